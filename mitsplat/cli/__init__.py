@@ -1,65 +1,109 @@
-"""The command ``mitsplat``: arguments to calls, and errors in one sentence, never a traceback.
+"""Command line interface ``mitsplat``: parses arguments, calls the library and reports errors in one sentence.
 
-Exit status: 0 done, 1 the doctor or an audit found something wrong, 2 bad input, 3 something is missing on the machine,
-4 a result was written that is not whole or misses a threshold, 70 a fault of mitsplat, 130 interrupted.
+Exit status:
+    0: done.
+    1: the doctor, a check or an audit found a problem.
+    2: invalid input.
+    3: a library, memory or disk space is missing on the machine.
+    4: a result was written but is incomplete or misses a threshold.
+    70: internal error of mitsplat.
+    130: interrupted.
 """
 
 from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
+from typer.core import TyperGroup
 
 from mitsplat.cli import assets, datasets, detectors, fault, lights, photographs
 from mitsplat.errors import InputError, LateDeviceError, exit_status, sentence_of
 from mitsplat.runtime.child_process import leave_current_folder, python_command, python_environment
 from mitsplat.version import __version__
 
+COMMAND_GROUPS: Mapping[str, Sequence[Callable[..., None]]] = {
+    "Make assets": (
+        photographs.asset,
+        photographs.capture,
+        photographs.fit,
+        photographs.mesh,
+        photographs.board,
+        assets.bake,
+        assets.import_,
+        lights.lights,
+    ),
+    "Make datasets": (
+        datasets.render,
+        datasets.settle,
+        datasets.merge,
+        datasets.split,
+        datasets.export,
+    ),
+    "Inspect": (
+        datasets.view,
+        datasets.preview,
+        datasets.check,
+        datasets.audit,
+        datasets.report,
+        datasets.chart,
+    ),
+    "Train detectors": (
+        detectors.train,
+        detectors.evaluate,
+        detectors.compare,
+    ),
+    "Machine": (
+        datasets.doctor,
+        datasets.schema,
+    ),
+}
+"""Commands by heading of the help page, in the order of a typical workflow."""
+
+
+class _CommandGroup(TyperGroup):
+    """Command group whose help page lists the commands under the headings of ``COMMAND_GROUPS``.
+
+    Typer shows headings only with rich markup, in which texts such as ``[px]`` would be read as styles.
+    """
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        width = max(len(name) for name in self.commands)
+        for heading, functions in COMMAND_GROUPS.items():
+            names = [_command_name(function) for function in functions]
+            with formatter.section(heading):
+                formatter.write_dl(
+                    # The padding aligns the second column over all sections.
+                    [(name.ljust(width), self.commands[name].get_short_help_str(formatter.width)) for name in names]
+                )
+
+
+def _command_name(function: Callable[..., None]) -> str:
+    return function.__name__.rstrip("_")
+
+
 app = typer.Typer(
-    help="Labelled training images of settled objects, from Gaussian splats, physics and traced light.",
+    cls=_CommandGroup,
+    help="Render labelled training images of objects at rest, from Gaussian splats, physics and ray-traced light.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
 
-for _command in (
-    datasets.render,
-    datasets.merge,
-    datasets.split,
-    datasets.chart,
-    datasets.audit,
-    datasets.report,
-    datasets.preview,
-    datasets.view,
-    datasets.settle,
-    datasets.export,
-    detectors.train,
-    detectors.evaluate,
-    detectors.compare,
-    assets.bake,
-    photographs.fit,
-    photographs.capture,
-    photographs.board,
-    photographs.mesh,
-    photographs.asset,
-    lights.lights,
-    assets.import_,
-    datasets.schema,
-    datasets.check,
-    datasets.doctor,
-):
-    app.command(_command.__name__.rstrip("_"))(_command)
+for _functions in COMMAND_GROUPS.values():
+    for _function in _functions:
+        app.command(_command_name(_function))(_function)
 
 
 def main(args: Sequence[str] | None = None) -> None:
     """Run the command line and exit.
 
-    A GPU that another one hides from Dr.Jit is taken by beginning again, with only that one visible.
+    If another GPU prevents Dr.Jit from using the selected GPU, the process restarts with only that GPU visible.
 
     Args:
         args: Arguments; those of the process if None.
@@ -69,7 +113,7 @@ def main(args: Sequence[str] | None = None) -> None:
     try:
         _check_text([*(sys.argv[1:] if args is None else args), os.fspath(Path.cwd())])
         app(args)
-    except Exception as error:  # noqa: BLE001 - the last one who can tell the user
+    except Exception as error:  # noqa: BLE001 - last handler before the traceback would be printed
         if args is None and isinstance(error, LateDeviceError):
             command = python_command(*sys.orig_argv[1:])
             os.execve(command[0], command, python_environment(error.environment))
@@ -79,7 +123,10 @@ def main(args: Sequence[str] | None = None) -> None:
 
 
 def _check_text(texts: Sequence[str]) -> None:
-    """Refuse names that are not UTF-8, which native libraries do not take or end this process by."""
+    """Raise InputError for names that are not valid UTF-8.
+
+    Native libraries reject such names or abort the process.
+    """
     for text in texts:
         try:
             text.encode()

@@ -1,6 +1,6 @@
-"""Commands that make assets of meshes and of splats that were made elsewhere.
+"""Commands that make assets from meshes and from splat files.
 
-Commands import what they need inside of their functions, so that the start of every other one stays short.
+Each command imports its dependencies inside its function, so that all other commands start fast.
 """
 
 from __future__ import annotations
@@ -26,43 +26,55 @@ from mitsplat.cli.options import (
 from mitsplat.errors import InputError
 
 Overwrite = Annotated[
-    bool, typer.Option("--overwrite", help="Replace the asset that is in the folder, with what was changed in it.")
+    bool,
+    typer.Option("--overwrite", help="Replace an existing asset in the folder, including manual changes to its files."),
 ]
 
 
 def bake(
-    mesh: Annotated[Path, typer.Argument(metavar="MESH", help="Textured or coloured mesh that trimesh reads.")],
+    mesh: Annotated[
+        Path,
+        typer.Argument(metavar="MESH", help="Mesh with textures or vertex colours, in a format that trimesh reads."),
+    ],
     out: AssetFolder,
     name: Name = None,
     class_name: ClassName = None,
     kind: Kind = "object",
-    light: Annotated[Literal["uniform", "studio"], typer.Option(help="Light to bake under.")] = "uniform",
-    gaussians: Annotated[int, typer.Option(help="Number of Gaussians aimed for.")] = 20000,
+    light: Annotated[
+        Literal["uniform", "studio"], typer.Option(help="Light whose radiance is baked into the Gaussians.")
+    ] = "uniform",
+    gaussians: Annotated[int, typer.Option(help="Target number of Gaussians.")] = 20000,
     sh_degree: ShDegree = 2,
     units: Annotated[float, typer.Option(help="Metres per unit of the mesh; 0.001 for millimetres.")] = 1.0,
     up: Annotated[Literal["y", "z"], typer.Option(help="Axis of the mesh that points up.")] = "z",
     density: Annotated[float, typer.Option(help="Mass density [kg/m^3].")] = 1000.0,
     friction: Annotated[float, typer.Option(help="Coulomb friction coefficient.")] = 0.5,
     colour: Annotated[
-        str | None, typer.Option(help="Name or #rrggbb, instead of all colours and textures of the file.")
+        str | None,
+        typer.Option(help="Colour that replaces all colours and textures of the file: a CSS name or #rrggbb."),
     ] = None,
     roughness: Annotated[
-        float | None, typer.Option(help="0 (a mirror) to 1, instead of the file's; makes what is matt glossy.")
+        float | None,
+        typer.Option(help="Roughness that replaces the file's values, 0 (mirror) to 1; makes matt parts glossy."),
     ] = None,
-    metallic: Annotated[float | None, typer.Option(help="0 to 1 (metal), instead of the file's.")] = None,
+    metallic: Annotated[
+        float | None, typer.Option(help="Metalness that replaces the file's values, 0 (dielectric) to 1 (metal).")
+    ] = None,
     specular: Annotated[
-        float | None, typer.Option(help="Reflectance of what is no metal, 0 (matt) to 0.08, instead of the file's.")
+        float | None,
+        typer.Option(help="Reflectance of dielectric parts that replaces the file's values, 0 (matt) to 0.08."),
     ] = None,
     any_size: Annotated[
-        bool, typer.Option("--any-size", help="Bake an object of less than 1 mm or more than 5 m as well.")
+        bool, typer.Option("--any-size", help="Also accept an object smaller than 1 mm or larger than 5 m.")
     ] = False,
     overwrite: Overwrite = False,
     device: DeviceName = "cpu",
     seed: Seed = 0,
 ) -> None:
-    """Turn MESH into an asset.
+    """Make an asset from MESH.
 
-    It has Gaussians with baked radiance, a proxy mesh and convex pieces; report.html shows the mesh beside the splats.
+    The asset has Gaussians with baked radiance, a proxy mesh and convex collision pieces. The page report.html compares
+    the mesh with the splats.
     """
     from mitsplat.bake.bake import BakeSettings, bake_asset
     from mitsplat.bake.bake_report import write_bake_report
@@ -102,46 +114,57 @@ def bake(
 
 def import_(
     file: Annotated[
-        Path, typer.Argument(metavar="FILE", help="Splats (.ply, .compressed.ply, .splat, .ksplat, .spz or .sog).")
+        Path, typer.Argument(metavar="FILE", help="Splat file (.ply, .compressed.ply, .splat, .ksplat, .spz or .sog).")
     ],
     out: AssetFolder,
     name: Name = None,
     class_name: ClassName = None,
     kind: Kind = "object",
     up: Annotated[
-        Literal["auto", "x", "-x", "y", "-y", "z", "-z"], typer.Option(help="Axis of the file that points up.")
+        Literal["auto", "x", "-x", "y", "-y", "z", "-z"],
+        typer.Option(help="Axis of the file that points up; auto estimates it."),
     ] = "auto",
-    size: Annotated[float | None, typer.Option(help="Longest extent of what is kept [m].")] = None,
-    units: Annotated[float | None, typer.Option(help="Metres per unit of the file, instead.")] = None,
+    size: Annotated[float | None, typer.Option(help="Longest extent of the asset [m]; sets the scale.")] = None,
+    units: Annotated[float | None, typer.Option(help="Metres per unit of the file; alternative to --size.")] = None,
     crop: Annotated[
         tuple[float, float, float, float, float, float] | None,
-        typer.Option(metavar="X0 Y0 Z0 X1 Y1 Z1", help="Keep the inside of this box, in the file's units and axes."),
+        typer.Option(
+            metavar="X0 Y0 Z0 X1 Y1 Z1",
+            help="Crop box in the units and axes of the file; only Gaussians inside are used.",
+        ),
     ] = None,
     without_table: Annotated[
-        bool, typer.Option("--without-table", help="Remove the flat surface that the object stands on.")
+        bool,
+        typer.Option(
+            "--without-table", help="Remove the flat surface that the object stands on, and everything below it."
+        ),
     ] = False,
     flat_base: Annotated[
-        bool, typer.Option("--flat-base", help="Cut off what hangs below the base, until the object stands.")
+        bool, typer.Option("--flat-base", help="Cut off parts below the base, so that the object can stand.")
     ] = False,
-    mass: Annotated[float | None, typer.Option(help="Mass [kg], instead of density.")] = None,
-    density: Annotated[float | None, typer.Option(help="Mass density [kg/m^3]; 1000 if absent.")] = None,
+    mass: Annotated[float | None, typer.Option(help="Mass [kg]; alternative to --density.")] = None,
+    density: Annotated[float | None, typer.Option(help="Mass density [kg/m^3]; 1000 by default.")] = None,
     friction: Annotated[float, typer.Option(help="Coulomb friction coefficient.")] = 0.5,
     light: Annotated[
         Literal["uniform", "scene"] | None,
-        typer.Option(help="Whether scenes light it anew, as objects by default, or only shadow it, as environments."),
+        typer.Option(
+            help="Light in the captured colours. uniform: scenes relight the asset (default for objects); "
+            "scene: scenes only add shadows (default for environments)."
+        ),
     ] = None,
     faces: Faces = 10000,
-    voxels: Annotated[int, typer.Option(help="Cells of the mesh's grid along the longest extent.")] = 192,
+    voxels: Annotated[int, typer.Option(help="Grid cells along the longest extent for the mesh reconstruction.")] = 192,
     scene: Annotated[
-        Path | None, typer.Option(metavar="SCENE", help="Also write a scene file to begin with, that has it.")
+        Path | None, typer.Option(metavar="SCENE", help="Also write a starter scene file that contains the asset.")
     ] = None,
     overwrite: Overwrite = False,
     device: DeviceName = "cpu",
 ) -> None:
-    """Make an asset of splats that were made elsewhere.
+    """Make an asset from a splat file of another tool.
 
-    What is invisible, too large or loose is removed, up is found, and an object gets a mesh and convex pieces;
-    report.html shows it all. What is questionable is said; `check` says more.
+    Invisible, oversized and isolated Gaussians are removed, and the up axis is estimated. An object gets a mesh and
+    convex
+    collision pieces. The page report.html shows the result. Warnings are printed; `mitsplat check` runs more checks.
     """
     from mitsplat.importing.import_report import check_scene_path, write_import_report, write_scene
     from mitsplat.importing.splat_import import ImportSettings, import_splats
@@ -194,7 +217,7 @@ def import_(
 
 
 def _check_folder(out: Path, source: Path, name: str | None, *, overwrite: bool) -> None:
-    """Refuse, before work starts, a folder that cannot be made, or in which something would be lost."""
+    """Raise InputError if the asset folder cannot be created or if existing files would be lost."""
     for place in (out, *out.absolute().parents):
         if place.exists() and not place.is_dir():
             raise InputError(f"--out must be a folder (got {'' if place == out else f'{out} below '}the file {place})")
@@ -207,4 +230,4 @@ def _check_folder(out: Path, source: Path, name: str | None, *, overwrite: bool)
 
 
 _WRITTEN = ("asset.yaml", "splats.ply", "mesh.ply", "pieces.ply", "report.html")
-"""Files of an asset's folder."""
+"""Files of an asset folder."""

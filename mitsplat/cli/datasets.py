@@ -1,6 +1,6 @@
-"""Commands on scenes and datasets.
+"""Commands for scenes and datasets.
 
-Commands import what they need inside of their functions, so that the start of every other one stays short.
+Each command imports its dependencies inside its function, so that all other commands and ``--help`` start fast.
 """
 
 from __future__ import annotations
@@ -32,29 +32,33 @@ if TYPE_CHECKING:
     from mitsplat.runtime.device import Device
     from mitsplat.scene.scene import Scene
 
-# Commands import what they need themselves, so that help appears at once.
 
 SceneFile = Annotated[Path, typer.Argument(metavar="SCENE", help="Scene file (.yaml).")]
 DatasetFolder = Annotated[Path, typer.Argument(metavar="DATASET", help="Dataset folder.")]
-FrameIndex = Annotated[int, typer.Option("--frame", help="Index of the frame, from 0.")]
+FrameIndex = Annotated[int, typer.Option("--frame", help="Frame index, from 0.")]
 FrameSize = Annotated[str | None, typer.Option(metavar="WxH", help="Image size [px], such as 1280x720.")]
-SceneSeed = Annotated[int | None, typer.Option(help="Decides everything that is random.")]
-AllowOutside = Annotated[bool, typer.Option("--allow-outside", help="Let SCENE name files outside of its folder.")]
-Preset = Annotated[PresetName | None, typer.Option(help="Rendering preset.")]
+SceneSeed = Annotated[int | None, typer.Option(help="Seed of all random numbers; replaces the seed of the scene.")]
+AllowOutside = Annotated[
+    bool, typer.Option("--allow-outside", help="Allow SCENE to reference files outside its folder.")
+]
+Preset = Annotated[PresetName | None, typer.Option(help="Rendering preset; replaces the preset of the scene.")]
 
 
 def render(
-    scene: Annotated[Path, typer.Argument(metavar="SCENE", help="Scene file (.yaml), or a Mitsuba scene (.xml).")],
+    scene: Annotated[Path, typer.Argument(metavar="SCENE", help="Scene file (.yaml) or Mitsuba scene (.xml).")],
     out: Annotated[
         Path | None,
-        typer.Option("--out", "-o", help="Dataset folder (for .xml: picture); out/<name of SCENE> if absent."),
+        typer.Option(
+            "--out", "-o", help="Dataset folder, or picture for a .xml scene; out/<name of SCENE> by default."
+        ),
     ] = None,
-    frames: Annotated[int | None, typer.Option("--frames", "-n", help="Only the first so many images.")] = None,
+    frames: Annotated[int | None, typer.Option("--frames", "-n", help="Render only the first N images.")] = None,
     only: Annotated[
         int | None,
         typer.Option(
             metavar="FRAME",
-            help="Only this image, from 0, again: into a folder beside --out, and compared with the dataset in --out.",
+            help="Render only this image again (index from 0) into a folder beside --out, and compare it "
+            "with the dataset in --out.",
         ),
     ] = None,
     size: FrameSize = None,
@@ -62,54 +66,68 @@ def render(
     quality: Preset = None,
     tolerance: Annotated[
         float | None,
-        typer.Option(help="Choose the cheapest preset within this error (RMSE of encoded colours), as `chart` does."),
+        typer.Option(
+            help="Use the fastest preset whose error (RMSE of encoded colours) is at most this value; see "
+            "`mitsplat chart`."
+        ),
     ] = None,
     device: Annotated[
         str | None,
         typer.Option(
             metavar="NAME",
-            help="Render on the cpu, or on GPUs: cuda, cuda:1, cuda:all, or auto if there is one; cpu if absent.",
+            help="Device that renders: cpu, cuda (one GPU), cuda:1, cuda:all, or auto (a GPU if there is "
+            "one); cpu by default.",
         ),
     ] = None,
     any_device: Annotated[
-        bool, typer.Option("--any-device", help="Go on with a dataset that was begun on the other kind of device.")
+        bool, typer.Option("--any-device", help="Continue a dataset that was started on the other kind of device.")
     ] = False,
     workers: Annotated[
         int | None,
         typer.Option(
-            help="Processes that make images; if absent, as many as turn out to pay, on GPUs as there is room for."
+            help="Number of worker processes; by default chosen by measured speed, and limited by the GPU "
+            "memory on GPUs."
         ),
     ] = None,
     engine: Annotated[
-        Literal["local", "ray"], typer.Option(help="Make images on this machine, or on a Ray cluster.")
+        Literal["local", "ray"], typer.Option(help="Render on this machine or on a Ray cluster.")
     ] = "local",
     address: Annotated[
-        str | None, typer.Option(help="Of the cluster, or auto; Ray is started on this machine if absent.")
+        str | None, typer.Option(help="Address of the Ray cluster, or auto; by default Ray is started on this machine.")
     ] = None,
     resources: Annotated[
         str | None,
         typer.Option(
             metavar="NAME=AMOUNT,...",
-            help="What a worker on the cluster reserves, such as CPU=4; if absent, CPU=2, or CPU=1,GPU=0.125 on cuda.",
+            help="Resources that each cluster worker reserves, such as CPU=4; by default CPU=2, or "
+            "CPU=1,GPU=0.125 on cuda.",
         ),
     ] = None,
     shard: Annotated[
-        str | None, typer.Option(metavar="I/N", help="Only the I-th of N parts, which `merge` joins; I counts from 1.")
+        str | None,
+        typer.Option(metavar="I/N", help="Render only part I of N (I from 1); `mitsplat merge` joins the parts."),
     ] = None,
     json_log: JsonLog = False,
     formats: Annotated[
         str | None,
-        typer.Option("--format", metavar="NAMES", help="Label formats as in output.formats, separated by commas."),
+        typer.Option(
+            "--format",
+            metavar="NAMES",
+            help="Label formats, separated by commas; replaces output.formats of the scene.",
+        ),
     ] = None,
     overwrite: Annotated[
         bool,
-        typer.Option("--overwrite/--resume", help="Replace the dataset in the folder, or keep what is finished of it."),
+        typer.Option(
+            "--overwrite/--resume",
+            help="Replace the dataset in the folder, or continue it and keep its finished images.",
+        ),
     ] = False,
     allow_outside: AllowOutside = False,
 ) -> None:
-    """Write the labelled dataset that SCENE describes.
+    """Render the labelled dataset of SCENE.
 
-    Options replace what the file says. A Mitsuba scene (.xml) gives one picture.
+    Options override values of the scene file. A Mitsuba scene (.xml) is rendered to one picture without labels.
     """
     from mitsplat.runtime.device import find_device
 
@@ -141,7 +159,7 @@ def render(
         cluster = None
         if engine == "ray":
             cluster = Cluster(address, None if resources is None else Cluster.parse_resources(resources))
-            cluster.on_device(device)  # refuses what contradicts it
+            cluster.on_device(device)  # raises if the device contradicts the cluster's resources
         loaded = load_scene(scene, overrides=overrides, allow_outside=allow_outside)
         if tolerance is not None:
             if quality is not None:
@@ -181,7 +199,7 @@ def render(
 
 
 def _remake(scene: Scene, index: int, dataset: Path, device: str | Device | None) -> None:
-    """Make one frame again; status 1 if it is not what the dataset has."""
+    """Render one frame again and exit with status 1 if it differs from the frame in the dataset."""
     from mitsplat.dataset.remake import remake_frame
 
     made = remake_frame(scene, index, Path(f"{dataset}-{index:06d}"), dataset=dataset, device=device)
@@ -197,17 +215,22 @@ def _remake(scene: Scene, index: int, dataset: Path, device: str | Device | None
 
 
 def merge(
-    shards: Annotated[list[Path], typer.Argument(metavar="SHARDS...", help="Dataset folders, all shards of one.")],
+    shards: Annotated[
+        list[Path], typer.Argument(metavar="SHARDS...", help="Dataset folders with all shards of one dataset.")
+    ],
     out: Annotated[Path, typer.Option("--out", "-o", help="Dataset folder to write.")],
     overwrite: Annotated[
         bool,
-        typer.Option("--overwrite/--resume", help="Replace the dataset in the folder, or keep what is finished of it."),
+        typer.Option(
+            "--overwrite/--resume",
+            help="Replace the dataset in the folder, or continue it and keep its finished images.",
+        ),
     ] = False,
     json_log: JsonLog = False,
 ) -> None:
-    """Join SHARDS, the parts of a dataset that were made apart.
+    """Join the shards of a dataset into one dataset.
 
-    Every file is checked against its hash, and no frame may be missing. The result is that of a single run.
+    The hash of every file is checked, and every frame must be present. The result equals that of a single run.
     """
     from mitsplat.dataset.shards import merge_shards
 
@@ -218,11 +241,15 @@ def merge(
 
 def split(
     dataset: DatasetFolder,
-    folds: Annotated[int, typer.Option(help="How many; each validates with another part of the layouts.")] = 5,
+    folds: Annotated[
+        int, typer.Option(help="Number of folds; each fold validates on a different part of the layouts.")
+    ] = 5,
 ) -> None:
-    """List the images of DATASET for cross-validation.
+    """Write image lists of DATASET for cross-validation.
 
-    Layouts stay whole, classes are spread evenly over the folds as far as that allows, and the test split is left out.
+    All images of a layout are in the same fold. Classes are spread evenly over the folds as far as whole layouts allow.
+    The
+    test split is not used.
     """
     from mitsplat.dataset.folds import write_folds
 
@@ -232,7 +259,11 @@ def split(
 
 
 def _tell_dataset(summary: DatasetSummary, *, whole: bool = True) -> None:
-    """Say what a dataset holds; without any label it is not what was asked for, unless it is a part of one."""
+    """Print a summary of a dataset.
+
+    Raises:
+        PartialResultError: If a complete dataset has no label at all. A shard may have none.
+    """
     images = ", ".join(f"{count} {split}" for split, count in summary.images.items())
     typer.echo(f"dataset: {summary.path} ({images}; {sum(summary.instances.values())} labelled instances)")
     typer.echo(f"not labelled: {_counts(summary.dropped)}; marked: {_counts(summary.marked)}")
@@ -249,26 +280,30 @@ def _tell_dataset(summary: DatasetSummary, *, whole: bool = True) -> None:
 
 
 def chart(
-    scene: Annotated[Path, typer.Argument(metavar="SCENE", help="Scene file (.yaml), or a file of splats.")],
-    frames: Annotated[int, typer.Option("--frames", "-n", help="Images to compare, spread over the scene's.")] = 3,
+    scene: Annotated[Path, typer.Argument(metavar="SCENE", help="Scene file (.yaml) or splat file.")],
+    frames: Annotated[
+        int, typer.Option("--frames", "-n", help="Number of images to compare, spread evenly over the scene.")
+    ] = 3,
     size: FrameSize = None,
     tolerance: Annotated[
-        float, typer.Option(help="Mark the cheapest preset within this error (RMSE of encoded colours).")
+        float, typer.Option(help="Mark the fastest preset whose error (RMSE of encoded colours) is at most this value.")
     ] = 0.004,
     at: Annotated[
         list[float] | None,
-        typer.Option(help="Tolerance of the order of blending, at which `balanced` is measured too; repeatable."),
+        typer.Option(help="Additional blending-order tolerance at which `balanced` is measured; repeatable."),
     ] = None,
     out: Annotated[
-        Path, typer.Option("--out", "-o", help="Chart to write (.png); a .csv of the same name goes beside it.")
+        Path,
+        typer.Option("--out", "-o", help="Chart to write (.png); a .csv file of the same name is written beside it."),
     ] = Path("chart.png"),
     device: DeviceName = "cpu",
     allow_outside: AllowOutside = False,
 ) -> None:
-    """Chart speed against accuracy for SCENE.
+    """Measure speed and accuracy of the rendering presets on SCENE.
 
-    Every preset, and cheaper models of light, beside the preset exact. Times are those of this machine, now; memory is
-    the machine's, not a GPU's.
+    All presets and several cheaper light models are compared with the preset exact. Times are valid for this machine
+    only.
+    Memory is main memory, not GPU memory.
     """
     from rich.console import Console
     from rich.table import Table
@@ -306,9 +341,9 @@ def chart(
 
 
 def audit(dataset: DatasetFolder) -> None:
-    """Re-check DATASET from its files alone.
+    """Check DATASET for errors, from its files alone.
 
-    Every violation is one line; with any, the exit status is 1.
+    Each violation is printed on one line. The exit status is 1 if there is any violation.
     """
     from mitsplat.audit.audit import POLYGON_AREA, POLYGON_IOU, audit_dataset
 
@@ -325,13 +360,14 @@ def audit(dataset: DatasetFolder) -> None:
 def report(
     dataset: DatasetFolder,
     out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Page to write (.html); report.html in DATASET if absent.")
+        Path | None, typer.Option("--out", "-o", help="HTML page to write (.html); report.html in DATASET by default.")
     ] = None,
 ) -> None:
-    """Write a page to look at DATASET by.
+    """Write an HTML report of DATASET.
 
-    It is one HTML file that needs no network: samples with their labels, statistics, draws, audit, origin. What a
-    detector cannot learn from the images is printed, too.
+    The report is a single file that works offline. It shows sample images with labels, statistics, random draws, the
+    audit
+    and the origin of the data. Properties of the images that a detector cannot learn are also printed.
     """
     from mitsplat.report.dataset_report import write_report
 
@@ -345,17 +381,18 @@ def report(
 def preview(
     scene: SceneFile,
     frame: FrameIndex = 0,
-    out: Annotated[Path, typer.Option("--out", "-o", help="Picture to write (.png or .jpg).")] = Path("preview.png"),
+    out: Annotated[Path, typer.Option("--out", "-o", help="Image to write (.png or .jpg).")] = Path("preview.png"),
     size: FrameSize = None,
     seed: SceneSeed = None,
     quality: Preset = None,
     layers: Annotated[
-        bool, typer.Option("--layers/--no-layers", help="Show ids, depth, light and highlight beside the picture.")
+        bool,
+        typer.Option("--layers/--no-layers", help="Show instance ids, depth, light and highlights beside the image."),
     ] = True,
     device: DeviceName = "cpu",
     allow_outside: AllowOutside = False,
 ) -> None:
-    """Render one frame of SCENE to a picture, with its layers side by side."""
+    """Render one frame of SCENE, with its layers side by side."""
     check_place(out, ".png", ".jpg", ".jpeg")
     from PIL import Image
 
@@ -377,23 +414,27 @@ def preview(
 def view(
     path: Annotated[
         Path,
-        typer.Argument(metavar="PATH", help="Scene file (.yaml), asset, capture or dataset folder, or a splat file."),
+        typer.Argument(
+            metavar="PATH", help="Scene file (.yaml), splat file, or folder of an asset, a capture or a dataset."
+        ),
     ],
     host: Annotated[
-        str, typer.Option(help="Address to listen on; any but localhost is reached from other machines.")
+        str, typer.Option(help="Address to listen on; with any address but localhost, other machines can connect.")
     ] = "localhost",
     port: Annotated[int, typer.Option(help="TCP port to listen on.")] = 8080,
     gaussians: Annotated[
-        int, typer.Option(help="Most Gaussians of each cloud that the browser is sent, an even sample of larger ones.")
+        int,
+        typer.Option(help="Maximum number of Gaussians per cloud in the browser; larger clouds are subsampled evenly."),
     ] = 300_000,
     browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open the page in a browser.")] = False,
     device: DeviceName = "cpu",
     allow_outside: AllowOutside = False,
 ) -> None:
-    """Look at a scene, an asset, a capture, a dataset or a file of splats in the browser.
+    """Show a scene, asset, capture, dataset or splats in a browser.
 
-    A scene can be steered: beside its splats is the real render of what is looked at, which sharpens as time allows,
-    and the file is read again when it changes. Ctrl-C ends it.
+    For a scene, the page shows the splats beside a real render of the same view, which is refined over time. Scene
+    values
+    can be changed on the page, and the scene file is read again when it changes. Press Ctrl-C to stop.
     """
     from importlib.util import find_spec
 
@@ -416,17 +457,19 @@ def view(
 
 def settle(
     scene: SceneFile,
-    layouts: Annotated[int | None, typer.Option("--layouts", "-n", help="Only the first so many layouts.")] = None,
-    preview: Annotated[bool, typer.Option("--preview", help="Write the drop of the first layout as a GIF.")] = False,
-    out: Annotated[Path, typer.Option("--out", "-o", help="GIF to write.")] = Path("settle.gif"),
+    layouts: Annotated[int | None, typer.Option("--layouts", "-n", help="Settle only the first N layouts.")] = None,
+    preview: Annotated[
+        bool, typer.Option("--preview", help="Write an animation of the first layout while it settles (GIF).")
+    ] = False,
+    out: Annotated[Path, typer.Option("--out", "-o", help="GIF file to write.")] = Path("settle.gif"),
     size: Annotated[str, typer.Option(metavar="WxH", help="Size of the GIF [px].")] = "480x270",
     seed: SceneSeed = None,
-    workers: Annotated[int, typer.Option(help="Processes that settle layouts.")] = 1,
+    workers: Annotated[int, typer.Option(help="Number of processes that settle layouts.")] = 1,
     allow_outside: AllowOutside = False,
 ) -> None:
     """Settle the layouts of SCENE and print their rest certificates.
 
-    They are kept, so that rendering finds them settled.
+    Settled layouts are cached, so that a later `mitsplat render` does not settle them again.
     """
     check_place(out, ".gif")
     from rich.console import Console
@@ -446,7 +489,7 @@ def settle(
     with Console(stderr=True).status("settling") as status:
         found = settle_layouts(loaded, range(wanted), workers=workers, progress=status.update)
         settled = sorted(found, key=lambda layout: layout.index)
-    # In 80 columns, as where output goes to a file, its headings would be cut to a letter or two.
+    # Output to a file has 80 columns, which would truncate the headings to one or two letters.
     Console(width=max(Console().width, 120)).print(certificate_table(settled))
     for layout in settled:
         for one in layout.left_out:
@@ -461,13 +504,13 @@ def export(
     frame: FrameIndex = 0,
     out: Annotated[Path, typer.Option("--out", "-o", help="Mitsuba scene to write (.xml).")] = Path("scene.xml"),
     overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Replace the file, with what was edited in it.")
+        bool, typer.Option("--overwrite", help="Replace an existing file, including manual changes.")
     ] = False,
     allow_outside: AllowOutside = False,
 ) -> None:
-    """Write one frame of SCENE as a Mitsuba scene.
+    """Export one frame of SCENE as a Mitsuba scene.
 
-    It can be edited, and rendered by `mitsplat render`.
+    The XML file can be edited and rendered with `mitsplat render`.
     """
     check_new(out, ".xml", overwrite=overwrite)
     files = out.with_name(f"{out.stem}_files")
@@ -490,9 +533,10 @@ def schema() -> None:
 
 
 def doctor() -> None:
-    """Check that this machine has what is needed.
+    """Check that this machine meets the requirements.
 
-    Python, Mitsuba, processor, LLVM, GPU, Warp, memory, disk and cache, and what to do about what is missing.
+    The command checks Python, Mitsuba, processor, LLVM, GPU, Warp, memory, disk and cache, and suggests a remedy for
+    each problem. The exit status is 1 if there is any problem.
     """
     from mitsplat.checks.doctor import examine
 
@@ -500,13 +544,14 @@ def doctor() -> None:
 
 
 def check(
-    path: Annotated[Path, typer.Argument(metavar="ASSET|SCENE", help="Asset folder, or scene file (.yaml).")],
+    path: Annotated[Path, typer.Argument(metavar="ASSET|SCENE", help="Asset folder or scene file (.yaml).")],
     allow_outside: AllowOutside = False,
 ) -> None:
-    """Look for what is questionable about an asset or a scene.
+    """Check an asset or a scene for likely mistakes.
 
-    Units, up axis, needles, floaters, mesh against splats, mass, colliders, room, sight and light, and what to do about
-    each. If there is anything, the exit status is 1.
+    The command checks units, up axis, needle-shaped Gaussians, floaters, agreement of mesh and splats, mass,
+    colliders, free space, visibility and light, and suggests a remedy for each problem. The exit status is 1 if there
+    is any problem.
     """
     from mitsplat.checks.path_checks import check_path
 
@@ -514,7 +559,7 @@ def check(
 
 
 def _tell_findings(findings: Iterable[Finding], mark: str) -> NoReturn:
-    """One line for each, with what to do where something is wrong; then status 0 or 1."""
+    """Print one line per finding, with its remedy if there is a problem, and exit with status 0 or 1."""
     good = True
     for finding in findings:
         good &= finding.ok
@@ -531,7 +576,7 @@ def _counts(counts: Mapping[str, int]) -> str:
 def _overrides(
     *, size: str | None = None, seed: int | None = None, quality: str | None = None, formats: str | None = None
 ) -> dict[str, Any]:
-    """The options that were given, by the scene file's keys."""
+    """Return the given options as a mapping from scene file keys to values."""
     from mitsplat.scene.spec.scene_spec import FORMATS
 
     if seed is not None and seed < 0:

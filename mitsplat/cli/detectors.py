@@ -1,6 +1,6 @@
-"""Commands on detectors.
+"""Commands for detectors.
 
-Commands import what they need inside of their functions, so that the start of every other one stays short.
+Each command imports its dependencies inside its function, so that all other commands start fast.
 """
 
 from __future__ import annotations
@@ -21,54 +21,64 @@ if TYPE_CHECKING:
 TorchDevice = Annotated[
     str,
     typer.Option(
-        "--device", metavar="NAME", help="Compute on the cpu, or on a GPU: cuda, cuda:1, or auto if there is one."
+        "--device", metavar="NAME", help="Device that computes: cpu, cuda, cuda:1, or auto (a GPU if there is one)."
     ),
 ]
 
 
 def train(
     datasets: Annotated[
-        list[Path], typer.Argument(metavar="DATASETS...", help="Dataset folders with YOLO files; all are learnt from.")
+        list[Path],
+        typer.Argument(
+            metavar="DATASETS...", help="Dataset folders with YOLO labels; the detector trains on all of them."
+        ),
     ],
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder of the run to write.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Run folder to write.")],
     real: Annotated[
         Path | None,
-        typer.Option(metavar="DIR", help="Labelled photographs to mix in: a YOLO folder, a COCO folder or a dataset."),
+        typer.Option(
+            metavar="DIR", help="Labelled photographs to mix in: a YOLO folder, a COCO folder or a dataset folder."
+        ),
     ] = None,
-    share: Annotated[float, typer.Option(help="Of photographs among the images of every step.")] = 0.1,
+    share: Annotated[float, typer.Option(help="Fraction of photographs in each batch, between 0 and 1.")] = 0.1,
     real_size: Annotated[
         int | None,
         typer.Option(
-            help="Longer side at which photographs will be searched [px]: above --size they are cut to tiles that show "
-            "things as large."
+            help="Longer side of photographs at inference [px]; above --size, photographs are cut into "
+            "tiles in which objects appear at that size."
         ),
     ] = None,
     model: Annotated[
-        str, typer.Option(help="Network of Ultralytics: yolo11n-seg for masks, yolo11n for boxes; s and m are larger.")
+        str,
+        typer.Option(
+            help="Ultralytics network: yolo11n-seg predicts masks, yolo11n boxes; the s and m variants are larger."
+        ),
     ] = "yolo11n-seg.yaml",
     weights: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Weights to start from (.pt), instead of random ones.")
+        Path | None, typer.Option(metavar="FILE", help="Initial weights (.pt); random by default.")
     ] = None,
-    steps: Annotated[int, typer.Option(help="Batches to learn from, however many images there are.")] = 1500,
-    batch: Annotated[int, typer.Option(help="Images of a step.")] = 16,
-    size: Annotated[int, typer.Option(help="Longer side that images are scaled to [px], a multiple of 32.")] = 640,
+    steps: Annotated[int, typer.Option(help="Number of training batches, independent of the number of images.")] = 1500,
+    batch: Annotated[int, typer.Option(help="Number of images per batch.")] = 16,
+    size: Annotated[int, typer.Option(help="Longer side of the images in training [px], a multiple of 32.")] = 640,
     mirror: Annotated[
         bool,
-        typer.Option(help="Mirror half of the images: not for what is printed, or for left and right parts."),
+        typer.Option(
+            help="Mirror half of the images left to right; switch it off for printed text or for left and right parts."
+        ),
     ] = True,
     seed: Seed = 0,
     device: TorchDevice = "auto",
     workers: Annotated[
-        int | None, typer.Option(help="Processes that read images; if absent, up to 8, and none on the cpu.")
+        int | None, typer.Option(help="Number of processes that read images; by default up to 8, and none on the cpu.")
     ] = None,
     overwrite: Annotated[
-        bool, typer.Option("--overwrite/--resume", help="Replace the run in the folder, or go on with it.")
+        bool, typer.Option("--overwrite/--resume", help="Replace the run in the folder, or continue it.")
     ] = False,
     json_log: JsonLog = False,
 ) -> None:
-    """Train a detector on DATASETS, by Ultralytics.
+    """Train an Ultralytics detector on DATASETS.
 
-    Nothing is downloaded: networks start from random weights, or from a file. Needs the extra train.
+    Nothing is downloaded: the initial weights are random or read from a file. Requires the extra `train`.
     """
     from mitsplat.detector.training import TrainSettings, train_detector
 
@@ -100,22 +110,29 @@ def train(
 
 
 def evaluate(
-    run: Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a finished `mitsplat train`.")],
-    data: Annotated[Path, typer.Argument(metavar="DATASET", help="Dataset, YOLO or COCO folder with labelled images.")],
-    split: Annotated[Literal["train", "val", "test", "all"], typer.Option(help="Which of its images.")] = "val",
+    run: Annotated[Path, typer.Argument(metavar="RUN", help="Run folder of a finished `mitsplat train`.")],
+    data: Annotated[
+        Path,
+        typer.Argument(metavar="DATASET", help="Labelled images: a dataset folder, a YOLO folder or a COCO folder."),
+    ],
+    split: Annotated[
+        Literal["train", "val", "test", "all"], typer.Option(help="Split of the images to evaluate on.")
+    ] = "val",
     size: Annotated[
-        int | None, typer.Option(help="Longer side that images are scaled to [px]; that of the training if absent.")
+        int | None,
+        typer.Option(help="Longer side of the images at inference [px]; by default the size used in training."),
     ] = None,
     device: TorchDevice = "auto",
     out: Annotated[
         Path | None,
-        typer.Option("--out", "-o", help="Folder to write; evaluation/<name of DATASET>-<split> in RUN if absent."),
+        typer.Option("--out", "-o", help="Folder to write; evaluation/<name of DATASET>-<split> in RUN by default."),
     ] = None,
     json_log: JsonLog = False,
 ) -> None:
-    """Judge the detector of RUN on labelled images: average precision by COCO's rules, and a page.
+    """Evaluate a trained detector on labelled images.
 
-    The page shows precision over recall, what is taken for what, and the images that went worst.
+    The command prints the average precision by the rules of COCO and writes a page. The page shows precision-recall
+    curves, confusions between classes, and the images with the worst results.
     """
     from mitsplat.detector.detector_evaluation import evaluate_detector
 
@@ -132,23 +149,28 @@ def evaluate(
 
 
 def compare(
-    datasets: Annotated[list[Path], typer.Argument(metavar="DATASETS...", help="Rendered datasets.")],
+    datasets: Annotated[list[Path], typer.Argument(metavar="DATASETS...", help="Folders of rendered datasets.")],
     photographs: Annotated[
-        Path, typer.Argument(metavar="PHOTOS", help="Labelled photographs: a YOLO folder, a COCO folder or a dataset.")
+        Path,
+        typer.Argument(
+            metavar="PHOTOS", help="Labelled photographs: a YOLO folder, a COCO folder or a dataset folder."
+        ),
     ],
-    split: Annotated[Literal["train", "val", "test", "all"], typer.Option(help="Which rendered images.")] = "train",
-    size: Annotated[
-        int, typer.Option(help="Longer side that images are scaled to before they are measured [px].")
-    ] = 640,
-    images: Annotated[int, typer.Option(help="How many of each to measure at most, evenly drawn.")] = 400,
+    split: Annotated[
+        Literal["train", "val", "test", "all"], typer.Option(help="Split of the rendered images to measure.")
+    ] = "train",
+    size: Annotated[int, typer.Option(help="Longer side of the images when they are measured [px].")] = 640,
+    images: Annotated[int, typer.Option(help="Maximum number of images to measure on each side, drawn evenly.")] = 400,
     out: Annotated[
-        Path | None, typer.Option("--out", "-o", metavar="FILE", help="JSON file to write what was measured to.")
+        Path | None, typer.Option("--out", "-o", metavar="FILE", help="JSON file for the measured values.")
     ] = None,
     json_log: JsonLog = False,
 ) -> None:
-    """Say where labelled photographs lie outside of rendered images, and what to change.
+    """Compare rendered images with labelled photographs.
 
-    Objects' brightness, colours, size and number, images' brightness and noise, of all and of each class.
+    The command compares the brightness, colours, size and number of objects, and the brightness and noise of images,
+    in total and per class. Where photographs lie outside the range of the rendered images, the output suggests a
+    change to the scene.
     """
     from mitsplat.detector.likeness import compare_with_photographs
     from mitsplat.storage.files import write_text

@@ -1,4 +1,4 @@
-"""What the command line does about an error that nobody foresaw: a sentence for the user, the traceback in a file."""
+"""Handling of unexpected errors on the command line: a sentence on stderr and a traceback in a log file."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from mitsplat.storage.cache import cache_folder
 from mitsplat.version import __version__
 
 STATUS = 70
-"""EX_SOFTWARE of sysexits.h: a fault of mitsplat, not of its input."""
+"""Exit status EX_SOFTWARE of sysexits.h: an internal error of mitsplat."""
 
 VARIABLE = "MITSPLAT_TRACEBACK"
-"""Environment variable by which a developer sees the traceback at once."""
+"""Environment variable that prints the traceback to stderr."""
 
 _LONGEST = 200
 _FOLDERS: tuple[Callable[[], Path], ...] = (
@@ -31,7 +31,10 @@ _FOLDERS: tuple[Callable[[], Path], ...] = (
 
 
 def tell_fault(error: BaseException) -> str:
-    """One sentence on an error, whose traceback, with that of the worker process it came from, is kept in a file."""
+    """Return one sentence about an unexpected error, and write its traceback to a log file.
+
+    The traceback includes that of the worker process in which the error occurred.
+    """
     text = "".join(traceback.format_exception(error))
     if os.environ.get(VARIABLE):
         sys.stderr.write(text)
@@ -52,7 +55,7 @@ def _circumstances() -> str:
 
 
 def _keep(text: str) -> Path | None:
-    """A new file of the text, in the first folder that can be written, or None."""
+    """Write the text to a new file in the first writable folder; return its path, or None if no folder is writable."""
     for folder in _FOLDERS:
         with suppress(OSError, RuntimeError):  # RuntimeError: there is no home folder
             place = folder()

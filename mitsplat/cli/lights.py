@@ -1,6 +1,6 @@
-"""The command that makes lights of a scene of what was captured.
+"""Command that converts captured light to lights of a scene file.
 
-Commands import what they need inside of their functions, so that the start of every other one stays short.
+The command imports its dependencies inside its function, so that all other commands start fast.
 """
 
 from __future__ import annotations
@@ -19,57 +19,68 @@ if TYPE_CHECKING:
 
 _MIRROR = (1.0, 1.0, 1.0)
 _WHITE = math.pi
-"""Irradiance under which white paper has a radiance of 1, which is display white [W/m^2]."""
+"""Irradiance at which white paper has the radiance 1, that is display white [W/m^2]."""
 
 
 def lights(
     images: Annotated[
         list[Path],
-        typer.Argument(metavar="IMAGES", help="An HDR panorama; or, with --camera, photographs of a mirror ball."),
+        typer.Argument(metavar="IMAGES", help="One HDR panorama, or with --camera photographs of a mirror ball."),
     ],
-    out: Annotated[Path, typer.Option("--out", "-o", help="Lines of a scene file to write (.yaml).")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="File for the lights, in scene file syntax (.yaml).")],
     camera: Annotated[
         tuple[float, float] | None,
         typer.Option(
             metavar="AZIMUTH ELEVATION",
-            help="Where the camera was, seen from the ball, as camera keys of scene files count [degrees].",
+            help="Direction from the ball to the camera, as in the camera keys of scene files [degrees].",
         ),
     ] = None,
     ball: Annotated[
         tuple[float, float, float] | None,
-        typer.Option(metavar="X Y RADIUS", help="Ball in the photograph [px], which is looked for otherwise."),
+        typer.Option(
+            metavar="X Y RADIUS", help="Centre and radius of the ball in the photograph [px]; detected by default."
+        ),
     ] = None,
     fov_x: Annotated[
-        float | None, typer.Option(help="Horizontal field of view of the photographs [degrees]; else by EXIF.")
+        float | None,
+        typer.Option(help="Horizontal field of view of the photographs [degrees]; read from EXIF by default."),
     ] = None,
     exposures: Annotated[
-        str | None, typer.Option(metavar="T,T,...", help="Exposure times, such as 1/60,1/8,1 [s]; else by EXIF.")
+        str | None,
+        typer.Option(metavar="T,T,...", help="Exposure times [s], such as 1/60,1/8,1; read from EXIF by default."),
     ] = None,
     reflectivity: Annotated[
-        tuple[float, float, float], typer.Option(metavar="R G B", help="Of the ball, above 0 to 1.")
+        tuple[float, float, float], typer.Option(metavar="R G B", help="Reflectance of the ball, > 0 to 1.")
     ] = _MIRROR,
-    rotate_z: Annotated[float, typer.Option(help="Turn of the panorama about the vertical [degrees].")] = 0.0,
+    rotate_z: Annotated[float, typer.Option(help="Rotation of the panorama about the vertical [degrees].")] = 0.0,
     around: Annotated[
         tuple[float, float, float],
-        typer.Option(metavar="X Y Z", help="Place in the scene where light was captured, which lamps face [m]."),
+        typer.Option(metavar="X Y Z", help="Point in the scene where the light was captured [m]; the lamps face it."),
     ] = (0.0, 0.0, 0.0),
-    distance: Annotated[float, typer.Option(help="From there to the lamps, whose sizes grow with it [m].")] = 1.5,
-    lamps: Annotated[int, typer.Option(help="Most lamps; 0 leaves all light in the image.")] = 6,
+    distance: Annotated[
+        float, typer.Option(help="Distance from that point to the lamps [m]; lamp sizes scale with it.")
+    ] = 1.5,
+    lamps: Annotated[
+        int, typer.Option(help="Maximum number of lamps; 0 keeps all light in the environment image.")
+    ] = 6,
     rest: Annotated[
-        Literal["image", "constant"], typer.Option(help="What is no lamp, as an image or as one colour all around.")
+        Literal["image", "constant"],
+        typer.Option(help="Environment light for everything except the lamps: an image, or one constant colour."),
     ] = "image",
     irradiance: Annotated[
         float | None,
         typer.Option(
-            help="Irradiance of a level table that light is scaled to [W/m^2]; by default that under which white is "
-            "white for photographs, which say nothing of it, and as it is for HDR."
+            help="Irradiance on a level table [W/m^2] to scale all light to. By default HDR light keeps "
+            "its scale, and light from photographs is scaled so that white paper appears white."
         ),
     ] = None,
 ) -> None:
-    """Turn captured light into lights of a scene file.
+    """Convert a panorama or mirror-ball photos to scene lights.
 
-    Lamps are cut out as area lights, which layouts may vary; what is left is an environment light. A level table gets
-    the same light from both together as from the panorama. A picture beside the lines shows what was taken for a lamp.
+    Bright regions become area lights, which the scene file can vary per layout. The remaining light becomes an
+    environment
+    light. Together they give a level table the same irradiance as the panorama. A picture beside the output file shows
+    which regions became lamps.
     """
     from mitsplat.capture.lighting import (
         BallView,
@@ -121,7 +132,7 @@ def lights(
 
 
 def _tell(estimate: LightEstimate) -> None:
-    """A table of the lamps."""
+    """Print a table of the lamps."""
     if estimate.lamps:
         typer.echo("lamp  azimuth  elevation  size            radiance  colour            share of irradiance")
     for number, lamp in enumerate(estimate.lamps, start=1):
@@ -136,7 +147,7 @@ def _tell(estimate: LightEstimate) -> None:
 
 
 def _times(text: str) -> tuple[float, ...]:
-    """Exposure times such as 1/60,0.5,2."""
+    """Parse exposure times such as 1/60,0.5,2."""
     times = []
     for part in text.split(","):
         numerator, slash, denominator = part.partition("/")

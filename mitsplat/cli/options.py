@@ -1,4 +1,4 @@
-"""What commands share: options of assets, the seed, the bar or log of how far they are, and logs for machines."""
+"""Shared options of commands, checks of output paths, progress bars and machine-readable logs."""
 
 from __future__ import annotations
 
@@ -22,54 +22,59 @@ if TYPE_CHECKING:
 DeviceName = Annotated[
     str,
     typer.Option(
-        "--device", metavar="NAME", help="Render on the cpu, or on a GPU: cuda, cuda:1, or auto if there is one."
+        "--device", metavar="NAME", help="Device that renders: cpu, cuda, cuda:1, or auto (a GPU if there is one)."
     ),
 ]
 
-Name = Annotated[str | None, typer.Option(help="Name of the asset; the folder's if absent.")]
-ClassName = Annotated[str | None, typer.Option("--class", help="Class to learn; the name if absent.")]
-Kind = Annotated[Literal["object", "environment"], typer.Option(help="Whether physics moves it.")]
+Name = Annotated[str | None, typer.Option(help="Name of the asset; the folder name by default.")]
+ClassName = Annotated[str | None, typer.Option("--class", help="Class label in datasets; the asset name by default.")]
+Kind = Annotated[
+    Literal["object", "environment"],
+    typer.Option(help="object: rigid body that physics moves; environment: static surroundings."),
+]
 AssetFolder = Annotated[Path, typer.Option("--out", "-o", help="Asset folder to write.")]
 ShDegree = Annotated[int, typer.Option(help="Degree of the spherical harmonics, 0 to 3.")]
-Faces = Annotated[int, typer.Option(help="Most faces of the mesh.")]
+Faces = Annotated[int, typer.Option(help="Maximum number of mesh faces.")]
 
-Seed = Annotated[int, typer.Option(help="Decides everything that is random.")]
+Seed = Annotated[int, typer.Option(help="Seed of all random numbers.")]
 
 JsonLog = Annotated[
     bool,
-    typer.Option("--json", help="Log to stderr for machines: an event a line, as a JSON object, instead of a bar."),
+    typer.Option(
+        "--json", help="Write a log for machines to stderr instead of a progress bar: one JSON object per line."
+    ),
 ]
 
 
 def check_ending(out: Path | None, *endings: str) -> None:
-    """Refuse a file that is to be written, and ends otherwise."""
+    """Raise InputError if the output file has none of the given endings."""
     if out is not None and out.suffix.lower() not in endings:
         raise InputError(f"--out must end in {' or '.join(endings)} (got {out})")
 
 
 def check_place(out: Path, *endings: str) -> None:
-    """Refuse such a file, and one in a folder that is not there."""
+    """Raise InputError if the output file has none of the given endings or its folder does not exist."""
     check_ending(out, *endings)
     if not out.parent.is_dir():
         raise InputError(f"--out must be in a folder that exists (got {out})")
 
 
 def check_new(out: Path, *endings: str, overwrite: bool) -> None:
-    """Refuse such a file, and one that is there, unless it is to be replaced."""
+    """Raise InputError if the output file has none of the given endings, or exists and must not be replaced."""
     check_ending(out, *endings)
     if out.exists() and not (overwrite and out.is_file()):
         raise InputError(f"--out must be a new file (got {out}); --overwrite replaces one")
 
 
 def take_device(name: str) -> None:
-    """Compute on a device from now on; why ``auto`` chose it is said."""
-    from mitsplat.runtime.device import use_device  # most commands do without
+    """Select the device for all later computation and print the reason for the choice of ``auto``."""
+    from mitsplat.runtime.device import use_device  # most commands do not need it
 
     tell_device(use_device(name))
 
 
 def tell_device(device: Device) -> None:
-    """Say in one line which device ``auto`` chose, and why."""
+    """Print in one line the device that ``auto`` selected, and the reason."""
     if device.reason:
         typer.echo(f"device: {device}, as {device.reason}", err=True)
 
@@ -78,9 +83,19 @@ def tell_device(device: Device) -> None:
 def command_log(
     json_log: bool, command: str, unit: str = "images/s"
 ) -> Iterator[Callable[[], AbstractContextManager[Progress]]]:
-    """How a command shows its progress: by bars, or as a log for machines, which then holds its errors too.
+    """Report the progress of a command, by bars or as a JSON log that also contains its errors.
 
-    The log's events are started, progress, then finished, or failed with the exit status and a sentence.
+    The log has the event started, any number of progress events, and then finished or failed. A failed event has the
+    exit
+    status and a sentence.
+
+    Args:
+        json_log: Write the log to stderr instead of bars.
+        command: Name of the command in the log.
+        unit: Unit of the speed that bars show.
+
+    Yields:
+        Function that returns a context manager for one progress callback.
     """
     if not json_log:
         yield lambda: progress_bar(unit)
@@ -112,8 +127,8 @@ def command_log(
 
 @contextmanager
 def progress_bar(unit: str = "images/s") -> Iterator[Progress]:
-    """A bar on stderr with speed and the time left."""
-    # Not at the top: half of the commands show no bar, and `--help` none.
+    """Show a bar on stderr with the speed and the remaining time."""
+    # Imported here because half of the commands and `--help` show no bar.
     from rich.console import Console
     from rich.progress import (
         BarColumn,
@@ -136,7 +151,7 @@ def progress_bar(unit: str = "images/s") -> Iterator[Progress]:
         task = bar.add_task("", total=None)
 
         def update(done: int, total: int, doing: str) -> None:
-            # Frames of an earlier run, or the steps of an earlier stage, must not count as this one's speed.
+            # Frames of an earlier run and steps of an earlier stage must not count for the present speed.
             if bar.tasks[0].total != total or done < bar.tasks[0].completed:
                 bar.reset(task, total=total, completed=done)
             bar.update(task, completed=done, description=doing)
@@ -146,10 +161,11 @@ def progress_bar(unit: str = "images/s") -> Iterator[Progress]:
 
 @contextmanager
 def stage_bar(unit: str = "%/s") -> Iterator[Progress]:
-    """A bar on stderr with the time left where that is a terminal, else a line for every stage, and one a minute in it.
+    """Show progress in stages on stderr: a bar on a terminal, otherwise one line per stage.
 
-    What follows a colon in what is being done is of the moment, and no other stage. Lines within one tell what time is
-    left.
+    Without a terminal, a stage that takes longer prints one more line per minute, with the remaining time. The text
+    after
+    a colon in the progress message is a detail and does not start a new stage.
     """
     if sys.stderr.isatty():
         with progress_bar(unit) as bar:

@@ -1,6 +1,6 @@
-"""Commands that make assets of photographs, in one or stage by stage.
+"""Commands that make assets from photographs, in one call or stage by stage.
 
-Commands import what they need inside of their functions, so that the start of every other one stays short.
+Each command imports its dependencies inside its function, so that all other commands start fast.
 """
 
 from __future__ import annotations
@@ -33,107 +33,136 @@ if TYPE_CHECKING:
     from mitsplat.capture.capture_photos import CaptureSettings
     from mitsplat.reconstruct.asset_from_photos import AssetResult
 
-CaptureFolder = Annotated[Path, typer.Argument(metavar="CAPTURE", help="Capture folder, with masks for an object.")]
+CaptureFolder = Annotated[Path, typer.Argument(metavar="CAPTURE", help="Capture folder; an object needs masks.")]
 Photos = Annotated[
-    Path, typer.Argument(metavar="PHOTOS", help="Folder of photographs of one object or place, or a video of it.")
+    Path, typer.Argument(metavar="PHOTOS", help="Folder of photographs of one object or place, or a video file.")
 ]
-Frames = Annotated[int, typer.Option(help="Most frames that are taken of a video.")]
+Frames = Annotated[int, typer.Option(help="Maximum number of frames to take from a video.")]
 Poses = Annotated[
-    Path | None, typer.Option(help="Folder of a COLMAP model, or NeRF's transforms.json, to take cameras from.")
+    Path | None,
+    typer.Option(help="Camera poses from another tool: folder of a COLMAP model, or a NeRF transforms.json."),
 ]
-Masks = Annotated[Path | None, typer.Option(help="Folder of masks, PHOTO.png, white = object.")]
-MaskModel = Annotated[Path | None, typer.Option(help="Segmentation network (.onnx) that makes the masks, by rembg.")]
+Masks = Annotated[Path | None, typer.Option(help="Folder of masks, named PHOTO.png; white marks the object.")]
+MaskModel = Annotated[
+    Path | None, typer.Option(help="Segmentation network (.onnx) that computes the masks through rembg.")
+]
 ScaleFrom = Annotated[
     tuple[str, str, float] | None,
     typer.Option(
-        metavar="A B METRES", help="Distance of two places: PHOTO is its camera, PHOTO:X,Y what it sees at a pixel."
+        metavar="A B METRES",
+        help="Known distance between two points: PHOTO is the camera centre of a photo, PHOTO:X,Y the "
+        "surface point at a pixel.",
     ),
 ]
 Picks = Annotated[
     list[str] | None,
-    typer.Option("--pick", metavar="PHOTO:X,Y", help="Pixel on the object, in CAPTURE/images; may be repeated."),
+    typer.Option("--pick", metavar="PHOTO:X,Y", help="Pixel on the object, in CAPTURE/images; repeatable."),
 ]
 PicksNot = Annotated[
-    list[str] | None, typer.Option("--pick-not", metavar="PHOTO:X,Y", help="Pixel on a thing that it is not.")
+    list[str] | None,
+    typer.Option(
+        "--pick-not", metavar="PHOTO:X,Y", help="Pixel on something that does not belong to the object; repeatable."
+    ),
 ]
 Remove = Annotated[
     list[str] | None,
     typer.Option(
         "--remove",
         metavar="PHOTO:X,Y",
-        help="Take the thing at this pixel, in CAPTURE/images, out of an environment; may be repeated.",
+        help="Remove the thing at this pixel, in CAPTURE/images, from an environment; repeatable.",
     ),
 ]
 Delight = Annotated[
     Path | None,
     typer.Option(
         metavar="LIGHTS",
-        help="File of the lights that the object was photographed in, which its colours are freed of.",
+        help="File with the lights of the photographs; the colours of the object are divided by that light.",
     ),
 ]
 Box = Annotated[
     tuple[float, float, float, float, float, float] | None,
-    typer.Option(metavar="X0 Y0 Z0 X1 Y1 Z1", help="Box that holds the object, in the capture's frame."),
+    typer.Option(metavar="X0 Y0 Z0 X1 Y1 Z1", help="Box that contains the object, in the frame of the capture."),
 ]
 Size = Annotated[
-    float | None, typer.Option(help="Longest edge of the smallest upright box around it [m], without other scale.")
+    float | None,
+    typer.Option(
+        help="Longest edge of the smallest upright box around the object [m]; only for captures without a scale."
+    ),
 ]
-Gaussians = Annotated[int, typer.Option(help="Most Gaussians.")]
-Iterations = Annotated[int, typer.Option(help="Steps of the fit, one photo each.")]
+Gaussians = Annotated[int, typer.Option(help="Maximum number of Gaussians.")]
+Iterations = Annotated[int, typer.Option(help="Number of optimiser steps; each uses one photo.")]
 Budget = Annotated[
-    str | None, typer.Option(metavar="TIME", help="Shorten the fit to this time, such as 90s, 10min or 1h.")
+    str | None,
+    typer.Option(
+        metavar="TIME", help="Time limit of the fit, such as 90s, 10min or 1h; the schedule is shortened to it."
+    ),
 ]
-Edge = Annotated[int, typer.Option(help="Longest edge of the photos in the fit, around an object [px].")]
-Voxels = Annotated[int, typer.Option(help="Cells of the mesh's grid along the longest extent.")]
+Edge = Annotated[int, typer.Option(help="Longest edge of the training images [px]; objects are cropped first.")]
+Voxels = Annotated[int, typer.Option(help="Grid cells along the longest extent for the mesh reconstruction.")]
 Refine = Annotated[
-    bool, typer.Option("--refine", help="Refine the mesh by the masks, where photos set aside say that it helps.")
+    bool,
+    typer.Option(
+        "--refine", help="Refine the mesh with the masks; the result is used only if it improves on validation photos."
+    ),
 ]
 
 
 def fit(
     capture: CaptureFolder,
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Fit folder to write.")],
     gaussians: Gaussians = 30000,
     densification: Annotated[
         Literal["mcmc", "classic"],
-        typer.Option(help="Add Gaussians where others are opaque, or where the photos pull at them."),
+        typer.Option(
+            help="Where Gaussians are added. mcmc: in opaque regions; classic: where image gradients are large."
+        ),
     ] = "mcmc",
     iterations: Iterations = 3000,
     budget: Budget = None,
     target_psnr: Annotated[
-        float | None, typer.Option(help="End early at this PSNR [dB] of photos that are set aside for it.")
+        float | None,
+        typer.Option(help="Stop early at this PSNR [dB] on validation photos, which are then excluded from training."),
     ] = None,
     edge: Edge = 800,
     sh_degree: ShDegree = 3,
     masks: Annotated[
         Literal["alpha", "ignore", "off"],
-        typer.Option(help="Fit only what masks show, ignore what they leave out, or do not read them."),
+        typer.Option(
+            help="alpha: masks supervise alpha; ignore: pixels outside masks have no loss; off: masks are not read."
+        ),
     ] = "alpha",
-    background: Annotated[Literal["random", "black"], typer.Option(help="Colour behind the splats.")] = "random",
-    depth: Annotated[float, typer.Option(help="Weight of the depths of the capture's points, or of depth maps.")] = 0.5,
+    background: Annotated[
+        Literal["random", "black"], typer.Option(help="Background colour during training.")
+    ] = "random",
+    depth: Annotated[
+        float,
+        typer.Option(help="Weight of the depth loss, on the points of the capture or on depth maps; 0 disables it."),
+    ] = 0.5,
     depths: Annotated[
         Path | None, typer.Option(help="Folder of depth maps, PHOTO.png (16-bit), .npy, .exr or .tiff.")
     ] = None,
     depth_kind: Annotated[
         Literal["inverse", "metric"],
-        typer.Option(help="Whether these are of inverse depth, as of a network, or of depth, 0 where unknown."),
+        typer.Option(
+            help="Content of the depth maps: inverse depth (as networks predict), or metric depth with 0 where unknown."
+        ),
     ] = "inverse",
     depth_model: Annotated[
-        Path | None, typer.Option(help="Network (.onnx, such as Depth Anything v2) that makes the depth maps.")
+        Path | None, typer.Option(help="Depth network that computes the depth maps (.onnx, such as Depth Anything v2).")
     ] = None,
     exposure: Annotated[
-        bool, typer.Option("--exposure/--no-exposure", help="Give each photo a colour correction of its own.")
+        bool, typer.Option("--exposure/--no-exposure", help="Estimate a colour correction for each photo.")
     ] = False,
     device: DeviceName = "cpu",
     seed: Seed = 0,
     overwrite: Annotated[
         bool,
-        typer.Option("--overwrite/--resume", help="Replace what the folder holds of another fit, or refuse to."),
+        typer.Option("--overwrite/--resume", help="Replace an existing fit of other inputs, or stop with an error."),
     ] = False,
 ) -> None:
     """Fit Gaussians to the photos of CAPTURE.
 
-    Every eighth photo is held out to check the result. Runs again where it stopped.
+    Every eighth photo is held out to evaluate the result. An interrupted fit continues when the command runs again.
     """
     from mitsplat.capture.capture import Capture
     from mitsplat.fit.depth_network import model_maps
@@ -196,30 +225,35 @@ def fit(
 
 def capture(
     photos: Photos,
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder of the capture to write.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Capture folder to write.")],
     kind: Annotated[
-        Literal["object", "environment"], typer.Option(help="Whether the subject is cut out by masks.")
+        Literal["object", "environment"],
+        typer.Option(help="object: the subject is segmented by masks; environment: the whole photos are used."),
     ] = "object",
     frames: Frames = 150,
-    max_size: Annotated[int, typer.Option(help="Longest edge at which photos are used [px].")] = 1600,
-    squares: Annotated[str, typer.Option(metavar="CxR", help="Squares of the ChArUco board to look for.")] = "7x5",
-    square: Annotated[float, typer.Option(help="Edge of its squares as measured on the print [m].")] = 0.035,
-    tag: Annotated[float | None, typer.Option(help="Edge of AprilTags (36h11) as printed, black border [m].")] = None,
+    max_size: Annotated[int, typer.Option(help="Longest edge of the photos [px]; larger photos are reduced.")] = 1600,
+    squares: Annotated[
+        str, typer.Option(metavar="CxR", help="Number of squares of the ChArUco board, columns x rows.")
+    ] = "7x5",
+    square: Annotated[float, typer.Option(help="Edge length of a board square, measured on the print [m].")] = 0.035,
+    tag: Annotated[
+        float | None, typer.Option(help="Edge length of the black border of printed AprilTags (36h11) [m].")
+    ] = None,
     scale_from: ScaleFrom = None,
     poses: Poses = None,
-    metric: Annotated[bool, typer.Option("--metric", help="The given poses are in metres with z up.")] = False,
+    metric: Annotated[bool, typer.Option("--metric", help="The poses of --poses are in metres with z up.")] = False,
     masks: Masks = None,
     mask_model: MaskModel = None,
     pick: Picks = None,
     pick_not: PicksNot = None,
     box: Box = None,
     undistort: Annotated[
-        bool, typer.Option("--undistort", help="Resample the photos to cameras without lens distortion.")
+        bool, typer.Option("--undistort", help="Resample the photos to pinhole cameras without lens distortion.")
     ] = False,
 ) -> None:
-    """Find cameras, scale, gravity and masks of PHOTOS.
+    """Find camera poses, scale, gravity and masks of PHOTOS.
 
-    Runs again where it stopped. If too many photos are of no use, the exit status is 4.
+    An interrupted run continues when the command runs again. The exit status is 4 if too many photos are unusable.
     """
     from mitsplat.capture.capture_photos import capture_photos
 
@@ -255,15 +289,15 @@ def capture(
 
 
 def board(
-    out: Annotated[Path, typer.Option("--out", "-o", help="Sheet to write (.pdf).")] = Path("board.pdf"),
-    paper: Annotated[Literal["a4", "letter", "a3"], typer.Option(help="Paper, in landscape.")] = "a4",
-    squares: Annotated[str, typer.Option(metavar="CxR", help="Squares across and down.")] = "7x5",
-    square: Annotated[float, typer.Option(help="Edge of a square [m].")] = 0.035,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the file.")] = False,
+    out: Annotated[Path, typer.Option("--out", "-o", help="PDF file to write (.pdf).")] = Path("board.pdf"),
+    paper: Annotated[Literal["a4", "letter", "a3"], typer.Option(help="Paper size, in landscape.")] = "a4",
+    squares: Annotated[str, typer.Option(metavar="CxR", help="Number of squares, columns x rows.")] = "7x5",
+    square: Annotated[float, typer.Option(help="Edge length of a square [m].")] = 0.035,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing file.")] = False,
 ) -> None:
-    """Write a ChArUco board to print.
+    """Write a printable ChArUco board (PDF).
 
-    In photographs of what stands on or beside it, it gives `mitsplat capture` metres and the vertical.
+    Place the object on the board or beside it. `mitsplat capture` then finds the scale in metres and the vertical.
     """
     check_new(out, ".pdf", overwrite=overwrite)
     _board(squares, square).write_pdf(out, paper)
@@ -272,21 +306,33 @@ def board(
 
 def mesh(
     capture: CaptureFolder,
-    splats: Annotated[Path, typer.Argument(metavar="SPLATS", help="Folder of a fit, or a splat file in its frame.")],
+    splats: Annotated[
+        Path, typer.Argument(metavar="SPLATS", help="Folder of a fit, or a splat file in the frame of the capture.")
+    ],
     out: AssetFolder,
     name: Name = None,
     class_name: ClassName = None,
     kind: Kind = "object",
     faces: Faces = 10000,
     voxels: Voxels = 192,
-    dissent: Annotated[int, typer.Option(help="Masks that may leave a point out and be overruled, 0 to 3.")] = 2,
+    dissent: Annotated[
+        int, typer.Option(help="Number of masks, 0 to 3, that may show a point as background without removing it.")
+    ] = 2,
     size: Size = None,
     take: Annotated[
-        Path | None, typer.Option("--import", metavar="MESH", help="Take this mesh instead; it is registered.")
+        Path | None,
+        typer.Option(
+            "--import",
+            metavar="MESH",
+            help="Use this mesh instead of a reconstructed one; it is registered to the splats.",
+        ),
     ] = None,
     normalisation: Annotated[
         Path | None,
-        typer.Option(help="Matrix (3x4 or 4x4, text) that its tool applied to the cameras: its inverse places it."),
+        typer.Option(
+            help="Text file with the matrix (3x4 or 4x4) that the mesh tool applied to the cameras; its "
+            "inverse places the mesh."
+        ),
     ] = None,
     units: Annotated[float | None, typer.Option(help="Metres per unit of the imported mesh.")] = None,
     refine: Refine = False,
@@ -294,10 +340,12 @@ def mesh(
     delight: Delight = None,
     device: DeviceName = "cpu",
 ) -> None:
-    """Make an asset of SPLATS that were fitted to CAPTURE.
+    """Make an asset from SPLATS that were fitted to CAPTURE.
 
-    The object is isolated by its masks, its surface found, and both are judged by held-out photos in report.html. An
-    environment is kept whole, and level surfaces in it are found. If a threshold is missed, the exit status is 4.
+    An object is isolated by its masks and its surface is reconstructed. Held-out photos check both, and the page
+    report.html shows the result. An environment is kept whole, and its level surfaces are detected. The exit status is
+    4 if
+    a quality threshold is missed.
     """
     from mitsplat.asset import read_mesh
     from mitsplat.reconstruct.asset_from_photos import AssetJob, make_asset
@@ -346,7 +394,8 @@ def asset(
     pick_not: PicksNot = None,
     box: Box = None,
     gaussians: Annotated[
-        int | None, typer.Option(help="Most Gaussians; 30000 of an object, 60000 of surroundings if absent.")
+        int | None,
+        typer.Option(help="Maximum number of Gaussians; by default 30000 for an object, 60000 for an environment."),
     ] = None,
     iterations: Iterations = 3000,
     budget: Budget = None,
@@ -359,11 +408,12 @@ def asset(
     device: DeviceName = "cpu",
     seed: Seed = 0,
 ) -> None:
-    """Make an asset of PHOTOS.
+    """Make an asset from PHOTOS.
 
-    Cameras, splats, isolation, mesh and verdict: `capture`, `fit` and `mesh` in one. Runs again where it stopped;
-    report.html shows what came of it. Of an environment, level surfaces are found, and a scene file beside its folder
-    drops things on the one that photos look at. If a threshold is missed, the exit status is 4.
+    The command runs the stages `capture`, `fit` and `mesh`. An interrupted run continues when the command runs again.
+    The page report.html shows the result. For an environment, level surfaces are detected. A scene file beside the
+    asset folder then drops objects on the surface at which the photos are directed. The exit status is 4 if a quality
+    threshold is missed.
     """
     from mitsplat.fit.trainer import FitSettings
     from mitsplat.reconstruct.asset_from_photos import AssetJob, make_photo_asset
@@ -417,7 +467,7 @@ def _capture_settings(
     pick_not: PicksNot,
     box: Box,
 ) -> CaptureSettings:
-    """What `capture` and `asset` both are told of photographs."""
+    """Return the capture settings from the options that `capture` and `asset` share."""
     from mitsplat.capture.capture_photos import CaptureSettings
 
     return CaptureSettings(
@@ -443,7 +493,11 @@ def _board(squares: str, square: float) -> Board:
 
 
 def _tell_asset(done: AssetResult) -> None:
-    """What came of an asset, and status 4 where a threshold is missed."""
+    """Print the result of making an asset.
+
+    Raises:
+        PartialResultError: If the asset misses a threshold (exit status 4).
+    """
     found, kept = done.verdict, " (kept: nothing it is made of has changed)" if done.kept else ""
     closed = "watertight" if found.watertight else "open"
     typer.echo(f"asset: {done.folder}{kept}")
@@ -471,7 +525,7 @@ def _tell_asset(done: AssetResult) -> None:
 
 
 def _seconds(text: str) -> float:
-    """Time [s] such as 90s, 10min or 1h."""
+    """Return the time [s] of a text such as 90s, 10min or 1h."""
     for suffix, factor in (("min", 60.0), ("h", 3600.0), ("s", 1.0)):
         if text.endswith(suffix):
             with suppress(ValueError):

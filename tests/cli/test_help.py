@@ -9,7 +9,7 @@ import typer
 import typer.core
 import typer.main
 
-from mitsplat.cli import app
+from mitsplat.cli import COMMAND_GROUPS, app
 from tests.cli.typed import run
 
 
@@ -40,3 +40,14 @@ def test_every_command_and_option_is_documented() -> None:
             if parameter.param_type_name == "option" and parameter.name != "help":
                 spelt = [form for o in parameter.opts for form in (f"`{o}`", f"/{o}", f"{o}/")]
                 assert any(form in line for form in spelt), parameter.opts
+
+
+def test_help_lists_every_command_once_under_a_heading(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("--help") == 0
+    sections = capsys.readouterr().out.split("\n\n")[3:]
+    assert [section.splitlines()[0].rstrip(":") for section in sections] == list(COMMAND_GROUPS)
+    group = typer.main.get_command(app)
+    assert isinstance(group, typer.core.TyperGroup)
+    rows = [row for section in sections for row in section.splitlines()[1:]]
+    listed = [row.split()[0] for row in rows if row.startswith("  ") and not row.startswith("   ")]
+    assert sorted(listed) == sorted(group.commands)

@@ -1,4 +1,4 @@
-"""Layers to picture: shadow and highlight, then lens, sensor, colour, tone curve and compression of a camera."""
+"""Camera response: shadow and highlight, then lens, sensor, colour, tone curve and compression of a camera."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from mitsplat.scene.spec.image_spec import Composite, ImageShadow, Sensor
 Tone: TypeAlias = Literal["neutral", "filmic"]
 
 BACKGROUND = 0.18
-"""Linear grey where a scene shows nothing."""
+"""Linear grey of pixels in which a scene has no surface."""
 
 SENSOR = Sensor()
 
@@ -38,14 +38,14 @@ CURVE_STEPS = 1 << 14
 """Entries of the tone curve's table, evenly spaced in the square root of the input."""
 
 GREY = 118.0
-"""Mean of a metered picture's bytes, of 255: the middle grey of the standard output sensitivity (ISO 12232)."""
+"""Mean byte value (of 255) of a metered picture: middle grey of the standard output sensitivity (ISO 12232)."""
 
 _METERED_PIXELS = 1 << 14
 _STOPS = 6.0
-"""How far metering makes a picture brighter or darker at most."""
+"""Maximum correction by metering, in both directions [stops]."""
 
 _LONGEST = 256.0
-"""Motion [px] from which on its steps are wider than a pixel."""
+"""Length of a motion path up to which its samples are at most one pixel apart [px]."""
 
 CURVE_WHITE = 16.0
 """Linear input at the end of the table."""
@@ -53,12 +53,12 @@ CURVE_WHITE = 16.0
 
 @one_at_a_time
 def light_image(layers: Layers, composite: Composite) -> Float32Array:
-    """Linear picture (H, W, 3) with the shadows asked for, over a grey background."""
+    """Compute the linear picture (H, W, 3) with the configured shadows over a grey background."""
     return host_array(light_layers(layers, composite), layers.shape)
 
 
 def light_layers(layers: Layers, composite: Composite, behind: Any = BACKGROUND) -> Any:
-    """The same on the device, over what is behind: flat and row-major, Color3f."""
+    """Compute the linear picture on the device over the background ``behind``, as flat row-major Color3f."""
     alpha = layers.device_array("alpha")
     lit = layers.device_array("rgb" if composite.shadow == "traced" else "captured")
     if composite.shadow == "image":
@@ -73,7 +73,7 @@ def light_layers(layers: Layers, composite: Composite, behind: Any = BACKGROUND)
 
 
 def shadow_from_image(shadow_map: Float32Array, parameters: ImageShadow) -> tuple[Float32Array, Float32Array]:
-    """Factor and highlight (H, W) that the published chain makes of a shadow map (H, W)."""
+    """Compute the factor and the highlight (H, W) of the published image-space chain from a shadow map (H, W)."""
     brightest = float(np.percentile(shadow_map, 99.0))
     normalised = np.clip(shadow_map / max(brightest, 1e-6), 0.0, 1.0).astype(np.float32)
     soft = cv2.GaussianBlur(normalised, (0, 0), parameters.blur * shadow_map.shape[1] / 1280)
@@ -101,21 +101,20 @@ def develop(
     swept: tuple[Float32Array, Float32Array] | None = None,
     metered: bool = False,
 ) -> ByteImage:
-    """Linear picture (H, W, 3) to display-encoded bytes, as a camera would develop it.
+    """Convert a linear picture (H, W, 3) to display-encoded bytes with a camera model.
 
     Args:
         linear: Linear sRGB, 1 = display white.
         draws: ``exposure`` [stops], ``vignetting`` [stops in the corners], ``chromatic_aberration`` [px in the
             corners, red outwards and blue inwards], ``motion_blur`` [px] along ``motion_angle`` [degrees], ``iso``,
             ``white_balance`` [K], ``chroma_stretch`` along ``chroma_angle`` [degrees], ``hue`` [degrees],
-            ``saturation``, ``sharpening`` [share of what exceeds a blur of 1 px], ``jpeg`` [quality]; what is missing
-            changes nothing.
+            ``saturation``, ``sharpening`` [factor of the difference to a blur of 1 px], ``jpeg`` [quality]. A missing
+            entry has no effect.
         tone: ``neutral`` shows captured colours unchanged; ``filmic`` rolls highlights off.
-        sensor: What turns ``iso`` into noise.
-        seed: Seed of the noise, below 2^64: its numbers are a function of seed, row-major index and channel of a pixel.
-        swept: How far every pixel moves to the right and down while the shutter is open [px], each (H, W); none if
-            absent.
-        metered: Whether the camera exposes by itself, see :func:`metered_exposure`; ``exposure`` is added to that.
+        sensor: Sensor parameters that determine the noise at ``iso``.
+        seed: Seed of the noise, below 2^64. The noise is a function of seed, row-major index and channel of a pixel.
+        swept: Motion of every pixel to the right and down during the exposure [px], each (H, W); None for no motion.
+        metered: Automatic exposure, see :func:`metered_exposure`; ``exposure`` is added to it.
     """
     height, width = linear.shape[:2]
     how: dict[str, Any] = {"tone": tone, "sensor": sensor, "seed": seed, "swept": swept, "metered": metered}
@@ -133,7 +132,7 @@ def develop_layers(
     swept: tuple[Float32Array, Float32Array] | None = None,
     metered: bool = False,
 ) -> Development:
-    """Begin to :func:`develop` a picture of the device (Color3f, flat and row-major over ``shape``)."""
+    """Start to :func:`develop` a picture on the device (Color3f, flat, row-major over ``shape``)."""
     height, width = shape
     pixel = dr.arange(mi.UInt32, height * width)
     if metered:
@@ -157,7 +156,7 @@ def develop_layers(
     position = dr.sqrt(dr.clip(linear, 0.0, CURVE_WHITE) / CURVE_WHITE) * (CURVE_STEPS - 1)
     table, data = _byte_curve(tone, str(mi.variant())), dr.empty(mi.UInt8, 3 * height * width)
     for c in range(3):
-        entry = dr.minimum(mi.UInt32(dr.round(position[c])), CURVE_STEPS - 1)  # also where that is no number
+        entry = dr.minimum(mi.UInt32(dr.round(position[c])), CURVE_STEPS - 1)  # also bounds NaN
         value = dr.gather(mi.UInt32, table, entry)
         dr.scatter(data, mi.UInt8(value), 3 * pixel + c, mode=dr.ReduceMode.Permute)
     dr.eval(data)
@@ -167,13 +166,13 @@ def develop_layers(
 
 @dataclass(frozen=True, eq=False)
 class Development:
-    """A picture that the device is developing.
+    """Result of a development that may still run on the device.
 
     Attributes:
-        data: Its bytes on the device, flat and row-major, red, green, blue.
+        data: Bytes on the device, flat and row-major, in the order red, green, blue.
         shape: Height and width [px].
-        sharpening: How many times what the encoded picture has beyond a Gaussian blur of 1 px is added (unsharp mask).
-        jpeg: Quality of the JPEG file that it has been, if any.
+        sharpening: Factor of the unsharp mask, the difference of the encoded picture to its Gaussian blur of 1 px.
+        jpeg: Quality of the simulated JPEG compression, or None.
     """
 
     data: Any
@@ -182,7 +181,7 @@ class Development:
     jpeg: int | None
 
     def image(self) -> ByteImage:
-        """The picture (H, W, 3) on the host, when it is done."""
+        """Wait for the picture and return it on the host, (H, W, 3)."""
         image = self.data.numpy().reshape(*self.shape, 3)
         if self.sharpening:
             blur = cv2.GaussianBlur(image, (0, 0), 1.0, borderType=cv2.BORDER_REPLICATE)
@@ -191,19 +190,19 @@ class Development:
 
 
 def _opaque(value: float) -> Any:
-    """A value that differs from frame to frame; as a literal it would be part of the kernel, and compiled anew."""
+    """Return a value that may change between frames without recompilation; a literal becomes part of the kernel."""
     return dr.opaque(mi.Float, float(value))
 
 
 def metered_exposure(linear: Any, count: int, tone: Tone) -> float:
-    """Exposure [stops] at which a picture's luminance has the mean :data:`GREY` once it is encoded, within 6 stops.
+    """Compute the exposure [stops], within 6 stops, at which the encoded luminance has the mean :data:`GREY`.
 
-    So a camera that exposes by itself averages what it shows: lamps that are clipped count no more than white paper.
+    The mean is taken after encoding, so that clipped lamps weigh no more than white paper.
 
     Args:
-        linear: A picture of the device (Color3f, flat), of which evenly spaced pixels are looked at.
-        count: Its pixels.
-        tone: What it is encoded by.
+        linear: Picture on the device (Color3f, flat); evenly spaced pixels are sampled.
+        count: Number of its pixels.
+        tone: Tone curve of the encoding.
     """
     every = dr.arange(mi.UInt32, 0, count, max(1, count // _METERED_PIXELS))
     dr.eval(linear)
@@ -223,7 +222,7 @@ def metered_exposure(linear: Any, count: int, tone: Tone) -> float:
 
 
 def _through_lens(linear: Any, pixel: Any, shape: tuple[int, int], draws: Mapping[str, float]) -> Any:
-    """Exposed, with colours drawn apart and darker towards the corners."""
+    """Apply chromatic aberration, exposure and vignetting."""
     height, width = shape
     if draws.get("chromatic_aberration", 0.0):
         linear = _drawn_apart(linear, pixel, shape, draws["chromatic_aberration"])
@@ -238,7 +237,7 @@ def _through_lens(linear: Any, pixel: Any, shape: tuple[int, int], draws: Mappin
 
 
 def _drawn_apart(linear: Any, pixel: Any, shape: tuple[int, int], corner: float) -> Any:
-    """With red magnified about the middle so that it moves outwards by ``corner`` [px] there, and blue inwards."""
+    """Magnify red about the image centre so that it moves by ``corner`` [px] in the corners; reduce blue likewise."""
     height, width = shape
     picture = dr.ravel(mi.Vector4f(*linear, 0.0))
     dr.eval(picture)
@@ -251,7 +250,7 @@ def _drawn_apart(linear: Any, pixel: Any, shape: tuple[int, int], corner: float)
 
 
 def _between(picture: Any, shape: tuple[int, int], x: Any, y: Any) -> Any:
-    """Bilinear interpolation of a picture at columns and rows [px]; beyond its border it goes on as it ends there."""
+    """Interpolate a picture bilinearly at columns and rows [px]; border values extend beyond the border."""
     height, width = shape
     x, y = dr.clip(x, 0.0, width - 1.0), dr.clip(y, 0.0, height - 1.0)
     left, top = dr.minimum(mi.UInt32(x), max(0, width - 2)), dr.minimum(mi.UInt32(y), max(0, height - 2))
@@ -268,7 +267,10 @@ def _between(picture: Any, shape: tuple[int, int], x: Any, y: Any) -> Any:
 
 
 def _smeared(linear: Any, pixel: Any, shape: tuple[int, int], swept: tuple[Float32Array, Float32Array]) -> Any:
-    """The mean over the exposure of what moves through each pixel, as fast and in the direction as it itself does."""
+    """Average the picture over the exposure along each pixel's motion.
+
+    All of the light that passes through a pixel is assumed to move with the pixel's own velocity.
+    """
     width = shape[1]
     picture = dr.ravel(mi.Vector4f(*linear, 0.0))
     right, down = (wrapped(mi.Float, np.ascontiguousarray(way.ravel(), dtype=np.float32)) for way in swept)
@@ -288,7 +290,7 @@ def _smeared(linear: Any, pixel: Any, shape: tuple[int, int], swept: tuple[Float
 
 
 def blurred(linear: Any, pixel: Any, shape: tuple[int, int], kernel: Float32Array) -> Any:
-    """Correlated with a kernel (K, K); the picture goes on beyond its border as it ends there."""
+    """Correlate the picture with a kernel (K, K); border values extend beyond the border."""
     height, width = shape
     picture = dr.ravel(mi.Vector4f(*linear, 0.0))  # a CPU gathers four neighbours as fast as one
     rows, columns = np.nonzero(kernel)
@@ -310,7 +312,7 @@ def blurred(linear: Any, pixel: Any, shape: tuple[int, int], kernel: Float32Arra
 
 
 def motion_kernel(length: float, angle: float) -> Float32Array:
-    """Weights (K, K) of a line of ``length`` [px] through the middle, ``angle`` [degrees] above the x axis."""
+    """Compute the weights (K, K) of a centred line of ``length`` [px], ``angle`` [degrees] above the x axis."""
     reach = int(np.ceil(length / 2))
     along = (np.arange(64 * (reach + 1)) + 0.5) / (64 * (reach + 1)) - 0.5
     x, y = (length * along * f(np.radians(angle)) + reach for f in (np.cos, lambda a: -np.sin(a)))
@@ -325,10 +327,12 @@ def motion_kernel(length: float, angle: float) -> Float32Array:
 
 
 def sensed(linear: Any, pixel: Any, iso: float, sensor: Sensor, seed: int) -> Any:
-    """With shot and read noise: a variance of N + read_noise^2 for N electrons (EMVA 1288, section 2).
+    """Add shot and read noise: a variance of N + read_noise^2 for N electrons (EMVA 1288, section 2).
 
-    Display white fills the wells at ISO 100. The Poisson noise of N is taken as normal. Its numbers are counted by the
-    pixel (Philox 4x32, Salmon et al. 2011, "Parallel random numbers: as easy as 1, 2, 3"), in whatever order they come.
+    Display white fills the wells at ISO 100. The Poisson noise of N is approximated as normal. The random numbers are a
+    function of the pixel index (Philox 4x32, Salmon et al. 2011, "Parallel random numbers: as easy as 1, 2, 3"), so
+    that
+    they do not depend on the order of evaluation.
     """
     electrons = sensor.full_well * 100.0 / iso
     numbers = mi.Philox4x32(dr.opaque(mi.UInt64, seed), pixel).next_float32x4_normal()
@@ -337,7 +341,7 @@ def sensed(linear: Any, pixel: Any, iso: float, sensor: Sensor, seed: int) -> An
 
 
 def _compressed(image: ByteImage, quality: int) -> ByteImage:
-    """The picture after JPEG compression."""
+    """Return the picture after JPEG compression."""
     done, data = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])
     if not done:
         raise OSError(f"OpenCV could not encode an image of shape {image.shape} as jpg")
@@ -351,10 +355,11 @@ def colour_matrix(
     saturation: float = 1.0,
     chroma: tuple[float, float] = (1.0, 0.0),
 ) -> Float64Array:
-    """One 3x3 matrix on linear sRGB for white balance, chroma, hue and saturation, in this order.
+    """Compute a 3x3 matrix on linear sRGB for white balance, chroma, hue and saturation, in this order.
 
-    White balance is a Bradford adaptation from the daylight of that temperature to sRGB's white; chroma is a factor and
-    an angle of :func:`mitsplat.images.colour.chroma_matrix`; hue turns colours about the grey axis; saturation scales
+    White balance is a Bradford adaptation from daylight of the given temperature to sRGB's white. Chroma is a factor
+    and
+    an angle of :func:`mitsplat.images.colour.chroma_matrix`. Hue rotates colours about the grey axis. Saturation scales
     their distance from the grey of the same luminance.
     """
     matrix = np.eye(3)
@@ -371,7 +376,7 @@ def colour_matrix(
 
 @lru_cache(maxsize=2)
 def tone_curve(tone: Tone) -> Float32Array:
-    """Display-encoded values of linear inputs ``CURVE_WHITE * (i / (CURVE_STEPS - 1))^2``, by sRGB's transfer.
+    """Tabulate encoded values of linear inputs ``CURVE_WHITE * (i / (CURVE_STEPS - 1))^2``, with sRGB's transfer.
 
     ``filmic`` is Hable's curve (2010, "Filmic tonemapping operators", Uncharted 2), scaled so that 0.18 stays 0.18.
     """
@@ -389,5 +394,5 @@ def tone_curve(tone: Tone) -> Float32Array:
 
 @lru_cache(maxsize=4)
 def _byte_curve(tone: Tone, variant: str) -> Any:
-    """The tone curve's values as bytes, on the device."""
+    """Return the tone curve's byte values on the device."""
     return wrapped(mi.UInt32, np.rint(255.0 * np.clip(tone_curve(tone), 0.0, 1.0)).astype(np.uint32))

@@ -1,4 +1,4 @@
-"""One frame of a scene, from its plan to picture and labels."""
+"""Rendering and labelling of one frame of a scene."""
 
 from __future__ import annotations
 
@@ -62,33 +62,33 @@ from mitsplat.scene.spec.light_spec import EnvironmentLight, LightEntry, LightSp
 from mitsplat.scene.walls import backdrop_distance
 
 KEPT_LAYOUTS = 4
-"""Settled layouts that a renderer keeps for further views of them."""
+"""Number of settled layouts that a renderer caches for further views."""
 
 NOTHING = Splats(*(np.empty(shape, np.float32) for shape in ((0, 3), (0, 4), (0, 3), 0, (0, 1, 3))))
-"""Splats of a proxy that only receives and casts shadows."""
+"""Empty splats of a proxy that only receives and casts shadows."""
 
 NOWHERE = LayoutSurroundings()
-"""The place of a scene that draws none."""
+"""Surroundings of a scene without drawn surroundings."""
 
 
 @dataclass(frozen=True, eq=False)
 class Frame(LazyValue):
-    """A labelled picture of H x W pixels with everything that it was made from. In a notebook it shows itself.
+    """A labelled picture of H x W pixels with all its inputs. Notebooks display it as an image.
 
-    Layers and linear picture stay on the device, and come to the host when they are first looked at.
+    Layers and the linear picture stay on the device; they are copied to the host at the first access.
 
     Attributes:
         plan: Camera, lights and random draws.
-        layout: Where the objects came to rest.
-        layers: What the integrator made of the view.
+        layout: Resting poses of the objects.
+        layers: Output layers of the integrator.
         rgb: Linear picture before the camera's development, (H, W, 3) float32.
         image: Display-encoded picture, (H, W, 3) uint8.
         labels: Labels of the visible instances.
-        seconds: Time of the host per stage [s]; the device may still work at what a stage began in the next ones.
-        order_error: Estimated error of the pixels' display-encoded colours that the order of blending leaves, before
-            light: ``largest`` and ``mean``. None where the quality estimates none.
-        appearances: What was drawn of the appearance of objects, by instance id.
-        next_layout: Where the objects lie in the image that follows, None if they stay.
+        seconds: Host time per stage [s]. Device work of one stage may still run during the next stages.
+        order_error: Estimated error of the display-encoded colours due to the blending order, before lighting:
+            ``largest`` and ``mean``. None if the quality does not estimate it.
+        appearances: Drawn appearance of objects, by instance id.
+        next_layout: Layout of the next image, None if the objects do not move.
     """
 
     plan: FramePlan
@@ -109,7 +109,7 @@ class Frame(LazyValue):
 
     @property
     def camera(self) -> Camera:
-        """Where the image is taken from."""
+        """Camera of the image."""
         return self.plan.camera
 
     @property
@@ -119,17 +119,17 @@ class Frame(LazyValue):
 
     @property
     def depth(self) -> Float32Array:
-        """Depth along the optical axis [m], 0 where nothing is, (H, W)."""
+        """Depth along the optical axis [m], 0 for no surface, (H, W)."""
         return self.layers.depth
 
     @property
     def instance(self) -> npt.NDArray[np.uint16]:
-        """Instance id per pixel, 0 for the environment, (H, W)."""
+        """Instance id per pixel from the splats, 0 for the environment, (H, W)."""
         return self.layers.instance
 
     @property
     def proxy_instance(self) -> npt.NDArray[np.uint16]:
-        """The same from the proxy meshes, (H, W)."""
+        """Instance id per pixel from the proxy meshes, 0 for the environment, (H, W)."""
         return self.layers.proxy_instance
 
     @property
@@ -144,10 +144,9 @@ class Frame(LazyValue):
 
     @property
     def flow(self) -> Float32Array | None:
-        """Motion of every pixel to the image that follows [px], (H, W, 2); None if none follows.
+        """Motion of every pixel to the next image [px], (H, W, 2); None without a next image or with a rolling shutter.
 
-        Nor if its rows are not exposed at once. Components are 1e10 where it is unknown, see
-        :func:`mitsplat.frames.flow.optical_flow`.
+        Both components are 1e10 where the flow is unknown, see :func:`mitsplat.frames.flow.optical_flow`.
         """
         if self.plan.next_camera is None or "readout" in self.plan.viewpoint.get("motion", {}):
             return None
@@ -157,7 +156,7 @@ class Frame(LazyValue):
         return optical_flow(self.depth, self.camera, self.plan.next_camera, ids, motions, belt)
 
     def _repr_png_(self) -> bytes:
-        """The image and, beside it, its labels drawn over it."""
+        """Return a PNG of the image beside the image with drawn labels."""
         sheet = np.hstack([self.image, draw_labels(self.image, self.labels)])
         _, data = cv2.imencode(".png", cv2.cvtColor(sheet, cv2.COLOR_RGB2BGR))
         return bytes(data)
@@ -174,25 +173,26 @@ def render_frame(
     next_layout: Layout | None = None,
     next_camera: Camera | None = None,
 ) -> Frame:
-    """Render and label one frame, by a :class:`Renderer` that is kept for the next one of the scene.
+    """Render and label one frame with a :class:`Renderer` that is cached for the scene's next frames.
 
     Args:
         scene: A scene of :func:`mitsplat.load_scene`.
         index: Frame index, below ``scene.num_frames``.
-        quality: Preset of the splat renderer, which the scene file's ``rendering`` refines, or all its values; the
-            preset of the scene file by default.
-        layout: The frame's settled layout, or one of your own (:meth:`mitsplat.Layout.of_poses`); settled here when not
-            given.
-        camera: In place of the scene's.
-        lights: Entries in place of the scene's, as in a scene file: models, or mappings of keys to values.
-        next_layout: Where the objects lie in the image that follows, for the flow; they stay when not given.
-        next_camera: Where that image is taken from; by default the scene's next view of the layout, or ``camera`` if
-            that is given and objects move.
+        quality: Preset of the splat renderer, refined by the scene file's ``rendering``, or a complete `Quality`. By
+            default, the preset of the scene file.
+        layout: Settled layout of the frame, or a custom one (:meth:`mitsplat.Layout.of_poses`). By default, the layout
+            is
+            settled here.
+        camera: Camera in place of the scene's.
+        lights: Lights in place of the scene's, as in a scene file: models, or mappings of keys to values.
+        next_layout: Layout of the next image, for the flow. By default, the objects do not move.
+        next_camera: Camera of the next image. By default, the scene's next view of the layout; or ``camera``, if it is
+            given and objects move.
 
     Raises:
         InputError: If the index is out of range, the layout cannot be settled, or the lights break a rule.
     """
-    layout_of(scene, index)  # a wrong index costs nothing
+    layout_of(scene, index)  # check the index before costly work
     ensure_variant()
     return _kept_renderer(scene, quality, str(mi.variant())).render(
         index, layout=layout, camera=camera, lights=lights, next_layout=next_layout, next_camera=next_camera
@@ -207,7 +207,7 @@ def _kept_renderer(scene: Scene, quality: str | Quality | None, _variant: str) -
 
 @dataclass(frozen=True, eq=False)
 class _Look:
-    """What a band of rows shows; ``swept`` is how far its pixels move while the shutter is open, down and right."""
+    """Rendered band of rows; ``swept`` is the motion of its pixels during the exposure, to the right and down [px]."""
 
     band: Band
     layers: Layers
@@ -218,7 +218,7 @@ class _Look:
 def _swept(
     layers: Layers, camera: Camera, motion: Mapping[str, Any], layout: Layout, belt: Belt | None
 ) -> tuple[Float32Array, Float32Array]:
-    """How far every pixel moves while the shutter is open, by the camera's motion and a belt's."""
+    """Compute the motion of every pixel during the exposure, from camera and belt motion."""
     moving = None
     if belt is not None:
         moving = belt, np.isin(layers.instance, list(carried_instances(layout, belt.box)))
@@ -226,7 +226,7 @@ def _swept(
 
 
 def _projection(layout: Layout, plan: FramePlan) -> Projection | None:
-    """Where points of instances are in an image whose rows are exposed one after another, None for others."""
+    """Return the point projection for an image with a rolling shutter, or None for a global shutter."""
     motion, belt = plan.viewpoint.get("motion", {}), plan.belt
     if "readout" not in motion:
         return None
@@ -247,28 +247,27 @@ def _timed(seconds: dict[str, float], name: str) -> Iterator[None]:
 
 
 class Renderer:
-    """Renders the frames of one scene, and holds what they share: uploads, and the layout's shapes.
+    """Renderer for the frames of one scene, with cached uploads and shapes.
 
-    Used with ``with``, it lets go of that at the end::
+    As a context manager, it releases the cached data at the end::
 
         with ms.Renderer(scene, quality="balanced") as renderer:
             frames = [renderer.render(index) for index in range(12)]
 
-    It takes no device, because that is Mitsuba's variant, of which a process has one (see
-    :mod:`mitsplat.runtime.variant`): a second renderer could not keep to another. ``ms.use_device("cuda")`` before the
-    first one takes the GPU.
+    There is no device argument: a process has one Mitsuba variant (see :mod:`mitsplat.runtime.variant`), which all
+    renderers share. Call ``ms.use_device("cuda")`` before the first renderer to use the GPU.
 
     Attributes:
         scene: The scene.
         quality: All values of the splat renderer.
-        integrator: Mitsuba's integrator ``splat_proxy``, lit as the scene file says.
+        integrator: Mitsuba's integrator ``splat_proxy``, configured by the scene file.
 
     Args:
         scene: A scene of :func:`mitsplat.load_scene`.
         quality: As in :func:`render_frame`.
 
     Raises:
-        InputError: If there is no such preset, or a Mitsuba variant was chosen that cannot run the plugins.
+        InputError: If the preset does not exist, or the selected Mitsuba variant cannot run the plugins.
     """
 
     def __init__(self, scene: Scene, *, quality: str | Quality | None = None) -> None:
@@ -308,7 +307,9 @@ class Renderer:
         """Render and label one frame; see :func:`render_frame`.
 
         Raises:
-            InputError: As there, after the end of the renderer's ``with``, or in another variant than it was made in.
+            InputError: As in :func:`render_frame`; also if the renderer is closed, or if the Mitsuba variant has
+                changed since
+                its creation.
         """
         if self.integrator is None:
             raise InputError("the renderer is closed: render before its `with` ends")
@@ -378,7 +379,10 @@ class Renderer:
         return render_silhouettes(self.integrator, mitsuba_scene, camera, source=self.scene.spec.labels.source)
 
     def _load(self, layout: Layout, plan: FramePlan, replaced: bool, belt: Belt | None) -> Any:
-        """Mitsuba's scene of a layout; its few parts are made sooner than threads are woken."""
+        """Build the Mitsuba scene of a layout.
+
+        A scene has few parts, so that loading them serially is faster than waking threads.
+        """
         return mi.load_dict(self.describe(layout, plan.lights, replaced, belt), parallel=False)
 
     def _look(
@@ -390,7 +394,7 @@ class Renderer:
         replaced: bool,
         mitsuba_scene: Any,
     ) -> _Look:
-        """What the rows of a band show at their moment, of a scene that only a belt changes until then."""
+        """Render a band of rows at its moment. Until then, only a belt changes the scene."""
         belt = plan.belt
         if belt is not None:
             belt = replace(belt, time=belt.time + band.time)
@@ -402,7 +406,7 @@ class Renderer:
         return _Look(band, layers, (ways[0][band.rows], ways[1][band.rows]), silhouettes)
 
     def _at_moment(self, layout: Layout, index: int) -> tuple[Layout, Layout | None]:
-        """A layout at the moment of a frame, and at that of the layout's next one, None if nothing moves until then."""
+        """Return the layout at a frame's moment and at the next view's moment; None for the latter if nothing moves."""
         spec = self.scene.spec
         view = index - layout_of(self.scene, index) * spec.output.views
         here = carried(spec, layout, view)
@@ -410,7 +414,7 @@ class Renderer:
         return here, None if after is here else after
 
     def _settle(self, index: int) -> Layout:
-        """A layout, kept for the next views of it."""
+        """Settle a layout and cache it for its next views."""
         if index not in self._settled:
             while len(self._settled) >= KEPT_LAYOUTS:
                 del self._settled[next(iter(self._settled))]
@@ -419,7 +423,7 @@ class Renderer:
 
     def _label(self, layers: Layers, silhouettes: Mapping[int, Silhouette], layout: Layout, plan: FramePlan) -> Labels:
         scene, rules = self.scene, self.scene.spec.labels
-        if rules.source == "splats":  # the depth that is not looked at stays on the device
+        if rules.source == "splats":  # the depth that is not used stays on the device
             truth = Truth(layers.instance, layers.proxy_instance, silhouettes, layers.depth)
         else:
             truth = Truth(layers.proxy_instance, layers.instance, silhouettes, layers.proxy_depth)
@@ -436,11 +440,11 @@ class Renderer:
     def describe(
         self, layout: Layout, lights: tuple[LightSpec, ...], replaced: bool = False, belt: Belt | None = None
     ) -> dict[str, Any]:
-        """Mitsuba's dictionary of a layout under some lights. Shapes stay the same objects while the layout does.
+        """Return Mitsuba's scene dictionary of a layout under given lights.
 
-        Patterns on a ``belt`` are where it has run.
-
-        No kernel is compiled when lights that are not the scene's, but ``replaced`` them, move.
+        Shape objects are reused as long as the layout is the same. The pattern of a ``belt`` is shifted by the belt's
+        travel.
+        With ``replaced``, the lights are not the scene's own. Such lights can move without recompilation of kernels.
         """
         if self._placed is None or self._placed[0] is not layout:
             objects, appearances = {}, draw_appearances(self.scene, layout)
@@ -456,7 +460,7 @@ class Renderer:
         return {"type": "scene", **surroundings, **self._running(belt), **self._placed[1], **emitters}
 
     def _running(self, belt: Belt | None) -> dict[str, Any]:
-        """The shape of a belt, its pattern where it has run; nothing if it has none."""
+        """Return the shape of a belt with its shifted pattern; empty if the belt has no pattern."""
         if belt is None or self._pattern is None:
             return {}
         number, finish, image, bsdf = self._pattern
@@ -469,9 +473,11 @@ class Renderer:
         return emitter_dict(light)
 
     def _made(self, emitter: dict[str, Any], replaced: bool) -> Any:
-        """An emitter; that of the last image if it has the same one, for to read a large one takes longer than a frame.
+        """Return an emitter, with the last environment map reused if its file is the same.
 
-        Lights that are drawn are made so that no kernel is compiled when they move.
+        Loading a large map can take longer than a frame. Lights with random draws are built so that their motion does
+        not
+        recompile kernels.
         """
         if emitter["type"] != "envmap":
             moves = replaced or any(light.draw for light in written_out(self.scene.spec))
@@ -479,13 +485,13 @@ class Renderer:
         if self._sky is None or self._sky[0] != emitter["filename"]:
             self._sky = emitter["filename"], mi.load_dict(emitter)
         state = mi.traverse(self._sky[1])
-        # As a constant of kernels it would have them compiled anew for every radiance.
+        # As a literal constant, each new radiance would recompile the kernels.
         state["scale"], state["to_world"] = dr.opaque(mi.Float, emitter["scale"]), emitter["to_world"]
         state.update()
         return self._sky[1]
 
     def _background(self, backing: BackgroundDraw | None, camera: Camera) -> Any:
-        """What is behind everything, on the device; kept as long as it is the same."""
+        """Return the background picture on the device, cached until it changes."""
         if backing is None:
             return BACKGROUND
         if self._behind is None or self._behind[0] != backing:
@@ -494,7 +500,7 @@ class Renderer:
         return self._behind[1]
 
     def _surroundings(self, place: LayoutSurroundings) -> dict[str, Any]:
-        """What does not move in a place; the same objects as before if they look the same."""
+        """Return the static shapes of the surroundings, cached until their appearance changes."""
         place = replace(place, background=None)
         if self._static is None or self._static[0] != place:
             self._static = place, self._static_shapes(place)
@@ -536,7 +542,7 @@ def _asset_shape(
 
 
 def _visible_shape(colour: tuple[float, float, float], mesh: trimesh.Trimesh) -> Any:
-    """A plain diffuse mesh; its colour is display-encoded, as in the scene file."""
+    """Build a uniformly diffuse mesh; its colour is display-encoded, as in the scene file."""
     props = mi.Properties()
     props["bsdf"] = mi.load_dict(
         {"type": "diffuse", "reflectance": {"type": "rgb", "value": decode_srgb(colour).tolist()}}
@@ -545,7 +551,7 @@ def _visible_shape(colour: tuple[float, float, float], mesh: trimesh.Trimesh) ->
 
 
 def light_properties(scene: Scene, place: LayoutSurroundings = NOWHERE) -> dict[str, Any]:
-    """Properties of the integrator ``splat_proxy`` by which it lights a place of a scene as its file says."""
+    """Return the lighting properties of the integrator ``splat_proxy`` from the scene file."""
     composite = scene.spec.composite
     return {
         "shadow": "none" if composite.shadow == "none" else "traced",
@@ -555,18 +561,18 @@ def light_properties(scene: Scene, place: LayoutSurroundings = NOWHERE) -> dict[
         "bounce": composite.bounce,
         "highlight": composite.highlight,
         "reference": list(reference_point(scene)),
-        # A sky in a room stands for what walls reflect, which they must not hide; things near each other do.
+        # A sky inside a room represents light reflected by the walls. Walls must not occlude it, but near objects must.
         "sky_reach": backdrop_distance(scene.spec, reference_point(scene)) / 2,
         "white": white_irradiance(scene, place),
-        # What no splat covers is the grey of mitsplat.frames.camera_response, which draws no light source.
+        # Pixels without splats show the background of mitsplat.frames.camera_response, not a light source.
         "hide_emitters": True,
     }
 
 
 def white_irradiance(scene: Scene, place: LayoutSurroundings) -> float:
-    """Irradiance [W/m^2] of display white in a place's surroundings, or 0 where it is unknown or of no matter.
+    """Return the irradiance [W/m^2] of display white in the surroundings, or 0 if it is unknown or not used.
 
-    The image-space shadow only looks at light relative to its brightest.
+    The image-space shadow does not use it, because it only evaluates light relative to the brightest value.
     """
     environment = environment_at(scene, place)
     if environment is None or scene.spec.composite.shadow == "image":
@@ -575,7 +581,7 @@ def white_irradiance(scene: Scene, place: LayoutSurroundings) -> float:
 
 
 def reference_point(scene: Scene) -> tuple[float, float, float]:
-    """Where uniformly captured colours are shown unchanged [m]: below the middle of the drop region."""
+    """Return the point at which uniformly captured colours are unchanged [m]: below the middle of the drop region."""
     low, high = np.array(scene.spec.region.min), np.array(scene.spec.region.max)
     x, y = (low + high)[:2] / 2
     return float(x), float(y), float(low[2])

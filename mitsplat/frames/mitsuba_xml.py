@@ -1,4 +1,4 @@
-"""Mitsuba scene files: one frame written as XML to be edited by hand, and XML scenes rendered to a picture."""
+"""Mitsuba scene files: export of a frame as editable XML, and rendering of XML scenes to pictures."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ from mitsplat.storage.files import library_errors, storage_errors, write_file
 def export_xml(scene: Scene, index: int, path: str | Path) -> None:
     """Write one frame as a Mitsuba scene, with its splats and meshes in a folder beside it.
 
-    The scene shows what the frame's layers hold; exposure, tone, noise and background images are not part of it.
+    The scene contains the content of the frame's layers. Exposure, tone, noise and background images are not included.
 
     Raises:
         InputError: If the index is out of range, or the layout cannot be settled.
@@ -62,7 +62,7 @@ def export_xml(scene: Scene, index: int, path: str | Path) -> None:
     if environment is not None:
         stem = _write_asset(environment, files / "environment")
         shapes["environment"] = _describe_asset(environment, stem, np.eye(4), 0)
-    # Named by place: names of assets need be neither distinct nor those of files.
+    # File names use positions, because asset names may repeat and need not be valid file names.
     stems = {i: _write_asset(scene.assets[i], files / f"object_{i}") for i in {one.asset for one in layout.instances}}
     appearances = draw_appearances(scene, layout)
     for one in layout.instances:
@@ -78,7 +78,7 @@ def export_xml(scene: Scene, index: int, path: str | Path) -> None:
     lights = {f"light_{i}": emitter_dict(light, scene.path.parent.resolve()) for i, light in enumerate(plan.lights)}
     description = {
         "type": "scene",
-        "embree_use_robust_intersections": True,  # for other integrators than this one
+        "embree_use_robust_intersections": True,  # for integrators other than splat_proxy
         "integrator": {
             "type": "splat_proxy",
             "quality": scene.spec.quality,
@@ -96,12 +96,12 @@ def export_xml(scene: Scene, index: int, path: str | Path) -> None:
 
 
 def render_xml(path: str | Path, out: str | Path, *, allow_outside: bool = False) -> Path:
-    """Render a Mitsuba scene with the integrator, sensor and size that it states.
+    """Render a Mitsuba scene with the integrator, sensor and size that it specifies.
 
     Args:
         path: The ``.xml`` file.
-        out: Picture to write (``.png``, ``.jpg`` or ``.exr``), or a folder, which gets ``picture.png``.
-        allow_outside: Whether it may name files outside of its folder, see :mod:`mitsplat.frames.untrusted_xml`.
+        out: Picture to write (``.png``, ``.jpg`` or ``.exr``), or a folder for ``picture.png``.
+        allow_outside: Accept files outside of the scene's folder, see :mod:`mitsplat.frames.untrusted_xml`.
 
     Returns:
         Path of the picture.
@@ -132,10 +132,10 @@ def render_xml(path: str | Path, out: str | Path, *, allow_outside: bool = False
 
 
 def render_apart(path: Path, out: Path, *, allow_outside: bool = False, device: Device | None = None) -> Path:
-    """As :func:`render_xml`, in a process of its own: a damaged mesh or image can end the one that Mitsuba runs in.
+    """Run :func:`render_xml` in a separate process, because a damaged mesh or image can crash Mitsuba.
 
     Raises:
-        InputError: Also if that process is ended.
+        InputError: As in :func:`render_xml`, or if the process crashes.
         MissingResourceError: If the device cannot be used, or its memory does not suffice.
     """
     job = _RenderOne(path, out, allow_outside)
@@ -169,7 +169,7 @@ def _render(path: Path, scene: Any) -> Any:
             raise InputError(f"{path}: {error}") from None
     elif any(hasattr(shape, "world_from_splats") for shape in scene.shapes()):
         raise InputError(f"{path}: shape 'splats' is only seen by the integrator 'splat_proxy'")
-    # Not by mi.render, which says "see above" in place of what is wrong.
+    # mi.render would replace the cause of an error by "see above".
     return integrator.render(scene, sensor)
 
 
@@ -179,15 +179,15 @@ _PROPERTY = re.compile(r'- \S+ "(?P<name>[^"]+)"')
 
 
 def one_sentence(path: Path, message: str, stands_for: Mapping[Path, Path] | None = None) -> str:
-    """What Mitsuba says of a scene, as place, rule and value, without the stack that it went through.
+    """Convert an error message of Mitsuba to one sentence with place, rule and value, without the call stack.
 
     Args:
         path: The scene.
         message: Text of Mitsuba's error.
-        stands_for: What the files that Mitsuba has read stand for.
+        stands_for: Original file of each file that Mitsuba has read.
     """
     place = str(path)
-    for found in _PLACE.finditer(message):  # an included file is named after the ones that include it
+    for found in _PLACE.finditer(message):  # an included file follows the files that include it
         file = Path(found["file"])
         place = f"{(stands_for or {}).get(file, file)}:{found['line']}"
     unknown = _UNKNOWN.search(message)
@@ -205,7 +205,7 @@ def one_sentence(path: Path, message: str, stands_for: Mapping[Path, Path] | Non
 
 
 def _documented(plugin: str) -> list[str]:
-    """Properties that one of our plugins takes."""
+    """Return the documented properties of a mitsplat plugin; empty for other plugins."""
     from mitsplat.plugins import opencv_camera, splat_proxy, splats  # derive from classes of the variant
 
     classes = {
@@ -219,7 +219,7 @@ def _documented(plugin: str) -> list[str]:
 
 
 def _write_asset(asset: Asset, stem: Path) -> Path:
-    """Write splats and mesh as ``stem.ply`` and ``stem_proxy.ply``; ``stem``."""
+    """Write splats and mesh as ``stem.ply`` and ``stem_proxy.ply``; return ``stem``."""
     asset.splats.save(stem.with_suffix(".ply"))
     if asset.mesh is not None:
         _write_mesh(asset.mesh, stem.with_name(f"{stem.name}_proxy.ply"))
@@ -247,7 +247,7 @@ def _describe_asset(asset: Asset, stem: Path, world_from_asset: np.ndarray, inst
 def _describe_shape(
     shape: Shape, mesh: trimesh.Trimesh, stem: Path, finish: MaterialDraw | None, scene: Scene, belt: Belt | None
 ) -> dict[str, Any]:
-    """A mesh as ``stem.ply`` and, if it has a pattern, ``stem.png``."""
+    """Write a mesh as ``stem.ply``, and its pattern, if any, as ``stem.png``; return its Mitsuba dictionary."""
     path = stem.with_suffix(".ply")
     if finish is not None:
         image, texture = texture_image(finish, scene.images), None
@@ -274,7 +274,7 @@ def _describe_shape(
 
 
 def _teach_writer() -> None:
-    """Tell Mitsuba's XML writer of what kind our plugins are: it looks them up in a scalar variant."""
+    """Register the kinds of our plugins in a scalar variant, where Mitsuba's XML writer looks them up."""
     scalar = importlib.import_module("mitsuba.scalar_rgb")
 
     def refuse(props: Any) -> Any:

@@ -1,7 +1,7 @@
-"""Speed against accuracy: the same pictures by every preset and by cheaper models of light, beside the exact ones.
+"""Benchmark of speed and accuracy: presets and cheaper light models against the exact renderer.
 
-Every step runs in a process of its own, so that its time and memory are its own. Pictures are compared display-encoded,
-before the camera's development, whose noise would hide the differences.
+Every step runs in a separate process, so that its time and memory are measured alone. Pictures are compared
+display-encoded, before the camera's development, because sensor noise would mask the differences.
 """
 
 from __future__ import annotations
@@ -38,12 +38,12 @@ from mitsplat.scene.loading.scene_loading import load_scene
 from mitsplat.storage.files import storage_errors, write_file, write_text
 
 INSTANCE_MIN = 50
-"""Instances of fewer pixels [px] count in no mask IoU."""
+"""Minimum size of an instance for the mask IoU [px]."""
 
 
 @dataclass(frozen=True)
 class Step:
-    """One way to make the pictures: what the splat renderer computes, and changes to the scene file by key.
+    """One configuration: the splat renderer's quality, and changes to the scene file by key.
 
     Without a quality, Mitsuba's own ``ellipsoids`` and ``volprim_rf_basic`` render a file of splats.
     """
@@ -70,22 +70,22 @@ LIGHT_STEPS = (
 
 
 def tolerance_steps(tolerances: Sequence[float]) -> tuple[Step, ...]:
-    """The preset ``balanced`` at other tolerances of the order of blending.
+    """Return steps with the preset ``balanced`` at other tolerances of the blending order.
 
     Raises:
-        InputError: If one is negative or not a number.
+        InputError: If a tolerance is negative or not a number.
     """
     balanced = PRESETS["balanced"]
     return tuple(Step(f"{_CURVE}{t:g}", replace(balanced, tolerance=t)) for t in tolerances)
 
 
 _CURVE = "balanced at "
-"""What names of steps of :func:`tolerance_steps` begin with, before the tolerance."""
+"""Prefix of the step names of :func:`tolerance_steps`, before the tolerance."""
 
 
 @dataclass(frozen=True)
 class Row:
-    """What one step costs and misses, over all pictures.
+    """Cost and error of one step over all pictures.
 
     Attributes:
         name: Name of the step.
@@ -94,9 +94,9 @@ class Row:
         psnr: The same in dB; infinite for ``exact``.
         largest: Largest error of a channel.
         ssim: Mean structural similarity (Wang et al. 2004).
-        mask_iou: Mean IoU of the instances' pixels; NaN without instances, and where the step tells none.
+        mask_iou: Mean IoU of the instances' pixels; NaN without instances, or if the step has no instance ids.
         memory: Peak memory of the process [GiB].
-        estimate: Largest error that the step's own estimate leaves of the order of blending; NaN where it makes none.
+        estimate: Largest error due to the blending order by the step's own estimate; NaN without an estimate.
     """
 
     name: str
@@ -135,18 +135,18 @@ def measure_steps(
     """Measure steps against the preset ``exact``.
 
     Args:
-        path: Scene file, or a file of splats, which is looked at from around.
-        steps: What to measure; all that apply to the file by default.
-        tolerances: Of the order of blending, at which ``balanced`` is measured too.
-        frames: Pictures to compare, spread evenly over the scene's.
+        path: Scene file, or a file of splats, which is rendered from a circle of cameras.
+        steps: Steps to measure; by default, all that apply to the file.
+        tolerances: Additional tolerances of the blending order for ``balanced``.
+        frames: Number of pictures to compare, spread evenly over the scene's frames.
         overrides: Changes to the scene file by key, such as ``output.width``.
-        allow_outside: Whether the scene may name files outside of its folder.
-        progress: Hears (steps done, steps, name of the next).
-        device: Where; that of :func:`mitsplat.runtime.device.current_device` if None.
+        allow_outside: Accept files outside of the scene's folder.
+        progress: Callback with (steps done, number of steps, name of the next step).
+        device: Device; that of :func:`mitsplat.runtime.device.current_device` if None.
 
     Raises:
-        InputError: If the file is not as it should be, or ``frames`` is below 1.
-        MissingResourceError: If a step's process dies, as it does when memory runs out.
+        InputError: If the file is invalid, or ``frames`` is below 1.
+        MissingResourceError: If a step's process dies, for example because memory is exhausted.
     """
     path = Path(path)
     if frames < 1:
@@ -169,7 +169,7 @@ def measure_steps(
 
 
 def cheapest(rows: Sequence[Row], tolerance: float) -> Row:
-    """The fastest preset whose error [RMSE] is within the tolerance; rows of all presets must be among ``rows``.
+    """Return the fastest preset whose RMSE is within the tolerance; ``rows`` must contain all presets.
 
     Raises:
         InputError: If the tolerance is negative.
@@ -180,7 +180,7 @@ def cheapest(rows: Sequence[Row], tolerance: float) -> Row:
 
 
 def check_tolerance(tolerance: float) -> None:
-    """Refuse what no error can be within.
+    """Check that a tolerance is a number >= 0.
 
     Raises:
         InputError: If it is negative or not a number.
@@ -198,10 +198,10 @@ def choose_preset(
     progress: Progress | None = None,
     device: Device | None = None,
 ) -> Row:
-    """The cheapest preset for a scene, from two of its frames; see :func:`measure_steps`.
+    """Return the cheapest preset for a scene, measured on two of its frames; see :func:`measure_steps`.
 
     Raises:
-        InputError: If the tolerance is negative, or the scene file is not as it should be.
+        InputError: If the tolerance is negative, or the scene file is invalid.
     """
     check_tolerance(tolerance)
     steps = STEPS[: len(PRESETS)]
@@ -239,7 +239,7 @@ class _Shoot:
 
 
 def _shoot(path: Path, quality: Quality | None, frames: int, overrides: dict[str, Any], allow_outside: bool) -> _Shots:
-    """Make the pictures; the first one twice, because it compiles or loads kernels."""
+    """Render the pictures; the first one is rendered twice, because it compiles or loads kernels."""
     if quality is None:
         shoot = _volprim_shooter(path, frames, overrides)
     elif _is_splats(path):
@@ -258,7 +258,7 @@ def _shoot(path: Path, quality: Quality | None, frames: int, overrides: dict[str
 
 
 Shot = tuple[Float32Array, npt.NDArray[np.uint16], float, float]
-"""Picture, instances, time [s], and the largest error that was estimated, or NaN."""
+"""Picture, instances, time [s], and the estimated largest error, or NaN."""
 
 
 def _largest(order_error: Mapping[str, float] | None) -> float:
@@ -270,7 +270,7 @@ def _scene_shooter(
 ) -> Callable[[int], Shot]:
     scene = load_scene(path, overrides=overrides, allow_outside=allow_outside)
     drawn = scene.spec.rendering.model_dump()
-    if quality.response == "ewa":  # what the step is about
+    if quality.response == "ewa":  # the step itself sets the response
         del drawn["response"]
     quality = replace(quality, **drawn)
     indices = np.linspace(0, scene.num_frames - 1, frames).round().astype(int)
@@ -299,7 +299,7 @@ def _splats_shooter(path: Path, quality: Quality, frames: int, overrides: dict[s
 
 
 def picture_of(layers: Layers) -> Float32Array:
-    """Display-encoded colours over black, (H, W, 3) in [0, 1]: blended encoded, as captures of splats are."""
+    """Blend the encoded colours over black, (H, W, 3) in [0, 1], as in captures of splats."""
     colour = layers.rgb / np.maximum(layers.alpha, 1e-6)[..., None]
     return np.clip(encode_srgb(colour) * layers.alpha[..., None], 0, 1).astype(np.float32)
 
@@ -320,7 +320,7 @@ def _volprim_shooter(path: Path, frames: int, overrides: dict[str, Any]) -> Call
 
 
 def look_around(splats: Splats, index: int, count: int, *, width: int, height: int) -> Camera:
-    """View ``index`` of ``count`` on a circle around splats whose up axis is -y, as files of 3DGS have it."""
+    """Return camera ``index`` of ``count`` on a circle around splats whose up axis is -y, as in 3DGS files."""
     centre = np.median(splats.means, axis=0)
     size = np.percentile(np.linalg.norm(splats.means - centre, axis=1), 80)
     angle = 2 * math.pi * index / count + 0.25
@@ -329,7 +329,7 @@ def look_around(splats: Splats, index: int, count: int, *, width: int, height: i
 
 
 def _compare(name: str, shots: _Shots, truth: _Shots) -> Row:
-    # Not for the processes that measure steps, in whose peak memory it would count.
+    # Imported here, because it would add to the peak memory of the measuring processes.
     from skimage.metrics import structural_similarity
 
     difference = shots.pictures.astype(np.float64) - truth.pictures
@@ -352,7 +352,7 @@ def _compare(name: str, shots: _Shots, truth: _Shots) -> Row:
 
 
 def _mask_iou(mine: npt.NDArray[np.uint16] | None, theirs: npt.NDArray[np.uint16] | None) -> float:
-    """Mean IoU over the instances of all pictures, or NaN."""
+    """Compute the mean IoU over the instances of all pictures, or NaN."""
     if mine is None or theirs is None:
         return math.nan
     ious = []
@@ -365,7 +365,7 @@ def _mask_iou(mine: npt.NDArray[np.uint16] | None, theirs: npt.NDArray[np.uint16
 
 
 def write_csv(rows: Sequence[Row], file: Path) -> None:
-    """One line per row, with a head."""
+    """Write a CSV file with a header and one line per row."""
     stream = io.StringIO(newline="")
     writer = csv.DictWriter(stream, list(asdict(rows[0])))
     writer.writeheader()
@@ -375,9 +375,9 @@ def write_csv(rows: Sequence[Row], file: Path) -> None:
 
 
 def draw_chart(rows: Sequence[Row], file: Path, *, title: str, tolerance: float) -> None:
-    """Time of an image against its error, both logarithmic.
+    """Plot the time of an image against its error, both logarithmic.
 
-    The steps that nothing beats in both are joined by stairs, and those of ``balanced`` by a curve over its tolerance.
+    Steps connect the Pareto-optimal configurations; a curve connects those of ``balanced`` over its tolerance.
     """
     from matplotlib.figure import Figure  # takes half a second, which only a chart needs
 
@@ -400,7 +400,7 @@ def draw_chart(rows: Sequence[Row], file: Path, *, title: str, tolerance: float)
         axes.scatter(row.seconds, error, s=50, color="C3" if row == chosen else "C0", zorder=2)
         label = f"{row.name} (no error)" if row.rmse == 0 else row.name
         placed: dict[str, Any] = {"xytext": (6, 4)}
-        if row.name.startswith(_CURVE):  # below the points, which lie close together where the curve ends
+        if row.name.startswith(_CURVE):  # below the points, which are dense at the curve's end
             label, placed = row.name.removeprefix(_CURVE), {"xytext": (0, -6), "rotation": -45, "va": "top"}
         axes.annotate(label, (row.seconds, error), textcoords="offset points", fontsize=8, **placed)
     axes.axhline(tolerance, color="C3", linewidth=0.8, linestyle="--")
@@ -411,7 +411,7 @@ def draw_chart(rows: Sequence[Row], file: Path, *, title: str, tolerance: float)
 
 
 def curve_of(rows: Sequence[Row], least: float = 0.0) -> list[tuple[float, float]]:
-    """Seconds and errors, at least the ``least``, of ``balanced`` at all of its tolerances, from the largest on."""
+    """Return (seconds, error >= ``least``) of ``balanced`` at all its tolerances, in descending order."""
     at = {f"{_CURVE}{PRESETS['balanced'].tolerance:g}" if row.name == "balanced" else row.name: row for row in rows}
     known = {float(name.removeprefix(_CURVE)): row for name, row in at.items() if name.startswith(_CURVE)}
     return [(row.seconds, max(row.rmse, least)) for _, row in sorted(known.items(), reverse=True)]

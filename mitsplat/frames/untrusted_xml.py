@@ -1,7 +1,6 @@
-"""Reader of Mitsuba scenes of others: a scene is written anew, so that Mitsuba looks up no name in it itself.
+"""Sanitiser for untrusted Mitsuba scenes: a scene is rewritten so that Mitsuba itself resolves no file names.
 
-The new texts have no document types, no parameters and no folders to search, and name files by absolute paths that were
-checked.
+The new texts have no document types, no parameters and no search folders. They name files by checked absolute paths.
 """
 
 from __future__ import annotations
@@ -19,28 +18,28 @@ from mitsplat.errors import InputError
 from mitsplat.storage.files import is_inside
 
 MAX_BYTES = 64 << 20
-"""Of all files of a scene together, and of the texts that they become."""
+"""Maximum total size of a scene's files, and of the rewritten texts."""
 MAX_DEPTH = 64
 MAX_INCLUDES = 100
 MAX_TEXT = 1 << 20
-"""Characters of an attribute after parameters are substituted."""
+"""Maximum characters of an attribute after parameters are substituted."""
 
-_MAX_LEVELS = 15  # of includes: Mitsuba's own bound
+_MAX_LEVELS = 15  # of includes: Mitsuba's own limit
 _NAMES_OF_FILES = ("filename", "asset", "proxy")
-"""Names of texts by which plugins of Mitsuba and of mitsplat are given files."""
+"""Names of string properties in which plugins of Mitsuba and of mitsplat expect files."""
 _RESOLVED = {"default": (("name", "value"), ()), "path": (("value",), ()), "include": (("filename",), ("name",))}
-"""Elements that are resolved here: attributes that they must have, and those that they may have."""
+"""Elements that this module resolves, with their required and their optional attributes."""
 _OUTSIDE = "must not name a file outside of the scene's folder"
 _PLUGIN = re.compile(r"[\w-]*", re.ASCII)
 _UNDEFINED = re.compile(r"(?<!\\)\$(\w*)", re.ASCII)
 
 
 class CheckedXml(NamedTuple):
-    """Mitsuba scene that was written anew.
+    """Rewritten Mitsuba scene.
 
     Attributes:
-        names: The scene, and every file that it includes, once for each time.
-        texts: Text of each, with elements on the lines where they were. They include each other as ``1.xml`` and so on.
+        names: Path of the scene and of every included file, one entry per inclusion.
+        texts: Text of each, with elements on their original lines. They include each other as ``1.xml`` and so on.
     """
 
     names: tuple[Path, ...]
@@ -50,7 +49,7 @@ class CheckedXml(NamedTuple):
         """Write the texts into an empty folder, the scene as ``0.xml``.
 
         Returns:
-            What each of the new files stands for.
+            Original path of each new file.
         """
         names = {folder / f"{number}.xml": name for number, name in enumerate(self.names)}
         for file, text in zip(names, self.texts, strict=True):
@@ -59,18 +58,19 @@ class CheckedXml(NamedTuple):
 
 
 def check_xml(path: Path, *, allow_outside: bool = False) -> CheckedXml:
-    """Write a scene anew; refuse one that names files outside of its folder or is built to exhaust a parser.
+    """Rewrite a scene; refuse one that names files outside of its folder or is built to exhaust a parser.
 
-    Document types are refused, and with them all entities, which no scene needs. Every text of the file is looked at,
-    not only those that plugins take for the name of a file.
+    Document types are refused, and therefore all entities; scenes do not need them. Every attribute value is checked,
+    not
+    only the values that plugins use as file names.
 
-    Names are looked up in the folders of ``<path>`` elements, the last one first, in the scene's folder and in the
-    current one. For a file that is included or of a spectrum only the ``<path>`` elements before it count; the folder
-    of the file that includes comes first.
+    Names are looked up in the folders of ``<path>`` elements (the last one first), in the scene's folder and in the
+    current folder. For an included file or a spectrum, only the preceding ``<path>`` elements count; the folder of the
+    including file is searched first.
 
     Args:
-        path: The ``.xml`` file; what it includes is read too.
-        allow_outside: Whether files anywhere may be named.
+        path: The ``.xml`` file; included files are read too.
+        allow_outside: Accept files outside of the scene's folder.
 
     Raises:
         InputError: With file, line, rule and value.
@@ -82,22 +82,22 @@ def check_xml(path: Path, *, allow_outside: bool = False) -> CheckedXml:
 
 
 class _FileName(NamedTuple):
-    """Name of a file, which is looked up when all folders of the scene are known; its place is a file and a line."""
+    """File name that is looked up after all folders of the scene are known; its place is a file and a line."""
 
     name: str
     place: str
 
 
 class _Reader:
-    """Reader of a scene with its includes, in the order of elements: parameters count from where they are set.
+    """Reader of a scene with its includes in document order, because parameters take effect from their definition on.
 
     Args:
         scene: The ``.xml`` file.
-        allow_outside: Whether files anywhere may be named.
+        allow_outside: Accept files outside of the scene's folder.
 
     Attributes:
-        names: Files that were begun.
-        pieces: New text of each.
+        names: Files whose reading has started.
+        pieces: New text of each file.
     """
 
     def __init__(self, scene: Path, *, allow_outside: bool) -> None:
@@ -109,7 +109,7 @@ class _Reader:
         self.pieces: list[list[str | _FileName]] = []
 
     def text(self, pieces: Sequence[str | _FileName], folders: Sequence[Path]) -> str:
-        """Join pieces, with names looked up in folders."""
+        """Join text pieces and resolve file names in the given folders."""
         return "".join(
             piece if isinstance(piece, str) else _quoted(str(self._find(piece.name, folders, piece.place, "string")))
             for piece in pieces
@@ -119,12 +119,12 @@ class _Reader:
         """Read a file.
 
         Args:
-            path: The file; it was checked to be inside.
-            folders: Where to look up names; the file's ``<path>`` elements add to them.
-            level: Number of files between this one and the scene, with the scene.
+            path: The file; already checked to be inside.
+            folders: Search folders; the file's ``<path>`` elements extend the list.
+            level: Inclusion depth of the file, 0 for the scene.
 
         Returns:
-            Its number.
+            Number of the file.
         """
         data = self._read_bytes(path)
         number, pieces, parents = len(self.names), list[str | _FileName](), list[str]()
@@ -214,7 +214,7 @@ class _Reader:
         return data
 
     def _substitute(self, text: str, place: str) -> str:
-        """Replace parameters, the longest name first, and dollar signs after backslashes by these alone."""
+        """Substitute parameters, the longest name first, and unescape dollar signs."""
         if "$" not in text:
             return text
         for name in sorted(self._parameters, key=len, reverse=True):
@@ -231,7 +231,7 @@ class _Reader:
     def _value(
         self, element: str, key: str, value: str, values: Mapping[str, str], folders: Sequence[Path], place: str
     ) -> str | _FileName:
-        """An attribute as it is written, between quotes."""
+        """Return the quoted form of an attribute's value."""
         if element == "spectrum" and key == "filename":
             return _quoted(str(self._find(value, folders, place, element)))
         if element == "string" and key == "value" and value and values.get("name") in _NAMES_OF_FILES:
@@ -243,13 +243,16 @@ class _Reader:
         return _quoted(value)
 
     def _find(self, name: str, folders: Sequence[Path], place: str, element: str) -> Path:
-        """Look up a name: an absolute path without links. What is in no folder is sought in the scene's."""
+        """Resolve a name to an absolute path without links.
+
+        A name that no search folder contains is resolved in the scene's folder.
+        """
         found = next((path for folder in folders if _is_there(path := folder / name)), self._scene.parent / name)
         if self._bounds is not None and not is_inside(self._bounds, os.path.realpath(found)):
             rule = _OUTSIDE if element == "string" else f"{element} must be inside the scene's folder"
             raise InputError(f"{place}: {rule} (got {name}); --allow-outside lifts this")
         path = Path(os.path.realpath(found))
-        if path.suffix != found.suffix:  # by which readers choose a format
+        if path.suffix != found.suffix:  # readers choose a format by suffix
             path = Path(os.path.realpath(found.parent), found.name)
         if _is_there(path) and not (path.is_file() or path.is_dir()):
             raise InputError(f"{place}: {element} must name a file or a folder (got {name})")
@@ -263,7 +266,7 @@ class _Reader:
 def _is_there(path: Path) -> bool:
     try:
         return path.exists()
-    except (OSError, ValueError):  # a name that no file can have
+    except (OSError, ValueError):  # not a valid file name
         return False
 
 
@@ -272,7 +275,7 @@ def _quoted(value: str) -> str:
 
 
 def _check_attributes(element: str, values: Mapping[str, str], place: str) -> None:
-    """Refuse attributes that an element lacks or does not take, as Mitsuba does."""
+    """Refuse missing required and unexpected attributes, as Mitsuba does."""
     needed, possible = _RESOLVED[element]
     for key in needed:
         if not values.get(key):
@@ -283,7 +286,10 @@ def _check_attributes(element: str, values: Mapping[str, str], place: str) -> No
 
 
 def _names_outside(folder: Path, text: str) -> bool:
-    """Whether a text names a file or an asset, seen from the scene or from here, that is not in the folder."""
+    """Return True if a text names an existing file or asset outside the folder.
+
+    Relative names are tested against the folder and the current folder.
+    """
     if ".." in re.split(r"[/\\]", text):
         return True
     if not text or "\0" in text or len(text) > 4096:

@@ -1,5 +1,5 @@
 """Cameras and triangle meshes.
 
 In: intrinsics, poses and meshes. Out: :class:`~mitsplat.geometry.camera.Camera`, mass properties, signed distances,
-normals, and convex decompositions.
+normals and convex decompositions.
 """

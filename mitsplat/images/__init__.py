@@ -1,5 +1,5 @@
-"""Colour conversion, masks, and image files of unknown origin.
+"""Colour conversion, masks, and image files from untrusted sources.
 
-In: pixel arrays and image paths. Out: linear or display-encoded colour, silhouettes and run-length codes, and a verdict
-on whether an image file can be read safely.
+In: pixel arrays and image paths. Out: linear or display-encoded colour, silhouettes and run-length codes, and a check
+whether an image file can be read safely.
 """

@@ -1,8 +1,9 @@
 """Scenes: values, loading and planning.
 
 In: a YAML file and the asset folders that it names. Out: a :class:`Scene` (the checked specification with its assets
-and meshes) and, for every frame, a :class:`FramePlan` (camera, lights, random draws) decided by the seed and the
-frame's index. A :class:`Layout` holds the poses of the objects; physics makes it, and all later stages read it.
+and meshes) and one :class:`FramePlan` per frame (camera, lights, random draws). The seed and the index of the frame
+determine the plan. A :class:`Layout` holds the poses of the objects. The physics simulation creates it; all later
+stages read it.
 """
 
 from __future__ import annotations

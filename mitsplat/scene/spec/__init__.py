@@ -1,7 +1,7 @@
-"""What a scene file may say: its models, with units and rules.
+"""Models of the scene file, with units and validation rules.
 
-In: the mapping that YAML or Python gives. Out: a frozen :class:`SceneSpec`, or an error that names the key, the rule
-and the value. No file is read; what a specification names is read by the wing ``scene``.
+In: a mapping from YAML or Python. Out: a frozen :class:`SceneSpec`, or an error that names the key, the rule and the
+value. The models read no files; :mod:`mitsplat.scene.loading` reads the files that a specification names.
 """
 
 from __future__ import annotations

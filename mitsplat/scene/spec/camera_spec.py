@@ -1,4 +1,4 @@
-"""Keys of a scene file about the camera: its lens, and where it looks from."""
+"""Keys of the scene file for cameras: lens and viewpoints."""
 
 from __future__ import annotations
 
@@ -22,23 +22,27 @@ from mitsplat.storage.yaml_input import FieldError
 
 
 class Intrinsics(StrictModel):
-    """OpenCV intrinsics, pixel centres at +0.5: either ``fov_x``, or ``fx`` with what else was calibrated."""
+    """OpenCV intrinsics with pixel centres at +0.5: either ``fov_x``, or ``fx`` with the other calibrated values."""
 
     fov_x: float | None = Field(None, gt=0, lt=180, description="Horizontal field of view [degrees].")
     fx: Positive | None = Field(None, description="Focal length along x [px].")
-    fy: Positive | None = Field(None, description="Focal length along y [px]; fx if absent.")
-    cx: float | None = Field(None, description="Principal point [px]; the image's middle if absent.")
-    cy: float | None = Field(None, description="Principal point [px]; the image's middle if absent.")
+    fy: Positive | None = Field(None, description="Focal length along y [px]. Equal to ``fx`` if absent.")
+    cx: float | None = Field(None, description="Principal point along x [px]. The centre of the image if absent.")
+    cy: float | None = Field(None, description="Principal point along y [px]. The centre of the image if absent.")
     size: tuple[Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]] | None = Field(
-        None, description="Width and height that fx, fy, cx and cy refer to [px]; the output's if absent."
+        None,
+        description="Image width and height to which ``fx``, ``fy``, ``cx`` and ``cy`` refer [px]. The size of the "
+        "output if absent.",
     )
     distortion: tuple[float, ...] = Field(
-        (), description="OpenCV's k1, k2, p1, p2[, k3[, k4, k5, k6]]; empty for a pinhole. A fisheye's k1, k2, k3, k4."
+        (),
+        description="OpenCV distortion coefficients k1, k2, p1, p2[, k3[, k4, k5, k6]]; k1, k2, k3, k4 for a fisheye "
+        "lens. Empty for a pinhole camera.",
     )
-    lens: Lens = Field("opencv", description="Which of OpenCV's camera models.")
-    aperture: NonNegativeFloat = Field(0.0, description="Radius of a thin lens's aperture [m]; 0 for a pinhole.")
-    focus: Positive = Field(1.0, description="Depth that a thin lens sees sharp [m].")
-    near: Positive = Field(0.01, description="Nearest depth at which anything is seen [m].")
+    lens: Lens = Field("opencv", description="OpenCV camera model.")
+    aperture: NonNegativeFloat = Field(0.0, description="Aperture radius of a thin lens [m]. 0 for a pinhole camera.")
+    focus: Positive = Field(1.0, description="Focus depth of a thin lens [m].")
+    near: Positive = Field(0.01, description="Near clipping depth [m].")
 
     @model_validator(mode="after")
     def _check(self) -> Intrinsics:
@@ -58,74 +62,78 @@ class Intrinsics(StrictModel):
 
 
 class Stereo(StrictModel):
-    """A second camera beside the first, alike and parallel to it: a rectified pair."""
+    """Second camera of a rectified pair, with the same intrinsics and parallel to the first."""
 
-    baseline: Positive = Field(description="Distance of the right camera from the left one, along its x axis [m].")
+    baseline: Positive = Field(description="Distance of the right camera from the left camera, along its x axis [m].")
 
 
 class Handheld(StrictModel):
-    """Motion of the hand that holds a camera: smooth from view to view of a layout, and another in every layout."""
+    """Motion of a handheld camera, smooth over the views of a layout and different in every layout."""
 
     position: NonNegativeFloat = Field(0.0, description="Displacement along each axis, 1 sigma [m].")
     rotation: NonNegativeFloat = Field(0.0, description="Rotation about each axis, 1 sigma [degrees].")
 
 
 class Defocus(StrictModel):
-    """A thin lens that is drawn anew for every view, in place of the intrinsics' own."""
+    """Thin lens whose parameters are drawn anew for every view, in place of those of ``intrinsics``."""
 
-    aperture: NonNegativeRange = Field(description="Radius of the aperture [m]; 0 for a pinhole.")
-    focus: PositiveRange = Field(description="Depth that is sharp [m].")
+    aperture: NonNegativeRange = Field(description="Range of aperture radii [m]. 0 for a pinhole camera.")
+    focus: PositiveRange = Field(description="Range of focus depths [m].")
 
 
 class Motion(StrictModel):
-    """Steady motion of the camera while its shutter is open, drawn anew for every view in its own frame."""
+    """Constant camera motion while the shutter is open, drawn anew for every view in the camera's frame."""
 
-    exposure: PositiveRange = Field(description="How long the shutter is open [s].")
+    exposure: PositiveRange = Field(description="Range of exposure times [s].")
     speed: NonNegativeRange = Field(
-        (0.0, 0.0), description="Speed [m/s], in a direction that is uniform on the sphere."
+        (0.0, 0.0), description="Range of speeds [m/s]. The direction is uniform on the sphere."
     )
     rotation: NonNegativeRange = Field(
-        (0.0, 0.0), description="Rate of rotation [degrees/s], about an axis that is uniform on the sphere."
+        (0.0, 0.0), description="Range of rotation rates [degrees/s]. The axis is uniform on the sphere."
     )
     readout: NonNegativeRange = Field(
         (0.0, 0.0),
         exclude_if=lambda readout: readout == (0.0, 0.0),
-        description="How long after the first row the last one is exposed [s]; 0 for all rows at once.",
+        description="Range of readout times [s]: delay of the exposure of the last row after that of the first row. "
+        "0 for a global shutter.",
     )
 
     @property
     def moves(self) -> bool:
-        """Whether it is more than an open shutter."""
+        """True if the camera moves during the exposure."""
         return bool(self.speed[1] or self.rotation[1])
 
 
 class Viewpoint(StrictModel):
-    """What every kind of camera has."""
+    """Keys that all kinds of cameras have."""
 
-    intrinsics: Intrinsics = Field(Intrinsics(fov_x=60), description="Lens and sensor.")
+    intrinsics: Intrinsics = Field(Intrinsics(fov_x=60), description="Lens and sensor geometry.")
     zoom: PositiveRange = Field(
         (1.0, 1.0),
         exclude_if=lambda zoom: zoom == (1.0, 1.0),
-        description="Factor on the focal lengths, drawn anew for every view.",
+        description="Range of factors on the focal lengths, drawn anew for every view.",
     )
     handheld: Handheld | None = Field(
-        None, exclude_if=lambda handheld: handheld is None, description="Smooth random motion on top of the pose."
+        None,
+        exclude_if=lambda handheld: handheld is None,
+        description="Smooth random motion that is added to the pose.",
     )
     defocus: Defocus | None = Field(
         None,
         exclude_if=lambda defocus: defocus is None,
-        description="Aperture and focus, drawn anew for every view.",
+        description="Ranges of aperture and focus, drawn anew for every view.",
     )
     motion: Motion | None = Field(
         None,
         exclude_if=lambda motion: motion is None,
-        description="Motion that blurs the picture, near things more than far ones. Pose and labels are those of the "
-        "exposure's middle.",
+        description="Camera motion during the exposure, which blurs near things more than far ones. Pose and labels "
+        "refer to the middle of the exposure.",
     )
     stereo: Stereo | None = Field(
         None,
         exclude_if=lambda stereo: stereo is None,
-        description="Takes every view twice, from the left and then from the right; these are two of output.views.",
+        description="Takes a stereo pair of every view: the left image, then the right one. A pair counts as two of "
+        "``output.views``.",
     )
 
     @model_validator(mode="after")
@@ -140,11 +148,11 @@ class Viewpoint(StrictModel):
 
 
 class PoseKey(StrictModel):
-    """One pose on a camera path."""
+    """Key pose of a camera path."""
 
     eye: Vec3 = Field(description="Centre of projection [m].")
-    target: Vec3 = Field(description="Point in the middle of the view [m].")
-    up: Vec3 = Field((0, 0, 1), description="Direction that points up in the image.")
+    target: Vec3 = Field(description="Point in the centre of the image [m].")
+    up: Vec3 = Field((0, 0, 1), description="Direction that appears upwards in the image.")
 
     @model_validator(mode="after")
     def _check(self) -> PoseKey:
@@ -158,7 +166,7 @@ class PoseKey(StrictModel):
 class CameraPath(Viewpoint):
     """Views evenly spaced in time on a smooth path through key poses, the same in every layout."""
 
-    kind: Literal["path"] = Field("path", description="A path through key poses.")
+    kind: Literal["path"] = Field("path", description="Path through key poses.")
     keys: tuple[PoseKey, ...] = Field(min_length=1, description="Key poses, evenly spaced in time.")
     jitter: NonNegativeFloat = Field(0.0, description="Random displacement of the eye, 1 sigma [m].")
 
@@ -166,12 +174,12 @@ class CameraPath(Viewpoint):
 class CameraOrbit(Viewpoint):
     """Views evenly spaced on a horizontal circle, the same in every layout."""
 
-    kind: Literal["orbit"] = Field("orbit", description="A horizontal circle.")
-    target: Vec3 = Field(description="Point in the middle of every view; the circle is centred above it [m].")
+    kind: Literal["orbit"] = Field("orbit", description="Horizontal circle around a target.")
+    target: Vec3 = Field(description="Point in the centre of every image [m]. The centre of the circle is above it.")
     radius: Positive = Field(description="Radius of the circle [m].")
     height: float = Field(description="Height of the circle above the target [m].")
-    start: float = Field(0.0, description="First azimuth, 0 along +x, counter-clockwise from above [degrees].")
-    sweep: float = Field(360.0, ge=-360, le=360, description="Azimuth swept over a layout's views [degrees].")
+    start: float = Field(0.0, description="First azimuth, 0 along +x, counter-clockwise seen from above [degrees].")
+    sweep: float = Field(360.0, ge=-360, le=360, description="Azimuth range of the views of a layout [degrees].")
     jitter: NonNegativeFloat = Field(0.0, description="Random displacement of the eye, 1 sigma [m].")
 
 
@@ -179,82 +187,86 @@ TRIES = 16
 
 
 class Acceptance(StrictModel):
-    """What a view must show and keep off. A camera inside of a visible shape or an object is never accepted."""
+    """Conditions of an accepted view. A view from inside a visible shape or an object is always rejected."""
 
     in_view: Unit = Field(
-        0.0, description="Least share of the labelled objects of which half of the surface or more is in the image."
+        0.0, description="Minimum share of the labelled objects that have at least half of their surface in the image."
     )
     extent: NonNegativeFloat = Field(
-        0.0, description="Least longer side of the box around each labelled object that is in view [px]."
+        0.0, description="Minimum length of the longer side of the bounding box, for each labelled object in view [px]."
     )
     clearance: NonNegativeFloat = Field(
-        0.0, description="Least distance of the camera from objects, visible shapes and the environment's mesh [m]."
+        0.0,
+        description="Minimum distance of the camera from objects, visible shapes and the mesh of the environment [m].",
     )
 
 
 class Occlusion(StrictModel):
-    """How many of the labelled objects in view should be partly hidden."""
+    """Target share of partly hidden objects among the labelled objects in view."""
 
-    share: Unit = Field(description="Share of the objects in view that is aimed at.")
-    visible: UnitRange = Field((0.2, 0.9), description="Range of visible fractions that counts as partly hidden.")
+    share: Unit = Field(description="Target share of partly hidden objects among the labelled objects in view.")
+    visible: UnitRange = Field((0.2, 0.9), description="Range of visible fractions of a partly hidden object.")
 
 
 class Truncation(StrictModel):
-    """How many of the labelled objects in view the image's border should cut."""
+    """Target share of objects that the border of the image cuts, among the labelled objects in view."""
 
-    share: Unit = Field(description="Share of the objects in view that is aimed at.")
-    cut: UnitRange = Field((0.05, 0.8), description="Range of shares beyond the border that counts as cut.")
+    share: Unit = Field(description="Target share of truncated objects among the labelled objects in view.")
+    cut: UnitRange = Field((0.05, 0.8), description="Range of the share beyond the border of a truncated object.")
 
 
 class CameraHemisphere(Viewpoint):
-    """Views drawn at random, uniform by area on spheres around a target."""
+    """Random views, uniform by area on spheres around a target."""
 
     kind: Literal["hemisphere"] = Field("hemisphere", description="Random views around a target.")
-    target: Vec3 = Field(description="Point in the middle of the views [m].")
+    target: Vec3 = Field(description="Point in the centre of the images [m].")
     radius: PositiveRange = Field(description="Range of distances from the target [m].")
-    elevation: ElevationRange = Field((25.0, 80.0), description="Range above the horizon [degrees].")
-    azimuth: Range = Field((0.0, 360.0), description="Range, 0 along +x, counter-clockwise from above [degrees].")
-    roll: Range = Field((0.0, 0.0), description="Range of rotations about the line of sight [degrees].")
+    elevation: ElevationRange = Field((25.0, 80.0), description="Range of elevations above the horizon [degrees].")
+    azimuth: Range = Field(
+        (0.0, 360.0), description="Range of azimuths, 0 along +x, counter-clockwise seen from above [degrees]."
+    )
+    roll: Range = Field((0.0, 0.0), description="Range of rotations about the optical axis [degrees].")
     target_jitter: NonNegativeFloat = Field(0.0, description="Random displacement of the target, 1 sigma [m].")
     look_at: Literal["target", "objects", "clusters"] = Field(
         "target",
         exclude_if=lambda look_at: look_at == "target",
-        description="What is in the middle of a view: the target, or the middle of a labelled object that is drawn "
-        "anew for every view, alone or with the two nearest to it. Layouts without one are seen at the target.",
+        description="Point in the centre of the image. ``target`` takes the target. ``objects`` takes the centre of "
+        "a labelled object that is drawn anew for every view. ``clusters`` takes the centre of such an "
+        "object and its two nearest neighbours. Layouts without labelled objects use the target.",
     )
     coverage: Literal["random", "even"] = Field(
         "random",
         exclude_if=lambda coverage: coverage == "random",
-        description="Whether azimuth, sine of the elevation and radius are drawn independently, or follow a sequence "
-        "of low discrepancy over the frames, which leaves smaller gaps between them.",
+        description="``random`` draws azimuth, sine of the elevation, and radius independently. ``even`` takes them "
+        "from a low-discrepancy sequence over the frames, which leaves smaller gaps.",
     )
     accept: Acceptance | None = Field(
         None,
         exclude_if=lambda accept: accept is None,
-        description="What every view must fulfil; others are drawn again.",
+        description="Conditions that every view must fulfil. Rejected views are drawn again.",
     )
     occlusion: Occlusion | None = Field(
         None,
         exclude_if=lambda occlusion: occlusion is None,
-        description="Share of partly hidden objects, for which one of the tries is chosen.",
+        description="Target share of partly hidden objects. The candidate view nearest to it is selected.",
     )
     truncation: Truncation | None = Field(
         None,
         exclude_if=lambda truncation: truncation is None,
-        description="Share of objects cut by the border, for which one of the tries is chosen; every other try looks "
-        "past what it would look at, so that it is near the border.",
+        description="Target share of objects cut by the border. The candidate view nearest to it is selected. Every "
+        "other candidate is turned so that the target is near the border.",
     )
     tries: int = Field(
         TRIES,
         ge=1,
         le=1000,
         exclude_if=lambda tries: tries == TRIES,
-        description="How many views are drawn for a frame at most, to accept or choose from.",
+        description="Maximum number of candidate views per frame.",
     )
 
     @property
     def chosen(self) -> bool:
-        """Whether a frame's view is one of several tries, which depends on what lies there."""
+        """True if views are selected from several candidates, which depends on the objects of the layout."""
         return not (self.accept is None and self.occlusion is None and self.truncation is None)
 
     @model_validator(mode="after")
@@ -265,17 +277,20 @@ class CameraHemisphere(Viewpoint):
 
 
 class CameraWalk(Viewpoint):
-    """A video of each layout: a smooth path around the target, through places drawn at random as on a hemisphere.
+    """Video of each layout: a smooth path around the target through random waypoints of a hemisphere.
 
-    Azimuth, sine of the elevation and radius are interpolated by monotone cubics, and so never leave their ranges.
+    Azimuth, sine of the elevation, and radius are interpolated by monotone cubics and therefore stay within their
+    ranges.
     """
 
-    kind: Literal["walk"] = Field("walk", description="A smooth random path around a target, for videos.")
-    target: Vec3 = Field(description="Point in the middle of the views [m].")
+    kind: Literal["walk"] = Field("walk", description="Smooth random path around a target, for videos.")
+    target: Vec3 = Field(description="Point in the centre of the images [m].")
     radius: PositiveRange = Field(description="Range of distances from the target [m].")
-    elevation: ElevationRange = Field((25.0, 80.0), description="Range above the horizon [degrees].")
-    azimuth: Range = Field((0.0, 360.0), description="Range, 0 along +x, counter-clockwise from above [degrees].")
-    places: int = Field(4, ge=2, le=1000, description="How many places are drawn, evenly spaced in time.")
+    elevation: ElevationRange = Field((25.0, 80.0), description="Range of elevations above the horizon [degrees].")
+    azimuth: Range = Field(
+        (0.0, 360.0), description="Range of azimuths, 0 along +x, counter-clockwise seen from above [degrees]."
+    )
+    places: int = Field(4, ge=2, le=1000, description="Number of random waypoints, evenly spaced in time.")
 
 
 CameraSpec = Annotated[CameraPath | CameraOrbit | CameraHemisphere | CameraWalk, Field(discriminator="kind")]

@@ -1,4 +1,4 @@
-"""Keys of a scene file about light sources."""
+"""Keys of the scene file for light sources."""
 
 from __future__ import annotations
 
@@ -29,50 +29,58 @@ ConeAngle = Annotated[float, Field(gt=0, lt=90)]
 
 
 class LightDraw(StrictModel):
-    """What of a light is drawn, from ranges ``[low, high]`` of which each end is written as the light's own key is.
+    """Ranges ``[low, high]`` of random values of a light. Each end of a range has the form of the light's own key.
 
-    Values are uniform in their range and independent of each other, components of positions, targets and sizes too. A
-    light's own value of a key that is drawn counts for nothing.
+    Values are uniform in their range and independent of each other. This includes the components of positions, targets
+    and sizes. A drawn value replaces the light's own value of the same key.
     """
 
-    vary: Vary = Field("layout", description="Whether values are drawn once for a layout, or anew for every frame.")
+    vary: Vary = Field("layout", description="``layout`` draws values once per layout, ``frame`` anew for every frame.")
     count: CountRange = Field(
-        (1, 1), description="How many such lights there are, each drawn for itself: a number or an inclusive range."
+        (1, 1),
+        description="Number of such lights, a number or an inclusive range. The values of each light are drawn "
+        "independently.",
     )
-    position: Vec3Range | None = Field(None, description="Opposite corners of a box [m].")
+    position: Vec3Range | None = Field(None, description="Opposite corners of a box that contains the position [m].")
     distance: PositiveRange | None = Field(
         None,
-        description="Distance from ``around`` [m], at an azimuth and elevation that are uniform by area on the sphere; "
-        "instead of a position.",
+        description="Distance from ``around`` [m], in place of ``position``. The direction is uniform by area on the "
+        "part of the sphere that ``azimuth`` and ``elevation`` select.",
     )
-    azimuth: Range = Field((0.0, 360.0), description="0 along +x, counter-clockwise from above [degrees].")
-    elevation: ElevationRange = Field((15.0, 85.0), description="Above the horizon [degrees].")
+    azimuth: Range = Field(
+        (0.0, 360.0), description="Azimuth, 0 along +x, counter-clockwise seen from above [degrees]."
+    )
+    elevation: ElevationRange = Field((15.0, 85.0), description="Elevation above the horizon [degrees].")
     around: Vec3 | None = Field(
-        None, description="Where distances are from [m]; the light's target if absent, or else the origin."
+        None,
+        description="Point from which ``distance`` is measured [m]. If absent, the target of the light, or the "
+        "origin if the light has no target.",
     )
-    target: Vec3Range | None = Field(None, description="Opposite corners of a box that it faces a point of [m].")
+    target: Vec3Range | None = Field(None, description="Opposite corners of a box that contains the target [m].")
     size: SizeRange | None = Field(None, description="Width and height [m].")
     cone: Annotated[tuple[ConeAngle, ConeAngle], AfterValidator(ordered)] | None = Field(
         None, description="Half angle of the cone [degrees]."
     )
-    radiance: PositiveRange | None = Field(None, description="Radiance [W/(m^2 sr)], or the factor on an image.")
+    radiance: PositiveRange | None = Field(
+        None, description="Radiance [W/(m^2 sr)], or the factor on an environment image."
+    )
     intensity: PositiveRange | None = Field(None, description="Radiant intensity [W/sr].")
     temperature: KelvinRange | None = Field(None, description="Temperature of the black body [K], uniform in 1/K.")
     colour: tuple[EmittedColour, EmittedColour] | None = Field(
-        None, description="Colours between these two, on the straight line from one to the other."
+        None, description="Two colours. The drawn colour lies on the straight line between them."
     )
-    rotate_z: Range | None = Field(None, description="Rotation about the vertical [degrees].")
+    rotate_z: Range | None = Field(None, description="Rotation about the vertical axis [degrees].")
 
 
 _OF_DRAWS = frozenset({"vary", "count", "distance", "azimuth", "elevation", "around"})
-"""Keys of a draw that are none of a light's."""
+"""Keys of a draw that lights themselves do not have."""
 
 
 class DrawnLight(StrictModel):
-    """What lights of all kinds have."""
+    """Keys that all kinds of lights have."""
 
     draw: LightDraw | None = Field(
-        None, exclude_if=lambda draw: draw is None, description="Values that are drawn instead of stated."
+        None, exclude_if=lambda draw: draw is None, description="Ranges of values that are drawn at random."
     )
 
     @model_validator(mode="after")
@@ -94,16 +102,20 @@ class DrawnLight(StrictModel):
 
     @property
     def sure(self) -> bool:
-        """Whether there is one in every frame."""
+        """True if every frame has at least one such light."""
         return self.draw is None or self.draw.count[0] > 0
 
 
 class LightKey(StrictModel):
-    """State of a light at one time of its path; what is absent stays as the light itself has it."""
+    """State of a light at one time of its path. Absent values are those of the light itself."""
 
     position: Vec3 | None = Field(None, description="Position [m].")
-    intensity: Positive | None = Field(None, description="Intensity [W/sr], or an area light's radiance [W/(m^2 sr)].")
-    temperature: Kelvin | None = Field(None, description="Colour temperature [K]; needs that of the light.")
+    intensity: Positive | None = Field(
+        None, description="Intensity [W/sr], or the radiance of an area light [W/(m^2 sr)]."
+    )
+    temperature: Kelvin | None = Field(
+        None, description="Colour temperature [K]. Requires ``temperature`` of the light."
+    )
 
     @model_validator(mode="after")
     def _check(self) -> LightKey:
@@ -113,22 +125,22 @@ class LightKey(StrictModel):
 
 
 class LocalLight(DrawnLight):
-    """What every light at a place has."""
+    """Keys of lights with a position."""
 
-    position: Vec3 = Field((0, 0, 0), description="Position [m]; required where it is not drawn.")
+    position: Vec3 = Field((0, 0, 0), description="Position [m]. Required unless it is drawn.")
     colour: EmittedColour = (1, 1, 1)
     temperature: Kelvin | None = Field(
-        None, description="Temperature of the black body whose colour multiplies that of the light [K]."
+        None, description="Temperature of a black body [K]. Its colour multiplies the colour of the light."
     )
     path: tuple[LightKey, ...] = Field(
         (),
-        description="Keys evenly spaced over a layout's views, linear in between (temperatures in 1/K); "
-        "empty for a light at rest.",
+        description="Key states, evenly spaced over the views of a layout. Values in between are interpolated "
+        "linearly, temperatures in 1/K. Empty for a static light.",
     )
 
     @property
     def moved(self) -> bool:
-        """Whether its position is drawn."""
+        """True if the position is drawn."""
         return self.draw is not None and (self.draw.position is not None or self.draw.distance is not None)
 
     @model_validator(mode="after")
@@ -146,9 +158,9 @@ class LocalLight(DrawnLight):
 
 
 class AimedLight(LocalLight):
-    """What every light that faces something has."""
+    """Keys of lights with a target."""
 
-    target: Vec3 = Field((0, 0, 0), description="Point that it faces [m].")
+    target: Vec3 = Field((0, 0, 0), description="Point that the light faces [m].")
 
     @model_validator(mode="after")
     def _check(self) -> AimedLight:
@@ -161,47 +173,47 @@ class AimedLight(LocalLight):
 
 
 class AreaLight(AimedLight):
-    """A rectangle that emits from the face turned to its target."""
+    """Rectangle that emits light from the face towards its target."""
 
-    kind: Literal["area"] = Field("area", description="A rectangle.")
+    kind: Literal["area"] = Field("area", description="Rectangular area light.")
     size: tuple[Positive, Positive] = Field((0.5, 0.5), description="Width and height [m].")
     radiance: Positive = Field(10.0, description="Emitted radiance [W/(m^2 sr)].")
 
 
 class SpotLight(AimedLight):
-    """A point that emits into a cone."""
+    """Point that emits light into a cone."""
 
-    kind: Literal["spot"] = Field("spot", description="A cone.")
+    kind: Literal["spot"] = Field("spot", description="Spot light.")
     cone: ConeAngle = Field(30.0, description="Half angle of the cone [degrees].")
     intensity: Positive = Field(10.0, description="Radiant intensity [W/sr].")
 
 
 class PointLight(LocalLight):
-    """A point that emits in all directions."""
+    """Point that emits light in all directions."""
 
-    kind: Literal["point"] = Field("point", description="A point.")
+    kind: Literal["point"] = Field("point", description="Point light.")
     intensity: Positive = Field(10.0, description="Radiant intensity [W/sr].")
 
 
 class EnvironmentLight(DrawnLight):
-    """A constant sky, or an equirectangular image of it (z up)."""
+    """Environment light of constant radiance, or from an equirectangular image (z up)."""
 
-    kind: Literal["environment"] = Field("environment", description="A sky all around.")
+    kind: Literal["environment"] = Field("environment", description="Environment light from all directions.")
     radiance: Positive = Field(1.0, description="Radiance [W/(m^2 sr)], or the factor on the image.")
     colour: EmittedColour = (1, 1, 1)
     image: str | None = Field(None, description="HDR or EXR file, relative to the scene file.")
     pool: str | tuple[str, ...] | None = Field(
         None,
         exclude_if=lambda pool: pool is None,
-        description="Such files of which each layout has one, also where all else is drawn anew for every frame; or a "
-        "folder, or a pattern such as ``skies/*``, of which the images are taken, by name.",
+        description="List of HDR or EXR files, a folder, or a pattern such as ``skies/*``, whose images are sorted "
+        "by name. Each layout draws one image, even if other values vary from frame to frame.",
     )
     weights: tuple[Positive, ...] = Field(
         (),
         exclude_if=lambda weights: not weights,
-        description="How often each of the pool is drawn, relative to the others; alike if absent.",
+        description="Relative probabilities of the images of the pool. All are equally probable if absent.",
     )
-    rotate_z: float = Field(0.0, description="Rotation about the vertical [degrees].")
+    rotate_z: float = Field(0.0, description="Rotation about the vertical axis [degrees].")
 
     @model_validator(mode="after")
     def _check(self) -> EnvironmentLight:
@@ -218,35 +230,40 @@ class EnvironmentLight(DrawnLight):
         return self
 
     def check_weights(self, members: int) -> None:
-        """Refuse weights of another number than the pool's members."""
+        """Check that there is one weight per member of the pool, or none."""
         check_weights(self.weights, members, "images")
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Images that it shows; a loaded scene has no pattern, but what it matched."""
+        """Names of the image files. In a loaded scene, a pattern has been replaced by the files that it matched."""
         if self.image is not None:
             return (self.image,)
         return self.pool if isinstance(self.pool, tuple) else ()
 
 
 class RoomLight(StrictModel):
-    """A window and lamps: the light of a room, as one layout after the other might be lit.
+    """Random light of a room: a window, lamps, and light reflected by walls.
 
-    It stands for three other entries, by which the manifest states what was drawn, of a room that is ``size`` wide. A
-    window: an area light 12 to 35 degrees above the horizon, at 0.35 to 0.6 of the size from ``around`` in any
-    direction, of 0.2 by 0.25 to 0.45 by 0.4 of the size, of 5000 to 8000 K and a radiance of 3 to 10. Lamps: area
-    lights 50 to 85 degrees above the horizon at the same distances, of 0.05 by 0.05 to 0.15 by 0.35 of the size, of
-    2700 to 5000 K and 8 to 30. And what walls reflect: an environment light of 0.1 to 0.4, white to warm.
+    It expands to three entries, and the manifest states the values that were drawn for them. Distances and sizes are
+    relative to the width ``size`` of the room; distances are measured from ``around``, in any direction.
+
+    * Window: an area light 12 to 35 degrees above the horizon, at a distance of 0.35 to 0.6. Its size is 0.2 x 0.25 to
+      0.45 x 0.4, its temperature 5000 to 8000 K, its radiance 3 to 10.
+    * Lamps: area lights 50 to 85 degrees above the horizon, at the same distances. Their size is 0.05 x 0.05 to
+      0.15 x 0.35, their temperature 2700 to 5000 K, their radiance 8 to 30.
+    * Walls: an environment light with a radiance of 0.1 to 0.4 and a colour from white to warm white.
     """
 
-    kind: Literal["room"] = Field("room", description="A window and lamps.")
-    around: Vec3 = Field((0, 0, 0), description="What they light [m].")
+    kind: Literal["room"] = Field("room", description="Window, lamps and light reflected by walls.")
+    around: Vec3 = Field((0, 0, 0), description="Centre of the lit area [m].")
     size: Positive = Field(4.0, description="Width of the room [m].")
-    lamps: CountRange = Field((1, 3), description="How many lamps: a number or an inclusive range.")
-    vary: Vary = Field("layout", description="Whether all of it is drawn once for a layout, or anew for every frame.")
+    lamps: CountRange = Field((1, 3), description="Number of lamps, a number or an inclusive range.")
+    vary: Vary = Field(
+        "layout", description="``layout`` draws all values once per layout, ``frame`` anew for every frame."
+    )
 
     def written_out(self) -> tuple[AreaLight, AreaLight, EnvironmentLight]:
-        """The entries that it stands for."""
+        """Return the three entries that the room expands to: window, lamps and walls."""
 
         def place(elevation: tuple[float, float]) -> dict[str, Any]:
             return {"vary": self.vary, "distance": (0.35 * self.size, 0.6 * self.size), "elevation": elevation}
@@ -273,7 +290,7 @@ class RoomLight(StrictModel):
 
 
 LightSpec = AreaLight | SpotLight | PointLight | EnvironmentLight
-"""A light as frames have it."""
+"""Light of a frame."""
 
 LightEntry = Annotated[LightSpec | RoomLight, Field(discriminator="kind")]
-"""An entry of the scene file."""
+"""Entry of ``lights`` in the scene file."""

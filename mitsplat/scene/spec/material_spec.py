@@ -1,4 +1,4 @@
-"""Keys of a scene file about what visible shapes are made of, and what is behind everything."""
+"""Keys of the scene file for materials of visible shapes and for the background."""
 
 from __future__ import annotations
 
@@ -9,86 +9,88 @@ from pydantic import AfterValidator, Field
 from mitsplat.storage.field_types import PositiveRange, Range, StrictModel, UnitRange, ordered
 
 Share = Annotated[float, Field(gt=0, le=1)]
-Turn = Annotated[Range, Field(description="Rotation of the pattern on the surface [degrees], drawn from this range.")]
+Turn = Annotated[Range, Field(description="Range of rotations of the pattern on the surface [degrees].")]
 
 
 class _Coloured(StrictModel):
-    hue: Range = Field((0, 360), description="Hue [degrees], drawn from this range; beyond 360 it goes on from 0.")
-    saturation: UnitRange = Field((0, 0.6), description="Saturation (HSV, of sRGB-encoded colours), drawn likewise.")
-    value: UnitRange = Field((0.2, 0.9), description="Value (HSV, of sRGB-encoded colours), drawn likewise.")
+    hue: Range = Field((0, 360), description="Range of hues [degrees]. Values beyond 360 wrap around.")
+    saturation: UnitRange = Field((0, 0.6), description="Range of saturations (HSV of sRGB-encoded colours).")
+    value: UnitRange = Field((0.2, 0.9), description="Range of values (HSV of sRGB-encoded colours).")
 
 
 class _Patterned(_Coloured):
     contrast: UnitRange = Field(
-        (0.1, 0.5), description="How much darker the second colour is than the first, a share of its value, drawn."
+        (0.1, 0.5),
+        description="Range of contrasts: 1 minus the ratio of the HSV value of the second colour to that of the first.",
     )
-    scale: PositiveRange = Field((0.02, 0.1), description="Size of the pattern's largest features [m], drawn.")
+    scale: PositiveRange = Field((0.02, 0.1), description="Range of sizes of the largest features of the pattern [m].")
     rotate: Turn = (0, 360)
 
 
 class ColourMaterial(_Coloured):
-    """One diffuse colour."""
+    """Diffuse material of one colour."""
 
-    kind: Literal["colour"] = Field("colour", description="One colour.")
+    kind: Literal["colour"] = Field("colour", description="Uniform colour.")
 
 
 class NoiseMaterial(_Patterned):
-    """Diffuse, two colours in clouds of all sizes: concrete, stone, stained cloth."""
+    """Diffuse material with multi-scale noise of two colours, such as concrete, stone or stained cloth."""
 
-    kind: Literal["noise"] = Field("noise", description="Clouds of two colours.")
+    kind: Literal["noise"] = Field("noise", description="Noise of two colours.")
 
 
 class WoodMaterial(_Patterned):
-    """Diffuse, bent lines of grain along one direction."""
+    """Diffuse material with curved grain lines along one direction."""
 
-    kind: Literal["wood"] = Field("wood", description="Grain.")
-    hue: Range = Field((18, 38), description="Hue [degrees], drawn.")
-    saturation: UnitRange = Field((0.3, 0.65), description="Saturation, drawn.")
-    value: UnitRange = Field((0.35, 0.85), description="Value, drawn.")
-    scale: PositiveRange = Field((0.01, 0.03), description="Distance of the lines of grain [m], drawn.")
+    kind: Literal["wood"] = Field("wood", description="Wood grain.")
+    hue: Range = Field((18, 38), description="Range of hues [degrees].")
+    saturation: UnitRange = Field((0.3, 0.65), description="Range of saturations.")
+    value: UnitRange = Field((0.35, 0.85), description="Range of values.")
+    scale: PositiveRange = Field((0.01, 0.03), description="Range of distances between grain lines [m].")
 
 
 class BrushedMetalMaterial(_Patterned):
-    """Metal with scratches along one direction. It is path traced, which takes longer than all diffuse materials."""
+    """Metal with scratches along one direction. It is path traced, which takes longer than diffuse materials."""
 
-    kind: Literal["brushed_metal"] = Field("brushed_metal", description="Metal with scratches.")
-    hue: Range = Field((20, 230), description="Hue [degrees], drawn.")
-    saturation: UnitRange = Field((0, 0.08), description="Saturation, drawn.")
-    value: UnitRange = Field((0.7, 0.9), description="Value, drawn.")
-    contrast: UnitRange = Field((0.03, 0.15), description="How much darker scratches are, drawn.")
-    scale: PositiveRange = Field((0.05, 0.2), description="Length of scratches [m], drawn.")
+    kind: Literal["brushed_metal"] = Field("brushed_metal", description="Brushed metal.")
+    hue: Range = Field((20, 230), description="Range of hues [degrees].")
+    saturation: UnitRange = Field((0, 0.08), description="Range of saturations.")
+    value: UnitRange = Field((0.7, 0.9), description="Range of values.")
+    contrast: UnitRange = Field((0.03, 0.15), description="Range of contrasts of the scratches.")
+    scale: PositiveRange = Field((0.05, 0.2), description="Range of lengths of the scratches [m].")
     roughness: UnitRange = Field(
-        (0.15, 0.35), description="Roughness (GGX) across the scratches, drawn; along them it is a third of that."
+        (0.15, 0.35),
+        description="Range of GGX roughness across the scratches. The roughness along them is a third of it.",
     )
 
 
 class CheckerMaterial(_Patterned):
-    """Diffuse squares of two colours."""
+    """Diffuse checkerboard of two colours."""
 
-    kind: Literal["checker"] = Field("checker", description="Squares.")
-    contrast: UnitRange = Field((0.3, 0.9), description="How much darker every second square is, drawn.")
-    scale: PositiveRange = Field((0.02, 0.2), description="Edge of a square [m], drawn.")
+    kind: Literal["checker"] = Field("checker", description="Checkerboard.")
+    contrast: UnitRange = Field((0.3, 0.9), description="Range of contrasts between neighbouring squares.")
+    scale: PositiveRange = Field((0.02, 0.2), description="Range of edge lengths of a square [m].")
 
 
 class StripesMaterial(_Patterned):
-    """Diffuse, straight bands side by side, each darker towards one edge: slats, planks, corrugated sheet."""
+    """Diffuse parallel bands, each darker towards one edge, such as slats, planks or corrugated sheet."""
 
-    kind: Literal["stripes"] = Field("stripes", description="Bands.")
-    contrast: UnitRange = Field((0.2, 0.7), description="How much darker a band's edge is, drawn.")
-    scale: PositiveRange = Field((0.02, 0.12), description="Width of a band [m], drawn.")
+    kind: Literal["stripes"] = Field("stripes", description="Stripes.")
+    contrast: UnitRange = Field((0.2, 0.7), description="Range of contrasts between a band and its dark edge.")
+    scale: PositiveRange = Field((0.02, 0.12), description="Range of widths of a band [m].")
 
 
 class ImageMaterial(StrictModel):
-    """Diffuse, an image side by side with itself."""
+    """Diffuse material with a repeated image."""
 
-    kind: Literal["image"] = Field("image", description="An image.")
+    kind: Literal["image"] = Field("image", description="Image texture.")
     images: str | tuple[str, ...] = Field(
-        description="Image file, folder of images, pattern such as ``textures/*.jpg``, or a list of files, relative to "
-        "the scene file; of several, one is drawn."
+        description="Image file, folder of images, pattern such as ``textures/*.jpg``, or list of files, relative to "
+        "the scene file. Of several images, one is drawn."
     )
-    scale: PositiveRange = Field((0.3, 1.0), description="Width of the image on the surface [m], drawn.")
+    scale: PositiveRange = Field((0.3, 1.0), description="Range of widths of the image on the surface [m].")
     rotate: Turn = (0, 360)
-    gain: PositiveRange = Field((1.0, 1.0), description="Factor on the image's linear colours, drawn.")
+    gain: PositiveRange = Field((1.0, 1.0), description="Range of factors on the linear colours of the image.")
 
 
 Material = Annotated[
@@ -104,17 +106,20 @@ Material = Annotated[
 
 
 class Background(StrictModel):
-    """Images behind everything, which are seen where nothing of the scene is: in no label, and no source of light."""
+    """Images behind the scene. They are visible where a ray hits nothing, have no label and emit no light."""
 
     images: str | tuple[str, ...] = Field(
-        description="Folder of images, pattern such as ``photos/*.jpg``, or a list of files, relative to the scene "
-        "file, one of which is drawn."
+        description="Folder of images, pattern such as ``photos/*.jpg``, or list of files, relative to the scene "
+        "file. One of the images is drawn."
     )
-    per: Literal["frame", "layout"] = Field("frame", description="Whether each image or each layout draws one.")
+    per: Literal["frame", "layout"] = Field(
+        "frame", description="``frame`` draws an image for every frame, ``layout`` once per layout."
+    )
     crop: Annotated[tuple[Share, Share], AfterValidator(ordered)] = Field(
         (0.5, 1.0),
-        description="Size of what is shown of it, relative to the largest part that has the picture's proportions, "
-        "drawn.",
+        description="Range of sizes of the crop, relative to the largest crop with the aspect ratio of the output.",
     )
-    rotate: Range = Field((-15, 15), description="Rotation [degrees], drawn; turned parts stay inside of the image.")
-    gain: PositiveRange = Field((0.7, 1.3), description="Factor on its linear colours, drawn.")
+    rotate: Range = Field(
+        (-15, 15), description="Range of rotations of the crop [degrees]. A rotated crop stays inside the image."
+    )
+    gain: PositiveRange = Field((0.7, 1.3), description="Range of factors on the linear colours of the image.")

@@ -1,4 +1,4 @@
-"""Files that a scene specification names: their keys and paths."""
+"""Keys and paths of the files that a scene specification names."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from mitsplat.storage.yaml_input import KeyPath
 
 
 def object_assets(spec: SceneSpec) -> Iterator[tuple[KeyPath, str, ObjectSpec]]:
-    """Key, folder and entry of every asset that is named for objects."""
+    """Yield key, folder and entry of every asset of the objects."""
     for position, entry in enumerate(spec.objects):
         for number, name in enumerate(entry.names):
             keys = ("asset",) if entry.asset is not None else ("pool", number)
@@ -20,14 +20,14 @@ def object_assets(spec: SceneSpec) -> Iterator[tuple[KeyPath, str, ObjectSpec]]:
 
 
 def environments(spec: SceneSpec) -> list[tuple[KeyPath, str]]:
-    """Key and folder of every environment."""
+    """Return key and folder of every environment."""
     if isinstance(spec.environment, str):
         return [(("environment",), spec.environment)]
     return [(("environment", number), name) for number, name in enumerate(spec.environment or ())]
 
 
 def light_images(spec: SceneSpec) -> Iterator[tuple[KeyPath, str]]:
-    """Key and file of every image that is named for lights."""
+    """Yield key and file of every image of the lights."""
     for position, light in enumerate(spec.lights):
         if isinstance(light, EnvironmentLight):
             for number, name in enumerate(light.names):
@@ -35,7 +35,10 @@ def light_images(spec: SceneSpec) -> Iterator[tuple[KeyPath, str]]:
 
 
 def image_lists(spec: SceneSpec) -> Iterator[tuple[KeyPath, str | tuple[str, ...]]]:
-    """Key and names of the images that materials and the background draw from; a loaded scene has no patterns."""
+    """Yield key and names of the images of each material and of the background.
+
+    The specification of a loaded scene contains no patterns.
+    """
     for position, shape in enumerate(spec.shapes):
         for number, material in enumerate(shape.materials):
             if isinstance(material, ImageMaterial):
@@ -50,7 +53,7 @@ def image_lists(spec: SceneSpec) -> Iterator[tuple[KeyPath, str | tuple[str, ...
 
 
 def named_images(spec: SceneSpec) -> Iterator[tuple[KeyPath, str]]:
-    """Key and file of every image that is named."""
+    """Yield key and file of every image that the specification names."""
     yield from light_images(spec)
     for keys, images in image_lists(spec):
         yield from ((keys, name) for name in ([images] if isinstance(images, str) else images))

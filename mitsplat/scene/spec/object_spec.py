@@ -1,4 +1,4 @@
-"""Keys of a scene file about objects: which lie there, and how they come to rest."""
+"""Keys of the scene file for objects: assets, counts, and how they come to rest."""
 
 from __future__ import annotations
 
@@ -39,105 +39,112 @@ Arrangement = Literal["drop", "pile", "scatter", "stack", "upright", "tower", "p
 
 
 class ObjectPose(StrictModel):
-    """Where an object starts."""
+    """Initial pose of an object."""
 
-    position: Vec3 = Field(description="Origin of the asset [m].")
+    position: Vec3 = Field(description="Position of the origin of the asset [m].")
     rotate: Vec3 = Field((0, 0, 0), description="Euler angles about the fixed axes x, y, z, in this order [degrees].")
 
 
 PRIMITIVES = "primitives"
-"""The pool that needs no folder, see :mod:`mitsplat.scene.loading.primitives`."""
+"""Name of the built-in pool, see :mod:`mitsplat.scene.loading.primitives`."""
 
 NUM_PRIMITIVES = 15
 
 MAIN = "main"
-"""What the region is called that the key ``region`` states."""
+"""Name of the region that the key ``region`` defines."""
 
 SIZES = 5
-"""How many sizes a range of scales has, evenly spaced in ratio: each is a rigid model of its own in every format."""
+"""Number of sizes in a range of scales, evenly spaced in ratio. Every format treats each size as a separate rigid
+model.
+"""
 
 
 class AppearanceRanges(StrictModel):
-    """Ranges from which each object's appearance is drawn, once for a layout, uniformly and each for itself.
+    """Ranges of the appearance of objects. Values are uniform and drawn once per layout, independently for each object.
 
-    Colours change as reflectances do: in linear light, from all directions alike. Nothing becomes brighter than white
-    that was not captured so. What is absent stays as it was captured.
+    Colours change as reflectances do: in linear light, equally for all directions. No colour becomes brighter than
+    white
+    unless it was captured so. Absent keys leave the captured appearance unchanged.
     """
 
     hue: HueRange = Field((0.0, 0.0), description="Rotation of colours about the grey axis [degrees].")
     saturation: SaturationRange = Field(
-        (1.0, 1.0), description="Factor on the distance from the grey of the same luminance."
+        (1.0, 1.0), description="Factor on the distance of a colour from the grey of equal luminance."
     )
     value: ValueRange = Field((1.0, 1.0), description="Factor on the reflectance.")
     gain: GainRange = Field(
         (1.0, 1.0),
-        description="Factors on red, green and blue, each drawn for itself: another capture's white balance.",
+        description="Factors on red, green and blue, drawn independently. They model the white balance of another "
+        "capture.",
     )
     roughness: RoughnessRange | None = Field(
-        None, description="GGX roughness of the highlight, instead of the asset's own."
+        None, description="GGX roughness of the highlight. The value of the asset if absent."
     )
     specular: UnitRange | None = Field(
-        None, description="Specular reflectance at normal incidence, instead of the asset's own."
+        None, description="Specular reflectance at normal incidence. The value of the asset if absent."
     )
     wear: UnitRange = Field(
         (0.0, 0.0),
-        description="Share of its light that dirt takes where it is thickest, about a third of the surface, in patches "
-        "that lie elsewhere on every object.",
+        description="Share of light that dirt absorbs where it is thickest. Dirt covers about a third of the "
+        "surface, in patches that differ from object to object.",
     )
 
 
 class ObjectSpec(StrictModel):
-    """Objects of one asset, or of a pool that each layout draws from."""
+    """Objects of one asset, or of a pool from which each layout draws."""
 
-    asset: str | None = Field(None, description="Asset folder, relative to the scene file; this or ``pool``.")
+    asset: str | None = Field(
+        None, description="Asset folder, relative to the scene file. An entry has either ``asset`` or ``pool``."
+    )
     pool: str | tuple[str, ...] | None = Field(
         None,
         exclude_if=lambda pool: pool is None,
-        description="Asset folders that every object of the entry is drawn from, or a pattern such as ``assets/*`` "
-        "that takes the objects among the folders that it matches, by name. Or ``primitives``: "
-        f"{NUM_PRIMITIVES} boxes, cylinders, spheres, capsules and cones of 25 to 60 mm in random materials, which the "
-        "seed decides and no folder holds.",
+        description="List of asset folders, or a pattern such as ``assets/*``, which selects the objects among the "
+        "matching folders, sorted by name. Each object of the entry draws one asset. Or ``primitives``: "
+        f"{NUM_PRIMITIVES} boxes, cylinders, spheres, capsules and cones of 25 to 60 mm with random "
+        "materials. The seed determines the primitives; they need no folder.",
     )
-    count: CountRange = Field((1, 1), description="How many in each layout: a number or an inclusive range.")
+    count: CountRange = Field((1, 1), description="Number of objects per layout, a number or an inclusive range.")
     weights: tuple[Positive, ...] = Field(
         (),
         exclude_if=lambda weights: not weights,
-        description="How often each of the pool is drawn, relative to the others; alike if absent.",
+        description="Relative probabilities of the assets of the pool. All are equally probable if absent.",
     )
     balance: bool = Field(
         False,
         exclude_if=lambda balance: not balance,
-        description="Whether classes of the pool are dealt out in turn, so that in each split none is ahead of another "
-        "by more than one; weights then choose within a class.",
+        description="Draws the classes of the pool in turn, so that within each split the counts of any two classes "
+        "differ by at most one. Weights then apply within a class.",
     )
     label: bool = Field(
         True,
         exclude_if=lambda label: label,
-        description="Whether it is labelled. What is not hides, shadows and pushes what is, and is in no label file.",
+        description="The objects are labelled. An object without a label still occludes, shadows and pushes other "
+        "objects, but is in no label file.",
     )
-    size: Positive | None = Field(None, description="Longest extent [m], for an asset of unknown units only.")
+    size: Positive | None = Field(None, description="Longest extent [m]. Only for an asset of unknown units.")
     scale: Scale = Field(
         1.0,
-        description="Uniform scale applied to the asset, its mass with its volume; or a range, of which each object "
-        f"has one of {SIZES} sizes evenly spaced in ratio.",
+        description="Uniform scale of the asset. The mass scales with the volume. With a range, each object has one "
+        f"of {SIZES} sizes, evenly spaced in ratio.",
     )
-    class_name: Name | None = Field(None, description="Class to label it as, if not the asset's own.")
+    class_name: Name | None = Field(None, description="Class name of the labels. The class of the asset if absent.")
     region: str | tuple[str, ...] | None = Field(
         None,
         exclude_if=lambda region: region is None,
-        description="Name of the region that it starts in, or of several that each object is drawn among by floor "
-        f"area; all if absent. The one of the key ``region`` is called ``{MAIN}``.",
+        description="Name of the region in which objects start, or a list of names. Each object draws one of them by "
+        f"floor area. All regions if absent. The region of the key ``region`` has the name ``{MAIN}``.",
     )
     poses: tuple[ObjectPose, ...] = Field(
-        (), description="Where each starts, instead of count; from there it settles like the others."
+        (), description="Initial pose of each object, in place of ``count``. From there, objects settle as usual."
     )
 
-    # Not shown, because layouts are known by what entries show, and none depends on how objects look.
+    # ``appearance`` is not in the repr, because layouts are identified by the repr of entries and do not depend on it.
     appearance: AppearanceRanges | None = Field(
         None,
         repr=False,
         exclude_if=lambda appearance: appearance is None,
-        description="How much one object looks other than the next.",
+        description="Ranges of the differences in appearance between objects.",
     )
 
     @model_validator(mode="after")
@@ -162,17 +169,20 @@ class ObjectSpec(StrictModel):
         return self
 
     def check_weights(self, members: int) -> None:
-        """Refuse weights of another number than the pool's members."""
+        """Check that there is one weight per member of the pool, or none."""
         check_weights(self.weights, members, "assets")
 
     @property
     def most(self) -> int:
-        """The most objects of it that a layout can have."""
+        """Maximum number of objects of the entry in a layout."""
         return len(self.poses) or self.count[1]
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Asset folders, or primitives, that it draws from; a loaded scene has no pattern, but what it matched."""
+        """Names of the asset folders or primitives.
+
+        In a loaded scene, a pattern has been replaced by the folders that it matched.
+        """
         if self.asset is not None:
             return (self.asset,)
         if self.pool == PRIMITIVES:
@@ -181,49 +191,60 @@ class ObjectSpec(StrictModel):
 
     @property
     def scales(self) -> tuple[float, ...]:
-        """Scales that each of them comes in."""
+        """Scales of the objects of the entry."""
         if isinstance(self.scale, tuple):
             return tuple(np.geomspace(*self.scale, SIZES).tolist()) if self.scale[0] < self.scale[1] else self.scale[:1]
         return (self.scale,)
 
 
 class Settle(StrictModel):
-    """How objects are laid out and come to rest.
+    """Initial arrangement of objects and simulation until rest.
 
-    ``drop``: random poses in the region. ``pile``: the same above a bin, in a column as high as it takes, poured in at
-    1 m/s. ``scatter``: apart, so that none touches another. ``stack``: all of one asset above one another on their
-    largest face. ``upright``: put down as the asset stands, turned about the vertical. ``tower``: the same, all that
-    start in the region on one another, the widest below. ``packed``: the same side by side, in rows from a corner of
-    the region, by quarter turns that are a little off.
+    * ``drop``: random poses in the region.
+    * ``pile``: random poses above a bin, in a column as high as necessary, poured in at 1 m/s.
+    * ``scatter``: random poses apart from each other, so that no objects touch.
+    * ``stack``: the objects of one asset on top of each other, on their largest face.
+    * ``upright``: upright as the asset is modelled, rotated about the vertical axis.
+    * ``tower``: upright, and all objects that start in the region on top of each other, the widest at the bottom.
+    * ``packed``: upright side by side, in rows from a corner of the region, in slightly inexact quarter turns.
     """
 
     arrangement: Arrangement = Field(
-        "drop", description="Random drop, pile, sparse scatter, stacks, upright, a tower, or packed side by side."
+        "drop",
+        description="Initial arrangement of the objects: random drop, pile, sparse scatter, stacks, upright, a "
+        "tower, or packed side by side.",
     )
     yaw: YawRange | None = Field(
         None,
         exclude_if=lambda yaw: yaw is None,
-        description="Range of turns about the vertical [degrees] of what is put down upright, as a tower or packed, 0 "
-        "as the asset stands: where fronts look. Any turn if absent, quarter turns of what is packed.",
+        description="Range of rotations about the vertical axis [degrees] for the arrangements ``upright``, "
+        "``tower`` and ``packed``. 0 is the orientation of the asset, so the range controls the "
+        "direction of the fronts. If absent, any rotation, or quarter turns for ``packed``.",
     )
     turned_over: Unit = Field(
         0.0,
         exclude_if=lambda share: share == 0,
-        description="Share of what is put down upright, as a tower or packed that stands on another side if it would "
-        "stand so: on its left or right, or its head, its front in front.",
+        description="For the arrangements ``upright``, ``tower`` and ``packed``: share of objects that stand on "
+        "another side, if they are stable on it. The side is left, right or top; the front stays in "
+        "front.",
     )
     max_time: Positive = Field(6.0, description="Simulated time within which a layout must come to rest [s].")
     attempts: int = Field(
-        5, ge=1, description="Draws of poses before what does not come to rest is left out of a layout."
+        5,
+        ge=1,
+        description="Number of draws of poses. Objects that do not come to rest in any of them are left out of the "
+        "layout.",
     )
-    # Not shown, because layouts do not depend on it.
+    # ``incomplete`` is not in the repr, because layouts do not depend on it.
     incomplete: Unit = Field(
         0.2,
         repr=False,
-        description="Share of layouts that may lack objects because they did not come to rest; a dataset of which more "
-        "do ends with an error.",
+        description="Maximum share of layouts that lack objects because these did not come to rest. A dataset with a "
+        "larger share ends with an error.",
     )
     timestep: Positive = Field(0.002, description="Time step of the simulation [s].")
     stepper: Literal["warp", "mujoco"] = Field(
-        "warp", description="Newton's MuJoCo solver on Warp, or MuJoCo in C: double precision and nothing to compile."
+        "warp",
+        description="Physics engine: ``warp`` for the MuJoCo solver of Newton on Warp, ``mujoco`` for MuJoCo in C, "
+        "with double precision and no compilation.",
     )

@@ -1,6 +1,6 @@
-"""The scene file's models: what may be written, in which units, under which rules.
+"""Model of the scene file: keys, units and validation rules.
 
-Lengths are metres, angles degrees, z is up; conventions are those of :mod:`mitsplat.gaussians.splat_cloud`.
+Lengths are in metres, angles in degrees, z is up; for conventions see :mod:`mitsplat.gaussians.splat_cloud`.
 """
 
 from __future__ import annotations
@@ -21,11 +21,13 @@ from mitsplat.storage.field_types import Positive, StrictModel, Unit
 from mitsplat.storage.yaml_input import FieldError, KeyPath
 
 BACKDROP = "backdrop "
-"""How the names of the shapes begin that a backdrop is written out as."""
+"""Prefix of the names of the shapes that a backdrop expands to."""
 
 SCHEMA_VERSION = 1
-"""Goes up when a scene file that was right is refused or means something else. Scene files, which people write, state
-none: what is new to them are keys, and an unknown key is refused by its name."""
+"""Version of the scene schema. It increases when a valid scene file becomes invalid or changes its meaning.
+
+Scene files, which people write, do not state the version: newer features are new keys, and unknown keys are errors.
+"""
 
 FormatName = Literal[
     "yolo",
@@ -52,27 +54,29 @@ FORMATS: tuple[str, ...] = get_args(FormatName)
 
 
 class Output(StrictModel):
-    """What is written."""
+    """Number, size and formats of the images, and the splits."""
 
     width: int = Field(1280, ge=1, le=MOST_PIXELS, description="Image width [px].")
     height: int = Field(720, ge=1, le=MOST_PIXELS, description="Image height [px].")
-    layouts: int = Field(4, ge=1, description="How many times the objects are dropped.")
-    views: int = Field(10, ge=1, description="Images of each layout.")
+    layouts: int = Field(4, ge=1, description="Number of layouts. Each layout is one drop of the objects.")
+    views: int = Field(10, ge=1, description="Number of images per layout.")
     formats: tuple[FormatName, ...] = Field(
-        ("yolo",), min_length=1, description="Label formats, and exr for every layer."
+        ("yolo",), min_length=1, description="Formats of the labels. ``exr`` writes all layers of an image."
     )
     image: Literal["png", "jpg"] = Field("png", description="Image file format.")
     jpeg_quality: int = Field(95, ge=1, le=100, description="Quality of jpg images.")
     validation: Unit = Field(
-        0.2, description="Share of layouts for validation; the second layout is the first of the smaller split."
+        0.2,
+        description="Share of layouts in the validation split. Of the two splits, the smaller one starts with the "
+        "second layout.",
     )
     test: float = Field(
         0.0,
         ge=0,
         lt=1,
         exclude_if=lambda test: test == 0,
-        description="Share of layouts for a test split; the second layout is its first, and the others are parted into "
-        "training and validation.",
+        description="Share of layouts in the test split. The second layout is the first of this split, if the share "
+        "is at most one half. The other layouts are divided into training and validation.",
     )
 
     @model_validator(mode="after")
@@ -83,106 +87,119 @@ class Output(StrictModel):
 
 
 class HoldOut(StrictModel):
-    """What a detector must meet in the test split for the first time."""
+    """Assets and environments that only the test split contains."""
 
     assets: tuple[str, ...] = Field(
-        (), description="Asset folders of objects, as ``objects`` names them, that no other split has."
+        (), description="Asset folders of objects, as ``objects`` names them, that only the test split contains."
     )
     environments: tuple[str, ...] = Field(
-        (), description="Those of several, as ``environment`` names them, that no other split has."
+        (),
+        description="Asset folders of environments, as ``environment`` lists them, that only the test split contains.",
     )
 
 
 class LabelRules(StrictModel):
-    """What is labelled, see :mod:`mitsplat.labels.labels`."""
+    """Rules for labels, see :mod:`mitsplat.labels.labels`."""
 
     source: Literal["splats", "proxies"] = Field(
-        "splats", description="Where masks come from: what the image shows, or the proxy meshes."
+        "splats",
+        description="Source of the masks: ``splats`` for the rendered splats, ``proxies`` for the proxy meshes.",
     )
-    min_pixels: int = Field(16, ge=1, description="Instances with fewer visible pixels are not labelled.")
-    min_fragment: int = Field(8, ge=1, description="Connected parts with fewer pixels are dropped from a mask.")
-    min_visible: Unit = Field(0.05, description="Visible fraction below which an instance is occluded.")
+    min_pixels: int = Field(16, ge=1, description="Instances with fewer visible pixels have no label.")
+    min_fragment: int = Field(
+        8, ge=1, description="Connected parts of a mask with fewer pixels are removed from the mask."
+    )
+    min_visible: Unit = Field(0.05, description="Visible fraction below which an instance counts as occluded.")
     min_agreement: Unit = Field(
-        0.5, description="IoU of the masks by splats and by proxies below which an instance is disagreeing."
+        0.5, description="IoU of the splat mask and the proxy mask below which an instance counts as disagreeing."
     )
     below_threshold: Literal["drop", "mark"] = Field(
-        "mark", description="Whether occluded and disagreeing instances are not labelled, or labelled and marked."
+        "mark",
+        description="Treatment of occluded and disagreeing instances: ``drop`` removes their labels, ``mark`` keeps "
+        "and marks them.",
     )
 
 
 class SceneSpec(StrictModel):
-    """A scene file. Lengths in metres, angles in degrees, z up; paths are relative to the file."""
+    """Scene file. Lengths are in metres, angles in degrees, z is up. Paths are relative to the file."""
 
     name: str = Field(min_length=1, description="Name of the dataset.")
     environment: str | tuple[str, ...] | None = Field(
         None,
-        description="Asset folder of the surroundings, relative to the scene file; or a list of folders, or a pattern "
-        "such as ``assets/cell_*`` that takes the environments among the folders that it matches, by name, of which "
-        "each layout draws one.",
+        description="Asset folder of the environment, relative to the scene file. Or a list of folders, or a pattern "
+        "such as ``assets/cell_*``, which selects the environments among the matching folders, sorted by "
+        "name. Each layout draws one environment.",
     )
     environment_weights: tuple[Positive, ...] = Field(
         (),
         exclude_if=lambda weights: not weights,
-        description="How often each of several environments is drawn, relative to the others; alike if absent.",
+        description="Relative probabilities of the environments. All are equally probable if absent.",
     )
     environment_collides: bool = Field(
         False,
-        description="Whether objects also rest on the environment's mesh, whose convex pieces take minutes to make.",
+        description="Objects also rest on the mesh of the environment. Its convex decomposition takes minutes.",
     )
-    shapes: tuple[Shape, ...] = Field((), description="Tabletop, walls and other things that do not move.")
+    shapes: tuple[Shape, ...] = Field((), description="Static shapes, such as a tabletop or walls.")
     backdrop: Backdrop | None = Field(
         None,
         exclude_if=lambda backdrop: backdrop is None,
-        description="A room around an environment that is only a table, or around shapes.",
+        description="Room around the scene. It is useful if the environment is only a table, or if the scene has "
+        "only shapes.",
     )
     conveyor: Conveyor | None = Field(
         None,
         exclude_if=lambda conveyor: conveyor is None,
-        description="A belt among the shapes that carries objects from view to view of a layout, whose middle shows "
-        "them as they settled.",
+        description="Belt, one of the shapes, that moves objects between the views of a layout. At the middle of the "
+        "run, the objects are where they settled.",
     )
     background: Background | None = Field(
         None,
         exclude_if=lambda background: background is None,
-        description="Images behind everything, instead of grey.",
+        description="Images behind the scene, in place of grey.",
     )
-    objects: tuple[ObjectSpec, ...] = Field((), description="What is dropped and labelled.")
+    objects: tuple[ObjectSpec, ...] = Field((), description="Objects that are dropped and labelled.")
     empty: Unit = Field(
         0.0,
         exclude_if=lambda empty: empty == 0,
-        description="Share of layouts, in each split, that nothing which is labelled lies in.",
+        description="Share of layouts without labelled objects, in each split.",
     )
-    region: Region = Field(description="Where objects are dropped from.")
+    region: Region = Field(description="Region from which objects are dropped.")
     regions: tuple[NamedRegion, ...] = Field(
         (),
         exclude_if=lambda regions: not regions,
-        description="Further regions: other tables, levels of a shelf, bins, the floor.",
+        description="Further drop regions: other tables, shelf levels, bins, the floor.",
     )
     enclosure: Enclosure | None = Field(None, description="Invisible walls around the region.")
-    settle: Settle = Field(Settle(), description="How objects come to rest.")
-    camera: CameraSpec = Field(description="Where images are taken from.")
+    settle: Settle = Field(Settle(), description="Initial arrangement and physics simulation of the objects.")
+    camera: CameraSpec = Field(description="The camera: lens and viewpoints.")
     cameras: tuple[CameraSpec, ...] = Field(
         (),
         exclude_if=lambda cameras: not cameras,
-        description="More cameras: `camera` and these take a layout's views in turn, such as one in a robot's hand "
-        "and one above it; one that is listed twice takes twice as many.",
+        description="Further cameras, such as one on the robot's hand and one above it. ``camera`` and these take "
+        "the views of a layout in turn. A camera that is listed twice takes twice as many views.",
     )
     lights: tuple[LightEntry, ...] = Field((), description="Light sources.")
-    randomise: Randomise = Field(Randomise(), description="What varies from image to image.")
-    composite: Composite = Field(Composite(), description="Shadows, highlights and tone.")
+    randomise: Randomise = Field(Randomise(), description="Ranges of the values that vary between images or layouts.")
+    composite: Composite = Field(Composite(), description="Shadows, highlights, exposure and tone curve.")
     depth_sensor: DepthSensor | None = Field(
         None,
         exclude_if=lambda sensor: sensor is None,
-        description="What measures the depth of the format depth-sensor.",
+        description="Simulated sensor for the format ``depth-sensor``.",
     )
-    labels: LabelRules = Field(LabelRules(), description="What is labelled.")
+    labels: LabelRules = Field(LabelRules(), description="Rules for labels.")
     output: Output = Field(Output(), description="Number, size and formats of the images.")
     hold_out: HoldOut = Field(
-        HoldOut(), exclude_if=lambda held: held == HoldOut(), description="What is in the test split alone."
+        HoldOut(),
+        exclude_if=lambda held: held == HoldOut(),
+        description="Assets and environments that only the test split contains.",
     )
     quality: PresetName = Field("fast", description="Rendering preset.")
-    rendering: Rendering = Field(Rendering(), description="How splats are drawn.")
-    seed: int = Field(0, ge=0, description="Decides, with the frame's index, everything that is random.")
+    rendering: Rendering = Field(
+        Rendering(), description="Options of the splat renderer that do not depend on the preset."
+    )
+    seed: int = Field(
+        0, ge=0, description="Seed of all random values. Seed and frame index together determine a frame."
+    )
 
     @model_validator(mode="after")
     def _check(self) -> SceneSpec:
@@ -229,7 +246,7 @@ class SceneSpec(StrictModel):
         return self
 
     def _check_regions(self) -> None:
-        """Refuse walls above their region, regions that are not told apart or not there, and turns of nothing."""
+        """Check enclosure heights, names of regions, references to regions, and keys that need upright arrangements."""
         stated: list[tuple[tuple[str | int, ...], Region, Enclosure | None]] = [((), self.region, self.enclosure)]
         stated += [(("regions", i), region, region.enclosure) for i, region in enumerate(self.regions)]
         for keys, region, walls in stated:
@@ -255,33 +272,33 @@ class SceneSpec(StrictModel):
 
     @property
     def camera_entries(self) -> tuple[tuple[KeyPath, CameraSpec], ...]:
-        """All cameras, by their keys in the file."""
+        """All cameras, with their keys in the file."""
         return ((("camera",), self.camera), *((("cameras", i), camera) for i, camera in enumerate(self.cameras)))
 
     @property
     def seats(self) -> tuple[tuple[int, int], ...]:
-        """Of each view of a turn its camera's position among all, and 1 if it is the right one of a stereo pair."""
+        """For each view of a turn: index of the camera, and 1 for the right image of a stereo pair, else 0."""
         cameras = enumerate((self.camera, *self.cameras))
         return tuple((number, side) for number, camera in cameras for side in range(2 if camera.stereo else 1))
 
     @property
     def region_names(self) -> tuple[str, ...]:
-        """Names of all regions, the main one first."""
+        """Names of all regions, the main region first."""
         return (MAIN, *(region.name for region in self.regions))
 
     @property
     def all_regions(self) -> tuple[tuple[Region, Arrangement], ...]:
-        """All regions, and how objects are laid out in them."""
+        """All regions with the arrangement of objects in them."""
         usual = self.settle.arrangement
         return ((self.region, usual), *((region, region.arrangement or usual) for region in self.regions))
 
     def regions_of(self, entry: ObjectSpec) -> tuple[int, ...]:
-        """Positions among all regions of those that an entry's objects may start in."""
+        """Return the indices of the regions in which objects of an entry may start."""
         named = (entry.region,) if isinstance(entry.region, str) else entry.region or self.region_names
         return tuple(map(self.region_names.index, named))
 
     def check_environment_weights(self) -> None:
-        """Refuse weights of another number than there are environments."""
+        """Check that there is one weight per environment, or none."""
         count = 1 if isinstance(self.environment, str) else len(self.environment or ())
         if self.environment_weights and len(self.environment_weights) != count:
             text = f"must be as many as there are environments, {count} (got {len(self.environment_weights)})"

@@ -1,4 +1,4 @@
-"""Keys of a scene file about what does not move: shapes, the drop region, the walls around it."""
+"""Keys of the scene file for static geometry: shapes, backdrop, conveyor, drop regions and enclosures."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from mitsplat.storage.yaml_input import FieldError
 
 
 class Box(StrictModel):
-    """A box, its axes along the world's before ``rotate``."""
+    """Box whose axes are those of the world before ``rotate``."""
 
     size: tuple[Positive, Positive, Positive] = Field(description="Full edge lengths [m].")
     position: Vec3 = Field((0, 0, 0), description="Centre [m].")
@@ -21,36 +21,40 @@ class Box(StrictModel):
 
 
 class Bin(StrictModel):
-    """A box without lid, open upwards, that objects fall into."""
+    """Open box without a lid, into which objects fall."""
 
-    size: tuple[Positive, Positive, Positive] = Field(description="Width, depth and height of its inside [m].")
-    position: Vec3 = Field((0, 0, 0), description="Middle of its inner floor [m].")
-    rotate_z: float = Field(0.0, description="Rotation about the vertical [degrees].")
+    size: tuple[Positive, Positive, Positive] = Field(description="Width, depth and height of the interior [m].")
+    position: Vec3 = Field((0, 0, 0), description="Centre of the inner floor [m].")
+    rotate_z: float = Field(0.0, description="Rotation about the vertical axis [degrees].")
     thickness: Positive = Field(0.004, description="Thickness of floor and walls [m].")
 
 
 class Shape(StrictModel):
-    """A box, a bin or a mesh that is rendered, collides or shades."""
+    """Box, bin or mesh that is rendered, collides or shadows."""
 
     name: str = Field(min_length=1, description="Name, unique among the shapes.")
-    box: Box | None = Field(None, description="The shape as a box.")
-    bin: Bin | None = Field(None, description="Or as a bin.")
-    mesh: str | None = Field(None, description="Or as a mesh file, relative to the scene file, in world space [m].")
-    visible: bool = Field(False, description="Whether it is rendered.")
-    collider: bool = Field(True, description="Whether objects rest on it and bounce off it.")
+    box: Box | None = Field(
+        None, description="Geometry: a box. A shape has exactly one of ``box``, ``bin`` and ``mesh``."
+    )
+    bin: Bin | None = Field(None, description="Geometry: an open bin.")
+    mesh: str | None = Field(None, description="Geometry: a mesh file, relative to the scene file, in world space [m].")
+    visible: bool = Field(False, description="The shape is rendered.")
+    collider: bool = Field(True, description="The shape collides with objects.")
     proxy: bool = Field(
         False,
-        description="Whether light is traced against it though it is not rendered: a table that only splats show.",
+        description="Rays of light are traced against the shape although it is not rendered. Use it for a table that "
+        "only the splats show.",
     )
     colour: tuple[Unit, Unit, Unit] = Field((0.6, 0.6, 0.6), description="Diffuse reflectance, sRGB-encoded.")
     materials: tuple[Material, ...] = Field(
         (),
         exclude_if=lambda materials: not materials,
-        description="What it is made of instead of ``colour``, if it is visible: one of these, which each layout draws "
-        "anew with all that is a range of it.",
+        description="Materials of a visible shape, in place of ``colour``. Each layout draws one of them and a value "
+        "from each of its ranges.",
     )
     friction: NonNegativeFloat = Field(
-        0.6, description="Coulomb friction coefficient; what touches has the geometric mean of both sides'."
+        0.6,
+        description="Coulomb friction coefficient. A contact has the geometric mean of the coefficients of both sides.",
     )
 
     @model_validator(mode="after")
@@ -65,11 +69,11 @@ class Shape(StrictModel):
 
 
 class Conveyor(StrictModel):
-    """A belt that runs while images are taken, with all that settled above it."""
+    """Conveyor belt that runs while images are taken and carries all objects that settled above it."""
 
-    belt: str = Field(description="Name of the shape, a box that runs along its own x axis.")
-    speed: float = Field(description="Speed of its surface [m/s]; negative towards -x.")
-    interval: Positive = Field(description="Time from one turn of the cameras to the next [s].")
+    belt: str = Field(description="Name of the belt shape, a box. The belt runs along the x axis of the box.")
+    speed: float = Field(description="Speed of the belt surface [m/s]. Negative towards -x.")
+    interval: Positive = Field(description="Time between two turns of the cameras [s].")
 
     @model_validator(mode="after")
     def _check(self) -> Conveyor:
@@ -79,23 +83,23 @@ class Conveyor(StrictModel):
 
 
 class Backdrop(StrictModel):
-    """Floor and walls around everything, which lights fall on as on visible shapes. What is behind them is hidden."""
+    """Floor and walls around the scene. They are lit like visible shapes and hide everything behind them."""
 
-    size: tuple[Positive, Positive, Positive] = Field(description="Width, depth and height of the room inside [m].")
-    position: Vec3 = Field((0, 0, 0), description="Middle of its floor [m].")
-    rotate_z: float = Field(0.0, description="Rotation about the vertical [degrees].")
+    size: tuple[Positive, Positive, Positive] = Field(description="Inner width, depth and height of the room [m].")
+    position: Vec3 = Field((0, 0, 0), description="Centre of the floor [m].")
+    rotate_z: float = Field(0.0, description="Rotation about the vertical axis [degrees].")
     sides: tuple[Literal["-x", "+x", "-y", "+y"], ...] = Field(
-        ("-x", "+x", "-y", "+y"), description="Sides that have a wall, before the rotation."
+        ("-x", "+x", "-y", "+y"), description="Sides with a wall, before the rotation."
     )
-    ceiling: bool = Field(False, description="Whether it has a ceiling, of the walls' material.")
-    collider: bool = Field(False, description="Whether objects rest on its floor.")
+    ceiling: bool = Field(False, description="Adds a ceiling with the material of the walls.")
+    collider: bool = Field(False, description="Objects can rest on the floor of the room.")
     floor: tuple[Material, ...] = Field(
         (NoiseMaterial(saturation=(0, 0.3), scale=(0.1, 0.5)),),
-        description="Materials, one of which each layout draws for the floor.",
+        description="Materials of the floor. Each layout draws one of them.",
     )
     walls: tuple[Material, ...] = Field(
         (ColourMaterial(saturation=(0, 0.3), value=(0.4, 0.9)),),
-        description="Materials, one of which each layout draws for all walls.",
+        description="Materials of the walls. Each layout draws one of them for all walls.",
     )
 
     @model_validator(mode="after")
@@ -107,7 +111,7 @@ class Backdrop(StrictModel):
 
 
 class Region(StrictModel):
-    """Axis-aligned box from whose inside objects are dropped."""
+    """Axis-aligned box in which objects start before they fall."""
 
     min: Vec3 = Field(description="Lower corner [m].")
     max: Vec3 = Field(description="Upper corner [m].")
@@ -121,27 +125,29 @@ class Region(StrictModel):
 
 
 class Enclosure(StrictModel):
-    """Four invisible walls around the drop region, and a lid on it, that keep objects in.
+    """Four invisible walls around the drop region and a lid on top of it, which keep objects inside.
 
-    A layout in which an object comes to rest against one of them is drawn again.
+    A layout in which an object comes to rest against a wall is drawn again.
     """
 
     margin: NonNegativeFloat | None = Field(
         None,
-        description="Distance of the walls outside the region's sides [m]; if absent the size of the largest object, "
-        "as far as there are colliders to lie on.",
+        description="Distance between the sides of the region and the walls [m]. If absent, the size of the largest "
+        "object, but not beyond the bounds of the colliders.",
     )
-    floor: float = Field(0.0, description="Height of the walls' lower edge [m].")
+    floor: float = Field(0.0, description="Height of the lower edge of the walls [m].")
     thickness: Positive = Field(0.05, description="Thickness of walls and lid [m].")
 
 
 class NamedRegion(Region):
-    """A further region, with a name by which objects are sent there."""
+    """Additional drop region, to which objects refer by its name."""
 
     name: str = Field(min_length=1, description="Name, unique among the regions.")
     enclosure: Enclosure | None = Field(
-        None, description="Invisible walls around it; their ``floor`` is the height of what its objects lie on."
+        None,
+        description="Invisible walls around the region. Their ``floor`` is the height of the surface on which "
+        "objects lie.",
     )
     arrangement: Arrangement | None = Field(
-        None, description="How objects are laid out in it, if not as ``settle.arrangement`` says."
+        None, description="Arrangement of objects in the region. ``settle.arrangement`` if absent."
     )

@@ -87,7 +87,7 @@ class Output(StrictModel):
 
 
 class HoldOut(StrictModel):
-    """Assets and environments that only the test split contains."""
+    """Contents of the test split that no other split has."""
 
     assets: tuple[str, ...] = Field(
         (), description="Asset folders of objects, as ``objects`` names them, that only the test split contains."

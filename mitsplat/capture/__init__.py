@@ -1,8 +1,8 @@
-"""Photographs to cameras, metres and masks.
+"""Conversion of photographs to camera poses, metric scale and object masks.
 
-In: a folder of photographs, with a printed board, poses of another tool, or neither. Out: a :class:`Capture`:
-undistorted photos with their cameras in a metric frame, z up, the points that structure from motion found, and masks
-of the object.
+Input: a folder of photographs, optionally with a printed board in them or with poses of another tool. Output: a
+:class:`Capture` with undistorted photos, their cameras in a metric frame (z up), the points of structure from motion,
+and masks of the object.
 """
 
 from __future__ import annotations

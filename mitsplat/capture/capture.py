@@ -1,7 +1,7 @@
-"""Captures: photographs with their cameras, and the points that these were found from.
+"""Captures: photographs with their cameras, and the points of structure from motion.
 
-A folder holds ``capture.json`` (:class:`CaptureSpec` lists its keys), ``points.npz``, ``images/`` and ``masks/``.
-Cameras and points share the frame of the asset that is to be made of them; conventions are those of
+A capture folder has ``capture.json`` (keys: :class:`CaptureSpec`), ``points.npz``, ``images/`` and ``masks/``. Cameras
+and points are in the frame of the asset that is made from the capture. Conventions are those of
 :mod:`mitsplat.gaussians.splat_cloud`.
 """
 
@@ -31,7 +31,7 @@ from mitsplat.storage.format_version import FORMAT_VERSIONS
 from mitsplat.storage.yaml_input import load_yaml
 
 HELD_OUT_EVERY = 8
-"""One photo in so many, by name, is kept for evaluation (Kerbl et al. 2023, after Mip-NeRF 360)."""
+"""Interval of held-out photos, in the order of names (Kerbl et al. 2023, after Mip-NeRF 360)."""
 
 CAPTURE_FILE = "capture.json"
 _POINTS = "points.npz"
@@ -44,7 +44,7 @@ class _Strict(BaseModel):
 
 
 class PhotoCamera(_Strict):
-    """A camera's keys: those of :class:`~mitsplat.geometry.camera.Camera`."""
+    """Keys of a camera, as in :class:`~mitsplat.geometry.camera.Camera`."""
 
     width: int
     height: int
@@ -59,7 +59,7 @@ class PhotoCamera(_Strict):
 
 
 class PhotoSpec(_Strict):
-    """A photo's keys; files are relative to the folder, ``gain`` is absent where a photo is as it was taken."""
+    """Keys of a photo; file names are relative to the capture folder, and ``gain`` is absent without a correction."""
 
     name: str = Field(min_length=1)
     file: str = Field(min_length=1)
@@ -81,21 +81,20 @@ class CaptureSpec(_Strict):
 
 
 Window = tuple[int, int, int, int]
-"""Part of a photo: left, top, width and height [px]."""
+"""Rectangle in a photo: left, top, width and height [px]."""
 
 
 @dataclass(frozen=True, eq=False)
 class Photo:
-    """One registered photograph.
+    """Registered photograph.
 
     Attributes:
-        name: File name as the user knows it.
-        file: The image, upright as the camera has it.
-        camera: From where and through which lens; its frame is the capture's.
-        mask: 8-bit image of the same size, 255 = object; transparent where another thing may hide the object.
+        name: File name as given by the user.
+        file: Image file, in the orientation of the camera.
+        camera: Camera in the frame of the capture.
+        mask: 8-bit image of the same size, 255 = object; transparent where another thing may occlude the object.
         seen: Indices of the capture's points that this photo observes, shape (K,).
-        gain: What its linear red, green and blue are multiplied by to look as the capture's other photos; None: they
-            are as they are.
+        gain: Factors of linear red, green and blue that match the exposure of the other photos; None for no correction.
     """
 
     name: str
@@ -106,18 +105,22 @@ class Photo:
     gain: tuple[float, float, float] | None = None
 
     def picture(self, scale: float = 1.0, window: Window | None = None) -> tuple[Float32Array, Float32Array | None]:
-        """The photo, display-encoded in [0, 1], shape (H, W, 3), and its mask as alpha, shape (H, W), or None.
-
-        Its exposure is corrected by ``gain``.
+        """Read the photo, with its exposure corrected by ``gain``, and its mask.
 
         Args:
-            scale: Size relative to the camera's, at most 1; pixels are averages over the area they cover. The camera of
-                the picture is ``camera.resized(W, H)``.
-            window: Part of the photo to show, by left, top, width and height [px], inside of it; the camera is then
+            scale: Size relative to the camera, at most 1. Pixels are averages over the area they cover. The camera of
+                the
+                returned picture is ``camera.resized(W, H)``.
+            window: Rectangle of the photo to read: left, top, width and height [px], inside the photo. The camera is
+                then
                 ``camera.cropped(*window).resized(W, H)``.
 
+        Returns:
+            Display-encoded colours in [0, 1], shape (H, W, 3), and the mask as alpha, shape (H, W), or None without a
+            mask.
+
         Raises:
-            InputError: If a file cannot be read or has another size than the camera.
+            InputError: If a file cannot be read or its size differs from that of the camera.
             ValueError: If ``scale`` is not in (0, 1].
         """
         return self.read(scale, window)[:2]
@@ -125,7 +128,7 @@ class Photo:
     def read(
         self, scale: float = 1.0, window: Window | None = None
     ) -> tuple[Float32Array, Float32Array | None, Float32Array | None]:
-        """The two of :meth:`picture`, and :meth:`hidden`; the mask is read once for both."""
+        """Read the results of :meth:`picture` and :meth:`hidden`, with one access to the mask file."""
         if not 0 < scale <= 1:
             raise ValueError(f"scale must be in (0, 1] (got {scale})")
         rgb = self._pixels(self.file, ("RGB",), scale, window)
@@ -134,11 +137,11 @@ class Photo:
         return rgb, *self._matte(scale, window)
 
     def alpha(self, scale: float = 1.0, window: Window | None = None) -> Float32Array | None:
-        """The mask of :meth:`picture` alone, for which the photo need not be read."""
+        """Read only the mask of :meth:`picture`."""
         return self._matte(scale, window)[0]
 
     def hidden(self, scale: float = 1.0, window: Window | None = None) -> Float32Array | None:
-        """Where in :meth:`picture` another thing may hide the object, (H, W) in [0, 1]; None where nothing does."""
+        """Read the possible occlusion of the object by other things, (H, W) in [0, 1]; None without occlusion."""
         return self._matte(scale, window)[1]
 
     def _matte(self, scale: float, window: Window | None) -> tuple[Float32Array | None, Float32Array | None]:
@@ -148,7 +151,7 @@ class Photo:
         return (values, None) if values.ndim == 2 else (values[..., 0].copy(), 1 - values[..., 1])
 
     def _pixels(self, path: Path, modes: Sequence[str], scale: float, window: Window | None) -> Float32Array:
-        """An image in its mode if that is among ``modes``, else in the first of them."""
+        """Read an image, converted to the first of ``modes`` unless its mode is among them."""
         with _opened(path) as image:
             pixels = image.convert(image.mode if image.mode in modes else modes[0])
         size = (self.camera.width, self.camera.height)
@@ -165,13 +168,18 @@ class Photo:
 
 
 def known_where(hidden: Float32Array | None, camera: Camera) -> BoolArray:
-    """Where a mask says whether there is the object, as nothing hides it by :meth:`Photo.hidden`, (H, W)."""
+    """Return the pixels in which nothing occludes the object, so that the mask is valid, shape (H, W).
+
+    Args:
+        hidden: Result of :meth:`Photo.hidden`.
+        camera: Camera that gives the size of the result.
+    """
     return np.ones((camera.height, camera.width), dtype=bool) if hidden is None else np.asarray(hidden == 0)
 
 
 @contextmanager
 def _opened(path: Path) -> Iterator[Image.Image]:
-    """An image file; what is wrong with it is one sentence."""
+    """Open an image file; all read errors are raised as InputError."""
     try:
         with Image.open(path) as image:
             yield image
@@ -183,20 +191,20 @@ def _opened(path: Path) -> Iterator[Image.Image]:
 
 @dataclass(frozen=True, eq=False)
 class Capture:
-    """Photographs of one object or place, and what their structure from motion found.
+    """Photographs of one object or place, with the result of structure from motion.
 
     Attributes:
         photos: Registered photos, sorted by name.
         points: Triangulated points, shape (N, 3).
-        colours: Of the points, display-encoded 8-bit, shape (N, 3).
-        units: Whether cameras and points are in metres; if not, their scale is arbitrary.
-        up: Whether +z points against gravity.
-        table: Whether z = 0 is a plane that things stand on.
-        rejected: Why a given photo is not among ``photos``, one clause, by name.
-        scale_error: Estimated relative error of the metric scale, if known.
+        colours: Display-encoded 8-bit colours of the points, shape (N, 3).
+        units: ``metre`` if cameras and points are in metres, ``unknown`` if their scale is arbitrary.
+        up: ``z`` if +z points against gravity, else ``unknown``.
+        table: True if z = 0 is a plane on which objects stand.
+        rejected: Reasons for photos that are not in ``photos``, by name; one clause per photo.
+        scale_error: Estimated relative error of the metric scale, or None if unknown.
 
     Raises:
-        ValueError: If a name occurs twice, shapes do not match, or a photo sees a point that does not exist.
+        ValueError: If a name occurs twice, shapes do not match, or a photo observes a point that does not exist.
     """
 
     photos: tuple[Photo, ...]
@@ -234,14 +242,14 @@ class Capture:
 
     @property
     def training(self) -> tuple[Photo, ...]:
-        """The photos that are not held out."""
+        """Photos that are not held out."""
         return tuple(photo for index, photo in enumerate(self.photos) if index % HELD_OUT_EVERY)
 
     def picked(self, pick: str) -> tuple[Photo, tuple[float, float]]:
-        """The photo and the pixel that PHOTO:X,Y means.
+        """Return the photo and the pixel of a text PHOTO:X,Y.
 
         Raises:
-            InputError: If it means none.
+            InputError: If the photo is not registered or the pixel is not two numbers.
         """
         name, _, pixel = pick.rpartition(":")
         photos = {photo.name: photo for photo in self.photos}
@@ -254,9 +262,12 @@ class Capture:
         return photos[name], (x, y)
 
     def transformed(self, matrix: npt.ArrayLike) -> Capture:
-        """Cameras and points after a similarity transform (4, 4), near distances scaled; units and up are left.
+        """Return the capture after a similarity transform.
 
-        Where the table is, is forgotten.
+        Near distances are scaled, ``units`` and ``up`` are unchanged, and ``table`` becomes False.
+
+        Args:
+            matrix: Similarity transform, shape (4, 4).
 
         Raises:
             ValueError: If the matrix shears, mirrors or scales unevenly.
@@ -275,7 +286,10 @@ class Capture:
         )
 
     def save(self, folder: str | PathLike[str]) -> Capture:
-        """Write the capture as a folder, images and masks copied into it, and return it with these files.
+        """Write the capture folder with copies of images and masks.
+
+        Returns:
+            The capture with the copied files.
 
         Raises:
             InputError: If the folder cannot be written or a file is missing.
@@ -283,7 +297,7 @@ class Capture:
         folder = Path(folder)
         photos = []
         try:
-            (folder / CAPTURE_FILE).unlink(missing_ok=True)  # an earlier capture's is not of these photos
+            (folder / CAPTURE_FILE).unlink(missing_ok=True)  # the file of an earlier capture describes other photos
             for photo in self.photos:
                 file = copied(photo.file, folder / "images" / stored_name(photo.name, photo.file.suffix))
                 mask = None if photo.mask is None else copied(photo.mask, folder / "masks" / mask_name(photo.name))
@@ -313,7 +327,7 @@ class Capture:
                 rejected=dict(sorted(self.rejected.items())),
                 photos=[_photo_spec(photo, folder) for photo in photos],
             )
-            # Last, so that an interrupted save is not mistaken for a capture.
+            # Written last, so that an interrupted save leaves no valid capture.
             write_text(folder / CAPTURE_FILE, json.dumps(spec.model_dump(), indent=1) + "\n")
         except OSError as error:
             raise InputError(f"{error.filename or folder}: cannot be written ({error.strerror})") from error
@@ -321,10 +335,10 @@ class Capture:
 
     @classmethod
     def load(cls, folder: str | PathLike[str]) -> Capture:
-        """Read a capture's folder; images are read only by :meth:`Photo.picture`.
+        """Read a capture folder; images are read later by :meth:`Photo.picture`.
 
         Raises:
-            InputError: If a file is missing, of a newer version or breaks a rule.
+            InputError: If a file is missing, has a newer format version or is invalid.
         """
         folder = Path(folder)
         spec = load_yaml(folder / CAPTURE_FILE, CaptureSpec, newest=FORMAT_VERSIONS[CAPTURE_FILE])
@@ -361,18 +375,21 @@ class Capture:
 
 
 def stored_name(name: str, suffix: str) -> str:
-    """File name of a photo's image of some format: the photo's own, without folder marks, where its suffix agrees."""
+    """Return the file name of a photo's image in a capture.
+
+    The name is that of the photo with folders flattened. The suffix is appended if the name has another suffix.
+    """
     flat = name.replace("/", "__")
     return flat if Path(flat).suffix.lower() == suffix.lower() else flat + suffix
 
 
 def mask_name(name: str) -> str:
-    """File name of a photo's mask, as COLMAP has it."""
+    """Return the file name of a photo's mask, by the convention of COLMAP."""
     return f"{name.replace('/', '__')}.png"
 
 
 def _named_file(folder: Path, name: str) -> Path:
-    """A file that ``capture.json`` names, see :func:`mitsplat.storage.files.file_inside`."""
+    """Return the path of a file named in ``capture.json``, see :func:`mitsplat.storage.files.file_inside`."""
     try:
         return file_inside(folder, name)
     except InputError as error:

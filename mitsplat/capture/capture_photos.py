@@ -1,4 +1,4 @@
-"""From photographs, or a video, to a :class:`~mitsplat.capture.capture.Capture`, the stage of ``mitsplat capture``."""
+"""Stage ``mitsplat capture``: from photographs or a video to a :class:`~mitsplat.capture.capture.Capture`."""
 
 from __future__ import annotations
 
@@ -33,42 +33,44 @@ from mitsplat.storage.files import write_file, write_text
 
 MIN_PHOTOS = 3
 MIN_REGISTERED = 0.75
-"""Share of the photos given from which a capture counts as a success."""
+"""Minimum fraction of registered photos for a successful capture."""
 
 FEW_POINTS = 3 * MIN_POINTS
-"""A camera that observes fewer points is worth a warning."""
+"""Number of observed points below which a camera causes a warning."""
 
 _HIDDEN = 0.03
-"""Share of the object from which what other things hide of it in a photo is unknown there."""
+"""Occluded fraction of the object above which the mask of a photo marks the occluded pixels as unknown."""
 _MOST_HIDDEN = 0.5
-"""Share of the object that is unknown in a photo up to which the rest of it is of use."""
+"""Possibly occluded fraction of the object above which an occluded photo is rejected."""
 
 _INPUTS = "inputs.json"
 _PHOTOS = "sfm/photos.json"
-"""What the copies of photographs were made of, which is written first."""
+"""Record of the inputs of the photo copies; written before the copies."""
 _RECORDED = ("source", "reprojection_error", "doubtful")
-"""What this file holds of a result beside its inputs."""
+"""Fields of a result that ``inputs.json`` stores in addition to the inputs."""
 
 
 @dataclass(frozen=True)
 class CaptureSettings:
-    """What decides a capture beside its photographs.
+    """Settings of a capture.
 
     Attributes:
-        kind: An object is cut out by masks; an environment is not.
-        max_size: Longest edge at which photos are used [px].
-        frames: Most frames that are taken of a video.
-        board: ChArUco board to look for.
-        tag: Edge of AprilTags as printed [m]; unknown if None.
-        scale_from: Two places and their distance [m], as in :func:`mitsplat.capture.metric_frame.spot`.
-        poses: COLMAP model or ``transforms.json`` to take cameras from.
-        metric: Whether ``poses`` are in metres with z up, and stay as they are.
+        kind: ``object`` is segmented by masks; ``environment`` is not.
+        max_size: Longest edge of the photos [px]; larger photos are reduced.
+        frames: Maximum number of frames taken from a video.
+        board: ChArUco board to detect.
+        tag: Edge length of printed AprilTags [m]; None if unknown.
+        scale_from: Two points and their distance [m], as in :func:`mitsplat.capture.metric_frame.spot`.
+        poses: COLMAP model or ``transforms.json`` with given cameras.
+        metric: True if ``poses`` are in metres with z up; they are then not transformed.
         masks: Folder of masks.
         mask_model: ONNX file of a segmentation network.
-        undistorted: Whether photos are resampled to pinhole cameras.
-        picks: Places on the object, PHOTO:X,Y in pixels of the capture's photos; without any, it is what they look at.
-        picks_not: Places on things that are not the object.
-        box: Least and largest x, y and z of a box that holds the object, in the capture's frame.
+        undistorted: Resample the photos to pinhole cameras.
+        picks: Pixels on the object, PHOTO:X,Y in pixels of the capture's photos. Without picks, the object is the thing
+            at
+            which the photos are directed.
+        picks_not: Pixels on things that do not belong to the object.
+        box: Minimum and maximum x, y and z of a box that contains the object, in the frame of the capture.
     """
 
     kind: Literal["object", "environment"] = "object"
@@ -88,7 +90,7 @@ class CaptureSettings:
 
     @property
     def hinted(self) -> bool:
-        """Whether anything is said of where the object is."""
+        """True if picks or a box indicate the object."""
         return bool(self.picks or self.picks_not or self.box)
 
     def __post_init__(self) -> None:
@@ -114,15 +116,15 @@ class CaptureSettings:
 
 @dataclass(frozen=True, eq=False)
 class CaptureResult:
-    """A capture and what there is to say about it.
+    """Result of the stage ``mitsplat capture``.
 
     Attributes:
-        capture: As in its folder.
-        given: Number of photographs given.
-        source: Where scale and gravity come from, a clause.
-        reprojection_error: Mean over all observations [px].
-        doubtful: Share of the matches that a camera explains, where it is low and no board confirms the camera.
-        video: What the photographs are frames of, if they are.
+        capture: Capture as stored in its folder.
+        given: Number of input photographs.
+        source: Origin of scale and gravity, as a clause.
+        reprojection_error: Mean reprojection error over all observations [px].
+        doubtful: Low fractions of matches that agree with the camera, by photo; without cameras that a board confirms.
+        video: Chosen video frames, or None for photographs.
     """
 
     capture: Capture
@@ -134,24 +136,24 @@ class CaptureResult:
 
     @property
     def registered(self) -> float:
-        """Share of the photos given that are in the capture."""
+        """Fraction of the input photos that are in the capture."""
         return len(self.capture.photos) / self.given
 
     @property
     def exposure(self) -> str | None:
-        """How far exposures differed, which is corrected, a clause; None where they hardly did."""
+        """Range of the corrected exposure differences as a clause; None without correction."""
         gains = [np.log(photo.gain).mean() for photo in self.capture.photos if photo.gain is not None]
         return f"photos differ by up to {np.expm1(np.ptp(gains)):.0%}, which is corrected" if gains else None
 
     @property
     def weak(self) -> dict[str, int]:
-        """Photos that observe few points, and how many."""
+        """Number of observed points of photos that observe too few, by name."""
         counts = {photo.name: len(photo.seen) for photo in self.capture.photos}
         return {name: count for name, count in counts.items() if count < FEW_POINTS}
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What the user should know of photos that are in the capture, one sentence each."""
+        """Warnings about photos in the capture, one sentence each."""
         warnings = [] if self.video is None else [*self.video.warnings]
         if self.doubtful:
             shares = ", ".join(f"{name} ({share:.0%})" for name, share in sorted(self.doubtful.items()))
@@ -164,7 +166,7 @@ class CaptureResult:
 
     @property
     def shortcoming(self) -> str | None:
-        """The threshold that was missed and what would help, or None."""
+        """Missed threshold and its remedy as a sentence, or None."""
         if self.registered >= MIN_REGISTERED:
             return None
         return (
@@ -177,18 +179,22 @@ class CaptureResult:
 def capture_photos(
     photos: Path, out: Path, settings: CaptureSettings = CaptureSettings(), *, progress: Progress | None = None
 ) -> CaptureResult:
-    """Find cameras, scale, gravity and masks of photographs; what an interrupted or finished run left is used.
+    """Find cameras, scale, gravity and masks of photographs.
+
+    Results of an interrupted or finished run with the same inputs are reused.
 
     Args:
-        photos: Folder of photographs of one object or place, or a video of it.
-        out: Folder of the capture; ``sfm/`` in it keeps what a repeated run can use, ``frames/`` those of a video.
-        settings: What else decides the result.
-        progress: Told steps done, of how many, and what is being done.
+        photos: Folder of photographs of one object or place, or a video file.
+        out: Capture folder. ``sfm/`` in it holds intermediate results for later runs, ``frames/`` the frames of a
+            video.
+        settings: Settings of the capture.
+        progress: Callback with the steps done, their total and the present activity.
 
     Raises:
-        InputError: If there are fewer than three usable photographs, or no cameras can be found from them, or what is
-            given lies where the capture is written.
-        MissingResourceError: If COLMAP or the masks' model fails to run.
+        InputError: If there are fewer than three usable photographs, if no cameras can be found, or if an input lies in
+            a
+            folder that is overwritten.
+        MissingResourceError: If COLMAP or the mask network fails to run.
     """
     _keep_apart(out, photos, settings)
     if settings.masks is not None and not settings.masks.is_dir():
@@ -200,7 +206,7 @@ def capture_photos(
 
 
 def _capture(photos: Path, out: Path, settings: CaptureSettings, progress: Progress | None) -> CaptureResult:
-    """The capture of a folder of photographs."""
+    """Make the capture of a folder of photographs."""
     files = find_photos(photos, but=settings.masks)
     if len(files) < MIN_PHOTOS:
         raise InputError(f"{photos}: must hold at least {MIN_PHOTOS} photographs (got {len(files)})")
@@ -208,7 +214,7 @@ def _capture(photos: Path, out: Path, settings: CaptureSettings, progress: Progr
     if (done := _finished(out, inputs)) is not None:
         return done
     work = out / "sfm"
-    for marker in (_INPUTS, CAPTURE_FILE):  # pictures and masks are about to be others
+    for marker in (_INPUTS, CAPTURE_FILE):  # images and masks will change
         (out / marker).unlink(missing_ok=True)
     _forget_other_photos(out, inputs, settings)
     prepared, rejected = prepare_photos(
@@ -237,7 +243,7 @@ def _capture(photos: Path, out: Path, settings: CaptureSettings, progress: Progr
         rejected=rejected,
         scale_error=frame.scale_error,
     ).transformed(frame.matrix)
-    # What is near depends on what the units are; poses carry none.
+    # The near distance depends on the units, and poses do not define one.
     near = tuple(replace(photo, camera=replace(photo.camera, near=0.01)) for photo in capture.photos)
     capture = replace(capture, photos=near, table=frame.table)
     if settings.undistorted:
@@ -269,7 +275,10 @@ def _capture(photos: Path, out: Path, settings: CaptureSettings, progress: Progr
 
 
 def _keep_apart(out: Path, photos: Path, settings: CaptureSettings) -> None:
-    """Refuse to write among what was given, or is no capture's: files that are no longer needed are removed."""
+    """Raise InputError if an input lies in an output folder, or an output folder belongs to no capture.
+
+    The reason is that unused files in output folders are deleted.
+    """
     if out.resolve().is_relative_to(photos.resolve()):
         raise InputError(f"{out}: must not lie in the folder of the photographs, {photos}")
     if settings.masks is not None and settings.masks.resolve() == photos.resolve():
@@ -286,31 +295,33 @@ def _keep_apart(out: Path, photos: Path, settings: CaptureSettings) -> None:
 
 
 def _inputs(photos: Path, files: Sequence[Path], settings: CaptureSettings) -> dict[str, object]:
-    """What decides a capture, in JSON: what files hold, and not where they lie."""
+    """Return the inputs of a capture as JSON values: hashes of file contents, without absolute paths."""
     given = {name: getattr(settings, name) for name in ("poses", "masks", "mask_model")}
     kept = {name: value for name, value in asdict(settings).items() if name not in ("frames", *given)}
     others = [(name, at, path) for name, at in given.items() if at is not None for path in [at, *sorted(at.rglob("*"))]]
     return {
-        "photos": {path.relative_to(photos).as_posix(): file_hash(path) for path in files},  # or frames of a video
+        "photos": {
+            path.relative_to(photos).as_posix(): file_hash(path) for path in files
+        },  # photographs or frames of a video
         "settings": json.loads(json.dumps(kept, default=str)),
         "files": {f"{name}/{path.relative_to(at)}": file_hash(path) for name, at, path in others if path.is_file()},
     }
 
 
 def _finished(out: Path, inputs: dict[str, object]) -> CaptureResult | None:
-    """The result that ``out`` holds already, if it is of the same inputs."""
+    """Return the result stored in ``out`` if it has the same inputs, else None."""
     try:
         record = json.loads((out / _INPUTS).read_text())
         if record["inputs"] != inputs or not (out / "capture.png").is_file():
             return None
         capture = Capture.load(out)
         return CaptureResult(capture, len(record["inputs"]["photos"]), **{key: record[key] for key in _RECORDED})
-    except (OSError, ValueError, KeyError, TypeError):  # none, or damaged: made anew
+    except (OSError, ValueError, KeyError, TypeError):  # missing or damaged: recompute
         return None
 
 
 def _forget_other_photos(out: Path, inputs: dict[str, object], settings: CaptureSettings) -> None:
-    """Drop masks, and copies and matches that were made of other photographs or in another way."""
+    """Delete masks, and delete copies and matches of other photographs or other settings."""
     way = settings.max_size, settings.poses is None, settings.undistorted
     marker = json.dumps([inputs["photos"], *way], sort_keys=True)
     file = out / _PHOTOS
@@ -318,7 +329,7 @@ def _forget_other_photos(out: Path, inputs: dict[str, object], settings: Capture
         shutil.rmtree(out / "sfm", ignore_errors=True)
         shutil.rmtree(out / "images", ignore_errors=True)
         write_text(file, marker)
-    elif settings.undistorted:  # the pictures of an earlier run may bear the names of the copies
+    elif settings.undistorted:  # undistorted images of an earlier run may have the names of the copies
         shutil.rmtree(out / "images", ignore_errors=True)
     shutil.rmtree(out / "masks", ignore_errors=True)
 
@@ -326,7 +337,13 @@ def _forget_other_photos(out: Path, inputs: dict[str, object], settings: Capture
 def _find_model(
     photos: Path, by_file: dict[str, Prepared], settings: CaptureSettings, work: Path, progress: Progress | None
 ) -> tuple[SparseModel, MetricFrame, dict[str, str]]:
-    """Cameras that neither each other nor a board contradicts, where they are put, and why other files have none."""
+    """Find consistent cameras and their metric frame.
+
+    Returns:
+        The sparse model without cameras that contradict the other cameras or the board, its metric frame, and the
+        reason
+        for each file without a camera.
+    """
     faults: dict[str, str] = {}
     if settings.poses is not None:
         model = read_poses(settings.poses, list(by_file.values()), work, progress)
@@ -353,7 +370,7 @@ def _find_model(
 def _demand_cameras(
     photos: Path, model: SparseModel, by_file: Mapping[str, Prepared], faults: Mapping[str, str]
 ) -> None:
-    """Refuse too few cameras."""
+    """Raise InputError if the model has fewer than ``MIN_PHOTOS`` cameras."""
     if len(model.cameras) < MIN_PHOTOS:
         reasons = "; ".join(f"{by_file[file].name}: {fault}" for file, fault in sorted(faults.items())[:3])
         raise InputError(
@@ -364,7 +381,7 @@ def _demand_cameras(
 
 
 def _without_faults(model: SparseModel, least: int = MIN_POINTS) -> tuple[SparseModel, dict[str, str]]:
-    """The model without cameras that contradict the others or observe fewer points, and why each is left out."""
+    """Remove cameras that contradict the others or observe fewer than ``least`` points, and return the reasons."""
     shares = {file: model.agreement.get(file, 1.0) for file in model.cameras}
     wrong = {file: share for file, share in shares.items() if share < MIN_AGREEMENT}
     model, weak = model.without(wrong).without_weak(least)
@@ -390,7 +407,7 @@ def _metric_frame(model: SparseModel, by_file: dict[str, Prepared], settings: Ca
 
 
 def _spots(scale_from: tuple[str, str, float] | None, by_file: dict[str, Prepared]) -> tuple[str, str, float] | None:
-    """``scale_from`` with the copies' names instead of the photos'."""
+    """Return ``scale_from`` with the names of the copies instead of those of the photos."""
     if scale_from is None:
         return None
     files = {photo.name: file for file, photo in by_file.items()}
@@ -426,7 +443,7 @@ def _masked(
     bare = None if frame.board is None else partial(bare_squares, settings.board, frame.board)
     if frame.board is not None and not settings.hinted:
         points = object_points(capture)
-        above = points[points[:, 2] > 0]  # where a foot would be, the board may be seen
+        above = points[points[:, 2] > 0]  # below them, the board may be visible under the object
     else:
         chosen = chosen_object(capture, settings.picks, settings.picks_not, settings.box)
         points, above = chosen.points, chosen.above
@@ -435,9 +452,10 @@ def _masked(
 
 
 def _hidden_parts(capture: Capture, chosen: ChosenObject) -> tuple[Capture, dict[str, BoolArray]]:
-    """The capture without photos in which other things hide much of the object, and what they may hide in others.
+    """Reject photos in which other things occlude much of the object, and find the occluded pixels of the others.
 
-    The pixels (H, W) are by the names of the photos.
+    Returns:
+        The capture without the rejected photos, and the possibly occluded pixels, (H, W), by the name of the photo.
     """
     photos, rejected, hidden = [], dict(capture.rejected), dict[str, BoolArray]()
     for photo in capture.photos:

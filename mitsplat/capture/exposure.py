@@ -1,4 +1,4 @@
-"""Exposure and white balance of each photo against the others, by the points that several of them see."""
+"""Relative exposure and white balance of photos, estimated from points that several photos observe."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from mitsplat.capture.capture import Capture, Photo
 from mitsplat.images.colour import decode_srgb
 
 STEADY = 0.02
-"""Standard deviation of the photos' logarithmic gains up to which exposure counts as fixed, and is left alone."""
+"""Largest standard deviation of the logarithmic gains at which exposure counts as fixed and is not corrected."""
 _EDGE = 320
-"""Longest edge of the pictures that points are looked up in, whose pixels are means over noise [px]."""
+"""Longest edge of the reduced pictures for colour look-up [px]; their pixels average out noise."""
 _SURE = (0.04, 0.96)
-"""Display-encoded values that are neither lost in noise nor clipped."""
+"""Range of display-encoded values that are neither dominated by noise nor clipped."""
 _FEWEST = 20
-"""Points from which a photo is corrected."""
+"""Minimum number of points for the correction of a photo."""
 _LEAST_SCALE = 0.02
-"""Least scale of what counts as an ordinary difference between logarithms."""
+"""Lower limit of the scale of the robust weights, in differences of logarithms."""
 
 
 def even_exposure(capture: Capture) -> Capture:
-    """The capture with gains for its photos that make shared points look the same, if exposure was not fixed."""
+    """Return the capture with gains that equalise the colours of shared points, unless exposure was fixed."""
     gains = relative_gains(capture.photos, capture.points)
     if np.log(gains).std(axis=0).max(initial=0.0) <= STEADY:
         return capture
@@ -36,11 +36,16 @@ def even_exposure(capture: Capture) -> Capture:
 
 
 def relative_gains(photos: Sequence[Photo], points: Float64Array) -> Float64Array:
-    """What each photo's linear red, green and blue are to be multiplied by, (N, 3); their logarithms have mean 0.
+    """Estimate the factors of linear red, green and blue for each photo, (N, 3); their logarithms have mean 0.
 
-    The logarithm of what a photo shows of a point is the point's less the photo's: linear least squares, the points
-    eliminated, in which differences count by Cauchy's weights, because gloss and hidden points tell of no exposure. The
-    points are those of the photos' capture, shape (M, 3).
+    The model is: log colour of a point in a photo = log colour of the point - log gain of the photo. It is solved by
+    linear
+    least squares with the points eliminated. Residuals have Cauchy weights, because glossy and occluded points carry no
+    information about exposure.
+
+    Args:
+        photos: Photos of a capture.
+        points: Points of the same capture, shape (M, 3).
     """
     photo, point, seen = _observations(photos, points)
     if not len(photo):
@@ -58,7 +63,7 @@ def relative_gains(photos: Sequence[Photo], points: Float64Array) -> Float64Arra
         system = np.diag(np.asarray(links.sum(axis=1)).ravel()) - spread.toarray()
         residual = weight[:, None] * (means(seen)[point] - seen)
         right = np.column_stack([np.bincount(photo, r, len(photos)) for r in residual.T])
-        # Least norm: groups of photos that share no point keep their means.
+        # Minimum-norm solution: groups of photos without shared points keep their means.
         corrections = np.linalg.lstsq(system, right, rcond=1e-9)[0]
         corrected = seen + corrections[photo]
         off = np.linalg.norm(corrected - means(corrected)[point], axis=1)
@@ -68,7 +73,7 @@ def relative_gains(photos: Sequence[Photo], points: Float64Array) -> Float64Arra
 
 
 def _observations(photos: Sequence[Photo], points: Float64Array) -> tuple[Int64Array, Int64Array, Float64Array]:
-    """Photo and point of each sight of a point, (K,), and the logarithm of its linear colour, (K, 3)."""
+    """Return photo index and point index of each observation, (K,), and its log linear colour, (K, 3)."""
     found = []
     for number, photo in enumerate(photos):
         scale = min(1.0, _EDGE / max(photo.camera.width, photo.camera.height))

@@ -1,4 +1,4 @@
-"""One picture to judge a capture by: points and cameras from above and from the side, and photos with their masks."""
+"""Overview picture of a capture: points and cameras from above and from the side, and photos with their masks."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ _TINT = np.array([0.33, 0.0, 0.33], dtype=np.float32)
 
 
 def capture_sheet(capture: Capture) -> Image.Image:
-    """The picture, RGB."""
+    """Draw the overview picture of a capture, in RGB."""
     centres = np.array([photo.camera.centre for photo in capture.photos])
     ahead = np.array([photo.camera.world_from_camera[:3, 2] for photo in capture.photos])
     reach = 1.1 * float(np.abs(centres).max())
     panels = []
     for axes, down in (((0, 1), 2), ((0, 2), 1)):
-        order = np.argsort(capture.points[:, down] * (1 if down == 2 else -1))  # what is nearer to the viewer last
+        order = np.argsort(capture.points[:, down] * (1 if down == 2 else -1))  # draws the nearest points last
         panels.append(_panel(capture.points[order], capture.colours[order], centres, ahead, axes, reach))
     tiles = [_tile(capture, index) for index in np.linspace(0, len(capture.photos) - 1, 24).round().astype(int)]
     rows = [np.hstack(tiles[start : start + _COLUMNS]) for start in range(0, len(tiles), _COLUMNS)]
@@ -56,7 +56,7 @@ def _panel(
 
 
 def _tile(capture: Capture, index: int) -> npt.NDArray[np.uint8]:
-    """A photo in a square, what its mask leaves out tinted."""
+    """Return a square thumbnail of a photo, with the background of its mask tinted."""
     photo = capture.photos[index]
     rgb, alpha = photo.picture(min(1.0, _TILE / max(photo.camera.width, photo.camera.height)))
     if alpha is not None:

@@ -1,4 +1,4 @@
-"""What is pointed at in a capture: from a pixel to the object, and from a ray to a pixel."""
+"""Object selection from pixels, and conversion of viewer rays to pixels."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from mitsplat.capture.isolation import ChosenObject, PhotoView, Pick, choose_obj
 from mitsplat.errors import InputError
 
 _CONE = np.radians(1.0)
-"""Half of the angle around a ray within which the nearest point is what it meets."""
+"""Half angle of the cone around a ray in which the nearest point is picked [rad]."""
 _WIDE = np.radians(5.0)
-"""The same where nothing lies so near to it."""
+"""Half angle of the wider cone that is used if the first cone has no point [rad]."""
 
 
 def chosen_object(
@@ -23,16 +23,16 @@ def chosen_object(
     picks_not: Sequence[str] = (),
     box: tuple[float, ...] | None = None,
 ) -> ChosenObject:
-    """The points of the object, by the hints that there are.
+    """Return the points of the object that the hints select.
 
     Args:
-        capture: With z up.
-        picks: PHOTO:X,Y on it.
-        picks_not: The same on things that it is not.
-        box: Least and largest x, y and z of a box that holds it.
+        capture: Capture with z up.
+        picks: Pixels on the object, PHOTO:X,Y.
+        picks_not: Pixels on things that do not belong to the object.
+        box: Minimum and maximum x, y and z of a box that contains the object.
 
     Raises:
-        InputError: If a pick means nothing, or nothing stands out there.
+        InputError: If a pick is invalid or no object is found there.
     """
     views = {photo.name: PhotoView(photo.camera, photo.seen) for photo in capture.photos}
 
@@ -45,12 +45,12 @@ def chosen_object(
 
 
 def pick_along(capture: Capture, origin: npt.ArrayLike, direction: npt.ArrayLike) -> str:
-    """PHOTO:X,Y of the point that a ray meets, in the photo that shows it most as the ray does.
+    """Return PHOTO:X,Y of the point that a ray hits, in the photo with the most similar viewing direction.
 
     Args:
-        capture: Where.
-        origin: Of the ray, shape (3,), in the capture's frame.
-        direction: Of the ray, shape (3,).
+        capture: Capture that contains the points.
+        origin: Origin of the ray in the frame of the capture, shape (3,).
+        direction: Direction of the ray, shape (3,).
 
     Raises:
         InputError: If no point lies near the ray.

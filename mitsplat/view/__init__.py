@@ -1,8 +1,9 @@
-"""A live view in the browser: what a scene, an asset, a dataset, a capture or a file of splats looks like, and why.
+"""Interactive viewer in the browser for scenes, assets, datasets, captures and splat files.
 
-In: a path. Out: a page, served until it is interrupted. What is shown are plain values (``parts``), of which the page
-sends a browser only what has changed; real renders come from a thread that works on the newest request alone
-(``previews``). viser makes the page, and draws splats and meshes in the browser.
+Input: a path. Output: a page that is served until it is interrupted. The displayed parts are plain values
+(:mod:`mitsplat.view.scene_parts`); the page sends only changed parts to a browser. A thread renders real previews for
+the newest request only (:mod:`mitsplat.view.previews`). The library viser provides the page and draws splats and meshes
+in the browser.
 """
 
 from __future__ import annotations

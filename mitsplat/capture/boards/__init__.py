@@ -1,7 +1,7 @@
-"""Boards and tags that are printed, stood upon, and found in photographs again.
+"""Printed calibration boards and tags, and their detection in photographs.
 
-In: the squares of a board, and photographs with their cameras. Out: a page to print, corners in pixels and in metres,
-and which pixels show bare board. It knows neither captures nor masks.
+Input: the squares of a board, and photographs with their cameras. Output: a page to print, corners in pixels and in
+metres, and the pixels that show uncovered board. This package is independent of captures and masks.
 """
 
 from __future__ import annotations

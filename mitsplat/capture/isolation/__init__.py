@@ -1,8 +1,8 @@
-"""Which of the points that photographs share are the object: chosen in space, not in each photo.
+"""Selection of the points of an object, in space instead of per photo.
 
-In: points, the cameras that see them, and hints if there are any. Out: the points of one thing that stands on the
-support, from which masks are begun, and how much of it other things hide in a photo. It knows neither files nor
-captures.
+Input: points, the cameras that observe them, and optional hints. Output: the points of one object on its support, as
+initial data for masks, and the fraction of the object that is occluded in a photo. This package is independent of files
+and captures.
 """
 
 from __future__ import annotations

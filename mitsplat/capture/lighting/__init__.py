@@ -1,7 +1,7 @@
-"""Light that was captured to lights of a scene file.
+"""Conversion of captured light to lights of a scene file.
 
-In: an HDR panorama, or photographs of a mirror ball. Out: lamps as area lights, and an environment light of all else,
-which together send the light that the panorama sends onto a level table.
+Input: an HDR panorama, or photographs of a mirror ball. Output: area lights for the lamps, and an environment light for
+the remaining light. Together they give a level table the same irradiance as the panorama.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""A video to the few of its frames that structure from motion needs: sharp, and each a step further than the last one.
+"""Selection of video frames for structure from motion: sharp frames with sufficient camera motion between them.
 
-In: a video file. Out: a folder of pictures, named by their time in the video, and where the video jumps. What the
-pictures are used for it does not know.
+Input: a video file. Output: a folder of images, named by their time in the video, and the times of cuts in the video.
+This package is independent of the later use of the images.
 """
 
 from __future__ import annotations

@@ -1,9 +1,8 @@
-"""CAD meshes to assets: surface-aligned Gaussians whose outgoing radiance Mitsuba's path tracer bakes.
+"""Baking of CAD meshes: surface-aligned Gaussians with the outgoing radiance of Mitsuba's path tracer.
 
-Surfels (:mod:`mitsplat.gaussians.surfels`) are seen from directions all over their hemispheres. The radiance that
-leaves them towards each, display-encoded, is fitted with spherical harmonics. A diffuse white surface under the
-``uniform`` light has radiance 1. Materials are those of the mesh: glTF's metallic-roughness model, or diffuse vertex or
-face colours.
+Radiance is traced in directions all over the hemisphere of each surfel (:mod:`mitsplat.gaussians.surfels`),
+display-encoded, and fitted with spherical harmonics. A diffuse white surface under the ``uniform`` light has radiance
+1. Materials are those of the mesh: glTF's metallic-roughness model, or diffuse vertex or face colours.
 """
 
 from __future__ import annotations
@@ -39,16 +38,16 @@ from mitsplat.runtime.variant import one_at_a_time
 from mitsplat.scene.spec.light_spec import LightSpec
 
 _HIDDEN = 0.01
-"""Radiance of a white surface under the uniform light below which nobody sees it."""
+"""Radiance of a white surface under the uniform light below which a surfel counts as invisible."""
 _FEW = 1000
-"""Gaussians that tell how many of all will be where nothing is seen: to 2 %, for a tenth of the time."""
+"""Number of trial Gaussians that estimate the visible fraction: accurate to 2 %, in a tenth of the time."""
 _DETAIL = 7.0
-"""How many times denser Gaussians are where the texture changes strongly."""
+"""Additional relative density of Gaussians where the texture changes strongly."""
 _MOST_GAUSSIANS = 2_000_000
 _SMALLEST, _LARGEST = 0.001, 5.0
-"""Size of objects [m] outside of which units are wrong rather than objects unusual."""
+"""Size range of objects [m]; sizes outside of it indicate wrong units."""
 _LEAST, _MOST = 1e-5, 1e5
-"""Size of anything [m] outside of which 32 bits are too few."""
+"""Size range of any mesh [m]; 32-bit floats are too coarse outside of it."""
 _STAGES = {
     "placing Gaussians": 14,
     "tracing their radiance": 16,
@@ -57,26 +56,26 @@ _STAGES = {
     "finding convex pieces": 25,
     "comparing with the mesh": 8,
 }
-"""What a bake does, and its shares of the time."""
+"""Stages of a bake, with their relative durations."""
 _DARKEST, _BRIGHTEST = 0.6, 1.4
-"""Brightness relative to its textures that corners in the shade and highlights explain."""
+"""Range of brightness relative to the textures that shaded corners and highlights can explain."""
 _RIDGE = 0.02
-"""Weight of the penalty on view dependence, relative to the data: decides what no ray has seen."""
+"""Weight of the penalty on view dependence, relative to the data; it determines directions without rays."""
 
 
 @dataclass(frozen=True, eq=False)
 class BakeResult:
-    """A baked asset and how close it comes to a path-traced picture of its mesh.
+    """Baked asset and its difference from path-traced pictures of its mesh.
 
     Attributes:
-        asset: The asset, in metres, z up.
-        psnr: Over whole images of unseen views [dB]; NaN without verification.
-        psnr_object: Over the mesh's pixels alone [dB]; NaN without verification.
-        views: The pictures of that comparison.
-        surface: The mesh that was baked, all parts of it [m], z up; None where it was not kept.
-        brightness: Mean brightness of the splats relative to the textures of the file, read from it once more, with
-            the gloss that lies on them; None without textures of its own or under a scene's lights.
-        warnings: What a user should know, a sentence each.
+        asset: Asset in metres, z up.
+        psnr: PSNR over whole images of unseen views [dB]; NaN without verification.
+        psnr_object: PSNR over the mesh's pixels alone [dB]; NaN without verification.
+        views: Pictures of that comparison.
+        surface: Baked mesh with all its parts [m], z up, or None.
+        brightness: Mean brightness of the splats relative to the textures of the file and the gloss on top of them. The
+            textures are read from the file independently. None without textures or under a scene's lights.
+        warnings: Warnings for the user, a sentence each.
     """
 
     asset: Asset
@@ -90,21 +89,21 @@ class BakeResult:
 
 @dataclass(frozen=True)
 class BakeSettings:
-    """How finely a mesh is baked.
+    """Resolution and quality of a bake.
 
     Attributes:
-        gaussians: Number of Gaussians aimed for.
+        gaussians: Target number of Gaussians.
         sh_degree: Degree of the spherical harmonics, 0 to 3; metal needs 2.
-        directions: Directions in which every Gaussian is seen.
+        directions: Number of traced directions per Gaussian.
         samples: Light paths per direction.
-        bounces: Longest light path.
-        sharpening: Rounds that undo the blur which overlapping Gaussians cause.
-        density: Relative density of Gaussians of a part of the mesh, by its name; 1 where unnamed.
-        proxy_faces: Most faces of the proxy mesh.
-        fit_views: Path-traced pictures all around the mesh that the Gaussians are fitted to at last.
+        bounces: Maximum length of a light path.
+        sharpening: Iterations that compensate the blur of overlapping Gaussians.
+        density: Relative density of Gaussians of each part of the mesh, by its name; 1 for other parts.
+        proxy_faces: Maximum number of faces of the proxy mesh.
+        fit_views: Number of path-traced pictures around the mesh for the final fit of the Gaussians.
         fit_steps: Steps of that fit; 0 skips it.
-        verify_views: Views in which the result is compared with the mesh; 0 skips it.
-        seed: Decides every random number.
+        verify_views: Number of views in which the result is compared with the mesh; 0 skips the comparison.
+        seed: Seed of all random numbers.
     """
 
     gaussians: int = 20000
@@ -153,27 +152,27 @@ def bake_asset(
     """Bake a textured or coloured mesh into an asset of Gaussians.
 
     Args:
-        mesh: A mesh, a scene of several parts, or a file that trimesh reads.
+        mesh: Mesh, scene of several parts, or file that trimesh reads.
         name: Name of the asset.
-        class_name: Class that detectors learn; ``name`` if None.
-        kind: Objects get convex pieces for physics.
-        light: ``uniform`` (radiance 1 from everywhere), ``studio`` (soft boxes all around, mean radiance 1), or the
-            lights of a scene, which the asset then carries as ``capture_light: scene``.
-        settings: How finely to bake.
+        class_name: Class label for detectors; ``name`` if None.
+        kind: ``object`` or ``environment``. Objects get convex pieces for physics.
+        light: ``uniform`` (radiance 1 from all directions), ``studio`` (soft boxes all around, mean radiance 1), or the
+            lights of a scene. With the latter, the asset has ``capture_light: scene``.
+        settings: Resolution and quality.
         metres_per_unit: Length of the mesh's unit [m].
         up: Axis that points up in the mesh (glTF: y).
         density: Mass density [kg/m^3].
         friction: Coulomb friction coefficient.
         pieces: Convex pieces of an object for physics [m], z up; by default the proxy mesh is decomposed.
         cameras: Views for the comparison; by default all around the mesh.
-        fit_cameras: Views of the pictures that the fit takes; by default all around the mesh, others than for the
-            comparison.
-        finish: Colour and gloss to use instead of the file's own.
-        any_size: Bake an object even if it is smaller than 1 mm or larger than 5 m, which tells of wrong units.
-        progress: Told how much of how much is done, and the stage.
+        fit_cameras: Views for the fit; by default all around the mesh, different from those of the comparison.
+        finish: Colour and gloss that replace those of the file.
+        any_size: Bake an object even if it is smaller than 1 mm or larger than 5 m, which indicates wrong units.
+        progress: Callback that gets the progress, its total, and the stage.
 
     Raises:
-        InputError: Before work starts, if the mesh cannot be read, is empty or of a size that tells of wrong units, or
+        InputError: Before work starts, if the mesh cannot be read, is empty, or has a size that indicates wrong units,
+            or
             if another value breaks a rule.
     """
     ensure_variant()
@@ -200,7 +199,7 @@ def bake_asset(
     relative = settings.density or {}
     face_density = np.concatenate([relative.get(part.name, 1.0) * part.detail_density(_DETAIL, rng) for part in parts])
     clay = mitsuba_scene(parts, bake_lights("uniform"), clay=True)
-    # A few first: as many more are placed as will be where nothing is seen.
+    # The visible fraction of a few trial surfels determines how many surfels are placed.
     few = place_surfels(surface, face_density, min(_FEW, settings.gaussians), rng)
     share = float(_seen(clay, few, rng).mean()) if len(few) else 1.0
     surfels = place_surfels(surface, face_density, round(settings.gaussians / max(share, 0.2)), rng)
@@ -263,7 +262,7 @@ def bake_asset(
 
 
 class _Stages:
-    """Tells how far a bake is, of 100."""
+    """Progress of a bake in percent."""
 
     def __init__(self, tell: Progress | None) -> None:
         self._tell = tell
@@ -275,17 +274,17 @@ class _Stages:
             self._tell(int(100 * (before + share * _STAGES[stage]) / sum(_STAGES.values())), 100, stage)
 
     def step(self, done: int, total: int, stage: str) -> None:
-        """So many steps of a stage are done."""
+        """Report that ``done`` of ``total`` steps of a stage are complete."""
         self(stage, done / total)
 
     def end(self) -> None:
-        """All is done."""
+        """Report the end."""
         if self._tell is not None:
             self._tell(100, 100, "done")
 
 
 def _check_size(source: str, size: float, metres_per_unit: float) -> None:
-    """Refuse objects whose size [m] tells of wrong units."""
+    """Refuse objects whose size [m] indicates wrong units."""
     if _SMALLEST <= size <= _LARGEST:
         return
     factor, unit = (0.001, "millimetres") if size > _LARGEST else (1000.0, "metres")
@@ -297,12 +296,12 @@ def _check_size(source: str, size: float, metres_per_unit: float) -> None:
 
 
 def _hemisphere(count: int) -> Float64Array:
-    """Directions (M, 3) evenly over the hemisphere around z, none closer than 3 degrees to the horizon."""
+    """Return directions (M, 3), evenly distributed over the hemisphere around z, at least 3 degrees above the horizon."""
     return spiral(1.0 - 0.95 * (np.arange(count) + 0.5) / count)
 
 
 def _turned(frames: Float64Array, directions: Float64Array, rng: np.random.Generator) -> Float64Array:
-    """``directions`` (M, 3) in every one of ``frames`` (N, 3, 3), each turned by a random angle: (N, M, 3)."""
+    """Return ``directions`` (M, 3) in each of ``frames`` (N, 3, 3), rotated by a random angle, shape (N, M, 3)."""
     angle = rng.uniform(0.0, 2.0 * np.pi, (len(frames), 1))
     cos, sin = np.cos(angle), np.sin(angle)
     local = np.empty((len(frames), len(directions), 3))
@@ -313,9 +312,14 @@ def _turned(frames: Float64Array, directions: Float64Array, rng: np.random.Gener
 
 
 def _seen(clay: mi.Scene, surfels: Surfels, rng: np.random.Generator) -> BoolArray:
-    """Whether light from outside finds its way to a surfel (N,): not inside a solid, a closed hollow or under a label.
+    """Return a mask (N,) of the surfels that light from outside reaches.
 
-    ``clay`` is the scene in white, under the uniform light, its faces black from behind.
+    Surfels inside a solid, in a closed cavity or under a label are not reached.
+
+    Args:
+        clay: Scene in white under the uniform light, with black back faces.
+        surfels: Surfels to test.
+        rng: Random generator.
     """
     directions = _turned(surfels.frames, _hemisphere(8), rng)
     origins = surfels.points[:, None] + _lift(clay) * directions
@@ -331,7 +335,7 @@ def _seen(clay: mi.Scene, surfels: Surfels, rng: np.random.Generator) -> BoolArr
 
 
 def _lift(scene: mi.Scene) -> float:
-    """Distance above a surface [m] at which rays towards it start: little, but more than float32's rounding."""
+    """Return the distance above a surface [m] at which rays towards it start, just above the rounding of float32."""
     box = scene.bbox()
     return 1e-5 * float(max(abs(v) for v in (*box.min, *box.max)))
 
@@ -339,14 +343,16 @@ def _lift(scene: mi.Scene) -> float:
 def _hits_nearby(
     scene: mi.Scene, origins: Float64Array, directions: Float64Array, normals: Float64Array, reach: Float64Array
 ) -> BoolArray:
-    """Whether rays (N, M, 3) hit a surface within ``reach`` (N,) [m] that faces much as ``normals`` (N, 3) do."""
+    """Return a mask (N, M) of the rays that hit a surface within ``reach`` (N,) [m] with a normal close to ``normals``
+    (N, 3).
+    """
     rays = mi.Ray3f(
         mi.Point3f(origins.reshape(-1, 3).T.astype(np.float32)),
         mi.Vector3f(directions.reshape(-1, 3).T.astype(np.float32)),
     )
     hit = scene.ray_intersect_preliminary(rays)
     facing = hit.compute_surface_interaction(rays).n
-    dr.eval(facing, hit.t)  # together: what is left for later would trace the rays again
+    dr.eval(facing, hit.t)  # evaluated together, because a later evaluation would trace the rays again
     normal = np.asarray(facing).T.reshape(origins.shape)
     distance = np.asarray(hit.t).reshape(origins.shape[:2])
     alike = np.einsum("nmd,nd->nm", normal, normals) > 0.8
@@ -356,7 +362,7 @@ def _hits_nearby(
 def _fit_radiance(
     scene: mi.Scene, surfels: Surfels, settings: BakeSettings, rng: np.random.Generator, progress: Progress
 ) -> Float64Array:
-    """Spherical-harmonic coefficients (N, K, 3) of the display-encoded radiance that leaves every surfel."""
+    """Fit spherical harmonics (N, K, 3) to the display-encoded radiance that leaves every surfel."""
     local = _hemisphere(settings.directions)
     weights = 0.2 + local[:, 2]
     terms = (settings.sh_degree + 1) ** 2
@@ -368,7 +374,7 @@ def _fit_radiance(
         chunk = slice(start, start + step)
         frames, scales = surfels.frames[chunk], surfels.scales[chunk]
         towards = _turned(frames, local, rng)
-        # Footprint samples average the texture over the Gaussian instead of aliasing it.
+        # Samples over the footprint average the texture over the Gaussian instead of aliasing it.
         offset = np.clip(rng.normal(size=(*towards.shape[:2], 2)), -1.5, 1.5) * 0.5 * scales[:, None, :2]
         origins = surfels.points[chunk, None] + np.einsum("nij,nmj->nmi", frames[:, :, :2], offset)
         origins += (0.3 * scales[:, None, :1] + _lift(scene)) * towards
@@ -392,9 +398,9 @@ def _fit_radiance(
 
 
 def _sharpened(surfels: Surfels, target: Float64Array, rounds: int) -> Float64Array:
-    """Colours (N, K, 3) whose blend at every surfel comes close to ``target`` (N, K, 3).
+    """Return colours (N, K, 3) whose blend at every surfel approximates ``target`` (N, K, 3).
 
-    Van Cittert's iteration; colours stay within those of their neighbours, so that nothing rings.
+    Van Cittert's iteration. Colours are clamped to the range of their neighbours, which prevents ringing.
     """
     if not rounds or len(surfels) < 2:
         return target
@@ -417,14 +423,14 @@ def _sharpened(surfels: Surfels, target: Float64Array, rounds: int) -> Float64Ar
 
 
 def _picture(scene: mi.Scene, camera: Camera, settings: BakeSettings, view: int) -> Picture:
-    """A path-traced picture of the mesh to fit to."""
+    """Path-trace a picture of the mesh for the fit."""
     seed = settings.seed + 1000 + view
     radiance, cover = render_mesh(scene, camera, samples=16, bounces=settings.bounces, seed=seed)
     return Picture(camera, encode_srgb(radiance).astype(np.float32), cover.astype(np.float32))
 
 
 def _orbit(surface: trimesh.Trimesh, count: int, *, turn: float = 0.7) -> list[Camera]:
-    """Views (``count``) from all around that frame the mesh."""
+    """Return ``count`` views from all around that frame the mesh."""
     centre = surface.bounds.mean(axis=0)
     radius = 0.5 * float(np.linalg.norm(surface.extents))
     outward = spiral(1.0 - 2.0 * (np.arange(count) + 0.5) / count, turn)

@@ -1,4 +1,4 @@
-"""One page to look at a baked asset by: the mesh beside its splats, figures, and what a user should know."""
+"""HTML page of a baked asset: the mesh beside its splats, figures and warnings."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from mitsplat.storage.files import write_text
 
 _VIEW = 420
 _MOST_DIFFERENCE = 0.3
-"""Error of a display-encoded channel that is drawn white."""
+"""Error of a display-encoded channel that is shown as white."""
 
 
 def write_bake_report(folder: Path, result: BakeResult) -> Path:

@@ -1,4 +1,4 @@
-"""CAD meshes as Mitsuba scenes: their parts with materials, and the lights to bake them under."""
+"""CAD meshes as Mitsuba scenes: their parts with materials, and the lights of the bake."""
 
 from __future__ import annotations
 
@@ -41,28 +41,28 @@ from mitsplat.storage.files import MESH_ERRORS
 
 _SUFFIXES = (".stl", ".obj", ".glb", ".gltf", ".off", ".3mf", ".dae", ".ply")
 _BY_OTHERS = {".3mf": ("lxml", "lxml"), ".dae": ("collada", "pycollada")}
-"""Modules that trimesh reads some files by, and the packages that have them."""
+"""Modules that trimesh needs for some file types, and the packages that contain them."""
 _WHITE = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 1.0}}
 _DETAIL_SAMPLES = 12
 _DETAIL_CONTRAST = 0.12
-"""Standard deviation of the encoded colour inside a face at which detail counts in full."""
+"""Standard deviation of the encoded colour inside a face at which the density of Gaussians is largest."""
 
 
 @dataclass(frozen=True, eq=False)
 class MeshPart:
-    """One material's share of a mesh.
+    """Part of a mesh with one material.
 
     Attributes:
-        name: Name of the part, to address it in settings.
-        mesh: Geometry [m], vertices at one position merged.
-        colours: Linear base colour of every face corner, shape (F, 3, 3), or None where ``texture`` is.
+        name: Name of the part, for use in settings.
+        mesh: Geometry [m], with vertices merged by position.
+        colours: Linear base colour of every face corner, shape (F, 3, 3), or None if there is a ``texture``.
         texture: Display-encoded base colour, shape (H, W, 3) uint8, or None.
         uv: Texture coordinates of every face corner, v up, shape (F, 3, 2), or None.
-        metallic: 0 for dielectrics to 1 for metals.
-        roughness: Of the glTF material model, in (0, 1]; None for a matt surface without highlight.
-        shiny: Whether the material reflects a highlight at all.
-        reflectance: At normal incidence, of what of the material is no metal.
-        warnings: What of the file's material is left out, a sentence each.
+        metallic: Metalness, 0 for dielectrics to 1 for metals.
+        roughness: Roughness of the glTF material model, in (0, 1].
+        shiny: True if the material reflects a highlight.
+        reflectance: Reflectance at normal incidence of the non-metallic part of the material.
+        warnings: Ignored properties of the file's material, a sentence each.
     """
 
     name: str
@@ -78,19 +78,19 @@ class MeshPart:
 
     @property
     def gloss(self) -> float:
-        """Reflectance at normal incidence that comes on top of the base colour: of a coat without a colour."""
+        """Reflectance at normal incidence of the colourless coat on top of the base colour."""
         return self.reflectance * (1.0 - self.metallic) if self.shiny else 0.0
 
     @property
     def specular(self) -> float:
-        """Reflectance at normal incidence, grey."""
+        """Reflectance at normal incidence, averaged to grey."""
         if not self.shiny:
             return 0.0
         base = float(self._face_colours(np.full((1, 3), 1.0 / 3.0)).mean())
         return self.gloss + base * self.metallic
 
     def _face_colours(self, barycentric: Float64Array) -> Float64Array:
-        """Linear colours (F, S, 3) at ``barycentric`` (S, 3) of every face, by the nearest texel."""
+        """Return linear colours (F, S, 3) at ``barycentric`` (S, 3) of every face, from the nearest texel."""
         if self.colours is not None:
             return np.asarray(np.einsum("sk,fkc->fsc", barycentric, self.colours))
         if self.uv is None or self.texture is None:
@@ -102,7 +102,7 @@ class MeshPart:
         return decode_srgb(self.texture[row, column] / 255.0)
 
     def detail_density(self, gain: float, rng: np.random.Generator) -> Float64Array:
-        """Relative density (F,) that the texture asks for: 1 where it is even, ``1 + gain`` where it changes most."""
+        """Return the relative density (F,) for the texture: 1 where it is uniform, ``1 + gain`` where it changes most."""
         barycentric = rng.dirichlet(np.ones(3), _DETAIL_SAMPLES)
         deviation = (self._face_colours(barycentric) ** (1 / 2.2)).std(axis=1).max(axis=1)
         return np.asarray(1.0 + gain * np.clip(deviation / _DETAIL_CONTRAST, 0.0, 1.0))
@@ -115,12 +115,12 @@ def read_parts(
     up: Literal["y", "z"] = "z",
     finish: SurfaceFinish | None = None,
 ) -> tuple[MeshPart, ...]:
-    """Parts of a mesh or of a file that trimesh reads, in metres, z up, with ``finish`` over their own materials.
+    """Read the parts of a mesh or of a file that trimesh reads [m], z up; ``finish`` replaces their own materials.
 
     Raises:
         InputError: If the file or its textures cannot be read, there are no faces, none has an area, or a position is
             not finite.
-        MissingResourceError: If what reads such files is not installed.
+        MissingResourceError: If the package that reads such files is not installed.
     """
     finish, linear = finish or SurfaceFinish(), False
     source = "mesh"
@@ -171,7 +171,7 @@ def read_parts(
 
 
 def world_from_file(metres_per_unit: float, up: Literal["y", "z"]) -> Float64Array:
-    """Matrix (4, 4) to metres, z up."""
+    """Return the transform (4, 4) from the file's units and axes to metres, z up."""
     matrix = np.diag([metres_per_unit, metres_per_unit, metres_per_unit, 1.0])
     if up == "y":
         matrix = matrix @ trimesh.transformations.rotation_matrix(np.pi / 2, (1, 0, 0))
@@ -181,10 +181,10 @@ def world_from_file(metres_per_unit: float, up: Literal["y", "z"]) -> Float64Arr
 def _read_part(
     name: str, source: trimesh.Trimesh, transform: Float64Array, finish: SurfaceFinish, *, linear: bool
 ) -> MeshPart:
-    """A part; its vertex colours are ``linear`` or display-encoded."""
+    """Read a part; ``linear`` states that its vertex colours are linear instead of display-encoded."""
     geometry = trimesh.Trimesh(source.vertices, source.faces, process=False)
     geometry.merge_vertices(merge_tex=True, merge_norm=True)
-    # Only what has collapsed: dropping slivers would open holes.
+    # Only collapsed faces are removed, because removing slivers would open holes.
     keep = np.diff(np.sort(geometry.faces, axis=1), axis=1).all(axis=1)
     geometry.update_faces(keep)
     geometry.apply_transform(transform)
@@ -222,7 +222,7 @@ def _read_part(
 
 
 def _finished(material: Material, finish: SurfaceFinish) -> Material:
-    """``material`` with what ``finish`` gives."""
+    """Return ``material`` with the values that ``finish`` defines."""
     colour = finish.linear_colour()
     if colour is not None:
         material = replace(material, factor=colour, texture=None)
@@ -242,9 +242,9 @@ def _finished(material: Material, finish: SurfaceFinish) -> Material:
 
 
 def mitsuba_scene(parts: Sequence[MeshPart], lights: dict[str, Any], *, clay: bool = False) -> mi.Scene:
-    """Mitsuba scene of ``parts`` under emitters ``lights``.
+    """Create a Mitsuba scene of ``parts`` under emitters ``lights``.
 
-    Metals and plastics are ``principled`` BSDFs; with ``clay`` everything is a white diffuse one instead.
+    Metals and plastics are ``principled`` BSDFs. With ``clay``, all parts have a white diffuse BSDF instead.
     """
     ensure_variant()
     shapes = {f"part_{k}": _mitsuba_mesh(part, _WHITE) if clay else part_shape(part) for k, part in enumerate(parts)}
@@ -252,7 +252,7 @@ def mitsuba_scene(parts: Sequence[MeshPart], lights: dict[str, Any], *, clay: bo
 
 
 def part_shape(part: MeshPart) -> mi.Mesh:
-    """Mitsuba's shape of a part in its own material."""
+    """Create the Mitsuba shape of a part in its own material."""
     return _mitsuba_mesh(part, _bsdf(part))
 
 
@@ -292,7 +292,7 @@ def _mitsuba_mesh(part: MeshPart, bsdf: dict[str, Any]) -> mi.Mesh:
 
 
 def bake_lights(light: str | Sequence[LightSpec]) -> dict[str, Any]:
-    """Mitsuba emitters, by name, of a named light (``uniform``, ``studio``) or of a scene's lights.
+    """Return Mitsuba emitters, by name, of a named light (``uniform``, ``studio``) or of a scene's lights.
 
     Raises:
         InputError: If the name is unknown, or there is no light at all.
@@ -310,7 +310,7 @@ def bake_lights(light: str | Sequence[LightSpec]) -> dict[str, Any]:
 
 
 def _studio() -> Float32Array:
-    """Latitude-longitude map (H, W, 3) of eight soft boxes, one towards each corner of a cube, of mean radiance 1."""
+    """Return a latitude-longitude map (H, W, 3) of mean radiance 1, with a soft box towards each corner of a cube."""
     height, width = 64, 128
     polar = (np.arange(height) + 0.5) / height * np.pi
     azimuth = (np.arange(width) + 0.5) / width * 2.0 * np.pi

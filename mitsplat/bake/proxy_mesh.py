@@ -1,4 +1,4 @@
-"""The one surface of an asset that physics and shadows use, of the parts of a CAD mesh or a scan."""
+"""Proxy mesh of an asset for physics and shadows, made from the parts of a CAD mesh or a scan."""
 
 from __future__ import annotations
 
@@ -14,15 +14,17 @@ from mitsplat.geometry.mesh import simplify_solid
 from mitsplat.renderer.occluders.proxies import Occluder, Proxies
 
 _LABEL_GAP = 0.01
-"""Distance from a solid, relative to its own size, within which a sheet is a label on it."""
+"""Maximum distance of a label sheet from its solid, relative to the size of the sheet."""
 _TOLERANCES = 1e-5 * 1.5 ** np.arange(18)
-"""Of simplification, relative to the size, up to a hundredth; tried in turn until the faces are few enough."""
+"""Tolerances of simplification relative to the size, up to 0.01; tried in turn until the face count is low enough."""
 
 
 def make_proxy(parts: Sequence[MeshPart], most_faces: int) -> trimesh.Trimesh:
-    """One surface of all parts, of at most about ``most_faces`` faces; labels on solids are left out.
+    """Merge all parts into one surface of at most about ``most_faces`` faces; labels on solids are left out.
 
-    Decimation eats open sheets from their edges, so they keep all faces, the flat ones only as many as they need.
+    Open sheets are not decimated, because decimation would shrink them from their edges. Flat sheets are
+    re-triangulated
+    from their outlines.
     """
     meshes = [_without_holes(part.mesh) for part in parts]
     solids = [mesh for mesh in meshes if mesh.is_volume]
@@ -39,7 +41,10 @@ def make_proxy(parts: Sequence[MeshPart], most_faces: int) -> trimesh.Trimesh:
 
 
 def _of_fewer_faces(solid: trimesh.Trimesh, most: int) -> trimesh.Trimesh:
-    """A solid of at most about ``most`` faces; what quadric decimation tears, as it does scans, Manifold thins."""
+    """Simplify a solid to at most about ``most`` faces.
+
+    Quadric decimation may tear meshes such as scans; Manifold simplifies those instead.
+    """
     if len(solid.faces) <= most:
         return solid
     fewer = solid.simplify_quadric_decimation(face_count=most)
@@ -50,7 +55,7 @@ def _of_fewer_faces(solid: trimesh.Trimesh, most: int) -> trimesh.Trimesh:
 
 
 def _without_holes(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
-    """A solid that lacks a triangle or two, as scans do, closed; any other mesh as it is."""
+    """Close small holes of a solid, such as missing triangles of a scan; return any other mesh unchanged."""
     if mesh.is_watertight:
         return mesh
     closed = mesh.copy()
@@ -59,7 +64,7 @@ def _without_holes(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
 
 
 def _flattened(sheet: trimesh.Trimesh) -> trimesh.Trimesh:
-    """A sheet in a plane with no more faces than its outline needs; any other sheet as it is."""
+    """Re-triangulate a planar sheet from its outline; return any other sheet unchanged."""
     normal = sheet.face_normals[0]
     height = (sheet.vertices - sheet.vertices[0]) @ normal
     if (sheet.face_normals @ normal < 0.999).any() or np.ptp(height) > 1e-5 * sheet.scale:
@@ -74,7 +79,7 @@ def _flattened(sheet: trimesh.Trimesh) -> trimesh.Trimesh:
 
 
 def _lies_on(sheet: trimesh.Trimesh, solid: trimesh.Trimesh) -> bool:
-    """Whether an open sheet hugs a solid, as a label does: everywhere within a hundredth of its size."""
+    """Return True if every face of an open sheet is within 1 % of the sheet's size from a solid, as a label is."""
     origins, down = sheet.triangles_center, -sheet.face_normals
     rays = mi.Ray3f(mi.Point3f(origins.T.astype(np.float32)), mi.Vector3f(down.T.astype(np.float32)))
     hit, _ = Proxies([Occluder(solid, 0, dynamic=False)]).nearest(rays)

@@ -1,8 +1,8 @@
-"""What meshes look like: the materials of mesh files, and finishes that users give instead.
+"""Materials of mesh files, and finishes that replace them.
 
-Colours of files are display-encoded (PLY, STL, OBJ with its MTL), but for glTF's factors and vertex colours, which are
-linear by its specification (Khronos, *glTF 2.0*, 3.9.2 and 3.7.2.1). A texture without a factor counts as it is. An
-MTL without ``Ks``, ``Pr`` and ``Pm``, or with ``illum`` 0 or 1, is matt.
+Colours in files are display-encoded (PLY, STL, OBJ with its MTL). Factors and vertex colours of glTF are linear by its
+specification (Khronos, *glTF 2.0*, 3.9.2 and 3.7.2.1). A texture without a factor is used unchanged. An MTL without
+``Ks``, ``Pr`` and ``Pm``, or with ``illum`` 0 or 1, is matt.
 """
 
 from __future__ import annotations
@@ -29,25 +29,25 @@ DIELECTRIC_SPECULAR = 0.04
 """Reflectance at normal incidence of common plastics, lacquers and glass."""
 MOST_SPECULAR = 0.08
 UNKNOWN_COLOUR = 0.5
-"""Linear grey of what has no colour."""
+"""Linear grey of parts without a colour."""
 ROUGHNESS = 0.6
 LEAST_ROUGHNESS = 0.05
 _OPAQUE = 0.999
 _TRIMESH_DIFFUSE = (102, 102, 102)
-"""What trimesh fills in for a ``Kd`` that is absent."""
+"""Value that trimesh inserts for an absent ``Kd``."""
 
 
 @dataclass(frozen=True)
 class SurfaceFinish:
-    """A material to use instead of a file's own; each value replaces that of all parts, None leaves it.
+    """Material that replaces that of a file; each value applies to all parts, None keeps the file's value.
 
     A colour replaces textures and vertex colours. Roughness, metalness or specular on a matt part make it glossy.
 
     Attributes:
-        colour: Display-encoded: a name or ``#rrggbb`` as in CSS, or red, green, blue from 0 to 1.
-        roughness: Of glTF's material model, 0 (a mirror) to 1.
-        metallic: 0 for what is no metal to 1 for metal.
-        specular: Reflectance at normal incidence of what is no metal, 0 (matt) to 0.08; 0.04 for plastics.
+        colour: Display-encoded colour: a CSS name, ``#rrggbb``, or red, green, blue from 0 to 1.
+        roughness: Roughness of glTF's material model, 0 (a mirror) to 1.
+        metallic: Metalness, 0 for dielectrics to 1 for metals.
+        specular: Reflectance at normal incidence of dielectrics, 0 (matt) to 0.08; 0.04 for plastics.
     """
 
     colour: str | tuple[float, float, float] | None = None
@@ -64,7 +64,7 @@ class SurfaceFinish:
         self.linear_colour()
 
     def linear_colour(self) -> Float64Array | None:
-        """Linear red, green and blue, shape (3,), or None."""
+        """Return linear red, green and blue, shape (3,), or None."""
         if self.colour is None:
             return None
         if isinstance(self.colour, str):
@@ -81,16 +81,16 @@ class SurfaceFinish:
 
 @dataclass(frozen=True, eq=False)
 class Material:
-    """One material, uniform but for its texture.
+    """One material, uniform except for its texture.
 
     Attributes:
-        factor: Linear colour, or what multiplies the texture, shape (3,).
+        factor: Linear colour, or factor of the texture, shape (3,).
         texture: Display-encoded base colour, shape (H, W, 3) uint8, or None.
-        metallic: 0 to 1.
-        roughness: Of glTF's material model, > 0.
-        specular: Reflectance at normal incidence of what is no metal.
-        shiny: Whether a highlight is reflected at all.
-        warnings: What of the file's material is left out, a sentence each.
+        metallic: Metalness, 0 to 1.
+        roughness: Roughness of glTF's material model, > 0.
+        specular: Reflectance at normal incidence of the non-metallic part.
+        shiny: True if the material reflects a highlight.
+        warnings: Ignored properties of the file's material, a sentence each.
     """
 
     factor: Float64Array
@@ -103,7 +103,7 @@ class Material:
 
 
 def read_material(material: Any) -> Material:
-    """Material of trimesh's."""
+    """Convert a material of trimesh."""
     if isinstance(material, PBRMaterial):
         return _read_gltf(material)
     if isinstance(material, SimpleMaterial):
@@ -113,7 +113,7 @@ def read_material(material: Any) -> Material:
 
 def _read_gltf(source: PBRMaterial) -> Material:
     warnings = []
-    # trimesh keeps the file's linear numbers in steps of 1/255.
+    # trimesh stores the file's linear values as multiples of 1/255.
     factor = np.ones(3) if source.baseColorFactor is None else np.asarray(source.baseColorFactor) / 255.0
     if source.alphaMode not in (None, "OPAQUE") and (factor[3:] < _OPAQUE).any():
         warnings.append("it is transparent, and baked opaque")
@@ -122,7 +122,7 @@ def _read_gltf(source: PBRMaterial) -> Material:
     metallic = 0.0 if source.metallicFactor is None else float(source.metallicFactor)
     roughness = ROUGHNESS if source.roughnessFactor is None else float(source.roughnessFactor)
     if source.metallicRoughnessTexture is not None:
-        # Absent factors are 1 beside this texture; its green is roughness, its blue metalness.
+        # If this texture exists, absent factors are 1; green is roughness, blue is metalness.
         means = np.asarray(source.metallicRoughnessTexture.convert("RGB")).reshape(-1, 3).mean(axis=0) / 255.0
         metallic = means[2] * (1.0 if source.metallicFactor is None else metallic)
         roughness = means[1] * (1.0 if source.roughnessFactor is None else roughness)
@@ -137,7 +137,7 @@ def _read_gltf(source: PBRMaterial) -> Material:
 
 
 def _read_mtl(source: SimpleMaterial) -> Material:
-    """An MTL's material: the file's own keys, because trimesh fills in a dark grey for a ``Kd`` that is absent."""
+    """Convert an MTL material from the file's own keys, because trimesh inserts dark grey for an absent ``Kd``."""
     keys: Mapping[str, Any] = source.kwargs
     warnings: list[str] = []
     texture = _pixels(source.image, warnings)
@@ -169,7 +169,7 @@ def _read_mtl(source: SimpleMaterial) -> Material:
     if given_roughness is not None:
         roughness = float(given_roughness[0])
     elif (exponent := _numbers(keys, "ns")) is not None:
-        # Phong's exponent as the slope's variance of a microfacet surface (Walter et al. 2007).
+        # Phong's exponent, converted to the slope variance of a microfacet surface (Walter et al. 2007).
         roughness = (2.0 / (max(0.0, float(exponent[0])) + 2.0)) ** 0.25
     metal = 0.0 if metallic is None else float(np.clip(metallic[0], 0.0, 1.0))
     shiny = specular > 0 or metal > 0
@@ -185,7 +185,7 @@ def _read_mtl(source: SimpleMaterial) -> Material:
 
 
 def _numbers(keys: Mapping[str, Any], name: str) -> Float64Array | None:
-    """Numbers of an MTL's key, or None where it is absent or damaged."""
+    """Return the numbers of an MTL key, or None if it is absent or damaged."""
     try:
         found = np.atleast_1d(np.asarray(keys[name], dtype=np.float64))
     except (KeyError, ValueError):
@@ -205,10 +205,10 @@ def _pixels(image: Image.Image | None, warnings: list[str]) -> npt.NDArray[np.ui
 
 
 def check_textures(mesh: Path) -> None:
-    """Refuse a mesh whose material file, materials or textures are missing: without them it would bake in grey.
+    """Refuse a mesh whose material file, materials or textures are missing, because it would be baked in grey.
 
     Raises:
-        InputError: If what an OBJ, its MTL, a glTF or a PLY names is missing, or is no image.
+        InputError: If a file that an OBJ, its MTL, a glTF or a PLY names is missing, or is no image.
     """
     kind = mesh.suffix.lower()
     if kind == ".obj":
@@ -223,7 +223,7 @@ def check_textures(mesh: Path) -> None:
 
 
 _HEADER = 1 << 16
-"""Bytes of a PLY file that its header is looked for in."""
+"""Maximum size of the header of a PLY file [bytes]."""
 
 
 def _check_obj(mesh: Path) -> None:
@@ -259,7 +259,7 @@ def _check_gltf(mesh: Path) -> None:
     except (OSError, ValueError, AttributeError, TypeError) as error:
         if isinstance(error, InputError):
             raise
-        return  # its reader says what is wrong
+        return  # trimesh reports the error when it reads the file
     for uri in images:
         if not uri.startswith("data:"):
             _check_texture(mesh, unquote(uri))
@@ -276,7 +276,7 @@ def _check_texture(path: Path, texture: str) -> None:
 
 
 def _named(path: Path, key: str) -> list[str]:
-    """What the lines of an OBJ or an MTL that begin with a key name."""
+    """Return the values of all lines of an OBJ or an MTL that begin with a key."""
     names = []
     for line in path.read_bytes().splitlines():
         words = line.split(maxsplit=1)

@@ -1,4 +1,4 @@
-"""What a bake came to: its splats beside the path-traced mesh, and beside the textures of its file."""
+"""Verification of a bake: its splats compared with the path-traced mesh and with the textures of its file."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from mitsplat.renderer.path_tracing import render_mesh
 
 _POINTS = 4000
 _NEAR = 3.0
-"""Distance from the next Gaussian, in standard deviations of it, beyond which a point of the mesh is hidden."""
+"""Distance to the next Gaussian, in its standard deviations, beyond which a point of the mesh counts as hidden."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,10 +34,10 @@ class BakedView:
     """One view of the mesh and of its splats.
 
     Attributes:
-        mesh: Path-traced picture of the mesh, display-encoded, black where nothing is, shape (H, W, 3).
-        splats: The same of the splats.
-        cover: Share of each pixel that the mesh covers, shape (H, W).
-        psnr: Of the whole picture [dB].
+        mesh: Path-traced picture of the mesh, display-encoded, with black background, shape (H, W, 3).
+        splats: Picture of the splats in the same encoding, shape (H, W, 3).
+        cover: Fraction of each pixel that the mesh covers, shape (H, W).
+        psnr: PSNR of the whole picture [dB].
     """
 
     mesh: Float64Array
@@ -55,7 +55,11 @@ def compare_views(
     seed: int,
     progress: Progress,
 ) -> tuple[tuple[BakedView, ...], float, float]:
-    """Views of the mesh and the splats, and PSNR [dB] of all together: whole images, and the mesh's pixels alone."""
+    """Compare the mesh and the splats in several views.
+
+    Returns:
+        The views, the PSNR of whole images [dB], and the PSNR of the mesh's pixels alone [dB].
+    """
     views, errors, on_object = [], [], []
     for number, camera in enumerate(cameras):
         progress(number, len(cameras), "comparing with the mesh")
@@ -74,17 +78,21 @@ def compare_with_textures(
     world_from_file: Float64Array,
     gloss: Mapping[str, float],
 ) -> float | None:
-    """Brightness of the splats relative to the textures of a mesh, at points of its surface; None without textures.
+    """Return the brightness of the splats relative to the textures of a mesh at points of its surface.
 
-    The texture is looked up by trimesh in the file's own image, past all that is known of its colour here. Under light
-    of radiance 1 from everywhere a convex surface has its texture's brightness and that of its gloss, which is the
-    larger share of what a dark one sends out.
+    Trimesh reads the texture from the file's own image, independently of the colours used for baking. Under light of
+    radiance 1 from all directions, a convex surface has the brightness of its texture plus that of its gloss. For a
+    dark
+    surface, the gloss is the larger part.
 
     Args:
-        mesh: Or its file.
-        splats: Baked of it, under such light.
-        world_from_file: Matrix (4, 4) to metres, z up.
-        gloss: Reflectance on top of the texture by the name of a part; 0 where unnamed.
+        mesh: Mesh or its file.
+        splats: Splats baked from the mesh under such light.
+        world_from_file: Transform (4, 4) to metres, z up.
+        gloss: Reflectance on top of the texture by the name of a part; 0 for other parts.
+
+    Returns:
+        The ratio, or None without textures.
     """
     if isinstance(mesh, str | Path):
         mesh = trimesh.load_scene(mesh)

@@ -7,8 +7,8 @@
     bop/<split>/000000/rgb/000003.png, depth/000003.png, mask/000003_000000.png, mask_visib/000003_000000.png
 
 Definitions are those of the BOP toolkit (``docs/bop_datasets_format.md``, ``scripts/calc_gt_info.py``): the silhouette
-is counted up to one image beyond each border, boxes are (x, y, x_max - x_min, y_max - y_min), pixel centres are whole
-numbers. The one difference: what is visible is known exactly, where the toolkit compares depths within 15 mm.
+is counted up to one image beyond each border, boxes are (x, y, x_max - x_min, y_max - y_min), and pixel centres are
+integers. There is one difference: visibility is known exactly, whereas the toolkit compares depths within 15 mm.
 """
 
 from __future__ import annotations
@@ -33,16 +33,16 @@ from mitsplat.storage.json_stream import EntriesFile
 
 MILLIMETRES = 1000.0
 _TOGETHER, _WAITING = 768, 32
-"""Files, and how many of them are waited for at a time."""
+"""Number of finished files per batch, and number of threads that flush a batch to disk."""
 
 
 def scene_folder(record: Record) -> str:
-    """Folder of the frame's scene, relative to the dataset."""
+    """Return the folder of the frame's scene, relative to the dataset."""
     return f"bop/{record['split']}/{record['layout']:06d}"
 
 
 def write(files: FrameFiles) -> None:
-    """Write a frame's pictures, and its own under a second name."""
+    """Write a frame's depth picture and masks, and add its image under a second name."""
     scene = scene_folder(files.record)
     files.add_image(f"{scene}/rgb/{files.image_name}")
     files.add_depth(f"{scene}/depth/{files.number}.png")
@@ -51,7 +51,7 @@ def write(files: FrameFiles) -> None:
 
 
 def mask_pictures(labels: Labels) -> Iterable[tuple[str, int, bytes]]:
-    """(folder, position of the instance, PNG of 0 and 255) of every mask of a frame."""
+    """Yield (folder, position of the instance, PNG of 0 and 255) for every mask of a frame."""
     size = labels.width, labels.height
     for position, label in enumerate(labels.instances):
         yield "mask", position, encode_mask_png(label.amodal.mask, label.amodal.box, size)
@@ -59,10 +59,11 @@ def mask_pictures(labels: Labels) -> Iterable[tuple[str, int, bytes]]:
 
 
 class ScenesWriter:
-    """Writes the annotations of all scenes, and the models: frames come by layout.
+    """Writer of the annotations of all scenes and of the models; frames must be added by ascending layout.
 
-    Files of scenes are put on disk side by side, as many as :data:`_TOGETHER`: a million images have 300,000, and
-    waiting for one after the other would take longer than all the rest.
+    The files of scenes are flushed to disk in parallel, in batches of :data:`_TOGETHER`. A million images have 300,000
+    such
+    files, and flushing them one by one would take longer than all other work.
     """
 
     def __init__(self, root: Path, catalogue: Catalogue) -> None:
@@ -77,7 +78,7 @@ class ScenesWriter:
         self._ended: list[GrowingFile] = []
 
     def add(self, record: Record) -> None:
-        """Describe a frame."""
+        """Add a frame."""
         folder = scene_folder(record)
         if folder != self._folder:
             if record["layout"] <= self._layout:
@@ -106,13 +107,13 @@ class ScenesWriter:
         self._ended = []
 
     def keep(self) -> None:
-        """Give the files of the last scenes their names, and write the models."""
+        """Give the files of the last scenes their final names, and write the models."""
         self._end_scene()
         self._name_ended()
         write_models(self._root, self._meshes)
 
     def discard(self) -> None:
-        """Remove what was not kept."""
+        """Remove the files that do not have their final name yet."""
         for open_file in self._files.values():
             open_file.discard()
         for file in self._ended:
@@ -120,7 +121,7 @@ class ScenesWriter:
 
 
 def write_models(root: Path, meshes: Mapping[int, trimesh.Trimesh]) -> None:
-    """Write the objects' meshes by object id, and their bounds and diameters."""
+    """Write the objects' meshes by object id, with their bounds and diameters."""
     info = {}
     for number, mesh in meshes.items():
         scaled = mesh.copy()
@@ -132,7 +133,7 @@ def write_models(root: Path, meshes: Mapping[int, trimesh.Trimesh]) -> None:
 
 
 def model_info(mesh: trimesh.Trimesh) -> dict[str, float]:
-    """Diameter, lower corner and extents of a mesh, in its units."""
+    """Return diameter, lower corner and extents of a mesh, in its units."""
     return {
         "diameter": diameter(mesh),
         **{f"min_{axis}": float(value) for axis, value in zip("xyz", mesh.bounds[0], strict=True)},
@@ -141,14 +142,14 @@ def model_info(mesh: trimesh.Trimesh) -> dict[str, float]:
 
 
 def diameter(mesh: trimesh.Trimesh) -> float:
-    """Largest distance of two vertices."""
+    """Return the largest distance between two vertices."""
     points = mesh.vertices
     corners = points[ConvexHull(points).vertices]
     return float(pdist(corners).max())
 
 
 def camera_entry(record: Record, camera: Camera) -> dict[str, Any]:
-    """The frame in ``scene_camera.json``."""
+    """Return the frame's entry in ``scene_camera.json``."""
     intrinsics = camera.intrinsics
     intrinsics[:2, 2] -= 0.5
     pose = camera.camera_from_world
@@ -161,7 +162,7 @@ def camera_entry(record: Record, camera: Camera) -> dict[str, Any]:
 
 
 def pose_entries(record: Record, camera: Camera) -> list[dict[str, Any]]:
-    """The frame in ``scene_gt.json``."""
+    """Return the frame's entry in ``scene_gt.json``."""
     camera_from_world = camera.camera_from_world
     entries = []
     for label in record["labels"]["instances"]:
@@ -177,7 +178,7 @@ def pose_entries(record: Record, camera: Camera) -> list[dict[str, Any]]:
 
 
 def info_entries(record: Record) -> list[dict[str, Any]]:
-    """The frame in ``scene_gt_info.json``."""
+    """Return the frame's entry in ``scene_gt_info.json``."""
 
     def box(bounds: Sequence[int]) -> list[int]:
         x0, y0, x1, y1 = bounds

@@ -1,15 +1,16 @@
 """COCO annotations from the records of a dataset's frames; image ids are frame indices, category ids class indices + 1.
 
 ``annotations/instances_<split>.json``
-    Boxes, areas and run-length masks of what is visible, with the keypoints of assets that name some.
+    Boxes, areas and run-length masks of the visible pixels, with the keypoints of assets that define some.
 ``annotations/amodal_<split>.json``
-    The same instances with all that they cover, hidden pixels included; ``visible_segmentation`` is what is seen.
+    The same instances with their full silhouettes, hidden pixels included. ``visible_segmentation`` is the visible
+    part.
 ``annotations/panoptic_<split>.json`` and ``panoptic/<split>/NNNNNN.png``
-    Every pixel's segment, id = R + 256 G + 256² B; the environment is a segment of stuff, and what belongs to an
-    instance without a label is void (id 0).
+    Segment of every pixel, id = R + 256 G + 256² B. The environment is a stuff segment. Pixels of instances without a
+    label are void (id 0).
 ``annotations/poses_<split>.json``
-    Cameras, and the rigid transforms of the instances, in metres. ``object`` is the position of an instance's entry
-    among the scene's ``objects``, from 0: names of assets may be given twice.
+    Cameras, and the rigid transforms of the instances [m]. ``object`` is the position of an instance's entry among the
+    scene's ``objects``, starting at 0, because names of assets need not be unique.
 """
 
 from __future__ import annotations
@@ -28,13 +29,13 @@ from mitsplat.storage.files import Record
 from mitsplat.storage.json_stream import ListsFile
 
 ENVIRONMENT = "environment"
-"""Name of the panoptic category of what is no instance."""
+"""Name of the panoptic category of pixels without an instance."""
 
 
 def annotations_of(
     record: Record, keypoint_names: Sequence[Sequence[str]], *, first: int, amodal: bool
 ) -> Iterator[dict[str, Any]]:
-    """Annotations of a frame's instances, of what is visible or of all that they cover, with ids from ``first`` on."""
+    """Yield the visible or amodal annotations of a frame's instances, with ids from ``first`` on."""
     width, height = record["labels"]["size"]
     for number, label in enumerate(record["labels"]["instances"], start=first):
         visible = {"size": [height, width], "counts": label["rle"]}
@@ -60,7 +61,7 @@ def annotations_of(
 
 
 def panoptic_annotation(record: Record, num_classes: int) -> dict[str, Any]:
-    """Segments of a frame's picture, which is that of :func:`panoptic_image`."""
+    """Return the segments of a frame, for the picture of :func:`panoptic_image`."""
     segments = [
         {
             "id": label["id"],
@@ -81,7 +82,7 @@ def panoptic_annotation(record: Record, num_classes: int) -> dict[str, Any]:
 
 
 def pose_entry(record: Record, assets: Sequence[str]) -> dict[str, Any]:
-    """Camera and 6-DoF poses of a frame."""
+    """Return the camera and the 6-DoF poses of a frame."""
     camera_from_world = Camera.from_json(record["camera"]).camera_from_world
     return {
         **_image(record),
@@ -101,9 +102,9 @@ def pose_entry(record: Record, assets: Sequence[str]) -> dict[str, Any]:
 
 
 class InstancesWriter:
-    """Writes ``instances_<split>.json``, or ``amodal_<split>.json``.
+    """Writer of ``instances_<split>.json`` or ``amodal_<split>.json``.
 
-    Names of images are without folders, which are those of the file's split, unless ``folders`` is set: then they are
+    Image names have no folder part by default, because the file belongs to one split. With ``folders``, image names are
     relative to ``images/``.
     """
 
@@ -122,7 +123,7 @@ class InstancesWriter:
         self._keypoint_names, self._amodal, self._folders = keypoint_names, amodal, folders
 
     def add(self, record: Record) -> None:
-        """Describe a frame."""
+        """Add a frame."""
         name = {"file_name": image_file(record).removeprefix("images/")} if self._folders else {}
         self.file.append("images", _image(record) | name)
         first = self.file.count("annotations") + 1
@@ -131,7 +132,7 @@ class InstancesWriter:
 
 
 class PanopticWriter:
-    """Writes ``panoptic_<split>.json``."""
+    """Writer of ``panoptic_<split>.json``."""
 
     def __init__(self, path: Path, class_names: Sequence[str]) -> None:
         self._stuff = len(class_names)
@@ -140,20 +141,20 @@ class PanopticWriter:
         self.file = ListsFile(path, ("images", "annotations"), after={"categories": categories})
 
     def add(self, record: Record) -> None:
-        """Describe a frame."""
+        """Add a frame."""
         self.file.append("images", _image(record))
         self.file.append("annotations", panoptic_annotation(record, self._stuff))
 
 
 class PosesWriter:
-    """Writes ``poses_<split>.json``."""
+    """Writer of ``poses_<split>.json``."""
 
     def __init__(self, path: Path, class_names: Sequence[str], assets: Sequence[str]) -> None:
         self.file = ListsFile(path, ("frames",), before={"classes": list(class_names)})
         self._assets = assets
 
     def add(self, record: Record) -> None:
-        """Describe a frame."""
+        """Add a frame."""
         self.file.append("frames", pose_entry(record, self._assets))
 
 
@@ -164,7 +165,7 @@ class _OfSplit(Protocol):
 
 
 class _OfSplits:
-    """A file of annotations for each split."""
+    """Writers of one annotation file for each split."""
 
     def __init__(self, root: Path, name: str, catalogue: Catalogue, make: Callable[[Path], _OfSplit]) -> None:
         self._writers = {split: make(root / f"annotations/{name}_{split}.json") for split in catalogue.splits}
@@ -182,7 +183,7 @@ class _OfSplits:
 
 
 def describe_instances(root: Path, catalogue: Catalogue, *, amodal: bool = False) -> Describer:
-    """Writes ``instances_<split>.json``, or ``amodal_<split>.json``."""
+    """Create the writer of ``instances_<split>.json`` or ``amodal_<split>.json``."""
     names = catalogue.class_names, catalogue.keypoint_names
     return _OfSplits(
         root, "amodal" if amodal else "instances", catalogue, lambda path: InstancesWriter(path, *names, amodal=amodal)
@@ -190,17 +191,17 @@ def describe_instances(root: Path, catalogue: Catalogue, *, amodal: bool = False
 
 
 def describe_panoptic(root: Path, catalogue: Catalogue) -> Describer:
-    """Writes ``panoptic_<split>.json``."""
+    """Create the writer of ``panoptic_<split>.json``."""
     return _OfSplits(root, "panoptic", catalogue, lambda path: PanopticWriter(path, catalogue.class_names))
 
 
 def describe_poses(root: Path, catalogue: Catalogue) -> Describer:
-    """Writes ``poses_<split>.json``."""
+    """Create the writer of ``poses_<split>.json``."""
     return _OfSplits(root, "poses", catalogue, lambda path: PosesWriter(path, catalogue.class_names, catalogue.assets))
 
 
 def write_panoptic(files: FrameFiles) -> None:
-    """Write a frame's picture of segments, and into its record that of the environment."""
+    """Write a frame's segment picture, and add the environment segment to its record."""
     environment = environment_segment(files.frame.labels, files.ids)
     if environment is not None:
         files.record["environment"] = environment
@@ -209,7 +210,7 @@ def write_panoptic(files: FrameFiles) -> None:
 
 
 def environment_segment(labels: Labels, ids: npt.NDArray[np.integer[Any]]) -> dict[str, Any] | None:
-    """The segment of the pixels where an id map holds 0: its id, area and box; None if there are none."""
+    """Return id, area and box of the pixels where an id map is 0, or None if there are none."""
     ys, xs = np.nonzero(ids == 0)
     if not len(ys):
         return None
@@ -221,7 +222,7 @@ def environment_segment(labels: Labels, ids: npt.NDArray[np.integer[Any]]) -> di
 def panoptic_image(
     labelled: npt.NDArray[np.uint16], ids: npt.NDArray[np.integer[Any]], environment: Mapping[str, Any] | None
 ) -> npt.NDArray[np.uint8]:
-    """RGB picture of segment ids, (H, W, 3), from the labelled ids and all ids (H, W)."""
+    """Return the RGB picture of segment ids, shape (H, W, 3), from the labelled ids and all ids, shape (H, W)."""
     segments = labelled.astype(np.uint32)
     if environment is not None:
         segments[ids == 0] = environment["id"]
@@ -229,7 +230,7 @@ def panoptic_image(
 
 
 def image_file(record: Record) -> str:
-    """The frame's image, relative to the dataset."""
+    """Return the frame's image file, relative to the dataset."""
     return str(next(file for file in record["files"] if file.startswith("images/")))
 
 

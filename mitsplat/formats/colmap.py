@@ -1,7 +1,7 @@
-"""Cameras of a dataset as COLMAP's text model: ``colmap/cameras.txt``, ``images.txt`` and an empty ``points3D.txt``.
+"""Cameras of a dataset as a COLMAP text model: ``colmap/cameras.txt``, ``images.txt`` and an empty ``points3D.txt``.
 
-Positions are in pixels with centres at +0.5, as in COLMAP; poses are camera_from_world, quaternions scalar first. Image
-names are relative to ``images/``.
+Positions are in pixels with centres at +0.5, as in COLMAP. Poses are camera_from_world with scalar-first quaternions.
+Image names are relative to ``images/``.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from mitsplat.storage.files import GrowingFile, Record
 
 
 class ModelWriter:
-    """Writes the three files."""
+    """Writer of the three files."""
 
     def __init__(self, root: Path, catalogue: Catalogue) -> None:
         self._cameras, self._images, self._points = (
@@ -26,7 +26,7 @@ class ModelWriter:
         self._models: dict[str, int] = {}
 
     def add(self, record: Record) -> None:
-        """Describe a frame."""
+        """Add a frame."""
         camera = Camera.from_json(record["camera"])
         model = camera_model(camera)
         if model not in self._models:
@@ -39,18 +39,21 @@ class ModelWriter:
         self._images.write(f"{record['index'] + 1} {values} {self._models[model]} {name}\n\n")
 
     def keep(self) -> None:
-        """Give the files their names."""
+        """Give the files their final names."""
         for file in (self._cameras, self._images, self._points):
             file.keep()
 
     def discard(self) -> None:
-        """Remove what was written, unless it was kept."""
+        """Remove the files if they do not have their final names yet."""
         for file in (self._cameras, self._images, self._points):
             file.discard()
 
 
 def camera_model(camera: Camera) -> str:
-    """Model, size and parameters: PINHOLE, OPENCV (k1 k2 p1 p2), FULL_OPENCV (and k3 k4 k5 k6), OPENCV_FISHEYE."""
+    """Return the line of a camera: model, size and parameters.
+
+    Models are PINHOLE, OPENCV (k1 k2 p1 p2), FULL_OPENCV (and k3 k4 k5 k6) and OPENCV_FISHEYE.
+    """
     values = [camera.fx, camera.fy, camera.cx, camera.cy]
     if not camera.distortion:
         model = "PINHOLE"

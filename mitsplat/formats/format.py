@@ -1,4 +1,4 @@
-"""What a format is, and the files of one frame while they are written."""
+"""Base types of formats, and the files of one frame while they are written."""
 
 from __future__ import annotations
 
@@ -25,22 +25,22 @@ if TYPE_CHECKING:
 
 
 _ONE_POSE = frozenset(("bop", "colmap", "flow"))
-"""Formats that say by one pose of the camera where all that an image shows is."""
+"""Formats that describe an image by a single camera pose."""
 
 
 @dataclass(frozen=True, eq=False)
 class Catalogue:
-    """What the labels of a scene refer to.
+    """Classes, keypoints and assets that the labels of a scene refer to.
 
     Attributes:
-        class_names: By class index.
-        keypoint_names: Keypoints of every class.
-        assets: Names, by position among the scene's assets.
-        meshes: Their proxy meshes [m].
-        distractors: Positions of the assets that are in no label.
-        drawn: Of a scene that draws its objects, what the manifest states of an instance of each asset; else empty.
+        class_names: Names of the classes, by class index.
+        keypoint_names: Names of the keypoints of every class.
+        assets: Names of the assets, by position among the scene's assets.
+        meshes: Proxy meshes of the assets [m].
+        distractors: Positions of the assets that have no labels.
+        drawn: Manifest entry of each asset's instances, for a scene that draws its objects; empty otherwise.
         splits: Names of the dataset's splits.
-        depth_sensor: What measures the depth of the format ``depth-sensor``.
+        depth_sensor: Simulated sensor of the format ``depth-sensor``.
     """
 
     class_names: Sequence[str]
@@ -54,10 +54,10 @@ class Catalogue:
 
     @classmethod
     def of(cls, scene: Scene) -> Catalogue:
-        """The catalogue of a scene, checked against the formats that it asks for.
+        """Create the catalogue of a scene, and check it against the requested formats.
 
         Raises:
-            InputError: If assets of one class name different keypoints, or a format cannot show what the scene has.
+            InputError: If assets of one class define different keypoints, or a format cannot represent the scene.
         """
         for name in scene.class_names:
             try:
@@ -108,12 +108,15 @@ class Catalogue:
 
     @property
     def num_keypoints(self) -> int:
-        """Keypoints of the class that has most."""
+        """Largest number of keypoints of any class."""
         return max(map(len, self.keypoint_names), default=0)
 
 
 def _drawn(scene: Scene) -> list[dict[str, Any]]:
-    """What the manifest states of each asset's instances, if the scene file leaves open which ones lie in a layout."""
+    """Return the manifest entry of each asset's instances, or an empty list.
+
+    Entries are needed only if the scene file does not determine which objects are in a layout.
+    """
     spec = scene.spec
     told = any(entry.pool is not None or len(entry.scales) > 1 or not entry.label for entry in spec.objects)
     if not told and not spec.regions:
@@ -128,12 +131,13 @@ def _drawn(scene: Scene) -> list[dict[str, Any]]:
 
 @dataclass(frozen=True, eq=False)
 class FrameFiles:
-    """The files of one frame below ``root``; ``record`` is its line of the manifest, which lists them.
+    """Files of one frame below ``root``; ``record`` is its line of the manifest, which lists them.
 
     Attributes:
-        frame: What is written.
-        image: The frame's picture, relative to the root, which is there before any other file.
-        ids: Ids of the instances that labels are of, shape (H, W), those without a label included, but no distractors.
+        frame: Frame to write.
+        image: File of the frame's picture, relative to the root; it is written before any other file.
+        ids: Instance ids of the label source, shape (H, W). Instances without a label are included, distractors are
+            not.
     """
 
     root: Path
@@ -145,12 +149,12 @@ class FrameFiles:
 
     @property
     def number(self) -> str:
-        """How the frame's files are called."""
+        """File name of the frame's files, without suffix."""
         return f"{self.frame.index:06d}"
 
     @property
     def name(self) -> str:
-        """The same in the folder of its split."""
+        """File name of the frame's files with the folder of its split, without suffix."""
         return f"{self.frame.plan.split}/{self.number}"
 
     @property
@@ -168,48 +172,48 @@ class FrameFiles:
         return maps.depth_picture(self.frame.depth)
 
     def add(self, file: str, write: Callable[[Path], object]) -> None:
-        """Write a file whole or not at all, and list it."""
+        """Write a file atomically and list it in the record."""
         self.record["files"][file] = write_file(self.root / file, write)
 
     def add_bytes(self, file: str, content: bytes) -> None:
-        """Write a file of this content."""
+        """Write a file with the given content."""
         self.add(file, lambda path: path.write_bytes(content))
 
     def add_png(self, file: str, picture: npt.NDArray[Any]) -> None:
-        """Write a picture without loss."""
+        """Write a picture as PNG."""
         self.add_bytes(file, maps.encode_png(picture))
 
     def add_depth(self, file: str) -> None:
-        """Write the frame's depth as a picture, in units that the record states as ``depth_scale`` [mm]."""
+        """Write the frame's depth picture; the record states its unit as ``depth_scale`` [mm]."""
         self.record["depth_scale"] = maps.depth_scale(self.frame.depth)
         self.add_png(file, self._depth)
 
     def add_image(self, file: str) -> None:
-        """Give the frame's picture a second name."""
+        """Add the frame's picture under a second name."""
         self.add(file, lambda path: link_file(self.root / self.image, path))
 
 
 class Describer(Protocol):
-    """Writes files that describe a whole dataset, frame by frame; they get their names when they are kept."""
+    """Writer of files that describe a whole dataset, frame by frame; ``keep`` gives them their final names."""
 
     def add(self, record: Record) -> None:
-        """Describe a frame; frames come by ascending index."""
+        """Add a frame; frames come by ascending index."""
 
     def keep(self) -> None:
-        """End the files, and give them their names."""
+        """Complete the files and give them their final names."""
 
     def discard(self) -> None:
-        """Remove what was not kept."""
+        """Remove the files that do not have their final name yet."""
 
 
 @dataclass(frozen=True)
 class Format:
-    """A label format.
+    """Label format.
 
     Attributes:
-        entries: Names of its files and folders in the dataset's own folder.
-        write: Writes the files of a frame.
-        describe: Makes what writes the files that describe all frames.
+        entries: Names of its files and folders at the top level of the dataset folder.
+        write: Function that writes the files of a frame, or None.
+        describe: Function that creates the writer of the files that describe all frames, or None.
     """
 
     entries: tuple[str, ...]

@@ -1,18 +1,18 @@
-"""Tasks for Label Studio, in which people look at labels and correct them: exact masks as brush strokes.
+"""Tasks for Label Studio, where people inspect and correct labels; masks are exact brush strokes.
 
 ::
 
-    label-studio/config.xml                 the labelling interface: paste it when you set up a project
-    label-studio/<split>/000003.json        a task: the picture, and a region for every instance
+    label-studio/config.xml                 labelling interface, to be pasted into the settings of a project
+    label-studio/<split>/000003.json        task: the picture, and a region for every instance
 
 Label Studio serves pictures from its own machine if it is started with
 ``LABEL_STUDIO_LOCAL_FILES_SERVING_ENABLED=true`` and ``LABEL_STUDIO_LOCAL_FILES_DOCUMENT_ROOT`` set to the dataset's
-folder; the tasks name them relative to it.
+folder. The tasks name the pictures relative to that folder.
 
 A brush stroke is an RGBA picture of the image's size in the run-length code of ``@thi.ng/rle-pack``, as a list of bytes
-(``label_studio_sdk.converter.brush``): 32 bits for the number of values, 5 for the bits of a value less 1, four times 4
-for the bits of a count less 1; then blocks of one bit that says whether a value repeats, two for which of the four
-sizes its count has, the count less 1, and the value.
+(``label_studio_sdk.converter.brush``). The header has 32 bits for the number of values, 5 bits for the bits per value
+minus 1, and four times 4 bits for the bits per count minus 1. Each following block has one bit that marks a repeated
+value, two bits that select one of the four count sizes, the count minus 1, and the value.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from mitsplat.labels.labels import InstanceLabel
 from mitsplat.storage.files import Record, write_text
 
 _COUNT_BITS = (3, 4, 8, 16)
-"""Bits of counts, as Label Studio's own encoder chooses them."""
+"""Bits of counts, as in Label Studio's own encoder."""
 _CHANNELS = 4
 
 
@@ -46,7 +46,7 @@ def write(files: FrameFiles) -> None:
 
 
 def region(label: InstanceLabel, size: tuple[int, int]) -> dict[str, Any]:
-    """An instance of an image of this width and height; its id says which of the instance map it is."""
+    """Return the region of an instance in an image of this width and height; its id contains the instance id."""
     width, height = size
     mask = np.zeros((height, width), dtype=bool)
     x0, y0, x1, y1 = label.box
@@ -64,7 +64,7 @@ def region(label: InstanceLabel, size: tuple[int, int]) -> dict[str, Any]:
 
 
 def encode_brush(mask: BoolArray) -> list[int]:
-    """A mask (H, W) as the bytes of a brush stroke."""
+    """Encode a mask (H, W) as the bytes of a brush stroke."""
     values = mask.ravel()
     starts = np.concatenate([[0], np.flatnonzero(values[1:] != values[:-1]) + 1])
     counts = np.diff(np.append(starts, values.size)) * _CHANNELS
@@ -80,13 +80,13 @@ def encode_brush(mask: BoolArray) -> list[int]:
 
 
 class ConfigWriter:
-    """Writes ``config.xml``."""
+    """Writer of ``config.xml``."""
 
     def __init__(self, root: Path, catalogue: Catalogue) -> None:
         self._path, self._class_names = root / "label-studio/config.xml", catalogue.class_names
 
     def add(self, record: Record) -> None:
-        """The interface is the same for every frame."""
+        """Do nothing; the interface is the same for every frame."""
 
     def keep(self) -> None:
         """Write the file."""
@@ -99,4 +99,4 @@ class ConfigWriter:
         write_text(self._path, ElementTree.tostring(view, encoding="unicode") + "\n")
 
     def discard(self) -> None:
-        """There is nothing that was not kept."""
+        """Do nothing; the file is written only by ``keep``."""

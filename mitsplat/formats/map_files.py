@@ -1,4 +1,4 @@
-"""Per-pixel maps of a frame as files: depth, normals, instances, classes and flow, and all layers as OpenEXR."""
+"""Files of a frame's per-pixel maps: depth, normals, instances, classes and flow, and all layers as OpenEXR."""
 
 from __future__ import annotations
 
@@ -18,23 +18,23 @@ from mitsplat.formats.maps import depth_picture, depth_scale, encode_flow, norma
 
 
 def write_instances(files: FrameFiles) -> None:
-    """Write the ids of a frame's labelled instances."""
+    """Write the id map of a frame's labelled instances."""
     files.add_png(f"instances/{files.name}.png", files.labelled)
 
 
 def write_semantic(files: FrameFiles) -> None:
-    """Write a frame's classes."""
+    """Write a frame's class map."""
     picture = semantic_picture(files.frame.labels, files.ids, files.catalogue.class_names)
     files.add_png(f"semantic/{files.name}.png", picture)
 
 
 def write_depth(files: FrameFiles) -> None:
-    """Write a frame's depth."""
+    """Write a frame's depth map."""
     files.add_depth(f"depth/{files.name}.png")
 
 
 def write_depth_sensor(files: FrameFiles) -> None:
-    """Write a frame's depth as the scene's sensor measures it, and its unit as ``depth_sensor_scale`` [mm]."""
+    """Write the depth that the scene's depth sensor measures, and its unit as ``depth_sensor_scale`` [mm]."""
     assert files.catalogue.depth_sensor is not None  # noqa: S101 - the scene's rule
     measured = sensed_depth(files.frame, files.catalogue.depth_sensor)
     files.record["depth_sensor_scale"] = depth_scale(measured)
@@ -42,7 +42,7 @@ def write_depth_sensor(files: FrameFiles) -> None:
 
 
 def write_normals(files: FrameFiles) -> None:
-    """Write a frame's normals."""
+    """Write a frame's normal map."""
     files.add_png(f"normals/{files.name}.png", normal_picture(files.frame.normal))
 
 
@@ -53,7 +53,7 @@ def write_flow(files: FrameFiles) -> None:
 
 
 def write_exr(files: FrameFiles) -> None:
-    """Write the layers of a frame."""
+    """Write the layers of a frame as OpenEXR."""
     files.add(f"layers/{files.name}.exr", lambda path: save_exr(path, files.frame))
 
 

@@ -1,7 +1,7 @@
-"""Files of a dataset: those of one frame, and those that describe all of them, by format.
+"""Files of a dataset by format: files of one frame, and files that describe all frames.
 
-A format is one entry of :data:`TABLE`. It derives from the frame's labels in memory, or from their record in the
-manifest. By their names in a scene file's ``output.formats``:
+A format is one entry of :data:`TABLE`. Its files are written from the frame's labels in memory, or from their record in
+the manifest. Names of formats in a scene file's ``output.formats``:
 
 ``yolo``, ``yolo-detect``, ``yolo-obb``, ``yolo-pose``
     See :mod:`mitsplat.formats.yolo`.
@@ -16,10 +16,10 @@ manifest. By their names in a scene file's ``output.formats``:
 ``colmap``
     See :mod:`mitsplat.formats.colmap`.
 ``depth``, ``depth-sensor``, ``normals``, ``instances``, ``semantic``, ``flow``
-    ``<format>/<split>/NNNNNN.png`` (``.flo``), see :mod:`mitsplat.formats.maps`; a depth picture's unit is
-    ``depth_scale`` millimetres (``depth_sensor_scale``) of the frame's line in the manifest.
+    ``<format>/<split>/NNNNNN.png`` (``.flo``), see :mod:`mitsplat.formats.maps`. The unit of a depth picture is
+    ``depth_scale`` (``depth_sensor_scale``) in the frame's line of the manifest [mm].
 ``exr``
-    ``layers/<split>/NNNNNN.exr``: linear R, G, B; A (opacity); Z (depth along the camera's axis [m], 0 = nothing);
+    ``layers/<split>/NNNNNN.exr``: linear R, G, B; A (opacity); Z (depth along the camera's axis [m], 0 = no surface);
     instance and proxy_instance (ids); normal.X/Y/Z (world); light.R/G/B; and the frame's further layers by name.
 """
 
@@ -70,9 +70,9 @@ TABLE = {
 
 
 def write_frame(frame: Frame, root: Path, spec: SceneSpec, catalogue: Catalogue, *, given: bool = False) -> Record:
-    """Write the files of one frame below ``root`` and describe it, its files included, as a line of the manifest.
+    """Write the files of one frame below ``root``, and return its manifest record, which lists the files.
 
-    Of a frame whose layout was ``given``, and not drawn as the specification says, no draws of that are stated.
+    If the layout was ``given`` by the caller, the record contains no values that are drawn together with a layout.
     """
     plan, output = frame.plan, spec.output
     ids = frame.instance if spec.labels.source == "splats" else frame.proxy_instance
@@ -124,7 +124,7 @@ def write_frame(frame: Frame, root: Path, spec: SceneSpec, catalogue: Catalogue,
 
 
 def encode_image(image: npt.NDArray[np.uint8], output: Output) -> bytes:
-    """An RGB image (H, W, 3) as PNG or JPEG."""
+    """Encode an RGB image (H, W, 3) as PNG or JPEG."""
     if output.image == "png":
         return maps.encode_png(image)
     options = [cv2.IMWRITE_JPEG_QUALITY, output.jpeg_quality]
@@ -135,10 +135,11 @@ def encode_image(image: npt.NDArray[np.uint8], output: Output) -> bytes:
 
 
 class CollectionWriter:
-    """Writes what describes a whole dataset, from the records of its frames by ascending index.
+    """Writer of the files that describe a whole dataset, from the records of its frames by ascending index.
 
-    Nothing is kept in memory but the frame at hand, and no file gets its name before all frames were added, but for
-    BOP's scenes, each of which is whole with its last frame.
+    Only the current frame is held in memory. No file gets its final name before all frames were added, except the files
+    of
+    BOP scenes, which are complete after their last frame.
     """
 
     def __init__(self, root: Path, catalogue: Catalogue, formats: Iterable[str]) -> None:
@@ -156,11 +157,11 @@ class CollectionWriter:
             describer.discard()
 
     def add(self, record: Record) -> None:
-        """Describe a frame."""
+        """Add a frame."""
         for describer in self._describers:
             describer.add(record)
 
     def keep(self) -> None:
-        """Give the files their names."""
+        """Give the files their final names."""
         for describer in self._describers:
             describer.keep()

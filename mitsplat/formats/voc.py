@@ -1,13 +1,13 @@
-"""Boxes as in Pascal VOC: one XML file per image, read by CVAT, FiftyOne and detectors of every age.
+"""Boxes in Pascal VOC format: one XML file per image, read by CVAT, FiftyOne and many old and new detectors.
 
 ::
 
     voc/Annotations/000003.xml, voc/JPEGImages/000003.jpg, voc/ImageSets/Main/train.txt, val.txt, voc/labelmap.txt
 
-``labelmap.txt`` names the classes to CVAT, which knows VOC's own twenty otherwise. Pixels count from 1, and boxes
-include their last (VOC2012 development kit, ``VOCevaldet``). The flags follow the 2009 annotation guidelines: an object
-is *truncated* if more than 15 % of it lies outside the box of what is visible, *occluded* if more than 5 % of what lies
-in that box is hidden. Both are exact here.
+``labelmap.txt`` defines the classes for CVAT, which assumes the twenty classes of VOC otherwise. Pixels count from 1,
+and boxes include their last pixel (VOC2012 development kit, ``VOCevaldet``). The flags follow the 2009 annotation
+guidelines. An object is *truncated* if more than 15 % of it lies outside the box of its visible part. It is *occluded*
+if more than 5 % of its part in that box is hidden. Both are exact here.
 """
 
 from __future__ import annotations
@@ -20,17 +20,17 @@ from mitsplat.labels.labels import InstanceLabel, Labels
 from mitsplat.storage.files import GrowingFile, Record
 
 TRUNCATED, OCCLUDED = 0.15, 0.05
-"""Shares of an object above which its flags are set."""
+"""Fractions of an object above which its flags are set."""
 
 
 def write(files: FrameFiles) -> None:
-    """Write a frame's XML file, and its picture under a second name."""
+    """Write a frame's XML file, and add its picture under a second name."""
     files.add_image(f"voc/JPEGImages/{files.image_name}")
     files.add_bytes(f"voc/Annotations/{files.number}.xml", annotation(files.frame.labels, files.image_name).encode())
 
 
 def annotation(labels: Labels, image: str) -> str:
-    """The XML file of an image by that name."""
+    """Return the XML file of an image with the given name."""
     root = ElementTree.Element("annotation")
     size = {"width": labels.width, "height": labels.height, "depth": 3}
     for name, value in {"folder": "JPEGImages", "filename": image, "size": size, "segmented": 0}.items():
@@ -52,17 +52,17 @@ def annotation(labels: Labels, image: str) -> str:
 
 
 def flags(label: InstanceLabel) -> tuple[bool, bool]:
-    """Whether an instance is truncated, and whether it is occluded."""
+    """Return the flags *truncated* and *occluded* of an instance."""
     x0, y0, x1, y1 = label.box
     left, top = label.amodal.box[:2]
     boxed = int(label.amodal.mask[y0 - top : y1 - top, x0 - left : x1 - left].sum())
-    # Products, because 1 - 95/100 is rounded to more than 0.05.
+    # Products are exact, whereas 1 - 95/100 is rounded to more than 0.05.
     beyond, hidden = label.silhouette_area - boxed, boxed - label.area
     return beyond > TRUNCATED * label.silhouette_area, hidden > OCCLUDED * boxed
 
 
 class SetsWriter:
-    """Writes which images belong to which split, and what classes there are."""
+    """Writer of the image list of each split, and of the class list."""
 
     def __init__(self, root: Path, catalogue: Catalogue) -> None:
         self._files = {split: GrowingFile(root / f"voc/ImageSets/Main/{split}.txt") for split in catalogue.splits}
@@ -71,16 +71,16 @@ class SetsWriter:
         self._classes.write("".join(["# label:color_rgb:parts:actions\n", *(f"{name}:::\n" for name in names)]))
 
     def add(self, record: Record) -> None:
-        """Describe a frame."""
+        """Add a frame."""
         self._files[record["split"]].write(f"{record['index']:06d}\n")
 
     def keep(self) -> None:
-        """Give the files their names."""
+        """Give the files their final names."""
         for file in (*self._files.values(), self._classes):
             file.keep()
 
     def discard(self) -> None:
-        """Remove what was written, unless it was kept."""
+        """Remove the files if they do not have their final names yet."""
         for file in (*self._files.values(), self._classes):
             file.discard()
 

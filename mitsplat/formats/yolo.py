@@ -1,16 +1,16 @@
-"""YOLO labels as Ultralytics reads them: one text file per image, one line per instance, positions in [0, 1].
+"""YOLO labels for Ultralytics: one text file per image, one line per instance, positions in [0, 1].
 
 =========== =============================== ==================================================================
 format      folder                          numbers of a line after the class index
 =========== =============================== ==================================================================
 yolo        ``labels/``                     x y of the outline of :func:`mitsplat.labels.polygons.outline`
-yolo-detect ``yolo-detect/labels/``         x y of the box's middle, width, height
+yolo-detect ``yolo-detect/labels/``         x y of the box's centre, width, height
 yolo-obb    ``yolo-obb/labels/``            x y of the four corners of the smallest rotated rectangle
 yolo-pose   ``yolo-pose/labels/``           the box, then x y v of every keypoint: 2 visible, 1 hidden, 0 outside
 =========== =============================== ==================================================================
 
-Ultralytics finds a label by the image's path, so each task but the first has a folder of its own with the images under
-second names. All classes share one number of keypoints, the largest; a class with fewer ends in zeros.
+Ultralytics finds a label by the path of its image. Each task except ``yolo`` therefore has its own folder, with the
+images under second names. All classes have the same number of keypoints, the largest; missing keypoints are zeros.
 """
 
 from __future__ import annotations
@@ -32,20 +32,20 @@ from mitsplat.storage.files import SPLITS, Record, write_text
 
 @dataclass(frozen=True)
 class Task:
-    """One of Ultralytics' tasks: the folder of its dataset, and the numbers of an instance's line [px]."""
+    """Task of Ultralytics: folder of its dataset, and function that returns the numbers of an instance's line [px]."""
 
     folder: str
     numbers: Callable[[InstanceLabel], Float64Array]
 
 
 def format_of(task: str) -> Format:
-    """The format of a task."""
+    """Return the format of a task."""
     entries = (TASKS[task].folder.rstrip("/"),) if TASKS[task].folder else ("labels", "data.yaml")
     return Format(entries, partial(write, task=task), partial(DataYaml, task=task))
 
 
 def write(files: FrameFiles, task: str) -> None:
-    """Write a frame's label file; tasks but the first get the picture under a second name."""
+    """Write a frame's label file; add the picture under a second name for tasks with their own folder."""
     folder, text = TASKS[task].folder, yolo_lines(files.frame.labels, task, files.catalogue.num_keypoints)
     if folder:
         files.add_image(folder + files.image)
@@ -53,7 +53,7 @@ def write(files: FrameFiles, task: str) -> None:
 
 
 class DataYaml:
-    """Writes ``data.yaml`` of a task."""
+    """Writer of the ``data.yaml`` of a task."""
 
     def __init__(self, root: Path, catalogue: Catalogue, task: str) -> None:
         self._path, self._class_names = root / TASKS[task].folder / "data.yaml", catalogue.class_names
@@ -61,7 +61,7 @@ class DataYaml:
         self._splits: set[str] = set()
 
     def add(self, record: Record) -> None:
-        """Remember the frame's split."""
+        """Record the frame's split."""
         self._splits.add(record["split"])
 
     def keep(self) -> None:
@@ -69,16 +69,16 @@ class DataYaml:
         write_text(self._path, data_yaml(self._class_names, self._splits, self._keypoint_names))
 
     def discard(self) -> None:
-        """There is nothing that was not kept."""
+        """Do nothing; the file is written only by ``keep``."""
 
 
 def yolo_lines(labels: Labels, task: str = "yolo", num_keypoints: int = 0) -> str:
-    """Lines of a label file.
+    """Return the lines of a label file.
 
     Args:
-        labels: What the image shows.
-        task: A key of :data:`TASKS`.
-        num_keypoints: Keypoints on each line of ``yolo-pose``.
+        labels: Labels of the image.
+        task: Key of :data:`TASKS`.
+        num_keypoints: Number of keypoints on each line of ``yolo-pose``.
     """
     size = np.array((labels.width, labels.height), dtype=np.float64)
     lines = []
@@ -96,9 +96,9 @@ def yolo_lines(labels: Labels, task: str = "yolo", num_keypoints: int = 0) -> st
 def data_yaml(
     class_names: Sequence[str], splits: Iterable[str], keypoint_names: Sequence[Sequence[str]] | None = None
 ) -> str:
-    """Description of a dataset for Ultralytics; ``keypoint_names`` of every class for ``yolo-pose``.
+    """Return the description of a dataset for Ultralytics; ``keypoint_names`` of every class for ``yolo-pose``.
 
-    It has no ``path``: Ultralytics then resolves the splits against the file's own folder, wherever it is run.
+    The description has no ``path``, so Ultralytics resolves the splits from the file's own folder.
     """
     present = [split for split in SPLITS if split in splits]
     lines = ["# Paths are relative to this file."]
@@ -111,7 +111,7 @@ def data_yaml(
 
 
 def names_yaml(class_names: Sequence[str], keypoint_names: Sequence[Sequence[str]] | None = None) -> str:
-    """What a description says of classes, and of the keypoints of every class for ``yolo-pose``."""
+    """Return the class names, and the keypoints of every class for ``yolo-pose``, as lines of ``data.yaml``."""
     lines = ["names:" if class_names else "names: {}"]
     lines += [f"  {i}: {json.dumps(name, ensure_ascii=False)}" for i, name in enumerate(class_names)]
     if keypoint_names is not None:
@@ -124,7 +124,7 @@ def names_yaml(class_names: Sequence[str], keypoint_names: Sequence[Sequence[str
 
 
 def rotated_box(label: InstanceLabel) -> Float64Array:
-    """Corners of the smallest rectangle around the mask's pixels, whole pixels included [px], shape (4, 2)."""
+    """Return the corners of the smallest rectangle around the whole pixels of the mask [px], shape (4, 2)."""
     x0, y0 = label.box[:2]
     ys, xs = np.nonzero(label.mask)
     pixels = np.concatenate([np.stack([xs + dx, ys + dy], axis=1) for dx in (0, 1) for dy in (0, 1)])

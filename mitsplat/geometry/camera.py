@@ -8,11 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any, Literal
 
 import cv2
 import numpy as np
 import numpy.typing as npt
+from numpy.polynomial import Polynomial
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
@@ -208,7 +210,8 @@ class Camera:
     def project(self, points: npt.ArrayLike) -> tuple[Float64Array, Float64Array]:
         """Pixel positions (N, 2), lens distortion included, and depths along z [m] (N,) of world points (N, 3).
 
-        A point at or behind the camera plane has pixel position NaN.
+        A point at or behind the camera plane has pixel position NaN. So has a point beyond the angle at which the
+        distortion turns back: its polynomial would place it inside the image, where no ray shows it.
         """
         pose = self.camera_from_world
         local = np.atleast_2d(np.asarray(points, dtype=np.float64)) @ pose[:3, :3].T + pose[:3, 3]
@@ -228,6 +231,8 @@ class Camera:
                 local[front], np.zeros(3), np.zeros(3), self.intrinsics, np.array(self.distortion)
             )
             pixels[front] = projected.reshape(-1, 2)
+            slopes = local[front, :2] / depth[front, None]
+            pixels[np.flatnonzero(front)[np.linalg.norm(slopes, axis=1) >= turning_slope(self.distortion)]] = np.nan
         return pixels, depth
 
     def undistorted(self, image: npt.NDArray[np.uint8]) -> tuple[npt.NDArray[np.uint8], Camera]:
@@ -261,6 +266,22 @@ class Camera:
             slopes.reshape(-1, 1, 2), np.eye(3), np.array(self.distortion), None, np.eye(3), np.eye(3), criteria
         )
         return np.asarray(undistorted, dtype=np.float64).reshape(-1, 2)
+
+
+@lru_cache(maxsize=64)
+def turning_slope(distortion: tuple[float, ...]) -> float:
+    """Return the ray slope at which OpenCV's radial distortion stops growing; infinity if it always grows.
+
+    The distorted radius is ``r N(s) / D(s)`` with ``s = r^2``, ``N = 1 + k1 s + k2 s^2 + k3 s^3`` and
+    ``D = 1 + k4 s + k5 s^2 + k6 s^3``. Its derivative has the sign of ``N D + 2 s (N' D - N D')``. Poles (``D = 0``)
+    end the valid range too. Tangential distortion is small and is left out.
+    """
+    k1, k2, _, _, k3, k4, k5, k6 = (*distortion, *(0.0,) * (8 - len(distortion)))
+    top, bottom, s = Polynomial([1, k1, k2, k3]), Polynomial([1, k4, k5, k6]), Polynomial([0, 1])
+    rate = top * bottom + 2 * s * (top.deriv() * bottom - top * bottom.deriv())
+    roots = np.concatenate([rate.trim().roots(), bottom.trim().roots()])
+    real = roots[np.isreal(roots)].real
+    return float(np.sqrt(min(real[real > 0], default=np.inf)))
 
 
 def fisheye_radius(angle: Any, k: Sequence[Any]) -> Any:

@@ -12,7 +12,7 @@ import pytest
 
 from mitsplat.errors import InputError
 from mitsplat.formats.colmap import camera_model
-from mitsplat.geometry.camera import Camera, look_at_pose
+from mitsplat.geometry.camera import Camera, look_at_pose, turning_slope
 from mitsplat.renderer.layers import describe_sensor, ensure_variant
 
 PINHOLE = Camera.look_at((0, 0, 0), (0, 0, 1), up=(0, -1, 0), width=640, height=480, fov_x=60)
@@ -112,3 +112,27 @@ def test_json_brings_back_every_field(camera: Camera) -> None:
     for field in fields(Camera):
         np.testing.assert_array_equal(getattr(back, field.name), getattr(camera, field.name))
         assert type(getattr(back, field.name)) is type(getattr(camera, field.name))
+
+
+@pytest.mark.parametrize(
+    ("distortion", "turn"),
+    [
+        ((-0.3, 0.0, 0.0, 0.0), 1 / np.sqrt(0.9)),
+        ((0.1, 0.02, 0.0, 0.0), np.inf),
+        ((0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0), 1.0),
+    ],
+)
+def test_distortion_turns_where_its_derivative_vanishes(distortion: tuple[float, ...], turn: float) -> None:
+    """r - 0.3 r^3 turns at r^2 = 1 / 0.9, r / (1 + r^2) at r = 1; positive coefficients never turn."""
+    assert turning_slope(distortion) == pytest.approx(turn, rel=1e-9)
+
+
+def test_points_beyond_the_turn_of_a_barrel_distortion_are_not_in_the_image() -> None:
+    camera = Camera(640, 480, 300.0, 300.0, 320.0, 240.0, np.eye(4), (-0.3, 0.0, 0.0, 0.0))
+    slopes = np.array([0.0, 0.5, 1.0, 1.05, 1.7, 3.0])
+    pixels, depth = camera.project(np.column_stack([slopes, np.zeros(6), np.ones(6)]))
+    assert np.isnan(pixels[4:]).all()
+    assert (depth == 1.0).all()
+    np.testing.assert_allclose(pixels[:4, 0], 320 + 300 * (slopes[:4] - 0.3 * slopes[:4] ** 3), rtol=1e-9)
+    points = np.array([[3.0, 0.0, 1.0], [0.1, 0.0, -1.0], [0.5, 0.0, 1.0]])
+    assert np.isnan(camera.project(points)[0]).all(axis=1).tolist() == [True, True, False]

@@ -15,7 +15,7 @@ import pytest
 import trimesh
 from pycocotools import mask as coco_mask
 
-from mitsplat.audit.audit import audit_dataset
+from mitsplat.audit.audit import CrossFrameCheck, audit_dataset
 from mitsplat.errors import InputError
 from mitsplat.storage.files import Record
 from tests.cli.typed import run
@@ -424,3 +424,22 @@ def test_a_folder_without_a_dataset_is_refused(tmp_path: Path) -> None:
     (tmp_path / "dataset.json").write_text('{"mitsplat": "0.0.1", "scene": {}}')
     with pytest.raises(InputError, match="must be a dataset of this version of mitsplat"):
         audit_dataset(tmp_path)
+
+
+@pytest.mark.parametrize(("instances", "violations"), [([], 0), ([{"id": 1}], 1)])
+def test_only_equal_pictures_with_objects_are_a_violation(instances: list[Any], violations: int) -> None:
+    """Empty layouts under a fixed camera show the same: the surroundings."""
+    records = [
+        {
+            "index": index,
+            "layout": index,
+            "split": "train",
+            "files": {f"images/train/{index:06d}.png": "ab" * 32},
+            "labels": {"instances": instances},
+        }
+        for index in range(2)
+    ]
+    check = CrossFrameCheck()
+    for record in records:
+        assert check.add(record) == []
+    assert len(list(check.check(records))) == violations

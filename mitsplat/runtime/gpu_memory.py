@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import ctypes
 import os
+from dataclasses import dataclass
 
 VISIBLE = "CUDA_VISIBLE_DEVICES"
+ORDER = "CUDA_DEVICE_ORDER"
 
 NEEDED = 2**30
 """Memory that a process takes before it has computed anything [bytes]: half of it on an H200."""
@@ -19,8 +21,16 @@ class _Memory(ctypes.Structure):
     _fields_ = tuple((name, ctypes.c_ulonglong) for name in ("total", "unused", "used"))
 
 
-def unused_gpu_memory() -> dict[str, int]:
-    """Unused memory [bytes] of every GPU of this machine, by its id and in the order of PCI buses; {} if unknown."""
+@dataclass(frozen=True)
+class GpuMemory:
+    """Memory of one GPU: its model, and unused memory [bytes]."""
+
+    model: str
+    unused: int
+
+
+def gpu_memory() -> dict[str, GpuMemory]:
+    """Memory of every GPU of this machine, by its id and in the order of PCI buses; {} if unknown."""
     try:
         library = ctypes.CDLL("libnvidia-ml.so.1")
     except OSError:
@@ -30,24 +40,37 @@ def unused_gpu_memory() -> dict[str, int]:
     count, found = ctypes.c_uint(0), {}
     library.nvmlDeviceGetCount_v2(ctypes.byref(count))
     for index in range(count.value):
-        handle, name, memory = ctypes.c_void_p(), ctypes.create_string_buffer(96), _Memory()
+        handle, memory = ctypes.c_void_p(), _Memory()
+        name, model = ctypes.create_string_buffer(96), ctypes.create_string_buffer(96)
         if not (
             library.nvmlDeviceGetHandleByIndex_v2(index, ctypes.byref(handle))
             or library.nvmlDeviceGetUUID(handle, name, len(name))
+            or library.nvmlDeviceGetName(handle, model, len(model))
             or library.nvmlDeviceGetMemoryInfo(handle, ctypes.byref(memory))
         ):
-            found[name.value.decode()] = int(memory.unused)
+            found[name.value.decode()] = GpuMemory(model.value.decode(errors="replace"), int(memory.unused))
     library.nvmlShutdown()
     return found
 
 
+def unused_gpu_memory() -> dict[str, int]:
+    """Unused memory [bytes] of every GPU of this machine, by its id and in the order of PCI buses; {} if unknown."""
+    return {name: memory.unused for name, memory in gpu_memory().items()}
+
+
 def hide_full_gpus() -> None:
-    """Make GPUs with less than :data:`NEEDED` unused invisible to this process, which must not have begun with CUDA."""
-    memory = unused_gpu_memory()
+    """Make GPUs with less than :data:`NEEDED` unused invisible to this process, which must not have begun with CUDA.
+
+    Numbers in ``CUDA_VISIBLE_DEVICES`` count GPUs from the fastest on, unless ``CUDA_DEVICE_ORDER`` is ``PCI_BUS_ID``.
+    Among different models that order is unknown here, and a GPU named by its number stays visible.
+    """
+    found = gpu_memory()
+    memory = {name: one.unused for name, one in found.items()}
     if all(unused >= NEEDED for unused in memory.values()):
         return
     ids = list(memory)
     named = os.environ.get(VISIBLE, ",".join(ids)).split(",")
-    numbered = {str(number): name for number, name in enumerate(ids)}
+    by_bus = os.environ.get(ORDER) == "PCI_BUS_ID" or len({one.model for one in found.values()}) == 1
+    numbered = {str(number): name for number, name in enumerate(ids)} if by_bus else {}
     kept = [name for name in named if memory.get(numbered.get(name.strip(), name.strip()), NEEDED) >= NEEDED]
     os.environ[VISIBLE] = ",".join(kept)

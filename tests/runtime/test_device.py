@@ -47,8 +47,9 @@ class FakeDriver:
 class FakeManagement:
     """As much of NVML as tells of unused memory, given in GiB; it counts in the order of buses."""
 
-    def __init__(self, *unused):
+    def __init__(self, *unused, models=None):
         self.unused, self.users = unused, 0
+        self.models = models or ["One"] * len(unused)
 
     def nvmlInit_v2(self):
         self.users += 1
@@ -68,6 +69,10 @@ class FakeManagement:
         name.value = id_of(len(self.unused) - handle.value).encode()
         return 0
 
+    def nvmlDeviceGetName(self, handle, name, size):
+        name.value = self.models[handle.value - 1].encode()
+        return 0
+
     def nvmlDeviceGetMemoryInfo(self, handle, memory):
         memory._obj.total, memory._obj.unused = 99 * 2**30, int(self.unused[handle.value - 1] * 2**30)
         return 0
@@ -81,11 +86,12 @@ def id_of(ordinal):
 def machine(monkeypatch):
     """Gives this machine a driver, with or without OptiX."""
     monkeypatch.delenv(gpu_memory.VISIBLE, raising=False)
+    monkeypatch.delenv(gpu_memory.ORDER, raising=False)
     monkeypatch.delenv(devices.NUMBER, raising=False)
 
-    def have(*gpus, optix=True, status=0, unused=None):
+    def have(*gpus, optix=True, status=0, unused=None, models=None):
         libraries = {"libcuda.so.1": FakeDriver(*gpus, status=status)} if gpus or status else {}
-        libraries |= {} if unused is None else {"libnvidia-ml.so.1": FakeManagement(*unused)}
+        libraries |= {} if unused is None else {"libnvidia-ml.so.1": FakeManagement(*unused, models=models)}
         libraries |= {"libnvoptix.so.1": object()} if optix else {}
 
         def load(name):
@@ -163,6 +169,17 @@ def test_a_full_gpu_is_hidden(machine, monkeypatch, visible, unused, left):
         monkeypatch.delenv(gpu_memory.VISIBLE)
     gpu_memory.hide_full_gpus()
     assert os.environ.get(gpu_memory.VISIBLE) == left
+
+
+@pytest.mark.parametrize(("order", "left"), [(None, "0,1"), ("FASTEST_FIRST", "0,1"), ("PCI_BUS_ID", "1")])
+def test_numbers_of_different_gpus_are_read_in_the_order_of_cuda(machine, monkeypatch, order, left):
+    """The first GPU on the bus is full; without PCI order its number is unknown, and none is hidden."""
+    machine(unused=(0.5, 20), models=["Two", "One"])
+    monkeypatch.setenv(gpu_memory.VISIBLE, "0,1")
+    if order is not None:
+        monkeypatch.setenv(gpu_memory.ORDER, order)
+    gpu_memory.hide_full_gpus()
+    assert os.environ[gpu_memory.VISIBLE] == left
 
 
 def test_what_others_have_taken_is_not_for_workers(machine):

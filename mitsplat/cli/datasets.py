@@ -142,8 +142,9 @@ def render(
         if chosen is not None and not json_log:
             tell_device(chosen)
         if scene.suffix == ".xml":
-            if overrides or any(given is not None for given in (frames, only, tolerance, shard)):
-                raise InputError(f"{scene}: a Mitsuba scene says size, seed and quality itself; only --out applies")
+            ignored = engine != "local", overwrite, any_device, workers is not None
+            if overrides or any(ignored) or any(given is not None for given in (frames, only, tolerance, shard)):
+                raise InputError(f"{scene}: a Mitsuba scene states size, seed and quality itself; only --out applies")
             from mitsplat.frames.mitsuba_xml import render_apart
 
             typer.echo(f"picture: {render_apart(scene, out, allow_outside=allow_outside, device=chosen)}")

@@ -372,7 +372,16 @@ def content_of(scene: Scene, catalogue: Catalogue, device: Kind) -> dict[str, An
 
     The library versions are informative only; they are not compared on resume.
     """
-    libraries = ("mitsuba", "drjit", "newton", "mujoco-warp", "warp-lang", "numpy", "opencv-contrib-python-headless")
+    libraries = (
+        "mitsuba",
+        "drjit",
+        "newton",
+        "mujoco",
+        "mujoco-warp",
+        "warp-lang",
+        "numpy",
+        "opencv-contrib-python-headless",
+    )
     return {
         FORMAT_VERSION: FORMAT_VERSIONS[CONTENT],
         "device": device,

@@ -147,8 +147,9 @@ def test_render_xml(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pyt
     assert run("render", "one.xml", "-o", tmp_path) == 0
     assert calls.args == (Path("one.xml"), tmp_path)
     assert str(picture) in capsys.readouterr().out
-    assert run("render", "one.xml", "--seed", 3) == 2
-    assert "a Mitsuba scene says size, seed and quality itself" in capsys.readouterr().err
+    for ignored in (["--seed", 3], ["--workers", 2], ["--overwrite"], ["--any-device"], ["--engine", "ray"]):
+        assert run("render", "one.xml", *ignored) == 2
+        assert "a Mitsuba scene states size, seed and quality itself; only --out" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

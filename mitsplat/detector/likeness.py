@@ -220,7 +220,7 @@ def _turn(ours: Float64Array, theirs: Float64Array) -> float | None:
 
 
 def _larger(sides: tuple[_Values, _Values], classes: int) -> float | None:
-    """Return the size ratio of rendered to photographed objects, or None if no class is frequent enough on both sides."""
+    """Return the size ratio of rendered to photographed objects, or None if no class is frequent enough in both."""
     ratios = []
     for index in range(classes):
         ours, theirs = (side.get((_WHOLE, index), []) for side in sides)

@@ -27,8 +27,9 @@ _JPEG = (cv2.IMWRITE_JPEG_QUALITY, 97, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMW
 
 
 def cut_photographs(photographs: LabelledSet, real_size: int, size: int, folder: Path) -> LabelledSet:
-    """Cut photographs to overlapping tiles; a tile at ``size`` shows objects as large as a whole photograph at
-    ``real_size``.
+    """Cut photographs to overlapping tiles.
+
+    A tile at ``size`` shows objects as large as a whole photograph at ``real_size``.
 
     Args:
         photographs: Labelled photographs.

@@ -81,8 +81,9 @@ class DetectionMatches:
         self._place = {image: i for i, image in enumerate(self._eval.params.imgIds)}
 
     def average_precision(self, images: Sequence[int] | None = None) -> AveragePrecision:
-        """Compute the average precision on some images, or on all if None; a repeated image counts again, as in a
-        bootstrap.
+        """Compute the average precision on some images, or on all images if None.
+
+        A repeated image counts again, as in a bootstrap.
 
         Raises:
             InputError: If the list is empty or contains an unknown image.

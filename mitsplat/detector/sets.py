@@ -70,8 +70,9 @@ class LabelledObject:
         return self.polygon is not None or self.rle is not None
 
     def encoded(self, width: int, height: int) -> dict[str, Any]:
-        """Return the mask in an image of this size [px] as COCO's compressed run-length code; a label without a mask
-        gives its box.
+        """Return the mask in an image of this size [px] as COCO's compressed run-length code.
+
+        For a label without a mask, the mask is the filled box.
         """
         if self.rle is not None:
             return self.rle

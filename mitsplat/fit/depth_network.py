@@ -1,4 +1,4 @@
-"""Depth maps of photos by a network of the user's: Depth Anything v2 (Yang et al. 2024), or one like it, in ONNX."""
+"""Depth maps of photos from an ONNX network of the user, such as Depth Anything v2 (Yang et al. 2024)."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ from mitsplat.version import __version__
 FloatImage = Float32Array
 
 _MEAN, _DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
-"""Of ImageNet's pixels, display-encoded: red, green, blue."""
+"""Mean and standard deviation of display-encoded ImageNet pixels: red, green, blue."""
 _EDGE = 518
-"""Shorter edge of what the network sees where it leaves that open [px], as in Depth Anything's own code."""
+"""Shorter edge of the network input [px] if the network accepts any size, as in the code of Depth Anything."""
 _PATCH = 14
-"""Edges are multiples of its patches [px]."""
+"""Patch size of the network [px]; input edges are multiples of it."""
 _TYPES = {"tensor(float)": np.float32, "tensor(float16)": np.float16}
 
 
@@ -39,17 +39,19 @@ def model_maps(
     *,
     progress: Progress | None = None,
 ) -> DepthMaps:
-    """Depth maps of photos by a network, kept in a folder until the photo, the network or this package changes.
+    """Compute depth maps of photos with a network, and cache them in a folder.
+
+    A cached map is used until the photo, the network or the version of this package changes.
 
     Args:
-        photos: Whose maps to make.
+        photos: Photos.
         model: The network, an ONNX file.
-        folder: Where the maps are kept.
-        kind: What the network returns.
-        progress: Told the photos done.
+        folder: Folder of the cached maps.
+        kind: Kind of the network output.
+        progress: Called after each photo.
 
     Raises:
-        InputError: If the file does not exist or is no such network.
+        InputError: If the file does not exist or is not such a network.
         MissingResourceError: If onnxruntime is not installed, or too old.
     """
     if not model.is_file():
@@ -71,28 +73,28 @@ def model_maps(
 
 
 def open_session(model: Path) -> Any:
-    """A session of onnxruntime with a network, on the CPU.
+    """Open an onnxruntime session of a network on the CPU.
 
     Raises:
-        InputError: If the file is no network.
+        InputError: If the file is not a network.
         MissingResourceError: If onnxruntime is not installed, or too old.
     """
     onnxruntime = load_library("depth", "onnxruntime")
     try:
         return onnxruntime.InferenceSession(str(model), providers=["CPUExecutionProvider"])
-    except Exception as error:  # its errors have no other base
+    except Exception as error:  # onnxruntime's errors have no common base class
         raise InputError(f"{model}: not a network in ONNX ({' '.join(str(error).split())})") from error
 
 
 class DepthNetwork:
-    """A network from a picture to its depths or inverse depths.
+    """A network that maps a picture to depths or inverse depths.
 
     Args:
-        session: As onnxruntime has it.
-        path: Of the network, for what is said of it.
+        session: Session of onnxruntime.
+        path: Path of the network, for error messages.
 
     Raises:
-        InputError: If it takes something else than one picture of floats, shape (1, 3, H, W).
+        InputError: If the input of the network is not one picture of floats, shape (1, 3, H, W).
     """
 
     def __init__(self, session: Any, path: Path) -> None:
@@ -107,10 +109,12 @@ class DepthNetwork:
         self._height, self._width = (edge if isinstance(edge, int) and edge > 0 else None for edge in shape[2:])
 
     def depths(self, rgb: FloatImage) -> FloatImage:
-        """What the network finds in a picture (H, W, 3), display-encoded in [0, 1]; of its shape, but no finer.
+        """Return the network output for a picture (H, W, 3), display-encoded in [0, 1].
+
+        The output has the aspect ratio of the picture. It is not enlarged above the resolution of the network.
 
         Raises:
-            InputError: If the network fails, or returns something else than one finite number per pixel.
+            InputError: If the network fails, or does not return one finite number per pixel.
         """
         height, width = rgb.shape[:2]
         scale = _EDGE / min(height, width)
@@ -119,7 +123,7 @@ class DepthNetwork:
         batch = np.ascontiguousarray(picture.transpose(2, 0, 1)[None], dtype=self._type)
         try:
             found = np.asarray(self._session.run(None, {self._name: batch})[0], dtype=np.float32)
-        except Exception as error:  # its errors have no other base
+        except Exception as error:  # onnxruntime's errors have no common base class
             raise InputError(
                 f"{self._path}: fails on {size[0]}x{size[1]} px ({' '.join(str(error).split())})"
             ) from error

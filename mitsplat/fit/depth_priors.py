@@ -1,8 +1,8 @@
-"""Depth maps of photos, from a network or a sensor, brought to the scale of a capture by the points that photos see.
+"""Depth maps of photos from a network or a sensor, aligned to the scale of a capture by its points.
 
-Networks such as Depth Anything v2 (Yang et al. 2024) give inverse depth up to a scale and a shift that differ from
-photo to photo (Ranftl et al. 2022); as in "A Hierarchical 3D Gaussian Representation" (Kerbl et al. 2024) both are
-found for each photo from the points of structure from motion.
+Networks such as Depth Anything v2 (Yang et al. 2024) return inverse depth up to a scale and a shift, which differ
+between photos (Ranftl et al. 2022). As in "A Hierarchical 3D Gaussian Representation" (Kerbl et al. 2024), both are
+determined for each photo from its structure-from-motion points.
 """
 
 from __future__ import annotations
@@ -28,26 +28,29 @@ from mitsplat.images.exr_header import check_exr_header
 from mitsplat.storage.files import IMAGE_ERRORS
 
 DepthMap = Float32Array
-"""Inverse depths along z [1/m] of a photo's pixels, shape (H, W) of its aspect, NaN where unknown."""
+"""Inverse depths along z [1/m] of a photo, shape (H, W) with the aspect ratio of the photo, NaN where unknown."""
 DepthKind = Literal["inverse", "metric"]
 
 SUFFIXES = (".png", ".npy", ".exr", ".tiff", ".tif")
 POINTS_MIN = 10
-"""Points that a photo must see for its map to be used."""
+"""Least number of capture points inside a photo for the use of its map."""
 _TRIALS = 500
 _UNEXPLAINED = 0.5
-"""Median difference of a map from the points in it, in that of the points from their own median, from which it says
-nothing of them."""
+"""Largest residual of an aligned map, relative to the spread of the points.
+
+The residual is the median absolute difference between the map and the points. The spread is the median absolute
+deviation of the points. A map with a larger ratio has no information on the points.
+"""
 
 
 @dataclass(frozen=True)
 class DepthMaps:
-    """Files of depth maps, one per photo, known up to what the capture's points can tell.
+    """Files of depth maps, one per photo, before alignment to the points of the capture.
 
     Attributes:
-        files: The maps, by the names of their photos.
-        kind: ``inverse``: of inverse depth, up to a scale and a shift, as networks give it; ``metric``: of depth along
-            the camera's z axis in any unit, 0 where it is not known, as sensors and renderers give it.
+        files: Paths of the maps by photo name.
+        kind: ``inverse``: inverse depth up to a scale and a shift, as networks return it; ``metric``: depth along the
+            camera's z axis in any unit, 0 where unknown, as sensors and renderers return it.
     """
 
     files: Mapping[str, Path]
@@ -55,9 +58,9 @@ class DepthMaps:
 
 
 def find_maps(folder: Path, photos: Sequence[Photo], kind: DepthKind = "inverse") -> DepthMaps:
-    """The maps in a folder that have the names of photos, or of their files in a capture, but for the suffix.
+    """Find the maps in a folder whose names match photos, or the photos' files in a capture, except for the suffix.
 
-    That is .png, .npy, .exr, .tiff or .tif; other files do not matter.
+    The suffix is .png, .npy, .exr, .tiff or .tif. Other files are ignored.
 
     Raises:
         InputError: If the folder does not exist or has no map of any photo.
@@ -78,7 +81,7 @@ def find_maps(folder: Path, photos: Sequence[Photo], kind: DepthKind = "inverse"
 
 
 def read_map(path: Path) -> Float32Array:
-    """The values of a depth map, shape (H, W), whatever they mean.
+    """Read the values of a depth map, shape (H, W), without interpretation.
 
     Raises:
         InputError: If the file cannot be read, has several channels, or a value is not finite.
@@ -105,7 +108,7 @@ def read_map(path: Path) -> Float32Array:
 
 
 def _read_exr(path: Path) -> Float32Array:
-    """The only channel of an OpenEXR file, or the one that is named Z."""
+    """Read the only channel of an OpenEXR file, or the channel Z."""
     if not path.is_file():
         raise FileNotFoundError(path)
     check_exr_header(path)
@@ -119,16 +122,16 @@ def _read_exr(path: Path) -> Float32Array:
 def align_maps(
     photos: Sequence[Photo], points: Float64Array, maps: DepthMaps, size: int
 ) -> tuple[dict[str, DepthMap], tuple[str, ...]]:
-    """The maps of photos as inverse depths in the unit of the points (N, 3), and sentences on the photos without.
+    """Return the maps as inverse depths in the unit of the points, and warnings on the photos without a map.
 
     Args:
-        photos: Whose maps are wanted.
-        points: Those of the capture.
-        maps: Their files.
-        size: Longest edge of what is kept of a map [px].
+        photos: Photos whose maps are aligned.
+        points: Points of the capture, shape (N, 3).
+        maps: Files of the maps.
+        size: Longest edge to which a map is reduced [px].
 
     Raises:
-        InputError: If a map cannot be read, or is not of its photo, or none is of use.
+        InputError: If a map cannot be read or does not belong to its photo, or no map can be used.
     """
     found: dict[str, DepthMap] = {}
     without: dict[str, list[str]] = {}
@@ -155,16 +158,17 @@ def align_maps(
 
 
 def align_map(photo: Photo, points: Float64Array, values: Float32Array, kind: DepthKind) -> DepthMap | str:
-    """The values of a photo's map as inverse depths in the capture's unit, or why maps like it are of no use.
+    """Return a photo's map as inverse depths in the capture's unit, or a text with the reason why it cannot be used.
 
     Args:
-        photo: Whose map it is.
-        points: Those of the capture, shape (N, 3).
-        values: Of the map, shape (H, W), of any size.
-        kind: What they mean.
+        photo: Photo of the map.
+        points: Points of the capture, shape (N, 3).
+        values: Values of the map, shape (H, W), of any size.
+        kind: Meaning of the values.
 
     Raises:
-        InputError: With the rule alone, if the map is not of the photo's shape, or a depth is negative.
+        InputError: If the map does not have the aspect ratio of the photo, or a depth is negative. The message has only
+            the rule; the caller adds the file.
     """
     size, shape = (photo.camera.width, photo.camera.height), values.shape[::-1]
     if shapes_differ(shape, size):
@@ -177,7 +181,8 @@ def align_map(photo: Photo, points: Float64Array, values: Float32Array, kind: De
     pixels, depth = photo.camera.project(points[photo.seen])
     inside = (depth > 0) & ((pixels >= 0) & (pixels < size)).all(axis=1)
     column, row = (pixels[inside] * np.divide(shape, size) - 0.5).T
-    # Between pixels, for on planes inverse depth is linear in the image; unknown beside what is unknown.
+    # Linear interpolation is exact on planes, where inverse depth is linear in the image. The result is unknown next to
+    # unknown pixels.
     found = map_coordinates(values.astype(np.float64), (row, column), order=1, mode="nearest")
     known = np.isfinite(found)
     if known.sum() < POINTS_MIN:
@@ -191,17 +196,20 @@ def align_map(photo: Photo, points: Float64Array, values: Float32Array, kind: De
 
 
 def fit_line(values: Float64Array, wanted: Float64Array, *, shift: bool) -> tuple[float, float]:
-    """Scale and shift by which most of the values are as wanted, those that are far from it left out.
+    """Fit scale and shift of values to wanted values, robust against outliers.
 
-    Least median of squares, which up to half of the values cannot mislead, then least squares over what is within 2.5
-    standard deviations of it (Rousseeuw 1984).
+    Least median of squares tolerates outliers up to half of the values. Least squares over the values within 2.5
+    standard deviations of that line refines the result (Rousseeuw 1984).
 
     Args:
         values: Shape (N,), N at least 3.
         wanted: Shape (N,).
-        shift: Whether there is one; else it is 0.
+        shift: True to fit a shift; otherwise it is 0.
+
+    Returns:
+        Scale and shift.
     """
-    middle = float(np.median(values)) if shift else 0.0  # so that equal values have scale 0
+    middle = float(np.median(values)) if shift else 0.0  # so that equal values give scale 0
     design = np.column_stack([values - middle, np.ones_like(values)][: 1 + shift])
     rng = np.random.default_rng(0)
     picks = rng.integers(len(values), size=(_TRIALS, design.shape[1]))
@@ -216,7 +224,7 @@ def fit_line(values: Float64Array, wanted: Float64Array, *, shift: bool) -> tupl
 
 
 def crop_map(inverse: DepthMap, camera: Camera, window: Window) -> DepthMap:
-    """What the map of a whole photo has in a window of it, to the nearest of the map's own pixels."""
+    """Crop the map of a whole photo to a window of the photo, rounded to whole map pixels."""
     rows, columns = inverse.shape
     left, top, width, height = window
     x = np.floor((left + np.arange(width) + 0.5) * columns / camera.width).astype(np.int64)
@@ -225,7 +233,7 @@ def crop_map(inverse: DepthMap, camera: Camera, window: Window) -> DepthMap:
 
 
 def resize_map(inverse: DepthMap, width: int, height: int) -> DepthMap:
-    """A map in another size: means of what is known over the area of a pixel; unknown where that is less than half."""
+    """Resize a map; each pixel is the mean of its known area, or unknown if less than half of the area is known."""
     if inverse.shape == (height, width):
         return inverse
     way = cv2.INTER_AREA if width <= inverse.shape[1] else cv2.INTER_LINEAR

@@ -1,8 +1,8 @@
-"""The folder of a fit, which never holds parts of two.
+"""The folder of a fit, which never contains files of two different fits.
 
-``fit.json`` (:class:`FitResult` and the settings) is written last and removed first: where it is, ``splats.ply`` and,
-for every held-out photo, ``held_out/NAME.png`` (photo | render | difference) belong to it. ``checkpoint.npz`` is what
-an unfinished fit goes on from. Both hold the hash of what they were made of.
+``fit.json`` (:class:`FitResult` and the settings) is written last and removed first. If it exists, ``splats.ply`` and
+``held_out/NAME.png`` (photo | render | difference) of every held-out photo belong to it. An unfinished fit resumes from
+``checkpoint.npz``. Both files contain the hash of the inputs.
 """
 
 from __future__ import annotations
@@ -26,21 +26,22 @@ from mitsplat.storage.format_version import FORMAT_VERSION, FORMAT_VERSIONS, che
 
 FIT_FILE = "fit.json"
 _UNFINISHED = ".unfinished"
-"""A file that is there while a fit is, and after it if it was interrupted."""
+"""Marker file of a running or interrupted fit."""
 
 
 @dataclass(frozen=True, eq=False)
 class FitResult:
-    """What a fit came to.
+    """Result of a fit.
 
     Attributes:
         splats: The Gaussians, in the capture's frame and units.
-        iterations: Steps made.
-        seconds: Time that they took, over all runs.
-        held_out: Photos that took no part in the fit, nor in when it ended.
+        iterations: Number of optimiser steps.
+        seconds: Duration of the steps, over all runs [s].
+        held_out: Quality on photos that affected neither the fit nor its end.
         inputs: SHA-256 of photos, masks, depth maps, cameras, points, settings and version.
-        warnings: What was given and is of no use, a sentence each.
-        validation: Photos that were not fitted, and whose PSNR decided when the fit ended; none without a target.
+        warnings: Sentences on inputs that could not be used.
+        validation: Quality on photos that were not fitted, and whose PSNR decided the end of the fit; empty without a
+            target.
     """
 
     splats: Splats
@@ -63,7 +64,7 @@ class FitResult:
 
     @property
     def validation_psnr(self) -> float | None:
-        """Mean PSNR of the photos that the target is for [dB]."""
+        """Mean PSNR of the validation photos [dB], or None without a target."""
         return _mean_psnr(self.validation) if self.validation else None
 
 
@@ -72,10 +73,10 @@ def _mean_psnr(photos: Sequence[HeldOut]) -> float:
 
 
 def read_record(path: Path) -> Any:
-    """What ``fit.json`` says, of a version that is known; its keys are still to be checked.
+    """Read ``fit.json`` and check its format version; the keys are not checked.
 
     Raises:
-        InputError: If it is missing, no JSON, or of a newer version.
+        InputError: If the file is missing, not JSON, or of a newer version.
     """
     try:
         record = json.loads(path.read_text(encoding="utf-8"))
@@ -89,11 +90,11 @@ def read_record(path: Path) -> Any:
 
 @dataclass(frozen=True)
 class FitFolder:
-    """Where a fit of some inputs is kept.
+    """Output folder of a fit with given inputs.
 
     Attributes:
         path: The folder.
-        inputs: Hash of what decides the fit.
+        inputs: Hash of all inputs of the fit.
     """
 
     path: Path
@@ -101,17 +102,17 @@ class FitFolder:
 
     @property
     def held_out(self) -> Path:
-        """Where the held-out photos are compared."""
+        """Folder of the comparisons with the held-out photos."""
         return self.path / "held_out"
 
     def finished(self, *, overwrite: bool) -> FitResult | None:
-        """The fit of these inputs, if it is finished.
+        """Return the finished fit of these inputs, or None.
 
         Args:
-            overwrite: Whether a fit of other inputs, or a damaged one, counts as none.
+            overwrite: True to treat a fit of other inputs, or a damaged fit, as absent.
 
         Raises:
-            InputError: If the folder holds such a fit otherwise.
+            InputError: If the folder contains such a fit and ``overwrite`` is False.
         """
         path = self.path / FIT_FILE
         if not path.exists():
@@ -122,7 +123,7 @@ class FitFolder:
             if overwrite:
                 return None
             raise InputError(f"{error}; --overwrite replaces it") from error
-        for name in ("checkpoint.npz", _UNFINISHED):  # of a run that was interrupted after its last step
+        for name in ("checkpoint.npz", _UNFINISHED):  # left by a run that was interrupted after its last step
             (self.path / name).unlink(missing_ok=True)
         return result
 
@@ -144,13 +145,13 @@ class FitFolder:
         return FitResult(splats, iterations, seconds, held_out, self.inputs, warnings, validation)
 
     def checkpoint(self, *, overwrite: bool) -> dict[str, npt.NDArray[Any]] | None:
-        """What an unfinished fit of these inputs left to go on from, if any.
+        """Return the checkpoint of an unfinished fit of these inputs, or None.
 
         Args:
-            overwrite: Whether a checkpoint of other inputs, or a damaged one, counts as none.
+            overwrite: True to treat a checkpoint of other inputs, or a damaged checkpoint, as absent.
 
         Raises:
-            InputError: If the folder holds such a checkpoint otherwise.
+            InputError: If the folder contains such a checkpoint and ``overwrite`` is False.
         """
         path = self.path / "checkpoint.npz"
         if not path.exists():
@@ -172,10 +173,10 @@ class FitFolder:
         )
 
     def refuse_others(self) -> None:
-        """Refuse a folder that holds what a fit would replace, and no fit.
+        """Refuse a folder whose files a fit would replace, if they are not from a fit.
 
         Raises:
-            InputError: Which names it.
+            InputError: If there is such a file; the message names it.
         """
         if any((self.path / name).exists() for name in (FIT_FILE, "checkpoint.npz", _UNFINISHED)):
             return
@@ -184,7 +185,7 @@ class FitFolder:
                 raise InputError(f"{there}: is there already, and not of a fit; --overwrite replaces it")
 
     def begin(self, *, goes_on: bool) -> None:
-        """Remove what another fit left, its record first; the checkpoint stays if the fit goes on from it."""
+        """Remove the files of an earlier fit, the record first; keep the checkpoint if the fit resumes from it."""
         self.path.mkdir(parents=True, exist_ok=True)
         (self.path / _UNFINISHED).touch()
         (self.path / FIT_FILE).unlink(missing_ok=True)
@@ -192,11 +193,11 @@ class FitFolder:
             (self.path / "checkpoint.npz").unlink(missing_ok=True)
         (self.path / "splats.ply").unlink(missing_ok=True)
         shutil.rmtree(self.held_out, ignore_errors=True)
-        for part in self.path.glob(".*.part"):  # of a run that was killed while it wrote
+        for part in self.path.glob(".*.part"):  # left by a run that was killed during a write
             part.unlink()
 
     def save_checkpoint(self, state: Mapping[str, Any]) -> None:
-        """Write what the fit can go on from."""
+        """Write a checkpoint."""
 
         def write(temporary: Path) -> None:
             with temporary.open("wb") as file:
@@ -205,7 +206,7 @@ class FitFolder:
         write_file(self.path / "checkpoint.npz", write)
 
     def save(self, result: FitResult, known: Mapping[str, Any]) -> None:
-        """Write the finished fit, and beside its own figures in the record what else is ``known`` of it."""
+        """Write the finished fit; the record contains the result and the entries of ``known``."""
         result.splats.save(self.path / "splats.ply")
         names = ("inputs", "iterations", "seconds", "psnr", "ssim", "validation_psnr", "warnings")
         record = {FORMAT_VERSION: FORMAT_VERSIONS[FIT_FILE]} | {name: getattr(result, name) for name in names}

@@ -1,4 +1,4 @@
-"""How close pictures come to each other."""
+"""Image similarity metrics."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ from skimage.metrics import structural_similarity
 
 
 def psnr(seen: npt.NDArray[np.floating], truth: npt.NDArray[np.floating]) -> float:
-    """Peak signal-to-noise ratio [dB] of pictures with values in [0, 1]."""
+    """Return the peak signal-to-noise ratio [dB] of pictures with values in [0, 1]."""
     return psnr_of(float(np.mean((seen - truth) ** 2)))
 
 
 def psnr_of(error: float) -> float:
-    """Peak signal-to-noise ratio [dB] of a mean squared error."""
+    """Return the peak signal-to-noise ratio [dB] of a mean squared error."""
     return float(-10.0 * np.log10(max(error, 1e-12)))
 
 
 def ssim(seen: npt.NDArray[np.floating], truth: npt.NDArray[np.floating]) -> float:
-    """Mean SSIM of pictures (H, W, 3) with values in [0, 1], each side at least 11 px.
+    """Return the mean SSIM of pictures (H, W, 3) with values in [0, 1] and sides of at least 11 px.
 
     The window is that of Wang et al. 2004.
     """

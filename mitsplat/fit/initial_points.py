@@ -1,4 +1,4 @@
-"""Points at which a fit starts: those of the capture, or random ones where it has too few."""
+"""Initial points of a fit: the points of the capture, and random points if there are too few."""
 
 from __future__ import annotations
 
@@ -26,19 +26,20 @@ def seed_points(
     rng: np.random.Generator,
     most: int,
 ) -> tuple[Float64Array, Float64Array]:
-    """Points (N, 3) and their display-encoded colours in [0, 1], (N, 3).
+    """Return initial points (N, 3) and their display-encoded colours in [0, 1], (N, 3).
 
-    With masks, points that most of the photos which see them show outside the object are left out. Where fewer than 500
-    are left, grey points are added, from all of the space that the cameras look at, or from the masks' visual hull.
+    With masks, a point is dropped unless it lies on the object in more than half of the photos that see it. If fewer
+    than 500 points remain, grey random points are added: in a ball around the common focus of the cameras, or in the
+    visual hull of the masks.
 
     Args:
-        points: Those of the capture, shape (M, 3).
-        colours: Theirs, 8-bit, shape (M, 3).
-        cameras: Of the training photos.
-        seen: Indices of the points that each of them sees; none if that is not known.
-        masks: Share of the pixels of each that the object covers, or None.
-        rng: Draws points.
-        most: Largest number.
+        points: Points of the capture, shape (M, 3).
+        colours: 8-bit colours of these points, shape (M, 3).
+        cameras: Cameras of the training photos.
+        seen: Indices of the points that each photo sees; empty if unknown.
+        masks: Share of each pixel that the object covers, one image per photo, or None.
+        rng: Random number generator.
+        most: Largest number of points.
     """
     tints = colours / 255.0
     if masks is not None and len(points):
@@ -62,10 +63,14 @@ def seed_points(
 
 
 def _random_points(cameras: Sequence[Camera], masks: Sequence[Mask] | None, rng: np.random.Generator) -> Float64Array:
-    """Points in a ball around what the cameras look at, or in the part of it that hardly a mask excludes."""
+    """Return random points in a ball around the common focus of the cameras, or in its part inside the visual hull.
+
+    A point belongs to the hull if it is inside at least 90 % of the largest number of masks that share a point.
+    """
     centres = np.array([camera.centre for camera in cameras])
     axes = np.array([camera.world_from_camera[:3, 2] for camera in cameras])
-    # The point nearest to all optical axes; a little weight on the cameras' own middle decides if these are parallel.
+    # The focus is the point nearest to all optical axes. A small weight on the mean camera centre defines it for
+    # parallel axes.
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
     weight = 1e-3 * len(centres)
     normal = across.sum(axis=0) + weight * np.eye(3)
@@ -84,7 +89,7 @@ def _random_points(cameras: Sequence[Camera], masks: Sequence[Mask] | None, rng:
 
 
 def _covered(camera: Camera, mask: Mask, points: Float64Array) -> Float64Array:
-    """Share of the pixel of each point that the object covers; -1 outside of the picture."""
+    """Return the share of each point's pixel that the object covers; -1 outside the picture."""
     pixels, depth = camera.project(points)
     x, y = np.nan_to_num(np.floor(pixels), nan=-1.0).clip(-1, 1e6).astype(int).T
     inside = (depth > 0) & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)

@@ -1,4 +1,4 @@
-"""Gaussians as an optimiser moves them: unconstrained parameters on the device, and Adam's moments beside them."""
+"""Gaussians as unconstrained optimiser parameters on the device, with the moments of Adam."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ from mitsplat.renderer.splatting.gaussian import Cloud
 from mitsplat.runtime.recorded_kernels import recorded
 
 _BETA_1, _BETA_2, _EPSILON = 0.9, 0.999, 1e-15
-"""Adam as in 3DGS; mi.ad.Adam forgets all moments when the number of Gaussians changes."""
+"""Constants of Adam as in 3DGS. mi.ad.Adam is not used: it loses all moments when the number of Gaussians changes."""
 
 
 class BandRates(NamedTuple):
-    """Learning rates of SH coefficients: of the constant ones, of the others, and how many there are per channel."""
+    """Learning rates of the constant SH coefficients and of the others, and the number of coefficients per channel."""
 
     constant: float
     rest: float
@@ -42,13 +42,13 @@ Rate = float | BandRates
 
 
 class Adam:
-    """Flat parameters by name, and their running moments (Kingma and Ba 2015).
+    """Flat parameters by name, with Adam's moments (Kingma and Ba 2015).
 
     Attributes:
-        values: The parameters.
-        first: Running mean of their gradients.
-        second: Running mean of the squares of their gradients.
-        steps: Updates so far.
+        values: Parameters.
+        first: Running means of the gradients.
+        second: Running means of the squared gradients.
+        steps: Number of updates.
     """
 
     def __init__(self, values: Mapping[str, npt.NDArray[Any]]) -> None:
@@ -59,11 +59,11 @@ class Adam:
         self._settle()
 
     def track(self) -> None:
-        """Collect gradients from here on."""
+        """Enable gradients of the parameters."""
         dr.enable_grad(self.values)
 
     def update(self, rates: Mapping[str, Rate]) -> None:
-        """One step down the gradients, with a rate per parameter."""
+        """Make one optimiser step, with a learning rate per parameter."""
         self.steps += 1
         unbias = np.sqrt(1 - _BETA_2**self.steps) / (1 - _BETA_1**self.steps)
         bands: dict[str, int] = {}
@@ -82,7 +82,13 @@ class Adam:
         self.values, self.first, self.second = _descend(values, gradients, self.first, self.second, numbers, bands)
 
     def take(self, rows: npt.NDArray[np.uint32], widths: Mapping[str, int], fresh: BoolArray) -> None:
-        """Become these rows of the parameters, of so many floats each; ``fresh`` rows lose their moments."""
+        """Replace the parameters by a selection of their rows.
+
+        Args:
+            rows: Indices of the rows; they may repeat.
+            widths: Floats per row, by parameter.
+            fresh: True for rows whose moments are reset, shape of ``rows``.
+        """
         index, kept = wrapped(mi.UInt32, rows), wrapped(mi.Float, (~fresh).astype(np.float32))
         for name, width in widths.items():
             element = dr.arange(mi.UInt32, len(rows) * width)
@@ -94,7 +100,7 @@ class Adam:
         self._settle()
 
     def state(self) -> dict[str, npt.NDArray[Any]]:
-        """Everything, as arrays that :meth:`restore` takes."""
+        """Return the complete state as arrays for :meth:`restore`."""
         groups = {"value": self.values, "first": self.first, "second": self.second}
         arrays = {
             f"{group}.{name}": np.array(dr.detach(array))
@@ -104,7 +110,7 @@ class Adam:
         return arrays | {"steps": np.array(self.steps)}
 
     def restore(self, state: Mapping[str, npt.NDArray[Any]]) -> None:
-        """Go on from what :meth:`state` gave."""
+        """Restore a state from :meth:`state`."""
         for group, members in (("value", self.values), ("first", self.first), ("second", self.second)):
             for name in members:
                 members[name] = wrapped(mi.Float, state[f"{group}.{name}"])
@@ -122,11 +128,14 @@ _Arrays = dict[str, Any]
 def _descend(
     values: _Arrays, gradients: _Arrays, first: _Arrays, second: _Arrays, rates: Any, bands: dict[str, int]
 ) -> tuple[_Arrays, _Arrays, _Arrays]:
-    """Parameters and moments after a step; two rates per parameter, that of its constant bands and that of the rest."""
+    """Return parameters and moments after a step.
+
+    ``rates`` has two values per parameter: for its constant SH bands and for the rest.
+    """
     values, first, second = dict(values), dict(first), dict(second)
     for place, (name, value) in enumerate(values.items()):
         gradient = gradients[name]
-        # Exactly in the camera's plane a derivative is undefined, and would stay in the moments for ever.
+        # The derivative is undefined exactly in the camera plane; a NaN would stay in the moments.
         gradient = dr.select(dr.isfinite(gradient), gradient, 0)
         rate = number(rates, 2 * place)
         if bands[name] > 1:
@@ -139,13 +148,13 @@ def _descend(
 
 
 class GaussianModel(Adam):
-    """Gaussians in terms of unconstrained parameters.
+    """Gaussians in unconstrained parameters.
 
-    Means and logarithms of scales are in ``unit``, opacities are logits; quaternions are xyzw and of any length. The SH
+    Means and logarithms of scales are in ``unit``. Opacities are logits. Quaternions are xyzw with any norm. SH
     coefficients are channel-last.
 
     Attributes:
-        unit: Length [m] by which learning rates become independent of the scene's size.
+        unit: Length [m] that makes learning rates independent of the size of the scene.
         bands: SH coefficients per channel.
     """
 
@@ -169,24 +178,30 @@ class GaussianModel(Adam):
 
     @property
     def widths(self) -> dict[str, int]:
-        """Floats per Gaussian of every parameter."""
+        """Floats per Gaussian, by parameter."""
         return {"means": 3, "quats": 4, "scales": 3, "opacities": 1, "sh": 3 * self.bands}
 
     def activated(self) -> tuple[Any, Any, Any, Any, Any]:
-        """Means [m], quaternions, scales [m], opacities and SH coefficients, flat, with gradients if tracked."""
+        """Return means [m], quaternions, scales [m], opacities and SH coefficients as flat arrays.
+
+        The arrays carry gradients if :meth:`track` was called.
+        """
         return _activated(self.values, self._unit)
 
     def cloud(self) -> Cloud:
-        """The Gaussians as the renderer takes them."""
+        """Return the Gaussians as a renderer cloud."""
         return pack_cloud(*self.activated(), self.bands)
 
     def render(self, eye: Eye, quality: Quality, *, depth: bool = False) -> RenderOp:
-        """The Gaussians as a camera sees them, a :class:`DepthRendering` with depth; :meth:`learn` goes back.
+        """Render the Gaussians; :meth:`learn` computes the gradients of the parameters.
 
         Args:
             eye: The camera.
             quality: Cut-offs and SH degree.
-            depth: Whether depths are wanted.
+            depth: True to render depths as well.
+
+        Returns:
+            The rendering; a :class:`DepthRendering` if ``depth`` is True.
         """
         found = _project(dr.detach(self.values), self._unit, eye.view.kind, eye.numbers, quality, self.bands)
         return render_records(*found, eye.view, quality, depth=depth)
@@ -200,14 +215,14 @@ class GaussianModel(Adam):
         opacity_weight: float = 0,
         scale_weight: float = 0,
     ) -> None:
-        """Give the parameters the gradients of a loss, for :meth:`update`.
+        """Set the gradients of the parameters from the gradients of a loss, for :meth:`update`.
 
         Args:
-            eye: The camera that the loss looks through.
-            quality: As it was rendered with.
-            gradients: Of the view records, to be added up.
-            opacity_weight: Gradient of the loss by every opacity, beside these.
-            scale_weight: The same by every scale [1/m].
+            eye: Camera of the rendering.
+            quality: Quality of the rendering.
+            gradients: Gradients with respect to the view records; they are summed.
+            opacity_weight: Additional gradient with respect to every opacity.
+            scale_weight: Additional gradient with respect to every scale [1/m].
         """
         values = dr.detach(self.values)
         weights = on_device(opacity_weight, scale_weight)
@@ -219,11 +234,11 @@ class GaussianModel(Adam):
             dr.set_grad(self.values[name], gradient)
 
     def sh_rates(self, rate: float, rest_rate: float) -> Rate:
-        """Rates of ``sh``: one for the constant coefficients, another for the rest."""
+        """Return the rates of ``sh``: one for the constant coefficients and another for the rest."""
         return rate if self.bands == 1 else BandRates(rate, rest_rate, self.bands)
 
     def splats(self) -> Splats:
-        """The Gaussians as they are now."""
+        """Return the current Gaussians."""
         means, quats, scales, opacities, sh = (np.array(dr.detach(value)) for value in self.activated())
         return Splats(
             means=means.reshape(-1, 3),
@@ -252,7 +267,7 @@ def _activated(values: _Arrays, unit: Any) -> tuple[Any, Any, Any, Any, Any]:
 def _project(
     values: _Arrays, unit: Any, kind: tuple[Any, ...], numbers: _Arrays, quality: Quality, bands: int
 ) -> tuple[Any, Any, Any]:
-    """View records of Gaussians, least depths and boxes of tiles."""
+    """Return the view records of Gaussians, their least depths and their tile boxes."""
     records, least, box, _ = project_cloud(pack_cloud(*_activated(values, unit), bands), kind, numbers, quality)
     return records, least, box
 
@@ -268,7 +283,7 @@ def _gradients(
     found: list[Any],
     weights: Any,
 ) -> _Arrays:
-    """Gradients of parameters from those of their view records, and from weights of opacities and of scales."""
+    """Return parameter gradients from gradients of view records and from the weights of opacities and scales."""
     values = {name: mi.Float(value) for name, value in values.items()}
     dr.enable_grad(values)
     _, _, scales, opacities, _ = _activated(values, unit)

@@ -1,4 +1,4 @@
-"""Bring given splats closer to pictures, by gradient descent through the renderer."""
+"""Refinement of given splats towards pictures by gradient descent through the renderer."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ from mitsplat.runtime.recorded_kernels import recorded
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """What a camera saw.
+    """A target picture.
 
     Attributes:
-        camera: From where; its distortion is followed by the rays.
+        camera: Camera of the picture; the rays follow its lens distortion.
         rgb: Display-encoded colour times alpha, (H, W, 3).
-        alpha: Share of the pixel that the subject covers, (H, W).
+        alpha: Share of each pixel that the subject covers, (H, W).
     """
 
     camera: Camera
@@ -43,15 +43,15 @@ class RefineSettings:
     """Steps and learning rates; rates fall exponentially to ``final_rate`` times their start.
 
     Attributes:
-        iterations: Optimiser steps; each takes one picture, all pictures in turn.
-        rate_means: Per step, as a share of the splats' own mean size.
-        rate_quats: Of the quaternions' components.
-        rate_scales: Of the logarithms of the scales.
-        rate_opacities: Of the logits of the opacities.
-        rate_sh: Of the constant SH coefficient.
+        iterations: Optimiser steps, each with one picture; all pictures are used in turn.
+        rate_means: Rate of the means per step, as a share of the mean scale of the splats.
+        rate_quats: Rate of the quaternions' components.
+        rate_scales: Rate of the logarithms of the scales.
+        rate_opacities: Rate of the logits of the opacities.
+        rate_sh: Rate of the constant SH coefficient.
         rest_rate: Share of ``rate_sh`` for higher bands, which few pictures determine.
         final_rate: Factor on all rates at the end.
-        seed: Decides the order of the pictures and the backgrounds.
+        seed: Seed of the picture order and of the backgrounds.
     """
 
     iterations: int = 300
@@ -67,7 +67,7 @@ class RefineSettings:
 
 QUALITY = Quality(transmittance_min=1e-3)
 _EVERY = 10
-"""Steps between reports: reading a loss waits for the device."""
+"""Steps between reports; reading a loss waits for the device."""
 
 
 def refine_splats(
@@ -77,16 +77,19 @@ def refine_splats(
     *,
     observe: Callable[[int, float], None] | None = None,
 ) -> Splats:
-    """Splats that look more like the pictures, by Adam on the mean squared error of encoded colours.
+    """Refine splats with Adam on the mean squared error of display-encoded colours.
 
-    The error is taken over a random grey background, the same behind both, so that it also measures alpha. The number
-    of Gaussians stays as it is.
+    Picture and rendering are composited over the same random grey background, so the error also measures alpha. The
+    number of Gaussians does not change.
 
     Args:
-        splats: Where to start.
-        pictures: What to come close to.
-        settings: Steps and rates.
-        observe: Told after every tenth step and the last one its number and its PSNR [dB].
+        splats: Initial splats.
+        pictures: Target pictures.
+        settings: Steps and learning rates.
+        observe: Called after every tenth step and the last step, with the step number and its PSNR [dB].
+
+    Returns:
+        The refined splats.
 
     Raises:
         ValueError: If there are no pictures, or no splats.
@@ -118,7 +121,7 @@ def refine_splats(
 
 @recorded
 def _gradients(rgb: list[Any], alpha: Any, target: list[Any], cover: Any, grey: Any) -> tuple[list[Any], Any, Any]:
-    """Gradients of the loss by colours and by alpha, and the loss."""
+    """Return the gradients of the loss with respect to colours and alpha, and the loss."""
     rgb, alpha = [mi.Float(channel) for channel in rgb], mi.Float(alpha)
     dr.enable_grad(rgb, alpha)
     behind, loss = number(grey, 0), mi.Float(0)

@@ -1,9 +1,9 @@
-"""Adaptive density control, the densification that 3DGS was published with (Kerbl et al. 2023, section 5).
+"""Adaptive density control, the original densification of 3DGS (Kerbl et al. 2023, section 5).
 
-Where photos pull at the place of a Gaussian in the image, too few of them stand for too much: small ones are cloned,
-large ones split in two. What is transparent or too large is removed, and opacities are lowered now and then, so that
-only what the photos want becomes opaque again. Constants are those of the published code and of gsplat's
-``DefaultStrategy``; spans of steps are kept as shares of the fit, for the published one has 30,000 steps.
+A large image-space position gradient indicates too few Gaussians in an area. Small Gaussians there are cloned, and
+large ones are split in two. Transparent or too large Gaussians are removed. Opacities are lowered at intervals, so that
+only Gaussians that the photos need become opaque again. Constants are those of the published code and of gsplat's
+``DefaultStrategy``. Step ranges are shares of the fit, because the published fit has 30,000 steps.
 """
 
 from __future__ import annotations
@@ -24,28 +24,28 @@ from mitsplat.geometry.camera import Camera
 from mitsplat.renderer.rays.device_arrays import wrapped
 
 _REFINED = (1 / 60, 0.5)
-"""Shares of the fit between which Gaussians are added and removed."""
+"""Range of the fit, as shares, in which Gaussians are added and removed."""
 _RESET_EVERY = 0.1
-"""Share of the fit between resets of the opacities."""
+"""Share of the fit between opacity resets."""
 _RESET_STEPS = 300
-"""Steps between them at least: Adam needs a hundred at its rate to make a Gaussian half opaque again."""
+"""Least number of steps between opacity resets; Adam needs 100 steps to make a Gaussian half opaque again."""
 _RESET_TO = 2 * DEAD
 _GRADIENT_MIN = 2e-4
-"""Mean gradient in the image from which a Gaussian is cloned or split; the image is 2 wide and 2 high."""
+"""Mean image-space gradient above which a Gaussian is cloned or split; the image is 2 wide and 2 high."""
 _SMALL = 0.01
-"""Largest scale of a Gaussian that is cloned and not split, in the model's unit."""
+"""Largest scale of a Gaussian that is cloned instead of split, in the model's unit."""
 _LARGE = 0.1
-"""Scale in the model's unit from which a Gaussian is removed, once opacities have been reset."""
+"""Scale above which a Gaussian is removed after the first opacity reset, in the model's unit."""
 _SHRINK = 1.6
 _REACH = 3.0
-"""Standard deviations up to which a Gaussian is in an image, as published."""
+"""Radius of a Gaussian in the test if it is in an image [standard deviations], as published."""
 
 
 class Classic:
-    """Clones, splits, removals and resets.
+    """Densification by clones, splits, removals and opacity resets.
 
     Args:
-        most: Most Gaussians; if more are wanted, those with the largest gradients come first.
+        most: Largest number of Gaussians; at this limit, those with the largest gradients have priority.
         every: Steps between changes.
     """
 
@@ -58,53 +58,53 @@ class Classic:
         self._photos: Any = mi.Float(0)
 
     def look(self, model: GaussianModel, camera: Camera) -> None:
-        """Add the gradients of a photo to those since the last change."""
+        """Accumulate the gradients of a photo since the last change."""
         pull, seen = image_gradient(model, camera)
         self._pull += dr.select(seen, pull, 0)
         self._photos += dr.select(seen, mi.Float(1), 0)
         dr.eval(self._pull, self._photos)
 
     def refine(self, model: GaussianModel, step: int, fraction: float, rate: float, rng: np.random.Generator) -> None:
-        """Clone, split and remove now and then, and reset opacities more rarely."""
+        """Clone, split and remove Gaussians at intervals, and reset opacities at longer intervals."""
         if not (_REFINED[0] <= fraction < _REFINED[1] and step % self._every == 0):
             return
         pull = np.array(self._pull / dr.maximum(self._photos, 1), dtype=np.float64)
         control_density(model, pull, self._most, rng, remove_large=self._reset_step > 0)
-        self._pull, self._photos = mi.Float(0), mi.Float(0)  # two, for they are added to in place
+        self._pull, self._photos = mi.Float(0), mi.Float(0)  # two arrays, because both are accumulated in place
         if fraction - self._reset_fraction >= _RESET_EVERY and step - self._reset_step >= _RESET_STEPS:
             self._reset_step, self._reset_fraction = step, fraction
             lower_opacities(model)
 
     def state(self) -> dict[str, npt.NDArray[Any]]:
-        """Gradients and photos since the last change, and when opacities were reset."""
+        """Return the accumulated gradients and photo counts, and the time of the last opacity reset."""
         reset = np.array([self._reset_step, self._reset_fraction])
         return {"pull": np.array(self._pull), "photos": np.array(self._photos), "reset": reset}
 
     def restore(self, state: Mapping[str, npt.NDArray[Any]]) -> None:
-        """Go on from what :meth:`state` gave."""
+        """Restore a state from :meth:`state`."""
         self._pull, self._photos = (wrapped(mi.Float, state[name]) for name in ("pull", "photos"))
         self._reset_step, self._reset_fraction = int(state["reset"][0]), float(state["reset"][1])
 
 
 def image_gradient(model: GaussianModel, camera: Camera) -> tuple[Any, Any]:
-    """How strongly the loss pulls at the places of Gaussians in an image, and which of them are in it, on the device.
+    """Compute the image-space position gradients of Gaussians, and the Gaussians in the image, on the device.
 
-    A mean m that moves by dX along the camera's x axis at depth z moves in the image by fx dX / z pixels. So the
-    gradient with respect to its place (u, v) follows from that with respect to the mean:
+    If a mean m moves by dX along the camera's x axis at depth z, its image moves by fx dX / z pixels. So the gradient
+    with respect to the image position (u, v) follows from that with respect to the mean:
 
         dL/du = (dL/dm . e_x) z / fx,    dL/dv = (dL/dm . e_y) z / fy,
 
     times half of the image's width and height, because the published threshold is for an image 2 wide and 2 high.
-    Unlike the published gradient, this one holds what a move changes beside the place: the footprint's perspective and
-    the direction from which colours are seen. A lens's distortion is left out.
+    Unlike the published gradient, this one includes all effects of a move: also those of the footprint's perspective
+    and of the view direction on the SH colour. Lens distortion is ignored.
 
     Args:
         model: Gaussians whose means have gradients.
-        camera: Of the photo that they are of.
+        camera: Camera of the photo behind these gradients.
 
     Returns:
-        Norm of the gradient, and whether a Gaussian's sphere of three standard deviations reaches into the image and
-        not to the camera's plane, both of width N.
+        Norm of the gradient, and True if the sphere of three standard deviations overlaps the image and does not reach
+        the near plane, both of width N.
     """
     i = dr.arange(mi.UInt32, model.count)
     axes = [mi.Vector3f(*(dr.opaque(mi.Float, float(x)) for x in axis)) for axis in camera.world_from_camera[:3, :3].T]
@@ -120,7 +120,7 @@ def image_gradient(model: GaussianModel, camera: Camera) -> tuple[Any, Any]:
         (axes[0], x, camera.fx, camera.cx, camera.width),
         (axes[1], y, camera.fy, camera.cy, camera.height),
     ):
-        # In the model's unit as well as in metres: lengths in z and in the gradient cancel.
+        # The result is the same in the model's unit and in metres: lengths in z and in the gradient cancel.
         total += dr.square(dr.dot(axis, pull) * z * dr.opaque(mi.Float, 0.5 * size / focal))
         low, high = dr.opaque(mi.Float, -middle / focal), dr.opaque(mi.Float, (size - middle) / focal)
         seen &= (offset + reach > low * z) & (offset - reach < high * z)
@@ -130,17 +130,17 @@ def image_gradient(model: GaussianModel, camera: Camera) -> tuple[Any, Any]:
 def control_density(
     model: GaussianModel, pull: Float64Array, most: int, rng: np.random.Generator, *, remove_large: bool
 ) -> None:
-    """Clone or split Gaussians whose mean gradient in the image is large, and remove those that show nothing.
+    """Clone or split Gaussians with a large mean image-space gradient, and remove transparent ones.
 
-    A clone lies on what it was made of, and Adam's moments pull only that away. The two parts of a split one are drawn
-    from it, with scales smaller by 1.6.
+    A clone has the position of its original; Adam's moments move only the original away. The two parts of a split
+    Gaussian are sampled from it, with scales divided by 1.6.
 
     Args:
         model: The Gaussians, N.
         pull: Mean norm of :func:`image_gradient`, shape (N,).
-        most: Number that may not be exceeded.
-        rng: Draws the places of parts.
-        remove_large: Whether Gaussians of more than a tenth of the model's unit are removed as well.
+        most: Largest number of Gaussians.
+        rng: Random number generator for the positions of parts.
+        remove_large: True to remove also Gaussians larger than a tenth of the model's unit.
     """
     scales = np.exp(np.array(dr.detach(model.values["scales"]), dtype=np.float64)).reshape(-1, 3)
     size = scales.max(axis=1)
@@ -167,7 +167,7 @@ def control_density(
 
 
 def lower_opacities(model: GaussianModel) -> None:
-    """Make no Gaussian more opaque than twice the opacity at which it is removed; opacities lose Adam's moments."""
+    """Limit opacities to twice the removal threshold, and reset their moments."""
     most = dr.opaque(mi.Float, float(np.log(_RESET_TO / (1 - _RESET_TO))))
     model.values["opacities"] = dr.minimum(dr.detach(model.values["opacities"]), most)
     for moments in (model.first, model.second):

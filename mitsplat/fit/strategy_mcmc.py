@@ -1,9 +1,10 @@
-"""Where Gaussians are: seeds for a capture, and "3D Gaussian splatting as Markov chain Monte Carlo".
+"""Initial Gaussians, and the densification of "3D Gaussian splatting as Markov chain Monte Carlo".
 
-Kheradmand et al. 2024 see the Gaussians as samples of a distribution. Noise moves those that are hardly opaque; dead
-ones are put where others are opaque, and new ones as well, all so that the picture stays what it was: n Gaussians in
-the place of one have the opacity ``1 - (1 - o)^(1/n)`` and scales by eq. 9 of the paper. The densification that 3DGS
-was published with is :mod:`mitsplat.fit.strategy_classic`; a fit knows both as a :class:`Densification`.
+Kheradmand et al. 2024 treat the Gaussians as samples of a distribution. Noise moves Gaussians of low opacity. Dead
+Gaussians move to positions of opaque ones, and new Gaussians are added there. The rendered image stays the same: n
+Gaussians that replace one have the opacity ``1 - (1 - o)^(1/n)`` and scales by eq. 9 of the paper. The original
+densification of 3DGS is :mod:`mitsplat.fit.strategy_classic`. A fit uses both through the protocol
+:class:`Densification`.
 """
 
 from __future__ import annotations
@@ -28,14 +29,14 @@ from mitsplat.renderer.splatting.gaussian import rotation_axes
 from mitsplat.runtime.recorded_kernels import recorded
 
 DEAD = 0.005
-"""Opacity below which a Gaussian is moved to where it is of use."""
+"""Opacity below which a Gaussian counts as dead and is relocated."""
 
 _REFINED = (0.02, 0.8)
-"""Shares of the fit between which MCMC moves and adds Gaussians."""
+"""Range of the fit, as shares, in which MCMC relocates and adds Gaussians."""
 _GROWTH = 1.05
 _COPIES_MAX = 51
 _NOISE = 5e5
-"""Size of the noise per learning rate of the means; they and the covariance are in the model's unit."""
+"""Noise per learning rate of the means; means and covariance are in the model's unit."""
 
 _BINOMIALS = np.array(
     [[comb(n, k) * (-1) ** k / np.sqrt(k + 1) for k in range(_COPIES_MAX)] for n in range(_COPIES_MAX)]
@@ -43,43 +44,43 @@ _BINOMIALS = np.array(
 
 
 class Densification(Protocol):
-    """How a fit changes the number and the places of its Gaussians.
+    """Strategy that changes the number and the positions of Gaussians during a fit.
 
     Attributes:
-        scale_weight: Weight of the mean scale that it needs in the loss.
+        scale_weight: Default weight of the mean scale in the loss.
     """
 
     scale_weight: float
 
     def look(self, model: GaussianModel, camera: Camera) -> None:
-        """Note what the gradients of a photo by this camera say, before they are used up."""
+        """Accumulate the gradients of a photo by this camera, before the optimiser step."""
 
     def refine(self, model: GaussianModel, step: int, fraction: float, rate: float, rng: np.random.Generator) -> None:
         """Change the Gaussians after a step.
 
         Args:
             model: The Gaussians.
-            step: Steps made.
-            fraction: Share of the fit's schedule that had run off before this one.
+            step: Number of finished steps.
+            fraction: Share of the fit's schedule before this step.
             rate: Learning rate of the means.
-            rng: The step's random numbers.
+            rng: Random number generator of the step.
         """
 
     def state(self) -> dict[str, npt.NDArray[Any]]:
-        """What it has noted, as arrays that :meth:`restore` takes."""
+        """Return the state as arrays for :meth:`restore`."""
 
     def restore(self, state: Mapping[str, npt.NDArray[Any]]) -> None:
-        """Go on from what :meth:`state` gave."""
+        """Restore a state from :meth:`state`."""
 
 
 class Mcmc:
-    """Markov chain Monte Carlo.
+    """Markov chain Monte Carlo densification.
 
     Args:
-        most: Most Gaussians; their number grows to this by the middle of the fit.
-        start: Their number at the start.
-        every: Steps between moves and additions.
-        seed: Decides the jitter.
+        most: Largest number of Gaussians; their number grows to this by the middle of the fit.
+        start: Initial number of Gaussians.
+        every: Steps between relocations and additions.
+        seed: Seed of the noise.
     """
 
     scale_weight = 0.01
@@ -88,24 +89,24 @@ class Mcmc:
         self._most, self._start, self._every, self._seed = most, start, every, seed
 
     def look(self, model: GaussianModel, camera: Camera) -> None:
-        """Nothing: opacity alone decides."""
+        """Do nothing, because MCMC depends only on opacities."""
 
     def refine(self, model: GaussianModel, step: int, fraction: float, rate: float, rng: np.random.Generator) -> None:
-        """Move dead Gaussians and add new ones now and then, and always jitter."""
+        """Relocate dead Gaussians and add new ones at intervals, and add noise in every step."""
         if _REFINED[0] <= fraction < _REFINED[1] and step % self._every == 0:
             relocate(model, rng)
             grow(model, self._wanted(model.count, fraction), rng)
         jitter(model, rate, (self._seed, step))
 
     def state(self) -> dict[str, npt.NDArray[Any]]:
-        """Nothing."""
+        """Return no state."""
         return {}
 
     def restore(self, state: Mapping[str, npt.NDArray[Any]]) -> None:
-        """Nothing."""
+        """Do nothing, because there is no state."""
 
     def _wanted(self, count: int, fraction: float) -> int:
-        """Number of Gaussians by now: 5 % more each time as published, or more if the fit is short."""
+        """Return the target number of Gaussians: 5 % growth each time as published, or more in short fits."""
         share = min(1.0, (fraction - _REFINED[0]) / (0.5 - _REFINED[0]))
         planned = self._start * (self._most / self._start) ** share
         return min(self._most, int(max(planned, _GROWTH * count)))
@@ -114,13 +115,13 @@ class Mcmc:
 def seed_splats(
     points: Float64Array, colours: Float64Array, sh_degree: int, *, opacity: float = 0.5, spread: float = 0.5
 ) -> Splats:
-    """Round Gaussians at points.
+    """Return isotropic Gaussians at points.
 
     Args:
         points: Centres, shape (N, 3), N > 1.
-        colours: Display-encoded, in [0, 1], shape (N, 3).
+        colours: Display-encoded colours in [0, 1], shape (N, 3).
         sh_degree: Degree of the spherical harmonics; all but the constant ones are zero.
-        opacity: Of every Gaussian.
+        opacity: Opacity of every Gaussian.
         spread: Standard deviation as a share of the mean distance to the three nearest neighbours.
     """
     distance, _ = KDTree(points).query(points, k=min(4, len(points)))
@@ -138,7 +139,7 @@ def seed_splats(
 
 
 def relocate(model: GaussianModel, rng: np.random.Generator) -> int:
-    """Put dead Gaussians where others are opaque; their number."""
+    """Move dead Gaussians to positions of opaque ones, and return their number."""
     opacities = np.array(dr.detach(model.activated()[3]), dtype=np.float64)
     dead = opacities <= DEAD
     if not dead.any() or dead.all():
@@ -150,7 +151,7 @@ def relocate(model: GaussianModel, rng: np.random.Generator) -> int:
 
 
 def grow(model: GaussianModel, count: int, rng: np.random.Generator) -> None:
-    """Add Gaussians, up to so many in all, where there is opacity."""
+    """Add Gaussians at positions drawn by opacity, up to a total of ``count``."""
     opacities = np.array(dr.detach(model.activated()[3]), dtype=np.float64)
     missing = count - len(opacities)
     if missing > 0:
@@ -158,12 +159,12 @@ def grow(model: GaussianModel, count: int, rng: np.random.Generator) -> None:
 
 
 def jitter(model: GaussianModel, rate: float, seed: Sequence[int]) -> None:
-    """Move Gaussians at random within their own shape, the less the more opaque they are (eq. 8 of the paper).
+    """Add noise to means within the shape of each Gaussian, less for higher opacity (eq. 8 of the paper).
 
     Args:
         model: The Gaussians.
         rate: Learning rate of the means.
-        seed: Two numbers that decide the noise, such as seed and step.
+        seed: Two numbers that determine the noise, such as seed and step.
     """
     p = dr.detach(model.values)
     numbers = wrapped(mi.UInt32, np.array([int(value) % 2**32 for value in seed], dtype=np.uint32))
@@ -179,7 +180,7 @@ def _jittered(means: Any, scales: Any, quats: Any, opacities: Any, size: Any, se
     key, step = (dr.gather(mi.UInt32, seed, place) for place in range(2))
     first = mi.sample_tea_32(i, key + 0x9E3779B9 * step)
     second = mi.sample_tea_32(first[0], first[1])
-    uniform = [mi.Float(v >> 8) * 2.0**-24 for v in (*first, *second)]  # below 1, which has no finite normal
+    uniform = [mi.Float(v >> 8) * 2.0**-24 for v in (*first, *second)]  # below 1, which has no finite normal deviate
     x, y = mi.warp.square_to_std_normal(mi.Point2f(*uniform[:2]))
     z, _ = mi.warp.square_to_std_normal(mi.Point2f(*uniform[2:]))
     noise = mi.Vector3f(x, y, z)
@@ -198,7 +199,7 @@ def _draw(weights: Float64Array, count: int, rng: np.random.Generator) -> npt.ND
 
 
 def _share_out(model: GaussianModel, rows: npt.NDArray[np.intp], opacities: Float64Array) -> None:
-    """Replace the Gaussians by these rows of them; rows that occur more than once share opacity and size."""
+    """Replace the Gaussians by the selected rows; copies of one row share its opacity and size."""
     copies = np.bincount(rows, minlength=len(opacities))
     several = copies > 1
     opacity, factor = shared(opacities[several], copies[several])
@@ -217,7 +218,7 @@ def _share_out(model: GaussianModel, rows: npt.NDArray[np.intp], opacities: Floa
 
 
 def shared(opacities: Float64Array, copies: npt.NDArray[np.intp]) -> tuple[Float64Array, Float64Array]:
-    """Opacity of each of n coincident Gaussians that replace one, and the factor on its scales (eq. 9 of the paper)."""
+    """Return the opacity of each of n coincident Gaussians that replace one, and the factor on its scales (eq. 9)."""
     copies = np.minimum(copies, _COPIES_MAX)
     opacity = 1 - (1 - opacities) ** (1 / copies)
     total = np.zeros(len(opacities))

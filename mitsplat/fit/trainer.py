@@ -1,7 +1,7 @@
-"""Captures to splats: 3D Gaussian splatting (Kerbl et al. 2023) through this package's differentiable renderer.
+"""Fit of splats to captures: 3D Gaussian splatting (Kerbl et al. 2023) with this package's differentiable renderer.
 
-Gaussians start at the capture's points and are densified (:mod:`mitsplat.fit.strategy_mcmc`). A fit lives in a folder,
-see :mod:`mitsplat.fit.fit_folder`.
+Gaussians start at the points of the capture and are densified (:mod:`mitsplat.fit.strategy_mcmc`). The files of a fit
+are described in :mod:`mitsplat.fit.fit_folder`.
 """
 
 from __future__ import annotations
@@ -44,45 +44,46 @@ from mitsplat.version import __version__
 
 @dataclass(frozen=True)
 class FitSettings:
-    """How a capture is fitted. Rates are those published for 3DGS, regularisation is that of its MCMC densification.
+    """Settings of a fit. Learning rates are those of 3DGS; regularisation is that of its MCMC densification.
 
     Attributes:
-        gaussians: Most Gaussians; with MCMC their number grows to this by the middle of the fit.
-        densification: ``mcmc`` puts Gaussians where others are opaque (Kheradmand et al. 2024); ``classic`` where the
-            photos pull at them (Kerbl et al. 2023), in as many as that takes.
-        iterations: Optimiser steps; each takes one photo, all photos in turn.
-        budget: Time [s] in which the schedule of the iterations runs off even if it must leave some out; then the
-            result depends on the machine.
-        target_psnr: Mean PSNR [dB] at which the fit ends early: of one in eight of the training photos, which are then
-            set aside for that. Held-out photos take part in no decision.
-        size: Longest edge of the pictures [px]; photos are made smaller, never larger.
-        crop: Whether photos are fitted around the object alone, and ``size`` is that of these parts; only where masks
-            supervise alpha. Held-out photos are compared whole.
-        sh_degree: Degree of the spherical harmonics, 0 to 3; a degree more every fifth of the fit.
-        masks: ``alpha``: only what masks show is fitted, and they supervise alpha; ``ignore``: what they leave out may
-            look like anything; ``off``: they are not read.
-        background: Behind splats and mask: a random colour in every step, or black.
-        ssim_share: Weight of D-SSIM against L1.
+        gaussians: Largest number of Gaussians; with MCMC their number grows to this by the middle of the fit.
+        densification: ``mcmc`` adds Gaussians at positions of opaque ones (Kheradmand et al. 2024); ``classic`` adds
+            them where image-space gradients are large (Kerbl et al. 2023), without a fixed target number.
+        iterations: Optimiser steps, each with one photo; all photos are used in turn.
+        budget: Time limit [s] of the schedule, which then skips iterations if necessary. The result then depends on the
+            machine.
+        target_psnr: Mean PSNR [dB] at which the fit ends early. It is measured on one in eight of the training photos,
+            which are then not fitted. Held-out photos never affect a decision.
+        size: Longest edge of the pictures [px]; photos are reduced, never enlarged.
+        crop: True to fit only the area around the object in each photo, with ``size`` for this area; only if masks
+            supervise alpha. Held-out photos are compared as a whole.
+        sh_degree: Degree of the spherical harmonics, 0 to 3; it increases by one every fifth of the fit.
+        masks: ``alpha``: only masked pixels are fitted, and masks supervise alpha; ``ignore``: pixels outside masks
+            have no loss; ``off``: masks are not read.
+        background: Background behind splats and mask: a random colour in every step, or black.
+        ssim_share: Weight of D-SSIM relative to L1.
         alpha_weight: Weight of the difference between alpha and mask.
-        depth_weight: Weight of the difference between inverse depths of the splats and of the points a photo sees, or
-            of its depth map, relative to the inverse of the fit's length unit, in every fourth step; 0 leaves depths
-            out. Without it, Gaussians inside and behind an object explain its photos as well as those on its surface.
-            The weight of maps falls to a hundredth exponentially, as published: they are smooth and may be bent.
-        opacity_weight: Weight of the mean opacity. MCMC's authors have 0.01 in fits ten times as long; in short ones it
-            leaves surfaces that are seen through.
-        scale_weight: Weight of the mean scale in units of the cameras' extent; by default 0.01 with MCMC, as published,
-            and 0 with classic densification, which removes what is large.
-        exposure: Whether every photo has an affine colour correction of its own (3 x 4). Their mean stays the identity,
-            because photos alone do not say whether splats are bright or corrections are.
-        coarse: Share of the fit that sees pictures of half the size.
-        refine_every: Steps between removals or moves of dead Gaussians and additions of new ones.
-        rate_means: Learning rate at the start in units of the cameras' extent; falls to a hundredth exponentially.
+        depth_weight: Weight of the difference between inverse depths of the splats and of the visible points or the
+            depth map, relative to the inverse of the fit's length unit, in every fourth step; 0 disables depth. Without
+            depth, Gaussians inside and behind an object explain its photos as well as those on its surface. The weight
+            of maps falls exponentially to a hundredth, as published, because maps are smooth and may be bent.
+        opacity_weight: Weight of the mean opacity. The MCMC authors use 0.01 in fits ten times as long; in short fits
+            it makes surfaces transparent.
+        scale_weight: Weight of the mean scale in units of the cameras' extent. The default is 0.01 with MCMC, as
+            published, and 0 with classic densification, which removes large Gaussians.
+        exposure: True to fit an affine colour correction (3 x 4) per photo. The mean of the corrections stays the
+            identity, because photos alone do not separate the brightness of splats from that of corrections.
+        coarse: Share of the fit that uses pictures of half the size.
+        refine_every: Steps between removals or relocations of dead Gaussians and additions of new ones.
+        rate_means: Initial learning rate of the means in units of the cameras' extent; falls exponentially to a
+            hundredth.
         rate_quats: Learning rate of the quaternions' components.
         rate_scales: Learning rate of the logarithms of the scales.
         rate_opacities: Learning rate of the logits of the opacities.
         rate_sh: Learning rate of the constant SH coefficients; the others have a twentieth.
-        rate_exposure: Learning rate of the colour corrections at the start; falls to a tenth exponentially.
-        seed: Decides every random number.
+        rate_exposure: Initial learning rate of the colour corrections; falls exponentially to a tenth.
+        seed: Seed of all random numbers.
     """
 
     gaussians: int = 30_000
@@ -138,13 +139,13 @@ class FitSettings:
 
 @dataclass(frozen=True)
 class FitProgress:
-    """Where a fit stands.
+    """Progress of a fit.
 
     Attributes:
-        step: Steps made.
-        fraction: Share of the schedule that has run off.
-        psnr: Of the photos of the last steps [dB].
-        validation: Mean over the photos that the target is for, when they were last looked at [dB], if they were.
+        step: Number of finished steps.
+        fraction: Finished share of the schedule.
+        psnr: PSNR of the photos of the last steps [dB].
+        validation: Mean PSNR of the validation photos at their last evaluation [dB], or None.
         gaussians: Number of Gaussians.
     """
 
@@ -157,18 +158,21 @@ class FitProgress:
 
 QUALITY = Quality(transmittance_min=1e-3)
 _EVERY = 25
-"""Steps between reports: reading a loss waits for the device."""
+"""Steps between reports; reading a loss waits for the device."""
 _READERS = 16
-"""Most photos that are read at a time, which takes less than a GPU does to fit them: of 24 megapixels, each takes up to
-0.6 GB meanwhile, as floats twice."""
+"""Largest number of photos that are read in parallel.
+
+With this number, reading takes less time than the fit on a GPU. A photo of 24 megapixels takes up to 0.6 GB meanwhile,
+as two float copies.
+"""
 _EXTENT = 1.1
 _CHECKPOINT_SECONDS = 60.0
 _LOOK_EVERY = 0.05
-"""Share of the schedule between looks at the photos that the target is for."""
+"""Share of the schedule between evaluations of the validation photos."""
 _DEPTH_EVERY = 4
-"""Steps between looks at depth, which double the time of a step."""
+"""Steps between steps with a depth loss, which doubles the time of a step."""
 _MAPS_FALL_TO = 0.01
-"""What is left at the end of the weight of depth maps (Kerbl et al. 2024, as published for 3DGS)."""
+"""Final weight of depth maps relative to the initial one (Kerbl et al. 2024, as published for 3DGS)."""
 
 
 def fit_capture(
@@ -180,20 +184,21 @@ def fit_capture(
     overwrite: bool = False,
     progress: Callable[[FitProgress], None] | None = None,
 ) -> FitResult:
-    """Fit splats to the training photos of a capture, or go on with a fit that was interrupted.
+    """Fit splats to the training photos of a capture, or resume an interrupted fit.
 
-    Runs of the same inputs give the same splats on the same device, resumed or not, unless ``settings.budget`` is set.
+    Runs with equal inputs give equal splats on the same device, resumed or not, unless ``settings.budget`` is set.
 
     Args:
         capture: Photos, cameras, points.
         out: Folder of the fit.
-        settings: How to fit.
-        depths: Depth maps of photos, which take the place of the points that these see in the loss.
-        overwrite: Whether what the folder holds of other inputs, or damaged, is replaced.
-        progress: Told every few steps where the fit stands.
+        settings: Settings of the fit.
+        depths: Depth maps of photos, which replace the visible points in the depth loss.
+        overwrite: True to replace files of other inputs, or damaged files, in the folder.
+        progress: Called every few steps.
 
     Raises:
-        InputError: If there are too few photos, a photo or a depth map cannot be read, or the folder holds another fit.
+        InputError: If there are too few photos, a photo or a depth map cannot be read, or the folder contains another
+            fit.
     """
     training, held_out = _usable(capture.training, settings), _usable(capture.held_out, settings)
     if not (training and held_out):
@@ -245,7 +250,7 @@ def fit_capture(
 
 
 class _Fit:
-    """A fit between two steps."""
+    """State of a fit between two steps."""
 
     def __init__(
         self,
@@ -289,12 +294,12 @@ class _Fit:
 
     @property
     def elapsed(self) -> float:
-        """Time [s] spent, over all runs."""
+        """Duration of the fit over all runs [s]."""
         return self.seconds + time.monotonic() - self.began
 
     @property
     def fraction(self) -> float:
-        """Share of the schedule that has run off."""
+        """Finished share of the schedule."""
         s = self.settings
         spent = self.elapsed / s.budget if s.budget else 0.0
         return min(1.0, max(self.steps / s.iterations, spent))
@@ -326,7 +331,7 @@ class _Fit:
         self.errors.append(error)
 
     def _depth_weight(self, sight: TrainingView, fraction: float) -> float:
-        """Weight of the depths of a photo in this step."""
+        """Return the weight of the depth loss of a photo in this step."""
         if self.steps % _DEPTH_EVERY:
             return 0.0
         return self.settings.depth_weight * (1 if sight.inverse_depth is None else _MAPS_FALL_TO**fraction)
@@ -334,7 +339,7 @@ class _Fit:
     def _learn(
         self, sight: TrainingView, number: int, quality: Quality, fraction: float, rng: np.random.Generator
     ) -> Any:
-        """Give the parameters the gradients of the loss of a photo, whose mean squared error it returns."""
+        """Set the parameter gradients of the loss of a photo, and return its mean squared error."""
         s = self.settings
         weight = self._depth_weight(sight, fraction)
         pixel, inverse = sight.depths(self.points) if weight > 0 else (mi.UInt32(), mi.Float())
@@ -376,7 +381,7 @@ class _Fit:
         return error
 
     def report(self) -> FitProgress:
-        """Where the fit stands; looks now and then at the photos that the target is for."""
+        """Return the progress, and evaluate the validation photos at intervals."""
         error = float(np.mean([e.numpy()[0] for e in self.errors]))
         self.errors = []
         fraction = self.fraction
@@ -387,7 +392,7 @@ class _Fit:
         return FitProgress(self.steps, fraction, psnr_of(error), validated, self.model.count)
 
     def check(self, photos: Sequence[TrainingView], folder: Path | None) -> tuple[HeldOut, ...]:
-        """Photos that are not fitted, with a picture of each in the folder."""
+        """Evaluate photos that are not fitted, and write a comparison of each to the folder if it is not None."""
         quality = replace(QUALITY, sh_degree=self.settings.sh_degree)
         found = []
         for sight in photos:
@@ -398,12 +403,12 @@ class _Fit:
         return tuple(found)
 
     def state(self) -> dict[str, Any]:
-        """Everything that decides how the fit goes on after a report, as arrays that :meth:`restore` takes."""
+        """Return everything that determines the rest of the fit after a report, as arrays for :meth:`restore`."""
         own = {"steps": self.steps, "seconds": self.elapsed, "looked": self.looked, "validated": self.validated}
         return own | {f"{name}.{k}": v for name, part in self._parts.items() for k, v in part.state().items()}
 
     def restore(self, state: Mapping[str, npt.NDArray[Any]]) -> None:
-        """Go on from what :meth:`state` gave."""
+        """Restore a state from :meth:`state`."""
         self.steps, self.seconds = int(state["steps"]), float(state["seconds"])
         self.looked, self.validated = float(state["looked"]), float(state["validated"])
         for name, part in self._parts.items():
@@ -411,12 +416,12 @@ class _Fit:
 
     @property
     def _parts(self) -> dict[str, Adam | Densification]:
-        """What changes from step to step, by its name in checkpoints."""
+        """Parts with a state that changes in every step, by their names in checkpoints."""
         return {"model": self.model, "exposure": self.exposure, "densification": self.densification}
 
 
 def _densification(settings: FitSettings, start: int) -> Densification:
-    """The strategy that is asked for, of so many Gaussians at the start."""
+    """Return the densification of the settings; ``start`` is the initial number of Gaussians."""
     s = settings
     if s.densification == "classic":
         return Classic(s.gaussians, s.refine_every)
@@ -424,7 +429,7 @@ def _densification(settings: FitSettings, start: int) -> Densification:
 
 
 class _Recipe(NamedTuple):
-    """What decides the kernels of a loss."""
+    """Constants of the loss that determine its kernels."""
 
     width: int
     height: int
@@ -444,19 +449,19 @@ def _gradients(
     numbers: Any,
     recipe: _Recipe,
 ) -> tuple[dict[str, Any], Any]:
-    """Gradients of the loss of one photo, and the mean squared error of its pixels.
+    """Return the gradients of the loss of one photo, and the mean squared error of its pixels.
 
     Args:
-        rgb: What the splats show, three flat row-major arrays.
-        alpha: Their opacity.
-        depth: Moment of depth, and inverse depths that are known, see :func:`_depth_image`.
-        photo: Its pixels, and where it does not show whether there is the object, if so anywhere.
-        correction: The table of colour corrections, and which one is the photo's.
-        numbers: What is behind the splats, red, green and blue; weight of depth; inverse number of known depths.
-        recipe: What else there is to the loss.
+        rgb: Rendered colours, three flat row-major arrays.
+        alpha: Rendered opacity.
+        depth: Depth moment of the rendering, and known inverse depths from :func:`_depth_image`.
+        photo: Packed pixels, and a mask of the pixels where the object may be hidden, or None.
+        correction: Table of colour corrections, and the index of the photo in it.
+        numbers: Background red, green and blue; weight of depth; inverse number of known depths.
+        recipe: Constants of the loss.
 
     Returns:
-        Gradients of ``rgb``, ``alpha``, and of the ``moment`` and ``exposure`` where there are such; and the error.
+        Gradients of ``rgb``, ``alpha``, and of ``moment`` and ``exposure`` if they exist; and the error.
     """
     inputs: dict[str, Any] = {"rgb": [mi.Float(c) for c in rgb], "alpha": mi.Float(alpha)}
     if depth is not None:
@@ -477,7 +482,7 @@ def _gradients(
         behind = [number(numbers, channel) for channel in range(3)]
         rgb = [c + b * (1 - alpha) for c, b in zip(rgb, behind, strict=True)]
         target = [c + b * (1 - mask) for c, b in zip(target, behind, strict=True)]
-    if photo[1] is not None:  # what is there is right
+    if photo[1] is not None:  # no loss where the object may be hidden
         target = [dr.select(photo[1], dr.detach(c), t) for c, t in zip(rgb, target, strict=True)]
         mask = dr.select(photo[1], dr.detach(alpha), mask)
     loss += photometric_loss(rgb, target, recipe.width, recipe.height, recipe.ssim_share)
@@ -489,7 +494,7 @@ def _gradients(
 
 
 def _depth_image(camera: Camera, pixel: Any, inverse: Any) -> Any:
-    """Inverse depths [1/m] at pixels, all different, as an image, flat and row-major; NaN where there are none."""
+    """Return inverse depths [1/m] at distinct pixels as a flat row-major image, NaN elsewhere."""
     image = dr.full(mi.Float, dr.nan, camera.width * camera.height)
     dr.scatter(image, inverse, pixel)
     dr.eval(image)
@@ -497,10 +502,11 @@ def _depth_image(camera: Camera, pixel: Any, inverse: Any) -> Any:
 
 
 def _depth_error(alpha: Any, moment: Any, inverse: Any) -> Any:
-    """Sum of the differences between inverse depths [1/m] as splats have them and as an image has them."""
+    """Return the sum of absolute differences between the inverse depths of splats and of an image [1/m]."""
     known = dr.isfinite(inverse)
     wanted = dr.select(known, inverse, 0)
-    # Gathered, because gradients of the layers themselves would be rounded with those that they have elsewhere.
+    # Gathered copies keep the gradients of this term apart; added to the other gradients of the layers they would be
+    # rounded.
     pixel = dr.arange(mi.UInt32, dr.width(inverse))
     cover, depth = (dr.gather(mi.Float, layer, pixel, mode=dr.ReduceMode.NoConflicts) for layer in (alpha, moment))
     seen = known & (cover > 0.1) & (depth > 0)
@@ -509,13 +515,13 @@ def _depth_error(alpha: Any, moment: Any, inverse: Any) -> Any:
 
 
 def _exposed(rgb: list[Any], alpha: Any, table: Any, place: Any, photos: int) -> list[Any]:
-    """Premultiplied colours after the affine correction of a photo; the table has its twelve entries photo by photo."""
+    """Apply a photo's affine colour correction to premultiplied colours; ``table`` has 12 rows of one entry per photo."""
     m = [dr.gather(mi.Float, table, place + i * photos) for i in range(12)]
     return [sum(m[4 * i + j] * rgb[j] for j in range(3)) + m[4 * i + 3] * alpha for i in range(3)]
 
 
 def _centred(table: Any, photos: int) -> Any:
-    """The table of corrections, shifted so that their mean is the identity."""
+    """Return the table of corrections, shifted so that their mean is the identity."""
     entry = dr.arange(mi.UInt32, 12 * photos) // photos
     mean = dr.block_sum(table, photos) * dr.opaque(mi.Float, 1 / photos)
     centred = table - dr.gather(mi.Float, mean, entry) + dr.select(entry % 5 == 0, 1, 0)
@@ -524,16 +530,16 @@ def _centred(table: Any, photos: int) -> Any:
 
 
 def _usable(photos: tuple[Photo, ...], settings: FitSettings) -> tuple[Photo, ...]:
-    """The photos, but none without mask where others have one: it shows what is not to be fitted."""
+    """Return the photos; if some have masks, drop those without, because they show more than the object."""
     masked = tuple(photo for photo in photos if photo.mask is not None)
     return photos if settings.masks == "off" or not masked else masked
 
 
 def _set_aside(training: tuple[Photo, ...]) -> tuple[tuple[Photo, ...], tuple[Photo, ...]]:
-    """The photos to learn from and those that a target is for: the middle one of every eight, or the last.
+    """Split photos into training and validation photos; the middle one of every eight, or the last, is for validation.
 
     Raises:
-        InputError: If there is only one.
+        InputError: If there is only one photo.
     """
     if len(training) < 2:
         raise InputError(f"a target takes at least two photos besides the held-out ones (got {len(training)})")
@@ -553,7 +559,7 @@ def _training_view(
 
 
 def _digest(capture: Capture, settings: FitSettings, depths: DepthMaps | None) -> str:
-    """SHA-256 of everything that decides a fit."""
+    """Return the SHA-256 of all inputs of a fit."""
     digest = ContentHash()
     digest.add_json([__version__, asdict(settings)])
     for photo in capture.photos:

@@ -1,4 +1,4 @@
-"""A photo as a fit sees it: its rays and pixels at the size of the fit, and the comparison with a render."""
+"""A photo in a fit: its rays and pixels at the size of the fit, and its comparison with a rendering."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ _DIFFERENCE_GAIN = 4
 
 @dataclass(frozen=True)
 class HeldOut:
-    """How a photo that was not fitted comes out.
+    """Image quality at a photo that was not fitted.
 
     Attributes:
-        name: Of the photo.
-        psnr: Of the whole picture [dB], black where a mask leaves it out.
-        ssim: Of the same.
-        psnr_object: Of the pixels that the mask shows [dB]; ``psnr`` without mask.
-        psnr_corrected: Of these after the affine colour correction that suits the photo best [dB].
+        name: Name of the photo.
+        psnr: PSNR of the whole picture [dB], black outside the mask.
+        ssim: SSIM of the whole picture.
+        psnr_object: PSNR of the masked pixels [dB]; ``psnr`` without mask.
+        psnr_corrected: PSNR of these pixels after the best affine colour correction [dB].
     """
 
     name: str
@@ -52,15 +52,15 @@ class TrainingView:
 
     Args:
         photo: The photo.
-        scale: Size relative to it.
-        masked: Whether its mask is used.
-        inverse_depth: Of its pixels, in any size, if they are known.
-        window: The part of the photo that is used; all of it if None.
+        scale: Size relative to the photo.
+        masked: True to use the mask of the photo.
+        inverse_depth: Depth map of the photo in any size, or None.
+        window: Part of the photo that is used; the whole photo if None.
 
     Attributes:
-        camera: Its camera at that size.
-        masked: Whether it has a mask that is used.
-        inverse_depth: Of its pixels [1/m], (H, W), NaN where unknown; or None.
+        camera: Camera at that size.
+        masked: True if a mask exists and is used.
+        inverse_depth: Depth map [1/m], (H, W), NaN where unknown; or None.
     """
 
     def __init__(
@@ -88,8 +88,8 @@ class TrainingView:
 
     @property
     def half(self) -> TrainingView:
-        """The same photo at half the size, read when it is first asked for."""
-        if self._half is None:  # a cached_property of Python 3.11 would let threads take turns
+        """The same photo at half the size, read at the first access."""
+        if self._half is None:  # cached_property of Python 3.11 has a lock that would serialise threads
             self._half = TrainingView(
                 self._photo,
                 0.5 * self._scale,
@@ -101,14 +101,14 @@ class TrainingView:
 
     @cached_property
     def eye(self) -> Eye:
-        """The camera as the renderer takes it."""
+        """Camera of the differentiable renderer."""
         return Eye(view_of(make_sensor(self.camera)))
 
     @cached_property
     def packed(self) -> Any:
-        """Its pixels on the device, flat, red in the lowest byte, the mask in the highest; see :func:`unpacked`.
+        """Flat pixels on the device, red in the lowest byte, the mask in the highest; see :func:`unpacked`.
 
-        Four bytes per pixel, so that hundreds of photos fit in the device's memory; made to floats in the kernels.
+        Pixels have four bytes, so that hundreds of photos fit in device memory. Kernels convert them to floats.
         """
         pixels = self._bytes
         self._pixels = None
@@ -116,12 +116,12 @@ class TrainingView:
 
     @cached_property
     def hidden(self) -> Any:
-        """On the device, flat, where another thing may hide the object; None where nothing does."""
+        """Flat mask on the device of the pixels where another thing may hide the object; None if there are none."""
         return None if self._hidden is None else wrapped(mi.Bool, self._hidden.ravel())
 
     @property
     def mask(self) -> Float32Array:
-        """Share of every pixel that the object covers, (H, W)."""
+        """Share of each pixel that the object covers, (H, W)."""
         return np.asarray(self._bytes[..., 3] / np.float32(255), dtype=np.float32)
 
     @property
@@ -137,9 +137,12 @@ class TrainingView:
         return pixels.reshape(self.camera.height, self.camera.width, 4)
 
     def depths(self, points: Float64Array) -> tuple[Any, Any]:
-        """Pixels and inverse depths [1/m] on the device: of its map, else of the points (N, 3) that the photo sees."""
+        """Return pixels and inverse depths [1/m] on the device: of the depth map, or else of the visible points.
+
+        ``points`` has shape (N, 3).
+        """
         if self.inverse_depth is not None:
-            # Made anew each time: on the device, maps of hundreds of photos would not fit.
+            # Not cached: the maps of hundreds of photos would not fit in device memory.
             number = np.flatnonzero(np.isfinite(self.inverse_depth) & (self.mask > 0.5))
             return wrapped(mi.UInt32, number.astype(np.uint32)), wrapped(mi.Float, self.inverse_depth.ravel()[number])
         if self._depths is None:
@@ -151,7 +154,7 @@ class TrainingView:
             shown = self.mask[row, column] > 0.5
             number = (row * self.camera.width + column)[shown]
             inverse = (1 / depth[inside][shown]).astype(np.float32)
-            # One per pixel, the nearest: the gradients of several would be added in any order.
+            # One point per pixel, the nearest: gradients of several points would be summed in an undefined order.
             order = np.lexsort((-inverse, number))
             number, first = np.unique(number[order], return_index=True)
             inverse = inverse[order][first]
@@ -159,18 +162,21 @@ class TrainingView:
         return self._depths
 
     def render(self, model: GaussianModel, quality: Quality) -> tuple[Float32Array, Float32Array]:
-        """Display-encoded colour times alpha, (H, W, 3), and alpha, (H, W), as the splats look from here."""
+        """Render the splats; return display-encoded colour times alpha, (H, W, 3), and alpha, (H, W)."""
         seen = model.render(self.eye, quality)
         shape = self.camera.height, self.camera.width
         return np.stack([np.array(c).reshape(shape) for c in seen.rgb], axis=-1), np.array(seen.alpha).reshape(shape)
 
     def compare(self, seen: Float32Array, folder: Path | None) -> HeldOut:
-        """A render (H, W, 3) against the photo; writes them and their difference, 4 times as bright, side by side."""
+        """Compare a rendering (H, W, 3) with the photo.
+
+        If ``folder`` is not None, write both and their difference, 4 times as bright, side by side as an image.
+        """
         cover = self.mask
         truth = self.picture
         seen = np.clip(seen, 0, 1)
         if self._hidden is not None:
-            seen = np.where(self._hidden[..., None], truth, seen)  # nobody knows
+            seen = np.where(self._hidden[..., None], truth, seen)  # the true colour is unknown there
         shown = cover > 0.5 if (cover > 0.5).any() else np.ones_like(cover, dtype=bool)
         design = np.column_stack([seen[shown], np.ones(shown.sum())])
         corrected = np.clip(design @ np.linalg.lstsq(design, truth[shown], rcond=None)[0], 0, 1)
@@ -189,6 +195,6 @@ class TrainingView:
 
 
 def unpacked(packed: Any) -> tuple[list[Any], Any]:
-    """Display-encoded colour times mask, and the mask, of the pixels of a :class:`TrainingView`."""
+    """Return display-encoded colour times mask, and the mask, of the pixels of a :class:`TrainingView`."""
     red, green, blue, mask = (mi.Float((packed >> shift) & 0xFF) / 255 for shift in (0, 8, 16, 24))
     return [red * mask, green * mask, blue * mask], mask

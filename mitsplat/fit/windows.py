@@ -1,4 +1,4 @@
-"""The part of each photo that a fit of an object alone needs."""
+"""Part of each photo that the fit of a single object needs."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from mitsplat.arrays import Int64Array
 from mitsplat.capture.capture import Photo, Window
 
 _MARGIN = 0.1
-"""Room on each side of the object where it is largest, as a share of its size there: there splats must be invisible."""
+"""Margin on each side of the object, as a share of its largest size; splats in the margin must be invisible."""
 _WHOLE = 0.95
-"""Share of a photo's longer edge from which a part of it is no gain."""
+"""Share of a photo's longer edge from which cropping has no benefit."""
 
 
 def object_windows(photos: Sequence[Photo]) -> list[Window | None]:
-    """Where the masks of photos show the object, with room around it; None where all of a photo is needed.
+    """Return the window of each photo around the object in its mask, with a margin; None if the whole photo is needed.
 
-    All are of one size as far as photos are, because each size takes kernels of its own.
+    All windows have the same size if photos are large enough, because each size compiles its own kernels.
     """
     boxes = [_box(photo) for photo in photos]
     sizes = [box[1] - box[0] for box in boxes if box is not None]
@@ -38,7 +38,7 @@ def _window(photo: Photo, box: Int64Array, room: Int64Array) -> Window | None:
 
 
 def _box(photo: Photo) -> Int64Array | None:
-    """Least x and y of what the mask of a photo shows, and those where it ends [px], shape (2, 2)."""
+    """Return the bounds of the object in a photo's mask [px]: least x and y, and exclusive ends, shape (2, 2)."""
     mask = photo.alpha()
     shown = np.argwhere(mask >= 0.5) if mask is not None else np.zeros((0, 2), dtype=np.int64)
     return np.stack([shown.min(axis=0)[::-1], shown.max(axis=0)[::-1] + 1]) if len(shown) else None

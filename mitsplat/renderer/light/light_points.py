@@ -99,7 +99,7 @@ class LightPoints:
         return rows
 
     def shared(self, rays: Any, rows: Any) -> Any:
-        """Return the number of rays (at least 1) of the points ``rows``, given the ``rays`` (UInt32) of their pixels."""
+        """Return the number of rays (at least 1) of the points ``rows``, given the ``rays`` (UInt32) of pixels."""
         return dr.select(rows < dr.opaque(mi.UInt32, self.count), rays, dr.maximum(rays // len(OFFSETS), 1))
 
     def turn(self, rows: Any) -> tuple[Any, Any]:

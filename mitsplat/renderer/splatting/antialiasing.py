@@ -1,12 +1,12 @@
-"""Antialiased silhouettes: where instances border on each other, a pixel is the mean of ZOOM x ZOOM rays.
+"""Antialiasing of silhouettes: at borders between instances, a pixel is the mean of ZOOM x ZOOM rays.
 
-One ray through a pixel's centre sees either side of a silhouette, and a row of such pixels shows steps. Pixels of which
-a neighbour shows another instance, or another visible mesh, are therefore looked at again, in a view of as many pixels
-as there are rays; of its tiles only those that hold such pixels have lists. Linear colours in light are averaged.
+One ray through a pixel's centre sees only one side of a silhouette, so that its outline shows steps. Pixels with a
+neighbour of another instance or another visible mesh are therefore rendered again, in a view with one pixel per ray.
+Only the tiles of this view that contain such pixels have lists. The average is taken over linear, lit colours.
 
-Light is not traced again. A ray has that of the nearest pixel among its own and those around it which shows the same
-thing, so that both sides of a silhouette are lit as they are beside it (compare Salvi and Vidimce 2012, "Surface based
-anti-aliasing", which shades once for each surface). Ids, depths and all that labels are made of stay those of the
+Light is not traced again. A ray takes the light of the nearest pixel, its own or an adjacent one, that shows the same
+surface. Both sides of a silhouette are therefore lit like the surface beside them (compare Salvi and Vidimce 2012,
+"Surface based anti-aliasing", which shades once per surface). Ids, depths and all other label data stay those of the
 pixel's centre.
 """
 
@@ -32,19 +32,19 @@ ZOOM = 2
 """Rays along each axis of a pixel, a divisor of a tile's width and height."""
 
 BLOCK_WIDTH, BLOCK_HEIGHT = TILE_WIDTH // ZOOM, TILE_HEIGHT // ZOOM
-"""Size of a block of pixels that are looked at again together [px]: one tile of the finer view."""
+"""Size of a block of pixels that are rendered again together [px]: one tile of the finer view."""
 
 
 @dataclass(frozen=True, eq=False)
 class Edges:
-    """The blocks of a view's pixels that hold a border, and the finer view of them.
+    """Blocks of a view's pixels that contain a border, and the finer view of them.
 
-    Rays of the finer view are counted tile after tile of ``chosen``, and row by row in each.
+    Rays of the finer view are numbered tile after tile of ``chosen``, and row by row in each tile.
 
     Attributes:
-        view: The picture's.
-        fine: The finer one.
-        chosen: Its tiles.
+        view: View of the picture.
+        fine: Finer view.
+        chosen: Tiles of the finer view that contain borders.
     """
 
     view: CameraView
@@ -53,7 +53,10 @@ class Edges:
 
     @classmethod
     def find(cls, key: Any, view: CameraView) -> Edges | None:
-        """Where pixels differ in ``key`` (UInt32, row-major) from one of the eight around them; None if nowhere."""
+        """Find the pixels whose ``key`` (UInt32, row-major) differs from one of their eight neighbours.
+
+        Returns None if there are none.
+        """
         fine = view.finer(ZOOM)
         block = dr.arange(mi.UInt32, fine.tiles_x * fine.tiles_y)
         row = block // fine.tiles_x
@@ -66,32 +69,37 @@ class Edges:
         return cls(view, fine, chosen) if chosen.count else None
 
     def rays(self) -> Any:
-        """World-space rays of the finer view, of unit direction."""
+        """Return the world-space rays of the finer view, with unit direction."""
         rays = self.fine.rays_through(*self.positions())
         dr.eval(rays)
         return rays
 
     def positions(self) -> tuple[Any, Any]:
-        """Pixel positions (x, y) of those rays in the finer view [px]."""
+        """Return the pixel positions (x, y) of those rays in the finer view [px]."""
         x, y = self._places()
         return mi.Float(x) + 0.5, mi.Float(y) + 0.5
 
     def trace(self, clouds: CloudSet, placements: Sequence[Placement], quality: Quality, z_max: Any | None) -> Image:
-        """What those rays see of splats; arguments as of :func:`mitsplat.renderer.splatting.march.trace`.
+        """Render splats along those rays; arguments as in :func:`mitsplat.renderer.splatting.march.trace`.
 
-        They are so few that any tolerance of the order that is not infinite is kept by the order per ray.
+        The rays are few, so that the order per ray replaces every order with a finite tolerance.
 
         Raises:
-            CrowdedError: If even one tile is too crowded for the memory.
+            CrowdedError: If one tile alone has too many pairs.
         """
         exact = quality if quality.order == "tile" else replace(quality, tolerance=0.0)
         return _trace(clouds, placements, self.fine, self.chosen, exact, z_max)
 
     def alike(self, keys: Any, own: Any) -> Any:
-        """For rays that show ``own``, the nearest pixel around them that shows the same by ``keys``, or else theirs."""
+        """Return for each ray the nearest pixel with the same key; the ray's own pixel if there is none.
+
+        Args:
+            keys: Keys of the picture's pixels.
+            own: Keys of the rays.
+        """
         x, y = self._places()
         px, py = mi.Int32(x // ZOOM), mi.Int32(y // ZOOM)
-        # Which of the neighbours along each axis is nearer.
+        # Direction of the nearer neighbour along each axis.
         right, down = (dr.select(place % ZOOM * 2 >= ZOOM, mi.Int32(1), -1) for place in (x, y))
         found, pixel = mi.Bool(False), _pixel(px, py, self.view)
         for dx, dy in ((0, 0), (1, 0), (0, 1), (1, 1), (-1, 0), (0, -1), (-1, 1), (1, -1), (-1, -1)):
@@ -101,7 +109,7 @@ class Edges:
         return pixel
 
     def averaged(self, values: Any, fine: Any) -> Any:
-        """The pixels ``values`` of the picture (Float or Color3f), in the chosen blocks the means over the rays."""
+        """Return the picture ``values`` (Float or Color3f) with means over the rays in the blocks with borders."""
         size = BLOCK_WIDTH * BLOCK_HEIGHT
         lane = dr.arange(mi.UInt32, self.chosen.count * size)
         tile, within = lane // size, lane % size
@@ -119,7 +127,7 @@ class Edges:
         return result
 
     def _places(self) -> tuple[Any, Any]:
-        """Column and row of the finer view's pixels."""
+        """Return column and row of the finer view's pixels."""
         lane = dr.arange(mi.UInt32, self.chosen.count * TILE_PIXELS)
         number = dr.gather(mi.UInt32, self.chosen.number, lane // TILE_PIXELS)
         row = number // self.fine.tiles_x
@@ -128,7 +136,7 @@ class Edges:
 
 
 def _pixel(x: Any, y: Any, view: CameraView) -> Any:
-    """Number of a pixel, the nearest one in the image."""
+    """Return the number of a pixel, clamped to the image."""
     return mi.UInt32(dr.clip(y, 0, view.height - 1) * view.width + dr.clip(x, 0, view.width - 1))
 
 

@@ -9,20 +9,21 @@ In camera space a ray is ``d = (u, v, 1)`` with slopes u = x/z and v = y/z. Let 
     A = m_z^2 |w0 x w1|^2 / |w0|^2,   B = m_z^2 (w0 x w1).(w0 x w2) / |w0|^2,   C = m_z^2 |w0 x w2|^2 / |w0|^2
     E = 2 w0.w1 / |w0|^2,  F = 2 w0.w2 / |w0|^2,  G = |w1|^2 / |w0|^2,  H = 2 w1.w2 / |w0|^2,  I = |w2|^2 / |w0|^2
 
-and the depth of that point is ``z = m_z (1 + (E du + F dv) / 2) / (the same denominator)``. Both follow from expanding
-``|W m|^2 - (W m . W d)^2 / |W d|^2`` about d0 with Lagrange's identity. Nothing is linearised, so the response is exact
-for every perspective ray, and no two large numbers are subtracted, so float32 holds for small and far Gaussians, where
-the textbook form loses all its digits.
+and the depth of that point is ``z = m_z (1 + (E du + F dv) / 2) / (the same denominator)``. Both follow from the
+expansion of ``|W m|^2 - (W m . W d)^2 / |W d|^2`` about d0 with Lagrange's identity. Nothing is linearised, so that the
+response is exact for every perspective ray. No two large numbers are subtracted, so that float32 is sufficient for
+small and distant Gaussians, where the textbook form loses all its digits.
 
-A low-pass filter of covariance K on the image makes the footprint's covariance M^-1 + K, where M = ((A, B), (B, C)):
+A low-pass filter of covariance K on the image changes the footprint's covariance to M^-1 + K, where M = ((A, B), (B,
+C)):
 
     M' = (M + det(M) adj(K)) / D,   D = det(I + M K) = 1 + tr(M K) + det(M) det(K),   opacity' = opacity / sqrt(D)
 
-As for any joint Gaussian, what its depth and its denominator have of the slopes shrinks by P = (I + M K)^-1: the filter
-spreads a Gaussian over rays that pass beside it, and says nothing about where it would be there.
+As for any joint Gaussian, the slope terms of depth and denominator shrink by P = (I + M K)^-1. The filter spreads a
+Gaussian over rays that pass beside it, but does not define its depth there.
 
 The rays on which a Gaussian reaches the cut-off ``q <= k^2`` fill the conic ``numerator - k^2 denominator <= 0``. It is
-an ellipse, with a closed-form bounding box, unless the cut-off ellipsoid touches the camera's plane z = 0.
+an ellipse with a closed-form bounding box, unless the cut-off ellipsoid touches the camera's plane z = 0.
 """
 
 from __future__ import annotations
@@ -38,13 +39,16 @@ import numpy as np
 from mitsplat.renderer.rays.device_arrays import wrapped
 
 RECORD = 16
-"""Floats in a view record: u0, v0, A, 2B, C, log2(opacity), red, green | blue, m_z, E, F, G, H, I, instance bits.
-A, 2B and C carry the factor log2(e)/2, so that opacity along a ray is ``exp2(log2(opacity) - q)``."""
+"""Floats in a view record: u0, v0, A, 2B, C, log2(opacity), red, green | blue, m_z, E, F, G, H, I, instance bits. A, 2B
+and C include the factor log2(e)/2, so that opacity along a ray is ``exp2(log2(opacity) - q)``.
+"""
 
 LOG2_E_HALF = 0.5 * 1.4426950408889634
 
 SCALE_RATIO_MIN = 1e-6
-"""Axes thinner than this share of the thickest are widened to it: a disk stays a disk, and 1/sigma stays finite."""
+"""Smallest ratio of an axis to the largest axis. Thinner axes are widened to it: a disk stays a disk, and 1/sigma stays
+finite.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,10 +88,12 @@ def upload_cloud(
 
 
 def evaluate_sh(direction: Any, coefficient: Any, bands: int) -> list[Any]:
-    """Display-encoded colour of Gaussians seen along unit vectors, 3DGS's real spherical harmonics (Kerbl et al. 2023).
+    """Evaluate the display-encoded colour of Gaussians along unit vectors.
+
+    The basis is that of 3DGS, real spherical harmonics (Kerbl et al. 2023).
 
     Args:
-        direction: Unit vector from the camera to the Gaussian, in the Gaussians' own frame, so that rotating an object
+        direction: Unit vector from the camera to the Gaussian, in the Gaussians' own frame. A rotated object therefore
             needs no rotation of its coefficients.
         coefficient: Function of the coefficient's index that returns its three channels.
         bands: Number of coefficients to use, 1, 4, 9 or 16.
@@ -123,20 +129,20 @@ def evaluate_sh(direction: Any, coefficient: Any, bands: int) -> list[Any]:
 
 
 def srgb_to_linear(value: Any) -> Any:
-    """IEC 61966-2-1 electro-optical transfer, extended above 1."""
+    """Apply the electro-optical transfer of IEC 61966-2-1, extended above 1."""
     return dr.select(
         value <= 0.04045, value / 12.92, dr.power(dr.fma(dr.maximum(value, 0), 1 / 1.055, 0.055 / 1.055), 2.4)
     )
 
 
 def linear_to_srgb(value: Any) -> Any:
-    """The inverse of :func:`srgb_to_linear`; what is below 0 counts as 0."""
+    """Apply the inverse of :func:`srgb_to_linear`; values below 0 count as 0."""
     value = dr.maximum(value, 0)
     return dr.select(value <= 0.0031308, 12.92 * value, 1.055 * dr.power(dr.maximum(value, 1e-9), 1 / 2.4) - 0.055)
 
 
 def rotation_axes(q: Any) -> Axes:
-    """Columns of the rotation matrix of a quaternion xyzw: the Gaussian's axes in its frame."""
+    """Return the columns of a quaternion's (xyzw) rotation matrix: the Gaussian's axes in its frame."""
     x, y, z, w = q
     return (
         mi.Vector3f(1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)),
@@ -152,7 +158,7 @@ Conic6 = tuple[Any, Any, Any, Any, Any, Any]
 
 @dataclass(frozen=True, eq=False)
 class Response:
-    """A Gaussian seen from the camera: centre, coefficients of the response (module docstring), depth and det(M)."""
+    """Response of a Gaussian to rays: centre, coefficients (module docstring), depth and det(M)."""
 
     u0: Any
     v0: Any
@@ -168,7 +174,10 @@ class Response:
     det: Any
 
     def filtered(self, k11: Any, k12: Any, k22: Any) -> tuple[Response, Any]:
-        """The response under a low-pass filter of covariance K in slopes, and det(I + M K) (module docstring)."""
+        """Return the response under a low-pass filter of covariance K in slopes, and det(I + M K).
+
+        See the module docstring.
+        """
         b = 0.5 * self.b2
         p, q = self.a * k11 + b * k12, self.a * k12 + b * k22
         r, s = b * k11 + self.c * k12, b * k12 + self.c * k22
@@ -193,11 +202,11 @@ class Response:
         return response, det
 
     def parallel(self) -> Response:
-        """The response along rays parallel to the one through the centre: no perspective within the footprint."""
+        """Return the response along rays parallel to the central one, without perspective within the footprint."""
         return replace(self, e=mi.Float(0), f=mi.Float(0), g=mi.Float(0), h=mi.Float(0), i=mi.Float(0))
 
     def cutoff(self, k2: Any) -> Conic6:
-        """Coefficients of du^2, du dv, dv^2, du, dv and 1 of the conic that is <= 0 where q <= k^2."""
+        """Return coefficients of du^2, du dv, dv^2, du, dv and 1 of the conic that is <= 0 where q <= k^2."""
         return (
             self.a - k2 * self.g,
             self.b2 - k2 * self.h,
@@ -209,15 +218,15 @@ class Response:
 
 
 def project_gaussian(mean: Any, axes: Axes, sigma: Any, right: Any, down: Any, forward: Any, scale: Any) -> Response:
-    """Response coefficients of Gaussians.
+    """Compute the response coefficients of Gaussians.
 
     Args:
         mean: Centre relative to the camera's centre, in the Gaussians' frame.
         axes: The three principal axes in the same frame.
         sigma: Standard deviations along them.
         right: The camera's x axis in the same frame.
-        down: Its y axis.
-        forward: Its z axis.
+        down: The camera's y axis.
+        forward: The camera's z axis.
         scale: Size of one unit of that frame in the camera's units [m].
     """
     depth = dr.dot(forward, mean)
@@ -251,7 +260,7 @@ def project_gaussian(mean: Any, axes: Axes, sigma: Any, right: Any, down: Any, f
 
 
 def ellipse_bounds(cutoff: Conic6) -> tuple[Any, Any, Any, Any, Any]:
-    """Bounding box (du_min, du_max, dv_min, dv_max) of a conic, and whether it is an ellipse at all."""
+    """Return the bounding box (du_min, du_max, dv_min, dv_max) of a conic, and True where it is an ellipse."""
     a, b, c, d, e, f = cutoff
     det = 4 * a * c - b * b
     ellipse = (a > 0) & (c > 0) & (det > 1e-6 * a * c)
@@ -263,7 +272,10 @@ def ellipse_bounds(cutoff: Conic6) -> tuple[Any, Any, Any, Any, Any]:
 
 
 def ellipse_spans(cutoff: Conic6) -> Callable[[Any, Any], tuple[Any, Any, Any]]:
-    """Function from a band of v to the range (du_min, du_max) of an ellipse's part in it, and whether there is any."""
+    """Return a function that clips an ellipse to a band of v.
+
+    The function maps the limits of the band to (du_min, du_max) of the ellipse in it, and to True if they intersect.
+    """
     a, b, c, d, e, f = cutoff
     du_min, du_max, _, _, _ = ellipse_bounds(cutoff)
     half = 0.5 * dr.rcp(a)
@@ -275,7 +287,8 @@ def ellipse_spans(cutoff: Conic6) -> Callable[[Any, Any], tuple[Any, Any, Any]]:
         return (sign * dr.safe_sqrt(root) - linear) * half, root >= 0
 
     def span(lo_v: Any, hi_v: Any) -> tuple[Any, Any, Any]:
-        # The outline bends away on both sides of the ellipse's extreme point: the band's nearest v to it counts.
+        # The outline recedes on both sides of the ellipse's extreme point, so that the nearest v of the band is
+        # decisive.
         lo, below = edge(dr.clip(extremes[0], lo_v, hi_v), -1.0)
         hi, above = edge(dr.clip(extremes[1], lo_v, hi_v), 1.0)
         return lo, hi, below & above
@@ -284,7 +297,7 @@ def ellipse_spans(cutoff: Conic6) -> Callable[[Any, Any], tuple[Any, Any, Any]]:
 
 
 def conic_touches_rectangle(conic: Conic6, lo_u: Any, hi_u: Any, lo_v: Any, hi_v: Any) -> Any:
-    """Whether a conic is <= 0 anywhere in an axis-aligned rectangle: exact for every kind of conic.
+    """Return True if a conic is <= 0 anywhere in an axis-aligned rectangle; exact for every kind of conic.
 
     The minimum of a quadratic over a rectangle lies at a corner, at the vertex of an edge along which it is convex, or,
     if it is convex, at its centre.
@@ -313,10 +326,14 @@ def conic_touches_rectangle(conic: Conic6, lo_u: Any, hi_u: Any, lo_v: Any, hi_v
 
 
 def general_response(mean: Any, axes: Axes, sigma: Any, right: Any, down: Any, forward: Any, scale: Any) -> list[Any]:
-    """The response without a reference ray, for Gaussians at the camera's plane; arguments as `project_gaussian`.
+    """Compute the response without a reference ray, for Gaussians at the camera's plane.
 
-    With d = (u, v, 1): q = |W m x W d|^2 / |W d|^2 and z = (W m . W d) / |W d|^2. Returns 15 coefficients: of
-    u^2, uv, v^2, u, v, 1 in the first numerator and in the denominator, and of u, v, 1 in the second numerator.
+    With d = (u, v, 1): q = |W m x W d|^2 / |W d|^2 and z = (W m . W d) / |W d|^2. Arguments are those of
+    `project_gaussian`.
+
+    Returns:
+        15 coefficients: of u^2, uv, v^2, u, v, 1 in the first numerator and in the denominator, and of u, v, 1 in the
+            second numerator.
     """
     w1, w2, w3, wm = (
         mi.Vector3f(*[dr.dot(axis, vector) / s for axis, s in zip(axes, sigma, strict=True)])
@@ -331,6 +348,6 @@ def general_response(mean: Any, axes: Axes, sigma: Any, right: Any, down: Any, f
 
 
 def general_depth(k: Any, u: Any, v: Any) -> tuple[Any, Any]:
-    """1 / |W d|^2, and the depth of the peak along the ray of slopes u and v, by what `general_response` returns."""
+    """Return 1 / |W d|^2 and the peak depth along the ray of slopes u and v, from `general_response`."""
     inverse = dr.rcp((k[6] * u + k[7] * v + k[9]) * u + (k[8] * v + k[10]) * v + k[11])
     return inverse, (k[12] * u + k[13] * v + k[14]) * inverse

@@ -1,9 +1,9 @@
-"""Which instance has the largest share of a ray, for any number of instances.
+"""Instance votes: the instance with the largest share of a ray, for any number of instances.
 
-A ray's first walk keeps the sums of weights of the environment and of the first instances that it meets, which are
-whole, because none of them leaves, and one sum of all others. The largest of the whole ones wins for sure unless that
-one sum is larger. Rays where it is are walked again: every walk sums up the weights of the next instances in the order
-of ids, until those that are left weigh less together than the best one.
+The first walk of a ray sums the weights of the environment and of the first instances that it meets. These sums are
+complete, because no instance leaves its slot. All other instances share one sum. The largest complete sum wins, unless
+the shared sum is larger. In that case the ray is walked again: each walk sums the weights of the next instances in the
+order of ids, until the remaining instances together weigh less than the best one.
 """
 
 from __future__ import annotations
@@ -19,23 +19,24 @@ from mitsplat.renderer.splatting.tiles import TileLists
 from mitsplat.renderer.splatting.walk import Lanes, Pixel, Rays, walk
 
 FIRST = 3
-"""Instances that the first walk tells apart."""
+"""Number of instances with a slot in the first walk."""
 
 NEXT = 8
-"""Instances that each further walk tells apart."""
+"""Number of instances with a slot in each further walk."""
 
 OWN, OTHERS, SLOTS = range(3)
-"""State of a tally: weight of the environment, of all instances without a slot; and from there on id and weight of
-those that have one, 0 where it is empty."""
+"""Indices of a tally: weight of the environment, weight of all instances without a slot, and first entry of the slots.
+Each slot holds id and weight, 0 if empty.
+"""
 
 
 def new_tally() -> list[Any]:
-    """The tally of a ray that has met nothing."""
+    """Return the empty tally of a ray."""
     return [mi.Float(0.0) for _ in range(SLOTS + 2 * FIRST)]
 
 
 def add_to_tally(tally: list[Any], weight: Any, instance: Any) -> list[Any]:
-    """The tally after one more Gaussian."""
+    """Return the tally after one more Gaussian."""
     placed = instance == 0
     result = [dr.select(placed, tally[OWN] + weight, tally[OWN]), tally[OTHERS]]
     placed |= weight <= 0
@@ -48,9 +49,9 @@ def add_to_tally(tally: list[Any], weight: Any, instance: Any) -> list[Any]:
 
 
 def winner_of_tally(tally: list[Any], transmittance: Any) -> tuple[Any, Any]:
-    """Instance (Float) with the largest share of a ray, and whether another one may have more.
+    """Return the instance (Float) with the largest share of a ray, and True if another one may have more.
 
-    What is left of the ray shows what lies behind, and counts as environment.
+    The remaining transmittance counts as environment.
     """
     instance, most = mi.Float(0), tally[OWN] + transmittance
     for number, total in zip(tally[SLOTS::2], tally[SLOTS + 1 :: 2], strict=True):
@@ -61,10 +62,10 @@ def winner_of_tally(tally: list[Any], transmittance: Any) -> tuple[Any, Any]:
 def settle_instances(
     instance: Any, unsure: Any, lists: TileLists, view: CameraView, quality: Quality, order: Order, z_max: Any | None
 ) -> Any:
-    """The instance image (UInt32, row-major) with the right ids where it is ``unsure`` (Bool).
+    """Return the instance image (UInt32, row-major) with exact ids where it is ``unsure`` (Bool).
 
-    Rays are walked in the ``order`` of the picture. Other rays are not walked, but their lanes are launched, so that
-    nothing has to be read from the device. The other arguments are those of
+    Rays are walked in the ``order`` of the picture. Other rays are not walked, but their lanes are launched, which
+    avoids a read-back from the device. The other arguments are those of
     :func:`mitsplat.renderer.splatting.march.march`.
     """
     lanes = Lanes(lists, view, rows=1)
@@ -80,7 +81,7 @@ def settle_instances(
         ((transmittance, own, left, *slots),) = walk(
             rays, order, _nothing, lambda pixel, alpha, record, _: _count(pixel, pixel[0] * alpha, record[15], last)
         )
-        # The same in every walk, and 0 at first: what the ray shows of the environment.
+        # This value is the same in every walk: the share of the environment.
         most = dr.maximum(most, own + transmittance)
         for number, total in zip(slots[0::2], slots[1::2], strict=True):
             best, most = dr.select(active & (total > most), number, best), dr.maximum(total, most)
@@ -95,15 +96,15 @@ def settle_instances(
 
 
 def _nothing() -> Pixel:
-    """State of a ray of a further walk that has met nothing: as a tally, with slots in the order of ids."""
+    """Return the initial state of a ray of a further walk: a tally with slots in the order of ids."""
     slots = [mi.Float(value) for _ in range(NEXT) for value in (dr.inf, 0.0)]
     return [mi.Float(1.0), mi.Float(0.0), mi.Float(0.0), *slots]
 
 
 def _count(pixel: Pixel, weight: Any, instance: Any, last: Any) -> Pixel:
-    """The state after one more Gaussian: the least ids above ``last`` keep their slots.
+    """Return the state after one more Gaussian: the smallest ids above ``last`` keep their slots.
 
-    None that ends up among them was ever without a slot, so that their sums are whole.
+    An id that is among them at the end always had a slot, so that its sum is complete.
     """
     transmittance, own, left, *slots = pixel
     own = dr.select(instance == 0, own + weight, own)
@@ -116,7 +117,7 @@ def _count(pixel: Pixel, weight: Any, instance: Any, last: Any) -> Pixel:
             dr.select(before, number, slot),
             dr.select(before, weight_left, dr.select(same, total + weight_left, total)),
         ]
-        # What was in the slot moves on to the next one; what was added to it is placed.
+        # A displaced entry moves on to the next slot; a weight that was added to a slot is settled.
         number = dr.select(before, slot, dr.select(same, dr.inf, number))
         weight_left = dr.select(before, total, dr.select(same, 0, weight_left))
     return [transmittance - weight, own, left + weight_left, *result]

@@ -1,31 +1,32 @@
-"""The march: rays through all pixels walk their tiles' lists, see module `walk`, and become an image.
+"""Ray march: rays of all pixels traverse the lists of their tiles (see module `walk`) and form an image.
 
-What the order of blending does to the colour of a ray. Let some Gaussians be blended in the order of their peaks, with
-weights w_i and colours c_i, and let one more come, of opacity a, whose peak lies in front of some of them, the set B.
-In its place it takes the share a of the light of B, and is seen through what is in front of B; at the end of the row it
-is also seen through B:
+Blending order and colour error. Suppose that Gaussians were blended in the order of their peaks, with weights w_i and
+colours c_i. One more Gaussian with opacity a and colour c follows, whose peak lies in front of some of them, the set B.
+In its correct place it takes the share a of the light of B and is attenuated only by the Gaussians in front of B.
+Blended last, it is attenuated by B as well:
 
     in its place   sum_front w_i c_i + a (T + W) c + (1 - a) C
     at the end     sum_front w_i c_i + C + a T c
 
-with W and C the sums of w_i and of w_i c_i over B, and T the transmittance behind all. The difference is
+W and C are the sums of w_i and of w_i c_i over B, and T is the transmittance behind all. The difference is
 
     a (W c - C),
 
-for one neighbour the well-known a_i a_j T (c_j - c_i). Summed over all Gaussians it is the whole error of a ray, and
-the sum of its absolute values bounds that. B would have to be searched for among all that was blended. What comes late
-mostly lies just in front of the deepest ones, so that W and C are estimated from sums of w_i, w_i c_i and w_i z_i that
-forget: a new deepest Gaussian of weight w leaves the share S / (S + 2 w) of them, S being the sum of weights. Of these
-sums counts what lies behind the late peak, if they reach evenly from the deepest peak to as far in front of their mean.
-Those are seven more numbers in a ray's state. What is late by so much that the ray has ended before is not noticed.
+which for one neighbour is the well-known a_i a_j T (c_j - c_i). The sum over all Gaussians is the exact error of a ray,
+and the sum of absolute values is a bound of it. Finding B exactly would need a search through all blended Gaussians. A
+late Gaussian mostly lies just in front of the deepest ones. W and C are therefore estimated from decaying sums of w_i,
+w_i c_i and w_i z_i: a new deepest Gaussian of weight w scales them by S / (S + 2 w), where S is the sum of weights. The
+share of these sums behind the late peak counts. It assumes that they extend evenly from the deepest peak to the same
+distance in front of their mean. The state of a ray grows by seven numbers for this. A Gaussian so late that its ray has
+already ended is not detected.
 
-`fast` adds that difference to the colour instead (`amends`): what comes late takes from what it hides. Its weight and
-theirs change by the same amount, so that one colour stays one colour. Sums there forget more of what lies in front,
+`fast` adds the difference to the colour instead (`amends`), so that a late Gaussian takes light from those it occludes.
+Its weight and theirs change by the same amount, so that a uniform colour stays uniform. Here the sums decay faster, by
 S / (S + 8 w).
 
-Most tiles need no more than their own order, and one walk in that, several rays to a lane, tells which: where the
-estimate exceeds the tolerance, it ends. Such tiles are walked in a window, and those of them in which an estimate still
-exceeds the tolerance in the order of each ray.
+Most tiles need only the order per tile. One walk in that order, with several rays per lane, finds the others: it ends
+where the estimate exceeds the tolerance. Such tiles are walked with a window. Tiles whose estimate still exceeds the
+tolerance are walked in the order of each ray.
 """
 
 from __future__ import annotations
@@ -51,16 +52,17 @@ from mitsplat.renderer.splatting.walk import Lanes, Pixel, Rays, largest, rows_t
 
 @dataclass(eq=False)
 class Image:
-    """What the rays of one view saw, flat and row-major over height x width pixels.
+    """Rendered image of one view, flat and row-major over height x width pixels.
 
     Attributes:
         rgb: Display-encoded colour, not divided by alpha, three arrays.
         alpha: Opacity.
-        depth: Depth along z [m] at which a ray has lost half its light, or, where it keeps more, the mean depth of what
-            it met; 0 where it met nothing.
-        instance: Id with the largest share of the ray; 0 is the environment, which has what is left of the ray as well.
-        centre_alpha: Opacity of the ray through the pixel's centre, whose depth and instance these are.
-        error: Estimate of what the order of blending leaves wrong in ``rgb``, see the module; None if there is none.
+        depth: Depth along z [m] at which the ray's transmittance falls below one half. If it stays above, the mean
+            depth of the Gaussians; 0 without Gaussians.
+        instance: Id with the largest share of the ray. Id 0 is the environment, which also gets the remaining
+            transmittance.
+        centre_alpha: Opacity of the ray through the pixel's centre, to which depth and instance belong.
+        error: Estimated error of ``rgb`` due to the blending order, see the module; None without an estimate.
     """
 
     rgb: list[Any]
@@ -72,13 +74,13 @@ class Image:
 
     @classmethod
     def empty(cls, count: int) -> Image:
-        """Rays that met nothing."""
+        """Return an image of rays without Gaussians."""
         nothing = dr.zeros(mi.Float, count)
         return cls([nothing] * 3, nothing, nothing, dr.zeros(mi.UInt32, count), nothing, nothing)
 
     @classmethod
     def joined(cls, parts: Sequence[Image]) -> Image:
-        """The image whose rows are those of the parts, one after the other."""
+        """Concatenate the rows of images."""
         rgb = [dr.concat([part.rgb[c] for part in parts]) for c in range(3)]
         rest = [dr.concat([getattr(p, name) for p in parts]) for name in ("alpha", "depth", "instance", "centre_alpha")]
         known = all(part.error is not None for part in parts)
@@ -86,7 +88,7 @@ class Image:
         return cls(rgb, *rest)
 
     def with_tiles(self, part: Image, lists: TileLists, view: CameraView) -> Image:
-        """This image with the tiles of ``lists`` from another."""
+        """Return this image with the tiles of ``lists`` replaced by those of ``part``."""
         changed = dr.zeros(mi.Bool, view.width * view.height)
         lanes = Lanes(lists, view)
         for pixel, inside in zip(lanes.pixel, lanes.inside, strict=True):
@@ -104,40 +106,47 @@ def _select(changed: Any, new: Any, old: Any) -> Any:
 
 
 def largest_and_mean(error: Any) -> tuple[Any, Any]:
-    """Of the pixels' errors, up to 1; the mean by whole numbers, whose sum does not depend on its order."""
+    """Return maximum and mean of the pixels' errors, each clamped to 1.
+
+    The mean uses integers, whose sum does not depend on the order.
+    """
     unit = 1 << 24
     total = dr.sum(mi.UInt64(dr.minimum(error, 1.0) * unit))
     return dr.minimum(dr.max(error), 1.0), mi.Float(total) / (unit * dr.width(error))
 
 
 T, RED, GREEN, BLUE, SUM_Z, HALF_Z, TALLY = range(7)
-"""State of a ray: transmittance, red, green, blue, sum of weighted depths, depth at half transmittance, and from there
-on the tally of its instances where there are several. What is known of late peaks comes last, see :data:`_EXTRA`."""
+"""Indices of a ray's state: transmittance, red, green, blue, sum of weighted depths, depth at half transmittance, and
+first entry of the instance tally (if there are several instances). The state of late peaks comes last, see
+:data:`_EXTRA`.
+"""
 
 Late = Literal["taken", "estimated", "amended"]
-"""What becomes of peaks that come late in the order of a tile: nothing, an estimate of the error, or its correction."""
+"""Treatment of out-of-order Gaussians: ignored, blended with an error estimate, or with a colour correction."""
 
 _EXTRA: dict[Late, int] = {"taken": 0, "estimated": 7, "amended": 6}
-"""Numbers that a ray's state holds for that."""
+"""Numbers in a ray's state for late peaks."""
 
 ERROR, DEEPEST, SUMS = -7, -6, slice(-5, None)
-"""State of late peaks: estimate of the error; deepest peak, and sums of the last weights and of these times depth, red,
-green, blue."""
+"""Indices of the state of late peaks: error estimate; deepest peak; and decaying sums of weights and of weights times
+depth, red, green, blue.
+"""
 
 _FORGETS = 8
-"""Weights of a new deepest peak that sums give way to where late ones are amended. From 2 on, more is better for solid
-walls, and less for a solid object: between 2 and 16 the PSNR of captures changes by up to 1.4 dB."""
+"""Decay rate of the sums where late peaks are corrected, in weights of a new deepest Gaussian. From 2 on, larger values
+are better for solid walls and worse for solid objects: between 2 and 16 the PSNR of captures changes by up to 1.4 dB.
+"""
 
 
 def _fresh(several: bool, late: Late) -> Pixel:
-    """A ray that has met nothing yet."""
+    """Return the initial state of a ray."""
     nothing = [mi.Float(0.0) for _ in range(TALLY - 1)]
     tally, extra = new_tally() if several else [], [mi.Float(0.0) for _ in range(_EXTRA[late])]
     return [mi.Float(1.0), *nothing, *tally, *extra]
 
 
 def _blend(pixel: Pixel, alpha: Any, record: Any, z: Any, several: bool, late: Late) -> Pixel:
-    """The pixel after one more Gaussian."""
+    """Return the state of a ray after one more Gaussian."""
     weight = pixel[T] * alpha
     transmittance = pixel[T] - weight
     colour = [record[6], record[7], record[8]]
@@ -159,9 +168,9 @@ def _blend(pixel: Pixel, alpha: Any, record: Any, z: Any, several: bool, late: L
 
 
 def _shares(pixel: Pixel, weight: Any, late: Any, z: Any, forgets: int) -> tuple[Any, Any]:
-    """Share of the sums that lies behind a peak if it is late, and that is left of them if it is the deepest one.
+    """Return the share of the sums behind a late peak, and the share kept after a new deepest peak.
 
-    See the module. One division is enough for both.
+    See the module. Both cases use the same division.
     """
     total, moment, *_ = pixel[SUMS]
     gap, reach = (pixel[DEEPEST] - z) * total, 2 * dr.fma(pixel[DEEPEST], total, -moment)
@@ -170,7 +179,7 @@ def _shares(pixel: Pixel, weight: Any, late: Any, z: Any, forgets: int) -> tuple
 
 
 def _add_to_error(pixel: Pixel, alpha: Any, weight: Any, colour: list[Any], z: Any) -> list[Any]:
-    """The estimate after one more Gaussian, see the module."""
+    """Return the state of late peaks with the error estimate after one more Gaussian, see the module."""
     total, _, *colours = pixel[SUMS]
     deepest, met = pixel[DEEPEST], weight > 0
     late = met & (z < deepest)
@@ -187,7 +196,7 @@ def _add_to_error(pixel: Pixel, alpha: Any, weight: Any, colour: list[Any], z: A
 
 
 def _amended(pixel: Pixel, alpha: Any, weight: Any, colour: list[Any], z: Any) -> tuple[list[Any], list[Any]]:
-    """What one more Gaussian changes of the colour if it is late, and the state of late peaks after it."""
+    """Return the colour correction for a late Gaussian, and the state of late peaks after it."""
     total, _, *colours = pixel[SUMS]
     deepest, met = pixel[DEEPEST], weight > 0
     late = met & (z < deepest)
@@ -205,17 +214,17 @@ def _amended(pixel: Pixel, alpha: Any, weight: Any, colour: list[Any], z: Any) -
 def trace(
     clouds: CloudSet, placements: Sequence[Placement], view: CameraView, quality: Quality, *, z_max: Any | None = None
 ) -> Image:
-    """Image of all placements; one that is too crowded for the memory is made in parts.
+    """Render all placements; an image with too many pairs for the memory is rendered in parts.
 
     Args:
         clouds: Gaussians on the device.
-        placements: Where they are.
+        placements: Poses of the clouds.
         view: The camera, from :meth:`View.sampled`.
         quality: Order, cut-offs and kernel.
-        z_max: Depth along z [m] of the nearest visible surface per pixel, beyond which nothing is seen.
+        z_max: Depth along z [m] of the nearest visible surface per pixel; Gaussians behind it are not visible.
 
     Raises:
-        CrowdedError: If even one row of tiles is too crowded.
+        CrowdedError: If one row of tiles alone has too many pairs.
     """
     try:
         return march(bin_gaussians(clouds, placements, view, quality), view, quality, z_max=z_max)
@@ -242,14 +251,15 @@ def march(
 ) -> Image:
     """Blend every ray of a view front to back, and average the colours of each pixel.
 
-    What labels are made of belongs to the pixel's centre, through which a ray goes whatever the number of samples.
+    Label data (depth, instance, centre opacity) come from a ray through the pixel's centre, whatever the number of
+    samples.
 
     Args:
         lists: Depth-sorted Gaussians per tile.
         view: Camera.
-        quality: Order, cut-off and early end.
-        z_max: Depth along z [m] of the nearest visible surface per pixel, beyond which nothing is seen.
-        slopes: Those of the rays, where they are known already; for one sample per pixel.
+        quality: Order, cut-off and early termination.
+        z_max: Depth along z [m] of the nearest visible surface per pixel; Gaussians behind it are not visible.
+        slopes: Slopes of the rays if already known; for one sample per pixel.
     """
     if quality.order != "window" or not lists.pairs:
         return _march(lists, view, quality, quality.order, z_max, slopes)[0]
@@ -273,7 +283,10 @@ def _march(
     slopes: tuple[list[Any], list[Any]] | None = None,
     estimated: bool = False,
 ) -> tuple[Image, Any]:
-    """The image of one march, and the places of the tiles whose errors are ``estimated`` above the tolerance."""
+    """Return the image of one march, and the places of tiles whose estimated error exceeds the tolerance.
+
+    The places are None unless ``estimated`` is True.
+    """
     lanes = Lanes(lists, view, len(slopes[0]) if slopes else rows_together(order))
     far = [
         dr.gather(mi.Float, z_max, p, m) if z_max is not None else mi.Float(dr.inf)
@@ -287,11 +300,11 @@ def _march(
     late: Late = "estimated" if estimated else _late(quality)
 
     def right(pixels: list[Pixel]) -> Any:
-        """Whether lanes have no ray whose error exceeds the tolerance."""
+        """Return True for lanes in which no ray's error exceeds the tolerance."""
         return ~_too_wrong([pixel[ERROR] for pixel in pixels], lanes.inside, tolerance)
 
     def pixels(dx: float, dy: float, labelled: bool) -> tuple[list[Pixel], list[Any]]:
-        """States of the rays at a place in the pixels, and estimates of their errors."""
+        """Return the states of the rays at an offset in the pixels, and their error estimates."""
         state: dict[str, Any] = {"several": labelled and several, "late": late}
         where = slopes or lanes.slopes(dr.opaque(mi.Float, dx), dr.opaque(mi.Float, dy))
         rays = Rays.through(lists, view, quality, where, far, lanes.start, lanes.stop)
@@ -306,12 +319,12 @@ def _march(
         image.error = lanes.image(mi.Float, errors or [mi.Float(0.0) for _ in found])
     if estimated:
         dr.eval(image, unsure, errors)  # in one kernel
-    # One bit is soon read on a CPU, and mostly saves the launch; a GPU would have to be waited for.
+    # On a CPU, reading one bit is cheap and mostly saves the launch; on a GPU, it would cause a synchronisation.
     if several and (dr.backend_v(unsure) == dr.JitBackend.CUDA or dr.any(unsure)):
         image.instance = settle_instances(image.instance, unsure, lists, view, quality, order, z_max)
     n, colours = view.samples, []
     for y, x in np.ndindex(n, n) if n > 1 else ():
-        if (2 * x + 1, 2 * y + 1) == (n, n):  # the centre is one of an odd number of samples
+        if (2 * x + 1, 2 * y + 1) == (n, n):  # an odd number of samples includes the centre
             colours.append([*image.rgb, image.alpha])
         else:
             found, also = pixels((x + 0.5) / n, (y + 0.5) / n, labelled=False)
@@ -326,22 +339,22 @@ def _march(
 
 
 def _late(quality: Quality) -> Late:
-    """What becomes of late peaks where no error is estimated: in the order of rays there are none."""
+    """Return how late peaks are blended without an error estimate; in the order of rays no peak is late."""
     return "amended" if quality.amends and quality.order == "tile" else "taken"
 
 
 def _without_extra(pixels: list[Pixel], late: Late) -> list[Pixel]:
-    """States of rays without what is known of late peaks."""
+    """Return the states of rays without the state of late peaks."""
     return [pixel[: len(pixel) - _EXTRA[late]] for pixel in pixels]
 
 
 def _too_wrong(errors: list[Any], inside: list[Any], tolerance: Any) -> Any:
-    """Whether the estimate for any of a lane's rays inside of the image exceeds the tolerance."""
+    """Return True for lanes in which the estimate of a ray inside the image exceeds the tolerance."""
     return largest([dr.select(m, error, 0.0) for error, m in zip(errors, inside, strict=True)]) > tolerance
 
 
 def _tiles_of(flags: Any, lanes: Lanes) -> Any:
-    """Places of the tiles that have flagged lanes."""
+    """Return the places of tiles that have flagged lanes."""
     dr.eval(flags)
     per_tile = TILE_PIXELS // lanes.rows
     lane = dr.arange(mi.UInt32, dr.width(flags) // per_tile) * per_tile
@@ -349,9 +362,9 @@ def _tiles_of(flags: Any, lanes: Lanes) -> Any:
 
 
 def march_apart(lists: TileLists, view: CameraView, quality: Quality, z_max: Any | None = None) -> Image:
-    """The pixels of some tiles, tile after tile, by one ray through the centre of each.
+    """Render the pixels of some tiles, tile after tile, with one ray through each pixel's centre.
 
-    Arguments are those of :func:`march`, but nothing is repaired: the order is per tile or per ray.
+    Arguments are those of :func:`march`. Nothing is repaired: the order is per tile or per ray.
     """
     lanes = Lanes(lists, view, rows_together(quality.order), apart=True)
     places = zip(lanes.pixel, lanes.inside, strict=True)
@@ -369,7 +382,7 @@ def march_apart(lists: TileLists, view: CameraView, quality: Quality, z_max: Any
 
 
 def _picture(pixels: list[Pixel], lanes: Lanes, quality: Quality) -> list[Any]:
-    """Red, green, blue and opacity of the lanes' pixels as row-major arrays."""
+    """Return red, green, blue and opacity of the lanes' pixels as row-major arrays."""
     shown = [[*pixel[RED : BLUE + 1], 1.0 - pixel[T]] for pixel in pixels]
     if quality.extends:
         end = dr.opaque(mi.Float, quality.transmittance_min)
@@ -379,9 +392,9 @@ def _picture(pixels: list[Pixel], lanes: Lanes, quality: Quality) -> list[Any]:
 
 
 def _collect(pixels: list[Pixel], lanes: Lanes, only: int | None, quality: Quality) -> tuple[Image, Any]:
-    """The lanes' pixels as row-major arrays, and where an instance may be wrong.
+    """Return the lanes' pixels as row-major arrays, and a flag (Bool) where an instance is uncertain.
 
-    ``only`` is the id of all Gaussians if there is but one.
+    ``only`` is the instance id of all Gaussians, or None if there are several.
     """
     *rgb, alpha = _picture(pixels, lanes, quality)
     depths = []

@@ -1,4 +1,4 @@
-"""Pairs of Gaussians and the image tiles that their cut-off ellipses meet, with the keys that they are sorted by."""
+"""Pairs of Gaussians and the image tiles that their cut-off ellipses intersect, with sort keys."""
 
 from __future__ import annotations
 
@@ -18,17 +18,20 @@ from mitsplat.renderer.splatting.tile_depths import DEPTH_BITS, depths_by_tile, 
 from mitsplat.renderer.splatting.tile_subset import TileBox, TileSubset
 
 NUMBER_BITS = 26
-"""Bits of the number of a record or pair in what pairs are sorted by."""
+"""Bits of a record number or pair number in sort keys."""
 
 PAIRS_MAX = 1 << NUMBER_BITS
-"""Most pairs of a Gaussian and a tile that are held at once, about 40 bytes each."""
+"""Largest number of pairs that are stored at once, about 40 bytes each."""
 
 TILES_MAX = 1 << (64 - DEPTH_BITS - NUMBER_BITS)
-"""Most tiles of a view."""
+"""Largest number of tiles of a view."""
 
 
 class CrowdedError(MissingResourceError):
-    """A view has more pairs than :data:`PAIRS_MAX`, or tiles than :data:`TILES_MAX`: render a part of it."""
+    """Error of a view with more than :data:`PAIRS_MAX` pairs or :data:`TILES_MAX` tiles.
+
+    Such a view must be rendered in parts.
+    """
 
     def __init__(self) -> None:
         super().__init__(
@@ -41,9 +44,9 @@ class Pairs:
     """Pairs of a record and a tile, record after record.
 
     Attributes:
-        key: What they are sorted by, see :meth:`key_of`.
-        record: Number of each one's record, of pairs that are numbered themselves.
-        first: First pair of each record, and the number of pairs; of the same.
+        key: Sort keys, see :meth:`key_of`.
+        record: Record number of each pair; None unless the pairs themselves are numbered.
+        first: First pair of each record, followed by the number of pairs; None unless the pairs are numbered.
     """
 
     key: Any
@@ -52,7 +55,7 @@ class Pairs:
 
     @staticmethod
     def key_of(tile: Any, level: Any, number: Any) -> Any:
-        """Tile, level of depth, and the number of the record, or of the pair, in one."""
+        """Combine tile, depth level, and the number of the record or pair in one sort key."""
         return mi.UInt64(tile) << (DEPTH_BITS + NUMBER_BITS) | mi.UInt64(level) << NUMBER_BITS | mi.UInt64(number)
 
 
@@ -67,12 +70,13 @@ def pair_records(
     numbered: bool,
     groups: Any | None = None,
 ) -> Pairs | None:
-    """Pairs of every record with the tiles it meets, by their places among the chosen ones; None if there are none.
+    """Pair every record with the tiles it intersects; return None if there are no pairs.
 
-    ``groups`` are numbers of the records, below 2^DEPTH_BITS, that they are sorted by in a tile instead of by depth.
+    Tiles are given by their places in ``chosen``. ``groups`` are numbers of the records below 2^DEPTH_BITS, which
+    replace the depth level in sort keys.
 
     Raises:
-        CrowdedError: If there are more than :data:`PAIRS_MAX`, or their keys have no room for tiles or records.
+        CrowdedError: If there are more than :data:`PAIRS_MAX` pairs, or more tiles or records than sort keys can hold.
     """
     count = dr.width(least)
     if count > 1 << NUMBER_BITS or view.tiles_x * view.tiles_y > TILES_MAX:
@@ -82,7 +86,7 @@ def pair_records(
     row_of, rows = prefix_ranges(dr.select(y1 > y0, y1 - y0, 0), view.tiles_y)
     if rows == 0:
         return None
-    # Rows first: one lane finds the spans of one record, and then one lane fills one span.
+    # Rows first: one lane finds the spans of one record, then one lane fills one span.
     record = dr.gather(mi.ArrayXf, records, order, shape=(RECORD, count))
     cut = dr.log2(dr.opaque(mi.Float, quality.alpha_min))
     owner, first_tile = dr.empty(mi.UInt32, rows), dr.empty(mi.UInt32, rows)
@@ -139,15 +143,15 @@ def pair_records(
 
 
 def prefix_ranges(sizes: Any, most: int) -> tuple[Any, int]:
-    """Where each of consecutive ranges begins, none of them larger than ``most``, and their whole size.
+    """Return the start of each of consecutive ranges of size at most ``most``, and their total size.
 
     Raises:
-        CrowdedError: If that is more than :data:`PAIRS_MAX`.
+        CrowdedError: If the total is more than :data:`PAIRS_MAX`.
     """
     count = dr.width(sizes)
     begin, last = dr.prefix_sum(sizes), count - 1
     sums = [dr.gather(mi.UInt32, begin, last) + dr.gather(mi.UInt32, sizes, last)]
-    if count * most > 0xFFFFFFFF:  # added as floats too, because a sum of integers may wrap
+    if count * most > 0xFFFFFFFF:  # also summed as floats, because the integer sum may wrap
         sums.append(mi.UInt32(dr.minimum(dr.sum(mi.Float(sizes)), 2.0 * PAIRS_MAX)))
     totals: list[int] = np.array(dr.concat(sums)).tolist()
     if max(totals) > PAIRS_MAX:
@@ -156,10 +160,10 @@ def prefix_ranges(sizes: Any, most: int) -> tuple[Any, int]:
 
 
 def _spans(record: Any, cut: Any, x0: Any, x1: Any, view: CameraView) -> Callable[[Any], tuple[Any, Any]]:
-    """Function from a row of tiles to the half-open range of its tiles that a record's cut-off ellipse meets.
+    """Return a function from a row of tiles to the half-open range that a record's ellipse intersects.
 
-    Gaussians at the camera's plane take their whole box. Under lens distortion, rows are no bands of slopes: the tiles
-    of the box are tried one by one.
+    Gaussians at the camera's plane take their whole box. Under lens distortion, rows of tiles are not bands of slopes,
+    so that the tiles of the box are tested one by one.
     """
     u0, v0, a, b2, c, opacity, _, _, _, _, e, f, g, h, i, _ = record
     k2 = opacity - cut

@@ -1,4 +1,7 @@
-"""Projection: Gaussians of all placements, in one set of device arrays, to view records of those that a camera sees."""
+"""Projection of the Gaussians of all placements to view records of those that a camera sees.
+
+All clouds lie in one set of device arrays.
+"""
 
 from __future__ import annotations
 
@@ -30,21 +33,22 @@ from mitsplat.runtime.recorded_kernels import Table, recorded
 
 PLACEMENT = 32
 """Floats per placement: camera axes in the cloud's frame (9), scale, instance id, first Gaussian, camera centre in the
-cloud's frame as a sum of two floats (3 + 3), appearance (13). Two floats keep the difference exact far from the
-origin."""
+cloud's frame as a sum of two floats (3 + 3), appearance (13). The sum of two floats keeps differences exact far from
+the origin.
+"""
 
 _APPEARANCE = PLACEMENT - ROW
 
 
 @dataclass(frozen=True, eq=False)
 class Placement:
-    """A cloud in the world.
+    """Pose of a cloud in the world.
 
     Attributes:
         cloud: Index of the cloud.
         world_from_cloud: Rotation, translation and uniform scale, shape (4, 4).
         instance: Instance id; 0 is the environment.
-        appearance: What its colours are changed by, if anything.
+        appearance: Change of its colours, or None.
     """
 
     cloud: int
@@ -55,7 +59,7 @@ class Placement:
 
 @dataclass(frozen=True, eq=False)
 class CloudSet:
-    """Several clouds in one set of device arrays, so that one kernel serves every placement of a scene."""
+    """Several clouds in one set of device arrays, so that one kernel serves all placements of a scene."""
 
     counts: tuple[int, ...]
     first: tuple[int, ...]
@@ -67,9 +71,9 @@ class CloudSet:
     _numbers: dict[tuple[int, ...], tuple[Any, Any]] = field(default_factory=dict, init=False, repr=False)
 
     def numbers(self, chosen: Sequence[int]) -> tuple[Any, Any]:
-        """For every Gaussian of some clouds, one after the other: its cloud's place in ``chosen``, and its own number.
+        """Return, for every Gaussian of the clouds ``chosen``, its index into ``chosen`` and its number.
 
-        Those of the last two choices are kept: all of a layout's placements, and its objects alone.
+        The last two results are cached: all placements of a layout, and its objects alone.
         """
         key = tuple(chosen)
         if key not in self._numbers:
@@ -88,13 +92,13 @@ class CloudSet:
             return dr.zeros(mi.UInt32, total), number + dr.opaque(mi.UInt32, self.first[chosen[0]])
         begins = np.cumsum(counts) - counts
         owner = dr.zeros(mi.UInt32, total)
-        # Clouds without Gaussians share a start with the next one: count each start as often as it occurs.
+        # An empty cloud has the same start as the next one, so each start is counted as often as it occurs.
         starts, repeats = np.unique(begins[(begins > 0) & (begins < total)], return_counts=True)
         if len(starts):
             repeats, starts = (wrapped(mi.UInt32, values.astype(np.uint32)) for values in (repeats, starts))
             dr.scatter(owner, repeats, starts)
             owner = dr.cumsum(owner)
-        if not counts[0]:  # those without Gaussians before the first that has some
+        if not counts[0]:  # empty clouds before the first non-empty one
             owner += dr.opaque(mi.UInt32, int(np.count_nonzero(begins == 0)) - 1)
         shift = wrapped(mi.Int32, (np.array([self.first[cloud] for cloud in chosen]) - begins).astype(np.int32))
         local = mi.UInt32(mi.Int32(number) + dr.gather(mi.Int32, shift, owner))
@@ -103,7 +107,7 @@ class CloudSet:
 
 
 def merge_clouds(clouds: Sequence[Cloud]) -> CloudSet:
-    """Concatenate clouds on the device; SH are padded with zeros to the largest degree present."""
+    """Concatenate clouds on the device; SH are padded with zeros to the largest degree."""
     counts = tuple(c.count for c in clouds)
     first = tuple(int(i) for i in np.concatenate([[0], np.cumsum(counts)[:-1]]))
     if len(clouds) == 1:
@@ -116,10 +120,10 @@ def merge_clouds(clouds: Sequence[Cloud]) -> CloudSet:
     else:
         sh = dr.zeros(mi.Float, stride * sum(counts))
         for start, c in zip(first, clouds, strict=True):
-            if c.count == 0:  # Dr.Jit adds nothing to arrays of no elements
+            if c.count == 0:  # Dr.Jit cannot add to empty arrays
                 continue
             i = dr.arange(mi.UInt32, c.count * c.sh_stride)
-            # Opaque, so that another set of clouds reuses the compiled kernels.
+            # An opaque start lets another set of clouds reuse the compiled kernels.
             row = i // c.sh_stride + dr.opaque(mi.UInt32, start)
             dr.scatter(sh, c.sh, row * stride + i % c.sh_stride, mode=dr.ReduceMode.Permute)
     dr.eval(geometry, scales, sh)
@@ -127,12 +131,14 @@ def merge_clouds(clouds: Sequence[Cloud]) -> CloudSet:
 
 
 _ADJOINT = dr.ReduceMode.NoConflicts
-"""How gradients are added to a cloud: they are asked for where it is placed once, so each Gaussian has but one sum. The
-default would write the number of Gaussians into the kernels, and compile them anew whenever it changes."""
+"""Mode in which gradients are added to a cloud. Gradients need a cloud that is placed once, so that each Gaussian
+receives one sum. The default mode would write the number of Gaussians into the kernels and recompile them at each
+change.
+"""
 
 
 def placement_table(clouds: CloudSet, placements: Sequence[Placement], view: CameraView) -> tuple[Any, Any, Any]:
-    """Placement rows on the device, and for every Gaussian of every placement its row and its number in the clouds."""
+    """Return placement rows on the device, and for every placed Gaussian its row and its number in the clouds."""
     rows = np.zeros((max(1, len(placements)), PLACEMENT), np.float32)
     if placements:
         matrix = np.array([p.world_from_cloud for p in placements], dtype=np.float64)
@@ -151,7 +157,7 @@ def placement_table(clouds: CloudSet, placements: Sequence[Placement], view: Cam
 
 
 class Projector:
-    """Gaussians of placements as the projection kernels read them; ``changed`` is whether any has an appearance."""
+    """Input of the projection kernels; ``changed`` is True if any placement has an appearance."""
 
     def __init__(
         self, clouds: CloudSet, table: Any, view: CameraView, quality: Quality, at_camera: bool, changed: bool = False
@@ -181,9 +187,10 @@ class Projector:
         }
 
     def _bounds(self, g: dict[str, Any]) -> tuple[Any, ...]:
-        """Response, opacity, squared cut-off, whether the plane z = 0 is near, visibility, slope box and least depth.
+        """Return response, opacity, squared cut-off, near flag, visibility, slope box and least depth.
 
-        Gaussians near the plane keep the exact response: a pixel is small against them, and no line of sight central.
+        The near flag marks Gaussians that reach the plane z = 0. They keep the exact response without a filter, because
+        they are large relative to a pixel and have no central ray.
         """
         view, kernel = self.view, KERNELS[self.quality.kernel]
         shape = {k: g[k] for k in ("mean", "axes", "sigma", "right", "down", "forward", "scale")}
@@ -197,7 +204,8 @@ class Projector:
         centre = [g["scale"] * dr.dot(g[axis], g["mean"]) for axis in ("right", "down", "forward")]
         response, opacity = project_gaussian(**shape), g["opacity"]
         if kernel.variance > 0:
-            # A filter is as wide as the view's pixels; what trainers add is of the picture's, however fine the view is.
+            # A filter is as wide as the view's pixels. The variance that trainers add refers to the picture's pixels,
+            # however fine the view is.
             variance = kernel.variance * (1 if kernel.keeps_light else view.zoom**2)
             covariance = view.pixel_covariance(response.u0, response.v0, variance)
             response, det = response.filtered(*covariance)
@@ -211,7 +219,7 @@ class Projector:
         opacity, k2 = dr.select(near, g["opacity"], opacity), dr.select(near, k * k, k2)
         farthest = dr.maximum(centre[2] + reach[2], view.near_plane)
 
-        # Slopes of the part of the ellipsoid's box beyond the near plane: loose, but only few Gaussians need it.
+        # Slopes of the ellipsoid's box behind the near plane: a loose bound, but few Gaussians need it.
         def slopes(axis: int) -> tuple[Any, Any]:
             lo, hi = centre[axis] - reach[axis], centre[axis] + reach[axis]
             return (
@@ -232,7 +240,7 @@ class Projector:
         return response, opacity, k2, near, visible, box, centre[2] - reach[2]
 
     def cull(self, owner: Any, local: Any, chosen: TileSubset | None = None) -> tuple[Any, Any]:
-        """Whether Gaussians are in view, or near some tiles of it, and whether they reach the camera's plane."""
+        """Return two flags per Gaussian: it is in view (and in ``chosen`` tiles), and it reaches the camera's plane."""
         g = self._load(owner, local)
         _, _, _, near, visible, box, _ = self._bounds(g)
         x0, x1, y0, y1 = self.view.tile_box(*box)
@@ -243,7 +251,7 @@ class Projector:
         return visible, near
 
     def records(self, owner: Any, local: Any, near: Any) -> tuple[Any, Any, Any, Any]:
-        """View records, rows of those at the camera, least depths of the ellipsoids, and boxes of tiles."""
+        """Return view records, rows of Gaussians at the camera's plane, least depths, and tile boxes."""
         count = dr.width(local)
         g = self._load(owner, local)
         response, opacity, _, _, _, box, least = self._bounds(g)
@@ -261,10 +269,10 @@ class Projector:
         return records, near_rows, least, tile_box
 
     def every_record(self, owner: Any, local: Any) -> tuple[Any, Any, Any, Any, Any]:
-        """View records of all Gaussians, least depths, boxes of tiles, which are seen, and which of those at the plane.
+        """Return view records of all Gaussians, least depths, tile boxes, visibility, and near flags.
 
-        Boxes of those that are not seen are empty, and records of those that reach the camera's plane do not say so.
-        Unlike after :meth:`cull`, no width depends on the view.
+        Invisible Gaussians have empty boxes. Records of Gaussians that reach the camera's plane are not marked. Unlike
+        after :meth:`cull`, no array size depends on the view.
         """
         g = self._load(owner, local)
         response, opacity, _, near, visible, box, least = self._bounds(g)
@@ -275,9 +283,9 @@ class Projector:
         return _rows(mi.Float, record), dr.detach(least), boxes, visible, visible & dr.detach(near)
 
     def records_at_once(self, owner: Any, local: Any) -> tuple[Any, Any, Any, Any]:
-        """As :meth:`records`, of all Gaussians, those out of view with empty boxes: by recorded kernels.
+        """Return the results of :meth:`records` for all Gaussians, with recorded kernels and without gradients.
 
-        There is no gradient to them.
+        Invisible Gaussians have empty boxes.
         """
         clouds, view = self.clouds, self.view
         shape = self.quality, self.at_camera, self.changed, clouds.sh_count, clouds.sh_stride
@@ -293,7 +301,7 @@ class Projector:
         return records, rows, least, boxes
 
     def _record(self, g: dict[str, Any], response: Response, opacity: Any, local: Any) -> list[Any]:
-        """View records of Gaussians that do not reach the camera's plane."""
+        """Return view records of Gaussians that do not reach the camera's plane."""
         scaled = LOG2_E_HALF
         colour = self._colour(g["mean"], local)
         if self.changed:
@@ -319,7 +327,7 @@ class Projector:
         return list(self.view.tile_box(*(dr.detach(side) for side in box)))
 
     def _near_rows(self, index: Any, owner: Any, local: Any) -> Any:
-        """General responses of Gaussians at the camera's plane."""
+        """Return general responses of Gaussians at the camera's plane."""
         count = dr.width(index)
         g = self._load(dr.gather(mi.UInt32, owner, index), dr.gather(mi.UInt32, local, index))
         shape = {k: g[k] for k in ("mean", "axes", "sigma", "right", "down", "forward", "scale")}
@@ -340,7 +348,7 @@ class Projector:
         def coefficient(k: int) -> list[Any]:
             return [packets[(3 * k + c) // 4][(3 * k + c) % 4] for c in range(3)]
 
-        # A Gaussian centred on the camera is seen along no direction: only its constant band counts.
+        # A Gaussian centred on the camera has no direction, so only its constant band counts.
         direction = mean * dr.rsqrt(dr.maximum(dr.squared_norm(mean), 1e-30))
         return evaluate_sh(direction, coefficient, bands)
 
@@ -354,7 +362,7 @@ def _every_record(
     owner: Any,
     local: Any,
 ) -> tuple[Any, Any, Any, Any]:
-    """Records, least depths, boxes of tiles, and which reach the camera's plane, see ``Projector.every_record``."""
+    """Return records, least depths, tile boxes and near flags, see ``Projector.every_record``."""
     quality, at_camera, changed, sh_count, sh_stride = shape
     geometry, scales, sh, table = arrays
     clouds = CloudSet((dr.width(owner),), (0,), geometry, scales, sh, sh_count, sh_stride)
@@ -364,7 +372,7 @@ def _every_record(
 
 
 def _rows(kind: Any, columns: list[Any]) -> Any:
-    """Columns side by side, as a flat array of type ``kind``."""
+    """Interleave columns into a flat array of type ``kind``."""
     count = dr.width(columns)
     rows = dr.empty(kind, len(columns) * count)
     dr.scatter(rows, (mi.ArrayXf if kind is mi.Float else mi.ArrayXu)(columns), dr.arange(mi.UInt32, count))

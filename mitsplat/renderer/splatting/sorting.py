@@ -14,9 +14,9 @@ import numpy as np
 
 
 def stable_order(key: Any, bits: int) -> Any:
-    """Stable order of keys of so many bits: positions in ``key``.
+    """Return the stable sort order of keys with ``bits`` bits, as positions in ``key``.
 
-    A radix sort like Dr.Jit's own, which knows no keys shorter than 32 bits.
+    This is a radix sort like Dr.Jit's own, which always sorts 32 bits or more.
     """
     count, order = dr.width(key), None
     radix = 16 if dr.backend_v(key) == dr.JitBackend.LLVM else 8
@@ -32,15 +32,15 @@ def stable_order(key: Any, bits: int) -> Any:
 
 
 CPUINFO = Path("/proc/cpuinfo")
-"""Where Linux describes its processors."""
+"""Linux file with the processor description."""
 
 
 @cache
 def numpy_sorts_slowly() -> bool:
-    """Whether NumPy's sort is slow on this processor: then :func:`stable_order` takes a third of its time.
+    """Return True if NumPy's sort takes three times as long as :func:`stable_order` on this processor.
 
-    On AMD's Zen 4 (family 25 with AVX-512) it stores chosen lanes to memory by an instruction that is microcoded there:
-    https://github.com/numpy/x86-simd-sort/issues/6. Zen 5 has it in hardware, and Zen 3 has no AVX-512.
+    On AMD's Zen 4 (family 25 with AVX-512), the compress-store instruction of NumPy's sort is microcoded:
+    https://github.com/numpy/x86-simd-sort/issues/6. Zen 5 executes it in hardware, and Zen 3 has no AVX-512.
     """
     try:
         with CPUINFO.open() as file:
@@ -52,7 +52,10 @@ def numpy_sorts_slowly() -> bool:
 
 
 def sort_in_threads(values: np.ndarray, threads: int) -> None:
-    """Sort in place, by halves in several threads where that is worth it: all of them take more time than one alone."""
+    """Sort in place; large arrays are partitioned into halves that several threads sort.
+
+    All threads together take more CPU time than one thread, so small arrays are sorted by one.
+    """
     if threads == 1 or len(values) < 1 << 16:
         values.sort()
         return

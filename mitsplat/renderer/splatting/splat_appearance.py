@@ -1,9 +1,10 @@
-"""How one copy of captured Gaussians differs from another: their colours, and the dirt on them.
+"""Appearance changes of captured Gaussians: colours and dirt.
 
-A Gaussian's colour is that of its spherical harmonics towards the camera, all bands of it. It is made linear, taken by
-a 3x3 matrix, multiplied by dirt, and encoded again; nothing becomes brighter than white that was not. Dirt is a
-function of the Gaussian's centre in its own frame, the same from wherever it is seen: three octaves of value noise on a
-lattice, the first with :data:`CELLS` cells along the object (Ebert et al. 2003, "Texturing and Modeling", chapter 2).
+The colour of a Gaussian comes from all its SH bands, evaluated towards the camera. It is linearised, multiplied by a
+3x3 matrix, attenuated by dirt, and encoded again. No channel exceeds white unless the colour did before. Dirt is a
+function of the Gaussian's centre in its own frame, independent of the view. It is value noise of three octaves on a
+lattice with :data:`CELLS` cells along the object in the first octave (Ebert et al. 2003, "Texturing and Modeling",
+chapter 2).
 """
 
 from __future__ import annotations
@@ -18,31 +19,31 @@ import numpy as np
 from mitsplat.renderer.splatting.gaussian import linear_to_srgb, srgb_to_linear
 
 ROW = 13
-"""Floats of an appearance: whether there is one, the matrix row by row, wear, seed, and cells per unit of length."""
+"""Floats of an appearance: presence flag, matrix row by row, wear, seed, and cells per unit of length."""
 
 CELLS = 3.0
 """Cells of the coarsest noise along the longest side of an object."""
 
 OCTAVES = 3
-"""Of noise, each of twice the frequency and half the amplitude of the one before."""
+"""Octaves of noise, each with twice the frequency and half the amplitude of the previous one."""
 
 CLEAN, COVERED = 0.4, 0.7
-"""Values of the noise up to which there is no dirt, and from which it is at its thickest."""
+"""Noise value up to which there is no dirt, and value from which dirt has its full thickness."""
 
 DIRT = (0.12, 0.09, 0.06)
-"""Factor of dirt that lets nothing through on linear red, green and blue."""
+"""Factor of opaque dirt on linear red, green and blue."""
 
 _PRIMES = (0x8DA6B343, 0xD8163841, 0xCB1AB31F, 0x9E3779B1)
 
 
 @dataclass(frozen=True)
 class SplatAppearance:
-    """What a placement's colours are changed by.
+    """Change of a placement's colours.
 
     Attributes:
-        matrix: On linear colours, row by row.
-        wear: Share of light that dirt takes where it is thickest, but for its own colour, in [0, 1].
-        seed: Of its noise, below 2^23.
+        matrix: Matrix on linear colours, row by row.
+        wear: Coverage of dirt at its full thickness, in [0, 1]; opaque dirt has the factors :data:`DIRT`.
+        seed: Seed of the noise, below 2^23.
         size: Longest extent of the object in its own frame.
     """
 
@@ -53,17 +54,20 @@ class SplatAppearance:
 
     @property
     def row(self) -> list[float]:
-        """As the kernels read it."""
+        """Row of floats for the kernels."""
         return [1.0, *self.matrix, self.wear, float(self.seed), CELLS / self.size]
 
 
 def rows_of(appearances: list[SplatAppearance | None]) -> np.ndarray:
-    """Rows of :data:`ROW` floats, of zeros where there is none."""
+    """Return rows of :data:`ROW` floats; zeros where the appearance is None."""
     return np.array([[0.0] * ROW if one is None else one.row for one in appearances], np.float32).reshape(-1, ROW)
 
 
 def changed(colour: list[Any], row: list[Any], point: Any) -> list[Any]:
-    """Display-encoded colours of Gaussians at ``point`` in their own frames, as their placements' rows say."""
+    """Apply the appearance rows of placements to display-encoded colours of Gaussians.
+
+    ``point`` are the centres of the Gaussians in their own frames.
+    """
 
     def change(colour: list[Any], row: list[Any], point: Any) -> list[Any]:
         linear = [srgb_to_linear(c) for c in colour]
@@ -81,7 +85,7 @@ def changed(colour: list[Any], row: list[Any], point: Any) -> list[Any]:
 
 
 def dirt(point: Any, seed: Any) -> Any:
-    """How thick dirt is at points in cells of the coarsest noise, in [0, 1]."""
+    """Return the thickness of dirt in [0, 1] at points, given in cells of the coarsest noise."""
     total, weight = mi.Float(0), 0.0
     for octave in range(OCTAVES):
         total += 0.5**octave * _value_noise(point * 2.0**octave, seed + octave)
@@ -91,7 +95,7 @@ def dirt(point: Any, seed: Any) -> Any:
 
 
 def _value_noise(point: Any, seed: Any) -> Any:
-    """Random values in [0, 1) at whole coordinates, and cubic steps between them."""
+    """Return random values in [0, 1) at integer coordinates, with cubic interpolation between them."""
     low = [mi.Int32(dr.floor(c)) for c in point]
     share = [c - mi.Float(i) for c, i in zip(point, low, strict=True)]
     share = [t * t * (3 - 2 * t) for t in share]
@@ -108,7 +112,7 @@ def _value_noise(point: Any, seed: Any) -> Any:
 
 
 def _hashed(key: Any) -> Any:
-    """32 bits of which each depends on each of the key (Wellons 2018, "Hash Function Prospector", lowbias32)."""
+    """Return a 32-bit hash (Wellons 2018, "Hash Function Prospector", lowbias32)."""
     key = (key ^ (key >> 16)) * 0x7FEB352D
     key = (key ^ (key >> 15)) * 0x846CA68B
     return key ^ (key >> 16)

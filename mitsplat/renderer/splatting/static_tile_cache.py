@@ -1,8 +1,8 @@
-"""The static part of a picture, kept while the camera stands still.
+"""Cache of the static splats' tiles, valid while the camera does not move.
 
-Where no Gaussian of a dynamic object meets a tile, its pixels are those of the static splats alone. Where one does, the
-tile's two lists are merged and walked as one, so that what is static still hides what is behind it: the picture is the
-same, bit for bit, as one made of everything at once.
+In a tile without Gaussians of dynamic objects, the pixels come from the static splats alone. In every other tile, both
+lists are merged and blended as one, so that static splats still occlude what lies behind them. The result is
+bit-identical to a picture of all placements.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from mitsplat.renderer.splatting.tiles import TileLists, bin_gaussians, merge_li
 
 @dataclass(frozen=True, eq=False)
 class StaticTileCache:
-    """Static splats as one camera sees them.
+    """Static splats seen by one camera.
 
     Attributes:
-        lists: Their Gaussians per tile.
-        image: Their picture.
+        lists: Gaussians per tile.
+        image: Rendered picture.
     """
 
     lists: TileLists
@@ -36,12 +36,12 @@ class StaticTileCache:
     def of(
         cls, clouds: CloudSet, placements: Sequence[Placement], view: CameraView, quality: Quality, z_max: Any | None
     ) -> StaticTileCache:
-        """The layer of some placements; arguments as of :func:`mitsplat.renderer.splatting.march.trace`.
+        """Render and store the static placements; arguments as in :func:`mitsplat.renderer.splatting.march.trace`.
 
         Raises:
-            CrowdedError: If they are too many to be kept.
+            CrowdedError: If there are too many pairs to store.
         """
-        # Weights of instances are kept as they are where there are several, so that no pixel changes.
+        # The instance is stored as None, so that pixels are computed exactly as with several instances.
         lists = replace(bin_gaussians(clouds, placements, view, quality), instance=None)
         image = march(lists, view, quality, z_max=z_max)
         dr.eval(image)
@@ -50,10 +50,10 @@ class StaticTileCache:
     def with_objects(
         self, clouds: CloudSet, placements: Sequence[Placement], view: CameraView, quality: Quality, z_max: Any | None
     ) -> Image:
-        """The picture with more placements in it.
+        """Return the picture with additional placements.
 
         Raises:
-            CrowdedError: If they are too many.
+            CrowdedError: If there are too many pairs.
         """
         objects = bin_gaussians(clouds, placements, view, quality)
         touched = dr.compress(objects.stop > objects.start)

@@ -1,7 +1,8 @@
-"""Depths that the Gaussians of an image tile are sorted by, and the levels that stand for them in sort keys.
+"""Sort depths of Gaussians in an image tile, and their quantised levels in sort keys.
 
-For the order per tile that is the peak's depth along the ray around which the tile sees most of the Gaussian; for the
-order per ray it is a lower bound over all rays of the tile, which says when a ray has seen all that can come first.
+In the order per tile, the sort depth is the depth of the peak along the ray around which the tile sees most of the
+Gaussian. In the order per ray, it is a lower bound over all rays of the tile, which tells when no later entry can come
+first.
 """
 
 from __future__ import annotations
@@ -17,21 +18,22 @@ from mitsplat.renderer.rays.camera_rays import CameraView
 from mitsplat.renderer.splatting.gaussian import LOG2_E_HALF, RECORD, general_depth
 
 DEPTH_BITS = 16
-"""Bits of a depth that pairs are sorted by: 11 of its mantissa tell depths apart that differ by 0.05 %, and 5 of its
-exponent those up to 2^32 times the near plane. Equals stay in the order of the clouds."""
+"""Bits of a depth in sort keys: 11 bits of its mantissa separate depths that differ by 0.05 %, and 5 bits of its
+exponent cover depths up to 2^32 times the near plane. Equal levels stay in the order of the clouds.
+"""
 
 _BITS_OF_1 = 0x3F800000
-"""The float 1 as an integer."""
+"""Bit pattern of the float 1."""
 
 
 def level_of(depth: Any, view: CameraView) -> Any:
-    """Sort key of a depth: the leading bits of its ratio to the near plane, which grow with it."""
+    """Quantise a depth to its level: the leading bits of its ratio to the near plane, which increase with the ratio."""
     ratio = dr.clip(depth / view.near_plane, 1.0, 0.9999 * 2.0**32)
     return (dr.reinterpret_array(mi.UInt32, ratio) - _BITS_OF_1) >> (23 + 5 - DEPTH_BITS)
 
 
 def depth_of_level(level: Any, view: CameraView) -> Any:
-    """Least depth that has a level; what is nearer than the near plane has level 0."""
+    """Return the least depth of a level; depths in front of the near plane have level 0."""
     ratio = dr.reinterpret_array(mi.Float, (level << (23 + 5 - DEPTH_BITS)) + _BITS_OF_1)
     return dr.select(level == 0, 0, (1 - 1e-6) * ratio * view.near_plane)
 
@@ -39,10 +41,10 @@ def depth_of_level(level: Any, view: CameraView) -> Any:
 def depths_by_tile(
     record: Any, near: Any | None, ellipsoid: Any, first: Any, view: CameraView, quality: Quality
 ) -> Callable[[Any], Any]:
-    """Function from a tile in the row of tiles of the ``first`` one to a record's depth there, by which it is sorted.
+    """Return a function from a tile to the sort depth of a record in it.
 
-    In an undistorted view, most of it is the same for a whole row. ``near`` is as in
-    :class:`mitsplat.renderer.splatting.tiles.TileLists`.
+    The tile must be in the same row of tiles as ``first``. In an undistorted view, most of the computation is the same
+    for a whole row. ``near`` is as in :class:`mitsplat.renderer.splatting.tiles.TileLists`.
     """
     if quality.order == "ray":
         return lambda tile: least_depth(record, ellipsoid, view.tile_slopes(tile))
@@ -69,29 +71,34 @@ def depths_by_tile(
 
     def depth_of(tile: Any) -> Any:
         u, v, depth = usual(tile)
-        # Those that reach the camera's plane are large against a tile: its middle stands for it.
+        # Gaussians that reach the camera's plane are large relative to a tile, so the depth at the tile's centre is
+        # used.
         return dr.select(at_camera, dr.maximum(general_depth(general, u, v)[1], 0), depth)
 
     return depth_of
 
 
 def depth_where_seen(record: Any, slopes: tuple[Any, Any, Any, Any]) -> Any:
-    """Depth of a Gaussian's peak along the ray around which a tile between some slopes sees most of it."""
+    """Return the peak depth of a Gaussian along the ray around which a tile sees most of it.
+
+    ``slopes`` are the limits of the tile (lo_u, hi_u, lo_v, hi_v).
+    """
     lo_u, hi_u, lo_v, hi_v = slopes
     depth_around = _depths_where_seen(record, hi_u - lo_u, hi_v - lo_v)
     return depth_around(0.5 * (lo_u + hi_u) - record[0], 0.5 * (lo_v + hi_v) - record[1])
 
 
 def _depths_where_seen(record: Any, width: Any, height: Any) -> Callable[[Any, Any], Any]:
-    """Function from the middle of a tile of such slopes, from the footprint's centre on, to :func:`depth_where_seen`.
+    """Return a function from a tile centre, relative to the footprint's centre, to :func:`depth_where_seen`.
 
-    With M the inverse covariance of the footprint and V that of a tile's pixels, taken for a Gaussian around its middle
-    m, their product has its mean at (I + V M)^-1 m from the footprint's centre: near the centre of what is small
-    against the tile, in the middle of the tile for what is large.
+    All tiles have the size ``width`` x ``height`` in slopes. Let M be the inverse covariance of the footprint, and V
+    the covariance of the tile's pixels, modelled as a Gaussian around the tile centre m. The product of both Gaussians
+    has its mean at (I + V M)^-1 m from the footprint's centre. This mean lies near the footprint's centre for small
+    Gaussians, and at the tile centre for large ones.
     """
     a, b2, c = (record[k] for k in (2, 3, 4))
     variance_u, variance_v = (dr.square(w) / (12 * LOG2_E_HALF) for w in (width, height))
-    # What is smaller than the tile by more than this is seen at its centre, and would overflow.
+    # The limits avoid overflow; a Gaussian so much smaller than the tile is seen at its own centre.
     p11, p22 = 1 + dr.minimum(variance_u * a, 1e15), 1 + dr.minimum(variance_v * c, 1e15)
     b = dr.clip(0.5 * b2, -1e15 / variance_u, 1e15 / variance_u)
     inverse = dr.rcp(dr.maximum(p11 * p22 - variance_u * b * (variance_v * b), 1))
@@ -110,10 +117,10 @@ def _depths_where_seen(record: Any, width: Any, height: Any) -> Callable[[Any, A
 
 
 def least_depth(record: Any, ellipsoid: Any, slopes: tuple[Any, Any, Any, Any]) -> Any:
-    """Lower bound of the depth of a Gaussian's peak along any ray of a tile.
+    """Return a lower bound of the depth of a Gaussian's peak along all rays of a tile.
 
-    The numerator of the depth is linear and the denominator convex in the slopes: both are bounded at the corners. Nor
-    can the peak lie in front of the cut-off ellipsoid.
+    The numerator of the depth is linear in the slopes and the denominator is convex, so that both are bounded at the
+    corners. In addition, the peak cannot lie in front of the cut-off ellipsoid.
     """
     lo_u, hi_u, lo_v, hi_v = slopes
     least, largest = mi.Float(dr.inf), mi.Float(0)
@@ -126,7 +133,7 @@ def least_depth(record: Any, ellipsoid: Any, slopes: tuple[Any, Any, Any, Any]) 
 
 
 def _depth_fraction(record: Any, du: Any, dv: Any) -> tuple[Any, Any]:
-    """Numerator and denominator of the depth of a peak, relative to the depth of the centre."""
+    """Return numerator and denominator of a peak's depth relative to the depth of the centre."""
     _, _, _, _, _, _, _, _, _, _, e, f, g, h, i, _ = record
     top = dr.fma(0.5, dr.fma(du, e, dv * f), 1)
     return top, dr.fma(dv, dr.fma(dv, i, dr.fma(du, h, f)), dr.fma(du, dr.fma(du, g, e), 1))

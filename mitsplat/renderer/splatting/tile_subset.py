@@ -1,4 +1,4 @@
-"""Some tiles of a view: their numbers, and how many of them lie in a part of it."""
+"""Subsets of a view's tiles, with counts of their members in rectangles of tiles."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from mitsplat.renderer.rays.camera_rays import CameraView
 
 @dataclass(frozen=True, eq=False)
 class TileSubset:
-    """Tiles of a view that are looked at apart from all others.
+    """Subset of a view's tiles that is processed separately.
 
     Attributes:
-        number: Theirs in the view, ascending.
-        count: How many they are.
-        before: How many of them lie before each of the view's tiles, and of all.
-        above: How many lie above and to the left of each corner of the view's tiles, row by row (Crow 1984,
+        number: Tile numbers in the view, ascending.
+        count: Number of tiles.
+        before: Number of subset tiles before each tile of the view; the last entry is the total.
+        above: Number of subset tiles above and to the left of each tile corner of the view, row by row (Crow 1984,
             "Summed-area tables for texture mapping").
-        columns: Corners in a row.
+        columns: Number of corners in a row.
     """
 
     number: Any
@@ -33,7 +33,7 @@ class TileSubset:
 
     @classmethod
     def of(cls, flags: Any, view: CameraView) -> TileSubset:
-        """Those of a view's tiles that are flagged (Bool)."""
+        """Create the subset of a view's tiles that are flagged (Bool)."""
         columns, rows = view.tiles_x + 1, view.tiles_y + 1
         number = dr.compress(flags)
         corner = dr.arange(mi.UInt32, columns * rows)
@@ -42,7 +42,8 @@ class TileSubset:
         tile = y * view.tiles_x + x
         inside = (x < view.tiles_x) & (y < view.tiles_y)
         flag = dr.select(dr.gather(mi.Bool, flags, tile, inside), mi.UInt32(1), 0)
-        # Sums along the rows of corners, then along their columns: whole sums, less those at the line's start.
+        # Prefix sums along the rows of corners, then along their columns; the sum at the start of each line is
+        # subtracted.
         running = dr.prefix_sum(flag)
         along = running - dr.gather(mi.UInt32, running, y * columns)
         across = x * rows + y
@@ -60,7 +61,7 @@ class TileSubset:
         return cls(number, dr.width(number), before, above, columns)
 
     def halves(self, view: CameraView) -> tuple[TileSubset, TileSubset]:
-        """The first and the second half of them."""
+        """Split the subset into its first and second half."""
         middle, tiles = self.count // 2, dr.width(self.before) - 1
         flags = [dr.zeros(mi.Bool, tiles) for _ in range(2)]
         place = dr.arange(mi.UInt32, self.count)
@@ -70,7 +71,7 @@ class TileSubset:
         return first, second
 
     def any_in(self, x0: Any, x1: Any, y0: Any, y1: Any, active: Any = True) -> Any:
-        """Whether there are any in half-open ranges of columns and rows."""
+        """Return True for half-open ranges of columns and rows that contain a tile of the subset."""
 
         def above(x: Any, y: Any) -> Any:
             return dr.gather(mi.UInt32, self.above, y * self.columns + x, active)
@@ -78,20 +79,20 @@ class TileSubset:
         return above(x1, y1) + above(x0, y0) > above(x0, y1) + above(x1, y0)
 
     def among(self, begin: Any, size: Any) -> tuple[Any, Any]:
-        """Place of the first, and number, of those among ``size`` consecutive tiles from ``begin`` on."""
+        """Return first place and number of the subset's tiles among ``size`` consecutive tiles from ``begin`` on."""
         first = dr.gather(mi.UInt32, self.before, begin)
         return first, dr.gather(mi.UInt32, self.before, begin + size) - first
 
 
 @dataclass(frozen=True, eq=False)
 class TileBox:
-    """All tiles of a view in a box of them, as :class:`TileSubset` that need no tables.
+    """Box of a view's tiles: a :class:`TileSubset` that needs no tables.
 
     Attributes:
-        number: Theirs in the view, ascending.
-        count: How many they are.
-        left, top, columns: Its first column and row, and its columns, as opaque values.
-        across: The view's columns.
+        number: Tile numbers in the view, ascending.
+        count: Number of tiles.
+        left, top, columns: First column, first row and number of columns, as opaque values.
+        across: Number of the view's columns.
     """
 
     number: Any
@@ -103,7 +104,7 @@ class TileBox:
 
     @classmethod
     def around(cls, boxes: Any, view: CameraView) -> TileBox:
-        """The smallest around half-open ranges (x0, x1, y0, y1), four numbers each, none of which is empty."""
+        """Create the smallest box around non-empty half-open ranges (x0, x1, y0, y1), four numbers each."""
         x0, x1, y0, y1 = dr.gather(mi.Array4u, boxes, dr.arange(mi.UInt32, dr.width(boxes) // 4))
         ends = np.array(dr.concat([dr.min(x0), dr.max(x1), dr.min(y0), dr.max(y1)])).tolist()
         left, right, top, bottom = (int(end) for end in ends)
@@ -115,6 +116,6 @@ class TileBox:
         return cls(number, dr.width(number), first_column, first_row, columns, view.tiles_x)
 
     def among(self, begin: Any, size: Any) -> tuple[Any, Any]:
-        """Place of the first, and number, of ``size`` consecutive tiles in the box from ``begin`` on."""
+        """Return first place and number of ``size`` consecutive tiles in the box from ``begin`` on."""
         row = begin // self.across
         return (row - self.top) * self.columns + (begin - row * self.across - self.left), size

@@ -1,9 +1,9 @@
-"""From clouds of Gaussians to depth-sorted lists per image tile, all on the device.
+"""Depth-sorted lists of Gaussians per image tile, built on the device.
 
-1. *Cull* every Gaussian of every placement by the exact screen box of its cut-off ellipsoid (one kernel). 2. *Project*
-what is left to view records (one kernel), see :mod:`mitsplat.renderer.splatting.projection`. On a GPU, both at once. 3.
-*Pair* each with the tiles that its cut-off ellipse really meets, see
-   :mod:`mitsplat.renderer.splatting.pairs`.
+1. *Cull* every Gaussian of every placement by the exact screen box of its cut-off ellipsoid (one kernel).
+2. *Project* the others to view records (one kernel), see :mod:`mitsplat.renderer.splatting.projection`. On a GPU, one
+kernel does both.
+3. *Pair* each record with the tiles that its cut-off ellipse intersects, see :mod:`mitsplat.renderer.splatting.pairs`.
 4. *Sort* the pairs by tile and by depth there, see :mod:`mitsplat.renderer.splatting.tile_depths`.
 """
 
@@ -27,7 +27,7 @@ from mitsplat.renderer.splatting.tile_depths import DEPTH_BITS, depth_of_level, 
 from mitsplat.renderer.splatting.tile_subset import TileBox, TileSubset
 
 AT_ONCE = 1 << 22
-"""Most Gaussians that are projected without a look at which of them are seen: records take 84 bytes each."""
+"""Largest number of Gaussians that are projected without prior culling; records take 84 bytes each."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,18 +37,18 @@ class TileLists:
     Attributes:
         records: View records, see :data:`mitsplat.renderer.splatting.gaussian.RECORD`.
         near: Coefficients of :func:`mitsplat.renderer.splatting.gaussian.general_response`, 16 floats each, of the
-        Gaussians that
-            reach the camera's plane, or None; their records hold -1 for A and the row's number for u0.
+            Gaussians that reach the camera's plane; None if there are none. Records of these Gaussians hold -1 for A
+            and the row number for u0.
         entries: Record numbers, tile after tile.
-        slots: Place of every entry if they were sorted by record number instead; of lists that are for gradients.
-        first: First of those places of each record, and the number of entries; of the same.
+        slots: Position of every entry in the order by record number; for gradients only.
+        first: First of those positions of each record, followed by the number of entries; for gradients only.
         nearest: Least depth [m] that an entry's peak can have in its tile, ascending per tile; for the order per ray.
         start, stop: Range of each tile in ``entries``.
         visible, pairs: Number of records and of entries.
-        instance: Id of all of them, or None if they have several.
-        levels: What entries are sorted by in their tile.
-        tiles: Numbers of the tiles whose ranges these are; None for all of the view's.
-        least: Depth [m] in front of which no peak of each record lies, for tiles that are sorted again.
+        instance: Instance id of all entries; None if there are several.
+        levels: Sort keys of entries within their tile.
+        tiles: Numbers of the tiles that have ranges; None for all tiles of the view.
+        least: Depth [m] in front of which the peak of a record cannot lie, for tiles that are sorted again.
     """
 
     records: Any
@@ -79,21 +79,21 @@ def bin_gaussians(
     groups: Any | None = None,
     for_gradients: bool = False,
 ) -> TileLists:
-    """Tile lists of all placements seen by one camera, for a view from :meth:`View.sampled`.
+    """Build the tile lists of all placements for a view from :meth:`View.sampled`.
 
     Args:
         clouds: Gaussians on the device.
-        placements: Where they are.
+        placements: Poses of the clouds.
         view: The camera.
         quality: Order, cut-offs and kernel.
-        at_camera: Whether Gaussians that reach the camera's plane are seen.
-        chosen: The only tiles that have lists; all of the view's if None.
-        fitted: Whether only the tiles in a box around all that is seen have lists.
-        groups: By instance id, a number below 2^DEPTH_BITS that its entries have for a level, instead of their depth.
-        for_gradients: Whether entries are to be known by record too.
+        at_camera: True if Gaussians that reach the camera's plane are visible.
+        chosen: Subset of tiles that have lists; None for all tiles of the view.
+        fitted: True if only the tiles in a box around all visible Gaussians have lists.
+        groups: A number below 2^DEPTH_BITS by instance id, which replaces the depth level of its entries.
+        for_gradients: True if entries are also indexed by record.
 
     Raises:
-        CrowdedError: If the view has too many pairs to hold.
+        CrowdedError: If the view has too many pairs.
     """
     table, owner, local = placement_table(clouds, placements, view)
     if dr.width(local) == 0:
@@ -124,9 +124,9 @@ def bin_gaussians(
 
 
 def _at_once(count: int) -> bool:
-    """Whether so many Gaussians are projected before it is known which are seen.
+    """Return True if ``count`` Gaussians are projected without prior culling.
 
-    On a GPU, that takes less time than to wait for the number of them, and to trace what comes then.
+    On a GPU, this takes less time than waiting for the number of visible Gaussians and tracing the next kernels.
     """
     return dr.backend_v(mi.Float) == dr.JitBackend.CUDA and count <= AT_ONCE
 
@@ -144,12 +144,13 @@ def bin_records(
     groups: Any | None = None,
     for_gradients: bool = False,
 ) -> TileLists:
-    """Tile lists of view records, from least depths and boxes of tiles; ``only`` is the id of all, if there is one.
+    """Build tile lists from view records, least depths and tile boxes.
 
-    ``groups`` are as of :func:`mitsplat.renderer.splatting.pairs.pair_records`.
+    ``only`` is the instance id of all records, or None if there are several. ``groups`` are as in
+    :func:`mitsplat.renderer.splatting.pairs.pair_records`.
 
     Raises:
-        CrowdedError: If there are too many pairs to hold.
+        CrowdedError: If there are too many pairs.
     """
     pairs = pair_records(dr.detach(records), near, least, box, view, quality, chosen, for_gradients, groups)
     if pairs is None:
@@ -169,9 +170,9 @@ def _listed(
     only: int | None,
     own: Any = None,
 ) -> TileLists:
-    """Lists of pairs by tile and depth. Levels and least depths are evaluated where they are used."""
+    """Sort pairs by tile and depth into lists. Levels and least depths are evaluated on use."""
     count = dr.width(pairs.key)
-    # As many bits as numbers of all tiles have, so that lists of a few need no kernels of their own.
+    # The number of bits is that of all tiles, so that lists of a subset reuse the kernels.
     key = _sorted(pairs.key, DEPTH_BITS + max(1, (view.tiles_x * view.tiles_y - 1).bit_length()))
     number, tile = mi.UInt32(key & ((1 << NUMBER_BITS) - 1)), dr.arange(mi.UInt32, tiles)
     slots, entries = (None, number) if pairs.record is None else (number, dr.gather(mi.UInt32, pairs.record, number))
@@ -198,7 +199,7 @@ def _listed(
 
 
 def _numbered(view: CameraView, chosen: TileSubset | TileBox | None) -> tuple[int, Any]:
-    """How many tiles have lists, and their numbers in the view unless they are all of it."""
+    """Return the number of tiles with lists, and their numbers in the view (None for all tiles)."""
     return (view.tiles_x * view.tiles_y, None) if chosen is None else (chosen.count, chosen.number)
 
 
@@ -214,10 +215,10 @@ def _empty(view: CameraView, chosen: TileSubset | TileBox | None, records: Any |
 
 
 def merge_lists(first: TileLists, second: TileLists, tiles: Any, view: CameraView) -> TileLists:
-    """The lists of some tiles of a view with the Gaussians of both, as if they had been binned together.
+    """Merge two lists in some tiles of a view, as if their Gaussians had been binned together.
 
     Raises:
-        CrowdedError: If there are too many pairs to hold.
+        CrowdedError: If there are too many pairs.
     """
     visible = dr.width(first.records) // RECORD
     both = [p for p in (_pairs_in(first, tiles, 0), _pairs_in(second, tiles, visible)) if p is not None]
@@ -225,7 +226,7 @@ def merge_lists(first: TileLists, second: TileLists, tiles: Any, view: CameraVie
     dr.eval(pairs.key)
     records, near = second.records, second.near
     if near is not None and first.near is not None:
-        # The rows of the second follow those of the first.
+        # The rows of the second list follow those of the first.
         row, before = dr.arange(mi.UInt32, second.visible) * RECORD, dr.opaque(mi.Float, dr.width(first.near) // RECORD)
         shifted, at_camera = dr.copy(records), dr.gather(mi.Float, records, row + 2) < 0
         dr.scatter(shifted, dr.gather(mi.Float, records, row) + before, row, at_camera)
@@ -237,7 +238,7 @@ def merge_lists(first: TileLists, second: TileLists, tiles: Any, view: CameraVie
 
 
 def some_tiles(lists: TileLists, chosen: Any) -> TileLists:
-    """The lists of some tiles by their places, as they are."""
+    """Return the unchanged lists of some tiles, given by their places."""
     tiles = chosen if lists.tiles is None else dr.gather(mi.UInt32, lists.tiles, chosen)
     start, stop = dr.gather(mi.UInt32, lists.start, chosen), dr.gather(mi.UInt32, lists.stop, chosen)
     dr.eval(tiles, start, stop)
@@ -245,7 +246,7 @@ def some_tiles(lists: TileLists, chosen: Any) -> TileLists:
 
 
 def in_ray_order(lists: TileLists, chosen: Any, view: CameraView) -> TileLists:
-    """Some tiles of a view by their places in ``lists``, none of them empty, sorted for the order per ray."""
+    """Sort some non-empty tiles, given by their places in ``lists``, for the order per ray."""
     place, _, number = cast("tuple[Any, Any, Any]", _pairs_in(lists, chosen, 0))
     tiles = chosen if lists.tiles is None else dr.gather(mi.UInt32, lists.tiles, chosen)
     record = dr.gather(mi.ArrayXf, dr.detach(lists.records), number, shape=(RECORD, dr.width(number)))
@@ -257,7 +258,10 @@ def in_ray_order(lists: TileLists, chosen: Any, view: CameraView) -> TileLists:
 
 
 def _pairs_in(lists: TileLists, tiles: Any, shift: int) -> tuple[Any, Any, Any] | None:
-    """Places in ``tiles``, levels, and records (from ``shift`` on) of the entries of some tiles; None if none."""
+    """Return the entries of some tiles as places in ``tiles``, levels, and record numbers plus ``shift``.
+
+    Returns None if there are no entries.
+    """
     start = dr.gather(mi.UInt32, lists.start, tiles)
     length = dr.gather(mi.UInt32, lists.stop, tiles) - start
     begin, size = prefix_ranges(length, lists.pairs)
@@ -279,9 +283,9 @@ def _pairs_in(lists: TileLists, tiles: Any, shift: int) -> tuple[Any, Any, Any] 
 
 
 def _sorted(key: Any, bits: int) -> Any:
-    """Keys (UInt64, evaluated) of pairs by their leading ``bits``, above their numbers, by which they ascend already.
+    """Sort the keys of pairs (UInt64, evaluated) by their leading ``bits``; the numbers below already ascend.
 
-    On most CPUs NumPy sorts several of them with each instruction, in their own memory.
+    On most CPUs, NumPy sorts them in place with vector instructions.
     """
     if dr.backend_v(key) == dr.JitBackend.LLVM and not numpy_sorts_slowly():
         sort_in_threads(key.numpy(), min(8, max(1, dr.thread_count() // 2)))
@@ -292,7 +296,7 @@ def _sorted(key: Any, bits: int) -> Any:
 
 
 def _first_entries(key: Any, tiles: int) -> Any:
-    """Number of the first entry of every tile, and of all entries, by bisection of sorted keys."""
+    """Return the number of the first entry of every tile, and of all entries, by bisection of sorted keys."""
     wanted = Pairs.key_of(dr.arange(mi.UInt32, tiles + 1), mi.UInt32(0), mi.UInt32(0))
     pairs = dr.opaque(mi.UInt32, dr.width(key))
 

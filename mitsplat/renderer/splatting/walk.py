@@ -1,9 +1,8 @@
-"""Walks: rays go through their tiles' lists front to back, and blend what they meet.
+"""Traversal of tile lists: rays visit Gaussians front to back and blend them.
 
-What a ray keeps of that is up to the caller: its state is a list of numbers whose first is the transmittance, and a
-function makes the next state of one and a Gaussian. One lane may carry several rays of a tile, because fetching a
-record costs several times more than evaluating it for a packet of rays: the more rays share a fetch, the better, until
-registers run out.
+The caller defines the state of a ray: a list of numbers, the first of which is the transmittance. A function returns
+the next state from a state and a Gaussian. One lane may carry several rays of a tile, because fetching a record costs
+several times more than evaluating it for a packet of rays. More rays per fetch are faster until registers run out.
 """
 
 from __future__ import annotations
@@ -22,43 +21,44 @@ from mitsplat.renderer.splatting.gaussian import RECORD, general_depth
 from mitsplat.renderer.splatting.tiles import TileLists
 
 SORT_SLOTS = 8
-"""Gaussians that the per-ray order collects in one walk over a part of a list."""
+"""Number of Gaussians that the order per ray collects in one walk over a part of a list."""
 
 WINDOW_SLOTS = 8
-"""Gaussians of a list that a ray holds back until it knows which of them comes first."""
+"""Number of Gaussians of a list that a ray holds back for sorting."""
 
 Pixel = list[Any]
 """State of a ray, the transmittance first."""
 
 Blend = Callable[[Pixel, Any, Any, Any], Pixel]
-"""The state of a ray after one more Gaussian in front-to-back order: from the state, the Gaussian's opacity on the
-ray, its record, of which colour and instance may be asked for, and the depth of its peak. An opacity of 0 changes
-nothing."""
+"""Function that returns the state of a ray after one more Gaussian in front-to-back order. Arguments: state, opacity of
+the Gaussian on the ray, its record (for colour and instance), and depth of its peak. An opacity of 0 leaves the state
+unchanged.
+"""
 
 
 def rows_together(order: Order) -> int:
-    """Pixels of a column that a lane carries, of a walk in an order.
+    """Return the number of pixels of a column that one lane carries in a walk of an order.
 
-    A GPU has lanes enough for a ray each, and those of a warp fetch the same record then: the march takes 0.6 of the
-    time that it does with four. The orders of rays hold too many numbers for more than one.
+    A GPU has enough lanes for one ray each, and the lanes of a warp fetch the same record. The march takes 0.6 of the
+    time of four rays per lane. The orders per ray need too many registers for more than one ray.
     """
     return TILE_HEIGHT if order == "tile" and dr.backend_v(mi.Float) == dr.JitBackend.LLVM else 1
 
 
 class Lanes:
-    """Which pixels each lane carries: one or more of a column of a tile.
+    """Mapping from lanes to pixels: each lane carries one or more pixels of a column of a tile.
 
     Attributes:
-        pixel: Number of each of the lane's pixels, row-major.
-        inside: Whether it is in the image.
-        count: Of all pixels.
+        pixel: Row-major number of each pixel of the lane.
+        inside: True if the pixel is in the image.
+        count: Number of all pixels.
         start, stop: Range of the tile's list.
     """
 
     def __init__(self, lists: TileLists, view: CameraView, rows: int = TILE_HEIGHT, *, apart: bool = False) -> None:
-        """Lanes of ``rows`` pixels each, a divisor of a tile's height.
+        """Assign ``rows`` pixels (a divisor of the tile height) to each lane.
 
-        Tiles that are taken ``apart`` from their view have pixels of their own, tile after tile and row by row.
+        With ``apart``, pixels are numbered tile after tile and row by row in each tile, instead of by the image.
         """
         count = view.tiles_x * view.tiles_y if lists.tiles is None else dr.width(lists.tiles)
         per_tile = TILE_PIXELS // rows
@@ -80,7 +80,7 @@ class Lanes:
         self.stop = dr.select(self.inside[0], dr.gather(mi.UInt32, lists.stop, own), self.start)
 
     def centre_slopes(self) -> tuple[list[Any], list[Any]]:
-        """Slopes u and v of the rays through the pixels' centres; those of a distorted view are in memory."""
+        """Return slopes u and v of the rays through pixel centres; those of a distorted view are stored in memory."""
         if not self.view.distortion:
             return self.slopes(0.5, 0.5)
         number = dr.arange(mi.UInt32, self.view.width * self.view.height)
@@ -91,31 +91,31 @@ class Lanes:
         return [dr.gather(mi.Float, u, p, m) for p, m in places], [dr.gather(mi.Float, v, p, m) for p, m in places]
 
     def image(self, kind: Any, values: list[Any]) -> Any:
-        """Row-major array of type ``kind`` of a value for each of the lane's pixels."""
+        """Return a row-major array of type ``kind`` from one value per pixel of the lane."""
         target = dr.empty(kind, self.count)
         for value, number, mask in zip(values, self.pixel, self.inside, strict=True):
             dr.scatter(target, kind(value), number, mask, mode=dr.ReduceMode.Permute)
         return target
 
     def slopes(self, dx: Any, dy: Any) -> tuple[list[Any], list[Any]]:
-        """Slopes u and v of the rays at (dx, dy) in the lane's pixels."""
+        """Return slopes u and v of the rays at offset (dx, dy) in the lane's pixels."""
         pairs = [self.view.slopes(mi.Float(self.x) + dx, mi.Float(self.y + k) + dy) for k in range(self.rows)]
         return [u for u, _ in pairs], [v for _, v in pairs]
 
 
 @dataclass(frozen=True, eq=False)
 class Rays:
-    """Rays of some lanes, several each, which share a list.
+    """Rays of lanes, several per lane, that share a tile list.
 
     Attributes:
         lists: Depth-sorted Gaussians per tile.
         us, vs: Slopes of a lane's rays.
-        far: Depths along z [m] beyond which they see nothing.
+        far: Depths along z [m] behind which Gaussians are not visible.
         start, stop: Range of the lane's list.
-        near: Nearest depth that is seen [m].
-        cut, cap: Least and highest opacity that counts (log2); None for no highest.
+        near: Smallest visible depth [m].
+        cut, cap: Smallest and largest opacity that counts (log2); None for no largest.
         end: Transmittance at which a ray ends.
-        column: Whether the slopes ``us`` of a lane are all the same.
+        column: True if all rays of a lane have the same slope ``us``.
     """
 
     lists: TileLists
@@ -141,7 +141,7 @@ class Rays:
         start: Any,
         stop: Any,
     ) -> Rays:
-        """Rays of a view that see as a quality says."""
+        """Create the rays of a view with the limits of a quality."""
         highest = KERNELS[quality.kernel].alpha_max
         return cls(
             lists,
@@ -157,7 +157,7 @@ class Rays:
         )
 
     def respond(self, record: Any) -> list[tuple[Any, Any]]:
-        """(log2 of opacity along the ray, depth of the peak) of one Gaussian on the rays of each lane."""
+        """Return (log2 of the opacity along the ray, depth of the peak) of one Gaussian per lane, for each ray."""
         return respond_along(record, self.lists, self.us, self.vs, self.column, self.cap)
 
 
@@ -168,14 +168,14 @@ def walk(
     blend: Blend,
     going: Callable[[list[Pixel]], Any] | None = None,
 ) -> list[Pixel]:
-    """States of the rays at their ends, in the order of their tile's list, of their own peaks, or between the two.
+    """Return the final states of rays: in the order of the tile's list, of their own peaks, or with a window.
 
     Args:
         rays: The rays.
-        order: As of :class:`mitsplat.quality.Quality`.
-        fresh: Makes the state of a ray that has met nothing.
-        blend: What Gaussians add to it.
-        going: Whether lanes go on, by the states of their rays; for the order of the tile's list.
+        order: As in :class:`mitsplat.quality.Quality`.
+        fresh: Function that returns the initial state of a ray.
+        blend: Function that blends one Gaussian.
+        going: Function from the states of a lane's rays to True if the lane continues; for the order per tile.
     """
     if order == "tile":
         return _walk_in_tile_order(rays, fresh, blend, going)
@@ -183,20 +183,20 @@ def walk(
 
 
 def largest(values: Sequence[Any]) -> Any:
-    """Of the values of a lane's rays, none of them NaN, by which the lane knows when it is done."""
+    """Return the maximum over the values of a lane's rays, none of which is NaN."""
     return reduce(lambda a, b: dr.select(a > b, a, b), values)
 
 
 def faintest(quality: Quality) -> Any:
-    """Logarithm to base 2 of the opacity below which a response does not count, one that :func:`exp2` takes."""
+    """Return log2 of the smallest opacity that counts, limited to the domain of :func:`exp2`."""
     return dr.maximum(dr.log2(dr.opaque(mi.Float, quality.alpha_min)), -126)
 
 
 def exp2(x: Any) -> Any:
-    """2^x from -126 to 126, by less than 2e-7 of it; anything beyond that.
+    """Compute 2^x for x in [-126, 126] with relative error below 2e-7; the result is undefined outside.
 
-    On a CPU by the nearest whole number, which is added to the exponent, and a polynomial of the rest, that is 1 at 0:
-    half of the instructions of Dr.Jit's own, which knows no limits. A GPU has one instruction for it.
+    On a CPU, the nearest integer is added to the exponent, and a polynomial that is 1 at 0 covers the remainder. This
+    takes half of the instructions of Dr.Jit's own function, which has no limits. A GPU has one instruction for it.
     """
     if dr.backend_v(x) == dr.JitBackend.CUDA:
         return dr.exp2(x)
@@ -210,15 +210,15 @@ def exp2(x: Any) -> Any:
 
 
 _ROUNDS = 1.5 * 2.0**23
-"""What is added to this has the place of its ones at the end of its bits."""
+"""Float whose addition rounds a number to an integer, stored in the low bits of the sum."""
 
 _EXP2 = 1.0, 0.69314700, 0.24022242, 0.055507336, 0.0096715130, 0.0013264727
-"""Coefficients of the powers of x of 2^x between -1/2 and 1/2, of least relative error."""
+"""Polynomial coefficients of 2^x on [-1/2, 1/2] with the smallest relative error."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Fields:
-    """Fields of the records of that number, fetched where they are asked for: rays of a lane meet different ones."""
+    """Record fields that are fetched on access, because the rays of a lane blend different records."""
 
     records: Any
     number: Any
@@ -231,7 +231,7 @@ class _Fields:
 def respond_along(
     record: Any, lists: TileLists, us: list[Any], vs: list[Any], shared_column: bool, cap: Any | None
 ) -> list[tuple[Any, Any]]:
-    """(log2 of opacity along the ray, depth of the peak) of one Gaussian on several rays, as in module `gaussian`."""
+    """Return (log2 of the opacity along the ray, peak depth) of a Gaussian on several rays, see `gaussian`."""
     u0, v0, a, b2, c, opacity, _, _, _, depth, e, f, g, h, i, _ = record
     result: list[Any] = []
     previous: Any = None
@@ -260,7 +260,7 @@ def respond_along(
         result, _ = dr.if_stmt(
             (result, u0), a < 0, at_the_camera, lambda result, row: (result, row), label="gaussian at the camera"
         )
-    # Rounding can lift the response of a needle over its peak, by any factor.
+    # Rounding can raise the response of a needle-shaped Gaussian above its peak by any factor.
     most = opacity if cap is None else dr.minimum(opacity, cap)
     log_alphas = [dr.select(log_alpha > most, most, log_alpha) for log_alpha in result[0::2]]
     return list(zip(log_alphas, result[1::2], strict=True))
@@ -269,7 +269,7 @@ def respond_along(
 def _walk_in_tile_order(
     rays: Rays, fresh: Callable[[], Pixel], blend: Blend, going: Callable[[list[Pixel]], Any] | None
 ) -> list[Pixel]:
-    """Blend in the order of the tile's list: that of the peaks along one of its rays."""
+    """Blend in the order of the tile's list, which is that of the peaks along one of the tile's rays."""
     lists, far, near, cut, end = rays.lists, rays.far, rays.near, rays.cut, rays.end
 
     def body(i: Any, pixels: list[Pixel]) -> tuple[Any, list[Pixel]]:
@@ -293,17 +293,17 @@ def _walk_in_tile_order(
 
 
 def _walk_in_window(rays: Rays, fresh: Callable[[], Pixel], blend: Blend) -> list[Pixel]:
-    """Blend in the order of the tile's list, but for what a window can put right.
+    """Blend in the order of the tile's list, corrected by a sorting window.
 
-    A ray holds back the last :data:`WINDOW_SLOTS` Gaussians that it met, sorted by their peaks along it, and blends the
-    first one when another comes. What is more places too late in the list than that is blended late.
+    A ray holds back its last :data:`WINDOW_SLOTS` Gaussians, sorted by their peaks along the ray. It blends the first
+    one when another arrives. A Gaussian that is more places too late in the list is blended late.
     """
     lists, far, near, cut, end = rays.lists, rays.far, rays.near, rays.cut, rays.end
 
     def push(pixel: Pixel, window: _Slots, z: Any, alpha: Any, number: Any) -> tuple[Pixel, _Slots]:
         result: _Slots = []
         for slot_z, slot_alpha, slot_number in reversed(window):
-            # Whatever lies in front of the new peak, or is its equal, moves forward by one.
+            # Peaks in front of the new one, or equal to it, move forward by one slot.
             deeper = z >= slot_z
             result.insert(
                 0,
@@ -330,7 +330,7 @@ def _walk_in_window(rays: Rays, fresh: Callable[[], Pixel], blend: Blend) -> lis
             states.append(dr.if_stmt(state, hit, push, lambda pixel, window, *_: (pixel, window), label="push"))
         return i + 1, [pixel for pixel, _ in states], [window for _, window in states]
 
-    # An empty slot lies in front of all peaks, and nothing is seen of it.
+    # An empty slot has depth 0, in front of all peaks, and opacity 0.
     empty = [[(mi.Float(0), mi.Float(0), mi.UInt32(0)) for _ in range(WINDOW_SLOTS)] for _ in far]
     state = mi.UInt32(rays.start), [fresh() for _ in far], empty
     _, pixels, windows = dr.while_loop(state, alive, body, label="march in a window")
@@ -346,9 +346,10 @@ def _walk_in_window(rays: Rays, fresh: Callable[[], Pixel], blend: Blend) -> lis
 def _walk_in_ray_order(rays: Rays, fresh: Callable[[], Pixel], blend: Blend) -> list[Pixel]:
     """Blend in the exact order of the peaks along each ray.
 
-    Every walk collects the next :data:`SORT_SLOTS` peaks behind the last one blended. It ends where no later entry can
-    have a peak in front of those, and the next one begins at the first entry that found no slot: a walk sees a short
-    part of the list, and any number of Gaussians in any order comes out right. Equal depths keep the list's order.
+    Each walk collects the next :data:`SORT_SLOTS` peaks behind the last one blended. It ends where no later entry can
+    have a peak in front of those. The next walk begins at the first entry that found no slot. Each walk therefore
+    covers a short part of the list, and any number of Gaussians in any order is blended correctly. Equal depths keep
+    the list's order.
     """
     lists, start, stop, far = rays.lists, rays.start, rays.stop, rays.far
     near, cut, end = rays.near, rays.cut, rays.end
@@ -356,11 +357,11 @@ def _walk_in_ray_order(rays: Rays, fresh: Callable[[], Pixel], blend: Blend) -> 
     none = 0xFFFFFFFF
 
     def insert(slots: _Slots, left: Any, z: Any, alpha: Any, i: Any) -> tuple[_Slots, Any]:
-        """Slots in order of depth with one more peak, and the first entry that was left without."""
+        """Return the depth-sorted slots with one more peak, and the first entry that found no slot."""
         result: _Slots = []
         behind = mi.Bool(False)
         for slot_z, slot_alpha, slot_i in slots:
-            # Whatever lies behind the new peak moves on by one, also among equals: they keep their order.
+            # Peaks behind the new one move back by one slot; equal depths keep their order.
             behind |= z < slot_z
             result.append((dr.minimum(z, slot_z), dr.select(behind, alpha, slot_alpha), dr.select(behind, i, slot_i)))
             z, alpha, i = dr.maximum(z, slot_z), dr.select(behind, slot_alpha, alpha), dr.select(behind, slot_i, i)
@@ -381,7 +382,7 @@ def _walk_in_ray_order(rays: Rays, fresh: Callable[[], Pixel], blend: Blend) -> 
             for (log_alpha, z), own, first_left, z_far, (last_z, last_i) in zip(
                 responses, slots, left, far, last, strict=True
             ):
-                # An entry that no walk has seen counts wherever it lies: rounding may put it in front of its bound.
+                # An entry not visited before always counts, because rounding may put its peak in front of its bound.
                 new = (z > last_z) | ((z == last_z) & (i > last_i)) | (i >= seen)
                 hit = (log_alpha > cut) & (z > near) & (z < z_far) & new
                 own, first_left = dr.if_stmt(
@@ -412,9 +413,9 @@ def _walk_in_ray_order(rays: Rays, fresh: Callable[[], Pixel], blend: Blend) -> 
                 found = active & (z < dr.inf) & (pixel[0] > end)
                 number = dr.gather(mi.UInt32, lists.entries, i, found)
                 record = _Fields(lists.records, number, found)
-                z = dr.select(found, z, 0.0)  # an empty slot lies at infinity, which no weight makes 0
+                z = dr.select(found, z, 0.0)  # an empty slot lies at infinity, and 0 * inf is NaN
                 pixel = blend(pixel, dr.select(found, alpha, 0.0), record, z)
-            # A ray that has ended takes nothing more: no peak lies behind infinity.
+            # A ray that has ended gets infinity as its last depth, behind which no peak lies.
             open_ray = pixel[0] > end
             z, _, i = own[-1]
             last_i = dr.select(z < last_z, last_i, i)
@@ -436,4 +437,4 @@ def _walk_in_ray_order(rays: Rays, fresh: Callable[[], Pixel], blend: Blend) -> 
 
 
 _Slots = list[tuple[Any, Any, Any]]
-"""Peaks in order of depth: depth, opacity and entry."""
+"""Depth-sorted peaks: depth, opacity and entry."""

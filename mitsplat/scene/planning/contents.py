@@ -1,6 +1,6 @@
-"""What a layout holds, before anything says where it lies: its split, whether it is empty, and which objects are drawn.
+"""Contents of a layout: the drawn objects and the regions in which they start.
 
-The seed and the layout's index decide it: any worker may ask for any layout in any order.
+The seed and the index of the layout determine the contents. Any worker can therefore draw any layout in any order.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from mitsplat.scene.splits import is_empty, split_of
 
 
 def draw_objects(scene: Scene, layout: int) -> tuple[tuple[int, ...], tuple[Float64Array | None, ...]]:
-    """Which of the scene's assets each object of a layout is of, and the pose that the file gives it, if any."""
+    """Return, for each object of a layout, the index of its asset and the pose that the scene file states, or None."""
     assets: list[int] = []
     given: list[Float64Array | None] = []
     for position, (entry, count) in enumerate(zip(scene.spec.objects, _counts(scene.spec, layout), strict=True)):
@@ -35,7 +35,7 @@ def draw_objects(scene: Scene, layout: int) -> tuple[tuple[int, ...], tuple[Floa
 
 
 def draw_regions(spec: SceneSpec, layout: int) -> tuple[int, ...]:
-    """Which of the regions each object of a layout starts in, drawn by floor area among those of its entry."""
+    """Return the index of the start region of each object, drawn by floor area among the regions of its entry."""
     areas = np.array([np.prod(np.subtract(region.max, region.min)[:2]) for region, _ in spec.all_regions])
     found: list[int] = []
     for position, (entry, count) in enumerate(zip(spec.objects, _counts(spec, layout), strict=True)):
@@ -46,7 +46,7 @@ def draw_regions(spec: SceneSpec, layout: int) -> tuple[int, ...]:
 
 
 def _counts(spec: SceneSpec, layout: int) -> list[int]:
-    """How many objects of each entry a layout has."""
+    """Return the number of objects of each entry in a layout."""
     counts = random_stream(spec.seed, "object counts", layout)
     drawn = [(len(entry.poses), int(counts.integers(*entry.count, endpoint=True))) for entry in spec.objects]
     empty, held_out = is_empty(spec, layout), _held_out(spec, layout)
@@ -57,14 +57,14 @@ def _counts(spec: SceneSpec, layout: int) -> list[int]:
 
 
 def _held_out(spec: SceneSpec, layout: int) -> frozenset[str]:
-    """Names of assets that a layout must not have, because they are for the test split alone."""
+    """Return the names of the assets that a layout must not contain because only the test split may."""
     if not spec.hold_out.assets or split_of(layout, spec.output.validation, spec.output.test) == "test":
         return frozenset()
     return frozenset(spec.hold_out.assets)
 
 
 def _draw_entry(scene: Scene, position: int, layout: int, count: int) -> list[int]:
-    """Assets of the objects of one entry."""
+    """Return the asset indices of the objects of one entry."""
     spec, entry, pool = scene.spec, scene.spec.objects[position], scene.pools[position]
     if len(pool) == 1:
         return [pool[0]] * count
@@ -89,7 +89,11 @@ def _draw_entry(scene: Scene, position: int, layout: int, count: int) -> list[in
 
 
 def _dealt(spec: SceneSpec, position: int, layout: int, count: int, kinds: int) -> list[int]:
-    """Classes of a layout's objects, from decks of one card for each class that are dealt out to a split's layouts."""
+    """Return the class of each object of a balanced entry in a layout.
+
+    The classes of a split form a sequence of random permutations. The layouts of the split take consecutive parts of
+    it.
+    """
     split = split_of(layout, spec.output.validation, spec.output.test)
     known = max(layout + 1, min(1 << layout.bit_length(), spec.output.layouts))
     first = int(_dealt_before(spec, position, known)[layout])
@@ -102,7 +106,7 @@ def _dealt(spec: SceneSpec, position: int, layout: int, count: int, kinds: int) 
 
 @lru_cache(maxsize=8)
 def _dealt_before(spec: SceneSpec, position: int, layouts: int) -> Int64Array:
-    """How many objects of an entry the earlier layouts of its split have, for each of the first layouts."""
+    """Return, for each of the first layouts, the number of objects of an entry in the earlier layouts of its split."""
     totals = dict.fromkeys(SPLITS, 0)
     before = np.zeros(layouts, dtype=np.int64)
     for layout in range(layouts):

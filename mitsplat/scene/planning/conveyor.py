@@ -1,7 +1,8 @@
-"""A belt that carries what lies on it from one moment of a layout to the next.
+"""Motion of objects on a conveyor belt between the views of a layout.
 
-Objects settle while the belt stands still; it then runs, and the cameras' turns are moments of its run, the middle of
-the first and the last of which shows the layout as it settled. What is above the belt moves with it as it lies.
+Objects settle while the belt stands still; then the belt runs. Each turn of the cameras is one moment of the run. At
+the middle between the first and the last moment, the layout is as it settled. Objects above the belt move with it
+rigidly.
 """
 
 from __future__ import annotations
@@ -24,18 +25,18 @@ if TYPE_CHECKING:
     from mitsplat.scene.layout import Layout
 
 _NEAR = 1e-3
-"""Distance from the belt's top within which a point that is seen is one of the belt [m]."""
+"""Maximum distance of a belt point from the top of the belt [m]."""
 
 
 @dataclass(frozen=True)
 class Belt:
-    """A conveyor's belt at a moment.
+    """Conveyor belt at one moment.
 
     Attributes:
-        box: The belt, which runs along its own x axis.
-        speed: Of its surface [m/s].
-        time: Since the layout was as it settled [s]; negative before.
-        interval: Until the next image of the layout [s]; 0 if that is of the same moment, or there is none.
+        box: Box of the belt, which runs along its own x axis.
+        speed: Speed of the belt surface [m/s].
+        time: Time since the moment at which the layout is as it settled [s]; negative before it.
+        interval: Time until the next image of the layout [s]; 0 if that shows the same moment, or if there is none.
     """
 
     box: Box
@@ -45,21 +46,21 @@ class Belt:
 
     @property
     def travel(self) -> float:
-        """How far it has run since the layout was as it settled [m]."""
+        """Distance that the belt has run since the moment at which the layout is as it settled [m]."""
         return self.speed * self.time
 
     @property
     def velocity(self) -> Float64Array:
-        """Of its surface in the world [m/s], shape (3,)."""
+        """Velocity of the belt surface in the world [m/s], shape (3,)."""
         return np.asarray(self.speed * stated_pose(self.box)[:3, 0])
 
     def shows(self, points: Float64Array) -> BoolArray:
-        """Which of some points (N, 3) in the world [m] lie on its upper side."""
+        """Return a mask of the world points (N, 3) [m] that lie on the upper side of the belt."""
         return _over(self.box, points, _NEAR)
 
 
 def _over(box: Box, points: Float64Array, height: float) -> BoolArray:
-    """Which of some points (N, 3) in the world [m] are above a box, up to a height [m]."""
+    """Return a mask of the world points (N, 3) [m] that are above a box, up to a height [m]."""
     pose, half = stated_pose(box), np.array(box.size) / 2
     x, y, z = ((points - pose[:3, 3]) @ pose[:3, :3]).T
     above: BoolArray = (z > half[2] - _NEAR) & (z < half[2] + height) & (abs(x) <= half[0]) & (abs(y) <= half[1])
@@ -67,7 +68,7 @@ def _over(box: Box, points: Float64Array, height: float) -> BoolArray:
 
 
 def belt_of(spec: SceneSpec, view: int) -> Belt | None:
-    """The belt at the moment of a view of a layout; all cameras of a turn look at the same moment."""
+    """Return the belt at the moment of a view of a layout. All cameras of one turn see the same moment."""
     if spec.conveyor is None:
         return None
     box = next(shape.box for shape in spec.shapes if shape.name == spec.conveyor.belt and shape.box is not None)
@@ -79,28 +80,31 @@ def belt_of(spec: SceneSpec, view: int) -> Belt | None:
 
 
 def carried(spec: SceneSpec, layout: Layout, view: int) -> Layout:
-    """A settled layout as it is at the moment of a view; poses that were given stay as they are.
+    """Return a settled layout at the moment of a view. Layouts with given poses are returned unchanged.
 
     Args:
-        spec: The scene, whose conveyor it is, if it has one.
-        layout: As it settled, or carried to another view.
-        view: Position of the view among the layout's.
+        spec: The scene, with or without a conveyor.
+        layout: The layout as it settled, or at the moment of another view.
+        view: Index of the view in the layout.
     """
     belt = belt_of(spec, view)
     return layout if belt is None else carried_by(belt, layout)
 
 
 def carried_by(belt: Belt, layout: Layout) -> Layout:
-    """A settled layout as it is at the moment of a belt; poses that were given stay as they are."""
+    """Return a settled layout at the moment of a belt. Layouts with given poses are returned unchanged."""
     settled = layout.settled or layout
-    if not settled.certificate.attempts:  # physics had no part in it
+    if not settled.certificate.attempts:  # without physics, poses are given
         return layout
     return _moved(settled, belt.box, tuple((belt.time * belt.velocity).tolist()))
 
 
 @lru_cache(maxsize=4)
 def _moved(settled: Layout, box: Box, by: Sequence[float]) -> Layout:
-    """The same object for all views of a moment, by which the renderer knows that nothing moved."""
+    """Return the layout with the carried objects moved by a vector [m].
+
+    The cache returns the identical layout for all views of a moment, so that the renderer can skip unchanged geometry.
+    """
     instances = []
     moving = carried_instances(settled, box)
     for instance in settled.instances:
@@ -113,7 +117,7 @@ def _moved(settled: Layout, box: Box, by: Sequence[float]) -> Layout:
 
 
 def carried_instances(layout: Layout, box: Box) -> frozenset[int]:
-    """Ids of the instances that a belt carries: those whose origin was above it when they had settled."""
+    """Return the ids of the instances that a belt carries: those whose origin was above it after settling."""
     settled = (layout.settled or layout).instances
     places = np.array([instance.world_from_object[:3, 3] for instance in settled]).reshape(-1, 3)
     above = _over(box, places, np.inf)
@@ -121,10 +125,10 @@ def carried_instances(layout: Layout, box: Box) -> frozenset[int]:
 
 
 def check_belt(spec: SceneSpec) -> None:
-    """Refuse a belt that would carry objects of a region beyond its end.
+    """Check that the belt is long enough to carry the objects of its regions.
 
     Raises:
-        InputError: With how long it must be.
+        InputError: If the belt is not below a region, or if it is too short; the message states the necessary length.
     """
     belt = belt_of(spec, 0)
     if belt is None:

@@ -1,7 +1,7 @@
-"""The lights of a frame: what their entries in the scene file leave open is drawn, and their paths are followed.
+"""Lights of a frame: random draws of their values, and their positions on paths.
 
-The seed decides it with the layout's index, or with the frame's where a light varies from frame to frame. Every value
-has a stream of its own, named by the light's entry, which of its copies it is, and the key.
+The seed and the index of the layout determine the lights, or the index of the frame for lights that vary per frame.
+Every value has a random stream of its own, named by the entry of the light, the number of its copy, and the key.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _UNIFORM = ("position", "target", "size", "cone", "radiance", "intensity", "rota
 
 
 def written_out(spec: SceneSpec) -> tuple[LightSpec, ...]:
-    """The lights of a scene file, with what its rooms stand for in their place."""
+    """Return the lights of a scene file, with rooms expanded to their lights."""
     found: list[LightSpec] = []
     for light in spec.lights:
         found += light.written_out() if isinstance(light, RoomLight) else (light,)
@@ -28,7 +28,7 @@ def written_out(spec: SceneSpec) -> tuple[LightSpec, ...]:
 
 
 def lights_at(spec: SceneSpec, layout: int, index: int, time: float) -> tuple[LightSpec, ...]:
-    """Lights of frame ``index``, which is at ``time`` in [0, 1] of its layout's paths."""
+    """Return the lights of frame ``index``, at ``time`` in [0, 1] of the paths of its layout."""
     found = []
     for position, light in enumerate(written_out(spec)):
         number, copies = layout, 1
@@ -47,7 +47,7 @@ def lights_at(spec: SceneSpec, layout: int, index: int, time: float) -> tuple[Li
 
 
 def _with_image(sky: EnvironmentLight, rng: np.random.Generator) -> EnvironmentLight:
-    """A sky with one image of its pool."""
+    """Return an environment light with one image of its pool."""
     if sky.pool is None:
         return sky
     image = sky.names[weighted_choice(rng, sky.weights or np.ones(len(sky.names)))[0]]
@@ -55,7 +55,7 @@ def _with_image(sky: EnvironmentLight, rng: np.random.Generator) -> EnvironmentL
 
 
 def _drawn(light: LightSpec, draw: LightDraw, seed: int, name: str, number: int) -> LightSpec:
-    """A light with values in place of its ranges."""
+    """Return a light with values drawn from its ranges."""
 
     def uniform(key: str, low: Any, high: Any) -> Any:
         value = random_stream(seed, f"light {name} {key}", number).uniform(low, high)
@@ -81,7 +81,7 @@ def _drawn(light: LightSpec, draw: LightDraw, seed: int, name: str, number: int)
 
 
 def _on_path(light: LightSpec, time: float, factor: float) -> LightSpec:
-    """A light at ``time`` in [0, 1] of its path, times a factor."""
+    """Return a light at ``time`` in [0, 1] of its path, with its intensity multiplied by a factor."""
     strength = "intensity" if isinstance(light, SpotLight | PointLight) else "radiance"
     state: dict[str, Any] = {strength: getattr(light, strength)}
     if not isinstance(light, EnvironmentLight) and light.path:

@@ -29,24 +29,25 @@ _DRAWN = (
     *("exposure", "vignetting", "chromatic_aberration", "motion_blur", "motion_angle", "iso"),
     *("white_balance", "hue", "saturation", "chroma_stretch", "chroma_angle", "sharpening", "jpeg"),
 )
-"""What is drawn anew for every frame."""
+"""Names of the values that are drawn anew for every frame."""
 
 
 @dataclass(frozen=True, eq=False)
 class FramePlan:
-    """Everything about a frame but where its objects came to rest.
+    """Plan of a frame: everything except the resting poses of its objects.
 
     Attributes:
         index: Index of the frame.
-        layout, view: Index of its layout, and of the view in it.
-        split: Split that the whole layout belongs to.
-        camera: Where the image is taken from.
-        next_camera: Where the layout's next image is taken from, None for its last.
-        lights: Lights as they are in this frame: paths and random factors applied.
+        layout: Index of the layout.
+        view: Index of the view in the layout.
+        split: Split of the whole layout.
+        camera: Camera of the image.
+        next_camera: Camera of the next image of the layout; None for the last image.
+        lights: Lights of this frame, with paths and random factors applied.
         draws: Random values by name, see :func:`mitsplat.frames.camera_response.develop`.
         seed: Seed of the pixel noise.
-        viewpoint: What the camera was drawn or chosen by, see :class:`mitsplat.scene.planning.viewpoints.Viewpoint`.
-        belt: The conveyor at the moment of the frame, if the scene has one.
+        viewpoint: Random draws of the camera, see :class:`mitsplat.scene.planning.viewpoints.Viewpoint`.
+        belt: The conveyor belt at the moment of the frame, if the scene has one.
     """
 
     index: int
@@ -63,10 +64,10 @@ class FramePlan:
 
 
 def whole(index: SupportsIndex, name: str) -> int:
-    """An index that an integer of any kind gives.
+    """Convert an index of any integer type to ``int``.
 
     Raises:
-        InputError: If it is something else, such as text.
+        InputError: If the value is no integer, such as text.
     """
     try:
         return operator.index(index)
@@ -75,7 +76,11 @@ def whole(index: SupportsIndex, name: str) -> int:
 
 
 def layout_of(scene: Scene, index: int) -> int:
-    """Layout that frame ``index`` shows."""
+    """Return the index of the layout that frame ``index`` shows.
+
+    Raises:
+        InputError: If the scene has no such frame.
+    """
     index = whole(index, "frame")
     if not 0 <= index < scene.num_frames:
         raise InputError(f"{scene.path}: frame must be in 0 to {scene.num_frames - 1} (got {index})")
@@ -92,26 +97,29 @@ def plan_frame(
     next_camera: Camera | None = None,
     lights: Sequence[LightEntry] | None = None,
 ) -> FramePlan:
-    """The plan of frame ``index``, from the seed and the index alone, which decide its layout as well.
+    """Plan frame ``index``. The seed and the index determine the plan, and also the layout.
 
     Args:
         scene: The scene.
         index: Index of the frame.
-        layout: Where its objects lie. Without it, cameras that are chosen by what lies there are ones that may be.
-        camera: In place of the scene's; nothing is then drawn or chosen of it.
-        next_layout: Where its objects lie in the next image, if they move.
-        next_camera: Where the next image is taken from. Without it that is the scene's next view of the layout, or
-            ``camera`` if that is given and objects move.
-        lights: Entries in place of the scene's, drawn and moved as those would be.
+        layout: Resting poses of the objects. Without it, a camera whose view depends on the objects gets only a
+            possible
+            view.
+        camera: Replaces the camera of the scene; nothing is drawn or selected for it.
+        next_layout: Poses of the objects in the next image, if they move.
+        next_camera: Camera of the next image. If absent, the next view of the layout; or ``camera``, if that is given
+            and objects move.
+        lights: Entries that replace the lights of the scene. They are drawn and moved along their paths in the same
+            way.
 
     Raises:
-        InputError: If there is no such frame, none of its views is as the scene file says that they must be, or the
-            lights break a rule.
+        InputError: If there is no such frame, if no candidate view fulfils the conditions of the scene file, or if the
+            lights are invalid.
     """
     index = whole(index, "frame")
     spec, number = scene.spec, layout_of(scene, index)
     if lights is not None:
-        spec = SceneSpec(**{**dict(spec), "lights": tuple(lights)})  # by which they are checked
+        spec = SceneSpec(**{**dict(spec), "lights": tuple(lights)})  # validates the lights
         if unknown := {name for _, name in light_images(spec)} - set(scene.images):
             raise InputError(f"images of lights must be among those of the scene's own (got {min(unknown)!r})")
         for light in spec.lights:
@@ -145,7 +153,7 @@ def plan_frame(
 
 
 def _drawn_from(ranges: Randomise, name: str) -> tuple[float, float] | None:
-    """The range of what is drawn for a frame, None if the scene has none of it."""
+    """Return the range of a value that is drawn for a frame; None if the scene does not use the value."""
     if name in ("chromatic_aberration", "sharpening") and not any(getattr(ranges, name)):
         return None
     if name in ("chroma_stretch", "chroma_angle") and ranges.chroma_stretch == (1.0, 1.0):

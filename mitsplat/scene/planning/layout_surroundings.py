@@ -1,6 +1,6 @@
-"""Where a layout lies, beside its objects: which environment, of what its visible shapes are made, what is behind all.
+"""Surroundings of a layout: environment, materials of visible shapes, and background image.
 
-The seed and the layout's index decide it, and the frame's index what changes from frame to frame.
+The seed and the index of the layout determine the surroundings; the index of the frame determines per-frame values.
 """
 
 from __future__ import annotations
@@ -27,18 +27,18 @@ Colour = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class MaterialDraw:
-    """A material as one layout has it.
+    """Material with values drawn for one layout.
 
     Attributes:
-        kind: As in the scene file.
-        colours: Of its pattern, sRGB-encoded: one, two, or none of an image.
-        scale: Size of its largest features, or width of the image [m].
+        kind: Kind of material, as in the scene file.
+        colours: sRGB-encoded colours of the pattern: one or two, or none for an image.
+        scale: Size of the largest features of the pattern, or width of the image [m].
         rotate: Rotation on the surface [degrees].
-        offset: Shift on the surface, in shares of a repetition.
-        roughness: Across the scratches of metal, GGX.
-        gain: Factor on the image's linear colours.
+        offset: Shift on the surface, as a fraction of a repetition.
+        roughness: GGX roughness across the scratches of brushed metal.
+        gain: Factor on the linear colours of the image.
         image: Name of the image file.
-        seed: Of its pattern.
+        seed: Seed of the pattern.
     """
 
     kind: str
@@ -52,20 +52,20 @@ class MaterialDraw:
     seed: int = 0
 
     def to_json(self) -> dict[str, Any]:
-        """The finish as JSON values, without what its kind has none of."""
+        """Return the material as JSON values, without the values that its kind does not have."""
         return {name: value for name, value in vars(self).items() if value not in (None, ())}
 
 
 @dataclass(frozen=True)
 class BackgroundDraw:
-    """An image behind everything, as one frame shows it.
+    """Background image of one frame.
 
     Attributes:
         image: Name of the file.
-        crop: Size of what is shown, relative to the largest part of the picture's proportions, turned as it is.
-        place: Where that lies, in shares of the room that it has, from the left and from the top.
+        crop: Size of the crop, relative to the largest crop with the aspect ratio of the output at this rotation.
+        place: Position of the crop in its free range, from the left and from the top, in [0, 1].
         rotate: Rotation [degrees].
-        gain: Factor on its linear colours.
+        gain: Factor on the linear colours of the image.
     """
 
     image: str
@@ -75,18 +75,18 @@ class BackgroundDraw:
     gain: float
 
     def to_json(self) -> dict[str, Any]:
-        """The same as JSON values."""
+        """Return the background as JSON values."""
         return dict(vars(self))
 
 
 @dataclass(frozen=True)
 class LayoutSurroundings:
-    """What was drawn for the surroundings of a frame.
+    """Surroundings drawn for a frame.
 
     Attributes:
-        environment: Position among the scene's environments; 0 without any.
-        finishes: Materials of visible shapes that draw one by their names, and of all walls of a backdrop.
-        background: What is behind everything, if it is an image.
+        environment: Index among the environments of the scene; 0 if there are none.
+        finishes: Drawn materials, by the names of visible shapes. All walls of a backdrop share one entry.
+        background: Background image, if the scene has one.
     """
 
     environment: int = 0
@@ -94,11 +94,11 @@ class LayoutSurroundings:
     background: BackgroundDraw | None = None
 
     def finish_of(self, shape: str) -> MaterialDraw | None:
-        """Material of a shape by its name, if it draws one."""
+        """Return the drawn material of a shape; None if its material is fixed."""
         return self.finishes.get(finish_name(shape))
 
     def to_json(self, spec: SceneSpec) -> dict[str, Any]:
-        """What the scene file leaves open, as JSON values; empty if that is nothing."""
+        """Return the values that the scene file leaves open as JSON values; empty if there are none."""
         told: dict[str, Any] = {}
         if isinstance(spec.environment, tuple):
             told["environment"] = {"number": self.environment, "name": spec.environment[self.environment]}
@@ -110,7 +110,7 @@ class LayoutSurroundings:
 
 
 def draw_place(spec: SceneSpec, index: int, layout: int | None = None) -> LayoutSurroundings:
-    """The place of frame ``index``, of a layout of one's own where its number is given."""
+    """Draw the surroundings of frame ``index``, or of the layout whose number is given."""
     layout = index // spec.output.views if layout is None else layout
     materials = {finish_name(shape.name): shape.materials for shape in spec.shapes if shape.materials}
     finishes = {name: draw_finish(among, spec.seed, name, layout) for name, among in materials.items()}
@@ -121,16 +121,16 @@ def draw_place(spec: SceneSpec, index: int, layout: int | None = None) -> Layout
 
 
 def environment_at(scene: Scene, place: LayoutSurroundings) -> Asset | None:
-    """The surroundings of a place."""
+    """Return the environment of drawn surroundings; None if the scene has none."""
     return scene.environments[place.environment] if scene.environments else None
 
 
 def draw_finish(materials: Sequence[Material], seed: int, name: str, layout: int) -> MaterialDraw:
-    """One of some materials, with its ranges drawn."""
+    """Draw one of several materials and a value from each of its ranges."""
     rng = random_stream(seed, f"material {name}", layout)
     material = materials[int(rng.integers(len(materials)))]
     pattern = int(rng.integers(2**31))
-    # All are drawn, so that none depends on which others a material has.
+    # All values are drawn always, so that no value depends on the other values of the material.
     hue, saturation, value, contrast, scale, rotate, other, u, v, which = map(float, rng.random(10))
     if isinstance(material, ImageMaterial):
         return MaterialDraw(
@@ -158,7 +158,7 @@ def draw_finish(materials: Sequence[Material], seed: int, name: str, layout: int
 
 
 def draw_backing(background: Background, seed: int, number: int) -> BackgroundDraw:
-    """What is behind frame or layout ``number``."""
+    """Draw the background image of frame or layout ``number``."""
     rng = random_stream(seed, "background", number)
     which, crop, x, y, rotate, gain = map(float, rng.random(6))
     return BackgroundDraw(

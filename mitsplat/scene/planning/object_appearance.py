@@ -1,6 +1,7 @@
-"""How one object of a layout looks other than the next one of its asset.
+"""Random appearance of the objects of a layout.
 
-The seed, the layout's index and the object's id decide it; every value has a stream of its own.
+The seed, the index of the layout and the instance id determine the appearance. Every value has a random stream of its
+own.
 """
 
 from __future__ import annotations
@@ -16,24 +17,24 @@ from mitsplat.scene.scene import Scene
 from mitsplat.scene.streams import random_stream
 
 WEAR_SEEDS = 1 << 23
-"""Patterns of dirt, whose numbers are exact in 32 bits of floating point."""
+"""Number of dirt patterns. Their indices are exact in single precision."""
 
 
 @dataclass(frozen=True)
 class ObjectAppearance:
-    """What was drawn of an object's appearance.
+    """Appearance drawn for an object.
 
     Attributes:
         id: Instance id.
-        entry: Which of the scene file's objects it is of.
+        entry: Index of its entry in ``objects`` of the scene file.
         hue: Rotation about the grey axis [degrees].
         saturation: Factor on the distance from grey.
         value: Factor on the reflectance.
         gain: Factors on red, green and blue.
         roughness: GGX roughness of the highlight.
         specular: Specular reflectance at normal incidence.
-        wear: Share of light that dirt takes where it is thickest.
-        wear_seed: Where dirt lies.
+        wear: Share of light that dirt absorbs where it is thickest.
+        wear_seed: Seed of the dirt pattern.
     """
 
     id: int
@@ -48,11 +49,11 @@ class ObjectAppearance:
     wear_seed: int
 
     def to_json(self) -> dict[str, Any]:
-        """As the manifest states it."""
+        """Return the appearance as JSON values for the manifest."""
         return {**vars(self), "gain": list(self.gain)}
 
     def properties(self) -> dict[str, Any]:
-        """Properties of the shape plugin ``splats``; of colours that stay as they are, none."""
+        """Return properties for the shape plugin ``splats``. Unchanged colours and absent dirt have no property."""
         matrix = np.diag(np.multiply(self.gain, self.value)) @ saturation_matrix(self.saturation) @ hue_matrix(self.hue)
         found: dict[str, Any] = {"roughness": self.roughness, "specular": self.specular}
         if (self.hue, self.saturation, self.value, *self.gain) != (0.0, 1.0, 1.0, 1.0, 1.0, 1.0):
@@ -63,7 +64,11 @@ class ObjectAppearance:
 
 
 def draw_appearances(scene: Scene, layout: Layout) -> dict[int, ObjectAppearance]:
-    """Appearances of the objects of a layout whose entries leave them open, by instance id."""
+    """Draw the appearances of the objects of a layout whose entries define ranges.
+
+    Returns:
+        Appearances by instance id.
+    """
     if not any(entry.appearance for entry in scene.spec.objects):
         return {}
     entries = {asset: entry for entry, pool in enumerate(scene.pools) for asset in pool}
@@ -72,7 +77,7 @@ def draw_appearances(scene: Scene, layout: Layout) -> dict[int, ObjectAppearance
 
 
 def _draw(scene: Scene, layout: int, instance: Instance, entry: int) -> ObjectAppearance | None:
-    """Appearance of one object of an entry."""
+    """Draw the appearance of one object; None if its entry defines no ranges."""
     ranges, asset = scene.spec.objects[entry].appearance, scene.assets[instance.asset]
     if ranges is None:
         return None

@@ -1,7 +1,8 @@
-"""Where a frame's image is taken from.
+"""Viewpoints of frames.
 
-The seed and the frame's index decide it, and the layout that the frame shows where the scene file says that cameras
-look at what lies there, or are chosen by what they see of it. Whoever asks without a layout gets one that may be.
+The seed and the index of the frame determine the viewpoint. If the scene file points cameras at objects or selects
+views by the visible objects, the viewpoint also depends on the layout. Without a layout, such a camera gets a possible
+viewpoint instead.
 """
 
 from __future__ import annotations
@@ -36,28 +37,39 @@ if TYPE_CHECKING:
     from mitsplat.scene.scene import Scene
 
 _NEIGHBOURS = 2
-"""Objects beside one that make a cluster with it."""
+"""Number of neighbours that form a cluster with an object."""
 _STEPS = 1.2207440846057596 ** -np.arange(1.0, 4.0)
-"""Of the sequence of low discrepancy in three dimensions: powers of the root of x^4 = x + 1 (Roberts, *The Unreasonable
-Effectiveness of Quasirandom Sequences*, 2018). Each of its points is known without those before it."""
+"""Steps of the low-discrepancy sequence in three dimensions: powers of the root of x^4 = x + 1.
+
+Source: Roberts, *The Unreasonable Effectiveness of Quasirandom Sequences*, 2018. Each point can be computed without
+the points before it.
+"""
 _BORDER = (0.6, 1.0)
-"""How far from the image's middle a try looks past its target that should be cut, in half widths or heights."""
+"""Range of the distance between target and image centre of views that should cut objects, in half widths or heights."""
 _WAVES, _FASTEST = 8, 0.15
-"""Cosines of a hand's motion along each axis, and the most periods in a view."""
+"""Number of cosines of the handheld motion along each axis, and their maximum frequency in periods per view."""
 
 
 @dataclass(frozen=True, eq=False)
 class Viewpoint:
-    """Where an image is taken from.
+    """Viewpoint of an image.
 
     Attributes:
         camera: The camera.
-        drawn: What it was drawn or chosen by, as JSON values: the position of the ``camera`` among several, the
-            ``side`` of a stereo pair, ``zoom``, ``aperture`` and ``focus`` of a thin lens [m], the ``motion`` while the
-            shutter is open (``exposure`` [s]; ``velocity`` [m/s] and ``rotation`` [degrees/s] in the camera's frame),
-            the motion of the hand (``handheld``, see :func:`moved_by`), the ``target`` [m], the ``object`` that it is
-            the middle of, which ``attempt`` it was, and what was ``predicted`` of the labelled objects. Empty for a
-            scene that has none of these.
+        drawn: Random values and selection results as JSON values, empty if the scene has none. Keys:
+
+            * ``camera``: index of the camera among several;
+            * ``side``: side of a stereo pair;
+            * ``zoom``: factor on the focal lengths;
+            * ``aperture``, ``focus``: thin lens [m];
+            * ``motion``: motion during the exposure: ``exposure`` [s]; ``velocity`` [m/s] and ``rotation`` [degrees/s]
+                in
+              the camera's frame; ``readout`` [s] if the shutter is a rolling one;
+            * ``handheld``: handheld motion, see :func:`moved_by`;
+            * ``target``: point in the centre of the image [m];
+            * ``object``: id of the instance in the centre of the image;
+            * ``attempt``: number of the candidate view;
+            * ``predicted``: predicted visibility of the labelled objects.
     """
 
     camera: Camera
@@ -66,16 +78,17 @@ class Viewpoint:
 
 @dataclass(frozen=True, eq=False)
 class _Turn:
-    """A frame as one of its camera's.
+    """Frame as one of the views of its camera.
 
     Attributes:
         seed: Seed of the scene.
         index: Index of the frame.
-        number: Position of its camera among the scene's.
-        camera: What the scene file says of that.
+        number: Index of the camera among the cameras of the scene.
+        camera: Specification of the camera.
         output: Size of the images.
         layout: Index of the layout.
-        turn, turns: Which of the camera's views of the layout it is, and of how many.
+        turn: Index of the view among the views of this camera in the layout.
+        turns: Number of views of this camera in the layout.
     """
 
     seed: int
@@ -89,11 +102,11 @@ class _Turn:
 
     @property
     def time(self) -> float:
-        """Time in [0, 1] of the camera's views of the layout."""
+        """Time in [0, 1] over the views of the camera in the layout."""
         return self.turn / max(1, self.turns - 1)
 
     def take(self, pose: Float64Array) -> tuple[Camera, dict[str, Any]]:
-        """The camera at a pose in the hand that holds it, and what was drawn for that."""
+        """Return the camera at a pose plus handheld motion, and the values drawn for it."""
         camera, drawn = self.camera, dict[str, Any]()
         if camera.zoom[0] < camera.zoom[1]:
             drawn["zoom"] = float(random_stream(self.seed, "camera zoom", self.index).uniform(*camera.zoom))
@@ -112,7 +125,7 @@ class _Turn:
         return taken, drawn
 
     def _motion(self, motion: Motion) -> dict[str, Any]:
-        """Exposure and readout [s], velocity [m/s] and rate of rotation [degrees/s], in the camera's frame."""
+        """Draw exposure and readout [s], velocity [m/s] and rotation rate [degrees/s], in the camera's frame."""
         rng = random_stream(self.seed, "camera motion", self.index)
         exposure, *rates = (float(rng.uniform(*bounds)) for bounds in (motion.exposure, motion.speed, motion.rotation))
         velocity, rotation = (rate * direction(2 * np.pi * rng.uniform(), rng.uniform(-1, 1)) for rate in rates)
@@ -120,10 +133,11 @@ class _Turn:
         return drawn | ({"readout": float(rng.uniform(*motion.readout))} if motion.readout[1] else {})
 
     def _sway(self, hand: Handheld) -> Float64Array:
-        """Displacement [m] and rotation vector [degrees] of a hand at a turn, shape (6,).
+        """Return displacement [m] and rotation vector [degrees] of the handheld camera at a turn, shape (6,).
 
-        A sum of cosines of random phases is about normal and has a variance of one half times their number, whatever
-        their frequencies; these, of a period of seven views and more, make it smooth.
+        A sum of N cosines with random phases is approximately normal and has a variance of N/2, whatever the
+        frequencies. The
+        periods here are about seven views or more, which makes the motion smooth.
         """
         rng = random_stream(self.seed, "camera handheld", self.layout, self.number)
         rates, phases = rng.uniform(0, _FASTEST, (6, _WAVES)), rng.uniform(0, 1, (6, _WAVES))
@@ -133,10 +147,10 @@ class _Turn:
 
 @lru_cache(maxsize=4)
 def view_of(scene: Scene, index: int, layout: Layout | None = None) -> Viewpoint:
-    """Where frame ``index`` is taken from; with its layout, what looks at or is chosen by what lies there.
+    """Return the viewpoint of frame ``index``. The layout is needed only if the viewpoint depends on the objects.
 
     Raises:
-        InputError: If none of a frame's tries fulfils what the scene file says that a view must.
+        InputError: If no candidate view of the frame fulfils the conditions of the scene file.
     """
     spec = scene.spec
     cameras = (spec.camera, *spec.cameras)
@@ -171,7 +185,7 @@ def view_of(scene: Scene, index: int, layout: Layout | None = None) -> Viewpoint
 
 
 def moved_by(motion: Sequence[float]) -> Float64Array:
-    """Rigid transform (4, 4) of a displacement [m] and a rotation vector [degrees], both in the camera's frame."""
+    """Return the rigid transform (4, 4) of a displacement [m] and a rotation vector [degrees] in the camera's frame."""
     moved = np.eye(4)
     moved[:3, 3] = motion[:3]
     moved[:3, :3] = Rotation.from_rotvec(motion[3:], degrees=True).as_matrix()
@@ -179,10 +193,12 @@ def moved_by(motion: Sequence[float]) -> Float64Array:
 
 
 def camera_at(pose: Float64Array, intrinsics: Intrinsics, output: Output, zoom: float = 1.0) -> Camera:
-    """The camera of a scene file at a pose, for images of the output's size, its focal lengths times ``zoom``.
+    """Return a camera of the scene file at a pose, for images of the output's size.
+
+    The focal lengths are multiplied by ``zoom``.
 
     Raises:
-        ValueError: If there is none, such as a fisheye that sees behind itself.
+        ValueError: If the intrinsics are invalid, such as those of a fisheye lens that sees backwards.
     """
     width, height = intrinsics.size or (output.width, output.height)
     if intrinsics.fov_x is not None:
@@ -207,7 +223,10 @@ def camera_at(pose: Float64Array, intrinsics: Intrinsics, output: Output, zoom: 
 
 
 def _orbit_pose(camera: CameraOrbit, view: int, views: int) -> Float64Array:
-    """A full circle ends one step before its start; a part of one ends at its end."""
+    """Return the pose of a view on an orbit.
+
+    A full circle ends one step before its start. A partial circle ends at its end.
+    """
     steps = views if abs(camera.sweep) == 360 else max(1, views - 1)
     azimuth = np.radians(camera.start + camera.sweep * view / steps)
     offset = (camera.radius * np.cos(azimuth), camera.radius * np.sin(azimuth), camera.height)
@@ -215,7 +234,10 @@ def _orbit_pose(camera: CameraOrbit, view: int, views: int) -> Float64Array:
 
 
 def _walk_pose(camera: CameraWalk, here: _Turn) -> Float64Array:
-    """Monotone piecewise cubic interpolation (Fritsch and Carlson 1980) between places drawn for the layout."""
+    """Return a pose by interpolation between the waypoints of the layout.
+
+    The interpolation is monotone piecewise cubic (Fritsch and Carlson 1980).
+    """
     rng = random_stream(here.seed, "camera walk", here.layout, here.number)
     ranges = np.array([camera.azimuth, np.sin(np.radians(camera.elevation)), camera.radius])
     places = rng.uniform(ranges[:, 0], ranges[:, 1], (camera.places, 3))
@@ -224,12 +246,15 @@ def _walk_pose(camera: CameraWalk, here: _Turn) -> Float64Array:
 
 
 def _pose_around(target: Float64Array, azimuth: float, sine: float, radius: float) -> Float64Array:
-    """Pose that looks at a target [m] from an azimuth [rad], a sine of the elevation and a distance [m]."""
+    """Return the pose that looks at a target [m] from an azimuth [rad], a sine of the elevation and a distance [m]."""
     return look_at_pose(target + radius * direction(azimuth, sine), target)
 
 
 def _hemisphere_view(scene: Scene, here: _Turn, camera: CameraHemisphere, layout: Layout | None) -> Viewpoint:
-    """The first try that is accepted, or of all that are the one that comes nearest to the shares aimed at."""
+    """Return the accepted candidate view whose shares of hidden and cut objects are nearest to the targets.
+
+    The search ends at the first accepted candidate that meets the targets exactly.
+    """
     spec, index = scene.spec, here.index
     sight = (
         None
@@ -274,22 +299,23 @@ def _hemisphere_view(scene: Scene, here: _Turn, camera: CameraHemisphere, layout
 
 
 def _cost(prospect: PredictedView, shares: list[float], fate: Float64Array) -> float:
-    """How far a view is from the shares of objects that are aimed at.
+    """Return the difference between the shares of objects in a view and the target shares.
 
-    A share of few objects is seldom a whole number: it is rounded up or down by the frame's random numbers ``fate``, so
-    that frames reach it on average although none knows of the others.
+    A share of few objects is seldom a whole number. The frame's random numbers ``fate`` round it up or down, so that
+    the
+    average over frames reaches the target although frames are independent.
     """
     wanted = np.floor(np.multiply(shares, prospect.in_view) + fate)
     counts = np.array([prospect.hidden, prospect.cut])
     if not prospect.in_view:
-        return float(len(prospect.visible))  # an image without objects has no share of them, whatever is asked for
+        return float(len(prospect.visible))  # an image without objects meets no target share
     return float(np.abs(counts - wanted).sum()) / prospect.in_view
 
 
 def _target(
     camera: CameraHemisphere, seed: int, index: int, number: int, sight: VisibilityPredictor | None
 ) -> tuple[Float64Array, int | None]:
-    """What a try looks at [m] but for its jitter, and the object that it is the middle of."""
+    """Return the point at the centre of a candidate view before jitter [m], and the id of the object there, if any."""
     if sight is None or camera.look_at == "target" or not sight.labelled.any():
         return np.array(camera.target, dtype=np.float64), None
     among = np.flatnonzero(sight.labelled)
@@ -304,7 +330,7 @@ def _target(
 def _hemisphere_pose(
     camera: CameraHemisphere, here: _Turn, number: int, middle: Float64Array
 ) -> tuple[Float64Array, Float64Array]:
-    """Pose of a try that looks at a point [m], and the target [m] that it turned out to look at."""
+    """Return the pose of a candidate view around a point [m], and its target with jitter [m]."""
     seed, index = here.seed, here.index
 
     def draw(name: str, low: float, high: float) -> float:
@@ -331,7 +357,11 @@ def _hemisphere_pose(
 def _look_past(
     lens: Camera, pose: Float64Array, target: Float64Array, rng: np.random.Generator
 ) -> tuple[Float64Array, Float64Array]:
-    """The pose turned until its target [m] is near the border of such a camera, and the point as far that it shows."""
+    """Rotate a pose until its target is near the border of the image.
+
+    Returns:
+        The new pose, and the point in the centre of the new view at the distance of the target [m].
+    """
     place = np.array([rng.choice([-1, 1]) * rng.uniform(*_BORDER), rng.uniform(-1, 1)])[:: rng.choice([-1, 1])]
     slopes = place * (lens.width / lens.fx, lens.height / lens.fy) / 2
     away = float(np.linalg.norm(slopes))
@@ -342,5 +372,5 @@ def _look_past(
 
 
 def _stream(seed: int, purpose: str, index: int, number: int) -> np.random.Generator:
-    """Random numbers of a try of a frame; the first are those of frames that have but one."""
+    """Return the random stream of a candidate view. Candidate 0 has the stream of frames with a single candidate."""
     return random_stream(seed, purpose, index, *([number] if number else []))

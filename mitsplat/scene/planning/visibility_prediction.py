@@ -1,9 +1,10 @@
-"""What a camera would see of a layout, before anything is rendered: a cheap prediction to choose views by.
+"""Cheap visibility prediction for view selection.
 
-Surfaces are points, spread evenly over the proxy meshes. An object's visible fraction is predicted from a raster as
-coarse as the points are dense: of its cells in the image, those in which no point of another object is nearer. What
-visible shapes hide is found by rays from the points to the camera. The environment hides nothing here. All of it is
-worked out by NumPy on the CPU, so that views do not depend on the device that renders them.
+Surfaces are represented by points, spread evenly over the proxy meshes. The visible fraction of an object is predicted
+on a raster whose cells match the spacing of the points. It is the share of the object's cells inside the image in
+which no point of another object is nearer. Occlusion by visible shapes is tested with rays from the points to the
+camera. The environment occludes nothing here. NumPy computes everything on the CPU, so that views do not depend on the
+device that renders them.
 """
 
 from __future__ import annotations
@@ -25,28 +26,28 @@ if TYPE_CHECKING:
     from mitsplat.scene.spec.camera_spec import Acceptance, Occlusion, Truncation
 
 _POINTS = 40_000
-"""Of all objects of a layout together, at most."""
+"""Maximum number of points of all objects of a layout."""
 _FINEST = 800
-"""Of the object with the largest surface, at most."""
+"""Number of points of the object with the largest surface."""
 _FEWEST = 100
 _CELL = 1.25
-"""Size of a raster's cells, in spacings of the points."""
+"""Size of a raster cell, in point spacings."""
 _TESTS = 2_000_000
-"""Pairs of a ray and a triangle that are looked at together."""
+"""Maximum number of ray-triangle pairs that are tested together."""
 
 
 @dataclass(frozen=True, eq=False)
 class ProjectedPoints:
-    """Where the surfaces of a layout are in a camera's image.
+    """Surface points of a layout, projected into the image of a camera.
 
     Attributes:
         camera: The camera.
         x, y, depth: Pixel positions [px] and depths [m] of the points, shape (P,).
-        raster: Which of them are in front of the camera and in the image or as far around it as it is wide and high.
-        edge: Size of the raster's cells [px].
+        raster: Mask of the points in front of the camera and in the image or a margin of one image size around it.
+        edge: Size of the raster cells [px].
         within: Share of the surface of each object that is in front of the camera and in the image, shape (N,).
-        extents: Longer side of the box around each in the image [px], 0 for what is not in it, shape (N,).
-        lost: Share of each that is not in the raster, shape (N,).
+        extents: Longer side of the bounding box of each object in the image [px], 0 outside of the image, shape (N,).
+        lost: Share of each object outside of the raster, shape (N,).
     """
 
     camera: Camera
@@ -62,13 +63,14 @@ class ProjectedPoints:
 
 @dataclass(frozen=True, eq=False)
 class PredictedView:
-    """What a view is predicted to show of the labelled objects of a layout.
+    """Predicted visibility of the labelled objects of a layout in a view.
 
     Attributes:
-        visible: Visible fraction of each, 0 for what is not in the image, shape (N,).
-        beyond: Share of each beyond the image's border, shape (N,).
-        in_view: How many have enough visible pixels to be labelled.
-        hidden, cut: How many of those are partly hidden, and cut by the border, as the scene file says.
+        visible: Visible fraction of each object, 0 outside of the image, shape (N,).
+        beyond: Share of each object beyond the border of the image, shape (N,).
+        in_view: Number of objects with enough visible pixels for a label.
+        hidden: Number of those objects that are partly hidden by the rule of the scene file.
+        cut: Number of those objects that the border cuts by the rule of the scene file.
     """
 
     visible: Float64Array
@@ -78,17 +80,17 @@ class PredictedView:
     cut: int
 
     def to_json(self) -> dict[str, Any]:
-        """The counts, as a dataset states them."""
+        """Return the counts as JSON values for the dataset."""
         return {"in_view": self.in_view, "hidden": self.hidden, "cut": self.cut}
 
 
 class VisibilityPredictor:
-    """The surfaces of a layout.
+    """Visibility prediction for the objects of a layout.
 
     Attributes:
         ids: Instance ids, shape (N,).
-        labelled: Which of the instances are labelled, shape (N,).
-        centres: Middle of the box around each [m], shape (N, 3).
+        labelled: Mask of the labelled instances, shape (N,).
+        centres: Centre of the bounding box of each instance [m], shape (N, 3).
     """
 
     def __init__(self, scene: Scene, layout: Layout) -> None:
@@ -120,22 +122,22 @@ class VisibilityPredictor:
     @staticmethod
     @lru_cache(maxsize=2)
     def of(scene: Scene, layout: Layout) -> VisibilityPredictor:
-        """The surfaces of a layout, kept for its next frame."""
+        """Return the predictor of a layout, cached for its next frame."""
         return VisibilityPredictor(scene, layout)
 
     def framed(self, camera: Camera) -> ProjectedPoints:
-        """Where the surfaces are in a camera's image."""
+        """Project the surface points into the image of a camera."""
         count, owner = len(self.ids), self._owner
         pixel, depth = camera.project(self._points)
         x, y = np.ascontiguousarray(pixel.T)
         front = depth > camera.near
         with np.errstate(invalid="ignore"):
             inside = front & _within(x, y, camera, 0)
-            # Distortion of what is far outside is anybody's guess, and the raster needs an end.
+            # Distortion far outside of the image is undefined, and the raster must be finite.
             raster = front & _within(x, y, camera, 1)
         within, in_raster = (np.bincount(owner[some], minlength=count) / self._counts for some in (inside, raster))
         extents, edge = np.zeros(count), 1.0
-        if count:  # points are in the order of their owners, who all have some
+        if count:  # points are sorted by owner, and every owner has points
             starts = np.cumsum(self._counts) - self._counts
             for at in (x, y):
                 high = np.maximum.reduceat(np.where(inside, at, -np.inf), starts)
@@ -149,7 +151,7 @@ class VisibilityPredictor:
     def prospect(
         self, framed: ProjectedPoints, occlusion: Occlusion | None, truncation: Truncation | None, min_pixels: int
     ) -> PredictedView:
-        """What a view would show of the labelled objects."""
+        """Predict the visibility of the labelled objects in a view."""
         visible, beyond, seen = self._cells(framed)
         beyond = framed.lost + (1.0 - framed.lost) * beyond
         shown = self.labelled & (seen * framed.edge**2 >= min_pixels)
@@ -162,7 +164,7 @@ class VisibilityPredictor:
         return PredictedView(visible[ours], beyond[ours], int(np.count_nonzero(shown)), hidden, cut)
 
     def _cells(self, framed: ProjectedPoints) -> tuple[Float64Array, Float64Array, Int64Array]:
-        """Visible fraction and share beyond the border of each object, by cells of the raster; its seen cells."""
+        """Return, for each object, visible fraction, share beyond the border, and number of visible raster cells."""
         count, camera, edge, depth = len(self.ids), framed.camera, framed.edge, framed.depth
         across = int(3 * camera.width / edge) + 2
         left, above = across // 3 + 1, int(camera.height / edge) + 2
@@ -171,7 +173,7 @@ class VisibilityPredictor:
         key = (column + left + across * (row + above)) * count + self._owner[among]
         order = np.argsort(key)
         among, key = among[order], key[order]
-        # Of each cell, every object in it once, by its nearest point there, and the one in front of the others.
+        # Take each object of a cell once, by its nearest point there. The nearest object of the cell is visible.
         first = _starts(key)
         nearest = among[_least(depth[among], first)]
         owner, cell = self._owner[nearest], key[first] // count
@@ -189,7 +191,7 @@ class VisibilityPredictor:
         return seen_cells / np.maximum(own, 1), beyond, seen_cells
 
     def faults(self, framed: ProjectedPoints, rules: Acceptance) -> list[tuple[float, str]]:
-        """By what share a view misses each rule that it does not fulfil, and the same in words."""
+        """Return the rules that a view violates: the relative shortfall, and a description."""
         found, eye = [], framed.camera.centre
         within, extents = framed.within[self.labelled], framed.extents[self.labelled]
         share = float(np.mean(within >= 0.5)) if len(within) else 1.0
@@ -208,7 +210,7 @@ class VisibilityPredictor:
         return found
 
     def _around(self, eye: Float64Array) -> str:
-        """What a point is inside of, or empty."""
+        """Return the description of the shape or object that contains a point; empty if none does."""
         if name := solid_around(self._scene, eye):
             return f"shape {name!r}"
         for one in self._near(eye, 0.0):
@@ -218,7 +220,7 @@ class VisibilityPredictor:
         return ""
 
     def _clearance(self, eye: Float64Array, reach: float) -> float:
-        """Distance of a point to the surface that is nearest [m], or ``reach`` if none is as near."""
+        """Return the distance from a point to the nearest surface [m], at most ``reach``."""
         distance = self._still.distance(eye, reach)
         for one in self._near(eye, distance):
             triangles = _Triangles(np.asarray(_mesh(self._scene, one.asset).triangles))
@@ -226,13 +228,13 @@ class VisibilityPredictor:
         return distance
 
     def _near(self, eye: Float64Array, reach: float) -> list[Instance]:
-        """Instances that a part of may be as near to a point."""
+        """Return the instances whose bounding spheres come within ``reach`` [m] of a point."""
         near = np.linalg.norm(self.centres - eye, axis=1) < self._radii + reach
         return [one for one, is_near in zip(self._layout.instances, near, strict=True) if is_near]
 
 
 def solid_around(scene: Scene, point: Float64Array) -> str:
-    """Name of a visible shape that a point [m] is in and the region is not, or empty."""
+    """Return the name of a visible shape that contains a point [m] and not the centre of the region, or empty."""
     middle = (np.array(scene.spec.region.min) + scene.spec.region.max) / 2
     for shape, mesh in zip(scene.spec.shapes, scene.shape_meshes, strict=True):
         if shape.visible and points_inside(mesh, np.stack([point, middle])).tolist() == [True, False]:
@@ -242,7 +244,7 @@ def solid_around(scene: Scene, point: Float64Array) -> str:
 
 @lru_cache(maxsize=2)
 def _surface_points(scene: Scene) -> tuple[Float64Array, ...]:
-    """Points on the surface of each asset, in its frame [m], as dense on all of them."""
+    """Return points on the surface of each asset, in its frame [m], with equal density on all assets."""
     spacing = _spacing(scene)
     points = []
     for asset in range(len(scene.assets)):
@@ -253,12 +255,12 @@ def _surface_points(scene: Scene) -> tuple[Float64Array, ...]:
 
 
 def _spacing(scene: Scene) -> float:
-    """About how far apart points on surfaces are [m]."""
+    """Return the approximate distance between surface points [m]."""
     return float(np.sqrt(max(asset.mesh.area for asset in scene.assets if asset.mesh is not None) / _FINEST))
 
 
 def _mesh(scene: Scene, asset: int) -> trimesh.Trimesh:
-    return cast(trimesh.Trimesh, scene.assets[asset].mesh)  # no object is loaded without, for it must be dropped
+    return cast(trimesh.Trimesh, scene.assets[asset].mesh)  # loading refuses objects without a mesh
 
 
 def _local(point: Float64Array, pose: Float64Array) -> Float64Array:
@@ -266,21 +268,21 @@ def _local(point: Float64Array, pose: Float64Array) -> Float64Array:
 
 
 def _within(x: Float64Array, y: Float64Array, camera: Camera, margin: int) -> BoolArray:
-    """Whether pixels lie in a camera's image, with a margin of so many images on each side."""
+    """Return a mask of the pixels in the image of a camera, extended on each side by ``margin`` image sizes."""
     width, height = camera.width, camera.height
     inside = (x >= -margin * width) & (x < (1 + margin) * width)
     return np.asarray(inside & (y >= -margin * height) & (y < (1 + margin) * height))
 
 
 def _starts(key: Int64Array) -> Int64Array:
-    """Where runs of equal numbers begin."""
+    """Return the start index of each run of equal numbers."""
     begins = np.ones(len(key), dtype=bool)
     begins[1:] = key[1:] != key[:-1]
     return np.flatnonzero(begins)
 
 
 def _least(values: Float64Array, starts: Int64Array) -> Int64Array:
-    """Place of the first of the least values of each run, of those that begin at ``starts``."""
+    """Return the index of the first minimum of each run. Runs begin at ``starts``."""
     if not len(starts):
         return starts
     least = np.minimum.reduceat(values, starts)
@@ -293,7 +295,7 @@ def _among(values: Float64Array, bounds: tuple[float, float]) -> BoolArray:
 
 
 class _Triangles:
-    """Triangles (T, 3, 3) [m] and the boxes around them, which tell most to be too far away."""
+    """Triangles (T, 3, 3) [m] with bounding boxes, which exclude most of them from distance tests."""
 
     def __init__(self, triangles: Float64Array) -> None:
         self._triangles = triangles
@@ -301,7 +303,7 @@ class _Triangles:
         self._boxes = list(zip(by_axis.min(axis=2), by_axis.max(axis=2), strict=True))
 
     def distance(self, point: Float64Array, reach: float) -> float:
-        """Distance of a point to the nearest triangle, or ``reach`` if none is as near."""
+        """Return the distance from a point to the nearest triangle [m], at most ``reach``."""
         touched = np.ones(len(self._triangles), dtype=bool)
         for (low, high), place in zip(self._boxes, point, strict=True):
             touched &= (low < place + reach) & (high > place - reach)
@@ -313,7 +315,10 @@ class _Triangles:
 
 
 def _between(triangles: Float64Array, eye: Float64Array, points: Float64Array) -> Float64Array:
-    """Triangles that can cross a line of sight: in whose plane, or on whose other side, some point's box is."""
+    """Return the triangles that can intersect a line of sight.
+
+    A triangle cannot if the bounding box of the points is on the same side of its plane as the eye.
+    """
     if not len(triangles) or not len(points):
         return triangles[:0]
     low, high = points.min(axis=0), points.max(axis=0)
@@ -321,14 +326,14 @@ def _between(triangles: Float64Array, eye: Float64Array, points: Float64Array) -
     corners = np.stack(np.meshgrid(*np.stack([low, high]).T, indexing="ij"), axis=-1).reshape(-1, 3)
     here = np.einsum("ti,ti->t", normals, eye - triangles[:, 0])
     there = np.einsum("ti,tci->tc", normals, corners - triangles[:, :1])
-    # Objects sink into what they lie on by less than a tenth of a millimetre.
+    # Objects penetrate their support by less than 0.1 mm.
     slack = 1e-4 * np.linalg.norm(normals, axis=1)
     other = there * np.sign(here)[:, None] < -slack[:, None]
     return np.asarray(triangles[other.any(axis=1) & (np.abs(here) > 0)])
 
 
 def _crossed(eye: Float64Array, points: Float64Array, triangles: Float64Array) -> BoolArray:
-    """Which lines of sight from an eye to points (N, 3) cross a triangle on their way (Möller and Trumbore 1997)."""
+    """Return a mask of the points (N, 3) whose line of sight from the eye hits a triangle (Möller, Trumbore 1997)."""
     crossed = np.zeros(len(points), dtype=bool)
     one, two = triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
     start = eye - triangles[:, 0]

@@ -300,9 +300,7 @@ def _inputs(photos: Path, files: Sequence[Path], settings: CaptureSettings) -> d
     kept = {name: value for name, value in asdict(settings).items() if name not in ("frames", *given)}
     others = [(name, at, path) for name, at in given.items() if at is not None for path in [at, *sorted(at.rglob("*"))]]
     return {
-        "photos": {
-            path.relative_to(photos).as_posix(): file_hash(path) for path in files
-        },  # photographs or frames of a video
+        "photos": {path.relative_to(photos).as_posix(): file_hash(path) for path in files},  # or frames of a video
         "settings": json.loads(json.dumps(kept, default=str)),
         "files": {f"{name}/{path.relative_to(at)}": file_hash(path) for name, at, path in others if path.is_file()},
     }

@@ -1,4 +1,4 @@
-"""Cameras that are known already: COLMAP models and NeRF's ``transforms.json``, matched to photographs."""
+"""Import of known cameras from COLMAP models and NeRF's ``transforms.json``, matched to photographs."""
 
 from __future__ import annotations
 
@@ -22,11 +22,13 @@ _Positive = Annotated[float, Field(gt=0)]
 
 
 _FARTHEST = 1e9
-"""Largest coordinate of a camera or a point, in the model's unit; that of geocentric metres is 6e6."""
+"""Largest accepted coordinate of a camera or a point, in units of the model; geocentric coordinates in metres reach
+6e6.
+"""
 
 
 class _Lens(BaseModel):
-    """Intrinsics, of all frames or of one; pixel centres at +0.5 as in COLMAP, from where such files come."""
+    """Intrinsics of all frames or of one frame; pixel centres are at +0.5, by the convention of COLMAP."""
 
     model_config = ConfigDict(allow_inf_nan=False)
 
@@ -56,19 +58,19 @@ class _Transforms(_Lens):
 
 
 def read_poses(source: Path, photos: Sequence[Prepared], folder: Path, progress: Progress | None = None) -> SparseModel:
-    """The cameras of photographs from a file that has them, keyed by the copies' file names.
+    """Read the cameras of photographs from a file, keyed by the file names of the copies.
 
-    A model without points gets some from the photographs; its cameras stay as they are.
+    If the model has no points, points are triangulated from the photographs with fixed cameras.
 
     Args:
         source: Folder of a COLMAP model (``.bin`` or ``.txt``), or a ``transforms.json`` (OpenGL axes).
-        photos: Copies of the photographs, not turned by EXIF: such files ignore it.
-        folder: For intermediate files.
-        progress: Told what is being done.
+        photos: Copies of the photographs without EXIF rotation, because such files ignore it.
+        folder: Folder for intermediate files.
+        progress: Callback with the present activity.
 
     Raises:
-        InputError: If the file is damaged or no photo is in it.
-        MissingResourceError: If COLMAP ends its process.
+        InputError: If the file is damaged or contains none of the photos.
+        MissingResourceError: If COLMAP aborts its process.
     """
     if source.is_dir():
         model = read_model(source, folder / "given")
@@ -88,7 +90,7 @@ def read_poses(source: Path, photos: Sequence[Prepared], folder: Path, progress:
 
 
 def _check_places(source: Path, model: SparseModel) -> None:
-    """Refuse a model of which a camera or a point is so far away that numbers overflow, or nowhere."""
+    """Raise InputError if a camera or a point of the model is not finite or lies beyond ``_FARTHEST``."""
     places = [(f"camera {name}", camera.world_from_camera[:3, 3]) for name, camera in model.cameras.items()]
     places += [("a point", model.points)] if len(model.points) else []
     for name, place in places:
@@ -97,7 +99,7 @@ def _check_places(source: Path, model: SparseModel) -> None:
 
 
 def _read_transforms(path: Path, photos: Mapping[str, Prepared]) -> SparseModel:
-    """Cameras of a ``transforms.json``, by its file paths."""
+    """Read the cameras of a ``transforms.json``, keyed by its file paths."""
     try:
         content = _Transforms.model_validate_json(path.read_bytes())
     except FileNotFoundError:
@@ -117,7 +119,7 @@ def _read_transforms(path: Path, photos: Mapping[str, Prepared]) -> SparseModel:
         width, height = lens.w, lens.h
         if width is None or height is None:
             if frame.file_path not in sizes:
-                continue  # not among the photos: nothing says its size, and nothing needs it
+                continue  # not among the photos; its size is unknown and not needed
             width, height = sizes[frame.file_path]
         try:
             cameras[frame.file_path] = _camera(lens, round(width), round(height), np.array(frame.transform_matrix))
@@ -135,7 +137,7 @@ def _match_names(content: _Transforms, photos: Mapping[str, Prepared]) -> dict[s
 
 
 def _camera(lens: _Lens, width: int, height: int, pose: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> Camera:
-    """The OpenCV camera of a frame: its y and z axes are OpenGL's turned about."""
+    """Return the OpenCV camera of a frame, with the y and z axes of OpenGL negated."""
     if lens.camera_model not in ("OPENCV", "OPENCV_FISHEYE", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL"):
         raise ValueError(
             f"camera_model must be OPENCV, OPENCV_FISHEYE or PINHOLE (got {lens.camera_model}): undistort the photos"
@@ -167,7 +169,10 @@ def _camera(lens: _Lens, width: int, height: int, pose: np.ndarray[tuple[int, ..
 
 
 def _match(names: Iterable[str], photos: Sequence[Prepared]) -> dict[str, str]:
-    """File names of the photos' copies by the names of a model: the same path, or the same last part of only one."""
+    """Match names of a model to file names of the photo copies.
+
+    A name matches by its path, or by its last part if only one photo has it.
+    """
     keys: dict[str, set[str]] = {}
     for photo in photos:
         path = PurePosixPath(photo.name)
@@ -184,7 +189,7 @@ def _match(names: Iterable[str], photos: Sequence[Prepared]) -> dict[str, str]:
 
 
 def _fitted(source: Path, name: str, camera: Camera, size: tuple[int, int]) -> Camera:
-    """The camera on the pixels of a reduced copy."""
+    """Return the camera resized to the pixels of a reduced copy."""
     if abs(camera.width * size[1] - camera.height * size[0]) > max(camera.width, camera.height, *size):
         raise InputError(
             f"{source}: {name} must have the shape of its photo, {size[0]}x{size[1]} px (got {camera.width}x"

@@ -1,4 +1,4 @@
-"""Scale and gravity of a reconstruction: from printed targets, a known distance, the table's plane, or the cameras."""
+"""Scale and gravity of a reconstruction, from targets, a known distance, the table plane or camera attitudes."""
 
 from __future__ import annotations
 
@@ -21,43 +21,46 @@ from mitsplat.geometry.triangulation import meeting_point, triangulate
 from mitsplat.images.picture_files import read_picture
 
 DEFAULT_BOARD = Board()
-"""What `mitsplat board` prints by default."""
+"""Default board of `mitsplat board`."""
 
 MAX_CONTRADICTION = 0.0025
-"""Error up to which a camera sees the board where it is, as a share of its image's longer edge."""
+"""Reprojection error of the board up to which a camera is confirmed, as a fraction of the longer image edge."""
 
 _CERTAINLY_WRONG = 0.01
-"""Error from which a camera is wrong, in the same units; between the two it is if it stands out from the others."""
+"""Reprojection error above which a camera is always wrong, as a fraction of the longer image edge.
+
+Between both limits, a camera is wrong if its error is an outlier.
+"""
 
 _OUTLYING = 3.0
-"""Errors of the median camera from which one stands out."""
+"""Factor of the median camera error above which an error is an outlier."""
 
 PRINT_ERROR = 1e-4
-"""Standard error with which a user measures the edge of a printed square or tag [m]."""
+"""Standard error of the user's measurement of a printed square or tag edge [m]."""
 
 _GROUPS = 6
-"""Groups of images that are left out in turn to see how much the scale depends on them."""
+"""Number of image groups of the jackknife for the scale error."""
 
 _Views = dict[int, dict[str, tuple[Camera, Float64Array]]]
 
 _TILT = np.cos(np.radians(30))
-"""A plane that leans more against the vertical that the cameras suggest is no table."""
+"""Cosine of the largest angle between the table normal and the vertical that the cameras suggest."""
 
 
 @dataclass(frozen=True, eq=False)
 class MetricFrame:
-    """Where a reconstruction is put.
+    """Placement of a reconstruction in the asset frame.
 
     Attributes:
-        matrix: ``asset_from_model``, a similarity, shape (4, 4); z up, z = 0 the table where one is known.
-        units: Whether the result is in metres.
-        up: Whether z is vertical, as far as a target or the table is level.
-        table: Whether z = 0 is a plane that things stand on.
-        source: What decided, a clause for the user.
+        matrix: Similarity ``asset_from_model``, shape (4, 4); z up, and z = 0 on the table if one is known.
+        units: ``metre`` if the result is in metres, else ``unknown``.
+        up: ``z`` if z is vertical (as far as a target or the table is level), else ``unknown``.
+        table: True if z = 0 is a plane on which objects stand.
+        source: Origin of scale and gravity, as a clause for the user.
         scale_error: Estimated relative standard error of the scale, if metric.
-        wrong: Images whose cameras the board contradicts, and by how many pixels.
-        confirmed: Images whose cameras see the board where it is.
-        board: Pose (4, 4) of the ChArUco board where the reconstruction is put, in metres, if there is one.
+        wrong: Images whose cameras the board contradicts, with their error [px].
+        confirmed: Images whose cameras agree with the board.
+        board: Pose of the ChArUco board in the asset frame [m], shape (4, 4), if there is one.
     """
 
     matrix: Float64Array
@@ -80,21 +83,25 @@ def find_metric_frame(
     scale_from: tuple[str, str, float] | None = None,
     centred: bool = True,
 ) -> MetricFrame:
-    """Find scale and gravity by the best evidence there is.
+    """Find scale and gravity from the best available evidence.
 
-    A ChArUco board decides both; so do AprilTags of known size; then ``scale_from`` the scale and the largest plane
-    below the cameras the vertical. A vertical that only the cameras' attitude suggests leaves ``up`` unknown.
+    A ChArUco board determines both, and so do AprilTags of known size. Otherwise ``scale_from`` determines the scale,
+    and
+    the largest plane below the cameras the vertical. If only the camera attitudes suggest a vertical, ``up`` is
+    unknown.
 
     Args:
-        model: What structure from motion found.
-        images: The images' files, by the model's names.
-        board: The board to look for.
-        tag: Edge of AprilTags as printed, without their white border [m].
-        scale_from: Two places and their distance [m]; see :func:`spot`.
-        centred: Whether the origin is below the point that the cameras look at, else in the middle of a board.
+        model: Result of structure from motion.
+        images: Image files by the names of the model.
+        board: Board to detect.
+        tag: Edge length of AprilTags as printed, without their white border [m].
+        scale_from: Two points and their distance [m]; see :func:`spot`.
+        centred: Put the origin below the point at which the cameras are directed; else in the middle of a board.
 
     Raises:
-        InputError: If ``scale_from`` names places that do not exist, or all cameras are where they look.
+        InputError: If ``scale_from`` names points that do not exist, or all cameras coincide with the point at which
+            they
+            are directed.
     """
     views, tag_views = _find_targets(model, images, board, tags=tag is not None)
     corners = _triangulate_corners(views, set(model.cameras))
@@ -181,7 +188,11 @@ def find_metric_frame(
 
 
 def spot(model: SparseModel, name: str) -> Float64Array:
-    """A place in the model, shape (3,): "photo" is its camera, "photo:x,y" the point that it sees at that pixel.
+    """Return a point of the model, shape (3,).
+
+    Args:
+        model: Result of structure from motion.
+        name: "photo" for the camera centre of a photo; "photo:x,y" for the surface point at a pixel of a photo.
 
     Raises:
         InputError: If there is no such photo, or it observes no point near the pixel.
@@ -204,7 +215,7 @@ def spot(model: SparseModel, name: str) -> Float64Array:
     near = near[gaps[near] < limit]
     if not len(near):
         raise InputError(f"{name}: the photo observes no point within {limit:.0f} px of this pixel")
-    # The pixel's own ray at the depth of the points around it: they need not lie on the pixel.
+    # Observed points need not lie on the pixel: use the ray of the pixel and the depth of the nearest points.
     weights = 1 / (gaps[near] + 1)
     depth = float(depths[near] @ weights / weights.sum())
     ray = np.append(camera.ray_slopes([(x, y)])[0], 1.0) * depth
@@ -212,17 +223,33 @@ def spot(model: SparseModel, name: str) -> Float64Array:
 
 
 def fit_similarity(source: Float64Array, target: Float64Array) -> tuple[Float64Array, Float64Array]:
-    """The similarity (4, 4) that takes points (N, 3) closest to others, and the residuals (N, 3) (Umeyama 1991)."""
+    """Fit the similarity between two point sets (Umeyama 1991).
+
+    Args:
+        source: Points, shape (N, 3).
+        target: Corresponding points, shape (N, 3).
+
+    Returns:
+        Matrix, shape (4, 4), and the residuals, shape (N, 3).
+    """
     matrix = np.asarray(SimilarityTransform.from_estimate(source, target).params, dtype=np.float64)
     return matrix, source @ matrix[:3, :3].T + matrix[:3, 3] - target
 
 
 def find_table(model: SparseModel, *, trials: int = 30000, seed: int = 0) -> tuple[Float64Array, Float64Array] | None:
-    """Normal towards the cameras and a point of the plane that things stand on, or None.
+    """Find the plane on which objects stand, by RANSAC (Fischler and Bolles 1981) over the points.
 
-    RANSAC (Fischler and Bolles 1981) over the points: the plane with the most of them, at least 2 %, that has all but a
-    twentieth of the cameras above it, less than a tenth of the points below, and a normal within 30 degrees of the
-    vertical that the cameras suggest, if they do.
+    The plane with the most points is chosen, at least 2 % of them. At least 95 % of the cameras must be above it, and
+    less
+    than a tenth of the points below it. If the cameras suggest a vertical, the normal must be within 30 degrees of it.
+
+    Args:
+        model: Result of structure from motion.
+        trials: Number of random planes.
+        seed: Seed of the random numbers.
+
+    Returns:
+        Normal towards the cameras and a point of the plane, or None.
     """
     points = model.points[_well_seen(model)]
     if len(points) < 50:
@@ -262,13 +289,15 @@ def find_table(model: SparseModel, *, trials: int = 30000, seed: int = 0) -> tup
 
 
 def vertical_from_cameras(model: SparseModel) -> Float64Array | None:
-    """Up, shape (3,), if photographs from several sides, upright or on their side but held level, suggest it.
+    """Estimate the up direction, shape (3,), from the attitudes of cameras; None if they do not suggest one.
 
-    It is the direction to which a side of every image is most nearly orthogonal, and from where the cameras look.
+    The estimate requires photographs from several sides in portrait or landscape format, held level. Up is the
+    direction to
+    which one image axis of each photo is most nearly orthogonal, on the side of the cameras.
     """
     poses = np.array([camera.world_from_camera[:3, :3] for camera in model.cameras.values()])
     sides = poses[:, :, :2]
-    golden = np.arange(1000) + 0.5  # a half sphere, evenly (Fibonacci)
+    golden = np.arange(1000) + 0.5  # even samples of a half sphere (Fibonacci)
     height, angle = golden / 1000, np.pi * (1 + np.sqrt(5)) * golden
     radius = np.sqrt(1 - height**2)
     directions = np.column_stack([radius * np.cos(angle), radius * np.sin(angle), height])
@@ -280,19 +309,19 @@ def vertical_from_cameras(model: SparseModel) -> Float64Array | None:
         refined = np.linalg.eigh(level.T @ level)[1][:, 0]
         upward = refined * np.sign(refined @ upward)
     others = tilt[np.abs(directions @ upward) < _TILT]
-    if tilt[best] > 0.03 or others.min() < 3 * tilt[best] + 0.01:  # held anyhow, or all from one side
+    if tilt[best] > 0.03 or others.min() < 3 * tilt[best] + 0.01:  # arbitrary roll, or all from one side
         return None
     return np.asarray(upward * np.sign(np.mean(-poses[:, :, 2] @ upward)))
 
 
 def _rays(model: SparseModel) -> tuple[Float64Array, Float64Array]:
-    """Centres and viewing directions of the cameras, (N, 3) each."""
+    """Return centres and viewing directions of the cameras, shape (N, 3) each."""
     poses = np.array([camera.world_from_camera for camera in model.cameras.values()])
     return poses[:, :3, 3], poses[:, :3, 2]
 
 
 def _well_seen(model: SparseModel) -> npt.NDArray[np.intp]:
-    """Indices of points that at least three images observe; all, where nothing is known of that."""
+    """Return the indices of points that at least three images observe, or of all points if observations are unknown."""
     counts = np.zeros(len(model.points), dtype=np.int64)
     for indices in model.seen.values():
         counts[indices] += 1
@@ -300,7 +329,7 @@ def _well_seen(model: SparseModel) -> npt.NDArray[np.intp]:
 
 
 def _upright(normal: Float64Array, heading: Float64Array) -> Float64Array:
-    """Rotation (3, 3) that takes ``normal`` to z and what of ``heading`` is orthogonal to it to x."""
+    """Return the rotation (3, 3) that takes ``normal`` to z and the component of ``heading`` orthogonal to it to x."""
     x = heading - heading @ normal * normal
     if np.linalg.norm(x) < 1e-6:
         x = np.eye(3)[np.abs(normal).argmin()]
@@ -310,7 +339,11 @@ def _upright(normal: Float64Array, heading: Float64Array) -> Float64Array:
 
 
 def _find_targets(model: SparseModel, images: Mapping[str, Path], board: Board, *, tags: bool) -> tuple[_Views, _Views]:
-    """Where images see the board's corners, (2,) by index and image, and AprilTags, (4, 2) by id and image."""
+    """Detect board corners and AprilTags in the images.
+
+    Returns:
+        Pixels (2,) of board corners by index and image, and pixels (4, 2) of tag corners by tag id and image.
+    """
     corner_views: _Views = {}
     tag_views: _Views = {}
     for name, camera in model.cameras.items():
@@ -325,16 +358,17 @@ def _find_targets(model: SparseModel, images: Mapping[str, Path], board: Board, 
 
 
 def _scale_error(scale: float, measure: Callable[[set[str]], float | None], images: list[str], edge: float) -> float:
-    """Relative standard error of a scale: that of the print, and by a jackknife over groups of images (Tukey 1958).
+    """Return the relative standard error of a scale, from the print and a jackknife over image groups (Tukey 1958).
 
-    Corners that lie as they should say little: what bends or stretches a whole model moves them together. So the scale
-    is measured without every sixth image in turn, which also brings another mix of cameras.
+    The residuals of corners are too optimistic, because a deformation of the whole model moves all corners together. So
+    the
+    scale is measured with every sixth image left out in turn, which also changes the mix of cameras.
 
     Args:
-        scale: From all images.
-        measure: The scale from some of the images, if they suffice.
-        images: Names of all of them.
-        edge: What the user measured [m].
+        scale: Scale from all images.
+        measure: Function that returns the scale from a subset of the images, or None if they are not sufficient.
+        images: Names of all images.
+        edge: Edge length measured by the user [m].
     """
     found = [measure(set(images) - set(images[first::_GROUPS])) for first in range(_GROUPS)]
     scales = np.array([value for value in found if value is not None])
@@ -343,13 +377,13 @@ def _scale_error(scale: float, measure: Callable[[set[str]], float | None], imag
 
 
 def _triangulate_corners(views: _Views, names: set[str]) -> dict[int, Float64Array]:
-    """Corners (3,) of the board that enough of the named images show, by index."""
+    """Triangulate the board corners that enough of the named images show; points (3,) by index."""
     found = {i: triangulate([view for name, view in seen.items() if name in names]) for i, seen in views.items()}
     return {index: point for index, point in found.items() if point is not None}
 
 
 def _triangulate_tags(views: _Views, names: set[str]) -> dict[int, Float64Array]:
-    """Corners (4, 3) in the model of the tags that enough of the named images show, by id."""
+    """Triangulate the tags that enough of the named images show; corners (4, 3) in the model by tag id."""
     tags = {}
     for number, seen in views.items():
         shown = [view for name, view in seen.items() if name in names]
@@ -361,10 +395,19 @@ def _triangulate_tags(views: _Views, names: set[str]) -> dict[int, Float64Array]
 
 
 def _judge_cameras(views: _Views, corners: Mapping[int, Float64Array]) -> tuple[dict[str, float], frozenset[str]]:
-    """Images that see the board elsewhere than the others do, and by how far [px]; and those that see it there.
+    """Compare the cameras with the board.
 
-    At least six of the corners (3,) must be seen. They are best triangulated: a bent print has them elsewhere than a
-    flat one. Cameras that few or repetitive points hold can be far off at small reprojection errors.
+    A camera is judged if it observes at least six corners. Cameras with few or repetitive points can be far off at
+    small
+    reprojection errors.
+
+    Args:
+        views: Observations of board corners.
+        corners: Positions (3,) of the corners by index. Triangulated positions are best, because a bent print is not
+            flat.
+
+    Returns:
+        Images that contradict the board, with their error [px], and images that agree with it.
     """
     errors: dict[str, list[float]] = {}
     edges = {}
@@ -383,9 +426,9 @@ def _judge_cameras(views: _Views, corners: Mapping[int, Float64Array]) -> tuple[
 
 
 def _fit_board(corners: Mapping[int, Float64Array], board: Board) -> tuple[Float64Array, float] | None:
-    """Pose of the board in the model (4, 4), and metres per unit of the model.
+    """Return the pose (4, 4) of the board in the model, and the metres per unit of the model.
 
-    None without enough corners, or where they do not lie as the board's do.
+    The result is None if there are too few corners or their arrangement does not match the board.
     """
     if len(corners) < 6:
         return None
@@ -403,7 +446,7 @@ def _fit_board(corners: Mapping[int, Float64Array], board: Board) -> tuple[Float
 
 
 def _plane_of_tags(tags: Mapping[int, Float64Array]) -> tuple[Float64Array, Float64Array] | None:
-    """Normal and a point of the plane that the tags lie on, or None where they lie on several."""
+    """Return the normal and a point of the common plane of the tags, or None if they are not in one plane."""
     corners = np.concatenate(list(tags.values()))
     point = corners.mean(axis=0)
     _, spread, axes = np.linalg.svd(corners - point)

@@ -1,4 +1,4 @@
-"""Which pixels of a photograph are the object: masks given by the user, from a segmentation model, or from geometry."""
+"""Object masks of photographs: given by the user, from a segmentation network, or from geometry."""
 
 from __future__ import annotations
 
@@ -29,46 +29,50 @@ from mitsplat.storage.files import IMAGE_ERRORS, write_file
 
 ByteImage = npt.NDArray[np.uint8]
 MaskMaker = Callable[[Photo], BoolArray]
-"""Makes the mask of a photo, shape (H, W)."""
+"""Function that computes the mask of a photo, shape (H, W)."""
 
 Hidden = Mapping[str, BoolArray]
-"""Pixels (H, W) of a photo in which another thing may hide the object, by its name; photos without such are absent."""
+"""Pixels (H, W) in which another thing may occlude the object, by the name of the photo; photos without them are
+absent.
+"""
 _NOTHING: Hidden = {}
 
 Bare = Callable[[Camera, npt.NDArray[np.uint8]], BoolArray]
-"""Pixels (H, W) of a grey image (H, W) by a camera that are surely not the object."""
+"""Function of a camera and its grey image (H, W) that returns pixels (H, W) that are certainly not the object."""
 
 MIN_SHARE = 0.02
-"""Share of a photo that its object must cover; models that find nothing mark less than that."""
+"""Minimum fraction of a photo that a mask must cover; networks that find nothing mark less."""
 
 MIN_AGREEMENT = 0.7
-"""Share of the object's points in a photo that its mask must cover."""
+"""Minimum fraction of the object's points in a photo that its mask must cover."""
 
 _WORK_EDGE = 480
-"""Longer edge of a photo at which GrabCut begins, and of the object at which it ends [px]."""
+"""Longer edge of the photo in the first GrabCut, and of the object in the last [px]."""
 
 _FAR_OFF = 100
-"""Sizes of the image within which a point must be projected to count."""
+"""Limit of projected coordinates, in image sizes; points beyond it are ignored."""
 
 _ROUNDS = 3
 _EXTENSIONS = 4
 _RING = 0.1
-"""Width of what is in question around the object, as a share of its size."""
+"""Width of the undecided band around the object, as a fraction of its size."""
 
 _CELLS = 96
-"""Cells along the longest edge of the box in which masks are brought together."""
+"""Cells along the longest edge of the visual hull's box."""
 
 _DISSENT = 0.04
-"""Share of the photos whose masks may leave a point out and be overruled by the others."""
+"""Fraction of the photos whose masks may exclude a cell that still belongs to the visual hull."""
 
 _DOUBT = 0.04
-"""Width on either side of the common outline in which a photo decides for itself, as a share of the object's size."""
+"""Half width of the band around the common outline that each photo segments by itself, as a fraction of the object
+size.
+"""
 
 _FEWEST = 3
-"""Photos that can agree on an outline."""
+"""Minimum number of photos for a common outline."""
 
 _ABOVE = 0.01
-"""Height over the table from which a point belongs to the object, as a share of the cameras' distance."""
+"""Minimum height of object points above the table, as a fraction of the cameras' distance."""
 
 
 def add_masks(
@@ -81,21 +85,21 @@ def add_masks(
     hidden: Hidden = _NOTHING,
     threads: int = 1,
 ) -> Capture:
-    """The capture with a mask for each photo; photos whose mask is unusable are rejected.
+    """Return the capture with a mask for each photo; photos with an unusable mask are rejected.
 
     Args:
-        capture: Its photos' files must exist.
-        make: Makes one mask.
-        folder: Where the masks are written.
-        progress: Told the photos done.
-        points: Points known to be of the object, shape (N, 3), that masks must cover.
-        hidden: Where other things may hide the object.
-        threads: How many masks are made at a time.
+        capture: Capture whose image files exist.
+        make: Function that computes one mask.
+        folder: Folder for the masks.
+        progress: Callback with the number of finished photos.
+        points: Points of the object that masks must cover, shape (N, 3).
+        hidden: Pixels in which other things may occlude the object.
+        threads: Number of masks that are computed at the same time.
     """
     photos, rejected = [], dict(capture.rejected)
 
     def cut(photo: Photo) -> str | None:
-        """Write the mask of a photo, or say why it is unusable."""
+        """Write the mask of a photo, or return the reason why it is unusable."""
         mask, unknown = make(photo), hidden.get(photo.name)
         mask = mask if unknown is None else mask & ~unknown
         reason = _fault(mask, photo.camera, points, unknown)
@@ -126,16 +130,18 @@ def object_masks(
     hidden: Hidden = _NOTHING,
     progress: Progress | None = None,
 ) -> Capture:
-    """The capture with masks of an object that some of its points are on, cut out of each photo and then of all.
+    """Return the capture with masks of an object, from points on it.
+
+    The object is first segmented in each photo alone, then again with the common outline of all photos.
 
     Args:
-        capture: Its photos' files must exist.
-        points: Of the object and of where it stands, shape (N, 3).
-        above: Of the object alone, which masks must cover, shape (M, 3).
-        folder: Where the masks are written.
-        bare: Finds what is surely not the object.
-        hidden: Where other things may hide the object: there masks show nothing, and are transparent.
-        progress: Told the photos done.
+        capture: Capture whose image files exist.
+        points: Points of the object and of its footprint, shape (N, 3).
+        above: Points of the object alone, which masks must cover, shape (M, 3).
+        folder: Folder for the masks.
+        bare: Function that finds pixels that are certainly not the object.
+        hidden: Pixels in which other things may occlude the object; masks are 0 and transparent there.
+        progress: Callback with the number of finished photos.
     """
     add = partial(
         add_masks, capture, folder=folder, progress=progress, points=above, hidden=hidden, threads=usable_cores()
@@ -143,18 +149,25 @@ def object_masks(
     masked = add(geometric_masks(points, bare, hidden))
     if len(masked.photos) < _FEWEST:
         return masked
-    # What a photo was rejected for may be what the others set right.
+    # The second pass uses all photos again, because the common outline can repair masks that were rejected.
     return add(agreed_masks(masked, points, bare, hidden))
 
 
 def given_masks(folder: Path, prepared: Mapping[str, Prepared]) -> MaskMaker:
-    """Masks of the user: ``<photo>.png`` with or without the photo's own suffix, in any case, in the size of the photo.
+    """Return a function that reads masks of the user.
 
-    White, or what is opaque in a picture with transparency, marks the object. A mask lies as viewers show the photo;
-    one that lies on its side, as the camera held by EXIF's account, is turned.
+    A mask file is ``<photo>.png``, with or without the photo's own suffix, in any case. It has the size of the photo.
+    White
+    marks the object; in a picture with transparency, opaque pixels do. A mask is oriented as viewers show the photo. A
+    mask
+    in the orientation of the sensor is rotated by the EXIF orientation of the photo.
+
+    Args:
+        folder: Folder of the masks.
+        prepared: Photo copies by the name of the photo.
 
     Raises:
-        InputError: The maker, if a mask is missing or of another shape.
+        InputError: Raised by the returned function if a mask is missing or has another aspect ratio.
     """
     below = sorted(path for path in folder.rglob("*") if path.is_file())
     by_name = {path.relative_to(folder).as_posix().lower(): path for path in below}
@@ -169,7 +182,7 @@ def given_masks(folder: Path, prepared: Mapping[str, Prepared]) -> MaskMaker:
             with Image.open(path) as image:
                 upright = ImageOps.exif_transpose(image)
                 mask = upright.getchannel("A") if "A" in upright.getbands() else upright.convert("L")
-                if mask.getextrema() == (255, 255):  # opaque everywhere says nothing
+                if mask.getextrema() == (255, 255):  # a fully opaque alpha channel has no information
                     mask = upright.convert("L")
         except IMAGE_ERRORS as error:
             raise InputError(f"{path}: not a readable image ({error})") from error
@@ -187,7 +200,9 @@ def given_masks(folder: Path, prepared: Mapping[str, Prepared]) -> MaskMaker:
 
 
 def model_masks(model: Path) -> MaskMaker:
-    """Masks by a segmentation network through rembg: any ONNX file of the kind of IS-Net (dichotomous segmentation).
+    """Return a function that computes masks by a segmentation network through rembg.
+
+    The network is an ONNX file for dichotomous segmentation, like IS-Net.
 
     Raises:
         InputError: If the file does not exist or is no such network.
@@ -198,7 +213,7 @@ def model_masks(model: Path) -> MaskMaker:
     rembg = load_library("masks", "rembg")
     try:
         session: Any = rembg.new_session("dis_custom", model_path=str(model.resolve()))
-    except Exception as error:  # onnxruntime's have no other base
+    except Exception as error:  # exceptions of onnxruntime have no other base
         raise InputError(f"{model}: not a segmentation network in ONNX ({' '.join(str(error).split())})") from error
 
     def make(photo: Photo) -> BoolArray:
@@ -210,19 +225,19 @@ def model_masks(model: Path) -> MaskMaker:
 
 
 def geometric_masks(points: Float64Array, bare: Bare | None = None, hidden: Hidden = _NOTHING) -> MaskMaker:
-    """Masks by GrabCut (Rother et al. 2004), begun from the hull of points on the object.
+    """Return a function that computes masks by GrabCut (Rother et al. 2004), initialised by the hull of object points.
 
     Args:
-        points: Of the object, in the capture's frame, shape (N, 3); see :func:`object_points`.
-        bare: Finds what is surely not the object.
-        hidden: Where other things may hide the object.
+        points: Points of the object in the frame of the capture, shape (N, 3); see :func:`object_points`.
+        bare: Function that finds pixels that are certainly not the object.
+        hidden: Pixels in which other things may occlude the object.
     """
 
     def make(photo: Photo) -> BoolArray:
         camera, bgr, _ = _reduced(photo)
         unknown = _shrunk(hidden.get(photo.name), camera)
         pixels, _ = camera.project(points)
-        # A point that all but lies in the camera's plane may be at any number of pixels, more than an integer holds.
+        # A point close to the camera plane projects to coordinates that overflow an integer.
         near = (np.abs(pixels) < _FAR_OFF * max(camera.width, camera.height)).all(axis=1)
         return _enlarged(_grab(bgr, pixels[near], _free(bare, camera, bgr), unknown), photo.camera)
 
@@ -232,16 +247,16 @@ def geometric_masks(points: Float64Array, bare: Bare | None = None, hidden: Hidd
 def agreed_masks(
     masked: Capture, points: Float64Array, bare: Bare | None = None, hidden: Hidden = _NOTHING
 ) -> MaskMaker:
-    """Masks by GrabCut within a band around the outline that the masks of all photos agree on.
+    """Return a function that computes masks by GrabCut within a band around the common outline of all photos.
 
-    What one photo cannot tell from its object, such as a dark corner behind it, others see beside it: the visual hull
-    (Laurentini 1994) of all masks, less the few that contradict the rest, says where the outline may be.
+    In one photo, background such as a dark corner can look like the object. Other photos show it beside the object. The
+    visual hull (Laurentini 1994) of all masks, except the few that contradict the rest, gives the common outline.
 
     Args:
-        masked: The capture with first masks.
-        points: Of the object, in the capture's frame, shape (N, 3); the hull is looked for around them.
-        bare: Finds what is surely not the object.
-        hidden: Where other things may hide the object.
+        masked: Capture with initial masks.
+        points: Points of the object in the frame of the capture, shape (N, 3); they bound the hull.
+        bare: Function that finds pixels that are certainly not the object.
+        hidden: Pixels in which other things may occlude the object.
     """
     small = {photo.name: _reduced(photo) for photo in masked.photos}
     shown = [(camera, mask | _shrunk(hidden.get(name), camera)) for name, (camera, _, mask) in small.items()]
@@ -264,9 +279,11 @@ def agreed_masks(
 
 
 def object_points(capture: Capture) -> Float64Array:
-    """Points (N, 3) of what stands on the table (z = 0) where the cameras look: the nearest large cluster.
+    """Find the points (N, 3) of the object on the table (z = 0).
 
-    Points as low as the table cannot be told from it, so the feet of the lowest are added; of all, if none is low.
+    The object is a large cluster near the point at which the cameras are directed. Points at the height of the table
+    cannot be separated from it. So the vertical projections of the cluster's lowest points onto the table are added; of
+    all points, if none is low.
 
     Raises:
         InputError: If there is no such cluster.
@@ -297,14 +314,14 @@ def object_points(capture: Capture) -> Float64Array:
 
 
 def _free(bare: Bare | None, camera: Camera, bgr: ByteImage) -> BoolArray:
-    """What is surely not the object, shape (H, W)."""
+    """Return the pixels that are certainly not the object, shape (H, W)."""
     if bare is None:
         return np.zeros(bgr.shape[:2], dtype=bool)
     return bare(camera, np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2GRAY), dtype=np.uint8))
 
 
 def _shrunk(hidden: BoolArray | None, camera: Camera) -> BoolArray:
-    """What may be hidden, in the size of a camera's picture; nothing if None."""
+    """Return the possibly occluded pixels in the size of a camera's picture; no pixels if None."""
     if hidden is None:
         return np.zeros((camera.height, camera.width), dtype=bool)
     return np.asarray(
@@ -313,9 +330,11 @@ def _shrunk(hidden: BoolArray | None, camera: Camera) -> BoolArray:
 
 
 def _grab(image: ByteImage, pixels: Float64Array, free: BoolArray, unknown: BoolArray) -> BoolArray:
-    """GrabCut of a BGR image (H, W, 3) from where points of the object are in it, shape (N, 2), and where it is not.
+    """Segment a BGR image (H, W, 3) by GrabCut from projected object points (N, 2).
 
-    Sides without points lie outside of the hull. So the region in question begins at it and follows what was found.
+    Parts of the object without points lie outside the hull of the points. So the undecided band starts at the hull and
+    is
+    extended around the segmented region.
     """
     height, width = image.shape[:2]
     nothing = np.zeros((height, width), dtype=bool)
@@ -348,23 +367,31 @@ def _cut(
     unknown: BoolArray,
     ring: float,
 ) -> BoolArray:
-    """GrabCut of a BGR image (H, W, 3) where ``near``, begun from what is probably, surely and not ``inside``.
+    """Segment a BGR image (H, W, 3) by GrabCut within ``near``.
 
-    Nothing is found where it is ``unknown`` whether a thing hides the object, but parts may be joined by that.
+    Args:
+        image: BGR image, shape (H, W, 3).
+        near: Pixels that may be object.
+        inside: Pixels that are probably object.
+        core: Pixels that are certainly object.
+        free: Pixels that are certainly background.
+        unknown: Possibly occluded pixels. They are never object, but they can connect parts of it.
+        ring: Width of the undecided band [px].
     """
     trimap = np.full(near.shape, cv2.GC_BGD, dtype=np.uint8)
     trimap[near] = cv2.GC_PR_BGD
     trimap[inside] = cv2.GC_PR_FGD
     trimap[core] = cv2.GC_FGD
     trimap[free | unknown] = cv2.GC_BGD
-    # The background that is learnt from is what surrounds the object, and the cost is that of its box.
+    # The colour model of the background uses only the surroundings of the object, and the run time depends on their
+    # box.
     edge = round(ring) + 4
     y, x = np.nonzero(near)
     box = np.s_[max(0, y.min() - edge) : y.max() + edge + 1, max(0, x.min() - edge) : x.max() + edge + 1]
     part = np.ascontiguousarray(trimap[box])
     found = (part == cv2.GC_FGD) | (part == cv2.GC_PR_FGD)
     if found.any() and not found.all():
-        cv2.setRNGSeed(0)  # of this thread
+        cv2.setRNGSeed(0)  # per thread
         models = np.zeros((1, 65)), np.zeros((1, 65))
         cv2.grabCut(np.ascontiguousarray(image[box]), part, (0, 0, 1, 1), *models, _ROUNDS, cv2.GC_INIT_WITH_MASK)
         found = (part == cv2.GC_FGD) | (part == cv2.GC_PR_FGD)
@@ -374,7 +401,7 @@ def _cut(
 
 
 def _agreed_hull(views: Sequence[tuple[Camera, BoolArray]], points: Float64Array) -> tuple[Float64Array, float]:
-    """Middles (N, 3) of the cells that all masks but a few show as object, and the edge of a cell."""
+    """Return the centres (N, 3) of cells that all masks except a few show as object, and the cell edge."""
     low, high = points.min(axis=0), points.max(axis=0)
     margin = 0.3 * float((high - low).max())
     low, high = low - (margin, margin, 0.0), high + margin
@@ -395,7 +422,7 @@ def _agreed_hull(views: Sequence[tuple[Camera, BoolArray]], points: Float64Array
 
 
 def _silhouette(cells: Float64Array, cell: float, camera: Camera) -> BoolArray:
-    """The pixels that cells with an edge of ``cell`` cover, shape (H, W)."""
+    """Return the pixels covered by cells of edge ``cell``, shape (H, W)."""
     shown = np.zeros((camera.height, camera.width), dtype=np.uint8)
     pixels, depths = camera.project(cells)
     inside = ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(axis=1)
@@ -403,19 +430,24 @@ def _silhouette(cells: Float64Array, cell: float, camera: Camera) -> BoolArray:
         return shown > 0
     x, y = pixels[inside].astype(np.intp).T
     shown[y, x] = 1
-    # Middles of cells lie apart by an edge at most, and half an edge inside of the outline.
+    # Cell centres are at most one edge apart and half an edge inside the outline.
     edge = cell * camera.fx / float(np.median(depths[inside]))
     return ~_grown(~_grown(shown, edge), edge / 2)
 
 
 def _share(mask: BoolArray) -> float:
-    """What share of the longer edge of its picture a mask spans."""
+    """Return the extent of a mask as a fraction of the longer edge of its picture."""
     shown = np.argwhere(mask)
     return float(np.ptp(shown, axis=0).max() + 1) / max(mask.shape) if len(shown) else 1.0
 
 
 def _reduced(photo: Photo, share: float = 1.0) -> tuple[Camera, ByteImage, BoolArray]:
-    """Camera, BGR picture (H, W, 3) and mask (H, W) in the size for GrabCut of a ``share`` of a photo's longer edge."""
+    """Return camera, BGR picture (H, W, 3) and mask (H, W) of a photo, reduced for GrabCut.
+
+    Args:
+        photo: Photo to reduce.
+        share: Extent of the object as a fraction of the photo's longer edge.
+    """
     scale = min(1.0, _WORK_EDGE / share / max(photo.camera.width, photo.camera.height))
     rgb, mask = photo.picture(scale)
     bgr = np.rint(255 * rgb[..., ::-1]).astype(np.uint8)
@@ -424,24 +456,24 @@ def _reduced(photo: Photo, share: float = 1.0) -> tuple[Camera, ByteImage, BoolA
 
 
 def _enlarged(mask: BoolArray, camera: Camera) -> BoolArray:
-    """A mask in the size of the camera."""
+    """Return a mask resampled to the size of the camera."""
     soft = cv2.GaussianBlur(mask.astype(np.float32), (0, 0), 1.0)
     return np.asarray(cv2.resize(soft, (camera.width, camera.height), interpolation=cv2.INTER_CUBIC) >= 0.5)
 
 
 def _grown(mask: npt.NDArray[np.generic], radius: float) -> BoolArray:
-    """The mask dilated by a disc of at least one pixel."""
+    """Dilate a mask by a disc with a radius of at least one pixel."""
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * max(1, round(radius)) + 1,) * 2)
     return np.asarray(cv2.dilate(mask.astype(np.uint8), disc) > 0)
 
 
 def shapes_differ(one: tuple[int, int], other: tuple[int, int]) -> bool:
-    """Whether two image sizes are of different shape, up to the rounding of a reduced copy."""
+    """Return True if two image sizes have different aspect ratios, beyond the rounding of a reduced copy."""
     return abs(one[0] * other[1] - one[1] * other[0]) > max(*one, *other)
 
 
 def _largest_part(mask: BoolArray) -> BoolArray:
-    """The largest connected part of a mask."""
+    """Return the largest connected component of a mask."""
     count, parts, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
     return parts == 1 + int(stats[1:, cv2.CC_STAT_AREA].argmax()) if count > 1 else mask
 

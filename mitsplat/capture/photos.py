@@ -1,4 +1,4 @@
-"""Photographs as they come from a camera: which are usable, and the upright copies that everything else works on."""
+"""Preparation of photographs: selection of usable photos, and upright copies for all later stages."""
 
 from __future__ import annotations
 
@@ -26,23 +26,26 @@ _UNREAD = (".arw", ".avif", ".cr2", ".cr3", ".dng", ".heic", ".heif", ".nef")
 _LOSSY = ("JPEG", "MPO", "WEBP")
 
 _BLURRED = 0.12
-"""Share of the set's median sharpness. Gaussian blur of 3 px in 1600 px comes below it; views of one object, which
-differ by a factor of 2.5 to either side, do not."""
+"""Minimum sharpness as a fraction of the median of all photos.
+
+A Gaussian blur of 3 px at 1600 px falls below this limit. Sharp views of one object differ by a factor of up to 2.5 in
+both directions and stay above it.
+"""
 
 _CLIPPED = 0.9
-"""Share of black or white pixels from which a photo is unusable; a white sweep behind a part covers less."""
+"""Fraction of black or white pixels above which a photo is unusable; a white backdrop covers less."""
 
 
 @dataclass(frozen=True)
 class Prepared:
-    """An upright copy of a photo.
+    """Upright copy of a photo.
 
     Attributes:
-        name: Path of the photo below the folder given, as the user knows it.
-        file: The copy.
+        name: Path of the photo relative to the input folder, as given by the user.
+        file: File of the copy.
         size: Width and height [px].
         orientation: EXIF orientation that was applied, 1 to 8 (1: none).
-        lens: Camera, focal length and size; photos that agree in it can share intrinsics.
+        lens: Camera make and model, focal length and size; photos with equal values can share intrinsics.
     """
 
     name: str
@@ -60,14 +63,14 @@ class _Judged:
 
 
 def find_photos(folder: Path, *, but: Path | None = None) -> list[Path]:
-    """The photographs below a folder and folders that it links to, sorted; hidden ones are left out.
+    """Return the photographs below a folder and its linked folders, sorted; hidden files are excluded.
 
     Args:
-        folder: Where they are.
-        but: A folder whose pictures are none.
+        folder: Folder of the photographs.
+        but: Folder whose pictures are excluded.
 
     Raises:
-        InputError: If the folder does not exist, or two photographs would have copies of one name.
+        InputError: If the folder does not exist, or two photographs would have copies of the same name.
     """
     if not folder.is_dir():
         raise InputError(f"{folder}: must be a folder of photographs, or a video, that is there")
@@ -91,18 +94,22 @@ def prepare_photos(
     upright: bool = True,
     progress: Progress | None = None,
 ) -> tuple[list[Prepared], dict[str, str]]:
-    """Upright copies of the usable photographs below ``folder``, and why the others are not, by name.
+    """Make upright copies of the usable photographs below ``folder``.
 
-    EXIF orientation is applied, since COLMAP ignores it; what is larger than ``max_size`` is reduced. A photo that
-    needs neither is copied byte by byte.
+    EXIF orientation is applied because COLMAP ignores it. Photos larger than ``max_size`` are reduced. A photo that
+    needs
+    neither is copied byte by byte.
 
     Args:
-        folder: Photographs in any depth.
-        but: A folder whose pictures are none.
-        out: Folder of the copies; those that are there already are not made again.
+        folder: Folder of photographs, at any depth.
+        but: Folder whose pictures are excluded.
+        out: Folder of the copies; existing copies are reused.
         max_size: Longest edge of the copies [px].
-        upright: Whether EXIF orientation is applied; cameras that are known already ignore it.
-        progress: Told the photos done.
+        upright: Apply the EXIF orientation. Known cameras ignore it.
+        progress: Callback with the number of finished photos.
+
+    Returns:
+        The copies, and the reasons why other photos are unusable, by name.
 
     Raises:
         InputError: As :func:`find_photos`.
@@ -132,7 +139,7 @@ def prepare_photos(
 
 
 def _prepare(path: Path, *, folder: Path, out: Path, max_size: int, upright: bool) -> _Judged | str:
-    """The photo's upright copy, or why it cannot be read."""
+    """Make the upright copy of a photo, or return the reason why it cannot be read."""
     if path.suffix.lower() in _UNREAD:
         return f"{path.suffix[1:].upper()} files are not read; export it as JPEG or PNG"
     name = path.relative_to(folder).as_posix()
@@ -156,15 +163,15 @@ def _prepare(path: Path, *, folder: Path, out: Path, max_size: int, upright: boo
         if kept:
             write_file(file, partial(shutil.copyfile, path))
         else:
-            # EXIF goes along for the focal length, which COLMAP starts from, without the orientation.
+            # EXIF is copied for the focal length, the initial value of COLMAP; the orientation is removed.
             exif = turned.getexif()
             exif.pop(ExifTags.Base.Orientation, None)
             try:
                 kept_exif = exif.tobytes()
-            except (ValueError, TypeError, AttributeError, struct.error):  # of kinds that no file can hold
+            except (ValueError, TypeError, AttributeError, struct.error):  # value types that no file can store
                 kept_exif = b""
             options: dict[str, Any] = {"quality": 95, "subsampling": 0} if lossy else {}
-            options["exif"] = kept_exif if len(kept_exif) < 65_000 else b""  # for which a JPEG has room
+            options["exif"] = kept_exif if len(kept_exif) < 65_000 else b""  # limit of a JPEG segment
             write_file(file, lambda part: rgb.save(part, "JPEG" if lossy else "PNG", **options))
     focal = details.get(ExifTags.Base.FocalLength), details.get(ExifTags.Base.FocalLengthIn35mmFilm)
     lens = (details.get(ExifTags.Base.Make), details.get(ExifTags.Base.Model), *focal, *rgb.size)
@@ -185,7 +192,7 @@ def _fault(photo: _Judged, median_sharpness: float) -> str | None:
 
 
 def undistort(photo: Photo) -> Photo:
-    """The photo resampled to a pinhole camera that sees nothing beyond its border; its file is replaced by a PNG."""
+    """Resample the photo, as a PNG file, to a pinhole camera that shows no pixels beyond the photo's border."""
     camera = photo.camera
     if not camera.distortion:
         return photo

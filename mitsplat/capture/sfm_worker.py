@@ -1,10 +1,11 @@
-"""Structure from motion by pycolmap, in a process of its own: ``python -m mitsplat.capture.sfm_worker JOB``.
+"""Structure from motion by pycolmap, in a separate process: ``python -m mitsplat.capture.sfm_worker JOB``.
 
-pycolmap can end the process it runs in, and breaks zlib where that was not used before. So nothing else imports it;
-:mod:`mitsplat.capture.structure_from_motion` starts this module, follows its progress and reads what it leaves in the
+pycolmap can abort its process, and it breaks zlib if zlib was not used before the import. So no other module imports
+it. :mod:`mitsplat.capture.structure_from_motion` starts this module, monitors its progress and reads the results in the
 job's folder.
 
-JOB is a JSON file, see :func:`run`; ``model.npz`` next to it is the result, ``status`` what is being done.
+JOB is a JSON file, see :func:`run`. In the same folder, ``model.npz`` is the result and ``status`` the present
+activity.
 """
 
 from __future__ import annotations
@@ -30,14 +31,14 @@ from mitsplat.runtime.cores import usable_cores  # noqa: E402
 SEED = 1
 SEQUENTIAL_OVERLAP = 10
 MAX_SAMPSON = 4.0
-"""Error up to which cameras explain a match, as in COLMAP's own verification [px]."""
+"""Maximum error of a match that agrees with the cameras, as in COLMAP's own verification [px]."""
 
 BLOCK = 12
-"""Images in a block of exhaustive matching: results are stored, and so progress seen, per pair of blocks."""
+"""Images per block of exhaustive matching; results are stored, and progress is visible, per pair of blocks."""
 
 
 def main(job_file: Path) -> None:
-    """Do the job; whatever goes wrong is left as one line in ``error``."""
+    """Run the job; an error is written as one line to the file ``error``."""
     folder = job_file.parent
     try:
         run(json.loads(job_file.read_text()), folder)
@@ -47,9 +48,9 @@ def main(job_file: Path) -> None:
 
 
 def end_with_parent() -> None:
-    """End this process when the one at the other end of its standard input does, however that ends.
+    """Exit this process when its parent, at the other end of standard input, ends for any reason.
 
-    Left alone it would write on into the database that the next run takes up.
+    Otherwise it would continue to write to the database that the next run uses.
     """
 
     def watch() -> None:
@@ -64,15 +65,16 @@ def run(job: dict[str, Any], folder: Path) -> None:
     """Find or read a model and store it.
 
     Args:
-        job: ``task``: "read" a COLMAP model from ``model`` within ``memory`` [bytes]; or "reconstruct" from ``groups``
-            (names of the photos in ``images``, a path from ``folder``, by shared intrinsics), with ``features``,
-            ``first_octave``, ``matching`` ("exhaustive" or "sequential") and ``enough``, the number of photos below
-            which the global mapper is tried as well; or "triangulate", the same with known ``cameras`` (see
-            :func:`known_model`).
-        folder: Where the database and the results are.
+        job: Mapping with the key ``task``. "read" reads a COLMAP model from ``model`` within ``memory`` [bytes].
+            "reconstruct" uses ``groups`` (names of the photos with shared intrinsics), ``images`` (their folder,
+            relative
+            to ``folder``), ``features``, ``first_octave``, ``matching`` ("exhaustive" or "sequential") and ``enough``
+            (number of photos below which the global mapper is also tried). "triangulate" uses the same keys and
+            ``cameras`` (see :func:`known_model`).
+        folder: Folder of the database and the results.
     """
     if job["task"] == "read":
-        limit_memory(job["memory"])  # counts in damaged files are not compared with their sizes
+        limit_memory(job["memory"])  # damaged files can declare arbitrarily large counts
         store(folder, [pycolmap.Reconstruction(job["model"])])
         return
     images, database = folder / job["images"], folder / "database.db"
@@ -90,17 +92,18 @@ def run(job: dict[str, Any], folder: Path) -> None:
 
 
 def say(folder: Path, doing: str) -> None:
-    """Leave word of the stage reached."""
+    """Write the present activity to the file ``status``."""
     part = folder / "status.part"
     part.write_text(doing)
-    part.replace(folder / "status")  # at once, as it is read at any time
+    part.replace(folder / "status")  # atomic, because the parent reads it at any time
 
 
 def number(job: dict[str, Any], images: Path, database: Path) -> None:
-    """Give the photos their ids in the order of the job; photos of a group share a camera.
+    """Assign image ids in the order of the job; photos of a group share a camera.
 
-    Features are stored by several threads as they come. Left to that, ids would differ from run to run, and with them
-    which of two photos is the first of a pair, the order of all pairs, and so every camera found.
+    Several threads store features in arbitrary order. Without this step, ids would differ between runs, and with them
+    the
+    order within pairs, the order of pairs, and all cameras.
     """
     reader = pycolmap.ImageReaderOptions()
     reader.camera_model = job["camera_model"]
@@ -109,18 +112,18 @@ def number(job: dict[str, Any], images: Path, database: Path) -> None:
         found = [image.name for image in sorted(opened.read_all_images(), key=lambda image: image.image_id)]
     if found == wanted:
         return
-    database.unlink()  # interrupted before all were in
+    database.unlink()  # an interrupted run left only some of the images
     pycolmap.Database.open(database).close()
     for names in job["groups"]:
         pycolmap.import_images(database, images, pycolmap.CameraMode.SINGLE, names, reader)
 
 
 def extract(job: dict[str, Any], images: Path, database: Path, folder: Path) -> None:
-    """SIFT features of the photos that have none yet."""
+    """Compute SIFT features of the photos that have none yet."""
     say(folder, "finding features")
     number(job, images, database)
     options = pycolmap.FeatureExtractionOptions()
-    options.num_threads = usable_cores()  # COLMAP counts those of the machine, and each takes the memory of a photo
+    options.num_threads = usable_cores()  # COLMAP would use all cores; each needs memory for a photo
     options.sift.max_num_features = job["features"]
     options.sift.first_octave = job["first_octave"]
     for names in job["groups"]:
@@ -135,7 +138,7 @@ def extract(job: dict[str, Any], images: Path, database: Path, folder: Path) -> 
 
 
 def match(job: dict[str, Any], database: Path, folder: Path) -> None:
-    """Verified matches of the pairs that have none yet."""
+    """Compute verified matches of the pairs that have none yet."""
     say(folder, "matching")
     matching = pycolmap.FeatureMatchingOptions()
     matching.num_threads = usable_cores()
@@ -152,7 +155,10 @@ def match(job: dict[str, Any], database: Path, folder: Path) -> None:
 
 
 def reconstruct(images: Path, database: Path, folder: Path, enough: int) -> list[pycolmap.Reconstruction]:
-    """All models found, the largest first: by the incremental mapper, or the global one where that registers more."""
+    """Reconstruct all models and return them, the largest first.
+
+    The incremental mapper is used. The global mapper is used if it registers more photos.
+    """
     say(folder, "finding cameras")
     options = mapping()
     registered = 0
@@ -171,7 +177,7 @@ def reconstruct(images: Path, database: Path, folder: Path, enough: int) -> list
         return models
     say(folder, "finding cameras at once")
     copy = folder / "global.db"
-    shutil.copyfile(database, copy)  # calibration rewrites the two-view geometries
+    shutil.copyfile(database, copy)  # calibration modifies the two-view geometries
     calibration = pycolmap.ViewGraphCalibrationOptions()
     calibration.random_seed = SEED
     pycolmap.calibrate_view_graph(copy, calibration)
@@ -189,26 +195,27 @@ def reconstruct(images: Path, database: Path, folder: Path, enough: int) -> list
 
 
 def mapping() -> pycolmap.IncrementalPipelineOptions:
-    """Options of the incremental mapper."""
+    """Return the options of the incremental mapper."""
     options = pycolmap.IncrementalPipelineOptions()
     options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = SEED
-    # Several threads of bundle adjustment sum up in any order, and the cameras would differ from run to run.
+    # Bundle adjustment with several threads sums in arbitrary order, so the cameras would differ between runs.
     options.num_threads = options.mapper.num_threads = 1
     options.min_model_size = 3
     return options
 
 
 def largest_first(found: dict[int, pycolmap.Reconstruction]) -> list[pycolmap.Reconstruction]:
-    """The models by the number of registered photos."""
+    """Sort the models by the number of registered photos, descending."""
     return sorted(found.values(), key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
 
 
 def known_model(cameras: dict[str, dict[str, Any]], database: Path) -> pycolmap.Reconstruction:
-    """A model without points.
+    """Return a model with known cameras and without points.
 
     Args:
-        cameras: Per photo ``width``, ``height``, COLMAP's ``model`` and ``params``, ``camera_from_world`` (3, 4).
-        database: Whose ids it takes.
+        cameras: Per photo ``width``, ``height``, COLMAP's ``model`` and ``params``, and ``camera_from_world``, shape
+            (3, 4).
+        database: Database that defines the image and camera ids.
     """
     model = pycolmap.Reconstruction()
     with pycolmap.Database.open(database) as opened:
@@ -232,7 +239,7 @@ def known_model(cameras: dict[str, dict[str, Any]], database: Path) -> pycolmap.
 
 
 def store(folder: Path, models: list[pycolmap.Reconstruction], shares: Mapping[str, float] | None = None) -> None:
-    """Write the first model with its :func:`agreement`, and which photos the others hold, as ``model.npz``."""
+    """Write the first model with its :func:`agreement`, and the names of photos in other models, to ``model.npz``."""
     arrays: dict[str, Any] = {"elsewhere": sorted(names_of(models[1:]) - names_of(models[:1]))}
     if models:
         arrays |= model_arrays(models[0])
@@ -241,10 +248,11 @@ def store(folder: Path, models: list[pycolmap.Reconstruction], shares: Mapping[s
 
 
 def agreement(model: pycolmap.Reconstruction, database: Path) -> dict[str, float]:
-    """Share of each photo's verified matches with the other photos that the model's cameras explain.
+    """Return, for each photo, the fraction of its verified matches that agree with the model's cameras.
 
-    Points only tell of the matches that a camera agrees with, so a photo that stands in a wrong place on a few of them
-    has small reprojection errors; here the others speak. The Sampson error (Hartley and Zisserman, 11.4.3) counts.
+    Points are triangulated only from matches that agree with the cameras. So a photo that is misplaced by a few matches
+    has
+    small reprojection errors, but a low fraction here. The error is the Sampson error (Hartley and Zisserman, 11.4.3).
     """
     explained: dict[int, list[int]] = {index: [0, 0] for index in model.reg_image_ids()}
     with pycolmap.Database.open(database) as opened:
@@ -276,12 +284,12 @@ def agreement(model: pycolmap.Reconstruction, database: Path) -> dict[str, float
 
 
 def names_of(models: list[pycolmap.Reconstruction]) -> set[str]:
-    """Registered photos."""
+    """Return the names of the registered photos."""
     return {model.image(index).name for model in models for index in model.reg_image_ids()}
 
 
 def model_arrays(model: pycolmap.Reconstruction) -> dict[str, Any]:
-    """The model in arrays: photos sorted by name, parameters padded with NaN."""
+    """Return the model as arrays: photos sorted by name, parameters padded with NaN."""
     ids = sorted(model.points3D)
     row = {point: index for index, point in enumerate(ids)}
     images = sorted((model.image(index) for index in model.reg_image_ids()), key=lambda image: image.name)

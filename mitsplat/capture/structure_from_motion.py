@@ -1,6 +1,6 @@
-"""Structure from motion: cameras and points from photographs, or from a COLMAP model that exists.
+"""Structure from motion: cameras and points from photographs, or from an existing COLMAP model.
 
-The work is done by COLMAP (Schönberger and Frahm 2016; global mapper: Pan et al. 2024) in
+The computation is done by COLMAP (Schönberger and Frahm 2016; global mapper: Pan et al. 2024) in
 :mod:`mitsplat.capture.sfm_worker`.
 """
 
@@ -30,25 +30,29 @@ from mitsplat.runtime.child_process import python_command, python_environment
 from mitsplat.storage.files import write_text
 
 MIN_POINTS = 30
-"""Points that a photo must observe: with fewer, cameras 20 % off were measured at reprojection errors of 0.2 px."""
+"""Minimum number of points that a photo must observe.
+
+With fewer points, camera errors of 20 % were measured at reprojection errors of 0.2 px.
+"""
 
 MIN_AGREEMENT = 0.5
-"""Share of a photo's matches that its camera must explain. On photographs of a statue it was 98 % or more for each."""
+"""Minimum fraction of a photo's matches that must agree with its camera; in photos of a statue, all had 98 % or more.
+"""
 
 SURE_AGREEMENT = 0.65
-"""Share below which a camera is doubtful, unless a board says otherwise."""
+"""Fraction of agreeing matches below which a camera is doubtful, unless a board confirms it."""
 
 ENOUGH = 0.8
-"""Share of registered photos below which the global mapper is tried as well."""
+"""Fraction of registered photos below which the global mapper is also tried."""
 
 _MODEL_PARTS = ("cameras", "images", "points3D")
 _READ_MEMORY = 2 << 30
-"""Address space for reading a model, beside 100 times the size of its files [bytes]."""
+"""Address space for reading a model, in addition to 100 times the size of its files [bytes]."""
 _READ_SECONDS = 30
-"""Time for reading a model, beside a second for each megabyte [s]."""
+"""Time limit for reading a model, in addition to one second per megabyte [s]."""
 
 _MODELS: Mapping[str, tuple[int, ...]] = {
-    # Places of COLMAP's parameters fx, fy, cx, cy, then k1, k2, p1, p2, k3, k4, k5, k6; -1: 0.
+    # Indices of COLMAP's parameters fx, fy, cx, cy, then k1, k2, p1, p2, k3, k4, k5, k6; -1 stands for 0.
     "SIMPLE_PINHOLE": (0, 0, 1, 2),
     "PINHOLE": (0, 1, 2, 3),
     "SIMPLE_RADIAL": (0, 0, 1, 2, 3, -1, -1, -1),
@@ -61,16 +65,16 @@ _MODELS: Mapping[str, tuple[int, ...]] = {
 
 @dataclass(frozen=True, eq=False)
 class SparseModel:
-    """What structure from motion found; its scale and frame are arbitrary.
+    """Result of structure from motion, in arbitrary scale and frame.
 
     Attributes:
-        cameras: Of the registered images, by file name.
+        cameras: Cameras of the registered images, by file name.
         points: Triangulated points, shape (N, 3).
-        colours: Of the points, 8-bit, shape (N, 3).
+        colours: 8-bit colours of the points, shape (N, 3).
         seen: Indices of the points that each image observes.
-        elsewhere: Names of images that only smaller models hold.
-        reprojection_error: Mean over all observations [px].
-        agreement: Share of each image's matches with the others that its camera explains; 1 where unknown.
+        elsewhere: Names of images that only smaller models contain.
+        reprojection_error: Mean reprojection error over all observations [px].
+        agreement: Fraction of each image's matches that agree with its camera; 1 where unknown.
     """
 
     cameras: Mapping[str, Camera]
@@ -82,9 +86,9 @@ class SparseModel:
     agreement: Mapping[str, float] = field(default_factory=dict)
 
     def without_weak(self, min_points: int = MIN_POINTS) -> tuple[SparseModel, dict[str, int]]:
-        """The model without images that observe fewer points, and how many those observe.
+        """Return the model without images that observe fewer points, and the number of points that those observe.
 
-        Points that fewer than two images are left to see go too, which can weaken further images.
+        Points that fewer than two remaining images observe are removed too, which can make more images weak.
         """
         counts = {name: len(indices) for name, indices in self.seen.items()}
         weak = {name: count for name, count in counts.items() if count < min_points}
@@ -94,7 +98,7 @@ class SparseModel:
         return rest, weak | weaker
 
     def without(self, names: Collection[str]) -> SparseModel:
-        """The model without some images, and without the points that fewer than two others see."""
+        """Return the model without the named images, and without points that fewer than two other images observe."""
         kept = [name for name in self.cameras if name not in names]
         observers = np.zeros(len(self.points), dtype=np.int64)
         for name in kept:
@@ -113,11 +117,11 @@ class SparseModel:
 
 
 def find_cameras(photos: Sequence[Prepared], folder: Path, progress: Progress | None = None) -> SparseModel:
-    """Cameras of photographs and the points they share. What an interrupted run had found of it is used.
+    """Find the cameras of photographs and their common points; results of an interrupted run are reused.
 
     Raises:
-        InputError: If no two photos share enough points to begin with.
-        MissingResourceError: If COLMAP ends its process.
+        InputError: If no two photos share enough points to start with.
+        MissingResourceError: If COLMAP aborts its process.
     """
     return _read_arrays(_run({"task": "reconstruct", **_job(photos, folder)}, folder, progress), photos)
 
@@ -125,11 +129,11 @@ def find_cameras(photos: Sequence[Prepared], folder: Path, progress: Progress | 
 def find_points(
     photos: Sequence[Prepared], cameras: Mapping[str, Camera], folder: Path, progress: Progress | None = None
 ) -> SparseModel:
-    """Points that photographs with known cameras share; the cameras stay as they are.
+    """Triangulate the common points of photographs with fixed, known cameras.
 
     Raises:
-        InputError: If COLMAP cannot use them.
-        MissingResourceError: If COLMAP ends its process.
+        InputError: If COLMAP cannot use the cameras.
+        MissingResourceError: If COLMAP aborts its process.
     """
     known = {
         name: {
@@ -150,15 +154,15 @@ def find_points(
 
 
 def read_model(source: Path, folder: Path) -> SparseModel:
-    """A COLMAP model, ``cameras``, ``images`` and ``points3D`` as ``.bin`` or ``.txt``.
+    """Read a COLMAP model: ``cameras``, ``images`` and ``points3D`` as ``.bin`` or ``.txt``.
 
     Args:
-        source: The model's folder.
-        folder: For intermediate files.
+        source: Folder of the model.
+        folder: Folder for intermediate files.
 
     Raises:
-        InputError: If it is damaged or its lens model is not one of OpenCV's.
-        MissingResourceError: If COLMAP ends its process.
+        InputError: If the model is damaged or its lens model is none of OpenCV's.
+        MissingResourceError: If COLMAP aborts its process.
     """
     parts = [source / f"{name}{suffix}" for name in _MODEL_PARTS for suffix in (".bin", ".txt")]
     if odd := [path for path in parts if path.exists() and not path.is_file()]:
@@ -175,10 +179,10 @@ def read_model(source: Path, folder: Path) -> SparseModel:
 def opencv_camera(
     model: str, width: int, height: int, params: npt.ArrayLike, camera_from_world: Float64Array
 ) -> Camera:
-    """The camera with COLMAP's parameters; both put pixel centres at +0.5.
+    """Return the camera with COLMAP's parameters; both conventions put pixel centres at +0.5.
 
     Raises:
-        InputError: If the lens model is not one of OpenCV's, or shows more than it can.
+        InputError: If the lens model is none of OpenCV's, or the camera is invalid.
     """
     if model not in _MODELS:
         raise InputError(
@@ -186,7 +190,7 @@ def opencv_camera(
         )
     values = np.append(np.asarray(params, dtype=np.float64), 0.0)
     fx, fy, cx, cy, *distortion = (float(values[place]) for place in _MODELS[model])
-    # Quaternions of text files have few digits: the nearest rotation.
+    # Quaternions of text files have few digits, so use the nearest rotation.
     u, _, vt = np.linalg.svd(camera_from_world[:3, :3])
     pose = np.eye(4)
     pose[:3, :3] = (u @ vt).T
@@ -203,9 +207,9 @@ def opencv_camera(
 
 
 def _job(photos: Sequence[Prepared], folder: Path) -> dict[str, Any]:
-    """What to do for so many photos: finer features for few, neighbours only for many.
+    """Return the job for the photos: finer features for few photos, sequential matching for many.
 
-    It names the photos as seen from its own folder, so that what was found of them is still of use when both move.
+    The job has the photo folder relative to its own folder, so that results stay valid when both are moved together.
     """
     groups: dict[tuple[str, ...], list[str]] = {}
     for photo in photos:
@@ -225,7 +229,10 @@ def _job(photos: Sequence[Prepared], folder: Path) -> dict[str, Any]:
 def _run(
     job: Mapping[str, Any], folder: Path, progress: Progress | None, *, seconds: float = math.inf
 ) -> dict[str, npt.NDArray[Any]]:
-    """Have the child do the job within a time; what an earlier one of the same input stored in the database is kept."""
+    """Run the job in a child process within a time limit.
+
+    The database of an earlier run with the same job is reused.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     text = json.dumps(job, indent=1)
     file, database = folder / "job.json", folder / "database.db"
@@ -239,7 +246,7 @@ def _run(
         child = subprocess.Popen(
             python_command("-m", "mitsplat.capture.sfm_worker", file.resolve()),
             env=python_environment(),
-            stdin=subprocess.PIPE,  # closes when this process ends, and the child with it
+            stdin=subprocess.PIPE,  # closes when this process ends, which ends the child
             stdout=log,
             stderr=subprocess.STDOUT,
         )
@@ -278,7 +285,7 @@ def _doing(folder: Path) -> str:
 
 
 def _reached(job: Mapping[str, Any], folder: Path) -> tuple[int, int, str]:
-    """Steps done, of how many, and what is being done."""
+    """Return the steps done, their total and the present activity."""
     stage, _, count = _doing(folder).rpartition(" ")
     if not count.isdecimal():
         stage, count = _doing(folder), "0"
@@ -296,15 +303,15 @@ def _rows(database: Path, table: str) -> int:
     try:
         with closing(sqlite3.connect(f"{database.resolve().as_uri()}?mode=ro", uri=True, timeout=0.1)) as connection:
             return int(connection.execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0])
-    except sqlite3.Error:  # not there yet, or being written
+    except sqlite3.Error:  # missing, or locked by a writer
         return 0
 
 
 def _read_arrays(arrays: Mapping[str, npt.NDArray[Any]], photos: Sequence[Prepared]) -> SparseModel:
-    """The child's result.
+    """Return the result of the child process.
 
     Raises:
-        InputError: If it found nothing.
+        InputError: If no cameras were found.
     """
     if "names" not in arrays or not len(arrays["names"]):
         raise InputError(

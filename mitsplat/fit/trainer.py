@@ -515,7 +515,7 @@ def _depth_error(alpha: Any, moment: Any, inverse: Any) -> Any:
 
 
 def _exposed(rgb: list[Any], alpha: Any, table: Any, place: Any, photos: int) -> list[Any]:
-    """Apply a photo's affine colour correction to premultiplied colours; ``table`` has 12 rows of one entry per photo."""
+    """Apply a photo's affine colour correction to premultiplied colours; ``table`` is a flat (12, photos) array."""
     m = [dr.gather(mi.Float, table, place + i * photos) for i in range(12)]
     return [sum(m[4 * i + j] * rgb[j] for j in range(3)) + m[4 * i + 3] * alpha for i in range(3)]
 

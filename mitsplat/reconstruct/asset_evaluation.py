@@ -1,4 +1,4 @@
-"""How good an asset is that was made of photographs, in figures and in plain sentences."""
+"""Quality of an asset made of photographs, as figures and as sentences with advice."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ VERDICT_FILE = "verdict.json"
 
 @dataclass(frozen=True)
 class Thresholds:
-    """Figures from which an asset is good enough for a training set.
+    """Quality thresholds of an asset for training sets.
 
     Attributes:
-        registered: Least share of the photos that found their camera.
+        registered: Least share of the photos with a camera pose.
         psnr: Least PSNR of held-out photos [dB].
         splat_iou: Least mean IoU of the splats' alpha with the masks of held-out photos.
-        mesh_iou: The same of the mesh's silhouette.
+        mesh_iou: Least mean IoU of the mesh's silhouette with these masks.
         offset: Largest shift between mesh and splats, as a share of the diagonal.
-        scale_error: Largest relative error of the metric scale, where it is known.
+        scale_error: Largest relative error of the metric scale, if it is known.
         lost: Largest share of the object that isolation removed with its surroundings.
     """
 
@@ -62,13 +62,13 @@ _ADVICE = {
 
 @dataclass(frozen=True, eq=False)
 class AssetView:
-    """What an asset shows of its splats and its mesh.
+    """Rendering of an asset's splats and mesh from one camera.
 
     Attributes:
-        camera: At the size of these pictures.
+        camera: Camera at the size of these pictures.
         render: Splats, display-encoded and multiplied by alpha, (H, W, 3).
-        alpha: Of the splats, (H, W).
-        mesh: Whether the mesh covers the pixel's middle, (H, W).
+        alpha: Alpha of the splats, (H, W).
+        mesh: True if the mesh covers the centre of the pixel, (H, W).
         normal: Unit normals of the mesh in the world, (H, W, 3).
     """
 
@@ -80,11 +80,11 @@ class AssetView:
 
     @property
     def picture(self) -> Float32Array:
-        """The splats over grey, display-encoded, (H, W, 3)."""
+        """Splats over grey, display-encoded, (H, W, 3)."""
         return np.asarray(self.render + 0.5 * (1 - self.alpha[..., None]), dtype=np.float32)
 
     def shaded(self, behind: Float32Array | float, share: float = 1.0) -> Float32Array:
-        """The mesh, lit from the camera, over ``behind``, of which it hides a share."""
+        """Return the mesh, lit from the camera, over ``behind``; ``share`` is the opacity of the mesh."""
         towards = -self.camera.world_from_camera[:3, 2]
         light = 0.25 + 0.75 * np.clip(self.normal @ towards, 0, 1)
         grey = np.repeat(light[..., None], 3, axis=2) * (1.0, 0.75, 0.45)
@@ -94,13 +94,13 @@ class AssetView:
 
 @dataclass(frozen=True, eq=False)
 class HeldOutView(AssetView):
-    """What a photo that nothing was fitted to shows, and what the asset shows from there.
+    """A held-out photo and the rendering of the asset from its camera.
 
     Attributes:
-        name: Of the photo.
-        photo: Display-encoded, (H, W, 3).
-        mask: Share of the pixel that is object, (H, W), or None.
-        known: Where nothing that may hide the object stands before it, (H, W).
+        name: Name of the photo.
+        photo: Display-encoded colours, (H, W, 3).
+        mask: Share of each pixel that the object covers, (H, W), or None.
+        known: True where no other thing may hide the object, (H, W).
     """
 
     name: str
@@ -111,30 +111,30 @@ class HeldOutView(AssetView):
 
 @dataclass(frozen=True)
 class Verdict:
-    """Figures of an asset; None where they are not known or make no sense.
+    """Quality figures of an asset; None if unknown or not applicable.
 
     Attributes:
-        photos: Number of photos that found their camera.
-        rejected: Number that did not, or were refused.
-        psnr: Of held-out photos, as the fit reports it [dB].
-        psnr_object: Of the object's pixels in held-out photos, after isolation, without those of its outline [dB].
+        photos: Number of photos with a camera pose.
+        rejected: Number of photos without a pose, or refused.
+        psnr: PSNR of held-out photos, as the fit reports it [dB].
+        psnr_object: PSNR of the object's pixels in held-out photos after isolation, without outline pixels [dB].
         splat_iou: Mean IoU of the splats' alpha with held-out masks.
-        mesh_iou: The same of the mesh's silhouette.
+        mesh_iou: Mean IoU of the mesh's silhouette with held-out masks.
         offset: Shift between mesh and the splats' surface, as a share of the mesh's diagonal.
-        spread: Median distance between the two, in the same units.
+        spread: Median distance between mesh and the splats' surface, in the same unit.
         lost: Share of the object that isolation removed.
         scale_error: Estimated relative error of the metric scale.
-        units: Whether the asset is in metres.
+        units: Unit of the asset.
         gaussians: Number of Gaussians.
         faces: Number of faces of the mesh.
-        watertight: Whether the mesh encloses a volume.
-        solid: Whether it must, as that of an object.
-        refinement: What came of refining the mesh, as one clause, or None where that was not asked for.
-        causes: What was measured of the photos, one clause each, by the threshold that it makes an asset miss.
-        surface: What the mesh of an object was reconstructed from, or None where it was not.
-        surface_faults: Why finer surfaces were not kept, one clause each.
-        rows: Further figures in words, by what they are of.
-        findings: What else is missed, a sentence each with advice.
+        watertight: True if the mesh encloses a volume.
+        solid: True if the mesh must enclose a volume, as that of an object.
+        refinement: Result of the mesh refinement as one clause, or None if it was not requested.
+        causes: Measured causes in the photos, one clause each, by the threshold that they affect.
+        surface: Source of the reconstructed mesh of an object, or None.
+        surface_faults: Reasons why finer surfaces were rejected, one clause each.
+        rows: Further figures in words, by their names.
+        findings: Further problems, one sentence each with advice.
     """
 
     photos: int
@@ -160,16 +160,16 @@ class Verdict:
     findings: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        for name in ("surface_faults", "findings"):  # files have lists
+        for name in ("surface_faults", "findings"):  # JSON has lists
             object.__setattr__(self, name, tuple(getattr(self, name)))
 
     @property
     def registered(self) -> float:
-        """Share of the photos that found their camera."""
+        """Share of the photos with a camera pose."""
         return self.photos / max(1, self.photos + self.rejected)
 
     def misses(self, thresholds: Thresholds = Thresholds()) -> tuple[str, ...]:
-        """A sentence for each threshold that is missed, with advice."""
+        """Return a sentence with advice for each threshold that is missed."""
         least = {
             "registered": f"only {self.photos} of {self.photos + self.rejected} photos found their camera",
             "psnr": f"held-out photos are met at only {self.psnr or 0:.1f} dB",
@@ -199,14 +199,14 @@ class Verdict:
         return (*found, *self.findings)
 
     def _advice(self, name: str) -> str:
-        """What would help, behind what was measured."""
+        """Return the measured cause, if any, and the advice for a threshold."""
         return "; ".join(filter(None, [self.causes.get(name), _ADVICE[name]]))
 
 
 def show_held_out(
     splats: Splats, mesh: trimesh.Trimesh | None, photos: Sequence[Photo], size: int
 ) -> list[HeldOutView]:
-    """Photos beside splats and mesh seen from the same cameras, the longest edge ``size`` px at most."""
+    """Render splats and mesh from the cameras of photos; the longest edge is at most ``size`` px."""
     sized = [sized_photo(photo, size) for photo in photos]
     shown = show_asset(splats, mesh, [camera for camera, *_ in sized])
     return [
@@ -216,7 +216,7 @@ def show_held_out(
 
 
 def show_asset(splats: Splats, mesh: trimesh.Trimesh | None, cameras: Sequence[Camera]) -> list[AssetView]:
-    """Splats and mesh as cameras see them."""
+    """Render splats and mesh from cameras."""
     integrator = make_integrator(shadow="none")
     scene = mi.load_dict({"type": "scene", "splats": make_splats_shape(splats, instance=1, proxy=mesh)})
     views = []
@@ -236,7 +236,7 @@ def show_asset(splats: Splats, mesh: trimesh.Trimesh | None, cameras: Sequence[C
 
 
 def sized_photo(photo: Photo, size: int) -> tuple[Camera, Float32Array, Float32Array | None, Float32Array | None]:
-    """Camera, colours, mask, and where that is hidden, of a photo whose longest edge is at most ``size`` px."""
+    """Return camera, colours, mask and hidden area of a photo, with a longest edge of at most ``size`` px."""
     rgb, mask, hidden = photo.read(min(1.0, size / max(photo.camera.width, photo.camera.height)))
     return photo.camera.resized(rgb.shape[1], rgb.shape[0]), rgb, mask, hidden
 
@@ -252,7 +252,7 @@ def judge(
     refinement: RefinedMesh | None = None,
     causes: Mapping[str, str] | None = None,
 ) -> Verdict:
-    """Figures from held-out views of splats and mesh."""
+    """Compute the quality figures from held-out views of splats and mesh."""
     masked = [(view, view.mask >= 0.5) for view in views if view.mask is not None and (view.mask >= 0.5).any()]
     errors = [float(((view.render - view.photo)[_inside(mask)] ** 2).mean()) for view, mask in masked]
     offset = None
@@ -280,20 +280,23 @@ def judge(
 
 
 def is_closed(mesh: trimesh.Trimesh) -> bool:
-    """Whether a mesh is watertight also where readers weld vertices that lie on each other."""
+    """Return True if a mesh is watertight, also after coincident vertices are welded."""
     welded = mesh.copy()
     welded.merge_vertices(merge_tex=True, merge_norm=True)
     return bool(welded.is_watertight)
 
 
 def iou(one: BoolArray, other: BoolArray) -> float:
-    """Intersection over union; 1 where both are empty."""
+    """Return the intersection over union; 1 if both are empty."""
     union = int((one | other).sum())
     return int((one & other).sum()) / union if union else 1.0
 
 
 def _inside(mask: BoolArray) -> BoolArray:
-    """A mask without the pixels of its outline, which show what is behind as well; the mask if that is all of it."""
+    """Return a mask without its outline pixels, which also show the background.
+
+    If no other pixels are left, return the mask itself.
+    """
     inner = np.asarray(binary_erosion(mask))
     return inner if inner.any() else mask
 

@@ -1,7 +1,8 @@
-"""From photographs to an asset folder: capture, fit, isolation, mesh and verdict, each kept until its inputs change.
+"""Pipeline from photographs to an asset folder: capture, fit, isolation, mesh and evaluation.
 
-The work folders ``capture/`` and ``fit/`` inside the asset's folder keep what those stages made; they look after their
-own inputs. The last stage is kept by a hash of everything that decides it, in ``verdict.json`` beside the figures.
+Each stage is repeated only if its inputs change. The work folders ``capture/`` and ``fit/`` inside the asset folder
+contain the results of those stages, which check their own inputs. The last stage stores a hash of all its inputs in
+``verdict.json``, together with the quality figures.
 """
 
 from __future__ import annotations
@@ -42,20 +43,20 @@ from mitsplat.version import __version__
 
 @dataclass(frozen=True, eq=False)
 class AssetJob:
-    """What an asset of photographs is to be.
+    """Description of the asset to make.
 
     Attributes:
-        name: Of the asset.
-        class_name: Class that detectors learn; the name if None.
+        name: Name of the asset.
+        class_name: Class for detectors; the name if None.
         kind: Objects are isolated and can be dropped; environments stay whole.
-        settings: How the asset is made of the splats.
-        imported: A mesh to take instead of a reconstructed one.
-        remove: Things that are taken out of an environment, PHOTO:X,Y in pixels of the capture's photos.
-        delight: File of the lights that an object was photographed in, which its colours are freed of.
+        settings: Settings of the reconstruction.
+        imported: Mesh that replaces the reconstructed one.
+        remove: Things to remove from an environment, PHOTO:X,Y in pixels of the capture's photos.
+        delight: File of the capture's lights; their effect is removed from the colours of an object.
 
     Raises:
-        InputError: If an object's mesh cannot be refined, things are to be removed from an object or an imported mesh,
-            or an environment is to be freed of light.
+        InputError: If an object's mesh cannot be refined, ``remove`` is used with an object or an imported mesh, or
+            ``delight`` is used with an environment.
     """
 
     name: str
@@ -81,11 +82,11 @@ class AssetResult:
     """An asset on disk.
 
     Attributes:
-        folder: Of the asset.
-        verdict: Its figures.
-        kept: Whether an earlier run had made it of the same inputs.
-        warnings: What there is to say about its photographs, one sentence each.
-        scene: File of a scene that has it, if one was written.
+        folder: Folder of the asset.
+        verdict: Quality figures.
+        kept: True if an earlier run made the asset from the same inputs.
+        warnings: Warnings on the photographs, one sentence each.
+        scene: File of an example scene with the asset, if one was written.
     """
 
     folder: Path
@@ -96,21 +97,25 @@ class AssetResult:
 
     @property
     def shortcoming(self) -> str | None:
-        """The thresholds that were missed and what would help, as one sentence, or None."""
+        """The missed thresholds with advice as one sentence, or None."""
         return "; ".join(self.verdict.misses()) or None
 
 
 Maker = Callable[[Capture, Splats, AssetJob, float | None, str | None, Progress | None], Reconstruction]
-"""Makes an asset of a capture and splats: given the job, the fit's held-out PSNR [dB] and what the scale is by."""
+"""Function that makes an asset from a capture and splats.
+
+Further arguments are the job, the held-out PSNR of the fit [dB], the source of the scale, and a progress callback.
+"""
 
 
 def reconstruct_job(
     capture: Capture, splats: Splats, job: AssetJob, psnr: float | None, source: str | None, progress: Progress | None
 ) -> Reconstruction:
-    """A :data:`Maker`: :func:`~mitsplat.reconstruct.reconstruct.reconstruct_asset` as a job says.
+    """Reconstruct the asset of a job with :func:`~mitsplat.reconstruct.reconstruct.reconstruct_asset`; a :data:`Maker`.
 
     Raises:
-        InputError: As that, or if lights are given and are none, or nothing says where up is.
+        InputError: As in that function. Also if the light file is invalid, or lights are given and the vertical
+            direction is unknown.
     """
     light = None if job.delight is None else LightFile.load(job.delight)
     if light is not None and capture.up != "z":
@@ -123,12 +128,12 @@ def reconstruct_job(
 
 
 def delighted(made: Reconstruction, light: LightFile, table: bool, progress: Progress | None) -> Reconstruction:
-    """The asset with its colours freed of light, and how that went in the verdict."""
+    """Remove the effect of light from the colours of an asset, and add the result to the verdict."""
     if progress is not None:
         progress(0, 1, "freeing colours of light")
     if made.asset.mesh is None:
         return made
-    turn = np.eye(4)  # from the asset to how its capture lies, as the lights do
+    turn = np.eye(4)  # from the asset's frame to the axes of the capture, which the lights share
     turn[:3, :3] = made.asset_from_capture[:3, :3].T / np.cbrt(np.linalg.det(made.asset_from_capture[:3, :3]))
     mesh = made.asset.mesh.copy().apply_transform(turn)
     done = delight(made.asset.splats.transformed(turn), mesh, light, table=table)
@@ -142,10 +147,10 @@ def delighted(made: Reconstruction, light: LightFile, table: bool, progress: Pro
 
 
 def read_fit(path: Path) -> tuple[Path, float | None]:
-    """Splat file and held-out PSNR [dB] of a fit's folder, or a splat file itself.
+    """Return the splat file and the held-out PSNR [dB] of a fit folder, or None for the PSNR of a plain splat file.
 
     Raises:
-        InputError: If the folder holds no finished fit.
+        InputError: If the folder has no finished fit.
     """
     if not path.is_dir():
         return path, None
@@ -171,20 +176,20 @@ def make_photo_asset(
     make: Maker = reconstruct_job,
     progress: Progress | None = None,
 ) -> AssetResult:
-    """Make an asset of a folder of photographs; stages whose inputs are unchanged since an earlier run are kept.
+    """Make an asset from a folder of photographs; stages with unchanged inputs are not repeated.
 
     Args:
         photos: Folder of photographs of one object or place.
-        out: Folder of the asset; ``capture/`` and ``fit/`` in it are the work folders.
-        job: What to make.
-        capture: How cameras, scale and masks are found.
-        fit: How splats are fitted.
-        make: The last stage.
-        progress: Told what is being done.
+        out: Folder of the asset, with the work folders ``capture/`` and ``fit/``.
+        job: Description of the asset.
+        capture: Settings for cameras, scale and masks.
+        fit: Settings of the fit.
+        make: Function of the last stage.
+        progress: Progress callback.
 
     Raises:
         InputError: If the photographs do not suffice.
-        MissingResourceError: If a program or model that is needed is missing.
+        MissingResourceError: If a required program or model is missing.
     """
     taken = capture_photos(photos, out / "capture", capture, progress=progress)
     found = taken.capture
@@ -209,16 +214,16 @@ def make_asset(
     source: str | None = None,
     progress: Progress | None = None,
 ) -> AssetResult:
-    """Write the asset of a capture and a fit, with its verdict and its report, unless they are there already.
+    """Write the asset of a capture and a fit with its verdict and its report, unless they already exist.
 
     Args:
-        capture_folder: As ``mitsplat capture`` writes it.
-        fit: Folder that ``mitsplat fit`` wrote, or a splat file in the capture's frame.
+        capture_folder: Folder of ``mitsplat capture``.
+        fit: Folder of ``mitsplat fit``, or a splat file in the capture's frame.
         out: Folder of the asset.
-        job: What to make.
-        make: How.
-        source: What the capture's scale and gravity are by, a clause.
-        progress: Told what is being done.
+        job: Description of the asset.
+        make: Function that makes the asset.
+        source: Source of the capture's scale and gravity, a clause.
+        progress: Progress callback.
 
     Raises:
         InputError: If a file is missing or damaged, or an object has no masks.
@@ -237,17 +242,17 @@ def make_asset(
         (out / ASSET_FILE).replace(edited)
     result.asset.save(out)
     write_asset_report(out, capture, result)
-    # Last, so that an interrupted run is not mistaken for a finished one.
+    # Written last, so that an interrupted run does not look finished.
     _save_verdict(out, result, inputs)
     warnings = () if edited is None else (f"{ASSET_FILE} had been edited: as it was, it is {edited.name} now",)
     return AssetResult(out, result.verdict, kept=False, warnings=warnings)
 
 
 def refuse_to_replace(out: Path, splats: Path) -> None:
-    """Refuse a folder in which an asset would replace the splats that it is made of, or files of no asset.
+    """Refuse an output folder whose splats are the input, or whose files do not belong to an asset.
 
     Raises:
-        InputError: Which names the file.
+        InputError: If a file would be replaced; the message names it.
     """
     known = any((out / name).exists() for name in (ASSET_FILE, REPORT_FILE))
     for name in ("splats.ply", "mesh.ply", "pieces.ply"):
@@ -256,12 +261,12 @@ def refuse_to_replace(out: Path, splats: Path) -> None:
 
 
 def _edited(out: Path) -> Path | None:
-    """What to call the ``asset.yaml`` of an earlier run from now on, if it has been edited since."""
+    """Return a new path for the ``asset.yaml`` of an earlier run if it was edited since, or None."""
     described = out / ASSET_FILE
     try:
         if json.loads((out / VERDICT_FILE).read_text())[ASSET_FILE] == file_hash(described):
             return None
-    except (OSError, ValueError, KeyError, TypeError):  # by another version, or by hand
+    except (OSError, ValueError, KeyError, TypeError):  # written by another version or edited by hand
         if not described.exists():
             return None
     names = (out / f"asset.edited{number if number > 1 else ''}.yaml" for number in itertools.count(1))
@@ -288,7 +293,7 @@ _REMOVED = ("outside", "unseen", "needles", "floaters")
 
 
 def _digest(folder: Path, capture: Capture, splats: Path, job: AssetJob) -> str:
-    """Hash of everything that decides the asset."""
+    """Return the hash of all inputs of the asset."""
     imported = None
     if job.imported is not None:
         matrix = job.imported.capture_from_mesh
@@ -307,13 +312,13 @@ def _digest(folder: Path, capture: Capture, splats: Path, job: AssetJob) -> str:
 
 
 def _files(folder: Path, capture: Capture) -> list[Path]:
-    """Everything that a capture is on disk."""
+    """Return all files of a capture."""
     pictures = [path for photo in capture.photos for path in (photo.file, photo.mask) if path is not None]
     return [folder / "capture.json", folder / "points.npz", *pictures]
 
 
 def _finished(out: Path, inputs: str) -> AssetResult | None:
-    """What an earlier run of the same inputs left, if it is whole."""
+    """Return the asset of an earlier run with the same inputs if it is complete, or None."""
     if not all((out / name).is_file() for name in (VERDICT_FILE, REPORT_FILE, ASSET_FILE)):
         return None
     try:

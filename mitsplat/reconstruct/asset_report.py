@@ -1,4 +1,4 @@
-"""One page to look at an asset by that was made of photographs: verdict, held-out views, cameras, photos, masks."""
+"""HTML report of an asset made of photographs: verdict, held-out views, cameras, photos and masks."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from mitsplat.storage.files import write_text
 T = TypeVar("T")
 
 PHOTOS = 24
-"""Registered photos that are shown, evenly spread."""
+"""Largest number of registered photos in the report, taken at equal intervals."""
 HELD_OUT = 8
-"""Held-out views that are shown, evenly spread."""
+"""Largest number of held-out views in the report, taken at equal intervals."""
 
 _THUMBNAIL, _VIEW = 240, 420
 _POINTS = 1500
@@ -114,7 +114,7 @@ def _held_out(views: Sequence[HeldOutView]) -> str:
 
 
 def _cameras(capture: Capture) -> str:
-    """Cameras and points from the side and from above, as drawings."""
+    """Return drawings of cameras and points from the side and from above."""
     centres = np.array([photo.camera.centre for photo in capture.photos]).reshape(-1, 3)
     if not len(centres):
         return ""
@@ -154,7 +154,7 @@ def _cameras(capture: Capture) -> str:
 
 
 def _directions(capture: Capture) -> str:
-    """From where the object was photographed: straight above in the middle, the horizon around, below it beyond."""
+    """Return a polar drawing of the view directions: the zenith in the middle, the horizon as a circle around it."""
     offsets = views_from([photo.camera for photo in capture.photos])
     heights = np.degrees(np.arctan2(offsets[:, 2], np.linalg.norm(offsets[:, :2], axis=1)))
     middle, reach = (_PLOT_WIDTH / 2, _PLOT_HEIGHT / 2), _PLOT_HEIGHT / 2 - 30
@@ -165,7 +165,7 @@ def _directions(capture: Capture) -> str:
         for radius in (reach * (90 - height) / 90,)
     )
     flat = offsets[:, :2] / np.maximum(np.linalg.norm(offsets[:, :2], axis=1, keepdims=True), 1e-12)
-    beyond = reach * (90 - np.maximum(heights, -15)) / 90  # no farther below the horizon than the drawing reaches
+    beyond = reach * (90 - np.maximum(heights, -15)) / 90  # the drawing ends 15 degrees below the horizon
     places = np.array(middle) + beyond[:, None] * flat * (1, -1)
     dots = "".join(
         f'<circle cx="{x:.1f}" cy="{y:.1f}" r="3.5"><title>{html.escape(photo.name)}</title></circle>'

@@ -1,4 +1,4 @@
-"""What in the photographs of an object keeps an asset from being better: measured, with what would change it."""
+"""Causes in the photographs that limit the quality of an asset: measurements with advice."""
 
 from __future__ import annotations
 
@@ -12,28 +12,28 @@ from mitsplat.capture.capture import Capture
 from mitsplat.geometry.camera import Camera
 
 Pictures = Sequence[tuple[Camera, Float32Array, Float32Array | None]]
-"""Of each photo its camera, colours (H, W, 3) and mask (H, W), all of the same longest edge."""
+"""Camera, colours (H, W, 3) and mask (H, W) of each photo, all with the same longest edge."""
 
 _FEW_POINTS = 100
-"""On an object, from which its surface and not only its outline is known."""
+"""Least number of points on an object that determine its surface beyond its outline."""
 _SPILT = 0.3
-"""Share of the points inside of masks that lie in the support from which masks include it."""
+"""Largest share of masked points in the support surface; above it, masks seem to include the support."""
 _LOW = 0.05
 _BLURRED = 0.5
 _NAMED = 5
 _BANDS = ((0.0, 20.0), (20.0, 45.0), (45.0, 90.0))
-"""Heights above the horizon of the object's middle [degrees]; of the last, whose circle is small, one photo will do."""
+"""Elevation bands around the object [degrees]; in the last, whose circle is small, one photo is enough."""
 _SECTOR = 30.0
 _WIDEST_SECTORS = 3
-"""Of a band: neighbouring sectors [degrees] without a camera that are worth a word."""
+"""Least number of neighbouring sectors without a camera in a band that is reported."""
 
 
 def find_causes(capture: Capture, pictures: Pictures) -> dict[str, str]:
-    """Causes by the name of the threshold that they make an asset miss, one clause each.
+    """Return causes, one clause each, by the name of the threshold that they affect.
 
     Args:
         capture: The photos.
-        pictures: Of ``capture.photos``, in their order.
+        pictures: Pictures of ``capture.photos``, in the same order.
     """
     found: dict[str, list[str]] = {}
 
@@ -63,7 +63,7 @@ def find_causes(capture: Capture, pictures: Pictures) -> dict[str, str]:
 
 
 def masked_points(capture: Capture, pictures: Pictures) -> Float64Array:
-    """The capture's points (K, 3) that most of the photos which see them show inside of their masks."""
+    """Return the capture's points (K, 3) that lie inside the masks of more than half of the photos that see them."""
     inside, seen = np.zeros(len(capture.points)), np.zeros(len(capture.points))
     for photo, (camera, _, mask) in zip(capture.photos, pictures, strict=True):
         if mask is None:
@@ -78,20 +78,20 @@ def masked_points(capture: Capture, pictures: Pictures) -> Float64Array:
 
 
 def share_on_support(points: Float64Array) -> float:
-    """Share of an object's points (N, 3) that lie in what it stands on, z = 0: as low as its height's twentieth."""
+    """Return the share of points (N, 3) within 5 % of the object's height from its support, z = 0."""
     height = float(np.quantile(points[:, 2], 0.95))
     return float((np.abs(points[:, 2]) < _LOW * height).mean()) if height > 0 else 1.0
 
 
 def blurred_photos(names: Sequence[str], pictures: Pictures) -> list[str]:
-    """Photos of which the object is less than half as sharp as of the median photo, the worst first.
+    """Return the photos in which the object is less than half as sharp as in the median photo, the worst first.
 
-    Sharpness is the energy of the Laplacian relative to that of the gradient, which hardly depends on what is seen.
+    Sharpness is the energy of the Laplacian relative to that of the gradient. This ratio depends little on the content.
     """
     values = []
     for _, rgb, mask in pictures:
         grey = cv2.cvtColor(np.ascontiguousarray(rgb, dtype=np.float32), cv2.COLOR_RGB2GRAY)
-        # A photo's outline is as sharp as its mask: only what is inside of it counts.
+        # The outline has the sharpness of the mask, so only inner pixels count.
         seen = _inner(np.ones(grey.shape, dtype=bool) if mask is None else mask >= 0.5)
         slopes = cv2.Sobel(grey, cv2.CV_32F, 1, 0) ** 2 + cv2.Sobel(grey, cv2.CV_32F, 0, 1) ** 2
         curvature = cv2.Laplacian(grey, cv2.CV_32F) ** 2
@@ -103,7 +103,7 @@ def blurred_photos(names: Sequence[str], pictures: Pictures) -> list[str]:
 
 
 def views_from(cameras: Sequence[Camera]) -> Float64Array:
-    """Centres (N, 3) of cameras, from the point that is nearest to all their axes."""
+    """Return camera centres (N, 3) relative to the point nearest to all optical axes."""
     centres = np.array([camera.centre for camera in cameras])
     axes = np.array([camera.world_from_camera[:3, 2] for camera in cameras])
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
@@ -112,7 +112,7 @@ def views_from(cameras: Sequence[Camera]) -> Float64Array:
 
 
 def missing_views(offsets: Float64Array) -> list[str]:
-    """Directions that no camera has, of cameras at ``offsets`` (N, 3) from an object, z up, in words."""
+    """Describe directions without a camera, for cameras at ``offsets`` (N, 3) from an object, z up."""
     heights = np.degrees(np.arctan2(offsets[:, 2], np.linalg.norm(offsets[:, :2], axis=1)))
     turns = np.degrees(np.arctan2(offsets[:, 1], offsets[:, 0])) % 360
     sectors = round(360 / _SECTOR)
@@ -132,7 +132,7 @@ def missing_views(offsets: Float64Array) -> list[str]:
 
 
 def _longest_gap(taken: BoolArray) -> tuple[int, int]:
-    """First position and length of the longest run of False in a ring that is not all False."""
+    """Return start and length of the longest run of False in a ring that is not all False."""
     start = int(np.argmax(taken))
     best, length = (0, 0), 0
     for step in range(1, len(taken) + 1):
@@ -144,5 +144,5 @@ def _longest_gap(taken: BoolArray) -> tuple[int, int]:
 
 
 def _inner(mask: BoolArray) -> BoolArray:
-    """A mask without its border of three pixels."""
+    """Return a mask without a border of three pixels."""
     return np.asarray(cv2.erode(mask.astype(np.uint8), np.ones((7, 7), dtype=np.uint8)) > 0)

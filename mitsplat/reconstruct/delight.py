@@ -1,10 +1,10 @@
-"""Colours of an object without the uneven light that it was photographed in.
+"""Removal of uneven capture light from the colours of an object.
 
-What a matt surface sends out is its reflectance times the irradiance (Lambert 1760). Where the light that an object was
-photographed in is known, Mitsuba traces the irradiance of each place of its mesh, with the shadows that it casts on
-itself and on its table and the light that these throw back; colours divided by it are those that even light would have
-given. A mesh that is coarse, light that was measured elsewhere, or gloss may make that worse, so that it is done only
-where colours follow the irradiance, and follow each lamp.
+The radiance of a matt surface is its reflectance times the irradiance (Lambert 1760). If the lights of the capture are
+known, Mitsuba traces the irradiance at each point of the mesh. This includes self-shadowing, the table and indirect
+light. Colours divided by the irradiance are those under even light. A coarse mesh, lights that were measured elsewhere,
+or gloss can make the result worse. The division is therefore applied only if the colours correlate with the irradiance,
+in total and for each lamp.
 """
 
 from __future__ import annotations
@@ -36,45 +36,45 @@ from mitsplat.storage.field_types import StrictModel
 from mitsplat.storage.yaml_input import load_yaml
 
 _REFLECTANCE = 0.5
-"""Of the mesh, in light that it throws onto itself."""
+"""Reflectance of the mesh in the computation of indirect light."""
 _BOUNCES = 3
 _SAMPLES = 256
 _PROBE, _WIDE = 1e-3, 3.0
-"""Edge of a cube by which light from below is measured, and half that of the table [m]."""
+"""Edge of the cube that measures light from below, and half the edge of the table [m]."""
 _TABLES = (0.02, 0.9)
-"""Reflectance of tables."""
+"""Range of the reflectance of tables."""
 _STEP = 1e-3
-"""From where a place is looked at, in diagonals of the mesh."""
+"""Distance of the ray origin from the surface, in diagonals of the mesh."""
 _NEIGHBOURS, _ALIKE = 12, 16
-"""Of which irradiance is averaged, and the power of the cosine between normals by which they count."""
+"""Number of neighbours over which irradiance is averaged, and the power of the cosine between normals as their weight.
+"""
 _EVEN = 0.03
-"""Standard deviation of the logarithm of irradiance below which light is even."""
+"""Standard deviation of the logarithm of irradiance below which light counts as even."""
 FOLLOWS = 0.5
-"""Slope of colours over irradiance, both logarithms, and share of a lamp's light that colours show, from which it helps
-to divide."""
+"""Least log-log slope of colours over irradiance, and least relative brightness of each lamp, for the division."""
 _STRONGEST = 4.0
-"""Factor on colours up to which they are made brighter or darker."""
+"""Largest factor by which colours are changed."""
 _NEAR = 0.02
-"""Distance from the mesh from which a Gaussian is not of its surface, in its diagonals."""
+"""Largest distance of surface Gaussians from the mesh, in its diagonals."""
 _UNLIT = 0.02
-"""Irradiance of places that nobody sees, such as a void's, in the median; they are left as they are."""
+"""Irradiance, relative to the median, below which colours stay unchanged; such points lie for example in cavities."""
 _DARKEST = 0.004
-"""Linear luminance from which a colour counts."""
+"""Least linear luminance of colours in the statistics."""
 
 
 class CapturedLights(StrictModel):
-    """A file of lights, as ``mitsplat lights`` writes it."""
+    """Content of a light file of ``mitsplat lights``."""
 
     lights: list[LightSpec] = Field(min_length=1, description="Around the object, in the frame of its capture.")
 
 
 @dataclass(frozen=True, eq=False)
 class LightFile:
-    """Lights that an object was photographed in.
+    """Lights of a capture.
 
     Attributes:
-        path: Of the file.
-        lights: Around the object, in the frame of its capture [m].
+        path: Path of the file.
+        lights: Lights around the object, in the frame of its capture [m].
     """
 
     path: Path
@@ -82,10 +82,10 @@ class LightFile:
 
     @classmethod
     def load(cls, path: Path) -> LightFile:
-        """Read a file that ``mitsplat lights`` wrote.
+        """Read a light file of ``mitsplat lights``.
 
         Raises:
-            InputError: If it or an image that it names cannot be read.
+            InputError: If the file or one of its images cannot be read.
         """
         found = cls(path, tuple(load_yaml(path, CapturedLights).lights))
         for file in found.files[1:]:
@@ -95,23 +95,23 @@ class LightFile:
 
     @property
     def files(self) -> list[Path]:
-        """It, and the images that it names."""
+        """The light file and its images."""
         named = (light.image for light in self.lights if isinstance(light, EnvironmentLight))
         return [self.path, *(self.path.parent / image for image in named if image is not None)]
 
 
 @dataclass(frozen=True, eq=False)
 class Delighting:
-    """What came of it.
+    """Result of the removal of light.
 
     Attributes:
-        splats: With colours of even light, or as they were.
-        kept: Whether the colours were changed.
+        splats: Splats with the colours under even light, or unchanged.
+        kept: True if the colours were changed.
         uneven: Standard deviation of the logarithm of irradiance over the surface.
-        slope: Of the logarithm of colours over that of irradiance: 1 where light alone makes them differ.
-        borne_out: Brightness of each lamp by the colours, relative to that by the file; those that hardly matter are
-            left out.
-        told: In words, a clause.
+        slope: Slope of the logarithm of colours over that of irradiance; 1 if light is the only cause of differences.
+        borne_out: Brightness of each lamp estimated from the colours, relative to the file, without lamps of little
+            effect.
+        told: Summary as a clause.
     """
 
     splats: Splats
@@ -123,13 +123,13 @@ class Delighting:
 
 
 def delight(splats: Splats, mesh: trimesh.Trimesh, light: LightFile, *, table: bool = False) -> Delighting:
-    """Divide an object's colours by the irradiance of where they are, where that makes them differ less.
+    """Divide an object's colours by the local irradiance, if the colours follow the irradiance.
 
     Args:
-        splats: Of the object.
-        mesh: Of it; both in the frame of the lights [m].
-        light: That it was photographed in.
-        table: Whether it stands on one in z = 0.
+        splats: Splats of the object.
+        mesh: Mesh of the object; both in the frame of the lights [m].
+        light: Lights of the capture.
+        table: True if the object stands on a table in z = 0.
     """
     places, normals, away = DistanceSurface(mesh).nearest(splats.means.astype(np.float64))
     area, near = visible_area(splats), away < _NEAR * float(np.linalg.norm(mesh.extents))
@@ -144,7 +144,7 @@ def delight(splats: Splats, mesh: trimesh.Trimesh, light: LightFile, *, table: b
     level = whole @ LUMINANCE
     lit = level > _UNLIT * np.median(level[near]) if near.any() else near
     colours = decode_srgb((0.5 + SH_C0 * splats.sh[:, 0].astype(np.float64)).clip(0, 1))
-    seen = _smoothed(colours, other, alike * (area * near)[other]) @ LUMINANCE  # single Gaussians are of many colours
+    seen = _smoothed(colours, other, alike * (area * near)[other]) @ LUMINANCE  # single Gaussians vary in colour
     own = lit & near & (seen > _DARKEST) & (area > 0)
     uneven, slope, borne_out = _follow(seen[own], each[:, own] @ LUMINANCE, area[own])
 
@@ -170,7 +170,7 @@ def delight(splats: Splats, mesh: trimesh.Trimesh, light: LightFile, *, table: b
 
 
 def _apart(lights: Sequence[LightSpec]) -> list[list[LightSpec]]:
-    """Each lamp by itself, and last what comes from all around."""
+    """Return each lamp as its own group, and the environment lights as the last group."""
     groups, around = list[list[LightSpec]](), list[LightSpec]()
     for light in lights:
         if isinstance(light, EnvironmentLight):
@@ -181,7 +181,10 @@ def _apart(lights: Sequence[LightSpec]) -> list[list[LightSpec]]:
 
 
 def _table(light: LightFile) -> Float64Array:
-    """Reflectance (3,) of a table under lights, by what comes from below: it was photographed with them."""
+    """Estimate the reflectance (3,) of the table as the ratio of irradiance from below to irradiance from above.
+
+    The lights were photographed with the table, so their lower half contains its radiance.
+    """
     probe = trimesh.creation.box((_PROBE,) * 3)
     up = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]])
     above, below = trace_irradiance(probe, 0.5 * _PROBE * up, up, light.lights, light.path.parent, 16 * _SAMPLES)
@@ -198,16 +201,16 @@ def trace_irradiance(
     *,
     table: Float64Array | None = None,
 ) -> Float64Array:
-    """Irradiance (N, 3) of places on a mesh that is grey, in lights, with what it sends itself [W/m^2].
+    """Trace the irradiance (N, 3) at points on a grey mesh under lights, including indirect light [W/m^2].
 
     Args:
-        mesh: The only thing there [m].
-        places: On it, (N, 3).
-        normals: There, outward, (N, 3).
-        lights: Around it.
-        folder: That images of lights are in.
-        samples: Paths for each place.
-        table: Reflectance (3,) of a plane z = 0 below it, which hides what light comes from there; None: there is none.
+        mesh: The object, alone in the scene [m].
+        places: Points on the mesh, (N, 3).
+        normals: Outward normals at these points, (N, 3).
+        lights: Lights around the object.
+        folder: Folder of the images of lights.
+        samples: Paths per point.
+        table: Reflectance (3,) of a plane z = 0 below the object, which blocks light from below; None without a table.
     """
     ensure_variant()
     step = _STEP * float(np.linalg.norm(mesh.extents))
@@ -229,24 +232,27 @@ def _matt(reflectance: list[float]) -> dict[str, Any]:
 
 
 def _neighbours(places: Float64Array, normals: Float64Array) -> tuple[Int64Array, Float64Array]:
-    """The nearest places to each (N, 3), itself among them, (N, K), and how far they face the same way, up to 1."""
+    """Return the indices (N, K) of the nearest points, including the point itself, and their weights.
+
+    A weight is a power of the cosine between the normals.
+    """
     other = KDTree(places).query(places, k=min(_NEIGHBOURS, len(places)))[1].reshape(len(places), -1)
     return other, np.asarray(np.einsum("nkc,nc->nk", normals[other], normals).clip(0, 1) ** _ALIKE)
 
 
 def _smoothed(values: Float64Array, other: Int64Array, share: Float64Array) -> Float64Array:
-    """Values (N, 3) averaged over neighbours (N, K) by their shares (N, K)."""
+    """Return the weighted average of values (N, 3) over neighbours (N, K) with weights (N, K)."""
     total = share.sum(axis=1, keepdims=True)
     return np.asarray((values[other] * share[..., None]).sum(axis=1) / np.maximum(total, 1e-30))
 
 
 def _follow(seen: Float64Array, each: Float64Array, weight: Float64Array) -> tuple[float, float, tuple[float, ...]]:
-    """How uneven irradiance is, how colours follow it, and how far they bear out each lamp.
+    """Return the unevenness of irradiance, the slope of colours over it, and the relative brightness of each lamp.
 
     Args:
         seen: Luminance of colours, (N,).
-        each: Irradiance by each light, that from all around last, (L, N).
-        weight: Of the places, (N,).
+        each: Irradiance of each light, environment last, (L, N).
+        weight: Weights of the points, (N,).
     """
     if not len(seen):
         return 0.0, 0.0, ()
@@ -264,7 +270,7 @@ def _follow(seen: Float64Array, each: Float64Array, weight: Float64Array) -> tup
 
 
 def _brightened(splats: Splats, gain: Float64Array) -> Splats:
-    """The splats with linear colours times a gain (N, 3), and what depends on the direction with these."""
+    """Multiply linear colours by a gain (N, 3); higher SH bands scale with the display-encoded colour."""
     before = (0.5 + SH_C0 * splats.sh[:, 0].astype(np.float64)).clip(1e-3, 1)
     after = encode_srgb((decode_srgb(before) * gain).clip(0, 1))
     sh = splats.sh * (after / before)[:, None]

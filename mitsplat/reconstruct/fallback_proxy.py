@@ -1,9 +1,10 @@
-"""The finest surface of an object that its masks and splats bear out; a coarser one where they contradict it.
+"""Surface of an object with consistency checks and fallbacks.
 
-Depth that disagrees between views, splats that float, or masks that contradict each other can make a closed mesh of any
-shape. So each surface is compared, before it is kept, with the silhouettes that the masks show and with the surface
-that the splats show. A surface from depth lies inside the hull of the masks and the bulk of the splats by its making
-(:mod:`.surface`); after it come the hull of the masks alone, and the convex hull of the splats, which always is sound.
+Inconsistent depth, floating splats or contradictory masks can produce a closed mesh of any shape. Each candidate
+surface is therefore compared with the masks' silhouettes and with the surface of the splats. The first candidate is the
+surface from depth; by construction it lies inside the visual hull and around the bulk of the splats (:mod:`.surface`).
+The fallbacks are the visual hull alone, and then the convex hull of the splats, which always exists if the splats span
+a volume.
 """
 
 from __future__ import annotations
@@ -24,13 +25,13 @@ from mitsplat.reconstruct.segment_splats import MaskedView
 from mitsplat.reconstruct.surface import SurfaceSettings, reconstruct_surface
 
 LEAST_OVERLAP = 0.85
-"""Mean IoU of a surface's silhouettes with the masks from which it is kept."""
+"""Least mean IoU of a surface's silhouettes with the masks."""
 MOST_SPREAD = 0.02
-"""Median distance between a surface and that of the splats up to which it is kept, as a share of its diagonal."""
+"""Largest median distance between a surface and that of the splats, as a share of its diagonal."""
 _FLAT = 1e-4
-"""Thinnest extent of a volume, as a share of the longest."""
+"""Least extent of a volume, as a share of its longest extent."""
 _VIEWS = 8
-"""Views in which surfaces are compared."""
+"""Number of views in the comparison."""
 
 FINEST = "depth of the splats inside the hull of the masks"
 HULL = "hull of the masks"
@@ -39,12 +40,12 @@ CONVEX = "convex hull of the splats"
 
 @dataclass(frozen=True, eq=False)
 class SoundSurface:
-    """A closed mesh and what it is.
+    """A closed mesh and its source.
 
     Attributes:
-        mesh: In the splats' frame.
-        source: What it was made of: :data:`FINEST`, :data:`HULL` or :data:`CONVEX`.
-        faults: Why finer surfaces were not kept, one clause each.
+        mesh: Mesh in the splats' frame.
+        source: Source of the mesh: :data:`FINEST`, :data:`HULL` or :data:`CONVEX`.
+        faults: Reasons why finer surfaces were rejected, one clause each.
     """
 
     mesh: trimesh.Trimesh
@@ -60,14 +61,14 @@ def find_sound_surface(
     floor: float | None = None,
     progress: Progress | None = None,
 ) -> SoundSurface:
-    """The finest surface that masks and splats bear out; if none is, that whose silhouettes are nearest to the masks.
+    """Return the finest surface that agrees with masks and splats, or else the one with the largest IoU with the masks.
 
     Args:
-        splats: One object, isolated.
-        views: Its masks from all around.
+        splats: One isolated object.
+        views: Masks of the object from all sides.
         settings: Resolution and size.
-        floor: Height z of what the object stands on, if that is known.
-        progress: Told after every view how many of how many are done.
+        floor: Height z of the support of the object, if known.
+        progress: Called after each view.
 
     Raises:
         InputError: If the splats span no volume.
@@ -103,7 +104,7 @@ def find_sound_surface(
 
 
 def _compare(mesh: trimesh.Trimesh, splats: Splats, views: Sequence[MaskedView]) -> tuple[float, str | None]:
-    """Mean IoU of a mesh's silhouettes with masks, and what speaks against the mesh."""
+    """Return the mean IoU of a mesh's silhouettes with masks, and the reason for a rejection or None."""
     if not (is_closed(mesh) and mesh.volume > 0):
         return 0.0, "is open"
     shown = show_asset(splats, mesh, [view.camera for view in views])
@@ -119,7 +120,7 @@ def _compare(mesh: trimesh.Trimesh, splats: Splats, views: Sequence[MaskedView])
 
 
 def _convex_hull(splats: Splats, floor: float | None) -> trimesh.Trimesh:
-    """Of the opaque Gaussians, floaters left out; not below the floor."""
+    """Return the convex hull of the opaque Gaussians without floaters, clipped at the floor."""
     points = opaque_core(splats).astype(np.float64)
     if floor is not None:
         points[:, 2] = np.maximum(points[:, 2], floor)

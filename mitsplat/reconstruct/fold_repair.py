@@ -1,4 +1,4 @@
-"""Vertices that moved without breaking their mesh: where faces would turn over or cross, they are held back."""
+"""Limits on vertex motion that prevent folded faces and self-intersections."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from mitsplat.renderer.layers import ensure_variant
 from mitsplat.renderer.rays.device_arrays import plain_mesh
 
 _THINNEST = 1e-3
-"""Share of a face's area that must be left on its side of the old plane."""
+"""Least signed area of a moved face, projected onto its original plane, as a share of its original area."""
 _ROUNDS = 12
-"""Times that vertices of what broke are taken half of their way back."""
+"""Largest number of times that the motion of invalid vertices is halved."""
 
 
 def mend_motion(mesh: trimesh.Trimesh, vertices: Float64Array) -> Float64Array | None:
-    """Moved vertices, held back where a face turns over or vanishes, or an edge newly passes through a face.
+    """Return moved vertices whose motion is reduced where faces fold or vanish, or edges newly pass through faces.
 
     Args:
-        mesh: Where they come from.
-        vertices: Where they want to be, (V, 3).
+        mesh: Mesh with the original vertices.
+        vertices: Target positions, (V, 3).
 
     Returns:
-        Where they may be, (V, 3), or None if no part of their way is right.
+        Valid positions, (V, 3), or None if none were found.
     """
     share = np.ones((len(vertices), 1))
     across = _normals(mesh.vertices, mesh.faces)
@@ -45,9 +45,9 @@ def mend_motion(mesh: trimesh.Trimesh, vertices: Float64Array) -> Float64Array |
 
 
 def edges_through_faces(mesh: trimesh.Trimesh, vertices: Float64Array) -> npt.NDArray[np.intp]:
-    """Rows of a mesh's ``edges_unique`` that, with the vertices at (V, 3), pass through a face they do not touch.
+    """Return rows of ``edges_unique`` that pass through a face they do not share a vertex with, for vertices (V, 3).
 
-    An edge is traced as a ray; of what it meets, the first counts.
+    Each edge is traced as a ray; only its first hit is tested.
     """
     ensure_variant()
     edges, faces = mesh.edges_unique, np.asarray(mesh.faces)
@@ -61,6 +61,6 @@ def edges_through_faces(mesh: trimesh.Trimesh, vertices: Float64Array) -> npt.ND
 
 
 def _normals(vertices: Float64Array, faces: npt.NDArray[np.integer[Any]]) -> Float64Array:
-    """Normals of faces, of twice their area in length."""
+    """Return the normals of faces; their length is twice the area."""
     a, b, c = np.moveaxis(np.asarray(vertices)[faces], 1, 0)
     return np.cross(b - a, c - a)

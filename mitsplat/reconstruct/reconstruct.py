@@ -1,4 +1,4 @@
-"""Captures and splats to assets: isolate the object, find its surface, and judge the result."""
+"""Reconstruction of an asset from a capture and splats: isolation, surface and evaluation."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ from mitsplat.reconstruct.surface import SurfaceSettings, reconstruct_surface, s
 
 @dataclass(frozen=True)
 class ReconstructSettings:
-    """How an asset is made of splats.
+    """Settings of the reconstruction.
 
     Attributes:
-        surface: How the mesh is reconstructed.
-        view_size: Longest edge of the pictures that masks and depth are read from [px].
+        surface: Settings of the mesh reconstruction.
+        view_size: Longest edge of the pictures for masks and depth [px].
         verdict_size: Longest edge of the held-out pictures [px].
-        size: Longest edge of the smallest upright box around the mesh [m], which then decides the units; the asset is
-            turned about z until that box lies along its axes.
-        refine: How the mesh of an object is refined by its masks; None leaves it as it is reconstructed.
+        size: Longest edge of the smallest upright box around the mesh [m], which determines the scale. The asset is
+            rotated about z until the edges of that box are parallel to the axes.
+        refine: Settings of the mask-based mesh refinement of an object; None disables it.
     """
 
     surface: SurfaceSettings = field(default_factory=SurfaceSettings)
@@ -52,12 +52,13 @@ class ReconstructSettings:
 
 @dataclass(frozen=True, eq=False)
 class ImportedMesh:
-    """A mesh made elsewhere.
+    """A mesh from another source.
 
     Attributes:
-        mesh: In its own frame.
-        capture_from_mesh: Where it belongs in the capture, shape (4, 4); None: it is registered to the splats.
-        metres_per_unit: Of the mesh; a registered one gives a capture of unknown units its scale.
+        mesh: Mesh in its own frame.
+        capture_from_mesh: Transform to the capture's frame, shape (4, 4); None to register the mesh to the splats.
+        metres_per_unit: Scale of the mesh [m]; after registration it also gives the scale of a capture of unknown
+            units.
     """
 
     mesh: trimesh.Trimesh
@@ -71,18 +72,19 @@ class ImportedMesh:
 
 @dataclass(frozen=True, eq=False)
 class Reconstruction:
-    """An asset and what is known about it.
+    """A reconstructed asset and its evaluation.
 
     Attributes:
-        asset: In the capture's frame, or in metres where a size was given, and then turned, or a mesh registered.
-        verdict: Its quality.
-        held_out: The views that this was judged by.
-        isolation: What was removed, or None for surroundings.
-        alignment: Where a registered mesh was found.
-        refinement: What came of refining the mesh, in the capture's frame, or None where that was not asked for.
-        asset_from_capture: Where the capture's frame is in the asset's, a similarity, shape (4, 4).
+        asset: The asset in the capture's frame. With a size it is rotated and in metres; with a registered mesh of
+            known units it is in metres.
+        verdict: Quality figures.
+        held_out: Held-out views of the evaluation.
+        isolation: Result of the isolation, or None for an environment.
+        alignment: Registration of an imported mesh, or None.
+        refinement: Result of the mesh refinement in the capture's frame, or None if it was not requested.
+        asset_from_capture: Similarity transform from the capture's frame to the asset's frame, shape (4, 4).
         sections: Further sections of the report, HTML.
-        record: What else is kept beside the verdict, JSON.
+        record: Further entries of the verdict file, JSON.
     """
 
     asset: Asset
@@ -108,22 +110,22 @@ def reconstruct_asset(
     psnr: float | None = None,
     progress: Progress | None = None,
 ) -> Reconstruction:
-    """Make an asset of splats that were fitted to a capture.
+    """Make an asset from splats that were fitted to a capture.
 
     Args:
         capture: Photos with cameras, and for an object with masks.
-        splats: In the capture's frame, with or without surroundings.
-        name: Of the asset.
-        class_name: Class that detectors learn; the name if None.
-        kind: Objects are isolated and get convex pieces; environments stay as they are and get an open mesh.
+        splats: Splats in the capture's frame, with or without surroundings.
+        name: Name of the asset.
+        class_name: Class for detectors; the name if None.
+        kind: Objects are isolated and get convex pieces; environments stay whole and get an open mesh.
         settings: Resolutions and size.
-        imported: A mesh to take instead of a reconstructed one.
-        psnr: Held-out PSNR that the fit reported [dB].
-        progress: Told what is being done.
+        imported: Mesh that replaces the reconstructed one.
+        psnr: Held-out PSNR of the fit [dB].
+        progress: Progress callback.
 
     Raises:
-        InputError: If an object has no masks, a size is given to a capture in metres, what is to be refined was not
-            reconstructed by masks, or masks and splats do not belong together.
+        InputError: If an object has no masks, a size is given for a capture in metres, refinement is requested for a
+            mesh that was not reconstructed from masks, or masks and splats do not match.
     """
     if settings.size is not None and capture.units == "metre":
         raise InputError(f"{name}: the capture is in metres already: it takes no size (got {settings.size:g} m)")
@@ -193,21 +195,24 @@ def reconstruct_asset(
 
 
 def check_refinable(settings: ReconstructSettings, kind: str, imported: ImportedMesh | None) -> None:
-    """Refuse to refine what has no masks or was not reconstructed.
+    """Check that mesh refinement is possible: only for an object whose mesh is reconstructed from masks.
 
     Raises:
-        InputError: If that is asked for.
+        InputError: If refinement is requested for any other mesh.
     """
     if settings.refine is not None and (kind != "object" or imported is not None):
         raise InputError("only the mesh of an object that is reconstructed by its masks is refined")
 
 
 _BELOW = 0.02
-"""Share of an object that may be found below the table that it stands on, in Gaussians and in height."""
+"""Largest share of an object below its table, in number of Gaussians and in height."""
 
 
 def _stands(splats: Splats) -> bool:
-    """Whether z = 0 can be what an object stands on: tags may be on the object itself, a board beside it on a box."""
+    """Return True if z = 0 can be the support of the object.
+
+    It is not if the tags are on the object itself, or if the board lies beside the object on a box.
+    """
     height = splats.means[:, 2]
     return bool(
         np.quantile(height, _BELOW)
@@ -216,9 +221,9 @@ def _stands(splats: Splats) -> bool:
 
 
 def _squaring_turn(mesh: trimesh.Trimesh) -> Float64Array:
-    """The least turn about z, (4, 4), after which the smallest upright box around a mesh lies along the axes.
+    """Return the smallest rotation about z (4, 4) that aligns the smallest upright box around a mesh with the axes.
 
-    A ruler is held against that box; extents along axes that cameras chose may be larger by almost a half.
+    A ruler measures that box. Extents along arbitrary camera axes can be almost 50 % larger.
     """
     flat, _ = trimesh.bounds.oriented_bounds_2D(np.asarray(mesh.vertices)[:, :2])
     angle = float(np.arctan2(flat[1, 0], flat[0, 0]))
@@ -229,7 +234,7 @@ def _squaring_turn(mesh: trimesh.Trimesh) -> Float64Array:
 def _placed(
     imported: ImportedMesh, splats: Splats, cameras: Sequence[Camera]
 ) -> tuple[trimesh.Trimesh, Alignment | None]:
-    """The mesh in the capture's frame, and how it was found there."""
+    """Return the mesh in the capture's frame and its registration, or None if the transform was given."""
     alignment = None
     matrix = imported.capture_from_mesh
     if matrix is None:

@@ -1,8 +1,8 @@
-"""Bring a mesh that was made elsewhere into the frame of a splat, and measure how far apart the two are.
+"""Registration of a mesh from another source to splats, and their distance.
 
-Tools that reconstruct meshes move the cameras first, so that the object is centred and of size one; the mesh is then
-in that frame, and the inverse of what they did to the cameras takes it back. A drawing (CAD) has a frame and a scale of
-its own and is registered to the surface that the splats show.
+Mesh reconstruction tools first transform the cameras, so that the object is centred and of unit size. Their mesh is in
+that frame, and the inverse of this transform takes it back. A CAD mesh has its own frame and scale, and is registered
+to the surface of the splats.
 """
 
 from __future__ import annotations
@@ -25,26 +25,26 @@ from mitsplat.geometry.mesh_distance import DistanceSurface
 from mitsplat.renderer.layers import render_splats
 
 _OPAQUE = 0.9
-"""Alpha of a pixel that shows a surface and no edge of it."""
+"""Least alpha of a pixel on a surface, away from edges."""
 _SAMPLES = 4000
 _COARSE_POINTS, _COARSE_STEPS = 400, 16
 _FINE_STEPS = 40
 _FINALISTS = 3
 _WIDE, _NARROW = 0.1, 0.01
-"""Distance at which a registration begins to doubt a point, as a share of the mesh's diagonal: at first, at last."""
+"""Initial and final width of the robust kernel, as a share of the mesh's diagonal."""
 _MISSED = 0.05
-"""Distance beyond which a point counts as missed, however far it is, as a share of the diagonal."""
+"""Upper limit of a point's distance in the misfit, as a share of the diagonal."""
 _NEAREST = 0.9
-"""Share of the points, the nearest ones, that an offset is measured by."""
+"""Share of the points, the nearest ones, that determine an offset."""
 
 
 @dataclass(frozen=True, eq=False)
 class Alignment:
-    """Where a mesh belongs.
+    """Registration of a mesh to splats.
 
     Attributes:
         splats_from_mesh: Similarity transform, shape (4, 4).
-        scale: Its scale.
+        scale: Scale of the transform.
         residual: Median distance of the splats' surface from the moved mesh, as a share of its diagonal.
     """
 
@@ -55,11 +55,11 @@ class Alignment:
 
 @dataclass(frozen=True)
 class Offset:
-    """How far a mesh is from the surface that splats show, as shares of the mesh's diagonal.
+    """Distance between a mesh and the surface of splats, as shares of the mesh's diagonal.
 
     Attributes:
-        shift: Length of the translation that would bring them together best.
-        spread: Median distance that is between them.
+        shift: Length of the translation that aligns them best.
+        spread: Median distance between them.
     """
 
     shift: float
@@ -67,7 +67,9 @@ class Offset:
 
 
 def surface_points(splats: Splats, cameras: Sequence[Camera], *, count: int = 4000, seed: int = 0) -> Float64Array:
-    """Points (M, 3), at most ``count``, on the surface of splats as cameras see it: where half of the light is lost.
+    """Return at most ``count`` points (M, 3) on the splat surface that cameras see.
+
+    At the surface the transmittance falls to one half.
 
     Raises:
         InputError: If no camera sees an opaque pixel.
@@ -88,10 +90,10 @@ def surface_points(splats: Splats, cameras: Sequence[Camera], *, count: int = 40
 
 
 def invert_transform(path: Path) -> Float64Array:
-    """Inverse of the similarity that a text file holds, 3 x 4 or 4 x 4 numbers, as a (4, 4) matrix.
+    """Read a similarity transform from a text file, 3 x 4 or 4 x 4 numbers, and return its inverse, shape (4, 4).
 
     Raises:
-        InputError: If the file cannot be read or holds no similarity transform.
+        InputError: If the file cannot be read or is not a similarity transform.
     """
     try:
         matrix = np.loadtxt(path, dtype=np.float64, ndmin=2)
@@ -111,11 +113,11 @@ def invert_transform(path: Path) -> Float64Array:
 
 
 def register_mesh(mesh: trimesh.Trimesh, points: Float64Array) -> Alignment:
-    """Register a mesh of any frame and scale to points (N, 3) of the object's surface, of which parts may be missing.
+    """Register a mesh of any frame and scale to points (N, 3) on parts of the object's surface.
 
-    Iterative closest points with scale, by Gauss-Newton steps on the distances from the nearest planes (Chen and
-    Medioni 1992), from the 24 ways in which principal axes can be matched: with few points from all, and with all
-    points from the best of them.
+    Iterative closest points with scale, by Gauss-Newton steps on point-to-plane distances (Chen and Medioni 1992). The
+    24 proper matches of the principal axes are starting poses. All starts use a few points; the best starts are refined
+    with all points.
 
     Raises:
         InputError: If there are fewer than 100 points.
@@ -144,11 +146,11 @@ def register_mesh(mesh: trimesh.Trimesh, points: Float64Array) -> Alignment:
 
 
 def measure_offset(mesh: trimesh.Trimesh, points: Float64Array) -> Offset:
-    """How far a mesh is from surface points (N, 3) in the same frame."""
+    """Measure the offset of a mesh from surface points (N, 3) in the same frame."""
     nearest, normal, distance = DistanceSurface(mesh).nearest(points)
     near = distance <= np.quantile(distance, _NEAREST)
     gap = np.einsum("nd,nd->n", normal, nearest - points)
-    # Directions in which the surface can slide along itself stay at zero: the least-squares solution of least norm.
+    # The least-norm solution is zero in directions in which the surface can slide along itself.
     shift, *_ = np.linalg.lstsq(normal[near], gap[near], rcond=1e-3)
     return Offset(float(np.linalg.norm(shift) / mesh.scale), float(np.median(distance) / mesh.scale))
 
@@ -159,7 +161,7 @@ def _moved(points: Float64Array, matrix: Float64Array) -> Float64Array:
 
 
 def _starts(points: Float64Array, samples: Float64Array) -> list[Float64Array]:
-    """Transforms that match centres, sizes and, in every proper way, the principal axes of two sets of points."""
+    """Return the transforms that match centres, sizes and principal axes of two point sets, in all 24 proper ways."""
     frames = []
     for cloud in (points, samples):
         middle = cloud.mean(axis=0)
@@ -182,11 +184,11 @@ def _starts(points: Float64Array, samples: Float64Array) -> list[Float64Array]:
 def _plane_steps(
     surface: DistanceSurface, points: Float64Array, matrix: Float64Array, widths: Float64Array
 ) -> Float64Array:
-    """Gauss-Newton on ``n . (p + w x (p - c) + s (p - c) + t - q)`` for rotation w, scale s and translation t.
+    """Run Gauss-Newton on ``n . (p + w x (p - c) + s (p - c) + t - q)`` for rotation w, scale s and translation t.
 
-    Points are weighted by Geman and McClure's kernel, of one width a step; they shrink (graduated non-convexity, Blake
-    and Zisserman 1987). As long as a nearly round part is turned wrongly, the few points that say so are the farthest
-    ones: without them, it would stay as it is.
+    Points have weights by the kernel of Geman and McClure, whose width decreases with the steps (graduated
+    non-convexity, Blake and Zisserman 1987). A wide kernel at the start is necessary for nearly round parts: only the
+    few farthest points show a wrong rotation.
     """
     for width in widths:
         moved = _moved(points, matrix)
@@ -198,7 +200,8 @@ def _plane_steps(
         arm, gap = arm / size, gap / size
         rows = np.concatenate([np.cross(arm, normal), np.einsum("nd,nd->n", arm, normal)[:, None], normal], axis=1)
         wanted = np.einsum("nd,nd->n", gap, normal)
-        # Directions in which the surface slides along itself, as around the axis of a turned part, stay as they are.
+        # The pseudo-inverse makes no step in directions in which the surface slides along itself, such as around the
+        # axis of a turned part.
         weighted = rows.T * weight
         update = np.linalg.pinv(weighted @ rows, rcond=1e-5, hermitian=True) @ (weighted @ wanted)
         turn = Rotation.from_rotvec(update[:3]).as_matrix() * (1 + float(np.clip(update[3], -0.1, 0.1)))
@@ -213,10 +216,12 @@ def _plane_steps(
 def _misfit(
     surface: DistanceSurface, samples: Float64Array, points: Float64Array, matrix: Float64Array, missed: float
 ) -> float:
-    """Mean distance both ways: a cloud that shrank into a corner is near the mesh, but the mesh not near the cloud.
+    """Return the sum of the mean distances in both directions.
 
-    No point is left out, because the few that are far decide between two ways to lay a nearly symmetric part, and none
-    counts for more than ``missed``, because parts of the surface may be unseen.
+    A cloud that shrank into a corner is near the mesh, but the mesh is not near the cloud.
+
+    All points count, because the few far points distinguish two poses of a nearly symmetric part. Distances are limited
+    to ``missed``, because parts of the surface may be unseen.
     """
     moved = _moved(points, matrix)
     there, back = surface.nearest(moved)[2], KDTree(moved).query(samples)[0]

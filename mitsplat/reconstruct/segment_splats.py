@@ -1,9 +1,9 @@
-"""Take one object out of the splats of a whole photographed place.
+"""Isolation of one object from the splats of a whole scene.
 
-The projection of masks is the published method's: a Gaussian belongs to the object if what the photographs show of it
-falls inside their masks. What a photograph shows of a Gaussian is its blended weight, ``sum over pixels of T a``, so
-that what is hidden in a view has no say in it. Needles and floaters, which masks cannot tell from the object, are
-removed after.
+The projection of masks is that of the published method: a Gaussian belongs to the object if its visible part in the
+photographs falls inside their masks. The visible part is its blending weight, ``sum over pixels of T a``, so hidden
+Gaussians do not count in a view. Needles and floaters, which masks cannot separate from the object, are removed
+afterwards.
 """
 
 from __future__ import annotations
@@ -35,26 +35,26 @@ from mitsplat.renderer.layers import ensure_variant, make_sensor, render_splats
 from mitsplat.renderer.rays.sensors import view_of
 
 INSIDE = 0.5
-"""Least share of a Gaussian's visible weight that must fall inside the masks."""
+"""Least share of a Gaussian's visible weight inside the masks."""
 SEEN = 0.05
-"""Visible weight, summed over all views [px], below which nobody has seen a Gaussian."""
+"""Visible weight over all views [px] below which a Gaussian counts as unseen."""
 NEEDLE = 8.0
-"""Longest over second longest standard deviation of a needle."""
+"""Least ratio of the longest to the second longest standard deviation of a needle."""
 NEEDLE_LENGTH = 0.1
-"""Share of an asset's size from which a needle is seen."""
+"""Least length of a visible needle, as a share of the asset's size."""
 NEEDLE_TIP = 2.0
-"""Standard deviations from a needle's middle to its tips, which must not stick out of the masks."""
+"""Distance of a needle's tips from its centre [standard deviations]; tips must not stick out of the masks."""
 TIP_MARGIN = 1.5
-"""How far a tip may stick out [px]."""
+"""Largest distance of a tip from a mask [px]."""
 TOUCH = 2.5
-"""Distance in standard deviations of the larger of two Gaussians up to which they touch."""
+"""Largest distance of touching Gaussians, in standard deviations of the larger one."""
 SMALLEST_PART = 0.02
-"""Share of the object's visible weight that a part which touches no other must have to be no floater."""
+"""Share of the object's visible weight below which an isolated part is a floater."""
 
 _QUALITY = Quality(alpha_min=2e-3, transmittance_min=1e-3, sh_degree=0)
 _NEIGHBOURS = 12
 _MOST_NEIGHBOURS = 12 * 4**3
-"""Of each Gaussian in a group that seems to float."""
+"""Largest number of neighbours per Gaussian in a candidate floater."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,12 +62,12 @@ class MaskedView:
     """A camera and the mask of the object in its picture.
 
     Attributes:
-        camera: From where.
-        mask: Share of each pixel that is the object, (H, W) in [0, 1].
-        hidden: Where another thing may hide the object, (H, W) in [0, 1]; None: nowhere.
+        camera: The camera.
+        mask: Share of each pixel that the object covers, (H, W) in [0, 1].
+        hidden: Share of each pixel where another thing may hide the object, (H, W) in [0, 1]; None if nowhere.
 
     Raises:
-        ValueError: If the mask is not of the camera's size.
+        ValueError: If the mask does not have the camera's size.
     """
 
     camera: Camera
@@ -75,33 +75,33 @@ class MaskedView:
     hidden: Float32Array | None = None
 
     def __post_init__(self) -> None:
-        """Check."""
+        """Check the shape of the mask."""
         if self.mask.shape != (self.camera.height, self.camera.width):
             raise ValueError(f"a mask must be of its camera's {self.camera.height} x {self.camera.width} px")
 
     @property
     def possible(self) -> Float32Array:
-        """Share of each pixel in which the object may be, (H, W)."""
+        """Share of each pixel that the object may cover, (H, W)."""
         return self.mask if self.hidden is None else np.maximum(self.mask, (self.hidden > 0).astype(np.float32))
 
     @property
     def known(self) -> BoolArray:
-        """Where the mask says whether there is the object, (H, W)."""
+        """True where the mask is certain, because nothing may hide the object, (H, W)."""
         return known_where(self.hidden, self.camera)
 
 
 @dataclass(frozen=True, eq=False)
 class Isolation:
-    """An object's splats, and what was removed around them.
+    """An object's splats and the counts of removed Gaussians.
 
     Attributes:
-        splats: Those that are left.
-        kept: Which these are, shape (N,).
+        splats: Splats of the object.
+        kept: True for Gaussians of the object, shape (N,).
         unseen: Number of Gaussians that no view shows.
-        outside: Number of those seen mostly outside the masks.
-        needles: Number of elongated ones whose tips stick out of the masks.
-        floaters: Number of those in parts that touch nothing else.
-        lost: Share of the alpha inside the masks that went with what was removed.
+        outside: Number of Gaussians seen mostly outside the masks.
+        needles: Number of elongated Gaussians whose tips stick out of the masks.
+        floaters: Number of Gaussians in isolated parts.
+        lost: Share of the alpha inside the masks that was lost by the removal.
     """
 
     splats: Splats
@@ -119,15 +119,15 @@ def isolate_object(
     *,
     progress: Progress | None = None,
 ) -> Isolation:
-    """The Gaussians of the object that the masks show.
+    """Return the Gaussians of the masked object.
 
     Args:
         splats: Object and surroundings.
-        views: All around the object.
-        progress: Told after every view how many of how many are done.
+        views: Views from all sides of the object.
+        progress: Called after each view.
 
     Raises:
-        InputError: If there are no views, or nothing is left.
+        InputError: If there are no views, or no Gaussian is left.
     """
     if not views:
         raise InputError("masks are needed to isolate an object (got no view with one)")
@@ -160,10 +160,10 @@ def isolate_object(
 
 
 class VisibleWeights:
-    """Blended weights of a cloud's Gaussians in views, which is uploaded once.
+    """Blending weights of a cloud's Gaussians in views; the cloud is uploaded once.
 
-    The picture is linear in the colours: the derivative of ``sum of mask * red`` with respect to the red of a Gaussian
-    is its weight ``T a`` summed over the mask, and green serves for what is outside.
+    The picture is linear in the colours. The derivative of ``sum of mask * red`` with respect to the red of a Gaussian
+    is therefore its weight ``T a`` summed over the mask. Green gives the weight outside the mask.
     """
 
     def __init__(self, splats: Splats) -> None:
@@ -173,7 +173,7 @@ class VisibleWeights:
         self._inputs = [mi.Float(np.ravel(values)) for values in fields]
 
     def __call__(self, view: MaskedView) -> Float64Array:
-        """Weight of each inside and outside the mask, where that is known, shape (N, 2) [px]."""
+        """Return the weights inside and outside the mask, where it is known, shape (N, 2) [px]."""
         colours = dr.zeros(mi.Float, 3 * self._count)
         dr.enable_grad(colours)
         means, quats, scales, opacities = self._inputs
@@ -187,7 +187,7 @@ class VisibleWeights:
 
 
 def _needles(splats: Splats, views: Sequence[MaskedView]) -> BoolArray:
-    """Elongated Gaussians one of whose tips more than one view sees outside its mask."""
+    """Return True for elongated Gaussians with a tip outside the mask in more than one view."""
     ordered = np.sort(splats.scales.astype(np.float64), axis=1)
     needle = np.flatnonzero(ordered[:, 2] > NEEDLE * ordered[:, 1])
     result = np.zeros(len(splats), dtype=bool)
@@ -206,13 +206,13 @@ def _needles(splats: Splats, views: Sequence[MaskedView]) -> BoolArray:
 
 
 def long_needles(splats: Splats, size: float) -> BoolArray:
-    """Which Gaussians (N,) are elongated, and long against the ``size`` of what they are of [m]."""
+    """Return True for elongated Gaussians (N,) that are long relative to the ``size`` of their asset [m]."""
     ordered = np.sort(splats.scales, axis=1)
     return np.asarray((ordered[:, 2] > NEEDLE * ordered[:, 1]) & (ordered[:, 2] > NEEDLE_LENGTH * size))
 
 
 def visible_area(splats: Splats) -> Float64Array:
-    """Area that each Gaussian shows at most, times its opacity, up to a constant, shape (N,)."""
+    """Return the largest projected area of each Gaussian times its opacity, up to a constant factor, shape (N,)."""
     ordered = np.sort(splats.scales, axis=1).astype(np.float64)
     return np.asarray(splats.opacities * ordered[:, 1] * ordered[:, 2])
 
@@ -220,7 +220,10 @@ def visible_area(splats: Splats) -> Float64Array:
 def sample_nearest(
     image: npt.NDArray[Any], camera: Camera, points: npt.NDArray[np.floating], missing: float
 ) -> npt.NDArray[Any]:
-    """The pixels that world points (N, 3) fall on, and ``missing`` for those beside the picture or behind it."""
+    """Return the pixel values at world points (N, 3).
+
+    Points outside the picture or behind the camera get the value ``missing``.
+    """
     pixels, _ = camera.project(points)
     known = np.isfinite(pixels[:, 0])
     x, y = np.floor(np.where(known[:, None], pixels, -1)).clip(-1, 1 << 30).astype(np.int64).T
@@ -231,10 +234,10 @@ def sample_nearest(
 
 
 def find_floaters(splats: Splats, weight: Float64Array) -> Int64Array:
-    """Indices of Gaussians in groups that touch no other and have little of the visible weight (N,).
+    """Return the indices of Gaussians in isolated groups with a small share of the visible weight (N,).
 
-    Neighbours are looked at as far as it takes: where a fit puts many Gaussians in one place, as MCMC does, the nearest
-    ones of each are of that place alone.
+    The number of neighbours grows as necessary. A fit with MCMC puts many Gaussians at one place, so the nearest
+    neighbours may all lie at that place.
     """
     count = len(splats)
     if count < 2:
@@ -257,7 +260,7 @@ def find_floaters(splats: Splats, weight: Float64Array) -> Int64Array:
 
 
 def _lost_share(before: Splats, after: Splats, views: Sequence[MaskedView]) -> float:
-    """Share of the alpha inside the masks that is missing after."""
+    """Return the share of the alpha inside the masks that is missing after the removal."""
     shown = missing = 0.0
     alphas = [render_splats(before, view.camera, quality="fast").alpha for view in views]
     for view, alpha in zip(views, alphas, strict=True):

@@ -1,17 +1,18 @@
-"""A mesh closer to the outlines that photographs show, by gradient descent through Mitsuba.
+"""Refinement of a mesh towards silhouettes in photographs, by gradient descent through Mitsuba.
 
-The mesh shines evenly before a black background, so its picture is its silhouette; the squared difference to the mask
-is lowered. How a silhouette moves with the vertices comes from projective sampling (Zhang et al. 2023, "Projective
-Sampling for Differentiable Rendering of Geometry"), Mitsuba's ``prb_projective``; the gradients are spread over the
-surface by "Large Steps in Inverse Rendering of Geometry" (Nicolet et al. 2021), Mitsuba's ``mi.ad.LargeSteps``.
+The mesh emits uniformly in front of a black background, so its image is its silhouette. The loss is the squared
+difference to the mask. Silhouette gradients come from projective sampling (Zhang et al. 2023, "Projective Sampling for
+Differentiable Rendering of Geometry"), Mitsuba's ``prb_projective``. They are smoothed over the surface by "Large Steps
+in Inverse Rendering of Geometry" (Nicolet et al. 2021), Mitsuba's ``mi.ad.LargeSteps``.
 
-Mitsuba samples the outlines of pinhole cameras only. Every mask is therefore resampled, through whatever lens it was
-taken, to a pinhole at the same place that looks at the middle of the mesh and is filled by it: turning a camera about
-its centre changes nothing of what it sees, and views of one size share their kernels.
+Mitsuba samples silhouettes of pinhole cameras only. Every mask is therefore resampled, from any lens, to a pinhole
+camera at the same position that is directed at the centre of the mesh and fills its picture with the mesh. Rotating a
+camera about its centre does not change the visible content, and views of one size share their kernels.
 
-The photos' colours are left out by measurement. On a solid whose photos a colour per vertex explains without light,
-colours that were found together with the vertices raised the error of the silhouettes in views set aside from 0.35 to
-0.37 %, and the distance to the solid from 0.035 to 0.037 % (weight 0.3) and 0.042 % (weight 1) of the diagonal.
+The colours of the photos are not used, because measurements showed no benefit. On a solid whose photos can be explained
+by a colour per vertex without light, joint optimisation of colours raised the silhouette error in validation views from
+0.35 to 0.37 %. It raised the distance to the solid from 0.035 to 0.037 % (weight 0.3) and 0.042 % (weight 1) of the
+diagonal.
 """
 
 from __future__ import annotations
@@ -36,32 +37,34 @@ from mitsplat.renderer.layers import ensure_variant
 from mitsplat.renderer.rays.device_arrays import plain_mesh, ray_scene, wrapped
 
 _ROOM = 1.1
-"""Radius that a view shows around the middle of the mesh, in radii of the mesh."""
+"""Radius that a view shows around the centre of the mesh, in radii of the mesh."""
 _VALIDATION_EVERY = 6
-"""One view in so many judges what the others ask for, or one in fewer, so that two do of four and three of more."""
+"""Interval of the validation views; smaller for few views, so that there are at least two of four and three of more."""
 _LEAST = 4
-"""Views without which nothing is refined."""
+"""Least number of views for a refinement."""
 _BATCH = 2
-"""Views that a step looks at."""
+"""Views per step."""
 _CHECKS = 10
-"""Times that the mesh is judged on the way."""
+"""Number of validations."""
 _SAMPLES = 4
-"""Rays per pixel of a silhouette, and four times as many where it judges; its gradient takes one sample of the outline
-per pixel of the picture, which is a hundred for each that the outline passes through."""
+"""Rays per pixel of a silhouette; validation uses four times as many.
+
+The gradient uses one silhouette sample per pixel of the picture, which is about a hundred per pixel on the silhouette.
+"""
 _STANDING = 0.005
-"""Height above the table up to which vertices are what the object stands on, in radii."""
+"""Height above the table up to which vertices belong to the base of the object, in radii."""
 
 
 @dataclass(frozen=True)
 class MeshRefineSettings:
-    """How a mesh is refined.
+    """Settings of the mesh refinement.
 
     Attributes:
         steps: Gradient steps of two views each.
-        size: Edge of the square pictures that masks are resampled to [px].
-        rate: Step of the optimiser, in radii of the mesh; it falls to nothing by the end.
-        smoothness: Weight λ of the Laplacian that gradients are spread by.
-        seed: Of the choice of views and of the samples; runs of the same seed agree to the rounding of float32.
+        size: Edge of the square pictures to which masks are resampled [px].
+        rate: Step size of the optimiser, in radii of the mesh; it falls to zero by the end.
+        smoothness: Weight λ of the Laplacian that smooths gradients.
+        seed: Seed of view selection and samples; runs with equal seeds agree to the rounding of float32.
     """
 
     steps: int = 200
@@ -81,15 +84,15 @@ class MeshRefineSettings:
 
 @dataclass(frozen=True, eq=False)
 class RefinedMesh:
-    """What came of a refinement.
+    """Result of a refinement.
 
     Attributes:
-        mesh: Refined if that was kept, or as it was.
-        kept: Whether it is the refined one.
-        before: Mean of 1 - IoU between the silhouettes of the mesh and the masks of the views that judge.
-        after: The same of the best refined mesh; infinite if none was valid. These views chose it among those on the
-            way, so others may differ by a little more: a verdict judges by photos that had no say.
-        judges: Number of these views; 0 if there were too few views to try.
+        mesh: The refined mesh if it was accepted, or the given mesh.
+        kept: True if the refined mesh was accepted.
+        before: Mean of 1 - IoU between the silhouettes of the given mesh and the masks of the validation views.
+        after: The same of the best refined mesh; infinite if none was valid. The best mesh is selected by these views,
+            so other views may differ by slightly more. A verdict uses photos that affected nothing.
+        judges: Number of validation views; 0 if there were too few views.
     """
 
     mesh: trimesh.Trimesh
@@ -99,7 +102,7 @@ class RefinedMesh:
     judges: int
 
     def __str__(self) -> str:
-        """What came of it in one clause."""
+        """Return the result as one clause."""
         if not self.judges:
             return f"dropped: it takes masks from {_LEAST} places outside of the mesh"
         if not np.isfinite(self.after):
@@ -119,18 +122,20 @@ def refine_mesh(
     floor: float | None = None,
     progress: Progress | None = None,
 ) -> RefinedMesh:
-    """Move the vertices of a mesh to where masks want its outlines.
+    """Move the vertices of a mesh so that its silhouettes match masks.
 
-    Every sixth view, or more of few, takes no part, and judges: the best mesh on the way is kept if its error there is
-    below that of the given one, by more than the standard error of the mean over these views. If the given one was made
-    of all masks, it has an advantage. Faces stay what they are, and none turns over or newly passes through another.
+    Every sixth view, or more if there are few, is a validation view and is not fitted. The best mesh on the way is
+    accepted if its validation error is below that of the given mesh by more than the standard error of the mean over
+    these views. A given mesh that was made from all masks has an advantage. The faces stay the same; no face folds over
+    or newly intersects another.
 
     Args:
-        mesh: Close to what the masks show, in the frame of the cameras.
+        mesh: Mesh close to the masks, in the frame of the cameras.
         views: Cameras of any lens, and their masks.
         settings: Number and size of steps.
-        floor: Height z of the table that the object stands on, if it does: what is on it stays, and nothing sinks.
-        progress: Told after every step how many of how many are done.
+        floor: Height z of the table below the object, or None. Vertices on the table stay, and no vertex moves below
+            it.
+        progress: Called after each step.
     """
     ensure_variant()
     middle = mesh.bounds.mean(axis=0)
@@ -181,12 +186,12 @@ def refine_mesh(
 
 
 class Outline:
-    """What a mask shows of the unit ball around the mesh, as a pinhole that looks at it sees it.
+    """A mask resampled to a pinhole camera that is directed at the bounding ball of the mesh.
 
     Attributes:
-        sensor: Mitsuba's pinhole, in radii about the middle.
-        focal: Its focal length [px].
-        mask: Share of each pixel that is the object, (size * size,).
+        sensor: Mitsuba's pinhole camera; lengths in radii, relative to the centre.
+        focal: Focal length [px].
+        mask: Share of each pixel that the object covers, (size * size,).
         known: 1 where the photo shows the pixel, else 0.
     """
 
@@ -201,7 +206,7 @@ class Outline:
         slopes = camera.ray_slopes(np.column_stack([x.ravel(), y.ravel()]))
         pose = camera.world_from_camera
         ahead = np.column_stack([slopes, np.ones(len(slopes))]) @ pose[:3, :3].T
-        # Pixel centres are at +0.5 here, and whole in OpenCV.
+        # Pixel centres are at +0.5 here, but at integers in OpenCV.
         pixels = np.nan_to_num(given.project(given.centre + distance * ahead)[0], nan=-9.0) - 0.5
         known = ((pixels > -0.5) & (pixels < np.array([given.width, given.height]) - 0.5)).all(axis=1)
         x, y = pixels.T.astype(np.float32).reshape(2, size, size)
@@ -220,19 +225,19 @@ class Outline:
 
 
 class Silhouettes:
-    """A mesh that shines evenly, whose vertices can be moved."""
+    """A uniformly emitting mesh with movable vertices."""
 
     def __init__(self, mesh: trimesh.Trimesh) -> None:
         properties = mi.Properties()
         properties["emitter"] = mi.load_dict({"type": "area", "radiance": {"type": "uniform", "value": 1.0}})
         self.scene = ray_scene({"mesh": plain_mesh(mesh, properties)})
-        # Directly seen light alone; inside a silhouette nothing changes.
+        # Only directly visible emission matters; inside a silhouette the image is constant.
         self.integrator = mi.load_dict({"type": "prb_projective", "max_depth": 1, "sppc": 0, "sppi": 0})
         self.integrator.sample_border_warning = False
         self.params = mi.traverse(self.scene)
 
     def loss(self, vertices: Any, views: Sequence[Outline], rng: np.random.Generator) -> Any:
-        """Mean squared difference of silhouettes and masks, with gradients."""
+        """Return the mean squared difference between silhouettes and masks, with gradients."""
         self.move(vertices)
         total = mi.Float(0)
         for view in views:
@@ -241,7 +246,7 @@ class Silhouettes:
         return total
 
     def errors(self, vertices: Float64Array, views: Sequence[Outline]) -> Float64Array:
-        """1 - IoU of silhouette and mask, of which every pixel has a share, per view."""
+        """Return 1 - IoU of silhouette and mask per view, computed with fractional pixel coverage."""
         self.move(wrapped(mi.Float, vertices.ravel().astype(np.float32)))
         errors = []
         for view in views:
@@ -251,11 +256,11 @@ class Silhouettes:
         return np.array(errors, dtype=np.float64)
 
     def move(self, vertices: Any) -> None:
-        """Put the vertices elsewhere."""
+        """Set the vertex positions."""
         self.params["mesh.vertex_positions"] = vertices
         self.params.update()
 
     def shown(self, view: Outline, samples: int, seed: int, params: Any = None) -> Any:
-        """Share of each pixel that the mesh covers, (size * size,); gradients reach ``params``."""
+        """Render the share of each pixel that the mesh covers, (size * size,), with gradients to ``params``."""
         picture = mi.render(self.scene, params, view.sensor, self.integrator, seed=seed, spp=samples, spp_grad=1)
         return picture.array

@@ -1,11 +1,10 @@
-"""Splats and masks to a closed surface: the visual hull intersected with a fusion of the splats' depth.
+"""Closed surface from splats and masks: the visual hull intersected with the fused depth of the splats.
 
-The hull (Laurentini 1994) is the set of points that every mask shows as object; it closes the surface where no
-photograph looks, and knows nothing of hollows. Depth that the splats are rendered to is fused into a truncated signed
-distance (Curless and Levoy 1996), which cuts the hollows out, and only as deep as the views agree on. Both are
-distances on one grid, positive inside: their minimum is the intersection, and marching cubes (Lorensen and Cline 1987)
-takes its zero for the surface. Below an object that stands on a table the hull sags, because no camera looks there: the
-table bounds it.
+The hull (Laurentini 1994) is the set of points that every mask shows as object. It closes the surface in unseen areas,
+but it has no concavities. Rendered depth of the splats is fused into a truncated signed distance (Curless and Levoy
+1996), which adds the concavities to the depth on which the views agree. Both are distances on one grid, positive
+inside. Their minimum is the intersection, and marching cubes (Lorensen and Cline 1987) extracts its zero level. The
+hull extends below an object on a table, because no camera sees it from below; the table plane limits it.
 """
 
 from __future__ import annotations
@@ -35,45 +34,52 @@ from mitsplat.renderer.layers import ensure_variant, make_sensor, render_splats
 from mitsplat.renderer.rays.sensors import view_of
 
 _OPAQUE = 0.5
-"""Alpha from which a pixel shows the splats' surface."""
+"""Least alpha of a pixel that shows the splats' surface."""
 _BULK = 0.002
-"""Share of the Gaussians at either end of an axis that do not decide where the grid is."""
+"""Share of the Gaussians at either end of an axis that are ignored for the bounds of the grid."""
 _MARGIN = 0.08
-"""Room around the bulk of the Gaussians, as a share of its longest extent."""
+"""Margin around the bulk of the Gaussians, as a share of its longest extent."""
 _SEEN_BY = 0.035
-"""Share of the views that look towards a cell which must see it: a few look through gaps between Gaussians."""
+"""Least share of the views towards a cell that must see it; a few views look through gaps between Gaussians."""
 _BEHIND = 2.0
-"""Truncations behind the seen surface up to which a view says that a cell is inside. With one, errors of depth draw the
-surface inwards, because all of the space in front counts; without a limit, hollows close that some views miss."""
+"""Largest depth behind the seen surface, in truncations, at which a view votes for inside.
+
+With 1, depth errors move the surface inwards, because all of the space in front counts. Without a limit, concavities
+close that some views do not see.
+"""
 _DOUBT = 0.5
-"""Standard deviations between views by which depth must exceed the hull to cut it: masks err less than depths."""
+"""Standard deviations between views by which depth must exceed the hull to cut it; masks are more accurate than depths.
+"""
 _PASSAGE = 2.5
-"""Radius up to which a passage into a solid is closed [cells]."""
+"""Largest radius of a passage into a solid that is closed [cells]."""
 _EDGE = 1.5
-"""Room between solid cells that the inner edges and corners of hollows do not have where that radius ends [cells]."""
+"""Least distance from solid cells in a void [cells].
+
+The concave edges and corners that the closing also fills are thinner.
+"""
 _FILLED = 0.5
-"""Share of a cell's cross-section that Gaussians must cover to fill it."""
+"""Least share of a cell's cross-section that Gaussians must cover to fill it."""
 _DRAWS = 8
-"""Points by which a Gaussian is spread over cells."""
+"""Random points per Gaussian that distribute its area over cells."""
 _SMALLEST_PART = 1e-3
-"""Volume of a leaf whose stem is lost, as a share of the largest part's."""
+"""Least volume of a separate part, such as a leaf without its stem, as a share of the largest part's."""
 _FAR = 1e6
 _APART = 0.02
-"""Share of the way to its neighbours by which a vertex leaves the place that it shares with another."""
+"""Share of the way to its neighbours by which a vertex is moved away from a coincident one."""
 _ROUNDS_APART = 8
-"""Times that this is tried: a vertex may move to where another one is."""
+"""Largest number of repetitions; a moved vertex can coincide with another one."""
 
 
 @dataclass(frozen=True)
 class SurfaceSettings:
-    """How a surface is reconstructed.
+    """Settings of the surface reconstruction.
 
     Attributes:
         voxels: Grid cells along the longest extent.
-        truncation: Depth behind the surface that one view speaks for, in cells.
+        truncation: Depth behind the surface that one view affects, in cells.
         blur: Standard deviation of the smoothing of the distances, in cells.
-        dissent: Views that may show a point as background and be overruled: there are errors in masks.
-        faces: Most faces of the result.
+        dissent: Number of views that may show an inside point as background, because of errors in masks.
+        faces: Largest number of faces of the result.
     """
 
     voxels: int = 192
@@ -102,25 +108,24 @@ def reconstruct_surface(
     depth: bool = True,
     progress: Progress | None = None,
 ) -> trimesh.Trimesh:
-    """Surface of the splats in their own frame.
+    """Reconstruct the surface of splats in their own frame.
 
     Args:
-        splats: One object, isolated; or surroundings.
-        cameras: Around it.
-        masks: Share of each pixel of their pictures that is the object, (H, W) each; None leaves the hull out, as
-            surroundings need.
+        splats: One isolated object, or surroundings.
+        cameras: Cameras around it.
+        masks: Share of each pixel that the object covers, (H, W) each; None disables the hull, as for surroundings.
         settings: Resolution and size.
-        floor: Height z of the table that the object stands on, if it does.
-        thin: Keep sheets and stems that are thinner than a cell, such as leaves, three cells thick, where Gaussians lie
-            densely: depths of both sides cancel each other there.
-        depth: Whether the splats' depth cuts into the hull; without it, they only say where the hull is looked for.
-        progress: Told after every view how many of how many are done.
+        floor: Height z of the table below the object, or None.
+        thin: True to keep sheets and stems thinner than a cell, such as leaves, as three cells where Gaussians are
+            dense. Depths from both sides cancel there.
+        depth: True to carve the hull with the splats' depth; otherwise splats only define the bounds of the grid.
+        progress: Called after each view.
 
     Returns:
-        A watertight mesh where masks close it.
+        The mesh; watertight if there are masks.
 
     Raises:
-        InputError: If there are no cameras or splats, or nothing that all masks show as object.
+        InputError: If there are no cameras or splats, or no point is inside all masks.
     """
     if not cameras or not len(splats):
         raise InputError(f"a surface needs cameras and splats (got {len(cameras)} and {len(splats)})")
@@ -139,7 +144,7 @@ def reconstruct_surface(
         distance = np.where(grid.lost(splats, distance, state), 0.5 * np.float32(grid.cell), distance)
     if floor is not None:
         distance = np.minimum(distance, grid.heights() - np.float32(floor))
-    # A border outside closes the surface at the edge of the grid.
+    # An outside border closes the surface at the edge of the grid.
     padded, known = np.pad(distance, 1, constant_values=-grid.truncation), np.pad(known, 1, constant_values=masked)
     try:
         triangulate: Any = marching_cubes
@@ -156,11 +161,13 @@ def reconstruct_surface(
 
 
 def simplify_surface(surface: trimesh.Trimesh, faces: int) -> trimesh.Trimesh:
-    """At most ``faces`` faces by quadric error (Garland and Heckbert 1997); what is watertight stays so.
+    """Simplify to at most ``faces`` faces by quadric error (Garland and Heckbert 1997).
 
-    Collapses that pinch a closed surface are undone by a simplification that keeps it a manifold, to within a tolerance
-    that grows until the faces are few enough, or as few as the shape has at a tenth of its size. Where a closed surface
-    then touches itself it is drawn apart, so that it is one also for readers that weld vertices.
+    A watertight mesh stays watertight.
+
+    If edge collapses pinch a closed surface, a manifold-preserving simplification replaces them. Its tolerance grows
+    until the faces are few enough, or until a tenth of the size of the mesh. Coincident vertices of a closed surface
+    are moved apart, so that it stays closed after vertices are welded.
     """
     if len(surface.faces) <= faces:
         return surface
@@ -180,9 +187,9 @@ def simplify_surface(surface: trimesh.Trimesh, faces: int) -> trimesh.Trimesh:
 
 
 def _untouched(surface: trimesh.Trimesh) -> trimesh.Trimesh:
-    """A closed surface whose vertices all lie apart in single precision, as files store them.
+    """Return a closed surface whose vertices differ in single precision, the precision of mesh files.
 
-    Vertices in one place belong to sheets that touch there: each moves a little towards its own neighbours.
+    Coincident vertices belong to sheets that touch; each moves slightly towards its own neighbours.
     """
     vertices = np.array(surface.vertices)
     one, other = surface.edges.T
@@ -192,7 +199,7 @@ def _untouched(surface: trimesh.Trimesh) -> trimesh.Trimesh:
         touching = shared[place] > 1
         if not touching.any():
             break
-        # An edge of a closed surface is listed once in either direction.
+        # A closed surface lists each edge once in either direction.
         sums = np.column_stack([np.bincount(one, vertices[other, k], len(vertices)) for k in range(3)])
         middle = sums[touching] / counts[touching, None]
         vertices[touching] += _APART * (middle - vertices[touching])
@@ -200,7 +207,7 @@ def _untouched(surface: trimesh.Trimesh) -> trimesh.Trimesh:
 
 
 def _outer_shells(surface: trimesh.Trimesh, least: float) -> trimesh.Trimesh:
-    """The closed parts of at least a share of the largest one's volume, without crumbs beside and cavities inside."""
+    """Return the closed parts with at least a share of the largest volume, without small parts and inner cavities."""
     parts = surface.split(only_watertight=True)
     largest = max((float(part.volume) for part in parts), default=0.0)
     kept = [part for part in parts if part.volume >= least * largest > 0]
@@ -211,14 +218,14 @@ def _outer_shells(surface: trimesh.Trimesh, least: float) -> trimesh.Trimesh:
 
 @dataclass(eq=False)
 class _State:
-    """Values of every cell.
+    """Values of all cells.
 
     Attributes:
-        hull: The smallest distances to silhouettes found so far [m], ascending; empty without masks.
+        hull: Smallest distances to silhouettes so far [m], ascending; empty without masks.
         total: Sum of the truncated distances behind the seen surface [m].
         squares: Sum of their squares [m^2].
-        count: Number of views in these.
-        towards: Number of views that see a surface in the cell's direction.
+        count: Number of views in these sums.
+        towards: Number of views that see a surface in the direction of the cell.
     """
 
     hull: list[Any]
@@ -236,7 +243,7 @@ class _Grid:
         low: Corner of the grid [m], shape (3,).
         cell: Edge of a cell [m].
         shape: Number of cells along x, y, z.
-        truncation: Largest distance that is told apart [m].
+        truncation: Largest absolute distance [m].
     """
 
     low: Float64Array
@@ -258,7 +265,7 @@ class _Grid:
         return cls(low, cell, (int(shape[0]), int(shape[1]), int(shape[2])), settings.truncation * cell)
 
     def heights(self) -> Float32Array:
-        """Height z of the middles of the layers of cells, shape (cells along z,)."""
+        """Return the heights z of the cell centres by layer, shape (cells along z,)."""
         return np.asarray(self.low[2] + self.cell * (np.arange(self.shape[2]) + 0.5), dtype=np.float32)
 
     def start(self, silhouettes: int) -> _State:
@@ -267,7 +274,7 @@ class _Grid:
         return _State([dr.full(mi.Float, _FAR, self.count) for _ in range(silhouettes)], *[nothing] * 4)
 
     def carve(self, state: _State, camera: Camera, mask: Float32Array) -> None:
-        """Add what the mask of one view says."""
+        """Add the silhouette distances of one mask."""
         pixel, z, ahead = self._seen_from(camera)
         silhouette = _bilinear(_signed_distance(mask), camera, pixel, ahead)[0]
         away = dr.select(ahead, silhouette * z / view_of(make_sensor(camera))._opaque["fx"], _FAR)
@@ -276,13 +283,13 @@ class _Grid:
         dr.eval(state.hull)
 
     def fuse(self, state: _State, splats: Splats, camera: Camera) -> None:
-        """Add what one view of the splats says."""
+        """Add the depth of the splats in one view."""
         layers = render_splats(splats, camera, quality="fast")
         depth = np.where(layers.alpha > _OPAQUE, layers.depth, 0.0).astype(np.float32)
         pixel, z, ahead = self._seen_from(camera)
         span = dr.opaque(mi.Float, self.truncation)
         seen, low, high = _bilinear(depth, camera, pixel, ahead)
-        # Between a surface and what lies behind its edge nothing is interpolated.
+        # Depth is not interpolated across a depth edge.
         behind = z - seen
         valid = ahead & (low > 0) & (high - low < span) & (behind < _BEHIND * span)
         behind = dr.select(valid, dr.clip(behind, -span, span), 0)
@@ -293,7 +300,7 @@ class _Grid:
         dr.eval(state.total, state.squares, state.count, state.towards)
 
     def _seen_from(self, camera: Camera) -> tuple[Any, Any, Any]:
-        """Where the middles of all cells are in a picture [px], how deep [m], and whether they are in it."""
+        """Return image positions of all cell centres [px], their depths [m], and True for those inside the picture."""
         view = view_of(make_sensor(camera))
         x, y, z = self._in_camera(camera)
         ahead = z > view.near_plane
@@ -306,10 +313,13 @@ class _Grid:
         return pixel, z, ahead & (pixel.x >= 0) & (pixel.y >= 0) & (pixel.x < width) & (pixel.y < height)
 
     def combine(self, state: _State, blur: float) -> tuple[Float32Array, BoolArray]:
-        """Distance to the surface of every cell [m], positive inside, and whether it is known, of shape ``shape``."""
+        """Return the distance of every cell to the surface [m], positive inside, and True for known cells.
+
+        Both have the shape ``shape``.
+        """
         count = np.array(state.count)
         mean, squares = (np.array(sums) / np.maximum(count, 1) for sums in (state.total, state.squares))
-        # What nobody looked at is inside the object as far as the hull reaches.
+        # Unseen cells inside the hull count as inside the object.
         known = count > (_SEEN_BY * np.array(state.towards) if state.hull else 0)
         distance = np.where(known, mean, self.truncation)
         if state.hull:
@@ -317,17 +327,19 @@ class _Grid:
             distance = np.minimum(distance, np.clip(np.array(state.hull[-1]), -self.truncation, self.truncation))
             known = np.ones_like(known)
             distance = _sealed(distance.reshape(self.shape), self.truncation)
-        # Marching cubes looks at all eight corners, and the blur at neighbours.
+        # Marching cubes uses all eight corners, and the blur uses neighbours.
         known = binary_erosion(known.reshape(self.shape), np.ones((3, 3, 3)), border_value=1)
         shaped = distance.reshape(self.shape).astype(np.float32)
         smooth = gaussian_filter(shaped, blur, mode="nearest") if blur > 0 else shaped
         return smooth, known
 
     def lost(self, splats: Splats, distance: Float32Array, state: _State) -> BoolArray:
-        """Cells that Gaussians fill in all silhouettes, but which no surface encloses, and their neighbours.
+        """Return True for cells that Gaussians fill inside all silhouettes but outside any surface.
 
-        A Gaussian of opacity a and standard deviations s, t stops light on an area of 2 pi a s t; it is spread over
-        cells by random points.
+        Neighbours of these cells are included.
+
+            A Gaussian of opacity a and standard deviations s, t blocks light on an area of 2 pi a s t. Random points
+            distribute this area over cells.
         """
         ordered = np.sort(splats.scales.astype(np.float64), axis=1)
         area = 2 * np.pi * splats.opacities * ordered[:, 1] * ordered[:, 2] / self.cell**2
@@ -345,7 +357,7 @@ class _Grid:
         return np.asarray(binary_dilation(lost))
 
     def _in_camera(self, camera: Camera) -> tuple[Any, Any, Any]:
-        """Camera coordinates of the middles of all cells [m]."""
+        """Return the camera coordinates of all cell centres [m]."""
         index = dr.arange(mi.UInt32, self.count)
         nz, nyz = self.shape[2], self.shape[1] * self.shape[2]
         i, rest = index // nyz, index % nyz
@@ -364,11 +376,11 @@ class _Grid:
 
 
 def _sealed(distance: Float32Array, inside: float) -> Float32Array:
-    """Distances with ``inside`` in voids that only narrow passages connect with the outside.
+    """Set distances to ``inside`` in voids that only narrow passages connect with the outside.
 
-    Views that look between Gaussians dig such passages, and voids behind them. Voids are what a closing (Serra 1982) of
-    the solid cuts off, which no ball of that size reaches from the outside; edges of hollows, which none reaches
-    either, are thinner than voids and stay.
+    Views that look between Gaussians carve such passages and voids. A void is a part cut off by a closing (Serra 1982)
+    of the solid, which no ball of that radius reaches from the outside. Edges of concavities are also out of reach, but
+    they are thinner than voids and stay.
     """
     empty = np.pad(distance <= 0, 1 + math.ceil(_PASSAGE), constant_values=True)
     if empty.all():
@@ -385,19 +397,19 @@ def _sealed(distance: Float32Array, inside: float) -> Float32Array:
 
 
 def _signed_distance(mask: Float32Array) -> Float32Array:
-    """Distance of every pixel's centre to the outline [px], positive inside the mask."""
+    """Return the distance of every pixel centre to the outline [px], positive inside the mask."""
     inside = (mask >= 0.5).astype(np.uint8)
     if not inside.any():
         return np.full(mask.shape, -_FAR, dtype=np.float32)
     if inside.all():
         return np.full(mask.shape, _FAR, dtype=np.float32)
     within, without = (cv2.distanceTransform(part, cv2.DIST_L2, cv2.DIST_MASK_PRECISE) for part in (inside, 1 - inside))
-    # The transform measures to the centres of the pixels on the other side, half a pixel beyond the outline.
+    # The transform measures to pixel centres on the other side, which lie half a pixel beyond the outline.
     return np.where(inside > 0, within - 0.5, 0.5 - without).astype(np.float32)
 
 
 def _bilinear(image: Float32Array, camera: Camera, pixel: Any, active: Any) -> tuple[Any, Any, Any]:
-    """Interpolated value at pixel positions, and the least and largest of the four that it comes from."""
+    """Return the interpolated values at pixel positions, and the minimum and maximum of the four source pixels."""
     flat = mi.Float(np.ravel(image))
     width = dr.opaque(mi.UInt32, camera.width)
     last_x, last_y = dr.opaque(mi.Float, camera.width - 1), dr.opaque(mi.Float, camera.height - 1)

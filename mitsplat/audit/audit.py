@@ -1,12 +1,12 @@
-"""Re-check a dataset from its files alone.
+"""Audit of a dataset from its files alone.
 
-The manifest's masks are the truth that every other file must agree with, and they must agree with the layouts, the
-scene and each other: exclusive, inside their silhouettes, of the stated boxes, areas and shares, above the thresholds.
-Then every file of every format is read back the way its users do, by pycocotools, pycolmap, OpenCV and the logic of the
-BOP toolkit, and compared with what is worked out anew from masks, cameras and poses (:mod:`mitsplat.audit.truth`):
-nothing that wrote the dataset takes part.
+The masks in the manifest are the reference for all other files. First they are checked against the layouts, the scene
+and each other: they must be exclusive, lie inside their silhouettes, have the stated boxes, areas and fractions, and
+exceed the thresholds. Then every file of every format is read as its users read it, by pycocotools, pycolmap, OpenCV
+and the logic of the BOP toolkit. Its content is compared with values recomputed from masks, cameras and poses
+(:mod:`mitsplat.audit.truth`). The code that wrote the dataset is not used.
 
-The manifest and the files that describe all frames are read in step, a frame at a time.
+The manifest and the files that describe all frames are read in parallel, one frame at a time.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from mitsplat.storage.content_hash import file_hash
 from mitsplat.storage.files import SPLITS, Record, splits_of
 
 _SHARE = 1e-5
-"""Difference of shares that are stored with six decimals."""
+"""Tolerance of fractions that are stored with six decimals."""
 
 
 _CHECKS = {**CHECKS, "label-studio/": check_task}
@@ -48,15 +48,15 @@ __all__ = ["POLYGON_AREA", "POLYGON_IOU", "Audit", "audit_dataset"]
 
 @dataclass(frozen=True)
 class Audit:
-    """What an audit found.
+    """Result of an audit.
 
     Attributes:
-        frames, instances, files: How many were checked.
-        violations: File and sentence of each.
-        low_polygons: Masks of more than :data:`POLYGON_AREA` pixels whose polygon is below :data:`POLYGON_IOU` because
-            bridges join their parts.
-        marked: Instances below a threshold, by mark.
-        dropped: What was not labelled, by reason.
+        frames, instances, files: Numbers of checked frames, instances and files.
+        violations: File and description of each violation.
+        low_polygons: Number of masks of more than :data:`POLYGON_AREA` pixels whose polygon has an IoU below
+            :data:`POLYGON_IOU` because bridges join their parts.
+        marked: Number of instances below a threshold, by mark.
+        dropped: Number of unlabelled instances, by reason.
     """
 
     frames: int
@@ -72,8 +72,8 @@ def audit_dataset(root: str | Path, hear: Callable[[Record], object] = lambda re
     """Check every file of a dataset.
 
     Args:
-        root: The dataset.
-        hear: Is told every record that can be read, by ascending index.
+        root: Dataset folder.
+        hear: Callback that is called with every readable record, by ascending index.
 
     Raises:
         InputError: If the folder is no dataset of mitsplat.
@@ -118,10 +118,10 @@ def audit_dataset(root: str | Path, hear: Callable[[Record], object] = lambda re
 
 
 def _refuse_special(root: Path) -> None:
-    """Refuse what is neither a file nor a folder: who reads a pipe could wait without end.
+    """Refuse special files, such as pipes, because reading them could block forever.
 
     Raises:
-        InputError: With the first of them.
+        InputError: With the first one.
     """
     for folder, _, _ in os.walk(root):
         with os.scandir(folder) as entries:
@@ -131,7 +131,7 @@ def _refuse_special(root: Path) -> None:
 
 
 def _readers(root: Path, content: Mapping[str, Any]) -> list[Reader]:
-    """What reads the files that describe all frames, and what compares frames with each other and the scene."""
+    """Create the readers of files that describe all frames, and the checks across frames and against the scene."""
     splits = splits_of(content["scene"]["output"])
     make: dict[str, Callable[[], list[Reader]]] = {
         "coco": lambda: [InstancesReader(root, content, "instances", split) for split in splits],
@@ -161,7 +161,7 @@ def _check_files(root: Path, record: Record) -> Violations:
 
 
 def _check_rest(root: Path) -> Violations:
-    """What belongs to no format."""
+    """Check the files that belong to no format."""
     sheet = root / "contact_sheet.jpg"
     if not sheet.is_file() or read_picture(sheet) is None:
         yield sheet.name, "is missing or cannot be read as an image"
@@ -170,7 +170,7 @@ def _check_rest(root: Path) -> Violations:
 
 
 def _check_labels(frame: TrueFrame) -> Iterator[str]:
-    """Whether the labels can be right at all."""
+    """Check that the labels of a frame are consistent."""
     classes, rules = frame.content["classes"], frame.content["scene"]["labels"]
     for number, count in Counter(label.id for label in frame.instances).items():
         if count > 1:
@@ -217,14 +217,14 @@ def _check_labels(frame: TrueFrame) -> Iterator[str]:
 
 
 class CrossFrameCheck:
-    """What no single frame shows: repeated frames and pictures, views of a layout in two splits; 16 bytes a frame."""
+    """Checks across frames: repeated frames or pictures, and layouts in two splits; 16 bytes per frame."""
 
     def __init__(self) -> None:
         self._last = -1
         self._splits, self._pictures = array("Q"), array("Q")
 
     def add(self, record: Record) -> list[tuple[str, str]]:
-        """Remember a frame; what is wrong if it has a line already."""
+        """Add a frame; return a violation if the frame has a line already."""
         self._splits.append(len(SPLITS) * record["layout"] + SPLITS.index(record["split"]))
         self._pictures.append(_picture(record) or 0)
         repeated = record["index"] == self._last
@@ -232,7 +232,7 @@ class CrossFrameCheck:
         return [("manifest.jsonl", f"frame {record['index']} has several lines")] if repeated else []
 
     def check(self, records: Records) -> Violations:
-        """What follows from all frames."""
+        """Yield the violations after all frames were added."""
         places = np.unique(np.array(self._splits, dtype=np.uint64)).astype(np.int64)
         layouts = places // len(SPLITS)
         for layout in np.unique(layouts[1:][layouts[1:] == layouts[:-1]]):
@@ -249,9 +249,10 @@ class CrossFrameCheck:
 
 
 def _picture(record: Record) -> int:
-    """First 64 bits of the picture's SHA-256; 0 if it is none, or if the frame is empty.
+    """Return the first 64 bits of the picture's SHA-256.
 
-    Empty layouts under a fixed camera have equal pictures, and rightly so.
+    The value is 0 if the stored text is no SHA-256, or if the frame is empty. Empty layouts under a fixed camera have equal
+    pictures, which is no fault.
     """
     if not record["labels"]["instances"]:
         return 0
@@ -267,7 +268,7 @@ def _is_rigid(pose: Float64Array) -> bool:
     return bool(
         pose.shape == (4, 4)
         and np.isfinite(pose).all()
-        and np.abs(rotation).max() < 2  # products of larger ones may overflow
+        and np.abs(rotation).max() < 2  # products of larger values may overflow
         and np.abs(rotation @ rotation.T - np.eye(3)).max() < 1e-5
         and np.linalg.det(rotation) > 0
         and (pose[3] == (0, 0, 0, 1)).all()

@@ -1,7 +1,7 @@
-"""BOP scenes and models read back as the BOP toolkit reads them, and tried on the masks: poses must project onto them.
+"""Audit of BOP scenes and models, which are read as by the BOP toolkit; projected models must match the masks.
 
 After the toolkit's ``inout.load_scene_camera``, ``load_scene_gt`` and ``scripts/calc_gt_info.py``: matrices by rows,
-lengths in millimetres, boxes (x, y, x_max - x_min, y_max - y_min), pixel centres at whole numbers.
+lengths in millimetres, boxes (x, y, x_max - x_min, y_max - y_min), pixel centres at integers.
 """
 
 from __future__ import annotations
@@ -28,18 +28,18 @@ from mitsplat.storage.json_stream import read_entries
 
 _PARTS = ("camera", "gt", "gt_info")
 _MODEL_ROUNDED = 0.01
-"""Difference that the decimals of a model's file make [mm]."""
+"""Tolerance for the limited decimals of a model file [mm]."""
 _FIT = 0.5
-"""Least IoU, by the median over its instances, of the boxes of a model in its poses and of its silhouettes."""
+"""Minimum of the median IoU, over all instances of a model, between its projected box and that of the silhouette."""
 _BINS = 20
 _FEW = 3
-"""Instances of which nothing is concluded."""
+"""Minimum number of instances for the check of a model."""
 _LEAST_AREA = 64
-"""Silhouettes of fewer pixels are not tried [px]."""
+"""Minimum area of silhouettes for the check of a model [px]."""
 
 
 class BopReader:
-    """``scene_camera.json``, ``scene_gt.json`` and ``scene_gt_info.json`` of all scenes, and the models."""
+    """Reader of ``scene_camera.json``, ``scene_gt.json``, ``scene_gt_info.json`` and the models of all scenes."""
 
     def __init__(self, root: Path, content: Mapping[str, Any]) -> None:
         self._root, self._content = root, content
@@ -50,7 +50,7 @@ class BopReader:
         self._models = list(self._check_models())
 
     def check(self, frame: TrueFrame) -> Violations:
-        """Compare with the frame's masks, depth picture, camera and poses."""
+        """Compare the entries of a frame with its masks, depth picture, camera and poses."""
         if frame.bop_folder != self._folder:
             yield from self._finish_scene()
             self._folder = frame.bop_folder
@@ -88,7 +88,7 @@ class BopReader:
             yield self._cursors[part].file, f"frame {frame.index}{text}"
 
     def _try_on(self, frame: TrueFrame, label: TrueInstance, camera: Any, pose: Any) -> None:
-        """Count how well the model's box in the image, by the files alone, fits that of the silhouette."""
+        """Project the model by the camera and pose in the files, and count the IoU with the silhouette's box."""
         number = label.entry["asset"] + 1
         corners = self._corners.get(number)
         stated = _numbers(camera, cam_K=9), _numbers(pose, cam_R_m2c=9), _numbers(pose, cam_t_m2c=3)
@@ -97,7 +97,7 @@ class BopReader:
         matrix, rotation, shift = (np.zeros(9) if values is None else values for values in stated)
         seen = (corners @ rotation.reshape(3, 3).T + shift) @ matrix.reshape(3, 3).T
         if seen[:, 2].max() > 0 >= seen[:, 2].min():
-            return  # it reaches behind the camera, where its box has no bounds
+            return  # the model reaches behind the camera, so its box is unbounded
         with np.errstate(all="ignore"):
             pixels = seen[:, :2] / seen[:, 2:]
         box = np.concatenate([pixels.min(axis=0), pixels.max(axis=0) + 1])
@@ -110,7 +110,7 @@ class BopReader:
                 yield from cursor.finish()
 
     def finish(self) -> Violations:
-        """What is left, and whether the models fit the masks."""
+        """Check the remaining entries and the models, and that the models match the masks."""
         yield from self._finish_scene()
         yield from self._models
         for number, counts in sorted(self._fits.items()):
@@ -123,7 +123,7 @@ class BopReader:
                 )
 
     def _check_models(self) -> Violations:
-        """Whether the models are there and measure what is said of them."""
+        """Check that the model files exist and have the stated measures."""
         file = "bop/models/models_info.json"
         try:
             info = read_json(self._root / file)

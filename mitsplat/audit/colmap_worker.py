@@ -1,8 +1,8 @@
-"""A COLMAP text model read by pycolmap in its own process: ``python -m mitsplat.audit.colmap_worker MODEL POINTS``.
+"""Process that reads a COLMAP text model with pycolmap: ``python -m mitsplat.audit.colmap_worker MODEL POINTS``.
 
-Prints a line of JSON for each image, by ascending id: what pycolmap understands it to be, and where its camera sees
-POINTS, a JSON list of points in its frame. Images are given to pycolmap
-:data:`PIECE` at a time, so that a million of them take no more memory than these.
+It prints one line of JSON for each image, by ascending id: the image's properties as read by pycolmap, and the pixels
+at which its camera sees POINTS, a JSON list of points in its frame. pycolmap gets :data:`PIECE` images at a time, so
+that memory use does not grow with the number of images.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ PIECE = 10_000
 
 
 def main(model: Path, points: list[list[float]]) -> None:
-    """Print what the images are."""
+    """Print the properties of all images."""
     with (model / "images.txt").open() as file, tempfile.TemporaryDirectory() as folder:
         for name in ("cameras.txt", "points3D.txt"):
             shutil.copyfile(model / name, Path(folder) / name)
@@ -37,7 +37,7 @@ def main(model: Path, points: list[list[float]]) -> None:
 
 
 def describe(folder: Path, points: list[list[float]]) -> Iterator[str]:
-    """The images of a piece of a model."""
+    """Yield the images of a piece of a model as JSON."""
     piece = pycolmap.Reconstruction(folder)
     for number in sorted(piece.images):
         image = piece.images[number]

@@ -1,4 +1,4 @@
-"""Where a scene's conveyor has carried what lies on it, worked out anew from what ``dataset.json`` says."""
+"""Motion of a scene's conveyor, recomputed from ``dataset.json``."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from mitsplat.arrays import Float64Array
 from mitsplat.audit.truth import TrueFrame, seats_of
 
 _BELOW = 1e-3
-"""How far below a belt's upper side the origin of an object may be that it carries [m]."""
+"""Maximum depth of a carried object's origin below the top of the belt [m]."""
 
 
 class BeltTruth:
-    """A belt that runs along its box's own x axis; without one, nothing moves.
+    """Reference motion of a belt along its box's own x axis; nothing moves in a scene without a belt.
 
     Args:
-        content: What ``dataset.json`` says.
+        content: Content of ``dataset.json``.
     """
 
     def __init__(self, content: Mapping[str, Any]) -> None:
@@ -34,18 +34,18 @@ class BeltTruth:
         self._last = math.ceil(scene["output"]["views"] / self._seats) - 1
 
     def carries(self, pose: Float64Array) -> bool:
-        """Whether an object at a pose (4, 4) is carried, as it is if its origin is above the belt."""
+        """Return True if the belt carries an object at a pose (4, 4), because the object's origin is above the belt."""
         if self._conveyor is None:
             return False
         place, half = self._turn.inv().apply(pose[:3, 3] - self._box["position"]), np.array(self._box["size"]) / 2
         return bool((abs(place[:2]) <= half[:2]).all() and place[2] > half[2] - _BELOW)
 
     def way(self, pose: Float64Array, frame: TrueFrame) -> Float64Array:
-        """How far an object that settled at a pose (4, 4) has been carried when a frame is taken [m], shape (3,)."""
+        """Return the displacement at the time of a frame of an object that settled at a pose (4, 4) [m], shape (3,)."""
         return self._run(frame) if self.carries(pose) else np.zeros(3)
 
     def between(self, frame: TrueFrame, following: TrueFrame) -> Float64Array:
-        """How far the belt runs from one frame to another of the same layout [m], shape (3,)."""
+        """Return the displacement of the belt between two frames of the same layout [m], shape (3,)."""
         return np.zeros(3) if self._conveyor is None else self._run(following) - self._run(frame)
 
     def _run(self, frame: TrueFrame) -> Float64Array:

@@ -1,7 +1,8 @@
-"""COCO's annotations, panoptic segments and poses read back frame by frame, beside the frames' own files.
+"""Audit of COCO annotations, panoptic segments and poses, frame by frame with the frames' own files.
 
-Every reader goes through its file once, in step with the manifest: an image at a time, whatever the number of images.
-Masks are decoded by pycocotools; files of up to :data:`WHOLE` bytes are opened by its ``COCO`` as well.
+Every reader reads its file once, in parallel with the manifest and one image at a time, so memory use does not grow
+with the number of images. Masks are decoded by pycocotools. Files of up to :data:`WHOLE` bytes are also opened by its
+``COCO`` class.
 """
 
 from __future__ import annotations
@@ -23,29 +24,29 @@ from mitsplat.images.masks import decode_rle
 from mitsplat.storage.json_stream import read_lists
 
 WHOLE = 32 << 20
-"""Size up to which a file is also opened by pycocotools, which holds all of it, ten times as large [bytes]."""
+"""Maximum size of a file that is also opened by pycocotools, which needs ten times as much memory [bytes]."""
 
 _SHARE = 1e-5
-"""Difference of shares that are stored with six decimals."""
+"""Tolerance of fractions that are stored with six decimals."""
 _EXACT = 1e-9
-"""Relative difference of poses and intrinsics, which are stored in full."""
+"""Relative tolerance of poses and intrinsics, which are stored with full precision."""
 
 
 class Reader(Protocol):
-    """Reads files that describe all frames, in step with them."""
+    """Reader of files that describe all frames, in parallel with the frames."""
 
     def check(self, frame: TrueFrame) -> Violations:
-        """What is wrong with what they say of the next frame."""
+        """Yield the violations in the entries of the next frame."""
 
     def finish(self) -> Violations:
-        """What is wrong with the rest of them, when all frames were checked."""
+        """Yield the violations in the remaining entries, after all frames were checked."""
 
 
 class Cursor:
-    """The next of the entries of a file, by frame index; what cannot be read is a violation, once.
+    """Position in the entries of a file, by frame index; a read error is reported once as a violation.
 
     Args:
-        file: The file, relative to the dataset.
+        file: File, relative to the dataset.
         entries: Frame index and entry of each, by ascending index.
     """
 
@@ -72,7 +73,7 @@ class Cursor:
             self._next = None
 
     def take(self, index: int) -> Iterator[Any]:
-        """The frame's entries; those of frames that were passed over are violations, see :meth:`errors`."""
+        """Yield the entries of a frame; skipped entries of other frames become violations, see :meth:`errors`."""
         while self._next is not None and self._next[0] <= index:
             found, entry = self._next
             self._advance()
@@ -82,14 +83,14 @@ class Cursor:
                 self._error = self._error or f"has an entry of frame {found}, which is not in the manifest at its place"
 
     def errors(self) -> Violations:
-        """What could not be read so far; entries can be missed from then on."""
+        """Yield the errors so far; after an error, further entries may be missed."""
         if self._error:
             self.broken = True
             yield self.file, self._error
             self._error = ""
 
     def finish(self) -> Violations:
-        """What is left."""
+        """Yield the remaining errors, and a violation if entries are left."""
         yield from self.errors()
         if self._next is not None and not self.broken:
             yield self.file, f"has an entry of frame {self._next[0]}, which is not in the manifest at its place"
@@ -102,12 +103,12 @@ class Cursor:
 
 
 class AnnotationFile:
-    """A file of ``images``, entries by image, and categories or classes.
+    """Annotation file with ``images``, entries by image, and categories or classes.
 
     Args:
-        root: The dataset.
-        file: Relative to it.
-        entries: Name of the list of what is said of the images, and key of the frame's index in it.
+        root: Dataset folder.
+        file: File, relative to the dataset.
+        entries: Name of the list of entries, and key of the frame index in each entry.
     """
 
     def __init__(self, root: Path, file: str, entries: tuple[str, str]) -> None:
@@ -118,7 +119,7 @@ class AnnotationFile:
         self.entries = Cursor(file, self._read(*entries, keep=True))
 
     def _read(self, name: str, index: str, *, keep: bool) -> Iterator[tuple[int, Any]]:
-        """Elements of a list by frame index; with ``keep`` the other lists, which are short, are kept."""
+        """Yield the elements of a list by frame index; with ``keep``, also store the other lists, which are short."""
         for key, value in read_lists(self._path):
             if key == name:
                 self.counts[name] += 1
@@ -126,21 +127,21 @@ class AnnotationFile:
             elif keep and key not in self.counts and len(self.rest.setdefault(key, [])) <= 65535:
                 self.rest[key].append(value)
             elif not keep and self.counts[name]:
-                return  # the second reader goes through the rest
+                return  # the other cursor reads the rest
 
     @property
     def broken(self) -> bool:
-        """Whether it cannot be read further."""
+        """True if the file cannot be read further."""
         return self.images.broken or self.entries.broken
 
     def finish(self) -> Violations:
-        """What is left."""
+        """Yield the violations in the remaining entries."""
         for cursor in (self.images, self.entries):
             if not self.broken:
                 yield from cursor.finish()
 
     def entries_of(self, frame: TrueFrame) -> Generator[tuple[str, str], None, list[Any]]:
-        """What is said of a frame, whose image is checked on the way; nothing once the file is broken."""
+        """Check the image of a frame and return the frame's entries; the list is empty after a read error."""
         yield from self.check_image(frame)
         if self.broken:
             return []
@@ -149,7 +150,7 @@ class AnnotationFile:
         return found
 
     def check_image(self, frame: TrueFrame) -> Violations:
-        """What is wrong with the frame's image."""
+        """Yield the violations in the frame's image entry."""
         if self.broken:
             return
         images = list(self.images.take(frame.index))
@@ -165,7 +166,7 @@ class AnnotationFile:
 
 
 class InstancesReader:
-    """``instances_<split>.json``, or ``amodal_<split>.json``."""
+    """Reader of ``instances_<split>.json`` or ``amodal_<split>.json``."""
 
     def __init__(self, root: Path, content: Mapping[str, Any], name: str, split: str) -> None:
         self._split, self._content, self._amodal = split, content, name == "amodal"
@@ -173,7 +174,7 @@ class InstancesReader:
         self._path, self._last = root / self._of.file, 0
 
     def check(self, frame: TrueFrame) -> Violations:
-        """Compare with the masks."""
+        """Compare the annotations of a frame with its masks."""
         if frame.split != self._split:
             return
         found = yield from self._of.entries_of(frame)
@@ -218,7 +219,7 @@ class InstancesReader:
                 yield f"{key} is {entry.get(key)}, not {share:.6f}"
 
     def finish(self) -> Violations:
-        """What is left, and the categories."""
+        """Check the remaining entries and the categories, and read the file with pycocotools."""
         yield from self._of.finish()
         if self._of.broken:
             return
@@ -241,14 +242,14 @@ class InstancesReader:
 
 
 class PanopticReader:
-    """``panoptic_<split>.json``, compared with the pictures of segments."""
+    """Reader of ``panoptic_<split>.json``, which is compared with the segment pictures."""
 
     def __init__(self, root: Path, content: Mapping[str, Any], split: str) -> None:
         self._split, self._content = split, content
         self._of = AnnotationFile(root, f"annotations/panoptic_{split}.json", ("annotations", "image_id"))
 
     def check(self, frame: TrueFrame) -> Violations:
-        """Compare with the frame's picture of segments."""
+        """Compare the segments of a frame with its segment picture."""
         if frame.split != self._split:
             return
         found = yield from self._of.entries_of(frame)
@@ -267,7 +268,7 @@ class PanopticReader:
         picture = frame.root / f"panoptic/{frame.split}/{name}"
         ids = segment_picture(frame, picture) if picture.is_file() else None
         if ids is None:
-            return  # which is a violation of its own
+            return  # reported by the check of that file
         kinds = {label.id: label.kind + 1 for label in frame.instances}
         stuff = len(self._content["classes"]) + 1
         stated = entry.get("segments_info")
@@ -291,7 +292,7 @@ class PanopticReader:
                 yield f"segment {number}: {wrong}"
 
     def finish(self) -> Violations:
-        """What is left, and the categories."""
+        """Check the remaining entries and the categories."""
         yield from self._of.finish()
         if not self._of.broken:
             names = [*self._content["classes"], "environment"]
@@ -304,7 +305,7 @@ class PanopticReader:
 
 
 class PosesReader:
-    """``poses_<split>.json``: cameras, and objects in the camera's frame and the world's."""
+    """Reader of ``poses_<split>.json``: cameras, and object poses in the camera and world frames."""
 
     def __init__(self, root: Path, content: Mapping[str, Any], split: str) -> None:
         self._split, self._content = split, content
@@ -320,7 +321,7 @@ class PosesReader:
                 self._classes.append(value)
 
     def check(self, frame: TrueFrame) -> Violations:
-        """Compare with the frame's camera, inverted anew, and poses."""
+        """Compare an entry with the frame's poses and its camera, whose pose is inverted independently."""
         if frame.split != self._split or self._frames.broken:
             return
         found = list(self._frames.take(frame.index))
@@ -357,7 +358,7 @@ class PosesReader:
                     yield f", {label.name}: {key} is not that of the manifest's poses"
 
     def finish(self) -> Violations:
-        """What is left, and the classes."""
+        """Check the remaining entries and the classes."""
         if not self._frames.broken:
             yield from self._frames.finish()
         if not self._frames.broken and self._classes != self._content["classes"]:
@@ -395,13 +396,13 @@ def _check_categories(of: AnnotationFile, expected: list[dict[str, Any]]) -> Vio
 
 
 def coco_box(box: Box) -> list[int]:
-    """COCO's x, y, width and height."""
+    """Convert bounds to COCO's x, y, width and height."""
     x0, y0, x1, y1 = box
     return [x0, y0, x1 - x0, y1 - y0]
 
 
 def is_close(found: Any, expected: npt.ArrayLike, tolerance: float = _EXACT) -> bool:
-    """Whether numbers read from a file, in lists or not, are those expected, but for rounding."""
+    """Return True if a number or list read from a file equals the expected values within a relative tolerance."""
     truth = np.asarray(expected, dtype=np.float64)
     try:
         values = np.array(found, dtype=np.float64)
@@ -412,12 +413,12 @@ def is_close(found: Any, expected: npt.ArrayLike, tolerance: float = _EXACT) -> 
 
 
 def are_objects(found: Any) -> bool:
-    """Whether something read from a file is a list of objects."""
+    """Return True if a value read from a file is a list of objects."""
     return isinstance(found, list) and all(isinstance(entry, dict) for entry in found)
 
 
 def differing(found: Any, expected: Mapping[str, Any]) -> str:
-    """The first key with another value than expected, and both; "" if there is none."""
+    """Describe the first key with an unexpected value; return an empty string if there is none."""
     if not isinstance(found, dict):
         return f"must be an object (got {str(found)[:40]})"
     for key, value in expected.items():

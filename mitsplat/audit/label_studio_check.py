@@ -1,4 +1,4 @@
-"""Label Studio's tasks read back as it reads them: brush strokes in the run-length code of ``@thi.ng/rle-pack``."""
+"""Audit of Label Studio tasks, with brush strokes in the run-length code of ``@thi.ng/rle-pack``."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from mitsplat.storage.files import read_json
 
 
 def check_task(frame: TrueFrame, path: Path) -> Iterator[str]:
-    """What is wrong with a frame's task."""
+    """Yield the violations in a frame's task."""
     try:
         task = read_json(path)
         image, regions = task["data"]["image"], task["annotations"][0]["result"]
@@ -40,10 +40,10 @@ def check_task(frame: TrueFrame, path: Path) -> Iterator[str]:
 
 
 def decode_brush(code: list[int], size: tuple[int, int]) -> BoolArray:
-    """The pixels (H, W) that a stroke sets in an image of this width and height.
+    """Return the pixels (H, W) that a stroke sets in an image of this width and height.
 
     Raises:
-        ValueError: If it is no stroke of this size.
+        ValueError: If the list is no stroke of this size.
     """
     bits = "".join(f"{byte:08b}" for byte in code)
     at = 0
@@ -71,17 +71,17 @@ def decode_brush(code: list[int], size: tuple[int, int]) -> BoolArray:
 
 
 class ConfigReader:
-    """``config.xml``, by which Label Studio knows the classes."""
+    """Reader of ``config.xml``, which defines the classes for Label Studio."""
 
     def __init__(self, root: Path, content: Mapping[str, Any]) -> None:
         self._root, self._classes = root, content["classes"]
 
     def check(self, frame: TrueFrame) -> Violations:
-        """It says nothing of a frame."""
+        """Do nothing; the file contains no frames."""
         yield from ()
 
     def finish(self) -> Violations:
-        """Whether its labels are the dataset's classes."""
+        """Check that its labels are the dataset's classes."""
         file = "label-studio/config.xml"
         try:
             tree = ElementTree.parse(self._root / file)

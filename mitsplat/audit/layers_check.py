@@ -1,4 +1,4 @@
-"""Pictures of per-pixel values compared with each other, and with the masks, cameras and poses."""
+"""Audit of per-pixel maps against each other, and against masks, cameras and poses."""
 
 from __future__ import annotations
 
@@ -20,24 +20,24 @@ from mitsplat.images.exr_header import check_exr_header
 from mitsplat.images.picture_files import read_picture
 
 _FLOW_ROUNDED = 0.02
-"""Difference that single precision and lens models make in optical flow [px]."""
+"""Tolerance of optical flow for single precision and lens models [px]."""
 _KNOWN_FLOW = 1e9
-"""Components above this mean that there is no flow."""
+"""Magnitude of components above which a pixel has no flow."""
 _MOST_MEASURED = 0.25
-"""Middle error of measured depth, relative to the true one, which no sensor of use has."""
+"""Maximum median error of measured depth, relative to true depth; useful sensors are better."""
 _FEW = 6
-"""Instances of an asset of which nothing is concluded."""
+"""Minimum number of instances of an asset for a conclusion."""
 _MOST_TRUNCATED = 0.2
-"""Of silhouettes cut off by more, the middle is not the object's."""
+"""Maximum truncation of silhouettes whose centre is used; stronger truncation shifts the centre."""
 _OFF_PLACE, _OFF_DEPTH = 1.0, 0.2
-"""Distances of silhouettes from where poses put them, in half their size, and of depths, in depths, that are too large.
+"""Maximum offset of silhouettes from their poses, in half their size, and of depths, relative to depth.
 
-Of rendered scenes they were up to 0.09 and 0.04; with cameras inverted, silhouettes were off by 2 to 30.
+Values of rendered scenes were up to 0.09 and 0.04. With inverted cameras, silhouettes were off by 2 to 30.
 """
 
 
 class LayersReader:
-    """``depth/``, ``normals/``, ``flow/`` and ``layers/`` of one frame after the other."""
+    """Reader of ``depth/``, ``normals/``, ``flow/`` and ``layers/``, frame by frame."""
 
     def __init__(self, content: Mapping[str, Any]) -> None:
         self._content = content
@@ -45,7 +45,7 @@ class LayersReader:
         self._last: tuple[TrueFrame, Float64Array, float] | None = None
 
     def check(self, frame: TrueFrame) -> Violations:
-        """What is wrong between the frame's pictures, and with the flow from the frame before it to this one."""
+        """Check the frame's maps against each other, and the flow from the previous frame to this one."""
         channels = dict[str, npt.NDArray[Any]]()
         layers = f"layers/{frame.split}/{frame.index:06d}.exr"
         if "exr" in frame.formats and (frame.root / layers).is_file():
@@ -72,7 +72,7 @@ class LayersReader:
         self._last = None if depth is None else (frame, depth, step)
 
     def _check_flow(self, frame: TrueFrame) -> Violations:
-        """The flow of the frame before, by its depth and both cameras."""
+        """Compare the flow of the previous frame with that computed from its depth and both cameras."""
         assert self._last is not None  # noqa: S101
         before, depth, step = self._last
         file = f"flow/{before.split}/{before.index:06d}.flo"
@@ -94,7 +94,7 @@ class LayersReader:
         stated = (np.abs(found) < _KNOWN_FLOW).all(axis=1)
 
         def wrong_if_carried(by: Float64Array) -> BoolArray:
-            """Which of the pixels that have a depth do not move as points that something carries [m]."""
+            """Return a mask of the pixels with depth whose flow differs from that of points displaced by ``by`` [m]."""
             run = frame.camera_from_world[:3, :3] @ by
             ahead = np.zeros(len(found))
 
@@ -115,7 +115,7 @@ class LayersReader:
             return
         wrong = wrong_if_carried(np.zeros(3))
         if (run := self._belt.between(before, frame)).any():
-            # What is no labelled instance may be the belt or what stands still.
+            # Pixels without a labelled instance may show the belt or static parts, so both motions are accepted.
             carried = wrong_if_carried(run)
             runs, stays = (self._seen(before, carries).ravel()[known] for carries in (True, False))
             wrong = np.where(runs, carried, np.where(stays, wrong, wrong & carried))
@@ -123,7 +123,7 @@ class LayersReader:
             yield file, f"{count} pixels do not move as depth and cameras say"
 
     def _seen(self, frame: TrueFrame, carried: bool) -> BoolArray:
-        """Pixels of labelled instances that the belt carries, or of the others, (H, W)."""
+        """Return the pixels (H, W) of the labelled instances that the belt carries, or of the others."""
         width, height = frame.size
         seen = np.zeros((height, width), dtype=bool)
         for instance in frame.instances:
@@ -132,15 +132,18 @@ class LayersReader:
         return seen
 
     def finish(self) -> Violations:
-        """Nothing is left."""
+        """Do nothing; all checks are done per frame."""
         yield from ()
 
 
 class SightReader:
-    """Whether poses and cameras agree with what is seen, over the whole dataset: silhouettes lie where objects are.
+    """Check over the whole dataset that poses and cameras agree with the positions and depths of silhouettes.
 
-    Nothing tells where in its coordinates an asset is. But one point of it is in the middle of all its silhouettes, and
-    at the depth of its pixels, more or less: the point that fits best, and how well it does, follow from sums.
+    The position of an asset's geometry in its own coordinates is not stored. However, one point of the asset projects
+    to
+    the centre of all its silhouettes, at about the depth of its pixels. Sums over the dataset give the least-squares
+    point
+    and its residual.
     """
 
     def __init__(self) -> None:
@@ -169,7 +172,7 @@ class SightReader:
         yield from ()
 
     def finish(self) -> Violations:
-        """What follows from all frames."""
+        """Yield the violations after all frames were added."""
         for asset, fit in sorted(self._places.items()):
             if fit.count >= 2 * _FEW and fit.rms > _OFF_PLACE:
                 yield (
@@ -182,7 +185,7 @@ class SightReader:
 
 
 class _Fit:
-    """The point p that comes closest to ``rows @ p = values``, by sums."""
+    """Least-squares solution p of ``rows @ p = values``, from accumulated sums."""
 
     def __init__(self) -> None:
         self._square, self._product, self._total, self.count = np.zeros((3, 3)), np.zeros(3), 0.0, 0
@@ -196,7 +199,7 @@ class _Fit:
 
     @property
     def rms(self) -> float:
-        """What is left of an equation in the mean; infinite if sums overflow, as of poses that are none."""
+        """Root mean square of the residuals; infinite if the sums overflow, as for invalid poses."""
         if not (np.isfinite(self._square).all() and np.isfinite(self._product).all()):
             return np.inf
         point = np.linalg.lstsq(self._square, self._product, rcond=1e-12)[0]
@@ -204,14 +207,14 @@ class _Fit:
 
 
 def _depth_files(frame: TrueFrame) -> list[str]:
-    """The frame's depth pictures that are there."""
+    """Return the existing depth pictures of the frame."""
     name = f"{frame.index:06d}.png"
     files = [f"depth/{frame.split}/{name}", f"{frame.bop_folder}/depth/{name}"]
     return [file for file in files if file in frame.record["files"] and (frame.root / file).is_file()]
 
 
 def _check_sensed(frame: TrueFrame, depth: Float64Array | None) -> Violations:
-    """Whether measured depth is of the frame's size, and its middle error small where the true depth is known."""
+    """Check the size of measured depth, and its median error where the true depth is known."""
     file = f"depth-sensor/{frame.split}/{frame.index:06d}.png"
     if file not in frame.record["files"] or not (frame.root / file).is_file():
         return
@@ -233,7 +236,7 @@ def _read_16_bits(path: Path, shape: tuple[int, ...]) -> npt.NDArray[np.uint16] 
 
 
 def _read_exr(path: Path) -> tuple[dict[str, npt.NDArray[Any]], str]:
-    """Channels by name, and what prevents reading them."""
+    """Return channels by name, and the read error, which is empty if there is none."""
     try:
         check_exr_header(path)
         with OpenEXR.File(str(path), separate_channels=True) as file:
@@ -256,7 +259,7 @@ def _check_channels(frame: TrueFrame, channels: Mapping[str, npt.NDArray[Any]], 
 
 
 def _check_normals(frame: TrueFrame, file: str, channels: Mapping[str, npt.NDArray[Any]]) -> list[str]:
-    """Against the layers where there are any, which nothing else states exactly."""
+    """Compare the normal map with the exact normals in ``layers/``, if the dataset has them."""
     picture = _read_16_bits(frame.root / file, (*frame.size[::-1], 3)) if (frame.root / file).is_file() else None
     if picture is None:
         return ["cannot be read as a 16-bit colour image of the frame's size"]

@@ -1,4 +1,4 @@
-"""Text files that describe all frames, read back: VOC's lists, Ultralytics' ``data.yaml``, COLMAP's model, layouts."""
+"""Audit of text files that describe all frames: VOC lists, Ultralytics' ``data.yaml``, COLMAP models and layouts."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ from mitsplat.runtime.child_process import python_command, python_environment
 from mitsplat.storage.files import SPLITS, read_json, splits_of
 
 _POINTS = np.array([[0.0, 0.0, 1.0], [0.1, 0.0, 1.0], [0.0, 0.1, 1.0], [-0.15, 0.05, 0.8], [0.12, -0.2, 1.5]])
-"""Points before a camera, in its frame, whose pixels tell its model and parameters, shape (5, 3)."""
+"""Points in front of a camera, in its frame, whose pixels determine its model and parameters, shape (5, 3)."""
 _PIXEL = 1e-6
-"""Difference that OpenCV's and COLMAP's arithmetic makes [px]."""
+"""Tolerance between projections of OpenCV and COLMAP [px]."""
 
 
 class VocReader:
-    """Which images belong to which split, and ``labelmap.txt``."""
+    """Reader of VOC's image list of each split, and of ``labelmap.txt``."""
 
     def __init__(self, root: Path, content: Mapping[str, Any]) -> None:
         self._root, self._content = root, content
@@ -39,7 +39,7 @@ class VocReader:
         }
 
     def check(self, frame: TrueFrame) -> Violations:
-        """Whether the frame is in its split."""
+        """Check that the frame is in the list of its split."""
         cursor = self._sets[frame.split]
         if cursor.broken:
             return
@@ -49,7 +49,7 @@ class VocReader:
             yield cursor.file, f"names image {frame.index:06d} {len(found)} times"
 
     def finish(self) -> Violations:
-        """What is left, and the classes."""
+        """Check the remaining entries and the classes."""
         for cursor in self._sets.values():
             if not cursor.broken:
                 yield from cursor.finish()
@@ -73,19 +73,19 @@ def _numbers_of(path: Path) -> Iterator[tuple[int, str]]:
 
 
 class YoloReader:
-    """``data.yaml`` of every task, as Ultralytics reads it."""
+    """Reader of the ``data.yaml`` of every task."""
 
     def __init__(self, root: Path, content: Mapping[str, Any]) -> None:
         self._root, self._content = root, content
         self._splits: set[str] = set()
 
     def check(self, frame: TrueFrame) -> Violations:
-        """Remember the split."""
+        """Record the split of the frame."""
         self._splits.add(frame.split)
         yield from ()
 
     def finish(self) -> Violations:
-        """Whether classes, folders and keypoints are the dataset's."""
+        """Check that classes, folders and keypoints are those of the dataset."""
         for task, folder in YOLO_FOLDERS.items():
             if task in self._content["scene"]["output"]["formats"]:
                 file = f"{folder}data.yaml"
@@ -123,7 +123,7 @@ class YoloReader:
 
 
 class ColmapReader:
-    """``colmap/``, read by pycolmap in a process of its own, which it can end."""
+    """Reader of ``colmap/``; pycolmap runs in a process of its own, because it may abort the process."""
 
     def __init__(self, root: Path) -> None:
         self._model = root / "colmap"
@@ -152,7 +152,7 @@ class ColmapReader:
                     child.stdout.close()
 
     def check(self, frame: TrueFrame) -> Violations:
-        """Compare the image's pose, and where its camera sees some points, with the manifest's."""
+        """Compare the image's pose, and the projections of some points by its camera, with those of the manifest."""
         if self._images.broken or self._missing:
             return
         found = list(self._images.take(frame.index))
@@ -174,7 +174,7 @@ class ColmapReader:
             yield "its camera is not that of the manifest"
 
     def finish(self) -> Violations:
-        """What is left."""
+        """Report missing files and check the remaining entries."""
         for name in self._missing:
             yield f"colmap/{name}.txt", "is missing"
         if not self._missing and not self._images.broken:
@@ -182,14 +182,14 @@ class ColmapReader:
 
 
 class LayoutReader:
-    """``layouts/``: where the objects came to rest, which the labels' poses must be, or a belt carried them from."""
+    """Reader of ``layouts/``; resting poses, moved by the belt if there is one, must equal the labels' poses."""
 
     def __init__(self, root: Path, content: Mapping[str, Any]) -> None:
         self._root, self._belt = root, BeltTruth(content)
         self._index, self._found = -1, dict[int, Any]()
 
     def check(self, frame: TrueFrame) -> Violations:
-        """Whether the labelled instances lie in the layout as the manifest says, and none of it is unaccounted for."""
+        """Check that labelled instances match the layout, and that every object of the layout is accounted for."""
         index = frame.record["layout"]
         file = f"layouts/{index:04d}.json"
         if index != self._index:
@@ -226,7 +226,7 @@ class LayoutReader:
             yield where, f"its objects are not those of {file}"
 
     def _at_moment(self, stored: Any, frame: TrueFrame) -> Any:
-        """A pose as it is at the moment of a frame, carried by a belt or not."""
+        """Return a stored pose at the time of a frame, displaced by the belt if the belt carries the object."""
         try:
             pose = np.array(stored, dtype=np.float64)
         except (TypeError, ValueError):
@@ -237,5 +237,5 @@ class LayoutReader:
         return pose
 
     def finish(self) -> Violations:
-        """Files of layouts that no frame shows belong to no frame."""
+        """Do nothing; layout files without a frame are reported as files that belong to no frame."""
         yield from ()

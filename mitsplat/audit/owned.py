@@ -1,4 +1,4 @@
-"""Which files a dataset must have, derived from its formats anew, and files that nothing accounts for."""
+"""Files that a dataset must have, derived independently from its formats, and files that belong to no frame."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from mitsplat.audit.read_back import Violations
 from mitsplat.storage.files import Record, splits_of
 
 YOLO_FOLDERS = {"yolo": "", "yolo-detect": "yolo-detect/", "yolo-obb": "yolo-obb/", "yolo-pose": "yolo-pose/"}
-"""Where Ultralytics' tasks have their folders: labels lie beside the images that they are of."""
+"""Folders of Ultralytics' tasks, in which labels lie beside their images."""
 _YOLO = {name: folder for name, folder in YOLO_FOLDERS.items() if folder}
 _ANNOTATIONS = {"coco": "instances", "amodal": "amodal", "panoptic": "panoptic", "poses": "poses"}
 _MAPS = ("depth", "depth-sensor", "normals", "instances", "semantic", "panoptic")
@@ -24,12 +24,12 @@ _FOLDERS = (
     *("images", "labels", "layers", "annotations", "layouts", *_YOLO, *_MAPS),
     *("flow", "voc", "label-studio", "bop", "colmap"),
 )
-"""Folders that hold nothing else than a dataset's files."""
+"""Folders that contain only files of a dataset."""
 _FOLD = re.compile(r"fold[0-9]+(_train|_val)?\.(txt|yaml)")
 
 
 def files_of_frame(record: Record, content: Mapping[str, Any]) -> dict[str, str]:
-    """The files that a frame must have, each with the format that it is of."""
+    """Return the files that a frame must have, each with its format."""
     output = content["scene"]["output"]
     formats, number, split = output["formats"], f"{record['index']:06d}", record["split"]
     image, png = f"{number}.{output['image']}", f"{number}.png"
@@ -60,7 +60,7 @@ def files_of_frame(record: Record, content: Mapping[str, Any]) -> dict[str, str]
 
 
 def check_listed(record: Record, content: Mapping[str, Any]) -> Violations:
-    """Whether the manifest lists the files that the frame must have, and no others."""
+    """Check that the manifest lists exactly the files that the frame must have."""
     where, wanted = f"manifest.jsonl, frame {record['index']}", files_of_frame(record, content)
     for file, name in wanted.items():
         if file not in record["files"]:
@@ -71,12 +71,12 @@ def check_listed(record: Record, content: Mapping[str, Any]) -> Violations:
 
 
 def labelled_assets(content: Mapping[str, Any]) -> list[int]:
-    """Positions of the assets that labels are of, which are those that have models, in a dataset of this content."""
+    """Return the positions of the assets that have labels and therefore models."""
     return sorted(set(range(len(content["assets"]))) - set(content.get("distractors", ())))
 
 
 class Owned:
-    """Names of all files that something accounts for, 8 bytes each."""
+    """Hashes of the names of all files that belong to the dataset, 8 bytes each."""
 
     def __init__(self, content: Mapping[str, Any]) -> None:
         self._formats = content["scene"]["output"]["formats"]
@@ -88,7 +88,7 @@ class Owned:
             self._add(file)
 
     def _of_all(self) -> Iterator[str]:
-        """Files that describe all frames."""
+        """Yield the files that describe all frames."""
         for name, described in _ANNOTATIONS.items():
             if name in self._formats:
                 yield from (f"annotations/{described}_{split}.json" for split in self._splits)
@@ -104,7 +104,7 @@ class Owned:
             yield from (f"colmap/{name}.txt" for name in ("cameras", "images", "points3D"))
 
     def add(self, record: Record) -> None:
-        """Account for the files of a frame, and those of its layout."""
+        """Add the files of a frame and of its layout."""
         for file in record["files"]:
             self._add(file)
         scene = record["split"], record["layout"]
@@ -120,12 +120,12 @@ class Owned:
         self._names.append(_hash(file))
 
     def orphans(self, root: Path) -> Violations:
-        """Files in the dataset's folders that nothing accounts for."""
+        """Yield the files in the dataset's folders that do not belong to the dataset."""
         known = np.sort(np.array(self._names, dtype=np.uint64))
         for top in sorted(_FOLDERS):
             for folder, folders, names in os.walk(root / top):
                 folders.sort()
-                # Ultralytics leaves a cache of what it read beside the labels; folds are lists of what is checked.
+                # Caches of Ultralytics and lists of folds are accepted.
                 files = [
                     (Path(folder) / name).relative_to(root).as_posix()
                     for name in sorted(names)

@@ -1,4 +1,4 @@
-"""Files of a frame read back the way their users read them, and compared with the masks of the manifest."""
+"""Audit of a frame's files, which are read as their users read them and compared with the masks of the manifest."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ from mitsplat.audit.truth import TrueFrame, TrueInstance, bounds_of
 from mitsplat.images.picture_files import read_picture
 
 POLYGON_IOU = 0.99
-"""Least IoU of a mask in one part and its polygon, for masks of more than :data:`POLYGON_AREA` pixels."""
+"""Minimum IoU of a connected mask and its polygon, for masks of more than :data:`POLYGON_AREA` pixels."""
 POLYGON_AREA = 200
 
 _ROUNDED_PIXELS = 4
-"""Pixels by which a polygon read from text may differ from its mask."""
+"""Maximum number of pixels by which a polygon read from text may differ from its mask."""
 _ROUNDED = 0.01
-"""Distance that six decimals and OpenCV's rectangles may move a position [px]."""
+"""Tolerance of positions for six decimals and OpenCV's rectangles [px]."""
 _WIDER = 1.001
-"""Factor by which a rectangle in single precision may be larger than the smallest."""
+"""Maximum ratio of the area of a single-precision rectangle to the smallest possible area."""
 Violations = Iterator[tuple[str, str]]
-"""File, relative to the dataset, and what is wrong with it."""
+"""Iterator of violations: file, relative to the dataset, and description."""
 
 
 def check_image(frame: TrueFrame, path: Path) -> Iterator[str]:
-    """What is wrong with the frame's picture."""
+    """Yield the violations of the frame's picture."""
     image = read_picture(path)
     width, height = frame.size
     if image is None:
@@ -42,18 +42,18 @@ def check_image(frame: TrueFrame, path: Path) -> Iterator[str]:
 
 
 def _check_copy(frame: TrueFrame, path: Path) -> Iterator[str]:
-    """A second name of the frame's picture, where a format looks for it."""
+    """Check that a format's picture is the frame's picture under a second name."""
     image = f"images/{frame.split}/{frame.image_name}"
     if frame.record["files"][path.relative_to(frame.root).as_posix()] != frame.record["files"].get(image):
         yield f"is not the picture {image}"
 
 
 LineCheck = Callable[[TrueFrame, TrueInstance, list[float]], Iterator[str]]
-"""What is wrong with the numbers of an instance's line."""
+"""Function that yields the violations in the numbers of an instance's line."""
 
 
 def _check_lines(check: LineCheck, frame: TrueFrame, path: Path) -> Iterator[str]:
-    """What is wrong with a file of one line per instance: its class, then numbers."""
+    """Check a file with one line per instance: class index, then numbers."""
     try:
         rows = [[float(value) for value in line.split()] for line in path.read_text().splitlines()]
     except ValueError as error:
@@ -80,7 +80,7 @@ def _check_segment(frame: TrueFrame, label: TrueInstance, values: list[float]) -
         yield f"{label.name}: its polygon leaves the image"
         return
     width, height = frame.size
-    # As Ultralytics' polygon2mask: single precision, truncated to pixels, even-odd, edges painted.
+    # Rasterised as in Ultralytics' polygon2mask: single precision, truncated to pixels, even-odd rule, edges painted.
     canvas = np.zeros((height, width), dtype=np.uint8)
     cv2.fillPoly(canvas, [(points.astype(np.float32) * np.array(frame.size, dtype=np.float32)).astype(np.int32)], 1)
     read, mask = canvas.astype(bool), frame.whole(label)
@@ -99,7 +99,7 @@ def _check_segment(frame: TrueFrame, label: TrueInstance, values: list[float]) -
 
 
 def bridged_pixels(mask: BoolArray) -> int:
-    """Fewest pixels of gaps that join all parts of a mask: Prim's algorithm, by distances in the chessboard metric."""
+    """Return the minimum number of gap pixels that join all parts of a mask (Prim's algorithm, chessboard distance)."""
     count, parts = cv2.connectedComponents(mask.astype(np.uint8), connectivity=8)
     pixels = [np.argwhere(parts == part) for part in range(1, count)]
     trees = [KDTree(places) for places in pixels]
@@ -121,7 +121,7 @@ def _check_box(frame: TrueFrame, label: TrueInstance, values: list[float]) -> It
 
 
 def _check_rotated(frame: TrueFrame, label: TrueInstance, values: list[float]) -> Iterator[str]:
-    """Whether four corners are a rectangle that holds the mask's pixels, and none is smaller."""
+    """Check that four corners are the smallest rectangle that contains the mask's pixels."""
     if len(values) != 8:
         yield f"{label.name}: its line is not four corners"
         return
@@ -178,14 +178,14 @@ def _check_voc(frame: TrueFrame, path: Path) -> Iterator[str]:
             yield f"{label.name}: class is {entry.findtext('name')}, not {frame.content['classes'][label.kind]}"
         box = [entry.findtext(f"bndbox/{name}") for name in ("xmin", "ymin", "xmax", "ymax")]
         x0, y0, x1, y1 = label.box
-        if box != [str(value) for value in (x0 + 1, y0 + 1, x1, y1)]:  # pixels count from 1, the last is included
+        if box != [str(value) for value in (x0 + 1, y0 + 1, x1, y1)]:  # from 1, last included
             yield f"{label.name}: its box is not that of its mask"
         if [entry.findtext(name) for name in ("truncated", "occluded")] != [str(int(flag)) for flag in label.voc_flags]:
             yield f"{label.name}: its flags are not those of its masks"
 
 
 def read_grey(path: Path, frame: TrueFrame) -> Int64Array | None:
-    """A grey picture of 8 or 16 bits, None if it is none of the frame's size."""
+    """Read a grey picture of 8 or 16 bits; return None if it does not have the frame's size."""
     picture = read_picture(path, cv2.IMREAD_UNCHANGED)
     if picture is None or picture.shape != frame.size[::-1]:
         return None
@@ -212,7 +212,7 @@ def _check_semantic(frame: TrueFrame, path: Path) -> Iterator[str]:
 
 
 def segment_picture(frame: TrueFrame, path: Path) -> Int64Array | None:
-    """Ids of a panoptic picture, R + 256 G + 65536 B as panopticapi reads them."""
+    """Read the ids of a panoptic picture, R + 256 G + 65536 B as in panopticapi."""
     picture = read_picture(path)
     if picture is None or picture.shape[:2] != frame.size[::-1]:
         return None
@@ -244,12 +244,12 @@ def _check_depth(frame: TrueFrame, path: Path) -> Iterator[str]:
 
 
 def _from_splats(frame: TrueFrame) -> bool:
-    """Whether the labels' source is what depths are of, too."""
+    """Return True if labels and depths come from the same source, the splats."""
     return bool(frame.content["scene"]["labels"]["source"] == "splats")
 
 
 def check_bop(frame: TrueFrame, damaged: Collection[str]) -> Violations:
-    """What is wrong with the frame's BOP pictures, but for those of which it is known already."""
+    """Check the frame's BOP pictures, except those that are known to be damaged."""
     if "bop" not in frame.formats:
         return
     name = f"{frame.index:06d}"
@@ -288,7 +288,7 @@ CHECKS: dict[str, Callable[[TrueFrame, Path], Iterator[str]]] = {
     "panoptic/": _check_panoptic,
     "depth/": _check_depth,
 }
-"""What is wrong with a file, by the folder that it is in."""
+"""Check functions of files, by folder prefix."""
 
 
 def _is_box(values: list[float], frame: TrueFrame, label: TrueInstance) -> bool:

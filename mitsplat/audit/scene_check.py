@@ -1,4 +1,4 @@
-"""Frames of a dataset compared with the scene that it states: intrinsics, where cameras may be, what is labelled."""
+"""Audit of frames against the scene in ``dataset.json``: intrinsics, camera positions and labelled objects."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from mitsplat.audit.read_back import Violations
 from mitsplat.audit.truth import TrueFrame, seats_of
 
 _SIGMAS = 6.0
-"""Multiples of a jitter's standard deviation within which cameras stay."""
+"""Maximum jitter of cameras, in standard deviations."""
 _NEAR = 1e-6
-"""Rounding of positions [m]."""
+"""Tolerance of positions [m]."""
 
 
 class SceneReader:
-    """The scene of ``dataset.json``."""
+    """Comparison of frames with the scene of ``dataset.json``."""
 
     def __init__(self, content: Mapping[str, Any]) -> None:
         scene = content["scene"]
@@ -30,7 +30,7 @@ class SceneReader:
         self._given = content.get("given", False)
 
     def check(self, frame: TrueFrame) -> Violations:
-        """Whether its camera, unless that was given, can be the scene's, and its labels are of what is labelled."""
+        """Check that the scene can have the frame's camera and labels; a camera given by the caller is not checked."""
         width, height = self._output["width"], self._output["height"]
         if frame.size != (width, height):
             text = f"is {frame.size[0]}x{frame.size[1]} px, not {width}x{height} as the scene says"
@@ -47,7 +47,7 @@ class SceneReader:
         yield from self._check_place(frame)
 
     def finish(self) -> Violations:
-        """Nothing is left."""
+        """Do nothing; all checks are done per frame."""
         yield from ()
 
     def _check_objects(self, frame: TrueFrame) -> Iterator[str]:
@@ -90,23 +90,23 @@ class SceneReader:
             yield "its lens distortion is not the scene's"
 
     def _camera_of(self, frame: TrueFrame) -> Mapping[str, Any]:
-        """The camera of the scene that took a frame."""
+        """Return the camera of the scene that took a frame."""
         camera: Mapping[str, Any] = self._cameras[self._seat(frame)[0]]
         return camera
 
     def _seat(self, frame: TrueFrame) -> tuple[int, bool]:
-        """Position of a frame's camera among the scene's, and whether it is the right one of a pair: taken in turn."""
+        """Return the position of a frame's camera in the scene, and True for the right camera of a stereo pair."""
         number, side = self._seats[frame.record["view"] % len(self._seats)]
         return number, side == 1
 
     def _turn(self, frame: TrueFrame) -> tuple[int, int]:
-        """Which of its camera's views of the layout a frame is, and of how many."""
+        """Return the position of a frame among the views of its camera in the layout, and the number of these views."""
         seats = len(self._seats)
         turn, seat = divmod(frame.record["view"], seats)
         return turn, len(range(seat, self._output["views"], seats))
 
     def _unheld(self, frame: TrueFrame) -> Float64Array:
-        """Pose of a frame's camera without the hand that moved it, and of a pair's left camera for its right one."""
+        """Return the pose of a frame's camera without hand-held motion; a right camera is moved to its left camera."""
         pose = np.array(frame.world_from_camera, dtype=np.float64)
         number, right = self._seat(frame)
         if right:
@@ -119,7 +119,7 @@ class SceneReader:
         return pose
 
     def _check_place(self, frame: TrueFrame) -> Iterator[str]:
-        """Closed forms: circles and spheres about a target that the axis meets, and the ends of paths."""
+        """Check the camera's position and direction: distance and direction to the target, or the ends of a path."""
         camera, pose = self._camera_of(frame), self._unheld(frame)
         eye, axis = pose[:3, 3], pose[:3, 2]
         if camera["kind"] == "path":
@@ -136,7 +136,7 @@ class SceneReader:
             return
         target, room = camera["target"], _SIGMAS * camera.get("target_jitter", 0.0) + _NEAR
         if (stated := (frame.record.get("viewpoint") or {}).get("target")) is not None:
-            target, room = stated, _NEAR  # it looks at what lies there, and says what that is
+            target, room = stated, _NEAR  # the record states the drawn target
         offset = eye - target
         if camera["kind"] == "orbit":
             room = _SIGMAS * camera["jitter"] + _NEAR
@@ -153,7 +153,7 @@ class SceneReader:
 
 
 def _held_out(scene: Mapping[str, Any]) -> set[int]:
-    """Positions, among the assets of a scene's objects in turn, of those that only the test split may have."""
+    """Return the positions, in the order of the scene's assets, of assets that only the test split may have."""
     names = set(scene.get("hold_out", {}).get("assets", ()))
     found, position = set[int](), 0
     for entry in scene.get("objects", ()) if names else ():

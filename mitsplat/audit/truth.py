@@ -1,7 +1,7 @@
-"""What a frame's line in the manifest means, worked out anew from its masks, poses and intrinsics.
+"""Reference values of a frame, recomputed from the masks, poses and intrinsics in its manifest line.
 
-The audit compares files with this. Nothing here calls what wrote them: masks are decoded by pycocotools, poses inverted
-by NumPy, points projected by OpenCV, everything else is counted.
+The audit compares files with these values. The code that wrote the files is not used: masks are decoded by pycocotools,
+poses inverted by NumPy, points projected by OpenCV, and all other values are counted.
 """
 
 from __future__ import annotations
@@ -23,24 +23,24 @@ Box = tuple[int, int, int, int]
 """Bounds (x0, y0, x1, y1) [px], half-open."""
 
 VOC_TRUNCATED, VOC_OCCLUDED = 0.15, 0.05
-"""Shares of an object beyond the box of what is seen, and hidden in it, above which VOC's guidelines set its flags."""
+"""Fractions of an object outside of the box of its visible part, and hidden in it, above which VOC sets its flags."""
 
 
 def seats_of(scene: Mapping[str, Any]) -> list[tuple[int, int]]:
-    """Of each view of a turn its camera's position among the scene's, and 1 if it is the right one of a pair."""
+    """Return camera position and side for each view of a turn; side is 1 for the right camera of a pair."""
     cameras = enumerate((scene["camera"], *scene.get("cameras", ())))
     return [(number, side) for number, camera in cameras for side in range(2 if camera.get("stereo") else 1)]
 
 
 @dataclass(frozen=True, eq=False)
 class TrueInstance:
-    """An instance of a frame.
+    """Instance of a frame.
 
     Attributes:
-        entry: What the manifest states of it.
-        box: Bounds of what is seen of it, counted from the mask.
-        mask: Its pixels in the box.
-        amodal_box, amodal: The same of all that it covers in the image.
+        entry: Label of the instance in the manifest.
+        box: Bounds of the visible pixels, counted from the mask.
+        mask: Visible pixels in the box.
+        amodal_box, amodal: Bounds and pixels of the whole silhouette in the image.
     """
 
     entry: Mapping[str, Any]
@@ -51,7 +51,7 @@ class TrueInstance:
 
     @classmethod
     def of(cls, entry: Mapping[str, Any], width: int, height: int) -> TrueInstance:
-        """Decode the masks, neither of which is empty."""
+        """Decode both masks, which are not empty."""
         return cls(entry, *_decode(entry["rle"], width, height), *_decode(entry["amodal_rle"], width, height))
 
     @property
@@ -66,7 +66,7 @@ class TrueInstance:
 
     @property
     def name(self) -> str:
-        """How sentences begin."""
+        """Beginning of messages about the instance."""
         return f"instance {self.id}"
 
     @property
@@ -76,22 +76,22 @@ class TrueInstance:
 
     @cached_property
     def area(self) -> int:
-        """Pixels that are seen."""
+        """Number of visible pixels."""
         return int(np.count_nonzero(self.mask))
 
     @cached_property
     def amodal_area(self) -> int:
-        """Pixels of the image that it covers."""
+        """Number of pixels of the silhouette in the image."""
         return int(np.count_nonzero(self.amodal))
 
     @property
     def silhouette_area(self) -> int:
-        """Pixels that it covers, beyond the image's border too; no file of a frame shows those."""
+        """Number of pixels of the silhouette, also beyond the image's border, as stated in the manifest."""
         return int(self.entry["silhouette_area"])
 
     @cached_property
     def voc_flags(self) -> tuple[bool, bool]:
-        """Whether VOC calls it truncated, and occluded."""
+        """Flags *truncated* and *occluded* of VOC."""
         x0, y0, x1, y1 = self.box
         left, top = self.amodal_box[:2]
         boxed = int(np.count_nonzero(self.amodal[max(0, y0 - top) : y1 - top, max(0, x0 - left) : x1 - left]))
@@ -102,7 +102,7 @@ class TrueInstance:
 
 @dataclass(frozen=True, eq=False)
 class TrueFrame:
-    """A frame's record, and the dataset that it is in."""
+    """Record of a frame, with its dataset and its decoded instances."""
 
     root: Path
     record: Record
@@ -111,7 +111,7 @@ class TrueFrame:
 
     @classmethod
     def of(cls, root: Path, record: Record, content: Mapping[str, Any]) -> TrueFrame:
-        """The frame of a record that :mod:`mitsplat.dataset.schema` has checked."""
+        """Create the frame from a record that :mod:`mitsplat.dataset.schema` has checked."""
         width, height = record["labels"]["size"]
         return cls(
             root,
@@ -127,7 +127,7 @@ class TrueFrame:
 
     @property
     def split(self) -> str:
-        """``train`` or ``val``."""
+        """Name of the split."""
         return str(self.record["split"])
 
     @property
@@ -148,11 +148,11 @@ class TrueFrame:
 
     @property
     def bop_folder(self) -> str:
-        """Where BOP has the frame's layout."""
+        """Folder of the frame's layout in BOP, relative to the dataset."""
         return f"bop/{self.split}/{self.record['layout']:06d}"
 
     def whole(self, instance: TrueInstance, *, amodal: bool = False) -> BoolArray:
-        """What is seen of an instance, or all that it covers, in the whole image (H, W)."""
+        """Return the visible pixels of an instance, or its whole silhouette, in the whole image (H, W)."""
         width, height = self.size
         canvas = np.zeros((height, width), dtype=bool)
         x0, y0, x1, y1 = instance.amodal_box if amodal else instance.box
@@ -161,12 +161,12 @@ class TrueFrame:
 
     @cached_property
     def ids(self) -> Int64Array:
-        """Id of the labelled instance of every pixel, 0 for anything else, (H, W)."""
+        """Id of the labelled instance of every pixel, shape (H, W); 0 is any other pixel."""
         return self._painted([instance.id for instance in self.instances])
 
     @cached_property
     def classes(self) -> Int64Array:
-        """Class index + 1 of every labelled pixel, 0 for anything else, (H, W)."""
+        """Class index + 1 of every labelled pixel, shape (H, W); 0 is any other pixel."""
         return self._painted([instance.kind + 1 for instance in self.instances])
 
     def _painted(self, values: list[int]) -> Int64Array:
@@ -179,26 +179,26 @@ class TrueFrame:
 
     @property
     def world_from_camera(self) -> Float64Array:
-        """As the manifest states it, shape (4, 4) [m]."""
+        """Camera pose in the manifest [m], shape (4, 4)."""
         return np.array(self.record["camera"]["world_from_camera"], dtype=np.float64)
 
     @cached_property
     def camera_from_world(self) -> Float64Array:
-        """Shape (4, 4) [m]."""
+        """Inverse camera pose [m], shape (4, 4)."""
         return np.asarray(np.linalg.inv(self.world_from_camera))
 
     @property
     def intrinsics(self) -> Float64Array:
-        """Shape (3, 3) [px], pixel centres at +0.5."""
+        """Intrinsic matrix [px], pixel centres at +0.5, shape (3, 3)."""
         return np.array(self.record["camera"]["intrinsics"], dtype=np.float64)
 
     @property
     def distortion(self) -> Float64Array:
-        """OpenCV's coefficients."""
+        """Distortion coefficients of OpenCV."""
         return np.array(self.record["camera"]["distortion"], dtype=np.float64)
 
     def project(self, points: Float64Array) -> Float64Array:
-        """Pixels (N, 2) of points in the camera's frame (N, 3), all before the camera."""
+        """Project points in the camera's frame (N, 3), all in front of the camera, to pixels (N, 2)."""
         points, zero = np.ascontiguousarray(points).reshape(-1, 1, 3), np.zeros(3)
         if self.record["camera"]["lens"] == "fisheye":
             pixels, _ = cv2.fisheye.projectPoints(points, zero, zero, self.intrinsics, self.distortion)
@@ -207,7 +207,7 @@ class TrueFrame:
         return np.asarray(pixels, dtype=np.float64).reshape(-1, 2)
 
     def slopes(self, pixels: Float64Array) -> Float64Array:
-        """Ray slopes (x / z, y / z) of pixels, both (N, 2)."""
+        """Return the ray slopes (x / z, y / z) of pixels; both have shape (N, 2)."""
         pixels = np.ascontiguousarray(pixels, dtype=np.float64).reshape(-1, 1, 2)
         criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-12)
         if self.record["camera"]["lens"] == "fisheye":
@@ -219,7 +219,7 @@ class TrueFrame:
 
 
 def bounds_of(mask: BoolArray) -> Box:
-    """Bounds of a mask's pixels, all 0 for an empty one."""
+    """Return the bounds of a mask's pixels; all are 0 for an empty mask."""
     ys, xs = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     return (int(xs[0]), int(ys[0]), int(xs[-1]) + 1, int(ys[-1]) + 1) if len(xs) else (0, 0, 0, 0)
 

@@ -296,7 +296,7 @@ def _check_size(source: str, size: float, metres_per_unit: float) -> None:
 
 
 def _hemisphere(count: int) -> Float64Array:
-    """Return directions (M, 3), evenly distributed over the hemisphere around z, at least 3 degrees above the horizon."""
+    """Return directions (M, 3), evenly over the hemisphere around z, at least 3 degrees above the horizon."""
     return spiral(1.0 - 0.95 * (np.arange(count) + 0.5) / count)
 
 
@@ -343,8 +343,9 @@ def _lift(scene: mi.Scene) -> float:
 def _hits_nearby(
     scene: mi.Scene, origins: Float64Array, directions: Float64Array, normals: Float64Array, reach: Float64Array
 ) -> BoolArray:
-    """Return a mask (N, M) of the rays that hit a surface within ``reach`` (N,) [m] with a normal close to ``normals``
-    (N, 3).
+    """Return a mask (N, M) of the rays that hit a nearby surface of similar orientation.
+
+    The hit is within ``reach`` (N,) [m], and its normal is close to ``normals`` (N, 3).
     """
     rays = mi.Ray3f(
         mi.Point3f(origins.reshape(-1, 3).T.astype(np.float32)),

@@ -102,7 +102,7 @@ class MeshPart:
         return decode_srgb(self.texture[row, column] / 255.0)
 
     def detail_density(self, gain: float, rng: np.random.Generator) -> Float64Array:
-        """Return the relative density (F,) for the texture: 1 where it is uniform, ``1 + gain`` where it changes most."""
+        """Return the relative density (F,) of Gaussians: 1 for uniform texture, ``1 + gain`` where it changes most."""
         barycentric = rng.dirichlet(np.ones(3), _DETAIL_SAMPLES)
         deviation = (self._face_colours(barycentric) ** (1 / 2.2)).std(axis=1).max(axis=1)
         return np.asarray(1.0 + gain * np.clip(deviation / _DETAIL_CONTRAST, 0.0, 1.0))

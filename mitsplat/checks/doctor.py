@@ -1,4 +1,4 @@
-"""What this machine has of all that mitsplat needs, and what to do about the rest."""
+"""Check of this machine: software, processor, GPU, caches, memory and disk, with a remedy for each problem."""
 
 from __future__ import annotations
 
@@ -23,16 +23,20 @@ from mitsplat.runtime.warp_start import quiet_warp
 from mitsplat.storage.cache import cache_folder, drjit_folder, warp_folder, why_unusable
 
 NEEDED_MEMORY = 2.5
-"""What :func:`mitsplat.frames.budget.worker_memory` allows a worker of the default scene, rounded up [GiB];
-``python -m benchmarks.scale.workers budget`` has it beside what is used."""
+"""Memory of a worker of the default scene by :func:`mitsplat.frames.budget.worker_memory`, rounded up [GiB].
+
+``python -m benchmarks.scale.workers budget`` prints it beside the memory that is used.
+"""
 
 NEEDED_DISK = 0.5
-"""Twice a dataset of a thousand frames of 0.25 MB [GiB]. What a first run compiles and keeps is little beside it, see
-``python -m benchmarks.scale.first_run``."""
+"""Twice the size of a dataset of a thousand frames of 0.25 MB [GiB].
+
+Compiled kernels of a first run are small in comparison, see ``python -m benchmarks.scale.first_run``.
+"""
 
 
 def examine() -> Iterator[Finding]:
-    """The findings, one after the other as they are made."""
+    """Yield the findings one by one."""
     yield Finding("Python", sys.version_info >= (3, 11), platform.python_version(), "install Python 3.11 or newer")
     for package in ("mitsuba", "drjit", "newton"):
         yield _package(package)
@@ -62,7 +66,7 @@ def _llvm() -> Finding:
 
 
 def _try(device: str, environment: Mapping[str, str]) -> tuple[str, str]:
-    """The version of LLVM, and what is wrong with the picture of a trial on a device, if anything is."""
+    """Render the trial scene on a device, and return the LLVM version and the fault, or an empty text."""
     command = python_command("-m", "mitsplat.checks.trial", device)
     environment = python_environment(environment)
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
@@ -75,7 +79,7 @@ def _try(device: str, environment: Mapping[str, str]) -> tuple[str, str]:
 
 
 def _processor() -> Finding:
-    """Kernels are compiled for what the processor has; without 8 lanes of floats they are slow."""
+    """Check that the processor has AVX2: kernels are compiled for its features, and are slow without 8 float lanes."""
     machine, cores = platform.machine(), os.cpu_count()
     flags: set[str] = set()
     with suppress(OSError):
@@ -90,7 +94,7 @@ def _processor() -> Finding:
 
 
 def _cuda() -> Finding:
-    """A GPU is not needed; half of one, or one that renders wrong, is worth a word."""
+    """Check the GPUs, which are optional; report a GPU without OptiX or with a wrong picture as a problem."""
     gpus = visible_gpus()
     if isinstance(gpus, Lack):
         return Finding("GPU", "OptiX" not in gpus.what, f"{gpus.what} (optional)", gpus.remedy)
@@ -104,7 +108,7 @@ def _cuda() -> Finding:
 
 
 def _driver() -> str:
-    """The release of NVIDIA's driver."""
+    """Return the release of NVIDIA's driver."""
     with suppress(OSError):
         found = re.search(r" (\d+\.[\d.]+) ", Path("/proc/driver/nvidia/version").read_text())
         if found:
@@ -129,7 +133,7 @@ def _cache() -> Finding:
 def _warp() -> Finding:
     remedy = "pip install warp-lang"
     try:
-        import warp  # whether it can be imported is the question
+        import warp  # the import itself is tested
 
         with quiet_warp():
             devices = ", ".join(str(device) for device in warp.get_devices())

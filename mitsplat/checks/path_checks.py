@@ -1,4 +1,4 @@
-"""What is questionable about an asset or a scene before time is spent on it, and what to do about each."""
+"""Checks of an asset or a scene before a long run, with a remedy for each problem."""
 
 from __future__ import annotations
 
@@ -27,24 +27,24 @@ from mitsplat.scene.scene import Scene
 from mitsplat.scene.spec.named_files import environments, object_assets
 
 SIZES = {"object": (0.002, 2.0), "environment": (0.2, 100.0)}
-"""Longest extents that are expected [m]."""
+"""Expected range of the longest extent by kind of asset [m]."""
 DENSITIES = (20.0, 22600.0)
-"""From foam to osmium [kg/m^3]."""
+"""Expected range of mass density, from foam to osmium [kg/m^3]."""
 FEW = 0.01
-"""Share of Gaussians of which nothing is said."""
+"""Fraction of Gaussians up to which needles and floaters are acceptable."""
 INVISIBLE = 1 / 255
 MIN_OVERLAP = 0.5
 MAX_OFFSET = 0.02
 MAX_SPREAD = 0.05
-"""Shift and median distance between splats and mesh, in shares of the mesh's diagonal."""
+"""Maximum median distance between splats and mesh, as a fraction of the mesh's diagonal."""
 MAX_FILL = 0.35
-"""Share of the region's volume that objects which are dropped may take; loose packing of boxes ends at about 0.6."""
+"""Maximum fraction of the region's volume for dropped objects; loose packing of boxes ends at about 0.6."""
 TILT = 0.5
-"""Share by which another axis than z must be the thinner one for an environment to look as if it lay on its side."""
+"""Relative difference of spreads above which an environment that is thinner along x or y seems to lie on its side."""
 
 
 def check_path(path: Path, *, allow_outside: bool = False) -> Iterator[Finding]:
-    """Findings on an asset's folder or on a scene file with all that it names.
+    """Yield the findings for an asset folder, or for a scene file with all files that it names.
 
     Raises:
         InputError: If it cannot be read at all.
@@ -56,13 +56,13 @@ def check_path(path: Path, *, allow_outside: bool = False) -> Iterator[Finding]:
 
 
 def check_asset(asset: Asset) -> Iterator[Finding]:
-    """Findings on an asset, one for each thing that was looked at."""
+    """Yield one finding for each property of an asset that is checked."""
     splats = asset.splats
     core = opaque_core(splats).astype(np.float64)
     if not len(core):
         yield Finding("splats", False, f"none of {len(splats)} is opaque", "fit or bake the asset anew")
         return
-    yield Finding("splats", True, f"{len(splats)}, all values finite")  # what is not finite has not been loaded
+    yield Finding("splats", True, f"{len(splats)}, all values finite")  # loading refuses non-finite values
     extents = np.ptp(core, axis=0) if asset.mesh is None else asset.mesh.extents
     size = float(extents.max())
     yield _units(asset, size)
@@ -113,7 +113,7 @@ def _mesh(asset: Asset, core: Float64Array) -> Iterator[Finding]:
         remedy = "nothing casts shadows, occludes or carries objects; `mitsplat mesh` makes one"
         yield Finding("mesh", asset.kind == "environment", "none", remedy)
         return
-    if asset.kind == "object":  # what surrounds is only known in part, by either
+    if asset.kind == "object":  # splats and mesh of an environment may each be incomplete
         overlap = _overlap(np.stack([core.min(axis=0), core.max(axis=0)]), mesh.bounds)
         yield Finding(
             "overlap", overlap > MIN_OVERLAP, f"the boxes of splats and mesh share {overlap:.0%} of both",
@@ -163,7 +163,7 @@ def _mass(asset: Asset, mesh: trimesh.Trimesh) -> Iterator[Finding]:
 
 
 def check_scene(scene: Scene) -> Iterator[Finding]:
-    """Findings on a scene, and what is wrong with each of its assets, whose names they begin with."""
+    """Yield the findings for a scene, and the problems of each of its assets, prefixed with the asset's name."""
     spec = scene.spec
     try:
         Catalogue.of(scene)
@@ -202,7 +202,7 @@ def check_scene(scene: Scene) -> Iterator[Finding]:
 
 
 def _sized(scene: Scene) -> Iterator[list[Asset]]:
-    """Each asset in all sizes that it has in a scene: one by its folder, as several may have one name."""
+    """Yield each asset in all its sizes in a scene, grouped by folder because names need not be unique."""
     folders = [folder for _, folder in environments(scene.spec)]
     folders += [folder for _, folder, entry in object_assets(scene.spec) for _ in entry.scales]
     found: dict[str, dict[int, Asset]] = {}
@@ -213,7 +213,7 @@ def _sized(scene: Scene) -> Iterator[list[Asset]]:
 
 
 def _rest(scene: Scene) -> Iterator[Finding]:
-    """Which objects do not come to rest even alone."""
+    """Report the objects that do not come to rest even if they are settled alone."""
     rested = set()
     try:
         for name, arrangement, refused in try_alone(scene):
@@ -232,7 +232,7 @@ def _rest(scene: Scene) -> Iterator[Finding]:
 
 
 def _sight(scene: Scene) -> Finding:
-    """Whether the cameras look at where objects are dropped: the middle of a region, at its bottom."""
+    """Check that most views show the place where objects are dropped: the centre of a region, at its bottom."""
     corners = np.array([(region.min, region.max) for region, _ in scene.spec.all_regions])
     middles = np.column_stack([corners.mean(axis=1)[:, :2], corners[:, 0, 2]])
     views = range(0, scene.num_frames, max(1, scene.num_frames // 24))
@@ -250,7 +250,7 @@ def _sight(scene: Scene) -> Finding:
 
 
 def _overlap(one: Float64Array, other: Float64Array) -> float:
-    """Intersection over union of two boxes (2, 3); flat ones are given a thickness."""
+    """Return the intersection over union of two boxes (2, 3); flat boxes get a small thickness."""
     thin = 1e-3 * float(max(np.ptp(one, axis=0).max(), np.ptp(other, axis=0).max()))
     grown = [box + np.array([[-thin], [thin]]) for box in (one, other)]
     common = np.minimum(grown[0][1], grown[1][1]) - np.maximum(grown[0][0], grown[1][0])

@@ -1,9 +1,9 @@
-"""A tiny scene whose picture is known: what a device renders wrong shows in it.
+"""Tiny test scene with a known picture, which reveals devices that render wrong.
 
     python -m mitsplat.checks.trial cpu|cuda
 
-prints as JSON what is wrong, and the version of LLVM. In a process of its own, because an unusable LLVM does not raise:
-it aborts; and because a process has one device.
+prints the faults and the version of LLVM as JSON. It runs in its own process for two reasons: an unusable LLVM aborts
+the process instead of raising an error, and a process can use only one device.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ from mitsplat.renderer.layers import Layers, make_integrator, make_splats_shape,
 from mitsplat.runtime.device import use_device
 
 BLOCK = 8
-"""Edge of the squares whose means are compared [px]."""
+"""Edge length of the squares whose means are compared [px]."""
 
 TOLERANCE = 0.02
-"""Most by which a mean may be off, 1 being white or unshadowed: one pixel at an edge moves it by 0.016."""
+"""Maximum difference of a mean; 1 is white or unshadowed. One pixel at an edge changes a mean by 0.016."""
 
 # fmt: off
 KNOWN = {
@@ -63,14 +63,19 @@ KNOWN = {
     ],
 }
 # fmt: on
-"""What :func:`trial_means` gives in the variant llvm_ad_rgb. After a change of the renderer that is meant, its new
-values are taken over once light and picture have been looked at."""
+"""Values of :func:`trial_means` in the variant llvm_ad_rgb.
+
+After an intended change of the renderer, inspect light and picture, then replace these values.
+"""
 
 
 def render_trial(**options: Any) -> Layers:
-    """A ball before a wall on a floor, under a lamp and a sky: what is captured and what is added stop the light."""
+    """Render a ball in front of a wall on a floor, lit by a lamp and a sky.
+
+    The wall occludes light in the captured floor, and the ball is an added object that occludes light.
+    """
     integrator = make_integrator(quality="fast", **options)
-    import mitsuba as mi  # after the variant
+    import mitsuba as mi  # after the variant was set
 
     x, y = (values.ravel() for values in np.meshgrid(*2 * [np.linspace(-0.5, 0.5, 30)]))
     floor = _splats(np.column_stack([x, y, np.zeros_like(x)]), (0.03, 0.03, 0.001), 0.4)
@@ -100,7 +105,7 @@ def _splats(means: Float64Array, scales: tuple[float, float, float], sh: float) 
 
 
 def trial_means(layers: Layers) -> dict[str, Float64Array]:
-    """Picture, light, and the shares of the ball's splats and proxy: means over squares, shape (6, 8)."""
+    """Return means over squares, shape (6, 8), of picture, light, and coverage by the ball's splats and proxy."""
     maps = {
         "picture": layers.rgb.mean(axis=-1),
         "light": layers.light.mean(axis=-1),
@@ -113,7 +118,7 @@ def trial_means(layers: Layers) -> dict[str, Float64Array]:
 
 
 def trial_faults(layers: Layers) -> list[str]:
-    """What differs from the known picture."""
+    """Return the differences from the known picture, a text each."""
     faults = []
     for name, means in trial_means(layers).items():
         worst = float(np.abs(means - KNOWN[name]).max())
@@ -123,10 +128,10 @@ def trial_faults(layers: Layers) -> list[str]:
 
 
 def main() -> None:
-    """Render in the device that is named, and print."""
+    """Render on the device given on the command line, and print the result."""
     use_device(sys.argv[1])
     faults = trial_faults(render_trial())
-    import drjit as dr  # after LLVM was chosen
+    import drjit as dr  # after LLVM was selected
 
     sys.stdout.write(json.dumps({"faults": faults, "llvm": ".".join(map(str, dr.detail.llvm_version()))}))
 

@@ -26,7 +26,7 @@ def spread(total: int, count: int) -> set[int]:
 
 
 class ContactSheet:
-    """Picture of up to ``count`` labelled frames, evenly spread over the ``total`` frames of the dataset in ``root``."""
+    """Picture of up to ``count`` labelled frames, evenly spread over the ``total`` frames of the dataset."""
 
     def __init__(self, root: Path, total: int, *, count: int = 16) -> None:
         self._root = root

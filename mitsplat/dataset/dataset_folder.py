@@ -279,8 +279,9 @@ def missing_file(out: Path, record: Record) -> Path | None:
 
 
 def _check_own(out: Path) -> None:
-    """Refuse a folder that holds anything else than a mitsplat dataset, so that other files are not mixed up or
-    removed.
+    """Refuse a folder that holds anything else than a mitsplat dataset.
+
+    Other files must not be mixed with a dataset or removed.
     """
     present: Any = None
     try:

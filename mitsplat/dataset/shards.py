@@ -103,8 +103,9 @@ def _common_content(folders: Sequence[Path]) -> dict[str, Any]:
 
 
 def _check_complete(folders: Sequence[Path]) -> int | None:
-    """Return the number of frames of the whole dataset as stated by its shards, or None if all folders are whole
-    datasets.
+    """Return the number of frames of the whole dataset, as stated by its shards.
+
+    The number is None if all folders are whole datasets.
     """
     said = {folder: read_shard(folder) for folder in folders}
     parts = {folder: part for folder, part in said.items() if part is not None}

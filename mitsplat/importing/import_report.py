@@ -1,4 +1,4 @@
-"""What came of a splat file: a page to look at, and a scene to begin with."""
+"""HTML report of an imported splat file, and a first scene for it."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from mitsplat.storage.files import is_inside, write_text
 
 _VIEW = 420
 _REMOVED_SHOWN = 4
-"""Views that show what was removed."""
+"""Number of views that show the removed Gaussians."""
 
 
 def write_import_report(folder: Path, imported: Imported) -> Path:
@@ -76,7 +76,7 @@ def _views(imported: Imported) -> str:
 
 
 def _removed(imported: Imported) -> str:
-    """What was removed in red, beside what is left."""
+    """Show the removed Gaussians in red beside the remaining ones."""
     rubbish = imported.rubbish
     if not len(rubbish) or not imported.views:
         return ""
@@ -102,15 +102,15 @@ def _figure(alt: str, caption: str, picture: Float32Array) -> str:
 
 
 def check_scene_path(path: Path, asset_folder: Path, *, known: bool) -> None:
-    """Refuse, before there is an asset, a scene file that could not be written for it.
+    """Refuse a scene file that could not be written for an asset, before the asset is created.
 
     Args:
-        path: Of the scene file.
-        asset_folder: Of the asset.
-        known: Whether its size is.
+        path: Scene file.
+        asset_folder: Folder of the asset.
+        known: True if the size of the asset is known.
 
     Raises:
-        InputError: If there is such a file, the asset is not below its folder, or its size is not known.
+        InputError: If the file exists, the asset is not below its folder, or the size of the asset is unknown.
     """
     if path.exists():
         raise InputError(f"{path}: is there already: name another scene, or remove it")
@@ -121,10 +121,10 @@ def check_scene_path(path: Path, asset_folder: Path, *, known: bool) -> None:
 
 
 def write_scene(path: Path, asset_folder: Path, imported: Imported) -> None:
-    """Write a scene file to begin with: the object on a table, or solids dropped where the surroundings are flat.
+    """Write a first scene file: the object on a table, or solids dropped on a flat part of the environment.
 
     Raises:
-        InputError: As :func:`check_scene_path`, or if surroundings have no horizontal surface.
+        InputError: As :func:`check_scene_path`, or if the environment has no horizontal surface.
     """
     asset = imported.asset
     check_scene_path(path, asset_folder, known=asset.units == "metre")
@@ -156,13 +156,13 @@ def write_scene(path: Path, asset_folder: Path, imported: Imported) -> None:
 
 
 def _quoted(text: str) -> str:
-    """Text as a scene file has it: in quotes, unless it is a plain word or path."""
+    """Return a text for a scene file: in quotes, unless it is a plain word or path."""
     plain = re.fullmatch(r"[A-Za-z_./][\w./-]*", text, re.ASCII) and text.lower() not in _WORDS
     return text if plain else json.dumps(text, ensure_ascii=False)
 
 
 _WORDS = frozenset({"true", "false", "yes", "no", "on", "off", "y", "n", "null", "~"})
-"""What YAML takes for something else than text."""
+"""Words that YAML does not read as text."""
 
 
 def _metres(length: float) -> str:

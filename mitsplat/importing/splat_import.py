@@ -1,8 +1,8 @@
-"""Splats that were made elsewhere to an asset: cleaned, upright, in metres, with a mesh of their own.
+"""Import of splats from other programs as an asset: cleaned, upright, in metres, with its own mesh.
 
-Nothing but the file is needed. What the photographs of a capture decide otherwise is found from the splats themselves:
-pictures of them from all around are the masks of an object, and the depths of its surface. A file says neither which
-way is up nor how large a unit is; the one is found, the other is for the user to say.
+Only the splat file is needed. Masks of an object and depths of its surface, which photographs define in a capture, are
+rendered from the splats themselves in views from all around. A splat file states neither its up axis nor its unit. The
+up axis is estimated; the user must give the unit or the size.
 """
 
 from __future__ import annotations
@@ -33,41 +33,41 @@ from mitsplat.renderer.layers import render_splats
 from mitsplat.runtime.variant import one_at_a_time
 
 FAINT = 1 / 255
-"""Opacity below which a Gaussian is in no picture."""
+"""Opacity below which a Gaussian is invisible in every picture."""
 HUGE = 0.2
-"""Standard deviation of a Gaussian of an object that is no part of it but haze, as a share of the longest extent."""
+"""Standard deviation above which a Gaussian of an object counts as haze, as a fraction of the longest extent."""
 _BULK = 0.005
-"""Share of the Gaussians at either end of an axis that do not decide how large an object is."""
+"""Fraction of the Gaussians at either end of an axis that is ignored for the size of an object."""
 _FOV, _DISTANCE = 29.0, 4.5
-"""Field of view [degrees], and distance in radii of what it shows, of the views of an object."""
+"""Field of view [degrees] of the views of an object, and their distance in radii of the object."""
 _HELD_OUT = 6
 _CONCAVITY = 0.04
-"""Of convex pieces: the surface of splats is too rough for less."""
+"""Concavity threshold of convex pieces; the surface of splats is too rough for a smaller one."""
 _LEAF = 0.1
-"""Volume of a part, as a share of the largest one's, below which its hull is a piece: leaves, lids, screws."""
+"""Volume of a part, relative to the largest part, below which its convex hull is one piece: leaves, lids, screws."""
 _TILT = 4.0
-"""Tilt that an object must bear without falling over [degrees]."""
+"""Tilt that an object must withstand without falling over [degrees]."""
 _CONTACT = 0.01
-"""Height up to which its lowest parts touch the table, as a share of the longest extent."""
+"""Maximum height of vertices that touch the table, as a fraction of the longest extent."""
 _BASE = 0.06
-"""Most that is cut off an object for a flat base, as a share of its height."""
+"""Maximum height that is cut off an object for a flat base, as a fraction of its height."""
 _STAGES = 6
 
 
 @dataclass(frozen=True)
 class ImportSettings:
-    """How a splat file becomes an asset.
+    """Settings of the conversion of a splat file to an asset.
 
     Attributes:
-        up: Axis of the file that points up; found if None.
+        up: Axis of the file that points up; estimated if None.
         units: Metres per unit of the file.
         size: Longest extent [m], instead of units.
-        crop: Lower and upper corner of the box that is kept, in the file's units and axes.
-        without_table: Remove the flat surface that the object stands on, and what is below it.
-        flat_base: Cut off what hangs below the base, until it stands: nobody saw the bottom of what stood somewhere.
-        views: Pictures that the surface is found by.
-        view_size: Their edge [px].
-        surface: How the mesh is reconstructed.
+        crop: Lower and upper corner of the box outside of which Gaussians are removed, in the file's units and axes.
+        without_table: Remove the flat surface that the object stands on, and everything below it.
+        flat_base: Cut off parts below the base until the object stands, because captures rarely show the underside.
+        views: Number of pictures for the surface reconstruction.
+        view_size: Edge length of these pictures [px].
+        surface: Settings of the surface reconstruction.
     """
 
     up: Axis | None = None
@@ -95,11 +95,11 @@ class ImportSettings:
 
 @dataclass(frozen=True, eq=False)
 class ImportSupport:
-    """A horizontal surface of surroundings that things can be dropped on, in the middle of which the origin is.
+    """Horizontal surface of an environment for dropping objects; its centre is the origin.
 
     Attributes:
-        size: Along x and y [m].
-        share: Share of what is seen that lies in it.
+        size: Size along x and y [m].
+        share: Fraction of the visible area that lies in the surface.
     """
 
     size: tuple[float, float]
@@ -108,21 +108,22 @@ class ImportSupport:
 
 @dataclass(frozen=True, eq=False)
 class Imported:
-    """An asset, and what came of its file on the way.
+    """Imported asset and the results of the import.
 
     Attributes:
-        asset: In metres, or in the file's units where these are unknown; z up. An object stands on z = 0, the middle of
-            its base in the origin; surroundings have the middle of the surface in the origin that most of them lie in.
-        upright: Why up is where it is, in the file's axes.
-        found: Number of Gaussians of the file.
-        removed: Number of those removed, by the reason.
-        rubbish: The removed ones, in the asset's frame.
-        support: What things can be dropped on in surroundings, or None.
-        views: Asset and mesh from where the mesh was not fitted to.
-        mesh_iou: Mean IoU of the mesh's silhouette with that of the splats in these, of an object.
-        offset: Shift between mesh and splats' surface, as a share of the mesh's diagonal.
-        watertight: Whether the mesh encloses a volume.
-        topples: Whether it would fall over as it stands there.
+        asset: Asset in metres, or in the file's units where these are unknown; z up. An object stands on z = 0 with the
+            centre of its base at the origin. For an environment, the origin is the centre of its largest horizontal
+            surface.
+        upright: Estimated up direction, in the file's axes, and its reason.
+        found: Number of Gaussians in the file.
+        removed: Number of removed Gaussians, by reason.
+        rubbish: Removed Gaussians, in the asset's frame.
+        support: Surface of an environment for dropping objects, or None.
+        views: Pictures of asset and mesh from views that were not used for the reconstruction.
+        mesh_iou: Mean IoU of the silhouettes of mesh and splats in these views, for an object.
+        offset: Shift between the mesh and the surface of the splats, as a fraction of the mesh's diagonal.
+        watertight: True if the mesh encloses a volume.
+        topples: True if the object would fall over in its pose.
     """
 
     asset: Asset
@@ -139,13 +140,13 @@ class Imported:
 
     @property
     def removed_of_all(self) -> str:
-        """How many Gaussians of the file are left, and how many went why, in words."""
+        """Summary of the remaining and the removed Gaussians, as text."""
         removed = ", ".join(f"{count} {reason}" for reason, count in self.removed.items() if count) or "none"
         return f"{len(self.asset.splats)} of {self.found}; removed: {removed}"
 
     @property
     def misses(self) -> tuple[str, ...]:
-        """What is questionable, a sentence each with what to do."""
+        """Problems of the asset with their remedies, a sentence each."""
         asset, found, thresholds = self.asset, [], Thresholds()
         if asset.units == "unknown":
             found.append("how large it is is unknown: give --size, the longest extent in metres, or --units")
@@ -185,22 +186,23 @@ def import_splats(
     capture_light: Literal["uniform", "scene"] | None = None,
     progress: Progress | None = None,
 ) -> Imported:
-    """Make an asset of a splat file.
+    """Convert a splat file to an asset.
 
     Args:
         path: Any file that :meth:`mitsplat.Splats.load` reads.
-        name: Of the asset.
-        class_name: Class that detectors learn; the name if None.
-        kind: Objects can be dropped: they get a closed mesh and convex pieces. Environments stay where they are.
-        settings: Up, scale, what to cut away, and resolutions.
+        name: Name of the asset.
+        class_name: Class label for detectors; ``name`` if None.
+        kind: ``object`` or ``environment``. Objects can be dropped, so they get a closed mesh and convex pieces.
+            Environments are static.
+        settings: Up axis, scale, removal of parts, and resolutions.
         density: Mass density [kg/m^3]; 1000 if neither this nor ``mass`` is given.
         mass: Mass [kg].
         friction: Coulomb friction coefficient.
-        capture_light: As :class:`mitsplat.Asset` has it; by default ``uniform`` of objects, ``scene`` of environments.
-        progress: Told what is being done.
+        capture_light: As in :class:`mitsplat.Asset`; by default ``uniform`` for objects, ``scene`` for environments.
+        progress: Callback that gets the current stage.
 
     Raises:
-        InputError: If the file cannot be read, nothing of it is left, or a value breaks a rule.
+        InputError: If the file cannot be read, no Gaussian remains, or a value breaks a rule.
     """
     path = Path(path)
     if density is not None and mass is not None:
@@ -300,7 +302,7 @@ def import_splats(
 
 
 class _Cleaner:
-    """The Gaussians of a file that are left, and why the others went."""
+    """Remaining Gaussians of a file, and the reasons for the removal of the others."""
 
     def __init__(self, path: Path, splats: Splats) -> None:
         self._path, self._all, self._kept = path, splats, np.ones(len(splats), dtype=bool)
@@ -308,22 +310,22 @@ class _Cleaner:
 
     @property
     def splats(self) -> Splats:
-        """What is left."""
+        """Remaining Gaussians."""
         return self._all.select(self._kept)
 
     def rubbish(self) -> Splats:
-        """What was removed."""
+        """Return the removed Gaussians."""
         return self._all.select(~self._kept)
 
     def remove(self, reason: str, which: BoolArray, otherwise: str) -> None:
-        """Remove some of those that are left, and refuse to remove all."""
+        """Remove some of the remaining Gaussians, and raise an error if none would remain."""
         self.removed[reason] = self.removed.get(reason, 0) + int(which.sum())
         self._kept[np.flatnonzero(self._kept)[which]] = False
         if not self._kept.any():
             raise InputError(f"{self._path}: {otherwise}")
 
     def remove_floaters(self, kind: str) -> None:
-        """Remove what is invisible, too large to be part of an object, or touches no large part."""
+        """Remove Gaussians that are invisible, too large to be part of an object, or connected to no large part."""
         self.remove("invisible", self.splats.opacities < FAINT, "all Gaussians are invisible")
         if kind == "object":
             splats = self.splats
@@ -337,16 +339,16 @@ class _Cleaner:
 
 
 def _extent(splats: Splats) -> float:
-    """Longest extent of the bulk of the Gaussians."""
+    """Return the longest extent of the Gaussians without outliers."""
     return float(np.ptp(np.quantile(splats.means, (_BULK, 1 - _BULK), axis=0), axis=0).max())
 
 
 def _cameras(
     splats: Splats, kind: str, settings: ImportSettings, count: int, *, lowest: float, turn: float = 0.0
 ) -> list[Camera]:
-    """Views from all around, from a height of ``lowest`` upwards, where 1 is straight above and -1 below.
+    """Return views from all around, at heights from ``lowest`` upwards; 1 is straight above and -1 straight below.
 
-    Of surroundings they look at the origin, from within their reach.
+    Views of an environment look at the origin, from within its extent.
     """
     low, high = np.quantile(splats.means.astype(np.float64), (_BULK, 1 - _BULK), axis=0)
     if kind == "object":
@@ -363,7 +365,7 @@ def _cameras(
 
 
 def _surface(splats: Splats, kind: str, settings: ImportSettings, lowest: float) -> trimesh.Trimesh | None:
-    """The mesh of what the splats show; None of surroundings in which nothing is opaque."""
+    """Reconstruct the mesh of the splats; return None for an environment without opaque parts."""
     cameras = _cameras(splats, kind, settings, settings.views, lowest=lowest)
     if kind == "object":
         masks = [render_splats(splats, camera, quality="fast").alpha for camera in cameras]
@@ -375,7 +377,7 @@ def _surface(splats: Splats, kind: str, settings: ImportSettings, lowest: float)
 
 
 def _pieces(mesh: trimesh.Trimesh) -> tuple[trimesh.Trimesh, ...]:
-    """Convex pieces of every part."""
+    """Return convex pieces of every connected part."""
     parts = sorted(mesh.split(only_watertight=True), key=lambda part: -float(part.volume)) or [mesh]
     small = [part for part in parts[1:] if part.volume < _LEAF * parts[0].volume]
     large = parts[: len(parts) - len(small)]
@@ -384,9 +386,11 @@ def _pieces(mesh: trimesh.Trimesh) -> tuple[trimesh.Trimesh, ...]:
 
 
 def _on_support(splats: Splats, plane: Plane) -> tuple[ImportSupport | None, Float64Array]:
-    """The horizontal surface of surroundings, and the motion that takes its middle to the origin, its sides to x, y.
+    """Return the horizontal surface of an environment, and the transform that moves its centre to the origin.
 
-    No surface, and no motion, where what lies in the plane spans no area.
+    The transform aligns the sides of the surface with x and y. If the Gaussians in the plane span no area, the surface
+    is
+    None and the transform is the identity.
     """
     inside = np.abs(splats.means[:, 2] - plane.height) <= 3 * plane.thickness
     flat = splats.means[inside & (splats.opacities > 0.1), :2].astype(np.float64)
@@ -399,7 +403,7 @@ def _on_support(splats: Splats, plane: Plane) -> tuple[ImportSupport | None, Flo
     corners = np.array(envelope.exterior.coords)[:4]
     along = corners[1] - corners[0]
     across = corners[2] - corners[1]
-    if np.abs(along[0]) < np.abs(along[1]):  # the smaller turn
+    if np.abs(along[0]) < np.abs(along[1]):  # the smaller rotation
         along, across = across, along
     angle = float(np.arctan2(along[1], along[0]))
     angle -= np.pi * np.round(angle / np.pi)
@@ -410,7 +414,7 @@ def _on_support(splats: Splats, plane: Plane) -> tuple[ImportSupport | None, Flo
 
 
 def _cut_base(path: Path, mesh: trimesh.Trimesh) -> tuple[trimesh.Trimesh, float]:
-    """A solid without its lowest part, as little of it as makes it stand, and the height of the cut."""
+    """Cut off the lowest part of a solid, as little as possible, so that it stands; also return the height."""
     (low, *_), high = mesh.bounds[:, 2], mesh.bounds[1] + mesh.scale
     for height in low + _BASE * np.linspace(0, 1, 11)[1:] * float(mesh.extents[2]):
         corner = np.append(mesh.bounds[0, :2] - mesh.scale, height)
@@ -422,7 +426,7 @@ def _cut_base(path: Path, mesh: trimesh.Trimesh) -> tuple[trimesh.Trimesh, float
 
 
 def _topples(mesh: trimesh.Trimesh, contact: float = _CONTACT) -> bool:
-    """Whether something falls over or rolls away when it is put down as it is and tilted by :data:`_TILT`."""
+    """Return True if an object falls over or rolls away when it is put down in its pose and tilted by :data:`_TILT`."""
     low = float(mesh.bounds[0, 2])
     middle = mesh.center_mass if mesh.is_watertight else mesh.centroid
     touching = mesh.vertices[mesh.vertices[:, 2] <= low + contact * float(mesh.extents.max()), :2]

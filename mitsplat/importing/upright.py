@@ -1,8 +1,8 @@
-"""Which way is up in splats whose file does not say so, and the flat surfaces that things stand on.
+"""Up direction of splats whose file does not state it, and the flat surfaces that objects stand on.
 
-Files of splats name no axes. Two things tell of the vertical: what is usual for the format, and a large flat surface
-that everything else lies above, such as the table that an object was photographed on or the floor of a room. Planes are
-found by random samples of three points (Fischler and Bolles 1981, RANSAC) and fitted to their inliers.
+Splat files name no axes. Two cues define the vertical: the usual up axis of the format, and a large flat surface below
+everything else, such as the table under an object or the floor of a room. Planes are found by random samples of three
+points (Fischler and Bolles 1981, RANSAC) and fitted to their inliers.
 """
 
 from __future__ import annotations
@@ -22,31 +22,31 @@ from mitsplat.gaussians.splat_files import Axis
 from mitsplat.reconstruct.segment_splats import visible_area
 
 POINTS = 4000
-"""Gaussians that planes are looked for among, drawn by the area that they show."""
+"""Number of Gaussians for the search of planes, drawn in proportion to their visible area."""
 _SAMPLES = 3000
 _TOLERANCE = 0.006
-"""Distance from a plane up to which a point belongs to it, as a share of the diagonal of what there is."""
+"""Maximum distance of inliers from a plane, as a fraction of the diagonal of all points."""
 _BELOW = 0.01
-"""Share of the points that may lie below what an object stands on."""
+"""Maximum fraction of the points below the surface that an object stands on."""
 _NEAR = 35.0
-"""Angle to the usual axis up to which a plane is taken for what is horizontal [degrees]."""
+"""Maximum angle between the usual up axis and the normal of a horizontal plane [degrees]."""
 _SMALL, _LARGE = 0.04, 0.25
-"""Shares of the points from which a plane near the usual axis, or any other one, says where up is."""
+"""Minimum fractions of inliers with which a plane defines up: near the usual axis, and in any other orientation."""
 _BROAD = 0.85
-"""Share of the ground below everything that a surface must span for an object to be turned by it."""
+"""Minimum span of a surface below an object, relative to the object's footprint, with which it defines up."""
 _SNAP = 1.0
-"""Angle up to which the usual axis itself is taken [degrees]."""
+"""Angle up to which the up direction snaps to the usual axis [degrees]."""
 
 
 @dataclass(frozen=True, eq=False)
 class Plane:
-    """A flat surface.
+    """Flat surface.
 
     Attributes:
         normal: Unit normal, shape (3,).
-        height: Distance from the origin along it.
-        share: Share of what there is that lies in it.
-        thickness: Standard deviation of that from the plane.
+        height: Distance from the origin along the normal.
+        share: Fraction of the points that lie in the plane.
+        thickness: Standard deviation of these points from the plane.
     """
 
     normal: Float64Array
@@ -57,12 +57,12 @@ class Plane:
 
 @dataclass(frozen=True, eq=False)
 class Upright:
-    """Where up is.
+    """Up direction of splats.
 
     Attributes:
         up: Unit vector in the file's axes, shape (3,).
-        reason: Why, in a few words.
-        support: The horizontal plane that things stand on, or None.
+        reason: Short text that explains the choice.
+        support: Horizontal plane that objects stand on, or None.
     """
 
     up: Float64Array
@@ -71,15 +71,15 @@ class Upright:
 
     @property
     def rotation(self) -> Float64Array:
-        """The smallest rotation that takes up to z, shape (3, 3)."""
+        """Smallest rotation that maps up to z, shape (3, 3)."""
         return rotation_to_z(self.up)
 
 
 def axis_vector(axis: str) -> Float64Array:
-    """Unit vector of an axis such as ``-y``.
+    """Return the unit vector of an axis such as ``-y``.
 
     Raises:
-        InputError: If it is none.
+        InputError: If the name is no axis.
     """
     if axis not in get_args(Axis):
         raise InputError(f"up must be auto, {', '.join(get_args(Axis))} (got {axis!r})")
@@ -87,7 +87,7 @@ def axis_vector(axis: str) -> Float64Array:
 
 
 def rotation_to_z(up: Float64Array) -> Float64Array:
-    """The smallest rotation that takes a unit vector to z, shape (3, 3); of -z the one about x."""
+    """Return the smallest rotation that maps a unit vector to z, shape (3, 3); for -z, the rotation about x."""
     axis = np.cross(up, (0.0, 0.0, 1.0))
     sine = float(np.linalg.norm(axis))
     axis = axis / sine if sine > 1e-9 else np.array([1.0, 0.0, 0.0])
@@ -95,13 +95,14 @@ def rotation_to_z(up: Float64Array) -> Float64Array:
 
 
 def find_up(splats: Splats, kind: str, usual: Axis, given: Axis | None = None) -> Upright:
-    """Which way is up, and the flat surface that things stand on.
+    """Estimate the up direction, and find the flat surface that objects stand on.
 
     Args:
-        splats: What there is, without floaters.
-        kind: Of ``object`` nearly all lies above what it stands on; an ``environment`` may go on below a table.
-        usual: Axis that points up where nothing says otherwise.
-        given: Axis that does; then only the surface is looked for.
+        splats: Splats without floaters.
+        kind: ``object`` or ``environment``. Nearly all points of an object lie above its support; an environment may
+            continue below a table.
+        usual: Axis that points up if there is no other evidence.
+        given: Known up axis; only the surface is searched then.
     """
     points = visible_points(splats)
     tolerance = _TOLERANCE * float(np.linalg.norm(np.ptp(np.quantile(points, (0.01, 0.99), axis=0), axis=0)))
@@ -113,7 +114,7 @@ def find_up(splats: Splats, kind: str, usual: Axis, given: Axis | None = None) -
     if given is not None:
         return Upright(wanted, f"{given}, as given", near)
     name = f"{usual}, as is usual for such files"
-    # What is narrower than the object may be a sole or a side of it, which need not be level.
+    # A plane narrower than the object may be its sole or one of its sides, which need not be level.
     if near is not None and (kind == "environment" or _reach(points, near, tolerance) >= _BROAD):
         angle = float(np.degrees(np.arccos(np.clip(near.normal @ wanted, -1, 1))))
         flat = f"a flat surface with {near.share:.0%} of what is seen faces there"
@@ -132,7 +133,7 @@ def find_up(splats: Splats, kind: str, usual: Axis, given: Axis | None = None) -
 
 
 def visible_points(splats: Splats) -> Float64Array:
-    """Centres (:data:`POINTS`, 3) of Gaussians, drawn with the same chance for the same opaque area."""
+    """Draw centres (:data:`POINTS`, 3) of Gaussians with probabilities proportional to their opaque area."""
     weight = visible_area(splats)
     rng = np.random.default_rng(0)
     chosen = rng.choice(len(splats), POINTS, p=weight / weight.sum()) if weight.sum() > 0 else np.arange(len(splats))
@@ -147,14 +148,14 @@ def largest_plane(
     within: float = 180.0,
     below: float = 1.0,
 ) -> Plane | None:
-    """The plane that most points (N, 3) lie in, or None.
+    """Return the plane with the most inliers among points (N, 3), or None.
 
     Args:
-        points: The points.
-        tolerance: Distance up to which one belongs to a plane.
-        towards: Direction that its normal faces; towards more of the points if None.
-        within: Angle that it may differ from there [degrees].
-        below: Share of the points that may lie behind it.
+        points: Points.
+        tolerance: Maximum distance of inliers from the plane.
+        towards: Direction that the normal faces; if None, it faces the side with more points.
+        within: Maximum angle between the normal and that direction [degrees].
+        below: Maximum fraction of the points behind the plane.
     """
     rng = np.random.default_rng(0)
     corners = points[rng.integers(0, len(points), (_SAMPLES, 3))]
@@ -178,7 +179,7 @@ def largest_plane(
 
 
 def _fitted(points: Float64Array, plane: Float64Array, tolerance: float) -> Plane:
-    """A plane through its inliers by least squares, three times over; ``plane`` is normal and height."""
+    """Refine a plane by least squares on its inliers, in three iterations; ``plane`` is normal and height."""
     normal, height = plane[:3], plane[3]
     inside: BoolArray = np.abs(points @ normal - height) <= tolerance
     for _ in range(3):
@@ -195,7 +196,7 @@ def _fitted(points: Float64Array, plane: Float64Array, tolerance: float) -> Plan
 
 
 def _reach(points: Float64Array, plane: Plane, tolerance: float) -> float:
-    """How much of the ground below all points those in the plane span, 0 to 1."""
+    """Return the area of the points in the plane relative to the footprint of all points, 0 to 1."""
     flat = points @ rotation_to_z(plane.normal).T
     contact = np.abs(flat[:, 2] - plane.height) <= tolerance
     spans = []
@@ -207,9 +208,9 @@ def _reach(points: Float64Array, plane: Plane, tolerance: float) -> float:
 
 
 def cut_support(splats: Splats, support: Plane) -> BoolArray:
-    """Which Gaussians (N,) are left without a flat surface and what is below it.
+    """Return a mask (N,) of the Gaussians that remain after removal of a flat surface and everything below it.
 
-    What lies in the surface stays where something stands on it: where Gaussians lie right above.
+    Gaussians in the surface remain where an object stands on it, that is, where Gaussians lie directly above.
     """
     margin = 3 * support.thickness
     turn = rotation_to_z(support.normal)

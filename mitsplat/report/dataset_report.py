@@ -1,4 +1,4 @@
-"""One page to look at a dataset by: a single HTML file that needs no network, no server and no other file."""
+"""Dataset report: a single HTML file that needs no network, no server and no other file."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ from mitsplat.report.variety import Variety
 from mitsplat.storage.files import Record, open_regular, parse_json, write_text
 
 SAMPLES = 12
-"""Images that are shown, evenly spread over the dataset."""
+"""Number of sample images, evenly spread over the dataset."""
 BRIGHTNESS_IMAGES = 200
-"""Images, evenly spread, that the brightness is read from."""
+"""Number of images for the brightness statistics, evenly spread over the dataset."""
 
 _THUMBNAIL = 640
 _OVERLAYS = {"mask": "Masks", "box": "Boxes", "name": "Names", "alone": "Silhouettes, hidden parts included"}
@@ -42,7 +42,7 @@ _SHARES = ("visible_fraction", "truncation", "agreement", "boundary_f1")
 
 
 class _Statistics:
-    """What is counted while the manifest is read once, for images of a size [px]."""
+    """Statistics of the manifest, counted in one pass, for images of ``size`` (width, height) [px]."""
 
     def __init__(self, size: tuple[int, int]) -> None:
         self.size = size
@@ -70,10 +70,10 @@ class _Statistics:
 
 
 def write_report(root: str | Path, out: str | Path | None = None) -> tuple[Path, Audit, list[str]]:
-    """Write the page of a dataset, ``report.html`` in it by default.
+    """Write the report of a dataset, by default to ``report.html`` in its folder.
 
     Returns:
-        Its path, the audit that it shows, and its warnings of what a detector cannot learn from the images.
+        Path of the report, the audit in it, and warnings about gaps that a detector cannot learn from the images.
 
     Raises:
         InputError: If the folder is no dataset of mitsplat.
@@ -128,14 +128,14 @@ def _summary(content: dict[str, Any], counted: _Statistics, audit: Audit, root: 
 
 
 def _left_out(counted: _Statistics) -> str:
-    """What did not come to rest, most frequent first."""
+    """List the objects that did not come to rest, most frequent first."""
     told = Counter(text for objects in counted.left_out.values() for text in objects).most_common(5)
     often = ", ".join(f"{count} {text}" for text, count in told)
     return f"{len(counted.left_out)} layouts lack objects that did not come to rest: {often}"
 
 
 def _order_error(counted: _Statistics) -> str:
-    """Of display-encoded colours, over the images that know theirs."""
+    """Format the estimated order error of display-encoded colours, over the images that have an estimate."""
     found, images = counted.order_errors, sum(counted.images.values())
     if not found:
         return "not estimated by this preset"
@@ -214,7 +214,7 @@ def _sample(root: Path, record: Record) -> str:
 
 
 def _brightness(root: Path, records: Iterable[Record]) -> tuple[np.ndarray, Histogram]:
-    """Counts of pixels by luma in 32 bins, and of images by their mean luma."""
+    """Count pixels by luma in 32 bins, and images by their mean luma."""
     counts, means = np.zeros(32, dtype=np.int64), Histogram((0, 255))
     for record in records:
         grey = read_picture(root / image_file(record), cv2.IMREAD_GRAYSCALE)
@@ -225,7 +225,7 @@ def _brightness(root: Path, records: Iterable[Record]) -> tuple[np.ndarray, Hist
 
 
 def _seconds(root: Path) -> dict[str, float]:
-    """Median seconds of every stage over the frames."""
+    """Return the median seconds of every stage over the frames."""
     stages: defaultdict[str, array[float]] = defaultdict(lambda: array("f"))
     for line in _lines(root / "timings.jsonl"):
         for stage, seconds in line.items():
@@ -280,7 +280,7 @@ def _details(content: dict[str, Any]) -> str:
 
 
 def _lines(path: Path) -> Iterator[dict[str, Any]]:
-    """The objects that lines of a file hold, which may be missing or torn."""
+    """Yield the JSON objects in the lines of a file; the file may be missing or damaged."""
     with suppress(FileNotFoundError), open_regular(path) as file:
         for line in read_lines(file):
             with suppress(ValueError):

@@ -1,4 +1,4 @@
-"""What was drawn for a dataset, how its objects were seen, and what a detector cannot learn from it."""
+"""Variety of a dataset: drawn values, viewpoints of its objects, and gaps that a detector cannot learn."""
 
 from __future__ import annotations
 
@@ -17,15 +17,18 @@ from mitsplat.pages.svg_charts import Histogram, bars, discs
 from mitsplat.storage.files import Record
 
 OCCLUDED = 0.05
-"""Share of an instance's pixels in the image that are hidden if it is occluded."""
+"""Fraction of hidden pixels above which an instance counts as occluded."""
 FEW, FEW_VIEWS = 20, 100
-"""Images or instances of which nothing is concluded, and instances of an object whose viewpoints are not judged."""
+"""Minimum number of images or instances for a warning, and of instances of an object for a warning about viewpoints."""
 UNEVEN = 3.0
-"""Factor between the instances of two classes that is warned of."""
+"""Ratio of the instances of two classes above which a warning is given."""
 LEAST_OCCLUDED, LEAST_SEEN, ONE_SIDED = 0.1, 0.8, 0.95
-"""Shares of occluded instances, of directions that an object is seen from, and of images lit from one side."""
+"""Minimum fractions of occluded instances and of covered view directions, maximum fraction of images lit from one side.
+"""
 RINGS, SECTORS = 3, 8
-"""Cells of a hemisphere: rings of equal height, hence of equal area (Archimedes), cut into sectors; 30 degrees wide."""
+"""Cells of a hemisphere: rings of equal height, hence of equal area (Archimedes), divided into sectors; 30 degrees
+wide.
+"""
 
 _NO_DRAWS = frozenset(
     {
@@ -44,16 +47,16 @@ _NO_DRAWS = frozenset(
         "depth_sensor_scale",
     }
 )
-"""Keys of a frame's record that state no draw, or that are looked at in another way."""
+"""Keys of a frame's record that contain no drawn values, or that are evaluated separately."""
 _NO_VALUES = frozenset({"id", "entry", "asset", "seed"})
 _MOST_NUMBERS, _MOST_TEXTS, _MOST_PAIRS = 1 << 16, 1000, 20
 
 
 class Variety:
-    """What is counted while the manifest is read once.
+    """Variety of a dataset, counted in one pass over the manifest.
 
     Args:
-        content: What ``dataset.json`` says.
+        content: Content of ``dataset.json``.
     """
 
     def __init__(self, content: Mapping[str, Any]) -> None:
@@ -84,14 +87,14 @@ class Variety:
         self._add_directions(record)
 
     def _add_occlusion(self, labels: list[dict[str, Any]], size: list[int]) -> None:
-        """Count which classes hide which: what is seen of one within the whole outline of the other."""
+        """Count the pairs of classes where the visible part of one overlaps the silhouette of the other."""
         hidden = [label for label in labels if label["visible_fraction"] < 1 - OCCLUDED]
         self._occluded.update(label["class"] for label in hidden)
         if not hidden:
             return
         whole = [{"size": size[::-1], "counts": label["amodal_rle"]} for label in hidden]
         seen = [{"size": size[::-1], "counts": label["rle"]} for label in labels]
-        # Where the second is a crowd, their intersection is divided by the area of the first alone.
+        # For crowd annotations, pycocotools divides the intersection by the area of the first mask alone.
         shares = np.asarray(coco_mask.iou(whole, seen, [1] * len(seen))).reshape(len(hidden), len(labels))
         for label, row in zip(hidden, shares, strict=True):
             near = {
@@ -102,7 +105,7 @@ class Variety:
             self._pairs.update(f"{other} hides {label['class']}" for other in near)
 
     def _add_directions(self, record: Record) -> None:
-        """Count where each object is seen from, in its own coordinates, and the image's side that light comes from."""
+        """Count view directions of objects in their own coordinates, and the side of the image that light comes from."""
         labels, camera = record["labels"]["instances"], np.array(record["camera"]["world_from_camera"])
         places = []
         for label in labels:
@@ -116,7 +119,7 @@ class Variety:
             self._sides["right" if x > 0 else "left"] += 1
 
     def warnings(self) -> list[str]:
-        """What a detector cannot learn from these images, a sentence each."""
+        """Return warnings about gaps that a detector cannot learn from these images, a sentence each."""
         found = [*self._class_warnings(), *self._instance_warnings()]
         for name, counts in sorted(self._seen.items()):
             cells = np.count_nonzero(counts[:RINGS])
@@ -152,7 +155,7 @@ class Variety:
             yield "no instance is cut off by the image's border"
 
     def sections(self) -> str:
-        """Parts of the page: warnings and directions, and the histogram of every draw."""
+        """Return parts of the page: warnings, view directions, and the histogram of every drawn value."""
         warned = "".join(f"<li>{html.escape(text)}</li>" for text in self.warnings())
         warned = f"<ul>{warned}</ul>" if warned else '<p class="good">Nothing to warn of</p>'
         seen = dict(sorted(self._seen.items()))
@@ -199,7 +202,7 @@ class Variety:
 
 
 class _Sample:
-    """Numbers, evenly thinned out where they are too many to keep."""
+    """Bounded list of numbers; every second one is removed when the list is full."""
 
     def __init__(self) -> None:
         self.values = array("d")
@@ -215,7 +218,7 @@ class _Sample:
 
 
 def cell_of(direction: Float64Array) -> tuple[int, int]:
-    """Ring, from the top down, and sector of a direction of any length; both hemispheres have :data:`RINGS` rings."""
+    """Return ring, from the top down, and sector of a direction; both hemispheres have :data:`RINGS` rings."""
     x, y, z = direction / max(float(np.linalg.norm(direction)), 1e-12)
     ring = int((1 - z) / 2 * 2 * RINGS)
     sector = int((math.atan2(y, x) / math.tau % 1) * SECTORS)
@@ -223,7 +226,7 @@ def cell_of(direction: Float64Array) -> tuple[int, int]:
 
 
 def _values(value: Any, name: str) -> Iterator[tuple[str, float | str]]:
-    """Numbers and texts in a part of a record, by their place in it; what is of an entry counts with that entry."""
+    """Yield numbers and texts in a part of a record by key path; values of an entry are grouped by its number."""
     if isinstance(value, bool | str):
         yield name, str(value)
     elif isinstance(value, int | float):
@@ -239,7 +242,7 @@ def _values(value: Any, name: str) -> Iterator[tuple[str, float | str]]:
 
 
 def _camera_values(record: Record) -> Iterator[tuple[str, float]]:
-    """What a camera's pose comes to; azimuth and elevation are where it is, seen from what it looks at."""
+    """Yield values of a camera's pose and lens; azimuth and elevation are its direction seen from its target."""
     camera = record["camera"]
     pose = np.array(camera["world_from_camera"])
     right, forward = pose[:3, 0], pose[:3, 2]
@@ -256,7 +259,10 @@ def _camera_values(record: Record) -> Iterator[tuple[str, float]]:
 
 
 def _key_light(lights: list[dict[str, Any]], point: Float64Array) -> Float64Array | None:
-    """Directions to local lights summed, each by its irradiance at a point but for angles; None if there is none."""
+    """Return the sum of the directions to local lights, weighted by their irradiance at a point without cosine terms.
+
+    The result is None if there is no local light.
+    """
     total = np.zeros(3)
     for light in lights:
         if light.get("position") is not None:

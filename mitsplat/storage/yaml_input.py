@@ -28,6 +28,8 @@ MAX_DEPTH = 32
 """What nests deeper is hostile, or an alias that contains itself."""
 MAX_BYTES = 8 << 20
 MAX_VALUES = 200_000
+MAX_NUMBER = 1e30
+"""Largest number: the fourth power of a larger one may overflow."""
 """What has more values than this is hostile: aliases of aliases multiply."""
 
 RULES = {
@@ -195,6 +197,10 @@ def _plain(node: Any, keys: KeyPath, tree: CommentedMap, path: Path, values: Ite
         return [_plain(value, (*keys, position), tree, path, values) for position, value in enumerate(node)]
     if node is None or isinstance(node, bool):
         return node
+    if isinstance(node, int | float) and MAX_NUMBER < abs(node) < float("inf"):
+        got = f"{float(node):g}" if isinstance(node, float) else f"a whole number of {int(node).bit_length()} bits"
+        rule = f"numbers must be from {-MAX_NUMBER:g} to {MAX_NUMBER:g} (got {got})"
+        raise InputError(_sentence(path, _line(tree, keys), keys, rule))
     for scalar in (int, float, str):
         if isinstance(node, scalar):
             return scalar(node)

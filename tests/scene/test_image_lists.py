@@ -59,3 +59,11 @@ def test_links_that_multiply_paths_are_bounded(tmp_path: Path, monkeypatch: pyte
 def test_what_is_no_pattern_is_refused(tmp_path: Path, pattern: str) -> None:
     with pytest.raises(InputError, match="must be a pattern of files or folders"):
         glob_below(tmp_path, pattern)
+
+
+@pytest.mark.parametrize("pattern", ["[" * 100_000, "*/" * 1_000_000, "*a" * 5_000])
+def test_a_long_pattern_is_refused_at_once(tmp_path: Path, pattern: str) -> None:
+    begun = time.process_time()
+    with pytest.raises(InputError, match=rf"of at most 4096 characters \(got {len(pattern)}\)$"):
+        glob_below(tmp_path, pattern)
+    assert time.process_time() - begun < 1

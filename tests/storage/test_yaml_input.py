@@ -173,3 +173,21 @@ def test_any_text_is_read_or_refused(tmp_path_factory: pytest.TempPathFactory, t
         load_yaml(path, Drawing)
     except InputError as error:
         assert "\n" not in str(error)
+
+
+@pytest.mark.parametrize(
+    ("number", "got"),
+    [
+        ("1e300", "1e+300"),
+        ("-2e30", "-2e+30"),
+        ("1" + "0" * 300, "a whole number of 997 bits"),
+        ("0x" + "f" * 100_000, "a whole number of 400000 bits"),
+    ],
+)
+def test_numbers_that_would_overflow_are_refused(tmp_path: Path, number: str, got: str) -> None:
+    path = tmp_path / "a.yaml"
+    path.write_text(f"title: a\nshapes:\n  - {{kind: circle, radius: {number}}}\n")
+    with pytest.raises(InputError) as raised:
+        load_yaml(path, Drawing)
+    rule = f"numbers must be from -1e+30 to 1e+30 (got {got})"
+    assert str(raised.value) == f"{path}:3: shapes[0].radius: {rule}"

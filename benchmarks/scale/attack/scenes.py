@@ -168,14 +168,10 @@ VALUES: Mapping[str, tuple[str, Build]] = {
     "class that is a path": ("write outside", _class("../../outside/made")),
 }
 
-_MAY_BE_GOOD = (
-    "class that turns",
-    "class of 5,000",
-    "class that is a path",
-    "pattern of light",
-    "pattern of backdrops",
-    "pattern of nine",
-)
+_WRONG = ("read outside", "break files of labels", "break a terminal")
+"""Harm for which a scene must be refused; of others, the check may also say what is questionable."""
+_MAY_BE_GOOD = "class that turns"
+
 
 ATTACKS = (
     *(
@@ -183,7 +179,13 @@ ATTACKS = (
         for name, build in TEXTS.items()
     ),
     *(
-        Attack(f"scene: {name}", tries, build, [CHECK], ANY if name.startswith(_MAY_BE_GOOD) else REFUSED)
+        Attack(
+            f"scene: {name}",
+            tries,
+            build,
+            [CHECK],
+            REFUSED if tries in _WRONG and not name.startswith(_MAY_BE_GOOD) else ANY,
+        )
         for name, (tries, build) in VALUES.items()
     ),
     Attack("scene: render of 8,000 x 6,000", "fill memory", VALUES["image of 8,000 x 6,000"][1], [RENDER], REFUSED),

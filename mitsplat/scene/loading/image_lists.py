@@ -19,6 +19,8 @@ WILDCARDS = frozenset("*?[")
 MAX_ENTRIES = 1_000_000
 """Entries of folders that a pattern may look at."""
 MAX_PARTS = 64
+MAX_LENGTH = 4096
+"""Length of a pattern: that of the longest path [characters]."""
 
 
 def glob_below(folder: Path, pattern: str) -> list[Path]:
@@ -30,6 +32,10 @@ def glob_below(folder: Path, pattern: str) -> list[Path]:
     Raises:
         InputError: If it is no pattern, or has to look at more than :data:`MAX_ENTRIES` entries.
     """
+    if len(pattern) > MAX_LENGTH:
+        raise InputError(
+            f"must be a pattern of files or folders of at most {MAX_LENGTH} characters (got {len(pattern)})"
+        )
     absolute = Path(pattern).is_absolute()
     parts = [part for part in pattern.split("/") if part not in ("", ".")]
     parts = [part for number, part in enumerate(parts) if part != "**" or parts[number - 1 : number] != ["**"]]

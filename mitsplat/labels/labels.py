@@ -1,15 +1,16 @@
-"""Labels of a frame: exclusive masks, boxes, outlines and poses of the instances that can be seen, and their audit.
+"""Labels of a frame: exclusive masks, boxes, outlines and poses of the visible instances, with statistics of omissions.
 
-Every label derives from the integer id map of the frame, so masks are exclusive and respect occlusion. These rules, in
-this order, decide what is labelled; what they drop or mark is counted and never silent:
+Every label derives from the integer id map of the frame, so masks are exclusive and respect occlusion. The following
+rules, in this order, select the labels. All omissions and marks are counted:
 
 1. a connected part (8-connectivity) of fewer than ``min_fragment`` pixels is removed from its instance;
 2. an instance left with fewer than ``min_pixels`` pixels is dropped;
-3. an instance of which less than ``min_visible`` is visible is ``occluded``, and one whose splats and proxy agree by
-   less than ``min_agreement`` is ``disagreeing``; both are dropped or only marked, as ``below_threshold`` says.
+3. an instance with a visible fraction below ``min_visible`` is ``occluded``. An instance whose splats and proxy agree
+by
+   less than ``min_agreement`` is ``disagreeing``. Both are dropped or only marked, depending on ``below_threshold``.
 
-What an instance would cover if it were alone, by the same rule for a pixel and after rule 1, is its *silhouette*. Its
-visible fraction is exact: visible pixels over the silhouette's pixels in the image, no depth tolerance involved. Its
+The *silhouette* of an instance is its mask when rendered alone, by the same rule for a pixel and after rule 1. The
+visible fraction is exact and uses no depth tolerance: visible pixels over the silhouette's pixels in the image. The
 truncation is the share of the silhouette beyond the image's border.
 
 Positions are in pixels with the image's corner at (0, 0), so pixel centres are at +0.5 and a box is half-open.
@@ -45,25 +46,25 @@ if TYPE_CHECKING:
 
 
 KEYPOINT_TOLERANCE = 0.005
-"""How far behind the surface that is seen a keypoint may lie and still count as visible, as a share of its depth."""
+"""Maximum distance of a visible keypoint behind the visible surface, as a share of its depth."""
 
 UNLABELLED, HIDDEN, VISIBLE = 0, 1, 2
-"""Visibility of a keypoint, as in COCO: outside the image, behind something, seen."""
+"""Visibility of a keypoint, as in COCO: outside the image, occluded, visible."""
 
 
 Projection = Callable[[Float64Array, "Instance"], tuple[Float64Array, Float64Array]]
-"""Pixels (N, 2) and depths [m] (N,) of points (N, 3) of an instance in the world."""
+"""Function that projects world points (N, 3) of an instance to pixels (N, 2) and depths [m] (N,)."""
 
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """What a rendered frame says about its instances, 0 = no instance in the maps.
+    """Ground-truth maps of a rendered frame; 0 = no instance.
 
     Attributes:
-        instance: Ids that labels derive from, (H, W) integers.
-        second: Ids by the other source: proxies where the labels are the splats', (H, W) integers.
-        silhouettes: Every instance alone, by id and by the labels' source; an instance without pixels is absent.
-        depth: Depth along the optical axis of what is seen [m], (H, W), to tell hidden keypoints.
+        instance: Ids from which labels derive, (H, W) integers.
+        second: Ids from the other source (proxies if labels derive from splats), (H, W) integers.
+        silhouettes: Silhouette of every instance by id, from the labels' source; instances without pixels are absent.
+        depth: Depth of the visible surface along the optical axis [m], (H, W), for the visibility of keypoints.
     """
 
     instance: npt.NDArray[np.integer[Any]]
@@ -74,25 +75,25 @@ class Truth:
 
 @dataclass(frozen=True, eq=False)
 class InstanceLabel:
-    """What can be seen of one instance.
+    """Label of one visible instance.
 
     Attributes:
         id: Value of the instance in the id map, from 1.
-        asset: Position among the scene's assets.
-        class_index: Position of ``class_name`` among the scene's classes.
-        class_name: Class that detectors learn.
+        asset: Index among the scene's assets.
+        class_index: Index of ``class_name`` among the scene's classes.
+        class_name: Class name in the labels.
         box: Bounds of the mask [px].
         mask: Visible pixels inside the box, shape (y1 - y0, x1 - x0).
-        amodal: The silhouette's part in the image, hidden pixels included.
-        silhouette_box: Bounds of the silhouette, beyond the image's border too [px].
-        silhouette_area: Its pixels.
+        amodal: The silhouette's part in the image, including hidden pixels.
+        silhouette_box: Bounds of the silhouette, also beyond the image's border [px].
+        silhouette_area: Pixels of the silhouette.
         depth_area: Pixels of ``amodal`` at which the image has a depth.
         agreement: IoU of the instance's masks by splats and by proxies.
         boundary_f1: F1 score of their boundaries, see :func:`mitsplat.images.masks.boundary_f1`.
-        world_from_object: Rigid transform of the asset's coordinates to the world's [m], shape (4, 4).
+        world_from_object: Rigid transform from the asset's coordinates to the world's [m], shape (4, 4).
         keypoints: Position [px] and visibility of the asset's named points, shape (K, 3): :data:`VISIBLE`,
             :data:`HIDDEN`, or :data:`UNLABELLED` at (0, 0).
-        marks: ``occluded`` and ``disagreeing``, as they apply.
+        marks: Any of ``occluded`` and ``disagreeing``.
     """
 
     id: int
@@ -113,17 +114,17 @@ class InstanceLabel:
 
     @cached_property
     def area(self) -> int:
-        """Visible pixels."""
+        """Number of visible pixels."""
         return int(np.count_nonzero(self.mask))
 
     @property
     def visible_fraction(self) -> float:
-        """Visible pixels over those that the instance would have in the image if it were alone."""
+        """Visible pixels over the silhouette's pixels in the image."""
         return self.area / self.amodal.area
 
     @property
     def truncation(self) -> float:
-        """Share of the silhouette that the image's border cuts off."""
+        """Share of the silhouette beyond the image's border."""
         return 1 - self.amodal.area / self.silhouette_area
 
     @cached_property
@@ -133,7 +134,7 @@ class InstanceLabel:
 
     @cached_property
     def polygon_iou(self) -> float:
-        """Intersection over union of the mask and the polygon as :func:`fill_polygon` reads it back."""
+        """Intersection over union of the mask and the polygon rasterised by :func:`fill_polygon`."""
         height, width = self.mask.shape
         filled = fill_polygon(self.polygon - self.box[:2], width, height)
         return float(np.count_nonzero(filled & self.mask) / np.count_nonzero(filled | self.mask))
@@ -141,7 +142,7 @@ class InstanceLabel:
 
 @dataclass(frozen=True, eq=False)
 class Labels:
-    """The labels of one frame.
+    """Labels of one frame.
 
     Attributes:
         width, height: Size of the image [px].
@@ -156,7 +157,7 @@ class Labels:
     dropped: dict[str, int]
 
     def to_json(self) -> dict[str, Any]:
-        """Everything, as JSON values; masks are COCO run-length codes over the whole image."""
+        """Return all labels as JSON values; masks are COCO run-length codes over the whole image."""
         size = self.width, self.height
         return {
             "size": list(size),
@@ -191,7 +192,7 @@ class Labels:
 
     @classmethod
     def from_json(cls, record: dict[str, Any]) -> Labels:
-        """Inverse of :meth:`to_json`."""
+        """Restore labels from the output of :meth:`to_json`."""
         width, height = record["size"]
 
         def decode(code: str, box: list[int]) -> BoolArray:
@@ -234,20 +235,19 @@ def label_instances(
     keypoints: Mapping[int, Float64Array] | None = None,
     project: Projection | None = None,
 ) -> Labels:
-    """Labels of the ``instances`` that a frame shows.
+    """Label the visible ``instances`` of a frame.
 
     Args:
         truth: The frame's maps, all of the same shape (H, W).
-        instances: Everything that was placed; what has no class is in the maps, and not in the labels.
+        instances: All placed instances. An instance without a class is in the maps, but gets no label.
         class_names: Names by class index.
-        rules: What is dropped or marked.
-        camera: Needed for keypoints.
-        keypoints: Points of each asset that has any, by its position, in its own coordinates [m], shape (K, 3).
-        project: Where the camera shows points of an instance, if that is not a matter of its pose alone.
+        rules: Thresholds for dropping and marking.
+        camera: Camera; required for keypoints.
+        keypoints: Keypoints by asset index, in the asset's coordinates [m], shape (K, 3) each.
+        project: Projection of an instance's points, if it does not follow from its pose and the camera alone.
 
     Raises:
-        ValueError: If a map is not a 2-D integer array, the maps differ in shape, or one holds an id of none of the
-            instances.
+        ValueError: If a map is not a 2-D integer array, the maps differ in shape, or a map contains an unknown id.
     """
     for ids in (truth.instance, truth.second):
         if ids.ndim != 2 or not np.issubdtype(ids.dtype, np.integer) or ids.shape != truth.instance.shape:
@@ -315,10 +315,10 @@ def label_instances(
 def _amodal(
     alone: Silhouette | None, seen: Silhouette, min_fragment: int, size: tuple[int, int]
 ) -> tuple[Silhouette, Box, int]:
-    """What an instance covers in the image, and the bounds and pixels of its whole silhouette.
+    """Return the silhouette inside the image, and the bounds and area of the complete silhouette.
 
-    Where three instances mix in a pixel, one may have the largest share of it that would not cover it alone: what is
-    seen always counts as covered.
+    Where three instances overlap in a pixel, one may have the largest share there that would not cover the pixel alone.
+    Visible pixels therefore always belong to the silhouette.
     """
     parts = [seen] if alone is None else [alone, seen]
     x0, y0 = min(part.box[0] for part in parts), min(part.box[1] for part in parts)
@@ -327,7 +327,7 @@ def _amodal(
     for part in parts:
         left, top, right, bottom = part.box
         canvas[top - y0 : bottom - y0, left - x0 : right - x0] |= part.mask
-    # Fragments are judged in the image, as those of the visible mask are, and again beyond it.
+    # Fragments are removed inside the image like those of the visible mask, and separately in the full silhouette.
     whole = Silhouette.cropped(without_fragments(canvas, min_fragment)[0], x0, y0)
     if min(whole.box[:2]) >= 0 and whole.box[2] <= size[0] and whole.box[3] <= size[1]:
         return whole, whole.box, whole.area
@@ -341,7 +341,7 @@ def _amodal(
 def _agreement(
     seen: Silhouette, second: npt.NDArray[np.integer[Any]], number: int, bounds: Box | None
 ) -> tuple[float, float]:
-    """IoU and boundary F1 of an instance's mask and its mask in the other id map, which is within ``bounds``."""
+    """Compute IoU and boundary F1 between an instance's mask and its mask (within ``bounds``) in the other id map."""
     height, width = second.shape
     x0, y0, x1, y1 = seen.box
     if bounds is not None:
@@ -359,7 +359,7 @@ def _agreement(
 def _see_keypoints(
     points: Float64Array, instance: Instance, camera: Camera, truth: Truth, project: Projection | None
 ) -> Float64Array:
-    """Pixels and visibilities of an asset's keypoints, shape (K, 3)."""
+    """Compute pixels and visibilities of an asset's keypoints, shape (K, 3)."""
     pose = instance.world_from_object
     points = points @ pose[:3, :3].T + pose[:3, 3]
     pixels, depth = camera.project(points) if project is None else project(points, instance)

@@ -1,4 +1,4 @@
-"""Labels drawn over the image that they are of."""
+"""Overlay of labels on their image."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ _FONT = cv2.FONT_HERSHEY_SIMPLEX
 
 
 def class_colour(class_index: int) -> tuple[int, int, int]:
-    """Colour of a class, RGB in [0, 255]: hues apart by the golden ratio, so that neighbours differ."""
+    """Return the colour of a class, RGB in [0, 255]; hues are spaced by the golden ratio, so that neighbours differ."""
     hue = (0.11 + class_index * (math.sqrt(5) - 1) / 2) % 1
     red, green, blue = colorsys.hsv_to_rgb(hue, 0.85, 1.0)
     return round(255 * red), round(255 * green), round(255 * blue)
 
 
 def draw_labels(image: ByteImage, labels: Labels, *, opacity: float = 0.45) -> ByteImage:
-    """The RGB image (H, W, 3) with the instances' masks tinted, outlined, boxed and named by class."""
+    """Draw masks, outlines, boxes and class names of the instances over an RGB image (H, W, 3)."""
     drawn = image.copy()
     unit = max(1.0, image.shape[1] / 640)
     for label in labels.instances:

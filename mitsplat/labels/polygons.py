@@ -1,4 +1,4 @@
-"""Masks as polygons that come back: one closed polygon for an instance, whatever its holes and parts.
+"""Lossless polygons of masks: one closed polygon per instance, including holes and separate parts.
 
 Positions are in pixels with the image's corner at (0, 0), so pixel centres are at +0.5.
 """
@@ -13,23 +13,28 @@ from scipy.sparse import coo_array, csgraph
 from mitsplat.arrays import BoolArray, Float64Array, Int64Array
 
 _LEAN = 0.02
-"""How far from a pixel's edge the outline's outermost vertices stay [px], so that they truncate to that pixel."""
+"""Distance of the outermost vertices from a pixel's edge [px], so that they truncate to that pixel."""
 
 
 def outline(mask: BoolArray) -> Float64Array:
-    """A mask of at least one pixel as one closed polygon [px], shape (M, 2).
+    """Convert a mask of at least one pixel to one closed polygon [px], shape (M, 2).
 
-    Made for how Ultralytics reads YOLO segments: one polygon per instance; positions scaled to the training size,
-    resampled along the edges and truncated to pixels; ``cv2.fillPoly`` (even-odd, edges painted). Therefore
+    The polygon is designed for Ultralytics' reader of YOLO segments. The reader expects one polygon per instance. It
+    scales
+    positions to the training size, resamples them along the edges, truncates them to pixels, and fills them with
+    ``cv2.fillPoly`` (even-odd, edges painted). Therefore
 
-    * vertices are the *centres* of the mask's border pixels and edges run in the eight directions of the grid: at the
-      image's own size vertices and edges truncate to pixels of the mask, so the mask comes back exactly (but for a
-      pixel where a resampled point meets the middle of a diagonal step), and when scaled down no side gains more than
-      half a pixel; vertices on the border pixels' outer edges gain as much or more at every scale;
-    * holes and separate parts hang on bridges walked there and back. A bridge to a hole runs inside the mask; a
-      bridge between parts paints the pixels of the gap, so the bridges are a minimum spanning tree;
-    * at its four extremes the polygon reaches out to the pixels' outer edges by spikes without area: the box that
-      is read off the polygon is the box of the mask.
+    * vertices are the *centres* of the mask's border pixels, and edges run in the eight directions of the grid. At the
+      image's own size, vertices and edges truncate to pixels of the mask, so that the mask is restored exactly (except
+      for a
+      pixel where a resampled point meets the middle of a diagonal step). When scaled down, no side gains more than half
+      a
+      pixel. Vertices on the border pixels' outer edges would gain as much or more at every scale;
+    * holes and separate parts are connected by bridges that are traversed in both directions. A bridge to a hole runs
+      inside the mask. A bridge between parts paints the pixels of the gap, so the bridges are a minimum spanning tree;
+    * at its four extremes, the polygon extends to the pixels' outer edges by spikes without area, so that the bounding
+      box
+      of the polygon is the box of the mask.
     """
     height, width = mask.shape
     rings = [
@@ -47,14 +52,14 @@ def outline(mask: BoolArray) -> Float64Array:
 
 
 def fill_polygon(polygon: npt.ArrayLike, width: int, height: int) -> BoolArray:
-    """Pixels of a polygon (M, 2) [px] as Ultralytics' ``polygon2mask`` fills it, shape (height, width)."""
+    """Rasterise a polygon (M, 2) [px] like Ultralytics' ``polygon2mask``, shape (height, width)."""
     canvas = np.zeros((height, width), dtype=np.uint8)
     cv2.fillPoly(canvas, [np.asarray(polygon, dtype=np.float32).astype(np.int32)], 1)
     return canvas.astype(bool)
 
 
 def _joined(rings: list[Int64Array], shape: tuple[int, int]) -> Int64Array:
-    """One closed walk of pixels (x, y) through all ``rings``, each bridge walked there and back."""
+    """Join all ``rings`` to one closed walk of pixels (x, y); each bridge is traversed in both directions."""
     walk = rings[0]
     for start, ring, first in _bridges(rings, shape):
         at = int(np.flatnonzero((walk == start).all(axis=1))[0])
@@ -67,13 +72,13 @@ def _joined(rings: list[Int64Array], shape: tuple[int, int]) -> Int64Array:
 
 
 def _bridges(rings: list[Int64Array], shape: tuple[int, int]) -> list[tuple[Int64Array, Int64Array, int]]:
-    """The bridges that join all rings over the fewest pixels, in an order in which a bridge starts on a joined ring.
+    """Find the bridges that join all rings over the fewest pixels; each bridge starts on a joined ring.
 
-    A minimum spanning tree over the neighbours in the rings' discrete Voronoi diagram in the chessboard metric, which
-    counts the pixels that ``cv2.fillPoly`` paints along an edge.
+    The bridges are a minimum spanning tree over the neighbours in the rings' discrete Voronoi diagram. The chessboard
+    metric counts the pixels that ``cv2.fillPoly`` paints along an edge.
 
     Returns:
-        For each bridge the pixel (x, y) it starts at, the ring it joins and the position in that ring where it ends.
+        For each bridge: its start pixel (x, y), the ring that it joins, and its end position in that ring.
     """
     if len(rings) == 1:
         return []
@@ -87,7 +92,7 @@ def _bridges(rings: list[Int64Array], shape: tuple[int, int]) -> list[tuple[Int6
     near = pixel_of_cell[cell]
     position = pixels @ (1, shape[1])
     order = np.argsort(position, kind="stable")
-    shared = np.flatnonzero(np.diff(position[order]) == 0)  # walls one pixel thick belong to the rings of both sides
+    shared = np.flatnonzero(np.diff(position[order]) == 0)  # walls one pixel thick belong to both rings
     a, b = order[shared], order[shared + 1]
     apart = ring_of[a] != ring_of[b]
     pairs = [(a[apart], b[apart])]
@@ -103,7 +108,7 @@ def _bridges(rings: list[Int64Array], shape: tuple[int, int]) -> list[tuple[Int6
         pairs.append((near[here][border], near[beside][border]))
     a, b = (np.concatenate(side) for side in zip(*pairs, strict=True))
     length = np.abs(pixels[a] - pixels[b]).max(axis=1)
-    if len(rings) == 2:  # most often: one part with one hole
+    if len(rings) == 2:  # the most frequent case: one part with one hole
         nearest = int(length.argmin())
         one, other = (a, b) if ring_of[a[nearest]] == 0 else (b, a)
         return [(pixels[one[nearest]], rings[1], int(other[nearest]) - len(rings[0]))]
@@ -111,7 +116,7 @@ def _bridges(rings: list[Int64Array], shape: tuple[int, int]) -> list[tuple[Int6
     shortest = np.lexsort((length, low * len(rings) + high))
     _, first = np.unique((low * len(rings) + high)[shortest], return_index=True)
     best = shortest[first]
-    # SciPy takes a stored zero for no edge; one more pixel for every edge leaves the tree the same.
+    # SciPy treats a stored zero as no edge. One more pixel for every edge does not change the tree.
     graph = coo_array((length[best] + 1, (low[best], high[best])), shape=(len(rings), len(rings)))
     ends = {(int(low[i]), int(high[i])): (int(a[i]), int(b[i])) for i in best}
     order, parent = csgraph.breadth_first_order(csgraph.minimum_spanning_tree(graph.tocsr()), 0, directed=False)
@@ -125,7 +130,7 @@ def _bridges(rings: list[Int64Array], shape: tuple[int, int]) -> list[tuple[Int6
 
 
 def _corners(walk: Int64Array) -> Int64Array:
-    """The closed ``walk`` without standing still and without pixels between two steps of one direction."""
+    """Remove repeated pixels, and pixels between two steps of the same direction, from the closed ``walk``."""
     if len(walk) == 1:
         return walk
     x, y = (walk - np.concatenate([walk[-1:], walk[:-1]])).T

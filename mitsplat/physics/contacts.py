@@ -1,4 +1,4 @@
-"""Newton's contacts for one model after another, by kernels that are generated once."""
+"""Newton collision pipelines that share one set of generated kernels."""
 
 from __future__ import annotations
 
@@ -12,23 +12,25 @@ import trimesh
 import warp as wp
 from newton.geometry import BroadPhaseSAP, NarrowPhase
 
-_SPARE = 4  # room for models of more pairs than the first
+_SPARE = 4  # capacity factor for models with more pairs than the first
 
 
 def newton_hull(piece: trimesh.Trimesh) -> newton.Mesh:
-    """A convex piece for Newton."""
+    """Convert a convex piece to a Newton mesh."""
     return newton.Mesh(piece.vertices, np.asarray(piece.faces).ravel(), maxhullvert=-1, compute_inertia=False)
 
 
 class ContactFinder:
-    """Makes collision pipelines that share the kernels of one narrow phase.
+    """Factory of collision pipelines that share the kernels of one narrow phase.
 
-    Each narrow phase generates its own, which costs as much as a second of simulation. What they do depends on the
-    shapes of the model that they are generated for; here on all that are given, so that no contact depends on the
-    models before.
+    Each narrow phase generates its own kernels, which costs as much time as a second of simulation. The kernels depend
+    on
+    the shapes of the model for which they are generated. This class generates them for all given pieces, so that
+    contacts do
+    not depend on earlier models.
 
     Args:
-        pieces: Convex pieces of all that may be simulated.
+        pieces: Convex pieces of all objects that may be simulated.
     """
 
     def __init__(self, pieces: Iterable[trimesh.Trimesh]) -> None:
@@ -36,7 +38,10 @@ class ContactFinder:
         self._narrow_phase: NarrowPhase | None = None
 
     def pipeline(self, model: newton.Model, *, max_contacts: int) -> newton.CollisionPipeline:
-        """A pipeline for a model of boxes and convex hulls. Pipelines share buffers, and must not run at once."""
+        """Return a pipeline for a model of boxes and convex hulls.
+
+        Pipelines share buffers and must not run concurrently.
+        """
         pairs = model.shape_count * (model.shape_count - 1) // 2
         if self._narrow_phase is None or self._narrow_phase.max_candidate_pairs < pairs:
             self._narrow_phase = _generate(self._pieces, _SPARE * pairs)
@@ -44,8 +49,8 @@ class ContactFinder:
         narrow_phase.shape_aabb_lower, narrow_phase.shape_aabb_upper = (
             wp.zeros(model.shape_count, dtype=wp.vec3, device=model.device) for _ in range(2)
         )
-        narrow_phase.shape_voxel_resolution = None  # the model's
-        worlds: Any = model.shape_world  # there is one of any finished model
+        narrow_phase.shape_voxel_resolution = None  # of the model
+        worlds: Any = model.shape_world  # every finished model has this array
         return newton.CollisionPipeline(
             model,
             broad_phase=BroadPhaseSAP(worlds, shape_flags=model.shape_flags, device=model.device),
@@ -55,15 +60,15 @@ class ContactFinder:
 
 
 def _generate(pieces: Sequence[trimesh.Trimesh], max_pairs: int) -> NarrowPhase:
-    """A narrow phase for boxes and these hulls."""
-    # Where a hull has many corners, those of all hulls are searched in another way.
+    """Generate a narrow phase for boxes and these hulls."""
+    # If one hull has many vertices, the support search changes for all hulls; the largest hull therefore decides.
     hull = newton_hull(max(pieces, key=lambda piece: len(piece.vertices)))
     builder = newton.ModelBuilder()
-    builder.validate_inertia_detailed = True  # in Python, for the other way compiles a kernel
+    builder.validate_inertia_detailed = True  # in Python; the alternative compiles a kernel
     builder.add_shape_box(-1)
     builder.add_shape_convex_hull(-1, mesh=hull)
     builder.add_shape_convex_hull(builder.add_body(), mesh=hull)
     model = builder.finalize(device="cpu")
-    # Overflow is read from the solver's flags: the pipeline would print it at every step.
+    # Overflow is read from the solver's flags, because the pipeline would print it at every step.
     pipeline = newton.CollisionPipeline(model, broad_phase="sap", shape_pairs_max=max_pairs, verify_buffers=False)
     return pipeline.narrow_phase

@@ -1,4 +1,4 @@
-"""Draw poses above a scene, drop the objects from them, and judge how they came to rest."""
+"""Drop simulation of a layout: draw start poses, drop the objects, and certify their rest."""
 
 from __future__ import annotations
 
@@ -31,25 +31,26 @@ from mitsplat.scene.splits import draw_environment
 from mitsplat.scene.streams import random_stream
 from mitsplat.scene.walls import ENCLOSURE, PILE_HEIGHT, bin_walls, enclosed_bounds, stated_pose, walls_beside
 
-_REACH = 5e-3  # gaps beyond this are not measured [m]
-# How deep objects at rest may be in others [m], or as a share of their size where that is more: a scan's pieces err so.
+_REACH = 5e-3  # larger gaps are not measured [m]
+# Maximum penetration at rest [m], or as a share of the object's size if that is larger: convex pieces of scans deviate
+# by that much.
 _DEEPEST_IN_COLLIDER, _DEEPEST_IN_OBJECT, _DEEPEST_SHARE = 3e-4, 5e-4, 0.003
-_DEEPEST_GIVEN = 1e-3  # how far objects may start in one another where the scene file says so [m]
-_NEAREST = 5e-4  # what is scattered is farther apart than this [m]
-_FALLEN = 5.0  # tilt beyond which what was put up has fallen over [degrees]
-# Simulations of which the remains may pile up. Newton leaves the model of each, a MiB and more, in reference cycles,
-# which Python would look for only after a quarter of all objects. Looking takes 0.5 s.
+_DEEPEST_GIVEN = 1e-3  # maximum overlap of start poses from the scene file [m]
+_NEAREST = 5e-4  # minimum distance of scattered objects at rest [m]
+_FALLEN = 5.0  # tilt from which an upright object has fallen over [degrees]
+# Number of simulations between garbage collections. Newton leaves each model (1 MiB and more) in reference cycles,
+# which Python would collect only after a quarter of all objects. A collection takes 0.5 s.
 _GARBAGE = 24
 CROWDED = "no room for all"
-_CROWD = 0.1  # share of the objects that are left out at a time where they find no room beside one another,
-_CROWDED = 0.5  # and at the most: a region that lacks room for more is too small
-_POURED = 1.0  # speed of objects that are poured in piles [m/s]: faster, light ones are flung out by heavy ones
-_THRESHOLDS = (0.02, 0.01, 0.005)  # concavity of convex pieces, finer until they follow the mesh
+_CROWD = 0.1  # share of the objects that is left out per round if they find no room,
+_CROWDED = 0.5  # and maximum share in total: beyond it, the region is too small
+_POURED = 1.0  # speed limit of poured objects [m/s]: at higher speed, heavy objects eject light ones
+_THRESHOLDS = (0.02, 0.01, 0.005)  # concavity of convex pieces, from coarse to fine
 
 
 @dataclass(frozen=True, eq=False)
 class _Part:
-    """What physics needs of an asset; ``standoff`` as in :func:`mitsplat.geometry.mesh_distance.standoff`."""
+    """Physics data of an asset; ``standoff`` as in :func:`mitsplat.geometry.mesh_distance.standoff`."""
 
     body: Body
     surface: DistanceSurface
@@ -58,11 +59,11 @@ class _Part:
 
 @dataclass(frozen=True, eq=False)
 class _Ground:
-    """What does not move; colliders and obstacles are parallel.
+    """Static scene; colliders and obstacles are parallel.
 
     Attributes:
-        contact_finder: For all objects and these colliders.
-        bounds: Corners of what centres of mass of each region's objects must not leave [m], shape (R, 3) each.
+        contact_finder: Contact finder for all objects and these colliders.
+        bounds: Corners of the box in which the centres of mass must stay [m], per region, shape (R, 3) each.
     """
 
     colliders: tuple[Collider, ...]
@@ -73,7 +74,7 @@ class _Ground:
 
 @dataclass(frozen=True, eq=False)
 class _Dealt:
-    """An object that is drawn for a layout, the pose that the file gives it if any, and the region it starts in."""
+    """An object drawn for a layout, with its pose from the scene file (if any) and its start region."""
 
     id: int
     asset: int
@@ -82,12 +83,12 @@ class _Dealt:
 
 
 _Fault = tuple[str, set[PlacedSurface]]
-"""What is wrong with objects at rest, and with which of them."""
+"""Defect of a resting state: its description and the affected objects."""
 
 
 @dataclass(frozen=True)
 class _Refusal:
-    """Why a draw cannot be used, the positions of the objects whose fault that is, and a sentence if there is more."""
+    """Rejection of a draw: its reason, the positions of the objects that cause it, and an optional error message."""
 
     reason: str
     blamed: Sequence[int]
@@ -96,14 +97,14 @@ class _Refusal:
 
 @dataclass(frozen=True)
 class _Request:
-    """A scene, and whom to tell what making its :class:`Drop` takes, which is no part of what is asked for."""
+    """Cache key: the scene. The progress callback is excluded from equality."""
 
     scene: Scene
     progress: Note = field(compare=False)
 
 
 def drop_of(scene: Scene, progress: Note) -> Drop:
-    """The :class:`Drop` of a scene, the same as the last time if the scene is."""
+    """Return the :class:`Drop` of a scene, cached for the last scene."""
     return _make_drop(_Request(scene, progress))
 
 
@@ -113,11 +114,13 @@ def _make_drop(request: _Request) -> Drop:
 
 
 class Drop:
-    """Drops the objects of a scene; keeps what its layouts share, of which the simulation itself costs most to make.
+    """Drop simulation of a scene's objects, with cached data that its layouts share.
+
+    The simulation itself is the most expensive of these data.
 
     Args:
-        scene: What to drop, from where, and on what.
-        progress: Told in a few words what takes long.
+        scene: Objects, start regions and colliders.
+        progress: Callback that receives a short description of a slow operation.
     """
 
     def __init__(self, scene: Scene, progress: Note) -> None:
@@ -133,14 +136,17 @@ class Drop:
             self._check_given_poses(ground)
 
     def settle(self, index: int) -> Layout:
-        """Draw poses until a layout holds.
+        """Draw poses until a layout passes all checks.
 
-        After ``settle.attempts`` draws what was at fault in all of them is left out, or else what was most often, and
-        the others are drawn anew. Where objects find no room beside one another, the last of them are left out.
+        After ``settle.attempts`` rejected draws, the objects that caused every rejection are left out. If there are
+        none, the
+        object that caused most rejections is left out. The remaining objects are drawn again. If objects find no room
+        beside one
+        another, the last of them are left out.
 
         Raises:
-            InputError: If more than half of the objects find no room, though each of them would alone.
-            NothingRests: If no draw holds, of however few objects.
+            InputError: If more than half of the objects find no room, although each of them fits alone.
+            NothingRests: If no draw passes, even with fewer objects.
         """
         dealt = self._dealt(index)
         if not dealt:
@@ -179,13 +185,13 @@ class Drop:
         raise NothingRests(sentence or f"{self.scene.path}: {must}", Layout(index, (), nothing, tuple(left_out)))
 
     def _dealt(self, index: int) -> list[_Dealt]:
-        """What is drawn for a layout."""
+        """Return the objects that are drawn for a layout."""
         assets, given = draw_objects(self.scene, index)
         rows = zip(assets, given, draw_regions(self.scene.spec, index), strict=True)
         return [_Dealt(number, *row) for number, row in enumerate(rows, start=1)]
 
     def _try(self, index: int, dealt: Sequence[_Dealt], refused: Sequence[str]) -> Layout | _Refusal:
-        """Drop what was dealt from poses that are drawn for the next time."""
+        """Drop the given objects from the next draw of start poses."""
         number = self._ground_of(index)
         assets, given = tuple(one.asset for one in dealt), [one.given for one in dealt]
         regions, obstacles = [one.region for one in dealt], self._grounds[number].obstacles
@@ -193,7 +199,7 @@ class Drop:
         try:
             start = self.draw_poses(assets, rng, given, number, regions)
         except InputError as error:
-            # An object that is too large for its region leaves the others room.
+            # An object that is too large for its region is rejected alone; the others may still fit.
             alone = [self._place([item], number, rng) is None for item in self._items(assets, given, regions)]
             reason = "no room for it" if any(alone) else CROWDED
             return _Refusal(reason, np.flatnonzero(alone).tolist(), str(error))
@@ -229,7 +235,11 @@ class Drop:
         return Layout(index, self._instances(dealt, outcome.poses), certificate)
 
     def try_alone(self, asset: int, region: int, tries: int) -> list[str]:
-        """Why an object alone does not come to rest as a region's arrangement asks for, for each try; [] if it does."""
+        """Drop an object alone with a region's arrangement.
+
+        Returns:
+            The reason of each failed try, or [] if one try succeeds.
+        """
         refused: list[str] = []
         while len(refused) < tries:
             found = self._try(0, [_Dealt(1, asset, None, region)], refused)
@@ -239,7 +249,7 @@ class Drop:
         return refused
 
     def replay(self, layout: Layout, interval: float) -> Iterator[Float64Array]:
-        """Poses (N, 4, 4) of a layout's objects every ``interval`` seconds, from the start until they rest."""
+        """Yield poses (N, 4, 4) of a layout's objects every ``interval`` seconds, from the start until they rest."""
         there = {instance.id for instance in layout.instances}
         dealt = [one for one in self._dealt(layout.index) if one.id in there]
         if not dealt:
@@ -261,7 +271,7 @@ class Drop:
         yield from moments
 
     def _ground_of(self, layout: int) -> int:
-        """Which of the grounds a layout lies on: objects do not notice environments that do not collide."""
+        """Return the index of a layout's ground; environments without collision share one ground."""
         return draw_environment(self.scene.spec, layout) if len(self._grounds) > 1 else 0
 
     def _run(
@@ -275,20 +285,20 @@ class Drop:
         settle = self.scene.spec.settle
         fastest = _POURED if any(self._arrangements[i] == "pile" for i in regions) else np.inf
         low, high = self._grounds[ground].bounds
-        # What the scene file puts somewhere may be in any of the regions.
+        # Objects with a pose in the scene file may be in any of the regions.
         free = np.array([pose is None for pose in given])[:, None]
         own = np.asarray(regions)
         bounds = np.where(free, low[own], low.min(axis=0)), np.where(free, high[own], high.max(axis=0))
         return run_to_rest(world, max_time=settle.max_time, bounds=bounds, fastest=fastest, **options)
 
     def _draw_frictions(self, index: int) -> tuple[float, ...]:
-        """Friction coefficient of each asset in a layout."""
+        """Draw the friction coefficient of each asset in a layout."""
         spec = self.scene.spec
         rng = random_stream(spec.seed, "friction", index)
         return tuple(asset.friction * float(rng.uniform(*spec.randomise.friction)) for asset in self.scene.assets)
 
     def _world(self, assets: tuple[int, ...], frictions: tuple[float, ...], capacity: float, number: int = 0) -> World:
-        """The simulation of these assets on one of the grounds; the last one is kept."""
+        """Return the simulation of these assets on a ground; the last one is cached."""
         key = assets, frictions, capacity, number
         if key not in self._worlds:
             settle, ground = self.scene.spec.settle, self._grounds[number]
@@ -311,7 +321,7 @@ class Drop:
         return self._worlds[key]
 
     def _part(self, asset: Asset, progress: Note) -> _Part:
-        """What physics needs of an asset, made once for all entries that share its mesh."""
+        """Build the physics data of an asset, once for all entries that share its mesh."""
         if asset.mesh is None:
             raise InputError(f"asset {asset.name!r} must have a mesh to be dropped")
         if id(asset.mesh) not in self._parts:
@@ -332,8 +342,8 @@ class Drop:
         return self._parts[id(asset.mesh)]
 
     def _make_ground(self, surroundings: Asset | None, progress: Note) -> _Ground:
-        """Shapes that collide, and surroundings if they do."""
-        scene, walls = self.scene, []  # positions of what is invisible: the enclosure
+        """Build the static scene from colliding shapes and, optionally, surroundings."""
+        scene, walls = self.scene, []  # positions of the invisible enclosure walls
         colliders: list[Collider] = []
         obstacles: list[PlacedSurface] = []
         for shape, shape_mesh in zip(scene.spec.shapes, scene.shape_meshes, strict=True):
@@ -369,7 +379,10 @@ class Drop:
         return _Ground(tuple(colliders), tuple(obstacles), finder, bounds)
 
     def _check_given_poses(self, ground: _Ground) -> None:
-        """Refuse poses of the scene file that start in one another or in a collider, which would part them anyhow."""
+        """Refuse start poses of the scene file that overlap one another or a collider.
+
+        The simulation would push such objects apart.
+        """
         keys: dict[PlacedSurface, str] = {}
         for entry, spec in enumerate(self.scene.spec.objects):
             for number, pose in enumerate(spec.poses):
@@ -390,7 +403,7 @@ class Drop:
         ground: int = 0,
         regions: Sequence[int] | None = None,
     ) -> Float64Array:
-        """Poses (N, 4, 4) to start from above one of the grounds, see :func:`mitsplat.physics.placement.draw_poses`.
+        """Draw start poses (N, 4, 4) above a ground, see :func:`mitsplat.physics.placement.draw_poses`.
 
         Raises:
             InputError: If objects find no room.
@@ -433,7 +446,7 @@ class Drop:
         ]
 
     def _in_way(self, obstacles: Sequence[PlacedSurface]) -> str:
-        """Of what takes most of the region: how much, and its name; empty if nothing takes a tenth."""
+        """Describe the obstacle that fills most of the region; empty if no obstacle fills a tenth of it."""
         points = np.random.default_rng(0).uniform(self.scene.spec.region.min, self.scene.spec.region.max, (1000, 3))
         taken = [float((item.signed_distances(points) < 0).mean()) for item in obstacles]
         worst = int(np.argmax(taken))
@@ -449,7 +462,7 @@ class Drop:
         given: Sequence[Float64Array | None],
         regions: Sequence[int],
     ) -> _Fault | None:
-        """How a layout at rest is not arranged as asked for, if it is not."""
+        """Return how a resting layout violates the requested arrangement, or None."""
         laid = {item: self._arrangements[region] for item, region in zip(resting, regions, strict=True)}
         for pair in clearances:
             if pair.second.name.startswith(ENCLOSURE) and pair.distance < widest_gap(0.0):
@@ -457,7 +470,7 @@ class Drop:
         for pair in clearances:
             if laid[pair.first] == "scatter" and pair.second not in obstacles and pair.distance < _NEAREST:
                 return f"{pair.first.name} and {pair.second.name} touch", {pair.first, pair.second}
-        # Angle between the world's vertical, carried along by the object, and the vertical.
+        # The tilt is the angle between the vertical and the object's start vertical after its rotation.
         tilts = np.degrees(np.arccos(np.clip(np.einsum("nj,nj->n", end[:, 2, :3], start[:, 2, :3]), -1, 1)))
         fallen = [
             item
@@ -477,7 +490,7 @@ class Drop:
 
 
 def _support_gaps(resting: Sequence[PlacedSurface], clearances: Sequence[Clearance]) -> dict[PlacedSurface, float]:
-    """Distance of each object from what is nearest to it [m]."""
+    """Compute the distance of each object from its nearest neighbour [m]."""
     return {
         item: max(0.0, min(pair.distance for pair in clearances if item in (pair.first, pair.second)))
         for item in resting
@@ -487,7 +500,7 @@ def _support_gaps(resting: Sequence[PlacedSurface], clearances: Sequence[Clearan
 def _fault(
     clearances: Sequence[Clearance], gaps: Mapping[PlacedSurface, float], obstacles: Sequence[PlacedSurface]
 ) -> _Fault | None:
-    """Why objects at rest are not where they could be, if they are not."""
+    """Return the defect of a resting state (penetration or unsupported object), or None."""
     for pair in sorted(clearances, key=lambda pair: pair.distance):
         if pair.second in obstacles:
             deepest = max(_DEEPEST_IN_COLLIDER, _DEEPEST_SHARE * pair.first.size)

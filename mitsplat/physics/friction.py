@@ -1,15 +1,15 @@
-"""Friction of two surfaces that touch, from the friction of each: one rule for MuJoCo on Warp and in C.
+"""Friction of a pair of surfaces from the friction of each, for MuJoCo on Warp and in C.
 
 Sliding
     The geometric mean of the two coefficients, as in Box2D (``b2MixFriction``) and Jolt (``DefaultCombineFriction``).
-    Two surfaces of one material have that material's coefficient, a frictionless one slides on everything, and either
-    side always counts. MuJoCo by itself takes the larger coefficient, by which the lower one has no effect.
+    Two surfaces of one material have that material's coefficient. A frictionless surface slides on everything. Both
+    surfaces always count. MuJoCo's default is the larger coefficient, so that the smaller one has no effect.
 Spin, about the contact's normal
-    The sliding coefficient times a length, the radius of the contact [m]: the larger of the two surfaces'.
+    The sliding coefficient times the contact radius [m], the larger of the two surfaces' radii.
 Rolling
-    A length alone [m], the larger of the two: it comes from deformation, not from sliding.
+    A length [m], the larger of the two. It does not depend on sliding friction, because deformation causes it.
 
-MuJoCo's ``geom_friction`` holds these three of each geom: coefficient, radius of contact, length of rolling.
+MuJoCo's ``geom_friction`` holds these values of each geom: coefficient, contact radius, rolling length.
 """
 
 from __future__ import annotations
@@ -25,24 +25,24 @@ from newton.solvers import SolverMuJoCo
 from mitsplat.arrays import Float64Array
 
 LEAST_FRICTION = 2e-5
-"""Below it MuJoCo divides by almost nothing."""
+"""Minimum friction. MuJoCo divides by the friction, and smaller values are unstable."""
 
 _vec5 = wp.types.vector(length=5, dtype=wp.float32)
 
 
 def pair_friction(first: Float64Array, second: Float64Array) -> Float64Array:
-    """Friction of contacts, shape (N, 5), twice sliding, spin and twice rolling, of their geoms' (N, 3)."""
+    """Compute the friction of contacts (N, 5), as 2 x sliding, spin, 2 x rolling, from that of their geoms (N, 3)."""
     slide = np.sqrt(first[:, 0] * second[:, 0])
     spin, roll = np.maximum(first[:, 1:], second[:, 1:]).T
     return np.asarray(np.maximum(np.stack([slide, slide, slide * spin, roll, roll], axis=1), LEAST_FRICTION))
 
 
 class PairFrictionSolver(SolverMuJoCo):
-    """MuJoCo on Warp, its contacts given by Newton, with the friction of :func:`pair_friction`."""
+    """MuJoCo solver on Warp with Newton's contacts and the friction of :func:`pair_friction`."""
 
     def __init__(self, model: newton.Model, **options: Any) -> None:
         with warnings.catch_warnings():
-            # A geom without friction is one factor of a pair's, which has LEAST_FRICTION.
+            # The friction of a geom is one factor of a pair's friction, which is at least LEAST_FRICTION.
             warnings.filterwarnings("ignore", message=r"geom \d+: friction.* < MJ_MINMU")
             super().__init__(model, **options)
 
@@ -66,7 +66,7 @@ def _mix_friction(
     geom_friction: wp.array2d[wp.vec3],
     friction: wp.array[_vec5],
 ):
-    """:func:`pair_friction` of the contacts of one step, in place."""
+    """Apply :func:`pair_friction` to the contacts of one step, in place."""
     contact = wp.tid()
     if contact >= count[0]:
         return

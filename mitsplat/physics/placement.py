@@ -1,4 +1,4 @@
-"""Where objects start: poses that overlap nothing, for each way of laying them out."""
+"""Start poses without overlap for each arrangement."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from mitsplat.scene.spec.object_spec import Arrangement
 from mitsplat.scene.spec.shape_spec import Region
 from mitsplat.scene.walls import PILE_HEIGHT
 
-_PLACES = 200  # positions tried for an object before all are drawn anew
-_PLACES_IN_LAYER = 20  # of a pile
+_PLACES = 200  # positions tried per object before all objects are drawn anew
+_PLACES_IN_LAYER = 20  # positions tried per layer of a pile
 _DRAWS = 20
-_SPACING = 1e-3  # between the bounding boxes of objects at the start [m]
-_ROOM = (2e-3, 5e-3)  # between what is packed [m]
-_ASKEW = 3.0  # how far it is turned from quarter turns [degrees]
-_OFF_MIDDLE = 4e-3  # how far each of a tower is from the middle of what is below it, along x and y [m]
-_LEAN = np.radians(10)  # that must lift the middle of what is turned over
-_LIFT = 0.005  # by so much of its height above the ground
-_HOVER = 2e-4  # how closely objects are put on what is below them [m]
+_SPACING = 1e-3  # minimum distance of bounding boxes at the start [m]
+_ROOM = (2e-3, 5e-3)  # distance of packed objects [m]
+_ASKEW = 3.0  # maximum rotation of packed objects from quarter turns [degrees]
+_OFF_MIDDLE = 4e-3  # maximum offset of a tower's object from the centre below, along x and y [m]
+_LEAN = np.radians(10)  # tilt that must raise the centre of an object on another side
+_LIFT = 0.005  # minimum rise, as a share of the centre's height above the ground
+_HOVER = 2e-4  # start distance of objects from the surface below [m]
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,11 +33,11 @@ class Item:
     """An object to place.
 
     Attributes:
-        asset: Position of its asset in the scene; a stack is of one asset.
+        asset: Index of its asset in the scene; a stack consists of one asset.
         surface: Its mesh.
         outline: Vertices of its convex hull [m], shape (N, 3).
-        pose: Where the scene file puts it, or None.
-        region: Which of the regions it starts in.
+        pose: Pose from the scene file, or None.
+        region: Index of its start region.
     """
 
     asset: int
@@ -55,16 +55,19 @@ def draw_poses(
     yaw: tuple[float, float] | None = None,
     turned_over: float = 0.0,
 ) -> Float64Array | None:
-    """Poses (N, 4, 4) of all items; None if they find no room. None that is drawn touches another or an obstacle.
+    """Draw start poses (N, 4, 4) of all items, or None if there is no room.
+
+    Drawn poses touch neither one another nor an obstacle.
 
     Args:
-        items: What to place.
-        obstacles: What does not move.
-        regions: Where, and how, see :class:`mitsplat.scene.spec.scene_spec.Settle`; one region after the other.
-        rng: Decides all that is random; orientations are uniform in SO(3), or about the vertical.
-        yaw: Range of turns about the vertical [degrees] of what is put down upright, as a tower or packed; any if
+        items: Objects to place.
+        obstacles: Static surfaces.
+        regions: Start regions with their arrangements, see :class:`mitsplat.scene.spec.scene_spec.Settle`. Regions are
+            filled one after the other.
+        rng: Random generator. Orientations are uniform in SO(3), or about the vertical.
+        yaw: Range of rotations about the vertical [degrees] for upright, tower and packed arrangements; unlimited if
             None.
-        turned_over: Share of those that stand on another side, see :func:`standing_turns`.
+        turned_over: Probability that such an object stands on another side, see :func:`standing_turns`.
     """
     for _ in range(_DRAWS):
         poses = _Draw(items, obstacles, rng, yaw, turned_over).all_poses(regions)
@@ -74,11 +77,11 @@ def draw_poses(
 
 
 def resting_turn(outline: Float64Array) -> Float64Array:
-    """Rotation (3, 3) that lays a convex hull on its largest face."""
+    """Compute the rotation (3, 3) that lays a convex hull on its largest face."""
     hull = ConvexHull(outline)
     corners = outline[hull.simplices]
     areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-    normals = np.round(hull.equations[:, :3], 6)  # triangles of one face count together
+    normals = np.round(hull.equations[:, :3], 6)  # triangles of one face are merged
     faces, face_of = np.unique(normals, axis=0, return_inverse=True)
     normal = faces[np.argmax(np.bincount(face_of, areas).round(12))]
     turn: Float64Array = Rotation.align_vectors([[0.0, 0.0, -1.0]], [normal])[0].as_matrix()
@@ -86,10 +89,10 @@ def resting_turn(outline: Float64Array) -> Float64Array:
 
 
 def standing_turns(outline: Float64Array) -> list[Float64Array]:
-    """Rotations (3, 3) about the y axis by one, two or three quarter turns, after which a convex hull (N, 3) stands.
+    """Return rotations (3, 3) about y by one to three quarter turns after which a convex hull (N, 3) stands.
 
-    What looks to -y goes on to do so: on its left side, its head, or its right side. It stands if leaning lifts the
-    middle of its bounds whichever way it leans, which it does not of what is round.
+    The side that faces -y keeps facing -y: the object stands on its left side, its top or its right side. It counts as
+    standing if a tilt in every direction raises the centre of its bounds. Round objects do not stand.
     """
     ways = np.linspace(0, 2 * np.pi, 16, endpoint=False)
     lean = np.sin(_LEAN)
@@ -130,19 +133,19 @@ class _Draw:
                 free.append(i)
             else:
                 self._take(i, item.pose, _bounds(item.outline, item.pose))
-        # Large ones first, for which room is scarce.
+        # Large objects are placed first, because they find the least room.
         free.sort(key=lambda i: -float(np.ptp(self._items[i].outline, axis=0).max()))
-        # Towers before what stands around them.
+        # Towers are placed before the objects around them.
         for number, (region, arrangement) in sorted(enumerate(regions), key=lambda one: one[1][1] != "tower"):
             self._low, self._high = np.array(region.min), np.array(region.max)
-            self._sky = float(self._high[2]) if len(regions) > 1 else np.inf  # there may be another region above
-            self._foot = self._low.copy()  # of what is still free of a pile's column
+            self._sky = float(self._high[2]) if len(regions) > 1 else np.inf  # another region may lie above
+            self._foot = self._low.copy()  # lower end of the free part of a pile's column
             if not self._fill([i for i in free if self._items[i].region == number], arrangement):
                 return None
         return self._poses
 
     def _fill(self, free: Sequence[int], arrangement: Arrangement) -> bool:
-        """Put items into the region at hand."""
+        """Place items in the current region."""
         if arrangement == "stack":
             assets = dict.fromkeys(self._items[i].asset for i in free)
             return all(self._stack([i for i in free if self._items[i].asset == asset]) for asset in assets)
@@ -162,7 +165,7 @@ class _Draw:
         return self._try(i, self._low, self._high)
 
     def _pour(self, i: int) -> bool:
-        """In a column above the region's foot that grows as it fills."""
+        """Place an item in a column above the region's floor; the column rises as it fills."""
         height = float(np.linalg.norm(np.ptp(self._items[i].outline, axis=0)))
         while self._foot[2] + height < self._high[2] + PILE_HEIGHT:
             top = self._high.copy()
@@ -173,7 +176,7 @@ class _Draw:
         return False
 
     def _scatter(self, i: int) -> bool:
-        """Low, and so far from the others that it meets none of them whichever way it falls."""
+        """Place an item low, and far enough from the others to avoid contact in whichever direction it falls."""
         outline = self._items[i].outline
         reach = float(np.linalg.norm(outline - outline.mean(axis=0), axis=1).max())
         top = self._high.copy()
@@ -194,7 +197,7 @@ class _Draw:
         places: int = _PLACES,
         occupies: Callable[[Float64Array], Float64Array] = lambda box: box,
     ) -> bool:
-        """Put an item, turned at random, somewhere between two corners where there is room."""
+        """Place an item with a random rotation at a free position between two corners."""
         pose = np.eye(4)
         pose[:3, :3] = Rotation.random(rng=self._rng).as_matrix()
         bounds = _bounds(self._items[i].outline, pose)
@@ -209,7 +212,7 @@ class _Draw:
         return False
 
     def _stack(self, members: Sequence[int]) -> bool:
-        """All members above one another, each on its largest face, turned about the vertical alike."""
+        """Stack all members, each on its largest face, with the same rotation about the vertical."""
         first = members[0]
         turn = resting_turn(self._items[first].outline)
         if not self._stand(first, turn):
@@ -225,7 +228,7 @@ class _Draw:
         return True
 
     def _build(self, members: Sequence[int]) -> bool:
-        """All members upright on one another, the widest below, each turned for itself and a little off the middle."""
+        """Stack all members upright, the widest at the bottom, each with its own rotation and a small offset."""
         sides = {i: self._side(i) for i in members}
         members = sorted(
             members, key=lambda i: -float(np.ptp((self._items[i].outline @ sides[i].T)[:, :2], axis=0).prod())
@@ -245,7 +248,7 @@ class _Draw:
         return True
 
     def _pack(self, members: Sequence[int]) -> bool:
-        """All members side by side in rows along x, from the region's low corner on."""
+        """Place all members side by side in rows along x, starting at the region's low corner."""
         corner, depth = self._low.copy(), 0.0
         for i in self._rng.permutation(np.asarray(members, dtype=np.intp)).tolist():
             pose = np.eye(4)
@@ -272,7 +275,7 @@ class _Draw:
         return True
 
     def _stand(self, i: int, turn: Float64Array, yaw: tuple[float, float] | None = None) -> bool:
-        """Put an item, turned about the vertical, down on what is below."""
+        """Put an item, rotated about the vertical, down on the surface below."""
         outline = self._items[i].outline
         for _ in range(_PLACES):
             pose = np.eye(4)
@@ -289,7 +292,7 @@ class _Draw:
         return False
 
     def _side(self, i: int) -> Float64Array:
-        """The rotation (3, 3) that brings down the side that an item stands on."""
+        """Draw the rotation (3, 3) that selects the side on which an item stands."""
         if self._turned_over > 0 and self._rng.random() < self._turned_over:
             turns = standing_turns(self._items[i].outline)
             if turns:
@@ -297,18 +300,19 @@ class _Draw:
         return np.eye(3)
 
     def _turn(self, yaw: tuple[float, float] | None) -> Float64Array:
-        """A rotation (3, 3) about the vertical by an angle from a range [degrees], or any."""
+        """Draw a rotation (3, 3) about the vertical by an angle from a range [degrees], or by any angle."""
         low, high = (0.0, 2 * np.pi) if yaw is None else np.radians(yaw)
         turn: Float64Array = Rotation.from_euler("z", self._rng.uniform(low, high)).as_matrix()
         return turn
 
     def _lower(self, i: int, pose: Float64Array) -> bool:
-        """Lower a pose, in place, until it all but touches an obstacle; false if there is none below.
+        """Lower a pose, in place, to just above the first obstacle; return False if there is no obstacle below.
 
-        Conservative advancement: nothing is met on a way that is shorter than the distance of what is nearest.
+        The method is conservative advancement: a step shorter than the distance to the nearest surface cannot cause a
+        collision.
         """
         top = _bounds(self._items[i].outline, pose)[1][2]
-        # The lid of an enclosure, which a pose at the region's top touches, is not met on the way down.
+        # The lid of an enclosure touches a pose at the region's top; it is not an obstacle for lowering.
         obstacles = [obstacle for obstacle in self._obstacles if obstacle.bounds[0][2] < top - _HOVER]
         if not obstacles:
             return False
@@ -326,7 +330,7 @@ class _Draw:
             pose[2, 3] -= distance - _HOVER / 2
 
     def _free(self, i: int, pose: Float64Array, box: Float64Array, *, above: bool = False) -> bool:
-        """Whether nothing is in the way; ``above`` asks for free sky as well, which whatever stands there needs."""
+        """Return True if a pose collides with nothing; with ``above``, the space above must be free too."""
         if above:
             box = np.stack([box[0], [*box[1][:2], self._sky]])
         if self._taken and _boxes_meet(box, np.stack(self._taken)).any():
@@ -340,12 +344,12 @@ class _Draw:
 
 
 def _bounds(outline: Float64Array, pose: Float64Array) -> Float64Array:
-    """Corners of the bounding box of points (N, 3) at a pose, shape (2, 3)."""
+    """Compute the corners of the bounding box of points (N, 3) at a pose, shape (2, 3)."""
     moved = outline @ pose[:3, :3].T + pose[:3, 3]
     return np.stack([moved.min(axis=0), moved.max(axis=0)])
 
 
 def _boxes_meet(box: Float64Array, others: Float64Array) -> BoolArray:
-    """Which of some boxes (N, 2, 3) come nearer to a box (2, 3) than objects may start."""
+    """Return a mask (N,) of boxes (N, 2, 3) closer to a box (2, 3) than the minimum start distance."""
     meet: BoolArray = ((box[0] < others[:, 1] + _SPACING) & (others[:, 0] < box[1] + _SPACING)).all(axis=1)
     return meet

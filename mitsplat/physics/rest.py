@@ -1,4 +1,4 @@
-"""When bodies that fall are at rest, and when it is clear that they will not be."""
+"""Detection of rest, and of drops that will not come to rest."""
 
 from __future__ import annotations
 
@@ -13,26 +13,27 @@ from mitsplat.arrays import Float64Array
 from mitsplat.physics.worlds import Body, ContactOverflow, World
 
 OVERFLOW = "contact buffer overflow"
-"""Why :func:`run_to_rest` refuses a drop that a larger capacity may save."""
+"""Reason of :func:`run_to_rest` for rejecting a drop that may succeed with a larger capacity."""
 
-# How far no surface may move [m] in how long [s] for all to be at rest, and before what may still roll is let go.
-# Speeds say less: contacts of rounded hulls flicker from step to step, and with them what stays where it is.
+# Rest means that no surface moves farther than a limit [m] within a time [s]. The stricter first stage ends before
+# rolling friction is disabled. Speeds are less reliable: contacts of rounded hulls flicker from step to step, and so do
+# the velocities of resting bodies.
 _MOTION, _WATCH_TIME = 5e-4, 1.0
 _QUIET_MOTION, _QUIET_TIME = 1e-4, 0.25
-_MEAN_TIME = 0.05  # over which speeds are told [s]
+_MEAN_TIME = 0.05  # averaging time of the reported speeds [s]
 
 
 @dataclass(frozen=True, eq=False)
 class RestOutcome:
-    """How a drop ended.
+    """Result of a drop.
 
     Attributes:
-        refused: Why it cannot be used, or empty.
+        refused: Reason of a rejection, or empty.
         time: Simulated time from which the bodies were at rest [s].
-        surface_motion: Farthest that a point of any body moved in the second after that [m]; infinite if refused.
-        max_speed, max_spin: Of the fastest body at the end of that second [m/s, rad/s].
-        poses: World-from-body transforms then, shape (N, 4, 4).
-        blamed: Positions of the bodies for which it is refused.
+        surface_motion: Largest displacement of a surface point in the second after that [m]; infinite if rejected.
+        max_speed, max_spin: Maxima over the bodies at the end of that second [m/s, rad/s].
+        poses: World-from-body transforms at that time, shape (N, 4, 4).
+        blamed: Positions of the bodies that cause the rejection.
     """
 
     refused: str
@@ -52,17 +53,18 @@ def run_to_rest(
     fastest: float = np.inf,
     observe: Callable[[float, Float64Array], None] = lambda time, poses: None,
 ) -> RestOutcome:
-    """Advance a world until its bodies have been at rest for a second, or it is clear that they will not be.
+    """Advance a world until its bodies have been at rest for a second, or until rest is ruled out.
 
-    At rest no surface moves by half a millimetre in a second, and by a tenth in its first quarter. After that quarter
-    nothing rolls with friction, which would let a box balance on its edge.
+    At rest, no surface point moves by 0.5 mm within one second, and by 0.1 mm within its first quarter. After that
+    quarter,
+    rolling friction is disabled, because it would let a box balance on its edge.
 
     Args:
-        world: Changed in place.
-        max_time: When they must have come to rest [s].
-        bounds: Corners of what centres of mass must not leave [m], shape (3,) each, or (N, 3) for each body.
-        fastest: Speed to which faster bodies are slowed down after each advance [m/s].
-        observe: Told the time [s] and the poses (N, 4, 4) after each advance.
+        world: Simulation; changed in place.
+        max_time: Time limit for coming to rest [s].
+        bounds: Corners of the box in which the centres of mass must stay [m], shape (3,) each, or (N, 3) for each body.
+        fastest: Speed limit to which faster bodies are slowed down after each advance [m/s].
+        observe: Callback that receives the time [s] and the poses (N, 4, 4) after each advance.
     """
     try:
         return _run_to_rest(world, max_time, bounds, fastest, observe)
@@ -74,7 +76,7 @@ def run_to_rest(
 
 
 class _Refused(Exception):
-    """Why a drop cannot be used, and for which bodies."""
+    """Rejection of a drop, with the bodies that cause it."""
 
     def __init__(self, reason: str, bodies: npt.ArrayLike) -> None:
         super().__init__(reason)
@@ -109,7 +111,7 @@ def _run_to_rest(
 
 
 def _advance_within(world: World, bounds: tuple[Float64Array, Float64Array], fastest: float) -> Float64Array:
-    """Advance, and return the poses."""
+    """Advance the world, check the bounds, and return the poses."""
     world.advance()
     poses, velocities = world.poses, world.velocities
     if not np.isfinite(poses).all() or not np.isfinite(velocities).all():
@@ -126,7 +128,7 @@ def _advance_within(world: World, bounds: tuple[Float64Array, Float64Array], fas
 
 
 def _centres(bodies: Sequence[Body], poses: Float64Array) -> Float64Array:
-    """Centres of mass [m], shape (N, 3)."""
+    """Compute the centres of mass [m], shape (N, 3)."""
     local = np.array([body.mass.centre for body in bodies])
     return np.asarray(np.einsum("nij,nj->ni", poses[:, :3, :3], local) + poses[:, :3, 3])
 
@@ -134,16 +136,16 @@ def _centres(bodies: Sequence[Body], poses: Float64Array) -> Float64Array:
 def _mean_speeds(
     bodies: Sequence[Body], before: Float64Array, after: Float64Array, seconds: float
 ) -> tuple[float, float]:
-    """Largest mean speed [m/s] and spin [rad/s] of any body between two sets of poses."""
+    """Compute the largest mean speed [m/s] and spin [rad/s] of any body between two sets of poses."""
     way = np.linalg.norm(_centres(bodies, after) - _centres(bodies, before), axis=1)
-    # Rotations that are an angle t apart differ by a matrix of Frobenius norm 2 sqrt(2) sin(t / 2).
+    # Rotations that differ by an angle t have a difference matrix of Frobenius norm 2 sqrt(2) sin(t / 2).
     apart = np.linalg.norm(after[:, :3, :3] - before[:, :3, :3], axis=(1, 2))
     turn = 2 * np.arcsin(np.minimum(1.0, apart / np.sqrt(8.0)))
     return float(way.max()) / seconds, float(turn.max()) / seconds
 
 
 def _surface_motion(bodies: Sequence[Body], before: Float64Array, after: Float64Array) -> Float64Array:
-    """Farthest that a point of each body is displaced between two sets of poses [m], shape (N,)."""
+    """Compute the largest displacement of a point of each body between two sets of poses [m], shape (N,)."""
     moved = after - before
     return np.array(
         [

@@ -1,4 +1,4 @@
-"""Layouts: objects dropped at random poses and simulated until they rest, each with a certificate that they do."""
+"""Settled layouts: objects dropped from random poses and simulated until they rest, each with a rest certificate."""
 
 from __future__ import annotations
 
@@ -40,37 +40,42 @@ MODULES = (
     "scene.streams",
     "scene.walls",
 )
-"""Whose code decides how objects come to rest; of others they import only types, and values, which are hashed."""
+"""Modules whose code determines the resting poses.
+
+From other modules they import only types and values, and the values are hashed separately.
+"""
 _SIMULATION = ("mujoco", "mujoco-warp", "newton", "warp-lang")
 LIBRARIES = ("coacd", "fast-simplification", "numpy", "scipy", "trimesh", *_SIMULATION)
 
 
 @one_at_a_time
 def settle_layout(scene: Scene, index: int, *, progress: Note | None = None, cached: bool = True) -> Layout:
-    """Drop the objects of one layout until they rest. The scene's seed and ``index`` decide the result.
+    """Drop the objects of one layout until they rest. The scene's seed and ``index`` determine the result.
 
-    It is kept in ``$XDG_CACHE_HOME/mitsplat/layouts`` (``~/.cache`` by default) by the hash of all that decides it:
-    what is dropped, from where, on what and with which code, but not how it is shown.
+    The result is cached in ``$XDG_CACHE_HOME/mitsplat/layouts`` (``~/.cache`` by default). The key is a hash of all
+    inputs
+    of the simulation: objects, start regions, colliders and code, but not their appearance.
 
     Args:
-        scene: What to drop, from where, and on what.
+        scene: Objects, start regions and colliders.
         index: Index of the layout.
-        progress: Told in a few words what takes long: making convex pieces, compiling.
-        cached: Whether a layout that was settled before is taken from the cache, and this one kept there.
+        progress: Callback for slow operations: convex decomposition, compilation.
+        cached: Read an existing result from the cache, and write a new one to it.
 
     Raises:
-        InputError: If the index is no layout's, the region is too small for the objects, or none of them comes to rest
-            within the limits.
+        InputError: If there is no layout of this index, the region is too small for the objects, or none of them comes
+            to
+            rest within the limits.
     """
     index = whole(index, "layout")
     if index < 0:
         raise InputError(f"layout must be at least 0 (got {index})")
     path = cache_folder() / "layouts" / f"{_scene_hash(scene)[:32]}-{index:04d}.json"
     if cached:
-        with suppress(OSError, ValueError, KeyError, TypeError):  # damaged or missing: settled anew
+        with suppress(OSError, ValueError, KeyError, TypeError):  # a damaged or missing file is made anew
             return Layout.from_json(json.loads(path.read_bytes()))
     with warp_settings(progress):
-        from mitsplat.physics.drop import drop_of  # Newton compiles as these settings say
+        from mitsplat.physics.drop import drop_of  # Newton reads these settings when it compiles
 
         layout = drop_of(scene, progress or (lambda text: None)).settle(index)
     if cached:
@@ -80,7 +85,7 @@ def settle_layout(scene: Scene, index: int, *, progress: Note | None = None, cac
 
 @dataclass(frozen=True)
 class _SettleOne:
-    """Settles a layout in a worker process."""
+    """Job that settles a layout in a worker process."""
 
     scene: Scene
     cached: bool
@@ -95,11 +100,12 @@ class _SettleOne:
 def settle_layouts(
     scene: Scene, indices: Iterable[int], *, workers: int = 1, progress: Note | None = None, cached: bool = True
 ) -> Iterator[Layout]:
-    """Settle many layouts over processes, in the order in which they are finished; see :func:`settle_layout`.
+    """Settle many layouts in worker processes and yield them in order of completion; see :func:`settle_layout`.
 
-    One of which nothing comes to rest has no objects, and names those that it lacks.
+    If no object of a layout comes to rest, the layout is empty and lists the missing objects.
 
-    Several layouts in one simulation (Newton's worlds) cost about as much each as one alone on a CPU, and would wait
+    Several layouts in one simulation (Newton's worlds) cost about as much per layout as single ones on a CPU, and would
+    wait
     for the slowest (``python -m benchmarks.physics.settle worlds``).
     """
     layouts = {index: [index] for index in indices}
@@ -107,18 +113,18 @@ def settle_layouts(
 
 
 def try_alone(scene: Scene, *, tries: int = 3) -> Iterator[tuple[str, Arrangement, list[str]]]:
-    """Drop each object alone, until it rests: its asset, the arrangement, and why each try failed if all did.
+    """Drop each object alone; yield its asset, the arrangement, and the reasons of the tries if all of them failed.
 
-    Of an asset's sizes one is tried. MuJoCo in C steps, whatever the scene asks for: it has nothing to compile.
+    One size of each asset is tried. The stepper is always MuJoCo in C, because it needs no compilation.
 
     Raises:
-        InputError: If there is nothing to rest on.
+        InputError: If no collider exists.
     """
     settle = scene.spec.settle.model_copy(update={"stepper": "mujoco"})
     scene = replace(scene, spec=scene.spec.model_copy(update={"settle": settle}))
     tried = set()
     with warp_settings():
-        from mitsplat.physics.drop import drop_of  # Newton compiles as these settings say
+        from mitsplat.physics.drop import drop_of  # Newton reads these settings when it compiles
 
         drop = drop_of(scene, lambda text: None)
         for entry, pool in zip(scene.spec.objects, scene.pools, strict=True):
@@ -132,12 +138,15 @@ def try_alone(scene: Scene, *, tries: int = 3) -> Iterator[tuple[str, Arrangemen
 
 
 def replay_layout(scene: Scene, layout: Layout, *, interval: float = 0.04) -> Iterator[Layout]:
-    """How a layout came to rest: the layout as it was every ``interval`` seconds [s], and at last as it is.
+    """Simulate the drop of a layout again.
 
-    On a CPU the drop that is simulated again is the one that was.
+    On a CPU, the simulation reproduces the original drop exactly.
+
+    Yields:
+        The layout every ``interval`` seconds [s], and finally the given layout.
     """
     with warp_settings():
-        from mitsplat.physics.drop import drop_of  # Newton compiles as these settings say
+        from mitsplat.physics.drop import drop_of  # Newton reads these settings when it compiles
 
         for poses in drop_of(scene, lambda text: None).replay(layout, interval):
             moving = (
@@ -150,7 +159,7 @@ def replay_layout(scene: Scene, layout: Layout, *, interval: float = 0.04) -> It
 
 @lru_cache(maxsize=4)
 def _scene_hash(scene: Scene) -> str:
-    """Hash of what decides where the objects of a scene come to rest."""
+    """Return a hash of all inputs that determine the resting poses of a scene."""
     spec = scene.spec
     digest = ContentHash()
 
@@ -172,7 +181,7 @@ def _scene_hash(scene: Scene) -> str:
     add(platform.machine(), spec.seed, spec.settle, spec.region, spec.objects, shapes, spec.randomise.friction)
     add(scene.class_names, spec.environment_collides)
     held_out = spec.hold_out.assets or spec.hold_out.environments
-    if spec.empty or held_out or any(entry.balance for entry in spec.objects):  # which depend on splits
+    if spec.empty or held_out or any(entry.balance for entry in spec.objects):  # these depend on splits
         add(spec.empty, spec.output.validation, spec.output.test, spec.hold_out)
     for mesh in compress(scene.shape_meshes, solid):
         add_mesh(mesh)
@@ -190,8 +199,8 @@ def _scene_hash(scene: Scene) -> str:
 
 @contextmanager
 def warp_settings(progress: Note | None = None) -> Iterator[None]:
-    """Keep Warp quiet and leave gradients out, without which the simulation compiles in two thirds of the time."""
-    import warp as wp  # takes a third of a second, which a layout from the cache does not need
+    """Silence Warp and disable gradients, which reduces the simulation's compile time to two thirds."""
+    import warp as wp  # takes a third of a second, which a cached layout does not need
 
     kept = wp.config.enable_backward
     wp.config.enable_backward = False

@@ -1,6 +1,6 @@
-"""Rigid bodies that fall: a Newton model, stepped by MuJoCo's solver on Warp or in C.
+"""Rigid-body simulation: a Newton model, stepped by MuJoCo's solver on Warp or in C.
 
-Import it, and use it, within :func:`mitsplat.physics.settle.warp_settings`, which keeps compilation short.
+Import and use this module within :func:`mitsplat.physics.settle.warp_settings`, which shortens compilation.
 """
 
 from __future__ import annotations
@@ -25,17 +25,18 @@ from mitsplat.physics.contacts import ContactFinder, newton_hull
 from mitsplat.physics.friction import PairFrictionSolver, pair_friction
 
 _GRAVITY = (0.0, 0.0, -9.81)
-# Contact of damping 2/t and stiffness 1/(t z)^2, as MuJoCo's. At a damping ratio z of 1 a body rebounds from a drop of
-# 0.3 m by 5 mm, for contact cannot pull; from 1.5 it does not leave the table, and at 2 it sinks in deeper for nothing.
+# Contact of damping 2/t and stiffness 1/(t z)^2, as in MuJoCo. At a damping ratio z of 1, a body rebounds from a drop
+# of 0.3 m by 5 mm, because contact cannot pull. From 1.5 on it does not leave the table. At 2 it penetrates deeper
+# without benefit.
 _CONTACT_TIME, _DAMPING_RATIO = 0.004, 1.5
-# Radius of contact and length of roll friction [m], at most these shares of the size: round parts stop, thin ones do
-# not stand on their rim. See :mod:`mitsplat.physics.friction`.
+# Contact radius and rolling-friction length [m], limited to these shares of the size, so that round parts stop and thin
+# parts do not stand on their rim. See :mod:`mitsplat.physics.friction`.
 _CONTACT_RADIUS, _ROLLING = (0.01, 0.2), (5e-4, 0.01)
-_WITH_ROLL, _WITHOUT_ROLL = 6, 4  # dimensions of a contact: one across, two of sliding, spin, and two of rolling
-# Impedance of contacts at their surface and 1 mm deep: at MuJoCo's default of 0.9, a nut that carries a plate of a
-# hundred times its mass sinks by 1 mm. MuJoCo's own contacts, which flicker, come to rest less often when stiffer.
+_WITH_ROLL, _WITHOUT_ROLL = 6, 4  # contact dimensions: normal, two sliding, spin, and two rolling
+# Impedance of contacts at the surface and 1 mm deep: at MuJoCo's default of 0.9, a nut under a plate of a hundred times
+# its mass sinks by 1 mm. MuJoCo's own contacts flicker, and come to rest less often when stiffer.
 _IMPEDANCE_WARP, _IMPEDANCE_MUJOCO = (0.996, 0.9999), (0.99, 0.999)
-_STEPS = 4  # per captured graph; even, so that the two states end as they began
+_STEPS = 4  # per captured graph; even, so that the two states return to their roles
 _SOLVER_OPTIONS: dict[str, Any] = {
     "integrator": "implicitfast",
     "solver": "newton",
@@ -46,7 +47,7 @@ _SOLVER_OPTIONS: dict[str, Any] = {
     "include_sites": False,
     "kinematic_switchable_roots": False,
 }
-# The stages of mj_step (mj_forward, then the integrator) for models without sensors, before and after collision.
+# Stages of mj_step (mj_forward, then the integrator) for models without sensors, before and after collision.
 _BEFORE_CONTACTS = (
     *(mujoco.mj_checkPos, mujoco.mj_checkVel),
     *(mujoco.mj_fwdKinematics, mujoco.mj_makeM, mujoco.mj_factorM),
@@ -56,17 +57,17 @@ _AFTER_CONTACTS = (
     *(mujoco.mj_fwdVelocity, mujoco.mj_fwdActuation, mujoco.mj_fwdAcceleration, mujoco.mj_fwdConstraint),
     *(mujoco.mj_checkAcc, mujoco.mj_implicit),
 )
-# Some kernels are compiled for the number of bodies: bodies without shape fill it up to a multiple of this.
+# Some kernels are compiled for the number of bodies. Bodies without shape pad it to a multiple of this.
 _BATCH = 4
 
 
 class ContactOverflow(Exception):
-    """More contacts than the buffers hold: some were dropped, and bodies may have passed through one another."""
+    """Overflow of the contact buffers: contacts were dropped, and bodies may have passed through one another."""
 
 
 @dataclass(frozen=True, eq=False)
 class Body:
-    """What falls. Bodies of one asset share it."""
+    """Dynamic rigid body. Bodies of one asset share it."""
 
     pieces: tuple[trimesh.Trimesh, ...]
     mass: MassProperties
@@ -74,7 +75,7 @@ class Body:
 
     @cached_property
     def outline(self) -> Float64Array:
-        """Vertices of the convex hull [m], shape (N, 3); nothing of the body moves farther than one of them."""
+        """Vertices of the convex hull [m], shape (N, 3). The largest displacement of the body occurs at one of them."""
         return np.asarray(join_meshes(self.pieces).convex_hull.vertices, dtype=np.float64)
 
     @cached_property
@@ -84,11 +85,11 @@ class Body:
 
     @cached_property
     def hulls(self) -> list[newton.Mesh]:
-        """The pieces for Newton."""
+        """The pieces as Newton meshes."""
         return [newton_hull(piece) for piece in self.pieces]
 
     def with_friction(self, friction: float) -> Body:
-        """The same body with another friction; what is made of its pieces is made once for both."""
+        """Return the same body with another friction; both share the data derived from the pieces."""
         body = replace(self, friction=friction)
         vars(body).update(outline=self.outline, size=self.size, hulls=self.hulls)
         return body
@@ -96,7 +97,7 @@ class Body:
 
 @dataclass(frozen=True, eq=False)
 class Collider:
-    """What does not move: convex pieces in world space, or a box by its full ``size`` [m] and pose (4, 4)."""
+    """Static collider: convex pieces in world space, or a box by its full ``size`` [m] and pose (4, 4)."""
 
     friction: float
     pieces: tuple[trimesh.Trimesh, ...] = ()
@@ -104,7 +105,7 @@ class Collider:
 
 
 def all_pieces(bodies: Iterable[Body], colliders: Iterable[Collider]) -> Iterator[trimesh.Trimesh]:
-    """Convex pieces of all that is simulated."""
+    """Yield the convex pieces of all bodies and colliders."""
     for body in bodies:
         yield from body.pieces
     for collider in colliders:
@@ -112,10 +113,10 @@ def all_pieces(bodies: Iterable[Body], colliders: Iterable[Collider]) -> Iterato
 
 
 class World(ABC):
-    """Bodies above colliders; made without motion, set in motion by :meth:`reset`.
+    """Simulation of bodies above colliders; :meth:`reset` sets its initial state.
 
     Attributes:
-        bodies: What falls.
+        bodies: Dynamic bodies.
         interval: Simulated time of each :meth:`advance` [s].
         time: Simulated time since :meth:`reset` [s].
     """
@@ -127,7 +128,7 @@ class World(ABC):
         self._rolls = False
 
     def reset(self, poses: Float64Array, velocities: Float64Array | None = None) -> None:
-        """Put the bodies somewhere; nothing is left of the past.
+        """Set the state of all bodies and clear the solver's history.
 
         Args:
             poses: World-from-body transforms, shape (N, 4, 4).
@@ -139,20 +140,20 @@ class World(ABC):
         self.set_velocities(np.zeros((len(self.bodies), 2, 3)) if velocities is None else velocities)
 
     def set_velocities(self, velocities: Float64Array) -> None:
-        """Give the bodies other velocities, as :attr:`velocities`, where they are."""
+        """Set the velocities of the bodies, as in :attr:`velocities`; poses do not change."""
         self._set_velocities(np.pad(velocities, ((0, -len(velocities) % _BATCH), (0, 0), (0, 0))))
 
     def advance(self) -> None:
-        """Step a few times.
+        """Advance the simulation by :attr:`interval`.
 
         Raises:
-            ContactOverflow: The contact buffers were too small in one of the steps.
+            ContactOverflow: If the contact buffers were too small in one of the steps.
         """
         self._advance()
         self.time += self.interval
 
     def let_roll(self, rolls: bool) -> None:
-        """Take roll friction away, or give it back."""
+        """Disable rolling friction if ``rolls`` is true, else enable it."""
         if rolls != self._rolls:
             self._rolls = rolls
             self._let_roll(rolls)
@@ -176,7 +177,7 @@ class World(ABC):
 
     @abstractmethod
     def _set_velocities(self, velocities: Float64Array) -> None:
-        """Velocities of every body, those without shape included, shape (M, 2, 3)."""
+        """Set the velocities of every body, including those without shape, shape (M, 2, 3)."""
 
     @abstractmethod
     def _advance(self) -> None: ...
@@ -186,14 +187,15 @@ class World(ABC):
 
     @abstractmethod
     def _coordinates(self) -> Float64Array:
-        """Position and xyzw quaternion of every body, those without shape included, shape (M, 7)."""
+        """Return position and xyzw quaternion of every body, including those without shape, shape (M, 7)."""
 
 
 class WarpWorld(World):
-    """Newton's contacts and mujoco_warp's solver in one captured graph.
+    """Simulation with Newton's contacts and mujoco_warp's solver in one captured graph.
 
-    The contacts of mujoco_warp itself flicker where many coplanar pieces touch in single precision: a cup of fifty
-    pieces then creeps at 5 mm/s for ever. Newton's come to rest.
+    The contacts of mujoco_warp itself flicker in single precision where many coplanar pieces touch. A cup of fifty
+    pieces
+    then creeps at 5 mm/s and never rests. Newton's contacts come to rest.
     """
 
     def __init__(
@@ -212,16 +214,17 @@ class WarpWorld(World):
         self._solver = PairFrictionSolver(
             model, nconmax=contacts, njmax=6 * contacts, use_mujoco_contacts=False, **_SOLVER_OPTIONS
         )
-        # Overflow is read from flags: the kernels would print it at every step.
+        # Overflow is read from flags, because the kernels would print it at every step.
         self._solver.mjw_model.opt.warn_overflow = 0
-        # One contact more than the solver takes: the pipeline stops counting when it is full, and flags nothing then.
+        # The pipeline has room for one contact more than the solver, because it stops counting when it is full and sets
+        # no flag.
         finder = contact_finder or ContactFinder(all_pieces(bodies, colliders))
         self._pipeline = finder.pipeline(model, max_contacts=contacts + 1)
         self._contacts = self._pipeline.contacts()
         self._states = model.state(), model.state()
         self._control = model.control()
         self._observables = [self._solver.observables({SolverMuJoCo.ObservableKind.OVERFLOW}) for _ in range(_STEPS)]
-        self._record(self._observables[:1])  # loads the kernels, which a capture must not
+        self._record(self._observables[:1])  # loads the kernels; a graph capture must not load them
         with wp.ScopedCapture(device="cpu") as capture:
             self._record(self._observables)
         self._graph = capture.graph
@@ -262,7 +265,7 @@ class WarpWorld(World):
 
 
 class MujocoWorld(World):
-    """The same model, stepped by MuJoCo in C: double precision, its own contacts, buffers that grow."""
+    """Simulation of the same model with MuJoCo in C: double precision, MuJoCo's contacts, growing buffers."""
 
     def __init__(self, bodies: Sequence[Body], colliders: Sequence[Collider], *, timestep: float) -> None:
         super().__init__(bodies, timestep=timestep)
@@ -275,7 +278,7 @@ class MujocoWorld(World):
 
     @property
     def velocities(self) -> Float64Array:
-        """See :attr:`World.velocities`; MuJoCo's are of the frame's origin, and turn in the body's axes."""
+        """See :attr:`World.velocities`. MuJoCo stores the velocity of the frame's origin, and the spin in body axes."""
         rotations = self.poses[:, :3, :3]
         of_origin = np.array(self._data.qvel).reshape(-1, 2, 3)[: len(self.bodies)]
         spin = np.einsum("nij,nj->ni", rotations, of_origin[:, 1])
@@ -301,9 +304,10 @@ class MujocoWorld(World):
             raise ContactOverflow
 
     def _step(self) -> None:
-        """``mj_step`` for this integrator, but with the friction of :mod:`mitsplat.physics.friction`.
+        """Run ``mj_step`` for this integrator with the friction of :mod:`mitsplat.physics.friction`.
 
-        Between what it calls there is no callback where contacts are known and their constraints are not made yet.
+        MuJoCo has no callback between contact detection and constraint assembly, so that its stages are called
+        separately.
         """
         model, data = self._model, self._data
         for stage in (*_BEFORE_CONTACTS, mujoco.mj_collision):
@@ -321,7 +325,7 @@ class MujocoWorld(World):
 
 
 def _array(values: Any) -> Float64Array:
-    """A Warp array as a copy in double precision."""
+    """Copy a Warp array in double precision."""
     return np.array(values.numpy(), dtype=np.float64)
 
 
@@ -330,9 +334,11 @@ def _assign(array: Any, values: Float64Array) -> None:
 
 
 def _parking(bodies: Sequence[Body]) -> Float64Array:
-    """Where bodies wait, those without shape always: in a row above everything, far apart; shape (M, 7).
+    """Return initial coordinates in a row high above the scene, far apart, shape (M, 7).
 
-    Models are built there, so that no constant of the solver depends on the poses of a drop.
+    Bodies without shape stay there. Models are built with these coordinates, so that no constant of the solver depends
+    on
+    the poses of a drop.
     """
     spacing = 2 * max(body.size for body in bodies)
     count = len(bodies) + -len(bodies) % _BATCH
@@ -342,7 +348,7 @@ def _parking(bodies: Sequence[Body]) -> Float64Array:
 
 
 def _coordinates(bodies: Sequence[Body], poses: Float64Array) -> Float64Array:
-    """Position and xyzw quaternion of bodies at poses (N, 4, 4), and of those without shape, shape (M, 7)."""
+    """Return position and xyzw quaternion of bodies at poses (N, 4, 4), and of those without shape, shape (M, 7)."""
     coordinates = _parking(bodies)
     turns = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
     coordinates[: len(poses)] = np.concatenate([poses[:, :3, 3], turns], axis=1)
@@ -350,7 +356,7 @@ def _coordinates(bodies: Sequence[Body], poses: Float64Array) -> Float64Array:
 
 
 def max_contacts(bodies: int, shapes: int) -> int:
-    """How many contacts to make room for: most kernels run over all of it, and parts that tumble fill a half to 0.8."""
+    """Return the capacity for contacts; tumbling parts use 0.5 to 0.8 of it, and most kernels run over all of it."""
     return 24 * bodies + shapes
 
 
@@ -363,10 +369,10 @@ def _build_scene(
 ) -> newton.ModelBuilder:
     contact = {"mujoco:condim": _WITH_ROLL, "mujoco:geom_solimp": (*impedance, 1e-3, 0.5, 2.0)}
     builder = newton.ModelBuilder(gravity=_GRAVITY)
-    builder.validate_inertia_detailed = True  # in Python: the other way compiles a kernel for 4 s
+    builder.validate_inertia_detailed = True  # in Python: the alternative compiles a kernel for 4 s
     SolverMuJoCo.register_custom_attributes(builder)
     for collider in colliders:
-        # Size 0 leaves the lengths of spin and roll friction to the bodies.
+        # With size 0, the bodies determine the lengths of spin and rolling friction.
         config = _shape_config(collider.friction, size=0.0)
         if collider.box is not None:
             size, pose = collider.box

@@ -1,4 +1,7 @@
-"""Where a photo shows the bare board: surely not the object, though it may be as black as the board's squares are."""
+"""Detection of uncovered board squares in a photo.
+
+Uncovered squares are certainly not the object, even if the object is as black as the squares of the board.
+"""
 
 from __future__ import annotations
 
@@ -13,32 +16,36 @@ from mitsplat.capture.boards.targets import Board
 from mitsplat.geometry.camera import Camera
 
 _DOTS = 16
-"""Samples along a square's edge."""
+"""Samples along the edge of a square."""
 
 _RIM = 3
-"""Samples of the squares around one that must be as printed as well: a black square shows nothing but its edges."""
+"""Width of the rim around a square that must also match the print, in samples; a black square has detail only at its
+edges.
+"""
 
 _LIKENESS = 0.9
-"""Correlation with the print from which a square is bare."""
+"""Minimum correlation of an uncovered square with the print."""
 
 _BLOT = 0.3
-"""Largest difference from the print anywhere in a bare square, as a share of the contrast of black and white."""
+"""Maximum difference from the print at any sample of an uncovered square, as a fraction of the black-white contrast."""
 
 
 def bare_squares(
     board: Board, world_from_board: Float64Array, camera: Camera, grey: npt.NDArray[np.uint8]
 ) -> BoolArray:
-    """Pixels of the squares that an image shows as they are printed, shape (H, W).
+    """Return the pixels of squares that look as printed, shape (H, W).
 
-    Each square is laid flat and compared with the print, up to the brightness and contrast of the light there. A square
-    counts only as a whole, with the edges of those around it, so that what covers a part of it leaves none of it. What
-    is thinner than a tenth of a square, or covers a few modules of a marker in a grey like theirs, can go unseen.
+    Each square is rectified and compared with the print, up to the local brightness and contrast. A square is accepted
+    only
+    as a whole, with the edges of its neighbours. So a partly covered square is rejected completely. Things thinner than
+    a
+    tenth of a square, or things that cover a few modules of a marker in a similar grey, can be missed.
 
     Args:
-        board: The print.
-        world_from_board: Its pose (4, 4), in the camera's world.
-        camera: Of the image.
-        grey: The image, 8-bit, shape (H, W).
+        board: The printed board.
+        world_from_board: Pose of the board in the world of the camera, shape (4, 4).
+        camera: Camera of the image.
+        grey: 8-bit image, shape (H, W).
     """
     found = np.zeros(grey.shape, dtype=np.uint8)
     flat, shown = _laid_flat(board, world_from_board, camera, grey)
@@ -56,30 +63,30 @@ def bare_squares(
 
 @cache
 def _printed(board: Board) -> Float64Array:
-    """The print, 0 to 255, in the samples of :func:`_laid_flat`."""
+    """Return the print, 0 to 255, in the samples of :func:`_laid_flat`."""
     return _blurred(cv2.resize(board.draw(4 * _DOTS), None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA))
 
 
 def _alike(values: Float64Array, printed: Float64Array) -> bool:
-    """Whether values are those of the print, times and plus something."""
+    """Return True if the values match the print up to a factor and an offset."""
     values, printed = values - values.mean(), printed - printed.mean()
     spread = float((printed * printed).sum())
     contrast = float((values * printed).sum()) / spread
     if not contrast > 0:
         return False
     likeness = contrast * np.sqrt(spread / float((values * values).sum()))
-    # The print is 0 to 255, so the contrast is that of the image's black and white as well.
+    # The print ranges from 0 to 255, so ``contrast`` also relates the black-white contrast of the image to 255.
     return bool(likeness > _LIKENESS and np.abs(values - contrast * printed).max() < _BLOT * 255 * contrast)
 
 
 def _places(board: Board, x: Float64Array, y: Float64Array) -> Float64Array:
-    """Places on the board [m], shape (len(y), len(x), 3), of positions in squares from its upper left corner."""
+    """Return points on the board [m], shape (len(y), len(x), 3), at positions in squares from its upper left corner."""
     across, down = np.meshgrid(x, y)
     return np.stack([across - board.columns / 2, board.rows / 2 - down, np.zeros_like(down)], axis=-1) * board.square
 
 
 def _seen(places: Float64Array, world_from_board: Float64Array, camera: Camera) -> Float64Array:
-    """Pixel positions (..., 2) of places on the board (..., 3)."""
+    """Return the pixel positions (..., 2) of points on the board (..., 3)."""
     pixels, _ = camera.project(places.reshape(-1, 3) @ world_from_board[:3, :3].T + world_from_board[:3, 3])
     return pixels.reshape(*places.shape[:-1], 2)
 
@@ -87,7 +94,7 @@ def _seen(places: Float64Array, world_from_board: Float64Array, camera: Camera) 
 def _laid_flat(
     board: Board, world_from_board: Float64Array, camera: Camera, grey: npt.NDArray[np.uint8]
 ) -> tuple[Float64Array, BoolArray]:
-    """The board in samples of the image, and which of these the image holds."""
+    """Return the rectified board in samples of the image, and the samples that lie inside the image."""
     x, y = ((np.arange(n * _DOTS) + 0.5) / _DOTS for n in (board.columns, board.rows))
     pixels = _seen(_places(board, x, y), world_from_board, camera)
     shown = np.asarray(((pixels >= 0) & (pixels < (camera.width, camera.height))).all(axis=-1))
@@ -100,5 +107,5 @@ def _laid_flat(
 
 
 def _blurred(image: npt.NDArray[np.generic]) -> Float64Array:
-    """Cameras are off by a fraction of a sample; what is sharper than that must not count."""
+    """Blur an image, because camera errors of a fraction of a sample must not affect the comparison."""
     return np.asarray(cv2.GaussianBlur(np.asarray(image, dtype=np.float64), (0, 0), 1.0))

@@ -1,4 +1,4 @@
-"""Printed targets of known size: the ChArUco board of ``mitsplat board``, and AprilTags, found in photographs."""
+"""Printed targets of known size and their detection: the ChArUco board of ``mitsplat board``, and AprilTags."""
 
 from __future__ import annotations
 
@@ -17,35 +17,36 @@ from mitsplat.errors import InputError
 from mitsplat.storage.files import write_file
 
 PAPERS: Mapping[str, tuple[float, float]] = {"a4": (0.297, 0.210), "letter": (0.2794, 0.2159), "a3": (0.420, 0.297)}
-"""Sheets in landscape, width and height [m]."""
+"""Paper sizes in landscape, width and height [m]."""
 
 _DOTS = 20
-"""Dots per millimetre: squares of whole millimetres, and the modules of their markers, end on dots."""
+"""Dots per millimetre; squares of whole millimetres and the modules of their markers end on dots."""
 
 _MARGIN = 0.008
-"""What printers leave white at the border [m]."""
+"""Unprintable margin of printers [m]."""
 
 _SMALL = 1000
-"""Longer edge of images below which they are enlarged to look for a board [px]."""
+"""Longer edge of images below which they are enlarged for the board detection [px]."""
 
 LEAST_SQUARE = 0.001
-"""Smallest square of a board [m], of whose marker a module is two dots."""
+"""Minimum square edge of a board [m], at which a module of a marker has two dots."""
 
 _MARKER = 0.75
-"""Edge of a marker as a share of its square."""
+"""Edge of a marker as a fraction of its square."""
 
 
 @dataclass(frozen=True)
 class Board:
-    """A ChArUco board: a chessboard with ArUco markers (``DICT_5X5_250``) in its white squares.
+    """ChArUco board: a chessboard with ArUco markers (``DICT_5X5_250``) in its white squares.
 
     Attributes:
-        columns, rows: Squares across and down.
+        columns, rows: Numbers of squares across and down.
         square: Edge of a square as printed [m].
 
     Raises:
-        InputError: If there are fewer than 3x4 squares, which have six inner corners, more than the dictionary has
-            markers, or no size.
+        InputError: If there are fewer than 3x4 squares (six inner corners) or more than the dictionary has markers, or
+            if
+            the square edge is out of range.
     """
 
     columns: int = 7
@@ -60,24 +61,28 @@ class Board:
 
     @property
     def aruco(self) -> Any:
-        """OpenCV's description of it."""
+        """Board object of OpenCV."""
         markers = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_250)
         return cv2.aruco.CharucoBoard((self.columns, self.rows), self.square, _MARKER * self.square, markers)
 
     @property
     def corners(self) -> Float64Array:
-        """Inner corners on the board [m], shape (N, 3): origin in the middle, x right, y up the sheet, z off it."""
+        """Inner corners on the board [m], shape (N, 3): origin in the middle, x right, y up, z out of the sheet."""
         y, x = np.mgrid[1 : self.rows, 1 : self.columns].reshape(2, -1)
         flat = np.column_stack([x - self.columns / 2, self.rows / 2 - y, np.zeros(len(x))])
         return np.asarray(flat * self.square)
 
     def draw(self, dots: int) -> npt.NDArray[np.uint8]:
-        """The board alone, 8-bit grey, with squares of so many dots."""
+        """Draw the board without a margin, 8-bit grey.
+
+        Args:
+            dots: Edge of a square in pixels.
+        """
         size = (self.columns * dots, self.rows * dots)
         return np.asarray(self.aruco.generateImage(size, marginSize=0, borderBits=1))
 
     def write_pdf(self, path: Path, paper: str) -> None:
-        """Write the sheet to print, true to size, with a ruler to check it by.
+        """Write the sheet to print in true size, with a ruler to verify the size.
 
         Raises:
             InputError: If the board does not fit on the paper, or the file cannot be written.
@@ -106,7 +111,7 @@ class Board:
         draw.rectangle([start, base - dots(0.001), start + dots(0.1) - 1, base - dots(0.0005)], fill=0)
         for x in (start, start + dots(0.1) - 4):
             draw.rectangle([x, base - dots(0.0025), x + 3, base], fill=0)
-        # Two levels: PIL stores these without loss, unlike grey, which becomes a JPEG.
+        # PIL stores bilevel images without loss; grey images would become JPEG.
         page = sheet.convert("1", dither=Image.Dither.NONE)
         try:
             write_file(path, lambda part: page.save(part, "PDF", resolution=25.4 * _DOTS))
@@ -114,8 +119,12 @@ class Board:
             raise InputError(f"{path}: cannot be written ({error.strerror or error})") from error
 
     def find(self, grey: npt.NDArray[np.uint8]) -> dict[int, Float64Array]:
-        """Inner corners of the board that an image shows: pixel positions, centres at +0.5, by index."""
-        # Markers of few pixels are only found enlarged.
+        """Detect the inner corners of the board in an image.
+
+        Returns:
+            Pixel positions by index of the corner; pixel centres are at +0.5.
+        """
+        # Markers of few pixels are detected only in enlarged images.
         factor = 2 if max(grey.shape) < _SMALL else 1
         image = cv2.resize(grey, None, fx=factor, fy=factor, interpolation=cv2.INTER_CUBIC) if factor > 1 else grey
         found, ids, _, _ = cv2.aruco.CharucoDetector(self.aruco).detectBoard(image)
@@ -126,9 +135,12 @@ class Board:
 
 
 def find_tags(grey: npt.NDArray[np.uint8]) -> dict[int, Float64Array]:
-    """AprilTags of family 36h11 in an image: their corners (4, 2), clockwise from the upper left, by id.
+    """Detect AprilTags of family 36h11 in an image.
 
-    Pixel centres are at +0.5. An id that the image shows twice is left out: it is no landmark.
+    A tag whose id occurs twice in the image is excluded, because it is ambiguous.
+
+    Returns:
+        Corners (4, 2) by tag id, clockwise from the upper left; pixel centres are at +0.5.
     """
     settings = cv2.aruco.DetectorParameters()
     settings.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_APRILTAG

@@ -1,8 +1,8 @@
-"""The object among the points of a photographed place: what most photos look at, or what a hint says.
+"""Selection of the object among the points of a photographed place.
 
-What stands out of its support (:mod:`.support`) falls into things that lie apart. Each is weighed by how near to the
-middle of its photos it is seen, and how near to the place that the cameras look at it lies; a pick or a box decides
-before that.
+Points above the support surface (:mod:`.support`) are clustered into separate things. A pick or a box decides if given.
+Otherwise the score of a thing increases with its closeness to the centres of the photos, and with its closeness to the
+point at which the cameras are directed.
 """
 
 from __future__ import annotations
@@ -21,30 +21,30 @@ from mitsplat.errors import InputError
 from mitsplat.geometry.camera import Camera
 
 _REACH = 0.7
-"""Of the cameras' distance: how far from what they look at things count."""
+"""Maximum distance of considered points from the focus, as a fraction of the cameras' distance."""
 _CENTRED = 0.25
-"""Of the cameras' distance: standard deviation of how far from there the object may be."""
+"""Standard deviation of the object's distance from the focus, as a fraction of the cameras' distance."""
 _MIDDLE = 0.2
-"""Standard deviation of the window around a photo's middle, as a share of its longer edge."""
+"""Standard deviation of the window around the centre of a photo, as a fraction of its longer edge."""
 _HEIGHT = 3.0
-"""Roughnesses of the support above it from which a point stands on it."""
+"""Minimum height of points above the support, in roughnesses of the support."""
 _FLATTEST = 0.003
-"""Least roughness, of the cameras' distance."""
+"""Minimum roughness, as a fraction of the cameras' distance."""
 _APART = (0.02, 0.08)
-"""Of the cameras' distance: bounds of the gap between things, which is four times that between points."""
+"""Bounds of the gap between things, as fractions of the cameras' distance; the gap is four times the point spacing."""
 _FEWEST = 20
 _PICKED = 0.1
-"""How far from a picked pixel a point may be seen, as a share of the photo's longer edge."""
+"""Maximum distance of a point from a picked pixel, as a fraction of the photo's longer edge."""
 _LOW = 0.15
-"""Share of the object's height whose points have feet on the support."""
+"""Height below which points are projected onto the support, as a fraction of the object's height."""
 
 
 @dataclass(frozen=True, eq=False)
 class PhotoView:
-    """A camera, and which of the points it observes.
+    """Camera with the points that it observes.
 
     Attributes:
-        camera: From where.
+        camera: Camera of the photo.
         seen: Indices of points, shape (K,).
     """
 
@@ -54,11 +54,11 @@ class PhotoView:
 
 @dataclass(frozen=True, eq=False)
 class Pick:
-    """A pixel that is of the object, or is not.
+    """Pixel that is on the object, or is not.
 
     Attributes:
-        name: As the user gave it, for messages.
-        view: Of the photo.
+        name: Pick as given by the user, for messages.
+        view: View of the photo.
         pixel: x and y [px].
     """
 
@@ -69,12 +69,12 @@ class Pick:
 
 @dataclass(frozen=True, eq=False)
 class ChosenObject:
-    """An object among points.
+    """Selected object among points.
 
     Attributes:
-        points: On it, and where the lowest stand on the support, shape (N, 3).
-        above: Those on it alone, shape (M, 3).
-        others: Those on each other thing that stands there, shape (K, 3).
+        points: Points on the object, and the projections of the lowest onto the support, shape (N, 3).
+        above: Points on the object only, shape (M, 3).
+        others: Points on each other thing on the support, shape (K, 3) each.
     """
 
     points: Float64Array
@@ -90,17 +90,17 @@ def choose_object(
     picks_not: Sequence[Pick] = (),
     box: tuple[float, ...] | None = None,
 ) -> ChosenObject:
-    """The points of the object, z up.
+    """Select the points of the object; z is up.
 
     Args:
-        points: That the photos share, shape (N, 3).
-        views: Of the photos.
-        picks: Pixels on the object; several may name its parts.
-        picks_not: Pixels on things that it is not.
-        box: Least and largest x, y and z of a box that holds the object.
+        points: Points that the photos share, shape (N, 3).
+        views: Views of the photos.
+        picks: Pixels on the object; several picks can mark separate parts.
+        picks_not: Pixels on things that do not belong to the object.
+        box: Minimum and maximum x, y and z of a box that contains the object.
 
     Raises:
-        InputError: If nothing stands out there, or a pick shows no point of a thing.
+        InputError: If there is no thing above the support, or a pick is near no point of a thing.
     """
     focus, distance = focus_of([view.camera for view in views])
     if box is not None:
@@ -143,9 +143,9 @@ def choose_object(
 
 
 def focus_of(cameras: Sequence[Camera]) -> tuple[Float64Array, float]:
-    """The point (3,) that most cameras look at, and their median distance from it.
+    """Return the point (3,) at which most cameras are directed, and the median distance of the cameras from it.
 
-    Axes that pass it by count less: iteratively reweighted least squares with Cauchy's weights.
+    The point is found by iteratively reweighted least squares. Axes far from the point have low weights (Cauchy).
     """
     centres = np.array([camera.centre for camera in cameras])
     axes = np.array([camera.world_from_camera[:3, 2] for camera in cameras])
@@ -161,7 +161,11 @@ def focus_of(cameras: Sequence[Camera]) -> tuple[Float64Array, float]:
 
 
 def _things(points: Float64Array, stands: BoolArray, distance: float) -> tuple[Int64Array, int]:
-    """The thing that each point (N,) is of, -1 for none, and how many there are."""
+    """Cluster the points into things.
+
+    Returns:
+        Index of the thing of each point (N,), -1 for none, and the number of things.
+    """
     tree = KDTree(points[stands])
     gap = 4 * float(np.median(tree.query(points[stands], k=6)[0][:, -1]))
     gap = min(max(gap, _APART[0] * distance), _APART[1] * distance)
@@ -174,7 +178,7 @@ def _things(points: Float64Array, stands: BoolArray, distance: float) -> tuple[I
 
 
 def _picked(pick: Pick, points: Float64Array, thing: Int64Array) -> int:
-    """The thing that a photo shows nearest to a pixel."""
+    """Return the index of the thing nearest to a pixel of a photo."""
     camera = pick.view.camera
     shown = pick.view.seen[thing[pick.view.seen] >= 0]
     gaps = np.linalg.norm(camera.project(points[shown])[0] - pick.pixel, axis=1)
@@ -185,7 +189,10 @@ def _picked(pick: Pick, points: Float64Array, thing: Int64Array) -> int:
 
 
 def _feet(own: Float64Array, height: Float64Array, support: SupportSurface) -> Float64Array:
-    """Where the lowest points stand; all, if few are low. Points as low as the support cannot be told from it."""
+    """Project the lowest points onto the support; all points if few are low.
+
+    Points at the height of the support cannot be separated from it, so the object has no points there.
+    """
     low = own[height < _LOW * height.max()]
     feet = (low if len(low) >= 5 else own).copy()
     feet[:, 2] = support.under(feet)

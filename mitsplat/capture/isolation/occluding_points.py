@@ -1,4 +1,4 @@
-"""What stands before the object in a photo, where nobody knows what is behind it."""
+"""Occlusion of the object by other things in a photo."""
 
 from __future__ import annotations
 
@@ -13,26 +13,35 @@ from mitsplat.arrays import BoolArray, Float64Array
 from mitsplat.geometry.camera import Camera
 
 _EDGE = 128
-"""Longer edge of the object in the picture that shares are counted in [px]."""
+"""Longer edge of the object in the picture in which fractions are counted [px]."""
 _GAPS = (12, 40)
-"""Bounds of how far points of a thing reach there, which is twice the usual way to the third nearest of them [px]."""
+"""Bounds of the gap between points of a thing in that picture [px].
+
+The gap is twice the median distance to the third nearest point.
+"""
 
 
 def hidden_part(camera: Camera, own: Float64Array, others: Sequence[Float64Array]) -> tuple[float, float, BoolArray]:
-    """What other things hide of an object from a camera.
+    """Estimate the part of an object that other things occlude from a camera.
 
-    The object's outline is the convex hull of its points in the image, also of one that is not convex: masks are looked
-    for in there, and would take in what stands before a notch; and sparse points do not tell a notch from a plain side.
-    Another thing is where its points lie close that are nearer to the camera than the middle of the object; it may
-    reach around it. As plain sides have no points, it may be anywhere between these, and half such a gap beyond.
+    The outline of the object is the convex hull of its points in the image, even for an object that is not convex. The
+    first reason is that masks are searched in the hull and would include a thing in front of a notch. The second is
+    that
+    sparse points cannot separate a notch from a plain surface.
+
+    Another thing occludes the image where its points are dense and nearer to the camera than the middle of the object.
+    It
+    may surround the object. Plain surfaces have no points, so the thing may cover the whole hull of its points and half
+    a
+    gap beyond.
 
     Args:
-        camera: From where.
+        camera: Camera of the photo.
         own: Points on the object, shape (N, 3).
         others: Points on each other thing, shape (M, 3).
 
     Returns:
-        The share of the outline that things hide, the share that they may hide, and the pixels where they may be, shape
+        The occluded fraction of the outline, the possibly occluded fraction, and the possibly occluded pixels, shape
         (H, W).
     """
     pixels, depths = camera.project(own)
@@ -63,7 +72,7 @@ def hidden_part(camera: Camera, own: Float64Array, others: Sequence[Float64Array
         between = np.zeros_like(outline)
         _fill_hull(between, near)
         possible |= cv2.dilate(between, _disc(gap // 2)) > 0
-    # Pixels have their middles at +0.5 here, and at whole numbers in OpenCV.
+    # Pixel centres are at +0.5 here, and at integers in OpenCV.
     x, y = step * (0.5 - low) + _EDGE / 2 - 0.5
     back = np.array([[step, 0, x], [0, step, y]])
     seen = cv2.warpAffine(possible, back, (camera.width, camera.height), flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP)

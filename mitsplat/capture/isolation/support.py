@@ -1,9 +1,9 @@
-"""What things stand on in a photographed place: a smooth, uneven surface below them, such as a cloth or a lawn.
+"""Support surface of a photographed place: the smooth, possibly uneven surface below the things, such as cloth or lawn.
 
-It is a height over a grid, fitted from below as ground is to laser scans (Zhang et al. 2016 review such filters): what
-lies above it counts the less the farther, what lies on it or below counts in full, and where a thing hides it the
-surface goes on with the least bending (thin plate). The first rounds allow hardly more than a plane; stiffness and
-tolerance fall from round to round.
+The surface is a height over a grid, fitted from below, as ground filters do for laser scans (review: Zhang et al.
+2016). The weight of points above it falls with their height; points on it or below have full weight. Where a thing
+occludes the surface, it continues with minimal bending (thin plate). The first iterations allow little more than a
+plane; stiffness and tolerance decrease with each iteration.
 """
 
 from __future__ import annotations
@@ -20,22 +20,22 @@ CELLS = 32
 """Cells of the grid along an edge."""
 _ROUNDS = 12
 _STIFF = (1e3, 3e-2)
-"""Weight of bending against the points' mean weight in a cell, at the start and at the end."""
+"""Weight of bending relative to the mean weight of points in a cell, in the first and the last iteration."""
 _TOLERANCE = (0.08, 0.01)
-"""Height above the surface up to which points belong to it, at the start and at the end, as a share of the radius."""
+"""Height tolerance of points on the surface in the first and the last iteration, as a fraction of the radius."""
 _BELOW = 4.0
-"""Tolerances below the surface from which a point is an outlier."""
+"""Depth below the surface beyond which a point is an outlier, in tolerances."""
 
 
 @dataclass(frozen=True, eq=False)
 class SupportSurface:
-    """A surface z = h(x, y) over a square.
+    """Surface z = h(x, y) over a square.
 
     Attributes:
-        low: Least x and y of the grid, shape (2,).
+        low: Minimum x and y of the grid, shape (2,).
         cell: Edge of a cell.
-        heights: At the nodes of the grid, shape (N, N), first axis x.
-        roughness: Standard deviation of what belongs to the surface around it.
+        heights: Heights at the nodes of the grid, shape (N, N), first axis x.
+        roughness: Standard deviation of points on the surface from it.
     """
 
     low: Float64Array
@@ -44,16 +44,19 @@ class SupportSurface:
     roughness: float
 
     def under(self, points: Float64Array) -> Float64Array:
-        """Height z of the surface below or above points (N, 3), shape (N,); beyond the grid, that of its border."""
+        """Return the height z of the surface at the x and y of points (N, 3), shape (N,).
+
+        Outside the grid, the height at its border is returned.
+        """
         return np.asarray(_interpolation(points, self.low, self.cell, len(self.heights)) @ self.heights.ravel())
 
 
 def find_support(points: Float64Array, middle: Float64Array, radius: float) -> SupportSurface:
-    """The surface that things stand on within ``radius`` of ``middle`` (3,), z up.
+    """Fit the support surface within ``radius`` of ``middle``; z is up.
 
     Args:
-        points: On all surfaces, as photos show them, shape (N, 3).
-        middle: Of what is looked at.
+        points: Points on all surfaces, shape (N, 3).
+        middle: Point at which the cameras are directed, shape (3,).
         radius: Half the edge of the square.
     """
     near = (np.abs(points[:, :2] - middle[:2]) < radius).all(axis=1) & (np.abs(points[:, 2] - middle[2]) < radius)
@@ -78,7 +81,7 @@ def find_support(points: Float64Array, middle: Float64Array, radius: float) -> S
 
 
 def _interpolation(points: Float64Array, low: Float64Array, cell: float, nodes: int) -> csr_array:
-    """Bilinear weights (N, nodes^2) of a grid's nodes at points (N, 3 or more)."""
+    """Return the bilinear weights (N, nodes^2) of the grid nodes at points (N, 3 or more)."""
     place = ((points[:, :2] - low) / cell).clip(0, nodes - 1 - 1e-9)
     corner = np.floor(place).astype(np.int64)
     x, y = (place - corner).T
@@ -90,7 +93,7 @@ def _interpolation(points: Float64Array, low: Float64Array, cell: float, nodes: 
 
 
 def _bending(nodes: int) -> csr_array:
-    """Quadratic form of the thin plate's bending energy on a grid of nodes x nodes."""
+    """Return the quadratic form of the thin-plate bending energy on a grid of nodes x nodes."""
     one = eye_array(nodes)
     second = diags_array([1.0, -2.0, 1.0], offsets=[0, 1, 2], shape=(nodes - 2, nodes))
     first = diags_array([-1.0, 1.0], offsets=[0, 1], shape=(nodes - 1, nodes))

@@ -1,4 +1,4 @@
-"""Frames of a video file one after another, upright, with their times: OpenCV's reader, which has FFmpeg's decoders."""
+"""Video decoding: upright frames with their times, by OpenCV's reader with FFmpeg decoders."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from mitsplat.arrays import ByteImage
 from mitsplat.errors import InputError
 
 _RATE = 30.0
-"""Frames a second that are looked at; of faster videos every second, third … frame."""
+"""Target frame rate [1/s]; of faster videos, every second, third ... frame is read."""
 
 _MISSING = 0.05
-"""Share of its frames, and of its time, that may be missing at the end of a video: containers are not exact."""
+"""Fraction of frames and of time that may be missing at the end of a video, because containers are not exact."""
 
 
 @dataclass(frozen=True)
 class VideoReader:
-    """A video that is being read.
+    """Open video.
 
     Attributes:
-        file: The video.
+        file: Video file.
         opened: OpenCV's reader.
-        rate: Frames a second, as the container says; 30 where it does not.
-        stated: Frames that it holds, as the container says or lets guess; 0 where it does not.
+        rate: Frame rate of the container [1/s]; 30 if it has none.
+        stated: Number of frames by the container, possibly estimated; 0 if unknown.
     """
 
     file: Path
@@ -38,16 +38,16 @@ class VideoReader:
 
     @property
     def stride(self) -> int:
-        """Each how many-th frame is looked at."""
+        """Interval of the frames that are read."""
         return max(1, round(self.rate / _RATE))
 
     def times(self) -> Iterator[tuple[int, float]]:
-        """Index and time [s] of each frame that is looked at; :meth:`picture` is what it shows, until the next one.
+        """Iterate over index and time [s] of the frames; :meth:`picture` returns the current one.
 
-        Times increase, also where the container has none, or odd ones.
+        Times increase even if the container has no times or invalid ones.
 
         Raises:
-            InputError: At the end, if there was no frame, or the video ends before it should.
+            InputError: At the end, if there was no frame, or the video is shorter than stated.
         """
         index, time, last = 0, 0.0, -1.0
         while self.opened.grab():
@@ -67,7 +67,7 @@ class VideoReader:
             )
 
     def picture(self) -> ByteImage:
-        """The frame that was reached, blue, green and red, shape (H, W, 3).
+        """Return the current frame, channels blue, green and red, shape (H, W, 3).
 
         Raises:
             InputError: If it cannot be decoded.
@@ -80,10 +80,10 @@ class VideoReader:
 
 @contextmanager
 def open_video(file: Path) -> Iterator[VideoReader]:
-    """Open a video at its first frame; frames are turned as the camera's sensor of gravity says.
+    """Open a video at its first frame; frames are rotated by the orientation stored in the file.
 
     Raises:
-        InputError: If it is none that can be read, or OpenCV gives up on it while it is used.
+        InputError: If it is not a readable video, or OpenCV fails while it is read.
     """
     opened = cv2.VideoCapture(str(file), cv2.CAP_FFMPEG)
     try:
@@ -95,7 +95,7 @@ def open_video(file: Path) -> Iterator[VideoReader]:
         opened.set(cv2.CAP_PROP_ORIENTATION_AUTO, 1)
         rate, stated = opened.get(cv2.CAP_PROP_FPS), opened.get(cv2.CAP_PROP_FRAME_COUNT)
         yield VideoReader(file, opened, rate if 0 < rate < 1000 else _RATE, max(0, int(stated)))
-    except cv2.error as error:  # such as frames of several sizes, or of more memory than there is
+    except cv2.error as error:  # such as frames of different sizes, or too large for memory
         raise InputError(f"{file}: must hold frames that can be decoded (got {error.err or error})") from error
     finally:
         opened.release()

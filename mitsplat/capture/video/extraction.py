@@ -1,4 +1,4 @@
-"""The folder of a video's chosen frames: made by a process of its own, kept until the video changes."""
+"""Folder of the frames chosen from a video: written by a child process, and reused until the video changes."""
 
 from __future__ import annotations
 
@@ -17,23 +17,23 @@ from mitsplat.storage.files import write_text
 
 _RECORD = "video.json"
 _METHOD = 1
-"""How frames are chosen; another number where others would be."""
+"""Version of the frame selection; increase it when the selection changes."""
 _TOLD = 6
-"""Most cuts that are told by their time."""
+"""Maximum number of cuts that a warning lists by time."""
 
 
 @dataclass(frozen=True)
 class ChosenFrames:
-    """Frames of a video, as pictures in a folder.
+    """Frames of a video as pictures in a folder.
 
     Attributes:
-        video: The video.
-        folder: Where the pictures are.
-        names: Of the pictures, by their times, such as ``01m15s040.jpg``.
-        read: Frames that were looked at.
-        seconds: Time of the last of them [s].
-        cuts: Times at which the picture jumps [s].
-        moved: How far the picture moves in all, as a share of its width; jumps do not count.
+        video: Video file.
+        folder: Folder of the pictures.
+        names: File names of the pictures by their times, such as ``01m15s040.jpg``.
+        read: Number of frames that were read.
+        seconds: Time of the last frame [s].
+        cuts: Times of discontinuities [s].
+        moved: Total image motion as a fraction of the image width, without discontinuities.
     """
 
     video: Path
@@ -46,7 +46,7 @@ class ChosenFrames:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What the user should know of the video, one sentence each."""
+        """Warnings about the video, one sentence each."""
         if not self.cuts:
             return ()
         times = ", ".join(f"{time:.1f} s" for time in self.cuts[:_TOLD])
@@ -60,20 +60,21 @@ class ChosenFrames:
 def choose_frames(
     video: Path, folder: Path, *, most: int, least: int, progress: Progress | None = None
 ) -> ChosenFrames:
-    """Write frames of a video that are sharp and show it in even steps, unless they are there already.
+    """Write sharp frames of a video in even steps of motion, unless the folder has them already.
 
-    The same video and numbers give the same frames. Pictures have the video's size, turned as it is to be shown.
+    The same video and numbers give the same frames. Pictures have the size and the display orientation of the video.
 
     Args:
-        video: A file that FFmpeg reads.
-        folder: Of the frames; it is written anew.
-        most: Frames that may be taken.
-        least: Frames that are needed.
-        progress: Told frames done, of how many, and what is being done.
+        video: File that FFmpeg reads.
+        folder: Folder of the frames; its content is replaced.
+        most: Maximum number of frames.
+        least: Minimum number of frames.
+        progress: Callback with the frames done, their total and the present activity.
 
     Raises:
-        InputError: If the file is no video, ends too early, or has too few or too many different views, or the folder
-            holds something else.
+        InputError: If the file is no video, ends too early, or has too few or too many different views, or if the
+            folder
+            contains something else.
     """
     if most < least:
         raise InputError(f"at least {least} frames must be taken of a video (got {most})")
@@ -82,7 +83,7 @@ def choose_frames(
         return kept
     if folder.exists() and any(folder.iterdir()) and not (folder / _RECORD).is_file():
         raise InputError(f"{folder}: is there already, and not of frames of a video: choose another folder")
-    # Apart, so that earlier frames are there until all of these are.
+    # Written to another folder, so that earlier frames exist until all new ones do.
     made = folder.with_name(f".{folder.name}.part")
     shutil.rmtree(made, ignore_errors=True)
     made.mkdir(parents=True)
@@ -98,13 +99,13 @@ def choose_frames(
 
 
 def _kept(video: Path, folder: Path, inputs: dict[str, Any]) -> ChosenFrames | None:
-    """The frames that an earlier run left, if they are all there and of the same inputs."""
+    """Return the frames of an earlier run if they are complete and have the same inputs, else None."""
     try:
         record = json.loads((folder / _RECORD).read_text())
         if record.pop("inputs") != inputs:
             return None
         chosen = _chosen(video, folder, record)
-    except (OSError, ValueError, KeyError, TypeError):  # none, or damaged: made anew
+    except (OSError, ValueError, KeyError, TypeError):  # missing or damaged: recompute
         return None
     return chosen if {path.name for path in folder.glob("*.jpg")} == set(chosen.names) else None
 
@@ -114,14 +115,14 @@ def _chosen(video: Path, folder: Path, found: dict[str, Any]) -> ChosenFrames:
 
 
 def _run(video: Path, folder: Path, most: int, least: int, progress: Progress | None) -> dict[str, Any]:
-    """What the child found of the video whose frames it wrote."""
+    """Run the child process that writes the frames, and return its result."""
     command = python_command("-m", "mitsplat.capture.video.video_worker", video, folder, str(most), str(least))
-    # A list of files to play is no video.
+    # Excludes playlists, which FFmpeg would follow to other files.
     environment = python_environment({"OPENCV_FFMPEG_CAPTURE_OPTIONS": "protocol_whitelist;file"})
     found, error = None, None
     with (
         (folder / "log.txt").open("wb") as log,
-        # What ends this process closes the pipe, which ends the child.
+        # The pipe closes when this process ends for any reason, which ends the child.
         subprocess.Popen(command, stdout=subprocess.PIPE, stderr=log, text=True, env=environment) as child,
     ):
         try:

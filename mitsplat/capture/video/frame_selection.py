@@ -1,4 +1,4 @@
-"""Which frames of a video to take, by how far its picture has moved and how sharp it is."""
+"""Selection of video frames by image motion and sharpness."""
 
 from __future__ import annotations
 
@@ -10,25 +10,27 @@ from mitsplat.arrays import Float64Array, Int64Array
 from mitsplat.capture.video.motion import Moved
 
 STEP = 0.05
-"""How far the picture moves from one frame to the next, as a share of its width: ten degrees around a thing that stands
-on its board and fills half of the picture."""
+"""Image motion between chosen frames, as a fraction of the image width.
+
+It corresponds to ten degrees around an object that stands on its board and fills half of the image.
+"""
 
 _MIDDLE = 0.5
-"""Share of a step, about its middle, in which its frame is looked for first, so that frames lie evenly."""
+"""Central fraction of a step that is searched first, so that frames are evenly spaced."""
 
 _DULL = 0.5
-"""Sharpness of the best frame there, as a share of the step's best, below which that one is taken."""
+"""Minimum sharpness of the best central frame relative to the best frame of the step; otherwise the latter is taken."""
 
 
 @dataclass(frozen=True)
 class FrameMeasure:
-    """What is known of a frame before any is chosen.
+    """Measurements of a frame before the selection.
 
     Attributes:
-        index: Its number in the video, from 0.
-        time: When it is shown [s].
-        moved: Where in the motion of the video it is.
-        sharpness: As :func:`mitsplat.capture.video.sharpness.sharpness`.
+        index: Frame number in the video, from 0.
+        time: Display time [s].
+        moved: Position in the motion of the video.
+        sharpness: Result of :func:`mitsplat.capture.video.sharpness.sharpness`.
     """
 
     index: int
@@ -39,12 +41,12 @@ class FrameMeasure:
 
 @dataclass(frozen=True)
 class Choice:
-    """Frames to take.
+    """Chosen frames.
 
     Attributes:
-        frames: In the order of the video.
-        cuts: Times at which the picture jumps [s].
-        moved: How far the picture moves in all, as a share of its width; jumps do not count.
+        frames: Frames in the order of the video.
+        cuts: Times of discontinuities [s].
+        moved: Total image motion as a fraction of the image width, without discontinuities.
     """
 
     frames: tuple[FrameMeasure, ...]
@@ -53,12 +55,13 @@ class Choice:
 
 
 def choose(measures: list[FrameMeasure], most: int) -> Choice:
-    """The sharpest frame of each step of the motion.
+    """Choose the sharpest frame of each step of motion.
 
-    Each stretch without jumps is divided into equal steps of at most :data:`STEP`, or of longer ones where there would
-    be more than ``most``. Sharpness is compared within a step alone: its frames show nearly the same, so that blur
-    decides and not texture. Every stretch gives a frame at least: more than ``most`` come only of a video that jumps as
-    often.
+    Each continuous segment is divided into equal steps of at most :data:`STEP`, or of longer steps if there would be
+    more
+    than ``most`` frames. Sharpness is compared only within a step. Its frames show nearly the same view, so that blur
+    determines the sharpness and not texture. Each segment gives at least one frame. So the result exceeds ``most`` only
+    for a video with at least as many discontinuities.
     """
     usable = [measure for measure in measures if measure.moved.followed]
     numbers = sorted({measure.moved.segment for measure in usable})
@@ -78,11 +81,11 @@ def choose(measures: list[FrameMeasure], most: int) -> Choice:
 
 
 def _sharpest(share: Float64Array, sharp: Float64Array, count: int) -> list[int]:
-    """Places of the sharpest frame of each of ``count`` equal steps; those that no frame lies in have none.
+    """Return the indices of the sharpest frame of each of ``count`` equal steps; empty steps have none.
 
     Args:
-        share: How much of the motion has been before each frame, 0 to 1, not falling, shape (N,).
-        sharp: Their sharpness, shape (N,).
+        share: Fraction of the motion before each frame, 0 to 1, not decreasing, shape (N,).
+        sharp: Sharpness of the frames, shape (N,).
         count: Number of steps.
     """
     places: Int64Array = np.minimum((share * count).astype(np.int64), count - 1)

@@ -1,4 +1,4 @@
-"""How far the picture of a video has moved, frame by frame, and where it jumps."""
+"""Image motion of a video frame by frame, and its discontinuities."""
 
 from __future__ import annotations
 
@@ -11,29 +11,29 @@ from mitsplat.arrays import ByteImage, Float32Array
 from mitsplat.capture.video.shrink import shrink
 
 _EDGE = 480
-"""Longer edge at which motion is measured [px]."""
+"""Longer edge of the images in which motion is measured [px]."""
 _CORNERS = 300
-"""Most corners that are followed."""
+"""Maximum number of tracked corners."""
 _FEWEST = 12
-"""Corners without which motion is not known."""
+"""Minimum number of corners for a motion measurement."""
 _SURVIVING = 0.3
-"""Share of the corners that must be found again. Views of one thing keep most, other pictures hardly any."""
+"""Minimum fraction of corners that must be found again; views of one scene keep most, other images hardly any."""
 _RETURN = 1.0
-"""Distance from where it began up to which a corner that was followed there and back counts as found [px]."""
+"""Maximum distance between a corner and its position after forward and backward tracking [px]."""
 _TICK = 0.01
-"""Share of the picture's width from which it has moved on: well above what noise and compression do to a still one."""
+"""Motion after which the anchor is replaced, as a fraction of the image width; well above noise and compression."""
 _PATIENCE = 5
-"""Frames in a row that may be blurred beyond recognition; after them the picture counts as another one."""
+"""Maximum number of consecutive unrecognisable frames; after them, a new segment starts."""
 
 
 @dataclass(frozen=True)
 class Moved:
-    """Where in the motion of a video a frame is.
+    """Position of a frame in the motion of a video.
 
     Attributes:
-        segment: Number of the stretch without a jump that it belongs to.
-        path: How far the picture has moved up to it, in all segments together, as a share of its width.
-        followed: Whether that was measured in this frame; a frame in which nothing is recognised is as far as the last.
+        segment: Index of the continuous segment.
+        path: Accumulated image motion over all segments, as a fraction of the image width.
+        followed: True if motion was measured in this frame; otherwise ``path`` is that of the frame before.
     """
 
     segment: int
@@ -42,10 +42,11 @@ class Moved:
 
 
 class MotionClock:
-    """Adds up how far pictures move: the median length of the tracks of corners (Shi and Tomasi 1994; Bouguet 2000).
+    """Accumulator of image motion: the median length of corner tracks (Shi and Tomasi 1994; Bouguet 2000).
 
-    Corners are followed from one picture, the anchor, until the picture has moved on from it; then that one is the
-    anchor. So noise, and a hand that trembles about a place, add up to nothing.
+    Corners are tracked from one image, the anchor, until the motion since then exceeds ``_TICK``. The current image
+    then
+    becomes the anchor. So noise and a trembling hand add no motion.
     """
 
     def __init__(self) -> None:
@@ -54,11 +55,9 @@ class MotionClock:
         self._segment, self._path, self._beyond, self._lost = 0, 0.0, 0.0, 0
 
     def add(self, grey: ByteImage) -> Moved:
-        """Take the next picture, grey, shape (H, W)."""
+        """Add the next image, grey, shape (H, W), and return its position in the motion."""
         grey = shrink(grey, _EDGE)
-        if (
-            self._anchor is None or len(self._corners) < _FEWEST
-        ):  # nothing to follow yet: the first that shows something
+        if self._anchor is None or len(self._corners) < _FEWEST:  # no corners yet: use the first image that has some
             self._take(grey)
             return Moved(self._segment, self._path, len(self._corners) >= _FEWEST)
         moves = _moves(self._anchor, grey, self._corners)
@@ -79,14 +78,14 @@ class MotionClock:
         return moved
 
     def _take(self, grey: ByteImage) -> None:
-        """Make a picture the anchor."""
+        """Make an image the anchor."""
         found = cv2.goodFeaturesToTrack(grey, _CORNERS, qualityLevel=0.01, minDistance=8)
         self._corners = np.zeros((0, 1, 2), dtype=np.float32) if found is None else np.asarray(found, dtype=np.float32)
         self._anchor, self._beyond, self._lost = grey, 0.0, 0
 
 
 def _moves(before: ByteImage, after: ByteImage, corners: Float32Array) -> Float32Array:
-    """Displacements [px] of the corners, shape (N, 1, 2), that are found again, shape (M, 2)."""
+    """Return the displacements [px], shape (M, 2), of the corners (N, 1, 2) that are found again."""
     window, levels = (21, 21), 4
     there, found, _ = cv2.calcOpticalFlowPyrLK(before, after, corners, corners.copy(), winSize=window, maxLevel=levels)
     back, returned, _ = cv2.calcOpticalFlowPyrLK(after, before, there, corners.copy(), winSize=window, maxLevel=levels)

@@ -1,4 +1,4 @@
-"""How sharp a picture is, as a number to compare pictures of one thing by."""
+"""Sharpness measure for comparing pictures of the same scene."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from mitsplat.arrays import ByteImage
 from mitsplat.capture.video.shrink import shrink
 
 _JUDGED_EDGE = 800
-"""Longer edge at which sharpness is measured [px], so that size and noise matter little."""
+"""Longer edge at which sharpness is measured [px], so that picture size and noise have little effect."""
 
 
 def sharpness(grey: ByteImage) -> float:
-    """Variance of the Laplacian (Pech-Pacheco et al. 2000) of a grey picture, shape (H, W), at a fixed size."""
+    """Return the variance of the Laplacian (Pech-Pacheco et al. 2000) of a reduced grey picture, shape (H, W)."""
     return float(cv2.Laplacian(shrink(grey, _JUDGED_EDGE), cv2.CV_32F).var())

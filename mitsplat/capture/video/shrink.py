@@ -1,4 +1,4 @@
-"""Pictures no larger than what is measured in them needs."""
+"""Reduction of pictures to the resolution of a measurement."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from mitsplat.arrays import ByteImage
 
 
 def shrink(grey: ByteImage, edge: int) -> ByteImage:
-    """A grey picture, shape (H, W), whose longer edge is at most ``edge`` px."""
+    """Reduce a grey picture, shape (H, W), so that its longer edge is at most ``edge`` px."""
     scale = edge / max(grey.shape)
     if scale >= 1:
         return grey

@@ -1,9 +1,11 @@
-"""Chooses and writes frames of a video: ``python -m mitsplat.capture.video.video_worker VIDEO FOLDER MOST LEAST``.
+"""Child process that chooses and writes video frames.
 
-A damaged video can end the process that decodes it, and decoders write what they think of it to standard error. So
-:mod:`mitsplat.capture.video.extraction` starts this module and reads what it says on standard output, a JSON object a
-line: ``progress``, as :data:`mitsplat.progress.Progress` is told; then ``error``, a sentence, or ``found``, what there
-is to say of the frames that lie in FOLDER.
+Usage: ``python -m mitsplat.capture.video.video_worker VIDEO FOLDER MOST LEAST``.
+
+A damaged video can abort the process that decodes it, and decoders write messages to standard error. So
+:mod:`mitsplat.capture.video.extraction` starts this module and reads its standard output, one JSON object per line.
+``progress`` has the arguments of :data:`mitsplat.progress.Progress`. The last line is ``error``, a sentence, or
+``found``, a description of the frames in FOLDER.
 """
 
 from __future__ import annotations
@@ -27,13 +29,13 @@ from mitsplat.errors import InputError
 from mitsplat.storage.files import write_file
 
 _MEMORY = 12 << 30
-"""Address space [bytes]; decoders of large frames reserve some for each thread."""
+"""Address space limit [bytes]; decoders of large frames reserve some for each thread."""
 
 _JPEG = (cv2.IMWRITE_JPEG_QUALITY, 95, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444)
 
 
 def main(video: Path, folder: Path, most: int, least: int) -> None:
-    """Do it, and say what came of it."""
+    """Choose and write the frames, and print the result."""
     try:
         measures = _measure(video)
         choice = choose(measures, most)
@@ -54,7 +56,7 @@ def main(video: Path, folder: Path, most: int, least: int) -> None:
 
 
 def _measure(video: Path) -> list[FrameMeasure]:
-    """How far the picture has moved in each frame, and how sharp it is."""
+    """Measure the image motion and the sharpness of each frame."""
     clock, measures = MotionClock(), list[FrameMeasure]()
     with open_video(video) as reader:
         for index, time in reader.times():
@@ -65,7 +67,7 @@ def _measure(video: Path) -> list[FrameMeasure]:
 
 
 def _refuse(video: Path, choice: Choice, seconds: float, most: int, least: int) -> None:
-    """Refuse a video of which there would be too few frames, or too many."""
+    """Raise InputError if the video gives too few frames or too many."""
     if len(choice.frames) < least:
         if not choice.cuts and choice.moved < STEP:
             raise InputError(
@@ -84,7 +86,7 @@ def _refuse(video: Path, choice: Choice, seconds: float, most: int, least: int) 
 
 
 def _write(video: Path, folder: Path, choice: Choice) -> list[str]:
-    """Write the frames, as JPEG of quality 95 with colours of full resolution; returns their names."""
+    """Write the frames as JPEG of quality 95 with full colour resolution, and return their names."""
     names = {frame.index: _name(frame.time) for frame in choice.frames}
     with open_video(video) as reader:
         for index, _ in reader.times():
@@ -102,7 +104,7 @@ def _store(data: bytes, file: Path) -> None:
 
 
 def _name(time: float) -> str:
-    """Name of a frame's file by its time [s]: 75.04 is ``01m15s040.jpg``."""
+    """Return the file name of a frame by its time [s]: 75.04 gives ``01m15s040.jpg``."""
     minutes, milliseconds = divmod(round(1000 * time), 60_000)
     return f"{minutes:02}m{milliseconds // 1000:02}s{milliseconds % 1000:03}.jpg"
 

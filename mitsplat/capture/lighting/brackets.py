@@ -1,9 +1,10 @@
-"""Photographs of one view at several exposures, merged to radiance (Debevec and Malik 1997).
+"""Merging of photographs of one view at several exposures to radiance (Debevec and Malik 1997).
 
-OpenCV does so too, but not for lamps: it recovers a curve for each channel, of pixels in a grid, which with two or
-three exposures makes lamps too dark by 10 to 50 %, in each channel by another share; and white pixels have a say in
-what it merges, so that a lamp that all exposures clip comes out three times darker than its lower bound. Here one curve
-serves all channels, of pixels that are spread over the levels, and white counts in the shortest exposure alone.
+OpenCV's implementation is not suited to lamps. It recovers a response for each channel from a grid of pixels, which
+with
+two or three exposures makes lamps 10 to 50 % too dark, differently per channel. It also includes white pixels, so that
+a lamp that all exposures clip becomes three times darker than its lower bound. Here one response serves all channels.
+It is recovered from pixels spread over the levels, and white pixels count only in the shortest exposure.
 """
 
 from __future__ import annotations
@@ -25,29 +26,30 @@ from mitsplat.images.colour import decode_srgb, eight_bit
 from mitsplat.storage.files import IMAGE_ERRORS
 
 CLIPPED = 250
-"""Level from which a pixel may be more than it says."""
+"""Level from which a pixel may be clipped."""
 _DARK = 4
 """Level up to which a pixel is noise."""
 _SAMPLES = 150
-"""Pixels that the response is recovered from: more than 255 over the photographs less one, as Debevec and Malik ask."""
+"""Number of pixels for the response recovery; Debevec and Malik require more than 255 / (photographs - 1)."""
 _SMOOTHNESS = 50.0
-"""Weight of the response's smoothness: by 10, noise bends it by 10 %, and so does 200 by itself with few exposures."""
+"""Weight of the response's smoothness; at 10, noise causes errors of 10 %, and at 200, the smoothness itself does."""
 _HAT = np.minimum(np.arange(256) + 1.0, 256.0 - np.arange(256))
-"""Trust in each level."""
+"""Weight of each level."""
 _DIAGONAL = float(np.hypot(36.0, 24.0))
-"""Of a frame of 35 mm film [mm]."""
+"""Diagonal of a 35 mm film frame [mm]."""
 
 
 @dataclass(frozen=True, eq=False)
 class Photograph:
-    """A photograph as its camera stored it, upright.
+    """Upright photograph as stored by its camera.
 
     Attributes:
-        path: The file.
+        path: Image file.
         pixels: Display-encoded RGB, (H, W, 3).
-        exposure: Exposure time, times ISO / 100 and over the squared f-number where EXIF says them [s]; None if it does
-            not say the time.
-        focal: Focal length by its equivalent at 35 mm, which is by the diagonal [px]; None if EXIF does not say it.
+        exposure: Exposure time [s], multiplied by ISO / 100 and divided by the squared f-number if EXIF has them; None
+            if
+            EXIF has no exposure time.
+        focal: Focal length [px] from the 35 mm equivalent, which refers to the diagonal; None if EXIF has none.
     """
 
     path: Path
@@ -57,7 +59,7 @@ class Photograph:
 
 
 def read_photograph(path: Path) -> Photograph:
-    """A photograph with 8 bits a channel.
+    """Read a photograph with 8 bits per channel.
 
     Raises:
         InputError: If it cannot be read.
@@ -83,7 +85,7 @@ def read_photograph(path: Path) -> Photograph:
 
 
 def _number(known: dict[int, object], tag: int) -> float | None:
-    """A positive number that EXIF states, else None."""
+    """Return a positive number of the EXIF data, or None."""
     value = known.get(tag)
     try:
         number = float(value[0] if isinstance(value, tuple) else value)  # type: ignore[arg-type]
@@ -93,10 +95,10 @@ def _number(known: dict[int, object], tag: int) -> float | None:
 
 
 def exposures_of(photographs: Sequence[Photograph], stated: Sequence[float] | None = None) -> Float64Array:
-    """Exposures of photographs of one size, which differ if there are several: ``stated``, else those of EXIF.
+    """Return the exposures of photographs of equal size: ``stated`` if given, else those of EXIF.
 
     Raises:
-        InputError: If they are missing, do not differ, or the photographs differ in size.
+        InputError: If exposures are missing or do not differ, or if the photographs differ in size.
     """
     first = photographs[0]
     for photograph in photographs:
@@ -125,15 +127,19 @@ def exposures_of(photographs: Sequence[Photograph], stated: Sequence[float] | No
 
 
 def merge_exposures(pixels: Sequence[ByteImage], exposures: npt.ArrayLike) -> tuple[Float32Array, BoolArray]:
-    """Radiance that photographs show, (H, W, 3), and where it is a lower bound as all of them are white, (H, W).
+    """Merge photographs to radiance, (H, W, 3), and mark pixels where it is a lower bound, (H, W).
 
-    Radiance ``sum(w t f(z) / t) / sum(w t)`` of levels z, the response f, and w of a hat over the levels, as Robertson,
-    Borman and Stevenson (2003) weigh exposures t; pixels from ``CLIPPED`` on count in the shortest exposure alone. Of
-    three exposures on the response is recovered, else it is taken for that of sRGB.
+    Radiance is ``sum(w t f(z) / t) / sum(w t)`` with levels z, the response f, exposures t and a hat-shaped weight w of
+    the level, as in Robertson, Borman and Stevenson (2003). Pixels from ``CLIPPED`` on count only in the shortest
+    exposure.
+    With three or more exposures, the response is recovered; otherwise it is that of sRGB.
 
     Args:
-        pixels: Photographs of one size, (H, W, 3).
-        exposures: Theirs, (N,).
+        pixels: Photographs of equal size, (H, W, 3).
+        exposures: Exposures of the photographs, (N,).
+
+    Returns:
+        Radiance, and True where even the shortest exposure is white.
     """
     exposures = np.asarray(exposures, dtype=np.float64)
     response = decode_srgb(np.arange(256) / 255) if len(pixels) < 3 else _response(pixels, exposures)
@@ -148,7 +154,7 @@ def merge_exposures(pixels: Sequence[ByteImage], exposures: npt.ArrayLike) -> tu
 
 
 def _response(pixels: Sequence[ByteImage], exposures: Float64Array) -> Float64Array:
-    """What each level stands for, (256,), by pixels that two photographs or more show well, evenly over the levels."""
+    """Recover the response, (256,), from pixels that two or more photographs expose well, evenly over the levels."""
     levels = np.stack([np.asarray(cv2.medianBlur(p, 3), np.uint8).reshape(-1) for p in pixels])
     usable = np.flatnonzero(((levels > _DARK) & (levels < CLIPPED)).sum(axis=0) >= 2)
     if len(usable) < _SAMPLES:
@@ -158,14 +164,15 @@ def _response(pixels: Sequence[ByteImage], exposures: Float64Array) -> Float64Ar
 
 
 def recover_response(levels: npt.NDArray[np.uint8], exposures: npt.ArrayLike) -> Float64Array:
-    """The exposure that each level stands for, (256,), 1 for level 128 (Debevec and Malik 1997, equation 3).
+    """Recover the exposure of each level, (256,), 1 for level 128 (Debevec and Malik 1997, equation 3).
 
-    Least squares of ``w(z_ij) (g(z_ij) - ln E_i - ln t_j)`` and ``l w(z) g''(z)`` with a hat w, over the logarithm g of
-    the response and the irradiances E of pixels.
+    It minimises the squares of ``w(z_ij) (g(z_ij) - ln E_i - ln t_j)`` and ``l w(z) g''(z)`` with a hat-shaped weight
+    w,
+    over the logarithm g of the response and the irradiances E of pixels.
 
     Args:
-        levels: Of pixels i in photographs j, (J, I).
-        exposures: t_j, (J,).
+        levels: Levels of pixels i in photographs j, (J, I).
+        exposures: Exposures t_j, (J,).
     """
     photographs, samples = levels.shape
     z, pixel = levels.reshape(-1).astype(np.intp), np.tile(np.arange(samples), photographs)

@@ -1,4 +1,4 @@
-"""Captured light to lines of a scene file, with a panorama of what is no lamp, and a picture to judge them by."""
+"""Output of captured light: lines of a scene file, a panorama without the lamps, and a picture for inspection."""
 
 from __future__ import annotations
 
@@ -22,24 +22,24 @@ from mitsplat.images.colour import LUMINANCE, encode_srgb
 from mitsplat.storage.files import write_file, write_text
 
 _WIDEST = 4096
-"""Of panoramas that are written [px]."""
+"""Maximum width of written panoramas [px]."""
 _MIDDLE = 110.0
-"""Mean level of the photograph that the ball is shown in, about."""
+"""Mean level that the displayed photograph of the ball should have."""
 _SMALLEST = 20.0
-"""Radius of a ball in its photograph [px], of which 45 degrees around what is behind it are not seen."""
+"""Minimum radius of a ball in its photograph [px]; at this radius, 45 degrees around its rear are not visible."""
 _OUTLINE = (230, 40, 40)
 
 
 @dataclass(frozen=True)
 class BallView:
-    """How a mirror ball was photographed.
+    """Geometry and exposure of photographs of a mirror ball.
 
     Attributes:
-        azimuth, elevation: Where the camera is as seen from the ball [degrees].
-        ball: Middle and radius of the ball in the image [px]; it is looked for if None.
-        fov_x: Horizontal field of view [degrees]; that of EXIF if None, and parallel rays without.
-        exposures: One for each photograph [s]; those of EXIF if None.
-        reflectivity: Of the ball, linear RGB.
+        azimuth, elevation: Direction from the ball to the camera [degrees].
+        ball: Centre and radius of the ball in the image [px]; detected if None.
+        fov_x: Horizontal field of view [degrees]; None uses EXIF, and parallel rays if EXIF has none.
+        exposures: Exposure time of each photograph [s]; None uses EXIF.
+        reflectivity: Reflectance of the ball, linear RGB.
     """
 
     azimuth: float
@@ -65,15 +65,15 @@ class BallView:
 
 @dataclass(frozen=True)
 class LightSettings:
-    """How light becomes lines of a scene file.
+    """Settings of the conversion of light to lines of a scene file.
 
     Attributes:
-        around: What is lit, where the light was captured [m].
-        distance: From it to the lamps [m], whose sizes grow with it.
-        lamps: Most lamps; the others stay in the image.
-        rest: Whether what is no lamp is an image, or a constant of the same irradiance.
-        rotate_z: Turn of the panorama about the vertical [degrees].
-        irradiance: Horizontal irradiance that all light is scaled to [W/m^2]; None leaves it as it is.
+        around: Point in the scene where the light was captured [m]; the lamps face it.
+        distance: Distance from that point to the lamps [m]; lamp sizes scale with it.
+        lamps: Maximum number of lamps; other bright regions stay in the image.
+        rest: Form of the remaining light: an image, or a constant of the same irradiance.
+        rotate_z: Rotation of the panorama about the vertical [degrees].
+        irradiance: Horizontal irradiance to which all light is scaled [W/m^2]; None keeps the scale.
     """
 
     around: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -95,13 +95,13 @@ class LightSettings:
 
 @dataclass(frozen=True, eq=False)
 class LightEstimate:
-    """Light that was captured.
+    """Captured light, divided into lamps and the rest.
 
     Attributes:
-        lamps: By falling share of the irradiance.
-        rest: Radiance of what is no lamp, equirectangular, (H, W, 3).
-        panorama: Radiance of everything, (H, W, 3).
-        settings: What it was made by.
+        lamps: Lamps by decreasing irradiance.
+        rest: Radiance without the lamps, equirectangular, (H, W, 3).
+        panorama: Radiance of all light, (H, W, 3).
+        settings: Settings of the estimate.
     """
 
     lamps: Sequence[Lamp]
@@ -111,21 +111,21 @@ class LightEstimate:
 
     @property
     def irradiance(self) -> Float64Array:
-        """Of a horizontal plane by everything, linear RGB [W/m^2]."""
+        """Irradiance of a horizontal plane by all light, linear RGB [W/m^2]."""
         return level_irradiance(self.panorama)
 
     @property
     def ambient(self) -> Float64Array:
-        """Of a horizontal plane by what is no lamp, linear RGB [W/m^2]."""
+        """Irradiance of a horizontal plane by the light without the lamps, linear RGB [W/m^2]."""
         return level_irradiance(self.rest)
 
     def share(self, irradiance: Float64Array) -> float:
-        """Of the luminance of all irradiance."""
+        """Return the luminance of an irradiance as a fraction of that of all light."""
         return float(irradiance @ LUMINANCE / (self.irradiance @ LUMINANCE))
 
 
 def estimate_light(panorama: Float32Array, settings: LightSettings) -> LightEstimate:
-    """Lamps and the rest of a panorama of radiance, (H, W, 3), which has light above the horizon."""
+    """Divide a panorama of radiance, (H, W, 3), into lamps and the rest; it must have light above the horizon."""
     if panorama.shape[1] > _WIDEST:
         panorama = resized(panorama, _WIDEST // 2, _WIDEST)
     if settings.irradiance is not None:
@@ -136,13 +136,13 @@ def estimate_light(panorama: Float32Array, settings: LightSettings) -> LightEsti
 
 @dataclass(frozen=True, eq=False)
 class BallReading:
-    """What a mirror ball showed.
+    """Result of the evaluation of a mirror ball.
 
     Attributes:
-        panorama: What it mirrors.
-        ball: Middle and radius in the photograph [px].
-        picture: The photograph with the ball's outline, (H, W, 3).
-        warnings: What makes the panorama doubtful, a sentence each.
+        panorama: Panorama that the ball reflects.
+        ball: Centre and radius in the photograph [px].
+        picture: Photograph with the outline of the ball, (H, W, 3).
+        warnings: Reasons why the panorama may be inaccurate, one sentence each.
     """
 
     panorama: BallPanorama
@@ -152,14 +152,14 @@ class BallReading:
 
 
 def read_ball(paths: Sequence[Path], view: BallView) -> BallReading:
-    """The panorama that a mirror ball shows.
+    """Compute the panorama that a mirror ball reflects.
 
     Args:
-        paths: An HDR photograph, or one or several photographs of 8 bits that differ in their exposure alone.
-        view: How they were taken.
+        paths: One HDR photograph, or one or more 8-bit photographs that differ only in their exposure.
+        view: Geometry and exposure of the photographs.
 
     Raises:
-        InputError: If they cannot be read or merged, or the ball is not found or not whole.
+        InputError: If the photographs cannot be read or merged, or the ball is not found or not completely visible.
     """
     warnings = list[str]()
     hdr = paths[0].suffix.lower() in HDR_SUFFIXES
@@ -214,16 +214,17 @@ def read_ball(paths: Sequence[Path], view: BallView) -> BallReading:
 
 
 def write_light(estimate: LightEstimate, out: Path, photograph: ByteImage | None = None) -> list[Path]:
-    """Write a scene file's lines, and beside them the images that they name and a picture.
+    """Write the lines of a scene file, the images that they reference, and a picture for inspection.
 
     Args:
-        estimate: What is written.
-        out: NAME.yaml. The others are NAME_panorama.exr of all light, NAME_rest.exr of what is no lamp if the lines
-            name it, and NAME.png.
-        photograph: Shown in the picture beside the panorama.
+        estimate: Light to write.
+        out: Path NAME.yaml. The other files are NAME_panorama.exr with all light, NAME_rest.exr with the light without
+            the
+            lamps (if the lines reference it), and NAME.png.
+        photograph: Photograph to show in the picture beside the panorama.
 
     Returns:
-        The files.
+        The written files.
     """
     picture_file, panorama, rest = _beside(out)
     image = panorama.name
@@ -245,16 +246,16 @@ def write_light(estimate: LightEstimate, out: Path, photograph: ByteImage | None
 
 
 def _beside(out: Path) -> tuple[Path, Path, Path]:
-    """The picture, and the images of all light and of what is no lamp, of a scene file's lines."""
+    """Return the paths of the picture, of the panorama and of the panorama without the lamps."""
     panorama, rest = (out.with_name(f"{out.stem}_{part}.exr") for part in ("panorama", "rest"))
     return out.with_suffix(".png"), panorama, rest
 
 
 def refuse_to_replace(out: Path, images: Sequence[Path]) -> None:
-    """Refuse to write where :func:`write_light` would replace what it was given, or what it has not written.
+    """Raise InputError if :func:`write_light` would replace an input or a file that it has not written.
 
     Raises:
-        InputError: Which names the file.
+        InputError: With the name of the file.
     """
     written, given = (out, *_beside(out)), {image.resolve() for image in images}
     if lost := [file for file in written if file.resolve() in given]:
@@ -265,11 +266,11 @@ def refuse_to_replace(out: Path, images: Sequence[Path]) -> None:
 
 
 _TITLE = "# Captured light: "
-"""How a file of lights begins."""
+"""First characters of a file of lights."""
 
 
 def light_lines(estimate: LightEstimate, image: str) -> str:
-    """The key ``lights`` of a scene file; ``image`` is the file of what is no lamp."""
+    """Return the key ``lights`` of a scene file; ``image`` is the file with the light without the lamps."""
     settings = estimate.settings
     lines = [
         f"{_TITLE}{estimate.irradiance @ LUMINANCE:.4g} W/m^2 on a horizontal plane, "
@@ -291,7 +292,7 @@ def light_lines(estimate: LightEstimate, image: str) -> str:
 def area_line(
     position: Float64Array, target: Sequence[float] | Float64Array, size: tuple[float, float], radiance: Float64Array
 ) -> str:
-    """One of the entries of ``lights``."""
+    """Return the entry of an area light in ``lights``."""
     return (
         f"  - {{kind: area, position: {list_of(position)}, target: {list_of(target)}, "
         f"size: {list_of(size)}, {radiance_keys(radiance)}}}"
@@ -299,31 +300,31 @@ def area_line(
 
 
 def radiance_keys(rgb: Float64Array) -> str:
-    """Its luminance as radiance, and its colour."""
+    """Return the keys of a radiance: its luminance, and its colour of luminance 1."""
     luminance = float(rgb @ LUMINANCE)
     return f"radiance: {luminance:.5g}, colour: {list_of(rgb / luminance)}"
 
 
 def list_of(values: Sequence[float] | Float64Array) -> str:
-    """Numbers as a scene file has them."""
+    """Format numbers as a list of a scene file."""
     return f"[{', '.join(f'{value:.5g}' for value in values)}]"
 
 
 def _shown(radiance: Float32Array) -> ByteImage:
-    """Radiance as a picture whose median luminance is a middle grey."""
+    """Convert radiance to a picture whose median luminance is mid-grey."""
     middle = float(np.median(radiance @ LUMINANCE)) or float(radiance.mean())
     return np.asarray(np.rint(255 * np.minimum(encode_srgb(radiance * (0.18 / middle)), 1.0)), dtype=np.uint8)
 
 
 def _with_circle(photograph: ByteImage, circle: Circle) -> ByteImage:
-    """The photograph with a circle drawn in."""
+    """Return the photograph with a circle drawn on it."""
     x, y, radius = (round(16 * value) for value in circle)
     thick = max(1, photograph.shape[0] // 250)
     return np.asarray(cv2.circle(photograph.copy(), (x - 8, y - 8), radius, _OUTLINE, thick, cv2.LINE_AA, shift=4))
 
 
 def _outlined(estimate: LightEstimate) -> ByteImage:
-    """The panorama with its lamps outlined and numbered."""
+    """Return the panorama with outlined and numbered lamps."""
     width = 1024
     shown = np.ascontiguousarray(_shown(resized(estimate.panorama, width // 2, width)))
     for number, lamp in enumerate(estimate.lamps, start=1):

@@ -1,12 +1,12 @@
-"""The lamps of a panorama, as rectangles that send the same light, and the panorama without them.
+"""Extraction of lamps from a panorama, as rectangles that send the same light.
 
-What is a lamp is decided against the rest, as outliers are by clipping at a multiple of the mean: a pixel belongs to
-one if its luminance is more than ``CONTRAST`` times the mean over the solid angle of all that belong to none, which is
-repeated until nothing changes. A cloudy sky or a bright wall has no lamps; a lamp and a window beside it, which differ
-by far in radiance, are both found, where one threshold between two classes (Otsu 1979) finds the brighter one. Median
-cut (Debevec 2005) and variance cut (Viriyothai and Debevec 2009) place points by energy and know nothing of sizes.
+A pixel belongs to a lamp if its luminance exceeds ``CONTRAST`` times the mean of all other pixels, weighted by solid
+angle. The rule is repeated until nothing changes. So a cloudy sky or a bright wall has no lamps. A lamp and a window
+beside it, with very different radiances, are both found; a single threshold between two classes (Otsu 1979) finds only
+the brighter one. Median cut (Debevec 2005) and variance cut (Viriyothai and Debevec 2009) place points by energy and
+give no sizes.
 
-Pixels are grouped by their distance on the sphere, to which the panorama's seam and poles are nothing.
+Pixels are grouped by their distance on the sphere, so that the seam and the poles of the panorama have no effect.
 """
 
 from __future__ import annotations
@@ -31,31 +31,31 @@ from mitsplat.capture.lighting.panorama import (
 from mitsplat.images.colour import LUMINANCE
 
 CONTRAST = 4.0
-"""Luminance of a lamp over the mean of the rest. In a room of one lamp, walls and ceilings come up to 3."""
+"""Minimum luminance of a lamp relative to the mean of the rest; walls and ceilings of a room with one lamp reach 3."""
 LEAST_SHARE = 0.02
-"""Share of the irradiance below which a bright place is none of the lamps."""
+"""Minimum fraction of the irradiance that a lamp must contribute."""
 _WIDTH = 360
-"""Of the panorama that lamps are looked for in [px]."""
+"""Width of the panorama in which lamps are searched [px]."""
 _GAP = 3.0
-"""Bright pixels that are nearer to each other are one lamp [degrees]."""
+"""Maximum distance between bright pixels of one lamp [degrees]."""
 _RING = 4.0
-"""Width of the surroundings that take a lamp's place [degrees]."""
+"""Width of the ring around a lamp whose mean radiance replaces the lamp [degrees]."""
 _WIDEST = 60.0
-"""Angle from its middle up to which a bright place is a lamp, and not half of the sky [degrees]."""
+"""Maximum angle between the centre and any point of a lamp [degrees]; larger bright regions are sky."""
 _GRID = 64
-"""Points along an edge of a rectangle by which its light is integrated."""
+"""Points along an edge of a rectangle for the integration of its light."""
 
 
 @dataclass(frozen=True, eq=False)
 class Lamp:
-    """A rectangle that faces the panorama's origin, its width level.
+    """Rectangular lamp that faces the origin of the panorama, with its width horizontal.
 
     Attributes:
-        direction: Unit vector to its middle.
-        extents: Width and height over its distance.
-        radiance: Linear RGB, beyond that of its surroundings, which stay behind it [W/(m^2 sr)].
-        irradiance: Linear RGB, of a horizontal plane by it [W/m^2].
-        pixels: Where it is in the panorama, (H, W).
+        direction: Unit vector to its centre.
+        extents: Width and height divided by its distance.
+        radiance: Linear RGB in excess of the surroundings, which remain in the panorama [W/(m^2 sr)].
+        irradiance: Irradiance of a horizontal plane by the lamp, linear RGB [W/m^2].
+        pixels: Pixels of the lamp in the panorama, (H, W).
     """
 
     direction: Float64Array
@@ -66,17 +66,17 @@ class Lamp:
 
     @property
     def angles(self) -> tuple[float, float]:
-        """Azimuth and elevation of its middle [degrees]."""
+        """Azimuth and elevation of the centre [degrees]."""
         return angles(self.direction)
 
     @property
     def luminance(self) -> float:
-        """Of its radiance [W/(m^2 sr)]."""
+        """Luminance of the radiance [W/(m^2 sr)]."""
         return float(self.radiance @ LUMINANCE)
 
     @property
     def colour(self) -> Float64Array:
-        """Linear RGB of luminance 1."""
+        """Linear RGB, scaled to luminance 1."""
         return self.radiance / self.luminance
 
     @property
@@ -87,14 +87,17 @@ class Lamp:
 
 
 def take_lamps(panorama: Float32Array, *, rotate_z: float = 0.0, most: int = 6) -> tuple[list[Lamp], Float32Array]:
-    """Lamps by falling share of the irradiance, and the panorama with their surroundings in their place.
+    """Extract the lamps of a panorama and replace them by the radiance of their surroundings.
 
-    The horizontal irradiance of both together is that of the panorama.
+    Lamps and the remaining panorama together give a horizontal plane the same irradiance as the panorama.
 
     Args:
         panorama: Radiance, (H, W, 3).
-        rotate_z: Its turn about the vertical [degrees].
-        most: Most lamps that are taken out.
+        rotate_z: Rotation of the panorama about the vertical [degrees].
+        most: Maximum number of lamps.
+
+    Returns:
+        Lamps by decreasing irradiance, and the remaining panorama.
     """
     height, width = panorama.shape[:2]
     shape = (min(height, _WIDTH // 2), min(width, _WIDTH))
@@ -113,7 +116,7 @@ def take_lamps(panorama: Float32Array, *, rotate_z: float = 0.0, most: int = 6) 
         arrives = (weight * panorama[pixels]).sum(axis=0)
         if arrives @ LUMINANCE < LEAST_SHARE * total:
             continue
-        # In no channel more than the lamp itself has, so that nothing negative is left of it.
+        # Limited to the mean of the lamp in each channel, so that its radiance does not become negative.
         around = np.minimum(_surroundings(coarse, sight, own, bright), arrives / weight.sum())
         lamp = _rectangle(panorama[pixels], everywhere[pixels], pixels, arrives - weight.sum() * around)
         if lamp is not None:
@@ -126,11 +129,11 @@ def take_lamps(panorama: Float32Array, *, rotate_z: float = 0.0, most: int = 6) 
 
 
 def _bright(panorama: Float32Array) -> BoolArray:
-    """Pixels that belong to lamps, (H, W)."""
+    """Return the pixels that belong to lamps, (H, W)."""
     luminance = panorama @ LUMINANCE
     weights = np.broadcast_to(solid_angles(*luminance.shape), luminance.shape)
     bright = np.zeros(luminance.shape, bool)
-    while True:  # lamps only grow: each round's mean of the rest is below the last one's
+    while True:  # terminates, because the mean of the rest never increases
         brighter = luminance > CONTRAST * np.average(luminance[~bright], weights=weights[~bright])
         if (brighter == bright).all():
             return bright
@@ -138,14 +141,17 @@ def _bright(panorama: Float32Array) -> BoolArray:
 
 
 def _grouped(points: Float32Array) -> Int32Array:
-    """Number of the group of each unit vector (N,): what is linked by steps of less than ``_GAP``."""
+    """Return the group index of each unit vector (N,); vectors less than ``_GAP`` apart are in one group."""
     pairs = cKDTree(points).query_pairs(2 * np.sin(np.radians(_GAP) / 2), output_type="ndarray")
     graph = coo_array((np.ones(len(pairs), bool), pairs.T), shape=(len(points), len(points)))
     return np.asarray(connected_components(graph, directed=False)[1])
 
 
 def _surroundings(panorama: Float32Array, sight: Float32Array, own: BoolArray, bright: BoolArray) -> Float64Array:
-    """Mean radiance (3,) of a ring around a lamp, without other lamps; of all that is none where there is no ring."""
+    """Return the mean radiance (3,) of a ring around a lamp, without other lamps.
+
+    If the ring has no such pixels, the mean of all pixels without lamps is returned.
+    """
     reach = 2 * np.sin(np.radians(_RING) / 2)
     near = np.isfinite(cKDTree(sight[own]).query(sight[~bright], distance_upper_bound=reach)[0])
     weights = np.broadcast_to(solid_angles(*own.shape), own.shape)[~bright]
@@ -154,11 +160,13 @@ def _surroundings(panorama: Float32Array, sight: Float32Array, own: BoolArray, b
 
 
 def _rectangle(radiance: Float32Array, sight: Float32Array, pixels: BoolArray, irradiance: Float64Array) -> Lamp | None:
-    """The lamp of some pixels, or None if they reach too far around, or are below the horizon by their middle.
+    """Fit a lamp to pixels; None if they extend too far or their centre is below the horizon.
 
-    Its middle is that of the light. Its area, in the plane that is perpendicular to that, and the ratio of its sides,
-    which is that of second moments, are those of its core: what has half of the mean radiance that its light leaves
-    with, as images blur.
+    The centre of the lamp is the centroid of its light. The area and the aspect ratio are those of its core, projected
+    to
+    the plane perpendicular to the centre; the aspect ratio is from second moments. The core has at least half of the
+    mean
+    radiance, weighted by light, because images are blurred.
     """
     luminance = radiance @ LUMINANCE
     solid = np.broadcast_to(solid_angles(*pixels.shape), pixels.shape)[pixels]
@@ -173,16 +181,16 @@ def _rectangle(radiance: Float32Array, sight: Float32Array, pixels: BoolArray, i
     area = solid[core] / depth**3
     plane = (sight[core] @ axes.T) / depth[:, None]
     spread = plane - np.average(plane, axis=0, weights=area)
-    moments = np.average(spread**2, axis=0, weights=area) + np.average(area, weights=area) / 12  # of pixels themselves
+    moments = np.average(spread**2, axis=0, weights=area) + np.average(area, weights=area) / 12  # of one pixel
     ratio, whole = np.sqrt(moments[0] / moments[1]), float(area.sum())
     extents = float(np.sqrt(whole * ratio)), float(np.sqrt(whole / ratio))
     return Lamp(middle, extents, irradiance / rectangle_irradiance(middle, extents), irradiance, pixels)
 
 
 def rectangle_axes(direction: Float64Array) -> Float64Array:
-    """Unit vectors (2, 3) along width and height of an area light in this direction from its target.
+    """Return the unit vectors (2, 3) along width and height of an area light in this direction from its target.
 
-    Those of :func:`mitsplat.renderer.scene_emitters.emitter_dict`, but for signs.
+    They equal those of :func:`mitsplat.renderer.scene_emitters.emitter_dict` up to signs.
     """
     level = np.hypot(direction[0], direction[1]) <= 1e-6
     across = np.cross((0.0, 1.0, 0.0) if level else (0.0, 0.0, 1.0), direction)
@@ -191,13 +199,15 @@ def rectangle_axes(direction: Float64Array) -> Float64Array:
 
 
 def rectangle_irradiance(direction: Float64Array, extents: tuple[float, float]) -> float:
-    """Irradiance of a horizontal plane by a rectangle of radiance 1 that faces it, as far as it is above the horizon.
+    """Compute the irradiance of a horizontal plane by a rectangle of radiance 1 that faces the origin.
 
-    The integral of ``cos(lamp) cos(plane) / r^2`` over the area at distance 1, by the midpoint rule.
+    Only the part of the rectangle above the horizon counts. It integrates ``cos(lamp) cos(plane) / r^2`` over the area
+    at
+    distance 1 by the midpoint rule.
 
     Args:
-        direction: To its middle.
-        extents: Width and height over the distance.
+        direction: Direction to the centre of the rectangle.
+        extents: Width and height divided by the distance.
     """
     steps = (np.arange(_GRID) + 0.5) / _GRID - 0.5
     across, up = rectangle_axes(direction)

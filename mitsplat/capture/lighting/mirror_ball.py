@@ -1,10 +1,10 @@
-"""A mirror ball in a photograph: where it is, and the panorama that it mirrors.
+"""Detection of a mirror ball in a photograph, and the panorama that it reflects.
 
-A light probe after Debevec (1998), "Rendering synthetic objects into real scenes", here of a camera that is near.
-The ball is a unit sphere around the origin, the camera at D radii from it in the direction d. A point whose normal is
-at the angle b from d is seen at the angle s from the ball's middle, tan(s) = sin(b) / (D - cos(b)), and mirrors what
-is at the angle 2 b + s from d. The last point that is seen has cos(b) = 1 / D and mirrors what is at 180 degrees - a,
-where sin(a) = 1 / D: what is within a of the direction behind the ball is never seen.
+The method is the light probe of Debevec (1998), "Rendering synthetic objects into real scenes", for a camera at finite
+distance. The ball is a unit sphere around the origin, and the camera is at the distance D in the direction d. A point
+whose normal has the angle b to d is seen at the angle s from the ball's centre, with tan(s) = sin(b) / (D - cos(b)). It
+reflects light from the angle 2 b + s to d. The last visible point has cos(b) = 1 / D and reflects light from 180
+degrees - a, where sin(a) = 1 / D. So directions within a of the rear of the ball are never visible.
 """
 
 from __future__ import annotations
@@ -20,42 +20,44 @@ from mitsplat.capture.lighting.panorama import directions, resized, solid_angles
 from mitsplat.geometry.camera import Camera
 
 WIDTH = 1024
-"""Of panoramas of balls [px]."""
+"""Width of ball panoramas [px]."""
 _FAR = 1000.0
-"""Focal length of a camera of which it is not known, in radii of the ball: its rays are parallel."""
+"""Focal length of a camera with unknown focal length, in radii of the ball; its rays are almost parallel."""
 _COARSE, _FINE = 96, 700
-"""Longest edges of the pictures that circles are looked for in, and measured in [px]."""
+"""Longest edges of the pictures in which circles are searched and refined [px]."""
 _LOWEST = 10
-"""Shorter edge of the first one below which nothing is looked for [px]."""
+"""Minimum shorter edge of the search picture [px]."""
 _SMALLEST = 0.1
-"""Least radius of a ball that is found, as a share of the shorter edge."""
+"""Minimum radius of a detected ball, as a fraction of the shorter edge."""
 _INSIDE = 0.7
-"""Share of its radius that a circle's middle is from the border: one that is cut is found as well, and refused."""
+"""Minimum distance of a circle's centre from the border, in radii; partly visible balls are detected and rejected
+later.
+"""
 _CANDIDATES = 30
 _NEARLY = 0.85
-"""Share of the best circle's score from which a larger one around it is the outline."""
+"""Fraction of the best score from which a larger circle around the best one is taken as the outline."""
 _LEAST = 0.55
-"""Least score of a ball's outline."""
+"""Minimum score of a ball's outline."""
 _STEPS = np.stack(np.meshgrid(*[(-1, 0, 1)] * 3), axis=-1).reshape(-1, 3)
 _AROUND = np.stack(np.meshgrid(*[np.arange(-8, 9) / 100] * 2, np.arange(94, 113) / 100, indexing="ij"), axis=-1)
-"""Shifts by shares of the radius, and factors on it."""
+"""Shifts as fractions of the radius, and factors of the radius."""
 _MARGIN = 1.5
-"""Width of the ball's rim that is mixed with what is behind it [px]."""
+"""Width of the ball's rim that is mixed with the background [px]."""
 _RING = 10.0
-"""Width of the ring around the blind spot by which it is filled [degrees]."""
+"""Width of the ring whose mean fills the blind region [degrees]."""
 
 Circle = tuple[float, float, float]
-"""Middle and radius [px]."""
+"""Centre x, y and radius [px]."""
 
 
 @dataclass(frozen=True, eq=False)
 class BallPanorama:
-    """What a ball mirrors.
+    """Panorama that a mirror ball reflects.
 
     Attributes:
-        radiance: Equirectangular, (H, W, 3).
-        blind: Half angle of what the ball hides, which has the mean of a ring around it [degrees].
-        clipped: Share of the ball's image that is a lower bound.
+        radiance: Equirectangular radiance, (H, W, 3).
+        blind: Half angle of the region hidden by the ball [degrees]; it has the mean radiance of a ring around it.
+        clipped: Fraction of the ball's image in which radiance is a lower bound.
     """
 
     radiance: Float32Array
@@ -64,11 +66,13 @@ class BallPanorama:
 
 
 def find_ball(*exposures: ByteImage) -> Circle | None:
-    """The circle that stands out as a ball's outline does in one of the exposures of a view, or None.
+    """Detect the outline of a ball in one of the exposures of a view; None if there is none.
 
-    Circles are judged by the gradient across them, averaged along them (Daugman 1993), which is capped so that no part
-    outweighs the others, less that along them. All are tried in a small picture, and the best ones climb in finer ones.
-    Where the ball mirrors a corner of the room as a circle within its outline, the largest counts.
+    The score of a circle is the image gradient across it, averaged along it (Daugman 1993), minus the gradient along
+    it. The
+    gradient is limited, so that no part dominates. All circles are tested in a small picture, and the best are refined
+    in
+    larger ones. If the ball reflects a corner of the room as a circle inside its outline, the largest circle is taken.
 
     Args:
         exposures: RGB, (H, W, 3).
@@ -78,7 +82,7 @@ def find_ball(*exposures: ByteImage) -> Circle | None:
 
 
 def _find_ball(picture: ByteImage) -> tuple[float, Circle] | None:
-    """The circle that stands out most, and its score."""
+    """Return the score and the circle of the best outline, or None."""
     scale = _COARSE / max(picture.shape[:2])
     if scale * min(picture.shape[:2]) < _LOWEST:
         return None
@@ -110,7 +114,7 @@ def _find_ball(picture: ByteImage) -> tuple[float, Circle] | None:
 
 @dataclass(frozen=True, eq=False)
 class _Slopes:
-    """Gradients of a picture in CIELAB along x and y, (H, W, 3), and how steep one must be to count fully."""
+    """Gradients of a picture in CIELAB along x and y, (H, W, 3), and the gradient magnitude that counts fully."""
 
     x: Float32Array
     y: Float32Array
@@ -124,10 +128,10 @@ class _Slopes:
         return cls(x, y, 1.0 + 1.5 * float(np.sqrt((x**2 + y**2).sum(axis=2)).mean()))
 
     def judge(self, circles: Float64Array) -> Float64Array:
-        """How far each circle (x, y, radius), (N, 3), is an outline: up to 1."""
+        """Return the score, at most 1, of circles (x, y, radius), (N, 3), as outlines."""
         turn = np.linspace(0, 2 * np.pi, 72, endpoint=False)
         score = [np.zeros(0)]
-        for some in np.array_split(circles, 1 + len(circles) // 20_000):  # OpenCV takes 32,767 rows at most
+        for some in np.array_split(circles, 1 + len(circles) // 20_000):  # OpenCV accepts at most 32,767 rows
             x, y = (
                 np.asarray(some[:, k : k + 1] + some[:, 2:] * wave(turn) - 0.5, np.float32)
                 for k, wave in enumerate((np.cos, np.sin))
@@ -142,7 +146,7 @@ class _Slopes:
         return np.concatenate(score)
 
     def climb(self, circles: Float64Array) -> Float64Array:
-        """Each circle moved and sized to the best one near it."""
+        """Move and resize each circle to the local maximum of the score."""
         for step in (1.5, 0.75, 0.4):
             for _ in range(4):
                 moved = circles[:, None] + step * _STEPS
@@ -154,15 +158,15 @@ class _Slopes:
 def unwrap_ball(
     image: Float32Array, ball: Circle, focal: float | None, azimuth: float, elevation: float, clipped: BoolArray
 ) -> BallPanorama:
-    """The panorama that a ball mirrors, all of which counts as far away.
+    """Compute the panorama that a ball reflects; the surroundings are assumed to be at infinity.
 
     Args:
         image: Radiance, (H, W, 3).
-        ball: The ball's outline, all of it in the image.
-        focal: Focal length of the camera [px], which is held level; None takes its rays for parallel.
-        azimuth: Of the camera as seen from the ball [degrees].
-        elevation: Of it [degrees].
-        clipped: Where radiance is a lower bound, (H, W).
+        ball: Outline of the ball, completely inside the image.
+        focal: Focal length of the level camera [px]; None assumes parallel rays.
+        azimuth: Azimuth of the camera as seen from the ball [degrees].
+        elevation: Elevation of the camera as seen from the ball [degrees].
+        clipped: Pixels in which radiance is a lower bound, (H, W).
     """
     height, width = image.shape[:2]
     x, y, radius = ball
@@ -173,7 +177,7 @@ def unwrap_ball(
     mirrors = 2 * normal_angle + seen_at
     last = float(np.interp(seen_at[-1] * (1 - _MARGIN / radius), seen_at, mirrors))
 
-    finer = min(3, int(np.ceil(np.pi * radius / WIDTH)))  # towards the camera a pixel of the ball is 2 / radius wide
+    finer = min(3, int(np.ceil(np.pi * radius / WIDTH)))  # a pixel at the centre of the ball spans 2 / radius
     towards = camera.centre / distance
     directed = directions(finer * WIDTH // 2, finer * WIDTH).reshape(-1, 3).astype(np.float64)
     cosine = directed @ towards
@@ -197,9 +201,9 @@ def unwrap_ball(
 
 
 def _ball_camera(width: int, height: int, ball: Circle, focal: float, towards: Float64Array) -> tuple[Camera, float]:
-    """The level camera that sees a unit sphere around the origin in a circle, and its distance.
+    """Return the level camera that sees a unit sphere around the origin as a circle, and its distance.
 
-    Rays v to the outline are at one angle a to the axis c: v.c = cos(a), which is linear in c / cos(a).
+    Rays v to the outline have one angle a to the axis c: v.c = cos(a), which is linear in c / cos(a).
     """
     middle = np.array([width, height]) / 2
     turn = np.linspace(0, 2 * np.pi, 64, endpoint=False)
@@ -211,7 +215,7 @@ def _ball_camera(width: int, height: int, ball: Circle, focal: float, towards: F
     x, y, z = solved / length
     distance = length / np.sqrt(length**2 - 1)
 
-    # Without roll, a pitch and a yaw take the axis to where the ball is from the camera.
+    # Without roll, a pitch and a yaw rotate the axis to the direction from the camera to the ball.
     ahead = -towards
     pitch = np.arcsin(np.clip(ahead[2] / np.hypot(y, z), -1, 1)) + np.arctan2(y, z)
     level = z * np.cos(pitch) + y * np.sin(pitch)

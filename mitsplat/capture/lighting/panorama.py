@@ -1,8 +1,8 @@
-"""Equirectangular panoramas of radiance as scene files show them: directions, solid angles, irradiance, files.
+"""Equirectangular radiance panoramas in the convention of scene files: directions, solid angles, irradiance and files.
 
-Rows go from the zenith down to the nadir. Columns go clockwise as seen from above, from azimuth 90 degrees (+y) at the
-left border over 0 (+x) to -90 (-y) in the middle: what Mitsuba's ``envmap`` is when it is turned z up and ``rotate_z``
-is zero. Azimuths count from +x, counter-clockwise, as those of cameras and lights do.
+Rows go from the zenith to the nadir. Columns go clockwise as seen from above: azimuth 90 degrees (+y) at the left
+border, 0 (+x), and -90 (-y) in the middle. This is Mitsuba's ``envmap`` rotated to z up, with ``rotate_z`` zero.
+Azimuths are counter-clockwise from +x, like those of cameras and lights.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from mitsplat.runtime.variant import ensure_variant
 from mitsplat.storage.files import library_errors, write_file
 
 HDR_SUFFIXES = (".exr", ".hdr", ".pfm")
-"""Of files that hold radiance."""
+"""Suffixes of files with radiance."""
 
 
 def directions(height: int, width: int, rotate_z: float = 0.0) -> Float32Array:
-    """Unit vectors to the centres of a panorama's pixels, shape (H, W, 3), turned about the vertical [degrees]."""
+    """Return unit vectors to the pixel centres of a panorama, shape (H, W, 3), rotated about the vertical [degrees]."""
     polar = np.pi * (np.arange(height) + 0.5)[:, None] / height
     azimuth = np.radians(90.0 + rotate_z) - 2 * np.pi * (np.arange(width) + 0.5) / width
     level = np.sin(polar)
@@ -34,48 +34,51 @@ def directions(height: int, width: int, rotate_z: float = 0.0) -> Float32Array:
 
 
 def solid_angles(height: int, width: int) -> Float64Array:
-    """Solid angle of a pixel of each row [sr], shape (H, 1): exact, so that they sum to 4 pi."""
+    """Return the exact solid angle of a pixel of each row [sr], shape (H, 1); the pixels sum to 4 pi."""
     edges = np.cos(np.pi * np.arange(height + 1) / height)
     return 2 * np.pi / width * (edges[:-1] - edges[1:])[:, None]
 
 
 def level_weights(height: int, width: int) -> Float64Array:
-    """Irradiance of a horizontal plane by a unit of radiance in a pixel of each row [sr], shape (H, 1); they sum to pi.
+    """Return the irradiance of a horizontal plane per radiance of a pixel of each row [sr], shape (H, 1).
 
-    The cosine's integral over the pixel above the horizon, ``dphi / 2 (sin(t1)^2 - sin(t0)^2)`` of polar angles t.
+    It is the integral of the cosine over the part of the pixel above the horizon, ``dphi / 2 (sin(t1)^2 - sin(t0)^2)``
+    with
+    polar angles t. The pixels sum to pi.
     """
     edges = np.sin(np.minimum(np.pi * np.arange(height + 1) / height, np.pi / 2)) ** 2
     return np.pi / width * np.diff(edges)[:, None]
 
 
 def level_irradiance(panorama: Float32Array) -> Float64Array:
-    """Irradiance of a horizontal plane that faces up [W/m^2], shape (3,)."""
+    """Compute the irradiance of a horizontal plane that faces up [W/m^2], shape (3,)."""
     return np.asarray((panorama * level_weights(*panorama.shape[:2])[..., None]).sum(axis=(0, 1)))
 
 
 def resized(radiance: Float32Array, height: int, width: int) -> Float32Array:
-    """An image of radiance, (H, W, 3), in fewer pixels, by the mean of areas."""
+    """Reduce a radiance image, (H, W, 3), by area averages."""
     return np.asarray(cv2.resize(radiance, (width, height), interpolation=cv2.INTER_AREA), dtype=np.float32)
 
 
 def unit_vector(azimuth: float, elevation: float) -> Float64Array:
-    """The direction of an azimuth and an elevation [degrees]."""
+    """Return the direction of an azimuth and an elevation [degrees]."""
     turn, rise = np.radians([azimuth, elevation])
     return np.array([np.cos(rise) * np.cos(turn), np.cos(rise) * np.sin(turn), np.sin(rise)])
 
 
 def angles(direction: npt.ArrayLike) -> tuple[float, float]:
-    """Azimuth, 0 to 360, and elevation [degrees] of a direction."""
+    """Return azimuth, 0 to 360, and elevation [degrees] of a direction."""
     x, y, z = np.asarray(direction, dtype=np.float64)
     return float(np.degrees(np.arctan2(y, x)) % 360), float(np.degrees(np.arctan2(z, np.hypot(x, y))))
 
 
 def read_panorama(path: Path) -> Float32Array:
-    """The radiance of an HDR panorama, shape (H, W, 3).
+    """Read the radiance of an HDR panorama, shape (H, W, 3).
 
     Raises:
-        InputError: If the file is none of HDR, cannot be read, holds what is no number, is not twice as wide as high,
-            or has no light above the horizon.
+        InputError: If the file has no HDR format, cannot be read, has non-finite values, is not twice as wide as high,
+            or
+            has no light above the horizon.
     """
     panorama = read_radiance(path)
     height, width = panorama.shape[:2]
@@ -87,10 +90,10 @@ def read_panorama(path: Path) -> Float32Array:
 
 
 def read_radiance(path: Path) -> Float32Array:
-    """Linear RGB of an HDR image as Mitsuba reads it, shape (H, W, 3); what is negative counts as 0.
+    """Read linear RGB of an HDR image through Mitsuba, shape (H, W, 3); negative values become 0.
 
     Raises:
-        InputError: If the file is none of HDR, cannot be read, or holds what is no number.
+        InputError: If the file has no HDR format, cannot be read, or has non-finite values.
     """
     if path.suffix.lower() not in HDR_SUFFIXES:
         raise InputError(

@@ -1,8 +1,10 @@
-"""NVIDIA's Multi-Process Service (MPS): processes that compute on a GPU at the same time.
+"""NVIDIA's Multi-Process Service (MPS), with which processes compute on a GPU at the same time.
 
-Without it they take turns in slices of time, and an H200 is busy for less than half of it, however many they are
-(``python -m benchmarks.scale.gpu``, and the same with ``--turns``). It comes with NVIDIA's driver for Linux, needs no
-rights of an administrator, and is a daemon: started here for as long as it is used, unless one runs already.
+Without MPS, processes share the GPU by time slices. An H200 is then busy for less than half of the time, for any number
+of processes (``python -m benchmarks.scale.gpu``, and the same with ``--turns``). MPS is part of NVIDIA's driver for
+Linux
+and needs no administrator rights. It is a daemon, which is started here for the duration of its use, unless one is
+already running.
 """
 
 from __future__ import annotations
@@ -17,13 +19,13 @@ from mitsplat.runtime.child_process import python_command, python_environment
 from mitsplat.runtime.gpu_memory import VISIBLE
 
 CONTROL = "nvidia-cuda-mps-control"
-"""The program that starts the service and ends it."""
+"""Program that starts and stops the service."""
 
 PIPES = "CUDA_MPS_PIPE_DIRECTORY"
-"""Environment variable: where the service is found by processes that are to use it."""
+"""Environment variable: folder through which client processes find the service."""
 
 MOST_CLIENTS = 48
-"""Processes that may share a GPU: another one is refused by the service (NVIDIA, "Multi-Process Service")."""
+"""Maximum number of processes per GPU; the service refuses more (NVIDIA, "Multi-Process Service")."""
 
 _LOGS = "CUDA_MPS_LOG_DIRECTORY"
 
@@ -35,26 +37,27 @@ scene = mi.load_dict({"type": "scene", "shape": {"type": "rectangle"}})
 hit = scene.ray_test(mi.Ray3f([0, 0, 1], [0, 0, -1]))
 assert hit[0]
 """
-"""A ray traced by a process of its own: whether the service serves is known when it has."""
+"""Test program that traces one ray in a separate process, to verify that the service works."""
 
 _KEEPER = """
 read nothing
 echo quit -t 5 | {control}
 rm -rf {folder}
 """
-"""Ends the service when its input ends: when that is closed, or this process is gone, however it went."""
+"""Shell script that stops the service when its input is closed, also if this process is killed."""
 
 _PATIENCE = 60.0
-"""How long a trial may take [s]."""
+"""Time limit of a trial [s]."""
 
 
 class SharedGpu:
-    """The service, started if it can be had; :meth:`close` ends it, and so does the end of this process.
+    """The MPS service, started if available. It ends with :meth:`close` or with this process.
 
     Attributes:
-        environment: Variables with which processes start that use it; none if they take turns, or find it by
-            themselves.
-        lack: Why it cannot be had, for "because ..."; empty if it can.
+        environment: Environment variables of processes that use the service; empty if it is unavailable, or if
+            processes
+            find it by default.
+        lack: Reason why the service is unavailable, as the rest of "because ..."; empty if it is available.
     """
 
     def __init__(self) -> None:
@@ -64,7 +67,7 @@ class SharedGpu:
         if shutil.which(CONTROL) is None:
             self.lack = f"{CONTROL} of NVIDIA's driver is absent"
         elif _control("get_server_list"):
-            return  # somebody else's serves us
+            return  # an already running service is used
         else:
             self._start()
 
@@ -79,7 +82,7 @@ class SharedGpu:
                 stdin=subprocess.PIPE,
                 stdout=subprocess.DEVNULL,
                 stderr=subprocess.DEVNULL,
-                start_new_session=True,  # Ctrl-C in a terminal is not for it
+                start_new_session=True,  # Ctrl-C in a terminal must not reach it
             )
             started = subprocess.run(
                 [CONTROL, "-d"], env=os.environ | service, capture_output=True, text=True, check=False
@@ -103,7 +106,7 @@ class SharedGpu:
             self.lack = f"{CONTROL} does not serve ({error})"
 
     def close(self) -> None:
-        """End the service, when the processes that use it have ended."""
+        """Stop the service after its client processes have ended."""
         keeper, self._keeper, self.environment = self._keeper, None, {}
         if keeper is not None:
             with suppress(subprocess.TimeoutExpired):
@@ -111,13 +114,13 @@ class SharedGpu:
 
 
 def _renumbered(visible: str) -> dict[str, str]:
-    """GPUs that are made visible by their numbers, as clients must call them: the service counts those it sees anew."""
+    """Renumber GPUs that are selected by index for clients, because the service counts its visible GPUs from 0."""
     names = visible.split(",")
     return {VISIBLE: ",".join(map(str, range(len(names))))} if all(name.strip().isdigit() for name in names) else {}
 
 
 def _control(command: str) -> bool:
-    """Whether the service is there and does as it is told."""
+    """Return True if the service is running and executes the command."""
     with suppress(OSError, subprocess.TimeoutExpired):
         done = subprocess.run(
             [CONTROL],

@@ -1,8 +1,8 @@
-"""Run frames here, in worker processes or on a cluster: any worker, any order, the same bytes.
+"""Scheduler of frames: in this process, in worker processes or on a cluster, with identical bytes in every case.
 
-A frame is decided by (seed, frame index) alone, so the engine is free to order them. It gives each worker all frames
-of one layout in turn, which lets different layouts settle side by side and a worker keep what its layout needs. A frame
-whose worker is lost is made again by another.
+A frame depends only on (seed, frame index), so the scheduler may choose any order. Each worker gets all frames of one
+layout in turn. Different layouts thus settle in parallel, and a worker can cache the data of its layout. A frame whose
+worker is lost is made again by another worker.
 """
 
 from __future__ import annotations
@@ -44,21 +44,21 @@ Made = TypeVar("Made", covariant=True)
 Result = TypeVar("Result")
 
 MOST_LOSSES = 3
-"""Workers that one frame may cost before the run gives up."""
+"""Maximum number of workers that one frame may terminate before the run is aborted."""
 
 WORTHWHILE = 1.1
-"""Gain in speed for which another worker stays, when their number is left to the engine."""
+"""Minimum speed-up for keeping another worker, if the engine chooses the number of workers."""
 
 _WINDOW = 6
-"""Frames of each worker over which speed is measured."""
+"""Frames per worker over which speed is measured."""
 _FEW = 16
-"""Frames up to which starting worker processes does not pay."""
+"""Number of frames up to which worker processes are not worth their start-up time."""
 
 _START = 300.0
-"""Time limit for the start of a worker [s]: on an idle machine it takes about two seconds of imports."""
+"""Time limit for the start of a worker [s]. On an idle machine, imports take about two seconds."""
 
 _LOOK = 1.0
-"""Interval at which the start of workers is timed [s]."""
+"""Polling interval while workers start [s]."""
 
 _END = 30.0
 """Time limit for the end of a worker that has closed its pipe [s]."""
@@ -67,41 +67,41 @@ _SENTENCES: tuple[type[Exception], ...] = (InputError, MissingResourceError, Par
 
 
 class MakeFrame(Protocol[Made]):
-    """Makes one frame; picklable where worker processes are used."""
+    """Function that makes one frame; must be picklable if worker processes are used."""
 
     def __call__(self, index: int, note: Note, /) -> Made:
         """Make frame ``index``."""
 
 
 class FrameError(RuntimeError):
-    """Making a frame failed in a worker; the sentence names the frame, and a note holds the worker's traceback."""
+    """Failure of a frame in a worker. The message names the frame, and a note holds the worker's traceback."""
 
 
 class LostWorkersError(PartialResultError):
-    """A frame ended the process of every worker that tried it; finished frames are kept."""
+    """Loss of every worker process that tried a frame; finished frames are kept."""
 
 
 @dataclass(frozen=True)
 class Status:
-    """What a worker is doing."""
+    """Status message of a worker."""
 
     text: str
 
 
 @dataclass(frozen=True)
 class Finished(Generic[Result]):
-    """A worker's frame is made."""
+    """Result of a worker's frame."""
 
     result: Result
 
 
 @dataclass(frozen=True)
 class Failure:
-    """What went wrong in a worker, as text: not every exception can be pickled.
+    """Exception of a worker as text, because not every exception can be pickled.
 
     Attributes:
-        sentence: The class, if it is one whose message is for the user.
-        exhausted: Whether memory has run out.
+        sentence: Exception class, if its message is meant for the user.
+        exhausted: True if memory is exhausted.
     """
 
     sentence: type[Exception] | None
@@ -112,14 +112,14 @@ class Failure:
 
     @classmethod
     def of(cls, error: Exception) -> Failure:
-        """The failure that the exception being handled is."""
+        """Build a failure from the exception that is being handled."""
         sentence = next((kind for kind in _SENTENCES if isinstance(error, kind)), None)
-        if sentence is None:  # what ends the command line with the same status
+        if sentence is None:  # classes with the same exit status of the command line
             sentence = {2: InputError, 3: MissingResourceError}.get(exit_status(error) or 0)
         return cls(sentence, type(error).__name__, sentence_of(error), traceback.format_exc(), is_out_of_memory(error))
 
     def error(self, frame: int) -> Exception:
-        """The exception to raise for it where the frames are wanted."""
+        """Return the exception to raise in the calling process."""
         if self.sentence is not None:
             return self.sentence(self.message)
         error = FrameError(f"frame {frame} failed: {self.kind}: {self.message}")
@@ -129,46 +129,46 @@ class Failure:
 
 @dataclass(frozen=True)
 class Lost:
-    """A worker is gone, with its frame; ``how`` continues "the process making frame 3 ..."."""
+    """Loss of a worker with its frame; ``how`` continues "the process making frame 3 ..."."""
 
     how: str
 
 
 @dataclass(frozen=True)
 class Started:
-    """A worker has been started, and takes frames now."""
+    """Message of a worker that is ready for frames."""
 
 
 Answer = Status | Finished[Result] | Failure | Lost
 
 
 class Pool(Protocol[Result]):
-    """Workers, known by their numbers, each of which makes one frame at a time."""
+    """Pool of numbered workers, each of which makes one frame at a time."""
 
     def start(self) -> int:
-        """Start a worker."""
+        """Start a worker and return its number."""
 
     def stop(self, worker: int) -> None:
         """Stop a worker."""
 
     def give(self, worker: int, frame: int, layout: int) -> None:
-        """Have an idle worker make a frame."""
+        """Send a frame to an idle worker."""
 
     def wait(self) -> Iterator[tuple[int, Answer[Result]]]:
-        """Wait for answers; those that came, perhaps none."""
+        """Wait for answers and yield those that arrived; there may be none."""
 
     def openings(self) -> int:
-        """How many workers there is room for that there was not before; each is told of once."""
+        """Return the number of workers that can be started on newly available resources; each is reported once."""
 
     def close(self) -> None:
         """Stop all workers."""
 
 
 def check_workers(workers: int | None) -> None:
-    """Refuse fewer than one.
+    """Check that a number of workers is None or at least 1.
 
     Raises:
-        InputError: If there are.
+        InputError: If it is less than 1.
     """
     if workers is not None and workers < 1:
         raise InputError(f"workers must be at least 1 (got {workers})")
@@ -183,25 +183,29 @@ def run_frames(
     memory: WorkerMemory = TYPICAL,
     device: Device | None = None,
 ) -> Generator[Result]:
-    """Results of ``make`` for every frame, in the order in which they are finished.
+    """Call ``make`` for every frame and yield the results in order of completion.
 
     Args:
-        make: Makes one frame. With workers it is sent to each of them once, by spawning: a script that gets here must
-            guard its main part by ``if __name__ == "__main__"``.
-        layouts: The frames to make, by layout.
-        workers: Processes to use; 1 makes the frames in this process if that can compute on the device. None is as many
-            as turn out to pay on CPUs, and at once as many as there are cores and memory for on GPUs.
-        note: Hears what is being done.
-        memory: What a worker takes, by which their number is limited if it is left to the engine.
-        device: What frames are computed on; each worker takes it first, one of the GPUs in turn. None for work that
-            does without.
+        make: Function that makes one frame. It is sent once to each worker, which is spawned. A script that calls this
+            function must therefore guard its main part by ``if __name__ == "__main__"``.
+        layouts: Frame indices by layout.
+        workers: Number of processes; 1 makes the frames in this process if it can compute on the device. None selects
+            the
+            number automatically: on CPUs, as long as another worker speeds up the run; on GPUs, immediately the number
+                that
+            cores and memory allow.
+        note: Callback that receives a short description of the current operation.
+        memory: Memory of a worker, which limits an automatic number of workers.
+        device: Device for the frames; each worker selects it first, and several GPUs are assigned in turn. None for
+            work
+            without a device.
 
     Raises:
-        InputError: If a frame finds its input at fault.
-        MissingResourceError: If a frame does not fit into memory that a worker has for itself.
+        InputError: If the input of a frame is invalid.
+        MissingResourceError: If the memory does not suffice for a frame in a single worker.
         FrameError: If a frame fails otherwise in a worker.
-        LostWorkersError: If :data:`MOST_LOSSES` workers died of one frame. Workers are stopped before anything is
-            raised, and when the iterator is closed.
+        LostWorkersError: If :data:`MOST_LOSSES` workers died while making the same frame. Workers are stopped before an
+            exception is raised, and when the iterator is closed.
     """
     check_workers(workers)
     total = sum(map(len, layouts.values()))
@@ -222,7 +226,7 @@ def run_frames(
         return
     if few:
         most = 1
-    # Starting workers one by one would take longer on a GPU than most runs do.
+    # On a GPU, starting workers one by one would take longer than most runs.
     grow = workers is None and (device is None or not device.gpus)
     shares = device is not None and 0 < len(device.gpus) < min(most, total)
     with closing(SharedGpu()) if shares else nullcontext() as shared:
@@ -236,7 +240,7 @@ def run_frames(
 
 
 def run_apart(make: MakeFrame[Result], device: Device | None = None) -> Generator[Result]:
-    """The result of ``make`` for frame 0, in a process of its own.
+    """Call ``make`` for frame 0 in a separate process and yield the result.
 
     Raises:
         InputError, MissingResourceError, FrameError, LostWorkersError: As :func:`run_frames`.
@@ -246,7 +250,7 @@ def run_apart(make: MakeFrame[Result], device: Device | None = None) -> Generato
 
 
 def affordable_workers(memory: WorkerMemory, device: Device | None = None) -> int:
-    """Most worker processes that this machine has cores and unused memory for, and its GPUs memory, at least 1."""
+    """Return the number of workers for which cores, unused memory and GPU memory suffice, at least 1."""
     most = min(usable_cores(), int((unused_memory() * 2**30 - memory.shared) / memory.own))
     if device is not None and device.gpus:
         held = int(min(gpu.memory for gpu in device.gpus) / memory.gpu)
@@ -257,18 +261,21 @@ def affordable_workers(memory: WorkerMemory, device: Device | None = None) -> in
 def run_pool(
     pool: Pool[Result], layouts: Mapping[int, Sequence[int]], most: int, note: Note, *, grow: bool = False
 ) -> Generator[Result]:
-    """Results of the pool's workers for every frame, in the order in which they are finished.
+    """Distribute all frames over the pool's workers and yield the results in order of completion.
 
-    A worker gets its next frame when it has finished one, so results do not pile up while the caller is busy. A lost
-    one is replaced only if it was the last, because memory is what it most likely died of, or where machines join. One
-    that says that memory has run out is replaced only if another one has gone since it began the frame.
+    A worker gets its next frame when it has finished one, so that results do not accumulate while the caller is busy. A
+    lost
+    worker is replaced only if it was the last one, because exhausted memory is the most likely cause, or on newly
+    joined
+    machines. A worker that reports exhausted memory is replaced only if another worker has gone since it began the
+    frame.
 
     Args:
-        pool: Starts and hears the workers.
-        layouts: The frames to make, by layout.
-        most: Workers to start, at most one per frame.
-        note: Hears what is being done.
-        grow: Begin with one worker, and start the next only when the last one made the run faster.
+        pool: Pool that starts the workers and receives their answers.
+        layouts: Frame indices by layout.
+        most: Maximum number of workers; at most one per frame is started.
+        note: Callback that receives a short description of the current operation.
+        grow: Begin with one worker, and start the next one only while the last one sped up the run.
 
     Raises:
         InputError, MissingResourceError, FrameError, LostWorkersError: As :func:`run_frames`.
@@ -279,7 +286,7 @@ def run_pool(
     losses: Counter[int] = Counter()
     at_work: dict[int, int] = {}
     gone = 0
-    staff: dict[int, int] = {}  # and how many others had gone when each was given its frame
+    staff: dict[int, int] = {}  # by worker: number of workers that had gone when it got its frame
 
     def assign(worker: int) -> None:
         staff[worker] = gone
@@ -295,7 +302,7 @@ def run_pool(
                 note(answer.text)
                 continue
             if worker not in at_work:
-                staff.pop(worker, None)  # died while there was nothing to do for it
+                staff.pop(worker, None)  # died while idle
                 continue
             frame = at_work.pop(worker)
             if isinstance(answer, Failure) and not answer.exhausted:
@@ -304,7 +311,7 @@ def run_pool(
                 plan.put_back(worker, frame)
                 pool.stop(worker)
                 grow = False
-                if staff.pop(worker) < gone:  # what it lacked may be free by now
+                if staff.pop(worker) < gone:  # the missing memory may be free now
                     assign(pool.start())
                     continue
                 if not staff:
@@ -355,11 +362,13 @@ def _too_large(frame: int, why: str) -> MissingResourceError:
 
 
 class _Plan:
-    """Which frames are still to be given to a worker, by layout.
+    """Frames that are not yet assigned to a worker, by layout.
 
-    A worker keeps to its layout while that has frames, then takes the first that nobody has, and when there is none
-    helps with that which has most left. Each costs O(log layouts): heaps hold what was so when it was entered, which is
-    looked at again when it comes to the top.
+    A worker stays with its layout while that has frames. Then it takes the first unassigned layout. If there is none,
+    it
+    helps with the layout that has most frames left. Each operation costs O(log layouts): heap entries may be outdated,
+    and
+    are checked when they reach the top.
 
     Args:
         layouts: Frames of each layout, in order.
@@ -377,7 +386,7 @@ class _Plan:
         heapify(self._longest)
 
     def take(self, worker: int) -> tuple[int, int] | None:
-        """Layout and frame: of the worker's layout, of one nobody has taken, or of that with most left to do."""
+        """Return the next (layout, frame) for a worker, or None if all frames are assigned."""
         if not self.waiting:
             return None
         layout = self._layouts.get(worker)
@@ -397,9 +406,9 @@ class _Plan:
         return layout, frame
 
     def put_back(self, worker: int, frame: int) -> None:
-        """The worker is gone, and its frame is to be made again."""
+        """Return the frame of a lost worker to the plan."""
         layout = self._layouts[worker]
-        if layout not in self.waiting:  # now the last
+        if layout not in self.waiting:  # append the layout at the end
             self.waiting[layout] = deque()
             self._order[layout] = self._entered
             self._entered += 1
@@ -409,7 +418,7 @@ class _Plan:
         self.leave(worker)
 
     def leave(self, worker: int) -> None:
-        """The worker is gone."""
+        """Remove a worker that has gone."""
         layout = self._layouts.pop(worker)
         self._workers[layout] -= 1
         if layout in self.waiting and not self._workers[layout]:
@@ -434,7 +443,7 @@ class _Plan:
 
 
 class _Growth:
-    """Whether another worker pays, by the frames finished per second with so many and with one fewer."""
+    """Decision about another worker, from the frame rates with n and with n - 1 workers."""
 
     def __init__(self, most: int) -> None:
         self._most = most
@@ -445,9 +454,9 @@ class _Growth:
         self._since = 0.0
 
     def judge(self, worker: int, count: int, now: float) -> str:
-        """What follows from a frame that one of ``count`` workers finished: start, stop, stay or "" for nothing yet.
+        """Evaluate a frame finished by one of ``count`` workers; return "start", "stop", "stay" or "" (undecided).
 
-        The first frame of each is not counted: it waits for imports, compilation and a layout.
+        The first frame of each worker is ignored, because it includes imports, compilation and settling of a layout.
         """
         if count != self._count:
             self._count, self._finished = count, -1
@@ -467,11 +476,12 @@ class _Growth:
 
 
 class _Processes(Generic[Result]):
-    """Workers that are processes of this machine.
+    """Worker processes on this machine.
 
-    Nothing here waits for a worker that does not start. :mod:`multiprocessing` writes what a process begins with into a
-    pipe, and would wait for ever for a process that is gone before it has read more than the pipe holds (64 KiB): so
-    that is little, and the work itself is in a file, see :class:`SharedArrays`.
+    Nothing here waits for a worker that does not start. :mod:`multiprocessing` writes a process's start data into a
+    pipe. It
+    would wait forever for a process that dies before reading more than the pipe's capacity (64 KiB). The start data are
+    therefore small, and the job itself is in a file, see :class:`SharedArrays`.
     """
 
     def __init__(
@@ -496,14 +506,15 @@ class _Processes(Generic[Result]):
         load = Counter(self._taken.values())
         gpu = min(self._gpus, key=load.__getitem__, default=None)
         with starting_safely(), starting_on(gpu, **self._environment):
-            resource_tracker.ensure_running()  # starting it with the first worker would unblock what is blocked here
-            # Ctrl-C goes to all processes of a terminal, but is for this one only: workers inherit what is blocked.
+            resource_tracker.ensure_running()  # its start together with the first worker would unblock SIGINT
+            # Ctrl-C reaches all processes of a terminal, but only this one must handle it: workers inherit the blocked
+            # signal.
             blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
             try:
                 process.start()
             finally:
                 signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
-        far_end.close()  # so that the death of the worker ends the pipe
+        far_end.close()  # so that the worker's death closes the pipe
         self._workers[worker] = process, pipe
         self._starting[worker] = _START
         if gpu is not None:
@@ -514,18 +525,18 @@ class _Processes(Generic[Result]):
         process, pipe = self._workers.pop(worker)
         self._taken.pop(worker, None)
         self._starting.pop(worker, None)
-        process.kill()  # a signal that also ends a stopped process
+        process.kill()  # SIGKILL also ends a suspended process
         process.join()
         pipe.close()
 
     def give(self, worker: int, frame: int, layout: int) -> None:
-        with suppress(BrokenPipeError, ConnectionResetError):  # a worker that died is found when its answer is received
+        with suppress(BrokenPipeError, ConnectionResetError):  # a dead worker is detected when its answer is received
             self._workers[worker][1].send(frame)
 
     def wait(self) -> Iterator[tuple[int, Answer[Result]]]:
         begun = time.monotonic()
         ready = set(wait([pipe for _, pipe in self._workers.values()], _LOOK if self._starting else None))
-        # No more than an interval counts: this process may have been stopped, and its workers with it.
+        # At most one interval counts, because this process and its workers may have been suspended.
         waited = min(time.monotonic() - begun, _LOOK)
         for worker, (process, pipe) in list(self._workers.items()):
             if pipe not in ready:
@@ -559,7 +570,7 @@ class _Processes(Generic[Result]):
 
 
 def _ending(process: BaseProcess) -> str:
-    """How a process has ended that has closed its pipe."""
+    """Describe the end of a process that has closed its pipe."""
     process.join(_END)
     code = process.exitcode
     if code is None:
@@ -568,7 +579,7 @@ def _ending(process: BaseProcess) -> str:
 
 
 def _work(pipe: Connection, device: Kind | None, make: MakeFrame[Result]) -> None:
-    """Main function of a worker: frames come in, notes and results go out, until it is stopped."""
+    """Run a worker: receive frame indices, send notes and results, until the process is stopped."""
     threading.Thread(target=_end_with_parent, daemon=True).start()
     with suppress(EOFError, BrokenPipeError):
         pipe.send(Started())
@@ -581,7 +592,8 @@ def _work(pipe: Connection, device: Kind | None, make: MakeFrame[Result]) -> Non
                     except (ImportError, RuntimeError, MissingResourceError) as error:
                         if device == "cpu":
                             raise
-                        # Others have taken its memory since the run began, or one has brought it down for all.
+                        # Other processes may have taken the GPU's memory since the run began, or one may have crashed a
+                        # shared service.
                         pipe.send(replace(Failure.of(error), exhausted=True))
                         continue
                     device = None
@@ -591,7 +603,7 @@ def _work(pipe: Connection, device: Kind | None, make: MakeFrame[Result]) -> Non
 
 
 def _end_with_parent() -> None:
-    """End this process when its parent is killed: its folder is another run's from then on."""
+    """End this process when its parent is killed, because another run may then use the output folder."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         wait([parent.sentinel])

@@ -1,9 +1,9 @@
-"""Frames on a Ray cluster, or on this machine through Ray: the same bytes as :mod:`mitsplat.engine.pool` makes.
+"""Frames on a Ray cluster, or on this machine through Ray, with the same bytes as :mod:`mitsplat.engine.pool`.
 
-The scene goes into Ray's object store once, a worker takes it from there once, and a layout that one worker settled is
-handed to every other that needs it. Files come back to the caller, who alone writes: no file system has to be shared.
-Workers must have the same mitsplat installed, and open no other file of the caller's. A machine that is lost costs its
-workers' frames in hand, which others make again; one that joins gets workers too.
+The scene is put into Ray's object store once, and each worker reads it once. A layout that one worker has settled is
+passed to all other workers that need it. The caller receives all files and is the only one that writes, so that no
+shared file system is needed. Workers need the same version of mitsplat, and open no other file of the caller. The
+unfinished frames of a lost machine are made again by other workers. A machine that joins gets workers too.
 """
 
 from __future__ import annotations
@@ -26,23 +26,23 @@ Result = TypeVar("Result")
 Made = TypeVar("Made", covariant=True)
 
 GPU_SHARE = {"CPU": 1.0, "GPU": 0.125}
-"""What a worker on a GPU reserves: eight of them, with 3 GiB each, share one of 24 GiB."""
+"""Resources of a worker on a GPU: eight workers of 3 GiB each share a GPU of 24 GiB."""
 
 _LOOK = 3.0
-"""How often to look for machines that joined, at most [s]."""
+"""Minimum interval between searches for new machines [s]."""
 
 _PATIENCE = 60.0
-"""How long to wait for a machine when none is left [s]."""
+"""Maximum waiting time for a machine when none is left [s]."""
 
 _KEPT_LAYOUTS = 64
-"""Layouts held in the object store; any other is settled, or found in a cache, again."""
+"""Maximum number of layouts in the object store; any other layout is settled again or read from a cache."""
 
 
 class ClusterJob(Protocol[Made]):
-    """Settles layouts and makes their frames; picklable."""
+    """Job that settles layouts and makes their frames; must be picklable."""
 
     def known(self, layout: int) -> str | None:
-        """A layout that is settled already; asked by the caller, not on the cluster."""
+        """Return a layout that is already settled, or None; called in the caller's process, not on the cluster."""
 
     def settle(self, layout: int) -> str:
         """Settle a layout."""
@@ -53,13 +53,14 @@ class ClusterJob(Protocol[Made]):
 
 @dataclass(frozen=True)
 class Cluster:
-    """Where to find Ray, and what a worker takes of it.
+    """Address of a Ray cluster, and the resources of a worker.
 
     Attributes:
-        address: As of ``ray.init``: None starts Ray on this machine, "auto" finds the one that runs here.
+        address: Address for ``ray.init``: None starts Ray on this machine, "auto" finds a running one.
         resources: Amounts that each worker reserves, by Ray's names: CPU, GPU, memory [bytes] or a resource that some
-            nodes declare. A worker with a GPU, or a part of one, renders on it, any other on its CPUs. If None, two
-            CPUs, or on GPUs :data:`GPU_SHARE`.
+            nodes declare. A worker with a GPU, or a fraction of one, renders on it. Other workers render on their CPUs.
+            The
+            default is two CPUs, or :data:`GPU_SHARE` for GPUs.
     """
 
     address: str | None = None
@@ -67,10 +68,10 @@ class Cluster:
 
     @staticmethod
     def parse_resources(text: str) -> dict[str, float]:
-        """Amounts from a text such as ``CPU=4,GPU=1``.
+        """Parse amounts from a text such as ``CPU=4,GPU=1``.
 
         Raises:
-            InputError: If it is another kind of text.
+            InputError: If the text has another format.
         """
         found = {}
         for part in text.split(","):
@@ -84,13 +85,13 @@ class Cluster:
         return found
 
     def on_device(self, device: str | Device | None) -> tuple[Device, Cluster]:
-        """The device that workers render on, and the cluster with what each of them reserves for that.
+        """Return the device of the workers, and the cluster with the resources that each of them reserves.
 
         Args:
-            device: ``cpu``, ``cuda``, or None for what the resources say.
+            device: ``cpu``, ``cuda``, or None to follow the resources.
 
         Raises:
-            InputError: If it is another one, or the resources contradict it.
+            InputError: If the device is unknown, or contradicts the resources.
         """
         kind = device.kind if isinstance(device, Device) else device
         if kind not in (None, "cpu", "cuda"):
@@ -113,14 +114,14 @@ def run_on_ray(
     workers: int | None = None,
     note: Note,
 ) -> Generator[Result]:
-    """Results of ``job.make`` for every frame, in the order in which they are finished.
+    """Call ``job.make`` for every frame and yield the results in order of completion.
 
     Args:
-        job: What to do.
-        layouts: The frames to make, by layout.
-        cluster: Where.
-        workers: How many; as many as the cluster has resources for if None.
-        note: Hears what is being done.
+        job: Job to run.
+        layouts: Frame indices by layout.
+        cluster: Cluster to use.
+        workers: Number of workers; None for the number that the cluster's resources allow.
+        note: Callback that receives a short description of the current operation.
 
     Raises:
         MissingResourceError: If Ray is not installed or not found, or has no room for one worker.
@@ -134,7 +135,7 @@ def run_on_ray(
 
 
 def load_ray() -> Any:
-    """The module.
+    """Import and return the module ``ray``.
 
     Raises:
         MissingResourceError: If it is not installed.
@@ -147,10 +148,10 @@ def load_ray() -> Any:
 
 
 class _Actors(Generic[Result]):
-    """Workers that are Ray actors.
+    """Pool of workers that are Ray actors.
 
     Attributes:
-        room: How many there can be at the start.
+        room: Maximum number of workers at the start.
     """
 
     def __init__(self, job: ClusterJob[Result], cluster: Cluster, most: int | None) -> None:
@@ -160,7 +161,7 @@ class _Actors(Generic[Result]):
         if self._started:
             where: dict[str, Any] = {"include_dashboard": False} if cluster.address is None else {}
             try:
-                # What a worker prints is in its answers, or in Ray's logs.
+                # Output of a worker is contained in its answers or in Ray's logs.
                 ray.init(address=cluster.address or "local", log_to_driver=False, logging_level=logging.ERROR, **where)
             except (ConnectionError, ValueError, RuntimeError) as error:
                 raise MissingResourceError(
@@ -188,7 +189,7 @@ class _Actors(Generic[Result]):
         self._count = 0
 
     def _room(self) -> dict[str, int]:
-        """Workers that fit on each node."""
+        """Return the number of workers that fit on each node."""
         nodes = [(node["NodeID"], node["Resources"]) for node in self._ray.nodes() if node["Alive"]]
         return {
             node: int(min(resources.get(name, 0.0) / amount for name, amount in self._wanted.items()))
@@ -224,7 +225,7 @@ class _Actors(Generic[Result]):
         actor = self._actors[worker]
         if layout not in self._layouts:
             known = self._job.known(layout)
-            # Its settler is the worker that needs it first; Ray hands the result on to the others.
+            # The first worker that needs a layout settles it; Ray passes the result to the others.
             self._layouts[layout] = (
                 (actor.settle.remote(layout), worker) if known is None else (self._ray.put(known), None)
             )
@@ -241,7 +242,7 @@ class _Actors(Generic[Result]):
             except self._ray.exceptions.RayError as error:
                 _, settler = self._layouts.pop(layout, (None, None))
                 if settler not in (None, worker):
-                    self.give(worker, frame, layout)  # what was lost may be the worker that settled the layout
+                    self.give(worker, frame, layout)  # the lost worker may be the one that settled the layout
                     continue
                 self.stop(worker)
                 yield worker, Lost(f"was lost ({str(error).strip().splitlines()[0]})")
@@ -254,7 +255,7 @@ class _Actors(Generic[Result]):
 
 
 class _Actor:
-    """A worker on the cluster."""
+    """Worker on the cluster."""
 
     def __init__(self, stored: list[Any], kind: Kind) -> None:
         import ray  # optional: the extra [cluster]

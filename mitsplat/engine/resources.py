@@ -1,4 +1,4 @@
-"""How much memory this machine has for workers, and how much they take."""
+"""Memory of this machine, and memory requirements of workers."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ _CGROUP = Path("/sys/fs/cgroup")
 
 @dataclass(frozen=True)
 class WorkerMemory:
-    """What worker processes take [bytes].
+    """Memory requirements of worker processes [bytes].
 
     Attributes:
-        own: Each of them.
-        shared: All of them together, once.
-        gpu: Each of those that compute on a GPU, of its memory.
+        own: Memory of each worker.
+        shared: Memory that all workers share.
+        gpu: GPU memory of each worker that computes on a GPU.
     """
 
     own: float
@@ -26,16 +26,16 @@ class WorkerMemory:
 
 
 TYPICAL = WorkerMemory(4.0 * 2**30)
-"""Of work that nothing is known of."""
+"""Requirements of work without an estimate."""
 
 
 def unused_memory() -> float:
-    """Memory that programs can still have [GiB], within what a container is limited to."""
+    """Return the memory available to programs [GiB], within the limit of a container."""
     free = {"MemAvailable": os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") / 2**30}
     with suppress(OSError):
         lines = (line.split() for line in Path("/proc/meminfo").read_text().splitlines())
         free |= {words[0].rstrip(":"): int(words[1]) / 2**20 for words in lines}
-    with suppress(OSError, ValueError):  # no limit is "max", which is no number
+    with suppress(OSError, ValueError):  # an absent limit reads "max", which is not a number
         limit, used = (int((_CGROUP / name).read_text()) for name in ("memory.max", "memory.current"))
         return min(free["MemAvailable"], (limit - used) / 2**30)
     return free["MemAvailable"]

@@ -1,7 +1,7 @@
-"""Values for worker processes, with arrays that all of them share: one copy in memory, which nobody can change.
+"""Values for worker processes whose arrays share one read-only copy in memory.
 
-The arrays are taken out of the pickle (PEP 574) and put into a file that every worker maps, the pickle after them, and
-a table of their places. The file has no name, so that the system frees it with the last process, however that ends.
+The arrays are extracted from the pickle (PEP 574) and written to a file that every worker maps, followed by the pickle
+and a table of offsets. The file has no name, so that the system frees it when the last process ends.
 """
 
 from __future__ import annotations
@@ -23,18 +23,18 @@ from mitsplat.storage.cache import cache_folder
 Value = TypeVar("Value")
 
 _LINE = 64
-"""Arrays start at whole cache lines [bytes]."""
+"""Alignment of arrays to cache lines [bytes]."""
 
 _logger = logging.getLogger(__name__)
 
 
 class SharedArrays(Generic[Value]):
-    """A value that processes can be started with; there it is unpickled where it stands, as that value.
+    """A value for the start of processes, which each process unpickles as the original value.
 
-    Where no file can be written, they share memory that the system cannot put aside.
+    If no file can be written, the processes share memory that the system cannot swap out.
 
     Attributes:
-        size: What the processes share [bytes].
+        size: Shared data [bytes].
     """
 
     def __init__(self, value: Value) -> None:
@@ -54,19 +54,19 @@ class SharedArrays(Generic[Value]):
         return _open, (DupFd(self._file.fileno()), self.size)
 
     def close(self) -> None:
-        """Let go of the file; processes that were started keep it."""
+        """Close the file; started processes keep it open."""
         self._file.close()
 
 
 def _filled(file: IO[bytes], places: Sequence[tuple[int, memoryview]]) -> IO[bytes]:
-    """The file with its parts written, or closed where there is no room for them."""
+    """Write all parts to the file and return it; close it if there is no space."""
     try:
         for start, part in places:
             file.seek(start)
             file.write(part)
         file.flush()
     except BaseException:
-        with suppress(OSError):  # it writes what is left again
+        with suppress(OSError):  # closing tries to write the remaining data again
             file.close()
         raise
     return file

@@ -1,4 +1,4 @@
-"""Pages that are one HTML file and need no network: their frame, and pictures inside of them."""
+"""Self-contained HTML pages: page template and embedded pictures."""
 
 from __future__ import annotations
 
@@ -18,36 +18,36 @@ REPORT_FILE = "report.html"
 
 
 def make_page(title: str, body: str, *, script: str = "") -> str:
-    """An HTML page around a body that is HTML already."""
+    """Build an HTML page from an HTML body."""
     page = _PAGE.replace("{{title}}", html.escape(title)).replace("{{body}}", body)
     return page.replace("{{script}}", f"<script>{script}</script>\n" if script else "")
 
 
 def inline_image(pixels: npt.NDArray[Any], *, quality: int = 82) -> str:
-    """A picture in blue, green, red order (H, W, 3) as the address of an image element."""
+    """Encode a picture in blue, green, red order (H, W, 3) as a data URL."""
     _, data = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, quality])
     return f"data:image/jpeg;base64,{base64.b64encode(bytes(data)).decode('ascii')}"
 
 
 def shrunk_image(picture: ByteImage, width: int) -> str:
-    """A picture in red, green, blue order for the page, at most ``width`` px wide."""
+    """Encode a picture in red, green, blue order as a data URL, at most ``width`` px wide."""
     scale = min(1.0, width / picture.shape[1])
     size = max(1, round(picture.shape[1] * scale)), max(1, round(picture.shape[0] * scale))
     return inline_image(cv2.cvtColor(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), cv2.COLOR_RGB2BGR))
 
 
 def rgb_image(values: npt.NDArray[np.floating], width: int) -> str:
-    """Colours from 0 to 1, (H, W, 3), as the address of an image element at most ``width`` px wide."""
+    """Encode colours from 0 to 1, (H, W, 3), as a data URL of a picture at most ``width`` px wide."""
     return shrunk_image(eight_bit(values), width)
 
 
 def eight_bit(values: npt.NDArray[np.floating]) -> ByteImage:
-    """Colours from 0 to 1 as bytes."""
+    """Convert colours from 0 to 1 to bytes."""
     return np.asarray(255 * np.clip(values, 0, 1) + 0.5).astype(np.uint8)
 
 
 def mask_path(shape: Silhouette) -> str:
-    """Outlines of a mask along its pixels' centres as an SVG path, holes cut out by the even-odd rule."""
+    """Convert a mask to an SVG path along the centres of its outline pixels; holes follow the even-odd rule."""
     x, y = shape.box[:2]
     rings, _ = cv2.findContours(shape.mask.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_TC89_L1)
     return "".join(
@@ -56,12 +56,12 @@ def mask_path(shape: Silhouette) -> str:
 
 
 def figure_of(value: float | None, form: str) -> str | None:
-    """A figure as text, or None where it is not known."""
+    """Format a value, or return None if it is unknown."""
     return None if value is None else form.format(value)
 
 
 def verdict_of(wrong: Sequence[str], good: str, rows: Mapping[str, str | None]) -> str:
-    """What is wrong, a paragraph each, or a sentence that all is good, and a table of the figures that are known."""
+    """Build HTML with one paragraph per defect, or the sentence ``good``, and a table of the known values."""
     lines = "".join(f'<p class="bad">{html.escape(line)}</p>' for line in wrong) or f'<p class="good">{good}</p>'
     table = "".join(
         f'<tr><th scope="row">{key}</th><td>{html.escape(value)}</td></tr>' for key, value in rows.items() if value

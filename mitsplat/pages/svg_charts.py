@@ -1,4 +1,4 @@
-"""Charts as inline SVG for a page without network or framework: each with a caption and its numbers as a table."""
+"""Charts as inline SVG without network or framework, each with a caption and a table of its numbers."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _LEFT, _BOTTOM, _TOP = 46, 34, 10
 
 
 def bars(caption: str, values: Mapping[str, float], *, unit: str = "", name_width: int = 150) -> str:
-    """Horizontal bars with a name, on ``name_width`` of the chart's 420 units, and a value each."""
+    """Draw horizontal bars with names (``name_width`` of the chart's 420 units) and values."""
     if not values:
         return _figure(caption, "<p>nothing</p>", [])
     most = max(values.values()) or 1.0
@@ -33,7 +33,7 @@ def bars(caption: str, values: Mapping[str, float], *, unit: str = "", name_widt
 
 
 class Histogram:
-    """Counts of values in equal bins; values beyond ``bounds`` count in the outermost ones."""
+    """Counts of values in equal bins; values beyond ``bounds`` are counted in the outermost bins."""
 
     def __init__(self, bounds: tuple[float, float], bins: int = 20) -> None:
         self._bounds = bounds
@@ -45,7 +45,7 @@ class Histogram:
         self._counts += np.histogram(np.clip(data, *self._bounds), bins=len(self._counts), range=self._bounds)[0]
 
     def draw(self, caption: str, axis: str = "") -> str:
-        """The histogram as a chart."""
+        """Draw the histogram as a chart."""
         if not self._counts.any():
             return _figure(caption, "<p>nothing</p>", [])
         low, high = self._bounds
@@ -55,7 +55,7 @@ class Histogram:
 
 
 def columns(caption: str, counts: Sequence[int] | npt.NDArray[np.integer], names: Sequence[str], axis: str = "") -> str:
-    """A histogram that was counted before, with a name for every bin."""
+    """Draw a histogram from given counts, with a name for every bin."""
     ends = (
         {0.0: names[0], 0.5: names[len(names) // 2], 1.0: names[-1]}
         if len(names) > 2
@@ -67,7 +67,7 @@ def columns(caption: str, counts: Sequence[int] | npt.NDArray[np.integer], names
 def curves(
     caption: str, lines: Mapping[str, npt.NDArray[np.float64]], axes: tuple[str, str], numbers: Mapping[str, str]
 ) -> str:
-    """Lines of points (x, y) in [0, 1], shape (N, 2) each, the first one thick; ``numbers`` is the table."""
+    """Draw curves of points (x, y) in [0, 1], shape (N, 2) each, the first one thick; ``numbers`` is the table."""
     width, height = _WIDTH - _LEFT - 10, 0.6 * (_WIDTH - _LEFT - 10)
     base = _TOP + height
     marks = [f'<rect class="frame" x="{_LEFT}" y="{_TOP}" width="{width}" height="{height:.1f}"/>']
@@ -88,9 +88,9 @@ def curves(
 
 
 def discs(caption: str, counts: Mapping[str, npt.NDArray[np.integer]]) -> str:
-    """Hemispheres seen from above, their cells (rings from the top, sectors from +x to +y) darker the more they count.
+    """Draw hemispheres from above; their cells (rings from the top, sectors from +x to +y) darken with the counts.
 
-    Rings are as wide as makes equal areas of a sphere equal on the disc (Lambert's azimuthal projection).
+    Equal areas of the sphere have equal areas on the disc (Lambert's azimuthal projection).
     """
     if not counts:
         return _figure(caption, "<p>nothing</p>", [])
@@ -122,7 +122,7 @@ def discs(caption: str, counts: Mapping[str, npt.NDArray[np.integer]]) -> str:
 
 
 class HeatMap:
-    """Counts of points (x, y) in a grid over (0, 0) to ``size``, y downwards."""
+    """Counts of points (x, y) in a grid from (0, 0) to ``size``, y downwards."""
 
     def __init__(self, size: tuple[float, float], cells: tuple[int, int]) -> None:
         self._size = size
@@ -139,7 +139,7 @@ class HeatMap:
         self._counts += counts
 
     def draw(self, caption: str, axes: str) -> str:
-        """The map as a chart."""
+        """Draw the map as a chart."""
         counts, size = self._counts, self._size
         cells = counts.shape[::-1]
         most = counts.max() or 1.0

@@ -1,7 +1,8 @@
 """Start of Python child processes: the only module that builds their command lines.
 
-A child never imports Python files of the current folder, which may be a downloaded one: it starts in Python's safe-path
-mode (``-P``), and the variable ``PYTHONSAFEPATH`` hands that on to the processes that it starts itself.
+A child never imports Python files from the current folder, which may be a downloaded one. It starts in Python's
+safe-path
+mode (``-P``), and the variable ``PYTHONSAFEPATH`` passes this mode on to its own child processes.
 """
 
 from __future__ import annotations
@@ -22,13 +23,13 @@ from typing import NamedTuple
 from mitsplat.errors import InputError
 
 SAFE_PATH = "PYTHONSAFEPATH"
-"""Environment variable: Python does not look for modules in the current folder."""
+"""Environment variable: Python does not search the current folder for modules."""
 
 REFUSED = 2
-"""Status of a bounded child whose function raised :class:`InputError`."""
+"""Exit status of a bounded child whose function raised :class:`InputError`."""
 
 _SETTLING = 5.0
-"""Time by which a child may outlive its limit if its parent is gone [s]."""
+"""Time by which a child may exceed its limit if its parent is gone [s]."""
 
 _BOUNDED = "from mitsplat.runtime.child_process import run_function; run_function()"
 
@@ -37,10 +38,10 @@ class Ended(NamedTuple):
     """Result of a bounded child.
 
     Attributes:
-        status: 0 if the function returned, :data:`REFUSED` or 1 if it raised, negative for a signal, None if time ran
-            out.
-        output: Bytes that the function wrote; of one that failed, those that it flushed.
-        reason: Message of its exception, or how it ended, for "its reader ..."; empty if it returned.
+        status: 0 if the function returned, :data:`REFUSED` or 1 if it raised, negative for a signal, None after a
+            timeout.
+        output: Bytes that the function wrote; after a failure, those that it flushed.
+        reason: Message of its exception, or a description of its end that continues "its reader ..."; empty on success.
     """
 
     status: int | None
@@ -49,21 +50,22 @@ class Ended(NamedTuple):
 
 
 def python_command(*arguments: str | Path) -> list[str]:
-    """Command line of a Python child: the interpreter's arguments, such as ``-m`` and a module."""
+    """Return the command line of a Python child for interpreter arguments such as ``-m`` and a module."""
     return [sys.executable, "-P", *map(str, arguments)]
 
 
 def python_environment(changes: Mapping[str, str] | None = None) -> dict[str, str]:
-    """Environment of a Python child: this process's, with changes."""
+    """Return the environment of a Python child: that of this process, with changes."""
     return {**os.environ, **(changes or {}), SAFE_PATH: "1"}
 
 
 @contextmanager
 def starting_safely() -> Iterator[None]:
-    """Start processes of :mod:`multiprocessing` and of libraries in safe-path mode meanwhile.
+    """Put processes that :mod:`multiprocessing` and libraries start in this context into safe-path mode.
 
-    They get this process's environment and import path, so both are changed for that long. An empty entry of the path
-    stands for the current folder: that of a prompt, of a notebook or of ``python -c``.
+    Such processes inherit this process's environment and import path, so that both are changed within the context. An
+    empty
+    entry of the path means the current folder: that of a prompt, of a notebook or of ``python -c``.
     """
     kept, path = os.environ.get(SAFE_PATH), list(sys.path)
     os.environ[SAFE_PATH] = "1"
@@ -79,9 +81,9 @@ def starting_safely() -> Iterator[None]:
 
 
 def leave_current_folder() -> None:
-    """Import nothing from the current folder any more, in this process and all that it starts.
+    """Stop imports from the current folder, in this process and in all of its child processes.
 
-    The folder stays on the import path if mitsplat itself is in it.
+    The folder stays on the import path if it contains mitsplat itself.
     """
     os.environ[SAFE_PATH] = "1"
     first = sys.path[0] if sys.path and not sys.flags.safe_path else None
@@ -97,15 +99,15 @@ def run_bounded(
     memory: int,
     seconds: float,
 ) -> Ended:
-    """Run a function of an importable module in a child whose memory and time are bounded.
+    """Run a function of an importable module in a child with limited memory and time.
 
     Args:
-        function: Function of a module's top level, called with a binary file for its result, ``data`` and
+        function: Function at a module's top level. It is called with a binary file for its result, ``data`` and
             ``arguments``. The child imports its module.
-        arguments: Texts that the function gets.
-        data: Bytes that the function gets.
-        imports: Modules to import before memory is bounded.
-        memory: Address space for the function, on top of what the child holds before [bytes].
+        arguments: Text arguments of the function.
+        data: Bytes argument of the function.
+        imports: Modules to import before memory is limited.
+        memory: Address space for the function, in addition to that of the child before the call [bytes].
         seconds: Time limit of the whole child.
     """
     call = [function.__module__, function.__qualname__, *imports]
@@ -124,7 +126,8 @@ def run_bounded(
 
 
 def run_function() -> None:
-    """Run the function that the command line names, and end this process: the child's part of :func:`run_bounded`."""
+    """Run the function named by the command line and end this process; this is the child's part of :func:`run_bounded`.
+    """
     call, memory, seconds, *arguments = sys.argv[1:]
     signal.alarm(math.ceil(float(seconds) + _SETTLING))  # ends this process if its parent cannot
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
@@ -147,17 +150,17 @@ def run_function() -> None:
         sys.stderr.write(f"\n{said[-1]}\n")
         sys.stderr.flush()
         os._exit(REFUSED if isinstance(error, InputError) else 1)
-    os._exit(0)  # within the bound, what ends a driver may never end
+    os._exit(0)  # with limited memory, the shutdown of a driver may hang
 
 
 def limit_memory(memory: int) -> None:
-    """Lower the bound of a child for what follows: this much address space more than it holds now [bytes]."""
+    """Lower the limit of a child's address space to its present size plus ``memory`` [bytes]."""
     _, most = resource.getrlimit(resource.RLIMIT_AS)
     bound = _held() + memory
     resource.setrlimit(resource.RLIMIT_AS, (bound if most == resource.RLIM_INFINITY else min(bound, most), most))
 
 
 def _held() -> int:
-    """Address space of this process [bytes]; a driver of a GPU may have set aside any amount."""
+    """Return the address space of this process [bytes]; a GPU driver may have reserved any amount."""
     with open("/proc/self/statm") as pages:  # noqa: PTH123 - a file of the system
         return int(pages.read().split()[0]) * resource.getpagesize()

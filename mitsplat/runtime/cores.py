@@ -1,4 +1,4 @@
-"""How many cores a process may use, which can be fewer than the machine has."""
+"""Number of CPU cores available to this process."""
 
 from __future__ import annotations
 
@@ -6,5 +6,8 @@ import os
 
 
 def usable_cores() -> int:
-    """Cores that this process is let run on, as by ``taskset``; threads beyond these only take memory."""
+    """Return the number of cores on which this process may run, for example limited by ``taskset``.
+
+    More threads than these cores only increase memory use.
+    """
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -1,12 +1,13 @@
-"""Which processor computes: the CPU by ``llvm_ad_rgb``, an NVIDIA GPU by ``cuda_ad_rgb``.
+"""Selection of the compute device: the CPU by ``llvm_ad_rgb``, an NVIDIA GPU by ``cuda_ad_rgb``.
 
-Devices are named ``cpu``, ``cuda`` (the GPU that CUDA counts first), ``cuda:N`` (one of several, from 0), ``cuda:all``
-(all of them, where several processes make a dataset) and ``auto`` (``cuda`` if the driver and OptiX are whole, else
-``cpu``). N counts as in ``CUDA_VISIBLE_DEVICES``; without it in the order of PCI buses, as in ``nvidia-smi``, where
-CUDA itself begins with the fastest.
+Device names are ``cpu``, ``cuda`` (CUDA's first GPU), ``cuda:N`` (one of several, from 0), ``cuda:all`` (all GPUs, if
+several processes make a dataset) and ``auto`` (``cuda`` if the driver and OptiX are complete, else ``cpu``). N is the
+position in ``CUDA_VISIBLE_DEVICES``. Without this variable, N follows the order of PCI buses, as in ``nvidia-smi``;
+CUDA itself begins with the fastest GPU.
 
-A process computes on the first GPU that is visible to it, which is settled when Mitsuba is imported: Dr.Jit starts CUDA
-then. Another one is for a process that starts with :func:`gpu_environment`.
+A process computes on its first visible GPU. This GPU is fixed when Mitsuba is imported, because Dr.Jit then starts
+CUDA.
+Another GPU needs a process that is started with :func:`gpu_environment`.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from mitsplat.runtime.variant import VARIANTS, choose_variant
 Kind = Literal["cpu", "cuda"]
 
 NUMBER = "MITSPLAT_GPU"
-"""Environment variable: the N of the ``cuda:N`` that alone is visible to this process."""
+"""Environment variable: N of the ``cuda:N`` that is the only visible GPU of this process."""
 
 _DEVICE = re.compile(r"cpu|auto|cuda(:all|:\d{1,4})?")
 
@@ -40,11 +41,11 @@ class Gpu:
     """An NVIDIA GPU that is visible to this process.
 
     Attributes:
-        name: As its maker calls it.
-        memory: What of it no program has taken [bytes], or all of it where that is unknown.
-        ordinal: Its number as CUDA counts in this process; Dr.Jit computes on 0.
-        bus: Its place on the PCI bus.
-        id: What makes it alone visible to another process by ``CUDA_VISIBLE_DEVICES``; empty if it is alone already.
+        name: Product name.
+        memory: Unused memory [bytes], or total memory if the unused part is unknown.
+        ordinal: CUDA device index in this process; Dr.Jit computes on 0.
+        bus: PCI bus id.
+        id: Value of ``CUDA_VISIBLE_DEVICES`` that selects only this GPU; empty if it is already the only one.
     """
 
     name: str
@@ -56,12 +57,12 @@ class Gpu:
 
 @dataclass(frozen=True)
 class Device:
-    """What to compute on.
+    """Compute device.
 
     Attributes:
-        kind: What decides bytes.
-        gpus: Those to use, each by processes of its own.
-        reason: Why it is this one, if ``auto`` chose it.
+        kind: Kind of processor, which determines the output bytes.
+        gpus: GPUs to use, each by separate processes.
+        reason: Reason of the choice, if ``auto`` was requested.
     """
 
     kind: Kind
@@ -74,7 +75,7 @@ class Device:
 
     @property
     def is_here(self) -> bool:
-        """Whether this process can compute on it."""
+        """True if this process can compute on the device."""
         return self.kind == "cpu" or any(gpu.ordinal == 0 for gpu in self.gpus)
 
 
@@ -82,24 +83,24 @@ CPU = Device("cpu")
 
 
 class Lack(NamedTuple):
-    """What a GPU is missing, for "as ...", and what to do about it."""
+    """Missing prerequisite of a GPU (continues "as ..."), and its remedy."""
 
     what: str
     remedy: str
 
 
 def use_device(device: str | Device) -> Device:
-    """Compute on a device from now on, in this process: choose Mitsuba's variant for it.
+    """Select the device of this process, by setting Mitsuba's variant.
 
     Args:
-        device: ``cpu``, ``cuda``, ``cuda:N`` or ``auto``. Of ``cuda:all`` a process takes the first.
+        device: ``cpu``, ``cuda``, ``cuda:N`` or ``auto``. For ``cuda:all``, a process uses the first GPU.
 
     Returns:
-        The device; its ``reason`` says why ``auto`` chose it.
+        The device; its ``reason`` explains the choice of ``auto``.
 
     Raises:
-        InputError: If there is no such device, or this process sees another GPU first than the one named.
-        MissingResourceError: If there is no GPU, or no whole driver, or no usable LLVM for the CPU.
+        InputError: If there is no such device, or another GPU than the named one is the first visible one.
+        MissingResourceError: If there is no GPU, or no complete driver, or no usable LLVM for the CPU.
     """
     found = find_device(device)
     if not found.is_here:
@@ -109,9 +110,9 @@ def use_device(device: str | Device) -> Device:
 
 
 def use_share(kind: Kind) -> None:
-    """As :func:`use_device`, in one of several processes, each of which would have a thread for every core.
+    """Select a device like :func:`use_device`, in one of several processes that share its cores.
 
-    On a GPU Dr.Jit's threads only build scenes, for which one takes a tenth of the time that sixteen do.
+    On a GPU, Dr.Jit's threads only build scenes. One thread does this in a tenth of the time of sixteen threads.
     """
     use_device(kind)
     if kind == "cuda":
@@ -119,12 +120,12 @@ def use_share(kind: Kind) -> None:
 
 
 def current_device() -> Device:
-    """The device that this process computes on: that of Mitsuba's variant, ``cpu`` if none is chosen yet."""
+    """Return the device of Mitsuba's current variant, or ``cpu`` if none is set."""
     return find_device("cuda") if mi.variant() == VARIANTS[1] else CPU
 
 
 def find_device(device: str | Device) -> Device:
-    """A device of this machine by its name; nothing is chosen yet.
+    """Return a device of this machine by its name, without selecting it.
 
     Raises:
         InputError, MissingResourceError: As :func:`use_device`.
@@ -164,10 +165,10 @@ def _too_late(text: str, gpu: Gpu) -> LateDeviceError:
 
 
 def check_name(device: str) -> str:
-    """The name of a device, which need not be here.
+    """Validate and return the name of a device, which need not exist on this machine.
 
     Raises:
-        InputError: If it is none.
+        InputError: If the name is invalid.
     """
     if not _DEVICE.fullmatch(device):
         raise InputError(f"device must be cpu, cuda, cuda:N, cuda:all or auto (got {device})")
@@ -175,13 +176,13 @@ def check_name(device: str) -> str:
 
 
 def gpu_environment(gpu: Gpu) -> dict[str, str]:
-    """Variables with which a process starts to which a GPU alone is visible."""
+    """Return the environment variables of a process for which this GPU is the only visible one."""
     return {VISIBLE: gpu.id} if gpu.id else {}
 
 
 @contextmanager
 def starting_on(gpu: Gpu | None, **variables: str) -> Iterator[None]:
-    """Processes that are started meanwhile see this GPU alone, or what this one does if None, and more variables."""
+    """Start processes in this context with only this GPU visible (unchanged if None), and with more variables."""
     changes = variables if gpu is None else variables | gpu_environment(gpu)
     kept = {name: os.environ.get(name) for name in changes}
     os.environ.update(changes)
@@ -196,7 +197,7 @@ def starting_on(gpu: Gpu | None, **variables: str) -> Iterator[None]:
 
 
 def visible_gpus() -> tuple[Gpu, ...] | Lack:
-    """GPUs on which Mitsuba can trace rays, at least one."""
+    """Return the GPUs on which Mitsuba can trace rays (at least one), or the missing prerequisite."""
     driver = _library("libcuda.so.1")
     if driver is None:
         return Lack("NVIDIA's driver is absent (libcuda.so.1)", "install it")
@@ -231,12 +232,12 @@ def _gpu(driver: Any, ordinal: int, unused: Mapping[str, int], *, alone: bool) -
         unused.get(own, memory.value),
         ordinal,
         bus.value.decode(errors="replace"),
-        "" if alone else own,  # that of a part of a GPU would be another name
+        "" if alone else own,  # a partition of a GPU has another name
     )
 
 
 def _library(name: str) -> Any:
-    """A library of the driver, or None."""
+    """Load a library of the driver, or return None."""
     try:
         return ctypes.CDLL(name)
     except OSError:

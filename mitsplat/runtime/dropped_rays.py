@@ -1,7 +1,7 @@
-"""Rays that Dr.Jit leaves out on a GPU, made an error: it only warns, and the picture lacks shadows or objects.
+"""Detection of rays that Dr.Jit drops on a GPU, which would cause missing shadows or objects.
 
-A kernel of ``cuda_ad_rgb`` can trace one scene. Of one that traces two, Dr.Jit keeps the first, and logs that it
-disables the others, which then hit nothing.
+A kernel of ``cuda_ad_rgb`` can trace one scene. If a kernel traces two, Dr.Jit keeps the first one. It only logs a
+warning that it disables the others, whose rays then hit nothing. This module turns the warning into an error.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ import drjit as dr
 from mitsplat.errors import MissingResourceError
 
 SIGN = b"ray tracing operation"
-"""Part of what Dr.Jit logs then, of several pipelines and of several shader binding tables alike."""
+"""Text common to Dr.Jit's warnings about several pipelines and about several shader binding tables."""
 
 SET_CALLBACK = "_Z26jit_set_log_level_callback8LogLevelPFvS_PKcE"
-"""The function ``jit_set_log_level_callback``, as the library of Dr.Jit exports it."""
+"""Exported symbol of the function ``jit_set_log_level_callback`` in Dr.Jit's library."""
 
 _Callback = ctypes.CFUNCTYPE(None, ctypes.c_uint32, ctypes.c_char_p)
 
@@ -29,10 +29,11 @@ _lost: list[str] = []
 
 
 def watch_rays() -> None:
-    """Keep from now on what Dr.Jit logs of rays that it leaves out, and print its other messages to stderr.
+    """Record Dr.Jit's log messages about dropped rays from now on, and print its other messages to stderr.
 
-    To be called again where somebody else may have set the log level, which takes the callback's place. The callback
-    takes Python's lock inside of Dr.Jit's: safe as long as Dr.Jit is used by one thread at a time, see
+    Call this function again where other code may have set the log level, which replaces the callback. The callback
+    takes
+    Python's lock inside Dr.Jit's lock. This is safe as long as only one thread at a time uses Dr.Jit, see
     :func:`mitsplat.runtime.variant.one_at_a_time`.
 
     Raises:
@@ -43,10 +44,10 @@ def watch_rays() -> None:
 
 
 def refuse_lost_rays() -> None:
-    """Raise what was logged of rays since the last call.
+    """Raise an error if rays were dropped since the last call.
 
     Raises:
-        RuntimeError: If Dr.Jit left out any.
+        RuntimeError: If Dr.Jit has dropped rays.
     """
     if _lost:
         text, count = _lost[0], len(_lost)
@@ -55,7 +56,7 @@ def refuse_lost_rays() -> None:
 
 
 def _keep(level: int, message: bytes) -> None:
-    """Must not raise: it is called from within Dr.Jit."""
+    """Record or print a log message. Dr.Jit calls this function, so it must not raise."""
     text = message.decode(errors="replace")
     if SIGN in message:
         _lost.append(text)
@@ -68,7 +69,7 @@ _callback = _Callback(_keep)
 
 @lru_cache
 def _set_callback() -> Callable[..., None]:
-    """The function that gives Dr.Jit a level and a callback."""
+    """Return Dr.Jit's function that sets the log level and a callback."""
     try:
         function = ctypes.CDLL(str(Path(dr.__file__).with_name("libdrjit-core.so")))[SET_CALLBACK]
     except (OSError, AttributeError) as error:
@@ -77,6 +78,6 @@ def _set_callback() -> Callable[..., None]:
             "install the drjit that mitsplat was tested with, or take the CPU"
         ) from error
     function.argtypes, function.restype = (ctypes.c_uint32, _Callback), None
-    # Dr.Jit may still log while Python ends, when the callback is gone: this brings back its own.
+    # Dr.Jit may still log during Python's shutdown, when the callback no longer exists: this restores the default one.
     atexit.register(lambda: dr.set_log_level(dr.log_level()))
     return function

@@ -1,7 +1,8 @@
-"""What of a GPU's memory no program has taken, by NVIDIA's management library, which starts nothing on a GPU.
+"""Unused GPU memory from NVIDIA's management library (NVML), which does not start CUDA.
 
-Dr.Jit starts CUDA on every visible GPU as it is imported, and ends the process where one has no memory for that, even
-one that is to compute on the CPU. So GPUs that are full are hidden from it before.
+When Dr.Jit is imported, it starts CUDA on every visible GPU. It ends the process if a GPU has no memory for that, even
+if
+the process computes on the CPU. GPUs with full memory are therefore hidden before the import.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ VISIBLE = "CUDA_VISIBLE_DEVICES"
 ORDER = "CUDA_DEVICE_ORDER"
 
 NEEDED = 2**30
-"""Memory that a process takes before it has computed anything [bytes]: half of it on an H200."""
+"""GPU memory for the start of a process [bytes]; on an H200, half of it is used before any computation."""
 
 
 class _Memory(ctypes.Structure):
@@ -54,16 +55,12 @@ def gpu_memory() -> dict[str, GpuMemory]:
 
 
 def unused_gpu_memory() -> dict[str, int]:
-    """Unused memory [bytes] of every GPU of this machine, by its id and in the order of PCI buses; {} if unknown."""
+    """Return the unused memory [bytes] of every GPU by its id, in the order of PCI buses; {} if unknown."""
     return {name: memory.unused for name, memory in gpu_memory().items()}
 
 
 def hide_full_gpus() -> None:
-    """Make GPUs with less than :data:`NEEDED` unused invisible to this process, which must not have begun with CUDA.
-
-    Numbers in ``CUDA_VISIBLE_DEVICES`` count GPUs from the fastest on, unless ``CUDA_DEVICE_ORDER`` is ``PCI_BUS_ID``.
-    Among different models that order is unknown here, and a GPU named by its number stays visible.
-    """
+    """Hide GPUs with less than :data:`NEEDED` unused memory from this process; CUDA must not have been started."""
     found = gpu_memory()
     memory = {name: one.unused for name, one in found.items()}
     if all(unused >= NEEDED for unused in memory.values()):

@@ -1,6 +1,8 @@
-"""What is to be done once Mitsuba is there, without importing it: what renders nothing starts without Mitsuba.
+"""Import hook that runs a callback after Mitsuba has been imported, without importing it.
 
-Its import takes a tenth of a second, and as soon as it happens Dr.Jit starts CUDA on every visible GPU.
+Commands that do not render thus start without Mitsuba. Its import takes a tenth of a second, and Dr.Jit then starts
+CUDA
+on every visible GPU.
 """
 
 from __future__ import annotations
@@ -16,7 +18,7 @@ _NAME = "mitsuba"
 
 
 def after_mitsuba(act: Callable[[], object]) -> None:
-    """Call ``act`` after Mitsuba's import, which may have been already."""
+    """Call ``act`` after Mitsuba is imported, or immediately if it is already imported."""
     if _NAME in sys.modules:
         act()
     else:
@@ -24,7 +26,7 @@ def after_mitsuba(act: Callable[[], object]) -> None:
 
 
 class _Finder(MetaPathFinder):
-    """Finds Mitsuba as it would be found without it."""
+    """Meta path finder that wraps the loader of Mitsuba."""
 
     def __init__(self, act: Callable[[], object]) -> None:
         self._act = act
@@ -42,7 +44,7 @@ class _Finder(MetaPathFinder):
 
 
 class _Loader(Loader):
-    """Loads by another loader, to which it leaves the module, and then acts."""
+    """Loader that delegates to another loader and then runs the callback."""
 
     def __init__(self, loader: Loader, act: Callable[[], object]) -> None:
         self._loader, self._act = loader, act

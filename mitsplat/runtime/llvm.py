@@ -1,4 +1,7 @@
-"""Which LLVM Dr.Jit uses: a wheel brings a modern one, because those of distributions abort on recent processors."""
+"""Selection of the LLVM library for Dr.Jit.
+
+A Python wheel provides a recent LLVM, because the LLVM of Linux distributions aborts on recent processors.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +16,9 @@ OLDEST_USABLE = 16
 
 
 def use_bundled_llvm() -> None:
-    """Point Dr.Jit, before it is imported, at the libLLVM of this Python environment, unless the user has set one."""
+    """Set Dr.Jit's libLLVM to that of this Python environment, before Dr.Jit is imported and unless the user has set
+    one.
+    """
     if not os.environ.get(VARIABLE):
         path = find_bundled_llvm()
         if path is not None:
@@ -21,7 +26,7 @@ def use_bundled_llvm() -> None:
 
 
 def find_bundled_llvm() -> Path | None:
-    """The libLLVM that a wheel put into this environment's ``lib`` folder, or None."""
+    """Return the path of libLLVM that a wheel installed in this environment's ``lib`` folder, or None."""
     folders = {Path(sysconfig.get_path("data")) / "lib", Path(sysconfig.get_path("platlib")).parents[1]}
     for folder in sorted(folders):
         for name in ("libLLVM.so", "libLLVM.dylib"):
@@ -36,7 +41,7 @@ def check_llvm() -> None:
     Raises:
         MissingResourceError: If Dr.Jit has loaded no LLVM, or one that is too old.
     """
-    import drjit  # after `use_bundled_llvm`, because it looks for LLVM once
+    import drjit  # after `use_bundled_llvm`, because Dr.Jit searches for LLVM only once
 
     version = drjit.detail.llvm_version()
     if version[0] >= OLDEST_USABLE:

@@ -1,4 +1,4 @@
-"""Libraries that run networks in ONNX which users name."""
+"""Import of libraries that run user-supplied ONNX networks."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ from typing import Any, Literal
 from mitsplat.errors import MissingResourceError
 
 OLDEST = (1, 24)
-"""First release of ONNX Runtime that reads no weights from outside of the folder of the network."""
+"""First release of ONNX Runtime that reads no weights from outside the network's folder."""
 
 
 def load_library(extra: Literal["depth", "masks"], name: str) -> Any:
     """Import a library that runs networks by ONNX Runtime.
 
     Args:
-        extra: Extra of mitsplat that installs it.
-        name: Its module.
+        extra: Extra of mitsplat that installs the library.
+        name: Module of the library.
 
     Raises:
-        MissingResourceError: If it or ONNX Runtime is not installed, or ONNX Runtime is too old.
+        MissingResourceError: If the library or ONNX Runtime is not installed, or ONNX Runtime is too old.
     """
     try:
         runtime = importlib.import_module("onnxruntime")

@@ -1,7 +1,6 @@
-"""Registration of Mitsuba plugins under a variant, set by the package that has the plugins.
+"""Registration of Mitsuba plugins under a variant, set by the package that defines the plugins.
 
-The packages below the plugins choose variants, and must not import the plugins. Mitsuba creates plugin classes once per
-variant.
+Lower-level packages select variants, and must not import the plugins. Mitsuba creates plugin classes once per variant.
 """
 
 from __future__ import annotations
@@ -14,13 +13,13 @@ _registration: Callable[[str | None], None] | None = None
 
 
 def set_registration(function: Callable[[str | None], None]) -> None:
-    """Set the function that registers the plugins under a variant; calling it twice for one variant must do no harm."""
+    """Set the function that registers the plugins under a variant; it must be idempotent for each variant."""
     global _registration
     _registration = function
 
 
 def register_plugins(variant: str | None) -> None:
-    """Register the plugins under a variant; one thread at a time, and complete when this returns."""
+    """Register the plugins under a variant. Threads are serialised, and registration is complete on return."""
     with _lock:
         if _registration is not None:
             _registration(variant)

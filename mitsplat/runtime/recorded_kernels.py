@@ -1,6 +1,6 @@
-"""Kernels that are recorded once and launched again, for parts of a training step that are the same in every step.
+"""Recorded kernel launches for parts of a training step that repeat in every step.
 
-To trace a step in Python and to find its compiled kernels takes longer than a GPU takes to run them.
+Tracing a step in Python and looking up its compiled kernels takes longer than the GPU needs to run them.
 """
 
 from __future__ import annotations
@@ -15,25 +15,31 @@ import drjit as dr
 import mitsuba as mi
 
 REPLAY = True
-"""Whether recordings are used. Without, every call is traced: to the same bytes on a CPU, and on a GPU to the same but
-for rounding, because it divides by a number that is known when a kernel is compiled otherwise than by one that is not
-(``tests/renderer/test_recorded.py``, ``python -m benchmarks.assets.fit --synthetic spur_gear --replay off``)."""
+"""Use of recordings. If false, every call is traced.
+
+On a CPU, both give the same bytes. On a GPU, both agree up to rounding, because division by a compile-time constant
+differs from division by a variable (``tests/renderer/test_recorded.py``,
+``python -m benchmarks.assets.fit --synthetic spur_gear --replay off``).
+"""
 
 _KEPT = 64
-"""Recordings of one function: there is one per size of a picture, number of Gaussians and degree of their colours."""
+"""Maximum number of recordings per function; one per picture size, number of Gaussians and SH degree."""
 
 Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")
 
 
 def recorded(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
-    """A function of arrays on the device whose launches are recorded, and repeated when it is called again.
+    """Record the kernel launches of a function of device arrays, and replay them in later calls.
 
-    What is no array must be hashable, and decides which recording is used, as the widths of arrays do, but for those in
-    a :class:`Table`, in place of which the function gets the array itself. Dr.Jit can keep several recordings of a
-    function too, but guesses other widths, and takes some numbers for others. The function must read nothing from the
-    device, compress nothing, take evaluated arrays without gradients, and use nothing that changes but its arguments,
-    which come by position. What it returns is evaluated.
+    Arguments that are not arrays must be hashable. They select the recording, as do the widths of arrays. Arrays in a
+    :class:`Table` are exempt: their width is free, and the function receives the array itself. Dr.Jit can also manage
+    several
+    recordings of one function, but it guesses other widths and confuses some numbers. Requirements for the function: it
+    reads
+    nothing back from the device, compresses nothing, takes evaluated arrays without gradients as positional arguments,
+    and
+    depends on no other variable state. Its results are evaluated.
     """
     recordings: OrderedDict[Any, Callable[[list[Any]], Any]] = OrderedDict()
 
@@ -63,34 +69,34 @@ def recorded(function: Callable[Arguments, Result]) -> Callable[Arguments, Resul
 
 @dataclass(frozen=True, eq=False)
 class Table:
-    """An array of any width that a recorded function only gathers from, in kernels that also take a number."""
+    """An array of any width from which a recorded function only gathers, in kernels that also take a number."""
 
     values: Any
 
 
 class _Array(NamedTuple):
-    """Stands for an array; of no width if that may be any."""
+    """Placeholder of an array; width None if any width is allowed."""
 
     kind: type
     width: int | None
 
 
 class _Keyed(NamedTuple):
-    """Stands for a dictionary."""
+    """Placeholder of a dictionary."""
 
     keys: tuple[str, ...]
     parts: tuple[Any, ...]
 
 
 class _Listed(NamedTuple):
-    """Stands for a list or a tuple."""
+    """Placeholder of a list or a tuple."""
 
     kind: type
     parts: tuple[Any, ...]
 
 
 def _form(values: Any, arrays: list[Any]) -> Any:
-    """Values with what stands for their arrays, which are appended to a list."""
+    """Replace arrays in the values by placeholders, and append the arrays to a list."""
     if isinstance(values, dr.ArrayBase):
         arrays.append(values)
         return _Array(type(values), dr.width(values))
@@ -105,7 +111,7 @@ def _form(values: Any, arrays: list[Any]) -> Any:
 
 
 def _filled(form: Any, arrays: Iterator[Any]) -> Any:
-    """The values of a form, with these arrays."""
+    """Replace the placeholders of a form by these arrays."""
     if isinstance(form, _Array):
         return next(arrays)
     if isinstance(form, _Keyed):

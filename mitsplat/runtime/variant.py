@@ -1,9 +1,8 @@
-"""What a process has one of: Mitsuba's variant with the plugins under it, and the turn to use Dr.Jit or Warp.
+"""Process-wide state: Mitsuba's variant with the registered plugins, and the lock for Dr.Jit and Warp.
 
-The rule for variants: mitsplat runs in ``llvm_ad_rgb`` and ``cuda_ad_rgb``. It uses the one that has been chosen by
-``mi.set_variant``, before or after the import, chooses ``llvm_ad_rgb`` where none has been, and refuses to work in any
-other one, which it leaves as it is. A variant belongs to the process, not to a thread, so switching it for the time of
-a call would pull it from under other threads.
+mitsplat runs in ``llvm_ad_rgb`` and ``cuda_ad_rgb``. It uses the variant set by ``mi.set_variant``, before or after the
+import. If none is set, it sets ``llvm_ad_rgb``. It refuses to work in any other variant, and does not change that
+variant. A variant belongs to the process, not to a thread; switching it during a call would break other threads.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ from mitsplat.runtime.llvm import check_llvm
 from mitsplat.runtime.plugin_registration import register_plugins
 
 VARIANTS = ("llvm_ad_rgb", "cuda_ad_rgb")
-"""Those that the plugins run in; the first is the default."""
+"""Variants in which the plugins run; the first is the default."""
 
 _turn = threading.RLock()
 
@@ -30,10 +29,10 @@ Result = TypeVar("Result")
 
 
 def ensure_variant() -> None:
-    """Choose ``llvm_ad_rgb`` if no variant has been chosen, and have the plugins under it when this returns.
+    """Set ``llvm_ad_rgb`` if no variant is set, and register the plugins for the variant.
 
     Raises:
-        InputError: If the variant that has been chosen cannot run the plugins.
+        InputError: If the current variant cannot run the plugins.
         MissingResourceError: If Dr.Jit has no usable LLVM.
     """
     with _turn:
@@ -47,14 +46,14 @@ def ensure_variant() -> None:
             check_llvm()
         if variant is None:
             mi.set_variant(VARIANTS[0])
-        # Mitsuba names a variant before it calls back those who register under it: another thread may be that far.
+        # Mitsuba changes the variant before it calls its callbacks, and another thread may be between both steps.
         register_plugins(mi.variant())
         if mi.variant() == "cuda_ad_rgb":
             watch_rays()
 
 
 def choose_variant(variant: str) -> None:
-    """Choose one of :data:`VARIANTS` for this process, whatever was chosen before.
+    """Set one of :data:`VARIANTS` for this process, replacing the current one.
 
     Raises:
         MissingResourceError: If it is ``llvm_ad_rgb``, and Dr.Jit has no usable LLVM.
@@ -67,9 +66,9 @@ def choose_variant(variant: str) -> None:
 
 
 def one_at_a_time(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
-    """Let calls from several threads take turns, as they share what a scene has on the device, and Warp's settings.
+    """Serialise calls from several threads, because they share a scene's device data and Warp's settings.
 
-    Each uses all processors, so nothing is lost.
+    Each call uses all processors, so that serialisation costs no speed.
     """
 
     @wraps(function)

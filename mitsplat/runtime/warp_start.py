@@ -1,4 +1,4 @@
-"""Warp without its greeting, and without what it says of machines that have no GPU."""
+"""Initialisation of Warp without its banner and without the warning on machines without a GPU."""
 
 from __future__ import annotations
 
@@ -17,10 +17,11 @@ _NO_GPU = b"Could not find or load the NVIDIA CUDA driver"
 
 @contextmanager
 def quiet_warp() -> Iterator[None]:
-    """Warp, started, telling of nothing but errors; a function may be decorated by this.
+    """Initialise Warp and limit its log to errors; also usable as a function decorator.
 
-    That a machine has no GPU is no news: the warning, which no setting mutes, is left out. An error that a disk is full
-    names the folder of Warp's kernels, because nothing else is written here.
+    The warning about a missing GPU, which no setting disables, is filtered out. An error about a full disk gets the
+    folder of
+    Warp's kernels as file name, because no other files are written here.
     """
     import warp as wp  # takes a third of a second, which only physics needs
 
@@ -44,12 +45,12 @@ def quiet_warp() -> Iterator[None]:
 
 @contextmanager
 def _stderr_without(phrase: bytes) -> Iterator[None]:
-    """Leave out lines with a phrase from what native code writes to stderr."""
+    """Remove lines with a phrase from the stderr output of native code."""
     if sys.stderr is not None:
         sys.stderr.flush()
     try:
         kept = os.dup(2)
-    except OSError:  # there is none
+    except OSError:  # there is no stderr
         yield
         return
     with tempfile.TemporaryFile() as written:

@@ -1,4 +1,4 @@
-"""Files that cost time only when they are missing, and folders for them.
+"""Cache files, whose loss only costs time, and their folders.
 
 Layouts and convex pieces are in ``$XDG_CACHE_HOME/mitsplat``, kernels of Warp in ``$XDG_CACHE_HOME/warp`` or
 ``$WARP_CACHE_PATH``, and kernels of Dr.Jit in ``~/.drjit`` or ``$DRJIT_CACHE_DIR``.
@@ -22,24 +22,24 @@ from typing import IO, Any
 _logger = logging.getLogger(__name__)
 
 ROOM = 16 * 2**20
-"""Least free room of a usable cache folder [bytes]; all kernels of physics take 8 MiB."""
+"""Minimum free space of a usable cache folder [bytes]; all kernels of physics take 8 MiB."""
 
 _WARP = "WARP_CACHE_PATH"
 _reported: set[Path] = set()
 
 
 def cache_folder() -> Path:
-    """``$XDG_CACHE_HOME/mitsplat``, ``~/.cache/mitsplat`` by default; it need not exist."""
+    """Return ``$XDG_CACHE_HOME/mitsplat``, by default ``~/.cache/mitsplat``; it need not exist."""
     return _cache_home() / "mitsplat"
 
 
 def warp_folder() -> Path:
-    """Folder of Warp's kernels."""
+    """Return the folder of Warp's kernels."""
     return Path(os.environ.get(_WARP) or _cache_home() / "warp")
 
 
 def drjit_folder() -> Path:
-    """Folder of Dr.Jit's kernels."""
+    """Return the folder of Dr.Jit's kernels."""
     return Path(os.environ.get("DRJIT_CACHE_DIR") or _home() / ".drjit")
 
 
@@ -49,7 +49,7 @@ def _cache_home() -> Path:
 
 
 def _home() -> Path:
-    """Home folder; of users who have none a path that does not exist."""
+    """Return the home folder, or a path that does not exist for users without one."""
     try:
         return Path.home()
     except RuntimeError:
@@ -57,30 +57,31 @@ def _home() -> Path:
 
 
 def why_unusable(folder: Path) -> str:
-    """Return why no file of :data:`ROOM` bytes can be made in a folder, or an empty text; the folder is made."""
+    """Return the reason why a folder cannot hold a file of :data:`ROOM` bytes, or ""; the folder is created."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder) as file:
             os.posix_fallocate(file.fileno(), 0, ROOM)
     except OSError as error:
-        # File systems that cannot reserve room.
+        # These errors come from file systems that cannot reserve space.
         return "" if error.errno in (errno.EOPNOTSUPP, errno.EINVAL) else error.strerror or str(error)
     return ""
 
 
 @lru_cache(maxsize=1)
 def prepare_caches() -> None:
-    """Warn once if nothing can be kept, and let Warp compile into a temporary folder if its own is unusable.
+    """Warn once about unusable cache folders; redirect Warp to a temporary folder if its own is unusable.
 
-    Child processes inherit the temporary folder, which is removed when this process ends. Kernels that can be read
-    from the unusable folder are copied there.
+    Child processes inherit the temporary folder, which is removed when this process ends. Kernels that can be read from
+    the
+    unusable folder are copied there.
     """
     own, kernels = cache_folder(), warp_folder()
     lacks = {folder: lack for folder in (own, kernels) if (lack := why_unusable(folder))}
     if kernels in lacks:
         temporary = tempfile.mkdtemp(prefix="mitsplat-kernels-")
         atexit.register(_remove, temporary, os.getpid())
-        with suppress(OSError):  # there are none, or not all of them can be read
+        with suppress(OSError):  # there are none, or some cannot be read
             shutil.copytree(kernels, temporary, dirs_exist_ok=True)
         os.environ[_WARP] = temporary
     if lacks:
@@ -88,7 +89,7 @@ def prepare_caches() -> None:
 
 
 def keep_file(path: Path, write: Callable[[IO[bytes]], Any]) -> None:
-    """Make a file by ``write(open file)`` and give it its name when it is complete; warn once if it cannot be made."""
+    """Write a cache file atomically by ``write(open file)``; warn once if it cannot be written."""
     temporary = None
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -104,7 +105,7 @@ def keep_file(path: Path, write: Callable[[IO[bytes]], Any]) -> None:
 
 
 def _warn(lacks: dict[Path, str]) -> None:
-    """Warn of unusable folders that were not reported, in one line; the parent of a worker process has done so."""
+    """Warn about newly found unusable folders in one line; in a worker process, the parent has already done so."""
     new = [folder for folder in lacks if not any(folder.is_relative_to(known) for known in _reported)]
     _reported.update(new)
     if new and parent_process() is None:
@@ -113,5 +114,5 @@ def _warn(lacks: dict[Path, str]) -> None:
 
 
 def _remove(folder: str, process: int) -> None:
-    if os.getpid() == process:  # and not in processes that it forks
+    if os.getpid() == process:  # not in forked processes
         shutil.rmtree(folder, ignore_errors=True)

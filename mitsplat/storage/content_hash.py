@@ -1,4 +1,4 @@
-"""SHA-256 of content: whether a file is as it was written, and what a result that is kept was made of."""
+"""SHA-256 of content, for integrity checks of files and for cache keys."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from mitsplat.errors import InputError
 
 
 def file_hash(file: Path | BufferedReader) -> str:
-    """SHA-256 of a file's content, or of the rest of an open one, as hexadecimal text.
+    """Compute the SHA-256 of a file's content, or of the rest of an open file, as hexadecimal text.
 
     Raises:
-        OSError: If it cannot be read.
+        OSError: If the file cannot be read.
     """
     if isinstance(file, Path):
         with file.open("rb") as opened:
@@ -28,10 +28,11 @@ def file_hash(file: Path | BufferedReader) -> str:
 class ContentHash:
     """SHA-256 of several parts, in the order in which they are added.
 
-    Parts are not kept apart: where one could end elsewhere, add what tells, as :meth:`add_array` does.
+    Parts are concatenated without separators. Where their boundaries are ambiguous, add the lengths as well, as
+    :meth:`add_array` does.
 
     Args:
-        parts: The first ones, as :meth:`add` takes them.
+        parts: First parts, as for :meth:`add`.
     """
 
     def __init__(self, *parts: bytes | str) -> None:
@@ -39,12 +40,12 @@ class ContentHash:
         self.add(*parts)
 
     def add(self, *parts: bytes | str) -> None:
-        """Add bytes, and text in UTF-8, as they are."""
+        """Add bytes, or text in UTF-8."""
         for part in parts:
             self._sha.update(part.encode() if isinstance(part, str) else part)
 
     def add_json(self, value: Any) -> None:
-        """Add a JSON value, whatever the order of its keys."""
+        """Add a JSON value, independent of the order of its keys."""
         self.add(json.dumps(value, sort_keys=True))
 
     def add_array(self, array: Any) -> None:
@@ -64,5 +65,5 @@ class ContentHash:
             raise InputError(f"{path}: cannot be read ({error.strerror})") from error
 
     def hexdigest(self) -> str:
-        """The hash of what was added so far, as hexadecimal text."""
+        """Return the hash of all added parts as hexadecimal text."""
         return self._sha.hexdigest()

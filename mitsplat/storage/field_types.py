@@ -1,4 +1,4 @@
-"""What the models of a scene file are made of: values with their units and rules."""
+"""Field types of scene-file models: values with their units and rules."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ Vector = TypeVar("Vector", bound=tuple[float, ...])
 
 
 class _TellsInOneSentence(ModelMetaclass):
-    """Values that a model is made of in Python are refused in the words that a file's would be."""
+    """Metaclass that reports invalid Python values of a model with the same messages as values of a file."""
 
-    if not TYPE_CHECKING:  # editors complete the keys of models that their fields declare
+    if not TYPE_CHECKING:  # editors complete the keys of models from their fields
 
         def __call__(cls, **values: Any) -> Any:
             try:
@@ -32,20 +32,20 @@ class _TellsInOneSentence(ModelMetaclass):
 
 
 class StrictModel(BaseModel, metaclass=_TellsInOneSentence):
-    """Immutable, without unknown keys, infinities or NaN."""
+    """Immutable model without unknown keys, infinities or NaN."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 def ordered(bounds: tuple[float, float]) -> tuple[float, float]:
-    """Refuse a range whose ends are swapped."""
+    """Refuse a range with low > high."""
     if bounds[0] > bounds[1]:
         raise ValueError(f"must be [low, high] with low <= high (got {list(bounds)})")
     return bounds
 
 
 def plain(name: str) -> str:
-    """Refuse a name that files of labels cannot hold on a line: XML has no control characters, and text has lines."""
+    """Refuse a name with control characters (invalid in XML) or line breaks (invalid in line-based label files)."""
     for character in name:
         if unicodedata.category(character) in ("Cc", "Cs", "Zl", "Zp") or ord(character) & 0xFFFE == 0xFFFE:
             raise ValueError(
@@ -55,24 +55,24 @@ def plain(name: str) -> str:
 
 
 Name = Annotated[str, Field(min_length=1), AfterValidator(plain)]
-"""A name in files of labels: of a class, an asset or a keypoint."""
+"""Name of a class, an asset or a keypoint in label files."""
 
 
 def _each_ordered(bounds: tuple[Vector, Vector]) -> tuple[Vector, Vector]:
-    """Refuse a range of vectors that any component of has its ends swapped."""
+    """Refuse a range of vectors with low > high in any component."""
     if any(low > high for low, high in zip(*bounds, strict=True)):
         raise ValueError(f"must be [low, high] with low <= high in each component (got {json.dumps(bounds)})")
     return bounds
 
 
 def check_weights(weights: tuple[float, ...], members: int, what: str) -> None:
-    """Refuse weights of another number than the members of the pool that they are of."""
+    """Check that the number of weights equals the number of members of a pool."""
     if weights and len(weights) != members:
         raise FieldError("weights", f"must be as many as the pool has {what}, {members} (got {len(weights)})")
 
 
 def _count_range(count: Any) -> Any:
-    """One number n as (n, n); a list as a tuple, since strict mode takes nothing else from here on."""
+    """Convert a number n to (n, n), and a list to a tuple, which strict mode requires."""
     if isinstance(count, int) and not isinstance(count, bool):
         if count < 1:
             raise ValueError(f"must be >= 1 (got {count})")
@@ -84,7 +84,7 @@ def _count_range(count: Any) -> Any:
 
 
 def _scale_range(scale: Any) -> Any:
-    """A list as a tuple, once it is known for a range: of a union, the error would be that of its other half."""
+    """Validate a range and convert it to a tuple; otherwise pydantic would report the union's other member."""
     if not isinstance(scale, list | tuple):
         return scale
     if len(scale) != 2 or not all(isinstance(n, int | float) and not isinstance(n, bool) and n > 0 for n in scale):

@@ -1,4 +1,4 @@
-"""What a path is, told by its name: for the sentence on one that was given where another kind is wanted."""
+"""File kinds by name, for error messages about files of the wrong kind."""
 
 from __future__ import annotations
 
@@ -28,15 +28,17 @@ _BY_CONTENT = {
 
 
 def refuse_others(path: Path, wanted: str, *suffixes: str) -> None:
-    """Refuse a folder, or a file whose suffix is that of another kind; what is not there is for its reader to refuse.
+    """Refuse a folder, or an existing file whose suffix belongs to another kind of file.
+
+    A missing file is not refused here, but by its reader.
 
     Args:
-        path: What was given.
-        wanted: What is wanted instead.
-        suffixes: Those that may be what is wanted.
+        path: Given path.
+        wanted: Description of the expected kind.
+        suffixes: Accepted suffixes.
 
     Raises:
-        InputError: Which says what it is.
+        InputError: If the path is of another kind; the message names the kind.
     """
     if path.is_dir():
         what = next((text for name, text in _BY_CONTENT.items() if (path / name).is_file()), None)

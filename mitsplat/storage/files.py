@@ -1,4 +1,4 @@
-"""Files that are never half written."""
+"""Atomic and safe file access."""
 
 from __future__ import annotations
 
@@ -21,30 +21,34 @@ from mitsplat.errors import FULL, InputError, MissingResourceError
 from mitsplat.storage.content_hash import file_hash
 
 Record = dict[str, Any]
-"""The line of one frame in ``manifest.jsonl``."""
+"""Line of one frame in ``manifest.jsonl``."""
 
 SPLITS = ("train", "val", "test")
-"""A dataset has the last one if its scene asks for it."""
+"""Splits of a dataset. The scene may disable the last one."""
 
 
 def splits_of(output: Mapping[str, Any]) -> tuple[str, ...]:
-    """Splits of a dataset whose scene says this as ``output``."""
+    """Return the splits of a dataset from the ``output`` section of its scene."""
     return SPLITS if output.get("test") else SPLITS[:2]
 
 
 IMAGE_ERRORS = (OSError, SyntaxError, ValueError, TypeError, struct.error, Image.DecompressionBombError)
-"""What Pillow raises on damaged images, and on those of more pixels than a file should hold."""
+"""Exceptions of Pillow for damaged images, and for images with an excessive number of pixels."""
 
 MESH_ERRORS = (
     *(ValueError, TypeError, LookupError, AttributeError, ArithmeticError, AssertionError, RuntimeError),
     *(MemoryError, EOFError, ImportError, NameError, struct.error),
 )
-"""What trimesh's readers raise on damaged files; ImportError where they guess at the encoding of binary rubbish,
-NameError where a branch that rubbish does not take sets a variable."""
+"""Exceptions of trimesh's readers for damaged files.
+
+ImportError occurs where a reader guesses the encoding of binary data. NameError occurs where damaged data skip the
+branch that sets a variable.
+"""
 
 
 def write_file(path: Path, write: Callable[[Path], object]) -> str:
-    """Make a file by ``write(temporary path)``, then move it to ``path`` at once and for good; its folder is made.
+    """Write a file atomically: call ``write(temporary path)``, sync, and rename to ``path``. Create its folder if
+    needed.
 
     Returns:
         The SHA-256 of the content.
@@ -59,7 +63,7 @@ def write_file(path: Path, write: Callable[[Path], object]) -> str:
             os.fsync(file.fileno())
         temporary.replace(path)
     except BaseException as error:
-        with suppress(OSError):  # a disk that cannot be written
+        with suppress(OSError):  # the disk may not be writable
             temporary.unlink(missing_ok=True)
         if isinstance(error, OSError) and error.errno and error.filename in (None, str(temporary)):
             error.filename = str(path)
@@ -68,10 +72,10 @@ def write_file(path: Path, write: Callable[[Path], object]) -> str:
 
 
 class GrowingFile:
-    """A text file that is written bit by bit under a temporary name, and gets its own at once and for good.
+    """A text file that is written incrementally under a temporary name and renamed atomically at the end.
 
     Args:
-        path: The file; its folder is made.
+        path: The file; its folder is created.
     """
 
     def __init__(self, path: Path) -> None:
@@ -82,48 +86,50 @@ class GrowingFile:
         self._named = False
 
     def write(self, text: str) -> None:
-        """Add UTF-8 text."""
+        """Append UTF-8 text."""
         self._file.write(text.encode())
 
     def take(self, other: GrowingFile) -> None:
-        """Add what another one holds, which is given up."""
+        """Append the content of another growing file, and discard that file."""
         other._file.seek(0)
         shutil.copyfileobj(other._file, self._file, 1 << 20)
         other.discard()
 
     def keep(self) -> None:
-        """Give the file its name; it is on disk then."""
+        """Sync the file to disk and give it its final name."""
         self._file.flush()
         os.fsync(self._file.fileno())
         self.close()
         self.name()
 
     def close(self) -> None:
-        """Write no more."""
+        """Close the file for writing."""
         self._file.close()
 
     def sync(self) -> None:
-        """Wait until a closed file is on disk."""
+        """Sync a closed file to disk."""
         with self._temporary.open("rb") as file:
             os.fsync(file.fileno())
 
     def name(self) -> None:
-        """Give a closed file its name; it must be on disk."""
+        """Give a closed file its final name; it must be synced before."""
         self._temporary.replace(self._path)
         self._named = True
 
     def discard(self) -> None:
-        """Remove what was written, unless it has its name."""
+        """Remove the temporary file, unless it has its final name."""
         self._file.close()
         if not self._named:
             self._temporary.unlink(missing_ok=True)
 
 
 def open_in_place(path: Path, mode: str) -> IO[Any]:
-    """Open a file that is written where it lies, and is made if the mode says so.
+    """Open a file for writing in place; depending on the mode, the file is created.
 
     Raises:
-        OSError: If it cannot be opened, or another file would be written with it: it is a link, or has a second name.
+        OSError: If the file cannot be opened. A link, or a file with a second hard link, is refused, because another
+            file
+            would be changed too.
     """
     file: IO[Any] = open(path, mode, opener=_open_unlinked)  # noqa: SIM115 - the caller's
     return file
@@ -149,10 +155,10 @@ def _open_unlinked(name: str, flags: int) -> int:
 
 
 def open_regular(path: Path) -> IO[bytes]:
-    """Open a regular file to read, through links too; others, such as a pipe, could be waited for without end.
+    """Open a regular file for reading, also through links; other files, such as a pipe, could block forever.
 
     Raises:
-        OSError: If it is none, or cannot be opened.
+        OSError: If the file is not regular, or cannot be opened.
     """
     number = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     try:
@@ -172,18 +178,18 @@ def _check_regular(number: int, path: str | Path) -> None:
 
 
 MOST_JSON = 1 << 28
-"""Largest JSON file that is read as a whole [bytes]."""
+"""Maximum size of a JSON file that is read as a whole [bytes]."""
 DEEPEST_JSON = 64
-"""Most levels of JSON; what mitsplat and others write has about ten."""
+"""Maximum nesting depth of JSON; files of mitsplat and other tools use about ten levels."""
 _NO_BRACKETS = bytes(set(range(256)) - set(b'[]{}"'))
 
 
 def read_json(path: Path, most: int = MOST_JSON) -> Any:
-    """The value of a JSON file that need not be trusted: a regular one of ``most`` bytes, bounded in depth.
+    """Read an untrusted JSON file: a regular file of at most ``most`` bytes, with limited depth.
 
     Raises:
-        OSError: If it cannot be read.
-        ValueError: If it is too large, too deep, or no JSON.
+        OSError: If the file cannot be read.
+        ValueError: If it is too large, too deep, or not JSON.
     """
     with open_regular(path) as file:
         size = os.fstat(file.fileno()).st_size
@@ -193,23 +199,23 @@ def read_json(path: Path, most: int = MOST_JSON) -> Any:
 
 
 def parse_json(data: bytes) -> Any:
-    """The value of JSON as UTF-8.
+    """Parse JSON in UTF-8.
 
     Raises:
-        ValueError: If it has more than :data:`DEEPEST_JSON` levels, or is no JSON.
+        ValueError: If it has more than :data:`DEEPEST_JSON` levels, or is not JSON.
     """
     text = data.decode("utf-8-sig")
     if data.count(b"[") + data.count(b"{") > DEEPEST_JSON:
         bare = re.sub(rb"\\.", b"", data, flags=re.DOTALL) if b"\\" in data else data
         brackets = re.sub(rb'"[^"]*"', b"", bare.translate(None, _NO_BRACKETS))
-        steps = np.frombuffer(brackets, dtype=np.uint8) & 2  # of [ and {, but not of ] and }
+        steps = np.frombuffer(brackets, dtype=np.uint8) & 2  # bit 1 is set for [ and {, but not for ] and }
         if np.cumsum(steps.astype(np.int64) - 1).max(initial=0) > DEEPEST_JSON:
             raise ValueError(f"must not be nested deeper than {DEEPEST_JSON} levels")
     return json.loads(text)
 
 
 def remove_folder(folder: Path) -> None:
-    """Remove a folder, if it is there, or a link of its name, but not what the link leads to."""
+    """Remove a folder if it exists. A link of that name is removed, but not its target."""
     if folder.is_symlink():
         folder.unlink()
     shutil.rmtree(folder, ignore_errors=True)
@@ -221,7 +227,7 @@ def write_text(path: Path, text: str) -> str:
 
 
 def files_below(folder: Path, *, but: Path | None = None) -> list[Path]:
-    """Files anywhere in a folder, and in folders that it links to, each of them once; not in ``but``; by name."""
+    """List all files in a folder and in linked folders, each once, sorted by name; the folder ``but`` is skipped."""
     found, seen = list[Path](), set[str]() if but is None else {os.path.realpath(but)}
     for place, folders, files in os.walk(folder, followlinks=True):
         seen.add(os.path.realpath(place))
@@ -231,25 +237,26 @@ def files_below(folder: Path, *, but: Path | None = None) -> list[Path]:
 
 
 def is_inside(folder: Path, name: str) -> bool:
-    """Whether a path, relative to ``folder`` or absolute, is in it also after links and ``..`` are followed."""
+    """Return True if a path (absolute or relative to ``folder``) lies in it after links and ``..`` are resolved."""
     try:
         return (folder / name).resolve().is_relative_to(folder.resolve())
-    except (OSError, ValueError, RuntimeError):  # too long, a zero byte, a loop of links
+    except (OSError, ValueError, RuntimeError):  # too long, a zero byte, or a loop of links
         return False
 
 
 def file_inside(folder: Path, name: str) -> Path:
-    """The file of this name, which must be in ``folder`` also after links and ``..`` are followed.
+    """Return the path of a file that must lie in ``folder`` after links and ``..`` are resolved.
 
     Raises:
-        InputError: With the rule alone, if it is outside or missing: the caller knows where the name is from.
+        InputError: If the file is outside or missing. The message holds only the rule, because the caller adds the
+            place.
     """
     if not is_inside(folder, name):
         raise InputError(f"must be a file inside {folder} (got {name})")
     path = folder / name
     try:
         found = path.is_file()
-    except OSError:  # a name that no file can have
+    except OSError:  # not a valid file name
         found = False
     if not found:
         raise InputError(f"no such file (got {name})")
@@ -258,7 +265,7 @@ def file_inside(folder: Path, name: str) -> Path:
 
 @contextmanager
 def library_errors(path: Path) -> Iterator[None]:
-    """Make the system's errors of those of a library, which puts their words, but not their numbers, into what it says.
+    """Convert a library's errors to system errors; such libraries include only the text of the system error.
 
     Raises:
         OSError: For any ``RuntimeError``.
@@ -272,11 +279,11 @@ def library_errors(path: Path) -> Iterator[None]:
 
 @contextmanager
 def storage_errors(folder: Path) -> Iterator[None]:
-    """Tell what prevents writing into a folder in one sentence.
+    """Convert system errors during file access in a folder to errors of one sentence.
 
     Raises:
-        MissingResourceError: If there is no room.
-        InputError: If something else is wrong with a file.
+        MissingResourceError: If the disk is full.
+        InputError: For any other ``OSError``.
     """
     try:
         yield
@@ -290,14 +297,14 @@ def storage_errors(folder: Path) -> Iterator[None]:
 
 
 def copied(source: Path, target: Path) -> Path:
-    """``target``, made a copy of ``source`` unless it is that already."""
+    """Copy ``source`` to ``target`` unless both are the same file; return ``target``."""
     if not (target.exists() and target.samefile(source)):
         write_file(target, lambda temporary: shutil.copyfile(source, temporary))
     return target
 
 
 def link_file(source: Path, target: Path) -> None:
-    """Give a file a second name, or copy it where the file system has no hard links."""
+    """Create a hard link, or copy the file if the file system has no hard links."""
     try:
         os.link(os.path.realpath(source), target)
     except OSError:

@@ -1,7 +1,8 @@
-"""Versions of the files that a later mitsplat reads back.
+"""Versions of the file formats that later versions of mitsplat read.
 
-Such a file states its version as ``format_version``; one that states none is of version 1. A version goes up when an
-earlier mitsplat would misread the file. What reads what is told in ``docs/compatibility.md``.
+Such a file stores its version as ``format_version``; the default is 1. A version increases when an earlier mitsplat
+would
+misread the file. ``docs/compatibility.md`` states which versions are readable.
 """
 
 from __future__ import annotations
@@ -14,22 +15,22 @@ from mitsplat.errors import InputError
 from mitsplat.version import __version__
 
 FORMAT_VERSION = "format_version"
-"""The key that states it."""
+"""Key of the version."""
 
 FORMAT_VERSIONS = {"asset.yaml": 1, "capture.json": 1, "dataset.json": 1, "fit.json": 1}
-"""Newest version by file, which is the one that is written. That of ``dataset.json`` is of the whole dataset."""
+"""Newest version by file, which is the version written. That of ``dataset.json`` covers the whole dataset."""
 
 
 def check_format_version(stored: object, newest: int, place: str | Path) -> None:
-    """Refuse what only a later mitsplat understands.
+    """Refuse files of a newer format version.
 
     Args:
-        stored: What the file holds; anything but a mapping is left to what reads it.
-        newest: The newest version that is read.
-        place: The file, and its line if known, with which the error begins.
+        stored: Content of the file. A value that is not a mapping is not checked here, but by its reader.
+        newest: Newest readable version.
+        place: File, and its line if known, for the beginning of the error.
 
     Raises:
-        InputError: If the file states a newer version, or none that could be one.
+        InputError: If the version is newer, or is not a positive whole number.
     """
     if not isinstance(stored, Mapping):
         return

@@ -1,7 +1,7 @@
-"""JSON that need not fit into memory: objects of long lists, written and read element by element.
+"""Streaming JSON for objects of long lists, written and read element by element.
 
-What is written is byte for byte what ``json.dumps`` makes of the whole. Reading takes the standard library's decoder to
-one element after the other, which are small here; only one is held at a time.
+The output equals that of ``json.dumps`` byte for byte. The reader applies the standard library's decoder to one element
+at a time, so that only one element is in memory.
 """
 
 from __future__ import annotations
@@ -16,21 +16,21 @@ from mitsplat.storage.files import GrowingFile, open_regular
 
 _BLOCK = 1 << 16
 _LOOK_AHEAD = 3
-"""Characters behind a number by which it is known to have ended: it may go on by ``.5`` or ``e-5``."""
+"""Characters after a number that show that it has ended; it could continue with ``.5`` or ``e-5``."""
 MOST_ELEMENT = 1 << 26
-"""Largest element that is read [characters]; no frame needs as much."""
+"""Maximum size of an element [characters]; frames need less."""
 
 
 class ListsFile:
     """An object of growing lists, such as COCO's ``{"images": [...], "annotations": [...], "categories": [...]}``.
 
-    Every list but the first grows in a file of its own, which is added at the end.
+    Every list except the first grows in a separate file, which is appended at the end.
 
     Args:
-        path: The file, which gets its name when it is kept.
+        path: The file, which gets its final name in :meth:`keep`.
         lists: Names of the lists, in their order.
         before: Entries before the lists.
-        after: Entries after them.
+        after: Entries after the lists.
     """
 
     def __init__(
@@ -50,17 +50,17 @@ class ListsFile:
         self._parts[self._first].write(f"{{{head}{json.dumps(self._first)}: [")
 
     def append(self, name: str, element: Any) -> None:
-        """Add an element to a list."""
+        """Append an element to a list."""
         text = json.dumps(element)
         self._parts[name].write(f", {text}" if self._counts[name] else text)
         self._counts[name] += 1
 
     def count(self, name: str) -> int:
-        """Elements of a list so far."""
+        """Return the current number of elements of a list."""
         return self._counts[name]
 
     def keep(self) -> None:
-        """End the lists, and give the file its name."""
+        """End the lists, and give the file its final name."""
         whole = self._parts[self._first]
         for name in self._others:
             whole.write(f"], {json.dumps(name)}: [")
@@ -70,49 +70,49 @@ class ListsFile:
         whole.keep()
 
     def discard(self) -> None:
-        """Remove what was written, unless it was kept."""
+        """Remove the temporary files, unless the file was kept."""
         for part in self._parts.values():
             part.discard()
 
 
 class EntriesFile:
-    """A growing JSON object, such as BOP's ``{"0": ..., "1": ...}``; see :class:`GrowingFile` for its end."""
+    """A growing JSON object, such as BOP's ``{"0": ..., "1": ...}``; it ends as a :class:`GrowingFile`."""
 
     def __init__(self, path: Path) -> None:
         self._file = GrowingFile(path)
         self._separator = "{"
 
     def append(self, key: str, value: Any) -> None:
-        """Add an entry."""
+        """Append an entry."""
         self._file.write(f"{self._separator}{json.dumps(key)}: {json.dumps(value)}")
         self._separator = ", "
 
     def end(self) -> GrowingFile:
-        """End the object; its file, closed, still has to be named."""
+        """End the object and return its closed file, which still needs its final name."""
         self._file.write("{}" if self._separator == "{" else "}")
         self._file.close()
         return self._file
 
     def discard(self) -> None:
-        """Remove what was written."""
+        """Remove the temporary file."""
         self._file.discard()
 
 
 def read_lists(path: Path) -> Iterator[tuple[str, Any]]:
-    """Elements of an object's lists, and its other values, each with its key, one after the other.
+    """Yield the elements of an object's lists, and its other values, each with its key.
 
     Raises:
-        ValueError: If it is not JSON or not an object.
+        ValueError: If the file is not JSON or not an object.
         OSError: If it cannot be read.
     """
     yield from _read_object(path, lists=True)
 
 
 def read_entries(path: Path) -> Iterator[tuple[str, Any]]:
-    """Entries of an object, one after the other.
+    """Yield the entries of an object.
 
     Raises:
-        ValueError: If it is not JSON or not an object.
+        ValueError: If the file is not JSON or not an object.
         OSError: If it cannot be read.
     """
     yield from _read_object(path, lists=False)
@@ -157,7 +157,7 @@ def _elements(window: _Window) -> Iterator[Any]:
 
 
 class _Window:
-    """The part of a file that is being decoded."""
+    """Part of a file that is being decoded."""
 
     def __init__(self, file: IO[str]) -> None:
         self._file = file
@@ -165,7 +165,7 @@ class _Window:
         self._decode = json.JSONDecoder(parse_constant=_refuse_constant).raw_decode
 
     def peek(self) -> str:
-        """The next character that is no space, "" at the end."""
+        """Return the next character that is not white space, or "" at the end."""
         while True:
             self._at = _skip_space(self._text, self._at)
             if self._at < len(self._text) or not self._read():
@@ -177,7 +177,7 @@ class _Window:
         self._at += 1
 
     def value(self) -> Any:
-        """The value that begins here."""
+        """Decode the value at the current position."""
         self.peek()
         while True:
             try:
@@ -188,14 +188,14 @@ class _Window:
             except RecursionError as error:
                 raise ValueError("it is nested too deeply") from error
             else:
-                # A number may go on where what was read ends; whatever else ends in a character of its own.
+                # A number may continue beyond the text read so far; all other values end with a character of their own.
                 sure = not isinstance(value, int | float) or end + _LOOK_AHEAD <= len(self._text)
                 if sure or not self._read():
                     self._at = end
                     return value
 
     def _read(self, least: int = 0) -> bool:
-        """Let go of what was decoded and read on, twice as much where an element is large."""
+        """Drop the decoded text and read the next block, at least ``least`` characters."""
         block = self._file.read(max(_BLOCK, least))
         if block:
             self._text, self._at = self._text[self._at :] + block, 0

@@ -1,4 +1,4 @@
-"""YAML files to pydantic models, with errors of one sentence: file, line, key path, rule and value received."""
+"""YAML files as pydantic models, with errors of one sentence: file, line, key path, rule and received value."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ Validated = TypeVar("Validated", bound=BaseModel)
 KeyPath = tuple[str | int, ...]
 
 MAX_DEPTH = 32
-"""What nests deeper is hostile, or an alias that contains itself."""
+"""Maximum nesting depth. Deeper files are malicious, or contain an alias to itself."""
 MAX_BYTES = 8 << 20
 MAX_VALUES = 200_000
+"""Maximum number of values. Files with more are malicious: nested aliases multiply values."""
 MAX_NUMBER = 1e30
-"""Largest number: the fourth power of a larger one may overflow."""
-"""What has more values than this is hostile: aliases of aliases multiply."""
+"""Maximum magnitude of a number; the fourth power of a larger one may overflow."""
 
 RULES = {
     "missing": "is required",
@@ -55,13 +55,13 @@ RULES = {
     "float_type": "must be a number",
     "bool_type": "must be true or false",
 }
-"""Our wording of pydantic's error types; any other type keeps pydantic's message."""
+"""Messages by pydantic error type; other types keep pydantic's message."""
 
 
 class FieldError(ValueError):
-    """A rule between several fields of one model is broken; ``key`` is the field to point the user at.
+    """Violation of a rule between several fields of one model; ``key`` is the field to report.
 
-    Raise it in a model validator, where pydantic alone would only know the model.
+    Raise it in a model validator, where pydantic reports only the model.
     """
 
     def __init__(self, key: str | KeyPath, rule: str) -> None:
@@ -70,17 +70,17 @@ class FieldError(ValueError):
 
 
 class _Scanner(RoundTripScanner):
-    """Ends at what nests too deep, on which it otherwise spends time with the square of the depth."""
+    """Scanner with a limit on nesting; its time otherwise grows with the square of the depth."""
 
     def fetch_flow_collection_start(self, *args: Any, **kwargs: Any) -> None:
-        """Begin a list or mapping in brackets."""
+        """Start a list or mapping in brackets."""
         if len(self.flow_context) > MAX_DEPTH:
             raise RecursionError
         super().fetch_flow_collection_start(*args, **kwargs)
 
 
 class _Finding(NamedTuple):
-    """One broken rule, ready to be told."""
+    """One broken rule for an error message."""
 
     path: KeyPath
     rule: str
@@ -91,16 +91,16 @@ class _Finding(NamedTuple):
 def load_yaml(
     path: str | Path, model: type[Validated], *, overrides: Mapping[str, Any] | None = None, newest: int | None = None
 ) -> Validated:
-    """Read a YAML 1.2 file into ``model``; types are checked strictly (no text for numbers) and no code is run.
+    """Read a YAML 1.2 file into ``model``. Types are checked strictly (no text for numbers), and no code is executed.
 
     Args:
         path: The file.
-        model: The pydantic model that states its rules.
-        overrides: Values that replace the file's, by dotted key, such as ``{"output.width": 640}``.
-        newest: Newest version of the file's format that is read; None for files without versions.
+        model: Pydantic model with the rules.
+        overrides: Values that replace those of the file, by dotted key, such as ``{"output.width": 640}``.
+        newest: Newest readable version of the file's format; None for files without versions.
 
     Raises:
-        InputError: If the file cannot be read, is not YAML, repeats a key, is of a newer version or breaks a rule of
+        InputError: If the file cannot be read, is not YAML, repeats a key, has a newer version or breaks a rule of
             ``model``.
     """
     path = Path(path)
@@ -121,7 +121,7 @@ def load_yaml(
 
 
 def sentence_of_model(error: ValidationError, model: type[BaseModel], values: Mapping[str, Any]) -> str:
-    """The sentence that tells of ``values`` that break a rule of a model, which Python code and no file gave."""
+    """Return the error sentence for ``values`` from Python code (not from a file) that break a rule of a model."""
     data = _as_written(values)
     findings = [_finding(details, model, data, None, {}) for details in error.errors()]
     first = min(findings, key=lambda finding: _follows(finding, findings))
@@ -129,13 +129,15 @@ def sentence_of_model(error: ValidationError, model: type[BaseModel], values: Ma
 
 
 def key_place(path: str | Path, keys: KeyPath) -> str:
-    """Where a file says ``keys``, as errors begin: ``scene.yaml:41: objects[2].asset``; no line if there is no file."""
+    """Return the place of ``keys`` as errors begin: ``scene.yaml:41: objects[2].asset``; without line if no file
+    exists.
+    """
     path = Path(path)
     return _place(path, _line(_parse(path), keys) if path.exists() else None, keys)
 
 
 def _as_written(value: Any) -> Any:
-    """What a file would have said: mappings and lists, down to what is neither."""
+    """Convert a value to mappings, lists and scalars as in a file."""
     if isinstance(value, BaseModel):
         return _as_written(dict(value))
     if isinstance(value, Mapping):
@@ -146,7 +148,7 @@ def _as_written(value: Any) -> Any:
 
 
 def _parse(path: Path) -> CommentedMap:
-    """The file's mapping, still with line numbers."""
+    """Parse the file to a mapping with line numbers."""
     try:
         if path.exists() and not path.is_file():
             raise InputError(f"{path}: must be a file")
@@ -180,7 +182,7 @@ def _parse(path: Path) -> CommentedMap:
 
 
 def _plain(node: Any, keys: KeyPath, tree: CommentedMap, path: Path, values: Iterator[int]) -> Any:
-    """The node as built-in dicts, lists and scalars; refuses what JSON cannot hold."""
+    """Convert a node to built-in dicts, lists and scalars; refuse values without a JSON equivalent."""
     if len(keys) > MAX_DEPTH:
         raise InputError(f"{path}: must not nest deeper than {MAX_DEPTH} levels")
     if next(values) > MAX_VALUES:
@@ -208,7 +210,7 @@ def _plain(node: Any, keys: KeyPath, tree: CommentedMap, path: Path, values: Ite
 
 
 def _set(data: dict[str, Any], keys: tuple[str, ...], value: Any) -> None:
-    """Replace one value of nested mappings, making those that are absent."""
+    """Replace one value of nested mappings, and create missing mappings."""
     for key in keys[:-1]:
         inner = data.get(key)
         if not isinstance(inner, dict):
@@ -224,7 +226,7 @@ def _finding(
     tree: CommentedMap | None,
     overridden: Mapping[tuple[str, ...], Any],
 ) -> _Finding:
-    """Pydantic's account of one error in terms of the file, if there is one."""
+    """Convert one error of pydantic to a finding in terms of the file, if there is one."""
     kind, context, location = details["type"], details.get("ctx", {}), details["loc"]
     keys = _file_path(location, data, keep_last=kind == "missing")
     value: Any = details["input"]
@@ -254,14 +256,14 @@ def _finding(
 
 
 def _follows(finding: _Finding, findings: Sequence[_Finding]) -> bool:
-    """Whether it may be the mere consequence of another: a misspelt key, or an item too few for a bad one in a list."""
+    """Return True if the finding may result from another one, such as a misspelt key or an invalid list item."""
     return finding.missing or any(
         len(finding.path) < len(other.path) and other.path[: len(finding.path)] == finding.path for other in findings
     )
 
 
 def _file_path(location: KeyPath, data: Any, *, keep_last: bool) -> KeyPath:
-    """Pydantic's location less the names of union members, which the user never wrote."""
+    """Remove the names of union members from pydantic's location, because they are not in the file."""
     keys: list[str | int] = []
     for position, part in enumerate(location):
         last = position == len(location) - 1
@@ -278,7 +280,7 @@ def _file_path(location: KeyPath, data: Any, *, keep_last: bool) -> KeyPath:
 
 
 def _line(tree: Any, keys: KeyPath) -> int:
-    """Line (from 1) of the deepest part of ``keys`` that the file has."""
+    """Return the line (from 1) of the deepest part of ``keys`` that the file contains."""
     line = int(tree.lc.line)
     for key in keys:
         try:
@@ -293,7 +295,7 @@ def _line(tree: Any, keys: KeyPath) -> int:
 
 
 def _schema_at(model: type[BaseModel], location: KeyPath) -> dict[str, Any]:
-    """The part of the model's JSON Schema that pydantic's ``location`` points at, or {}."""
+    """Return the part of the model's JSON Schema at pydantic's ``location``, or {}."""
     root = model.model_json_schema()
 
     def resolved(schema: dict[str, Any]) -> dict[str, Any]:
@@ -333,6 +335,6 @@ def _sentence(path: Path, line: int | None, keys: KeyPath, rule: str) -> str:
 
 
 def _shown(value: Any) -> str:
-    """The value as the file would write it, shortened."""
+    """Return the value in the notation of the file, shortened."""
     text = "nothing" if value is None else json.dumps(value, default=str, ensure_ascii=False)
     return text if len(text) <= 60 else f"{text[:57]}..."

@@ -121,8 +121,8 @@ class Asset:
         roughness: GGX roughness of the highlight in (0, 1].
         specular: Specular reflectance at normal incidence in [0, 1]; 0 disables the highlight.
         capture_light: Light under which the colours were captured. ``uniform`` (light tent, turntable in the shade):
-            the
-            scene's lights relight the asset. ``scene`` (already lit as displayed): the scene's lights only add shadows.
+            the scene's lights relight the asset. ``scene`` (already lit as displayed): the scene's lights only add
+            shadows.
         keypoints: Named points in the asset's frame [m], for pose labels.
         white: Irradiance [W/m^2] of the scene's lights at which a white surface has the colour 1 in an environment's
             splats: pi for baked environments, None if the exposure is unknown, as in photographs.

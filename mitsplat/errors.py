@@ -39,8 +39,7 @@ def is_out_of_memory(error: BaseException) -> bool:
     """Return True if an error means that host or GPU memory is exhausted.
 
     Dr.Jit, PyTorch and OpenCV report exhausted memory only in the message text. A `TypeError` with such a text occurs
-    when
-    an array is built from values that do not fit into memory.
+    when an array is built from values that do not fit into memory.
     """
     if isinstance(error, MissingResourceError | PartialResultError):
         return False

@@ -2,9 +2,8 @@
 
 Without MPS, processes share the GPU by time slices. An H200 is then busy for less than half of the time, for any number
 of processes (``python -m benchmarks.scale.gpu``, and the same with ``--turns``). MPS is part of NVIDIA's driver for
-Linux
-and needs no administrator rights. It is a daemon, which is started here for the duration of its use, unless one is
-already running.
+Linux and needs no administrator rights. It is a daemon, which is started here for the duration of its use, unless one
+is already running.
 """
 
 from __future__ import annotations
@@ -55,8 +54,7 @@ class SharedGpu:
 
     Attributes:
         environment: Environment variables of processes that use the service; empty if it is unavailable, or if
-            processes
-            find it by default.
+            processes find it by default.
         lack: Reason why the service is unavailable, as the rest of "because ..."; empty if it is available.
     """
 

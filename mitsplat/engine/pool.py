@@ -190,15 +190,14 @@ def run_frames(
             function must therefore guard its main part by ``if __name__ == "__main__"``.
         layouts: Frame indices by layout.
         workers: Number of processes; 1 makes the frames in this process if it can compute on the device. None selects
-            the
-            number automatically: on CPUs, as long as another worker speeds up the run; on GPUs, immediately the number
+            the number automatically: on CPUs, as long as another worker speeds up the run; on GPUs, immediately the
+            number
                 that
             cores and memory allow.
         note: Callback that receives a short description of the current operation.
         memory: Memory of a worker, which limits an automatic number of workers.
         device: Device for the frames; each worker selects it first, and several GPUs are assigned in turn. None for
-            work
-            without a device.
+            work without a device.
 
     Raises:
         InputError: If the input of a frame is invalid.
@@ -264,11 +263,9 @@ def run_pool(
     """Distribute all frames over the pool's workers and yield the results in order of completion.
 
     A worker gets its next frame when it has finished one, so that results do not accumulate while the caller is busy. A
-    lost
-    worker is replaced only if it was the last one, because exhausted memory is the most likely cause, or on newly
-    joined
-    machines. A worker that reports exhausted memory is replaced only if another worker has gone since it began the
-    frame.
+    lost worker is replaced only if it was the last one, because exhausted memory is the most likely cause, or on newly
+    joined machines. A worker that reports exhausted memory is replaced only if another worker has gone since it began
+    the frame.
 
     Args:
         pool: Pool that starts the workers and receives their answers.
@@ -365,10 +362,8 @@ class _Plan:
     """Frames that are not yet assigned to a worker, by layout.
 
     A worker stays with its layout while that has frames. Then it takes the first unassigned layout. If there is none,
-    it
-    helps with the layout that has most frames left. Each operation costs O(log layouts): heap entries may be outdated,
-    and
-    are checked when they reach the top.
+    it helps with the layout that has most frames left. Each operation costs O(log layouts): heap entries may be
+    outdated, and are checked when they reach the top.
 
     Args:
         layouts: Frames of each layout, in order.
@@ -479,9 +474,8 @@ class _Processes(Generic[Result]):
     """Worker processes on this machine.
 
     Nothing here waits for a worker that does not start. :mod:`multiprocessing` writes a process's start data into a
-    pipe. It
-    would wait forever for a process that dies before reading more than the pipe's capacity (64 KiB). The start data are
-    therefore small, and the job itself is in a file, see :class:`SharedArrays`.
+    pipe. It would wait forever for a process that dies before reading more than the pipe's capacity (64 KiB). The start
+    data are therefore small, and the job itself is in a file, see :class:`SharedArrays`.
     """
 
     def __init__(

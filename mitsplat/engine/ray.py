@@ -59,8 +59,7 @@ class Cluster:
         address: Address for ``ray.init``: None starts Ray on this machine, "auto" finds a running one.
         resources: Amounts that each worker reserves, by Ray's names: CPU, GPU, memory [bytes] or a resource that some
             nodes declare. A worker with a GPU, or a fraction of one, renders on it. Other workers render on their CPUs.
-            The
-            default is two CPUs, or :data:`GPU_SHARE` for GPUs.
+            The default is two CPUs, or :data:`GPU_SHARE` for GPUs.
     """
 
     address: str | None = None

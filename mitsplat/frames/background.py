@@ -24,8 +24,7 @@ def cut_out(image: ByteImage, backing: BackgroundDraw, width: int, height: int) 
     """Cut a rotated rectangle out of an image and resample it to linear colours (H, W, 3).
 
     The rectangle has the picture's aspect ratio and lies entirely inside the image. If it has more pixels than the
-    picture,
-    the result averages them.
+    picture, the result averages them.
     """
     turn = np.radians(backing.rotate)
     cosine, sine = np.cos(turn), np.sin(turn)

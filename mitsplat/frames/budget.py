@@ -2,8 +2,7 @@
 
 ``python -m benchmarks.scale.workers budget`` measured the coefficients and compares the estimate with measured peaks.
 The coefficients hold for the variant ``llvm_ad_rgb``, where the device's memory is the process's own. They have not
-been
-measured on a GPU. A GPU worker is therefore assumed to need this amount of GPU memory and the same amount of the
+been measured on a GPU. A GPU worker is therefore assumed to need this amount of GPU memory and the same amount of the
 machine's memory.
 """
 
@@ -54,10 +53,8 @@ def worker_memory(scene: Scene) -> WorkerMemory:
     """Estimate the maximum memory of workers for frames of a scene.
 
     The estimate is a sum of terms in: Gaussians of assets, Gaussians of all instances, covered tiles, rays, objects,
-    and
-    objects times pixels. Covered tiles are counted from some of the scene's cameras, with dropped objects in the middle
-    of
-    the region.
+    and objects times pixels. Covered tiles are counted from some of the scene's cameras, with dropped objects in the
+    middle of the region.
     """
     spec = scene.spec
     most = [entry.most for entry in spec.objects]

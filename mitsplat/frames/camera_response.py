@@ -331,8 +331,7 @@ def sensed(linear: Any, pixel: Any, iso: float, sensor: Sensor, seed: int) -> An
 
     Display white fills the wells at ISO 100. The Poisson noise of N is approximated as normal. The random numbers are a
     function of the pixel index (Philox 4x32, Salmon et al. 2011, "Parallel random numbers: as easy as 1, 2, 3"), so
-    that
-    they do not depend on the order of evaluation.
+    that they do not depend on the order of evaluation.
     """
     electrons = sensor.full_well * 100.0 / iso
     numbers = mi.Philox4x32(dr.opaque(mi.UInt64, seed), pixel).next_float32x4_normal()
@@ -358,9 +357,8 @@ def colour_matrix(
     """Compute a 3x3 matrix on linear sRGB for white balance, chroma, hue and saturation, in this order.
 
     White balance is a Bradford adaptation from daylight of the given temperature to sRGB's white. Chroma is a factor
-    and
-    an angle of :func:`mitsplat.images.colour.chroma_matrix`. Hue rotates colours about the grey axis. Saturation scales
-    their distance from the grey of the same luminance.
+    and an angle of :func:`mitsplat.images.colour.chroma_matrix`. Hue rotates colours about the grey axis. Saturation
+    scales their distance from the grey of the same luminance.
     """
     matrix = np.eye(3)
     if white_balance != 6504.0:

@@ -75,12 +75,9 @@ def hidden_from_second(disparity: Float64Array) -> BoolArray:
     """Return a mask (H, W) of the pixels that an identical second camera in +x does not see.
 
     A pixel with disparity d appears d pixels further left in the second image. There it covers the two pixels around
-    its
-    position. It hides every pixel of that place whose disparity is smaller by more than one pixel. Such pixels belong
-    to
-    other surfaces, or to a surface at a grazing angle, with disparities that grow by more than 0.4 px per pixel; no
-    window
-    matches the latter. Pixels beyond the left border are not visible either.
+    its position. It hides every pixel of that place whose disparity is smaller by more than one pixel. Such pixels
+    belong to other surfaces, or to a surface at a grazing angle, with disparities that grow by more than 0.4 px per
+    pixel; no window matches the latter. Pixels beyond the left border are not visible either.
     """
     height, width = disparity.shape
     rows, columns = np.mgrid[:height, :width]
@@ -105,12 +102,10 @@ def time_of_flight_depth(
     """Simulate the depth (H, W) of a time-of-flight camera from the phase of the returned modulated light.
 
     A surface at distance r returns the signal s = reflectance cos / r^2 (s = 1 for a white surface at 1 m that faces
-    the
-    sensor) with the phase 2 pi r / u. The unambiguous range is u = c / (2 modulation). A pixel sums all light that it
-    receives. At an edge, it therefore measures a distance between both surfaces (a flying pixel). The standard
-    deviation of
-    distances is noise sqrt(s + ambient) / s: shot noise of signal and ambient light (Lange and Seitz 2001, "Solid-state
-    time-of-flight range camera", for a constant modulation and exposure).
+    the sensor) with the phase 2 pi r / u. The unambiguous range is u = c / (2 modulation). A pixel sums all light that
+    it receives. At an edge, it therefore measures a distance between both surfaces (a flying pixel). The standard
+    deviation of distances is noise sqrt(s + ambient) / s: shot noise of signal and ambient light (Lange and Seitz 2001,
+    "Solid-state time-of-flight range camera", for a constant modulation and exposure).
 
     Args:
         depth: True depth along the optical axis [m], 0 for no surface.

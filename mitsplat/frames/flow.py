@@ -28,8 +28,7 @@ def optical_flow(
     """Compute the motion of every pixel to the next image [px], (H, W, 2).
 
     The flow is :data:`UNKNOWN_FLOW` where the pixel shows nothing, or where its point lies behind the next camera or
-    belongs
-    to an object that is removed. Points that become occluded in the next image have ordinary flow.
+    belongs to an object that is removed. Points that become occluded in the next image have ordinary flow.
 
     Args:
         depth: Depth along the optical axis [m], 0 for no surface, (H, W).
@@ -70,16 +69,14 @@ def swept_by(
     """Compute the motion of every pixel to the right and down [px] during the exposure, each (H, W).
 
     The motion field is evaluated in the middle of the exposure (Longuet-Higgins and Prazdny 1980, "The interpretation
-    of a
-    moving retinal image"). Pixels without depth are treated as infinitely distant.
+    of a moving retinal image"). Pixels without depth are treated as infinitely distant.
 
     Args:
         depth: Depth along the optical axis [m], 0 for no surface, (H, W).
         camera: Camera in the middle of the exposure.
         motion: Camera motion as in :class:`mitsplat.scene.planning.viewpoints.Viewpoint`.
         moving: Conveyor belt, and a mask of the pixels that show carried objects (H, W). Pixels of the belt's surface
-            are
-            found from their depth.
+            are found from their depth.
     """
     height, width = depth.shape
     columns, rows = np.arange(width) + 0.5, np.arange(height) + 0.5

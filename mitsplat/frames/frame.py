@@ -181,8 +181,7 @@ def render_frame(
         quality: Preset of the splat renderer, refined by the scene file's ``rendering``, or a complete `Quality`. By
             default, the preset of the scene file.
         layout: Settled layout of the frame, or a custom one (:meth:`mitsplat.Layout.of_poses`). By default, the layout
-            is
-            settled here.
+            is settled here.
         camera: Camera in place of the scene's.
         lights: Lights in place of the scene's, as in a scene file: models, or mappings of keys to values.
         next_layout: Layout of the next image, for the flow. By default, the objects do not move.
@@ -308,8 +307,7 @@ class Renderer:
 
         Raises:
             InputError: As in :func:`render_frame`; also if the renderer is closed, or if the Mitsuba variant has
-                changed since
-                its creation.
+                changed since its creation.
         """
         if self.integrator is None:
             raise InputError("the renderer is closed: render before its `with` ends")
@@ -443,8 +441,8 @@ class Renderer:
         """Return Mitsuba's scene dictionary of a layout under given lights.
 
         Shape objects are reused as long as the layout is the same. The pattern of a ``belt`` is shifted by the belt's
-        travel.
-        With ``replaced``, the lights are not the scene's own. Such lights can move without recompilation of kernels.
+        travel. With ``replaced``, the lights are not the scene's own. Such lights can move without recompilation of
+        kernels.
         """
         if self._placed is None or self._placed[0] is not layout:
             objects, appearances = {}, draw_appearances(self.scene, layout)
@@ -476,8 +474,7 @@ class Renderer:
         """Return an emitter, with the last environment map reused if its file is the same.
 
         Loading a large map can take longer than a frame. Lights with random draws are built so that their motion does
-        not
-        recompile kernels.
+        not recompile kernels.
         """
         if emitter["type"] != "envmap":
             moves = replaced or any(light.draw for light in written_out(self.scene.spec))

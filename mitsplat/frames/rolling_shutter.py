@@ -1,10 +1,8 @@
 """Images with row-wise exposure (rolling shutter) while the camera moves and a belt runs.
 
 An image is rendered in bands of rows. Each band shows the moment at which its middle row is exposed. The number of
-bands
-limits the displacement within a band to a quarter of a pixel from each row's own moment. An image in which nothing
-moves
-by half a pixel is rendered in one piece.
+bands limits the displacement within a band to a quarter of a pixel from each row's own moment. An image in which
+nothing moves by half a pixel is rendered in one piece.
 """
 
 from __future__ import annotations

@@ -48,16 +48,13 @@ def render_frames(
             ...
 
     Each frame equals that of :func:`mitsplat.render_frame`, independent of the other frames. A layout is settled when
-    its
-    first frame is requested. With given ``layouts`` or ``cameras``, the frames form a film: the flow of each frame
-    leads to
-    the next one. Objects are matched by their id. The last frame has no flow.
+    its first frame is requested. With given ``layouts`` or ``cameras``, the frames form a film: the flow of each frame
+    leads to the next one. Objects are matched by their id. The last frame has no flow.
 
     Args:
         scene: The scene.
         frames: Number of frames, or their indices. By default, the frames of the scene; with given layouts or cameras,
-            the
-            shorter of these. Indices may be endless, such as ``itertools.count()``.
+            the shorter of these. Indices may be endless, such as ``itertools.count()``.
         layouts: One layout per frame, or one for all frames; by default, the scene's settled layouts.
         cameras: One camera per frame, or one for all frames; by default, those of the scene.
         lights: As in :func:`mitsplat.render_frame`, for all frames.

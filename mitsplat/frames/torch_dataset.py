@@ -34,10 +34,8 @@ class FrameStream(IterableDataset[Sample]):
     """Endless frames of a scene in the format of torchvision's detection models.
 
     With N worker processes of a ``DataLoader``, worker k renders the layouts k, k + N, k + 2 N and so on, so that no
-    layout
-    is rendered twice. The scene's seed determines all frames: ``ms.load_scene(path, overrides={"seed": 1})`` gives
-    others.
-    Workers must be spawned, because a renderer does not survive a fork.
+    layout is rendered twice. The scene's seed determines all frames: ``ms.load_scene(path, overrides={"seed": 1})``
+    gives others. Workers must be spawned, because a renderer does not survive a fork.
 
     Each sample is an image, (3, H, W) float32 from 0 to 1, and a target:
 

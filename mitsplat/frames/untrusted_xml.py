@@ -61,8 +61,7 @@ def check_xml(path: Path, *, allow_outside: bool = False) -> CheckedXml:
     """Rewrite a scene; refuse one that names files outside of its folder or is built to exhaust a parser.
 
     Document types are refused, and therefore all entities; scenes do not need them. Every attribute value is checked,
-    not
-    only the values that plugins use as file names.
+    not only the values that plugins use as file names.
 
     Names are looked up in the folders of ``<path>`` elements (the last one first), in the scene's folder and in the
     current folder. For an included file or a spectrum, only the preceding ``<path>`` elements count; the folder of the

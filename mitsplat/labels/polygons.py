@@ -20,21 +20,17 @@ def outline(mask: BoolArray) -> Float64Array:
     """Convert a mask of at least one pixel to one closed polygon [px], shape (M, 2).
 
     The polygon is designed for Ultralytics' reader of YOLO segments. The reader expects one polygon per instance. It
-    scales
-    positions to the training size, resamples them along the edges, truncates them to pixels, and fills them with
+    scales positions to the training size, resamples them along the edges, truncates them to pixels, and fills them with
     ``cv2.fillPoly`` (even-odd, edges painted). Therefore
 
     * vertices are the *centres* of the mask's border pixels, and edges run in the eight directions of the grid. At the
       image's own size, vertices and edges truncate to pixels of the mask, so that the mask is restored exactly (except
-      for a
-      pixel where a resampled point meets the middle of a diagonal step). When scaled down, no side gains more than half
-      a
-      pixel. Vertices on the border pixels' outer edges would gain as much or more at every scale;
+      for a pixel where a resampled point meets the middle of a diagonal step). When scaled down, no side gains more
+      than half a pixel. Vertices on the border pixels' outer edges would gain as much or more at every scale;
     * holes and separate parts are connected by bridges that are traversed in both directions. A bridge to a hole runs
       inside the mask. A bridge between parts paints the pixels of the gap, so the bridges are a minimum spanning tree;
     * at its four extremes, the polygon extends to the pixels' outer edges by spikes without area, so that the bounding
-      box
-      of the polygon is the box of the mask.
+      box of the polygon is the box of the mask.
     """
     height, width = mask.shape
     rings = [

@@ -24,10 +24,8 @@ class ContactFinder:
     """Factory of collision pipelines that share the kernels of one narrow phase.
 
     Each narrow phase generates its own kernels, which costs as much time as a second of simulation. The kernels depend
-    on
-    the shapes of the model for which they are generated. This class generates them for all given pieces, so that
-    contacts do
-    not depend on earlier models.
+    on the shapes of the model for which they are generated. This class generates them for all given pieces, so that
+    contacts do not depend on earlier models.
 
     Args:
         pieces: Convex pieces of all objects that may be simulated.

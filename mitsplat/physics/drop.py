@@ -139,10 +139,8 @@ class Drop:
         """Draw poses until a layout passes all checks.
 
         After ``settle.attempts`` rejected draws, the objects that caused every rejection are left out. If there are
-        none, the
-        object that caused most rejections is left out. The remaining objects are drawn again. If objects find no room
-        beside one
-        another, the last of them are left out.
+        none, the object that caused most rejections is left out. The remaining objects are drawn again. If objects find
+        no room beside one another, the last of them are left out.
 
         Raises:
             InputError: If more than half of the objects find no room, although each of them fits alone.

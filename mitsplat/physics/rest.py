@@ -56,8 +56,7 @@ def run_to_rest(
     """Advance a world until its bodies have been at rest for a second, or until rest is ruled out.
 
     At rest, no surface point moves by 0.5 mm within one second, and by 0.1 mm within its first quarter. After that
-    quarter,
-    rolling friction is disabled, because it would let a box balance on its edge.
+    quarter, rolling friction is disabled, because it would let a box balance on its edge.
 
     Args:
         world: Simulation; changed in place.

@@ -53,8 +53,7 @@ def settle_layout(scene: Scene, index: int, *, progress: Note | None = None, cac
     """Drop the objects of one layout until they rest. The scene's seed and ``index`` determine the result.
 
     The result is cached in ``$XDG_CACHE_HOME/mitsplat/layouts`` (``~/.cache`` by default). The key is a hash of all
-    inputs
-    of the simulation: objects, start regions, colliders and code, but not their appearance.
+    inputs of the simulation: objects, start regions, colliders and code, but not their appearance.
 
     Args:
         scene: Objects, start regions and colliders.
@@ -64,8 +63,7 @@ def settle_layout(scene: Scene, index: int, *, progress: Note | None = None, cac
 
     Raises:
         InputError: If there is no layout of this index, the region is too small for the objects, or none of them comes
-            to
-            rest within the limits.
+            to rest within the limits.
     """
     index = whole(index, "layout")
     if index < 0:
@@ -105,8 +103,7 @@ def settle_layouts(
     If no object of a layout comes to rest, the layout is empty and lists the missing objects.
 
     Several layouts in one simulation (Newton's worlds) cost about as much per layout as single ones on a CPU, and would
-    wait
-    for the slowest (``python -m benchmarks.physics.settle worlds``).
+    wait for the slowest (``python -m benchmarks.physics.settle worlds``).
     """
     layouts = {index: [index] for index in indices}
     return run_frames(_SettleOne(scene, cached), layouts, workers=workers, note=progress or (lambda text: None))

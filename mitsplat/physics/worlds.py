@@ -194,8 +194,7 @@ class WarpWorld(World):
     """Simulation with Newton's contacts and mujoco_warp's solver in one captured graph.
 
     The contacts of mujoco_warp itself flicker in single precision where many coplanar pieces touch. A cup of fifty
-    pieces
-    then creeps at 5 mm/s and never rests. Newton's contacts come to rest.
+    pieces then creeps at 5 mm/s and never rests. Newton's contacts come to rest.
     """
 
     def __init__(
@@ -337,8 +336,7 @@ def _parking(bodies: Sequence[Body]) -> Float64Array:
     """Return initial coordinates in a row high above the scene, far apart, shape (M, 7).
 
     Bodies without shape stay there. Models are built with these coordinates, so that no constant of the solver depends
-    on
-    the poses of a drop.
+    on the poses of a drop.
     """
     spacing = 2 * max(body.size for body in bodies)
     count = len(bodies) + -len(bodies) % _BATCH

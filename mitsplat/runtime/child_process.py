@@ -1,8 +1,7 @@
 """Start of Python child processes: the only module that builds their command lines.
 
 A child never imports Python files from the current folder, which may be a downloaded one. It starts in Python's
-safe-path
-mode (``-P``), and the variable ``PYTHONSAFEPATH`` passes this mode on to its own child processes.
+safe-path mode (``-P``), and the variable ``PYTHONSAFEPATH`` passes this mode on to its own child processes.
 """
 
 from __future__ import annotations
@@ -64,8 +63,7 @@ def starting_safely() -> Iterator[None]:
     """Put processes that :mod:`multiprocessing` and libraries start in this context into safe-path mode.
 
     Such processes inherit this process's environment and import path, so that both are changed within the context. An
-    empty
-    entry of the path means the current folder: that of a prompt, of a notebook or of ``python -c``.
+    empty entry of the path means the current folder: that of a prompt, of a notebook or of ``python -c``.
     """
     kept, path = os.environ.get(SAFE_PATH), list(sys.path)
     os.environ[SAFE_PATH] = "1"

@@ -6,8 +6,7 @@ position in ``CUDA_VISIBLE_DEVICES``. Without this variable, N follows the order
 CUDA itself begins with the fastest GPU.
 
 A process computes on its first visible GPU. This GPU is fixed when Mitsuba is imported, because Dr.Jit then starts
-CUDA.
-Another GPU needs a process that is started with :func:`gpu_environment`.
+CUDA. Another GPU needs a process that is started with :func:`gpu_environment`.
 """
 
 from __future__ import annotations

@@ -32,8 +32,7 @@ def watch_rays() -> None:
     """Record Dr.Jit's log messages about dropped rays from now on, and print its other messages to stderr.
 
     Call this function again where other code may have set the log level, which replaces the callback. The callback
-    takes
-    Python's lock inside Dr.Jit's lock. This is safe as long as only one thread at a time uses Dr.Jit, see
+    takes Python's lock inside Dr.Jit's lock. This is safe as long as only one thread at a time uses Dr.Jit, see
     :func:`mitsplat.runtime.variant.one_at_a_time`.
 
     Raises:

@@ -1,8 +1,7 @@
 """Unused GPU memory from NVIDIA's management library (NVML), which does not start CUDA.
 
 When Dr.Jit is imported, it starts CUDA on every visible GPU. It ends the process if a GPU has no memory for that, even
-if
-the process computes on the CPU. GPUs with full memory are therefore hidden before the import.
+if the process computes on the CPU. GPUs with full memory are therefore hidden before the import.
 """
 
 from __future__ import annotations

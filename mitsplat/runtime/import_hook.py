@@ -1,8 +1,7 @@
 """Import hook that runs a callback after Mitsuba has been imported, without importing it.
 
 Commands that do not render thus start without Mitsuba. Its import takes a tenth of a second, and Dr.Jit then starts
-CUDA
-on every visible GPU.
+CUDA on every visible GPU.
 """
 
 from __future__ import annotations

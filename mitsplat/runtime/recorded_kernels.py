@@ -34,12 +34,9 @@ def recorded(function: Callable[Arguments, Result]) -> Callable[Arguments, Resul
 
     Arguments that are not arrays must be hashable. They select the recording, as do the widths of arrays. Arrays in a
     :class:`Table` are exempt: their width is free, and the function receives the array itself. Dr.Jit can also manage
-    several
-    recordings of one function, but it guesses other widths and confuses some numbers. Requirements for the function: it
-    reads
-    nothing back from the device, compresses nothing, takes evaluated arrays without gradients as positional arguments,
-    and
-    depends on no other variable state. Its results are evaluated.
+    several recordings of one function, but it guesses other widths and confuses some numbers. Requirements for the
+    function: it reads nothing back from the device, compresses nothing, takes evaluated arrays without gradients as
+    positional arguments, and depends on no other variable state. Its results are evaluated.
     """
     recordings: OrderedDict[Any, Callable[[list[Any]], Any]] = OrderedDict()
 

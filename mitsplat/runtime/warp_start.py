@@ -20,8 +20,7 @@ def quiet_warp() -> Iterator[None]:
     """Initialise Warp and limit its log to errors; also usable as a function decorator.
 
     The warning about a missing GPU, which no setting disables, is filtered out. An error about a full disk gets the
-    folder of
-    Warp's kernels as file name, because no other files are written here.
+    folder of Warp's kernels as file name, because no other files are written here.
     """
     import warp as wp  # takes a third of a second, which only physics needs
 

@@ -73,8 +73,7 @@ def prepare_caches() -> None:
     """Warn once about unusable cache folders; redirect Warp to a temporary folder if its own is unusable.
 
     Child processes inherit the temporary folder, which is removed when this process ends. Kernels that can be read from
-    the
-    unusable folder are copied there.
+    the unusable folder are copied there.
     """
     own, kernels = cache_folder(), warp_folder()
     lacks = {folder: lack for folder in (own, kernels) if (lack := why_unusable(folder))}

@@ -128,8 +128,7 @@ def open_in_place(path: Path, mode: str) -> IO[Any]:
 
     Raises:
         OSError: If the file cannot be opened. A link, or a file with a second hard link, is refused, because another
-            file
-            would be changed too.
+            file would be changed too.
     """
     file: IO[Any] = open(path, mode, opener=_open_unlinked)  # noqa: SIM115 - the caller's
     return file

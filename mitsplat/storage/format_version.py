@@ -1,8 +1,7 @@
 """Versions of the file formats that later versions of mitsplat read.
 
 Such a file stores its version as ``format_version``; the default is 1. A version increases when an earlier mitsplat
-would
-misread the file. ``docs/compatibility.md`` states which versions are readable.
+would misread the file. ``docs/compatibility.md`` states which versions are readable.
 """
 
 from __future__ import annotations

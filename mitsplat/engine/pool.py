@@ -191,9 +191,7 @@ def run_frames(
         layouts: Frame indices by layout.
         workers: Number of processes; 1 makes the frames in this process if it can compute on the device. None selects
             the number automatically: on CPUs, as long as another worker speeds up the run; on GPUs, immediately the
-            number
-                that
-            cores and memory allow.
+            number that cores and memory allow.
         note: Callback that receives a short description of the current operation.
         memory: Memory of a worker, which limits an automatic number of workers.
         device: Device for the frames; each worker selects it first, and several GPUs are assigned in turn. None for

@@ -1,4 +1,4 @@
 """Self-contained HTML pages and SVG charts for reports.
 
-In: text, pictures and numbers. Out: one HTML file that needs no network.
+Input: text, pictures and numbers. Output: one HTML file that needs no network.
 """

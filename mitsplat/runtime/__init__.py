@@ -1,4 +1,5 @@
 """Process-wide state of the compute libraries: Mitsuba variant, device, LLVM, GPU memory, child processes.
 
-In: the requested device. Out: a registered Mitsuba variant, and functions that serialise access to Dr.Jit and Warp.
+Input: the requested device. Output: a registered Mitsuba variant, and functions that serialise access to Dr.Jit and
+Warp.
 """

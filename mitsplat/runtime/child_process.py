@@ -124,8 +124,7 @@ def run_bounded(
 
 
 def run_function() -> None:
-    """Run the function named by the command line and end this process; this is the child's part of :func:`run_bounded`.
-    """
+    """Run the function named by the command line, as the child's part of :func:`run_bounded`, and end this process."""
     call, memory, seconds, *arguments = sys.argv[1:]
     signal.alarm(math.ceil(float(seconds) + _SETTLING))  # ends this process if its parent cannot
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))

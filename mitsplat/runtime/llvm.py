@@ -16,8 +16,9 @@ OLDEST_USABLE = 16
 
 
 def use_bundled_llvm() -> None:
-    """Set Dr.Jit's libLLVM to that of this Python environment, before Dr.Jit is imported and unless the user has set
-    one.
+    """Set Dr.Jit's libLLVM to that of this Python environment, unless the user has set one.
+
+    Dr.Jit must not have been imported.
     """
     if not os.environ.get(VARIABLE):
         path = find_bundled_llvm()

@@ -47,8 +47,9 @@ branch that sets a variable.
 
 
 def write_file(path: Path, write: Callable[[Path], object]) -> str:
-    """Write a file atomically: call ``write(temporary path)``, sync, and rename to ``path``. Create its folder if
-    needed.
+    """Write a file atomically: call ``write(temporary path)``, sync, and rename to ``path``.
+
+    The folder of the file is created if needed.
 
     Returns:
         The SHA-256 of the content.

@@ -109,10 +109,10 @@ def load_yaml(
     data = _plain(tree, (), tree, path, count())
     for keys, value in overridden.items():
         _set(data, keys, _as_written(value))
-    if newest is not None:  # first: whatever else is wrong with a newer file may be right for newer code
+    if newest is not None:  # checked first: other errors may be valid in a newer version
         check_format_version(data, newest, _place(path, _line(tree, (FORMAT_VERSION,)), ()))
     try:
-        # Strict JSON mode is what YAML means: lists fill tuples, whole numbers fill floats, nothing else is converted.
+        # Strict JSON mode matches YAML: lists fill tuples, whole numbers fill floats, and nothing else is converted.
         return model.model_validate_json(json.dumps(data), strict=True)
     except ValidationError as error:
         findings = [_finding(details, model, data, tree, overridden) for details in error.errors()]
@@ -129,8 +129,9 @@ def sentence_of_model(error: ValidationError, model: type[BaseModel], values: Ma
 
 
 def key_place(path: str | Path, keys: KeyPath) -> str:
-    """Return the place of ``keys`` as errors begin: ``scene.yaml:41: objects[2].asset``; without line if no file
-    exists.
+    """Return the place of ``keys`` as errors begin: ``scene.yaml:41: objects[2].asset``.
+
+    The line is omitted if the file does not exist.
     """
     path = Path(path)
     return _place(path, _line(_parse(path), keys) if path.exists() else None, keys)
@@ -172,7 +173,7 @@ def _parse(path: Path) -> CommentedMap:
     except MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         raise InputError(_sentence(path, mark.line + 1 if mark else None, (), f"not YAML: {error.problem}")) from None
-    except (YAMLError, ValueError) as error:  # ValueError: a date or number that cannot be
+    except (YAMLError, ValueError) as error:  # ValueError: an impossible date or number
         raise InputError(f"{path}: not YAML: {str(error).splitlines()[0]}") from None
     except RecursionError:
         raise InputError(f"{path}: must not nest deeper than {MAX_DEPTH} levels") from None

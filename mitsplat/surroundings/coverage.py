@@ -1,4 +1,4 @@
-"""A support from above: what stands on it, where it is free, and what photos hardly show of it."""
+"""Top-down map of a support: covered cells, free cells, and cells that few photos show."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from mitsplat.surroundings.depth_views import DepthView, SurfacePoints, depth_vi
 from mitsplat.surroundings.supports import Support
 
 CELLS = 80
-"""Cells along the longer side."""
+"""Number of cells along the longer side."""
 ENOUGH = 3
-"""Photos that must show a place."""
+"""Least number of photos that must show a cell."""
 OFF = 0.012
-"""Height up to which what a photo shows is the support, as a share of the typical depth."""
+"""Largest height above the support that still counts as the support, as a share of the typical depth."""
 TALL = 0.6
-"""Height up to which what is above a support stands on it, as a share of the typical depth."""
+"""Largest height of things that stand on a support, as a share of the typical depth."""
 _SMALLEST_HOLE = 0.005
-"""Area of a hole that is worth a word, as a share of the support's."""
+"""Least area of a hole in the report, as a share of the support's area."""
 _HOLES = 3
 _TURNS, _HEIGHTS = 8, (35.0, 65.0)
 _LOOK = 120
-"""Longest edge of the pictures by which views of a hole are tried [px]."""
+"""Longest edge of the pictures that test views of a hole [px]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,11 +36,11 @@ class Hole:
     """A part of a support that too few photos show.
 
     Attributes:
-        middle: In the support's frame, x and y.
-        area: Of it.
-        near: Name of the photo whose camera is nearest to where it would be seen from, or None if nothing shows it.
-        height: Of that place above the horizon of the hole [degrees].
-        shown: Share of the hole that can be seen from there.
+        middle: Centre in the support's frame, x and y.
+        area: Area of the hole.
+        near: Name of the photo whose camera is nearest to the best viewpoint, or None if no viewpoint sees the hole.
+        height: Elevation of the best viewpoint above the hole [degrees].
+        shown: Share of the hole that is visible from there.
     """
 
     middle: tuple[float, float]
@@ -56,8 +56,8 @@ class Coverage:
 
     Attributes:
         cell: Edges along x and y, shape (2,).
-        photos: How many photos show a cell, (X, Y).
-        covered: Whether something stands there, (X, Y).
+        photos: Number of photos that show each cell, (X, Y).
+        covered: True if something stands on the cell, (X, Y).
     """
 
     cell: Float64Array
@@ -66,23 +66,23 @@ class Coverage:
 
     @property
     def hidden(self) -> BoolArray:
-        """Free cells that fewer than :data:`ENOUGH` photos show, (X, Y)."""
+        """True for uncovered cells that fewer than :data:`ENOUGH` photos show, (X, Y)."""
         return (self.photos < ENOUGH) & ~self.covered
 
     @property
     def free(self) -> BoolArray:
-        """Cells that are seen and have nothing on or beside them, nor the edge, (X, Y)."""
+        """True for visible cells that are neither covered, nor next to covered cells, nor at the edge, (X, Y)."""
         good = (self.photos >= ENOUGH) & ~binary_dilation(self.covered, np.ones((3, 3)))
         return np.asarray(binary_erosion(good))
 
     def middle(self, cells: npt.ArrayLike) -> Float64Array:
-        """Where cells (N, 2) have their middles in the support's frame, (N, 2)."""
+        """Return the centres of cells (N, 2) in the support's frame, (N, 2)."""
         return np.asarray(
             (np.asarray(cells, dtype=np.float64) + 0.5) * self.cell - np.array(self.photos.shape) * self.cell / 2
         )
 
     def holding(self, flat: Float64Array) -> BoolArray:
-        """Which cells hold points (N, 2) of the support's frame, (X, Y)."""
+        """Return True for cells that contain points (N, 2) of the support's frame, (X, Y)."""
         shape = self.photos.shape
         index = np.floor(flat / self.cell + np.array(shape) / 2).astype(np.int64)
         held = np.zeros(shape, dtype=bool)
@@ -91,13 +91,13 @@ class Coverage:
 
 
 def find_coverage(support: Support, views: Sequence[DepthView], points: SurfacePoints, scale: float) -> Coverage:
-    """Look at a support in all photos.
+    """Compute the coverage of a support from all photos.
 
     Args:
-        support: Where.
-        views: Of the photos.
-        points: What they see.
-        scale: Their typical depth.
+        support: The support.
+        views: Depth views of the photos.
+        points: Surface points of the photos.
+        scale: Typical depth of the photos.
     """
     longer = max(support.size)
     shape = np.maximum(np.rint(np.array(support.size) / longer * CELLS), 1).astype(int)
@@ -109,7 +109,7 @@ def find_coverage(support: Support, views: Sequence[DepthView], points: SurfaceP
     for view in views:
         depth, surface = view.look(world)
         height = float((view.camera.centre - support.pose[:3, 3]) @ support.pose[:3, 2])
-        # Height over the support of what the ray to a cell ends at.
+        # Height above the support of the surface point that the ray to a cell hits.
         above = height * (1 - surface / depth)
         photos += (np.abs(above) < OFF * scale).reshape(shape)
     local = support.local(points.places)
@@ -121,12 +121,15 @@ def find_coverage(support: Support, views: Sequence[DepthView], points: SurfaceP
 
 
 def _placed(support: Support, flat: Float64Array) -> Float64Array:
-    """Points (N, 2) of a support's frame in the place, (N, 3)."""
+    """Transform points (N, 2) from a support's frame to the scene, (N, 3)."""
     return np.asarray(flat @ support.pose[:3, :2].T + support.pose[:3, 3])
 
 
 def free_rectangle(free: BoolArray) -> tuple[int, int, int, int] | None:
-    """First and last but one row and column of the largest rectangle of True cells, or None where there are none."""
+    """Return the largest rectangle of True cells as first row, end row, first column and end column, or None.
+
+    The ends are exclusive.
+    """
     best, area = None, 0
     run = np.zeros(free.shape[1], dtype=np.int64)
     for row in range(free.shape[0]):
@@ -144,13 +147,13 @@ def free_rectangle(free: BoolArray) -> tuple[int, int, int, int] | None:
 def find_holes(
     support: Support, coverage: Coverage, splats: Splats, cameras: Sequence[tuple[str, Camera]]
 ) -> list[Hole]:
-    """The largest holes of a support, and from where each would be seen.
+    """Find the largest holes of a support, and the best viewpoint of each.
 
     Args:
-        support: Where.
-        coverage: Of it.
-        splats: Of the place.
-        cameras: Names of the photos, and their cameras.
+        support: The support.
+        coverage: Coverage of the support.
+        splats: Splats of the scene.
+        cameras: Names and cameras of the photos.
     """
     parts, count = label(coverage.hidden)
     sizes = np.bincount(parts.ravel(), minlength=count + 1)[1:]
@@ -184,7 +187,7 @@ def _hole(
             degrees.append(elevation)
     for view, elevation in zip(depth_views(splats, tried, min(_LOOK, edge)), degrees, strict=True):
         depth, surface = view.look(cells)
-        # Where nobody looked there may be no splats: what matters is that nothing is before it.
+        # A hole may have no splats, so the test is that no surface lies in front of it.
         shown = float(np.nanmean(surface > 0.97 * depth)) if np.isfinite(depth).any() else 0.0
         if shown > best + 0.05:
             best, chosen, height = shown, view.camera.centre, elevation

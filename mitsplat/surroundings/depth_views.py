@@ -1,4 +1,4 @@
-"""What photos see of a place: the depth of its splats from their cameras, and points on surfaces."""
+"""Depth of the splats from the cameras of the photos, and points on their surfaces."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ SIZE = 240
 """Longest edge of the pictures [px]."""
 _OPAQUE = 0.5
 _STEP = 2
-"""Pixels from one to the next point, and half of those over which a normal is taken."""
+"""Distance between neighbouring surface points, and half the span of the differences for normals [px]."""
 _BENT = 0.05
-"""Share of the depth by which neighbours may differ for a normal."""
+"""Largest depth difference across a normal's span, as a share of the depth."""
 
 
 @dataclass(frozen=True, eq=False)
 class DepthView:
-    """Depth from a camera.
+    """Depth image of a camera.
 
     Attributes:
-        camera: At the size of the picture.
-        depth: Along the optical axis, infinite where nothing opaque is, (H, W).
+        camera: Camera at the size of the picture.
+        depth: Depth along the optical axis, infinite where nothing is opaque, (H, W).
     """
 
     camera: Camera
@@ -35,16 +35,19 @@ class DepthView:
 
     @classmethod
     def of(cls, camera: Camera, layers: Layers, opaque: float = _OPAQUE) -> DepthView:
-        """What layers show whose alpha is above ``opaque``."""
+        """Return the depth of the pixels whose alpha is above ``opaque``."""
         seen = (layers.alpha > opaque) & (layers.depth > 0)
         return cls(camera, np.where(seen, layers.depth, np.inf).astype(np.float32))
 
     def transformed(self, motion: Float64Array) -> DepthView:
-        """What the camera sees after it and the place moved rigidly (4, 4)."""
+        """Return the view after a rigid motion (4, 4) of camera and scene."""
         return DepthView(self.camera.transformed(motion), self.depth)
 
     def look(self, points: Float64Array) -> tuple[Float64Array, Float64Array]:
-        """Depth of points (N, 3) and of the surface in their pixels, (N,) each; NaN for points that are not in view."""
+        """Return the depths of points (N, 3) and of the surface at their pixels, (N,) each.
+
+        Points outside the view get NaN.
+        """
         pixels, z = self.camera.project(points)
         x, y = np.nan_to_num(np.floor(pixels), nan=-1.0).clip(-1, 1e6).astype(np.int64).T
         inside = (z > self.camera.near) & (x >= 0) & (y >= 0) & (x < self.camera.width) & (y < self.camera.height)
@@ -55,12 +58,12 @@ class DepthView:
 
 @dataclass(frozen=True, eq=False)
 class SurfacePoints:
-    """Points on what photos see, as many of each photo as it has opaque pixels.
+    """Points on the visible surfaces; the number per photo is proportional to its opaque pixels.
 
     Attributes:
-        places: Shape (N, 3).
+        places: Positions, shape (N, 3).
         normals: Unit normals towards the camera, (N, 3).
-        central: Whether a point is in the middle half of its photo, (N,).
+        central: True if a point is in the middle half of its photo, (N,).
     """
 
     places: Float64Array
@@ -68,25 +71,25 @@ class SurfacePoints:
     central: BoolArray
 
     def transformed(self, motion: Float64Array) -> SurfacePoints:
-        """The points after a rigid motion (4, 4)."""
+        """Return the points after a rigid motion (4, 4)."""
         turn = motion[:3, :3].T
         return SurfacePoints(self.places @ turn + motion[:3, 3], self.normals @ turn, self.central)
 
 
 def depth_views(splats: Splats, cameras: Sequence[Camera], size: int = SIZE) -> list[DepthView]:
-    """Depths of splats from cameras, the longest edge ``size`` px at most."""
+    """Render depths of splats from cameras; the longest edge is at most ``size`` px."""
     return [DepthView.of(*render_sized(splats, camera, size)) for camera in cameras]
 
 
 def render_sized(splats: Splats, camera: Camera, size: int) -> tuple[Camera, Layers]:
-    """Splats from a camera, the longest edge ``size`` px at most, and the camera of that picture."""
+    """Render splats with a longest edge of at most ``size`` px; return the resized camera and the layers."""
     scale = min(1.0, size / max(camera.width, camera.height))
     small = camera.resized(max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
     return small, render_splats(splats, small, quality="balanced")
 
 
 def surface_points(views: Sequence[DepthView]) -> SurfacePoints:
-    """Points and normals of the surfaces in all views, without their edges."""
+    """Return points and normals of the surfaces in all views, without depth edges."""
     places, normals, central = [], [], []
     for view in views:
         height, width = view.depth.shape

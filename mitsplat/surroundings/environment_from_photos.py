@@ -1,4 +1,7 @@
-"""From a capture and a fit of a whole place to an environment: cleaned, level, with supports, a verdict and a scene."""
+"""Pipeline from the capture and the fit of a place to an environment asset.
+
+The environment is cleaned and level. It has supports, quality figures and an example scene.
+"""
 
 from __future__ import annotations
 
@@ -39,31 +42,36 @@ from mitsplat.surroundings.shading import ShadingLight, light_of_shading
 from mitsplat.surroundings.supports import Support, find_supports, flattened
 
 _NEAR = 3.0
-"""Distance from what the cameras look at, in their own, beyond which is background: shown, but no part of the mesh."""
+"""Distance from the focus of the cameras beyond which Gaussians are background, in camera distances.
+
+The background is rendered, but it is not part of the mesh.
+"""
 _TURNED = 30.0
-"""Angle to the capture's vertical up to which a surface may be the support [degrees]."""
+"""Largest angle of the support to the capture's vertical [degrees]."""
 _ANYHOW = 55.0
-"""The same to one of the six axes, by which every direction is looked in, where nothing says where up is [degrees]."""
+"""Largest angle of the support to one of the six axes if the vertical is unknown [degrees]; this covers all directions.
+"""
 _LEVEL = 2.0
-"""Angle to the support up to which other surfaces are level [degrees]."""
+"""Largest angle between the support and other level surfaces [degrees]."""
 _ROUGH = 0.03
-"""Height of the mesh over a support that is flattened, as a share of the typical depth."""
+"""Height range around a support in which the mesh is flattened, as a share of the typical depth."""
 _HIDDEN = 0.1
 """Largest share of the support that too few photos may show."""
 _SAME = 1.5 / 255
-"""Difference up to which a pixel shows nothing of what was removed."""
+"""Largest colour difference of a pixel that the removal of things left unchanged."""
 _ACROSS = 256
-"""Most cells along a support by which its light is told."""
+"""Largest number of cells along a support in the estimation of light."""
 _SMALLEST_REGION = 0.1
-"""Least edge of a place that things can be dropped on [m]."""
+"""Least edge of a drop region [m]."""
 
 
 def make_surroundings(
     capture_folder: Path, fit: Path, out: Path, job: AssetJob, *, progress: Progress | None = None
 ) -> AssetResult:
-    """Write an environment and a scene; see :func:`~mitsplat.reconstruct.asset_from_photos.make_asset`.
+    """Write an environment and a scene file; see :func:`~mitsplat.reconstruct.asset_from_photos.make_asset`.
 
-    The scene file lies beside the asset's folder and has its name; one that was changed by hand is kept.
+    The scene file lies next to the asset's folder and has the same name. A scene file that was edited by hand is not
+    replaced.
     """
     before = _recorded_scene(out)
     return _with_scene(
@@ -91,15 +99,15 @@ def make_photo_surroundings(
 def reconstruct_surroundings(
     capture: Capture, splats: Splats, job: AssetJob, psnr: float | None, source: str | None, progress: Progress | None
 ) -> Reconstruction:
-    """Make an environment of splats that were fitted to a capture.
+    """Make an environment from splats that were fitted to a capture.
 
     Args:
         capture: Photos with cameras.
-        splats: In the capture's frame.
-        job: What to make.
-        psnr: Held-out PSNR that the fit reported [dB].
-        source: What the capture's scale and gravity are by.
-        progress: Told what is being done.
+        splats: Splats in the capture's frame.
+        job: Description of the asset.
+        psnr: Held-out PSNR of the fit [dB].
+        source: Source of the capture's scale and gravity.
+        progress: Progress callback.
 
     Raises:
         InputError: As :func:`mitsplat.reconstruct.reconstruct.reconstruct_asset`.
@@ -137,7 +145,8 @@ def reconstruct_surroundings(
         capture, splats, name=job.name, class_name=job.class_name, kind="environment", settings=job.settings,
         imported=imported, psnr=psnr, progress=progress,
     )  # fmt: skip
-    # A size squares the asset with its mesh: that turn is taken back, as the support lies along the axes.
+    # A given size rotates the asset to its mesh. This rotation is undone, because the support is already parallel to
+    # the axes.
     factor = float(np.cbrt(np.linalg.det(made.asset_from_capture[:3, :3])))
     back = np.eye(4)
     back[:3, :3] = made.asset_from_capture[:3, :3].T / factor
@@ -192,7 +201,7 @@ def reconstruct_surroundings(
             "how large it is is unknown, so that there is no scene file: lay a board of `mitsplat board` on the table, "
             "or give --scale-from"
         )
-    # As the asset is rendered, not as the fit saw it.
+    # The PSNR is that of the asset after all changes, not that of the fit.
     shown = mean_psnr(made.held_out) if made.held_out else psnr
     if made.held_out and things:
         shown = _psnr_beside(made.held_out, show_held_out(fitted, None, capture.held_out, job.settings.verdict_size))
@@ -203,7 +212,7 @@ def reconstruct_surroundings(
 def _light(
     support: Support, splats: Splats, capture: Capture, points: SurfacePoints, scale: float, factor: float
 ) -> ShadingLight | None:
-    """What light the shadows on a support tell, relative to its middle [m], ``factor`` metres to a unit."""
+    """Estimate the light from the shadows on a support, relative to its centre [m]; ``factor`` is metres per unit."""
     ground = Ground.of(support, splats, capture, scale)
     places = points.transformed(np.asarray(np.linalg.inv(support.pose))).places
     heights = ground.grid.heights(places[places[:, 2] < TALL * scale], OFF * scale)
@@ -223,7 +232,7 @@ def _light(
 
 
 def _lit(light: ShadingLight) -> str:
-    """Lamps by their directions from the middle of the support, and the rest, a clause."""
+    """Describe the directions of lamps and the share of ambient light as a clause."""
     told = []
     for lamp in light.lamps:
         x, y, z = lamp.position
@@ -233,14 +242,14 @@ def _lit(light: ShadingLight) -> str:
 
 
 def _typical_depth(capture: Capture) -> float:
-    """Median over the photos of the median depth of the points that they see."""
+    """Return the median over the photos of the median depth of their points."""
     depths = [photo.camera.project(capture.points[photo.seen])[1] for photo in capture.training]
     known = [float(np.median(depth)) for depth in depths if len(depth)]
     return float(np.median(known)) if known else 1.0
 
 
 def _beyond(splats: Splats, cameras: Sequence[Camera]) -> BoolArray:
-    """Which Gaussians (N,) are far beyond what the cameras look at."""
+    """Return True for Gaussians (N,) in the background."""
     centres = np.array([camera.centre for camera in cameras])
     focus = meeting_point(centres, np.array([camera.world_from_camera[:3, 2] for camera in cameras]))
     away = float(np.quantile(np.linalg.norm(centres - focus, axis=1), 0.9))
@@ -261,7 +270,7 @@ def _mesh(
 
 
 def _region(coverage: Coverage, support: Support, factor: float) -> Region | None:
-    """The largest free rectangle of the support [m or units], in its frame."""
+    """Return the largest free rectangle of the support in its frame [m or units]."""
     cells = free_rectangle(coverage.free)
     if cells is None:
         return None
@@ -299,7 +308,7 @@ def _rows(
 
 
 def _told(hole: Hole, factor: float, unit: str) -> str:
-    """A hole, and from where it would be seen, a clause."""
+    """Describe a hole and its best viewpoint as a clause."""
     x, y = (factor * value for value in hole.middle)
     place = f"{factor**2 * hole.area:.2g} {unit}² around x {x:.2f}, y {y:.2f}"
     if hole.near is None:
@@ -308,7 +317,7 @@ def _told(hole: Hole, factor: float, unit: str) -> str:
 
 
 def _missing(thing: RemovedThing, factor: float, unit: str) -> str:
-    """What was removed and filled in, a clause."""
+    """Describe a removed thing and the filled area as a clause."""
     size = " x ".join(f"{factor * edge:.2g}" for edge in thing.high - thing.low)
     x, y = (factor * 0.5 * (thing.low + thing.high))[:2]
     copied = "copies of what is around" if thing.copied > 0.99 else f"copies of what is around ({thing.copied:.0%})"
@@ -320,7 +329,7 @@ def _missing(thing: RemovedThing, factor: float, unit: str) -> str:
 
 
 def _psnr_beside(after: Sequence[HeldOutView], before: Sequence[HeldOutView]) -> float:
-    """Mean PSNR [dB] of held-out photos where they show nothing that was removed."""
+    """Return the mean PSNR [dB] of held-out photos at pixels that the removal left unchanged."""
     errors = []
     for view, old in zip(after, before, strict=True):
         same = np.abs(view.render - old.render).max(axis=2) < _SAME
@@ -348,7 +357,7 @@ def _findings(
 
 
 def _map(coverage: Coverage, filled: BoolArray) -> str:
-    """The support from above, with what is covered, free, hardly seen and filled in."""
+    """Return the top view of the support with covered, free, hardly visible and filled cells, as HTML."""
     tint = np.full((*coverage.photos.shape, 3), 0.85)
     tint[coverage.free] = (0.55, 0.8, 0.55)
     tint[coverage.covered] = (0.35, 0.4, 0.5)
@@ -371,7 +380,7 @@ def _scene_file(out: Path) -> Path:
 
 
 def _recorded_scene(out: Path) -> str | None:
-    """The scene that the asset's verdict holds, if any."""
+    """Return the scene text in the asset's verdict file, or None."""
     try:
         scene = json.loads((out / VERDICT_FILE).read_text()).get("scene")
     except (OSError, ValueError, AttributeError):
@@ -380,7 +389,7 @@ def _recorded_scene(out: Path) -> str | None:
 
 
 def _with_scene(done: AssetResult, before: str | None) -> AssetResult:
-    """The result, with its scene file on disk; one that neither this run nor the last one wrote is kept."""
+    """Write the scene file and return the result with its path; keep a scene file that was edited."""
     text, path = _recorded_scene(done.folder), _scene_file(done.folder)
     if text is None:
         return done

@@ -1,9 +1,9 @@
-"""Gaussians that photographs do not bear out: haze, what hangs where they look through, and what none of them shows.
+"""Removal of Gaussians that the photographs do not support: haze, specks in free space, and unseen Gaussians.
 
-A fit may explain what differs from photo to photo by haze, or by specks close to a camera. Haze is Gaussians so large
-that they reach through much of the place; a fit does not know it from those photos whose camera's plane it reaches
-(``mitsplat/renderer/differentiation/backward.py``). Specks stand in free space: other photos see surfaces behind them
-(space carving, Kutulakos and Seitz 2000). Nothing goes that makes the photos come out worse.
+A fit can explain differences between photos by haze, or by specks close to a camera. Haze consists of Gaussians large
+enough to extend through much of the scene. The fit has no gradient from photos whose camera plane such a Gaussian
+reaches (``mitsplat/renderer/differentiation/backward.py``). Specks lie in free space: other photos show surfaces behind
+them (space carving, Kutulakos and Seitz 2000). No removal may lower the quality of the photos.
 """
 
 from __future__ import annotations
@@ -20,31 +20,31 @@ from mitsplat.reconstruct.asset_evaluation import HeldOutView, show_held_out
 from mitsplat.surroundings.depth_views import DepthView, depth_views
 
 _LARGEST = (2.0, 1.0, 0.6, 0.4, 0.3)
-"""Standard deviations from which Gaussians are tried as haze, as a share of the typical depth."""
+"""Candidate limits of the standard deviation above which Gaussians are haze, as shares of the typical depth."""
 _WORSE = 0.05
-"""PSNR that the removal of specks may cost [dB]."""
+"""Largest loss of PSNR by the removal of specks [dB]."""
 _JUDGES = 8
-"""Training photos by which removals are judged, and their longest edge [px]."""
+"""Number of training photos that test removals; ``_SIZE`` is their longest edge [px]."""
 _SIZE = 240
 _DEPTH = 0.03
-"""Share of the depth by which a Gaussian may lie before a surface and belong to it."""
+"""Largest depth of a Gaussian in front of its surface, as a share of the depth."""
 _REACH = 2.0
-"""Standard deviations of a Gaussian that it reaches."""
+"""Radius of a Gaussian in standard deviations."""
 _PASSED = 3
-"""Least number of photos that must look through a speck, or show a surface that is close to a camera."""
+"""Least number of photos that must see through a speck, or that must confirm a surface close to a camera."""
 _NEAR = 0.3
-"""Depth that is close to a camera, as a share of the typical one."""
+"""Depth below which a surface is close to a camera, as a share of the typical depth."""
 _BORNE = 0.1
-"""Photos that show a surface where it is, as a share of those, from which it is none."""
+"""Largest share of confirming photos, relative to those that see through, for a speck."""
 
 
 def remove_floaters(splats: Splats, photos: Sequence[Photo], scale: float) -> tuple[Splats, dict[str, int]]:
-    """The splats without what the photos do not bear out, and how many went why.
+    """Return the splats without unsupported Gaussians, and the number of removed Gaussians by reason.
 
     Args:
-        splats: Of the whole place.
-        photos: That they were fitted to.
-        scale: Typical depth of these.
+        splats: Splats of the whole scene.
+        photos: Photos of the fit.
+        scale: Typical depth of the photos.
     """
     judges = [photos[int(i)] for i in np.unique(np.linspace(0, len(photos) - 1, _JUDGES).round())]
     best, kept = _psnr(splats, judges), splats
@@ -67,17 +67,17 @@ def _psnr(splats: Splats, photos: Sequence[Photo]) -> float:
 
 
 def mean_psnr(views: Sequence[HeldOutView]) -> float:
-    """Mean PSNR of renders against their photos [dB]."""
+    """Return the mean PSNR of renderings relative to their photos [dB]."""
     return float(np.mean([psnr(view.render, view.photo) for view in views]))
 
 
 def find_unsupported(splats: Splats, views: Sequence[DepthView], near: float) -> tuple[BoolArray, BoolArray]:
-    """Which Gaussians hang in free space, and which are in no photo, (N,) each.
+    """Return True for Gaussians in free space, and True for Gaussians that are in no photo, (N,) each.
 
     Args:
-        splats: Of the whole place.
-        views: Depths of the same splats from the cameras of its photos.
-        near: Depth up to which what fewer than three photos show is no surface.
+        splats: Splats of the whole scene.
+        views: Depths of the same splats from the cameras of the photos.
+        near: Depth below which a surface needs three photos.
     """
     passed: Int64Array = np.zeros(len(splats), dtype=np.int64)
     borne, shown, close = passed.copy(), passed.copy(), np.zeros(len(splats), dtype=bool)

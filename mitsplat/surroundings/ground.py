@@ -1,4 +1,4 @@
-"""A support as photos show it: cells with the colours of its bare surface."""
+"""Cells of a support with the colours of its bare surface."""
 
 from __future__ import annotations
 
@@ -20,28 +20,28 @@ from mitsplat.surroundings.depth_views import DepthView, render_sized
 from mitsplat.surroundings.supports import Support
 
 CELL = 0.004
-"""Edge of the cells that a support is filled by, as a share of the typical depth."""
+"""Edge of the cells that fill a support, as a share of the typical depth."""
 _FLAT = 0.25
-"""Height up to which what photos show is the bare support, as a share of that by which it is told from things."""
+"""Largest height of the bare support, as a share of the height that separates it from things."""
 _GAP = 4
-"""Cells between points on a thing that are of it, too."""
+"""Largest gap between points of one thing [cells]."""
 _EDGE = 400
-"""Longest edge of the pictures that the support's colours are read from [px]."""
+"""Longest edge of the pictures for the support's colours [px]."""
 _OPAQUE = 0.9
 _BORDER = cv2.BORDER_REPLICATE
 _DISC, _THICK = 0.7, 0.1
-"""Standard deviations of the sheet's Gaussians along it and across [cells]."""
+"""Standard deviations of the sheet's Gaussians in its plane and along its normal [cells]."""
 
 
 @dataclass(eq=False)
 class Ground:
-    """A support as photos see it, which changes as things are taken off.
+    """Texture of a support in the photos; it changes when things are removed.
 
     Attributes:
-        support: Where.
-        grid: Its cells.
-        texture: Their display-encoded colours, (X, Y, 3).
-        seen: Those that enough photos show bare, or that are filled in, (X, Y).
+        support: The support.
+        grid: Cells of the support.
+        texture: Display-encoded colours of the cells, (X, Y, 3).
+        seen: True for cells that enough photos show bare, or that are filled, (X, Y).
     """
 
     support: Support
@@ -51,7 +51,7 @@ class Ground:
 
     @classmethod
     def of(cls, support: Support, splats: Splats, capture: Capture, scale: float) -> Ground:
-        """What the training photos show of a support, ``scale`` their typical depth."""
+        """Compute the texture of a support from the training photos; ``scale`` is their typical depth."""
         inverse, grid = np.linalg.inv(support.pose), Grid.of(support, CELL * scale)
         cameras = [photo.camera.transformed(inverse) for photo in capture.training]
         return cls(support, grid, *grid.look(splats.transformed(inverse), cameras, _FLAT * OFF * scale))
@@ -62,8 +62,8 @@ class Grid:
     """Cells of a support in its frame, first axis x.
 
     Attributes:
-        cell: Their edge.
-        middles: Where they are, (X, Y, 2).
+        cell: Edge of a cell.
+        middles: Centres of the cells, (X, Y, 2).
     """
 
     cell: float
@@ -71,19 +71,19 @@ class Grid:
 
     @classmethod
     def of(cls, support: Support, cell: float) -> Grid:
-        """Cells of an edge that fill a support."""
+        """Return cells of the given edge that fill a support."""
         sides = [(np.arange(max(1, int(edge / cell))) + 0.5) * cell for edge in support.size]
         x, y = (side - side.mean() for side in sides)
         return cls(cell, np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1))
 
     def cells(self, flat: Float64Array) -> Int64Array:
-        """Indices of the cells at places (N, 2), (N, 2); -1 off the support."""
+        """Return the cell indices of positions (N, 2), shape (N, 2); -1 outside the support."""
         index = np.floor((flat - self.middles[0, 0]) / self.cell + 0.5).astype(np.int64)
         outside = ((index < 0) | (index >= self.middles.shape[:2])).any(axis=1)
         return np.where(outside[:, None], -1, index)
 
     def covered(self, points: Float64Array) -> BoolArray:
-        """Cells that have points (N, 2 or 3) in or over them, gaps between samples closed."""
+        """Return True for cells that contain or lie below points (N, 2 or 3), with gaps between samples closed."""
         covered = np.zeros(self.middles.shape[:2], dtype=bool)
         cells = self.cells(points[:, :2])
         covered[tuple(cells[(cells >= 0).all(axis=1)].T)] = True
@@ -91,12 +91,15 @@ class Grid:
         return closed[4:-4, 4:-4]
 
     def heights(self, points: Float64Array, floor: float) -> Float64Array:
-        """Of what stands in the cells (X, Y) by points (N, 3) on it that are above ``floor``, gaps closed; else 0."""
+        """Return the heights of things in the cells (X, Y) from points (N, 3) above ``floor``; 0 elsewhere.
+
+        Gaps between points are closed.
+        """
         top = self._tops(points[points[:, 2] > floor])
         return np.asarray(grey_closing(np.pad(top, _GAP), size=(2 * _GAP + 1,) * 2)[_GAP:-_GAP, _GAP:-_GAP])
 
     def _tops(self, points: Float64Array) -> Float64Array:
-        """The highest of points (N, 3) in each cell (X, Y), 0 where there are none."""
+        """Return the largest height of points (N, 3) in each cell (X, Y), 0 without points."""
         top = np.zeros(self.middles.shape[:2])
         cells = self.cells(points[:, :2])
         within = (cells >= 0).all(axis=1)
@@ -104,7 +107,10 @@ class Grid:
         return top
 
     def inside(self, points: Float64Array, footprint: BoolArray, depth: float) -> Float64Array:
-        """Places (M, 3) below points on a thing, that far from its sides, top and ground, in steps as long."""
+        """Return a lattice of positions (M, 3) inside a thing, below its surface points.
+
+        The positions are at least ``depth`` from sides, top and ground; ``depth`` is also the step of the lattice.
+        """
         top = self._tops(points)
         near = distance_transform_edt(top == 0, return_distances=False, return_indices=True)
         deep = distance_transform_edt(np.pad(footprint, 1))[1:-1, 1:-1] * self.cell > depth
@@ -118,13 +124,13 @@ class Grid:
         return np.concatenate([np.zeros((0, 3)), *columns])
 
     def outline(self, points: Float64Array) -> BoolArray:
-        """The same of one thing, without holes."""
+        """Return the covered cells of one thing, with holes filled."""
         return np.asarray(binary_fill_holes(self.covered(points)))
 
     def look(self, splats: Splats, cameras: Sequence[Camera], height: float) -> tuple[Float64Array, BoolArray]:
-        """Display-encoded colours (X, Y, 3) that cameras see of the bare support, and where enough of them do.
+        """Return display-encoded colours (X, Y, 3) of the bare support, and True for cells with enough bare views.
 
-        Cameras that look from near and steeply have more of a say.
+        Cameras with near and steep views have larger weights.
         """
         shape = self.middles.shape[:2]
         places = np.concatenate([self.middles, np.zeros((*shape, 1))], axis=2).reshape(-1, 3)
@@ -132,7 +138,7 @@ class Grid:
         for camera in cameras:
             view, shown = _seen_by(splats, camera)
             depth, surface = view.look(places)
-            bare = np.abs(view.camera.centre[2] * (1 - surface / depth)) < height  # NaN is not
+            bare = np.abs(view.camera.centre[2] * (1 - surface / depth)) < height  # False for NaN
             towards = places - view.camera.centre
             weight = np.where(bare, -towards[:, 2] / np.linalg.norm(towards, axis=1) ** 3, 0.0).reshape(shape)
             x, y = np.nan_to_num(view.camera.project(places)[0] - 0.5).astype(np.float32).T.reshape(2, *shape)
@@ -142,7 +148,7 @@ class Grid:
         return colours / weights[..., None], np.asarray(count >= ENOUGH)
 
     def sheet(self, texture: Float64Array, cells: BoolArray) -> Splats:
-        """Flat Gaussians of a texture's display-encoded colours (X, Y, 3) in some cells."""
+        """Return flat Gaussians with a texture's display-encoded colours (X, Y, 3) in the given cells."""
         flat = self.middles[cells]
         count = len(flat)
         return Splats(
@@ -155,7 +161,7 @@ class Grid:
 
 
 def _seen_by(splats: Splats, camera: Camera) -> tuple[DepthView, Float32Array]:
-    """Depth and display-encoded colours from a camera, the longest edge :data:`_EDGE` px at most."""
+    """Render depth and display-encoded colours; the longest edge is at most :data:`_EDGE` px."""
     small, layers = render_sized(splats, camera, _EDGE)
     shown = encode_srgb(layers.captured / np.maximum(layers.alpha, 1e-6)[..., None])
     return DepthView.of(small, layers, _OPAQUE), np.asarray(shown, dtype=np.float32)

@@ -1,4 +1,4 @@
-"""A scene file that drops things where a photographed support is free, seen as photos saw it."""
+"""Example scene file that drops objects on the free area of a photographed support, with cameras as in the photos."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from mitsplat.surroundings.shading import ShadingLight
 from mitsplat.surroundings.supports import Support
 
 _MARGIN = 0.05
-"""Room between the drop region and what is around it, at most [m]."""
+"""Largest margin between the drop region and its surroundings [m]."""
 _WIDEST = 0.6
 """Longest side of the drop region [m]."""
 _GAP = 40.0
-"""Directions without photos from which the scene has none either [degrees]."""
+"""Least azimuth gap between photos that the scene's cameras also avoid [degrees]."""
 _THICK = 0.04
-"""Of the boxes [m]."""
+"""Thickness of the boxes [m]."""
 
 Region = tuple[float, float, float, float]
-"""Least and largest x, least and largest y [m]."""
+"""Rectangle: least and largest x, least and largest y [m]."""
 
 
 def scene_text(
@@ -34,15 +34,15 @@ def scene_text(
     cameras: Sequence[Camera],
     light: ShadingLight | None = None,
 ) -> str:
-    """A scene file.
+    """Return the text of a scene file.
 
     Args:
-        name: Of the environment.
-        folder: Of its asset, as the scene file names it.
-        supports: In the asset's frame [m]; things are dropped on the first, whose top is z = 0.
-        free: Part of that where nothing stands.
-        cameras: Of the photos, in the same frame.
-        light: That of the place, relative to the first support's middle; that of some room if None.
+        name: Name of the environment.
+        folder: Folder of its asset, relative to the scene file.
+        supports: Supports in the asset's frame [m]; objects are dropped on the first, whose top is z = 0.
+        free: Free rectangle of the first support.
+        cameras: Cameras of the photos, in the same frame.
+        light: Estimated light relative to the first support's centre; None for a generic room.
     """
     margin = min(_MARGIN, 0.25 * min(free[1] - free[0], free[3] - free[2]))
     spans = []
@@ -69,7 +69,7 @@ def scene_text(
 
 
 def _lights(light: ShadingLight, support: Support) -> str:
-    """The key ``lights``: white paper in the support's middle would be white."""
+    """Return the key ``lights``, with a total irradiance that makes white paper at the support's centre white."""
     whole = light.ambient + np.sum([lamp.irradiance for lamp in light.lamps], axis=0)
     white = np.pi / float(whole @ LUMINANCE)
     middle = support.pose[:3, 3].round(3) + 0.0
@@ -84,7 +84,7 @@ def _lights(light: ShadingLight, support: Support) -> str:
 
 
 def _seen_from(cameras: Sequence[Camera], target: Float64Array) -> tuple[float, float, float, float, float, float]:
-    """Range of distances [m], of heights and of directions [degrees] that most photos of a place have."""
+    """Return the ranges of distance [m], elevation and azimuth [degrees] of most photos of a place."""
     away = np.array([camera.centre for camera in cameras]) - target
     distance = np.linalg.norm(away, axis=1)
     height = np.degrees(np.arcsin(np.clip(away[:, 2] / distance, -1, 1)))
@@ -105,7 +105,7 @@ def _name(number: int) -> str:
 
 
 def _m(length: float) -> str:
-    """A length to a tenth of a millimetre."""
+    """Format a length to a tenth of a millimetre."""
     return f"{round(float(length), 4) + 0.0:g}"
 
 

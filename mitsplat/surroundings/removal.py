@@ -1,9 +1,8 @@
-"""Take a thing away that stands on a support, and fill what it hid with what lies around.
+"""Removal of a thing from a support, and completion of the surfaces behind it.
 
-What goes is told by points: those that stand on the support fall into things that lie apart, and each Gaussian is of
-what the nearest point is of; so does what reaches into its volume. No photo shows what was below, nor what it hid of a
-wall close behind it. Both are made of pieces of the same surface (:mod:`.texture_fill`), laid down as sheets of flat
-Gaussians.
+Points that stand on the support are separated into connected things. Each Gaussian belongs to the thing of its nearest
+point, and so do Gaussians that reach into its volume. No photo shows the support below the thing, or a wall close
+behind it. Both are filled with patches of the same surface (:mod:`.texture_fill`), as sheets of flat Gaussians.
 """
 
 from __future__ import annotations
@@ -28,41 +27,44 @@ from mitsplat.surroundings.supports import Support, find_walls
 from mitsplat.surroundings.texture_fill import dilated, fill
 
 _APART = 0.02
-"""Edge of the voxels by which things lie apart, as a share of the typical depth."""
+"""Edge of the voxels that separate things, as a share of the typical depth."""
 _SPARSE = 0.05
-"""Points in a voxel, as a share of the usual number, below which it is taken for free."""
+"""Number of points in a voxel below which it counts as free, as a share of the median number."""
 _PICKED = 3
-"""Voxels from a pick in which the thing must have a point."""
+"""Largest distance between a picked position and a point of the thing [voxels]."""
 _OVER = 3
-"""Voxels that a thing may stick out beyond its support."""
+"""Largest overhang of a thing beyond its support [voxels]."""
 _REACH = 2.0
-"""Standard deviations that a Gaussian reaches."""
+"""Radius of a Gaussian in standard deviations."""
 _ON = 0.5
-"""Voxels from another thing's surface from which a Gaussian over the footprint is none of its own."""
+"""Distance from the surface of another thing above which a Gaussian over the footprint does not belong to that thing
+[voxels].
+"""
 _BESIDE = 4
-"""Voxels around a thing in which Gaussians are its own if it is nearer to them than all else."""
+"""Margin around a thing in which the nearest point decides on the owner of a Gaussian [voxels]."""
 _BLED = 2
-"""Steps around what is hidden, each as high as what is told from the support, in which colours are the thing's, too."""
+"""Width of the border around the hidden area whose colours the thing contaminates, in units of :data:`OFF`."""
 _FEET = 0.4
-"""Half the span of heights at which a thing's feet are, around the middle of those that count as the support's."""
+"""Half the height range of a thing's feet around half of :data:`OFF`, as a share of :data:`OFF`."""
 _STRAY = 0.02
-"""Share of a thing's points that do not say how near to a wall it is."""
+"""Share of a thing's points that are ignored for its distance from a wall."""
 
 
 @dataclass(frozen=True, eq=False)
 class RemovedThing:
-    """What was taken away, in the support's frame.
+    """A removed thing, in the support's frame.
 
     Attributes:
-        pick: As it was given.
-        support: Number of the support that it stood on.
-        gaussians: Of the thing.
-        low: Least x, y and z of what photos saw of it.
-        high: Largest.
-        filled: Middles of the cells that were filled in, (N, 2).
-        area: Of these.
-        behind: Area that was filled in on walls behind it.
-        copied: Share of all these that repeats other parts of the same surface; the rest has a plain colour.
+        pick: The pick as given.
+        support: Index of its support.
+        gaussians: Number of its Gaussians.
+        low: Least x, y and z of its visible points.
+        high: Largest x, y and z of its visible points.
+        filled: Centres of the filled cells, (N, 2).
+        area: Area of these cells.
+        behind: Filled area on walls behind it.
+        copied: Share of the filled area that repeats other parts of the same surface; the rest is a smooth
+            interpolation.
     """
 
     pick: str
@@ -77,7 +79,7 @@ class RemovedThing:
 
     @property
     def whole(self) -> float:
-        """Area of all that was filled in."""
+        """Total filled area."""
         return self.area + self.behind
 
 
@@ -90,26 +92,29 @@ def remove_things(
     scale: float,
     progress: Progress | None = None,
 ) -> tuple[Splats, list[RemovedThing]]:
-    """The splats without things that were picked, one after the other, and with what they hid filled in.
+    """Remove picked things one after the other, and fill the surfaces that they hid.
 
     Args:
-        splats: Of the place.
+        splats: Splats of the scene.
         picks: PHOTO:X,Y [px] on each thing.
-        capture: The photos, in the splats' frame.
-        supports: That things stand on.
-        points: What the training photos see.
-        scale: Their typical depth.
-        progress: Told after every thing.
+        capture: Photos in the splats' frame.
+        supports: Supports of things.
+        points: Surface points of the training photos.
+        scale: Typical depth of the photos.
+        progress: Called after each thing.
+
+    Returns:
+        The splats, and the removed things.
 
     Raises:
-        InputError: If there is no such photo, or nothing is seen there that stands on a support.
+        InputError: If there is no such photo, or the pixel shows nothing that stands on a support.
     """
     walls = find_walls(points, scale)
     surfaces = [*supports, *walls]
     fitted, places, grounds, removed = splats, points.places, dict[int, Ground](), list[RemovedThing]()
 
     def ground(number: int) -> Ground:
-        """A surface as photos show it, and as it was filled in since."""
+        """Return the texture of a surface, including earlier fills."""
         if number not in grounds:
             grounds[number] = Ground.of(surfaces[number], fitted, capture, scale)
         return grounds[number]
@@ -138,10 +143,10 @@ def _remove(
     places: Float64Array,
     scale: float,
 ) -> tuple[Splats, Float64Array, Float64Array, RemovedThing]:
-    """Splats without the thing at a place of a support, its points (M, 3), the others (N, 3), and what it was."""
+    """Return the splats without the thing, its points (M, 3), all other points (N, 3), and its description."""
     support, grid = ground.support, ground.grid
     inverse = np.asarray(np.linalg.inv(support.pose))
-    # A thing that touches a wall ends there.
+    # Points on walls are excluded, so that a thing that touches a wall ends there.
     loose = ~np.any([np.zeros(len(places), dtype=bool), *(w.holds(places, OFF * scale) for w in walls)], axis=0)
     thing, others = _apart(support.local(places), loose, spot, support, scale)
     if thing is None:
@@ -169,9 +174,9 @@ def _remove(
 
 
 def _stands_close(thing: Float64Array, wall: Support, scale: float) -> bool:
-    """Whether points (N, 3) on a thing are before a wall and nearer to it than they are wide.
+    """Return True if points (N, 3) of a thing are in front of a wall and nearer to it than the thing is wide.
 
-    Farther away it hides nothing that cameras all around it do not see past it.
+    A thing farther away hides nothing from all cameras, because some of them see past it.
     """
     local = wall.local(thing)
     before = (np.abs(local[:, :2]) <= np.array(wall.size) / 2).all(axis=1)
@@ -183,7 +188,7 @@ def _stands_close(thing: Float64Array, wall: Support, scale: float) -> bool:
 def _fill_behind(
     splats: Splats, thing: Float64Array, others: Float64Array, ground: Ground, scale: float
 ) -> tuple[Splats, float, float]:
-    """Splats with what a thing that was taken away hid of a wall, the area of that, and the share that is copied."""
+    """Fill the area of a wall that a removed thing hid; return the splats, the area, and the share that is copied."""
     wall = ground.support
     standing, _, hole = _hidden(ground, wall.local(thing), wall.local(others), scale)
     if not hole.any():
@@ -197,13 +202,13 @@ def _fill_behind(
 def _hidden(
     ground: Ground, thing: Float64Array, others: Float64Array, scale: float
 ) -> tuple[BoolArray, BoolArray, BoolArray]:
-    """Cells of a surface that other points stand on, that a thing is over, and that it hid, (X, Y) each.
+    """Return cells of a surface that other points stand on, that a thing is above, and that it hid, (X, Y) each.
 
     Points are in the surface's frame, shape (N, 3).
     """
     height, top, margin = others[:, 2], float(thing[:, 2].max()), round(OFF / CELL)
     standing = ground.grid.covered(others[(height > OFF * scale) & (height < top)])
-    footprint = dilated(ground.grid.outline(thing), margin) & ~standing  # points keep off edges
+    footprint = dilated(ground.grid.outline(thing), margin) & ~standing  # surface points lie away from edges
     parts, _ = label(~ground.seen & ~standing)
     hidden = np.isin(parts, np.setdiff1d(parts[footprint], [0]))
     core = binary_fill_holes(hidden & dilated(footprint, 4 * margin))
@@ -211,11 +216,11 @@ def _hidden(
 
 
 def _filled(ground: Ground, standing: BoolArray, hole: BoolArray) -> tuple[Splats, float]:
-    """A sheet for a hole of a surface, which then counts as seen, and the share of it that is copied."""
+    """Return a sheet for a hole of a surface, and the share of it that is copied; the hole then counts as seen."""
     margin = round(OFF / CELL)
     ground.texture, copied = fill(ground.texture, ground.seen & ~hole & ~dilated(standing, margin), hole)
     ground.seen = ground.seen | hole
-    # Around the hole, too, where what went was reaching to.
+    # The sheet also covers the border of the hole, where Gaussians of the thing extended.
     sheet = ground.grid.sheet(ground.texture, ground.seen & dilated(hole, margin))
     return sheet.transformed(ground.support.pose), copied
 
@@ -223,14 +228,14 @@ def _filled(ground: Ground, standing: BoolArray, hole: BoolArray) -> tuple[Splat
 def _picked(
     splats: Splats, pick: str, capture: Capture, supports: Sequence[Support], scale: float
 ) -> tuple[int, Float64Array]:
-    """The support on which what is seen at a pixel stands, and the place (3,) in its frame."""
+    """Return the index of the support below the thing at a pixel, and the position (3,) in the support's frame."""
     photo, pixel = capture.picked(pick)
     camera = photo.camera
     ray = np.append(camera.ray_slopes([pixel])[0], 1.0)
     (view,) = depth_views(splats, [camera])
     ray = ray @ camera.world_from_camera[:3, :3].T
     depth = float(view.look((camera.centre + scale * ray)[None])[1][0])
-    spot = camera.centre + (depth if np.isfinite(depth) else np.nan) * ray  # what is NaN stands on nothing
+    spot = camera.centre + (depth if np.isfinite(depth) else np.nan) * ray  # NaN stands on no support
     found, lowest = -1, np.inf
     for number, support in enumerate(supports):
         local = support.local(spot)
@@ -245,9 +250,11 @@ def _picked(
 def _apart(
     points: Float64Array, loose: BoolArray, spot: Float64Array, support: Support, scale: float
 ) -> tuple[Float64Array | None, Float64Array]:
-    """Points of the thing at a place, None if there are none, and others without stray ones, in the support's frame.
+    """Return the points of the thing at a position, or None, and all other points without stray ones.
 
-    Only ``loose`` ones (N,) can be of a thing. What sticks out beyond the support by some voxels goes along.
+    The result is in the support's frame.
+
+    Only ``loose`` points (N,) can belong to a thing. An overhang of a few voxels beyond the support is included.
     """
     over = (np.abs(points[:, :2]) <= np.array(support.size) / 2).all(axis=1)
     high = loose & (points[:, 2] > OFF * scale) & (points[:, 2] < TALL * scale)
@@ -284,7 +291,7 @@ def _of_thing(
     hole: BoolArray,
     scale: float,
 ) -> BoolArray:
-    """Which Gaussians (N,) go with a thing: its surface, what is inside of it, and what fills the hole by guess."""
+    """Return True for Gaussians (N,) to remove: on the surface and inside the thing, and in or below the hole."""
     reach, means = _APART * scale, splats.means.astype(np.float64)
     beside = _BESIDE * reach
     low, high = thing.min(axis=0) - beside, thing.max(axis=0) + beside
@@ -308,7 +315,10 @@ def _of_thing(
 
 
 def _guesses(splats: Splats, grid: Grid, hole: BoolArray, scale: float) -> BoolArray:
-    """Which Gaussians (N,) are in the hole of a surface, or below it and reach out of it, in the surface's frame."""
+    """Return True for Gaussians (N,) in the hole of a surface, or below it and reaching out of it.
+
+    The splats are in the surface's frame.
+    """
     floor, height, cells = (
         OFF * scale,
         splats.means[:, 2].astype(np.float64),
@@ -325,7 +335,10 @@ def _guesses(splats: Splats, grid: Grid, hole: BoolArray, scale: float) -> BoolA
 
 
 def _reaching(splats: Splats, places: Float64Array) -> BoolArray:
-    """Which Gaussians (N,) reach any of some places: as these were hidden, no photo has a say in what is there."""
+    """Return True for Gaussians (N,) that reach any of the given positions.
+
+    The positions were hidden, so no photo constrains Gaussians there.
+    """
     found = np.zeros(len(splats), dtype=bool)
     if not len(places):
         return found
@@ -344,6 +357,6 @@ def _reaching(splats: Splats, places: Float64Array) -> BoolArray:
 
 
 def _thinned(points: Float64Array, edge: float) -> Float64Array:
-    """One of the points (N, 3) in each cube of an edge."""
+    """Return one of the points (N, 3) in each cube of the given edge."""
     _, first = np.unique(np.floor(points / edge).astype(np.int64), axis=0, return_index=True)
     return points[first]

@@ -1,11 +1,10 @@
-"""Lamps told by the shadows on a level surface that photographs show.
+"""Estimation of lamps from the shadows on a level surface in photographs.
 
-A matt surface sends to the eye its reflectance times the light that reaches it. The reflectance is unknown, but prints
-and grain know nothing of where lamps are, while light ends where something stands in its way. Candidates of lamps all
-around, each with the shadows that the things on the surface would throw, are held against what is seen; the one that
-explains most is moved to where it explains more, and another is added as long as one explains enough. The rest is light
-from all sides, less of it beside what stands there. Slow changes over the surface, as reflectance may have them, too,
-say nothing; nor do the colours of light from all sides and of all lamps together, which are taken for white.
+The radiance of a matt surface is its reflectance times the irradiance. The reflectance is unknown, but prints and grain
+do not depend on lamp positions, while shadows do. Candidate lamps in all directions, with the shadows of the things on
+the surface, are compared with the observed brightness. The lamp that explains most is refined. Further lamps are added
+while they explain enough. The rest is ambient light, reduced by ambient occlusion. Slow variations over the surface are
+ignored, because reflectance can have them too. The colour of the total light is also unknown and is taken as white.
 """
 
 from __future__ import annotations
@@ -22,47 +21,48 @@ from mitsplat.capture.lighting.lamps import rectangle_axes
 from mitsplat.images.colour import LUMINANCE
 
 _DISTANCES = (1.0, 1.5, 2.2, 3.3)
-"""From the middle to candidates [m]."""
+"""Distances of candidate lamps from the centre [m]."""
 _TURN, _RISE = 10.0, 8.0
-"""Steps between candidates [degrees]."""
+"""Azimuth and elevation steps between candidates [degrees]."""
 _LOWEST = 14.0
 """Elevation of the lowest candidates [degrees]."""
 _NEAREST, _FARTHEST = 0.8, 4.0
-"""Distances of lamps [m]."""
+"""Range of the distances of lamps [m]."""
 _SINE = np.sin(np.radians(10.0))
 _SIZES = (0.1, 0.2, 0.4, 0.8)
-"""Edges of lamps that are tried [m]."""
+"""Candidate edges of lamps [m]."""
 _POINTS = 8
-"""Of a lamp whose shadows are soft."""
+"""Sample points of a lamp with soft shadows."""
 _STEPS = (6.0, 3.0, 1.5)
-"""By which a lamp is moved to where it explains more [degrees]."""
+"""Step sizes of the refinement of a lamp's direction [degrees]."""
 _COMMON = 0.1
-"""Logarithm of a reflectance within which it counts fully."""
+"""Largest residual of the logarithm of brightness with full weight."""
 _GAIN = 0.025
-"""Share of what is left unexplained by which another lamp must lessen it."""
+"""Least relative reduction of the residual by a further lamp."""
 _MOST = 3
 _FEWEST, _CELLS = 300, 1500
-"""Cells that shading is told by."""
+"""Least and largest number of cells in the estimation."""
 _SCANNED = 800
-"""Of these, by which candidates are looked through."""
+"""Largest number of cells in the search over candidates."""
 _STRIDES = 16
-"""Steps of a way from cell to cell that are looked at together."""
+"""Number of steps along shadow rays that are tested together."""
 _DARKEST = 0.02
-"""Share of the light that comes from all sides at least."""
+"""Least share of ambient light."""
 _LEAST = 0.08
-"""Share of the light below which a lamp is none."""
+"""Least share of the light for a lamp."""
 _SKY = 256
-"""Directions by which light from all sides is told."""
+"""Number of directions of ambient light."""
 
 
 @dataclass(frozen=True, eq=False)
 class ShadingLamp:
-    """A lamp, as shading tells it.
+    """A lamp estimated from shading.
 
     Attributes:
-        position: Of its middle, shape (3,) [m].
-        size: Its edge [m].
-        irradiance: Linear RGB that it sends to the middle of the surface, of 1 in all on average, shape (3,).
+        position: Position of its centre, shape (3,) [m].
+        size: Edge of the lamp [m].
+        irradiance: Irradiance (linear RGB) at the centre of the surface; the total of all light is 1 on average, shape
+            (3,).
     """
 
     position: Float64Array
@@ -72,11 +72,11 @@ class ShadingLamp:
 
 @dataclass(frozen=True, eq=False)
 class ShadingLight:
-    """What lights a surface.
+    """Light on a surface.
 
     Attributes:
-        lamps: The strongest first.
-        ambient: Irradiance from all sides at an open place, linear RGB.
+        lamps: Lamps, the strongest first.
+        ambient: Ambient irradiance without occlusion, linear RGB.
     """
 
     lamps: tuple[ShadingLamp, ...]
@@ -84,7 +84,7 @@ class ShadingLight:
 
     @property
     def ambient_share(self) -> float:
-        """Of the light at the middle."""
+        """Share of ambient light at the centre."""
         whole = self.ambient + sum((lamp.irradiance for lamp in self.lamps), np.zeros(3))
         return float((self.ambient @ LUMINANCE) / (whole @ LUMINANCE))
 
@@ -92,16 +92,16 @@ class ShadingLight:
 def light_of_shading(
     colours: Float64Array, heights: Float64Array, open_to_view: BoolArray, cell: float
 ) -> ShadingLight | None:
-    """The lamps that explain how bright the cells of a level surface are, or None if shading does not tell any.
+    """Estimate the lamps that explain the brightness of the cells of a level surface.
 
     Args:
-        colours: What is seen of each cell, linear RGB, first axis x, shape (X, Y, 3).
-        heights: Of what stands in each, 0 where nothing does, shape (X, Y) [m].
-        open_to_view: Cells whose colour is that of the bare surface, shape (X, Y).
-        cell: Their edge [m].
+        colours: Observed linear RGB of each cell, first axis x, shape (X, Y, 3).
+        heights: Height of the thing on each cell, 0 without one, shape (X, Y) [m].
+        open_to_view: True for cells whose colour is that of the bare surface, shape (X, Y).
+        cell: Edge of a cell [m].
 
     Returns:
-        Lamps relative to the middle of the cells.
+        Lamps relative to the centre of the cells, or None if shading does not determine any.
     """
     surface = _Surface(colours, heights, open_to_view, cell, _CELLS)
     if surface.few:
@@ -122,7 +122,7 @@ def light_of_shading(
             break
         lamps.append((place, size))
         columns.append(column)
-        for k in range(len(lamps) - 1):  # those before were told when this one was not known
+        for k in range(len(lamps) - 1):  # refine the earlier lamps, which were estimated without this one
             others = columns[: k + 1] + columns[k + 2 :]
             lamps[k] = surface.improved(others, *lamps[k])
             columns[k + 1] = surface.lit(*lamps[k])
@@ -141,7 +141,7 @@ def light_of_shading(
 
 
 def _ways() -> list[Float64Array]:
-    """Directions from the middle, shape (3,) each."""
+    """Return the directions of candidates from the centre, shape (3,) each."""
     return [
         np.array([np.cos(turn) * np.cos(rise), np.sin(turn) * np.cos(rise), np.sin(rise)])
         for rise in np.radians(np.arange(_LOWEST, 90, _RISE))
@@ -150,7 +150,7 @@ def _ways() -> list[Float64Array]:
 
 
 class _Surface:
-    """Cells of a level surface, how bright they are, and what candidates of lamps would make of them."""
+    """Cells of a level surface, their brightness, and their irradiance from candidate lamps."""
 
     def __init__(
         self, colours: Float64Array, heights: Float64Array, open_to_view: BoolArray, cell: float, most: int
@@ -169,13 +169,13 @@ class _Surface:
         self._smooth = np.stack([np.ones(len(x)), x, y, x * x, x * y, y * y], axis=1)
 
     def _sees(self, ways: Float64Array) -> BoolArray:
-        """Whether nothing stands in ways (N, 3) or (3,) from the places, that lead upwards, shape (N,)."""
+        """Return True for cells (N,) whose upward ray in direction (N, 3) or (3,) is not occluded."""
         ways = np.broadcast_to(ways, self.places.shape)
         flat = np.maximum(np.linalg.norm(ways[:, :2], axis=1), 1e-9)
         rise, (ahead, aside), (x, y) = ways[:, 2] / flat * self._cell, ways[:, :2].T / flat, self._cells.T
         free, rows = np.ones(len(ways), dtype=bool), np.arange(len(ways))
         (width, depth), tall = self._heights.shape, float(self._heights.max())
-        around = np.pad(self._heights, 1)  # nothing stands beyond the cells
+        around = np.pad(self._heights, 1)  # no occluders outside the cells
         for first in range(1, int(np.hypot(width, depth)) + 1, _STRIDES):
             number = np.arange(first, first + _STRIDES)[:, None]
             at = [
@@ -191,13 +191,14 @@ class _Surface:
         return free
 
     def explain(self, columns: Sequence[Float64Array], seen: Float64Array | None = None) -> tuple[float, Float64Array]:
-        """Mean deviation of the logarithms that columns leave unexplained, and their weights.
+        """Fit the brightness by columns of irradiance; return the mean absolute log residual and the weights.
 
-        Least absolute deviations by iteratively reweighted least squares, with what varies slowly left out.
+        Least absolute deviations by iteratively reweighted least squares; slow variations over the surface are fitted
+        and ignored.
         """
         seen, matrix = self.seen if seen is None else seen, np.column_stack(columns)
         weights, share, smooth = np.zeros(len(columns)), np.ones(len(seen)), np.zeros(len(seen))
-        for _ in range(3):  # errors are shares of the light, as reflectances are factors
+        for _ in range(3):  # errors are relative to the light, because reflectances are factors
             weights, _ = nnls(matrix * share[:, None], seen * np.exp(-smooth) * share)
             light = np.maximum(matrix @ weights, 0.02)
             ratio = np.log(np.maximum(seen, 1e-3) / light)
@@ -207,7 +208,7 @@ class _Surface:
         return float(np.mean(np.abs(ratio - smooth))), weights
 
     def sky(self) -> Float64Array:
-        """Light from all sides, 1 at an open place."""
+        """Return the ambient irradiance of the cells, 1 without occlusion."""
         points = qmc.Sobol(2, seed=0).random(_SKY)
         radius, turn = np.sqrt(points[:, 0]), 2 * np.pi * points[:, 1]
         ways = np.stack([radius * np.cos(turn), radius * np.sin(turn), np.sqrt(1 - points[:, 0])], axis=1)
@@ -217,7 +218,7 @@ class _Surface:
         return seen / _SKY
 
     def lit(self, place: Float64Array, size: float) -> Float64Array:
-        """Light of a lamp that faces the middle from a place relative to it, 1 in the open middle."""
+        """Return the irradiance of the cells from a lamp that faces the centre, 1 at an unoccluded centre."""
         points = place + self._spread(place, size)
         light = np.zeros(len(self.places))
         for point in points:
@@ -230,7 +231,7 @@ class _Surface:
 
     @staticmethod
     def _spread(place: Float64Array, size: float) -> Float64Array:
-        """Points of a square that faces the middle, relative to its own, (P, 3)."""
+        """Return sample points of a square that faces the centre of the surface, relative to its own centre, (P, 3)."""
         if size == 0:
             return np.zeros((1, 3))
         flat = size * (qmc.Sobol(2, seed=1).random(_POINTS) - 0.5)
@@ -239,7 +240,7 @@ class _Surface:
     def improved(
         self, columns: Sequence[Float64Array], place: Float64Array, size: float = _SIZES[1]
     ) -> tuple[Float64Array, float]:
-        """A place near one, and a size, at which a lamp explains most beside what columns do."""
+        """Refine position and size of a lamp so that it explains most in addition to the given columns."""
         best, _ = self.explain([*columns, self.lit(place, size)])
         for step in _STEPS:
             for _ in range(6):
@@ -260,7 +261,7 @@ class _Surface:
 
     @staticmethod
     def _turned(place: Float64Array, step: float, turn: float) -> Float64Array:
-        """A place as far away, so many degrees beside one."""
+        """Rotate a position about the centre by ``step`` degrees, in the tangential direction ``turn`` [rad]."""
         way = place / np.linalg.norm(place)
         across = np.cross(way, [0.0, 0.0, 1.0] if abs(way[2]) < 0.9 else [1.0, 0.0, 0.0])
         across /= np.linalg.norm(across)

@@ -1,8 +1,8 @@
-"""Flat, level surfaces of a place that things can stand on, a table, a shelf, the floor; and the walls behind them.
+"""Flat, level surfaces of a scene on which things can stand (table, shelf, floor), and walls.
 
-Planes are found by random samples among the points that photos see of upward surfaces (Fischler and Bolles 1981), the
-largest first, and fitted by least squares in which points count by Cauchy's weights. What lies in a plane falls into
-connected parts, and each is described by the smallest rectangle around it.
+Planes are found by RANSAC (Fischler and Bolles 1981) among points on upward surfaces, the largest first. They are
+refined by least squares with Cauchy weights. The points of a plane are split into connected parts, and each part is
+described by the smallest enclosing rectangle.
 """
 
 from __future__ import annotations
@@ -21,44 +21,44 @@ from mitsplat.importing.upright import POINTS, largest_plane, rotation_to_z
 from mitsplat.surroundings.depth_views import SurfacePoints
 
 _SAME = 25.0
-"""Angle between the normal of a point and of a plane up to which it may belong to that [degrees]."""
+"""Largest angle between the normals of a point and of its plane [degrees]."""
 _TOLERANCE = 0.008
-"""Distance from a plane up to which a point may belong to it, as a share of the typical depth."""
+"""Largest distance of a point from its plane, as a share of the typical depth."""
 _SPREADS, _LEAST = 5.0, 0.001
-"""The same once the plane is fitted: in median distances from it, and at least as a share of the typical depth."""
+"""Largest distance after the fit, in median distances, and its lower limit as a share of the typical depth."""
 _SMALLEST = 0.02
-"""Share of the upward points from which a plane is looked into."""
+"""Least share of the upward points in a plane."""
 _MOST = 6
-"""Planes that are looked for."""
+"""Largest number of planes."""
 _CELL = 0.01
-"""Edge of the cells that parts of a plane are found by, as a share of the typical depth."""
+"""Edge of the cells that define the parts of a plane, as a share of the typical depth."""
 _RIM = 0.5
-"""Cells in a row of a rectangle, as a share of its median row's, from which the row is no spur."""
+"""Least number of cells in an outer row of a rectangle, relative to its median row; emptier rows are cut off."""
 _TRIMS = 6
 
 _SIDES = 6
-"""Directions that walls are looked for in."""
+"""Number of directions in the search for walls."""
 _LEANING = 10.0
-"""Angle to the vertical up to which a surface is a wall [degrees]."""
+"""Largest angle of a wall to the vertical [degrees]."""
 _BEHIND = 0.05
-"""Points behind a wall, as a share of those in it, from which it is none."""
+"""Largest number of points behind a wall, as a share of the points in it."""
 _FILLED = 0.5
-"""Share of its rectangle that a support must fill at least."""
+"""Least filled share of a support's rectangle."""
 _LEAST_AREA = 0.02
-"""Area of a support, as a share of the typical depth squared."""
+"""Least area of a support, as a share of the typical depth squared."""
 
 
 @dataclass(frozen=True, eq=False)
 class Support:
-    """A flat rectangle that things can stand on.
+    """A flat rectangle on which things can stand.
 
     Attributes:
-        pose: Its frame in the place: z its normal, x along its longer side, its middle the origin, (4, 4).
-        size: Along x and y.
-        roughness: Median distance of the points on it from its plane.
-        tilt: Of its normal against z [degrees].
-        filled: Share of the rectangle that is seen as surface.
-        looked_at: Share of the middles of the photos that it takes up.
+        pose: Frame of the rectangle in the scene, (4, 4): z is its normal, x its longer side, its centre is the origin.
+        size: Edges along x and y.
+        roughness: Median distance of its points from its plane.
+        tilt: Angle of its normal to z [degrees].
+        filled: Share of the rectangle that is visible as surface.
+        looked_at: Share of the central points of all photos that lie on it.
     """
 
     pose: Float64Array
@@ -70,24 +70,24 @@ class Support:
 
     @property
     def height(self) -> float:
-        """Where its middle is along z."""
+        """Height z of its centre."""
         return float(self.pose[2, 3])
 
     @property
     def angle(self) -> float:
-        """Turn of its longer side about z [degrees]."""
+        """Rotation of its longer side about z [degrees]."""
         return float(np.degrees(np.arctan2(self.pose[1, 0], self.pose[0, 0])))
 
     def local(self, points: Float64Array) -> Float64Array:
-        """Points (N, 3) of the place in the support's frame."""
+        """Transform points (N, 3) from the scene to the support's frame."""
         return np.asarray((points - self.pose[:3, 3]) @ self.pose[:3, :3])
 
     def holds(self, points: Float64Array, margin: float) -> BoolArray:
-        """Which points (N, 3) of the place lie in the rectangle, up to a ``margin``."""
+        """Return True for points (N, 3) of the scene in the rectangle, up to a distance ``margin``."""
         return np.asarray((np.abs(self.local(points)) <= (*(np.array(self.size) / 2 + margin), margin)).all(axis=1))
 
     def transformed(self, motion: Float64Array) -> Support:
-        """The support after a similarity (4, 4)."""
+        """Return the support after a similarity transform (4, 4)."""
         scale = float(np.cbrt(np.linalg.det(motion[:3, :3])))
         pose = motion @ self.pose
         pose[:3, :3] /= scale
@@ -102,13 +102,13 @@ class Support:
 
 
 def find_supports(points: SurfacePoints, up: Float64Array, scale: float, within: float) -> list[Support]:
-    """Level surfaces, the one that photos look at most first.
+    """Find level surfaces, sorted by their share of the photos' central points.
 
     Args:
-        points: What photos see.
+        points: Surface points of the photos.
         up: Unit vector, shape (3,).
-        scale: The photos' typical depth.
-        within: Tilt against ``up`` that surfaces may have [degrees].
+        scale: Typical depth of the photos.
+        within: Largest tilt of surfaces against ``up`` [degrees].
     """
     upward = points.normals @ up > np.cos(np.radians(within + _SAME))
     places, normals = points.places[upward], points.normals[upward]
@@ -135,11 +135,13 @@ def find_supports(points: SurfacePoints, up: Float64Array, scale: float, within:
 
 
 def find_walls(points: SurfacePoints, scale: float) -> list[Support]:
-    """Upright surfaces with nothing behind them, as :func:`find_supports` finds level ones; sides of things have a top.
+    """Find upright surfaces with almost no visible points behind them.
+
+    The side of a thing is not a wall: the top of the thing gives points behind its side.
 
     Args:
-        points: What photos see, z up.
-        scale: The photos' typical depth.
+        points: Surface points of the photos, z up.
+        scale: Typical depth of the photos.
     """
     found = list[Support]()
     for turn in range(_SIDES):
@@ -152,7 +154,7 @@ def find_walls(points: SurfacePoints, scale: float) -> list[Support]:
 
 
 def _bounds(wall: Support, points: SurfacePoints, scale: float) -> bool:
-    """Whether photos see next to nothing behind a surface, as far as it is wide or high."""
+    """Return True if there are almost no points behind a surface, up to its smaller edge."""
     local = wall.local(points.places)
     before = (np.abs(local[:, :2]) <= np.array(wall.size) / 2 + _CELL * scale).all(axis=1)
     depth = local[before, 2]
@@ -161,7 +163,7 @@ def _bounds(wall: Support, points: SurfacePoints, scale: float) -> bool:
 
 
 def _coincide(one: Support, other: Support, scale: float) -> bool:
-    """Whether the middle of one surface lies in another that faces as it does."""
+    """Return True if the centre of one surface lies in another with the same orientation."""
     inside = other.holds(one.pose[None, :3, 3], _TOLERANCE * scale)[0]
     return bool(inside and one.pose[:3, 2] @ other.pose[:3, 2] > np.cos(np.radians(_SAME)))
 
@@ -169,7 +171,7 @@ def _coincide(one: Support, other: Support, scale: float) -> bool:
 def fit_plane(
     points: Float64Array, normal: Float64Array, height: float, tolerance: float
 ) -> tuple[Float64Array, float, float]:
-    """Unit normal and height of a plane through those of points (N, 3) near it, and their median distance from it."""
+    """Refine a plane with the points (N, 3) near it; return its unit normal, height and median point distance."""
     spread = tolerance / 2
     for _ in range(10):
         distance = points @ normal - height
@@ -195,7 +197,7 @@ def _parts(
     up: Float64Array,
     scale: float,
 ) -> list[Support]:
-    """The connected parts of a plane that are large enough."""
+    """Return the connected parts of a plane that are large enough."""
     turn = np.eye(4)
     turn[:3, :3] = rotation_to_z(normal)
     flat = (places @ turn[:3, :3].T)[:, :2]
@@ -204,7 +206,7 @@ def _parts(
     index = ((flat - low) / cell).astype(np.int64)
     seen: BoolArray = np.zeros(index.max(axis=0) + 5, dtype=bool)
     seen[tuple(index.T)] = True
-    # Gaps between samples are closed, and what only touches by a corner is apart.
+    # Closing fills gaps between samples; opening separates parts that only touch at a corner.
     solid = binary_opening(binary_closing(seen, np.ones((3, 3)), iterations=2), np.ones((3, 3)), iterations=2)
     parts, count = label(solid)
     of_part = parts[tuple(index.T)]
@@ -233,7 +235,7 @@ def _parts(
 
 
 def _rectangle(middles: Float64Array, cell: float) -> Float64Array:
-    """Corners (4, 2) of the smallest rectangle around cells (N, 2), rims that are hardly filled cut off."""
+    """Return the corners (4, 2) of the smallest rectangle around cells (N, 2), without sparse outer rows."""
     corners = np.zeros((4, 2))
     for _ in range(_TRIMS):
         corners = np.array(shapely.oriented_envelope(shapely.MultiPoint(middles)).exterior.coords)[:4]
@@ -250,7 +252,7 @@ def _rectangle(middles: Float64Array, cell: float) -> Float64Array:
 
 
 def flattened(mesh: trimesh.Trimesh, supports: Sequence[Support], margin: float) -> trimesh.Trimesh:
-    """A mesh whose vertices lie in supports where they are within ``margin`` of these, as splats' depth is rough."""
+    """Move vertices within ``margin`` of supports onto them, because the depth of splats is noisy."""
     vertices = np.array(mesh.vertices, dtype=np.float64)
     for support in supports:
         local, inside = support.local(vertices), support.holds(vertices, margin)

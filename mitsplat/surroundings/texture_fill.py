@@ -1,7 +1,7 @@
-"""A hole in a texture filled with pieces of the texture itself.
+"""Completion of a hole in a texture with patches of the texture itself.
 
-Patches are moved to where their surroundings look most as those of the hole do (Efros and Leung 1999, by patches as
-Criminisi, Pérez and Toyama 2004), and their colours are made to meet these (Pérez, Gangnet and Blake 2003).
+Patches are shifted to the position with the most similar surroundings (Efros and Leung 1999, by patches as Criminisi,
+Pérez and Toyama 2004). Their colours are adapted to the border of the hole (Pérez, Gangnet and Blake 2003).
 """
 
 from __future__ import annotations
@@ -18,18 +18,18 @@ from scipy.sparse.linalg import spsolve
 from mitsplat.arrays import BoolArray, Float64Array
 
 _RING = 10
-"""Width of the surroundings of a hole that patches are compared by [cells]."""
+"""Width of the surroundings of a hole in the comparison of patches [cells]."""
 _COMPARED = 0.5
-"""Share of these that a patch must have."""
+"""Least share of these surroundings that must be known around a patch."""
 _PATCHES = 8
 
 Value = TypeVar("Value", bound=np.generic)
 
 
 def fill(texture: Float64Array, known: BoolArray, hole: BoolArray) -> tuple[Float64Array, float]:
-    """A texture (X, Y, 3) whose hole is filled with moved parts of what is known, and the share of it that is these.
+    """Fill the hole of a texture (X, Y, 3) with shifted known parts; return the texture and the filled share.
 
-    Where no part of what is known reaches, its place is filled without bends from the border.
+    The remaining part of the hole is a smooth interpolation from the border.
     """
     given, source, left = texture, known, hole
     texture = np.where(known[..., None], texture, 0.0)
@@ -53,13 +53,16 @@ def fill(texture: Float64Array, known: BoolArray, hole: BoolArray) -> tuple[Floa
 
 
 def _best_shift(texture: Float64Array, known: BoolArray, source: BoolArray, hole: BoolArray) -> tuple[int, int] | None:
-    """The move by which what is known covers most of a hole and looks there as its surroundings do, up to a shade."""
+    """Return the shift with the most similar surroundings among those that cover most of the hole, or None.
+
+    Similarity ignores a constant colour offset.
+    """
     ring = (known & dilated(hole, _RING)).astype(np.float64)
     valid, target = source.astype(np.float64), texture * ring[..., None]
     there = texture * valid[..., None]
 
     def correlated(one: Float64Array, other: Float64Array) -> Float64Array:
-        """Sum over places p of one(p) other(p + shift), the middle of the result being no shift."""
+        """Return the sum over positions p of one(p) other(p + shift); the middle of the result is no shift."""
         return np.asarray(fftconvolve(other, one[::-1, ::-1], mode="full"))
 
     covers = correlated(hole.astype(np.float64), valid)
@@ -79,7 +82,7 @@ def _best_shift(texture: Float64Array, known: BoolArray, source: BoolArray, hole
 
 
 def _shifted(image: npt.NDArray[Value], shift: tuple[int, int]) -> npt.NDArray[Value]:
-    """image(p + shift), zero where that is beyond it."""
+    """Return image(p + shift), zero outside the image."""
     result = np.zeros_like(image)
     to, of = [], []
     for size, step in zip(image.shape, shift, strict=False):
@@ -90,10 +93,10 @@ def _shifted(image: npt.NDArray[Value], shift: tuple[int, int]) -> npt.NDArray[V
 
 
 def _membrane(values: Float64Array, border: BoolArray, inside: BoolArray) -> Float64Array:
-    """Values (X, Y, 3) inside that continue those of a border without bends: Laplace's equation.
+    """Return a smooth continuation of border values (X, Y, 3) inside, by Laplace's equation.
 
-    It is solved on the border as well, whose values it follows only on the whole, as those of single cells are noise;
-    and it is level across all other edges.
+    The border values are only data terms, because single cells are noisy. The derivative across all other edges is
+    zero.
     """
     cells = border | inside
     x, y = (slice(int(rows.min()), int(rows.max()) + 1) for rows in np.nonzero(cells))
@@ -113,5 +116,5 @@ def _membrane(values: Float64Array, border: BoolArray, inside: BoolArray) -> Flo
 
 
 def dilated(cells: BoolArray, steps: int) -> BoolArray:
-    """Cells within so many of those given."""
+    """Return all cells within ``steps`` of the given cells."""
     return np.asarray(distance_transform_edt(~cells) <= steps) if cells.any() else cells

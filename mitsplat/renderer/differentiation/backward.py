@@ -1,12 +1,12 @@
-"""Gradients of the splat renderer: a second march that walks the same lists and scatters per-Gaussian derivatives.
+"""Gradients of the splat renderer: a second march over the same lists that scatters per-Gaussian derivatives.
 
-Blending front to back, ``C = sum_i T_i a_i c_i`` with ``T_i = prod_{j<i} (1 - a_j)``. Let S_i be the sum up to and
-with i; what lies behind is ``C - S_i``, so that no list is walked backwards (the remaining-radiance trick):
+Front-to-back blending computes ``C = sum_i T_i a_i c_i`` with ``T_i = prod_{j<i} (1 - a_j)``. Let S_i be the partial
+sum including i. The light behind i is ``C - S_i``, so that no list is walked backwards:
 
     dC / da_i = T_i c_i - (C - S_i) / (1 - a_i),     dC / dc_i = T_i a_i,     dA / da_i = T_end / (1 - a_i)
 
 With ``a = exp2(log2 o - q)`` and ``q = N / D`` as in module `gaussian`, the chain rule gives the derivatives of the
-view records; Dr.Jit's own differentiation carries them on through the projection to the Gaussians.
+view records. Dr.Jit's automatic differentiation continues through the projection to the Gaussians.
 """
 
 from __future__ import annotations
@@ -31,31 +31,32 @@ from mitsplat.runtime.recorded_kernels import Table, recorded
 LN_2 = 0.6931471805599453
 
 PAIRS_AT_ONCE = 1 << 20
-"""Pairs of a Gaussian and a tile whose gradients are held at once, 512 bytes each."""
+"""Number of pairs of a Gaussian and a tile whose gradients are stored at once, 512 bytes each."""
 
 
 def render_differentiable(cloud: Cloud, view: CameraView, quality: Quality) -> tuple[list[Any], Any]:
-    """Display-encoded colour (three flat row-major arrays, times alpha) and alpha, with gradients to the cloud.
+    """Render display-encoded colour (three flat row-major arrays, times alpha) and alpha with gradients.
+
+    Gaussians that reach the camera's plane are omitted, because they would have no gradient and a fit could not move
+    them.
 
     Args:
         cloud: Gaussians from :func:`pack_cloud`, in world space.
         view: Camera; one sample per pixel.
-        quality: Cut-offs and SH degree; of infinite tolerance.
-
-    Gaussians that reach the camera's plane would have no gradient, and are left out: a fit cannot mend them.
+        quality: Cut-offs and SH degree; with infinite tolerance.
 
     Raises:
-        ValueError: If the quality asks for a tolerance, several samples or a kernel that limits opacity.
+        ValueError: If the quality has a finite tolerance, several samples or a kernel that limits opacity.
     """
     _check(view, quality)
     lists = bin_gaussians(_only(cloud), [_PLACE], view, quality, at_camera=False, for_gradients=True)
-    # A function hides the rest from Dr.Jit, which would take data classes apart to differentiate them.
+    # The lambda hides the other arguments from Dr.Jit, which would traverse dataclasses for differentiation.
     *rgb, alpha = dr.custom(_March, lists.records, lambda: (lists, view, quality))
     return rgb, alpha
 
 
 def _tinted(records: Any) -> Any:
-    """View records whose red is the depth of the centre."""
+    """Return view records with the depth of the centre as red."""
     row = dr.arange(mi.UInt32, dr.width(records) // RECORD) * RECORD
     tinted = dr.copy(records)
     depth = dr.gather(mi.Float, records, row + _DEPTH, mode=dr.ReduceMode.NoConflicts)
@@ -64,7 +65,7 @@ def _tinted(records: Any) -> Any:
 
 
 _RED, _DEPTH = 6, 9
-"""Places in a view record."""
+"""Indices in a view record."""
 
 
 def _check(view: CameraView, quality: Quality) -> None:
@@ -86,11 +87,11 @@ _PLACE = Placement(0, np.eye(4), 1)
 
 
 class Eye:
-    """A camera as the parts of a training step take it that do not know the number of Gaussians that it sees.
+    """Camera for those parts of a training step that do not depend on the number of visible Gaussians.
 
     Attributes:
         view: The camera.
-        numbers: What cameras of its kind differ in, on the device.
+        numbers: Device values that differ between cameras of its kind.
     """
 
     def __init__(self, view: CameraView) -> None:
@@ -102,12 +103,12 @@ class Eye:
 def project_cloud(
     cloud: Cloud, kind: tuple[Any, ...], numbers: Mapping[str, Any], quality: Quality
 ) -> tuple[Any, Any, Any, Any]:
-    """View records of all Gaussians of a cloud, least depths, boxes of tiles, and which are seen, not yet evaluated.
+    """Return view records, least depths, tile boxes and visibility of all Gaussians, not evaluated.
 
     Args:
         cloud: Gaussians in world space.
-        kind: Of the camera's view.
-        numbers: Those of an :class:`Eye`.
+        kind: Kind of the camera's view.
+        numbers: Numbers of an :class:`Eye`.
         quality: Cut-offs and SH degree.
     """
     projector = Projector(
@@ -119,14 +120,14 @@ def project_cloud(
 def gather_gradients(
     cloud: Cloud, kind: tuple[Any, ...], numbers: Mapping[str, Any], quality: Quality, found: Any
 ) -> None:
-    """Add to the gradients of what a cloud is made of those that reach it from its view records.
+    """Add the gradients of view records to those of a cloud's parameters.
 
-    Those of Gaussians that are not seen are zero, where the chain rule says 0 times infinity.
+    Gradients of invisible Gaussians are zero, where the chain rule would give 0 times infinity.
 
     Args:
         cloud: From :func:`pack_cloud`, with gradients.
-        kind: Of the camera's view.
-        numbers: Those of an :class:`Eye`.
+        kind: Kind of the camera's view.
+        numbers: Numbers of an :class:`Eye`.
         quality: Cut-offs and SH degree.
         found: Gradients of the records of :func:`project_cloud`.
     """
@@ -142,14 +143,14 @@ def gather_gradients(
 
 
 def _send_back(values: Any, gradient: Any) -> None:
-    """Add to the gradients of all that values were made of."""
+    """Propagate a gradient to all inputs of ``values``."""
     dr.set_grad(values, gradient)
     dr.enqueue(dr.ADMode.Backward, values)
     dr.traverse(dr.ADMode.Backward)
 
 
 class RenderOp:
-    """An image of view records, and the way back from its gradients to theirs.
+    """Image of view records, with back-propagation of image gradients to the records.
 
     Args:
         lists: Records per tile.
@@ -167,7 +168,7 @@ class RenderOp:
         self.rgb, self.alpha, self._slopes = _image(view.kind, view.numbers, quality, *tiles)
 
     def gradient(self, colour: list[Any], alpha: Any) -> Any:
-        """Gradient of the records, flat as they are, from evaluated ones of colour and alpha."""
+        """Return the gradient of the flat records from evaluated gradients of colour and alpha."""
         lists, view, seen = self._lists, self._view, [*self.rgb, self.alpha]
         gradient = [*colour, alpha]
         if not 0 < lists.pairs <= PAIRS_AT_ONCE:
@@ -178,7 +179,7 @@ class RenderOp:
 
 
 def _room(pairs: int) -> int:
-    """A number of pairs that holds for those of many views, at most a quarter more."""
+    """Round a number of pairs up by at most a quarter, so that many views share it."""
     step = max(1024, 1 << max(0, pairs.bit_length() - 3))
     return -(-pairs // step) * step
 
@@ -187,10 +188,10 @@ def _room(pairs: int) -> int:
 def _image(
     kind: tuple[Any, ...], numbers: dict[str, Any], quality: Quality, entries: Any, records: Any, start: Any, stop: Any
 ) -> tuple[list[Any], Any, Any]:
-    """Colours and alpha of the rays of a view, and their slopes if its lens distorts them."""
+    """Return colours and alpha of the rays of a view, and the slopes of the rays of a distorted lens."""
     view = CameraView.of_numbers(kind, numbers)
     lists = _bare_lists(entries, None, None, records, start, stop, dr.width(entries))
-    # The way back needs them again, and to undo a lens's distortion takes longer than a march.
+    # The backward pass reuses the slopes, because the inversion of a lens distortion takes longer than a march.
     slopes = Lanes(lists, view).centre_slopes() if view.distortion else None
     image = march(lists, view, quality, slopes=slopes)
     return image.rgb, image.alpha, slopes
@@ -212,20 +213,20 @@ def _way_back(
     gradient: list[Any],
     slopes: Any,
 ) -> Any:
-    """Gradient of the view records from those of colours and alpha, with room for so many pairs."""
+    """Return the gradient of the view records from those of colours and alpha, for at most ``room`` pairs."""
     view = CameraView.of_numbers(kind, numbers)
     lists = _bare_lists(entries, slots, first, records, start, stop, room)
     return _gradient(lists, view, quality, seen, gradient, slopes or Lanes(lists, view).centre_slopes())
 
 
 def _bare_lists(entries: Any, slots: Any, first: Any, records: Any, start: Any, stop: Any, pairs: int) -> TileLists:
-    """Tile lists of one instance for the order per tile."""
+    """Return tile lists of one instance for the order per tile."""
     visible = dr.width(records) // RECORD
     return TileLists(records, None, entries, slots, first, None, start, stop, visible, pairs, _PLACE.instance, None)
 
 
 class DepthRendering(RenderOp):
-    """A rendering and the sum ``moment`` of the centres' depths [m] by their weights in alpha."""
+    """Rendering with the ``moment``: the sum of the centres' depths [m], weighted by their share of alpha."""
 
     def __init__(self, lists: TileLists, view: CameraView, quality: Quality) -> None:
         super().__init__(lists, view, quality)
@@ -233,7 +234,7 @@ class DepthRendering(RenderOp):
         self.moment = self._depths.rgb[0]
 
     def gradient_of_moment(self, moment: Any) -> Any:
-        """Gradient of the records from an evaluated one of the moment."""
+        """Return the gradient of the records from an evaluated gradient of the moment."""
         nothing = dr.zeros(mi.Float, dr.width(moment))
         tinted = self._depths.gradient([moment, nothing, nothing], nothing)
         entry = dr.arange(mi.UInt32, dr.width(tinted))
@@ -245,11 +246,11 @@ class DepthRendering(RenderOp):
 def render_records(
     records: Any, least: Any, box: Any, view: CameraView, quality: Quality, *, depth: bool = False
 ) -> RenderOp:
-    """The image of what :func:`project_cloud` found; a :class:`DepthRendering` if it is to have depth.
+    """Render the result of :func:`project_cloud`; with ``depth``, as a :class:`DepthRendering`.
 
     Raises:
         ValueError: As for :func:`render_differentiable`.
-        CrowdedError: If there are too many pairs of a Gaussian and a tile to hold.
+        CrowdedError: If there are too many pairs of a Gaussian and a tile.
     """
     _check(view, quality)
     lists = bin_records(records, None, least, box, view, quality, _PLACE.instance, for_gradients=True)
@@ -257,7 +258,7 @@ def render_records(
 
 
 def pack_cloud(means: Any, quats: Any, scales: Any, opacities: Any, sh: Any, bands: int) -> Cloud:
-    """Differentiable counterpart of :func:`mitsplat.renderer.splatting.gaussian.upload_cloud`.
+    """Pack differentiable parameters like :func:`mitsplat.renderer.splatting.gaussian.upload_cloud`.
 
     Args:
         means: Flat device array of N x 3 centres.
@@ -287,7 +288,7 @@ def pack_cloud(means: Any, quats: Any, scales: Any, opacities: Any, sh: Any, ban
 
 
 class _March(dr.CustomOp):
-    """The march as a function of the view records."""
+    """March as a differentiable function of the view records."""
 
     def eval(self, records: Any, context: Callable[[], tuple[TileLists, CameraView, Quality]]) -> tuple[Any, ...]:
         lists, view, quality = context()
@@ -311,15 +312,15 @@ def march_backward(
     gradient: list[Any],
     slopes: tuple[list[Any], list[Any]] | None,
 ) -> Any:
-    """Gradient of the view records (flat, as ``lists.records``) from gradients of red, green, blue and alpha.
+    """Return the gradient of the flat view records from gradients of red, green, blue and alpha.
 
     Args:
         lists: Records per tile.
         view: Camera.
         quality: Cut-offs.
-        seen: Red, green, blue and alpha.
-        gradient: Of these.
-        slopes: Of the rays, where they are known.
+        seen: Rendered red, green, blue and alpha.
+        gradient: Gradients of these.
+        slopes: Slopes of the rays if already known.
     """
     if lists.pairs == 0:
         return dr.zeros(mi.Float, RECORD * max(1, lists.visible))
@@ -335,9 +336,9 @@ def march_backward(
 
 
 def _parts(lists: TileLists) -> Iterator[tuple[TileLists, Any]]:
-    """Lists of consecutive tiles with at most :data:`PAIRS_AT_ONCE` pairs, or of one tile; and numbers of their lanes.
+    """Yield lists of consecutive tiles with at most :data:`PAIRS_AT_ONCE` pairs, and their lane numbers.
 
-    Places by record are counted within each part.
+    A single tile may have more pairs. Positions by record are counted within each part.
     """
     begins = np.append(np.array(lists.start), lists.pairs).astype(np.int64)
     first = 0
@@ -373,7 +374,7 @@ def _gradient(
     gradient: list[Any],
     slopes: tuple[list[Any], list[Any]],
 ) -> Any:
-    """The gradient that comes from the tiles of some lists; they may say that there are more pairs than there are."""
+    """Return the gradient from the tiles of lists; ``lists.pairs`` is an upper bound of their pairs."""
     lanes = Lanes(lists, view)
     us, vs = slopes
     column = dr.arange(mi.UInt32, dr.width(lanes.start)) % TILE_WIDTH
@@ -386,7 +387,7 @@ def _gradient(
 
     d_colour = list(zip(*(load(g) for g in gradient[:3]), strict=True))
     whole = list(zip(*(load(c) for c in seen[:3]), strict=True))
-    # What lies behind, weighted with the gradient, less the gradient that reaches alpha through the end of the ray.
+    # Light behind, weighted with the gradient, minus the gradient of alpha through the final transmittance.
     behind = [
         sum(c * d for c, d in zip(cs, ds, strict=True)) - (1 - a) * d_alpha
         for cs, ds, a, d_alpha in zip(whole, d_colour, load(seen[3]), load(gradient[3]), strict=True)
@@ -404,7 +405,7 @@ def _gradient(
             q = (du * (a * du + b2 * dv) + dv * dv * c) * inverse
             z = depth * (1 + 0.5 * (e * du + f * dv)) * inverse
             hit = (log_opacity - q > cut) & (z > near) & (t > end)
-            # A response that overflows beyond the cut-off, or that rounding lifts over the peak, has no gradient.
+            # A response that overflows beyond the cut-off, or that rounding raises above the peak, has no gradient.
             inverse, q = dr.select(hit & (q > 0), inverse, 0), dr.select(hit & (q > 0), q, 0)
             alpha = dr.select(hit, dr.exp2(log_opacity - q), 0)
             weight = t * alpha
@@ -434,17 +435,17 @@ def _gradient(
 
 
 def _sum_shares(shares: Any, lists: TileLists) -> Any:
-    """Sum of the gradients that each record has from the columns of its tiles.
+    """Sum the gradients of each record over the columns of its tiles.
 
-    They are added in a fixed order, so that every run gives the same bits, which additions by atomics do not. A record
-    that covers many tiles is summed by several lanes, for which the others would have to wait.
+    The order of additions is fixed, so that every run is bit-identical; atomic additions are not. A record that covers
+    many tiles is summed by several lanes, so that other lanes do not wait for it.
     """
     record = dr.arange(mi.UInt32, lists.visible)
     first = dr.gather(mi.UInt32, lists.first, record)
     pairs = dr.gather(mi.UInt32, lists.first, record + 1) - first
     runs = dr.maximum((pairs + (_RUN - 1)) // _RUN, 1)
     begin = dr.prefix_sum(runs)
-    lanes = lists.visible + lists.pairs // _RUN  # no fewer than there are runs; what is left over finds nothing to add
+    lanes = lists.visible + lists.pairs // _RUN  # upper bound of the number of runs; spare lanes add nothing
     marks = dr.zeros(mi.UInt32, lanes)
     dr.scatter(marks, mi.UInt32(1), begin, begin > 0)
     owner = dr.cumsum(marks)
@@ -456,11 +457,11 @@ def _sum_shares(shares: Any, lists: TileLists) -> Any:
 
 
 _RUN = 32
-"""Tiles whose gradients one lane adds."""
+"""Number of tiles whose gradients one lane adds."""
 
 
 def _sum_rows(rows: Any, start: Any, stop: Any) -> Any:
-    """Sums of the rows of :data:`RECORD` floats from ``start`` up to ``stop``, as such rows."""
+    """Sum the rows of :data:`RECORD` floats from ``start`` to ``stop`` (exclusive); return one row per range."""
     width = dr.width(start)
 
     def add(i: Any, sums: list[Any]) -> tuple[Any, list[Any]]:

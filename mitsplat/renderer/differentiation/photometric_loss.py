@@ -1,4 +1,4 @@
-"""The loss that 3DGS trains with, L1 + D-SSIM, on the device and with its gradient.
+"""Photometric loss of 3DGS, L1 + D-SSIM, on the device, with its gradient.
 
 SSIM is that of Wang et al. 2004 with an 11 x 11 Gaussian window of 1.5 px, zero beyond the borders.
 """
@@ -20,13 +20,15 @@ _WEIGHTS = tuple(float(w) for w in _taps / _taps.sum())
 
 
 def photometric_loss(seen: list[Any], target: list[Any], width: int, height: int, ssim_share: float) -> Any:
-    """``(1 - s) L1 + s (1 - SSIM)`` of two pictures (Kerbl et al. 2023, eq. 7), with gradients to the first.
+    """Compute ``(1 - s) L1 + s (1 - SSIM)`` of two pictures (Kerbl et al. 2023, eq. 7).
+
+    The loss has gradients to the first picture.
 
     Args:
         seen: Flat row-major arrays of red, green and blue.
-        target: The same of what should be seen.
+        target: Target picture, in the same form.
         width: Width of the pictures [px].
-        height: Their height [px].
+        height: Height of the pictures [px].
         ssim_share: s, in [0, 1].
     """
     loss = mi.Float(0)
@@ -35,7 +37,7 @@ def photometric_loss(seen: list[Any], target: list[Any], width: int, height: int
     if ssim_share == 0:
         return loss
     targets = [dr.detach(b) for b in target]
-    # A function hides what needs no gradient from Dr.Jit.
+    # The lambda hides the arguments without gradient from Dr.Jit.
     return loss + ssim_share * (1 - dr.custom(_Ssim, seen, lambda: (targets, width, height)))
 
 
@@ -85,7 +87,10 @@ class _Ssim(dr.CustomOp):
 
 
 def _ssim_of(mx: Any, my: Any, xx: Any, yy: Any, xy: Any) -> tuple[Any, list[Any]]:
-    """SSIM from a window's means of x, y, x^2, y^2 and xy, and its derivatives by those of x, x^2 and xy."""
+    """Return SSIM and its derivatives by the means of x, x^2 and xy.
+
+    Arguments are a window's means of x, y, x^2, y^2 and xy.
+    """
     a1, a2 = 2 * mx * my + _C1, 2 * (xy - mx * my) + _C2
     b1, b2 = mx * mx + my * my + _C1, xx - mx * mx + yy - my * my + _C2
     scale = dr.rcp(b1 * b2)
@@ -96,7 +101,7 @@ def _ssim_of(mx: Any, my: Any, xx: Any, yy: Any, xy: Any) -> tuple[Any, list[Any
 
 
 def _pack(planes: list[Any], pixel: Any) -> Any:
-    """Planes side by side per pixel: one fetch brings all of them."""
+    """Interleave planes per pixel, so that one fetch reads all of them."""
     packed = dr.empty(mi.Float, len(planes) * dr.width(pixel))
     dr.scatter(packed, mi.ArrayXf(planes), pixel)
     dr.eval(packed)
@@ -108,13 +113,13 @@ _Write = Callable[[Any, list[Any]], None]
 
 
 def _blur(read: _Read, write: _Write, width: int, height: int) -> None:
-    """Means in Gaussian windows, zero beyond the borders, of several values per pixel.
+    """Compute means of several values per pixel in Gaussian windows, zero beyond the borders.
 
     Args:
-        read: The values of pixels, from their numbers and whether they are inside.
-        write: Takes numbers of pixels and the means there.
+        read: Function that returns the values of pixels, from their numbers and an inside mask.
+        write: Function that receives pixel numbers and the means there.
         width: Width of the picture [px].
-        height: Its height [px].
+        height: Height of the picture [px].
     """
     pixel = dr.arange(mi.UInt32, width * height)
     y = pixel // width
@@ -131,7 +136,10 @@ def _blur(read: _Read, write: _Write, width: int, height: int) -> None:
 
 
 def _window(read: _Read, pixel: Any, place: Any, step: int, length: int) -> list[Any]:
-    """Weighted means of the pixels around each one along an axis, where it has this place of ``length``."""
+    """Return weighted means around each pixel along one axis.
+
+    ``place`` is the pixel's coordinate on the axis, and ``length`` the size of the axis.
+    """
     sums: list[Any] = []
     for offset, weight in zip(range(-RADIUS, RADIUS + 1), _WEIGHTS, strict=True):
         inside = (mi.Int32(place) + offset >= 0) & (mi.Int32(place) + offset < length)

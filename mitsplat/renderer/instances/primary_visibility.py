@@ -1,4 +1,4 @@
-"""What rays show: splats, what of visible meshes is seen through and beside them, and emitters behind both."""
+"""Primary visibility of rays: splats, visible meshes behind and between them, and emitters behind both."""
 
 from __future__ import annotations
 
@@ -13,23 +13,23 @@ from mitsplat.renderer.splatting.gaussian import srgb_to_linear
 from mitsplat.renderer.splatting.march import Image
 
 NO_SPLAT = 1 << 16
-"""What keys of meshes and emitters start from, above all ids of instances."""
+"""First key of meshes and emitters, above all instance ids."""
 
 
 @dataclass(frozen=True, eq=False)
 class Shown:
-    """What some rays show, before light.
+    """Primary visibility of rays, without light.
 
     Attributes:
-        colour: Linear, as captured, multiplied by the opacity ``cover`` of splats and plainly diffuse meshes (Color3f).
-        alpha: Opacity of all.
+        colour: Linear captured colour, multiplied by ``cover`` (Color3f).
+        alpha: Total opacity.
         veil: Opacity of the splats.
-        cover: Opacity of what light is traced at.
-        solid: Whether a mesh is behind the splats.
-        plain: Whether that is plainly diffuse.
-        front: Whether a mesh or an emitter is seen rather than splats.
+        cover: Opacity of the surfaces that light is traced at: splats and purely diffuse meshes.
+        solid: True if a mesh is behind the splats.
+        plain: True if that mesh is purely diffuse.
+        front: True if the pixel shows a mesh or an emitter instead of splats.
         glow: Radiance of emitters behind (Color3f), in the picture's scale.
-        key: The same where rays show the same thing: instance, or mesh.
+        key: Equal for rays that show the same instance or the same mesh.
     """
 
     colour: Any
@@ -44,9 +44,10 @@ class Shown:
 
     @classmethod
     def of(cls, splat: Image, behind: Behind | None, lamps: SeenLights | None, z_max: Any | None, scale: Any) -> Shown:
-        """What rays show of splats, meshes and emitters, of which the last are seen up to the depths ``z_max``.
+        """Combine splats, meshes and emitters.
 
-        ``scale`` is what radiance is multiplied by in the picture (Color3f).
+        ``z_max`` is the depth along z [m] of the nearest mesh or emitter, behind which nothing is visible. ``scale`` is
+        the factor from radiance to the picture's scale (Color3f).
         """
         covered = dr.maximum(splat.alpha, 1e-6)
         colour = mi.Color3f(*[srgb_to_linear(c / covered) * splat.alpha for c in splat.rgb])
@@ -69,7 +70,10 @@ class Shown:
         return cls(colour, alpha, splat.alpha, cover, solid, plain, front, glow, key)
 
     def lit(self, light: Any, highlight: Any, radiance: Any | None) -> tuple[Any, Any]:
-        """Linear colour in light, and as captured (Color3f), of rays whose meshes send ``radiance``, if any does."""
+        """Return linear colours (Color3f) with light and as captured.
+
+        ``radiance`` is that of meshes that are not purely diffuse, or None.
+        """
         glow = self.glow
         if radiance is not None:
             glow = dr.select(self.solid & ~self.plain, radiance * (1 - self.veil), glow)

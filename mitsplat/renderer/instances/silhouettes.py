@@ -1,10 +1,9 @@
-"""Every instance as it would be seen alone, on a canvas that is larger than the image.
+"""Unoccluded silhouettes of instances on a canvas larger than the image.
 
-A pixel belongs to an instance that is alone where it lets less than half of the light behind it through: the rule of
-the instance image, :class:`mitsplat.renderer.splatting.march.Image`, with what is left of a ray counted as environment.
-Opacity
-does not depend on the order of Gaussians, so lists of tiles are sorted by instance instead of by depth: one packet of
-lanes walks what a tile has of an instance, and stops as soon as all its pixels are decided.
+A pixel belongs to the silhouette of an instance if the instance alone transmits less than half of the light behind it.
+This is the rule of the instance image (:class:`mitsplat.renderer.splatting.march.Image`), where remaining transmittance
+counts as environment. Opacity does not depend on the order of Gaussians, so tile lists are sorted by instance instead
+of by depth. One packet of lanes walks the entries of one instance in a tile, and stops when all its pixels are decided.
 """
 
 from __future__ import annotations
@@ -33,20 +32,21 @@ from mitsplat.renderer.splatting.tiles import TileLists, bin_gaussians
 from mitsplat.renderer.splatting.walk import exp2, faintest, largest, respond_along
 
 MARGINS = (1.0, 0.5, 0.25, 0.125, 0.0)
-"""Widths of the canvas around the image that are tried, in images. One image on each side is BOP's; where lens
-distortion cannot be inverted that far out, the widest is taken where it can."""
+"""Candidate margins of the canvas around the image, in image sizes. BOP uses one image on each side. Where lens
+distortion cannot be inverted that far out, the largest margin with an inverse is used.
+"""
 
 _ROWS_OF_COLUMN = (np.arange(1 << TILE_HEIGHT)[:, None] >> np.arange(TILE_HEIGHT) & 1).astype(bool)
-"""Which pixels of a column of a tile, from the top, the bits of a number cover."""
+"""Pixels of a tile column, from the top, that the bits of a number cover."""
 
 _INVERTED = 0.01
-"""How near to itself a pixel must come back through the inverted distortion [px]."""
+"""Largest round-trip error of a pixel through the inverted distortion [px]."""
 
 
 def splat_silhouettes(
     clouds: CloudSet, placements: Sequence[Placement], view: CameraView, quality: Quality
 ) -> dict[int, Silhouette]:
-    """Silhouettes of the instances above 0 by their splats; instances without any pixel are absent."""
+    """Return the silhouettes of instances above 0 from their splats; instances without pixels are omitted."""
     objects = [placement for placement in placements if placement.instance > 0]
     if not objects:
         return {}
@@ -60,9 +60,9 @@ def splat_silhouettes(
 def _cover(
     clouds: CloudSet, objects: Sequence[Placement], canvas: CameraView, quality: Quality, ids: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Tile, instance (as position in ``ids``) and covered pixels of every run, see :func:`_covered`.
+    """Return tile, instance (as position in ``ids``) and covered pixels of every run, see :func:`_covered`.
 
-    A canvas that is too crowded for the memory is looked at in parts.
+    A canvas with too many pairs for the memory is processed in parts.
     """
     slots = np.zeros(int(ids[-1]) + 1, dtype=np.uint32)
     slots[ids] = np.arange(len(ids), dtype=np.uint32)
@@ -89,7 +89,10 @@ def _cover(
 def proxy_silhouettes(
     proxies: Mapping[int, Sequence[tuple[trimesh.Trimesh, np.ndarray]]], view: CameraView
 ) -> dict[int, Silhouette]:
-    """The same by proxy meshes: (mesh, world_from_mesh) of every part of an instance, by the instance's id."""
+    """Return the silhouettes of instances from proxy meshes.
+
+    ``proxies`` holds (mesh, world_from_mesh) of every part of an instance, by instance id.
+    """
     canvas, left, top = _canvas(view)
     found = {}
     for instance, parts in proxies.items():
@@ -107,7 +110,7 @@ def proxy_silhouettes(
 
 
 def _canvas(view: CameraView) -> tuple[CameraView, int, int]:
-    """The view on a larger canvas, and where on it the image begins."""
+    """Return the view on a larger canvas, and the position of the image on it (left, top)."""
     share = _margin(view.width, view.height, view.fx, view.fy, view.cx, view.cy, view.distortion, view.lens)
     left, top = int(share * view.width), int(share * view.height)
     width, height = view.width + 2 * left, view.height + 2 * top
@@ -135,7 +138,7 @@ def _margin(
         pixels = np.stack([x.ravel(), y.ravel()], axis=1)
         slopes = camera.ray_slopes(pixels)
         back, _ = camera.project(np.column_stack([slopes, np.ones(len(slopes))]))
-        # Farther from the centre must stay farther: past its fold a distortion is inverted to the wrong side.
+        # The radius must increase outwards: beyond a fold, the distortion is inverted to the wrong side.
         radius = np.linalg.norm(slopes, axis=1).reshape(x.shape)
         grows = all(
             (np.diff(line, axis=1) > 0).all()
@@ -148,12 +151,12 @@ def _margin(
 
 @dataclass(frozen=True, eq=False)
 class _Runs:
-    """What tiles have of instances.
+    """Runs of entries of one instance in one tile.
 
     Attributes:
-        place: Of the tile among those that have lists.
-        slot: Of the instance in the ids.
-        start, stop: Range of its entries.
+        place: Index of the tile among those with lists.
+        slot: Index of the instance in the ids.
+        start, stop: Range of the entries.
     """
 
     place: Any
@@ -163,7 +166,7 @@ class _Runs:
 
 
 def _runs(lists: TileLists) -> _Runs:
-    """Every tile and instance that meet, of lists that are sorted by instance and not empty."""
+    """Return the runs of non-empty lists that are sorted by instance."""
     entry, tile = dr.arange(mi.UInt32, lists.pairs), dr.arange(mi.UInt32, dr.width(lists.start))
     slot, filled = lists.levels, lists.stop > lists.start
     first = dr.zeros(mi.UInt32, lists.pairs)
@@ -189,7 +192,7 @@ def _runs(lists: TileLists) -> _Runs:
 
 
 def _covered(lists: TileLists, view: CameraView, quality: Quality, runs: _Runs) -> Any:
-    """For every run and each column of its tile, the pixels that the instance covers, as bits from the top."""
+    """Return the covered pixels of every run, for each column of its tile, as bits from the top."""
     lane = dr.arange(mi.UInt32, dr.width(runs.place) * TILE_WIDTH)
     run, column = lane // TILE_WIDTH, lane % TILE_WIDTH
     tile = dr.gather(mi.UInt32, lists.tiles, dr.gather(mi.UInt32, runs.place, run))
@@ -227,7 +230,7 @@ def _covered(lists: TileLists, view: CameraView, quality: Quality, runs: _Runs) 
 def _assemble(
     tile: np.ndarray, slot: np.ndarray, bits: np.ndarray, ids: np.ndarray, canvas: CameraView, left: int, top: int
 ) -> dict[int, Silhouette]:
-    """Masks of whole instances from those of their tiles."""
+    """Assemble the masks of instances from those of their tiles."""
     columns = bits.astype(np.uint8).reshape(len(tile), TILE_WIDTH)
     chosen = np.flatnonzero(columns.any(axis=1))
     chosen = chosen[np.argsort(slot[chosen], kind="stable")]
@@ -251,7 +254,7 @@ def _assemble(
 
 
 def _window(view: CameraView, parts: Sequence[tuple[trimesh.Trimesh, np.ndarray]]) -> tuple[int, int, int, int] | None:
-    """Box of pixels on the canvas that meshes may cover, or None."""
+    """Return the box of canvas pixels that meshes may cover, or None."""
     camera = view.camera
     points = np.concatenate([trimesh.transform_points(mesh.vertices, pose) for mesh, pose in parts])
     pixels, depth = camera.project(points)
@@ -263,7 +266,7 @@ def _window(view: CameraView, parts: Sequence[tuple[trimesh.Trimesh, np.ndarray]
 
 
 def _trace_alone(view: CameraView, window: tuple[int, int, int, int], mesh: trimesh.Trimesh, pose: np.ndarray) -> Any:
-    """Whether the rays of a window of pixels meet a mesh."""
+    """Return True for the pixels of a window whose rays hit a mesh."""
     x0, y0, x1, y1 = window
     lane = dr.arange(mi.UInt32, (x1 - x0) * (y1 - y0))
     width = dr.opaque(mi.UInt32, x1 - x0)

@@ -1,4 +1,4 @@
-"""Visible meshes, and splats that they mirror.
+"""Visible meshes, and the splats that they reflect.
 
 In: meshes with materials. Out: the radiance of visible meshes, and of splats along reflected rays.
 """

@@ -1,7 +1,7 @@
-"""What rays that leave a visible mesh see of the splats: the colour of the first solid that they meet.
+"""Splats seen by rays from visible meshes: the colour of the first stochastic solid on the ray.
 
-The solids are those of :mod:`mitsplat.renderer.occluders.splat_occlusion`, by which a Gaussian stops a ray with the
-chance of its opacity there. The colour of the first one is then, in the mean, what blending front to back would give.
+The solids are those of :mod:`mitsplat.renderer.occluders.splat_occlusion`: a Gaussian stops a ray with a probability
+equal to its opacity there. The expected colour of the first solid is the result of front-to-back blending.
 """
 
 from __future__ import annotations
@@ -21,22 +21,22 @@ from mitsplat.renderer.splatting.projection import CloudSet, Placement
 from mitsplat.renderer.splatting.splat_appearance import ROW, changed, rows_of
 
 MOST_SOLIDS = 1_000_000
-"""Of all sets together, roughly; large scenes have fewer sets, but never less than two."""
+"""Approximate limit of the solids in all sets. Larger scenes have fewer sets, but at least two."""
 
 _ROW = 16
-"""Floats per placement: rotation into the splats' frame (9), first Gaussian, whether relit, footprint [m], padding."""
+"""Floats per placement: rotation into the splats' frame (9), relit flag, footprint [m], padding."""
 
 
 @dataclass(frozen=True, eq=False)
 class Glimpse:
-    """What rays see of splats.
+    """Hits of rays on splats.
 
     Attributes:
-        distance: Along the ray [m], infinite where it meets none.
+        distance: Distance along the ray [m], infinite for a miss.
         colour: Display-encoded captured colour (three arrays).
-        normal: Of the Gaussian's flattest side, towards the ray's origin.
-        relit: Whether the colour was captured under uniform light.
-        footprint: How far off the surface its own splats shadow nothing [m].
+        normal: Normal of the Gaussian's flattest side, towards the ray's origin.
+        relit: True if the colour was captured under uniform light.
+        footprint: Distance from the surface within which its own splats cast no shadow [m].
     """
 
     distance: Any
@@ -48,15 +48,15 @@ class Glimpse:
 
 @dataclass(frozen=True, eq=False)
 class SplatMirror:
-    """Splats of a scene as rays from anywhere see them.
+    """Splats of a scene for rays from any point.
 
     Attributes:
-        solids: What they are to a ray.
-        clouds: Their colours.
-        gaussians: Placement and number in its cloud of each triangle's Gaussian, two per triangle.
+        solids: Stochastic solids that rays hit.
+        clouds: Colours of the splats.
+        gaussians: Placement and Gaussian number in the clouds for each triangle, two numbers per triangle.
         table: ``_ROW`` floats per placement.
-        appearances: Floats per placement, see :mod:`mitsplat.renderer.splatting.splat_appearance`; None if there are
-        none.
+        appearances: Floats per placement, see :mod:`mitsplat.renderer.splatting.splat_appearance`; None if no placement
+            has an appearance.
     """
 
     solids: Solids
@@ -69,7 +69,7 @@ class SplatMirror:
     def build(
         cls, clouds: CloudSet | None, placements: Sequence[Placement], splats: Sequence[Any], relit: Sequence[bool]
     ) -> SplatMirror | None:
-        """The placements' splats, of which those are ``relit`` that were captured under uniform light."""
+        """Build the solids of the placements' splats; ``relit`` marks placements captured under uniform light."""
         total = sum(len(splats[p.cloud]) for p in placements)
         if clouds is None or not total:
             return None
@@ -93,7 +93,7 @@ class SplatMirror:
         return cls(solids, clouds, wrapped(mi.UInt32, owners), wrapped(mi.Float, rows), appearances)
 
     def look(self, ray: Any, key: Any, active: Any) -> Glimpse:
-        """What rays see, each by the set of solids that its ``key`` decides."""
+        """Trace rays against splats; the ``key`` of a ray selects its set of solids."""
         inside, start, met = self.solids.enter(ray, key, mi.Float(0))
         hit = self.solids.scene.ray_intersect_preliminary(inside, active=active & met)
         found = active & met & hit.is_valid()

@@ -1,9 +1,9 @@
-"""Visible meshes: where a camera sees them, and the light that their materials send to it.
+"""Visible meshes: camera hits, and the radiance of their materials.
 
-Plainly diffuse ones are lit as splats are, see :mod:`mitsplat.renderer.light.light`. What else Mitsuba has of materials
-is path traced (Kajiya 1986): at every vertex one emitter is sampled and one direction of the material, weighted by the
-power heuristic (Veach 1997, section 9.2.4), as in Mitsuba's integrator ``path``, whose pictures of meshes alone these
-equal. A path ends where it meets a splat, whose captured colour holds all further bounces.
+Purely diffuse meshes are lit like splats, see :mod:`mitsplat.renderer.light.light`. All other materials of Mitsuba are
+path traced (Kajiya 1986). Each vertex samples one emitter and one direction of the material, weighted by the power
+heuristic (Veach 1997, section 9.2.4). For meshes alone, the result equals that of Mitsuba's integrator ``path``. A path
+ends at a splat, whose captured colour contains all further bounces.
 """
 
 from __future__ import annotations
@@ -26,22 +26,24 @@ from mitsplat.renderer.rays.device_arrays import gathered, ray_scene, wrapped
 from mitsplat.renderer.splatting.gaussian import srgb_to_linear
 
 LANES = 1 << 20
-"""Paths that are traced at once."""
+"""Number of paths that are traced at once."""
 
 R7 = (3915259345, 3569120481, 3253582939, 2965941329, 2703729436, 2464699080, 2246800835)
 """Additive recurrence of seven dimensions in units of 2^-32 (Roberts 2018): powers of 1/g with g^8 = g + 1."""
 
 PER_VERTEX = 16
-"""Random numbers that are kept for every vertex of a path."""
+"""Random numbers that are reserved for each vertex of a path."""
 
 ROUNDS = 8
-"""Of the hash behind them (Zafar et al. 2010): after four, numbers of neighbouring pixels are still alike."""
+"""Rounds of the hash behind the random numbers (Zafar et al. 2010). After four rounds, the numbers of adjacent pixels
+are still correlated.
+"""
 
 FOOTPRINT = 4
-"""Points along each side of a pixel's footprint that the reflectance of patterned meshes is looked at."""
+"""Sample points along each side of a pixel's footprint for the reflectance of textured meshes."""
 
 _BENT = ("NormalMap", "BumpMap")
-"""Materials that bend the normals of the one that they hold."""
+"""Materials that perturb the normals of their nested material."""
 
 
 def _has(flags: Any, *names: str) -> Any:
@@ -49,32 +51,32 @@ def _has(flags: Any, *names: str) -> Any:
 
 
 def is_plain(bsdf: Any) -> bool:
-    """Whether a material is diffuse and no more."""
+    """Return True if a material is purely diffuse."""
     flags, diffuse = int(bsdf.flags()), int(mi.BSDFFlags.DiffuseReflection)
     return (flags & int(mi.BSDFFlags.All)) == diffuse and not any(name in str(bsdf) for name in _BENT)
 
 
 def is_clear(bsdf: Any) -> bool:
-    """Whether light passes through a material, so that it casts no shadow on splats and diffuse meshes."""
+    """Return True if light passes through a material, which then casts no shadow on splats and diffuse meshes."""
     return bool(_has(int(bsdf.flags()), "GlossyTransmission", "DeltaTransmission")) or "ThinDielectric" in str(bsdf)
 
 
 def has_texture(bsdf: Any) -> bool:
-    """Whether a material changes with texture coordinates; Mitsuba's flag for that is not set for textures."""
+    """Return True if a material depends on texture coordinates; Mitsuba does not set its flag for textures."""
     return any(key.endswith(".to_uv") for key in mi.traverse(bsdf).keys())  # noqa: SIM118 - no mapping
 
 
 @dataclass(frozen=True, eq=False)
 class Behind:
-    """Visible meshes as a camera sees them.
+    """Camera hits on visible meshes.
 
     Attributes:
-        depth: Along z [m], infinite where there is none.
-        reflectance: Diffuse albedo (Color3f) of plain ones.
-        valid: Whether there is one.
-        plain: Whether it is plainly diffuse.
+        depth: Depth along z [m], infinite for a miss.
+        reflectance: Diffuse albedo (Color3f) of purely diffuse meshes.
+        valid: True for a hit.
+        plain: True if the mesh is purely diffuse.
         normal, face: Unit normals of the surface and of its triangle, towards the camera.
-        hit: Where it is met.
+        hit: Mitsuba's intersection.
     """
 
     depth: Any
@@ -86,7 +88,7 @@ class Behind:
     hit: Any
 
     def before(self, other: Hit) -> Hit:
-        """The nearer of the meshes and what else the same rays meet."""
+        """Return the nearer of these hits and other hits of the same rays."""
         closer = self.valid & (self.hit.t < other.distance)
         return Hit(
             dr.select(closer, self.hit.t, other.distance),
@@ -99,12 +101,12 @@ class Behind:
 
 @dataclass(frozen=True, eq=False)
 class VisibleMeshes:
-    """The meshes of a scene that are neither splats nor lights.
+    """Meshes of a scene that are neither splats nor lights.
 
     Attributes:
-        scene: A Mitsuba scene of them alone.
-        plain: By number of the shape, whether it is plainly diffuse; None if all are.
-        patterned: Whether the reflectance of any of them changes over its surface.
+        scene: Mitsuba scene of these meshes only.
+        plain: True if a shape is purely diffuse, by shape number; None if all shapes are.
+        patterned: True if the reflectance of any mesh varies over its surface.
     """
 
     scene: Any
@@ -113,7 +115,7 @@ class VisibleMeshes:
 
     @classmethod
     def build(cls, shapes: Sequence[Any]) -> VisibleMeshes | None:
-        """The visible ones of ``shapes``; None if there are none."""
+        """Build the scene of the visible ``shapes``; return None if there are none."""
         if not shapes:
             return None
         scene = ray_scene({f"visible_{i}": shape for i, shape in enumerate(shapes)})
@@ -127,13 +129,13 @@ class VisibleMeshes:
         return cls(scene, wrapped(mi.Bool, table), patterned)
 
     def is_plain(self, hit: Any) -> Any:
-        """Whether what is hit is plainly diffuse; false where nothing is."""
+        """Return True for hits on purely diffuse meshes, False for misses."""
         if self.plain is None:
             return hit.is_valid()
         return dr.gather(mi.Bool, self.plain, dr.reinterpret_array(mi.UInt32, hit.shape), hit.is_valid())
 
     def trace(self, view: CameraView, rays: Any, at: tuple[Any, Any] | None = None) -> Behind:
-        """What camera rays meet: those through positions ``at`` [px], or through the centres of all pixels."""
+        """Trace camera rays through positions ``at`` [px], or through the centres of all pixels."""
         hit = self.scene.ray_intersect_preliminary(rays, coherent=True)
         si = hit.compute_surface_interaction(rays)
         valid = si.is_valid()
@@ -146,7 +148,7 @@ class VisibleMeshes:
         return behind
 
     def _reflectance(self, view: CameraView, rays: Any, at: tuple[Any, Any] | None, si: Any, active: Any) -> Any:
-        """Diffuse albedo (Color3f) where rays meet meshes; of patterns, its mean over the pixel's footprint.
+        """Return the diffuse albedo (Color3f) of hits; for textures, its mean over the pixel's footprint.
 
         The footprint is the parallelogram of ray differentials (Igehy 1999), sampled at ``FOOTPRINT`` squared points.
         """
@@ -169,12 +171,12 @@ class VisibleMeshes:
 
 @dataclass(frozen=True, eq=False)
 class SeenLights:
-    """Emitters as a camera sees them.
+    """Emitters seen by a camera.
 
     Attributes:
-        depth: Along z [m] of those that are shapes, infinite where there is none.
-        radiance: Theirs, or else that of the sky (Color3f).
-        everywhere: Whether there is a sky.
+        depth: Depth along z [m] of emitters that are shapes, infinite for a miss.
+        radiance: Radiance of the shape, otherwise of the sky (Color3f).
+        everywhere: True if there is a sky.
     """
 
     depth: Any
@@ -183,7 +185,7 @@ class SeenLights:
 
     @classmethod
     def trace(cls, scene: Any, view: CameraView, rays: Any) -> SeenLights | None:
-        """What the camera's rays see of a scene's emitters; None if it has none that can be seen."""
+        """Trace camera rays to a scene's emitters; return None if no emitter can be visible."""
         sky = scene.environment()
         if any(shape.is_emitter() for shape in scene.shapes()):
             si = scene.ray_intersect(rays, mi.RayFlags.All, coherent=True)
@@ -195,7 +197,7 @@ class SeenLights:
         emitter = si.emitter(scene)
         shines = emitter != None  # noqa: E711 - of every element
         depth = dr.select(shines & si.is_valid(), si.t * view.cosine(rays), dr.inf)
-        # A mesh that hides the sky is told by its depth.
+        # Meshes that occlude the sky are handled by their depth.
         lights = cls(depth, dr.select(shines, emitter.eval(si, shines), 0), sky is not None)
         dr.eval(lights)
         return lights
@@ -207,8 +209,8 @@ class _Path:
 
     Attributes:
         lane: Number of the path.
-        ray, hit: The ray that has come here, and what it has met.
-        throughput: Radiance that reaches the camera per radiance that leaves here (Color3f).
+        ray, hit: Incoming ray and its intersection.
+        throughput: Radiance at the camera per radiance that leaves the vertex (Color3f).
     """
 
     lane: Any
@@ -219,18 +221,18 @@ class _Path:
 
 @dataclass(frozen=True, eq=False)
 class PathTracer:
-    """Light that visible meshes send along camera rays.
+    """Path tracer for the radiance of visible meshes along camera rays.
 
     Attributes:
-        meshes: What camera rays meet.
-        scene: The whole scene, with its emitters.
-        proxies: What else stands in the light.
-        mirror: Splats that paths may meet, or None.
-        exposure: What radiance is multiplied by in the picture (Color3f).
+        meshes: Meshes that camera rays hit.
+        scene: Complete scene with its emitters.
+        proxies: Additional occluders.
+        mirror: Splats that paths may hit, or None.
+        exposure: Factor from radiance to the picture's scale (Color3f).
         white: Irradiance (Color3f) under which uniformly captured colours are shown unchanged.
-        max_depth: Longest paths, counted as by Mitsuba: 2 is direct light.
-        bounce: Whether splats light diffuse surfaces; mirrors show them in any case.
-        seed: Of all random numbers.
+        max_depth: Largest path length, counted as in Mitsuba: 2 is direct light.
+        bounce: True if splats light diffuse surfaces; mirrors always show splats.
+        seed: Seed of all random numbers.
     """
 
     meshes: VisibleMeshes
@@ -244,12 +246,13 @@ class PathTracer:
     seed: int
 
     def radiance(self, view: CameraView, ray: Any, hit: Any, pixel: Any, samples: int) -> Any:
-        """Mean (Color3f) over ``samples`` paths from each of some pixels, in the picture's scale.
+        """Return the mean radiance (Color3f) over ``samples`` paths per pixel, in the picture's scale.
 
-        ``ray`` through the pixel's centre meets a mesh at ``hit``. Other rays of the pixel start paths where they do.
+        ``ray`` through the pixel's centre hits a mesh at ``hit``. Paths start along other rays of the pixel where these
+        hit a mesh too.
         """
         count = dr.width(pixel)
-        # Far apart, so that no two pictures share random numbers.
+        # The factor separates the seeds, so that no two pictures share random numbers.
         seed = dr.opaque(mi.UInt32, self.seed * 2654435761 % (1 << 32))
         most = max(1, min(samples, LANES // count))
         total, done = mi.Color3f(dr.zeros(mi.Float, count)), 0
@@ -270,7 +273,10 @@ class PathTracer:
         return total / samples
 
     def _beside(self, view: CameraView, dice: _Dice, ray: Any, hit: Any) -> tuple[Any, Any]:
-        """Rays through random points of the pixels and what they meet; through the centres where that is plain."""
+        """Return rays through random points of the pixels and their hits.
+
+        The ray through the centre is used where the random ray misses or hits a purely diffuse mesh.
+        """
         row = dice.pixel // view.width
         other = mi.Ray3f(ray)
         x, y = mi.Float(dice.pixel - row * view.width), mi.Float(row)
@@ -280,7 +286,7 @@ class PathTracer:
         return dr.select(usable, other, ray), dr.select(usable, beside, hit)
 
     def _trace(self, path: _Path, dice: _Dice) -> Any:
-        """Radiance (Color3f) of every path."""
+        """Return the radiance (Color3f) of every path."""
         result = mi.Color3f(dr.zeros(mi.Float, dr.width(path.lane)))
         lights = bool(self.scene.emitters())
         for depth in range(self.max_depth - 1):
@@ -331,7 +337,7 @@ class PathTracer:
 
     @staticmethod
     def _interaction(path: _Path) -> Any:
-        """The surface where paths are, turned towards them if its material has one side and lets no light through."""
+        """Return the surface at path vertices, flipped towards the path if its material is opaque and one-sided."""
         si = path.hit.compute_surface_interaction(path.ray, mi.RayFlags.All)
         flags = si.bsdf().flags()
         behind = (si.wi.z < 0) & ~_has(flags, "BackSide", "Transmission")
@@ -344,7 +350,7 @@ class PathTracer:
         return si
 
     def _add_direct(self, result: Any, path: _Path, si: Any, bsdf: Any, context: Any, point: Any, key: Any) -> None:
-        """Add light that arrives from one emitter."""
+        """Add the direct light of one sampled emitter."""
         rough = _has(bsdf.flags(), "Smooth")
         towards, light = self.scene.sample_emitter_direction(si, point, False, rough)
         out = si.to_local(towards.d)
@@ -358,7 +364,7 @@ class PathTracer:
         self._add_lit(result, path.lane, ray, arrives, key)
 
     def _add_lit(self, result: Any, lane: Any, ray: Any, light: Any, key: Any) -> None:
-        """Add light to paths where nothing stands in the way of rays; a kernel for every scene that is traced."""
+        """Add light to paths whose shadow rays are unoccluded; each traced scene has a kernel of its own."""
         dr.eval(ray, light, key)
         free = dr.max(light) > 0
         free &= ~self.scene.ray_test(ray, active=free)
@@ -368,7 +374,7 @@ class PathTracer:
         _add(result, lane, dr.select(free, light, 0))
 
     def _look(self, path: _Path, smooth: Any, dice: _Dice, depth: int, result: Any) -> Glimpse | None:
-        """Add what paths see of splats."""
+        """Add the light of splats that paths hit."""
         if self.mirror is None:
             return None
         own = gathered(dice, path.lane)
@@ -400,7 +406,7 @@ class PathTracer:
         return glimpse
 
     def _add_emission(self, result: Any, path: _Path, reference: Any, density: Any, delta: Any, active: Any) -> None:
-        """Add light of emitters that paths have met."""
+        """Add the light of emitters that paths hit."""
         si = path.hit.compute_surface_interaction(path.ray, mi.RayFlags.All)
         emitter = si.emitter(self.scene)
         towards = mi.DirectionSample3f(self.scene, si, reference)
@@ -412,18 +418,18 @@ class PathTracer:
 
 @dataclass(frozen=True, eq=False)
 class _Dice:
-    """Random numbers of paths: the first vertices of a pixel's paths share a low-discrepancy sequence."""
+    """Random numbers of paths; the first vertices of a pixel's paths share a low-discrepancy sequence."""
 
     pixel: Any
     number: Any
     seed: Any
 
     def key(self, depth: int) -> Any:
-        """Something different for every path and vertex."""
+        """Return an integer that differs between paths and vertices."""
         return self.pixel * 0x9E3779B1 + self.number * PER_VERTEX * 64 + self._dimension(depth, 9) + self.seed
 
     def number_of(self, depth: int, dimension: int) -> Any:
-        """A number in [0, 1)."""
+        """Return a random number in [0, 1)."""
         if depth == 0 and dimension < len(R7):
             shift = mi.sample_tea_32(self.pixel, self.seed + self._dimension(0, dimension), ROUNDS)[0]
             return mi.Float((shift + self.number * R7[dimension]) >> 8) * 2.0**-24
@@ -444,7 +450,7 @@ def _power(own: Any, other: Any) -> Any:
 
 
 def _add(total: Any, lane: Any, light: Any) -> None:
-    """Add ``light`` to the paths ``lane``, no two of which are the same."""
+    """Add ``light`` to the paths ``lane``, which must be distinct."""
     light = dr.gather(mi.Color3f, total, lane) + light
     dr.eval(light)
     dr.scatter(total, light, lane)

@@ -1,4 +1,4 @@
-"""Proxy surfaces that rays are traced against: what stands in the light, and where light arrives."""
+"""Proxy surfaces that rays are traced against: occluders of light, and surfaces that receive it."""
 
 from __future__ import annotations
 
@@ -17,22 +17,23 @@ from mitsplat.renderer.occluders.splat_occlusion import Caster, SplatOccluders
 from mitsplat.renderer.rays.device_arrays import ray_scene, wrapped
 
 NOISE_CREASE = 10.0
-"""Dihedral angle of a crease over the lower quartile of a mesh, which is zero where it was drawn: flat faces have edges
-inside; and from 2 to 8 degrees where a smooth surface was reconstructed."""
+"""Dihedral angle of a crease over the lower quartile of a mesh's dihedral angles. The quartile is zero for CAD meshes,
+whose flat faces have interior edges, and 2 to 8 degrees for reconstructed smooth surfaces.
+"""
 
 SHARPEST = np.radians(80.0)
-"""Dihedral angle that is a crease in any mesh [rad]."""
+"""Dihedral angle that is a crease in every mesh [rad]."""
 
 
 @dataclass(frozen=True, eq=False)
 class Occluder:
-    """A proxy surface.
+    """Proxy surface.
 
     Attributes:
         mesh: Surface in its own frame [m].
         instance: Instance id, 0 for the environment.
-        dynamic: Whether its shadow is missing in what was captured.
-        world_from_mesh: Where it is: a similarity transform, shape (4, 4).
+        dynamic: True if the captured colours do not contain its shadow.
+        world_from_mesh: Pose, a similarity transform, shape (4, 4).
     """
 
     mesh: trimesh.Trimesh
@@ -43,13 +44,13 @@ class Occluder:
 
 @dataclass(frozen=True, eq=False)
 class Hit:
-    """Where rays meet a proxy.
+    """Hits of rays on proxies.
 
     Attributes:
-        distance: Along the ray [m], infinite for a miss.
+        distance: Distance along the ray [m], infinite for a miss.
         face: Unit normal of the triangle, towards the ray's origin.
-        normal: The same of the smooth surface that the triangles stand for.
-        lift: Displacement from the triangle to that surface [m], where it bulges out; else zero.
+        normal: Unit normal of the smooth surface that the triangles approximate, towards the ray's origin.
+        lift: Displacement from the triangle to that surface [m] where it is convex, otherwise zero.
         instance: Instance id, 0 for a miss.
     """
 
@@ -61,33 +62,34 @@ class Hit:
 
     @classmethod
     def nothing(cls) -> Hit:
-        """A miss."""
+        """Return a miss."""
         return cls(mi.Float(dr.inf), mi.Normal3f(0), mi.Normal3f(0), mi.Vector3f(0), mi.UInt32(0))
 
 
 class Stopper(Protocol):
-    """A ray-traceable scene of what stops light."""
+    """Ray-traceable scene of occluders."""
 
     def stop(self, ray: Any, instance: Any, key: Any, active: Any) -> Any:
-        """Whether rays from points of some instances are stopped; a ``key`` per ray decides where chance does."""
+        """Return True for occluded rays from points of instances; ``key`` selects the random outcome of a ray."""
 
 
 class Proxies:
-    """Ray-traceable proxy surfaces: one scene of the static and one of the dynamic ones.
+    """Ray-traceable proxy surfaces: one scene of static proxies and one of dynamic proxies.
 
     Attributes:
-        static, dynamic: They, as they are met.
-        casting: What casts the shadows of what is dynamic: none, one or two scenes.
-        shows_meshes: Whether visible meshes are among the dynamic ones.
-        apart: Whether a kernel may trace but one scene, as on CUDA: there Dr.Jit leaves out all but the first one.
+        static, dynamic: These scenes, for hits.
+        casting: Scenes that cast the shadows of dynamic objects: none, one or two.
+        shows_meshes: True if the dynamic proxies include visible meshes.
+        apart: True if a kernel may trace only one scene, as on CUDA, where Dr.Jit drops all scenes but the first.
     """
 
     def __init__(
         self, occluders: Sequence[Occluder], visible: Sequence[Any] = (), casters: Sequence[Caster] | None = None
     ) -> None:
-        """Proxies from meshes, and visible Mitsuba shapes, which are dynamic: no capture holds their shadows.
+        """Build the scenes from proxy meshes and visible Mitsuba shapes.
 
-        The shadows of dynamic proxies are cast by ``casters``, or else by their meshes.
+        Visible shapes are dynamic, because no capture contains their shadows. Shadows of dynamic proxies are cast by
+        ``casters``, or by the proxy meshes if ``casters`` is None.
         """
         self.static = _TraceScene.build([o for o in occluders if not o.dynamic])
         self.dynamic = _TraceScene.build([o for o in occluders if o.dynamic], visible)
@@ -98,19 +100,19 @@ class Proxies:
 
     @property
     def stoppers(self) -> tuple[Stopper, ...]:
-        """All that stops light, the static proxies first."""
+        """All occluder scenes, the static proxies first."""
         return self.casting if self.static is None else (self.static, *self.casting)
 
     def nearest(self, ray: Any) -> tuple[Hit, Hit]:
-        """What rays meet first, and what they would meet without the dynamic proxies."""
+        """Return the first hits of rays, and the first hits without the dynamic proxies."""
         static = _TraceScene.nearest(self.static, ray, Hit.nothing())
-        dr.eval(static)  # a kernel of its own, see `apart`
+        dr.eval(static)  # a separate kernel, see `apart`
         return _TraceScene.nearest(self.dynamic, ray, static), static
 
 
 @dataclass(frozen=True, eq=False)
 class _TraceScene:
-    """All meshes as one (or None), with the instance id of every triangle, beside visible shapes."""
+    """All meshes merged into one (or None), with the instance id of every triangle, and visible shapes."""
 
     scene: Any
     mesh: Any
@@ -119,7 +121,7 @@ class _TraceScene:
     normals: Any
 
     def nearest(self: _TraceScene | None, ray: Any, other: Hit) -> Hit:
-        """The nearer of ``other`` and what the rays meet here."""
+        """Return the nearer of ``other`` and the hits in this scene."""
         if self is None:
             return other
         si = self.scene.ray_intersect(ray, mi.RayFlags.UV, coherent=True)
@@ -138,18 +140,18 @@ class _TraceScene:
         )
 
     def is_visible(self, hit: Any) -> Any:
-        """Whether what rays have met is a visible shape."""
+        """Return True for hits on visible shapes."""
         return mi.Bool(True) if self.mesh is None else hit.shape != self.mesh
 
     def stop(self, ray: Any, instance: Any, key: Any, active: Any) -> Any:
-        """Whether rays are stopped."""
+        """Return True for occluded rays."""
         return self.scene.ray_test(ray, active=active)
 
     def _smooth(self, si: Any, flip: Any, proxy: Any) -> tuple[Any, Any]:
-        """Interpolated normal, and the way to the surface that bulges out from a triangle's corners.
+        """Return the interpolated normal, and the displacement to the convex surface through a triangle's corners.
 
-        That surface is the mean of the projections on the corners' tangent planes: light that grazes it is not shadowed
-        by the triangles next to it (Hanika 2021, "Hacking the Shadow Terminator", Ray Tracing Gems II, chapter 4).
+        That surface is the mean of the projections on the corners' tangent planes. From there, grazing light is not
+        shadowed by adjacent triangles (Hanika 2021, "Hacking the Shadow Terminator", Ray Tracing Gems II, chapter 4).
         """
         weights = 1 - si.uv.x - si.uv.y, si.uv.x, si.uv.y
         normal, lift = mi.Normal3f(0), mi.Vector3f(0)
@@ -175,12 +177,12 @@ class _TraceScene:
 
 
 _Parts = tuple[tuple[trimesh.Trimesh, int, bytes], ...]
-"""Meshes, each with its instance id and its pose, 16 floats."""
+"""Meshes with their instance ids and poses (bytes of 16 floats)."""
 
 
 @lru_cache(maxsize=2)
 def _kept(parts: _Parts, _variant: str) -> _TraceScene:
-    """The static meshes, kept from layout to layout, and the last dynamic ones."""
+    """Return the merged meshes, cached for the static meshes of all layouts and the last dynamic ones."""
     return _merged(parts, {})
 
 
@@ -202,7 +204,7 @@ def _merged(parts: _Parts, others: Mapping[str, Any]) -> _TraceScene:
     instances = np.repeat([instance for _, instance, _ in parts], [len(part.faces) for part, _, _ in parts])
     return _TraceScene(
         ray_scene({"mesh": mesh, **others}),
-        dr.opaque(mi.ShapePtr, mesh),  # its number would be written into kernels, and changes with every layout
+        dr.opaque(mi.ShapePtr, mesh),  # a literal shape number would enter the kernels and change with every layout
         wrapped(mi.UInt32, instances.astype(np.uint32)),
         positions,
         wrapped(mi.Float, np.concatenate(normals).astype(np.float32)),
@@ -211,10 +213,10 @@ def _merged(parts: _Parts, others: Mapping[str, Any]) -> _TraceScene:
 
 @lru_cache(maxsize=64)
 def smooth_normals(mesh: trimesh.Trimesh) -> np.ndarray:
-    """Corner normals, kept from layout to layout.
+    """Return corner normals, cached across layouts.
 
-    Reconstructed surfaces are rough everywhere: what would be a crease in a drawing is noise there, and no edge is one
-    that is not much sharper than the flattest quarter of the others, by length.
+    Reconstructed surfaces are rough everywhere, so that an angle that is a crease in a CAD mesh is noise in them. An
+    edge is therefore a crease only if it is much sharper than the flattest quarter of all edges, by length.
     """
     angles, ends = mesh.face_adjacency_angles, mesh.vertices[mesh.face_adjacency_edges]
     order = np.argsort(angles)

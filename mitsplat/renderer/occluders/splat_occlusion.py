@@ -1,11 +1,11 @@
-"""Shadow rays through splats: Gaussians that stop a ray with the chance of their opacity there.
+"""Shadow rays through splats: a Gaussian stops a ray with a probability equal to its opacity there.
 
-What reaches a point through Gaussians of opacity a_i is T = prod_i (1 - a_i G_i), with G_i the peak of Gaussian i along
-the ray. Sorting them is not needed where shadow rays are sampled anyway: a ray that each Gaussian stops with chance
-a_i G_i, all independent, arrives with chance T (Enderton 2010, "Stochastic Transparency"). Gaussian i with a number u_i
-in (0, 1) stops those rays for which a_i G_i > u_i, which are the ones that meet its ellipsoid of sqrt(2 ln(a_i / u_i))
-standard deviations. A set of numbers makes solids of all Gaussians, and the first of them that a ray meets ends it. A
-ray takes one of several such sets by chance.
+The transmittance through Gaussians of opacity a_i is T = prod_i (1 - a_i G_i), where G_i is the peak of Gaussian i
+along the ray. Sampled shadow rays need no sorting: if each Gaussian independently stops a ray with probability a_i G_i,
+the ray arrives with probability T (Enderton 2010, "Stochastic Transparency"). With a random number u_i in (0, 1),
+Gaussian i stops the rays with a_i G_i > u_i. These are the rays that intersect its ellipsoid of sqrt(2 ln(a_i / u_i))
+standard deviations. A set of numbers u_i turns all Gaussians into solids, and the first solid on a ray stops it. Each
+ray selects one of several such sets at random.
 """
 
 from __future__ import annotations
@@ -25,37 +25,39 @@ from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.renderer.rays.device_arrays import ray_scene, wrapped
 
 SETS = 8
-"""Sets of solids. Each Gaussian is in as many of them as its opacity says, to one."""
+"""Number of sets of solids. A Gaussian of opacity a is in about a * SETS of them."""
 
 FAINTEST = 0.01
-"""Opacity below which a Gaussian stops no ray, and least u_i."""
+"""Opacity below which a Gaussian stops no ray, and smallest u_i."""
 
 FOOTPRINT = 2.0
-"""Distance within which splats do not shadow their own object, over the largest standard deviation that nine of ten of
-them do not exceed: the Gaussians of a surface scatter about it, and would shadow each other."""
+"""Distance within which splats do not shadow their own object, in units of the 90 % quantile of their largest standard
+deviations. The Gaussians of a surface scatter around it and would shadow each other.
+"""
 
 FLAT = 0.2
-"""Shortest over second axis below which an ellipsoid stands for its middle section."""
+"""Ratio of the shortest to the second axis below which a flat section replaces the ellipsoid."""
 
 _SQUARE = (
     np.sqrt(np.pi / 2) * np.array([[1, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0]]),
     np.array([[0, 1, 2], [0, 2, 3]]),
 )
-"""Corners and faces of the square that has the area of the unit disc."""
+"""Corners and faces of the square with the area of the unit disc."""
 
 _OCTAHEDRON = (
     np.sqrt(np.pi / np.sqrt(3)) * np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]]),
     np.array([(x, z, y) if (x + y + z) % 2 else (x, y, z) for x in (0, 1) for y in (2, 3) for z in (4, 5)]),
 )
-"""The same for the octahedron that has the unit sphere's surface, and so its mean projected area (Cauchy)."""
+"""Corners and faces of the octahedron with the surface of the unit sphere, hence with its mean projected area (Cauchy).
+"""
 
 
 @dataclass(frozen=True, eq=False)
 class Caster:
-    """Splats that stand in the light.
+    """Splats that occlude light.
 
     Attributes:
-        splats: In their own frame.
+        splats: Splats in their own frame.
         instance: Instance id.
         world_from_splats: Similarity transform, shape (4, 4).
     """
@@ -67,14 +69,14 @@ class Caster:
 
 @dataclass(frozen=True, eq=False)
 class Solids:
-    """Sets of solids that rays may be stopped by, all in one Mitsuba scene, beside each other along x.
+    """Sets of solids in one Mitsuba scene, side by side along x.
 
     Attributes:
-        scene: The scene, with the middle of the first set in its origin.
-        middle: Middle of the splats in the world [m].
-        radius: Radius around it [m].
+        scene: The scene, with the centre of the first set at its origin.
+        middle: Centre of the splats in the world [m].
+        radius: Radius around the centre [m].
         sets: Number of sets.
-        owners: Caster, and number among its splats, of the Gaussian that every triangle stands for, shape (2, T).
+        owners: Caster, and number among its splats, of each triangle's Gaussian, shape (2, T).
         footprints: Distance [m] within which the splats of each caster do not shadow their own object, shape (N,).
     """
 
@@ -87,7 +89,7 @@ class Solids:
 
     @classmethod
     def build(cls, casters: Sequence[Caster], sets: int = SETS) -> Solids | None:
-        """Solids of some splats; None if nothing in them is opaque enough."""
+        """Build the solids of splats; return None if no Gaussian is opaque enough."""
         rng = np.random.default_rng(0)
         corners, faces, owners, count = [], [], [], 0
         footprints = np.zeros(len(casters))
@@ -133,12 +135,18 @@ class Solids:
         )
 
     def enter(self, ray: Any, key: Any, near: Any) -> tuple[Any, Any, Any]:
-        """Rays as one of the sets sees them, how far on they start, and whether they meet its ball.
+        """Transform rays into one of the sets.
 
-        Each takes the set that its ``key`` decides, and starts ``near`` [m] on or later.
+        Args:
+            ray: World-space rays.
+            key: Integer per ray that selects the set.
+            near: Smallest distance at which a ray starts [m].
+
+        Returns:
+            Rays in the set, the distances at which they start, and True where they intersect the set's ball.
         """
         number = mi.UInt32(mi.sample_tea_float32(key, mi.UInt32(self.sets), 4) * self.sets)
-        # Only what lies in the ball around its own set may stop a ray.
+        # Rays are clipped to the ball of their set, so that no other set occludes them.
         start = ray.o - self.middle
         along = dr.dot(start, ray.d)
         half = dr.square(along) - dr.squared_norm(start) + dr.square(self.radius)
@@ -151,11 +159,11 @@ class Solids:
 
 @dataclass(frozen=True, eq=False)
 class SplatOccluders:
-    """Splats that shadow rays may be stopped by.
+    """Splats as occluders of shadow rays.
 
     Attributes:
-        solids: What they are to a ray.
-        spared: By instance, how far a ray goes before splats may stop it [m].
+        solids: Stochastic solids that rays hit.
+        spared: Distance from the ray origin within which splats do not occlude [m], by instance.
     """
 
     solids: Solids
@@ -163,7 +171,7 @@ class SplatOccluders:
 
     @classmethod
     def build(cls, casters: Sequence[Caster], sets: int = SETS) -> SplatOccluders | None:
-        """Occluders of some splats; None if nothing in them is opaque enough."""
+        """Build the occluders of splats; return None if no Gaussian is opaque enough."""
         solids = Solids.build(casters, sets)
         if solids is None:
             return None
@@ -172,7 +180,7 @@ class SplatOccluders:
         return cls(solids, wrapped(mi.Float, spared))
 
     def stop(self, ray: Any, instance: Any, key: Any, active: Any) -> Any:
-        """Whether rays from points of some instances are stopped; a ``key`` per ray decides by chance."""
+        """Return True for occluded rays from points of instances; ``key`` selects the random outcome of a ray."""
         instance = mi.UInt32(instance)
         near = dr.gather(mi.Float, self.spared, instance, active & (instance < dr.width(self.spared)))
         inside, _, met = self.solids.enter(ray, key, near)
@@ -180,7 +188,10 @@ class SplatOccluders:
 
 
 def _ellipsoids(splats: Splats, world_from_splats: Float64Array) -> tuple[Float64Array, Float64Array]:
-    """Axes (N, 3, 3), the columns as long as the standard deviations and the shortest last, and centres (N, 3)."""
+    """Return axes (N, 3, 3) and centres (N, 3) of ellipsoids.
+
+    The columns of the axes are as long as the standard deviations, the shortest last.
+    """
     turn, shift = world_from_splats[:3, :3], world_from_splats[:3, 3]
     axes = Rotation.from_quat(splats.quats).as_matrix() * splats.scales[:, None].astype(np.float64)
     order = np.argsort(-splats.scales, axis=1)
@@ -188,9 +199,11 @@ def _ellipsoids(splats: Splats, world_from_splats: Float64Array) -> tuple[Float6
 
 
 def _radii(opacities: Float64Array, sets: int, rng: np.random.Generator) -> Float64Array:
-    """Standard deviations (sets, N) of every Gaussian's solid in each set, 0 where it is not in it.
+    """Return the radius of every Gaussian's solid in each set, in standard deviations, shape (sets, N).
 
-    The u_i of a Gaussian are stratified over the sets, in an order of its own.
+    The radius is 0 where the Gaussian is not in the set.
+
+    The u_i of a Gaussian are stratified over the sets, in a random order per Gaussian.
     """
     order = np.argsort(rng.random((sets, len(opacities))), axis=0)
     u = np.maximum((order + rng.random(order.shape)) / sets, FAINTEST)
@@ -198,7 +211,10 @@ def _radii(opacities: Float64Array, sets: int, rng: np.random.Generator) -> Floa
 
 
 def _turned(points: Float64Array, count: int, rng: np.random.Generator) -> Float64Array:
-    """``count`` copies of a shape, each turned at random: in its plane if it is flat, so that none has corners."""
+    """Return ``count`` randomly rotated copies of a shape; flat shapes rotate in their plane.
+
+    The rotation hides the corners of the shapes.
+    """
     flat = not points[:, 2].any()
     turns = (
         Rotation.from_rotvec(rng.random((count, 1)) * [0, 0, 2 * np.pi]) if flat else Rotation.random(count, rng=rng)

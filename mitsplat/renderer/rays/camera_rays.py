@@ -1,4 +1,4 @@
-"""The camera as the splat renderer sees it: ray slopes per pixel, tiles, and the tiles that slopes fall into."""
+"""Camera model of the splat renderer: ray slopes per pixel, image tiles, and the tiles of slope ranges."""
 
 from __future__ import annotations
 
@@ -14,13 +14,15 @@ import numpy as np
 from mitsplat.geometry.camera import FISHEYE_MAX, Camera, Lens, fisheye_radius, fisheye_rate
 
 TILE_WIDTH, TILE_HEIGHT = 8, 4
-"""Size of a tile [px]. Smaller tiles make more pairs to sort; larger ones idle more lanes, blend further from the order
-of each ray, and bound depths less tightly. A packet of eight lanes carries all of a tile and fetches a record once."""
+"""Size of a tile [px]. Smaller tiles create more pairs to sort. Larger tiles leave more lanes idle, deviate more from
+the order of each ray, and bound depths less tightly. A packet of eight lanes covers a whole tile and fetches each
+record once.
+"""
 
 TILE_PIXELS = TILE_WIDTH * TILE_HEIGHT
 
 Kind = tuple[int, int, int, Lens, int, int]
-"""Width, height, number of coefficients of distortion, lens, samples and zoom of a view."""
+"""Width, height, number of distortion coefficients, lens, samples and zoom of a view."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,14 +32,14 @@ class CameraView:
     Attributes:
         width, height: Image size [px].
         fx, fy, cx, cy: Intrinsics [px].
-        distortion: OpenCV coefficients k1, k2, p1, p2, k3, k4, k5, k6, or empty; k1, k2, k3, k4 of a fisheye.
-        near: Nearest depth that is seen [m].
+        distortion: OpenCV coefficients k1, k2, p1, p2, k3, k4, k5, k6, or empty; k1, k2, k3, k4 of a fisheye lens.
+        near: Smallest visible depth [m].
         world_from_camera: Pose, OpenCV axes, shape (4, 4).
         samples: Rays per pixel along each axis.
-        lens: Model of the lens.
-        aperture_radius, focus_distance: Of a thin lens [m].
-        zoom: How many of its pixels lie along one of the picture's, see :meth:`finer`.
-        shift: What the slopes of rays lack of those through the lens's centre; of a view through another of its points.
+        lens: Lens model.
+        aperture_radius, focus_distance: Parameters of a thin lens [m].
+        zoom: Number of pixels of this view along one pixel of the picture, see :meth:`finer`.
+        shift: Offset of slopes that is subtracted for a view through another point of the lens than its centre.
     """
 
     width: int
@@ -61,7 +63,7 @@ class CameraView:
         if self.lens == "opencv":
             padded = (*self.distortion, *(0.0,) * (8 - len(self.distortion)))
             object.__setattr__(self, "distortion", padded if any(padded) else ())
-        # Opaque, so that a new camera reuses the compiled kernels.
+        # Opaque values let a new camera reuse the compiled kernels.
         for name in ("fx", "fy", "cx", "cy", "near"):
             self._opaque[name] = dr.opaque(mi.Float, getattr(self, name))
         for i, value in enumerate(self.distortion):
@@ -76,23 +78,23 @@ class CameraView:
 
     @property
     def key(self) -> tuple[Any, ...]:
-        """What tells two views apart."""
+        """Values that identify a view."""
         lens = self.fx, self.fy, self.cx, self.cy, self.distortion, self.lens, self.shift
         return self.width, self.height, *lens, self.near, self.samples, self.world_from_camera.tobytes()
 
     @property
     def kind(self) -> Kind:
-        """What decides the kernels of a view beside its :attr:`numbers`."""
+        """Values that determine the kernels of a view; :attr:`numbers` are their inputs."""
         return self.width, self.height, len(self.distortion), self.lens, self.samples, self.zoom
 
     @property
     def numbers(self) -> dict[str, Any]:
-        """What views of one kind differ in, on the device; the pose is in a table of placements."""
+        """Device values that differ between views of one kind; the pose is in the table of placements."""
         return self._opaque | ({"extent": self._extent} if self.distortion else {})
 
     @classmethod
     def of_numbers(cls, kind: Kind, numbers: Mapping[str, Any]) -> CameraView:
-        """A view that knows no more than its kind and :attr:`numbers`: enough to project, not to march."""
+        """Create a view from its kind and :attr:`numbers` only, sufficient for projection but not for the march."""
         view = object.__new__(cls)
         width, height, coefficients, lens, samples, zoom = kind
         known = {"width": width, "height": height, "distortion": (0.0,) * coefficients, "lens": lens}
@@ -113,17 +115,17 @@ class CameraView:
         return -(-self.height // TILE_HEIGHT)
 
     def sampled(self, samples: int) -> CameraView:
-        """The same view with ``samples`` x ``samples`` rays per pixel."""
+        """Return the same view with ``samples`` x ``samples`` rays per pixel."""
         return self if samples == self.samples else replace(self, samples=samples)
 
     def finer(self, zoom: int) -> CameraView:
-        """The same view in ``zoom`` x ``zoom`` pixels for each of its own."""
+        """Return the same view with each pixel divided into ``zoom`` x ``zoom`` pixels."""
         numbers: dict[str, Any] = {n: zoom * getattr(self, n) for n in ("width", "height", "fx", "fy", "cx", "cy")}
         return replace(self, zoom=zoom * self.zoom, **numbers)
 
     @property
     def camera(self) -> Camera:
-        """The same camera on the host, one ray per pixel."""
+        """The same camera on the host, with one ray per pixel."""
         return Camera(
             self.width,
             self.height,
@@ -137,15 +139,15 @@ class CameraView:
         )
 
     def apertures(self, rings: int) -> list[CameraView]:
-        """Views through evenly spaced points of the aperture, the centre first: a hexagon and so many rings around it.
+        """Return views through evenly spaced points of the aperture: the centre and ``rings`` hexagonal rings.
 
-        All of them see the plane at ``focus_distance`` at the same pixels. A pinhole has one.
+        All views see the plane at ``focus_distance`` at the same pixels. A pinhole has one view.
         """
         if self.aperture_radius == 0:
             return [self]
         points, count = [(0.0, 0.0)], 1 + 3 * rings * (rings + 1)
         for ring in range(1, rings + 1):
-            # In the middle, by area, of the annulus that belongs to the ring's 6 n points.
+            # Radius that halves, by area, the annulus that belongs to the ring's 6 n points.
             radius = self.aperture_radius * np.sqrt((1 + 3 * ring * ring) / count)
             angles = (np.arange(6 * ring) + 0.5 * (ring % 2)) * np.pi / (3 * ring)
             points += [(radius * np.cos(angle), radius * np.sin(angle)) for angle in angles]
@@ -160,23 +162,23 @@ class CameraView:
         return replace(self, world_from_camera=pose, cx=self.cx + self.fx * du, cy=self.cy + self.fy * dv)
 
     def rows(self, start: int, stop: int) -> CameraView:
-        """The part of the view from pixel row ``start`` up to ``stop``."""
+        """Return the part of the view from pixel row ``start`` to ``stop`` (exclusive)."""
         return replace(self, height=stop - start, cy=self.cy - start)
 
     def rays(self) -> Any:
-        """World-space rays through the pixels' centres, row-major, of unit direction."""
+        """Return the world-space rays through pixel centres, row-major, with unit direction."""
         ray = self.rays_through(*self.centres())
         dr.eval(ray)
         return ray
 
     def centres(self) -> tuple[Any, Any]:
-        """Positions (x, y) of the pixels' centres, row-major [px]."""
+        """Return the positions (x, y) of pixel centres, row-major [px]."""
         pixel = dr.arange(mi.UInt32, self.width * self.height)
         row = pixel // self.width
         return mi.Float(pixel - row * self.width) + 0.5, mi.Float(row) + 0.5
 
     def rays_through(self, x: Any, y: Any) -> Any:
-        """World-space rays through pixel positions (x, y) [px], of unit direction."""
+        """Return the world-space rays through pixel positions (x, y) [px], with unit direction."""
         ray = dr.zeros(mi.Ray3f, dr.width(x))
         ray.d = self.direction(x, y)
         ray.o = mi.Point3f(*[dr.opaque(mi.Float, float(value)) for value in self.world_from_camera[:3, 3]])
@@ -184,19 +186,19 @@ class CameraView:
         return ray
 
     def direction(self, x: Any, y: Any) -> Any:
-        """World-space unit vectors of the rays through pixel positions (x, y) [px]."""
+        """Return the world-space unit vectors of the rays through pixel positions (x, y) [px]."""
         u, v = self.slopes(x, y)
         axes = [[dr.opaque(mi.Float, float(value)) for value in column] for column in self.world_from_camera[:3, :3].T]
         right, down, forward = axes
         return dr.normalize(mi.Vector3f(*[right[i] * u + down[i] * v + forward[i] for i in range(3)]))
 
     def cosine(self, rays: Any) -> Any:
-        """Depth along z per unit of distance along each ray."""
+        """Return the depth along z per unit of distance along each ray."""
         forward = mi.Vector3f(*[dr.opaque(mi.Float, float(value)) for value in self.world_from_camera[:3, 2]])
         return dr.dot(rays.d, forward)
 
     def slopes(self, x: Any, y: Any) -> tuple[Any, Any]:
-        """Undistorted slopes (u, v) of the rays through pixel positions (x, y) [px]."""
+        """Return the undistorted slopes (u, v) of the rays through pixel positions (x, y) [px]."""
         o = self._opaque
         xd, yd = (x - o["cx"]) / o["fx"], (y - o["cy"]) / o["fy"]
         if not self.distortion:
@@ -205,7 +207,7 @@ class CameraView:
             u, v = self._fisheye_slopes(xd, yd)
             return u - o["du"], v - o["dv"]
         u, v = xd, yd
-        # Newton's method on the 2-D distortion map with a numerical-free Jacobian: converges in 3 to 5 steps.
+        # Newton's method on the 2-D distortion map with its analytic Jacobian converges in 3 to 5 steps.
         for _ in range(8):
             pu, pv, j = self.distort(u, v)
             ru, rv = xd - pu, yd - pv
@@ -230,12 +232,12 @@ class CameraView:
         slope = dr.sqrt(slope2)
         angle = dr.atan(slope)
         rate, scale = fisheye_rate(angle, self._k), fisheye_radius(angle, self._k) / slope
-        # Along the radius the map grows by d(shown)/d(slope), across it by the scale.
+        # The map's derivative is d(shown)/d(slope) along the radius and the scale across it.
         growth = (rate / (1 + slope2) - scale) / slope2
         return u * scale, v * scale, (scale + growth * u * u, growth * u * v, growth * u * v, scale + growth * v * v)
 
     def distort(self, u: Any, v: Any) -> tuple[Any, Any, tuple[Any, Any, Any, Any]]:
-        """OpenCV's distortion of slopes, and its Jacobian (du'/du, du'/dv, dv'/du, dv'/dv).
+        """Apply OpenCV's distortion to slopes; return them with the Jacobian (du'/du, du'/dv, dv'/du, dv'/dv).
 
         Source: OpenCV documentation, "Camera Calibration and 3D Reconstruction", rational model, and "Fisheye camera
         model" (Kannala and Brandt 2006).
@@ -262,7 +264,7 @@ class CameraView:
         )
 
     def pixel_covariance(self, u: Any, v: Any, variance: float) -> tuple[Any, Any, Any]:
-        """Covariance (uu, uv, vv) in slopes, at (u, v), of an isotropic ``variance`` [px^2] on the image."""
+        """Return the covariance (uu, uv, vv) in slopes at (u, v) of an isotropic ``variance`` [px^2]."""
         o = self._opaque
         variance = dr.opaque(mi.Float, variance)
         if not self.distortion:
@@ -275,12 +277,13 @@ class CameraView:
         return variance * (a * a + b * b), variance * (a * c + b * d), variance * (c * c + d * d)
 
     def tile_box(self, u0: Any, u1: Any, v0: Any, v1: Any) -> tuple[Any, Any, Any, Any]:
-        """Half-open ranges of tiles (x0, x1, y0, y1) that a box of slopes may meet, clipped to the image."""
+        """Return half-open tile ranges (x0, x1, y0, y1) that a box of slopes may intersect, clipped to the image."""
         o = self._opaque
         if not self.distortion:
             box = u0 * o["fx"] + o["cx"], u1 * o["fx"] + o["cx"], v0 * o["fy"] + o["cy"], v1 * o["fy"] + o["cy"]
             return self._clip_tiles(*box, 0.0)
-        # Beyond the image's own slopes the distortion may fold back: clip there first, then follow the box's outline.
+        # Distortion may fold back outside the image's slopes, so the box is clipped to them before its outline is
+        # projected.
         lo_u, hi_u, lo_v, hi_v = self._extent
         empty = (u1 < lo_u) | (u0 > hi_u) | (v1 < lo_v) | (v0 > hi_v)
         u0, u1 = dr.clip(u0, lo_u, hi_u), dr.clip(u1, lo_u, hi_u)
@@ -300,7 +303,7 @@ class CameraView:
         return x0, dr.select(empty, x0, x1), y0, y1
 
     def tile_columns(self, u0: Any, u1: Any) -> tuple[Any, Any]:
-        """Half-open range of columns of tiles that a range of slopes meets in an undistorted view."""
+        """Return the half-open range of tile columns that a range of slopes intersects in an undistorted view."""
         o = self._opaque
         return self._tile_range(u0 * o["fx"] + o["cx"], u1 * o["fx"] + o["cx"], TILE_WIDTH, self.tiles_x)
 
@@ -309,13 +312,14 @@ class CameraView:
         return *columns, *self._tile_range(y0 - margin, y1 + margin, TILE_HEIGHT, self.tiles_y)
 
     def _tile_range(self, low: Any, high: Any, size: int, tiles: int) -> tuple[Any, Any]:
-        # A pixel is sampled at its centre: what ends before the first centre or starts after the last one is out.
+        # Pixels are sampled at their centres, so ranges that end before the first or start after the last centre are
+        # empty.
         half = 0.5 if self.samples == 1 else 0.0
         first, last = dr.floor((low + half) / size), dr.floor((high - half) / size) + 1.0
         return mi.UInt32(dr.clip(first, 0.0, float(tiles))), mi.UInt32(dr.clip(last, 0.0, float(tiles)))
 
     def tile_slopes(self, tile: Any) -> tuple[Any, Any, Any, Any]:
-        """Box (u_min, u_max, v_min, v_max) of the slopes of a tile's rays."""
+        """Return the box (u_min, u_max, v_min, v_max) of the slopes of a tile's rays."""
         if self.distortion:
             box = dr.gather(mi.Array4f, self._tile_table, tile)
             return box.x, box.y, box.z, box.w
@@ -331,9 +335,9 @@ class CameraView:
         )
 
     def tile_grid(self) -> tuple[tuple[Any, Any, Any], tuple[Any, Any, Any]]:
-        """Slope of the first tile's middle, step from tile to tile, and a tile's width, along u and along v.
+        """Return slope of the first tile's centre, step between tiles, and tile width, along u and along v.
 
-        Of an undistorted view.
+        The view must be undistorted.
         """
         o, inset = self._opaque, 1.0 if self.samples == 1 else 0.0
         return (
@@ -343,7 +347,7 @@ class CameraView:
 
     @cached_property
     def _tile_table(self) -> Any:
-        """Slope boxes of all tiles of a distorted view, 4 floats each, from the slopes around each tile's edge."""
+        """Slope boxes of all tiles of a distorted view, 4 floats each, from the slopes along each tile's border."""
         tiles = self.tiles_x * self.tiles_y
         tile = dr.arange(mi.UInt32, tiles)
         x, y = mi.Float(tile % self.tiles_x * TILE_WIDTH), mi.Float(tile // self.tiles_x * TILE_HEIGHT)

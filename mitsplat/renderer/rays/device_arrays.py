@@ -1,4 +1,4 @@
-"""Arrays and meshes of the host on the device."""
+"""Upload of host arrays and meshes to the device."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ import trimesh
 
 
 def wrapped(kind: type, values: np.ndarray) -> Any:
-    """Device array of type ``kind`` on a copy of ``values`` that always starts at a whole cache line.
+    """Return a device array of type ``kind`` on a copy of ``values`` that starts at a cache line.
 
-    Dr.Jit compiles other kernels for memory that does not, and where NumPy's own starts is chance.
+    Dr.Jit compiles different kernels for unaligned memory, and the alignment of NumPy's memory is random.
     """
     values = np.ascontiguousarray(values).ravel()
     memory = np.empty(values.nbytes + 64, dtype=np.uint8)
@@ -26,9 +26,9 @@ def wrapped(kind: type, values: np.ndarray) -> Any:
 
 
 def concatenated(parts: Sequence[Any]) -> Any:
-    """One device array of several of a type, not yet evaluated.
+    """Concatenate device arrays of one type without evaluation.
 
-    ``dr.concat`` writes into its kernels where each part begins, so that other sizes are compiled anew.
+    ``dr.concat`` writes the start of each part into its kernels, so that other sizes cause a new compilation.
     """
     whole = dr.empty(type(parts[0]), sum(dr.width(part) for part in parts))
     start = 0
@@ -41,12 +41,12 @@ def concatenated(parts: Sequence[Any]) -> Any:
 
 
 def on_device(*numbers: float) -> Any:
-    """A few numbers that change from step to step, in one array: one copy, and kernels that do not contain them."""
+    """Return a few numbers in one device array; one copy, and kernels do not contain the values."""
     return wrapped(mi.Float, np.array(numbers, dtype=np.float32))
 
 
 def number(values: Any, place: int) -> Any:
-    """One of the numbers of :func:`on_device`."""
+    """Return one of the numbers of :func:`on_device`."""
     return dr.gather(mi.Float, values, place)
 
 
@@ -54,21 +54,21 @@ Columns = TypeVar("Columns")
 
 
 def gathered(columns: Columns, index: Any) -> Columns:
-    """The rows ``index`` of a dataclass of device arrays; those of one element hold for all rows."""
+    """Return the rows ``index`` of a dataclass of device arrays; arrays of one element hold for all rows."""
     values = [getattr(columns, f.name) for f in fields(columns)]  # type: ignore[arg-type]
     return type(columns)(*[v if dr.width(v) == 1 else dr.gather(type(v), v, index) for v in values])
 
 
 def ray_scene(contents: Mapping[str, Any]) -> mi.Scene:
-    """Mitsuba's scene of shapes, lights and what else ``contents`` names, between whose triangles no ray passes.
+    """Load a Mitsuba scene of ``contents`` (shapes, lights and others) with watertight triangle edges.
 
-    Embree loses rays that meet an edge which two triangles share, unless it is told not to; OptiX does not.
+    By default Embree misses rays on an edge that two triangles share; OptiX does not.
     """
     return mi.load_dict({"type": "scene", "embree_use_robust_intersections": True, **contents}, parallel=False)
 
 
 def plain_mesh(mesh: trimesh.Trimesh, properties: mi.Properties | None = None) -> mi.Mesh:
-    """Mitsuba's shape of a mesh without normals or texture."""
+    """Return a Mitsuba shape of a mesh without normals or texture."""
     shape = mi.Mesh("mesh", len(mesh.vertices), len(mesh.faces), props=properties or mi.Properties())
     params = mi.traverse(shape)
     params["vertex_positions"] = wrapped(mi.Float, np.asarray(mesh.vertices, dtype=np.float32))

@@ -1,4 +1,4 @@
-"""Sensors that the splat renderer sees through."""
+"""Conversion of Mitsuba sensors to the camera of the splat renderer."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from mitsplat.errors import InputError
 from mitsplat.renderer.rays.camera_rays import CameraView
 
 SMALLEST_APERTURE = 1e-6
-"""Radius of a lens up to which it is a pinhole [m]."""
+"""Radius up to which a lens counts as a pinhole [m]."""
 
 _PERSPECTIVE = ("PerspectiveCamera", "ThinLensCamera")
 
 
 def view_of(sensor: Any) -> CameraView:
-    """The camera of a sensor: ``opencv_camera``, or Mitsuba's own ``perspective`` or ``thinlens``.
+    """Return the camera of a sensor: ``opencv_camera``, or Mitsuba's ``perspective`` or ``thinlens``.
 
     Raises:
         InputError: If the sensor is of another kind.
@@ -38,7 +38,7 @@ def view_of(sensor: Any) -> CameraView:
 
     focal = 0.5 * width / np.tan(0.5 * np.radians(number("x_fov")))
     centre = [width * (0.5 + number("principal_point_offset_x")), height * (0.5 + number("principal_point_offset_y"))]
-    # Mitsuba makes an aperture of 0 the smallest number that it calculates with.
+    # Mitsuba replaces an aperture radius of 0 by its smallest float.
     radius = number("aperture_radius")
     pose = np.array(params["to_world"].matrix, dtype=np.float64).reshape(4, 4) @ np.diag([-1.0, -1.0, 1.0, 1.0])
     view = CameraView(
@@ -57,6 +57,6 @@ def view_of(sensor: Any) -> CameraView:
 
 
 def cropped(view: CameraView, film: Any) -> CameraView:
-    """The part of a view that the crop window of a film leaves."""
+    """Return the part of a view inside the crop window of a film."""
     (width, height), (x, y) = film.crop_size(), film.crop_offset()
     return replace(view, width=int(width), height=int(height), cx=view.cx - int(x), cy=view.cy - int(y))

@@ -2,7 +2,7 @@
 
 1. *Cull* every Gaussian of every placement by the exact screen box of its cut-off ellipsoid (one kernel).
 2. *Project* the others to view records (one kernel), see :mod:`mitsplat.renderer.splatting.projection`. On a GPU, one
-kernel does both.
+   kernel does both.
 3. *Pair* each record with the tiles that its cut-off ellipse intersects, see :mod:`mitsplat.renderer.splatting.pairs`.
 4. *Sort* the pairs by tile and by depth there, see :mod:`mitsplat.renderer.splatting.tile_depths`.
 """

@@ -1,4 +1,4 @@
-"""Poses that other programs give, by asset: rigid transforms, or one sentence on what is wrong with them."""
+"""Validation of poses that the caller provides: names of assets, and rigid transforms."""
 
 from __future__ import annotations
 
@@ -11,11 +11,19 @@ from mitsplat.arrays import Float64Array
 from mitsplat.errors import InputError
 
 _RIGID = 1e-5
-"""Largest entry of R R^T - 1 in a pose, as of cameras: single precision is rigid, any scale is not."""
+"""Maximum absolute entry of R R^T - 1 in a pose, as for cameras. Rotations in single precision pass; scales do not."""
 
 
 def asset_named(name: str | int, names: Sequence[tuple[str, str]]) -> int:
-    """Position of the one asset that a name or number means, of assets with a name and a path each."""
+    """Return the index of the asset with a name or number.
+
+    Args:
+        name: Name, path or index of the asset.
+        names: Name and path of each asset.
+
+    Raises:
+        InputError: If no asset or several assets match.
+    """
     if isinstance(name, str):
         found = [position for position, called in enumerate(names) if name in called]
         if len(found) == 1:
@@ -32,7 +40,11 @@ def asset_named(name: str | int, names: Sequence[tuple[str, str]]) -> int:
 
 
 def rigid_pose(pose: npt.ArrayLike, place: str) -> Float64Array:
-    """A pose as (4, 4), refused unless it is a rotation and a translation."""
+    """Return a pose as a matrix (4, 4).
+
+    Raises:
+        InputError: If the pose is not a rotation and a translation. The message begins with ``place``.
+    """
     try:
         matrix = np.array(pose, dtype=np.float64)
     except (TypeError, ValueError):
@@ -53,7 +65,7 @@ def rigid_pose(pose: npt.ArrayLike, place: str) -> Float64Array:
 
 
 def _told(pose: npt.ArrayLike) -> str:
-    """What was given in place of a matrix."""
+    """Describe a value that is not a valid matrix, for an error message."""
     if isinstance(pose, np.ndarray) and pose.shape != (4, 4):
         return f"an array of shape {pose.shape}"
     text = repr(pose)

@@ -1,4 +1,4 @@
-"""Where the objects of a scene lie, and what was measured of that."""
+"""Layouts: resting poses of the objects of a scene, with the measurements of their rest."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Instance:
-    """One object of a layout.
+    """Object of a layout.
 
     Attributes:
         id: Instance id, from 1.
         asset: Index into the scene's assets.
-        class_index: Index into the scene's class names; None for what is not labelled.
+        class_index: Index into the scene's class names; None for an object without a label.
         world_from_object: Rigid transform of the asset's frame, shape (4, 4).
     """
 
@@ -36,21 +36,21 @@ class Instance:
 
 @dataclass(frozen=True)
 class RestCertificate:
-    """What was measured of a layout at rest; penetration and gap on the true meshes, not on their convex pieces.
+    """Measurements of a layout at rest. Penetration and gap refer to the true meshes, not to their convex pieces.
 
     Attributes:
-        rested: Whether everything was within its limit.
-        inside: Whether no object left the scene's enclosure, or what else there is to lie on.
-        overflow: Whether any contact was dropped for want of room.
-        time_to_rest: Simulated time after which every object stayed where it was [s].
-        max_speed, max_spin: Residual motion of the fastest object a second later [m/s, rad/s].
-        surface_motion: Farthest that a point of any surface moved in that second [m].
-        collider_penetration: Depth of the deepest object in a collider [m].
-        pair_penetration: Depth of the deepest object in another [m].
-        support_gap: Distance of the most isolated object from what is nearest to it [m]; 0 if all touch.
-        standoff: How far the convex pieces of any object stand off its true mesh [m], which bounds the gaps.
-        attempts: Draws of poses that it took.
-        refused: Why each earlier draw was refused.
+        rested: True if every measurement is within its limit.
+        inside: True if no object left the enclosure of the scene or, without one, the area of the colliders.
+        overflow: True if a contact was dropped because a buffer was full.
+        time_to_rest: Simulated time until no object moved any more [s].
+        max_speed, max_spin: Residual motion of the fastest object one second later [m/s, rad/s].
+        surface_motion: Maximum displacement of a surface point in that second [m].
+        collider_penetration: Maximum depth of an object in a collider [m].
+        pair_penetration: Maximum depth of an object in another object [m].
+        support_gap: Maximum distance of an object from its nearest neighbour or collider [m]; 0 if all touch.
+        standoff: Maximum distance between the convex pieces of an object and its true mesh [m]. It bounds the gaps.
+        attempts: Number of draws of poses.
+        refused: Reason for the rejection of each earlier draw.
     """
 
     rested: bool
@@ -68,7 +68,7 @@ class RestCertificate:
     refused: tuple[str, ...] = ()
 
     def to_json(self) -> dict[str, Any]:
-        """The certificate as JSON values."""
+        """Return the certificate as JSON values."""
         return {**vars(self), "refused": list(self.refused)}
 
 
@@ -86,17 +86,17 @@ NOTHING_TO_REST = RestCertificate(
     standoff=0.0,
     attempts=0,
 )
-"""Of a layout that physics had no part in: one without objects, or one whose poses are made up."""
+"""Certificate of a layout without physics: a layout without objects, or with given poses."""
 
 
 @dataclass(frozen=True)
 class LeftOut:
-    """An object that was drawn for a layout and is not in it, because no draw with it came to rest.
+    """Object that was drawn for a layout but left out, because it did not come to rest in any draw.
 
     Attributes:
-        id: Instance id that it would have, and that nothing else has.
+        id: Instance id of the object; no other object has it.
         asset: Index into the scene's assets.
-        reason: What became of it, and how often.
+        reason: Reason and frequency of the failures.
     """
 
     id: int
@@ -106,14 +106,14 @@ class LeftOut:
 
 @dataclass(frozen=True, eq=False)
 class Layout:
-    """Where the objects of one layout lie, and which of those that were drawn are not there.
+    """Poses of the objects of one layout, and the objects that were left out.
 
     Attributes:
         index: Index of the layout.
         instances: The objects.
-        certificate: What was measured of them at rest.
-        left_out: Those that did not come to rest.
-        settled: The layout as it settled, where this is that at a moment of a conveyor's run.
+        certificate: Measurements at rest.
+        left_out: Objects that did not come to rest.
+        settled: The settled layout, if this layout is that at another moment of a conveyor's run.
     """
 
     index: int
@@ -126,20 +126,23 @@ class Layout:
     def of_poses(
         cls, scene: Scene, poses: Mapping[str | int, Sequence[npt.ArrayLike | None]], *, index: int = 0
     ) -> Layout:
-        """A layout of objects at given poses, such as a simulator's, without physics: nothing has to rest.
+        """Create a layout from given poses, such as those of a simulator.
 
-        Objects are numbered from 1 by asset, then by their place in the lists, whatever the mapping's order: those of
-        the same lists have the same ids from layout to layout of a sequence.
+        Physics is skipped; the objects need not rest.
+
+        Instance ids count from 1, by asset and then by position in the lists. They do not depend on the order of the
+        mapping. Equal lists therefore give equal ids in all layouts of a sequence.
 
         Args:
-            scene: The scene whose assets they are.
-            poses: For each asset a list of rigid transforms ``world_from_object`` [m], (4, 4) each, one an object; None
-                for an object that is not there, whose id stays free. An asset is named by its name or its path in the
-                scene file, or by its position in ``scene.assets`` where it has several sizes or classes.
-            index: Of the layout, by which its surroundings and the looks of objects are drawn: one for all of a film.
+            scene: The scene with the assets.
+            poses: For each asset, a list of rigid transforms ``world_from_object`` [m], (4, 4) each, one per object.
+                None stands for an absent object, whose id stays unused. The key is the name of an asset, its path in
+                the scene file, or its index in ``scene.assets`` if it has several sizes or classes.
+            index: Index of the layout. It determines the surroundings and the appearance of objects; use one index for
+                all frames of a video.
 
         Raises:
-            InputError: If a name is not one asset's, or a matrix is no rotation and translation.
+            InputError: If a name does not match exactly one asset, or if a matrix is not a rotation and a translation.
         """
         paths = [path for entry in scene.spec.objects for path in entry.names for _ in entry.scales]
         names = [(asset.name, path) for asset, path in zip(scene.assets, paths, strict=True)]
@@ -161,7 +164,7 @@ class Layout:
         return cls(index, instances, NOTHING_TO_REST)
 
     def to_json(self) -> dict[str, Any]:
-        """The layout as JSON values; floats survive the round trip exactly."""
+        """Return the layout as JSON values. Floats survive the round trip exactly."""
         return {
             "index": self.index,
             "instances": [
@@ -174,7 +177,7 @@ class Layout:
 
     @classmethod
     def from_json(cls, stored: Mapping[str, Any]) -> Layout:
-        """The layout that :meth:`to_json` described."""
+        """Return the layout from the values of :meth:`to_json`."""
         return cls(
             index=stored["index"],
             instances=tuple(
@@ -189,10 +192,10 @@ class Layout:
 
 
 class NothingRests(InputError):
-    """No object of a layout came to rest.
+    """Error: no object of a layout came to rest.
 
     Attributes:
-        layout: The layout without any of them, with which a dataset goes on.
+        layout: The layout without these objects. A dataset continues with it.
     """
 
     def __init__(self, text: str, layout: Layout) -> None:
@@ -200,5 +203,5 @@ class NothingRests(InputError):
         self.layout = layout
 
     def __reduce__(self) -> tuple[type[NothingRests], tuple[str, Layout]]:
-        """For the way from a worker process."""
+        """Return the arguments for pickling, which worker processes need."""
         return type(self), (str(self), self.layout)

@@ -18,17 +18,17 @@ from mitsplat.scene.splits import draw_environment
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """A scene file with everything that it refers to.
+    """Scene specification with all files that it names.
 
     Attributes:
-        spec: What the file says, its enclosure written out as shapes, rooms as lights, and patterns of pools as what
-            they match.
-        path: The scene file; of a scene that was made in Python, one that does not exist, in its folder.
-        environments: The surroundings, of which each layout has one; empty if there are none.
-        assets: Assets of each entry of ``spec.objects`` in turn, in each of its scales, with its class name.
+        spec: Specification of the scene file. Enclosures are expanded to shapes, rooms to lights, and patterns to
+            lists.
+        path: Path of the scene file. For a scene made in Python, a path in its folder at which no file exists.
+        environments: Environments, of which each layout draws one; empty if there are none.
+        assets: Assets of each entry of ``spec.objects`` in turn, one per scale, with the class name of the entry.
         shape_meshes: Mesh of each entry of ``spec.shapes``, in world space [m].
-        class_names: Of what is labelled, sorted; the position in it is the class index.
-        images: Files of the images that lights, materials and the background name, by those names.
+        class_names: Sorted class names of labelled objects. The position of a name is its class index.
+        images: Image files of lights, materials and the background, by their names in the specification.
     """
 
     spec: SceneSpec
@@ -40,24 +40,24 @@ class Scene:
     images: Mapping[str, Path] = field(default_factory=dict)
 
     def environment_of(self, layout: int) -> Asset | None:
-        """The surroundings of a layout."""
+        """Return the environment of a layout; None if the scene has none."""
         return self.environments[draw_environment(self.spec, layout)] if self.environments else None
 
     @property
     def num_frames(self) -> int:
-        """Layouts times views; frames of one layout are neighbours."""
+        """Number of frames: layouts times views. Frames of one layout have consecutive indices."""
         return self.spec.output.layouts * self.spec.output.views
 
     @cached_property
     def pools(self) -> tuple[range, ...]:
-        """Positions among the assets that each entry of ``spec.objects`` draws from."""
+        """For each entry of ``spec.objects``, the indices of its assets."""
         ends = list(accumulate((len(entry.names) * len(entry.scales) for entry in self.spec.objects), initial=0))
         return tuple(range(*ends) for ends in pairwise(ends))
 
     def entry_of(self, asset: int) -> ObjectSpec:
-        """The entry of ``spec.objects`` that draws an asset."""
+        """Return the entry of ``spec.objects`` to which an asset belongs."""
         return next(entry for entry, pool in zip(self.spec.objects, self.pools, strict=True) if asset in pool)
 
     def class_index(self, asset: int) -> int | None:
-        """Class index that objects of an asset are labelled with; None if they are not."""
+        """Return the class index of an asset; None if its objects have no labels."""
         return self.class_names.index(self.assets[asset].class_name) if self.entry_of(asset).label else None

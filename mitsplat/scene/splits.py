@@ -1,4 +1,4 @@
-"""Split, emptiness and environment of a layout, decided by the seed and the index of the layout."""
+"""Split, emptiness and environment of a layout, determined by the seed and the index of the layout."""
 
 from __future__ import annotations
 
@@ -19,16 +19,17 @@ Split = Literal["train", "val", "test"]
 
 
 def split_of(layout: int, validation: float, test: float = 0.0) -> Split:
-    """Split of a layout, the same however many follow it: the second layout is the first of the smaller split.
+    """Return the split of a layout. It does not depend on the number of layouts.
 
-    Of n layouts, floor(1 + (n - 2) share) belong to the smaller of two splits. With a test split, the layouts are first
-    parted into that and the others, and these likewise into training and validation.
+    The second layout is the first of the smaller split. Of n layouts, floor(1 + (n - 2) share) belong to the smaller of
+    two splits. With a test split, layouts are first divided into test and others; then the others are divided into
+    training and validation by the same rule.
     """
     return _place_in_split(layout, validation, test)[0]
 
 
 def _place_in_split(layout: int, validation: float, test: float) -> tuple[Split, int]:
-    """Split of a layout, and how many earlier ones are in it."""
+    """Return the split of a layout, and the number of earlier layouts in it."""
     if test:
         apart, layout = _parted(layout, test)
         if apart:
@@ -39,10 +40,14 @@ def _place_in_split(layout: int, validation: float, test: float) -> tuple[Split,
 
 
 def _parted(number: int, share: float) -> tuple[bool, int]:
-    """Whether a number from 0 is among the share that is taken of all, and how many smaller ones are on its side."""
+    """Divide numbers from 0 by a share.
+
+    Returns:
+        True if the number is in the part of that share, and how many smaller numbers are in the same part.
+    """
 
     def taken(count: int) -> int:
-        """How many of the first numbers are on the smaller side, but for a constant."""
+        """Return how many of the first numbers are in the smaller part, up to a constant."""
         return math.floor(1.0 + (count - 2) * min(share, 1.0 - share))
 
     smaller, before = taken(number + 1) > taken(number), taken(number) - taken(0)
@@ -50,7 +55,7 @@ def _parted(number: int, share: float) -> tuple[bool, int]:
 
 
 def is_empty(spec: SceneSpec, layout: int) -> bool:
-    """Whether nothing that is labelled lies in a layout: evenly spread over the layouts of each split."""
+    """Return True if a layout has no labelled objects. Such layouts are evenly spread over each split."""
     if not spec.empty:
         return False
     split, rank = _place_in_split(layout, spec.output.validation, spec.output.test)
@@ -59,7 +64,7 @@ def is_empty(spec: SceneSpec, layout: int) -> bool:
 
 
 def draw_environment(spec: SceneSpec, layout: int) -> int:
-    """Which of the environments a layout has."""
+    """Draw the index of the environment of a layout."""
     if not isinstance(spec.environment, tuple) or len(spec.environment) == 1:
         return 0
     weights = np.array(spec.environment_weights or np.ones(len(spec.environment)))
@@ -70,5 +75,5 @@ def draw_environment(spec: SceneSpec, layout: int) -> int:
 
 @lru_cache
 def _phase(seed: int, split: str) -> float:
-    """Where in its turn a split begins with empty layouts, in [0, 1)."""
+    """Return the phase of the empty layouts of a split, in [0, 1)."""
     return float(random_stream(seed, f"empty layouts {split}").uniform())

@@ -1,4 +1,7 @@
-"""Random numbers by purpose: adding one never shifts another, and any worker may draw any of them in any order."""
+"""Independent random streams, one per purpose.
+
+A new stream does not change the values of other streams. Any worker can use any stream in any order.
+"""
 
 from __future__ import annotations
 
@@ -9,18 +12,18 @@ import numpy.typing as npt
 
 
 def random_stream(seed: int, purpose: str, *numbers: int) -> np.random.Generator:
-    """Random numbers for one purpose in one frame, layout or attempt, independent of those for every other.
+    """Return the random generator for one purpose in one frame, layout or attempt. It is independent of all others.
 
     Args:
-        seed: Of the scene.
-        purpose: What they decide.
-        numbers: Which of several: the index of the frame or layout, and of what is drawn again for it.
+        seed: Seed of the scene.
+        purpose: Name of the value that is drawn.
+        numbers: Index of the frame or layout, and of the attempt if values are drawn repeatedly.
     """
     return np.random.default_rng(np.random.SeedSequence([seed, zlib.crc32(purpose.encode()), *numbers]))
 
 
 def weighted_choice(rng: np.random.Generator, weights: npt.ArrayLike, count: int = 1) -> list[int]:
-    """Positions of ``count`` members of a pool, drawn by weights relative to each other, shape (N,)."""
+    """Draw ``count`` indices of members of a pool, with probabilities in proportion to their weights, shape (N,)."""
     shares = np.asarray(weights, dtype=np.float64)
     found: list[int] = rng.choice(len(shares), count, p=shares / shares.sum()).tolist()
     return found

@@ -1,4 +1,4 @@
-"""Walls that decide where objects may be: those of bins, and those that an enclosure is written out as."""
+"""Walls of bins, enclosures and backdrops, and the bounds within which objects must stay."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ if TYPE_CHECKING:
 
 
 ENCLOSURE = "enclosure "
-"""How the names of the shapes begin that an enclosure is written out as."""
+"""Prefix of the names of the shapes that an enclosure expands to."""
 
 BACKDROP_THICKNESS = 0.1
-"""Of a backdrop's floor and walls [m]."""
+"""Thickness of the floor and walls of a backdrop [m]."""
 
 PILE_HEIGHT = 1.0
-"""How far above the drop region the objects of a pile may start [m]."""
+"""Maximum height above the drop region at which objects of a pile start [m]."""
 
 
 def enclosure_walls(
@@ -36,10 +36,10 @@ def enclosure_walls(
     supports: Sequence[trimesh.Trimesh],
     number: int = 0,
 ) -> list[Shape]:
-    """The enclosure of a region as five invisible boxes: walls from its floor up to its top or a pile's, and a lid.
+    """Return the enclosure of a region as five invisible boxes: four walls and a lid.
 
-    Without a margin of its own the largest object finds room between region and walls, but no wall stands where there
-    is nothing to lie on before it.
+    The walls reach from the floor of the enclosure to the top of the region, or of the pile. Without a margin in the
+    specification, the largest object fits between region and walls; but no wall is farther out than the supports.
     """
     region, arrangement = spec.all_regions[number]
     inner_low, inner_high = np.array(region.min), np.array(region.max)
@@ -67,19 +67,19 @@ def enclosure_walls(
 
 
 def _of_region(spec: SceneSpec, number: int) -> str:
-    """What names of a region's walls have before their side."""
+    """Return the part of a wall's name that identifies its region; empty for the main region."""
     return f"{spec.region_names[number]} " if number else ""
 
 
 def walls_beside(spec: SceneSpec, number: int, names: Sequence[str], walls: Sequence[int]) -> list[int]:
-    """Those of some walls, positions among ``names``, that no other region has of its own."""
+    """Return the indices of those walls that do not belong to another region. ``walls`` are indices into ``names``."""
     others = [f"{ENCLOSURE}{_of_region(spec, i)}" for i in range(len(spec.all_regions)) if i != number]
     foreign = {f"{other}{side}" for other in others for side in ("-x", "+x", "-y", "+y", "lid")}
     return [position for position in walls if names[position] not in foreign]
 
 
 def backdrop_shapes(room: Backdrop) -> list[Shape]:
-    """A backdrop as visible boxes: floor, walls that stand on it, and ceiling, each outside of the room."""
+    """Return a backdrop as visible boxes: floor, walls on the floor, and ceiling, all outside of the room."""
     width, depth, height = room.size
     turn = Rotation.from_euler("z", room.rotate_z, degrees=True).as_matrix()
     edge = BACKDROP_THICKNESS
@@ -88,7 +88,7 @@ def backdrop_shapes(room: Backdrop) -> list[Shape]:
     for side in room.sides:
         axis, sign = "xy".index(side[1]), -1.0 if side[0] == "-" else 1.0
         size, middle = [width, wide[1], height], [0.0, 0.0, height / 2]
-        if axis == 1:  # these stand between those along y, so that no faces coincide
+        if axis == 1:  # between the other walls, so that no faces coincide
             size = [width, edge, height]
         else:
             size[0] = edge
@@ -109,7 +109,7 @@ def backdrop_shapes(room: Backdrop) -> list[Shape]:
 
 
 def backdrop_distance(spec: SceneSpec, point: Vec3) -> float:
-    """How far walls and ceiling of a backdrop are from a point [m]; 0 if there are none."""
+    """Return the distance from a point to the walls and ceiling of a backdrop [m]; 0 if there are none."""
 
     def distance(box: Box) -> float:
         pose = stated_pose(box)
@@ -120,17 +120,17 @@ def backdrop_distance(spec: SceneSpec, point: Vec3) -> float:
 
 
 def backdrop_walls(spec: SceneSpec) -> list[Box]:
-    """Walls and ceiling of a backdrop."""
+    """Return the walls and the ceiling of a backdrop."""
     return [shape.box for shape in spec.shapes if shape.box and shape.name.startswith(f"{BACKDROP}wall ")]
 
 
 def finish_name(shape: str) -> str:
-    """What a shape shares its material with: all walls of a backdrop have one."""
+    """Return the name under which a shape's material is drawn. All walls of a backdrop share one name."""
     return f"{BACKDROP}walls" if shape.startswith(f"{BACKDROP}wall ") else shape
 
 
 def stated_pose(place: Box | ObjectPose) -> Float64Array:
-    """A place of the scene file as a transform (4, 4)."""
+    """Return a pose of the scene file as a transform (4, 4)."""
     pose = np.eye(4)
     pose[:3, :3] = Rotation.from_euler("xyz", place.rotate, degrees=True).as_matrix()
     pose[:3, 3] = place.position
@@ -138,10 +138,10 @@ def stated_pose(place: Box | ObjectPose) -> Float64Array:
 
 
 def bin_walls(shape: Bin) -> tuple[trimesh.Trimesh, ...]:
-    """The five boxes that a bin consists of, in world space."""
+    """Return the five boxes of a bin, in world space."""
     width, depth, height = shape.size
     edge = shape.thickness
-    # Walls along x are as long as the floor; those along y stand between them, so that no faces coincide.
+    # Walls along x are as long as the floor. Walls along y stand between them, so that no faces coincide.
     walls = [((width + 2 * edge, depth + 2 * edge, edge), (0.0, 0.0, -edge / 2))]
     walls += [((width + 2 * edge, edge, height), (0.0, side * (depth + edge) / 2, height / 2)) for side in (-1, 1)]
     walls += [((edge, depth, height), (side * (width + edge) / 2, 0.0, height / 2)) for side in (-1, 1)]
@@ -157,12 +157,14 @@ def bin_walls(shape: Bin) -> tuple[trimesh.Trimesh, ...]:
 def enclosed_bounds(
     region: Region, bounds: Sequence[Float64Array], walls: Sequence[int]
 ) -> tuple[Float64Array, Float64Array]:
-    """Corners of what centres of mass must stay in: the outer faces of the walls beside the region, else all colliders.
+    """Return the corners of the box in which centres of mass must stay.
+
+    The box ends at the outer faces of the walls beside the region, or at the bounds of all colliders without walls.
 
     Args:
-        region: Where objects start.
+        region: Region in which objects start.
         bounds: Bounding box of each collider, shape (2, 3) [m].
-        walls: Positions of the colliders that are an enclosure.
+        walls: Indices of the colliders that are enclosure walls.
     """
     low, high = np.min(bounds, axis=0)[0], np.max(bounds, axis=0)[1]
     high[2] = max(high[2], region.max[2])

@@ -1,4 +1,4 @@
-"""Images that a scene file names as a file, a folder, a pattern or a list: which ones they are."""
+"""Lists of image files from a file, a folder, a pattern or a list of names."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ WILDCARDS = frozenset("*?[")
 
 
 MAX_ENTRIES = 1_000_000
-"""Entries of folders that a pattern may look at."""
+"""Maximum number of folder entries that a pattern may visit."""
 MAX_PARTS = 64
 MAX_LENGTH = 4096
 """Length of a pattern: that of the longest path [characters]."""
 
 
 def glob_below(folder: Path, pattern: str) -> list[Path]:
-    """Paths that a pattern matches, relative to a folder, by name.
+    """Return the paths below a folder that match a pattern, sorted by name.
 
-    The pattern is that of :meth:`pathlib.Path.glob`. A folder is read once however often ``**`` occurs, so the time
-    grows with the entries that are there.
+    The pattern has the syntax of :meth:`pathlib.Path.glob`. Each folder is read once, however often ``**`` occurs, so
+    the time grows with the number of entries.
 
     Raises:
-        InputError: If it is no pattern, or has to look at more than :data:`MAX_ENTRIES` entries.
+        InputError: If the pattern is invalid, or if it must visit more than :data:`MAX_ENTRIES` entries.
     """
     if len(pattern) > MAX_LENGTH:
         raise InputError(
@@ -48,16 +48,16 @@ def glob_below(folder: Path, pattern: str) -> list[Path]:
 
 
 def _matches(root: str, parts: Sequence[str], pattern: str) -> set[str]:
-    """Paths below a folder that match the parts of a pattern.
+    """Return the paths below a folder that match the parts of a pattern.
 
-    Every folder is visited with the numbers of all parts that may come next in it.
+    Every folder is visited once, with the numbers of all parts that may match there.
     """
     wild = {i: re.compile(fnmatch.translate(part)).match for i, part in enumerate(parts) if WILDCARDS & set(part)}
     found, looked_at = set[str](), 0
     waiting = [(root, {0})]
     while waiting:
         place, numbers = waiting.pop()
-        numbers |= {i + 1 for i in numbers if i < len(parts) and parts[i] == "**"}  # which may stand for no folder
+        numbers |= {i + 1 for i in numbers if i < len(parts) and parts[i] == "**"}  # '**' also matches no folder
         if len(parts) in numbers:
             found.add(place)
         below = defaultdict[str, set[int]](set)
@@ -66,7 +66,7 @@ def _matches(root: str, parts: Sequence[str], pattern: str) -> set[str]:
                 below[parts[i]].add(i + 1)
         try:
             entries = os.scandir(place) if numbers & wild.keys() else nullcontext(())
-        except OSError:  # not a folder, or one of somebody else
+        except OSError:  # not a folder, or not readable
             entries = nullcontext(())
         with entries as inside:
             for entry in inside:
@@ -84,16 +84,16 @@ def _matches(root: str, parts: Sequence[str], pattern: str) -> set[str]:
 
 
 def names_below(folder: Path, pattern: str, paths: Iterable[Path]) -> tuple[str, ...]:
-    """The names of what a pattern matched, as a scene file in a folder would state them."""
+    """Return matched paths as names in the form that a scene file in ``folder`` would use."""
     absolute = Path(pattern).is_absolute()
     return tuple(path.as_posix() if absolute else path.relative_to(folder).as_posix() for path in paths)
 
 
 def image_names(folder: Path, images: str | tuple[str, ...]) -> tuple[str, ...]:
-    """Names of the image files, relative to a folder, in order.
+    """Return the names of the image files, relative to a folder, in order.
 
     Raises:
-        InputError: If there are none, or one does not exist.
+        InputError: If there is no image, or if a file does not exist.
     """
     if isinstance(images, tuple):
         names = images

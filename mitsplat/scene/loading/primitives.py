@@ -1,7 +1,7 @@
-"""Things that no folder holds, for distractors: convex solids of random proportions in random materials, as splats.
+"""Built-in distractor objects: convex solids of random proportions with random materials, as splats.
 
-A material is two colours in stripes, checks or spots of an object's own coordinates, or one, with a roughness and a
-specular reflectance. Nothing is traced: uniform light shows what hides nothing of itself in its own colours.
+A material has one colour, or two colours in stripes, checks or spots in the object's own coordinates. It also has a
+roughness and a specular reflectance. No light is traced: under uniform light, a convex object shows its own colours.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from mitsplat.gaussians.spherical_harmonics import SH_C0
 from mitsplat.gaussians.surfels import Surfels, place_surfels
 
 _KINDS = ("box", "cylinder", "sphere", "capsule", "cone")
-_EXTENT = (0.025, 0.06)  # longest [m]
+_EXTENT = (0.025, 0.06)  # range of the longest extent [m]
 _SURFELS = 1200
-_LINING = 0.97  # size of the second layer
+_LINING = 0.97  # relative size of the second layer
 
 
 def make_primitives(streams: Iterable[np.random.Generator]) -> tuple[Asset, ...]:
-    """The primitives that random numbers decide, one each, the kinds in turn; 15 take a second or two."""
+    """Create one primitive per random stream. Kinds take turns; 15 primitives take one to two seconds."""
     return tuple(_make(number, rng) for number, rng in enumerate(streams))
 
 
@@ -53,7 +53,10 @@ def _make(number: int, rng: np.random.Generator) -> Asset:
 
 
 def _solid(kind: str, rng: np.random.Generator) -> trimesh.Trimesh:
-    """A closed, convex mesh of any size, round ones fine enough for silhouettes of some hundred pixels."""
+    """Return a closed, convex mesh of arbitrary size.
+
+    Round solids are fine enough for silhouettes of some hundred pixels.
+    """
     slim = rng.uniform(0.3, 1.0)
     if kind == "box":
         return trimesh.creation.box(extents=(1.0, slim, rng.uniform(0.2, 1.0)))
@@ -69,9 +72,10 @@ def _solid(kind: str, rng: np.random.Generator) -> trimesh.Trimesh:
 
 
 def _lined(surfels: Surfels) -> Surfels:
-    """Surfels and a second layer of them a little inside, through whose gaps nothing of the far side is seen.
+    """Add a second layer of surfels slightly inside, so that the far side is not visible through gaps.
 
-    Half a turn about z, which takes every solid to itself, puts other surfels behind the gaps.
+    The second layer is rotated by 180 degrees about z, which maps every solid to itself. Its surfels therefore lie
+    behind the gaps of the first layer.
     """
     turn = np.diag([-1.0, -1.0, 1.0])
     return replace(
@@ -85,7 +89,7 @@ def _lined(surfels: Surfels) -> Surfels:
 
 
 def _pattern(points: Float64Array, rng: np.random.Generator) -> BoolArray:
-    """Which points (N, 3), of an object of size 1, have the second colour."""
+    """Return a mask of the points (N, 3), on an object of size 1, that have the second colour."""
     style = rng.choice(["plain", "stripes", "checks", "spots"])
     turned = Rotation.random(rng=rng).apply(points) * rng.uniform(2.0, 5.0)
     if style == "plain":

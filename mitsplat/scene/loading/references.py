@@ -1,6 +1,6 @@
-"""What a scene file names: folders of assets, meshes, images, and patterns of them, which become what they match.
+"""Files that a scene file names: asset folders, meshes, images, and patterns that select them.
 
-Whatever is wrong with one is told by the key that names it.
+Errors name the key of the scene file that refers to the file.
 """
 
 from __future__ import annotations
@@ -30,12 +30,19 @@ from mitsplat.storage.files import is_inside
 from mitsplat.storage.yaml_input import FieldError, KeyPath, key_place
 
 _MOST_IMAGES = 500
-"""Tried in one process, which is given their names as arguments."""
+"""Maximum number of images that are tested in one process; their names are its arguments."""
 
 
 @dataclass(frozen=True, eq=False)
 class Named:
-    """What a scene file names, as it is on disk; assets and images by their names in the file."""
+    """Loaded files of a scene.
+
+    Attributes:
+        environments: Assets of the environments.
+        assets: Assets of the objects, by their names in the scene file.
+        shape_meshes: Mesh of each shape, in world space [m].
+        images: Paths of the images, by their names in the scene file.
+    """
 
     environments: tuple[Asset, ...]
     assets: Mapping[str, Asset]
@@ -45,7 +52,7 @@ class Named:
 
 @contextmanager
 def blaming(path: Path, *keys: str | int) -> Iterator[None]:
-    """Begin the sentence of an error with the key of the scene file that led to it."""
+    """Prepend the key of the scene file to the message of an input error."""
     try:
         yield
     except FieldError as error:
@@ -55,10 +62,10 @@ def blaming(path: Path, *keys: str | int) -> Iterator[None]:
 
 
 def matched(spec: SceneSpec, path: Path, *, allow_outside: bool) -> SceneSpec:
-    """The specification with patterns replaced by what they match, by name: folders of assets, and images.
+    """Return the specification with patterns replaced by the sorted names of the folders or images that they match.
 
     Raises:
-        InputError: If there are none or not as many as weights, or what is named is where none may be.
+        InputError: If nothing matches, if the number of weights differs, or if a file is outside of the allowed folder.
     """
     if not allow_outside:
         _confine(spec, path)
@@ -82,7 +89,7 @@ def matched(spec: SceneSpec, path: Path, *, allow_outside: bool) -> SceneSpec:
 
 
 def _inside(folder: Path, names: tuple[str, ...], allow_outside: bool) -> tuple[str, ...]:
-    """These names, refused if one leads to where none may be."""
+    """Check that names do not lead out of the folder, unless that is allowed, and return them."""
     for name in () if allow_outside else names:
         _refuse_outside(folder, name)
     return names
@@ -133,7 +140,7 @@ def _matched_images(spec: SceneSpec, path: Path, allow_outside: bool) -> SceneSp
 def _matches(
     folder: Path, pattern: str, kind: Literal["object", "environment"], *, allow_outside: bool
 ) -> tuple[str, ...]:
-    """Asset folders of a kind that a pattern matches, relative to a folder."""
+    """Return the folders of assets of a kind that match a pattern, relative to a folder."""
     found = [path for path in glob_below(folder, pattern) if (path / ASSET_FILE).is_file()]
     named = _inside(folder, names_below(folder, pattern, found), allow_outside)
     names = tuple(name for name in named if read_spec(folder / name).kind == kind)
@@ -143,7 +150,7 @@ def _matches(
 
 
 def _confine(spec: SceneSpec, path: Path) -> None:
-    """Refuse what is named outside of the scene's folder."""
+    """Check that all named files are inside the scene's folder."""
     named: list[tuple[KeyPath, str | None]] = [*environments(spec)]
     named += [(keys, name) for keys, name, _ in object_assets(spec)]
     patterns = ((i, entry.pool) for i, entry in enumerate(spec.objects))
@@ -164,10 +171,10 @@ def _refuse_outside(folder: Path, name: str) -> None:
 
 
 def read_named(spec: SceneSpec, path: Path) -> Named:
-    """Read every asset and mesh that a scene file names, each once, and try its images, which Mitsuba reads.
+    """Read every asset and mesh that a scene file names once, and test the images, which Mitsuba reads later.
 
     Raises:
-        InputError: If one is missing or broken.
+        InputError: If a file is missing or damaged.
     """
     folder = path.parent
     places, assets, shape_meshes = list[Asset](), dict[str, Asset](), []
@@ -190,7 +197,7 @@ def read_named(spec: SceneSpec, path: Path) -> Named:
 
 
 def _check_images(spec: SceneSpec, path: Path, images: Mapping[str, Path]) -> None:
-    """Refuse images that are absent, or that Mitsuba should not be given."""
+    """Check that images exist and that Mitsuba can read them safely."""
     asked = list(named_images(spec))
     for keys, name in asked:
         with blaming(path, *keys):
@@ -204,7 +211,7 @@ def _check_images(spec: SceneSpec, path: Path, images: Mapping[str, Path]) -> No
 
 
 def shape_mesh(shape: Shape, folder: Path) -> trimesh.Trimesh:
-    """A shape in world space [m]; what it names is relative to a folder."""
+    """Return the mesh of a shape in world space [m]. File names are relative to ``folder``."""
     if shape.bin is not None:
         walls: trimesh.Trimesh = trimesh.boolean.union(list(bin_walls(shape.bin)))
         return walls

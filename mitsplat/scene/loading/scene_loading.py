@@ -26,19 +26,21 @@ from mitsplat.storage.file_kinds import refuse_others
 from mitsplat.storage.yaml_input import key_place, load_yaml
 
 _MADE_IN_PYTHON = "<python>.yaml"
-"""Name of the scene file that a scene made in Python has not: errors begin with it, datasets keep such a file."""
+"""File name of scenes made in Python. No such file exists; error messages begin with it, and datasets store the scene
+there.
+"""
 
 
 def load_scene(path: str | Path, *, overrides: Mapping[str, Any] | None = None, allow_outside: bool = False) -> Scene:
-    """Read a scene file, then every asset and mesh that it names, and then judge what was read.
+    """Read a scene file and all assets, meshes and images that it names, and validate them.
 
     Args:
         path: The YAML file.
-        overrides: Values that replace the file's, by dotted key, such as ``{"output.width": 640}``.
-        allow_outside: Whether it may name assets, meshes and images outside of its folder.
+        overrides: Values that replace those of the file, by dotted key, such as ``{"output.width": 640}``.
+        allow_outside: Allow assets, meshes and images outside of the scene's folder.
 
     Raises:
-        InputError: If the file or something that it names is missing or breaks a rule.
+        InputError: If the scene file or a file that it names is missing or invalid.
     """
     path = Path(path)
     refuse_others(path, "a scene file (.yaml)", ".yaml", ".yml")
@@ -46,21 +48,21 @@ def load_scene(path: str | Path, *, overrides: Mapping[str, Any] | None = None, 
 
 
 def make_scene(spec: SceneSpec, folder: str | Path = ".") -> Scene:
-    """A scene of a specification that was made in Python; no file is read but what it names.
+    """Create a scene from a specification made in Python. Only the files that it names are read.
 
     Args:
-        spec: The scene, as ``ms.SceneSpec(name=..., region={"min": ...}, ...)`` makes it: its keys are those of scene
-            files, and a mapping stands for each part that is not made of its own model. It may name files anywhere.
-        folder: What its paths are relative to [the working directory].
+        spec: The scene, created by ``ms.SceneSpec(name=..., region={"min": ...}, ...)``. Its keys are those of scene
+            files; a part can be a model or a mapping. It may name files anywhere.
+        folder: Folder to which paths are relative [the working directory].
 
     Raises:
-        InputError: If something that it names is missing or breaks a rule.
+        InputError: If a named file is missing or invalid.
     """
     return _scene_of(spec, Path(folder) / _MADE_IN_PYTHON, allow_outside=True)
 
 
 def _scene_of(spec: SceneSpec, path: Path, *, allow_outside: bool) -> Scene:
-    """The scene of what a file says, or of what stands for one."""
+    """Return the scene of a specification."""
     spec = matched(spec, path, allow_outside=allow_outside)
     _check_lens(spec, path)
     _check_held_out(spec, path)
@@ -87,10 +89,10 @@ def _scene_of(spec: SceneSpec, path: Path, *, allow_outside: bool) -> Scene:
 
 
 def _sized_objects(spec: SceneSpec, path: Path, named: Named) -> tuple[Asset, ...]:
-    """Asset of each entry, in its size; entries that differ in nothing but count and class share its arrays.
+    """Return the asset of each entry at each of its scales. Entries that differ only in count and class share arrays.
 
     Raises:
-        InputError: If one is of unknown size, cannot be dropped, or does not fit into the region.
+        InputError: If an asset has unknown size, cannot be dropped, or does not fit into its region.
     """
     sized: dict[tuple[str, float | None, float], Asset] = {}
     assets = []
@@ -111,13 +113,13 @@ def _sized_objects(spec: SceneSpec, path: Path, named: Named) -> tuple[Asset, ..
 
 
 def _class_names(spec: SceneSpec, assets: Sequence[Asset]) -> tuple[str, ...]:
-    """Classes of what is labelled."""
+    """Return the sorted class names of labelled objects."""
     entries = [entry for _, _, entry in object_assets(spec) for _ in entry.scales]
     return tuple(sorted({asset.class_name for entry, asset in zip(entries, assets, strict=True) if entry.label}))
 
 
 def _walled(spec: SceneSpec, named: Named, assets: tuple[Asset, ...]) -> tuple[SceneSpec, tuple[trimesh.Trimesh, ...]]:
-    """The specification with its enclosures written out as shapes, and the mesh of every shape."""
+    """Return the specification with enclosures expanded to shapes, and the mesh of every shape."""
     enclosures = (spec.enclosure, *(region.enclosure for region in spec.regions))
     if not any(enclosures):
         return spec, named.shape_meshes
@@ -126,24 +128,24 @@ def _walled(spec: SceneSpec, named: Named, assets: tuple[Asset, ...]) -> tuple[S
         supports += [environment.mesh for environment in named.environments if environment.mesh is not None]
     around = [enclosure_walls(one, spec, assets, supports, i) for i, one in enumerate(enclosures) if one is not None]
     walls = [wall for some in around for wall in some]
-    meshes = tuple(shape_mesh(wall, Path()) for wall in walls)  # boxes, which no file holds
+    meshes = tuple(shape_mesh(wall, Path()) for wall in walls)  # boxes, without files
     regions = tuple(region.model_copy(update={"enclosure": None}) for region in spec.regions)
     update = {"shapes": (*spec.shapes, *walls), "enclosure": None, "regions": regions}
     return spec.model_copy(update=update), (*named.shape_meshes, *meshes)
 
 
 def _check_lens(spec: SceneSpec, path: Path) -> None:
-    """Refuse intrinsics that no camera of the image's size can have, such as a fisheye's that sees behind itself."""
+    """Check that the intrinsics are valid for the image size; a fisheye lens must not see backwards, for example."""
     for keys, camera in spec.camera_entries:
         with blaming(path, *keys, "intrinsics"):
             try:
-                camera_at(np.eye(4), camera.intrinsics, spec.output, camera.zoom[0])  # which shows most
+                camera_at(np.eye(4), camera.intrinsics, spec.output, camera.zoom[0])  # the widest view
             except ValueError as error:
                 raise InputError(str(error)) from error
 
 
 def _check_held_out(spec: SceneSpec, path: Path) -> None:
-    """Refuse to hold out what is not named, and all environments."""
+    """Check that held-out assets and environments exist, and that training keeps an environment."""
     named = {
         "assets": {name for _, name, _ in object_assets(spec)},
         "environments": {name for _, name in environments(spec)},
@@ -160,13 +162,17 @@ def _check_held_out(spec: SceneSpec, path: Path) -> None:
 
 
 def scene_json_schema() -> dict[str, Any]:
-    """JSON Schema of a scene file, for editors."""
+    """Return the JSON schema of scene files, for editors."""
     named = {"$schema": "https://json-schema.org/draft/2020-12/schema", "$id": f"urn:mitsplat:scene:{SCHEMA_VERSION}"}
     return {**named, **SceneSpec.model_json_schema()}
 
 
 def _metric(asset: Asset) -> Asset:
-    """The asset, unless nothing says how large it is."""
+    """Return the asset unchanged if its units are known.
+
+    Raises:
+        InputError: If its units are unknown.
+    """
     if asset.units == "unknown":
         raise InputError(
             f"asset {asset.name!r} is of unknown units: give its longest extent [m] as size, here or in asset.yaml"
@@ -175,15 +181,15 @@ def _metric(asset: Asset) -> Asset:
 
 
 def _check_object(asset: Asset) -> None:
-    """Refuse an object that physics cannot move."""
+    """Check that physics can move the asset."""
     if asset.kind != "object" or asset.mesh is None:
         raise InputError(f"asset {asset.name!r} must be of kind object and have a mesh to be dropped")
 
 
 def _check_fit(asset: Asset, region: Region, name: str) -> None:
-    """Refuse an object that could not lie in a region on its largest side."""
+    """Check that an object fits into the region when it lies on its largest side."""
     where = "the region" if name == MAIN else f"region {name!r}"
-    footprint = np.sort(cast(trimesh.Trimesh, asset.mesh).extents)[1:]  # no object is without
+    footprint = np.sort(cast(trimesh.Trimesh, asset.mesh).extents)[1:]  # every object has a mesh
     space = np.sort(np.subtract(region.max, region.min)[:2])
     if (footprint > space).any():
         raise InputError(

@@ -103,8 +103,7 @@ def plan_frame(
         scene: The scene.
         index: Index of the frame.
         layout: Resting poses of the objects. Without it, a camera whose view depends on the objects gets only a
-            possible
-            view.
+            possible view.
         camera: Replaces the camera of the scene; nothing is drawn or selected for it.
         next_layout: Poses of the objects in the next image, if they move.
         next_camera: Camera of the next image. If absent, the next view of the layout; or ``camera``, if that is given

@@ -41,8 +41,8 @@ _NEIGHBOURS = 2
 _STEPS = 1.2207440846057596 ** -np.arange(1.0, 4.0)
 """Steps of the low-discrepancy sequence in three dimensions: powers of the root of x^4 = x + 1.
 
-Source: Roberts, *The Unreasonable Effectiveness of Quasirandom Sequences*, 2018. Each point can be computed without
-the points before it.
+Source: Roberts, *The Unreasonable Effectiveness of Quasirandom Sequences*, 2018. Each point can be computed without the
+points before it.
 """
 _BORDER = (0.6, 1.0)
 """Range of the distance between target and image centre of views that should cut objects, in half widths or heights."""
@@ -63,8 +63,7 @@ class Viewpoint:
             * ``zoom``: factor on the focal lengths;
             * ``aperture``, ``focus``: thin lens [m];
             * ``motion``: motion during the exposure: ``exposure`` [s]; ``velocity`` [m/s] and ``rotation`` [degrees/s]
-                in
-              the camera's frame; ``readout`` [s] if the shutter is a rolling one;
+                in the camera's frame; ``readout`` [s] if the shutter is a rolling one;
             * ``handheld``: handheld motion, see :func:`moved_by`;
             * ``target``: point in the centre of the image [m];
             * ``object``: id of the instance in the centre of the image;
@@ -136,8 +135,7 @@ class _Turn:
         """Return displacement [m] and rotation vector [degrees] of the handheld camera at a turn, shape (6,).
 
         A sum of N cosines with random phases is approximately normal and has a variance of N/2, whatever the
-        frequencies. The
-        periods here are about seven views or more, which makes the motion smooth.
+        frequencies. The periods here are about seven views or more, which makes the motion smooth.
         """
         rng = random_stream(self.seed, "camera handheld", self.layout, self.number)
         rates, phases = rng.uniform(0, _FASTEST, (6, _WAVES)), rng.uniform(0, 1, (6, _WAVES))
@@ -302,8 +300,7 @@ def _cost(prospect: PredictedView, shares: list[float], fate: Float64Array) -> f
     """Return the difference between the shares of objects in a view and the target shares.
 
     A share of few objects is seldom a whole number. The frame's random numbers ``fate`` round it up or down, so that
-    the
-    average over frames reaches the target although frames are independent.
+    the average over frames reaches the target although frames are independent.
     """
     wanted = np.floor(np.multiply(shares, prospect.in_view) + fate)
     counts = np.array([prospect.hidden, prospect.cut])

@@ -1,10 +1,10 @@
 """Cheap visibility prediction for view selection.
 
 Surfaces are represented by points, spread evenly over the proxy meshes. The visible fraction of an object is predicted
-on a raster whose cells match the spacing of the points. It is the share of the object's cells inside the image in
-which no point of another object is nearer. Occlusion by visible shapes is tested with rays from the points to the
-camera. The environment occludes nothing here. NumPy computes everything on the CPU, so that views do not depend on the
-device that renders them.
+on a raster whose cells match the spacing of the points. It is the share of the object's cells inside the image in which
+no point of another object is nearer. Occlusion by visible shapes is tested with rays from the points to the camera. The
+environment occludes nothing here. NumPy computes everything on the CPU, so that views do not depend on the device that
+renders them.
 """
 
 from __future__ import annotations

@@ -134,8 +134,7 @@ class ImageShadow(StrictModel):
     """Parameters of the published image-space shadow (Niżeniec and Iwanowski, section 4.2).
 
     The shadow map is normalised, blurred, mapped by a sigmoid and multiplied with the image. Where the map is
-    brightest,
-    a highlight is added.
+    brightest, a highlight is added.
     """
 
     blur: Positive = Field(5.0, description="Standard deviation of the Gaussian blur [px at a width of 1280].")

@@ -249,8 +249,8 @@ class RoomLight(StrictModel):
 
     * Window: an area light 12 to 35 degrees above the horizon, at a distance of 0.35 to 0.6. Its size is 0.2 x 0.25 to
       0.45 x 0.4, its temperature 5000 to 8000 K, its radiance 3 to 10.
-    * Lamps: area lights 50 to 85 degrees above the horizon, at the same distances. Their size is 0.05 x 0.05 to
-      0.15 x 0.35, their temperature 2700 to 5000 K, their radiance 8 to 30.
+    * Lamps: area lights 50 to 85 degrees above the horizon, at the same distances. Their size is 0.05 x 0.05 to 0.15 x
+      0.35, their temperature 2700 to 5000 K, their radiance 8 to 30.
     * Walls: an environment light with a radiance of 0.1 to 0.4 and a colour from white to warm white.
     """
 

@@ -63,8 +63,7 @@ class AppearanceRanges(StrictModel):
     """Ranges of the appearance of objects. Values are uniform and drawn once per layout, independently for each object.
 
     Colours change as reflectances do: in linear light, equally for all directions. No colour becomes brighter than
-    white
-    unless it was captured so. Absent keys leave the captured appearance unchanged.
+    white unless it was captured so. Absent keys leave the captured appearance unchanged.
     """
 
     hue: HueRange = Field((0.0, 0.0), description="Rotation of colours about the grey axis [degrees].")

@@ -1,4 +1,4 @@
-"""Presets that trade speed against accuracy in the splat renderer."""
+"""Quality presets of the splat renderer: speed against accuracy."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ Samples = int | Literal["edges"]
 
 @dataclass(frozen=True)
 class Kernel:
-    """How a Gaussian's footprint on the image differs from the Gaussian itself.
+    """Change of a Gaussian's footprint on the image.
 
     Attributes:
-        variance: What is added to the footprint's covariance [px^2].
-        keeps_light: Whether opacity falls as the footprint grows, so that the light of small Gaussians stays the same.
-        alpha_max: Highest opacity of one Gaussian along a ray.
+        variance: Variance added to the footprint's covariance [px^2].
+        keeps_light: True if opacity decreases as the footprint grows, so that small Gaussians emit the same light.
+        alpha_max: Largest opacity of one Gaussian along a ray.
     """
 
     variance: float
@@ -40,30 +40,31 @@ KERNELS: dict[KernelName, Kernel] = {
 
 @dataclass(frozen=True)
 class Quality:
-    """What the renderer computes for one ray; every field that is cheaper is also less exact.
+    """Accuracy settings of the renderer; every cheaper value is less exact.
 
     Attributes:
-        response: Gaussians along every perspective ray (``perspective``), or along rays that are parallel within one
-            Gaussian's footprint, as trainers linearise the projection (``ewa``; Zwicker et al. 2002).
+        response: ``perspective`` evaluates Gaussians along every perspective ray. ``ewa`` uses parallel rays within the
+            footprint of one Gaussian, as trainers linearise the projection (Zwicker et al. 2002).
         kernel: ``exact`` evaluates the Gaussian itself at the pixel's centre. ``mip`` widens footprints by the variance
-            of a pixel, so that small Gaussians do not sparkle (2-D Mip filter, Yu et al. 2024). ``3dgs`` and ``gsplat``
-            dilate and limit opacity as those trainers do.
-        tolerance: Error of a display-encoded colour that the order of blending may make. Infinite: Gaussians are
-            blended in the order of their peaks along one ray of every tile of 8 x 4 pixels. 0: along every pixel's own
-            ray. Between: along one ray with an estimate of the error, nearly along every ray in tiles where that
-            exceeds the tolerance, and quite so where it still does; a few pixels err by more.
-        alpha_min: A Gaussian is cut where its opacity along a ray falls below this. 3DGS trains with 1/255.
-        transmittance_min: A ray ends when less than this share of the light behind would still be seen.
-        extends: Whether what a ray has not seen because it ended counts as the mean of what it has seen, and not as
-            nothing, by which it mostly is nearer to a ray that goes on.
-        amends: Whether, where the tolerance is infinite, a Gaussian that comes later in its tile's order than along the
-            ray takes its share of the colour from what it hides, as far as a few sums tell what that is. Opacities,
-            depths and instances stay those of the tile's order.
-        sh_degree: Highest spherical-harmonic band that is evaluated.
-        samples: Rays per pixel along each axis (n x n on a regular grid, box-filtered); ``edges`` for one, and 2 x 2
-            where instances border on each other, see :mod:`mitsplat.renderer.splatting.antialiasing`.
-        lens_rings: Rings of points around the centre of a thin lens that are looked through: 1, 2, 3 take 7, 19, 37
-            images. Where blur is wide, its points stand apart, and more rings make it smooth.
+            of a pixel, so that small Gaussians do not flicker (2-D Mip filter, Yu et al. 2024). ``3dgs`` and ``gsplat``
+            dilate footprints and limit opacity as those trainers do.
+        tolerance: Tolerated error of a display-encoded colour due to the blending order. Infinite: Gaussians are
+            blended in the order of their peaks along one ray per tile of 8 x 4 pixels. 0: in the order along every
+            pixel's own ray. Between: in the order per tile with an error estimate. Tiles above the tolerance are
+            repeated with a sorting window, and those still above it in the exact order. A few pixels exceed the
+            tolerance.
+        alpha_min: Opacity along a ray below which a Gaussian is cut off. 3DGS trains with 1/255.
+        transmittance_min: Transmittance at which a ray ends.
+        extends: True if the remaining transmittance of an ended ray takes the mean colour of the ray instead of black.
+            This is mostly closer to the result of a longer ray.
+        amends: True if out-of-order Gaussians are corrected where the tolerance is infinite. Such a Gaussian takes its
+            share of the colour from those that it occludes, as estimated from a few sums. Opacities, depths and
+            instances stay those of the tile's order.
+        sh_degree: Highest spherical-harmonic degree that is evaluated.
+        samples: Rays per pixel along each axis (n x n on a regular grid, box-filtered). ``edges`` takes one ray, and 2
+            x 2 at borders between instances, see :mod:`mitsplat.renderer.splatting.antialiasing`.
+        lens_rings: Rings of sample points around the centre of a thin lens: 1, 2, 3 take 7, 19, 37 images. Wide blur
+            shows single points, and more rings make it smooth.
     """
 
     response: ResponseName = "perspective"
@@ -97,12 +98,12 @@ class Quality:
 
     @property
     def grid(self) -> int:
-        """Rays of every pixel along each axis."""
+        """Rays per pixel along each axis."""
         return 1 if self.samples == "edges" else self.samples
 
     @property
     def order(self) -> Order:
-        """How rays walk the lists of their tiles before any are repaired."""
+        """Blending order of the first walk, before tiles are repeated."""
         return "ray" if self.tolerance == 0 else "tile" if math.isinf(self.tolerance) else "window"
 
 
@@ -114,7 +115,7 @@ PRESETS: dict[PresetName, Quality] = {
 
 
 def resolve_quality(quality: str | Quality) -> Quality:
-    """A preset by name, or the value itself.
+    """Return a preset by name, or the given value itself.
 
     Raises:
         InputError: If no preset has that name.

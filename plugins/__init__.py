@@ -16,7 +16,10 @@ _registered: str | None = None
 
 
 def register_under(variant: str | None) -> None:
-    """Register the plugins under a variant once; under an unsupported one, plugins that raise a clear error."""
+    """Register the plugins once per variant.
+
+    Under an unsupported variant, plugins are registered that raise a clear error.
+    """
     global _registered
     if variant is None or variant == _registered:
         return
@@ -28,7 +31,7 @@ def register_under(variant: str | None) -> None:
 
 
 def register() -> None:
-    """Register the plugins under the current variant: their classes derive from types that exist once per variant."""
+    """Register the plugins under the current variant, because their base classes exist once per variant."""
     for name in PLUGINS:
         module = f"{__name__}.{name}"
         if module in sys.modules:
@@ -38,7 +41,7 @@ def register() -> None:
 
 
 def refuse(variant: str) -> None:
-    """Register, under a variant that cannot run them, plugins that say so when a scene names them."""
+    """Register plugins that raise an error on use, for a variant that cannot run them."""
 
     def refused(props: Any) -> Any:
         raise RuntimeError(

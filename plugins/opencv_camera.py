@@ -1,4 +1,4 @@
-"""The sensor plugin ``opencv_camera``: OpenCV intrinsics with lens distortion, or a fisheye."""
+"""Sensor plugin ``opencv_camera``: OpenCV intrinsics with lens distortion, or a fisheye lens."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ class OpenCVCamera(mi.Sensor):
 
      * - cx, cy
        - |float|
-       - Principal point [px], pixel centres at +0.5. (Default: middle of the film)
+       - Principal point [px], pixel centres at +0.5. (Default: centre of the film)
 
      * - distortion
        - |string|
-       - Coefficients ``k1 k2 p1 p2 [k3 [k4 k5 k6]]``, or ``k1 k2 k3 k4`` of a fisheye. (Default: none)
+       - Coefficients ``k1 k2 p1 p2 [k3 [k4 k5 k6]]``, or ``k1 k2 k3 k4`` of a fisheye lens. (Default: none)
 
      * - lens
        - |string|
@@ -41,18 +41,18 @@ class OpenCVCamera(mi.Sensor):
 
      * - aperture_radius
        - |float|
-       - Of a thin lens [m]; 0 for a pinhole. (Default: 0)
+       - Aperture radius of a thin lens [m]; 0 for a pinhole. (Default: 0)
 
      * - focus_distance
        - |float|
-       - Depth along the optical axis that a thin lens sees sharp [m]. (Default: 1)
+       - Depth of the plane in focus of a thin lens, along the optical axis [m]. (Default: 1)
 
      * - near_clip
        - |float|
-       - Nearest visible depth [m]. (Default: 0.01)
+       - Smallest visible depth [m]. (Default: 0.01)
 
-    Rays are generated through the distorted lens itself, so nothing is warped afterwards; other integrators can use
-    the sensor too.
+    Rays are generated through the distorted lens, so that no image is warped afterwards. Other integrators can use the
+    sensor too.
     """
 
     def __init__(self, props: mi.Properties) -> None:
@@ -85,7 +85,7 @@ class OpenCVCamera(mi.Sensor):
             raise InputError(f"sensor 'opencv_camera': {error}") from None
 
     def view(self, samples: int = 1) -> CameraView:
-        """What the splat renderer needs of this camera."""
+        """Return the camera of the splat renderer."""
         width, height = (int(n) for n in self.film().size())
         flip = np.diag([-1.0, -1.0, 1.0, 1.0])
         pose = self.world_from_mitsuba @ flip
@@ -116,7 +116,7 @@ class OpenCVCamera(mi.Sensor):
         return mi.RayDifferential3f(ray), weight
 
     def to_string(self) -> str:
-        """Mitsuba's description of the plugin."""
+        """Return the description that Mitsuba prints."""
         return f"OpenCVCamera[f = ({self.fx}, {self.fy}), c = ({self.cx}, {self.cy}), distortion = {self.distortion}]"
 
 

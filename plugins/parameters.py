@@ -1,4 +1,4 @@
-"""Parameters of plugins, of the types that their manuals state: Mitsuba alone takes text where a number is meant."""
+"""Typed parameters of plugins; Mitsuba alone accepts a string as a number."""
 
 from __future__ import annotations
 
@@ -10,57 +10,57 @@ from mitsplat.errors import InputError
 
 
 class Parameters:
-    """What a scene says of one plugin.
+    """Parameters of one plugin in a scene.
 
-    Every method takes a parameter's name and its value where the scene does not say it, and raises
-    :class:`~mitsplat.errors.InputError` if what it says is of another type or out of range.
+    Every method takes the name of a parameter and its default value. It raises :class:`~mitsplat.errors.InputError` if
+    the value has another type or is out of range.
 
     Args:
-        props: As Mitsuba hands them to the plugin.
-        plugin: What errors call it, such as ``shape 'splats'``.
+        props: Properties from Mitsuba.
+        plugin: Name of the plugin in errors, such as ``shape 'splats'``.
     """
 
     def __init__(self, props: mi.Properties, plugin: str) -> None:
         self._props, self._plugin = props, plugin
 
     def text(self, name: str, default: str) -> str:
-        """Text."""
+        """Return a string."""
         return str(self._typed(name, default, (str,), "text"))
 
     def choice(self, name: str, default: str, *others: str) -> str:
-        """One of a few words."""
+        """Return one of several words."""
         value, words = self.text(name, default), (default, *others)
         if value not in words:
             self.refuse(name, f"be {' or '.join(map(repr, words))}", value)
         return value
 
     def truth(self, name: str, default: bool) -> bool:
-        """True or false."""
+        """Return a boolean."""
         return bool(self._typed(name, default, (bool,), "true or false"))
 
     def number(self, name: str, default: float | None) -> float:
-        """A number; it must be given where the default is None."""
+        """Return a number; it is required if the default is None."""
         value = self._typed(name, default, (int, float), "a number")
         if value is None:
             raise InputError(f"{self._plugin}: {name!r} is missing")
         return float(value)
 
     def positive(self, name: str, default: float | None) -> float:
-        """A number above 0."""
+        """Return a number above 0."""
         value = self.number(name, default)
         if not value > 0:
             self.refuse(name, "be > 0", value)
         return value
 
     def whole(self, name: str, default: int, least: int, most: int) -> int:
-        """A whole number within bounds."""
+        """Return an integer from ``least`` to ``most``."""
         value = self._typed(name, default, (int,), f"from {least} to {most}")
         if not least <= value <= most:
             self.refuse(name, f"be from {least} to {most}", value)
         return int(value)
 
     def refuse(self, name: str, rule: str, value: Any) -> None:
-        """Say that a parameter must be otherwise."""
+        """Raise an error that a parameter violates a rule."""
         raise InputError(f"{self._plugin}: {name!r} must {rule} (got {value!r})")
 
     def _typed(self, name: str, default: Any, kinds: tuple[type, ...], what: str) -> Any:

@@ -1,4 +1,4 @@
-"""The integrator plugin ``splat_proxy``: splats for appearance, their proxy meshes for light."""
+"""Integrator plugin ``splat_proxy``: splats for appearance, proxy meshes for light."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ AOVS = (
 
 @dataclass(frozen=True, eq=False)
 class _Contents:
-    """What the shapes of a scene that emit nothing amount to on the device; kept while they stay the same."""
+    """Device data of all shapes of a scene that emit no light; reused while these shapes stay the same."""
 
     shapes: tuple[Any, ...]
     clouds: CloudSet | None
@@ -82,92 +82,92 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
 
      * - response
        - |string|
-       - ``perspective``, or ``ewa`` for rays that are parallel within a Gaussian's footprint. (Default:
-         ``perspective``)
+       - ``perspective``, or ``ewa`` for parallel rays within a Gaussian's footprint. (Default: ``perspective``)
 
      * - kernel
        - |string|
-       - Footprint of a Gaussian: ``exact``, ``mip`` (widened by a pixel), or as the trainers ``3dgs`` and ``gsplat``
-         dilate it. (Default: ``exact``)
+       - Footprint of a Gaussian: ``exact``, ``mip`` (widened by a pixel), or dilated as by the trainers ``3dgs`` and
+         ``gsplat``. (Default: ``exact``)
 
      * - samples
        - |int|
-       - Rays per pixel along each axis, 1 to 8; or the |string| ``edges``: one, and 2 x 2 where instances or visible
-         meshes border on each other. (Default: 1)
+       - Rays per pixel along each axis, 1 to 8; or the |string| ``edges``: one ray, and 2 x 2 at borders between
+         instances or visible meshes. (Default: 1)
 
      * - lens_rings
        - |int|
-       - Rings of points that the aperture of a thin lens is sampled at, 1 to 8. (Default: 2)
+       - Rings of sample points on the aperture of a thin lens, 1 to 8. (Default: 2)
 
      * - shadow
        - |string|
-       - ``traced``: light from the scene's emitters, shadowed by the proxies. ``none``: colours as captured.
-         (Default: ``traced``)
+       - ``traced``: light from the scene's emitters, shadowed by the proxies. ``none``: colours as captured. (Default:
+         ``traced``)
 
      * - shadow_error
        - |float|
-       - Standard error of light that is half of white for which shadow rays are spent, and as much to the eye of all
-         other light, above 0 and below 1; or 0 for ``shadow_samples`` at every pixel. (Default: 0.03)
+       - Target standard error of mid-grey irradiance, scaled perceptually elsewhere; in (0, 1). With 0, every pixel
+         takes ``shadow_samples`` rays. (Default: 0.03)
 
      * - metered
        - |bool|
-       - Whether the picture will be exposed by the light in it, which ``shadow_error`` then refers to. (Default:
-         false)
+       - True if automatic exposure normalises the mean brightness of the picture; ``shadow_error`` then refers to the
+         exposed picture. (Default: false)
 
      * - shadow_samples
        - |int|
-       - Most shadow rays per pixel. (Default: 64)
+       - Largest number of shadow rays per pixel. (Default: 64)
 
      * - occluders
        - |string|
-       - What casts the shadows of dynamic objects: their ``proxies``, or their ``splats``, which thin and porous things
-         need, and which takes longer. (Default: ``proxies``)
+       - Occluders that cast the shadows of dynamic objects: ``proxies``, or ``splats`` for thin and porous objects,
+         which takes longer. (Default: ``proxies``)
 
      * - bounce
        - |bool|
-       - Whether uniformly captured objects and plain meshes also get the light that the surroundings and visible
+       - True if uniformly captured objects and diffuse meshes also receive the light that surroundings and visible
          meshes reflect. (Default: true)
 
      * - highlight
        - |bool|
-       - Whether lights shine in surfaces, as roughness and specular of the splats say. (Default: true)
+       - True if surfaces show highlights of lights, by the roughness and specular of the splats. (Default: true)
 
      * - white
        - |float|
-       - Irradiance under which uniformly captured colours are shown unchanged [W/m^2]: pi where radiance 1 is the white
-         of the surroundings, as in baked ones. (Default: 0, that of an unoccluded horizontal surface at ``reference``)
+       - Irradiance under which uniformly captured colours are shown unchanged [W/m^2]. Use pi if radiance 1 is the
+         white of the surroundings, as in baked ones. (Default: 0, the irradiance of an unoccluded horizontal surface at
+         ``reference``)
 
      * - sky_reach
        - |float|
-       - How far away what hides the sky from a point may be [m]: less than the walls of a room lets a sky stand for the
-         light that these reflect. (Default: 0, any distance)
+       - Largest distance at which an object occludes the sky [m]. With a distance below that of the walls of a room, a
+         sky represents the light that the walls reflect. (Default: 0, any distance)
 
      * - reference
        - |point|
-       - A place in the middle of what is lit. (Default: origin)
+       - Point in the middle of the lit objects. (Default: origin)
 
      * - mesh_samples
        - |int|
-       - Light paths per pixel of visible meshes that are not plainly diffuse, 1 to 65536. (Default: 64)
+       - Light paths per pixel of visible meshes that are not purely diffuse, 1 to 65536. (Default: 64)
 
      * - max_depth
        - |int|
-       - Longest of these paths, as in Mitsuba's own integrators: 2 is direct light. From 2 to 64. (Default: 8)
+       - Largest length of these paths, 2 to 64, as in Mitsuba's own integrators: 2 is direct light. (Default: 8)
 
      * - hide_emitters
        - |bool|
-       - Whether the camera sees no emitter: neither area lights nor, where nothing covers it, the sky. (Default: false)
+       - True if the camera sees no emitters: neither area lights nor an uncovered sky. (Default: false)
 
-    Every :monosp:`splats` shape is blended front to back per pixel; other meshes of the scene hide splats behind them,
-    are hidden by splats before them, and cast shadows on them, unless light passes through them. Plainly diffuse ones
-    are lit as splats are, from both sides, by emitters and by what the surroundings reflect. All other materials of
-    Mitsuba are path traced: metal mirrors, and glass shows, splats, meshes and emitters. In mirrors, splats that were
-    captured under the scene's light lack the shadows of what was added.
+    Every :monosp:`splats` shape is blended front to back per pixel. Other meshes of the scene occlude splats behind
+    them and are occluded by splats in front of them. They cast shadows on splats unless light passes through them.
+    Purely diffuse meshes are lit like splats, from both sides, by emitters and by reflected light of the surroundings.
+    All other materials of Mitsuba are path traced: metal reflects, and glass shows, splats, meshes and emitters. In
+    reflections, splats that were captured under the scene's light do not show the shadows of added objects.
 
-    The picture's white is the irradiance that ``white`` states: radiance is shown times pi over it. A sky makes alpha
-    1. The image holds linear R, G, B, A and the channels that ``aov_names`` lists. One emitter or more are needed for
-    ``shadow: traced``; without any, colours stay as captured. Sensors are :monosp:`opencv_camera`,
-    :monosp:`perspective` and :monosp:`thinlens`; their film's filter and their sampler are not used.
+    The irradiance ``white`` is the white of the picture: radiance is multiplied by pi over it. With a sky, alpha is 1.
+    The image holds linear R, G, B, A and the channels of ``aov_names``. ``shadow: traced`` needs at least one emitter;
+    without emitters, colours stay as captured. Sensors are :monosp:`opencv_camera`, :monosp:`perspective` and
+    :monosp:`thinlens`; the filter of their film and their sampler are not used.
 
     .. tabs::
 
@@ -213,13 +213,13 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
         self._still: tuple[tuple[Any, Quality, list[Any]], StaticTileCache | None] | None = None
 
     def aov_names(self) -> list[str]:
-        """Names of the channels after R, G, B and A."""
+        """Return the names of the channels after R, G, B and A."""
         return list(AOVS)
 
     def render(
         self, scene: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0, develop: bool = True, evaluate: bool = True
     ) -> Any:
-        """Image tensor (H, W, 4 + AOVs), linear RGBA first."""
+        """Render an image tensor (H, W, 4 + AOVs), linear RGBA first."""
         if not isinstance(sensor, mi.Sensor):
             sensor = scene.sensors()[sensor]
         layers = self.render_layers(scene, sensor, seed=int(seed))
@@ -238,11 +238,11 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
         return image
 
     def render_layers(self, scene: Any, sensor: Any, *, seed: int = 0) -> dict[str, Any]:
-        """All layers as flat row-major device arrays: colours linear, depths along z [m].
+        """Render all layers as flat row-major device arrays: colours linear, depths along z [m].
 
-        Through a thin lens, colours and opacity are means over its aperture; all else is what its centre sees.
-        ``order_error`` holds the largest and the mean error that the order of blending leaves, see :class:`Image`;
-        it is absent where the quality estimates none.
+        Through a thin lens, colours and opacity are means over its aperture; all other layers are those of its centre.
+        ``order_error`` holds the largest and the mean error due to the blending order, see :class:`Image`. It is absent
+        if the quality has no estimate.
         """
         contents = self._read(scene)
         views = view_of(sensor).apertures(self.quality.lens_rings)
@@ -251,7 +251,7 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
         layers, errors = self._layers(contents, scene, views[0], accuracy, paths, seed), []
         errors.append(layers.pop("order_error"))
         if len(views) > 1:
-            # The mean of n views has sqrt(n) times less noise than each of them.
+            # The mean of n views has sqrt(n) times less noise than each view.
             error, most = self.shadow_error * len(views) ** 0.5, -(-self.shadow_samples // len(views))
             coarse = Accuracy(error, most, self.metered)
             blurred = {name: layers[name] for name in ("rgb", "alpha", "captured")}
@@ -270,7 +270,7 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
     def _layers(
         self, contents: _Contents, scene: Any, view: CameraView, accuracy: Accuracy, paths: int, seed: int
     ) -> dict[str, Any]:
-        """The layers that one point of the lens sees."""
+        """Render the layers through one point of the lens."""
         rays = view.rays()
         behind, lamps, z_max = self._behind(contents, scene, view, rays)
         splat = self._trace_splats(contents, scene, view, z_max)
@@ -292,7 +292,7 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
                 contents.traits.seen(self._by_shape(contents, view, z_max), splat.instance),
                 mesh,
             )
-            # Light is traced at visible meshes as at static proxies, also where splats touch them.
+            # Visible meshes receive light like static proxies, also where splats touch them.
             ground = behind.before(static) if behind else static
             dr.eval(seen, ground)
             light, highlight = light_factor(
@@ -338,7 +338,7 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
         radiance: Any,
         white: Any,
     ) -> dict[str, Any]:
-        """Colours and opacity of ``layers``, averaged over several rays where pixels that differ in ``key`` meet."""
+        """Return colours and opacity with several rays averaged at borders between pixels of different ``key``."""
         edges = Edges.find(key, view)
         if edges is None:
             return {}
@@ -351,7 +351,7 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
         pixel = edges.alike(key, shown.key)
 
         def near(values: Any) -> Any:
-            """What the nearest pixel has that shows the same."""
+            """Return the values of the nearest pixel with the same key."""
             return values if dr.width(values) == 1 else dr.gather(type(values), values, pixel)
 
         lights = near(layers["light"]), near(layers["highlight"])
@@ -365,9 +365,9 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
     def _behind(
         self, contents: _Contents, scene: Any, view: CameraView, rays: Any, at: tuple[Any, Any] | None = None
     ) -> tuple[Behind | None, SeenLights | None, Any | None]:
-        """Visible meshes and emitters that rays meet, and the depths [m] of the nearest of them.
+        """Return visible meshes and emitters along rays, and the depths [m] of the nearest of them.
 
-        Rays are those through the positions ``at`` of the view [px], or through the centres of all its pixels.
+        Rays pass through the positions ``at`` of the view [px], or through the centres of all its pixels.
         """
         behind = contents.meshes.trace(view, rays, at) if contents.meshes else None
         lamps = None if self.hide_emitters else SeenLights.trace(scene, view, rays)
@@ -388,7 +388,7 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
         paths: int,
         seed: int,
     ) -> Any | None:
-        """What path-traced meshes send along the rays that show them, in the picture's scale (Color3f)."""
+        """Return the radiance (Color3f) of path-traced meshes along their visible rays, in the picture's scale."""
         if behind is None or contents.meshes is None or contents.meshes.plain is None:
             return None
         pixel = dr.compress(shown.solid & ~shown.plain & (shown.veil < 1 - 1e-3))
@@ -413,9 +413,9 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
         return radiance
 
     def silhouettes(self, scene: Any, sensor: Any, *, source: str = "splats") -> dict[int, Silhouette]:
-        """Every instance above 0 as it would be seen alone, by its splats or its proxies (``source``).
+        """Return the unoccluded silhouette of every instance above 0, by its splats or its proxies (``source``).
 
-        Positions are relative to the image and may lie outside it; an instance without pixels is absent.
+        Positions are relative to the image and may lie outside it. An instance without pixels is omitted.
         """
         contents = self._read(scene)
         view = view_of(sensor)
@@ -430,13 +430,16 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
         return proxy_silhouettes(proxies, view)
 
     def _white(self, scene: Any) -> Any:
-        """Irradiance (Color3f) that the colours of uniformly captured objects stand for."""
+        """Return the irradiance (Color3f) at which uniformly captured objects keep their colours."""
         return (
             mi.Color3f(dr.opaque(mi.Float, self.white)) if self.white else reference_irradiance(scene, self.reference)
         )
 
     def _by_shape(self, contents: _Contents, view: CameraView, z_max: Any | None) -> Any | None:
-        """Which of an instance's shapes a pixel shows, where these are not lit alike; see :class:`Traits`."""
+        """Return the shape of an instance that each pixel shows, or None if all its shapes are lit alike.
+
+        Shapes are rows of :class:`Traits`.
+        """
         if contents.traits.placements is None or contents.clouds is None:
             return None
         fine = view.sampled(self.quality.grid)
@@ -456,7 +459,7 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
     def _still_layer(
         self, contents: _Contents, scene: Any, view: CameraView, z_max: Any | None
     ) -> StaticTileCache | None:
-        """What is static as seen from here, from the second time that the camera is in the same place."""
+        """Return the static tile cache of a camera, from its second use on."""
         static = [p for p in contents.placements if p.instance == 0]
         if contents.clouds is None or len(static) == len(contents.placements):
             return None
@@ -474,8 +477,8 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
         return self._still[1]
 
     def _read(self, scene: Any) -> _Contents:
-        """Upload what the shapes hold, unless they are those of the last call."""
-        # Lights that are shapes change from frame to frame, and are neither seen nor in the way.
+        """Upload the data of the shapes unless they are those of the last call."""
+        # Emitter shapes change from frame to frame; as contents they are neither visible nor occluders.
         shapes = tuple(s for s in scene.shapes() if not s.is_emitter())
         known = self._contents
         if known is not None and _identical(known.shapes, shapes):
@@ -510,7 +513,7 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
         return self._contents
 
     def _surroundings(self, carriers: list[Any]) -> RadianceGrid | None:
-        """Captured colours of the largest of the splats that were captured under the scene's light."""
+        """Return the radiance grid of the largest splats that were captured under the scene's light."""
         static = [c for c in carriers if not c.dynamic and c.capture_light == "scene" and len(c.splats)]
         if not static:
             return None
@@ -520,7 +523,7 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
         return self._grid[1]
 
     def _upload(self, distinct: list[Any]) -> CloudSet | None:
-        """Device copies of splats; those of the last call are kept, because layouts of a scene share their assets."""
+        """Upload splats; copies of the last call are reused, because layouts of a scene share their assets."""
         kept = {id(splats): (splats, cloud) for splats, cloud in self._uploaded}
         self._uploaded = [
             kept.get(id(s)) or (s, upload_cloud(s.means, s.quats, s.scales, s.opacities, s.sh)) for s in distinct
@@ -529,12 +532,12 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
         return merge_clouds(clouds) if sum(c.count for c in clouds) else None
 
     def to_string(self) -> str:
-        """Mitsuba's description of the plugin."""
+        """Return the description that Mitsuba prints."""
         return f"SplatProxyIntegrator[quality = {self.quality}, shadow = {self.shadow}]"
 
 
 def _same(a: tuple[Any, Quality, list[Any]], b: tuple[Any, Quality, list[Any]]) -> bool:
-    """Whether two cameras, presets and lists of shapes are the same."""
+    """Return True if two keys of camera, quality and shapes are the same."""
     return a[:2] == b[:2] and _identical(a[2], b[2])
 
 

@@ -1,4 +1,4 @@
-"""The shape plugin ``splats``: Gaussians with a proxy mesh, carried to the integrator ``splat_proxy``."""
+"""Shape plugin ``splats``: Gaussians with a proxy mesh, as input of the integrator ``splat_proxy``."""
 
 from __future__ import annotations
 
@@ -28,18 +28,18 @@ class SplatsShape(mi.Mesh):
 
      * - filename
        - |string|
-       - Splat file, where there is no asset: 3DGS ``.ply``, ``.compressed.ply``, ``.splat``, ``.ksplat``, ``.spz`` or
-         ``.sog``.
+       - Splat file, required without ``asset``: 3DGS ``.ply``, ``.compressed.ply``, ``.splat``, ``.ksplat``, ``.spz``
+         or ``.sog``.
 
      * - proxy
        - |string|
-       - Mesh file in the splats' own frame that stands for them where light is traced: it receives and casts shadows.
+       - Mesh file in the frame of the splats. It represents them in light transport: it receives and casts shadows.
          (Default: that of the asset, or none)
 
      * - units
        - |float|
-       - Metres per unit of ``filename`` and ``proxy``. (Default: 1; must be given for the splats of an asset folder
-         that has others)
+       - Metres per unit of ``filename`` and ``proxy``. (Default: 1; required for splats of an asset folder with other
+         units)
 
      * - to_world
        - |transform|
@@ -51,7 +51,7 @@ class SplatsShape(mi.Mesh):
 
      * - dynamic
        - |bool|
-       - Whether the shadow of the proxy is missing in what was captured and has to be added. (Default: true for an
+       - True if the captured colours do not contain the shadow of the proxy, so that it is added. (Default: true for an
          instance above 0)
 
      * - capture_light
@@ -73,14 +73,14 @@ class SplatsShape(mi.Mesh):
 
      * - wear
        - |float|
-       - Share of light that dirt takes where it is thickest, in [0, 1]. (Default: 0)
+       - Coverage of dirt at its full thickness, in [0, 1]. (Default: 0)
 
      * - wear_seed
        - |int|
-       - Which dirt, from 0 to 8388607. (Default: 0)
+       - Seed of the dirt pattern, from 0 to 8388607. (Default: 0)
 
-    The shape only carries its data: rays never meet it, and other integrators see nothing. Shapes of one file share one
-    copy.
+    The shape only holds data: rays never hit it, and it is invisible to other integrators. Shapes with the same file
+    share one copy.
 
     .. tabs::
 
@@ -97,7 +97,7 @@ class SplatsShape(mi.Mesh):
         self, props: mi.Properties, splats: Splats | None = None, proxy: trimesh.Trimesh | None = None
     ) -> None:
         super().__init__("splats", 3, 1, props=props)
-        # One triangle without area: Mitsuba asks for a mesh, and no ray can meet this one.
+        # Mitsuba requires a mesh; one triangle without area is never hit.
         params = mi.traverse(self)
         params["vertex_positions"] = mi.Float([0.0] * 9)
         params["faces"] = mi.UInt32([0, 0, 0])
@@ -141,7 +141,7 @@ class SplatsShape(mi.Mesh):
         self.appearance = self._read_appearance(given)
 
     def _read_appearance(self, given: Parameters) -> SplatAppearance | None:
-        """What its colours are changed by, if the scene says anything of that."""
+        """Read the appearance; return None if the scene sets neither colours nor wear."""
         text, wear = given.text("colours", ""), given.number("wear", 0.0)
         seed = given.whole("wear_seed", 0, 0, 2**23 - 1)
         if not 0 <= wear <= 1:
@@ -159,7 +159,7 @@ class SplatsShape(mi.Mesh):
         return SplatAppearance(tuple(matrix), wear, seed, size or 1.0)
 
     def to_string(self) -> str:
-        """Mitsuba's description of the plugin."""
+        """Return the description that Mitsuba prints."""
         return f"SplatsShape[count = {len(self.splats)}, instance = {self.instance}, proxy = {self.proxy is not None}]"
 
 
@@ -183,7 +183,10 @@ def _stamp(filename: str, inside: str = "") -> tuple[Path, int]:
 
 
 def _refuse_other_units(path: Path) -> None:
-    """Refuse splats of an asset whose files are not in metres with z up, which the file alone does not say."""
+    """Raise an error for splats of an asset that are not in metres with z up.
+
+    The splat file itself does not state its units and axes.
+    """
     folder = path.parent
     if not (folder / ASSET_FILE).is_file():
         return

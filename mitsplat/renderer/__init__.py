@@ -1,8 +1,8 @@
-"""Splats and proxy meshes to layers, by the integrator ``splat_proxy``.
+"""Renderer of splats and proxy meshes, called through the integrator ``splat_proxy``.
 
-In: Gaussians, meshes and lights as Mitsuba's shapes and emitters, and a camera. Out: :class:`Layers`, as arrays:
-linear colour, depth, instance ids, light and highlight; and the silhouette of every instance alone. The work is done
-by :mod:`mitsplat.plugins`, one stage a module.
+In: Gaussians, meshes and lights as Mitsuba's shapes and emitters, and a camera. Out: :class:`Layers` as arrays (linear
+colour, depth, instance ids, light and highlight), and the unoccluded silhouette of every instance. Each stage has a
+subpackage; :mod:`mitsplat.plugins` connects them to Mitsuba.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Scenes to layers: every path to the renderer, Python, YAML or XML, ends in the integrator plugin ``splat_proxy``."""
+"""Rendering of scenes to layers; Python, YAML and XML scenes all use the integrator plugin ``splat_proxy``."""
 
 from __future__ import annotations
 
@@ -27,27 +27,27 @@ from mitsplat.runtime.variant import one_at_a_time
 
 @dataclass(frozen=True, eq=False)
 class Layers(LazyValue):
-    """What the integrator makes of one view, H x W pixels.
+    """Output of the integrator for one view, H x W pixels.
 
-    Layers that were rendered stay on the device as long as this does, and come to the host one by one, when they are
-    first looked at. Those of one channel may not be written to: copy them.
+    Rendered layers stay on the device as long as this object exists. Each layer is copied to the host on first access.
+    Layers of one channel are read-only: copy them to change them.
 
-    Through a thin lens, ``rgb``, ``captured`` and ``alpha`` are means over its aperture; all else is what its centre
-    sees.
+    Through a thin lens, ``rgb``, ``captured`` and ``alpha`` are means over its aperture. All other layers are those of
+    the ray through its centre.
 
     Attributes:
         rgb: Linear colour with light and highlight applied, multiplied by alpha, (H, W, 3) float32.
         alpha: Opacity, (H, W) float32.
         captured: Linear colour before light, multiplied by alpha, (H, W, 3) float32.
-        depth: Depth along the optical axis [m], 0 where nothing is, (H, W) float32.
-        instance: Id that has the largest share of the pixel, 0 where that is the environment's or what is left of the
-            ray, (H, W) uint16.
-        proxy_depth: The same depth of the proxy meshes, (H, W) float32.
+        depth: Depth along the optical axis [m], 0 for background, (H, W) float32.
+        instance: Id with the largest share of the pixel, (H, W) uint16. It is 0 if the environment or the remaining
+            transmittance has the largest share.
+        proxy_depth: Depth of the proxy meshes along the optical axis [m], (H, W) float32.
         proxy_instance: Id of the nearest proxy mesh, (H, W) uint16.
-        normal: World-space unit normal of the nearest proxy, zero where there is none, (H, W, 3) float32.
-        light: Factor that light and shadow put on the linear colour, (H, W, 3) float32.
-        highlight: Linear colour to add to captured colours in light, less what they hold of their own light's mirror
-            image, (H, W, 3) float32.
+        normal: World-space unit normal of the nearest proxy, zero for a miss, (H, W, 3) float32.
+        light: Factor of light and shadow on the linear colour, (H, W, 3) float32.
+        highlight: Linear colour added to lit colours, minus the mirrored capture light in the captured colours, (H, W,
+            3) float32.
     """
 
     rgb: Float32Array
@@ -63,7 +63,7 @@ class Layers(LazyValue):
 
     @classmethod
     def on_device(cls, channels: Mapping[str, Any], shape: tuple[int, int]) -> Layers:
-        """Layers of (H, W) pixels that are flat row-major device arrays, colours of three channels."""
+        """Create layers of (H, W) pixels from flat row-major device arrays; colours have three channels."""
         fetch = {name: _host_ids if name.endswith("instance") else host_array for name in channels}
         known = dict(channels)
         order_error = known.pop("order_error", None)
@@ -72,7 +72,7 @@ class Layers(LazyValue):
 
     @classmethod
     def stacked(cls, parts: Sequence[tuple[Layers, slice]]) -> Layers:
-        """Layers of one below another, of each of which the stated rows are taken; all on the device, equally wide."""
+        """Stack row ranges of layers from top to bottom; all parts must be on the device and have equal width."""
         width = parts[0][0].shape[1]
         counts = [width * (rows.stop - rows.start) for _, rows in parts]
 
@@ -80,7 +80,7 @@ class Layers(LazyValue):
             if dr.depth_v(value) == 2:
                 return type(value)(*[taken(channel, rows) for channel in value])
             place = dr.arange(mi.UInt32, width * (rows.stop - rows.start)) + dr.opaque(mi.UInt32, width * rows.start)
-            # What is the same everywhere is one value on the device.
+            # A constant layer is one value on the device.
             return dr.gather(type(value), value, place if dr.width(value) > 1 else 0 * place)
 
         known = [(part.__dict__["_channels"], rows) for part, rows in parts]
@@ -94,9 +94,9 @@ class Layers(LazyValue):
 
     @property
     def order_error(self) -> dict[str, float] | None:
-        """Largest and mean error of the pixels' display-encoded colours that the order of blending leaves, estimated.
+        """Largest and mean estimated error of display-encoded pixel colours due to the blending order.
 
-        None where the quality estimates none, as ``fast``; and of copies.
+        None if the quality has no estimate, such as ``fast``, and None for copies.
         """
         found = self.__dict__.get("_order_error")
         return None if found is None else dict(zip(("largest", "mean"), np.array(found).tolist(), strict=True))
@@ -108,15 +108,15 @@ class Layers(LazyValue):
         return height, width
 
     def device_array(self, name: str) -> Any:
-        """A layer of floats as a flat row-major device array; colours and normals as three of them, Color3f."""
+        """Return a float layer as a flat row-major device array; colours and normals as Color3f."""
         channels = self.__dict__.get("_channels")
         return device_array(getattr(self, name)) if channels is None else channels[name]
 
 
 def make_integrator(*, quality: str | Quality = "balanced", **properties: Any) -> Any:
-    """The integrator ``splat_proxy``, which keeps what it uploaded as long as it sees the same shapes.
+    """Create the integrator ``splat_proxy``; ``properties`` are those of the plugin.
 
-    ``properties`` are those of the plugin.
+    The integrator keeps its uploads as long as the shapes of the scene stay the same.
     """
     ensure_variant()
     integrator = mi.load_dict({"type": "splat_proxy", **properties})
@@ -125,19 +125,19 @@ def make_integrator(*, quality: str | Quality = "balanced", **properties: Any) -
 
 
 def make_sensor(camera: Camera) -> Any:
-    """A camera as the sensor plugin ``opencv_camera``."""
+    """Create the sensor plugin ``opencv_camera`` of a camera."""
     ensure_variant()
     return mi.load_dict(describe_sensor(camera), parallel=False)
 
 
 @lru_cache(maxsize=1)
 def _sensor_of(camera: Camera, _variant: str) -> Any:
-    """The sensor of the last camera, through which a frame is looked at twice."""
+    """Return the cached sensor of the last camera, because a frame uses it twice."""
     return make_sensor(camera)
 
 
 def describe_sensor(camera: Camera) -> dict[str, Any]:
-    """Mitsuba's dictionary of a camera."""
+    """Return Mitsuba's dictionary of a camera."""
     pose = camera.world_from_camera @ np.diag([-1.0, -1.0, 1.0, 1.0])
     return {
         "type": "opencv_camera",
@@ -164,7 +164,7 @@ def describe_sensor(camera: Camera) -> dict[str, Any]:
 def make_splats_shape(
     splats: Splats, world_from_splats: npt.ArrayLike | None = None, proxy: Any = None, **properties: Any
 ) -> Any:
-    """The shape plugin ``splats`` around data in memory; ``properties`` are those of the plugin."""
+    """Create the shape plugin ``splats`` from data in memory; ``properties`` are those of the plugin."""
     ensure_variant()
     from mitsplat.plugins.splats import SplatsShape  # derives from a class of the variant
 
@@ -178,12 +178,12 @@ def make_splats_shape(
 
 @one_at_a_time
 def render_splats(splats: Splats, camera: Camera, *, quality: str | Quality = "balanced") -> Layers:
-    """Render splats alone, with the colours as captured.
+    """Render splats alone with their captured colours.
 
     Args:
-        splats: What to render; it becomes instance 1.
-        camera: From where.
-        quality: A preset's name or a :class:`mitsplat.quality.Quality`.
+        splats: Splats to render, as instance 1.
+        camera: Camera.
+        quality: Name of a preset, or a :class:`mitsplat.quality.Quality`.
 
     Raises:
         InputError: If there is no such preset.
@@ -198,41 +198,41 @@ def render_splats(splats: Splats, camera: Camera, *, quality: str | Quality = "b
 
 @lru_cache(maxsize=2)
 def _alone(splats: Splats, variant: str) -> tuple[Any, Any]:
-    """Integrator and scene of splats alone, kept so that the next view of the same splats uploads nothing."""
+    """Return cached integrator and scene of splats, so that the next view of them needs no upload."""
     scene = mi.load_dict({"type": "scene", "splats": make_splats_shape(splats, instance=1)})
     return make_integrator(shadow="none"), scene
 
 
 def render_layers(integrator: Any, scene: Any, camera: Camera, *, seed: int = 0) -> Layers:
-    """Run the integrator; each layer comes to the host when it is first looked at, see :class:`Layers`."""
+    """Run the integrator; each layer is copied to the host on first access, see :class:`Layers`."""
     layers = integrator.render_layers(scene, _sensor_of(camera, str(mi.variant())), seed=seed)
     refuse_lost_rays()
     return Layers.on_device(layers, (camera.height, camera.width))
 
 
 def device_array(values: npt.NDArray[Any]) -> Any:
-    """Values (H, W), or (H, W, 3), as flat row-major floats on the device, or three of them, Color3f."""
+    """Upload values as flat row-major floats: (H, W) as Float, (H, W, 3) as Color3f."""
     ensure_variant()
     flat = wrapped(mi.Float, values.astype(np.float32, copy=False))
     return flat if values.ndim == 2 else dr.unravel(mi.Color3f, flat)
 
 
 def host_array(values: Any, shape: tuple[int, int]) -> Float32Array:
-    """Flat row-major device values on the host by one copy: (H, W), or, of three channels, (H, W, 3).
+    """Copy flat row-major device values to the host: (H, W), or (H, W, 3) for three channels.
 
-    Those of one channel are read-only, because on a CPU they are the device's own.
+    Arrays of one channel are read-only, because on a CPU they share the device's memory.
     """
     colour = dr.depth_v(values) == 2
     array = dr.ravel(values).numpy() if colour else values.numpy()
     size = (*shape, 3) if colour else shape
-    if array.size < math.prod(size):  # what is the same everywhere is one value on the device
+    if array.size < math.prod(size):  # a constant layer is one value on the device
         array = np.broadcast_to(array, size).copy()
     array.flags.writeable = colour
     return np.asarray(array.reshape(size), dtype=np.float32)
 
 
 def _host_ids(ids: Any, shape: tuple[int, int]) -> npt.NDArray[np.uint16]:
-    """Ids on the host, (H, W): two of them travel as one number of 32 bits, as Dr.Jit has none of 16."""
+    """Copy ids to the host, (H, W); two ids are packed into 32 bits, because Dr.Jit has no 16-bit integers."""
     count = dr.width(ids)
     if count > 1:
         first = 2 * dr.arange(type(ids), (count + 1) // 2)
@@ -243,7 +243,7 @@ def _host_ids(ids: Any, shape: tuple[int, int]) -> npt.NDArray[np.uint16]:
 
 
 def render_silhouettes(integrator: Any, scene: Any, camera: Camera, *, source: str = "splats") -> dict[int, Silhouette]:
-    """Every instance as it would be seen alone, by its ``splats`` or by its ``proxies``, see the integrator plugin."""
+    """Return the unoccluded silhouette of every instance, by its ``splats`` or its ``proxies``."""
     silhouettes = dict(integrator.silhouettes(scene, _sensor_of(camera, str(mi.variant())), source=source))
     refuse_lost_rays()
     return silhouettes

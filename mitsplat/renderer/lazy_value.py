@@ -1,4 +1,4 @@
-"""Fields of frozen dataclasses that are made when they are first looked at: what a GPU holds, brought to the host."""
+"""Frozen dataclasses with fields that are computed on first access, such as device arrays copied to the host."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from mitsplat.runtime.variant import one_at_a_time
 
 
 class LazyValue:
-    """A dataclass of which some fields are made when they are first looked at, and kept from then on.
+    """Dataclass of which some fields are computed on first access and then stored.
 
     Copies by ``replace`` and pickles hold the values of all fields.
     """
 
     @classmethod
     def later(cls, makers: Mapping[str, Callable[[], Any]], **known: Any) -> Self:
-        """An object of the fields that are ``known``, and those that ``makers`` make."""
+        """Create an object from ``known`` fields and functions that compute the other fields."""
         made = cls.__new__(cls)
         made.__dict__.update(known, _makers=dict(makers))
         return made
 
-    if not TYPE_CHECKING:  # all other names stay unknown to type checkers
+    if not TYPE_CHECKING:  # keeps all other names unknown to type checkers
 
         def __getattr__(self, name: str) -> Any:
             if name not in self.__dict__.get("_makers", ()):
@@ -31,7 +31,7 @@ class LazyValue:
 
     @one_at_a_time
     def _make(self, name: str) -> Any:
-        if name not in self.__dict__:  # another thread may have been first
+        if name not in self.__dict__:  # another thread may have stored it meanwhile
             self.__dict__[name] = self.__dict__["_makers"][name]()
         return self.__dict__[name]
 

@@ -1,4 +1,4 @@
-"""Radiance of meshes by Mitsuba's path tracer: along single rays, and as pictures to compare splats with."""
+"""Radiance of meshes by Mitsuba's path tracer: along rays, and as reference pictures for splats."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from mitsplat.renderer.layers import make_sensor
 from mitsplat.renderer.rays.sensors import view_of
 
 RAYS_PER_LAUNCH = 1 << 21
-"""Paths that are traced at once: bounds the memory, and changes no result but by its seeds."""
+"""Number of paths that are traced at once. It limits the memory, and affects results only through the random seeds."""
 
 
 def trace_radiance(
@@ -28,9 +28,10 @@ def trace_radiance(
     bounces: int,
     seed: int,
 ) -> tuple[Float64Array, BoolArray]:
-    """Mean radiance (R, 3) that arrives at ``origins`` (R, 3) [m] from ``directions`` (R, 3), and where a surface is.
+    """Compute the mean radiance (R, 3) that arrives at points from given directions, and a hit mask (R,).
 
-    Every ray is traced ``samples`` times by Mitsuba's path tracer.
+    Every ray is traced ``samples`` times by Mitsuba's path tracer. ``origins`` (R, 3) [m] are the points, and
+    ``directions`` (R, 3) point from them to the surfaces.
     """
     radiance, hit = np.empty((len(origins), 3)), np.empty(len(origins), dtype=bool)
     step = max(1, RAYS_PER_LAUNCH // samples)
@@ -54,19 +55,19 @@ def trace_radiance(
 def _mean_radiance(
     scene: mi.Scene, origins: Any, directions: Any, *, samples: int, bounces: int, seed: int
 ) -> tuple[Float64Array, Float64Array]:
-    """Mean radiance (N, 3) of every ``samples`` consecutive rays, black where nothing is, and the share that hits (N,).
+    """Return mean radiance (N, 3) of every ``samples`` consecutive rays, black for misses, and hit share (N,).
 
     The paths of one mean share a multi-jittered pattern (Kensler 2013), which has several times less noise than
-    independent ones.
+    independent paths.
     """
     integrator, sampler = _path_tracer(bounces, samples, mi.variant())
     sampler.seed(seed, dr.width(directions))
     spectrum, valid, _ = integrator.sample(scene, sampler, mi.RayDifferential3f(origins, directions))
-    # A path that meets a sliver may end in no number, a few of ten million in drawings: the mean is of the others.
+    # A path that hits a sliver triangle may yield NaN (a few of ten million in CAD meshes); such paths are excluded.
     finite = dr.all(dr.isfinite(spectrum))
     radiance = mi.Color3f(dr.select(valid & finite, spectrum, 0.0))
     hit, number = (dr.select(which, mi.Float(1), 0) for which in (valid, finite))
-    # Together: what is left for later would trace all paths again.
+    # Evaluated together, because a later evaluation would trace all paths again.
     dr.eval(radiance, hit, number)
     *sums, hits, numbers = (
         np.asarray(dr.block_sum(channel, samples), dtype=np.float64) for channel in (*radiance, hit, number)
@@ -76,12 +77,15 @@ def _mean_radiance(
 
 @lru_cache(maxsize=4)
 def _path_tracer(bounces: int, samples: int, variant: str) -> tuple[Any, Any]:
-    """Integrator and sampler: a GPU traces a picture while they load. To seed the sampler resets it."""
+    """Return cached integrator and sampler; seeding resets the sampler.
+
+    Loading them would delay the next launch on a GPU.
+    """
     integrator = mi.load_dict({"type": "path", "max_depth": bounces + 1, "rr_depth": 64, "hide_emitters": True})
     sampler = mi.load_dict({"type": "multijitter", "sample_count": samples})
     if sampler.sample_count() == samples:
         sampler.set_samples_per_wavefront(samples)
-    else:  # a number that has no grid
+    else:  # the sampler has no grid for this number
         sampler = mi.load_dict({"type": "independent"})
     return integrator, sampler
 
@@ -89,10 +93,11 @@ def _path_tracer(bounces: int, samples: int, variant: str) -> tuple[Any, Any]:
 def render_mesh(
     scene: mi.Scene, camera: Camera, *, samples: int, bounces: int = 6, seed: int = 0
 ) -> tuple[Float64Array, Float64Array]:
-    """Path-traced radiance (H, W, 3) of a pinhole ``camera``, black where nothing is, and coverage (H, W) in [0, 1].
+    """Render path-traced radiance (H, W, 3) of a pinhole ``camera`` and coverage (H, W) in [0, 1].
 
-    ``samples`` is rounded to a square: the rays of a pixel are on a regular grid. Their radiance is averaged before it
-    is encoded, because the mean of encoded noise is too dark. Only the background counts encoded, as splats blend.
+    The radiance is black for background. ``samples`` is rounded to a square, because the rays of a pixel form a regular
+    grid. Radiance is averaged before it is encoded, because the mean of encoded noise is too dark. Only the background
+    is blended with encoded values, as splats are.
     """
     view, side = view_of(make_sensor(camera)), max(1, round(samples**0.5))
     samples, pixels = side * side, camera.width * camera.height

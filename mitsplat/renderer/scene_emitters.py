@@ -1,4 +1,4 @@
-"""The lights of a scene file as Mitsuba's emitters."""
+"""Conversion of the lights of a scene file to Mitsuba's emitters."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from mitsplat.scene.spec.light_spec import LightSpec
 
 
 def emitter_dict(light: LightSpec, folder: Path | None = None) -> dict[str, Any]:
-    """Mitsuba's description of one light; images of environments are relative to ``folder``."""
+    """Return Mitsuba's description of one light; environment images are relative to ``folder``."""
     ensure_variant()
     colour = np.asarray(light.colour)
     if light.kind != "environment" and light.temperature is not None:
@@ -50,11 +50,12 @@ def emitter_dict(light: LightSpec, folder: Path | None = None) -> dict[str, Any]
 
 
 def movable(description: dict[str, Any]) -> Any:
-    """An emitter that is somewhere else in every frame: a rectangle is made here, so that kernels do not contain where.
+    """Return an emitter whose pose may change in every frame without a new compilation of kernels.
 
-    Its frame is then computed on the device, which may differ in the last bit from one that is a constant of kernels.
+    A rectangle is loaded here and its pose made opaque. Its frame is then computed on the device, and may differ in the
+    last bit from a constant in kernels.
     """
-    if description["type"] != "rectangle":  # of all others nothing but data says where they are
+    if description["type"] != "rectangle":  # the poses of all other emitters are data already
         return description
     shape = mi.load_dict(description)
     state = mi.traverse(shape)
@@ -70,6 +71,6 @@ def _rgb(value: Float64Array) -> dict[str, Any]:
 
 
 def y_up_to_z_up(degrees: float) -> mi.ScalarTransform4f:
-    """Turns Mitsuba's y-up environment maps z up, then about z."""
+    """Return the transform that rotates Mitsuba's y-up environment maps to z up, and then about z."""
     transform = mi.ScalarTransform4f()
     return transform.rotate([0, 0, 1], degrees) @ transform.rotate([1, 0, 0], 90.0)

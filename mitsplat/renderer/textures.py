@@ -1,4 +1,4 @@
-"""What visible shapes are made of, as Mitsuba's materials: patterns are images that repeat without a seam."""
+"""Mitsuba materials of visible shapes; patterns are seamless tileable images."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ SIZE = 1024
 """Edge of a pattern's image [px]."""
 
 FEATURES = 12
-"""Largest features across the image; lines of grain, twice as many."""
+"""Number of the largest features across the image; wood has twice as many grain lines."""
 
 
 def texture_image(finish: MaterialDraw, images: Mapping[str, Path]) -> ByteImage | None:
-    """The image (H, W, 3) that a finish repeats, sRGB-encoded; None for one colour.
+    """Return the tile image (H, W, 3) of a finish, sRGB-encoded; None for a single colour.
 
     Args:
         finish: The finish.
-        images: Files by the names that finishes have for them.
+        images: Image files by the names that finishes use.
     """
     if finish.image is not None:
         return with_gain(read_image(images[finish.image]), finish.gain or 1.0)
@@ -42,19 +42,19 @@ def texture_image(finish: MaterialDraw, images: Mapping[str, Path]) -> ByteImage
 
 
 def repeat_width(finish: MaterialDraw) -> float:
-    """Width of a finish's image on a surface [m]."""
+    """Return the width of a finish's image on a surface [m]."""
     repeats = {"image": 1, "checker": 2, "wood": 2 * FEATURES, "brushed_metal": 2}
     return finish.scale * repeats.get(finish.kind, FEATURES)
 
 
 def read_image(path: Path) -> ByteImage:
-    """An image file as sRGB-encoded bytes, shape (H, W, 3)."""
+    """Read an image file as sRGB-encoded bytes, shape (H, W, 3)."""
     bitmap = mi.Bitmap(str(path)).convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.UInt8, srgb_gamma=True)
     return np.array(bitmap)
 
 
 def with_gain(image: ByteImage, gain: float) -> ByteImage:
-    """An sRGB-encoded image with a factor on its linear colours, clipped at white."""
+    """Multiply the linear colours of an sRGB-encoded image by a gain, clipped at white."""
     if gain == 1.0:
         return image
     table = encode_srgb(np.minimum(gain * decode_srgb(np.arange(256) / 255), 1.0))
@@ -62,16 +62,16 @@ def with_gain(image: ByteImage, gain: float) -> ByteImage:
 
 
 def material(finish: MaterialDraw, texture: dict[str, Any] | None) -> dict[str, Any]:
-    """Mitsuba's material of a finish.
+    """Return Mitsuba's material of a finish.
 
     Args:
         finish: The finish.
-        texture: Mitsuba's texture of :func:`texture_image`; None for one colour.
+        texture: Mitsuba's texture of :func:`texture_image`; None for a single colour.
     """
     colour = texture or {"type": "rgb", "value": decode_srgb(np.array(finish.colours[0])).tolist()}
     if finish.roughness is None:
         return {"type": "diffuse", "reflectance": colour}
-    # Scratches run along u, along which slopes are less.
+    # Scratches run along u, so that the roughness along u is lower.
     return {
         "type": "roughconductor",
         "distribution": "ggx",
@@ -83,7 +83,7 @@ def material(finish: MaterialDraw, texture: dict[str, Any] | None) -> dict[str, 
 
 
 def bitmap_texture(image: ByteImage) -> dict[str, Any]:
-    """Mitsuba's texture of an sRGB-encoded image (H, W, 3)."""
+    """Return Mitsuba's texture of an sRGB-encoded image (H, W, 3)."""
     return {"type": "bitmap", "bitmap": mi.Bitmap(image), "wrap_mode": "repeat"}
 
 
@@ -95,15 +95,15 @@ def finished_mesh(
     bsdf: Any = None,
     travel: float = 0.0,
 ) -> Any:
-    """Mitsuba's shape of a mesh with texture coordinates.
+    """Create Mitsuba's shape of a mesh with texture coordinates.
 
     Args:
         mesh: Mesh of ``shape`` in world space [m].
-        shape: What the scene file says of it.
-        finish: Its finish.
-        image: The finish's image.
-        bsdf: Mitsuba's material, loaded; its own default if None.
-        travel: How far its surface has run along the shape's own x axis [m], as a belt's does.
+        shape: Shape of the scene file.
+        finish: Finish of the shape.
+        image: Image of the finish.
+        bsdf: Loaded Mitsuba material; None for Mitsuba's default.
+        travel: Distance that the surface has moved along the shape's own x axis [m], for example of a belt.
     """
     props = mi.Properties()
     if bsdf is not None:
@@ -123,7 +123,7 @@ def finished_mesh(
 
 
 def pattern_axes(shape: Shape) -> Float64Array:
-    """Axes of the box that a pattern is projected from, as columns (3, 3): a box's or bin's own, else the world's."""
+    """Return the axes of a pattern's box projection as columns (3, 3): those of a box or bin, otherwise world axes."""
     if shape.box is not None:
         return stated_pose(shape.box)[:3, :3]
     if shape.bin is not None:
@@ -135,20 +135,20 @@ def pattern_axes(shape: Shape) -> Float64Array:
 def box_projection(
     mesh: trimesh.Trimesh, axes: Float64Array, finish: MaterialDraw, aspect: float, travel: float = 0.0
 ) -> Float64Array:
-    """Texture coordinates of each corner of each triangle (3 F, 2): every face sees the image along its nearest axis.
+    """Return texture coordinates (3 F, 2) of all triangle corners; each face is projected along its nearest axis.
 
     Args:
-        mesh: In world space [m], F triangles.
-        axes: Columns (3, 3), along which the image is projected.
-        finish: Whose ``repeat_width``, rotation and offset count.
+        mesh: Mesh in world space [m], F triangles.
+        axes: Projection axes as columns (3, 3).
+        finish: Finish that sets ``repeat_width``, rotation and offset.
         aspect: Height of the image over its width.
-        travel: How far the image has moved along the first axis [m].
+        travel: Distance that the image has moved along the first axis [m].
     """
     local = np.asarray(mesh.triangles) @ axes - [travel, 0.0, 0.0]
     normals = np.asarray(mesh.face_normals) @ axes
     along = np.argmax(np.abs(normals), axis=1)
-    # Seen along x the image lies in y and z, along y in x and z, along z in x and y; its rows go down, and from no side
-    # is it a mirror image.
+    # Along x the image spans y and z, along y it spans x and z, along z it spans x and y. Its rows go down, and it is
+    # not mirrored on any side.
     plane = np.array([[1, 2], [0, 2], [0, 1]])[along]
     facing = np.where(np.take_along_axis(normals, along[:, None], axis=1) < 0, -1.0, 1.0)
     right = facing * np.array([1.0, -1.0, 1.0])[along][:, None]
@@ -160,9 +160,10 @@ def box_projection(
 
 
 def _clouds(rng: np.random.Generator, x: float, y: float, fall: float = 1.6) -> Float64Array:
-    """Periodic noise in [0, 1], by spectral synthesis: amplitudes fall as 1/f^``fall`` from ``x`` and ``y`` periods on.
+    """Return periodic noise in [0, 1] by spectral synthesis.
 
-    Peitgen and Saupe (1988), The Science of Fractal Images, section 2.6; stretched where ``x`` and ``y`` differ.
+    Amplitudes fall as 1/f^``fall`` from ``x`` and ``y`` periods on; different ``x`` and ``y`` stretch the noise.
+    Source: Peitgen and Saupe (1988), The Science of Fractal Images, section 2.6.
     """
     fy, fx = np.meshgrid(np.fft.fftfreq(SIZE, 1 / SIZE), np.fft.rfftfreq(SIZE, 1 / SIZE), indexing="ij")
     frequency = np.hypot(fx / x, fy / y)
@@ -178,11 +179,14 @@ def _noise(rng: np.random.Generator) -> Float64Array:
 
 
 def _wood(rng: np.random.Generator) -> Float64Array:
-    """Lines along x, bent by noise that is long in x: early wood fades in, late wood ends at once. Fibres over it."""
+    """Return wood grain: lines along x, distorted by noise that is stretched in x, and overlaid with fibres.
+
+    Early wood fades in, and late wood ends abruptly.
+    """
     height = np.arange(SIZE)[:, None] / SIZE
     bend = 6.0 * (_clouds(rng, 1, 3, 2.5) - 0.5)
     rings = (2 * FEATURES * height + bend) % 1.0
-    edge = 0.12  # of a ring, in which late wood ends
+    edge = 0.12  # share of a ring in which late wood ends
     lines = np.where(rings < 1 - edge, (rings / (1 - edge)) ** 2, (1 - rings) / edge)
     return np.asarray(np.clip(0.75 * lines + 0.5 * (_clouds(rng, 6, 200, 1.0) - 0.25), 0.0, 1.0))
 
@@ -197,7 +201,7 @@ def _checks(rng: np.random.Generator) -> Float64Array:
 
 
 def _stripes(_: np.random.Generator) -> Float64Array:
-    """Each band fades as the side of a slat that is turned away from the light, and the next begins at once."""
+    """Return stripes like slats: each band darkens like a side that faces away from the light, then restarts."""
     across = (FEATURES * np.arange(SIZE) / SIZE) % 1.0
     return np.repeat(across[:, None] ** 3, SIZE, axis=1)
 

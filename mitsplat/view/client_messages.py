@@ -1,7 +1,7 @@
-"""Messages of browsers: only those that the page expects, with finite values, and no faster than they are handled.
+"""Validation of browser messages: expected kinds with bounded values, at the rate at which they are handled.
 
-viser takes every message of its protocol as it comes: uploads, values that are no numbers, attributes of its controls
-by name. A connection drops all but a few kinds with values of bounded size, before viser sees them.
+viser accepts every message of its protocol, including uploads, non-finite values, and control attributes by name. A
+connection drops all messages except a few kinds with bounded, finite values, before viser receives them.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, TypeAdapter, 
 from websockets.asyncio.server import ServerConnection
 
 LARGEST = 2**16
-"""Largest message [bytes]; a connection that sends a larger one is closed."""
+"""Maximum message size [bytes]; a connection that sends a larger message is closed."""
 
 
 def _not_zero(vector: list[float]) -> list[float]:
@@ -113,7 +113,7 @@ _EXPECTED: TypeAdapter[Any] = TypeAdapter(
 
 
 def is_expected(message: str | bytes) -> bool:
-    """Whether a message is one that the page's own script sends, with values in bounds."""
+    """Return True if the message is one that the page's own script sends, with values in bounds."""
     if isinstance(message, str):
         return False
     try:
@@ -125,16 +125,16 @@ def is_expected(message: str | bytes) -> bool:
 
 @dataclass
 class Pool:
-    """The threads that handle messages.
+    """Threads that handle messages.
 
     Attributes:
-        threads: None until there are any.
+        threads: Executor of viser; None before the server starts.
     """
 
     threads: Executor | None = None
 
     async def caught_up(self) -> None:
-        """Wait until the jobs that are queued now have begun, so that a browser cannot queue them without end."""
+        """Wait until all queued jobs have started, so that a browser cannot queue an unlimited number."""
         if self.threads is not None:
             try:
                 await asyncio.get_running_loop().run_in_executor(self.threads, int)
@@ -143,7 +143,7 @@ class Pool:
 
 
 class Connection(ServerConnection):  # type: ignore[misc]  # of the extra `view`, which mypy does not read
-    """A browser's connection, which receives expected messages only."""
+    """Connection of a browser that receives only expected messages."""
 
     def __init__(self, *args: Any, pool: Pool, **options: Any) -> None:
         super().__init__(*args, **options)

@@ -1,4 +1,4 @@
-"""Which images of a dataset have what: found by class, visibility and size of their labels."""
+"""Index of the images of a dataset by class, visibility and size of their labels."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ OVERLAYS: tuple[OverlayName, ...] = get_args(OverlayName)
 
 @dataclass(frozen=True)
 class Filter:
-    """What at least one label of an image must have, all of it at once.
+    """Conditions that at least one label of an image must fulfil together.
 
     Attributes:
-        class_name: Its class; None for any, also for images without labels.
-        visible: Range of its visible fraction.
-        size: Range of its box's longer side [px].
+        class_name: Class of the label; None accepts any class, and also images without labels.
+        visible: Range of the visible fraction.
+        size: Range of the longer side of the box [px].
     """
 
     class_name: str | None = None
@@ -37,14 +37,14 @@ class Filter:
 
 
 class DatasetIndex:
-    """The labels of a dataset as arrays; records and images are read when they are looked at.
+    """Labels of a dataset as arrays; records and images are read on demand.
 
     Args:
-        root: The dataset's folder.
+        root: Dataset folder.
 
     Attributes:
-        classes: Names of its classes.
-        unreadable: Lines of the manifest that cannot be read, which are left out.
+        classes: Names of the classes.
+        unreadable: Number of unreadable lines of the manifest, which are skipped.
 
     Raises:
         InputError: If the folder is no dataset of mitsplat.
@@ -71,11 +71,11 @@ class DatasetIndex:
 
     @property
     def largest(self) -> int:
-        """Longer side of the largest label's box [px], 1 if there are none."""
+        """Longer side of the largest label box [px]; 1 if there are no labels."""
         return int(self._labels[:, 3].max(initial=1))
 
     def find(self, wanted: Filter) -> list[int]:
-        """Indices of the frames that pass a filter, ascending."""
+        """Return the indices of the frames that pass a filter, ascending."""
         if wanted == Filter():
             return [int(index) for index in self._frames]
         if wanted.class_name is not None and wanted.class_name not in self.classes:
@@ -88,20 +88,20 @@ class DatasetIndex:
         return [int(index) for index in np.unique(frame[passed])]
 
     def record(self, index: int) -> Record:
-        """The record of a frame.
+        """Return the record of a frame.
 
         Raises:
-            InputError: If it cannot be read any more.
+            InputError: If it can no longer be read.
         """
         for record in self._records.of_frame(index):
             return record
         raise InputError(f"{self._root}: the record of frame {index} cannot be read")
 
     def picture(self, index: int, overlay: OverlayName = "labels") -> tuple[str, ByteImage]:
-        """A caption, and the image of a frame with its labels drawn over it, RGB.
+        """Return a caption and the RGB image of a frame with its labels drawn on it.
 
         Raises:
-            InputError: If the image is missing, unreadable, or no file of the dataset.
+            InputError: If the image is missing, unreadable, or not a file of the dataset.
         """
         record = self.record(index)
         name = next(file for file in record["files"] if file.startswith("images/"))
@@ -126,7 +126,7 @@ class DatasetIndex:
 
 
 def _draw_silhouettes(image: ByteImage, labels: Labels) -> ByteImage:
-    """The outlines of what each instance would cover alone."""
+    """Draw the unoccluded outline of each instance."""
     drawn = image.copy()
     for label in labels.instances:
         contours, _ = cv2.findContours(label.amodal.mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)

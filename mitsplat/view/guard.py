@@ -1,9 +1,9 @@
-"""Access to the page: a token in its address, no other site's script, no frame around it, and few browsers at a time.
+"""Access control of the page: a token in its address, no scripts of other sites, no frames, and few browsers at a time.
 
-viser answers everyone who reaches its port, and has no hook for a check. Its server is made by ``websockets``, which
-has two: ``process_request`` is called with every request, and ``create_connection`` makes the connections. The address
-of the page is also that of its websocket: viser's client derives the one from the other. So a token in the path reaches
-both, and no cookie is needed, which every port of a host would be sent.
+viser answers every request to its port and has no hook for access control. It uses a server of ``websockets``, which
+has two hooks: ``process_request`` is called for every request, and ``create_connection`` makes the connections. viser's
+client derives the address of its websocket from that of the page. So a token in the path protects both. No cookie is
+needed; a browser would send a cookie to every port of a host.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ if TYPE_CHECKING:
 
 LOOPBACK = ("localhost", "127.0.0.1", "::1")
 MOST_BROWSERS = 16
-"""Most browsers that are connected at a time: each is sent all that is shown, and holds it until it has read it."""
+"""Maximum number of connected browsers; each uses memory for all displayed parts until it has received them."""
 
 _LOCAL = re.compile(r"(localhost|127\.0\.0\.1|\[::1\])(:\d{1,5})?")
 _HOST = re.compile(r"([\w.-]+|\[[0-9A-Fa-f:.]+\])(:\d{1,5})?", re.ASCII)
 _POLICY = "; ".join(
     (
         "default-src 'none'",
-        # viser's page is one file that unpacks its script, and sorts splats in WASM whose bindings are made by eval.
+        # viser's page is one file that unpacks its script, and it sorts splats in WASM with bindings made by eval.
         "script-src 'unsafe-inline' 'unsafe-eval' blob:",
         "worker-src blob: data:",
         "style-src 'unsafe-inline'",
@@ -50,12 +50,12 @@ _POLICY = "; ".join(
 
 @dataclass(frozen=True)
 class Guard:
-    """Conditions of a request.
+    """Conditions that a request must fulfil.
 
     Attributes:
         token: Path of the page's address.
-        local: Whether a request must also name this machine as its host, so that no foreign name that was made to lead
-            here is answered.
+        local: True if the header ``Host`` must name this machine. This rejects foreign names that resolve to this
+            machine.
     """
 
     token: str
@@ -63,16 +63,16 @@ class Guard:
 
     @classmethod
     def of_host(cls, host: str) -> Guard:
-        """Make a new token for a server that listens on a host."""
+        """Return a guard with a new token for a server that listens on ``host``."""
         return cls(secrets.token_urlsafe(16), host in LOOPBACK)
 
     def refusal(self, path: str, host: str, origin: str | None) -> str | None:
-        """Say why a request is refused, or None if it is not.
+        """Return the reason why a request is rejected, or None if it is accepted.
 
         Args:
-            path: With what follows ``?``.
+            path: Path of the request with the query.
             host: Header ``Host``.
-            origin: Header ``Origin``, which browsers send with scripts' requests.
+            origin: Header ``Origin``, which browsers add to requests of scripts.
         """
         if (_LOCAL if self.local else _HOST).fullmatch(host) is None:
             return "not asked for by the name of this machine" + (", localhost" if self.local else "")
@@ -82,13 +82,16 @@ class Guard:
         page = f"/{self.token}"
         if not secrets.compare_digest(_bytes(place.removesuffix("/")), _bytes(page)):
             return "the address must end in the token that `mitsplat view` printed"
-        # viser's client adds the address of its own websocket, and connects to whichever it finds there.
+        # viser's client adds the address of its own websocket as a query, and connects to any address in it.
         if query and query not in (f"websocket=ws://{host}{page}", f"websocket=wss://{host}{page}"):
             return "the address must have nothing behind the token"
         return None
 
     def answer_headers(self, host: str) -> dict[str, str]:
-        """Headers of the page: it connects to its own server alone, and is shown in no other page."""
+        """Return the response headers of the page.
+
+        They allow the page to connect only to its own server, and no other page to embed it.
+        """
         return {
             "Content-Security-Policy": _POLICY.format(host=host),
             "X-Frame-Options": "DENY",
@@ -102,15 +105,15 @@ class Guard:
 
 @contextmanager
 def guarded(guard: Guard) -> Iterator[Pool]:
-    """Make servers of ``websockets`` that start within ask the guard first.
+    """Make servers of ``websockets`` that start in this context apply the guard.
 
     Yields:
-        The pool whose jobs connections wait for, to be filled in once there is one.
+        The pool on whose jobs connections wait; the caller sets its threads.
 
     Raises:
-        MissingResourceError: If none started, which leaves a page without a guard.
+        MissingResourceError: If no server started, so that the page would have no guard.
     """
-    import websockets.asyncio.server as server  # optional: of the extra `view`
+    import websockets.asyncio.server as server  # optional dependency of the extra `view`
     from websockets.datastructures import Headers
     from websockets.http11 import Request
 
@@ -149,7 +152,7 @@ def guarded(guard: Guard) -> Iterator[Pool]:
 
 
 def _logger() -> logging.Logger:
-    """Return the server's logger, without the traceback that each visitor who asks for no page would print."""
+    """Return a logger that omits the tracebacks of failed handshakes, which any visitor could cause."""
     logger = logging.getLogger(__name__)
     logger.addFilter(_is_no_handshake)
     return logger
@@ -160,10 +163,10 @@ def _is_no_handshake(record: logging.LogRecord) -> bool:
 
 
 def check_address(host: str, port: int) -> None:
-    """Refuse an address that cannot be bound to.
+    """Raise an error if the address cannot be bound.
 
     Raises:
-        InputError: If the machine has no such address, or the port is taken.
+        InputError: If the machine has no such address, or the port is in use.
     """
     if not 0 <= port < 2**16:
         raise InputError(f"--port must be from 0 to 65535 (got {port})")
@@ -178,5 +181,5 @@ def check_address(host: str, port: int) -> None:
 
 
 def _bytes(text: str) -> bytes:
-    """Text of a request, which may hold bytes that are no text."""
+    """Encode text of a request, which may contain bytes that are not text."""
     return text.encode("utf-8", "surrogateescape")

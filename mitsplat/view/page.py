@@ -1,4 +1,4 @@
-"""The page: viser's server, what it shows of parts, and the panels beside it."""
+"""Viewer page: viser's server, the display of parts, and the panels beside them."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ from mitsplat.view.scene_parts import (
 )
 
 _HALF_MAX = 200.0
-"""Longest standard deviation that is sent: viser holds covariances as half floats, of which 65504 is the largest."""
+"""Maximum standard deviation sent to browsers; viser stores covariances as half floats, whose maximum is 65504."""
 _START_FOV = 0.9
-"""Vertical field of view of a page that shows no camera's view [rad]."""
+"""Vertical field of view of a page without a camera view [rad]."""
 
 
 @dataclass(frozen=True)
 class Address:
-    """Where a page is served.
+    """Network address of the page.
 
     Attributes:
         host: Name or address to listen on.
@@ -51,20 +51,20 @@ class Address:
 
 
 class Page:
-    """A page in the browser that shows parts, and a picture beside them.
+    """Page in the browser that shows parts and a picture beside them.
 
     Args:
-        title: Above the controls.
-        address: Where it is served.
-        gaussians: Most Gaussians of a cloud that are sent; a larger one is thinned.
+        title: Title above the controls.
+        address: Network address of the page.
+        gaussians: Maximum number of Gaussians per cloud; larger clouds are subsampled.
 
     Attributes:
         gui: viser's controls.
-        port: TCP port that it is served on.
+        port: TCP port of the server.
         url: Address to open, which ends in a token.
 
     Raises:
-        InputError: If the address cannot be listened on.
+        InputError: If the address cannot be bound.
     """
 
     def __init__(self, title: str, address: Address, *, gaussians: int) -> None:
@@ -96,16 +96,16 @@ class Page:
         self._boxes: dict[str, Any] = {}
 
     def close(self) -> None:
-        """Stop serving."""
+        """Stop the server."""
         with _silence():
             self._server.stop()
 
     def on_click(self, clicked: Callable[[int], object]) -> None:
-        """Whom to tell the index of a camera that was clicked."""
+        """Set the callback for a click on a camera; its argument is the index of the camera."""
         self._clicked = clicked
 
     def on_point(self, pointed: Callable[[Float64Array, Float64Array], object]) -> None:
-        """Whom to tell origin and direction, (3,) each, of the ray under a click, whatever it meets."""
+        """Set the callback for a click anywhere; its arguments are origin and direction of the ray, (3,) each."""
 
         def tell(event: viser.SceneClickEvent) -> None:
             pointed(np.array(event.ray_origin), np.array(event.ray_direction))
@@ -113,7 +113,10 @@ class Page:
         self._server.scene.on_click()(tell)
 
     def on_move(self, moved: Callable[[Any], object]) -> None:
-        """Whom to tell viser's camera when someone moves theirs, once it has been where the page looks from."""
+        """Set the callback for a moved view; its argument is viser's camera.
+
+        It is first called after the view of the browser has reached the initial camera of the page.
+        """
 
         def listen(client: Any) -> None:
             begun = False
@@ -129,7 +132,7 @@ class Page:
         self._server.on_client_connect(listen)
 
     def add_handle(self, moved: Callable[[Float64Array], object]) -> Any:
-        """Viser's handle to drag something by, hidden until it is needed; ``moved`` is told where to [m]."""
+        """Add a hidden handle of viser for dragging; ``moved`` is called with the new position [m]."""
         handle = self._server.scene.add_transform_controls(
             "/handle", scale=0.15, disable_rotations=True, visible=False, depth_test=False
         )
@@ -137,7 +140,7 @@ class Page:
         return handle
 
     def show(self, parts: Iterable[ShownPart]) -> None:
-        """Show these and nothing else; only what differs from what is shown is sent."""
+        """Show exactly these parts; only changes are sent."""
         wanted = {part.name: part for part in parts}
         removed, added, moved = changes(self._shown, wanted)
         with self._server.atomic():
@@ -152,20 +155,20 @@ class Page:
         self._shown = wanted
 
     def show_picture(self, image: ByteImage, caption: str) -> None:
-        """Show a picture beside the parts, with a line of Markdown below it."""
+        """Show a picture beside the parts, with a caption in Markdown."""
         self._picture.image, self._picture.visible = image, True
         self._caption.content = caption
 
     def widen(self, width: int) -> None:
-        """Give the picture a panel of this width [px]."""
+        """Set the width of the picture panel [px]."""
         self._panel.set_width(width)
 
     def caption(self, text: str) -> None:
-        """A line of Markdown below the picture."""
+        """Set the caption below the picture, in Markdown."""
         self._caption.content = text
 
     def alert(self, sentence: str | None) -> None:
-        """Show what is wrong, until it is None."""
+        """Show an error message, or hide it if None."""
         if sentence == self._alerted:
             return
         self._alerted, self._alert.visible = sentence, sentence is not None
@@ -174,7 +177,7 @@ class Page:
             self._alert.content = f'<div role="alert" style="{style}">{html.escape(sentence)}</div>'
 
     def look_through(self, camera: Camera) -> None:
-        """Move the view of all browsers, and of those to come, to a camera."""
+        """Move the view of all present and future browsers to a camera."""
         pose, fov = camera.world_from_camera, 2 * float(np.arctan(0.5 * camera.height / camera.fy))
         ahead = pose[:3, 3] + self._distance(pose) * pose[:3, 2]
         start = self._server.initial_camera
@@ -185,7 +188,7 @@ class Page:
                 client.camera.up_direction, client.camera.fov = -pose[:3, 1], fov
 
     def look_around(self, up: Axis = "z") -> None:
-        """Look at all that is shown, from above and aside; ``up`` is the axis that points up from now on."""
+        """Show all parts from an oblique view; ``up`` sets the axis that points up."""
         above = np.zeros(3)
         above["xyz".index(up[-1])] = -1 if up.startswith("-") else 1
         self._server.scene.set_up_direction(above)
@@ -203,7 +206,7 @@ class Page:
         self.look_through(Camera.look_at(eye, middle, up=above, width=side, height=side, fov_x=fov, near=1e-3))
 
     def _distance(self, pose: Float64Array) -> float:
-        """How far ahead of a camera that is what the view turns around [m]."""
+        """Return the distance from a camera to the centre of rotation ahead of it [m]."""
         middle = bounds_of(self._shown.values()).mean(axis=0)
         return max(float((middle - pose[:3, 3]) @ pose[:3, 2]), 0.05)
 
@@ -255,7 +258,7 @@ class Page:
             fov=2 * float(np.arctan(height)),
             aspect=aspect,
             scale=thing.depth
-            * float(np.cbrt(height * height * aspect / 3)),  # viser takes the edge of a cube of its volume
+            * float(np.cbrt(height * height * aspect / 3)),  # viser expects the edge of a cube of equal volume
             thickness=1.5,
             thickness_units="screen",
             color=thing.colour,
@@ -266,10 +269,10 @@ class Page:
 
 
 def splat_arrays(splats: Splats) -> dict[str, Any]:
-    """Viser's arrays of Gaussians: centres, covariances, colours, opacities and a scale.
+    """Return viser's arrays of Gaussians: centres, covariances, colours, opacities and a scale.
 
-    Covariances are sent as half floats, to which those of Gaussians of a millimetre would be lost: everything is sent
-    larger, and shown smaller again.
+    Covariances are sent as half floats, which would round those of Gaussians of a millimetre to zero. So all values are
+    enlarged, and ``scale`` reduces them again.
     """
     factor = _HALF_MAX / max(float(splats.scales.max(initial=0.0)), 1e-6)
     axes = Rotation.from_quat(splats.quats).as_matrix() if len(splats) else np.zeros((0, 3, 3))
@@ -285,7 +288,7 @@ def splat_arrays(splats: Splats) -> dict[str, Any]:
 
 @contextmanager
 def _silence() -> Iterator[None]:
-    """Keep viser from printing that it starts, and at which address, and that it stops."""
+    """Suppress viser's messages about start, address and stop."""
     console = rich.get_console()
     before, console.quiet = console.quiet, True
     try:

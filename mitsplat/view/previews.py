@@ -1,4 +1,4 @@
-"""Real renders of what the browser looks at: a thread for the newest request, and what it does for a scene."""
+"""Real renders of the current view: a worker thread for the newest request, and the renderer of a scene."""
 
 from __future__ import annotations
 
@@ -25,16 +25,16 @@ Request = TypeVar("Request")
 Result = TypeVar("Result")
 
 PAUSES: dict[PresetName, float] = {"fast": 0.0, "balanced": 0.3, "exact": 0.6}
-"""How long nothing must have been asked for before a preset begins [s]: a render that began cannot be broken off."""
+"""Time without new requests before a preset starts [s], because a running render cannot be cancelled."""
 
 
 class NewestFirst(Generic[Request, Result]):
-    """A thread that works on the newest request, step by step, and drops it for a newer one between two steps.
+    """Worker thread for the newest request, which it processes in steps; a newer request replaces it between two steps.
 
     Args:
-        work: Yields a request's results; it is not asked for the next one once there is a newer request.
-        tell: Is told a request and one of its results.
-        refuse: Is told the sentence of an InputError that ended a request.
+        work: Generator of the results of a request; it is not resumed after a newer request.
+        tell: Callback with a request and one of its results.
+        refuse: Callback with the InputError that ended a request.
     """
 
     def __init__(
@@ -52,18 +52,18 @@ class NewestFirst(Generic[Request, Result]):
         self._thread.start()
 
     def ask(self, request: Request) -> None:
-        """Work on this next, and on no earlier request any more."""
+        """Replace all earlier requests by this one."""
         with self._changed:
             self._waiting = request
             self._changed.notify_all()
 
     def wait(self, seconds: float) -> bool:
-        """Within a request: wait, and say whether nothing newer was asked for meanwhile."""
+        """Wait within a request, and return True if there is no newer request."""
         with self._changed:
             return not self._changed.wait_for(lambda: self._waiting is not None or self._closed, seconds)
 
     def close(self) -> None:
-        """Stop after the step that is being worked on."""
+        """Stop after the current step."""
         with self._changed:
             self._closed = True
             self._changed.notify_all()
@@ -71,7 +71,7 @@ class NewestFirst(Generic[Request, Result]):
             self._thread.join()
 
     def check(self) -> None:
-        """Raise what ended the thread, if anything but bad input did."""
+        """Raise the error that ended the thread, if there is one; an InputError does not end it."""
         if self._fault is not None:
             raise self._fault
 
@@ -100,15 +100,15 @@ class NewestFirst(Generic[Request, Result]):
 
 @dataclass(frozen=True, eq=False)
 class ViewRequest:
-    """What is to be rendered.
+    """View to render.
 
     Attributes:
         scene: The scene.
-        index: Index of the frame, which decides layout, lights and random draws.
-        pose: ``world_from_camera`` instead of the frame's own, shape (4, 4).
-        lights: In place of the frame's.
-        width: Of the picture [px]; its height follows from the scene's output.
-        finest: Preset to sharpen up to.
+        index: Index of the frame, which determines layout, lights and random draws.
+        pose: ``world_from_camera``, shape (4, 4); None uses the camera of the frame.
+        lights: Lights; None uses those of the frame.
+        width: Width of the picture [px]; its height has the aspect ratio of the scene's output.
+        finest: Best preset of the progressive rendering.
     """
 
     scene: Scene
@@ -121,7 +121,7 @@ class ViewRequest:
 
 @dataclass(frozen=True, eq=False)
 class Preview:
-    """A rendered view: by which preset, the frame, and how long it took from the request's turn [s]."""
+    """Rendered view: the preset, the frame, and the render time since the start of the request [s]."""
 
     preset: PresetName
     frame: Frame
@@ -129,7 +129,7 @@ class Preview:
 
 
 class SceneRenders:
-    """Layouts and pictures of a scene as it is asked for; keeps a renderer for each preset until the scene changes."""
+    """Layouts and renders of a scene on demand, with one cached renderer per preset until the scene changes."""
 
     def __init__(self, note: Note) -> None:
         self._note = note
@@ -138,7 +138,7 @@ class SceneRenders:
         self._renderers: dict[PresetName, Renderer] = {}
 
     def layout(self, scene: Scene, index: int) -> Layout:
-        """The layout at the moment of a frame, settled now if it is not known."""
+        """Return the layout at the time of a frame; it is settled first if necessary."""
         if scene is not self._scene:
             self._scene, self._layouts, self._renderers = scene, {}, {}
         number = index // scene.spec.output.views
@@ -148,7 +148,7 @@ class SceneRenders:
         return carried(scene.spec, self._layouts[number], index % scene.spec.output.views)
 
     def render(self, request: ViewRequest, preset: PresetName) -> Preview:
-        """The view in one preset."""
+        """Render the view with one preset."""
         start = time.perf_counter()
         layout = self.layout(request.scene, request.index)
         if preset not in self._renderers:
@@ -160,7 +160,7 @@ class SceneRenders:
 
 
 def view_camera(request: ViewRequest, layout: Layout) -> Camera:
-    """The frame's camera in the size of previews, or one like it that was moved."""
+    """Return the camera of the frame in preview size, at the requested pose if there is one."""
     camera = plan_frame(request.scene, request.index, layout).camera
     if request.pose is not None:
         camera = replace(camera, world_from_camera=request.pose)
@@ -168,6 +168,6 @@ def view_camera(request: ViewRequest, layout: Layout) -> Camera:
 
 
 def presets_up_to(finest: PresetName) -> Sequence[PresetName]:
-    """From the fastest to the finest that is wanted."""
+    """Return the presets from the fastest to ``finest``."""
     names = list(PRESETS)
     return names[: names.index(finest) + 1]

@@ -1,4 +1,4 @@
-"""The page of a scene: its frames, drops, lights and camera, beside the real render of what is looked at."""
+"""Page of a scene: frames, drops, lights and camera, beside a real render of the current view."""
 
 from __future__ import annotations
 
@@ -30,22 +30,23 @@ from mitsplat.view.scene_parts import ShownPart, camera_parts, scene_parts
 from mitsplat.view.yaml_lines import camera_lines, light_line, rounded, seed_line
 
 _INTERVAL = 0.04
-"""Between the moments of a drop that is played [s]."""
+"""Time between the displayed moments of a drop [s]."""
 _WIDTHS = ("320", "480", "640", "960", "1280")
 _NO_LIGHT = "none"
 _PLAIN = "Appearances and materials that are drawn are in the render alone; beside it, objects and shapes are plain."
 
 
 class ScenePage:
-    """A scene file in the browser, until it is closed. What is moved there is told as lines for the file.
+    """Page of a scene file; changes made in the browser are shown as YAML lines for the file.
 
     Args:
-        page: The page, still empty.
-        path: The scene file.
-        allow_outside: As :func:`mitsplat.load_scene` takes it.
+        page: Empty page.
+        path: Scene file.
+        allow_outside: Allow files outside the folder of the scene, as in :func:`mitsplat.load_scene`.
 
     Raises:
-        InputError: If the scene breaks a rule now; later its sentence is shown, and the last good scene stays.
+        InputError: If the scene is invalid at the start. Later errors are shown on the page, and the last valid scene
+            stays.
     """
 
     def __init__(self, page: Page, path: Path, *, allow_outside: bool = False) -> None:
@@ -77,7 +78,7 @@ class ScenePage:
         self._worker.close()
 
     def check(self) -> None:
-        """Read the file again if it has changed; raise what went wrong in the thread that renders."""
+        """Read the file again if it has changed, and raise errors of the render thread."""
         self._worker.check()
         content = _content(self._path)
         if content == self._seen:
@@ -94,7 +95,7 @@ class ScenePage:
             self._take(scene)
 
     def _take(self, scene: Scene) -> None:
-        """Show another scene in place of this one."""
+        """Replace the displayed scene."""
         self._page.alert(self._fault)
         self._scene, self._layout, self._lights = scene, None, {}
         self._looked.clear()
@@ -106,7 +107,7 @@ class ScenePage:
         self._plain.visible = _draws_looks(scene)
         self._ask()
 
-    # What the browser asks for
+    # Actions of the browser
 
     def _make_controls(self) -> None:
         gui, scene = self._page.gui, self._scene
@@ -148,7 +149,7 @@ class ScenePage:
         as_stated.on_click(lambda _: self._reset_lights())
 
     def _look_at_frame(self, index: int, *, anew: bool = False) -> None:
-        """Look through the camera of a frame, which its layout may decide: as soon as that is known."""
+        """Move the view to the camera of a frame, as soon as the layout is known, which can determine the camera."""
         with self._turn:
             index = min(max(int(index), 0), self._scene.num_frames - 1)
             if index == self._index and not anew and self._pose is None:
@@ -173,13 +174,13 @@ class ScenePage:
             self._ask()
 
     def _moved(self, camera: Any) -> None:
-        """A browser's camera was moved, by hand unless it is where the frame's is."""
+        """Handle a moved view of a browser; it is a manual move unless the view equals the camera of the frame."""
         with self._turn:
             pose = np.eye(4)
             pose[:3, :3] = Rotation.from_quat(camera.wxyz, scalar_first=True).as_matrix()
             pose[:3, 3] = camera.position
             ours = [np.allclose(pose, own, atol=1e-4) for own in self._looked]
-            if any(ours):  # the page moved it; a browser may have told of places on the way
+            if any(ours):  # moved by the page; browsers may report positions on the way
                 if ours[-1] and self._pose is not None:
                     self._pose = None
                     self._show(self._layout)
@@ -208,7 +209,7 @@ class ScenePage:
             self._strength.value = getattr(light, _strength_of(light))
 
     def _move_light(self, **changed: Any) -> None:
-        """Put what was changed of the chosen light in place of what the file says."""
+        """Override properties of the selected light."""
         with self._turn:
             number = self._chosen
             if number is None:
@@ -216,7 +217,7 @@ class ScenePage:
             light = self._lights_now()[number]
             try:
                 moved = changed_light(light, **changed)
-            except ValidationError:  # no browser's own control sends such a value
+            except ValidationError:  # the page's own controls send no such value
                 self._choose_light()
                 return
             if moved == light:
@@ -233,7 +234,7 @@ class ScenePage:
             self._show(self._layout)
             self._ask()
 
-    # What is shown of it
+    # Display
 
     @property
     def _views(self) -> int:
@@ -252,20 +253,20 @@ class ScenePage:
         return tuple(self._lights.get(i, light) for i, light in enumerate(lights))
 
     def _look(self, camera: Camera) -> None:
-        """Move all browsers' views to a camera, unless they are there."""
+        """Move the views of all browsers to a camera, unless they are there."""
         pose = camera.world_from_camera
         if not any(np.allclose(pose, own, atol=1e-9) for own in self._looked):
             self._looked.append(pose)
             self._page.look_through(camera)
 
     def _show(self, layout: Layout | None) -> None:
-        """Show the scene with a layout; as long as the next one is not known, objects stay where they are shown."""
+        """Show the scene with a layout; without one, keep the objects displayed before."""
         if layout is None and self._preview is not None:
             return
         around = self._scene, self._index // self._views, layout is None
         if self._cameras[0] != around:
             self._cameras = around, list(camera_parts(self._scene, self._index, layout))
-        own = f"/cameras/{self._index}"  # whoever looks through it would see it all around
+        own = f"/cameras/{self._index}"  # would surround a view through it
         cameras = [part for part in self._cameras[1] if self._pose is not None or part.name != own]
         self._page.show([*scene_parts(self._scene, self._index, layout, self._lights_now()), *cameras])
 
@@ -285,7 +286,7 @@ class ScenePage:
             self._asked = ViewRequest(self._scene, self._index, self._pose, lights, width, finest)
             self._worker.ask((self._asked, self._playing))
 
-    # In the thread that renders
+    # Render thread
 
     def _work(self, request: _Request) -> Iterator[Layout | Preview]:
         view, playing = request
@@ -309,7 +310,7 @@ class ScenePage:
                         self._look(plan_frame(self._scene, self._index, result).camera)
                 return
             self._preview = request[0], result
-            self._page.alert(self._fault)  # what an earlier view was refused for is over
+            self._page.alert(self._fault)  # clears the error of an earlier view
             self._show_preview()
             if self._playing and request[1]:
                 self._playing = False
@@ -323,27 +324,27 @@ class ScenePage:
 
 
 _Request = tuple[ViewRequest, bool]
-"""A view, and whether the drop is played before."""
+"""View, and True if the drop is to be played before it."""
 
 
 def reseeded(scene: Scene, seed: int) -> Scene:
-    """The scene with another seed; what was read stays the same objects, unless the seed decides that as well."""
+    """Return the scene with another seed; loaded assets are reused unless the seed determines them too."""
     if any(entry.pool == PRIMITIVES for entry in scene.spec.objects):
         return load_scene(scene.path, overrides={"seed": seed}, allow_outside=True)
     return replace(scene, spec=scene.spec.model_copy(update={"seed": seed}))
 
 
 def _draws_looks(scene: Scene) -> bool:
-    """Whether layouts differ in how objects or shapes look, which splats and meshes in the browser do not show."""
+    """Return True if layouts vary the appearance of objects or shapes, which the splats in the browser do not show."""
     drawn = any(entry.appearance is not None for entry in scene.spec.objects)
     return drawn or any(shape.materials for shape in scene.spec.shapes)
 
 
 def changed_light(light: LightSpec, *, position: Any = None, target: Any = None, strength: Any = None) -> LightSpec:
-    """A light of a frame elsewhere, or of another strength; what it has not is left out.
+    """Return a light with changed properties; properties that its kind does not have are ignored.
 
     Raises:
-        ValidationError: If no light has such a place or strength.
+        ValidationError: If a value is invalid for a light.
     """
     update: dict[str, Any] = {}
     if position is not None and not isinstance(light, EnvironmentLight):
@@ -356,7 +357,7 @@ def changed_light(light: LightSpec, *, position: Any = None, target: Any = None,
 
 
 def told_error(preview: Preview) -> str:
-    """What is known of a preview's error, to stand behind its seconds."""
+    """Return the text about the error of a preview, for its caption."""
     error = preview.frame.order_error
     if error is None:
         return ", error of the order of blending unknown"

@@ -1,7 +1,7 @@
-"""What is shown, as plain values: splats, surfaces, lines, points and cameras at their places.
+"""Displayed parts as plain values: splats, meshes, lines, points and cameras with their poses.
 
-A part's name is a path, ``/group/name``; a group is shown or hidden as a whole. Parts of one name that differ in their
-pose alone are the same thing moved, which costs a browser nothing.
+The name of a part is a path, ``/group/name``; a group is shown or hidden as a whole. If two parts of one name differ
+only in their pose, only the pose is sent to browsers.
 """
 
 from __future__ import annotations
@@ -33,10 +33,10 @@ from mitsplat.scene.walls import ENCLOSURE
 Colour = tuple[int, int, int]
 
 HIDDEN_FIRST = frozenset({"meshes", "pieces", "colliders", "enclosure", "other cameras"})
-"""Groups that are not shown until they are asked for."""
+"""Groups that are hidden initially."""
 
 MOST_CAMERAS = 200
-"""Frusta of a scene that are shown; of more frames those of evenly spaced ones, and of the layout that is shown."""
+"""Maximum number of evenly spaced camera frusta, and of frusta of the current layout."""
 
 _GREY, _WALL, _REGION, _LIGHT, _CAMERA, _OTHER = (
     (150, 150, 150),
@@ -48,17 +48,20 @@ _GREY, _WALL, _REGION, _LIGHT, _CAMERA, _OTHER = (
 )
 _RING = np.linspace(0, 2 * np.pi, 25)
 _EDGES = np.array([[0, 1], [2, 3], [4, 5], [6, 7], [0, 2], [1, 3], [4, 6], [5, 7], [0, 4], [1, 5], [2, 6], [3, 7]])
-"""Of a box, whose corner ``i`` is low or high along x, y, z by the bits of ``i``."""
+"""Edges of a box, whose corner ``i`` is low or high along x, y, z by the bits of ``i``."""
 
 
 @dataclass(frozen=True, eq=False)
 class ShownSplats:
-    """Gaussians, drawn in the colour that they have from all sides on average."""
+    """Gaussians, drawn with their direction-independent colours."""
 
     splats: Splats
 
     def thinned(self, most: int) -> Splats:
-        """At most so many Gaussians: every n-th, larger by the root of n, so that surfaces stay covered."""
+        """Return at most ``most`` Gaussians.
+
+        Every n-th Gaussian is taken and enlarged by the square root of n, so that surfaces stay covered.
+        """
         count = len(self.splats)
         if count <= most:
             return self.splats
@@ -68,7 +71,7 @@ class ShownSplats:
 
 @dataclass(frozen=True, eq=False)
 class ShownMesh:
-    """A mesh in one colour, opaque or see-through."""
+    """Mesh of one colour, opaque or transparent."""
 
     mesh: trimesh.Trimesh
     colour: Colour
@@ -77,7 +80,7 @@ class ShownMesh:
 
 @dataclass(frozen=True, eq=False)
 class Lines:
-    """Segments, shape (N, 2, 3) [m]."""
+    """Line segments, shape (N, 2, 3) [m]."""
 
     segments: Float64Array
     colour: Colour
@@ -93,7 +96,7 @@ class ShownPoints:
 
     @property
     def edge(self) -> float:
-        """Of a point that is drawn."""
+        """Edge of a drawn point."""
         if self.size is not None:
             return self.size
         return 0.002 * float(np.linalg.norm(np.ptp(self.points, axis=0))) if len(self.points) else 0.002
@@ -101,7 +104,7 @@ class ShownPoints:
 
 @dataclass(frozen=True, eq=False)
 class Frustum:
-    """A camera, drawn ``depth`` [m] deep; clicking it looks through frame or photo ``index``."""
+    """Camera frustum of the given ``depth`` [m]; a click moves the view to the camera of frame or photo ``index``."""
 
     camera: Camera
     depth: float
@@ -114,11 +117,11 @@ Thing = ShownSplats | ShownMesh | Lines | ShownPoints | Frustum
 
 @dataclass(frozen=True, eq=False)
 class ShownPart:
-    """A thing at its place.
+    """Displayed thing with its pose.
 
     Attributes:
-        name: Where it is in the tree of what is shown, ``/group/name``.
-        thing: What is shown.
+        name: Path in the tree of displayed parts, ``/group/name``.
+        thing: Displayed value.
         pose: ``world_from_thing``, rotation and translation [m], shape (4, 4).
     """
 
@@ -128,12 +131,12 @@ class ShownPart:
 
     @property
     def group(self) -> str:
-        """What it is shown or hidden with."""
+        """Group with which the part is shown or hidden."""
         return self.name.split("/")[1]
 
 
 def same(one: Any, other: Any) -> bool:
-    """Whether two things, or what they hold, look the same: then nothing of them is sent again."""
+    """Return True if two things, or their fields, look the same, so that nothing must be sent again."""
     if one is other:
         return True
     if type(one) is not type(other):
@@ -148,20 +151,20 @@ def same(one: Any, other: Any) -> bool:
 
 
 def base_colours(splats: Splats) -> Float32Array:
-    """Display-encoded colours without what depends on the direction, in [0, 1], shape (N, 3)."""
+    """Return the direction-independent, display-encoded colours in [0, 1], shape (N, 3)."""
     return np.asarray(np.clip(0.5 + SH_C0 * splats.sh[:, 0], 0.0, 1.0), dtype=np.float32)
 
 
 def scene_parts(
     scene: Scene, index: int, layout: Layout | None = None, lights: Sequence[LightSpec] = ()
 ) -> Iterator[ShownPart]:
-    """What a scene is made of as frame ``index`` shows it; objects only once their layout is known.
+    """Iterate over the parts of a scene in frame ``index``.
 
     Args:
         scene: The scene.
         index: Index of the frame.
-        layout: Where the frame's objects lie, or how they move there.
-        lights: The frame's lights.
+        layout: Poses of the frame's objects; None omits the objects.
+        lights: Lights of the frame.
     """
     number = index // scene.spec.output.views
     environment = scene.environment_of(number)
@@ -185,7 +188,10 @@ def scene_parts(
 
 
 def _object_parts(scene: Scene, layout: Layout) -> Iterator[ShownPart]:
-    """Splats, proxy mesh and convex pieces of every object, numbered by asset, so that a drop moves what is there."""
+    """Iterate over splats, proxy mesh and convex pieces of every object.
+
+    Names are numbered per asset, so that a drop changes only poses.
+    """
     counts = Counter[int]()
     for instance in layout.instances:
         asset = scene.assets[instance.asset]
@@ -203,7 +209,7 @@ def _asset_parts(asset: Asset, name: str, pose: Float64Array) -> Iterator[ShownP
 
 
 def asset_parts(asset: Asset) -> Iterator[ShownPart]:
-    """An asset as it lies in its own frame."""
+    """Iterate over the parts of an asset in its own frame."""
     yield from _asset_parts(asset, asset.name.replace("/", "_"), np.eye(4))
     if asset.keypoints:
         points = asset.keypoint_array
@@ -211,7 +217,7 @@ def asset_parts(asset: Asset) -> Iterator[ShownPart]:
 
 
 def capture_parts(capture: Capture) -> Iterator[ShownPart]:
-    """The points of a capture, and its cameras."""
+    """Iterate over the points of a capture and its cameras."""
     yield ShownPart("/points/all", ShownPoints(capture.points, capture.colours))
     centres = np.array([photo.camera.centre for photo in capture.photos]).reshape(-1, 3)
     around = centres if not len(capture.points) else np.vstack([centres, np.median(capture.points, axis=0)])
@@ -223,7 +229,7 @@ def capture_parts(capture: Capture) -> Iterator[ShownPart]:
 
 
 def light_parts(lights: Sequence[LightSpec], scene: Scene | None = None) -> Iterator[ShownPart]:
-    """Lights at their places and in their sizes, and the paths that a scene's lights move on."""
+    """Iterate over lights in their poses and sizes, and over the paths of a scene's lights."""
     for number, light in enumerate(lights):
         if isinstance(light, EnvironmentLight):
             continue
@@ -249,7 +255,7 @@ def light_parts(lights: Sequence[LightSpec], scene: Scene | None = None) -> Iter
 
 
 def camera_parts(scene: Scene, index: int, layout: Layout | None) -> Iterator[ShownPart]:
-    """The cameras of frames: of those that show the layout of frame ``index``, and of others evenly spread."""
+    """Iterate over the cameras of the frames of the current layout, and of other frames at even intervals."""
     views = scene.spec.output.views
     own = range(index // views * views, (index // views + 1) * views)
     spread = np.linspace(0, scene.num_frames - 1, min(scene.num_frames, MOST_CAMERAS)).astype(int)
@@ -262,7 +268,7 @@ def camera_parts(scene: Scene, index: int, layout: Layout | None) -> Iterator[Sh
 
 
 def bounds_of(parts: Iterable[ShownPart]) -> Float64Array:
-    """Lowest and highest coordinates [m] of what lies in the middle of splats and points, shape (2, 3)."""
+    """Return the minimum and maximum coordinates [m] of the central 96 % of splats and points, shape (2, 3)."""
     found = []
     for part in parts:
         if isinstance(part.thing, ShownSplats | ShownPoints):
@@ -277,7 +283,11 @@ def bounds_of(parts: Iterable[ShownPart]) -> Float64Array:
 def changes(
     shown: Mapping[str, ShownPart], wanted: Mapping[str, ShownPart]
 ) -> tuple[list[str], list[ShownPart], list[ShownPart]]:
-    """What leads from what is shown to what is wanted: names to remove, parts to add, parts that only moved."""
+    """Compare displayed and requested parts.
+
+    Returns:
+        Names to remove, parts to add, and parts of which only the pose changed.
+    """
     kept = {name for name, part in wanted.items() if name in shown and same(shown[name].thing, part.thing)}
     moved = [wanted[name] for name in kept if not np.array_equal(shown[name].pose, wanted[name].pose)]
     return [name for name in shown if name not in kept], [wanted[n] for n in wanted if n not in kept], moved
@@ -306,7 +316,7 @@ def _rectangle(width: float, height: float) -> trimesh.Trimesh:
 
 
 def _cone(half_angle: float, length: float = 0.15) -> Float64Array:
-    """A cone that opens along +z from the origin, shape (N, 2, 3) [m]."""
+    """Return the lines of a cone that opens along +z from the origin, shape (N, 2, 3) [m]."""
     along, across = length * np.cos(np.radians(half_angle)), length * np.sin(np.radians(half_angle))
     rim = np.stack([across * np.cos(_RING), across * np.sin(_RING), np.full_like(_RING, along)], axis=1)
     rays = np.stack([np.zeros((4, 3)), rim[:-1:6]], axis=1)

@@ -1,4 +1,4 @@
-"""From a path to a page that is served until it is interrupted."""
+"""Viewer server: from a path to a page that is served until it is interrupted."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _BY_CONTENT: dict[str, Kind] = {ASSET_FILE: "asset", CAPTURE_FILE: "capture", "d
 SPLAT_SUFFIXES = (".ply", ".splat", ".ksplat", ".spz", ".sog")
 
 _LOOK = 0.3
-"""How often a file is looked at for changes [s]."""
+"""Interval of checks for changes of a file [s]."""
 
 
 def serve(
@@ -36,14 +36,14 @@ def serve(
     """Serve the page of a path until Ctrl-C.
 
     Args:
-        path: A scene file, a file of splats, or the folder of an asset, a capture or a dataset.
-        address: Where it is served.
-        gaussians: Most Gaussians of a cloud that a browser is sent.
-        allow_outside: Whether a scene may name files outside of its folder.
-        ready: Told the page's address once it answers.
+        path: Scene file, splat file, or folder of an asset, a capture or a dataset.
+        address: Network address of the page.
+        gaussians: Maximum number of Gaussians per cloud in the browser.
+        allow_outside: Allow a scene to reference files outside its folder.
+        ready: Callback with the address of the page, called when it is available.
 
     Raises:
-        InputError: If it is nothing that can be shown, or the address cannot be listened on.
+        InputError: If the path cannot be displayed, or the address cannot be bound.
     """
     path = Path(path)
     kind = kind_of(path)
@@ -64,7 +64,7 @@ def serve(
 
 
 def _filled(page: Page, path: Path, kind: Kind, allow_outside: bool) -> ScenePage | StillPage:
-    """What is shown of a path; only what its kind needs is imported, which takes a part of the time to the picture."""
+    """Fill the page with the content of a path; only the modules of its kind are imported, for a fast start."""
     if kind == "scene":
         from mitsplat.view.scene_page import ScenePage  # fast start: renders, physics
 
@@ -81,10 +81,10 @@ def _filled(page: Page, path: Path, kind: Kind, allow_outside: bool) -> ScenePag
 
 
 def kind_of(path: Path) -> Kind:
-    """What a path is, by its name or what its folder holds.
+    """Return the kind of a path, by its suffix or by the content of its folder.
 
     Raises:
-        InputError: If it is missing, or nothing that can be shown.
+        InputError: If the path is missing or cannot be displayed.
     """
     if path.is_dir():
         for name, kind in _BY_CONTENT.items():

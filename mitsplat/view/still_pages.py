@@ -1,4 +1,4 @@
-"""The pages of what does not move: an asset, a file of splats, a capture, a dataset."""
+"""Static pages: an asset, a splat file, a capture, a dataset."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ from mitsplat.view.scene_parts import Frustum, ShownPart, ShownPoints, ShownSpla
 
 _ANY = "any"
 _EDGE = 960
-"""Longest edge of a photo that is shown [px]."""
+"""Longest edge of a displayed photo [px]."""
 _WIDE = 860
-"""Of the panel with images of a dataset [px]."""
+"""Width of the panel with images of a dataset [px]."""
 _MASKS = ("outside darkened", "none")
 _PICK, _PICK_NOT, _REMOVE = "--pick", "--pick-not", "--remove"
 _NOTHING = "nothing"
@@ -36,22 +36,22 @@ _CLICKS = {
     "this is not the object": _PICK_NOT,
     "take this out of the place": _REMOVE,
 }
-"""What a click may say, and the option of the command line that says it."""
+"""Meanings of a click, and the corresponding command line option."""
 _COLOURS = {_PICK: (255, 210, 0), _PICK_NOT: (60, 120, 255), _REMOVE: (255, 60, 60)}
 
 
 class StillPage:
-    """A page that shows what it was made with until it is closed; nothing of it has to be stopped or watched."""
+    """Page with static content."""
 
     def close(self) -> None:
-        """Nothing is left to be done."""
+        """Do nothing; there is nothing to stop."""
 
     def check(self) -> None:
-        """Nothing can go wrong meanwhile."""
+        """Do nothing; static content has no later errors."""
 
 
 class AssetPage(StillPage):
-    """An asset: its splats, mesh, pieces and named points."""
+    """Page of an asset: its splats, mesh, convex pieces and keypoints."""
 
     def __init__(self, page: Page, folder: Path) -> None:
         asset = Asset.load(folder)
@@ -71,7 +71,7 @@ class AssetPage(StillPage):
 
 
 class SplatsPage(StillPage):
-    """A file of splats as it is: it says neither its units nor which axis points up, for which the usual is taken."""
+    """Page of a splat file; units are unknown, and the usual up axis of the format is assumed."""
 
     def __init__(self, page: Page, path: Path) -> None:
         splats = Splats.load(path)
@@ -87,7 +87,7 @@ class SplatsPage(StillPage):
 
 
 class CapturePage(StillPage):
-    """A capture: points, cameras, and the photo of the one that is chosen, with its mask; a click picks a thing."""
+    """Page of a capture: points, cameras, and the selected photo with its mask; a click picks a thing."""
 
     def __init__(self, page: Page, folder: Path) -> None:
         self._page, self._capture = page, Capture.load(folder)
@@ -119,7 +119,7 @@ class CapturePage(StillPage):
         self._show()
 
     def _pointed(self, origin: Float64Array, direction: Float64Array) -> None:
-        """Take what a click points at for what is said of it, if it can be."""
+        """Add a pick for the point under a click, if there is one."""
         with self._turn:
             if (option := _CLICKS.get(self._click.value)) is None:
                 return
@@ -137,14 +137,14 @@ class CapturePage(StillPage):
             self._take([] if all_of_them else self._picks[:-1])
 
     def _take(self, picks: list[tuple[str, str]]) -> None:
-        """Show what picks choose, and what to give on a command line; no cameras while a click picks.
+        """Show the things that the picks select, and the options for the command line; hide cameras while clicks pick.
 
         Raises:
-            InputError: If they choose nothing; those before stay.
+            InputError: If the picks select nothing; the earlier picks remain.
         """
         chosen, self._picks = self._chosen_parts(picks), picks
         parts = list(capture_parts(self._capture))
-        if _CLICKS.get(self._click.value) is not None:  # a click on a camera would say something, too
+        if _CLICKS.get(self._click.value) is not None:  # a click on a camera would also pick
             parts = [part for part in parts if not isinstance(part.thing, Frustum)]
         self._page.show([*parts, *chosen])
         self._show()
@@ -152,7 +152,7 @@ class CapturePage(StillPage):
         self._told.content = f"```\n{words}\n```" if words else ""
 
     def _chosen_parts(self, picks: Sequence[tuple[str, str]]) -> list[ShownPart]:
-        """Points of what picks choose, as far as points tell."""
+        """Return the points of the things that the picks select."""
         on, off, away = ([pick for kind, pick in picks if kind == option] for option in (_PICK, _PICK_NOT, _REMOVE))
         parts = []
         if on or off:
@@ -191,14 +191,14 @@ class CapturePage(StillPage):
 
 
 class DatasetPage(StillPage):
-    """The images of a dataset with their labels, and a filter for them."""
+    """Page of a dataset: images with their labels, and a filter."""
 
     def __init__(self, page: Page, folder: Path) -> None:
         self._page, self._index = page, DatasetIndex(folder)
         if not len(self._index):
             raise InputError(f"{folder}: must have an image to be shown (got none)")
         self._turn = threading.RLock()
-        page.widen(_WIDE)  # there is nothing beside it
+        page.widen(_WIDE)  # the page has no other content
         gui, largest = page.gui, self._index.largest
         self._number = gui.add_slider("image", 0, 1, 1, 0)
         step = gui.add_button_group("step", ("previous", "next"))
@@ -258,7 +258,7 @@ class DatasetPage(StillPage):
 
 
 def photo_picture(photo: Photo, *, masked: bool) -> ByteImage:
-    """A photo in the size of the page, what its mask leaves out darkened if that is asked for.
+    """Return a photo in the size of the page; if ``masked``, its background is darkened.
 
     Raises:
         InputError: If it cannot be read.
@@ -270,5 +270,5 @@ def photo_picture(photo: Photo, *, masked: bool) -> ByteImage:
 
 
 def _literal(text: str) -> str:
-    """Text that Markdown shows as it is."""
+    """Escape text for Markdown."""
     return "".join(f"\\{sign}" if sign in "\\`*_{}[]<>()#+-.!|~$" else sign for sign in text)

@@ -1,4 +1,4 @@
-"""Lines of a scene file for what was moved in the view, to be copied into it."""
+"""YAML lines of a scene file for changes made in the viewer."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from mitsplat.scene.spec.light_spec import LightSpec
 
 
 def light_line(light: LightSpec) -> str:
-    """A light as an entry of ``lights:``, with what differs from the defaults."""
+    """Return a light as an entry of ``lights:``, without default values."""
     stated = {"kind": light.kind, **light.model_dump(exclude_defaults=True)}
     return f"  - {_flow(stated)}\n"
 
 
 def camera_lines(pose: Float64Array, look_at: npt.ArrayLike, intrinsics: Intrinsics) -> str:
-    """A camera that stays at ``world_from_camera`` (4, 4), and looks at a point [m], as the key ``camera:``.
+    """Return a fixed camera at ``world_from_camera`` (4, 4), directed at a point [m], as the key ``camera:``.
 
-    The point is moved onto the camera's axis, at the depth that it has.
+    The point is moved onto the axis of the camera, at the same depth.
     """
     eye = pose[:3, 3]
     depth = max(float((np.asarray(look_at) - eye) @ pose[:3, 2]), 0.01)
@@ -34,17 +34,17 @@ def camera_lines(pose: Float64Array, look_at: npt.ArrayLike, intrinsics: Intrins
 
 
 def seed_line(seed: int) -> str:
-    """The seed, as its key."""
+    """Return the key ``seed:``."""
     return f"seed: {seed}\n"
 
 
 def rounded(vector: npt.ArrayLike) -> tuple[float, ...]:
-    """Coordinates [m] to a tenth of a millimetre."""
+    """Round coordinates [m] to a tenth of a millimetre."""
     return tuple(round(float(value), 4) + 0.0 for value in np.asarray(vector))  # no negative zero
 
 
 def _flow(value: Mapping[str, Any]) -> str:
-    """A mapping in one line."""
+    """Format a mapping as one line of YAML."""
     yaml = YAML(typ="safe", pure=True)
     yaml.default_flow_style, yaml.width = True, 10_000
     yaml.sort_base_mapping_type_on_output = False  # type: ignore[assignment]  # in the order given

@@ -41,8 +41,8 @@ def splats():
 
 
 def doctor():
-    from mitsplat.checks.doctor import _try
-    print(_try("cpu", {}))
+    from mitsplat.checks.doctor import _render_trial_on
+    print(_render_trial_on("cpu", {}))
 
 
 def colmap():

@@ -25,9 +25,9 @@ from mitsplat.arrays import Float64Array
 from mitsplat.audit.bop_check import BopReader
 from mitsplat.audit.described import InstancesReader, PanopticReader, PosesReader, Reader
 from mitsplat.audit.label_studio_check import ConfigReader, check_task
-from mitsplat.audit.layers_check import LayersReader, SightReader
+from mitsplat.audit.layers_check import LayersReader, PlacementReader
 from mitsplat.audit.listed import ColmapReader, LayoutReader, VocReader, YoloReader
-from mitsplat.audit.owned import Owned, check_listed
+from mitsplat.audit.owned import OwnedFiles, check_listed
 from mitsplat.audit.read_back import CHECKS, POLYGON_AREA, POLYGON_IOU, Violations, check_bop
 from mitsplat.audit.scene_check import SceneReader
 from mitsplat.audit.truth import TrueFrame
@@ -37,7 +37,7 @@ from mitsplat.images.picture_files import read_picture
 from mitsplat.storage.content_hash import file_hash
 from mitsplat.storage.files import SPLITS, Record, splits_of
 
-_SHARE = 1e-5
+_FRACTION_TOLERANCE = 1e-5
 """Tolerance of fractions that are stored with six decimals."""
 
 
@@ -68,12 +68,12 @@ class Audit:
     dropped: dict[str, int]
 
 
-def audit_dataset(root: str | Path, hear: Callable[[Record], object] = lambda record: None) -> Audit:
+def audit_dataset(root: str | Path, visit: Callable[[Record], object] = lambda record: None) -> Audit:
     """Check every file of a dataset.
 
     Args:
         root: Dataset folder.
-        hear: Callback that is called with every readable record, by ascending index.
+        visit: Callback that is called with every readable record, by ascending index.
 
     Raises:
         InputError: If the folder is no dataset of mitsplat.
@@ -82,12 +82,12 @@ def audit_dataset(root: str | Path, hear: Callable[[Record], object] = lambda re
     content = read_content(root)
     _refuse_special(root)
     records = Records(root, content)
-    readers, whole, owned = _readers(root, content), CrossFrameCheck(), Owned(content)
+    readers, cross_frame, owned = _readers(root, content), CrossFrameCheck(), OwnedFiles(content)
     violations: list[tuple[str, str]] = []
     marked, dropped = Counter[str](), Counter[str]()
     frames = instances = low = files = 0
     for record in records:
-        hear(record)
+        visit(record)
         frame, found = TrueFrame.of(root, record, content), list(_check_files(root, record))
         damaged = {name for name, _ in found}
         violations += found
@@ -98,7 +98,7 @@ def audit_dataset(root: str | Path, hear: Callable[[Record], object] = lambda re
             if check is not None and file not in damaged:
                 violations += ((file, text) for text in check(frame, root / file))
         violations += check_bop(frame, damaged)
-        repeated = whole.add(record)
+        repeated = cross_frame.add(record)
         violations += repeated
         if not repeated:
             for reader in readers:
@@ -111,7 +111,7 @@ def audit_dataset(root: str | Path, hear: Callable[[Record], object] = lambda re
     violations += records.violations
     for reader in readers:
         violations += reader.finish()
-    violations += whole.check(records)
+    violations += cross_frame.check(records)
     violations += owned.orphans(root)
     violations += _check_rest(root)
     return Audit(frames, instances, files, tuple(violations), low, dict(marked), dict(dropped))
@@ -143,7 +143,12 @@ def _readers(root: Path, content: Mapping[str, Any]) -> list[Reader]:
         "bop": lambda: [BopReader(root, content)],
         "colmap": lambda: [ColmapReader(root)],
     }
-    readers: list[Reader] = [SceneReader(content), LayoutReader(root, content), LayersReader(content), SightReader()]
+    readers: list[Reader] = [
+        SceneReader(content),
+        LayoutReader(root, content),
+        LayersReader(content),
+        PlacementReader(),
+    ]
     readers.append(YoloReader(root, content))
     for name in make:
         if name in content["scene"]["output"]["formats"]:
@@ -178,7 +183,7 @@ def _check_labels(frame: TrueFrame) -> Iterator[str]:
     times = np.zeros(frame.size[::-1], dtype=np.uint16)
     for label in frame.instances:
         entry, name = label.entry, label.name
-        mask, amodal = frame.whole(label), frame.whole(label, amodal=True)
+        mask, amodal = frame.full_mask(label), frame.full_mask(label, amodal=True)
         times += mask
         if classes[label.kind] != entry["class"]:
             yield f"{name}: class {label.kind} is not {entry['class']!r}"
@@ -199,13 +204,13 @@ def _check_labels(frame: TrueFrame) -> Iterator[str]:
         ):
             yield f"{name}: silhouette_box {entry['silhouette_box']} is not that of its silhouette"
         fraction = label.area / label.amodal_area
-        if abs(fraction - entry["visible_fraction"]) > _SHARE:
+        if abs(fraction - entry["visible_fraction"]) > _FRACTION_TOLERANCE:
             yield f"{name}: its visible fraction is {fraction:.6f}, not {entry['visible_fraction']}"
         truncation = 1 - label.amodal_area / label.silhouette_area
-        if abs(truncation - entry["truncation"]) > _SHARE:
+        if abs(truncation - entry["truncation"]) > _FRACTION_TOLERANCE:
             yield f"{name}: its truncation is {truncation:.6f}, not {entry['truncation']}"
-        below = {"occluded": fraction < rules["min_visible"] - _SHARE}
-        below["disagreeing"] = entry["agreement"] < rules["min_agreement"] - _SHARE
+        below = {"occluded": fraction < rules["min_visible"] - _FRACTION_TOLERANCE}
+        below["disagreeing"] = entry["agreement"] < rules["min_agreement"] - _FRACTION_TOLERANCE
         if set(entry["marks"]) != {mark for mark, is_below in below.items() if is_below}:
             yield f"{name}: its marks {entry['marks']} are not those that the thresholds give"
         if label.area < rules["min_pixels"]:
@@ -251,8 +256,8 @@ class CrossFrameCheck:
 def _picture(record: Record) -> int:
     """Return the first 64 bits of the picture's SHA-256.
 
-    The value is 0 if the stored text is no SHA-256, or if the frame is empty. Empty layouts under a fixed camera have equal
-    pictures, which is no fault.
+    The value is 0 if the stored text is no SHA-256, or if the frame is empty. Empty layouts under a fixed camera have
+    equal pictures, which is no fault.
     """
     if not record["labels"]["instances"]:
         return 0

@@ -27,14 +27,14 @@ from mitsplat.storage.files import read_json
 from mitsplat.storage.json_stream import read_entries
 
 _PARTS = ("camera", "gt", "gt_info")
-_MODEL_ROUNDED = 0.01
+_MODEL_TOLERANCE = 0.01
 """Tolerance for the limited decimals of a model file [mm]."""
-_FIT = 0.5
+_MIN_FIT = 0.5
 """Minimum of the median IoU, over all instances of a model, between its projected box and that of the silhouette."""
 _BINS = 20
-_FEW = 3
+_MIN_INSTANCES = 3
 """Minimum number of instances for the check of a model."""
-_LEAST_AREA = 64
+_MIN_AREA = 64
 """Minimum area of silhouettes for the check of a model [px]."""
 
 
@@ -72,27 +72,27 @@ class BopReader:
                 continue
             found[part] = entries[0]
         if "camera" in found:
-            yield from self._said("camera", frame, _check_camera(frame, found["camera"]))
+            yield from self._prefix("camera", frame, _check_camera(frame, found["camera"]))
         if "gt" in found:
             for label, pose in zip(frame.instances, found["gt"], strict=True):
-                yield from self._said("gt", frame, _check_pose(frame, label, pose))
-                self._try_on(frame, label, found.get("camera", {}), pose)
+                yield from self._prefix("gt", frame, _check_pose(frame, label, pose))
+                self._count_fit(frame, label, found.get("camera", {}), pose)
         if "gt_info" in found:
             picture = self._root / f"{frame.bop_folder}/depth/{frame.index:06d}.png"
             depth = read_picture(picture, cv2.IMREAD_UNCHANGED) if picture.is_file() else None
             for label, info in zip(frame.instances, found["gt_info"], strict=True):
-                yield from self._said("gt_info", frame, _check_info(frame, label, info, depth))
+                yield from self._prefix("gt_info", frame, _check_info(frame, label, info, depth))
 
-    def _said(self, part: str, frame: TrueFrame, texts: Iterator[str]) -> Violations:
+    def _prefix(self, part: str, frame: TrueFrame, texts: Iterator[str]) -> Violations:
         for text in texts:
             yield self._cursors[part].file, f"frame {frame.index}{text}"
 
-    def _try_on(self, frame: TrueFrame, label: TrueInstance, camera: Any, pose: Any) -> None:
+    def _count_fit(self, frame: TrueFrame, label: TrueInstance, camera: Any, pose: Any) -> None:
         """Project the model by the camera and pose in the files, and count the IoU with the silhouette's box."""
         number = label.entry["asset"] + 1
         corners = self._corners.get(number)
         stated = _numbers(camera, cam_K=9), _numbers(pose, cam_R_m2c=9), _numbers(pose, cam_t_m2c=3)
-        if corners is None or any(values is None for values in stated) or label.silhouette_area < _LEAST_AREA:
+        if corners is None or any(values is None for values in stated) or label.silhouette_area < _MIN_AREA:
             return
         matrix, rotation, shift = (np.zeros(9) if values is None else values for values in stated)
         seen = (corners @ rotation.reshape(3, 3).T + shift) @ matrix.reshape(3, 3).T
@@ -115,7 +115,7 @@ class BopReader:
         yield from self._models
         for number, counts in sorted(self._fits.items()):
             middle = int(np.searchsorted(np.cumsum(counts), sum(counts) / 2)) / _BINS
-            if sum(counts) >= _FEW and middle < _FIT:
+            if sum(counts) >= _MIN_INSTANCES and middle < _MIN_FIT:
                 yield (
                     f"bop/models/obj_{number:06d}.ply",
                     f"does not fit its silhouettes in the poses of scene_gt.json: half of {sum(counts)} boxes have an "
@@ -154,7 +154,7 @@ class BopReader:
             measured |= {f"size_{axis}": value for axis, value in zip("xyz", high - low, strict=True)}
             stated = info.get(str(number), {}) if isinstance(info, dict) else {}
             if info is not None and not all(
-                isinstance(stated, dict) and is_close(stated.get(key), value, _MODEL_ROUNDED / max(1.0, abs(value)))
+                isinstance(stated, dict) and is_close(stated.get(key), value, _MODEL_TOLERANCE / max(1.0, abs(value)))
                 for key, value in measured.items()
             ):
                 yield file, f"does not give the measures of {model}"
@@ -188,7 +188,7 @@ def _check_info(frame: TrueFrame, label: TrueInstance, info: Mapping[str, Any], 
     x0, y0, x1, y1 = label.amodal_box
     expected = {
         "bbox_obj": _bop_box(label.entry["silhouette_box"]),
-        "bbox_visib": _bop_box(bounds_of(frame.whole(label))),
+        "bbox_visib": _bop_box(bounds_of(frame.full_mask(label))),
         "px_count_all": label.silhouette_area,
         "px_count_visib": label.area,
     }

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from mitsplat.arrays import Float64Array
 from mitsplat.audit.truth import TrueFrame, seats_of
 
-_BELOW = 1e-3
+_MAX_DEPTH = 1e-3
 """Maximum depth of a carried object's origin below the top of the belt [m]."""
 
 
@@ -38,9 +38,9 @@ class BeltTruth:
         if self._conveyor is None:
             return False
         place, half = self._turn.inv().apply(pose[:3, 3] - self._box["position"]), np.array(self._box["size"]) / 2
-        return bool((abs(place[:2]) <= half[:2]).all() and place[2] > half[2] - _BELOW)
+        return bool((abs(place[:2]) <= half[:2]).all() and place[2] > half[2] - _MAX_DEPTH)
 
-    def way(self, pose: Float64Array, frame: TrueFrame) -> Float64Array:
+    def displacement(self, pose: Float64Array, frame: TrueFrame) -> Float64Array:
         """Return the displacement at the time of a frame of an object that settled at a pose (4, 4) [m], shape (3,)."""
         return self._run(frame) if self.carries(pose) else np.zeros(3)
 

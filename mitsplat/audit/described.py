@@ -26,9 +26,9 @@ from mitsplat.storage.json_stream import read_lists
 WHOLE = 32 << 20
 """Maximum size of a file that is also opened by pycocotools, which needs ten times as much memory [bytes]."""
 
-_SHARE = 1e-5
+_FRACTION_TOLERANCE = 1e-5
 """Tolerance of fractions that are stored with six decimals."""
-_EXACT = 1e-9
+_RELATIVE_TOLERANCE = 1e-9
 """Relative tolerance of poses and intrinsics, which are stored with full precision."""
 
 
@@ -215,7 +215,7 @@ class InstancesReader:
             "truncation": 1 - label.amodal_area / label.silhouette_area,
         }
         for key, share in shares.items():
-            if not is_close(entry.get(key), share, _SHARE):
+            if not is_close(entry.get(key), share, _FRACTION_TOLERANCE):
                 yield f"{key} is {entry.get(key)}, not {share:.6f}"
 
     def finish(self) -> Violations:
@@ -232,8 +232,8 @@ class InstancesReader:
         if self._path.stat().st_size <= WHOLE:
             try:
                 with contextlib.redirect_stdout(io.StringIO()):
-                    whole = COCO(self._path)
-                read = {"images": len(whole.imgs), "annotations": len(whole.anns)}
+                    coco = COCO(self._path)
+                read = {"images": len(coco.imgs), "annotations": len(coco.anns)}
             except Exception as error:  # noqa: BLE001 - whatever it stumbles over, its users do too
                 yield self._of.file, f"cannot be read by pycocotools ({type(error).__name__}: {error})"
             else:
@@ -371,7 +371,7 @@ def _check_segmentation(frame: TrueFrame, label: TrueInstance, code: Any, *, amo
     if not isinstance(code, dict) or code.get("size") != [height, width] or not isinstance(code.get("counts"), str):
         yield f"{name} is not a run-length code of {width}x{height} px"
         return
-    truth = frame.whole(label, amodal=amodal)
+    truth = frame.full_mask(label, amodal=amodal)
     try:
         mask = decode_rle(code).astype(bool)
         box = coco_mask.toBbox(code).tolist()
@@ -401,7 +401,7 @@ def coco_box(box: Box) -> list[int]:
     return [x0, y0, x1 - x0, y1 - y0]
 
 
-def is_close(found: Any, expected: npt.ArrayLike, tolerance: float = _EXACT) -> bool:
+def is_close(found: Any, expected: npt.ArrayLike, tolerance: float = _RELATIVE_TOLERANCE) -> bool:
     """Return True if a number or list read from a file equals the expected values within a relative tolerance."""
     truth = np.asarray(expected, dtype=np.float64)
     try:

@@ -34,7 +34,7 @@ def check_task(frame: TrueFrame, path: Path) -> Iterator[str]:
             yield f"{label.name}: class is {region['value'].get('brushlabels')}"
         if [region.get("original_width"), region.get("original_height")] != list(frame.size):
             yield f"{label.name}: its region is of another size than the picture"
-        wrong = np.count_nonzero(strokes[region["id"]] != frame.whole(label))
+        wrong = np.count_nonzero(strokes[region["id"]] != frame.full_mask(label))
         if wrong:
             yield f"{label.name}: {wrong} pixels differ from its mask"
 

@@ -19,17 +19,17 @@ from mitsplat.audit.truth import TrueFrame
 from mitsplat.images.exr_header import check_exr_header
 from mitsplat.images.picture_files import read_picture
 
-_FLOW_ROUNDED = 0.02
+_FLOW_TOLERANCE = 0.02
 """Tolerance of optical flow for single precision and lens models [px]."""
-_KNOWN_FLOW = 1e9
+_MAX_FLOW = 1e9
 """Magnitude of components above which a pixel has no flow."""
-_MOST_MEASURED = 0.25
+_MAX_DEPTH_ERROR = 0.25
 """Maximum median error of measured depth, relative to true depth; useful sensors are better."""
-_FEW = 6
+_MIN_INSTANCES = 6
 """Minimum number of instances of an asset for a conclusion."""
-_MOST_TRUNCATED = 0.2
+_MAX_TRUNCATION = 0.2
 """Maximum truncation of silhouettes whose centre is used; stronger truncation shifts the centre."""
-_OFF_PLACE, _OFF_DEPTH = 1.0, 0.2
+_MAX_OFFSET, _MAX_DEPTH_OFFSET = 1.0, 0.2
 """Maximum offset of silhouettes from their poses, in half their size, and of depths, relative to depth.
 
 Values of rendered scenes were up to 0.09 and 0.04. With inverted cameras, silhouettes were off by 2 to 30.
@@ -91,7 +91,7 @@ class LayersReader:
         known = depth.ravel() > step
         motion = frame.camera_from_world @ before.world_from_camera
         found = flow.reshape(-1, 2)[known]
-        stated = (np.abs(found) < _KNOWN_FLOW).all(axis=1)
+        stated = (np.abs(found) < _MAX_FLOW).all(axis=1)
 
         def wrong_if_carried(by: Float64Array) -> BoolArray:
             """Return a mask of the pixels with depth whose flow differs from that of points displaced by ``by`` [m]."""
@@ -106,9 +106,9 @@ class LayersReader:
 
             near, far = moved(depth.ravel() - step / 2), moved(depth.ravel() + step / 2)
             expected = moved(depth.ravel()) - pixels[known]
-            room = _FLOW_ROUNDED + np.abs(far - near).max(axis=1) + 1e-5 * np.abs(expected).max(axis=1)
+            tolerance = _FLOW_TOLERANCE + np.abs(far - near).max(axis=1) + 1e-5 * np.abs(expected).max(axis=1)
             in_front = ahead > frame.record["camera"]["near"] + step
-            wrong: BoolArray = in_front & (~stated | (np.abs(found - expected).max(axis=1) > room))
+            wrong: BoolArray = in_front & (~stated | (np.abs(found - expected).max(axis=1) > tolerance))
             return wrong
 
         if not known.any():
@@ -117,18 +117,18 @@ class LayersReader:
         if (run := self._belt.between(before, frame)).any():
             # Pixels without a labelled instance may show the belt or static parts, so both motions are accepted.
             carried = wrong_if_carried(run)
-            runs, stays = (self._seen(before, carries).ravel()[known] for carries in (True, False))
+            runs, stays = (self._pixels_of(before, carries).ravel()[known] for carries in (True, False))
             wrong = np.where(runs, carried, np.where(stays, wrong, wrong & carried))
         if count := np.count_nonzero(wrong):
             yield file, f"{count} pixels do not move as depth and cameras say"
 
-    def _seen(self, frame: TrueFrame, carried: bool) -> BoolArray:
+    def _pixels_of(self, frame: TrueFrame, carried: bool) -> BoolArray:
         """Return the pixels (H, W) of the labelled instances that the belt carries, or of the others."""
         width, height = frame.size
         seen = np.zeros((height, width), dtype=bool)
         for instance in frame.instances:
             if self._belt.carries(instance.pose) == carried:
-                seen |= frame.whole(instance)
+                seen |= frame.full_mask(instance)
         return seen
 
     def finish(self) -> Violations:
@@ -136,7 +136,7 @@ class LayersReader:
         yield from ()
 
 
-class SightReader:
+class PlacementReader:
     """Check over the whole dataset that poses and cameras agree with the positions and depths of silhouettes.
 
     The position of an asset's geometry in its own coordinates is not stored. However, one point of the asset projects
@@ -147,7 +147,7 @@ class SightReader:
     """
 
     def __init__(self) -> None:
-        self._places, self._depths = defaultdict[int, _Fit](_Fit), defaultdict[int, _Fit](_Fit)
+        self._places, self._depths = defaultdict[int, _PointFit](_PointFit), defaultdict[int, _PointFit](_PointFit)
 
     def check(self, frame: TrueFrame) -> Violations:
         """Add the frame's instances to the sums."""
@@ -159,7 +159,7 @@ class SightReader:
             rotation, shift = pose[:3, :3], pose[:3, 3]
             away = max(abs(float(shift[2])), 1e-6)
             x0, y0, x1, y1 = label.entry["silhouette_box"]
-            if label.entry["truncation"] <= _MOST_TRUNCATED:
+            if label.entry["truncation"] <= _MAX_TRUNCATION:
                 slopes = frame.slopes(np.array([[(x0 + x1) / 2, (y0 + y1) / 2]]))[0]
                 reach = away * max(x1 - x0, y1 - y0) / 2 / frame.intrinsics[0, 0]
                 rows = rotation[:2] - np.outer(slopes, rotation[2])
@@ -174,17 +174,17 @@ class SightReader:
     def finish(self) -> Violations:
         """Yield the violations after all frames were added."""
         for asset, fit in sorted(self._places.items()):
-            if fit.count >= 2 * _FEW and fit.rms > _OFF_PLACE:
+            if fit.count >= 2 * _MIN_INSTANCES and fit.rms > _MAX_OFFSET:
                 yield (
                     "manifest.jsonl",
                     f"silhouettes of asset {asset} lie {fit.rms / 2:.1f} times their size from where its poses put it",
                 )
         for asset, fit in sorted(self._depths.items()):
-            if fit.count >= _FEW and fit.rms > _OFF_DEPTH:
+            if fit.count >= _MIN_INSTANCES and fit.rms > _MAX_DEPTH_OFFSET:
                 yield "manifest.jsonl", f"depth pictures put asset {asset} {fit.rms:.0%} of its distance off its poses"
 
 
-class _Fit:
+class _PointFit:
     """Least-squares solution p of ``rows @ p = values``, from accumulated sums."""
 
     def __init__(self) -> None:
@@ -224,7 +224,7 @@ def _check_sensed(frame: TrueFrame, depth: Float64Array | None) -> Violations:
     elif depth is not None and (both := (stored > 0) & (depth > 0)).any():
         measured = stored[both] * frame.record["depth_sensor_scale"] / 1000
         error = float(np.median(np.abs(measured - depth[both]) / depth[both]))
-        if error > _MOST_MEASURED:
+        if error > _MAX_DEPTH_ERROR:
             yield file, f"depths are off by {error:.0%} of the true ones in the middle"
 
 
@@ -248,8 +248,8 @@ def _read_exr(path: Path) -> tuple[dict[str, npt.NDArray[Any]], str]:
 def _check_channels(frame: TrueFrame, channels: Mapping[str, npt.NDArray[Any]], error: str) -> list[str]:
     if error:
         return [error]
-    wanted = {*"RGBAZ", "instance", "proxy_instance", "normal.X", "normal.Y", "normal.Z"}
-    if missing := wanted - channels.keys():
+    required = {*"RGBAZ", "instance", "proxy_instance", "normal.X", "normal.Y", "normal.Z"}
+    if missing := required - channels.keys():
         return [f"has no channel {min(missing)}"]
     if any(values.shape != frame.size[::-1] for values in channels.values()):
         return ["is not of the frame's size"]

@@ -24,7 +24,7 @@ from mitsplat.storage.files import SPLITS, read_json, splits_of
 
 _POINTS = np.array([[0.0, 0.0, 1.0], [0.1, 0.0, 1.0], [0.0, 0.1, 1.0], [-0.15, 0.05, 0.8], [0.12, -0.2, 1.5]])
 """Points in front of a camera, in its frame, whose pixels determine its model and parameters, shape (5, 3)."""
-_PIXEL = 1e-6
+_PIXEL_TOLERANCE = 1e-6
 """Tolerance between projections of OpenCV and COLMAP [px]."""
 
 
@@ -134,15 +134,19 @@ class ColmapReader:
     def _read(self) -> Iterator[tuple[int, Any]]:
         points = json.dumps(_POINTS.tolist())
         command = python_command("-m", "mitsplat.audit.colmap_worker", self._model.resolve(), points)
-        with tempfile.TemporaryFile("w+") as said:
-            child = subprocess.Popen(command, env=python_environment(), stdout=subprocess.PIPE, stderr=said, text=True)
+        with tempfile.TemporaryFile("w+") as error_output:
+            child = subprocess.Popen(
+                command, env=python_environment(), stdout=subprocess.PIPE, stderr=error_output, text=True
+            )
             try:
                 for line in child.stdout or ():
                     image = json.loads(line)
                     yield image["id"] - 1, image
                 if child.wait():
-                    said.seek(0)
-                    lines = said.read().strip().splitlines() or [f"its process ended with status {child.returncode}"]
+                    error_output.seek(0)
+                    lines = error_output.read().strip().splitlines() or [
+                        f"its process ended with status {child.returncode}"
+                    ]
                     raise ValueError(lines[-1])
             finally:
                 if child.poll() is None:
@@ -170,7 +174,7 @@ class ColmapReader:
             yield f"its name is {image['name']}, not {frame.split}/{frame.image_name}"
         if not is_close(image["camera_from_world"], frame.camera_from_world[:3], 1e-8):
             yield "its pose is not that of the manifest's camera"
-        if image["size"] != list(frame.size) or not is_close(image["pixels"], frame.project(_POINTS), _PIXEL):
+        if image["size"] != list(frame.size) or not is_close(image["pixels"], frame.project(_POINTS), _PIXEL_TOLERANCE):
             yield "its camera is not that of the manifest"
 
     def finish(self) -> Violations:
@@ -212,7 +216,7 @@ class LayoutReader:
                 yield where, f"{label.name} is not in {file}"
             elif (entry.get("asset"), entry.get("class_index")) != (label.entry["asset"], label.kind):
                 yield where, f"{label.name} is of another asset or class than in {file}"
-            elif not is_close(self._at_moment(entry.get("world_from_object"), frame), label.pose, 1e-12):
+            elif not is_close(self._pose_at(entry.get("world_from_object"), frame), label.pose, 1e-12):
                 yield where, f"{label.name} has another pose than in {file}"
         dropped = Counter(frame.record["labels"]["dropped"])
         del dropped["fragments"]
@@ -225,7 +229,7 @@ class LayoutReader:
         ]:
             yield where, f"its objects are not those of {file}"
 
-    def _at_moment(self, stored: Any, frame: TrueFrame) -> Any:
+    def _pose_at(self, stored: Any, frame: TrueFrame) -> Any:
         """Return a stored pose at the time of a frame, displaced by the belt if the belt carries the object."""
         try:
             pose = np.array(stored, dtype=np.float64)
@@ -233,7 +237,7 @@ class LayoutReader:
             return stored
         if pose.shape != (4, 4):
             return stored
-        pose[:3, 3] += self._belt.way(pose, frame)
+        pose[:3, 3] += self._belt.displacement(pose, frame)
         return pose
 
     def finish(self) -> Violations:

@@ -61,12 +61,12 @@ def files_of_frame(record: Record, content: Mapping[str, Any]) -> dict[str, str]
 
 def check_listed(record: Record, content: Mapping[str, Any]) -> Violations:
     """Check that the manifest lists exactly the files that the frame must have."""
-    where, wanted = f"manifest.jsonl, frame {record['index']}", files_of_frame(record, content)
-    for file, name in wanted.items():
+    where, required = f"manifest.jsonl, frame {record['index']}", files_of_frame(record, content)
+    for file, name in required.items():
         if file not in record["files"]:
             yield where, f"lists no file of the format {name} by the name {file}"
     for file in record["files"]:
-        if file not in wanted:
+        if file not in required:
             yield where, f"lists {file}, which is of no format of the dataset"
 
 
@@ -75,7 +75,7 @@ def labelled_assets(content: Mapping[str, Any]) -> list[int]:
     return sorted(set(range(len(content["assets"]))) - set(content.get("distractors", ())))
 
 
-class Owned:
+class OwnedFiles:
     """Hashes of the names of all files that belong to the dataset, 8 bytes each."""
 
     def __init__(self, content: Mapping[str, Any]) -> None:
@@ -84,10 +84,10 @@ class Owned:
         self._models = labelled_assets(content)
         self._names = array("Q")
         self._last = ("", -1)
-        for file in self._of_all():
+        for file in self._collection_files():
             self._add(file)
 
-    def _of_all(self) -> Iterator[str]:
+    def _collection_files(self) -> Iterator[str]:
         """Yield the files that describe all frames."""
         for name, described in _ANNOTATIONS.items():
             if name in self._formats:

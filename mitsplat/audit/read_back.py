@@ -19,11 +19,11 @@ POLYGON_IOU = 0.99
 """Minimum IoU of a connected mask and its polygon, for masks of more than :data:`POLYGON_AREA` pixels."""
 POLYGON_AREA = 200
 
-_ROUNDED_PIXELS = 4
+_PIXEL_TOLERANCE = 4
 """Maximum number of pixels by which a polygon read from text may differ from its mask."""
-_ROUNDED = 0.01
+_POSITION_TOLERANCE = 0.01
 """Tolerance of positions for six decimals and OpenCV's rectangles [px]."""
-_WIDER = 1.001
+_MAX_AREA_RATIO = 1.001
 """Maximum ratio of the area of a single-precision rectangle to the smallest possible area."""
 Violations = Iterator[tuple[str, str]]
 """Iterator of violations: file, relative to the dataset, and description."""
@@ -83,15 +83,15 @@ def _check_segment(frame: TrueFrame, label: TrueInstance, values: list[float]) -
     # Rasterised as in Ultralytics' polygon2mask: single precision, truncated to pixels, even-odd rule, edges painted.
     canvas = np.zeros((height, width), dtype=np.uint8)
     cv2.fillPoly(canvas, [(points.astype(np.float32) * np.array(frame.size, dtype=np.float32)).astype(np.int32)], 1)
-    read, mask = canvas.astype(bool), frame.whole(label)
+    read, mask = canvas.astype(bool), frame.full_mask(label)
     lost, added = np.count_nonzero(mask & ~read), np.count_nonzero(read & ~mask)
     parts = cv2.connectedComponents(label.mask.astype(np.uint8), connectivity=8)[0] - 1
     iou = (label.area - lost) / (label.area + added)
-    if lost > _ROUNDED_PIXELS or added > _ROUNDED_PIXELS + (bridged_pixels(label.mask) if parts > 1 else 0):
+    if lost > _PIXEL_TOLERANCE or added > _PIXEL_TOLERANCE + (bridged_pixels(label.mask) if parts > 1 else 0):
         yield f"{label.name}: its polygon does not give its mask back (IoU {iou:.4f})"
     elif label.area > POLYGON_AREA and parts == 1 and iou < POLYGON_IOU:
         yield f"{label.name}: its polygon has an IoU of {iou:.4f} with its mask"
-    if abs(iou - label.entry["polygon_iou"]) > _ROUNDED_PIXELS / label.area:
+    if abs(iou - label.entry["polygon_iou"]) > _PIXEL_TOLERANCE / label.area:
         yield f"{label.name}: the IoU of its polygon is {iou:.6f}, not the manifest's {label.entry['polygon_iou']}"
     box = np.concatenate([points.min(axis=0), points.max(axis=0)]) * np.tile(frame.size, 2)
     if np.abs(box - label.box).max() > 0.05:
@@ -143,7 +143,7 @@ def _check_rotated(frame: TrueFrame, label: TrueInstance, values: list[float]) -
     tolerance = 0.05
     if inside.min() < -tolerance or (inside - lengths).max() > tolerance:
         yield f"{label.name}: its line is not the smallest rectangle around its mask: pixels lie outside"
-    elif lengths[0] * lengths[1] > _WIDER * smallest + tolerance * lengths.max():
+    elif lengths[0] * lengths[1] > _MAX_AREA_RATIO * smallest + tolerance * lengths.max():
         yield f"{label.name}: its line is not the smallest rectangle around its mask: one of {smallest:.1f} px fits"
 
 
@@ -155,7 +155,7 @@ def _check_pose(frame: TrueFrame, label: TrueInstance, values: list[float]) -> I
     points = np.array(values[4:]).reshape(-1, 3) * [*frame.size, 1]
     stated = np.array(label.entry["keypoints"], dtype=np.float64).reshape(-1, 3)
     expected = np.concatenate([stated, np.zeros((count - len(stated), 3))])
-    if np.abs(points - expected).max() > _ROUNDED:
+    if np.abs(points - expected).max() > _POSITION_TOLERANCE:
         yield f"{label.name}: its keypoints are not those of the manifest"
 
 
@@ -259,7 +259,7 @@ def check_bop(frame: TrueFrame, damaged: Collection[str]) -> Violations:
     }
     for position, label in enumerate(frame.instances):
         for folder in ("mask", "mask_visib"):
-            expected = frame.whole(label, amodal=folder == "mask")
+            expected = frame.full_mask(label, amodal=folder == "mask")
             checks[f"{frame.bop_folder}/{folder}/{name}_{position:06d}.png"] = partial(_check_mask, expected)
     for file, check in checks.items():
         if file in frame.record["files"] and file not in damaged:
@@ -294,4 +294,4 @@ CHECKS: dict[str, Callable[[TrueFrame, Path], Iterator[str]]] = {
 def _is_box(values: list[float], frame: TrueFrame, label: TrueInstance) -> bool:
     x, y, width, height = np.array(values) * np.tile(frame.size, 2)
     box: Float64Array = np.array([x - width / 2, y - height / 2, x + width / 2, y + height / 2])
-    return bool(np.abs(box - label.box).max() <= _ROUNDED)
+    return bool(np.abs(box - label.box).max() <= _POSITION_TOLERANCE)

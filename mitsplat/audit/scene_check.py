@@ -14,7 +14,7 @@ from mitsplat.audit.truth import TrueFrame, seats_of
 
 _SIGMAS = 6.0
 """Maximum jitter of cameras, in standard deviations."""
-_NEAR = 1e-6
+_POSITION_TOLERANCE = 1e-6
 """Tolerance of positions [m]."""
 
 
@@ -39,7 +39,7 @@ class SceneReader:
             yield f"manifest.jsonl, frame {frame.index}", text
 
     def _check_camera(self, frame: TrueFrame) -> Iterator[str]:
-        drawn, (number, right) = frame.record.get("viewpoint") or {}, self._seat(frame)
+        drawn, (number, right) = frame.record.get("viewpoint") or {}, self._camera_slot(frame)
         sides = ("left", "right") if self._cameras[number].get("stereo") else (None, None)
         if (drawn.get("camera", 0), drawn.get("side")) != (number, sides[right]):
             yield "it is not of the camera whose turn it is"
@@ -91,24 +91,24 @@ class SceneReader:
 
     def _camera_of(self, frame: TrueFrame) -> Mapping[str, Any]:
         """Return the camera of the scene that took a frame."""
-        camera: Mapping[str, Any] = self._cameras[self._seat(frame)[0]]
+        camera: Mapping[str, Any] = self._cameras[self._camera_slot(frame)[0]]
         return camera
 
-    def _seat(self, frame: TrueFrame) -> tuple[int, bool]:
+    def _camera_slot(self, frame: TrueFrame) -> tuple[int, bool]:
         """Return the position of a frame's camera in the scene, and True for the right camera of a stereo pair."""
         number, side = self._seats[frame.record["view"] % len(self._seats)]
         return number, side == 1
 
-    def _turn(self, frame: TrueFrame) -> tuple[int, int]:
+    def _view_of_camera(self, frame: TrueFrame) -> tuple[int, int]:
         """Return the position of a frame among the views of its camera in the layout, and the number of these views."""
         seats = len(self._seats)
         turn, seat = divmod(frame.record["view"], seats)
         return turn, len(range(seat, self._output["views"], seats))
 
-    def _unheld(self, frame: TrueFrame) -> Float64Array:
+    def _steady_pose(self, frame: TrueFrame) -> Float64Array:
         """Return the pose of a frame's camera without hand-held motion; a right camera is moved to its left camera."""
         pose = np.array(frame.world_from_camera, dtype=np.float64)
-        number, right = self._seat(frame)
+        number, right = self._camera_slot(frame)
         if right:
             pose[:3, 3] -= self._cameras[number]["stereo"]["baseline"] * pose[:3, 0]
         if (motion := (frame.record.get("viewpoint") or {}).get("handheld")) is not None:
@@ -120,36 +120,36 @@ class SceneReader:
 
     def _check_place(self, frame: TrueFrame) -> Iterator[str]:
         """Check the camera's position and direction: distance and direction to the target, or the ends of a path."""
-        camera, pose = self._camera_of(frame), self._unheld(frame)
+        camera, pose = self._camera_of(frame), self._steady_pose(frame)
         eye, axis = pose[:3, 3], pose[:3, 2]
         if camera["kind"] == "path":
-            turn, turns = self._turn(frame)
+            turn, turns = self._view_of_camera(frame)
             ends = {0: camera["keys"][0], turns - 1: camera["keys"][-1]}
             if (key := ends.get(turn)) is None or turns == 1:
                 return
             away = float(np.linalg.norm(eye - key["eye"]))
-            if away > _SIGMAS * camera["jitter"] + _NEAR:
+            if away > _SIGMAS * camera["jitter"] + _POSITION_TOLERANCE:
                 yield f"its camera is {away:.3g} m from the key of the scene's path"
-            wanted = np.subtract(key["target"], key["eye"])
-            if axis @ wanted < (1 - _NEAR) * np.linalg.norm(wanted):
+            direction = np.subtract(key["target"], key["eye"])
+            if axis @ direction < (1 - _POSITION_TOLERANCE) * np.linalg.norm(direction):
                 yield "its camera does not look where the scene's path says"
             return
-        target, room = camera["target"], _SIGMAS * camera.get("target_jitter", 0.0) + _NEAR
+        target, tolerance = camera["target"], _SIGMAS * camera.get("target_jitter", 0.0) + _POSITION_TOLERANCE
         if (stated := (frame.record.get("viewpoint") or {}).get("target")) is not None:
-            target, room = stated, _NEAR  # the record states the drawn target
+            target, tolerance = stated, _POSITION_TOLERANCE  # the record states the drawn target
         offset = eye - target
         if camera["kind"] == "orbit":
-            room = _SIGMAS * camera["jitter"] + _NEAR
+            tolerance = _SIGMAS * camera["jitter"] + _POSITION_TOLERANCE
             off = float(np.hypot(np.hypot(*offset[:2]) - camera["radius"], offset[2] - camera["height"]))
             low = high = float(np.hypot(camera["radius"], camera["height"]))
         else:
             low, high = camera["radius"]
             off = max(low - np.linalg.norm(offset), np.linalg.norm(offset) - high, 0.0)
-        if off > room:
+        if off > tolerance:
             yield f"its camera is {off:.3g} m off the scene's {camera['kind']}"
-        beside = float(np.linalg.norm(np.cross(axis, offset)))
-        if beside > room or (axis @ offset > 0 and high > room):
-            yield f"its camera looks past the scene's target by {beside:.3g} m"
+        distance = float(np.linalg.norm(np.cross(axis, offset)))
+        if distance > tolerance or (axis @ offset > 0 and high > tolerance):
+            yield f"its camera looks past the scene's target by {distance:.3g} m"
 
 
 def _held_out(scene: Mapping[str, Any]) -> set[int]:

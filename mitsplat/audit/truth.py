@@ -151,7 +151,7 @@ class TrueFrame:
         """Folder of the frame's layout in BOP, relative to the dataset."""
         return f"bop/{self.split}/{self.record['layout']:06d}"
 
-    def whole(self, instance: TrueInstance, *, amodal: bool = False) -> BoolArray:
+    def full_mask(self, instance: TrueInstance, *, amodal: bool = False) -> BoolArray:
         """Return the visible pixels of an instance, or its whole silhouette, in the whole image (H, W)."""
         width, height = self.size
         canvas = np.zeros((height, width), dtype=bool)

@@ -37,16 +37,16 @@ from mitsplat.renderer.path_tracing import RAYS_PER_LAUNCH, render_mesh, trace_r
 from mitsplat.runtime.variant import one_at_a_time
 from mitsplat.scene.spec.light_spec import LightSpec
 
-_HIDDEN = 0.01
+_MIN_RADIANCE = 0.01
 """Radiance of a white surface under the uniform light below which a surfel counts as invisible."""
-_FEW = 1000
+_TRIAL_GAUSSIANS = 1000
 """Number of trial Gaussians that estimate the visible fraction: accurate to 2 %, in a tenth of the time."""
-_DETAIL = 7.0
+_DETAIL_GAIN = 7.0
 """Additional relative density of Gaussians where the texture changes strongly."""
-_MOST_GAUSSIANS = 2_000_000
-_SMALLEST, _LARGEST = 0.001, 5.0
+_MAX_GAUSSIANS = 2_000_000
+_MIN_OBJECT_SIZE, _MAX_OBJECT_SIZE = 0.001, 5.0
 """Size range of objects [m]; sizes outside of it indicate wrong units."""
-_LEAST, _MOST = 1e-5, 1e5
+_MIN_SIZE, _MAX_SIZE = 1e-5, 1e5
 """Size range of any mesh [m]; 32-bit floats are too coarse outside of it."""
 _STAGES = {
     "placing Gaussians": 14,
@@ -57,9 +57,9 @@ _STAGES = {
     "comparing with the mesh": 8,
 }
 """Stages of a bake, with their relative durations."""
-_DARKEST, _BRIGHTEST = 0.6, 1.4
+_MIN_BRIGHTNESS, _MAX_BRIGHTNESS = 0.6, 1.4
 """Range of brightness relative to the textures that shaded corners and highlights can explain."""
-_RIDGE = 0.02
+_RIDGE_WEIGHT = 0.02
 """Weight of the penalty on view dependence, relative to the data; it determines directions without rays."""
 
 
@@ -123,8 +123,8 @@ class BakeSettings:
         for name in ("gaussians", "directions", "samples", "bounces", "proxy_faces"):
             if getattr(self, name) < 1:
                 raise InputError(f"{name} must be at least 1 (got {getattr(self, name)})")
-        if self.gaussians > _MOST_GAUSSIANS:
-            raise InputError(f"gaussians must be at most {_MOST_GAUSSIANS} (got {self.gaussians})")
+        if self.gaussians > _MAX_GAUSSIANS:
+            raise InputError(f"gaussians must be at most {_MAX_GAUSSIANS} (got {self.gaussians})")
         if not 0 <= self.sh_degree <= 3:
             raise InputError(f"sh_degree must be 0, 1, 2 or 3 (got {self.sh_degree})")
 
@@ -191,30 +191,32 @@ def bake_asset(
     source, size = str(mesh) if isinstance(mesh, str | Path) else name, float(surface.extents.max())
     if kind == "object" and not any_size:
         _check_size(source, size, metres_per_unit)
-    if not _LEAST <= size <= _MOST:
-        raise InputError(f"{source}: a mesh must be {_LEAST:g} to {_MOST:g} m across (got {size:.3g} m)")
+    if not _MIN_SIZE <= size <= _MAX_SIZE:
+        raise InputError(f"{source}: a mesh must be {_MIN_SIZE:g} to {_MAX_SIZE:g} m across (got {size:.3g} m)")
     scene = mitsuba_scene(parts, lights)
     stages("placing Gaussians")
     rng = np.random.default_rng(settings.seed)
     relative = settings.density or {}
-    face_density = np.concatenate([relative.get(part.name, 1.0) * part.detail_density(_DETAIL, rng) for part in parts])
+    face_density = np.concatenate(
+        [relative.get(part.name, 1.0) * part.detail_density(_DETAIL_GAIN, rng) for part in parts]
+    )
     clay = mitsuba_scene(parts, bake_lights("uniform"), clay=True)
     # The visible fraction of a few trial surfels determines how many surfels are placed.
-    few = place_surfels(surface, face_density, min(_FEW, settings.gaussians), rng)
-    share = float(_seen(clay, few, rng).mean()) if len(few) else 1.0
+    trial = place_surfels(surface, face_density, min(_TRIAL_GAUSSIANS, settings.gaussians), rng)
+    share = float(_visible_surfels(clay, trial, rng).mean()) if len(trial) else 1.0
     surfels = place_surfels(surface, face_density, round(settings.gaussians / max(share, 0.2)), rng)
-    surfels = surfels.subset(_seen(clay, surfels, rng))
+    surfels = surfels.subset(_visible_surfels(clay, surfels, rng))
     if not len(surfels):
         raise InputError(f"{name}: no point of the mesh can be seen; are its faces inside out?")
     colour = _fit_radiance(scene, surfels, settings, rng, stages.step)
-    splats = surfels.splats(_sharpened(surfels, colour, settings.sharpening))
+    splats = surfels.splats(_sharpen_colours(surfels, colour, settings.sharpening))
     if settings.fit_steps:
         stages("path-tracing pictures")
         fit_cameras = fit_cameras or _orbit(surface, settings.fit_views, turn=0.0)
         pictures = []
         for view, camera in enumerate(fit_cameras):
             stages("path-tracing pictures", view / len(fit_cameras))
-            pictures.append(_picture(scene, camera, settings, view))
+            pictures.append(_trace_picture(scene, camera, settings, view))
         stages("fitting to the pictures")
         refining = RefineSettings(iterations=settings.fit_steps, seed=settings.seed)
         splats = refine_splats(
@@ -245,33 +247,33 @@ def bake_asset(
         stages.end()
         return BakeResult(asset, float("nan"), float("nan"), surface=surface, warnings=tuple(warnings))
     cameras = cameras or _orbit(surface, settings.verify_views)
-    views, whole, on_object = compare_views(
+    views, psnr, psnr_object = compare_views(
         scene, splats, cameras, bounces=settings.bounces, seed=settings.seed, progress=stages.step
     )
     brightness = None
     if isinstance(light, str) and (finish is None or finish.colour is None):
         gloss = {part.name: part.gloss for part in parts}
         brightness = compare_with_textures(mesh, splats, world_from_file(metres_per_unit, up), gloss)
-    if brightness is not None and not _DARKEST < brightness < _BRIGHTEST:
+    if brightness is not None and not _MIN_BRIGHTNESS < brightness < _MAX_BRIGHTNESS:
         warnings.append(
             f"the splats are {brightness:.2g} times as bright as the textures of the file: "
             "are the factors of its materials meant?"
         )
     stages.end()
-    return BakeResult(asset, whole, on_object, views, surface, brightness, tuple(warnings))
+    return BakeResult(asset, psnr, psnr_object, views, surface, brightness, tuple(warnings))
 
 
 class _Stages:
     """Progress of a bake in percent."""
 
     def __init__(self, tell: Progress | None) -> None:
-        self._tell = tell
+        self._progress = tell
 
     def __call__(self, stage: str, share: float = 0.0) -> None:
-        if self._tell is not None:
+        if self._progress is not None:
             names = list(_STAGES)
             before = sum(_STAGES[name] for name in names[: names.index(stage)])
-            self._tell(int(100 * (before + share * _STAGES[stage]) / sum(_STAGES.values())), 100, stage)
+            self._progress(int(100 * (before + share * _STAGES[stage]) / sum(_STAGES.values())), 100, stage)
 
     def step(self, done: int, total: int, stage: str) -> None:
         """Report that ``done`` of ``total`` steps of a stage are complete."""
@@ -279,19 +281,21 @@ class _Stages:
 
     def end(self) -> None:
         """Report the end."""
-        if self._tell is not None:
-            self._tell(100, 100, "done")
+        if self._progress is not None:
+            self._progress(100, 100, "done")
 
 
 def _check_size(source: str, size: float, metres_per_unit: float) -> None:
     """Refuse objects whose size [m] indicates wrong units."""
-    if _SMALLEST <= size <= _LARGEST:
+    if _MIN_OBJECT_SIZE <= size <= _MAX_OBJECT_SIZE:
         return
-    factor, unit = (0.001, "millimetres") if size > _LARGEST else (1000.0, "metres")
-    likely = f"--units {metres_per_unit * factor:g} reads it in {unit}, and "
+    factor, unit = (0.001, "millimetres") if size > _MAX_OBJECT_SIZE else (1000.0, "metres")
+    likely = ""
+    if _MIN_OBJECT_SIZE <= size * factor <= _MAX_OBJECT_SIZE:
+        likely = f"--units {metres_per_unit * factor:g} reads it in {unit}, and "
     raise InputError(
-        f"{source}: an object must be {_SMALLEST:g} to {_LARGEST:g} m across (got {size:.3g} m at {metres_per_unit:g} "
-        f"metres per unit: {likely if _SMALLEST <= size * factor <= _LARGEST else ''}--any-size bakes it as it is)"
+        f"{source}: an object must be {_MIN_OBJECT_SIZE:g} to {_MAX_OBJECT_SIZE:g} m across (got {size:.3g} m at "
+        f"{metres_per_unit:g} metres per unit: {likely}--any-size bakes it as it is)"
     )
 
 
@@ -300,7 +304,7 @@ def _hemisphere(count: int) -> Float64Array:
     return spiral(1.0 - 0.95 * (np.arange(count) + 0.5) / count)
 
 
-def _turned(frames: Float64Array, directions: Float64Array, rng: np.random.Generator) -> Float64Array:
+def _rotate_directions(frames: Float64Array, directions: Float64Array, rng: np.random.Generator) -> Float64Array:
     """Return ``directions`` (M, 3) in each of ``frames`` (N, 3, 3), rotated by a random angle, shape (N, M, 3)."""
     angle = rng.uniform(0.0, 2.0 * np.pi, (len(frames), 1))
     cos, sin = np.cos(angle), np.sin(angle)
@@ -311,7 +315,7 @@ def _turned(frames: Float64Array, directions: Float64Array, rng: np.random.Gener
     return np.asarray(np.einsum("nij,nmj->nmi", frames, local))
 
 
-def _seen(clay: mi.Scene, surfels: Surfels, rng: np.random.Generator) -> BoolArray:
+def _visible_surfels(clay: mi.Scene, surfels: Surfels, rng: np.random.Generator) -> BoolArray:
     """Return a mask (N,) of the surfels that light from outside reaches.
 
     Surfels inside a solid, in a closed cavity or under a label are not reached.
@@ -321,8 +325,8 @@ def _seen(clay: mi.Scene, surfels: Surfels, rng: np.random.Generator) -> BoolArr
         surfels: Surfels to test.
         rng: Random generator.
     """
-    directions = _turned(surfels.frames, _hemisphere(8), rng)
-    origins = surfels.points[:, None] + _lift(clay) * directions
+    directions = _rotate_directions(surfels.frames, _hemisphere(8), rng)
+    origins = surfels.points[:, None] + _ray_offset(clay) * directions
     radiance, _ = trace_radiance(
         clay,
         origins.reshape(-1, 3),
@@ -331,10 +335,10 @@ def _seen(clay: mi.Scene, surfels: Surfels, rng: np.random.Generator) -> BoolArr
         bounces=2,
         seed=int(rng.integers(1 << 30)),
     )
-    return np.asarray(radiance.reshape(len(surfels), -1).mean(axis=1) > _HIDDEN)
+    return np.asarray(radiance.reshape(len(surfels), -1).mean(axis=1) > _MIN_RADIANCE)
 
 
-def _lift(scene: mi.Scene) -> float:
+def _ray_offset(scene: mi.Scene) -> float:
     """Return the distance above a surface [m] at which rays towards it start, just above the rounding of float32."""
     box = scene.bbox()
     return 1e-5 * float(max(abs(v) for v in (*box.min, *box.max)))
@@ -367,20 +371,20 @@ def _fit_radiance(
     local = _hemisphere(settings.directions)
     weights = 0.2 + local[:, 2]
     terms = (settings.sh_degree + 1) ** 2
-    penalty = _RIDGE * weights.sum() * np.diag([1e-6] + [1.0] * (terms - 1)) / (4.0 * np.pi)
+    penalty = _RIDGE_WEIGHT * weights.sum() * np.diag([1e-6] + [1.0] * (terms - 1)) / (4.0 * np.pi)
     coefficients = np.empty((len(surfels), terms, 3))
     step = max(1, RAYS_PER_LAUNCH // (settings.directions * settings.samples))
     for start in range(0, len(surfels), step):
         progress(start, len(surfels), "tracing their radiance")
         chunk = slice(start, start + step)
         frames, scales = surfels.frames[chunk], surfels.scales[chunk]
-        towards = _turned(frames, local, rng)
+        towards = _rotate_directions(frames, local, rng)
         # Samples over the footprint average the texture over the Gaussian instead of aliasing it.
         offset = np.clip(rng.normal(size=(*towards.shape[:2], 2)), -1.5, 1.5) * 0.5 * scales[:, None, :2]
         origins = surfels.points[chunk, None] + np.einsum("nij,nmj->nmi", frames[:, :, :2], offset)
-        origins += (0.3 * scales[:, None, :1] + _lift(scene)) * towards
+        origins += (0.3 * scales[:, None, :1] + _ray_offset(scene)) * towards
         on_surface = _hits_nearby(scene, origins, -towards, frames[:, :, 2], 1.2 * scales[:, 0])
-        origins = np.where(on_surface[..., None], origins, surfels.points[chunk, None] + _lift(scene) * towards)
+        origins = np.where(on_surface[..., None], origins, surfels.points[chunk, None] + _ray_offset(scene) * towards)
         radiance, _ = trace_radiance(
             scene,
             origins.reshape(-1, 3),
@@ -398,7 +402,7 @@ def _fit_radiance(
     return coefficients
 
 
-def _sharpened(surfels: Surfels, target: Float64Array, rounds: int) -> Float64Array:
+def _sharpen_colours(surfels: Surfels, target: Float64Array, rounds: int) -> Float64Array:
     """Return colours (N, K, 3) whose blend at every surfel approximates ``target`` (N, K, 3).
 
     Van Cittert's iteration. Colours are clamped to the range of their neighbours, which prevents ringing.
@@ -414,16 +418,16 @@ def _sharpened(surfels: Surfels, target: Float64Array, rounds: int) -> Float64Ar
     blend /= blend.sum(axis=1, keepdims=True)
     colour = target.copy()
     for band in range(target.shape[1]):
-        wanted, now = target[:, band], colour[:, band]
-        around = wanted[index]
+        goal, now = target[:, band], colour[:, band]
+        around = goal[index]
         low, high = around.min(axis=1), around.max(axis=1)
         for _ in range(rounds):
-            now = np.clip(now + 0.7 * (wanted - np.einsum("nk,nkc->nc", blend, now[index])), low, high)
+            now = np.clip(now + 0.7 * (goal - np.einsum("nk,nkc->nc", blend, now[index])), low, high)
         colour[:, band] = now
     return colour
 
 
-def _picture(scene: mi.Scene, camera: Camera, settings: BakeSettings, view: int) -> Picture:
+def _trace_picture(scene: mi.Scene, camera: Camera, settings: BakeSettings, view: int) -> Picture:
     """Path-trace a picture of the mesh for the fit."""
     seed = settings.seed + 1000 + view
     radiance, cover = render_mesh(scene, camera, samples=16, bounces=settings.bounces, seed=seed)

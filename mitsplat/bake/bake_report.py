@@ -16,7 +16,7 @@ from mitsplat.pages.html import REPORT_FILE, figure_of, make_page, rgb_image, ve
 from mitsplat.storage.files import write_text
 
 _VIEW = 420
-_MOST_DIFFERENCE = 0.3
+_WHITE_DIFFERENCE = 0.3
 """Error of a display-encoded channel that is shown as white."""
 
 
@@ -37,8 +37,8 @@ def _figures(result: BakeResult) -> str:
     asset, warnings = result.asset, list(result.warnings)
     rows: dict[str, str | None] = {
         "Gaussians": f"{len(asset.splats)}",
-        "PSNR on unseen views": figure_of(_known(result.psnr), "{:.2f} dB"),
-        "PSNR of the mesh's pixels": figure_of(_known(result.psnr_object), "{:.2f} dB"),
+        "PSNR on unseen views": figure_of(_finite_or_none(result.psnr), "{:.2f} dB"),
+        "PSNR of the mesh's pixels": figure_of(_finite_or_none(result.psnr_object), "{:.2f} dB"),
         "Brightness relative to the file's textures": figure_of(result.brightness, "{:.2f}"),
     }
     if asset.mesh is not None:
@@ -55,14 +55,14 @@ def _figures(result: BakeResult) -> str:
                     f"convex pieces close hollows of the mesh by up to {1e3 * gap:.1f} mm, more than the "
                     f"{1e3 * bearable:.1f} mm that layouts bear: those in which something rests there are drawn again"
                 )
-    told = verdict_of(warnings, "Nothing to note.", rows)
-    return f'<section aria-labelledby="figures"><h2 id="figures">Figures</h2>{told}</section>'
+    verdict = verdict_of(warnings, "Nothing to note.", rows)
+    return f'<section aria-labelledby="figures"><h2 id="figures">Figures</h2>{verdict}</section>'
 
 
 def _views(result: BakeResult) -> str:
     note = (
         "Views that nothing was fitted to: the path-traced mesh, and its splats. "
-        f"In differences white is an error of {_MOST_DIFFERENCE:g} of the range."
+        f"In differences white is an error of {_WHITE_DIFFERENCE:g} of the range."
     )
     figures = "".join(_view(number + 1, view) for number, view in enumerate(result.views))
     return (
@@ -74,7 +74,7 @@ def _view(number: int, view: BakedView) -> str:
     pictures = {
         "mesh": view.mesh,
         f"splats, {view.psnr:.1f} dB": view.splats,
-        "difference": np.abs(view.splats - view.mesh) / _MOST_DIFFERENCE,
+        "difference": np.abs(view.splats - view.mesh) / _WHITE_DIFFERENCE,
     }
     images = "".join(
         f'<figure><img alt="view {number}, {html.escape(kind, quote=True)}" src="{rgb_image(picture, _VIEW)}">'
@@ -84,5 +84,5 @@ def _view(number: int, view: BakedView) -> str:
     return f'<div class="row">{images}</div>'
 
 
-def _known(value: float) -> float | None:
+def _finite_or_none(value: float) -> float | None:
     return value if np.isfinite(value) else None

@@ -40,7 +40,7 @@ from mitsplat.storage.file_kinds import refuse_others
 from mitsplat.storage.files import MESH_ERRORS
 
 _SUFFIXES = (".stl", ".obj", ".glb", ".gltf", ".off", ".3mf", ".dae", ".ply")
-_BY_OTHERS = {".3mf": ("lxml", "lxml"), ".dae": ("collada", "pycollada")}
+_READER_PACKAGES = {".3mf": ("lxml", "lxml"), ".dae": ("collada", "pycollada")}
 """Modules that trimesh needs for some file types, and the packages that contain them."""
 _WHITE = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 1.0}}
 _DETAIL_SAMPLES = 12
@@ -136,8 +136,8 @@ def read_parts(
         try:
             mesh = trimesh.load_scene(mesh)
         except (OSError, *MESH_ERRORS) as error:
-            if path.suffix.lower() in _BY_OTHERS:
-                needed = _BY_OTHERS[path.suffix.lower()]
+            if path.suffix.lower() in _READER_PACKAGES:
+                needed = _READER_PACKAGES[path.suffix.lower()]
                 if importlib.util.find_spec(needed[0]) is None:
                     raise MissingResourceError(f"{source}: reading it needs `pip install {needed[1]}`") from error
             raise InputError(f"{source}: not a mesh that can be read ({error})") from error
@@ -204,7 +204,7 @@ def _read_part(
         if stored is not None and len(stored) == len(source.vertices):
             per_corner = to_rgba(np.asarray(stored))[faces]
     warnings = [f"material of part {name!r}: {warning}" for warning in material.warnings]
-    material = _finished(material, finish)
+    material = _apply_finish(material, finish)
     if finish.colour is not None:
         warnings, per_corner = [], None
     gloss = (material.metallic, material.roughness, material.shiny, material.specular)
@@ -221,7 +221,7 @@ def _read_part(
     return MeshPart(name, geometry, colours * material.factor, None, None, *gloss, tuple(warnings))
 
 
-def _finished(material: Material, finish: SurfaceFinish) -> Material:
+def _apply_finish(material: Material, finish: SurfaceFinish) -> Material:
     """Return ``material`` with the values that ``finish`` defines."""
     colour = finish.linear_colour()
     if colour is not None:

@@ -26,21 +26,21 @@ def make_proxy(parts: Sequence[MeshPart], most_faces: int) -> trimesh.Trimesh:
     re-triangulated
     from their outlines.
     """
-    meshes = [_without_holes(part.mesh) for part in parts]
+    meshes = [_close_holes(part.mesh) for part in parts]
     solids = [mesh for mesh in meshes if mesh.is_volume]
     sheets = [mesh for mesh in meshes if not mesh.is_volume]
     if len(solids) > 1:
         solids = [trimesh.boolean.union(solids, engine="manifold")]
     if solids:
         sheets = [sheet for sheet in sheets if not _lies_on(sheet, solids[0])]
-    sheets = [_flattened(sheet) for sheet in sheets]
-    room = max(most_faces - sum(len(sheet.faces) for sheet in sheets), most_faces // 2)
-    solids = [_of_fewer_faces(solid, room) for solid in solids]
+    sheets = [_retriangulate_flat(sheet) for sheet in sheets]
+    face_budget = max(most_faces - sum(len(sheet.faces) for sheet in sheets), most_faces // 2)
+    solids = [_simplify(solid, face_budget) for solid in solids]
     proxy = trimesh.util.concatenate(solids + sheets)
     return trimesh.Trimesh(proxy.vertices, proxy.faces)
 
 
-def _of_fewer_faces(solid: trimesh.Trimesh, most: int) -> trimesh.Trimesh:
+def _simplify(solid: trimesh.Trimesh, most: int) -> trimesh.Trimesh:
     """Simplify a solid to at most about ``most`` faces.
 
     Quadric decimation may tear meshes such as scans; Manifold simplifies those instead.
@@ -54,7 +54,7 @@ def _of_fewer_faces(solid: trimesh.Trimesh, most: int) -> trimesh.Trimesh:
     return next((mesh for mesh in closed if len(mesh.faces) <= most), fewer)
 
 
-def _without_holes(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+def _close_holes(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     """Close small holes of a solid, such as missing triangles of a scan; return any other mesh unchanged."""
     if mesh.is_watertight:
         return mesh
@@ -63,7 +63,7 @@ def _without_holes(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     return closed if closed.is_volume else mesh
 
 
-def _flattened(sheet: trimesh.Trimesh) -> trimesh.Trimesh:
+def _retriangulate_flat(sheet: trimesh.Trimesh) -> trimesh.Trimesh:
     """Re-triangulate a planar sheet from its outline; return any other sheet unchanged."""
     normal = sheet.face_normals[0]
     height = (sheet.vertices - sheet.vertices[0]) @ normal

@@ -217,17 +217,17 @@ def check_textures(mesh: Path) -> None:
         _check_gltf(mesh)
     elif kind == ".ply":
         with mesh.open("rb") as file:
-            header = file.read(_HEADER).partition(b"end_header")[0].decode("utf-8", errors="replace")
+            header = file.read(_MAX_HEADER_BYTES).partition(b"end_header")[0].decode("utf-8", errors="replace")
         for texture in re.findall(r"^comment TextureFile (.+?)\s*$", header, re.MULTILINE):
             _check_texture(mesh, texture)
 
 
-_HEADER = 1 << 16
+_MAX_HEADER_BYTES = 1 << 16
 """Maximum size of the header of a PLY file [bytes]."""
 
 
 def _check_obj(mesh: Path) -> None:
-    libraries = _named(mesh, "mtllib")
+    libraries = _values_of(mesh, "mtllib")
     known: list[str] = []
     for library in libraries:
         path = mesh.parent / library
@@ -235,12 +235,12 @@ def _check_obj(mesh: Path) -> None:
             if all((mesh.parent / word).is_file() for word in library.split()):
                 raise InputError(f"{mesh}: must have one material file (got {library})")
             raise InputError(f"{mesh}: its material file {library} is missing; put it there, or give a colour")
-        known += _named(path, "newmtl")
-        for texture in _named(path, "map_kd"):
+        known += _values_of(path, "newmtl")
+        for texture in _values_of(path, "map_kd"):
             if texture.startswith("-"):
                 raise InputError(f"{path}: options of a texture are not read: leave them out (got map_Kd {texture})")
             _check_texture(path, texture)
-    missing = sorted(set(_named(mesh, "usemtl")) - set(known)) if libraries else []
+    missing = sorted(set(_values_of(mesh, "usemtl")) - set(known)) if libraries else []
     if missing:
         raise InputError(
             f"{mesh}: its material {missing[0]} is not in {', '.join(libraries)}: add it, or give a colour"
@@ -249,10 +249,10 @@ def _check_obj(mesh: Path) -> None:
 
 def _check_gltf(mesh: Path) -> None:
     try:
-        said = json.loads(mesh.read_text("utf-8"))
-        images = [image.get("uri", "data:") for image in said.get("images", [])]
-        sources = [texture.get("source", 0) for texture in said.get("textures", [])]
-        for material in said.get("materials", []):
+        stored = json.loads(mesh.read_text("utf-8"))
+        images = [image.get("uri", "data:") for image in stored.get("images", [])]
+        sources = [texture.get("source", 0) for texture in stored.get("textures", [])]
+        for material in stored.get("materials", []):
             index = material.get("pbrMetallicRoughness", {}).get("baseColorTexture", {}).get("index")
             if index is not None and not (0 <= index < len(sources) and 0 <= sources[index] < len(images)):
                 raise InputError(f"{mesh}: a material's texture {index} is not there; give a colour")
@@ -275,7 +275,7 @@ def _check_texture(path: Path, texture: str) -> None:
         raise InputError(f"{path}: its texture {texture} {fault}; put it there, or give a colour") from None
 
 
-def _named(path: Path, key: str) -> list[str]:
+def _values_of(path: Path, key: str) -> list[str]:
     """Return the values of all lines of an OBJ or an MTL that begin with a key."""
     names = []
     for line in path.read_bytes().splitlines():

@@ -24,8 +24,8 @@ from mitsplat.progress import Progress
 from mitsplat.renderer.layers import render_splats
 from mitsplat.renderer.path_tracing import render_mesh
 
-_POINTS = 4000
-_NEAR = 3.0
+_SAMPLES_PER_PART = 4000
+_MAX_SIGMAS = 3.0
 """Distance to the next Gaussian, in its standard deviations, beyond which a point of the mesh counts as hidden."""
 
 
@@ -107,7 +107,7 @@ def compare_with_textures(
         image = getattr(visual.material, "baseColorTexture", None) or getattr(visual.material, "image", None)
         if image is None:
             continue
-        at, face = trimesh.sample.sample_surface(geometry, _POINTS, seed=0)
+        at, face = trimesh.sample.sample_surface(geometry, _SAMPLES_PER_PART, seed=0)
         share = trimesh.triangles.points_to_barycentric(geometry.triangles[face], at)
         uv = np.einsum("nk,nkd->nd", share, np.asarray(visual.uv)[geometry.faces[face]])
         pose = world_from_file @ transform
@@ -116,11 +116,13 @@ def compare_with_textures(
         colours.append(decode_srgb(uv_to_color(uv, image)[:, :3] / 255.0) + gloss.get(str(name), 0.0))
     if not points:
         return None
-    place, normal, own = (np.concatenate(values) for values in (points, normals, colours))
+    place, normal, texture = (np.concatenate(values) for values in (points, normals, colours))
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     distance, nearest = KDTree(splats.means).query(place)
     outward = Rotation.from_quat(splats.quats[nearest]).as_matrix()[:, :, 2]
-    seen = (distance < _NEAR * splats.scales[nearest].max(axis=1)) & (np.einsum("nd,nd->n", outward, normal) > 0.7)
+    seen = (distance < _MAX_SIGMAS * splats.scales[nearest].max(axis=1)) & (
+        np.einsum("nd,nd->n", outward, normal) > 0.7
+    )
     baked = evaluate_sh(splats.sh[nearest], -outward)
-    expected = own[seen].mean() if seen.any() else 0.0
+    expected = texture[seen].mean() if seen.any() else 0.0
     return float(decode_srgb(baked)[seen].mean() / expected) if expected > 0 else None

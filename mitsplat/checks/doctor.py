@@ -59,20 +59,20 @@ def _package(name: str) -> Finding:
 def _llvm() -> Finding:
     path = os.environ.get(VARIABLE) or "the system's libLLVM"
     remedy = f"pip install karellen-llvm-core, or set {VARIABLE} to a libLLVM of version {OLDEST_USABLE} or newer"
-    number, fault = _try("cpu", {})
+    number, fault = _render_trial_on("cpu", {})
     if fault:
         return Finding("LLVM", False, f"{number} from {path} {fault}" if number else f"{path} {fault}", remedy)
     return Finding("LLVM", True, f"{number} from {path} renders the trial scene as it is known")
 
 
-def _try(device: str, environment: Mapping[str, str]) -> tuple[str, str]:
+def _render_trial_on(device: str, environment: Mapping[str, str]) -> tuple[str, str]:
     """Render the trial scene on a device, and return the LLVM version and the fault, or an empty text."""
     command = python_command("-m", "mitsplat.checks.trial", device)
     environment = python_environment(environment)
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     if done.returncode:
-        said = (done.stderr.strip().splitlines() or [f"exit status {done.returncode}"])[-1]
-        return "", f"does not render ({re.sub('^mitsplat[.]errors[.][A-Za-z]+: ', '', said)})"
+        message = (done.stderr.strip().splitlines() or [f"exit status {done.returncode}"])[-1]
+        return "", f"does not render ({re.sub('^mitsplat[.]errors[.][A-Za-z]+: ', '', message)})"
     found = json.loads(done.stdout.splitlines()[-1])
     faults = "; ".join(found["faults"])
     return found["llvm"], f"renders the trial scene wrong ({faults})" if faults else ""
@@ -100,7 +100,7 @@ def _cuda() -> Finding:
         return Finding("GPU", "OptiX" not in gpus.what, f"{gpus.what} (optional)", gpus.remedy)
     driver, texts, ok = _driver(), [], True
     for gpu in gpus:
-        _, fault = _try("cuda", gpu_environment(gpu))
+        _, fault = _render_trial_on("cuda", gpu_environment(gpu))
         texts.append(f"{gpu.name} {fault or 'renders the trial scene as the CPU does'}")
         ok = ok and not fault
     remedy = "update NVIDIA's driver; until this line is well, render on the CPU"
@@ -123,10 +123,10 @@ def _disk() -> Finding:
 
 def _cache() -> Finding:
     folders = (cache_folder(), warp_folder(), drjit_folder())
-    lacks = [f"{folder}: {lack}" for folder in folders if (lack := why_unusable(folder))]
-    if lacks:
+    unusable = [f"{folder}: {reason}" for folder in folders if (reason := why_unusable(folder))]
+    if unusable:
         remedy = "set HOME or XDG_CACHE_HOME to a folder with room: kernels, layouts and pieces are made anew else"
-        return Finding("cache", False, "; ".join(lacks), remedy)
+        return Finding("cache", False, "; ".join(unusable), remedy)
     return Finding("cache", True, f"{', '.join(map(str, folders))} can be written")
 
 

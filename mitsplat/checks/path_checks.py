@@ -13,7 +13,7 @@ from scipy.spatial import QhullError
 
 from mitsplat.arrays import Float64Array
 from mitsplat.asset import Asset, opaque_core
-from mitsplat.dataset.preflight import doubts, run_faults
+from mitsplat.dataset.preflight import run_faults, scene_warnings
 from mitsplat.errors import InputError
 from mitsplat.findings import Finding
 from mitsplat.formats.registry import Catalogue
@@ -30,9 +30,9 @@ SIZES = {"object": (0.002, 2.0), "environment": (0.2, 100.0)}
 """Expected range of the longest extent by kind of asset [m]."""
 DENSITIES = (20.0, 22600.0)
 """Expected range of mass density, from foam to osmium [kg/m^3]."""
-FEW = 0.01
+MAX_FAULTY = 0.01
 """Fraction of Gaussians up to which needles and floaters are acceptable."""
-INVISIBLE = 1 / 255
+MIN_OPACITY = 1 / 255
 MIN_OVERLAP = 0.5
 MAX_OFFSET = 0.02
 MAX_SPREAD = 0.05
@@ -97,10 +97,10 @@ def _gaussians(asset: Asset, size: float) -> Iterator[Finding]:
     needles = long_needles(splats, size)
     share = float(needles.mean())
     remedy = "`mitsplat import` removes them; `mitsplat mesh` those that stick out of the object's masks"
-    yield Finding("needles", share <= FEW, f"{needles.sum()} long ones ({share:.1%})", remedy)
+    yield Finding("needles", share <= MAX_FAULTY, f"{needles.sum()} long ones ({share:.1%})", remedy)
     floaters = len(find_floaters(splats, visible_area(splats))) / len(splats)
-    yield Finding("floaters", floaters <= FEW, f"{floaters:.1%} of the Gaussians touch no large part", remedy)
-    faint = float((splats.opacities < INVISIBLE).mean())
+    yield Finding("floaters", floaters <= MAX_FAULTY, f"{floaters:.1%} of the Gaussians touch no large part", remedy)
+    faint = float((splats.opacities < MIN_OPACITY).mean())
     yield Finding("opacity", faint <= 0.2, f"{faint:.0%} are invisible", "prune them: they only cost time")
     unused = splats.sh_degree > 0 and not splats.sh[:, 1:].any()
     text = f"degree {splats.sh_degree}{', but all of it zero' if unused else ''}"
@@ -170,8 +170,8 @@ def check_scene(scene: Scene) -> Iterator[Finding]:
     except InputError as error:
         yield Finding("formats", False, str(error), "change output.formats, or what they need")
     faults = list(run_faults(scene))
-    yield from faults or doubts(scene)
-    for sizes in _sized(scene):
+    yield from faults or scene_warnings(scene)
+    for sizes in _assets_by_folder(scene):
         name = sizes[0].name
         wrong = dict.fromkeys(finding for asset in sizes for finding in check_asset(asset) if not finding.ok)
         for finding in wrong:
@@ -192,8 +192,8 @@ def check_scene(scene: Scene) -> Iterator[Finding]:
     text = "objects have something to lie on" if support else "nothing collides with objects"
     yield Finding("support", support or not spec.objects, text, "add a table to shapes, or set environment_collides")
     if support and not faults:
-        yield from _rest(scene)
-    yield _sight(scene)
+        yield from _check_rest(scene)
+    yield _check_view(scene)
     drawn = (*scene.environments, *scene.assets)
     lit = bool(spec.lights) or all(asset.capture_light == "scene" for asset in drawn)
     yield Finding(
@@ -201,7 +201,7 @@ def check_scene(scene: Scene) -> Iterator[Finding]:
     )
 
 
-def _sized(scene: Scene) -> Iterator[list[Asset]]:
+def _assets_by_folder(scene: Scene) -> Iterator[list[Asset]]:
     """Yield each asset in all its sizes in a scene, grouped by folder because names need not be unique."""
     folders = [folder for _, folder in environments(scene.spec)]
     folders += [folder for _, folder, entry in object_assets(scene.spec) for _ in entry.scales]
@@ -212,7 +212,7 @@ def _sized(scene: Scene) -> Iterator[list[Asset]]:
         yield list(sizes.values())
 
 
-def _rest(scene: Scene) -> Iterator[Finding]:
+def _check_rest(scene: Scene) -> Iterator[Finding]:
     """Report the objects that do not come to rest even if they are settled alone."""
     rested = set()
     try:
@@ -221,8 +221,8 @@ def _rest(scene: Scene) -> Iterator[Finding]:
                 rested.add(name)
                 continue
             reason, times = Counter(refused).most_common(1)[0]
-            said = f"it{reason.removeprefix(name)}" if reason.startswith(f"{name} ") else reason
-            text = f"{name} cannot take arrangement {arrangement}: {said} in {times} of {len(refused)} tries"
+            problem = f"it{reason.removeprefix(name)}" if reason.startswith(f"{name} ") else reason
+            text = f"{name} cannot take arrangement {arrangement}: {problem} in {times} of {len(refused)} tries"
             remedy = "choose another settle.arrangement, mend its mesh or its up axis, or leave it out of objects"
             yield Finding("rest", False, text, remedy)
     except InputError as error:
@@ -231,7 +231,7 @@ def _rest(scene: Scene) -> Iterator[Finding]:
         yield Finding("rest", True, f"{len(rested)} objects come to rest, each tried alone")
 
 
-def _sight(scene: Scene) -> Finding:
+def _check_view(scene: Scene) -> Finding:
     """Check that most views show the place where objects are dropped: the centre of a region, at its bottom."""
     corners = np.array([(region.min, region.max) for region, _ in scene.spec.all_regions])
     middles = np.column_stack([corners.mean(axis=1)[:, :2], corners[:, 0, 2]])

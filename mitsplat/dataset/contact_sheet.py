@@ -30,8 +30,8 @@ class ContactSheet:
 
     def __init__(self, root: Path, total: int, *, count: int = 16) -> None:
         self._root = root
-        self._chosen = spread(total, count)
-        self._heard = 0
+        self._selected = spread(total, count)
+        self._count = 0
         self._tiles: list[ByteImage] = []
 
     def add(self, record: Record) -> None:
@@ -40,9 +40,9 @@ class ContactSheet:
         Raises:
             OSError: If its image cannot be read.
         """
-        if self._heard in self._chosen:
+        if self._count in self._selected:
             self._tiles.append(_tile(self._root, record))
-        self._heard += 1
+        self._count += 1
 
     def write(self, path: Path) -> None:
         """Write the picture as JPEG."""

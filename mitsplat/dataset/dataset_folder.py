@@ -61,7 +61,7 @@ if TYPE_CHECKING:
 
 IMPLIED = {FORMAT_VERSION: 1, "device": "cpu"}
 """Default values of keys that are absent in ``dataset.json``."""
-_LOCK_TEXT = 200
+_MAX_LOCK_TEXT = 200
 """Maximum number of characters of a lock file that an error message shows."""
 
 
@@ -152,12 +152,12 @@ def open_folder(
         InputError: If the folder cannot be written, is in use, or holds other files.
         MissingResourceError: If the disk is full.
     """
-    _check_own(out)
+    _check_is_dataset(out)
     try:
         out.mkdir(parents=True, exist_ok=True)
         lock = open_in_place(out / LOCK, "a+")
     except OSError as error:
-        raise InputError(_lock_sentence(out, error)) from error
+        raise InputError(_lock_error(out, error)) from error
     with lock:
         _take_lock(out, lock)
         try:
@@ -179,7 +179,7 @@ def open_folder(
             remove_partial(out)
 
 
-def _lock_sentence(out: Path, error: OSError) -> str:
+def _lock_error(out: Path, error: OSError) -> str:
     if error.errno in (errno.ELOOP, errno.EMLINK, errno.EINVAL):
         return f"{error.filename}: {error.strerror}"
     return f"cannot write into {out}: {error.strerror}"
@@ -205,7 +205,7 @@ def open_finished(out: Path, content: Mapping[str, Any], *, write: bool) -> Iter
             with suppress(FileNotFoundError):  # no run has written this dataset here
                 lock = io.TextIOWrapper(open_regular(out / LOCK), errors="replace")
     except OSError as error:
-        raise InputError(_lock_sentence(out, error)) from error
+        raise InputError(_lock_error(out, error)) from error
     with lock or nullcontext():
         if lock is not None:
             _take_lock(out, lock)
@@ -224,7 +224,7 @@ def _take_lock(out: Path, lock: IO[str]) -> None:
         fcntl.flock(lock, (fcntl.LOCK_EX if lock.writable() else fcntl.LOCK_SH) | fcntl.LOCK_NB)
     except BlockingIOError:
         lock.seek(0)
-        raise InputError(f"{out} is being written by another run ({lock.read(_LOCK_TEXT)})") from None
+        raise InputError(f"{out} is being written by another run ({lock.read(_MAX_LOCK_TEXT)})") from None
 
 
 def append_run(out: Path, workers: int | None, device: str, gpus: Sequence[str] = ()) -> None:
@@ -239,7 +239,7 @@ def finish_folder(
     manifest: Manifest,
     content: dict[str, Any],
     catalogue: Catalogue,
-    hear: Callable[[Record], object],
+    visit: Callable[[Record], object],
 ) -> None:
     """Sort the manifest, and write the contact sheet and the collection files in one pass over all records.
 
@@ -248,7 +248,7 @@ def finish_folder(
         manifest: Records of its frames.
         content: Content of ``dataset.json``.
         catalogue: Classes, keypoints and assets that the labels refer to.
-        hear: Callback that is called with every record.
+        visit: Callback that is called with every record.
 
     Raises:
         PartialResultError: If a file was removed in the meantime.
@@ -262,7 +262,7 @@ def finish_folder(
         check(missing_file(out, record))
         collection.add(record)
         sheet.add(record)
-        hear(record)
+        visit(record)
 
     check(None if (out / CONTENT).is_file() else out / CONTENT)
     sheet = ContactSheet(out, len(manifest))
@@ -278,7 +278,7 @@ def missing_file(out: Path, record: Record) -> Path | None:
     return None if missing is None else out / missing
 
 
-def _check_own(out: Path) -> None:
+def _check_is_dataset(out: Path) -> None:
     """Refuse a folder that holds anything else than a mitsplat dataset.
 
     Other files must not be mixed with a dataset or removed.
@@ -286,12 +286,12 @@ def _check_own(out: Path) -> None:
     present: Any = None
     try:
         present = read_json(out / CONTENT)
-        own = isinstance(present, dict) and "mitsplat" in present
+        is_dataset = isinstance(present, dict) and "mitsplat" in present
     except (FileNotFoundError, NotADirectoryError):
-        own = not out.is_dir() or all(is_unfinished(entry.name) for entry in out.iterdir())
+        is_dataset = not out.is_dir() or all(is_unfinished(entry.name) for entry in out.iterdir())
     except (OSError, ValueError) as error:
         raise InputError(f"{out / CONTENT} cannot be read ({error})") from error
-    if not own:
+    if not is_dataset:
         raise InputError(f"{out} must be empty or a dataset of mitsplat (it holds other files)")
     check_format_version(present, FORMAT_VERSIONS[CONTENT], out / CONTENT)
 

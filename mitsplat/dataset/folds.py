@@ -59,7 +59,7 @@ def write_folds(root: str | Path, folds: int) -> list[Fold]:
     formats = content["scene"]["output"]["formats"]
     classes, keypoints = content["classes"], content["keypoints"]
     tasks = [task for task in TASKS if task in formats]
-    with open_finished(root, content, write=True) as records, storage_errors(root), ExitStack() as undone:
+    with open_finished(root, content, write=True) as records, storage_errors(root), ExitStack() as cleanup:
         layouts: defaultdict[int, Counter[str]] = defaultdict(Counter)
         images = Counter[int]()
         for record in records:
@@ -84,7 +84,7 @@ def write_folds(root: str | Path, folds: int) -> list[Fold]:
         files: list[GrowingFile | ListsFile] = [file for found in lists.values() for file in found]
         files += [writer.file for writer in described.values()]
         for file in files:
-            undone.callback(file.discard)
+            cleanup.callback(file.discard)
         for record in records:
             for fold, name in enumerate(names) if record["split"] != "test" else ():
                 key = name, "val" if fold_of[record["layout"]] == fold else "train"
@@ -120,22 +120,22 @@ def assign_folds(layouts: Mapping[int, Counter[str]], folds: int) -> dict[int, i
         layouts: Number of instances by class, for each layout.
         folds: Number of folds.
     """
-    room = [len(layouts) // folds + (fold < len(layouts) % folds) for fold in range(folds)]
+    free = [len(layouts) // folds + (fold < len(layouts) % folds) for fold in range(folds)]
     total = sum(layouts.values(), Counter[str]())
-    lacking = [dict.fromkeys(total, 1.0) for _ in range(folds)]  # as fractions of the target of the fold
+    deficits = [dict.fromkeys(total, 1.0) for _ in range(folds)]  # as fractions of the target of the fold
     rarity = {layout: min((total[name], name) for name in found) for layout, found in layouts.items() if found}
     most = (total.total() + 1, "")
     fold_of: dict[int, int] = {}
     for layout in sorted(layouts, key=lambda layout: (rarity.get(layout, most), -layouts[layout].total(), layout)):
         shares = {name: folds * count / total[name] for name, count in layouts[layout].items()}
         gains = [
-            sum(share * lacking[fold][name] for name, share in shares.items())
-            + room[fold] * (folds / len(layouts)) ** 2
+            sum(share * deficits[fold][name] for name, share in shares.items())
+            + free[fold] * (folds / len(layouts)) ** 2
             for fold in range(folds)
         ]
-        chosen = max((fold for fold in range(folds) if room[fold]), key=lambda fold: (gains[fold], -fold))
-        fold_of[layout] = chosen
-        room[chosen] -= 1
+        best = max((fold for fold in range(folds) if free[fold]), key=lambda fold: (gains[fold], -fold))
+        fold_of[layout] = best
+        free[best] -= 1
         for name, share in shares.items():
-            lacking[chosen][name] -= share
+            deficits[best][name] -= share
     return fold_of

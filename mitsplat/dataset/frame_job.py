@@ -51,7 +51,7 @@ class FrameMaker:
     out: Path
     render: Render
     settle: Settle
-    _kept: Layout | None = None
+    _cached_layout: Layout | None = None
 
     def __call__(self, index: int, note: Note, /) -> tuple[Record, dict[str, float]]:
         """Make frame ``index``, and return its record and the seconds of its stages."""
@@ -70,7 +70,7 @@ class FrameMaker:
         stages = {**frame.seconds, "write": time.perf_counter() - rendered}
         return record, {stage: round(seconds, 4) for stage, seconds in stages.items()}
 
-    def settled(self, index: int, note: Note) -> str:
+    def settle_to_json(self, index: int, note: Note) -> str:
         """Settle a layout and return it as JSON."""
         note(f"settling layout {index}")
         try:
@@ -84,17 +84,17 @@ class FrameMaker:
 
         If the file is missing, one process settles the layout, and other processes that need it wait.
         """
-        if self._kept is not None and self._kept.index == index:
-            return self._kept
+        if self._cached_layout is not None and self._cached_layout.index == index:
+            return self._cached_layout
         path = self.out / f"layouts/{index:04d}.json"
         with storage_errors(self.out), open_in_place(path.parent / LOCK, "ab") as lock:
             fcntl.lockf(lock, fcntl.LOCK_EX, 1, index)  # one byte per layout; released with the file or the process
             if not path.exists():
-                write_text(path, self.settled(index, note))
+                write_text(path, self.settle_to_json(index, note))
             with layout_errors(path), open_regular(path) as file:
-                return self.keep(file.read())
+                return self.load_layout(file.read())
 
-    def keep(self, text: str | bytes) -> Layout:
+    def load_layout(self, text: str | bytes) -> Layout:
         """Parse a layout from JSON and cache it; return the cached object if the index is the same.
 
         A layout is always parsed from its file, so a resumed run uses exactly the same numbers. All views get the same
@@ -102,9 +102,9 @@ class FrameMaker:
         because the renderer detects an unchanged layout by object identity.
         """
         stored = parse_json(text.encode() if isinstance(text, str) else text)
-        if self._kept is None or self._kept.index != stored["index"]:
-            self._kept = Layout.from_json(stored)
-        return self._kept
+        if self._cached_layout is None or self._cached_layout.index != stored["index"]:
+            self._cached_layout = Layout.from_json(stored)
+        return self._cached_layout
 
 
 @contextmanager
@@ -173,14 +173,14 @@ class RemoteFrames:
 
     def settle(self, layout: int) -> str:
         """Settle a layout and return it as JSON."""
-        return self.maker.settled(layout, lambda text: None)
+        return self.maker.settle_to_json(layout, lambda text: None)
 
     def make(self, index: int, layout: str) -> Parcel:
         """Make frame ``index`` of a layout."""
         self._unpack_images()
         with tempfile.TemporaryDirectory(prefix="mitsplat-") as folder:
             self.maker.out = Path(folder)
-            record, seconds = self.maker.write(index, self.maker.keep(layout))
+            record, seconds = self.maker.write(index, self.maker.load_layout(layout))
             contents = {digest: (Path(folder) / file).read_bytes() for file, digest in record["files"].items()}
         return Parcel(record, seconds, contents, layout)
 

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from mitsplat.asset import Asset
     from mitsplat.scene.scene import Scene
 
-_NO_CONTENT = frozenset({"folder"})
+_LOCATION_FIELDS = frozenset({"folder"})
 """Fields of an asset that describe its location instead of its content."""
 
 
@@ -63,7 +63,7 @@ class _Describer:
 
     def asset(self, asset: Asset) -> dict[str, Any]:
         """Describe every field of an asset, so that fields added later are included."""
-        return {f.name: self.value(getattr(asset, f.name)) for f in fields(asset) if f.name not in _NO_CONTENT}
+        return {f.name: self.value(getattr(asset, f.name)) for f in fields(asset) if f.name not in _LOCATION_FIELDS}
 
     def value(self, value: Any) -> Any:
         """Convert a field to JSON."""

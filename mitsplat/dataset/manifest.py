@@ -120,21 +120,21 @@ class Manifest:
         self._in_order &= record["index"] > self._last
         self._last = max(self._last, record["index"])
 
-    def sort(self, hear: Callable[[Record], object] = lambda record: None) -> None:
-        """Sort the file to one line per frame by ascending index, and call ``hear`` with every record in that order.
+    def sort(self, visit: Callable[[Record], object] = lambda record: None) -> None:
+        """Sort the file to one line per frame by ascending index, and call ``visit`` with every record in that order.
 
-        A file that is sorted already is not rewritten. Otherwise it is replaced after the last call of ``hear``.
+        A file that is sorted already is not rewritten. Otherwise it is replaced after the last call of ``visit``.
         """
         if self._in_order:
             for record in self:
-                hear(record)
+                visit(record)
             return
 
         def write(temporary: Path) -> None:
             place = 0
             with temporary.open("wb") as new:
                 for index, line in self._lines():
-                    hear(parse_line(line))
+                    visit(parse_line(line))
                     new.write(line)
                     places[index] = place
                     place += len(line)
@@ -266,6 +266,6 @@ def cut_torn_line(path: Path) -> None:
             file.seek(start)
             tail = file.read(end - start)
             end = start
-        whole = end + tail.rfind(b"\n") + 1
-        if whole < size:
-            file.truncate(whole)
+        complete = end + tail.rfind(b"\n") + 1
+        if complete < size:
+            file.truncate(complete)

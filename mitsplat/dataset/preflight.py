@@ -32,25 +32,25 @@ from mitsplat.scene.spec.object_spec import Arrangement
 from mitsplat.scene.spec.shape_spec import Region
 from mitsplat.scene.walls import ENCLOSURE, PILE_HEIGHT, backdrop_walls, enclosed_bounds, stated_pose, walls_beside
 
-MOST_OBJECTS = 65535
+MAX_OBJECTS = 65535
 """Maximum number of objects of a layout; instance ids have 16 bits."""
-MOST_FRAMES = 2**31 - 1
-MOST_STEPS = 1_000_000
+MAX_FRAMES = 2**31 - 1
+MAX_STEPS = 1_000_000
 """Maximum number of simulation steps of a layout; 250 to 1000 steps of 30 objects take one second."""
 VIEWS = 48
 """Maximum number of views that are tested, spread evenly over the run."""
-NARROWEST = 0.01
+MIN_VIEW_WIDTH = 0.01
 """Minimum width of the field of view at the largest depth, as a fraction of the extent of the smallest object."""
-PIXEL_BYTES, PROCESS_GIB = 500, 0.5
+MIN_PIXEL_BYTES, MIN_PROCESS_GIB = 500, 0.5
 """Minimum peak memory per pixel of a frame [bytes], and of a process in addition [GiB].
 
 Measured with the workcell scene: 1.0 GiB at 640x360, 2.6 GiB at 2000x2000, 8.4 GiB at 4000x4000.
 """
 SLOW_OBJECTS = 40
 """Number of objects per layout above which settling takes minutes on two cores; 25 took 27 s, 50 took 212 s."""
-FRAME_BYTES = 8192
+MIN_FRAME_BYTES = 8192
 """Minimum disk space of a frame [bytes]: one block for the image, one for the label."""
-_CELLS = 24  # per axis of a region, in the search for free volume
+_MAX_CELLS = 24  # per axis of a region, in the search for free volume
 
 
 def refuse(scene: Scene, faults: Iterable[Finding]) -> None:
@@ -86,7 +86,7 @@ def run_faults(
     yield from layout_faults(scene)
     if not elsewhere:
         yield from image_faults(scene, workers)
-    frames = range(min(scene.num_frames, MOST_FRAMES)) if frames is None else frames
+    frames = range(min(scene.num_frames, MAX_FRAMES)) if frames is None else frames
     yield from label_faults(scene, frames)
     yield from disk_faults(len(frames), out)
 
@@ -94,22 +94,22 @@ def run_faults(
 def count_faults(scene: Scene) -> Iterator[Finding]:
     """Check that the numbers of objects and images do not exceed the range of their ids."""
     most = sum(entry.most for entry in scene.spec.objects)
-    if most > MOST_OBJECTS:
-        text = f"objects: a layout must have at most {MOST_OBJECTS} objects, as many as there are ids (got {most})"
+    if most > MAX_OBJECTS:
+        text = f"objects: a layout must have at most {MAX_OBJECTS} objects, as many as there are ids (got {most})"
         yield Finding("count", False, text, "lower objects[].count")
-    if scene.num_frames > MOST_FRAMES:
-        text = f"output: layouts x views must be at most {MOST_FRAMES} images (got {scene.num_frames})"
+    if scene.num_frames > MAX_FRAMES:
+        text = f"output: layouts x views must be at most {MAX_FRAMES} images (got {scene.num_frames})"
         yield Finding("frames", False, text, "lower output.layouts or output.views")
 
 
 def layout_faults(scene: Scene) -> Iterator[Finding]:
     """Find reasons why no layout can come to rest."""
     settle = scene.spec.settle
-    if settle.max_time / settle.timestep > MOST_STEPS:
+    if settle.max_time / settle.timestep > MAX_STEPS:
         yield Finding(
             "time",
             False,
-            f"settle: max_time / timestep must be at most {MOST_STEPS} steps "
+            f"settle: max_time / timestep must be at most {MAX_STEPS} steps "
             f"(got {settle.max_time:g} s / {settle.timestep:g} s)",
             "lower settle.max_time",
         )
@@ -154,7 +154,7 @@ def _room_faults(
     pools = [[mesh for asset in scene.pools[i] if (mesh := scene.assets[asset].mesh) is not None] for i in dropped]
     meshes = [mesh for pool in pools for mesh in pool]
     finest = min(float(mesh.extents.min()) for mesh in meshes) / 2
-    cells = np.clip(np.ceil((high - low) / finest), 5, _CELLS).astype(int)
+    cells = np.clip(np.ceil((high - low) / finest), 5, _MAX_CELLS).astype(int)
     axes = [start + (end - start) * (np.arange(n) + 0.5) / n for start, end, n in zip(low, high, cells, strict=True)]
     points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     taken = np.zeros(len(points), dtype=bool)
@@ -185,7 +185,7 @@ def _room_faults(
 def image_faults(scene: Scene, workers: int | None = None) -> Iterator[Finding]:
     """Check that this machine has enough memory for one image, and for one image per worker."""
     output, free = scene.spec.output, unused_memory()
-    need = PROCESS_GIB + output.width * output.height * PIXEL_BYTES / 2**30
+    need = MIN_PROCESS_GIB + output.width * output.height * MIN_PIXEL_BYTES / 2**30
     size = f"an image of {output.width}x{output.height} px"
     if need > free:
         text = f"output: {size} takes at least {need:.1f} GiB of memory ({free:.1f} GiB are unused)"
@@ -201,16 +201,18 @@ def disk_faults(frames: int, out: Path | None) -> Iterator[Finding]:
     while not place.is_dir():
         place = place.parent
     free = shutil.disk_usage(place).free
-    if frames * FRAME_BYTES > free and out is not None and (out / MANIFEST).is_file():
+    if frames * MIN_FRAME_BYTES > free and out is not None and (out / MANIFEST).is_file():
         with (out / MANIFEST).open("rb") as lines:
             frames -= sum(1 for _ in lines)
-    need = frames * FRAME_BYTES
+    need = frames * MIN_FRAME_BYTES
     if need > free:
-        text = f"output: {frames} images take at least {_amount(need)} ({_amount(free)} are free at {place})"
+        text = (
+            f"output: {frames} images take at least {_format_bytes(need)} ({_format_bytes(free)} are free at {place})"
+        )
         yield Finding("disk", False, text, "lower output.layouts or views, give --frames, or write to another disk")
 
 
-def _amount(size: int) -> str:
+def _format_bytes(size: int) -> str:
     """Format a number of bytes as MiB or GiB."""
     return f"{size / 2**30:.1f} GiB" if size >= 2**30 else f"{size / 2**20:.3g} MiB"
 
@@ -236,35 +238,35 @@ def label_faults(scene: Scene, frames: Sequence[int]) -> Iterator[Finding]:
         text = f"camera: every view is from inside of shape {hidden[0]!r}, which hides all objects"
         yield Finding("sight", False, text, "move camera out of it")
         return
-    low, high = _reach(scene)
+    low, high = _reachable_box(scene)
     if not any(sees(camera, low, high) for camera in cameras):
-        yield _blind(cameras, low, high)
+        yield _no_view_fault(cameras, low, high)
         return
-    depths = [_depths(camera, low, high) for camera in cameras]
+    depths = [_depth_range(camera, low, high) for camera in cameras]
     across = [far * c.width / c.fx for c, (_, far) in zip(cameras, depths, strict=True)]
     smallest = min(float(mesh.extents.max()) for mesh in meshes)
-    if max(across) < NARROWEST * smallest:
+    if max(across) < MIN_VIEW_WIDTH * smallest:
         text = (
             f"camera.intrinsics: an image shows at most {max(across):.2g} m (the smallest object has {smallest:.2g} m)"
         )
         yield Finding("lens", False, text, "fx and fy are focal lengths in pixels")
     largest = max(float(np.linalg.norm(mesh.extents)) for mesh in meshes)
-    shown = max(_most_pixels(c, largest, near) for c, (near, _) in zip(cameras, depths, strict=True))
+    shown = max(_max_pixels(c, largest, near) for c, (near, _) in zip(cameras, depths, strict=True))
     if shown < least:
         text = f"camera: no object covers more than {shown:.2g} px in any view (labels.min_pixels is {least})"
         yield Finding("labels", False, text, "move camera nearer, or make fx or the image larger")
 
 
-def doubts(scene: Scene) -> Iterator[Finding]:
+def scene_warnings(scene: Scene) -> Iterator[Finding]:
     """Find probable mistakes that do not stop a run.
 
     Examples are views or lights inside of solids, bins that are too small, and high cost in memory or time.
     """
     spec = scene.spec
-    plans = _plans(scene, range(min(scene.num_frames, MOST_FRAMES)))
+    plans = _plans(scene, range(min(scene.num_frames, MAX_FRAMES)))
     cameras = [plan.camera for plan in plans]
     inside = [name for camera in cameras if (name := solid_around(scene, camera.centre))]
-    low, high = _reach(scene)
+    low, high = _reachable_box(scene)
     blind = sum(not sees(camera, low, high) for camera in cameras)
     yield Finding(
         "views",
@@ -272,15 +274,15 @@ def doubts(scene: Scene) -> Iterator[Finding]:
         f"of {len(cameras)} views {len(inside)} are from inside of a shape, {blind} see no place where objects can be",
         "move camera, its keys or its ranges: such images have no labels",
     )
-    yield from _cost_doubts(scene)
-    yield from _backdrop_doubts(scene, plans)
+    yield from _cost_warnings(scene)
+    yield from _backdrop_warnings(scene, plans)
     for number, light in enumerate(spec.lights):
-        if isinstance(light, LocalLight) and not light.moved and (name := _light_inside(scene, light)):
+        if isinstance(light, LocalLight) and not light.moved and (name := _shape_around_light(scene, light)):
             text = f"lights[{number}] is inside of shape {name!r}"
             yield Finding("lights", False, text, "move it out: it lights nothing")
     if any(isinstance(light, LocalLight) and light.moved for light in spec.lights):
         lights = {light for plan in plans for light in plan.lights if isinstance(light, LocalLight)}
-        names = [name for light in lights if (name := _light_inside(scene, light))]
+        names = [name for light in lights if (name := _shape_around_light(scene, light))]
         if names:
             text = f"{len(names)} of {len(lights)} lights that were drawn are inside of a shape, such as {names[0]!r}"
             yield Finding("lights", False, text, "narrow lights[].draw: they light nothing")
@@ -294,7 +296,7 @@ def doubts(scene: Scene) -> Iterator[Finding]:
                 yield Finding("bin", False, text, "make the bin larger, or the object smaller by scale")
 
 
-def _cost_doubts(scene: Scene) -> Iterator[Finding]:
+def _cost_warnings(scene: Scene) -> Iterator[Finding]:
     """Warn of frames that may exceed the memory, and of layouts that take minutes to settle."""
     output, free = scene.spec.output, unused_memory()
     need = worker_memory(scene).own / 2**30
@@ -308,7 +310,7 @@ def _cost_doubts(scene: Scene) -> Iterator[Finding]:
         yield Finding("settling", False, text, "lower objects[].count, or add views to each layout by output.views")
 
 
-def _backdrop_doubts(scene: Scene, plans: Sequence[FramePlan]) -> Iterator[Finding]:
+def _backdrop_warnings(scene: Scene, plans: Sequence[FramePlan]) -> Iterator[Finding]:
     """Warn of views and lights behind a wall of the backdrop."""
     walls = backdrop_walls(scene.spec)
     middle = (np.array(scene.spec.region.min) + scene.spec.region.max) / 2
@@ -353,11 +355,11 @@ def sees(camera: Camera, low: Float64Array, high: Float64Array) -> bool:
     return bool((np.maximum(first, camera.near) < last).any())
 
 
-def _blind(cameras: Sequence[Camera], low: Float64Array, high: Float64Array) -> Finding:
+def _no_view_fault(cameras: Sequence[Camera], low: Float64Array, high: Float64Array) -> Finding:
     """Return the reason why no camera sees a box."""
     touching = [replace(camera, near=1e-9) for camera in cameras]
     if any(sees(camera, low, high) for camera in touching):
-        far = max(_depths(camera, low, high)[1] for camera in touching)
+        far = max(_depth_range(camera, low, high)[1] for camera in touching)
         text = (
             f"camera.intrinsics.near: must be nearer than what objects can reach, {far:.3g} m (got {cameras[0].near:g})"
         )
@@ -373,11 +375,11 @@ def _cameras(scene: Scene, frames: Sequence[int]) -> list[Camera]:
 
 def _plans(scene: Scene, frames: Sequence[int]) -> list[FramePlan]:
     """Plan up to :data:`VIEWS` of the frames, evenly spread."""
-    chosen = {round(share * (len(frames) - 1)) for share in np.linspace(0, 1, min(len(frames), VIEWS))}
-    return [plan_frame(scene, frames[position]) for position in sorted(chosen)]
+    positions = {round(share * (len(frames) - 1)) for share in np.linspace(0, 1, min(len(frames), VIEWS))}
+    return [plan_frame(scene, frames[position]) for position in sorted(positions)]
 
 
-def _light_inside(scene: Scene, light: LocalLight) -> str:
+def _shape_around_light(scene: Scene, light: LocalLight) -> str:
     """Return the name of a visible shape that contains a light but not the region, or an empty string."""
     return solid_around(scene, np.array(light.position))
 
@@ -390,7 +392,7 @@ def _colliders(scene: Scene) -> Iterator[tuple[str, trimesh.Trimesh]]:
         yield from ((around.name, around.mesh) for around in scene.environments if around.mesh is not None)
 
 
-def _reach(scene: Scene) -> tuple[Float64Array, Float64Array]:
+def _reachable_box(scene: Scene) -> tuple[Float64Array, Float64Array]:
     """Return the corners of a box [m] that contains every point that objects can reach.
 
     An object that leaves the box causes its layout to be drawn again.
@@ -419,14 +421,14 @@ def _reach(scene: Scene) -> tuple[Float64Array, Float64Array]:
     return low - beyond, high + beyond
 
 
-def _depths(camera: Camera, low: Float64Array, high: Float64Array) -> tuple[float, float]:
+def _depth_range(camera: Camera, low: Float64Array, high: Float64Array) -> tuple[float, float]:
     """Return the smallest and largest depth of a box in a camera [m], limited by the near plane."""
     corners = np.stack(np.meshgrid(*zip(low, high, strict=True), indexing="ij"), axis=-1).reshape(-1, 3)
     depth = (corners - camera.centre) @ camera.world_from_camera[:3, 2]
     return max(camera.near, float(depth.min())), max(camera.near, float(depth.max()))
 
 
-def _most_pixels(camera: Camera, size: float, depth: float) -> float:
+def _max_pixels(camera: Camera, size: float, depth: float) -> float:
     """Return an upper bound of the pixels that an object of a size [m] covers at a depth [m] or beyond.
 
     Perspective stretches the disc of a small sphere by 1 / cos^3 of its angle to the optical axis, which is largest in

@@ -86,14 +86,14 @@ def remake_frame(
     if out.exists() and not (out / FRAME).is_file() and (not out.is_dir() or any(out.iterdir())):
         raise InputError(f"{out} must be absent, empty, or hold a frame that was made again (it holds other files)")
     refuse_links(out)
-    chosen = current_device() if device is None else use_device(device)
+    used_device = current_device() if device is None else use_device(device)
     place = f"layouts/{layout:04d}.json"
     maker = FrameMaker(scene, catalogue, out, render, settle)
     with storage_errors(out):
-        text = maker.settled(layout, lambda said: None)
+        text = maker.settle_to_json(layout, lambda text: None)
         _remove_frame(out)
         write_text(out / place, text)
-        record, _ = maker.write(index, maker.keep(text))
+        record, _ = maker.write(index, maker.load_layout(text))
         write_text(out / FRAME, json.dumps(record, indent=1) + "\n")
     known = None if dataset is None else _frame_of(Path(dataset), index)
     if dataset is None or known is None:
@@ -105,7 +105,7 @@ def remake_frame(
     if (Path(dataset) / place).is_file() and (Path(dataset) / place).read_bytes() != text.encode():
         differing.append(place)
     present = {**IMPLIED, **read_json(Path(dataset) / CONTENT)}
-    found = first_difference(present, content_of(scene, catalogue, chosen.kind))
+    found = first_difference(present, content_of(scene, catalogue, used_device.kind))
     cause = "" if found is None else "{} was {} and is {}".format(*found)
     return RemadeFrame(out, record, len(before), tuple(differing), cause)
 

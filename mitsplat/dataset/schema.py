@@ -322,11 +322,11 @@ class Records:
                     check_record(line, record, self._content)
                     _check_masks(record)
                 except ValueError as error:
-                    self._blame(number, str(error))
+                    self._add_violation(number, str(error))
                 else:
                     yield record
 
-    def _blame(self, number: int, text: str) -> None:
+    def _add_violation(self, number: int, text: str) -> None:
         self.violations.append(("manifest.jsonl", f"line {number + 1} is not the record of a frame ({text})"))
 
 

@@ -107,15 +107,15 @@ def _check_complete(folders: Sequence[Path]) -> int | None:
 
     The number is None if all folders are whole datasets.
     """
-    said = {folder: read_shard(folder) for folder in folders}
-    parts = {folder: part for folder, part in said.items() if part is not None}
+    stored = {folder: read_shard(folder) for folder in folders}
+    parts = {folder: part for folder, part in stored.items() if part is not None}
     if not parts:
         return None
     sizes = {(part["of"], part["frames"]) for part in parts.values()}
-    if len(parts) < len(said) or len(sizes) > 1:
+    if len(parts) < len(stored) or len(sizes) > 1:
         raise InputError(
             "shards must be of one division of one dataset (got "
-            + ", ".join(f"{folder}: {'whole' if part is None else _named(part)}" for folder, part in said.items())
+            + ", ".join(f"{folder}: {'whole' if part is None else _named(part)}" for folder, part in stored.items())
             + ")"
         )
     count, frames = next(iter(sizes))
@@ -152,9 +152,9 @@ def _check_frames(manifests: Mapping[Path, Manifest], stated: int | None) -> int
     return sum(map(len, manifests.values()))
 
 
-def _join_lines(files: Sequence[Path], whole: Path) -> None:
+def _join_lines(files: Sequence[Path], target: Path) -> None:
     """Concatenate the lines of several files; a file may be missing or end in an incomplete line."""
-    with whole.open("wb") as out:
+    with target.open("wb") as out:
         for file in files:
             with suppress(FileNotFoundError), open_regular(file) as lines:
                 out.writelines(line for line in read_lines(lines) if line.endswith(b"\n"))

@@ -142,42 +142,42 @@ def write_dataset(
         raise InputError(f"output.formats must be among {', '.join(FORMATS)} (got {min(unknown)})")
     check_workers(workers)
     catalogue = Catalogue.of(scene)
-    wanted = range(count) if shard is None else shard.frames(count, scene.spec.output.views)
+    indices = range(count) if shard is None else shard.frames(count, scene.spec.output.views)
     if render is None and settle is None:
-        refuse(scene, run_faults(scene, wanted, out=out, workers=workers, elsewhere=cluster is not None))
+        refuse(scene, run_faults(scene, indices, out=out, workers=workers, elsewhere=cluster is not None))
     if cluster is not None:
-        chosen, cluster = cluster.on_device(device)
+        used_device, cluster = cluster.on_device(device)
         load_ray()
     else:
-        chosen = current_device() if device is None else find_device(device)
-    content = content_of(scene, catalogue, chosen.kind)
+        used_device = current_device() if device is None else find_device(device)
+    content = content_of(scene, catalogue, used_device.kind)
     part = None if shard is None else shard.to_json(count)
     with open_folder(
         out, content, scene.path, part, resume=resume, overwrite=overwrite, any_device=any_device
     ) as manifest:
         layouts: dict[int, list[int]] = {}
-        for index in wanted:
+        for index in indices:
             if index not in manifest:
                 layouts.setdefault(layout_of(scene, index), []).append(index)
 
         def note(text: str) -> None:
             if progress is not None:
-                progress(len(manifest), max(len(wanted), len(manifest)), text)
+                progress(len(manifest), max(len(indices), len(manifest)), text)
 
         note("starting")
-        if chosen.reason:
-            note(f"device {chosen}: {chosen.reason}")
+        if used_device.reason:
+            note(f"device {used_device}: {used_device.reason}")
         if layouts:
             if remove_folds(out):
                 _logger.warning(
                     "%s: lists of folds lack the new images and are removed: run `mitsplat split` again", out
                 )
-            append_run(out, workers, chosen.kind, [gpu.name for gpu in chosen.gpus])
+            append_run(out, workers, used_device.kind, [gpu.name for gpu in used_device.gpus])
         shortfall = Shortfall(scene, -(-count // scene.spec.output.views))
-        for layout in sorted({layout_of(scene, index) for index in wanted}):
+        for layout in sorted({layout_of(scene, index) for index in indices}):
             shortfall.read(out / f"layouts/{layout:04d}.json")
         make = FrameMaker(scene, catalogue, out, render or render_frame, settle or settle_layout)
-        with closing(_results(make, layouts, workers, cluster, chosen, note)) as results:
+        with closing(_results(make, layouts, workers, cluster, used_device, note)) as results:
             for record, seconds in results:
                 append_line(out / TIMINGS, {"index": record["index"], **seconds})
                 manifest.append(record)
@@ -218,7 +218,7 @@ class Shortfall:
 
     def __init__(self, scene: Scene, layouts: int) -> None:
         self._scene, self._layouts = scene, layouts
-        self._lacking: dict[int, Sequence[tuple[str, str]]] = {}
+        self._incomplete: dict[int, Sequence[tuple[str, str]]] = {}
 
     def read(self, path: Path) -> None:
         """Count a layout that an earlier run settled, if its file exists."""
@@ -235,14 +235,14 @@ class Shortfall:
         """
         if not left_out:
             return
-        self._lacking[layout] = left_out
+        self._incomplete[layout] = left_out
         share = self._scene.spec.settle.incomplete
-        if len(self._lacking) > share * self._layouts:
-            told = Counter(f"{name}: {reason}" for objects in self._lacking.values() for name, reason in objects)
-            often = "; ".join(f"{count} x {text}" for text, count in told.most_common(3))
+        if len(self._incomplete) > share * self._layouts:
+            counts = Counter(f"{name}: {reason}" for objects in self._incomplete.values() for name, reason in objects)
+            often = "; ".join(f"{count} x {text}" for text, count in counts.most_common(3))
             raise InputError(
                 f"{self._scene.path}: at most a share of settle.incomplete = {share:g} of the {self._layouts} layouts "
-                f"may lack objects that do not come to rest (got {len(self._lacking)}, among them {often}); "
+                f"may lack objects that do not come to rest (got {len(self._incomplete)}, among them {often}); "
                 "`mitsplat check` tries each object alone"
             )
 

@@ -32,7 +32,7 @@ from mitsplat.storage.files import GrowingFile, Record, write_file, write_text
 from mitsplat.storage.json_stream import EntriesFile
 
 MILLIMETRES = 1000.0
-_TOGETHER, _WAITING = 768, 32
+_BATCH_FILES, _SYNC_THREADS = 768, 32
 """Number of finished files per batch, and number of threads that flush a batch to disk."""
 
 
@@ -61,9 +61,8 @@ def mask_pictures(labels: Labels) -> Iterable[tuple[str, int, bytes]]:
 class ScenesWriter:
     """Writer of the annotations of all scenes and of the models; frames must be added by ascending layout.
 
-    The files of scenes are flushed to disk in parallel, in batches of :data:`_TOGETHER`. A million images have 300,000
-    such
-    files, and flushing them one by one would take longer than all other work.
+    The files of scenes are flushed to disk in parallel, in batches of :data:`_BATCH_FILES`. A million images have
+    300,000 such files, and flushing them one by one would take longer than all other work.
     """
 
     def __init__(self, root: Path, catalogue: Catalogue) -> None:
@@ -75,7 +74,7 @@ class ScenesWriter:
         }
         self._folder, self._layout = "", -1
         self._files: dict[str, EntriesFile] = {}
-        self._ended: list[GrowingFile] = []
+        self._completed: list[GrowingFile] = []
 
     def add(self, record: Record) -> None:
         """Add a frame."""
@@ -84,8 +83,8 @@ class ScenesWriter:
             if record["layout"] <= self._layout:
                 raise ValueError(f"frames must come by layout (got {record['layout']} after {self._layout})")
             self._end_scene()
-            if len(self._ended) >= _TOGETHER:
-                self._name_ended()
+            if len(self._completed) >= _BATCH_FILES:
+                self._finish_batch()
             self._folder, self._layout = folder, record["layout"]
             self._files = {
                 part: EntriesFile(self._root / folder / f"scene_{part}.json") for part in ("camera", "gt", "gt_info")
@@ -96,27 +95,27 @@ class ScenesWriter:
         self._files["gt_info"].append(index, info_entries(record))
 
     def _end_scene(self) -> None:
-        self._ended += (file.end() for file in self._files.values())
+        self._completed += (file.end() for file in self._files.values())
         self._files = {}
 
-    def _name_ended(self) -> None:
-        with ThreadPoolExecutor(_WAITING) as pool:
-            list(pool.map(GrowingFile.sync, self._ended))
-        for file in self._ended:
+    def _finish_batch(self) -> None:
+        with ThreadPoolExecutor(_SYNC_THREADS) as pool:
+            list(pool.map(GrowingFile.sync, self._completed))
+        for file in self._completed:
             file.name()
-        self._ended = []
+        self._completed = []
 
     def keep(self) -> None:
         """Give the files of the last scenes their final names, and write the models."""
         self._end_scene()
-        self._name_ended()
+        self._finish_batch()
         write_models(self._root, self._meshes)
 
     def discard(self) -> None:
         """Remove the files that do not have their final name yet."""
         for open_file in self._files.values():
             open_file.discard()
-        for file in self._ended:
+        for file in self._completed:
             file.discard()
 
 

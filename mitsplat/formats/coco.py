@@ -158,16 +158,16 @@ class PosesWriter:
         self.file.append("frames", pose_entry(record, self._assets))
 
 
-class _OfSplit(Protocol):
+class _SplitWriter(Protocol):
     file: ListsFile
 
     def add(self, record: Record) -> None: ...
 
 
-class _OfSplits:
+class _SplitWriters:
     """Writers of one annotation file for each split."""
 
-    def __init__(self, root: Path, name: str, catalogue: Catalogue, make: Callable[[Path], _OfSplit]) -> None:
+    def __init__(self, root: Path, name: str, catalogue: Catalogue, make: Callable[[Path], _SplitWriter]) -> None:
         self._writers = {split: make(root / f"annotations/{name}_{split}.json") for split in catalogue.splits}
 
     def add(self, record: Record) -> None:
@@ -185,19 +185,21 @@ class _OfSplits:
 def describe_instances(root: Path, catalogue: Catalogue, *, amodal: bool = False) -> Describer:
     """Create the writer of ``instances_<split>.json`` or ``amodal_<split>.json``."""
     names = catalogue.class_names, catalogue.keypoint_names
-    return _OfSplits(
+    return _SplitWriters(
         root, "amodal" if amodal else "instances", catalogue, lambda path: InstancesWriter(path, *names, amodal=amodal)
     )
 
 
 def describe_panoptic(root: Path, catalogue: Catalogue) -> Describer:
     """Create the writer of ``panoptic_<split>.json``."""
-    return _OfSplits(root, "panoptic", catalogue, lambda path: PanopticWriter(path, catalogue.class_names))
+    return _SplitWriters(root, "panoptic", catalogue, lambda path: PanopticWriter(path, catalogue.class_names))
 
 
 def describe_poses(root: Path, catalogue: Catalogue) -> Describer:
     """Create the writer of ``poses_<split>.json``."""
-    return _OfSplits(root, "poses", catalogue, lambda path: PosesWriter(path, catalogue.class_names, catalogue.assets))
+    return _SplitWriters(
+        root, "poses", catalogue, lambda path: PosesWriter(path, catalogue.class_names, catalogue.assets)
+    )
 
 
 def write_panoptic(files: FrameFiles) -> None:

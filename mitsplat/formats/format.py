@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from mitsplat.scene.spec.image_spec import DepthSensor
 
 
-_ONE_POSE = frozenset(("bop", "colmap", "flow"))
+_SINGLE_POSE_FORMATS = frozenset(("bop", "colmap", "flow"))
 """Formats that describe an image by a single camera pose."""
 
 
@@ -86,7 +86,11 @@ class Catalogue:
                     f"{scene.path}: output.formats: bop must have a camera without lens distortion "
                     f"(got {list(camera.intrinsics.distortion)})"
                 )
-            if camera.motion is not None and camera.motion.readout[1] and (one := _ONE_POSE.intersection(formats)):
+            if (
+                camera.motion is not None
+                and camera.motion.readout[1]
+                and (one := _SINGLE_POSE_FORMATS.intersection(formats))
+            ):
                 raise InputError(
                     f"{scene.path}: output.formats: {min(one)} must have a camera whose rows are exposed at once, with "
                     f"one pose (got camera.motion.readout {list(camera.motion.readout)})"
@@ -101,7 +105,7 @@ class Catalogue:
             assets,
             meshes,
             distractors,
-            _drawn(scene),
+            _drawn_objects(scene),
             splits,
             scene.spec.depth_sensor,
         )
@@ -112,14 +116,14 @@ class Catalogue:
         return max(map(len, self.keypoint_names), default=0)
 
 
-def _drawn(scene: Scene) -> list[dict[str, Any]]:
+def _drawn_objects(scene: Scene) -> list[dict[str, Any]]:
     """Return the manifest entry of each asset's instances, or an empty list.
 
     Entries are needed only if the scene file does not determine which objects are in a layout.
     """
     spec = scene.spec
-    told = any(entry.pool is not None or len(entry.scales) > 1 or not entry.label for entry in spec.objects)
-    if not told and not spec.regions:
+    draws_objects = any(entry.pool is not None or len(entry.scales) > 1 or not entry.label for entry in spec.objects)
+    if not draws_objects and not spec.regions:
         return []
     found: list[dict[str, Any]] = []
     for position, entry in enumerate(scene.spec.objects):

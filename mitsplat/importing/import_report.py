@@ -22,7 +22,7 @@ from mitsplat.reconstruct.asset_evaluation import show_asset
 from mitsplat.storage.files import is_inside, write_text
 
 _VIEW = 420
-_REMOVED_SHOWN = 4
+_REMOVED_VIEWS = 4
 """Number of views that show the removed Gaussians."""
 
 
@@ -77,13 +77,13 @@ def _views(imported: Imported) -> str:
 
 def _removed(imported: Imported) -> str:
     """Show the removed Gaussians in red beside the remaining ones."""
-    rubbish = imported.rubbish
-    if not len(rubbish) or not imported.views:
+    removed_splats = imported.removed_splats
+    if not len(removed_splats) or not imported.views:
         return ""
-    red = np.zeros((len(rubbish), 1, 3), dtype=np.float32)
+    red = np.zeros((len(removed_splats), 1, 3), dtype=np.float32)
     red[:, 0] = np.array([0.4, -0.4, -0.4]) / SH_C0
-    everything = Splats.concatenate([imported.asset.splats, replace(rubbish, sh=red)])
-    cameras = [view.camera for view in imported.views[:_REMOVED_SHOWN]]
+    everything = Splats.concatenate([imported.asset.splats, replace(removed_splats, sh=red)])
+    cameras = [view.camera for view in imported.views[:_REMOVED_VIEWS]]
     images = "".join(
         _figure(f"view {number}, removed in red", f"view {number}", view.picture)
         for number, view in enumerate(show_asset(everything, None, cameras), 1)
@@ -157,11 +157,11 @@ def write_scene(path: Path, asset_folder: Path, imported: Imported) -> None:
 
 def _quoted(text: str) -> str:
     """Return a text for a scene file: in quotes, unless it is a plain word or path."""
-    plain = re.fullmatch(r"[A-Za-z_./][\w./-]*", text, re.ASCII) and text.lower() not in _WORDS
+    plain = re.fullmatch(r"[A-Za-z_./][\w./-]*", text, re.ASCII) and text.lower() not in _YAML_WORDS
     return text if plain else json.dumps(text, ensure_ascii=False)
 
 
-_WORDS = frozenset({"true", "false", "yes", "no", "on", "off", "y", "n", "null", "~"})
+_YAML_WORDS = frozenset({"true", "false", "yes", "no", "on", "off", "y", "n", "null", "~"})
 """Words that YAML does not read as text."""
 
 

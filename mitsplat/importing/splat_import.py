@@ -32,24 +32,24 @@ from mitsplat.reconstruct.surface import SurfaceSettings, reconstruct_surface
 from mitsplat.renderer.layers import render_splats
 from mitsplat.runtime.variant import one_at_a_time
 
-FAINT = 1 / 255
+MIN_OPACITY = 1 / 255
 """Opacity below which a Gaussian is invisible in every picture."""
-HUGE = 0.2
+MAX_SCALE = 0.2
 """Standard deviation above which a Gaussian of an object counts as haze, as a fraction of the longest extent."""
-_BULK = 0.005
+_OUTLIERS = 0.005
 """Fraction of the Gaussians at either end of an axis that is ignored for the size of an object."""
 _FOV, _DISTANCE = 29.0, 4.5
 """Field of view [degrees] of the views of an object, and their distance in radii of the object."""
-_HELD_OUT = 6
+_TEST_VIEWS = 6
 _CONCAVITY = 0.04
 """Concavity threshold of convex pieces; the surface of splats is too rough for a smaller one."""
-_LEAF = 0.1
+_SMALL_PART = 0.1
 """Volume of a part, relative to the largest part, below which its convex hull is one piece: leaves, lids, screws."""
-_TILT = 4.0
+_MAX_TILT = 4.0
 """Tilt that an object must withstand without falling over [degrees]."""
-_CONTACT = 0.01
+_CONTACT_HEIGHT = 0.01
 """Maximum height of vertices that touch the table, as a fraction of the longest extent."""
-_BASE = 0.06
+_MAX_BASE_CUT = 0.06
 """Maximum height that is cut off an object for a flat base, as a fraction of its height."""
 _STAGES = 6
 
@@ -117,7 +117,7 @@ class Imported:
         upright: Estimated up direction, in the file's axes, and its reason.
         found: Number of Gaussians in the file.
         removed: Number of removed Gaussians, by reason.
-        rubbish: Removed Gaussians, in the asset's frame.
+        removed_splats: Removed Gaussians, in the asset's frame.
         support: Surface of an environment for dropping objects, or None.
         views: Pictures of asset and mesh from views that were not used for the reconstruction.
         mesh_iou: Mean IoU of the silhouettes of mesh and splats in these views, for an object.
@@ -130,7 +130,7 @@ class Imported:
     upright: Upright
     found: int
     removed: dict[str, int]
-    rubbish: Splats
+    removed_splats: Splats
     support: ImportSupport | None
     views: Sequence[AssetView]
     mesh_iou: float | None
@@ -214,11 +214,11 @@ def import_splats(
         raise InputError(f"friction must be a number of at least 0 (got {friction:g})")
     stages = iter(range(_STAGES))
 
-    def tell(doing: str) -> None:
+    def report(stage_name: str) -> None:
         if progress is not None:
-            progress(next(stages), _STAGES, doing)
+            progress(next(stages), _STAGES, stage_name)
 
-    tell("reading the file")
+    report("reading the file")
     loaded = Splats.load(path)
     if not len(loaded):
         raise InputError(f"{path}: must hold at least one Gaussian (got 0)")
@@ -228,9 +228,9 @@ def import_splats(
         outside = np.asarray(((loaded.means < low) | (loaded.means > high)).any(axis=1))
         span = ", ".join(f"{axis} {a:.3g} to {b:.3g}" for axis, a, b in zip("xyz", *loaded.bounds, strict=True))
         cleaner.remove("outside of the box", outside, f"crop keeps nothing: the file has {span}")
-    tell("removing floaters")
+    report("removing floaters")
     cleaner.remove_floaters(kind)
-    tell("finding up")
+    report("finding up")
     upright = find_up(cleaner.splats, kind, usual_up(path), settings.up)
     turn = np.eye(4)
     turn[:3, :3] = upright.rotation
@@ -242,10 +242,10 @@ def import_splats(
     splats = cleaner.splats.transformed(turn)
     support = None
     if kind == "environment" and upright.support is not None:
-        support, placed = _on_support(splats, upright.support)
+        support, placed = _align_to_support(splats, upright.support)
         turn = placed @ turn
         splats = cleaner.splats.transformed(turn)
-    tell("finding the surface")
+    report("finding the surface")
     seen_below = kind == "object" and not settings.without_table
     mesh = _surface(splats, kind, settings, lowest=-1.0 if seen_below else 0.0)
     if mesh is not None and (settings.flat_base or (settings.without_table and _topples(mesh))):
@@ -278,20 +278,20 @@ def import_splats(
     views: list[AssetView] = []
     mesh_iou = offset = None
     if asset.mesh is not None:
-        tell("comparing mesh and splats")
-        cameras = _cameras(asset.splats, kind, settings, _HELD_OUT, lowest=-0.3 if seen_below else 0.0, turn=0.7)
+        report("comparing mesh and splats")
+        cameras = _cameras(asset.splats, kind, settings, _TEST_VIEWS, lowest=-0.3 if seen_below else 0.0, turn=0.7)
         views = show_asset(asset.splats, asset.mesh, cameras)
         offset = measure_offset(asset.mesh, surface_points(asset.splats, cameras)).shift
         if kind == "object":
             mesh_iou = float(np.mean([iou(view.alpha >= 0.5, view.mesh) for view in views]))
-            tell("splitting the mesh into convex pieces")
-            asset = replace(asset, pieces=_pieces(asset.mesh))
+            report("splitting the mesh into convex pieces")
+            asset = replace(asset, pieces=_pieces_of_parts(asset.mesh))
     return Imported(
         asset=asset,
         upright=upright,
         found=len(loaded),
         removed=cleaner.removed,
-        rubbish=cleaner.rubbish().transformed(metres_from_file),
+        removed_splats=cleaner.removed_splats().transformed(metres_from_file),
         support=support,
         views=views,
         mesh_iou=mesh_iou,
@@ -305,32 +305,32 @@ class _Cleaner:
     """Remaining Gaussians of a file, and the reasons for the removal of the others."""
 
     def __init__(self, path: Path, splats: Splats) -> None:
-        self._path, self._all, self._kept = path, splats, np.ones(len(splats), dtype=bool)
+        self._path, self._all, self._remaining = path, splats, np.ones(len(splats), dtype=bool)
         self.removed: dict[str, int] = {}
 
     @property
     def splats(self) -> Splats:
         """Remaining Gaussians."""
-        return self._all.select(self._kept)
+        return self._all.select(self._remaining)
 
-    def rubbish(self) -> Splats:
+    def removed_splats(self) -> Splats:
         """Return the removed Gaussians."""
-        return self._all.select(~self._kept)
+        return self._all.select(~self._remaining)
 
     def remove(self, reason: str, which: BoolArray, otherwise: str) -> None:
         """Remove some of the remaining Gaussians, and raise an error if none would remain."""
         self.removed[reason] = self.removed.get(reason, 0) + int(which.sum())
-        self._kept[np.flatnonzero(self._kept)[which]] = False
-        if not self._kept.any():
+        self._remaining[np.flatnonzero(self._remaining)[which]] = False
+        if not self._remaining.any():
             raise InputError(f"{self._path}: {otherwise}")
 
     def remove_floaters(self, kind: str) -> None:
         """Remove Gaussians that are invisible, too large to be part of an object, or connected to no large part."""
-        self.remove("invisible", self.splats.opacities < FAINT, "all Gaussians are invisible")
+        self.remove("invisible", self.splats.opacities < MIN_OPACITY, "all Gaussians are invisible")
         if kind == "object":
             splats = self.splats
             size = _extent(splats)
-            haze = (splats.scales.max(axis=1) > HUGE * size) | long_needles(splats, size)
+            haze = (splats.scales.max(axis=1) > MAX_SCALE * size) | long_needles(splats, size)
             self.remove("haze and needles", haze, "all Gaussians are haze or needles: is it an environment?")
         splats = self.splats
         floating = np.zeros(len(splats), dtype=bool)
@@ -340,7 +340,7 @@ class _Cleaner:
 
 def _extent(splats: Splats) -> float:
     """Return the longest extent of the Gaussians without outliers."""
-    return float(np.ptp(np.quantile(splats.means, (_BULK, 1 - _BULK), axis=0), axis=0).max())
+    return float(np.ptp(np.quantile(splats.means, (_OUTLIERS, 1 - _OUTLIERS), axis=0), axis=0).max())
 
 
 def _cameras(
@@ -350,7 +350,7 @@ def _cameras(
 
     Views of an environment look at the origin, from within its extent.
     """
-    low, high = np.quantile(splats.means.astype(np.float64), (_BULK, 1 - _BULK), axis=0)
+    low, high = np.quantile(splats.means.astype(np.float64), (_OUTLIERS, 1 - _OUTLIERS), axis=0)
     if kind == "object":
         middle, radius, fov = (low + high) / 2, 0.5 * float(np.linalg.norm(high - low)), _FOV
         away = _DISTANCE * radius
@@ -376,16 +376,16 @@ def _surface(splats: Splats, kind: str, settings: ImportSettings, lowest: float)
         return None
 
 
-def _pieces(mesh: trimesh.Trimesh) -> tuple[trimesh.Trimesh, ...]:
+def _pieces_of_parts(mesh: trimesh.Trimesh) -> tuple[trimesh.Trimesh, ...]:
     """Return convex pieces of every connected part."""
     parts = sorted(mesh.split(only_watertight=True), key=lambda part: -float(part.volume)) or [mesh]
-    small = [part for part in parts[1:] if part.volume < _LEAF * parts[0].volume]
+    small = [part for part in parts[1:] if part.volume < _SMALL_PART * parts[0].volume]
     large = parts[: len(parts) - len(small)]
     split = [piece for part in large for piece in convex_pieces(part, threshold=_CONCAVITY)]
     return (*split, *(part.convex_hull for part in small))
 
 
-def _on_support(splats: Splats, plane: Plane) -> tuple[ImportSupport | None, Float64Array]:
+def _align_to_support(splats: Splats, plane: Plane) -> tuple[ImportSupport | None, Float64Array]:
     """Return the horizontal surface of an environment, and the transform that moves its centre to the origin.
 
     The transform aligns the sides of the surface with x and y. If the Gaussians in the plane span no area, the surface
@@ -414,22 +414,22 @@ def _on_support(splats: Splats, plane: Plane) -> tuple[ImportSupport | None, Flo
 
 
 def _cut_base(path: Path, mesh: trimesh.Trimesh) -> tuple[trimesh.Trimesh, float]:
-    """Cut off the lowest part of a solid, as little as possible, so that it stands; also return the height."""
+    """Cut off the lowest part of a solid, as little as possible, so that it stands; return the height too."""
     (low, *_), high = mesh.bounds[:, 2], mesh.bounds[1] + mesh.scale
-    for height in low + _BASE * np.linspace(0, 1, 11)[1:] * float(mesh.extents[2]):
+    for height in low + _MAX_BASE_CUT * np.linspace(0, 1, 11)[1:] * float(mesh.extents[2]):
         corner = np.append(mesh.bounds[0, :2] - mesh.scale, height)
         above = trimesh.creation.box(bounds=[corner, high])
         cut = trimesh.boolean.intersection([mesh, above], engine="manifold")
-        if len(cut.faces) and not _topples(cut, contact=0.2 * _CONTACT):
+        if len(cut.faces) and not _topples(cut, contact=0.2 * _CONTACT_HEIGHT):
             return cut, float(height)
     raise InputError(f"{path}: has no base that it could stand on: give --up, or leave out --flat-base")
 
 
-def _topples(mesh: trimesh.Trimesh, contact: float = _CONTACT) -> bool:
-    """Return True if an object falls over or rolls away when it is put down in its pose and tilted by :data:`_TILT`."""
+def _topples(mesh: trimesh.Trimesh, contact: float = _CONTACT_HEIGHT) -> bool:
+    """Return True if an object in its pose falls over or rolls away when it is tilted by :data:`_MAX_TILT`."""
     low = float(mesh.bounds[0, 2])
     middle = mesh.center_mass if mesh.is_watertight else mesh.centroid
     touching = mesh.vertices[mesh.vertices[:, 2] <= low + contact * float(mesh.extents.max()), :2]
     ground = shapely.MultiPoint(touching).convex_hull
-    reach = np.tan(np.radians(_TILT)) * (float(middle[2]) - low)
+    reach = np.tan(np.radians(_MAX_TILT)) * (float(middle[2]) - low)
     return not ground.contains(shapely.Point(middle[:2]).buffer(reach))

@@ -24,17 +24,17 @@ from mitsplat.reconstruct.segment_splats import visible_area
 POINTS = 4000
 """Number of Gaussians for the search of planes, drawn in proportion to their visible area."""
 _SAMPLES = 3000
-_TOLERANCE = 0.006
+_PLANE_TOLERANCE = 0.006
 """Maximum distance of inliers from a plane, as a fraction of the diagonal of all points."""
-_BELOW = 0.01
+_MAX_BELOW = 0.01
 """Maximum fraction of the points below the surface that an object stands on."""
-_NEAR = 35.0
+_MAX_ANGLE = 35.0
 """Maximum angle between the usual up axis and the normal of a horizontal plane [degrees]."""
-_SMALL, _LARGE = 0.04, 0.25
+_MIN_SHARE_NEAR, _MIN_SHARE_ANY = 0.04, 0.25
 """Minimum fractions of inliers with which a plane defines up: near the usual axis, and in any other orientation."""
-_BROAD = 0.85
+_MIN_SPAN = 0.85
 """Minimum span of a surface below an object, relative to the object's footprint, with which it defines up."""
-_SNAP = 1.0
+_SNAP_ANGLE = 1.0
 """Angle up to which the up direction snaps to the usual axis [degrees]."""
 
 
@@ -105,24 +105,24 @@ def find_up(splats: Splats, kind: str, usual: Axis, given: Axis | None = None) -
         given: Known up axis; only the surface is searched then.
     """
     points = visible_points(splats)
-    tolerance = _TOLERANCE * float(np.linalg.norm(np.ptp(np.quantile(points, (0.01, 0.99), axis=0), axis=0)))
+    tolerance = _PLANE_TOLERANCE * float(np.linalg.norm(np.ptp(np.quantile(points, (0.01, 0.99), axis=0), axis=0)))
     wanted = axis_vector(given or usual)
-    below = _BELOW if kind == "object" else 1.0
-    near = largest_plane(points, tolerance, towards=wanted, within=_NEAR, below=below)
-    if near is not None and near.share < _SMALL:
+    below = _MAX_BELOW if kind == "object" else 1.0
+    near = largest_plane(points, tolerance, towards=wanted, within=_MAX_ANGLE, below=below)
+    if near is not None and near.share < _MIN_SHARE_NEAR:
         near = None
     if given is not None:
         return Upright(wanted, f"{given}, as given", near)
     name = f"{usual}, as is usual for such files"
     # A plane narrower than the object may be its sole or one of its sides, which need not be level.
-    if near is not None and (kind == "environment" or _reach(points, near, tolerance) >= _BROAD):
+    if near is not None and (kind == "environment" or _relative_span(points, near, tolerance) >= _MIN_SPAN):
         angle = float(np.degrees(np.arccos(np.clip(near.normal @ wanted, -1, 1))))
         flat = f"a flat surface with {near.share:.0%} of what is seen faces there"
-        if angle <= _SNAP:
+        if angle <= _SNAP_ANGLE:
             return Upright(wanted, f"{name}, and {flat}", near)
         return Upright(near.normal, f"{angle:.0f} degrees from {usual}, where {flat}", near)
     other = largest_plane(points, tolerance, below=0.5 if kind == "environment" else below)
-    if near is None and other is not None and other.share >= _LARGE:
+    if near is None and other is not None and other.share >= _MIN_SHARE_ANY:
         return Upright(other.normal, f"a flat surface with {other.share:.0%} of what is seen faces there", other)
     if near is None and kind == "environment":
         spread, axes = np.linalg.eigh(np.cov(points.T))
@@ -175,10 +175,10 @@ def largest_plane(
         count = int((np.abs(distance) <= tolerance).sum())
         if (best is None or count > best[0]) and (distance < -2 * tolerance).mean() <= below:
             best = count, np.append(normal, normal @ corner)
-    return None if best is None else _fitted(points, best[1], tolerance)
+    return None if best is None else _fit_plane(points, best[1], tolerance)
 
 
-def _fitted(points: Float64Array, plane: Float64Array, tolerance: float) -> Plane:
+def _fit_plane(points: Float64Array, plane: Float64Array, tolerance: float) -> Plane:
     """Refine a plane by least squares on its inliers, in three iterations; ``plane`` is normal and height."""
     normal, height = plane[:3], plane[3]
     inside: BoolArray = np.abs(points @ normal - height) <= tolerance
@@ -195,7 +195,7 @@ def _fitted(points: Float64Array, plane: Float64Array, tolerance: float) -> Plan
     return Plane(np.asarray(normal), float(height), float(inside.mean()), thickness)
 
 
-def _reach(points: Float64Array, plane: Plane, tolerance: float) -> float:
+def _relative_span(points: Float64Array, plane: Plane, tolerance: float) -> float:
     """Return the area of the points in the plane relative to the footprint of all points, 0 to 1."""
     flat = points @ rotation_to_z(plane.normal).T
     contact = np.abs(flat[:, 2] - plane.height) <= tolerance

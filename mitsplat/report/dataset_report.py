@@ -87,11 +87,11 @@ def write_report(root: str | Path, out: str | Path | None = None) -> tuple[Path,
     counted = _Statistics((output["width"], output["height"]))
     variety = Variety(content)
 
-    def hear(record: Record) -> None:
+    def visit(record: Record) -> None:
         counted.add(record)
         variety.add(record)
 
-    audit = audit_dataset(root, hear)
+    audit = audit_dataset(root, visit)
     name = str(content["scene"]["name"])
     parts = [
         f"<h1>{html.escape(name)}</h1>",
@@ -129,8 +129,8 @@ def _summary(content: dict[str, Any], counted: _Statistics, audit: Audit, root: 
 
 def _left_out(counted: _Statistics) -> str:
     """List the objects that did not come to rest, most frequent first."""
-    told = Counter(text for objects in counted.left_out.values() for text in objects).most_common(5)
-    often = ", ".join(f"{count} {text}" for text, count in told)
+    reasons = Counter(text for objects in counted.left_out.values() for text in objects).most_common(5)
+    often = ", ".join(f"{count} {text}" for text, count in reasons)
     return f"{len(counted.left_out)} layouts lack objects that did not come to rest: {often}"
 
 

@@ -18,11 +18,11 @@ from mitsplat.storage.files import Record
 
 OCCLUDED = 0.05
 """Fraction of hidden pixels above which an instance counts as occluded."""
-FEW, FEW_VIEWS = 20, 100
+MIN_COUNT, MIN_VIEWS = 20, 100
 """Minimum number of images or instances for a warning, and of instances of an object for a warning about viewpoints."""
-UNEVEN = 3.0
+MAX_CLASS_RATIO = 3.0
 """Ratio of the instances of two classes above which a warning is given."""
-LEAST_OCCLUDED, LEAST_SEEN, ONE_SIDED = 0.1, 0.8, 0.95
+MIN_OCCLUDED, MIN_DIRECTIONS, MAX_ONE_SIDED = 0.1, 0.8, 0.95
 """Minimum fractions of occluded instances and of covered view directions, maximum fraction of images lit from one side.
 """
 RINGS, SECTORS = 3, 8
@@ -30,7 +30,7 @@ RINGS, SECTORS = 3, 8
 wide.
 """
 
-_NO_DRAWS = frozenset(
+_NOT_DRAWN_KEYS = frozenset(
     {
         "index",
         "layout",
@@ -48,8 +48,8 @@ _NO_DRAWS = frozenset(
     }
 )
 """Keys of a frame's record that contain no drawn values, or that are evaluated separately."""
-_NO_VALUES = frozenset({"id", "entry", "asset", "seed"})
-_MOST_NUMBERS, _MOST_TEXTS, _MOST_PAIRS = 1 << 16, 1000, 20
+_IGNORED_KEYS = frozenset({"id", "entry", "asset", "seed"})
+_MAX_NUMBERS, _MAX_TEXTS, _MAX_PAIRS = 1 << 16, 1000, 20
 
 
 class Variety:
@@ -71,11 +71,11 @@ class Variety:
 
     def add(self, record: Record) -> None:
         """Count a frame."""
-        drawn = {key: value for key, value in record.items() if key not in _NO_DRAWS}
+        drawn = {key: value for key, value in record.items() if key not in _NOT_DRAWN_KEYS}
         for name, value in (*_values(drawn, ""), *_camera_values(record)):
             if isinstance(value, str):
                 texts = self._texts.setdefault(name, Counter())
-                texts[value if value in texts or len(texts) < _MOST_TEXTS else "others"] += 1
+                texts[value if value in texts or len(texts) < _MAX_TEXTS else "others"] += 1
             elif math.isfinite(value):
                 self._numbers.setdefault(name, _Sample()).add(value)
         labels = record["labels"]["instances"]
@@ -105,7 +105,7 @@ class Variety:
             self._pairs.update(f"{other} hides {label['class']}" for other in near)
 
     def _add_directions(self, record: Record) -> None:
-        """Count view directions of objects in their own coordinates, and the side of the image that light comes from."""
+        """Count view directions of objects in their own coordinates, and the side that light comes from."""
         labels, camera = record["labels"]["instances"], np.array(record["camera"]["world_from_camera"])
         places = []
         for label in labels:
@@ -123,10 +123,10 @@ class Variety:
         found = [*self._class_warnings(), *self._instance_warnings()]
         for name, counts in sorted(self._seen.items()):
             cells = np.count_nonzero(counts[:RINGS])
-            if counts.sum() >= FEW_VIEWS and cells < LEAST_SEEN * RINGS * SECTORS:
+            if counts.sum() >= MIN_VIEWS and cells < MIN_DIRECTIONS * RINGS * SECTORS:
                 found.append(f"{name} is seen from {cells} of the {RINGS * SECTORS} directions above it")
         side, images = max(self._sides.items(), key=lambda item: item[1], default=("", 0))
-        if self._sides.total() >= FEW and images > ONE_SIDED * self._sides.total():
+        if self._sides.total() >= MIN_COUNT and images > MAX_ONE_SIDED * self._sides.total():
             found.append(f"light comes from the {side} in {images} of {self._sides.total()} images")
         return found
 
@@ -137,19 +137,19 @@ class Variety:
             if count == 0:
                 yield f"class {name} has no instance"
                 continue
-            if most >= FEW and most > UNEVEN * count:
+            if most >= MIN_COUNT and most > MAX_CLASS_RATIO * count:
                 yield f"class {name} has {most / count:.1f} times fewer instances than {most_of}"
             if missing := [split for split in sorted(self._images) if not self._of_split[name, split]]:
                 yield f"class {name} has no instance in {' and '.join(missing)}"
-            if count >= FEW and not self._occluded[name]:
+            if count >= MIN_COUNT and not self._occluded[name]:
                 yield f"class {name} is never occluded"
 
     def _instance_warnings(self) -> Iterator[str]:
         total = self._instances.total()
-        if total < FEW:
+        if total < MIN_COUNT:
             yield f"there are {total} instances, too few to learn from"
             return
-        if self._occluded.total() < LEAST_OCCLUDED * total:
+        if self._occluded.total() < MIN_OCCLUDED * total:
             yield f"only {self._occluded.total()} of {total} instances are hidden by more than {OCCLUDED:.0%}"
         if not self._truncated:
             yield "no instance is cut off by the image's border"
@@ -172,7 +172,7 @@ class Variety:
             bars("Occluded instances of each class", occluded, unit=" %"),
             bars(
                 "Classes that hide each other, most frequent pairs",
-                dict(self._pairs.most_common(_MOST_PAIRS)),
+                dict(self._pairs.most_common(_MAX_PAIRS)),
                 name_width=240,
             ),
             self._lit.draw("Where light comes from in the image", "from the right 0, from above 90 [degrees]"),
@@ -190,7 +190,7 @@ class Variety:
             if len(texts) == 1:
                 fixed.append((name, next(iter(texts))))
             else:
-                drawn.append(bars(name, dict(texts.most_common(_MOST_PAIRS))))
+                drawn.append(bars(name, dict(texts.most_common(_MAX_PAIRS))))
         rows = "".join(f'<tr><th scope="row">{html.escape(a)}</th><td>{html.escape(b)}</td></tr>' for a, b in fixed)
         return (
             '<section aria-labelledby="variety"><h2 id="variety">Variety</h2>'
@@ -211,7 +211,7 @@ class _Sample:
     def add(self, value: float) -> None:
         if self._count % self._step == 0:
             self.values.append(value)
-            if len(self.values) > _MOST_NUMBERS:
+            if len(self.values) > _MAX_NUMBERS:
                 del self.values[1::2]
                 self._step *= 2
         self._count += 1
@@ -233,7 +233,7 @@ def _values(value: Any, name: str) -> Iterator[tuple[str, float | str]]:
         yield name, float(value)
     elif isinstance(value, dict):
         for key, inner in value.items():
-            if key not in _NO_VALUES:
+            if key not in _IGNORED_KEYS:
                 yield from _values(inner, key if name in ("", "draws") else f"{name}.{key}")
     elif isinstance(value, list):
         for position, inner in enumerate(value):

@@ -45,7 +45,7 @@ def test_a_healthy_machine(monkeypatch):
     ],
 )
 def test_a_fault_has_a_remedy(monkeypatch, name, change, remedy):
-    monkeypatch.setattr(doctor, "_try", lambda device, environment: ("23", ""))
+    monkeypatch.setattr(doctor, "_render_trial_on", lambda device, environment: ("23", ""))
     change(monkeypatch)
     finding = found()[name]
     assert not finding.ok and remedy in finding.remedy
@@ -95,7 +95,7 @@ def test_every_gpu_is_tried(monkeypatch, fault):
 
     gpus = Gpu("NVIDIA A", 1, 0, "01", "GPU-a"), Gpu("NVIDIA B", 1, 1, "02", "GPU-b")
     monkeypatch.setattr(doctor, "visible_gpus", lambda: gpus)
-    monkeypatch.setattr(doctor, "_try", attempt)
+    monkeypatch.setattr(doctor, "_render_trial_on", attempt)
     finding = doctor._cuda()
     assert tried == [("cuda", {"CUDA_VISIBLE_DEVICES": "GPU-a"}), ("cuda", {"CUDA_VISIBLE_DEVICES": "GPU-b"})]
     assert finding.ok == (not fault)

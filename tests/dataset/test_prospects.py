@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from mitsplat.checks.path_checks import check_scene
 from mitsplat.dataset import preflight as prospects
 from mitsplat.dataset import write as dataset
-from mitsplat.dataset.preflight import disk_faults, doubts, image_faults, refuse, run_faults, sees
+from mitsplat.dataset.preflight import disk_faults, image_faults, refuse, run_faults, scene_warnings, sees
 from mitsplat.dataset.write import write_dataset
 from mitsplat.errors import InputError, MissingResourceError
 from mitsplat.frames import speed_accuracy as chart
@@ -136,7 +136,7 @@ TOLD = "views", "lights", "bin"
     ],
 )
 def test_what_is_hardly_meant_is_told(change, found, scene_data, write_scene, machine):
-    assert all(finding.ok for finding in doubts(load_scene(write_scene(scene_data))))
+    assert all(finding.ok for finding in scene_warnings(load_scene(write_scene(scene_data))))
     scene_data["output"] = {**scene_data["output"], "layouts": 1, "views": 12}
     scene = scene_with(scene_data, write_scene, change)
     (finding,) = (finding for finding in check_scene(scene) if finding.name in TOLD and not finding.ok)
@@ -147,7 +147,9 @@ def test_check_warns_of_slow_settling_and_of_large_images(scene_data, write_scen
     scene_data["objects"][0]["count"] = [100, 200]
     scene_data["output"] |= {"width": 3000, "height": 3000}
     monkeypatch.setattr(prospects, "unused_memory", lambda: 5.0)
-    found = {finding.name: finding.text for finding in doubts(load_scene(write_scene(scene_data))) if not finding.ok}
+    found = {
+        finding.name: finding.text for finding in scene_warnings(load_scene(write_scene(scene_data))) if not finding.ok
+    }
     assert found["settling"] == "a layout of up to 201 objects takes minutes to settle"
     assert re.match(r"an image of 3000x3000 px may take \d+\.\d GiB of memory \(5\.0 GiB are unused\)", found["memory"])
 
@@ -165,7 +167,7 @@ def test_the_cost_of_checks_does_not_grow_with_layouts(scene_data, write_scene, 
     scene_data["output"]["layouts"] = 100_000
     scene = load_scene(write_scene(scene_data))
     assert list(run_faults(scene)) == []
-    assert all(finding.ok for finding in doubts(scene))
+    assert all(finding.ok for finding in scene_warnings(scene))
     assert len(planned) <= 2 * prospects.VIEWS
 
 

@@ -128,7 +128,7 @@ def test_an_object_comes_out_upright_clean_and_of_its_size(imported: Imported, p
     assert imported.removed["haze and needles"] == 1
     assert imported.removed["floaters"] >= 15
     assert imported.removed["table"] > 1000
-    assert len(imported.rubbish) + len(asset.splats) == imported.found
+    assert len(imported.removed_splats) + len(asset.splats) == imported.found
     assert asset.mesh is not None
     assert asset.mesh.is_volume
     truth = pin.copy().apply_scale(0.5)

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 
-from mitsplat.dataset.preflight import doubts
+from mitsplat.dataset.preflight import scene_warnings
 from mitsplat.errors import InputError
 from mitsplat.frames.frame import light_properties
 from mitsplat.scene.loading.scene_loading import load_scene
@@ -215,9 +215,9 @@ def test_a_backdrop_is_a_room_around_its_inside(scene_data: SceneData, write_sce
     assert draw_place(scene.spec, 0).finish_of("backdrop wall +y") == draw_place(scene.spec, 0).finish_of(
         "backdrop wall -x"
     )
-    assert [finding.text for finding in doubts(scene) if not finding.ok] == []
+    assert [finding.text for finding in scene_warnings(scene) if not finding.ok] == []
     assert light_properties(scene)["sky_reach"] == pytest.approx((1 - 0.2 * np.sin(np.pi / 6)) / 2)
     scene_data["backdrop"] = {"size": [0.7, 0.7, 0.9], "position": [0, 0, -0.2], "sides": ["+x", "-y"]}
-    found = [finding.text for finding in doubts(load_scene(write_scene(scene_data))) if not finding.ok]
+    found = [finding.text for finding in scene_warnings(load_scene(write_scene(scene_data))) if not finding.ok]
     assert "of 12 views 6 are from behind a wall of the backdrop, which hides everything" in found
     assert "1 of 1 lights are behind a wall of the backdrop" in found

@@ -16,7 +16,7 @@ from mitsplat.geometry.camera import look_at_pose
 from mitsplat.pages.svg_charts import discs
 from mitsplat.report import variety
 from mitsplat.report.dataset_report import write_report
-from mitsplat.report.variety import FEW_VIEWS, RINGS, SECTORS, Variety, cell_of
+from mitsplat.report.variety import MIN_VIEWS, RINGS, SECTORS, Variety, cell_of
 from tests.audit.test_audit import records_of, store
 from tests.cli.typed import run
 
@@ -136,7 +136,7 @@ def test_camera_angles_are_those_of_where_it_is() -> None:
 
 
 def test_samples_are_thinned_out_evenly(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(variety, "_MOST_NUMBERS", 8)
+    monkeypatch.setattr(variety, "_MAX_NUMBERS", 8)
     sample = variety._Sample()
     for value in range(100):
         sample.add(value)
@@ -149,7 +149,7 @@ class TestWarnings:
     def test_what_varies_is_not_warned_of(self) -> None:
         rng = np.random.default_rng(2)
         records = []
-        for number in range(4 * FEW_VIEWS):
+        for number in range(4 * MIN_VIEWS):
             poses = [np.eye(4), np.eye(4)]
             for pose in poses:
                 pose[:3, :3] = Rotation.random(rng=rng).as_matrix()

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from mitsplat.dataset.inputs import describe_inputs
-from mitsplat.dataset.preflight import doubts
+from mitsplat.dataset.preflight import scene_warnings
 from mitsplat.errors import InputError
 from mitsplat.scene.loading.scene_loading import load_scene
 from mitsplat.scene.planning.frame_plan import plan_frame
@@ -155,7 +155,7 @@ def test_lights_that_can_be_inside_of_a_shape_are_doubted(lit: Any) -> None:
     block = {"name": "block", "box": {"size": [1, 1, 1], "position": [0, 0, 5]}, "visible": True}
     table = {"name": "table", "box": {"size": [1, 1, 0.1], "position": [0, 0, -0.05]}}
     lamp = {"kind": "point", "draw": {"position": [[-0.4, -0.4, 4.6], [0.4, 0.4, 7]]}}
-    found = [finding.text for finding in doubts(lit(lamp, shapes=[table, block])) if finding.name == "lights"]
+    found = [finding.text for finding in scene_warnings(lit(lamp, shapes=[table, block])) if finding.name == "lights"]
     assert len(found) == 1 and "lights that were drawn are inside of a shape, such as 'block'" in found[0]
 
 

@@ -145,6 +145,6 @@ def test_memory_does_not_grow_with_the_frames(tmp_path: Path, monkeypatch: pytes
         assert [found["index"] for found in Manifest(folder / "manifest.jsonl")] == list(range(count))
         return held[0]
 
-    monkeypatch.setattr(bop, "_TOGETHER", 30)
+    monkeypatch.setattr(bop, "_BATCH_FILES", 30)
     memory(20)
     assert memory(600) - memory(150) < 50 * 1000

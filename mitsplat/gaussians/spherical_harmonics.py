@@ -1,4 +1,4 @@
-"""Real spherical harmonics of 3DGS: their values, the colours they give, and how they turn with an object."""
+"""Real spherical harmonics of 3DGS: basis functions, colours and rotation."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ _SH_C3 = (
 
 
 def sh_basis(directions: npt.ArrayLike, degree: int) -> Float64Array:
-    """Real spherical harmonics in the order and with the signs of 3DGS.
+    """Evaluate the real spherical harmonics in the order and with the signs of 3DGS.
 
-    Constants and polynomials are those of 3DGS's ``eval_sh`` (Kerbl et al. 2023; after Sloan 2008, "Stupid Spherical
+    Constants and polynomials are those of ``eval_sh`` of 3DGS (Kerbl et al. 2023; after Sloan 2008, "Stupid Spherical
     Harmonics Tricks", appendix A2).
 
     Args:
@@ -64,7 +64,7 @@ def sh_basis(directions: npt.ArrayLike, degree: int) -> Float64Array:
 
 
 def evaluate_sh(sh: npt.ArrayLike, directions: npt.ArrayLike) -> Float64Array:
-    """Display-encoded colours ``max(0, 0.5 + sum_k sh[k] Y_k(direction))``.
+    """Compute display-encoded colours ``max(0, 0.5 + sum_k sh[k] Y_k(direction))``.
 
     Args:
         sh: Coefficients, shape (..., K, 3) with K = 1, 4, 9 or 16.
@@ -80,17 +80,18 @@ def evaluate_sh(sh: npt.ArrayLike, directions: npt.ArrayLike) -> Float64Array:
 
 
 def sh_rotation(rotation: npt.ArrayLike, degree: int) -> Float64Array:
-    """Matrix that turns SH coefficients with an object: ``sum_k (D sh)_k Y_k(R d) = sum_k sh_k Y_k(d)`` for every d.
+    """Return the matrix that rotates SH coefficients with an object.
 
-    A rotation maps each band onto itself (Sloan 2008), so ``Y(R^T d)`` is an exact linear function of ``Y(d)``, and
-    the least-squares fit over well-spread directions finds it to rounding; the result is block diagonal.
+    It fulfils ``sum_k (D sh)_k Y_k(R d) = sum_k sh_k Y_k(d)`` for every d. A rotation maps each band onto itself (Sloan
+    2008), so ``Y(R^T d)`` is an exact linear function of ``Y(d)``. A least-squares fit over well-spread directions
+    therefore finds the matrix to rounding precision; it is block diagonal.
 
     Args:
         rotation: Rotation matrix ``new_from_old``, shape (3, 3).
         degree: Highest band, 0 to 3.
 
     Returns:
-        Matrix of shape (K, K), K = (degree + 1)^2; the new coefficients are ``D @ sh``.
+        Matrix D of shape (K, K), K = (degree + 1)^2; the new coefficients are ``D @ sh``.
     """
     # Fibonacci sphere: 64 directions determine 16 functions with a condition number near 1.
     index = np.arange(64) + 0.5

@@ -1,9 +1,9 @@
-"""Gaussian splats in memory: the one statement of mitsplat's conventions.
+"""Gaussian splats in memory, and the conventions of mitsplat.
 
 * World: right-handed, z up, metres, kilograms, seconds.
 * Cameras: OpenCV (x right, y down, z forward); pixel centres at +0.5.
-* ``a_from_b`` names a transform that takes b-coordinates to a-coordinates.
-* Quaternions: xyzw in memory (as Mitsuba, Warp and SciPy), wxyz in 3DGS files.
+* Transforms: ``a_from_b`` maps b-coordinates to a-coordinates.
+* Quaternions: xyzw in memory (as in Mitsuba, Warp and SciPy), wxyz in 3DGS files.
 * ``Splats`` holds activated values (scales in metres, opacities in [0, 1]); files hold logarithms and logits.
 * Colours of splats are display-encoded: they are blended encoded and linearised afterwards.
 * Spherical harmonics: real, with the Condon-Shortley phase, ordered ``(l, m) = (0, 0), (1, -1), (1, 0), (1, 1), ...``
@@ -31,20 +31,20 @@ from mitsplat.gaussians.splat_files import SplatArrays, read_splats, write_splat
 
 @dataclass(frozen=True, eq=False)
 class Splats:
-    """A set of N anisotropic 3D Gaussians with view-dependent colour (Kerbl et al. 2023, 3DGS).
+    """Set of N anisotropic 3D Gaussians with view-dependent colour (Kerbl et al. 2023, 3DGS).
 
-    Arrays are copied to contiguous float32 and frozen; quaternions are normalised.
+    Arrays are copied to contiguous float32 and made read-only; quaternions are normalised.
 
     Attributes:
         means: Gaussian centres [m], shape (N, 3).
         quats: Orientations, xyzw unit quaternions, shape (N, 4).
         scales: Standard deviations along the local axes [m], shape (N, 3), > 0.
         opacities: Peak opacity in [0, 1], shape (N,).
-        sh: Spherical-harmonic coefficients of the display-encoded colour in 3DGS order, shape (N, K, 3) with
-            K = 1, 4, 9 or 16: colour = max(0, 0.5 + sum_k sh[k] Y_k(direction)), direction from camera to Gaussian.
+        sh: Spherical-harmonic coefficients of the display-encoded colour in 3DGS order, shape (N, K, 3) with K = 1, 4,
+            9 or 16: colour = max(0, 0.5 + sum_k sh[k] Y_k(direction)), direction from camera to Gaussian.
 
     Raises:
-        ValueError: If a shape is wrong or a value breaks its rule; the sentence names field, rule, value and row.
+        ValueError: If an array has a wrong shape or an invalid value. The message names field, rule, value and row.
     """
 
     means: Float32Array
@@ -54,7 +54,7 @@ class Splats:
     sh: Float32Array
 
     def __post_init__(self) -> None:
-        with np.errstate(over="ignore"):  # beyond float32 becomes inf, which the rules below refuse
+        with np.errstate(over="ignore"):  # values beyond float32 become inf, which is refused below
             arrays = {f.name: np.array(getattr(self, f.name), dtype=np.float32, order="C") for f in fields(self)}
         count = len(arrays["means"]) if arrays["means"].ndim else 0
         for name, row in (("means", (3,)), ("quats", (4,)), ("scales", (3,)), ("opacities", ())):
@@ -69,7 +69,7 @@ class Splats:
         _require((opacities >= 0) & (opacities <= 1), "opacities", "in [0, 1]", opacities)
         norms = np.linalg.norm(quats.astype(np.float64), axis=1)
         _require(norms > 1e-12, "quats", "of non-zero length", norms)
-        # Unit quaternions keep their bits, so that copying a splat any number of times changes nothing.
+        # Unit quaternions are not normalised again, so that repeated copies are bit-identical.
         norms[np.abs(norms - 1.0) < 1e-6] = 1.0
         arrays["quats"] = (quats / norms[:, None]).astype(np.float32)
         for name, array in arrays.items():
@@ -86,7 +86,7 @@ class Splats:
 
     @property
     def bounds(self) -> Float32Array:
-        """Lowest and highest coordinates of the centres [m], shape (2, 3).
+        """Minimum and maximum coordinates of the centres [m], shape (2, 3).
 
         Raises:
             ValueError: If there are no Gaussians.
@@ -97,14 +97,14 @@ class Splats:
 
     @classmethod
     def load(cls, path: str | PathLike[str], *, units: float = 1.0) -> Splats:
-        """Read a file; :mod:`mitsplat.gaussians.splat_files` says which formats there are and what each one keeps.
+        """Read a splat file. :mod:`mitsplat.gaussians.splat_files` lists the formats and their precision.
 
         Args:
             path: A ``.ply``, ``.compressed.ply``, ``.splat``, ``.ksplat``, ``.spz`` or ``.sog`` file.
             units: Metres per unit of the file.
 
         Raises:
-            InputError: If the file is missing, of another kind, damaged, or holds a value that breaks a rule.
+            InputError: If the file is missing, of another kind, or damaged, or if it holds an invalid value.
         """
         arrays = read_splats(Path(path))
         try:
@@ -117,25 +117,25 @@ class Splats:
         """Write a 3DGS ``.ply`` (lossless to float32 rounding), a ``.splat`` or an ``.spz`` (both quantised).
 
         Raises:
-            InputError: If the suffix is another one, the format cannot hold these splats, or the file cannot be
-                written; no partial file is left.
+            InputError: If the suffix is unknown, the format cannot hold these splats, or the file cannot be written. No
+                partial file remains.
         """
         write_splats(SplatArrays(self.means, self.quats, self.scales, self.opacities, self.sh), Path(path))
 
     def select(self, index: Any) -> Splats:
-        """The Gaussians that a Boolean mask (N,), an integer array or a slice picks, in its order."""
+        """Return the Gaussians selected by a Boolean mask (N,), an integer array or a slice, in its order."""
         rows = index if isinstance(index, slice) else np.atleast_1d(np.asarray(index))
         return Splats(**{f.name: getattr(self, f.name)[rows] for f in fields(self)})
 
     def transformed(self, matrix: npt.ArrayLike) -> Splats:
-        """These splats after a similarity transform; colours turn with the object.
+        """Return the splats after a similarity transform. Their view-dependent colours rotate with them.
 
         Args:
             matrix: ``new_from_old``: rotation, uniform scale and translation [m], shape (4, 4).
 
         Raises:
-            ValueError: If the matrix shears, mirrors, or scales unevenly, all of which would leave the set of
-                Gaussians with orthonormal axes or of band-limited colours.
+            ValueError: If the matrix shears, mirrors or scales non-uniformly. Gaussians with orthonormal axes and
+                band-limited colours cannot represent the result.
         """
         rotation, scale, translation = split_similarity(matrix)
         turn = Rotation.from_matrix(rotation)
@@ -149,7 +149,7 @@ class Splats:
 
     @staticmethod
     def concatenate(parts: Sequence[Splats]) -> Splats:
-        """All Gaussians of ``parts`` in order; lower SH degrees are padded with zeros to the highest.
+        """Return all Gaussians of ``parts`` in order. Lower SH degrees are padded with zeros to the highest.
 
         Raises:
             ValueError: If ``parts`` is empty.
@@ -163,7 +163,7 @@ class Splats:
 
 
 def split_similarity(matrix: npt.ArrayLike) -> tuple[Float64Array, float, Float64Array]:
-    """Rotation (3, 3), uniform scale and translation (3,) of a similarity transform (4, 4).
+    """Return rotation (3, 3), uniform scale and translation (3,) of a similarity transform (4, 4).
 
     Raises:
         ValueError: If the matrix is not finite, or not a rotation with a uniform scale and a translation.
@@ -185,7 +185,7 @@ def split_similarity(matrix: npt.ArrayLike) -> tuple[Float64Array, float, Float6
 
 
 def _require(valid: BoolArray, name: str, rule: str, values: npt.NDArray[Any]) -> None:
-    """Raise InputError that names the first row of ``values`` (N, ...) where ``valid`` (N, ...) does not hold."""
+    """Raise an InputError that names the first row of ``values`` (N, ...) for which ``valid`` (N, ...) is false."""
     if not valid.all():
         place = np.unravel_index(int(np.argmin(valid)), valid.shape)
         raise InputError(f"{name} must be {rule} (got {values[place]:.6g} at row {place[0]})")

@@ -1,4 +1,4 @@
-"""Conversion of splat files by gaussforge, run in a bounded process by :mod:`mitsplat.gaussians.splat_files`."""
+"""Conversion of splat files by gaussforge, which :mod:`mitsplat.gaussians.splat_files` runs in a bounded process."""
 
 from __future__ import annotations
 
@@ -8,14 +8,15 @@ from mitsplat.errors import InputError
 
 
 def convert_splats(output: BinaryIO, data: bytes, source: str, target: str) -> None:
-    """Write ``data`` of one format as another.
+    """Convert ``data`` between formats and write it.
 
     Raises:
-        InputError: If nothing can be decoded.
+        InputError: If the data cannot be decoded.
     """
-    import gaussforge  # its decoders are for a bounded process only
+    import gaussforge  # imported only in the bounded process
 
-    # Strict checks array sizes; it also refuses the infinite logits that an opacity of 0 or 1 has in an .spz file.
+    # The strict mode checks array sizes. It also refuses the infinite logits that opacities of 0 and 1 have in .spz
+    # files.
     result = gaussforge.GaussForge().convert(data, source, target, strict=source != "spz")
     if not result.get("data"):
         raise InputError(result.get("error", "nothing could be decoded"))

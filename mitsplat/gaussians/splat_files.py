@@ -1,21 +1,21 @@
-"""Files of Gaussian splats, to and from the conventions of :mod:`mitsplat.gaussians.splat_cloud`.
+"""Files of Gaussian splats; for conventions see :mod:`mitsplat.gaussians.splat_cloud`.
 
 ======================  ====  =====  ==========================================================================
-suffix                  read  write  what the format keeps
+suffix                  read  write  precision
 ======================  ====  =====  ==========================================================================
-``.ply``                yes   yes    3DGS: everything, as float32 logarithms (scales) and logits (opacities)
+``.ply``                yes   yes    3DGS: all values, as float32 logarithms (scales) and logits (opacities)
 ``.compressed.ply``     yes   no     PlayCanvas: 11-bit positions in chunks of 256, SH to 1/32
 ``.splat``              yes   yes    float32 positions and scales; 8-bit colours, opacities, quaternions; no SH
-``.ksplat``             yes   no     GaussianSplats3D: as its compression level says
+``.ksplat``             yes   no     GaussianSplats3D: depends on its compression level
 ``.spz``                yes   yes    Niantic: 24-bit positions, log scales in steps of 1/16 from 4.5e-5 to 370
                                      file units, 8-bit colours and opacities, SH in [-1, 1] to 4 or 5 bits
 ``.sog``                yes   no     PlayCanvas: 16-bit log positions, 8-bit codebooks; the order changes
 ======================  ====  =====  ==========================================================================
 
-No format names its axes or its unit, and none is turned or scaled here: ``x, y, z`` are what the file says.
-``.ply``, ``.splat`` and version 3 of ``.spz``, which assets are stored in, are decoded here, and nothing is allocated
-that the size of the file does not warrant. The others are decoded by gaussforge, which trusts its input: it runs in a
-process of its own, with bounded memory, and takes a tenth of a second to start.
+No format states its axes or its unit, so ``x, y, z`` are returned as in the file, without rotation or scaling.
+This module decodes ``.ply``, ``.splat`` and version 3 of ``.spz``, in which assets are stored. Its allocations are
+limited by the size of the file. gaussforge decodes the other formats. It does not validate its input and therefore
+runs in a separate process with bounded memory, which takes 0.1 s to start.
 """
 
 from __future__ import annotations
@@ -53,22 +53,22 @@ _MAX_HEADER = 1 << 16
 _MEANS, _QUATS, _SCALES = ("x", "y", "z"), ("rot_1", "rot_2", "rot_3", "rot_0"), ("scale_0", "scale_1", "scale_2")
 _COLOUR = ("f_dc_0", "f_dc_1", "f_dc_2")
 _MAX_SWELL = 100
-"""Real files grow by a factor of 1.1 to 3 when they are unpacked."""
+"""Maximum ratio of decompressed to compressed size. Real files have ratios of 1.1 to 3."""
 _MAX_ENTRIES = 64
 _LOGIT_LIMIT = 110.0
-"""sigmoid(+-110) is exactly 1 and 0 in float32, so that both survive a file without infinities."""
+"""Largest stored logit. The sigmoid of +-110 is exactly 1 and 0 in float32, so no infinities are needed."""
 
 _SPLAT_ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
 
 _SPZ_HEADER = struct.Struct("<4s2I4B")
-"""Magic, version, number of Gaussians, degree of SH, fractional bits of positions, flags, reserved."""
+"""Magic number, version, number of Gaussians, SH degree, fractional bits of positions, flags, reserved."""
 _SPZ_FRACTIONAL_BITS = 12
 _SPZ_FRACTIONAL_BITS_OFFSET = 13
 _SPZ_POSITION_BITS = 23
 
 
 class SplatArrays(NamedTuple):
-    """Activated, unchecked arrays of N Gaussians, as :class:`~mitsplat.gaussians.splat_cloud.Splats` takes them."""
+    """Activated, unchecked arrays of N Gaussians: the arguments of :class:`~mitsplat.gaussians.splat_cloud.Splats`."""
 
     means: Float32Array
     quats: Float32Array
@@ -78,7 +78,7 @@ class SplatArrays(NamedTuple):
 
 
 def usual_up(path: Path) -> Axis:
-    """Axis that points up in most files of a format: y in ``.spz``, -y in others, as structure from motion has it."""
+    """Return the usual up axis of a format: y for ``.spz``, -y for the others, as in structure from motion."""
     return "y" if path.suffix.lower() == ".spz" else "-y"
 
 
@@ -86,7 +86,7 @@ def read_splats(path: Path) -> SplatArrays:
     """Read a splat file in its own units and axes.
 
     Raises:
-        InputError: If the file is missing, of an unknown suffix, damaged, or holds a value that breaks a rule.
+        InputError: If the file is missing, of an unknown suffix, or damaged, or if it holds an invalid value.
     """
     suffix = path.suffix.lower()
     if suffix not in (".ply", ".splat", *_CONVERTED):
@@ -112,12 +112,12 @@ def read_splats(path: Path) -> SplatArrays:
 
 
 def write_splats(splats: SplatArrays, path: Path) -> None:
-    """Write ``splats`` as the suffix of ``path`` says, replacing the file in one step.
+    """Write ``splats`` in the format of the suffix of ``path``. The file is replaced atomically.
 
     Raises:
         InputError: If the suffix is not ``.ply``, ``.splat`` or ``.spz``, the format cannot hold the splats, or the
             file cannot be written.
-        MissingResourceError: If there is no room.
+        MissingResourceError: If the disk is full.
     """
     encoders = {".ply": _encode_ply, ".splat": _encode_splat, ".spz": _encode_spz}
     suffix = path.suffix.lower()
@@ -147,7 +147,7 @@ def _decode_ply(data: bytes) -> SplatArrays:
     if rest not in (0, 9, 24, 45) or not set(rest_names) <= set(names):
         raise InputError(f"f_rest must be numbered from 0 and have 0, 9, 24 or 45 properties (got {rest})")
     rows = _vertex_rows(data, form, elements, start)
-    # Files are channel-major: all coefficients of red, then green, then blue.
+    # SH coefficients are channel-major: all of red, then green, then blue.
     higher = _columns(rows, rest_names).reshape(len(rows), 3, rest // 3).transpose(0, 2, 1)
     return SplatArrays(
         means=_columns(rows, _MEANS),
@@ -159,9 +159,13 @@ def _decode_ply(data: bytes) -> SplatArrays:
 
 
 def _parse_ply_header(data: bytes) -> tuple[str, dict[str, tuple[int, np.dtype[Any]]], int]:
-    """Format, elements (name to count and row type; lists have the type "object") and the offset of the rows.
+    """Parse the header of a PLY file (Turk 1994).
 
-    The PLY format is Turk's (1994); only what a header may say is accepted.
+    Returns:
+        Format; elements (name to count and row type; list properties have the type "object"); offset of the rows.
+
+    Raises:
+        InputError: If the header contains an invalid line.
     """
     end = re.search(rb"\nend_header[ \t]*\r?\n", data[:_MAX_HEADER])
     if not re.match(rb"ply[ \t]*\r?\n", data) or end is None:
@@ -190,13 +194,16 @@ def _parse_ply_header(data: bytes) -> tuple[str, dict[str, tuple[int, np.dtype[A
 def _vertex_rows(
     data: bytes, form: str, elements: dict[str, tuple[int, np.dtype[Any]]], start: int
 ) -> npt.NDArray[np.void]:
-    """The vertices as a structured array; the promised count is checked against the file before any allocation."""
+    """Return the vertices as a structured array.
+
+    The stated count is checked against the file size before any allocation.
+    """
     before = [elements[name] for name in list(elements)[: list(elements).index("vertex")]]
     count, row = elements["vertex"]
     if row.hasobject or any(kind.hasobject for _, kind in before) or (before and form == "ascii"):
         raise InputError("a PLY file of splats must not have list properties in or before its vertices")
     start += sum(number * kind.itemsize for number, kind in before)
-    # In text, a number takes at least a digit and a separator.
+    # In a text file, a number takes at least one digit and one separator.
     smallest = count * (row.itemsize if form != "ascii" else 2 * len(row.names or ()))
     present = max(0, len(data) - start + (form == "ascii"))
     if smallest > present:
@@ -212,7 +219,7 @@ def _vertex_rows(
 
 
 def _exp(logarithms: npt.NDArray[Any]) -> Float32Array:
-    with np.errstate(over="ignore"):  # overflow becomes inf, which Splats refuses by name and row
+    with np.errstate(over="ignore"):  # overflow becomes inf, which Splats refuses
         return np.exp(logarithms.astype(np.float64)).astype(np.float32)
 
 
@@ -221,7 +228,7 @@ def _sigmoid(logits: npt.NDArray[Any]) -> Float32Array:
 
 
 def _columns(rows: npt.NDArray[np.void], names: tuple[str, ...] | list[str]) -> Float32Array:
-    """The named properties side by side, shape (N, len(names))."""
+    """Return the named properties as columns, shape (N, len(names))."""
     table = np.empty((len(rows), len(names)), np.float32)
     with np.errstate(over="ignore"):
         for column, name in enumerate(names):
@@ -230,7 +237,7 @@ def _columns(rows: npt.NDArray[np.void], names: tuple[str, ...] | list[str]) -> 
 
 
 def _encode_ply(splats: SplatArrays) -> bytes:
-    """The layout of 3DGS's own files, empty normals included, which some loaders insist on."""
+    """Encode in the layout of the original 3DGS files. It includes empty normals, which some loaders require."""
     with np.errstate(divide="ignore"):
         opacity = np.clip(logit(splats.opacities.astype(np.float64)), -_LOGIT_LIMIT, _LOGIT_LIMIT)
     count, coefficients = splats.sh.shape[:2]
@@ -254,7 +261,10 @@ def _encode_ply(splats: SplatArrays) -> bytes:
 
 
 def _decode_splat(data: bytes) -> SplatArrays:
-    """32 bytes a Gaussian (antimatter15's viewer): position, scale, RGBA, quaternion wxyz as (b - 128) / 128."""
+    """Decode 32 bytes per Gaussian: position, scale, RGBA, and quaternion wxyz as (b - 128) / 128.
+
+    The format is that of antimatter15's viewer.
+    """
     if len(data) % _SPLAT_ROW.itemsize:
         raise InputError(f"a .splat file must hold {_SPLAT_ROW.itemsize} bytes per Gaussian (got {len(data)} bytes)")
     rows = np.frombuffer(data, _SPLAT_ROW)
@@ -278,10 +288,10 @@ def _encode_splat(splats: SplatArrays) -> bytes:
 
 
 def _decode_spz(data: bytes) -> SplatArrays:
-    """SPZ version 3 (Niantic's ``load-spz.cc``): one array of small integers after the other, in gzip.
+    """Decode SPZ version 3 (Niantic's ``load-spz.cc``): consecutive arrays of small integers in gzip.
 
-    To the bit what gaussforge makes of it, without its process. Other versions, and what is not as long as its header
-    says, are left to gaussforge, which reads or refuses them.
+    The result is bit-identical to that of gaussforge, without a separate process. gaussforge decodes or refuses other
+    versions and files whose length does not match their header.
     """
     raw = _gunzipped(data)
     magic, version, count, degree, bits, _, _ = _SPZ_HEADER.unpack(raw[: _SPZ_HEADER.size].ljust(_SPZ_HEADER.size))
@@ -306,7 +316,10 @@ def _decode_spz(data: bytes) -> SplatArrays:
 
 
 def _smallest_three(packed: npt.NDArray[np.uint32]) -> Float32Array:
-    """Unit quaternions xyzw (N, 4): the largest component's index, and the others in ten bits each, the sign first."""
+    """Decode unit quaternions xyzw (N, 4) from the index of the largest component and ten bits per other component.
+
+    The first of the ten bits is the sign.
+    """
     largest = packed >> 30
     quats, squares = np.zeros((len(packed), 4), np.float32), np.zeros(len(packed), np.float32)
     for axis in range(3, -1, -1):
@@ -320,10 +333,10 @@ def _smallest_three(packed: npt.NDArray[np.uint32]) -> Float32Array:
 
 
 def _encode_spz(splats: SplatArrays) -> bytes:
-    """SPZ version 3 with as many fractional bits of position as the extent of the splats leaves free.
+    """Encode SPZ version 3 with the maximum number of fractional position bits that the extent of the splats permits.
 
-    The encoder's own 12 bits are steps of 0.24 mm. Positions are handed to it times a power of two, which is exact,
-    and the header's number of fractional bits raised by that power.
+    The encoder itself uses 12 bits, which are steps of 0.24 mm. Here, positions are multiplied by a power of two before
+    encoding, which is exact. The number of fractional bits in the header is increased by the exponent.
     """
     extent = max(float(np.abs(splats.means).max()), 2.0**-60)
     bits = int(np.clip(np.floor(_SPZ_POSITION_BITS - np.log2(extent * (1.0 + 2.0**-20))), 0, _SPZ_POSITION_BITS))
@@ -335,7 +348,7 @@ def _encode_spz(splats: SplatArrays) -> bytes:
 
 
 def _convert(data: bytes, source: str, target: str) -> bytes:
-    """Convert between formats with gaussforge in a process of its own.
+    """Convert between formats with gaussforge in a separate process.
 
     Its decoders do not check every count against the size of the input, so a damaged file can crash the process.
     """
@@ -357,7 +370,11 @@ def _convert(data: bytes, source: str, target: str) -> bytes:
 
 
 def _gunzipped(data: bytes) -> bytes:
-    """What a gzip file holds; what swells beyond what splats can is refused, and what ends too early is cut there."""
+    """Return the decompressed content of a gzip file. A truncated file gives the content up to its end.
+
+    Raises:
+        InputError: If the file is invalid, or if its content is larger than splats can be.
+    """
     limit, raw, rest = _swollen(len(data)), bytearray(), data
     decoder = zlib.decompressobj(wbits=31)
     try:
@@ -372,7 +389,7 @@ def _gunzipped(data: bytes) -> bytes:
 
 
 def _check_zip(data: bytes) -> None:
-    """Refuse an archive whose entries lie outside of it, swell beyond what splats can, or miss their checksums."""
+    """Check that an archive has no entry outside of it, no implausible size, and correct checksums."""
     limit = _swollen(len(data))
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
@@ -384,7 +401,7 @@ def _check_zip(data: bytes) -> None:
             if size > limit or len(entries) > _MAX_ENTRIES:
                 within = f"{limit} in {_MAX_ENTRIES} files (got {size} in {len(entries)})"
                 raise InputError(f"{len(data)} bytes must not hold more than {within}")
-            damaged = archive.testzip()  # reads no more of an entry than it states
+            damaged = archive.testzip()  # reads no more of an entry than its stated size
     except InputError:
         raise
     except (zipfile.BadZipFile, ValueError, OSError, EOFError, RuntimeError, struct.error, zlib.error) as error:
@@ -394,5 +411,5 @@ def _check_zip(data: bytes) -> None:
 
 
 def _swollen(size: int) -> int:
-    """Most bytes that compressed splats of ``size`` bytes may become."""
+    """Return the maximum decompressed size of ``size`` compressed bytes."""
     return _MAX_SWELL * size + (16 << 20)

@@ -1,4 +1,4 @@
-"""Flat Gaussians on a surface: blue-noise placement, spacing that follows detail, and shapes that stop at edges."""
+"""Flat Gaussians on a surface: blue-noise placement, spacing that follows detail, and discs that end at creases."""
 
 from __future__ import annotations
 
@@ -17,46 +17,46 @@ from mitsplat.geometry.mesh_normals import CREASE_ANGLE
 
 _OPACITY = 0.98
 _PACKING = 0.62
-"""Points per area r^2 of the sets that :func:`poisson_subset` keeps, measured on a plane (0.70 at saturation)."""
+"""Points per area r^2 in the sets of :func:`poisson_subset`, measured on a plane (0.70 at saturation)."""
 _CANDIDATES = 5.0
-"""Candidates per area r^2 that make the set nearly maximal."""
+"""Candidates per area r^2, sufficient for a nearly maximal set."""
 _NORMAL_WEIGHT = 0.6
-"""Distance, in units of r, that two opposite normals add to: keeps the two sides of thin sheets apart."""
+"""Additional distance of points with opposite normals, in units of r. It separates the two sides of thin sheets."""
 _PROBES = 4
 """Points per Gaussian at which the surface is tested for gaps."""
 _LEAK = 0.02
-"""Largest share of light that may pass between Gaussians at a probe."""
+"""Maximum transmittance between Gaussians at a probe."""
 _CLOSING_ROUNDS = 14
 _ROW_OFFSET, _ROW_SPACING = 0.45, 0.75
-"""Rows of surfels along creases: their distance from the crease and from each other, in units of the local spacing."""
+"""Distance of surfel rows from a crease, and of surfels within a row, in units of the local spacing."""
 _CREASE_NEIGHBOURS = 16
 _EDGE_SIGMAS = 1.5
 """Standard deviations of a disc between its centre and the nearest crease."""
 _THINNEST = 0.27
-"""Least standard deviation along the surface in units of the local spacing, however near a crease is."""
+"""Minimum standard deviation along the surface near a crease, in units of the local spacing."""
 _THICKNESS = 0.035
-"""Standard deviation along the normal in units of the local spacing."""
+"""Standard deviation along the normal, in units of the local spacing."""
 _REFINEMENT = 0.55
-"""Spacing at creases and tight bends relative to the spacing elsewhere."""
+"""Spacing at creases and tight bends, relative to the spacing elsewhere."""
 _BEND = 0.5
-"""Angle [rad] by which a surface may bend from one surfel to the next before they move closer together."""
+"""Angle [rad] between neighbouring surfels above which the spacing is reduced."""
 _OVERHANG = 0.15
-"""How far tips of discs may stand off a bent surface, in standard deviations of an unhindered disc."""
+"""Maximum height of disc tips above a bent surface, in standard deviations of an unconstrained disc."""
 _SHARES = (2.0, 1.6, 1.25, 1.0, 0.8, 0.63, 0.5)
-"""Sizes of discs that are tried against the overhang, relative to an unhindered one."""
+"""Disc sizes that are tested against the overhang limit, relative to an unconstrained disc."""
 _COUNT_ROUNDS = 3
 
 
 @dataclass(frozen=True, eq=False)
 class Surfels:
-    """Points of a surface with frames and extents.
+    """Surface points with frames and extents.
 
     Attributes:
         points: Positions on the surface [m], shape (N, 3).
         frames: Rotations whose columns are two tangents and the outward normal, shape (N, 3, 3).
         scales: Standard deviations along the columns of ``frames`` [m], shape (N, 3).
-        faces: Face that each point lies on, shape (N,).
-        barycentric: Coordinates in that face, shape (N, 3).
+        faces: Index of the face of each point, shape (N,).
+        barycentric: Barycentric coordinates in the face, shape (N, 3).
     """
 
     points: Float64Array
@@ -67,11 +67,11 @@ class Surfels:
 
     @property
     def centres(self) -> Float64Array:
-        """Where to put Gaussians so that their outer sides lie on the surface [m], shape (N, 3)."""
+        """Gaussian centres for which the outer sides of the Gaussians lie on the surface [m], shape (N, 3)."""
         return self.points - 1.5 * self.scales[:, 2:] * self.normals
 
     def splats(self, sh: Float64Array) -> Splats:
-        """Gaussians of these shapes, all but opaque, with coefficients of SH (N, K, 3)."""
+        """Return nearly opaque Gaussians of these shapes with SH coefficients (N, K, 3)."""
         return Splats(
             means=self.centres.astype(np.float32),
             quats=self.quats.astype(np.float32),
@@ -94,7 +94,7 @@ class Surfels:
         return len(self.points)
 
     def subset(self, keep: BoolArray) -> Surfels:
-        """Those points where ``keep`` (N,) is true."""
+        """Return the surfels where ``keep`` (N,) is true."""
         return Surfels(
             self.points[keep], self.frames[keep], self.scales[keep], self.faces[keep], self.barycentric[keep]
         )
@@ -103,14 +103,14 @@ class Surfels:
 def place_surfels(
     mesh: trimesh.Trimesh, density: npt.ArrayLike, count: int, rng: np.random.Generator, *, spread: float = 0.72
 ) -> Surfels:
-    """About ``count`` surfels on ``mesh``.
+    """Place about ``count`` surfels on ``mesh``.
 
     Args:
-        mesh: Surface; vertices at one position should be merged, so that creases are known.
+        mesh: Surface. Vertices at the same position should be merged, so that creases are found.
         density: Relative density of points on every face, shape (F,), > 0.
-        count: How many points to aim for.
-        rng: Source of randomness.
-        spread: Standard deviation along the surface in units of the local spacing.
+        count: Target number of surfels.
+        rng: Random generator.
+        spread: Standard deviation along the surface, in units of the local spacing.
     """
     area = mesh.area_faces
     density = np.broadcast_to(np.asarray(density, dtype=np.float64), area.shape)
@@ -139,16 +139,16 @@ def place_surfels(
 
 @dataclass(frozen=True, eq=False)
 class _Pool:
-    """Candidates, several per surfel, dense where surfels shall be dense.
+    """Candidate points, several per surfel, with a density in proportion to that of the surfels.
 
     Attributes:
         points: Positions [m], shape (P, 3).
         normals: Unit normals of their faces, shape (P, 3).
-        faces: Shape (P,).
-        barycentric: Shape (P, 3).
-        radius: Distance to keep from other surfels [m], shape (P,).
+        faces: Face indices, shape (P,).
+        barycentric: Barycentric coordinates, shape (P, 3).
+        radius: Minimum distance to other surfels [m], shape (P,).
         crease_distance: Distance to the nearest crease [m], infinite where it is far, shape (P,).
-        uneven: Whether a crease or a bend may be near, shape (P,).
+        uneven: Mask of the points near a possible crease or bend, shape (P,).
     """
 
     points: Float64Array
@@ -163,11 +163,11 @@ class _Pool:
     def draw(
         cls, mesh: trimesh.Trimesh, spacing: Float64Array, creases: _CreaseIndex, rng: np.random.Generator
     ) -> _Pool:
-        """Candidates for surfels ``spacing`` (F,) apart, closer together near creases and where the surface bends."""
+        """Draw candidates for surfels at distances ``spacing`` (F,), which are reduced near creases and bends."""
         expected = mesh.area_faces / spacing**2
         points, faces, barycentric = _draw(mesh, expected, _CANDIDATES, rng)
         distance, bend = np.full(len(points), np.inf), np.zeros(len(points))
-        # The middle of flat regions, often most of a surface, needs no closer look.
+        # Flat regions, often most of a surface, need no distance queries.
         uneven = _uneven_faces(mesh, spacing, creases)
         reach = float(spacing[uneven].max(initial=0.0))
         look = uneven[faces]
@@ -190,7 +190,7 @@ class _Pool:
 
 
 def _uneven_faces(mesh: trimesh.Trimesh, spacing: Float64Array, creases: _CreaseIndex) -> BoolArray:
-    """Faces (F,) within about a ``spacing`` (F,) of a crease or a bend."""
+    """Return a mask of the faces (F,) within about one ``spacing`` (F,) of a crease or a bend."""
     uneven = np.zeros(len(mesh.faces), dtype=bool)
     uneven[mesh.face_adjacency[mesh.face_adjacency_angles > 1e-3]] = True
     size = np.linalg.norm(mesh.triangles - mesh.triangles_center[:, None], axis=2).max(axis=1)
@@ -202,16 +202,16 @@ def _uneven_faces(mesh: trimesh.Trimesh, spacing: Float64Array, creases: _Crease
 
 
 def _bend(tree: KDTree, normals: Float64Array, reach: Float64Array) -> Float64Array:
-    """Angle [rad], shape (P,), by which the surface bends within ``reach`` (P,) of every point of ``tree``."""
+    """Return the angle [rad], shape (P,), by which the surface bends within ``reach`` (P,) of each tree point."""
     distance, index = _query(tree, tree.data, k=range(1, 1 + min(10, tree.n)))
     cosine = np.einsum("pkd,pd->pk", normals[index], normals)
     return np.asarray(np.arccos(np.clip(np.where(distance < reach[:, None], cosine, 1.0).min(axis=1), -1.0, 1.0)))
 
 
 def _overhang_limit(pool: _Pool, points: Float64Array, frames: Float64Array, sigma: Float64Array) -> Float64Array:
-    """Largest standard deviations (N, 2) along the tangents with which discs stay close to the surface.
+    """Return the maximum standard deviations (N, 2) along the tangents at which discs stay close to the surface.
 
-    Tips at two standard deviations may rise above the nearest bit of surface by a fraction of ``sigma`` (N, 1).
+    Tips at two standard deviations may rise above the nearest surface point by a fraction of ``sigma`` (N, 1).
     """
     tree = KDTree(pool.points)
     limit = np.empty((len(points), 2))
@@ -238,11 +238,11 @@ def poisson_subset(
     rng: np.random.Generator,
     first: Int64Array | None = None,
 ) -> Int64Array:
-    """Indices of a Poisson-disk subset of ``points`` (N, 3): kept points are at least their ``radius`` (N,) apart.
+    """Return indices of a Poisson-disk subset of ``points`` (N, 3), at least their ``radius`` (N,) apart.
 
-    The parallel form of dart throwing (maximal independent set by random priorities, Luby 1986), from fine radii to
-    coarse ones. Opposite ``normals`` (N, 3) count as distance. Points ``first`` (M,) are chosen before all others and
-    may be a little closer together.
+    This is the parallel form of dart throwing (maximal independent set by random priorities, Luby 1986), from small
+    radii to large ones. Opposite ``normals`` (N, 3) count as distance. Points ``first`` (M,) are selected before all
+    others and may be slightly closer together.
     """
     if first is not None and len(first):
         seeds = first[poisson_subset(points[first], normals[first], _ROW_SPACING * radius[first], rng)]
@@ -270,7 +270,7 @@ def poisson_subset(
 
 
 def _independent_set(count: int, pairs: Int64Array, rng: np.random.Generator) -> BoolArray:
-    """Maximal independent set of a graph of ``count`` nodes with edges ``pairs`` (P, 2)."""
+    """Return a maximal independent set of a graph with ``count`` nodes and edges ``pairs`` (P, 2), as a mask."""
     priority = rng.permutation(count)
     alive, chosen = np.ones(count, dtype=bool), np.zeros(count, dtype=bool)
     while alive.any():
@@ -286,7 +286,10 @@ def _independent_set(count: int, pairs: Int64Array, rng: np.random.Generator) ->
 
 
 def _query(tree: KDTree, points: npt.ArrayLike, **options: Any) -> tuple[npt.NDArray[Any], npt.NDArray[Any]]:
-    """Distances and indices of nearest neighbours, by all processors: no point's answer depends on another's."""
+    """Return distances and indices of nearest neighbours.
+
+    All processors are used; the result does not depend on their number.
+    """
     found: tuple[npt.NDArray[Any], npt.NDArray[Any]] = tree.query(points, workers=-1, **options)
     return found
 
@@ -294,7 +297,7 @@ def _query(tree: KDTree, points: npt.ArrayLike, **options: Any) -> tuple[npt.NDA
 def _draw(
     mesh: trimesh.Trimesh, expected: Float64Array, factor: float, rng: np.random.Generator
 ) -> tuple[Float64Array, Int64Array, Float64Array]:
-    """``factor`` times ``expected`` (F,) points per face: positions, faces, barycentric coordinates."""
+    """Draw ``factor`` times ``expected`` (F,) points per face: positions, faces, barycentric coordinates."""
     total = expected.sum()
     count = int(np.ceil(factor * total))
     faces = np.sort(rng.choice(len(expected), size=count, p=expected / total if total > 0 else None))
@@ -307,11 +310,14 @@ def _draw(
 def _frames(
     normals: Float64Array, points: Float64Array, radius: Float64Array, creases: _CreaseIndex
 ) -> tuple[Float64Array, Float64Array]:
-    """Frames (N, 3, 3), first axis towards the nearest crease, and distances (N, 2) [m] to creases along the axes."""
+    """Return frames (N, 3, 3) and distances (N, 2) [m] to creases along their axes.
+
+    The first axis of a frame points to the nearest crease.
+    """
     towards, beside = creases.offsets(points, _CREASE_NEIGHBOURS)
     in_plane = towards - np.einsum("nkd,nd->nk", towards, normals)[..., None] * normals[:, None]
     distance = np.linalg.norm(in_plane, axis=2)
-    # What lies far above or below belongs to another surface.
+    # Creases far above or below belong to another surface.
     distance[distance < 0.5 * np.linalg.norm(towards, axis=2)] = np.inf
     nearest = np.argmin(distance, axis=1)[:, None]
     bounded = np.take_along_axis(distance, nearest, axis=1) < 4.0 * radius[:, None]
@@ -332,7 +338,10 @@ def _closed(
     probes: Float64Array,
     normals: Float64Array,
 ) -> Float64Array:
-    """``scales`` (N, 3), grown up to ``widest`` (N, 2) until little light passes between discs at ``probes`` (P, 3)."""
+    """Enlarge discs until little light passes between them.
+
+    ``scales`` (N, 3) grow up to ``widest`` (N, 2). The transmittance is tested at ``probes`` (P, 3).
+    """
     _, index = _query(KDTree(centres), probes, k=range(1, 1 + min(12, len(centres))))
     own = frames[index]
     local = np.einsum("pkj,pkji->pki", probes[:, None] - centres[index], own[..., :2])
@@ -344,7 +353,7 @@ def _closed(
         leaking = np.prod(1.0 - response, axis=1) > _LEAK
         if not leaking.any():
             break
-        # A gap that is closed stays closed, since discs only grow.
+        # A closed gap stays closed, because discs only grow.
         index, local, facing, response = index[leaking], local[leaking], facing[leaking], response[leaking]
         grown = np.unique(np.take_along_axis(index, np.argpartition(-response, 1, axis=1)[:, :2], axis=1))
         scales[grown, :2] = np.minimum(1.08 * scales[grown, :2], widest[grown])
@@ -353,13 +362,13 @@ def _closed(
 
 @dataclass(frozen=True, eq=False)
 class _CreaseIndex:
-    """Creases and boundaries of a mesh as a dense set of points on them.
+    """Creases and boundaries of a mesh, sampled as points.
 
     Attributes:
-        tree: The points, or None without creases.
-        starts, units, lengths: Edges, one for each face beside them: start [m], direction, length [m].
-        owner: Edge that each point lies on.
-        inward: Directions across the edge into its face and out of the face, shape (E, 2, 3).
+        tree: Search tree of the points; None without creases.
+        starts, units, lengths: Start [m], direction and length [m] of each edge. An edge occurs once per adjacent face.
+        owner: Index of the edge of each point.
+        inward: Direction across the edge into its face, and normal of the face, shape (E, 2, 3).
     """
 
     tree: KDTree | None
@@ -371,11 +380,11 @@ class _CreaseIndex:
 
     @classmethod
     def build(cls, mesh: trimesh.Trimesh, spacing: Float64Array) -> _CreaseIndex:
-        """Points on the creases as far apart as ``spacing`` (F,) [m] says for the faces beside them."""
+        """Sample the creases at the distance ``spacing`` (F,) [m] of their adjacent faces."""
         is_sharp = mesh.face_adjacency_angles > CREASE_ANGLE
         sharp, beside = mesh.face_adjacency_edges[is_sharp], mesh.face_adjacency[is_sharp]
         open_rows = trimesh.grouping.group_rows(mesh.edges_sorted, require_count=1)
-        # A crease counts once for each of its faces.
+        # A crease occurs once per adjacent face.
         edges = np.concatenate([sharp, sharp, mesh.edges_sorted[open_rows]]).astype(int)
         face = np.concatenate([beside[:, 0], beside[:, 1], mesh.edges_face[open_rows]]).astype(int)
         start, along = mesh.vertices[edges[:, 0]], mesh.vertices[edges[:, 1]] - mesh.vertices[edges[:, 0]]
@@ -390,7 +399,7 @@ class _CreaseIndex:
         return cls(tree, start, unit, length, owner, np.stack([inward, mesh.face_normals[face]], axis=1))
 
     def rows(self, pool: _Pool, offset: float) -> Int64Array:
-        """Those candidates (M,) that come nearest to rows along the creases, ``offset`` local spacings inside."""
+        """Return the candidates (M,) nearest to rows along the creases, ``offset`` local spacings inside."""
         if self.tree is None:
             return np.empty(0, dtype=np.int64)
         near = np.flatnonzero(np.isfinite(pool.crease_distance))
@@ -408,19 +417,20 @@ class _CreaseIndex:
 
     @property
     def length(self) -> float:
-        """Length of all creases [m]."""
+        """Total length of all creases [m]."""
         return float(self.lengths.sum())
 
     def distance(self, points: Float64Array, reach: float) -> Float64Array:
-        """Distances (N,) [m] to the nearest crease; infinite beyond ``reach`` [m] or without creases."""
+        """Return distances (N,) [m] to the nearest crease; infinite beyond ``reach`` [m] or without creases."""
         if self.tree is None:
             return np.full(len(points), np.inf)
         return np.asarray(_query(self.tree, points, distance_upper_bound=reach)[0])
 
     def offsets(self, points: Float64Array, count: int) -> tuple[Float64Array, BoolArray]:
-        """Vectors (N, ``count``, 3) to the nearest points of the nearest creases, far away without creases.
+        """Return vectors (N, ``count``, 3) to the nearest points of the nearest creases; they are long without creases.
 
-        And whether those points (N, ``count``) are inside their edges: ends say nothing about the distance across.
+        Also return a mask (N, ``count``) of the points inside their edges. Ends of edges do not define a distance
+        across.
         """
         if self.tree is None:
             return np.full((len(points), count, 3), 1e6), np.zeros((len(points), count), dtype=bool)

@@ -1,7 +1,7 @@
-"""Cameras in OpenCV convention, pinhole, distorted or fisheye, and paths between key cameras.
+"""Cameras in OpenCV convention (pinhole, distorted or fisheye), and paths between key poses.
 
-Conventions are those of :mod:`mitsplat.gaussians.splat_cloud`: x right, y down, z forward in the camera; pixel centres
-at +0.5.
+For conventions see :mod:`mitsplat.gaussians.splat_cloud`: x right, y down, z forward in the camera; pixel centres at
++0.5.
 """
 
 from __future__ import annotations
@@ -21,14 +21,16 @@ from scipy.spatial.transform import Rotation, RotationSpline
 from mitsplat.arrays import Float64Array
 
 Lens = Literal["opencv", "fisheye"]
-"""OpenCV's camera models: rational with tangential distortion, or fisheye."""
+"""OpenCV camera models: rational with tangential distortion, or fisheye."""
 
 FISHEYE_MAX = float(np.radians(85.0))
-"""Widest angle to the optical axis that a fisheye may show [rad]: rays are held as slopes, which grow beyond bounds."""
+"""Maximum angle between a fisheye ray and the optical axis [rad]. Rays are stored as slopes, which diverge at 90
+degrees.
+"""
 
 
 MOST_PIXELS = 16384
-"""Longest side of an image [px]."""
+"""Maximum side length of an image [px]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,19 +40,19 @@ class Camera:
     Attributes:
         width, height: Image size [px].
         fx, fy: Focal lengths [px].
-        cx, cy: Principal point [px], pixel centres at +0.5 (the middle of an image is ``width / 2``).
+        cx, cy: Principal point [px], pixel centres at +0.5 (the centre of an image is ``width / 2``).
         world_from_camera: Rigid transform of camera coordinates to world coordinates [m], shape (4, 4).
-        distortion: OpenCV coefficients ``k1, k2, p1, p2[, k3[, k4, k5, k6]]``, or empty for a pinhole; of a fisheye
-            ``k1, k2, k3, k4``.
-        near: Nearest depth at which anything is seen [m].
+        distortion: OpenCV coefficients ``k1, k2, p1, p2[, k3[, k4, k5, k6]]``, or empty for a pinhole camera; ``k1, k2,
+            k3, k4`` for a fisheye lens.
+        near: Near clipping depth [m].
         lens: ``opencv``, or ``fisheye`` for OpenCV's fisheye model (Kannala and Brandt 2006).
-        aperture_radius: Of a thin lens [m]; 0 for a pinhole, which sees everything sharp.
-        focus_distance: Depth along z that a thin lens sees sharp [m].
+        aperture_radius: Aperture radius of a thin lens [m]; 0 for a pinhole camera, which has no defocus blur.
+        focus_distance: Focus depth of a thin lens along z [m].
 
     Raises:
-        ValueError: If a size is below 1, a focal length is not positive, the pose is not rigid, or the number of
-            distortion coefficients is not 0, 4, 5 or 8 (of a fisheye 4), or if a fisheye shows more than 85 degrees to
-            any side of its axis, or if the aperture is negative or the focus not beyond ``near``.
+        ValueError: If a size is below 1, a focal length is not positive, or the pose is not rigid; if the number of
+            distortion coefficients is not 0, 4, 5 or 8 (4 for a fisheye lens); if a fisheye lens shows more than 85
+            degrees to any side of its axis; or if the aperture is negative or the focus is not beyond ``near``.
     """
 
     width: int
@@ -117,7 +119,9 @@ class Camera:
         distortion: Sequence[float] = (),
         near: float = 0.01,
     ) -> Camera:
-        """Camera at ``eye`` [m] that looks at ``target`` [m] with a horizontal field of view ``fov_x`` [degrees].
+        """Create a camera at ``eye`` [m] that faces ``target`` [m].
+
+        The horizontal field of view is ``fov_x`` [degrees].
 
         Raises:
             ValueError: If ``eye`` equals ``target`` or ``fov_x`` is not between 0 and 180.
@@ -139,10 +143,10 @@ class Camera:
 
     @classmethod
     def from_json(cls, stored: Mapping[str, Any]) -> Camera:
-        """The camera that :meth:`to_json` described.
+        """Return the camera from the values of :meth:`to_json`.
 
         Raises:
-            ValueError: If it is none that could be.
+            ValueError: If the values are invalid.
         """
         ((fx, _, cx), (_, fy, cy), _) = stored["intrinsics"]
         same = ("width", "height", "world_from_camera", "near", "lens", "aperture_radius", "focus_distance")
@@ -150,7 +154,7 @@ class Camera:
         return cls(fx=fx, fy=fy, cx=cx, cy=cy, distortion=tuple(stored["distortion"]), **known)
 
     def to_json(self) -> dict[str, Any]:
-        """The camera as JSON values, as datasets state it; floats survive the round trip exactly."""
+        """Return the camera as JSON values, as in datasets. Floats survive the round trip exactly."""
         return {
             "width": self.width,
             "height": self.height,
@@ -183,7 +187,7 @@ class Camera:
         return self.world_from_camera[:3, 3]
 
     def resized(self, width: int, height: int) -> Camera:
-        """The same camera sampled on another pixel grid that covers the same image."""
+        """Return the same camera with another pixel grid over the same image area."""
         sx, sy = width / self.width, height / self.height
         return replace(
             self,
@@ -196,7 +200,7 @@ class Camera:
         )
 
     def transformed(self, matrix: npt.ArrayLike) -> Camera:
-        """The camera after a similarity transform (4, 4), its near distance scaled."""
+        """Return the camera after a similarity transform (4, 4). The near distance is scaled."""
         matrix = np.asarray(matrix, dtype=np.float64)
         scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
         pose = matrix @ self.world_from_camera
@@ -204,14 +208,14 @@ class Camera:
         return replace(self, world_from_camera=pose, near=self.near * scale)
 
     def cropped(self, left: int, top: int, width: int, height: int) -> Camera:
-        """The camera of a part of the image, which begins at a pixel and may reach beyond the border."""
+        """Return the camera of a part of the image. The part begins at a pixel and may reach beyond the border."""
         return replace(self, width=width, height=height, cx=self.cx - left, cy=self.cy - top)
 
     def project(self, points: npt.ArrayLike) -> tuple[Float64Array, Float64Array]:
-        """Pixel positions (N, 2), lens distortion included, and depths along z [m] (N,) of world points (N, 3).
+        """Project world points (N, 3): return distorted pixel positions (N, 2) and depths along z [m] (N,).
 
-        A point at or behind the camera plane has pixel position NaN. So has a point beyond the angle at which the
-        distortion turns back: its polynomial would place it inside the image, where no ray shows it.
+        A point at or behind the camera plane has pixel position NaN. A point beyond the angle at which the distortion
+        turns back also has NaN, because its polynomial would place the point inside the image, where no ray shows it.
         """
         pose = self.camera_from_world
         local = np.atleast_2d(np.asarray(points, dtype=np.float64)) @ pose[:3, :3].T + pose[:3, 3]
@@ -236,7 +240,9 @@ class Camera:
         return pixels, depth
 
     def undistorted(self, image: npt.NDArray[np.uint8]) -> tuple[npt.NDArray[np.uint8], Camera]:
-        """An image of this camera as a pinhole sees it that sees nothing beyond its border, and that pinhole.
+        """Return an image of this camera resampled for a pinhole camera, and that pinhole camera.
+
+        The pinhole camera shows nothing beyond the border of the image.
 
         Args:
             image: Shape (H, W, C).
@@ -250,7 +256,7 @@ class Camera:
         return np.asarray(pixels, dtype=np.uint8), replace(self, fx=fx, fy=fy, cx=cx, cy=cy, distortion=())
 
     def ray_slopes(self, pixels: npt.ArrayLike) -> Float64Array:
-        """Undistorted ray slopes ``(x / z, y / z)`` in camera space, shape (N, 2), of pixel positions (N, 2)."""
+        """Return undistorted ray slopes ``(x / z, y / z)`` in camera space, shape (N, 2), of pixel positions (N, 2)."""
         pixels = np.asarray(pixels, dtype=np.float64).reshape(-1, 2)
         slopes = (pixels - (self.cx, self.cy)) / (self.fx, self.fy)
         if not self.distortion or not len(slopes):
@@ -272,9 +278,9 @@ class Camera:
 def turning_slope(distortion: tuple[float, ...]) -> float:
     """Return the ray slope at which OpenCV's radial distortion stops growing; infinity if it always grows.
 
-    The distorted radius is ``r N(s) / D(s)`` with ``s = r^2``, ``N = 1 + k1 s + k2 s^2 + k3 s^3`` and
-    ``D = 1 + k4 s + k5 s^2 + k6 s^3``. Its derivative has the sign of ``N D + 2 s (N' D - N D')``. Poles (``D = 0``)
-    end the valid range too. Tangential distortion is small and is left out.
+    The distorted radius is ``r N(s) / D(s)`` with ``s = r^2``, ``N = 1 + k1 s + k2 s^2 + k3 s^3`` and ``D = 1 + k4 s +
+    k5 s^2 + k6 s^3``. Its derivative has the sign of ``N D + 2 s (N' D - N D')``. Poles (``D = 0``) end the valid range
+    too. Tangential distortion is small and is left out.
     """
     k1, k2, _, _, k3, k4, k5, k6 = (*distortion, *(0.0,) * (8 - len(distortion)))
     top, bottom, s = Polynomial([1, k1, k2, k3]), Polynomial([1, k4, k5, k6]), Polynomial([0, 1])
@@ -285,30 +291,34 @@ def turning_slope(distortion: tuple[float, ...]) -> float:
 
 
 def fisheye_radius(angle: Any, k: Sequence[Any]) -> Any:
-    """Distance from the principal point in focal lengths, of rays at an angle to the axis [rad], on host or device."""
+    """Return the distance from the principal point [focal lengths] of rays at an angle to the axis [rad].
+
+    The function works with host and device arrays.
+    """
     square = angle * angle
     return angle * (1 + square * (k[0] + square * (k[1] + square * (k[2] + square * k[3]))))
 
 
 def fisheye_rate(angle: Any, k: Sequence[Any]) -> Any:
-    """Derivative of :func:`fisheye_radius`."""
+    """Return the derivative of :func:`fisheye_radius`."""
     square = angle * angle
     return 1 + square * (3 * k[0] + square * (5 * k[1] + square * (7 * k[2] + square * 9 * k[3])))
 
 
 def direction(azimuth: float, sine: float) -> Float64Array:
-    """Unit vector (3,) at an azimuth [rad], 0 along +x and counter-clockwise from above, and a sine of the elevation.
+    """Return the unit vector (3,) at an azimuth [rad] and a sine of the elevation.
 
-    Azimuths and sines that are uniform give directions that are uniform by area on the sphere (Archimedes).
+    The azimuth is 0 along +x and counter-clockwise seen from above. Uniform azimuths and sines give directions that are
+    uniform by area on the sphere (Archimedes).
     """
     cosine = np.sqrt(1.0 - sine * sine)
     return np.array([cosine * np.cos(azimuth), cosine * np.sin(azimuth), sine])
 
 
 def spiral(sines: Float64Array, turn: float = 0.0) -> Float64Array:
-    """Unit vectors (N, 3) of sines of the elevation (N,), each the golden angle further around, from ``turn`` [rad] on.
+    """Return unit vectors (N, 3) at sines of the elevation (N,) and azimuths in steps of the golden angle.
 
-    Sines that are evenly spaced give directions that are even over the sphere (Fibonacci lattice).
+    The first azimuth is ``turn`` [rad]. Evenly spaced sines give evenly distributed directions (Fibonacci lattice).
     """
     azimuth = np.pi * (3.0 - np.sqrt(5.0)) * np.arange(len(sines)) + turn
     cosine = np.sqrt(1.0 - sines**2)
@@ -316,9 +326,12 @@ def spiral(sines: Float64Array, turn: float = 0.0) -> Float64Array:
 
 
 def look_at_pose(eye: npt.ArrayLike, target: npt.ArrayLike, up: npt.ArrayLike = (0.0, 0.0, 1.0)) -> Float64Array:
-    """``world_from_camera`` (4, 4) of an OpenCV camera at ``eye`` [m] that looks at ``target`` [m].
+    """Return ``world_from_camera`` (4, 4) of an OpenCV camera at ``eye`` [m] that faces ``target`` [m].
 
-    When the view is along ``up`` the image's upper edge points along +y of the world.
+    If the view is parallel to ``up``, the upper edge of the image points along +y of the world.
+
+    Raises:
+        ValueError: If a point is not finite, or if both points are equal.
     """
     eye, target, up = (np.asarray(v, dtype=np.float64) for v in (eye, target, up))
     forward = target - eye
@@ -339,9 +352,9 @@ def look_at_pose(eye: npt.ArrayLike, target: npt.ArrayLike, up: npt.ArrayLike = 
 
 
 def interpolate_poses(key_poses: Sequence[npt.ArrayLike], times: npt.ArrayLike) -> Float64Array:
-    """Poses (M, 4, 4) along a smooth path through ``key_poses`` (K, 4, 4) at ``times`` (M,) in [0, 1].
+    """Return poses (M, 4, 4) on a smooth path through ``key_poses`` (K, 4, 4) at ``times`` (M,) in [0, 1].
 
-    Positions follow a natural cubic spline and orientations a rotation spline (SciPy), keys evenly spaced in time.
+    Positions follow a natural cubic spline, orientations a rotation spline (SciPy). Keys are evenly spaced in time.
     """
     keys = np.asarray(key_poses, dtype=np.float64).reshape(-1, 4, 4)
     times = np.clip(np.atleast_1d(np.asarray(times, dtype=np.float64)), 0.0, 1.0)

@@ -1,4 +1,4 @@
-"""Convex pieces of solids for physics: few of them, close to the surface, in seconds."""
+"""Convex decomposition of solids for physics: few pieces, close to the surface, in seconds."""
 
 from __future__ import annotations
 
@@ -27,32 +27,35 @@ from mitsplat.storage.content_hash import ContentHash
 _logger = logging.getLogger(__name__)
 
 MOST_PIECES = 32
-# Gaps between pieces and the mesh that layouts bear [m], or as a share of the size where that is more.
+# Acceptable gap between pieces and mesh [m], or as a share of the object's size if that is larger.
 _WIDEST_GAP, _GAP_SHARE = 1e-3, 0.005
 _THRESHOLD = 0.02
-# A solid that fills this share of its hull is its hull: what it leaves out is thinner than physics resolves.
+# A solid that fills this share of its hull is replaced by the hull. The difference is below the resolution of physics.
 _CONVEX = 0.9995
-# More parts than this are a scan's debris, which is decomposed as a whole.
+# More parts than this are debris of a scan, which is decomposed as a whole.
 _MOST_PARTS = 64
-# A mesh of more faces is a scan, whose noise is taken off before it is split: by this share of its size, and no more
-# than this [m], a third of what objects may sink into a table, unless it needs more to have few faces.
+# A mesh with more faces is a scan. Its noise is removed first, by this share of its size and at most by this distance
+# [m], a third of the permitted penetration into a table. More is removed if necessary for few faces.
 _SCAN_FACES, _DEVIATION, _MOST_DEVIATION = 3000, 5e-4, 1e-4
 _FEW_FACES, _WORST_ERROR = 5000, 0.003
-# A surface of which sharp valleys are more than this share of all edges, by length, is ragged: no shape, but what is
-# left of a bad fit, and comes apart into more pieces than it has faces. Parts and scans have 0.15 at most.
+# A surface is ragged if sharp valleys have more than this share of the length of all edges. It is the result of a bad
+# fit and would be split into more pieces than it has faces. Parts and scans have 0.15 at most.
 _RAGGED, _RAGGED_THRESHOLD = 0.25, 0.1
-# Of CoACD's search for every cut; a scan has more cuts than it has concavities, and any of them will do.
+# CoACD search iterations per cut. A scan has more cuts than concavities, so any of them is sufficient.
 _ITERATIONS, _SCAN_ITERATIONS = 150, 20
-# Places where a piece may be cut, along each direction.
+# Number of cut planes that are tested along each direction.
 _PLACES = 15
-# Pieces into which a solid is cut before some are joined again, for each that may be left; pairs tried at once.
+# Pieces that are cut before joining, per permitted piece; number of pairs whose joint hull is measured per step.
 _OVERSHOOT, _LIKELY = 2, 32
-# Share of a limit that is aimed for, as gaps are measured at points, and at most how many of them on faces.
+# Safety factor on the limit, because gaps are measured at points; maximum number of sample points on faces; batch size.
 _MARGIN, _SAMPLES, _BATCH = 0.75, 8000, 32
 
 
 def widest_gap(size: float) -> float:
-    """How far an object of a longest extent [m] may be from what it rests on, and its pieces from its mesh [m]."""
+    """Return the acceptable gap [m] for an object with a longest extent [m].
+
+    The gap is that between object and support, and that between convex pieces and mesh.
+    """
     return max(_WIDEST_GAP, _GAP_SHARE * size)
 
 
@@ -61,18 +64,18 @@ def convex_pieces(
 ) -> tuple[trimesh.Trimesh, ...]:
     """Split a solid into convex pieces whose union follows its surface.
 
-    Parts that are convex stay whole. Parts of few faces are split by CoACD (Wei et al., *Approximate Convex
-    Decomposition for 3D Meshes with Collision-Aware Concavity and Tree Search*, 2022), whose search takes minutes for
-    scans: these are cut where that takes most empty space out of their hulls, until the pieces stand off the surface by
-    no more than layouts bear, or are as many as they may be; :func:`mitsplat.geometry.mesh_distance.standoff` tells how
-    far they do. The result is kept in memory and in ``$XDG_CACHE_HOME/mitsplat/pieces`` (``~/.cache`` by default), by
-    the hash of the mesh.
+    Convex parts stay whole. Parts with few faces are split by CoACD (Wei et al., *Approximate Convex Decomposition for
+    3D Meshes with Collision-Aware Concavity and Tree Search*, 2022), whose search would take minutes for scans. Scans
+    are cut by the planes that remove most empty volume from the convex hulls. Cutting ends when the gap between pieces
+    and surface is acceptable for layouts, or at the maximum number of pieces.
+    :func:`mitsplat.geometry.mesh_distance.standoff` measures the gap. The result is cached in memory and in
+    ``$XDG_CACHE_HOME/mitsplat/pieces`` (``~/.cache`` by default) by the hash of the mesh.
 
     Args:
         mesh: Surface of one object [m].
-        threshold: Concavity at which a piece counts as convex, relative to half of the part's size; of a scan what
-            stands off by that share of what layouts bear at the default.
-        most: Pieces of a scan that is closed.
+        threshold: Concavity below which a piece counts as convex, relative to half of the part's size. For scans, the
+            acceptable gap is scaled by the ratio of the threshold to its default.
+        most: Maximum number of pieces of a closed scan.
     """
     vertices = np.ascontiguousarray(mesh.vertices, dtype=np.float64)
     faces = np.ascontiguousarray(mesh.faces, dtype=np.int64)
@@ -94,9 +97,9 @@ def _cached_pieces(vertices: bytes, faces: bytes, threshold: float, most: int) -
 
 
 def _parts(mesh: trimesh.Trimesh) -> list[trimesh.Trimesh]:
-    """Closed solids that a mesh is made of; the mesh itself where it is open. Cavities are left out."""
+    """Return the closed solids of a mesh, without cavities; or the mesh itself if it is open."""
     if not mesh.is_watertight:
-        mesh.fill_holes()  # a triangle or two that scans lack
+        mesh.fill_holes()  # scans lack a few triangles
     if not mesh.is_watertight:
         return [mesh]
     parts = [part for part in mesh.split(only_watertight=False) if part.volume > 0]
@@ -125,12 +128,12 @@ def _split(part: trimesh.Trimesh, threshold: float, most: int) -> list[trimesh.T
         seed=0,
     )
     pieces = [trimesh.Trimesh(vertices, faces, process=False).convex_hull for vertices, faces in found]
-    # Slivers carry no contact that their neighbours lack, and have no hull in single precision.
+    # Slivers add no contact to those of their neighbours and have no hull in single precision.
     return [piece for piece in pieces if piece.volume > 1e-6 * hull.volume]
 
 
 def _valleys(mesh: trimesh.Trimesh) -> float:
-    """Share of the edges, by length, at which the surface folds inwards by more than :data:`SHARP`."""
+    """Return the share of edges, by length, at which the surface folds inwards by more than :data:`SHARP`."""
     ends = mesh.vertices[mesh.face_adjacency_edges]
     lengths = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
     sharp = ~mesh.face_adjacency_convex & (mesh.face_adjacency_angles > SHARP)
@@ -138,7 +141,10 @@ def _valleys(mesh: trimesh.Trimesh) -> float:
 
 
 def thin_solid(solid: trimesh.Trimesh) -> trimesh.Trimesh:
-    """A closed surface without its noise, of 5000 faces or as few as keep it within 0.3 % of the size (diagonal)."""
+    """Simplify a closed surface and remove its noise.
+
+    The result has at most 5000 faces, or the minimum number within 0.3 % of the size (diagonal).
+    """
     tolerance = min(_DEVIATION * solid.scale, _MOST_DEVIATION)
     thin = simplify_solid(solid, tolerance)
     while len(thin.faces) > _FEW_FACES:
@@ -151,7 +157,7 @@ def thin_solid(solid: trimesh.Trimesh) -> trimesh.Trimesh:
 
 
 def _largest_distance(first: trimesh.Trimesh, second: trimesh.Trimesh) -> float:
-    """Of either surface's vertices and some points of its faces from the other [m]."""
+    """Return the maximum distance between two surfaces [m], at the vertices and sample points of each."""
     points = [np.concatenate([mesh.vertices, mesh.sample(_SAMPLES, seed=0)]) for mesh in (first, second)]
     surfaces = DistanceSurface(first), DistanceSurface(second)
     return max(float(surface.nearest(other)[2].max()) for surface, other in zip(surfaces, points[::-1], strict=True))
@@ -159,7 +165,13 @@ def _largest_distance(first: trimesh.Trimesh, second: trimesh.Trimesh) -> float:
 
 @dataclass(frozen=True, eq=False)
 class _Piece:
-    """What is left of a solid in one cell, its convex hull, and how far that stands off the solid [m]."""
+    """Part of a solid in one cell.
+
+    Attributes:
+        body: The part.
+        hull: Its convex hull.
+        gap: Maximum distance of the hull from the solid [m].
+    """
 
     body: manifold3d.Manifold
     hull: manifold3d.Manifold
@@ -167,24 +179,29 @@ class _Piece:
 
 
 class _Cutter:
-    """Cuts a solid by planes: always the piece that stands off most, and where most empty space leaves the hulls.
+    """Recursive cutting of a solid by planes.
 
-    That is weighted with the hull's volume: a rim is worth cutting off a can although its own hull is as empty.
+    The piece with the largest gap is cut next, by the plane that removes most empty volume from the hulls. The empty
+    volume is weighted with the volume of the hull. This cuts the rim off a can, although the hull of the rim is as
+    empty.
 
     Args:
         part: The solid.
-        limit: How far pieces may stand off it [m].
+        limit: Acceptable gap between pieces and solid [m].
     """
 
     def __init__(self, part: trimesh.Trimesh, limit: float) -> None:
         self._solid = _manifold(thin_solid(part))
         self._surface, self._limit = DistanceSurface(part), _MARGIN * limit
-        self._least = 1e-6 * self._solid.hull().volume()  # slivers carry no contact that their neighbours lack
+        self._least = 1e-6 * self._solid.hull().volume()  # slivers add no contact
         self._points = _mesh(self._solid).vertices
         self._touching = 1e-4 * part.scale
 
     def pieces(self, most: int) -> list[trimesh.Trimesh]:
-        """Convex pieces, at most so many: some more that are joined where that costs least."""
+        """Return at most ``most`` convex pieces.
+
+        More pieces are cut at first. They are then joined where that adds the smallest gap.
+        """
         pieces = [self._piece(self._solid)]
         done: list[_Piece] = []
         while pieces and len(pieces) + len(done) < _OVERSHOOT * most:
@@ -204,7 +221,7 @@ class _Cutter:
         return _Piece(body, hull, self._gap(hull))
 
     def _gap(self, hull: manifold3d.Manifold) -> float:
-        """How far a hull stands off the solid [m], or 0 if that is less than the limit."""
+        """Return the maximum distance of a hull from the solid [m]; 0 if it is below the limit."""
         mesh = _mesh(hull)
         low, high = mesh.bounds
         inside = self._points[((self._points > low) & (self._points < high)).all(axis=1)]
@@ -218,7 +235,7 @@ class _Cutter:
         return farthest_outside(self._surface, points, least=self._limit, batch=_BATCH)
 
     def _joined(self, pieces: Sequence[_Piece], most: int) -> list[manifold3d.Manifold]:
-        """Hulls of one or more pieces: joined where that stands off no more than it may, or if there are too many."""
+        """Join pieces if the gap of their common hull is acceptable, or if there are too many; return all hulls."""
         hulls: dict[int, manifold3d.Manifold] = {}
         joints: dict[tuple[int, int], tuple[float, manifold3d.Manifold]] = {}
         gaps: dict[tuple[int, int], float] = {}
@@ -236,7 +253,7 @@ class _Cutter:
         for piece in pieces:
             add(next(numbers), piece.hull)
         while joints:
-            # Gaps take long to measure: only of those that add least empty space.
+            # Gaps are slow to measure, so only the pairs that add the least empty volume are tested.
             likely = sorted(joints, key=lambda pair: (joints[pair][0], pair))[:_LIKELY]
             gaps |= {pair: self._gap(joints[pair][1]) for pair in likely if pair not in gaps}
             pair = min(likely, key=lambda pair: (gaps[pair], pair))
@@ -251,11 +268,13 @@ class _Cutter:
 
 
 def _best_cut(body: manifold3d.Manifold, thinnest: float) -> list[manifold3d.Manifold]:
-    """Connected parts of a body, on both sides of the plane that leaves least in hulls; itself where none helps.
+    """Return the connected parts of a body on both sides of the plane with the least empty volume.
+
+    If no plane is valid, the body itself is returned.
 
     Args:
-        body: What to cut.
-        thinnest: Distance of the plane from where the body ends [m].
+        body: Body to cut.
+        thinnest: Minimum distance of the plane from the ends of the body [m].
     """
     mesh = _mesh(body)
     _, principal = np.linalg.eigh(np.cov(mesh.vertices.T))
@@ -281,15 +300,15 @@ def _best_cut(body: manifold3d.Manifold, thinnest: float) -> list[manifold3d.Man
 
 
 def _emptiness(mesh: trimesh.Trimesh, heights: Float64Array, origin: Float64Array) -> float:
-    """Of the hulls of what is above and below a plane through ``origin``: each one's empty volume times its volume."""
+    """Return the sum over the hulls on both sides of a plane through ``origin`` of empty volume times hull volume."""
     above = heights > 0
     if above.all() or not above.any():
         return np.inf
     ends = mesh.edges_unique[above[mesh.edges_unique].sum(axis=1) == 1]
     share = heights[ends[:, 0]] / (heights[ends[:, 0]] - heights[ends[:, 1]])
     rim = mesh.vertices[ends[:, 0]] + share[:, None] * (mesh.vertices[ends[:, 1]] - mesh.vertices[ends[:, 0]])
-    # Volumes from tetrahedra with their tips in the plane, so that the cut's own face adds nothing. If the plane cuts
-    # one corner off a triangle, that part's is in proportion to the shares of both edges that are cut.
+    # Tetrahedra have their tips in the plane, so that the cut face adds no volume. If the plane cuts one corner off a
+    # triangle, the volume of that corner is proportional to the product of the cut shares of both edges.
     volumes = np.linalg.det(mesh.triangles - origin) / 6
     corners = heights[mesh.faces]
     high = (corners > 0).sum(axis=1)

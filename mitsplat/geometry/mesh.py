@@ -1,4 +1,4 @@
-"""Proxy meshes for physics: mass and inertia, and the checks before them."""
+"""Proxy meshes for physics: validation, mass and inertia."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from mitsplat.errors import InputError
 
 _logger = logging.getLogger(__name__)
 
-# Sizes outside of this range are wrong units, not objects of a workcell.
+# Sizes outside of this range indicate wrong units [m].
 _SMALLEST, _LARGEST = 5e-4, 20.0
-# More triangles than this say nothing about how an object lies, and take CoACD hours.
+# More triangles do not change how an object rests, and CoACD takes hours for them.
 _MOST_FACES = 200_000
-# Faces that meet at a larger angle form an edge that can poke into something [rad].
+# Minimum angle between faces at an edge that can penetrate another object [rad].
 SHARP = 0.17
 
 
@@ -29,9 +29,9 @@ class MassProperties:
     """Inertial properties of a rigid body in its own frame.
 
     Attributes:
-        mass: [kg].
+        mass: Mass [kg].
         centre: Centre of mass [m], shape (3,).
-        inertia: Inertia tensor about the centre of mass, axes of the frame [kg m^2], shape (3, 3).
+        inertia: Inertia tensor about the centre of mass, along the axes of the frame [kg m^2], shape (3, 3).
     """
 
     mass: float
@@ -40,14 +40,14 @@ class MassProperties:
 
 
 def check_size(mesh: trimesh.Trimesh, name: str) -> float:
-    """Its longest extent [m].
+    """Return the longest extent of a mesh [m].
 
     Args:
         mesh: Surface [m].
-        name: What to call it in an error.
+        name: Name of the mesh in error messages.
 
     Raises:
-        InputError: The mesh is empty, not finite, or its size tells of wrong units.
+        InputError: If the mesh is empty, is not finite, or has a size that indicates wrong units.
     """
     if len(mesh.faces) == 0:
         raise InputError(f"{name}: the mesh must have faces (got none)")
@@ -63,25 +63,25 @@ def check_size(mesh: trimesh.Trimesh, name: str) -> float:
 
 
 def prepare_mesh(mesh: trimesh.Trimesh, name: str, *, solid: bool = True) -> trimesh.Trimesh:
-    """Return a welded copy for physics, wound so that it encloses a positive volume, of 200,000 triangles at most.
+    """Return a welded copy for physics, with at most 200,000 triangles.
 
-    What is repaired is logged in one sentence.
+    Faces are oriented so that the volume is positive. Repairs are logged in one sentence.
 
     Args:
-        mesh: Surface [m]; may be wound inside out or have holes.
-        name: What to call it in an error.
-        solid: Whether it must enclose a volume: objects must, a scan of the surroundings need not.
+        mesh: Surface [m]; it may be inside out or have holes.
+        name: Name of the mesh in messages.
+        solid: True if the mesh must enclose a volume, as objects must. A scan of the environment need not.
 
     Raises:
-        InputError: The mesh is empty, not finite, has no volume, or its size tells of wrong units.
+        InputError: If the mesh is empty, is not finite, has no volume, or has a size that indicates wrong units.
     """
     size = check_size(mesh, name)
     welded = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     welded.merge_vertices(merge_tex=True, merge_norm=True)
     welded.update_faces(welded.nondegenerate_faces())
     welded.remove_unreferenced_vertices()
-    welded.fill_holes()  # of three or four edges, such as slivers leave
-    # Divergence theorem: tetrahedra from the origin to each triangle.
+    welded.fill_holes()  # of three or four edges, where slivers were removed
+    # Divergence theorem: sum of the tetrahedra from the origin to each triangle.
     volume = float(np.linalg.det(welded.triangles).sum()) / 6
     if volume < 0:
         _logger.warning("%s: the mesh is wound inside out; physics turns its faces", name)
@@ -103,13 +103,13 @@ def mass_properties(
     density: float,
     mass: float | None = None,
 ) -> MassProperties:
-    """Integrate a uniform density over a mesh, or over its convex pieces where the mesh is not watertight.
+    """Integrate a uniform density over a mesh, or over its convex pieces if the mesh is not watertight.
 
     Args:
         mesh: Surface of the object [m].
-        pieces: Convex pieces of the same object; they may overlap by a little.
-        density: [kg/m^3]; ignored where ``mass`` is given.
-        mass: [kg] or None.
+        pieces: Convex pieces of the same object; they may overlap slightly.
+        density: Density [kg/m^3]; ignored if ``mass`` is given.
+        mass: Mass [kg] or None.
     """
     solid = solid_of(mesh, pieces)
     actual_density = density if mass is None else mass / float(solid.volume)
@@ -121,20 +121,20 @@ def mass_properties(
 
 
 def solid_of(mesh: trimesh.Trimesh, pieces: Sequence[trimesh.Trimesh]) -> trimesh.Trimesh:
-    """What has a volume: the mesh if it is closed, else its convex pieces."""
+    """Return the mesh if it is closed, else its joined convex pieces."""
     return mesh if mesh.is_watertight and mesh.is_winding_consistent else join_meshes(pieces)
 
 
 def join_meshes(meshes: Sequence[trimesh.Trimesh]) -> trimesh.Trimesh:
-    """All triangles as one mesh."""
+    """Return all triangles as one mesh."""
     return cast(trimesh.Trimesh, trimesh.util.concatenate(list(meshes)))
 
 
 def contact_points(mesh: trimesh.Trimesh) -> Float64Array:
-    """Points that touch first when two solids meet: vertices, and points along sharp edges; shape (N, 3) [m].
+    """Return the points at which two solids touch first: vertices, and samples of sharp edges; shape (N, 3) [m].
 
-    Where two polyhedra overlap, a vertex of one is inside the other or two edges cross; edges are sampled every 0.5 mm,
-    or 1 % of the size where that is more.
+    If two polyhedra overlap, a vertex of one is inside the other, or two edges cross. Edges are sampled every 0.5 mm,
+    or every 1 % of the size if that is larger.
     """
     ends = mesh.vertices[mesh.face_adjacency_edges[mesh.face_adjacency_angles > SHARP]]
     lengths = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
@@ -147,7 +147,7 @@ def contact_points(mesh: trimesh.Trimesh) -> Float64Array:
 
 
 def simplify_solid(solid: trimesh.Trimesh, tolerance: float) -> trimesh.Trimesh:
-    """A closed surface of fewer faces that follows another to about a ``tolerance`` [m] (Manifold's simplification)."""
+    """Return a closed surface with fewer faces, within about ``tolerance`` [m] of the original (by Manifold)."""
     vertices, faces = solid.vertices.astype(np.float32), solid.faces.astype(np.uint32)
     mesh = manifold3d.Manifold(manifold3d.Mesh(vertices, faces)).simplify(tolerance).to_mesh()
     simple = trimesh.Trimesh(mesh.vert_properties[:, :3].astype(np.float64), mesh.tri_verts, process=False)
@@ -155,10 +155,10 @@ def simplify_solid(solid: trimesh.Trimesh, tolerance: float) -> trimesh.Trimesh:
 
 
 def check_faces(mesh: trimesh.Trimesh, source: object) -> None:
-    """Refuse faces of vertices that are not there, which readers of files let pass.
+    """Check that all faces refer to existing vertices, which file readers do not check.
 
     Raises:
-        InputError: Which begins with the ``source`` of the mesh.
+        InputError: If a face refers to a missing vertex. The message begins with the ``source`` of the mesh.
     """
     if mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.vertices):
         raise InputError(

@@ -1,4 +1,4 @@
-"""Signed distances between placed meshes, by Warp's mesh queries."""
+"""Signed distances between placed meshes, computed by mesh queries of Warp."""
 
 # Kernels are Python by syntax only.
 # mypy: disable-error-code="attr-defined, index, no-untyped-call, untyped-decorator"
@@ -19,15 +19,15 @@ from mitsplat.runtime.warp_start import quiet_warp
 
 _SAMPLES, _BATCH = 4000, 256
 ROUNDING = 1e-6
-"""By how much distances in single precision may err [m], and more."""
-_FAR = 1e6  # farther than any inside point is from its surface [m]
+"""Upper bound of the error of distances in single precision [m]."""
+_FAR = 1e6  # beyond the distance of any inside point from its surface [m]
 
 
 class DistanceSurface:
-    """A mesh that answers how far points are from it, and the points that would touch another first.
+    """Mesh for distance queries, with the points that touch another mesh first.
 
-    Inside is where the generalised winding number says so (Jacobson et al., *Robust Inside-Outside Segmentation using
-    Generalized Winding Numbers*, 2013), so holes in a scan do no harm.
+    Inside and outside are defined by the generalised winding number (Jacobson et al., *Robust Inside-Outside
+    Segmentation using Generalized Winding Numbers*, 2013). Holes in a scan are therefore harmless.
 
     Attributes:
         points: Contact points in the mesh's frame [m], shape (N, 3).
@@ -44,7 +44,7 @@ class DistanceSurface:
 
     @quiet_warp()
     def signed_distances(self, points: Float64Array) -> Float32Array:
-        """Distance of each point (N, 3) [m], in the mesh's frame, to the surface; negative inside."""
+        """Return the distance of each point (N, 3) [m], in the mesh's frame, to the surface; negative inside."""
         distances = wp.empty(len(points), dtype=wp.float32, device="cpu")
         wp.launch(
             _signed_distances,
@@ -58,7 +58,7 @@ class DistanceSurface:
 
     @quiet_warp()
     def nearest(self, points: Float64Array) -> tuple[Float64Array, Float64Array, Float64Array]:
-        """The surface's points (N, 3) that are nearest to ``points`` (N, 3), unit normals (N, 3), distances (N,)."""
+        """Return the surface points (N, 3) nearest to ``points`` (N, 3), unit normals (N, 3) and distances (N,)."""
         positions, normals = (wp.empty(len(points), dtype=wp.vec3, device="cpu") for _ in range(2))
         wp.launch(
             _nearest_points,
@@ -72,10 +72,10 @@ class DistanceSurface:
 
 
 class PlacedSurface:
-    """A surface at a pose.
+    """Surface at a pose.
 
     Attributes:
-        name: What to call it.
+        name: Name of the surface.
         size: Longest extent [m], to which tolerances relate.
         points: Contact points in world space [m], shape (N, 3).
         bounds: Corners of their bounding box, shape (2, 3).
@@ -90,7 +90,7 @@ class PlacedSurface:
         self._surface, self._pose = surface, pose
 
     def signed_distance(self, points: Float64Array, reach: float) -> float:
-        """Smallest signed distance [m] of world-space points (N, 3); ``reach`` where none is that near."""
+        """Return the smallest signed distance [m] of world-space points (N, 3), at most ``reach``."""
         near = points[((points > self.bounds[0] - reach) & (points < self.bounds[1] + reach)).all(axis=1)]
         if not len(near):
             return reach
@@ -98,16 +98,20 @@ class PlacedSurface:
 
     @quiet_warp()
     def signed_distances(self, points: Float64Array) -> Float32Array:
-        """Distance of each world-space point (N, 3) [m] to the surface; negative inside."""
+        """Return the distance of each world-space point (N, 3) [m] to the surface; negative inside."""
         return self._surface.signed_distances((points - self._pose[:3, 3]) @ self._pose[:3, :3])
 
 
 @dataclass(frozen=True)
 class Clearance:
-    """How closely a pair comes: ``distance`` [m] is negative where they overlap, by the depth of the deepest point.
+    """Clearance of a pair of surfaces.
 
-    Points are vertices and edge samples, so faces that overlap exactly flush (two equal boxes shifted along one axis)
-    are not seen; resting objects are never so aligned.
+    Distances are measured at vertices and edge samples. Faces that overlap exactly flush (two equal boxes shifted along
+    one axis) are therefore not detected; resting objects are never so aligned.
+
+    Attributes:
+        first, second: The surfaces.
+        distance: Smallest distance [m]. If the surfaces overlap, minus the depth of the deepest point.
     """
 
     first: PlacedSurface
@@ -116,12 +120,12 @@ class Clearance:
 
 
 def clearance(first: PlacedSurface, second: PlacedSurface, *, reach: float) -> Clearance:
-    """Smallest signed distance [m] between two surfaces; at most ``reach``, beyond which nothing is measured."""
+    """Return the smallest signed distance [m] between two surfaces, at most ``reach``."""
     apart = (first.bounds[0] > second.bounds[1] + reach) | (second.bounds[0] > first.bounds[1] + reach)
     if apart.any():
         return Clearance(first, second, reach)
     distance = second.signed_distance(first.points, reach)
-    # The other way only what is nearer counts; of points in a mesh, which may have holes, all count.
+    # In the other direction only smaller distances matter. Overlaps always matter, because the meshes may have holes.
     nearer = reach if distance < 0 else distance + ROUNDING
     return Clearance(first, second, min(distance, first.signed_distance(second.points, nearer)))
 
@@ -129,15 +133,15 @@ def clearance(first: PlacedSurface, second: PlacedSurface, *, reach: float) -> C
 def all_clearances(
     objects: Sequence[PlacedSurface], colliders: Sequence[PlacedSurface], *, reach: float
 ) -> list[Clearance]:
-    """Clearances of every object from every other and from every collider."""
+    """Return the clearances between all objects, and between every object and every collider."""
     pairs = [*combinations(objects, 2), *((item, collider) for item in objects for collider in colliders)]
     return [clearance(first, second, reach=reach) for first, second in pairs]
 
 
 def standoff(surface: DistanceSurface, pieces: Sequence[trimesh.Trimesh]) -> float:
-    """How far convex pieces stand off the mesh that they stand for [m]: the widest gap that they can leave at rest.
+    """Return the maximum distance of convex pieces from the mesh that they replace [m], which bounds gaps at rest.
 
-    Measured at their vertices, edges and 4000 points of their faces.
+    It is measured at vertices, at edges, and at 4000 points on faces.
     """
     samples, _ = trimesh.sample.sample_surface(join_meshes(pieces), _SAMPLES, seed=0)
     return farthest_outside(surface, np.concatenate([*(contact_points(piece) for piece in pieces), samples]))
@@ -146,10 +150,11 @@ def standoff(surface: DistanceSurface, pieces: Sequence[trimesh.Trimesh]) -> flo
 def farthest_outside(
     surface: DistanceSurface, points: Float64Array, *, least: float = 0.0, batch: int = _BATCH
 ) -> float:
-    """Distance from a mesh of the farthest of points (N, 3) that are outside of it [m]; 0 if none is by ``least``.
+    """Return the maximum distance from a mesh of those points (N, 3) that are outside of it [m].
 
-    Which side of a mesh a point is on costs ten times what its distance does: the farthest points are asked first, and
-    none after the first ``batch`` of which one is outside.
+    Distances below ``least`` count as 0. The side of a point costs ten times as much as its distance. Sides are
+    therefore computed in order of decreasing distance, and only up to the first ``batch`` that contains an outside
+    point.
     """
     distances = surface.nearest(points)[2]
     farthest_first = np.argsort(-distances, kind="stable")[: int((distances >= least).sum())]

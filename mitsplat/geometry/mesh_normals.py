@@ -8,11 +8,18 @@ import trimesh
 from mitsplat.arrays import Float64Array
 
 CREASE_ANGLE = np.radians(28.0)
-"""Dihedral angle above which an edge is a crease [rad]: Gaussians must not cross it, normals are not smoothed."""
+"""Dihedral angle above which an edge is a crease [rad]. Gaussians must not cross creases; normals are not smoothed
+there.
+"""
 
 
 def corner_normals(mesh: trimesh.Trimesh, *, crease_angle: float = CREASE_ANGLE) -> Float64Array:
-    """Unit normals (F, 3, 3) at the corners of faces, smooth except across creases [rad], weighted by area."""
+    """Return area-weighted unit normals (F, 3, 3) at the corners of faces, smooth except across creases.
+
+    Args:
+        mesh: The mesh.
+        crease_angle: Dihedral angle above which an edge is a crease [rad].
+    """
     corner = np.repeat(np.arange(len(mesh.faces)), 3)
     incidence = mesh.faces_sparse.astype(np.float64)
     pairs = (incidence.T @ incidence).tocoo()
@@ -29,12 +36,15 @@ def corner_normals(mesh: trimesh.Trimesh, *, crease_angle: float = CREASE_ANGLE)
 
 
 def _flat_normals(mesh: trimesh.Trimesh) -> Float64Array:
-    """Unit normals (F, 3) of faces: of slivers too, which trimesh gives none and whose reflections would be NaN."""
+    """Return unit normals (F, 3) of faces, including slivers.
+
+    trimesh returns zero normals for slivers, whose reflections would be NaN.
+    """
     normals = np.array(mesh.face_normals, dtype=np.float64)
     none = ~normals.any(axis=1)
     if none.any():
         corners = mesh.triangles[none]
-        # Scaled first, so that the product of two tiny edges does not vanish.
+        # The edges are scaled first, so that the product of two tiny edges does not underflow.
         edges = (corners[:, 1:] - corners[:, :1]) / np.maximum(np.ptp(corners, axis=(1, 2), keepdims=True), 1e-300)
         across = np.cross(edges[:, 0], edges[:, 1])
         length = np.linalg.norm(across, axis=1, keepdims=True)

@@ -1,4 +1,4 @@
-"""Points and triangle meshes, without a simulator: what is inside, what is near, what a surface is made of."""
+"""Queries on points and triangle meshes without a simulator."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ import trimesh
 
 from mitsplat.arrays import BoolArray, Float64Array
 
-_PAIRS = 1_000_000  # of a point and a triangle that are looked at together
+_PAIRS = 1_000_000  # point-triangle pairs per chunk
 
 
 def points_inside(mesh: trimesh.Trimesh, points: Float64Array) -> BoolArray:
-    """Which of some points (N, 3) are inside a mesh: around which it winds, as often as not (Jacobson et al. 2013).
+    """Return a mask of the points (N, 3) inside a mesh, by the generalised winding number (Jacobson et al. 2013).
 
-    The solid angles of its triangles are those of Van Oosterom and Strackee (1983).
-    :class:`mitsplat.geometry.mesh_distance.DistanceSurface` finds the same faster, once physics has been started, for
-    which no check should wait.
+    The solid angles of the triangles follow Van Oosterom and Strackee (1983).
+    :class:`mitsplat.geometry.mesh_distance.DistanceSurface` is faster but needs Warp, whose start would delay preflight
+    checks.
     """
     low, high = mesh.bounds
     inside = ((points > low) & (points < high)).all(axis=1)

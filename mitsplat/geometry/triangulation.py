@@ -1,4 +1,4 @@
-"""Points where rays of several cameras meet."""
+"""Triangulation of points from rays of several cameras."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from mitsplat.arrays import Float64Array
 from mitsplat.geometry.camera import Camera
 
 MAX_ERROR = 3.0
-"""Reprojection error from which an observation is an outlier [px]."""
+"""Reprojection error above which an observation is an outlier [px]."""
 
 
 def triangulate(observations: Sequence[tuple[Camera, Float64Array]]) -> Float64Array | None:
-    """The point (3,) that cameras see at pixels (2,), or None where fewer than three agree on one.
+    """Return the point (3,) that cameras observe at pixels (2,); None if fewer than three observations agree.
 
-    The point nearest to all rays starts a search for the least robust reprojection error; observations off by more
-    than :data:`MAX_ERROR` are then left out.
+    The search for the minimum robust reprojection error starts at the point nearest to all rays. Observations with
+    errors above :data:`MAX_ERROR` are then removed one by one.
     """
     observations = list(observations)
     while len(observations) >= 3:
@@ -44,9 +44,9 @@ def triangulate(observations: Sequence[tuple[Camera, Float64Array]]) -> Float64A
 
 
 def meeting_point(origins: Float64Array, directions: Float64Array) -> Float64Array:
-    """The point (3,) nearest to all lines through ``origins`` (N, 3) along unit ``directions`` (N, 3)."""
+    """Return the point (3,) nearest to all lines through ``origins`` (N, 3) along unit ``directions`` (N, 3)."""
     across = np.eye(3) - directions[:, :, None] * directions[:, None, :]
-    # A grain of the identity: lines that are all parallel have no such point.
+    # A small multiple of the identity regularises the case of parallel lines, which have no unique nearest point.
     whole = across.sum(axis=0) + 1e-9 * np.eye(3)
     right = np.einsum("nij,nj->i", across, origins) + 1e-9 * origins.mean(axis=0)
     return np.asarray(np.linalg.solve(whole, right))

@@ -1,4 +1,4 @@
-"""Reading of mesh files of others: tried in a process with bounded memory and time before it is done in this one."""
+"""Mesh files from untrusted sources: a trial read in a process with bounded memory and time."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from mitsplat.runtime.child_process import run_bounded
 from mitsplat.storage.files import MESH_ERRORS
 
 ARCHIVES = (".zip", ".bz2", ".gz", ".tar")
-"""Suffixes of archives, which are unpacked by who has looked into them."""
+"""Suffixes of archives, which are refused so that the user unpacks and inspects them."""
 
 _SECONDS = 120
 _MEMORY = 1 << 30
 _SWELLS = 100
-"""Memory that a reader may take for a byte of a file."""
+"""Permitted memory of a reader per byte of the file."""
 _LARGEST = 1 << 30
-"""Size of the largest file: 21 million triangles as binary STL [bytes]."""
+"""Maximum file size: 21 million triangles as binary STL [bytes]."""
 _HEADER = 4096
 _PLAIN_PLY = re.compile(
     rb"ply\r?\nformat binary_little_endian 1\.0\r?\n(?:comment [^\n]*\n)*element vertex (\d{1,12})\r?\n"
@@ -34,13 +34,13 @@ _WIDTHS = {b"float": 4, b"float32": 4, b"double": 8, b"float64": 8, b"uchar": 1,
 
 
 def check_mesh(path: Path) -> None:
-    """Refuse a mesh file whose reader takes more memory or time than the file warrants, or crashes.
+    """Refuse a mesh file whose reader crashes or takes more memory or time than its size justifies.
 
-    Binary triangles (.stl, .ply) that fill their file as its header says are not tried: their reader takes a few times
-    their size. What else a reader refuses is left for it to say.
+    Files of binary triangles (.stl, .ply) whose size matches their header are not tested, because their reader takes
+    only a few times their size. Other errors are left to the actual reader.
 
     Raises:
-        InputError: Also for an archive, and a file that is too large.
+        InputError: If the trial read fails, or for an archive, or if the file is missing or too large.
     """
     if path.suffix.lower() in ARCHIVES:
         raise InputError(f"{path}: must be a mesh file, not an archive: unpack it")
@@ -58,7 +58,7 @@ def check_mesh(path: Path) -> None:
 
 
 def _is_plain(path: Path, size: int) -> bool:
-    """Whether a file holds what its header says, as binary triangles of one kind."""
+    """Return True if a file holds binary triangles of one kind and its size matches its header."""
     with path.open("rb") as file:
         head = file.read(_HEADER)
     if path.suffix.lower() == ".stl":
@@ -71,7 +71,10 @@ def _is_plain(path: Path, size: int) -> bool:
 
 @lru_cache(maxsize=256)
 def _try_mesh(path: Path, _modified: int, size: int) -> str:
-    """Why a file cannot be read within its limits; empty if it can, or if its reader says what is wrong with it."""
+    """Return the reason why a file cannot be read within its limits.
+
+    The reason is empty if the file can be read, or if its reader reports an ordinary error.
+    """
     memory = _MEMORY + _SWELLS * size
     ended = run_bounded(_read_mesh, path, imports=["trimesh"], memory=memory, seconds=_SECONDS)
     if ended.status == 0:
@@ -80,7 +83,7 @@ def _try_mesh(path: Path, _modified: int, size: int) -> str:
 
 
 def _read_mesh(output: BinaryIO, _: bytes, path: str) -> None:
-    """Read a file and forget it; anything but lack of memory is for the reader in the other process to say again."""
+    """Read a file and discard it. Errors except lack of memory are ignored, since the actual reader reports them."""
     try:
         with np.errstate(all="ignore"):
             trimesh.load_scene(path).to_mesh()

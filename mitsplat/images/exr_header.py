@@ -1,6 +1,6 @@
-"""Bounds on the headers of OpenEXR files, to be asked for before a library reads one.
+"""Limits on the headers of OpenEXR files, checked before a library reads a file.
 
-OpenEXR looks through all channels, and all attributes, for each new one: 200,000 of them in 5 MB take it many minutes.
+OpenEXR searches all channels and all attributes for each new one. 200,000 of them in 5 MB take it many minutes.
 """
 
 from __future__ import annotations
@@ -14,17 +14,17 @@ from mitsplat.errors import InputError
 _MAGIC = b"\x76\x2f\x31\x01"
 _MULTIPLE_PARTS = 0x1000
 _MOST_CHANNELS = 64 << 10
-"""Size of the longest list of channels [bytes]; 2,000 channels with short names fit."""
+"""Maximum size of a channel list [bytes]; 2,000 channels with short names fit."""
 _MOST_ATTRIBUTES = 2000
-"""Most attributes of all parts."""
+"""Maximum number of attributes of all parts."""
 _LONGEST_NAME = 256
 
 
 def check_exr_header(path: Path) -> None:
-    """Refuse an OpenEXR file whose header holds too much; what is no OpenEXR file at all is left to its reader.
+    """Refuse an OpenEXR file with an oversized header. Files of other formats are ignored.
 
     Raises:
-        InputError: If a list of channels, or the number of attributes, is too large, or the header ends too early.
+        InputError: If a channel list or the number of attributes is too large, or if the header is truncated.
         OSError: If the file cannot be read.
     """
     with path.open("rb") as file:
@@ -38,7 +38,7 @@ def check_exr_header(path: Path) -> None:
 
 
 def _attribute(path: Path, file: BinaryIO) -> bool:
-    """Read one attribute; false at the end of a part's header."""
+    """Read one attribute. Return False at the end of a part's header."""
     name = _text(path, file)
     if not name:
         return False
@@ -50,7 +50,7 @@ def _attribute(path: Path, file: BinaryIO) -> bool:
 
 
 def _more_parts(file: BinaryIO) -> bool:
-    """Whether another part's header follows."""
+    """Return True if the header of another part follows."""
     following = file.read(1)
     file.seek(-len(following), 1)
     return following not in (b"", b"\0")
@@ -67,7 +67,7 @@ def _text(path: Path, file: BinaryIO) -> bytes:
 
 
 def _number(path: Path, file: BinaryIO) -> int:
-    """Read a 32-bit number that is not negative."""
+    """Read a non-negative 32-bit number."""
     data = file.read(4)
     value: int = struct.unpack("<i", data)[0] if len(data) == 4 else -1
     if value < 0:

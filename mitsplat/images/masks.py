@@ -1,4 +1,4 @@
-"""Masks: silhouettes that may reach beyond the image, their fragments, boundaries and run-length codes."""
+"""Masks: silhouettes that may extend beyond the image, fragments, boundaries and run-length codes."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ Box = tuple[int, int, int, int]
 """Bounds (x0, y0, x1, y1) [px], half-open."""
 
 BOUNDARY_TOLERANCE = 2
-"""Distance within which two boundaries count as the same [px]."""
+"""Maximum distance between matching boundary pixels [px]."""
 
 
 def decode_rle(rle: Any) -> Any:
     """Decode a COCO run-length code to a mask of 0 and 1, shape (H, W)."""
     with warnings.catch_warnings():
-        # Of pycocotools with NumPy 2; with Python's option -W error it would end the run.
+        # pycocotools causes this warning with NumPy 2; with Python's option -W error it would end the run.
         warnings.filterwarnings("ignore", "__array__ implementation", DeprecationWarning)
         return coco_mask.decode(rle)
 
 
 @dataclass(frozen=True, eq=False)
 class Silhouette:
-    """The pixels that an instance covers when it is alone; they may lie outside the image.
+    """Pixels that an instance covers without occluders. They may lie outside of the image.
 
     Attributes:
         box: Bounds of the mask.
@@ -43,18 +43,18 @@ class Silhouette:
 
     @classmethod
     def cropped(cls, mask: BoolArray, x: int, y: int) -> Silhouette:
-        """The silhouette of a mask with at least one pixel whose first pixel is at (x, y)."""
+        """Return the silhouette of a non-empty mask whose first pixel is at (x, y)."""
         ys, xs = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
         x0, x1, y0, y1 = int(xs[0]), int(xs[-1]) + 1, int(ys[0]), int(ys[-1]) + 1
         return cls((x + x0, y + y0, x + x1, y + y1), np.ascontiguousarray(mask[y0:y1, x0:x1]))
 
     @cached_property
     def area(self) -> int:
-        """Pixels."""
+        """Number of pixels."""
         return int(np.count_nonzero(self.mask))
 
     def inside(self, width: int, height: int) -> Silhouette | None:
-        """The part in an image, or None."""
+        """Return the part inside an image, or None if it is empty."""
         x0, y0, x1, y1 = self.box
         left, top, right, bottom = max(x0, 0), max(y0, 0), min(x1, width), min(y1, height)
         if left >= right or top >= bottom:
@@ -63,7 +63,7 @@ class Silhouette:
         return Silhouette.cropped(part, left, top) if part.any() else None
 
     def whole(self, width: int, height: int) -> BoolArray:
-        """The mask in an image, shape (height, width)."""
+        """Return the mask in an image, shape (height, width)."""
         canvas = np.zeros((height, width), dtype=bool)
         if part := self.inside(width, height):
             x0, y0, x1, y1 = part.box
@@ -72,20 +72,20 @@ class Silhouette:
 
 
 def encode_mask(mask: BoolArray, box: Box, size: tuple[int, int]) -> str:
-    """COCO's compressed run-length code of a mask at ``box`` in an image of ``size`` (width, height).
+    """Return COCO's compressed run-length code of a mask at ``box`` in an image of ``size`` (width, height).
 
-    Runs go down the columns. Only the box is looked at, in a tenth of pycocotools' time for whole images.
+    Runs go down the columns. Only the box is processed, which takes a tenth of the time of pycocotools on whole images.
     """
     x0, y0, x1, y1 = box
     width, height = size
     rows = y1 - y0
-    # One blank pixel behind every column, and one before them all.
+    # One blank pixel follows every column, and one precedes all columns.
     padded = np.zeros(1 + (x1 - x0) * (rows + 1), dtype=bool)
     padded[1:].reshape(x1 - x0, rows + 1)[:, :rows] = mask.T
     column, row = np.divmod(np.flatnonzero(padded[1:] != padded[:-1]), rows + 1)
     turns = (x0 + column) * height + y0 + row
     if rows == height:
-        # A run that goes on at the top of the next column neither ends nor begins there.
+        # A run that continues at the top of the next column neither ends nor begins there.
         goes_on = np.flatnonzero(np.diff(turns) == 0)
         turns = np.delete(turns, np.concatenate([goes_on, goes_on + 1]))
     counts = np.diff(np.concatenate([[0], turns, [width * height]]))
@@ -96,10 +96,11 @@ def encode_mask(mask: BoolArray, box: Box, size: tuple[int, int]) -> str:
 
 
 def boundary_f1(one: BoolArray, other: BoolArray) -> float:
-    """F1 score of two masks' boundaries: pixels within :data:`BOUNDARY_TOLERANCE` of the other's count as found.
+    """Return the F1 score of the boundaries of two masks.
 
-    After Csurka et al. 2013, "What is a good evaluation measure for semantic segmentation?". A mask's boundary is its
-    pixels with a neighbour outside it; the arrays' border is none.
+    Boundary pixels within :data:`BOUNDARY_TOLERANCE` of the other boundary count as matches. Source: Csurka et al.
+    2013, "What is a good evaluation measure for semantic segmentation?". The boundary of a mask consists of its pixels
+    with a neighbour outside of the mask; the border of the array is no boundary.
     """
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * BOUNDARY_TOLERANCE + 1,) * 2)
     cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
@@ -115,7 +116,11 @@ def boundary_f1(one: BoolArray, other: BoolArray) -> float:
 
 
 def without_fragments(mask: BoolArray, min_fragment: int) -> tuple[BoolArray, int]:
-    """The mask without connected parts of fewer than ``min_fragment`` pixels, and how many those were."""
+    """Remove connected parts with fewer than ``min_fragment`` pixels.
+
+    Returns:
+        The mask, and the number of removed parts.
+    """
     pixels = mask.view(np.uint8) if mask.flags.c_contiguous else mask.astype(np.uint8)
     if np.count_nonzero(mask) >= min_fragment and _is_connected(pixels):
         return mask, 0
@@ -126,15 +131,18 @@ def without_fragments(mask: BoolArray, min_fragment: int) -> tuple[BoolArray, in
 
 
 def _is_connected(pixels: npt.NDArray[np.uint8]) -> bool:
-    """Whether a mask is one part (8-connectivity), found by its outlines in half the time of labelling its parts."""
+    """Return True if a mask is one connected part (8-connectivity).
+
+    Outlines are counted, which takes half the time of labelling the parts.
+    """
     _, hierarchy = cv2.findContours(pixels, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE)
     return hierarchy is not None and int(np.count_nonzero(hierarchy[0, :, 3] < 0)) == 1
 
 
 def bounds_of_ids(ids: npt.NDArray[np.integer[Any]]) -> dict[int, Box]:
-    """Bounds of every id but 0 in a map (H, W) of ids, by ascending id.
+    """Return the bounds of every non-zero id in an id map (H, W), by ascending id.
 
-    Only where runs of one id along a row begin and end is looked at, in a fifth of ``scipy.ndimage``'s time.
+    Only the ends of runs along rows are processed, which takes a fifth of the time of ``scipy.ndimage``.
     """
     height, width = ids.shape
     if not ids.size:

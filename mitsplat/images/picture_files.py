@@ -1,4 +1,4 @@
-"""Pictures read by OpenCV from any path: given a path that is not UTF-8, OpenCV itself ends the process."""
+"""Reading of images by OpenCV from any path. OpenCV itself crashes on paths that are not UTF-8."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 
 def read_picture(path: Path, flags: int = cv2.IMREAD_COLOR) -> npt.NDArray[Any] | None:
-    """Pixels of a file as ``cv2.imread`` gives them, or None if it cannot be read or is no picture."""
+    """Return the pixels of an image file as ``cv2.imread`` does; None if the file cannot be read or is no image."""
     try:
         data = np.frombuffer(path.read_bytes(), np.uint8)
     except (OSError, ValueError):

@@ -1,4 +1,4 @@
-"""Whether Mitsuba can read an image, tried in a process of its own: a damaged one may end the process that reads it."""
+"""Trial read of images by Mitsuba in a separate process, because a damaged image can crash its reader."""
 
 from __future__ import annotations
 
@@ -11,18 +11,19 @@ from mitsplat.images.exr_header import check_exr_header
 from mitsplat.runtime.child_process import limit_memory, run_bounded
 
 IMAGES = (".exr", ".hdr", ".pfm", ".png", ".jpg", ".jpeg", ".bmp", ".tga")
-"""Suffixes of what patterns of images match."""
+"""Suffixes of image files that patterns match."""
 
 _SECONDS = 120
 _MEMORY = 6 << 30
 _Stamp = tuple[Path, int, int]
-"""A file, when it was changed [ns], and its size [bytes]."""
+"""Path, modification time [ns] and size [bytes] of a file."""
 
 
 def check_images(paths: Sequence[Path]) -> list[str | None]:
-    """Why each image cannot be read, or asks for more memory than its file warrants; None for what is not refused.
+    """Return for each image the reason why it is refused, or None.
 
-    All are tried in one process, as far as the first that is refused: those behind it are not looked at.
+    An image is refused if it cannot be read, or if it needs more memory than its size justifies. All images are tested
+    in one process, up to the first that is refused. Later images are not tested and have None.
     """
     found: list[str | None] = []
     stamps = []
@@ -45,8 +46,8 @@ def check_images(paths: Sequence[Path]) -> list[str | None]:
 
 @lru_cache(maxsize=64)
 def _try_images(files: tuple[_Stamp, ...]) -> tuple[int, str | None]:
-    """How many of the files can be read, and why the next one cannot, or None."""
-    # Half-precision pixels of one colour take a thousandth of what they become.
+    """Return the number of files that can be read, and the reason why the next one cannot, or None."""
+    # A file of half-precision pixels of one colour can be a thousandth of the size of its pixels.
     limits = [_MEMORY + 1000 * size for _, _, size in files]
     arguments = [text for (path, _, _), limit in zip(files, limits, strict=True) for text in (str(path), str(limit))]
     ended = run_bounded(
@@ -59,8 +60,8 @@ def _try_images(files: tuple[_Stamp, ...]) -> tuple[int, str | None]:
 
 
 def _read_images(output: BinaryIO, _: bytes, *arguments: str) -> None:
-    """Read images, each within the memory that follows its path, and write a line for each."""
-    import mitsuba as mi  # for the child only
+    """Read images, each within the memory limit that follows its path, and write one line per image."""
+    import mitsuba as mi  # imported only in the child process
 
     mi.set_variant("scalar_rgb")
     for path, limit in zip(arguments[::2], arguments[1::2], strict=True):

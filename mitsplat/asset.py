@@ -58,8 +58,8 @@ _SPZ_UNITS = 1e-3
 The smallest scale of the format is 4.5e-5 units. In metres this would be 45 um, which is too coarse.
 """
 
-_OPAQUE = 0.5
-_OFF_BY = 0.05
+_OPAQUE_THRESHOLD = 0.5
+_BOUNDS_TOLERANCE = 0.05
 """Tolerated difference between the bounds of splats, mesh and pieces, as a fraction of the asset's size."""
 
 
@@ -230,9 +230,9 @@ class Asset:
                 new = Path(apart)
                 stored.splats.save(new / splats)
                 if stored.mesh is not None:
-                    _joined([stored.mesh]).export(new / "mesh.ply")
+                    _concatenated([stored.mesh]).export(new / "mesh.ply")
                 if stored.pieces:
-                    _joined(stored.pieces).export(new / "pieces.ply")
+                    _concatenated(stored.pieces).export(new / "pieces.ply")
                 described = new / ASSET_FILE
                 YAML(pure=True).dump(spec.model_dump(by_alias=True, exclude_none=True), described)
                 (folder / ASSET_FILE).unlink(missing_ok=True)
@@ -290,8 +290,8 @@ class Asset:
         extent = float(np.ptp(points, axis=0).max()) if len(points) else 0.0
         if not extent > 0:
             raise InputError(
-                f"{self.folder or self.name}: size needs a mesh, or splats with opacity > {_OPAQUE}, of some extent "
-                "(got 0)"
+                f"{self.folder or self.name}: size needs a mesh, or splats with opacity > "
+                f"{_OPAQUE_THRESHOLD}, of nonzero extent (got 0)"
             )
         return size / extent
 
@@ -321,7 +321,7 @@ class Asset:
             if boxes:
                 joint = np.stack([np.min(boxes, axis=0)[0], np.max(boxes, axis=0)[1]])
                 offset = float(np.abs(joint - self.mesh.bounds).max())
-                if offset > _OFF_BY * size:
+                if offset > _BOUNDS_TOLERANCE * size:
                     findings.append(f"the bounds of {what} and mesh differ by {offset:.3g} m on {size:.3g} m")
         return tuple(findings)
 
@@ -382,7 +382,7 @@ def opaque_core(splats: Splats) -> Float32Array:
 
     Floaters lie more than a quarter of the range of the central 98 % outside that range along an axis.
     """
-    centres = splats.means[splats.opacities > _OPAQUE]
+    centres = splats.means[splats.opacities > _OPAQUE_THRESHOLD]
     if not len(centres):
         return centres
     low, high = np.percentile(centres, (1, 99), axis=0)
@@ -407,7 +407,7 @@ def _read_pieces(path: Path) -> tuple[trimesh.Trimesh, ...]:
     return tuple(_hull(part.vertices, str(path)) for part in parts)
 
 
-def _joined(meshes: Sequence[trimesh.Trimesh]) -> trimesh.Trimesh:
+def _concatenated(meshes: Sequence[trimesh.Trimesh]) -> trimesh.Trimesh:
     """Concatenate the triangles of all meshes, without colours, textures or vertex merging."""
     starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
     return trimesh.Trimesh(

@@ -43,8 +43,8 @@ def is_out_of_memory(error: BaseException) -> bool:
     """
     if isinstance(error, MissingResourceError | PartialResultError):
         return False
-    telling = isinstance(error, RuntimeError | TypeError) or type(error).__module__ == "cv2"
-    return isinstance(error, MemoryError) or (telling and bool(_OUT_OF_MEMORY.search(str(error))))
+    reports_by_text = isinstance(error, RuntimeError | TypeError) or type(error).__module__ == "cv2"
+    return isinstance(error, MemoryError) or (reports_by_text and bool(_OUT_OF_MEMORY.search(str(error))))
 
 
 def _is_interrupt(error: BaseException | None) -> bool:
@@ -72,9 +72,9 @@ def sentence_of(error: BaseException) -> str:
     if isinstance(error, OSError) and error.strerror:
         return f"{error.filename}: {error.strerror}" if error.filename else error.strerror
     if is_out_of_memory(error):
-        said = str(error).partition("\n")[0]
-        said = f" ({said})" if said else ""
+        detail = str(error).partition("\n")[0]
+        detail = f" ({detail})" if detail else ""
         return (
-            f"memory has run out{said}: smaller images and fewer samples take less; if it was a GPU's, use --device cpu"
+            f"memory is exhausted{detail}: use smaller images or fewer samples; if it was GPU memory, use --device cpu"
         )
     return str(error)

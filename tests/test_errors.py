@@ -17,7 +17,7 @@ from mitsplat.errors import InputError, exit_status, sentence_of
 )
 def test_memory_that_has_run_out_is_missing_on_the_machine(error: Exception) -> None:
     assert exit_status(error) == 3
-    assert sentence_of(error).startswith("memory has run out")
+    assert sentence_of(error).startswith("memory is exhausted")
 
 
 def test_opencv_tells_of_memory_too() -> None:

@@ -45,7 +45,7 @@ rm -rf {folder}
 """
 """Shell script that stops the service when its input is closed, also if this process is killed."""
 
-_PATIENCE = 60.0
+_TIMEOUT = 60.0
 """Time limit of a trial [s]."""
 
 
@@ -93,7 +93,7 @@ class SharedGpu:
                 capture_output=True,
                 text=True,
                 check=False,
-                timeout=_PATIENCE,
+                timeout=_TIMEOUT,
             )
             if trial.returncode:
                 raise OSError(_last_line(trial.stderr))
@@ -108,7 +108,7 @@ class SharedGpu:
         keeper, self._keeper, self.environment = self._keeper, None, {}
         if keeper is not None:
             with suppress(subprocess.TimeoutExpired):
-                keeper.communicate(timeout=_PATIENCE)
+                keeper.communicate(timeout=_TIMEOUT)
 
 
 def _renumbered(visible: str) -> dict[str, str]:
@@ -126,7 +126,7 @@ def _control(command: str) -> bool:
             capture_output=True,
             text=True,
             check=False,
-            timeout=_PATIENCE,
+            timeout=_TIMEOUT,
         )
         return done.returncode == 0
     return False

@@ -49,18 +49,18 @@ MOST_LOSSES = 3
 WORTHWHILE = 1.1
 """Minimum speed-up for keeping another worker, if the engine chooses the number of workers."""
 
-_WINDOW = 6
+_SPEED_WINDOW = 6
 """Frames per worker over which speed is measured."""
-_FEW = 16
+_MAX_SERIAL_FRAMES = 16
 """Number of frames up to which worker processes are not worth their start-up time."""
 
 _START = 300.0
 """Time limit for the start of a worker [s]. On an idle machine, imports take about two seconds."""
 
-_LOOK = 1.0
+_POLL_INTERVAL = 1.0
 """Polling interval while workers start [s]."""
 
-_END = 30.0
+_END_TIMEOUT = 30.0
 """Time limit for the end of a worker that has closed its pipe [s]."""
 
 _SENTENCES: tuple[type[Exception], ...] = (InputError, MissingResourceError, PartialResultError)
@@ -207,7 +207,7 @@ def run_frames(
     check_workers(workers)
     total = sum(map(len, layouts.values()))
     most = affordable_workers(memory, device) if workers is None else workers
-    few = min(most, total) <= 1 or (workers is None and total <= _FEW)
+    few = min(most, total) <= 1 or (workers is None and total <= _MAX_SERIAL_FRAMES)
     if few and (device is None or device.is_here):
         if device is not None and device != current_device():
             use_device(device)
@@ -217,7 +217,7 @@ def run_frames(
                     made = make(index, note)
                 except (RuntimeError, MemoryError) as error:
                     if is_out_of_memory(error):
-                        raise _too_large(index, sentence_of(error)) from error
+                        raise _memory_error(index, sentence_of(error)) from error
                     raise
                 yield made
         return
@@ -281,10 +281,10 @@ def run_pool(
     losses: Counter[int] = Counter()
     at_work: dict[int, int] = {}
     gone = 0
-    staff: dict[int, int] = {}  # by worker: number of workers that had gone when it got its frame
+    live_workers: dict[int, int] = {}  # value: number of lost workers when it got its frame
 
     def assign(worker: int) -> None:
-        staff[worker] = gone
+        live_workers[worker] = gone
         if (task := plan.take(worker)) is not None:
             at_work[worker] = task[1]
             pool.give(worker, task[1], task[0])
@@ -297,7 +297,7 @@ def run_pool(
                 note(answer.text)
                 continue
             if worker not in at_work:
-                staff.pop(worker, None)  # died while idle
+                live_workers.pop(worker, None)  # died while idle
                 continue
             frame = at_work.pop(worker)
             if isinstance(answer, Failure) and not answer.exhausted:
@@ -306,19 +306,19 @@ def run_pool(
                 plan.put_back(worker, frame)
                 pool.stop(worker)
                 grow = False
-                if staff.pop(worker) < gone:  # the missing memory may be free now
+                if live_workers.pop(worker) < gone:  # the missing memory may be free now
                     assign(pool.start())
                     continue
-                if not staff:
-                    raise _too_large(frame, answer.message)
+                if not live_workers:
+                    raise _memory_error(frame, answer.message)
                 gone += 1
-                left = f"{len(staff)} worker{'s' * (len(staff) > 1)}"
-                note(f"memory has run out for frame {frame}: it is made again with {left}")
+                left = f"{len(live_workers)} worker{'s' * (len(live_workers) > 1)}"
+                note(f"memory is exhausted for frame {frame}: it is made again with {left}")
                 if not at_work:
-                    assign(next(iter(staff)))
+                    assign(next(iter(live_workers)))
                 continue
             if isinstance(answer, Lost):
-                del staff[worker]
+                del live_workers[worker]
                 gone += 1
                 losses[frame] += 1
                 if losses[frame] == MOST_LOSSES:
@@ -340,7 +340,7 @@ def run_pool(
                         grow = False
                         plan.leave(worker)
                         pool.stop(worker)
-                        del staff[worker]
+                        del live_workers[worker]
                         yield answer.result
                         continue
                     case "stay":
@@ -352,7 +352,7 @@ def run_pool(
                 assign(pool.start())
 
 
-def _too_large(frame: int, why: str) -> MissingResourceError:
+def _memory_error(frame: int, why: str) -> MissingResourceError:
     return MissingResourceError(f"frame {frame} cannot be made: {why}; finished frames are kept")
 
 
@@ -459,7 +459,7 @@ class _Growth:
         self._finished += 1
         if self._finished == 0:
             self._since = now
-        if self._finished < _WINDOW * count:
+        if self._finished < _SPEED_WINDOW * count:
             return ""
         speed = self._finished / (now - self._since)
         if speed < WORTHWHILE * self._speed:
@@ -527,9 +527,9 @@ class _Processes(Generic[Result]):
 
     def wait(self) -> Iterator[tuple[int, Answer[Result]]]:
         begun = time.monotonic()
-        ready = set(wait([pipe for _, pipe in self._workers.values()], _LOOK if self._starting else None))
+        ready = set(wait([pipe for _, pipe in self._workers.values()], _POLL_INTERVAL if self._starting else None))
         # At most one interval counts, because this process and its workers may have been suspended.
-        waited = min(time.monotonic() - begun, _LOOK)
+        waited = min(time.monotonic() - begun, _POLL_INTERVAL)
         for worker, (process, pipe) in list(self._workers.items()):
             if pipe not in ready:
                 if worker in self._starting:
@@ -541,7 +541,7 @@ class _Processes(Generic[Result]):
             try:
                 answer = pipe.recv()
             except (EOFError, OSError):
-                how = _ending(process)
+                how = _describe_end(process)
                 self.stop(worker)
                 yield worker, Lost(how)
                 continue
@@ -561,9 +561,9 @@ class _Processes(Generic[Result]):
         self._make.close()
 
 
-def _ending(process: BaseProcess) -> str:
+def _describe_end(process: BaseProcess) -> str:
     """Describe the end of a process that has closed its pipe."""
-    process.join(_END)
+    process.join(_END_TIMEOUT)
     code = process.exitcode
     if code is None:
         return "answers no more"

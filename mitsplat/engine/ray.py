@@ -28,13 +28,13 @@ Made = TypeVar("Made", covariant=True)
 GPU_SHARE = {"CPU": 1.0, "GPU": 0.125}
 """Resources of a worker on a GPU: eight workers of 3 GiB each share a GPU of 24 GiB."""
 
-_LOOK = 3.0
+_SEARCH_INTERVAL = 3.0
 """Minimum interval between searches for new machines [s]."""
 
-_PATIENCE = 60.0
+_MACHINE_TIMEOUT = 60.0
 """Maximum waiting time for a machine when none is left [s]."""
 
-_KEPT_LAYOUTS = 64
+_MAX_STORED_LAYOUTS = 64
 """Maximum number of layouts in the object store; any other layout is settled again or read from a cache."""
 
 
@@ -171,7 +171,7 @@ class _Actors(Generic[Result]):
         self._actors: dict[int, Any] = {}
         room = self._room()
         self._nodes, self.room = set(room), min(self._most, sum(room.values()))
-        self._looked = self._last_room = time.monotonic()
+        self._last_search = self._last_room = time.monotonic()
         if not self.room:
             self.close()
             raise MissingResourceError(self._no_room())
@@ -201,13 +201,13 @@ class _Actors(Generic[Result]):
 
     def openings(self) -> int:
         now = time.monotonic()
-        if now < self._looked + _LOOK:
+        if now < self._last_search + _SEARCH_INTERVAL:
             return 0
-        room, known, self._looked = self._room(), self._nodes, now
+        room, known, self._last_search = self._room(), self._nodes, now
         self._nodes = set(room)
         if any(room.values()):
             self._last_room = now
-        elif now > self._last_room + _PATIENCE:
+        elif now > self._last_room + _MACHINE_TIMEOUT:
             raise LostWorkersError(f"{self._no_room()} any more; finished frames are kept")
         joined = sum(count for node, count in room.items() if node not in known)
         return max(0, min(joined, self._most - len(self._actors)))
@@ -228,12 +228,12 @@ class _Actors(Generic[Result]):
             self._layouts[layout] = (
                 (actor.settle.remote(layout), worker) if known is None else (self._ray.put(known), None)
             )
-            while len(self._layouts) > _KEPT_LAYOUTS:
+            while len(self._layouts) > _MAX_STORED_LAYOUTS:
                 self._layouts.popitem(last=False)
         self._answers[actor.make.remote(frame, self._layouts[layout][0])] = worker, frame, layout
 
     def wait(self) -> Iterator[tuple[int, Answer[Result]]]:
-        ready, _ = self._ray.wait(list(self._answers), num_returns=1, timeout=_LOOK)
+        ready, _ = self._ray.wait(list(self._answers), num_returns=1, timeout=_SEARCH_INTERVAL)
         for reference in ready:
             worker, frame, layout = self._answers.pop(reference)
             try:

@@ -22,7 +22,7 @@ from mitsplat.storage.cache import cache_folder
 
 Value = TypeVar("Value")
 
-_LINE = 64
+_CACHE_LINE = 64
 """Alignment of arrays to cache lines [bytes]."""
 
 _logger = logging.getLogger(__name__)
@@ -41,14 +41,14 @@ class SharedArrays(Generic[Value]):
         buffers: list[pickle.PickleBuffer] = []
         pickled = pickle.dumps(value, protocol=5, buffer_callback=buffers.append)
         parts = [*(buffer.raw() for buffer in buffers), memoryview(pickled)]
-        *starts, self.size = accumulate((-(-part.nbytes // _LINE) * _LINE for part in parts), initial=0)
+        *starts, self.size = accumulate((-(-part.nbytes // _CACHE_LINE) * _CACHE_LINE for part in parts), initial=0)
         table = array("q", chain.from_iterable((start, part.nbytes) for start, part in zip(starts, parts, strict=True)))
         places = list(zip([*starts, self.size], [*parts, memoryview(table)], strict=True))
         try:
-            self._file = _filled(_in_cache(), places)
+            self._file = _write_parts(_in_cache(), places)
         except OSError as error:
             _logger.warning("%s: cannot be written (%s): workers share memory instead", cache_folder(), error)
-            self._file = _filled(_in_memory(), places)
+            self._file = _write_parts(_in_memory(), places)
 
     def __reduce__(self) -> tuple[Any, ...]:
         return _open, (DupFd(self._file.fileno()), self.size)
@@ -58,7 +58,7 @@ class SharedArrays(Generic[Value]):
         self._file.close()
 
 
-def _filled(file: IO[bytes], places: Sequence[tuple[int, memoryview]]) -> IO[bytes]:
+def _write_parts(file: IO[bytes], places: Sequence[tuple[int, memoryview]]) -> IO[bytes]:
     """Write all parts to the file and return it; close it if there is no space."""
     try:
         for start, part in places:

@@ -43,9 +43,9 @@ PER_OBJECT = 12 * 2**20
 PER_SEEN = 2.25
 """Memory per pixel and instance for silhouettes, rendered in tiles up to one image size beyond each border [bytes]."""
 
-_VIEWS = 5
+_CAMERAS = 5
 _TILE = np.array([TILE_WIDTH, TILE_HEIGHT])
-_SAMPLE = 50_000
+_MAX_SAMPLES = 50_000
 """Maximum number of Gaussians of an asset that are sampled; the sample represents the others."""
 
 
@@ -68,7 +68,7 @@ def worker_memory(scene: Scene) -> WorkerMemory:
     count = sum(map(len, static)) + sum(number * len(one) for one, number in placed)
     quality = replace(resolve_quality(spec.quality), **spec.rendering.model_dump())
     pixels = spec.output.width * spec.output.height
-    cameras = [plan_frame(scene, int(i)).camera for i in np.linspace(0, scene.num_frames - 1, _VIEWS)]
+    cameras = [plan_frame(scene, int(i)).camera for i in np.linspace(0, scene.num_frames - 1, _CAMERAS)]
     pairs = max(
         sum(_pairs(one, camera, quality) for one in static)
         + sum(number * _pairs(one, camera, quality, at=middle) for one, number in placed)
@@ -90,7 +90,7 @@ def _pairs(splats: Splats, camera: Camera, quality: Quality, *, at: Iterable[flo
 
     The footprint of a Gaussian ends where its opacity falls below the quality's cut. The kernel's variance widens it.
     """
-    step = 1 + len(splats) // _SAMPLE
+    step = 1 + len(splats) // _MAX_SAMPLES
     means = splats.means[::step] + np.asarray(tuple(at), dtype=np.float32)
     pixel, depth = camera.project(means)
     above = splats.opacities[::step] / quality.alpha_min

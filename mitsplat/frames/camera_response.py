@@ -41,10 +41,10 @@ GREY = 118.0
 """Mean byte value (of 255) of a metered picture: middle grey of the standard output sensitivity (ISO 12232)."""
 
 _METERED_PIXELS = 1 << 14
-_STOPS = 6.0
+_MAX_METERING = 6.0
 """Maximum correction by metering, in both directions [stops]."""
 
-_LONGEST = 256.0
+_MAX_MOTION = 256.0
 """Length of a motion path up to which its samples are at most one pixel apart [px]."""
 
 CURVE_WHITE = 16.0
@@ -117,8 +117,8 @@ def develop(
         metered: Automatic exposure, see :func:`metered_exposure`; ``exposure`` is added to it.
     """
     height, width = linear.shape[:2]
-    how: dict[str, Any] = {"tone": tone, "sensor": sensor, "seed": seed, "swept": swept, "metered": metered}
-    return develop_layers(device_array(linear), (height, width), draws, **how).image()
+    options: dict[str, Any] = {"tone": tone, "sensor": sensor, "seed": seed, "swept": swept, "metered": metered}
+    return develop_layers(device_array(linear), (height, width), draws, **options).image()
 
 
 def develop_layers(
@@ -186,7 +186,7 @@ class Development:
         if self.sharpening:
             blur = cv2.GaussianBlur(image, (0, 0), 1.0, borderType=cv2.BORDER_REPLICATE)
             image = np.asarray(cv2.addWeighted(image, 1 + self.sharpening, blur, -self.sharpening, 0), dtype=np.uint8)
-        return image if self.jpeg is None else _compressed(image, self.jpeg)
+        return image if self.jpeg is None else _jpeg_compressed(image, self.jpeg)
 
 
 def _opaque(value: float) -> Any:
@@ -204,17 +204,17 @@ def metered_exposure(linear: Any, count: int, tone: Tone) -> float:
         count: Number of its pixels.
         tone: Tone curve of the encoding.
     """
-    every = dr.arange(mi.UInt32, 0, count, max(1, count // _METERED_PIXELS))
+    sampled_pixels = dr.arange(mi.UInt32, 0, count, max(1, count // _METERED_PIXELS))
     dr.eval(linear)
-    picked = dr.gather(mi.Color3f, linear, every).numpy()
-    luminance = np.maximum(LUMINANCE @ picked, 0.0)
+    sampled_colours = dr.gather(mi.Color3f, linear, sampled_pixels).numpy()
+    luminance = np.maximum(LUMINANCE @ sampled_colours, 0.0)
     curve = 255.0 * np.clip(tone_curve(tone), 0.0, 1.0)
 
     def mean(stops: float) -> float:
         step = np.sqrt(np.minimum(luminance * 2.0**stops, CURVE_WHITE) / CURVE_WHITE) * (CURVE_STEPS - 1)
         return float(curve[np.rint(step).astype(int)].mean())
 
-    low, high = -_STOPS, _STOPS
+    low, high = -_MAX_METERING, _MAX_METERING
     for _ in range(16):
         middle = (low + high) / 2
         low, high = (middle, high) if mean(middle) < GREY else (low, middle)
@@ -245,11 +245,11 @@ def _drawn_apart(linear: Any, pixel: Any, shape: tuple[int, int], corner: float)
     x, y = mi.Float(pixel - row * width), mi.Float(row)
     along = _opaque(corner / float(np.hypot(width, height) / 2))
     x_out, y_out = along * (x + (0.5 - width / 2)), along * (y + (0.5 - height / 2))
-    red, blue = (_between(picture, shape, x + sign * x_out, y + sign * y_out) for sign in (-1.0, 1.0))
+    red, blue = (_bilinear(picture, shape, x + sign * x_out, y + sign * y_out) for sign in (-1.0, 1.0))
     return mi.Color3f(red.x, linear[1], blue.z)
 
 
-def _between(picture: Any, shape: tuple[int, int], x: Any, y: Any) -> Any:
+def _bilinear(picture: Any, shape: tuple[int, int], x: Any, y: Any) -> Any:
     """Interpolate a picture bilinearly at columns and rows [px]; border values extend beyond the border."""
     height, width = shape
     x, y = dr.clip(x, 0.0, width - 1.0), dr.clip(y, 0.0, height - 1.0)
@@ -274,7 +274,7 @@ def _smeared(linear: Any, pixel: Any, shape: tuple[int, int], swept: tuple[Float
     width = shape[1]
     picture = dr.ravel(mi.Vector4f(*linear, 0.0))
     right, down = (wrapped(mi.Float, np.ascontiguousarray(way.ravel(), dtype=np.float32)) for way in swept)
-    longest = min(float(np.hypot(*swept).max()), _LONGEST)
+    longest = min(float(np.hypot(*swept).max()), _MAX_MOTION)
     count = dr.opaque(mi.UInt32, 1 + 2 * int(np.ceil(longest / 2)))
     row = pixel // width
     x, y = mi.Float(pixel - row * width), mi.Float(row)
@@ -282,7 +282,7 @@ def _smeared(linear: Any, pixel: Any, shape: tuple[int, int], swept: tuple[Float
 
     def add(number: Any, total: Any) -> tuple[Any, Any]:
         time = (mi.Float(number) + 0.5) / mi.Float(count) - 0.5
-        seen = _between(picture, shape, x + time * right, y + time * down)
+        seen = _bilinear(picture, shape, x + time * right, y + time * down)
         return number + 1, total + mi.Color3f(seen.x, seen.y, seen.z)
 
     state = mi.UInt32(0), mi.Color3f(0)
@@ -339,7 +339,7 @@ def sensed(linear: Any, pixel: Any, iso: float, sensor: Sensor, seed: int) -> An
     return linear + dr.sqrt(dr.maximum(linear, 0.0) * shot + read) * mi.Color3f(numbers.x, numbers.y, numbers.z)
 
 
-def _compressed(image: ByteImage, quality: int) -> ByteImage:
+def _jpeg_compressed(image: ByteImage, quality: int) -> ByteImage:
     """Return the picture after JPEG compression."""
     done, data = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])
     if not done:

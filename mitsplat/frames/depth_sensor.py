@@ -120,12 +120,12 @@ def time_of_flight_depth(
     slopes = camera.ray_slopes(np.stack([columns.ravel() + 0.5, rows.ravel() + 0.5], axis=1))
     rays = np.column_stack([slopes, np.ones(len(slopes))]).reshape(height, width, 3)
     length = np.linalg.norm(rays, axis=-1)
-    away = depth * length
+    distance = depth * length
     facing = np.abs(np.einsum("hwi,hwi->hw", normal @ camera.world_from_camera[:3, :3], rays)) / length
     facing = np.where(normal.any(axis=-1), facing, 1.0)
-    signal = np.divide(reflectance * facing, away**2, out=np.zeros_like(depth), where=away > 0)
+    signal = np.divide(reflectance * facing, distance**2, out=np.zeros_like(depth), where=distance > 0)
     longest = LIGHT_SPEED / (2e6 * sensor.modulation)
-    waves = signal * np.exp(2j * np.pi * away / longest)
+    waves = signal * np.exp(2j * np.pi * distance / longest)
     if sensor.blur > 0:
         waves = sum(
             cv2.GaussianBlur(part, (0, 0), sensor.blur) * unit for part, unit in ((waves.real, 1), (waves.imag, 1j))

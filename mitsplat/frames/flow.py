@@ -93,26 +93,26 @@ def swept_by(
         belt, carried = moving
         rotation, centre = camera.world_from_camera[:3, :3], camera.centre
         seen = np.stack(np.broadcast_arrays(x * depth, y * depth, depth), axis=-1) @ rotation.T + centre
-        runs = carried | belt.shows(seen.reshape(-1, 3)).reshape(height, width)
+        on_belt = carried | belt.shows(seen.reshape(-1, 3)).reshape(height, width)
         # The motion field depends on the camera's motion relative to the pixel's surface.
-        own = motion["exposure"] * (rotation.T @ belt.velocity)
-        vx, vy, vz = (np.float32(v) - np.float32(w) * runs for v, w in zip((vx, vy, vz), own, strict=True))
+        belt_motion = motion["exposure"] * (rotation.T @ belt.velocity)
+        vx, vy, vz = (np.float32(v) - np.float32(w) * on_belt for v, w in zip((vx, vy, vz), belt_motion, strict=True))
     wx, wy, wz = np.radians(np.multiply(motion["exposure"], motion["rotation"])).astype(np.float32)
     u = near * (x * vz - vx) + (x * y * wx - (1 + x * x) * wy + y * wz)
     v = near * (y * vz - vy) + ((1 + y * y) * wx - x * y * wy - x * wz)
     if not distorted:
         return u * np.float32(camera.fx), v * np.float32(camera.fy)
     (x_down, x_right), (y_down, y_right) = np.gradient(x), np.gradient(y)
-    whole = x_right * y_down - x_down * y_right
-    return (u * y_down - v * x_down) / whole, (v * x_right - u * y_right) / whole
+    determinant = x_right * y_down - x_down * y_right
+    return (u * y_down - v * x_down) / determinant, (v * x_right - u * y_right) / determinant
 
 
 def motions_of(before: Layout, after: Layout) -> dict[int, Float64Array | None]:
     """Compute the motions of instances between two layouts, for :func:`optical_flow`."""
     found: dict[int, Float64Array | None] = {}
-    there = {instance.id: instance.world_from_object for instance in after.instances}
+    next_poses = {instance.id: instance.world_from_object for instance in after.instances}
     for instance in before.instances:
-        pose, following = instance.world_from_object, there.get(instance.id)
+        pose, following = instance.world_from_object, next_poses.get(instance.id)
         if following is None:
             found[instance.id] = None
         elif not np.array_equal(pose, following):

@@ -193,19 +193,19 @@ def render_frame(
     """
     layout_of(scene, index)  # check the index before costly work
     ensure_variant()
-    return _kept_renderer(scene, quality, str(mi.variant())).render(
+    return _cached_renderer(scene, quality, str(mi.variant())).render(
         index, layout=layout, camera=camera, lights=lights, next_layout=next_layout, next_camera=next_camera
     )
 
 
 @one_at_a_time
 @lru_cache(maxsize=2)
-def _kept_renderer(scene: Scene, quality: str | Quality | None, _variant: str) -> Renderer:
+def _cached_renderer(scene: Scene, quality: str | Quality | None, _variant: str) -> Renderer:
     return Renderer(scene, quality=quality)
 
 
 @dataclass(frozen=True, eq=False)
-class _Look:
+class _BandRender:
     """Rendered band of rows; ``swept`` is the motion of its pixels during the exposure, to the right and down [px]."""
 
     band: Band
@@ -214,7 +214,7 @@ class _Look:
     silhouettes: Mapping[int, Silhouette]
 
 
-def _swept(
+def _exposure_motion(
     layers: Layers, camera: Camera, motion: Mapping[str, Any], layout: Layout, belt: Belt | None
 ) -> tuple[Float32Array, Float32Array]:
     """Compute the motion of every pixel during the exposure, from camera and belt motion."""
@@ -229,10 +229,10 @@ def _projection(layout: Layout, plan: FramePlan) -> Projection | None:
     motion, belt = plan.viewpoint.get("motion", {}), plan.belt
     if "readout" not in motion:
         return None
-    carried_ones = frozenset[int]() if belt is None else carried_instances(layout, belt.box)
+    carried_ids = frozenset[int]() if belt is None else carried_instances(layout, belt.box)
 
     def project(points: Float64Array, instance: Instance) -> tuple[Float64Array, Float64Array]:
-        velocity = belt.velocity if belt is not None and instance.id in carried_ones else np.zeros(3)
+        velocity = belt.velocity if belt is not None and instance.id in carried_ids else np.zeros(3)
         return project_by_row(plan.camera, motion, points, velocity)
 
     return project
@@ -277,20 +277,26 @@ class Renderer:
         self.quality = quality
         self._variant = mi.variant()
         self.integrator = make_integrator(quality=quality, **light_properties(scene))
-        self._static: tuple[LayoutSurroundings, dict[str, Any]] | None = None
-        self._pattern: tuple[int, MaterialDraw, ByteImage, Any] | None = None  # of a belt
-        self._behind: tuple[BackgroundDraw, Any] | None = None
-        self._placed: tuple[Layout, dict[str, Any]] | None = None
-        self._settled: dict[int, Layout] = {}
-        self._sky: tuple[str, Any] | None = None
+        self._cached_surroundings: tuple[LayoutSurroundings, dict[str, Any]] | None = None
+        self._belt_pattern: tuple[int, MaterialDraw, ByteImage, Any] | None = None  # of a belt
+        self._cached_background: tuple[BackgroundDraw, Any] | None = None
+        self._cached_objects: tuple[Layout, dict[str, Any]] | None = None
+        self._layouts: dict[int, Layout] = {}
+        self._cached_environment_map: tuple[str, Any] | None = None
 
     def __enter__(self) -> Renderer:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.integrator, self._static, self._placed, self._sky, self._behind = None, None, None, None, None
-        self._pattern = None
-        self._settled.clear()
+        (
+            self.integrator,
+            self._cached_surroundings,
+            self._cached_objects,
+            self._cached_environment_map,
+            self._cached_background,
+        ) = None, None, None, None, None
+        self._belt_pattern = None
+        self._layouts.clear()
 
     @one_at_a_time
     def render(
@@ -332,18 +338,22 @@ class Renderer:
             mitsuba_scene = self._load(layout, plan, lights is not None, plan.belt)
         with _timed(seconds, "render"):
             layers = render_layers(self.integrator, mitsuba_scene, plan.camera, seed=plan.seed)
-        motion, swept, looks = plan.viewpoint.get("motion"), None, list[_Look]()
+        motion, swept, band_renders = plan.viewpoint.get("motion"), None, list[_BandRender]()
         if motion is not None:
             with _timed(seconds, "composite"):
-                swept = _swept(layers, plan.camera, motion, layout, plan.belt)
+                swept = _exposure_motion(layers, plan.camera, motion, layout, plan.belt)
             with _timed(seconds, "render"):
                 bands = bands_of(plan.camera, motion, swept)
-                looks = [self._look(band, plan, motion, layout, lights is not None, mitsuba_scene) for band in bands]
-                if looks:
-                    layers = Layers.stacked([(look.layers, look.band.rows) for look in looks])
+                band_renders = [
+                    self._render_band(band, plan, motion, layout, lights is not None, mitsuba_scene) for band in bands
+                ]
+                if band_renders:
+                    layers = Layers.stacked(
+                        [(band_render.layers, band_render.band.rows) for band_render in band_renders]
+                    )
                     swept = (
-                        np.concatenate([look.swept[0] for look in looks]),
-                        np.concatenate([look.swept[1] for look in looks]),
+                        np.concatenate([band_render.swept[0] for band_render in band_renders]),
+                        np.concatenate([band_render.swept[1] for band_render in band_renders]),
                     )
         with _timed(seconds, "composite"):
             composite, shape = self.scene.spec.composite, layers.shape
@@ -360,8 +370,11 @@ class Renderer:
                 metered=composite.exposure == "auto",
             )
         with _timed(seconds, "silhouettes"):
-            if looks:
-                silhouettes = stacked_silhouettes([look.band for look in looks], [look.silhouettes for look in looks])
+            if band_renders:
+                silhouettes = stacked_silhouettes(
+                    [band_render.band for band_render in band_renders],
+                    [band_render.silhouettes for band_render in band_renders],
+                )
             else:
                 silhouettes = self._silhouettes(mitsuba_scene, plan.camera)
         with _timed(seconds, "label"):
@@ -383,7 +396,7 @@ class Renderer:
         """
         return mi.load_dict(self.describe(layout, plan.lights, replaced, belt), parallel=False)
 
-    def _look(
+    def _render_band(
         self,
         band: Band,
         plan: FramePlan,
@@ -391,7 +404,7 @@ class Renderer:
         layout: Layout,
         replaced: bool,
         mitsuba_scene: Any,
-    ) -> _Look:
+    ) -> _BandRender:
         """Render a band of rows at its moment. Until then, only a belt changes the scene."""
         belt = plan.belt
         if belt is not None:
@@ -399,9 +412,9 @@ class Renderer:
             layout = carried_by(belt, layout)
             mitsuba_scene = self._load(layout, plan, replaced, belt)
         layers = render_layers(self.integrator, mitsuba_scene, band.camera, seed=plan.seed)
-        ways = _swept(layers, band.camera, motion, layout, belt)
+        band_motion = _exposure_motion(layers, band.camera, motion, layout, belt)
         silhouettes = self._silhouettes(mitsuba_scene, band.camera)
-        return _Look(band, layers, (ways[0][band.rows], ways[1][band.rows]), silhouettes)
+        return _BandRender(band, layers, (band_motion[0][band.rows], band_motion[1][band.rows]), silhouettes)
 
     def _at_moment(self, layout: Layout, index: int) -> tuple[Layout, Layout | None]:
         """Return the layout at a frame's moment and at the next view's moment; None for the latter if nothing moves."""
@@ -413,11 +426,11 @@ class Renderer:
 
     def _settle(self, index: int) -> Layout:
         """Settle a layout and cache it for its next views."""
-        if index not in self._settled:
-            while len(self._settled) >= KEPT_LAYOUTS:
-                del self._settled[next(iter(self._settled))]
-            self._settled[index] = settle_layout(self.scene, index)
-        return self._settled[index]
+        if index not in self._layouts:
+            while len(self._layouts) >= KEPT_LAYOUTS:
+                del self._layouts[next(iter(self._layouts))]
+            self._layouts[index] = settle_layout(self.scene, index)
+        return self._layouts[index]
 
     def _label(self, layers: Layers, silhouettes: Mapping[int, Silhouette], layout: Layout, plan: FramePlan) -> Labels:
         scene, rules = self.scene, self.scene.spec.labels
@@ -444,24 +457,26 @@ class Renderer:
         travel. With ``replaced``, the lights are not the scene's own. Such lights can move without recompilation of
         kernels.
         """
-        if self._placed is None or self._placed[0] is not layout:
+        if self._cached_objects is None or self._cached_objects[0] is not layout:
             objects, appearances = {}, draw_appearances(self.scene, layout)
             for instance in layout.instances:
                 asset = self.scene.assets[instance.asset]
                 objects[f"instance_{instance.id}"] = _asset_shape(
                     asset, instance.world_from_object, instance.id, appearances.get(instance.id)
                 )
-            self._placed = layout, objects
-        emitters = {f"light_{i}": self._made(self._emitter(light), replaced) for i, light in enumerate(lights)}
+            self._cached_objects = layout, objects
+        emitters = {
+            f"light_{i}": self._cached_emitter(self._emitter(light), replaced) for i, light in enumerate(lights)
+        }
         place = draw_place(self.scene.spec, layout.index * self.scene.spec.output.views)
         surroundings = self._surroundings(place)
-        return {"type": "scene", **surroundings, **self._running(belt), **self._placed[1], **emitters}
+        return {"type": "scene", **surroundings, **self._belt_shape(belt), **self._cached_objects[1], **emitters}
 
-    def _running(self, belt: Belt | None) -> dict[str, Any]:
+    def _belt_shape(self, belt: Belt | None) -> dict[str, Any]:
         """Return the shape of a belt with its shifted pattern; empty if the belt has no pattern."""
-        if belt is None or self._pattern is None:
+        if belt is None or self._belt_pattern is None:
             return {}
-        number, finish, image, bsdf = self._pattern
+        number, finish, image, bsdf = self._belt_pattern
         shape, mesh = self.scene.spec.shapes[number], self.scene.shape_meshes[number]
         return {f"shape_{number}": finished_mesh(mesh, shape, finish, image, bsdf, belt.travel)}
 
@@ -470,7 +485,7 @@ class Renderer:
             light = light.model_copy(update={"image": str(self.scene.images[light.image])})
         return emitter_dict(light)
 
-    def _made(self, emitter: dict[str, Any], replaced: bool) -> Any:
+    def _cached_emitter(self, emitter: dict[str, Any], replaced: bool) -> Any:
         """Return an emitter, with the last environment map reused if its file is the same.
 
         Loading a large map can take longer than a frame. Lights with random draws are built so that their motion does
@@ -479,34 +494,34 @@ class Renderer:
         if emitter["type"] != "envmap":
             moves = replaced or any(light.draw for light in written_out(self.scene.spec))
             return movable(emitter) if moves else emitter
-        if self._sky is None or self._sky[0] != emitter["filename"]:
-            self._sky = emitter["filename"], mi.load_dict(emitter)
-        state = mi.traverse(self._sky[1])
+        if self._cached_environment_map is None or self._cached_environment_map[0] != emitter["filename"]:
+            self._cached_environment_map = emitter["filename"], mi.load_dict(emitter)
+        state = mi.traverse(self._cached_environment_map[1])
         # As a literal constant, each new radiance would recompile the kernels.
         state["scale"], state["to_world"] = dr.opaque(mi.Float, emitter["scale"]), emitter["to_world"]
         state.update()
-        return self._sky[1]
+        return self._cached_environment_map[1]
 
     def _background(self, backing: BackgroundDraw | None, camera: Camera) -> Any:
         """Return the background picture on the device, cached until it changes."""
         if backing is None:
             return BACKGROUND
-        if self._behind is None or self._behind[0] != backing:
+        if self._cached_background is None or self._cached_background[0] != backing:
             picture = background_picture(backing, self.scene.images[backing.image], camera.width, camera.height)
-            self._behind = backing, device_array(picture)
-        return self._behind[1]
+            self._cached_background = backing, device_array(picture)
+        return self._cached_background[1]
 
     def _surroundings(self, place: LayoutSurroundings) -> dict[str, Any]:
         """Return the static shapes of the surroundings, cached until their appearance changes."""
         place = replace(place, background=None)
-        if self._static is None or self._static[0] != place:
-            self._static = place, self._static_shapes(place)
+        if self._cached_surroundings is None or self._cached_surroundings[0] != place:
+            self._cached_surroundings = place, self._static_shapes(place)
             self.integrator.white = white_irradiance(self.scene, place)
-        return self._static[1]
+        return self._cached_surroundings[1]
 
     def _static_shapes(self, place: LayoutSurroundings) -> dict[str, Any]:
         shapes: dict[str, Any] = {}
-        conveyor, self._pattern = self.scene.spec.conveyor, None
+        conveyor, self._belt_pattern = self.scene.spec.conveyor, None
         environment = environment_at(self.scene, place)
         if environment is not None:
             shapes["environment"] = _asset_shape(environment, np.eye(4), 0)
@@ -516,7 +531,7 @@ class Renderer:
                 bsdf = mi.load_dict(material(finish, None if image is None else bitmap_texture(image)))
                 shapes[f"shape_{i}"] = finished_mesh(mesh, shape, finish, image, bsdf)
                 if conveyor is not None and shape.name == conveyor.belt and image is not None:
-                    self._pattern = i, finish, image, bsdf
+                    self._belt_pattern = i, finish, image, bsdf
             elif shape.visible:
                 shapes[f"shape_{i}"] = _visible_shape(shape.colour, mesh)
             elif shape.proxy:

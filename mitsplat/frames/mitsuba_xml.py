@@ -89,7 +89,7 @@ def export_xml(scene: Scene, index: int, path: str | Path) -> None:
         **shapes,
         **lights,
     }
-    _teach_writer()
+    _register_plugin_kinds()
     state = mi.parser.parse_dict(mi.parser.ParserConfig(str(mi.variant())), description)
     with library_errors(path):
         write_file(path, lambda part: mi.parser.write_file(state, str(part)))
@@ -273,7 +273,7 @@ def _describe_shape(
     }
 
 
-def _teach_writer() -> None:
+def _register_plugin_kinds() -> None:
     """Register the kinds of our plugins in a scalar variant, where Mitsuba's XML writer looks them up."""
     scalar = importlib.import_module("mitsuba.scalar_rgb")
 

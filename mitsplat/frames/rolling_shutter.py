@@ -32,7 +32,7 @@ MARGIN = 8
 Rendered bands begin at multiples of the margin, where the patterns of rays and tiles repeat.
 """
 
-_ROUNDS = 8
+_ITERATIONS = 8
 """Fixed-point iterations for a point's row and its moment.
 
 Each iteration reduces the error by the factor (image motion during read-out) / (image height).
@@ -108,10 +108,10 @@ def stacked_silhouettes(bands: Sequence[Band], parts: Sequence[Mapping[int, Silh
             mask = seen.mask[max(above - y0, 0) : max(below - y0, 0)]
             if mask.any():
                 found.setdefault(instance, []).append(Silhouette.cropped(mask, x0, above + band.top))
-    return {instance: _united(those) for instance, those in sorted(found.items())}
+    return {instance: _union(those) for instance, those in sorted(found.items())}
 
 
-def _united(parts: Sequence[Silhouette]) -> Silhouette:
+def _union(parts: Sequence[Silhouette]) -> Silhouette:
     boxes = np.array([part.box for part in parts])
     (left, top), (right, bottom) = boxes[:, :2].min(axis=0).tolist(), boxes[:, 2:].max(axis=0).tolist()
     mask = np.zeros((bottom - top, right - left), dtype=bool)
@@ -133,12 +133,12 @@ def project_by_row(
         velocity: Velocity of the points [m/s], shape (3,).
     """
     rotation, lens = camera.world_from_camera[:3, :3], replace(camera, world_from_camera=np.eye(4))
-    own = (points - camera.centre) @ rotation
+    camera_points = (points - camera.centre) @ rotation
     relative = rotation.T @ velocity - np.asarray(motion["velocity"])
     time = np.zeros(len(points))
-    for _ in range(_ROUNDS):
+    for _ in range(_ITERATIONS):
         turn = Rotation.from_rotvec(time[:, None] * np.asarray(motion["rotation"]), degrees=True)
-        pixels, depth = lens.project(turn.inv().apply(own + time[:, None] * relative))
+        pixels, depth = lens.project(turn.inv().apply(camera_points + time[:, None] * relative))
         share = np.clip(np.nan_to_num(pixels[:, 1]) / camera.height, 0, 1) - 0.5
         time = motion.get("readout", 0.0) * share
     return pixels, depth

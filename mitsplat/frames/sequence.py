@@ -26,7 +26,7 @@ Item = TypeVar("Item")
 Shot = tuple[int, Layout | None, Camera | None]
 """Frame index, and optional layout and camera in place of the scene's."""
 
-_ENDLESS = 1 << 40
+_UNLIMITED_LAYOUTS = 1 << 40
 """Number of layouts of an unlimited scene."""
 
 
@@ -78,13 +78,13 @@ def render_frames(
     scene = without_end(scene)
     with Renderer(scene, quality=quality) as renderer:
         if layouts is None and cameras is None:
-            for index in _told(indices, total, progress):
+            for index in _with_progress_bar(indices, total, progress):
                 yield renderer.render(index, lights=lights)
             return
-        shots = zip(indices, _each(layouts), _each(cameras), strict=False)
-        for shot, following in _told(_with_next(shots), total, progress):
+        shots = zip(indices, _one_per_frame(layouts), _one_per_frame(cameras), strict=False)
+        for shot, following in _with_progress_bar(_with_successor(shots), total, progress):
             index, layout, camera = shot
-            next_layout, next_camera = (None, None) if following is None else _next(scene, shot, following)
+            next_layout, next_camera = (None, None) if following is None else _next_view(scene, shot, following)
             frame = renderer.render(
                 index, layout=layout, camera=camera, lights=lights, next_layout=next_layout, next_camera=next_camera
             )
@@ -95,11 +95,11 @@ def render_frames(
 
 def without_end(scene: Scene) -> Scene:
     """Return the scene with a practically unlimited number of layouts; its first frames do not change."""
-    output = scene.spec.output.model_copy(update={"layouts": _ENDLESS})
+    output = scene.spec.output.model_copy(update={"layouts": _UNLIMITED_LAYOUTS})
     return replace(scene, spec=scene.spec.model_copy(update={"output": output}))
 
 
-def _next(scene: Scene, shot: Shot, following: Shot) -> tuple[Layout | None, Camera | None]:
+def _next_view(scene: Scene, shot: Shot, following: Shot) -> tuple[Layout | None, Camera | None]:
     """Return the next layout and camera for the flow of a film; (None, None) if the next image has other objects."""
     (index, layout, _), (next_index, next_layout, next_camera) = shot, following
     if layout is None and layout_of(scene, index) != layout_of(scene, next_index):
@@ -110,12 +110,12 @@ def _next(scene: Scene, shot: Shot, following: Shot) -> tuple[Layout | None, Cam
     return next_layout, view_of(scene, next_index, next_layout).camera if next_camera is None else next_camera
 
 
-def _each(given: Item | Iterable[Item] | None) -> Iterator[Item | None]:
+def _one_per_frame(given: Item | Iterable[Item] | None) -> Iterator[Item | None]:
     """Return an iterator over the given items, or an endless repetition of a single item."""
     return iter(given) if isinstance(given, Iterable) else itertools.repeat(given)
 
 
-def _with_next(items: Iterable[Item]) -> Iterator[tuple[Item, Item | None]]:
+def _with_successor(items: Iterable[Item]) -> Iterator[tuple[Item, Item | None]]:
     """Pair every item with its successor; None for the last one."""
     rest = iter(items)
     now = next(rest, None)
@@ -125,7 +125,7 @@ def _with_next(items: Iterable[Item]) -> Iterator[tuple[Item, Item | None]]:
         now = following
 
 
-def _told(steps: Iterable[Item], total: int | None, progress: bool) -> Iterator[Item]:
+def _with_progress_bar(steps: Iterable[Item], total: int | None, progress: bool) -> Iterator[Item]:
     """Yield the steps, with a progress bar if the console can show one."""
     console = Console(stderr=True)
     if not progress or not (find_spec("ipywidgets") if console.is_jupyter else console.is_terminal):

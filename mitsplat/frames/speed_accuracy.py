@@ -76,10 +76,10 @@ def tolerance_steps(tolerances: Sequence[float]) -> tuple[Step, ...]:
         InputError: If a tolerance is negative or not a number.
     """
     balanced = PRESETS["balanced"]
-    return tuple(Step(f"{_CURVE}{t:g}", replace(balanced, tolerance=t)) for t in tolerances)
+    return tuple(Step(f"{_TOLERANCE_PREFIX}{t:g}", replace(balanced, tolerance=t)) for t in tolerances)
 
 
-_CURVE = "balanced at "
+_TOLERANCE_PREFIX = "balanced at "
 """Prefix of the step names of :func:`tolerance_steps`, before the tolerance."""
 
 
@@ -111,7 +111,7 @@ class Row:
 
 
 @dataclass(frozen=True, eq=False)
-class _Shots:
+class _StepResult:
     """Pictures (K, H, W, 3) and instances (K, H, W) of one step, their median time [s], peak memory [GiB], estimate."""
 
     pictures: Float32Array
@@ -157,14 +157,14 @@ def measure_steps(
     exact = Step("exact", PRESETS["exact"])
     plan = [exact, *(step for step in steps if step != exact)]
     rows: dict[str, Row] = {}
-    truth: _Shots | None = None
+    reference: _StepResult | None = None
     for i, step in enumerate(plan):
         if progress is not None:
             progress(i, len(plan), step.name)
         changes = {**(overrides or {}), **step.overrides}
         shots = _run_alone(path, step, frames, changes, allow_outside, device or current_device())
-        truth = truth or shots
-        rows[step.name] = _compare(step.name, shots, truth)
+        reference = reference or shots
+        rows[step.name] = _compare(step.name, shots, reference)
     return [rows[step.name] for step in steps]
 
 
@@ -217,8 +217,8 @@ def _is_splats(path: Path) -> bool:
 
 def _run_alone(
     path: Path, step: Step, frames: int, overrides: Mapping[str, Any], allow_outside: bool, device: Device
-) -> _Shots:
-    job = _Shoot(path, step.quality, frames, dict(overrides), allow_outside)
+) -> _StepResult:
+    job = _RenderJob(path, step.quality, frames, dict(overrides), allow_outside)
     with closing(run_apart(job, device)) as results:
         try:
             return next(results)
@@ -227,28 +227,30 @@ def _run_alone(
 
 
 @dataclass(frozen=True)
-class _Shoot:
+class _RenderJob:
     path: Path
     quality: Quality | None
     frames: int
     overrides: dict[str, Any]
     allow_outside: bool
 
-    def __call__(self, _index: int, _note: Note, /) -> _Shots:
-        return _shoot(self.path, self.quality, self.frames, self.overrides, self.allow_outside)
+    def __call__(self, _index: int, _note: Note, /) -> _StepResult:
+        return _render_pictures(self.path, self.quality, self.frames, self.overrides, self.allow_outside)
 
 
-def _shoot(path: Path, quality: Quality | None, frames: int, overrides: dict[str, Any], allow_outside: bool) -> _Shots:
+def _render_pictures(
+    path: Path, quality: Quality | None, frames: int, overrides: dict[str, Any], allow_outside: bool
+) -> _StepResult:
     """Render the pictures; the first one is rendered twice, because it compiles or loads kernels."""
     if quality is None:
-        shoot = _volprim_shooter(path, frames, overrides)
+        shoot = _volprim_renderer(path, frames, overrides)
     elif _is_splats(path):
-        shoot = _splats_shooter(path, quality, frames, overrides)
+        shoot = _splats_renderer(path, quality, frames, overrides)
     else:
         shoot = _scene_shooter(path, quality, frames, overrides, allow_outside)
     shots = [shoot(i) for i in (0, *range(frames))][1:]
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return _Shots(
+    return _StepResult(
         np.stack([shot[0] for shot in shots]),
         None if quality is None else np.stack([shot[1] for shot in shots]),
         statistics.median(shot[2] for shot in shots),
@@ -284,7 +286,7 @@ def _scene_shooter(
     return shoot
 
 
-def _splats_shooter(path: Path, quality: Quality, frames: int, overrides: dict[str, Any]) -> Callable[[int], Shot]:
+def _splats_renderer(path: Path, quality: Quality, frames: int, overrides: dict[str, Any]) -> Callable[[int], Shot]:
     splats = Splats.load(path)
     width, height = overrides.get("output.width", 1280), overrides.get("output.height", 720)
 
@@ -304,7 +306,7 @@ def picture_of(layers: Layers) -> Float32Array:
     return np.clip(encode_srgb(colour) * layers.alpha[..., None], 0, 1).astype(np.float32)
 
 
-def _volprim_shooter(path: Path, frames: int, overrides: dict[str, Any]) -> Callable[[int], Shot]:
+def _volprim_renderer(path: Path, frames: int, overrides: dict[str, Any]) -> Callable[[int], Shot]:
     ensure_variant()
     splats = Splats.load(path)
     width, height = overrides.get("output.width", 1280), overrides.get("output.height", 720)
@@ -328,15 +330,15 @@ def look_around(splats: Splats, index: int, count: int, *, width: int, height: i
     return Camera.look_at(eye, centre, up=(0, -1, 0), width=width, height=height, fov_x=50)
 
 
-def _compare(name: str, shots: _Shots, truth: _Shots) -> Row:
+def _compare(name: str, shots: _StepResult, reference: _StepResult) -> Row:
     # Imported here, because it would add to the peak memory of the measuring processes.
     from skimage.metrics import structural_similarity
 
-    difference = shots.pictures.astype(np.float64) - truth.pictures
+    difference = shots.pictures.astype(np.float64) - reference.pictures
     rmse = float(np.sqrt(np.mean(difference**2)))
     ssim = [
         structural_similarity(a, b, channel_axis=-1, data_range=1.0)  # type: ignore[no-untyped-call]
-        for a, b in zip(shots.pictures, truth.pictures, strict=True)
+        for a, b in zip(shots.pictures, reference.pictures, strict=True)
     ]
     return Row(
         name,
@@ -345,18 +347,18 @@ def _compare(name: str, shots: _Shots, truth: _Shots) -> Row:
         -20 * math.log10(rmse) if rmse > 0 else math.inf,
         float(np.abs(difference).max()),
         float(np.mean(ssim)),
-        _mask_iou(shots.instances, truth.instances),
+        _mask_iou(shots.instances, reference.instances),
         shots.memory,
         shots.estimate,
     )
 
 
-def _mask_iou(mine: npt.NDArray[np.uint16] | None, theirs: npt.NDArray[np.uint16] | None) -> float:
+def _mask_iou(mine: npt.NDArray[np.uint16] | None, true_ids: npt.NDArray[np.uint16] | None) -> float:
     """Compute the mean IoU over the instances of all pictures, or NaN."""
-    if mine is None or theirs is None:
+    if mine is None or true_ids is None:
         return math.nan
     ious = []
-    for a, b in zip(mine, theirs, strict=True):
+    for a, b in zip(mine, true_ids, strict=True):
         ids, counts = np.unique(b[b > 0], return_counts=True)
         for instance in ids[counts >= INSTANCE_MIN]:
             own, other = a == instance, b == instance
@@ -400,8 +402,8 @@ def draw_chart(rows: Sequence[Row], file: Path, *, title: str, tolerance: float)
         axes.scatter(row.seconds, error, s=50, color="C3" if row == chosen else "C0", zorder=2)
         label = f"{row.name} (no error)" if row.rmse == 0 else row.name
         placed: dict[str, Any] = {"xytext": (6, 4)}
-        if row.name.startswith(_CURVE):  # below the points, which are dense at the curve's end
-            label, placed = row.name.removeprefix(_CURVE), {"xytext": (0, -6), "rotation": -45, "va": "top"}
+        if row.name.startswith(_TOLERANCE_PREFIX):  # below the points, which are dense at the curve's end
+            label, placed = row.name.removeprefix(_TOLERANCE_PREFIX), {"xytext": (0, -6), "rotation": -45, "va": "top"}
         axes.annotate(label, (row.seconds, error), textcoords="offset points", fontsize=8, **placed)
     axes.axhline(tolerance, color="C3", linewidth=0.8, linestyle="--")
     axes.set(xscale="log", yscale="log", xlabel="seconds per image", ylabel="RMSE against exact", title=title)
@@ -412,6 +414,13 @@ def draw_chart(rows: Sequence[Row], file: Path, *, title: str, tolerance: float)
 
 def curve_of(rows: Sequence[Row], least: float = 0.0) -> list[tuple[float, float]]:
     """Return (seconds, error >= ``least``) of ``balanced`` at all its tolerances, in descending order."""
-    at = {f"{_CURVE}{PRESETS['balanced'].tolerance:g}" if row.name == "balanced" else row.name: row for row in rows}
-    known = {float(name.removeprefix(_CURVE)): row for name, row in at.items() if name.startswith(_CURVE)}
+    at = {
+        f"{_TOLERANCE_PREFIX}{PRESETS['balanced'].tolerance:g}" if row.name == "balanced" else row.name: row
+        for row in rows
+    }
+    known = {
+        float(name.removeprefix(_TOLERANCE_PREFIX)): row
+        for name, row in at.items()
+        if name.startswith(_TOLERANCE_PREFIX)
+    }
     return [(row.seconds, max(row.rmse, least)) for _, row in sorted(known.items(), reverse=True)]

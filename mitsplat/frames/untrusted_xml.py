@@ -25,11 +25,11 @@ MAX_TEXT = 1 << 20
 """Maximum characters of an attribute after parameters are substituted."""
 
 _MAX_LEVELS = 15  # of includes: Mitsuba's own limit
-_NAMES_OF_FILES = ("filename", "asset", "proxy")
+_FILE_PROPERTIES = ("filename", "asset", "proxy")
 """Names of string properties in which plugins of Mitsuba and of mitsplat expect files."""
 _RESOLVED = {"default": (("name", "value"), ()), "path": (("value",), ()), "include": (("filename",), ("name",))}
 """Elements that this module resolves, with their required and their optional attributes."""
-_OUTSIDE = "must not name a file outside of the scene's folder"
+_INSIDE_RULE = "must not name a file outside of the scene's folder"
 _PLUGIN = re.compile(r"[\w-]*", re.ASCII)
 _UNDEFINED = re.compile(r"(?<!\\)\$(\w*)", re.ASCII)
 
@@ -103,7 +103,7 @@ class _Reader:
         self._scene = scene
         self._bounds = None if allow_outside else scene.parent
         self._parameters: dict[str, str] = {}
-        self._unread = self._unwritten = MAX_BYTES
+        self._read_budget = self._write_budget = MAX_BYTES
         self.names: list[Path] = []
         self.pieces: list[list[str | _FileName]] = []
 
@@ -139,8 +139,8 @@ class _Reader:
             raise refuse(f"must not have a document type (got {name})")
 
         def write(piece: str | _FileName) -> None:
-            self._unwritten -= len(piece if isinstance(piece, str) else piece.name)
-            if self._unwritten < 0:
+            self._write_budget -= len(piece if isinstance(piece, str) else piece.name)
+            if self._write_budget < 0:
                 raise refuse(f"the scene must not be larger than {MAX_BYTES >> 20} MiB with its parameters replaced")
             pieces.append(piece)
 
@@ -198,7 +198,7 @@ class _Reader:
             raise InputError(f"{self._scene}: must not include more than {MAX_INCLUDES} files")
         try:
             size = path.stat().st_size
-            if size > self._unread or not path.is_file():
+            if size > self._read_budget or not path.is_file():
                 raise InputError(
                     f"{path}: must be a file of at most {MAX_BYTES >> 20} MiB, with all that are included before "
                     f"(got {size} bytes)"
@@ -209,7 +209,7 @@ class _Reader:
             raise InputError(f"{path}: no such file") from None
         except OSError as error:
             raise InputError(f"{path}: cannot be read ({error.strerror})") from error
-        self._unread -= len(data)
+        self._read_budget -= len(data)
         return data
 
     def _substitute(self, text: str, place: str) -> str:
@@ -233,12 +233,12 @@ class _Reader:
         """Return the quoted form of an attribute's value."""
         if element == "spectrum" and key == "filename":
             return _quoted(str(self._find(value, folders, place, element)))
-        if element == "string" and key == "value" and value and values.get("name") in _NAMES_OF_FILES:
+        if element == "string" and key == "value" and value and values.get("name") in _FILE_PROPERTIES:
             return _FileName(value, place)
         if key == "type" and not _PLUGIN.fullmatch(value):
             raise InputError(f"{place}: type must be the name of a plugin (got {value})")
         if self._bounds is not None and element != "include" and _names_outside(self._bounds, value):
-            raise InputError(f"{place}: {_OUTSIDE} (got {value}); --allow-outside lifts this")
+            raise InputError(f"{place}: {_INSIDE_RULE} (got {value}); --allow-outside lifts this")
         return _quoted(value)
 
     def _find(self, name: str, folders: Sequence[Path], place: str, element: str) -> Path:
@@ -246,14 +246,14 @@ class _Reader:
 
         A name that no search folder contains is resolved in the scene's folder.
         """
-        found = next((path for folder in folders if _is_there(path := folder / name)), self._scene.parent / name)
+        found = next((path for folder in folders if _exists(path := folder / name)), self._scene.parent / name)
         if self._bounds is not None and not is_inside(self._bounds, os.path.realpath(found)):
-            rule = _OUTSIDE if element == "string" else f"{element} must be inside the scene's folder"
+            rule = _INSIDE_RULE if element == "string" else f"{element} must be inside the scene's folder"
             raise InputError(f"{place}: {rule} (got {name}); --allow-outside lifts this")
         path = Path(os.path.realpath(found))
         if path.suffix != found.suffix:  # readers choose a format by suffix
             path = Path(os.path.realpath(found.parent), found.name)
-        if _is_there(path) and not (path.is_file() or path.is_dir()):
+        if _exists(path) and not (path.is_file() or path.is_dir()):
             raise InputError(f"{place}: {element} must name a file or a folder (got {name})")
         try:
             str(path).encode()
@@ -262,7 +262,7 @@ class _Reader:
         return path
 
 
-def _is_there(path: Path) -> bool:
+def _exists(path: Path) -> bool:
     try:
         return path.exists()
     except (OSError, ValueError):  # not a valid file name

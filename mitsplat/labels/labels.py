@@ -263,9 +263,9 @@ def label_instances(
     for instance in sorted(instances, key=lambda instance: instance.id):
         if instance.class_index is None:
             continue
-        alone = truth.silhouettes.get(instance.id)
+        silhouette = truth.silhouettes.get(instance.id)
         if instance.id not in found:
-            dropped["outside" if alone is None or alone.inside(width, height) is None else "hidden"] += 1
+            dropped["outside" if silhouette is None or silhouette.inside(width, height) is None else "hidden"] += 1
             continue
         x0, y0, x1, y1 = found[instance.id]
         mask, fragments = without_fragments(ids[y0:y1, x0:x1] == instance.id, rules.min_fragment)
@@ -274,7 +274,7 @@ def label_instances(
             dropped["small"] += 1
             continue
         seen = Silhouette.cropped(mask, x0, y0)
-        amodal, box, area = _amodal(alone, seen, rules.min_fragment, (width, height))
+        amodal, box, area = _amodal(silhouette, seen, rules.min_fragment, (width, height))
         agreement, boundary = _agreement(seen, second, instance.id, found_second.get(instance.id))
         marks = tuple(
             name
@@ -305,7 +305,7 @@ def label_instances(
                 world_from_object=instance.world_from_object,
                 keypoints=np.zeros((0, 3))
                 if points is None or camera is None
-                else _see_keypoints(points, instance, camera, truth, project),
+                else _project_keypoints(points, instance, camera, truth, project),
                 marks=marks,
             )
         )
@@ -313,14 +313,14 @@ def label_instances(
 
 
 def _amodal(
-    alone: Silhouette | None, seen: Silhouette, min_fragment: int, size: tuple[int, int]
+    silhouette: Silhouette | None, seen: Silhouette, min_fragment: int, size: tuple[int, int]
 ) -> tuple[Silhouette, Box, int]:
     """Return the silhouette inside the image, and the bounds and area of the complete silhouette.
 
     Where three instances overlap in a pixel, one may have the largest share there that would not cover the pixel alone.
     Visible pixels therefore always belong to the silhouette.
     """
-    parts = [seen] if alone is None else [alone, seen]
+    parts = [seen] if silhouette is None else [silhouette, seen]
     x0, y0 = min(part.box[0] for part in parts), min(part.box[1] for part in parts)
     x1, y1 = max(part.box[2] for part in parts), max(part.box[3] for part in parts)
     canvas = np.zeros((y1 - y0, x1 - x0), dtype=bool)
@@ -328,14 +328,14 @@ def _amodal(
         left, top, right, bottom = part.box
         canvas[top - y0 : bottom - y0, left - x0 : right - x0] |= part.mask
     # Fragments are removed inside the image like those of the visible mask, and separately in the full silhouette.
-    whole = Silhouette.cropped(without_fragments(canvas, min_fragment)[0], x0, y0)
-    if min(whole.box[:2]) >= 0 and whole.box[2] <= size[0] and whole.box[3] <= size[1]:
-        return whole, whole.box, whole.area
-    inside = whole.inside(*size)
-    kept = None if inside is None else without_fragments(inside.mask, min_fragment)[0]
-    if inside is None or kept is None or not kept.any():
+    full = Silhouette.cropped(without_fragments(canvas, min_fragment)[0], x0, y0)
+    if min(full.box[:2]) >= 0 and full.box[2] <= size[0] and full.box[3] <= size[1]:
+        return full, full.box, full.area
+    inside = full.inside(*size)
+    cleaned = None if inside is None else without_fragments(inside.mask, min_fragment)[0]
+    if inside is None or cleaned is None or not cleaned.any():
         raise AssertionError("what is seen of an instance is part of its silhouette")
-    return Silhouette.cropped(kept, *inside.box[:2]), whole.box, whole.area
+    return Silhouette.cropped(cleaned, *inside.box[:2]), full.box, full.area
 
 
 def _agreement(
@@ -347,8 +347,8 @@ def _agreement(
     if bounds is not None:
         left, top, right, bottom = bounds
         x0, y0, x1, y1 = min(x0, left), min(y0, top), max(x1, right), max(y1, bottom)
-    room = 1 + BOUNDARY_TOLERANCE
-    x0, y0, x1, y1 = max(x0 - room, 0), max(y0 - room, 0), min(x1 + room, width), min(y1 + room, height)
+    margin = 1 + BOUNDARY_TOLERANCE
+    x0, y0, x1, y1 = max(x0 - margin, 0), max(y0 - margin, 0), min(x1 + margin, width), min(y1 + margin, height)
     other = second[y0:y1, x0:x1] == number
     one = np.zeros_like(other)
     left, top, right, bottom = seen.box
@@ -356,7 +356,7 @@ def _agreement(
     return float(np.count_nonzero(one & other) / np.count_nonzero(one | other)), boundary_f1(one, other)
 
 
-def _see_keypoints(
+def _project_keypoints(
     points: Float64Array, instance: Instance, camera: Camera, truth: Truth, project: Projection | None
 ) -> Float64Array:
     """Compute pixels and visibilities of an asset's keypoints, shape (K, 3)."""

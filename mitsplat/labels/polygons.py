@@ -12,7 +12,7 @@ from scipy.sparse import coo_array, csgraph
 
 from mitsplat.arrays import BoolArray, Float64Array, Int64Array
 
-_LEAN = 0.02
+_EDGE_DISTANCE = 0.02
 """Distance of the outermost vertices from a pixel's edge [px], so that they truncate to that pixel."""
 
 
@@ -37,12 +37,12 @@ def outline(mask: BoolArray) -> Float64Array:
         ring.reshape(-1, 2).astype(np.intp)
         for ring in cv2.findContours(mask.astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)[0]
     ]
-    polygon: Float64Array = _corners(_joined(rings, (height, width))) + np.float64(0.5)
+    polygon: Float64Array = _corners(_joined_rings(rings, (height, width))) + np.float64(0.5)
     (left, top), (right, bottom) = polygon.min(axis=0) - 0.5, polygon.max(axis=0) + 0.5
     for axis, edge in ((0, left), (0, right), (1, top), (1, bottom)):
         at = int(np.abs(polygon[:, axis] - edge).argmin())
         spike = polygon[[at, at]]
-        spike[0, axis] = edge - np.sign(edge - spike[0, axis]) * _LEAN
+        spike[0, axis] = edge - np.sign(edge - spike[0, axis]) * _EDGE_DISTANCE
         polygon = np.concatenate([polygon[: at + 1], spike, polygon[at + 1 :]])
     return polygon
 
@@ -54,7 +54,7 @@ def fill_polygon(polygon: npt.ArrayLike, width: int, height: int) -> BoolArray:
     return canvas.astype(bool)
 
 
-def _joined(rings: list[Int64Array], shape: tuple[int, int]) -> Int64Array:
+def _joined_rings(rings: list[Int64Array], shape: tuple[int, int]) -> Int64Array:
     """Join all ``rings`` to one closed walk of pixels (x, y); each bridge is traversed in both directions."""
     walk = rings[0]
     for start, ring, first in _bridges(rings, shape):

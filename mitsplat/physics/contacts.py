@@ -12,7 +12,7 @@ import trimesh
 import warp as wp
 from newton.geometry import BroadPhaseSAP, NarrowPhase
 
-_SPARE = 4  # capacity factor for models with more pairs than the first
+_PAIR_CAPACITY_FACTOR = 4  # capacity factor for models with more pairs than the first
 
 
 def newton_hull(piece: trimesh.Trimesh) -> newton.Mesh:
@@ -42,7 +42,7 @@ class ContactFinder:
         """
         pairs = model.shape_count * (model.shape_count - 1) // 2
         if self._narrow_phase is None or self._narrow_phase.max_candidate_pairs < pairs:
-            self._narrow_phase = _generate(self._pieces, _SPARE * pairs)
+            self._narrow_phase = _generate(self._pieces, _PAIR_CAPACITY_FACTOR * pairs)
         narrow_phase = copy(self._narrow_phase)
         narrow_phase.shape_aabb_lower, narrow_phase.shape_aabb_upper = (
             wp.zeros(model.shape_count, dtype=wp.vec3, device=model.device) for _ in range(2)

@@ -31,20 +31,20 @@ from mitsplat.scene.splits import draw_environment
 from mitsplat.scene.streams import random_stream
 from mitsplat.scene.walls import ENCLOSURE, PILE_HEIGHT, bin_walls, enclosed_bounds, stated_pose, walls_beside
 
-_REACH = 5e-3  # larger gaps are not measured [m]
+_MAX_MEASURED_GAP = 5e-3  # larger gaps are not measured [m]
 # Maximum penetration at rest [m], or as a share of the object's size if that is larger: convex pieces of scans deviate
 # by that much.
-_DEEPEST_IN_COLLIDER, _DEEPEST_IN_OBJECT, _DEEPEST_SHARE = 3e-4, 5e-4, 0.003
-_DEEPEST_GIVEN = 1e-3  # maximum overlap of start poses from the scene file [m]
-_NEAREST = 5e-4  # minimum distance of scattered objects at rest [m]
-_FALLEN = 5.0  # tilt from which an upright object has fallen over [degrees]
+_MAX_DEPTH_IN_COLLIDER, _MAX_DEPTH_IN_OBJECT, _MAX_DEPTH_SHARE = 3e-4, 5e-4, 0.003
+_MAX_START_OVERLAP = 1e-3  # maximum overlap of start poses from the scene file [m]
+_MIN_SCATTER_DISTANCE = 5e-4  # minimum distance of scattered objects at rest [m]
+_FALLEN_TILT = 5.0  # tilt from which an upright object has fallen over [degrees]
 # Number of simulations between garbage collections. Newton leaves each model (1 MiB and more) in reference cycles,
 # which Python would collect only after a quarter of all objects. A collection takes 0.5 s.
 _GARBAGE = 24
 CROWDED = "no room for all"
-_CROWD = 0.1  # share of the objects that is left out per round if they find no room,
-_CROWDED = 0.5  # and maximum share in total: beyond it, the region is too small
-_POURED = 1.0  # speed limit of poured objects [m/s]: at higher speed, heavy objects eject light ones
+_LEFT_OUT_PER_ROUND = 0.1  # share of the objects that is left out per round if they find no room,
+_MAX_LEFT_OUT = 0.5  # and maximum share in total: beyond it, the region is too small
+_POUR_SPEED = 1.0  # speed limit of poured objects [m/s]: at higher speed, heavy objects eject light ones
 _THRESHOLDS = (0.02, 0.01, 0.005)  # concavity of convex pieces, from coarse to fine
 
 
@@ -73,7 +73,7 @@ class _Ground:
 
 
 @dataclass(frozen=True, eq=False)
-class _Dealt:
+class _DrawnObject:
     """An object drawn for a layout, with its pose from the scene file (if any) and its start region."""
 
     id: int
@@ -82,12 +82,12 @@ class _Dealt:
     region: int
 
 
-_Fault = tuple[str, set[PlacedSurface]]
+_Defect = tuple[str, set[PlacedSurface]]
 """Defect of a resting state: its description and the affected objects."""
 
 
 @dataclass(frozen=True)
-class _Refusal:
+class _Rejection:
     """Rejection of a draw: its reason, the positions of the objects that cause it, and an optional error message."""
 
     reason: str
@@ -127,7 +127,7 @@ class Drop:
         self.scene = scene
         self._parts: dict[int, _Part] = {}
         self._worlds: dict[tuple[tuple[int, ...], tuple[float, ...], float, int], World] = {}
-        self._made = 0
+        self._world_count = 0
         self._objects = [self._part(asset, progress) for asset in scene.assets]
         self._arrangements = tuple(arrangement for _, arrangement in scene.spec.all_regions)
         surroundings = scene.environments if scene.spec.environment_collides else ()
@@ -146,53 +146,53 @@ class Drop:
             InputError: If more than half of the objects find no room, although each of them fits alone.
             NothingRests: If no draw passes, even with fewer objects.
         """
-        dealt = self._dealt(index)
-        if not dealt:
+        drawn = self._draw_contents(index)
+        if not drawn:
             return Layout(index, (), NOTHING_TO_REST)
         attempts = self.scene.spec.settle.attempts
         refused: list[str] = []
         left_out: list[LeftOut] = []
         sentence = crowded = ""
-        whole = len(dealt)
-        while dealt:
-            faults: dict[int, list[str]] = {one.id: [] for one in dealt}
+        total = len(drawn)
+        while drawn:
+            faults: dict[int, list[str]] = {one.id: [] for one in drawn}
             before = len(refused)
             while len(refused) < before + attempts and CROWDED not in refused[before:]:
-                found = self._try(index, dealt, refused)
+                found = self._try(index, drawn, refused)
                 if isinstance(found, Layout):
                     return replace(found, left_out=tuple(left_out))
                 refused.append(found.reason)
                 sentence = found.sentence
                 crowded = crowded or (sentence if found.reason == CROWDED else "")
                 for position in found.blamed:
-                    faults[dealt[position].id].append(found.reason)
+                    faults[drawn[position].id].append(found.reason)
             draws = len(refused) - before
-            gone = [one for one in dealt if len(faults[one.id]) == draws]
+            removed = [one for one in drawn if len(faults[one.id]) == draws]
             if CROWDED in refused[before:]:
-                gone = dealt[-math.ceil(_CROWD * len(dealt)) :]
-                if len(dealt) - len(gone) < (1 - _CROWDED) * whole:
+                removed = drawn[-math.ceil(_LEFT_OUT_PER_ROUND * len(drawn)) :]
+                if len(drawn) - len(removed) < (1 - _MAX_LEFT_OUT) * total:
                     raise InputError(crowded)
-            for one in gone or [max(dealt, key=lambda one: (len(faults[one.id]), one.id))]:
+            for one in removed or [max(drawn, key=lambda one: (len(faults[one.id]), one.id))]:
                 reason, times = Counter(faults[one.id] or refused[before:]).most_common(1)[0]
-                said = reason.removeprefix(f"{self.scene.assets[one.asset].name} ")
-                left_out.append(LeftOut(one.id, one.asset, f"{said} in {times} of {draws} draws"))
-                dealt.remove(one)
+                short_reason = reason.removeprefix(f"{self.scene.assets[one.asset].name} ")
+                left_out.append(LeftOut(one.id, one.asset, f"{short_reason} in {times} of {draws} draws"))
+                drawn.remove(one)
         reasons = ", ".join(f"{count} x {reason}" for reason, count in Counter(refused[:attempts]).items())
         must = f"layout {index} must come to rest in settle.attempts = {attempts} draws (got {reasons})"
         nothing = replace(NOTHING_TO_REST, attempts=len(refused), refused=tuple(refused))
         raise NothingRests(sentence or f"{self.scene.path}: {must}", Layout(index, (), nothing, tuple(left_out)))
 
-    def _dealt(self, index: int) -> list[_Dealt]:
+    def _draw_contents(self, index: int) -> list[_DrawnObject]:
         """Return the objects that are drawn for a layout."""
         assets, given = draw_objects(self.scene, index)
         rows = zip(assets, given, draw_regions(self.scene.spec, index), strict=True)
-        return [_Dealt(number, *row) for number, row in enumerate(rows, start=1)]
+        return [_DrawnObject(number, *row) for number, row in enumerate(rows, start=1)]
 
-    def _try(self, index: int, dealt: Sequence[_Dealt], refused: Sequence[str]) -> Layout | _Refusal:
+    def _try(self, index: int, drawn: Sequence[_DrawnObject], refused: Sequence[str]) -> Layout | _Rejection:
         """Drop the given objects from the next draw of start poses."""
         number = self._ground_of(index)
-        assets, given = tuple(one.asset for one in dealt), [one.given for one in dealt]
-        regions, obstacles = [one.region for one in dealt], self._grounds[number].obstacles
+        assets, given = tuple(one.asset for one in drawn), [one.given for one in drawn]
+        regions, obstacles = [one.region for one in drawn], self._grounds[number].obstacles
         rng = random_stream(self.scene.spec.seed, "object poses", index, len(refused))
         try:
             start = self.draw_poses(assets, rng, given, number, regions)
@@ -200,21 +200,21 @@ class Drop:
             # An object that is too large for its region is rejected alone; the others may still fit.
             alone = [self._place([item], number, rng) is None for item in self._items(assets, given, regions)]
             reason = "no room for it" if any(alone) else CROWDED
-            return _Refusal(reason, np.flatnonzero(alone).tolist(), str(error))
+            return _Rejection(reason, np.flatnonzero(alone).tolist(), str(error))
         world = self._world(assets, self._draw_frictions(index), 2.0 ** refused.count(OVERFLOW), number)
         world.reset(start)
         outcome = self._run(world, number, regions, given)
         if outcome.refused:
-            return _Refusal(outcome.refused, outcome.blamed)
+            return _Rejection(outcome.refused, outcome.blamed)
         resting = [self._placed(asset, pose) for asset, pose in zip(assets, outcome.poses, strict=True)]
-        clearances = all_clearances(resting, obstacles, reach=_REACH)
+        clearances = all_clearances(resting, obstacles, reach=_MAX_MEASURED_GAP)
         gaps = _support_gaps(resting, clearances)
-        fault = _fault(clearances, gaps, obstacles) or self._disarray(
+        fault = _fault(clearances, gaps, obstacles) or self._arrangement_defect(
             resting, clearances, obstacles, start, outcome.poses, given, regions
         )
         if fault is not None:
             reason, blamed = fault
-            return _Refusal(reason, [position for position, item in enumerate(resting) if item in blamed])
+            return _Rejection(reason, [position for position, item in enumerate(resting) if item in blamed])
         certificate = RestCertificate(
             rested=True,
             inside=True,
@@ -230,7 +230,7 @@ class Drop:
             attempts=len(refused) + 1,
             refused=tuple(refused),
         )
-        return Layout(index, self._instances(dealt, outcome.poses), certificate)
+        return Layout(index, self._instances(drawn, outcome.poses), certificate)
 
     def try_alone(self, asset: int, region: int, tries: int) -> list[str]:
         """Drop an object alone with a region's arrangement.
@@ -240,7 +240,7 @@ class Drop:
         """
         refused: list[str] = []
         while len(refused) < tries:
-            found = self._try(0, [_Dealt(1, asset, None, region)], refused)
+            found = self._try(0, [_DrawnObject(1, asset, None, region)], refused)
             if isinstance(found, Layout):
                 return []
             refused.append(found.reason)
@@ -248,15 +248,15 @@ class Drop:
 
     def replay(self, layout: Layout, interval: float) -> Iterator[Float64Array]:
         """Yield poses (N, 4, 4) of a layout's objects every ``interval`` seconds, from the start until they rest."""
-        there = {instance.id for instance in layout.instances}
-        dealt = [one for one in self._dealt(layout.index) if one.id in there]
-        if not dealt:
+        resting_ids = {instance.id for instance in layout.instances}
+        drawn = [one for one in self._draw_contents(layout.index) if one.id in resting_ids]
+        if not drawn:
             return
-        assets, given = tuple(one.asset for one in dealt), [one.given for one in dealt]
+        assets, given = tuple(one.asset for one in drawn), [one.given for one in drawn]
         certificate = layout.certificate
         rng = random_stream(self.scene.spec.seed, "object poses", layout.index, certificate.attempts - 1)
         capacity = 2.0 ** certificate.refused.count(OVERFLOW)
-        number, regions = self._ground_of(layout.index), [one.region for one in dealt]
+        number, regions = self._ground_of(layout.index), [one.region for one in drawn]
         world = self._world(assets, self._draw_frictions(layout.index), capacity, number)
         world.reset(self.draw_poses(assets, rng, given, number, regions))
         moments = [world.poses]
@@ -281,7 +281,7 @@ class Drop:
         **options: Any,
     ) -> RestOutcome:
         settle = self.scene.spec.settle
-        fastest = _POURED if any(self._arrangements[i] == "pile" for i in regions) else np.inf
+        fastest = _POUR_SPEED if any(self._arrangements[i] == "pile" for i in regions) else np.inf
         low, high = self._grounds[ground].bounds
         # Objects with a pose in the scene file may be in any of the regions.
         free = np.array([pose is None for pose in given])[:, None]
@@ -302,8 +302,8 @@ class Drop:
             settle, ground = self.scene.spec.settle, self._grounds[number]
             bodies = [self._objects[asset].body.with_friction(frictions[asset]) for asset in assets]
             self._worlds.clear()
-            self._made += 1
-            if self._made % _GARBAGE == 0:
+            self._world_count += 1
+            if self._world_count % _GARBAGE == 0:
                 gc.collect()
             self._worlds[key] = (
                 MujocoWorld(bodies, ground.colliders, timestep=settle.timestep)
@@ -325,18 +325,18 @@ class Drop:
         if id(asset.mesh) not in self._parts:
             mesh = prepare_mesh(asset.mesh, f"asset {asset.name!r}")
             surface = DistanceSurface(mesh)
-            pieces, stands_off = asset.pieces, 0.0
+            pieces, standoff_distance = asset.pieces, 0.0
             if pieces:
-                stands_off = standoff(surface, pieces)
+                standoff_distance = standoff(surface, pieces)
             else:
                 limit = widest_gap(float(mesh.extents.max()))
                 for threshold in _THRESHOLDS:
                     pieces = _pieces(mesh, asset.name, progress, threshold=threshold)
-                    stands_off = standoff(surface, pieces)
-                    if stands_off <= limit:
+                    standoff_distance = standoff(surface, pieces)
+                    if standoff_distance <= limit:
                         break
             mass = mass_properties(mesh, pieces, density=asset.density, mass=asset.mass)
-            self._parts[id(asset.mesh)] = _Part(Body(pieces, mass, asset.friction), surface, stands_off)
+            self._parts[id(asset.mesh)] = _Part(Body(pieces, mass, asset.friction), surface, standoff_distance)
         return self._parts[id(asset.mesh)]
 
     def _make_ground(self, surroundings: Asset | None, progress: Note) -> _Ground:
@@ -385,8 +385,8 @@ class Drop:
         for entry, spec in enumerate(self.scene.spec.objects):
             for number, pose in enumerate(spec.poses):
                 keys[self._placed(self.scene.pools[entry][0], stated_pose(pose))] = f"objects[{entry}].poses[{number}]"
-        for pair in all_clearances(list(keys), ground.obstacles, reach=_REACH):
-            if -pair.distance > _DEEPEST_GIVEN:
+        for pair in all_clearances(list(keys), ground.obstacles, reach=_MAX_MEASURED_GAP):
+            if -pair.distance > _MAX_START_OVERLAP:
                 other = keys.get(pair.second, f"collider {pair.second.name!r}")
                 raise InputError(
                     f"{self.scene.path}: {keys[pair.first]}: must not start in {other} "
@@ -421,7 +421,7 @@ class Drop:
         raise InputError(
             f"{self.scene.path}: region must be large enough to start all objects in (the {len(assets)} of a layout "
             f"find no room without overlap in {size[0]:.3g} x {size[1]:.3g} x {size[2]:.3g} m"
-            f"{self._in_way(self._grounds[ground].obstacles)}, settle.arrangement {arrangement})"
+            f"{self._describe_obstruction(self._grounds[ground].obstacles)}, settle.arrangement {arrangement})"
         )
 
     def _place(self, items: Sequence[Item], ground: int, rng: np.random.Generator) -> Float64Array | None:
@@ -443,14 +443,14 @@ class Drop:
             for i, asset in enumerate(assets)
         ]
 
-    def _in_way(self, obstacles: Sequence[PlacedSurface]) -> str:
+    def _describe_obstruction(self, obstacles: Sequence[PlacedSurface]) -> str:
         """Describe the obstacle that fills most of the region; empty if no obstacle fills a tenth of it."""
         points = np.random.default_rng(0).uniform(self.scene.spec.region.min, self.scene.spec.region.max, (1000, 3))
         taken = [float((item.signed_distances(points) < 0).mean()) for item in obstacles]
         worst = int(np.argmax(taken))
         return f", {taken[worst]:.0%} of which are inside of {obstacles[worst].name!r}" if taken[worst] >= 0.1 else ""
 
-    def _disarray(
+    def _arrangement_defect(
         self,
         resting: Sequence[PlacedSurface],
         clearances: Sequence[Clearance],
@@ -459,31 +459,35 @@ class Drop:
         end: Float64Array,
         given: Sequence[Float64Array | None],
         regions: Sequence[int],
-    ) -> _Fault | None:
+    ) -> _Defect | None:
         """Return how a resting layout violates the requested arrangement, or None."""
-        laid = {item: self._arrangements[region] for item, region in zip(resting, regions, strict=True)}
+        arrangement_of = {item: self._arrangements[region] for item, region in zip(resting, regions, strict=True)}
         for pair in clearances:
             if pair.second.name.startswith(ENCLOSURE) and pair.distance < widest_gap(0.0):
                 return f"{pair.first.name} rests against the enclosure", {pair.first}
         for pair in clearances:
-            if laid[pair.first] == "scatter" and pair.second not in obstacles and pair.distance < _NEAREST:
+            if (
+                arrangement_of[pair.first] == "scatter"
+                and pair.second not in obstacles
+                and pair.distance < _MIN_SCATTER_DISTANCE
+            ):
                 return f"{pair.first.name} and {pair.second.name} touch", {pair.first, pair.second}
         # The tilt is the angle between the vertical and the object's start vertical after its rotation.
         tilts = np.degrees(np.arccos(np.clip(np.einsum("nj,nj->n", end[:, 2, :3], start[:, 2, :3]), -1, 1)))
         fallen = [
             item
             for item, tilt, pose in zip(resting, tilts, given, strict=True)
-            if laid[item] in ("stack", "upright", "tower", "packed") and pose is None and tilt > _FALLEN
+            if arrangement_of[item] in ("stack", "upright", "tower", "packed") and pose is None and tilt > _FALLEN_TILT
         ]
         return (f"{fallen[0].name} fell over", set(fallen)) if fallen else None
 
     def _placed(self, asset: int, pose: Float64Array) -> PlacedSurface:
         return PlacedSurface(self.scene.assets[asset].name, self._objects[asset].surface, pose)
 
-    def _instances(self, dealt: Sequence[_Dealt], poses: Float64Array) -> tuple[Instance, ...]:
+    def _instances(self, drawn: Sequence[_DrawnObject], poses: Float64Array) -> tuple[Instance, ...]:
         return tuple(
             Instance(one.id, one.asset, self.scene.class_index(one.asset), pose)
-            for one, pose in zip(dealt, poses, strict=True)
+            for one, pose in zip(drawn, poses, strict=True)
         )
 
 
@@ -497,13 +501,13 @@ def _support_gaps(resting: Sequence[PlacedSurface], clearances: Sequence[Clearan
 
 def _fault(
     clearances: Sequence[Clearance], gaps: Mapping[PlacedSurface, float], obstacles: Sequence[PlacedSurface]
-) -> _Fault | None:
+) -> _Defect | None:
     """Return the defect of a resting state (penetration or unsupported object), or None."""
     for pair in sorted(clearances, key=lambda pair: pair.distance):
         if pair.second in obstacles:
-            deepest = max(_DEEPEST_IN_COLLIDER, _DEEPEST_SHARE * pair.first.size)
+            deepest = max(_MAX_DEPTH_IN_COLLIDER, _MAX_DEPTH_SHARE * pair.first.size)
         else:
-            deepest = max(_DEEPEST_IN_OBJECT, _DEEPEST_SHARE * max(pair.first.size, pair.second.size))
+            deepest = max(_MAX_DEPTH_IN_OBJECT, _MAX_DEPTH_SHARE * max(pair.first.size, pair.second.size))
         if -pair.distance > deepest:
             reason = f"{pair.first.name} and {pair.second.name} overlap by {-pair.distance * 1e3:.1f} mm"
             return reason, {pair.first, pair.second}

@@ -16,16 +16,16 @@ from mitsplat.scene.spec.object_spec import Arrangement
 from mitsplat.scene.spec.shape_spec import Region
 from mitsplat.scene.walls import PILE_HEIGHT
 
-_PLACES = 200  # positions tried per object before all objects are drawn anew
-_PLACES_IN_LAYER = 20  # positions tried per layer of a pile
-_DRAWS = 20
+_MAX_POSITIONS = 200  # positions tried per object before all objects are drawn anew
+_MAX_POSITIONS_IN_LAYER = 20  # positions tried per layer of a pile
+_MAX_DRAWS = 20
 _SPACING = 1e-3  # minimum distance of bounding boxes at the start [m]
-_ROOM = (2e-3, 5e-3)  # distance of packed objects [m]
-_ASKEW = 3.0  # maximum rotation of packed objects from quarter turns [degrees]
-_OFF_MIDDLE = 4e-3  # maximum offset of a tower's object from the centre below, along x and y [m]
-_LEAN = np.radians(10)  # tilt that must raise the centre of an object on another side
-_LIFT = 0.005  # minimum rise, as a share of the centre's height above the ground
-_HOVER = 2e-4  # start distance of objects from the surface below [m]
+_PACK_GAP = (2e-3, 5e-3)  # distance of packed objects [m]
+_MAX_PACK_YAW = 3.0  # maximum rotation of packed objects from quarter turns [degrees]
+_MAX_TOWER_OFFSET = 4e-3  # maximum offset of a tower's object from the centre below, along x and y [m]
+_TEST_TILT = np.radians(10)  # tilt that must raise the centre of an object on another side
+_MIN_RISE = 0.005  # minimum rise, as a share of the centre's height above the ground
+_START_GAP = 2e-4  # start distance of objects from the surface below [m]
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +69,7 @@ def draw_poses(
             None.
         turned_over: Probability that such an object stands on another side, see :func:`standing_turns`.
     """
-    for _ in range(_DRAWS):
+    for _ in range(_MAX_DRAWS):
         poses = _Draw(items, obstacles, rng, yaw, turned_over).all_poses(regions)
         if poses is not None:
             return poses
@@ -95,15 +95,15 @@ def standing_turns(outline: Float64Array) -> list[Float64Array]:
     standing if a tilt in every direction raises the centre of its bounds. Round objects do not stand.
     """
     ways = np.linspace(0, 2 * np.pi, 16, endpoint=False)
-    lean = np.sin(_LEAN)
-    downs = np.stack([lean * np.cos(ways), lean * np.sin(ways), np.full(len(ways), -np.cos(_LEAN))])
+    lean = np.sin(_TEST_TILT)
+    downs = np.stack([lean * np.cos(ways), lean * np.sin(ways), np.full(len(ways), -np.cos(_TEST_TILT))])
     found = []
     for quarters in (1, 2, 3):
         turn = Rotation.from_euler("y", 90 * quarters, degrees=True).as_matrix().round()
         points = outline @ turn.T
         points -= (points.min(axis=0) + points.max(axis=0)) / 2
         height = -points[:, 2].min()
-        if (points @ downs).max(axis=0).min() > (1 + _LIFT) * height:
+        if (points @ downs).max(axis=0).min() > (1 + _MIN_RISE) * height:
             found.append(turn)
     return found
 
@@ -121,10 +121,10 @@ class _Draw:
     ) -> None:
         self._items, self._obstacles, self._rng, self._yaw = items, obstacles, rng, yaw
         self._turned_over = turned_over
-        self._low = self._high = self._foot = np.zeros(3)
-        self._sky = np.inf
+        self._low = self._high = self._column_base = np.zeros(3)
+        self._ceiling = np.inf
         self._poses = np.tile(np.eye(4), (len(items), 1, 1))
-        self._taken: list[Float64Array] = []
+        self._occupied: list[Float64Array] = []
 
     def all_poses(self, regions: Sequence[tuple[Region, Arrangement]]) -> Float64Array | None:
         free = []
@@ -132,14 +132,14 @@ class _Draw:
             if item.pose is None:
                 free.append(i)
             else:
-                self._take(i, item.pose, _bounds(item.outline, item.pose))
+                self._record(i, item.pose, _bounds(item.outline, item.pose))
         # Large objects are placed first, because they find the least room.
         free.sort(key=lambda i: -float(np.ptp(self._items[i].outline, axis=0).max()))
         # Towers are placed before the objects around them.
         for number, (region, arrangement) in sorted(enumerate(regions), key=lambda one: one[1][1] != "tower"):
             self._low, self._high = np.array(region.min), np.array(region.max)
-            self._sky = float(self._high[2]) if len(regions) > 1 else np.inf  # another region may lie above
-            self._foot = self._low.copy()  # lower end of the free part of a pile's column
+            self._ceiling = float(self._high[2]) if len(regions) > 1 else np.inf  # another region may lie above
+            self._column_base = self._low.copy()  # lower end of the free part of a pile's column
             if not self._fill([i for i in free if self._items[i].region == number], arrangement):
                 return None
         return self._poses
@@ -150,29 +150,29 @@ class _Draw:
             assets = dict.fromkeys(self._items[i].asset for i in free)
             return all(self._stack([i for i in free if self._items[i].asset == asset]) for asset in assets)
         if arrangement == "tower":
-            return self._build(free)
+            return self._build_tower(free)
         if arrangement == "packed":
             return self._pack(free)
         place: dict[str, Callable[[int], bool]] = {
             "drop": self._drop,
             "pile": self._pour,
             "scatter": self._scatter,
-            "upright": lambda i: self._stand(i, self._side(i), self._yaw),
+            "upright": lambda i: self._stand(i, self._draw_side(i), self._yaw),
         }
         return all(place[arrangement](i) for i in free)
 
     def _drop(self, i: int) -> bool:
-        return self._try(i, self._low, self._high)
+        return self._place_randomly(i, self._low, self._high)
 
     def _pour(self, i: int) -> bool:
         """Place an item in a column above the region's floor; the column rises as it fills."""
         height = float(np.linalg.norm(np.ptp(self._items[i].outline, axis=0)))
-        while self._foot[2] + height < self._high[2] + PILE_HEIGHT:
+        while self._column_base[2] + height < self._high[2] + PILE_HEIGHT:
             top = self._high.copy()
-            top[2] = self._foot[2] + height
-            if self._try(i, self._foot, top, places=_PLACES_IN_LAYER):
+            top[2] = self._column_base[2] + height
+            if self._place_randomly(i, self._column_base, top, places=_MAX_POSITIONS_IN_LAYER):
                 return True
-            self._foot[2] += height / 2
+            self._column_base[2] += height / 2
         return False
 
     def _scatter(self, i: int) -> bool:
@@ -186,15 +186,15 @@ class _Draw:
             middle = box.mean(axis=0)
             return np.stack([middle - reach, middle + reach])
 
-        return self._try(i, self._low, top, occupies=around)
+        return self._place_randomly(i, self._low, top, occupies=around)
 
-    def _try(
+    def _place_randomly(
         self,
         i: int,
         low: Float64Array,
         high: Float64Array,
         *,
-        places: int = _PLACES,
+        places: int = _MAX_POSITIONS,
         occupies: Callable[[Float64Array], Float64Array] = lambda box: box,
     ) -> bool:
         """Place an item with a random rotation at a free position between two corners."""
@@ -206,8 +206,8 @@ class _Draw:
         for _ in range(places):
             pose[:3, 3] = self._rng.uniform(low - bounds[0], high - bounds[1])
             box = bounds + pose[:3, 3]
-            if self._free(i, pose, occupies(box)):
-                self._take(i, pose, occupies(box))
+            if self._is_free(i, pose, occupies(box)):
+                self._record(i, pose, occupies(box))
                 return True
         return False
 
@@ -219,32 +219,34 @@ class _Draw:
             return False
         for below, i in pairwise(members):
             pose = self._poses[below].copy()
-            height = float(np.ptp(self._taken[-1][:, 2]))
-            pose[2, 3] += height + _HOVER
+            height = float(np.ptp(self._occupied[-1][:, 2]))
+            pose[2, 3] += height + _START_GAP
             box = _bounds(self._items[i].outline, pose)
             if box[1][2] > self._high[2]:
                 return False
-            self._take(i, pose, box)
+            self._record(i, pose, box)
         return True
 
-    def _build(self, members: Sequence[int]) -> bool:
+    def _build_tower(self, members: Sequence[int]) -> bool:
         """Stack all members upright, the widest at the bottom, each with its own rotation and a small offset."""
-        sides = {i: self._side(i) for i in members}
+        sides = {i: self._draw_side(i) for i in members}
         members = sorted(
             members, key=lambda i: -float(np.ptp((self._items[i].outline @ sides[i].T)[:, :2], axis=0).prod())
         )
         if members and not self._stand(members[0], sides[members[0]], self._yaw):
             return False
         for i in members[1:]:
-            below, pose = self._taken[-1], np.eye(4)
-            pose[:3, :3] = self._turn(self._yaw) @ sides[i]
+            below, pose = self._occupied[-1], np.eye(4)
+            pose[:3, :3] = self._draw_yaw(self._yaw) @ sides[i]
             bounds = _bounds(self._items[i].outline, pose)
-            pose[:2, 3] = (below - bounds).mean(axis=0)[:2] + self._rng.uniform(-_OFF_MIDDLE, _OFF_MIDDLE, 2)
-            pose[2, 3] = below[1][2] + _HOVER - bounds[0][2]
+            pose[:2, 3] = (below - bounds).mean(axis=0)[:2] + self._rng.uniform(
+                -_MAX_TOWER_OFFSET, _MAX_TOWER_OFFSET, 2
+            )
+            pose[2, 3] = below[1][2] + _START_GAP - bounds[0][2]
             box = bounds + pose[:3, 3]
             if box[1][2] > self._high[2]:
                 return False
-            self._take(i, pose, box)
+            self._record(i, pose, box)
         return True
 
     def _pack(self, members: Sequence[int]) -> bool:
@@ -255,10 +257,10 @@ class _Draw:
             if self._yaw is not None:
                 angle = self._rng.uniform(*self._yaw)
             else:
-                angle = 90 * int(self._rng.integers(4)) + self._rng.uniform(-_ASKEW, _ASKEW)
-            pose[:3, :3] = Rotation.from_euler("z", angle, degrees=True).as_matrix() @ self._side(i)
+                angle = 90 * int(self._rng.integers(4)) + self._rng.uniform(-_MAX_PACK_YAW, _MAX_PACK_YAW)
+            pose[:3, :3] = Rotation.from_euler("z", angle, degrees=True).as_matrix() @ self._draw_side(i)
             bounds = _bounds(self._items[i].outline, pose)
-            size, room = bounds[1] - bounds[0], self._rng.uniform(*_ROOM)
+            size, room = bounds[1] - bounds[0], self._rng.uniform(*_PACK_GAP)
             if corner[0] + size[0] > self._high[0]:
                 corner[:2], depth = (self._low[0], corner[1] + depth + room), 0.0
             if (corner + size > self._high).any():
@@ -267,9 +269,9 @@ class _Draw:
             if not self._lower(i, pose):
                 return False
             box = bounds + pose[:3, 3]
-            if not self._free(i, pose, box, above=True):
+            if not self._is_free(i, pose, box, above=True):
                 return False
-            self._take(i, pose, box)
+            self._record(i, pose, box)
             corner[0] += size[0] + room
             depth = max(depth, float(size[1]))
         return True
@@ -277,21 +279,21 @@ class _Draw:
     def _stand(self, i: int, turn: Float64Array, yaw: tuple[float, float] | None = None) -> bool:
         """Put an item, rotated about the vertical, down on the surface below."""
         outline = self._items[i].outline
-        for _ in range(_PLACES):
+        for _ in range(_MAX_POSITIONS):
             pose = np.eye(4)
-            pose[:3, :3] = self._turn(yaw) @ turn
+            pose[:3, :3] = self._draw_yaw(yaw) @ turn
             bounds = _bounds(outline, pose)
             low, high = self._low - bounds[0], self._high - bounds[1]
             if (low > high).any():
                 continue
             pose[:3, 3] = self._rng.uniform(low, high)
             pose[2, 3] = high[2]
-            if self._lower(i, pose) and self._free(i, pose, _bounds(outline, pose), above=True):
-                self._take(i, pose, _bounds(outline, pose))
+            if self._lower(i, pose) and self._is_free(i, pose, _bounds(outline, pose), above=True):
+                self._record(i, pose, _bounds(outline, pose))
                 return True
         return False
 
-    def _side(self, i: int) -> Float64Array:
+    def _draw_side(self, i: int) -> Float64Array:
         """Draw the rotation (3, 3) that selects the side on which an item stands."""
         if self._turned_over > 0 and self._rng.random() < self._turned_over:
             turns = standing_turns(self._items[i].outline)
@@ -299,7 +301,7 @@ class _Draw:
                 return turns[int(self._rng.integers(len(turns)))]
         return np.eye(3)
 
-    def _turn(self, yaw: tuple[float, float] | None) -> Float64Array:
+    def _draw_yaw(self, yaw: tuple[float, float] | None) -> Float64Array:
         """Draw a rotation (3, 3) about the vertical by an angle from a range [degrees], or by any angle."""
         low, high = (0.0, 2 * np.pi) if yaw is None else np.radians(yaw)
         turn: Float64Array = Rotation.from_euler("z", self._rng.uniform(low, high)).as_matrix()
@@ -313,7 +315,7 @@ class _Draw:
         """
         top = _bounds(self._items[i].outline, pose)[1][2]
         # The lid of an enclosure touches a pose at the region's top; it is not an obstacle for lowering.
-        obstacles = [obstacle for obstacle in self._obstacles if obstacle.bounds[0][2] < top - _HOVER]
+        obstacles = [obstacle for obstacle in self._obstacles if obstacle.bounds[0][2] < top - _START_GAP]
         if not obstacles:
             return False
         floor = min(obstacle.bounds[0][2] for obstacle in obstacles)
@@ -323,24 +325,24 @@ class _Draw:
             for obstacle in obstacles:
                 nearer = clearance(placed, obstacle, reach=max(distance, 0.0) + ROUNDING).distance
                 distance = min(distance, nearer)
-            if distance < _HOVER:
+            if distance < _START_GAP:
                 return distance > 0
             if placed.bounds[1][2] < floor:
                 return False
-            pose[2, 3] -= distance - _HOVER / 2
+            pose[2, 3] -= distance - _START_GAP / 2
 
-    def _free(self, i: int, pose: Float64Array, box: Float64Array, *, above: bool = False) -> bool:
+    def _is_free(self, i: int, pose: Float64Array, box: Float64Array, *, above: bool = False) -> bool:
         """Return True if a pose collides with nothing; with ``above``, the space above must be free too."""
         if above:
-            box = np.stack([box[0], [*box[1][:2], self._sky]])
-        if self._taken and _boxes_meet(box, np.stack(self._taken)).any():
+            box = np.stack([box[0], [*box[1][:2], self._ceiling]])
+        if self._occupied and _boxes_meet(box, np.stack(self._occupied)).any():
             return False
         placed = PlacedSurface("", self._items[i].surface, pose)
         return all(clearance(placed, item, reach=_SPACING).distance > 0 for item in self._obstacles)
 
-    def _take(self, i: int, pose: Float64Array, box: Float64Array) -> None:
+    def _record(self, i: int, pose: Float64Array, box: Float64Array) -> None:
         self._poses[i] = pose
-        self._taken.append(box)
+        self._occupied.append(box)
 
 
 def _bounds(outline: Float64Array, pose: Float64Array) -> Float64Array:

@@ -18,9 +18,9 @@ OVERFLOW = "contact buffer overflow"
 # Rest means that no surface moves farther than a limit [m] within a time [s]. The stricter first stage ends before
 # rolling friction is disabled. Speeds are less reliable: contacts of rounded hulls flicker from step to step, and so do
 # the velocities of resting bodies.
-_MOTION, _WATCH_TIME = 5e-4, 1.0
+_REST_MOTION, _REST_TIME = 5e-4, 1.0
 _QUIET_MOTION, _QUIET_TIME = 1e-4, 0.25
-_MEAN_TIME = 0.05  # averaging time of the reported speeds [s]
+_SPEED_WINDOW = 0.05  # averaging time of the reported speeds [s]
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,13 +68,13 @@ def run_to_rest(
     try:
         return _run_to_rest(world, max_time, bounds, fastest, observe)
     except ContactOverflow:
-        refused = _Refused(OVERFLOW, np.zeros(len(world.bodies), dtype=bool))
-    except _Refused as error:
+        refused = _Rejected(OVERFLOW, np.zeros(len(world.bodies), dtype=bool))
+    except _Rejected as error:
         refused = error
     return RestOutcome(str(refused), world.time, np.inf, np.inf, np.inf, world.poses, refused.blamed)
 
 
-class _Refused(Exception):
+class _Rejected(Exception):
     """Rejection of a drop, with the bodies that cause it."""
 
     def __init__(self, reason: str, bodies: npt.ArrayLike) -> None:
@@ -89,22 +89,22 @@ def _run_to_rest(
     fastest: float,
     observe: Callable[[float, Float64Array], None],
 ) -> RestOutcome:
-    mean_frames = max(1, round(_MEAN_TIME / world.interval))
+    mean_frames = max(1, round(_SPEED_WINDOW / world.interval))
     past: deque[Float64Array] = deque([world.poses], maxlen=mean_frames + 1)
     since, rest = 0.0, world.poses
     motion = np.zeros(len(world.bodies))
-    while world.time - since < _WATCH_TIME:
+    while world.time - since < _REST_TIME:
         world.let_roll(world.time - since >= _QUIET_TIME)
         poses = _advance_within(world, bounds, fastest)
         past.append(poses)
         observe(world.time, poses)
         motion = np.maximum(motion, _surface_motion(world.bodies, rest, poses))
-        moving = motion > (_QUIET_MOTION if world.time - since < _QUIET_TIME else _MOTION)
+        moving = motion > (_QUIET_MOTION if world.time - since < _QUIET_TIME else _REST_MOTION)
         if moving.any():
             since, rest = world.time, poses
             motion = np.zeros(len(world.bodies))
         if since >= max_time:
-            raise _Refused(f"not at rest within {max_time:g} s", moving)
+            raise _Rejected(f"not at rest within {max_time:g} s", moving)
     speed, spin = _mean_speeds(world.bodies, past[0], poses, (len(past) - 1) * world.interval)
     return RestOutcome("", since, speed, spin, float(motion.max()), world.poses)
 
@@ -114,7 +114,7 @@ def _advance_within(world: World, bounds: tuple[Float64Array, Float64Array], fas
     world.advance()
     poses, velocities = world.poses, world.velocities
     if not np.isfinite(poses).all() or not np.isfinite(velocities).all():
-        raise _Refused("the simulation diverged", ~np.isfinite(poses).all(axis=(1, 2)))
+        raise _Rejected("the simulation diverged", ~np.isfinite(poses).all(axis=(1, 2)))
     speeds = np.linalg.norm(velocities[:, 0], axis=1)
     if speeds.max() > fastest:
         velocities[:, 0] *= np.minimum(1.0, fastest / np.maximum(speeds, fastest))[:, None]
@@ -122,7 +122,7 @@ def _advance_within(world: World, bounds: tuple[Float64Array, Float64Array], fas
     centres = _centres(world.bodies, poses)
     outside = ((centres < bounds[0]) | (centres > bounds[1])).any(axis=1)
     if outside.any():
-        raise _Refused(f"{int(outside.sum())} left the enclosure", outside)
+        raise _Rejected(f"{int(outside.sum())} left the enclosure", outside)
     return poses
 
 

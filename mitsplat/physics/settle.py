@@ -29,12 +29,12 @@ from mitsplat.storage.content_hash import ContentHash
 
 PACKAGE = Path(__file__).parents[1]
 
-_OWN = ("contacts", "drop", "friction", "placement", "rest", "worlds")
+_PHYSICS_MODULES = ("contacts", "drop", "friction", "placement", "rest", "worlds")
 MODULES = (
     "geometry.decomposition",
     "geometry.mesh",
     "geometry.mesh_distance",
-    *(f"physics.{name}" for name in _OWN),
+    *(f"physics.{name}" for name in _PHYSICS_MODULES),
     "scene.planning.contents",
     "scene.splits",
     "scene.streams",

@@ -27,7 +27,7 @@ SAFE_PATH = "PYTHONSAFEPATH"
 REFUSED = 2
 """Exit status of a bounded child whose function raised :class:`InputError`."""
 
-_SETTLING = 5.0
+_GRACE_TIME = 5.0
 """Time by which a child may exceed its limit if its parent is gone [s]."""
 
 _BOUNDED = "from mitsplat.runtime.child_process import run_function; run_function()"
@@ -126,7 +126,7 @@ def run_bounded(
 def run_function() -> None:
     """Run the function named by the command line, as the child's part of :func:`run_bounded`, and end this process."""
     call, memory, seconds, *arguments = sys.argv[1:]
-    signal.alarm(math.ceil(float(seconds) + _SETTLING))  # ends this process if its parent cannot
+    signal.alarm(math.ceil(float(seconds) + _GRACE_TIME))  # ends this process if its parent cannot
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     module, name, *imports = json.loads(call)
     function = getattr(importlib.import_module(module), name)
@@ -135,7 +135,7 @@ def run_function() -> None:
     data = sys.stdin.buffer.read()
     output = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # libraries print to stdout
-    bound = _held() + int(memory)
+    bound = _address_space() + int(memory)
     _, most = resource.getrlimit(resource.RLIMIT_AS)
     if most == resource.RLIM_INFINITY or bound < most:
         resource.setrlimit(resource.RLIMIT_AS, (bound, bound))
@@ -153,11 +153,11 @@ def run_function() -> None:
 def limit_memory(memory: int) -> None:
     """Lower the limit of a child's address space to its present size plus ``memory`` [bytes]."""
     _, most = resource.getrlimit(resource.RLIMIT_AS)
-    bound = _held() + memory
+    bound = _address_space() + memory
     resource.setrlimit(resource.RLIMIT_AS, (bound if most == resource.RLIM_INFINITY else min(bound, most), most))
 
 
-def _held() -> int:
+def _address_space() -> int:
     """Return the address space of this process [bytes]; a GPU driver may have reserved any amount."""
     with open("/proc/self/statm") as pages:  # noqa: PTH123 - a file of the system
         return int(pages.read().split()[0]) * resource.getpagesize()

@@ -103,7 +103,7 @@ def use_device(device: str | Device) -> Device:
     """
     found = find_device(device)
     if not found.is_here:
-        raise _too_late(str(device), found.gpus[0])
+        raise _late_device_error(str(device), found.gpus[0])
     choose_variant(VARIANTS[found.kind == "cuda"])
     return found
 
@@ -155,7 +155,7 @@ def find_device(device: str | Device) -> Device:
     return Device("cuda", (gpus[int(which)],))
 
 
-def _too_late(text: str, gpu: Gpu) -> LateDeviceError:
+def _late_device_error(text: str, gpu: Gpu) -> LateDeviceError:
     return LateDeviceError(
         f"{text} must be the first GPU that a process sees when it imports mitsplat: set {VISIBLE}={gpu.id} "
         "before, and use the device cuda",

@@ -25,7 +25,7 @@ SET_CALLBACK = "_Z26jit_set_log_level_callback8LogLevelPFvS_PKcE"
 
 _Callback = ctypes.CFUNCTYPE(None, ctypes.c_uint32, ctypes.c_char_p)
 
-_lost: list[str] = []
+_dropped: list[str] = []
 
 
 def watch_rays() -> None:
@@ -48,22 +48,22 @@ def refuse_lost_rays() -> None:
     Raises:
         RuntimeError: If Dr.Jit has dropped rays.
     """
-    if _lost:
-        text, count = _lost[0], len(_lost)
-        _lost.clear()
+    if _dropped:
+        text, count = _dropped[0], len(_dropped)
+        _dropped.clear()
         raise RuntimeError(f"the picture is wrong, because Dr.Jit left out rays ({count} times): {text}")
 
 
-def _keep(level: int, message: bytes) -> None:
+def _record(level: int, message: bytes) -> None:
     """Record or print a log message. Dr.Jit calls this function, so it must not raise."""
     text = message.decode(errors="replace")
     if SIGN in message:
-        _lost.append(text)
+        _dropped.append(text)
     elif sys.stderr is not None:
         sys.stderr.write(f"{text}\n")
 
 
-_callback = _Callback(_keep)
+_callback = _Callback(_record)
 
 
 @lru_cache

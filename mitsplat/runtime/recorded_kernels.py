@@ -22,7 +22,7 @@ differs from division by a variable (``tests/renderer/test_recorded.py``,
 ``python -m benchmarks.assets.fit --synthetic spur_gear --replay off``).
 """
 
-_KEPT = 64
+_MAX_RECORDINGS = 64
 """Maximum number of recordings per function; one per picture size, number of Gaussians and SH degree."""
 
 Arguments = ParamSpec("Arguments")
@@ -43,10 +43,10 @@ def recorded(function: Callable[Arguments, Result]) -> Callable[Arguments, Resul
     @wraps(function)
     def call(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
         arrays: list[Any] = []
-        form = _form(args, arrays)
+        form = _with_placeholders(args, arrays)
 
         def run(arrays: list[Any]) -> Result:
-            return function(*_filled(form, iter(arrays)))  # type: ignore[call-arg]
+            return function(*_with_arrays(form, iter(arrays)))  # type: ignore[call-arg]
 
         if not REPLAY:
             result = run(arrays)
@@ -54,7 +54,7 @@ def recorded(function: Callable[Arguments, Result]) -> Callable[Arguments, Resul
             key = mi.variant(), form
             if key not in recordings:
                 recordings[key] = dr.freeze(run)
-                if len(recordings) > _KEPT:
+                if len(recordings) > _MAX_RECORDINGS:
                     recordings.popitem(last=False)
             recordings.move_to_end(key)
             result = recordings[key](arrays)
@@ -78,21 +78,21 @@ class _Array(NamedTuple):
     width: int | None
 
 
-class _Keyed(NamedTuple):
+class _Dict(NamedTuple):
     """Placeholder of a dictionary."""
 
     keys: tuple[str, ...]
     parts: tuple[Any, ...]
 
 
-class _Listed(NamedTuple):
+class _Sequence(NamedTuple):
     """Placeholder of a list or a tuple."""
 
     kind: type
     parts: tuple[Any, ...]
 
 
-def _form(values: Any, arrays: list[Any]) -> Any:
+def _with_placeholders(values: Any, arrays: list[Any]) -> Any:
     """Replace arrays in the values by placeholders, and append the arrays to a list."""
     if isinstance(values, dr.ArrayBase):
         arrays.append(values)
@@ -101,18 +101,18 @@ def _form(values: Any, arrays: list[Any]) -> Any:
         arrays.append(values.values)
         return _Array(type(values.values), None)
     if isinstance(values, dict):
-        return _Keyed(tuple(values), tuple([_form(value, arrays) for value in values.values()]))
+        return _Dict(tuple(values), tuple([_with_placeholders(value, arrays) for value in values.values()]))
     if isinstance(values, (list, tuple)) and not hasattr(values, "_fields"):
-        return _Listed(type(values), tuple([_form(value, arrays) for value in values]))
+        return _Sequence(type(values), tuple([_with_placeholders(value, arrays) for value in values]))
     return values
 
 
-def _filled(form: Any, arrays: Iterator[Any]) -> Any:
+def _with_arrays(form: Any, arrays: Iterator[Any]) -> Any:
     """Replace the placeholders of a form by these arrays."""
     if isinstance(form, _Array):
         return next(arrays)
-    if isinstance(form, _Keyed):
-        return dict(zip(form.keys, [_filled(part, arrays) for part in form.parts], strict=True))
-    if isinstance(form, _Listed):
-        return form.kind(_filled(part, arrays) for part in form.parts)
+    if isinstance(form, _Dict):
+        return dict(zip(form.keys, [_with_arrays(part, arrays) for part in form.parts], strict=True))
+    if isinstance(form, _Sequence):
+        return form.kind(_with_arrays(part, arrays) for part in form.parts)
     return form

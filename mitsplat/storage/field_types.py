@@ -19,7 +19,7 @@ else:
 Vector = TypeVar("Vector", bound=tuple[float, ...])
 
 
-class _TellsInOneSentence(ModelMetaclass):
+class _InputErrorMeta(ModelMetaclass):
     """Metaclass that reports invalid Python values of a model with the same messages as values of a file."""
 
     if not TYPE_CHECKING:  # editors complete the keys of models from their fields
@@ -31,7 +31,7 @@ class _TellsInOneSentence(ModelMetaclass):
                 raise InputError(sentence_of_model(error, cls, values)) from None
 
 
-class StrictModel(BaseModel, metaclass=_TellsInOneSentence):
+class StrictModel(BaseModel, metaclass=_InputErrorMeta):
     """Immutable model without unknown keys, infinities or NaN."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)

@@ -61,13 +61,13 @@ class ListsFile:
 
     def keep(self) -> None:
         """End the lists, and give the file its final name."""
-        whole = self._parts[self._first]
+        first = self._parts[self._first]
         for name in self._others:
-            whole.write(f"], {json.dumps(name)}: [")
-            whole.take(self._parts[name])
-        whole.write("]" + "".join(f", {json.dumps(key)}: {json.dumps(value)}" for key, value in self._after.items()))
-        whole.write("}")
-        whole.keep()
+            first.write(f"], {json.dumps(name)}: [")
+            first.take(self._parts[name])
+        first.write("]" + "".join(f", {json.dumps(key)}: {json.dumps(value)}" for key, value in self._after.items()))
+        first.write("}")
+        first.keep()
 
     def discard(self) -> None:
         """Remove the temporary files, unless the file was kept."""
@@ -189,8 +189,8 @@ class _Window:
                 raise ValueError("it is nested too deeply") from error
             else:
                 # A number may continue beyond the text read so far; all other values end with a character of their own.
-                sure = not isinstance(value, int | float) or end + _LOOK_AHEAD <= len(self._text)
-                if sure or not self._read():
+                complete = not isinstance(value, int | float) or end + _LOOK_AHEAD <= len(self._text)
+                if complete or not self._read():
                     self._at = end
                     return value
 

@@ -108,7 +108,7 @@ def load_yaml(
     overridden = {tuple(key.split(".")): value for key, value in (overrides or {}).items()}
     data = _plain(tree, (), tree, path, count())
     for keys, value in overridden.items():
-        _set(data, keys, _as_written(value))
+        _set(data, keys, _to_file_values(value))
     if newest is not None:  # checked first: other errors may be valid in a newer version
         check_format_version(data, newest, _place(path, _line(tree, (FORMAT_VERSION,)), ()))
     try:
@@ -116,15 +116,15 @@ def load_yaml(
         return model.model_validate_json(json.dumps(data), strict=True)
     except ValidationError as error:
         findings = [_finding(details, model, data, tree, overridden) for details in error.errors()]
-    first = min(findings, key=lambda finding: (_follows(finding, findings), finding.line or 0))
+    first = min(findings, key=lambda finding: (_is_consequence(finding, findings), finding.line or 0))
     raise InputError(_sentence(path, first.line, first.path, first.rule))
 
 
 def sentence_of_model(error: ValidationError, model: type[BaseModel], values: Mapping[str, Any]) -> str:
     """Return the error sentence for ``values`` from Python code (not from a file) that break a rule of a model."""
-    data = _as_written(values)
+    data = _to_file_values(values)
     findings = [_finding(details, model, data, None, {}) for details in error.errors()]
-    first = min(findings, key=lambda finding: _follows(finding, findings))
+    first = min(findings, key=lambda finding: _is_consequence(finding, findings))
     return _sentence(Path(model.__name__), None, first.path, first.rule)
 
 
@@ -137,14 +137,14 @@ def key_place(path: str | Path, keys: KeyPath) -> str:
     return _place(path, _line(_parse(path), keys) if path.exists() else None, keys)
 
 
-def _as_written(value: Any) -> Any:
+def _to_file_values(value: Any) -> Any:
     """Convert a value to mappings, lists and scalars as in a file."""
     if isinstance(value, BaseModel):
-        return _as_written(dict(value))
+        return _to_file_values(dict(value))
     if isinstance(value, Mapping):
-        return {str(key): _as_written(inner) for key, inner in value.items()}
+        return {str(key): _to_file_values(inner) for key, inner in value.items()}
     if isinstance(value, list | tuple):
-        return [_as_written(inner) for inner in value]
+        return [_to_file_values(inner) for inner in value]
     return value.tolist() if isinstance(value, np.generic | np.ndarray) else value
 
 
@@ -178,7 +178,7 @@ def _parse(path: Path) -> CommentedMap:
     except RecursionError:
         raise InputError(f"{path}: must not nest deeper than {MAX_DEPTH} levels") from None
     if not isinstance(tree, CommentedMap):
-        raise InputError(f"{path}: must be a mapping of keys to values (got {_shown(tree)})")
+        raise InputError(f"{path}: must be a mapping of keys to values (got {_format_value(tree)})")
     return tree
 
 
@@ -194,7 +194,9 @@ def _plain(node: Any, keys: KeyPath, tree: CommentedMap, path: Path, values: Ite
     if isinstance(node, Mapping):
         for key in node:
             if not isinstance(key, str):
-                raise InputError(_sentence(path, _line(tree, keys), keys, f"keys must be text (got {_shown(key)})"))
+                raise InputError(
+                    _sentence(path, _line(tree, keys), keys, f"keys must be text (got {_format_value(key)})")
+                )
         return {str(key): _plain(value, (*keys, key), tree, path, values) for key, value in node.items()}
     if isinstance(node, list):
         return [_plain(value, (*keys, position), tree, path, values) for position, value in enumerate(node)]
@@ -249,14 +251,14 @@ def _finding(
     elif kind != "missing":
         if kind == "tuple_type" and "prefixItems" in (form := _schema_at(model, location)):
             rule += f" of {len(form['prefixItems'])}"
-        rule = f"{rule.replace('Input should', 'must')} (got {_shown(value)})"
+        rule = f"{rule.replace('Input should', 'must')} (got {_format_value(value)})"
     overlaps = [min(len(keys), len(override)) for override in overridden]
     from_file = not any(n and keys[:n] == override[:n] for n, override in zip(overlaps, overridden, strict=True))
     line = _line(tree, keys) if tree is not None and from_file else None
     return _Finding(keys, rule, line, kind == "missing" and isinstance(location[-1], str))
 
 
-def _follows(finding: _Finding, findings: Sequence[_Finding]) -> bool:
+def _is_consequence(finding: _Finding, findings: Sequence[_Finding]) -> bool:
     """Return True if the finding may result from another one, such as a misspelt key or an invalid list item."""
     return finding.missing or any(
         len(finding.path) < len(other.path) and other.path[: len(finding.path)] == finding.path for other in findings
@@ -335,7 +337,7 @@ def _sentence(path: Path, line: int | None, keys: KeyPath, rule: str) -> str:
     return f"{_place(path, line, keys)}: {rule}"
 
 
-def _shown(value: Any) -> str:
+def _format_value(value: Any) -> str:
     """Return the value in the notation of the file, shortened."""
     text = "nothing" if value is None else json.dumps(value, default=str, ensure_ascii=False)
     return text if len(text) <= 60 else f"{text[:57]}..."

@@ -168,7 +168,7 @@ class TooLarge:
 def test_memory_that_runs_out_costs_no_frame(scene, tmp_path, undisturbed, workers):
     out = tmp_path / "out"
     with pytest.raises(
-        MissingResourceError, match=r"^frame 7 cannot be made: memory has run out \(jit_malloc.*are kept$"
+        MissingResourceError, match=r"^frame 7 cannot be made: memory is exhausted \(jit_malloc.*are kept$"
     ):
         write(scene, out, render=TooLarge(7), workers=workers)
     kept = lines(out)

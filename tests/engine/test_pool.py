@@ -206,7 +206,7 @@ def test_fewer_workers_where_memory_runs_out(tmp_path):
     made = run(Greedy(tmp_path, room=2), 5, layouts={0: range(20), 1: range(20, 40)}, note=notes.append)
     assert sorted(index for index, _ in made) == list(range(40))
     assert 1 <= len({process for _, process in made[-10:]}) <= 2
-    assert notes[0].startswith("memory has run out for frame ") and notes[0].endswith("is made again with 4 workers")
+    assert notes[0].startswith("memory is exhausted for frame ") and notes[0].endswith("is made again with 4 workers")
     assert all(ended(path.name) for path in tmp_path.iterdir())
 
 
@@ -216,7 +216,7 @@ def test_a_frame_that_does_not_fit_even_alone(tmp_path, workers):
     with closing(results), pytest.raises(MissingResourceError) as caught:
         made.extend(results)
     assert str(caught.value) == (
-        "frame 7 cannot be made: memory has run out (jit_malloc(): out of memory! Could not allocate 4 GiB of device "
+        "frame 7 cannot be made: memory is exhausted (jit_malloc(): out of memory! Could not allocate 4 GiB of device "
         "memory.): smaller images and fewer samples take less; if it was a GPU's, use --device cpu; finished frames "
         "are kept"
     )
@@ -264,7 +264,7 @@ class Short:
         return 0
 
 
-EXHAUSTED = Failure(MissingResourceError, "RuntimeError", "memory has run out", "", exhausted=True)
+EXHAUSTED = Failure(MissingResourceError, "RuntimeError", "memory is exhausted", "", exhausted=True)
 
 
 def test_workers_take_the_device_before_anything_else(monkeypatch):

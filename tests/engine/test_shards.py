@@ -263,7 +263,7 @@ class TestRay:
             render=ExhaustedOnce(tmp_path, 6),
             progress=lambda *event: told.append(event[2]),
         )
-        assert "memory has run out for frame 6: it is made again with 3 workers" in told
+        assert "memory is exhausted for frame 6: it is made again with 3 workers" in told
         assert contents(tmp_path / "out") == whole
 
     def test_bad_input_keeps_its_sentence(self, scene, tmp_path):
@@ -367,7 +367,7 @@ def test_machines_that_join_are_told_of_once(monkeypatch):
     del few._actors[workers[0]]
     assert openings(fourth=8.0) == 1
     assert openings(**dict.fromkeys(ray.alive, 0.0)) == 0
-    now[0] += cluster._PATIENCE
+    now[0] += cluster._MACHINE_TIMEOUT
     with pytest.raises(LostWorkersError, match=r"^no node .* CPU=2 for a worker any more; finished frames are kept"):
         openings()
 

@@ -65,7 +65,7 @@ def test_a_layout_of_which_nothing_rests_is_an_error_that_has_the_empty_layout(n
 def test_what_is_higher_than_the_region_leaves_room_for_the_others(scene_data, write_scene, tmp_path, monkeypatch):
     from mitsplat.physics import placement
 
-    monkeypatch.setattr(placement, "_DRAWS", 2)
+    monkeypatch.setattr(placement, "_MAX_DRAWS", 2)
     box_asset("plank", (0.02, 0.02, 0.3)).save(tmp_path / "assets/plank")
     scene_data["objects"] = [{"asset": "assets/nut"}, {"asset": "assets/plank"}]
     scene_data["settle"] = {"arrangement": "upright", "attempts": 1, "stepper": "mujoco"}
@@ -110,7 +110,7 @@ def test_a_region_mostly_inside_of_a_table_is_blamed_on_it(scene_data, write_sce
     from mitsplat.physics import placement as place
     from mitsplat.physics.drop import drop_of
 
-    monkeypatch.setattr(place, "_DRAWS", 1)
+    monkeypatch.setattr(place, "_MAX_DRAWS", 1)
     rng = np.random.default_rng(0)
     scene_data["region"] = {"min": [-0.2, -0.2, -0.09], "max": [0.2, 0.2, 0.01]}
     with pytest.raises(InputError, match=r"in 0.4 x 0.4 x 0.1 m, (89|90|91)% of which are inside of 'table', settle"):

@@ -54,7 +54,7 @@ from mitsplat.storage.files import storage_errors, write_text
 LEAST_SCORE, NMS_IOU = 0.001, 0.7
 """Least score of stored detections, and IoU threshold of the non-maximum suppression within a class."""
 
-_OWN = frozenset(("truth.json", "detections.json", "results.json", REPORT_FILE))
+_EVALUATION_FILES = frozenset(("truth.json", "detections.json", "results.json", REPORT_FILE))
 """Names of the files of an evaluation."""
 
 
@@ -116,7 +116,7 @@ def evaluate_detector(
     out = trained.path / "evaluation" / name if out is None else Path(out)
     if root.resolve().is_relative_to(out.resolve()):
         raise InputError(f"{out}: must not hold the images that are judged, {root}: give another folder")
-    check_folder(out, "an evaluation", _OWN)
+    check_folder(out, "an evaluation", _EVALUATION_FILES)
     load_libraries()
     check_torchvision()
     network = str(trained.record["settings"]["model"])
@@ -241,7 +241,7 @@ def write_evaluation(
             "most_detections": MOST_DETECTIONS,
             "confusion": {"least_score": CONFIDENCE, "iou": IOU},
         },
-        **{kind: _described(score) for kind, score in scores.items()},
+        **{kind: _score_record(score) for kind, score in scores.items()},
         "gains": {kind: round(gain, 5) for kind, gain in gains(truth, detections, scores["box"]).items()},
         "confusion": {"classes": [*found.class_names, "nothing"], "matrix": confusion.matrix.tolist()},
     }
@@ -254,7 +254,7 @@ def write_evaluation(
     return Evaluation(out, results)
 
 
-def _described(score: AveragePrecision) -> dict[str, Any]:
+def _score_record(score: AveragePrecision) -> dict[str, Any]:
     return {
         "map50_95": round(score.map50_95, 5) if score.classes else None,
         "map50": round(score.map50, 5) if score.classes else None,

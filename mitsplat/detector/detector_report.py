@@ -21,7 +21,7 @@ from mitsplat.pages.svg_charts import bars, curves
 WORST = 8
 """Number of images in the report; those with the lowest share of correct detections."""
 _THUMBNAIL = 560
-_WORDS = {"box": "boxes", "mask": "masks"}
+_PLURALS = {"box": "boxes", "mask": "masks"}
 
 
 def make_report(
@@ -54,8 +54,8 @@ def _summary(
     found: LabelledSet, scores: Mapping[str, AveragePrecision], confusion: Confusion, results: Mapping[str, Any]
 ) -> str:
     right, missed, confused, extra = (sum(values) for values in zip(*confusion.errors.values(), strict=True))
-    rows = {f"mAP50-95 of {_WORDS[kind]}": f"{score.map50_95:.3f}" for kind, score in scores.items()}
-    rows |= {f"mAP50 of {_WORDS[kind]}": f"{score.map50:.3f}" for kind, score in scores.items()}
+    rows = {f"mAP50-95 of {_PLURALS[kind]}": f"{score.map50_95:.3f}" for kind, score in scores.items()}
+    rows |= {f"mAP50 of {_PLURALS[kind]}": f"{score.map50:.3f}" for kind, score in scores.items()}
     rows |= {
         f"At a score of {CONFIDENCE} and an IoU of {IOU}": f"{right} found as what they are, {confused} as another "
         f"class, {missed} missed; {extra} found where is nothing",
@@ -77,7 +77,7 @@ def _summary(
 
 
 def _classes(scores: Mapping[str, AveragePrecision], results: Mapping[str, Any]) -> str:
-    heads = [f"{name} of {_WORDS[kind]}" for kind in scores for name in ("AP50-95", "AP50")]
+    heads = [f"{name} of {_PLURALS[kind]}" for kind in scores for name in ("AP50-95", "AP50")]
     rows = []
     for name, count in results["data"]["instances"].items():
         values = [value for score in scores.values() for value in score.classes.get(name, (None, None))]
@@ -96,13 +96,15 @@ def _charts(scores: Mapping[str, AveragePrecision]) -> str:
         lines |= score.curves
         charts.append(
             curves(
-                f"Precision over recall of {_WORDS[kind]}, IoU 0.5",
+                f"Precision over recall of {_PLURALS[kind]}, IoU 0.5",
                 {name: np.stack([recalls, precision], axis=1) for name, precision in lines.items()},
                 ("recall", "precision"),
                 {f"{name}, at recall 0.5 and 0.9": f"{line[50]:.3f}, {line[90]:.3f}" for name, line in lines.items()},
             )
         )
-        means.append(bars(f"AP50-95 of {_WORDS[kind]} by class", {name: ap for name, (ap, _) in score.classes.items()}))
+        means.append(
+            bars(f"AP50-95 of {_PLURALS[kind]} by class", {name: ap for name, (ap, _) in score.classes.items()})
+        )
     return _section("charts", "Charts", f'<div class="charts">{"".join(charts + means)}</div>')
 
 
@@ -145,11 +147,11 @@ def _worst(found: LabelledSet, truth: Mapping[str, Any], detections: Sequence[De
     for image in order:
         sample = found.samples[image - 1]
         right, missed, confused, extra = confusion.errors[image]
-        told = f"{right} right, {missed} missed, {confused} of another class, {extra} of nothing"
+        summary = f"{right} right, {missed} missed, {confused} of another class, {extra} of nothing"
         figures.append(
             f'<figure><div class="pair">{_picture(sample, labelled[image], found.class_names, "labelled")}'
             f"{_picture(sample, predicted[image], found.class_names, 'found')}</div>"
-            f"<figcaption>{html.escape(sample.name)}: {told}</figcaption></figure>"
+            f"<figcaption>{html.escape(sample.name)}: {summary}</figcaption></figure>"
         )
     text = f"Labelled on the left, found with a score of {CONFIDENCE} or more on the right."
     body = "".join(figures) if figures else "<p>Everything was found as what it is.</p>"

@@ -34,14 +34,14 @@ from mitsplat.errors import InputError, MissingResourceError
 
 EPOCH = 50
 """Steps between checkpoints; an interrupted training resumes from the last checkpoint."""
-_WARM_UP = 100
+_MAX_WARM_UP_STEPS = 100
 """Most steps of the learning-rate warm-up; shorter trainings use a tenth of their steps."""
-_MANY = 10_000
+_MAX_ADAMW_STEPS = 10_000
 """Largest number of steps for AdamW; longer trainings use MuSGD.
 
 Ultralytics' ``auto`` has the same rule, but derives the number of steps from the number of images.
 """
-_OUTLINE = 1000
+_OUTLINE_POINTS = 1000
 """Number of points to which Ultralytics resamples every outline with no more points."""
 
 LAST = "weights/last.pt"
@@ -125,26 +125,26 @@ def train_job(
         "val": False,
         "plots": False,
         "patience": 0,
-        "warmup_epochs": min(_WARM_UP, len(job.plan) // 10) / min(EPOCH, len(job.plan)),
+        "warmup_epochs": min(_MAX_WARM_UP_STEPS, len(job.plan) // 10) / min(EPOCH, len(job.plan)),
         "close_mosaic": round(epochs / 10),
         "save_dir": str(job.run),
         "exist_ok": True,
         "verbose": False,
         # Same choice as Ultralytics' "auto" for this number of updates.
-        "optimizer": "MuSGD" if len(job.plan) > _MANY else "AdamW",
-        "lr0": 0.01 if len(job.plan) > _MANY else round(0.01 / (4 + len(job.class_names)), 6),
+        "optimizer": "MuSGD" if len(job.plan) > _MAX_ADAMW_STEPS else "AdamW",
+        "lr0": 0.01 if len(job.plan) > _MAX_ADAMW_STEPS else round(0.01 / (4 + len(job.class_names)), 6),
         "momentum": 0.9,
         "warmup_bias_lr": 0.0,
     }
     callbacks: defaultdict[str, list[Callable[[Any], None]]] = defaultdict(list)
-    callbacks["on_train_epoch_start"].append(_FixedSteps.begin_epoch)
-    callbacks["on_train_batch_end"].append(_FixedSteps.end_step)
+    callbacks["on_train_epoch_start"].append(_FixedStepsTrainer.begin_epoch)
+    callbacks["on_train_batch_end"].append(_FixedStepsTrainer.end_step)
     last = job.run / LAST
     with ExitStack() as links:
         settings["pretrained"] = links.enter_context(under_another_name(weights)) if weights else False
         if last.is_file():
             settings["resume"] = links.enter_context(under_another_name(last))
-        trainer = (_Masks if job.masks else _Boxes)(job, settings, callbacks)
+        trainer = (_MaskTrainer if job.masks else _BoxTrainer)(job, settings, callbacks)
         trainer.train()
     return trainer.outcome()
 
@@ -173,7 +173,7 @@ def epochs_done(run: Path) -> int:
         ) from error
 
 
-class _Plan(Sampler[int]):
+class _PlanSampler(Sampler[int]):
     """Sampler of the image indices of all steps from ``first`` on; its length is that of one epoch."""
 
     def __init__(self, plan: Int64Array) -> None:
@@ -186,11 +186,11 @@ class _Plan(Sampler[int]):
         return int(min(EPOCH, len(self._plan)) * self._plan.shape[1])
 
 
-class _FixedSteps:
+class _FixedStepsTrainer:
     """Common part of the box and the mask trainer."""
 
     def __init__(self, job: Job, settings: dict[str, Any], callbacks: dict[str, Any]) -> None:
-        self.job, self.order, self.taken, self.updates = job, _Plan(job.plan), 0, 0
+        self.job, self.order, self.taken, self.updates = job, _PlanSampler(job.plan), 0, 0
         super().__init__(overrides=settings, _callbacks=callbacks)  # type: ignore[call-arg]
 
     def get_dataset(self) -> dict[str, Any]:
@@ -219,10 +219,10 @@ class _FixedSteps:
         if dataset.im_files != images:
             raise InputError(f"{self.job.images}: Ultralytics read {len(dataset.im_files)} of {len(images)} images")
         for label in dataset.labels:  # resampling here and not in every mosaic saves a fifth of all augmentation
-            if max(map(len, label["segments"]), default=_OUTLINE) <= _OUTLINE:
-                resample_segments(label["segments"], n=_OUTLINE)
+            if max(map(len, label["segments"]), default=_OUTLINE_POINTS) <= _OUTLINE_POINTS:
+                resample_segments(label["segments"], n=_OUTLINE_POINTS)
         if dataset.cache == "ram":
-            _mix_mosaics(dataset.transforms, self.job.plan.ravel().tolist())
+            _set_mosaic_images(dataset.transforms, self.job.plan.ravel().tolist())
         generator = torch.Generator()
         generator.manual_seed(self.args.seed)
         return InfiniteDataLoader(
@@ -292,18 +292,18 @@ class _FixedSteps:
         )
 
 
-def _mix_mosaics(transforms: Any, indices: list[int]) -> None:
+def _set_mosaic_images(transforms: Any, indices: list[int]) -> None:
     """Draw the other images of mosaics from the plan, so that real images keep their share."""
     for transform in transforms.transforms:
         if isinstance(transform, Mosaic):
             transform.get_indexes = partial(random.choices, indices, k=transform.n - 1)
         elif hasattr(transform, "transforms"):
-            _mix_mosaics(transform, indices)
+            _set_mosaic_images(transform, indices)
 
 
-class _Boxes(_FixedSteps, DetectionTrainer):
+class _BoxTrainer(_FixedStepsTrainer, DetectionTrainer):
     pass
 
 
-class _Masks(_FixedSteps, SegmentationTrainer):
+class _MaskTrainer(_FixedStepsTrainer, SegmentationTrainer):
     pass

@@ -31,25 +31,25 @@ FEWEST, FEWEST_RENDERED = 5, 20
 """Least numbers of photographed and of rendered objects of a class that are compared."""
 CHANCE = 0.01
 """Significance level: advice is given if chance explains the share outside the range with a lower probability."""
-_DRAWS = 299
+_PERMUTATIONS = 299
 """Number of random permutations of the images between the two sides."""
 _TAIL = 0.05
-_SMALLEST = 64
+_MIN_AREA = 64
 """Least area inside a label for a colour measurement [px]."""
 _FLAT_QUANTILE = 0.4
 """Share of the pixels with the smallest smoothed gradient; there the Laplacian measures noise."""
-_DARK = 40
+_MIN_BYTE = 40
 """Byte value below which a sensor clips its noise."""
 
 BRIGHTNESS, SIZE = "brightness of objects", "size of objects"
-_WHOLE = "size of objects that no border cuts"
-_HUES = 120
+_UNCUT_SIZE = "size of objects that no border cuts"
+_HUE_BINS = 120
 """Number of hue bins over 360 degrees."""
-_FARTHEST = 15
+_MAX_HUE_SHIFT = 15
 """Largest hue shift in the search, in bins to either side."""
-_COLOURED = 25
+_MIN_CHROMA = 25
 """Least difference between the channels of a pixel with a hue, in bytes."""
-_TURNED = 8.0
+_SHIFT_LIMIT = 8.0
 """Median hue shift over the classes from which a colour shift of the camera is reported [degrees]."""
 _TRAITS: dict[str, tuple[str, str, str]] = {
     BRIGHTNESS: (
@@ -69,8 +69,8 @@ _TRAITS: dict[str, tuple[str, str, str]] = {
 _Values: TypeAlias = dict[tuple[str, int | None], list[tuple[int, float]]]
 """Pairs of image number and value, by trait and class index; the class index None stands for all classes."""
 
-_Hues: TypeAlias = dict[int, Float64Array]
-"""Sums of :func:`_hues_of` over the objects of a class, by class index."""
+_HueSums: TypeAlias = dict[int, Float64Array]
+"""Sums of :func:`_hue_histogram` over the objects of a class, by class index."""
 
 
 @dataclass(frozen=True)
@@ -123,7 +123,7 @@ class Likeness:
     def hue_advice(self) -> str:
         """Suggested change if photographs show shifted hues; empty otherwise."""
         turned = list(self.hues.values())
-        if not turned or np.median(np.abs(turned)) < _TURNED:
+        if not turned or np.median(np.abs(turned)) < _SHIFT_LIMIT:
             return ""
         return "have the camera turn colours as far, by randomise.hue, and more by randomise.chroma_stretch"
 
@@ -160,10 +160,10 @@ def compare_with_photographs(
     sets = [in_classes(read_set(one, split), real.class_names, str(photographs)) for one in rendered]
     if not sets:
         raise InputError("there are no rendered images to compare")
-    ours = _evenly([sample for one in sets for sample in one.samples], most)
-    theirs = _evenly(list(real.samples), most)
+    ours = _sample_evenly([sample for one in sets for sample in one.samples], most)
+    theirs = _sample_evenly(list(real.samples), most)
     sides: tuple[_Values, _Values] = defaultdict(list), defaultdict(list)
-    hues: tuple[_Hues, _Hues] = defaultdict(_no_hues), defaultdict(_no_hues)
+    hues: tuple[_HueSums, _HueSums] = defaultdict(_zero_hue_sums), defaultdict(_zero_hue_sums)
     for number, sample in enumerate(ours + theirs):
         if progress is not None:
             progress(number, len(ours) + len(theirs), "measuring images")
@@ -182,30 +182,30 @@ def compare_with_photographs(
     turned = {
         name: turn
         for index, name in enumerate(real.class_names)
-        if name in classes and (turn := _turn(hues[0][index], hues[1][index])) is not None
+        if name in classes and (turn := _hue_shift(hues[0][index], hues[1][index])) is not None
     }
-    larger = _larger(sides, len(real.class_names))
-    same_size = None if larger is None else max(round(size * larger / STRIDE), 1) * STRIDE
+    ratio = _size_ratio(sides, len(real.class_names))
+    same_size = None if ratio is None else max(round(size * ratio / STRIDE), 1) * STRIDE
     return Likeness(len(ours), len(theirs), same_size, traits_of(None), classes, turned)
 
 
-def _no_hues() -> Float64Array:
-    return np.zeros(_HUES)
+def _zero_hue_sums() -> Float64Array:
+    return np.zeros(_HUE_BINS)
 
 
-def _hues_of(pixels: ByteImage) -> Float64Array:
+def _hue_histogram(pixels: ByteImage) -> Float64Array:
     """Return the sum of the chroma [bytes] by hue, divided by the number of pixels, shape (_HUES,).
 
     ``pixels`` has shape (N, 3), BGR. Pixels without a hue count as zero.
     """
     hue = cv2.cvtColor(pixels[None].astype(np.float32) / 255, cv2.COLOR_BGR2HSV)[0, :, 0]
     chroma = np.ptp(pixels.astype(float), axis=1)
-    places = (hue * (_HUES / 360)).astype(np.intp) % _HUES
-    found = np.bincount(places, chroma * (chroma >= _COLOURED), _HUES)
+    places = (hue * (_HUE_BINS / 360)).astype(np.intp) % _HUE_BINS
+    found = np.bincount(places, chroma * (chroma >= _MIN_CHROMA), _HUE_BINS)
     return np.asarray(found / len(pixels))
 
 
-def _turn(ours: Float64Array, theirs: Float64Array) -> float | None:
+def _hue_shift(ours: Float64Array, theirs: Float64Array) -> float | None:
     """Return the hue shift with the largest overlap of two hue histograms [degrees].
 
     None if a histogram is empty, or if the best shift lies at the end of the search range.
@@ -213,29 +213,29 @@ def _turn(ours: Float64Array, theirs: Float64Array) -> float | None:
     if not (ours.any() and theirs.any()):
         return None
     smooth, wanted = (gaussian_filter1d(side / side.sum(), 2.0, mode="wrap") for side in (ours, theirs))
-    turns = sorted(range(-_FARTHEST, _FARTHEST + 1), key=abs)
+    turns = sorted(range(-_MAX_HUE_SHIFT, _MAX_HUE_SHIFT + 1), key=abs)
     overlaps = [float(np.minimum(np.roll(smooth, turn), wanted).sum()) for turn in turns]
     best = turns[int(np.argmax(overlaps))]
-    return None if abs(best) == _FARTHEST else 360 / _HUES * best
+    return None if abs(best) == _MAX_HUE_SHIFT else 360 / _HUE_BINS * best
 
 
-def _larger(sides: tuple[_Values, _Values], classes: int) -> float | None:
+def _size_ratio(sides: tuple[_Values, _Values], classes: int) -> float | None:
     """Return the size ratio of rendered to photographed objects, or None if no class is frequent enough in both."""
     ratios = []
     for index in range(classes):
-        ours, theirs = (side.get((_WHOLE, index), []) for side in sides)
+        ours, theirs = (side.get((_UNCUT_SIZE, index), []) for side in sides)
         if len(ours) >= FEWEST_RENDERED and len(theirs) >= FEWEST:
             upper = [np.quantile([value for _, value in values], 0.75) for values in (ours, theirs)]
             ratios.append(upper[0] / upper[1])
     return float(np.median(ratios)) if ratios else None
 
 
-def _evenly(samples: list[Sample], most: int) -> list[Sample]:
+def _sample_evenly(samples: list[Sample], most: int) -> list[Sample]:
     places = np.unique(np.linspace(0, len(samples) - 1, min(most, len(samples))).round().astype(int))
     return [samples[place] for place in places]
 
 
-def _measure(sample: Sample, number: int, size: int, values: _Values, hues: _Hues) -> None:
+def _measure(sample: Sample, number: int, size: int, values: _Values, hues: _HueSums) -> None:
     """Add the measurements of an image, scaled to a longer side of ``size`` pixels, to ``values`` and ``hues``."""
     stored = read_picture(sample.path)
     scale = size / max(sample.width, sample.height)
@@ -250,10 +250,10 @@ def _measure(sample: Sample, number: int, size: int, values: _Values, hues: _Hue
         if min(x0, y0) < 1 or x1 > sample.width - 1 or y1 > sample.height - 1:
             cut += 1
         else:
-            values[_WHOLE, instance.class_index].append((number, side))
-        inside = _inside(instance, sample, width, height)
-        if inside.sum() >= _SMALLEST:
-            hues[instance.class_index] += _hues_of(picture[inside])
+            values[_UNCUT_SIZE, instance.class_index].append((number, side))
+        inside = _object_pixels(instance, sample, width, height)
+        if inside.sum() >= _MIN_AREA:
+            hues[instance.class_index] += _hue_histogram(picture[inside])
             pixels = picture[inside].astype(float)
             most = pixels.max(axis=1)
             saturation = (most - pixels.min(axis=1)) / np.maximum(most, 1)
@@ -264,12 +264,12 @@ def _measure(sample: Sample, number: int, size: int, values: _Values, hues: _Hue
     if objects:
         values["objects cut by the border", None].append((number, 100 * cut / len(objects)))
     values["brightness of images", None].append((number, float(picture.mean())))
-    noise = _noise(picture[..., 1], picture.max(axis=2))
+    noise = _noise_level(picture[..., 1], picture.max(axis=2))
     if noise is not None:
         values["noise of images", None].append((number, noise))
 
 
-def _inside(instance: LabelledObject, sample: Sample, width: int, height: int) -> BoolArray:
+def _object_pixels(instance: LabelledObject, sample: Sample, width: int, height: int) -> BoolArray:
     """Return the pixels of an object in the scaled image, shape (height, width)."""
     factor = np.array([width / sample.width, height / sample.height])
     if instance.has_mask:
@@ -284,13 +284,13 @@ def _inside(instance: LabelledObject, sample: Sample, width: int, height: int) -
     return inside
 
 
-def _noise(green: ByteImage, bright: ByteImage) -> float | None:
+def _noise_level(green: ByteImage, bright: ByteImage) -> float | None:
     """Return the median absolute Laplacian in flat areas [bytes], or None if the image is almost black or clipped."""
     values = green.astype(np.float32)
     smooth = cv2.GaussianBlur(values, (0, 0), 2)
     slope = np.hypot(cv2.Sobel(smooth, cv2.CV_32F, 1, 0), cv2.Sobel(smooth, cv2.CV_32F, 0, 1))
-    lit = (bright > _DARK) & (bright < 250)
-    if lit.sum() < _SMALLEST:
+    lit = (bright > _MIN_BYTE) & (bright < 250)
+    if lit.sum() < _MIN_AREA:
         return None
     flat = lit & (slope <= np.quantile(slope[lit], _FLAT_QUANTILE))
     return float(np.median(np.abs(cv2.Laplacian(values, cv2.CV_32F))[flat]))
@@ -301,8 +301,8 @@ def _trait(name: str, rendered: Sequence[tuple[int, float]], real: Sequence[tupl
     images, values = np.array([*rendered, *real], dtype=float).T
     photographed = np.arange(len(values)) >= len(rendered)
     ours, theirs = (np.quantile(values[side], [_TAIL, 0.5, 1 - _TAIL]) for side in (~photographed, photographed))
-    outside = _outside(values, photographed)
-    too_low, too_high = _unlikely(outside, images, values, photographed)
+    outside = _outside_shares(values, photographed)
+    too_low, too_high = _significant(outside, images, values, photographed)
     advice = {
         (True, False): less,
         (False, True): more,
@@ -313,14 +313,14 @@ def _trait(name: str, rendered: Sequence[tuple[int, float]], real: Sequence[tupl
     return Trait(name, unit, quantiles[0], quantiles[1], below, above, advice.get((too_low, too_high), ""))
 
 
-def _outside(values: Float64Array, photographed: BoolArray) -> Float64Array:
+def _outside_shares(values: Float64Array, photographed: BoolArray) -> Float64Array:
     """Return the shares of photograph values below and above the middle 90 % of the rendered values, shape (2,)."""
     low, high = np.quantile(values[~photographed], [_TAIL, 1 - _TAIL])
     real = values[photographed]
     return np.array([np.mean(real < low), np.mean(real > high)])
 
 
-def _unlikely(
+def _significant(
     outside: Float64Array, images: Float64Array, values: Float64Array, photographed: BoolArray
 ) -> tuple[bool, bool]:
     """Return for each side True if the share outside is significant in a permutation test.
@@ -334,10 +334,10 @@ def _unlikely(
     names, places = np.unique(images, return_inverse=True)
     count = len(np.unique(images[photographed]))
     rng = np.random.default_rng(0)
-    as_much = np.ones(2)
-    for _ in range(_DRAWS):
+    reached = np.ones(2)
+    for _ in range(_PERMUTATIONS):
         dealt = np.zeros(len(names), dtype=bool)
         dealt[rng.choice(len(names), count, replace=False)] = True
-        as_much += _outside(values, dealt[places]) >= outside
-    low, high = (as_much / (_DRAWS + 1) < CHANCE).tolist()
+        reached += _outside_shares(values, dealt[places]) >= outside
+    low, high = (reached / (_PERMUTATIONS + 1) < CHANCE).tolist()
     return low, high

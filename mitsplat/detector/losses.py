@@ -43,15 +43,15 @@ def gains(truth: Mapping[str, Any], detections: Sequence[Detection], before: Ave
     hit: set[int] = set()
     by_image = _by_image(truth["annotations"])
     for image, seen in _by_image(detections).items():
-        judged = _judge(sorted(seen, key=lambda one: -one["score"]), by_image.get(image, []), hit)
-        for kind, mended in judged.items():
-            found[kind] += mended
+        judged = _correct_errors(sorted(seen, key=lambda one: -one["score"]), by_image.get(image, []), hit)
+        for kind, corrected in judged.items():
+            found[kind] += corrected
     missed = [one for one in truth["annotations"] if one["id"] not in hit and not one.get("iscrowd")]
-    kept = ("image_id", "category_id", "bbox")
-    found["missed"] = [*detections, *({key: one[key] for key in kept} | {"score": 1.0} for one in missed)]
+    keys = ("image_id", "category_id", "bbox")
+    found["missed"] = [*detections, *({key: one[key] for key in keys} | {"score": 1.0} for one in missed)]
     return {
-        kind: DetectionMatches(truth, mended).average_precision().map50_95 - before.map50_95
-        for kind, mended in found.items()
+        kind: DetectionMatches(truth, corrected).average_precision().map50_95 - before.map50_95
+        for kind, corrected in found.items()
     }
 
 
@@ -62,13 +62,15 @@ def _by_image(entries: Sequence[Mapping[str, Any]]) -> dict[int, list[Any]]:
     return found
 
 
-def _judge(seen: Sequence[Detection], labels: Sequence[Mapping[str, Any]], hit: set[int]) -> dict[str, list[Detection]]:
+def _correct_errors(
+    seen: Sequence[Detection], labels: Sequence[Mapping[str, Any]], hit: set[int]
+) -> dict[str, list[Detection]]:
     """Return the detections of an image with each kind of error corrected, and add the detected labels to ``hit``.
 
     ``seen`` is sorted by descending score. A detection of the wrong class gets the right class, or is removed if the
     label was detected already. A badly placed box gets the box of its label.
     """
-    mended: dict[str, list[Detection]] = {kind: [] for kind in KINDS if kind != "missed"}
+    corrected: dict[str, list[Detection]] = {kind: [] for kind in KINDS if kind != "missed"}
     crowds = [bool(one.get("iscrowd")) for one in labels]
     overlap = overlaps([one["bbox"] for one in seen], [one["bbox"] for one in labels], crowds)
     classes = np.array([one["category_id"] for one in labels])
@@ -76,25 +78,25 @@ def _judge(seen: Sequence[Detection], labels: Sequence[Mapping[str, Any]], hit: 
     for detection, row in zip(seen, overlap, strict=True):
         own = np.where(classes == detection["category_id"], row, 0.0)
         free = np.where(np.isin(np.arange(len(labels)), list(taken)), 0.0, own)
-        kept = dict.fromkeys(mended, detection)
+        variants = dict.fromkeys(corrected, detection)
         if free.max(initial=0.0) >= IOU:
             label = int(free.argmax())
             if not crowds[label]:
                 taken.add(label)
                 hit.add(int(labels[label]["id"]))
-                kept["place"] = {**detection, "bbox": labels[label]["bbox"]}
+                variants["place"] = {**detection, "bbox": labels[label]["bbox"]}
         elif own.max(initial=0.0) >= IOU:
             pass  # a duplicate, which may fit better than the first detection
         elif row.max(initial=0.0) >= IOU:
             label = int(row.argmax())
             if label in taken or crowds[label]:
-                del kept["another_class"]
+                del variants["another_class"]
             else:
-                kept["another_class"] = {**detection, "category_id": labels[label]["category_id"]}
+                variants["another_class"] = {**detection, "category_id": labels[label]["category_id"]}
         elif free.max(initial=0.0) >= NEAR:
-            kept["place"] = {**detection, "bbox": labels[int(free.argmax())]["bbox"]}
+            variants["place"] = {**detection, "bbox": labels[int(free.argmax())]["bbox"]}
         else:
-            del kept["nothing"]
-        for kind, one in kept.items():
-            mended[kind].append(one)
-    return mended
+            del variants["nothing"]
+        for kind, one in variants.items():
+            corrected[kind].append(one)
+    return corrected

@@ -32,12 +32,12 @@ def plan_images(rendered: int, real: int, *, share: float, steps: int, batch: in
     taken = np.floor(np.arange(steps * batch + 1) * (share if real else 0.0) + 1e-9)
     is_real = np.diff(taken) > 0
     order = np.empty(steps * batch, dtype=np.int64)
-    order[~is_real] = _shuffled(rendered, int(np.count_nonzero(~is_real)), seed, "rendered")
-    order[is_real] = rendered + _shuffled(real, int(np.count_nonzero(is_real)), seed, "real")
+    order[~is_real] = _shuffled_indices(rendered, int(np.count_nonzero(~is_real)), seed, "rendered")
+    order[is_real] = rendered + _shuffled_indices(real, int(np.count_nonzero(is_real)), seed, "real")
     return order.reshape(steps, batch)
 
 
-def _shuffled(total: int, count: int, seed: int, purpose: str) -> Int64Array:
+def _shuffled_indices(total: int, count: int, seed: int, purpose: str) -> Int64Array:
     """Return ``count`` indices below ``total``; the counts of any two indices differ by at most one."""
     rng = np.random.default_rng([seed, zlib.crc32(purpose.encode())])
     rounds = [rng.permutation(total) for _ in range(-(-count // total))] if count else []

@@ -20,9 +20,9 @@ from mitsplat.labels.polygons import outline
 
 LEAST_SEEN = 0.15
 """Least visible share of an object, relative to the whole photograph, for a label in a tile."""
-_OVERLAP = 1 / 3
+_MIN_OVERLAP = 1 / 3
 """Least overlap of tiles as a share of their sides; an object up to this size is whole in at least one tile."""
-_JPEG = (cv2.IMWRITE_JPEG_QUALITY, 97, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444)
+_JPEG_OPTIONS = (cv2.IMWRITE_JPEG_QUALITY, 97, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444)
 """JPEG quality similar to that of cameras, which preserves the noise."""
 
 
@@ -54,12 +54,12 @@ def cut_photographs(photographs: LabelledSet, real_size: int, size: int, folder:
             np.asarray(decode_rle(one.encoded(sample.width, sample.height)), dtype=bool) if one.has_mask else None
             for one in sample.instances
         ]
-        for top in _starts(sample.height, height):
-            for left in _starts(sample.width, width):
+        for top in _tile_starts(sample.height, height):
+            for left in _tile_starts(sample.width, width):
                 path = folder / f"{number:05d}_{top}_{left}.jpg"
-                cv2.imwrite(str(path), picture[top : top + height, left : left + width], _JPEG)
+                cv2.imwrite(str(path), picture[top : top + height, left : left + width], _JPEG_OPTIONS)
                 found = (
-                    _within(instance, mask, left, top, width, height)
+                    _crop_object(instance, mask, left, top, width, height)
                     for instance, mask in zip(sample.instances, masks, strict=True)
                 )
                 instances = tuple(instance for instance in found if instance is not None)
@@ -67,13 +67,13 @@ def cut_photographs(photographs: LabelledSet, real_size: int, size: int, folder:
     return replace(photographs, samples=tuple(samples))
 
 
-def _starts(side: int, tile: int) -> list[int]:
+def _tile_starts(side: int, tile: int) -> list[int]:
     """Return the tile positions along a side; the first and the last tile touch its ends."""
-    step = (1 - _OVERLAP) * tile
+    step = (1 - _MIN_OVERLAP) * tile
     return [round(start) for start in np.linspace(0, side - tile, int(np.ceil((side - tile) / step)) + 1)]
 
 
-def _within(
+def _crop_object(
     instance: LabelledObject, mask: BoolArray | None, left: int, top: int, width: int, height: int
 ) -> LabelledObject | None:
     """Return the part of a labelled object in a tile, or None if too little of it is visible."""

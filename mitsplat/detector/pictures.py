@@ -16,12 +16,12 @@ from mitsplat.storage.files import IMAGE_ERRORS, files_below
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
 """Suffixes of images that Ultralytics also reads."""
-_WHOLE, _DECODED = ("JPEG", "MPO", "PNG", "WEBP"), ("BMP", "TIFF")
+_VERIFIED_FORMATS, _DECODED_FORMATS = ("JPEG", "MPO", "PNG", "WEBP"), ("BMP", "TIFF")
 """Formats that Pillow checks for truncation, and formats that must be decoded for this check."""
 SMALLEST = 10
 """Least side of an image that Ultralytics accepts [px]."""
 _JPEG_ENDS = b"\xff\xd9"
-_ORIENTATION, _TURNED = 274, (5, 6, 7, 8)
+_ORIENTATION, _TRANSPOSED = 274, (5, 6, 7, 8)
 """EXIF orientation tag, which OpenCV applies when it reads an image, and its values that swap width and height."""
 
 
@@ -36,17 +36,17 @@ def read_picture(path: Path) -> ByteImage:
     Raises:
         InputError: If the image cannot be read.
     """
-    return _decoded(_content(path), path)  # cv2.imread only accepts file names in UTF-8
+    return _decode(_read_bytes(path), path)  # cv2.imread only accepts file names in UTF-8
 
 
-def _content(path: Path) -> bytes:
+def _read_bytes(path: Path) -> bytes:
     try:
         return path.read_bytes()
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from error
 
 
-def _decoded(data: bytes, path: Path) -> ByteImage:
+def _decode(data: bytes, path: Path) -> ByteImage:
     try:
         picture = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_COLOR)
     except cv2.error:  # empty data
@@ -62,31 +62,31 @@ def look_at_image(path: Path) -> tuple[int, int, ContentHash]:
     Raises:
         InputError: If the image cannot be read, is truncated, has an unknown format or is too small.
     """
-    data = _content(path)
+    data = _read_bytes(path)
     try:
         with Image.open(io.BytesIO(data)) as image:
             image.verify()
         with Image.open(io.BytesIO(data)) as image:
             width, height = image.size
-            turned = image.getexif().get(_ORIENTATION) in _TURNED
+            turned = image.getexif().get(_ORIENTATION) in _TRANSPOSED
             form = image.format
     except IMAGE_ERRORS as error:
         cause = "of no format that is known" if isinstance(error, UnidentifiedImageError) else error
         raise InputError(f"{path}: cannot be read as an image ({cause})") from error
     if form in ("JPEG", "MPO") and not data.endswith(_JPEG_ENDS):
-        raise InputError(f"{path}: {_ends(data)}")
-    if form not in _WHOLE + _DECODED:
+        raise InputError(f"{path}: {_jpeg_end_error(data)}")
+    if form not in _VERIFIED_FORMATS + _DECODED_FORMATS:
         raise InputError(f"{path}: must be a JPEG, PNG, BMP, TIFF or WebP file (got {form})")
     if turned:
         width, height = height, width
-    if form in _DECODED and _decoded(data, path).shape[:2] != (height, width):
+    if form in _DECODED_FORMATS and _decode(data, path).shape[:2] != (height, width):
         raise InputError(f"{path}: must be read by OpenCV as by others, {width} x {height} px: save it as PNG")
     if min(width, height) < SMALLEST:
         raise InputError(f"{path}: an image must have sides of {SMALLEST} px or more (got {width} x {height})")
     return width, height, ContentHash(data)
 
 
-def _ends(jpeg: bytes) -> str:
+def _jpeg_end_error(jpeg: bytes) -> str:
     """Return an error text for a JPEG file without its end marker at the end; Ultralytics would rewrite such a file."""
     ends = jpeg.rfind(_JPEG_ENDS)
     try:

@@ -73,7 +73,9 @@ class DetectionMatches:
                 )
         with contextlib.redirect_stdout(io.StringIO()):  # pycocotools prints progress messages
             labelled = _coco(truth)
-            found = labelled.loadRes([dict(detection) for detection in detections]) if detections else _nothing(truth)
+            found = (
+                labelled.loadRes([dict(detection) for detection in detections]) if detections else _no_detections(truth)
+            )
             self._eval = COCOeval(labelled, found, iou_type)
             self._eval.params.maxDets = [MOST_DETECTIONS]
             self._eval.params.areaRng, self._eval.params.areaRngLbl = [[0, 1e10]], ["all"]
@@ -88,13 +90,13 @@ class DetectionMatches:
         Raises:
             InputError: If the list is empty or contains an unknown image.
         """
-        chosen = self.images if images is None else list(images)
-        if not chosen or not self._place.keys() >= set(chosen):
+        ids = self.images if images is None else list(images)
+        if not ids or not self._place.keys() >= set(ids):
             raise InputError("images must be among those that are labelled, one or more")
         sample, total, params = copy(self._eval), len(self._place), copy(self._eval.params)
-        places = [self._place[image] for image in chosen]
+        places = [self._place[image] for image in ids]
         sample.evalImgs = [self._eval.evalImgs[k * total + i] for k in range(len(params.catIds)) for i in places]
-        params.imgIds = list(range(len(chosen)))
+        params.imgIds = list(range(len(ids)))
         sample.params = sample._paramsEval = params
         with contextlib.redirect_stdout(io.StringIO()):
             sample.accumulate()
@@ -204,5 +206,5 @@ def _coco(content: Mapping[str, Any]) -> COCO:
     return coco
 
 
-def _nothing(truth: Mapping[str, Any]) -> COCO:
+def _no_detections(truth: Mapping[str, Any]) -> COCO:
     return _coco({"images": truth["images"], "categories": truth["categories"], "annotations": []})

@@ -40,9 +40,9 @@ Split = Literal["train", "val", "test", "all"]
 STRIDE = 32
 """Divisor of the image sides in Ultralytics' networks [px]."""
 
-_MOST = 1 << 32
+_MAX_COCO_BYTES = 1 << 32
 """Largest COCO file that is read [bytes]; the file of COCO's 118,287 training images has 0.45e9 bytes."""
-_BEYOND = 0.01
+_OUTSIDE_TOLERANCE = 0.01
 """Largest distance of a position from the image, as a share of its sides; such positions are clipped."""
 
 
@@ -81,7 +81,7 @@ class LabelledObject:
             return {"size": [height, width], "counts": encode_mask(mask, (0, 0, width, height), (width, height))}
         x0, y0, x1, y1 = self.box
         corners = [[x0, y0, x1, y0, x1, y1, x0, y1]]
-        return _text(coco_mask.merge(coco_mask.frPyObjects(corners, height, width)))
+        return _rle_text(coco_mask.merge(coco_mask.frPyObjects(corners, height, width)))
 
     def outlined(self) -> Float64Array:
         """Return the outline [px], shape (M, 2)."""
@@ -172,7 +172,7 @@ def read_set(path: str | Path, split: Split, progress: Progress | None = None) -
         base = str(content.get("path") or ".")
         entries = {name: content[name] for name in SPLITS if content.get(name)}
         listed = {
-            name: [_entry(root, base, str(entry)) for entry in (given if isinstance(given, list) else [given])]
+            name: [_split_entry(root, base, str(entry)) for entry in (given if isinstance(given, list) else [given])]
             for name, given in entries.items()
         }
         return _yolo(root, "yolo", split, _class_names(content, root / "data.yaml"), listed, progress)
@@ -188,8 +188,8 @@ def in_classes(found: LabelledSet, class_names: Sequence[str], owner: str) -> La
     own, wanted = set(found.class_names), set(class_names)
     if own != wanted:
         more, less = sorted(own - wanted), sorted(wanted - own)
-        told = [f"it also has {', '.join(more)}"] * bool(more) + [f"it lacks {', '.join(less)}"] * bool(less)
-        raise InputError(f"{found.root}: its classes must be those of {owner}: {' and '.join(told)}")
+        differences = [f"it also has {', '.join(more)}"] * bool(more) + [f"it lacks {', '.join(less)}"] * bool(less)
+        raise InputError(f"{found.root}: its classes must be those of {owner}: {' and '.join(differences)}")
     if tuple(class_names) == found.class_names:
         return found
     place = [list(class_names).index(name) for name in found.class_names]
@@ -214,7 +214,7 @@ def check_masks(found: LabelledSet) -> None:
             )
 
 
-def _text(rle: dict[str, Any]) -> dict[str, Any]:
+def _rle_text(rle: dict[str, Any]) -> dict[str, Any]:
     return {"size": [int(side) for side in rle["size"]], "counts": rle["counts"].decode("ascii")}
 
 
@@ -246,16 +246,21 @@ def _yolo(
     progress: Progress | None,
 ) -> LabelledSet:
     wanted = [name for name in SPLITS if split in (name, "all") and name in listed]
-    images = list(dict.fromkeys(path for name in wanted for entry in listed[name] for path in _images(root, entry)))
+    images = list(
+        dict.fromkeys(path for name in wanted for entry in listed[name] for path in _listed_images(root, entry))
+    )
     if not images:
         sought = ", ".join(str(root / entry) for name in wanted for entry in listed[name])
-        raise InputError(f"{root}: there is no image for {split}" + (_has(_counted(root, listed)) or f" in {sought}"))
-    if not any(_label_of(image).is_file() for image in images):
-        raise InputError(f"{root}: there is no label of its images, such as {_label_of(images[0])}")
+        raise InputError(
+            f"{root}: there is no image for {split}"
+            + (_split_counts_text(_split_counts(root, listed)) or f" in {sought}")
+        )
+    if not any(_label_file(image).is_file() for image in images):
+        raise InputError(f"{root}: there is no label of its images, such as {_label_file(images[0])}")
 
     def read(image: Path) -> Sample:
         width, height, content = look_at_image(image)
-        label = _label_of(image)
+        label = _label_file(image)
         if label.is_file():
             text = label.read_text(encoding="utf-8-sig", errors="replace")
         elif label.is_symlink() or label.exists():
@@ -267,12 +272,12 @@ def _yolo(
             text = ""
         instances = tuple(_yolo_instances(text, label, len(classes), (width, height)))
         content.add(text)
-        return Sample(image, _below(root, image), width, height, instances, content.hexdigest())
+        return Sample(image, _relative_name(root, image), width, height, instances, content.hexdigest())
 
-    return LabelledSet(root, kind, split, classes, _all(read, images, root, progress))
+    return LabelledSet(root, kind, split, classes, _read_samples(read, images, root, progress))
 
 
-def _entry(root: Path, base: str, entry: str) -> str:
+def _split_entry(root: Path, base: str, entry: str) -> str:
     """Return the image folder or list of a split, relative to ``root``.
 
     Some exports write ``../`` paths that are correct only from a folder below ``data.yaml``. If the path does not
@@ -282,16 +287,16 @@ def _entry(root: Path, base: str, entry: str) -> str:
     return str(Path(base, inner)) if inner != entry and not (root / place).exists() else place
 
 
-def _counted(root: Path, listed: dict[str, list[str]]) -> dict[str, int]:
-    return {name: sum(len(_images(root, entry)) for entry in entries) for name, entries in listed.items()}
+def _split_counts(root: Path, listed: dict[str, list[str]]) -> dict[str, int]:
+    return {name: sum(len(_listed_images(root, entry)) for entry in entries) for name, entries in listed.items()}
 
 
-def _has(counts: dict[str, int]) -> str:
+def _split_counts_text(counts: dict[str, int]) -> str:
     shown = ", ".join(f"{count} for {name}" for name, count in counts.items() if count)
     return f" (it has {shown})" if shown else ""
 
 
-def _images(root: Path, entry: str) -> list[Path]:
+def _listed_images(root: Path, entry: str) -> list[Path]:
     """Return the images of a folder or of a list file, by name; none if it is missing."""
     place = root / entry
     if place.is_dir():
@@ -305,7 +310,7 @@ def _images(root: Path, entry: str) -> list[Path]:
     return [place.parent / line.strip() for line in lines if line.strip()]
 
 
-def _label_of(image: Path) -> Path:
+def _label_file(image: Path) -> Path:
     """Return the label file of an image; Ultralytics replaces the last ``images`` of the path with ``labels``."""
     before, found, after = f"/{image}".rpartition("/images/")
     return Path(f"{before}/labels/{after}"[1:] if found else image).with_suffix(".txt")
@@ -331,7 +336,7 @@ def _yolo_instances(text: str, path: Path, num_classes: int, size: tuple[int, in
         if len(values) == 5:
             (x, y), (w, h) = points
             points = np.array([[x - w / 2, y - h / 2], [x + w / 2, y + h / 2]])
-        polygon = _clipped(points * size, size, place)
+        polygon = _clip_points(points * size, size, place)
         (x0, y0), (x1, y1) = polygon.min(axis=0), polygon.max(axis=0)
         if not (x1 > x0 and y1 > y0):
             raise InputError(f"{place}: must have a width and a height (got {line[:60]!r})")
@@ -339,14 +344,16 @@ def _yolo_instances(text: str, path: Path, num_classes: int, size: tuple[int, in
         yield LabelledObject(int(values[0]), box, None if len(values) == 5 else polygon)
 
 
-def _clipped(points: Float64Array, size: tuple[int, int], place: str) -> Float64Array:
+def _clip_points(points: Float64Array, size: tuple[int, int], place: str) -> Float64Array:
     """Return points [px] clipped to the image.
 
     Raises:
-        InputError: If a point lies farther than ``_BEYOND`` outside the image.
+        InputError: If a point lies farther than ``_OUTSIDE_TOLERANCE`` outside the image.
     """
     shares = points / size
-    if not (np.isfinite(shares).all() and shares.min() >= -_BEYOND and shares.max() <= 1 + _BEYOND):
+    if not (
+        np.isfinite(shares).all() and shares.min() >= -_OUTSIDE_TOLERANCE and shares.max() <= 1 + _OUTSIDE_TOLERANCE
+    ):
         worst = shares.ravel()[np.abs(np.nan_to_num(shares.ravel(), nan=np.inf) - 0.5).argmax()]
         raise InputError(f"{place}: must lie in the image, at 0 to 1 of its width and height (got {worst:.4g})")
     return np.clip(points, 0, size)
@@ -382,7 +389,7 @@ def _coco_part(root: Path, split: Split, path: Path, content: dict[str, Any], pr
         raise InputError(f"{path}: ids of images, and ids and names of categories, must differ")
     if not by_image:
         raise InputError(f"{root}: there is no image for {split}")
-    find = _finder(root, path)
+    find = _image_finder(root, path)
 
     def read(image: dict[str, Any]) -> Sample:
         file = find(str(image.get("file_name")))
@@ -395,10 +402,10 @@ def _coco_part(root: Path, split: Split, path: Path, content: dict[str, Any], pr
         found = by_image[image["id"]]
         instances = tuple(_coco_instance(a, index[a["category_id"]], (width, height), path) for a in found)
         shown.add_json([names, found])
-        return Sample(file, _below(root, file), width, height, instances, shown.hexdigest())
+        return Sample(file, _relative_name(root, file), width, height, instances, shown.hexdigest())
 
     images = sorted(content["images"], key=lambda image: str(image.get("file_name")))
-    return LabelledSet(root, "coco", split, names, _all(read, images, root, progress))
+    return LabelledSet(root, "coco", split, names, _read_samples(read, images, root, progress))
 
 
 def _coco_files(root: Path, split: Split) -> dict[Path, dict[str, Any]]:
@@ -415,25 +422,25 @@ def _coco_files(root: Path, split: Split) -> dict[Path, dict[str, Any]]:
     if len(files) == 1 or (files and split == "all"):
         return files
     if files:
-        raise InputError(f"{root}: one of its COCO files must have {split} in its name (got {_names(files)})")
+        raise InputError(f"{root}: one of its COCO files must have {split} in its name (got {_file_names(files)})")
     raise InputError(
         f"{root}: must be a dataset of mitsplat (dataset.json), a YOLO folder (data.yaml) or a COCO folder (a JSON "
         "file with images, annotations and categories)"
     )
 
 
-def _names(files: Iterable[Path]) -> str:
+def _file_names(files: Iterable[Path]) -> str:
     return ", ".join(path.name for path in files)
 
 
 def _json(path: Path) -> Any:
     try:
-        return read_json(path, _MOST)
+        return read_json(path, _MAX_COCO_BYTES)
     except (OSError, ValueError) as error:
         raise InputError(f"{path}: cannot be read as JSON ({error})") from error
 
 
-def _finder(root: Path, listing: Path) -> Callable[[str], Path]:
+def _image_finder(root: Path, listing: Path) -> Callable[[str], Path]:
     """Return a function that finds the images named in an annotation file."""
     below: dict[str, list[Path]] = {}
     for path in images_below(root):
@@ -460,7 +467,7 @@ def _coco_instance(annotation: dict[str, Any], class_index: int, size: tuple[int
         x, y, w, h = (float(value) for value in annotation["bbox"])
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{place}: bbox must be x, y, width, height (got {annotation.get('bbox')})") from error
-    corners = _clipped(np.array([[x, y], [x + w, y + h]]), size, f"{place}: bbox")
+    corners = _clip_points(np.array([[x, y], [x + w, y + h]]), size, f"{place}: bbox")
     (x0, y0), (x1, y1) = corners.tolist()
     if not (x1 > x0 and y1 > y0):
         raise InputError(f"{place}: bbox must have a width and a height (got {annotation['bbox']})")
@@ -473,7 +480,7 @@ def _coco_instance(annotation: dict[str, Any], class_index: int, size: tuple[int
                         raise InputError(
                             f"{place}: segmentation must be polygons of 3 points or more (got {len(part)} numbers)"
                         )
-                    _clipped(np.array(part, dtype=np.float64).reshape(-1, 2), size, f"{place}: segmentation")
+                    _clip_points(np.array(part, dtype=np.float64).reshape(-1, 2), size, f"{place}: segmentation")
                 rle = coco_mask.merge(coco_mask.frPyObjects(given, height, width))
             elif list(given["size"]) != [height, width]:
                 raise InputError(f"{place}: segmentation must be of {height} x {width} px (got {given['size']})")
@@ -493,7 +500,7 @@ def _coco_instance(annotation: dict[str, Any], class_index: int, size: tuple[int
     crowd = annotation.get("iscrowd") or 0
     if crowd not in (0, 1):
         raise InputError(f"{place}: iscrowd must be 0 or 1 (got {crowd!r})")
-    return LabelledObject(class_index, (x0, y0, x1, y1), None, None if rle is None else _text(rle), bool(crowd))
+    return LabelledObject(class_index, (x0, y0, x1, y1), None, None if rle is None else _rle_text(rle), bool(crowd))
 
 
 def _run_lengths(code: str) -> list[int]:
@@ -514,11 +521,11 @@ def _run_lengths(code: str) -> list[int]:
     return lengths
 
 
-def _below(root: Path, path: Path) -> str:
+def _relative_name(root: Path, path: Path) -> str:
     return path.relative_to(root).as_posix() if path.is_relative_to(root) else path.as_posix()
 
 
-def _all(
+def _read_samples(
     read: Callable[[Any], Sample], images: Sequence[Any], root: Path, progress: Progress | None
 ) -> tuple[Sample, ...]:
     samples = []

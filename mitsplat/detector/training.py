@@ -43,10 +43,10 @@ from mitsplat.storage.files import open_in_place, read_json, remove_folder, stor
 RUN = "run.json"
 WEIGHTS = "weights.pt"
 _TILES = "tiles"
-_OWN = frozenset((RUN, WEIGHTS, "weights", "data", _TILES, "results.csv", "args.yaml", ".lock", "evaluation"))
+_RUN_FILES = frozenset((RUN, WEIGHTS, "weights", "data", _TILES, "results.csv", "args.yaml", ".lock", "evaluation"))
 """Names of files that a run folder may contain, in addition to temporary files."""
-_SETS = ("datasets", "real")
-_MOST_WORKERS = 8
+_SET_KEYS = ("datasets", "real")
+_MAX_WORKERS = 8
 
 
 @dataclass(frozen=True)
@@ -174,7 +174,7 @@ def train_detector(
     settings = replace(settings, model=network)
     sets, photographs = read_sets(datasets, real, masks=masks, progress=progress)
     for found in [*sets, *([photographs] if photographs else [])]:
-        _check_apart(out, found)
+        _check_separate(out, found)
     if settings.weights is not None:
         check_weights(settings.weights, network, masks=masks)
     device, device_name = torch_device(settings.device)
@@ -188,7 +188,7 @@ def train_detector(
     with storage_errors(out), _locked(out):
         if overwrite:
             _clear(out)
-        kept = _kept(out, record)
+        kept = _existing_run(out, record)
         if kept is not None and kept.record.get("finished"):
             return replace(kept, was_finished=True)
         start = {"weights": str(settings.weights)} if settings.weights else {"network": network}
@@ -302,8 +302,8 @@ def _train(
             progress(done, settings.steps, f"training, loss {loss:.3g}")
 
     job = fixed_steps.Job(out, listing, sets[0].class_names, plan, masks, step)
-    workers = min(_MOST_WORKERS, usable_cores()) if settings.workers is None else settings.workers
-    counted = {
+    workers = min(_MAX_WORKERS, usable_cores()) if settings.workers is None else settings.workers
+    counts = {
         "steps": settings.steps,
         "images_a_step": settings.batch,
         "images_taken": int(plan.size),
@@ -312,7 +312,7 @@ def _train(
     started = time.perf_counter()
     if (out / fixed_steps.LAST).is_file() and fixed_steps.epochs_done(out) in (0, job.epochs):
         fixed_steps.finish_checkpoint(out)  # the process ended between the last step and the export of the weights
-        return counted | {"seconds": 0.0, "resumed_at_step": settings.steps}
+        return counts | {"seconds": 0.0, "resumed_at_step": settings.steps}
     outcome = fixed_steps.train_job(
         job,
         network=settings.model,
@@ -323,7 +323,7 @@ def _train(
         device=device,
         workers=0 if device == "cpu" else workers,
     )
-    return counted | {
+    return counts | {
         "updates_of_weights": outcome.updates,
         "optimizer": outcome.optimizer,
         "losses": outcome.losses,
@@ -344,18 +344,20 @@ def _read_run(path: Path) -> Run | None:
     return Run(path, record)
 
 
-def _kept(out: Path, record: dict[str, Any]) -> Run | None:
+def _existing_run(out: Path, record: dict[str, Any]) -> Run | None:
     """Return the run in a folder, which must have the same settings and images, or None."""
     kept = _read_run(out)
     if kept is None:
         return None
     was, now = kept.record["settings"], record["settings"]
-    told = [
+    differences = [
         f"{name} {str(was.get(name))[:20]} (got {str(now[name])[:20]})" for name in now if was.get(name) != now[name]
     ]
-    told += [f"other images of {name}" for name in _SETS if _digests(kept.record.get(name)) != _digests(record[name])]
-    if told:
-        raise InputError(f"{out}: was begun with {', '.join(told)}: give another folder, or --overwrite")
+    differences += [
+        f"other images of {name}" for name in _SET_KEYS if _digests(kept.record.get(name)) != _digests(record[name])
+    ]
+    if differences:
+        raise InputError(f"{out}: was begun with {', '.join(differences)}: give another folder, or --overwrite")
     return kept
 
 
@@ -377,7 +379,7 @@ def check_folder(out: Path, kind: str, own: Collection[str] = ()) -> None:
         raise InputError(f"{out}: holds something else than {kind} (got {strange[0]}): give another folder")
 
 
-def _check_apart(out: Path, found: LabelledSet) -> None:
+def _check_separate(out: Path, found: LabelledSet) -> None:
     """Refuse a run folder that contains training images, because files of the run folder are removed."""
     folder = out.resolve()
     for path in (found.root, *(sample.path for sample in found.samples)):
@@ -386,7 +388,7 @@ def _check_apart(out: Path, found: LabelledSet) -> None:
 
 
 def _clear(out: Path) -> None:
-    for name in sorted(_OWN - {".lock"}):
+    for name in sorted(_RUN_FILES - {".lock"}):
         path = out / name
         if path.is_dir() and not path.is_symlink():
             shutil.rmtree(path)
@@ -402,6 +404,6 @@ def _locked(out: Path) -> Iterator[None]:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
             raise InputError(f"{out}: another training is at work in it") from error
-        if links := [out / name for name in sorted(_OWN) if (out / name).is_symlink()]:
+        if links := [out / name for name in sorted(_RUN_FILES) if (out / name).is_symlink()]:
             raise InputError(f"{links[0]}: must not be a link, for a run is written in its own folder; remove it")
         yield

@@ -24,7 +24,7 @@ FloatImage = Float32Array
 
 _MEAN, _DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 """Mean and standard deviation of display-encoded ImageNet pixels: red, green, blue."""
-_EDGE = 518
+_INPUT_EDGE = 518
 """Shorter edge of the network input [px] if the network accepts any size, as in the code of Depth Anything."""
 _PATCH = 14
 """Patch size of the network [px]; input edges are multiples of it."""
@@ -117,8 +117,8 @@ class DepthNetwork:
             InputError: If the network fails, or does not return one finite number per pixel.
         """
         height, width = rgb.shape[:2]
-        scale = _EDGE / min(height, width)
-        size = (self._width or _multiple(scale * width), self._height or _multiple(scale * height))
+        scale = _INPUT_EDGE / min(height, width)
+        size = (self._width or _patch_multiple(scale * width), self._height or _patch_multiple(scale * height))
         picture = (cv2.resize(rgb, size, interpolation=cv2.INTER_CUBIC) - _MEAN) / _DEVIATION
         batch = np.ascontiguousarray(picture.transpose(2, 0, 1)[None], dtype=self._type)
         try:
@@ -136,11 +136,11 @@ class DepthNetwork:
                 f"{np.count_nonzero(~np.isfinite(found))} not finite)"
             )
         shrink = min(1.0, max(values.shape) / max(height, width))
-        kept = (max(1, round(shrink * width)), max(1, round(shrink * height)))
-        return np.asarray(cv2.resize(values, kept, interpolation=cv2.INTER_LINEAR), dtype=np.float32)
+        output_size = (max(1, round(shrink * width)), max(1, round(shrink * height)))
+        return np.asarray(cv2.resize(values, output_size, interpolation=cv2.INTER_LINEAR), dtype=np.float32)
 
 
-def _multiple(edge: float) -> int:
+def _patch_multiple(edge: float) -> int:
     return max(1, round(edge / _PATCH)) * _PATCH
 
 

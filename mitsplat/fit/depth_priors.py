@@ -35,7 +35,7 @@ SUFFIXES = (".png", ".npy", ".exr", ".tiff", ".tif")
 POINTS_MIN = 10
 """Least number of capture points inside a photo for the use of its map."""
 _TRIALS = 500
-_UNEXPLAINED = 0.5
+_MAX_RESIDUAL = 0.5
 """Largest residual of an aligned map, relative to the spread of the points.
 
 The residual is the median absolute difference between the map and the points. The spread is the median absolute
@@ -134,11 +134,11 @@ def align_maps(
         InputError: If a map cannot be read or does not belong to its photo, or no map can be used.
     """
     found: dict[str, DepthMap] = {}
-    without: dict[str, list[str]] = {}
+    unused: dict[str, list[str]] = {}
     for photo in photos:
         path = maps.files.get(photo.name)
         if path is None:
-            without.setdefault("photos without a depth map", []).append(photo.name)
+            unused.setdefault("photos without a depth map", []).append(photo.name)
             continue
         values = read_map(path)
         try:
@@ -146,12 +146,12 @@ def align_maps(
         except InputError as error:
             raise InputError(f"{path}: {error}") from None
         if isinstance(inverse, str):
-            without.setdefault(f"depth maps that are left out, because {inverse}", []).append(photo.name)
+            unused.setdefault(f"depth maps that are left out, because {inverse}", []).append(photo.name)
         else:
             height, width = inverse.shape
             scale = min(1.0, size / max(width, height))
             found[photo.name] = resize_map(inverse, max(1, round(scale * width)), max(1, round(scale * height)))
-    warnings = tuple(f"{what}: {', '.join(names)}" for what, names in without.items())
+    warnings = tuple(f"{what}: {', '.join(names)}" for what, names in unused.items())
     if not found:
         raise InputError(f"no depth map is of use: {'; '.join(warnings)}")
     return found, warnings
@@ -190,7 +190,7 @@ def align_map(photo: Photo, points: Float64Array, values: Float32Array, kind: De
     found, wanted = found[known], 1 / depth[inside][known]
     scale, shift = fit_line(found, wanted, shift=kind == "inverse")
     left = np.median(np.abs(scale * found + shift - wanted))
-    if not scale > 0 or left > _UNEXPLAINED * np.median(np.abs(wanted - np.median(wanted))):
+    if not scale > 0 or left > _MAX_RESIDUAL * np.median(np.abs(wanted - np.median(wanted))):
         return f"their values as {kind} depths do not agree with the points in them"
     return np.asarray(np.maximum(scale * values + shift, 0), dtype=np.float32)
 

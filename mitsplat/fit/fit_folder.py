@@ -25,7 +25,7 @@ from mitsplat.storage.files import write_file, write_text
 from mitsplat.storage.format_version import FORMAT_VERSION, FORMAT_VERSIONS, check_format_version
 
 FIT_FILE = "fit.json"
-_UNFINISHED = ".unfinished"
+_RUNNING_MARKER = ".unfinished"
 """Marker file of a running or interrupted fit."""
 
 
@@ -123,7 +123,7 @@ class FitFolder:
             if overwrite:
                 return None
             raise InputError(f"{error}; --overwrite replaces it") from error
-        for name in ("checkpoint.npz", _UNFINISHED):  # left by a run that was interrupted after its last step
+        for name in ("checkpoint.npz", _RUNNING_MARKER):  # left by a run that was interrupted after its last step
             (self.path / name).unlink(missing_ok=True)
         return result
 
@@ -178,7 +178,7 @@ class FitFolder:
         Raises:
             InputError: If there is such a file; the message names it.
         """
-        if any((self.path / name).exists() for name in (FIT_FILE, "checkpoint.npz", _UNFINISHED)):
+        if any((self.path / name).exists() for name in (FIT_FILE, "checkpoint.npz", _RUNNING_MARKER)):
             return
         for there in (self.path / "splats.ply", self.held_out):
             if there.exists():
@@ -187,7 +187,7 @@ class FitFolder:
     def begin(self, *, goes_on: bool) -> None:
         """Remove the files of an earlier fit, the record first; keep the checkpoint if the fit resumes from it."""
         self.path.mkdir(parents=True, exist_ok=True)
-        (self.path / _UNFINISHED).touch()
+        (self.path / _RUNNING_MARKER).touch()
         (self.path / FIT_FILE).unlink(missing_ok=True)
         if not goes_on:
             (self.path / "checkpoint.npz").unlink(missing_ok=True)
@@ -213,5 +213,5 @@ class FitFolder:
         record |= {"gaussians": len(result.splats)} | dict(known)
         record |= {name: [asdict(p) for p in getattr(result, name)] for name in ("held_out", "validation")}
         write_text(self.path / FIT_FILE, json.dumps(record, indent=1) + "\n")
-        for name in ("checkpoint.npz", _UNFINISHED):
+        for name in ("checkpoint.npz", _RUNNING_MARKER):
             (self.path / name).unlink(missing_ok=True)

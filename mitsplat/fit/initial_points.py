@@ -12,9 +12,9 @@ from mitsplat.geometry.camera import Camera
 
 Mask = Float32Array
 
-_ENOUGH = 500
-_RANDOM = 3000
-_TRIES = 100_000
+_MIN_POINTS = 500
+_RANDOM_POINTS = 3000
+_HULL_CANDIDATES = 100_000
 
 
 def seed_points(
@@ -41,25 +41,25 @@ def seed_points(
         rng: Random number generator.
         most: Largest number of points.
     """
-    tints = colours / 255.0
+    point_colours = colours / 255.0
     if masks is not None and len(points):
         votes, voters = np.zeros(len(points)), np.zeros(len(points))
         for camera, indices, mask in zip(cameras, seen, masks, strict=True):
             own = indices if len(indices) else np.arange(len(points))
-            shown = _covered(camera, mask, points[own])
+            shown = _mask_values(camera, mask, points[own])
             known = shown >= 0
             np.add.at(votes, own[known], shown[known] > 0.5)
             np.add.at(voters, own[known], 1)
         kept = 2 * votes > voters
-        points, tints = points[kept], tints[kept]
-    if len(points) < _ENOUGH:
+        points, point_colours = points[kept], point_colours[kept]
+    if len(points) < _MIN_POINTS:
         extra = _random_points(cameras, masks, rng)
         points = np.concatenate([points, extra])
-        tints = np.concatenate([tints, np.full(extra.shape, 0.5)])
+        point_colours = np.concatenate([point_colours, np.full(extra.shape, 0.5)])
     if len(points) > most:
-        chosen = np.sort(rng.choice(len(points), most, replace=False))
-        points, tints = points[chosen], tints[chosen]
-    return points, tints
+        subset = np.sort(rng.choice(len(points), most, replace=False))
+        points, point_colours = points[subset], point_colours[subset]
+    return points, point_colours
 
 
 def _random_points(cameras: Sequence[Camera], masks: Sequence[Mask] | None, rng: np.random.Generator) -> Float64Array:
@@ -76,19 +76,19 @@ def _random_points(cameras: Sequence[Camera], masks: Sequence[Mask] | None, rng:
     normal = across.sum(axis=0) + weight * np.eye(3)
     focus = np.linalg.solve(normal, np.einsum("nij,nj->i", across, centres) + weight * centres.mean(axis=0))
     reach = float(np.median(np.linalg.norm(centres - focus, axis=1))) or 1.0
-    ball = rng.normal(size=(_RANDOM if masks is None else _TRIES, 3))
+    ball = rng.normal(size=(_RANDOM_POINTS if masks is None else _HULL_CANDIDATES, 3))
     ball *= rng.random((len(ball), 1)) ** (1 / 3) / np.linalg.norm(ball, axis=1, keepdims=True)
     ball = focus + 0.9 * reach * ball
     if masks is None:
         return ball
     inside = np.zeros(len(ball))
     for camera, mask in zip(cameras, masks, strict=True):
-        inside += _covered(camera, mask, ball) > 0.5
+        inside += _mask_values(camera, mask, ball) > 0.5
     hull: Float64Array = ball[inside >= max(1.0, 0.9 * inside.max())]
-    return hull[:_RANDOM]
+    return hull[:_RANDOM_POINTS]
 
 
-def _covered(camera: Camera, mask: Mask, points: Float64Array) -> Float64Array:
+def _mask_values(camera: Camera, mask: Mask, points: Float64Array) -> Float64Array:
     """Return the share of each point's pixel that the object covers; -1 outside the picture."""
     pixels, depth = camera.project(points)
     x, y = np.nan_to_num(np.floor(pixels), nan=-1.0).clip(-1, 1e6).astype(int).T

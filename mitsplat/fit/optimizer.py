@@ -56,7 +56,7 @@ class Adam:
         self.first: dict[str, Any] = {k: dr.zeros(mi.Float, dr.width(v)) for k, v in self.values.items()}
         self.second: dict[str, Any] = {k: dr.zeros(mi.Float, dr.width(v)) for k, v in self.values.items()}
         self.steps = 0
-        self._settle()
+        self._evaluate()
 
     def track(self) -> None:
         """Enable gradients of the parameters."""
@@ -79,7 +79,7 @@ class Adam:
         gradients = {name: dr.grad(value) for name, value in self.values.items()}
         values = dr.detach(self.values)
         dr.eval(gradients, values)
-        self.values, self.first, self.second = _descend(values, gradients, self.first, self.second, numbers, bands)
+        self.values, self.first, self.second = _adam_step(values, gradients, self.first, self.second, numbers, bands)
 
     def take(self, rows: npt.NDArray[np.uint32], widths: Mapping[str, int], fresh: BoolArray) -> None:
         """Replace the parameters by a selection of their rows.
@@ -97,7 +97,7 @@ class Adam:
             self.values[name] = dr.gather(mi.Float, dr.detach(self.values[name]), source)
             for moments in (self.first, self.second):
                 moments[name] = dr.gather(mi.Float, moments[name], source) * dr.gather(mi.Float, kept, row)
-        self._settle()
+        self._evaluate()
 
     def state(self) -> dict[str, npt.NDArray[Any]]:
         """Return the complete state as arrays for :meth:`restore`."""
@@ -115,9 +115,9 @@ class Adam:
             for name in members:
                 members[name] = wrapped(mi.Float, state[f"{group}.{name}"])
         self.steps = int(state["steps"])
-        self._settle()
+        self._evaluate()
 
-    def _settle(self) -> None:
+    def _evaluate(self) -> None:
         dr.eval(self.values, self.first, self.second)
 
 
@@ -125,7 +125,7 @@ _Arrays = dict[str, Any]
 
 
 @recorded
-def _descend(
+def _adam_step(
     values: _Arrays, gradients: _Arrays, first: _Arrays, second: _Arrays, rates: Any, bands: dict[str, int]
 ) -> tuple[_Arrays, _Arrays, _Arrays]:
     """Return parameters and moments after a step.

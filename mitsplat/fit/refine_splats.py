@@ -66,7 +66,7 @@ class RefineSettings:
 
 
 QUALITY = Quality(transmittance_min=1e-3)
-_EVERY = 10
+_REPORT_STEPS = 10
 """Steps between reports; reading a loss waits for the device."""
 
 
@@ -114,7 +114,7 @@ def refine_splats(
         decay = settings.final_rate ** (step / max(1, settings.iterations - 1))
         rates = {name: getattr(settings, f"rate_{name}") * decay for name in model.values}
         model.update(rates | {"sh": model.sh_rates(rates["sh"], rates["sh"] * settings.rest_rate)})
-        if observe is not None and (step % _EVERY == 0 or step == settings.iterations - 1):
+        if observe is not None and (step % _REPORT_STEPS == 0 or step == settings.iterations - 1):
             observe(step, psnr_of(float(loss.numpy()[0]) / 3))
     return model.splats()
 

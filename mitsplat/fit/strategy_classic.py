@@ -23,21 +23,21 @@ from mitsplat.fit.strategy_mcmc import DEAD
 from mitsplat.geometry.camera import Camera
 from mitsplat.renderer.rays.device_arrays import wrapped
 
-_REFINED = (1 / 60, 0.5)
+_ACTIVE_RANGE = (1 / 60, 0.5)
 """Range of the fit, as shares, in which Gaussians are added and removed."""
 _RESET_EVERY = 0.1
 """Share of the fit between opacity resets."""
 _RESET_STEPS = 300
 """Least number of steps between opacity resets; Adam needs 100 steps to make a Gaussian half opaque again."""
-_RESET_TO = 2 * DEAD
+_RESET_OPACITY = 2 * DEAD
 _GRADIENT_MIN = 2e-4
 """Mean image-space gradient above which a Gaussian is cloned or split; the image is 2 wide and 2 high."""
-_SMALL = 0.01
+_MAX_CLONE_SCALE = 0.01
 """Largest scale of a Gaussian that is cloned instead of split, in the model's unit."""
-_LARGE = 0.1
+_MAX_SCALE = 0.1
 """Scale above which a Gaussian is removed after the first opacity reset, in the model's unit."""
 _SHRINK = 1.6
-_REACH = 3.0
+_RADIUS_SIGMAS = 3.0
 """Radius of a Gaussian in the test if it is in an image [standard deviations], as published."""
 
 
@@ -54,23 +54,26 @@ class Classic:
     def __init__(self, most: int, every: int) -> None:
         self._most, self._every = most, every
         self._reset_step, self._reset_fraction = 0, 0.0
-        self._pull: Any = mi.Float(0)
-        self._photos: Any = mi.Float(0)
+        self._gradient_sum: Any = mi.Float(0)
+        self._photo_counts: Any = mi.Float(0)
 
     def look(self, model: GaussianModel, camera: Camera) -> None:
         """Accumulate the gradients of a photo since the last change."""
         pull, seen = image_gradient(model, camera)
-        self._pull += dr.select(seen, pull, 0)
-        self._photos += dr.select(seen, mi.Float(1), 0)
-        dr.eval(self._pull, self._photos)
+        self._gradient_sum += dr.select(seen, pull, 0)
+        self._photo_counts += dr.select(seen, mi.Float(1), 0)
+        dr.eval(self._gradient_sum, self._photo_counts)
 
     def refine(self, model: GaussianModel, step: int, fraction: float, rate: float, rng: np.random.Generator) -> None:
         """Clone, split and remove Gaussians at intervals, and reset opacities at longer intervals."""
-        if not (_REFINED[0] <= fraction < _REFINED[1] and step % self._every == 0):
+        if not (_ACTIVE_RANGE[0] <= fraction < _ACTIVE_RANGE[1] and step % self._every == 0):
             return
-        pull = np.array(self._pull / dr.maximum(self._photos, 1), dtype=np.float64)
+        pull = np.array(self._gradient_sum / dr.maximum(self._photo_counts, 1), dtype=np.float64)
         control_density(model, pull, self._most, rng, remove_large=self._reset_step > 0)
-        self._pull, self._photos = mi.Float(0), mi.Float(0)  # two arrays, because both are accumulated in place
+        self._gradient_sum, self._photo_counts = (
+            mi.Float(0),
+            mi.Float(0),
+        )  # two arrays, because both are accumulated in place
         if fraction - self._reset_fraction >= _RESET_EVERY and step - self._reset_step >= _RESET_STEPS:
             self._reset_step, self._reset_fraction = step, fraction
             lower_opacities(model)
@@ -78,11 +81,11 @@ class Classic:
     def state(self) -> dict[str, npt.NDArray[Any]]:
         """Return the accumulated gradients and photo counts, and the time of the last opacity reset."""
         reset = np.array([self._reset_step, self._reset_fraction])
-        return {"pull": np.array(self._pull), "photos": np.array(self._photos), "reset": reset}
+        return {"pull": np.array(self._gradient_sum), "photos": np.array(self._photo_counts), "reset": reset}
 
     def restore(self, state: Mapping[str, npt.NDArray[Any]]) -> None:
         """Restore a state from :meth:`state`."""
-        self._pull, self._photos = (wrapped(mi.Float, state[name]) for name in ("pull", "photos"))
+        self._gradient_sum, self._photo_counts = (wrapped(mi.Float, state[name]) for name in ("pull", "photos"))
         self._reset_step, self._reset_fraction = int(state["reset"][0]), float(state["reset"][1])
 
 
@@ -113,7 +116,7 @@ def image_gradient(model: GaussianModel, camera: Camera) -> tuple[Any, Any]:
     place = dr.gather(mi.Vector3f, means, i) - centre
     pull = dr.gather(mi.Vector3f, dr.grad(model.values["means"]), i)
     x, y, z = (dr.dot(axis, place) for axis in axes)
-    reach = _REACH * dr.exp(dr.max(dr.gather(mi.Vector3f, log_scales, i)))
+    reach = _RADIUS_SIGMAS * dr.exp(dr.max(dr.gather(mi.Vector3f, log_scales, i)))
     seen = z - reach > dr.opaque(mi.Float, camera.near / model.unit)
     total = mi.Float(0)
     for axis, offset, focal, middle, size in (
@@ -144,15 +147,15 @@ def control_density(
     """
     scales = np.exp(np.array(dr.detach(model.values["scales"]), dtype=np.float64)).reshape(-1, 3)
     size = scales.max(axis=1)
-    useless = np.array(dr.detach(model.activated()[3])) < DEAD
+    transparent = np.array(dr.detach(model.activated()[3])) < DEAD
     if remove_large:
-        useless |= size > _LARGE
-    if useless.all():
+        transparent |= size > _MAX_SCALE
+    if transparent.all():
         return
-    kept, wanted = np.flatnonzero(~useless), np.flatnonzero(~useless & (pull > _GRADIENT_MIN))
+    kept, wanted = np.flatnonzero(~transparent), np.flatnonzero(~transparent & (pull > _GRADIENT_MIN))
     wanted = wanted[np.argsort(-pull[wanted], kind="stable")][: max(0, most - len(kept))]
     split = np.zeros(len(scales), dtype=bool)
-    split[wanted] = size[wanted] > _SMALL
+    split[wanted] = size[wanted] > _MAX_CLONE_SCALE
     rows = np.concatenate([kept, wanted])
     part = split[rows]
     added = np.arange(len(rows)) >= len(kept)
@@ -168,7 +171,7 @@ def control_density(
 
 def lower_opacities(model: GaussianModel) -> None:
     """Limit opacities to twice the removal threshold, and reset their moments."""
-    most = dr.opaque(mi.Float, float(np.log(_RESET_TO / (1 - _RESET_TO))))
+    most = dr.opaque(mi.Float, float(np.log(_RESET_OPACITY / (1 - _RESET_OPACITY))))
     model.values["opacities"] = dr.minimum(dr.detach(model.values["opacities"]), most)
     for moments in (model.first, model.second):
         moments["opacities"] = dr.zeros(mi.Float, model.count)

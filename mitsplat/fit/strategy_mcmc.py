@@ -31,7 +31,7 @@ from mitsplat.runtime.recorded_kernels import recorded
 DEAD = 0.005
 """Opacity below which a Gaussian counts as dead and is relocated."""
 
-_REFINED = (0.02, 0.8)
+_ACTIVE_RANGE = (0.02, 0.8)
 """Range of the fit, as shares, in which MCMC relocates and adds Gaussians."""
 _GROWTH = 1.05
 _COPIES_MAX = 51
@@ -93,9 +93,9 @@ class Mcmc:
 
     def refine(self, model: GaussianModel, step: int, fraction: float, rate: float, rng: np.random.Generator) -> None:
         """Relocate dead Gaussians and add new ones at intervals, and add noise in every step."""
-        if _REFINED[0] <= fraction < _REFINED[1] and step % self._every == 0:
+        if _ACTIVE_RANGE[0] <= fraction < _ACTIVE_RANGE[1] and step % self._every == 0:
             relocate(model, rng)
-            grow(model, self._wanted(model.count, fraction), rng)
+            grow(model, self._target_count(model.count, fraction), rng)
         jitter(model, rate, (self._seed, step))
 
     def state(self) -> dict[str, npt.NDArray[Any]]:
@@ -105,9 +105,9 @@ class Mcmc:
     def restore(self, state: Mapping[str, npt.NDArray[Any]]) -> None:
         """Do nothing, because there is no state."""
 
-    def _wanted(self, count: int, fraction: float) -> int:
+    def _target_count(self, count: int, fraction: float) -> int:
         """Return the target number of Gaussians: 5 % growth each time as published, or more in short fits."""
-        share = min(1.0, (fraction - _REFINED[0]) / (0.5 - _REFINED[0]))
+        share = min(1.0, (fraction - _ACTIVE_RANGE[0]) / (0.5 - _ACTIVE_RANGE[0]))
         planned = self._start * (self._most / self._start) ** share
         return min(self._most, int(max(planned, _GROWTH * count)))
 
@@ -146,7 +146,7 @@ def relocate(model: GaussianModel, rng: np.random.Generator) -> int:
         return 0
     rows = np.arange(len(opacities))
     rows[dead] = _draw(opacities * ~dead, int(dead.sum()), rng)
-    _share_out(model, rows, opacities)
+    _replace_rows(model, rows, opacities)
     return int(dead.sum())
 
 
@@ -155,7 +155,7 @@ def grow(model: GaussianModel, count: int, rng: np.random.Generator) -> None:
     opacities = np.array(dr.detach(model.activated()[3]), dtype=np.float64)
     missing = count - len(opacities)
     if missing > 0:
-        _share_out(model, np.r_[np.arange(len(opacities)), _draw(opacities, missing, rng)], opacities)
+        _replace_rows(model, np.r_[np.arange(len(opacities)), _draw(opacities, missing, rng)], opacities)
 
 
 def jitter(model: GaussianModel, rate: float, seed: Sequence[int]) -> None:
@@ -198,7 +198,7 @@ def _draw(weights: Float64Array, count: int, rng: np.random.Generator) -> npt.ND
     return rng.choice(len(weights), count, p=weights / weights.sum())
 
 
-def _share_out(model: GaussianModel, rows: npt.NDArray[np.intp], opacities: Float64Array) -> None:
+def _replace_rows(model: GaussianModel, rows: npt.NDArray[np.intp], opacities: Float64Array) -> None:
     """Replace the Gaussians by the selected rows; copies of one row share its opacity and size."""
     copies = np.bincount(rows, minlength=len(opacities))
     several = copies > 1

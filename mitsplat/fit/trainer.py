@@ -115,8 +115,8 @@ class FitSettings:
     def __post_init__(self) -> None:
         for name, least in (("gaussians", 2), ("iterations", 1), ("size", 64), ("refine_every", 1), ("seed", 0)):
             if getattr(self, name) < least:
-                said = "the longest edge of pictures" if name == "size" else name
-                raise InputError(f"{said} must be at least {least} (got {getattr(self, name)})")
+                label = "the longest edge of pictures" if name == "size" else name
+                raise InputError(f"{label} must be at least {least} (got {getattr(self, name)})")
         if not 0 <= self.sh_degree <= 3:
             raise InputError(f"sh_degree must be 0, 1, 2 or 3 (got {self.sh_degree})")
         if self.target_psnr is not None and not np.isfinite(self.target_psnr):
@@ -157,9 +157,9 @@ class FitProgress:
 
 
 QUALITY = Quality(transmittance_min=1e-3)
-_EVERY = 25
+_REPORT_STEPS = 25
 """Steps between reports; reading a loss waits for the device."""
-_READERS = 16
+_MAX_READERS = 16
 """Largest number of photos that are read in parallel.
 
 With this number, reading takes less time than the fit on a GPU. A photo of 24 megapixels takes up to 0.6 GB meanwhile,
@@ -167,11 +167,11 @@ as two float copies.
 """
 _EXTENT = 1.1
 _CHECKPOINT_SECONDS = 60.0
-_LOOK_EVERY = 0.05
+_VALIDATION_INTERVAL = 0.05
 """Share of the schedule between evaluations of the validation photos."""
-_DEPTH_EVERY = 4
+_DEPTH_INTERVAL = 4
 """Steps between steps with a depth loss, which doubles the time of a step."""
-_MAPS_FALL_TO = 0.01
+_FINAL_MAP_WEIGHT = 0.01
 """Final weight of depth maps relative to the initial one (Kerbl et al. 2024, as published for 3DGS)."""
 
 
@@ -200,7 +200,7 @@ def fit_capture(
         InputError: If there are too few photos, a photo or a depth map cannot be read, or the folder contains another
             fit.
     """
-    training, held_out = _usable(capture.training, settings), _usable(capture.held_out, settings)
+    training, held_out = _usable_photos(capture.training, settings), _usable_photos(capture.held_out, settings)
     if not (training and held_out):
         raise InputError(
             "a fit needs a photo to learn from and a held-out one, with masks if any has one "
@@ -208,9 +208,9 @@ def fit_capture(
         )
     validation: tuple[Photo, ...] = ()
     if settings.target_psnr is not None:
-        training, validation = _set_aside(training)
+        training, validation = _split_validation(training)
     ensure_variant()
-    folder = FitFolder(Path(out), _digest(capture, settings, depths))
+    folder = FitFolder(Path(out), _input_hash(capture, settings, depths))
     if not overwrite:
         folder.refuse_others()
     done = folder.finished(overwrite=overwrite)
@@ -226,7 +226,7 @@ def fit_capture(
     saved = time.monotonic()
     while fit.fraction < 1:
         fit.step()
-        if fit.steps % _EVERY == 0 or fit.fraction >= 1:
+        if fit.steps % _REPORT_STEPS == 0 or fit.fraction >= 1:
             now = fit.report()
             if progress is not None:
                 progress(now)
@@ -261,7 +261,7 @@ class _Fit:
         maps: Mapping[str, DepthMap],
     ) -> None:
         self.settings, self.points = settings, capture.points
-        with ThreadPoolExecutor(min(_READERS, usable_cores())) as threads:
+        with ThreadPoolExecutor(min(_MAX_READERS, usable_cores())) as threads:
             cut = settings.crop and settings.masks == "alpha" and all(photo.mask is not None for photo in training)
             windows = object_windows(training) if cut else [None] * len(training)
             self.photos = list(
@@ -272,7 +272,7 @@ class _Fit:
                 )
             )
             if settings.coarse > 0:
-                list(threads.map(lambda sight: sight.half, self.photos))
+                list(threads.map(lambda view: view.half, self.photos))
             self.validation = list(threads.map(lambda photo: _training_view(photo, settings), validation))
         centres = np.array([photo.camera.centre for photo in training])
         self.extent = _EXTENT * float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max(initial=0))
@@ -290,7 +290,7 @@ class _Fit:
         self.steps, self.seconds = 0, 0.0
         self.errors: list[Any] = []
         self.began = time.monotonic()
-        self.looked, self.validated = 0.0, float("nan")
+        self.last_validation, self.validation_psnr = 0.0, float("nan")
 
     @property
     def elapsed(self) -> float:
@@ -309,10 +309,10 @@ class _Fit:
         epoch, turn = divmod(self.steps, len(self.photos))
         number = int(np.random.default_rng([s.seed, 1, epoch]).permutation(len(self.photos))[turn])
         rng = np.random.default_rng([s.seed, 2, self.steps])
-        sight = self.photos[number].half if fraction < s.coarse else self.photos[number]
+        view = self.photos[number].half if fraction < s.coarse else self.photos[number]
         degree = min(s.sh_degree, int(5 * fraction))
-        error = self._learn(sight, number, replace(QUALITY, sh_degree=degree), fraction, rng)
-        self.densification.look(self.model, sight.camera)
+        error = self._backpropagate(view, number, replace(QUALITY, sh_degree=degree), fraction, rng)
+        self.densification.look(self.model, view.camera)
         rate = s.rate_means * 0.01**fraction
         self.model.update(
             {
@@ -325,33 +325,33 @@ class _Fit:
         )
         if s.exposure:
             self.exposure.update({"exposure": s.rate_exposure * 0.1**fraction})
-            self.exposure.values["exposure"] = _centred(self.exposure.values["exposure"], len(self.photos))
+            self.exposure.values["exposure"] = _centre_exposure(self.exposure.values["exposure"], len(self.photos))
         self.steps += 1
         self.densification.refine(self.model, self.steps, fraction, rate, rng)
         self.errors.append(error)
 
-    def _depth_weight(self, sight: TrainingView, fraction: float) -> float:
+    def _depth_weight(self, view: TrainingView, fraction: float) -> float:
         """Return the weight of the depth loss of a photo in this step."""
-        if self.steps % _DEPTH_EVERY:
+        if self.steps % _DEPTH_INTERVAL:
             return 0.0
-        return self.settings.depth_weight * (1 if sight.inverse_depth is None else _MAPS_FALL_TO**fraction)
+        return self.settings.depth_weight * (1 if view.inverse_depth is None else _FINAL_MAP_WEIGHT**fraction)
 
-    def _learn(
-        self, sight: TrainingView, number: int, quality: Quality, fraction: float, rng: np.random.Generator
+    def _backpropagate(
+        self, view: TrainingView, number: int, quality: Quality, fraction: float, rng: np.random.Generator
     ) -> Any:
         """Set the parameter gradients of the loss of a photo, and return its mean squared error."""
         s = self.settings
-        weight = self._depth_weight(sight, fraction)
-        pixel, inverse = sight.depths(self.points) if weight > 0 else (mi.UInt32(), mi.Float())
+        weight = self._depth_weight(view, fraction)
+        pixel, inverse = view.depths(self.points) if weight > 0 else (mi.UInt32(), mi.Float())
         known = dr.width(pixel)
-        seen = self.model.render(sight.eye, quality, depth=known > 0)
+        seen = self.model.render(view.eye, quality, depth=known > 0)
         behind = rng.random(3) if s.background == "random" else np.zeros(3)
         numbers = on_device(*behind, weight * self.extent, 1 / max(known, 1))
-        recipe = _Recipe(
-            sight.camera.width,
-            sight.camera.height,
+        constants = _LossConstants(
+            view.camera.width,
+            view.camera.height,
             s.ssim_share,
-            s.alpha_weight if s.masks == "alpha" and sight.masked else None,
+            s.alpha_weight if s.masks == "alpha" and view.masked else None,
             only_masked=s.masks == "ignore",
             background=s.background == "random",
         )
@@ -360,9 +360,9 @@ class _Fit:
             if s.exposure
             else None
         )
-        depth = (seen.moment, _depth_image(sight.camera, pixel, inverse)) if isinstance(seen, DepthRendering) else None
+        depth = (seen.moment, _depth_image(view.camera, pixel, inverse)) if isinstance(seen, DepthRendering) else None
         gradient, error = _gradients(
-            seen.rgb, seen.alpha, depth, (sight.packed, sight.hidden), correction, numbers, recipe
+            seen.rgb, seen.alpha, depth, (view.packed, view.hidden), correction, numbers, constants
         )
         records = [seen.gradient(gradient["rgb"], gradient["alpha"])]
         if isinstance(seen, DepthRendering):
@@ -372,7 +372,7 @@ class _Fit:
             dr.set_grad(self.exposure.values["exposure"], gradient["exposure"])
         count = self.model.count
         self.model.learn(
-            sight.eye,
+            view.eye,
             quality,
             records,
             opacity_weight=s.opacity_weight / count,
@@ -385,37 +385,42 @@ class _Fit:
         error = float(np.mean([e.numpy()[0] for e in self.errors]))
         self.errors = []
         fraction = self.fraction
-        if self.validation and (fraction >= self.looked + _LOOK_EVERY or fraction >= 1):
-            self.looked = fraction
-            self.validated = float(np.mean([photo.psnr for photo in self.check(self.validation, None)]))
-        validated = None if np.isnan(self.validated) else self.validated
-        return FitProgress(self.steps, fraction, psnr_of(error), validated, self.model.count)
+        if self.validation and (fraction >= self.last_validation + _VALIDATION_INTERVAL or fraction >= 1):
+            self.last_validation = fraction
+            self.validation_psnr = float(np.mean([photo.psnr for photo in self.check(self.validation, None)]))
+        validation_psnr = None if np.isnan(self.validation_psnr) else self.validation_psnr
+        return FitProgress(self.steps, fraction, psnr_of(error), validation_psnr, self.model.count)
 
     def check(self, photos: Sequence[TrainingView], folder: Path | None) -> tuple[HeldOut, ...]:
         """Evaluate photos that are not fitted, and write a comparison of each to the folder if it is not None."""
         quality = replace(QUALITY, sh_degree=self.settings.sh_degree)
         found = []
-        for sight in photos:
-            seen, _ = sight.render(self.model, quality)
+        for view in photos:
+            seen, _ = view.render(self.model, quality)
             if self.settings.masks == "ignore":
-                seen = seen * sight.mask[..., None]
-            found.append(sight.compare(seen, folder))
+                seen = seen * view.mask[..., None]
+            found.append(view.compare(seen, folder))
         return tuple(found)
 
     def state(self) -> dict[str, Any]:
         """Return everything that determines the rest of the fit after a report, as arrays for :meth:`restore`."""
-        own = {"steps": self.steps, "seconds": self.elapsed, "looked": self.looked, "validated": self.validated}
-        return own | {f"{name}.{k}": v for name, part in self._parts.items() for k, v in part.state().items()}
+        own = {
+            "steps": self.steps,
+            "seconds": self.elapsed,
+            "looked": self.last_validation,
+            "validated": self.validation_psnr,
+        }
+        return own | {f"{name}.{k}": v for name, part in self._stateful_parts.items() for k, v in part.state().items()}
 
     def restore(self, state: Mapping[str, npt.NDArray[Any]]) -> None:
         """Restore a state from :meth:`state`."""
         self.steps, self.seconds = int(state["steps"]), float(state["seconds"])
-        self.looked, self.validated = float(state["looked"]), float(state["validated"])
-        for name, part in self._parts.items():
+        self.last_validation, self.validation_psnr = float(state["looked"]), float(state["validated"])
+        for name, part in self._stateful_parts.items():
             part.restore({k.removeprefix(f"{name}."): v for k, v in state.items() if k.startswith(f"{name}.")})
 
     @property
-    def _parts(self) -> dict[str, Adam | Densification]:
+    def _stateful_parts(self) -> dict[str, Adam | Densification]:
         """Parts with a state that changes in every step, by their names in checkpoints."""
         return {"model": self.model, "exposure": self.exposure, "densification": self.densification}
 
@@ -428,7 +433,7 @@ def _densification(settings: FitSettings, start: int) -> Densification:
     return Mcmc(s.gaussians, start, s.refine_every, s.seed)
 
 
-class _Recipe(NamedTuple):
+class _LossConstants(NamedTuple):
     """Constants of the loss that determine its kernels."""
 
     width: int
@@ -447,7 +452,7 @@ def _gradients(
     photo: tuple[Any, Any | None],
     correction: tuple[Any, Any] | None,
     numbers: Any,
-    recipe: _Recipe,
+    constants: _LossConstants,
 ) -> tuple[dict[str, Any], Any]:
     """Return the gradients of the loss of one photo, and the mean squared error of its pixels.
 
@@ -458,7 +463,7 @@ def _gradients(
         photo: Packed pixels, and a mask of the pixels where the object may be hidden, or None.
         correction: Table of colour corrections, and the index of the photo in it.
         numbers: Background red, green and blue; weight of depth; inverse number of known depths.
-        recipe: Constants of the loss.
+        constants: Constants of the loss.
 
     Returns:
         Gradients of ``rgb``, ``alpha``, and of ``moment`` and ``exposure`` if they exist; and the error.
@@ -475,19 +480,19 @@ def _gradients(
     target, mask = unpacked(photo[0])
     if correction is not None:
         table = inputs["exposure"]
-        rgb = _exposed(rgb, alpha, table, correction[1], dr.width(table) // 12)
-    if recipe.only_masked:
+        rgb = _apply_exposure(rgb, alpha, table, correction[1], dr.width(table) // 12)
+    if constants.only_masked:
         rgb, target, alpha = [c * mask for c in rgb], [c * mask for c in target], alpha * mask
-    if recipe.background:
+    if constants.background:
         behind = [number(numbers, channel) for channel in range(3)]
         rgb = [c + b * (1 - alpha) for c, b in zip(rgb, behind, strict=True)]
         target = [c + b * (1 - mask) for c, b in zip(target, behind, strict=True)]
     if photo[1] is not None:  # no loss where the object may be hidden
         target = [dr.select(photo[1], dr.detach(c), t) for c, t in zip(rgb, target, strict=True)]
         mask = dr.select(photo[1], dr.detach(alpha), mask)
-    loss += photometric_loss(rgb, target, recipe.width, recipe.height, recipe.ssim_share)
-    if recipe.alpha_weight is not None:
-        loss += recipe.alpha_weight * dr.mean(dr.abs(alpha - mask))
+    loss += photometric_loss(rgb, target, constants.width, constants.height, constants.ssim_share)
+    if constants.alpha_weight is not None:
+        loss += constants.alpha_weight * dr.mean(dr.abs(alpha - mask))
     error = dr.mean(sum(dr.square(dr.detach(c) - t) for c, t in zip(rgb, target, strict=True))) / 3
     dr.backward(loss)
     return {name: dr.grad(value) for name, value in inputs.items()}, error
@@ -514,13 +519,13 @@ def _depth_error(alpha: Any, moment: Any, inverse: Any) -> Any:
     return dr.sum(dr.abs(found - wanted))
 
 
-def _exposed(rgb: list[Any], alpha: Any, table: Any, place: Any, photos: int) -> list[Any]:
+def _apply_exposure(rgb: list[Any], alpha: Any, table: Any, place: Any, photos: int) -> list[Any]:
     """Apply a photo's affine colour correction to premultiplied colours; ``table`` is a flat (12, photos) array."""
     m = [dr.gather(mi.Float, table, place + i * photos) for i in range(12)]
     return [sum(m[4 * i + j] * rgb[j] for j in range(3)) + m[4 * i + 3] * alpha for i in range(3)]
 
 
-def _centred(table: Any, photos: int) -> Any:
+def _centre_exposure(table: Any, photos: int) -> Any:
     """Return the table of corrections, shifted so that their mean is the identity."""
     entry = dr.arange(mi.UInt32, 12 * photos) // photos
     mean = dr.block_sum(table, photos) * dr.opaque(mi.Float, 1 / photos)
@@ -529,13 +534,13 @@ def _centred(table: Any, photos: int) -> Any:
     return centred
 
 
-def _usable(photos: tuple[Photo, ...], settings: FitSettings) -> tuple[Photo, ...]:
+def _usable_photos(photos: tuple[Photo, ...], settings: FitSettings) -> tuple[Photo, ...]:
     """Return the photos; if some have masks, drop those without, because they show more than the object."""
     masked = tuple(photo for photo in photos if photo.mask is not None)
     return photos if settings.masks == "off" or not masked else masked
 
 
-def _set_aside(training: tuple[Photo, ...]) -> tuple[tuple[Photo, ...], tuple[Photo, ...]]:
+def _split_validation(training: tuple[Photo, ...]) -> tuple[tuple[Photo, ...], tuple[Photo, ...]]:
     """Split photos into training and validation photos; the middle one of every eight, or the last, is for validation.
 
     Raises:
@@ -558,7 +563,7 @@ def _training_view(
     return TrainingView(photo, scale, masked=settings.masks != "off", inverse_depth=inverse_depth, window=window)
 
 
-def _digest(capture: Capture, settings: FitSettings, depths: DepthMaps | None) -> str:
+def _input_hash(capture: Capture, settings: FitSettings, depths: DepthMaps | None) -> str:
     """Return the SHA-256 of all inputs of a fit."""
     digest = ContentHash()
     digest.add_json([__version__, asdict(settings)])

@@ -11,7 +11,7 @@ from mitsplat.capture.capture import Photo, Window
 
 _MARGIN = 0.1
 """Margin on each side of the object, as a share of its largest size; splats in the margin must be invisible."""
-_WHOLE = 0.95
+_MAX_CROP_SHARE = 0.95
 """Share of a photo's longer edge from which cropping has no benefit."""
 
 
@@ -31,7 +31,7 @@ def object_windows(photos: Sequence[Photo]) -> list[Window | None]:
 def _window(photo: Photo, box: Int64Array, room: Int64Array) -> Window | None:
     whole = np.array([photo.camera.width, photo.camera.height])
     size = np.minimum(room, whole)
-    if size.max() >= _WHOLE * whole.max():
+    if size.max() >= _MAX_CROP_SHARE * whole.max():
         return None
     left, top = np.clip((box.sum(axis=0) - size) // 2, 0, whole - size).tolist()
     return left, top, int(size[0]), int(size[1])

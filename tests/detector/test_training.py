@@ -412,7 +412,7 @@ def test_a_step_is_not_made_smaller_where_memory_has_run_out(torchvision: None) 
         train_loader=None, job=SimpleNamespace(plan=np.zeros((3, 16))), args=SimpleNamespace(imgsz=640)
     )
     with pytest.raises(MissingResourceError, match="run out with 16 images of 640 px a step: give a smaller --batch"):
-        fixed_steps._FixedSteps.get_dataloader(trainer, "images.txt")
+        fixed_steps._FixedStepsTrainer.get_dataloader(trainer, "images.txt")
 
 
 @needs_ultralytics
@@ -423,7 +423,7 @@ def test_every_step_takes_the_images_of_the_plan(data: Path, tmp_path: Path, mon
 
     batches: list[list[str]] = []
     others: list[int] = []
-    preprocess, mosaic = fixed_steps._Masks.preprocess_batch, fixed_steps.Mosaic.get_params
+    preprocess, mosaic = fixed_steps._MaskTrainer.preprocess_batch, fixed_steps.Mosaic.get_params
 
     def look(self: Any, batch: dict[str, Any]) -> Any:
         batches.append([Path(name).stem for name in batch["im_file"]])
@@ -434,7 +434,7 @@ def test_every_step_takes_the_images_of_the_plan(data: Path, tmp_path: Path, mon
         others.extend(int(Path(label["im_file"]).stem) for label in drawn["mix_labels"])
         return drawn
 
-    monkeypatch.setattr(fixed_steps._Masks, "preprocess_batch", look)
+    monkeypatch.setattr(fixed_steps._MaskTrainer, "preprocess_batch", look)
     monkeypatch.setattr(fixed_steps.Mosaic, "get_params", mix)
     run = train_detector([data / "cell"], tmp_path / "run", TINY, real=data / "photographs")
     plan = plan_images(40, 3, share=0.25, steps=4, batch=4, seed=0)

@@ -153,7 +153,7 @@ def test_interrupted_fit_ends_at_its_target_where_it_would_have(
     capture: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It looks every 10 steps, also after an interruption in between."""
-    monkeypatch.setattr(fit, "_EVERY", 2)
+    monkeypatch.setattr(fit, "_REPORT_STEPS", 2)
     monkeypatch.setattr(fit, "_CHECKPOINT_SECONDS", 0.0)
     settings = replace(SMALL, iterations=200, gaussians=300, coarse=0.0, target_psnr=99.0)
     found: dict[int, float | None] = {}

@@ -65,7 +65,7 @@ class Places:
     @contextmanager
     def watched(self) -> Iterator[None]:
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(fit, "_EVERY", 2)
+            patch.setattr(fit, "_REPORT_STEPS", 2)
             patch.setattr(fit, "_CHECKPOINT_SECONDS", 0.0)
             for owner, name in (
                 (fit._Fit, "step"),

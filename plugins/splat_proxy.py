@@ -15,15 +15,21 @@ import numpy as np
 from mitsplat.images.masks import Silhouette
 from mitsplat.plugins.parameters import Parameters
 from mitsplat.quality import Quality, resolve_quality
-from mitsplat.renderer.instances.primary_visibility import Shown
+from mitsplat.renderer.instances.primary_visibility import PrimaryVisibility
 from mitsplat.renderer.instances.silhouettes import proxy_silhouettes, splat_silhouettes
 from mitsplat.renderer.light.bounce import RadianceGrid
 from mitsplat.renderer.light.emitter_sampling import reference_irradiance
 from mitsplat.renderer.light.light import Accuracy, light_factor
 from mitsplat.renderer.light.light_traits import Traits
-from mitsplat.renderer.light.lit_surface import Seen, VisibleSurfaces
+from mitsplat.renderer.light.lit_surface import VisiblePixels, VisibleSurfaces
 from mitsplat.renderer.meshes.mirrored_splats import SplatMirror
-from mitsplat.renderer.meshes.visible_meshes import Behind, PathTracer, SeenLights, VisibleMeshes, is_clear
+from mitsplat.renderer.meshes.visible_meshes import (
+    MeshHits,
+    PathTracer,
+    VisibleEmitters,
+    VisibleMeshes,
+    is_transmissive,
+)
 from mitsplat.renderer.occluders.proxies import Occluder, Proxies
 from mitsplat.renderer.occluders.splat_occlusion import Caster
 from mitsplat.renderer.rays.camera_rays import CameraView
@@ -272,19 +278,19 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
     ) -> dict[str, Any]:
         """Render the layers through one point of the lens."""
         rays = view.rays()
-        behind, lamps, z_max = self._behind(contents, scene, view, rays)
+        behind, emitters, z_max = self._behind(contents, scene, view, rays)
         splat = self._trace_splats(contents, scene, view, z_max)
         hit, static = contents.proxies.nearest(rays)
         proxy_depth = dr.select(hit.distance < dr.inf, hit.distance * view.cosine(rays), 0)
         dr.eval(splat, proxy_depth, hit, static)
 
         white = self._white(scene) if scene.emitters() else mi.Color3f(dr.opaque(mi.Float, float(np.pi)))
-        shown = Shown.of(splat, behind, lamps, z_max, dr.pi / white)
+        shown = PrimaryVisibility.of(splat, behind, emitters, z_max, dr.pi / white)
         radiance = self._radiance(contents, scene, view, rays, behind, shown, white, paths, seed)
         light, highlight = mi.Color3f(1), mi.Color3f(0)
         if self.shadow == "traced" and scene.emitters():
-            mesh = shown.plain & shown.front
-            seen = Seen(
+            mesh = shown.diffuse & shown.front
+            seen = VisiblePixels(
                 rays.d,
                 shown.cover,
                 dr.select(mesh, behind.depth, splat.depth) if behind else splat.depth,
@@ -343,11 +349,11 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
         if edges is None:
             return {}
         rays = edges.rays()
-        behind, lamps, z_max = self._behind(contents, scene, edges.fine, rays, edges.positions())
+        behind, emitters, z_max = self._behind(contents, scene, edges.fine, rays, edges.positions())
         splat = Image.empty(dr.width(rays.d))
         if contents.clouds is not None:
             splat = edges.trace(contents.clouds, contents.placements, self.quality, z_max)
-        shown = Shown.of(splat, behind, lamps, z_max, dr.pi / white)
+        shown = PrimaryVisibility.of(splat, behind, emitters, z_max, dr.pi / white)
         pixel = edges.alike(key, shown.key)
 
         def near(values: Any) -> Any:
@@ -364,17 +370,17 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
 
     def _behind(
         self, contents: _Contents, scene: Any, view: CameraView, rays: Any, at: tuple[Any, Any] | None = None
-    ) -> tuple[Behind | None, SeenLights | None, Any | None]:
+    ) -> tuple[MeshHits | None, VisibleEmitters | None, Any | None]:
         """Return visible meshes and emitters along rays, and the depths [m] of the nearest of them.
 
         Rays pass through the positions ``at`` of the view [px], or through the centres of all its pixels.
         """
         behind = contents.meshes.trace(view, rays, at) if contents.meshes else None
-        lamps = None if self.hide_emitters else SeenLights.trace(scene, view, rays)
+        emitters = None if self.hide_emitters else VisibleEmitters.trace(scene, view, rays)
         z_max = behind.depth if behind else None
-        if lamps:
-            z_max = lamps.depth if z_max is None else dr.minimum(z_max, lamps.depth)
-        return behind, lamps, z_max
+        if emitters:
+            z_max = emitters.depth if z_max is None else dr.minimum(z_max, emitters.depth)
+        return behind, emitters, z_max
 
     def _radiance(
         self,
@@ -382,16 +388,16 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
         scene: Any,
         view: CameraView,
         rays: Any,
-        behind: Behind | None,
-        shown: Shown,
+        behind: MeshHits | None,
+        shown: PrimaryVisibility,
         white: Any,
         paths: int,
         seed: int,
     ) -> Any | None:
         """Return the radiance (Color3f) of path-traced meshes along their visible rays, in the picture's scale."""
-        if behind is None or contents.meshes is None or contents.meshes.plain is None:
+        if behind is None or contents.meshes is None or contents.meshes.diffuse is None:
             return None
-        pixel = dr.compress(shown.solid & ~shown.plain & (shown.veil < 1 - 1e-3))
+        pixel = dr.compress(shown.solid & ~shown.diffuse & (shown.splat_alpha < 1 - 1e-3))
         if not dr.width(pixel):
             return None
         ray, hit = (dr.gather(type(v), v, pixel) for v in (mi.Ray3f(rays), behind.hit))
@@ -407,7 +413,7 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
             seed=seed,
         )
         found = tracer.radiance(view, ray, hit, pixel, paths)
-        radiance = mi.Color3f(dr.zeros(mi.Float, dr.width(shown.veil)))
+        radiance = mi.Color3f(dr.zeros(mi.Float, dr.width(shown.splat_alpha)))
         dr.eval(radiance, found)
         dr.scatter(radiance, found, pixel)
         return radiance
@@ -498,13 +504,13 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
             casters = [Caster(c.splats, c.instance, c.world_from_splats) for c in carriers if c.dynamic]
         clouds, meshes = self._upload(distinct), VisibleMeshes.build(visible)
         mirror = None
-        if meshes is not None and meshes.plain is not None:
+        if meshes is not None and meshes.diffuse is not None:
             mirror = SplatMirror.build(clouds, placements, distinct, [c.capture_light == "uniform" for c in carriers])
         self._contents = _Contents(
             shapes,
             clouds,
             placements,
-            Proxies(occluders, [s for s in visible if not is_clear(s.bsdf())], casters),
+            Proxies(occluders, [s for s in visible if not is_transmissive(s.bsdf())], casters),
             meshes,
             mirror,
             Traits.of(carriers, placements),

@@ -47,12 +47,18 @@ REFLECTED = 96
 
 
 def means(
-    light_filter: LightFilter, estimate: Estimate, beside: tuple[Any, Any] | None = None
+    light_filter: LightFilter, estimate: Estimate, extra: tuple[Any, Any] | None = None
 ) -> tuple[Any, Any, Any, Any, Any]:
     """What a filter of one pixel would give; bounced light is that of a few rays, and always averaged."""
     count = dr.rcp(dr.maximum(estimate.rays, 1))
-    other = SMOOTH(light_filter, estimate, beside)[4]
-    return estimate.lit * count, estimate.base * count, estimate.shine * count, estimate.glare * count, other
+    other = SMOOTH(light_filter, estimate, extra)[4]
+    return (
+        estimate.lit * count,
+        estimate.base * count,
+        estimate.specular_lit * count,
+        estimate.specular_base * count,
+        other,
+    )
 
 
 @contextmanager

@@ -12,7 +12,7 @@ import trimesh
 
 from mitsplat.renderer.layers import make_integrator, make_splats_shape
 from mitsplat.renderer.light import light_points as footprint
-from mitsplat.renderer.light.light_filter import GAIN, SMALL, Estimate, LightFilter
+from mitsplat.renderer.light.light_filter import GAIN, SMALL_FILTER_PIXELS, Estimate, LightFilter
 from mitsplat.renderer.light.light_points import OFFSETS
 from mitsplat.renderer.light.lit_surface import LitSurface
 from mitsplat.renderer.rays.camera_rays import CameraView
@@ -88,7 +88,7 @@ def test_pixels_that_have_no_like_get_the_rays_that_the_others_save() -> None:
         share = (0.5 * draws + 0.5) / (draws + 1)
         return 4 * share * (1 - share) / draws / (gain * 0.03**2)
 
-    assert wanted(dr.zeros(mi.Float, count)) == pytest.approx(twin(SMALL, GAIN), rel=1e-4)
+    assert wanted(dr.zeros(mi.Float, count)) == pytest.approx(twin(SMALL_FILTER_PIXELS, GAIN), rel=1e-4)
     assert wanted(pixel) == pytest.approx(twin(1, 1), rel=1e-4)
 
 

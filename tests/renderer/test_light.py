@@ -498,8 +498,8 @@ def test_one_scene_in_each_kernel_makes_the_same_light(
 
     def apart(self: Proxies, *args: Any) -> None:
         build(self, *args)
-        assert len(self.casting) == (2 if occluders == "splats" else 1)
-        self.apart = True
+        assert len(self.shadow_casters) == (2 if occluders == "splats" else 1)
+        self.separate_kernels = True
 
     monkeypatch.setattr(Proxies, "__init__", apart)
     one_by_one = layers()

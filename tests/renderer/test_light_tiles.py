@@ -17,7 +17,7 @@ from tests.renderer.test_light import WHITE_SKY, down_camera, floor, nothing, sl
 
 ensure_variant()
 from mitsplat.renderer.light.highlight import Lobe  # noqa: E402
-from mitsplat.renderer.light.light_tiles import BLOCK, TOGETHER, Tiles, block_order  # noqa: E402
+from mitsplat.renderer.light.light_tiles import BLOCK, MIN_SHADOW_HITS, ShadowTiles, block_order  # noqa: E402
 
 
 @pytest.mark.parametrize(("width", "height"), [(8, 8), (100, 52), (130, 70)])
@@ -34,7 +34,7 @@ def test_tiles_are_those_of_a_loop(width: int, height: int) -> None:
         values = np.where(inside[:, None], image.reshape(-1, 3)[pixel], 0)
         return mi.Color3f(*[mi.Float(c.astype(np.float32)) for c in values.T])
 
-    tiles = Tiles.of(ordered(arriving), ordered(lost), view)
+    tiles = ShadowTiles.of(ordered(arriving), ordered(lost), view)
     across, down = -(-width // BLOCK), -(-height // BLOCK)
     sums = np.zeros((2, down + 2, across + 2, 3))
     together = np.zeros((down + 2, across + 2), bool)
@@ -46,7 +46,7 @@ def test_tiles_are_those_of_a_loop(width: int, height: int) -> None:
             found = lost[part].sum(axis=-1) > 0
             hits[: found.shape[0], : found.shape[1]] = found
             half = BLOCK // 2
-            together[y + 1, x + 1] = hits.reshape(2, half, 2, half).sum(axis=(1, 3)).max() >= TOGETHER
+            together[y + 1, x + 1] = hits.reshape(2, half, 2, half).sum(axis=(1, 3)).max() >= MIN_SHADOW_HITS
     kernel = (1, 2, 1)
     taken, around, uneven = np.zeros((down, across, 3)), np.zeros((down, across)), np.zeros((down, across), bool)
     for y in range(down):
@@ -55,7 +55,7 @@ def test_tiles_are_those_of_a_loop(width: int, height: int) -> None:
             taken[y, x] = np.divide(away, total, out=np.zeros(3), where=total > 0)
             around[y, x] = away.sum() / total.sum() if total.sum() > 0 else 0
             uneven[y, x] = together[y : y + 3, x : x + 3].any()
-    np.testing.assert_allclose(np.array(tiles.taken).T.reshape(taken.shape), taken, atol=1e-5)
+    np.testing.assert_allclose(np.array(tiles.occluded).T.reshape(taken.shape), taken, atol=1e-5)
     np.testing.assert_array_equal(
         np.array(tiles.differs(0.05)).reshape(height, width),
         (uneven | (around >= np.float32(0.05))).repeat(BLOCK, 0).repeat(BLOCK, 1)[:height, :width],

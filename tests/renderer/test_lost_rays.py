@@ -80,7 +80,7 @@ class TestKernels:
 
         def apart(self, *args):
             build(self, *args)
-            self.apart = True
+            self.separate_kernels = True
 
         monkeypatch.setattr(Proxies, "__init__", apart)
         with traced_scenes() as numbers:

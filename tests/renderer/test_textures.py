@@ -96,7 +96,7 @@ def test_a_pixel_shows_the_mean_of_what_it_covers(tmp_path: Path, distance: floa
         camera = Camera(width=size, height=size, fx=f, fy=f, cx=size / 2, cy=size / 2, world_from_camera=pose)
         view = view_of(make_sensor(camera))
         meshes = VisibleMeshes.build([made])
-        assert meshes is not None and meshes.patterned
+        assert meshes is not None and meshes.textured
         red = np.array(meshes.trace(view, view.rays()).reflectance.x).reshape(24, times, 24, times)
         return np.asarray(red.mean(axis=(1, 3)))
 

@@ -8,7 +8,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from mitsplat.renderer.meshes.visible_meshes import Behind, SeenLights
+from mitsplat.renderer.meshes.visible_meshes import MeshHits, VisibleEmitters
 from mitsplat.renderer.splatting.gaussian import srgb_to_linear
 from mitsplat.renderer.splatting.march import Image
 
@@ -17,7 +17,7 @@ NO_SPLAT = 1 << 16
 
 
 @dataclass(frozen=True, eq=False)
-class Shown:
+class PrimaryVisibility:
     """Primary visibility of rays, without light.
 
     Attributes:
@@ -34,16 +34,18 @@ class Shown:
 
     colour: Any
     alpha: Any
-    veil: Any
+    splat_alpha: Any
     cover: Any
     solid: Any
-    plain: Any
+    diffuse: Any
     front: Any
-    glow: Any
+    emission: Any
     key: Any
 
     @classmethod
-    def of(cls, splat: Image, behind: Behind | None, lamps: SeenLights | None, z_max: Any | None, scale: Any) -> Shown:
+    def of(
+        cls, splat: Image, behind: MeshHits | None, emitters: VisibleEmitters | None, z_max: Any | None, scale: Any
+    ) -> PrimaryVisibility:
         """Combine splats, meshes and emitters.
 
         ``z_max`` is the depth along z [m] of the nearest mesh or emitter, behind which nothing is visible. ``scale`` is
@@ -52,29 +54,29 @@ class Shown:
         covered = dr.maximum(splat.alpha, 1e-6)
         colour = mi.Color3f(*[srgb_to_linear(c / covered) * splat.alpha for c in splat.rgb])
         alpha, key = splat.alpha, mi.UInt32(splat.instance)
-        solid, plain, front, glow = mi.Bool(False), mi.Bool(False), mi.Bool(False), mi.Color3f(0)
+        solid, diffuse, front, emission = mi.Bool(False), mi.Bool(False), mi.Bool(False), mi.Color3f(0)
         shape = mi.UInt32(0)
         if behind:
             solid = behind.valid & (behind.depth <= z_max)
-            plain = solid & behind.plain
-            colour += dr.select(plain, behind.reflectance * (1 - splat.alpha), 0)
+            diffuse = solid & behind.diffuse
+            colour += dr.select(diffuse, behind.reflectance * (1 - splat.alpha), 0)
             alpha = dr.select(solid, 1, alpha)
             shape = dr.select(solid, dr.reinterpret_array(mi.UInt32, behind.hit.shape), 0)
-        if lamps:
-            alpha = dr.select(solid | lamps.everywhere | (lamps.depth < dr.inf), 1, alpha)
-            glow = dr.select(solid, 0, lamps.radiance * scale * (1 - splat.alpha))
+        if emitters:
+            alpha = dr.select(solid | emitters.everywhere | (emitters.depth < dr.inf), 1, alpha)
+            emission = dr.select(solid, 0, emitters.radiance * scale * (1 - splat.alpha))
         if z_max is not None:
             front = (z_max < dr.inf) & (splat.centre_alpha < 0.5)
             key = dr.select(front, shape + NO_SPLAT, key)
-        cover = dr.select(plain, 1, splat.alpha)
-        return cls(colour, alpha, splat.alpha, cover, solid, plain, front, glow, key)
+        cover = dr.select(diffuse, 1, splat.alpha)
+        return cls(colour, alpha, splat.alpha, cover, solid, diffuse, front, emission, key)
 
     def lit(self, light: Any, highlight: Any, radiance: Any | None) -> tuple[Any, Any]:
         """Return linear colours (Color3f) with light and as captured.
 
         ``radiance`` is that of meshes that are not purely diffuse, or None.
         """
-        glow = self.glow
+        emission = self.emission
         if radiance is not None:
-            glow = dr.select(self.solid & ~self.plain, radiance * (1 - self.veil), glow)
-        return dr.maximum(self.colour * light + highlight * self.cover, 0) + glow, self.colour + glow
+            emission = dr.select(self.solid & ~self.diffuse, radiance * (1 - self.splat_alpha), emission)
+        return dr.maximum(self.colour * light + highlight * self.cover, 0) + emission, self.colour + emission

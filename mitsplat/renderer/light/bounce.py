@@ -180,7 +180,7 @@ class Reflectors:
         shadow.maxt = beam.reach * (1 - 1e-3)
         free = dr.max(colour) > 0
         dr.eval(colour, shadow, key, free)
-        for stopper in self.proxies.stoppers:
-            free = free & ~stopper.stop(shadow, mi.UInt32(0), key, free)
+        for occluder_scene in self.proxies.occluder_scenes:
+            free = free & ~occluder_scene.occluded(shadow, mi.UInt32(0), key, free)
             dr.eval(free)
         return dr.select(free, colour, 0)

@@ -18,15 +18,15 @@ from mitsplat.renderer.rays.device_arrays import wrapped
 SURVEY_LATTICE = (233, 144)
 OPEN_LATTICE = (34, 21)
 LOBE_LATTICE = (21, 13)
-WHOLE_LATTICE = (4181, 2584)
+SPHERE_LATTICE = (4181, 2584)
 """Number of points and generator of Fibonacci lattices. Consecutive Fibonacci numbers give the best two-dimensional
 lattices (Niederreiter 1992, section 5.3).
 """
 
-LEAST_CHANCE = 0.1
+UNIFORM_SHARE = 0.1
 """Share of the rays that is divided equally among all emitters, independent of their light at the reference point."""
 
-_ENDS = 4
+_COUNT_STEP = 4
 """Emitter counts are rounded up to multiples of this number, so that one kernel serves several counts."""
 
 
@@ -85,10 +85,10 @@ class Emitters:
         self.sky = None if sky is None else mi.UInt32(0) if len(emitters) == 1 else dr.opaque(mi.UInt32, sky)
         point = mi.Point3f(*[dr.opaque(mi.Float, float(v)) for v in reference])
         fluence = self._survey(len(emitters), point)
-        share = LEAST_CHANCE / len(emitters) + (1 - LEAST_CHANCE) * fluence / max(fluence.sum(), 1e-30)
-        self.choice = _Choice(share)
+        share = UNIFORM_SHARE / len(emitters) + (1 - UNIFORM_SHARE) * fluence / max(fluence.sum(), 1e-30)
+        self.choice = _DiscreteDistribution(share)
         local = np.where(np.arange(len(emitters)) == sky, 0, share)
-        self.local_choice = _Choice(local) if len(emitters) > len(skies) else None
+        self.local_choice = _DiscreteDistribution(local) if len(emitters) > len(skies) else None
         self.rectangles = Rectangles.of(emitters, sky)
         infinite = [mi.has_flag(e.flags(), mi.EmitterFlags.Infinite) for e in emitters]
         self.infinite = mi.UInt32([int(v) for v in infinite])
@@ -155,7 +155,7 @@ class Emitters:
 
         ``lobe`` is None where nothing is mirrored, which takes less time.
         """
-        total, shine = mi.Color3f(0), mi.Color3f(0)
+        total, specular_lit = mi.Color3f(0), mi.Color3f(0)
         if self.local_choice is not None:
             choice = self.local_choice
 
@@ -165,7 +165,7 @@ class Emitters:
                 light = dr.select(active, radiance * dr.maximum(dr.dot(si.sh_frame.n, direction), 0), 0)
                 return light / chance, 0 if lobe is None else light * (lobe.reflectance(direction) / chance)
 
-            total, shine = self._integrate(si, active, OPEN_LATTICE, local)
+            total, specular_lit = self._integrate(si, active, OPEN_LATTICE, local)
         if self.sky is not None:
             emitter = dr.gather(mi.EmitterPtr, self.pointers, self.sky)
             total += dr.pi * self.sky_colour if self.even_sky else sky_irradiance(emitter).at(si.n, active)
@@ -177,16 +177,16 @@ class Emitters:
                     radiance = self.sky_colour if self.even_sky else self._sky_radiance(si, direction, emitter, active)
                     return mi.Color3f(0), dr.select(weight > 0, radiance * weight, 0)
 
-                shine += self._integrate(si, active, LOBE_LATTICE, mirrored)[1]
-        return total, shine
+                specular_lit += self._integrate(si, active, LOBE_LATTICE, mirrored)[1]
+        return total, specular_lit
 
     @staticmethod
     def _integrate(si: Any, active: Any, lattice: tuple[int, int], light: Any) -> tuple[Any, Any]:
         rounds = dr.opaque(mi.UInt32, lattice[0])
 
-        def body(i: Any, total: Any, shine: Any) -> tuple[Any, Any, Any]:
+        def body(i: Any, total: Any, specular_lit: Any) -> tuple[Any, Any, Any]:
             arriving, mirrored = light(lattice_point(i, lattice))
-            return i + 1, total + arriving, shine + mirrored
+            return i + 1, total + arriving, specular_lit + mirrored
 
         nothing = dr.zeros(mi.Color3f, dr.width(si.p))
         state = dr.zeros(mi.UInt32, dr.width(si.p)), nothing, mi.Color3f(nothing)
@@ -194,7 +194,7 @@ class Emitters:
         return sums[0] / lattice[0], sums[1] / lattice[0]
 
 
-class _Choice:
+class _DiscreteDistribution:
     """Discrete distribution over a few items."""
 
     def __init__(self, share: Any) -> None:
@@ -203,7 +203,7 @@ class _Choice:
         # Padding with infinite limits lets one kernel serve two to four items, another five to eight, and so on.
         ends = np.cumsum(chance)[:-1]
         if len(chance) > 1:
-            ends = np.concatenate([ends, np.full(-len(chance) % _ENDS, np.inf)])
+            ends = np.concatenate([ends, np.full(-len(chance) % _COUNT_STEP, np.inf)])
         self.ends = [dr.opaque(mi.Float, float(end)) for end in ends]
         self.starts = wrapped(mi.Float, np.concatenate([[0], np.cumsum(chance)[:-1]]).astype(np.float32))
         self.chances = wrapped(mi.Float, chance.astype(np.float32))
@@ -229,7 +229,7 @@ def _is_sky(emitter: Any) -> bool:
 
 def sky_irradiance(emitter: Any) -> SkyIrradiance:
     """Compute the irradiance of an infinite emitter for every orientation, sampled in proportion to its radiance."""
-    point = lattice_point(dr.arange(mi.UInt32, WHOLE_LATTICE[0]), WHOLE_LATTICE)
+    point = lattice_point(dr.arange(mi.UInt32, SPHERE_LATTICE[0]), SPHERE_LATTICE)
     sample, radiance = emitter.sample_direction(receiver(mi.Point3f(0), mi.Vector3f(0, 0, 1)), point, True)
     return SkyIrradiance(sample.d, radiance)
 
@@ -239,9 +239,9 @@ def reference_irradiance(scene: Any, point: Sequence[float], normal: Sequence[fl
 
     Where almost no light reaches that element, the result is the mean over all orientations (a quarter of the fluence).
     """
-    i = dr.arange(mi.UInt32, WHOLE_LATTICE[0])
+    i = dr.arange(mi.UInt32, SPHERE_LATTICE[0])
     si = receiver(mi.Point3f(*[dr.opaque(mi.Float, float(v)) for v in point]), mi.Vector3f(*normal))
-    sample, radiance = scene.sample_emitter_direction(si, lattice_point(i, WHOLE_LATTICE), False)
+    sample, radiance = scene.sample_emitter_direction(si, lattice_point(i, SPHERE_LATTICE), False)
     irradiance = mi.Color3f(*[dr.mean(c) for c in radiance * dr.maximum(dr.dot(mi.Vector3f(si.n), sample.d), 0)])
     mean = mi.Color3f(*[0.25 * dr.mean(c) for c in radiance])
     return dr.maximum(dr.select(irradiance > 1e-3 * mean, irradiance, mean), 1e-12)

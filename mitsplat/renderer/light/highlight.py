@@ -22,7 +22,7 @@ the captured colour and the scene's lights take its place. Metals reflect more; 
 stays and represents other mirrored surroundings.
 """
 
-LEAST_ROUGHNESS = 0.15
+MIN_ROUGHNESS = 0.15
 """Smallest roughness. On smoother surfaces the fixed directions would be visible as single spots."""
 
 
@@ -47,7 +47,7 @@ class Lobe:
     @classmethod
     def of(cls, surface: LitSurface) -> Lobe:
         """Return the lobes of visible points."""
-        alpha = dr.square(dr.maximum(surface.roughness, LEAST_ROUGHNESS))
+        alpha = dr.square(dr.maximum(surface.roughness, MIN_ROUGHNESS))
         return cls(surface.normal, surface.to_camera, alpha, surface.specular)
 
     def reflectance(self, to_light: Any) -> Any:

@@ -30,12 +30,12 @@ import mitsuba as mi
 from mitsplat.renderer.light.bounce import BOUNCE_RAYS, MESH_RAYS, RadianceGrid, Reflectors
 from mitsplat.renderer.light.emitter_sampling import Beam, Emitters, receiver
 from mitsplat.renderer.light.highlight import Lobe, mirrored_tent
-from mitsplat.renderer.light.light_filter import NOWHERE, RADIUS, Estimate, LightFilter, packed
-from mitsplat.renderer.light.light_planes import LEAST_ROWS, Planes, between_samples, plane_codes
+from mitsplat.renderer.light.light_filter import RADIUS, UNTRACED, Estimate, LightFilter, packed
+from mitsplat.renderer.light.light_planes import MIN_ROWS, Planes, between_samples, plane_codes
 from mitsplat.renderer.light.light_points import LightPoints
-from mitsplat.renderer.light.light_tiles import BLOCK, STRIDE, Tiles, block_order, parity
+from mitsplat.renderer.light.light_tiles import BLOCK, STRIDE, ShadowTiles, block_order, parity
 from mitsplat.renderer.light.lit_surface import LitSurface, VisibleSurfaces
-from mitsplat.renderer.occluders.proxies import Proxies, Stopper
+from mitsplat.renderer.occluders.proxies import OccluderScene, Proxies
 from mitsplat.renderer.rays.camera_rays import CameraView
 from mitsplat.renderer.rays.device_arrays import gathered
 from mitsplat.renderer.splatting.sorting import stable_order
@@ -52,16 +52,16 @@ Every 64th point of this recurrence is a point of Roberts' recurrence, in whose 
 same. There are 4096 recurrences of this kind; in this one consecutive points are farthest apart.
 """
 
-FIRST = 0.3
+FIRST_RAYS = 0.3
 """Rays per point before the first error estimate, times the wanted error: the number that most points need.
 
 With fewer rays the estimates are so rough that rays go to the wrong points, and penumbras count as even light.
 """
 
-LEAST_FIRST = 4
+MIN_FIRST_RAYS = 4
 """Smallest number of these rays."""
 
-DENSE = 2
+PLANE_FACTOR = 2
 """Factor of the number of rays at a point that represents four pixels of a plane. With factor 1, its error would be a
 quarter larger than with rays at each pixel. With this factor the error is the same.
 """
@@ -69,7 +69,7 @@ quarter larger than with rays at each pixel. With this factor the error is the s
 LEVEL_BITS = 4
 """Bits of the number of doublings; 2^15 times the first rays exceeds every setting."""
 
-WORD = 32
+WORD_BITS = 32
 """Number of rays whose occlusion is stored as bits of one integer."""
 
 
@@ -91,13 +91,13 @@ class Accuracy:
     @property
     def first(self) -> int:
         """Rays per point before the first error estimate."""
-        wanted = max(LEAST_FIRST, round(FIRST / self.error)) if self.error > 0 else self.most
+        wanted = max(MIN_FIRST_RAYS, round(FIRST_RAYS / self.error)) if self.error > 0 else self.most
         return min(wanted, self.most)
 
     @property
     def dense(self) -> int:
         """Rays per point that represents four pixels of a plane, before the first error estimate."""
-        return min(DENSE * self.first, self.most)
+        return min(PLANE_FACTOR * self.first, self.most)
 
 
 def light_factor(
@@ -146,7 +146,7 @@ def light_factor(
     dr.eval(needed, light)
     highlight = mi.Color3f(0)
     first, plane = accuracy.first, None
-    if accuracy.error > 0 and view.height >= LEAST_ROWS and some_planes:
+    if accuracy.error > 0 and view.height >= MIN_ROWS and some_planes:
         plane = _CoarseLight.of(Planes.of(codes, needed, view), visible, emitters, seed, accuracy)
     if plane is not None:
         needed &= ~plane.coarse | plane.lattice
@@ -161,16 +161,16 @@ def light_factor(
     points = LightPoints.of(visible, here, index, light_filter.place, order)
     pixels = dr.gather(mi.UInt32, index, points.owner)
     tracer = _Tracer(emitters, proxies, points.surface, pixels, view, seed, plane and plane.lattice)
-    estimate = Estimate.nothing(dr.width(points.owner))
+    estimate = Estimate.empty(dr.width(points.owner))
     rest = order
     if plane is not None:
         places = dr.gather(mi.UInt32, light_filter.place, plane.pixel)
-        estimate = plane.estimate.moved(places, dr.width(points.owner))
+        estimate = plane.estimate.scattered(places, dr.width(points.owner))
         rest = dr.gather(mi.UInt32, order, dr.compress(dr.gather(mi.Float, estimate.rays, order) == 0))
     rows = points.rows(rest)
     if dr.width(rows):
-        rays = points.shared(dr.opaque(mi.UInt32, first), rows)
-        estimate = tracer.trace(rows, estimate, rays, first, points.turn(rows))
+        rays = points.ray_count(dr.opaque(mi.UInt32, first), rows)
+        estimate = tracer.trace(rows, estimate, rays, first, points.steps(rows))
     special = dr.compress(here.relit | (here.specular > 0))
     unshadowed = dr.full(mi.Float, 1, dr.width(index))
     if dr.width(special):
@@ -184,7 +184,7 @@ def light_factor(
         bounced = whole.bounce(reflectors)
     if first < accuracy.most:
         pixels = dr.width(needed) if accuracy.metered else 0
-        wanted = light_filter.rays_for(points.summed(estimate), accuracy.error, unshadowed, pixels)
+        wanted = light_filter.rays_for(points.sum_estimate(estimate), accuracy.error, unshadowed, pixels)
         spent = dr.full(mi.UInt32, first, dr.width(index))
         if plane is not None:
             spent = dr.select(dr.gather(mi.Bool, plane.lattice, index), dr.opaque(mi.UInt32, accuracy.dense), spent)
@@ -198,20 +198,22 @@ def light_factor(
             level, extra = _doublings(dr.gather(mi.Float, wanted, owner), first, accuracy.most)
             extra += dr.opaque(mi.UInt32, first) - dr.gather(mi.UInt32, spent, owner)
             lane = stable_order(level, LEVEL_BITS)
-            rows, extra = (dr.gather(mi.UInt32, values, lane) for values in (rows, points.shared(extra, rows)))
-            estimate = tracer.trace(rows, estimate, extra, accuracy.most - first, points.turn(rows))
-    lit, base, shine, glare, bounced = light_filter.smooth(points.summed(estimate), bounced)
+            rows, extra = (dr.gather(mi.UInt32, values, lane) for values in (rows, points.ray_count(extra, rows)))
+            estimate = tracer.trace(rows, estimate, extra, accuracy.most - first, points.steps(rows))
+    lit, base, specular_lit, specular_base, bounced = light_filter.smooth(points.sum_estimate(estimate), bounced)
     share = dr.select((base > 0) & (lit != base), lit / base, 1)  # a GPU divides a number by itself to almost 1
     light = mi.Color3f(*[v + dr.zeros(mi.Float, dr.width(needed)) for v in light])
-    dr.eval(light, share, shine, glare)
+    dr.eval(light, share, specular_lit, specular_base)
     dr.scatter(light, share, index)
     if dr.width(special):
         own, pixels = gathered(here, special), dr.gather(mi.UInt32, index, special)
-        part, shine, glare = (dr.gather(type(v), v, special) for v in (share, shine, glare))
-        dr.eval(own, part, shine, glare)
+        part, specular_lit, specular_base = (
+            dr.gather(type(v), v, special) for v in (share, specular_lit, specular_base)
+        )
+        dr.eval(own, part, specular_lit, specular_base)
         # If no ray came from the directions of the lobe, the arriving share of all light applies. (dr.mean would write
         # the width of the array into the kernel.)
-        mirrored *= dr.select(glare > 0, shine / glare, dr.sum(part) / 3) * (dr.pi / reference)
+        mirrored *= dr.select(specular_base > 0, specular_lit / specular_base, dr.sum(part) / 3) * (dr.pi / reference)
         relit = part * open_light / reference
         mirrored -= dr.select(own.relit, relit * tent, 0)
         dr.eval(relit, mirrored)
@@ -254,7 +256,7 @@ def _open_light(emitters: Emitters, points: LightPoints, special: Any) -> tuple[
         by_row = dr.zeros(type(column), dr.width(points.owner))
         dr.scatter(by_row, dr.select(own.valid, column, 0), rows)
         dr.eval(by_row)
-        means.append(dr.gather(type(column), points.total(by_row), special))
+        means.append(dr.gather(type(column), points.sum_by_pixel(by_row), special))
     *sums, count = means
     light, mirrored, tent = (total / dr.maximum(count, 1) for total in sums)
     dr.eval(light, mirrored, tent)
@@ -290,9 +292,9 @@ class _CoarseLight:
         surface = visible.at(pixel)
         dr.eval(surface, lattice)
         tracer = _Tracer(emitters, visible.proxies, surface, pixel, view, seed, lattice)
-        count, rays, turn = dr.width(pixel), accuracy.dense, (mi.UInt32(0), mi.UInt32(1))
+        count, rays, steps = dr.width(pixel), accuracy.dense, (mi.UInt32(0), mi.UInt32(1))
         rows, rounds = dr.arange(mi.UInt32, count), dr.opaque(mi.UInt32, rays)
-        estimate = tracer.trace(rows, Estimate.nothing(count), rounds, rays, turn, matt=True)
+        estimate = tracer.trace(rows, Estimate.empty(count), rounds, rays, steps, matt=True)
         coarse = planes.coarse(estimate)
         # In a tile that is not coarse, the samples took other points of the sequence than the rest of its pixels will
         # take.
@@ -319,8 +321,8 @@ def _doublings(wanted: Any, rays: int, most: int) -> tuple[Any, Any]:
 def _blockwise(place: Any, view: CameraView) -> Any:
     """Return the values of an image ``place``, except NOWHERE, in the order of :func:`block_order`."""
     pixel, inside = block_order(view)
-    ordered = dr.select(inside, dr.gather(mi.UInt32, place, pixel), NOWHERE)
-    return dr.gather(mi.UInt32, ordered, dr.compress(ordered != NOWHERE))
+    ordered = dr.select(inside, dr.gather(mi.UInt32, place, pixel), UNTRACED)
+    return dr.gather(mi.UInt32, ordered, dr.compress(ordered != UNTRACED))
 
 
 @dataclass(frozen=True, eq=False)
@@ -341,7 +343,7 @@ class _Tracer:
     seed: int
     lattice: Any = None
 
-    def search(self, captured: Any) -> Tiles:
+    def search(self, captured: Any) -> ShadowTiles:
         """Estimate by tiles the light that dynamic objects occlude, with one ray per captured point of all pixels.
 
         The four blocks of a 2 x 2 group have different points; otherwise a shadow too small for the points of one block
@@ -357,23 +359,23 @@ class _Tracer:
         beam = self.emitters.sample(receiver(origin, normal), _sequence(number, ROBERTS), active)
         ray, key = _shadow_ray(origin, beam, offset), pixel * RECURRENCE[0] + number
         active &= dr.sum(beam.irradiance) > 0
-        taken, counts, share = mi.Bool(False), active, 1
-        for stopper in proxies.casting:
-            taken |= stopper.stop(ray, instance, key, active & ~taken)
-            if proxies.apart:
-                dr.eval(taken)
+        blocked, counts, share = mi.Bool(False), active, 1
+        for occluder_scene in proxies.shadow_casters:
+            blocked |= occluder_scene.occluded(ray, instance, key, active & ~blocked)
+            if proxies.separate_kernels:
+                dr.eval(blocked)
         if proxies.static is not None:
             one_of_four = ((x | y) & 1) == 0
-            stopped = proxies.static.stop(ray, instance, key, active & (taken | one_of_four))
-            taken &= ~stopped
+            stopped = proxies.static.occluded(ray, instance, key, active & (blocked | one_of_four))
+            blocked &= ~stopped
             counts, share = active & one_of_four & ~stopped, 4
         arriving = dr.select(counts, beam.irradiance * share, 0)
-        lost = dr.select(taken, beam.irradiance, 0)
+        lost = dr.select(blocked, beam.irradiance, 0)
         dr.eval(arriving, lost)
-        return Tiles.of(arriving, lost, self.view)
+        return ShadowTiles.of(arriving, lost, self.view)
 
     def trace(
-        self, places: Any, before: Estimate, rays: Any, most: int, turn: tuple[Any, Any], *, matt: bool = False
+        self, places: Any, before: Estimate, rays: Any, most: int, steps: tuple[Any, Any], *, matt: bool = False
     ) -> Estimate:
         """Add ``rays`` more rays to an estimate at ``places``.
 
@@ -382,24 +384,24 @@ class _Tracer:
             before: Estimate so far.
             rays: Number of additional rays per point.
             most: Upper limit of ``rays``.
-            turn: First number in the sequence of the pixel, and the step to the next number, by point.
+            steps: First number in the sequence of the pixel, and the step to the next number, by point.
             matt: True if no point mirrors light, so that the highlight sums are skipped.
         """
-        apart = self.proxies.apart
-        if apart and most > WORD:
-            for begin in range(0, most, WORD):
-                part = dr.minimum(dr.maximum(rays, begin) - begin, WORD)
-                before = self.trace(places, before, part, min(WORD, most - begin), turn, matt=matt)
+        separate_kernels = self.proxies.separate_kernels
+        if separate_kernels and most > WORD_BITS:
+            for begin in range(0, most, WORD_BITS):
+                part = dr.minimum(dr.maximum(rays, begin) - begin, WORD_BITS)
+                before = self.trace(places, before, part, min(WORD_BITS, most - begin), steps, matt=matt)
             return before
         surface = gathered(self.surface, places)
         pixel = dr.gather(mi.UInt32, self.pixel, places)
-        begin, step = turn
+        begin, step = steps
         done = mi.UInt32(dr.gather(mi.Float, before.rays, places))
         start, step = self._start(pixel) + (begin + done * step) * STRIDE, step * STRIDE
         si = receiver(surface.position, surface.normal)
         origin = _origin(surface)
         lobe = Lobe.of(surface)
-        static, stoppers = self.proxies.static, self.proxies.stoppers
+        static, occluder_scenes = self.proxies.static, self.proxies.occluder_scenes
         known: list[Any] = []
 
         def send(i: Any) -> tuple[Beam, Any, Any, list[Any]]:
@@ -409,29 +411,31 @@ class _Tracer:
             active = surface.valid & (dr.sum(beam.irradiance) > 0)
             return beam, active, number, [(word >> i & 1) != 0 for word in known]
 
-        def stop(stopper: Stopper, beam: Beam, number: Any, active: Any) -> Any:
+        def occluded(occluder_scene: OccluderScene, beam: Beam, number: Any, active: Any) -> Any:
             ray = _shadow_ray(origin, beam, surface.offset)
-            return stopper.stop(ray, surface.instance, pixel * RECURRENCE[0] + number, active)
+            return occluder_scene.occluded(ray, surface.instance, pixel * RECURRENCE[0] + number, active)
 
         def note(i: Any, word: Any) -> tuple[Any, Any]:
             beam, free, number, stopped = send(i)
             for each in stopped:
                 free = free & ~each
-            return i + 1, word | dr.select(stop(stoppers[len(known)], beam, number, free), mi.UInt32(1) << i, 0)
+            return i + 1, word | dr.select(
+                occluded(occluder_scenes[len(known)], beam, number, free), mi.UInt32(1) << i, 0
+            )
 
-        if apart:  # one bit per ray and scene except the last, one kernel each
-            for _ in stoppers[1:]:
+        if separate_kernels:  # one bit per ray and scene except the last, one kernel each
+            for _ in occluder_scenes[1:]:
                 nothing = dr.zeros(mi.UInt32, dr.width(places))
                 _, word = dr.while_loop((nothing, mi.UInt32(nothing)), lambda i, _: i < rays, note, label="stopped")
                 dr.eval(word)
                 known.append(word)
 
-        def body(i: Any, lit: Any, base: Any, shine: Any, glare: Any, squares: Any) -> tuple[Any, ...]:
+        def body(i: Any, lit: Any, base: Any, specular_lit: Any, specular_base: Any, squares: Any) -> tuple[Any, ...]:
             beam, active, number, stopped = send(i)
             static_light = free = active
-            for each, stopper in enumerate(stoppers):
-                free = free & ~(stopped[each] if each < len(stopped) else stop(stopper, beam, number, free))
-                if stopper is static:
+            for each, occluder_scene in enumerate(occluder_scenes):
+                free = free & ~(stopped[each] if each < len(stopped) else occluded(occluder_scene, beam, number, free))
+                if occluder_scene is static:
                     static_light = free
             light, unshadowed = (dr.select(where, beam.irradiance, 0) for where in (free, static_light))
             compared = dr.select(surface.relit, dr.select(active, beam.irradiance, 0), unshadowed)
@@ -439,10 +443,10 @@ class _Tracer:
             base += compared
             if not matt:
                 reflectance = lobe.reflectance(beam.direction)
-                shine += dr.sum(light) * reflectance
-                glare += dr.select(active, dr.sum(beam.irradiance) * reflectance, 0)
+                specular_lit += dr.sum(light) * reflectance
+                specular_base += dr.select(active, dr.sum(beam.irradiance) * reflectance, 0)
             squares += dr.square(dr.sum(compared))
-            return i + 1, lit, base, shine, glare, squares
+            return i + 1, lit, base, specular_lit, specular_base, squares
 
         sums = [dr.gather(type(v), v, places) for v in before.sums]
         state = dr.zeros(mi.UInt32, dr.width(places)), *sums
@@ -460,14 +464,14 @@ class _Tracer:
         cells = replace(view, width=-(-view.width // 2), height=-(-view.height // 2))
         x, y = self.pixel % view.width, self.pixel // view.width
         column, row = x >> 1, y >> 1
-        chosen = ((x & 1) == (row & 1)) & (
+        selected = ((x & 1) == (row & 1)) & (
             (y & 1) == ((column + row) & 1)
         )  # equally often in each row and in each column
         if self.lattice is not None:
-            chosen |= dr.gather(mi.Bool, self.lattice, self.pixel)
+            selected |= dr.gather(mi.Bool, self.lattice, self.pixel)
         thing, count = surface.instance > 0, dr.width(self.pixel)
         total, known = mi.Color3f(dr.zeros(mi.Float, count)), dr.zeros(mi.Float, count)
-        for on_mesh, which, rays in ((False, thing, BOUNCE_RAYS), (True, ~thing & chosen, MESH_RAYS)):
+        for on_mesh, which, rays in ((False, thing, BOUNCE_RAYS), (True, ~thing & selected, MESH_RAYS)):
             places = dr.compress(surface.relit & which)
             if not dr.width(places):
                 continue
@@ -490,8 +494,8 @@ class _Tracer:
         x, y = pixel % self.view.width, pixel // self.view.width
         if self.lattice is not None:
             # Traced neighbours are two pixels apart there.
-            apart = dr.select(dr.gather(mi.Bool, self.lattice, pixel), mi.UInt32(1), 0)
-            x, y = x >> apart, y >> apart
+            shift = dr.select(dr.gather(mi.Bool, self.lattice, pixel), mi.UInt32(1), 0)
+            x, y = x >> shift, y >> shift
         return start + _bayer(x, y)
 
 
@@ -500,13 +504,13 @@ def _origin(surface: LitSurface) -> Any:
     return surface.position + surface.lift + surface.face * surface.offset
 
 
-def _packed_rays(surface: LitSurface, chosen: Any, pixel: Any) -> tuple[Any, Any, Any, Any]:
+def _packed_rays(surface: LitSurface, selected: Any, pixel: Any) -> tuple[Any, Any, Any, Any]:
     """Return ray origins, normals, offsets and instances of pixels in any order, given the points of all pixels.
 
-    The offset is 0 where ``chosen`` is False. The values are packed, because fetching them separately takes half of the
+    The offset is 0 where ``selected`` is False. The values are packed, because separate fetches take half of the
     time.
     """
-    offset = dr.select(chosen, surface.offset, 0)
+    offset = dr.select(selected, surface.offset, 0)
     rows = packed([*_origin(surface), *surface.normal, offset, surface.instance])
     row = dr.gather(mi.ArrayXf, rows, pixel, shape=(8, dr.width(pixel)))
     return mi.Point3f(*row[:3]), mi.Vector3f(*row[3:6]), row[6], row[7]

@@ -19,7 +19,7 @@ NOISE_LIMIT = 4.0
 GUESS_WEIGHT = 1e-3
 """Weight of a point that is not known to lie on a surface, relative to a known point."""
 
-SMALL = 64 / 9
+SMALL_FILTER_PIXELS = 64 / 9
 """Number of equally weighted pixels with the same noise as a mean over 3 x 3 pixels with half weights at the ends."""
 
 GAIN = 10.0
@@ -27,10 +27,10 @@ GAIN = 10.0
 ``python -m benchmarks.light.traced`` measures 0.6 of a wanted error of 0.03 over all shadows.
 """
 
-HALF = 0.5
+MID_GREY = 0.5
 """Mid-grey irradiance as a share of white. The wanted standard error applies at this level."""
 
-DARKEST = 0.05
+MIN_LIGHT = 0.05
 """Light level below which the tolerated error does not decrease further."""
 
 DISPLAY = 1 / 2.2
@@ -42,7 +42,7 @@ BRIGHTEST, DIMMEST = 64.0, 1 / 64
 _STEPS = 4096
 """Number of integer steps of displayed light; integer sums do not depend on the number of threads."""
 
-NOWHERE = 0xFFFFFFFF
+UNTRACED = 0xFFFFFFFF
 """Place of a pixel without traced light."""
 
 
@@ -59,13 +59,13 @@ class Estimate:
 
     lit: Any
     base: Any
-    shine: Any
-    glare: Any
+    specular_lit: Any
+    specular_base: Any
     squares: Any
     rays: Any
 
     @classmethod
-    def nothing(cls, count: int) -> Estimate:
+    def empty(cls, count: int) -> Estimate:
         """Return an estimate without rays at ``count`` points."""
         colours, numbers = ([dr.zeros(kind, count) for _ in range(n)] for kind, n in ((mi.Color3f, 2), (mi.Float, 4)))
         return cls(*colours, *numbers)
@@ -73,11 +73,11 @@ class Estimate:
     @property
     def sums(self) -> tuple[Any, ...]:
         """All fields except the number of rays."""
-        return self.lit, self.base, self.shine, self.glare, self.squares
+        return self.lit, self.base, self.specular_lit, self.specular_base, self.squares
 
-    def moved(self, places: Any, count: int) -> Estimate:
+    def scattered(self, places: Any, count: int) -> Estimate:
         """Return this estimate at ``places`` of ``count`` points, without rays at the others."""
-        return Estimate.nothing(count).updated(places, *self.sums, self.rays)
+        return Estimate.empty(count).updated(places, *self.sums, self.rays)
 
     def updated(self, places: Any, *values: Any) -> Estimate:
         """Write new values at some points in place and return the estimate."""
@@ -117,7 +117,7 @@ class LightFilter:
         if coarse is not None:
             self.stride = dr.select(dr.gather(mi.Bool, coarse, index), mi.Int32(2), 1)
         # Neighbour data is stored compactly, for the traced pixels only.
-        self.place = dr.full(mi.UInt32, NOWHERE, view.width * view.height)
+        self.place = dr.full(mi.UInt32, UNTRACED, view.width * view.height)
         dr.scatter(self.place, dr.arange(mi.UInt32, dr.width(index)), index)
         dr.eval(self.place)
         # Untraced pixels of coarse tiles map to the traced pixel of their 2 x 2 cell. Otherwise neighbours in every
@@ -145,28 +145,28 @@ class LightFilter:
         """
         share, variance, shared = self._share(estimate)
         # If few of the 3 x 3 pixels are similar, almost none of the more distant pixels are.
-        gain = dr.fma(GAIN - 1, dr.square((shared - 1) / (SMALL - 1)), 1)
+        gain = dr.fma(GAIN - 1, dr.square((shared - 1) / (SMALL_FILTER_PIXELS - 1)), 1)
         light = unshadowed * share
         if metered:
             exposure = _metered(light, self.stride * self.stride, metered)
             light, unshadowed = light * exposure, unshadowed * exposure
         # The tolerated error follows the slope of the display curve, relative to HALF.
-        allowed = error * dr.power(dr.clip(light, DARKEST, 1) / HALF, 1 - DISPLAY)
+        allowed = error * dr.power(dr.clip(light, MIN_LIGHT, 1) / MID_GREY, 1 - DISPLAY)
         return estimate.rays * variance * dr.square(unshadowed / allowed) / gain
 
-    def smooth(self, estimate: Estimate, beside: tuple[Any, Any] | None = None) -> tuple[Any, Any, Any, Any, Any]:
+    def smooth(self, estimate: Estimate, extra: tuple[Any, Any] | None = None) -> tuple[Any, Any, Any, Any, Any]:
         """Average the first four sums of the estimate, per ray, over neighbours of the pixels of ``index``.
 
         ``beside`` is additional light (Color3f) and the flag (Float) where it is known (1, otherwise 0). Its average is
         0 where no neighbour knows it.
         """
         weight = dr.rcp(dr.maximum(estimate.rays, 1))
-        values = [c * weight for c in (*estimate.lit, *estimate.base, estimate.shine, estimate.glare)]
-        if beside is not None:
-            values += [*beside[0], beside[1]]
+        values = [c * weight for c in (*estimate.lit, *estimate.base, estimate.specular_lit, estimate.specular_base)]
+        if extra is not None:
+            values += [*extra[0], extra[1]]
         values, _ = self._average(values, estimate.rays, RADIUS, self._share(estimate)[:2])
         other = None
-        if beside is not None:
+        if extra is not None:
             *colour, share = values[8:]
             other = dr.select(share > 1e-6, mi.Color3f(*colour) / share, 0)
         return mi.Color3f(*values[:3]), mi.Color3f(*values[3:6]), values[6], values[7], other
@@ -225,7 +225,7 @@ class LightFilter:
             nx, ny = x + signed * along_x, y + signed * along_y
             inside = (nx >= 0) & (nx < view.width) & (ny >= 0) & (ny < view.height)
             place = dr.gather(mi.UInt32, self.shown, mi.UInt32(ny * view.width + nx), inside)
-            same = inside & (place != NOWHERE)
+            same = inside & (place != UNTRACED)
             other = dr.gather(mi.ArrayXf, traits, place, same, shape=(_TRAITS, width))
             position, normal = mi.Point3f(*other[:3]), mi.Vector3f(*other[3:6])
             trait, known, rays = other[6], other[7] > 0, other[8]
@@ -266,7 +266,7 @@ def _metered(light: Any, area: Any, pixels: int) -> Any:
     looks = dr.sum(mi.UInt64(looks + 0.5) * area) - dr.sum(area) * _STEPS
     looks += dr.opaque(mi.UInt64, pixels * _STEPS)
     mean = mi.Float(looks) / dr.opaque(mi.Float, pixels * _STEPS)
-    exposure = HALF * dr.power(dr.maximum(mean, 1e-6), -1 / DISPLAY)
+    exposure = MID_GREY * dr.power(dr.maximum(mean, 1e-6), -1 / DISPLAY)
     return dr.clip(exposure, DIMMEST, BRIGHTEST)
 
 

@@ -23,12 +23,12 @@ from mitsplat.renderer.rays.camera_rays import CameraView
 SAMPLES = (BLOCK // 2) ** 2
 """Number of traced pixels in a coarse tile."""
 
-LEAST_ROWS = 128
+MIN_ROWS = 128
 """Smallest image height [px] at which planes are searched. Lower images, such as the bands of a rolling shutter, gain
 little. The rows beyond a band would also change which of its tiles are coarse.
 """
 
-LEAST_STEP = 0.04
+MAX_EVEN_STEP = 0.04
 """Largest difference between the light shares of adjacent tiles that counts as even light."""
 
 NOISE = 1.0
@@ -145,13 +145,13 @@ class Planes:
         variance = likely * (1 - likely) / draws
         dr.eval(share, variance)
         even = mi.Bool(True)
-        for beside in self._beside():
-            plane = beside < count
-            theirs = dr.gather(mi.Float, share, beside, plane), dr.gather(mi.Float, variance, beside, plane)
+        for neighbour in self._neighbours():
+            plane = neighbour < count
+            theirs = dr.gather(mi.Float, share, neighbour, plane), dr.gather(mi.Float, variance, neighbour, plane)
             # Where no light is needed, almost all light arrives.
             other, noise = (dr.select(plane, v, rest) for v, rest in zip(theirs, (mi.Float(1), 0), strict=True))
-            allowed = dr.fma(NOISE, variance + noise, LEAST_STEP**2)
-            even &= (beside <= count) & (dr.square(share - other) <= allowed)
+            allowed = dr.fma(NOISE, variance + noise, MAX_EVEN_STEP**2)
+            even &= (neighbour <= count) & (dr.square(share - other) <= allowed)
         by_tile = dr.full(mi.Bool, False, dr.width(self.place))
         dr.scatter(by_tile, even, self.number)
         dr.eval(by_tile)
@@ -159,7 +159,7 @@ class Planes:
         tile = pixel // self.view.width // BLOCK * self._across + pixel % self.view.width // BLOCK
         return dr.gather(mi.Bool, by_tile, tile)
 
-    def _beside(self) -> Iterator[Any]:
+    def _neighbours(self) -> Iterator[Any]:
         """Yield the places of the eight neighbours of each tile, and of the tile itself.
 
         Coordinates are clamped to the image.

@@ -15,7 +15,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsplat.renderer.light.light_filter import NOWHERE, Estimate
+from mitsplat.renderer.light.light_filter import UNTRACED, Estimate
 from mitsplat.renderer.light.lit_surface import LitSurface, VisibleSurfaces
 from mitsplat.renderer.rays.camera_rays import CameraView
 from mitsplat.renderer.rays.device_arrays import concatenated, gathered, wrapped
@@ -36,7 +36,7 @@ class LightPoints:
     Attributes:
         surface: The points, by row.
         owner: Index of the pixel, by row.
-        slot: Index among bent pixels, by pixel; ``NOWHERE`` if the pixel is not bent.
+        slot: Index among bent pixels, by pixel; ``UNTRACED`` if the pixel is not bent.
         count, bent: Number of pixels, and number of bent pixels among them.
     """
 
@@ -61,7 +61,7 @@ class LightPoints:
         bends = _bends(here, index, place, visible.view)
         in_image = dr.compress(bends)
         bent = dr.width(in_image)
-        slot = dr.full(mi.UInt32, NOWHERE, count)
+        slot = dr.full(mi.UInt32, UNTRACED, count)
         if not bent:
             return cls(here, dr.arange(mi.UInt32, count), slot, count, 0)
         among = dr.gather(mi.UInt32, order, dr.compress(dr.gather(mi.Bool, bends, order)))
@@ -70,7 +70,7 @@ class LightPoints:
         number = dr.arange(mi.UInt32, bent * len(OFFSETS)) // dr.opaque(mi.UInt32, bent)
         # Traced in image order: adjacent camera rays hit the same triangles, which takes 40 % of the time.
         offset = dr.gather(mi.Point2f, wrapped(mi.Float, np.array(OFFSETS, np.float32)), number)
-        around = visible.beside(dr.gather(mi.UInt32, index, concatenated([in_image] * len(OFFSETS))), offset)
+        around = visible.at_offset(dr.gather(mi.UInt32, index, concatenated([in_image] * len(OFFSETS))), offset)
         rank = dr.empty(mi.UInt32, count)
         dr.scatter(rank, dr.arange(mi.UInt32, bent), in_image, mode=dr.ReduceMode.Permute)
         around = gathered(around, dr.gather(mi.UInt32, rank, owner) + number * dr.opaque(mi.UInt32, bent))
@@ -91,37 +91,37 @@ class LightPoints:
         if not dr.width(places):
             return places
         slot = dr.gather(mi.UInt32, self.slot, places)
-        even = dr.gather(mi.UInt32, places, dr.compress(slot == NOWHERE))
-        slot = dr.gather(mi.UInt32, slot, dr.compress(slot != NOWHERE))
+        even = dr.gather(mi.UInt32, places, dr.compress(slot == UNTRACED))
+        slot = dr.gather(mi.UInt32, slot, dr.compress(slot != UNTRACED))
         dr.eval(even, slot)  # keeps the kernels independent of which kinds occur
         rows = concatenated([even, *[slot + start for start in self._starts()]]) if dr.width(slot) else even
         dr.eval(rows)
         return rows
 
-    def shared(self, rays: Any, rows: Any) -> Any:
+    def ray_count(self, rays: Any, rows: Any) -> Any:
         """Return the number of rays (at least 1) of the points ``rows``, given the ``rays`` (UInt32) of pixels."""
         return dr.select(rows < dr.opaque(mi.UInt32, self.count), rays, dr.maximum(rays // len(OFFSETS), 1))
 
-    def turn(self, rows: Any) -> tuple[Any, Any]:
+    def steps(self, rows: Any) -> tuple[Any, Any]:
         """Return the first ray number of each point in the sequence of its pixel, and the step to its next ray."""
         count = dr.opaque(mi.UInt32, self.count)
         number = (rows - count) // dr.opaque(mi.UInt32, max(self.bent, 1))
         middle = rows < count
         return dr.select(middle, 0, number), dr.select(middle, mi.UInt32(1), len(OFFSETS))
 
-    def total(self, values: Any) -> Any:
+    def sum_by_pixel(self, values: Any) -> Any:
         """Sum values by row into values by pixel, in a fixed order."""
         slot = dr.gather(mi.UInt32, self.slot, dr.arange(mi.UInt32, self.count))
-        several, total = slot != NOWHERE, type(values)(0)
+        several, total = slot != UNTRACED, type(values)(0)
         for start in self._starts():
             total += dr.gather(type(values), values, slot + start, several)
         return dr.select(several, total, dr.gather(type(values), values, dr.arange(mi.UInt32, self.count)))
 
-    def summed(self, estimate: Estimate) -> Estimate:
+    def sum_estimate(self, estimate: Estimate) -> Estimate:
         """Sum an estimate by row into an estimate by pixel."""
         if not self.bent:
             return estimate
-        result = Estimate(*[self.total(getattr(estimate, f.name)) for f in fields(Estimate)])
+        result = Estimate(*[self.sum_by_pixel(getattr(estimate, f.name)) for f in fields(Estimate)])
         dr.eval(result)
         return result
 
@@ -137,7 +137,7 @@ def _bends(here: LitSurface, index: Any, place: Any, view: CameraView) -> Any:
         nx, ny = x + (dx - 1), y + (dy - 1)
         inside = (nx >= 0) & (nx < view.width) & (ny >= 0) & (ny < view.height)
         other = dr.gather(mi.UInt32, place, mi.UInt32(ny * view.width + nx), inside)
-        lit = inside & (other != NOWHERE)
+        lit = inside & (other != UNTRACED)
         same = dr.gather(mi.Float, here.trait, other, lit) == here.trait
         even = dr.dot(dr.gather(mi.Vector3f, here.normal, other, lit), here.normal) > EVEN
         bends |= (lit & ~same) | (inside & thing & ~(lit & even))

@@ -18,7 +18,7 @@ filter averages a stratified set.
 STRIDE = BLOCK * BLOCK
 """Step in the sequence between two rays of a pixel; the points between belong to its neighbours."""
 
-TOGETHER = 3
+MIN_SHADOW_HITS = 3
 """Number of occluded rays in a quarter of a tile that indicates a shadow instead of noise."""
 
 
@@ -47,7 +47,7 @@ def parity(block_x: Any, block_y: Any) -> Any:
 
 
 @dataclass(frozen=True, eq=False)
-class Tiles:
+class ShadowTiles:
     """Light loss in tiles of BLOCK x BLOCK pixels, from one ray per pixel.
 
     Attributes:
@@ -58,14 +58,14 @@ class Tiles:
         view: Camera.
     """
 
-    taken: Any
+    occluded: Any
     known: Any
-    around: Any
-    uneven: Any
+    mean_occluded: Any
+    concentrated: Any
     view: CameraView
 
     @classmethod
-    def of(cls, arriving: Any, lost: Any, view: CameraView) -> Tiles:
+    def of(cls, arriving: Any, lost: Any, view: CameraView) -> ShadowTiles:
         """Sum light by tile.
 
         Sums have a fixed order, so that they do not depend on the number of threads.
@@ -96,28 +96,28 @@ class Tiles:
         state = mi.UInt32(nothing), dr.zeros(mi.Color3f, width * height), dr.zeros(mi.Color3f, width * height), nothing
         _, total, away, hits = dr.while_loop(state, lambda i, *_: i < rounds, add, label="tiles")
         dr.eval(total, away, hits)
-        here, gone, uneven = mi.Color3f(0), mi.Color3f(0), mi.Bool(False)
+        here, gone, concentrated = mi.Color3f(0), mi.Color3f(0), mi.Bool(False)
         for dy in (-1, 0, 1):
             for dx in (-1, 0, 1):
                 nx, ny = mi.Int32(x) + dx, mi.Int32(y) + dy
                 inside = (nx >= 0) & (nx < width) & (ny >= 0) & (ny < height)
-                beside = mi.UInt32(ny * width + nx)
+                neighbour = mi.UInt32(ny * width + nx)
                 weight = (2 - abs(dx)) * (2 - abs(dy))  # blocks of each parity sum to a quarter of the weight
-                here += weight * dr.gather(mi.Color3f, total, beside, inside)
-                gone += weight * dr.gather(mi.Color3f, away, beside, inside)
-                counts = dr.gather(mi.UInt32, hits, beside, inside)
+                here += weight * dr.gather(mi.Color3f, total, neighbour, inside)
+                gone += weight * dr.gather(mi.Color3f, away, neighbour, inside)
+                counts = dr.gather(mi.UInt32, hits, neighbour, inside)
                 for quarter in range(4):
-                    uneven |= (counts >> (8 * quarter) & 0xFF) >= TOGETHER
-        taken = mi.Color3f(*[dr.select(h > 0, g / h, 0) for h, g in zip(here, gone, strict=True)])
-        around, known = dr.select(dr.sum(here) > 0, dr.sum(gone) / dr.sum(here), 0), dr.sum(total) > 0
-        dr.eval(taken, known, around, uneven)
-        return cls(taken, known, around, uneven, view)
+                    concentrated |= (counts >> (8 * quarter) & 0xFF) >= MIN_SHADOW_HITS
+        occluded = mi.Color3f(*[dr.select(h > 0, g / h, 0) for h, g in zip(here, gone, strict=True)])
+        mean_occluded, known = dr.select(dr.sum(here) > 0, dr.sum(gone) / dr.sum(here), 0), dr.sum(total) > 0
+        dr.eval(occluded, known, mean_occluded, concentrated)
+        return cls(occluded, known, mean_occluded, concentrated, view)
 
     def differs(self, error: float) -> Any:
         """Return for each pixel (Bool) if dynamic objects occlude at least the share ``error``, or one place in it."""
         pixel = dr.arange(mi.UInt32, self.view.width * self.view.height)
         tile = pixel // self.view.width // BLOCK * -(-self.view.width // BLOCK) + pixel % self.view.width // BLOCK
-        return dr.gather(mi.Bool, self.uneven | (self.around >= dr.opaque(mi.Float, error)), tile)
+        return dr.gather(mi.Bool, self.concentrated | (self.mean_occluded >= dr.opaque(mi.Float, error)), tile)
 
     def light(self) -> Any:
         """Return the remaining share of light (Color3f) at every pixel, interpolated between tile centres."""
@@ -134,6 +134,6 @@ class Tiles:
                 tile = mi.UInt32(ny * width + nx)
                 weight = (1 - dr.abs(x - left - dx)) * (1 - dr.abs(y - top - dy))
                 weight = dr.select(inside & dr.gather(mi.Bool, self.known, tile, inside), weight, 0)
-                total += weight * dr.gather(mi.Color3f, self.taken, tile, inside)
+                total += weight * dr.gather(mi.Color3f, self.occluded, tile, inside)
                 weights += weight
         return 1 - dr.select(weights > 0, total / weights, 0)

@@ -52,7 +52,7 @@ class LitSurface:
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
+class VisiblePixels:
     """Primary visibility of pixels.
 
     Attributes:
@@ -88,7 +88,7 @@ class VisibleSurfaces:
     view: CameraView
     proxies: Proxies
     eye: Any
-    seen: Seen
+    seen: VisiblePixels
     hit: Hit
     static: Hit
 
@@ -99,7 +99,7 @@ class VisibleSurfaces:
         """
         return self._surface(gathered(self.seen, pixel), gathered(self.hit, pixel), gathered(self.static, pixel))
 
-    def beside(self, pixel: Any, offset: Any) -> LitSurface:
+    def at_offset(self, pixel: Any, offset: Any) -> LitSurface:
         """Return the points at ``offset`` [px] (Point2f) from pixel centres.
 
         A point is valid where the ray hits a proxy of the same instance.
@@ -114,7 +114,7 @@ class VisibleSurfaces:
         dr.eval(surface)
         return surface
 
-    def _surface(self, seen: Seen, hit: Hit, static: Hit) -> LitSurface:
+    def _surface(self, seen: VisiblePixels, hit: Hit, static: Hit) -> LitSurface:
         ray, depth, instance = mi.Ray3f(self.eye, seen.direction), seen.depth, seen.instance
         cosine = self.view.cosine(ray)
         met = hit.distance < dr.inf

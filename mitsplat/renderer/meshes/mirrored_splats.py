@@ -28,7 +28,7 @@ _ROW = 16
 
 
 @dataclass(frozen=True, eq=False)
-class Glimpse:
+class SplatHits:
     """Hits of rays on splats.
 
     Attributes:
@@ -92,7 +92,7 @@ class SplatMirror:
             )
         return cls(solids, clouds, wrapped(mi.UInt32, owners), wrapped(mi.Float, rows), appearances)
 
-    def look(self, ray: Any, key: Any, active: Any) -> Glimpse:
+    def trace(self, ray: Any, key: Any, active: Any) -> SplatHits:
         """Trace rays against splats; the ``key`` of a ray selects its set of solids."""
         inside, start, met = self.solids.enter(ray, key, mi.Float(0))
         hit = self.solids.scene.ray_intersect_preliminary(inside, active=active & met)
@@ -114,7 +114,7 @@ class SplatMirror:
         thin_x, thin_y = (sigma.x < sigma.y) & (sigma.x < sigma.z), sigma.y < sigma.z
         side = dr.select(thin_x, axes[0], dr.select(thin_y, axes[1], axes[2]))
         side = dr.select(dr.dot(side, own) > 0, -side, side)
-        return Glimpse(
+        return SplatHits(
             distance=dr.select(found, start + hit.t, dr.inf),
             colour=colour,
             normal=axes_of[0] * side.x + axes_of[1] * side.y + axes_of[2] * side.z,

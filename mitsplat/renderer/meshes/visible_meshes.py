@@ -19,7 +19,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitsplat.renderer.light.emitter_sampling import receiver
-from mitsplat.renderer.meshes.mirrored_splats import Glimpse, SplatMirror
+from mitsplat.renderer.meshes.mirrored_splats import SplatHits, SplatMirror
 from mitsplat.renderer.occluders.proxies import Hit, Proxies
 from mitsplat.renderer.rays.camera_rays import CameraView
 from mitsplat.renderer.rays.device_arrays import gathered, ray_scene, wrapped
@@ -42,7 +42,7 @@ are still correlated.
 FOOTPRINT = 4
 """Sample points along each side of a pixel's footprint for the reflectance of textured meshes."""
 
-_BENT = ("NormalMap", "BumpMap")
+_NORMAL_MODIFIERS = ("NormalMap", "BumpMap")
 """Materials that perturb the normals of their nested material."""
 
 
@@ -50,13 +50,13 @@ def _has(flags: Any, *names: str) -> Any:
     return (flags & reduce(or_, (int(getattr(mi.BSDFFlags, name)) for name in names))) != 0
 
 
-def is_plain(bsdf: Any) -> bool:
+def is_diffuse(bsdf: Any) -> bool:
     """Return True if a material is purely diffuse."""
     flags, diffuse = int(bsdf.flags()), int(mi.BSDFFlags.DiffuseReflection)
-    return (flags & int(mi.BSDFFlags.All)) == diffuse and not any(name in str(bsdf) for name in _BENT)
+    return (flags & int(mi.BSDFFlags.All)) == diffuse and not any(name in str(bsdf) for name in _NORMAL_MODIFIERS)
 
 
-def is_clear(bsdf: Any) -> bool:
+def is_transmissive(bsdf: Any) -> bool:
     """Return True if light passes through a material, which then casts no shadow on splats and diffuse meshes."""
     return bool(_has(int(bsdf.flags()), "GlossyTransmission", "DeltaTransmission")) or "ThinDielectric" in str(bsdf)
 
@@ -67,7 +67,7 @@ def has_texture(bsdf: Any) -> bool:
 
 
 @dataclass(frozen=True, eq=False)
-class Behind:
+class MeshHits:
     """Camera hits on visible meshes.
 
     Attributes:
@@ -82,7 +82,7 @@ class Behind:
     depth: Any
     reflectance: Any
     valid: Any
-    plain: Any
+    diffuse: Any
     normal: Any
     face: Any
     hit: Any
@@ -110,8 +110,8 @@ class VisibleMeshes:
     """
 
     scene: Any
-    plain: Any
-    patterned: bool
+    diffuse: Any
+    textured: bool
 
     @classmethod
     def build(cls, shapes: Sequence[Any]) -> VisibleMeshes | None:
@@ -119,31 +119,31 @@ class VisibleMeshes:
         if not shapes:
             return None
         scene = ray_scene({f"visible_{i}": shape for i, shape in enumerate(shapes)})
-        plain = [is_plain(shape.bsdf()) for shape in shapes]
-        patterned = any(map(has_texture, (shape.bsdf() for shape in shapes)))
-        if all(plain):
-            return cls(scene, None, patterned)
+        diffuse = [is_diffuse(shape.bsdf()) for shape in shapes]
+        textured = any(map(has_texture, (shape.bsdf() for shape in shapes)))
+        if all(diffuse):
+            return cls(scene, None, textured)
         numbers = [int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0]) for shape in shapes]
         table = np.zeros(1 + max(numbers), bool)
-        table[numbers] = plain
-        return cls(scene, wrapped(mi.Bool, table), patterned)
+        table[numbers] = diffuse
+        return cls(scene, wrapped(mi.Bool, table), textured)
 
-    def is_plain(self, hit: Any) -> Any:
+    def is_diffuse(self, hit: Any) -> Any:
         """Return True for hits on purely diffuse meshes, False for misses."""
-        if self.plain is None:
+        if self.diffuse is None:
             return hit.is_valid()
-        return dr.gather(mi.Bool, self.plain, dr.reinterpret_array(mi.UInt32, hit.shape), hit.is_valid())
+        return dr.gather(mi.Bool, self.diffuse, dr.reinterpret_array(mi.UInt32, hit.shape), hit.is_valid())
 
-    def trace(self, view: CameraView, rays: Any, at: tuple[Any, Any] | None = None) -> Behind:
+    def trace(self, view: CameraView, rays: Any, at: tuple[Any, Any] | None = None) -> MeshHits:
         """Trace camera rays through positions ``at`` [px], or through the centres of all pixels."""
         hit = self.scene.ray_intersect_preliminary(rays, coherent=True)
         si = hit.compute_surface_interaction(rays)
         valid = si.is_valid()
-        plain = self.is_plain(hit)
-        reflectance = self._reflectance(view, rays, at, si, valid & plain)
+        diffuse = self.is_diffuse(hit)
+        reflectance = self._reflectance(view, rays, at, si, valid & diffuse)
         depth = dr.select(valid, si.t * view.cosine(rays), dr.inf)
         normal, face = (dr.select(dr.dot(n, rays.d) > 0, -n, n) for n in (si.sh_frame.n, si.n))
-        behind = Behind(depth, reflectance, valid, plain, normal, face, hit)
+        behind = MeshHits(depth, reflectance, valid, diffuse, normal, face, hit)
         dr.eval(behind)
         return behind
 
@@ -152,7 +152,7 @@ class VisibleMeshes:
 
         The footprint is the parallelogram of ray differentials (Igehy 1999), sampled at ``FOOTPRINT`` squared points.
         """
-        if not self.patterned:
+        if not self.textured:
             return si.bsdf().eval_diffuse_reflectance(si, active)
         x, y = at or view.centres()
         wide = mi.RayDifferential3f(rays)
@@ -170,7 +170,7 @@ class VisibleMeshes:
 
 
 @dataclass(frozen=True, eq=False)
-class SeenLights:
+class VisibleEmitters:
     """Emitters seen by a camera.
 
     Attributes:
@@ -184,7 +184,7 @@ class SeenLights:
     everywhere: bool
 
     @classmethod
-    def trace(cls, scene: Any, view: CameraView, rays: Any) -> SeenLights | None:
+    def trace(cls, scene: Any, view: CameraView, rays: Any) -> VisibleEmitters | None:
         """Trace camera rays to a scene's emitters; return None if no emitter can be visible."""
         sky = scene.environment()
         if any(shape.is_emitter() for shape in scene.shapes()):
@@ -261,36 +261,36 @@ class PathTracer:
             lane = dr.arange(mi.UInt32, count * own)
             row = lane // dr.opaque(mi.UInt32, own)
             number = lane - row * own + dr.opaque(mi.UInt32, done)
-            dice = _Dice(dr.gather(mi.UInt32, pixel, row), number, seed)
+            numbers = _RandomNumbers(dr.gather(mi.UInt32, pixel, row), number, seed)
             centre = dr.gather(mi.Ray3f, ray, row), dr.gather(mi.PreliminaryIntersection3f, hit, row)
-            dr.eval(lane, dice, centre)
-            path = _Path(lane, *self._beside(view, dice, *centre), dr.full(mi.Color3f, 1, count * own))
+            dr.eval(lane, numbers, centre)
+            path = _Path(lane, *self._jittered(view, numbers, *centre), dr.full(mi.Color3f, 1, count * own))
             dr.eval(path)
-            light = self._trace(path, dice)
+            light = self._trace(path, numbers)
             total += mi.Color3f(*[dr.block_sum(channel, own) for channel in light])
             dr.eval(total)
             done += own
         return total / samples
 
-    def _beside(self, view: CameraView, dice: _Dice, ray: Any, hit: Any) -> tuple[Any, Any]:
+    def _jittered(self, view: CameraView, numbers: _RandomNumbers, ray: Any, hit: Any) -> tuple[Any, Any]:
         """Return rays through random points of the pixels and their hits.
 
         The ray through the centre is used where the random ray misses or hits a purely diffuse mesh.
         """
-        row = dice.pixel // view.width
+        row = numbers.pixel // view.width
         other = mi.Ray3f(ray)
-        x, y = mi.Float(dice.pixel - row * view.width), mi.Float(row)
-        other.d = view.direction(x + dice.number_of(0, 5), y + dice.number_of(0, 6))
-        beside = self.meshes.scene.ray_intersect_preliminary(other, coherent=True)
-        usable = beside.is_valid() & ~self.meshes.is_plain(beside)
-        return dr.select(usable, other, ray), dr.select(usable, beside, hit)
+        x, y = mi.Float(numbers.pixel - row * view.width), mi.Float(row)
+        other.d = view.direction(x + numbers.number_of(0, 5), y + numbers.number_of(0, 6))
+        jittered = self.meshes.scene.ray_intersect_preliminary(other, coherent=True)
+        usable = jittered.is_valid() & ~self.meshes.is_diffuse(jittered)
+        return dr.select(usable, other, ray), dr.select(usable, jittered, hit)
 
-    def _trace(self, path: _Path, dice: _Dice) -> Any:
+    def _trace(self, path: _Path, numbers: _RandomNumbers) -> Any:
         """Return the radiance (Color3f) of every path."""
         result = mi.Color3f(dr.zeros(mi.Float, dr.width(path.lane)))
         lights = bool(self.scene.emitters())
         for depth in range(self.max_depth - 1):
-            own = gathered(dice, path.lane)
+            own = gathered(numbers, path.lane)
             si = self._interaction(path)
             bsdf, context = si.bsdf(path.ray), mi.BSDFContext()
             u = [own.number_of(depth, i) for i in range(5)]
@@ -313,24 +313,24 @@ class PathTracer:
             hit = self.scene.ray_intersect_preliminary(ray)
             dr.eval(hit)
             path = _Path(lane, ray, hit, throughput)
-            going = hit.is_valid()
-            glimpse = self._look(path, dr.gather(mi.Bool, smooth, alive), dice, depth, result)
-            if glimpse is not None:
-                going &= glimpse.distance >= hit.t
+            continuing = hit.is_valid()
+            splat_hits = self._add_splats(path, dr.gather(mi.Bool, smooth, alive), numbers, depth, result)
+            if splat_hits is not None:
+                continuing &= splat_hits.distance >= hit.t
             if lights:
                 reference = dr.zeros(mi.Interaction3f, dr.width(lane))
                 reference.p = dr.gather(mi.Point3f, at, alive)
-                seen = mi.Bool(True) if glimpse is None else ~(glimpse.distance < hit.t)
+                seen = mi.Bool(True) if splat_hits is None else ~(splat_hits.distance < hit.t)
                 chance = dr.gather(mi.Float, density, alive)
                 self._add_emission(result, path, reference, chance, dr.gather(mi.Bool, delta, alive), seen)
-            going = dr.compress(going)
-            if not dr.width(going):
+            continuing = dr.compress(continuing)
+            if not dr.width(continuing):
                 break
             path = _Path(
-                dr.gather(mi.UInt32, lane, going),
-                dr.gather(mi.Ray3f, ray, going),
-                dr.gather(mi.PreliminaryIntersection3f, hit, going),
-                dr.gather(mi.Color3f, throughput, going),
+                dr.gather(mi.UInt32, lane, continuing),
+                dr.gather(mi.Ray3f, ray, continuing),
+                dr.gather(mi.PreliminaryIntersection3f, hit, continuing),
+                dr.gather(mi.Color3f, throughput, continuing),
             )
             dr.eval(path)
         return result
@@ -361,49 +361,51 @@ class PathTracer:
         ray = si.spawn_ray_to(si.p + towards.d * towards.dist)
         infinite = _has_emitter_flag(towards.emitter, mi.EmitterFlags.Infinite)
         ray.maxt = dr.select(infinite, dr.inf, ray.maxt)
-        self._add_lit(result, path.lane, ray, arrives, key)
+        self._add_unoccluded(result, path.lane, ray, arrives, key)
 
-    def _add_lit(self, result: Any, lane: Any, ray: Any, light: Any, key: Any) -> None:
+    def _add_unoccluded(self, result: Any, lane: Any, ray: Any, light: Any, key: Any) -> None:
         """Add light to paths whose shadow rays are unoccluded; each traced scene has a kernel of its own."""
         dr.eval(ray, light, key)
         free = dr.max(light) > 0
         free &= ~self.scene.ray_test(ray, active=free)
-        for stopper in self.proxies.stoppers:
+        for occluder_scene in self.proxies.occluder_scenes:
             dr.eval(free)
-            free = free & ~stopper.stop(ray, mi.UInt32(0), key, free)
+            free = free & ~occluder_scene.occluded(ray, mi.UInt32(0), key, free)
         _add(result, lane, dr.select(free, light, 0))
 
-    def _look(self, path: _Path, smooth: Any, dice: _Dice, depth: int, result: Any) -> Glimpse | None:
+    def _add_splats(
+        self, path: _Path, smooth: Any, numbers: _RandomNumbers, depth: int, result: Any
+    ) -> SplatHits | None:
         """Add the light of splats that paths hit."""
         if self.mirror is None:
             return None
-        own = gathered(dice, path.lane)
+        own = gathered(numbers, path.lane)
         key = own.key(depth)
-        glimpse = self.mirror.look(path.ray, key, True)
-        colour = mi.Color3f(*[srgb_to_linear(c) for c in glimpse.colour])
-        nearer = glimpse.distance < path.hit.t
+        splat_hits = self.mirror.trace(path.ray, key, True)
+        colour = mi.Color3f(*[srgb_to_linear(c) for c in splat_hits.colour])
+        nearer = splat_hits.distance < path.hit.t
         if not self.bounce:
             colour = dr.select(smooth, 0, colour)
         colour = dr.select(nearer, colour * path.throughput, 0)
-        dr.eval(glimpse, colour, key, nearer)
-        _add(result, path.lane, dr.select(glimpse.relit, 0, colour))
-        anew = dr.compress(nearer & glimpse.relit)
+        dr.eval(splat_hits, colour, key, nearer)
+        _add(result, path.lane, dr.select(splat_hits.relit, 0, colour))
+        anew = dr.compress(nearer & splat_hits.relit)
         if dr.width(anew) and self.scene.emitters():
-            ray, normal = dr.gather(mi.Ray3f, path.ray, anew), dr.gather(mi.Vector3f, glimpse.normal, anew)
-            place = ray(dr.gather(mi.Float, glimpse.distance, anew))
+            ray, normal = dr.gather(mi.Ray3f, path.ray, anew), dr.gather(mi.Vector3f, splat_hits.normal, anew)
+            place = ray(dr.gather(mi.Float, splat_hits.distance, anew))
             si = receiver(place, normal)
-            dice_here = gathered(own, anew)
-            point = mi.Point2f(dice_here.number_of(depth, 7), dice_here.number_of(depth, 8))
+            numbers_here = gathered(own, anew)
+            point = mi.Point2f(numbers_here.number_of(depth, 7), numbers_here.number_of(depth, 8))
             towards, light = self.scene.sample_emitter_direction(si, point, False)
             cosine = dr.maximum(dr.dot(normal, towards.d), 0)
             lit = dr.gather(mi.Color3f, colour, anew) * light * cosine / self.white
             infinite = _has_emitter_flag(towards.emitter, mi.EmitterFlags.Infinite)
-            off = dr.gather(mi.Float, glimpse.footprint, anew)
+            off = dr.gather(mi.Float, splat_hits.footprint, anew)
             shadow = mi.Ray3f(place + normal * off, towards.d)
             shadow.maxt = dr.select(infinite, dr.inf, dr.maximum(towards.dist * (1 - 1e-3) - off, 0))
             lane = dr.gather(mi.UInt32, path.lane, anew)
-            self._add_lit(result, lane, shadow, lit, dr.gather(mi.UInt32, key, anew))
-        return glimpse
+            self._add_unoccluded(result, lane, shadow, lit, dr.gather(mi.UInt32, key, anew))
+        return splat_hits
 
     def _add_emission(self, result: Any, path: _Path, reference: Any, density: Any, delta: Any, active: Any) -> None:
         """Add the light of emitters that paths hit."""
@@ -417,7 +419,7 @@ class PathTracer:
 
 
 @dataclass(frozen=True, eq=False)
-class _Dice:
+class _RandomNumbers:
     """Random numbers of paths; the first vertices of a pixel's paths share a low-discrepancy sequence."""
 
     pixel: Any

@@ -61,15 +61,15 @@ class Hit:
     instance: Any
 
     @classmethod
-    def nothing(cls) -> Hit:
+    def miss(cls) -> Hit:
         """Return a miss."""
         return cls(mi.Float(dr.inf), mi.Normal3f(0), mi.Normal3f(0), mi.Vector3f(0), mi.UInt32(0))
 
 
-class Stopper(Protocol):
+class OccluderScene(Protocol):
     """Ray-traceable scene of occluders."""
 
-    def stop(self, ray: Any, instance: Any, key: Any, active: Any) -> Any:
+    def occluded(self, ray: Any, instance: Any, key: Any, active: Any) -> Any:
         """Return True for occluded rays from points of instances; ``key`` selects the random outcome of a ray."""
 
 
@@ -93,20 +93,24 @@ class Proxies:
         """
         self.static = _TraceScene.build([o for o in occluders if not o.dynamic])
         self.dynamic = _TraceScene.build([o for o in occluders if o.dynamic], visible)
-        casting = [self.dynamic] if casters is None else [_TraceScene.build([], visible), SplatOccluders.build(casters)]
-        self.casting: tuple[Stopper, ...] = tuple(stopper for stopper in casting if stopper is not None)
+        shadow_casters = (
+            [self.dynamic] if casters is None else [_TraceScene.build([], visible), SplatOccluders.build(casters)]
+        )
+        self.shadow_casters: tuple[OccluderScene, ...] = tuple(
+            occluder_scene for occluder_scene in shadow_casters if occluder_scene is not None
+        )
         self.shows_meshes = bool(visible)
-        self.apart = dr.backend_v(mi.Float) == dr.JitBackend.CUDA
+        self.separate_kernels = dr.backend_v(mi.Float) == dr.JitBackend.CUDA
 
     @property
-    def stoppers(self) -> tuple[Stopper, ...]:
+    def occluder_scenes(self) -> tuple[OccluderScene, ...]:
         """All occluder scenes, the static proxies first."""
-        return self.casting if self.static is None else (self.static, *self.casting)
+        return self.shadow_casters if self.static is None else (self.static, *self.shadow_casters)
 
     def nearest(self, ray: Any) -> tuple[Hit, Hit]:
         """Return the first hits of rays, and the first hits without the dynamic proxies."""
-        static = _TraceScene.nearest(self.static, ray, Hit.nothing())
-        dr.eval(static)  # a separate kernel, see `apart`
+        static = _TraceScene.nearest(self.static, ray, Hit.miss())
+        dr.eval(static)  # a separate kernel, see `separate_kernels`
         return _TraceScene.nearest(self.dynamic, ray, static), static
 
 
@@ -143,7 +147,7 @@ class _TraceScene:
         """Return True for hits on visible shapes."""
         return mi.Bool(True) if self.mesh is None else hit.shape != self.mesh
 
-    def stop(self, ray: Any, instance: Any, key: Any, active: Any) -> Any:
+    def occluded(self, ray: Any, instance: Any, key: Any, active: Any) -> Any:
         """Return True for occluded rays."""
         return self.scene.ray_test(ray, active=active)
 
@@ -173,7 +177,7 @@ class _TraceScene:
             nothing = mi.Float([0.0] * 9)
             return cls(ray_scene(others), None, mi.UInt32([0]), nothing, nothing)
         parts = tuple((o.mesh, o.instance, np.asarray(o.world_from_mesh, np.float64).tobytes()) for o in occluders)
-        return _merged(parts, others) if others else _kept(parts, str(mi.variant()))
+        return _merged_scene(parts, others) if others else _cached_scene(parts, str(mi.variant()))
 
 
 _Parts = tuple[tuple[trimesh.Trimesh, int, bytes], ...]
@@ -181,12 +185,12 @@ _Parts = tuple[tuple[trimesh.Trimesh, int, bytes], ...]
 
 
 @lru_cache(maxsize=2)
-def _kept(parts: _Parts, _variant: str) -> _TraceScene:
+def _cached_scene(parts: _Parts, _variant: str) -> _TraceScene:
     """Return the merged meshes, cached for the static meshes of all layouts and the last dynamic ones."""
-    return _merged(parts, {})
+    return _merged_scene(parts, {})
 
 
-def _merged(parts: _Parts, others: Mapping[str, Any]) -> _TraceScene:
+def _merged_scene(parts: _Parts, others: Mapping[str, Any]) -> _TraceScene:
     corners, normals = [], []
     for part, _, pose in parts:
         world_from_mesh = np.frombuffer(pose).reshape(4, 4)

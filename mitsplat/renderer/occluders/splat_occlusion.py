@@ -27,7 +27,7 @@ from mitsplat.renderer.rays.device_arrays import ray_scene, wrapped
 SETS = 8
 """Number of sets of solids. A Gaussian of opacity a is in about a * SETS of them."""
 
-FAINTEST = 0.01
+MIN_OPACITY = 0.01
 """Opacity below which a Gaussian stops no ray, and smallest u_i."""
 
 FOOTPRINT = 2.0
@@ -94,7 +94,7 @@ class Solids:
         corners, faces, owners, count = [], [], [], 0
         footprints = np.zeros(len(casters))
         for row, caster in enumerate(casters):
-            kept = np.flatnonzero(caster.splats.opacities > FAINTEST)
+            kept = np.flatnonzero(caster.splats.opacities > MIN_OPACITY)
             if not len(kept):
                 continue
             splats = caster.splats.select(kept)
@@ -106,7 +106,7 @@ class Solids:
                 for those, shape in ((flat & (radii > 0), _SQUARE), (~flat & (radii > 0), _OCTAHEDRON)):
                     if not those.any():
                         continue
-                    points = radii[those, None, None] * _turned(shape[0], int(those.sum()), rng)
+                    points = radii[those, None, None] * _rotated(shape[0], int(those.sum()), rng)
                     points = np.einsum("nij,nkj->nki", axes[those], points) + centres[those, None]
                     corners.append((number, points.reshape(-1, 3)))
                     faces.append(shape[1] + len(shape[0]) * np.arange(len(points))[:, None, None] + count)
@@ -118,11 +118,11 @@ class Solids:
         everything = np.concatenate([points for _, points in corners])
         middle = (everything.min(axis=0) + everything.max(axis=0)) / 2
         radius = 1.001 * np.linalg.norm(everything - middle, axis=1).max()
-        beside = [points - middle + [2 * radius * number, 0, 0] for number, points in corners]
+        shifted = [points - middle + [2 * radius * number, 0, 0] for number, points in corners]
         triangles = np.concatenate([f.reshape(-1, 3) for f in faces])
         mesh = mi.Mesh("splats", count, len(triangles))
         params = mi.traverse(mesh)
-        params["vertex_positions"] = wrapped(mi.Float, np.concatenate(beside).astype(np.float32))
+        params["vertex_positions"] = wrapped(mi.Float, np.concatenate(shifted).astype(np.float32))
         params["faces"] = wrapped(mi.UInt32, triangles.astype(np.uint32))
         params.update()
         return cls(
@@ -167,7 +167,7 @@ class SplatOccluders:
     """
 
     solids: Solids
-    spared: Any
+    skip_distance: Any
 
     @classmethod
     def build(cls, casters: Sequence[Caster], sets: int = SETS) -> SplatOccluders | None:
@@ -175,14 +175,14 @@ class SplatOccluders:
         solids = Solids.build(casters, sets)
         if solids is None:
             return None
-        spared = np.zeros(1 + max(c.instance for c in casters), np.float32)
-        np.maximum.at(spared, [c.instance for c in casters], solids.footprints.astype(np.float32))
-        return cls(solids, wrapped(mi.Float, spared))
+        skip_distance = np.zeros(1 + max(c.instance for c in casters), np.float32)
+        np.maximum.at(skip_distance, [c.instance for c in casters], solids.footprints.astype(np.float32))
+        return cls(solids, wrapped(mi.Float, skip_distance))
 
-    def stop(self, ray: Any, instance: Any, key: Any, active: Any) -> Any:
+    def occluded(self, ray: Any, instance: Any, key: Any, active: Any) -> Any:
         """Return True for occluded rays from points of instances; ``key`` selects the random outcome of a ray."""
         instance = mi.UInt32(instance)
-        near = dr.gather(mi.Float, self.spared, instance, active & (instance < dr.width(self.spared)))
+        near = dr.gather(mi.Float, self.skip_distance, instance, active & (instance < dr.width(self.skip_distance)))
         inside, _, met = self.solids.enter(ray, key, near)
         return active & met & self.solids.scene.ray_test(inside, active=active & met)
 
@@ -206,11 +206,11 @@ def _radii(opacities: Float64Array, sets: int, rng: np.random.Generator) -> Floa
     The u_i of a Gaussian are stratified over the sets, in a random order per Gaussian.
     """
     order = np.argsort(rng.random((sets, len(opacities))), axis=0)
-    u = np.maximum((order + rng.random(order.shape)) / sets, FAINTEST)
+    u = np.maximum((order + rng.random(order.shape)) / sets, MIN_OPACITY)
     return np.sqrt(2 * np.log(np.maximum(opacities / u, 1)))
 
 
-def _turned(points: Float64Array, count: int, rng: np.random.Generator) -> Float64Array:
+def _rotated(points: Float64Array, count: int, rng: np.random.Generator) -> Float64Array:
     """Return ``count`` randomly rotated copies of a shape; flat shapes rotate in their plane.
 
     The rotation hides the corners of the shapes.

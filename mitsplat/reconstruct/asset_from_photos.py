@@ -142,7 +142,7 @@ def delighted(made: Reconstruction, light: LightFile, table: bool, progress: Pro
         made,
         asset=replace(made.asset, splats=splats),
         verdict=replace(made.verdict, rows={**made.verdict.rows, "Light": done.told}),
-        record={**made.record, "light": {name: getattr(done, name) for name in _LIGHT}},
+        record={**made.record, "light": {name: getattr(done, name) for name in _LIGHT_FIELDS}},
     )
 
 
@@ -230,12 +230,12 @@ def make_asset(
     """
     capture = Capture.load(capture_folder)
     splat_file, psnr = read_fit(fit)
-    inputs = _digest(capture_folder, capture, splat_file, job)
-    done = _finished(out, inputs)
+    inputs = _input_hash(capture_folder, capture, splat_file, job)
+    done = _existing_asset(out, inputs)
     if done is not None:
         return done
     refuse_to_replace(out, splat_file)
-    edited = _edited(out)
+    edited = _edited_backup(out)
     result = make(capture, Splats.load(splat_file), job, psnr, source, progress)
     (out / VERDICT_FILE).unlink(missing_ok=True)
     if edited is not None:
@@ -260,7 +260,7 @@ def refuse_to_replace(out: Path, splats: Path) -> None:
             raise InputError(f"{out / name}: would be replaced: choose another folder for the asset")
 
 
-def _edited(out: Path) -> Path | None:
+def _edited_backup(out: Path) -> Path | None:
     """Return a new path for the ``asset.yaml`` of an earlier run if it was edited since, or None."""
     described = out / ASSET_FILE
     try:
@@ -278,7 +278,7 @@ def _save_verdict(out: Path, result: Reconstruction, inputs: str) -> None:
     record[ASSET_FILE] = file_hash(out / ASSET_FILE)
     record["asset_from_capture"] = result.asset_from_capture.tolist()
     if result.isolation is not None:
-        record["removed"] = {name: getattr(result.isolation, name) for name in _REMOVED}
+        record["removed"] = {name: getattr(result.isolation, name) for name in _REMOVED_FIELDS}
     if result.alignment is not None:
         record["alignment"] = {
             "scale": result.alignment.scale,
@@ -288,11 +288,11 @@ def _save_verdict(out: Path, result: Reconstruction, inputs: str) -> None:
     write_text(out / VERDICT_FILE, json.dumps(record, indent=1) + "\n")
 
 
-_LIGHT = ("kept", "uneven", "slope", "borne_out")
-_REMOVED = ("outside", "unseen", "needles", "floaters")
+_LIGHT_FIELDS = ("kept", "uneven", "slope", "borne_out")
+_REMOVED_FIELDS = ("outside", "unseen", "needles", "floaters")
 
 
-def _digest(folder: Path, capture: Capture, splats: Path, job: AssetJob) -> str:
+def _input_hash(folder: Path, capture: Capture, splats: Path, job: AssetJob) -> str:
     """Return the hash of all inputs of the asset."""
     imported = None
     if job.imported is not None:
@@ -306,18 +306,18 @@ def _digest(folder: Path, capture: Capture, splats: Path, job: AssetJob) -> str:
     digest = ContentHash()
     digest.add_json(decisive)
     lights = [] if job.delight is None else LightFile.load(job.delight).files
-    for path in (*_files(folder, capture), splats, *lights):
+    for path in (*_capture_files(folder, capture), splats, *lights):
         digest.add_file(path)
     return digest.hexdigest()
 
 
-def _files(folder: Path, capture: Capture) -> list[Path]:
+def _capture_files(folder: Path, capture: Capture) -> list[Path]:
     """Return all files of a capture."""
     pictures = [path for photo in capture.photos for path in (photo.file, photo.mask) if path is not None]
     return [folder / "capture.json", folder / "points.npz", *pictures]
 
 
-def _finished(out: Path, inputs: str) -> AssetResult | None:
+def _existing_asset(out: Path, inputs: str) -> AssetResult | None:
     """Return the asset of an earlier run with the same inputs if it is complete, or None."""
     if not all((out / name).is_file() for name in (VERDICT_FILE, REPORT_FILE, ASSET_FILE)):
         return None

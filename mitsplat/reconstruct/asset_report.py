@@ -27,7 +27,7 @@ HELD_OUT = 8
 
 _THUMBNAIL, _VIEW = 240, 420
 _POINTS = 1500
-_MOST_DIFFERENCE = 0.3
+_MAX_DIFFERENCE = 0.3
 """Error of a display-encoded channel that is drawn white."""
 _PLOT_WIDTH, _PLOT_HEIGHT = 460, 340
 
@@ -82,15 +82,15 @@ def _verdict(result: Reconstruction) -> str:
             f"{removed.floaters} floaters"
         )
     rows |= found.rows
-    told = verdict_of(misses, "Every threshold is met.", rows)
-    return f'<section aria-labelledby="verdict"><h2 id="verdict">Verdict</h2>{told}</section>'
+    table = verdict_of(misses, "Every threshold is met.", rows)
+    return f'<section aria-labelledby="verdict"><h2 id="verdict">Verdict</h2>{table}</section>'
 
 
 def _held_out(views: Sequence[HeldOutView]) -> str:
     figures = []
-    for view in _spread(views, HELD_OUT):
+    for view in _take_evenly(views, HELD_OUT):
         mask = np.ones(view.alpha.shape, dtype=np.float32) if view.mask is None else view.mask
-        difference = np.abs(view.render - view.photo * mask[..., None]) / _MOST_DIFFERENCE
+        difference = np.abs(view.render - view.photo * mask[..., None]) / _MAX_DIFFERENCE
         pictures = {
             "photo": _outlined(eight_bit(view.photo), view.mask),
             "render": eight_bit(view.picture),
@@ -105,7 +105,7 @@ def _held_out(views: Sequence[HeldOutView]) -> str:
         figures.append(f'<h3>{html.escape(view.name)}</h3><div class="row">{images}</div>')
     note = (
         f"Photos that nothing was fitted to, and the asset seen from their cameras. Yellow lines outline the masks; "
-        f"in differences white is an error of {_MOST_DIFFERENCE:g} of the range."
+        f"in differences white is an error of {_MAX_DIFFERENCE:g} of the range."
     )
     return (
         f'<section aria-labelledby="held-out"><h2 id="held-out">Held-out views</h2><p>{note}</p>'
@@ -119,8 +119,8 @@ def _cameras(capture: Capture) -> str:
     if not len(centres):
         return ""
     rng = np.random.default_rng(0)
-    chosen = rng.choice(len(capture.points), min(_POINTS, len(capture.points)), replace=False)
-    points, colours = capture.points[chosen], capture.colours[chosen]
+    subset = rng.choice(len(capture.points), min(_POINTS, len(capture.points)), replace=False)
+    points, colours = capture.points[subset], capture.colours[subset]
     middle = np.median(centres, axis=0)
     span = 1.3 * float(np.abs(centres - middle).max()) or 1.0
     near = (np.abs(points - middle) < span).all(axis=1)
@@ -190,7 +190,7 @@ def _frustum(photo: Photo, at: Callable[[Float64Array], Float64Array], depth: fl
 
 
 def _photos(capture: Capture) -> str:
-    shown = _spread(capture.photos, PHOTOS)
+    shown = _take_evenly(capture.photos, PHOTOS)
     figures = []
     for photo in shown:
         _, rgb, mask, _ = sized_photo(photo, _THUMBNAIL)
@@ -219,6 +219,6 @@ def _outlined(picture: ByteImage, mask: Float32Array | None) -> ByteImage:
     return np.asarray(cv2.drawContours(picture.copy(), rings, -1, (255, 220, 0), max(1, round(picture.shape[1] / 400))))
 
 
-def _spread(items: Sequence[T], count: int) -> list[T]:
-    chosen = np.unique(np.linspace(0, len(items) - 1, min(count, len(items))).round().astype(int))
-    return [items[int(i)] for i in chosen]
+def _take_evenly(items: Sequence[T], count: int) -> list[T]:
+    subset = np.unique(np.linspace(0, len(items) - 1, min(count, len(items))).round().astype(int))
+    return [items[int(i)] for i in subset]

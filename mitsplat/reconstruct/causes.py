@@ -14,17 +14,17 @@ from mitsplat.geometry.camera import Camera
 Pictures = Sequence[tuple[Camera, Float32Array, Float32Array | None]]
 """Camera, colours (H, W, 3) and mask (H, W) of each photo, all with the same longest edge."""
 
-_FEW_POINTS = 100
+_MIN_POINTS = 100
 """Least number of points on an object that determine its surface beyond its outline."""
-_SPILT = 0.3
+_MAX_SUPPORT_SHARE = 0.3
 """Largest share of masked points in the support surface; above it, masks seem to include the support."""
-_LOW = 0.05
-_BLURRED = 0.5
-_NAMED = 5
-_BANDS = ((0.0, 20.0), (20.0, 45.0), (45.0, 90.0))
+_SUPPORT_HEIGHT = 0.05
+_MIN_SHARPNESS = 0.5
+_MAX_NAMES = 5
+_ELEVATION_BANDS = ((0.0, 20.0), (20.0, 45.0), (45.0, 90.0))
 """Elevation bands around the object [degrees]; in the last, whose circle is small, one photo is enough."""
 _SECTOR = 30.0
-_WIDEST_SECTORS = 3
+_MIN_GAP_SECTORS = 3
 """Least number of neighbouring sectors without a camera in a band that is reported."""
 
 
@@ -37,24 +37,26 @@ def find_causes(capture: Capture, pictures: Pictures) -> dict[str, str]:
     """
     found: dict[str, list[str]] = {}
 
-    def blame(cause: str, *thresholds: str) -> None:
+    def add_cause(cause: str, *thresholds: str) -> None:
         for name in thresholds:
             found.setdefault(name, []).append(cause)
 
     if blurred := blurred_photos([photo.name for photo in capture.photos], pictures):
-        named = ", ".join(blurred[:_NAMED]) + (f" and {len(blurred) - _NAMED} more" if len(blurred) > _NAMED else "")
-        blame(f"{len(blurred)} of {len(pictures)} photos are less than half as sharp as most ({named})", "psnr")
+        named = ", ".join(blurred[:_MAX_NAMES]) + (
+            f" and {len(blurred) - _MAX_NAMES} more" if len(blurred) > _MAX_NAMES else ""
+        )
+        add_cause(f"{len(blurred)} of {len(pictures)} photos are less than half as sharp as most ({named})", "psnr")
     if capture.up == "z" and (gaps := missing_views(views_from([photo.camera for photo in capture.photos]))):
-        blame(f"no photo is from {'; from '.join(gaps)}", "mesh_iou", "watertight")
+        add_cause(f"no photo is from {'; from '.join(gaps)}", "mesh_iou", "watertight")
     own = masked_points(capture, pictures)
-    if len(capture.points) and len(own) < _FEW_POINTS:
-        blame(
+    if len(capture.points) and len(own) < _MIN_POINTS:
+        add_cause(
             f"photos share only {len(own)} points on it, because it has little texture: dust it or put patterns on it, "
             "or import a mesh",
             *("psnr", "mesh_iou", "offset", "surface", "watertight"),
         )
-    elif capture.table and (share := share_on_support(own)) > _SPILT:
-        blame(
+    elif capture.table and (share := share_on_support(own)) > _MAX_SUPPORT_SHARE:
+        add_cause(
             f"{share:.0%} of the points that its masks show lie in the surface under it, so that masks include that: "
             "photograph it on another surface, or pick it",
             *("splat_iou", "mesh_iou", "offset", "surface", "lost", "watertight"),
@@ -80,7 +82,7 @@ def masked_points(capture: Capture, pictures: Pictures) -> Float64Array:
 def share_on_support(points: Float64Array) -> float:
     """Return the share of points (N, 3) within 5 % of the object's height from its support, z = 0."""
     height = float(np.quantile(points[:, 2], 0.95))
-    return float((np.abs(points[:, 2]) < _LOW * height).mean()) if height > 0 else 1.0
+    return float((np.abs(points[:, 2]) < _SUPPORT_HEIGHT * height).mean()) if height > 0 else 1.0
 
 
 def blurred_photos(names: Sequence[str], pictures: Pictures) -> list[str]:
@@ -92,14 +94,14 @@ def blurred_photos(names: Sequence[str], pictures: Pictures) -> list[str]:
     for _, rgb, mask in pictures:
         grey = cv2.cvtColor(np.ascontiguousarray(rgb, dtype=np.float32), cv2.COLOR_RGB2GRAY)
         # The outline has the sharpness of the mask, so only inner pixels count.
-        seen = _inner(np.ones(grey.shape, dtype=bool) if mask is None else mask >= 0.5)
+        seen = _eroded(np.ones(grey.shape, dtype=bool) if mask is None else mask >= 0.5)
         slopes = cv2.Sobel(grey, cv2.CV_32F, 1, 0) ** 2 + cv2.Sobel(grey, cv2.CV_32F, 0, 1) ** 2
         curvature = cv2.Laplacian(grey, cv2.CV_32F) ** 2
         energy = float(slopes[seen].mean()) if seen.any() else 0.0
         values.append(float(curvature[seen].mean()) / energy if energy > 0 else np.nan)
-    usual = float(np.nanmedian(values)) if np.isfinite(values).any() else 0.0
+    median = float(np.nanmedian(values)) if np.isfinite(values).any() else 0.0
     order = np.argsort(values, kind="stable")
-    return [names[i] for i in order if values[i] < _BLURRED * usual]
+    return [names[i] for i in order if values[i] < _MIN_SHARPNESS * median]
 
 
 def views_from(cameras: Sequence[Camera]) -> Float64Array:
@@ -117,7 +119,7 @@ def missing_views(offsets: Float64Array) -> list[str]:
     turns = np.degrees(np.arctan2(offsets[:, 1], offsets[:, 0])) % 360
     sectors = round(360 / _SECTOR)
     found = []
-    for low, high in _BANDS:
+    for low, high in _ELEVATION_BANDS:
         where = f"{low:.0f} to {high:.0f} degrees above it"
         inside = (heights >= low) & (heights < high)
         if not inside.any():
@@ -125,7 +127,7 @@ def missing_views(offsets: Float64Array) -> list[str]:
             continue
         taken = np.bincount((turns[inside] // _SECTOR).astype(int), minlength=sectors) > 0
         start, length = _longest_gap(taken)
-        if low < _BANDS[-1][0] and length >= _WIDEST_SECTORS:
+        if low < _ELEVATION_BANDS[-1][0] and length >= _MIN_GAP_SECTORS:
             turn = start * _SECTOR
             found.append(f"{where}, {turn:.0f} to {(turn + length * _SECTOR) % 360:.0f} degrees around it")
     return found
@@ -143,6 +145,6 @@ def _longest_gap(taken: BoolArray) -> tuple[int, int]:
     return best
 
 
-def _inner(mask: BoolArray) -> BoolArray:
+def _eroded(mask: BoolArray) -> BoolArray:
     """Return a mask without a border of three pixels."""
     return np.asarray(cv2.erode(mask.astype(np.uint8), np.ones((7, 7), dtype=np.uint8)) > 0)

@@ -39,26 +39,26 @@ _REFLECTANCE = 0.5
 """Reflectance of the mesh in the computation of indirect light."""
 _BOUNCES = 3
 _SAMPLES = 256
-_PROBE, _WIDE = 1e-3, 3.0
+_PROBE_EDGE, _TABLE_HALF_EDGE = 1e-3, 3.0
 """Edge of the cube that measures light from below, and half the edge of the table [m]."""
-_TABLES = (0.02, 0.9)
+_TABLE_REFLECTANCES = (0.02, 0.9)
 """Range of the reflectance of tables."""
-_STEP = 1e-3
+_RAY_OFFSET = 1e-3
 """Distance of the ray origin from the surface, in diagonals of the mesh."""
-_NEIGHBOURS, _ALIKE = 12, 16
+_NEIGHBOURS, _NORMAL_POWER = 12, 16
 """Number of neighbours over which irradiance is averaged, and the power of the cosine between normals as their weight.
 """
-_EVEN = 0.03
+_EVEN_DEVIATION = 0.03
 """Standard deviation of the logarithm of irradiance below which light counts as even."""
 FOLLOWS = 0.5
 """Least log-log slope of colours over irradiance, and least relative brightness of each lamp, for the division."""
-_STRONGEST = 4.0
+_MAX_GAIN = 4.0
 """Largest factor by which colours are changed."""
-_NEAR = 0.02
+_MAX_SURFACE_DISTANCE = 0.02
 """Largest distance of surface Gaussians from the mesh, in its diagonals."""
-_UNLIT = 0.02
+_MIN_IRRADIANCE = 0.02
 """Irradiance, relative to the median, below which colours stay unchanged; such points lie for example in cavities."""
-_DARKEST = 0.004
+_MIN_LUMINANCE = 0.004
 """Least linear luminance of colours in the statistics."""
 
 
@@ -132,27 +132,27 @@ def delight(splats: Splats, mesh: trimesh.Trimesh, light: LightFile, *, table: b
         table: True if the object stands on a table in z = 0.
     """
     places, normals, away = DistanceSurface(mesh).nearest(splats.means.astype(np.float64))
-    area, near = visible_area(splats), away < _NEAR * float(np.linalg.norm(mesh.extents))
-    below = _table(light) if table else None
+    area, near = visible_area(splats), away < _MAX_SURFACE_DISTANCE * float(np.linalg.norm(mesh.extents))
+    below = _table_reflectance(light) if table else None
     traced = [
         trace_irradiance(mesh, places, normals, lights, light.path.parent, table=below)
-        for lights in _apart(light.lights)
+        for lights in _light_groups(light.lights)
     ]
     other, alike = _neighbours(places, normals)
     each = np.stack([_smoothed(one, other, alike) for one in traced])
-    whole = each.sum(axis=0)
-    level = whole @ LUMINANCE
-    lit = level > _UNLIT * np.median(level[near]) if near.any() else near
+    total_irradiance = each.sum(axis=0)
+    level = total_irradiance @ LUMINANCE
+    lit = level > _MIN_IRRADIANCE * np.median(level[near]) if near.any() else near
     colours = decode_srgb((0.5 + SH_C0 * splats.sh[:, 0].astype(np.float64)).clip(0, 1))
     seen = _smoothed(colours, other, alike * (area * near)[other]) @ LUMINANCE  # single Gaussians vary in colour
-    own = lit & near & (seen > _DARKEST) & (area > 0)
-    uneven, slope, borne_out = _follow(seen[own], each[:, own] @ LUMINANCE, area[own])
+    own = lit & near & (seen > _MIN_LUMINANCE) & (area > 0)
+    uneven, slope, borne_out = _irradiance_statistics(seen[own], each[:, own] @ LUMINANCE, area[own])
 
     def done(told: str, gain: Float64Array | None = None) -> Delighting:
-        changed = splats if gain is None else _brightened(splats, gain)
+        changed = splats if gain is None else _apply_gain(splats, gain)
         return Delighting(changed, gain is not None, uneven, slope, borne_out, told)
 
-    if uneven < _EVEN:
+    if uneven < _EVEN_DEVIATION:
         return done(f"its irradiance differs by {uneven:.1%}: colours are left as they are")
     if min(slope, *borne_out) < FOLLOWS:
         lamps = "".join(f", lamp {number} {value:.2f}" for number, value in enumerate(borne_out, start=1))
@@ -161,15 +161,15 @@ def delight(splats: Splats, mesh: trimesh.Trimesh, light: LightFile, *, table: b
             f"{FOLLOWS:g} or more is wanted) and are left as they are: was it measured where the object stood, in the "
             "capture's frame?"
         )
-    mean = np.average(whole[own], axis=0, weights=area[own])
-    gain = np.where(lit[:, None], mean / np.maximum(whole, 1e-12), 1.0)
+    mean = np.average(total_irradiance[own], axis=0, weights=area[own])
+    gain = np.where(lit[:, None], mean / np.maximum(total_irradiance, 1e-12), 1.0)
     return done(
         f"its irradiance differed by {uneven:.0%}, and colours with it (slope {slope:.2f}): it is taken out of them",
-        gain.clip(1 / _STRONGEST, _STRONGEST),
+        gain.clip(1 / _MAX_GAIN, _MAX_GAIN),
     )
 
 
-def _apart(lights: Sequence[LightSpec]) -> list[list[LightSpec]]:
+def _light_groups(lights: Sequence[LightSpec]) -> list[list[LightSpec]]:
     """Return each lamp as its own group, and the environment lights as the last group."""
     groups, around = list[list[LightSpec]](), list[LightSpec]()
     for light in lights:
@@ -180,15 +180,15 @@ def _apart(lights: Sequence[LightSpec]) -> list[list[LightSpec]]:
     return [*groups, around]
 
 
-def _table(light: LightFile) -> Float64Array:
+def _table_reflectance(light: LightFile) -> Float64Array:
     """Estimate the reflectance (3,) of the table as the ratio of irradiance from below to irradiance from above.
 
     The lights were photographed with the table, so their lower half contains its radiance.
     """
-    probe = trimesh.creation.box((_PROBE,) * 3)
+    probe = trimesh.creation.box((_PROBE_EDGE,) * 3)
     up = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]])
-    above, below = trace_irradiance(probe, 0.5 * _PROBE * up, up, light.lights, light.path.parent, 16 * _SAMPLES)
-    return np.asarray((below / np.maximum(above, 1e-12)).clip(*_TABLES))
+    above, below = trace_irradiance(probe, 0.5 * _PROBE_EDGE * up, up, light.lights, light.path.parent, 16 * _SAMPLES)
+    return np.asarray((below / np.maximum(above, 1e-12)).clip(*_TABLE_REFLECTANCES))
 
 
 def trace_irradiance(
@@ -213,21 +213,21 @@ def trace_irradiance(
         table: Reflectance (3,) of a plane z = 0 below the object, which blocks light from below; None without a table.
     """
     ensure_variant()
-    step = _STEP * float(np.linalg.norm(mesh.extents))
+    step = _RAY_OFFSET * float(np.linalg.norm(mesh.extents))
     properties = mi.Properties()
-    properties["bsdf"] = mi.load_dict(_matt([_REFLECTANCE] * 3))
+    properties["bsdf"] = mi.load_dict(_diffuse_bsdf([_REFLECTANCE] * 3))
     contents: dict[str, Any] = {f"light_{number}": emitter_dict(light, folder) for number, light in enumerate(lights)}
     contents["object"] = plain_mesh(mesh, properties)
     if table is not None:
-        pose = mi.ScalarTransform4f().translate([0, 0, -2 * step]).scale([_WIDE, _WIDE, 1])
-        contents["table"] = {"type": "rectangle", "to_world": pose, "bsdf": _matt(table.tolist())}
+        pose = mi.ScalarTransform4f().translate([0, 0, -2 * step]).scale([_TABLE_HALF_EDGE, _TABLE_HALF_EDGE, 1])
+        contents["table"] = {"type": "rectangle", "to_world": pose, "bsdf": _diffuse_bsdf(table.tolist())}
     radiance, _ = trace_radiance(
         ray_scene(contents), places + step * normals, -normals, samples=samples, bounces=_BOUNCES, seed=0
     )
     return np.asarray(np.pi / _REFLECTANCE * radiance)
 
 
-def _matt(reflectance: list[float]) -> dict[str, Any]:
+def _diffuse_bsdf(reflectance: list[float]) -> dict[str, Any]:
     return {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": reflectance}}}
 
 
@@ -237,7 +237,7 @@ def _neighbours(places: Float64Array, normals: Float64Array) -> tuple[Int64Array
     A weight is a power of the cosine between the normals.
     """
     other = KDTree(places).query(places, k=min(_NEIGHBOURS, len(places)))[1].reshape(len(places), -1)
-    return other, np.asarray(np.einsum("nkc,nc->nk", normals[other], normals).clip(0, 1) ** _ALIKE)
+    return other, np.asarray(np.einsum("nkc,nc->nk", normals[other], normals).clip(0, 1) ** _NORMAL_POWER)
 
 
 def _smoothed(values: Float64Array, other: Int64Array, share: Float64Array) -> Float64Array:
@@ -246,7 +246,9 @@ def _smoothed(values: Float64Array, other: Int64Array, share: Float64Array) -> F
     return np.asarray((values[other] * share[..., None]).sum(axis=1) / np.maximum(total, 1e-30))
 
 
-def _follow(seen: Float64Array, each: Float64Array, weight: Float64Array) -> tuple[float, float, tuple[float, ...]]:
+def _irradiance_statistics(
+    seen: Float64Array, each: Float64Array, weight: Float64Array
+) -> tuple[float, float, tuple[float, ...]]:
     """Return the unevenness of irradiance, the slope of colours over it, and the relative brightness of each lamp.
 
     Args:
@@ -257,19 +259,19 @@ def _follow(seen: Float64Array, each: Float64Array, weight: Float64Array) -> tup
     if not len(seen):
         return 0.0, 0.0, ()
     weight = weight / weight.sum()
-    whole = each.sum(axis=0)
-    x, y = np.log(whole), np.log(seen)
+    total_irradiance = each.sum(axis=0)
+    x, y = np.log(total_irradiance), np.log(seen)
     x, y = x - weight @ x, y - weight @ y
     variance = float(weight @ x**2)
     root = np.sqrt(weight)
-    scale = float(weight @ seen) / float(weight @ whole)
+    scale = float(weight @ seen) / float(weight @ total_irradiance)
     found = np.linalg.lstsq((each * root).T, seen * root, rcond=None)[0] / scale
-    matters = np.sqrt((each - (each @ weight)[:, None]) ** 2 @ weight) > _EVEN * (weight @ whole)
+    matters = np.sqrt((each - (each @ weight)[:, None]) ** 2 @ weight) > _EVEN_DEVIATION * (weight @ total_irradiance)
     borne_out = tuple(found[:-1][matters[:-1]].tolist())
     return float(np.sqrt(variance)), float(weight @ (x * y)) / max(variance, 1e-12), borne_out
 
 
-def _brightened(splats: Splats, gain: Float64Array) -> Splats:
+def _apply_gain(splats: Splats, gain: Float64Array) -> Splats:
     """Multiply linear colours by a gain (N, 3); higher SH bands scale with the display-encoded colour."""
     before = (0.5 + SH_C0 * splats.sh[:, 0].astype(np.float64)).clip(1e-3, 1)
     after = encode_srgb((decode_srgb(before) * gain).clip(0, 1))

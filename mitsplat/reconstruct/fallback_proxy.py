@@ -28,7 +28,7 @@ LEAST_OVERLAP = 0.85
 """Least mean IoU of a surface's silhouettes with the masks."""
 MOST_SPREAD = 0.02
 """Largest median distance between a surface and that of the splats, as a share of its diagonal."""
-_FLAT = 1e-4
+_MIN_THICKNESS = 1e-4
 """Least extent of a volume, as a share of its longest extent."""
 _VIEWS = 8
 """Number of views in the comparison."""
@@ -94,7 +94,7 @@ def find_sound_surface(
                 raise
             faults.append(f"the {source} is none: {error}")
             continue
-        overlap, fault = _compare(mesh, splats, seen)
+        overlap, fault = _check_surface(mesh, splats, seen)
         if fault is None:
             return SoundSurface(mesh, source, tuple(faults))
         faults.append(f"the {source} {fault}")
@@ -103,7 +103,7 @@ def find_sound_surface(
     return SoundSurface(mesh, source, tuple(faults))
 
 
-def _compare(mesh: trimesh.Trimesh, splats: Splats, views: Sequence[MaskedView]) -> tuple[float, str | None]:
+def _check_surface(mesh: trimesh.Trimesh, splats: Splats, views: Sequence[MaskedView]) -> tuple[float, str | None]:
     """Return the mean IoU of a mesh's silhouettes with masks, and the reason for a rejection or None."""
     if not (is_closed(mesh) and mesh.volume > 0):
         return 0.0, "is open"
@@ -125,6 +125,6 @@ def _convex_hull(splats: Splats, floor: float | None) -> trimesh.Trimesh:
     if floor is not None:
         points[:, 2] = np.maximum(points[:, 2], floor)
     spans = np.linalg.svd(points - points.mean(axis=0), compute_uv=False) if len(points) > 3 else np.zeros(3)
-    if not spans[2] > _FLAT * spans[0]:
+    if not spans[2] > _MIN_THICKNESS * spans[0]:
         raise InputError(f"the splats span no volume ({len(points)} opaque Gaussians)")
     return trimesh.convex.convex_hull(points)

@@ -13,9 +13,9 @@ from mitsplat.arrays import Float64Array
 from mitsplat.renderer.layers import ensure_variant
 from mitsplat.renderer.rays.device_arrays import plain_mesh
 
-_THINNEST = 1e-3
+_MIN_AREA_RATIO = 1e-3
 """Least signed area of a moved face, projected onto its original plane, as a share of its original area."""
-_ROUNDS = 12
+_MAX_ROUNDS = 12
 """Largest number of times that the motion of invalid vertices is halved."""
 
 
@@ -33,9 +33,9 @@ def mend_motion(mesh: trimesh.Trimesh, vertices: Float64Array) -> Float64Array |
     across = _normals(mesh.vertices, mesh.faces)
     area = (across**2).sum(axis=1)
     crossed = edges_through_faces(mesh, mesh.vertices)
-    for _ in range(_ROUNDS):
+    for _ in range(_MAX_ROUNDS):
         found: Float64Array = mesh.vertices + share * (vertices - mesh.vertices)
-        broken = ~((_normals(found, mesh.faces) * across).sum(axis=1) >= _THINNEST * area)
+        broken = ~((_normals(found, mesh.faces) * across).sum(axis=1) >= _MIN_AREA_RATIO * area)
         crossing = np.setdiff1d(edges_through_faces(mesh, found), crossed)
         wrong = np.union1d(mesh.faces[broken], mesh.edges_unique[crossing])
         if not len(wrong):

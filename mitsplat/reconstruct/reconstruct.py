@@ -141,19 +141,19 @@ def reconstruct_asset(
         isolation = isolate_object(splats, views, progress=progress)
         splats = isolation.splats
     cameras = [camera for camera, *_ in pictures]
-    alignment = refinement = sound = None
+    alignment = refinement = proxy = None
     if imported is None:
-        floor = 0.0 if kind == "object" and capture.table and _stands(splats) else None
+        floor = 0.0 if kind == "object" and capture.table and _may_stand_on_table(splats) else None
         if kind == "object":
-            sound = find_sound_surface(splats, views, settings.surface, floor=floor, progress=progress)
-            mesh = sound.mesh
+            proxy = find_sound_surface(splats, views, settings.surface, floor=floor, progress=progress)
+            mesh = proxy.mesh
         else:
             mesh = reconstruct_surface(splats, cameras, settings=settings.surface, progress=progress)
         if settings.refine is not None:
             refinement = refine_mesh(mesh, views, settings.refine, floor=floor, progress=progress)
             mesh = refinement.mesh
     else:
-        mesh, alignment = _placed(imported, splats, cameras)
+        mesh, alignment = _place_mesh(imported, splats, cameras)
         mesh = simplify_surface(mesh, settings.surface.faces)
     if progress is not None:
         progress(0, 1, "judging by held-out photos")
@@ -165,8 +165,8 @@ def reconstruct_asset(
     verdict = judge(
         capture, splats, mesh, held_out, isolation=isolation, psnr=psnr, refinement=refinement, causes=causes
     )
-    if sound is not None:
-        verdict = replace(verdict, surface=sound.source, surface_faults=sound.faults)
+    if proxy is not None:
+        verdict = replace(verdict, surface=proxy.source, surface_faults=proxy.faults)
     asset = Asset(
         name=name,
         class_name=class_name or name,
@@ -178,7 +178,7 @@ def reconstruct_asset(
     )
     asset_from_capture = np.eye(4)
     if settings.size is not None:
-        turn = _squaring_turn(mesh)
+        turn = _alignment_rotation(mesh)
         asset = asset.transformed(turn)
         asset_from_capture = np.diag([*[asset.factor_to(settings.size)] * 3, 1.0]) @ turn
         asset = asset.resized(settings.size)
@@ -204,23 +204,24 @@ def check_refinable(settings: ReconstructSettings, kind: str, imported: Imported
         raise InputError("only the mesh of an object that is reconstructed by its masks is refined")
 
 
-_BELOW = 0.02
+_MAX_SHARE_BELOW = 0.02
 """Largest share of an object below its table, in number of Gaussians and in height."""
 
 
-def _stands(splats: Splats) -> bool:
+def _may_stand_on_table(splats: Splats) -> bool:
     """Return True if z = 0 can be the support of the object.
 
     It is not if the tags are on the object itself, or if the board lies beside the object on a box.
     """
     height = splats.means[:, 2]
     return bool(
-        np.quantile(height, _BELOW)
-        > -_BELOW * np.ptp(np.quantile(splats.means, (_BELOW, 1 - _BELOW), axis=0), axis=0).max()
+        np.quantile(height, _MAX_SHARE_BELOW)
+        > -_MAX_SHARE_BELOW
+        * np.ptp(np.quantile(splats.means, (_MAX_SHARE_BELOW, 1 - _MAX_SHARE_BELOW), axis=0), axis=0).max()
     )
 
 
-def _squaring_turn(mesh: trimesh.Trimesh) -> Float64Array:
+def _alignment_rotation(mesh: trimesh.Trimesh) -> Float64Array:
     """Return the smallest rotation about z (4, 4) that aligns the smallest upright box around a mesh with the axes.
 
     A ruler measures that box. Extents along arbitrary camera axes can be almost 50 % larger.
@@ -231,7 +232,7 @@ def _squaring_turn(mesh: trimesh.Trimesh) -> Float64Array:
     return np.asarray(trimesh.transformations.rotation_matrix(angle, (0, 0, 1)))
 
 
-def _placed(
+def _place_mesh(
     imported: ImportedMesh, splats: Splats, cameras: Sequence[Camera]
 ) -> tuple[trimesh.Trimesh, Alignment | None]:
     """Return the mesh in the capture's frame and its registration, or None if the transform was given."""

@@ -29,12 +29,12 @@ _OPAQUE = 0.9
 _SAMPLES = 4000
 _COARSE_POINTS, _COARSE_STEPS = 400, 16
 _FINE_STEPS = 40
-_FINALISTS = 3
-_WIDE, _NARROW = 0.1, 0.01
+_REFINED_POSES = 3
+_KERNEL_START, _KERNEL_END = 0.1, 0.01
 """Initial and final width of the robust kernel, as a share of the mesh's diagonal."""
-_MISSED = 0.05
+_MAX_DISTANCE = 0.05
 """Upper limit of a point's distance in the misfit, as a share of the diagonal."""
-_NEAREST = 0.9
+_OFFSET_SHARE = 0.9
 """Share of the points, the nearest ones, that determine an offset."""
 
 
@@ -128,18 +128,18 @@ def register_mesh(mesh: trimesh.Trimesh, points: Float64Array) -> Alignment:
     rng = np.random.default_rng(0)
     few = points[rng.choice(len(points), min(_COARSE_POINTS, len(points)), replace=False)]
     samples = np.asarray(trimesh.sample.sample_surface(mesh, _SAMPLES, seed=0)[0])
-    missed = _MISSED * mesh.scale
-    widths = mesh.scale * np.geomspace(_WIDE, _NARROW, _COARSE_STEPS)
+    missed = _MAX_DISTANCE * mesh.scale
+    widths = mesh.scale * np.geomspace(_KERNEL_START, _KERNEL_END, _COARSE_STEPS)
     starts: list[tuple[float, int, Float64Array]] = []
-    for start in _starts(points, samples):
-        found = _plane_steps(surface, few, start, widths)
+    for start in _initial_poses(points, samples):
+        found = _icp_steps(surface, few, start, widths)
         starts.append((_misfit(surface, samples[:_COARSE_POINTS], few, found, missed), len(starts), found))
     finals: list[tuple[float, int, Float64Array]] = []
-    for _, _, start in sorted(starts)[:_FINALISTS]:
-        found = _plane_steps(surface, points, start, np.repeat(widths[-1], _FINE_STEPS))
+    for _, _, start in sorted(starts)[:_REFINED_POSES]:
+        found = _icp_steps(surface, points, start, np.repeat(widths[-1], _FINE_STEPS))
         finals.append((_misfit(surface, samples, points, found, missed), len(finals), found))
     _, _, mesh_from_splats = min(finals)
-    distance = surface.nearest(_moved(points, mesh_from_splats))[2]
+    distance = surface.nearest(_transform_points(points, mesh_from_splats))[2]
     splats_from_mesh = np.asarray(np.linalg.inv(mesh_from_splats), dtype=np.float64)
     scale = float(np.cbrt(np.linalg.det(splats_from_mesh[:3, :3])))
     return Alignment(splats_from_mesh, scale, float(np.median(distance) / mesh.scale))
@@ -148,19 +148,19 @@ def register_mesh(mesh: trimesh.Trimesh, points: Float64Array) -> Alignment:
 def measure_offset(mesh: trimesh.Trimesh, points: Float64Array) -> Offset:
     """Measure the offset of a mesh from surface points (N, 3) in the same frame."""
     nearest, normal, distance = DistanceSurface(mesh).nearest(points)
-    near = distance <= np.quantile(distance, _NEAREST)
+    near = distance <= np.quantile(distance, _OFFSET_SHARE)
     gap = np.einsum("nd,nd->n", normal, nearest - points)
     # The least-norm solution is zero in directions in which the surface can slide along itself.
     shift, *_ = np.linalg.lstsq(normal[near], gap[near], rcond=1e-3)
     return Offset(float(np.linalg.norm(shift) / mesh.scale), float(np.median(distance) / mesh.scale))
 
 
-def _moved(points: Float64Array, matrix: Float64Array) -> Float64Array:
+def _transform_points(points: Float64Array, matrix: Float64Array) -> Float64Array:
     moved: Float64Array = points @ matrix[:3, :3].T + matrix[:3, 3]
     return moved
 
 
-def _starts(points: Float64Array, samples: Float64Array) -> list[Float64Array]:
+def _initial_poses(points: Float64Array, samples: Float64Array) -> list[Float64Array]:
     """Return the transforms that match centres, sizes and principal axes of two point sets, in all 24 proper ways."""
     frames = []
     for cloud in (points, samples):
@@ -181,7 +181,7 @@ def _starts(points: Float64Array, samples: Float64Array) -> list[Float64Array]:
     return starts
 
 
-def _plane_steps(
+def _icp_steps(
     surface: DistanceSurface, points: Float64Array, matrix: Float64Array, widths: Float64Array
 ) -> Float64Array:
     """Run Gauss-Newton on ``n . (p + w x (p - c) + s (p - c) + t - q)`` for rotation w, scale s and translation t.
@@ -191,7 +191,7 @@ def _plane_steps(
     few farthest points show a wrong rotation.
     """
     for width in widths:
-        moved = _moved(points, matrix)
+        moved = _transform_points(points, matrix)
         nearest, normal, distance = surface.nearest(moved)
         weight = (1 + (distance / width) ** 2) ** -2
         middle = moved.mean(axis=0)
@@ -223,6 +223,6 @@ def _misfit(
     All points count, because the few far points distinguish two poses of a nearly symmetric part. Distances are limited
     to ``missed``, because parts of the surface may be unseen.
     """
-    moved = _moved(points, matrix)
+    moved = _transform_points(points, matrix)
     there, back = surface.nearest(moved)[2], KDTree(moved).query(samples)[0]
     return float(np.minimum(there, missed).mean() + np.minimum(back, missed).mean())

@@ -131,10 +131,10 @@ def isolate_object(
     """
     if not views:
         raise InputError("masks are needed to isolate an object (got no view with one)")
-    weigher = VisibleWeights(splats)
+    visible_weights = VisibleWeights(splats)
     weights = np.zeros((len(splats), 2))
     for done, view in enumerate(views, 1):
-        weights += weigher(view)
+        weights += visible_weights(view)
         if progress is not None:
             progress(done, len(views), "isolating the object")
     total = weights.sum(axis=1)
@@ -155,7 +155,7 @@ def isolate_object(
         outside=int((seen & ~inside).sum()),
         needles=int(needles.sum()),
         floaters=len(floating),
-        lost=_lost_share(splats, isolated, views),
+        lost=_lost_alpha_share(splats, isolated, views),
     )
 
 
@@ -259,7 +259,7 @@ def find_floaters(splats: Splats, weight: Float64Array) -> Int64Array:
         neighbours *= 4
 
 
-def _lost_share(before: Splats, after: Splats, views: Sequence[MaskedView]) -> float:
+def _lost_alpha_share(before: Splats, after: Splats, views: Sequence[MaskedView]) -> float:
     """Return the share of the alpha inside the masks that is missing after the removal."""
     shown = missing = 0.0
     alphas = [render_splats(before, view.camera, quality="fast").alpha for view in views]

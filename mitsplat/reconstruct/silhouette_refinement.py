@@ -36,22 +36,22 @@ from mitsplat.reconstruct.segment_splats import MaskedView
 from mitsplat.renderer.layers import ensure_variant
 from mitsplat.renderer.rays.device_arrays import plain_mesh, ray_scene, wrapped
 
-_ROOM = 1.1
+_VIEW_RADIUS = 1.1
 """Radius that a view shows around the centre of the mesh, in radii of the mesh."""
 _VALIDATION_EVERY = 6
 """Interval of the validation views; smaller for few views, so that there are at least two of four and three of more."""
-_LEAST = 4
+_MIN_VIEWS = 4
 """Least number of views for a refinement."""
 _BATCH = 2
 """Views per step."""
-_CHECKS = 10
+_VALIDATIONS = 10
 """Number of validations."""
 _SAMPLES = 4
 """Rays per pixel of a silhouette; validation uses four times as many.
 
 The gradient uses one silhouette sample per pixel of the picture, which is about a hundred per pixel on the silhouette.
 """
-_STANDING = 0.005
+_BASE_HEIGHT = 0.005
 """Height above the table up to which vertices belong to the base of the object, in radii."""
 
 
@@ -104,12 +104,12 @@ class RefinedMesh:
     def __str__(self) -> str:
         """Return the result as one clause."""
         if not self.judges:
-            return f"dropped: it takes masks from {_LEAST} places outside of the mesh"
+            return f"dropped: it takes masks from {_MIN_VIEWS} places outside of the mesh"
         if not np.isfinite(self.after):
             return "dropped: it broke the mesh"
-        fate = "kept" if self.kept else "dropped" if self.after >= self.before else "dropped, as it may be chance"
+        outcome = "kept" if self.kept else "dropped" if self.after >= self.before else "dropped, as it may be chance"
         return (
-            f"{fate}: silhouettes and masks of the {self.judges} photos that decide differ by "
+            f"{outcome}: silhouettes and masks of the {self.judges} photos that decide differ by "
             f"{self.before:.2%} of the object before and by {self.after:.2%} after"
         )
 
@@ -140,8 +140,8 @@ def refine_mesh(
     ensure_variant()
     middle = mesh.bounds.mean(axis=0)
     radius = float(np.linalg.norm(mesh.vertices - middle, axis=1).max())
-    outside = [view for view in views if np.linalg.norm(view.camera.centre - middle) > 1.05 * _ROOM * radius]
-    if len(outside) < _LEAST:
+    outside = [view for view in views if np.linalg.norm(view.camera.centre - middle) > 1.05 * _VIEW_RADIUS * radius]
+    if len(outside) < _MIN_VIEWS:
         return RefinedMesh(mesh, False, np.inf, np.inf, 0)
     outlines = [Outline(view, middle, radius, settings.size) for view in outside]
     every = min(_VALIDATION_EVERY, max(2, len(outlines) // 3))
@@ -150,18 +150,18 @@ def refine_mesh(
     shown = [outline for index, outline in enumerate(outlines) if index not in judges]
     start = trimesh.Trimesh((mesh.vertices - middle) / radius, mesh.faces, process=False)
     lowest = -np.inf if floor is None else (floor - middle[2]) / radius
-    standing = np.abs(start.vertices[:, 2] - lowest) < _STANDING
+    on_table = np.abs(start.vertices[:, 2] - lowest) < _BASE_HEIGHT
 
     scene = Silhouettes(start)
     positions, faces = (scene.params[f"mesh.{name}"] for name in ("vertex_positions", "faces"))
     smoothing = mi.ad.LargeSteps(positions, faces, settings.smoothness)
     descent = mi.ad.Adam(lr=settings.rate, uniform=True, params={"latent": smoothing.to_differential(positions)})
-    height, stays = (wrapped(mi.Float, v.astype(np.float32)) for v in (start.vertices[:, 2], standing))
+    height, fixed = (wrapped(mi.Float, v.astype(np.float32)) for v in (start.vertices[:, 2], on_table))
 
     def moved() -> Any:
         vertices = dr.unravel(mi.Point3f, smoothing.from_differential(descent["latent"]))
         above = dr.maximum(vertices.z, dr.minimum(height, float(lowest)))
-        vertices.z = dr.select(stays > 0, height, above)
+        vertices.z = dr.select(fixed > 0, height, above)
         return dr.ravel(vertices)
 
     rng = np.random.default_rng(settings.seed)
@@ -172,7 +172,7 @@ def refine_mesh(
         chosen = rng.choice(len(shown), min(_BATCH, len(shown)), replace=False)
         dr.backward(scene.loss(moved(), [shown[index] for index in chosen], rng))
         descent.step()
-        if (step + 1) % max(1, settings.steps // _CHECKS) == 0 or step + 1 == settings.steps:
+        if (step + 1) % max(1, settings.steps // _VALIDATIONS) == 0 or step + 1 == settings.steps:
             found = mend_motion(start, np.array(dr.detach(moved()), dtype=np.float64).reshape(-1, 3))
             if found is not None and (errors := scene.errors(found, held)).mean() < after.mean():
                 refined, after = found, errors
@@ -198,7 +198,7 @@ class Outline:
     def __init__(self, view: MaskedView, middle: Float64Array, radius: float, size: int) -> None:
         given = view.camera
         distance = float(np.linalg.norm(given.centre - middle))
-        fov = 2 * float(np.degrees(np.arcsin(_ROOM * radius / distance)))
+        fov = 2 * float(np.degrees(np.arcsin(_VIEW_RADIUS * radius / distance)))
         up = -given.world_from_camera[:3, 1]
         camera = Camera.look_at(given.centre, middle, up=up, width=size, height=size, fov_x=fov)
         self.focal = camera.fx
@@ -210,11 +210,11 @@ class Outline:
         pixels = np.nan_to_num(given.project(given.centre + distance * ahead)[0], nan=-9.0) - 0.5
         known = ((pixels > -0.5) & (pixels < np.array([given.width, given.height]) - 0.5)).all(axis=1)
         x, y = pixels.T.astype(np.float32).reshape(2, size, size)
-        mask, told = (
+        mask, known_share = (
             cv2.remap(part, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
             for part in (view.mask, view.known.astype(np.float32))
         )
-        known &= told.ravel() == 1
+        known &= known_share.ravel() == 1
         self.mask, self.known = (wrapped(mi.Float, v.ravel().astype(np.float32)) for v in (mask, known))
         pose = pose @ np.diag([-1.0, -1.0, 1.0, 1.0])
         pose[:3, 3] = (given.centre - middle) / radius

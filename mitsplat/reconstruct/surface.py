@@ -35,38 +35,38 @@ from mitsplat.renderer.rays.sensors import view_of
 
 _OPAQUE = 0.5
 """Least alpha of a pixel that shows the splats' surface."""
-_BULK = 0.002
+_BOUNDS_QUANTILE = 0.002
 """Share of the Gaussians at either end of an axis that are ignored for the bounds of the grid."""
 _MARGIN = 0.08
 """Margin around the bulk of the Gaussians, as a share of its longest extent."""
-_SEEN_BY = 0.035
+_MIN_VIEW_SHARE = 0.035
 """Least share of the views towards a cell that must see it; a few views look through gaps between Gaussians."""
-_BEHIND = 2.0
+_MAX_BEHIND = 2.0
 """Largest depth behind the seen surface, in truncations, at which a view votes for inside.
 
 With 1, depth errors move the surface inwards, because all of the space in front counts. Without a limit, concavities
 close that some views do not see.
 """
-_DOUBT = 0.5
+_DEPTH_DEVIATIONS = 0.5
 """Standard deviations between views by which depth must exceed the hull to cut it; masks are more accurate than depths.
 """
-_PASSAGE = 2.5
+_PASSAGE_RADIUS = 2.5
 """Largest radius of a passage into a solid that is closed [cells]."""
-_EDGE = 1.5
+_VOID_CLEARANCE = 1.5
 """Least distance from solid cells in a void [cells].
 
 The concave edges and corners that the closing also fills are thinner.
 """
-_FILLED = 0.5
+_MIN_CELL_COVER = 0.5
 """Least share of a cell's cross-section that Gaussians must cover to fill it."""
-_DRAWS = 8
+_SAMPLES_PER_GAUSSIAN = 8
 """Random points per Gaussian that distribute its area over cells."""
-_SMALLEST_PART = 1e-3
+_MIN_PART_VOLUME = 1e-3
 """Least volume of a separate part, such as a leaf without its stem, as a share of the largest part's."""
 _FAR = 1e6
-_APART = 0.02
+_SEPARATION = 0.02
 """Share of the way to its neighbours by which a vertex is moved away from a coincident one."""
-_ROUNDS_APART = 8
+_SEPARATION_ROUNDS = 8
 """Largest number of repetitions; a moved vertex can coincide with another one."""
 
 
@@ -141,9 +141,9 @@ def reconstruct_surface(
             progress(number + 1, len(cameras), "finding the surface")
     distance, known = grid.combine(state, settings.blur)
     if thin:
-        distance = np.where(grid.lost(splats, distance, state), 0.5 * np.float32(grid.cell), distance)
+        distance = np.where(grid.thin_cells(splats, distance, state), 0.5 * np.float32(grid.cell), distance)
     if floor is not None:
-        distance = np.minimum(distance, grid.heights() - np.float32(floor))
+        distance = np.minimum(distance, grid.layer_heights() - np.float32(floor))
     # An outside border closes the surface at the edge of the grid.
     padded, known = np.pad(distance, 1, constant_values=-grid.truncation), np.pad(known, 1, constant_values=masked)
     try:
@@ -156,8 +156,8 @@ def reconstruct_surface(
     surface = trimesh.Trimesh(grid.low + (vertices - 0.5) * grid.cell, faces)
     if not masked:
         return simplify_surface(surface, settings.faces)
-    least = _SMALLEST_PART if thin else 1.0
-    return _untouched(_outer_shells(simplify_surface(_outer_shells(surface, least), settings.faces), least))
+    least = _MIN_PART_VOLUME if thin else 1.0
+    return _separate_vertices(_large_shells(simplify_surface(_large_shells(surface, least), settings.faces), least))
 
 
 def simplify_surface(surface: trimesh.Trimesh, faces: int) -> trimesh.Trimesh:
@@ -183,10 +183,10 @@ def simplify_surface(surface: trimesh.Trimesh, faces: int) -> trimesh.Trimesh:
             tolerance *= 1.1
         mesh = solid.to_mesh()
         simple = trimesh.Trimesh(mesh.vert_properties[:, :3], mesh.tri_verts, process=False)
-    return _untouched(simple)
+    return _separate_vertices(simple)
 
 
-def _untouched(surface: trimesh.Trimesh) -> trimesh.Trimesh:
+def _separate_vertices(surface: trimesh.Trimesh) -> trimesh.Trimesh:
     """Return a closed surface whose vertices differ in single precision, the precision of mesh files.
 
     Coincident vertices belong to sheets that touch; each moves slightly towards its own neighbours.
@@ -194,7 +194,7 @@ def _untouched(surface: trimesh.Trimesh) -> trimesh.Trimesh:
     vertices = np.array(surface.vertices)
     one, other = surface.edges.T
     counts = np.bincount(one, minlength=len(vertices))
-    for _ in range(_ROUNDS_APART):
+    for _ in range(_SEPARATION_ROUNDS):
         _, place, shared = np.unique(vertices.astype(np.float32), axis=0, return_inverse=True, return_counts=True)
         touching = shared[place] > 1
         if not touching.any():
@@ -202,11 +202,11 @@ def _untouched(surface: trimesh.Trimesh) -> trimesh.Trimesh:
         # A closed surface lists each edge once in either direction.
         sums = np.column_stack([np.bincount(one, vertices[other, k], len(vertices)) for k in range(3)])
         middle = sums[touching] / counts[touching, None]
-        vertices[touching] += _APART * (middle - vertices[touching])
+        vertices[touching] += _SEPARATION * (middle - vertices[touching])
     return trimesh.Trimesh(vertices, surface.faces, process=False)
 
 
-def _outer_shells(surface: trimesh.Trimesh, least: float) -> trimesh.Trimesh:
+def _large_shells(surface: trimesh.Trimesh, least: float) -> trimesh.Trimesh:
     """Return the closed parts with at least a share of the largest volume, without small parts and inner cavities."""
     parts = surface.split(only_watertight=True)
     largest = max((float(part.volume) for part in parts), default=0.0)
@@ -257,14 +257,14 @@ class _Grid:
 
     @classmethod
     def around(cls, splats: Splats, settings: SurfaceSettings) -> _Grid:
-        low, high = np.quantile(splats.means.astype(np.float64), (_BULK, 1 - _BULK), axis=0)
+        low, high = np.quantile(splats.means.astype(np.float64), (_BOUNDS_QUANTILE, 1 - _BOUNDS_QUANTILE), axis=0)
         margin = _MARGIN * float((high - low).max()) + 2 * float(np.median(splats.scales.max(axis=1)))
         low, high = low - margin, high + margin
         cell = float((high - low).max()) / settings.voxels
         shape = np.maximum(np.ceil((high - low) / cell).astype(int), 1)
         return cls(low, cell, (int(shape[0]), int(shape[1]), int(shape[2])), settings.truncation * cell)
 
-    def heights(self) -> Float32Array:
+    def layer_heights(self) -> Float32Array:
         """Return the heights z of the cell centres by layer, shape (cells along z,)."""
         return np.asarray(self.low[2] + self.cell * (np.arange(self.shape[2]) + 0.5), dtype=np.float32)
 
@@ -291,7 +291,7 @@ class _Grid:
         seen, low, high = _bilinear(depth, camera, pixel, ahead)
         # Depth is not interpolated across a depth edge.
         behind = z - seen
-        valid = ahead & (low > 0) & (high - low < span) & (behind < _BEHIND * span)
+        valid = ahead & (low > 0) & (high - low < span) & (behind < _MAX_BEHIND * span)
         behind = dr.select(valid, dr.clip(behind, -span, span), 0)
         state.total = state.total + behind
         state.squares = state.squares + dr.square(behind)
@@ -320,20 +320,20 @@ class _Grid:
         count = np.array(state.count)
         mean, squares = (np.array(sums) / np.maximum(count, 1) for sums in (state.total, state.squares))
         # Unseen cells inside the hull count as inside the object.
-        known = count > (_SEEN_BY * np.array(state.towards) if state.hull else 0)
+        known = count > (_MIN_VIEW_SHARE * np.array(state.towards) if state.hull else 0)
         distance = np.where(known, mean, self.truncation)
         if state.hull:
-            distance = distance + _DOUBT * np.sqrt(np.maximum(squares - mean * mean, 0))
+            distance = distance + _DEPTH_DEVIATIONS * np.sqrt(np.maximum(squares - mean * mean, 0))
             distance = np.minimum(distance, np.clip(np.array(state.hull[-1]), -self.truncation, self.truncation))
             known = np.ones_like(known)
-            distance = _sealed(distance.reshape(self.shape), self.truncation)
+            distance = _close_voids(distance.reshape(self.shape), self.truncation)
         # Marching cubes uses all eight corners, and the blur uses neighbours.
         known = binary_erosion(known.reshape(self.shape), np.ones((3, 3, 3)), border_value=1)
         shaped = distance.reshape(self.shape).astype(np.float32)
         smooth = gaussian_filter(shaped, blur, mode="nearest") if blur > 0 else shaped
         return smooth, known
 
-    def lost(self, splats: Splats, distance: Float32Array, state: _State) -> BoolArray:
+    def thin_cells(self, splats: Splats, distance: Float32Array, state: _State) -> BoolArray:
         """Return True for cells that Gaussians fill inside all silhouettes but outside any surface.
 
         Neighbours of these cells are included.
@@ -343,18 +343,20 @@ class _Grid:
         """
         ordered = np.sort(splats.scales.astype(np.float64), axis=1)
         area = 2 * np.pi * splats.opacities * ordered[:, 1] * ordered[:, 2] / self.cell**2
-        offsets = np.random.default_rng(0).normal(size=(_DRAWS, len(splats), 3)) * splats.scales
+        offsets = np.random.default_rng(0).normal(size=(_SAMPLES_PER_GAUSSIAN, len(splats), 3)) * splats.scales
         frames = Rotation.from_quat(splats.quats).as_matrix()
         points = (splats.means + np.einsum("nij,snj->sni", frames, offsets)).reshape(-1, 3)
         place = (points - self.low) / self.cell
         inside = ((place >= 0) & (place < self.shape)).all(axis=1)
         index = np.ravel_multi_index(tuple(place[inside].astype(np.int64).T), self.shape)
-        cover = np.bincount(index, np.tile(area / _DRAWS, _DRAWS)[inside], self.count).reshape(self.shape)
+        cover = np.bincount(
+            index, np.tile(area / _SAMPLES_PER_GAUSSIAN, _SAMPLES_PER_GAUSSIAN)[inside], self.count
+        ).reshape(self.shape)
         enclosed = binary_dilation(distance > 0, np.ones((3, 3, 3)), iterations=2)
-        lost = (cover >= _FILLED) & ~enclosed
+        thin_cells = (cover >= _MIN_CELL_COVER) & ~enclosed
         if state.hull:
-            lost &= np.array(state.hull[-1]).reshape(self.shape) > -self.cell
-        return np.asarray(binary_dilation(lost))
+            thin_cells &= np.array(state.hull[-1]).reshape(self.shape) > -self.cell
+        return np.asarray(binary_dilation(thin_cells))
 
     def _in_camera(self, camera: Camera) -> tuple[Any, Any, Any]:
         """Return the camera coordinates of all cell centres [m]."""
@@ -375,24 +377,24 @@ class _Grid:
         return found[0], found[1], found[2]
 
 
-def _sealed(distance: Float32Array, inside: float) -> Float32Array:
+def _close_voids(distance: Float32Array, inside: float) -> Float32Array:
     """Set distances to ``inside`` in voids that only narrow passages connect with the outside.
 
     Views that look between Gaussians carve such passages and voids. A void is a part cut off by a closing (Serra 1982)
     of the solid, which no ball of that radius reaches from the outside. Edges of concavities are also out of reach, but
     they are thinner than voids and stay.
     """
-    empty = np.pad(distance <= 0, 1 + math.ceil(_PASSAGE), constant_values=True)
+    empty = np.pad(distance <= 0, 1 + math.ceil(_PASSAGE_RADIUS), constant_values=True)
     if empty.all():
         return distance
     room = distance_transform_edt(empty)
-    wide = label(room > _PASSAGE)[0]
-    hidden = empty & (distance_transform_edt(wide != wide[0, 0, 0]) > _PASSAGE)
-    void = hidden & (room > _EDGE)
+    wide = label(room > _PASSAGE_RADIUS)[0]
+    hidden = empty & (distance_transform_edt(wide != wide[0, 0, 0]) > _PASSAGE_RADIUS)
+    void = hidden & (room > _VOID_CLEARANCE)
     if not void.any():
         return distance
-    void = hidden & (distance_transform_edt(~void) <= 1 + _EDGE)
-    border = (slice(1 + math.ceil(_PASSAGE), -1 - math.ceil(_PASSAGE)),) * 3
+    void = hidden & (distance_transform_edt(~void) <= 1 + _VOID_CLEARANCE)
+    border = (slice(1 + math.ceil(_PASSAGE_RADIUS), -1 - math.ceil(_PASSAGE_RADIUS)),) * 3
     return np.where(void[border], np.float32(inside), distance)
 
 

@@ -23,11 +23,11 @@ OFF = 0.012
 """Largest height above the support that still counts as the support, as a share of the typical depth."""
 TALL = 0.6
 """Largest height of things that stand on a support, as a share of the typical depth."""
-_SMALLEST_HOLE = 0.005
+_MIN_HOLE_AREA = 0.005
 """Least area of a hole in the report, as a share of the support's area."""
-_HOLES = 3
-_TURNS, _HEIGHTS = 8, (35.0, 65.0)
-_LOOK = 120
+_MAX_HOLES = 3
+_AZIMUTHS, _ELEVATIONS = 8, (35.0, 65.0)
+_VIEW_SIZE = 120
 """Longest edge of the pictures that test views of a hole [px]."""
 
 
@@ -105,7 +105,7 @@ def find_coverage(support: Support, views: Sequence[DepthView], points: SurfaceP
     photos: Int64Array = np.zeros(shape, dtype=np.int64)
     empty = Coverage(cell, photos, np.zeros(shape, dtype=bool))
     flat = empty.middle(np.argwhere(np.ones(shape)))
-    world = _placed(support, flat)
+    world = _to_scene(support, flat)
     for view in views:
         depth, surface = view.look(world)
         height = float((view.camera.centre - support.pose[:3, 3]) @ support.pose[:3, 2])
@@ -120,7 +120,7 @@ def find_coverage(support: Support, views: Sequence[DepthView], points: SurfaceP
     )
 
 
-def _placed(support: Support, flat: Float64Array) -> Float64Array:
+def _to_scene(support: Support, flat: Float64Array) -> Float64Array:
     """Transform points (N, 2) from a support's frame to the scene, (N, 3)."""
     return np.asarray(flat @ support.pose[:3, :2].T + support.pose[:3, 3])
 
@@ -157,9 +157,9 @@ def find_holes(
     """
     parts, count = label(coverage.hidden)
     sizes = np.bincount(parts.ravel(), minlength=count + 1)[1:]
-    least = _SMALLEST_HOLE * coverage.hidden.size
+    least = _MIN_HOLE_AREA * coverage.hidden.size
     found = []
-    for number in np.argsort(-sizes, kind="stable")[:_HOLES]:
+    for number in np.argsort(-sizes, kind="stable")[:_MAX_HOLES]:
         if sizes[number] < least:
             break
         flat = coverage.middle(np.argwhere(parts == number + 1))
@@ -170,28 +170,30 @@ def find_holes(
 def _hole(
     support: Support, flat: Float64Array, area: float, splats: Splats, cameras: Sequence[tuple[str, Camera]]
 ) -> Hole:
-    cells, middle = _placed(support, flat), _placed(support, flat.mean(axis=0)[None])[0]
+    cells, middle = _to_scene(support, flat), _to_scene(support, flat.mean(axis=0)[None])[0]
     centres = np.array([camera.centre for _, camera in cameras])
-    away = float(np.median(np.linalg.norm(centres - middle, axis=1)))
+    distance = float(np.median(np.linalg.norm(centres - middle, axis=1)))
     first = cameras[0][1]
     edge = max(first.width, first.height)
-    best, chosen, height = 0.0, None, 0.0
+    best, best_centre, height = 0.0, None, 0.0
     tried, degrees = [], []
-    for elevation in _HEIGHTS:
-        for turn in range(_TURNS):
-            outward = support.pose[:3, :3] @ direction(2 * np.pi * turn / _TURNS, float(np.sin(np.radians(elevation))))
+    for elevation in _ELEVATIONS:
+        for turn in range(_AZIMUTHS):
+            outward = support.pose[:3, :3] @ direction(
+                2 * np.pi * turn / _AZIMUTHS, float(np.sin(np.radians(elevation)))
+            )
             pose = Camera.look_at(
-                middle + away * outward, middle, width=_LOOK, height=_LOOK, fov_x=60, near=0.05 * away
+                middle + distance * outward, middle, width=_VIEW_SIZE, height=_VIEW_SIZE, fov_x=60, near=0.05 * distance
             )
             tried.append(pose)
             degrees.append(elevation)
-    for view, elevation in zip(depth_views(splats, tried, min(_LOOK, edge)), degrees, strict=True):
+    for view, elevation in zip(depth_views(splats, tried, min(_VIEW_SIZE, edge)), degrees, strict=True):
         depth, surface = view.look(cells)
         # A hole may have no splats, so the test is that no surface lies in front of it.
         shown = float(np.nanmean(surface > 0.97 * depth)) if np.isfinite(depth).any() else 0.0
         if shown > best + 0.05:
-            best, chosen, height = shown, view.camera.centre, elevation
+            best, best_centre, height = shown, view.camera.centre, elevation
     near = None
-    if chosen is not None:
-        near = cameras[int(np.linalg.norm(centres - chosen, axis=1).argmin())][0]
+    if best_centre is not None:
+        near = cameras[int(np.linalg.norm(centres - best_centre, axis=1).argmin())][0]
     return Hole((float(flat[:, 0].mean()), float(flat[:, 1].mean())), area, near, height, best)

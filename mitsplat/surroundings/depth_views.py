@@ -17,7 +17,7 @@ SIZE = 240
 _OPAQUE = 0.5
 _STEP = 2
 """Distance between neighbouring surface points, and half the span of the differences for normals [px]."""
-_BENT = 0.05
+_MAX_DEPTH_STEP = 0.05
 """Largest depth difference across a normal's span, as a share of the depth."""
 
 
@@ -103,7 +103,11 @@ def surface_points(views: Sequence[DepthView]) -> SurfacePoints:
         normal = np.cross(down, across)
         length = np.linalg.norm(normal, axis=-1)
         middle = depth[inner, inner]
-        smooth = (np.abs(across[..., 2]) < _BENT * middle) & (np.abs(down[..., 2]) < _BENT * middle) & (length > 0)
+        smooth = (
+            (np.abs(across[..., 2]) < _MAX_DEPTH_STEP * middle)
+            & (np.abs(down[..., 2]) < _MAX_DEPTH_STEP * middle)
+            & (length > 0)
+        )
         grid = np.zeros_like(smooth)
         grid[::_STEP, ::_STEP] = True
         kept = smooth & grid  # comparisons with NaN are false

@@ -41,27 +41,27 @@ from mitsplat.surroundings.removal import RemovedThing, remove_things
 from mitsplat.surroundings.shading import ShadingLight, light_of_shading
 from mitsplat.surroundings.supports import Support, find_supports, flattened
 
-_NEAR = 3.0
+_FOREGROUND_DISTANCE = 3.0
 """Distance from the focus of the cameras beyond which Gaussians are background, in camera distances.
 
 The background is rendered, but it is not part of the mesh.
 """
-_TURNED = 30.0
+_MAX_SUPPORT_TILT = 30.0
 """Largest angle of the support to the capture's vertical [degrees]."""
-_ANYHOW = 55.0
+_MAX_AXIS_ANGLE = 55.0
 """Largest angle of the support to one of the six axes if the vertical is unknown [degrees]; this covers all directions.
 """
-_LEVEL = 2.0
+_MAX_LEVEL_TILT = 2.0
 """Largest angle between the support and other level surfaces [degrees]."""
-_ROUGH = 0.03
+_FLATTEN_RANGE = 0.03
 """Height range around a support in which the mesh is flattened, as a share of the typical depth."""
-_HIDDEN = 0.1
+_MAX_HIDDEN_SHARE = 0.1
 """Largest share of the support that too few photos may show."""
-_SAME = 1.5 / 255
+_MAX_UNCHANGED = 1.5 / 255
 """Largest colour difference of a pixel that the removal of things left unchanged."""
-_ACROSS = 256
+_LIGHT_CELLS = 256
 """Largest number of cells along a support in the estimation of light."""
-_SMALLEST_REGION = 0.1
+_MIN_REGION = 0.1
 """Least edge of a drop region [m]."""
 
 
@@ -74,7 +74,7 @@ def make_surroundings(
     replaced.
     """
     before = _recorded_scene(out)
-    return _with_scene(
+    return _write_scene(
         make_asset(capture_folder, fit, out, job, make=reconstruct_surroundings, progress=progress), before
     )
 
@@ -93,7 +93,7 @@ def make_photo_surroundings(
     done = make_photo_asset(
         photos, out, job, capture=capture, fit=fit, make=reconstruct_surroundings, progress=progress
     )
-    return _with_scene(done, before)
+    return _write_scene(done, before)
 
 
 def reconstruct_surroundings(
@@ -119,27 +119,27 @@ def reconstruct_surroundings(
     splats, removed = remove_floaters(splats, capture.training, scale)
     views = depth_views(splats, cameras)
     points = surface_points(views)
-    found = find_supports(points, np.array([0.0, 0.0, 1.0]), scale, within=_TURNED)
+    found = find_supports(points, np.array([0.0, 0.0, 1.0]), scale, within=_MAX_SUPPORT_TILT)
     if not found and capture.up == "unknown":
         axes = np.concatenate([np.eye(3), -np.eye(3)])
-        anyhow = (find_supports(points, axis, scale, within=_ANYHOW) for axis in axes)
-        found = max(anyhow, key=lambda supports: supports[0].looked_at if supports else 0.0)
+        candidates = (find_supports(points, axis, scale, within=_MAX_AXIS_ANGLE) for axis in axes)
+        found = max(candidates, key=lambda supports: supports[0].looked_at if supports else 0.0)
     motion: Float64Array = np.eye(4)
     if found:
         motion = np.asarray(np.linalg.inv(found[0].pose))
         capture, splats = replace(capture.transformed(motion), up="z", table=True), splats.transformed(motion)
         points, views = points.transformed(motion), [view.transformed(motion) for view in views]
-        found = find_supports(points, np.array([0.0, 0.0, 1.0]), scale, within=_LEVEL)
+        found = find_supports(points, np.array([0.0, 0.0, 1.0]), scale, within=_MAX_LEVEL_TILT)
     cameras = [photo.camera for photo in capture.training]
     fitted, standing, things = splats, points, list[RemovedThing]()
     if job.remove:
         splats, things = remove_things(splats, job.remove, capture, found, points, scale, progress)
         views = depth_views(splats, cameras)
         points = surface_points(views)
-    beyond = _beyond(splats, cameras)
+    background = _background(splats, cameras)
     imported = job.imported
     if imported is None:
-        mesh = _mesh(splats.select(~beyond), capture.training, job, found, scale, progress)
+        mesh = _mesh(splats.select(~background), capture.training, job, found, scale, progress)
         imported = ImportedMesh(mesh, np.eye(4))
     made = reconstruct_asset(
         capture, splats, name=job.name, class_name=job.class_name, kind="environment", settings=job.settings,
@@ -157,7 +157,7 @@ def reconstruct_surroundings(
         "Frame": f"{'in metres' if made.asset.units == 'metre' else 'in unknown units'}{error}"
         + (f", by {source}" if source else ""),
         "Removed Gaussians": ", ".join(f"{count} {reason}" for reason, count in removed.items()),
-        "Background": f"{int(beyond.sum())} Gaussians far beyond what the cameras look at, which are kept",
+        "Background": f"{int(background.sum())} Gaussians far beyond what the cameras look at, which are kept",
     }
     findings, sections, record = list[str](), list[str](), dict[str, Any]()
     if found:
@@ -171,7 +171,7 @@ def reconstruct_surroundings(
         rows |= _rows(supports, coverage, holes, region, factor, unit)
         findings += _findings(coverage, holes, region, factor, unit, metric=made.asset.units == "metre")
         if things:
-            rows["Removed things"] = "; ".join(_missing(thing, factor, unit) for thing in things)
+            rows["Removed things"] = "; ".join(_removal_text(thing, factor, unit) for thing in things)
             record["removed_things"] = [
                 {
                     "pick": t.pick,
@@ -182,13 +182,13 @@ def reconstruct_surroundings(
                 }
                 for t in things
             ]
-        sections.append(_map(coverage, filled))
+        sections.append(_support_map(coverage, filled))
         record["supports"] = [
             {"pose": s.pose.tolist(), "size": list(s.size), "tilt": s.tilt, "roughness": s.roughness} for s in supports
         ]
         if region is not None and made.asset.units == "metre":
-            light = _light(found[0], fitted, capture, standing, scale, factor)
-            rows["Light"] = "not told by shadows" if light is None else _lit(light)
+            light = _estimate_light(found[0], fitted, capture, standing, scale, factor)
+            rows["Light"] = "not told by shadows" if light is None else _light_text(light)
             seen = [photo.camera for photo in capture.transformed(larger).photos]
             record["scene"] = scene_text(job.name, "{folder}", supports, region, seen, light)
     else:
@@ -204,12 +204,12 @@ def reconstruct_surroundings(
     # The PSNR is that of the asset after all changes, not that of the fit.
     shown = mean_psnr(made.held_out) if made.held_out else psnr
     if made.held_out and things:
-        shown = _psnr_beside(made.held_out, show_held_out(fitted, None, capture.held_out, job.settings.verdict_size))
+        shown = _unchanged_psnr(made.held_out, show_held_out(fitted, None, capture.held_out, job.settings.verdict_size))
     verdict = replace(made.verdict, psnr=shown, rows=rows, findings=tuple(findings))
     return replace(made, verdict=verdict, sections=tuple(sections), record=record)
 
 
-def _light(
+def _estimate_light(
     support: Support, splats: Splats, capture: Capture, points: SurfacePoints, scale: float, factor: float
 ) -> ShadingLight | None:
     """Estimate the light from the shadows on a support, relative to its centre [m]; ``factor`` is metres per unit."""
@@ -217,7 +217,7 @@ def _light(
     places = points.transformed(np.asarray(np.linalg.inv(support.pose))).places
     heights = ground.grid.heights(places[places[:, 2] < TALL * scale], OFF * scale)
     linear, bare = decode_srgb(np.clip(ground.texture, 0, 1)), np.asarray(binary_erosion(ground.seen))
-    block = -(-max(heights.shape) // _ACROSS)
+    block = -(-max(heights.shape) // _LIGHT_CELLS)
 
     def blocks(values: Float64Array | BoolArray) -> Any:
         x, y = (count // block for count in values.shape[:2])
@@ -231,14 +231,14 @@ def _light(
     )
 
 
-def _lit(light: ShadingLight) -> str:
+def _light_text(light: ShadingLight) -> str:
     """Describe the directions of lamps and the share of ambient light as a clause."""
-    told = []
+    texts = []
     for lamp in light.lamps:
         x, y, z = lamp.position
         turn, rise = np.degrees(np.arctan2(y, x)) % 360, np.degrees(np.arctan2(z, np.hypot(x, y)))
-        told.append(f"a lamp at azimuth {turn:.0f}°, elevation {rise:.0f}°")
-    return f"{', '.join(told)}; {light.ambient_share:.0%} from all sides, as shadows on the support tell"
+        texts.append(f"a lamp at azimuth {turn:.0f}°, elevation {rise:.0f}°")
+    return f"{', '.join(texts)}; {light.ambient_share:.0%} from all sides, as shadows on the support tell"
 
 
 def _typical_depth(capture: Capture) -> float:
@@ -248,12 +248,12 @@ def _typical_depth(capture: Capture) -> float:
     return float(np.median(known)) if known else 1.0
 
 
-def _beyond(splats: Splats, cameras: Sequence[Camera]) -> BoolArray:
+def _background(splats: Splats, cameras: Sequence[Camera]) -> BoolArray:
     """Return True for Gaussians (N,) in the background."""
     centres = np.array([camera.centre for camera in cameras])
     focus = meeting_point(centres, np.array([camera.world_from_camera[:3, 2] for camera in cameras]))
     away = float(np.quantile(np.linalg.norm(centres - focus, axis=1), 0.9))
-    return np.asarray(np.linalg.norm(splats.means - focus, axis=1) > _NEAR * away)
+    return np.asarray(np.linalg.norm(splats.means - focus, axis=1) > _FOREGROUND_DISTANCE * away)
 
 
 def _mesh(
@@ -266,7 +266,7 @@ def _mesh(
 ) -> trimesh.Trimesh:
     cameras = [sized_photo(photo, job.settings.view_size)[0] for photo in photos]
     mesh = reconstruct_surface(splats, cameras, settings=job.settings.surface, progress=progress)
-    return flattened(mesh, supports, _ROUGH * scale)
+    return flattened(mesh, supports, _FLATTEN_RANGE * scale)
 
 
 def _region(coverage: Coverage, support: Support, factor: float) -> Region | None:
@@ -303,11 +303,11 @@ def _rows(
         )
     rows["Hardly seen"] = f"{coverage.hidden.mean():.1%} of the support is in fewer than {ENOUGH} photos"
     if holes:
-        rows["Holes"] = "; ".join(_told(hole, factor, unit) for hole in holes)
+        rows["Holes"] = "; ".join(_hole_text(hole, factor, unit) for hole in holes)
     return rows
 
 
-def _told(hole: Hole, factor: float, unit: str) -> str:
+def _hole_text(hole: Hole, factor: float, unit: str) -> str:
     """Describe a hole and its best viewpoint as a clause."""
     x, y = (factor * value for value in hole.middle)
     place = f"{factor**2 * hole.area:.2g} {unit}² around x {x:.2f}, y {y:.2f}"
@@ -316,7 +316,7 @@ def _told(hole: Hole, factor: float, unit: str) -> str:
     return f"{place}: photograph it from near {hole.near}, {hole.height:.0f} degrees above it (shows {hole.shown:.0%})"
 
 
-def _missing(thing: RemovedThing, factor: float, unit: str) -> str:
+def _removal_text(thing: RemovedThing, factor: float, unit: str) -> str:
     """Describe a removed thing and the filled area as a clause."""
     size = " x ".join(f"{factor * edge:.2g}" for edge in thing.high - thing.low)
     x, y = (factor * 0.5 * (thing.low + thing.high))[:2]
@@ -328,11 +328,11 @@ def _missing(thing: RemovedThing, factor: float, unit: str) -> str:
     )
 
 
-def _psnr_beside(after: Sequence[HeldOutView], before: Sequence[HeldOutView]) -> float:
+def _unchanged_psnr(after: Sequence[HeldOutView], before: Sequence[HeldOutView]) -> float:
     """Return the mean PSNR [dB] of held-out photos at pixels that the removal left unchanged."""
     errors = []
     for view, old in zip(after, before, strict=True):
-        same = np.abs(view.render - old.render).max(axis=2) < _SAME
+        same = np.abs(view.render - old.render).max(axis=2) < _MAX_UNCHANGED
         if same.any():
             errors.append(psnr_of(float(((view.render - view.photo)[same] ** 2).mean())))
     return float(np.mean(errors))
@@ -342,21 +342,21 @@ def _findings(
     coverage: Coverage, holes: Sequence[Hole], region: Region | None, factor: float, unit: str, *, metric: bool
 ) -> list[str]:
     found = []
-    if coverage.hidden.mean() > _HIDDEN:
-        places = "; ".join(_told(hole, factor, unit) for hole in holes) or "it is in many small parts: add photos"
+    if coverage.hidden.mean() > _MAX_HIDDEN_SHARE:
+        places = "; ".join(_hole_text(hole, factor, unit) for hole in holes) or "it is in many small parts: add photos"
         found.append(
-            f"{coverage.hidden.mean():.0%} of the support is in fewer than {ENOUGH} photos (at most {_HIDDEN:.0%} is "
-            f"wanted): {places}"
+            f"{coverage.hidden.mean():.0%} of the support is in fewer than {ENOUGH} photos "
+            f"(at most {_MAX_HIDDEN_SHARE:.0%} is wanted): {places}"
         )
-    if region is None or (metric and min(region[1] - region[0], region[3] - region[2]) < _SMALLEST_REGION):
+    if region is None or (metric and min(region[1] - region[0], region[3] - region[2]) < _MIN_REGION):
         found.append(
-            f"no free place of {_SMALLEST_REGION:g} x {_SMALLEST_REGION:g} m is left on the support: clear it, or "
+            f"no free place of {_MIN_REGION:g} x {_MIN_REGION:g} m is left on the support: clear it, or "
             "write the scene's region by hand"
         )
     return found
 
 
-def _map(coverage: Coverage, filled: BoolArray) -> str:
+def _support_map(coverage: Coverage, filled: BoolArray) -> str:
     """Return the top view of the support with covered, free, hardly visible and filled cells, as HTML."""
     tint = np.full((*coverage.photos.shape, 3), 0.85)
     tint[coverage.free] = (0.55, 0.8, 0.55)
@@ -388,7 +388,7 @@ def _recorded_scene(out: Path) -> str | None:
     return scene.replace("{folder}", out.resolve().name) if isinstance(scene, str) else None
 
 
-def _with_scene(done: AssetResult, before: str | None) -> AssetResult:
+def _write_scene(done: AssetResult, before: str | None) -> AssetResult:
     """Write the scene file and return the result with its path; keep a scene file that was edited."""
     text, path = _recorded_scene(done.folder), _scene_file(done.folder)
     if text is None:

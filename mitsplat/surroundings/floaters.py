@@ -19,22 +19,22 @@ from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.reconstruct.asset_evaluation import HeldOutView, show_held_out
 from mitsplat.surroundings.depth_views import DepthView, depth_views
 
-_LARGEST = (2.0, 1.0, 0.6, 0.4, 0.3)
+_HAZE_LIMITS = (2.0, 1.0, 0.6, 0.4, 0.3)
 """Candidate limits of the standard deviation above which Gaussians are haze, as shares of the typical depth."""
-_WORSE = 0.05
+_MAX_PSNR_LOSS = 0.05
 """Largest loss of PSNR by the removal of specks [dB]."""
-_JUDGES = 8
+_TEST_PHOTOS = 8
 """Number of training photos that test removals; ``_SIZE`` is their longest edge [px]."""
 _SIZE = 240
-_DEPTH = 0.03
+_DEPTH_TOLERANCE = 0.03
 """Largest depth of a Gaussian in front of its surface, as a share of the depth."""
-_REACH = 2.0
+_RADIUS_SIGMAS = 2.0
 """Radius of a Gaussian in standard deviations."""
-_PASSED = 3
+_MIN_PHOTOS = 3
 """Least number of photos that must see through a speck, or that must confirm a surface close to a camera."""
-_NEAR = 0.3
+_CLOSE_DEPTH = 0.3
 """Depth below which a surface is close to a camera, as a share of the typical depth."""
-_BORNE = 0.1
+_MAX_CONFIRMED = 0.1
 """Largest share of confirming photos, relative to those that see through, for a speck."""
 
 
@@ -46,17 +46,17 @@ def remove_floaters(splats: Splats, photos: Sequence[Photo], scale: float) -> tu
         photos: Photos of the fit.
         scale: Typical depth of the photos.
     """
-    judges = [photos[int(i)] for i in np.unique(np.linspace(0, len(photos) - 1, _JUDGES).round())]
-    best, kept = _psnr(splats, judges), splats
-    for limit in _LARGEST:
+    test_photos = [photos[int(i)] for i in np.unique(np.linspace(0, len(photos) - 1, _TEST_PHOTOS).round())]
+    best, kept = _psnr(splats, test_photos), splats
+    for limit in _HAZE_LIMITS:
         tried = splats.select(splats.scales.max(axis=1) <= limit * scale)
-        if len(tried) and (found := _psnr(tried, judges)) > best:
+        if len(tried) and (found := _psnr(tried, test_photos)) > best:
             best, kept = found, tried
     removed = {"haze": len(splats) - len(kept)}
-    specks, unseen = find_unsupported(kept, depth_views(kept, [p.camera for p in photos]), _NEAR * scale)
+    specks, unseen = find_unsupported(kept, depth_views(kept, [p.camera for p in photos]), _CLOSE_DEPTH * scale)
     removed |= {"specks": 0, "in no photo": int(unseen.sum())}
     tried = kept.select(~(specks | unseen))
-    if len(tried) and _psnr(tried, judges) >= best - _WORSE:
+    if len(tried) and _psnr(tried, test_photos) >= best - _MAX_PSNR_LOSS:
         removed["specks"] = int((specks & ~unseen).sum())
         return tried, removed
     return kept.select(~unseen), removed
@@ -79,14 +79,16 @@ def find_unsupported(splats: Splats, views: Sequence[DepthView], near: float) ->
         views: Depths of the same splats from the cameras of the photos.
         near: Depth below which a surface needs three photos.
     """
-    passed: Int64Array = np.zeros(len(splats), dtype=np.int64)
-    borne, shown, close = passed.copy(), passed.copy(), np.zeros(len(splats), dtype=bool)
-    means, reach = splats.means.astype(np.float64), _REACH * splats.scales.max(axis=1).astype(np.float64)
+    seen_through: Int64Array = np.zeros(len(splats), dtype=np.int64)
+    confirmed, shown, close = seen_through.copy(), seen_through.copy(), np.zeros(len(splats), dtype=bool)
+    means, reach = splats.means.astype(np.float64), _RADIUS_SIGMAS * splats.scales.max(axis=1).astype(np.float64)
     for view in views:
         depth, surface = view.look(means)
         shown += np.isfinite(depth)
-        room = reach + _DEPTH * np.where(np.isfinite(surface), surface, depth)
-        passed += depth < surface - room
-        borne += np.abs(depth - surface) <= room
+        room = reach + _DEPTH_TOLERANCE * np.where(np.isfinite(surface), surface, depth)
+        seen_through += depth < surface - room
+        confirmed += np.abs(depth - surface) <= room
         close |= depth < near
-    return ((passed >= _PASSED) & (borne <= _BORNE * passed)) | (close & (borne < _PASSED)), shown == 0
+    return ((seen_through >= _MIN_PHOTOS) & (confirmed <= _MAX_CONFIRMED * seen_through)) | (
+        close & (confirmed < _MIN_PHOTOS)
+    ), shown == 0

@@ -21,15 +21,15 @@ from mitsplat.surroundings.supports import Support
 
 CELL = 0.004
 """Edge of the cells that fill a support, as a share of the typical depth."""
-_FLAT = 0.25
+_BARE_HEIGHT = 0.25
 """Largest height of the bare support, as a share of the height that separates it from things."""
-_GAP = 4
+_MAX_GAP = 4
 """Largest gap between points of one thing [cells]."""
-_EDGE = 400
+_VIEW_SIZE = 400
 """Longest edge of the pictures for the support's colours [px]."""
 _OPAQUE = 0.9
 _BORDER = cv2.BORDER_REPLICATE
-_DISC, _THICK = 0.7, 0.1
+_SIGMA_ALONG, _SIGMA_ACROSS = 0.7, 0.1
 """Standard deviations of the sheet's Gaussians in its plane and along its normal [cells]."""
 
 
@@ -54,7 +54,7 @@ class Ground:
         """Compute the texture of a support from the training photos; ``scale`` is their typical depth."""
         inverse, grid = np.linalg.inv(support.pose), Grid.of(support, CELL * scale)
         cameras = [photo.camera.transformed(inverse) for photo in capture.training]
-        return cls(support, grid, *grid.look(splats.transformed(inverse), cameras, _FLAT * OFF * scale))
+        return cls(support, grid, *grid.look(splats.transformed(inverse), cameras, _BARE_HEIGHT * OFF * scale))
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,10 +95,12 @@ class Grid:
 
         Gaps between points are closed.
         """
-        top = self._tops(points[points[:, 2] > floor])
-        return np.asarray(grey_closing(np.pad(top, _GAP), size=(2 * _GAP + 1,) * 2)[_GAP:-_GAP, _GAP:-_GAP])
+        top = self._top_heights(points[points[:, 2] > floor])
+        return np.asarray(
+            grey_closing(np.pad(top, _MAX_GAP), size=(2 * _MAX_GAP + 1,) * 2)[_MAX_GAP:-_MAX_GAP, _MAX_GAP:-_MAX_GAP]
+        )
 
-    def _tops(self, points: Float64Array) -> Float64Array:
+    def _top_heights(self, points: Float64Array) -> Float64Array:
         """Return the largest height of points (N, 3) in each cell (X, Y), 0 without points."""
         top = np.zeros(self.middles.shape[:2])
         cells = self.cells(points[:, :2])
@@ -111,7 +113,7 @@ class Grid:
 
         The positions are at least ``depth`` from sides, top and ground; ``depth`` is also the step of the lattice.
         """
-        top = self._tops(points)
+        top = self._top_heights(points)
         near = distance_transform_edt(top == 0, return_distances=False, return_indices=True)
         deep = distance_transform_edt(np.pad(footprint, 1))[1:-1, 1:-1] * self.cell > depth
         step = max(1, int(depth / self.cell))
@@ -136,7 +138,7 @@ class Grid:
         places = np.concatenate([self.middles, np.zeros((*shape, 1))], axis=2).reshape(-1, 3)
         colours, weights, count = np.zeros((*shape, 3)), np.full(shape, 1e-12), np.zeros(shape, dtype=np.int64)
         for camera in cameras:
-            view, shown = _seen_by(splats, camera)
+            view, shown = _render_view(splats, camera)
             depth, surface = view.look(places)
             bare = np.abs(view.camera.centre[2] * (1 - surface / depth)) < height  # False for NaN
             towards = places - view.camera.centre
@@ -154,14 +156,17 @@ class Grid:
         return Splats(
             means=np.column_stack([flat, np.zeros(count)]).astype(np.float32),
             quats=np.tile(np.array([0, 0, 0, 1], dtype=np.float32), (count, 1)),
-            scales=np.tile(np.array([_DISC, _DISC, _THICK], dtype=np.float32) * np.float32(self.cell), (count, 1)),
+            scales=np.tile(
+                np.array([_SIGMA_ALONG, _SIGMA_ALONG, _SIGMA_ACROSS], dtype=np.float32) * np.float32(self.cell),
+                (count, 1),
+            ),
             opacities=np.full(count, 0.95, dtype=np.float32),
             sh=((texture[cells] - 0.5) / SH_C0)[:, None].astype(np.float32),
         )
 
 
-def _seen_by(splats: Splats, camera: Camera) -> tuple[DepthView, Float32Array]:
-    """Render depth and display-encoded colours; the longest edge is at most :data:`_EDGE` px."""
-    small, layers = render_sized(splats, camera, _EDGE)
+def _render_view(splats: Splats, camera: Camera) -> tuple[DepthView, Float32Array]:
+    """Render depth and display-encoded colours; the longest edge is at most :data:`_VIEW_SIZE` px."""
+    small, layers = render_sized(splats, camera, _VIEW_SIZE)
     shown = encode_srgb(layers.captured / np.maximum(layers.alpha, 1e-6)[..., None])
     return DepthView.of(small, layers, _OPAQUE), np.asarray(shown, dtype=np.float32)

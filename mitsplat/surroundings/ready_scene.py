@@ -15,11 +15,11 @@ from mitsplat.surroundings.supports import Support
 
 _MARGIN = 0.05
 """Largest margin between the drop region and its surroundings [m]."""
-_WIDEST = 0.6
+_MAX_REGION = 0.6
 """Longest side of the drop region [m]."""
-_GAP = 40.0
+_MIN_GAP = 40.0
 """Least azimuth gap between photos that the scene's cameras also avoid [degrees]."""
-_THICK = 0.04
+_BOX_THICKNESS = 0.04
 """Thickness of the boxes [m]."""
 
 Region = tuple[float, float, float, float]
@@ -47,24 +47,25 @@ def scene_text(
     margin = min(_MARGIN, 0.25 * min(free[1] - free[0], free[3] - free[2]))
     spans = []
     for low, high in (free[:2], free[2:]):
-        half = min((high - low) / 2 - margin, _WIDEST / 2)
+        half = min((high - low) / 2 - margin, _MAX_REGION / 2)
         spans.append(((low + high) / 2 - half, (low + high) / 2 + half))
     (x0, x1), (y0, y1) = spans
     target = np.array([(x0 + x1) / 2, (y0 + y1) / 2, 0.02])
-    near, far, low, high, start, end = _seen_from(cameras, target)
+    near, far, low, high, start, end = _camera_ranges(cameras, target)
     middle = cameras[len(cameras) // 2]
     fov = float(np.degrees(2 * np.arctan(middle.width / 2 / middle.fx)))
     boxes = "\n".join(
-        f"  - {{name: {_name(number)}, box: {{size: [{_m(s.size[0])}, {_m(s.size[1])}, {_THICK}], "
-        f"position: [{_m(s.pose[0, 3])}, {_m(s.pose[1, 3])}, {_m(s.height - _THICK / 2)}], "
+        f"  - {{name: {_surface_name(number)}, "
+        f"box: {{size: [{_length(s.size[0])}, {_length(s.size[1])}, {_BOX_THICKNESS}], "
+        f"position: [{_length(s.pose[0, 3])}, {_length(s.pose[1, 3])}, {_length(s.height - _BOX_THICKNESS / 2)}], "
         f"rotate: [0, 0, {s.angle:.2f}]}}}}"
         for number, s in enumerate(supports)
     )
     return _SCENE.format(
-        name=name, folder=folder, boxes=boxes, x0=_m(x0), x1=_m(x1), y0=_m(y0), y1=_m(y1), margin=_m(margin),
-        tx=_m(target[0]), ty=_m(target[1]), near=_m(near), far=_m(far), low=f"{low:.0f}", high=f"{high:.0f}",
-        start=f"{start:.0f}", end=f"{end:.0f}", fov=f"{min(fov, 120):.0f}",
-        lights=_ROOM if light is None else _lights(light, supports[0]),
+        name=name, folder=folder, boxes=boxes, x0=_length(x0), x1=_length(x1), y0=_length(y0), y1=_length(y1),
+        margin=_length(margin), tx=_length(target[0]), ty=_length(target[1]), near=_length(near), far=_length(far),
+        low=f"{low:.0f}", high=f"{high:.0f}", start=f"{start:.0f}", end=f"{end:.0f}", fov=f"{min(fov, 120):.0f}",
+        lights=_ROOM_LIGHTS if light is None else _lights(light, supports[0]),
     )  # fmt: skip
 
 
@@ -83,7 +84,7 @@ def _lights(light: ShadingLight, support: Support) -> str:
     return "\n".join(lines)
 
 
-def _seen_from(cameras: Sequence[Camera], target: Float64Array) -> tuple[float, float, float, float, float, float]:
+def _camera_ranges(cameras: Sequence[Camera], target: Float64Array) -> tuple[float, float, float, float, float, float]:
     """Return the ranges of distance [m], elevation and azimuth [degrees] of most photos of a place."""
     away = np.array([camera.centre for camera in cameras]) - target
     distance = np.linalg.norm(away, axis=1)
@@ -92,7 +93,7 @@ def _seen_from(cameras: Sequence[Camera], target: Float64Array) -> tuple[float, 
     gaps = np.diff(np.append(turn, turn[0] + 360))
     widest = int(gaps.argmax())
     start, end = 0.0, 360.0
-    if gaps[widest] > _GAP:
+    if gaps[widest] > _MIN_GAP:
         start = float(np.append(turn, turn[0] + 360)[widest + 1]) % 360
         end = start + 360 - float(gaps[widest])
     near, far = np.quantile(distance, (0.15, 0.7))
@@ -100,11 +101,11 @@ def _seen_from(cameras: Sequence[Camera], target: Float64Array) -> tuple[float, 
     return float(near), max(float(far), 1.05 * float(near)), float(low), max(float(high), float(low) + 2), start, end
 
 
-def _name(number: int) -> str:
+def _surface_name(number: int) -> str:
     return "support" if number == 0 else f"surface{number}"
 
 
-def _m(length: float) -> str:
+def _length(length: float) -> str:
     """Format a length to a tenth of a millimetre."""
     return f"{round(float(length), 4) + 0.0:g}"
 
@@ -135,7 +136,7 @@ camera:  # about as the photos were taken
 {lights}
 output: {{width: 960, height: 540, layouts: 4, views: 3, image: jpg}}
 """
-_ROOM = """\
+_ROOM_LIGHTS = """\
 lights:  # of a room; `mitsplat lights` makes those of yours
   - {kind: area, position: [0.5, -0.4, 1.6], target: [0, 0, 0], size: [0.6, 0.6], radiance: 10}
   - {kind: environment, radiance: 0.4}"""

@@ -26,27 +26,27 @@ from mitsplat.surroundings.ground import CELL, Grid, Ground
 from mitsplat.surroundings.supports import Support, find_walls
 from mitsplat.surroundings.texture_fill import dilated, fill
 
-_APART = 0.02
+_VOXEL = 0.02
 """Edge of the voxels that separate things, as a share of the typical depth."""
-_SPARSE = 0.05
+_SPARSE_SHARE = 0.05
 """Number of points in a voxel below which it counts as free, as a share of the median number."""
-_PICKED = 3
+_PICK_TOLERANCE = 3
 """Largest distance between a picked position and a point of the thing [voxels]."""
-_OVER = 3
+_MAX_OVERHANG = 3
 """Largest overhang of a thing beyond its support [voxels]."""
-_REACH = 2.0
+_RADIUS_SIGMAS = 2.0
 """Radius of a Gaussian in standard deviations."""
-_ON = 0.5
+_OTHER_DISTANCE = 0.5
 """Distance from the surface of another thing above which a Gaussian over the footprint does not belong to that thing
 [voxels].
 """
-_BESIDE = 4
+_OWNER_MARGIN = 4
 """Margin around a thing in which the nearest point decides on the owner of a Gaussian [voxels]."""
-_BLED = 2
+_BLEED_WIDTH = 2
 """Width of the border around the hidden area whose colours the thing contaminates, in units of :data:`OFF`."""
-_FEET = 0.4
+_FEET_RANGE = 0.4
 """Half the height range of a thing's feet around half of :data:`OFF`, as a share of :data:`OFF`."""
-_STRAY = 0.02
+_STRAY_SHARE = 0.02
 """Share of a thing's points that are ignored for its distance from a wall."""
 
 
@@ -78,7 +78,7 @@ class RemovedThing:
     copied: float
 
     @property
-    def whole(self) -> float:
+    def filled_area(self) -> float:
         """Total filled area."""
         return self.area + self.behind
 
@@ -120,12 +120,12 @@ def remove_things(
         return grounds[number]
 
     for pick in picks:
-        number, spot = _picked(splats, pick, capture, supports, scale)
-        splats, own, places, thing = _remove(splats, pick, number, spot, ground(number), walls, places, scale)
+        number, spot = _find_pick(splats, pick, capture, supports, scale)
+        splats, own, places, thing = _remove_thing(splats, pick, number, spot, ground(number), walls, places, scale)
         for place, wall in enumerate(walls, len(supports)):
-            if _stands_close(own, wall, scale):
+            if _is_close_to_wall(own, wall, scale):
                 splats, area, copied = _fill_behind(splats, own, places, ground(place), scale)
-                share = (thing.copied * thing.whole + copied * area) / (thing.whole + area)
+                share = (thing.copied * thing.filled_area + copied * area) / (thing.filled_area + area)
                 thing = replace(thing, behind=thing.behind + area, copied=share)
         removed.append(thing)
         if progress is not None:
@@ -133,7 +133,7 @@ def remove_things(
     return splats, removed
 
 
-def _remove(
+def _remove_thing(
     splats: Splats,
     pick: str,
     number: int,
@@ -148,12 +148,12 @@ def _remove(
     inverse = np.asarray(np.linalg.inv(support.pose))
     # Points on walls are excluded, so that a thing that touches a wall ends there.
     loose = ~np.any([np.zeros(len(places), dtype=bool), *(w.holds(places, OFF * scale) for w in walls)], axis=0)
-    thing, others = _apart(support.local(places), loose, spot, support, scale)
+    thing, others = _separate_thing(support.local(places), loose, spot, support, scale)
     if thing is None:
         raise InputError(f"{pick}: the photos do not show enough of what is there to tell it from the rest")
-    standing, footprint, hole = _hidden(ground, thing, others, scale)
-    gone = _of_thing(splats.transformed(inverse), thing, others, grid, footprint, hole, scale)
-    sheet, copied = _filled(ground, standing, hole)
+    standing, footprint, hole = _hidden_cells(ground, thing, others, scale)
+    gone = _thing_gaussians(splats.transformed(inverse), thing, others, grid, footprint, hole, scale)
+    sheet, copied = _fill_hole(ground, standing, hole)
     removed = RemovedThing(
         pick=pick,
         support=number,
@@ -167,13 +167,17 @@ def _remove(
     )
     left = Splats.concatenate([splats.select(~gone), sheet])
     cells = grid.cells(others[:, :2])
-    feet = (cells >= 0).all(axis=1) & footprint[tuple(cells.T)] & (np.abs(others[:, 2] / (OFF * scale) - 0.5) < _FEET)
+    feet = (
+        (cells >= 0).all(axis=1)
+        & footprint[tuple(cells.T)]
+        & (np.abs(others[:, 2] / (OFF * scale) - 0.5) < _FEET_RANGE)
+    )
     parts = np.concatenate([thing, others[feet]]), others[~feet]
     own, rest = (part @ support.pose[:3, :3].T + support.pose[:3, 3] for part in parts)
     return left, own, rest, removed
 
 
-def _stands_close(thing: Float64Array, wall: Support, scale: float) -> bool:
+def _is_close_to_wall(thing: Float64Array, wall: Support, scale: float) -> bool:
     """Return True if points (N, 3) of a thing are in front of a wall and nearer to it than the thing is wide.
 
     A thing farther away hides nothing from all cameras, because some of them see past it.
@@ -182,7 +186,7 @@ def _stands_close(thing: Float64Array, wall: Support, scale: float) -> bool:
     before = (np.abs(local[:, :2]) <= np.array(wall.size) / 2).all(axis=1)
     if not before.any() or np.median(local[:, 2]) < OFF * scale:
         return False
-    return bool(-OFF * scale < np.quantile(local[:, 2], _STRAY) < np.ptp(local[:, :2], axis=0).max())
+    return bool(-OFF * scale < np.quantile(local[:, 2], _STRAY_SHARE) < np.ptp(local[:, :2], axis=0).max())
 
 
 def _fill_behind(
@@ -190,16 +194,16 @@ def _fill_behind(
 ) -> tuple[Splats, float, float]:
     """Fill the area of a wall that a removed thing hid; return the splats, the area, and the share that is copied."""
     wall = ground.support
-    standing, _, hole = _hidden(ground, wall.local(thing), wall.local(others), scale)
+    standing, _, hole = _hidden_cells(ground, wall.local(thing), wall.local(others), scale)
     if not hole.any():
         return splats, 0.0, 1.0
-    guessed = _guesses(splats.transformed(np.linalg.inv(wall.pose)), ground.grid, hole, scale)
-    sheet, copied = _filled(ground, standing, hole)
+    guessed = _hole_gaussians(splats.transformed(np.linalg.inv(wall.pose)), ground.grid, hole, scale)
+    sheet, copied = _fill_hole(ground, standing, hole)
     area = float(hole.sum()) * ground.grid.cell**2
     return Splats.concatenate([splats.select(~guessed), sheet]), area, copied
 
 
-def _hidden(
+def _hidden_cells(
     ground: Ground, thing: Float64Array, others: Float64Array, scale: float
 ) -> tuple[BoolArray, BoolArray, BoolArray]:
     """Return cells of a surface that other points stand on, that a thing is above, and that it hid, (X, Y) each.
@@ -212,10 +216,10 @@ def _hidden(
     parts, _ = label(~ground.seen & ~standing)
     hidden = np.isin(parts, np.setdiff1d(parts[footprint], [0]))
     core = binary_fill_holes(hidden & dilated(footprint, 4 * margin))
-    return standing, footprint, dilated(np.asarray(core), _BLED * margin) & ~standing
+    return standing, footprint, dilated(np.asarray(core), _BLEED_WIDTH * margin) & ~standing
 
 
-def _filled(ground: Ground, standing: BoolArray, hole: BoolArray) -> tuple[Splats, float]:
+def _fill_hole(ground: Ground, standing: BoolArray, hole: BoolArray) -> tuple[Splats, float]:
     """Return a sheet for a hole of a surface, and the share of it that is copied; the hole then counts as seen."""
     margin = round(OFF / CELL)
     ground.texture, copied = fill(ground.texture, ground.seen & ~hole & ~dilated(standing, margin), hole)
@@ -225,7 +229,7 @@ def _filled(ground: Ground, standing: BoolArray, hole: BoolArray) -> tuple[Splat
     return sheet.transformed(ground.support.pose), copied
 
 
-def _picked(
+def _find_pick(
     splats: Splats, pick: str, capture: Capture, supports: Sequence[Support], scale: float
 ) -> tuple[int, Float64Array]:
     """Return the index of the support below the thing at a pixel, and the position (3,) in the support's frame."""
@@ -247,7 +251,7 @@ def _picked(
     return found, supports[found].local(spot)
 
 
-def _apart(
+def _separate_thing(
     points: Float64Array, loose: BoolArray, spot: Float64Array, support: Support, scale: float
 ) -> tuple[Float64Array | None, Float64Array]:
     """Return the points of the thing at a position, or None, and all other points without stray ones.
@@ -261,28 +265,28 @@ def _apart(
     standing = np.flatnonzero(over & high)
     if not len(standing):
         return None, points
-    edge = _APART * scale
+    edge = _VOXEL * scale
     voxel = np.floor(points[standing] / edge).astype(np.int64)
     low = voxel.min(axis=0) - 1
     voxel -= low
     count: Int64Array = np.zeros(voxel.max(axis=0) + 2, dtype=np.int64)
     np.add.at(count, tuple(voxel.T), 1)
-    parts = np.asarray(label(count > _SPARSE * np.median(count[count > 0]), np.ones((3, 3, 3)))[0])
+    parts = np.asarray(label(count > _SPARSE_SHARE * np.median(count[count > 0]), np.ones((3, 3, 3)))[0])
     near = np.argwhere(parts > 0)
     gaps = np.linalg.norm((near + low + 0.5) * edge - spot, axis=1)
-    if not len(near) or gaps.min() > _PICKED * edge:
+    if not len(near) or gaps.min() > _PICK_TOLERANCE * edge:
         return None, points
     part = parts[tuple(voxel.T)]
     own = part == parts[tuple(near[gaps.argmin()])]
     thing = points[standing[own]]
     beside = np.flatnonzero(~over & high)
-    away = KDTree(_thinned(thing, 0.5 * edge)).query(points[beside], distance_upper_bound=_OVER * edge)[0]
+    away = KDTree(_subsample(thing, 0.5 * edge)).query(points[beside], distance_upper_bound=_MAX_OVERHANG * edge)[0]
     beside = beside[np.isfinite(away)]
     gone = np.concatenate([standing[own | (part == 0)], beside])
     return np.concatenate([thing, points[beside]]), np.delete(points, gone, axis=0)
 
 
-def _of_thing(
+def _thing_gaussians(
     splats: Splats,
     thing: Float64Array,
     others: Float64Array,
@@ -292,13 +296,13 @@ def _of_thing(
     scale: float,
 ) -> BoolArray:
     """Return True for Gaussians (N,) to remove: on the surface and inside the thing, and in or below the hole."""
-    reach, means = _APART * scale, splats.means.astype(np.float64)
-    beside = _BESIDE * reach
+    reach, means = _VOXEL * scale, splats.means.astype(np.float64)
+    beside = _OWNER_MARGIN * reach
     low, high = thing.min(axis=0) - beside, thing.max(axis=0) + beside
     low[2] = -TALL * scale
     rows = np.flatnonzero(((means > low) & (means < high)).all(axis=1))
     around = others[((others > low - beside) & (others < high + beside)).all(axis=1)]
-    surface, around = _thinned(thing, 0.25 * reach), _thinned(around, 0.25 * reach)
+    surface, around = _subsample(thing, 0.25 * reach), _subsample(around, 0.25 * reach)
     both = np.concatenate([surface, around])
     away, nearest = KDTree(both).query(means[rows])
     own, bare = nearest < len(surface), both[nearest, 2] < OFF * scale
@@ -308,13 +312,15 @@ def _of_thing(
     inside = np.asarray((cells >= 0).all(axis=1))
     cells = np.where(inside[:, None], cells, 0)
     over = inside & footprint[tuple(cells.T)]
-    goes = (own | (over & (bare | (away > _ON * reach)) & (height < top))) & (height > floor)
-    gone = _reaching(splats, grid.inside(thing, footprint, reach)) | _guesses(splats, grid, hole, scale)
+    goes = (own | (over & (bare | (away > _OTHER_DISTANCE * reach)) & (height < top))) & (height > floor)
+    gone = _gaussians_reaching(splats, grid.inside(thing, footprint, reach)) | _hole_gaussians(
+        splats, grid, hole, scale
+    )
     gone[rows[goes]] = True
     return gone
 
 
-def _guesses(splats: Splats, grid: Grid, hole: BoolArray, scale: float) -> BoolArray:
+def _hole_gaussians(splats: Splats, grid: Grid, hole: BoolArray, scale: float) -> BoolArray:
     """Return True for Gaussians (N,) in the hole of a surface, or below it and reaching out of it.
 
     The splats are in the surface's frame.
@@ -328,13 +334,13 @@ def _guesses(splats: Splats, grid: Grid, hole: BoolArray, scale: float) -> BoolA
     rows = np.flatnonzero(near)
     rows = rows[hole[tuple(cells[rows].T)]]
     axes = Rotation.from_quat(splats.quats[rows]).as_matrix()[:, 2]
-    tip = height[rows] + _REACH * np.sqrt(((axes * splats.scales[rows]) ** 2).sum(axis=1))
+    tip = height[rows] + _RADIUS_SIGMAS * np.sqrt(((axes * splats.scales[rows]) ** 2).sum(axis=1))
     guessed = np.zeros(len(splats), dtype=bool)
     guessed[rows[(height[rows] >= -floor) | (tip > floor)]] = True
     return guessed
 
 
-def _reaching(splats: Splats, places: Float64Array) -> BoolArray:
+def _gaussians_reaching(splats: Splats, places: Float64Array) -> BoolArray:
     """Return True for Gaussians (N,) that reach any of the given positions.
 
     The positions were hidden, so no photo constrains Gaussians there.
@@ -345,18 +351,18 @@ def _reaching(splats: Splats, places: Float64Array) -> BoolArray:
     middle = places.mean(axis=0)
     radius = np.linalg.norm(places - middle, axis=1).max()
     away = np.linalg.norm(splats.means - middle, axis=1)
-    rows = np.flatnonzero(away < radius + _REACH * splats.scales.max(axis=1))
+    rows = np.flatnonzero(away < radius + _RADIUS_SIGMAS * splats.scales.max(axis=1))
     means, scales = splats.means[rows].astype(np.float64), splats.scales[rows]
     axes = Rotation.from_quat(splats.quats[rows]).as_matrix()
     reached = np.zeros(len(rows), dtype=bool)
     for place in places:
         local = np.einsum("nij,ni->nj", axes, place - means) / scales
-        reached |= (local**2).sum(axis=1) < _REACH**2
+        reached |= (local**2).sum(axis=1) < _RADIUS_SIGMAS**2
     found[rows[reached]] = True
     return found
 
 
-def _thinned(points: Float64Array, edge: float) -> Float64Array:
+def _subsample(points: Float64Array, edge: float) -> Float64Array:
     """Return one of the points (N, 3) in each cube of the given edge."""
     _, first = np.unique(np.floor(points / edge).astype(np.int64), axis=0, return_index=True)
     return points[first]

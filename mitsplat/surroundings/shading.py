@@ -22,35 +22,35 @@ from mitsplat.images.colour import LUMINANCE
 
 _DISTANCES = (1.0, 1.5, 2.2, 3.3)
 """Distances of candidate lamps from the centre [m]."""
-_TURN, _RISE = 10.0, 8.0
+_AZIMUTH_STEP, _ELEVATION_STEP = 10.0, 8.0
 """Azimuth and elevation steps between candidates [degrees]."""
-_LOWEST = 14.0
+_MIN_ELEVATION = 14.0
 """Elevation of the lowest candidates [degrees]."""
-_NEAREST, _FARTHEST = 0.8, 4.0
+_MIN_DISTANCE, _MAX_DISTANCE = 0.8, 4.0
 """Range of the distances of lamps [m]."""
-_SINE = np.sin(np.radians(10.0))
+_MIN_SINE = np.sin(np.radians(10.0))
 _SIZES = (0.1, 0.2, 0.4, 0.8)
 """Candidate edges of lamps [m]."""
-_POINTS = 8
+_LAMP_SAMPLES = 8
 """Sample points of a lamp with soft shadows."""
-_STEPS = (6.0, 3.0, 1.5)
+_DIRECTION_STEPS = (6.0, 3.0, 1.5)
 """Step sizes of the refinement of a lamp's direction [degrees]."""
-_COMMON = 0.1
+_FULL_WEIGHT_RESIDUAL = 0.1
 """Largest residual of the logarithm of brightness with full weight."""
-_GAIN = 0.025
+_MIN_GAIN = 0.025
 """Least relative reduction of the residual by a further lamp."""
-_MOST = 3
-_FEWEST, _CELLS = 300, 1500
+_MAX_LAMPS = 3
+_MIN_CELLS, _MAX_CELLS = 300, 1500
 """Least and largest number of cells in the estimation."""
-_SCANNED = 800
+_SCAN_CELLS = 800
 """Largest number of cells in the search over candidates."""
-_STRIDES = 16
+_RAY_BLOCK = 16
 """Number of steps along shadow rays that are tested together."""
-_DARKEST = 0.02
+_MIN_AMBIENT = 0.02
 """Least share of ambient light."""
-_LEAST = 0.08
+_MIN_LAMP_SHARE = 0.08
 """Least share of the light for a lamp."""
-_SKY = 256
+_SKY_DIRECTIONS = 256
 """Number of directions of ambient light."""
 
 
@@ -85,8 +85,8 @@ class ShadingLight:
     @property
     def ambient_share(self) -> float:
         """Share of ambient light at the centre."""
-        whole = self.ambient + sum((lamp.irradiance for lamp in self.lamps), np.zeros(3))
-        return float((self.ambient @ LUMINANCE) / (whole @ LUMINANCE))
+        total = self.ambient + sum((lamp.irradiance for lamp in self.lamps), np.zeros(3))
+        return float((self.ambient @ LUMINANCE) / (total @ LUMINANCE))
 
 
 def light_of_shading(
@@ -103,35 +103,35 @@ def light_of_shading(
     Returns:
         Lamps relative to the centre of the cells, or None if shading does not determine any.
     """
-    surface = _Surface(colours, heights, open_to_view, cell, _CELLS)
-    if surface.few:
+    surface = _Surface(colours, heights, open_to_view, cell, _MAX_CELLS)
+    if surface.too_few:
         return None
     lamps = list[tuple[Float64Array, float]]()
-    columns = [surface.sky()]
-    left, _ = surface.explain(columns)
-    scan = _Surface(colours, heights, open_to_view, cell, _SCANNED)
-    candidates = [distance * way for distance in _DISTANCES for way in _ways()]
-    shades = [scan.lit(place, 0.0) for place in candidates]
-    while len(lamps) < _MOST:
-        known = [scan.sky(), *(scan.lit(*lamp) for lamp in lamps)]
-        tried = [scan.explain([*known, shade])[0] for shade in shades]
-        place, size = surface.improved(columns, candidates[int(np.argmin(tried))])
-        column = surface.lit(place, size)
-        now, weights = surface.explain([*columns, column])
-        if now > (1 - _GAIN) * left or weights[-1] < _LEAST * weights.sum():
+    columns = [surface.sky_irradiance()]
+    left, _ = surface.fit(columns)
+    scan = _Surface(colours, heights, open_to_view, cell, _SCAN_CELLS)
+    candidates = [distance * way for distance in _DISTANCES for way in _candidate_directions()]
+    shades = [scan.lamp_irradiance(place, 0.0) for place in candidates]
+    while len(lamps) < _MAX_LAMPS:
+        known = [scan.sky_irradiance(), *(scan.lamp_irradiance(*lamp) for lamp in lamps)]
+        tried = [scan.fit([*known, shade])[0] for shade in shades]
+        place, size = surface.refine_lamp(columns, candidates[int(np.argmin(tried))])
+        column = surface.lamp_irradiance(place, size)
+        now, weights = surface.fit([*columns, column])
+        if now > (1 - _MIN_GAIN) * left or weights[-1] < _MIN_LAMP_SHARE * weights.sum():
             break
         lamps.append((place, size))
         columns.append(column)
         for k in range(len(lamps) - 1):  # refine the earlier lamps, which were estimated without this one
             others = columns[: k + 1] + columns[k + 2 :]
-            lamps[k] = surface.improved(others, *lamps[k])
-            columns[k + 1] = surface.lit(*lamps[k])
-        left, _ = surface.explain(columns)
+            lamps[k] = surface.refine_lamp(others, *lamps[k])
+            columns[k + 1] = surface.lamp_irradiance(*lamps[k])
+        left, _ = surface.fit(columns)
     if not lamps:
         return None
-    _, weights = surface.explain(columns)
-    weights[0] = max(weights[0], _DARKEST * weights.sum())
-    tinted = np.array([surface.explain(columns, channel / channel.mean())[1][1:] for channel in surface.colours.T])
+    _, weights = surface.fit(columns)
+    weights[0] = max(weights[0], _MIN_AMBIENT * weights.sum())
+    tinted = np.array([surface.fit(columns, channel / channel.mean())[1][1:] for channel in surface.colours.T])
     tinted *= weights[1:].sum() / np.maximum(tinted.sum(axis=1, keepdims=True), 1e-9) / weights.sum()
     order = np.argsort(-weights[1:])
     return ShadingLight(
@@ -140,12 +140,12 @@ def light_of_shading(
     )
 
 
-def _ways() -> list[Float64Array]:
+def _candidate_directions() -> list[Float64Array]:
     """Return the directions of candidates from the centre, shape (3,) each."""
     return [
         np.array([np.cos(turn) * np.cos(rise), np.sin(turn) * np.cos(rise), np.sin(rise)])
-        for rise in np.radians(np.arange(_LOWEST, 90, _RISE))
-        for turn in np.linspace(0, 2 * np.pi, max(1, round(360 / _TURN * np.cos(rise))), endpoint=False)
+        for rise in np.radians(np.arange(_MIN_ELEVATION, 90, _ELEVATION_STEP))
+        for turn in np.linspace(0, 2 * np.pi, max(1, round(360 / _AZIMUTH_STEP * np.cos(rise))), endpoint=False)
     ]
 
 
@@ -156,7 +156,7 @@ class _Surface:
         self, colours: Float64Array, heights: Float64Array, open_to_view: BoolArray, cell: float, most: int
     ) -> None:
         chosen = np.argwhere(open_to_view & (heights <= 0))
-        self.few = len(chosen) < _FEWEST
+        self.too_few = len(chosen) < _MIN_CELLS
         if len(chosen) > most:
             chosen = chosen[np.random.default_rng(0).choice(len(chosen), most, replace=False)]
         self.colours = colours[tuple(chosen.T)]
@@ -168,7 +168,7 @@ class _Surface:
         x, y = (self.places / (cell * max(heights.shape)))[:, :2].T
         self._smooth = np.stack([np.ones(len(x)), x, y, x * x, x * y, y * y], axis=1)
 
-    def _sees(self, ways: Float64Array) -> BoolArray:
+    def _unoccluded(self, ways: Float64Array) -> BoolArray:
         """Return True for cells (N,) whose upward ray in direction (N, 3) or (3,) is not occluded."""
         ways = np.broadcast_to(ways, self.places.shape)
         flat = np.maximum(np.linalg.norm(ways[:, :2], axis=1), 1e-9)
@@ -176,8 +176,8 @@ class _Surface:
         free, rows = np.ones(len(ways), dtype=bool), np.arange(len(ways))
         (width, depth), tall = self._heights.shape, float(self._heights.max())
         around = np.pad(self._heights, 1)  # no occluders outside the cells
-        for first in range(1, int(np.hypot(width, depth)) + 1, _STRIDES):
-            number = np.arange(first, first + _STRIDES)[:, None]
+        for first in range(1, int(np.hypot(width, depth)) + 1, _RAY_BLOCK):
+            number = np.arange(first, first + _RAY_BLOCK)[:, None]
             at = [
                 np.rint(start + number * step).clip(-1, most).astype(np.int64) + 1
                 for start, step, most in ((x, ahead, width), (y, aside, depth))
@@ -190,7 +190,7 @@ class _Surface:
             rows, rise, ahead, aside, x, y = (values[left] for values in (rows, rise, ahead, aside, x, y))
         return free
 
-    def explain(self, columns: Sequence[Float64Array], seen: Float64Array | None = None) -> tuple[float, Float64Array]:
+    def fit(self, columns: Sequence[Float64Array], seen: Float64Array | None = None) -> tuple[float, Float64Array]:
         """Fit the brightness by columns of irradiance; return the mean absolute log residual and the weights.
 
         Least absolute deviations by iteratively reweighted least squares; slow variations over the surface are fitted
@@ -202,22 +202,22 @@ class _Surface:
             weights, _ = nnls(matrix * share[:, None], seen * np.exp(-smooth) * share)
             light = np.maximum(matrix @ weights, 0.02)
             ratio = np.log(np.maximum(seen, 1e-3) / light)
-            counted = 1 / np.sqrt(np.maximum(np.abs(ratio - smooth), _COMMON))
+            counted = 1 / np.sqrt(np.maximum(np.abs(ratio - smooth), _FULL_WEIGHT_RESIDUAL))
             smooth = self._smooth @ np.linalg.lstsq(self._smooth * counted[:, None], ratio * counted, rcond=None)[0]
             share = counted / light
         return float(np.mean(np.abs(ratio - smooth))), weights
 
-    def sky(self) -> Float64Array:
+    def sky_irradiance(self) -> Float64Array:
         """Return the ambient irradiance of the cells, 1 without occlusion."""
-        points = qmc.Sobol(2, seed=0).random(_SKY)
+        points = qmc.Sobol(2, seed=0).random(_SKY_DIRECTIONS)
         radius, turn = np.sqrt(points[:, 0]), 2 * np.pi * points[:, 1]
         ways = np.stack([radius * np.cos(turn), radius * np.sin(turn), np.sqrt(1 - points[:, 0])], axis=1)
         seen = np.zeros(len(self.places))
         for way in ways:
-            seen += self._sees(way)
-        return seen / _SKY
+            seen += self._unoccluded(way)
+        return seen / _SKY_DIRECTIONS
 
-    def lit(self, place: Float64Array, size: float) -> Float64Array:
+    def lamp_irradiance(self, place: Float64Array, size: float) -> Float64Array:
         """Return the irradiance of the cells from a lamp that faces the centre, 1 at an unoccluded centre."""
         points = place + self._spread(place, size)
         light = np.zeros(len(self.places))
@@ -225,7 +225,7 @@ class _Surface:
             towards = point - self.places
             away = np.linalg.norm(towards, axis=1)
             facing = (towards @ place) / (away * np.linalg.norm(place))
-            light += self._sees(towards) * facing.clip(0) * towards[:, 2].clip(0) / away**3
+            light += self._unoccluded(towards) * facing.clip(0) * towards[:, 2].clip(0) / away**3
         cosine = place[2] / np.linalg.norm(place)
         return np.asarray(light / len(points) * (place @ place) / cosine)
 
@@ -234,33 +234,33 @@ class _Surface:
         """Return sample points of a square that faces the centre of the surface, relative to its own centre, (P, 3)."""
         if size == 0:
             return np.zeros((1, 3))
-        flat = size * (qmc.Sobol(2, seed=1).random(_POINTS) - 0.5)
+        flat = size * (qmc.Sobol(2, seed=1).random(_LAMP_SAMPLES) - 0.5)
         return np.asarray(flat @ rectangle_axes(place / np.linalg.norm(place)))
 
-    def improved(
+    def refine_lamp(
         self, columns: Sequence[Float64Array], place: Float64Array, size: float = _SIZES[1]
     ) -> tuple[Float64Array, float]:
         """Refine position and size of a lamp so that it explains most in addition to the given columns."""
-        best, _ = self.explain([*columns, self.lit(place, size)])
-        for step in _STEPS:
+        best, _ = self.fit([*columns, self.lamp_irradiance(place, size)])
+        for step in _DIRECTION_STEPS:
             for _ in range(6):
-                moved = [(self._turned(place, step, turn), size) for turn in np.radians(np.arange(0, 360, 60))]
+                moved = [(self._rotated(place, step, turn), size) for turn in np.radians(np.arange(0, 360, 60))]
                 moved += [(place * (1 + sign * step / 30), size) for sign in (-1, 1)]
                 moved += [(place, other) for other in _SIZES if other != size]
-                moved = [one for one in moved if self._may_be(one[0])]
-                tried = [self.explain([*columns, self.lit(*one)])[0] for one in moved]
+                moved = [one for one in moved if self._is_allowed(one[0])]
+                tried = [self.fit([*columns, self.lamp_irradiance(*one)])[0] for one in moved]
                 if min(tried) >= best:
                     break
                 best, (place, size) = min(tried), moved[int(np.argmin(tried))]
         return place, size
 
     @staticmethod
-    def _may_be(place: Float64Array) -> bool:
+    def _is_allowed(place: Float64Array) -> bool:
         away = float(np.linalg.norm(place))
-        return _NEAREST <= away <= _FARTHEST and place[2] > _SINE * away
+        return _MIN_DISTANCE <= away <= _MAX_DISTANCE and place[2] > _MIN_SINE * away
 
     @staticmethod
-    def _turned(place: Float64Array, step: float, turn: float) -> Float64Array:
+    def _rotated(place: Float64Array, step: float, turn: float) -> Float64Array:
         """Rotate a position about the centre by ``step`` degrees, in the tangential direction ``turn`` [rad]."""
         way = place / np.linalg.norm(place)
         across = np.cross(way, [0.0, 0.0, 1.0] if abs(way[2]) < 0.9 else [1.0, 0.0, 0.0])

@@ -20,31 +20,31 @@ from mitsplat.geometry.camera import direction
 from mitsplat.importing.upright import POINTS, largest_plane, rotation_to_z
 from mitsplat.surroundings.depth_views import SurfacePoints
 
-_SAME = 25.0
+_NORMAL_ANGLE = 25.0
 """Largest angle between the normals of a point and of its plane [degrees]."""
 _TOLERANCE = 0.008
 """Largest distance of a point from its plane, as a share of the typical depth."""
-_SPREADS, _LEAST = 5.0, 0.001
+_FIT_SPREADS, _MIN_TOLERANCE = 5.0, 0.001
 """Largest distance after the fit, in median distances, and its lower limit as a share of the typical depth."""
-_SMALLEST = 0.02
+_MIN_PLANE_SHARE = 0.02
 """Least share of the upward points in a plane."""
-_MOST = 6
+_MAX_PLANES = 6
 """Largest number of planes."""
 _CELL = 0.01
 """Edge of the cells that define the parts of a plane, as a share of the typical depth."""
-_RIM = 0.5
+_MIN_ROW_FILL = 0.5
 """Least number of cells in an outer row of a rectangle, relative to its median row; emptier rows are cut off."""
 _TRIMS = 6
 
-_SIDES = 6
+_WALL_DIRECTIONS = 6
 """Number of directions in the search for walls."""
-_LEANING = 10.0
+_MAX_WALL_LEAN = 10.0
 """Largest angle of a wall to the vertical [degrees]."""
-_BEHIND = 0.05
+_MAX_BEHIND = 0.05
 """Largest number of points behind a wall, as a share of the points in it."""
-_FILLED = 0.5
+_MIN_FILLED = 0.5
 """Least filled share of a support's rectangle."""
-_LEAST_AREA = 0.02
+_MIN_AREA = 0.02
 """Least area of a support, as a share of the typical depth squared."""
 
 
@@ -110,27 +110,27 @@ def find_supports(points: SurfacePoints, up: Float64Array, scale: float, within:
         scale: Typical depth of the photos.
         within: Largest tilt of surfaces against ``up`` [degrees].
     """
-    upward = points.normals @ up > np.cos(np.radians(within + _SAME))
+    upward = points.normals @ up > np.cos(np.radians(within + _NORMAL_ANGLE))
     places, normals = points.places[upward], points.normals[upward]
     weights = points.central[upward].astype(np.float64) / max(int(points.central.sum()), 1)
     total, found = len(places), list[Support]()
     left = np.ones(total, dtype=bool)
     rng = np.random.default_rng(0)
-    for _ in range(_MOST):
+    for _ in range(_MAX_PLANES):
         rows = np.flatnonzero(left)
-        if len(rows) < max(3, _SMALLEST * total):
+        if len(rows) < max(3, _MIN_PLANE_SHARE * total):
             break
         sample = places[rng.choice(rows, min(POINTS, len(rows)), replace=False)]
         plane = largest_plane(sample, _TOLERANCE * scale, towards=up, within=within)
-        if plane is None or plane.share * len(rows) < _SMALLEST * total:
+        if plane is None or plane.share * len(rows) < _MIN_PLANE_SHARE * total:
             break
         normal, height, spread = fit_plane(places[left], plane.normal, plane.height, _TOLERANCE * scale)
-        inside = left & (np.abs(places @ normal - height) < max(_SPREADS * spread, _LEAST * scale))
-        inside &= normals @ normal > np.cos(np.radians(_SAME))
+        inside = left & (np.abs(places @ normal - height) < max(_FIT_SPREADS * spread, _MIN_TOLERANCE * scale))
+        inside &= normals @ normal > np.cos(np.radians(_NORMAL_ANGLE))
         left &= np.abs(places @ normal - height) >= 2 * _TOLERANCE * scale
         if inside.any():
-            found += _parts(places[inside], weights[inside], normal, height, spread, up, scale)
-    found = [support for support in found if support.filled >= _FILLED]
+            found += _plane_parts(places[inside], weights[inside], normal, height, spread, up, scale)
+    found = [support for support in found if support.filled >= _MIN_FILLED]
     return sorted(found, key=lambda support: -support.looked_at)
 
 
@@ -144,28 +144,32 @@ def find_walls(points: SurfacePoints, scale: float) -> list[Support]:
         scale: Typical depth of the photos.
     """
     found = list[Support]()
-    for turn in range(_SIDES):
-        towards = direction(2 * np.pi * turn / _SIDES, 0.0)
-        for wall in find_supports(points, towards, scale, within=180 / _SIDES):
-            upright = abs(wall.pose[2, 2]) < np.sin(np.radians(_LEANING))
-            if upright and _bounds(wall, points, scale) and not any(_coincide(wall, other, scale) for other in found):
+    for turn in range(_WALL_DIRECTIONS):
+        towards = direction(2 * np.pi * turn / _WALL_DIRECTIONS, 0.0)
+        for wall in find_supports(points, towards, scale, within=180 / _WALL_DIRECTIONS):
+            upright = abs(wall.pose[2, 2]) < np.sin(np.radians(_MAX_WALL_LEAN))
+            if (
+                upright
+                and _is_boundary(wall, points, scale)
+                and not any(_coincide(wall, other, scale) for other in found)
+            ):
                 found.append(wall)
     return found
 
 
-def _bounds(wall: Support, points: SurfacePoints, scale: float) -> bool:
+def _is_boundary(wall: Support, points: SurfacePoints, scale: float) -> bool:
     """Return True if there are almost no points behind a surface, up to its smaller edge."""
     local = wall.local(points.places)
     before = (np.abs(local[:, :2]) <= np.array(wall.size) / 2 + _CELL * scale).all(axis=1)
     depth = local[before, 2]
     behind = (depth < -2 * _TOLERANCE * scale) & (depth > -min(wall.size))
-    return bool(behind.sum() < _BEHIND * (np.abs(depth) < 2 * _TOLERANCE * scale).sum())
+    return bool(behind.sum() < _MAX_BEHIND * (np.abs(depth) < 2 * _TOLERANCE * scale).sum())
 
 
 def _coincide(one: Support, other: Support, scale: float) -> bool:
     """Return True if the centre of one surface lies in another with the same orientation."""
     inside = other.holds(one.pose[None, :3, 3], _TOLERANCE * scale)[0]
-    return bool(inside and one.pose[:3, 2] @ other.pose[:3, 2] > np.cos(np.radians(_SAME)))
+    return bool(inside and one.pose[:3, 2] @ other.pose[:3, 2] > np.cos(np.radians(_NORMAL_ANGLE)))
 
 
 def fit_plane(
@@ -188,7 +192,7 @@ def fit_plane(
     return np.asarray(normal), height, spread
 
 
-def _parts(
+def _plane_parts(
     places: Float64Array,
     weights: Float64Array,
     normal: Float64Array,
@@ -213,7 +217,7 @@ def _parts(
     found = []
     for number in range(1, count + 1):
         cells = np.argwhere(parts == number)
-        if len(cells) * cell**2 < _LEAST_AREA * scale**2:
+        if len(cells) * cell**2 < _MIN_AREA * scale**2:
             continue
         corners = _rectangle(low + (cells + 0.5) * cell, cell)
         sides = sorted((corners[1] - corners[0], corners[2] - corners[1]), key=lambda side: -float(np.hypot(*side)))
@@ -243,7 +247,7 @@ def _rectangle(middles: Float64Array, cell: float) -> Float64Array:
         for side in (corners[1] - corners[0], corners[2] - corners[1]):
             along = (middles - corners[0]) @ (side / max(float(np.hypot(*side)), 1e-12)) / cell
             row = np.rint(along - along.min()).astype(np.int64)
-            full = np.flatnonzero(np.bincount(row) >= _RIM * np.median(np.bincount(row)))
+            full = np.flatnonzero(np.bincount(row) >= _MIN_ROW_FILL * np.median(np.bincount(row)))
             kept &= (row >= full[0]) & (row <= full[-1])
         if kept.all():
             break

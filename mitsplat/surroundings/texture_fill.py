@@ -19,7 +19,7 @@ from mitsplat.arrays import BoolArray, Float64Array
 
 _RING = 10
 """Width of the surroundings of a hole in the comparison of patches [cells]."""
-_COMPARED = 0.5
+_MIN_KNOWN = 0.5
 """Least share of these surroundings that must be known around a patch."""
 _PATCHES = 8
 
@@ -72,7 +72,7 @@ def _best_shift(texture: Float64Array, known: BoolArray, source: BoolArray, hole
         difference = correlated(target[..., k], valid) - correlated(ring, there[..., k])
         squares = correlated(target[..., k] ** 2, valid) + correlated(ring, there[..., k] ** 2)
         error += (squares - 2 * correlated(target[..., k], there[..., k])) / count - (difference / count) ** 2
-    usable = (count > _COMPARED * ring.sum()) & (covers > 0.5)
+    usable = (count > _MIN_KNOWN * ring.sum()) & (covers > 0.5)
     if not usable.any():
         return None
     most = covers[usable].max()

@@ -19,7 +19,7 @@ from mitsplat.geometry.mesh import prepare_mesh
 from mitsplat.geometry.mesh_distance import DistanceSurface
 from mitsplat.reconstruct.asset_evaluation import sized_photo
 from mitsplat.reconstruct.registration import invert_transform, measure_offset, register_mesh, surface_points
-from mitsplat.reconstruct.surface import SurfaceSettings, _sealed, reconstruct_surface, simplify_surface
+from mitsplat.reconstruct.surface import SurfaceSettings, _close_voids, reconstruct_surface, simplify_surface
 from tests.conftest import KnownObject
 
 
@@ -180,8 +180,8 @@ def test_passages_are_closed_and_hollows_are_not() -> None:
     solid[10:20, 10:20, 10:20] = False
     solid[13:16, 13:16, :10] = False
     solid[24:33, 24:33, 20:] = False
-    sealed = _sealed(np.where(solid, 1.0, -1.0).astype(np.float32), 3.0) > 0
+    sealed = _close_voids(np.where(solid, 1.0, -1.0).astype(np.float32), 3.0) > 0
     assert sealed[10:20, 10:20, 10:20].all()
     assert not sealed[24:33, 24:33, 20:].any()
     assert not sealed[:4].any() and not sealed[36:].any()
-    assert not (_sealed(np.full((4, 4, 4), -1.0, np.float32), 3.0) > 0).any()
+    assert not (_close_voids(np.full((4, 4, 4), -1.0, np.float32), 3.0) > 0).any()

@@ -93,7 +93,7 @@ def run_faults(
 
 def count_faults(scene: Scene) -> Iterator[Finding]:
     """Check that the numbers of objects and images do not exceed the range of their ids."""
-    most = sum(entry.most for entry in scene.spec.objects)
+    most = sum(entry.max_count for entry in scene.spec.objects)
     if most > MAX_OBJECTS:
         text = f"objects: a layout must have at most {MAX_OBJECTS} objects, as many as there are ids (got {most})"
         yield Finding("count", False, text, "lower objects[].count")
@@ -277,10 +277,14 @@ def scene_warnings(scene: Scene) -> Iterator[Finding]:
     yield from _cost_warnings(scene)
     yield from _backdrop_warnings(scene, plans)
     for number, light in enumerate(spec.lights):
-        if isinstance(light, LocalLight) and not light.moved and (name := _shape_around_light(scene, light)):
+        if (
+            isinstance(light, LocalLight)
+            and not light.has_drawn_position
+            and (name := _shape_around_light(scene, light))
+        ):
             text = f"lights[{number}] is inside of shape {name!r}"
             yield Finding("lights", False, text, "move it out: it lights nothing")
-    if any(isinstance(light, LocalLight) and light.moved for light in spec.lights):
+    if any(isinstance(light, LocalLight) and light.has_drawn_position for light in spec.lights):
         lights = {light for plan in plans for light in plan.lights if isinstance(light, LocalLight)}
         names = [name for light in lights if (name := _shape_around_light(scene, light))]
         if names:
@@ -304,7 +308,7 @@ def _cost_warnings(scene: Scene) -> Iterator[Finding]:
         size = f"{output.width}x{output.height} px"
         text = f"an image of {size} may take {need:.1f} GiB of memory ({free:.1f} GiB are unused)"
         yield Finding("memory", False, text, "lower output.width and height: it may be refused after the first layout")
-    most = sum(entry.most for entry in scene.spec.objects if not entry.poses)
+    most = sum(entry.max_count for entry in scene.spec.objects if not entry.poses)
     if most > SLOW_OBJECTS:
         text = f"a layout of up to {most} objects takes minutes to settle"
         yield Finding("settling", False, text, "lower objects[].count, or add views to each layout by output.views")

@@ -57,7 +57,7 @@ def worker_memory(scene: Scene) -> WorkerMemory:
     middle of the region.
     """
     spec = scene.spec
-    most = [entry.most for entry in spec.objects]
+    most = [entry.max_count for entry in spec.objects]
     pools = [[scene.assets[i].splats for i in pool] for pool in scene.pools]
     placed = [(max(pool, key=len), count) for pool, count in zip(pools, most, strict=True)]
     middle = np.add(spec.region.min, spec.region.max) / 2

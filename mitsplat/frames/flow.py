@@ -53,7 +53,7 @@ def optical_flow(
         else:
             points[shown] = points[shown] @ motion[:3, :3].T + motion[:3, 3]
     if belt is not None:
-        points[np.ravel(ids == 0) & belt.shows(points)] += belt.interval * belt.velocity
+        points[np.ravel(ids == 0) & belt.on_surface(points)] += belt.interval * belt.velocity
     moved, ahead = following.project(points)
     known &= ahead > following.near
     flow = np.where(known[:, None], moved - pixels, UNKNOWN_FLOW)
@@ -93,7 +93,7 @@ def swept_by(
         belt, carried = moving
         rotation, centre = camera.world_from_camera[:3, :3], camera.centre
         seen = np.stack(np.broadcast_arrays(x * depth, y * depth, depth), axis=-1) @ rotation.T + centre
-        on_belt = carried | belt.shows(seen.reshape(-1, 3)).reshape(height, width)
+        on_belt = carried | belt.on_surface(seen.reshape(-1, 3)).reshape(height, width)
         # The motion field depends on the camera's motion relative to the pixel's surface.
         belt_motion = motion["exposure"] * (rotation.T @ belt.velocity)
         vx, vy, vz = (np.float32(v) - np.float32(w) * on_belt for v, w in zip((vx, vy, vz), belt_motion, strict=True))

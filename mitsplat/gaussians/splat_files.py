@@ -52,7 +52,7 @@ _PLY_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "
 _MAX_HEADER = 1 << 16
 _MEANS, _QUATS, _SCALES = ("x", "y", "z"), ("rot_1", "rot_2", "rot_3", "rot_0"), ("scale_0", "scale_1", "scale_2")
 _COLOUR = ("f_dc_0", "f_dc_1", "f_dc_2")
-_MAX_SWELL = 100
+_MAX_COMPRESSION_RATIO = 100
 """Maximum ratio of decompressed to compressed size. Real files have ratios of 1.1 to 3."""
 _MAX_ENTRIES = 64
 _LOGIT_LIMIT = 110.0
@@ -293,7 +293,7 @@ def _decode_spz(data: bytes) -> SplatArrays:
     The result is bit-identical to that of gaussforge, without a separate process. gaussforge decodes or refuses other
     versions and files whose length does not match their header.
     """
-    raw = _gunzipped(data)
+    raw = _decompress_gzip(data)
     magic, version, count, degree, bits, _, _ = _SPZ_HEADER.unpack(raw[: _SPZ_HEADER.size].ljust(_SPZ_HEADER.size))
     widths = (9, 1, 3, 3, 4, 3 * (degree + 1) ** 2 - 3)
     known = (magic, version) == (b"NGSP", 3) and count > 0 and degree <= 3 and bits <= _SPZ_POSITION_BITS
@@ -341,8 +341,8 @@ def _encode_spz(splats: SplatArrays) -> bytes:
     extent = max(float(np.abs(splats.means).max()), 2.0**-60)
     bits = int(np.clip(np.floor(_SPZ_POSITION_BITS - np.log2(extent * (1.0 + 2.0**-20))), 0, _SPZ_POSITION_BITS))
     means = splats.means * np.float32(2.0 ** (bits - _SPZ_FRACTIONAL_BITS))
-    magnified = SplatArrays(means, splats.quats, splats.scales, splats.opacities, splats.sh)
-    packed = bytearray(gzip.decompress(_convert(_encode_ply(magnified), "ply", "spz")))
+    scaled = SplatArrays(means, splats.quats, splats.scales, splats.opacities, splats.sh)
+    packed = bytearray(gzip.decompress(_convert(_encode_ply(scaled), "ply", "spz")))
     packed[_SPZ_FRACTIONAL_BITS_OFFSET] = bits
     return gzip.compress(bytes(packed), compresslevel=6, mtime=0)
 
@@ -354,7 +354,7 @@ def _convert(data: bytes, source: str, target: str) -> bytes:
     """
     if source == "sog":
         _check_zip(data)
-    ended = run_bounded(
+    process = run_bounded(
         convert_splats,
         source,
         target,
@@ -363,19 +363,19 @@ def _convert(data: bytes, source: str, target: str) -> bytes:
         memory=(4 << 30) + 64 * len(data),
         seconds=60 + len(data) / 1e6,
     )
-    if ended.status == 0:
-        return ended.output
-    reason = ended.reason if (ended.status or 0) > 0 else f"its decoder {ended.reason}"
+    if process.status == 0:
+        return process.output
+    reason = process.reason if (process.status or 0) > 0 else f"its decoder {process.reason}"
     raise InputError(f"not a valid {source} file ({reason})")
 
 
-def _gunzipped(data: bytes) -> bytes:
+def _decompress_gzip(data: bytes) -> bytes:
     """Return the decompressed content of a gzip file. A truncated file gives the content up to its end.
 
     Raises:
         InputError: If the file is invalid, or if its content is larger than splats can be.
     """
-    limit, raw, rest = _swollen(len(data)), bytearray(), data
+    limit, raw, rest = _max_decompressed_size(len(data)), bytearray(), data
     decoder = zlib.decompressobj(wbits=31)
     try:
         while rest and not decoder.eof:
@@ -390,7 +390,7 @@ def _gunzipped(data: bytes) -> bytes:
 
 def _check_zip(data: bytes) -> None:
     """Check that an archive has no entry outside of it, no implausible size, and correct checksums."""
-    limit = _swollen(len(data))
+    limit = _max_decompressed_size(len(data))
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             entries = archive.infolist()
@@ -410,6 +410,6 @@ def _check_zip(data: bytes) -> None:
         raise InputError(f"not a valid sog file ({damaged} in it is damaged)")
 
 
-def _swollen(size: int) -> int:
+def _max_decompressed_size(size: int) -> int:
     """Return the maximum decompressed size of ``size`` compressed bytes."""
-    return _MAX_SWELL * size + (16 << 20)
+    return _MAX_COMPRESSION_RATIO * size + (16 << 20)

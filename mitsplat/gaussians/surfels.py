@@ -24,7 +24,7 @@ _NORMAL_WEIGHT = 0.6
 """Additional distance of points with opposite normals, in units of r. It separates the two sides of thin sheets."""
 _PROBES = 4
 """Points per Gaussian at which the surface is tested for gaps."""
-_LEAK = 0.02
+_MAX_TRANSMITTANCE = 0.02
 """Maximum transmittance between Gaussians at a probe."""
 _CLOSING_ROUNDS = 14
 _ROW_OFFSET, _ROW_SPACING = 0.45, 0.75
@@ -32,7 +32,7 @@ _ROW_OFFSET, _ROW_SPACING = 0.45, 0.75
 _CREASE_NEIGHBOURS = 16
 _EDGE_SIGMAS = 1.5
 """Standard deviations of a disc between its centre and the nearest crease."""
-_THINNEST = 0.27
+_MIN_SPREAD = 0.27
 """Minimum standard deviation along the surface near a crease, in units of the local spacing."""
 _THICKNESS = 0.035
 """Standard deviation along the normal, in units of the local spacing."""
@@ -125,7 +125,7 @@ def place_surfels(
         spacing = spacing * np.sqrt(len(kept) / count)
     radius = pool.radius[kept, None]
     frames, room = _frames(pool.normals[kept], pool.points[kept], pool.radius[kept], creases)
-    widest = np.clip(room / _EDGE_SIGMAS, _THINNEST * radius, _SHARES[0] * spread * radius)
+    widest = np.clip(room / _EDGE_SIGMAS, _MIN_SPREAD * radius, _SHARES[0] * spread * radius)
     bent = pool.uneven[kept]
     widest[bent] = np.minimum(
         widest[bent], _overhang_limit(pool, pool.points[kept][bent], frames[bent], radius[bent] * spread)
@@ -133,7 +133,7 @@ def place_surfels(
     scales = np.concatenate([np.minimum(widest, spread * radius), _THICKNESS * radius], axis=1)
     probe = rng.choice(len(pool.points), size=min(len(pool.points), _PROBES * len(kept)), replace=False)
     probe = probe[pool.crease_distance[probe] > 0.15 * pool.radius[probe]]
-    scales = _closed(pool.points[kept], frames, scales, widest, pool.points[probe], pool.normals[probe])
+    scales = _close_gaps(pool.points[kept], frames, scales, widest, pool.points[probe], pool.normals[probe])
     return Surfels(pool.points[kept], frames, scales, pool.faces[kept], pool.barycentric[kept])
 
 
@@ -274,9 +274,9 @@ def _independent_set(count: int, pairs: Int64Array, rng: np.random.Generator) ->
     priority = rng.permutation(count)
     alive, chosen = np.ones(count, dtype=bool), np.zeros(count, dtype=bool)
     while alive.any():
-        beaten = np.zeros(count, dtype=bool)
-        beaten[np.where(priority[pairs[:, 0]] > priority[pairs[:, 1]], pairs[:, 0], pairs[:, 1])] = True
-        winners = alive & ~beaten
+        dominated = np.zeros(count, dtype=bool)
+        dominated[np.where(priority[pairs[:, 0]] > priority[pairs[:, 1]], pairs[:, 0], pairs[:, 1])] = True
+        winners = alive & ~dominated
         chosen |= winners
         alive &= ~winners
         alive[pairs[winners[pairs[:, 0]], 1]] = False
@@ -330,7 +330,7 @@ def _frames(
     return frames, np.where(ahead, across, np.inf).min(axis=1)
 
 
-def _closed(
+def _close_gaps(
     centres: Float64Array,
     frames: Float64Array,
     scales: Float64Array,
@@ -350,7 +350,7 @@ def _closed(
     for _ in range(_CLOSING_ROUNDS):
         across, along = ((local[..., axis] / scales[index, axis]) ** 2 for axis in range(2))
         response = np.exp(-0.5 * (across + along)) * facing
-        leaking = np.prod(1.0 - response, axis=1) > _LEAK
+        leaking = np.prod(1.0 - response, axis=1) > _MAX_TRANSMITTANCE
         if not leaking.any():
             break
         # A closed gap stays closed, because discs only grow.

@@ -28,25 +28,25 @@ _logger = logging.getLogger(__name__)
 
 MOST_PIECES = 32
 # Acceptable gap between pieces and mesh [m], or as a share of the object's size if that is larger.
-_WIDEST_GAP, _GAP_SHARE = 1e-3, 0.005
+_MIN_GAP_LIMIT, _GAP_SHARE = 1e-3, 0.005
 _THRESHOLD = 0.02
 # A solid that fills this share of its hull is replaced by the hull. The difference is below the resolution of physics.
 _CONVEX = 0.9995
 # More parts than this are debris of a scan, which is decomposed as a whole.
-_MOST_PARTS = 64
+_MAX_PARTS = 64
 # A mesh with more faces is a scan. Its noise is removed first, by this share of its size and at most by this distance
 # [m], a third of the permitted penetration into a table. More is removed if necessary for few faces.
-_SCAN_FACES, _DEVIATION, _MOST_DEVIATION = 3000, 5e-4, 1e-4
-_FEW_FACES, _WORST_ERROR = 5000, 0.003
+_SCAN_FACES, _DEVIATION, _MAX_DEVIATION = 3000, 5e-4, 1e-4
+_TARGET_FACES, _MAX_ERROR = 5000, 0.003
 # A surface is ragged if sharp valleys have more than this share of the length of all edges. It is the result of a bad
 # fit and would be split into more pieces than it has faces. Parts and scans have 0.15 at most.
 _RAGGED, _RAGGED_THRESHOLD = 0.25, 0.1
 # CoACD search iterations per cut. A scan has more cuts than concavities, so any of them is sufficient.
 _ITERATIONS, _SCAN_ITERATIONS = 150, 20
 # Number of cut planes that are tested along each direction.
-_PLACES = 15
+_CUTS_PER_AXIS = 15
 # Pieces that are cut before joining, per permitted piece; number of pairs whose joint hull is measured per step.
-_OVERSHOOT, _LIKELY = 2, 32
+_OVERSHOOT, _PAIRS_PER_STEP = 2, 32
 # Safety factor on the limit, because gaps are measured at points; maximum number of sample points on faces; batch size.
 _MARGIN, _SAMPLES, _BATCH = 0.75, 8000, 32
 
@@ -56,7 +56,7 @@ def widest_gap(size: float) -> float:
 
     The gap is that between object and support, and that between convex pieces and mesh.
     """
-    return max(_WIDEST_GAP, _GAP_SHARE * size)
+    return max(_MIN_GAP_LIMIT, _GAP_SHARE * size)
 
 
 def convex_pieces(
@@ -103,7 +103,7 @@ def _parts(mesh: trimesh.Trimesh) -> list[trimesh.Trimesh]:
     if not mesh.is_watertight:
         return [mesh]
     parts = [part for part in mesh.split(only_watertight=False) if part.volume > 0]
-    return parts if 0 < len(parts) <= _MOST_PARTS else [mesh]
+    return parts if 0 < len(parts) <= _MAX_PARTS else [mesh]
 
 
 def _split(part: trimesh.Trimesh, threshold: float, most: int) -> list[trimesh.Trimesh]:
@@ -145,12 +145,12 @@ def thin_solid(solid: trimesh.Trimesh) -> trimesh.Trimesh:
 
     The result has at most 5000 faces, or the minimum number within 0.3 % of the size (diagonal).
     """
-    tolerance = min(_DEVIATION * solid.scale, _MOST_DEVIATION)
+    tolerance = min(_DEVIATION * solid.scale, _MAX_DEVIATION)
     thin = simplify_solid(solid, tolerance)
-    while len(thin.faces) > _FEW_FACES:
+    while len(thin.faces) > _TARGET_FACES:
         tolerance *= 1.2
         thinner = simplify_solid(solid, tolerance)
-        if _largest_distance(solid, thinner) > _WORST_ERROR * solid.scale:
+        if _largest_distance(solid, thinner) > _MAX_ERROR * solid.scale:
             break
         thin = thinner
     return thin
@@ -193,9 +193,9 @@ class _Cutter:
     def __init__(self, part: trimesh.Trimesh, limit: float) -> None:
         self._solid = _manifold(thin_solid(part))
         self._surface, self._limit = DistanceSurface(part), _MARGIN * limit
-        self._least = 1e-6 * self._solid.hull().volume()  # slivers add no contact
+        self._min_volume = 1e-6 * self._solid.hull().volume()  # slivers add no contact
         self._points = _mesh(self._solid).vertices
-        self._touching = 1e-4 * part.scale
+        self._contact_distance = 1e-4 * part.scale
 
     def pieces(self, most: int) -> list[trimesh.Trimesh]:
         """Return at most ``most`` convex pieces.
@@ -209,12 +209,12 @@ class _Cutter:
             if pieces[worst].gap <= self._limit:
                 break
             piece = pieces.pop(worst)
-            cut = [self._piece(body) for body in _best_cut(piece.body, self._limit) if body.volume() > self._least]
+            cut = [self._piece(body) for body in _best_cut(piece.body, self._limit) if body.volume() > self._min_volume]
             if len(cut) > 1:
                 pieces += cut
             else:
                 done.append(piece)
-        return [_mesh(hull).convex_hull for hull in self._joined(pieces + done, most)]
+        return [_mesh(hull).convex_hull for hull in self._join(pieces + done, most)]
 
     def _piece(self, body: manifold3d.Manifold) -> _Piece:
         hull = body.hull()
@@ -234,14 +234,14 @@ class _Cutter:
         points = np.concatenate([above, contact_points(mesh), mesh.sample(samples, seed=0)])
         return farthest_outside(self._surface, points, least=self._limit, batch=_BATCH)
 
-    def _joined(self, pieces: Sequence[_Piece], most: int) -> list[manifold3d.Manifold]:
+    def _join(self, pieces: Sequence[_Piece], most: int) -> list[manifold3d.Manifold]:
         """Join pieces if the gap of their common hull is acceptable, or if there are too many; return all hulls."""
         hulls: dict[int, manifold3d.Manifold] = {}
         joints: dict[tuple[int, int], tuple[float, manifold3d.Manifold]] = {}
         gaps: dict[tuple[int, int], float] = {}
 
         def add(new: int, hull: manifold3d.Manifold) -> None:
-            low, high = np.reshape(hull.bounding_box(), (2, 3)) + self._touching * np.array([[-1.0], [1.0]])
+            low, high = np.reshape(hull.bounding_box(), (2, 3)) + self._contact_distance * np.array([[-1.0], [1.0]])
             for old, other in hulls.items():
                 corners = np.reshape(other.bounding_box(), (2, 3))
                 if (low <= corners[1]).all() and (corners[0] <= high).all():
@@ -254,9 +254,9 @@ class _Cutter:
             add(next(numbers), piece.hull)
         while joints:
             # Gaps are slow to measure, so only the pairs that add the least empty volume are tested.
-            likely = sorted(joints, key=lambda pair: (joints[pair][0], pair))[:_LIKELY]
-            gaps |= {pair: self._gap(joints[pair][1]) for pair in likely if pair not in gaps}
-            pair = min(likely, key=lambda pair: (gaps[pair], pair))
+            candidates = sorted(joints, key=lambda pair: (joints[pair][0], pair))[:_PAIRS_PER_STEP]
+            gaps |= {pair: self._gap(joints[pair][1]) for pair in candidates if pair not in gaps}
+            pair = min(candidates, key=lambda pair: (gaps[pair], pair))
             if gaps[pair] > self._limit and len(hulls) <= most:
                 break
             joint = joints[pair][1]
@@ -267,39 +267,39 @@ class _Cutter:
         return list(hulls.values())
 
 
-def _best_cut(body: manifold3d.Manifold, thinnest: float) -> list[manifold3d.Manifold]:
+def _best_cut(body: manifold3d.Manifold, min_thickness: float) -> list[manifold3d.Manifold]:
     """Return the connected parts of a body on both sides of the plane with the least empty volume.
 
     If no plane is valid, the body itself is returned.
 
     Args:
         body: Body to cut.
-        thinnest: Minimum distance of the plane from the ends of the body [m].
+        min_thickness: Minimum distance of the plane from the ends of the body [m].
     """
     mesh = _mesh(body)
     _, principal = np.linalg.eigh(np.cov(mesh.vertices.T))
     best, plane = np.inf, (np.zeros(3), 0.0)
 
-    def look(normal: Float64Array, low: float, high: float) -> None:
+    def search(normal: Float64Array, low: float, high: float) -> None:
         nonlocal best, plane
         heights = mesh.vertices @ normal
-        low, high = max(low, float(heights.min()) + thinnest), min(high, float(heights.max()) - thinnest)
-        for offset in np.linspace(low, high, _PLACES) if low < high else ():
-            emptiness = _emptiness(mesh, heights - offset, offset * normal)
-            if emptiness < best:
-                best, plane = emptiness, (normal, float(offset))
+        low, high = max(low, float(heights.min()) + min_thickness), min(high, float(heights.max()) - min_thickness)
+        for offset in np.linspace(low, high, _CUTS_PER_AXIS) if low < high else ():
+            empty_volume = _weighted_empty_volume(mesh, heights - offset, offset * normal)
+            if empty_volume < best:
+                best, plane = empty_volume, (normal, float(offset))
 
     for normal in (*np.eye(3), *principal.T):
-        look(normal, -np.inf, np.inf)
+        search(normal, -np.inf, np.inf)
     if best == np.inf:
         return [body]
     normal, offset = plane
-    step = float(np.ptp(mesh.vertices @ normal)) / _PLACES
-    look(normal, offset - step, offset + step)
+    step = float(np.ptp(mesh.vertices @ normal)) / _CUTS_PER_AXIS
+    search(normal, offset - step, offset + step)
     return [part for side in body.split_by_plane(*plane) for part in side.decompose()]
 
 
-def _emptiness(mesh: trimesh.Trimesh, heights: Float64Array, origin: Float64Array) -> float:
+def _weighted_empty_volume(mesh: trimesh.Trimesh, heights: Float64Array, origin: Float64Array) -> float:
     """Return the sum over the hulls on both sides of a plane through ``origin`` of empty volume times hull volume."""
     above = heights > 0
     if above.all() or not above.any():

@@ -17,9 +17,9 @@ from mitsplat.errors import InputError
 _logger = logging.getLogger(__name__)
 
 # Sizes outside of this range indicate wrong units [m].
-_SMALLEST, _LARGEST = 5e-4, 20.0
+_MIN_SIZE, _MAX_SIZE = 5e-4, 20.0
 # More triangles do not change how an object rests, and CoACD takes hours for them.
-_MOST_FACES = 200_000
+_MAX_FACES = 200_000
 # Minimum angle between faces at an edge that can penetrate another object [rad].
 SHARP = 0.17
 
@@ -55,9 +55,9 @@ def check_size(mesh: trimesh.Trimesh, name: str) -> float:
         row = int(np.flatnonzero(~np.isfinite(mesh.vertices).all(axis=1))[0])
         raise InputError(f"{name}: mesh vertices must be finite (got {mesh.vertices[row].tolist()} at vertex {row})")
     size = float(mesh.extents.max())
-    if not _SMALLEST <= size <= _LARGEST:
+    if not _MIN_SIZE <= size <= _MAX_SIZE:
         raise InputError(
-            f"{name}: the mesh must be {_SMALLEST} m to {_LARGEST} m across, in metres (got {size:g} m: wrong units?)"
+            f"{name}: the mesh must be {_MIN_SIZE} m to {_MAX_SIZE} m across, in metres (got {size:g} m: wrong units?)"
         )
     return size
 
@@ -90,9 +90,9 @@ def prepare_mesh(mesh: trimesh.Trimesh, name: str, *, solid: bool = True) -> tri
         raise InputError(f"{name}: the mesh must enclose a volume (got {abs(volume):.3g} m^3 at {size:g} m across)")
     if solid and not welded.is_watertight:
         _logger.warning("%s: the mesh is not closed; mass and inertia are those of its convex pieces", name)
-    if len(welded.faces) > _MOST_FACES:
-        _logger.warning("%s: physics simplifies the mesh of %d to %d triangles", name, len(welded.faces), _MOST_FACES)
-        welded = welded.simplify_quadric_decimation(face_count=_MOST_FACES)
+    if len(welded.faces) > _MAX_FACES:
+        _logger.warning("%s: physics simplifies the mesh of %d to %d triangles", name, len(welded.faces), _MAX_FACES)
+        welded = welded.simplify_quadric_decimation(face_count=_MAX_FACES)
     return welded
 
 

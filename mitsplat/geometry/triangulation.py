@@ -47,6 +47,6 @@ def meeting_point(origins: Float64Array, directions: Float64Array) -> Float64Arr
     """Return the point (3,) nearest to all lines through ``origins`` (N, 3) along unit ``directions`` (N, 3)."""
     across = np.eye(3) - directions[:, :, None] * directions[:, None, :]
     # A small multiple of the identity regularises the case of parallel lines, which have no unique nearest point.
-    whole = across.sum(axis=0) + 1e-9 * np.eye(3)
-    right = np.einsum("nij,nj->i", across, origins) + 1e-9 * origins.mean(axis=0)
-    return np.asarray(np.linalg.solve(whole, right))
+    normal_matrix = across.sum(axis=0) + 1e-9 * np.eye(3)
+    right_side = np.einsum("nij,nj->i", across, origins) + 1e-9 * origins.mean(axis=0)
+    return np.asarray(np.linalg.solve(normal_matrix, right_side))

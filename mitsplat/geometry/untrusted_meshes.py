@@ -20,9 +20,9 @@ ARCHIVES = (".zip", ".bz2", ".gz", ".tar")
 
 _SECONDS = 120
 _MEMORY = 1 << 30
-_SWELLS = 100
+_MEMORY_PER_BYTE = 100
 """Permitted memory of a reader per byte of the file."""
-_LARGEST = 1 << 30
+_MAX_SIZE = 1 << 30
 """Maximum file size: 21 million triangles as binary STL [bytes]."""
 _HEADER = 4096
 _PLAIN_PLY = re.compile(
@@ -48,16 +48,16 @@ def check_mesh(path: Path) -> None:
         raise InputError(f"{path}: no such file")
     try:
         status = path.stat()
-        if status.st_size > _LARGEST:
-            raise InputError(f"{path}: must be a mesh file of at most {_LARGEST} bytes (got {status.st_size})")
-        plain = _is_plain(path, status.st_size)
+        if status.st_size > _MAX_SIZE:
+            raise InputError(f"{path}: must be a mesh file of at most {_MAX_SIZE} bytes (got {status.st_size})")
+        is_plain = _is_plain_binary(path, status.st_size)
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from error
-    if not plain and (reason := _try_mesh(path.resolve(), status.st_mtime_ns, status.st_size)):
+    if not is_plain and (reason := _try_mesh(path.resolve(), status.st_mtime_ns, status.st_size)):
         raise InputError(f"{path}: not a mesh file that can be read ({reason})")
 
 
-def _is_plain(path: Path, size: int) -> bool:
+def _is_plain_binary(path: Path, size: int) -> bool:
     """Return True if a file holds binary triangles of one kind and its size matches its header."""
     with path.open("rb") as file:
         head = file.read(_HEADER)
@@ -75,11 +75,11 @@ def _try_mesh(path: Path, _modified: int, size: int) -> str:
 
     The reason is empty if the file can be read, or if its reader reports an ordinary error.
     """
-    memory = _MEMORY + _SWELLS * size
-    ended = run_bounded(_read_mesh, path, imports=["trimesh"], memory=memory, seconds=_SECONDS)
-    if ended.status == 0:
+    memory = _MEMORY + _MEMORY_PER_BYTE * size
+    process = run_bounded(_read_mesh, path, imports=["trimesh"], memory=memory, seconds=_SECONDS)
+    if process.status == 0:
         return ""
-    return ended.reason if (ended.status or 0) > 0 else f"its reader {ended.reason}"
+    return process.reason if (process.status or 0) > 0 else f"its reader {process.reason}"
 
 
 def _read_mesh(output: BinaryIO, _: bytes, path: str) -> None:

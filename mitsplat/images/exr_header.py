@@ -13,11 +13,11 @@ from mitsplat.errors import InputError
 
 _MAGIC = b"\x76\x2f\x31\x01"
 _MULTIPLE_PARTS = 0x1000
-_MOST_CHANNELS = 64 << 10
+_MAX_CHANNEL_BYTES = 64 << 10
 """Maximum size of a channel list [bytes]; 2,000 channels with short names fit."""
-_MOST_ATTRIBUTES = 2000
+_MAX_ATTRIBUTES = 2000
 """Maximum number of attributes of all parts."""
-_LONGEST_NAME = 256
+_MAX_NAME_LENGTH = 256
 
 
 def check_exr_header(path: Path) -> None:
@@ -31,10 +31,10 @@ def check_exr_header(path: Path) -> None:
         if file.read(4) != _MAGIC:
             return
         multiple = bool(_number(path, file) & _MULTIPLE_PARTS)
-        for _ in range(_MOST_ATTRIBUTES):
-            if not _attribute(path, file) and not (multiple and _more_parts(file)):
+        for _ in range(_MAX_ATTRIBUTES):
+            if not _attribute(path, file) and not (multiple and _has_more_parts(file)):
                 return
-    raise InputError(f"{path}: the header of an OpenEXR file must not hold more than {_MOST_ATTRIBUTES} attributes")
+    raise InputError(f"{path}: the header of an OpenEXR file must not hold more than {_MAX_ATTRIBUTES} attributes")
 
 
 def _attribute(path: Path, file: BinaryIO) -> bool:
@@ -43,13 +43,13 @@ def _attribute(path: Path, file: BinaryIO) -> bool:
     if not name:
         return False
     kind, size = _text(path, file), _number(path, file)
-    if kind == b"chlist" and size > _MOST_CHANNELS:
-        raise InputError(f"{path}: channels must be listed in at most {_MOST_CHANNELS} bytes (got {size})")
+    if kind == b"chlist" and size > _MAX_CHANNEL_BYTES:
+        raise InputError(f"{path}: channels must be listed in at most {_MAX_CHANNEL_BYTES} bytes (got {size})")
     file.seek(size, 1)
     return True
 
 
-def _more_parts(file: BinaryIO) -> bool:
+def _has_more_parts(file: BinaryIO) -> bool:
     """Return True if the header of another part follows."""
     following = file.read(1)
     file.seek(-len(following), 1)
@@ -58,10 +58,12 @@ def _more_parts(file: BinaryIO) -> bool:
 
 def _text(path: Path, file: BinaryIO) -> bytes:
     """Read a text up to its zero byte."""
-    found = file.read(_LONGEST_NAME)
+    found = file.read(_MAX_NAME_LENGTH)
     text, zero, rest = found.partition(b"\0")
     if not zero:
-        raise InputError(f"{path}: the header of an OpenEXR file must have names of at most {_LONGEST_NAME - 1} bytes")
+        raise InputError(
+            f"{path}: the header of an OpenEXR file must have names of at most {_MAX_NAME_LENGTH - 1} bytes"
+        )
     file.seek(-len(rest), 1)
     return text
 

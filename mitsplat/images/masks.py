@@ -86,8 +86,8 @@ def encode_mask(mask: BoolArray, box: Box, size: tuple[int, int]) -> str:
     turns = (x0 + column) * height + y0 + row
     if rows == height:
         # A run that continues at the top of the next column neither ends nor begins there.
-        goes_on = np.flatnonzero(np.diff(turns) == 0)
-        turns = np.delete(turns, np.concatenate([goes_on, goes_on + 1]))
+        continued = np.flatnonzero(np.diff(turns) == 0)
+        turns = np.delete(turns, np.concatenate([continued, continued + 1]))
     counts = np.diff(np.concatenate([[0], turns, [width * height]]))
     if counts[-1] == 0:
         counts = counts[:-1]
@@ -148,10 +148,10 @@ def bounds_of_ids(ids: npt.NDArray[np.integer[Any]]) -> dict[int, Box]:
     if not ids.size:
         return {}
     flat = np.ascontiguousarray(ids).ravel()
-    begins = np.empty(flat.shape, dtype=bool)
-    np.not_equal(flat[1:], flat[:-1], out=begins[1:])
-    begins[::width] = True
-    first = np.flatnonzero(begins)
+    is_start = np.empty(flat.shape, dtype=bool)
+    np.not_equal(flat[1:], flat[:-1], out=is_start[1:])
+    is_start[::width] = True
+    first = np.flatnonzero(is_start)
     number = flat[first]
     last = np.append(first[1:], flat.size) - 1
     seen = number != 0

@@ -37,10 +37,10 @@ def check_images(paths: Sequence[Path]) -> list[str | None]:
             found.append(f"{path}: must be a file")
             break
         stamps.append((path.resolve(), status.st_mtime_ns, status.st_size))
-    good, reason = _try_images(tuple(stamps)) if stamps else (0, None)
+    num_readable, reason = _try_images(tuple(stamps)) if stamps else (0, None)
     if reason is not None:
-        found = [f"{paths[good]}: not a readable image ({reason})"]
-    known = [*[None] * (good if reason is not None else len(stamps)), *found]
+        found = [f"{paths[num_readable]}: not a readable image ({reason})"]
+    known = [*[None] * (num_readable if reason is not None else len(stamps)), *found]
     return [*known, *[None] * (len(paths) - len(known))]
 
 
@@ -50,13 +50,13 @@ def _try_images(files: tuple[_Stamp, ...]) -> tuple[int, str | None]:
     # A file of half-precision pixels of one colour can be a thousandth of the size of its pixels.
     limits = [_MEMORY + 1000 * size for _, _, size in files]
     arguments = [text for (path, _, _), limit in zip(files, limits, strict=True) for text in (str(path), str(limit))]
-    ended = run_bounded(
+    process = run_bounded(
         _read_images, *arguments, imports=["mitsuba"], memory=max(limits), seconds=_SECONDS + len(files)
     )
-    good = len(ended.output.splitlines())
-    if ended.status == 0:
-        return good, None
-    return good, ended.reason if (ended.status or 0) > 0 else f"its reader {ended.reason}"
+    num_readable = len(process.output.splitlines())
+    if process.status == 0:
+        return num_readable, None
+    return num_readable, process.reason if (process.status or 0) > 0 else f"its reader {process.reason}"
 
 
 def _read_images(output: BinaryIO, _: bytes, *arguments: str) -> None:

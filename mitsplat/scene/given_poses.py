@@ -50,7 +50,7 @@ def rigid_pose(pose: npt.ArrayLike, place: str) -> Float64Array:
     except (TypeError, ValueError):
         matrix = np.empty(0)
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
-        raise InputError(f"{place}: must be a finite 4x4 matrix world_from_object (got {_told(pose)})")
+        raise InputError(f"{place}: must be a finite 4x4 matrix world_from_object (got {_describe(pose)})")
     rotation = matrix[:3, :3]
     if np.abs(matrix[3] - (0, 0, 0, 1)).max() > _RIGID:
         raise InputError(f"{place}: must have the last row 0, 0, 0, 1 (got {matrix[3].tolist()}); is it transposed?")
@@ -64,7 +64,7 @@ def rigid_pose(pose: npt.ArrayLike, place: str) -> Float64Array:
     return matrix
 
 
-def _told(pose: npt.ArrayLike) -> str:
+def _describe(pose: npt.ArrayLike) -> str:
     """Describe a value that is not a valid matrix, for an error message."""
     if isinstance(pose, np.ndarray) and pose.shape != (4, 4):
         return f"an array of shape {pose.shape}"

@@ -31,15 +31,15 @@ def split_of(layout: int, validation: float, test: float = 0.0) -> Split:
 def _place_in_split(layout: int, validation: float, test: float) -> tuple[Split, int]:
     """Return the split of a layout, and the number of earlier layouts in it."""
     if test:
-        apart, layout = _parted(layout, test)
-        if apart:
+        in_part, layout = _divide(layout, test)
+        if in_part:
             return "test", layout
         validation = min(1.0, validation / (1.0 - test))
-    apart, rank = _parted(layout, validation)
-    return "val" if apart else "train", rank
+    in_part, rank = _divide(layout, validation)
+    return "val" if in_part else "train", rank
 
 
-def _parted(number: int, share: float) -> tuple[bool, int]:
+def _divide(number: int, share: float) -> tuple[bool, int]:
     """Divide numbers from 0 by a share.
 
     Returns:

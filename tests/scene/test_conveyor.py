@@ -113,7 +113,7 @@ def test_a_belt_below_no_region_is_refused(belt_data: SceneData, write_scene: Wr
 
 def test_an_open_shutter_needs_something_that_moves(belt_data: SceneData, write_scene: WriteScene) -> None:
     belt_data["camera"]["motion"] = {"exposure": [0.01, 0.02]}
-    assert not scene_of(belt_data, write_scene).spec.camera.motion.moves  # type: ignore[union-attr]
+    assert not scene_of(belt_data, write_scene).spec.camera.motion.is_moving  # type: ignore[union-attr]
     del belt_data["conveyor"]
     with pytest.raises(InputError, match="motion: must have a speed or a rotation, or the scene a conveyor"):
         scene_of(belt_data, write_scene)

@@ -186,7 +186,7 @@ def test_prediction_agrees_with_rays_through_every_pixel(scene: Scene, wall: boo
             eye = 0.75 * np.array([np.cos(across), np.sin(across), 0.3])
             camera = Camera.look_at(eye, (0.05, 0, 0.02 * index), width=64, height=48, fov_x=32)
             sight = VisibilityPredictor.of(scene, layout)
-            found = sight.prospect(sight.framed(camera), None, None, 1)
+            found = sight.predict(sight.project(camera), None, None, 1)
             visible, beyond = twin(camera, placed(scene, layout), list(scene.shape_meshes))
             errors += [*np.abs(found.visible - visible)[beyond < 1], *np.abs(found.beyond - beyond)]
             assert (visible < 0.9).any()
@@ -198,7 +198,7 @@ def test_prediction_counts_what_is_hidden_and_cut(scene: Scene) -> None:
     layout = layouts(scene)[0]
     camera = Camera.look_at((0.1, -0.7, 0.2), (0.1, 0, 0), width=64, height=48, fov_x=25)
     sight = VisibilityPredictor.of(scene, layout)
-    found = sight.prospect(sight.framed(camera), Occlusion(share=1), Truncation(share=1), 1)
+    found = sight.predict(sight.project(camera), Occlusion(share=1), Truncation(share=1), 1)
     visible, beyond = twin(camera, placed(scene, layout), [])
     shown = (visible > 0) & (beyond < 1)
     assert found.in_view == np.count_nonzero(shown)
@@ -253,7 +253,7 @@ def test_shares_of_hidden_and_cut_objects_are_reached(scene: Scene) -> None:
         seen = hidden = cut = 0.0
         for plan, layout in views(there):
             sight = VisibilityPredictor.of(there, layout)
-            found = sight.prospect(sight.framed(plan.camera), Occlusion(share=1), Truncation(share=1), 16)
+            found = sight.predict(sight.project(plan.camera), Occlusion(share=1), Truncation(share=1), 16)
             seen, hidden, cut = seen + found.in_view, hidden + found.hidden, cut + found.cut
         return hidden / seen, cut / seen
 

@@ -53,7 +53,7 @@ def _matches(root: str, parts: Sequence[str], pattern: str) -> set[str]:
     Every folder is visited once, with the numbers of all parts that may match there.
     """
     wild = {i: re.compile(fnmatch.translate(part)).match for i, part in enumerate(parts) if WILDCARDS & set(part)}
-    found, looked_at = set[str](), 0
+    found, num_visited = set[str](), 0
     waiting = [(root, {0})]
     while waiting:
         place, numbers = waiting.pop()
@@ -70,8 +70,8 @@ def _matches(root: str, parts: Sequence[str], pattern: str) -> set[str]:
             entries = nullcontext(())
         with entries as inside:
             for entry in inside:
-                looked_at += 1
-                if looked_at > MAX_ENTRIES:
+                num_visited += 1
+                if num_visited > MAX_ENTRIES:
                     raise InputError(f"must look at {MAX_ENTRIES} files and folders at most (got {pattern!r})")
                 for i in numbers & wild.keys():
                     if parts[i] == "**":

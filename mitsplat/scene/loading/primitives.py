@@ -23,7 +23,7 @@ from mitsplat.gaussians.surfels import Surfels, place_surfels
 _KINDS = ("box", "cylinder", "sphere", "capsule", "cone")
 _EXTENT = (0.025, 0.06)  # range of the longest extent [m]
 _SURFELS = 1200
-_LINING = 0.97  # relative size of the second layer
+_INNER_SCALE = 0.97  # relative size of the second layer
 
 
 def make_primitives(streams: Iterable[np.random.Generator]) -> tuple[Asset, ...]:
@@ -36,7 +36,7 @@ def _make(number: int, rng: np.random.Generator) -> Asset:
     mesh = _solid(kind, rng)
     mesh.apply_translation(-mesh.center_mass)
     mesh.apply_scale(rng.uniform(*_EXTENT) / mesh.extents.max())
-    surfels = _lined(place_surfels(mesh, 1.0, _SURFELS, rng))
+    surfels = _add_inner_layer(place_surfels(mesh, 1.0, _SURFELS, rng))
     colours = [colorsys.hsv_to_rgb(rng.random(), rng.random(), rng.uniform(0.25, 0.95)) for _ in range(2)]
     second = _pattern(surfels.points / mesh.extents.max(), rng)
     polished = rng.random() < 0.3
@@ -71,7 +71,7 @@ def _solid(kind: str, rng: np.random.Generator) -> trimesh.Trimesh:
     return trimesh.creation.cone(radius=0.5, height=0.5 + slim, sections=32)
 
 
-def _lined(surfels: Surfels) -> Surfels:
+def _add_inner_layer(surfels: Surfels) -> Surfels:
     """Add a second layer of surfels slightly inside, so that the far side is not visible through gaps.
 
     The second layer is rotated by 180 degrees about z, which maps every solid to itself. Its surfels therefore lie
@@ -80,7 +80,7 @@ def _lined(surfels: Surfels) -> Surfels:
     turn = np.diag([-1.0, -1.0, 1.0])
     return replace(
         surfels,
-        points=np.concatenate([surfels.points, _LINING * surfels.points @ turn]),
+        points=np.concatenate([surfels.points, _INNER_SCALE * surfels.points @ turn]),
         frames=np.concatenate([surfels.frames, turn @ surfels.frames]),
         scales=np.tile(surfels.scales, (2, 1)),
         faces=np.tile(surfels.faces, 2),

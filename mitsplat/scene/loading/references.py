@@ -29,7 +29,7 @@ from mitsplat.scene.walls import bin_walls, stated_pose
 from mitsplat.storage.files import is_inside
 from mitsplat.storage.yaml_input import FieldError, KeyPath, key_place
 
-_MOST_IMAGES = 500
+_MAX_IMAGES_PER_PROCESS = 500
 """Maximum number of images that are tested in one process; their names are its arguments."""
 
 
@@ -68,7 +68,7 @@ def matched(spec: SceneSpec, path: Path, *, allow_outside: bool) -> SceneSpec:
         InputError: If nothing matches, if the number of weights differs, or if a file is outside of the allowed folder.
     """
     if not allow_outside:
-        _confine(spec, path)
+        _check_inside_folder(spec, path)
     spec = _matched_images(_matched_environments(spec, path, allow_outside), path, allow_outside)
     objects, lights = list(spec.objects), list(spec.lights)
     for position, entry in enumerate(objects):
@@ -81,14 +81,14 @@ def matched(spec: SceneSpec, path: Path, *, allow_outside: bool) -> SceneSpec:
     for position, light in enumerate(lights):
         if isinstance(light, EnvironmentLight) and isinstance(light.pool, str):
             with blaming(path, "lights", position, "pool"):
-                names = _inside(path.parent, image_names(path.parent, light.pool), allow_outside)
+                names = _checked_names(path.parent, image_names(path.parent, light.pool), allow_outside)
             with blaming(path, "lights", position):
                 light.check_weights(len(names))
             lights[position] = light.model_copy(update={"pool": names})
     return spec.model_copy(update={"objects": tuple(objects), "lights": tuple(lights)})
 
 
-def _inside(folder: Path, names: tuple[str, ...], allow_outside: bool) -> tuple[str, ...]:
+def _checked_names(folder: Path, names: tuple[str, ...], allow_outside: bool) -> tuple[str, ...]:
     """Check that names do not lead out of the folder, unless that is allowed, and return them."""
     for name in () if allow_outside else names:
         _refuse_outside(folder, name)
@@ -112,7 +112,7 @@ def _matched_images(spec: SceneSpec, path: Path, allow_outside: bool) -> SceneSp
     found = {}
     for keys, images in image_lists(spec):
         with blaming(path, *keys):
-            found[keys] = _inside(path.parent, image_names(path.parent, images), allow_outside)
+            found[keys] = _checked_names(path.parent, image_names(path.parent, images), allow_outside)
     if not found:
         return spec
 
@@ -129,8 +129,10 @@ def _matched_images(spec: SceneSpec, path: Path, allow_outside: bool) -> SceneSp
     )
     spec = spec.model_copy(update={"shapes": shapes})
     if spec.backdrop is not None:
-        both = {key: materials_of("backdrop", key, among=getattr(spec.backdrop, key)) for key in ("floor", "walls")}
-        spec = spec.model_copy(update={"backdrop": spec.backdrop.model_copy(update=both)})
+        materials = {
+            key: materials_of("backdrop", key, among=getattr(spec.backdrop, key)) for key in ("floor", "walls")
+        }
+        spec = spec.model_copy(update={"backdrop": spec.backdrop.model_copy(update=materials)})
     if spec.background is None:
         return spec
     background = spec.background.model_copy(update={"images": found["background", "images"]})
@@ -142,14 +144,14 @@ def _matches(
 ) -> tuple[str, ...]:
     """Return the folders of assets of a kind that match a pattern, relative to a folder."""
     found = [path for path in glob_below(folder, pattern) if (path / ASSET_FILE).is_file()]
-    named = _inside(folder, names_below(folder, pattern, found), allow_outside)
+    named = _checked_names(folder, names_below(folder, pattern, found), allow_outside)
     names = tuple(name for name in named if read_spec(folder / name).kind == kind)
     if not names:
         raise InputError(f"must match at least one folder of an {kind}'s asset (got {pattern!r}, which matches none)")
     return names
 
 
-def _confine(spec: SceneSpec, path: Path) -> None:
+def _check_inside_folder(spec: SceneSpec, path: Path) -> None:
     """Check that all named files are inside the scene's folder."""
     named: list[tuple[KeyPath, str | None]] = [*environments(spec)]
     named += [(keys, name) for keys, name, _ in object_assets(spec)]
@@ -198,14 +200,14 @@ def read_named(spec: SceneSpec, path: Path) -> Named:
 
 def _check_images(spec: SceneSpec, path: Path, images: Mapping[str, Path]) -> None:
     """Check that images exist and that Mitsuba can read them safely."""
-    asked = list(named_images(spec))
-    for keys, name in asked:
+    named = list(named_images(spec))
+    for keys, name in named:
         with blaming(path, *keys):
             if not images[name].is_file():
                 raise InputError(f"{images[name]}: no such file")
-    for start in range(0, len(asked), _MOST_IMAGES):
-        some = asked[start : start + _MOST_IMAGES]
-        for (keys, _), reason in zip(some, check_images([images[name] for _, name in some]), strict=True):
+    for start in range(0, len(named), _MAX_IMAGES_PER_PROCESS):
+        batch = named[start : start + _MAX_IMAGES_PER_PROCESS]
+        for (keys, _), reason in zip(batch, check_images([images[name] for _, name in batch]), strict=True):
             if reason is not None:
                 raise InputError(f"{key_place(path, keys)}: {reason}")
 

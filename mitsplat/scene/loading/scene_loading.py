@@ -25,7 +25,7 @@ from mitsplat.scene.walls import backdrop_shapes, enclosure_walls
 from mitsplat.storage.file_kinds import refuse_others
 from mitsplat.storage.yaml_input import key_place, load_yaml
 
-_MADE_IN_PYTHON = "<python>.yaml"
+_PYTHON_SCENE_NAME = "<python>.yaml"
 """File name of scenes made in Python. No such file exists; error messages begin with it, and datasets store the scene
 there.
 """
@@ -44,7 +44,7 @@ def load_scene(path: str | Path, *, overrides: Mapping[str, Any] | None = None, 
     """
     path = Path(path)
     refuse_others(path, "a scene file (.yaml)", ".yaml", ".yml")
-    return _scene_of(load_yaml(path, SceneSpec, overrides=overrides), path, allow_outside=allow_outside)
+    return _build_scene(load_yaml(path, SceneSpec, overrides=overrides), path, allow_outside=allow_outside)
 
 
 def make_scene(spec: SceneSpec, folder: str | Path = ".") -> Scene:
@@ -58,23 +58,23 @@ def make_scene(spec: SceneSpec, folder: str | Path = ".") -> Scene:
     Raises:
         InputError: If a named file is missing or invalid.
     """
-    return _scene_of(spec, Path(folder) / _MADE_IN_PYTHON, allow_outside=True)
+    return _build_scene(spec, Path(folder) / _PYTHON_SCENE_NAME, allow_outside=True)
 
 
-def _scene_of(spec: SceneSpec, path: Path, *, allow_outside: bool) -> Scene:
+def _build_scene(spec: SceneSpec, path: Path, *, allow_outside: bool) -> Scene:
     """Return the scene of a specification."""
     spec = matched(spec, path, allow_outside=allow_outside)
     _check_lens(spec, path)
-    _check_held_out(spec, path)
+    _check_hold_out(spec, path)
     with blaming(path, "conveyor", "belt"):
         check_belt(spec)
     if spec.backdrop is not None:
         spec = spec.model_copy(update={"shapes": (*spec.shapes, *backdrop_shapes(spec.backdrop)), "backdrop": None})
     named = read_named(spec, path)
     with blaming(path, "environment"):
-        surroundings = tuple(map(_metric, named.environments))
+        surroundings = tuple(map(_check_units, named.environments))
     assets = _sized_objects(spec, path, named)
-    spec, shape_meshes = _walled(spec, named, assets)
+    spec, shape_meshes = _expand_enclosures(spec, named, assets)
     if (lights := written_out(spec)) != spec.lights:
         spec = spec.model_copy(update={"lights": lights})
     return Scene(
@@ -102,7 +102,7 @@ def _sized_objects(spec: SceneSpec, path: Path, named: Named) -> tuple[Asset, ..
             if key not in sized:
                 with blaming(path, *keys):
                     asset = named.assets[name]
-                    asset = _metric(asset) if entry.size is None else asset.resized(entry.size)
+                    asset = _check_units(asset) if entry.size is None else asset.resized(entry.size)
                     sized[key] = asset if scale == 1.0 else asset.scaled(scale)
                     _check_object(sized[key])
             with blaming(path, *keys):
@@ -118,7 +118,9 @@ def _class_names(spec: SceneSpec, assets: Sequence[Asset]) -> tuple[str, ...]:
     return tuple(sorted({asset.class_name for entry, asset in zip(entries, assets, strict=True) if entry.label}))
 
 
-def _walled(spec: SceneSpec, named: Named, assets: tuple[Asset, ...]) -> tuple[SceneSpec, tuple[trimesh.Trimesh, ...]]:
+def _expand_enclosures(
+    spec: SceneSpec, named: Named, assets: tuple[Asset, ...]
+) -> tuple[SceneSpec, tuple[trimesh.Trimesh, ...]]:
     """Return the specification with enclosures expanded to shapes, and the mesh of every shape."""
     enclosures = (spec.enclosure, *(region.enclosure for region in spec.regions))
     if not any(enclosures):
@@ -144,7 +146,7 @@ def _check_lens(spec: SceneSpec, path: Path) -> None:
                 raise InputError(str(error)) from error
 
 
-def _check_held_out(spec: SceneSpec, path: Path) -> None:
+def _check_hold_out(spec: SceneSpec, path: Path) -> None:
     """Check that held-out assets and environments exist, and that training keeps an environment."""
     named = {
         "assets": {name for _, name, _ in object_assets(spec)},
@@ -167,7 +169,7 @@ def scene_json_schema() -> dict[str, Any]:
     return {**named, **SceneSpec.model_json_schema()}
 
 
-def _metric(asset: Asset) -> Asset:
+def _check_units(asset: Asset) -> Asset:
     """Return the asset unchanged if its units are known.
 
     Raises:

@@ -39,9 +39,9 @@ def draw_regions(spec: SceneSpec, layout: int) -> tuple[int, ...]:
     areas = np.array([np.prod(np.subtract(region.max, region.min)[:2]) for region, _ in spec.all_regions])
     found: list[int] = []
     for position, (entry, count) in enumerate(zip(spec.objects, _counts(spec, layout), strict=True)):
-        among = list(spec.regions_of(entry))
+        candidates = list(spec.regions_of(entry))
         rng = random_stream(spec.seed, f"object region {position}", layout)
-        found += [among[i] for i in weighted_choice(rng, areas[among], count)]
+        found += [candidates[i] for i in weighted_choice(rng, areas[candidates], count)]
     return tuple(found)
 
 
@@ -82,30 +82,30 @@ def _draw_entry(scene: Scene, position: int, layout: int, count: int) -> list[in
             members[scene.assets[asset].class_name].append(i)
     names = sorted(members)
     drawn = []
-    for kind in _dealt(spec, position, layout, count, len(names)):
-        among = members[names[kind]]
-        drawn.append(pool[among[weighted_choice(rng, weights[among])[0]]])
+    for class_number in _balanced_classes(spec, position, layout, count, len(names)):
+        candidates = members[names[class_number]]
+        drawn.append(pool[candidates[weighted_choice(rng, weights[candidates])[0]]])
     return drawn
 
 
-def _dealt(spec: SceneSpec, position: int, layout: int, count: int, kinds: int) -> list[int]:
+def _balanced_classes(spec: SceneSpec, position: int, layout: int, count: int, num_classes: int) -> list[int]:
     """Return the class of each object of a balanced entry in a layout.
 
     The classes of a split form a sequence of random permutations. The layouts of the split take consecutive parts of
     it.
     """
     split = split_of(layout, spec.output.validation, spec.output.test)
-    known = max(layout + 1, min(1 << layout.bit_length(), spec.output.layouts))
-    first = int(_dealt_before(spec, position, known)[layout])
-    decks = {
-        deck: random_stream(spec.seed, f"deck {position} {split}", deck).permutation(kinds)
-        for deck in range(first // kinds, (first + count) // kinds + 1)
+    num_layouts = max(layout + 1, min(1 << layout.bit_length(), spec.output.layouts))
+    first = int(_objects_before(spec, position, num_layouts)[layout])
+    permutations = {
+        turn: random_stream(spec.seed, f"deck {position} {split}", turn).permutation(num_classes)
+        for turn in range(first // num_classes, (first + count) // num_classes + 1)
     }
-    return [int(decks[card // kinds][card % kinds]) for card in range(first, first + count)]
+    return [int(permutations[rank // num_classes][rank % num_classes]) for rank in range(first, first + count)]
 
 
 @lru_cache(maxsize=8)
-def _dealt_before(spec: SceneSpec, position: int, layouts: int) -> Int64Array:
+def _objects_before(spec: SceneSpec, position: int, layouts: int) -> Int64Array:
     """Return, for each of the first layouts, the number of objects of an entry in the earlier layouts of its split."""
     totals = dict.fromkeys(SPLITS, 0)
     before = np.zeros(layouts, dtype=np.int64)

@@ -54,12 +54,12 @@ class Belt:
         """Velocity of the belt surface in the world [m/s], shape (3,)."""
         return np.asarray(self.speed * stated_pose(self.box)[:3, 0])
 
-    def shows(self, points: Float64Array) -> BoolArray:
+    def on_surface(self, points: Float64Array) -> BoolArray:
         """Return a mask of the world points (N, 3) [m] that lie on the upper side of the belt."""
-        return _over(self.box, points, _NEAR)
+        return _above_box(self.box, points, _NEAR)
 
 
-def _over(box: Box, points: Float64Array, height: float) -> BoolArray:
+def _above_box(box: Box, points: Float64Array, height: float) -> BoolArray:
     """Return a mask of the world points (N, 3) [m] that are above a box, up to a height [m]."""
     pose, half = stated_pose(box), np.array(box.size) / 2
     x, y, z = ((points - pose[:3, 3]) @ pose[:3, :3]).T
@@ -72,9 +72,9 @@ def belt_of(spec: SceneSpec, view: int) -> Belt | None:
     if spec.conveyor is None:
         return None
     box = next(shape.box for shape in spec.shapes if shape.name == spec.conveyor.belt and shape.box is not None)
-    seats = len(spec.seats)
-    turn, turns = view // seats, -(-spec.output.views // seats)
-    follows = view + 1 < spec.output.views and (view + 1) // seats != turn
+    views_per_turn = len(spec.views_of_turn)
+    turn, turns = view // views_per_turn, -(-spec.output.views // views_per_turn)
+    follows = view + 1 < spec.output.views and (view + 1) // views_per_turn != turn
     interval = spec.conveyor.interval
     return Belt(box, spec.conveyor.speed, interval * (turn - (turns - 1) / 2), interval if follows else 0.0)
 
@@ -96,11 +96,11 @@ def carried_by(belt: Belt, layout: Layout) -> Layout:
     settled = layout.settled or layout
     if not settled.certificate.attempts:  # without physics, poses are given
         return layout
-    return _moved(settled, belt.box, tuple((belt.time * belt.velocity).tolist()))
+    return _shifted_layout(settled, belt.box, tuple((belt.time * belt.velocity).tolist()))
 
 
 @lru_cache(maxsize=4)
-def _moved(settled: Layout, box: Box, by: Sequence[float]) -> Layout:
+def _shifted_layout(settled: Layout, box: Box, offset: Sequence[float]) -> Layout:
     """Return the layout with the carried objects moved by a vector [m].
 
     The cache returns the identical layout for all views of a moment, so that the renderer can skip unchanged geometry.
@@ -111,7 +111,7 @@ def _moved(settled: Layout, box: Box, by: Sequence[float]) -> Layout:
         pose = instance.world_from_object
         if instance.id in moving:
             pose = pose.copy()
-            pose[:3, 3] += by
+            pose[:3, 3] += offset
         instances.append(replace(instance, world_from_object=pose))
     return replace(settled, instances=tuple(instances), settled=settled)
 
@@ -120,7 +120,7 @@ def carried_instances(layout: Layout, box: Box) -> frozenset[int]:
     """Return the ids of the instances that a belt carries: those whose origin was above it after settling."""
     settled = (layout.settled or layout).instances
     places = np.array([instance.world_from_object[:3, 3] for instance in settled]).reshape(-1, 3)
-    above = _over(box, places, np.inf)
+    above = _above_box(box, places, np.inf)
     return frozenset(instance.id for instance, is_above in zip(settled, above, strict=True) if is_above)
 
 

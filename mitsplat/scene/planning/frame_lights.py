@@ -23,7 +23,7 @@ def written_out(spec: SceneSpec) -> tuple[LightSpec, ...]:
     """Return the lights of a scene file, with rooms expanded to their lights."""
     found: list[LightSpec] = []
     for light in spec.lights:
-        found += light.written_out() if isinstance(light, RoomLight) else (light,)
+        found += light.expand() if isinstance(light, RoomLight) else (light,)
     return tuple(found)
 
 
@@ -39,10 +39,14 @@ def lights_at(spec: SceneSpec, layout: int, index: int, time: float) -> tuple[Li
         if isinstance(light, EnvironmentLight):
             light = _with_image(light, random_stream(spec.seed, f"light {position} image", layout))
         for copy in range(copies):
-            one = light if light.draw is None else _drawn(light, light.draw, spec.seed, f"{position}.{copy}", number)
+            one = (
+                light
+                if light.draw is None
+                else _draw_values(light, light.draw, spec.seed, f"{position}.{copy}", number)
+            )
             name = f"{position}" if not copy else f"{position}.{copy}"
             factors = random_stream(spec.seed, f"light intensity {name}", layout)
-            found.append(_on_path(one, time, float(factors.uniform(*spec.randomise.light_intensity))))
+            found.append(_at_time(one, time, float(factors.uniform(*spec.randomise.light_intensity))))
     return tuple(found)
 
 
@@ -54,7 +58,7 @@ def _with_image(sky: EnvironmentLight, rng: np.random.Generator) -> EnvironmentL
     return sky.model_copy(update={"image": image, "pool": None, "weights": ()})
 
 
-def _drawn(light: LightSpec, draw: LightDraw, seed: int, name: str, number: int) -> LightSpec:
+def _draw_values(light: LightSpec, draw: LightDraw, seed: int, name: str, number: int) -> LightSpec:
     """Return a light with values drawn from its ranges."""
 
     def uniform(key: str, low: Any, high: Any) -> Any:
@@ -80,7 +84,7 @@ def _drawn(light: LightSpec, draw: LightDraw, seed: int, name: str, number: int)
     return light.model_copy(update=state)
 
 
-def _on_path(light: LightSpec, time: float, factor: float) -> LightSpec:
+def _at_time(light: LightSpec, time: float, factor: float) -> LightSpec:
     """Return a light at ``time`` in [0, 1] of its path, with its intensity multiplied by a factor."""
     strength = "intensity" if isinstance(light, SpotLight | PointLight) else "radiance"
     state: dict[str, Any] = {strength: getattr(light, strength)}
@@ -94,7 +98,7 @@ def _on_path(light: LightSpec, time: float, factor: float) -> LightSpec:
             "path": (),
         }
         if light.temperature is not None:
-            warmth = [1.0 / (key.temperature or light.temperature) for key in light.path]
-            state["temperature"] = float(1.0 / np.interp(time, times, warmth))
+            inverse_kelvins = [1.0 / (key.temperature or light.temperature) for key in light.path]
+            state["temperature"] = float(1.0 / np.interp(time, times, inverse_kelvins))
     state[strength] *= factor
     return light.model_copy(update=state)

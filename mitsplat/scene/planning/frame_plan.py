@@ -25,7 +25,7 @@ from mitsplat.scene.spec.scene_spec import SceneSpec
 from mitsplat.scene.splits import Split, split_of
 from mitsplat.scene.streams import random_stream
 
-_DRAWN = (
+_FRAME_DRAWS = (
     *("exposure", "vignetting", "chromatic_aberration", "motion_blur", "motion_angle", "iso"),
     *("white_balance", "hue", "saturation", "chroma_stretch", "chroma_angle", "sharpening", "jpeg"),
 )
@@ -142,8 +142,8 @@ def plan_frame(
         lights=lights_at(spec, number, index, time),
         draws={
             name: float(random_stream(spec.seed, name, index).uniform(*bounds))
-            for name in _DRAWN
-            if (bounds := _drawn_from(ranges, name)) is not None
+            for name in _FRAME_DRAWS
+            if (bounds := _range_of(ranges, name)) is not None
         },
         seed=int(random_stream(spec.seed, "pixel noise", index).integers(2**31)),
         viewpoint=here.drawn,
@@ -151,7 +151,7 @@ def plan_frame(
     )
 
 
-def _drawn_from(ranges: Randomise, name: str) -> tuple[float, float] | None:
+def _range_of(ranges: Randomise, name: str) -> tuple[float, float] | None:
     """Return the range of a value that is drawn for a frame; None if the scene does not use the value."""
     if name in ("chromatic_aberration", "sharpening") and not any(getattr(ranges, name)):
         return None

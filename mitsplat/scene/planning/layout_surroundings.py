@@ -99,14 +99,14 @@ class LayoutSurroundings:
 
     def to_json(self, spec: SceneSpec) -> dict[str, Any]:
         """Return the values that the scene file leaves open as JSON values; empty if there are none."""
-        told: dict[str, Any] = {}
+        values: dict[str, Any] = {}
         if isinstance(spec.environment, tuple):
-            told["environment"] = {"number": self.environment, "name": spec.environment[self.environment]}
+            values["environment"] = {"number": self.environment, "name": spec.environment[self.environment]}
         if self.finishes:
-            told["materials"] = {name: finish.to_json() for name, finish in self.finishes.items()}
+            values["materials"] = {name: finish.to_json() for name, finish in self.finishes.items()}
         if self.background is not None:
-            told["background"] = self.background.to_json()
-        return told
+            values["background"] = self.background.to_json()
+        return values
 
 
 def draw_place(spec: SceneSpec, index: int, layout: int | None = None) -> LayoutSurroundings:
@@ -131,28 +131,28 @@ def draw_finish(materials: Sequence[Material], seed: int, name: str, layout: int
     material = materials[int(rng.integers(len(materials)))]
     pattern = int(rng.integers(2**31))
     # All values are drawn always, so that no value depends on the other values of the material.
-    hue, saturation, value, contrast, scale, rotate, other, u, v, which = map(float, rng.random(10))
+    hue, saturation, value, contrast, scale, rotate, other, u, v, choice = map(float, rng.random(10))
     if isinstance(material, ImageMaterial):
         return MaterialDraw(
             kind=material.kind,
-            scale=_between(material.scale, scale),
-            rotate=_between(material.rotate, rotate),
+            scale=_lerp(material.scale, scale),
+            rotate=_lerp(material.rotate, rotate),
             offset=(u, v),
-            gain=_between(material.gain, other),
-            image=material.images[int(which * len(material.images))],
+            gain=_lerp(material.gain, other),
+            image=material.images[int(choice * len(material.images))],
         )
-    tint = _between(material.hue, hue) / 360 % 1.0, _between(material.saturation, saturation)
-    bright = _between(material.value, value)
+    tint = _lerp(material.hue, hue) / 360 % 1.0, _lerp(material.saturation, saturation)
+    bright = _lerp(material.value, value)
     first = colorsys.hsv_to_rgb(*tint, bright)
     if isinstance(material, ColourMaterial):
         return MaterialDraw(kind=material.kind, colours=(first,))
     return MaterialDraw(
         kind=material.kind,
-        colours=(first, colorsys.hsv_to_rgb(*tint, bright * (1 - _between(material.contrast, contrast)))),
-        scale=_between(material.scale, scale),
-        rotate=_between(material.rotate, rotate),
+        colours=(first, colorsys.hsv_to_rgb(*tint, bright * (1 - _lerp(material.contrast, contrast)))),
+        scale=_lerp(material.scale, scale),
+        rotate=_lerp(material.rotate, rotate),
         offset=(u, v),
-        roughness=_between(material.roughness, other) if isinstance(material, BrushedMetalMaterial) else None,
+        roughness=_lerp(material.roughness, other) if isinstance(material, BrushedMetalMaterial) else None,
         seed=pattern,
     )
 
@@ -160,15 +160,15 @@ def draw_finish(materials: Sequence[Material], seed: int, name: str, layout: int
 def draw_backing(background: Background, seed: int, number: int) -> BackgroundDraw:
     """Draw the background image of frame or layout ``number``."""
     rng = random_stream(seed, "background", number)
-    which, crop, x, y, rotate, gain = map(float, rng.random(6))
+    choice, crop, x, y, rotate, gain = map(float, rng.random(6))
     return BackgroundDraw(
-        image=background.images[int(which * len(background.images))],
-        crop=_between(background.crop, crop),
+        image=background.images[int(choice * len(background.images))],
+        crop=_lerp(background.crop, crop),
         place=(x, y),
-        rotate=_between(background.rotate, rotate),
-        gain=_between(background.gain, gain),
+        rotate=_lerp(background.rotate, rotate),
+        gain=_lerp(background.gain, gain),
     )
 
 
-def _between(bounds: tuple[float, float], share: float) -> float:
+def _lerp(bounds: tuple[float, float], share: float) -> float:
     return float(bounds[0] + share * np.subtract(*bounds[::-1]))

@@ -85,8 +85,8 @@ def _draw(scene: Scene, layout: int, instance: Instance, entry: int) -> ObjectAp
     def stream(name: str) -> np.random.Generator:
         return random_stream(scene.spec.seed, f"appearance {name}", layout, instance.id)
 
-    def uniform(name: str, bounds: tuple[float, float] | None, own: float) -> float:
-        return own if bounds is None else float(stream(name).uniform(*bounds))
+    def uniform(name: str, bounds: tuple[float, float] | None, asset_value: float) -> float:
+        return asset_value if bounds is None else float(stream(name).uniform(*bounds))
 
     red, green, blue = stream("gain").uniform(*ranges.gain, 3).tolist()
     return ObjectAppearance(

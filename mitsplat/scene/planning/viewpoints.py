@@ -76,7 +76,7 @@ class Viewpoint:
 
 
 @dataclass(frozen=True, eq=False)
-class _Turn:
+class _CameraTurn:
     """Frame as one of the views of its camera.
 
     Attributes:
@@ -104,13 +104,13 @@ class _Turn:
         """Time in [0, 1] over the views of the camera in the layout."""
         return self.turn / max(1, self.turns - 1)
 
-    def take(self, pose: Float64Array) -> tuple[Camera, dict[str, Any]]:
+    def camera_at_pose(self, pose: Float64Array) -> tuple[Camera, dict[str, Any]]:
         """Return the camera at a pose plus handheld motion, and the values drawn for it."""
         camera, drawn = self.camera, dict[str, Any]()
         if camera.zoom[0] < camera.zoom[1]:
             drawn["zoom"] = float(random_stream(self.seed, "camera zoom", self.index).uniform(*camera.zoom))
         if camera.handheld is not None:
-            drawn["handheld"] = self._sway(camera.handheld).tolist()
+            drawn["handheld"] = self._handheld_motion(camera.handheld).tolist()
             pose = pose @ moved_by(drawn["handheld"])
         taken = camera_at(pose, camera.intrinsics, self.output, drawn.get("zoom", camera.zoom[0]))
         if camera.defocus is not None:
@@ -120,10 +120,10 @@ class _Turn:
             )
             taken = replace(taken, aperture_radius=drawn["aperture"], focus_distance=drawn["focus"])
         if camera.motion is not None:
-            drawn["motion"] = self._motion(camera.motion)
+            drawn["motion"] = self._draw_motion(camera.motion)
         return taken, drawn
 
-    def _motion(self, motion: Motion) -> dict[str, Any]:
+    def _draw_motion(self, motion: Motion) -> dict[str, Any]:
         """Draw exposure and readout [s], velocity [m/s] and rotation rate [degrees/s], in the camera's frame."""
         rng = random_stream(self.seed, "camera motion", self.index)
         exposure, *rates = (float(rng.uniform(*bounds)) for bounds in (motion.exposure, motion.speed, motion.rotation))
@@ -131,7 +131,7 @@ class _Turn:
         drawn = {"exposure": exposure, "velocity": velocity.tolist(), "rotation": rotation.tolist()}
         return drawn | ({"readout": float(rng.uniform(*motion.readout))} if motion.readout[1] else {})
 
-    def _sway(self, hand: Handheld) -> Float64Array:
+    def _handheld_motion(self, hand: Handheld) -> Float64Array:
         """Return displacement [m] and rotation vector [degrees] of the handheld camera at a turn, shape (6,).
 
         A sum of N cosines with random phases is approximately normal and has a variance of N/2, whatever the
@@ -153,17 +153,17 @@ def view_of(scene: Scene, index: int, layout: Layout | None = None) -> Viewpoint
     spec = scene.spec
     cameras = (spec.camera, *spec.cameras)
     number_of_layout, view = divmod(index, spec.output.views)
-    seats = spec.seats
-    turn, seat = divmod(view, len(seats))
-    number, side = seats[seat]
+    views_of_turn = spec.views_of_turn
+    turn, place_in_turn = divmod(view, len(views_of_turn))
+    number, side = views_of_turn[place_in_turn]
     camera = cameras[number]
     if side and camera.stereo is not None:
         left = view_of(scene, index - 1, layout)
         pose = left.camera.world_from_camera.copy()
         pose[:3, 3] += camera.stereo.baseline * pose[:3, 0]
         return Viewpoint(replace(left.camera, world_from_camera=pose), {**left.drawn, "side": "right"})
-    turns = 1 + (spec.output.views - 1 - seat) // len(seats)
-    here = _Turn(spec.seed, index, number, camera, spec.output, number_of_layout, turn, turns)
+    turns = 1 + (spec.output.views - 1 - place_in_turn) // len(views_of_turn)
+    here = _CameraTurn(spec.seed, index, number, camera, spec.output, number_of_layout, turn, turns)
     own: dict[str, Any] = {"camera": number} if spec.cameras else {}
     own |= {"side": "left"} if camera.stereo else {}
     if isinstance(camera, CameraHemisphere):
@@ -178,8 +178,8 @@ def view_of(scene: Scene, index: int, layout: Layout | None = None) -> Viewpoint
             keys = [look_at_pose(key.eye, key.target, key.up) for key in camera.keys]
             pose = interpolate_poses(keys, here.time)[0]
         pose[:3, 3] += camera.jitter * random_stream(spec.seed, "camera jitter", index).standard_normal(3)
-    eye, drawn = here.take(pose)
-    return Viewpoint(eye, own | drawn)
+    view_camera, drawn = here.camera_at_pose(pose)
+    return Viewpoint(view_camera, own | drawn)
 
 
 def moved_by(motion: Sequence[float]) -> Float64Array:
@@ -231,7 +231,7 @@ def _orbit_pose(camera: CameraOrbit, view: int, views: int) -> Float64Array:
     return look_at_pose(np.add(camera.target, offset), camera.target)
 
 
-def _walk_pose(camera: CameraWalk, here: _Turn) -> Float64Array:
+def _walk_pose(camera: CameraWalk, here: _CameraTurn) -> Float64Array:
     """Return a pose by interpolation between the waypoints of the layout.
 
     The interpolation is monotone piecewise cubic (Fritsch and Carlson 1980).
@@ -248,44 +248,49 @@ def _pose_around(target: Float64Array, azimuth: float, sine: float, radius: floa
     return look_at_pose(target + radius * direction(azimuth, sine), target)
 
 
-def _hemisphere_view(scene: Scene, here: _Turn, camera: CameraHemisphere, layout: Layout | None) -> Viewpoint:
+def _hemisphere_view(scene: Scene, here: _CameraTurn, camera: CameraHemisphere, layout: Layout | None) -> Viewpoint:
     """Return the accepted candidate view whose shares of hidden and cut objects are nearest to the targets.
 
     The search ends at the first accepted candidate that meets the targets exactly.
     """
     spec, index = scene.spec, here.index
-    sight = (
+    predictor = (
         None
-        if layout is None or (camera.look_at == "target" and not camera.chosen)
+        if layout is None or (camera.look_at == "target" and not camera.selects_views)
         else VisibilityPredictor.of(scene, layout)
     )
-    if sight is None or not camera.chosen:
-        target, seen = _target(camera, spec.seed, index, 0, sight)
+    if predictor is None or not camera.selects_views:
+        target, seen = _target(camera, spec.seed, index, 0, predictor)
         pose, target = _hemisphere_pose(camera, here, 0, target)
-        eye, drawn = here.take(pose)
+        view_camera, drawn = here.camera_at_pose(pose)
         return Viewpoint(
-            eye, drawn if camera.look_at == "target" else {**drawn, "target": target.tolist(), "object": seen}
+            view_camera, drawn if camera.look_at == "target" else {**drawn, "target": target.tolist(), "object": seen}
         )
     shares = (camera.occlusion, camera.truncation)
-    fate = random_stream(spec.seed, "camera shares", index).uniform(size=2)
+    rounding = random_stream(spec.seed, "camera shares", index).uniform(size=2)
     best: tuple[float, Viewpoint] | None = None
     refused: list[tuple[float, str]] = []
     for number in range(camera.tries):
-        target, seen = _target(camera, spec.seed, index, number, sight)
+        target, seen = _target(camera, spec.seed, index, number, predictor)
         pose, target = _hemisphere_pose(camera, here, number, target)
         if camera.truncation is not None and number % 2:
             rng = _stream(spec.seed, "camera border", index, number)
-            pose, target = _look_past(here.take(pose)[0], pose, target, rng)
-        eye, held = here.take(pose)
-        framed = sight.framed(eye)
-        if camera.accept is not None and (faults := sight.faults(framed, camera.accept)):
-            refused.append((sum(miss for miss, _ in faults), " and ".join(text for _, text in faults)))
+            pose, target = _rotate_target_to_border(here.camera_at_pose(pose)[0], pose, target, rng)
+        view_camera, motion_draws = here.camera_at_pose(pose)
+        projected = predictor.project(view_camera)
+        if camera.accept is not None and (violations := predictor.find_violations(projected, camera.accept)):
+            refused.append((sum(miss for miss, _ in violations), " and ".join(text for _, text in violations)))
             continue
-        prospect = sight.prospect(framed, camera.occlusion, camera.truncation, spec.labels.min_pixels)
-        drawn = {"target": target.tolist(), "object": seen, "attempt": number, "predicted": prospect.to_json()} | held
-        cost = _cost(prospect, [0.0 if share is None else share.share for share in shares], fate)
+        prediction = predictor.predict(projected, camera.occlusion, camera.truncation, spec.labels.min_pixels)
+        drawn = {
+            "target": target.tolist(),
+            "object": seen,
+            "attempt": number,
+            "predicted": prediction.to_json(),
+        } | motion_draws
+        cost = _cost(prediction, [0.0 if share is None else share.share for share in shares], rounding)
         if best is None or cost < best[0]:
-            best = cost, Viewpoint(eye, drawn)
+            best = cost, Viewpoint(view_camera, drawn)
         if cost == 0:
             break
     if best is None:
@@ -296,36 +301,36 @@ def _hemisphere_view(scene: Scene, here: _Turn, camera: CameraHemisphere, layout
     return best[1]
 
 
-def _cost(prospect: PredictedView, shares: list[float], fate: Float64Array) -> float:
+def _cost(prediction: PredictedView, shares: list[float], rounding: Float64Array) -> float:
     """Return the difference between the shares of objects in a view and the target shares.
 
-    A share of few objects is seldom a whole number. The frame's random numbers ``fate`` round it up or down, so that
-    the average over frames reaches the target although frames are independent.
+    A share of few objects is seldom a whole number. The random numbers ``rounding`` of the frame round it up or
+    down, so that the average over frames reaches the target although frames are independent.
     """
-    wanted = np.floor(np.multiply(shares, prospect.in_view) + fate)
-    counts = np.array([prospect.hidden, prospect.cut])
-    if not prospect.in_view:
-        return float(len(prospect.visible))  # an image without objects meets no target share
-    return float(np.abs(counts - wanted).sum()) / prospect.in_view
+    wanted = np.floor(np.multiply(shares, prediction.in_view) + rounding)
+    counts = np.array([prediction.hidden, prediction.cut])
+    if not prediction.in_view:
+        return float(len(prediction.visible))  # an image without objects meets no target share
+    return float(np.abs(counts - wanted).sum()) / prediction.in_view
 
 
 def _target(
-    camera: CameraHemisphere, seed: int, index: int, number: int, sight: VisibilityPredictor | None
+    camera: CameraHemisphere, seed: int, index: int, number: int, predictor: VisibilityPredictor | None
 ) -> tuple[Float64Array, int | None]:
     """Return the point at the centre of a candidate view before jitter [m], and the id of the object there, if any."""
-    if sight is None or camera.look_at == "target" or not sight.labelled.any():
+    if predictor is None or camera.look_at == "target" or not predictor.labelled.any():
         return np.array(camera.target, dtype=np.float64), None
-    among = np.flatnonzero(sight.labelled)
+    among = np.flatnonzero(predictor.labelled)
     drawn = int(among[_stream(seed, "camera look at", index, number).integers(len(among))])
     if camera.look_at == "objects":
-        return sight.centres[drawn], int(sight.ids[drawn])
-    away = np.linalg.norm(sight.centres[among] - sight.centres[drawn], axis=1)
+        return predictor.centres[drawn], int(predictor.ids[drawn])
+    away = np.linalg.norm(predictor.centres[among] - predictor.centres[drawn], axis=1)
     nearest = among[np.argsort(away, kind="stable")[: 1 + _NEIGHBOURS]]
-    return sight.centres[nearest].mean(axis=0), int(sight.ids[drawn])
+    return predictor.centres[nearest].mean(axis=0), int(predictor.ids[drawn])
 
 
 def _hemisphere_pose(
-    camera: CameraHemisphere, here: _Turn, number: int, middle: Float64Array
+    camera: CameraHemisphere, here: _CameraTurn, number: int, middle: Float64Array
 ) -> tuple[Float64Array, Float64Array]:
     """Return the pose of a candidate view around a point [m], and its target with jitter [m]."""
     seed, index = here.seed, here.index
@@ -351,7 +356,7 @@ def _hemisphere_pose(
     return pose, target
 
 
-def _look_past(
+def _rotate_target_to_border(
     lens: Camera, pose: Float64Array, target: Float64Array, rng: np.random.Generator
 ) -> tuple[Float64Array, Float64Array]:
     """Rotate a pose until its target is near the border of the image.

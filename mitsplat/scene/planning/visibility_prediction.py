@@ -25,14 +25,14 @@ if TYPE_CHECKING:
     from mitsplat.scene.scene import Scene
     from mitsplat.scene.spec.camera_spec import Acceptance, Occlusion, Truncation
 
-_POINTS = 40_000
+_MAX_POINTS = 40_000
 """Maximum number of points of all objects of a layout."""
-_FINEST = 800
+_LARGEST_OBJECT_POINTS = 800
 """Number of points of the object with the largest surface."""
-_FEWEST = 100
-_CELL = 1.25
+_MIN_POINTS = 100
+_CELL_SIZE = 1.25
 """Size of a raster cell, in point spacings."""
-_TESTS = 2_000_000
+_MAX_TESTS = 2_000_000
 """Maximum number of ray-triangle pairs that are tested together."""
 
 
@@ -44,10 +44,10 @@ class ProjectedPoints:
         camera: The camera.
         x, y, depth: Pixel positions [px] and depths [m] of the points, shape (P,).
         raster: Mask of the points in front of the camera and in the image or a margin of one image size around it.
-        edge: Size of the raster cells [px].
+        cell_size: Size of the raster cells [px].
         within: Share of the surface of each object that is in front of the camera and in the image, shape (N,).
         extents: Longer side of the bounding box of each object in the image [px], 0 outside of the image, shape (N,).
-        lost: Share of each object outside of the raster, shape (N,).
+        outside_raster: Share of each object outside of the raster, shape (N,).
     """
 
     camera: Camera
@@ -55,10 +55,10 @@ class ProjectedPoints:
     y: Float64Array
     depth: Float64Array
     raster: BoolArray
-    edge: float
+    cell_size: float
     within: Float64Array
     extents: Float64Array
-    lost: Float64Array
+    outside_raster: Float64Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,7 +99,7 @@ class VisibilityPredictor:
         self.ids = np.array([one.id for one in instances], dtype=np.int64)
         self.labelled = np.array([one.class_index is not None for one in instances], dtype=bool)
         samples = [_surface_points(scene)[one.asset] for one in instances]
-        step = 1 + sum(map(len, samples)) // _POINTS
+        step = 1 + sum(map(len, samples)) // _MAX_POINTS
         samples = [points[::step] for points in samples]
         poses = [one.world_from_object for one in instances]
         placed = [points @ pose[:3, :3].T + pose[:3, 3] for points, pose in zip(samples, poses, strict=True)]
@@ -117,7 +117,7 @@ class VisibilityPredictor:
         self._triangles = np.concatenate([np.zeros((0, 3, 3)), *(mesh.triangles for mesh in shapes)])
         here = scene.environment_of(layout.index)
         around = [] if here is None or here.mesh is None else [here.mesh]
-        self._still = _Triangles(np.concatenate([self._triangles, *(mesh.triangles for mesh in around)]))
+        self._static_triangles = _Triangles(np.concatenate([self._triangles, *(mesh.triangles for mesh in around)]))
 
     @staticmethod
     @lru_cache(maxsize=2)
@@ -125,7 +125,7 @@ class VisibilityPredictor:
         """Return the predictor of a layout, cached for its next frame."""
         return VisibilityPredictor(scene, layout)
 
-    def framed(self, camera: Camera) -> ProjectedPoints:
+    def project(self, camera: Camera) -> ProjectedPoints:
         """Project the surface points into the image of a camera."""
         count, owner = len(self.ids), self._owner
         pixel, depth = camera.project(self._points)
@@ -136,7 +136,7 @@ class VisibilityPredictor:
             # Distortion far outside of the image is undefined, and the raster must be finite.
             raster = front & _within(x, y, camera, 1)
         within, in_raster = (np.bincount(owner[some], minlength=count) / self._counts for some in (inside, raster))
-        extents, edge = np.zeros(count), 1.0
+        extents, cell_size = np.zeros(count), 1.0
         if count:  # points are sorted by owner, and every owner has points
             starts = np.cumsum(self._counts) - self._counts
             for at in (x, y):
@@ -145,55 +145,55 @@ class VisibilityPredictor:
                 extents = np.maximum(extents, np.where(within > 0, high - low, 0.0))
         if front.any():
             away = max(float(np.median(depth[front])), camera.near)
-            edge = _CELL * self._spacing * max(camera.fx, camera.fy) / away
-        return ProjectedPoints(camera, x, y, depth, raster, edge, within, extents, 1.0 - in_raster)
+            cell_size = _CELL_SIZE * self._spacing * max(camera.fx, camera.fy) / away
+        return ProjectedPoints(camera, x, y, depth, raster, cell_size, within, extents, 1.0 - in_raster)
 
-    def prospect(
-        self, framed: ProjectedPoints, occlusion: Occlusion | None, truncation: Truncation | None, min_pixels: int
+    def predict(
+        self, projected: ProjectedPoints, occlusion: Occlusion | None, truncation: Truncation | None, min_pixels: int
     ) -> PredictedView:
         """Predict the visibility of the labelled objects in a view."""
-        visible, beyond, seen = self._cells(framed)
-        beyond = framed.lost + (1.0 - framed.lost) * beyond
-        shown = self.labelled & (seen * framed.edge**2 >= min_pixels)
+        visible, beyond, seen = self._count_cells(projected)
+        beyond = projected.outside_raster + (1.0 - projected.outside_raster) * beyond
+        shown = self.labelled & (seen * projected.cell_size**2 >= min_pixels)
         hidden = cut = 0
         if occlusion is not None:
-            hidden = int(np.count_nonzero(shown & _among(visible, occlusion.visible)))
+            hidden = int(np.count_nonzero(shown & _in_range(visible, occlusion.visible)))
         if truncation is not None:
-            cut = int(np.count_nonzero(shown & _among(beyond, truncation.cut)))
-        ours = self.labelled
-        return PredictedView(visible[ours], beyond[ours], int(np.count_nonzero(shown)), hidden, cut)
+            cut = int(np.count_nonzero(shown & _in_range(beyond, truncation.cut)))
+        labelled = self.labelled
+        return PredictedView(visible[labelled], beyond[labelled], int(np.count_nonzero(shown)), hidden, cut)
 
-    def _cells(self, framed: ProjectedPoints) -> tuple[Float64Array, Float64Array, Int64Array]:
+    def _count_cells(self, projected: ProjectedPoints) -> tuple[Float64Array, Float64Array, Int64Array]:
         """Return, for each object, visible fraction, share beyond the border, and number of visible raster cells."""
-        count, camera, edge, depth = len(self.ids), framed.camera, framed.edge, framed.depth
-        across = int(3 * camera.width / edge) + 2
-        left, above = across // 3 + 1, int(camera.height / edge) + 2
-        among = np.flatnonzero(framed.raster)
-        column, row = (np.floor(at[among] / edge).astype(np.int64) for at in (framed.x, framed.y))
-        key = (column + left + across * (row + above)) * count + self._owner[among]
+        count, camera, cell_size, depth = len(self.ids), projected.camera, projected.cell_size, projected.depth
+        across = int(3 * camera.width / cell_size) + 2
+        left, above = across // 3 + 1, int(camera.height / cell_size) + 2
+        selected = np.flatnonzero(projected.raster)
+        column, row = (np.floor(at[selected] / cell_size).astype(np.int64) for at in (projected.x, projected.y))
+        key = (column + left + across * (row + above)) * count + self._owner[selected]
         order = np.argsort(key)
-        among, key = among[order], key[order]
+        selected, key = selected[order], key[order]
         # Take each object of a cell once, by its nearest point there. The nearest object of the cell is visible.
         first = _starts(key)
-        nearest = among[_least(depth[among], first)]
+        nearest = selected[_first_minima(depth[selected], first)]
         owner, cell = self._owner[nearest], key[first] // count
         seen = np.zeros(len(first), dtype=bool)
-        seen[_least(depth[nearest], _starts(cell))] = True
-        x, y = (np.asarray((n + 0.5) * edge, np.float64) for n in (cell % across - left, cell // across - above))
+        seen[_first_minima(depth[nearest], _starts(cell))] = True
+        x, y = (np.asarray((n + 0.5) * cell_size, np.float64) for n in (cell % across - left, cell // across - above))
         shown = _within(x, y, camera, 0)
         seen &= shown
-        triangles = _between(self._triangles, camera.centre, self._points)
+        triangles = _possible_occluders(self._triangles, camera.centre, self._points)
         if len(triangles):
-            seen[seen] = ~_crossed(camera.centre, self._points[nearest[seen]], triangles)
+            seen[seen] = ~_occluded(camera.centre, self._points[nearest[seen]], triangles)
         seen_cells, own = (np.bincount(owner[some], minlength=count) for some in (seen, shown))
         everywhere = np.bincount(owner, minlength=count)
         beyond = np.where(everywhere > 0, 1.0 - own / np.maximum(everywhere, 1), 1.0)
         return seen_cells / np.maximum(own, 1), beyond, seen_cells
 
-    def faults(self, framed: ProjectedPoints, rules: Acceptance) -> list[tuple[float, str]]:
+    def find_violations(self, projected: ProjectedPoints, rules: Acceptance) -> list[tuple[float, str]]:
         """Return the rules that a view violates: the relative shortfall, and a description."""
-        found, eye = [], framed.camera.centre
-        within, extents = framed.within[self.labelled], framed.extents[self.labelled]
+        found, eye = [], projected.camera.centre
+        within, extents = projected.within[self.labelled], projected.extents[self.labelled]
         share = float(np.mean(within >= 0.5)) if len(within) else 1.0
         if share < rules.in_view:
             text = f"shows {share:.3g} of the labelled objects, where in_view is {rules.in_view:g}"
@@ -202,14 +202,14 @@ class VisibilityPredictor:
         if least < rules.extent:
             found.append((1 - least / rules.extent, f"shows one of {least:.3g} px, where extent is {rules.extent:g}"))
         away = self._clearance(eye, rules.clearance)
-        if name := self._around(eye):
+        if name := self._containing_solid(eye):
             found.append((1.0, f"is from inside of {name}"))
         elif away < rules.clearance:
             text = f"is {away:.3g} m from what is nearest, where clearance is {rules.clearance:g}"
             found.append((1 - away / rules.clearance, text))
         return found
 
-    def _around(self, eye: Float64Array) -> str:
+    def _containing_solid(self, eye: Float64Array) -> str:
         """Return the description of the shape or object that contains a point; empty if none does."""
         if name := solid_around(self._scene, eye):
             return f"shape {name!r}"
@@ -221,7 +221,7 @@ class VisibilityPredictor:
 
     def _clearance(self, eye: Float64Array, reach: float) -> float:
         """Return the distance from a point to the nearest surface [m], at most ``reach``."""
-        distance = self._still.distance(eye, reach)
+        distance = self._static_triangles.distance(eye, reach)
         for one in self._near(eye, distance):
             triangles = _Triangles(np.asarray(_mesh(self._scene, one.asset).triangles))
             distance = triangles.distance(_local(eye, one.world_from_object), distance)
@@ -249,14 +249,16 @@ def _surface_points(scene: Scene) -> tuple[Float64Array, ...]:
     points = []
     for asset in range(len(scene.assets)):
         mesh = _mesh(scene, asset)
-        samples, _ = trimesh.sample.sample_surface(mesh, max(_FEWEST, round(mesh.area / spacing**2)), seed=0)
+        samples, _ = trimesh.sample.sample_surface(mesh, max(_MIN_POINTS, round(mesh.area / spacing**2)), seed=0)
         points.append(np.asarray(samples, dtype=np.float64))
     return tuple(points)
 
 
 def _spacing(scene: Scene) -> float:
     """Return the approximate distance between surface points [m]."""
-    return float(np.sqrt(max(asset.mesh.area for asset in scene.assets if asset.mesh is not None) / _FINEST))
+    return float(
+        np.sqrt(max(asset.mesh.area for asset in scene.assets if asset.mesh is not None) / _LARGEST_OBJECT_POINTS)
+    )
 
 
 def _mesh(scene: Scene, asset: int) -> trimesh.Trimesh:
@@ -281,7 +283,7 @@ def _starts(key: Int64Array) -> Int64Array:
     return np.flatnonzero(begins)
 
 
-def _least(values: Float64Array, starts: Int64Array) -> Int64Array:
+def _first_minima(values: Float64Array, starts: Int64Array) -> Int64Array:
     """Return the index of the first minimum of each run. Runs begin at ``starts``."""
     if not len(starts):
         return starts
@@ -290,7 +292,7 @@ def _least(values: Float64Array, starts: Int64Array) -> Int64Array:
     return equals[np.searchsorted(equals, starts)]
 
 
-def _among(values: Float64Array, bounds: tuple[float, float]) -> BoolArray:
+def _in_range(values: Float64Array, bounds: tuple[float, float]) -> BoolArray:
     return np.asarray((values >= bounds[0]) & (values <= bounds[1]))
 
 
@@ -314,7 +316,7 @@ class _Triangles:
         return min(reach, float(np.linalg.norm(closest - point, axis=1).min()))
 
 
-def _between(triangles: Float64Array, eye: Float64Array, points: Float64Array) -> Float64Array:
+def _possible_occluders(triangles: Float64Array, eye: Float64Array, points: Float64Array) -> Float64Array:
     """Return the triangles that can intersect a line of sight.
 
     A triangle cannot if the bounding box of the points is on the same side of its plane as the eye.
@@ -332,14 +334,14 @@ def _between(triangles: Float64Array, eye: Float64Array, points: Float64Array) -
     return np.asarray(triangles[other.any(axis=1) & (np.abs(here) > 0)])
 
 
-def _crossed(eye: Float64Array, points: Float64Array, triangles: Float64Array) -> BoolArray:
+def _occluded(eye: Float64Array, points: Float64Array, triangles: Float64Array) -> BoolArray:
     """Return a mask of the points (N, 3) whose line of sight from the eye hits a triangle (Möller, Trumbore 1997)."""
     crossed = np.zeros(len(points), dtype=bool)
     one, two = triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
     start = eye - triangles[:, 0]
     turned = np.cross(start, one)
     height = np.einsum("ti,ti->t", two, turned)
-    for part in np.array_split(np.arange(len(points)), 1 + len(points) * len(triangles) // _TESTS):
+    for part in np.array_split(np.arange(len(points)), 1 + len(points) * len(triangles) // _MAX_TESTS):
         ray = points[part] - eye
         across = np.cross(ray[:, None], two[None])
         volume = np.einsum("pti,ti->pt", across, one)

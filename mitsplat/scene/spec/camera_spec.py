@@ -99,7 +99,7 @@ class Motion(StrictModel):
     )
 
     @property
-    def moves(self) -> bool:
+    def is_moving(self) -> bool:
         """True if the camera moves during the exposure."""
         return bool(self.speed[1] or self.rotation[1])
 
@@ -265,13 +265,13 @@ class CameraHemisphere(Viewpoint):
     )
 
     @property
-    def chosen(self) -> bool:
+    def selects_views(self) -> bool:
         """True if views are selected from several candidates, which depends on the objects of the layout."""
         return not (self.accept is None and self.occlusion is None and self.truncation is None)
 
     @model_validator(mode="after")
     def _check_tries(self) -> CameraHemisphere:
-        if "tries" in self.model_fields_set and not self.chosen:
+        if "tries" in self.model_fields_set and not self.selects_views:
             raise FieldError("tries", "needs accept, occlusion or truncation")
         return self
 

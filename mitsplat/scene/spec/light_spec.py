@@ -72,7 +72,7 @@ class LightDraw(StrictModel):
     rotate_z: Range | None = Field(None, description="Rotation about the vertical axis [degrees].")
 
 
-_OF_DRAWS = frozenset({"vary", "count", "distance", "azimuth", "elevation", "around"})
+_DRAW_ONLY_KEYS = frozenset({"vary", "count", "distance", "azimuth", "elevation", "around"})
 """Keys of a draw that lights themselves do not have."""
 
 
@@ -89,7 +89,7 @@ class DrawnLight(StrictModel):
             return self
         local = "position" in type(self).model_fields
         for key in sorted(self.draw.model_fields_set - {"vary"}):
-            if key not in type(self).model_fields and not (local and key in _OF_DRAWS):
+            if key not in type(self).model_fields and not (local and key in _DRAW_ONLY_KEYS):
                 raise FieldError(("draw", key), f"is nothing that a light of kind {getattr(self, 'kind', '')} has")
         if self.draw.distance is not None and self.draw.position is not None:
             raise FieldError(("draw", "distance"), "must not be given together with position")
@@ -101,7 +101,7 @@ class DrawnLight(StrictModel):
         return self
 
     @property
-    def sure(self) -> bool:
+    def always_present(self) -> bool:
         """True if every frame has at least one such light."""
         return self.draw is None or self.draw.count[0] > 0
 
@@ -139,13 +139,13 @@ class LocalLight(DrawnLight):
     )
 
     @property
-    def moved(self) -> bool:
+    def has_drawn_position(self) -> bool:
         """True if the position is drawn."""
         return self.draw is not None and (self.draw.position is not None or self.draw.distance is not None)
 
     @model_validator(mode="after")
     def _check_place(self) -> LocalLight:
-        if "position" not in self.model_fields_set and not self.moved:
+        if "position" not in self.model_fields_set and not self.has_drawn_position:
             raise FieldError("position", "is required")
         return self
 
@@ -164,7 +164,7 @@ class AimedLight(LocalLight):
 
     @model_validator(mode="after")
     def _check(self) -> AimedLight:
-        if self.moved or (self.draw is not None and self.draw.target is not None):
+        if self.has_drawn_position or (self.draw is not None and self.draw.target is not None):
             return self
         for position in (self.position, *(key.position for key in self.path)):
             if position == self.target:
@@ -262,7 +262,7 @@ class RoomLight(StrictModel):
         "layout", description="``layout`` draws all values once per layout, ``frame`` anew for every frame."
     )
 
-    def written_out(self) -> tuple[AreaLight, AreaLight, EnvironmentLight]:
+    def expand(self) -> tuple[AreaLight, AreaLight, EnvironmentLight]:
         """Return the three entries that the room expands to: window, lamps and walls."""
 
         def place(elevation: tuple[float, float]) -> dict[str, Any]:

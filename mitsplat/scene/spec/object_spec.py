@@ -172,7 +172,7 @@ class ObjectSpec(StrictModel):
         check_weights(self.weights, members, "assets")
 
     @property
-    def most(self) -> int:
+    def max_count(self) -> int:
         """Maximum number of objects of the entry in a layout."""
         return len(self.poses) or self.count[1]
 

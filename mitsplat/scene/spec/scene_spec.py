@@ -212,32 +212,36 @@ class SceneSpec(StrictModel):
                 text = f"must not begin with {BACKDROP!r} beside a backdrop (got {shape.name!r})"
                 raise FieldError(("shapes", position, "name"), text)
         for keys, camera in self.camera_entries:
-            if camera.motion is not None and not camera.motion.moves and self.conveyor is None:
+            if camera.motion is not None and not camera.motion.is_moving and self.conveyor is None:
                 raise FieldError((*keys, "motion"), "must have a speed or a rotation, or the scene a conveyor")
         boxes = [shape.name for shape in self.shapes if shape.box is not None]
         if self.conveyor is not None and self.conveyor.belt not in boxes:
             named, got = ", ".join(boxes) or "none", self.conveyor.belt
             raise FieldError(("conveyor", "belt"), f"must be a box among the shapes, {named} (got {got})")
-        skies = [i for i, light in enumerate(self.lights) if isinstance(light, EnvironmentLight | RoomLight)]
+        environment_lights = [
+            i for i, light in enumerate(self.lights) if isinstance(light, EnvironmentLight | RoomLight)
+        ]
         if self.environment == ():
             raise FieldError("environment", "must name at least one asset (got [])")
         if not isinstance(self.environment, str):
             self.check_environment_weights()
-        if len(skies) > 1:
-            raise FieldError(("lights", skies[1], "kind"), "must not be a second environment light, which rooms have")
-        if self.lights and not any(isinstance(light, RoomLight) or light.sure for light in self.lights):
+        if len(environment_lights) > 1:
+            raise FieldError(
+                ("lights", environment_lights[1], "kind"), "must not be a second environment light, which rooms have"
+            )
+        if self.lights and not any(isinstance(light, RoomLight) or light.always_present for light in self.lights):
             raise FieldError(
                 ("lights", 0, "draw", "count"), "must be at least 1 where no other light is in every frame (got 0)"
             )
         if "depth-sensor" in self.output.formats and self.depth_sensor is None:
             raise FieldError(("output", "formats"), "depth-sensor needs a depth_sensor")
         lenses = [camera.intrinsics for _, camera in self.camera_entries]
-        bent = any(lens.lens == "fisheye" or any(lens.distortion) for lens in lenses)
-        if isinstance(self.depth_sensor, StereoSensor) and bent:
+        distorted = any(lens.lens == "fisheye" or any(lens.distortion) for lens in lenses)
+        if isinstance(self.depth_sensor, StereoSensor) and distorted:
             raise FieldError("depth_sensor", "stereo must have cameras without lens distortion")
         if self.hold_out != HoldOut() and not self.output.test:
             raise FieldError("hold_out", "needs a test split: give output.test")
-        turn = len(self.seats)
+        turn = len(self.views_of_turn)
         if any(camera.stereo for camera in (self.camera, *self.cameras)) and self.output.views % turn:
             raise FieldError(
                 ("output", "views"), f"must be a multiple of {turn}, so that pairs are whole (got {self.output.views})"
@@ -253,9 +257,9 @@ class SceneSpec(StrictModel):
             if walls is not None and walls.floor >= region.max[2]:
                 text = f"must be below the region's top at {region.max[2]:g} m (got {walls.floor:g})"
                 raise FieldError((*keys, "enclosure", "floor"), text)
-        put_down = {"upright", "tower", "packed"} & {way for _, way in self.all_regions}
-        for key, stated_so in (("yaw", self.settle.yaw is not None), ("turned_over", self.settle.turned_over > 0)):
-            if stated_so and not put_down:
+        has_upright = {"upright", "tower", "packed"} & {way for _, way in self.all_regions}
+        for key, is_set in (("yaw", self.settle.yaw is not None), ("turned_over", self.settle.turned_over > 0)):
+            if is_set and not has_upright:
                 text = f"needs settle.arrangement upright, tower or packed (got {self.settle.arrangement})"
                 raise FieldError(("settle", key), text)
         names = self.region_names
@@ -276,7 +280,7 @@ class SceneSpec(StrictModel):
         return ((("camera",), self.camera), *((("cameras", i), camera) for i, camera in enumerate(self.cameras)))
 
     @property
-    def seats(self) -> tuple[tuple[int, int], ...]:
+    def views_of_turn(self) -> tuple[tuple[int, int], ...]:
         """For each view of a turn: index of the camera, and 1 for the right image of a stereo pair, else 0."""
         cameras = enumerate((self.camera, *self.cameras))
         return tuple((number, side) for number, camera in cameras for side in range(2 if camera.stereo else 1))

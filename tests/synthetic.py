@@ -10,9 +10,9 @@ import numpy as np
 from mitsplat.frames.frame import Frame
 from mitsplat.labels.labels import Labels
 from mitsplat.renderer.layers import Layers
-from mitsplat.scene.layout import NOTHING_TO_REST
+from mitsplat.scene.layout import NO_PHYSICS
 
-CERTIFICATE = replace(NOTHING_TO_REST, time_to_rest=1.5, collider_penetration=1e-5, attempts=2, refused=("too deep",))
+CERTIFICATE = replace(NO_PHYSICS, time_to_rest=1.5, collider_penetration=1e-5, attempts=2, refused=("too deep",))
 
 
 def frame_around(plan: Any, layout: Any, labels: Labels, *, image: Any, ids: Any, depth: Any, normal: Any) -> Frame:

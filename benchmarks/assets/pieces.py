@@ -19,7 +19,7 @@ from benchmarks.assets.bake import cpu_seconds
 from benchmarks.record import figure, recording
 from mitsplat.bake.mesh_parts import read_parts
 from mitsplat.bake.proxy_mesh import make_proxy
-from mitsplat.geometry.decomposition import convex_pieces, thin_solid, widest_gap
+from mitsplat.geometry.decomposition import convex_pieces, denoise_solid, max_gap
 from mitsplat.geometry.mesh_distance import DistanceSurface, standoff
 from mitsplat.renderer.layers import ensure_variant
 
@@ -40,12 +40,12 @@ def main() -> None:
             start = cpu_seconds()
             pieces = convex_pieces(mesh)
             seconds = cpu_seconds() - start
-            thin = thin_solid(mesh)
+            thin = denoise_solid(mesh)
             points = np.concatenate([thin.vertices, thin.sample(4000, seed=0)])
             back = np.concatenate([mesh.vertices, mesh.sample(4000, seed=0)])
             surface = DistanceSurface(mesh)
             error = max(surface.nearest(points)[2].max(), DistanceSurface(thin).nearest(back)[2].max()) / mesh.scale
-            limit = widest_gap(float(mesh.extents.max()))
+            limit = max_gap(float(mesh.extents.max()))
             rows.append((len(thin.faces), 100 * error, len(pieces), seconds, 1e3 * standoff(surface, pieces), limit))
             print(f"{path.stem}: {len(mesh.faces)} faces, thinned to %d within %.2f %% of the diagonal, %d pieces in "
                   "%.1f CPU s that stand off by %.2f mm" % rows[-1][:-1], flush=True)  # fmt: skip

@@ -27,7 +27,7 @@ from shapely.geometry.base import BaseGeometry
 
 # isort: on
 from benchmarks.detector.experiment import PLAN, VIEWS, write_scene
-from mitsplat.scene.layout import NOTHING_TO_REST, Instance, Layout
+from mitsplat.scene.layout import NO_PHYSICS, Instance, Layout
 from mitsplat.scene.planning.contents import draw_objects, draw_regions
 from mitsplat.scene.scene import Scene
 
@@ -76,7 +76,7 @@ def arranged(scene: Scene, index: int, *, floating: bool) -> Layout:
         pose = place(scene, scene.assets[asset].mesh, region, taken, rng)
         if pose is not None:
             instances.append(Instance(number, asset, scene.class_index(asset), pose))
-    return Layout(index, tuple(instances), NOTHING_TO_REST)
+    return Layout(index, tuple(instances), NO_PHYSICS)
 
 
 def _room(scene: Scene, region: int) -> tuple[np.ndarray, np.ndarray]:

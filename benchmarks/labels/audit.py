@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 import mitsplat as ms
 from benchmarks.record import figure, recording
 from mitsplat.audit.audit import audit_dataset
-from mitsplat.scene.layout import NOTHING_TO_REST, Instance, Layout
+from mitsplat.scene.layout import NO_PHYSICS, Instance, Layout
 from mitsplat.scene.spec.scene_spec import FORMATS
 from mitsplat.scene.streams import random_stream
 
@@ -43,7 +43,7 @@ def scatter(scene: ms.Scene, index: int, *, progress: Any = None) -> Layout:
         kind = scene.class_names.index(scene.assets[asset].class_name)
         # Some ids need sixteen bits.
         instances.append(Instance(i + 1 if index % 2 else 300 * (i + 1), asset, kind, pose))
-    return Layout(index, tuple(instances), NOTHING_TO_REST)
+    return Layout(index, tuple(instances), NO_PHYSICS)
 
 
 def main() -> None:

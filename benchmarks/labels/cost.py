@@ -24,7 +24,7 @@ import mitsplat as ms
 from benchmarks.record import figure, recording
 from mitsplat.formats.registry import Catalogue, write_frame
 from mitsplat.labels.labels import LabelRules, Truth, label_instances
-from mitsplat.scene.layout import NOTHING_TO_REST, Instance, Layout
+from mitsplat.scene.layout import NO_PHYSICS, Instance, Layout
 from mitsplat.scene.spec.scene_spec import FORMATS
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -50,7 +50,7 @@ def grid(scene: ms.Scene) -> Layout:
         pose[:3, 3] = (i % 5 - 2) * 0.055, (i // 5 - 1) * 0.055 - 0.08, -mesh.bounds[0][2] if mesh is not None else 0
         kind = scene.class_names.index(scene.assets[asset].class_name)
         instances.append(Instance(i + 1, asset, kind, pose))
-    return Layout(0, tuple(instances), NOTHING_TO_REST)
+    return Layout(0, tuple(instances), NO_PHYSICS)
 
 
 def truth_of(frame: ms.Frame) -> Truth:

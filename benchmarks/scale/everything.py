@@ -30,7 +30,7 @@ from mitsplat.dataset.dataset_folder import Shard
 from mitsplat.dataset.shards import merge_shards
 from mitsplat.formats.registry import Catalogue, write_frame
 from mitsplat.runtime.device import current_device
-from mitsplat.scene.layout import NOTHING_TO_REST, Instance, Layout
+from mitsplat.scene.layout import NO_PHYSICS, Instance, Layout
 from mitsplat.scene.planning.contents import draw_objects
 from mitsplat.scene.spec.scene_spec import FORMATS
 from mitsplat.scene.streams import random_stream
@@ -92,7 +92,7 @@ def scatter(scene: ms.Scene, index: int, *, progress: Any = None) -> Layout:
         pose[:3, :3] = Rotation.random(rng=rng).as_matrix()
         pose[:3, 3] = rng.normal((0, -0.08, 0.03), (0.07, 0.07, 0.02))
         instances.append(Instance(number, asset, scene.class_index(asset), pose))
-    return Layout(index, tuple(instances), NOTHING_TO_REST)
+    return Layout(index, tuple(instances), NO_PHYSICS)
 
 
 def differing(one: Path, other: Path) -> list[str]:

@@ -9,7 +9,7 @@ import numpy as np
 
 from mitsplat.bake.bake import BakeResult
 from mitsplat.bake.verification import BakedView
-from mitsplat.geometry.decomposition import widest_gap
+from mitsplat.geometry.decomposition import max_gap
 from mitsplat.geometry.mesh import mass_properties
 from mitsplat.geometry.mesh_distance import DistanceSurface, standoff
 from mitsplat.pages.html import REPORT_FILE, figure_of, make_page, rgb_image, verdict_of
@@ -48,7 +48,7 @@ def _figures(result: BakeResult) -> str:
             mass = mass_properties(asset.mesh, asset.pieces, density=asset.density, mass=asset.mass)
             rows["Mass"] = f"{mass.mass:.4g} kg at {asset.density:.4g} kg/m^3"
             truth = asset.mesh if result.surface is None else result.surface
-            gap, bearable = standoff(DistanceSurface(truth), asset.pieces), widest_gap(float(asset.mesh.extents.max()))
+            gap, bearable = standoff(DistanceSurface(truth), asset.pieces), max_gap(float(asset.mesh.extents.max()))
             rows["Convex pieces"] = f"{len(asset.pieces)}, at most {1e3 * gap:.2f} mm outside of the mesh"
             if gap > bearable:
                 warnings.append(

@@ -17,7 +17,7 @@ from mitsplat.capture.boards.targets import Board, find_tags
 from mitsplat.capture.structure_from_motion import SparseModel
 from mitsplat.errors import InputError
 from mitsplat.geometry.camera import Camera
-from mitsplat.geometry.triangulation import meeting_point, triangulate
+from mitsplat.geometry.triangulation import nearest_point_to_lines, triangulate
 from mitsplat.images.picture_files import read_picture
 
 DEFAULT_BOARD = Board()
@@ -156,7 +156,7 @@ def find_metric_frame(
         upward = vertical_from_cameras(model)
         normal, point = (np.array([0.0, -1.0, 0.0]) if upward is None else upward), np.zeros(3)
         source += f"{', ' if source else ''}the cameras' attitude"
-    target = meeting_point(centres, forward)
+    target = nearest_point_to_lines(centres, forward)
     if plane is None:
         origin = target
     elif centred or board_pose is None:
@@ -255,7 +255,7 @@ def find_table(model: SparseModel, *, trials: int = 30000, seed: int = 0) -> tup
     if len(points) < 50:
         return None
     centres, forward = _rays(model)
-    distance = float(np.median(np.linalg.norm(centres - meeting_point(centres, forward), axis=1)))
+    distance = float(np.median(np.linalg.norm(centres - nearest_point_to_lines(centres, forward), axis=1)))
     tolerance = 0.004 * distance
     upward = vertical_from_cameras(model)
     rng = np.random.default_rng(seed)

@@ -17,7 +17,7 @@ from mitsplat.dataset.preflight import run_faults, scene_warnings
 from mitsplat.errors import InputError
 from mitsplat.findings import Finding
 from mitsplat.formats.registry import Catalogue
-from mitsplat.geometry.mesh import mass_properties, solid_of
+from mitsplat.geometry.mesh import closed_solid, mass_properties
 from mitsplat.physics.settle import try_alone, warp_settings
 from mitsplat.reconstruct.registration import measure_offset
 from mitsplat.reconstruct.segment_splats import find_floaters, long_needles, visible_area
@@ -152,7 +152,7 @@ def _mass(asset: Asset, mesh: trimesh.Trimesh) -> Iterator[Finding]:
     except QhullError:
         yield Finding("mass", False, "its mesh spans no volume", "give it another mesh, or another size")
         return
-    solid = solid_of(mesh, pieces)
+    solid = closed_solid(mesh, pieces)
     mass = mass_properties(mesh, pieces, density=asset.density, mass=asset.mass).mass
     density = mass / abs(float(solid.volume)) if solid.volume else float("inf")
     hull = "" if solid is mesh or asset.pieces else " if it filled its convex hull: its convex pieces are not made yet"

@@ -25,12 +25,12 @@ from mitsplat.geometry.camera import Camera
 from mitsplat.geometry.mesh import check_size
 from mitsplat.geometry.mesh_points import points_inside
 from mitsplat.scene.planning.frame_plan import FramePlan, plan_frame
-from mitsplat.scene.planning.visibility_prediction import solid_around
+from mitsplat.scene.planning.visibility_prediction import enclosing_shape
 from mitsplat.scene.scene import Scene
 from mitsplat.scene.spec.light_spec import LocalLight
 from mitsplat.scene.spec.object_spec import Arrangement
 from mitsplat.scene.spec.shape_spec import Region
-from mitsplat.scene.walls import ENCLOSURE, PILE_HEIGHT, backdrop_walls, enclosed_bounds, stated_pose, walls_beside
+from mitsplat.scene.walls import ENCLOSURE, PILE_HEIGHT, backdrop_walls, enclosed_bounds, pose_matrix, walls_beside
 
 MAX_OBJECTS = 65535
 """Maximum number of objects of a layout; instance ids have 16 bits."""
@@ -233,7 +233,7 @@ def label_faults(scene: Scene, frames: Sequence[int]) -> Iterator[Finding]:
         yield Finding("labels", False, text, "make output.width and height larger")
         return
     cameras = _cameras(scene, frames)
-    hidden = [name for camera in cameras if (name := solid_around(scene, camera.centre))]
+    hidden = [name for camera in cameras if (name := enclosing_shape(scene, camera.centre))]
     if len(hidden) == len(cameras):
         text = f"camera: every view is from inside of shape {hidden[0]!r}, which hides all objects"
         yield Finding("sight", False, text, "move camera out of it")
@@ -265,7 +265,7 @@ def scene_warnings(scene: Scene) -> Iterator[Finding]:
     spec = scene.spec
     plans = _plans(scene, range(min(scene.num_frames, MAX_FRAMES)))
     cameras = [plan.camera for plan in plans]
-    inside = [name for camera in cameras if (name := solid_around(scene, camera.centre))]
+    inside = [name for camera in cameras if (name := enclosing_shape(scene, camera.centre))]
     low, high = _reachable_box(scene)
     blind = sum(not sees(camera, low, high) for camera in cameras)
     yield Finding(
@@ -323,7 +323,7 @@ def _backdrop_warnings(scene: Scene, plans: Sequence[FramePlan]) -> Iterator[Fin
         """Return True if the middle plane of a wall separates a point from the centre of the region."""
         for box in walls:
             axis = int(np.argmin(box.size))
-            turn = stated_pose(box)[:3, :3].T
+            turn = pose_matrix(box)[:3, :3].T
             here, there = (turn @ np.subtract(tuple(place), box.position) for place in (point, middle))
             if here[axis] * there[axis] < 0:
                 return True
@@ -385,7 +385,7 @@ def _plans(scene: Scene, frames: Sequence[int]) -> list[FramePlan]:
 
 def _shape_around_light(scene: Scene, light: LocalLight) -> str:
     """Return the name of a visible shape that contains a light but not the region, or an empty string."""
-    return solid_around(scene, np.array(light.position))
+    return enclosing_shape(scene, np.array(light.position))
 
 
 def _colliders(scene: Scene) -> Iterator[tuple[str, trimesh.Trimesh]]:

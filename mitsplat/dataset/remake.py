@@ -26,7 +26,7 @@ from mitsplat.formats.registry import Catalogue
 from mitsplat.frames.frame import render_frame
 from mitsplat.physics.settle import settle_layout
 from mitsplat.runtime.device import Device, current_device, use_device
-from mitsplat.scene.planning.frame_plan import layout_of, whole
+from mitsplat.scene.planning.frame_plan import layout_of, to_index
 from mitsplat.scene.scene import Scene
 from mitsplat.storage.files import Record, open_regular, read_json, storage_errors, write_text
 
@@ -79,7 +79,7 @@ def remake_frame(
         InputError: If there is no such frame, a preflight check fails, or the folder holds other files.
         MissingResourceError: If the device is not available, or memory does not suffice for one frame.
     """
-    out, index = Path(out), whole(index, "frame")
+    out, index = Path(out), to_index(index, "frame")
     layout = layout_of(scene, index)
     catalogue = Catalogue.of(scene)
     refuse(scene, chain(count_faults(scene), layout_faults(scene), image_faults(scene, 1)))

@@ -38,7 +38,7 @@ from mitsplat.formats import bop, coco, label_studio, map_files, maps, voc, yolo
 from mitsplat.formats.colmap import ModelWriter
 from mitsplat.formats.format import Catalogue, Describer, Format, FrameFiles
 from mitsplat.scene.planning.contents import draw_regions
-from mitsplat.scene.planning.layout_surroundings import draw_place
+from mitsplat.scene.planning.layout_surroundings import draw_surroundings
 from mitsplat.scene.spec.scene_spec import FORMATS, Output, SceneSpec
 from mitsplat.scene.splits import is_empty
 from mitsplat.storage.files import Record
@@ -106,7 +106,7 @@ def write_frame(frame: Frame, root: Path, spec: SceneSpec, catalogue: Catalogue,
         record["viewpoint"] = dict(plan.viewpoint)
     if plan.belt is not None and not given:
         record["conveyor"] = {"time": plan.belt.time}
-    if place := draw_place(spec, frame.index, frame.layout.index).to_json(spec):
+    if place := draw_surroundings(spec, frame.index, frame.layout.index).to_json(spec):
         record["place"] = place
     if any(entry.appearance for entry in spec.objects):
         record["appearance"] = [one.to_json() for one in frame.appearances.values()]

@@ -46,15 +46,15 @@ from mitsplat.renderer.scene_emitters import emitter_dict, movable
 from mitsplat.renderer.textures import bitmap_texture, finished_mesh, material, texture_image
 from mitsplat.runtime.variant import ensure_variant, one_at_a_time
 from mitsplat.scene.layout import Instance, Layout
-from mitsplat.scene.planning.conveyor import Belt, carried, carried_by, carried_instances
-from mitsplat.scene.planning.frame_lights import written_out
+from mitsplat.scene.planning.conveyor import Belt, carried_instances, layout_at_view, layout_on_belt
+from mitsplat.scene.planning.frame_lights import expand_rooms
 from mitsplat.scene.planning.frame_plan import FramePlan, layout_of, plan_frame
 from mitsplat.scene.planning.layout_surroundings import (
     BackgroundDraw,
     LayoutSurroundings,
     MaterialDraw,
-    draw_place,
-    environment_at,
+    draw_surroundings,
+    drawn_environment,
 )
 from mitsplat.scene.planning.object_appearance import ObjectAppearance, draw_appearances
 from mitsplat.scene.scene import Scene
@@ -357,7 +357,7 @@ class Renderer:
                     )
         with _timed(seconds, "composite"):
             composite, shape = self.scene.spec.composite, layers.shape
-            behind = self._background(draw_place(self.scene.spec, index, layout.index).background, plan.camera)
+            behind = self._background(draw_surroundings(self.scene.spec, index, layout.index).background, plan.camera)
             linear = light_layers(layers, composite, behind)
             development = develop_layers(
                 linear,
@@ -409,7 +409,7 @@ class Renderer:
         belt = plan.belt
         if belt is not None:
             belt = replace(belt, time=belt.time + band.time)
-            layout = carried_by(belt, layout)
+            layout = layout_on_belt(belt, layout)
             mitsuba_scene = self._load(layout, plan, replaced, belt)
         layers = render_layers(self.integrator, mitsuba_scene, band.camera, seed=plan.seed)
         band_motion = _exposure_motion(layers, band.camera, motion, layout, belt)
@@ -420,8 +420,8 @@ class Renderer:
         """Return the layout at a frame's moment and at the next view's moment; None for the latter if nothing moves."""
         spec = self.scene.spec
         view = index - layout_of(self.scene, index) * spec.output.views
-        here = carried(spec, layout, view)
-        after = carried(spec, layout, min(view + 1, spec.output.views - 1))
+        here = layout_at_view(spec, layout, view)
+        after = layout_at_view(spec, layout, min(view + 1, spec.output.views - 1))
         return here, None if after is here else after
 
     def _settle(self, index: int) -> Layout:
@@ -468,7 +468,7 @@ class Renderer:
         emitters = {
             f"light_{i}": self._cached_emitter(self._emitter(light), replaced) for i, light in enumerate(lights)
         }
-        place = draw_place(self.scene.spec, layout.index * self.scene.spec.output.views)
+        place = draw_surroundings(self.scene.spec, layout.index * self.scene.spec.output.views)
         surroundings = self._surroundings(place)
         return {"type": "scene", **surroundings, **self._belt_shape(belt), **self._cached_objects[1], **emitters}
 
@@ -492,7 +492,7 @@ class Renderer:
         not recompile kernels.
         """
         if emitter["type"] != "envmap":
-            moves = replaced or any(light.draw for light in written_out(self.scene.spec))
+            moves = replaced or any(light.draw for light in expand_rooms(self.scene.spec))
             return movable(emitter) if moves else emitter
         if self._cached_environment_map is None or self._cached_environment_map[0] != emitter["filename"]:
             self._cached_environment_map = emitter["filename"], mi.load_dict(emitter)
@@ -522,7 +522,7 @@ class Renderer:
     def _static_shapes(self, place: LayoutSurroundings) -> dict[str, Any]:
         shapes: dict[str, Any] = {}
         conveyor, self._belt_pattern = self.scene.spec.conveyor, None
-        environment = environment_at(self.scene, place)
+        environment = drawn_environment(self.scene, place)
         if environment is not None:
             shapes["environment"] = _asset_shape(environment, np.eye(4), 0)
         for i, (shape, mesh) in enumerate(zip(self.scene.spec.shapes, self.scene.shape_meshes, strict=True)):
@@ -586,7 +586,7 @@ def white_irradiance(scene: Scene, place: LayoutSurroundings) -> float:
 
     The image-space shadow does not use it, because it only evaluates light relative to the brightest value.
     """
-    environment = environment_at(scene, place)
+    environment = drawn_environment(scene, place)
     if environment is None or scene.spec.composite.shadow == "image":
         return 0.0
     return environment.white or 0.0

@@ -29,9 +29,9 @@ from mitsplat.renderer.rays.sensors import view_of
 from mitsplat.renderer.scene_emitters import emitter_dict
 from mitsplat.renderer.textures import finished_mesh, material, texture_image
 from mitsplat.runtime.device import Device
-from mitsplat.scene.planning.conveyor import Belt, carried
+from mitsplat.scene.planning.conveyor import Belt, layout_at_view
 from mitsplat.scene.planning.frame_plan import layout_of, plan_frame
-from mitsplat.scene.planning.layout_surroundings import MaterialDraw, draw_place
+from mitsplat.scene.planning.layout_surroundings import MaterialDraw, draw_surroundings
 from mitsplat.scene.planning.object_appearance import draw_appearances
 from mitsplat.scene.scene import Scene
 from mitsplat.scene.spec.shape_spec import Shape
@@ -51,13 +51,13 @@ def export_xml(scene: Scene, index: int, path: str | Path) -> None:
     path = Path(path)
     files = path.with_name(f"{path.stem}_files")
     number = layout_of(scene, index)
-    layout = carried(scene.spec, settle_layout(scene, number), index - number * scene.spec.output.views)
+    layout = layout_at_view(scene.spec, settle_layout(scene, number), index - number * scene.spec.output.views)
     plan = plan_frame(scene, index, layout)
     if files.is_symlink():
         raise InputError(f"{files}: must not be a link, for files are written into it; remove it")
     files.mkdir(parents=True, exist_ok=True)
     shapes: dict[str, Any] = {}
-    place = draw_place(scene.spec, index)
+    place = draw_surroundings(scene.spec, index)
     environment = scene.environment_of(layout.index)
     if environment is not None:
         stem = _write_asset(environment, files / "environment")

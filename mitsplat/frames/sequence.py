@@ -16,8 +16,8 @@ from mitsplat.frames.frame import Frame, Renderer
 from mitsplat.geometry.camera import Camera
 from mitsplat.quality import Quality
 from mitsplat.scene.layout import Layout
-from mitsplat.scene.planning.conveyor import carried
-from mitsplat.scene.planning.frame_plan import layout_of, whole
+from mitsplat.scene.planning.conveyor import layout_at_view
+from mitsplat.scene.planning.frame_plan import layout_of, to_index
 from mitsplat.scene.planning.viewpoints import view_of
 from mitsplat.scene.scene import Scene
 from mitsplat.scene.spec.light_spec import LightEntry
@@ -70,7 +70,7 @@ def render_frames(
     elif isinstance(frames, Iterable):
         indices = frames
     else:
-        if (count := whole(frames, "frames")) < 0:
+        if (count := to_index(frames, "frames")) < 0:
             raise InputError(f"frames must be 0 or more (got {count})")
         indices = range(count)
     parts: tuple[object, ...] = (indices, layouts, cameras)
@@ -106,7 +106,7 @@ def _next_view(scene: Scene, shot: Shot, following: Shot) -> tuple[Layout | None
         return None, None
     if next_layout is not None:
         view = next_index - layout_of(scene, next_index) * scene.spec.output.views
-        next_layout = carried(scene.spec, next_layout, view)
+        next_layout = layout_at_view(scene.spec, next_layout, view)
     return next_layout, view_of(scene, next_index, next_layout).camera if next_camera is None else next_camera
 
 

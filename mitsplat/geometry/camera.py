@@ -29,7 +29,7 @@ degrees.
 """
 
 
-MOST_PIXELS = 16384
+MAX_IMAGE_SIDE = 16384
 """Maximum side length of an image [px]."""
 
 
@@ -70,8 +70,10 @@ class Camera:
 
     def __post_init__(self) -> None:
         sides = self.width, self.height
-        if not all(isinstance(side, int | np.integer) and 1 <= side <= MOST_PIXELS for side in sides):
-            raise ValueError(f"camera size must be whole numbers of 1 to {MOST_PIXELS} px (got {sides[0]}x{sides[1]})")
+        if not all(isinstance(side, int | np.integer) and 1 <= side <= MAX_IMAGE_SIDE for side in sides):
+            raise ValueError(
+                f"camera size must be whole numbers of 1 to {MAX_IMAGE_SIDE} px (got {sides[0]}x{sides[1]})"
+            )
         if not (self.fx > 0 and self.fy > 0 and np.isfinite([self.fx, self.fy, self.cx, self.cy]).all()):
             raise ValueError(f"focal lengths must be finite and > 0 (got fx={self.fx}, fy={self.fy})")
         if not self.near > 0:

@@ -20,13 +20,13 @@ from scipy.spatial import ConvexHull
 
 from mitsplat.arrays import Float64Array
 from mitsplat.geometry.mesh import SHARP, contact_points, simplify_solid
-from mitsplat.geometry.mesh_distance import DistanceSurface, farthest_outside
+from mitsplat.geometry.mesh_distance import DistanceSurface, max_outside_distance
 from mitsplat.storage.cache import cache_folder, keep_file
 from mitsplat.storage.content_hash import ContentHash
 
 _logger = logging.getLogger(__name__)
 
-MOST_PIECES = 32
+MAX_PIECES = 32
 # Acceptable gap between pieces and mesh [m], or as a share of the object's size if that is larger.
 _MIN_GAP_LIMIT, _GAP_SHARE = 1e-3, 0.005
 _THRESHOLD = 0.02
@@ -51,7 +51,7 @@ _OVERSHOOT, _PAIRS_PER_STEP = 2, 32
 _MARGIN, _SAMPLES, _BATCH = 0.75, 8000, 32
 
 
-def widest_gap(size: float) -> float:
+def max_gap(size: float) -> float:
     """Return the acceptable gap [m] for an object with a longest extent [m].
 
     The gap is that between object and support, and that between convex pieces and mesh.
@@ -60,7 +60,7 @@ def widest_gap(size: float) -> float:
 
 
 def convex_pieces(
-    mesh: trimesh.Trimesh, *, threshold: float = _THRESHOLD, most: int = MOST_PIECES
+    mesh: trimesh.Trimesh, *, threshold: float = _THRESHOLD, most: int = MAX_PIECES
 ) -> tuple[trimesh.Trimesh, ...]:
     """Split a solid into convex pieces whose union follows its surface.
 
@@ -112,7 +112,7 @@ def _split(part: trimesh.Trimesh, threshold: float, most: int) -> list[trimesh.T
         return [hull]
     scan = len(part.faces) > _SCAN_FACES
     if scan and part.is_volume:
-        limit = widest_gap(float(part.extents.max())) * threshold / _THRESHOLD
+        limit = max_gap(float(part.extents.max())) * threshold / _THRESHOLD
         return _Cutter(part, limit).pieces(most)
     ragged = _valleys(part) > _RAGGED
     if ragged:
@@ -140,7 +140,7 @@ def _valleys(mesh: trimesh.Trimesh) -> float:
     return float(lengths[sharp].sum() / max(lengths.sum(), 1e-300))
 
 
-def thin_solid(solid: trimesh.Trimesh) -> trimesh.Trimesh:
+def denoise_solid(solid: trimesh.Trimesh) -> trimesh.Trimesh:
     """Simplify a closed surface and remove its noise.
 
     The result has at most 5000 faces, or the minimum number within 0.3 % of the size (diagonal).
@@ -191,7 +191,7 @@ class _Cutter:
     """
 
     def __init__(self, part: trimesh.Trimesh, limit: float) -> None:
-        self._solid = _manifold(thin_solid(part))
+        self._solid = _manifold(denoise_solid(part))
         self._surface, self._limit = DistanceSurface(part), _MARGIN * limit
         self._min_volume = 1e-6 * self._solid.hull().volume()  # slivers add no contact
         self._points = _mesh(self._solid).vertices
@@ -232,7 +232,7 @@ class _Cutter:
         above = (inside + depth * normals[face])[depth[:, 0] > self._limit]
         samples = min(_SAMPLES, round(float(mesh.area) / (3 * self._limit) ** 2))
         points = np.concatenate([above, contact_points(mesh), mesh.sample(samples, seed=0)])
-        return farthest_outside(self._surface, points, least=self._limit, batch=_BATCH)
+        return max_outside_distance(self._surface, points, least=self._limit, batch=_BATCH)
 
     def _join(self, pieces: Sequence[_Piece], most: int) -> list[manifold3d.Manifold]:
         """Join pieces if the gap of their common hull is acceptable, or if there are too many; return all hulls."""

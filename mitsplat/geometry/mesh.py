@@ -111,7 +111,7 @@ def mass_properties(
         density: Density [kg/m^3]; ignored if ``mass`` is given.
         mass: Mass [kg] or None.
     """
-    solid = solid_of(mesh, pieces)
+    solid = closed_solid(mesh, pieces)
     actual_density = density if mass is None else mass / float(solid.volume)
     return MassProperties(
         mass=actual_density * float(solid.volume),
@@ -120,7 +120,7 @@ def mass_properties(
     )
 
 
-def solid_of(mesh: trimesh.Trimesh, pieces: Sequence[trimesh.Trimesh]) -> trimesh.Trimesh:
+def closed_solid(mesh: trimesh.Trimesh, pieces: Sequence[trimesh.Trimesh]) -> trimesh.Trimesh:
     """Return the mesh if it is closed, else its joined convex pieces."""
     return mesh if mesh.is_watertight and mesh.is_winding_consistent else join_meshes(pieces)
 

@@ -144,10 +144,10 @@ def standoff(surface: DistanceSurface, pieces: Sequence[trimesh.Trimesh]) -> flo
     It is measured at vertices, at edges, and at 4000 points on faces.
     """
     samples, _ = trimesh.sample.sample_surface(join_meshes(pieces), _SAMPLES, seed=0)
-    return farthest_outside(surface, np.concatenate([*(contact_points(piece) for piece in pieces), samples]))
+    return max_outside_distance(surface, np.concatenate([*(contact_points(piece) for piece in pieces), samples]))
 
 
-def farthest_outside(
+def max_outside_distance(
     surface: DistanceSurface, points: Float64Array, *, least: float = 0.0, batch: int = _BATCH
 ) -> float:
     """Return the maximum distance from a mesh of those points (N, 3) that are outside of it [m].

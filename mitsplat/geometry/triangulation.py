@@ -26,7 +26,7 @@ def triangulate(observations: Sequence[tuple[Camera, Float64Array]]) -> Float64A
         slopes = np.array([np.append(c.ray_slopes([p])[0], 1.0) for c, p in observations])
         rays = np.array([c.world_from_camera[:3, :3] @ slope for c, slope in zip(cameras, slopes, strict=True)])
         centres = np.array([camera.centre for camera in cameras])
-        start = meeting_point(centres, rays / np.linalg.norm(rays, axis=1, keepdims=True))
+        start = nearest_point_to_lines(centres, rays / np.linalg.norm(rays, axis=1, keepdims=True))
         poses = np.array([camera.camera_from_world for camera in cameras])
         focal = np.array([(camera.fx, camera.fy) for camera in cameras])
 
@@ -43,7 +43,7 @@ def triangulate(observations: Sequence[tuple[Camera, Float64Array]]) -> Float64A
     return None
 
 
-def meeting_point(origins: Float64Array, directions: Float64Array) -> Float64Array:
+def nearest_point_to_lines(origins: Float64Array, directions: Float64Array) -> Float64Array:
     """Return the point (3,) nearest to all lines through ``origins`` (N, 3) along unit ``directions`` (N, 3)."""
     across = np.eye(3) - directions[:, :, None] * directions[:, None, :]
     # A small multiple of the identity regularises the case of parallel lines, which have no unique nearest point.

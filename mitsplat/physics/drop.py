@@ -16,7 +16,7 @@ import trimesh
 from mitsplat.arrays import Float64Array
 from mitsplat.asset import Asset
 from mitsplat.errors import InputError
-from mitsplat.geometry.decomposition import MOST_PIECES, convex_pieces, widest_gap
+from mitsplat.geometry.decomposition import MAX_PIECES, convex_pieces, max_gap
 from mitsplat.geometry.mesh import mass_properties, prepare_mesh
 from mitsplat.geometry.mesh_distance import Clearance, DistanceSurface, PlacedSurface, all_clearances, standoff
 from mitsplat.physics.contacts import ContactFinder
@@ -24,12 +24,12 @@ from mitsplat.physics.placement import Item, draw_poses
 from mitsplat.physics.rest import OVERFLOW, RestOutcome, run_to_rest
 from mitsplat.physics.worlds import Body, Collider, MujocoWorld, WarpWorld, World, all_pieces
 from mitsplat.progress import Note
-from mitsplat.scene.layout import NOTHING_TO_REST, Instance, Layout, LeftOut, NothingRests, RestCertificate
+from mitsplat.scene.layout import NO_PHYSICS, Instance, Layout, LeftOut, NothingRests, RestCertificate
 from mitsplat.scene.planning.contents import draw_objects, draw_regions
 from mitsplat.scene.scene import Scene
 from mitsplat.scene.splits import draw_environment
 from mitsplat.scene.streams import random_stream
-from mitsplat.scene.walls import ENCLOSURE, PILE_HEIGHT, bin_walls, enclosed_bounds, stated_pose, walls_beside
+from mitsplat.scene.walls import ENCLOSURE, PILE_HEIGHT, bin_walls, enclosed_bounds, pose_matrix, walls_beside
 
 _MAX_MEASURED_GAP = 5e-3  # larger gaps are not measured [m]
 # Maximum penetration at rest [m], or as a share of the object's size if that is larger: convex pieces of scans deviate
@@ -148,7 +148,7 @@ class Drop:
         """
         drawn = self._draw_contents(index)
         if not drawn:
-            return Layout(index, (), NOTHING_TO_REST)
+            return Layout(index, (), NO_PHYSICS)
         attempts = self.scene.spec.settle.attempts
         refused: list[str] = []
         left_out: list[LeftOut] = []
@@ -179,7 +179,7 @@ class Drop:
                 drawn.remove(one)
         reasons = ", ".join(f"{count} x {reason}" for reason, count in Counter(refused[:attempts]).items())
         must = f"layout {index} must come to rest in settle.attempts = {attempts} draws (got {reasons})"
-        nothing = replace(NOTHING_TO_REST, attempts=len(refused), refused=tuple(refused))
+        nothing = replace(NO_PHYSICS, attempts=len(refused), refused=tuple(refused))
         raise NothingRests(sentence or f"{self.scene.path}: {must}", Layout(index, (), nothing, tuple(left_out)))
 
     def _draw_contents(self, index: int) -> list[_DrawnObject]:
@@ -329,7 +329,7 @@ class Drop:
             if pieces:
                 standoff_distance = standoff(surface, pieces)
             else:
-                limit = widest_gap(float(mesh.extents.max()))
+                limit = max_gap(float(mesh.extents.max()))
                 for threshold in _THRESHOLDS:
                     pieces = _pieces(mesh, asset.name, progress, threshold=threshold)
                     standoff_distance = standoff(surface, pieces)
@@ -355,7 +355,7 @@ class Drop:
             elif shape.box is None:
                 collider = Collider(shape.friction, pieces=_pieces(mesh, shape.name, progress))
             else:
-                collider = Collider(shape.friction, box=(shape.box.size, stated_pose(shape.box)))
+                collider = Collider(shape.friction, box=(shape.box.size, pose_matrix(shape.box)))
             colliders.append(collider)
             obstacles.append(PlacedSurface(shape.name, DistanceSurface(mesh)))
         if surroundings is not None and surroundings.mesh is not None:
@@ -384,7 +384,7 @@ class Drop:
         keys: dict[PlacedSurface, str] = {}
         for entry, spec in enumerate(self.scene.spec.objects):
             for number, pose in enumerate(spec.poses):
-                keys[self._placed(self.scene.pools[entry][0], stated_pose(pose))] = f"objects[{entry}].poses[{number}]"
+                keys[self._placed(self.scene.pools[entry][0], pose_matrix(pose))] = f"objects[{entry}].poses[{number}]"
         for pair in all_clearances(list(keys), ground.obstacles, reach=_MAX_MEASURED_GAP):
             if -pair.distance > _MAX_START_OVERLAP:
                 other = keys.get(pair.second, f"collider {pair.second.name!r}")
@@ -463,7 +463,7 @@ class Drop:
         """Return how a resting layout violates the requested arrangement, or None."""
         arrangement_of = {item: self._arrangements[region] for item, region in zip(resting, regions, strict=True)}
         for pair in clearances:
-            if pair.second.name.startswith(ENCLOSURE) and pair.distance < widest_gap(0.0):
+            if pair.second.name.startswith(ENCLOSURE) and pair.distance < max_gap(0.0):
                 return f"{pair.first.name} rests against the enclosure", {pair.first}
         for pair in clearances:
             if (
@@ -512,7 +512,7 @@ def _fault(
             reason = f"{pair.first.name} and {pair.second.name} overlap by {-pair.distance * 1e3:.1f} mm"
             return reason, {pair.first, pair.second}
     for item, gap in gaps.items():
-        if gap > widest_gap(item.size):
+        if gap > max_gap(item.size):
             return f"{item.name} rests {gap * 1e3:.1f} mm or more from what is nearest", {item}
     return None
 
@@ -525,4 +525,4 @@ def _pieces(
     mesh: trimesh.Trimesh, name: str, progress: Note, *, threshold: float = _THRESHOLDS[0]
 ) -> tuple[trimesh.Trimesh, ...]:
     progress(f"convex pieces of {name}")
-    return convex_pieces(mesh, threshold=threshold, most=round(MOST_PIECES * _THRESHOLDS[0] / threshold))
+    return convex_pieces(mesh, threshold=threshold, most=round(MAX_PIECES * _THRESHOLDS[0] / threshold))

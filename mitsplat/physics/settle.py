@@ -21,7 +21,7 @@ from mitsplat.progress import Note
 from mitsplat.runtime.variant import one_at_a_time
 from mitsplat.runtime.warp_start import quiet_warp
 from mitsplat.scene.layout import Layout, NothingRests
-from mitsplat.scene.planning.frame_plan import whole
+from mitsplat.scene.planning.frame_plan import to_index
 from mitsplat.scene.scene import Scene
 from mitsplat.scene.spec.object_spec import Arrangement
 from mitsplat.storage.cache import cache_folder, keep_file
@@ -65,7 +65,7 @@ def settle_layout(scene: Scene, index: int, *, progress: Note | None = None, cac
         InputError: If there is no layout of this index, the region is too small for the objects, or none of them comes
             to rest within the limits.
     """
-    index = whole(index, "layout")
+    index = to_index(index, "layout")
     if index < 0:
         raise InputError(f"layout must be at least 0 (got {index})")
     path = cache_folder() / "layouts" / f"{_scene_hash(scene)[:32]}-{index:04d}.json"

@@ -15,7 +15,7 @@ from mitsplat.images.colour import decode_srgb, encode_srgb
 from mitsplat.renderer.rays.device_arrays import plain_mesh, wrapped
 from mitsplat.scene.planning.layout_surroundings import MaterialDraw
 from mitsplat.scene.spec.shape_spec import Shape
-from mitsplat.scene.walls import stated_pose
+from mitsplat.scene.walls import pose_matrix
 
 SIZE = 1024
 """Edge of a pattern's image [px]."""
@@ -125,7 +125,7 @@ def finished_mesh(
 def pattern_axes(shape: Shape) -> Float64Array:
     """Return the axes of a pattern's box projection as columns (3, 3): those of a box or bin, otherwise world axes."""
     if shape.box is not None:
-        return stated_pose(shape.box)[:3, :3]
+        return pose_matrix(shape.box)[:3, :3]
     if shape.bin is not None:
         turn = np.radians(shape.bin.rotate_z)
         return np.array([[np.cos(turn), -np.sin(turn), 0], [np.sin(turn), np.cos(turn), 0], [0, 0, 1.0]])

@@ -72,7 +72,7 @@ class RestCertificate:
         return {**vars(self), "refused": list(self.refused)}
 
 
-NOTHING_TO_REST = RestCertificate(
+NO_PHYSICS = RestCertificate(
     rested=True,
     inside=True,
     overflow=False,
@@ -161,7 +161,7 @@ class Layout:
             for number, (asset, pose) in enumerate(listed, start=1)
             if pose is not None
         )
-        return cls(index, instances, NOTHING_TO_REST)
+        return cls(index, instances, NO_PHYSICS)
 
     def to_json(self) -> dict[str, Any]:
         """Return the layout as JSON values. Floats survive the round trip exactly."""

@@ -112,7 +112,7 @@ def backdrop_distance(spec: SceneSpec, point: Vec3) -> float:
     """Return the distance from a point to the walls and ceiling of a backdrop [m]; 0 if there are none."""
 
     def distance(box: Box) -> float:
-        pose = stated_pose(box)
+        pose = pose_matrix(box)
         own = pose[:3, :3].T @ (np.asarray(point) - pose[:3, 3])
         return float(np.linalg.norm(np.maximum(np.abs(own) - np.asarray(box.size) / 2, 0)))
 
@@ -124,12 +124,12 @@ def backdrop_walls(spec: SceneSpec) -> list[Box]:
     return [shape.box for shape in spec.shapes if shape.box and shape.name.startswith(f"{BACKDROP}wall ")]
 
 
-def finish_name(shape: str) -> str:
+def material_name(shape: str) -> str:
     """Return the name under which a shape's material is drawn. All walls of a backdrop share one name."""
     return f"{BACKDROP}walls" if shape.startswith(f"{BACKDROP}wall ") else shape
 
 
-def stated_pose(place: Box | ObjectPose) -> Float64Array:
+def pose_matrix(place: Box | ObjectPose) -> Float64Array:
     """Return a pose of the scene file as a transform (4, 4)."""
     pose = np.eye(4)
     pose[:3, :3] = Rotation.from_euler("xyz", place.rotate, degrees=True).as_matrix()

@@ -23,7 +23,7 @@ from mitsplat.fit.image_metrics import psnr_of
 from mitsplat.fit.trainer import FitSettings
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.camera import Camera
-from mitsplat.geometry.triangulation import meeting_point
+from mitsplat.geometry.triangulation import nearest_point_to_lines
 from mitsplat.images.colour import decode_srgb
 from mitsplat.pages.html import rgb_image
 from mitsplat.progress import Progress
@@ -251,7 +251,7 @@ def _typical_depth(capture: Capture) -> float:
 def _background(splats: Splats, cameras: Sequence[Camera]) -> BoolArray:
     """Return True for Gaussians (N,) in the background."""
     centres = np.array([camera.centre for camera in cameras])
-    focus = meeting_point(centres, np.array([camera.world_from_camera[:3, 2] for camera in cameras]))
+    focus = nearest_point_to_lines(centres, np.array([camera.world_from_camera[:3, 2] for camera in cameras]))
     away = float(np.quantile(np.linalg.norm(centres - focus, axis=1), 0.9))
     return np.asarray(np.linalg.norm(splats.means - focus, axis=1) > _FOREGROUND_DISTANCE * away)
 

@@ -16,7 +16,7 @@ from mitsplat.physics.settle import settle_layout
 from mitsplat.progress import Note
 from mitsplat.quality import PRESETS, PresetName
 from mitsplat.scene.layout import Layout
-from mitsplat.scene.planning.conveyor import carried
+from mitsplat.scene.planning.conveyor import layout_at_view
 from mitsplat.scene.planning.frame_plan import plan_frame
 from mitsplat.scene.scene import Scene
 from mitsplat.scene.spec.light_spec import LightSpec
@@ -145,7 +145,7 @@ class SceneRenders:
         if number not in self._layouts:
             self._note(f"settling layout {number}")
             self._layouts[number] = settle_layout(scene, number, progress=self._note)
-        return carried(scene.spec, self._layouts[number], index % scene.spec.output.views)
+        return layout_at_view(scene.spec, self._layouts[number], index % scene.spec.output.views)
 
     def render(self, request: ViewRequest, preset: PresetName) -> Preview:
         """Render the view with one preset."""

@@ -23,7 +23,7 @@ from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.camera import Camera, look_at_pose
 from mitsplat.labels.overlay import class_colour
 from mitsplat.scene.layout import Layout
-from mitsplat.scene.planning.conveyor import carried
+from mitsplat.scene.planning.conveyor import layout_at_view
 from mitsplat.scene.planning.viewpoints import view_of
 from mitsplat.scene.scene import Scene
 from mitsplat.scene.spec.light_spec import AreaLight, EnvironmentLight, LightSpec, RoomLight, SpotLight
@@ -261,7 +261,7 @@ def camera_parts(scene: Scene, index: int, layout: Layout | None) -> Iterator[Sh
     spread = np.linspace(0, scene.num_frames - 1, min(scene.num_frames, MOST_CAMERAS)).astype(int)
     size = float(np.linalg.norm(np.subtract(scene.spec.region.max, scene.spec.region.min)))
     for frame in sorted({*own[:MOST_CAMERAS], *spread.tolist()}):
-        there = None if layout is None or frame not in own else carried(scene.spec, layout, frame % views)
+        there = None if layout is None or frame not in own else layout_at_view(scene.spec, layout, frame % views)
         camera = view_of(scene, frame, there).camera
         group, colour = ("cameras", _CAMERA) if frame in own else ("other cameras", _OTHER)
         yield ShownPart(f"/{group}/{frame}", Frustum(camera, 0.15 * size, colour, frame), camera.world_from_camera)

@@ -23,7 +23,7 @@ from mitsplat.capture.metric_frame import (
 from mitsplat.capture.structure_from_motion import SparseModel
 from mitsplat.errors import InputError
 from mitsplat.geometry.camera import Camera
-from mitsplat.geometry.triangulation import meeting_point, triangulate
+from mitsplat.geometry.triangulation import nearest_point_to_lines, triangulate
 
 BOARD = Board(6, 4, 0.03)
 LOST = np.eye(4)
@@ -313,7 +313,7 @@ def test_lines_meet() -> None:
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     point = np.array([1.0, 2, 3])
     np.testing.assert_allclose(
-        meeting_point(point - directions * rng.uniform(1, 2, (5, 1)), directions), point, atol=1e-6
+        nearest_point_to_lines(point - directions * rng.uniform(1, 2, (5, 1)), directions), point, atol=1e-6
     )
 
 

@@ -16,7 +16,7 @@ from mitsplat.dataset.inputs import describe_inputs
 from mitsplat.errors import InputError
 from mitsplat.frames.mitsuba_xml import export_xml
 from mitsplat.gaussians.splat_cloud import Splats
-from mitsplat.scene.layout import NOTHING_TO_REST, Instance, Layout
+from mitsplat.scene.layout import NO_PHYSICS, Instance, Layout
 from mitsplat.scene.loading.scene_loading import load_scene
 from tests.conftest import box_asset
 from tests.dataset.test_write import never_render, write
@@ -165,4 +165,4 @@ def test_an_exported_scene_holds_every_asset_of_one_name_as_it_is_now(copy, tmp_
 
 def every_entry(scene, index):
     poses = (Instance(i + 1, i, 0, np.eye(4)) for i in range(len(scene.assets)))
-    return Layout(index, tuple(poses), NOTHING_TO_REST)
+    return Layout(index, tuple(poses), NO_PHYSICS)

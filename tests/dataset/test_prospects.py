@@ -18,7 +18,7 @@ from mitsplat.errors import InputError, MissingResourceError
 from mitsplat.frames import speed_accuracy as chart
 from mitsplat.geometry.camera import Camera
 from mitsplat.geometry.mesh_points import points_inside
-from mitsplat.scene.layout import NOTHING_TO_REST, Layout
+from mitsplat.scene.layout import NO_PHYSICS, Layout
 from mitsplat.scene.loading.scene_loading import load_scene
 from mitsplat.scene.planning.frame_plan import plan_frame
 from tests.bodies import pose_at
@@ -237,5 +237,5 @@ def test_a_dataset_without_any_label_is_told(scene_data, write_scene, tmp_path, 
     assert "no image has a label (not labelled: " in told.err
     assert "outside)" in told.err
     assert run("render", path, "-o", tmp_path / "part", "--workers", 1, "--shard", "1/2") == 0
-    laid_out = lambda scene, index, **_: Layout(index, (), NOTHING_TO_REST)  # noqa: E731
+    laid_out = lambda scene, index, **_: Layout(index, (), NO_PHYSICS)  # noqa: E731
     assert run("render", path, "-o", tmp_path / "empty", "--workers", 1) == 0

@@ -31,12 +31,12 @@ from mitsplat.frames.budget import worker_memory
 from mitsplat.frames.frame import render_frame
 from mitsplat.renderer.layers import make_sensor
 from mitsplat.scene.loading.scene_loading import load_scene
-from mitsplat.scene.layout import NOTHING_TO_REST, Instance, Layout
+from mitsplat.scene.layout import NO_PHYSICS, Instance, Layout
 scene = load_scene(sys.argv[1])
 poses = [np.eye(4) for _ in range(6)]
 for i, pose in enumerate(poses):
     pose[:2, 3] = 0.05 * i - 0.12, 0.02 * i
-layout = Layout(0, tuple(Instance(i + 1, i % 2, i % 2, pose) for i, pose in enumerate(poses)), NOTHING_TO_REST)
+layout = Layout(0, tuple(Instance(i + 1, i % 2, i % 2, pose) for i, pose in enumerate(poses)), NO_PHYSICS)
 for index in range(2):
     render_frame(scene, index, layout=layout)
 peak = next(line for line in open("/proc/self/status") if line.startswith("VmHWM"))

@@ -12,7 +12,7 @@ import pytest
 import mitsplat as ms
 from mitsplat.frames.background import cut_out
 from mitsplat.images.colour import decode_srgb
-from mitsplat.scene.layout import NOTHING_TO_REST, Layout
+from mitsplat.scene.layout import NO_PHYSICS, Layout
 from mitsplat.scene.planning.layout_surroundings import BackgroundDraw
 from tests.conftest import WriteScene
 
@@ -67,7 +67,7 @@ def test_it_is_seen_where_nothing_is_and_changes_no_label(
 ) -> None:
     scene_data["shapes"][0]["box"]["size"] = [0.4, 0.4, 0.1]
     scene_data["objects"] = []
-    layout = Layout(0, (), NOTHING_TO_REST)
+    layout = Layout(0, (), NO_PHYSICS)
     plain = ms.render_frame(ms.load_scene(write_scene(scene_data)), 0, layout=layout)
     cv2.imwrite(str(tmp_path / "red.png"), np.full((30, 40, 3), (0, 0, 200), dtype=np.uint8))
     scene_data["background"] = {"images": "red.png", "gain": [0.5, 0.5]}

@@ -17,7 +17,7 @@ from mitsplat.dataset.remake import remake_frame
 from mitsplat.dataset.write import write_dataset
 from mitsplat.frames.flow import UNKNOWN_FLOW, swept_by
 from mitsplat.geometry.camera import Camera
-from mitsplat.scene.layout import NOTHING_TO_REST, Instance, Layout
+from mitsplat.scene.layout import NO_PHYSICS, Instance, Layout
 from mitsplat.scene.planning.conveyor import Belt
 from mitsplat.scene.spec.shape_spec import Box
 from tests.audit.test_audit import records_of, store
@@ -33,7 +33,7 @@ def lying(scene: ms.Scene, index: int, **_: Any) -> Layout:
     poses = np.tile(np.eye(4), (2, 1, 1))
     poses[:, :3, 3] = (0.0, 0.0, 0.02), (0.0, 0.14, 0.02)
     instances = [Instance(i, 0, scene.class_index(0), pose) for i, pose in enumerate(poses, start=1)]
-    return Layout(index, tuple(instances), replace(NOTHING_TO_REST, attempts=1))
+    return Layout(index, tuple(instances), replace(NO_PHYSICS, attempts=1))
 
 
 @pytest.fixture
@@ -89,7 +89,7 @@ def test_flow_of_a_film_of_settled_layouts_is_the_scenes(belt_data: SceneData, w
 def test_the_pattern_runs_with_the_belt(belt_data: SceneData, write_scene: WriteScene) -> None:
     belt_data["objects"] = []
     scene = ms.load_scene(write_scene(belt_data))
-    empty = Layout(0, (), NOTHING_TO_REST)
+    empty = Layout(0, (), NO_PHYSICS)
     with ms.Renderer(scene) as renderer:
         first, second = (renderer.render(index, layout=empty).rgb[10:38] for index in (0, 1))
     shift = round(100 * STEP / 0.5)

@@ -12,7 +12,7 @@ import pytest
 import mitsplat as ms
 from mitsplat.formats.registry import Catalogue, write_frame
 from mitsplat.frames.mitsuba_xml import export_xml, render_xml
-from mitsplat.scene.layout import NOTHING_TO_REST, Instance, Layout
+from mitsplat.scene.layout import NO_PHYSICS, Instance, Layout
 from tests.conftest import WriteScene
 from tests.drawn import scatter_boxes
 
@@ -65,7 +65,7 @@ def _apart() -> Layout:
     poses = np.tile(np.eye(4), (4, 1, 1))
     poses[:, :3, 3] = (-0.05, 0, 0.005), (0, 0.05, 0.005), (0.05, 0, 0.005), (0, -0.05, 0.025)
     instances = [Instance(i + 1, int(i == 3), int(i < 3), pose) for i, pose in enumerate(poses)]
-    return Layout(0, tuple(instances), NOTHING_TO_REST)
+    return Layout(0, tuple(instances), NO_PHYSICS)
 
 
 APART = _apart()

@@ -14,7 +14,7 @@ import pytest
 from mitsplat.frames.frame import Renderer
 from mitsplat.geometry.camera import Camera
 from mitsplat.renderer.layers import render_layers, render_silhouettes
-from mitsplat.scene.layout import NOTHING_TO_REST, Instance, Layout
+from mitsplat.scene.layout import NO_PHYSICS, Instance, Layout
 from mitsplat.scene.loading.scene_loading import load_scene
 from mitsplat.scene.planning.frame_plan import plan_frame
 from mitsplat.scene.spec.light_spec import AreaLight, EnvironmentLight, LightDraw
@@ -35,7 +35,7 @@ def strewn(index: int, assets: list[int]) -> Layout:
         pose = np.eye(4)
         pose[:3, 3] = 0.06 * (number % 3 - 1), -0.08 + 0.06 * (number // 3 - 1), 0.02
         instances.append(Instance(number, asset, 0, pose))
-    return Layout(index, tuple(instances), NOTHING_TO_REST)
+    return Layout(index, tuple(instances), NO_PHYSICS)
 
 
 def compiled(renderer: Renderer, index: int, layout: Layout) -> tuple[int, int]:

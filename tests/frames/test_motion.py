@@ -14,7 +14,7 @@ from mitsplat.frames.camera_response import _drawn_apart, _smeared, develop
 from mitsplat.frames.flow import optical_flow, swept_by
 from mitsplat.geometry.camera import Camera
 from mitsplat.renderer.layers import device_array, host_array
-from mitsplat.scene.planning.viewpoints import moved_by
+from mitsplat.scene.planning.viewpoints import handheld_transform
 
 SHAPE = 23, 31
 
@@ -26,7 +26,7 @@ def test_pixels_move_as_the_camera_does(distortion: tuple[float, ...]) -> None:
     depth = np.random.default_rng(0).uniform(0.4, 2.0, (60, 80))
     motion = {"exposure": 1e-3, "velocity": [0.2, -0.3, 0.4], "rotation": [20.0, -30.0, 10.0]}
     half = 0.5e-3 * np.concatenate([motion["velocity"], motion["rotation"]])
-    poses = (camera.world_from_camera @ moved_by(way) for way in (-half, half))
+    poses = (camera.world_from_camera @ handheld_transform(way) for way in (-half, half))
     ends = [optical_flow(depth, camera, replace(camera, world_from_camera=pose)) for pose in poses]
     exact = ends[1].astype(np.float64) - ends[0]
     inside = slice(1, -1), slice(1, -1)  # at the border the lens's gradient is one-sided

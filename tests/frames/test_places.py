@@ -17,9 +17,9 @@ from mitsplat.audit.audit import audit_dataset
 from mitsplat.dataset.write import write_dataset
 from mitsplat.frames.mitsuba_xml import export_xml
 from mitsplat.images.colour import encode_srgb
-from mitsplat.scene.layout import NOTHING_TO_REST, Instance, Layout
+from mitsplat.scene.layout import NO_PHYSICS, Instance, Layout
 from mitsplat.scene.planning.contents import draw_regions
-from mitsplat.scene.planning.layout_surroundings import draw_place
+from mitsplat.scene.planning.layout_surroundings import draw_surroundings
 from mitsplat.scene.spec.scene_spec import FORMATS
 from tests.conftest import WriteScene, box_asset
 
@@ -32,7 +32,7 @@ def lying(scene: ms.Scene, index: int, **_: Any) -> Layout:
     """One object, above the table's middle."""
     pose = np.eye(4)
     pose[:3, 3] = 0, 0, 0.006
-    return Layout(index, (Instance(1, 0, scene.class_index(0), pose),), NOTHING_TO_REST)
+    return Layout(index, (Instance(1, 0, scene.class_index(0), pose),), NO_PHYSICS)
 
 
 @pytest.fixture
@@ -68,7 +68,7 @@ def test_a_drawn_place_looks_as_a_stated_one(places: SceneData, write_scene: Wri
     with ms.Renderer(drawn) as renderer:
         for layout in range(6):
             frame = renderer.render(2 * layout, layout=lying(drawn, layout))
-            seen[layout] = (draw_place(drawn.spec, frame.index).environment, frame.image)
+            seen[layout] = (draw_surroundings(drawn.spec, frame.index).environment, frame.image)
     assert {number for number, _ in seen.values()} == {0, 1}
     for layout, (number, image) in seen.items():
         places["environment"] = f"assets/cell_{'ab'[number]}"
@@ -84,7 +84,7 @@ def test_one_colour_looks_as_the_key_colour(places: SceneData, write_scene: Writ
     scene = ms.load_scene(write_scene(places))
     frame = ms.render_frame(scene, 0, layout=lying(scene, 0))
     del places["shapes"][0]["materials"]
-    places["shapes"][0]["colour"] = draw_place(scene.spec, frame.index).finishes["table"].colours[0]
+    places["shapes"][0]["colour"] = draw_surroundings(scene.spec, frame.index).finishes["table"].colours[0]
     stated = ms.load_scene(write_scene(places))
     np.testing.assert_array_equal(ms.render_frame(stated, 0, layout=lying(stated, 0)).image, frame.image)
 
@@ -111,7 +111,7 @@ def test_a_dataset_of_places(places: SceneData, write_scene: WriteScene, tmp_pat
     assert found.violations == () and found.instances == 6
     records = [json.loads(line) for line in (out / "manifest.jsonl").read_bytes().splitlines()]
     for record in records:
-        place = draw_place(scene.spec, record["index"])
+        place = draw_surroundings(scene.spec, record["index"])
         assert set(record["place"]) == {"environment", "materials", "background"}
         assert record["place"] == json.loads(json.dumps(place.to_json(scene.spec)))
     content = json.loads((out / "dataset.json").read_bytes())

@@ -20,7 +20,7 @@ from mitsplat.frames.rolling_shutter import Band, bands_of, project_by_row, stac
 from mitsplat.geometry.camera import Camera
 from mitsplat.images.masks import Silhouette
 from mitsplat.renderer.layers import Layers, render_layers
-from mitsplat.scene.layout import NOTHING_TO_REST, Instance, Layout
+from mitsplat.scene.layout import NO_PHYSICS, Instance, Layout
 from tests.conftest import WriteScene
 from tests.frames.test_conveyor import belt_data as belt_data
 from tests.frames.test_conveyor import lying
@@ -58,7 +58,7 @@ def lying_about(scene: ms.Scene) -> Layout:
     poses = [np.eye(4) for _ in places]
     for pose, place in zip(poses, places, strict=True):
         pose[:3, 3] = *place, 0.02
-    return Layout(0, tuple(Instance(i, 0, scene.class_index(0), p) for i, p in enumerate(poses, 1)), NOTHING_TO_REST)
+    return Layout(0, tuple(Instance(i, 0, scene.class_index(0), p) for i, p in enumerate(poses, 1)), NO_PHYSICS)
 
 
 def test_every_row_is_that_of_an_image_of_its_moment(moving: ms.Scene, monkeypatch: pytest.MonkeyPatch) -> None:

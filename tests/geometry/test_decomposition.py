@@ -9,7 +9,7 @@ import shapely
 import trimesh
 
 from mitsplat.geometry import decomposition
-from mitsplat.geometry.decomposition import convex_pieces, thin_solid, widest_gap
+from mitsplat.geometry.decomposition import convex_pieces, denoise_solid, max_gap
 from mitsplat.geometry.mesh import simplify_solid
 from mitsplat.geometry.mesh_distance import DistanceSurface, standoff
 
@@ -143,10 +143,10 @@ def test_pieces_of_a_scan_are_few_and_stand_off_no_more_than_layouts_bear():
     assert can.is_volume
     assert len(can.faces) > 3000
     pieces = convex_pieces(can)
-    assert len(pieces) <= decomposition.MOST_PIECES
+    assert len(pieces) <= decomposition.MAX_PIECES
     assert all(piece.is_convex for piece in pieces)
-    assert standoff(DistanceSurface(can), pieces) < widest_gap(0)
-    assert standoff(DistanceSurface(can), [can.convex_hull]) > 3 * widest_gap(0)
+    assert standoff(DistanceSurface(can), pieces) < max_gap(0)
+    assert standoff(DistanceSurface(can), [can.convex_hull]) > 3 * max_gap(0)
 
 
 def test_no_more_pieces_than_are_asked_for_however_rough_a_scan():
@@ -169,14 +169,14 @@ def test_what_a_cut_leaves_empty_is_what_manifold_says_of_both_sides(bracket, no
 def test_a_scan_is_thinned_to_5000_faces_unless_that_moves_its_surface():
     ball = trimesh.creation.icosphere(5, 0.05)
     assert len(ball.faces) == 20480
-    thin = thin_solid(ball)
+    thin = denoise_solid(ball)
     assert thin.is_volume
     assert len(thin.faces) <= 5000
     points = np.concatenate([thin.vertices, thin.sample(2000, seed=0)])
     # Radius against a sphere's: the chords of both meshes lie within.
     assert np.abs(np.linalg.norm(points, axis=1) - 0.05).max() < 0.003 * ball.scale
     rough = ball.vertices * (1 + np.random.default_rng(1).uniform(-0.02, 0.02, (len(ball.vertices), 1)))
-    kept = thin_solid(trimesh.Trimesh(rough, ball.faces, process=False))
+    kept = denoise_solid(trimesh.Trimesh(rough, ball.faces, process=False))
     assert len(kept.faces) > 5000
     assert np.abs(DistanceSurface(kept).signed_distances(rough)).max() < 0.003 * ball.scale * 1.01
 
@@ -188,4 +188,4 @@ def test_a_small_dent_of_a_large_face_is_not_overlooked():
     assert len(dented.faces) > 3000
     pieces = convex_pieces(dented)
     assert len(pieces) > 1
-    assert standoff(DistanceSurface(dented), pieces) < widest_gap(0)
+    assert standoff(DistanceSurface(dented), pieces) < max_gap(0)

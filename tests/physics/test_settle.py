@@ -23,7 +23,7 @@ from mitsplat.errors import InputError
 from mitsplat.physics.settle import replay_layout, settle_layout, settle_layouts
 from mitsplat.scene.layout import Layout
 from mitsplat.scene.loading.scene_loading import load_scene
-from mitsplat.scene.planning.layout_surroundings import draw_place
+from mitsplat.scene.planning.layout_surroundings import draw_surroundings
 from tests.bodies import STEPPERS, lowest, pose_at
 
 pytestmark = pytest.mark.usefixtures("physics")
@@ -155,7 +155,7 @@ def test_code_that_decides_layouts_is_hashed():
         *(f"spec.shapes.{name}" for name in ("Backdrop", "Bin", "Box", "Enclosure", "Region", "Shape")),
         *("spec.spec.SceneSpec", "spec_types.Vec3"),
     }
-    given = types | {"cache.cache_folder", "cache.keep_file", "scene.layout.NOTHING_TO_REST", "warp_start.quiet_warp"}
+    given = types | {"cache.cache_folder", "cache.keep_file", "scene.layout.NO_PHYSICS", "warp_start.quiet_warp"}
     given |= {"content_hash.ContentHash"}  # names what is kept
     given |= {"files.SPLITS"}  # names of tallies; which layout is of which split is decided in scene.contents
     given |= {"spec.spec.BACKDROP"}  # begins the names of shapes, which are hashed
@@ -319,7 +319,7 @@ def test_objects_lie_on_the_environment_that_their_layout_draws(scene_data, writ
         cells.append(replace(scene.assets[0], name=f"cell {top}", mesh=step, pieces=(step,), kind="environment"))
     spec = scene.spec.model_copy(update={"environment": ("a", "b"), "environment_collides": True})
     scene = replace(scene, environments=tuple(cells), spec=spec)
-    numbers = [draw_place(spec, 4 * index).environment for index in range(9)]
+    numbers = [draw_surroundings(spec, 4 * index).environment for index in range(9)]
     for number in (0, 1, 0):
         index = numbers.index(number)
         layout = settle_layout(scene, index, cached=False)

@@ -16,7 +16,7 @@ from mitsplat.dataset.preflight import scene_warnings
 from mitsplat.errors import InputError
 from mitsplat.frames.frame import light_properties
 from mitsplat.scene.loading.scene_loading import load_scene
-from mitsplat.scene.planning.layout_surroundings import MaterialDraw, draw_place, environment_at
+from mitsplat.scene.planning.layout_surroundings import MaterialDraw, draw_surroundings, drawn_environment
 from tests.conftest import WriteScene, box_asset
 
 SceneData = dict[str, Any]
@@ -44,20 +44,20 @@ def test_each_layout_draws_an_environment(scene_data: SceneData, write_scene: Wr
     scene_data["output"] |= {"layouts": 200, "views": 2}
     scene = load_scene(write_scene(scene_data))
     assert scene.spec.environment == ("assets/cell_a", "assets/cell_b")
-    plans = [draw_place(scene.spec, index) for index in range(scene.num_frames)]
+    plans = [draw_surroundings(scene.spec, index) for index in range(scene.num_frames)]
     assert all(first.environment == second.environment for first, second in zip(plans[::2], plans[1::2], strict=True))
     counts = Counter(place.environment for place in plans[::2])
     assert abs(counts[1] - 150) < 4 * (200 * 0.25 * 0.75) ** 0.5
     told = plans[0].to_json(scene.spec)
     assert told == {"environment": {"number": told["environment"]["number"], "name": told["environment"]["name"]}}
-    chosen = environment_at(scene, plans[0])
+    chosen = drawn_environment(scene, plans[0])
     assert chosen is not None
     assert f"assets/{chosen.name}" == told["environment"]["name"]
 
 
 def test_a_scene_of_one_place_tells_nothing(scene_data: SceneData, write_scene: WriteScene) -> None:
     scene = load_scene(write_scene(scene_data))
-    assert draw_place(scene.spec, 0).to_json(scene.spec) == {}
+    assert draw_surroundings(scene.spec, 0).to_json(scene.spec) == {}
     stated = json.loads(scene.spec.model_dump_json())
     assert not {"environment_weights", "background"} & set(stated)
     assert "materials" not in stated["shapes"][0]
@@ -71,7 +71,7 @@ def test_every_value_of_a_material_is_within_its_range(
     scene_data["output"]["layouts"] = 60
     scene = load_scene(write_scene(scene_data))
     (material,) = scene.spec.shapes[0].materials
-    drawn = [draw_place(scene.spec, 4 * layout).finishes["table"] for layout in range(60)]
+    drawn = [draw_surroundings(scene.spec, 4 * layout).finishes["table"] for layout in range(60)]
     assert len({finish.colours for finish in drawn}) == 60
     for finish in drawn:
         red, green, blue = finish.colours[0]
@@ -89,7 +89,7 @@ def test_every_value_of_a_material_is_within_its_range(
 def test_a_further_material_shifts_no_other_draw(scene_data: SceneData, write_scene: WriteScene) -> None:
     def finishes() -> list[MaterialDraw]:
         scene = load_scene(write_scene(scene_data))
-        return [draw_place(scene.spec, index).finishes["table"] for index in range(12)]
+        return [draw_surroundings(scene.spec, index).finishes["table"] for index in range(12)]
 
     scene_data["shapes"][0]["materials"] = [{"kind": "noise"}, {"kind": "wood"}]
     alone = finishes()
@@ -126,7 +126,7 @@ def test_each_frame_or_layout_draws_a_background(scene_data: SceneData, write_sc
     write_images(write_scene(scene_data).parent, *names)
     scene_data |= {"background": {"images": names, "per": per, "crop": [0.2, 0.3], "rotate": [5, 6], "gain": [2, 3]}}
     scene = load_scene(write_scene(scene_data))
-    drawn = [draw_place(scene.spec, index).background for index in range(12)]
+    drawn = [draw_surroundings(scene.spec, index).background for index in range(12)]
     assert len(set(drawn)) == (12 if per == "frame" else 3)
     for backing in drawn:
         assert backing is not None
@@ -211,8 +211,8 @@ def test_a_backdrop_is_a_room_around_its_inside(scene_data: SceneData, write_sce
     inside = (np.abs(own[:, :2]) < (1.499, 0.999)).all(axis=1) & (own[:, 2] > 0.001) & (own[:, 2] < 2.499)
     assert not inside.any()
     assert [s.name for s in scene.spec.shapes if s.collider and s.visible] == ["table", "backdrop floor"]
-    assert set(draw_place(scene.spec, 0).finishes) == {"backdrop floor", "backdrop walls"}
-    assert draw_place(scene.spec, 0).finish_of("backdrop wall +y") == draw_place(scene.spec, 0).finish_of(
+    assert set(draw_surroundings(scene.spec, 0).finishes) == {"backdrop floor", "backdrop walls"}
+    assert draw_surroundings(scene.spec, 0).finish_of("backdrop wall +y") == draw_surroundings(scene.spec, 0).finish_of(
         "backdrop wall -x"
     )
     assert [finding.text for finding in scene_warnings(scene) if not finding.ok] == []

@@ -27,7 +27,7 @@ from mitsplat.renderer.textures import (
 )
 from mitsplat.scene.planning.layout_surroundings import MaterialDraw
 from mitsplat.scene.spec.shape_spec import Box, Shape
-from mitsplat.scene.walls import stated_pose
+from mitsplat.scene.walls import pose_matrix
 
 COLOURS = ((0.8, 0.6, 0.4), (0.4, 0.3, 0.2))
 
@@ -55,7 +55,7 @@ def test_a_pattern_lies_on_every_face_in_its_size() -> None:
     """Lengths on a face are lengths in its image: the projection is along the faces of a turned box."""
     shape = Shape(name="a", box=Box(size=(0.4, 0.3, 0.2), rotate=(20, 30, 40)), visible=True)
     assert shape.box is not None
-    pose = stated_pose(shape.box)
+    pose = pose_matrix(shape.box)
     mesh = trimesh.creation.box(extents=shape.box.size, transform=pose)
     wood = finish("wood", rotate=25.0, offset=(0.3, 0.1))
     uv = box_projection(mesh, pose[:3, :3], wood, 1.0).reshape(-1, 3, 2)

@@ -11,7 +11,7 @@ import pytest
 from mitsplat.errors import InputError
 from mitsplat.images.colour import hue_matrix, saturation_matrix
 from mitsplat.physics.settle import _scene_hash
-from mitsplat.scene.layout import NOTHING_TO_REST, Instance, Layout
+from mitsplat.scene.layout import NO_PHYSICS, Instance, Layout
 from mitsplat.scene.loading.scene_loading import load_scene
 from mitsplat.scene.planning.object_appearance import ObjectAppearance, draw_appearances
 from mitsplat.scene.scene import Scene
@@ -42,7 +42,7 @@ def varied(scene_data: dict[str, Any], write_scene: WriteScene) -> Any:
 def layout(index: int, nuts: int = 3) -> Layout:
     """Nuts, and a bolt behind them."""
     instances = [Instance(number + 1, int(number == nuts), 0, np.eye(4)) for number in range(nuts + 1)]
-    return Layout(index, tuple(instances), NOTHING_TO_REST)
+    return Layout(index, tuple(instances), NO_PHYSICS)
 
 
 def test_each_object_is_drawn_in_its_ranges(varied: Any) -> None:

@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 
 from mitsplat.errors import InputError
-from mitsplat.scene.layout import NOTHING_TO_REST, Instance, Layout
+from mitsplat.scene.layout import NO_PHYSICS, Instance, Layout
 from mitsplat.scene.loading.scene_loading import load_scene
-from mitsplat.scene.planning.conveyor import belt_of, carried
+from mitsplat.scene.planning.conveyor import belt_of, layout_at_view
 from mitsplat.scene.scene import Scene
 from tests.conftest import WriteScene
 
 SceneData = dict[str, Any]
-SETTLED = replace(NOTHING_TO_REST, attempts=1)
+SETTLED = replace(NO_PHYSICS, attempts=1)
 
 
 @pytest.fixture
@@ -51,7 +51,7 @@ def test_what_is_above_the_belt_runs_along_it(belt_data: SceneData, write_scene:
     layout = lying((0.1, 0.0, 0.01), beside, below, (-0.1, 0.05, 0.3))
     along = np.array([np.cos(np.pi / 6), 0.5, 0.0])
     for view, time in enumerate((-0.15, -0.05, 0.05, 0.15)):
-        moved = places_of(carried(spec, layout, view)) - places_of(layout)
+        moved = places_of(layout_at_view(spec, layout, view)) - places_of(layout)
         np.testing.assert_allclose(moved[[0, 3]], [0.2 * time * along] * 2, atol=1e-15)
         np.testing.assert_array_equal(moved[[1, 2]], 0)
 
@@ -59,20 +59,20 @@ def test_what_is_above_the_belt_runs_along_it(belt_data: SceneData, write_scene:
 def test_a_layout_is_carried_from_where_it_settled(belt_data: SceneData, write_scene: WriteScene) -> None:
     spec = scene_of(belt_data, write_scene).spec
     layout = lying((0.1, 0.0, 0.01))
-    last = carried(spec, layout, 3)
-    assert carried(spec, last, 3) is last
-    np.testing.assert_array_equal(places_of(carried(spec, last, 0)), places_of(carried(spec, layout, 0)))
+    last = layout_at_view(spec, layout, 3)
+    assert layout_at_view(spec, last, 3) is last
+    np.testing.assert_array_equal(places_of(layout_at_view(spec, last, 0)), places_of(layout_at_view(spec, layout, 0)))
 
 
 def test_poses_that_are_made_up_stay(belt_data: SceneData, write_scene: WriteScene) -> None:
     scene = scene_of(belt_data, write_scene)
     given = Layout.of_poses(scene, {"nut": [np.eye(4)]})
-    assert carried(scene.spec, given, 0) is given
+    assert layout_at_view(scene.spec, given, 0) is given
 
 
 def test_a_scene_without_a_belt_has_the_layout_itself(scene_data: SceneData, write_scene: WriteScene) -> None:
     layout = lying((0.1, 0.0, 0.01))
-    assert carried(scene_of(scene_data, write_scene).spec, layout, 1) is layout
+    assert layout_at_view(scene_of(scene_data, write_scene).spec, layout, 1) is layout
 
 
 def test_cameras_of_a_turn_see_the_same_moment(belt_data: SceneData, write_scene: WriteScene) -> None:
@@ -84,7 +84,7 @@ def test_cameras_of_a_turn_see_the_same_moment(belt_data: SceneData, write_scene
     assert [belt and round(belt.time, 9) for belt in belts] == [-0.1] * 3 + [0.0] * 3 + [0.1] * 3
     assert [belt and belt.interval for belt in belts] == [0, 0, 0.1, 0, 0, 0.1, 0, 0, 0]
     layout = lying((0.1, 0.0, 0.01))
-    assert carried(spec, layout, 0) is carried(spec, layout, 2)
+    assert layout_at_view(spec, layout, 0) is layout_at_view(spec, layout, 2)
 
 
 @pytest.mark.parametrize(

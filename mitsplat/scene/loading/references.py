@@ -25,7 +25,7 @@ from mitsplat.scene.spec.object_spec import PRIMITIVES
 from mitsplat.scene.spec.scene_spec import SceneSpec
 from mitsplat.scene.spec.shape_spec import Shape
 from mitsplat.scene.streams import random_stream
-from mitsplat.scene.walls import bin_walls, stated_pose
+from mitsplat.scene.walls import bin_walls, pose_matrix
 from mitsplat.storage.files import is_inside
 from mitsplat.storage.yaml_input import FieldError, KeyPath, key_place
 
@@ -34,7 +34,7 @@ _MAX_IMAGES_PER_PROCESS = 500
 
 
 @dataclass(frozen=True, eq=False)
-class Named:
+class LoadedFiles:
     """Loaded files of a scene.
 
     Attributes:
@@ -51,7 +51,7 @@ class Named:
 
 
 @contextmanager
-def blaming(path: Path, *keys: str | int) -> Iterator[None]:
+def errors_at_key(path: Path, *keys: str | int) -> Iterator[None]:
     """Prepend the key of the scene file to the message of an input error."""
     try:
         yield
@@ -61,7 +61,7 @@ def blaming(path: Path, *keys: str | int) -> Iterator[None]:
         raise InputError(f"{key_place(path, keys)}: {error}") from error
 
 
-def matched(spec: SceneSpec, path: Path, *, allow_outside: bool) -> SceneSpec:
+def expand_patterns(spec: SceneSpec, path: Path, *, allow_outside: bool) -> SceneSpec:
     """Return the specification with patterns replaced by the sorted names of the folders or images that they match.
 
     Raises:
@@ -73,16 +73,16 @@ def matched(spec: SceneSpec, path: Path, *, allow_outside: bool) -> SceneSpec:
     objects, lights = list(spec.objects), list(spec.lights)
     for position, entry in enumerate(objects):
         if isinstance(entry.pool, str) and entry.pool != PRIMITIVES:
-            with blaming(path, "objects", position, "pool"):
+            with errors_at_key(path, "objects", position, "pool"):
                 names = _matches(path.parent, entry.pool, "object", allow_outside=allow_outside)
-            with blaming(path, "objects", position):
+            with errors_at_key(path, "objects", position):
                 entry.check_weights(len(names))
             objects[position] = entry.model_copy(update={"pool": names})
     for position, light in enumerate(lights):
         if isinstance(light, EnvironmentLight) and isinstance(light.pool, str):
-            with blaming(path, "lights", position, "pool"):
+            with errors_at_key(path, "lights", position, "pool"):
                 names = _checked_names(path.parent, image_names(path.parent, light.pool), allow_outside)
-            with blaming(path, "lights", position):
+            with errors_at_key(path, "lights", position):
                 light.check_weights(len(names))
             lights[position] = light.model_copy(update={"pool": names})
     return spec.model_copy(update={"objects": tuple(objects), "lights": tuple(lights)})
@@ -100,10 +100,10 @@ def _matched_environments(spec: SceneSpec, path: Path, allow_outside: bool) -> S
     if not isinstance(pattern, str):
         return spec
     if WILDCARDS & set(pattern) and not (path.parent / pattern / ASSET_FILE).is_file():
-        with blaming(path, "environment"):
+        with errors_at_key(path, "environment"):
             names = _matches(path.parent, pattern, "environment", allow_outside=allow_outside)
         spec = spec.model_copy(update={"environment": names})
-    with blaming(path):
+    with errors_at_key(path):
         spec.check_environment_weights()
     return spec
 
@@ -111,7 +111,7 @@ def _matched_environments(spec: SceneSpec, path: Path, allow_outside: bool) -> S
 def _matched_images(spec: SceneSpec, path: Path, allow_outside: bool) -> SceneSpec:
     found = {}
     for keys, images in image_lists(spec):
-        with blaming(path, *keys):
+        with errors_at_key(path, *keys):
             found[keys] = _checked_names(path.parent, image_names(path.parent, images), allow_outside)
     if not found:
         return spec
@@ -163,7 +163,7 @@ def _check_inside_folder(spec: SceneSpec, path: Path) -> None:
     named += [(("lights", i, "pool"), pattern) for i, pattern in skies if isinstance(pattern, str)]
     for keys, name in named:
         if name is not None:
-            with blaming(path, *keys):
+            with errors_at_key(path, *keys):
                 _refuse_outside(path.parent, name)
 
 
@@ -172,7 +172,7 @@ def _refuse_outside(folder: Path, name: str) -> None:
         raise InputError(f"must be inside the scene's folder (got {name}); --allow-outside lifts this")
 
 
-def read_named(spec: SceneSpec, path: Path) -> Named:
+def load_files(spec: SceneSpec, path: Path) -> LoadedFiles:
     """Read every asset and mesh that a scene file names once, and test the images, which Mitsuba reads later.
 
     Raises:
@@ -181,28 +181,28 @@ def read_named(spec: SceneSpec, path: Path) -> Named:
     folder = path.parent
     places, assets, shape_meshes = list[Asset](), dict[str, Asset](), []
     for keys, name in environments(spec):
-        with blaming(path, *keys):
+        with errors_at_key(path, *keys):
             places.append(Asset.load(folder / name))
     for keys, name, entry in object_assets(spec):
         if entry.pool == PRIMITIVES:
             streams = (random_stream(spec.seed, "primitive", number) for number in range(len(entry.names)))
             assets |= {} if name in assets else dict(zip(entry.names, make_primitives(streams), strict=True))
         elif name not in assets:
-            with blaming(path, *keys):
+            with errors_at_key(path, *keys):
                 assets[name] = Asset.load(folder / name)
     for position, shape in enumerate(spec.shapes):
-        with blaming(path, "shapes", position, "mesh"):
+        with errors_at_key(path, "shapes", position, "mesh"):
             shape_meshes.append(shape_mesh(shape, folder))
     images = {name: folder / name for _, name in named_images(spec)}
     _check_images(spec, path, images)
-    return Named(tuple(places), assets, tuple(shape_meshes), images)
+    return LoadedFiles(tuple(places), assets, tuple(shape_meshes), images)
 
 
 def _check_images(spec: SceneSpec, path: Path, images: Mapping[str, Path]) -> None:
     """Check that images exist and that Mitsuba can read them safely."""
     named = list(named_images(spec))
     for keys, name in named:
-        with blaming(path, *keys):
+        with errors_at_key(path, *keys):
             if not images[name].is_file():
                 raise InputError(f"{images[name]}: no such file")
     for start in range(0, len(named), _MAX_IMAGES_PER_PROCESS):
@@ -219,5 +219,5 @@ def shape_mesh(shape: Shape, folder: Path) -> trimesh.Trimesh:
         return walls
     if shape.box is None:
         return read_mesh(folder / str(shape.mesh))
-    box: trimesh.Trimesh = trimesh.creation.box(extents=shape.box.size, transform=stated_pose(shape.box))
+    box: trimesh.Trimesh = trimesh.creation.box(extents=shape.box.size, transform=pose_matrix(shape.box))
     return box

@@ -12,9 +12,9 @@ import trimesh
 
 from mitsplat.asset import Asset
 from mitsplat.errors import InputError
-from mitsplat.scene.loading.references import Named, blaming, matched, read_named, shape_mesh
+from mitsplat.scene.loading.references import LoadedFiles, errors_at_key, expand_patterns, load_files, shape_mesh
 from mitsplat.scene.planning.conveyor import check_belt
-from mitsplat.scene.planning.frame_lights import written_out
+from mitsplat.scene.planning.frame_lights import expand_rooms
 from mitsplat.scene.planning.viewpoints import camera_at
 from mitsplat.scene.scene import Scene
 from mitsplat.scene.spec.named_files import environments, object_assets
@@ -63,19 +63,19 @@ def make_scene(spec: SceneSpec, folder: str | Path = ".") -> Scene:
 
 def _build_scene(spec: SceneSpec, path: Path, *, allow_outside: bool) -> Scene:
     """Return the scene of a specification."""
-    spec = matched(spec, path, allow_outside=allow_outside)
+    spec = expand_patterns(spec, path, allow_outside=allow_outside)
     _check_lens(spec, path)
     _check_hold_out(spec, path)
-    with blaming(path, "conveyor", "belt"):
+    with errors_at_key(path, "conveyor", "belt"):
         check_belt(spec)
     if spec.backdrop is not None:
         spec = spec.model_copy(update={"shapes": (*spec.shapes, *backdrop_shapes(spec.backdrop)), "backdrop": None})
-    named = read_named(spec, path)
-    with blaming(path, "environment"):
+    named = load_files(spec, path)
+    with errors_at_key(path, "environment"):
         surroundings = tuple(map(_check_units, named.environments))
     assets = _sized_objects(spec, path, named)
     spec, shape_meshes = _expand_enclosures(spec, named, assets)
-    if (lights := written_out(spec)) != spec.lights:
+    if (lights := expand_rooms(spec)) != spec.lights:
         spec = spec.model_copy(update={"lights": lights})
     return Scene(
         spec=spec,
@@ -88,7 +88,7 @@ def _build_scene(spec: SceneSpec, path: Path, *, allow_outside: bool) -> Scene:
     )
 
 
-def _sized_objects(spec: SceneSpec, path: Path, named: Named) -> tuple[Asset, ...]:
+def _sized_objects(spec: SceneSpec, path: Path, named: LoadedFiles) -> tuple[Asset, ...]:
     """Return the asset of each entry at each of its scales. Entries that differ only in count and class share arrays.
 
     Raises:
@@ -100,12 +100,12 @@ def _sized_objects(spec: SceneSpec, path: Path, named: Named) -> tuple[Asset, ..
         for scale in entry.scales:
             key = (name, entry.size, scale)
             if key not in sized:
-                with blaming(path, *keys):
+                with errors_at_key(path, *keys):
                     asset = named.assets[name]
                     asset = _check_units(asset) if entry.size is None else asset.resized(entry.size)
                     sized[key] = asset if scale == 1.0 else asset.scaled(scale)
                     _check_object(sized[key])
-            with blaming(path, *keys):
+            with errors_at_key(path, *keys):
                 for number in spec.regions_of(entry) if not entry.poses or not spec.regions else ():
                     _check_fit(sized[key], spec.all_regions[number][0], spec.region_names[number])
             assets.append(replace(sized[key], class_name=entry.class_name or sized[key].class_name))
@@ -119,7 +119,7 @@ def _class_names(spec: SceneSpec, assets: Sequence[Asset]) -> tuple[str, ...]:
 
 
 def _expand_enclosures(
-    spec: SceneSpec, named: Named, assets: tuple[Asset, ...]
+    spec: SceneSpec, named: LoadedFiles, assets: tuple[Asset, ...]
 ) -> tuple[SceneSpec, tuple[trimesh.Trimesh, ...]]:
     """Return the specification with enclosures expanded to shapes, and the mesh of every shape."""
     enclosures = (spec.enclosure, *(region.enclosure for region in spec.regions))
@@ -139,7 +139,7 @@ def _expand_enclosures(
 def _check_lens(spec: SceneSpec, path: Path) -> None:
     """Check that the intrinsics are valid for the image size; a fisheye lens must not see backwards, for example."""
     for keys, camera in spec.camera_entries:
-        with blaming(path, *keys, "intrinsics"):
+        with errors_at_key(path, *keys, "intrinsics"):
             try:
                 camera_at(np.eye(4), camera.intrinsics, spec.output, camera.zoom[0])  # the widest view
             except ValueError as error:

@@ -14,7 +14,7 @@ import numpy as np
 from mitsplat.arrays import Float64Array, Int64Array
 from mitsplat.scene.spec.scene_spec import SceneSpec
 from mitsplat.scene.streams import random_stream, weighted_choice
-from mitsplat.scene.walls import stated_pose
+from mitsplat.scene.walls import pose_matrix
 from mitsplat.storage.files import SPLITS
 
 if TYPE_CHECKING:
@@ -27,7 +27,7 @@ def draw_objects(scene: Scene, layout: int) -> tuple[tuple[int, ...], tuple[Floa
     assets: list[int] = []
     given: list[Float64Array | None] = []
     for position, (entry, count) in enumerate(zip(scene.spec.objects, _counts(scene.spec, layout), strict=True)):
-        poses: list[Float64Array | None] = [stated_pose(pose) for pose in entry.poses]
+        poses: list[Float64Array | None] = [pose_matrix(pose) for pose in entry.poses]
         drawn = _draw_entry(scene, position, layout, count)
         assets += drawn
         given += (poses or [None] * count)[: len(drawn)]

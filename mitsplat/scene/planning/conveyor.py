@@ -19,7 +19,7 @@ from mitsplat.arrays import BoolArray, Float64Array
 from mitsplat.errors import InputError
 from mitsplat.scene.spec.scene_spec import SceneSpec
 from mitsplat.scene.spec.shape_spec import Box
-from mitsplat.scene.walls import stated_pose
+from mitsplat.scene.walls import pose_matrix
 
 if TYPE_CHECKING:
     from mitsplat.scene.layout import Layout
@@ -52,7 +52,7 @@ class Belt:
     @property
     def velocity(self) -> Float64Array:
         """Velocity of the belt surface in the world [m/s], shape (3,)."""
-        return np.asarray(self.speed * stated_pose(self.box)[:3, 0])
+        return np.asarray(self.speed * pose_matrix(self.box)[:3, 0])
 
     def on_surface(self, points: Float64Array) -> BoolArray:
         """Return a mask of the world points (N, 3) [m] that lie on the upper side of the belt."""
@@ -61,7 +61,7 @@ class Belt:
 
 def _above_box(box: Box, points: Float64Array, height: float) -> BoolArray:
     """Return a mask of the world points (N, 3) [m] that are above a box, up to a height [m]."""
-    pose, half = stated_pose(box), np.array(box.size) / 2
+    pose, half = pose_matrix(box), np.array(box.size) / 2
     x, y, z = ((points - pose[:3, 3]) @ pose[:3, :3]).T
     above: BoolArray = (z > half[2] - _NEAR) & (z < half[2] + height) & (abs(x) <= half[0]) & (abs(y) <= half[1])
     return above
@@ -79,7 +79,7 @@ def belt_of(spec: SceneSpec, view: int) -> Belt | None:
     return Belt(box, spec.conveyor.speed, interval * (turn - (turns - 1) / 2), interval if follows else 0.0)
 
 
-def carried(spec: SceneSpec, layout: Layout, view: int) -> Layout:
+def layout_at_view(spec: SceneSpec, layout: Layout, view: int) -> Layout:
     """Return a settled layout at the moment of a view. Layouts with given poses are returned unchanged.
 
     Args:
@@ -88,10 +88,10 @@ def carried(spec: SceneSpec, layout: Layout, view: int) -> Layout:
         view: Index of the view in the layout.
     """
     belt = belt_of(spec, view)
-    return layout if belt is None else carried_by(belt, layout)
+    return layout if belt is None else layout_on_belt(belt, layout)
 
 
-def carried_by(belt: Belt, layout: Layout) -> Layout:
+def layout_on_belt(belt: Belt, layout: Layout) -> Layout:
     """Return a settled layout at the moment of a belt. Layouts with given poses are returned unchanged."""
     settled = layout.settled or layout
     if not settled.certificate.attempts:  # without physics, poses are given
@@ -133,7 +133,7 @@ def check_belt(spec: SceneSpec) -> None:
     belt = belt_of(spec, 0)
     if belt is None:
         return
-    pose, (length, width, _) = stated_pose(belt.box), belt.box.size
+    pose, (length, width, _) = pose_matrix(belt.box), belt.box.size
     reach = 0.0
     for region, _ in spec.all_regions:
         corners = trimesh.bounds.corners(np.array([region.min, region.max]))

@@ -19,7 +19,7 @@ _UNIFORM = ("position", "target", "size", "cone", "radiance", "intensity", "rota
 """Keys whose values, or components, are uniform between two bounds."""
 
 
-def written_out(spec: SceneSpec) -> tuple[LightSpec, ...]:
+def expand_rooms(spec: SceneSpec) -> tuple[LightSpec, ...]:
     """Return the lights of a scene file, with rooms expanded to their lights."""
     found: list[LightSpec] = []
     for light in spec.lights:
@@ -30,7 +30,7 @@ def written_out(spec: SceneSpec) -> tuple[LightSpec, ...]:
 def lights_at(spec: SceneSpec, layout: int, index: int, time: float) -> tuple[LightSpec, ...]:
     """Return the lights of frame ``index``, at ``time`` in [0, 1] of the paths of its layout."""
     found = []
-    for position, light in enumerate(written_out(spec)):
+    for position, light in enumerate(expand_rooms(spec)):
         number, copies = layout, 1
         if light.draw is not None:
             number = index if light.draw.vary == "frame" else layout

@@ -63,7 +63,7 @@ class FramePlan:
     belt: Belt | None = None
 
 
-def whole(index: SupportsIndex, name: str) -> int:
+def to_index(index: SupportsIndex, name: str) -> int:
     """Convert an index of any integer type to ``int``.
 
     Raises:
@@ -81,7 +81,7 @@ def layout_of(scene: Scene, index: int) -> int:
     Raises:
         InputError: If the scene has no such frame.
     """
-    index = whole(index, "frame")
+    index = to_index(index, "frame")
     if not 0 <= index < scene.num_frames:
         raise InputError(f"{scene.path}: frame must be in 0 to {scene.num_frames - 1} (got {index})")
     return index // scene.spec.output.views
@@ -115,7 +115,7 @@ def plan_frame(
         InputError: If there is no such frame, if no candidate view fulfils the conditions of the scene file, or if the
             lights are invalid.
     """
-    index = whole(index, "frame")
+    index = to_index(index, "frame")
     spec, number = scene.spec, layout_of(scene, index)
     if lights is not None:
         spec = SceneSpec(**{**dict(spec), "lights": tuple(lights)})  # validates the lights

@@ -16,7 +16,7 @@ from mitsplat.scene.spec.material_spec import Background, BrushedMetalMaterial, 
 from mitsplat.scene.spec.scene_spec import SceneSpec
 from mitsplat.scene.splits import draw_environment
 from mitsplat.scene.streams import random_stream
-from mitsplat.scene.walls import finish_name
+from mitsplat.scene.walls import material_name
 
 if TYPE_CHECKING:
     from mitsplat.asset import Asset
@@ -95,7 +95,7 @@ class LayoutSurroundings:
 
     def finish_of(self, shape: str) -> MaterialDraw | None:
         """Return the drawn material of a shape; None if its material is fixed."""
-        return self.finishes.get(finish_name(shape))
+        return self.finishes.get(material_name(shape))
 
     def to_json(self, spec: SceneSpec) -> dict[str, Any]:
         """Return the values that the scene file leaves open as JSON values; empty if there are none."""
@@ -109,23 +109,23 @@ class LayoutSurroundings:
         return values
 
 
-def draw_place(spec: SceneSpec, index: int, layout: int | None = None) -> LayoutSurroundings:
+def draw_surroundings(spec: SceneSpec, index: int, layout: int | None = None) -> LayoutSurroundings:
     """Draw the surroundings of frame ``index``, or of the layout whose number is given."""
     layout = index // spec.output.views if layout is None else layout
-    materials = {finish_name(shape.name): shape.materials for shape in spec.shapes if shape.materials}
-    finishes = {name: draw_finish(among, spec.seed, name, layout) for name, among in materials.items()}
+    materials = {material_name(shape.name): shape.materials for shape in spec.shapes if shape.materials}
+    finishes = {name: draw_material(among, spec.seed, name, layout) for name, among in materials.items()}
     background = None
     if spec.background is not None:
-        background = draw_backing(spec.background, spec.seed, index if spec.background.per == "frame" else layout)
+        background = draw_background(spec.background, spec.seed, index if spec.background.per == "frame" else layout)
     return LayoutSurroundings(draw_environment(spec, layout), finishes, background)
 
 
-def environment_at(scene: Scene, place: LayoutSurroundings) -> Asset | None:
+def drawn_environment(scene: Scene, place: LayoutSurroundings) -> Asset | None:
     """Return the environment of drawn surroundings; None if the scene has none."""
     return scene.environments[place.environment] if scene.environments else None
 
 
-def draw_finish(materials: Sequence[Material], seed: int, name: str, layout: int) -> MaterialDraw:
+def draw_material(materials: Sequence[Material], seed: int, name: str, layout: int) -> MaterialDraw:
     """Draw one of several materials and a value from each of its ranges."""
     rng = random_stream(seed, f"material {name}", layout)
     material = materials[int(rng.integers(len(materials)))]
@@ -157,7 +157,7 @@ def draw_finish(materials: Sequence[Material], seed: int, name: str, layout: int
     )
 
 
-def draw_backing(background: Background, seed: int, number: int) -> BackgroundDraw:
+def draw_background(background: Background, seed: int, number: int) -> BackgroundDraw:
     """Draw the background image of frame or layout ``number``."""
     rng = random_stream(seed, "background", number)
     choice, crop, x, y, rotate, gain = map(float, rng.random(6))

@@ -64,7 +64,7 @@ class Viewpoint:
             * ``aperture``, ``focus``: thin lens [m];
             * ``motion``: motion during the exposure: ``exposure`` [s]; ``velocity`` [m/s] and ``rotation`` [degrees/s]
                 in the camera's frame; ``readout`` [s] if the shutter is a rolling one;
-            * ``handheld``: handheld motion, see :func:`moved_by`;
+            * ``handheld``: handheld motion, see :func:`handheld_transform`;
             * ``target``: point in the centre of the image [m];
             * ``object``: id of the instance in the centre of the image;
             * ``attempt``: number of the candidate view;
@@ -111,7 +111,7 @@ class _CameraTurn:
             drawn["zoom"] = float(random_stream(self.seed, "camera zoom", self.index).uniform(*camera.zoom))
         if camera.handheld is not None:
             drawn["handheld"] = self._handheld_motion(camera.handheld).tolist()
-            pose = pose @ moved_by(drawn["handheld"])
+            pose = pose @ handheld_transform(drawn["handheld"])
         taken = camera_at(pose, camera.intrinsics, self.output, drawn.get("zoom", camera.zoom[0]))
         if camera.defocus is not None:
             rng = random_stream(self.seed, "camera defocus", self.index)
@@ -182,7 +182,7 @@ def view_of(scene: Scene, index: int, layout: Layout | None = None) -> Viewpoint
     return Viewpoint(view_camera, own | drawn)
 
 
-def moved_by(motion: Sequence[float]) -> Float64Array:
+def handheld_transform(motion: Sequence[float]) -> Float64Array:
     """Return the rigid transform (4, 4) of a displacement [m] and a rotation vector [degrees] in the camera's frame."""
     moved = np.eye(4)
     moved[:3, 3] = motion[:3]

@@ -211,7 +211,7 @@ class VisibilityPredictor:
 
     def _containing_solid(self, eye: Float64Array) -> str:
         """Return the description of the shape or object that contains a point; empty if none does."""
-        if name := solid_around(self._scene, eye):
+        if name := enclosing_shape(self._scene, eye):
             return f"shape {name!r}"
         for one in self._near(eye, 0.0):
             mesh = _mesh(self._scene, one.asset)
@@ -233,7 +233,7 @@ class VisibilityPredictor:
         return [one for one, is_near in zip(self._layout.instances, near, strict=True) if is_near]
 
 
-def solid_around(scene: Scene, point: Float64Array) -> str:
+def enclosing_shape(scene: Scene, point: Float64Array) -> str:
     """Return the name of a visible shape that contains a point [m] and not the centre of the region, or empty."""
     middle = (np.array(scene.spec.region.min) + scene.spec.region.max) / 2
     for shape, mesh in zip(scene.spec.shapes, scene.shape_meshes, strict=True):

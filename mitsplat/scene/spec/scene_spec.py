@@ -9,7 +9,7 @@ from typing import Literal, get_args
 
 from pydantic import Field, model_validator
 
-from mitsplat.geometry.camera import MOST_PIXELS
+from mitsplat.geometry.camera import MAX_IMAGE_SIDE
 from mitsplat.quality import PresetName
 from mitsplat.scene.spec.camera_spec import CameraSpec
 from mitsplat.scene.spec.image_spec import Composite, DepthSensor, Randomise, Rendering, StereoSensor
@@ -56,8 +56,8 @@ FORMATS: tuple[str, ...] = get_args(FormatName)
 class Output(StrictModel):
     """Number, size and formats of the images, and the splits."""
 
-    width: int = Field(1280, ge=1, le=MOST_PIXELS, description="Image width [px].")
-    height: int = Field(720, ge=1, le=MOST_PIXELS, description="Image height [px].")
+    width: int = Field(1280, ge=1, le=MAX_IMAGE_SIDE, description="Image width [px].")
+    height: int = Field(720, ge=1, le=MAX_IMAGE_SIDE, description="Image height [px].")
     layouts: int = Field(4, ge=1, description="Number of layouts. Each layout is one drop of the objects.")
     views: int = Field(10, ge=1, description="Number of images per layout.")
     formats: tuple[FormatName, ...] = Field(

@@ -74,6 +74,16 @@ class TestScenes:
             load_scene(path)
         assert time.process_time() - begun < 1
 
+    @pytest.mark.parametrize("key", ["asset", "pool"])
+    def test_long_names_take_no_time(self, scene_data, write_scene, key):
+        """Resolving them would take a time with the square of the length."""
+        scene_data["objects"] = [{key: "*/" * 200_000}]
+        path = write_scene(scene_data)
+        begun = time.process_time()
+        with pytest.raises(InputError, match="must be inside the scene's folder") as raised:
+            load_scene(path)
+        assert time.process_time() - begun < 5 and len(str(raised.value)) < 1000
+
     def test_aliases_do_not_multiply(self, tmp_path):
         """The billion laughs: ten levels of ten aliases each."""
         levels = ["a0: &a0 [x]\n"] + [f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 10)}]\n" for i in range(1, 10)]

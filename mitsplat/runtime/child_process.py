@@ -85,7 +85,9 @@ def leave_current_folder() -> None:
     """
     os.environ[SAFE_PATH] = "1"
     first = sys.path[0] if sys.path and not sys.flags.safe_path else None
-    if first in ("", str(Path.cwd())) and not Path(first or ".", "mitsplat").is_dir():
+    folder = None if first is None else Path(first or ".")
+    # A current folder that has been removed has no path, but it is still a folder.
+    if folder is not None and folder.exists() and folder.samefile(".") and not (folder / "mitsplat").is_dir():
         del sys.path[0]
 
 

@@ -32,6 +32,9 @@ def splits_of(output: Mapping[str, Any]) -> tuple[str, ...]:
     return SPLITS if output.get("test") else SPLITS[:2]
 
 
+_LONGEST_PATH = 4096
+"""Length of the longest path that the system resolves [characters]."""
+
 IMAGE_ERRORS = (OSError, SyntaxError, ValueError, TypeError, struct.error, Image.DecompressionBombError)
 """Exceptions of Pillow for damaged images, and for images with an excessive number of pixels."""
 
@@ -238,6 +241,8 @@ def files_below(folder: Path, *, but: Path | None = None) -> list[Path]:
 
 def is_inside(folder: Path, name: str) -> bool:
     """Return True if a path (absolute or relative to ``folder``) lies in it after links and ``..`` are resolved."""
+    if len(name) > _LONGEST_PATH:  # resolving takes a time with the square of the length
+        return False
     try:
         return (folder / name).resolve().is_relative_to(folder.resolve())
     except (OSError, ValueError, RuntimeError):  # too long, a zero byte, or a loop of links

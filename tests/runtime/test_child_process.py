@@ -119,6 +119,16 @@ class TestSafePath:
         leave_current_folder()
         assert (os.environ[SAFE_PATH], sys.path) == ("1", [first, "/somewhere"] if kept else ["/somewhere"])
 
+    @pytest.mark.skipif(sys.flags.safe_path, reason="Python was started in safe-path mode")
+    def test_a_current_folder_that_was_removed_is_left(self, monkeypatch, tmp_path):
+        monkeypatch.setenv(SAFE_PATH, "0")
+        (tmp_path / "gone").mkdir()
+        monkeypatch.chdir(tmp_path / "gone")
+        (tmp_path / "gone").rmdir()
+        monkeypatch.setattr(sys, "path", ["", "/somewhere"])
+        leave_current_folder()
+        assert sys.path == ["/somewhere"]
+
     def test_the_folder_that_mitsplat_is_in_stays(self, monkeypatch):
         monkeypatch.setenv(SAFE_PATH, "0")
         monkeypatch.chdir(Path(__file__).parents[2])

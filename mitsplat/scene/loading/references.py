@@ -169,7 +169,7 @@ def _check_inside_folder(spec: SceneSpec, path: Path) -> None:
 
 def _refuse_outside(folder: Path, name: str) -> None:
     if not is_inside(folder, name):
-        raise InputError(f"must be inside the scene's folder (got {name}); --allow-outside lifts this")
+        raise InputError(f"must be inside the scene's folder (got {name:.200}); --allow-outside lifts this")
 
 
 def load_files(spec: SceneSpec, path: Path) -> LoadedFiles:

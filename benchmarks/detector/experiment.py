@@ -30,7 +30,7 @@ from ruamel.yaml import YAML
 
 from benchmarks.record import figure, recording
 from mitsplat.detector import DetectionMatches, TrainSettings, evaluate_detector, train_detector
-from mitsplat.detector.losses import gains
+from mitsplat.detector.losses import error_gains
 from mitsplat.detector.training import Run
 from mitsplat.storage.files import write_text
 
@@ -227,7 +227,7 @@ def measure(options: argparse.Namespace) -> None:
     figure(whole.map50, "", "map50")
     for name, (strict, _) in whole.classes.items():
         figure(strict, "", "class", name)
-    for name, gain in gains(truth, detections, whole).items():
+    for name, gain in error_gains(truth, detections, whole).items():
         figure(gain, "", "gain", name)
     by_scene: dict[int, list[int]] = {}
     for image in truth["images"]:

@@ -38,7 +38,7 @@ from mitsplat.capture.known_poses import read_poses
 from mitsplat.capture.photo_masks import given_masks
 from mitsplat.capture.photos import Prepared
 from mitsplat.capture.video import choose_frames
-from mitsplat.detector.detector_evaluation import truth_of
+from mitsplat.detector.detector_evaluation import coco_truth
 from mitsplat.detector.sets import read_set
 from mitsplat.detector.training import write_data
 from mitsplat.errors import InputError
@@ -204,7 +204,7 @@ def _labelled(folder: Path, rng: np.random.Generator) -> None:
 
 def _read_labelled(folder: Path) -> None:
     """Read a set and all that is made of it."""
-    truth_of(read_set(folder, "train"), masks=True)
+    coco_truth(read_set(folder, "train"), masks=True)
     write_data([read_set(folder, "train")], folder.parent / "data")
 
 

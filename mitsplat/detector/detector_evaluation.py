@@ -26,23 +26,23 @@ from mitsplat.detector.libraries import (
     check_device,
     check_torchvision,
     check_weights,
+    linked_weights,
     load_libraries,
     torch_device,
-    under_another_name,
     versions,
 )
-from mitsplat.detector.losses import gains
+from mitsplat.detector.losses import error_gains
 from mitsplat.detector.pictures import read_picture
 from mitsplat.detector.scores import (
     CONFIDENCE,
     IOU,
-    MOST_DETECTIONS,
+    MAX_DETECTIONS,
     AveragePrecision,
     Detection,
     DetectionMatches,
     confuse,
 )
-from mitsplat.detector.sets import LabelledSet, Sample, Split, check_masks, in_classes, read_set
+from mitsplat.detector.sets import LabelledSet, Sample, Split, check_masks, read_set, reorder_classes
 from mitsplat.detector.training import check_folder, open_run
 from mitsplat.errors import InputError
 from mitsplat.images.masks import encode_mask
@@ -51,7 +51,7 @@ from mitsplat.progress import Progress
 from mitsplat.storage.content_hash import file_hash
 from mitsplat.storage.files import storage_errors, write_text
 
-LEAST_SCORE, NMS_IOU = 0.001, 0.7
+MIN_SCORE, NMS_IOU = 0.001, 0.7
 """Least score of stored detections, and IoU threshold of the non-maximum suppression within a class."""
 
 _EVALUATION_FILES = frozenset(("truth.json", "detections.json", "results.json", REPORT_FILE))
@@ -109,7 +109,7 @@ def evaluate_detector(
     size = int(trained.record["settings"]["size"]) if size is None else size
     if size < 32 or size % 32:
         raise InputError(f"--size must be a multiple of 32 px (got {size})")
-    found = in_classes(read_set(root, split, progress), trained.class_names, str(trained.path))
+    found = reorder_classes(read_set(root, split, progress), trained.class_names, str(trained.path))
     if trained.has_masks:
         check_masks(found)
     name = f"{root.resolve().name}-{split}"
@@ -153,14 +153,14 @@ def detect(
     """
     from ultralytics import YOLO  # optional
 
-    with under_another_name(weights) as name:
+    with linked_weights(weights) as name:
         model, found = YOLO(name, task="segment" if masks else "detect"), []
     for number, sample in enumerate(samples, start=1):
         (result,) = model.predict(
             read_picture(sample.path),
-            conf=LEAST_SCORE,
+            conf=MIN_SCORE,
             iou=NMS_IOU,
-            max_det=MOST_DETECTIONS,
+            max_det=MAX_DETECTIONS,
             imgsz=size,
             device=device,
             rect=False,
@@ -188,7 +188,7 @@ def detect(
     return found
 
 
-def truth_of(found: LabelledSet, *, masks: bool) -> dict[str, Any]:
+def coco_truth(found: LabelledSet, *, masks: bool) -> dict[str, Any]:
     """Return the labels as a COCO dataset; ids of images, annotations and categories count from 1."""
     annotations: list[dict[str, Any]] = []
     for number, sample in enumerate(found.samples, start=1):
@@ -222,12 +222,12 @@ def write_evaluation(
 
     Args:
         found: The labelled images.
-        detections: Detections in COCO's results format, with ids as in :func:`truth_of`.
+        detections: Detections in COCO's results format, with ids as in :func:`coco_truth`.
         out: Output folder.
         masks: True to evaluate masks as well as boxes.
         about: Further entries of ``results.json``, for example how the detections were made.
     """
-    out, truth = Path(out), truth_of(found, masks=masks)
+    out, truth = Path(out), coco_truth(found, masks=masks)
     scores = {"box": DetectionMatches(truth, detections, "bbox").average_precision()}
     if masks:
         scores["mask"] = DetectionMatches(truth, detections, "segm").average_precision()
@@ -236,13 +236,13 @@ def write_evaluation(
         **about,
         "data": found.described(),
         "rules": {
-            "least_score": LEAST_SCORE,
+            "least_score": MIN_SCORE,
             "nms_iou": NMS_IOU,
-            "most_detections": MOST_DETECTIONS,
+            "most_detections": MAX_DETECTIONS,
             "confusion": {"least_score": CONFIDENCE, "iou": IOU},
         },
         **{kind: _score_record(score) for kind, score in scores.items()},
-        "gains": {kind: round(gain, 5) for kind, gain in gains(truth, detections, scores["box"]).items()},
+        "error_gains": {kind: round(gain, 5) for kind, gain in error_gains(truth, detections, scores["box"]).items()},
         "confusion": {"classes": [*found.class_names, "nothing"], "matrix": confusion.matrix.tolist()},
     }
     with storage_errors(out):

@@ -9,9 +9,9 @@ from typing import Any
 import cv2
 import numpy as np
 
-from mitsplat.detector.losses import KINDS
+from mitsplat.detector.losses import ERROR_KINDS
 from mitsplat.detector.pictures import read_picture
-from mitsplat.detector.scores import CONFIDENCE, IOU, MOST_DETECTIONS, AveragePrecision, Confusion, Detection
+from mitsplat.detector.scores import CONFIDENCE, IOU, MAX_DETECTIONS, AveragePrecision, Confusion, Detection
 from mitsplat.detector.sets import LabelledSet, Sample
 from mitsplat.images.masks import Silhouette, decode_rle
 from mitsplat.labels.overlay import class_colour
@@ -70,7 +70,7 @@ def _summary(
     rules = results["rules"]
     note = (
         "Average precision by COCO's rules: mean over 101 recalls and IoU thresholds 0.5 to 0.95, at most "
-        f"{MOST_DETECTIONS} detections an image with scores of {rules['least_score']} or more, overlaps "
+        f"{MAX_DETECTIONS} detections an image with scores of {rules['least_score']} or more, overlaps "
         f"beyond {rules['nms_iou']} suppressed."
     )
     return _section("summary", "Summary", f"<table>{lines}</table><p>{note}</p>")
@@ -110,7 +110,7 @@ def _charts(scores: Mapping[str, AveragePrecision]) -> str:
 
 def _gains(found: Mapping[str, float]) -> str:
     text = "How much mAP50-95 of boxes would rise if one kind of error were mended; gains do not add up."
-    chart = bars(text, {KINDS[kind]: max(gain, 0.0) for kind, gain in found.items()}, name_width=170)
+    chart = bars(text, {ERROR_KINDS[kind]: max(gain, 0.0) for kind, gain in found.items()}, name_width=170)
     return _section("gains", "What errors cost", f'<div class="charts">{chart}</div>')
 
 

@@ -29,7 +29,7 @@ from ultralytics.utils.ops import resample_segments
 from ultralytics.utils.torch_utils import strip_optimizer
 
 from mitsplat.arrays import Int64Array
-from mitsplat.detector.libraries import UNREADABLE, under_another_name
+from mitsplat.detector.libraries import WEIGHTS_ERRORS, linked_weights
 from mitsplat.errors import InputError, MissingResourceError
 
 EPOCH = 50
@@ -141,9 +141,9 @@ def train_job(
     callbacks["on_train_batch_end"].append(_FixedStepsTrainer.end_step)
     last = job.run / LAST
     with ExitStack() as links:
-        settings["pretrained"] = links.enter_context(under_another_name(weights)) if weights else False
+        settings["pretrained"] = links.enter_context(linked_weights(weights)) if weights else False
         if last.is_file():
-            settings["resume"] = links.enter_context(under_another_name(last))
+            settings["resume"] = links.enter_context(linked_weights(last))
         trainer = (_MaskTrainer if job.masks else _BoxTrainer)(job, settings, callbacks)
         trainer.train()
     return trainer.outcome()
@@ -165,9 +165,9 @@ def epochs_done(run: Path) -> int:
         InputError: If the checkpoint cannot be read.
     """
     try:
-        with under_another_name(run / LAST) as name:
+        with linked_weights(run / LAST) as name:
             return int(torch_safe_load(name)[0]["epoch"]) + 1
-    except UNREADABLE as error:
+    except WEIGHTS_ERRORS as error:
         raise InputError(
             f"{run / LAST}: cannot be read ({type(error).__name__}): begin anew with --overwrite"
         ) from error

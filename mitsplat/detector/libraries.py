@@ -20,7 +20,7 @@ from typing import Any
 
 from mitsplat.errors import InputError, MissingResourceError
 
-UNREADABLE = (
+WEIGHTS_ERRORS = (
     *(OSError, EOFError, UnpicklingError, RuntimeError),
     *(ValueError, LookupError, TypeError, AttributeError),
 )
@@ -195,7 +195,7 @@ def check_weights(weights: Path, network: str, *, masks: bool, classes: int | No
 
 
 @contextmanager
-def under_another_name(path: Path) -> Iterator[str]:
+def linked_weights(path: Path) -> Iterator[str]:
     """Yield the path of a temporary link to a weights file, by which Ultralytics reads the file unchanged.
 
     Ultralytics treats some file names as its own releases: it downloads these files again and removes them if they look
@@ -218,7 +218,7 @@ def load_weights(path: Path) -> Any:
     if not path.is_file() or path.suffix != ".pt":
         raise InputError(f"--weights must be a file of Ultralytics (.pt) that is there (got {path})")
     try:
-        with under_another_name(path) as name:
+        with linked_weights(path) as name:
             return load_checkpoint(name)[0]
-    except UNREADABLE as error:
+    except WEIGHTS_ERRORS as error:
         raise InputError(f"{path}: cannot be read as weights of Ultralytics ({type(error).__name__})") from error

@@ -22,14 +22,14 @@ from scipy.ndimage import gaussian_filter1d
 
 from mitsplat.arrays import BoolArray, ByteImage, Float64Array
 from mitsplat.detector.pictures import read_picture
-from mitsplat.detector.sets import STRIDE, LabelledObject, Sample, Split, in_classes, read_set
+from mitsplat.detector.sets import STRIDE, LabelledObject, Sample, Split, read_set, reorder_classes
 from mitsplat.errors import InputError
 from mitsplat.labels.polygons import fill_polygon
 from mitsplat.progress import Progress
 
-FEWEST, FEWEST_RENDERED = 5, 20
+MIN_REAL_OBJECTS, MIN_RENDERED_OBJECTS = 5, 20
 """Least numbers of photographed and of rendered objects of a class that are compared."""
-CHANCE = 0.01
+SIGNIFICANCE = 0.01
 """Significance level: advice is given if chance explains the share outside the range with a lower probability."""
 _PERMUTATIONS = 299
 """Number of random permutations of the images between the two sides."""
@@ -157,7 +157,7 @@ def compare_with_photographs(
     if most < 1:
         raise InputError(f"images of each side must be at least 1 (got {most})")
     real = read_set(photographs, "all")
-    sets = [in_classes(read_set(one, split), real.class_names, str(photographs)) for one in rendered]
+    sets = [reorder_classes(read_set(one, split), real.class_names, str(photographs)) for one in rendered]
     if not sets:
         raise InputError("there are no rendered images to compare")
     ours = _sample_evenly([sample for one in sets for sample in one.samples], most)
@@ -173,7 +173,7 @@ def compare_with_photographs(
         shown = [key for key in _TRAITS if all(side.get((key, index)) for side in sides)]
         return tuple(_trait(key, sides[0][key, index], sides[1][key, index]) for key in shown)
 
-    least = FEWEST_RENDERED, FEWEST
+    least = MIN_RENDERED_OBJECTS, MIN_REAL_OBJECTS
     classes = {
         name: traits_of(index)
         for index, name in enumerate(real.class_names)
@@ -224,7 +224,7 @@ def _size_ratio(sides: tuple[_Values, _Values], classes: int) -> float | None:
     ratios = []
     for index in range(classes):
         ours, theirs = (side.get((_UNCUT_SIZE, index), []) for side in sides)
-        if len(ours) >= FEWEST_RENDERED and len(theirs) >= FEWEST:
+        if len(ours) >= MIN_RENDERED_OBJECTS and len(theirs) >= MIN_REAL_OBJECTS:
             upper = [np.quantile([value for _, value in values], 0.75) for values in (ours, theirs)]
             ratios.append(upper[0] / upper[1])
     return float(np.median(ratios)) if ratios else None
@@ -325,11 +325,11 @@ def _significant(
 ) -> tuple[bool, bool]:
     """Return for each side True if the share outside is significant in a permutation test.
 
-    The test deals all images to the two sides at random. A share is significant if fewer than :data:`CHANCE` of the
-    permutations reach it. The objects of an image stay together because they share its light. The result is False for
-    too few objects.
+    The test deals all images to the two sides at random. A share is significant if fewer than :data:`SIGNIFICANCE` of
+    the permutations reach it. The objects of an image stay together because they share its light. The result is False
+    for too few objects.
     """
-    if (~photographed).sum() < FEWEST_RENDERED or photographed.sum() < FEWEST:
+    if (~photographed).sum() < MIN_RENDERED_OBJECTS or photographed.sum() < MIN_REAL_OBJECTS:
         return False, False
     names, places = np.unique(images, return_inverse=True)
     count = len(np.unique(images[photographed]))
@@ -339,5 +339,5 @@ def _significant(
         dealt = np.zeros(len(names), dtype=bool)
         dealt[rng.choice(len(names), count, replace=False)] = True
         reached += _outside_shares(values, dealt[places]) >= outside
-    low, high = (reached / (_PERMUTATIONS + 1) < CHANCE).tolist()
+    low, high = (reached / (_PERMUTATIONS + 1) < SIGNIFICANCE).tolist()
     return low, high

@@ -14,10 +14,10 @@ import numpy as np
 
 from mitsplat.detector.scores import IOU, AveragePrecision, Detection, DetectionMatches, overlaps
 
-NEAR = 0.1
+MIN_NEAR_IOU = 0.1
 """Least IoU of a badly placed box with a label of its class."""
 
-KINDS = {
+ERROR_KINDS = {
     "another_class": "taken for another class",
     "nothing": "found where it is not",
     "place": "boxes that do not fit",
@@ -26,8 +26,10 @@ KINDS = {
 """Kinds of errors and their descriptions."""
 
 
-def gains(truth: Mapping[str, Any], detections: Sequence[Detection], before: AveragePrecision) -> dict[str, float]:
-    """Return the gain in box mAP50-95 if one kind of error (:data:`KINDS`) is corrected.
+def error_gains(
+    truth: Mapping[str, Any], detections: Sequence[Detection], before: AveragePrecision
+) -> dict[str, float]:
+    """Return the gain in box mAP50-95 if one kind of error (:data:`ERROR_KINDS`) is corrected.
 
     Args:
         truth: The labels.
@@ -39,7 +41,7 @@ def gains(truth: Mapping[str, Any], detections: Sequence[Detection], before: Ave
     """
     if not before.classes:
         return {}
-    found: dict[str, list[Detection]] = {kind: [] for kind in KINDS}
+    found: dict[str, list[Detection]] = {kind: [] for kind in ERROR_KINDS}
     hit: set[int] = set()
     by_image = _by_image(truth["annotations"])
     for image, seen in _by_image(detections).items():
@@ -70,7 +72,7 @@ def _correct_errors(
     ``seen`` is sorted by descending score. A detection of the wrong class gets the right class, or is removed if the
     label was detected already. A badly placed box gets the box of its label.
     """
-    corrected: dict[str, list[Detection]] = {kind: [] for kind in KINDS if kind != "missed"}
+    corrected: dict[str, list[Detection]] = {kind: [] for kind in ERROR_KINDS if kind != "missed"}
     crowds = [bool(one.get("iscrowd")) for one in labels]
     overlap = overlaps([one["bbox"] for one in seen], [one["bbox"] for one in labels], crowds)
     classes = np.array([one["category_id"] for one in labels])
@@ -93,7 +95,7 @@ def _correct_errors(
                 del variants["another_class"]
             else:
                 variants["another_class"] = {**detection, "category_id": labels[label]["category_id"]}
-        elif free.max(initial=0.0) >= NEAR:
+        elif free.max(initial=0.0) >= MIN_NEAR_IOU:
             variants["place"] = {**detection, "bbox": labels[int(free.argmax())]["bbox"]}
         else:
             del variants["nothing"]

@@ -12,13 +12,13 @@ import cv2
 import numpy as np
 
 from mitsplat.arrays import BoolArray
-from mitsplat.detector.pictures import SMALLEST, read_picture
+from mitsplat.detector.pictures import MIN_SIDE, read_picture
 from mitsplat.detector.sets import LabelledObject, LabelledSet
 from mitsplat.errors import InputError
 from mitsplat.images.masks import Silhouette, decode_rle
 from mitsplat.labels.polygons import outline
 
-LEAST_SEEN = 0.15
+MIN_VISIBLE_SHARE = 0.15
 """Least visible share of an object, relative to the whole photograph, for a label in a tile."""
 _MIN_OVERLAP = 1 / 3
 """Least overlap of tiles as a share of their sides; an object up to this size is whole in at least one tile."""
@@ -45,9 +45,9 @@ def cut_photographs(photographs: LabelledSet, real_size: int, size: int, folder:
     for number, sample in enumerate(photographs.samples):
         picture = read_picture(sample.path)
         width, height = (max(round(side * size / real_size), 1) for side in (sample.width, sample.height))
-        if min(width, height) < SMALLEST:
+        if min(width, height) < MIN_SIDE:
             raise InputError(
-                f"{sample.path}: a tile of it must have sides of {SMALLEST} px or more (got {width} x {height}): give "
+                f"{sample.path}: a tile of it must have sides of {MIN_SIDE} px or more (got {width} x {height}): give "
                 f"a --real-size nearer to --size, {size}"
             )
         masks = [
@@ -79,13 +79,13 @@ def _crop_object(
     """Return the part of a labelled object in a tile, or None if too little of it is visible."""
     if mask is not None:
         seen = mask[top : top + height, left : left + width]
-        if seen.sum() < max(LEAST_SEEN * mask.sum(), 1):
+        if seen.sum() < max(MIN_VISIBLE_SHARE * mask.sum(), 1):
             return None
         box = Silhouette.cropped(seen, 0, 0).box
         return LabelledObject(instance.class_index, box, outline(seen), crowd=instance.crowd)
     low, high = np.reshape(instance.box, (2, 2))
     inside = np.clip([low, high], (left, top), (left + width, top + height))
-    if (inside[1] - inside[0]).prod() < LEAST_SEEN * (high - low).prod():
+    if (inside[1] - inside[0]).prod() < MIN_VISIBLE_SHARE * (high - low).prod():
         return None
     (x0, y0), (x1, y1) = (inside - (left, top)).tolist()
     return LabelledObject(instance.class_index, (x0, y0, x1, y1), crowd=instance.crowd)

@@ -18,7 +18,7 @@ SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
 """Suffixes of images that Ultralytics also reads."""
 _VERIFIED_FORMATS, _DECODED_FORMATS = ("JPEG", "MPO", "PNG", "WEBP"), ("BMP", "TIFF")
 """Formats that Pillow checks for truncation, and formats that must be decoded for this check."""
-SMALLEST = 10
+MIN_SIDE = 10
 """Least side of an image that Ultralytics accepts [px]."""
 _JPEG_ENDS = b"\xff\xd9"
 _ORIENTATION, _TRANSPOSED = 274, (5, 6, 7, 8)
@@ -56,7 +56,7 @@ def _decode(data: bytes, path: Path) -> ByteImage:
     return np.asarray(picture, dtype=np.uint8)
 
 
-def look_at_image(path: Path) -> tuple[int, int, ContentHash]:
+def check_image(path: Path) -> tuple[int, int, ContentHash]:
     """Check that an image is complete; return its width and height after EXIF orientation [px] and its content hash.
 
     Raises:
@@ -81,8 +81,8 @@ def look_at_image(path: Path) -> tuple[int, int, ContentHash]:
         width, height = height, width
     if form in _DECODED_FORMATS and _decode(data, path).shape[:2] != (height, width):
         raise InputError(f"{path}: must be read by OpenCV as by others, {width} x {height} px: save it as PNG")
-    if min(width, height) < SMALLEST:
-        raise InputError(f"{path}: an image must have sides of {SMALLEST} px or more (got {width} x {height})")
+    if min(width, height) < MIN_SIDE:
+        raise InputError(f"{path}: an image must have sides of {MIN_SIDE} px or more (got {width} x {height})")
     return width, height, ContentHash(data)
 
 

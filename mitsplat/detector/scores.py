@@ -26,7 +26,7 @@ from mitsplat.errors import InputError
 IouType = Literal["bbox", "segm"]
 Detection = dict[str, Any]
 
-MOST_DETECTIONS = 300
+MAX_DETECTIONS = 300
 """Largest number of detections per image over all classes, by score. COCO's own summary uses 100 per class."""
 CONFIDENCE, IOU = 0.25, 0.5
 """Least score and least box IoU of a detection in the confusion matrix."""
@@ -77,7 +77,7 @@ class DetectionMatches:
                 labelled.loadRes([dict(detection) for detection in detections]) if detections else _no_detections(truth)
             )
             self._eval = COCOeval(labelled, found, iou_type)
-            self._eval.params.maxDets = [MOST_DETECTIONS]
+            self._eval.params.maxDets = [MAX_DETECTIONS]
             self._eval.params.areaRng, self._eval.params.areaRngLbl = [[0, 1e10]], ["all"]
             self._eval.evaluate()
         self._place = {image: i for i, image in enumerate(self._eval.params.imgIds)}

@@ -27,7 +27,7 @@ from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
 from mitsplat.arrays import Float64Array
-from mitsplat.detector.pictures import images_below, look_at_image
+from mitsplat.detector.pictures import check_image, images_below
 from mitsplat.errors import InputError
 from mitsplat.images.masks import decode_rle, encode_mask
 from mitsplat.labels.polygons import fill_polygon, outline
@@ -179,7 +179,7 @@ def read_set(path: str | Path, split: Split, progress: Progress | None = None) -
     return _coco(root, split, progress)
 
 
-def in_classes(found: LabelledSet, class_names: Sequence[str], owner: str) -> LabelledSet:
+def reorder_classes(found: LabelledSet, class_names: Sequence[str], owner: str) -> LabelledSet:
     """Return the set with its classes in the order of ``class_names``, the classes of ``owner``.
 
     Raises:
@@ -259,7 +259,7 @@ def _yolo(
         raise InputError(f"{root}: there is no label of its images, such as {_label_file(images[0])}")
 
     def read(image: Path) -> Sample:
-        width, height, content = look_at_image(image)
+        width, height, content = check_image(image)
         label = _label_file(image)
         if label.is_file():
             text = label.read_text(encoding="utf-8-sig", errors="replace")
@@ -361,7 +361,7 @@ def _clip_points(points: Float64Array, size: tuple[int, int], place: str) -> Flo
 
 def _coco(root: Path, split: Split, progress: Progress | None) -> LabelledSet:
     parts = [_coco_part(root, split, *file, progress) for file in _coco_files(root, split).items()]
-    parts = [in_classes(part, parts[0].class_names, str(root)) for part in parts]
+    parts = [reorder_classes(part, parts[0].class_names, str(root)) for part in parts]
     samples = tuple(sample for part in parts for sample in part.samples)
     twice = [name for name, count in Counter(sample.name for sample in samples).items() if count > 1]
     if twice:
@@ -393,7 +393,7 @@ def _coco_part(root: Path, split: Split, path: Path, content: dict[str, Any], pr
 
     def read(image: dict[str, Any]) -> Sample:
         file = find(str(image.get("file_name")))
-        width, height, shown = look_at_image(file)
+        width, height, shown = check_image(file)
         if (image.get("width"), image.get("height")) != (width, height):
             raise InputError(
                 f"{file}: must be as large as {path.name} says, {image.get('width')} x {image.get('height')} px, "

@@ -33,7 +33,7 @@ from mitsplat.detector.libraries import (
 )
 from mitsplat.detector.mix import plan_images
 from mitsplat.detector.photo_tiles import cut_photographs
-from mitsplat.detector.sets import STRIDE, LabelledSet, check_masks, in_classes, read_set
+from mitsplat.detector.sets import STRIDE, LabelledSet, check_masks, read_set, reorder_classes
 from mitsplat.errors import InputError
 from mitsplat.progress import Progress
 from mitsplat.runtime.cores import usable_cores
@@ -230,7 +230,7 @@ def read_sets(
     for one in found:
         if all(instance.crowd for sample in one.samples for instance in sample.instances):
             raise InputError(f"{one.root}: nothing but crowds is labelled, from which nothing can be learnt")
-    found = [in_classes(one, found[0].class_names, str(found[0].root)) for one in found]
+    found = [reorder_classes(one, found[0].class_names, str(found[0].root)) for one in found]
     if masks:
         for one in found:
             check_masks(one)

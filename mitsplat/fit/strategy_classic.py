@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from mitsplat.arrays import Float64Array
 from mitsplat.fit.optimizer import GaussianModel
-from mitsplat.fit.strategy_mcmc import DEAD
+from mitsplat.fit.strategy_mcmc import DEAD_OPACITY
 from mitsplat.geometry.camera import Camera
 from mitsplat.renderer.rays.device_arrays import wrapped
 
@@ -29,7 +29,7 @@ _RESET_EVERY = 0.1
 """Share of the fit between opacity resets."""
 _RESET_STEPS = 300
 """Least number of steps between opacity resets; Adam needs 100 steps to make a Gaussian half opaque again."""
-_RESET_OPACITY = 2 * DEAD
+_RESET_OPACITY = 2 * DEAD_OPACITY
 _GRADIENT_MIN = 2e-4
 """Mean image-space gradient above which a Gaussian is cloned or split; the image is 2 wide and 2 high."""
 _MAX_CLONE_SCALE = 0.01
@@ -147,7 +147,7 @@ def control_density(
     """
     scales = np.exp(np.array(dr.detach(model.values["scales"]), dtype=np.float64)).reshape(-1, 3)
     size = scales.max(axis=1)
-    transparent = np.array(dr.detach(model.activated()[3])) < DEAD
+    transparent = np.array(dr.detach(model.activated()[3])) < DEAD_OPACITY
     if remove_large:
         transparent |= size > _MAX_SCALE
     if transparent.all():

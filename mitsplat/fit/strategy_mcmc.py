@@ -28,7 +28,7 @@ from mitsplat.renderer.rays.device_arrays import number, on_device, wrapped
 from mitsplat.renderer.splatting.gaussian import rotation_axes
 from mitsplat.runtime.recorded_kernels import recorded
 
-DEAD = 0.005
+DEAD_OPACITY = 0.005
 """Opacity below which a Gaussian counts as dead and is relocated."""
 
 _ACTIVE_RANGE = (0.02, 0.8)
@@ -141,7 +141,7 @@ def seed_splats(
 def relocate(model: GaussianModel, rng: np.random.Generator) -> int:
     """Move dead Gaussians to positions of opaque ones, and return their number."""
     opacities = np.array(dr.detach(model.activated()[3]), dtype=np.float64)
-    dead = opacities <= DEAD
+    dead = opacities <= DEAD_OPACITY
     if not dead.any() or dead.all():
         return 0
     rows = np.arange(len(opacities))
@@ -184,7 +184,7 @@ def _jittered(means: Any, scales: Any, quats: Any, opacities: Any, size: Any, se
     x, y = mi.warp.square_to_std_normal(mi.Point2f(*uniform[:2]))
     z, _ = mi.warp.square_to_std_normal(mi.Point2f(*uniform[2:]))
     noise = mi.Vector3f(x, y, z)
-    faint = dr.rcp(1 + dr.exp(-100 * (DEAD - dr.rcp(1 + dr.exp(-opacities)))))
+    faint = dr.rcp(1 + dr.exp(-100 * (DEAD_OPACITY - dr.rcp(1 + dr.exp(-opacities)))))
     gain = number(size, 0) * faint
     moved = dr.gather(mi.Vector3f, means, i)
     for axis, s in zip(axes, sigma, strict=True):
@@ -202,10 +202,10 @@ def _replace_rows(model: GaussianModel, rows: npt.NDArray[np.intp], opacities: F
     """Replace the Gaussians by the selected rows; copies of one row share its opacity and size."""
     copies = np.bincount(rows, minlength=len(opacities))
     several = copies > 1
-    opacity, factor = shared(opacities[several], copies[several])
+    opacity, factor = split_opacity(opacities[several], copies[several])
     log_factor, logit = np.zeros(len(opacities)), np.zeros(len(opacities))
     log_factor[several] = np.log(factor)
-    opacity = np.clip(opacity, DEAD, 1 - 1e-6)
+    opacity = np.clip(opacity, DEAD_OPACITY, 1 - 1e-6)
     logit[several] = np.log(opacity / (1 - opacity))
     changed = several[rows]
     model.take(rows.astype(np.uint32), model.widths, changed)
@@ -217,7 +217,7 @@ def _replace_rows(model: GaussianModel, rows: npt.NDArray[np.intp], opacities: F
     dr.eval(model.values)
 
 
-def shared(opacities: Float64Array, copies: npt.NDArray[np.intp]) -> tuple[Float64Array, Float64Array]:
+def split_opacity(opacities: Float64Array, copies: npt.NDArray[np.intp]) -> tuple[Float64Array, Float64Array]:
     """Return the opacity of each of n coincident Gaussians that replace one, and the factor on its scales (eq. 9)."""
     copies = np.minimum(copies, _COPIES_MAX)
     opacity = 1 - (1 - opacities) ** (1 / copies)

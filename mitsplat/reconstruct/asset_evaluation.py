@@ -241,7 +241,7 @@ def sized_photo(photo: Photo, size: int) -> tuple[Camera, Float32Array, Float32A
     return photo.camera.resized(rgb.shape[1], rgb.shape[0]), rgb, mask, hidden
 
 
-def judge(
+def compute_verdict(
     capture: Capture,
     splats: Splats,
     mesh: trimesh.Trimesh | None,

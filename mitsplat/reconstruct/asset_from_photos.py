@@ -124,10 +124,10 @@ def reconstruct_job(
         capture, splats, name=job.name, class_name=job.class_name, kind=job.kind, settings=job.settings,
         imported=job.imported, psnr=psnr, progress=progress,
     )  # fmt: skip
-    return made if light is None else delighted(made, light, capture.table, progress)
+    return made if light is None else delight_asset(made, light, capture.table, progress)
 
 
-def delighted(made: Reconstruction, light: LightFile, table: bool, progress: Progress | None) -> Reconstruction:
+def delight_asset(made: Reconstruction, light: LightFile, table: bool, progress: Progress | None) -> Reconstruction:
     """Remove the effect of light from the colours of an asset, and add the result to the verdict."""
     if progress is not None:
         progress(0, 1, "freeing colours of light")

@@ -50,7 +50,7 @@ _NEIGHBOURS, _NORMAL_POWER = 12, 16
 """
 _EVEN_DEVIATION = 0.03
 """Standard deviation of the logarithm of irradiance below which light counts as even."""
-FOLLOWS = 0.5
+MIN_SLOPE = 0.5
 """Least log-log slope of colours over irradiance, and least relative brightness of each lamp, for the division."""
 _MAX_GAIN = 4.0
 """Largest factor by which colours are changed."""
@@ -154,12 +154,12 @@ def delight(splats: Splats, mesh: trimesh.Trimesh, light: LightFile, *, table: b
 
     if uneven < _EVEN_DEVIATION:
         return done(f"its irradiance differs by {uneven:.1%}: colours are left as they are")
-    if min(slope, *borne_out) < FOLLOWS:
+    if min(slope, *borne_out) < MIN_SLOPE:
         lamps = "".join(f", lamp {number} {value:.2f}" for number, value in enumerate(borne_out, start=1))
         return done(
             f"its irradiance differs by {uneven:.0%}, but colours do not follow it (slope {slope:.2f}{lamps}; "
-            f"{FOLLOWS:g} or more is wanted) and are left as they are: was it measured where the object stood, in the "
-            "capture's frame?"
+            f"at least {MIN_SLOPE:g} is required) and are left as they are: were the lights measured at the position of "
+            "the object, in the capture's frame?"
         )
     mean = np.average(total_irradiance[own], axis=0, weights=area[own])
     gain = np.where(lit[:, None], mean / np.maximum(total_irradiance, 1e-12), 1.0)

@@ -24,9 +24,9 @@ from mitsplat.reconstruct.registration import measure_offset, surface_points
 from mitsplat.reconstruct.segment_splats import MaskedView
 from mitsplat.reconstruct.surface import SurfaceSettings, reconstruct_surface
 
-LEAST_OVERLAP = 0.85
+MIN_MASK_IOU = 0.85
 """Least mean IoU of a surface's silhouettes with the masks."""
-MOST_SPREAD = 0.02
+MAX_SPREAD = 0.02
 """Largest median distance between a surface and that of the splats, as a share of its diagonal."""
 _MIN_THICKNESS = 1e-4
 """Least extent of a volume, as a share of its longest extent."""
@@ -39,7 +39,7 @@ CONVEX = "convex hull of the splats"
 
 
 @dataclass(frozen=True, eq=False)
-class SoundSurface:
+class ProxySurface:
     """A closed mesh and its source.
 
     Attributes:
@@ -53,14 +53,14 @@ class SoundSurface:
     faults: tuple[str, ...]
 
 
-def find_sound_surface(
+def find_proxy_surface(
     splats: Splats,
     views: Sequence[MaskedView],
     settings: SurfaceSettings,
     *,
     floor: float | None = None,
     progress: Progress | None = None,
-) -> SoundSurface:
+) -> ProxySurface:
     """Return the finest surface that agrees with masks and splats, or else the one with the largest IoU with the masks.
 
     Args:
@@ -96,11 +96,11 @@ def find_sound_surface(
             continue
         overlap, fault = _check_surface(mesh, splats, seen)
         if fault is None:
-            return SoundSurface(mesh, source, tuple(faults))
+            return ProxySurface(mesh, source, tuple(faults))
         faults.append(f"the {source} {fault}")
         found.append((overlap, source, mesh))
     _, source, mesh = max(found, key=lambda one: one[0])
-    return SoundSurface(mesh, source, tuple(faults))
+    return ProxySurface(mesh, source, tuple(faults))
 
 
 def _check_surface(mesh: trimesh.Trimesh, splats: Splats, views: Sequence[MaskedView]) -> tuple[float, str | None]:
@@ -111,10 +111,10 @@ def _check_surface(mesh: trimesh.Trimesh, splats: Splats, views: Sequence[Masked
     overlap = float(
         np.mean([iou(one.mesh & view.known, view.mask >= 0.5) for one, view in zip(shown, views, strict=True)])
     )
-    if overlap < LEAST_OVERLAP:
+    if overlap < MIN_MASK_IOU:
         return overlap, f"meets the masks with an IoU of only {overlap:.2f}"
     spread = measure_offset(mesh, surface_points(splats, [view.camera for view in views])).spread
-    if spread > MOST_SPREAD:
+    if spread > MAX_SPREAD:
         return overlap, f"is {spread:.1%} of the diagonal from the splats"
     return overlap, None
 

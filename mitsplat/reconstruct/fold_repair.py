@@ -19,7 +19,7 @@ _MAX_ROUNDS = 12
 """Largest number of times that the motion of invalid vertices is halved."""
 
 
-def mend_motion(mesh: trimesh.Trimesh, vertices: Float64Array) -> Float64Array | None:
+def limit_motion(mesh: trimesh.Trimesh, vertices: Float64Array) -> Float64Array | None:
     """Return moved vertices whose motion is reduced where faces fold or vanish, or edges newly pass through faces.
 
     Args:

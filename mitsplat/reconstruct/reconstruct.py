@@ -17,9 +17,9 @@ from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.camera import Camera
 from mitsplat.geometry.decomposition import convex_pieces
 from mitsplat.progress import Progress
-from mitsplat.reconstruct.asset_evaluation import HeldOutView, Verdict, judge, show_held_out, sized_photo
+from mitsplat.reconstruct.asset_evaluation import HeldOutView, Verdict, compute_verdict, show_held_out, sized_photo
 from mitsplat.reconstruct.causes import find_causes
-from mitsplat.reconstruct.fallback_proxy import find_sound_surface
+from mitsplat.reconstruct.fallback_proxy import find_proxy_surface
 from mitsplat.reconstruct.registration import Alignment, register_mesh, surface_points
 from mitsplat.reconstruct.segment_splats import Isolation, MaskedView, isolate_object
 from mitsplat.reconstruct.silhouette_refinement import MeshRefineSettings, RefinedMesh, refine_mesh
@@ -145,7 +145,7 @@ def reconstruct_asset(
     if imported is None:
         floor = 0.0 if kind == "object" and capture.table and _may_stand_on_table(splats) else None
         if kind == "object":
-            proxy = find_sound_surface(splats, views, settings.surface, floor=floor, progress=progress)
+            proxy = find_proxy_surface(splats, views, settings.surface, floor=floor, progress=progress)
             mesh = proxy.mesh
         else:
             mesh = reconstruct_surface(splats, cameras, settings=settings.surface, progress=progress)
@@ -162,7 +162,7 @@ def reconstruct_asset(
     if kind == "object":
         seen = [sized_photo(photo, settings.view_size)[:3] for photo in capture.photos]
         causes = find_causes(capture, seen)
-    verdict = judge(
+    verdict = compute_verdict(
         capture, splats, mesh, held_out, isolation=isolation, psnr=psnr, refinement=refinement, causes=causes
     )
     if proxy is not None:

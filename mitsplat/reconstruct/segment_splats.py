@@ -34,11 +34,11 @@ from mitsplat.renderer.differentiation.backward import pack_cloud, render_differ
 from mitsplat.renderer.layers import ensure_variant, make_sensor, render_splats
 from mitsplat.renderer.rays.sensors import view_of
 
-INSIDE = 0.5
+MIN_INSIDE_SHARE = 0.5
 """Least share of a Gaussian's visible weight inside the masks."""
-SEEN = 0.05
+MIN_VISIBLE_WEIGHT = 0.05
 """Visible weight over all views [px] below which a Gaussian counts as unseen."""
-NEEDLE = 8.0
+NEEDLE_RATIO = 8.0
 """Least ratio of the longest to the second longest standard deviation of a needle."""
 NEEDLE_LENGTH = 0.1
 """Least length of a visible needle, as a share of the asset's size."""
@@ -46,9 +46,9 @@ NEEDLE_TIP = 2.0
 """Distance of a needle's tips from its centre [standard deviations]; tips must not stick out of the masks."""
 TIP_MARGIN = 1.5
 """Largest distance of a tip from a mask [px]."""
-TOUCH = 2.5
+TOUCH_SIGMAS = 2.5
 """Largest distance of touching Gaussians, in standard deviations of the larger one."""
-SMALLEST_PART = 0.02
+MIN_PART_SHARE = 0.02
 """Share of the object's visible weight below which an isolated part is a floater."""
 
 _QUALITY = Quality(alpha_min=2e-3, transmittance_min=1e-3, sh_degree=0)
@@ -138,8 +138,8 @@ def isolate_object(
         if progress is not None:
             progress(done, len(views), "isolating the object")
     total = weights.sum(axis=1)
-    seen = total > SEEN
-    inside = seen & (weights[:, 0] >= INSIDE * total)
+    seen = total > MIN_VISIBLE_WEIGHT
+    inside = seen & (weights[:, 0] >= MIN_INSIDE_SHARE * total)
     needles = inside & _needles(splats, views)
     body = np.flatnonzero(inside & ~needles)
     floating = body[find_floaters(splats.select(body), weights[body, 0])]
@@ -189,7 +189,7 @@ class VisibleWeights:
 def _needles(splats: Splats, views: Sequence[MaskedView]) -> BoolArray:
     """Return True for elongated Gaussians with a tip outside the mask in more than one view."""
     ordered = np.sort(splats.scales.astype(np.float64), axis=1)
-    needle = np.flatnonzero(ordered[:, 2] > NEEDLE * ordered[:, 1])
+    needle = np.flatnonzero(ordered[:, 2] > NEEDLE_RATIO * ordered[:, 1])
     result = np.zeros(len(splats), dtype=bool)
     if not len(needle):
         return result
@@ -208,7 +208,7 @@ def _needles(splats: Splats, views: Sequence[MaskedView]) -> BoolArray:
 def long_needles(splats: Splats, size: float) -> BoolArray:
     """Return True for elongated Gaussians (N,) that are long relative to the ``size`` of their asset [m]."""
     ordered = np.sort(splats.scales, axis=1)
-    return np.asarray((ordered[:, 2] > NEEDLE * ordered[:, 1]) & (ordered[:, 2] > NEEDLE_LENGTH * size))
+    return np.asarray((ordered[:, 2] > NEEDLE_RATIO * ordered[:, 1]) & (ordered[:, 2] > NEEDLE_LENGTH * size))
 
 
 def visible_area(splats: Splats) -> Float64Array:
@@ -248,12 +248,12 @@ def find_floaters(splats: Splats, weight: Float64Array) -> Int64Array:
     graph = coo_array((count, count)).tocsr()
     while True:
         distance, other = tree.query(splats.means[floating], k=min(neighbours + 1, count))
-        touching = distance <= TOUCH * np.maximum(sigma[floating, None], sigma[other])
+        touching = distance <= TOUCH_SIGMAS * np.maximum(sigma[floating, None], sigma[other])
         row = np.broadcast_to(floating[:, None], other.shape)[touching]
         graph = graph + coo_array((np.ones(len(row)), (row, other[touching])), shape=(count, count)).tocsr()
         _, group = connected_components(graph, directed=False)
         share = np.bincount(group, weights=weight) / max(float(weight.sum()), 1e-30)
-        floating = np.flatnonzero(share[group] < SMALLEST_PART)
+        floating = np.flatnonzero(share[group] < MIN_PART_SHARE)
         if not len(floating) or neighbours >= min(_MOST_NEIGHBOURS, count):
             return floating
         neighbours *= 4

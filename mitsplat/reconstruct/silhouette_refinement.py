@@ -31,7 +31,7 @@ from mitsplat.arrays import Float64Array
 from mitsplat.errors import InputError
 from mitsplat.geometry.camera import Camera
 from mitsplat.progress import Progress
-from mitsplat.reconstruct.fold_repair import mend_motion
+from mitsplat.reconstruct.fold_repair import limit_motion
 from mitsplat.reconstruct.segment_splats import MaskedView
 from mitsplat.renderer.layers import ensure_variant
 from mitsplat.renderer.rays.device_arrays import plain_mesh, ray_scene, wrapped
@@ -173,7 +173,7 @@ def refine_mesh(
         dr.backward(scene.loss(moved(), [shown[index] for index in chosen], rng))
         descent.step()
         if (step + 1) % max(1, settings.steps // _VALIDATIONS) == 0 or step + 1 == settings.steps:
-            found = mend_motion(start, np.array(dr.detach(moved()), dtype=np.float64).reshape(-1, 3))
+            found = limit_motion(start, np.array(dr.detach(moved()), dtype=np.float64).reshape(-1, 3))
             if found is not None and (errors := scene.errors(found, held)).mean() < after.mean():
                 refined, after = found, errors
         if progress is not None:

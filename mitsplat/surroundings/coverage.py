@@ -17,11 +17,11 @@ from mitsplat.surroundings.supports import Support
 
 CELLS = 80
 """Number of cells along the longer side."""
-ENOUGH = 3
+MIN_PHOTOS = 3
 """Least number of photos that must show a cell."""
-OFF = 0.012
+SUPPORT_TOLERANCE = 0.012
 """Largest height above the support that still counts as the support, as a share of the typical depth."""
-TALL = 0.6
+MAX_THING_HEIGHT = 0.6
 """Largest height of things that stand on a support, as a share of the typical depth."""
 _MIN_HOLE_AREA = 0.005
 """Least area of a hole in the report, as a share of the support's area."""
@@ -66,13 +66,13 @@ class Coverage:
 
     @property
     def hidden(self) -> BoolArray:
-        """True for uncovered cells that fewer than :data:`ENOUGH` photos show, (X, Y)."""
-        return (self.photos < ENOUGH) & ~self.covered
+        """True for uncovered cells that fewer than :data:`MIN_PHOTOS` photos show, (X, Y)."""
+        return (self.photos < MIN_PHOTOS) & ~self.covered
 
     @property
     def free(self) -> BoolArray:
         """True for visible cells that are neither covered, nor next to covered cells, nor at the edge, (X, Y)."""
-        good = (self.photos >= ENOUGH) & ~binary_dilation(self.covered, np.ones((3, 3)))
+        good = (self.photos >= MIN_PHOTOS) & ~binary_dilation(self.covered, np.ones((3, 3)))
         return np.asarray(binary_erosion(good))
 
     def middle(self, cells: npt.ArrayLike) -> Float64Array:
@@ -111,9 +111,9 @@ def find_coverage(support: Support, views: Sequence[DepthView], points: SurfaceP
         height = float((view.camera.centre - support.pose[:3, 3]) @ support.pose[:3, 2])
         # Height above the support of the surface point that the ray to a cell hits.
         above = height * (1 - surface / depth)
-        photos += (np.abs(above) < OFF * scale).reshape(shape)
+        photos += (np.abs(above) < SUPPORT_TOLERANCE * scale).reshape(shape)
     local = support.local(points.places)
-    standing = (local[:, 2] > OFF * scale) & (local[:, 2] < TALL * scale)
+    standing = (local[:, 2] > SUPPORT_TOLERANCE * scale) & (local[:, 2] < MAX_THING_HEIGHT * scale)
     covered = empty.holding(local[standing, :2])
     return Coverage(
         cell, photos, np.asarray(binary_closing(np.pad(covered, 3), np.ones((3, 3)), iterations=2)[3:-3, 3:-3])

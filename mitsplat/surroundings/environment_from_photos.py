@@ -32,14 +32,23 @@ from mitsplat.reconstruct.asset_from_photos import AssetJob, AssetResult, make_a
 from mitsplat.reconstruct.reconstruct import ImportedMesh, Reconstruction, reconstruct_asset
 from mitsplat.reconstruct.surface import reconstruct_surface
 from mitsplat.storage.files import write_text
-from mitsplat.surroundings.coverage import ENOUGH, OFF, TALL, Coverage, Hole, find_coverage, find_holes, free_rectangle
+from mitsplat.surroundings.coverage import (
+    MAX_THING_HEIGHT,
+    MIN_PHOTOS,
+    SUPPORT_TOLERANCE,
+    Coverage,
+    Hole,
+    find_coverage,
+    find_holes,
+    free_rectangle,
+)
 from mitsplat.surroundings.depth_views import SurfacePoints, depth_views, surface_points
 from mitsplat.surroundings.floaters import mean_psnr, remove_floaters
 from mitsplat.surroundings.ground import Ground
 from mitsplat.surroundings.ready_scene import Region, scene_text
 from mitsplat.surroundings.removal import RemovedThing, remove_things
 from mitsplat.surroundings.shading import ShadingLight, light_of_shading
-from mitsplat.surroundings.supports import Support, find_supports, flattened
+from mitsplat.surroundings.supports import Support, find_supports, flatten_mesh
 
 _FOREGROUND_DISTANCE = 3.0
 """Distance from the focus of the cameras beyond which Gaussians are background, in camera distances.
@@ -215,7 +224,7 @@ def _estimate_light(
     """Estimate the light from the shadows on a support, relative to its centre [m]; ``factor`` is metres per unit."""
     ground = Ground.of(support, splats, capture, scale)
     places = points.transformed(np.asarray(np.linalg.inv(support.pose))).places
-    heights = ground.grid.heights(places[places[:, 2] < TALL * scale], OFF * scale)
+    heights = ground.grid.heights(places[places[:, 2] < MAX_THING_HEIGHT * scale], SUPPORT_TOLERANCE * scale)
     linear, bare = decode_srgb(np.clip(ground.texture, 0, 1)), np.asarray(binary_erosion(ground.seen))
     block = -(-max(heights.shape) // _LIGHT_CELLS)
 
@@ -266,7 +275,7 @@ def _mesh(
 ) -> trimesh.Trimesh:
     cameras = [sized_photo(photo, job.settings.view_size)[0] for photo in photos]
     mesh = reconstruct_surface(splats, cameras, settings=job.settings.surface, progress=progress)
-    return flattened(mesh, supports, _FLATTEN_RANGE * scale)
+    return flatten_mesh(mesh, supports, _FLATTEN_RANGE * scale)
 
 
 def _region(coverage: Coverage, support: Support, factor: float) -> Region | None:
@@ -301,7 +310,7 @@ def _rows(
             f"{region[1] - region[0]:.3g} x {region[3] - region[2]:.3g} {unit}, x {region[0]:.3g} to {region[1]:.3g}, "
             f"y {region[2]:.3g} to {region[3]:.3g}"
         )
-    rows["Hardly seen"] = f"{coverage.hidden.mean():.1%} of the support is in fewer than {ENOUGH} photos"
+    rows["Hardly seen"] = f"{coverage.hidden.mean():.1%} of the support is in fewer than {MIN_PHOTOS} photos"
     if holes:
         rows["Holes"] = "; ".join(_hole_text(hole, factor, unit) for hole in holes)
     return rows
@@ -345,7 +354,7 @@ def _findings(
     if coverage.hidden.mean() > _MAX_HIDDEN_SHARE:
         places = "; ".join(_hole_text(hole, factor, unit) for hole in holes) or "it is in many small parts: add photos"
         found.append(
-            f"{coverage.hidden.mean():.0%} of the support is in fewer than {ENOUGH} photos "
+            f"{coverage.hidden.mean():.0%} of the support is in fewer than {MIN_PHOTOS} photos "
             f"(at most {_MAX_HIDDEN_SHARE:.0%} is wanted): {places}"
         )
     if region is None or (metric and min(region[1] - region[0], region[3] - region[2]) < _MIN_REGION):
@@ -367,7 +376,7 @@ def _support_map(coverage: Coverage, filled: BoolArray) -> str:
     invented = ", yellow was hidden by things that were removed and is invented" if filled.any() else ""
     note = (
         "The surface that things stand on, from above, x to the right and y up: green is free, dark is covered, red is "
-        f"in fewer than {ENOUGH} photos{invented}."
+        f"in fewer than {MIN_PHOTOS} photos{invented}."
     )
     return (
         f'<section aria-labelledby="support"><h2 id="support">Support</h2><p>{html.escape(note)}</p><figure>'

@@ -15,7 +15,7 @@ from mitsplat.gaussians.spherical_harmonics import SH_C0
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.camera import Camera
 from mitsplat.images.colour import encode_srgb
-from mitsplat.surroundings.coverage import ENOUGH, OFF
+from mitsplat.surroundings.coverage import MIN_PHOTOS, SUPPORT_TOLERANCE
 from mitsplat.surroundings.depth_views import DepthView, render_sized
 from mitsplat.surroundings.supports import Support
 
@@ -54,7 +54,9 @@ class Ground:
         """Compute the texture of a support from the training photos; ``scale`` is their typical depth."""
         inverse, grid = np.linalg.inv(support.pose), Grid.of(support, CELL * scale)
         cameras = [photo.camera.transformed(inverse) for photo in capture.training]
-        return cls(support, grid, *grid.look(splats.transformed(inverse), cameras, _BARE_HEIGHT * OFF * scale))
+        return cls(
+            support, grid, *grid.look(splats.transformed(inverse), cameras, _BARE_HEIGHT * SUPPORT_TOLERANCE * scale)
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,7 +149,7 @@ class Grid:
             colours += weight[..., None] * np.asarray(cv2.remap(shown, x, y, cv2.INTER_LINEAR, borderMode=_BORDER))
             weights += weight
             count += bare.reshape(shape)
-        return colours / weights[..., None], np.asarray(count >= ENOUGH)
+        return colours / weights[..., None], np.asarray(count >= MIN_PHOTOS)
 
     def sheet(self, texture: Float64Array, cells: BoolArray) -> Splats:
         """Return flat Gaussians with a texture's display-encoded colours (X, Y, 3) in the given cells."""

@@ -20,11 +20,11 @@ from mitsplat.capture.capture import Capture
 from mitsplat.errors import InputError
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.progress import Progress
-from mitsplat.surroundings.coverage import OFF, TALL
+from mitsplat.surroundings.coverage import MAX_THING_HEIGHT, SUPPORT_TOLERANCE
 from mitsplat.surroundings.depth_views import SurfacePoints, depth_views
 from mitsplat.surroundings.ground import CELL, Grid, Ground
 from mitsplat.surroundings.supports import Support, find_walls
-from mitsplat.surroundings.texture_fill import dilated, fill
+from mitsplat.surroundings.texture_fill import dilated, fill_texture
 
 _VOXEL = 0.02
 """Edge of the voxels that separate things, as a share of the typical depth."""
@@ -43,9 +43,9 @@ _OTHER_DISTANCE = 0.5
 _OWNER_MARGIN = 4
 """Margin around a thing in which the nearest point decides on the owner of a Gaussian [voxels]."""
 _BLEED_WIDTH = 2
-"""Width of the border around the hidden area whose colours the thing contaminates, in units of :data:`OFF`."""
+"""Width of the border around the hidden area whose colours the thing affects, in units of ``SUPPORT_TOLERANCE``."""
 _FEET_RANGE = 0.4
-"""Half the height range of a thing's feet around half of :data:`OFF`, as a share of :data:`OFF`."""
+"""Half the height range of a thing's feet around half of :data:`SUPPORT_TOLERANCE`, as a share of it."""
 _STRAY_SHARE = 0.02
 """Share of a thing's points that are ignored for its distance from a wall."""
 
@@ -147,7 +147,9 @@ def _remove_thing(
     support, grid = ground.support, ground.grid
     inverse = np.asarray(np.linalg.inv(support.pose))
     # Points on walls are excluded, so that a thing that touches a wall ends there.
-    loose = ~np.any([np.zeros(len(places), dtype=bool), *(w.holds(places, OFF * scale) for w in walls)], axis=0)
+    loose = ~np.any(
+        [np.zeros(len(places), dtype=bool), *(w.holds(places, SUPPORT_TOLERANCE * scale) for w in walls)], axis=0
+    )
     thing, others = _separate_thing(support.local(places), loose, spot, support, scale)
     if thing is None:
         raise InputError(f"{pick}: the photos do not show enough of what is there to tell it from the rest")
@@ -170,7 +172,7 @@ def _remove_thing(
     feet = (
         (cells >= 0).all(axis=1)
         & footprint[tuple(cells.T)]
-        & (np.abs(others[:, 2] / (OFF * scale) - 0.5) < _FEET_RANGE)
+        & (np.abs(others[:, 2] / (SUPPORT_TOLERANCE * scale) - 0.5) < _FEET_RANGE)
     )
     parts = np.concatenate([thing, others[feet]]), others[~feet]
     own, rest = (part @ support.pose[:3, :3].T + support.pose[:3, 3] for part in parts)
@@ -184,9 +186,11 @@ def _is_close_to_wall(thing: Float64Array, wall: Support, scale: float) -> bool:
     """
     local = wall.local(thing)
     before = (np.abs(local[:, :2]) <= np.array(wall.size) / 2).all(axis=1)
-    if not before.any() or np.median(local[:, 2]) < OFF * scale:
+    if not before.any() or np.median(local[:, 2]) < SUPPORT_TOLERANCE * scale:
         return False
-    return bool(-OFF * scale < np.quantile(local[:, 2], _STRAY_SHARE) < np.ptp(local[:, :2], axis=0).max())
+    return bool(
+        -SUPPORT_TOLERANCE * scale < np.quantile(local[:, 2], _STRAY_SHARE) < np.ptp(local[:, :2], axis=0).max()
+    )
 
 
 def _fill_behind(
@@ -210,8 +214,8 @@ def _hidden_cells(
 
     Points are in the surface's frame, shape (N, 3).
     """
-    height, top, margin = others[:, 2], float(thing[:, 2].max()), round(OFF / CELL)
-    standing = ground.grid.covered(others[(height > OFF * scale) & (height < top)])
+    height, top, margin = others[:, 2], float(thing[:, 2].max()), round(SUPPORT_TOLERANCE / CELL)
+    standing = ground.grid.covered(others[(height > SUPPORT_TOLERANCE * scale) & (height < top)])
     footprint = dilated(ground.grid.outline(thing), margin) & ~standing  # surface points lie away from edges
     parts, _ = label(~ground.seen & ~standing)
     hidden = np.isin(parts, np.setdiff1d(parts[footprint], [0]))
@@ -221,8 +225,8 @@ def _hidden_cells(
 
 def _fill_hole(ground: Ground, standing: BoolArray, hole: BoolArray) -> tuple[Splats, float]:
     """Return a sheet for a hole of a surface, and the share of it that is copied; the hole then counts as seen."""
-    margin = round(OFF / CELL)
-    ground.texture, copied = fill(ground.texture, ground.seen & ~hole & ~dilated(standing, margin), hole)
+    margin = round(SUPPORT_TOLERANCE / CELL)
+    ground.texture, copied = fill_texture(ground.texture, ground.seen & ~hole & ~dilated(standing, margin), hole)
     ground.seen = ground.seen | hole
     # The sheet also covers the border of the hole, where Gaussians of the thing extended.
     sheet = ground.grid.sheet(ground.texture, ground.seen & dilated(hole, margin))
@@ -243,7 +247,7 @@ def _find_pick(
     found, lowest = -1, np.inf
     for number, support in enumerate(supports):
         local = support.local(spot)
-        above = OFF * scale < local[2] < min(lowest, TALL * scale)
+        above = SUPPORT_TOLERANCE * scale < local[2] < min(lowest, MAX_THING_HEIGHT * scale)
         if above and (np.abs(local[:2]) <= np.array(support.size) / 2).all():
             found, lowest = number, float(local[2])
     if found < 0:
@@ -261,7 +265,7 @@ def _separate_thing(
     Only ``loose`` points (N,) can belong to a thing. An overhang of a few voxels beyond the support is included.
     """
     over = (np.abs(points[:, :2]) <= np.array(support.size) / 2).all(axis=1)
-    high = loose & (points[:, 2] > OFF * scale) & (points[:, 2] < TALL * scale)
+    high = loose & (points[:, 2] > SUPPORT_TOLERANCE * scale) & (points[:, 2] < MAX_THING_HEIGHT * scale)
     standing = np.flatnonzero(over & high)
     if not len(standing):
         return None, points
@@ -299,16 +303,16 @@ def _thing_gaussians(
     reach, means = _VOXEL * scale, splats.means.astype(np.float64)
     beside = _OWNER_MARGIN * reach
     low, high = thing.min(axis=0) - beside, thing.max(axis=0) + beside
-    low[2] = -TALL * scale
+    low[2] = -MAX_THING_HEIGHT * scale
     rows = np.flatnonzero(((means > low) & (means < high)).all(axis=1))
     around = others[((others > low - beside) & (others < high + beside)).all(axis=1)]
     surface, around = _subsample(thing, 0.25 * reach), _subsample(around, 0.25 * reach)
     both = np.concatenate([surface, around])
     away, nearest = KDTree(both).query(means[rows])
-    own, bare = nearest < len(surface), both[nearest, 2] < OFF * scale
+    own, bare = nearest < len(surface), both[nearest, 2] < SUPPORT_TOLERANCE * scale
     cells = grid.cells(means[rows, :2])
     height = means[rows, 2]
-    floor, top = OFF * scale, float(thing[:, 2].max()) + 0.5 * reach
+    floor, top = SUPPORT_TOLERANCE * scale, float(thing[:, 2].max()) + 0.5 * reach
     inside = np.asarray((cells >= 0).all(axis=1))
     cells = np.where(inside[:, None], cells, 0)
     over = inside & footprint[tuple(cells.T)]
@@ -326,11 +330,11 @@ def _hole_gaussians(splats: Splats, grid: Grid, hole: BoolArray, scale: float) -
     The splats are in the surface's frame.
     """
     floor, height, cells = (
-        OFF * scale,
+        SUPPORT_TOLERANCE * scale,
         splats.means[:, 2].astype(np.float64),
         grid.cells(splats.means[:, :2].astype(np.float64)),
     )
-    near = (cells >= 0).all(axis=1) & (height <= floor) & (height > -TALL * scale)
+    near = (cells >= 0).all(axis=1) & (height <= floor) & (height > -MAX_THING_HEIGHT * scale)
     rows = np.flatnonzero(near)
     rows = rows[hole[tuple(cells[rows].T)]]
     axes = Rotation.from_quat(splats.quats[rows]).as_matrix()[:, 2]

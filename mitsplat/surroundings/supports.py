@@ -255,7 +255,7 @@ def _rectangle(middles: Float64Array, cell: float) -> Float64Array:
     return corners
 
 
-def flattened(mesh: trimesh.Trimesh, supports: Sequence[Support], margin: float) -> trimesh.Trimesh:
+def flatten_mesh(mesh: trimesh.Trimesh, supports: Sequence[Support], margin: float) -> trimesh.Trimesh:
     """Move vertices within ``margin`` of supports onto them, because the depth of splats is noisy."""
     vertices = np.array(mesh.vertices, dtype=np.float64)
     for support in supports:

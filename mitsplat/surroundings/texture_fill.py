@@ -26,7 +26,7 @@ _PATCHES = 8
 Value = TypeVar("Value", bound=np.generic)
 
 
-def fill(texture: Float64Array, known: BoolArray, hole: BoolArray) -> tuple[Float64Array, float]:
+def fill_texture(texture: Float64Array, known: BoolArray, hole: BoolArray) -> tuple[Float64Array, float]:
     """Fill the hole of a texture (X, Y, 3) with shifted known parts; return the texture and the filled share.
 
     The remaining part of the hole is a smooth interpolation from the border.

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mitsplat.detector.detector_evaluation import Evaluation, evaluate_detector, truth_of, write_evaluation
+from mitsplat.detector.detector_evaluation import Evaluation, coco_truth, evaluate_detector, write_evaluation
 from mitsplat.detector.detector_report import worst_images
 from mitsplat.detector.scores import Confusion, average_precision
 from mitsplat.detector.sets import LabelledSet, read_set
@@ -22,7 +22,7 @@ from tests.detector.painted import write_coco, write_yolo
 def guesses(found: LabelledSet, seed: int = 0) -> list[dict[str, Any]]:
     """Detections that are the labels, some of them shifted, of another class, of low score, or left out."""
     rng, detections = np.random.default_rng(seed), []
-    for annotation in truth_of(found, masks=True)["annotations"]:
+    for annotation in coco_truth(found, masks=True)["annotations"]:
         x, y, w, h = annotation["bbox"]
         kind = annotation["category_id"]
         if rng.random() < 0.15:
@@ -109,7 +109,7 @@ def test_boxes_alone_are_judged_as_such(tmp_path: Path) -> None:
     found = read_set(write_yolo(tmp_path / "cell", {"val": 3}, boxes=True), "val")
     detections = [
         {key: annotation[key] for key in ("image_id", "category_id", "bbox")} | {"score": 0.9}
-        for annotation in truth_of(found, masks=False)["annotations"]
+        for annotation in coco_truth(found, masks=False)["annotations"]
     ]
     evaluation = write_evaluation(found, detections, tmp_path / "out", masks=False, about={})
     assert evaluation.results["box"]["map50_95"] == 1.0 and "mask" not in evaluation.results

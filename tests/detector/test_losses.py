@@ -7,8 +7,8 @@ from typing import Any
 import pytest
 
 from mitsplat.detector import average_precision
-from mitsplat.detector.losses import KINDS
-from mitsplat.detector.losses import gains as gains_over
+from mitsplat.detector.losses import ERROR_KINDS
+from mitsplat.detector.losses import error_gains as gains_over
 
 A, B = [0.0, 0.0, 10.0, 10.0], [50.0, 50.0, 20.0, 20.0]
 
@@ -49,7 +49,7 @@ TWO = truth((1, 1, A), (1, 2, B))
 )
 def test_a_single_error_is_worth_what_it_costs(detections: list[dict[str, Any]], kind: str, gain: float) -> None:
     worth = gains(TWO, detections)
-    assert worth.keys() == KINDS.keys()
+    assert worth.keys() == ERROR_KINDS.keys()
     assert worth[kind] == pytest.approx(gain, abs=1e-6)
     assert all(value == pytest.approx(0, abs=1e-6) for other, value in worth.items() if other not in (kind, "missed"))
 
@@ -62,7 +62,7 @@ def test_what_is_missed_counts_alone() -> None:
 
 
 def test_all_right_leaves_nothing_to_gain() -> None:
-    assert gains(TWO, [found(1, 1, A), found(1, 2, B)]) == dict.fromkeys(KINDS, 0.0)
+    assert gains(TWO, [found(1, 1, A), found(1, 2, B)]) == dict.fromkeys(ERROR_KINDS, 0.0)
 
 
 def test_one_label_is_found_once() -> None:

@@ -14,7 +14,7 @@ from PIL import Image
 from pycocotools import mask as coco_mask
 
 from mitsplat.detector.pictures import read_picture
-from mitsplat.detector.sets import LabelledSet, _run_lengths, check_masks, in_classes, read_set
+from mitsplat.detector.sets import LabelledSet, _run_lengths, check_masks, read_set, reorder_classes
 from mitsplat.detector.training import read_sets, write_data
 from mitsplat.errors import InputError
 from tests.detector.painted import CLASSES, HEIGHT, WIDTH, paint, write_coco, write_yolo
@@ -82,12 +82,12 @@ def test_coco_files_are_chosen_by_split_and_images_found_below(tmp_path: Path) -
 def test_classes_are_matched_by_name(tmp_path: Path) -> None:
     found = read_set(write_coco(tmp_path, 3), "train")
     assert found.class_names == ("box", "disc")  # by the ids of the file
-    turned = in_classes(found, CLASSES, "out/cell")
+    turned = reorder_classes(found, CLASSES, "out/cell")
     assert turned.class_names == CLASSES
     for sample, seed in zip(turned.samples, range(3), strict=True):
         assert [CLASSES[i.class_index] for i in sample.instances] == [name for name, _ in paint(seed)[1]]
     with pytest.raises(InputError, match="it also has box and it lacks gear, nut"):
-        in_classes(found, ("disc", "nut", "gear"), "out/cell")
+        reorder_classes(found, ("disc", "nut", "gear"), "out/cell")
 
 
 @pytest.mark.parametrize("boxes", [False, True])

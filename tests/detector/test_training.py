@@ -21,7 +21,7 @@ from typer.testing import CliRunner
 
 from mitsplat.cli import app
 from mitsplat.detector import libraries
-from mitsplat.detector.detector_evaluation import evaluate_detector, truth_of
+from mitsplat.detector.detector_evaluation import coco_truth, evaluate_detector
 from mitsplat.detector.libraries import check_weights, load_weights
 from mitsplat.detector.mix import plan_images
 from mitsplat.detector.scores import average_precision
@@ -492,7 +492,7 @@ def test_figures_are_those_of_ultralytics(data: Path, trained: Run, tmp_path: Pa
     (file,) = (tmp_path / "ultralytics").rglob("predictions.json")
     predictions = [entry | {"image_id": int(entry["image_id"]) + 1} for entry in json.loads(file.read_text())]
     evaluation = evaluate_detector(trained.path, data / "cell", tmp_path / "out", device="cpu")
-    truth = truth_of(found, masks=True)
+    truth = coco_truth(found, masks=True)
     for kind, iou_type, own in (("box", "bbox", theirs.box), ("mask", "segm", theirs.seg)):
         score, result = average_precision(truth, predictions, iou_type=iou_type), evaluation.results[kind]  # type: ignore[arg-type]
         assert score.map50_95 > 0.3

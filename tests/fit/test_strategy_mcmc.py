@@ -11,7 +11,7 @@ import pytest
 
 from mitsplat.fit.optimizer import GaussianModel
 from mitsplat.fit.refine_splats import QUALITY
-from mitsplat.fit.strategy_mcmc import grow, jitter, relocate, seed_splats, shared
+from mitsplat.fit.strategy_mcmc import grow, jitter, relocate, seed_splats, split_opacity
 from mitsplat.renderer.layers import ensure_variant, make_sensor, render_splats
 from tests.renderer.test_render import CAMERA, make_splats
 
@@ -20,7 +20,7 @@ from tests.renderer.test_render import CAMERA, make_splats
 @pytest.mark.parametrize("opacity", [0.05, 0.5, 0.97])
 def test_copies_absorb_along_a_line_what_one_did(copies: int, opacity: float) -> None:
     """Integral over x of 1 - (1 - o' exp(-x^2 / 2 s^2))^n equals that of o exp(-x^2 / 2)."""
-    (own,), (factor,) = shared(np.array([opacity]), np.array([copies]))
+    (own,), (factor,) = split_opacity(np.array([opacity]), np.array([copies]))
     x = np.linspace(-12, 12, 20001)
     several = 1 - (1 - own * np.exp(-0.5 * (x / factor) ** 2)) ** copies
     assert np.trapezoid(several, x) == pytest.approx(opacity * np.sqrt(2 * np.pi), rel=1e-6)

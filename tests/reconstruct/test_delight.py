@@ -18,8 +18,8 @@ from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.gaussians.surfels import place_surfels
 from mitsplat.images.colour import decode_srgb, encode_srgb
 from mitsplat.reconstruct.asset_evaluation import Verdict
-from mitsplat.reconstruct.asset_from_photos import AssetJob, delighted
-from mitsplat.reconstruct.delight import FOLLOWS, LightFile, delight, trace_irradiance
+from mitsplat.reconstruct.asset_from_photos import AssetJob, delight_asset
+from mitsplat.reconstruct.delight import MIN_SLOPE, LightFile, delight, trace_irradiance
 from mitsplat.reconstruct.reconstruct import Reconstruction
 from mitsplat.scene.spec.light_spec import AreaLight, EnvironmentLight, LightSpec
 
@@ -113,7 +113,7 @@ class TestDelight:
     def test_light_from_the_other_side_is_refused(self, tmp_path: Path) -> None:
         splats, _ = painted(30)
         done = delight(splats, ball(), file_of(tmp_path, *lights(210)))
-        assert not done.kept and done.slope < FOLLOWS and done.splats is splats
+        assert not done.kept and done.slope < MIN_SLOPE and done.splats is splats
         assert "colours do not follow it" in done.told
 
     def test_an_object_that_was_evenly_lit_stays(self, tmp_path: Path) -> None:
@@ -141,7 +141,7 @@ class TestJob:
             watertight=True, solid=True,
         )  # fmt: skip
         made = Reconstruction(asset, verdict, [], None, None, None, turn)
-        done = delighted(made, file_of(tmp_path, *lights(30)), False, None)
+        done = delight_asset(made, file_of(tmp_path, *lights(30)), False, None)
         assert done.record["light"]["kept"] and "it is taken out of them" in done.verdict.rows["Light"]
         assert unlike(done.asset.splats, reflectance) < 0.03
 

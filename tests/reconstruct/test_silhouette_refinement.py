@@ -16,7 +16,7 @@ from mitsplat.errors import InputError
 from mitsplat.geometry.camera import Camera
 from mitsplat.reconstruct.asset_evaluation import iou
 from mitsplat.reconstruct.asset_report import write_asset_report
-from mitsplat.reconstruct.fold_repair import edges_through_faces, mend_motion
+from mitsplat.reconstruct.fold_repair import edges_through_faces, limit_motion
 from mitsplat.reconstruct.reconstruct import ImportedMesh, reconstruct_asset
 from mitsplat.reconstruct.segment_splats import MaskedView
 from mitsplat.reconstruct.silhouette_refinement import MeshRefineSettings, Outline, Silhouettes, refine_mesh
@@ -119,7 +119,7 @@ def test_motion_that_breaks_a_mesh_is_held_back() -> None:
     wanted[7] = -2 * ball.vertices[7]
     broken = trimesh.Trimesh(wanted, ball.faces, process=False)
     assert len(edges_through_faces(broken, broken.vertices))
-    found = mend_motion(ball, wanted)
+    found = limit_motion(ball, wanted)
     assert found is not None
     whole = trimesh.Trimesh(found, ball.faces, process=False)
     assert ((whole.face_normals * ball.face_normals).sum(axis=1) > 0).all()
@@ -129,7 +129,7 @@ def test_motion_that_breaks_a_mesh_is_held_back() -> None:
 
 def test_motion_that_nothing_can_be_kept_of_is_refused() -> None:
     ball = trimesh.creation.icosphere(2)
-    assert mend_motion(ball, np.full_like(ball.vertices, np.nan)) is None
+    assert limit_motion(ball, np.full_like(ball.vertices, np.nan)) is None
 
 
 def test_area_of_a_balls_silhouette_grows_as_its_radius_says() -> None:

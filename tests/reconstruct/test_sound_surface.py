@@ -11,7 +11,7 @@ from benchmarks.assets.known import chamfer
 from mitsplat.errors import InputError
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.reconstruct.asset_evaluation import sized_photo
-from mitsplat.reconstruct.fallback_proxy import CONVEX, FINEST, HULL, find_sound_surface
+from mitsplat.reconstruct.fallback_proxy import CONVEX, FINEST, HULL, find_proxy_surface
 from mitsplat.reconstruct.segment_splats import MaskedView, isolate_object
 from mitsplat.reconstruct.surface import SurfaceSettings
 from tests.conftest import KnownObject
@@ -26,7 +26,7 @@ def views_of(known: KnownObject) -> list[MaskedView]:
 
 
 def test_what_masks_and_splats_bear_out_is_kept_as_fine_as_it_is(known_object: KnownObject) -> None:
-    found = find_sound_surface(known_object.splats, views_of(known_object), SETTINGS)
+    found = find_proxy_surface(known_object.splats, views_of(known_object), SETTINGS)
     assert (found.source, found.faults) == (FINEST, ())
     assert chamfer(found.mesh, known_object.mesh) < 0.004
 
@@ -37,7 +37,7 @@ def test_depth_that_is_wrong_gives_way_to_the_hull_of_the_masks(known_object: Kn
     inner = np.arange(len(splats)) % 3 > 0
     means = np.where(inner[:, None], 0.4 * splats.means, splats.means)
     wrong = replace(splats, means=means, opacities=np.where(inner, 0.98, 0.3).astype(np.float32))
-    found = find_sound_surface(wrong, views_of(known_object), SETTINGS)
+    found = find_proxy_surface(wrong, views_of(known_object), SETTINGS)
     assert found.source == HULL
     for fault, reason in zip(found.faults, ("masks with an IoU of only", "% of the diagonal", "IoU"), strict=True):
         assert reason in fault
@@ -50,7 +50,7 @@ def test_masks_that_contradict_each_other_give_way_to_the_splats(known_object: K
         MaskedView(view.camera, np.roll(view.mask, 70 if number % 2 else -70, axis=1))
         for number, view in enumerate(views_of(known_object))
     ]
-    found = find_sound_surface(known_object.splats, views, SETTINGS)
+    found = find_proxy_surface(known_object.splats, views, SETTINGS)
     assert found.source == CONVEX
     assert found.mesh.is_volume
     assert chamfer(found.mesh, known_object.mesh.convex_hull) < 0.02
@@ -62,7 +62,7 @@ def test_masks_that_contradict_each_other_give_way_to_the_splats(known_object: K
 
 def test_the_hull_of_splats_ends_at_the_floor(known_object: KnownObject) -> None:
     views = [MaskedView(view.camera, np.zeros_like(view.mask)) for view in views_of(known_object)]
-    found = find_sound_surface(known_object.splats, views, SETTINGS, floor=-0.03)
+    found = find_proxy_surface(known_object.splats, views, SETTINGS, floor=-0.03)
     assert found.source == CONVEX
     assert found.mesh.bounds[0, 2] == pytest.approx(-0.03)
 
@@ -74,14 +74,14 @@ def test_masks_do_not_cut_what_another_thing_may_hide(known_object: KnownObject)
     given = views_of(known_object)
     views = [MaskedView(v.camera, v.mask * (1 - veil), veil if k % 3 == 0 else None) for k, v in enumerate(given)]
     views = [view if view.hidden is not None else given[k] for k, view in enumerate(views)]
-    found = find_sound_surface(known_object.splats, views, SETTINGS)
+    found = find_proxy_surface(known_object.splats, views, SETTINGS)
     assert (found.source, found.faults) == (FINEST, ())
     assert chamfer(found.mesh, known_object.mesh) < 0.005
     kept = isolate_object(known_object.splats, views)
     assert kept.kept.mean() > 0.97 * isolate_object(known_object.splats, given).kept.mean()
     blind = [replace(view, hidden=None) for view in views]
     assert isolate_object(known_object.splats, blind).lost < 0.2
-    cut = find_sound_surface(known_object.splats, blind, SETTINGS)
+    cut = find_proxy_surface(known_object.splats, blind, SETTINGS)
     assert cut.source != FINEST or chamfer(cut.mesh, known_object.mesh) > 0.02
 
 
@@ -90,4 +90,4 @@ def test_splats_without_volume_are_refused(known_object: KnownObject) -> None:
     flat = known_object.splats.means * (1, 1, 0)
     splats: Splats = replace(known_object.splats, means=flat)
     with pytest.raises(InputError, match=r"the splats span no volume \(3\d+ opaque Gaussians\)"):
-        find_sound_surface(splats, views, SETTINGS)
+        find_proxy_surface(splats, views, SETTINGS)

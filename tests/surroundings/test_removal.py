@@ -27,7 +27,7 @@ from mitsplat.surroundings import make_surroundings
 from mitsplat.surroundings.depth_views import depth_views, surface_points
 from mitsplat.surroundings.removal import remove_things
 from mitsplat.surroundings.supports import find_supports, find_walls
-from mitsplat.surroundings.texture_fill import fill
+from mitsplat.surroundings.texture_fill import fill_texture
 from tests.surroundings.test_surroundings import (
     BOX,
     HEIGHT,
@@ -236,7 +236,7 @@ class TestFill:
     def filled(texture: Float64Array, known: BoolArray | None = None) -> tuple[Float64Array, float]:
         hole = TestFill.hole()
         broken = np.where(hole[..., None], 7.0, texture)
-        result, copied = fill(broken, ~hole if known is None else known & ~hole, hole)
+        result, copied = fill_texture(broken, ~hole if known is None else known & ~hole, hole)
         outside = ~hole if known is None else known & ~hole
         assert (result[outside] == broken[outside]).all()
         return result, copied
@@ -273,5 +273,5 @@ class TestFill:
 
     def test_where_nothing_is_known_nothing_breaks(self) -> None:
         hole = self.hole()
-        result, copied = fill(np.full((60, 50, 3), 0.4), np.zeros_like(hole), hole)
+        result, copied = fill_texture(np.full((60, 50, 3), 0.4), np.zeros_like(hole), hole)
         assert copied == 0 and np.isfinite(result).all()

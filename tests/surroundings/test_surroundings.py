@@ -22,7 +22,7 @@ from mitsplat.reconstruct.reconstruct import ReconstructSettings
 from mitsplat.reconstruct.surface import SurfaceSettings
 from mitsplat.scene.loading.scene_loading import load_scene
 from mitsplat.surroundings import make_surroundings
-from mitsplat.surroundings.coverage import ENOUGH, find_coverage, find_holes, free_rectangle
+from mitsplat.surroundings.coverage import MIN_PHOTOS, find_coverage, find_holes, free_rectangle
 from mitsplat.surroundings.depth_views import depth_views, surface_points
 from mitsplat.surroundings.environment_from_photos import reconstruct_surroundings
 from mitsplat.surroundings.floaters import find_unsupported, remove_floaters
@@ -138,14 +138,16 @@ def test_what_stands_on_it_is_covered_and_what_nobody_saw_is_named(splats: Splat
     inside = (x > TABLE[0] / 2 - BOX[0] + 0.03) & (y > TABLE[1] / 2 - BOX[1] + 0.03)
     assert coverage.covered[inside & (x < 0.54) & (y < 0.29)].mean() > 0.95
     assert not coverage.covered[(x < 0.1) & (y < 0)].any()
-    assert coverage.photos[(np.abs(x + 0.1) < 0.1) & (np.abs(y) < 0.1)].min() >= ENOUGH
+    assert coverage.photos[(np.abs(x + 0.1) < 0.1) & (np.abs(y) < 0.1)].min() >= MIN_PHOTOS
     named = [(str(number), camera) for number, camera in enumerate(cameras())]
     holes = find_holes(table, coverage, splats, named)
     if coverage.hidden.any():
         assert all(hole.near is not None and hole.shown > 0.5 for hole in holes)
     behind = np.zeros_like(coverage.covered)
     behind[60:70, 5:20] = True
-    gap = replace(coverage, photos=np.where(behind, 0, coverage.photos + ENOUGH), covered=coverage.covered & ~behind)
+    gap = replace(
+        coverage, photos=np.where(behind, 0, coverage.photos + MIN_PHOTOS), covered=coverage.covered & ~behind
+    )
     (hole,) = find_holes(table, gap, splats, named)
     assert hole.area == pytest.approx(behind.sum() * coverage.cell.prod()) and hole.shown > 0.9
 

@@ -131,28 +131,28 @@ class Photo:
         """Read the results of :meth:`picture` and :meth:`hidden`, with one access to the mask file."""
         if not 0 < scale <= 1:
             raise ValueError(f"scale must be in (0, 1] (got {scale})")
-        rgb = self._pixels(self.file, ("RGB",), scale, window)
+        rgb = self._read_pixels(self.file, ("RGB",), scale, window)
         if self.gain is not None:
             rgb = np.clip(encode_srgb(decode_srgb(rgb) * self.gain), 0, 1).astype(np.float32)
-        return rgb, *self._matte(scale, window)
+        return rgb, *self._read_mask(scale, window)
 
     def alpha(self, scale: float = 1.0, window: Window | None = None) -> Float32Array | None:
         """Read only the mask of :meth:`picture`."""
-        return self._matte(scale, window)[0]
+        return self._read_mask(scale, window)[0]
 
     def hidden(self, scale: float = 1.0, window: Window | None = None) -> Float32Array | None:
         """Read the possible occlusion of the object by other things, (H, W) in [0, 1]; None without occlusion."""
-        return self._matte(scale, window)[1]
+        return self._read_mask(scale, window)[1]
 
-    def _matte(self, scale: float, window: Window | None) -> tuple[Float32Array | None, Float32Array | None]:
+    def _read_mask(self, scale: float, window: Window | None) -> tuple[Float32Array | None, Float32Array | None]:
         if self.mask is None:
             return None, None
-        values = self._pixels(self.mask, ("L", "LA"), scale, window)
+        values = self._read_pixels(self.mask, ("L", "LA"), scale, window)
         return (values, None) if values.ndim == 2 else (values[..., 0].copy(), 1 - values[..., 1])
 
-    def _pixels(self, path: Path, modes: Sequence[str], scale: float, window: Window | None) -> Float32Array:
+    def _read_pixels(self, path: Path, modes: Sequence[str], scale: float, window: Window | None) -> Float32Array:
         """Read an image, converted to the first of ``modes`` unless its mode is among them."""
-        with _opened(path) as image:
+        with _open_image(path) as image:
             pixels = image.convert(image.mode if image.mode in modes else modes[0])
         size = (self.camera.width, self.camera.height)
         if pixels.size != size:
@@ -178,7 +178,7 @@ def known_where(hidden: Float32Array | None, camera: Camera) -> BoolArray:
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[Image.Image]:
+def _open_image(path: Path) -> Iterator[Image.Image]:
     """Open an image file; all read errors are raised as InputError."""
     try:
         with Image.open(path) as image:
@@ -350,8 +350,8 @@ class Capture:
             raise InputError(f"{folder / _POINTS}: no such file") from None
         except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
             raise InputError(f"{folder / _POINTS}: not a capture's points ({error})") from error
-        whole = seen.dtype.kind in "iu" and counts.dtype.kind in "iu"
-        if not whole or np.any((counts < 0) | (counts > len(seen))):
+        integral = seen.dtype.kind in "iu" and counts.dtype.kind in "iu"
+        if not integral or np.any((counts < 0) | (counts > len(seen))):
             raise InputError(f"{folder / _POINTS}: must count points in whole numbers of 0 to {len(seen)}")
         if len(counts) != len(spec.photos) or counts.sum() != len(seen):
             raise InputError(

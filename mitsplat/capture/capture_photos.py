@@ -40,13 +40,13 @@ FEW_POINTS = 3 * MIN_POINTS
 
 _HIDDEN = 0.03
 """Occluded fraction of the object above which the mask of a photo marks the occluded pixels as unknown."""
-_MOST_HIDDEN = 0.5
+_MAX_HIDDEN = 0.5
 """Possibly occluded fraction of the object above which an occluded photo is rejected."""
 
 _INPUTS = "inputs.json"
 _PHOTOS = "sfm/photos.json"
 """Record of the inputs of the photo copies; written before the copies."""
-_RECORDED = ("source", "reprojection_error", "doubtful")
+_RESULT_FIELDS = ("source", "reprojection_error", "doubtful")
 """Fields of a result that ``inputs.json`` stores in addition to the inputs."""
 
 
@@ -196,7 +196,7 @@ def capture_photos(
             folder that is overwritten.
         MissingResourceError: If COLMAP or the mask network fails to run.
     """
-    _keep_apart(out, photos, settings)
+    _check_outputs(out, photos, settings)
     if settings.masks is not None and not settings.masks.is_dir():
         raise InputError(f"{settings.masks}: no such folder of masks")
     if photos.is_file() and photos.suffix.lower() not in SUFFIXES:
@@ -211,12 +211,12 @@ def _capture(photos: Path, out: Path, settings: CaptureSettings, progress: Progr
     if len(files) < MIN_PHOTOS:
         raise InputError(f"{photos}: must hold at least {MIN_PHOTOS} photographs (got {len(files)})")
     inputs = _inputs(photos, files, settings)
-    if (done := _finished(out, inputs)) is not None:
+    if (done := _load_finished(out, inputs)) is not None:
         return done
     work = out / "sfm"
     for marker in (_INPUTS, CAPTURE_FILE):  # images and masks will change
         (out / marker).unlink(missing_ok=True)
-    _forget_other_photos(out, inputs, settings)
+    _delete_outdated(out, inputs, settings)
     prepared, rejected = prepare_photos(
         photos,
         out / "images",
@@ -250,7 +250,7 @@ def _capture(photos: Path, out: Path, settings: CaptureSettings, progress: Progr
         capture = replace(capture, photos=tuple(undistort(photo) for photo in capture.photos))
     capture = even_exposure(capture)
     if settings.kind == "object":
-        capture = _masked(capture, frame, settings, prepared, out, progress)
+        capture = _with_masks(capture, frame, settings, prepared, out, progress)
         if len(capture.photos) < MIN_PHOTOS:
             name, reason = sorted(set(capture.rejected.items()) - set(rejected.items()))[0]
             raise InputError(
@@ -269,12 +269,12 @@ def _capture(photos: Path, out: Path, settings: CaptureSettings, progress: Progr
         if share < SURE_AGREEMENT and file not in frame.confirmed and by_file[file].name in kept
     }
     result = CaptureResult(capture, len(files), frame.source, model.reprojection_error, doubtful)
-    record = {key: getattr(result, key) for key in _RECORDED}
+    record = {key: getattr(result, key) for key in _RESULT_FIELDS}
     write_text(out / _INPUTS, json.dumps({"inputs": inputs, **record}, indent=1))
     return result
 
 
-def _keep_apart(out: Path, photos: Path, settings: CaptureSettings) -> None:
+def _check_outputs(out: Path, photos: Path, settings: CaptureSettings) -> None:
     """Raise InputError if an input lies in an output folder, or an output folder belongs to no capture.
 
     The reason is that unused files in output folders are deleted.
@@ -306,19 +306,19 @@ def _inputs(photos: Path, files: Sequence[Path], settings: CaptureSettings) -> d
     }
 
 
-def _finished(out: Path, inputs: dict[str, object]) -> CaptureResult | None:
+def _load_finished(out: Path, inputs: dict[str, object]) -> CaptureResult | None:
     """Return the result stored in ``out`` if it has the same inputs, else None."""
     try:
         record = json.loads((out / _INPUTS).read_text())
         if record["inputs"] != inputs or not (out / "capture.png").is_file():
             return None
         capture = Capture.load(out)
-        return CaptureResult(capture, len(record["inputs"]["photos"]), **{key: record[key] for key in _RECORDED})
+        return CaptureResult(capture, len(record["inputs"]["photos"]), **{key: record[key] for key in _RESULT_FIELDS})
     except (OSError, ValueError, KeyError, TypeError):  # missing or damaged: recompute
         return None
 
 
-def _forget_other_photos(out: Path, inputs: dict[str, object], settings: CaptureSettings) -> None:
+def _delete_outdated(out: Path, inputs: dict[str, object], settings: CaptureSettings) -> None:
     """Delete masks, and delete copies and matches of other photographs or other settings."""
     way = settings.max_size, settings.poses is None, settings.undistorted
     marker = json.dumps([inputs["photos"], *way], sort_keys=True)
@@ -346,17 +346,17 @@ def _find_model(
     if settings.poses is not None:
         model = read_poses(settings.poses, list(by_file.values()), work, progress)
     else:
-        model, faults = _without_faults(find_cameras(list(by_file.values()), work, progress))
-    _demand_cameras(photos, model, by_file, faults)
+        model, faults = _remove_faulty_cameras(find_cameras(list(by_file.values()), work, progress))
+    _check_camera_count(photos, model, by_file, faults)
     frame = _metric_frame(model, by_file, settings)
     while frame.wrong:
         faults |= {
             file: f"its camera is wrong: it sees the board {error:.0f} px from where it is"
             for file, error in frame.wrong.items()
         }
-        model, further = _without_faults(model.without(frame.wrong), least=0 if settings.poses else MIN_POINTS)
+        model, further = _remove_faulty_cameras(model.without(frame.wrong), least=0 if settings.poses else MIN_POINTS)
         faults |= further
-        _demand_cameras(photos, model, by_file, faults)
+        _check_camera_count(photos, model, by_file, faults)
         frame = _metric_frame(model, by_file, settings)
     absent = "the poses given do not name it" if settings.poses else "it shares too few points with the other photos"
     elsewhere = "it only fits a smaller group of photos, as of another object or side"
@@ -365,7 +365,7 @@ def _find_model(
     return model, frame, faults
 
 
-def _demand_cameras(
+def _check_camera_count(
     photos: Path, model: SparseModel, by_file: Mapping[str, Prepared], faults: Mapping[str, str]
 ) -> None:
     """Raise InputError if the model has fewer than ``MIN_PHOTOS`` cameras."""
@@ -378,7 +378,7 @@ def _demand_cameras(
         )
 
 
-def _without_faults(model: SparseModel, least: int = MIN_POINTS) -> tuple[SparseModel, dict[str, str]]:
+def _remove_faulty_cameras(model: SparseModel, least: int = MIN_POINTS) -> tuple[SparseModel, dict[str, str]]:
     """Remove cameras that contradict the others or observe fewer than ``least`` points, and return the reasons."""
     shares = {file: model.agreement.get(file, 1.0) for file in model.cameras}
     wrong = {file: share for file, share in shares.items() if share < MIN_AGREEMENT}
@@ -399,12 +399,14 @@ def _metric_frame(model: SparseModel, by_file: dict[str, Prepared], settings: Ca
         {file: by_file[file].file for file in model.cameras},
         board=settings.board,
         tag=settings.tag,
-        scale_from=_spots(settings.scale_from, by_file),
+        scale_from=_stored_spots(settings.scale_from, by_file),
         centred=settings.kind == "object",
     )
 
 
-def _spots(scale_from: tuple[str, str, float] | None, by_file: dict[str, Prepared]) -> tuple[str, str, float] | None:
+def _stored_spots(
+    scale_from: tuple[str, str, float] | None, by_file: dict[str, Prepared]
+) -> tuple[str, str, float] | None:
     """Return ``scale_from`` with the names of the copies instead of those of the photos."""
     if scale_from is None:
         return None
@@ -418,7 +420,7 @@ def _spots(scale_from: tuple[str, str, float] | None, by_file: dict[str, Prepare
     return stored(one), stored(other), metres
 
 
-def _masked(
+def _with_masks(
     capture: Capture,
     frame: MetricFrame,
     settings: CaptureSettings,
@@ -445,11 +447,11 @@ def _masked(
     else:
         chosen = chosen_object(capture, settings.picks, settings.picks_not, settings.box)
         points, above = chosen.points, chosen.above
-        capture, hidden = _hidden_parts(capture, chosen)
+        capture, hidden = _reject_occluded(capture, chosen)
     return object_masks(capture, points, above, mask_folder, bare=bare, hidden=hidden, progress=progress)
 
 
-def _hidden_parts(capture: Capture, chosen: ChosenObject) -> tuple[Capture, dict[str, BoolArray]]:
+def _reject_occluded(capture: Capture, chosen: ChosenObject) -> tuple[Capture, dict[str, BoolArray]]:
     """Reject photos in which other things occlude much of the object, and find the occluded pixels of the others.
 
     Returns:
@@ -458,7 +460,7 @@ def _hidden_parts(capture: Capture, chosen: ChosenObject) -> tuple[Capture, dict
     photos, rejected, hidden = [], dict(capture.rejected), dict[str, BoolArray]()
     for photo in capture.photos:
         hides, may_hide, pixels = hidden_part(photo.camera, chosen.above, chosen.others)
-        if hides > _HIDDEN and may_hide > _MOST_HIDDEN:
+        if hides > _HIDDEN and may_hide > _MAX_HIDDEN:
             rejected[photo.name] = f"another thing stands before the object and may hide {may_hide:.0%} of it"
             continue
         photos.append(photo)

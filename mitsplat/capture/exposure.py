@@ -14,13 +14,13 @@ from mitsplat.images.colour import decode_srgb
 
 STEADY = 0.02
 """Largest standard deviation of the logarithmic gains at which exposure counts as fixed and is not corrected."""
-_EDGE = 320
+_LOOKUP_EDGE = 320
 """Longest edge of the reduced pictures for colour look-up [px]; their pixels average out noise."""
-_SURE = (0.04, 0.96)
+_RELIABLE_RANGE = (0.04, 0.96)
 """Range of display-encoded values that are neither dominated by noise nor clipped."""
-_FEWEST = 20
+_MIN_OBSERVATIONS = 20
 """Minimum number of points for the correction of a photo."""
-_LEAST_SCALE = 0.02
+_MIN_SCALE = 0.02
 """Lower limit of the scale of the robust weights, in differences of logarithms."""
 
 
@@ -67,8 +67,8 @@ def relative_gains(photos: Sequence[Photo], points: Float64Array) -> Float64Arra
         corrections = np.linalg.lstsq(system, right, rcond=1e-9)[0]
         corrected = seen + corrections[photo]
         off = np.linalg.norm(corrected - means(corrected)[point], axis=1)
-        weight = 1 / (1 + (off / max(float(np.median(off)), _LEAST_SCALE)) ** 2)
-    corrections[np.bincount(photo, minlength=len(photos)) < _FEWEST] = 0
+        weight = 1 / (1 + (off / max(float(np.median(off)), _MIN_SCALE)) ** 2)
+    corrections[np.bincount(photo, minlength=len(photos)) < _MIN_OBSERVATIONS] = 0
     return np.asarray(np.exp(corrections - corrections.mean(axis=0)))
 
 
@@ -76,15 +76,15 @@ def _observations(photos: Sequence[Photo], points: Float64Array) -> tuple[Int64A
     """Return photo index and point index of each observation, (K,), and its log linear colour, (K, 3)."""
     found = []
     for number, photo in enumerate(photos):
-        scale = min(1.0, _EDGE / max(photo.camera.width, photo.camera.height))
+        scale = min(1.0, _LOOKUP_EDGE / max(photo.camera.width, photo.camera.height))
         rgb, _ = photo.picture(scale)
         size = rgb.shape[1], rgb.shape[0]
         pixels, _ = photo.camera.resized(*size).project(points[photo.seen])
         inside = ((pixels >= 0) & (pixels < size)).all(axis=1)
         x, y = pixels[inside].astype(np.int64).T
         values = rgb[y, x]
-        sure = ((values > _SURE[0]) & (values < _SURE[1])).all(axis=1)
-        own = photo.seen[inside][sure].astype(np.int64)
-        found.append((np.full(len(own), number, dtype=np.int64), own, np.log(decode_srgb(values[sure]))))
+        reliable = ((values > _RELIABLE_RANGE[0]) & (values < _RELIABLE_RANGE[1])).all(axis=1)
+        own = photo.seen[inside][reliable].astype(np.int64)
+        found.append((np.full(len(own), number, dtype=np.int64), own, np.log(decode_srgb(values[reliable]))))
     photo_of, point_of, shown = (np.concatenate(parts) for parts in zip(*found, strict=True))
     return photo_of, point_of, shown

@@ -21,7 +21,7 @@ _Row = tuple[float, float, float, float]
 _Positive = Annotated[float, Field(gt=0)]
 
 
-_FARTHEST = 1e9
+_MAX_COORDINATE = 1e9
 """Largest accepted coordinate of a camera or a point, in units of the model; geocentric coordinates in metres reach
 6e6.
 """
@@ -81,21 +81,21 @@ def read_poses(source: Path, photos: Sequence[Prepared], folder: Path, progress:
     names = _match(model.cameras, photos)
     if len(names) < 2:
         raise InputError(f"{source}: must name the photos (got {next(iter(model.cameras))} and no match for it)")
-    _check_places(source, model)
+    _check_coordinates(source, model)
     sizes = {photo.file.name: photo.size for photo in photos}
-    cameras = {file: _fitted(source, name, model.cameras[name], sizes[file]) for name, file in names.items()}
+    cameras = {file: _resized_camera(source, name, model.cameras[name], sizes[file]) for name, file in names.items()}
     if not len(model.points):
         return find_points([photo for photo in photos if photo.file.name in cameras], cameras, folder, progress)
     return replace(model, cameras=cameras, seen={file: model.seen[name] for name, file in names.items()})
 
 
-def _check_places(source: Path, model: SparseModel) -> None:
-    """Raise InputError if a camera or a point of the model is not finite or lies beyond ``_FARTHEST``."""
+def _check_coordinates(source: Path, model: SparseModel) -> None:
+    """Raise InputError if a camera or a point of the model is not finite or lies beyond ``_MAX_COORDINATE``."""
     places = [(f"camera {name}", camera.world_from_camera[:3, 3]) for name, camera in model.cameras.items()]
     places += [("a point", model.points)] if len(model.points) else []
     for name, place in places:
-        if not (farthest := float(np.abs(place).max())) <= _FARTHEST:
-            raise InputError(f"{source}: {name} must lie within {_FARTHEST:g} of the origin (got {farthest:g})")
+        if not (farthest := float(np.abs(place).max())) <= _MAX_COORDINATE:
+            raise InputError(f"{source}: {name} must lie within {_MAX_COORDINATE:g} of the origin (got {farthest:g})")
 
 
 def _read_transforms(path: Path, photos: Mapping[str, Prepared]) -> SparseModel:
@@ -188,7 +188,7 @@ def _match(names: Iterable[str], photos: Sequence[Prepared]) -> dict[str, str]:
     return matched
 
 
-def _fitted(source: Path, name: str, camera: Camera, size: tuple[int, int]) -> Camera:
+def _resized_camera(source: Path, name: str, camera: Camera, size: tuple[int, int]) -> Camera:
     """Return the camera resized to the pixels of a reduced copy."""
     if abs(camera.width * size[1] - camera.height * size[0]) > max(camera.width, camera.height, *size):
         raise InputError(

@@ -26,13 +26,13 @@ DEFAULT_BOARD = Board()
 MAX_CONTRADICTION = 0.0025
 """Reprojection error of the board up to which a camera is confirmed, as a fraction of the longer image edge."""
 
-_CERTAINLY_WRONG = 0.01
+_WRONG_LIMIT = 0.01
 """Reprojection error above which a camera is always wrong, as a fraction of the longer image edge.
 
 Between both limits, a camera is wrong if its error is an outlier.
 """
 
-_OUTLYING = 3.0
+_OUTLIER_FACTOR = 3.0
 """Factor of the median camera error above which an error is an outlier."""
 
 PRINT_ERROR = 1e-4
@@ -43,7 +43,7 @@ _GROUPS = 6
 
 _Views = dict[int, dict[str, tuple[Camera, Float64Array]]]
 
-_TILT = np.cos(np.radians(30))
+_MIN_TILT_COSINE = np.cos(np.radians(30))
 """Cosine of the largest angle between the table normal and the vertical that the cameras suggest."""
 
 
@@ -116,7 +116,7 @@ def find_metric_frame(
         pose, factor = fitted
         board_pose = pose
         flat = board.corners / factor @ pose[:3, :3].T + pose[:3, 3]
-        wrong, confirmed = _judge_cameras(views, {**dict(enumerate(flat)), **corners})
+        wrong, confirmed = _check_cameras(views, {**dict(enumerate(flat)), **corners})
 
         def board_scale(names: set[str]) -> float | None:
             fitted = _fit_board(_triangulate_corners(views, names), board)
@@ -167,7 +167,7 @@ def find_metric_frame(
     if not distance > 0:
         raise InputError(f"the {len(centres)} cameras must stand apart from the place that they look at (got 0)")
     factor = scale[0] if scale else 1 / distance
-    rotation = _upright(normal, forward[0] if board_pose is None else board_pose[:3, 0])
+    rotation = _upright_rotation(normal, forward[0] if board_pose is None else board_pose[:3, 0])
     matrix = np.eye(4)
     matrix[:3, :3] = factor * rotation
     matrix[:3, 3] = -factor * rotation @ origin
@@ -251,7 +251,7 @@ def find_table(model: SparseModel, *, trials: int = 30000, seed: int = 0) -> tup
     Returns:
         Normal towards the cameras and a point of the plane, or None.
     """
-    points = model.points[_well_seen(model)]
+    points = model.points[_reliable_points(model)]
     if len(points) < 50:
         return None
     centres, forward = _rays(model)
@@ -269,7 +269,7 @@ def find_table(model: SparseModel, *, trials: int = 30000, seed: int = 0) -> tup
     normals *= np.where(np.median(above, axis=0) < 0, -1, 1)[:, None]
     usable = np.maximum(np.mean(above > 0, axis=0), np.mean(above < 0, axis=0)) >= 0.95
     if upward is not None:
-        usable &= normals @ upward >= _TILT
+        usable &= normals @ upward >= _MIN_TILT_COSINE
     best: tuple[Float64Array, Float64Array] | None = None
     most = max(30, len(sample) // 50)
     for point, normal in zip(a[usable], normals[usable], strict=True):
@@ -308,7 +308,7 @@ def vertical_from_cameras(model: SparseModel) -> Float64Array | None:
         level = sides[np.arange(len(sides)), :, np.argmin(np.abs(upward @ sides), axis=1)]
         refined = np.linalg.eigh(level.T @ level)[1][:, 0]
         upward = refined * np.sign(refined @ upward)
-    others = tilt[np.abs(directions @ upward) < _TILT]
+    others = tilt[np.abs(directions @ upward) < _MIN_TILT_COSINE]
     if tilt[best] > 0.03 or others.min() < 3 * tilt[best] + 0.01:  # arbitrary roll, or all from one side
         return None
     return np.asarray(upward * np.sign(np.mean(-poses[:, :, 2] @ upward)))
@@ -320,7 +320,7 @@ def _rays(model: SparseModel) -> tuple[Float64Array, Float64Array]:
     return poses[:, :3, 3], poses[:, :3, 2]
 
 
-def _well_seen(model: SparseModel) -> npt.NDArray[np.intp]:
+def _reliable_points(model: SparseModel) -> npt.NDArray[np.intp]:
     """Return the indices of points that at least three images observe, or of all points if observations are unknown."""
     counts = np.zeros(len(model.points), dtype=np.int64)
     for indices in model.seen.values():
@@ -328,7 +328,7 @@ def _well_seen(model: SparseModel) -> npt.NDArray[np.intp]:
     return np.flatnonzero(counts >= 3 if counts.any() else counts == 0)
 
 
-def _upright(normal: Float64Array, heading: Float64Array) -> Float64Array:
+def _upright_rotation(normal: Float64Array, heading: Float64Array) -> Float64Array:
     """Return the rotation (3, 3) that takes ``normal`` to z and the component of ``heading`` orthogonal to it to x."""
     x = heading - heading @ normal * normal
     if np.linalg.norm(x) < 1e-6:
@@ -394,7 +394,7 @@ def _triangulate_tags(views: _Views, names: set[str]) -> dict[int, Float64Array]
     return tags
 
 
-def _judge_cameras(views: _Views, corners: Mapping[int, Float64Array]) -> tuple[dict[str, float], frozenset[str]]:
+def _check_cameras(views: _Views, corners: Mapping[int, Float64Array]) -> tuple[dict[str, float], frozenset[str]]:
     """Compare the cameras with the board.
 
     A camera is judged if it observes at least six corners. Cameras with few or repetitive points can be far off at
@@ -419,8 +419,8 @@ def _judge_cameras(views: _Views, corners: Mapping[int, Float64Array]) -> tuple[
     shares = {name: float(np.median(found)) / edges[name] for name, found in errors.items() if len(found) >= 6}
     if not shares:
         return {}, frozenset()
-    outlying = _OUTLYING * float(np.median(list(shares.values())))
-    limit = min(max(MAX_CONTRADICTION, outlying), _CERTAINLY_WRONG)
+    outlying = _OUTLIER_FACTOR * float(np.median(list(shares.values())))
+    limit = min(max(MAX_CONTRADICTION, outlying), _WRONG_LIMIT)
     wrong = {name: share * edges[name] for name, share in shares.items() if share > limit}
     return wrong, frozenset(name for name, share in shares.items() if share <= MAX_CONTRADICTION)
 

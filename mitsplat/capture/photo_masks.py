@@ -49,7 +49,7 @@ MIN_AGREEMENT = 0.7
 _WORK_EDGE = 480
 """Longer edge of the photo in the first GrabCut, and of the object in the last [px]."""
 
-_FAR_OFF = 100
+_PROJECTION_LIMIT = 100
 """Limit of projected coordinates, in image sizes; points beyond it are ignored."""
 
 _ROUNDS = 3
@@ -60,18 +60,18 @@ _RING = 0.1
 _CELLS = 96
 """Cells along the longest edge of the visual hull's box."""
 
-_DISSENT = 0.04
+_DISSENT_SHARE = 0.04
 """Fraction of the photos whose masks may exclude a cell that still belongs to the visual hull."""
 
-_DOUBT = 0.04
+_BAND = 0.04
 """Half width of the band around the common outline that each photo segments by itself, as a fraction of the object
 size.
 """
 
-_FEWEST = 3
+_MIN_PHOTOS = 3
 """Minimum number of photos for a common outline."""
 
-_ABOVE = 0.01
+_MIN_HEIGHT = 0.01
 """Minimum height of object points above the table, as a fraction of the cameras' distance."""
 
 
@@ -102,9 +102,9 @@ def add_masks(
         """Write the mask of a photo, or return the reason why it is unusable."""
         mask, unknown = make(photo), hidden.get(photo.name)
         mask = mask if unknown is None else mask & ~unknown
-        reason = _fault(mask, photo.camera, points, unknown)
+        reason = _mask_fault(mask, photo.camera, points, unknown)
         if reason is None:
-            write_file(folder / mask_name(photo.name), partial(_save, mask, unknown))
+            write_file(folder / mask_name(photo.name), partial(_save_mask, mask, unknown))
         return reason
 
     with ThreadPoolExecutor(threads) as pool:
@@ -147,7 +147,7 @@ def object_masks(
         add_masks, capture, folder=folder, progress=progress, points=above, hidden=hidden, threads=usable_cores()
     )
     masked = add(geometric_masks(points, bare, hidden))
-    if len(masked.photos) < _FEWEST:
+    if len(masked.photos) < _MIN_PHOTOS:
         return masked
     # The second pass uses all photos again, because the common outline can repair masks that were rejected.
     return add(agreed_masks(masked, points, bare, hidden))
@@ -234,12 +234,14 @@ def geometric_masks(points: Float64Array, bare: Bare | None = None, hidden: Hidd
     """
 
     def make(photo: Photo) -> BoolArray:
-        camera, bgr, _ = _reduced(photo)
-        unknown = _shrunk(hidden.get(photo.name), camera)
+        camera, bgr, _ = _reduce_photo(photo)
+        unknown = _resize_occlusion(hidden.get(photo.name), camera)
         pixels, _ = camera.project(points)
         # A point close to the camera plane projects to coordinates that overflow an integer.
-        near = (np.abs(pixels) < _FAR_OFF * max(camera.width, camera.height)).all(axis=1)
-        return _enlarged(_grab(bgr, pixels[near], _free(bare, camera, bgr), unknown), photo.camera)
+        near = (np.abs(pixels) < _PROJECTION_LIMIT * max(camera.width, camera.height)).all(axis=1)
+        return _resize_mask(
+            _segment_from_points(bgr, pixels[near], _background_pixels(bare, camera, bgr), unknown), photo.camera
+        )
 
     return make
 
@@ -258,22 +260,22 @@ def agreed_masks(
         bare: Function that finds pixels that are certainly not the object.
         hidden: Pixels in which other things may occlude the object.
     """
-    small = {photo.name: _reduced(photo) for photo in masked.photos}
-    shown = [(camera, mask | _shrunk(hidden.get(name), camera)) for name, (camera, _, mask) in small.items()]
+    small = {photo.name: _reduce_photo(photo) for photo in masked.photos}
+    shown = [(camera, mask | _resize_occlusion(hidden.get(name), camera)) for name, (camera, _, mask) in small.items()]
     hull, cell = _agreed_hull(shown, points)
 
     def make(photo: Photo) -> BoolArray:
         rough = small[photo.name][2] if photo.name in small else None
-        camera, bgr, mask = _reduced(photo, 1 if rough is None else _share(rough))
-        unknown = _shrunk(hidden.get(photo.name), camera)
+        camera, bgr, mask = _reduce_photo(photo, 1 if rough is None else _extent_share(rough))
+        unknown = _resize_occlusion(hidden.get(photo.name), camera)
         silhouette = _silhouette(hull, cell, camera)
         size = float(np.sqrt(np.count_nonzero(silhouette)))
         if size > 0:
-            near = _grown(silhouette, _DOUBT * size)
-            core = ~_grown(~silhouette, _DOUBT * size)
-            free = _free(bare, camera, bgr)
-            mask = _cut(bgr, near, silhouette & (mask | core), core, free, unknown, _DOUBT * size)
-        return _enlarged(mask, photo.camera)
+            near = _dilate(silhouette, _BAND * size)
+            core = ~_dilate(~silhouette, _BAND * size)
+            free = _background_pixels(bare, camera, bgr)
+            mask = _segment(bgr, near, silhouette & (mask | core), core, free, unknown, _BAND * size)
+        return _resize_mask(mask, photo.camera)
 
     return make
 
@@ -294,7 +296,7 @@ def object_points(capture: Capture) -> Float64Array:
     for photo in capture.photos:
         counts[photo.seen] += 1
     points = capture.points[counts >= 3]
-    points = points[(points[:, 2] > _ABOVE * distance) & (np.linalg.norm(points, axis=1) < 0.9 * distance)]
+    points = points[(points[:, 2] > _MIN_HEIGHT * distance) & (np.linalg.norm(points, axis=1) < 0.9 * distance)]
     if len(points) < 20:
         raise InputError(
             f"no object stands out of the table in the photos ({len(points)} points above it): give masks, or take "
@@ -313,14 +315,14 @@ def object_points(capture: Capture) -> Float64Array:
     return np.concatenate([cluster, (low if len(low) >= 5 else cluster) * (1, 1, 0)])
 
 
-def _free(bare: Bare | None, camera: Camera, bgr: ByteImage) -> BoolArray:
+def _background_pixels(bare: Bare | None, camera: Camera, bgr: ByteImage) -> BoolArray:
     """Return the pixels that are certainly not the object, shape (H, W)."""
     if bare is None:
         return np.zeros(bgr.shape[:2], dtype=bool)
     return bare(camera, np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2GRAY), dtype=np.uint8))
 
 
-def _shrunk(hidden: BoolArray | None, camera: Camera) -> BoolArray:
+def _resize_occlusion(hidden: BoolArray | None, camera: Camera) -> BoolArray:
     """Return the possibly occluded pixels in the size of a camera's picture; no pixels if None."""
     if hidden is None:
         return np.zeros((camera.height, camera.width), dtype=bool)
@@ -329,7 +331,7 @@ def _shrunk(hidden: BoolArray | None, camera: Camera) -> BoolArray:
     )
 
 
-def _grab(image: ByteImage, pixels: Float64Array, free: BoolArray, unknown: BoolArray) -> BoolArray:
+def _segment_from_points(image: ByteImage, pixels: Float64Array, free: BoolArray, unknown: BoolArray) -> BoolArray:
     """Segment a BGR image (H, W, 3) by GrabCut from projected object points (N, 2).
 
     Parts of the object without points lie outside the hull of the points. So the undecided band starts at the hull and
@@ -348,17 +350,17 @@ def _grab(image: ByteImage, pixels: Float64Array, free: BoolArray, unknown: Bool
     x, y = pixels[((pixels >= 0) & (pixels < (width, height))).all(axis=1)].astype(np.intp).T
     dots[y, x] = 1
     size = float(np.sqrt(filled.sum()))
-    core = _grown(dots, 0.02 * size) & ~_grown(filled == 0, 0.03 * size)
+    core = _dilate(dots, 0.02 * size) & ~_dilate(filled == 0, 0.03 * size)
     inside = filled > 0
     for _ in range(_EXTENSIONS):
-        near = _grown(inside | (filled > 0), _RING * size)
-        before, inside = inside, _cut(image, near, inside, core, free, unknown, _RING * size)
+        near = _dilate(inside | (filled > 0), _RING * size)
+        before, inside = inside, _segment(image, near, inside, core, free, unknown, _RING * size)
         if np.count_nonzero(inside & ~before) < 0.01 * np.count_nonzero(inside):
             break
     return inside
 
 
-def _cut(
+def _segment(
     image: ByteImage,
     near: BoolArray,
     inside: BoolArray,
@@ -408,7 +410,7 @@ def _agreed_hull(views: Sequence[tuple[Camera, BoolArray]], points: Float64Array
     cell = float((high - low).max()) / _CELLS
     axes = [np.arange(a + cell / 2, b, cell) for a, b in zip(low, high, strict=True)]
     cells = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    most = max(1, round(_DISSENT * len(views)))
+    most = max(1, round(_DISSENT_SHARE * len(views)))
     misses = np.zeros(len(cells), dtype=np.int64)
     seen = np.zeros(len(cells), dtype=np.int64)
     for camera, mask in views:
@@ -432,16 +434,16 @@ def _silhouette(cells: Float64Array, cell: float, camera: Camera) -> BoolArray:
     shown[y, x] = 1
     # Cell centres are at most one edge apart and half an edge inside the outline.
     edge = cell * camera.fx / float(np.median(depths[inside]))
-    return ~_grown(~_grown(shown, edge), edge / 2)
+    return ~_dilate(~_dilate(shown, edge), edge / 2)
 
 
-def _share(mask: BoolArray) -> float:
+def _extent_share(mask: BoolArray) -> float:
     """Return the extent of a mask as a fraction of the longer edge of its picture."""
     shown = np.argwhere(mask)
     return float(np.ptp(shown, axis=0).max() + 1) / max(mask.shape) if len(shown) else 1.0
 
 
-def _reduced(photo: Photo, share: float = 1.0) -> tuple[Camera, ByteImage, BoolArray]:
+def _reduce_photo(photo: Photo, share: float = 1.0) -> tuple[Camera, ByteImage, BoolArray]:
     """Return camera, BGR picture (H, W, 3) and mask (H, W) of a photo, reduced for GrabCut.
 
     Args:
@@ -455,13 +457,13 @@ def _reduced(photo: Photo, share: float = 1.0) -> tuple[Camera, ByteImage, BoolA
     return photo.camera.resized(width, height), bgr, np.zeros((height, width), bool) if mask is None else mask >= 0.5
 
 
-def _enlarged(mask: BoolArray, camera: Camera) -> BoolArray:
+def _resize_mask(mask: BoolArray, camera: Camera) -> BoolArray:
     """Return a mask resampled to the size of the camera."""
     soft = cv2.GaussianBlur(mask.astype(np.float32), (0, 0), 1.0)
     return np.asarray(cv2.resize(soft, (camera.width, camera.height), interpolation=cv2.INTER_CUBIC) >= 0.5)
 
 
-def _grown(mask: npt.NDArray[np.generic], radius: float) -> BoolArray:
+def _dilate(mask: npt.NDArray[np.generic], radius: float) -> BoolArray:
     """Dilate a mask by a disc with a radius of at least one pixel."""
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * max(1, round(radius)) + 1,) * 2)
     return np.asarray(cv2.dilate(mask.astype(np.uint8), disc) > 0)
@@ -478,7 +480,7 @@ def _largest_part(mask: BoolArray) -> BoolArray:
     return parts == 1 + int(stats[1:, cv2.CC_STAT_AREA].argmax()) if count > 1 else mask
 
 
-def _fault(mask: BoolArray, camera: Camera, points: Float64Array | None, hidden: BoolArray | None) -> str | None:
+def _mask_fault(mask: BoolArray, camera: Camera, points: Float64Array | None, hidden: BoolArray | None) -> str | None:
     share = float(mask.mean())
     if share < MIN_SHARE:
         return f"its mask covers only {share:.1%} of it"
@@ -496,7 +498,7 @@ def _fault(mask: BoolArray, camera: Camera, points: Float64Array | None, hidden:
     return None
 
 
-def _save(mask: BoolArray, hidden: BoolArray | None, part: Path) -> None:
+def _save_mask(mask: BoolArray, hidden: BoolArray | None, part: Path) -> None:
     picture = Image.fromarray(np.uint8(255) * mask.astype(np.uint8))
     if hidden is not None:
         picture.putalpha(Image.fromarray(np.uint8(255) * (~hidden).astype(np.uint8)))

@@ -22,17 +22,17 @@ from mitsplat.runtime.cores import usable_cores
 from mitsplat.storage.files import IMAGE_ERRORS, files_below, write_file
 
 SUFFIXES = (".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp")
-_UNREAD = (".arw", ".avif", ".cr2", ".cr3", ".dng", ".heic", ".heif", ".nef")
+_UNSUPPORTED = (".arw", ".avif", ".cr2", ".cr3", ".dng", ".heic", ".heif", ".nef")
 _LOSSY = ("JPEG", "MPO", "WEBP")
 
-_BLURRED = 0.12
+_MIN_SHARPNESS = 0.12
 """Minimum sharpness as a fraction of the median of all photos.
 
 A Gaussian blur of 3 px at 1600 px falls below this limit. Sharp views of one object differ by a factor of up to 2.5 in
 both directions and stay above it.
 """
 
-_CLIPPED = 0.9
+_MAX_CLIPPED = 0.9
 """Fraction of black or white pixels above which a photo is unusable; a white backdrop covers less."""
 
 
@@ -56,7 +56,7 @@ class Prepared:
 
 
 @dataclass(frozen=True)
-class _Judged:
+class _MeasuredPhoto:
     prepared: Prepared
     sharpness: float
     clipped: tuple[float, float]
@@ -77,7 +77,7 @@ def find_photos(folder: Path, *, but: Path | None = None) -> list[Path]:
     found: dict[str, Path] = {}
     for path in files_below(folder, but=but):
         name = path.relative_to(folder).as_posix()
-        if path.suffix.lower() not in SUFFIXES + _UNREAD or not path.is_file() or "/." in f"/{name}":
+        if path.suffix.lower() not in SUFFIXES + _UNSUPPORTED or not path.is_file() or "/." in f"/{name}":
             continue
         other = found.setdefault(stored_name(name, path.suffix.lower()), path)
         if other != path:
@@ -116,7 +116,7 @@ def prepare_photos(
     """
     files = find_photos(folder, but=but)
     out.mkdir(parents=True, exist_ok=True)
-    judged: list[_Judged] = []
+    measured: list[_MeasuredPhoto] = []
     rejected: dict[str, str] = {}
     with ThreadPoolExecutor(usable_cores()) as pool:
         results = pool.map(partial(_prepare, folder=folder, out=out, max_size=max_size, upright=upright), files)
@@ -124,13 +124,13 @@ def prepare_photos(
             if isinstance(result, str):
                 rejected[file.relative_to(folder).as_posix()] = result
             else:
-                judged.append(result)
+                measured.append(result)
             if progress is not None:
                 progress(done, len(files), "reading photos")
-    median = float(np.median([photo.sharpness for photo in judged])) if judged else 0.0
+    median = float(np.median([photo.sharpness for photo in measured])) if measured else 0.0
     good = []
-    for photo in judged:
-        reason = _fault(photo, median)
+    for photo in measured:
+        reason = _photo_fault(photo, median)
         if reason is None:
             good.append(photo.prepared)
         else:
@@ -138,9 +138,9 @@ def prepare_photos(
     return good, rejected
 
 
-def _prepare(path: Path, *, folder: Path, out: Path, max_size: int, upright: bool) -> _Judged | str:
+def _prepare(path: Path, *, folder: Path, out: Path, max_size: int, upright: bool) -> _MeasuredPhoto | str:
     """Make the upright copy of a photo, or return the reason why it cannot be read."""
-    if path.suffix.lower() in _UNREAD:
+    if path.suffix.lower() in _UNSUPPORTED:
         return f"{path.suffix[1:].upper()} files are not read; export it as JPEG or PNG"
     name = path.relative_to(folder).as_posix()
     try:
@@ -177,16 +177,16 @@ def _prepare(path: Path, *, folder: Path, out: Path, max_size: int, upright: boo
     lens = (details.get(ExifTags.Base.Make), details.get(ExifTags.Base.Model), *focal, *rgb.size)
     grey = np.asarray(rgb.convert("L"))
     clipped = (float(np.mean(grey <= 4)), float(np.mean(grey >= 251)))
-    return _Judged(Prepared(name, file, rgb.size, orientation, tuple(map(str, lens))), sharpness(grey), clipped)
+    return _MeasuredPhoto(Prepared(name, file, rgb.size, orientation, tuple(map(str, lens))), sharpness(grey), clipped)
 
 
-def _fault(photo: _Judged, median_sharpness: float) -> str | None:
+def _photo_fault(photo: _MeasuredPhoto, median_sharpness: float) -> str | None:
     black, white = photo.clipped
-    if black > _CLIPPED:
+    if black > _MAX_CLIPPED:
         return f"it is too dark ({black:.0%} of it is black)"
-    if white > _CLIPPED:
+    if white > _MAX_CLIPPED:
         return f"it is too bright ({white:.0%} of it is white)"
-    if photo.sharpness < _BLURRED * median_sharpness:
+    if photo.sharpness < _MIN_SHARPNESS * median_sharpness:
         return f"it is blurred (sharpness {photo.sharpness / median_sharpness:.0%} of the median photo's)"
     return None
 

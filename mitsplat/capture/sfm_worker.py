@@ -81,7 +81,7 @@ def run(job: dict[str, Any], folder: Path) -> None:
     extract(job, images, database, folder)
     match(job, database, folder)
     if job["task"] == "triangulate":
-        say(folder, "triangulating")
+        write_status(folder, "triangulating")
         known = known_model(job["cameras"], database)
         (folder / "known").mkdir(exist_ok=True)
         found = pycolmap.triangulate_points(known, database, images, folder / "known", options=mapping())
@@ -91,14 +91,14 @@ def run(job: dict[str, Any], folder: Path) -> None:
         store(folder, models, agreement(models[0], database) if models else {})
 
 
-def say(folder: Path, doing: str) -> None:
+def write_status(folder: Path, doing: str) -> None:
     """Write the present activity to the file ``status``."""
     part = folder / "status.part"
     part.write_text(doing)
     part.replace(folder / "status")  # atomic, because the parent reads it at any time
 
 
-def number(job: dict[str, Any], images: Path, database: Path) -> None:
+def assign_ids(job: dict[str, Any], images: Path, database: Path) -> None:
     """Assign image ids in the order of the job; photos of a group share a camera.
 
     Several threads store features in arbitrary order. Without this step, ids would differ between runs, and with them
@@ -120,8 +120,8 @@ def number(job: dict[str, Any], images: Path, database: Path) -> None:
 
 def extract(job: dict[str, Any], images: Path, database: Path, folder: Path) -> None:
     """Compute SIFT features of the photos that have none yet."""
-    say(folder, "finding features")
-    number(job, images, database)
+    write_status(folder, "finding features")
+    assign_ids(job, images, database)
     options = pycolmap.FeatureExtractionOptions()
     options.num_threads = usable_cores()  # COLMAP would use all cores; each needs memory for a photo
     options.sift.max_num_features = job["features"]
@@ -139,7 +139,7 @@ def extract(job: dict[str, Any], images: Path, database: Path, folder: Path) -> 
 
 def match(job: dict[str, Any], database: Path, folder: Path) -> None:
     """Compute verified matches of the pairs that have none yet."""
-    say(folder, "matching")
+    write_status(folder, "matching")
     matching = pycolmap.FeatureMatchingOptions()
     matching.num_threads = usable_cores()
     verification = pycolmap.TwoViewGeometryOptions()
@@ -159,14 +159,14 @@ def reconstruct(images: Path, database: Path, folder: Path, enough: int) -> list
 
     The incremental mapper is used. The global mapper is used if it registers more photos.
     """
-    say(folder, "finding cameras")
+    write_status(folder, "finding cameras")
     options = mapping()
     registered = 0
 
     def count() -> None:
         nonlocal registered
         registered += 1
-        say(folder, f"finding cameras {registered}")
+        write_status(folder, f"finding cameras {registered}")
 
     output = folder / "models"
     shutil.rmtree(output, ignore_errors=True)
@@ -175,7 +175,7 @@ def reconstruct(images: Path, database: Path, folder: Path, enough: int) -> list
     models = largest_first(found)
     if models and models[0].num_reg_images() >= enough:
         return models
-    say(folder, "finding cameras at once")
+    write_status(folder, "finding cameras at once")
     copy = folder / "global.db"
     shutil.copyfile(database, copy)  # calibration modifies the two-view geometries
     calibration = pycolmap.ViewGraphCalibrationOptions()

@@ -259,7 +259,7 @@ def _run(
                     if time.monotonic() > until:
                         raise InputError(f"COLMAP did not end within {seconds:.0f} s") from None
                     if progress is not None:
-                        progress(*_reached(job, folder))
+                        progress(*_progress_of(job, folder))
         finally:
             if child.poll() is None:
                 child.kill()
@@ -271,35 +271,35 @@ def _run(
             raise InputError((folder / "error").read_text())
         raise MissingResourceError(
             f"COLMAP ended with {f'signal {-status}' if status < 0 else f'status {status}'} while "
-            f"{_doing(folder) or 'starting'}; its messages are in {folder / 'log.txt'}"
+            f"{_read_status(folder) or 'starting'}; its messages are in {folder / 'log.txt'}"
         )
     with (folder / "model.npz").open("rb") as stored, np.load(stored, allow_pickle=False) as arrays:
         return dict(arrays)
 
 
-def _doing(folder: Path) -> str:
+def _read_status(folder: Path) -> str:
     try:
         return (folder / "status").read_text()
     except OSError:
         return ""
 
 
-def _reached(job: Mapping[str, Any], folder: Path) -> tuple[int, int, str]:
+def _progress_of(job: Mapping[str, Any], folder: Path) -> tuple[int, int, str]:
     """Return the steps done, their total and the present activity."""
-    stage, _, count = _doing(folder).rpartition(" ")
+    stage, _, count = _read_status(folder).rpartition(" ")
     if not count.isdecimal():
-        stage, count = _doing(folder), "0"
+        stage, count = _read_status(folder), "0"
     photos = sum(map(len, job.get("groups", [])))
     if stage == "finding features":
-        return _rows(folder / "database.db", "keypoints"), photos, stage
+        return _count_rows(folder / "database.db", "keypoints"), photos, stage
     if stage == "matching":
         near = photos if job["matching"] == "exhaustive" else 18  # overlap 10 and powers of two up to 512
         pairs = sum(min(place, near) for place in range(photos))
-        return min(_rows(folder / "database.db", "two_view_geometries"), pairs), pairs, stage
+        return min(_count_rows(folder / "database.db", "two_view_geometries"), pairs), pairs, stage
     return min(int(count), photos), photos, stage or "starting COLMAP"
 
 
-def _rows(database: Path, table: str) -> int:
+def _count_rows(database: Path, table: str) -> int:
     try:
         with closing(sqlite3.connect(f"{database.resolve().as_uri()}?mode=ro", uri=True, timeout=0.1)) as connection:
             return int(connection.execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0])

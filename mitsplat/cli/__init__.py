@@ -118,7 +118,7 @@ def main(args: Sequence[str] | None = None) -> None:
             command = python_command(*sys.orig_argv[1:])
             os.execve(command[0], command, python_environment(error.environment))
         status = exit_status(error)
-        typer.echo(f"mitsplat: {fault.tell_fault(error) if status is None else sentence_of(error)}", err=True)
+        typer.echo(f"mitsplat: {fault.report_fault(error) if status is None else sentence_of(error)}", err=True)
         sys.exit(fault.STATUS if status is None else status)
 
 

@@ -20,8 +20,8 @@ from mitsplat.cli.options import (
     Name,
     Seed,
     ShDegree,
+    select_device,
     stage_bar,
-    take_device,
 )
 from mitsplat.errors import InputError
 
@@ -87,7 +87,7 @@ def bake(
         raise InputError(f"--seed must be 0 to {2**32 - 1} (got {seed})")
     settings = BakeSettings(gaussians=gaussians, sh_degree=sh_degree, seed=seed)
     finish = SurfaceFinish(colour=colour, roughness=roughness, metallic=metallic, specular=specular)
-    take_device(device)
+    select_device(device)
     with stage_bar() as progress:
         result = bake_asset(
             mesh,
@@ -182,7 +182,7 @@ def import_(
     )
     if scene is not None:
         check_scene_path(scene, out, known=size is not None or units is not None)
-    take_device(device)
+    select_device(device)
     with stage_bar() as progress:
         result = import_splats(
             file,
@@ -223,11 +223,11 @@ def _check_folder(out: Path, source: Path, name: str | None, *, overwrite: bool)
             raise InputError(f"--out must be a folder (got {'' if place == out else f'{out} below '}the file {place})")
     if not (name or out.resolve().name):
         raise InputError(f"--out must be a folder with a name (got {out})")
-    if source.resolve() in [(out / file).resolve() for file in _WRITTEN]:
-        raise InputError(f"--out must not be a folder where {source} itself would be replaced (got {out})")
-    if not overwrite and (there := [file for file in _WRITTEN if (out / file).exists()]):
-        raise InputError(f"{out / there[0]}: is there already: choose another folder, or --overwrite replaces it")
+    if source.resolve() in [(out / file).resolve() for file in _ASSET_FILES]:
+        raise InputError(f"--out must not be the folder of the input {source}, which would be replaced (got {out})")
+    if not overwrite and (there := [file for file in _ASSET_FILES if (out / file).exists()]):
+        raise InputError(f"{out / there[0]}: already exists: choose another folder, or use --overwrite to replace it")
 
 
-_WRITTEN = ("asset.yaml", "splats.ply", "mesh.ply", "pieces.ply", "report.html")
+_ASSET_FILES = ("asset.yaml", "splats.ply", "mesh.ply", "pieces.ply", "report.html")
 """Files of an asset folder."""

@@ -17,11 +17,11 @@ from mitsplat.cli.options import (
     JsonLog,
     check_ending,
     check_new,
-    check_place,
+    check_output_file,
     command_log,
+    print_device,
     progress_bar,
-    take_device,
-    tell_device,
+    select_device,
 )
 from mitsplat.errors import InputError, PartialResultError
 from mitsplat.quality import PresetName
@@ -132,7 +132,9 @@ def render(
     from mitsplat.runtime.device import find_device
 
     if only is not None and any((frames is not None, shard, engine == "ray", workers is not None, overwrite)):
-        raise InputError("--only makes one image, here: give it without -n, --shard, --engine, --workers, --overwrite")
+        raise InputError(
+            "--only renders one image on this machine: remove -n, --shard, --engine, --workers and --overwrite"
+        )
 
     with command_log(json_log, "render") as progress_bars:
         overrides = _overrides(size=size, seed=seed, quality=quality, formats=formats)
@@ -140,11 +142,11 @@ def render(
             out = Path("out") / (scene.stem if shard is None else f"{scene.stem}-{shard.replace('/', '-of-')}")
         chosen = find_device(device or "cpu") if engine == "local" else None
         if chosen is not None and not json_log:
-            tell_device(chosen)
+            print_device(chosen)
         if scene.suffix == ".xml":
             ignored = engine != "local", overwrite, any_device, workers is not None
             if overrides or any(ignored) or any(given is not None for given in (frames, only, tolerance, shard)):
-                raise InputError(f"{scene}: a Mitsuba scene states size, seed and quality itself; only --out applies")
+                raise InputError(f"{scene}: a Mitsuba scene defines size, seed and quality itself: remove all options except --out")
             from mitsplat.frames.mitsuba_xml import render_apart
 
             typer.echo(f"picture: {render_apart(scene, out, allow_outside=allow_outside, device=chosen)}")
@@ -156,7 +158,7 @@ def render(
 
         part = None if shard is None else Shard.parse(shard)
         if engine != "ray" and (address is not None or resources is not None):
-            raise InputError("--address and --resources are of a cluster: give --engine ray as well")
+            raise InputError("--address and --resources apply to a Ray cluster: add --engine ray")
         cluster = None
         if engine == "ray":
             cluster = Cluster(address, None if resources is None else Cluster.parse_resources(resources))
@@ -164,7 +166,7 @@ def render(
         loaded = load_scene(scene, overrides=overrides, allow_outside=allow_outside)
         if tolerance is not None:
             if quality is not None:
-                raise InputError("--quality and --tolerance both choose the preset: give one of them")
+                raise InputError("--quality and --tolerance both select the preset: give only one")
             from mitsplat.dataset.preflight import refuse, run_faults
             from mitsplat.frames.speed_accuracy import choose_preset
 
@@ -181,7 +183,7 @@ def render(
             typer.echo(f"preset: {best.name} (RMSE {best.rmse:.2g}, {best.seconds:.2f} s an image)")
             loaded = load_scene(scene, overrides=overrides | {"quality": best.name}, allow_outside=allow_outside)
         if only is not None:
-            _remake(loaded, only, out, device if chosen is None else chosen)
+            _render_again(loaded, only, out, device if chosen is None else chosen)
             return
         with progress_bars() as progress:
             summary = write_dataset(
@@ -196,10 +198,10 @@ def render(
                 device=device if chosen is None else chosen,
                 any_device=any_device,
             )
-        _tell_dataset(summary, whole=part is None)
+        _print_summary(summary, whole=part is None)
 
 
-def _remake(scene: Scene, index: int, dataset: Path, device: str | Device | None) -> None:
+def _render_again(scene: Scene, index: int, dataset: Path, device: str | Device | None) -> None:
     """Render one frame again and exit with status 1 if it differs from the frame in the dataset."""
     from mitsplat.dataset.remake import remake_frame
 
@@ -208,10 +210,10 @@ def _remake(scene: Scene, index: int, dataset: Path, device: str | Device | None
     if not made.compared:
         typer.echo(f"not compared: {dataset} has no frame {index}")
     elif not made.differing:
-        typer.echo(f"the same bytes as in {dataset}")
+        typer.echo(f"all files are identical to those in {dataset}")
     else:
-        cause = made.cause or "though both were made from the same"
-        typer.echo(f"not as in {dataset}: {', '.join(made.differing)} ({cause})")
+        cause = made.cause or "although the inputs are identical"
+        typer.echo(f"different from {dataset}: {', '.join(made.differing)} ({cause})")
         raise typer.Exit(1)
 
 
@@ -237,7 +239,7 @@ def merge(
 
     with command_log(json_log, "merge") as progress_bars, progress_bars() as progress:
         summary = merge_shards(shards, out, overwrite=overwrite, progress=progress)
-    _tell_dataset(summary)
+    _print_summary(summary)
 
 
 def split(
@@ -255,11 +257,11 @@ def split(
     from mitsplat.dataset.folds import write_folds
 
     for number, fold in enumerate(write_folds(dataset, folds), start=1):
-        counts = _counts(fold.instances)
+        counts = _format_counts(fold.instances)
         typer.echo(f"fold{number}: validates with {fold.images} images of {fold.layouts} layouts ({counts})")
 
 
-def _tell_dataset(summary: DatasetSummary, *, whole: bool = True) -> None:
+def _print_summary(summary: DatasetSummary, *, whole: bool = True) -> None:
     """Print a summary of a dataset.
 
     Raises:
@@ -267,16 +269,17 @@ def _tell_dataset(summary: DatasetSummary, *, whole: bool = True) -> None:
     """
     images = ", ".join(f"{count} {split}" for split, count in summary.images.items())
     typer.echo(f"dataset: {summary.path} ({images}; {sum(summary.instances.values())} labelled instances)")
-    typer.echo(f"not labelled: {_counts(summary.dropped)}; marked: {_counts(summary.marked)}")
+    typer.echo(f"not labelled: {_format_counts(summary.dropped)}; marked: {_format_counts(summary.marked)}")
     if summary.incomplete:
         typer.echo(
-            f"layouts that lack objects which did not come to rest: {summary.incomplete} ({_counts(summary.left_out)})"
+            f"layouts without objects that did not come to rest: {summary.incomplete} "
+            f"({_format_counts(summary.left_out)})"
         )
     typer.echo(f"contact sheet: {summary.contact_sheet}")
     if summary.unlabelled and whole:
         raise PartialResultError(
-            f"{summary.path}: no image has a label (not labelled: {_counts(summary.dropped)}); "
-            "`mitsplat check` and `mitsplat preview` show what the cameras see"
+            f"{summary.path}: no image has a label (not labelled: {_format_counts(summary.dropped)}); "
+            "run `mitsplat check` and `mitsplat preview` to see the view of the cameras"
         )
 
 
@@ -312,10 +315,10 @@ def chart(
     from mitsplat.frames.speed_accuracy import cheapest, check_tolerance, draw_chart, measure_steps, write_csv
     from mitsplat.runtime.device import find_device
 
-    check_place(out, ".png")
+    check_output_file(out, ".png")
     check_tolerance(tolerance)
     chosen = find_device(device)
-    tell_device(chosen)
+    print_device(chosen)
     with progress_bar() as progress:
         rows = measure_steps(
             scene,
@@ -335,7 +338,7 @@ def chart(
             name, f"{row.seconds:.2f}", *errors, f"{row.ssim:.4f}", f"{row.mask_iou:.4f}", f"{row.memory:.2f}"
         )
     Console(width=110).print(table)
-    typer.echo(f"* the cheapest preset within {tolerance:g}")
+    typer.echo(f"* fastest preset with an error of at most {tolerance:g}")
     write_csv(rows, out.with_suffix(".csv"))
     draw_chart(rows, out, title=f"{scene.name}: {frames} images", tolerance=tolerance)
     typer.echo(f"chart: {out}, {out.with_suffix('.csv')}")
@@ -352,8 +355,10 @@ def audit(dataset: DatasetFolder) -> None:
     for file, text in found.violations:
         typer.echo(f"{file}: {text}")
     typer.echo(f"{found.frames} frames, {found.instances} instances, {found.files} files")
-    typer.echo(f"not labelled: {_counts(found.dropped)}; marked: {_counts(found.marked)}")
-    typer.echo(f"polygons below an IoU of {POLYGON_IOU} (masks in parts, over {POLYGON_AREA} px): {found.low_polygons}")
+    typer.echo(f"not labelled: {_format_counts(found.dropped)}; marked: {_format_counts(found.marked)}")
+    typer.echo(
+        f"polygons with IoU < {POLYGON_IOU} (masks of several parts, over {POLYGON_AREA} px): {found.low_polygons}"
+    )
     typer.echo(f"violations: {len(found.violations)}")
     raise typer.Exit(1 if found.violations else 0)
 
@@ -394,7 +399,7 @@ def preview(
     allow_outside: AllowOutside = False,
 ) -> None:
     """Render one frame of SCENE, with its layers side by side."""
-    check_place(out, ".png", ".jpg", ".jpeg")
+    check_output_file(out, ".png", ".jpg", ".jpeg")
     from PIL import Image
 
     from mitsplat.dataset.preflight import count_faults, image_faults, layout_faults, refuse
@@ -405,7 +410,7 @@ def preview(
 
     loaded = load_scene(scene, overrides=_overrides(size=size, seed=seed, quality=quality), allow_outside=allow_outside)
     refuse(loaded, chain(count_faults(loaded), layout_faults(loaded), image_faults(loaded)))
-    take_device(device)
+    select_device(device)
     rendered = render_frame(loaded, frame)
     picture = Image.fromarray(layer_sheet(rendered) if layers else rendered.image)
     write_file(out, lambda part: picture.save(part, "PNG" if out.suffix.lower() == ".png" else "JPEG"))
@@ -444,15 +449,15 @@ def view(
     if gaussians < 1:
         raise InputError(f"--gaussians must be at least 1 (got {gaussians})")
     if find_spec("viser") is None:
-        raise MissingResourceError("the view needs viser: pip install 'mitsplat[view]'")
+        raise MissingResourceError("the viewer requires viser: pip install 'mitsplat[view]'")
     from mitsplat.view import Address, serve
 
     def tell(url: str) -> None:
-        typer.echo(f"view: {url}  (Ctrl-C ends it)")
+        typer.echo(f"view: {url}  (Ctrl-C stops it)")
         if browser:
             typer.launch(url)
 
-    take_device(device)
+    select_device(device)
     serve(path, Address(host, port), gaussians=gaussians, allow_outside=allow_outside, ready=tell)
 
 
@@ -472,7 +477,7 @@ def settle(
 
     Settled layouts are cached, so that a later `mitsplat render` does not settle them again.
     """
-    check_place(out, ".gif")
+    check_output_file(out, ".gif")
     from rich.console import Console
 
     from mitsplat.dataset.preflight import count_faults, layout_faults, refuse
@@ -516,7 +521,7 @@ def export(
     check_new(out, ".xml", overwrite=overwrite)
     files = out.with_name(f"{out.stem}_files")
     if files.exists() and not overwrite and not (files.is_dir() and not any(files.iterdir())):
-        raise InputError(f"--out needs a new folder beside it, {files} (it is there); --overwrite replaces its files")
+        raise InputError(f"--out {out}: the folder {files} must not exist yet; --overwrite replaces its files")
     from mitsplat.frames.mitsuba_xml import export_xml
     from mitsplat.scene.loading.scene_loading import load_scene
 
@@ -541,7 +546,7 @@ def doctor() -> None:
     """
     from mitsplat.checks.doctor import examine
 
-    _tell_findings(examine(), "FAIL")
+    _print_findings(examine(), "FAIL")
 
 
 def check(
@@ -556,10 +561,10 @@ def check(
     """
     from mitsplat.checks.path_checks import check_path
 
-    _tell_findings(check_path(path, allow_outside=allow_outside), "look")
+    _print_findings(check_path(path, allow_outside=allow_outside), "look")
 
 
-def _tell_findings(findings: Iterable[Finding], mark: str) -> NoReturn:
+def _print_findings(findings: Iterable[Finding], mark: str) -> NoReturn:
     """Print one line per finding, with its remedy if there is a problem, and exit with status 0 or 1."""
     good = True
     for finding in findings:
@@ -570,7 +575,7 @@ def _tell_findings(findings: Iterable[Finding], mark: str) -> NoReturn:
     raise typer.Exit(0 if good else 1)
 
 
-def _counts(counts: Mapping[str, int]) -> str:
+def _format_counts(counts: Mapping[str, int]) -> str:
     return ", ".join(f"{count} {reason}" for reason, count in counts.items() if count) or "none"
 
 
@@ -591,6 +596,6 @@ def _overrides(
     if formats is not None:
         names = [name.strip() for name in formats.split(",")]
         if unknown := [name for name in names if name not in FORMATS]:
-            raise InputError(f"--format must be among {', '.join(FORMATS)} (got {unknown[0]})")
+            raise InputError(f"--format must be one or more of {', '.join(FORMATS)} (got {unknown[0]})")
         overrides["output.formats"] = names
     return {key: value for key, value in overrides.items() if value is not None}

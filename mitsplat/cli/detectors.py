@@ -99,7 +99,7 @@ def train(
         run = train_detector(datasets, out, settings, real=real, overwrite=overwrite, progress=progress)
     done = run.record["finished"]
     if run.was_finished:
-        typer.echo(f"run: {run.path} is finished already ({done['steps']} steps); --overwrite trains again")
+        typer.echo(f"run: {run.path} is already finished ({done['steps']} steps); --overwrite trains again")
     else:
         resumed = f", resumed at step {done['resumed_at_step']}" if done["resumed_at_step"] else ""
         typer.echo(
@@ -140,11 +140,11 @@ def evaluate(
         found = evaluate_detector(run, data, out, split=split, size=size, device=device, progress=progress)
     kinds = {kind: words for kind, words in (("box", "boxes"), ("mask", "masks")) if kind in found.results}
     for kind, words in kinds.items():
-        typer.echo(f"{words}: {_scores(found.results[kind])}")
+        typer.echo(f"{words}: {_format_scores(found.results[kind])}")
     for name, count in found.results["data"]["instances"].items():
         scores = {words: found.results[kind]["classes"].get(name) for kind, words in kinds.items()}
-        told = [f"{score['ap50_95']:.3f} ({words})" for words, score in scores.items() if score]
-        typer.echo(f"  {name}: {count} labelled" + (f", AP50-95 {', '.join(told)}" if told else ""))
+        texts = [f"{score['ap50_95']:.3f} ({words})" for words, score in scores.items() if score]
+        typer.echo(f"  {name}: {count} labelled" + (f", AP50-95 {', '.join(texts)}" if texts else ""))
     typer.echo(f"report: {found.page}")
 
 
@@ -180,41 +180,43 @@ def compare(
         found = compare_with_photographs(datasets, photographs, split=split, size=size, most=images, progress=progress)
     typer.echo(f"{found.images} rendered images, {found.photographs} photographs; 5 %, median and 95 %:")
     for trait in found.traits:
-        _tell(trait.name, trait)
+        _print_trait(trait.name, trait)
     for name, traits in found.classes.items():
         for trait in traits:
             if trait.advice:
-                _tell(f"{name}: {trait.name}", trait)
+                _print_trait(f"{name}: {trait.name}", trait)
     if found.hues:
         turned = sorted(found.hues.values())
         typer.echo(
-            f"hues of {len(turned)} classes: photographs' are turned by {turned[0]:+.0f} to {turned[-1]:+.0f} degrees, "
-            f"{statistics.median(turned):+.0f} in the median"
+            f"hues of {len(turned)} classes: photographs differ by {turned[0]:+.0f} to {turned[-1]:+.0f} degrees, "
+            f"median {statistics.median(turned):+.0f}"
         )
         if found.hue_advice:
             typer.echo(f"  {found.hue_advice}")
     if found.same_size is not None:
         typer.echo(
-            f"objects are about as large on photographs of {found.same_size} px as on rendered images of {size} px: "
+            f"objects in photographs of {found.same_size} px are as large as in rendered images of {size} px: "
             f"`mitsplat evaluate --size {found.same_size}`"
             + (f", `mitsplat train --size {size} --real-size {found.same_size}`" if found.same_size > size else "")
         )
     if out is not None:
         write_text(out, json.dumps(asdict(found), indent=1) + "\n")
-        typer.echo(f"measured: {out}")
+        typer.echo(f"measurements: {out}")
 
 
-def _tell(name: str, trait: Trait) -> None:
+def _print_trait(name: str, trait: Trait) -> None:
     sides = "; ".join(
         f"{words} {values[0]:.0f} {values[1]:.0f} {values[2]:.0f}"
         for words, values in (("rendered", trait.rendered), ("photographs", trait.real))
     )
     typer.echo(f"{name}{f' [{trait.unit}]' if trait.unit else ''}: {sides}")
     if trait.advice:
-        typer.echo(f"  {trait.below:.0%} of photographs' have less, {trait.above:.0%} more: {trait.advice}")
+        typer.echo(
+            f"  photographs: {trait.below:.0%} below, {trait.above:.0%} above the rendered range: {trait.advice}"
+        )
 
 
-def _scores(score: dict[str, Any]) -> str:
+def _format_scores(score: dict[str, Any]) -> str:
     if score["map50"] is None:
-        return "nothing but crowds is labelled"
+        return "no labels except crowds"
     return f"mAP50-95 {score['map50_95']:.3f}, mAP50 {score['map50']:.3f}"

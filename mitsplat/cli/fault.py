@@ -22,7 +22,7 @@ STATUS = 70
 VARIABLE = "MITSPLAT_TRACEBACK"
 """Environment variable that prints the traceback to stderr."""
 
-_LONGEST = 200
+_MAX_LENGTH = 200
 _FOLDERS: tuple[Callable[[], Path], ...] = (
     lambda: cache_folder() / "logs",
     lambda: Path(tempfile.gettempdir()),
@@ -30,7 +30,7 @@ _FOLDERS: tuple[Callable[[], Path], ...] = (
 )
 
 
-def tell_fault(error: BaseException) -> str:
+def report_fault(error: BaseException) -> str:
     """Return one sentence about an unexpected error, and write its traceback to a log file.
 
     The traceback includes that of the worker process in which the error occurred.
@@ -40,21 +40,21 @@ def tell_fault(error: BaseException) -> str:
         sys.stderr.write(text)
     lines = str(error).strip().splitlines()
     what = f"{type(error).__name__}: {lines[0]}" if lines else type(error).__name__
-    if len(what) > _LONGEST:
-        what = f"{what[: _LONGEST - 3]}..."
-    log = _keep(f"{_circumstances()}\n{text}")
-    where = f"set {VARIABLE}=1 to see where" if log is None else f"the log is {log}"
-    return f"this is a fault of mitsplat, not of what it was given: {what} ({where})"
+    if len(what) > _MAX_LENGTH:
+        what = f"{what[: _MAX_LENGTH - 3]}..."
+    log = _write_log(f"{_environment_text()}\n{text}")
+    where = f"set {VARIABLE}=1 to print the traceback" if log is None else f"the log is {log}"
+    return f"internal error of mitsplat, not caused by the input: {what} ({where})"
 
 
-def _circumstances() -> str:
+def _environment_text() -> str:
     return (
         f"mitsplat {__version__}, Python {platform.python_version()}, {platform.platform()}\n"
         f"{time.strftime('%Y-%m-%d %H:%M:%S %z')} in {os.environ.get('PWD', '')}\n{shlex.join(sys.argv)}\n"
     )
 
 
-def _keep(text: str) -> Path | None:
+def _write_log(text: str) -> Path | None:
     """Write the text to a new file in the first writable folder; return its path, or None if no folder is writable."""
     for folder in _FOLDERS:
         with suppress(OSError, RuntimeError):  # RuntimeError: there is no home folder

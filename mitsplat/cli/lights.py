@@ -17,8 +17,8 @@ from mitsplat.errors import InputError
 if TYPE_CHECKING:
     from mitsplat.capture.lighting import LightEstimate
 
-_MIRROR = (1.0, 1.0, 1.0)
-_WHITE = math.pi
+_PERFECT_MIRROR = (1.0, 1.0, 1.0)
+_WHITE_IRRADIANCE = math.pi
 """Irradiance at which white paper has the radiance 1, that is display white [W/m^2]."""
 
 
@@ -51,7 +51,7 @@ def lights(
     ] = None,
     reflectivity: Annotated[
         tuple[float, float, float], typer.Option(metavar="R G B", help="Reflectance of the ball, > 0 to 1.")
-    ] = _MIRROR,
+    ] = _PERFECT_MIRROR,
     rotate_z: Annotated[float, typer.Option(help="Rotation of the panorama about the vertical [degrees].")] = 0.0,
     around: Annotated[
         tuple[float, float, float],
@@ -99,39 +99,39 @@ def lights(
     if camera is None:
         if len(images) > 1 or images[0].suffix.lower() not in HDR_SUFFIXES:
             raise InputError(
-                f"{images[-1]}: without --camera there must be one HDR panorama, {', '.join(HDR_SUFFIXES)}; give "
-                "--camera AZIMUTH ELEVATION for photographs of a mirror ball"
+                f"{images[-1]}: must be the only input and an HDR panorama, {', '.join(HDR_SUFFIXES)}; for photographs "
+                "of a mirror ball, add --camera AZIMUTH ELEVATION"
             )
-        if ball is not None or fov_x is not None or exposures is not None or reflectivity != _MIRROR:
+        if ball is not None or fov_x is not None or exposures is not None or reflectivity != _PERFECT_MIRROR:
             raise InputError(
-                "--ball, --fov-x, --exposures and --reflectivity are of photographs of a mirror ball: give --camera"
+                "--ball, --fov-x, --exposures and --reflectivity apply to photographs of a mirror ball: add --camera"
             )
     elif rotate_z:
-        raise InputError(f"--rotate-z is of panoramas: the ball's is turned by --camera (got {rotate_z:g})")
+        raise InputError(f"--rotate-z applies to panoramas; for a mirror ball, use --camera (got {rotate_z:g})")
     elif irradiance is None and images[0].suffix.lower() not in HDR_SUFFIXES:
-        irradiance = _WHITE
+        irradiance = _WHITE_IRRADIANCE
     settings = LightSettings(around, distance, lamps, rest, rotate_z, irradiance)
     if camera is None:
         panorama = read_panorama(images[0])
     else:
-        times = None if exposures is None else _times(exposures)
+        times = None if exposures is None else _parse_times(exposures)
         view = BallView(*camera, ball=ball, fov_x=fov_x, exposures=times, reflectivity=reflectivity)
         found = read_ball(images, view)
         panorama, photograph = found.panorama.radiance, found.picture
         x, y, radius = found.ball
         typer.echo(
-            f"ball: {x:.0f} {y:.0f} {radius:.0f} px; {found.panorama.blind:.0f} degrees around what is behind it "
-            "are not seen and have the mean of their surroundings"
+            f"ball: {x:.0f} {y:.0f} {radius:.0f} px; {found.panorama.blind:.0f} degrees around its rear are not "
+            "visible and are filled with the mean of a ring around them"
         )
         for warning in found.warnings:
             typer.echo(f"warning: {warning}")
     estimate = estimate_light(panorama, settings)
     files = write_light(estimate, out, photograph)
-    _tell(estimate)
+    _print_lamps(estimate)
     typer.echo(f"lights: {', '.join(str(file) for file in files)}")
 
 
-def _tell(estimate: LightEstimate) -> None:
+def _print_lamps(estimate: LightEstimate) -> None:
     """Print a table of the lamps."""
     if estimate.lamps:
         typer.echo("lamp  azimuth  elevation  size            radiance  colour            share of irradiance")
@@ -146,7 +146,7 @@ def _tell(estimate: LightEstimate) -> None:
     typer.echo(f"ambient: {estimate.share(estimate.ambient):.1%}")
 
 
-def _times(text: str) -> tuple[float, ...]:
+def _parse_times(text: str) -> tuple[float, ...]:
     """Parse exposure times such as 1/60,0.5,2."""
     times = []
     for part in text.split(","):

@@ -52,31 +52,31 @@ def check_ending(out: Path | None, *endings: str) -> None:
         raise InputError(f"--out must end in {' or '.join(endings)} (got {out})")
 
 
-def check_place(out: Path, *endings: str) -> None:
+def check_output_file(out: Path, *endings: str) -> None:
     """Raise InputError if the output file has none of the given endings or its folder does not exist."""
     check_ending(out, *endings)
     if not out.parent.is_dir():
-        raise InputError(f"--out must be in a folder that exists (got {out})")
+        raise InputError(f"--out must be in an existing folder (got {out})")
 
 
 def check_new(out: Path, *endings: str, overwrite: bool) -> None:
     """Raise InputError if the output file has none of the given endings, or exists and must not be replaced."""
     check_ending(out, *endings)
     if out.exists() and not (overwrite and out.is_file()):
-        raise InputError(f"--out must be a new file (got {out}); --overwrite replaces one")
+        raise InputError(f"--out must be a new file (got {out}); --overwrite replaces an existing one")
 
 
-def take_device(name: str) -> None:
+def select_device(name: str) -> None:
     """Select the device for all later computation and print the reason for the choice of ``auto``."""
     from mitsplat.runtime.device import use_device  # most commands do not need it
 
-    tell_device(use_device(name))
+    print_device(use_device(name))
 
 
-def tell_device(device: Device) -> None:
+def print_device(device: Device) -> None:
     """Print in one line the device that ``auto`` selected, and the reason."""
     if device.reason:
-        typer.echo(f"device: {device}, as {device.reason}", err=True)
+        typer.echo(f"device: {device}, because {device.reason}", err=True)
 
 
 @contextmanager
@@ -101,14 +101,14 @@ def command_log(
         yield lambda: progress_bar(unit)
         return
 
-    def tell(event: str, **details: Any) -> None:
+    def emit(event: str, **details: Any) -> None:
         line = json.dumps({"time": round(time.time(), 3), "command": command, "event": event, **details})
         typer.echo(line, err=True)
 
     def progress(done: int, total: int, doing: str) -> None:
-        tell("progress", done=done, total=total, doing=doing)
+        emit("progress", done=done, total=total, doing=doing)
 
-    tell("started")
+    emit("started")
     try:
         yield lambda: nullcontext(progress)
     except BaseException as error:
@@ -116,13 +116,18 @@ def command_log(
         if isinstance(error, typer.Exit) or (status is None and not isinstance(error, Exception)):
             raise
         if status == 130:
-            tell("failed", status=130, error=type(error).__name__, message="interrupted: run again to go on")
+            emit(
+                "failed",
+                status=130,
+                error=type(error).__name__,
+                message="interrupted: run the command again to continue",
+            )
             raise
-        sentence = fault.tell_fault(error) if status is None else sentence_of(error)
+        sentence = fault.report_fault(error) if status is None else sentence_of(error)
         status = fault.STATUS if status is None else status
-        tell("failed", status=status, error=type(error).__name__, message=sentence)
+        emit("failed", status=status, error=type(error).__name__, message=sentence)
         raise typer.Exit(status) from error
-    tell("finished", status=0)
+    emit("finished", status=0)
 
 
 @contextmanager
@@ -171,18 +176,18 @@ def stage_bar(unit: str = "%/s") -> Iterator[Progress]:
         with progress_bar(unit) as bar:
             yield bar
         return
-    stage, begun, told, first = "", 0.0, 0.0, 0
+    stage, stage_start, last_report, first = "", 0.0, 0.0, 0
 
-    def tell(done: int, total: int, doing: str) -> None:
-        nonlocal stage, begun, told, first
+    def emit(done: int, total: int, doing: str) -> None:
+        nonlocal stage, stage_start, last_report, first
         now, left = time.monotonic(), ""
         if doing.partition(":")[0] != stage:
-            stage, begun, first = doing.partition(":")[0], now, done
-        elif now - told >= 60 and done > first:
-            left = f", {(now - begun) * (total - done) / (done - first):.0f} s left"
+            stage, stage_start, first = doing.partition(":")[0], now, done
+        elif now - last_report >= 60 and done > first:
+            left = f", {(now - stage_start) * (total - done) / (done - first):.0f} s left"
         else:
             return
-        told = now
+        last_report = now
         typer.echo(f"{100 * done // total:3d} %: {doing}{left}", err=True)
 
-    yield tell
+    yield emit

@@ -23,8 +23,8 @@ from mitsplat.cli.options import (
     ShDegree,
     check_new,
     progress_bar,
+    select_device,
     stage_bar,
-    take_device,
 )
 from mitsplat.errors import InputError, PartialResultError
 
@@ -170,17 +170,17 @@ def fit(
     from mitsplat.fit.trainer import FitProgress, FitSettings, fit_capture
 
     if depths is not None and depth_model is not None:
-        raise InputError("depth maps come from a folder or from a network: give --depths or --depth-model")
+        raise InputError("--depths and --depth-model both define the depth maps: give only one")
     mapped = depths is not None or depth_model is not None
     if depth_kind != "inverse" and not mapped:
-        raise InputError(f"--depth-kind {depth_kind} is of depth maps: give --depths or --depth-model")
+        raise InputError(f"--depth-kind {depth_kind} requires depth maps: add --depths or --depth-model")
     if depth == 0 and mapped:
-        raise InputError("depth maps are of no use with --depth 0: leave them out, or give them weight")
+        raise InputError("--depth 0 disables depth maps: remove --depths or --depth-model, or increase --depth")
     settings = FitSettings(
         gaussians=gaussians,
         densification=densification,
         iterations=iterations,
-        budget=None if budget is None else _seconds(budget),
+        budget=None if budget is None else _parse_duration(budget),
         target_psnr=target_psnr,
         size=edge,
         sh_degree=sh_degree,
@@ -191,7 +191,7 @@ def fit(
         seed=seed,
     )
     loaded = Capture.load(capture)
-    take_device(device)
+    select_device(device)
     maps = None if depths is None else find_maps(depths, loaded.training, depth_kind)
     if depth_model is not None:
         with progress_bar("photos/s") as show:
@@ -215,11 +215,11 @@ def fit(
     )
     reached = result.validation_psnr
     if target_psnr is not None and reached is not None:
-        typer.echo(f"target: {reached:.2f} dB on {len(result.validation)} photos set aside for it")
+        typer.echo(f"target: {reached:.2f} dB on {len(result.validation)} validation photos")
         if reached < target_psnr:
             raise PartialResultError(
-                f"{out}: PSNR must reach {target_psnr:.2f} dB (got {reached:.2f}); more iterations or Gaussians, or "
-                "more photos with overlap and even light, would help"
+                f"{out}: PSNR must reach {target_psnr:.2f} dB (got {reached:.2f}); use more iterations or "
+                "Gaussians, or more photos with overlap and even light"
             )
 
 
@@ -260,7 +260,7 @@ def capture(
     settings = replace(
         _capture_settings(kind, frames, scale_from, poses, masks, mask_model, pick, pick_not, box),
         max_size=max_size,
-        board=_board(squares, square),
+        board=_parse_board(squares, square),
         tag=tag,
         metric=metric,
         undistorted=undistort,
@@ -300,7 +300,7 @@ def board(
     Place the object on the board or beside it. `mitsplat capture` then finds the scale in metres and the vertical.
     """
     check_new(out, ".pdf", overwrite=overwrite)
-    _board(squares, square).write_pdf(out, paper)
+    _parse_board(squares, square).write_pdf(out, paper)
     typer.echo(f"board: {out} (print at 100 %, then measure a square and give it to `mitsplat capture --square`)")
 
 
@@ -356,7 +356,7 @@ def mesh(
     from mitsplat.surroundings import make_surroundings
 
     if take is None and (normalisation is not None or units is not None):
-        raise InputError("--normalisation and --units say where an imported mesh belongs: give --import as well")
+        raise InputError("--normalisation and --units apply to an imported mesh: add --import")
     imported = None
     if take is not None:
         matrix = None if normalisation is None else invert_transform(normalisation)
@@ -371,11 +371,11 @@ def mesh(
         remove=tuple(remove or ()),
         delight=delight,
     )
-    take_device(device)
+    select_device(device)
     with stage_bar("steps/s") as progress:
         make = make_asset if kind == "object" else make_surroundings
         done = make(capture, splats, out, job, progress=progress)
-    _tell_asset(done)
+    _print_result(done)
 
 
 def asset(
@@ -436,7 +436,7 @@ def asset(
         remove=tuple(remove or ()),
         delight=delight,
     )
-    take_device(device)
+    select_device(device)
     with stage_bar("steps/s") as progress:
         done = make(
             photos,
@@ -446,14 +446,14 @@ def asset(
             fit=FitSettings(
                 gaussians=gaussians if gaussians is not None else 60_000 if whole else 30_000,
                 iterations=iterations,
-                budget=None if budget is None else _seconds(budget),
+                budget=None if budget is None else _parse_duration(budget),
                 masks="off" if whole else "alpha",
                 size=edge,
                 seed=seed,
             ),
             progress=progress,
         )
-    _tell_asset(done)
+    _print_result(done)
 
 
 def _capture_settings(
@@ -483,7 +483,7 @@ def _capture_settings(
     )
 
 
-def _board(squares: str, square: float) -> Board:
+def _parse_board(squares: str, square: float) -> Board:
     from mitsplat.capture.boards.targets import Board
 
     columns, _, rows = squares.lower().partition("x")
@@ -492,13 +492,13 @@ def _board(squares: str, square: float) -> Board:
     return Board(int(columns), int(rows), square)
 
 
-def _tell_asset(done: AssetResult) -> None:
+def _print_result(done: AssetResult) -> None:
     """Print the result of making an asset.
 
     Raises:
         PartialResultError: If the asset misses a threshold (exit status 4).
     """
-    found, kept = done.verdict, " (kept: nothing it is made of has changed)" if done.kept else ""
+    found, kept = done.verdict, " (reused: the inputs have not changed)" if done.kept else ""
     closed = "watertight" if found.watertight else "open"
     typer.echo(f"asset: {done.folder}{kept}")
     for warning in done.warnings:
@@ -524,7 +524,7 @@ def _tell_asset(done: AssetResult) -> None:
         raise PartialResultError(f"{done.folder}: {done.shortcoming}")
 
 
-def _seconds(text: str) -> float:
+def _parse_duration(text: str) -> float:
     """Return the time [s] of a text such as 90s, 10min or 1h."""
     for suffix, factor in (("min", 60.0), ("h", 3600.0), ("s", 1.0)):
         if text.endswith(suffix):

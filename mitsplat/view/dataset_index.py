@@ -115,11 +115,11 @@ class DatasetIndex:
             raise InputError(f"{path}: must be a readable image of {width}x{height} px")
         image = np.ascontiguousarray(stored[..., ::-1], dtype=np.uint8)
         labels = Labels.from_json(record["labels"])
-        told = ", ".join(
+        texts = ", ".join(
             f"{label.class_name} {label.visible_fraction:.0%}{''.join(f' {mark}' for mark in label.marks)}"
             for label in labels.instances
         )
-        caption = f"frame {index}, {record['split']}: {told or 'no labels'}"
+        caption = f"frame {index}, {record['split']}: {texts or 'no labels'}"
         if overlay == "labels":
             return caption, draw_labels(image, labels)
         return caption, _draw_silhouettes(image, labels) if overlay == "silhouettes" else image

@@ -52,22 +52,24 @@ class ScenePage:
     def __init__(self, page: Page, path: Path, *, allow_outside: bool = False) -> None:
         self._page, self._path, self._allow_outside = page, path, allow_outside
         self._scene = load_scene(path, allow_outside=allow_outside)
-        self._seen = _content(path)
-        self._turn = threading.RLock()
+        self._content_read = _content(path)
+        self._lock = threading.RLock()
         self._index = 0
         self._pose: Float64Array | None = None
-        self._looked: list[Float64Array] = []
+        self._page_poses: list[Float64Array] = []
         self._lights: dict[int, LightSpec] = {}
         self._layout: Layout | None = None
         self._cameras: tuple[Any, list[ShownPart]] = (None, [])
         self._playing = False
         self._fault: str | None = None
-        self._asked: ViewRequest | None = None
+        self._last_request: ViewRequest | None = None
         self._preview: tuple[ViewRequest, Preview] | None = None
         self._renders = SceneRenders(lambda text: page.caption(f"{text} …"))
-        self._worker: NewestFirst[_Request, Layout | Preview] = NewestFirst(self._work, self._tell, self._refuse)
+        self._worker: NewestFirst[_Request, Layout | Preview] = NewestFirst(
+            self._process, self._handle_result, self._handle_error
+        )
         self._make_controls()
-        self._ask()
+        self._request_render()
         self._show(None)
         self._look(plan_frame(self._scene, 0).camera)
         page.on_click(self._look_at_frame)
@@ -81,31 +83,31 @@ class ScenePage:
         """Read the file again if it has changed, and raise errors of the render thread."""
         self._worker.check()
         content = _content(self._path)
-        if content == self._seen:
+        if content == self._content_read:
             return
-        self._seen = content
+        self._content_read = content
         try:
             scene = load_scene(self._path, allow_outside=self._allow_outside)
         except InputError as error:
             self._fault = str(error)
             self._page.alert(self._fault)
             return
-        with self._turn:
+        with self._lock:
             self._fault = None
-            self._take(scene)
+            self._replace_scene(scene)
 
-    def _take(self, scene: Scene) -> None:
+    def _replace_scene(self, scene: Scene) -> None:
         """Replace the displayed scene."""
         self._page.alert(self._fault)
         self._scene, self._layout, self._lights = scene, None, {}
-        self._looked.clear()
+        self._page_poses.clear()
         self._index = min(self._index, scene.num_frames - 1)
         self._frame.max = max(scene.num_frames - 1, 1)
         self._frame.value = self._index
         self._seed.value = seed_line(scene.spec.seed)
         self._light.options = self._light_names()
-        self._plain.visible = _draws_looks(scene)
-        self._ask()
+        self._plain.visible = _varies_appearance(scene)
+        self._request_render()
 
     # Actions of the browser
 
@@ -121,7 +123,7 @@ class ScenePage:
             self._layer = gui.add_dropdown("layer", LAYERS)
             self._finest = gui.add_dropdown("sharpen to", tuple(PRESETS), initial_value="exact")
             self._width = gui.add_dropdown("width [px]", _WIDTHS, initial_value="640")
-            self._plain = gui.add_markdown(_PLAIN, visible=_draws_looks(scene))
+            self._plain = gui.add_markdown(_PLAIN, visible=_varies_appearance(scene))
         with gui.add_folder("Camera", expand_by_default=False):
             back = gui.add_button("Back to the frame's camera")
             self._camera_yaml = gui.add_text("YAML", "", multiline=True)
@@ -139,8 +141,8 @@ class ScenePage:
         again.on_click(lambda _: self._drop_again())
         play.on_click(lambda _: self._play())
         self._layer.on_update(lambda _: self._show_preview())
-        self._finest.on_update(lambda _: self._ask())
-        self._width.on_update(lambda _: self._ask())
+        self._finest.on_update(lambda _: self._request_render())
+        self._width.on_update(lambda _: self._request_render())
         back.on_click(lambda _: self._look_at_frame(self._index, anew=True))
         self._light.on_update(lambda _: self._choose_light())
         self._position.on_update(lambda _: self._move_light(position=self._position.value))
@@ -150,51 +152,51 @@ class ScenePage:
 
     def _look_at_frame(self, index: int, *, anew: bool = False) -> None:
         """Move the view to the camera of a frame, as soon as the layout is known, which can determine the camera."""
-        with self._turn:
+        with self._lock:
             index = min(max(int(index), 0), self._scene.num_frames - 1)
             if index == self._index and not anew and self._pose is None:
                 return
             if index // self._views != self._index // self._views:
                 self._layout = None
             self._index, self._pose = index, None
-            self._looked.clear()
+            self._page_poses.clear()
             self._frame.value = index
-            self._ask()
+            self._request_render()
 
     def _step(self, layouts: int) -> None:
         self._look_at_frame(self._index + layouts * self._views)
 
     def _drop_again(self) -> None:
-        with self._turn:
-            self._take(reseeded(self._scene, self._scene.spec.seed + 1))
+        with self._lock:
+            self._replace_scene(reseeded(self._scene, self._scene.spec.seed + 1))
 
     def _play(self) -> None:
-        with self._turn:
+        with self._lock:
             self._playing = True
-            self._ask()
+            self._request_render()
 
     def _moved(self, camera: Any) -> None:
         """Handle a moved view of a browser; it is a manual move unless the view equals the camera of the frame."""
-        with self._turn:
+        with self._lock:
             pose = np.eye(4)
             pose[:3, :3] = Rotation.from_quat(camera.wxyz, scalar_first=True).as_matrix()
             pose[:3, 3] = camera.position
-            ours = [np.allclose(pose, own, atol=1e-4) for own in self._looked]
+            ours = [np.allclose(pose, own, atol=1e-4) for own in self._page_poses]
             if any(ours):  # moved by the page; browsers may report positions on the way
                 if ours[-1] and self._pose is not None:
                     self._pose = None
                     self._show(self._layout)
-                    self._ask()
+                    self._request_render()
                 return
             left, self._pose = self._pose is None, pose
             if left:
                 self._show(self._layout)
             self._camera_yaml.value = camera_lines(pose, camera.look_at, self._scene.spec.camera.intrinsics)
             if not self._playing:
-                self._ask()
+                self._request_render()
 
     def _choose_light(self) -> None:
-        with self._turn:
+        with self._lock:
             number = self._chosen
             light = None if number is None else self._lights_now()[number]
             placed = light is not None and not isinstance(light, EnvironmentLight)
@@ -210,7 +212,7 @@ class ScenePage:
 
     def _move_light(self, **changed: Any) -> None:
         """Override properties of the selected light."""
-        with self._turn:
+        with self._lock:
             number = self._chosen
             if number is None:
                 return
@@ -225,14 +227,14 @@ class ScenePage:
             self._lights[number] = moved
             self._choose_light()
             self._show(self._layout)
-            self._ask()
+            self._request_render()
 
     def _reset_lights(self) -> None:
-        with self._turn:
+        with self._lock:
             self._lights = {}
             self._choose_light()
             self._show(self._layout)
-            self._ask()
+            self._request_render()
 
     # Display
 
@@ -255,8 +257,8 @@ class ScenePage:
     def _look(self, camera: Camera) -> None:
         """Move the views of all browsers to a camera, unless they are there."""
         pose = camera.world_from_camera
-        if not any(np.allclose(pose, own, atol=1e-9) for own in self._looked):
-            self._looked.append(pose)
+        if not any(np.allclose(pose, own, atol=1e-9) for own in self._page_poses):
+            self._page_poses.append(pose)
             self._page.look_through(camera)
 
     def _show(self, layout: Layout | None) -> None:
@@ -275,20 +277,20 @@ class ScenePage:
             preview = self._preview[1]
             layer: LayerName = self._layer.value if self._layer.value in LAYERS else "picture"
             title, image = draw_layer(preview.frame, layer)
-            cost = f"**{preview.preset}** {preview.seconds:.2f} s{told_error(preview)}"
+            cost = f"**{preview.preset}** {preview.seconds:.2f} s{error_text(preview)}"
             self._page.show_picture(image, f"{cost} – {title}")
 
-    def _ask(self) -> None:
-        with self._turn:
+    def _request_render(self) -> None:
+        with self._lock:
             lights = self._lights_now() if self._lights else None
             finest: PresetName = self._finest.value if self._finest.value in PRESETS else "exact"
             width = int(self._width.value) if self._width.value in _WIDTHS else 640
-            self._asked = ViewRequest(self._scene, self._index, self._pose, lights, width, finest)
-            self._worker.ask((self._asked, self._playing))
+            self._last_request = ViewRequest(self._scene, self._index, self._pose, lights, width, finest)
+            self._worker.ask((self._last_request, self._playing))
 
     # Render thread
 
-    def _work(self, request: _Request) -> Iterator[Layout | Preview]:
+    def _process(self, request: _Request) -> Iterator[Layout | Preview]:
         view, playing = request
         layout = self._renders.layout(view.scene, view.index)
         if playing:
@@ -300,8 +302,8 @@ class ScenePage:
             if self._worker.wait(PAUSES[preset]):
                 yield self._renders.render(view, preset)
 
-    def _tell(self, request: _Request, result: Layout | Preview) -> None:
-        with self._turn:
+    def _handle_result(self, request: _Request, result: Layout | Preview) -> None:
+        with self._lock:
             if isinstance(result, Layout):
                 if request[0].scene is self._scene and result.index == self._index // self._views:
                     self._layout = result
@@ -315,10 +317,10 @@ class ScenePage:
             if self._playing and request[1]:
                 self._playing = False
                 if self._pose is not request[0].pose:
-                    self._ask()
+                    self._request_render()
 
-    def _refuse(self, error: InputError) -> None:
-        with self._turn:
+    def _handle_error(self, error: InputError) -> None:
+        with self._lock:
             self._playing = False
             self._page.alert(str(error))
 
@@ -334,7 +336,7 @@ def reseeded(scene: Scene, seed: int) -> Scene:
     return replace(scene, spec=scene.spec.model_copy(update={"seed": seed}))
 
 
-def _draws_looks(scene: Scene) -> bool:
+def _varies_appearance(scene: Scene) -> bool:
     """Return True if layouts vary the appearance of objects or shapes, which the splats in the browser do not show."""
     drawn = any(entry.appearance is not None for entry in scene.spec.objects)
     return drawn or any(shape.materials for shape in scene.spec.shapes)
@@ -356,7 +358,7 @@ def changed_light(light: LightSpec, *, position: Any = None, target: Any = None,
     return type(light).model_validate(light.model_dump() | update)
 
 
-def told_error(preview: Preview) -> str:
+def error_text(preview: Preview) -> str:
     """Return the text about the error of a preview, for its caption."""
     error = preview.frame.order_error
     if error is None:

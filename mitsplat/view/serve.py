@@ -21,7 +21,7 @@ Kind = Literal["scene", "asset", "capture", "dataset", "splats"]
 _BY_CONTENT: dict[str, Kind] = {ASSET_FILE: "asset", CAPTURE_FILE: "capture", "dataset.json": "dataset"}
 SPLAT_SUFFIXES = (".ply", ".splat", ".ksplat", ".spz", ".sog")
 
-_LOOK = 0.3
+_CHECK_INTERVAL = 0.3
 """Interval of checks for changes of a file [s]."""
 
 
@@ -49,11 +49,11 @@ def serve(
     kind = kind_of(path)
     page = Page(path.name, address or Address(), gaussians=gaussians)
     try:
-        shown = _filled(page, path, kind, allow_outside)
+        shown = _fill_page(page, path, kind, allow_outside)
         try:
             ready(page.url)
             while True:
-                time.sleep(_LOOK)
+                time.sleep(_CHECK_INTERVAL)
                 shown.check()
         except KeyboardInterrupt:
             return
@@ -63,7 +63,7 @@ def serve(
         page.close()
 
 
-def _filled(page: Page, path: Path, kind: Kind, allow_outside: bool) -> ScenePage | StillPage:
+def _fill_page(page: Page, path: Path, kind: Kind, allow_outside: bool) -> ScenePage | StillPage:
     """Fill the page with the content of a path; only the modules of its kind are imported, for a fast start."""
     if kind == "scene":
         from mitsplat.view.scene_page import ScenePage  # fast start: renders, physics

@@ -91,14 +91,14 @@ class CapturePage(StillPage):
 
     def __init__(self, page: Page, folder: Path) -> None:
         self._page, self._capture = page, Capture.load(folder)
-        self._turn, self._picks = threading.RLock(), list[tuple[str, str]]()
+        self._lock, self._picks = threading.RLock(), list[tuple[str, str]]()
         photos = self._capture.photos
         if not photos:
             raise InputError(f"{folder}: must have a photo to be shown (got none)")
         page.show(capture_parts(self._capture))
         with page.gui.add_folder("Pick things by clicks"):
             self._click = page.gui.add_dropdown("a click says", tuple(_CLICKS), initial_value=_NOTHING)
-            self._told = page.gui.add_markdown("")
+            self._summary = page.gui.add_markdown("")
             back = page.gui.add_button_group("forget", ("the last", "all"))
         self._photo = page.gui.add_slider("photo", 0, max(len(photos) - 1, 1), 1, 0)
         self._mask = page.gui.add_dropdown("mask", _MASKS)
@@ -113,19 +113,19 @@ class CapturePage(StillPage):
         through.on_click(lambda _: page.look_through(self._chosen.camera))
         page.on_click(self._clicked)
         page.on_point(self._pointed)
-        self._click.on_update(lambda _: self._take(self._picks))
+        self._click.on_update(lambda _: self._apply_picks(self._picks))
         back.on_click(lambda _: self._forget(all_of_them=back.value == "all"))
         page.look_around()
         self._show()
 
     def _pointed(self, origin: Float64Array, direction: Float64Array) -> None:
         """Add a pick for the point under a click, if there is one."""
-        with self._turn:
+        with self._lock:
             if (option := _CLICKS.get(self._click.value)) is None:
                 return
             try:
                 pick = pick_along(self._capture, origin, direction)
-                self._take([*self._picks, (option, pick)])
+                self._apply_picks([*self._picks, (option, pick)])
             except InputError as error:
                 self._page.alert(str(error))
                 return
@@ -133,25 +133,25 @@ class CapturePage(StillPage):
             self._photo.value = [photo.name for photo in self._capture.photos].index(name)
 
     def _forget(self, *, all_of_them: bool) -> None:
-        with self._turn:
-            self._take([] if all_of_them else self._picks[:-1])
+        with self._lock:
+            self._apply_picks([] if all_of_them else self._picks[:-1])
 
-    def _take(self, picks: list[tuple[str, str]]) -> None:
+    def _apply_picks(self, picks: list[tuple[str, str]]) -> None:
         """Show the things that the picks select, and the options for the command line; hide cameras while clicks pick.
 
         Raises:
             InputError: If the picks select nothing; the earlier picks remain.
         """
-        chosen, self._picks = self._chosen_parts(picks), picks
+        chosen, self._picks = self._selected_parts(picks), picks
         parts = list(capture_parts(self._capture))
         if _CLICKS.get(self._click.value) is not None:  # a click on a camera would also pick
             parts = [part for part in parts if not isinstance(part.thing, Frustum)]
         self._page.show([*parts, *chosen])
         self._show()
         words = " ".join(f"{option} {shlex.quote(pick)}" for option, pick in self._picks)
-        self._told.content = f"```\n{words}\n```" if words else ""
+        self._summary.content = f"```\n{words}\n```" if words else ""
 
-    def _chosen_parts(self, picks: Sequence[tuple[str, str]]) -> list[ShownPart]:
+    def _selected_parts(self, picks: Sequence[tuple[str, str]]) -> list[ShownPart]:
         """Return the points of the things that the picks select."""
         on, off, away = ([pick for kind, pick in picks if kind == option] for option in (_PICK, _PICK_NOT, _REMOVE))
         parts = []
@@ -197,7 +197,7 @@ class DatasetPage(StillPage):
         self._page, self._index = page, DatasetIndex(folder)
         if not len(self._index):
             raise InputError(f"{folder}: must have an image to be shown (got none)")
-        self._turn = threading.RLock()
+        self._lock = threading.RLock()
         page.widen(_WIDE)  # the page has no other content
         gui, largest = page.gui, self._index.largest
         self._number = gui.add_slider("image", 0, 1, 1, 0)
@@ -207,7 +207,7 @@ class DatasetPage(StillPage):
             self._class = gui.add_dropdown("of class", (_ANY, *self._index.classes))
             self._visible = gui.add_multi_slider("visible [%]", 0, 100, 1, (0, 100))
             self._size = gui.add_multi_slider("as long as [px]", 0, largest, 1, (0, largest))
-        self._told = gui.add_markdown("")
+        self._summary = gui.add_markdown("")
         self._found: list[int] = []
         self._number.on_update(lambda _: self._show())
         self._overlay.on_update(lambda _: self._show())
@@ -222,7 +222,7 @@ class DatasetPage(StillPage):
         return tuple(self._found)
 
     def _filter(self) -> None:
-        with self._turn:
+        with self._lock:
             low, high = self._visible.value
             name = None if self._class.value == _ANY else str(self._class.value)
             short, long = self._size.value
@@ -230,7 +230,7 @@ class DatasetPage(StillPage):
             wanted = Filter(name) if whole else Filter(name, (low / 100, high / 100), (short, long))
             self._found = self._index.find(wanted)
             unreadable = self._index.unreadable
-            self._told.content = f"{len(self._found)} of {len(self._index)} images" + (
+            self._summary.content = f"{len(self._found)} of {len(self._index)} images" + (
                 f"; {unreadable} lines of the manifest cannot be read" if unreadable else ""
             )
             self._number.max = max(len(self._found) - 1, 1)
@@ -238,11 +238,11 @@ class DatasetPage(StillPage):
             self._show()
 
     def _step(self, by: int) -> None:
-        with self._turn:
+        with self._lock:
             self._number.value = min(max(int(self._number.value) + by, 0), max(len(self._found) - 1, 0))
 
     def _show(self) -> None:
-        with self._turn:
+        with self._lock:
             if not self._found:
                 self._page.caption("no image has such a label")
                 return

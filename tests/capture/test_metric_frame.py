@@ -152,7 +152,7 @@ def test_a_camera_is_wrong_by_the_measure_of_the_others(usual: float, off: float
             angle = rng.uniform(0, 2 * np.pi)
             error = (off if k == 0 else usual) * camera.width
             views[index][f"{k:02}"] = camera, pixel + error * np.array([np.cos(angle), np.sin(angle)])
-    found, confirmed = anchor._judge_cameras(views, dict(enumerate(BOARD.corners)))
+    found, confirmed = anchor._check_cameras(views, dict(enumerate(BOARD.corners)))
     assert set(found) == ({"00"} if wrong else set())
     assert confirmed == ({f"{k:02}" for k in range(1, 10)} if usual < anchor.MAX_CONTRADICTION else set())
 
@@ -167,7 +167,7 @@ def test_a_bent_print_condemns_no_camera() -> None:
         for index, point in enumerate(bent)
     }
     corners = anchor._triangulate_corners(views, {f"{k:02}" for k in range(33)})
-    assert anchor._judge_cameras(views, corners) == ({}, frozenset(f"{k:02}" for k in range(33)))
+    assert anchor._check_cameras(views, corners) == ({}, frozenset(f"{k:02}" for k in range(33)))
 
 
 def test_the_error_of_the_scale_covers_what_wrong_cameras_do_to_it() -> None:

@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 
 from mitsplat.capture.capture import Capture, Photo
-from mitsplat.capture.capture_photos import CaptureResult, _hidden_parts
+from mitsplat.capture.capture_photos import CaptureResult, _reject_occluded
 from mitsplat.capture.isolation import ChosenObject
 from mitsplat.capture.photo_masks import agreed_masks, geometric_masks, object_masks, object_points
 from mitsplat.errors import InputError
@@ -69,12 +69,12 @@ def test_photos_in_which_another_thing_stands_before_the_object_are_left_out() -
         for eye in [(0.4 * np.cos(np.radians(turn)), 0.4 * np.sin(np.radians(turn)), 0.1)]
     )
     capture = Capture(photos, np.zeros((0, 3)), np.zeros((0, 3)), rejected={"blurred.jpg": "it is blurred"})
-    found, hidden = _hidden_parts(capture, ChosenObject(ball, ball, (ball + np.array([0.12, 0, 0]),)))
+    found, hidden = _reject_occluded(capture, ChosenObject(ball, ball, (ball + np.array([0.12, 0, 0]),)))
     assert [photo.name for photo in found.photos] == [f"{turn:03}.jpg" for turn in range(45, 360, 45)]
     assert not hidden and found.rejected.keys() == {"blurred.jpg", "000.jpg"}
     assert re.fullmatch(r"another thing stands before the object and may hide \d+% of it", found.rejected["000.jpg"])
     aside = 0.75 * ball + np.array([0.12, 0.05, 0.03])
-    found, hidden = _hidden_parts(capture, ChosenObject(ball, ball, (aside,)))
+    found, hidden = _reject_occluded(capture, ChosenObject(ball, ball, (aside,)))
     assert len(found.photos) == 8 and hidden.keys() == {"000.jpg", "045.jpg"}
     pixels, _ = photos[0].camera.project(aside)
     x, y = pixels[np.linalg.norm(pixels - (160, 120), axis=1) < 40].astype(int).T  # before the object

@@ -78,7 +78,7 @@ def test_settle_prints_certificates_and_shows_the_drop(
     ("options", "sentence"),
     [
         (["-o", "drop.png"], "--out must end in .gif (got drop.png)"),
-        (["-o", "gone/drop.gif"], "--out must be in a folder that exists (got gone/drop.gif)"),
+        (["-o", "gone/drop.gif"], "--out must be in an existing folder (got gone/drop.gif)"),
         (["-n", "4"], "--layouts must be 1 to 3, the scene's output.layouts (got 4)"),
         (["--workers", "0"], "workers must be at least 1 (got 0)"),
     ],

@@ -27,7 +27,7 @@ class TestDevice:
         self, scene_path: Path, write_dataset: Calls, capsys: pytest.CaptureFixture[str]
     ) -> None:
         assert run("render", scene_path, "--device", "auto", "--any-device") == 0
-        assert "device: cpu, as there is none\n" in capsys.readouterr().err
+        assert "device: cpu, because there is none\n" in capsys.readouterr().err
         assert (write_dataset.kwargs["device"].kind, write_dataset.kwargs["any_device"]) == ("cpu", True)
         assert run("render", scene_path, "--device", "auto", "--json") == 0
         assert all(json.loads(line) for line in capsys.readouterr().err.splitlines())

@@ -35,7 +35,7 @@ from tests.conftest import box_asset
         ("preview scene.xml", "scene.xml: must be a scene file (.yaml) (got a Mitsuba scene, which `mitsplat render`"),
         ("audit folder", "folder must be a dataset of mitsplat (dataset.json: No such file or directory)"),
         ("audit gone", "gone must be a dataset of mitsplat (no such folder)"),
-        ("render gone.yaml --address auto", "--address and --resources are of a cluster: give --engine ray as well"),
+        ("render gone.yaml --address auto", "--address and --resources apply to a Ray cluster: add --engine ray"),
     ],
 )
 def test_another_kind_of_file_is_named(
@@ -86,9 +86,7 @@ def test_our_own_bugs_are_a_sentence(
     write_dataset.error = ZeroDivisionError()
     assert run("render", scene_path) == 70
     told = capsys.readouterr().err.splitlines()[-1]
-    assert told.startswith(
-        "mitsplat: this is a fault of mitsplat, not of what it was given: ZeroDivisionError (the log"
-    )
+    assert told.startswith("mitsplat: internal error of mitsplat, not caused by the input: ZeroDivisionError (the log")
 
 
 @pytest.mark.parametrize(

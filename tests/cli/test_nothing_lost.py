@@ -31,11 +31,11 @@ def test_an_asset_is_replaced_where_that_is_wanted(
     before = contents(tmp_path)
     assert run(command, given, "-o", tmp_path / "gear") == 2
     there = tmp_path / "gear" / "asset.yaml"
-    sentence = f"mitsplat: {there}: is there already: choose another folder, or --overwrite replaces it\n"
+    sentence = f"mitsplat: {there}: already exists: choose another folder, or use --overwrite to replace it\n"
     assert capsys.readouterr().err == sentence
     own = tmp_path / "gear" / ("splats.ply" if command == "import" else "mesh.ply")
     assert run(command, own, "-o", tmp_path / "gear", "--overwrite") == 2
-    assert "itself would be replaced" in capsys.readouterr().err
+    assert "which would be replaced" in capsys.readouterr().err
     assert run(command, given, "-o", given / "below") == 2
     assert f"got {given / 'below'} below the file {given}" in capsys.readouterr().err
     assert run(command, given, "-o", "/") == 2
@@ -91,7 +91,7 @@ def test_a_sheet_is_replaced_where_that_is_wanted(tmp_path: Path, capsys: pytest
     sheet = tmp_path / "board.pdf"
     sheet.write_text("an invoice")
     assert run("board", "-o", sheet) == 2 and sheet.read_text() == "an invoice"
-    said = f"mitsplat: --out must be a new file (got {sheet}); --overwrite replaces one\n"
+    said = f"mitsplat: --out must be a new file (got {sheet}); --overwrite replaces an existing one\n"
     assert capsys.readouterr().err == said
     assert run("board", "-o", sheet, "--overwrite") == 0 and sheet.read_bytes().startswith(b"%PDF")
 
@@ -107,7 +107,7 @@ def test_an_export_is_edited_and_so_kept(
     assert run("export", scene, "-o", scene) == 2 and "--out must end in .xml" in capsys.readouterr().err
     out = tmp_path / "scene.xml"
     out.write_text("edited")
-    assert run("export", scene, "-o", out) == 2 and "--overwrite replaces one" in capsys.readouterr().err
+    assert run("export", scene, "-o", out) == 2 and "--overwrite replaces an existing one" in capsys.readouterr().err
     assert out.read_text() == "edited"
     assert run("export", scene, "-o", out, "--overwrite") == 0 and "<scene" in out.read_text()
     assert run("export", scene, "-o", tmp_path, "--overwrite") == 2

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, Literal
@@ -11,7 +12,6 @@ import numpy as np
 import pytest
 
 from mitsplat import surroundings
-from mitsplat.capture import capture_photos as capturing
 from mitsplat.capture.boards.targets import Board
 from mitsplat.capture.capture import Capture
 from mitsplat.capture.capture_photos import CaptureSettings
@@ -66,9 +66,9 @@ def test_fit_takes_depth_maps_of_a_folder_or_of_a_network(
         assert found.args == args and fit_capture.kwargs["depths"] is found.result
         assert "warning: depth maps that are left out: a.jpg" in capsys.readouterr().out
     for options, text in (
-        (("--depths", "maps", "--depth-model", "a.onnx"), "give --depths or --depth-model"),
-        (("--depth-kind", "metric"), "--depth-kind metric is of depth maps: give --depths or --depth-model"),
-        (("--depths", "maps", "--depth", 0), "depth maps are of no use with --depth 0"),
+        (("--depths", "maps", "--depth-model", "a.onnx"), "both define the depth maps: give only one"),
+        (("--depth-kind", "metric"), "--depth-kind metric requires depth maps: add --depths or --depth-model"),
+        (("--depths", "maps", "--depth", 0), "--depth 0 disables depth maps"),
     ):
         assert run("fit", "photos", "-o", tmp_path, *options) == 2
         assert text in capsys.readouterr().err
@@ -79,7 +79,7 @@ def test_fit_below_its_target_exits_with_4(
 ) -> None:
     assert run("fit", "photos", "-o", tmp_path, "--target-psnr", 30) == 4
     out, err = capsys.readouterr()
-    assert "held-out photos: 28.00 dB" in out and "target: 29.00 dB on 1 photos set aside for it" in out
+    assert "held-out photos: 28.00 dB" in out and "target: 29.00 dB on 1 validation photos" in out
     assert "PSNR must reach 30.00 dB (got 29.00)" in err
 
 
@@ -101,7 +101,8 @@ def finished(folder: Path, **changes: Any) -> AssetResult:
 
 def test_capture_passes_every_option_on(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     calls = Calls(error=InputError("captured"))
-    monkeypatch.setattr(capturing, "capture_photos", calls)
+    module = import_module("mitsplat.capture.capture_photos")  # the package exports a function of this name
+    monkeypatch.setattr(module, "capture_photos", calls)
     common = (
         "--frames", 40, "--max-size", 800, "--squares", "6x4", "--square", 0.02, "--tag", 0.05,
         "--scale-from", "a.jpg", "b.jpg", 0.5, "--poses", "model", "--metric", "--undistort",

@@ -50,7 +50,7 @@ def test_render_passes_every_option_on(
 @pytest.mark.parametrize(
     ("made", "status", "told"),
     [
-        ({"compared": 2}, 0, "the same bytes as in"),
+        ({"compared": 2}, 0, "all files are identical to those in"),
         ({}, 0, "has no frame 3"),
         ({"compared": 2, "differing": ("a.png",), "cause": "seed was 0 and is 1"}, 1, "a.png (seed was 0 and is 1)"),
     ],
@@ -149,7 +149,7 @@ def test_render_xml(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pyt
     assert str(picture) in capsys.readouterr().out
     for ignored in (["--seed", 3], ["--workers", 2], ["--overwrite"], ["--any-device"], ["--engine", "ray"]):
         assert run("render", "one.xml", *ignored) == 2
-        assert "a Mitsuba scene states size, seed and quality itself; only --out" in capsys.readouterr().err
+        assert "a Mitsuba scene defines size, seed and quality itself: remove all" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -159,11 +159,11 @@ def test_render_xml(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pyt
         (["--size", "-1x3"], "--size must be WIDTHxHEIGHT"),
         (["--size", "0x3"], "--size must be WIDTHxHEIGHT in pixels, such as 1280x720 (got 0x3)"),
         (["--seed", "-1"], "--seed must be >= 0 (got -1)"),
-        (["--format", "yolo,zip"], "--format must be among yolo, yolo-detect, "),
+        (["--format", "yolo,zip"], "--format must be one or more of yolo, yolo-detect, "),
         (["-n", "13"], "(got 13)"),
         (["-n", "0"], "(got 0)"),
         (["--workers", "0"], "(got 0)"),
-        (["--quality", "fast", "--tolerance", "0.1"], "--quality and --tolerance both choose the preset"),
+        (["--quality", "fast", "--tolerance", "0.1"], "--quality and --tolerance both select the preset"),
     ],
 )
 def test_bad_option_is_one_sentence(

@@ -144,7 +144,7 @@ def test_meshes_beside_an_exported_scene_stay(scene: Scene, tmp_path: Path, caps
     (tmp_path / "y_files").mkdir()
     (tmp_path / "y_files/object_0.ply").write_text("mine")
     assert run("export", scene.path, "-o", tmp_path / "y.xml") == 2
-    assert f"--out needs a new folder beside it, {tmp_path / 'y_files'}" in capsys.readouterr().err
+    assert f"the folder {tmp_path / 'y_files'} must not exist yet" in capsys.readouterr().err
     assert (tmp_path / "y_files/object_0.ply").read_text() == "mine"
 
 

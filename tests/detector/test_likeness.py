@@ -172,7 +172,7 @@ def test_the_command_says_it_and_writes_it(rendered: Path, photographs: Path, tm
     assert done.exit_code == 0, done.output
     assert "40 rendered images, 20 photographs" in done.output
     assert "brightness of objects [of 255]: rendered 220 220 220; photographs 88 88 88" in done.output
-    assert "100% of photographs' have less, 0% more: lower randomise.exposure" in done.output
+    assert "photographs: 100% below, 0% above the rendered range: lower randomise.exposure" in done.output
     kept = json.loads(out.read_text())
     assert kept["traits"][0]["real"] == [88, 88, 88]
     assert CliRunner().invoke(app, ["compare", str(rendered)]).exit_code != 0

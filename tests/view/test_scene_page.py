@@ -52,8 +52,8 @@ class Shown:
 
     def picture(self) -> ByteImage:
         """The picture of what is looked at now."""
-        self.scene_page._ask()
-        asked = self.scene_page._asked
+        self.scene_page._request_render()
+        asked = self.scene_page._last_request
         self.wait(lambda: self.scene_page._preview and self.scene_page._preview[0] is asked)
         return self.told.pictures[-1][0]
 

@@ -148,12 +148,12 @@ def test_clicks_on_a_capture_pick_things(page, tmp_path):
 
     click(0, "nothing")
     click(0, "as no option says")  # as a browser might answer
-    assert shown._told.content == ""
+    assert shown._summary.content == ""
     assert "/cameras/0" in page._shown
     click(1, "this is the object")
     assert "/cameras/0" not in page._shown  # a click on it would pick what is behind
     (pick,) = (text for _, text in shown._picks)
-    assert shown._told.content == f"```\n--pick {pick}\n```"
+    assert shown._summary.content == f"```\n--pick {pick}\n```"
     assert page._caption.content.startswith(pick.partition(".")[0])  # its photo is shown, with a cross
     assert (page._picture.image != 90).any()
     points = page._shown["/chosen/object"].thing.points
@@ -161,16 +161,16 @@ def test_clicks_on_a_capture_pick_things(page, tmp_path):
 
     click(1, "this is not the object")
     assert "what was picked is also said not to be the object" in page._alert.content
-    assert shown._told.content == f"```\n--pick {pick}\n```" and "/chosen/object" in page._shown
+    assert shown._summary.content == f"```\n--pick {pick}\n```" and "/chosen/object" in page._shown
 
     click(2, "take this out of the place")
-    assert shown._told.content.count("--remove") == 1 and not page._alert.visible
+    assert shown._summary.content.count("--remove") == 1 and not page._alert.visible
     points = page._shown["/chosen/removed"].thing.points
     assert np.linalg.norm(points[:, :2] - THINGS[2], axis=1).max() < 0.05
     shown._pointed(eye, np.array([0.0, 0.0, 1.0]))
     assert "no point of the capture lies there" in page._alert.content
     shown._forget(all_of_them=True)
-    assert shown._told.content == "" and not [name for name in page._shown if name.startswith("/chosen")]
+    assert shown._summary.content == "" and not [name for name in page._shown if name.startswith("/chosen")]
     shown._forget(all_of_them=False)  # of none
 
 

@@ -284,7 +284,7 @@ def _offences(ended: Ended, allowed: frozenset[int], *, stopped: bool) -> Iterat
         yield f"it exits with status {ended.status}, not {expected}: {said:.300}"
     if "Traceback (most recent call last)" in text:
         yield "it prints a traceback"
-    if "this is a fault of mitsplat" in text:
+    if "internal error of mitsplat" in text:
         yield "it is a fault of mitsplat"
     if ended.status in (2, 3, 4):
         lines = [line for line in ended.errors.splitlines() if line.startswith("mitsplat: ")]

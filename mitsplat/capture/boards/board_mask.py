@@ -15,7 +15,7 @@ from mitsplat.arrays import BoolArray, Float64Array
 from mitsplat.capture.boards.targets import Board
 from mitsplat.geometry.camera import Camera
 
-_DOTS = 16
+_SAMPLES = 16
 """Samples along the edge of a square."""
 
 _RIM = 3
@@ -23,10 +23,10 @@ _RIM = 3
 edges.
 """
 
-_LIKENESS = 0.9
+_MIN_CORRELATION = 0.9
 """Minimum correlation of an uncovered square with the print."""
 
-_BLOT = 0.3
+_MAX_DIFFERENCE = 0.3
 """Maximum difference from the print at any sample of an uncovered square, as a fraction of the black-white contrast."""
 
 
@@ -48,26 +48,26 @@ def bare_squares(
         grey: 8-bit image, shape (H, W).
     """
     found = np.zeros(grey.shape, dtype=np.uint8)
-    flat, shown = _laid_flat(board, world_from_board, camera, grey)
-    printed = _printed(board)
-    corners = _places(board, np.arange(board.columns + 1.0), np.arange(board.rows + 1.0))
-    pixels = _seen(corners, world_from_board, camera)
+    flat, shown = _rectify_board(board, world_from_board, camera, grey)
+    printed = _draw_print(board)
+    corners = _board_points(board, np.arange(board.columns + 1.0), np.arange(board.rows + 1.0))
+    pixels = _project_points(corners, world_from_board, camera)
     for row in range(board.rows):
         for column in range(board.columns):
-            window = tuple(slice(max(0, k * _DOTS - _RIM), (k + 1) * _DOTS + _RIM) for k in (row, column))
-            if shown[window].all() and _alike(flat[window], printed[window]):
+            window = tuple(slice(max(0, k * _SAMPLES - _RIM), (k + 1) * _SAMPLES + _RIM) for k in (row, column))
+            if shown[window].all() and _matches_print(flat[window], printed[window]):
                 outline = pixels[[row, row, row + 1, row + 1], [column, column + 1, column + 1, column]]
                 cv2.fillConvexPoly(found, np.rint((outline - 0.5) * 16).astype(np.int32), 1, shift=4)
     return found > 0
 
 
 @cache
-def _printed(board: Board) -> Float64Array:
-    """Return the print, 0 to 255, in the samples of :func:`_laid_flat`."""
-    return _blurred(cv2.resize(board.draw(4 * _DOTS), None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA))
+def _draw_print(board: Board) -> Float64Array:
+    """Return the print, 0 to 255, in the samples of :func:`_rectify_board`."""
+    return _blur(cv2.resize(board.draw(4 * _SAMPLES), None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA))
 
 
-def _alike(values: Float64Array, printed: Float64Array) -> bool:
+def _matches_print(values: Float64Array, printed: Float64Array) -> bool:
     """Return True if the values match the print up to a factor and an offset."""
     values, printed = values - values.mean(), printed - printed.mean()
     spread = float((printed * printed).sum())
@@ -76,36 +76,38 @@ def _alike(values: Float64Array, printed: Float64Array) -> bool:
         return False
     likeness = contrast * np.sqrt(spread / float((values * values).sum()))
     # The print ranges from 0 to 255, so ``contrast`` also relates the black-white contrast of the image to 255.
-    return bool(likeness > _LIKENESS and np.abs(values - contrast * printed).max() < _BLOT * 255 * contrast)
+    return bool(
+        likeness > _MIN_CORRELATION and np.abs(values - contrast * printed).max() < _MAX_DIFFERENCE * 255 * contrast
+    )
 
 
-def _places(board: Board, x: Float64Array, y: Float64Array) -> Float64Array:
+def _board_points(board: Board, x: Float64Array, y: Float64Array) -> Float64Array:
     """Return points on the board [m], shape (len(y), len(x), 3), at positions in squares from its upper left corner."""
     across, down = np.meshgrid(x, y)
     return np.stack([across - board.columns / 2, board.rows / 2 - down, np.zeros_like(down)], axis=-1) * board.square
 
 
-def _seen(places: Float64Array, world_from_board: Float64Array, camera: Camera) -> Float64Array:
+def _project_points(places: Float64Array, world_from_board: Float64Array, camera: Camera) -> Float64Array:
     """Return the pixel positions (..., 2) of points on the board (..., 3)."""
     pixels, _ = camera.project(places.reshape(-1, 3) @ world_from_board[:3, :3].T + world_from_board[:3, 3])
     return pixels.reshape(*places.shape[:-1], 2)
 
 
-def _laid_flat(
+def _rectify_board(
     board: Board, world_from_board: Float64Array, camera: Camera, grey: npt.NDArray[np.uint8]
 ) -> tuple[Float64Array, BoolArray]:
     """Return the rectified board in samples of the image, and the samples that lie inside the image."""
-    x, y = ((np.arange(n * _DOTS) + 0.5) / _DOTS for n in (board.columns, board.rows))
-    pixels = _seen(_places(board, x, y), world_from_board, camera)
+    x, y = ((np.arange(n * _SAMPLES) + 0.5) / _SAMPLES for n in (board.columns, board.rows))
+    pixels = _project_points(_board_points(board, x, y), world_from_board, camera)
     shown = np.asarray(((pixels >= 0) & (pixels < (camera.width, camera.height))).all(axis=-1))
     steps = np.linalg.norm(np.diff(pixels, axis=1), axis=-1)[shown[:, 1:] & shown[:, :-1]]
     step = float(np.median(steps)) if len(steps) else 1.0
     smooth = cv2.GaussianBlur(grey, (0, 0), max(0.3, 0.4 * step))
     grid = np.nan_to_num(pixels - 0.5, nan=-1.0).astype(np.float32)
     flat = cv2.remap(smooth, grid[..., 0], grid[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return _blurred(flat), shown
+    return _blur(flat), shown
 
 
-def _blurred(image: npt.NDArray[np.generic]) -> Float64Array:
+def _blur(image: npt.NDArray[np.generic]) -> Float64Array:
     """Blur an image, because camera errors of a fraction of a sample must not affect the comparison."""
     return np.asarray(cv2.GaussianBlur(np.asarray(image, dtype=np.float64), (0, 0), 1.0))

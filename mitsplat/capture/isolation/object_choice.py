@@ -20,22 +20,22 @@ from mitsplat.capture.isolation.support import SupportSurface, find_support
 from mitsplat.errors import InputError
 from mitsplat.geometry.camera import Camera
 
-_REACH = 0.7
+_MAX_DISTANCE = 0.7
 """Maximum distance of considered points from the focus, as a fraction of the cameras' distance."""
-_CENTRED = 0.25
+_FOCUS_SIGMA = 0.25
 """Standard deviation of the object's distance from the focus, as a fraction of the cameras' distance."""
-_MIDDLE = 0.2
+_IMAGE_SIGMA = 0.2
 """Standard deviation of the window around the centre of a photo, as a fraction of its longer edge."""
-_HEIGHT = 3.0
+_MIN_HEIGHT = 3.0
 """Minimum height of points above the support, in roughnesses of the support."""
-_FLATTEST = 0.003
+_MIN_ROUGHNESS = 0.003
 """Minimum roughness, as a fraction of the cameras' distance."""
-_APART = (0.02, 0.08)
+_GAP_BOUNDS = (0.02, 0.08)
 """Bounds of the gap between things, as fractions of the cameras' distance; the gap is four times the point spacing."""
-_FEWEST = 20
-_PICKED = 0.1
+_MIN_POINTS = 20
+_PICK_RADIUS = 0.1
 """Maximum distance of a point from a picked pixel, as a fraction of the photo's longer edge."""
-_LOW = 0.15
+_FOOT_HEIGHT = 0.15
 """Height below which points are projected onto the support, as a fraction of the object's height."""
 
 
@@ -111,33 +111,33 @@ def choose_object(
         pixels, _ = camera.project(points[shown])
         away = np.linalg.norm(pixels - (camera.width / 2, camera.height / 2), axis=1)
         counts[shown] += 1
-        central[shown] += np.exp(-0.5 * (away / (_MIDDLE * max(camera.width, camera.height))) ** 2)
-    near = (counts >= 3) & (np.linalg.norm(points - focus, axis=1) < _REACH * distance)
-    support = find_support(points[near], focus, _REACH * distance)
+        central[shown] += np.exp(-0.5 * (away / (_IMAGE_SIGMA * max(camera.width, camera.height))) ** 2)
+    near = (counts >= 3) & (np.linalg.norm(points - focus, axis=1) < _MAX_DISTANCE * distance)
+    support = find_support(points[near], focus, _MAX_DISTANCE * distance)
     height = points[:, 2] - support.under(points)
-    stands = near & (height > _HEIGHT * max(support.roughness, _FLATTEST * distance))
+    stands = near & (height > _MIN_HEIGHT * max(support.roughness, _MIN_ROUGHNESS * distance))
     if box is not None:
         stands &= ((points >= box[:3]) & (points <= box[3:])).all(axis=1)
-    if np.count_nonzero(stands) < _FEWEST:
+    if np.count_nonzero(stands) < _MIN_POINTS:
         raise InputError(
             f"no object stands out of its support in the photos ({np.count_nonzero(stands)} points above it): give "
             "masks, or take photos of one object with texture on and under it"
         )
-    thing, count = _things(points, stands, distance)
+    thing, count = _cluster_things(points, stands, distance)
     if picks:
-        chosen = np.unique([_picked(pick, points, thing) for pick in picks])
+        chosen = np.unique([_picked_thing(pick, points, thing) for pick in picks])
     else:
-        away = np.linalg.norm(points[stands] - focus, axis=1) / (_CENTRED * distance)
+        away = np.linalg.norm(points[stands] - focus, axis=1) / (_FOCUS_SIGMA * distance)
         scores = np.bincount(thing[stands], central[stands] * np.exp(-0.5 * away**2), count)
         for pick in picks_not:
-            scores[_picked(pick, points, thing)] = -1
+            scores[_picked_thing(pick, points, thing)] = -1
         chosen = np.array([int(scores.argmax())])
-    refused = {_picked(pick, points, thing) for pick in picks_not}
+    refused = {_picked_thing(pick, points, thing) for pick in picks_not}
     if refused >= set(chosen.tolist()):
         raise InputError(f"what was picked is also said not to be the object ({picks_not[0].name}): they touch")
     own = np.isin(thing, [number for number in chosen.tolist() if number not in refused])
-    feet = _feet(points[own], height[own], support)
-    large = np.flatnonzero(np.bincount(thing[stands]) >= _FEWEST)
+    feet = _project_feet(points[own], height[own], support)
+    large = np.flatnonzero(np.bincount(thing[stands]) >= _MIN_POINTS)
     others = tuple(points[thing == number] for number in large if not own[thing == number].any())
     return ChosenObject(np.concatenate([points[own], feet]), points[own], others)
 
@@ -152,15 +152,15 @@ def focus_of(cameras: Sequence[Camera]) -> tuple[Float64Array, float]:
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
     weights, focus = np.ones(len(cameras)), centres.mean(axis=0)
     for _ in range(20):
-        whole = np.einsum("n,nij->ij", weights, across) + 1e-6 * weights.sum() * np.eye(3)
+        system = np.einsum("n,nij->ij", weights, across) + 1e-6 * weights.sum() * np.eye(3)
         right = np.einsum("n,nij,nj->i", weights, across, centres) + 1e-6 * weights @ centres
-        focus = np.linalg.solve(whole, right)
+        focus = np.linalg.solve(system, right)
         gaps = np.linalg.norm(np.einsum("nij,nj->ni", across, focus - centres), axis=1)
         weights = 1 / (1 + (gaps / max(1.5 * float(np.median(gaps)), 1e-9)) ** 2)
     return focus, float(np.median(np.linalg.norm(centres - focus, axis=1)))
 
 
-def _things(points: Float64Array, stands: BoolArray, distance: float) -> tuple[Int64Array, int]:
+def _cluster_things(points: Float64Array, stands: BoolArray, distance: float) -> tuple[Int64Array, int]:
     """Cluster the points into things.
 
     Returns:
@@ -168,7 +168,7 @@ def _things(points: Float64Array, stands: BoolArray, distance: float) -> tuple[I
     """
     tree = KDTree(points[stands])
     gap = 4 * float(np.median(tree.query(points[stands], k=6)[0][:, -1]))
-    gap = min(max(gap, _APART[0] * distance), _APART[1] * distance)
+    gap = min(max(gap, _GAP_BOUNDS[0] * distance), _GAP_BOUNDS[1] * distance)
     pairs = tree.query_pairs(gap, output_type="ndarray")
     graph = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(tree.n, tree.n))
     count, label = connected_components(graph, directed=False)
@@ -177,23 +177,23 @@ def _things(points: Float64Array, stands: BoolArray, distance: float) -> tuple[I
     return thing, int(count)
 
 
-def _picked(pick: Pick, points: Float64Array, thing: Int64Array) -> int:
+def _picked_thing(pick: Pick, points: Float64Array, thing: Int64Array) -> int:
     """Return the index of the thing nearest to a pixel of a photo."""
     camera = pick.view.camera
     shown = pick.view.seen[thing[pick.view.seen] >= 0]
     gaps = np.linalg.norm(camera.project(points[shown])[0] - pick.pixel, axis=1)
-    limit = _PICKED * max(camera.width, camera.height)
+    limit = _PICK_RADIUS * max(camera.width, camera.height)
     if not len(gaps) or not gaps.min() < limit:
         raise InputError(f"{pick.name}: the photo shows no point of a thing within {limit:.0f} px of this pixel")
     return int(thing[shown[int(gaps.argmin())]])
 
 
-def _feet(own: Float64Array, height: Float64Array, support: SupportSurface) -> Float64Array:
+def _project_feet(own: Float64Array, height: Float64Array, support: SupportSurface) -> Float64Array:
     """Project the lowest points onto the support; all points if few are low.
 
     Points at the height of the support cannot be separated from it, so the object has no points there.
     """
-    low = own[height < _LOW * height.max()]
+    low = own[height < _FOOT_HEIGHT * height.max()]
     feet = (low if len(low) >= 5 else own).copy()
     feet[:, 2] = support.under(feet)
     return feet

@@ -19,11 +19,11 @@ from mitsplat.arrays import Float64Array
 CELLS = 32
 """Cells of the grid along an edge."""
 _ROUNDS = 12
-_STIFF = (1e3, 3e-2)
+_STIFFNESS = (1e3, 3e-2)
 """Weight of bending relative to the mean weight of points in a cell, in the first and the last iteration."""
 _TOLERANCE = (0.08, 0.01)
 """Height tolerance of points on the surface in the first and the last iteration, as a fraction of the radius."""
-_BELOW = 4.0
+_OUTLIER_DEPTH = 4.0
 """Depth below the surface beyond which a point is an outlier, in tolerances."""
 
 
@@ -69,9 +69,9 @@ def find_support(points: Float64Array, middle: Float64Array, radius: float) -> S
     heights = np.full(nodes**2, float(np.quantile(points[:, 2], 0.1)) if len(points) else 0.0)
     gap = points[:, 2] - sample @ heights
     for turn in np.linspace(0, 1, _ROUNDS):
-        stiff = share * _STIFF[0] ** (1 - turn) * _STIFF[1] ** turn
+        stiff = share * _STIFFNESS[0] ** (1 - turn) * _STIFFNESS[1] ** turn
         tolerance = radius * _TOLERANCE[0] ** (1 - turn) * _TOLERANCE[1] ** turn
-        counts = np.where(gap > 0, 1 / (1 + (gap / tolerance) ** 2) ** 2, gap > -_BELOW * tolerance)
+        counts = np.where(gap > 0, 1 / (1 + (gap / tolerance) ** 2) ** 2, gap > -_OUTLIER_DEPTH * tolerance)
         normal = sample.T @ diags_array(counts) @ sample + stiff * bending + 1e-9 * share * eye_array(nodes**2)
         heights = spsolve(csr_array(normal).tocsc(), sample.T @ (counts * points[:, 2]))
         gap = points[:, 2] - sample @ heights

@@ -21,11 +21,11 @@ from mitsplat.errors import InputError
 from mitsplat.images.colour import LUMINANCE, encode_srgb
 from mitsplat.storage.files import write_file, write_text
 
-_WIDEST = 4096
+_MAX_WIDTH = 4096
 """Maximum width of written panoramas [px]."""
-_MIDDLE = 110.0
+_MEAN_LEVEL = 110.0
 """Mean level that the displayed photograph of the ball should have."""
-_SMALLEST = 20.0
+_MIN_RADIUS = 20.0
 """Minimum radius of a ball in its photograph [px]; at this radius, 45 degrees around its rear are not visible."""
 _OUTLINE = (230, 40, 40)
 
@@ -126,8 +126,8 @@ class LightEstimate:
 
 def estimate_light(panorama: Float32Array, settings: LightSettings) -> LightEstimate:
     """Divide a panorama of radiance, (H, W, 3), into lamps and the rest; it must have light above the horizon."""
-    if panorama.shape[1] > _WIDEST:
-        panorama = resized(panorama, _WIDEST // 2, _WIDEST)
+    if panorama.shape[1] > _MAX_WIDTH:
+        panorama = resized(panorama, _MAX_WIDTH // 2, _MAX_WIDTH)
     if settings.irradiance is not None:
         panorama = panorama * np.float32(settings.irradiance / (level_irradiance(panorama) @ LUMINANCE))
     lamps, rest = take_lamps(panorama, rotate_z=settings.rotate_z, most=settings.lamps)
@@ -169,12 +169,12 @@ def read_ball(paths: Sequence[Path], view: BallView) -> BallReading:
         raise InputError(f"{paths[0]}: --exposures is of photographs of 8 bits; an HDR photograph is taken as it is")
     if hdr:
         image = read_radiance(paths[0])
-        pixels, focal = [_shown(image)], None
+        pixels, focal = [_tone_mapped(image)], None
     else:
         photographs = [read_photograph(path) for path in paths]
         exposures = exposures_of(photographs, view.exposures)
         pixels, focal = [photograph.pixels for photograph in photographs], photographs[0].focal
-    picture = min(pixels, key=lambda levels: abs(float(levels.mean()) - _MIDDLE))
+    picture = min(pixels, key=lambda levels: abs(float(levels.mean()) - _MEAN_LEVEL))
     ball = find_ball(*pixels) if view.ball is None else view.ball
     if ball is None:
         raise InputError(f"{paths[0]}: no ball stands out in it: give --ball X Y RADIUS")
@@ -185,8 +185,8 @@ def read_ball(paths: Sequence[Path], view: BallView) -> BallReading:
             f"{paths[0]}: the ball must be whole in the photograph, {width} x {height} px (got one of radius "
             f"{radius:.0f} around {x:.0f}, {y:.0f})"
         )
-    if radius < _SMALLEST:
-        raise InputError(f"{paths[0]}: the ball's radius must be {_SMALLEST:g} px or more (got {radius:.0f})")
+    if radius < _MIN_RADIUS:
+        raise InputError(f"{paths[0]}: the ball's radius must be {_MIN_RADIUS:g} px or more (got {radius:.0f})")
     clipped = np.zeros((height, width), bool)
     if not hdr:
         part = tuple(slice(max(0, int(middle - radius) - 1), int(middle + radius) + 2) for middle in (y, x))
@@ -210,7 +210,7 @@ def read_ball(paths: Sequence[Path], view: BallView) -> BallReading:
             f"{found.clipped:.2%} of the ball is white (from {CLIPPED} of 255) in the shortest exposure: what lamps "
             "send there is a lower bound"
         )
-    return BallReading(found, ball, _with_circle(picture, ball), warnings)
+    return BallReading(found, ball, _draw_circle(picture, ball), warnings)
 
 
 def write_light(estimate: LightEstimate, out: Path, photograph: ByteImage | None = None) -> list[Path]:
@@ -226,7 +226,7 @@ def write_light(estimate: LightEstimate, out: Path, photograph: ByteImage | None
     Returns:
         The written files.
     """
-    picture_file, panorama, rest = _beside(out)
+    picture_file, panorama, rest = _output_files(out)
     image = panorama.name
     files = [out, picture_file, panorama]
     write_exr(panorama, estimate.panorama)
@@ -234,7 +234,7 @@ def write_light(estimate: LightEstimate, out: Path, photograph: ByteImage | None
         image = rest.name
         files.append(rest)
         write_exr(rest, estimate.rest)
-    shown = _outlined(estimate)
+    shown = _draw_lamps(estimate)
     if photograph is not None:
         width = photograph.shape[1] * len(shown) // len(photograph)
         beside = cv2.resize(photograph, (width, len(shown)), interpolation=cv2.INTER_AREA)
@@ -245,7 +245,7 @@ def write_light(estimate: LightEstimate, out: Path, photograph: ByteImage | None
     return files
 
 
-def _beside(out: Path) -> tuple[Path, Path, Path]:
+def _output_files(out: Path) -> tuple[Path, Path, Path]:
     """Return the paths of the picture, of the panorama and of the panorama without the lamps."""
     panorama, rest = (out.with_name(f"{out.stem}_{part}.exr") for part in ("panorama", "rest"))
     return out.with_suffix(".png"), panorama, rest
@@ -257,7 +257,7 @@ def refuse_to_replace(out: Path, images: Sequence[Path]) -> None:
     Raises:
         InputError: With the name of the file.
     """
-    written, given = (out, *_beside(out)), {image.resolve() for image in images}
+    written, given = (out, *_output_files(out)), {image.resolve() for image in images}
     if lost := [file for file in written if file.resolve() in given]:
         raise InputError(f"{lost[0]}: would be replaced: give another --out (got {out})")
     there = [file for file in written if file.exists()]
@@ -310,23 +310,23 @@ def list_of(values: Sequence[float] | Float64Array) -> str:
     return f"[{', '.join(f'{value:.5g}' for value in values)}]"
 
 
-def _shown(radiance: Float32Array) -> ByteImage:
+def _tone_mapped(radiance: Float32Array) -> ByteImage:
     """Convert radiance to a picture whose median luminance is mid-grey."""
     middle = float(np.median(radiance @ LUMINANCE)) or float(radiance.mean())
     return np.asarray(np.rint(255 * np.minimum(encode_srgb(radiance * (0.18 / middle)), 1.0)), dtype=np.uint8)
 
 
-def _with_circle(photograph: ByteImage, circle: Circle) -> ByteImage:
+def _draw_circle(photograph: ByteImage, circle: Circle) -> ByteImage:
     """Return the photograph with a circle drawn on it."""
     x, y, radius = (round(16 * value) for value in circle)
     thick = max(1, photograph.shape[0] // 250)
     return np.asarray(cv2.circle(photograph.copy(), (x - 8, y - 8), radius, _OUTLINE, thick, cv2.LINE_AA, shift=4))
 
 
-def _outlined(estimate: LightEstimate) -> ByteImage:
+def _draw_lamps(estimate: LightEstimate) -> ByteImage:
     """Return the panorama with outlined and numbered lamps."""
     width = 1024
-    shown = np.ascontiguousarray(_shown(resized(estimate.panorama, width // 2, width)))
+    shown = np.ascontiguousarray(_tone_mapped(resized(estimate.panorama, width // 2, width)))
     for number, lamp in enumerate(estimate.lamps, start=1):
         mask = cv2.resize(lamp.pixels.astype(np.uint8), (width, width // 2), interpolation=cv2.INTER_NEAREST)
         contours, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)

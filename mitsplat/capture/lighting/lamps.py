@@ -34,13 +34,13 @@ CONTRAST = 4.0
 """Minimum luminance of a lamp relative to the mean of the rest; walls and ceilings of a room with one lamp reach 3."""
 LEAST_SHARE = 0.02
 """Minimum fraction of the irradiance that a lamp must contribute."""
-_WIDTH = 360
+_SEARCH_WIDTH = 360
 """Width of the panorama in which lamps are searched [px]."""
 _GAP = 3.0
 """Maximum distance between bright pixels of one lamp [degrees]."""
 _RING = 4.0
 """Width of the ring around a lamp whose mean radiance replaces the lamp [degrees]."""
-_WIDEST = 60.0
+_MAX_HALF_ANGLE = 60.0
 """Maximum angle between the centre and any point of a lamp [degrees]; larger bright regions are sky."""
 _GRID = 64
 """Points along an edge of a rectangle for the integration of its light."""
@@ -100,11 +100,11 @@ def take_lamps(panorama: Float32Array, *, rotate_z: float = 0.0, most: int = 6) 
         Lamps by decreasing irradiance, and the remaining panorama.
     """
     height, width = panorama.shape[:2]
-    shape = (min(height, _WIDTH // 2), min(width, _WIDTH))
+    shape = (min(height, _SEARCH_WIDTH // 2), min(width, _SEARCH_WIDTH))
     coarse = resized(panorama, *shape)
     sight = directions(*shape, rotate_z)
-    bright = _bright(coarse)
-    groups = _grouped(sight[bright])
+    bright = _lamp_pixels(coarse)
+    groups = _group_pixels(sight[bright])
     everywhere, weights = directions(height, width, rotate_z), level_weights(height, width)
     total = level_irradiance(panorama) @ LUMINANCE
     found: list[tuple[Lamp, Float64Array]] = []
@@ -117,8 +117,8 @@ def take_lamps(panorama: Float32Array, *, rotate_z: float = 0.0, most: int = 6) 
         if arrives @ LUMINANCE < LEAST_SHARE * total:
             continue
         # Limited to the mean of the lamp in each channel, so that its radiance does not become negative.
-        around = np.minimum(_surroundings(coarse, sight, own, bright), arrives / weight.sum())
-        lamp = _rectangle(panorama[pixels], everywhere[pixels], pixels, arrives - weight.sum() * around)
+        around = np.minimum(_ring_radiance(coarse, sight, own, bright), arrives / weight.sum())
+        lamp = _fit_rectangle(panorama[pixels], everywhere[pixels], pixels, arrives - weight.sum() * around)
         if lamp is not None:
             found.append((lamp, around))
     found.sort(key=lambda lamp: -float(lamp[0].irradiance @ LUMINANCE))
@@ -128,7 +128,7 @@ def take_lamps(panorama: Float32Array, *, rotate_z: float = 0.0, most: int = 6) 
     return [lamp for lamp, _ in found[:most]], rest
 
 
-def _bright(panorama: Float32Array) -> BoolArray:
+def _lamp_pixels(panorama: Float32Array) -> BoolArray:
     """Return the pixels that belong to lamps, (H, W)."""
     luminance = panorama @ LUMINANCE
     weights = np.broadcast_to(solid_angles(*luminance.shape), luminance.shape)
@@ -140,14 +140,14 @@ def _bright(panorama: Float32Array) -> BoolArray:
         bright = brighter
 
 
-def _grouped(points: Float32Array) -> Int32Array:
+def _group_pixels(points: Float32Array) -> Int32Array:
     """Return the group index of each unit vector (N,); vectors less than ``_GAP`` apart are in one group."""
     pairs = cKDTree(points).query_pairs(2 * np.sin(np.radians(_GAP) / 2), output_type="ndarray")
     graph = coo_array((np.ones(len(pairs), bool), pairs.T), shape=(len(points), len(points)))
     return np.asarray(connected_components(graph, directed=False)[1])
 
 
-def _surroundings(panorama: Float32Array, sight: Float32Array, own: BoolArray, bright: BoolArray) -> Float64Array:
+def _ring_radiance(panorama: Float32Array, sight: Float32Array, own: BoolArray, bright: BoolArray) -> Float64Array:
     """Return the mean radiance (3,) of a ring around a lamp, without other lamps.
 
     If the ring has no such pixels, the mean of all pixels without lamps is returned.
@@ -159,7 +159,9 @@ def _surroundings(panorama: Float32Array, sight: Float32Array, own: BoolArray, b
     return np.asarray(np.average(panorama[~bright][chosen], axis=0, weights=weights[chosen]))
 
 
-def _rectangle(radiance: Float32Array, sight: Float32Array, pixels: BoolArray, irradiance: Float64Array) -> Lamp | None:
+def _fit_rectangle(
+    radiance: Float32Array, sight: Float32Array, pixels: BoolArray, irradiance: Float64Array
+) -> Lamp | None:
     """Fit a lamp to pixels; None if they extend too far or their centre is below the horizon.
 
     The centre of the lamp is the centroid of its light. The area and the aspect ratio are those of its core, projected
@@ -175,7 +177,7 @@ def _rectangle(radiance: Float32Array, sight: Float32Array, pixels: BoolArray, i
     middle /= max(float(np.linalg.norm(middle)), 1e-12)
     core = luminance >= 0.5 * (light @ luminance) / light.sum()
     depth = (sight @ middle)[core]
-    if depth.min() < np.cos(np.radians(_WIDEST)) or middle[2] <= 0:
+    if depth.min() < np.cos(np.radians(_MAX_HALF_ANGLE)) or middle[2] <= 0:
         return None
     axes = rectangle_axes(middle)
     area = solid[core] / depth**3

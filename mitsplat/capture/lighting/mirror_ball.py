@@ -21,25 +21,25 @@ from mitsplat.geometry.camera import Camera
 
 WIDTH = 1024
 """Width of ball panoramas [px]."""
-_FAR = 1000.0
+_PARALLEL_FOCAL = 1000.0
 """Focal length of a camera with unknown focal length, in radii of the ball; its rays are almost parallel."""
 _COARSE, _FINE = 96, 700
 """Longest edges of the pictures in which circles are searched and refined [px]."""
-_LOWEST = 10
+_MIN_EDGE = 10
 """Minimum shorter edge of the search picture [px]."""
-_SMALLEST = 0.1
+_MIN_RADIUS = 0.1
 """Minimum radius of a detected ball, as a fraction of the shorter edge."""
-_INSIDE = 0.7
+_MIN_INSIDE = 0.7
 """Minimum distance of a circle's centre from the border, in radii; partly visible balls are detected and rejected
 later.
 """
 _CANDIDATES = 30
-_NEARLY = 0.85
+_OUTLINE_SHARE = 0.85
 """Fraction of the best score from which a larger circle around the best one is taken as the outline."""
-_LEAST = 0.55
+_MIN_SCORE = 0.55
 """Minimum score of a ball's outline."""
 _STEPS = np.stack(np.meshgrid(*[(-1, 0, 1)] * 3), axis=-1).reshape(-1, 3)
-_AROUND = np.stack(np.meshgrid(*[np.arange(-8, 9) / 100] * 2, np.arange(94, 113) / 100, indexing="ij"), axis=-1)
+_NEIGHBOURHOOD = np.stack(np.meshgrid(*[np.arange(-8, 9) / 100] * 2, np.arange(94, 113) / 100, indexing="ij"), axis=-1)
 """Shifts as fractions of the radius, and factors of the radius."""
 _MARGIN = 1.5
 """Width of the ball's rim that is mixed with the background [px]."""
@@ -84,36 +84,36 @@ def find_ball(*exposures: ByteImage) -> Circle | None:
 def _find_ball(picture: ByteImage) -> tuple[float, Circle] | None:
     """Return the score and the circle of the best outline, or None."""
     scale = _COARSE / max(picture.shape[:2])
-    if scale * min(picture.shape[:2]) < _LOWEST:
+    if scale * min(picture.shape[:2]) < _MIN_EDGE:
         return None
-    slopes = _Slopes.of(picture, scale)
-    height, width = slopes.x.shape[:2]
-    radii = np.geomspace(_SMALLEST * min(height, width), 0.55 * min(height, width), 45)
+    gradients = _Gradients.of(picture, scale)
+    height, width = gradients.x.shape[:2]
+    radii = np.geomspace(_MIN_RADIUS * min(height, width), 0.55 * min(height, width), 45)
     circles = np.stack(np.meshgrid(np.arange(0, width, 2.0), np.arange(0, height, 2.0), radii), axis=-1).reshape(-1, 3)
-    reach = _INSIDE * circles[:, 2:]
+    reach = _MIN_INSIDE * circles[:, 2:]
     inside = (circles[:, :2] >= reach).all(axis=1) & (circles[:, :2] <= (width, height) - reach).all(axis=1)
     circles = circles[inside]
-    circles = circles[np.argsort(-slopes.judge(circles))[:_CANDIDATES]]
+    circles = circles[np.argsort(-gradients.score_circles(circles))[:_CANDIDATES]]
     while scale < min(1.0, _FINE / max(picture.shape[:2])):
         finer = min(1.0, 2 * scale)
-        slopes, circles = _Slopes.of(picture, finer), circles * finer / scale
+        gradients, circles = _Gradients.of(picture, finer), circles * finer / scale
         scale = finer
-        circles = slopes.climb(circles)
-    best = circles[slopes.judge(circles).argmax()]
-    near = _AROUND * best[2]
+        circles = gradients.refine(circles)
+    best = circles[gradients.score_circles(circles).argmax()]
+    near = _NEIGHBOURHOOD * best[2]
     near[..., :2] += best[:2]
-    score = slopes.judge(near.reshape(-1, 3)).reshape(near.shape[:3])
-    peaks = (score == maximum_filter(score, 3)) & (score > _NEARLY * score.max())
-    if score.max() < _LEAST:
+    score = gradients.score_circles(near.reshape(-1, 3)).reshape(near.shape[:3])
+    peaks = (score == maximum_filter(score, 3)) & (score > _OUTLINE_SHARE * score.max())
+    if score.max() < _MIN_SCORE:
         return None
     largest = near[peaks][near[peaks][:, 2].argmax()]
-    ball = slopes.climb(largest[None])
+    ball = gradients.refine(largest[None])
     x, y, radius = (ball[0] / scale).tolist()
     return float(score.max()), (x, y, radius)
 
 
 @dataclass(frozen=True, eq=False)
-class _Slopes:
+class _Gradients:
     """Gradients of a picture in CIELAB along x and y, (H, W, 3), and the gradient magnitude that counts fully."""
 
     x: Float32Array
@@ -121,13 +121,13 @@ class _Slopes:
     steep: float
 
     @classmethod
-    def of(cls, picture: ByteImage, scale: float) -> _Slopes:
+    def of(cls, picture: ByteImage, scale: float) -> _Gradients:
         small = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
         lab = cv2.GaussianBlur(np.asarray(cv2.cvtColor(small, cv2.COLOR_RGB2LAB), np.float32), (0, 0), 0.8)
         x, y = (np.asarray(cv2.Scharr(lab, cv2.CV_32F, *axis, scale=1 / 32), np.float32) for axis in ((1, 0), (0, 1)))
         return cls(x, y, 1.0 + 1.5 * float(np.sqrt((x**2 + y**2).sum(axis=2)).mean()))
 
-    def judge(self, circles: Float64Array) -> Float64Array:
+    def score_circles(self, circles: Float64Array) -> Float64Array:
         """Return the score, at most 1, of circles (x, y, radius), (N, 3), as outlines."""
         turn = np.linspace(0, 2 * np.pi, 72, endpoint=False)
         score = [np.zeros(0)]
@@ -145,12 +145,12 @@ class _Slopes:
             score.append((across - along).mean(axis=1))
         return np.concatenate(score)
 
-    def climb(self, circles: Float64Array) -> Float64Array:
+    def refine(self, circles: Float64Array) -> Float64Array:
         """Move and resize each circle to the local maximum of the score."""
         for step in (1.5, 0.75, 0.4):
             for _ in range(4):
                 moved = circles[:, None] + step * _STEPS
-                best = self.judge(moved.reshape(-1, 3)).reshape(len(moved), -1).argmax(axis=1)
+                best = self.score_circles(moved.reshape(-1, 3)).reshape(len(moved), -1).argmax(axis=1)
                 circles = moved[np.arange(len(moved)), best]
         return circles
 
@@ -170,7 +170,9 @@ def unwrap_ball(
     """
     height, width = image.shape[:2]
     x, y, radius = ball
-    camera, distance = _ball_camera(width, height, ball, focal or _FAR * radius, unit_vector(azimuth, elevation))
+    camera, distance = _ball_camera(
+        width, height, ball, focal or _PARALLEL_FOCAL * radius, unit_vector(azimuth, elevation)
+    )
 
     normal_angle = np.linspace(0.0, np.arccos(1 / distance), 4096)
     seen_at = np.arctan2(np.sin(normal_angle), distance - np.cos(normal_angle))

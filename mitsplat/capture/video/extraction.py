@@ -18,7 +18,7 @@ from mitsplat.storage.files import write_text
 _RECORD = "video.json"
 _METHOD = 1
 """Version of the frame selection; increase it when the selection changes."""
-_TOLD = 6
+_MAX_LISTED_CUTS = 6
 """Maximum number of cuts that a warning lists by time."""
 
 
@@ -49,8 +49,8 @@ class ChosenFrames:
         """Warnings about the video, one sentence each."""
         if not self.cuts:
             return ()
-        times = ", ".join(f"{time:.1f} s" for time in self.cuts[:_TOLD])
-        more = f" and {len(self.cuts) - _TOLD} times more" if len(self.cuts) > _TOLD else ""
+        times = ", ".join(f"{time:.1f} s" for time in self.cuts[:_MAX_LISTED_CUTS])
+        more = f" and {len(self.cuts) - _MAX_LISTED_CUTS} times more" if len(self.cuts) > _MAX_LISTED_CUTS else ""
         return (
             f"{self.video}: jumps at {times}{more}, by a cut or a movement too fast to follow: what shares no view "
             "with the rest gets no cameras",
@@ -79,7 +79,7 @@ def choose_frames(
     if most < least:
         raise InputError(f"at least {least} frames must be taken of a video (got {most})")
     inputs = {"video": file_hash(video), "most": most, "method": _METHOD}
-    if (kept := _kept(video, folder, inputs)) is not None:
+    if (kept := _load_finished(video, folder, inputs)) is not None:
         return kept
     if folder.exists() and any(folder.iterdir()) and not (folder / _RECORD).is_file():
         raise InputError(f"{folder}: is there already, and not of frames of a video: choose another folder")
@@ -88,33 +88,33 @@ def choose_frames(
     shutil.rmtree(made, ignore_errors=True)
     made.mkdir(parents=True)
     try:
-        found = _run(video, made, most, least, progress)
+        found = _run_worker(video, made, most, least, progress)
         write_text(made / _RECORD, json.dumps({"inputs": inputs, **found}, indent=1))
         shutil.rmtree(folder, ignore_errors=True)
         made.rename(folder)
     except BaseException:
         shutil.rmtree(made, ignore_errors=True)
         raise
-    return _chosen(video, folder, found)
+    return _chosen_frames(video, folder, found)
 
 
-def _kept(video: Path, folder: Path, inputs: dict[str, Any]) -> ChosenFrames | None:
+def _load_finished(video: Path, folder: Path, inputs: dict[str, Any]) -> ChosenFrames | None:
     """Return the frames of an earlier run if they are complete and have the same inputs, else None."""
     try:
         record = json.loads((folder / _RECORD).read_text())
         if record.pop("inputs") != inputs:
             return None
-        chosen = _chosen(video, folder, record)
+        chosen = _chosen_frames(video, folder, record)
     except (OSError, ValueError, KeyError, TypeError):  # missing or damaged: recompute
         return None
     return chosen if {path.name for path in folder.glob("*.jpg")} == set(chosen.names) else None
 
 
-def _chosen(video: Path, folder: Path, found: dict[str, Any]) -> ChosenFrames:
+def _chosen_frames(video: Path, folder: Path, found: dict[str, Any]) -> ChosenFrames:
     return ChosenFrames(video, folder, **found | {"names": tuple(found["names"]), "cuts": tuple(found["cuts"])})
 
 
-def _run(video: Path, folder: Path, most: int, least: int, progress: Progress | None) -> dict[str, Any]:
+def _run_worker(video: Path, folder: Path, most: int, least: int, progress: Progress | None) -> dict[str, Any]:
     """Run the child process that writes the frames, and return its result."""
     command = python_command("-m", "mitsplat.capture.video.video_worker", video, folder, str(most), str(least))
     # Excludes playlists, which FFmpeg would follow to other files.

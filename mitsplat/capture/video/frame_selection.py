@@ -15,10 +15,10 @@ STEP = 0.05
 It corresponds to ten degrees around an object that stands on its board and fills half of the image.
 """
 
-_MIDDLE = 0.5
+_CENTRAL_SHARE = 0.5
 """Central fraction of a step that is searched first, so that frames are evenly spaced."""
 
-_DULL = 0.5
+_MIN_RELATIVE_SHARPNESS = 0.5
 """Minimum sharpness of the best central frame relative to the best frame of the step; otherwise the latter is taken."""
 
 
@@ -75,12 +75,13 @@ def choose(measures: list[FrameMeasure], most: int) -> Choice:
         count = 1 + int(length / step)
         sharp = np.array([measure.sharpness for measure in segment])
         chosen += [
-            segment[place] for place in _sharpest(np.asarray((path - path[0]) / max(length, 1e-12)), sharp, count)
+            segment[place]
+            for place in _sharpest_frames(np.asarray((path - path[0]) / max(length, 1e-12)), sharp, count)
         ]
     return Choice(tuple(chosen), tuple(segment[0].time for segment in segments[1:]), sum(lengths))
 
 
-def _sharpest(share: Float64Array, sharp: Float64Array, count: int) -> list[int]:
+def _sharpest_frames(share: Float64Array, sharp: Float64Array, count: int) -> list[int]:
     """Return the indices of the sharpest frame of each of ``count`` equal steps; empty steps have none.
 
     Args:
@@ -89,7 +90,7 @@ def _sharpest(share: Float64Array, sharp: Float64Array, count: int) -> list[int]
         count: Number of steps.
     """
     places: Int64Array = np.minimum((share * count).astype(np.int64), count - 1)
-    central = np.abs(share * count - places - 0.5) <= _MIDDLE / 2
+    central = np.abs(share * count - places - 0.5) <= _CENTRAL_SHARE / 2
     chosen = []
     for number in np.unique(places):
         inside = np.flatnonzero(places == number)
@@ -97,6 +98,6 @@ def _sharpest(share: Float64Array, sharp: Float64Array, count: int) -> list[int]
         middle = inside[central[inside]]
         if count > 1 and len(middle):
             nearest = middle[np.argmax(sharp[middle])]
-            best = nearest if sharp[nearest] >= _DULL * sharp[best] else best
+            best = nearest if sharp[nearest] >= _MIN_RELATIVE_SHARPNESS * sharp[best] else best
         chosen.append(int(best))
     return chosen

@@ -12,17 +12,17 @@ from mitsplat.capture.video.shrink import shrink
 
 _EDGE = 480
 """Longer edge of the images in which motion is measured [px]."""
-_CORNERS = 300
+_MAX_CORNERS = 300
 """Maximum number of tracked corners."""
-_FEWEST = 12
+_MIN_CORNERS = 12
 """Minimum number of corners for a motion measurement."""
-_SURVIVING = 0.3
+_MIN_SURVIVING = 0.3
 """Minimum fraction of corners that must be found again; views of one scene keep most, other images hardly any."""
-_RETURN = 1.0
+_MAX_RETURN_ERROR = 1.0
 """Maximum distance between a corner and its position after forward and backward tracking [px]."""
-_TICK = 0.01
+_ANCHOR_MOTION = 0.01
 """Motion after which the anchor is replaced, as a fraction of the image width; well above noise and compression."""
-_PATIENCE = 5
+_MAX_LOST_FRAMES = 5
 """Maximum number of consecutive unrecognisable frames; after them, a new segment starts."""
 
 
@@ -44,9 +44,8 @@ class Moved:
 class MotionClock:
     """Accumulator of image motion: the median length of corner tracks (Shi and Tomasi 1994; Bouguet 2000).
 
-    Corners are tracked from one image, the anchor, until the motion since then exceeds ``_TICK``. The current image
-    then
-    becomes the anchor. So noise and a trembling hand add no motion.
+    Corners are tracked from one image, the anchor, until the motion since then exceeds ``_ANCHOR_MOTION``. The current
+    image then becomes the anchor. So noise and a trembling hand add no motion.
     """
 
     def __init__(self) -> None:
@@ -57,38 +56,38 @@ class MotionClock:
     def add(self, grey: ByteImage) -> Moved:
         """Add the next image, grey, shape (H, W), and return its position in the motion."""
         grey = shrink(grey, _EDGE)
-        if self._anchor is None or len(self._corners) < _FEWEST:  # no corners yet: use the first image that has some
-            self._take(grey)
-            return Moved(self._segment, self._path, len(self._corners) >= _FEWEST)
-        moves = _moves(self._anchor, grey, self._corners)
-        if len(moves) < max(_FEWEST, _SURVIVING * len(self._corners)):
+        if self._anchor is None or len(self._corners) < _MIN_CORNERS:  # use the first image with corners
+            self._set_anchor(grey)
+            return Moved(self._segment, self._path, len(self._corners) >= _MIN_CORNERS)
+        moves = _track_corners(self._anchor, grey, self._corners)
+        if len(moves) < max(_MIN_CORNERS, _MIN_SURVIVING * len(self._corners)):
             self._lost += 1
-            if self._lost <= _PATIENCE:
+            if self._lost <= _MAX_LOST_FRAMES:
                 return Moved(self._segment, self._path + self._beyond, followed=False)
             self._path += self._beyond
             self._segment += 1
-            self._take(grey)
-            return Moved(self._segment, self._path, len(self._corners) >= _FEWEST)
+            self._set_anchor(grey)
+            return Moved(self._segment, self._path, len(self._corners) >= _MIN_CORNERS)
         self._lost = 0
         self._beyond = float(np.median(np.linalg.norm(moves, axis=1))) / grey.shape[1]
         moved = Moved(self._segment, self._path + self._beyond, followed=True)
-        if self._beyond >= _TICK:
+        if self._beyond >= _ANCHOR_MOTION:
             self._path = moved.path
-            self._take(grey)
+            self._set_anchor(grey)
         return moved
 
-    def _take(self, grey: ByteImage) -> None:
+    def _set_anchor(self, grey: ByteImage) -> None:
         """Make an image the anchor."""
-        found = cv2.goodFeaturesToTrack(grey, _CORNERS, qualityLevel=0.01, minDistance=8)
+        found = cv2.goodFeaturesToTrack(grey, _MAX_CORNERS, qualityLevel=0.01, minDistance=8)
         self._corners = np.zeros((0, 1, 2), dtype=np.float32) if found is None else np.asarray(found, dtype=np.float32)
         self._anchor, self._beyond, self._lost = grey, 0.0, 0
 
 
-def _moves(before: ByteImage, after: ByteImage, corners: Float32Array) -> Float32Array:
+def _track_corners(before: ByteImage, after: ByteImage, corners: Float32Array) -> Float32Array:
     """Return the displacements [px], shape (M, 2), of the corners (N, 1, 2) that are found again."""
     window, levels = (21, 21), 4
     there, found, _ = cv2.calcOpticalFlowPyrLK(before, after, corners, corners.copy(), winSize=window, maxLevel=levels)
     back, returned, _ = cv2.calcOpticalFlowPyrLK(after, before, there, corners.copy(), winSize=window, maxLevel=levels)
-    near = np.linalg.norm(back - corners, axis=2).ravel() < _RETURN
+    near = np.linalg.norm(back - corners, axis=2).ravel() < _MAX_RETURN_ERROR
     good = near & (found.ravel() > 0) & (returned.ravel() > 0)
     return np.asarray((there - corners)[good, 0], dtype=np.float32)

@@ -39,12 +39,12 @@ def main(video: Path, folder: Path, most: int, least: int) -> None:
     try:
         measures = _measure(video)
         choice = choose(measures, most)
-        _refuse(video, choice, measures[-1].time, most, least)
+        _check_choice(video, choice, measures[-1].time, most, least)
         names = _write(video, folder, choice)
     except InputError as error:
-        _say(error=str(error))
+        _send(error=str(error))
         return
-    _say(
+    _send(
         found={
             "names": names,
             "read": len(measures),
@@ -62,11 +62,11 @@ def _measure(video: Path) -> list[FrameMeasure]:
         for index, time in reader.times():
             grey: ByteImage = np.asarray(cv2.cvtColor(reader.picture(), cv2.COLOR_BGR2GRAY), dtype=np.uint8)
             measures.append(FrameMeasure(index, time, clock.add(grey), sharpness(grey)))
-            _say(progress=(index + 1, max(index + 1, reader.stated), "watching the video"))
+            _send(progress=(index + 1, max(index + 1, reader.stated), "watching the video"))
     return measures
 
 
-def _refuse(video: Path, choice: Choice, seconds: float, most: int, least: int) -> None:
+def _check_choice(video: Path, choice: Choice, seconds: float, most: int, least: int) -> None:
     """Raise InputError if the video gives too few frames or too many."""
     if len(choice.frames) < least:
         if not choice.cuts and choice.moved < STEP:
@@ -92,14 +92,14 @@ def _write(video: Path, folder: Path, choice: Choice) -> list[str]:
         for index, _ in reader.times():
             if index in names:
                 _, coded = cv2.imencode(".jpg", reader.picture(), _JPEG)
-                write_file(folder / names[index], partial(_store, coded.tobytes()))
-                _say(progress=(index + 1, max(index + 1, reader.stated), "taking frames of the video"))
+                write_file(folder / names[index], partial(_write_bytes, coded.tobytes()))
+                _send(progress=(index + 1, max(index + 1, reader.stated), "taking frames of the video"))
             if index >= choice.frames[-1].index:
                 break
     return list(names.values())
 
 
-def _store(data: bytes, file: Path) -> None:
+def _write_bytes(data: bytes, file: Path) -> None:
     file.write_bytes(data)
 
 
@@ -109,7 +109,7 @@ def _name(time: float) -> str:
     return f"{minutes:02}m{milliseconds // 1000:02}s{milliseconds % 1000:03}.jpg"
 
 
-def _say(**message: Any) -> None:
+def _send(**message: Any) -> None:
     sys.stdout.write(f"{json.dumps(message)}\n")
     sys.stdout.flush()
 

@@ -484,8 +484,8 @@ class TestInput:
     @pytest.mark.parametrize(
         ("words", "sentence"),
         [
-            (["grey.png"], "grey.png: without --camera there must be one HDR panorama, .exr, .hdr, .pfm; give"),
-            (["nan.exr", "nan.exr"], "nan.exr: without --camera there must be one HDR panorama"),
+            (["grey.png"], "grey.png: must be the only input and an HDR panorama, .exr, .hdr, .pfm; for"),
+            (["nan.exr", "nan.exr"], "nan.exr: must be the only input and an HDR panorama"),
             (["square.exr"], "square.exr: a panorama must be twice as wide as high, all around (got 8 x 8 px)"),
             (["nan.exr"], "nan.exr: radiance must be finite (got nan at pixel 5, 3, and 1 such pixels)"),
             (["dark.exr"], "dark.exr: a panorama must have light above the horizon (got none)"),
@@ -524,11 +524,11 @@ class TestInput:
             (["grey.png", *CAMERA, "--ball", 60, 30, 9], "grey.png: the ball's radius must be 20 px or more (got 9)"),
             (
                 ["nan.exr", "--fov-x", 30],
-                "--ball, --fov-x, --exposures and --reflectivity are of photographs of a mirror",
+                "--ball, --fov-x, --exposures and --reflectivity apply to photographs of a mirror",
             ),
             (
                 ["grey.png", *CAMERA, "--rotate-z", 5],
-                "--rotate-z is of panoramas: the ball's is turned by --camera (got 5)",
+                "--rotate-z applies to panoramas; for a mirror ball, use --camera (got 5)",
             ),
             (["nan.exr", "--distance", 0], "--distance must be finite and > 0 (got 0)"),
             (["nan.exr", "--irradiance", -1], "--irradiance must be finite and > 0 (got -1)"),

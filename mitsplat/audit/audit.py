@@ -162,7 +162,7 @@ def _check_files(root: Path, record: Record) -> Violations:
             yield file, "is missing"
             continue
         if file_hash(root / file) != digest:
-            yield file, "is not what was written: its SHA-256 differs from the manifest's"
+            yield file, "has another SHA-256 than the manifest states"
 
 
 def _check_rest(root: Path) -> Violations:
@@ -171,7 +171,7 @@ def _check_rest(root: Path) -> Violations:
     if not sheet.is_file() or read_picture(sheet) is None:
         yield sheet.name, "is missing or cannot be read as an image"
     if not any((root / "scene").glob("*")):
-        yield "scene", "does not hold the scene file"
+        yield "scene", "must contain the scene file"
 
 
 def _check_labels(frame: TrueFrame) -> Iterator[str]:
@@ -192,17 +192,17 @@ def _check_labels(frame: TrueFrame) -> Iterator[str]:
             ("amodal_box", label.amodal_box, label.amodal_area, entry["amodal_area"]),
         ):
             if list(box) != entry[key] or area != stated:
-                yield f"{name}: {key} {entry[key]} and area {stated} are not those of its mask"
+                yield f"{name}: {key} {entry[key]} and area {stated} do not match its mask"
         if (mask & ~amodal).any():
             yield f"{name}: its mask has pixels outside its silhouette"
         if label.amodal_area > label.silhouette_area:
-            yield f"{name}: its silhouette is smaller in all than in the image"
+            yield f"{name}: its silhouette_area is below the number of its pixels in the image"
         x0, y0, x1, y1 = entry["silhouette_box"]
         left, top, right, bottom = label.amodal_box
         if not (x0 <= left and y0 <= top and x1 >= right and y1 >= bottom) or (
             label.amodal_area == label.silhouette_area and (x0, y0, x1, y1) != label.amodal_box
         ):
-            yield f"{name}: silhouette_box {entry['silhouette_box']} is not that of its silhouette"
+            yield f"{name}: silhouette_box {entry['silhouette_box']} does not match its silhouette"
         fraction = label.area / label.amodal_area
         if abs(fraction - entry["visible_fraction"]) > _FRACTION_TOLERANCE:
             yield f"{name}: its visible fraction is {fraction:.6f}, not {entry['visible_fraction']}"
@@ -212,7 +212,7 @@ def _check_labels(frame: TrueFrame) -> Iterator[str]:
         below = {"occluded": fraction < rules["min_visible"] - _FRACTION_TOLERANCE}
         below["disagreeing"] = entry["agreement"] < rules["min_agreement"] - _FRACTION_TOLERANCE
         if set(entry["marks"]) != {mark for mark, is_below in below.items() if is_below}:
-            yield f"{name}: its marks {entry['marks']} are not those that the thresholds give"
+            yield f"{name}: its marks {entry['marks']} do not match the thresholds"
         if label.area < rules["min_pixels"]:
             yield f"{name}: has {label.area} pixels, fewer than {rules['min_pixels']}"
         if not _is_rigid(label.pose):

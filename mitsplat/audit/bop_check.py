@@ -136,7 +136,7 @@ class BopReader:
         labelled = labelled_assets(self._content)
         numbers = {str(position + 1) for position in labelled}
         if isinstance(info, dict) and info.keys() - numbers:
-            yield file, f"measures {min(info.keys() - numbers)}, which is no object that is labelled"
+            yield file, f"has an entry {min(info.keys() - numbers)}, which is no labelled object"
         for number in (position + 1 for position in labelled):
             model = f"bop/models/obj_{number:06d}.ply"
             if not (self._root / model).is_file():
@@ -157,7 +157,7 @@ class BopReader:
                 isinstance(stated, dict) and is_close(stated.get(key), value, _MODEL_TOLERANCE / max(1.0, abs(value)))
                 for key, value in measured.items()
             ):
-                yield file, f"does not give the measures of {model}"
+                yield file, f"does not state the measures of {model}"
 
 
 def _by_frame(path: Path) -> Iterator[tuple[int, Any]]:
@@ -204,7 +204,7 @@ def _check_numbers(entry: Any, expected: Mapping[str, Float64Array]) -> Iterator
     for key, values in expected.items():
         found = entry.get(key) if isinstance(entry, dict) else None
         if not is_close(found, values):
-            yield f": {key} is {str(found)[:60]}, not that of the manifest's camera and poses"
+            yield f": {key} is {str(found)[:60]}, which differs from the manifest's camera and poses"
 
 
 def _numbers(entry: Any, **sizes: int) -> Float64Array | None:

@@ -80,7 +80,9 @@ class Cursor:
             if found == index:
                 yield entry
             else:
-                self._error = self._error or f"has an entry of frame {found}, which is not in the manifest at its place"
+                self._error = self._error or (
+                    f"has an entry of frame {found}, which the manifest does not have at this position"
+                )
 
     def errors(self) -> Violations:
         """Yield the errors so far; after an error, further entries may be missed."""
@@ -93,7 +95,7 @@ class Cursor:
         """Yield the remaining errors, and a violation if entries are left."""
         yield from self.errors()
         if self._next is not None and not self.broken:
-            yield self.file, f"has an entry of frame {self._next[0]}, which is not in the manifest at its place"
+            yield self.file, f"has an entry of frame {self._next[0]}, which the manifest does not have at this position"
             list(self._entries_left())
 
     def _entries_left(self) -> Iterator[Any]:
@@ -234,11 +236,11 @@ class InstancesReader:
                 with contextlib.redirect_stdout(io.StringIO()):
                     coco = COCO(self._path)
                 read = {"images": len(coco.imgs), "annotations": len(coco.anns)}
-            except Exception as error:  # noqa: BLE001 - whatever it stumbles over, its users do too
+            except Exception as error:  # noqa: BLE001 - users of the file get the same error
                 yield self._of.file, f"cannot be read by pycocotools ({type(error).__name__}: {error})"
             else:
                 if read != self._of.counts:
-                    yield self._of.file, f"has {self._of.counts}, of which pycocotools tells apart {read}"
+                    yield self._of.file, f"has {self._of.counts}, but pycocotools reads {read}"
 
 
 class PanopticReader:
@@ -355,7 +357,7 @@ class PosesReader:
             poses = {"world_from_object": label.pose, "camera_from_object": frame.camera_from_world @ label.pose}
             for key, pose in poses.items():
                 if not is_close(instance.get(key), pose):
-                    yield f", {label.name}: {key} is not that of the manifest's poses"
+                    yield f", {label.name}: {key} differs from the manifest's poses"
 
     def finish(self) -> Violations:
         """Check the remaining entries and the classes."""
@@ -367,7 +369,7 @@ class PosesReader:
 
 def _check_segmentation(frame: TrueFrame, label: TrueInstance, code: Any, *, amodal: bool) -> Iterator[str]:
     width, height = frame.size
-    name = "segmentation" if amodal else "segmentation of what is seen"
+    name = "segmentation" if amodal else "segmentation of visible pixels"
     if not isinstance(code, dict) or code.get("size") != [height, width] or not isinstance(code.get("counts"), str):
         yield f"{name} is not a run-length code of {width}x{height} px"
         return
@@ -375,7 +377,7 @@ def _check_segmentation(frame: TrueFrame, label: TrueInstance, code: Any, *, amo
     try:
         mask = decode_rle(code).astype(bool)
         box = coco_mask.toBbox(code).tolist()
-    except Exception as error:  # noqa: BLE001 - pycocotools raises what it likes
+    except Exception as error:  # noqa: BLE001 - pycocotools raises various types
         yield f"{name} cannot be decoded by pycocotools ({error})"
         return
     if (mask != truth).any():

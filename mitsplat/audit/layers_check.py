@@ -120,7 +120,7 @@ class LayersReader:
             runs, stays = (self._pixels_of(before, carries).ravel()[known] for carries in (True, False))
             wrong = np.where(runs, carried, np.where(stays, wrong, wrong & carried))
         if count := np.count_nonzero(wrong):
-            yield file, f"{count} pixels do not move as depth and cameras say"
+            yield file, f"{count} pixels have a flow that contradicts depth and cameras"
 
     def _pixels_of(self, frame: TrueFrame, carried: bool) -> BoolArray:
         """Return the pixels (H, W) of the labelled instances that the belt carries, or of the others."""
@@ -177,11 +177,14 @@ class PlacementReader:
             if fit.count >= 2 * _MIN_INSTANCES and fit.rms > _MAX_OFFSET:
                 yield (
                     "manifest.jsonl",
-                    f"silhouettes of asset {asset} lie {fit.rms / 2:.1f} times their size from where its poses put it",
+                    f"silhouettes of asset {asset} are {fit.rms / 2:.1f} times their size away from its poses",
                 )
         for asset, fit in sorted(self._depths.items()):
             if fit.count >= _MIN_INSTANCES and fit.rms > _MAX_DEPTH_OFFSET:
-                yield "manifest.jsonl", f"depth pictures put asset {asset} {fit.rms:.0%} of its distance off its poses"
+                yield (
+                    "manifest.jsonl",
+                    f"depths of asset {asset} differ from its poses by {fit.rms:.0%} of its distance",
+                )
 
 
 class _PointFit:
@@ -225,7 +228,7 @@ def _check_sensed(frame: TrueFrame, depth: Float64Array | None) -> Violations:
         measured = stored[both] * frame.record["depth_sensor_scale"] / 1000
         error = float(np.median(np.abs(measured - depth[both]) / depth[both]))
         if error > _MAX_DEPTH_ERROR:
-            yield file, f"depths are off by {error:.0%} of the true ones in the middle"
+            yield file, f"depths have a median error of {error:.0%}"
 
 
 def _read_16_bits(path: Path, shape: tuple[int, ...]) -> npt.NDArray[np.uint16] | None:
@@ -241,7 +244,7 @@ def _read_exr(path: Path) -> tuple[dict[str, npt.NDArray[Any]], str]:
         check_exr_header(path)
         with OpenEXR.File(str(path), separate_channels=True) as file:
             return {name: np.array(channel.pixels) for name, channel in file.channels().items()}, ""
-    except Exception as error:  # noqa: BLE001 - OpenEXR raises what it likes
+    except Exception as error:  # noqa: BLE001 - OpenEXR raises various types
         return {}, f"cannot be read as OpenEXR ({error})"
 
 

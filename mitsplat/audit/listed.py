@@ -111,9 +111,9 @@ class YoloReader:
             if data.get(split) != f"images/{shown}":
                 yield f"{split} is {data.get(split)}, not images/{shown}"
         if data.get("test") != ("images/test" if "test" in self._splits else None):
-            yield f"test is {data.get('test')}, which does not say whether there are images of that split"
+            yield f"test is {data.get('test')}, which does not match the images of that split"
         if "path" in data:
-            yield "has a path, which ties it to where it was made"
+            yield "must not have a path, because the dataset could not be moved"
         if with_points:
             names = self._content["keypoints"]
             count = max(map(len, names), default=0)
@@ -173,9 +173,9 @@ class ColmapReader:
         if image["name"] != f"{frame.split}/{frame.image_name}":
             yield f"its name is {image['name']}, not {frame.split}/{frame.image_name}"
         if not is_close(image["camera_from_world"], frame.camera_from_world[:3], 1e-8):
-            yield "its pose is not that of the manifest's camera"
+            yield "its pose differs from the manifest's camera"
         if image["size"] != list(frame.size) or not is_close(image["pixels"], frame.project(_POINTS), _PIXEL_TOLERANCE):
-            yield "its camera is not that of the manifest"
+            yield "its camera differs from that of the manifest"
 
     def finish(self) -> Violations:
         """Report missing files and check the remaining entries."""
@@ -222,12 +222,15 @@ class LayoutReader:
         del dropped["fragments"]
         labelled = [entry for entry in self._found.values() if entry.get("class_index") is not None]
         if len(frame.instances) + dropped.total() != len(labelled):
-            yield where, f"{len(frame.instances)} labels and {dropped.total()} instances without are not all of {file}"
+            yield (
+                where,
+                f"{len(frame.instances)} labels and {dropped.total()} unlabelled instances are not all of {file}",
+            )
         drawn = frame.record.get("objects")
         if drawn is not None and [(one["id"], one["asset"]) for one in drawn] != [
             (number, entry.get("asset")) for number, entry in self._found.items()
         ]:
-            yield where, f"its objects are not those of {file}"
+            yield where, f"its objects differ from those of {file}"
 
     def _pose_at(self, stored: Any, frame: TrueFrame) -> Any:
         """Return a stored pose at the time of a frame, displaced by the belt if the belt carries the object."""

@@ -64,10 +64,10 @@ def check_listed(record: Record, content: Mapping[str, Any]) -> Violations:
     where, required = f"manifest.jsonl, frame {record['index']}", files_of_frame(record, content)
     for file, name in required.items():
         if file not in record["files"]:
-            yield where, f"lists no file of the format {name} by the name {file}"
+            yield where, f"does not list {file} of the format {name}"
     for file in record["files"]:
         if file not in required:
-            yield where, f"lists {file}, which is of no format of the dataset"
+            yield where, f"lists {file}, which belongs to no format of the dataset"
 
 
 def labelled_assets(content: Mapping[str, Any]) -> list[int]:

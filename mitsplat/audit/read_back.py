@@ -57,7 +57,7 @@ def _check_lines(check: LineCheck, frame: TrueFrame, path: Path) -> Iterator[str
     try:
         rows = [[float(value) for value in line.split()] for line in path.read_text().splitlines()]
     except ValueError as error:
-        yield f"holds something else than numbers ({error})"
+        yield f"must contain only numbers ({error})"
         return
     if len(rows) != len(frame.instances):
         yield f"has {len(rows)} lines for {len(frame.instances)} instances"
@@ -88,14 +88,14 @@ def _check_segment(frame: TrueFrame, label: TrueInstance, values: list[float]) -
     parts = cv2.connectedComponents(label.mask.astype(np.uint8), connectivity=8)[0] - 1
     iou = (label.area - lost) / (label.area + added)
     if lost > _PIXEL_TOLERANCE or added > _PIXEL_TOLERANCE + (bridged_pixels(label.mask) if parts > 1 else 0):
-        yield f"{label.name}: its polygon does not give its mask back (IoU {iou:.4f})"
+        yield f"{label.name}: its polygon does not reproduce its mask (IoU {iou:.4f})"
     elif label.area > POLYGON_AREA and parts == 1 and iou < POLYGON_IOU:
         yield f"{label.name}: its polygon has an IoU of {iou:.4f} with its mask"
     if abs(iou - label.entry["polygon_iou"]) > _PIXEL_TOLERANCE / label.area:
         yield f"{label.name}: the IoU of its polygon is {iou:.6f}, not the manifest's {label.entry['polygon_iou']}"
     box = np.concatenate([points.min(axis=0), points.max(axis=0)]) * np.tile(frame.size, 2)
     if np.abs(box - label.box).max() > 0.05:
-        yield f"{label.name}: the box of its polygon is not that of its mask"
+        yield f"{label.name}: the box of its polygon does not match its mask"
 
 
 def bridged_pixels(mask: BoolArray) -> int:
@@ -117,7 +117,7 @@ def bridged_pixels(mask: BoolArray) -> int:
 
 def _check_box(frame: TrueFrame, label: TrueInstance, values: list[float]) -> Iterator[str]:
     if len(values) != 4 or not _is_box(values, frame, label):
-        yield f"{label.name}: its line is not its box"
+        yield f"{label.name}: its line does not match its box"
 
 
 def _check_rotated(frame: TrueFrame, label: TrueInstance, values: list[float]) -> Iterator[str]:
@@ -150,13 +150,13 @@ def _check_rotated(frame: TrueFrame, label: TrueInstance, values: list[float]) -
 def _check_pose(frame: TrueFrame, label: TrueInstance, values: list[float]) -> Iterator[str]:
     count = max(map(len, frame.content["keypoints"]), default=0)
     if len(values) != 4 + 3 * count or not _is_box(values[:4], frame, label):
-        yield f"{label.name}: its line is not its box and {count} keypoints"
+        yield f"{label.name}: its line does not match its box and {count} keypoints"
         return
     points = np.array(values[4:]).reshape(-1, 3) * [*frame.size, 1]
     stated = np.array(label.entry["keypoints"], dtype=np.float64).reshape(-1, 3)
     expected = np.concatenate([stated, np.zeros((count - len(stated), 3))])
     if np.abs(points - expected).max() > _POSITION_TOLERANCE:
-        yield f"{label.name}: its keypoints are not those of the manifest"
+        yield f"{label.name}: its keypoints differ from the manifest's"
 
 
 def _check_voc(frame: TrueFrame, path: Path) -> Iterator[str]:
@@ -179,9 +179,9 @@ def _check_voc(frame: TrueFrame, path: Path) -> Iterator[str]:
         box = [entry.findtext(f"bndbox/{name}") for name in ("xmin", "ymin", "xmax", "ymax")]
         x0, y0, x1, y1 = label.box
         if box != [str(value) for value in (x0 + 1, y0 + 1, x1, y1)]:  # from 1, last included
-            yield f"{label.name}: its box is not that of its mask"
+            yield f"{label.name}: its box does not match its mask"
         if [entry.findtext(name) for name in ("truncated", "occluded")] != [str(int(flag)) for flag in label.voc_flags]:
-            yield f"{label.name}: its flags are not those of its masks"
+            yield f"{label.name}: its flags do not match its masks"
 
 
 def read_grey(path: Path, frame: TrueFrame) -> Int64Array | None:
@@ -232,7 +232,7 @@ def _check_panoptic(frame: TrueFrame, path: Path) -> Iterator[str]:
     elif stuff is not None:
         box = bounds_of(ids == stuff["id"])
         if list(box) != stuff["box"] or np.count_nonzero(ids == stuff["id"]) != stuff["area"]:
-            yield f"its environment has the box {list(box)}, not {stuff['box']} as the manifest says, or another area"
+            yield f"its environment has the box {list(box)}, not {stuff['box']} as in the manifest, or another area"
 
 
 def _check_depth(frame: TrueFrame, path: Path) -> Iterator[str]:

@@ -33,7 +33,7 @@ class SceneReader:
         """Check that the scene can have the frame's camera and labels; a camera given by the caller is not checked."""
         width, height = self._output["width"], self._output["height"]
         if frame.size != (width, height):
-            text = f"is {frame.size[0]}x{frame.size[1]} px, not {width}x{height} as the scene says"
+            text = f"is {frame.size[0]}x{frame.size[1]} px, not {width}x{height} as in the scene"
             yield f"manifest.jsonl, frame {frame.index}", text
         for text in (*(() if self._given else self._check_camera(frame)), *self._check_objects(frame)):
             yield f"manifest.jsonl, frame {frame.index}", text
@@ -42,7 +42,7 @@ class SceneReader:
         drawn, (number, right) = frame.record.get("viewpoint") or {}, self._camera_slot(frame)
         sides = ("left", "right") if self._cameras[number].get("stereo") else (None, None)
         if (drawn.get("camera", 0), drawn.get("side")) != (number, sides[right]):
-            yield "it is not of the camera whose turn it is"
+            yield "its camera is not the scene's camera for this view"
         yield from self._check_lens(frame)
         yield from self._check_place(frame)
 
@@ -57,17 +57,17 @@ class SceneReader:
             if asset in self._held_out and frame.split != "test":
                 yield f"{label.name} is of an asset that is held out for the test split"
             if asset in self._distractors:
-                yield f"{label.name} is labelled, though the scene says that it is not"
+                yield f"{label.name} is labelled, although its asset is a distractor"
             if drawn is not None and not any(
                 (one["id"], one["asset"], one["label"]) == (label.id, asset, True) for one in drawn
             ):
-                yield f"{label.name} is none of the objects that were drawn"
+                yield f"{label.name} is not among the drawn objects"
         left_out = {one["id"] for one in frame.record.get("left_out", ())}
         for label in frame.instances:
             if label.id in left_out:
-                yield f"{label.name} is labelled, though its layout lacks it"
+                yield f"{label.name} is labelled, although its layout lacks it"
         if frame.record.get("empty") and frame.instances:
-            yield f"has {len(frame.instances)} labels, though its layout is an empty one"
+            yield f"has {len(frame.instances)} labels, although its layout is empty"
 
     def _check_lens(self, frame: TrueFrame) -> Iterator[str]:
         camera, drawn = self._camera_of(frame), frame.record.get("viewpoint") or {}
@@ -75,7 +75,7 @@ class SceneReader:
         low, high = camera.get("zoom", (1.0, 1.0))
         zoom = drawn.get("zoom", low)
         if not low <= zoom <= high or (low < high and "zoom" not in drawn):
-            yield f"its zoom must be stated, and in the scene's {low:g} to {high:g} (got {drawn.get('zoom')})"
+            yield f"its zoom must be stated and within the scene's {low:g} to {high:g} (got {drawn.get('zoom')})"
         wide, tall = lens["size"] or (width, height)
         if lens["fov_x"] is not None:
             fx = fy = wide / (2 * np.tan(np.radians(lens["fov_x"]) / 2))
@@ -132,7 +132,7 @@ class SceneReader:
                 yield f"its camera is {away:.3g} m from the key of the scene's path"
             direction = np.subtract(key["target"], key["eye"])
             if axis @ direction < (1 - _POSITION_TOLERANCE) * np.linalg.norm(direction):
-                yield "its camera does not look where the scene's path says"
+                yield "its camera does not look at the target of the scene's path"
             return
         target, tolerance = camera["target"], _SIGMAS * camera.get("target_jitter", 0.0) + _POSITION_TOLERANCE
         if (stated := (frame.record.get("viewpoint") or {}).get("target")) is not None:

@@ -207,7 +207,9 @@ def bake_asset(
     surfels = place_surfels(surface, face_density, round(settings.gaussians / max(share, 0.2)), rng)
     surfels = surfels.subset(_visible_surfels(clay, surfels, rng))
     if not len(surfels):
-        raise InputError(f"{name}: no point of the mesh can be seen; are its faces inside out?")
+        raise InputError(
+            f"{name}: no point of the mesh is visible from outside; check whether its faces are inside out"
+        )
     colour = _fit_radiance(scene, surfels, settings, rng, stages.step)
     splats = surfels.splats(_sharpen_colours(surfels, colour, settings.sharpening))
     if settings.fit_steps:
@@ -257,7 +259,7 @@ def bake_asset(
     if brightness is not None and not _MIN_BRIGHTNESS < brightness < _MAX_BRIGHTNESS:
         warnings.append(
             f"the splats are {brightness:.2g} times as bright as the textures of the file: "
-            "are the factors of its materials meant?"
+            "check the factors of its materials"
         )
     stages.end()
     return BakeResult(asset, psnr, psnr_object, views, surface, brightness, tuple(warnings))
@@ -295,7 +297,7 @@ def _check_size(source: str, size: float, metres_per_unit: float) -> None:
         likely = f"--units {metres_per_unit * factor:g} reads it in {unit}, and "
     raise InputError(
         f"{source}: an object must be {_MIN_OBJECT_SIZE:g} to {_MAX_OBJECT_SIZE:g} m across (got {size:.3g} m at "
-        f"{metres_per_unit:g} metres per unit: {likely}--any-size bakes it as it is)"
+        f"{metres_per_unit:g} metres per unit: {likely}--any-size accepts the size)"
     )
 
 

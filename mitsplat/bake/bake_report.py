@@ -52,8 +52,8 @@ def _figures(result: BakeResult) -> str:
             rows["Convex pieces"] = f"{len(asset.pieces)}, at most {1e3 * gap:.2f} mm outside of the mesh"
             if gap > bearable:
                 warnings.append(
-                    f"convex pieces close hollows of the mesh by up to {1e3 * gap:.1f} mm, more than the "
-                    f"{1e3 * bearable:.1f} mm that layouts bear: those in which something rests there are drawn again"
+                    f"convex pieces fill cavities of the mesh by up to {1e3 * gap:.1f} mm, more than the "
+                    f"{1e3 * bearable:.1f} mm that layouts allow: layouts with an object resting there are drawn again"
                 )
     verdict = verdict_of(warnings, "Nothing to note.", rows)
     return f'<section aria-labelledby="figures"><h2 id="figures">Figures</h2>{verdict}</section>'
@@ -61,8 +61,8 @@ def _figures(result: BakeResult) -> str:
 
 def _views(result: BakeResult) -> str:
     note = (
-        "Views that nothing was fitted to: the path-traced mesh, and its splats. "
-        f"In differences white is an error of {_WHITE_DIFFERENCE:g} of the range."
+        "Views that were not used for the fit: the path-traced mesh and its splats. "
+        f"White in the difference is an error of {_WHITE_DIFFERENCE:g} of the range."
     )
     figures = "".join(_view(number + 1, view) for number, view in enumerate(result.views))
     return (

@@ -210,7 +210,7 @@ def _read_part(
     gloss = (material.metallic, material.roughness, material.shiny, material.specular)
     if material.texture is not None and visual.uv is not None:
         if per_corner is not None and (per_corner[..., :3] < 255).any():
-            warnings.append(f"part {name!r} has a texture and vertex colours: these are left out")
+            warnings.append(f"part {name!r} has a texture and vertex colours: the vertex colours are ignored")
         texture = material.texture
         if not (material.factor == 1.0).all():
             texture = (255.0 * encode_srgb(decode_srgb(texture / 255.0) * material.factor)).round().astype(np.uint8)

@@ -59,7 +59,7 @@ class SurfaceFinish:
         for name, most in (("roughness", 1.0), ("metallic", 1.0), ("specular", MOST_SPECULAR)):
             value = getattr(self, name)
             if value is not None and not 0 <= value <= most:
-                cause = " (more is a metal: give metallic 1)" if name == "specular" and value > most else ""
+                cause = " (for a metal, give metallic 1)" if name == "specular" and value > most else ""
                 raise InputError(f"{name} must be from 0 to {most:g} (got {value:g}){cause}")
         self.linear_colour()
 
@@ -116,9 +116,9 @@ def _read_gltf(source: PBRMaterial) -> Material:
     # trimesh stores the file's linear values as multiples of 1/255.
     factor = np.ones(3) if source.baseColorFactor is None else np.asarray(source.baseColorFactor) / 255.0
     if source.alphaMode not in (None, "OPAQUE") and (factor[3:] < _OPAQUE).any():
-        warnings.append("it is transparent, and baked opaque")
+        warnings.append("it is transparent, but is baked as opaque")
     if source.emissiveTexture is not None or np.any(source.emissiveFactor):
-        warnings.append("it shines by itself, which is not baked")
+        warnings.append("it emits light, which is not baked")
     metallic = 0.0 if source.metallicFactor is None else float(source.metallicFactor)
     roughness = ROUGHNESS if source.roughnessFactor is None else float(source.roughnessFactor)
     if source.metallicRoughnessTexture is not None:
@@ -126,7 +126,7 @@ def _read_gltf(source: PBRMaterial) -> Material:
         means = np.asarray(source.metallicRoughnessTexture.convert("RGB")).reshape(-1, 3).mean(axis=0) / 255.0
         metallic = means[2] * (1.0 if source.metallicFactor is None else metallic)
         roughness = means[1] * (1.0 if source.roughnessFactor is None else roughness)
-        warnings.append("its metalness and roughness are baked as the means of their texture")
+        warnings.append("metalness and roughness are baked as the means of their texture")
     return Material(
         factor[:3],
         _pixels(source.baseColorTexture, warnings),
@@ -150,10 +150,10 @@ def _read_mtl(source: SimpleMaterial) -> Material:
         factor = np.ones(3) if texture is not None else np.full(3, UNKNOWN_COLOUR)
     opacity, transparency = _numbers(keys, "d"), _numbers(keys, "tr")
     if (opacity is not None and opacity[-1] < _OPAQUE) or (transparency is not None and transparency[0] > 1 - _OPAQUE):
-        warnings.append("it is transparent, and baked opaque")
+        warnings.append("it is transparent, but is baked as opaque")
     emission = _numbers(keys, "ke")
     if "map_ke" in keys or (emission is not None and emission.any()):
-        warnings.append("it shines by itself, which is not baked")
+        warnings.append("it emits light, which is not baked")
     left_out = sorted({"map_pr", "map_pm", "map_ks", "map_ns", "map_d", "map_bump", "bump", "norm"} & set(keys))
     if left_out:
         warnings.append(f"its {', '.join(left_out)} {'is' if len(left_out) == 1 else 'are'} left out")
@@ -198,7 +198,7 @@ def _pixels(image: Image.Image | None, warnings: list[str]) -> npt.NDArray[np.ui
         return None
     try:
         if "A" in image.getbands() and np.asarray(image.getchannel("A")).min() < 250:
-            warnings.append("its texture has transparent places, which are baked opaque")
+            warnings.append("its texture has transparent texels, which are baked as opaque")
         return np.array(eight_bit(image))
     except IMAGE_ERRORS as error:
         raise InputError(f"its texture cannot be read ({error})") from error
@@ -238,7 +238,7 @@ def _check_obj(mesh: Path) -> None:
         known += _values_of(path, "newmtl")
         for texture in _values_of(path, "map_kd"):
             if texture.startswith("-"):
-                raise InputError(f"{path}: options of a texture are not read: leave them out (got map_Kd {texture})")
+                raise InputError(f"{path}: options of a texture are not supported: remove them (got map_Kd {texture})")
             _check_texture(path, texture)
     missing = sorted(set(_values_of(mesh, "usemtl")) - set(known)) if libraries else []
     if missing:
@@ -255,7 +255,7 @@ def _check_gltf(mesh: Path) -> None:
         for material in stored.get("materials", []):
             index = material.get("pbrMetallicRoughness", {}).get("baseColorTexture", {}).get("index")
             if index is not None and not (0 <= index < len(sources) and 0 <= sources[index] < len(images)):
-                raise InputError(f"{mesh}: a material's texture {index} is not there; give a colour")
+                raise InputError(f"{mesh}: a material's texture {index} is missing; give a colour")
     except (OSError, ValueError, AttributeError, TypeError) as error:
         if isinstance(error, InputError):
             raise

@@ -62,7 +62,7 @@ def _llvm() -> Finding:
     number, fault = _render_trial_on("cpu", {})
     if fault:
         return Finding("LLVM", False, f"{number} from {path} {fault}" if number else f"{path} {fault}", remedy)
-    return Finding("LLVM", True, f"{number} from {path} renders the trial scene as it is known")
+    return Finding("LLVM", True, f"{number} from {path} renders the trial scene correctly")
 
 
 def _render_trial_on(device: str, environment: Mapping[str, str]) -> tuple[str, str]:
@@ -75,7 +75,7 @@ def _render_trial_on(device: str, environment: Mapping[str, str]) -> tuple[str, 
         return "", f"does not render ({re.sub('^mitsplat[.]errors[.][A-Za-z]+: ', '', message)})"
     found = json.loads(done.stdout.splitlines()[-1])
     faults = "; ".join(found["faults"])
-    return found["llvm"], f"renders the trial scene wrong ({faults})" if faults else ""
+    return found["llvm"], f"renders the trial scene incorrectly ({faults})" if faults else ""
 
 
 def _processor() -> Finding:
@@ -103,7 +103,7 @@ def _cuda() -> Finding:
         _, fault = _render_trial_on("cuda", gpu_environment(gpu))
         texts.append(f"{gpu.name} {fault or 'renders the trial scene as the CPU does'}")
         ok = ok and not fault
-    remedy = "update NVIDIA's driver; until this line is well, render on the CPU"
+    remedy = "update NVIDIA's driver; until this check passes, render on the CPU"
     return Finding("GPU", ok, f"{'; '.join(texts)} (driver {driver} with OptiX; optional)", remedy)
 
 
@@ -113,19 +113,22 @@ def _driver() -> str:
         found = re.search(r" (\d+\.[\d.]+) ", Path("/proc/driver/nvidia/version").read_text())
         if found:
             return found[1]
-    return "of an unknown release"
+    return "of unknown version"
 
 
 def _disk() -> Finding:
     free = shutil.disk_usage(Path.cwd()).free / 2**30
-    return Finding("disk", free >= NEEDED_DISK, f"{free:.1f} GiB free here", f"make room: have {NEEDED_DISK:g} GiB")
+    return Finding("disk", free >= NEEDED_DISK, f"{free:.1f} GiB free here", f"free at least {NEEDED_DISK:g} GiB")
 
 
 def _cache() -> Finding:
     folders = (cache_folder(), warp_folder(), drjit_folder())
     unusable = [f"{folder}: {reason}" for folder in folders if (reason := why_unusable(folder))]
     if unusable:
-        remedy = "set HOME or XDG_CACHE_HOME to a folder with room: kernels, layouts and pieces are made anew else"
+        remedy = (
+            "set HOME or XDG_CACHE_HOME to a writable folder with free space; otherwise "
+            "every run computes kernels and layouts again"
+        )
         return Finding("cache", False, "; ".join(unusable), remedy)
     return Finding("cache", True, f"{', '.join(map(str, folders))} can be written")
 
@@ -145,7 +148,5 @@ def _warp() -> Finding:
 def _memory() -> Finding:
     available = unused_memory()
     total = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") / 2**30
-    remedy = (
-        f"have {NEEDED_MEMORY:g} GiB for a worker of the default scene: close programs, or render with fewer workers"
-    )
+    remedy = f"a worker of the default scene needs {NEEDED_MEMORY:g} GiB: close programs, or render with fewer workers"
     return Finding("memory", total >= NEEDED_MEMORY, f"{available:.1f} of {total:.1f} GiB unused", remedy)

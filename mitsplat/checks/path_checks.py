@@ -83,40 +83,40 @@ def _units(asset: Asset, size: float) -> Finding:
 def _up(asset: Asset, core: Float64Array) -> Finding:
     spread = core.std(axis=0)
     if asset.kind == "object":
-        return Finding("up axis", True, "z; how an object lies is for physics to say")
+        return Finding("up axis", True, "z; physics determines the resting pose of an object")
     thin = int(np.argmin(spread))
     tilted = thin != 2 and spread[thin] < (1 - TILT) * spread[2]
-    text = f"z; the surroundings are thinnest along {'xyz'[thin]}"
-    return Finding(
-        "up axis", not tilted, text, f"if they lie on their side, set up: {'xyz'[thin]} (or -) in asset.yaml"
-    )
+    text = f"z; the environment is thinnest along {'xyz'[thin]}"
+    return Finding("up axis", not tilted, text, f"if it lies on its side, set up: {'xyz'[thin]} (or -) in asset.yaml")
 
 
 def _gaussians(asset: Asset, size: float) -> Iterator[Finding]:
     splats = asset.splats
     needles = long_needles(splats, size)
     share = float(needles.mean())
-    remedy = "`mitsplat import` removes them; `mitsplat mesh` those that stick out of the object's masks"
+    remedy = "`mitsplat import` removes them; `mitsplat mesh` removes those outside of the object's masks"
     yield Finding("needles", share <= MAX_FAULTY, f"{needles.sum()} long ones ({share:.1%})", remedy)
     floaters = len(find_floaters(splats, visible_area(splats))) / len(splats)
-    yield Finding("floaters", floaters <= MAX_FAULTY, f"{floaters:.1%} of the Gaussians touch no large part", remedy)
+    yield Finding(
+        "floaters", floaters <= MAX_FAULTY, f"{floaters:.1%} of the Gaussians are connected to no large part", remedy
+    )
     faint = float((splats.opacities < MIN_OPACITY).mean())
     yield Finding("opacity", faint <= 0.2, f"{faint:.0%} are invisible", "prune them: they only cost time")
     unused = splats.sh_degree > 0 and not splats.sh[:, 1:].any()
-    text = f"degree {splats.sh_degree}{', but all of it zero' if unused else ''}"
+    text = f"degree {splats.sh_degree}{', but all coefficients are zero' if unused else ''}"
     yield Finding("spherical harmonics", not unused, text, "store degree 0: the colours do not change with the view")
 
 
 def _mesh(asset: Asset, core: Float64Array) -> Iterator[Finding]:
     mesh = asset.mesh
     if mesh is None:
-        remedy = "nothing casts shadows, occludes or carries objects; `mitsplat mesh` makes one"
+        remedy = "nothing casts shadows, occludes or supports objects; `mitsplat mesh` creates a mesh"
         yield Finding("mesh", asset.kind == "environment", "none", remedy)
         return
     if asset.kind == "object":  # splats and mesh of an environment may each be incomplete
         overlap = _overlap(np.stack([core.min(axis=0), core.max(axis=0)]), mesh.bounds)
         yield Finding(
-            "overlap", overlap > MIN_OVERLAP, f"the boxes of splats and mesh share {overlap:.0%} of both",
+            "overlap", overlap > MIN_OVERLAP, f"the boxes of splats and mesh have an IoU of {overlap:.0%}",
             "make the mesh from the same photographs, or register it: `mitsplat mesh --import`",
         )  # fmt: skip
     with warp_settings():
@@ -129,20 +129,20 @@ def _mesh(asset: Asset, core: Float64Array) -> Iterator[Finding]:
     yield Finding(
         "watertightness", bool(mesh.is_watertight) or asset.kind == "environment",
         "closed" if mesh.is_watertight else "open",
-        "close it (`mitsplat mesh`, or a mesh editor): mass and inertia are those of its convex pieces else",
+        "close it (`mitsplat mesh`, or a mesh editor); otherwise mass and inertia are those of its convex pieces",
     )  # fmt: skip
     if asset.kind == "object":
         yield from _mass(asset, mesh)
     if not asset.pieces:
-        yield Finding("colliders", True, "none stored; convex pieces are made when they are needed, once")
+        yield Finding("colliders", True, "none stored; convex pieces are computed at the first use")
         return
     joint = np.stack(
         [np.min([p.bounds[0] for p in asset.pieces], axis=0), np.max([p.bounds[1] for p in asset.pieces], axis=0)]
     )
     yield Finding(
         "colliders", _overlap(joint, mesh.bounds) > 0.8,
-        f"{len(asset.pieces)} convex pieces that share {_overlap(joint, mesh.bounds):.0%} of the mesh's box",
-        "remove pieces from asset.yaml, so that they are made of the mesh",
+        f"{len(asset.pieces)} convex pieces; IoU of their box and the mesh's: {_overlap(joint, mesh.bounds):.0%}",
+        "remove pieces from asset.yaml, so that they are computed from the mesh",
     )  # fmt: skip
 
 
@@ -155,7 +155,8 @@ def _mass(asset: Asset, mesh: trimesh.Trimesh) -> Iterator[Finding]:
     solid = closed_solid(mesh, pieces)
     mass = mass_properties(mesh, pieces, density=asset.density, mass=asset.mass).mass
     density = mass / abs(float(solid.volume)) if solid.volume else float("inf")
-    hull = "" if solid is mesh or asset.pieces else " if it filled its convex hull: its convex pieces are not made yet"
+    has_solid = solid is mesh or bool(asset.pieces)
+    hull = "" if has_solid else " if it fills its convex hull; its convex pieces are not computed yet"
     yield Finding(
         "mass", DENSITIES[0] <= density <= DENSITIES[1], f"{mass:.3g} kg, of {density:.0f} kg/m^3{hull}",
         "set mass [kg] or density [kg/m^3] in asset.yaml; a wrong unit of length shows here too",
@@ -168,7 +169,7 @@ def check_scene(scene: Scene) -> Iterator[Finding]:
     try:
         Catalogue.of(scene)
     except InputError as error:
-        yield Finding("formats", False, str(error), "change output.formats, or what they need")
+        yield Finding("formats", False, str(error), "change output.formats, or meet their requirements")
     faults = list(run_faults(scene))
     yield from faults or scene_warnings(scene)
     for sizes in _assets_by_folder(scene):
@@ -177,7 +178,7 @@ def check_scene(scene: Scene) -> Iterator[Finding]:
         for finding in wrong:
             yield replace(finding, name=f"{name}: {finding.name}")
         if not wrong:
-            yield Finding(name, True, f"{len(sizes[0].splats)} Gaussians, nothing to say")
+            yield Finding(name, True, f"{len(sizes[0].splats)} Gaussians, no problems")
     most = [entry.count[1] for entry in spec.objects]
     meshes = [[asset.mesh for i in pool if (asset := scene.assets[i]).mesh is not None] for pool in scene.pools]
     volumes = [max(float(np.prod(mesh.extents)) for mesh in pool) for pool in meshes]
@@ -189,7 +190,7 @@ def check_scene(scene: Scene) -> Iterator[Finding]:
     )  # fmt: skip
     support = any(shape.collider and not shape.name.startswith("enclosure ") for shape in spec.shapes)
     support |= spec.environment_collides and bool(scene.environments)
-    text = "objects have something to lie on" if support else "nothing collides with objects"
+    text = "a collider supports objects" if support else "there is no collider below objects"
     yield Finding("support", support or not spec.objects, text, "add a table to shapes, or set environment_collides")
     if support and not faults:
         yield from _check_rest(scene)
@@ -223,7 +224,7 @@ def _check_rest(scene: Scene) -> Iterator[Finding]:
             reason, times = Counter(refused).most_common(1)[0]
             problem = f"it{reason.removeprefix(name)}" if reason.startswith(f"{name} ") else reason
             text = f"{name} cannot take arrangement {arrangement}: {problem} in {times} of {len(refused)} tries"
-            remedy = "choose another settle.arrangement, mend its mesh or its up axis, or leave it out of objects"
+            remedy = "choose another settle.arrangement, correct its mesh or up axis, or remove it from objects"
             yield Finding("rest", False, text, remedy)
     except InputError as error:
         yield Finding("rest", False, str(error), "change what objects rest on, or their region")
@@ -246,7 +247,7 @@ def _check_view(scene: Scene) -> Finding:
     where = "a region" if len(middles) > 1 else "the region"
     text = f"{len(views) - len(blind)} of {len(views)} views show the middle of {where}"
     remedy = f"turn the camera there: `mitsplat preview --frame {blind[0] if blind else 0}` shows one that does not"
-    return Finding("sight", len(blind) * 2 <= len(views), text, remedy)
+    return Finding("visibility", len(blind) * 2 <= len(views), text, remedy)
 
 
 def _overlap(one: Float64Array, other: Float64Array) -> float:

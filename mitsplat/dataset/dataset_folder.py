@@ -311,7 +311,7 @@ def _check_resumable(
         raise InputError(f"{out} cannot be resumed: {key} was {before} and is {now}; overwrite it or choose another")
     if present["device"] != content["device"] and not any_device:
         raise InputError(
-            f"{out} cannot be resumed on the device {content['device']}: it was begun on {present['device']}, whose "
+            f"{out} cannot be resumed on the device {content['device']}: it was started on {present['device']}, whose "
             f"pictures differ a little; give --device {present['device']}, or --any-device for frames of both"
         )
     stored = read_shard(out)
@@ -336,7 +336,10 @@ def read_shard(out: Path) -> dict[str, int] | None:
     except FileNotFoundError:
         return None
     except (OSError, ValueError) as error:
-        raise InputError(f"{path}: must say which shard this is ({' '.join(str(error).split())})") from error
+        raise InputError(
+            f"{path}: must state the shard, the number of shards and the number "
+            f"of frames ({' '.join(str(error).split())})"
+        ) from error
     return stored.model_dump()
 
 

@@ -113,7 +113,7 @@ def layout_errors(path: Path) -> Iterator[None]:
     try:
         yield
     except (ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{path}: must be a layout as it settled ({error!r}); remove it and run again") from error
+        raise InputError(f"{path}: must be a valid layout ({error!r}); remove it and run again") from error
 
 
 @dataclass(frozen=True)

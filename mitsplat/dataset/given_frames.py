@@ -49,7 +49,8 @@ def write_frames(scene: Scene, out: str | Path, frames: Iterable[Frame], *, over
     out, output = Path(out), scene.spec.output
     if "flow" in output.formats:
         raise InputError(
-            "output.formats: flow is of views of one layout: keep frame.flow of frames of your own yourself"
+            "output.formats: flow is not available for frames made in Python, because it "
+            "relates views of one layout; save frame.flow instead"
         )
     alone = replace(scene, spec=scene.spec.model_copy(update={"output": output.model_copy(update={"views": 1})}))
     catalogue = Catalogue.of(scene)

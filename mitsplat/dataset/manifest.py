@@ -64,7 +64,7 @@ class Manifest:
                     raise torn
                 try:
                     if not line.endswith(b"\n"):
-                        raise ValueError("it has no end")
+                        raise ValueError("the line is incomplete")
                     record = parse_line(line)
                 except ValueError as error:
                     torn = _damaged(path, number, error)
@@ -156,7 +156,7 @@ class Manifest:
 
 def _damaged(path: Path, number: int, error: ValueError) -> InputError:
     damaged = InputError(
-        f"{path}, line {number}: must be the record of a frame ({error}); without that line its frame is made again"
+        f"{path}, line {number}: must be the record of a frame ({error}); remove the line to render its frame again"
     )
     damaged.__cause__ = error
     return damaged

@@ -87,7 +87,9 @@ def refuse_links(out: Path) -> None:
         for folder, folders, _ in os.walk(top) if not links else ():
             links += [Path(folder, inner) for inner in folders if Path(folder, inner).is_symlink()]
         if links:
-            raise InputError(f"{links[0]}: must not be a link, for a dataset is written in its own folder; remove it")
+            raise InputError(
+                f"{links[0]}: must not be a link, because a dataset must lie in its own folder; remove the link"
+            )
 
 
 def remove_dataset(out: Path) -> None:

@@ -95,7 +95,9 @@ def count_faults(scene: Scene) -> Iterator[Finding]:
     """Check that the numbers of objects and images do not exceed the range of their ids."""
     most = sum(entry.max_count for entry in scene.spec.objects)
     if most > MAX_OBJECTS:
-        text = f"objects: a layout must have at most {MAX_OBJECTS} objects, as many as there are ids (got {most})"
+        text = (
+            f"objects: a layout must have at most {MAX_OBJECTS} objects, because instance ids have 16 bits (got {most})"
+        )
         yield Finding("count", False, text, "lower objects[].count")
     if scene.num_frames > MAX_FRAMES:
         text = f"output: layouts x views must be at most {MAX_FRAMES} images (got {scene.num_frames})"
@@ -121,7 +123,7 @@ def layout_faults(scene: Scene) -> Iterator[Finding]:
             try:
                 check_size(mesh, f"shapes[{number}]")
             except InputError as error:
-                yield Finding("shape", False, str(error), "correct it, or let it be no collider")
+                yield Finding("shape", False, str(error), "correct the mesh, or set collider: false")
                 return
     for number, (region, arrangement) in enumerate(scene.spec.all_regions):
         where = f"regions[{number - 1}]" if number else "region"
@@ -139,7 +141,7 @@ def _region_faults(
     if supports and not any(
         (box[0, :2] < high[:2]).all() and (box[1, :2] > low[:2]).all() and box[0, 2] < high[2] for box in supports
     ):
-        text = f"{where}: nothing that collides is below it, so that all objects fall for ever"
+        text = f"{where}: no collider is below it, so all objects fall forever"
         yield Finding("support", False, text, "move region above the table, or the table below it")
         return
     if arrangement == "pile":
@@ -165,7 +167,7 @@ def _room_faults(
             in_way.append(repr(name))
         taken |= inside
     if taken.all():
-        text = f"{where}: lies inside of what collides with objects, {' and '.join(in_way)}"
+        text = f"{where}: lies inside of colliders, {' and '.join(in_way)}"
         yield Finding("region", False, text, "move region above it")
         return
     volume = float(np.prod(high - low)) * float((~taken).mean())
@@ -176,8 +178,8 @@ def _room_faults(
         yield Finding(
             "room",
             False,
-            f"{where}: at most {sum(numbers)} objects of {1e3 * need:.3g} l must start in it at once "
-            f"(it has {1e3 * volume:.3g} l)",
+            f"{where}: at most {sum(numbers)} objects of {1e3 * need:.3g} l start in it at once "
+            f"(its free volume is {1e3 * volume:.3g} l)",
             "lower objects[].count or make region larger",
         )
 
@@ -191,7 +193,7 @@ def image_faults(scene: Scene, workers: int | None = None) -> Iterator[Finding]:
         text = f"output: {size} takes at least {need:.1f} GiB of memory ({free:.1f} GiB are unused)"
         yield Finding("memory", False, text, "lower output.width and height")
     elif workers is not None and workers * need > free:
-        text = f"workers: {workers} that each make {size} take at least {workers * need:.0f} GiB of memory"
+        text = f"workers: {workers} that each render {size} take at least {workers * need:.0f} GiB of memory"
         yield Finding("memory", False, f"{text} ({free:.1f} GiB are unused)", "use fewer workers")
 
 
@@ -236,7 +238,7 @@ def label_faults(scene: Scene, frames: Sequence[int]) -> Iterator[Finding]:
     hidden = [name for camera in cameras if (name := enclosing_shape(scene, camera.centre))]
     if len(hidden) == len(cameras):
         text = f"camera: every view is from inside of shape {hidden[0]!r}, which hides all objects"
-        yield Finding("sight", False, text, "move camera out of it")
+        yield Finding("visibility", False, text, "move camera out of it")
         return
     low, high = _reachable_box(scene)
     if not any(sees(camera, low, high) for camera in cameras):
@@ -247,7 +249,8 @@ def label_faults(scene: Scene, frames: Sequence[int]) -> Iterator[Finding]:
     smallest = min(float(mesh.extents.max()) for mesh in meshes)
     if max(across) < MIN_VIEW_WIDTH * smallest:
         text = (
-            f"camera.intrinsics: an image shows at most {max(across):.2g} m (the smallest object has {smallest:.2g} m)"
+            f"camera.intrinsics: an image shows at most {max(across):.2g} m (the "
+            f"smallest object is {smallest:.2g} m long)"
         )
         yield Finding("lens", False, text, "fx and fy are focal lengths in pixels")
     largest = max(float(np.linalg.norm(mesh.extents)) for mesh in meshes)
@@ -288,7 +291,7 @@ def scene_warnings(scene: Scene) -> Iterator[Finding]:
         lights = {light for plan in plans for light in plan.lights if isinstance(light, LocalLight)}
         names = [name for light in lights if (name := _shape_around_light(scene, light))]
         if names:
-            text = f"{len(names)} of {len(lights)} lights that were drawn are inside of a shape, such as {names[0]!r}"
+            text = f"{len(names)} of {len(lights)} drawn lights are inside of a shape, such as {names[0]!r}"
             yield Finding("lights", False, text, "narrow lights[].draw: they light nothing")
     for shape in spec.shapes:
         if shape.bin is None:
@@ -365,11 +368,11 @@ def _no_view_fault(cameras: Sequence[Camera], low: Float64Array, high: Float64Ar
     if any(sees(camera, low, high) for camera in touching):
         far = max(_depth_range(camera, low, high)[1] for camera in touching)
         text = (
-            f"camera.intrinsics.near: must be nearer than what objects can reach, {far:.3g} m (got {cameras[0].near:g})"
+            f"camera.intrinsics.near: must be below the largest depth of objects, {far:.3g} m (got {cameras[0].near:g})"
         )
-        return Finding("sight", False, text, "lower it")
-    text = f"camera: no view shows any place that objects can reach ({len(cameras)} looked at)"
-    return Finding("sight", False, text, "turn camera to region: `mitsplat preview` shows where it looks")
+        return Finding("visibility", False, text, "lower it")
+    text = f"camera: no view shows any place that objects can reach ({len(cameras)} views tested)"
+    return Finding("visibility", False, text, "turn camera to region: `mitsplat preview` shows where it looks")
 
 
 def _cameras(scene: Scene, frames: Sequence[int]) -> list[Camera]:

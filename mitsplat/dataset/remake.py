@@ -84,7 +84,7 @@ def remake_frame(
     catalogue = Catalogue.of(scene)
     refuse(scene, chain(count_faults(scene), layout_faults(scene), image_faults(scene, 1)))
     if out.exists() and not (out / FRAME).is_file() and (not out.is_dir() or any(out.iterdir())):
-        raise InputError(f"{out} must be absent, empty, or hold a frame that was made again (it holds other files)")
+        raise InputError(f"{out} must be absent, empty, or hold a frame of an earlier call (it holds other files)")
     refuse_links(out)
     used_device = current_device() if device is None else use_device(device)
     place = f"layouts/{layout:04d}.json"

@@ -263,7 +263,7 @@ def read_content(root: Path) -> dict[str, Any]:
         raise InputError(f"{root} must be a dataset of this version of mitsplat ({reason})") from error
     if len(content["keypoints"]) != len(content["classes"]):
         raise InputError(
-            f"{root / 'dataset.json'}: keypoints must be named for every class "
+            f"{root / 'dataset.json'}: keypoints must have one list per class "
             f"(got {len(content['keypoints'])} lists for {len(content['classes'])} classes)"
         )
     if not (root / "manifest.jsonl").is_file():
@@ -347,7 +347,7 @@ def check_record(line: bytes, record: Record, content: Mapping[str, Any]) -> Non
         raise ValueError(_first(error)) from error
     for file in record["files"]:
         if not file or "\0" in file or file.startswith("/") or ".." in file.split("/"):
-            raise ValueError(f"files must be named relative to the dataset, and lie in it (got {file[:80]!r})")
+            raise ValueError(f"file names must be relative to the dataset and lie in its folder (got {file[:80]!r})")
     if not any(file.startswith("images/") for file in record["files"]):
         raise ValueError("files must list the frame's image")
     if record["split"] not in splits_of(content["scene"]["output"]):
@@ -387,7 +387,7 @@ def _check_mask(code: str, box: list[int], width: int, height: int) -> None:
     mask = decode_rle({"size": [height, width], "counts": code})
     # The decoder leaves pixels without a run uninitialised; only a complete code equals the encoding of its mask.
     if not mask[y0:y1, x0:x1].any() or coco_mask.encode(mask)["counts"].decode() != code:
-        raise ValueError(f"must be the code of a mask in its box (got {code[:20]!r} for {box})")
+        raise ValueError(f"must be a complete run-length code of a mask in its box (got {code[:20]!r} for {box})")
 
 
 def _first(error: ValidationError) -> str:

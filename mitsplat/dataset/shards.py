@@ -142,7 +142,7 @@ def _check_frames(manifests: Mapping[Path, Manifest], stated: int | None) -> int
         missing += index - last - 1
         last, place = index, folder
     if last < 0 and stated is None:
-        raise InputError(f"{', '.join(map(str, manifests))}: has no image yet: finish it first")
+        raise InputError(f"{', '.join(map(str, manifests))}: must have at least one image; finish this shard first")
     count = last + 1 if stated is None else stated
     if count > last + 1 and not missing:
         first = last + 1
@@ -167,7 +167,7 @@ def _check_layouts(folders: Sequence[Path]) -> None:
         for layout in _layouts(folder):
             other = seen.setdefault(layout.name, layout)
             if other != layout and other.read_bytes() != layout.read_bytes():
-                raise InputError(f"{other} and {layout} must be the same: one layout was settled in two ways")
+                raise InputError(f"{other} and {layout} must be the same: the shards settled one layout differently")
 
 
 def _layouts(folder: Path) -> list[Path]:
@@ -186,7 +186,7 @@ def _scene_file(folder: Path) -> Path:
     """Return the path of the scene file that a dataset contains."""
     names = sorted((folder / "scene").glob("[!.]*"))
     if len(names) != 1:
-        raise InputError(f"{folder / 'scene'}: must hold the scene file alone (got {len(names)} files)")
+        raise InputError(f"{folder / 'scene'}: must hold only the scene file (got {len(names)} files)")
     return _inside(folder, names[0])
 
 

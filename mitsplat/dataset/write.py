@@ -170,7 +170,8 @@ def write_dataset(
         if layouts:
             if remove_folds(out):
                 _logger.warning(
-                    "%s: lists of folds lack the new images and are removed: run `mitsplat split` again", out
+                    "%s: the lists of folds do not contain the new images and are removed: run `mitsplat split` again",
+                    out,
                 )
             append_run(out, workers, used_device.kind, [gpu.name for gpu in used_device.gpus])
         shortfall = Shortfall(scene, -(-count // scene.spec.output.views))
@@ -241,7 +242,7 @@ class Shortfall:
             counts = Counter(f"{name}: {reason}" for objects in self._incomplete.values() for name, reason in objects)
             often = "; ".join(f"{count} x {text}" for text, count in counts.most_common(3))
             raise InputError(
-                f"{self._scene.path}: at most a share of settle.incomplete = {share:g} of the {self._layouts} layouts "
+                f"{self._scene.path}: at most a fraction settle.incomplete = {share:g} of the {self._layouts} layouts "
                 f"may lack objects that do not come to rest (got {len(self._incomplete)}, among them {often}); "
                 "`mitsplat check` tries each object alone"
             )

@@ -81,7 +81,9 @@ class ScenesWriter:
         folder = scene_folder(record)
         if folder != self._folder:
             if record["layout"] <= self._layout:
-                raise ValueError(f"frames must come by layout (got {record['layout']} after {self._layout})")
+                raise ValueError(
+                    f"frames must be added by ascending layout (got {record['layout']} after {self._layout})"
+                )
             self._end_scene()
             if len(self._completed) >= _BATCH_FILES:
                 self._finish_batch()

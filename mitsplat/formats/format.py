@@ -73,7 +73,7 @@ class Catalogue:
             other, known = points.setdefault(asset.class_name, (asset.name, names))
             if known != names:
                 raise InputError(
-                    f"{scene.path}: assets of class {asset.class_name!r} must name the same keypoints "
+                    f"{scene.path}: assets of class {asset.class_name!r} must define the same keypoints "
                     f"(got {list(known)} in {other} and {list(names)} in {asset.name})"
                 )
         keypoint_names = tuple(points[name][1] if name in points else () for name in scene.class_names)
@@ -92,8 +92,8 @@ class Catalogue:
                 and (one := _SINGLE_POSE_FORMATS.intersection(formats))
             ):
                 raise InputError(
-                    f"{scene.path}: output.formats: {min(one)} must have a camera whose rows are exposed at once, with "
-                    f"one pose (got camera.motion.readout {list(camera.motion.readout)})"
+                    f"{scene.path}: output.formats: {min(one)} must have a camera without rolling shutter "
+                    f"(got camera.motion.readout {list(camera.motion.readout)})"
                 )
         meshes = [asset.mesh for asset in scene.assets if asset.mesh is not None]
         distractors = [position for position, kind in enumerate(kinds) if kind is None]

@@ -35,7 +35,7 @@ def write_depth(files: FrameFiles) -> None:
 
 def write_depth_sensor(files: FrameFiles) -> None:
     """Write the depth that the scene's depth sensor measures, and its unit as ``depth_sensor_scale`` [mm]."""
-    assert files.catalogue.depth_sensor is not None  # noqa: S101 - the scene's rule
+    assert files.catalogue.depth_sensor is not None  # noqa: S101 - guaranteed by the scene
     measured = sensed_depth(files.frame, files.catalogue.depth_sensor)
     files.record["depth_sensor_scale"] = depth_scale(measured)
     files.add_png(f"depth-sensor/{files.name}.png", depth_picture(measured))

@@ -47,7 +47,7 @@ def _verdict(imported: Imported) -> str:
         "Gaussians": imported.removed_of_all,
         "IoU of mesh and splats": figure_of(imported.mesh_iou, "{:.3f}"),
         "Shift between mesh and splats": figure_of(imported.offset, "{:.3%} of the diagonal"),
-        "Light that it carries": asset.capture_light,
+        "Captured light": asset.capture_light,
     }
     if asset.mesh is not None:
         rows["Extents"] = " x ".join(f"{extent:.4g}" for extent in asset.mesh.extents) + f" {unit}"
@@ -57,7 +57,9 @@ def _verdict(imported: Imported) -> str:
             rows["Mass"] = f"{mass.mass:.4g} kg in {len(asset.pieces)} convex pieces"
     if imported.support is not None:
         width, depth = imported.support.size
-        rows["Surface to drop on"] = f"{width:.3g} x {depth:.3g} {unit}, {imported.support.share:.0%} of what is seen"
+        rows["Surface to drop on"] = (
+            f"{width:.3g} x {depth:.3g} {unit}, {imported.support.share:.0%} of the visible area"
+        )
     return _section("Verdict", verdict_of(imported.misses, "Nothing to note.", rows))
 
 
@@ -71,7 +73,7 @@ def _views(imported: Imported) -> str:
         }
         images = "".join(_figure(f"view {number}, {kind}", kind, shown) for kind, shown in pictures.items())
         rows.append(f'<div class="row">{images}</div>')
-    note = "<p>Up in the pictures is up in scenes. The mesh was fitted to other views.</p>"
+    note = "<p>The pictures have the up direction of scenes. The mesh was reconstructed from other views.</p>"
     return _section("Views", note + ("".join(rows) or "<p>none</p>"))
 
 
@@ -88,7 +90,7 @@ def _removed(imported: Imported) -> str:
         _figure(f"view {number}, removed in red", f"view {number}", view.picture)
         for number, view in enumerate(show_asset(everything, None, cameras), 1)
     )
-    return _section("Removed", f'<p>In red what is not in the asset.</p><div class="row">{images}</div>')
+    return _section("Removed", f'<p>Removed Gaussians are red.</p><div class="row">{images}</div>')
 
 
 def _section(title: str, body: str) -> str:
@@ -113,11 +115,11 @@ def check_scene_path(path: Path, asset_folder: Path, *, known: bool) -> None:
         InputError: If the file exists, the asset is not below its folder, or the size of the asset is unknown.
     """
     if path.exists():
-        raise InputError(f"{path}: is there already: name another scene, or remove it")
+        raise InputError(f"{path}: must not exist yet: name another scene, or remove the file")
     if not known:
         raise InputError(f"{path}: a scene is in metres: give --size or --units as well")
     if not is_inside(path.parent, os.path.relpath(asset_folder, path.parent)):
-        raise InputError(f"{path}: a scene reads below its own folder only, where {asset_folder} is not")
+        raise InputError(f"{path}: a scene reads only files below its own folder (got the asset {asset_folder})")
 
 
 def write_scene(path: Path, asset_folder: Path, imported: Imported) -> None:
@@ -142,7 +144,7 @@ def write_scene(path: Path, asset_folder: Path, imported: Imported) -> None:
         )  # fmt: skip
     else:
         if imported.support is None:
-            raise InputError(f"{path}: no horizontal surface was found to drop things on: write the scene by hand")
+            raise InputError(f"{path}: no horizontal surface was found for dropping objects: write the scene by hand")
         width, depth = imported.support.size
         reach = [min(0.35 * edge, 0.3) for edge in (width, depth)]
         text = _ENVIRONMENT_SCENE.format(

@@ -86,7 +86,7 @@ class ImportSettings:
             if value is not None and not 0 < value < np.inf:
                 raise InputError(f"{name} must be finite and > 0 (got {value:g})")
         if self.units is not None and self.size is not None:
-            raise InputError("units and size both say how large it is: give one of them")
+            raise InputError("units and size must not both be given")
         if self.crop is not None and not all(
             low < high for low, high in zip(self.crop[:3], self.crop[3:], strict=True)
         ):
@@ -149,24 +149,24 @@ class Imported:
         """Problems of the asset with their remedies, a sentence each."""
         asset, found, thresholds = self.asset, [], Thresholds()
         if asset.units == "unknown":
-            found.append("how large it is is unknown: give --size, the longest extent in metres, or --units")
+            found.append("its size is unknown: give --size, the longest extent in metres, or --units")
         if self.topples:
             found.append(
-                "it would roll or fall over as it stands in the pictures: give --up if it lies on its side there, or "
-                "--flat-base if nobody saw its bottom"
+                "it would roll or fall over in the pose of the pictures: give --up if it lies on its side, or "
+                "--flat-base if the capture lacks its underside"
             )
         if self.mesh_iou is not None and self.mesh_iou < thresholds.mesh_iou:
             found.append(
-                f"the mesh meets the outline of the splats with an IoU of only {self.mesh_iou:.3f} (at least "
-                f"{thresholds.mesh_iou:g} is wanted): crop what is soft around the object, or give more --voxels"
+                f"the silhouettes of mesh and splats have an IoU of only {self.mesh_iou:.3f} (at least "
+                f"{thresholds.mesh_iou:g} is expected): crop haze around the object, or give more --voxels"
             )
         if self.offset is not None and self.offset > thresholds.offset:
             found.append(
                 f"mesh and splats are {self.offset:.2%} of the diagonal apart (at most {thresholds.offset:.2%} is "
-                "wanted): see whether the file holds more than the object, and crop it"
+                "expected): if the file contains more than the object, crop it"
             )
         if asset.kind == "object" and not self.watertight:
-            found.append("the mesh is open (a closed one is wanted): give more --voxels, or crop what is around")
+            found.append("the mesh is open (it must be closed): give more --voxels, or crop the surroundings")
         if asset.kind == "environment" and self.support is None:
             found.append("no horizontal surface was found: state shapes and the region of a scene by hand")
         return tuple(found)
@@ -206,7 +206,7 @@ def import_splats(
     """
     path = Path(path)
     if density is not None and mass is not None:
-        raise InputError("density and mass both say how heavy it is: give one of them")
+        raise InputError("density and mass must not both be given")
     for key, value in (("density", density), ("mass", mass)):
         if value is not None and not 0 < value < np.inf:
             raise InputError(f"{key} must be finite and > 0 (got {value:g})")
@@ -236,7 +236,7 @@ def import_splats(
     turn[:3, :3] = upright.rotation
     if settings.without_table:
         if upright.support is None:
-            raise InputError(f"{path}: has no flat surface that the object stands on: leave out --without-table")
+            raise InputError(f"{path}: has no flat surface below the object: leave out --without-table")
         cleaner.remove("table", ~cut_support(cleaner.splats, upright.support), "nothing stands on the flat surface")
         cleaner.remove_floaters(kind)
     splats = cleaner.splats.transformed(turn)
@@ -422,7 +422,7 @@ def _cut_base(path: Path, mesh: trimesh.Trimesh) -> tuple[trimesh.Trimesh, float
         cut = trimesh.boolean.intersection([mesh, above], engine="manifold")
         if len(cut.faces) and not _topples(cut, contact=0.2 * _CONTACT_HEIGHT):
             return cut, float(height)
-    raise InputError(f"{path}: has no base that it could stand on: give --up, or leave out --flat-base")
+    raise InputError(f"{path}: has no base to stand on: give --up, or leave out --flat-base")
 
 
 def _topples(mesh: trimesh.Trimesh, contact: float = _CONTACT_HEIGHT) -> bool:

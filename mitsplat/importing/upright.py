@@ -117,19 +117,19 @@ def find_up(splats: Splats, kind: str, usual: Axis, given: Axis | None = None) -
     # A plane narrower than the object may be its sole or one of its sides, which need not be level.
     if near is not None and (kind == "environment" or _relative_span(points, near, tolerance) >= _MIN_SPAN):
         angle = float(np.degrees(np.arccos(np.clip(near.normal @ wanted, -1, 1))))
-        flat = f"a flat surface with {near.share:.0%} of what is seen faces there"
+        flat = f"a flat surface with {near.share:.0%} of the visible area faces there"
         if angle <= _SNAP_ANGLE:
             return Upright(wanted, f"{name}, and {flat}", near)
         return Upright(near.normal, f"{angle:.0f} degrees from {usual}, where {flat}", near)
     other = largest_plane(points, tolerance, below=0.5 if kind == "environment" else below)
     if near is None and other is not None and other.share >= _MIN_SHARE_ANY:
-        return Upright(other.normal, f"a flat surface with {other.share:.0%} of what is seen faces there", other)
+        return Upright(other.normal, f"a flat surface with {other.share:.0%} of the visible area faces there", other)
     if near is None and kind == "environment":
         spread, axes = np.linalg.eigh(np.cov(points.T))
         if spread[0] < 0.25 * spread[1]:
             thin = axes[:, 0] * (1.0 if axes[:, 0] @ wanted >= 0 else -1.0)
-            return Upright(thin, "the surroundings are thinnest there", None)
-    return Upright(wanted, f"{name}; no broad flat surface says otherwise", near)
+            return Upright(thin, "the environment is thinnest there", None)
+    return Upright(wanted, f"{name}; no broad flat surface indicates another direction", near)
 
 
 def visible_points(splats: Splats) -> Float64Array:

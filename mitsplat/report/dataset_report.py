@@ -115,7 +115,7 @@ def _summary(content: dict[str, Any], counted: _Statistics, audit: Audit, root: 
         "Not labelled": _counts(audit.dropped),
         "Marked": _counts(audit.marked),
         **({"Left out": _left_out(counted)} if counted.left_out else {}),
-        "Error of the order of blending, estimated": _order_error(counted),
+        "Estimated blending-order error": _order_error(counted),
         "Labels from": content["scene"]["labels"]["source"],
         "Formats": ", ".join(content["scene"]["output"]["formats"]),
         "Seed": str(content["scene"]["seed"]),
@@ -245,10 +245,10 @@ def _charts(counted: _Statistics, brightness: tuple[np.ndarray, Histogram], seco
             [str(number) for number in range(most + 1)],
             "instances",
         ),
-        counted.places.draw("Where boxes lie", "middle of the box [px]"),
-        counted.sizes.draw("How large boxes are", "width to the right, height down [px]"),
+        counted.places.draw("Positions of boxes", "centre of the box [px]"),
+        counted.sizes.draw("Sizes of boxes", "width to the right, height down [px]"),
         share["visible_fraction"].draw("Visible fraction of instances", "visible fraction"),
-        share["truncation"].draw("Truncation of instances", "share beyond the border"),
+        share["truncation"].draw("Truncation of instances", "fraction beyond the border"),
         share["agreement"].draw("Agreement of splats and proxies", "IoU"),
         share["boundary_f1"].draw("Agreement of their boundaries", "boundary F1"),
         columns(
@@ -275,7 +275,7 @@ def _details(content: dict[str, Any]) -> str:
     return (
         f'<section aria-labelledby="origin"><h2 id="origin">Origin</h2>'
         f"<details><summary>Libraries</summary><table>{libraries}</table></details>"
-        f'<details><summary>Scene in effect</summary><pre tabindex="0">{scene}</pre></details></section>'
+        f'<details><summary>Effective scene</summary><pre tabindex="0">{scene}</pre></details></section>'
     )
 
 

@@ -157,25 +157,25 @@ class Variety:
     def sections(self) -> str:
         """Return parts of the page: warnings, view directions, and the histogram of every drawn value."""
         warned = "".join(f"<li>{html.escape(text)}</li>" for text in self.warnings())
-        warned = f"<ul>{warned}</ul>" if warned else '<p class="good">Nothing to warn of</p>'
+        warned = f"<ul>{warned}</ul>" if warned else '<p class="good">No warnings</p>'
         seen = dict(sorted(self._seen.items()))
         upper = {name: 100 * np.count_nonzero(counts[:RINGS]) / counts[:RINGS].size for name, counts in seen.items()}
         lower = {name: 100 * np.count_nonzero(counts[RINGS:]) / counts[RINGS:].size for name, counts in seen.items()}
         occluded = {name: 100 * self._occluded[name] / count for name, count in sorted(self._instances.items())}
         charts = [
             discs(
-                "Directions from above that objects are seen from",
+                "View directions above objects",
                 {name: cells[:RINGS] for name, cells in seen.items()},
             ),
-            bars("Upper directions that are covered", upper, unit=" %"),
-            bars("Lower directions that are covered", lower, unit=" %"),
+            bars("Covered view directions above objects", upper, unit=" %"),
+            bars("Covered view directions below objects", lower, unit=" %"),
             bars("Occluded instances of each class", occluded, unit=" %"),
             bars(
-                "Classes that hide each other, most frequent pairs",
+                "Most frequent pairs of occluder and occluded class",
                 dict(self._pairs.most_common(_MAX_PAIRS)),
                 name_width=240,
             ),
-            self._lit.draw("Where light comes from in the image", "from the right 0, from above 90 [degrees]"),
+            self._lit.draw("Direction of light in the image", "from the right 0, from above 90 [degrees]"),
         ]
         drawn, fixed = [], []
         for name, sample in sorted(self._numbers.items()):
@@ -197,7 +197,7 @@ class Variety:
             f'{warned}<div class="charts">{"".join(charts)}</div></section>'
             '<section aria-labelledby="draws"><h2 id="draws">Draws</h2>'
             f'<div class="charts">{"".join(drawn)}</div>'
-            f"<details><summary>The same in all images</summary><table>{rows}</table></details></section>"
+            f"<details><summary>Constant in all images</summary><table>{rows}</table></details></section>"
         )
 
 

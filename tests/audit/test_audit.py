@@ -220,8 +220,8 @@ def model_in_metres(root: Path, records: list[Record]) -> None:
 FAULTS: dict[Callable[[Path, list[Record]], None], tuple[str, str]] = {
     lose_a_label: ("labels/train/000000.txt", "lines for"),
     swap_a_class: ("labels/train/000000.txt", "class is"),
-    move_a_polygon: ("labels/train/000000.txt", "does not give its mask back"),
-    fill_a_hole: ("labels/train/000000.txt", "does not give its mask back"),
+    move_a_polygon: ("labels/train/000000.txt", "does not reproduce its mask"),
+    fill_a_hole: ("labels/train/000000.txt", "does not reproduce its mask"),
     overlap_masks: ("manifest.jsonl, frame 0", "belong to more than one instance"),
     claim_visibility: ("manifest.jsonl, frame 0", "its visible fraction is"),
     deny_truncation: ("manifest.jsonl, frame 0", "its truncation is"),
@@ -233,19 +233,22 @@ FAULTS: dict[Callable[[Path, list[Record]], None], tuple[str, str]] = {
     paint_a_class: ("semantic/train/000000.png", "differ from the masks' classes"),
     erase_depth: ("depth/train/000000.png", "have no depth"),
     erode_a_bop_mask: ("bop/train/000000/mask_visib/000000_000000.png", "differ from the manifest's mask"),
-    widen_a_box: ("yolo-detect/labels/train/000000.txt", "is not its box"),
+    widen_a_box: ("yolo-detect/labels/train/000000.txt", "does not match its box"),
     turn_a_rotated_box: ("yolo-obb/labels/train/000000.txt", "is no rectangle"),
-    flip_a_keypoint: ("yolo-pose/labels/train/000000.txt", "keypoints are not"),
+    flip_a_keypoint: ("yolo-pose/labels/train/000000.txt", "keypoints differ"),
     name_another_class: ("voc/Annotations/000000.xml", "class is screw"),
-    count_from_zero: ("voc/Annotations/000000.xml", "its box is not that of its mask"),
-    deny_occlusion: ("voc/Annotations/000000.xml", "its flags are not"),
+    count_from_zero: ("voc/Annotations/000000.xml", "its box does not match its mask"),
+    deny_occlusion: ("voc/Annotations/000000.xml", "its flags do not match"),
     write_nan: ("yolo-obb/labels/train/000000.txt", "not finite"),
-    shorten_a_line: ("yolo-detect/labels/train/000000.txt", "is not its box"),
+    shorten_a_line: ("yolo-detect/labels/train/000000.txt", "does not match its box"),
     shift_segments: ("panoptic/train/000000.png", "differ from the masks"),
-    forget_a_depth: ("manifest.jsonl, frame 0", "lists no file of the format depth"),
-    forget_a_bop_mask: ("manifest.jsonl, frame 0", "bop by the name bop/train/000000/mask/000000_000000.png"),
+    forget_a_depth: ("manifest.jsonl, frame 0", "of the format depth"),
+    forget_a_bop_mask: (
+        "manifest.jsonl, frame 0",
+        "does not list bop/train/000000/mask/000000_000000.png of the format bop",
+    ),
     claim_a_polygon: ("labels/train/000000.txt", "the IoU of its polygon is"),
-    model_in_metres: ("bop/models/models_info.json", "does not give the measures of bop/models/obj_000001.ply"),
+    model_in_metres: ("bop/models/models_info.json", "does not state the measures of bop/models/obj_000001.ply"),
 }
 
 
@@ -266,9 +269,7 @@ def test_a_planted_fault_is_found(
 def test_a_file_that_changed_or_is_missing_is_found(dataset: Path, file: str) -> None:
     path = dataset / file
     path.write_bytes(path.read_bytes()[:-1] + b"x")
-    assert (file, "is not what was written: its SHA-256 differs from the manifest's") in audit_dataset(
-        dataset
-    ).violations
+    assert (file, "has another SHA-256 than the manifest states") in audit_dataset(dataset).violations
     path.unlink()
     assert (file, "is missing") in audit_dataset(dataset).violations
 
@@ -370,7 +371,7 @@ def test_entries_of_no_frame_are_found(dataset: Path) -> None:
     gt = dataset / "bop/train/000000/scene_gt.json"
     gt.write_text(gt.read_text().replace('"1": ', '"0": '))
     found = audit_dataset(dataset).violations
-    text = "has an entry of frame 77, which is not in the manifest at its place"
+    text = "has an entry of frame 77, which the manifest does not have at this position"
     for name in ("annotations/instances_val.json", "annotations/panoptic_train.json", "annotations/poses_train.json"):
         assert (name, text) in found
     assert ("bop/train/000000/scene_gt.json", "has 2 entries of frame 0") in found
@@ -390,8 +391,8 @@ def test_a_damaged_manifest_is_found(dataset: Path) -> None:
     [
         (("labels", "instances", 0, "box"), [0, 0, 0, 0], "instance 1: rle: its box must lie in the image"),
         (("labels", "instances", 0, "amodal_box"), [0, 0, 1000, 9], "amodal_rle: its box must lie in the image"),
-        (("labels", "instances", 0, "rle"), "", "must be the code of a mask in its box (got '' for"),
-        (("labels", "instances", 0, "rle"), "1", "must be the code of a mask in its box"),
+        (("labels", "instances", 0, "rle"), "", "must be a complete run-length code of a mask in its box (got '' for"),
+        (("labels", "instances", 0, "rle"), "1", "must be a complete run-length code of a mask in its box"),
         (("labels", "instances", 0, "silhouette_area"), 0, "silhouette_area: Input should be greater"),
         (("labels", "instances", 0, "class_index"), 2, "class_index must be below 2 (got 2)"),
         (("labels", "instances", 0, "asset"), 9, "asset must be below 2 (got 9)"),

@@ -274,7 +274,7 @@ def not_finite() -> trimesh.Trimesh:
         ),
         (
             {"mesh": trimesh.creation.box((0.04, 0.01, 0.01)), "metres_per_unit": 0.001},
-            r"got 4e-05 m at 0.001 metres per unit: --units 1 reads it in metres, and --any-size bakes it as it is",
+            r"got 4e-05 m at 0.001 metres per unit: --units 1 reads it in metres, and --any-size accepts the size",
         ),
         ({"density": 0.0}, "density must be a number > 0 .* .got 0."),
         ({"density": float("nan")}, "density must be a number > 0 .* .got nan."),

@@ -190,7 +190,7 @@ def test_finish_replaces_what_the_file_says(tmp_path: Path) -> None:
         ({"roughness": -0.1}, "roughness must be from 0 to 1 .got -0.1."),
         ({"metallic": 2.0}, "metallic must be from 0 to 1 .got 2."),
         ({"metallic": float("nan")}, "metallic must be from 0 to 1 .got nan."),
-        ({"specular": 0.5}, "specular must be from 0 to 0.08 .got 0.5. .more is a metal: give metallic 1."),
+        ({"specular": 0.5}, "specular must be from 0 to 0.08 .got 0.5. .for a metal, give metallic 1."),
     ],
 )
 def test_impossible_finishes_are_refused(finish: dict[str, object], sentence: str) -> None:

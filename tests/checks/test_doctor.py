@@ -27,7 +27,7 @@ def test_a_healthy_machine(monkeypatch):
     assert all(finding.ok for finding in first.values())
     assert all(finding.remedy or finding.name in ("mitsuba", "drjit", "newton", "warp", "cache", "LLVM")
                for finding in first.values())  # fmt: skip
-    assert re.match(r"\d+\.\d+\.\d+ from .* renders the trial scene as it is known", first["LLVM"].text)
+    assert re.match(r"\d+\.\d+\.\d+ from .* renders the trial scene correctly", first["LLVM"].text)
 
 
 @pytest.mark.parametrize(
@@ -85,7 +85,7 @@ class TestTrial:
         assert trial_faults(replace(trial, light=np.nan * trial.light)) == ["light is off by nan"]
 
 
-@pytest.mark.parametrize("fault", ["", "renders the trial scene wrong (light is off by 0.52)"])
+@pytest.mark.parametrize("fault", ["", "renders the trial scene incorrectly (light is off by 0.52)"])
 def test_every_gpu_is_tried(monkeypatch, fault):
     tried = []
 

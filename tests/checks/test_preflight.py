@@ -83,7 +83,7 @@ def test_a_fault_is_found(name):
     [
         ("room", lambda data: data["objects"][0].update(count=[900, 9000])),
         ("support", lambda data: data.update(shapes=[], enclosure={"floor": -0.1})),
-        ("sight", lambda data: data["camera"].update(target=[0, 0, 5], height=0.1, radius=0.2)),
+        ("visibility", lambda data: data["camera"].update(target=[0, 0, 5], height=0.1, radius=0.2)),
         ("light", lambda data: data.update(lights=[])),
     ],
 )
@@ -117,7 +117,7 @@ def test_an_asset_is_listed_once_in_all_its_sizes(scene_data, write_scene, monke
     said = [(finding.name, finding.text) for finding in check_scene(load_scene(write_scene(scene_data)))]
     assert [(name, text) for name, text in said if name.startswith(("nut", "bolt"))] == [
         ("nut: units", "the longest extent is 0.015 m"),
-        ("bolt", "12 Gaussians, nothing to say"),
+        ("bolt", "12 Gaussians, no problems"),
     ]
 
 
@@ -141,7 +141,7 @@ def test_an_open_mesh_weighs_what_its_pieces_do():
     half = GOOD.mesh.copy().apply_transform(np.diag([0.5, 1, 1, 1]))
     for pieces, said in (
         ((half,), "0.06 kg, of 1000 kg/m^3"),
-        ((), "0.12 kg, of 1000 kg/m^3 if it filled its convex hull: its convex pieces are not made yet"),
+        ((), "0.12 kg, of 1000 kg/m^3 if it fills its convex hull; its convex pieces are not computed yet"),
     ):
         found = {finding.name: finding for finding in check_asset(replace(GOOD, mesh=OPEN, pieces=pieces))}
         assert found["mass"].text == said

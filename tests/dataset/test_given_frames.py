@@ -84,5 +84,5 @@ def test_what_cannot_be_written_is_one_sentence(scene: Scene, frames: list, tmp_
         write_frames(scene, tmp_path / "wide", film(scene, 1, width=80))
     output = scene.spec.output.model_copy(update={"formats": ("flow",)})
     flowing = replace(scene, spec=scene.spec.model_copy(update={"output": output}))
-    with pytest.raises(InputError, match="flow is of views of one layout"):
+    with pytest.raises(InputError, match="flow is not available for frames made in Python"):
         write_frames(flowing, tmp_path / "flow", frames)

@@ -75,7 +75,7 @@ def test_a_merged_dataset_stays_where_a_shard_is_damaged(scene: Scene, tmp_path:
 def test_what_has_no_image_yet_is_not_merged(scene: Scene, tmp_path: Path) -> None:
     out = write(scene, tmp_path / "out", frames=1)
     (out / "manifest.jsonl").write_bytes(b"")
-    with pytest.raises(InputError, match=f"{out}: has no image yet: finish it first"):
+    with pytest.raises(InputError, match=f"{out}: must have at least one image; finish this shard first"):
         merge_shards([out], tmp_path / "whole")
     assert not (tmp_path / "whole").exists()
 
@@ -100,7 +100,7 @@ def test_a_damaged_layout_is_named(scene: Scene, tmp_path: Path, text: str) -> N
     out = write(scene, tmp_path / "out")
     layout = out / "layouts/0001.json"
     layout.write_text(text)
-    with pytest.raises(InputError, match=f"{layout}: must be a layout as it settled .*; remove it and run again"):
+    with pytest.raises(InputError, match=f"{layout}: must be a valid layout .*; remove it and run again"):
         write(scene, out)
 
 
@@ -110,7 +110,9 @@ def test_folds_are_those_of_all_images_or_none(scene: Scene, tmp_path: Path, cap
     assert len(list(out.rglob("fold*_train.txt"))) == 4  # for two tasks
     write(scene, out)
     assert not list(out.rglob("fold*_*")) and not list(out.rglob("folds"))
-    assert caplog.messages == [f"{out}: lists of folds lack the new images and are removed: run `mitsplat split` again"]
+    assert caplog.messages == [
+        f"{out}: the lists of folds do not contain the new images and are removed: run `mitsplat split` again"
+    ]
     write_folds(out, 3)
     write_folds(out, 2)
     assert not list(out.rglob("fold3*")) and len(list(out.rglob("fold2*.*"))) == 6

@@ -127,7 +127,7 @@ def test_a_label_of_what_was_left_out_is_found(whole: DatasetSummary, tmp_path: 
     path.write_bytes(b"".join(map(encode_line, records)))
     found = [text for _, text in audit_dataset(tmp_path / "out").violations]
     assert len(found) == 1
-    assert found[0].endswith("is labelled, though its layout lacks it")
+    assert found[0].endswith("is labelled, although its layout lacks it")
 
 
 def test_more_than_the_scene_bears_ends_the_run_whenever_it_is_met(scene: Scene, tmp_path: Path) -> None:

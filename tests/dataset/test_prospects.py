@@ -38,7 +38,7 @@ BIN, NARROW = ({"name": "bin", "bin": {"size": [0.012, depth, 0.03]}} for depth 
 HOPELESS = {
     "inside": ({"camera": path_of(INSIDE, (0.2, 0, -0.05))}, "camera: every view is from inside of shape 'table'"),
     "away": ({"camera": path_of(ABOVE, target=(3, 3, 4))}, "camera: no view shows any place that objects can reach"),
-    "near": ({"camera": path_of(ABOVE, fov_x=60, near=5)}, r"near: must be nearer .*, 1\.\d+ m \(got 5\)"),
+    "near": ({"camera": path_of(ABOVE, fov_x=60, near=5)}, r"near: must be below .*, 1\.\d+ m \(got 5\)"),
     "narrow": ({"camera": path_of(ABOVE, fx=1e9)}, r"camera.intrinsics: an image shows at most .*e-08 m"),
     "far": ({"camera": path_of((200, 0, 200), fov_x=60)}, r"no object covers more than .* \(labels.min_pixels is 16\)"),
     "tiny": ({"output": {"width": 1, "height": 1}}, "an image of 1 px cannot show labels.min_pixels = 16"),
@@ -48,8 +48,8 @@ HOPELESS = {
     "frames": ({"output": {"layouts": 10**9, "views": 10**9}}, "layouts x views must be at most 2147483647"),
     "disk": ({"output": {"layouts": 10**5, "views": 10**4}}, r"1000000000 images take at least 7629.4 GiB \(10.0 GiB"),
     "buried": ({"region": {"min": [-0.1, -0.1, -0.09], "max": [0.1, 0.1, -0.01]}}, "inside of .*, 'table'"),
-    "nothing below": ({"region": {"min": [1, 1, 0.1], "max": [1.2, 1.2, 0.2]}}, "nothing that collides is below it"),
-    "below": ({"region": {"min": [0, 0, -0.5], "max": [0.2, 0.2, -0.3]}}, "nothing that collides is below it"),
+    "nothing below": ({"region": {"min": [1, 1, 0.1], "max": [1.2, 1.2, 0.2]}}, "no collider is below it"),
+    "below": ({"region": {"min": [0, 0, -0.5], "max": [0.2, 0.2, -0.3]}}, "no collider is below it"),
     "steps": ({"settle": {"timestep": 1e-9}}, r"max_time / timestep must be at most .* \(got 6 s / 1e-09 s\)"),
 }
 
@@ -89,7 +89,7 @@ def test_check_and_render_say_the_same(scene_data, write_scene, tmp_path, capsys
     path = write_scene({**scene_data, "camera": path_of(INSIDE)})
     said = "camera: every view is from inside of shape 'table', which hides all objects"
     assert run("check", path) == 1
-    assert f"look  sight: {said}\n      to do: move camera out of it\n" in capsys.readouterr().out
+    assert f"look  visibility: {said}\n      to do: move camera out of it\n" in capsys.readouterr().out
     for command in (("render", path, "-o", tmp_path / "out"), ("render", path, "--tolerance", "0.1")):
         assert run(*command) == 2
         assert f"{path}: {said}; move camera out of it" in capsys.readouterr().err
@@ -97,7 +97,7 @@ def test_check_and_render_say_the_same(scene_data, write_scene, tmp_path, capsys
     buried = write_scene({**scene_data, **HOPELESS["buried"][0]})
     for command in (("preview", buried, "-o", tmp_path / "one.png"), ("settle", buried)):
         assert run(*command) == 2
-        assert "region: lies inside of what collides" in capsys.readouterr().err
+        assert "region: lies inside of colliders" in capsys.readouterr().err
     scene_data["camera"]["intrinsics"] = {"fx": 60, "distortion": [0.1, 0, 0, 0]}
     scene_data["output"]["formats"] = ["bop"]
     assert run("check", write_scene(scene_data)) == 1

@@ -70,7 +70,7 @@ def test_a_frame_that_the_dataset_has_not(scene: Scene, made: Path, tmp_path: Pa
 
 
 def test_a_folder_of_something_else_is_left_alone(scene: Scene, made: Path) -> None:
-    with pytest.raises(InputError, match="must be absent, empty, or hold a frame that was made again"):
+    with pytest.raises(InputError, match="must be absent, empty, or hold a frame of an earlier call"):
         remake_frame(scene, 1, made, **DRAWN)
     with pytest.raises(InputError, match="frame must be in 0 to 3"):
         remake_frame(scene, 4, made, **DRAWN)

@@ -441,7 +441,7 @@ class TestDevice:
         with pytest.raises(InputError) as refused:
             write(scene, out, render=never_render)
         assert str(refused.value) == (
-            f"{out} cannot be resumed on the device cpu: it was begun on cuda, whose pictures differ a little; give "
+            f"{out} cannot be resumed on the device cpu: it was started on cuda, whose pictures differ a little; give "
             "--device cuda, or --any-device for frames of both"
         )
         assert write(scene, out, any_device=True).rendered == 10

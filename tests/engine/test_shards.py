@@ -188,7 +188,7 @@ class TestRefusals:
         shutil.copy(shards[0] / "layouts/0000.json", shards[1] / "layouts/0000.json")
         with (shards[1] / "layouts/0000.json").open("a") as file:
             file.write(" ")
-        self.refuse(shards, tmp_path / "out", "must be the same: one layout was settled in two ways")
+        self.refuse(shards, tmp_path / "out", "must be the same: the shards settled one layout differently")
 
     def test_files_outside(self, shards, tmp_path):
         """A manifest that names files elsewhere, with a checksum that fits."""
@@ -199,7 +199,9 @@ class TestRefusals:
             records[0]["files"] = {name: "0" * 64}
             manifest.write_bytes(b"".join(map(encode_line, records)))
             self.refuse(
-                shards, tmp_path / "out", r"files must be named relative to the dataset, and lie in it \(got '" + name
+                shards,
+                tmp_path / "out",
+                r"file names must be relative to the dataset and lie in its folder \(got '" + name,
             )
 
     def test_itself(self, shards):

@@ -571,7 +571,7 @@ class TestCatalogue:
         path = write_scene(scene_data)
         manual = path.parent / "assets/nut/asset.yaml"
         manual.write_text(manual.read_text() + "keypoints: {top: [0, 0, 0.005]}\n")
-        with pytest.raises(InputError, match=r"class 'a' must name the same keypoints \(got \['top'\] in nut"):
+        with pytest.raises(InputError, match=r"class 'a' must define the same keypoints \(got \['top'\] in nut"):
             Catalogue.of(load_scene(path))
 
 

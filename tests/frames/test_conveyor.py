@@ -155,4 +155,4 @@ def test_flow_of_a_belt_that_stands_still_is_found_out(
     cv2.writeOpticalFlow(str(file), np.where(flow > 1, 0, flow))
     store(out, records_of(out))
     found = audit_dataset(out).violations
-    assert any("do not move as depth and cameras say" in text for _, text in found), found
+    assert any("have a flow that contradicts depth and cameras" in text for _, text in found), found

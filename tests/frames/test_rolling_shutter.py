@@ -188,5 +188,7 @@ def test_formats_of_one_pose_are_refused(
     belt_data["camera"]["motion"] = {"exposure": [0.001, 0.001], "readout": [0, 0.02]}
     belt_data["output"]["formats"] = ["yolo", name]
     scene = ms.load_scene(write_scene(belt_data))
-    with pytest.raises(InputError, match=rf"output.formats: {name} must have a camera whose rows .* \[0.0, 0.02\]"):
+    with pytest.raises(
+        InputError, match=rf"output.formats: {name} must have a camera without rolling shutter .* \[0.0, 0.02\]"
+    ):
         write_dataset(scene, tmp_path / "out", workers=1)

@@ -323,4 +323,4 @@ def test_wrong_regions_are_refused(shelf, write_scene, changes, sentence):
 def test_a_region_above_nothing_is_told_before_work_begins(shelf, write_scene):
     shelf["regions"][1] |= {"min": [0.9, 0.9, 0.02], "max": [1.1, 1.1, 0.2]}
     found = [fault.text for fault in layout_faults(load_scene(write_scene(shelf)))]
-    assert found == ["regions[1]: nothing that collides is below it, so that all objects fall for ever"]
+    assert found == ["regions[1]: no collider is below it, so all objects fall forever"]

@@ -60,8 +60,8 @@ def test_the_page_says_what_the_dataset_is(page: Page) -> None:
     captions = (
         "Instances by class",
         "Instances per image",
-        "Where boxes lie",
-        "How large boxes are",
+        "Positions of boxes",
+        "Sizes of boxes",
         "Visible fraction",
     )
     for caption in (*captions, "Truncation", "Agreement", "Brightness of pixels", "Seconds per frame by stage"):

@@ -73,12 +73,12 @@ def test_directions_are_counted_in_each_object_s_own_coordinates() -> None:
         pose[:3, :3], pose[:3, 3] = turn, (0.1, 0.2, 0.3)
         eye = pose[:3, 3] + turn @ (0.3, 0.4, 2.0)
         page = counted(record(label(0, pose=pose), eye=eye)).sections()
-        assert numbers(page, "Directions from above that objects are seen from") == {
+        assert numbers(page, "View directions above objects") == {
             "long bolt": f"1 of {RINGS * SECTORS} directions, 1 views"
         }
         covered = f"{100 / (RINGS * SECTORS):.3g} %"
-        assert numbers(page, "Upper directions that are covered") == {"long bolt": covered}
-        assert numbers(page, "Lower directions that are covered") == {"long bolt": "0 %"}
+        assert numbers(page, "Covered view directions above objects") == {"long bolt": covered}
+        assert numbers(page, "Covered view directions below objects") == {"long bolt": "0 %"}
 
 
 def test_who_hides_whom_is_what_masks_say(clean: Path) -> None:
@@ -99,7 +99,7 @@ def test_who_hides_whom_is_what_masks_say(clean: Path) -> None:
             expected.update(f"{kind} hides {a['class']}" for kind in kinds)
     assert len(expected) > 2
     page = write_report(clean, clean.parent / "variety.html")[0].read_text()
-    found = numbers(page, "Classes that hide each other, most frequent pairs")
+    found = numbers(page, "Most frequent pairs of occluder and occluded class")
     assert {name: int(count) for name, count in found.items()} == expected
 
 
@@ -118,7 +118,7 @@ def test_every_draw_has_its_histogram() -> None:
     assert sum(map(int, numbers(page, "objects[3].scale").values())) == 42
     assert sum(map(int, numbers(page, "lights[0].position[0]").values())) == 21
     assert numbers(page, "backdrop") == {"oak": "10", "steel": "11"}
-    same = dict(re.findall(r'<th scope="row">([^<]+)</th><td>([^<]+)</td>', page.split("The same in all images")[1]))
+    same = dict(re.findall(r'<th scope="row">([^<]+)</th><td>([^<]+)</td>', page.split("Constant in all images")[1]))
     assert same["iso"] == "100" and same["lights[0].intensity"] == "2" and "exposure" not in same
     assert "objects[3].id" not in page
 
@@ -160,7 +160,7 @@ class TestWarnings:
             records.append(record(*labels, split=split, lights=lights))
         found = counted(*records)
         assert found.warnings() == []
-        assert "Nothing to warn of" in found.sections()
+        assert "No warnings" in found.sections()
 
     def test_what_does_not_vary_is_named(self) -> None:
         lamp = [{"position": [-1, 0, 1], "intensity": 1.0}, {"position": [5, 0, 1], "intensity": 2.0}]

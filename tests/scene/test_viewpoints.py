@@ -412,8 +412,8 @@ def test_rigs_are_audited(scene: Scene, tmp_path: Path) -> None:
         made = write_dataset(drawn, tmp_path / name, render=render, settle=scatter_boxes, frames=4).path
         return {text for _, text in audit_dataset(made).violations}
 
-    assert any("whose turn it is" in text for text in wrong({"camera": 1}))
-    assert any("whose turn it is" in text for text in wrong({"side": "left"}))
+    assert any("is not the scene's camera for this view" in text for text in wrong({"camera": 1}))
+    assert any("is not the scene's camera for this view" in text for text in wrong({"side": "left"}))
     assert any("its intrinsics are not" in text for text in wrong({"zoom": 1.0}))
     assert any("looks past" in text for text in wrong({"handheld": [0.0] * 6}))
 

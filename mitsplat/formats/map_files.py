@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 import OpenEXR
 
+from mitsplat.formats.maps import depth_picture, depth_scale, encode_flow, normal_picture, semantic_picture
 from mitsplat.frames.depth_sensor import sensed_depth
 from mitsplat.storage.files import library_errors
 
 if TYPE_CHECKING:
     from mitsplat.formats.format import FrameFiles
     from mitsplat.frames.frame import Frame
-from mitsplat.formats.maps import depth_picture, depth_scale, encode_flow, normal_picture, semantic_picture
 
 
 def write_instances(files: FrameFiles) -> None:

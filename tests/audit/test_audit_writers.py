@@ -19,7 +19,7 @@ from mitsplat.audit.audit import audit_dataset
 from mitsplat.dataset.dataset_folder import Shard
 from mitsplat.dataset.shards import merge_shards
 from mitsplat.dataset.write import write_dataset
-from mitsplat.formats import bop, coco, colmap, label_studio, maps, voc, yolo
+from mitsplat.formats import bop, coco, colmap, label_studio, map_files, maps, voc, yolo
 from mitsplat.formats import registry as writers
 from mitsplat.frames import frame
 from mitsplat.geometry import camera
@@ -232,8 +232,8 @@ FAULTS: dict[str, tuple[str, Patch, str, str]] = {
         "panoptic/train/000000.png",
         "its environment has the box",
     ),
-    "poses: world for camera": ("poses", with_camera(world_for_camera), POSES, "camera_from_object is not"),
-    "poses: millimetres": ("poses", with_camera(millimetres_for_metres), POSES, "camera_from_object is not"),
+    "poses: world for camera": ("poses", with_camera(world_for_camera), POSES, "camera_from_object differs"),
+    "poses: millimetres": ("poses", with_camera(millimetres_for_metres), POSES, "camera_from_object differs"),
     "poses: objects from one": (
         "poses",
         entry(
@@ -373,7 +373,7 @@ FAULTS: dict[str, tuple[str, Patch, str, str]] = {
     ),
     "semantic: classes from zero": (
         "semantic",
-        changing(maps, "semantic_picture", lambda made, *args: np.where(made > 0, made - 1, made)),
+        changing(map_files, "semantic_picture", lambda made, *args: np.where(made > 0, made - 1, made)),
         "semantic/train/000000.png",
         "differ from the masks' classes",
     ),
@@ -385,7 +385,7 @@ FAULTS: dict[str, tuple[str, Patch, str, str]] = {
     ),
     "depth-sensor: metres": (
         "depth-sensor exr",
-        changing(maps, "depth_picture", lambda made, *args: np.maximum(made // 1000, made > 0).astype(np.uint16)),
+        changing(map_files, "depth_picture", lambda made, *args: np.maximum(made // 1000, made > 0).astype(np.uint16)),
         "depth-sensor/train/000000.png",
         "have a median error",
     ),
@@ -397,7 +397,7 @@ FAULTS: dict[str, tuple[str, Patch, str, str]] = {
     ),
     "normals: blue for red": (
         "exr normals",
-        changing(maps, "normal_picture", lambda made, *args: made[..., ::-1]),
+        changing(map_files, "normal_picture", lambda made, *args: made[..., ::-1]),
         "normals/train/000000.png",
         "differ from the normals",
     ),

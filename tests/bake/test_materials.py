@@ -138,7 +138,7 @@ def test_mtl_means_what_it_says(tmp_path: Path, lines: str, colour: np.ndarray, 
     [
         ("Kd 1 1 1\nd 0.5", "transparent"),
         ("Kd 1 1 1\nTr 0.5", "transparent"),
-        ("Kd 1 1 1\nmap_Ke colour.png", "shines by itself"),
+        ("Kd 1 1 1\nmap_Ke colour.png", "emits light"),
         ("Kd 1 1 1\nmap_Pr colour.png\nmap_Bump colour.png", "map_bump, map_pr are left out"),
     ],
 )
@@ -229,7 +229,7 @@ def test_colours_that_are_not_there_are_missed(tmp_path: Path) -> None:
     (tmp_path / "colour.png").write_bytes(cut)
     refused(path, r"box\.mtl: its texture colour\.png cannot be read")
     for lines, match in (
-        ("map_Kd -s 1 1 1 colour.png", "options of a texture are not read"),
+        ("map_Kd -s 1 1 1 colour.png", "options of a texture are not supported"),
         ("newmtl other", r"its material paint is not in box\.mtl"),
     ):
         text = (lines + "\n") if lines.startswith("newmtl") else f"newmtl paint\n{lines}\n"

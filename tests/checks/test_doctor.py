@@ -38,7 +38,7 @@ def test_a_healthy_machine(monkeypatch):
             lambda patch: patch.setattr(doctor, "visible_gpus", lambda: Lack("OptiX is absent", "fetch it")),
             "fetch",
         ),
-        ("disk", lambda patch: patch.setattr(doctor, "NEEDED_DISK", 1e9), "make room"),
+        ("disk", lambda patch: patch.setattr(doctor, "NEEDED_DISK", 1e9), "free at least"),
         ("memory", lambda patch: patch.setattr(doctor, "NEEDED_MEMORY", 1e9), "fewer workers"),
         ("cache", lambda patch: patch.setenv("XDG_CACHE_HOME", "/dev/null/cache"), "XDG_CACHE_HOME"),
         ("newton", lambda patch: patch.setattr(doctor, "version", missing), "pip install newton"),

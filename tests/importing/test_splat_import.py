@@ -158,7 +158,7 @@ def test_the_asset_its_report_and_its_scene_are_whole(imported: Imported, tmp_pa
         write_scene(tmp_path / f"{name}.yaml", folder.parent / name, named)
         scene = load_scene(tmp_path / f"{name}.yaml")
         assert [asset.name for asset in scene.assets] == [scene.spec.name] == [name]
-    with pytest.raises(InputError, match="is there already"):
+    with pytest.raises(InputError, match="must not exist yet"):
         write_scene(tmp_path / "table.yaml", folder, imported)
     with pytest.raises(InputError, match="below its own folder"):
         write_scene(tmp_path / "elsewhere" / "table.yaml", folder, imported)

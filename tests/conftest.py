@@ -31,7 +31,7 @@ from mitsplat.scene.spec.scene_spec import FORMATS
 from mitsplat.storage.cache import cache_folder
 
 if TYPE_CHECKING:
-    from mitsplat.capture.capture_photos import CaptureResult
+    from mitsplat.capture.pipeline.capture_pipeline import CaptureResult
 
 WriteScene = Callable[..., Path]
 
@@ -228,7 +228,7 @@ def captured(
     photos: tuple[Path, dict[str, Camera]], tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[Path, Path, CaptureResult]:
     """Their capture, with one torn photo among them: photos, folder, result."""
-    from mitsplat.capture.capture_photos import CaptureSettings, capture_photos
+    from mitsplat.capture.pipeline.capture_pipeline import CaptureSettings, capture_photos
     from tests import rendered
 
     def make(folder: Path) -> None:

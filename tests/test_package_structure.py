@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 from collections import Counter
 from collections.abc import Iterator
 from graphlib import TopologicalSorter
@@ -24,6 +25,7 @@ LAYERS = (
     ("detector", "renderer.instances"),
     ("labels", "physics", "renderer.meshes"),
     ("renderer.differentiation", "renderer.light", "scene.loading"),
+    ("capture.pipeline",),
     ("capture", "renderer.occluders", "renderer.splatting", "scene.planning"),
     ("scene",),
     ("asset",),
@@ -156,7 +158,7 @@ def imports_inside(path: Path) -> Iterator[tuple[int, bool]]:
     its functions import what they need.
     """
     lines, tree = path.read_text().splitlines(), ast.parse(path.read_text())
-    for_all = "inside of their functions" in (ast.get_docstring(tree) or "")
+    for_all = re.search(r"\binside (of )?(the |their |its )?functions?\b", ast.get_docstring(tree) or "") is not None
     inner = {
         node.lineno: node
         for function in ast.walk(tree)
@@ -208,3 +210,17 @@ def test_imports_inside_of_functions_have_a_reason() -> None:
         if not said
     ]
     assert silent == []
+
+
+def test_no_public_name_hides_a_module() -> None:
+    """``from package import name`` must not give a function where a module has the same name."""
+    for module, path in MODULES.items():
+        if path.name == "__init__.py" and module != "mitsplat":
+            exports = (node for node in ast.parse(path.read_text()).body if isinstance(node, ast.Assign))
+            names = {
+                name
+                for node in exports
+                if ast.unparse(node.targets[0]) == "__all__"
+                for name in ast.literal_eval(node.value)
+            }
+            assert names.isdisjoint(file.stem for file in path.parent.glob("*.py")), module

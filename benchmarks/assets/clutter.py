@@ -31,11 +31,11 @@ from benchmarks.assets.photographing import by_name, paint, photograph, show_whe
 from benchmarks.record import recording
 from mitsplat.asset import Asset
 from mitsplat.capture.capture import Capture, Photo, known_where
-from mitsplat.capture.capture_photos import CaptureSettings
+from mitsplat.capture.pipeline.capture_pipeline import CaptureSettings
 from mitsplat.fit.trainer import FitSettings
 from mitsplat.geometry.camera import Camera
 from mitsplat.reconstruct.asset_evaluation import iou, show_asset
-from mitsplat.reconstruct.asset_from_photos import AssetJob, make_photo_asset
+from mitsplat.reconstruct.asset_pipeline import AssetJob, make_photo_asset
 from mitsplat.reconstruct.reconstruct import ReconstructSettings
 from mitsplat.renderer.layers import ensure_variant
 

@@ -32,14 +32,14 @@ from benchmarks.assets.verdicts import views_around
 from benchmarks.record import figure, recording
 from mitsplat.arrays import Float32Array
 from mitsplat.asset import Asset
-from mitsplat.capture.capture_photos import CaptureSettings
 from mitsplat.capture.lighting import BallView, LightSettings, estimate_light, read_ball, write_light
 from mitsplat.capture.lighting.panorama import unit_vector
+from mitsplat.capture.pipeline.capture_pipeline import CaptureSettings
 from mitsplat.fit.trainer import FitSettings
 from mitsplat.geometry.camera import Camera
 from mitsplat.images.colour import decode_srgb, encode_srgb
 from mitsplat.reconstruct.asset_evaluation import VERDICT_FILE, show_asset
-from mitsplat.reconstruct.asset_from_photos import AssetJob, make_photo_asset
+from mitsplat.reconstruct.asset_pipeline import AssetJob, make_photo_asset
 from mitsplat.renderer.layers import ensure_variant
 from mitsplat.renderer.rays.device_arrays import ray_scene
 

@@ -29,14 +29,14 @@ from benchmarks.assets.photographing import Sensors, by_name, paint, photograph,
 from benchmarks.record import figure, recording
 from mitsplat.capture.boards.targets import Board
 from mitsplat.capture.capture import Capture
-from mitsplat.capture.capture_photos import CaptureSettings
 from mitsplat.capture.metric_frame import fit_similarity
+from mitsplat.capture.pipeline.capture_pipeline import CaptureSettings
 from mitsplat.dataset.write import write_dataset
 from mitsplat.fit.trainer import FitSettings
 from mitsplat.geometry.camera import Camera
 from mitsplat.geometry.mesh_distance import DistanceSurface
 from mitsplat.reconstruct.asset_evaluation import iou
-from mitsplat.reconstruct.asset_from_photos import AssetJob, make_photo_asset
+from mitsplat.reconstruct.asset_pipeline import AssetJob, make_photo_asset
 from mitsplat.renderer.layers import ensure_variant
 from mitsplat.scene.loading.scene_loading import load_scene
 

@@ -32,7 +32,7 @@ from mitsplat.fit.image_metrics import psnr_of
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.camera import Camera
 from mitsplat.reconstruct.asset_evaluation import VERDICT_FILE, show_held_out
-from mitsplat.reconstruct.asset_from_photos import AssetJob
+from mitsplat.reconstruct.asset_pipeline import AssetJob
 from mitsplat.storage.files import write_text
 from mitsplat.surroundings import make_surroundings
 

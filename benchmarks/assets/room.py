@@ -30,12 +30,12 @@ from benchmarks.assets.judged import on_truth, tell_wanted
 from benchmarks.assets.known import BOARD
 from benchmarks.assets.photographing import by_name, paint, photograph
 from benchmarks.record import cpu_seconds, figure, recording
-from mitsplat.capture.capture_photos import CaptureSettings, capture_photos
+from mitsplat.capture.pipeline.capture_pipeline import CaptureSettings, capture_photos
 from mitsplat.dataset.write import write_dataset
 from mitsplat.fit.trainer import FitSettings, fit_capture
 from mitsplat.geometry.camera import Camera
 from mitsplat.reconstruct.asset_evaluation import VERDICT_FILE
-from mitsplat.reconstruct.asset_from_photos import AssetJob
+from mitsplat.reconstruct.asset_pipeline import AssetJob
 from mitsplat.renderer.layers import ensure_variant
 from mitsplat.scene.loading.scene_loading import load_scene
 from mitsplat.scene.spec.light_spec import AreaLight, EnvironmentLight

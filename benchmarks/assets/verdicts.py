@@ -33,12 +33,12 @@ from benchmarks.assets.known import BOARD, chamfer, solid, speckled, table_scene
 from benchmarks.assets.photographing import by_name, photograph, show_where
 from benchmarks.record import figure, recording
 from mitsplat.asset import Asset
-from mitsplat.capture.capture_photos import CaptureSettings
+from mitsplat.capture.pipeline.capture_pipeline import CaptureSettings
 from mitsplat.errors import InputError
 from mitsplat.fit.trainer import FitSettings
 from mitsplat.geometry.camera import Camera, spiral
 from mitsplat.reconstruct.asset_evaluation import VERDICT_FILE, iou, show_asset
-from mitsplat.reconstruct.asset_from_photos import AssetJob, make_photo_asset
+from mitsplat.reconstruct.asset_pipeline import AssetJob, make_photo_asset
 from mitsplat.reconstruct.reconstruct import ReconstructSettings
 from mitsplat.reconstruct.surface import SurfaceSettings
 from mitsplat.renderer.layers import ensure_variant

@@ -30,8 +30,8 @@ from mitsplat.errors import InputError, PartialResultError
 
 if TYPE_CHECKING:
     from mitsplat.capture.boards.targets import Board
-    from mitsplat.capture.capture_photos import CaptureSettings
-    from mitsplat.reconstruct.asset_from_photos import AssetResult
+    from mitsplat.capture.pipeline.capture_pipeline import CaptureSettings
+    from mitsplat.reconstruct.asset_pipeline import AssetResult
 
 CaptureFolder = Annotated[Path, typer.Argument(metavar="CAPTURE", help="Capture folder; an object needs masks.")]
 Photos = Annotated[
@@ -255,7 +255,7 @@ def capture(
 
     An interrupted run continues when the command runs again. The exit status is 4 if too many photos are unusable.
     """
-    from mitsplat.capture.capture_photos import capture_photos
+    from mitsplat.capture.pipeline.capture_pipeline import capture_photos
 
     settings = replace(
         _capture_settings(kind, frames, scale_from, poses, masks, mask_model, pick, pick_not, box),
@@ -348,7 +348,7 @@ def mesh(
     a quality threshold is missed.
     """
     from mitsplat.asset import read_mesh
-    from mitsplat.reconstruct.asset_from_photos import AssetJob, make_asset
+    from mitsplat.reconstruct.asset_pipeline import AssetJob, make_asset
     from mitsplat.reconstruct.reconstruct import ImportedMesh, ReconstructSettings
     from mitsplat.reconstruct.registration import invert_transform
     from mitsplat.reconstruct.silhouette_refinement import MeshRefineSettings
@@ -416,7 +416,7 @@ def asset(
     threshold is missed.
     """
     from mitsplat.fit.trainer import FitSettings
-    from mitsplat.reconstruct.asset_from_photos import AssetJob, make_photo_asset
+    from mitsplat.reconstruct.asset_pipeline import AssetJob, make_photo_asset
     from mitsplat.reconstruct.reconstruct import ReconstructSettings
     from mitsplat.reconstruct.silhouette_refinement import MeshRefineSettings
     from mitsplat.reconstruct.surface import SurfaceSettings
@@ -468,7 +468,7 @@ def _capture_settings(
     box: Box,
 ) -> CaptureSettings:
     """Return the capture settings from the options that `capture` and `asset` share."""
-    from mitsplat.capture.capture_photos import CaptureSettings
+    from mitsplat.capture.pipeline.capture_pipeline import CaptureSettings
 
     return CaptureSettings(
         kind=kind,

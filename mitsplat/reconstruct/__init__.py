@@ -3,12 +3,12 @@
 Input: a capture and the splats that were fitted to it.
 Output: an :class:`~mitsplat.asset.Asset` of the object alone, with a closed mesh aligned to its splats, and an
 evaluation on held-out photos.
-:mod:`.asset_from_photos` runs all steps from the photographs to the asset.
+:mod:`.asset_pipeline` runs all steps from the photographs to the asset.
 """
 
 from __future__ import annotations
 
-from mitsplat.reconstruct.asset_from_photos import make_asset, make_photo_asset
+from mitsplat.reconstruct.asset_pipeline import make_asset, make_photo_asset
 from mitsplat.reconstruct.reconstruct import Reconstruction, ReconstructSettings, reconstruct_asset
 
 __all__ = [

@@ -18,7 +18,7 @@ from scipy.ndimage import binary_erosion
 
 from mitsplat.arrays import BoolArray, Float64Array
 from mitsplat.capture.capture import Capture, Photo
-from mitsplat.capture.capture_photos import CaptureSettings
+from mitsplat.capture.pipeline.capture_pipeline import CaptureSettings
 from mitsplat.fit.image_metrics import psnr_of
 from mitsplat.fit.trainer import FitSettings
 from mitsplat.gaussians.splat_cloud import Splats
@@ -28,7 +28,7 @@ from mitsplat.images.colour import decode_srgb
 from mitsplat.pages.html import rgb_image
 from mitsplat.progress import Progress
 from mitsplat.reconstruct.asset_evaluation import VERDICT_FILE, HeldOutView, show_held_out, sized_photo
-from mitsplat.reconstruct.asset_from_photos import AssetJob, AssetResult, make_asset, make_photo_asset
+from mitsplat.reconstruct.asset_pipeline import AssetJob, AssetResult, make_asset, make_photo_asset
 from mitsplat.reconstruct.reconstruct import ImportedMesh, Reconstruction, reconstruct_asset
 from mitsplat.reconstruct.surface import reconstruct_surface
 from mitsplat.storage.files import write_text
@@ -77,7 +77,7 @@ _MIN_REGION = 0.1
 def make_surroundings(
     capture_folder: Path, fit: Path, out: Path, job: AssetJob, *, progress: Progress | None = None
 ) -> AssetResult:
-    """Write an environment and a scene file; see :func:`~mitsplat.reconstruct.asset_from_photos.make_asset`.
+    """Write an environment and a scene file; see :func:`~mitsplat.reconstruct.asset_pipeline.make_asset`.
 
     The scene file lies next to the asset's folder and has the same name. A scene file that was edited by hand is not
     replaced.
@@ -97,7 +97,7 @@ def make_photo_surroundings(
     fit: FitSettings,
     progress: Progress | None = None,
 ) -> AssetResult:
-    """Make an environment from photographs; see :func:`mitsplat.reconstruct.asset_from_photos.make_photo_asset`."""
+    """Make an environment from photographs; see :func:`mitsplat.reconstruct.asset_pipeline.make_photo_asset`."""
     before = _recorded_scene(out)
     done = make_photo_asset(
         photos, out, job, capture=capture, fit=fit, make=reconstruct_surroundings, progress=progress

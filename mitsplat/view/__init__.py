@@ -9,6 +9,6 @@ in the browser.
 from __future__ import annotations
 
 from mitsplat.view.page import Address
-from mitsplat.view.serve import serve
+from mitsplat.view.server import serve
 
 __all__ = ["Address", "serve"]

@@ -14,7 +14,7 @@ import numpy as np
 from mitsplat.arrays import ByteImage, Float64Array
 from mitsplat.asset import Asset
 from mitsplat.capture.capture import Capture, Photo
-from mitsplat.capture.picking import chosen_object, pick_along
+from mitsplat.capture.pipeline.picking import chosen_object, pick_along
 from mitsplat.errors import InputError
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.gaussians.splat_files import Axis, usual_up

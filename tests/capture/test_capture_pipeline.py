@@ -19,12 +19,12 @@ import pytest
 from PIL import ExifTags, Image, ImageFilter
 
 from benchmarks.assets.photographing import photograph
-from mitsplat.capture import capture_photos as take
 from mitsplat.capture import structure_from_motion as sfm
 from mitsplat.capture.capture import Capture
-from mitsplat.capture.capture_photos import CaptureResult, CaptureSettings, capture_photos
 from mitsplat.capture.metric_frame import find_metric_frame, fit_similarity
 from mitsplat.capture.photos import Prepared
+from mitsplat.capture.pipeline import capture_pipeline as take
+from mitsplat.capture.pipeline.capture_pipeline import CaptureResult, CaptureSettings, capture_photos
 from mitsplat.capture.structure_from_motion import SparseModel
 from mitsplat.errors import InputError, MissingResourceError
 from mitsplat.geometry.camera import Camera

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mitsplat.capture.capture import Capture
-from mitsplat.capture.picking import chosen_object, pick_along
+from mitsplat.capture.pipeline.picking import chosen_object, pick_along
 from mitsplat.errors import InputError
 from tests.capture.isolation.balls import THINGS, capture_of_balls, ground
 

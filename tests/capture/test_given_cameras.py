@@ -16,9 +16,9 @@ from PIL import Image
 from mitsplat.capture import known_poses as poses
 from mitsplat.capture import structure_from_motion as sfm
 from mitsplat.capture.capture import Capture
-from mitsplat.capture.capture_photos import CaptureResult, CaptureSettings, capture_photos
 from mitsplat.capture.known_poses import read_poses
 from mitsplat.capture.photos import Prepared, prepare_photos
+from mitsplat.capture.pipeline.capture_pipeline import CaptureResult, CaptureSettings, capture_photos
 from mitsplat.errors import InputError
 from mitsplat.geometry.camera import Camera
 from tests import rendered
@@ -124,7 +124,7 @@ def test_given_masks_are_taken(
     assert alpha.sum() == alpha[80:250, 100:300].sum() == 170 * 200
     with monkeypatch.context() as elsewhere:
         elsewhere.chdir(tmp_path / "masks")
-        elsewhere.setattr("mitsplat.capture.capture_photos.prepare_photos", None)  # would be made anew
+        elsewhere.setattr("mitsplat.capture.pipeline.capture_pipeline.prepare_photos", None)  # would be made anew
         there = replace(settings, poses=Path("../model"), masks=Path())
         assert len(capture_photos(given, Path("../out"), there).capture.photos) == 15
     (tmp_path / "masks/photo05.PNG").unlink()

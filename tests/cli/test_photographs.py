@@ -14,16 +14,16 @@ import pytest
 from mitsplat import surroundings
 from mitsplat.capture.boards.targets import Board
 from mitsplat.capture.capture import Capture
-from mitsplat.capture.capture_photos import CaptureSettings
+from mitsplat.capture.pipeline.capture_pipeline import CaptureSettings
 from mitsplat.cli.options import stage_bar
 from mitsplat.errors import InputError
 from mitsplat.fit import depth_network as depth_model
 from mitsplat.fit import depth_priors as depth_maps
 from mitsplat.fit.depth_priors import DepthMaps
 from mitsplat.fit.trainer import FitProgress, FitSettings
-from mitsplat.reconstruct import asset_from_photos as pipeline
+from mitsplat.reconstruct import asset_pipeline as pipeline
 from mitsplat.reconstruct.asset_evaluation import Verdict
-from mitsplat.reconstruct.asset_from_photos import AssetResult
+from mitsplat.reconstruct.asset_pipeline import AssetResult
 from mitsplat.reconstruct.surface import SurfaceSettings
 from tests.cli.typed import Calls, run
 from tests.conftest import box_asset
@@ -101,7 +101,7 @@ def finished(folder: Path, **changes: Any) -> AssetResult:
 
 def test_capture_passes_every_option_on(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     calls = Calls(error=InputError("captured"))
-    module = import_module("mitsplat.capture.capture_photos")  # the package exports a function of this name
+    module = import_module("mitsplat.capture.pipeline.capture_pipeline")  # the package exports a function of this name
     monkeypatch.setattr(module, "capture_photos", calls)
     common = (
         "--frames", 40, "--max-size", 800, "--squares", "6x4", "--square", 0.02, "--tag", 0.05,

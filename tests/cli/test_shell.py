@@ -35,7 +35,7 @@ from tests.cli.typed import run as type_in
 from tests.conftest import box_asset
 
 if TYPE_CHECKING:
-    from mitsplat.capture.capture_photos import CaptureResult
+    from mitsplat.capture.pipeline.capture_pipeline import CaptureResult
 
 ROOT = Path(__file__).parents[2]
 PAGES = (ROOT / "README.md", *sorted(path for path in (ROOT / "docs").rglob("*.md") if "_build" not in path.parts))

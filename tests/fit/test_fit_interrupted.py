@@ -16,12 +16,12 @@ from typing import Any
 import pytest
 
 from mitsplat.capture.capture import Capture
-from mitsplat.capture.capture_photos import CaptureResult, CaptureSettings
+from mitsplat.capture.pipeline.capture_pipeline import CaptureResult, CaptureSettings
 from mitsplat.errors import InputError
 from mitsplat.fit import fit_folder
 from mitsplat.fit import trainer as fit
 from mitsplat.fit.trainer import fit_capture
-from mitsplat.reconstruct.asset_from_photos import AssetJob, AssetResult, make_photo_asset
+from mitsplat.reconstruct.asset_pipeline import AssetJob, AssetResult, make_photo_asset
 from tests.fit.test_fit import SMALL, photograph
 from tests.reconstruct.test_reconstruct import GOOD
 
@@ -159,10 +159,10 @@ def test_an_asset_whose_fit_was_interrupted_goes_on(
     """`asset` has no --overwrite to be told of: settings that changed, an interruption, the same command again."""
     captured = CaptureResult(fits.capture, 20, "a board", 0.5, doubtful={})
     monkeypatch.setattr(
-        "mitsplat.reconstruct.asset_from_photos.capture_photos", lambda photos, out, settings, progress: captured
+        "mitsplat.reconstruct.asset_pipeline.capture_photos", lambda photos, out, settings, progress: captured
     )
     monkeypatch.setattr(
-        "mitsplat.reconstruct.asset_from_photos.make_asset",
+        "mitsplat.reconstruct.asset_pipeline.make_asset",
         lambda *args, **kwargs: AssetResult(tmp_path, GOOD, kept=False),
     )
 

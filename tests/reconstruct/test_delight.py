@@ -18,7 +18,7 @@ from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.gaussians.surfels import place_surfels
 from mitsplat.images.colour import decode_srgb, encode_srgb
 from mitsplat.reconstruct.asset_evaluation import Verdict
-from mitsplat.reconstruct.asset_from_photos import AssetJob, delight_asset
+from mitsplat.reconstruct.asset_pipeline import AssetJob, delight_asset
 from mitsplat.reconstruct.delight import MIN_SLOPE, LightFile, delight, trace_irradiance
 from mitsplat.reconstruct.reconstruct import Reconstruction
 from mitsplat.scene.spec.light_spec import AreaLight, EnvironmentLight, LightSpec

@@ -14,13 +14,13 @@ import trimesh
 
 from mitsplat.asset import Asset
 from mitsplat.capture.capture import Capture, Photo
-from mitsplat.capture.capture_photos import CaptureResult, CaptureSettings
+from mitsplat.capture.pipeline.capture_pipeline import CaptureResult, CaptureSettings
 from mitsplat.errors import InputError
 from mitsplat.fit.trainer import FitSettings
 from mitsplat.geometry.camera import Camera
 from mitsplat.geometry.mesh_distance import DistanceSurface
 from mitsplat.reconstruct.asset_evaluation import Verdict
-from mitsplat.reconstruct.asset_from_photos import AssetJob, AssetResult, make_asset, make_photo_asset, read_fit
+from mitsplat.reconstruct.asset_pipeline import AssetJob, AssetResult, make_asset, make_photo_asset, read_fit
 from mitsplat.reconstruct.asset_report import _directions
 from mitsplat.reconstruct.reconstruct import ImportedMesh, ReconstructSettings, reconstruct_asset
 from mitsplat.reconstruct.surface import SurfaceSettings
@@ -112,7 +112,7 @@ def test_the_same_inputs_are_kept_and_others_are_not(
     def never(*args: object, **kwargs: object) -> None:
         raise InputError("made anew")
 
-    monkeypatch.setattr("mitsplat.reconstruct.asset_from_photos.reconstruct_asset", never)
+    monkeypatch.setattr("mitsplat.reconstruct.asset_pipeline.reconstruct_asset", never)
     again = make_asset(folder / "capture", folder / "fit", folder / "asset", job)
     assert again.kept
     assert again.verdict == first.verdict
@@ -276,10 +276,10 @@ def test_photos_go_through_all_stages(
     capture = known_object.capture.save(tmp_path / "asset" / "capture")
     captured = CaptureResult(capture, 32, "a board", 0.5, doubtful={"05.png": 0.6})
     monkeypatch.setattr(
-        "mitsplat.reconstruct.asset_from_photos.capture_photos", lambda photos, out, settings, progress: captured
+        "mitsplat.reconstruct.asset_pipeline.capture_photos", lambda photos, out, settings, progress: captured
     )
-    monkeypatch.setattr("mitsplat.reconstruct.asset_from_photos.fit_capture", fit_capture)
-    monkeypatch.setattr("mitsplat.reconstruct.asset_from_photos.make_asset", made_of)
+    monkeypatch.setattr("mitsplat.reconstruct.asset_pipeline.fit_capture", fit_capture)
+    monkeypatch.setattr("mitsplat.reconstruct.asset_pipeline.make_asset", made_of)
     job = AssetJob(name="part")
     for settings in (FitSettings(), FitSettings(), FitSettings(iterations=5)):
         made = make_photo_asset(tmp_path, tmp_path / "asset", job, capture=CaptureSettings(), fit=settings)

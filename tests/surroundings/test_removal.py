@@ -20,7 +20,7 @@ from mitsplat.gaussians.spherical_harmonics import SH_C0
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.camera import Camera
 from mitsplat.reconstruct.asset_evaluation import show_asset
-from mitsplat.reconstruct.asset_from_photos import AssetJob
+from mitsplat.reconstruct.asset_pipeline import AssetJob
 from mitsplat.reconstruct.reconstruct import ImportedMesh
 from mitsplat.surroundings import environment_from_photos as pipeline
 from mitsplat.surroundings import make_surroundings

@@ -17,7 +17,7 @@ from mitsplat.checks.path_checks import check_scene
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.camera import Camera
 from mitsplat.reconstruct.asset_evaluation import show_asset
-from mitsplat.reconstruct.asset_from_photos import AssetJob, AssetResult
+from mitsplat.reconstruct.asset_pipeline import AssetJob, AssetResult
 from mitsplat.reconstruct.reconstruct import ReconstructSettings
 from mitsplat.reconstruct.surface import SurfaceSettings
 from mitsplat.scene.loading.scene_loading import load_scene

@@ -16,7 +16,7 @@ from mitsplat.dataset.manifest import Manifest
 from mitsplat.errors import InputError
 from mitsplat.view.dataset_index import DatasetIndex, Filter
 from mitsplat.view.page import Address, Page, splat_arrays
-from mitsplat.view.serve import kind_of
+from mitsplat.view.server import kind_of
 from mitsplat.view.still_pages import AssetPage, CapturePage, DatasetPage, SplatsPage, photo_picture
 from tests.capture.isolation.balls import THINGS, capture_of_balls
 from tests.conftest import KnownObject, box_asset

@@ -19,7 +19,7 @@ from benchmarks.assets.known import solid, speckled
 from benchmarks.assets.photographing import Sensors, by_name, photograph, show_where
 from mitsplat.capture.capture import Capture, Photo
 from mitsplat.capture.photo_masks import object_masks
-from mitsplat.capture.picking import chosen_object
+from mitsplat.capture.pipeline.picking import chosen_object
 from mitsplat.reconstruct.asset_evaluation import iou
 from mitsplat.renderer.layers import ensure_variant
 

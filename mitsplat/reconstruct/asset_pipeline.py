@@ -19,7 +19,7 @@ import numpy as np
 
 from mitsplat.asset import ASSET_FILE, read_spec
 from mitsplat.capture.capture import Capture
-from mitsplat.capture.capture_photos import CaptureSettings, capture_photos
+from mitsplat.capture.pipeline.capture_pipeline import CaptureSettings, capture_photos
 from mitsplat.errors import InputError
 from mitsplat.fit.fit_folder import FIT_FILE, read_record
 from mitsplat.fit.trainer import FitProgress, FitSettings, fit_capture

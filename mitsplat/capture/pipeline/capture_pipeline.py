@@ -20,10 +20,10 @@ from mitsplat.capture.exposure import even_exposure
 from mitsplat.capture.isolation import ChosenObject, hidden_part
 from mitsplat.capture.known_poses import read_poses
 from mitsplat.capture.metric_frame import DEFAULT_BOARD, MetricFrame, find_metric_frame
-from mitsplat.capture.overview import capture_sheet
 from mitsplat.capture.photo_masks import add_masks, given_masks, model_masks, object_masks, object_points
 from mitsplat.capture.photos import SUFFIXES, Prepared, find_photos, prepare_photos, undistort
-from mitsplat.capture.picking import chosen_object
+from mitsplat.capture.pipeline.overview import capture_sheet
+from mitsplat.capture.pipeline.picking import chosen_object
 from mitsplat.capture.structure_from_motion import MIN_AGREEMENT, MIN_POINTS, SURE_AGREEMENT, SparseModel, find_cameras
 from mitsplat.capture.video import ChosenFrames, choose_frames
 from mitsplat.errors import InputError

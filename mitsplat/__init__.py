@@ -27,21 +27,24 @@ _importing = threading.RLock()
 _HOME = {
     "Asset": "asset",
     "Camera": "geometry.camera",
-    "DetectionMatches": "detector.scores",
     "Frame": "frames.frame",
     "InputError": "errors",
     "Labels": "labels.labels",
+    "LateDeviceError": "errors",
     "Layers": "renderer.layers",
     "Layout": "scene.layout",
+    "MissingResourceError": "errors",
+    "PartialResultError": "errors",
     "Quality": "quality",
     "Renderer": "frames.frame",
     "Scene": "scene.scene",
     "SceneSpec": "scene.spec.scene_spec",
     "Splats": "gaussians.splat_cloud",
-    "TrainSettings": "detector.training",
-    "average_precision": "detector.scores",
+    "asset_from_photos": "reconstruct.asset_pipeline",
     "bake_asset": "bake.bake",
-    "evaluate_detector": "detector.detector_evaluation",
+    "capture_photos": "capture.pipeline.capture_pipeline",
+    "fit_capture": "fit.trainer",
+    "import_splats": "importing.splat_import",
     "load_scene": "scene.loading.scene_loading",
     "make_scene": "scene.loading.scene_loading",
     "remake_frame": "dataset.remake",
@@ -49,7 +52,6 @@ _HOME = {
     "render_frames": "frames.sequence",
     "render_splats": "renderer.layers",
     "settle_layout": "physics.settle",
-    "train_detector": "detector.training",
     "use_device": "runtime.device",
     "write_dataset": "dataset.write",
     "write_frames": "dataset.given_frames",
@@ -60,24 +62,26 @@ __all__ = sorted(_HOME)
 if TYPE_CHECKING:
     from mitsplat.asset import Asset as Asset
     from mitsplat.bake.bake import bake_asset as bake_asset
+    from mitsplat.capture.pipeline.capture_pipeline import capture_photos as capture_photos
     from mitsplat.dataset.given_frames import write_frames as write_frames
     from mitsplat.dataset.remake import remake_frame as remake_frame
     from mitsplat.dataset.write import write_dataset as write_dataset
-    from mitsplat.detector.detector_evaluation import evaluate_detector as evaluate_detector
-    from mitsplat.detector.scores import DetectionMatches as DetectionMatches
-    from mitsplat.detector.scores import average_precision as average_precision
-    from mitsplat.detector.training import TrainSettings as TrainSettings
-    from mitsplat.detector.training import train_detector as train_detector
     from mitsplat.errors import InputError as InputError
+    from mitsplat.errors import LateDeviceError as LateDeviceError
+    from mitsplat.errors import MissingResourceError as MissingResourceError
+    from mitsplat.errors import PartialResultError as PartialResultError
+    from mitsplat.fit.trainer import fit_capture as fit_capture
     from mitsplat.frames.frame import Frame as Frame
     from mitsplat.frames.frame import Renderer as Renderer
     from mitsplat.frames.frame import render_frame as render_frame
     from mitsplat.frames.sequence import render_frames as render_frames
     from mitsplat.gaussians.splat_cloud import Splats as Splats
     from mitsplat.geometry.camera import Camera as Camera
+    from mitsplat.importing.splat_import import import_splats as import_splats
     from mitsplat.labels.labels import Labels as Labels
     from mitsplat.physics.settle import settle_layout as settle_layout
     from mitsplat.quality import Quality as Quality
+    from mitsplat.reconstruct.asset_pipeline import asset_from_photos as asset_from_photos
     from mitsplat.renderer.layers import Layers as Layers
     from mitsplat.renderer.layers import render_splats as render_splats
     from mitsplat.runtime.device import use_device as use_device
@@ -93,8 +97,7 @@ def __getattr__(name: str) -> Any:
         # The lock admits one thread at a time: Mitsuba replaces its module object during import, and Python reports a
         # deadlock when threads wait for each other's imports.
         with _importing:
-            if not _HOME[name].startswith("detector."):
-                importlib.import_module("mitsuba")
+            importlib.import_module("mitsuba")
             return getattr(importlib.import_module(f"mitsplat.{_HOME[name]}"), name)
     raise AttributeError(f"module 'mitsplat' has no attribute {name!r}")
 

@@ -35,7 +35,7 @@ from mitsplat.capture.pipeline.capture_pipeline import CaptureSettings
 from mitsplat.fit.trainer import FitSettings
 from mitsplat.geometry.camera import Camera
 from mitsplat.reconstruct.asset_evaluation import iou, show_asset
-from mitsplat.reconstruct.asset_pipeline import AssetJob, make_photo_asset
+from mitsplat.reconstruct.asset_pipeline import AssetJob, asset_from_photos
 from mitsplat.reconstruct.reconstruct import ReconstructSettings
 from mitsplat.renderer.layers import ensure_variant
 
@@ -338,7 +338,7 @@ def measure(args: argparse.Namespace) -> int:
         if done == total:
             print(f"  {text}: {total}", file=sys.stderr)
 
-    done = make_photo_asset(
+    done = asset_from_photos(
         photos,
         args.out / "asset",
         AssetJob(name="clutter", settings=ReconstructSettings(size=float(mesh.extents.max()))),

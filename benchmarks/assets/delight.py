@@ -39,7 +39,7 @@ from mitsplat.fit.trainer import FitSettings
 from mitsplat.geometry.camera import Camera
 from mitsplat.images.colour import decode_srgb, encode_srgb
 from mitsplat.reconstruct.asset_evaluation import VERDICT_FILE, show_asset
-from mitsplat.reconstruct.asset_pipeline import AssetJob, make_photo_asset
+from mitsplat.reconstruct.asset_pipeline import AssetJob, asset_from_photos
 from mitsplat.renderer.layers import ensure_variant
 from mitsplat.renderer.rays.device_arrays import ray_scene
 
@@ -189,7 +189,7 @@ def measure(args: argparse.Namespace) -> int:
         given = CaptureSettings(poses=folder / "transforms.json", metric=True, masks=folder / "masks")
         fit = FitSettings(gaussians=args.gaussians, iterations=args.iterations, size=args.width)
         job = AssetJob(name="solid", delight=delight)
-        done = make_photo_asset(folder / "photos", folder / "asset", job, capture=given, fit=fit)
+        done = asset_from_photos(folder / "photos", folder / "asset", job, capture=given, fit=fit)
         shutil.copytree(
             done.folder, args.out / name, dirs_exist_ok=True, ignore=shutil.ignore_patterns("capture", "fit")
         )

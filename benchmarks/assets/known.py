@@ -36,7 +36,7 @@ from mitsplat.fit.trainer import FitSettings
 from mitsplat.geometry.camera import Camera
 from mitsplat.geometry.mesh_distance import DistanceSurface
 from mitsplat.reconstruct.asset_evaluation import iou
-from mitsplat.reconstruct.asset_pipeline import AssetJob, make_photo_asset
+from mitsplat.reconstruct.asset_pipeline import AssetJob, asset_from_photos
 from mitsplat.renderer.layers import ensure_variant
 from mitsplat.scene.loading.scene_loading import load_scene
 
@@ -241,7 +241,7 @@ def measure(args: argparse.Namespace) -> int:
 
     asset = args.out / "asset"
     job = AssetJob(name="known")
-    done = make_photo_asset(photos, asset, job, capture=CaptureSettings(board=BOARD), fit=fit, progress=tell)
+    done = asset_from_photos(photos, asset, job, capture=CaptureSettings(board=BOARD), fit=fit, progress=tell)
     found = compare(asset, truth, mesh)
     found["instances in the rendered frame"] = drop(asset, args.out / "dropped")
     print(

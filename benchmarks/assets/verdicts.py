@@ -38,7 +38,7 @@ from mitsplat.errors import InputError
 from mitsplat.fit.trainer import FitSettings
 from mitsplat.geometry.camera import Camera, spiral
 from mitsplat.reconstruct.asset_evaluation import VERDICT_FILE, iou, show_asset
-from mitsplat.reconstruct.asset_pipeline import AssetJob, make_photo_asset
+from mitsplat.reconstruct.asset_pipeline import AssetJob, asset_from_photos
 from mitsplat.reconstruct.reconstruct import ReconstructSettings
 from mitsplat.reconstruct.surface import SurfaceSettings
 from mitsplat.renderer.layers import ensure_variant
@@ -268,7 +268,7 @@ def measure(case: Case, folder: Path, judge: bool) -> dict[str, Any]:
     poses.write_text(json.dumps(transforms(by_name(cameras(case)))))
     found: dict[str, Any] = {"refused": None, "verdict": None, "misses": [], "truth": None}
     try:
-        asset = make_photo_asset(
+        asset = asset_from_photos(
             folder / "photos",
             folder / "asset",
             AssetJob(name="known", settings=settings),

@@ -416,14 +416,14 @@ def asset(
     threshold is missed.
     """
     from mitsplat.fit.trainer import FitSettings
-    from mitsplat.reconstruct.asset_pipeline import AssetJob, make_photo_asset
+    from mitsplat.reconstruct.asset_pipeline import AssetJob, asset_from_photos
     from mitsplat.reconstruct.reconstruct import ReconstructSettings
     from mitsplat.reconstruct.silhouette_refinement import MeshRefineSettings
     from mitsplat.reconstruct.surface import SurfaceSettings
     from mitsplat.surroundings import make_photo_surroundings
 
     whole = kind == "environment"
-    make = make_photo_surroundings if whole else make_photo_asset
+    make = make_photo_surroundings if whole else asset_from_photos
     job = AssetJob(
         name=name or out.resolve().name,
         class_name=class_name,

@@ -8,13 +8,14 @@ evaluation on held-out photos.
 
 from __future__ import annotations
 
-from mitsplat.reconstruct.asset_pipeline import make_asset, make_photo_asset
+from mitsplat.reconstruct.asset_pipeline import AssetJob, asset_from_photos, make_asset
 from mitsplat.reconstruct.reconstruct import Reconstruction, ReconstructSettings, reconstruct_asset
 
 __all__ = [
+    "AssetJob",
     "ReconstructSettings",
     "Reconstruction",
+    "asset_from_photos",
     "make_asset",
-    "make_photo_asset",
     "reconstruct_asset",
 ]

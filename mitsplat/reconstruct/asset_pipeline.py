@@ -166,13 +166,13 @@ def read_fit(path: Path) -> tuple[Path, float | None]:
     return path / "splats.ply", known
 
 
-def make_photo_asset(
+def asset_from_photos(
     photos: Path,
     out: Path,
     job: AssetJob,
     *,
-    capture: CaptureSettings,
-    fit: FitSettings,
+    capture: CaptureSettings | None = None,
+    fit: FitSettings | None = None,
     make: Maker = reconstruct_job,
     progress: Progress | None = None,
 ) -> AssetResult:
@@ -182,8 +182,8 @@ def make_photo_asset(
         photos: Folder of photographs of one object or place.
         out: Folder of the asset, with the work folders ``capture/`` and ``fit/``.
         job: Description of the asset.
-        capture: Settings for cameras, scale and masks.
-        fit: Settings of the fit.
+        capture: Settings for cameras, scale and masks; defaults if None.
+        fit: Settings of the fit; defaults if None.
         make: Function of the last stage.
         progress: Progress callback.
 
@@ -191,7 +191,8 @@ def make_photo_asset(
         InputError: If the photographs do not suffice.
         MissingResourceError: If a required program or model is missing.
     """
-    taken = capture_photos(photos, out / "capture", capture, progress=progress)
+    fit = fit or FitSettings()
+    taken = capture_photos(photos, out / "capture", capture or CaptureSettings(), progress=progress)
     found = taken.capture
 
     def fitting(now: FitProgress) -> None:

@@ -158,8 +158,8 @@ def delight(splats: Splats, mesh: trimesh.Trimesh, light: LightFile, *, table: b
         lamps = "".join(f", lamp {number} {value:.2f}" for number, value in enumerate(borne_out, start=1))
         return done(
             f"its irradiance differs by {uneven:.0%}, but colours do not follow it (slope {slope:.2f}{lamps}; "
-            f"at least {MIN_SLOPE:g} is required) and are left as they are: were the lights measured at the position of "
-            "the object, in the capture's frame?"
+            f"at least {MIN_SLOPE:g} is required) and are left as they are: were the lights measured at the position "
+            "of the object, in the capture's frame?"
         )
     mean = np.average(total_irradiance[own], axis=0, weights=area[own])
     gain = np.where(lit[:, None], mean / np.maximum(total_irradiance, 1e-12), 1.0)

@@ -28,7 +28,7 @@ from mitsplat.images.colour import decode_srgb
 from mitsplat.pages.html import rgb_image
 from mitsplat.progress import Progress
 from mitsplat.reconstruct.asset_evaluation import VERDICT_FILE, HeldOutView, show_held_out, sized_photo
-from mitsplat.reconstruct.asset_pipeline import AssetJob, AssetResult, make_asset, make_photo_asset
+from mitsplat.reconstruct.asset_pipeline import AssetJob, AssetResult, asset_from_photos, make_asset
 from mitsplat.reconstruct.reconstruct import ImportedMesh, Reconstruction, reconstruct_asset
 from mitsplat.reconstruct.surface import reconstruct_surface
 from mitsplat.storage.files import write_text
@@ -97,9 +97,9 @@ def make_photo_surroundings(
     fit: FitSettings,
     progress: Progress | None = None,
 ) -> AssetResult:
-    """Make an environment from photographs; see :func:`mitsplat.reconstruct.asset_pipeline.make_photo_asset`."""
+    """Make an environment from photographs; see :func:`mitsplat.reconstruct.asset_pipeline.asset_from_photos`."""
     before = _recorded_scene(out)
-    done = make_photo_asset(
+    done = asset_from_photos(
         photos, out, job, capture=capture, fit=fit, make=reconstruct_surroundings, progress=progress
     )
     return _write_scene(done, before)

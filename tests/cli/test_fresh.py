@@ -45,9 +45,15 @@ def fresh(
 
 
 CALLS = {
+    "LateDeviceError": "assert issubclass(ms.LateDeviceError, ms.InputError)",
+    "MissingResourceError": "ms.MissingResourceError('x')",
+    "PartialResultError": "ms.PartialResultError('x')",
+    "asset_from_photos": "refused(lambda: ms.asset_from_photos(Path('no_photos'), Path('asset'), job('part')))",
+    "capture_photos": "refused(lambda: ms.capture_photos(Path('no_photos'), Path('capture')))",
+    "fit_capture": "refused(lambda: ms.fit_capture(empty_capture(), 'fit'))",
+    "import_splats": "refused(lambda: ms.import_splats('no.ply', name='part'))",
     "Asset": "ms.Asset.load('assets/nut')",
     "Camera": "camera.project(np.zeros((1, 3)))",
-    "DetectionMatches": "assert np.isnan(ms.DetectionMatches(truth, []).average_precision().map50)",
     "Frame": "ms.Frame",
     "InputError": "ms.InputError('x')",
     "Labels": "ms.Labels",
@@ -57,10 +63,7 @@ CALLS = {
     "Scene": "ms.Scene",
     "SceneSpec": "ms.SceneSpec.model_json_schema()",
     "Splats": "ms.Splats.load('assets/nut/splats.ply')",
-    "TrainSettings": "assert ms.TrainSettings().steps",
-    "average_precision": "assert np.isnan(ms.average_precision(truth, []).map50_95)",
     "bake_asset": "assert len(bake('part.stl').asset.splats)",
-    "evaluate_detector": "refused(lambda: ms.evaluate_detector('no_run', 'no_data'))",
     "Renderer": "assert ms.Renderer(ms.load_scene('scene.yaml')).render(0).image.any()",
     "load_scene": "ms.load_scene('scene.yaml')",
     "make_scene": "ms.make_scene(ms.load_scene('scene.yaml').spec)",
@@ -69,7 +72,6 @@ CALLS = {
     "render_frame": "assert ms.render_frame(ms.load_scene('scene.yaml'), 0).image.any()",
     "render_splats": "assert ms.render_splats(ball(), camera).alpha.any()",
     "settle_layout": "assert ms.settle_layout(ms.load_scene('scene.yaml'), 0).certificate.rested",
-    "train_detector": "refused(lambda: ms.train_detector(['no_data'], 'run'))",
     "use_device": "assert ms.use_device('cpu').kind == 'cpu' and mitsuba.variant() == 'llvm_ad_rgb'",
     "write_dataset": "assert ms.write_dataset(ms.load_scene('scene.yaml'), 'out', frames=1, workers=1).frames == 1",
     "write_frames": "scene = ms.load_scene('scene.yaml'); ms.write_frames(scene, 'own', ms.render_frames(scene, 1))",
@@ -97,7 +99,17 @@ def bake(file, **options):
     )
     return ms.bake_asset(file, name="part", kind="environment", settings=few, **options)
 
-truth = {"images": [{"id": 1}], "annotations": [], "categories": [{"id": 1, "name": "tin"}]}
+from pathlib import Path
+
+def job(name):
+    from mitsplat.reconstruct import AssetJob
+
+    return AssetJob(name=name)
+
+def empty_capture():
+    from mitsplat.capture import Capture
+
+    return Capture(photos=(), points=np.zeros((0, 3)), colours=np.zeros((0, 3)))
 
 def refused(call):
     from mitsplat.errors import MissingResourceError

@@ -167,7 +167,7 @@ def test_a_missed_threshold_is_status_4_and_a_sentence(
 @pytest.mark.parametrize(
     ("kind", "maker", "masks"),
     [
-        ("object", (pipeline, "make_photo_asset"), "alpha"),
+        ("object", (pipeline, "asset_from_photos"), "alpha"),
         ("environment", (surroundings, "make_photo_surroundings"), "off"),
     ],
 )

@@ -21,7 +21,7 @@ from mitsplat.errors import InputError
 from mitsplat.fit import fit_folder
 from mitsplat.fit import trainer as fit
 from mitsplat.fit.trainer import fit_capture
-from mitsplat.reconstruct.asset_pipeline import AssetJob, AssetResult, make_photo_asset
+from mitsplat.reconstruct.asset_pipeline import AssetJob, AssetResult, asset_from_photos
 from tests.fit.test_fit import SMALL, photograph
 from tests.reconstruct.test_reconstruct import GOOD
 
@@ -167,7 +167,7 @@ def test_an_asset_whose_fit_was_interrupted_goes_on(
     )
 
     def make(settings: fit.FitSettings) -> None:
-        make_photo_asset(tmp_path, tmp_path, AssetJob(name="part"), capture=CaptureSettings(), fit=settings)
+        asset_from_photos(tmp_path, tmp_path, AssetJob(name="part"), capture=CaptureSettings(), fit=settings)
 
     make(TINY)
     before = (tmp_path / "fit/splats.ply").stat().st_mtime_ns

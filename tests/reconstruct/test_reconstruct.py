@@ -20,7 +20,7 @@ from mitsplat.fit.trainer import FitSettings
 from mitsplat.geometry.camera import Camera
 from mitsplat.geometry.mesh_distance import DistanceSurface
 from mitsplat.reconstruct.asset_evaluation import Verdict
-from mitsplat.reconstruct.asset_pipeline import AssetJob, AssetResult, make_asset, make_photo_asset, read_fit
+from mitsplat.reconstruct.asset_pipeline import AssetJob, AssetResult, asset_from_photos, make_asset, read_fit
 from mitsplat.reconstruct.asset_report import _directions
 from mitsplat.reconstruct.reconstruct import ImportedMesh, ReconstructSettings, reconstruct_asset
 from mitsplat.reconstruct.surface import SurfaceSettings
@@ -282,7 +282,7 @@ def test_photos_go_through_all_stages(
     monkeypatch.setattr("mitsplat.reconstruct.asset_pipeline.make_asset", made_of)
     job = AssetJob(name="part")
     for settings in (FitSettings(), FitSettings(), FitSettings(iterations=5)):
-        made = make_photo_asset(tmp_path, tmp_path / "asset", job, capture=CaptureSettings(), fit=settings)
+        made = asset_from_photos(tmp_path, tmp_path / "asset", job, capture=CaptureSettings(), fit=settings)
     assert made.folder == tmp_path / "asset"
     assert made.warnings == captured.warnings
     assert "05.png (60%)" in made.warnings[0]

@@ -23,18 +23,18 @@ class Parameters:
     def __init__(self, props: mi.Properties, plugin: str) -> None:
         self._props, self._plugin = props, plugin
 
-    def text(self, name: str, default: str) -> str:
+    def string(self, name: str, default: str) -> str:
         """Return a string."""
         return str(self._typed(name, default, (str,), "text"))
 
     def choice(self, name: str, default: str, *others: str) -> str:
         """Return one of several words."""
-        value, words = self.text(name, default), (default, *others)
+        value, words = self.string(name, default), (default, *others)
         if value not in words:
             self.refuse(name, f"be {' or '.join(map(repr, words))}", value)
         return value
 
-    def truth(self, name: str, default: bool) -> bool:
+    def boolean(self, name: str, default: bool) -> bool:
         """Return a boolean."""
         return bool(self._typed(name, default, (bool,), "true or false"))
 
@@ -52,7 +52,7 @@ class Parameters:
             self.refuse(name, "be > 0", value)
         return value
 
-    def whole(self, name: str, default: int, least: int, most: int) -> int:
+    def integer(self, name: str, default: int, least: int, most: int) -> int:
         """Return an integer from ``least`` to ``most``."""
         value = self._typed(name, default, (int,), f"from {least} to {most}")
         if not least <= value <= most:

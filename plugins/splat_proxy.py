@@ -189,23 +189,23 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
         super().__init__(props)
         given = Parameters(props, "integrator 'splat_proxy'")
         refined: dict[str, Any] = {
-            "response": given.text("response", "perspective"),
-            "kernel": given.text("kernel", "exact"),
+            "response": given.string("response", "perspective"),
+            "kernel": given.string("kernel", "exact"),
             "samples": props.get("samples", 1),
             "lens_rings": props.get("lens_rings", 2),
         }
-        self.quality = replace(resolve_quality(given.text("quality", "balanced")), **refined)
+        self.quality = replace(resolve_quality(given.string("quality", "balanced")), **refined)
         self.shadow = given.choice("shadow", "traced", "none")
         self.occluders = given.choice("occluders", "proxies", "splats")
         self.shadow_error = given.number("shadow_error", 0.03)
         if not 0 <= self.shadow_error < 1:
             given.refuse("shadow_error", "be in [0, 1)", self.shadow_error)
-        self.metered = given.truth("metered", False)
-        self.shadow_samples = given.whole("shadow_samples", 64, 1, 4096)
-        self.bounce, self.highlight = given.truth("bounce", True), given.truth("highlight", True)
-        self.hide_emitters = given.truth("hide_emitters", False)
-        self.mesh_samples = given.whole("mesh_samples", 64, 1, 65536)
-        self.max_depth = given.whole("max_depth", 8, 2, 64)
+        self.metered = given.boolean("metered", False)
+        self.shadow_samples = given.integer("shadow_samples", 64, 1, 4096)
+        self.bounce, self.highlight = given.boolean("bounce", True), given.boolean("highlight", True)
+        self.hide_emitters = given.boolean("hide_emitters", False)
+        self.mesh_samples = given.integer("mesh_samples", 64, 1, 65536)
+        self.max_depth = given.integer("max_depth", 8, 2, 64)
         self.white = given.number("white", 0.0)
         if not 0 <= self.white < np.inf:
             given.refuse("white", "be >= 0", self.white)
@@ -216,7 +216,7 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
         self._contents: _Contents | None = None
         self._uploaded: list[tuple[Any, Cloud]] = []
         self._grid: tuple[Any, RadianceGrid | None] | None = None
-        self._still: tuple[tuple[Any, Quality, list[Any]], StaticTileCache | None] | None = None
+        self._static_tiles: tuple[tuple[Any, Quality, list[Any]], StaticTileCache | None] | None = None
 
     def aov_names(self) -> list[str]:
         """Return the names of the channels after R, G, B and A."""
@@ -278,7 +278,7 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
     ) -> dict[str, Any]:
         """Render the layers through one point of the lens."""
         rays = view.rays()
-        behind, emitters, z_max = self._behind(contents, scene, view, rays)
+        behind, emitters, z_max = self._trace_background(contents, scene, view, rays)
         splat = self._trace_splats(contents, scene, view, z_max)
         hit, static = contents.proxies.nearest(rays)
         proxy_depth = dr.select(hit.distance < dr.inf, hit.distance * view.cosine(rays), 0)
@@ -295,7 +295,7 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
                 shown.cover,
                 dr.select(mesh, behind.depth, splat.depth) if behind else splat.depth,
                 dr.select(mesh, 0, splat.instance),
-                contents.traits.seen(self._by_shape(contents, view, z_max), splat.instance),
+                contents.traits.seen(self._shape_votes(contents, view, z_max), splat.instance),
                 mesh,
             )
             # Visible meshes receive light like static proxies, also where splats touch them.
@@ -349,12 +349,12 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
         if edges is None:
             return {}
         rays = edges.rays()
-        behind, emitters, z_max = self._behind(contents, scene, edges.fine, rays, edges.positions())
+        behind, emitters, z_max = self._trace_background(contents, scene, edges.fine, rays, edges.positions())
         splat = Image.empty(dr.width(rays.d))
         if contents.clouds is not None:
             splat = edges.trace(contents.clouds, contents.placements, self.quality, z_max)
         shown = PrimaryVisibility.of(splat, behind, emitters, z_max, dr.pi / white)
-        pixel = edges.alike(key, shown.key)
+        pixel = edges.nearest_same(key, shown.key)
 
         def near(values: Any) -> Any:
             """Return the values of the nearest pixel with the same key."""
@@ -368,7 +368,7 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
         dr.eval(smooth)
         return smooth
 
-    def _behind(
+    def _trace_background(
         self, contents: _Contents, scene: Any, view: CameraView, rays: Any, at: tuple[Any, Any] | None = None
     ) -> tuple[MeshHits | None, VisibleEmitters | None, Any | None]:
         """Return visible meshes and emitters along rays, and the depths [m] of the nearest of them.
@@ -441,7 +441,7 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
             mi.Color3f(dr.opaque(mi.Float, self.white)) if self.white else reference_irradiance(scene, self.reference)
         )
 
-    def _by_shape(self, contents: _Contents, view: CameraView, z_max: Any | None) -> Any | None:
+    def _shape_votes(self, contents: _Contents, view: CameraView, z_max: Any | None) -> Any | None:
         """Return the shape of an instance that each pixel shows, or None if all its shapes are lit alike.
 
         Shapes are rows of :class:`Traits`.
@@ -455,14 +455,14 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
         if contents.clouds is None:
             return Image.empty(view.width * view.height)
         fine = view.sampled(self.quality.grid)
-        still = self._still_layer(contents, scene, fine, z_max)
-        if still is not None:
+        static_tiles = self._static_tile_cache(contents, scene, fine, z_max)
+        if static_tiles is not None:
             objects = [p for p in contents.placements if p.instance]
             with suppress(CrowdedError):
-                return still.with_objects(contents.clouds, objects, fine, self.quality, z_max)
+                return static_tiles.with_objects(contents.clouds, objects, fine, self.quality, z_max)
         return trace(contents.clouds, contents.placements, fine, self.quality, z_max=z_max)
 
-    def _still_layer(
+    def _static_tile_cache(
         self, contents: _Contents, scene: Any, view: CameraView, z_max: Any | None
     ) -> StaticTileCache | None:
         """Return the static tile cache of a camera, from its second use on."""
@@ -475,12 +475,12 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
         if not self.hide_emitters:
             fixed += [s for s in scene.shapes() if s.is_emitter()]
         seen = view.key, self.quality, fixed
-        if self._still is None or not _same(self._still[0], seen):
-            self._still = seen, None
-        elif self._still[1] is None:
+        if self._static_tiles is None or not _same_key(self._static_tiles[0], seen):
+            self._static_tiles = seen, None
+        elif self._static_tiles[1] is None:
             with suppress(CrowdedError):
-                self._still = seen, StaticTileCache.of(contents.clouds, static, view, self.quality, z_max)
-        return self._still[1]
+                self._static_tiles = seen, StaticTileCache.of(contents.clouds, static, view, self.quality, z_max)
+        return self._static_tiles[1]
 
     def _read(self, scene: Any) -> _Contents:
         """Upload the data of the shapes unless they are those of the last call."""
@@ -542,7 +542,7 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
         return f"SplatProxyIntegrator[quality = {self.quality}, shadow = {self.shadow}]"
 
 
-def _same(a: tuple[Any, Quality, list[Any]], b: tuple[Any, Quality, list[Any]]) -> bool:
+def _same_key(a: tuple[Any, Quality, list[Any]], b: tuple[Any, Quality, list[Any]]) -> bool:
     """Return True if two keys of camera, quality and shapes are the same."""
     return a[:2] == b[:2] and _identical(a[2], b[2])
 

@@ -104,7 +104,7 @@ class SplatsShape(mi.Mesh):
         params.update()
 
         given = Parameters(props, "shape 'splats'")
-        folder, filename, proxy_file = (given.text(name, "") for name in ("asset", "filename", "proxy"))
+        folder, filename, proxy_file = (given.string(name, "") for name in ("asset", "filename", "proxy"))
         units = given.number("units", 0.0)
         if "units" in props and not 0 < units < np.inf:
             raise InputError(f"shape 'splats': 'units' must be finite and > 0 (got {units})")
@@ -127,8 +127,8 @@ class SplatsShape(mi.Mesh):
         self.splats = splats
         self.proxy = proxy
         self.world_from_splats = _matrix(props) @ np.diag([units, units, units, 1.0]) if units else _matrix(props)
-        self.instance = given.whole("instance", 0, 0, 65535)
-        self.dynamic = given.truth("dynamic", self.instance > 0)
+        self.instance = given.integer("instance", 0, 0, 65535)
+        self.dynamic = given.boolean("dynamic", self.instance > 0)
         light = asset.capture_light if asset else "uniform" if self.instance else "scene"
         self.capture_light = given.choice("capture_light", light, "uniform" if light == "scene" else "scene")
         self.roughness = given.number("roughness", float(asset.roughness) if asset else 0.4)
@@ -142,8 +142,8 @@ class SplatsShape(mi.Mesh):
 
     def _read_appearance(self, given: Parameters) -> SplatAppearance | None:
         """Read the appearance; return None if the scene sets neither colours nor wear."""
-        text, wear = given.text("colours", ""), given.number("wear", 0.0)
-        seed = given.whole("wear_seed", 0, 0, 2**23 - 1)
+        text, wear = given.string("colours", ""), given.number("wear", 0.0)
+        seed = given.integer("wear_seed", 0, 0, 2**23 - 1)
         if not 0 <= wear <= 1:
             given.refuse("wear", "be in [0, 1]", wear)
         if not (text or wear):

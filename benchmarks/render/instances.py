@@ -73,7 +73,7 @@ def print_costs(name: str, integrator: Any, scene: Any, camera: ms.Camera, repea
     from mitsplat.renderer.splatting import march
     from mitsplat.renderer.splatting.tiles import bin_gaussians
 
-    contents, view, settle = integrator._read(scene), view_of(make_sensor(camera)), march.settle_instances
+    contents, view, settle = integrator._read(scene), view_of(make_sensor(camera)), march.resolve_instances
     unsure: list[float] = []
 
     def count(instance: Any, doubt: Any, *rest: Any) -> Any:
@@ -87,12 +87,12 @@ def print_costs(name: str, integrator: Any, scene: Any, camera: ms.Camera, repea
         times: dict[str, list[float]] = {case: [] for case in cases}
         for _ in range(repeats + 1):
             for case, (own, second) in cases.items():
-                march.settle_instances = second
+                march.resolve_instances = second
                 start = time.process_time()
                 dr.eval(march.march(own, view, quality))
                 dr.sync_thread()
                 times[case].append(time.process_time() - start)
-        march.settle_instances = settle
+        march.resolve_instances = settle
         least = {case: min(seconds[1:]) for case, seconds in times.items()}
         share = unsure[-1] if unsure else 0.0
         told = ", ".join(f"{case} {least[case] / least['one']:.2f}" for case in ("first walk", "all"))

@@ -189,7 +189,7 @@ def render_splats(splats: Splats, camera: Camera, *, quality: str | Quality = "b
         InputError: If there is no such preset.
     """
     ensure_variant()
-    integrator, scene = _alone(splats, str(mi.variant()))
+    integrator, scene = _single_shape_scene(splats, str(mi.variant()))
     integrator.quality = resolve_quality(quality)
     layers = render_layers(integrator, scene, camera)
     dr.sync_thread()
@@ -197,7 +197,7 @@ def render_splats(splats: Splats, camera: Camera, *, quality: str | Quality = "b
 
 
 @lru_cache(maxsize=2)
-def _alone(splats: Splats, variant: str) -> tuple[Any, Any]:
+def _single_shape_scene(splats: Splats, variant: str) -> tuple[Any, Any]:
     """Return cached integrator and scene of splats, so that the next view of them needs no upload."""
     scene = mi.load_dict({"type": "scene", "splats": make_splats_shape(splats, instance=1)})
     return make_integrator(shadow="none"), scene

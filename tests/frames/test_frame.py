@@ -263,10 +263,10 @@ def test_a_camera_that_stands_still_sees_the_same_bytes(quality: str, samples: A
         got, fresh = layers(still, number), layers(make_integrator(quality=chosen, shadow="none"), number)
         for field in fields(got):
             assert np.array_equal(getattr(got, field.name), getattr(fresh, field.name)), (number, field.name)
-    assert still._still is not None and still._still[1] is not None
+    assert still._static_tiles is not None and still._static_tiles[1] is not None
     elsewhere = replace(camera, cx=camera.cx + 1)
     render_layers(still, scene(0), elsewhere)
-    assert still._still[1] is None
+    assert still._static_tiles[1] is None
 
 
 def test_a_camera_that_stands_still_before_surroundings_without_splats() -> None:
@@ -289,7 +289,7 @@ def test_a_camera_that_stands_still_before_an_object_without_splats() -> None:
     camera = Camera.look_at((0, 0, -2), (0, 0, 0), up=(0, -1, 0), width=32, height=24, fov_x=40)
     scene, still = mi.load_dict({"type": "scene", "around": around, "bare": bare}), make_integrator(shadow="none")
     pictures = [render_layers(still, scene, camera).rgb.tobytes() for _ in range(3)]
-    assert still._still is not None and still._still[1] is not None
+    assert still._static_tiles is not None and still._static_tiles[1] is not None
     assert set(pictures) == {render_layers(make_integrator(shadow="none"), scene, camera).rgb.tobytes()}
 
 

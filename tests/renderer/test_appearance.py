@@ -58,7 +58,7 @@ def twin(encoded: np.ndarray, points: np.ndarray, matrix: np.ndarray, wear: floa
 
 def test_colours_and_dirt_are_those_of_the_slow_twin() -> None:
     ensure_variant()
-    from mitsplat.renderer.splatting.splat_appearance import SplatAppearance, changed
+    from mitsplat.renderer.splatting.splat_appearance import SplatAppearance, apply_appearance
 
     rng = np.random.default_rng(1)
     encoded, points = rng.uniform(0, 1.2, (300, 3)), rng.uniform(-0.05, 0.05, (300, 3))
@@ -70,27 +70,27 @@ def test_colours_and_dirt_are_those_of_the_slow_twin() -> None:
     ):
         row = [mi.Float(v) for v in SplatAppearance(tuple(matrix.ravel()), wear, seed, size).row]
         point = mi.Vector3f(*points.T.astype(np.float32))
-        seen = changed([mi.Float(c.astype(np.float32)) for c in encoded.T], row, point)
+        seen = apply_appearance([mi.Float(c.astype(np.float32)) for c in encoded.T], row, point)
         expected = twin(encoded, points, matrix, wear, seed, size)
         np.testing.assert_allclose(np.stack(seen, axis=1), expected, atol=2e-4)
         if wear == 1:
             dirty = (expected < twin(encoded, points, matrix, 0, seed, size) - 1e-3).all(axis=1).mean()
             assert 0.3 < dirty < 0.9  # patches, neither everywhere nor nowhere
     colours = [mi.Float(c.astype(np.float32)) for c in encoded.T]
-    same = changed(colours, [mi.Float(0)] * 13, mi.Vector3f(*points.T.astype(np.float32)))
+    same = apply_appearance(colours, [mi.Float(0)] * 13, mi.Vector3f(*points.T.astype(np.float32)))
     assert all((np.array(a) == np.array(b)).all() for a, b in zip(same, colours, strict=True))
 
 
 def test_dirt_lies_in_patches_of_the_object_s_size_and_elsewhere_for_another_seed() -> None:
     ensure_variant()
-    from mitsplat.renderer.splatting.splat_appearance import dirt
+    from mitsplat.renderer.splatting.splat_appearance import dirt_thickness
 
     rng = np.random.default_rng(2)
     points = rng.uniform(-50, 50, (20000, 3))
 
     def at(offset: float, seed: int = 5) -> np.ndarray:
         moved = points + offset * np.array([0.6, 0.8, 0])
-        return np.array(dirt(mi.Vector3f(*moved.T.astype(np.float32)), mi.UInt32(seed)))
+        return np.array(dirt_thickness(mi.Vector3f(*moved.T.astype(np.float32)), mi.UInt32(seed)))
 
     here = at(0)
     assert 0.2 < here.mean() < 0.45 and here.min() == 0 and here.max() == 1

@@ -103,7 +103,7 @@ def test_a_pixel_is_looked_at_again_where_one_around_it_shows_something_else() -
     edges = Edges.find(mi.UInt32(keys.ravel()), view)
     assert edges is not None
     blocks = np.unique(rows // BLOCK_HEIGHT * edges.fine.tiles_x + columns // BLOCK_WIDTH)
-    assert np.array_equal(np.array(edges.chosen.number), blocks)
+    assert np.array_equal(np.array(edges.subset.number), blocks)
 
 
 def test_chosen_tiles_are_counted_as_by_hand() -> None:
@@ -194,11 +194,11 @@ def test_what_is_too_crowded_is_looked_at_in_parts(monkeypatch: pytest.MonkeyPat
     whole = layers_of(scene, CAMERA, FINE)
     bins, sizes = edges.bin_gaussians, []
 
-    def crowded(*given: Any, chosen: Any) -> Any:
-        if chosen.count > 20:
+    def crowded(*given: Any, subset: Any) -> Any:
+        if subset.count > 20:
             raise pairs.CrowdedError
-        sizes.append(chosen.count)
-        return bins(*given, chosen=chosen)
+        sizes.append(subset.count)
+        return bins(*given, subset=subset)
 
     monkeypatch.setattr(edges, "bin_gaussians", crowded)
     parts = layers_of(scene, CAMERA, FINE)

@@ -143,8 +143,8 @@ def test_ids_on_a_device_that_is_not_waited_for(monkeypatch: pytest.MonkeyPatch)
     from mitsplat.renderer.splatting import march
 
     looked = []
-    settle = march.settle_instances
-    monkeypatch.setattr(march, "settle_instances", lambda *args: looked.append(0) or settle(*args))
+    settle = march.resolve_instances
+    monkeypatch.setattr(march, "resolve_instances", lambda *args: looked.append(0) or settle(*args))
     alone, crowd = porous(2, 3), porous(5, 3)
     expected = [shown(*splats, EXACT) for splats in (alone, crowd)]
     assert len(looked) == 1

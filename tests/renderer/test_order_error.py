@@ -56,8 +56,8 @@ def test_a_smaller_tolerance_walks_more_tiles_again(monkeypatch: pytest.MonkeyPa
     from mitsplat.renderer.splatting import march
 
     again: list[int] = []
-    sort = march.in_ray_order
-    monkeypatch.setattr(march, "in_ray_order", lambda lists, chosen, view: noted(sort(lists, chosen, view)))
+    sort = march.sort_by_ray
+    monkeypatch.setattr(march, "sort_by_ray", lambda lists, chosen, view: noted(sort(lists, chosen, view)))
 
     def noted(lists: Any) -> Any:
         again.append(dr.width(lists.tiles))
@@ -140,7 +140,7 @@ def test_tiles_leave_no_seams(monkeypatch: pytest.MonkeyPatch, samples: int) -> 
     """A picture of one colour keeps it, and a ramp has no steps, where tiles of all three orders lie side by side."""
     from mitsplat.renderer.splatting import march
 
-    judged = march._too_wrong
+    judged = march._exceeds_tolerance
 
     def judged_or_some(errors: list[Any], inside: list[Any], tolerance: Any) -> Any:
         """Also the black squares of a chequerboard of 12 x 18 tiles, and of those every other one a second time."""
@@ -149,7 +149,7 @@ def test_tiles_leave_no_seams(monkeypatch: pytest.MonkeyPatch, samples: int) -> 
         return judged(errors, inside, tolerance) | (square % 2 == 0)
 
     monkeypatch.setattr(march, "rows_together", lambda order: 4 if order == "tile" else 1)  # also on a GPU
-    monkeypatch.setattr(march, "_too_wrong", judged_or_some)
+    monkeypatch.setattr(march, "_exceeds_tolerance", judged_or_some)
     quality = Quality(tolerance=1e-3, alpha_min=1e-4, transmittance_min=1e-5, samples=samples)
     even = render_splats(sheets(lambda x: np.full_like(x, 0.7)), WIDE, quality=quality)
     assert np.ptp(even.rgb / even.alpha[..., None]) < 1e-5
@@ -179,10 +179,10 @@ def test_late_by_one_place_is_amended_exactly() -> None:
     from mitsplat.renderer.splatting.march import BLUE, RED, _blend, _fresh
 
     met = [((0.9, 0.2, 0.1), 0.6, 2.0), ((0.3, 0.6, 0.4), 0.5, 1.0), ((0.1, 0.8, 0.5), 0.7, 3.0)]
-    pixel = _fresh(False, "amended")
+    pixel = _fresh(False, "corrected")
     for colour, opacity, z in met:
         record = {6: colour[0], 7: colour[1], 8: colour[2]}
-        pixel = _blend(pixel, mi.Float(opacity), record, mi.Float(z), False, "amended")
+        pixel = _blend(pixel, mi.Float(opacity), record, mi.Float(z), False, "corrected")
     expected, transmittance = np.zeros(3), 1.0
     for colour, opacity, _ in sorted(met, key=lambda peak: peak[2]):
         expected += transmittance * opacity * np.array(colour)

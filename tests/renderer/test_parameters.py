@@ -22,7 +22,7 @@ def given(**values: Any) -> Parameters:
 
 def test_what_is_absent_is_the_default() -> None:
     none = given()
-    assert (none.text("a", "b"), none.truth("a", True), none.number("a", 2), none.whole("a", 3, 0, 9)) == (
+    assert (none.string("a", "b"), none.boolean("a", True), none.number("a", 2), none.integer("a", 3, 0, 9)) == (
         "b",
         True,
         2.0,
@@ -35,7 +35,7 @@ def test_what_is_absent_is_the_default() -> None:
 
 def test_what_is_given_is_taken() -> None:
     some = given(text="b", truth=False, whole=3, number=0.5)
-    assert (some.text("text", ""), some.truth("truth", True), some.whole("whole", 0, 0, 3)) == ("b", False, 3)
+    assert (some.string("text", ""), some.boolean("truth", True), some.integer("whole", 0, 0, 3)) == ("b", False, 3)
     assert (some.number("number", 1), some.number("whole", 1), some.choice("text", "a", "b")) == (0.5, 3.0, "b")
 
 
@@ -46,10 +46,10 @@ def test_what_is_given_is_taken() -> None:
         (True, "number", (0.0,), "'x' must be a number (got True)"),
         (0, "positive", (1.0,), "'x' must be > 0 (got 0.0)"),
         (float("nan"), "positive", (1.0,), "'x' must be > 0 (got nan)"),
-        (1.0, "whole", (0, 0, 9), "'x' must be from 0 to 9 (got 1.0)"),
-        (10, "whole", (0, 0, 9), "'x' must be from 0 to 9 (got 10)"),
-        (1, "truth", (True,), "'x' must be true or false (got 1)"),
-        (1, "text", ("",), "'x' must be text (got 1)"),
+        (1.0, "integer", (0, 0, 9), "'x' must be from 0 to 9 (got 1.0)"),
+        (10, "integer", (0, 0, 9), "'x' must be from 0 to 9 (got 10)"),
+        (1, "boolean", (True,), "'x' must be true or false (got 1)"),
+        (1, "string", ("",), "'x' must be text (got 1)"),
         ("c", "choice", ("a", "b"), "'x' must be 'a' or 'b' (got 'c')"),
     ],
 )

@@ -25,7 +25,7 @@ from mitsplat.renderer.splatting.gaussian import RECORD, SCALE_RATIO_MIN, Cloud
 from mitsplat.renderer.splatting.march import march
 from mitsplat.renderer.splatting.projection import CloudSet, Placement, Projector, placement_table
 from mitsplat.renderer.splatting.tiles import TileLists, bin_gaussians, bin_records
-from mitsplat.renderer.splatting.walk import Lanes, largest
+from mitsplat.renderer.splatting.walk import Lanes, max_of
 from mitsplat.runtime.recorded_kernels import Table, recorded
 
 LN_2 = 0.6931471805599453
@@ -49,19 +49,19 @@ def render_differentiable(cloud: Cloud, view: CameraView, quality: Quality) -> t
         ValueError: If the quality has a finite tolerance, several samples or a kernel that limits opacity.
     """
     _check(view, quality)
-    lists = bin_gaussians(_only(cloud), [_PLACE], view, quality, at_camera=False, for_gradients=True)
+    lists = bin_gaussians(_cloud_set(cloud), [_PLACEMENT], view, quality, at_camera=False, for_gradients=True)
     # The lambda hides the other arguments from Dr.Jit, which would traverse dataclasses for differentiation.
     *rgb, alpha = dr.custom(_March, lists.records, lambda: (lists, view, quality))
     return rgb, alpha
 
 
-def _tinted(records: Any) -> Any:
+def _with_depth_as_red(records: Any) -> Any:
     """Return view records with the depth of the centre as red."""
     row = dr.arange(mi.UInt32, dr.width(records) // RECORD) * RECORD
-    tinted = dr.copy(records)
+    with_depth = dr.copy(records)
     depth = dr.gather(mi.Float, records, row + _DEPTH, mode=dr.ReduceMode.NoConflicts)
-    dr.scatter(tinted, depth, row + _RED)
-    return tinted
+    dr.scatter(with_depth, depth, row + _RED)
+    return with_depth
 
 
 _RED, _DEPTH = 6, 9
@@ -79,11 +79,11 @@ def _check(view: CameraView, quality: Quality) -> None:
         raise ValueError(f"gradients need a kernel that does not limit opacity (got {quality.kernel!r})")
 
 
-def _only(cloud: Cloud) -> CloudSet:
+def _cloud_set(cloud: Cloud) -> CloudSet:
     return CloudSet((cloud.count,), (0,), cloud.geometry, cloud.scales, cloud.sh, cloud.sh_count, cloud.sh_stride)
 
 
-_PLACE = Placement(0, np.eye(4), 1)
+_PLACEMENT = Placement(0, np.eye(4), 1)
 
 
 class Eye:
@@ -96,7 +96,7 @@ class Eye:
 
     def __init__(self, view: CameraView) -> None:
         nothing = CloudSet((1,), (0,), None, None, None, 0, 0)
-        table, _, _ = placement_table(nothing, [_PLACE], view)
+        table, _, _ = placement_table(nothing, [_PLACEMENT], view)
         self.view, self.numbers = view, view.numbers | {"table": table}
 
 
@@ -112,9 +112,9 @@ def project_cloud(
         quality: Cut-offs and SH degree.
     """
     projector = Projector(
-        _only(cloud), numbers["table"], CameraView.of_numbers(kind, numbers), quality, at_camera=False
+        _cloud_set(cloud), numbers["table"], CameraView.of_numbers(kind, numbers), quality, at_camera=False
     )
-    return projector.every_record(dr.zeros(mi.UInt32, cloud.count), dr.arange(mi.UInt32, cloud.count))[:4]
+    return projector.all_records(dr.zeros(mi.UInt32, cloud.count), dr.arange(mi.UInt32, cloud.count))[:4]
 
 
 def gather_gradients(
@@ -134,15 +134,15 @@ def gather_gradients(
     packed = cloud.geometry, cloud.scales, cloud.sh
     leaves = [mi.Float(dr.detach(values)) for values in packed]
     dr.enable_grad(leaves)
-    apart = replace(cloud, geometry=leaves[0], scales=leaves[1], sh=leaves[2])
-    records, _, _, visible = project_cloud(apart, kind, numbers, quality)
-    _send_back(records, found)
+    leaf_cloud = replace(cloud, geometry=leaves[0], scales=leaves[1], sh=leaves[2])
+    records, _, _, visible = project_cloud(leaf_cloud, kind, numbers, quality)
+    _propagate(records, found)
     for values, leaf, width in zip(packed, leaves, (8, 4, cloud.sh_stride), strict=True):
         own = dr.gather(mi.Bool, visible, dr.arange(mi.UInt32, width * cloud.count) // width)
-        _send_back(values, dr.select(own, dr.grad(leaf), 0))
+        _propagate(values, dr.select(own, dr.grad(leaf), 0))
 
 
-def _send_back(values: Any, gradient: Any) -> None:
+def _propagate(values: Any, gradient: Any) -> None:
     """Propagate a gradient to all inputs of ``values``."""
     dr.set_grad(values, gradient)
     dr.enqueue(dr.ADMode.Backward, values)
@@ -174,11 +174,11 @@ class RenderOp:
         if not 0 < lists.pairs <= PAIRS_AT_ONCE:
             return march_backward(lists, view, self._quality, seen, gradient, self._slopes)
         tiles = Table(lists.entries), Table(lists.slots), lists.first, lists.records, lists.start, lists.stop
-        room = _room(lists.pairs)
-        return _way_back(view.kind, view.numbers, self._quality, room, *tiles, seen, gradient, self._slopes)
+        max_pairs = _rounded_up(lists.pairs)
+        return _image_gradient(view.kind, view.numbers, self._quality, max_pairs, *tiles, seen, gradient, self._slopes)
 
 
-def _room(pairs: int) -> int:
+def _rounded_up(pairs: int) -> int:
     """Round a number of pairs up by at most a quarter, so that many views share it."""
     step = max(1024, 1 << max(0, pairs.bit_length() - 3))
     return -(-pairs // step) * step
@@ -198,11 +198,11 @@ def _image(
 
 
 @recorded
-def _way_back(
+def _image_gradient(
     kind: tuple[Any, ...],
     numbers: dict[str, Any],
     quality: Quality,
-    room: int,
+    max_pairs: int,
     entries: Any,
     slots: Any,
     first: Any,
@@ -213,16 +213,16 @@ def _way_back(
     gradient: list[Any],
     slopes: Any,
 ) -> Any:
-    """Return the gradient of the view records from those of colours and alpha, for at most ``room`` pairs."""
+    """Return the gradient of the view records from those of colours and alpha, for at most ``max_pairs`` pairs."""
     view = CameraView.of_numbers(kind, numbers)
-    lists = _bare_lists(entries, slots, first, records, start, stop, room)
+    lists = _bare_lists(entries, slots, first, records, start, stop, max_pairs)
     return _gradient(lists, view, quality, seen, gradient, slopes or Lanes(lists, view).centre_slopes())
 
 
 def _bare_lists(entries: Any, slots: Any, first: Any, records: Any, start: Any, stop: Any, pairs: int) -> TileLists:
     """Return tile lists of one instance for the order per tile."""
     visible = dr.width(records) // RECORD
-    return TileLists(records, None, entries, slots, first, None, start, stop, visible, pairs, _PLACE.instance, None)
+    return TileLists(records, None, entries, slots, first, None, start, stop, visible, pairs, _PLACEMENT.instance, None)
 
 
 class DepthRendering(RenderOp):
@@ -230,17 +230,17 @@ class DepthRendering(RenderOp):
 
     def __init__(self, lists: TileLists, view: CameraView, quality: Quality) -> None:
         super().__init__(lists, view, quality)
-        self._depths = RenderOp(replace(lists, records=_tinted(lists.records)), view, quality)
+        self._depths = RenderOp(replace(lists, records=_with_depth_as_red(lists.records)), view, quality)
         self.moment = self._depths.rgb[0]
 
     def gradient_of_moment(self, moment: Any) -> Any:
         """Return the gradient of the records from an evaluated gradient of the moment."""
         nothing = dr.zeros(mi.Float, dr.width(moment))
-        tinted = self._depths.gradient([moment, nothing, nothing], nothing)
-        entry = dr.arange(mi.UInt32, dr.width(tinted))
+        with_depth = self._depths.gradient([moment, nothing, nothing], nothing)
+        entry = dr.arange(mi.UInt32, dr.width(with_depth))
         place = entry % RECORD
-        red = dr.gather(mi.Float, tinted, entry - (_DEPTH - _RED), place == _DEPTH)
-        return dr.select(place == _DEPTH, red, dr.select(place == _RED, 0, tinted))
+        red = dr.gather(mi.Float, with_depth, entry - (_DEPTH - _RED), place == _DEPTH)
+        return dr.select(place == _DEPTH, red, dr.select(place == _RED, 0, with_depth))
 
 
 def render_records(
@@ -253,7 +253,7 @@ def render_records(
         CrowdedError: If there are too many pairs of a Gaussian and a tile.
     """
     _check(view, quality)
-    lists = bin_records(records, None, least, box, view, quality, _PLACE.instance, for_gradients=True)
+    lists = bin_records(records, None, least, box, view, quality, _PLACEMENT.instance, for_gradients=True)
     return (DepthRendering if depth else RenderOp)(lists, view, quality)
 
 
@@ -426,7 +426,7 @@ def _gradient(
         return i + 1, new_light, new_rest
 
     def alive(i: Any, light: list[Any], rest: list[Any]) -> Any:
-        return (i < lanes.stop) & (largest(light) > end)
+        return (i < lanes.stop) & (max_of(light) > end)
 
     state = lanes.start, [mi.Float(1) for _ in us], behind
     dr.while_loop(state, alive, body, label="march backward")
@@ -443,20 +443,20 @@ def _sum_shares(shares: Any, lists: TileLists) -> Any:
     record = dr.arange(mi.UInt32, lists.visible)
     first = dr.gather(mi.UInt32, lists.first, record)
     pairs = dr.gather(mi.UInt32, lists.first, record + 1) - first
-    runs = dr.maximum((pairs + (_RUN - 1)) // _RUN, 1)
+    runs = dr.maximum((pairs + (_TILES_PER_LANE - 1)) // _TILES_PER_LANE, 1)
     begin = dr.prefix_sum(runs)
-    lanes = lists.visible + lists.pairs // _RUN  # upper bound of the number of runs; spare lanes add nothing
+    lanes = lists.visible + lists.pairs // _TILES_PER_LANE  # upper bound of the number of runs; spare lanes add nothing
     marks = dr.zeros(mi.UInt32, lanes)
     dr.scatter(marks, mi.UInt32(1), begin, begin > 0)
     owner = dr.cumsum(marks)
     run = dr.arange(mi.UInt32, lanes) - dr.gather(mi.UInt32, begin, owner)
-    start = dr.gather(mi.UInt32, first, owner) + run * _RUN
-    stop = dr.minimum(start + _RUN, dr.gather(mi.UInt32, lists.first, owner + 1))
+    start = dr.gather(mi.UInt32, first, owner) + run * _TILES_PER_LANE
+    stop = dr.minimum(start + _TILES_PER_LANE, dr.gather(mi.UInt32, lists.first, owner + 1))
     partial = _sum_rows(shares, start * TILE_WIDTH, stop * TILE_WIDTH)
     return _sum_rows(partial, begin, begin + runs)
 
 
-_RUN = 32
+_TILES_PER_LANE = 32
 """Number of tiles whose gradients one lane adds."""
 
 

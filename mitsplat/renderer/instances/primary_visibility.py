@@ -23,12 +23,12 @@ class PrimaryVisibility:
     Attributes:
         colour: Linear captured colour, multiplied by ``cover`` (Color3f).
         alpha: Total opacity.
-        veil: Opacity of the splats.
+        splat_alpha: Opacity of the splats.
         cover: Opacity of the surfaces that light is traced at: splats and purely diffuse meshes.
         solid: True if a mesh is behind the splats.
-        plain: True if that mesh is purely diffuse.
+        diffuse: True if that mesh is purely diffuse.
         front: True if the pixel shows a mesh or an emitter instead of splats.
-        glow: Radiance of emitters behind (Color3f), in the picture's scale.
+        emission: Radiance of emitters behind (Color3f), in the picture's scale.
         key: Equal for rays that show the same instance or the same mesh.
     """
 

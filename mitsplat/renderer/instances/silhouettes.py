@@ -29,7 +29,7 @@ from mitsplat.renderer.splatting.pairs import CrowdedError
 from mitsplat.renderer.splatting.projection import CloudSet, Placement
 from mitsplat.renderer.splatting.tile_depths import DEPTH_BITS
 from mitsplat.renderer.splatting.tiles import TileLists, bin_gaussians
-from mitsplat.renderer.splatting.walk import exp2, faintest, largest, respond_along
+from mitsplat.renderer.splatting.walk import exp2, max_of, min_log_opacity, respond_along
 
 MARGINS = (1.0, 0.5, 0.25, 0.125, 0.0)
 """Candidate margins of the canvas around the image, in image sizes. BOP uses one image on each side. Where lens
@@ -203,7 +203,7 @@ def _covered(lists: TileLists, view: CameraView, quality: Quality, runs: _Runs) 
     slopes = [view.slopes(x + centre, y + k + centre) for k in range(TILE_HEIGHT)]
     us, vs = [u for u, _ in slopes], [v for _, v in slopes]
     start, stop = dr.gather(mi.UInt32, runs.start, run), dr.gather(mi.UInt32, runs.stop, run)
-    cut, near, shared_column = faintest(quality), view.near_plane, not view.distortion
+    cut, near, shared_column = min_log_opacity(quality), view.near_plane, not view.distortion
 
     def body(i: Any, through: list[Any]) -> tuple[Any, list[Any]]:
         record = dr.gather(
@@ -216,7 +216,7 @@ def _covered(lists: TileLists, view: CameraView, quality: Quality, runs: _Runs) 
         ]
 
     def undecided(i: Any, through: list[Any]) -> Any:
-        return (i < stop) & (largest(through) >= 0.5)
+        return (i < stop) & (max_of(through) >= 0.5)
 
     ones = [mi.Float(1.0) for _ in range(TILE_HEIGHT)]
     _, through = dr.while_loop((mi.UInt32(start), ones), undecided, body, label="silhouettes")
@@ -232,13 +232,13 @@ def _assemble(
 ) -> dict[int, Silhouette]:
     """Assemble the masks of instances from those of their tiles."""
     columns = bits.astype(np.uint8).reshape(len(tile), TILE_WIDTH)
-    chosen = np.flatnonzero(columns.any(axis=1))
-    chosen = chosen[np.argsort(slot[chosen], kind="stable")]
-    tile, columns = tile[chosen], columns[chosen]
+    filled = np.flatnonzero(columns.any(axis=1))
+    filled = filled[np.argsort(slot[filled], kind="stable")]
+    tile, columns = tile[filled], columns[filled]
     blocks = _ROWS_OF_COLUMN[columns].swapaxes(1, 2)  # pair, row, column
     rows, cols = tile // canvas.tiles_x, tile % canvas.tiles_x
     found = {}
-    ends = np.searchsorted(slot[chosen], np.arange(len(ids) + 1))
+    ends = np.searchsorted(slot[filled], np.arange(len(ids) + 1))
     for instance, start, stop in zip(ids.tolist(), ends[:-1], ends[1:], strict=True):
         if start == stop:
             continue

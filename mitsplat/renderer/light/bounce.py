@@ -142,7 +142,7 @@ class Reflectors:
     def _colour(self, ray: Any, key: Any, light: Any) -> Any:
         """Return the colour (Color3f) at the hits of rays.
 
-        Each scene is traced by a kernel of its own, see ``Proxies.apart``.
+        Each scene is traced by a kernel of its own, see ``Proxies.separate_kernels``.
         """
         static, dynamic = self.proxies.static, self.proxies.dynamic
         colour = mi.Color3f(dr.zeros(mi.Float, dr.width(key)))

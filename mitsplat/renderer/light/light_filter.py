@@ -52,7 +52,7 @@ class Estimate:
 
     Attributes:
         lit, base: Arriving light and reference light (Color3f).
-        shine, glare: Arriving and unoccluded light that is mirrored towards the camera, summed over channels.
+        specular_lit, specular_base: Arriving and unoccluded light mirrored to the camera, summed over channels.
         squares: Sum of the squares of the terms of ``base``.
         rays: Number of rays.
     """
@@ -157,7 +157,7 @@ class LightFilter:
     def smooth(self, estimate: Estimate, extra: tuple[Any, Any] | None = None) -> tuple[Any, Any, Any, Any, Any]:
         """Average the first four sums of the estimate, per ray, over neighbours of the pixels of ``index``.
 
-        ``beside`` is additional light (Color3f) and the flag (Float) where it is known (1, otherwise 0). Its average is
+        ``extra`` is additional light (Color3f) and the flag (Float) where it is known (1, otherwise 0). Its average is
         0 where no neighbour knows it.
         """
         weight = dr.rcp(dr.maximum(estimate.rays, 1))

@@ -51,10 +51,10 @@ class ShadowTiles:
     """Light loss in tiles of BLOCK x BLOCK pixels, from one ray per pixel.
 
     Attributes:
-        taken: Share of light (Color3f) that dynamic objects occlude in each tile, row by row.
+        occluded: Share of light (Color3f) that dynamic objects occlude in each tile, row by row.
         known: True if light arrives in the tile without dynamic objects.
-        around: Mean occluded share in a tile and its neighbours.
-        uneven: True if the occluded rays are concentrated in one of these tiles.
+        mean_occluded: Mean occluded share in a tile and its neighbours.
+        concentrated: True if the occluded rays are concentrated in one of these tiles.
         view: Camera.
     """
 

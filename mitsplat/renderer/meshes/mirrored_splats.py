@@ -18,7 +18,7 @@ from mitsplat.renderer.occluders.splat_occlusion import SETS, Caster, Solids
 from mitsplat.renderer.rays.device_arrays import wrapped
 from mitsplat.renderer.splatting.gaussian import evaluate_sh, rotation_axes
 from mitsplat.renderer.splatting.projection import CloudSet, Placement
-from mitsplat.renderer.splatting.splat_appearance import ROW, changed, rows_of
+from mitsplat.renderer.splatting.splat_appearance import ROW, appearance_rows, apply_appearance
 
 MOST_SOLIDS = 1_000_000
 """Approximate limit of the solids in all sets. Larger scenes have fewer sets, but at least two."""
@@ -88,7 +88,7 @@ class SplatMirror:
         appearances = None
         if any(p.appearance is not None for p in placements):
             appearances = wrapped(
-                mi.Float, np.pad(rows_of([p.appearance for p in placements]), ((0, 0), (0, _ROW - ROW)))
+                mi.Float, np.pad(appearance_rows([p.appearance for p in placements]), ((0, 0), (0, _ROW - ROW)))
             )
         return cls(solids, clouds, wrapped(mi.UInt32, owners), wrapped(mi.Float, rows), appearances)
 
@@ -108,7 +108,7 @@ class SplatMirror:
         if self.appearances is not None:
             looks = dr.gather(mi.ArrayXf, self.appearances, owner.x, found, shape=(_ROW, dr.width(owner)))
             centre = mi.Vector3f(*[geometry[i] for i in range(3)])
-            colour = changed(colour, [looks[i] for i in range(ROW)], centre)
+            colour = apply_appearance(colour, [looks[i] for i in range(ROW)], centre)
         sigma = dr.gather(mi.Vector4f, self.clouds.scales, owner.y, found)
         axes = rotation_axes([geometry[4 + i] for i in range(4)])
         thin_x, thin_y = (sigma.x < sigma.y) & (sigma.x < sigma.z), sigma.y < sigma.z

@@ -74,7 +74,7 @@ class MeshHits:
         depth: Depth along z [m], infinite for a miss.
         reflectance: Diffuse albedo (Color3f) of purely diffuse meshes.
         valid: True for a hit.
-        plain: True if the mesh is purely diffuse.
+        diffuse: True if the mesh is purely diffuse.
         normal, face: Unit normals of the surface and of its triangle, towards the camera.
         hit: Mitsuba's intersection.
     """
@@ -105,8 +105,8 @@ class VisibleMeshes:
 
     Attributes:
         scene: Mitsuba scene of these meshes only.
-        plain: True if a shape is purely diffuse, by shape number; None if all shapes are.
-        patterned: True if the reflectance of any mesh varies over its surface.
+        diffuse: True if a shape is purely diffuse, by shape number; None if all shapes are.
+        textured: True if the reflectance of any mesh varies over its surface.
     """
 
     scene: Any

@@ -78,9 +78,9 @@ class Proxies:
 
     Attributes:
         static, dynamic: These scenes, for hits.
-        casting: Scenes that cast the shadows of dynamic objects: none, one or two.
+        shadow_casters: Scenes that cast the shadows of dynamic objects: none, one or two.
         shows_meshes: True if the dynamic proxies include visible meshes.
-        apart: True if a kernel may trace only one scene, as on CUDA, where Dr.Jit drops all scenes but the first.
+        separate_kernels: True if a kernel may trace only one scene. On CUDA, Dr.Jit drops all but the first.
     """
 
     def __init__(

@@ -163,7 +163,7 @@ class SplatOccluders:
 
     Attributes:
         solids: Stochastic solids that rays hit.
-        spared: Distance from the ray origin within which splats do not occlude [m], by instance.
+        skip_distance: Distance from the ray origin within which splats do not occlude [m], by instance.
     """
 
     solids: Solids

@@ -22,7 +22,7 @@ import numpy as np
 
 from mitsplat.quality import Quality
 from mitsplat.renderer.rays.camera_rays import TILE_HEIGHT, TILE_PIXELS, TILE_WIDTH, CameraView
-from mitsplat.renderer.splatting.march import Image, march_apart
+from mitsplat.renderer.splatting.march import Image, march_tiles
 from mitsplat.renderer.splatting.pairs import CrowdedError
 from mitsplat.renderer.splatting.projection import CloudSet, Placement
 from mitsplat.renderer.splatting.tile_subset import TileSubset
@@ -39,17 +39,17 @@ BLOCK_WIDTH, BLOCK_HEIGHT = TILE_WIDTH // ZOOM, TILE_HEIGHT // ZOOM
 class Edges:
     """Blocks of a view's pixels that contain a border, and the finer view of them.
 
-    Rays of the finer view are numbered tile after tile of ``chosen``, and row by row in each tile.
+    Rays of the finer view are numbered tile after tile of ``subset``, and row by row in each tile.
 
     Attributes:
         view: View of the picture.
         fine: Finer view.
-        chosen: Tiles of the finer view that contain borders.
+        subset: Tiles of the finer view that contain borders.
     """
 
     view: CameraView
     fine: CameraView
-    chosen: TileSubset
+    subset: TileSubset
 
     @classmethod
     def find(cls, key: Any, view: CameraView) -> Edges | None:
@@ -65,8 +65,8 @@ class Edges:
         for dx, dy in np.ndindex(BLOCK_WIDTH + 2, BLOCK_HEIGHT + 2):
             differs |= dr.gather(mi.UInt32, key, _pixel(x + (dx - 1), y + (dy - 1), view)) != own
         dr.eval(differs)
-        chosen = TileSubset.of(differs, fine)
-        return cls(view, fine, chosen) if chosen.count else None
+        subset = TileSubset.of(differs, fine)
+        return cls(view, fine, subset) if subset.count else None
 
     def rays(self) -> Any:
         """Return the world-space rays of the finer view, with unit direction."""
@@ -88,9 +88,9 @@ class Edges:
             CrowdedError: If one tile alone has too many pairs.
         """
         exact = quality if quality.order == "tile" else replace(quality, tolerance=0.0)
-        return _trace(clouds, placements, self.fine, self.chosen, exact, z_max)
+        return _trace(clouds, placements, self.fine, self.subset, exact, z_max)
 
-    def alike(self, keys: Any, own: Any) -> Any:
+    def nearest_same(self, keys: Any, own: Any) -> Any:
         """Return for each ray the nearest pixel with the same key; the ray's own pixel if there is none.
 
         Args:
@@ -111,14 +111,14 @@ class Edges:
     def averaged(self, values: Any, fine: Any) -> Any:
         """Return the picture ``values`` (Float or Color3f) with means over the rays in the blocks with borders."""
         size = BLOCK_WIDTH * BLOCK_HEIGHT
-        lane = dr.arange(mi.UInt32, self.chosen.count * size)
+        lane = dr.arange(mi.UInt32, self.subset.count * size)
         tile, within = lane // size, lane % size
         bx, by = within % BLOCK_WIDTH, within // BLOCK_WIDTH
         total = type(fine)(0)
         for dx, dy in np.ndindex(ZOOM, ZOOM):
             place = tile * TILE_PIXELS + (by * ZOOM + dy) * TILE_WIDTH + bx * ZOOM + dx
             total += dr.gather(type(fine), fine, place)
-        number = dr.gather(mi.UInt32, self.chosen.number, tile)
+        number = dr.gather(mi.UInt32, self.subset.number, tile)
         row = number // self.fine.tiles_x
         x, y = (number - row * self.fine.tiles_x) * BLOCK_WIDTH + bx, row * BLOCK_HEIGHT + by
         inside = (x < self.view.width) & (y < self.view.height)
@@ -128,8 +128,8 @@ class Edges:
 
     def _places(self) -> tuple[Any, Any]:
         """Return column and row of the finer view's pixels."""
-        lane = dr.arange(mi.UInt32, self.chosen.count * TILE_PIXELS)
-        number = dr.gather(mi.UInt32, self.chosen.number, lane // TILE_PIXELS)
+        lane = dr.arange(mi.UInt32, self.subset.count * TILE_PIXELS)
+        number = dr.gather(mi.UInt32, self.subset.number, lane // TILE_PIXELS)
         row = number // self.fine.tiles_x
         x = (number - row * self.fine.tiles_x) * TILE_WIDTH + lane % TILE_WIDTH
         return x, row * TILE_HEIGHT + lane // TILE_WIDTH % TILE_HEIGHT
@@ -144,17 +144,17 @@ def _trace(
     clouds: CloudSet,
     placements: Sequence[Placement],
     view: CameraView,
-    chosen: TileSubset,
+    subset: TileSubset,
     quality: Quality,
     z_max: Any | None,
 ) -> Image:
     try:
-        return march_apart(bin_gaussians(clouds, placements, view, quality, chosen=chosen), view, quality, z_max)
+        return march_tiles(bin_gaussians(clouds, placements, view, quality, subset=subset), view, quality, z_max)
     except CrowdedError:
-        if chosen.count == 1:
+        if subset.count == 1:
             raise
     parts, start = [], 0
-    for half in chosen.halves(view):
+    for half in subset.halves(view):
         pixels = dr.arange(mi.UInt32, half.count * TILE_PIXELS) + start
         part_z = None if z_max is None else dr.gather(mi.Float, z_max, pixels)
         parts.append(_trace(clouds, placements, view, half, quality, part_z))

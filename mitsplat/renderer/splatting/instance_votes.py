@@ -18,13 +18,13 @@ from mitsplat.renderer.rays.camera_rays import CameraView
 from mitsplat.renderer.splatting.tiles import TileLists
 from mitsplat.renderer.splatting.walk import Lanes, Pixel, Rays, walk
 
-FIRST = 3
+FIRST_SLOTS = 3
 """Number of instances with a slot in the first walk."""
 
-NEXT = 8
+NEXT_SLOTS = 8
 """Number of instances with a slot in each further walk."""
 
-OWN, OTHERS, SLOTS = range(3)
+ENVIRONMENT, OTHERS, SLOTS = range(3)
 """Indices of a tally: weight of the environment, weight of all instances without a slot, and first entry of the slots.
 Each slot holds id and weight, 0 if empty.
 """
@@ -32,13 +32,13 @@ Each slot holds id and weight, 0 if empty.
 
 def new_tally() -> list[Any]:
     """Return the empty tally of a ray."""
-    return [mi.Float(0.0) for _ in range(SLOTS + 2 * FIRST)]
+    return [mi.Float(0.0) for _ in range(SLOTS + 2 * FIRST_SLOTS)]
 
 
 def add_to_tally(tally: list[Any], weight: Any, instance: Any) -> list[Any]:
     """Return the tally after one more Gaussian."""
     placed = instance == 0
-    result = [dr.select(placed, tally[OWN] + weight, tally[OWN]), tally[OTHERS]]
+    result = [dr.select(placed, tally[ENVIRONMENT] + weight, tally[ENVIRONMENT]), tally[OTHERS]]
     placed |= weight <= 0
     for number, total in zip(tally[SLOTS::2], tally[SLOTS + 1 :: 2], strict=True):
         here = ~placed & ((number == instance) | (number == 0))
@@ -53,16 +53,16 @@ def winner_of_tally(tally: list[Any], transmittance: Any) -> tuple[Any, Any]:
 
     The remaining transmittance counts as environment.
     """
-    instance, most = mi.Float(0), tally[OWN] + transmittance
+    instance, most = mi.Float(0), tally[ENVIRONMENT] + transmittance
     for number, total in zip(tally[SLOTS::2], tally[SLOTS + 1 :: 2], strict=True):
         instance, most = dr.select(total > most, number, instance), dr.maximum(total, most)
     return instance, tally[OTHERS] > most
 
 
-def settle_instances(
-    instance: Any, unsure: Any, lists: TileLists, view: CameraView, quality: Quality, order: Order, z_max: Any | None
+def resolve_instances(
+    instance: Any, uncertain: Any, lists: TileLists, view: CameraView, quality: Quality, order: Order, z_max: Any | None
 ) -> Any:
-    """Return the instance image (UInt32, row-major) with exact ids where it is ``unsure`` (Bool).
+    """Return the instance image (UInt32, row-major) with exact ids where it is ``uncertain`` (Bool).
 
     Rays are walked in the ``order`` of the picture. Other rays are not walked, but their lanes are launched, which
     avoids a read-back from the device. The other arguments are those of
@@ -70,7 +70,7 @@ def settle_instances(
     """
     lanes = Lanes(lists, view, rows=1)
     (pixel,), (inside,) = lanes.pixel, lanes.inside
-    wanted = inside & dr.gather(mi.Bool, unsure, pixel, inside)
+    wanted = inside & dr.gather(mi.Bool, uncertain, pixel, inside)
     far = mi.Float(dr.inf) if z_max is None else dr.gather(mi.Float, z_max, pixel, wanted)
     slopes = lanes.slopes(*(dr.opaque(mi.Float, 0.5) for _ in range(2)))
 
@@ -79,7 +79,10 @@ def settle_instances(
             lists, view, quality, slopes, [far], lanes.start, dr.select(active, lanes.stop, lanes.start)
         )
         ((transmittance, own, left, *slots),) = walk(
-            rays, order, _nothing, lambda pixel, alpha, record, _: _count(pixel, pixel[0] * alpha, record[15], last)
+            rays,
+            order,
+            _initial_votes,
+            lambda pixel, alpha, record, _: _add_vote(pixel, pixel[0] * alpha, record[15], last),
         )
         # This value is the same in every walk: the share of the environment.
         most = dr.maximum(most, own + transmittance)
@@ -95,13 +98,13 @@ def settle_instances(
     return settled
 
 
-def _nothing() -> Pixel:
+def _initial_votes() -> Pixel:
     """Return the initial state of a ray of a further walk: a tally with slots in the order of ids."""
-    slots = [mi.Float(value) for _ in range(NEXT) for value in (dr.inf, 0.0)]
+    slots = [mi.Float(value) for _ in range(NEXT_SLOTS) for value in (dr.inf, 0.0)]
     return [mi.Float(1.0), mi.Float(0.0), mi.Float(0.0), *slots]
 
 
-def _count(pixel: Pixel, weight: Any, instance: Any, last: Any) -> Pixel:
+def _add_vote(pixel: Pixel, weight: Any, instance: Any, last: Any) -> Pixel:
     """Return the state after one more Gaussian: the smallest ids above ``last`` keep their slots.
 
     An id that is among them at the end always had a slot, so that its sum is complete.

@@ -43,11 +43,11 @@ import numpy as np
 
 from mitsplat.quality import Order, Quality
 from mitsplat.renderer.rays.camera_rays import TILE_HEIGHT, TILE_PIXELS, CameraView
-from mitsplat.renderer.splatting.instance_votes import add_to_tally, new_tally, settle_instances, winner_of_tally
+from mitsplat.renderer.splatting.instance_votes import add_to_tally, new_tally, resolve_instances, winner_of_tally
 from mitsplat.renderer.splatting.pairs import CrowdedError
 from mitsplat.renderer.splatting.projection import CloudSet, Placement
-from mitsplat.renderer.splatting.tiles import TileLists, bin_gaussians, in_ray_order, some_tiles
-from mitsplat.renderer.splatting.walk import Lanes, Pixel, Rays, largest, rows_together, walk
+from mitsplat.renderer.splatting.tiles import TileLists, bin_gaussians, select_tiles, sort_by_ray
+from mitsplat.renderer.splatting.walk import Lanes, Pixel, Rays, max_of, rows_together, walk
 
 
 @dataclass(eq=False)
@@ -118,13 +118,13 @@ def largest_and_mean(error: Any) -> tuple[Any, Any]:
 T, RED, GREEN, BLUE, SUM_Z, HALF_Z, TALLY = range(7)
 """Indices of a ray's state: transmittance, red, green, blue, sum of weighted depths, depth at half transmittance, and
 first entry of the instance tally (if there are several instances). The state of late peaks comes last, see
-:data:`_EXTRA`.
+:data:`_EXTRA_STATE`.
 """
 
-Late = Literal["taken", "estimated", "amended"]
+OutOfOrder = Literal["ignored", "estimated", "corrected"]
 """Treatment of out-of-order Gaussians: ignored, blended with an error estimate, or with a colour correction."""
 
-_EXTRA: dict[Late, int] = {"taken": 0, "estimated": 7, "amended": 6}
+_EXTRA_STATE: dict[OutOfOrder, int] = {"ignored": 0, "estimated": 7, "corrected": 6}
 """Numbers in a ray's state for late peaks."""
 
 ERROR, DEEPEST, SUMS = -7, -6, slice(-5, None)
@@ -132,20 +132,20 @@ ERROR, DEEPEST, SUMS = -7, -6, slice(-5, None)
 depth, red, green, blue.
 """
 
-_FORGETS = 8
+_DECAY = 8
 """Decay rate of the sums where late peaks are corrected, in weights of a new deepest Gaussian. From 2 on, larger values
 are better for solid walls and worse for solid objects: between 2 and 16 the PSNR of captures changes by up to 1.4 dB.
 """
 
 
-def _fresh(several: bool, late: Late) -> Pixel:
+def _fresh(several: bool, late: OutOfOrder) -> Pixel:
     """Return the initial state of a ray."""
     nothing = [mi.Float(0.0) for _ in range(TALLY - 1)]
-    tally, extra = new_tally() if several else [], [mi.Float(0.0) for _ in range(_EXTRA[late])]
+    tally, extra = new_tally() if several else [], [mi.Float(0.0) for _ in range(_EXTRA_STATE[late])]
     return [mi.Float(1.0), *nothing, *tally, *extra]
 
 
-def _blend(pixel: Pixel, alpha: Any, record: Any, z: Any, several: bool, late: Late) -> Pixel:
+def _blend(pixel: Pixel, alpha: Any, record: Any, z: Any, several: bool, late: OutOfOrder) -> Pixel:
     """Return the state of a ray after one more Gaussian."""
     weight = pixel[T] * alpha
     transmittance = pixel[T] - weight
@@ -154,8 +154,8 @@ def _blend(pixel: Pixel, alpha: Any, record: Any, z: Any, several: bool, late: L
     extra: list[Any] = []
     if late == "estimated":
         extra = _add_to_error(pixel, alpha, weight, colour, z)
-    elif late == "amended":
-        change, extra = _amended(pixel, alpha, weight, colour, z)
+    elif late == "corrected":
+        change, extra = _corrected(pixel, alpha, weight, colour, z)
         sums = [a + b for a, b in zip(sums, change, strict=True)]
     return [
         transmittance,
@@ -167,14 +167,14 @@ def _blend(pixel: Pixel, alpha: Any, record: Any, z: Any, several: bool, late: L
     ]
 
 
-def _shares(pixel: Pixel, weight: Any, late: Any, z: Any, forgets: int) -> tuple[Any, Any]:
+def _shares(pixel: Pixel, weight: Any, late: Any, z: Any, decay: int) -> tuple[Any, Any]:
     """Return the share of the sums behind a late peak, and the share kept after a new deepest peak.
 
     See the module. Both cases use the same division.
     """
     total, moment, *_ = pixel[SUMS]
     gap, reach = (pixel[DEEPEST] - z) * total, 2 * dr.fma(pixel[DEEPEST], total, -moment)
-    ratio = dr.select(late, gap, total) / dr.select(late, reach, dr.fma(forgets, weight, total))
+    ratio = dr.select(late, gap, total) / dr.select(late, reach, dr.fma(decay, weight, total))
     return dr.select(gap < reach, ratio, 1.0), ratio
 
 
@@ -195,12 +195,12 @@ def _add_to_error(pixel: Pixel, alpha: Any, weight: Any, colour: list[Any], z: A
     ]
 
 
-def _amended(pixel: Pixel, alpha: Any, weight: Any, colour: list[Any], z: Any) -> tuple[list[Any], list[Any]]:
+def _corrected(pixel: Pixel, alpha: Any, weight: Any, colour: list[Any], z: Any) -> tuple[list[Any], list[Any]]:
     """Return the colour correction for a late Gaussian, and the state of late peaks after it."""
     total, _, *colours = pixel[SUMS]
     deepest, met = pixel[DEEPEST], weight > 0
     late = met & (z < deepest)
-    behind, kept = _shares(pixel, weight, late, z, _FORGETS)
+    behind, kept = _shares(pixel, weight, late, z, _DECAY)
     taken = dr.select(late, alpha * behind, 0.0)
     change = [taken * dr.fma(total, c, -sum_c) for c, sum_c in zip(colour, colours, strict=True)]
     keep = dr.select(met & ~late, kept, 1.0 - taken)
@@ -263,13 +263,13 @@ def march(
     """
     if quality.order != "window" or not lists.pairs:
         return _march(lists, view, quality, quality.order, z_max, slopes)[0]
-    image, chosen = _march(lists, view, quality, "tile", z_max, estimated=True)
-    if dr.width(chosen) == 0:
+    image, places = _march(lists, view, quality, "tile", z_max, estimated=True)
+    if dr.width(places) == 0:
         return image
-    some = some_tiles(lists, chosen)
-    part, chosen = _march(some, view, quality, "window", z_max, estimated=True)
-    if dr.width(chosen):
-        again = in_ray_order(some, chosen, view)
+    some = select_tiles(lists, places)
+    part, places = _march(some, view, quality, "window", z_max, estimated=True)
+    if dr.width(places):
+        again = sort_by_ray(some, places, view)
         part = part.with_tiles(march(again, view, replace(quality, tolerance=0.0), z_max=z_max), again, view)
     return image.with_tiles(part, some, view)
 
@@ -296,32 +296,34 @@ def _march(
         dr.eval(lists.nearest)
     several = lists.instance is None
     tolerance = dr.opaque(mi.Float, quality.tolerance) if estimated else None
-    gives_up = estimated and order == "tile"
-    late: Late = "estimated" if estimated else _late(quality)
+    stops_early = estimated and order == "tile"
+    late: OutOfOrder = "estimated" if estimated else _out_of_order(quality)
 
-    def right(pixels: list[Pixel]) -> Any:
+    def within_tolerance(pixels: list[Pixel]) -> Any:
         """Return True for lanes in which no ray's error exceeds the tolerance."""
-        return ~_too_wrong([pixel[ERROR] for pixel in pixels], lanes.inside, tolerance)
+        return ~_exceeds_tolerance([pixel[ERROR] for pixel in pixels], lanes.inside, tolerance)
 
     def pixels(dx: float, dy: float, labelled: bool) -> tuple[list[Pixel], list[Any]]:
         """Return the states of the rays at an offset in the pixels, and their error estimates."""
         state: dict[str, Any] = {"several": labelled and several, "late": late}
         where = slopes or lanes.slopes(dr.opaque(mi.Float, dx), dr.opaque(mi.Float, dy))
         rays = Rays.through(lists, view, quality, where, far, lanes.start, lanes.stop)
-        found = walk(rays, order, partial(_fresh, **state), partial(_blend, **state), right if gives_up else None)
+        found = walk(
+            rays, order, partial(_fresh, **state), partial(_blend, **state), within_tolerance if stops_early else None
+        )
         return _without_extra(found, late), [pixel[ERROR] for pixel in found] if estimated else []
 
     found, errors = pixels(0.5, 0.5, labelled=True)
-    image, unsure = _collect(found, lanes, lists.instance, quality)
-    if gives_up and several:
-        unsure &= lanes.image(mi.Bool, [~_too_wrong(errors, lanes.inside, tolerance)] * lanes.rows)
+    image, uncertain = _collect(found, lanes, lists.instance, quality)
+    if stops_early and several:
+        uncertain &= lanes.image(mi.Bool, [~_exceeds_tolerance(errors, lanes.inside, tolerance)] * lanes.rows)
     if quality.order != "tile":
         image.error = lanes.image(mi.Float, errors or [mi.Float(0.0) for _ in found])
     if estimated:
-        dr.eval(image, unsure, errors)  # in one kernel
+        dr.eval(image, uncertain, errors)  # in one kernel
     # On a CPU, reading one bit is cheap and mostly saves the launch; on a GPU, it would cause a synchronisation.
-    if several and (dr.backend_v(unsure) == dr.JitBackend.CUDA or dr.any(unsure)):
-        image.instance = settle_instances(image.instance, unsure, lists, view, quality, order, z_max)
+    if several and (dr.backend_v(uncertain) == dr.JitBackend.CUDA or dr.any(uncertain)):
+        image.instance = resolve_instances(image.instance, uncertain, lists, view, quality, order, z_max)
     n, colours = view.samples, []
     for y, x in np.ndindex(n, n) if n > 1 else ():
         if (2 * x + 1, 2 * y + 1) == (n, n):  # an odd number of samples includes the centre
@@ -335,22 +337,22 @@ def _march(
         *image.rgb, image.alpha = (sum(channel[1:], channel[0]) / (n * n) for channel in zip(*colours, strict=True))
         if estimated:
             image.error = lanes.image(mi.Float, errors)
-    return image, _tiles_of(_too_wrong(errors, lanes.inside, tolerance), lanes) if estimated else None
+    return image, _tiles_of(_exceeds_tolerance(errors, lanes.inside, tolerance), lanes) if estimated else None
 
 
-def _late(quality: Quality) -> Late:
+def _out_of_order(quality: Quality) -> OutOfOrder:
     """Return how late peaks are blended without an error estimate; in the order of rays no peak is late."""
-    return "amended" if quality.amends and quality.order == "tile" else "taken"
+    return "corrected" if quality.amends and quality.order == "tile" else "ignored"
 
 
-def _without_extra(pixels: list[Pixel], late: Late) -> list[Pixel]:
+def _without_extra(pixels: list[Pixel], late: OutOfOrder) -> list[Pixel]:
     """Return the states of rays without the state of late peaks."""
-    return [pixel[: len(pixel) - _EXTRA[late]] for pixel in pixels]
+    return [pixel[: len(pixel) - _EXTRA_STATE[late]] for pixel in pixels]
 
 
-def _too_wrong(errors: list[Any], inside: list[Any], tolerance: Any) -> Any:
+def _exceeds_tolerance(errors: list[Any], inside: list[Any], tolerance: Any) -> Any:
     """Return True for lanes in which the estimate of a ray inside the image exceeds the tolerance."""
-    return largest([dr.select(m, error, 0.0) for error, m in zip(errors, inside, strict=True)]) > tolerance
+    return max_of([dr.select(m, error, 0.0) for error, m in zip(errors, inside, strict=True)]) > tolerance
 
 
 def _tiles_of(flags: Any, lanes: Lanes) -> Any:
@@ -361,17 +363,17 @@ def _tiles_of(flags: Any, lanes: Lanes) -> Any:
     return dr.compress(reduce(or_, [dr.gather(mi.Bool, flags, lane + k) for k in range(per_tile)]))
 
 
-def march_apart(lists: TileLists, view: CameraView, quality: Quality, z_max: Any | None = None) -> Image:
+def march_tiles(lists: TileLists, view: CameraView, quality: Quality, z_max: Any | None = None) -> Image:
     """Render the pixels of some tiles, tile after tile, with one ray through each pixel's centre.
 
     Arguments are those of :func:`march`. Nothing is repaired: the order is per tile or per ray.
     """
-    lanes = Lanes(lists, view, rows_together(quality.order), apart=True)
+    lanes = Lanes(lists, view, rows_together(quality.order), by_tile=True)
     places = zip(lanes.pixel, lanes.inside, strict=True)
     far = [mi.Float(dr.inf) if z_max is None else dr.gather(mi.Float, z_max, pixel, inside) for pixel, inside in places]
     if quality.order == "ray":
         dr.eval(lists.nearest)
-    late = _late(quality)
+    late = _out_of_order(quality)
     state: dict[str, Any] = {"several": lists.instance is None, "late": late}
     where = lanes.slopes(dr.opaque(mi.Float, 0.5), dr.opaque(mi.Float, 0.5))
     rays = Rays.through(lists, view, quality, where, far, lanes.start, lanes.stop)
@@ -402,13 +404,13 @@ def _collect(pixels: list[Pixel], lanes: Lanes, only: int | None, quality: Quali
         opacity = 1.0 - pixel[T]
         mean = dr.select(opacity > 0, pixel[SUM_Z] / opacity, 0.0)
         depths.append(dr.select(pixel[T] < 0.5, pixel[HALF_Z], mean))
-    unsure = None
+    uncertain = None
     if only is None:
         winners = [winner_of_tally(pixel[TALLY:], pixel[T]) for pixel in pixels]
         numbers = [number for number, _ in winners]
-        unsure = lanes.image(mi.Bool, [doubt for _, doubt in winners])
+        uncertain = lanes.image(mi.Bool, [doubt for _, doubt in winners])
     else:
         everything = dr.opaque(mi.Float, only)
         numbers = [dr.select(1.0 - pixel[T] > pixel[T], everything, 0.0) for pixel in pixels]
     depth, instance = lanes.image(mi.Float, depths), lanes.image(mi.UInt32, numbers)
-    return Image(rgb, alpha, depth, instance, alpha, None), unsure
+    return Image(rgb, alpha, depth, instance, alpha, None), uncertain

@@ -66,13 +66,13 @@ def pair_records(
     box: Any,
     view: CameraView,
     quality: Quality,
-    chosen: TileSubset | TileBox | None,
+    subset: TileSubset | TileBox | None,
     numbered: bool,
     groups: Any | None = None,
 ) -> Pairs | None:
     """Pair every record with the tiles it intersects; return None if there are no pairs.
 
-    Tiles are given by their places in ``chosen``. ``groups`` are numbers of the records below 2^DEPTH_BITS, which
+    Tiles are given by their places in ``subset``. ``groups`` are numbers of the records below 2^DEPTH_BITS, which
     replace the depth level in sort keys.
 
     Raises:
@@ -97,8 +97,8 @@ def pair_records(
         lo, hi = span_of(y)
         row = row_of + (y - y0)
         begin, size = y * view.tiles_x + lo, dr.select(hi > lo, hi - lo, 0)
-        if chosen is not None:
-            begin, size = chosen.among(begin, size)
+        if subset is not None:
+            begin, size = subset.among(begin, size)
         dr.scatter(owner, order, row, mode=dr.ReduceMode.Permute)
         dr.scatter(first_tile, begin, row, mode=dr.ReduceMode.Permute)
         dr.scatter(length, size, row, mode=dr.ReduceMode.Permute)
@@ -114,7 +114,7 @@ def pair_records(
     key, number = dr.empty(mi.UInt64, pairs), dr.empty(mi.UInt32, pairs) if numbered else None
 
     def in_view(tile: Any, active: Any = True) -> Any:
-        return tile if chosen is None else dr.gather(mi.UInt32, chosen.number, tile, active)
+        return tile if subset is None else dr.gather(mi.UInt32, subset.number, tile, active)
 
     if groups is None:
         depth_of = depths_by_tile(record, near, ellipsoid, in_view(first_tile, length > 0), view, quality)

@@ -27,7 +27,7 @@ from mitsplat.renderer.splatting.gaussian import (
     project_gaussian,
     rotation_axes,
 )
-from mitsplat.renderer.splatting.splat_appearance import ROW, SplatAppearance, changed, rows_of
+from mitsplat.renderer.splatting.splat_appearance import ROW, SplatAppearance, appearance_rows, apply_appearance
 from mitsplat.renderer.splatting.tile_subset import TileSubset
 from mitsplat.runtime.recorded_kernels import Table, recorded
 
@@ -70,26 +70,26 @@ class CloudSet:
     sh_stride: int
     _numbers: dict[tuple[int, ...], tuple[Any, Any]] = field(default_factory=dict, init=False, repr=False)
 
-    def numbers(self, chosen: Sequence[int]) -> tuple[Any, Any]:
-        """Return, for every Gaussian of the clouds ``chosen``, its index into ``chosen`` and its number.
+    def numbers(self, indices: Sequence[int]) -> tuple[Any, Any]:
+        """Return, for every Gaussian of the clouds ``indices``, its index into ``indices`` and its number.
 
         The last two results are cached: all placements of a layout, and its objects alone.
         """
-        key = tuple(chosen)
+        key = tuple(indices)
         if key not in self._numbers:
             while len(self._numbers) > 1:
                 del self._numbers[next(iter(self._numbers))]
-            self._numbers[key] = self._count_off(key)
+            self._numbers[key] = self._enumerate(key)
         return self._numbers[key]
 
-    def _count_off(self, chosen: tuple[int, ...]) -> tuple[Any, Any]:
-        counts = [self.counts[cloud] for cloud in chosen]
+    def _enumerate(self, indices: tuple[int, ...]) -> tuple[Any, Any]:
+        counts = [self.counts[cloud] for cloud in indices]
         total = int(sum(counts))
         number = dr.arange(mi.UInt32, total)
         if total == 0:
             return number, number
-        if len(chosen) == 1:
-            return dr.zeros(mi.UInt32, total), number + dr.opaque(mi.UInt32, self.first[chosen[0]])
+        if len(indices) == 1:
+            return dr.zeros(mi.UInt32, total), number + dr.opaque(mi.UInt32, self.first[indices[0]])
         begins = np.cumsum(counts) - counts
         owner = dr.zeros(mi.UInt32, total)
         # An empty cloud has the same start as the next one, so each start is counted as often as it occurs.
@@ -100,7 +100,7 @@ class CloudSet:
             owner = dr.cumsum(owner)
         if not counts[0]:  # empty clouds before the first non-empty one
             owner += dr.opaque(mi.UInt32, int(np.count_nonzero(begins == 0)) - 1)
-        shift = wrapped(mi.Int32, (np.array([self.first[cloud] for cloud in chosen]) - begins).astype(np.int32))
+        shift = wrapped(mi.Int32, (np.array([self.first[cloud] for cloud in indices]) - begins).astype(np.int32))
         local = mi.UInt32(mi.Int32(number) + dr.gather(mi.Int32, shift, owner))
         dr.eval(owner, local)
         return owner, local
@@ -152,7 +152,7 @@ def placement_table(clouds: CloudSet, placements: Sequence[Placement], view: Cam
         rows[:, 10] = [p.instance for p in placements]
         rows[:, 12:15] = coarse
         rows[:, 16:19] = centre - coarse
-        rows[:, _APPEARANCE:] = rows_of([p.appearance for p in placements])
+        rows[:, _APPEARANCE:] = appearance_rows([p.appearance for p in placements])
     return wrapped(mi.Float, rows), *clouds.numbers([p.cloud for p in placements])
 
 
@@ -239,14 +239,14 @@ class Projector:
             visible &= ~near
         return response, opacity, k2, near, visible, box, centre[2] - reach[2]
 
-    def cull(self, owner: Any, local: Any, chosen: TileSubset | None = None) -> tuple[Any, Any]:
-        """Return two flags per Gaussian: it is in view (and in ``chosen`` tiles), and it reaches the camera's plane."""
+    def cull(self, owner: Any, local: Any, subset: TileSubset | None = None) -> tuple[Any, Any]:
+        """Return two flags per Gaussian: it is in view (and in ``subset`` tiles), and it reaches the camera's plane."""
         g = self._load(owner, local)
         _, _, _, near, visible, box, _ = self._bounds(g)
         x0, x1, y0, y1 = self.view.tile_box(*box)
         visible, near = dr.detach(visible & (x1 > x0) & (y1 > y0)), dr.detach(near)
-        if chosen is not None:
-            visible &= chosen.any_in(x0, x1, y0, y1, visible)
+        if subset is not None:
+            visible &= subset.any_in(x0, x1, y0, y1, visible)
         dr.eval(visible, near)
         return visible, near
 
@@ -268,7 +268,7 @@ class Projector:
         dr.eval(records, tile_box, least)
         return records, near_rows, least, tile_box
 
-    def every_record(self, owner: Any, local: Any) -> tuple[Any, Any, Any, Any, Any]:
+    def all_records(self, owner: Any, local: Any) -> tuple[Any, Any, Any, Any, Any]:
         """Return view records of all Gaussians, least depths, tile boxes, visibility, and near flags.
 
         Invisible Gaussians have empty boxes. Records of Gaussians that reach the camera's plane are not marked. Unlike
@@ -282,7 +282,7 @@ class Projector:
         boxes = _rows(mi.UInt32, [x0, x1, y0, dr.select(visible, y1, y0)])
         return _rows(mi.Float, record), dr.detach(least), boxes, visible, visible & dr.detach(near)
 
-    def records_at_once(self, owner: Any, local: Any) -> tuple[Any, Any, Any, Any]:
+    def records_unculled(self, owner: Any, local: Any) -> tuple[Any, Any, Any, Any]:
         """Return the results of :meth:`records` for all Gaussians, with recorded kernels and without gradients.
 
         Invisible Gaussians have empty boxes.
@@ -290,7 +290,7 @@ class Projector:
         clouds, view = self.clouds, self.view
         shape = self.quality, self.at_camera, self.changed, clouds.sh_count, clouds.sh_stride
         arrays = Table(clouds.geometry), Table(clouds.scales), Table(clouds.sh), Table(self.table)
-        records, least, boxes, near = _every_record(view.kind, view.numbers, shape, arrays, owner, local)
+        records, least, boxes, near = _all_records(view.kind, view.numbers, shape, arrays, owner, local)
         if not dr.any(near):
             return records, None, least, boxes
         index = dr.compress(near)
@@ -305,7 +305,7 @@ class Projector:
         scaled = LOG2_E_HALF
         colour = self._colour(g["mean"], local)
         if self.changed:
-            colour = changed(colour, [g["row"][_APPEARANCE + i] for i in range(ROW)], g["point"])
+            colour = apply_appearance(colour, [g["row"][_APPEARANCE + i] for i in range(ROW)], g["point"])
         return [
             response.u0,
             response.v0,
@@ -354,7 +354,7 @@ class Projector:
 
 
 @recorded
-def _every_record(
+def _all_records(
     kind: Kind,
     numbers: Mapping[str, Any],
     shape: tuple[Quality, bool, bool, int, int],
@@ -362,12 +362,12 @@ def _every_record(
     owner: Any,
     local: Any,
 ) -> tuple[Any, Any, Any, Any]:
-    """Return records, least depths, tile boxes and near flags, see ``Projector.every_record``."""
+    """Return records, least depths, tile boxes and near flags, see ``Projector.all_records``."""
     quality, at_camera, changed, sh_count, sh_stride = shape
     geometry, scales, sh, table = arrays
     clouds = CloudSet((dr.width(owner),), (0,), geometry, scales, sh, sh_count, sh_stride)
     projector = Projector(clouds, table, CameraView.of_numbers(kind, numbers), quality, at_camera, changed)
-    records, least, boxes, _, near = projector.every_record(owner, local)
+    records, least, boxes, _, near = projector.all_records(owner, local)
     return records, least, boxes, near
 
 

@@ -58,12 +58,12 @@ class SplatAppearance:
         return [1.0, *self.matrix, self.wear, float(self.seed), CELLS / self.size]
 
 
-def rows_of(appearances: list[SplatAppearance | None]) -> np.ndarray:
+def appearance_rows(appearances: list[SplatAppearance | None]) -> np.ndarray:
     """Return rows of :data:`ROW` floats; zeros where the appearance is None."""
     return np.array([[0.0] * ROW if one is None else one.row for one in appearances], np.float32).reshape(-1, ROW)
 
 
-def changed(colour: list[Any], row: list[Any], point: Any) -> list[Any]:
+def apply_appearance(colour: list[Any], row: list[Any], point: Any) -> list[Any]:
     """Apply the appearance rows of placements to display-encoded colours of Gaussians.
 
     ``point`` are the centres of the Gaussians in their own frames.
@@ -71,7 +71,7 @@ def changed(colour: list[Any], row: list[Any], point: Any) -> list[Any]:
 
     def change(colour: list[Any], row: list[Any], point: Any) -> list[Any]:
         linear = [srgb_to_linear(c) for c in colour]
-        cover = row[10] * dirt(point * row[12], mi.UInt32(row[11]))
+        cover = row[10] * dirt_thickness(point * row[12], mi.UInt32(row[11]))
         white = dr.maximum(dr.maximum(colour[0], colour[1]), dr.maximum(colour[2], 1.0))
         result = []
         for i in range(3):
@@ -84,7 +84,7 @@ def changed(colour: list[Any], row: list[Any], point: Any) -> list[Any]:
     )
 
 
-def dirt(point: Any, seed: Any) -> Any:
+def dirt_thickness(point: Any, seed: Any) -> Any:
     """Return the thickness of dirt in [0, 1] at points, given in cells of the coarsest noise."""
     total, weight = mi.Float(0), 0.0
     for octave in range(OCTAVES):

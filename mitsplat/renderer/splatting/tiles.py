@@ -26,7 +26,7 @@ from mitsplat.renderer.splatting.sorting import numpy_sorts_slowly, sort_in_thre
 from mitsplat.renderer.splatting.tile_depths import DEPTH_BITS, depth_of_level, least_depth, level_of
 from mitsplat.renderer.splatting.tile_subset import TileBox, TileSubset
 
-AT_ONCE = 1 << 22
+MAX_UNCULLED = 1 << 22
 """Largest number of Gaussians that are projected without prior culling; records take 84 bytes each."""
 
 
@@ -74,7 +74,7 @@ def bin_gaussians(
     quality: Quality,
     *,
     at_camera: bool = True,
-    chosen: TileSubset | None = None,
+    subset: TileSubset | None = None,
     fitted: bool = False,
     groups: Any | None = None,
     for_gradients: bool = False,
@@ -87,7 +87,7 @@ def bin_gaussians(
         view: The camera.
         quality: Order, cut-offs and kernel.
         at_camera: True if Gaussians that reach the camera's plane are visible.
-        chosen: Subset of tiles that have lists; None for all tiles of the view.
+        subset: Subset of tiles that have lists; None for all tiles of the view.
         fitted: True if only the tiles in a box around all visible Gaussians have lists.
         groups: A number below 2^DEPTH_BITS by instance id, which replaces the depth level of its entries.
         for_gradients: True if entries are also indexed by record.
@@ -97,24 +97,24 @@ def bin_gaussians(
     """
     table, owner, local = placement_table(clouds, placements, view)
     if dr.width(local) == 0:
-        return _empty(view, chosen)
+        return _empty(view, subset)
     changed = any(placement.appearance is not None for placement in placements)
     source = Projector(clouds, table, view, quality, at_camera, changed)
 
-    if chosen is None and not (fitted or for_gradients) and _at_once(dr.width(local)):
-        records, near_rows, least, box = source.records_at_once(owner, local)
+    if subset is None and not (fitted or for_gradients) and _skips_culling(dr.width(local)):
+        records, near_rows, least, box = source.records_unculled(owner, local)
     else:
-        visible, near = source.cull(owner, local, chosen)
+        visible, near = source.cull(owner, local, subset)
         index = dr.compress(visible)
         if dr.width(index) == 0:
-            return _empty(view, chosen)
+            return _empty(view, subset)
         owner, local = dr.gather(mi.UInt32, owner, index), dr.gather(mi.UInt32, local, index)
         near = dr.gather(mi.Bool, near, index)
         dr.eval(owner, local, near)
         records, near_rows, least, box = source.records(owner, local, near)
     ids = {placement.instance for placement in placements}
     only = ids.pop() if len(ids) == 1 else None
-    listed: TileSubset | TileBox | None = TileBox.around(box, view) if fitted else chosen
+    listed: TileSubset | TileBox | None = TileBox.around(box, view) if fitted else subset
     if groups is not None:
         row = dr.arange(mi.UInt32, dr.width(least)) * RECORD
         groups = dr.gather(mi.UInt32, groups, mi.UInt32(dr.gather(mi.Float, records, row + (RECORD - 1))))
@@ -123,12 +123,12 @@ def bin_gaussians(
     )
 
 
-def _at_once(count: int) -> bool:
+def _skips_culling(count: int) -> bool:
     """Return True if ``count`` Gaussians are projected without prior culling.
 
     On a GPU, this takes less time than waiting for the number of visible Gaussians and tracing the next kernels.
     """
-    return dr.backend_v(mi.Float) == dr.JitBackend.CUDA and count <= AT_ONCE
+    return dr.backend_v(mi.Float) == dr.JitBackend.CUDA and count <= MAX_UNCULLED
 
 
 def bin_records(
@@ -139,7 +139,7 @@ def bin_records(
     view: CameraView,
     quality: Quality,
     only: int | None,
-    chosen: TileSubset | TileBox | None = None,
+    subset: TileSubset | TileBox | None = None,
     *,
     groups: Any | None = None,
     for_gradients: bool = False,
@@ -152,14 +152,14 @@ def bin_records(
     Raises:
         CrowdedError: If there are too many pairs.
     """
-    pairs = pair_records(dr.detach(records), near, least, box, view, quality, chosen, for_gradients, groups)
+    pairs = pair_records(dr.detach(records), near, least, box, view, quality, subset, for_gradients, groups)
     if pairs is None:
-        return _empty(view, chosen, records)
-    tiles, own = _numbered(view, chosen)
-    return _listed(records, near, pairs, least, dr.width(least), tiles, view, only, own)
+        return _empty(view, subset, records)
+    tiles, own = _tile_numbers(view, subset)
+    return _sorted_lists(records, near, pairs, least, dr.width(least), tiles, view, only, own)
 
 
-def _listed(
+def _sorted_lists(
     records: Any,
     near: Any,
     pairs: Pairs,
@@ -173,7 +173,7 @@ def _listed(
     """Sort pairs by tile and depth into lists. Levels and least depths are evaluated on use."""
     count = dr.width(pairs.key)
     # The number of bits is that of all tiles, so that lists of a subset reuse the kernels.
-    key = _sorted(pairs.key, DEPTH_BITS + max(1, (view.tiles_x * view.tiles_y - 1).bit_length()))
+    key = _sort_keys(pairs.key, DEPTH_BITS + max(1, (view.tiles_x * view.tiles_y - 1).bit_length()))
     number, tile = mi.UInt32(key & ((1 << NUMBER_BITS) - 1)), dr.arange(mi.UInt32, tiles)
     slots, entries = (None, number) if pairs.record is None else (number, dr.gather(mi.UInt32, pairs.record, number))
     begins = _first_entries(key, tiles)
@@ -198,13 +198,13 @@ def _listed(
     )
 
 
-def _numbered(view: CameraView, chosen: TileSubset | TileBox | None) -> tuple[int, Any]:
+def _tile_numbers(view: CameraView, subset: TileSubset | TileBox | None) -> tuple[int, Any]:
     """Return the number of tiles with lists, and their numbers in the view (None for all tiles)."""
-    return (view.tiles_x * view.tiles_y, None) if chosen is None else (chosen.count, chosen.number)
+    return (view.tiles_x * view.tiles_y, None) if subset is None else (subset.count, subset.number)
 
 
-def _empty(view: CameraView, chosen: TileSubset | TileBox | None, records: Any | None = None) -> TileLists:
-    tiles, own = _numbered(view, chosen)
+def _empty(view: CameraView, subset: TileSubset | TileBox | None, records: Any | None = None) -> TileLists:
+    tiles, own = _tile_numbers(view, subset)
     zeros = dr.zeros(mi.UInt32, tiles)
     dr.eval(zeros)
     entry = dr.zeros(mi.UInt32, 1)
@@ -234,27 +234,29 @@ def merge_lists(first: TileLists, second: TileLists, tiles: Any, view: CameraVie
     records = concatenated([first.records, records])
     near = first.near if near is None else near
     least = concatenated([first.least, second.least])
-    return _listed(records, near, pairs, least, visible + second.visible, dr.width(tiles), view, None, tiles)
+    return _sorted_lists(records, near, pairs, least, visible + second.visible, dr.width(tiles), view, None, tiles)
 
 
-def some_tiles(lists: TileLists, chosen: Any) -> TileLists:
+def select_tiles(lists: TileLists, places: Any) -> TileLists:
     """Return the unchanged lists of some tiles, given by their places."""
-    tiles = chosen if lists.tiles is None else dr.gather(mi.UInt32, lists.tiles, chosen)
-    start, stop = dr.gather(mi.UInt32, lists.start, chosen), dr.gather(mi.UInt32, lists.stop, chosen)
+    tiles = places if lists.tiles is None else dr.gather(mi.UInt32, lists.tiles, places)
+    start, stop = dr.gather(mi.UInt32, lists.start, places), dr.gather(mi.UInt32, lists.stop, places)
     dr.eval(tiles, start, stop)
     return replace(lists, start=start, stop=stop, tiles=tiles)
 
 
-def in_ray_order(lists: TileLists, chosen: Any, view: CameraView) -> TileLists:
+def sort_by_ray(lists: TileLists, places: Any, view: CameraView) -> TileLists:
     """Sort some non-empty tiles, given by their places in ``lists``, for the order per ray."""
-    place, _, number = cast("tuple[Any, Any, Any]", _pairs_in(lists, chosen, 0))
-    tiles = chosen if lists.tiles is None else dr.gather(mi.UInt32, lists.tiles, chosen)
+    place, _, number = cast("tuple[Any, Any, Any]", _pairs_in(lists, places, 0))
+    tiles = places if lists.tiles is None else dr.gather(mi.UInt32, lists.tiles, places)
     record = dr.gather(mi.ArrayXf, dr.detach(lists.records), number, shape=(RECORD, dr.width(number)))
     slopes = view.tile_slopes(dr.gather(mi.UInt32, tiles, place))
     level = level_of(least_depth(record, dr.gather(mi.Float, lists.least, number), slopes), view)
     again, count = Pairs(Pairs.key_of(place, level, number)), dr.width(tiles)
     dr.eval(again.key)
-    return _listed(lists.records, lists.near, again, lists.least, lists.visible, count, view, lists.instance, tiles)
+    return _sorted_lists(
+        lists.records, lists.near, again, lists.least, lists.visible, count, view, lists.instance, tiles
+    )
 
 
 def _pairs_in(lists: TileLists, tiles: Any, shift: int) -> tuple[Any, Any, Any] | None:
@@ -282,7 +284,7 @@ def _pairs_in(lists: TileLists, tiles: Any, shift: int) -> tuple[Any, Any, Any] 
     return place, level, number
 
 
-def _sorted(key: Any, bits: int) -> Any:
+def _sort_keys(key: Any, bits: int) -> Any:
     """Sort the keys of pairs (UInt64, evaluated) by their leading ``bits``; the numbers below already ascend.
 
     On most CPUs, NumPy sorts them in place with vector instructions.

@@ -55,10 +55,10 @@ class Lanes:
         start, stop: Range of the tile's list.
     """
 
-    def __init__(self, lists: TileLists, view: CameraView, rows: int = TILE_HEIGHT, *, apart: bool = False) -> None:
+    def __init__(self, lists: TileLists, view: CameraView, rows: int = TILE_HEIGHT, *, by_tile: bool = False) -> None:
         """Assign ``rows`` pixels (a divisor of the tile height) to each lane.
 
-        With ``apart``, pixels are numbered tile after tile and row by row in each tile, instead of by the image.
+        With ``by_tile``, pixels are numbered tile after tile and row by row in each tile, instead of by the image.
         """
         count = view.tiles_x * view.tiles_y if lists.tiles is None else dr.width(lists.tiles)
         per_tile = TILE_PIXELS // rows
@@ -69,8 +69,8 @@ class Lanes:
         self.view, self.rows = view, rows
         self.x = (tile - tile_y * view.tiles_x) * TILE_WIDTH + column
         self.y = tile_y * TILE_HEIGHT + row
-        self.count = count * TILE_PIXELS if apart else view.width * view.height
-        if apart:
+        self.count = count * TILE_PIXELS if by_tile else view.width * view.height
+        if by_tile:
             first = own * TILE_PIXELS + row * TILE_WIDTH + column
             self.pixel = [first + k * TILE_WIDTH for k in range(rows)]
         else:
@@ -150,7 +150,7 @@ class Rays:
             start,
             stop,
             near=view.near_plane,
-            cut=faintest(quality),
+            cut=min_log_opacity(quality),
             cap=dr.log2(dr.opaque(mi.Float, highest)) if highest < 1 else None,
             end=dr.opaque(mi.Float, quality.transmittance_min),
             column=not view.distortion,
@@ -166,7 +166,7 @@ def walk(
     order: Order,
     fresh: Callable[[], Pixel],
     blend: Blend,
-    going: Callable[[list[Pixel]], Any] | None = None,
+    continues: Callable[[list[Pixel]], Any] | None = None,
 ) -> list[Pixel]:
     """Return the final states of rays: in the order of the tile's list, of their own peaks, or with a window.
 
@@ -175,19 +175,19 @@ def walk(
         order: As in :class:`mitsplat.quality.Quality`.
         fresh: Function that returns the initial state of a ray.
         blend: Function that blends one Gaussian.
-        going: Function from the states of a lane's rays to True if the lane continues; for the order per tile.
+        continues: Function from the states of a lane's rays to True if the lane continues; for the order per tile.
     """
     if order == "tile":
-        return _walk_in_tile_order(rays, fresh, blend, going)
+        return _walk_in_tile_order(rays, fresh, blend, continues)
     return (_walk_in_window if order == "window" else _walk_in_ray_order)(rays, fresh, blend)
 
 
-def largest(values: Sequence[Any]) -> Any:
+def max_of(values: Sequence[Any]) -> Any:
     """Return the maximum over the values of a lane's rays, none of which is NaN."""
     return reduce(lambda a, b: dr.select(a > b, a, b), values)
 
 
-def faintest(quality: Quality) -> Any:
+def min_log_opacity(quality: Quality) -> Any:
     """Return log2 of the smallest opacity that counts, limited to the domain of :func:`exp2`."""
     return dr.maximum(dr.log2(dr.opaque(mi.Float, quality.alpha_min)), -126)
 
@@ -267,7 +267,7 @@ def respond_along(
 
 
 def _walk_in_tile_order(
-    rays: Rays, fresh: Callable[[], Pixel], blend: Blend, going: Callable[[list[Pixel]], Any] | None
+    rays: Rays, fresh: Callable[[], Pixel], blend: Blend, continues: Callable[[list[Pixel]], Any] | None
 ) -> list[Pixel]:
     """Blend in the order of the tile's list, which is that of the peaks along one of the tile's rays."""
     lists, far, near, cut, end = rays.lists, rays.far, rays.near, rays.cut, rays.end
@@ -285,8 +285,8 @@ def _walk_in_tile_order(
         return i + 1, blended
 
     def alive(i: Any, pixels: list[Pixel]) -> Any:
-        unfinished = (i < rays.stop) & (largest([pixel[0] for pixel in pixels]) > end)
-        return unfinished if going is None else unfinished & going(pixels)
+        unfinished = (i < rays.stop) & (max_of([pixel[0] for pixel in pixels]) > end)
+        return unfinished if continues is None else unfinished & continues(pixels)
 
     _, pixels = dr.while_loop((rays.start, [fresh() for _ in far]), alive, body, label="march")
     return pixels
@@ -318,7 +318,7 @@ def _walk_in_window(rays: Rays, fresh: Callable[[], Pixel], blend: Blend) -> lis
         return blend(pixel, alpha, _Fields(lists.records, number, mi.Bool(True)), z), result
 
     def alive(i: Any, pixels: list[Pixel], windows: list[_Slots]) -> Any:
-        return (i < rays.stop) & (largest([pixel[0] for pixel in pixels]) > end)
+        return (i < rays.stop) & (max_of([pixel[0] for pixel in pixels]) > end)
 
     def body(i: Any, pixels: list[Pixel], windows: list[_Slots]) -> tuple[Any, list[Pixel], list[_Slots]]:
         number = dr.gather(mi.UInt32, lists.entries, i)

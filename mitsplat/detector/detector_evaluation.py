@@ -115,7 +115,7 @@ def evaluate_detector(
     name = f"{root.resolve().name}-{split}"
     out = trained.path / "evaluation" / name if out is None else Path(out)
     if root.resolve().is_relative_to(out.resolve()):
-        raise InputError(f"{out}: must not hold the images that are judged, {root}: give another folder")
+        raise InputError(f"{out}: must not contain the evaluated images, {root}: choose another folder")
     check_folder(out, "an evaluation", _EVALUATION_FILES)
     load_libraries()
     check_torchvision()
@@ -242,7 +242,7 @@ def write_evaluation(
             "confusion": {"least_score": CONFIDENCE, "iou": IOU},
         },
         **{kind: _score_record(score) for kind, score in scores.items()},
-        "error_gains": {kind: round(gain, 5) for kind, gain in error_gains(truth, detections, scores["box"]).items()},
+        "gains": {kind: round(gain, 5) for kind, gain in error_gains(truth, detections, scores["box"]).items()},
         "confusion": {"classes": [*found.class_names, "nothing"], "matrix": confusion.matrix.tolist()},
     }
     with storage_errors(out):

@@ -57,8 +57,8 @@ def _summary(
     rows = {f"mAP50-95 of {_PLURALS[kind]}": f"{score.map50_95:.3f}" for kind, score in scores.items()}
     rows |= {f"mAP50 of {_PLURALS[kind]}": f"{score.map50:.3f}" for kind, score in scores.items()}
     rows |= {
-        f"At a score of {CONFIDENCE} and an IoU of {IOU}": f"{right} found as what they are, {confused} as another "
-        f"class, {missed} missed; {extra} found where is nothing",
+        f"At a score of {CONFIDENCE} and an IoU of {IOU}": f"{right} correct, {confused} with the wrong "
+        f"class, {missed} missed; {extra} false detections",
         "Images": f"{len(found.samples)} of {found.root} ({found.split})",
         "Run": str(results.get("run", "unknown")),
         "Images scaled to": f"{results['size']} px" if "size" in results else "unknown",
@@ -70,8 +70,8 @@ def _summary(
     rules = results["rules"]
     note = (
         "Average precision by COCO's rules: mean over 101 recalls and IoU thresholds 0.5 to 0.95, at most "
-        f"{MAX_DETECTIONS} detections an image with scores of {rules['least_score']} or more, overlaps "
-        f"beyond {rules['nms_iou']} suppressed."
+        f"{MAX_DETECTIONS} detections per image with scores of at least {rules['least_score']}, "
+        f"non-maximum suppression at an IoU of {rules['nms_iou']}."
     )
     return _section("summary", "Summary", f"<table>{lines}</table><p>{note}</p>")
 
@@ -81,7 +81,7 @@ def _classes(scores: Mapping[str, AveragePrecision], results: Mapping[str, Any])
     rows = []
     for name, count in results["data"]["instances"].items():
         values = [value for score in scores.values() for value in score.classes.get(name, (None, None))]
-        cells = "".join(f"<td>{'not labelled here' if value is None else f'{value:.3f}'}</td>" for value in values)
+        cells = "".join(f"<td>{'no labels' if value is None else f'{value:.3f}'}</td>" for value in values)
         rows.append(f'<tr><th scope="row">{html.escape(name)}</th><td>{count}</td>{cells}</tr>')
     head = "".join(f'<th scope="col">{text}</th>' for text in ("Class", "Labelled", *heads))
     table = f"<table><thead><tr>{head}</tr></thead><tbody>{''.join(rows)}</tbody></table>"
@@ -109,9 +109,9 @@ def _charts(scores: Mapping[str, AveragePrecision]) -> str:
 
 
 def _gains(found: Mapping[str, float]) -> str:
-    text = "How much mAP50-95 of boxes would rise if one kind of error were mended; gains do not add up."
+    text = "Gain in mAP50-95 of boxes if one kind of error is corrected; gains do not add up."
     chart = bars(text, {ERROR_KINDS[kind]: max(gain, 0.0) for kind, gain in found.items()}, name_width=170)
-    return _section("gains", "What errors cost", f'<div class="charts">{chart}</div>')
+    return _section("gains", "Cost of errors", f'<div class="charts">{chart}</div>')
 
 
 def _confusion(confusion: Confusion, class_names: Sequence[str]) -> str:
@@ -126,9 +126,7 @@ def _confusion(confusion: Confusion, class_names: Sequence[str]) -> str:
             shade = f' style="background: color-mix(in srgb, {colour} {60 * count / total:.0f}%, transparent)"'
             cells.append(f"<td{shade if count else ''}>{count or ''}</td>")
         rows.append(f'<tr><th scope="row">{name}</th>{"".join(cells)}</tr>')
-    text = (
-        f"What was taken for what, at a score of {CONFIDENCE} or more where boxes overlap by an IoU of {IOU} or more."
-    )
+    text = f"Labelled and detected classes, for scores of at least {CONFIDENCE} and a box IoU of at least {IOU}."
     table = f"<table><thead><tr>{head}</tr></thead><tbody>{''.join(rows)}</tbody></table>"
     return _section("confusion", "Confusion", f'<p>{text}</p><div class="matrix">{table}</div>')
 
@@ -147,14 +145,14 @@ def _worst(found: LabelledSet, truth: Mapping[str, Any], detections: Sequence[De
     for image in order:
         sample = found.samples[image - 1]
         right, missed, confused, extra = confusion.errors[image]
-        summary = f"{right} right, {missed} missed, {confused} of another class, {extra} of nothing"
+        summary = f"{right} right, {missed} missed, {confused} with the wrong class, {extra} false detections"
         figures.append(
             f'<figure><div class="pair">{_picture(sample, labelled[image], found.class_names, "labelled")}'
             f"{_picture(sample, predicted[image], found.class_names, 'found')}</div>"
             f"<figcaption>{html.escape(sample.name)}: {summary}</figcaption></figure>"
         )
-    text = f"Labelled on the left, found with a score of {CONFIDENCE} or more on the right."
-    body = "".join(figures) if figures else "<p>Everything was found as what it is.</p>"
+    text = f"Left: labels. Right: detections with a score of at least {CONFIDENCE}."
+    body = "".join(figures) if figures else "<p>All detections are correct.</p>"
     return _section("worst", "Worst images", f'<p>{text}</p><div class="show-mask show-box show-name">{body}</div>')
 
 

@@ -169,7 +169,7 @@ def epochs_done(run: Path) -> int:
             return int(torch_safe_load(name)[0]["epoch"]) + 1
     except WEIGHTS_ERRORS as error:
         raise InputError(
-            f"{run / LAST}: cannot be read ({type(error).__name__}): begin anew with --overwrite"
+            f"{run / LAST}: cannot be read ({type(error).__name__}): start again with --overwrite"
         ) from error
 
 
@@ -210,8 +210,8 @@ class _FixedStepsTrainer:
             return self.train_loader
         if hasattr(self, "train_loader"):  # Ultralytics would continue with half of the batch
             raise MissingResourceError(
-                f"the GPU's memory has run out with {self.job.plan.shape[1]} images of {self.args.imgsz} px a step: "
-                "give a smaller --batch or --size"
+                f"the GPU ran out of memory with {self.job.plan.shape[1]} images of {self.args.imgsz} px per step: "
+                "use a smaller --batch or --size"
             )
         with redirect_stdout(io.StringIO()):  # "verbose" does not silence this progress bar
             dataset = self.build_dataset(dataset_path, mode, batch_size)

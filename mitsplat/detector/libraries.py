@@ -90,7 +90,7 @@ def check_torchvision() -> None:
         import torchvision  # noqa: F401
     except (RuntimeError, ImportError, OSError) as error:
         raise MissingResourceError(
-            "torchvision cannot be imported, as it was built for another PyTorch: install both from the same place "
+            "torchvision cannot be imported, because it was built for another PyTorch: install both from one source "
             f"({str(error).splitlines()[0]})"
         ) from error
 
@@ -131,7 +131,7 @@ def torch_device(device: str) -> tuple[str, str]:
     if device == "cpu" or (device == "auto" and not count):
         return "cpu", "cpu"
     if not count:
-        raise MissingResourceError(f"{device} cannot be used, as PyTorch finds no GPU: use --device cpu")
+        raise MissingResourceError(f"{device} cannot be used, because PyTorch finds no GPU: use --device cpu")
     number = int(device.partition(":")[2] or 0)
     if number >= count:
         raise InputError(f"the GPUs that PyTorch finds are cuda:0 to cuda:{count - 1} (got {device})")
@@ -159,7 +159,7 @@ def read_network(model: str) -> tuple[str, bool]:
         raise InputError(f"--model must predict boxes or masks, such as yolo11n or yolo11n-seg (got {model}: {task})")
     head = str(content["head"][-1][-2])
     if "World" in head or "YOLOE" in head:
-        raise InputError(f"--model must tell classes by images alone, not by words (got {model}: {head})")
+        raise InputError(f"--model must not be an open-vocabulary network (got {model}: {head})")
     return name, task == "segment"
 
 
@@ -180,7 +180,7 @@ def check_weights(weights: Path, network: str, *, masks: bool, classes: int | No
     found = load_weights(weights)
     kind = SegmentationModel if masks else DetectionModel
     if classes not in (None, len(found.names)):
-        raise InputError(f"{weights}: must tell {classes} classes apart (got {len(found.names)})")
+        raise InputError(f"{weights}: must have {classes} classes (got {len(found.names)})")
     model = kind(network, nc=len(found.names), verbose=False)
     # The width of the class branch depends on the initial weights, whose number of classes may differ.
     model.load(found, verbose=False)
@@ -189,7 +189,7 @@ def check_weights(weights: Path, network: str, *, masks: bool, classes: int | No
         shapes = [tuple(tensors[name].shape) if name in tensors else None for tensors in (own, expected)]
         if shapes[0] != shapes[1]:
             raise InputError(
-                f"{weights}: does not fit {network}: {name} must have the shape {shapes[1] or 'of nothing'} "
+                f"{weights}: does not fit {network}: {name} must have the shape {shapes[1] or 'none'} "
                 f"(got {shapes[0] or 'none'})"
             )
 
@@ -216,7 +216,7 @@ def load_weights(path: Path) -> Any:
     from ultralytics.nn.tasks import load_checkpoint
 
     if not path.is_file() or path.suffix != ".pt":
-        raise InputError(f"--weights must be a file of Ultralytics (.pt) that is there (got {path})")
+        raise InputError(f"--weights must be an existing weights file of Ultralytics (.pt) (got {path})")
     try:
         with linked_weights(path) as name:
             return load_checkpoint(name)[0]

@@ -54,15 +54,19 @@ _SHIFT_LIMIT = 8.0
 _TRAITS: dict[str, tuple[str, str, str]] = {
     BRIGHTNESS: (
         "of 255",
-        "lower randomise.exposure, or light less",
-        "raise randomise.exposure, light objects more, or darken what lies around them",
+        "lower randomise.exposure, or use less light",
+        "raise randomise.exposure, use more light, or darken the surroundings of objects",
     ),
-    "saturation of objects": ("%", "lower randomise.saturation", "raise randomise.saturation, or give less gloss"),
-    SIZE: ("px", "take cameras farther away", "take cameras nearer"),
-    "objects of an image": ("", "lower objects[].count", "raise objects[].count, or show more of them at once"),
-    "objects cut by the border": ("% of an image's", "look at all of them, from farther", "let views cut more off"),
+    "saturation of objects": ("%", "lower randomise.saturation", "raise randomise.saturation, or reduce gloss"),
+    SIZE: ("px", "move cameras farther away", "move cameras nearer"),
+    "objects of an image": ("", "lower objects[].count", "raise objects[].count, or use wider views"),
+    "objects cut by the border": (
+        "% of an image's",
+        "aim views at all objects, from farther away",
+        "aim views less at the centre",
+    ),
     "brightness of images": ("of 255", "darken the backdrop", "brighten the backdrop"),
-    "noise of images": ("of 255", "lower randomise.iso, or expose more", "raise randomise.iso"),
+    "noise of images": ("of 255", "lower randomise.iso, or increase the exposure", "raise randomise.iso"),
 }
 """Unit of each trait, and the advice if photographs have lower or higher values."""
 
@@ -125,7 +129,7 @@ class Likeness:
         turned = list(self.hues.values())
         if not turned or np.median(np.abs(turned)) < _SHIFT_LIMIT:
             return ""
-        return "have the camera turn colours as far, by randomise.hue, and more by randomise.chroma_stretch"
+        return "shift the camera's hues as far with randomise.hue, and add randomise.chroma_stretch"
 
 
 def compare_with_photographs(
@@ -155,7 +159,7 @@ def compare_with_photographs(
     if size < 32:
         raise InputError(f"size must be 32 px or more (got {size})")
     if most < 1:
-        raise InputError(f"images of each side must be at least 1 (got {most})")
+        raise InputError(f"the number of images per side must be at least 1 (got {most})")
     real = read_set(photographs, "all")
     sets = [reorder_classes(read_set(one, split), real.class_names, str(photographs)) for one in rendered]
     if not sets:
@@ -306,7 +310,7 @@ def _trait(name: str, rendered: Sequence[tuple[int, float]], real: Sequence[tupl
     advice = {
         (True, False): less,
         (False, True): more,
-        (True, True): "photographs differ more among themselves: widen both ends of the range",
+        (True, True): "photographs vary more: widen the range at both ends",
     }
     quantiles = [(float(values[0]), float(values[1]), float(values[2])) for values in (ours, theirs)]
     below, above = outside.tolist()

@@ -18,9 +18,9 @@ MIN_NEAR_IOU = 0.1
 """Least IoU of a badly placed box with a label of its class."""
 
 ERROR_KINDS = {
-    "another_class": "taken for another class",
-    "nothing": "found where it is not",
-    "place": "boxes that do not fit",
+    "another_class": "wrong class",
+    "nothing": "false detection",
+    "place": "badly placed box",
     "missed": "missed",
 }
 """Kinds of errors and their descriptions."""

@@ -47,7 +47,7 @@ def cut_photographs(photographs: LabelledSet, real_size: int, size: int, folder:
         width, height = (max(round(side * size / real_size), 1) for side in (sample.width, sample.height))
         if min(width, height) < MIN_SIDE:
             raise InputError(
-                f"{sample.path}: a tile of it must have sides of {MIN_SIDE} px or more (got {width} x {height}): give "
+                f"{sample.path}: tiles must have sides of at least {MIN_SIDE} px (got {width} x {height}): use "
                 f"a --real-size nearer to --size, {size}"
             )
         masks = [

@@ -71,7 +71,7 @@ def check_image(path: Path) -> tuple[int, int, ContentHash]:
             turned = image.getexif().get(_ORIENTATION) in _TRANSPOSED
             form = image.format
     except IMAGE_ERRORS as error:
-        cause = "of no format that is known" if isinstance(error, UnidentifiedImageError) else error
+        cause = "unknown format" if isinstance(error, UnidentifiedImageError) else error
         raise InputError(f"{path}: cannot be read as an image ({cause})") from error
     if form in ("JPEG", "MPO") and not data.endswith(_JPEG_ENDS):
         raise InputError(f"{path}: {_jpeg_end_error(data)}")
@@ -80,7 +80,7 @@ def check_image(path: Path) -> tuple[int, int, ContentHash]:
     if turned:
         width, height = height, width
     if form in _DECODED_FORMATS and _decode(data, path).shape[:2] != (height, width):
-        raise InputError(f"{path}: must be read by OpenCV as by others, {width} x {height} px: save it as PNG")
+        raise InputError(f"{path}: OpenCV must decode it to {width} x {height} px, as Pillow does: save it as PNG")
     if min(width, height) < MIN_SIDE:
         raise InputError(f"{path}: an image must have sides of {MIN_SIDE} px or more (got {width} x {height})")
     return width, height, ContentHash(data)
@@ -95,5 +95,5 @@ def _jpeg_end_error(jpeg: bytes) -> str:
     except IMAGE_ERRORS:
         ends = -1
     if ends < 0:
-        return "is torn: a JPEG file must end with its end marker"
-    return f"has {len(jpeg) - ends - len(_JPEG_ENDS)} bytes after its end marker: cut them off, or save it anew"
+        return "is truncated: a JPEG file must end with its end marker"
+    return f"has {len(jpeg) - ends - len(_JPEG_ENDS)} bytes after its end marker: remove them, or save the image again"

@@ -68,7 +68,7 @@ class DetectionMatches:
         for detection in detections:
             if detection["image_id"] not in known or detection["category_id"] not in self._names:
                 raise InputError(
-                    "detections must be of images and classes that are labelled (got image "
+                    "detections must refer to images and classes of the labels (got image "
                     f"{detection['image_id']}, class {detection['category_id']})"
                 )
         with contextlib.redirect_stdout(io.StringIO()):  # pycocotools prints progress messages
@@ -92,7 +92,7 @@ class DetectionMatches:
         """
         ids = self.images if images is None else list(images)
         if not ids or not self._place.keys() >= set(ids):
-            raise InputError("images must be among those that are labelled, one or more")
+            raise InputError("images must be a non-empty list of labelled images")
         sample, total, params = copy(self._eval), len(self._place), copy(self._eval.params)
         places = [self._place[image] for image in ids]
         sample.evalImgs = [self._eval.evalImgs[k * total + i] for k in range(len(params.catIds)) for i in places]

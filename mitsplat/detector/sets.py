@@ -162,13 +162,13 @@ def read_set(path: str | Path, split: Split, progress: Progress | None = None) -
         raise InputError(f"{root}: must be the folder of a dataset (got {'a file' if root.exists() else 'nothing'})")
     if (root / "dataset.json").is_file():
         if not (root / "labels").is_dir():
-            raise InputError(f"{root}: a detector learns from its YOLO files: add yolo to output.formats of its scene")
+            raise InputError(f"{root}: training needs YOLO labels: add yolo to output.formats of the scene")
         classes = _class_names(_yaml(root / "data.yaml"), root / "data.yaml")
         return _yolo(root, "mitsplat", split, classes, {name: [f"images/{name}"] for name in SPLITS}, progress)
     if (root / "data.yaml").is_file():
         content = _yaml(root / "data.yaml")
         if "kpt_shape" in content:
-            raise InputError(f"{root / 'data.yaml'}: its labels are of keypoints (kpt_shape), not of boxes or masks")
+            raise InputError(f"{root / 'data.yaml'}: labels must be boxes or masks (got keypoints, kpt_shape)")
         base = str(content.get("path") or ".")
         entries = {name: content[name] for name in SPLITS if content.get(name)}
         listed = {
@@ -209,8 +209,8 @@ def check_masks(found: LabelledSet) -> None:
     for sample in found.samples:
         if not all(instance.has_mask for instance in sample.instances):
             raise InputError(
-                f"{found.root}: masks are to be learnt, but {sample.name} is labelled by boxes alone: "
-                "choose a model of boxes, such as yolo11n"
+                f"{found.root}: a mask model needs mask labels, but {sample.name} has only boxes: "
+                "choose a box model, such as yolo11n"
             )
 
 
@@ -233,7 +233,7 @@ def _class_names(content: dict[str, Any], path: Path) -> tuple[str, ...]:
     if isinstance(names, dict) and names.keys() == set(range(len(names))):
         names = [names[i] for i in range(len(names))]
     if not isinstance(names, list) or not names or len(set(map(str, names))) < len(names):
-        raise InputError(f"{path}: names must be different classes, numbered from 0 (got {str(names)[:80]})")
+        raise InputError(f"{path}: names must be distinct classes, numbered from 0 (got {str(names)[:80]})")
     return tuple(map(str, names))
 
 
@@ -252,11 +252,11 @@ def _yolo(
     if not images:
         sought = ", ".join(str(root / entry) for name in wanted for entry in listed[name])
         raise InputError(
-            f"{root}: there is no image for {split}"
+            f"{root}: there are no images for {split}"
             + (_split_counts_text(_split_counts(root, listed)) or f" in {sought}")
         )
     if not any(_label_file(image).is_file() for image in images):
-        raise InputError(f"{root}: there is no label of its images, such as {_label_file(images[0])}")
+        raise InputError(f"{root}: its images have no labels, such as {_label_file(images[0])}")
 
     def read(image: Path) -> Sample:
         width, height, content = check_image(image)
@@ -267,7 +267,7 @@ def _yolo(
             what = "a folder" if label.exists() else "a link to nothing"
             raise InputError(f"{label}: must be a file (got {what})")
         elif kind == "mitsplat":
-            raise InputError(f"{label}: is missing, though its image is there")
+            raise InputError(f"{label}: is missing, but its image exists")
         else:
             text = ""
         instances = tuple(_yolo_instances(text, label, len(classes), (width, height)))
@@ -355,7 +355,9 @@ def _clip_points(points: Float64Array, size: tuple[int, int], place: str) -> Flo
         np.isfinite(shares).all() and shares.min() >= -_OUTSIDE_TOLERANCE and shares.max() <= 1 + _OUTSIDE_TOLERANCE
     ):
         worst = shares.ravel()[np.abs(np.nan_to_num(shares.ravel(), nan=np.inf) - 0.5).argmax()]
-        raise InputError(f"{place}: must lie in the image, at 0 to 1 of its width and height (got {worst:.4g})")
+        raise InputError(
+            f"{place}: positions must lie in the image, at 0 to 1 of its width and height (got {worst:.4g})"
+        )
     return np.clip(points, 0, size)
 
 
@@ -384,11 +386,11 @@ def _coco_part(root: Path, split: Split, path: Path, content: dict[str, Any], pr
                     )
             by_image[annotation["image_id"]].append(annotation)
     except (KeyError, TypeError) as error:
-        raise InputError(f"{path}: is no COCO dataset of instances (key {error} is missing or wrong)") from error
+        raise InputError(f"{path}: must be a COCO dataset of instances (key {error} is missing or wrong)") from error
     if len(set(names)) < len(names) or len(index) < len(names) or len(by_image) < len(content["images"]):
         raise InputError(f"{path}: ids of images, and ids and names of categories, must differ")
     if not by_image:
-        raise InputError(f"{root}: there is no image for {split}")
+        raise InputError(f"{root}: there are no images for {split}")
     find = _image_finder(root, path)
 
     def read(image: dict[str, Any]) -> Sample:
@@ -396,8 +398,8 @@ def _coco_part(root: Path, split: Split, path: Path, content: dict[str, Any], pr
         width, height, shown = check_image(file)
         if (image.get("width"), image.get("height")) != (width, height):
             raise InputError(
-                f"{file}: must be as large as {path.name} says, {image.get('width')} x {image.get('height')} px, "
-                f"turned by its EXIF orientation (got {width} x {height})"
+                f"{file}: must have the size in {path.name}, {image.get('width')} x {image.get('height')} px, "
+                f"after EXIF orientation (got {width} x {height})"
             )
         found = by_image[image["id"]]
         instances = tuple(_coco_instance(a, index[a["category_id"]], (width, height), path) for a in found)
@@ -534,5 +536,5 @@ def _read_samples(
         if progress is not None:
             progress(number, len(images), f"reading {root.name}")
     if not any(sample.instances for sample in samples):
-        raise InputError(f"{root}: nothing is labelled in its {len(samples)} images")
+        raise InputError(f"{root}: its {len(samples)} images have no labels")
     return tuple(samples)

@@ -93,7 +93,7 @@ class TrainSettings:
         if not 0 < self.share < 1:
             raise InputError(f"share of real images must lie between 0 and 1 (got {self.share:g})")
         if self.real_size is not None and self.real_size < self.size:
-            raise InputError(f"real_size must be no less than size, {self.size} px (got {self.real_size})")
+            raise InputError(f"real_size must be at least size, {self.size} px (got {self.real_size})")
         check_device(self.device)
         if self.weights is not None:
             object.__setattr__(self, "weights", Path(self.weights))
@@ -162,11 +162,11 @@ def train_detector(
     """
     settings, out = settings or TrainSettings(), Path(out)
     if not datasets:
-        raise InputError("there must be a dataset to learn from (got none)")
+        raise InputError("training needs at least one dataset (got none)")
     if settings.real_size is not None and real is None:
-        raise InputError("--real-size is that of photographs: name them by --real")
+        raise InputError("--real-size needs photographs: give them with --real")
     if settings.weights is not None and not settings.weights.is_file():
-        raise InputError(f"--weights must be a file of Ultralytics (.pt) that is there (got {settings.weights})")
+        raise InputError(f"--weights must be an existing weights file of Ultralytics (.pt) (got {settings.weights})")
     if not (out / RUN).is_file():
         check_folder(out, "a run")
     load_libraries()
@@ -229,7 +229,7 @@ def read_sets(
         found.append(read_set(real, "train", progress))
     for one in found:
         if all(instance.crowd for sample in one.samples for instance in sample.instances):
-            raise InputError(f"{one.root}: nothing but crowds is labelled, from which nothing can be learnt")
+            raise InputError(f"{one.root}: all labels are crowds, which cannot be used for training")
     found = [reorder_classes(one, found[0].class_names, str(found[0].root)) for one in found]
     if masks:
         for one in found:
@@ -340,7 +340,7 @@ def _read_run(path: Path) -> Run | None:
     except (OSError, ValueError) as error:
         raise InputError(f"{path / RUN}: cannot be read ({error})") from error
     if not isinstance(record, dict) or not {"settings", "classes", "masks"} <= record.keys():
-        raise InputError(f"{path / RUN}: is not what `mitsplat train` writes")
+        raise InputError(f"{path / RUN}: must be a file written by `mitsplat train`")
     return Run(path, record)
 
 
@@ -357,7 +357,7 @@ def _existing_run(out: Path, record: dict[str, Any]) -> Run | None:
         f"other images of {name}" for name in _SET_KEYS if _digests(kept.record.get(name)) != _digests(record[name])
     ]
     if differences:
-        raise InputError(f"{out}: was begun with {', '.join(differences)}: give another folder, or --overwrite")
+        raise InputError(f"{out}: was started with {', '.join(differences)}: choose another folder, or use --overwrite")
     return kept
 
 
@@ -376,7 +376,7 @@ def check_folder(out: Path, kind: str, own: Collection[str] = ()) -> None:
         raise InputError(f"{out}: must be a folder (got a file)")
     names = sorted(path.name for path in out.iterdir()) if out.is_dir() else []
     if strange := [name for name in names if not name.startswith(".") and name not in own]:
-        raise InputError(f"{out}: holds something else than {kind} (got {strange[0]}): give another folder")
+        raise InputError(f"{out}: must contain only {kind} (got {strange[0]}): choose another folder")
 
 
 def _check_separate(out: Path, found: LabelledSet) -> None:
@@ -384,7 +384,7 @@ def _check_separate(out: Path, found: LabelledSet) -> None:
     folder = out.resolve()
     for path in (found.root, *(sample.path for sample in found.samples)):
         if path.resolve().is_relative_to(folder):
-            raise InputError(f"{out}: must not hold what is learnt from (got {path}): give another folder")
+            raise InputError(f"{out}: must not contain training images (got {path}): choose another folder")
 
 
 def _clear(out: Path) -> None:
@@ -403,7 +403,9 @@ def _locked(out: Path) -> Iterator[None]:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
-            raise InputError(f"{out}: another training is at work in it") from error
+            raise InputError(f"{out}: another training is running in this folder") from error
         if links := [out / name for name in sorted(_RUN_FILES) if (out / name).is_symlink()]:
-            raise InputError(f"{links[0]}: must not be a link, for a run is written in its own folder; remove it")
+            raise InputError(
+                f"{links[0]}: must not be a link, because a run is written only in its own folder: remove the link"
+            )
         yield

@@ -76,7 +76,7 @@ def find_maps(folder: Path, photos: Sequence[Photo], kind: DepthKind = "inverse"
             files[photo.name] = path
     if not files:
         example = Path(photos[0].name).with_suffix(".png") if photos else "PHOTO.png"
-        raise InputError(f"{folder}: must hold a depth map of one photo at least, such as {example} (got none)")
+        raise InputError(f"{folder}: must contain a depth map of at least one photo, such as {example} (got none)")
     return DepthMaps(files, kind)
 
 
@@ -103,7 +103,7 @@ def read_map(path: Path) -> Float32Array:
     if values.ndim != 2 or values.size == 0:
         raise InputError(f"{path}: a depth map must have one channel, shape (H, W) (got shape {values.shape})")
     if not np.isfinite(values).all():
-        raise InputError(f"{path}: depths must be finite (got {np.count_nonzero(~np.isfinite(values))} that are not)")
+        raise InputError(f"{path}: depths must be finite (got {np.count_nonzero(~np.isfinite(values))} others)")
     return values
 
 
@@ -146,14 +146,14 @@ def align_maps(
         except InputError as error:
             raise InputError(f"{path}: {error}") from None
         if isinstance(inverse, str):
-            unused.setdefault(f"depth maps that are left out, because {inverse}", []).append(photo.name)
+            unused.setdefault(f"depth maps that are not used, because {inverse}", []).append(photo.name)
         else:
             height, width = inverse.shape
             scale = min(1.0, size / max(width, height))
             found[photo.name] = resize_map(inverse, max(1, round(scale * width)), max(1, round(scale * height)))
     warnings = tuple(f"{what}: {', '.join(names)}" for what, names in unused.items())
     if not found:
-        raise InputError(f"no depth map is of use: {'; '.join(warnings)}")
+        raise InputError(f"no depth map can be used: {'; '.join(warnings)}")
     return found, warnings
 
 

@@ -182,7 +182,7 @@ class FitFolder:
             return
         for there in (self.path / "splats.ply", self.held_out):
             if there.exists():
-                raise InputError(f"{there}: is there already, and not of a fit; --overwrite replaces it")
+                raise InputError(f"{there}: exists already and does not belong to a fit; --overwrite replaces it")
 
     def begin(self, *, goes_on: bool) -> None:
         """Remove the files of an earlier fit, the record first; keep the checkpoint if the fit resumes from it."""

@@ -203,7 +203,7 @@ def fit_capture(
     training, held_out = _usable_photos(capture.training, settings), _usable_photos(capture.held_out, settings)
     if not (training and held_out):
         raise InputError(
-            "a fit needs a photo to learn from and a held-out one, with masks if any has one "
+            "a fit needs a training photo and a held-out photo, with masks if any photo has one "
             f"(got {len(training)} of {len(capture.training)} and {len(held_out)} of {len(capture.held_out)})"
         )
     validation: tuple[Photo, ...] = ()
@@ -547,7 +547,7 @@ def _split_validation(training: tuple[Photo, ...]) -> tuple[tuple[Photo, ...], t
         InputError: If there is only one photo.
     """
     if len(training) < 2:
-        raise InputError(f"a target takes at least two photos besides the held-out ones (got {len(training)})")
+        raise InputError(f"target_psnr needs at least two photos besides the held-out ones (got {len(training)})")
     validation = training[HELD_OUT_EVERY // 2 :: HELD_OUT_EVERY] or training[-1:]
     return tuple(photo for photo in training if photo not in validation), validation
 

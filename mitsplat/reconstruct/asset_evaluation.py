@@ -48,15 +48,15 @@ class Thresholds:
 
 
 _ADVICE = {
-    "registered": "take photos with more overlap, 10 to 15 degrees apart, and put texture such as newsprint under it",
+    "registered": "take photos with more overlap, 10 to 15 degrees apart, and put newsprint or another texture below",
     "psnr": "use even light, fixed exposure and sharp photos, and fit longer",
-    "splat_iou": "check the masks in the report, and give better ones",
+    "splat_iou": "check the masks in the report, and replace bad ones",
     "mesh_iou": "check the masks in the report, and photograph the object from more heights",
     "watertight": "photograph the object from all sides, or import a closed mesh",
     "offset": "fit longer, or check the frame and scale of an imported mesh",
-    "scale_error": "measure a longer distance, or put a board beside the object that more photos see",
-    "surface": "check masks and splats in the report, give better masks, or fit longer",
-    "lost": "check whether masks leave parts of the object out",
+    "scale_error": "measure a longer distance, or place the board where more photos see it",
+    "surface": "check masks and splats in the report, replace bad masks, or fit longer",
+    "lost": "check for parts of the object outside the masks",
 }
 
 
@@ -171,14 +171,14 @@ class Verdict:
     def misses(self, thresholds: Thresholds = Thresholds()) -> tuple[str, ...]:
         """Return a sentence with advice for each threshold that is missed."""
         least = {
-            "registered": f"only {self.photos} of {self.photos + self.rejected} photos found their camera",
-            "psnr": f"held-out photos are met at only {self.psnr or 0:.1f} dB",
-            "splat_iou": f"the splats meet held-out masks with an IoU of only {self.splat_iou or 0:.3f}",
-            "mesh_iou": f"the mesh meets held-out masks with an IoU of only {self.mesh_iou or 0:.3f}",
+            "registered": f"only {self.photos} of {self.photos + self.rejected} photos have a camera pose",
+            "psnr": f"held-out photos have a PSNR of only {self.psnr or 0:.1f} dB",
+            "splat_iou": f"the splats have an IoU with held-out masks of only {self.splat_iou or 0:.3f}",
+            "mesh_iou": f"the mesh has an IoU with held-out masks of only {self.mesh_iou or 0:.3f}",
         }
         most = {
-            "offset": f"mesh and splats are {self.offset or 0:.2%} of the diagonal apart",
-            "scale_error": f"the scale is known to {self.scale_error or 0:.1%} only",
+            "offset": f"the shift between mesh and splats is {self.offset or 0:.2%} of the diagonal",
+            "scale_error": f"the error of the scale is {self.scale_error or 0:.1%}",
             "lost": f"isolation removed {self.lost or 0:.1%} of the object",
         }
         found = []
@@ -188,14 +188,14 @@ class Verdict:
                 if value is not None and sign * value < sign * limit:
                     rule = "at least" if sign > 0 else "at most"
                     wanted = f"{100 * limit:g}%" if "%" in sentence else f"{limit:g}"
-                    found.append(f"{sentence} ({rule} {wanted} is wanted): {self._advice(name)}")
+                    found.append(f"{sentence} ({rule} {wanted} is required): {self._advice(name)}")
         if self.surface_faults:
             found.append(
                 f"the mesh is only the {self.surface}, because {', and '.join(self.surface_faults)}: "
                 f"{self._advice('surface')}"
             )
         if self.solid and not self.watertight:
-            found.append(f"the mesh is open (a closed one is wanted): {self._advice('watertight')}")
+            found.append(f"the mesh is open (a closed mesh is required): {self._advice('watertight')}")
         return (*found, *self.findings)
 
     def _advice(self, name: str) -> str:

@@ -70,11 +70,13 @@ class AssetJob:
     def __post_init__(self) -> None:
         check_refinable(self.settings, self.kind, self.imported)
         if self.remove and self.kind != "environment":
-            raise InputError("things are removed from an environment only: give --kind environment, or leave it out")
+            raise InputError("things can be removed only from an environment: use --kind environment, or omit --remove")
         if self.remove and self.imported is not None:
-            raise InputError("things cannot be removed from an imported mesh: leave out either")
+            raise InputError("things cannot be removed from an imported mesh: omit one of the two")
         if self.delight is not None and self.kind != "object":
-            raise InputError("colours of objects only are freed of light: an environment is rendered in its own")
+            raise InputError(
+                "light can be removed only from the colours of objects: an environment keeps its captured light"
+            )
 
 
 @dataclass(frozen=True)
@@ -119,7 +121,7 @@ def reconstruct_job(
     """
     light = None if job.delight is None else LightFile.load(job.delight)
     if light is not None and capture.up != "z":
-        raise InputError(f"{light.path}: lights are in a frame whose z is up, which the capture does not know")
+        raise InputError(f"{light.path}: lights need a capture with a known vertical direction (got up: unknown)")
     made = reconstruct_asset(
         capture, splats, name=job.name, class_name=job.class_name, kind=job.kind, settings=job.settings,
         imported=job.imported, psnr=psnr, progress=progress,
@@ -130,7 +132,7 @@ def reconstruct_job(
 def delight_asset(made: Reconstruction, light: LightFile, table: bool, progress: Progress | None) -> Reconstruction:
     """Remove the effect of light from the colours of an asset, and add the result to the verdict."""
     if progress is not None:
-        progress(0, 1, "freeing colours of light")
+        progress(0, 1, "removing light from colours")
     if made.asset.mesh is None:
         return made
     turn = np.eye(4)  # from the asset's frame to the axes of the capture, which the lights share
@@ -245,7 +247,7 @@ def make_asset(
     write_asset_report(out, capture, result)
     # Written last, so that an interrupted run does not look finished.
     _save_verdict(out, result, inputs)
-    warnings = () if edited is None else (f"{ASSET_FILE} had been edited: as it was, it is {edited.name} now",)
+    warnings = () if edited is None else (f"{ASSET_FILE} had been edited: the edited file is now {edited.name}",)
     return AssetResult(out, result.verdict, kept=False, warnings=warnings)
 
 
@@ -258,7 +260,7 @@ def refuse_to_replace(out: Path, splats: Path) -> None:
     known = any((out / name).exists() for name in (ASSET_FILE, REPORT_FILE))
     for name in ("splats.ply", "mesh.ply", "pieces.ply"):
         if (out / name).resolve() == splats.resolve() or ((out / name).exists() and not known):
-            raise InputError(f"{out / name}: would be replaced: choose another folder for the asset")
+            raise InputError(f"{out / name}: would be replaced: choose another output folder")
 
 
 def _edited_backup(out: Path) -> Path | None:

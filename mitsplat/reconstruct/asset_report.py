@@ -82,7 +82,7 @@ def _verdict(result: Reconstruction) -> str:
             f"{removed.floaters} floaters"
         )
     rows |= found.rows
-    table = verdict_of(misses, "Every threshold is met.", rows)
+    table = verdict_of(misses, "All thresholds are met.", rows)
     return f'<section aria-labelledby="verdict"><h2 id="verdict">Verdict</h2>{table}</section>'
 
 
@@ -104,8 +104,8 @@ def _held_out(views: Sequence[HeldOutView]) -> str:
         )
         figures.append(f'<h3>{html.escape(view.name)}</h3><div class="row">{images}</div>')
     note = (
-        f"Photos that nothing was fitted to, and the asset seen from their cameras. Yellow lines outline the masks; "
-        f"in differences white is an error of {_MAX_DIFFERENCE:g} of the range."
+        f"Photos that were not fitted, and the asset from their cameras. Yellow lines outline the masks; "
+        f"in difference images, white is an error of {_MAX_DIFFERENCE:g} of the range."
     )
     return (
         f'<section aria-labelledby="held-out"><h2 id="held-out">Held-out views</h2><p>{note}</p>'

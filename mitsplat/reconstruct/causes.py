@@ -51,14 +51,14 @@ def find_causes(capture: Capture, pictures: Pictures) -> dict[str, str]:
     own = masked_points(capture, pictures)
     if len(capture.points) and len(own) < _MIN_POINTS:
         add_cause(
-            f"photos share only {len(own)} points on it, because it has little texture: dust it or put patterns on it, "
+            f"photos share only {len(own)} points on the object, because it has little texture: add dust or patterns, "
             "or import a mesh",
             *("psnr", "mesh_iou", "offset", "surface", "watertight"),
         )
     elif capture.table and (share := share_on_support(own)) > _MAX_SUPPORT_SHARE:
         add_cause(
-            f"{share:.0%} of the points that its masks show lie in the surface under it, so that masks include that: "
-            "photograph it on another surface, or pick it",
+            f"{share:.0%} of the points inside the masks lie in the support surface, so masks seem to include it: "
+            "photograph the object on another surface, or pick it",
             *("splat_iou", "mesh_iou", "offset", "surface", "lost", "watertight"),
         )
     return {name: "; ".join(causes) for name, causes in found.items()}
@@ -120,7 +120,7 @@ def missing_views(offsets: Float64Array) -> list[str]:
     sectors = round(360 / _SECTOR)
     found = []
     for low, high in _ELEVATION_BANDS:
-        where = f"{low:.0f} to {high:.0f} degrees above it"
+        where = f"{low:.0f} to {high:.0f} degrees above the object"
         inside = (heights >= low) & (heights < high)
         if not inside.any():
             found.append(where)
@@ -129,7 +129,7 @@ def missing_views(offsets: Float64Array) -> list[str]:
         start, length = _longest_gap(taken)
         if low < _ELEVATION_BANDS[-1][0] and length >= _MIN_GAP_SECTORS:
             turn = start * _SECTOR
-            found.append(f"{where}, {turn:.0f} to {(turn + length * _SECTOR) % 360:.0f} degrees around it")
+            found.append(f"{where}, {turn:.0f} to {(turn + length * _SECTOR) % 360:.0f} degrees around the object")
     return found
 
 

@@ -90,7 +90,7 @@ class LightFile:
         found = cls(path, tuple(load_yaml(path, CapturedLights).lights))
         for file in found.files[1:]:
             if not file.is_file():
-                raise InputError(f"{path}: there is no image {file}")
+                raise InputError(f"{path}: the image {file} does not exist")
         return found
 
     @property
@@ -153,18 +153,18 @@ def delight(splats: Splats, mesh: trimesh.Trimesh, light: LightFile, *, table: b
         return Delighting(changed, gain is not None, uneven, slope, borne_out, told)
 
     if uneven < _EVEN_DEVIATION:
-        return done(f"its irradiance differs by {uneven:.1%}: colours are left as they are")
+        return done(f"irradiance varies by {uneven:.1%}: colours are unchanged")
     if min(slope, *borne_out) < MIN_SLOPE:
         lamps = "".join(f", lamp {number} {value:.2f}" for number, value in enumerate(borne_out, start=1))
         return done(
-            f"its irradiance differs by {uneven:.0%}, but colours do not follow it (slope {slope:.2f}{lamps}; "
-            f"at least {MIN_SLOPE:g} is required) and are left as they are: were the lights measured at the position "
-            "of the object, in the capture's frame?"
+            f"irradiance varies by {uneven:.0%}, but colours do not follow it (slope {slope:.2f}{lamps}; "
+            f"at least {MIN_SLOPE:g} is required) and are unchanged: were the lights measured at the position of "
+            "the object, in the capture's frame?"
         )
     mean = np.average(total_irradiance[own], axis=0, weights=area[own])
     gain = np.where(lit[:, None], mean / np.maximum(total_irradiance, 1e-12), 1.0)
     return done(
-        f"its irradiance differed by {uneven:.0%}, and colours with it (slope {slope:.2f}): it is taken out of them",
+        f"irradiance varied by {uneven:.0%}, and colours with it (slope {slope:.2f}): it was removed from colours",
         gain.clip(1 / _MAX_GAIN, _MAX_GAIN),
     )
 

@@ -92,7 +92,7 @@ def find_proxy_surface(
         except InputError as error:
             if source == CONVEX and not found:
                 raise
-            faults.append(f"the {source} is none: {error}")
+            faults.append(f"the {source} could not be made: {error}")
             continue
         overlap, fault = _check_surface(mesh, splats, seen)
         if fault is None:
@@ -112,7 +112,7 @@ def _check_surface(mesh: trimesh.Trimesh, splats: Splats, views: Sequence[Masked
         np.mean([iou(one.mesh & view.known, view.mask >= 0.5) for one, view in zip(shown, views, strict=True)])
     )
     if overlap < MIN_MASK_IOU:
-        return overlap, f"meets the masks with an IoU of only {overlap:.2f}"
+        return overlap, f"has an IoU with the masks of only {overlap:.2f}"
     spread = measure_offset(mesh, surface_points(splats, [view.camera for view in views])).spread
     if spread > MAX_SPREAD:
         return overlap, f"is {spread:.1%} of the diagonal from the splats"

@@ -128,7 +128,7 @@ def reconstruct_asset(
             mesh that was not reconstructed from masks, or masks and splats do not match.
     """
     if settings.size is not None and capture.units == "metre":
-        raise InputError(f"{name}: the capture is in metres already: it takes no size (got {settings.size:g} m)")
+        raise InputError(f"{name}: the capture is already in metres and must have no size (got {settings.size:g} m)")
     check_refinable(settings, kind, imported)
     pictures = [sized_photo(photo, settings.view_size) for photo in capture.training]
     isolation = None
@@ -156,7 +156,7 @@ def reconstruct_asset(
         mesh, alignment = _place_mesh(imported, splats, cameras)
         mesh = simplify_surface(mesh, settings.surface.faces)
     if progress is not None:
-        progress(0, 1, "judging by held-out photos")
+        progress(0, 1, "evaluating held-out photos")
     held_out = show_held_out(splats, mesh, capture.held_out, settings.verdict_size)
     causes = None
     if kind == "object":
@@ -201,7 +201,7 @@ def check_refinable(settings: ReconstructSettings, kind: str, imported: Imported
         InputError: If refinement is requested for any other mesh.
     """
     if settings.refine is not None and (kind != "object" or imported is not None):
-        raise InputError("only the mesh of an object that is reconstructed by its masks is refined")
+        raise InputError("only the mesh of an object that is reconstructed from masks can be refined")
 
 
 _MAX_SHARE_BELOW = 0.02

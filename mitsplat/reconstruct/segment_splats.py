@@ -77,7 +77,7 @@ class MaskedView:
     def __post_init__(self) -> None:
         """Check the shape of the mask."""
         if self.mask.shape != (self.camera.height, self.camera.width):
-            raise ValueError(f"a mask must be of its camera's {self.camera.height} x {self.camera.width} px")
+            raise ValueError(f"a mask must have its camera's size, {self.camera.height} x {self.camera.width} px")
 
     @property
     def possible(self) -> Float32Array:
@@ -130,7 +130,7 @@ def isolate_object(
         InputError: If there are no views, or no Gaussian is left.
     """
     if not views:
-        raise InputError("masks are needed to isolate an object (got no view with one)")
+        raise InputError("isolation of an object needs views with masks (got none)")
     visible_weights = VisibleWeights(splats)
     weights = np.zeros((len(splats), 2))
     for done, view in enumerate(views, 1):
@@ -146,7 +146,7 @@ def isolate_object(
     kept = inside & ~needles
     kept[floating] = False
     if not kept.any():
-        raise InputError("no Gaussian lies inside the masks: are these masks of this capture?")
+        raise InputError("no Gaussian lies inside the masks: do the masks belong to this capture?")
     isolated = splats.select(kept)
     return Isolation(
         splats=isolated,

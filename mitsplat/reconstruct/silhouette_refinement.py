@@ -104,12 +104,14 @@ class RefinedMesh:
     def __str__(self) -> str:
         """Return the result as one clause."""
         if not self.judges:
-            return f"dropped: it takes masks from {_MIN_VIEWS} places outside of the mesh"
+            return f"rejected: refinement needs masks from {_MIN_VIEWS} positions outside the mesh"
         if not np.isfinite(self.after):
-            return "dropped: it broke the mesh"
-        outcome = "kept" if self.kept else "dropped" if self.after >= self.before else "dropped, as it may be chance"
+            return "rejected: the refined mesh is invalid"
+        outcome = (
+            "accepted" if self.kept else "rejected" if self.after >= self.before else "rejected, as not significant"
+        )
         return (
-            f"{outcome}: silhouettes and masks of the {self.judges} photos that decide differ by "
+            f"{outcome}: silhouettes and masks of the {self.judges} validation photos differ by "
             f"{self.before:.2%} of the object before and by {self.after:.2%} after"
         )
 

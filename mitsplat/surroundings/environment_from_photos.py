@@ -166,7 +166,7 @@ def reconstruct_surroundings(
         "Frame": f"{'in metres' if made.asset.units == 'metre' else 'in unknown units'}{error}"
         + (f", by {source}" if source else ""),
         "Removed Gaussians": ", ".join(f"{count} {reason}" for reason, count in removed.items()),
-        "Background": f"{int(background.sum())} Gaussians far beyond what the cameras look at, which are kept",
+        "Background": f"{int(background.sum())} Gaussians far behind the focus of the cameras, which are kept",
     }
     findings, sections, record = list[str](), list[str](), dict[str, Any]()
     if found:
@@ -197,18 +197,18 @@ def reconstruct_surroundings(
         ]
         if region is not None and made.asset.units == "metre":
             light = _estimate_light(found[0], fitted, capture, standing, scale, factor)
-            rows["Light"] = "not told by shadows" if light is None else _light_text(light)
+            rows["Light"] = "not determined by shadows" if light is None else _light_text(light)
             seen = [photo.camera for photo in capture.transformed(larger).photos]
             record["scene"] = scene_text(job.name, "{folder}", supports, region, seen, light)
     else:
         findings.append(
-            "no level surface was found for things to stand on (one is wanted): photograph the table from above as "
+            "no level surface was found for things to stand on (one is required): photograph the table from above as "
             "well, and put texture on it"
         )
     if made.asset.units != "metre":
         findings.append(
-            "how large it is is unknown, so that there is no scene file: lay a board of `mitsplat board` on the table, "
-            "or give --scale-from"
+            "the scale is unknown, so no scene file was written: put a board of `mitsplat board` on the table, "
+            "or use --scale-from"
         )
     # The PSNR is that of the asset after all changes, not that of the fit.
     shown = mean_psnr(made.held_out) if made.held_out else psnr
@@ -247,7 +247,7 @@ def _light_text(light: ShadingLight) -> str:
         x, y, z = lamp.position
         turn, rise = np.degrees(np.arctan2(y, x)) % 360, np.degrees(np.arctan2(z, np.hypot(x, y)))
         texts.append(f"a lamp at azimuth {turn:.0f}°, elevation {rise:.0f}°")
-    return f"{', '.join(texts)}; {light.ambient_share:.0%} from all sides, as shadows on the support tell"
+    return f"{', '.join(texts)}; {light.ambient_share:.0%} ambient light, estimated from shadows on the support"
 
 
 def _typical_depth(capture: Capture) -> float:
@@ -298,8 +298,8 @@ def _rows(
 ) -> dict[str, str]:
     first = supports[0]
     rows = {
-        "Support": f"{first.size[0]:.3g} x {first.size[1]:.3g} {unit}, {first.filled:.0%} of it seen as flat, rough by "
-        f"{first.roughness:.2g} {unit}; {first.looked_at:.0%} of the photos' middles show it"
+        "Support": f"{first.size[0]:.3g} x {first.size[1]:.3g} {unit}, {first.filled:.0%} of it visible as flat, "
+        f"roughness {first.roughness:.2g} {unit}; {first.looked_at:.0%} of the photos' central points lie on it"
     }
     if len(supports) > 1:
         rows["Other level surfaces"] = "; ".join(
@@ -321,7 +321,7 @@ def _hole_text(hole: Hole, factor: float, unit: str) -> str:
     x, y = (factor * value for value in hole.middle)
     place = f"{factor**2 * hole.area:.2g} {unit}² around x {x:.2f}, y {y:.2f}"
     if hole.near is None:
-        return f"{place}, which things hide from everywhere: move them"
+        return f"{place}, hidden from all directions by things: move them"
     return f"{place}: photograph it from near {hole.near}, {hole.height:.0f} degrees above it (shows {hole.shown:.0%})"
 
 
@@ -329,11 +329,11 @@ def _removal_text(thing: RemovedThing, factor: float, unit: str) -> str:
     """Describe a removed thing and the filled area as a clause."""
     size = " x ".join(f"{factor * edge:.2g}" for edge in thing.high - thing.low)
     x, y = (factor * 0.5 * (thing.low + thing.high))[:2]
-    copied = "copies of what is around" if thing.copied > 0.99 else f"copies of what is around ({thing.copied:.0%})"
+    copied = "copies of the surroundings" if thing.copied > 0.99 else f"copies of the surroundings ({thing.copied:.0%})"
     behind = f" and {factor**2 * thing.behind:.2g} {unit}² of a wall behind it" if thing.behind else ""
     return (
         f"{size} {unit} around x {x:.2f}, y {y:.2f} of surface {thing.support} ({thing.pick}), {thing.gaussians} "
-        f"Gaussians; {factor**2 * thing.area:.2g} {unit}²{behind} that it hid are invented, of {copied}"
+        f"Gaussians; {factor**2 * thing.area:.2g} {unit}²{behind} hidden by it are synthesised from {copied}"
     )
 
 
@@ -352,14 +352,14 @@ def _findings(
 ) -> list[str]:
     found = []
     if coverage.hidden.mean() > _MAX_HIDDEN_SHARE:
-        places = "; ".join(_hole_text(hole, factor, unit) for hole in holes) or "it is in many small parts: add photos"
+        places = "; ".join(_hole_text(hole, factor, unit) for hole in holes) or "in many small parts: add photos"
         found.append(
             f"{coverage.hidden.mean():.0%} of the support is in fewer than {MIN_PHOTOS} photos "
-            f"(at most {_MAX_HIDDEN_SHARE:.0%} is wanted): {places}"
+            f"(at most {_MAX_HIDDEN_SHARE:.0%} is allowed): {places}"
         )
     if region is None or (metric and min(region[1] - region[0], region[3] - region[2]) < _MIN_REGION):
         found.append(
-            f"no free place of {_MIN_REGION:g} x {_MIN_REGION:g} m is left on the support: clear it, or "
+            f"the support has no free area of {_MIN_REGION:g} x {_MIN_REGION:g} m: clear the support, or "
             "write the scene's region by hand"
         )
     return found
@@ -373,9 +373,9 @@ def _support_map(coverage: Coverage, filled: BoolArray) -> str:
     tint[coverage.hidden] = (0.85, 0.3, 0.25)
     tint[filled] = (0.9, 0.75, 0.3)
     picture = np.repeat(np.repeat(tint.transpose(1, 0, 2)[::-1], 5, axis=0), 5, axis=1)
-    invented = ", yellow was hidden by things that were removed and is invented" if filled.any() else ""
+    invented = ", yellow was hidden by removed things and is synthesised" if filled.any() else ""
     note = (
-        "The surface that things stand on, from above, x to the right and y up: green is free, dark is covered, red is "
+        "The support from above, x to the right and y up: green is free, dark is covered, red is visible "
         f"in fewer than {MIN_PHOTOS} photos{invented}."
     )
     return (
@@ -403,7 +403,7 @@ def _write_scene(done: AssetResult, before: str | None) -> AssetResult:
     if text is None:
         return done
     if path.exists() and path.read_text() not in (text, before):
-        changed = f"{path}: holds another scene and is kept as it is; remove it to have it written anew"
+        changed = f"{path}: contains another scene and was not replaced; remove it to write a new one"
         return replace(done, scene=path, warnings=(*done.warnings, changed))
     write_text(path, text)
     return replace(done, scene=path)

@@ -74,7 +74,7 @@ def _lights(light: ShadingLight, support: Support) -> str:
     whole = light.ambient + np.sum([lamp.irradiance for lamp in light.lamps], axis=0)
     white = np.pi / float(whole @ LUMINANCE)
     middle = support.pose[:3, 3].round(3) + 0.0
-    lines = ["lights:  # told by the shadows on the table; `mitsplat lights` measures those of yours"]
+    lines = ["lights:  # estimated from shadows on the table; `mitsplat lights` measures yours"]
     for lamp in light.lamps:
         away = float(np.linalg.norm(lamp.position))
         radiance = white * lamp.irradiance * away**3 / (lamp.size**2 * lamp.position[2])
@@ -125,7 +125,7 @@ region: {{min: [{x0}, {y0}, 0.04], max: [{x1}, {y1}, 0.25]}}
 enclosure: {{margin: {margin}}}
 settle: {{stepper: mujoco}}
 
-camera:  # about as the photos were taken
+camera:  # similar to the cameras of the photos
   kind: hemisphere
   target: [{tx}, {ty}, 0.02]
   radius: [{near}, {far}]
@@ -137,6 +137,6 @@ camera:  # about as the photos were taken
 output: {{width: 960, height: 540, layouts: 4, views: 3, image: jpg}}
 """
 _ROOM_LIGHTS = """\
-lights:  # of a room; `mitsplat lights` makes those of yours
+lights:  # a generic room; `mitsplat lights` measures yours
   - {kind: area, position: [0.5, -0.4, 1.6], target: [0, 0, 0], size: [0.6, 0.6], radiance: 10}
   - {kind: environment, radiance: 0.4}"""

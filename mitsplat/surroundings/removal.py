@@ -152,7 +152,7 @@ def _remove_thing(
     )
     thing, others = _separate_thing(support.local(places), loose, spot, support, scale)
     if thing is None:
-        raise InputError(f"{pick}: the photos do not show enough of what is there to tell it from the rest")
+        raise InputError(f"{pick}: the photos do not show enough of the thing to separate it from its surroundings")
     standing, footprint, hole = _hidden_cells(ground, thing, others, scale)
     gone = _thing_gaussians(splats.transformed(inverse), thing, others, grid, footprint, hole, scale)
     sheet, copied = _fill_hole(ground, standing, hole)
@@ -251,7 +251,7 @@ def _find_pick(
         if above and (np.abs(local[:2]) <= np.array(support.size) / 2).all():
             found, lowest = number, float(local[2])
     if found < 0:
-        raise InputError(f"{pick}: what is to be removed must stand on a level surface that was found")
+        raise InputError(f"{pick}: a thing to remove must stand on one of the detected level surfaces")
     return found, supports[found].local(spot)
 
 

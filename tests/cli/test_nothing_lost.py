@@ -159,7 +159,7 @@ def test_frames_are_there_until_others_are(tmp_path: Path) -> None:
 @pytest.mark.parametrize("there", ["splats.ply", "held_out/photo.png"])
 def test_a_fit_refuses_a_folder_of_others(tmp_path: Path, there: str) -> None:
     write_text(tmp_path / there, "precious")
-    with pytest.raises(InputError, match="is there already, and not of a fit; --overwrite replaces it"):
+    with pytest.raises(InputError, match="exists already and does not belong to a fit; --overwrite replaces it"):
         FitFolder(tmp_path, "inputs").refuse_others()
     write_text(tmp_path / "fit.json", "{}")
     FitFolder(tmp_path, "inputs").refuse_others()

@@ -54,7 +54,7 @@ def test_fit_takes_depth_maps_of_a_folder_or_of_a_network(
     fit_capture: Calls, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     monkeypatch.setattr(Capture, "load", lambda folder: SimpleNamespace(training="photos"))
-    fit_capture.result = replace(fit_capture.result, warnings=("depth maps that are left out: a.jpg (…)",))
+    fit_capture.result = replace(fit_capture.result, warnings=("depth maps that are not used: a.jpg (…)",))
     given, made = (Path("maps"), "photos", "metric"), ("photos", Path("a.onnx"), tmp_path / "depths", "metric")
     for module, name, options, args in (
         (depth_maps, "find_maps", ("--depths", "maps"), given),
@@ -64,7 +64,7 @@ def test_fit_takes_depth_maps_of_a_folder_or_of_a_network(
         monkeypatch.setattr(module, name, found)
         assert run("fit", "photos", "-o", tmp_path, "--depth-kind", "metric", *options) == 0
         assert found.args == args and fit_capture.kwargs["depths"] is found.result
-        assert "warning: depth maps that are left out: a.jpg" in capsys.readouterr().out
+        assert "warning: depth maps that are not used: a.jpg" in capsys.readouterr().out
     for options, text in (
         (("--depths", "maps", "--depth-model", "a.onnx"), "both define the depth maps: give only one"),
         (("--depth-kind", "metric"), "--depth-kind metric requires depth maps: add --depths or --depth-model"),

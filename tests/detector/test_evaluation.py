@@ -96,9 +96,9 @@ def test_no_foreign_folder_is_written_to(tmp_path: Path) -> None:
     (tmp_path / "thesis/thesis.tex").touch()
     before = contents(tmp_path)
     for out, rule in (
-        (data, "must not hold the images that are judged"),
-        (tmp_path, "must not hold the images that are judged"),
-        (tmp_path / "thesis", r"holds something else than an evaluation \(got thesis.tex\)"),
+        (data, "must not contain the evaluated images"),
+        (tmp_path, "must not contain the evaluated images"),
+        (tmp_path / "thesis", r"must contain only an evaluation \(got thesis.tex\)"),
     ):
         with pytest.raises(InputError, match=f"{out}: {rule}"):
             evaluate_detector(run, data, out)
@@ -113,7 +113,7 @@ def test_boxes_alone_are_judged_as_such(tmp_path: Path) -> None:
     ]
     evaluation = write_evaluation(found, detections, tmp_path / "out", masks=False, about={})
     assert evaluation.results["box"]["map50_95"] == 1.0 and "mask" not in evaluation.results
-    assert "Everything was found as what it is." in evaluation.page.read_text()
+    assert "All detections are correct." in evaluation.page.read_text()
 
 
 def test_nothing_found_is_a_result(tmp_path: Path) -> None:

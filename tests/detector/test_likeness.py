@@ -106,7 +106,7 @@ def test_photographs_that_differ_both_ways_ask_for_a_wider_range(rendered: Path,
         image = cv2.imread(str(path)).astype(float) * (0.5 if number % 2 else 1.1)
         cv2.imwrite(str(path), np.clip(image, 0, 255).astype(np.uint8))
     found = trait(compare_with_photographs([rendered], photographs, size=WIDTH), "brightness of objects")
-    assert "widen both ends" in found.advice
+    assert "widen the range at both ends" in found.advice
     assert found.below > 0.3 and found.above > 0.3
 
 

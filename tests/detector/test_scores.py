@@ -105,7 +105,7 @@ def test_what_is_not_labelled_is_refused() -> None:
     with pytest.raises(InputError, match="got image 9, class 1"):
         average_precision(TRUE, [found(9, 1, [0, 0, 5, 5], 0.5)])
     for images in ([], [7]):
-        with pytest.raises(InputError, match="images must be among those that are labelled"):
+        with pytest.raises(InputError, match="images must be a non-empty list of labelled images"):
             average_precision(TRUE, [], images)
 
 

@@ -49,7 +49,7 @@ def test_a_split_is_what_was_asked_for(tmp_path: Path) -> None:
     assert [len(read_set(root, split).samples) for split in ("train", "val", "test", "all")] == [3, 2, 1, 6]  # type: ignore[arg-type]
     alone = write_yolo(tmp_path / "mitsplat", {"train": 3}, mitsplat=True)
     assert "val: images/train" in (alone / "data.yaml").read_text()  # for Ultralytics, which wants some
-    with pytest.raises(InputError, match=r"there is no image for val \(it has 3 for train\)"):
+    with pytest.raises(InputError, match=r"there are no images for val \(it has 3 for train\)"):
         read_set(alone, "val")
 
 
@@ -113,7 +113,7 @@ def test_what_is_written_for_ultralytics_is_what_was_read(tmp_path: Path, boxes:
 
 def test_masks_are_not_learnt_from_boxes(tmp_path: Path) -> None:
     found = read_set(write_yolo(tmp_path, {"train": 2}, boxes=True), "train")
-    with pytest.raises(InputError, match=r"images/train/000000.png is labelled by boxes alone: .* such as yolo11n"):
+    with pytest.raises(InputError, match=r"images/train/000000.png has only boxes: .* such as yolo11n"):
         check_masks(found)
     assert check_masks(read_set(write_yolo(tmp_path / "b", {"train": 2}), "train")) is None
 
@@ -156,13 +156,13 @@ YOLO_FAULTS: dict[str, tuple[Callable[[Path], object], str]] = {
         lambda root: (root / "images/train/000009.jpg").write_bytes(
             cv2.imencode(".jpg", paint(1)[0])[1].tobytes()[:-9]
         ),
-        r"000009.jpg: is torn",
+        r"000009.jpg: is truncated",
     ),
     "no end": (
         lambda root: (root / "images/train/000009.jpg").write_bytes(
             cv2.imencode(".jpg", paint(1)[0])[1].tobytes()[:-2]
         ),
-        r"000009.jpg: is torn",
+        r"000009.jpg: is truncated",
     ),
     "trailer": (
         lambda root: (root / "images/train/000009.jpg").write_bytes(
@@ -174,7 +174,7 @@ YOLO_FAULTS: dict[str, tuple[Callable[[Path], object], str]] = {
         lambda root: (root / "images/train/000009.bmp").write_bytes(
             cv2.imencode(".bmp", paint(1)[0])[1].tobytes()[:9000]
         ),
-        r"000009.bmp: (cannot be read as an image|must be read by OpenCV as by others)",
+        r"000009.bmp: (cannot be read as an image|OpenCV must decode it to)",
     ),
     "gif": (
         lambda root: Image.fromarray(paint(1)[0]).save(root / "images/train/000001.png", format="GIF"),
@@ -189,7 +189,7 @@ YOLO_FAULTS: dict[str, tuple[Callable[[Path], object], str]] = {
     ),
     "keypoints": (
         lambda root: (root / "data.yaml").write_text("train: images/train\nnames: [disc, box]\nkpt_shape: [2, 2]\n"),
-        r"data.yaml: its labels are of keypoints \(kpt_shape\)",
+        r"data.yaml: labels must be boxes or masks \(got keypoints, kpt_shape\)",
     ),
     "latin": (
         lambda root: (
@@ -200,9 +200,9 @@ YOLO_FAULTS: dict[str, tuple[Callable[[Path], object], str]] = {
     ),
     "nowhere": (
         lambda root: (root / "data.yaml").write_text("train: pictures\nnames: [disc, box]\n"),
-        r"there is no image for train in .*/pictures",
+        r"there are no images for train in .*/pictures",
     ),
-    "labels": (lambda root: [path.unlink() for path in root.glob("labels/*/*")], "there is no label of its images"),
+    "labels": (lambda root: [path.unlink() for path in root.glob("labels/*/*")], "its images have no labels"),
     "listed": (
         lambda root: (
             (root / "data.yaml").write_text("train: some.txt\nnames: [disc, box]\n"),
@@ -212,7 +212,7 @@ YOLO_FAULTS: dict[str, tuple[Callable[[Path], object], str]] = {
     ),
     "names": (lambda root: (root / "data.yaml").write_text("train: images/train\nnames: [a, a]\n"), "names must be"),
     "yaml": (lambda root: (root / "data.yaml").write_text("train: [\n"), "data.yaml: cannot be read as YAML"),
-    "nothing": (lambda root: [path.write_text("") for path in root.glob("labels/*/*")], "nothing is labelled"),
+    "nothing": (lambda root: [path.write_text("") for path in root.glob("labels/*/*")], "images have no labels"),
 }
 
 
@@ -229,7 +229,7 @@ def test_what_is_wrong_with_a_yolo_folder_is_one_sentence(tmp_path: Path, fault:
 def test_a_dataset_that_lacks_a_label_is_refused(tmp_path: Path) -> None:
     root = write_yolo(tmp_path, {"train": 2}, mitsplat=True)
     (root / "labels/train/000001.txt").unlink()
-    with pytest.raises(InputError, match=r"000001\.txt: is missing, though its image is there"):
+    with pytest.raises(InputError, match=r"000001\.txt: is missing, but its image exists"):
         read_set(root, "train")
     (root / "labels/train/000000.txt").unlink()
     (root / "labels/train").rmdir()
@@ -243,8 +243,8 @@ COCO_FAULTS: dict[str, tuple[Callable[[dict], object], str]] = {  # type: ignore
     "image": (lambda c: c["annotations"][0].update(image_id=9), r"image_id must be in the file \(got 9\)"),
     "missing": (lambda c: c["images"][0].update(file_name="none.png"), r"none.png must be one image in .* \(got 0\)"),
     "outside": (lambda c: c["images"][0].update(file_name="../../x.png"), "file_name must be of an image in"),
-    "size": (lambda c: c["images"][0].update(width=64, height=96), r"as large as labels.json says, 64 x 96 px"),
-    "beyond": (lambda c: c["annotations"][0].update(bbox=[0, 0, 200, 10]), r"bbox: must lie in the image"),
+    "size": (lambda c: c["images"][0].update(width=64, height=96), r"the size in labels.json, 64 x 96 px"),
+    "beyond": (lambda c: c["annotations"][0].update(bbox=[0, 0, 200, 10]), r"bbox: positions must lie in the image"),
     "bbox": (lambda c: c["annotations"][0].update(bbox=[0, 0, 10]), r"bbox must be x, y, width, height"),
     "empty": (lambda c: c["annotations"][0].update(bbox=[0, 0, 0, 10]), r"bbox must have a width and a height"),
     "polygon": (
@@ -270,7 +270,7 @@ COCO_FAULTS: dict[str, tuple[Callable[[dict], object], str]] = {  # type: ignore
         lambda c: [one.update(id=1) for one in c["categories"]] + [a.update(category_id=1) for a in c["annotations"]],
         "ids and names of categories, must differ",
     ),
-    "nothing": (lambda c: c.update(images=[], annotations=[]), "there is no image"),
+    "nothing": (lambda c: c.update(images=[], annotations=[]), "there are no images"),
 }
 
 

@@ -53,7 +53,7 @@ def test_boxes_are_cut_with_the_picture(tmp_path: Path) -> None:
 
 def test_tiles_of_a_few_pixels_are_refused(tmp_path: Path) -> None:
     photographs = read_set(write_yolo(tmp_path / "photographs", {"train": 1}), "all")
-    with pytest.raises(InputError, match=r"sides of 10 px or more \(got 6 x 4\): give a --real-size nearer"):
+    with pytest.raises(InputError, match=r"sides of at least 10 px \(got 6 x 4\): use a --real-size nearer"):
         cut_photographs(photographs, 960, 64, tmp_path / "tiles")
 
 

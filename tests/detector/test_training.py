@@ -143,9 +143,9 @@ def test_photographs_are_cut_to_the_size_at_which_they_will_be_searched(
     assert len(listed) == 5 + 4 * 3 and run.record["real"]["images"] == 3
     assert no_libraries[0]["job"].plan.max() >= 5 + 3
     assert not (tmp_path / "run/tiles").exists()
-    with pytest.raises(InputError, match=r"was begun with real_size 96 \(got None\)"):
+    with pytest.raises(InputError, match=r"was started with real_size 96 \(got None\)"):
         train_detector([cell], tmp_path / "run", TINY, real=photographs)
-    with pytest.raises(InputError, match="--real-size is that of photographs: name them by --real"):
+    with pytest.raises(InputError, match="--real-size needs photographs: give them with --real"):
         train_detector([cell], tmp_path / "other", _other(real_size=96))
 
 
@@ -157,7 +157,7 @@ def test_a_run_is_not_gone_on_with_by_other_means(no_libraries: list[dict[str, A
     cell = write_yolo(tmp_path / "cell", {"train": 5}, mitsplat=True)
     train_detector([cell], tmp_path / "run", TINY)
     for changes, message in (
-        ({"steps": 5}, r"run: was begun with steps 4 \(got 5\): give another folder, or --overwrite"),
+        ({"steps": 5}, r"run: was started with steps 4 \(got 5\): choose another folder, or use --overwrite"),
         ({"seed": 1, "batch": 2}, r"batch 4 \(got 2\), seed 0 \(got 1\)"),
         ({"model": "yolo11s-seg"}, r"model yolo11n-seg.yaml \(got yolo11s-seg.yaml\)"),
     ):
@@ -165,7 +165,7 @@ def test_a_run_is_not_gone_on_with_by_other_means(no_libraries: list[dict[str, A
             train_detector([cell], tmp_path / "run", _other(**changes))
     assert train_detector([cell], tmp_path / "run", _other(workers=3, device="auto", share=0.9)).was_finished
     write_yolo(cell, {"train": 6})
-    with pytest.raises(InputError, match="was begun with other images of datasets"):
+    with pytest.raises(InputError, match="was started with other images of datasets"):
         train_detector([cell], tmp_path / "run", TINY)
 
 
@@ -201,14 +201,18 @@ def _boxes(folder: Path) -> None:
 
 
 REFUSED: dict[str, tuple[Callable[[Path], object], dict[str, Any], str]] = {
-    "stranger": (_stranger, {}, r"run: holds something else than a run \(got thesis.tex\)"),
-    "own names": (_own_names, {}, r"run: holds something else than a run \(got data\)"),
-    "crowds": (_crowds, {"real": "crowds"}, "crowds: nothing but crowds is labelled"),
+    "stranger": (_stranger, {}, r"run: must contain only a run \(got thesis.tex\)"),
+    "own names": (_own_names, {}, r"run: must contain only a run \(got data\)"),
+    "crowds": (_crowds, {"real": "crowds"}, "crowds: all labels are crowds"),
     "empty": (_empty, {}, r"cell: there is no image for train \(it has 1 for val\)"),
     "classes": (_others, {"more": "other"}, "other: its classes must be those of .*cell: it also has gear"),
     "real classes": (_others, {"real": "other"}, "other: its classes must be those of .*cell: it also has gear"),
-    "boxes": (_boxes, {"real": "boxes"}, "boxes: masks are to be learnt, but photos/p0.png is labelled by boxes"),
-    "weights": (lambda folder: None, {"weights": "none.pt"}, r"--weights must be a file .* \(got .*none.pt\)"),
+    "boxes": (_boxes, {"real": "boxes"}, "boxes: a mask model needs mask labels, but photos/p0.png has only boxes"),
+    "weights": (
+        lambda folder: None,
+        {"weights": "none.pt"},
+        r"--weights must be an existing weights file .* \(got .*none.pt\)",
+    ),
     "file": (lambda folder: (folder / "run").write_text(""), {}, r"run: must be a folder \(got a file\)"),
 }
 
@@ -237,7 +241,7 @@ def test_what_is_learnt_from_is_never_in_the_folder_of_the_run(
     before = contents(tmp_path)
     (tmp_path / "link").symlink_to(tmp_path / "run/data")
     for dataset in (tmp_path / "run/data", tmp_path / "link"):
-        with pytest.raises(InputError, match="run: must not hold what is learnt from"):
+        with pytest.raises(InputError, match="run: must not contain training images"):
             train_detector([dataset], tmp_path / "run", TINY, overwrite=True)
     assert {path: data for path, data in contents(tmp_path).items() if "/link/" not in path} == before
 
@@ -400,7 +404,7 @@ def test_an_interrupted_run_goes_on_to_the_same_number_of_steps(
     assert (finished["resumed_at_step"], finished["updates_of_weights"], finished["steps"]) == (4, 7, 7)
     assert run.weights.is_file() and not (run.path / "weights").exists()
     (tmp_path / "torn/weights/last.pt").write_bytes(b"torn")
-    with pytest.raises(InputError, match=r"last\.pt: cannot be read .*: begin anew with --overwrite"):
+    with pytest.raises(InputError, match=r"last\.pt: cannot be read .*: start again with --overwrite"):
         train("torn")
 
 
@@ -411,7 +415,9 @@ def test_a_step_is_not_made_smaller_where_memory_has_run_out(torchvision: None) 
     trainer = SimpleNamespace(
         train_loader=None, job=SimpleNamespace(plan=np.zeros((3, 16))), args=SimpleNamespace(imgsz=640)
     )
-    with pytest.raises(MissingResourceError, match="run out with 16 images of 640 px a step: give a smaller --batch"):
+    with pytest.raises(
+        MissingResourceError, match="ran out of memory with 16 images of 640 px per step: use a smaller --batch"
+    ):
         fixed_steps._FixedStepsTrainer.get_dataloader(trainer, "images.txt")
 
 
@@ -511,7 +517,7 @@ def test_what_cannot_be_judged_is_refused(data: Path, trained: Run, tmp_path: Pa
     write_yolo(tmp_path / "boxes", {"val": 1}, boxes=True)
     write_yolo(tmp_path / "gears", {"val": 1}, classes=("disc", "gear", "box"))
     for folder, options, message in (
-        ("boxes", {}, "labelled by boxes alone"),
+        ("boxes", {}, "has only boxes"),
         ("gears", {}, r"gears: its classes must be those of .*run: it also has gear"),
         ("boxes", {"split": "test"}, "there is no image for test"),
         ("boxes", {"size": 100}, r"--size must be a multiple of 32 px \(got 100\)"),

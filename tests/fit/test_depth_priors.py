@@ -115,7 +115,7 @@ def test_all_maps_of_a_capture(tmp_path: Path) -> None:
     found, warnings = align_maps(photos, points, maps, 32)
     assert list(found) == ["a/floor.jpg"] and found["a/floor.jpg"].shape == (24, 32)
     assert warnings == (
-        "depth maps that are left out, because their values as inverse depths do not agree with the points in them: "
+        "depth maps that are not used, because their values as inverse depths do not agree with the points in them: "
         "b.jpg",
         "photos without a depth map: c.jpg, d.jpg",
     )
@@ -131,7 +131,9 @@ def test_maps_of_the_other_kind_are_refused(tmp_path: Path) -> None:
     photo, points = seeing()
     np.save(tmp_path / "a.npy", floor_depth(CAMERA, WIDTH, HEIGHT))
     maps = DepthMaps({photo.name: tmp_path / "a.npy"}, "inverse")
-    with pytest.raises(InputError, match=r"no depth map is of use: .* as inverse depths do not agree .*: a/floor\.jpg"):
+    with pytest.raises(
+        InputError, match=r"no depth map can be used: .* as inverse depths do not agree .*: a/floor\.jpg"
+    ):
         align_maps([photo], points, maps, 64)
     assert list(align_maps([photo], points, replace(maps, kind="metric"), 64)[0]) == [photo.name]
 
@@ -139,7 +141,7 @@ def test_maps_of_the_other_kind_are_refused(tmp_path: Path) -> None:
 def test_folders_without_maps_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="gone: no such folder of depth maps"):
         find_maps(tmp_path / "gone", [seeing()[0]])
-    with pytest.raises(InputError, match=r"of one photo at least, such as a/floor\.png \(got none\)"):
+    with pytest.raises(InputError, match=r"of at least one photo, such as a/floor\.png \(got none\)"):
         find_maps(tmp_path, [seeing()[0]])
 
 

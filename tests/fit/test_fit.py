@@ -274,7 +274,7 @@ def test_fit_ends_at_its_target_on_photos_apart_from_those_reported(capture: Cap
     assert other.psnr < early.psnr - 3
     assert other.iterations == early.iterations
     assert (tmp_path / "other/splats.ply").read_bytes() == (tmp_path / "early/splats.ply").read_bytes()
-    with pytest.raises(InputError, match="a target takes at least two photos besides the held-out ones"):
+    with pytest.raises(InputError, match="target_psnr needs at least two photos besides the held-out ones"):
         fit_capture(replace(capture, photos=capture.photos[:2]), tmp_path / "few", settings)
 
 
@@ -423,7 +423,7 @@ def test_depth_error_is_the_difference_of_inverse_depths_that_are_known() -> Non
 
 
 def test_too_few_photos_are_refused(capture: Capture, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="a fit needs a photo to learn from and a held-out one"):
+    with pytest.raises(InputError, match="a fit needs a training photo and a held-out photo"):
         fit_capture(replace(capture, photos=capture.photos[:1]), tmp_path)
 
 

@@ -28,8 +28,12 @@ def test_views_from_all_heights_and_sides_leave_nothing_to_say():
 
 
 def test_a_height_that_nobody_photographed_from_is_named():
-    assert missing_views(np.concatenate([ring(30, ALL_AROUND), ring(70, ALL_AROUND)])) == ["0 to 20 degrees above it"]
-    assert missing_views(np.concatenate([ring(10, ALL_AROUND), ring(30, ALL_AROUND)])) == ["45 to 90 degrees above it"]
+    assert missing_views(np.concatenate([ring(30, ALL_AROUND), ring(70, ALL_AROUND)])) == [
+        "0 to 20 degrees above the object"
+    ]
+    assert missing_views(np.concatenate([ring(10, ALL_AROUND), ring(30, ALL_AROUND)])) == [
+        "45 to 90 degrees above the object"
+    ]
 
 
 @pytest.mark.parametrize(("first", "last", "words"), [(100, 200, "120 to 180"), (300, 420, "300 to 60")])
@@ -40,7 +44,7 @@ def test_a_side_that_nobody_photographed_is_named_across_the_north_too(first, la
     if last - first < 110:  # two whole sectors are a step that people leave
         assert found == []
     else:
-        assert found == [f"0 to 20 degrees above it, {words} degrees around it"]
+        assert found == [f"0 to 20 degrees above the object, {words} degrees around the object"]
 
 
 def test_directions_are_those_from_what_the_cameras_look_at():
@@ -70,7 +74,7 @@ def test_blurred_photos_are_named_the_worst_first_and_no_smooth_side_of_the_obje
 def test_a_miss_names_what_was_measured_before_what_helps():
     found = replace(GOOD, psnr=20.0, causes={"psnr": "2 of 9 photos are blurred (a.jpg, b.jpg)", "mesh_iou": "unused"})
     (sentence,) = found.misses(Thresholds())
-    assert "is wanted): 2 of 9 photos are blurred (a.jpg, b.jpg); use even light" in sentence
+    assert "is required): 2 of 9 photos are blurred (a.jpg, b.jpg); use even light" in sentence
 
 
 def dotted(points, masked):
@@ -95,10 +99,10 @@ def test_what_masks_show_of_the_support_is_told_and_what_would_change_it():
     points = np.concatenate([body, cloth])
     assert find_causes(*dotted(points, np.arange(500) < 300)) == {}
     found = find_causes(*dotted(points, np.arange(500) < 500))
-    told = "40% of the points that its masks show lie in the surface under it"
+    told = "40% of the points inside the masks lie in the support surface"
     assert all(found[name].startswith(told) for name in ("splat_iou", "mesh_iou", "surface", "lost"))
     (miss,) = replace(GOOD, lost=0.2, causes=found).misses()
-    assert "photograph it on another surface, or pick it; check whether masks leave parts" in miss
+    assert "photograph the object on another surface, or pick it; check for parts of the object" in miss
 
 
 def test_an_object_without_texture_is_told():
@@ -109,4 +113,4 @@ def test_an_object_without_texture_is_told():
     )
     found = find_causes(*dotted(np.concatenate([body, cloth]), np.arange(230) < 30))
     assert set(found) == {"psnr", "mesh_iou", "offset", "surface", "watertight"}
-    assert found["psnr"].startswith("photos share only 30 points on it")
+    assert found["psnr"].startswith("photos share only 30 points on the object")

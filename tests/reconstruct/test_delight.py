@@ -96,7 +96,7 @@ class TestDelight:
     def test_reflectance_is_left(self, tmp_path: Path) -> None:
         splats, reflectance = painted(30)
         done = delight(splats, ball(), file_of(tmp_path, *lights(30)))
-        assert done.kept and done.told.endswith("it is taken out of them")
+        assert done.kept and done.told.endswith("it was removed from colours")
         assert done.slope == pytest.approx(1, abs=0.15)
         assert unlike(splats, reflectance) > 0.15 and unlike(done.splats, reflectance) < 0.02
         assert np.abs(done.splats.means - splats.means).max() == 0
@@ -120,12 +120,12 @@ class TestDelight:
         splats, _ = painted(None)
         assert not delight(splats, ball(), file_of(tmp_path, *lights(30))).kept
         done = delight(splats, ball(), file_of(tmp_path, EnvironmentLight(kind="environment", radiance=1.0)))
-        assert not done.kept and done.uneven < 0.03 and "left as they are" in done.told
+        assert not done.kept and done.uneven < 0.03 and "unchanged" in done.told
 
 
 class TestJob:
     def test_an_environment_keeps_its_light(self, tmp_path: Path) -> None:
-        with pytest.raises(InputError, match="colours of objects only are freed of light"):
+        with pytest.raises(InputError, match="light can be removed only from the colours of objects"):
             AssetJob(name="cell", kind="environment", delight=tmp_path / "l.yaml")
 
     def test_an_asset_that_is_turned_and_scaled_is_lit_as_its_capture_lies(self, tmp_path: Path) -> None:
@@ -142,7 +142,7 @@ class TestJob:
         )  # fmt: skip
         made = Reconstruction(asset, verdict, [], None, None, None, turn)
         done = delight_asset(made, file_of(tmp_path, *lights(30)), False, None)
-        assert done.record["light"]["kept"] and "it is taken out of them" in done.verdict.rows["Light"]
+        assert done.record["light"]["kept"] and "it was removed from colours" in done.verdict.rows["Light"]
         assert unlike(done.asset.splats, reflectance) < 0.03
 
 
@@ -152,7 +152,7 @@ class TestFile:
             "lights:\n  - {kind: area, position: [0, 0, 1], target: [0, 0, 0], size: [1, 1], radiance: 5}\n"
             '  - {kind: environment, image: "rest.exr"}\n'
         )
-        with pytest.raises(InputError, match=r"l\.yaml: there is no image .*rest\.exr"):
+        with pytest.raises(InputError, match=r"l\.yaml: the image .*rest\.exr does not exist"):
             LightFile.load(tmp_path / "l.yaml")
         write_exr(tmp_path / "rest.exr", np.ones((8, 16, 3), np.float32))
         assert LightFile.load(tmp_path / "l.yaml").files == [tmp_path / "l.yaml", tmp_path / "rest.exr"]

@@ -100,7 +100,7 @@ def test_the_page_is_one_file_with_every_part(made: tuple[Path, AssetResult]) ->
     assert "it is &lt;blurred&gt;" in page
     assert page.count('class="camera"') == 2 * 32
     assert page.count("mesh over photo") == 2 * 4
-    assert "Every threshold is met" in page
+    assert "All thresholds are met" in page
 
 
 def test_the_same_inputs_are_kept_and_others_are_not(
@@ -218,12 +218,12 @@ def test_surroundings_need_no_masks_and_get_an_open_mesh(known_object: KnownObje
 @pytest.mark.parametrize(
     ("change", "sentence"),
     [
-        ({"rejected": 30}, "only 32 of 62 photos found their camera"),
+        ({"rejected": 30}, "only 32 of 62 photos have a camera pose"),
         ({"psnr": 12.0}, "12.0 dB"),
-        ({"splat_iou": 0.5}, "the splats meet held-out masks"),
-        ({"mesh_iou": 0.5}, "the mesh meets held-out masks"),
-        ({"offset": 0.02}, "2.00% of the diagonal apart (at most 0.5% is wanted)"),
-        ({"scale_error": 0.05}, "known to 5.0% only"),
+        ({"splat_iou": 0.5}, "the splats have an IoU with held-out masks"),
+        ({"mesh_iou": 0.5}, "the mesh has an IoU with held-out masks"),
+        ({"offset": 0.02}, "2.00% of the diagonal (at most 0.5% is required)"),
+        ({"scale_error": 0.05}, "the error of the scale is 5.0%"),
         ({"watertight": False}, "the mesh is open"),
         ({"lost": 0.5}, "removed 50.0% of the object"),
     ],
@@ -232,11 +232,11 @@ def test_each_missed_threshold_is_one_sentence_with_advice(change: dict[str, flo
     assert GOOD.misses() == ()
     (miss,) = replace(GOOD, **change).misses()
     assert sentence in miss
-    assert " is wanted): " in miss
+    assert " is required): " in miss
 
 
 def test_a_capture_in_metres_takes_no_size(known_object: KnownObject) -> None:
-    with pytest.raises(InputError, match="in metres already: it takes no size"):
+    with pytest.raises(InputError, match="already in metres and must have no size"):
         reconstruct_asset(known_object.capture, known_object.splats, name="part", settings=replace(SETTINGS, size=0.2))
 
 

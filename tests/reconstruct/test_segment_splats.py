@@ -91,9 +91,9 @@ def test_masks_of_something_else_are_refused(known_object: KnownObject) -> None:
         MaskedView(photo.camera, np.zeros((photo.camera.height, photo.camera.width), dtype=np.float32))
         for photo in known_object.capture.photos[:4]
     ]
-    with pytest.raises(InputError, match="are these masks of this capture"):
+    with pytest.raises(InputError, match="do the masks belong to this capture"):
         isolate_object(known_object.splats, views)
-    with pytest.raises(InputError, match="got no view with one"):
+    with pytest.raises(InputError, match="isolation of an object needs views with masks"):
         isolate_object(known_object.splats, [])
 
 

@@ -93,7 +93,7 @@ def test_what_the_photos_set_aside_deny_is_dropped(truth: trimesh.Trimesh, views
     assert not found.kept
     assert found.mesh is truth
     assert found.after > found.before
-    assert str(found).startswith("dropped: silhouettes and masks of the 4 photos that decide differ by ")
+    assert str(found).startswith("rejected: silhouettes and masks of the 4 validation photos differ by ")
 
 
 def test_what_stands_on_the_table_stays_on_it() -> None:
@@ -174,7 +174,7 @@ def test_settings_are_checked(field: str, value: float) -> None:
 
 def test_of_few_views_two_judge_and_of_fewer_nothing_comes(truth: trimesh.Trimesh, views: list[MaskedView]) -> None:
     found = refine_mesh(truth, views[:3], QUICK)
-    assert found.mesh is truth and str(found) == "dropped: it takes masks from 4 places outside of the mesh"
+    assert found.mesh is truth and str(found) == "rejected: refinement needs masks from 4 positions outside the mesh"
     for count, judges in ((4, 2), (9, 3)):
         assert refine_mesh(truth, views[:count], replace(QUICK, steps=1)).judges == judges
 
@@ -191,5 +191,5 @@ def test_assets_say_what_came_of_it(
     page = write_asset_report(tmp_path_factory.mktemp("page"), known_object.capture, found).read_text()
     assert "Refinement of the mesh" in page and str(found.refinement) in page
     for other in ({"kind": "environment"}, {"imported": ImportedMesh(known_object.mesh)}):
-        with pytest.raises(InputError, match="reconstructed by its masks"):
+        with pytest.raises(InputError, match="reconstructed from masks"):
             reconstruct_asset(known_object.capture, known_object.splats, name="part", settings=settings, **other)

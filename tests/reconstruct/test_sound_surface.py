@@ -39,7 +39,7 @@ def test_depth_that_is_wrong_gives_way_to_the_hull_of_the_masks(known_object: Kn
     wrong = replace(splats, means=means, opacities=np.where(inner, 0.98, 0.3).astype(np.float32))
     found = find_proxy_surface(wrong, views_of(known_object), SETTINGS)
     assert found.source == HULL
-    for fault, reason in zip(found.faults, ("masks with an IoU of only", "% of the diagonal", "IoU"), strict=True):
+    for fault, reason in zip(found.faults, ("IoU with the masks of only", "% of the diagonal", "IoU"), strict=True):
         assert reason in fault
     assert found.mesh.is_volume
     assert chamfer(found.mesh, known_object.mesh) < 0.02

@@ -165,13 +165,15 @@ def test_what_is_not_on_a_surface_is_not_removed(captured: Capture) -> None:
     splats = Splats.concatenate([place(), cube()])
     on_table, on_floor = (pick(5, spot) for spot in ((0.1, -0.1, HEIGHT), (0.0, -1.2, HEIGHT - 0.8)))
     for spot in (on_table, on_floor, "photo05.png:3,1", "photo05.png:-50,900"):  # and where nothing is
-        with pytest.raises(InputError, match=r"photo05\.png:.*: what is to be removed must stand on a level surface"):
+        with pytest.raises(
+            InputError, match=r"photo05\.png:.*: a thing to remove must stand on one of the detected level surfaces"
+        ):
             removed(splats, captured, spot)
     with pytest.raises(InputError, match=r"none\.png:3,4: a pick must be PHOTO:X,Y with a registered photo"):
         removed(splats, captured, "none.png:3,4")
     with pytest.raises(InputError, match=r"a pixel must be given as X,Y \(got 3\)"):
         removed(splats, captured, "photo05.png:3")
-    with pytest.raises(InputError, match="removed from an environment only"):
+    with pytest.raises(InputError, match="removed only from an environment"):
         AssetJob(name="mug", remove=("photo05.png:3,4",))
     mesh = ImportedMesh(trimesh.creation.box((1, 1, 1)))
     with pytest.raises(InputError, match="cannot be removed from an imported mesh"):
@@ -190,8 +192,8 @@ def test_an_environment_says_what_was_removed(
     done = make_surroundings(tmp_path / "capture", tmp_path / "fit", tmp_path / "cell", job)
     size = done.verdict.rows["Removed things"].split(" m around x -0.")[0]
     assert [float(edge) for edge in size.split(" x ")] == pytest.approx([CUBE, CUBE, CUBE], abs=0.015)
-    assert what in done.verdict.rows["Removed things"] and "are invented" in done.verdict.rows["Removed things"]
-    assert "was hidden by things that were removed" in (tmp_path / "cell" / "report.html").read_text()
+    assert what in done.verdict.rows["Removed things"] and "are synthesised" in done.verdict.rows["Removed things"]
+    assert "was hidden by removed things" in (tmp_path / "cell" / "report.html").read_text()
     (record,) = json.loads((tmp_path / "cell" / "verdict.json").read_text())["removed_things"]
     assert record["pick"] == what and CUBE**2 < record["filled"] < 3 * CUBE**2 and record["copied"] == 1
     assert done.verdict.psnr is not None and done.verdict.psnr > 35  # photos show the thing: that is left out

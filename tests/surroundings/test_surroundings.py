@@ -225,7 +225,7 @@ def test_up_is_the_tables_where_nothing_says_where_it_is(splats: Splats, capture
     found = reconstruct_surroundings(capture, splats.transformed(fallen), job, None, None, None)
     assert (found.asset_from_capture @ fallen)[2] == pytest.approx([0, 0, 1, -HEIGHT], abs=2e-3)
     assert "scene" not in found.record
-    assert any("how large it is is unknown" in sentence for sentence in found.verdict.misses())
+    assert any("the scale is unknown" in sentence for sentence in found.verdict.misses())
 
 
 def test_its_scene_is_valid_and_drops_beside_the_box(made: tuple[Path, AssetResult]) -> None:
@@ -251,5 +251,5 @@ def test_a_changed_scene_is_kept_and_a_lost_one_written_again(made: tuple[Path, 
     assert make_surroundings(*arguments).kept and (folder / "cell.yaml").read_text() == text
     (folder / "cell.yaml").write_text(text + "seed: 3\n")
     again = make_surroundings(*arguments)
-    assert "is kept as it is" in again.warnings[-1] and (folder / "cell.yaml").read_text().endswith("seed: 3\n")
+    assert "was not replaced" in again.warnings[-1] and (folder / "cell.yaml").read_text().endswith("seed: 3\n")
     (folder / "cell.yaml").write_text(text)

@@ -151,14 +151,19 @@ def test_code_that_decides_layouts_is_hashed():
         *("arrays.BoolArray", "arrays.Float32Array", "arrays.Float64Array", "arrays.Int64Array", "progress.Note"),
         *("asset.Asset", "errors.InputError", "scene.scene.Scene"),
         *(f"scene.layout.{name}" for name in ("Instance", "Layout", "LeftOut", "NothingRests", "RestCertificate")),
-        *(f"spec.objects.{name}" for name in ("Arrangement", "ObjectPose")),
-        *(f"spec.shapes.{name}" for name in ("Backdrop", "Bin", "Box", "Enclosure", "Region", "Shape")),
-        *("spec.spec.SceneSpec", "spec_types.Vec3"),
+        *(f"scene.spec.object_spec.{name}" for name in ("Arrangement", "ObjectPose")),
+        *(f"scene.spec.shape_spec.{name}" for name in ("Backdrop", "Bin", "Box", "Enclosure", "Region", "Shape")),
+        *("scene.spec.scene_spec.SceneSpec", "storage.field_types.Vec3"),
     }
-    given = types | {"cache.cache_folder", "cache.keep_file", "scene.layout.NO_PHYSICS", "warp_start.quiet_warp"}
-    given |= {"content_hash.ContentHash"}  # names what is kept
-    given |= {"files.SPLITS"}  # names of tallies; which layout is of which split is decided in scene.contents
-    given |= {"spec.spec.BACKDROP"}  # begins the names of shapes, which are hashed
+    given = types | {
+        "storage.cache.cache_folder",
+        "storage.cache.keep_file",
+        "scene.layout.NO_PHYSICS",
+        "runtime.warp_start.quiet_warp",
+    }
+    given |= {"storage.content_hash.ContentHash"}  # names what is kept
+    given |= {"storage.files.SPLITS"}  # names of tallies; which layout is of which split is decided in scene.contents
+    given |= {"scene.spec.scene_spec.BACKDROP"}  # begins the names of shapes, which are hashed
     for module in settle.MODULES:
         for node in ast.walk(ast.parse((settle.PACKAGE / f"{module.replace('.', '/')}.py").read_text())):
             if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("mitsplat."):

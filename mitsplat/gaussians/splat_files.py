@@ -122,11 +122,11 @@ def write_splats(splats: SplatArrays, path: Path) -> None:
     encoders = {".ply": _encode_ply, ".splat": _encode_splat, ".spz": _encode_spz}
     suffix = path.suffix.lower()
     if suffix not in encoders or path.name.lower().endswith(".compressed.ply"):
-        raise InputError(f"{path}: splats are written as .ply, .splat or .spz (got {path.name!r})")
+        raise InputError(f"{path}: splats can be written as .ply, .splat or .spz (got {path.name!r})")
     if not len(splats.means) and suffix != ".ply":
         raise InputError(f"{path}: a {suffix} file must hold at least one Gaussian (got 0)")
     if not path.parent.is_dir():
-        raise InputError(f"{path}: cannot be written (there is no such folder)")
+        raise InputError(f"{path}: cannot be written (the folder does not exist)")
     data = encoders[suffix](splats)
     with storage_errors(path):
         write_file(path, lambda partial: partial.write_bytes(data))
@@ -187,7 +187,7 @@ def _parse_ply_header(data: bytes) -> tuple[str, dict[str, tuple[int, np.dtype[A
             case ["property", kind, name] if kind in _PLY_TYPES and counts:
                 types[next(reversed(types))].append((name, _PLY_ORDERS[form] + _PLY_TYPES[kind]))
             case _:
-                raise InputError(f"line {number} of the PLY header is not understood (got {line[:80]!r})")
+                raise InputError(f"line {number} of the PLY header is not valid (got {line[:80]!r})")
     return form, {name: (counts[name], np.dtype(types[name])) for name in counts}, end.end()
 
 
@@ -207,13 +207,13 @@ def _vertex_rows(
     smallest = count * (row.itemsize if form != "ascii" else 2 * len(row.names or ()))
     present = max(0, len(data) - start + (form == "ascii"))
     if smallest > present:
-        raise InputError(f"the header promises {count} Gaussians in at least {smallest} bytes (got {present} bytes)")
+        raise InputError(f"the PLY header states {count} Gaussians in at least {smallest} bytes (got {present} bytes)")
     if form != "ascii":
         return np.frombuffer(data, row, count, start) if count else np.empty(0, row)
     width = len(row.names or ())
     words = data[start:].split(maxsplit=count * width)[: count * width]
     if len(words) < count * width:
-        raise InputError(f"the header promises {count} Gaussians of {width} numbers (got {len(words)} numbers)")
+        raise InputError(f"the PLY header states {count} Gaussians of {width} numbers (got {len(words)} numbers)")
     numbers = np.array(words, dtype=np.bytes_).astype(np.float64)
     return numbers.view([(name, np.float64) for name in row.names or ()])
 
@@ -382,7 +382,9 @@ def _decompress_gzip(data: bytes) -> bytes:
             raw += decoder.decompress(rest, 1 << 20)
             rest = decoder.unconsumed_tail
             if len(raw) > limit:
-                raise InputError(f"{len(data)} bytes must not hold more than {limit} (got more)")
+                raise InputError(
+                    f"{len(data)} compressed bytes must not decompress to more than {limit} bytes (got more)"
+                )
     except zlib.error as error:
         raise InputError(f"not a valid spz file ({error})") from None
     return bytes(raw)
@@ -400,7 +402,7 @@ def _check_zip(data: bytes) -> None:
             size = sum(entry.file_size for entry in entries)
             if size > limit or len(entries) > _MAX_ENTRIES:
                 within = f"{limit} in {_MAX_ENTRIES} files (got {size} in {len(entries)})"
-                raise InputError(f"{len(data)} bytes must not hold more than {within}")
+                raise InputError(f"{len(data)} compressed bytes must not decompress to more than {within}")
             damaged = archive.testzip()  # reads no more of an entry than its stated size
     except InputError:
         raise

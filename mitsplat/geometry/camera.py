@@ -85,7 +85,7 @@ class Camera:
         if self.lens == "fisheye":
             self._check_fisheye()
         elif len(self.distortion) not in (0, 4, 5, 8):
-            raise ValueError(f"distortion takes 0, 4, 5 or 8 coefficients (got {len(self.distortion)})")
+            raise ValueError(f"distortion must have 0, 4, 5 or 8 coefficients (got {len(self.distortion)})")
         pose = np.array(self.world_from_camera, dtype=np.float64)
         if pose.shape != (4, 4) or not np.isfinite(pose).all():
             raise ValueError("world_from_camera must be a finite 4x4 matrix")
@@ -97,7 +97,7 @@ class Camera:
 
     def _check_fisheye(self) -> None:
         if len(self.distortion) != 4:
-            raise ValueError(f"the distortion of a fisheye takes 4 coefficients (got {len(self.distortion)})")
+            raise ValueError(f"the distortion of a fisheye lens must have 4 coefficients (got {len(self.distortion)})")
         x, y = np.meshgrid([0, self.width], [0, self.height])
         farthest = float(np.hypot((x - self.cx) / self.fx, (y - self.cy) / self.fy).max())
         angle = np.linspace(0, FISHEYE_MAX, 200)
@@ -339,7 +339,9 @@ def look_at_pose(eye: npt.ArrayLike, target: npt.ArrayLike, up: npt.ArrayLike = 
     forward = target - eye
     distance = np.linalg.norm(forward)
     if not np.isfinite(distance):
-        raise ValueError(f"a camera must have finite places (got {eye.tolist()} and {target.tolist()})")
+        raise ValueError(
+            f"the position and target of a camera must be finite (got {eye.tolist()} and {target.tolist()})"
+        )
     if not distance > 0:
         raise ValueError(f"a camera must look at a point other than its own position (got {eye.tolist()} twice)")
     forward = forward / distance

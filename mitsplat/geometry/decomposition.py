@@ -118,7 +118,9 @@ def _split(part: trimesh.Trimesh, threshold: float, most: int) -> list[trimesh.T
     if ragged:
         threshold = max(threshold, _RAGGED_THRESHOLD)
         _logger.warning(
-            "a mesh of %d faces is ragged: physics follows it to %g of its size", len(part.faces), threshold
+            "a mesh of %d faces is ragged: its convex pieces follow it only to %g of its size",
+            len(part.faces),
+            threshold,
         )
     coacd.set_log_level("error")
     found = coacd.run_coacd(
@@ -346,7 +348,7 @@ def _read_pieces(path: Path) -> tuple[trimesh.Trimesh, ...] | None:
     except FileNotFoundError:
         return None
     except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
-        _logger.warning("%s: unreadable convex pieces are made anew (%s)", path, error)
+        _logger.warning("%s: cached convex pieces are unreadable and are computed again (%s)", path, error)
         return None
 
 

@@ -84,7 +84,7 @@ def prepare_mesh(mesh: trimesh.Trimesh, name: str, *, solid: bool = True) -> tri
     # Divergence theorem: sum of the tetrahedra from the origin to each triangle.
     volume = float(np.linalg.det(welded.triangles).sum()) / 6
     if volume < 0:
-        _logger.warning("%s: the mesh is wound inside out; physics turns its faces", name)
+        _logger.warning("%s: the mesh is inside out; physics flips its faces", name)
         welded.invert()
     if solid and abs(volume) < 1e-6 * size**3:
         raise InputError(f"{name}: the mesh must enclose a volume (got {abs(volume):.3g} m^3 at {size:g} m across)")

@@ -88,7 +88,7 @@ def _read_mesh(output: BinaryIO, _: bytes, path: str) -> None:
         with np.errstate(all="ignore"):
             trimesh.load_scene(path).to_mesh()
     except MemoryError:
-        raise InputError("it takes more memory than a file of its size may") from None
+        raise InputError("reading it takes more memory than its file size justifies") from None
     except (OSError, *MESH_ERRORS):
         pass
     output.write(b"\n")

@@ -73,5 +73,5 @@ def _number(path: Path, file: BinaryIO) -> int:
     data = file.read(4)
     value: int = struct.unpack("<i", data)[0] if len(data) == 4 else -1
     if value < 0:
-        raise InputError(f"{path}: the header of an OpenEXR file is cut short or damaged")
+        raise InputError(f"{path}: the header of the OpenEXR file is truncated or damaged")
     return value

@@ -30,13 +30,13 @@ def asset_named(name: str | int, names: Sequence[tuple[str, str]]) -> int:
             return found[0]
         if found:
             raise InputError(
-                f"poses[{name!r}]: must name one asset (it names {len(found)} of scene.assets: give one of the numbers "
+                f"poses[{name!r}]: must name one asset (it names {len(found)} of scene.assets: use one of the indices "
                 f"{', '.join(map(str, found))})"
             )
     elif 0 <= name < len(names):
         return int(name)
     known = ", ".join(sorted({asset for asset, _ in names})) or "none"
-    raise InputError(f"poses[{name!r}]: must be an asset of the scene ({known}) or its position in scene.assets")
+    raise InputError(f"poses[{name!r}]: must be an asset of the scene ({known}) or its index in scene.assets")
 
 
 def rigid_pose(pose: npt.ArrayLike, place: str) -> Float64Array:

@@ -150,7 +150,7 @@ class Layout:
         for name, given in poses.items():
             asset = asset_named(name, names)
             if asset in lists:
-                raise InputError(f"poses[{name!r}]: must not be an asset that has poses already (it is asset {asset})")
+                raise InputError(f"poses[{name!r}]: must not name an asset that already has poses (asset {asset})")
             lists[asset] = [
                 None if pose is None else rigid_pose(pose, f"poses[{name!r}][{number}]")
                 for number, pose in enumerate(given)

@@ -173,7 +173,7 @@ def test_the_frame_s_seed_decides(sensor: Any) -> None:
 @pytest.mark.parametrize(
     ("change", "sentence"),
     [
-        ({"output": {"formats": ["depth-sensor"]}}, "output.formats: depth-sensor needs a depth_sensor"),
+        ({"output": {"formats": ["depth-sensor"]}}, "output.formats: depth-sensor needs the key depth_sensor"),
         ({"depth_sensor": {"kind": "stereo", "baseline": 0}}, "baseline: must be > 0"),
         ({"depth_sensor": {"kind": "stereo", "range": [2, 1]}}, r"range: must be \[low, high\]"),
         ({"depth_sensor": {"kind": "laser"}}, "depth_sensor"),
@@ -188,7 +188,7 @@ def test_the_frame_s_seed_decides(sensor: Any) -> None:
                     "intrinsics": {"fov_x": 40, "distortion": [0.1, 0, 0, 0]},
                 },
             },
-            "depth_sensor: stereo must have cameras without lens distortion",
+            "depth_sensor: stereo needs cameras without lens distortion",
         ),
         (
             {
@@ -203,7 +203,7 @@ def test_the_frame_s_seed_decides(sensor: Any) -> None:
                     }
                 ],
             },
-            "depth_sensor: stereo must have cameras without lens distortion",
+            "depth_sensor: stereo needs cameras without lens distortion",
         ),
     ],
 )

@@ -54,7 +54,7 @@ def test_repairs_are_told_in_a_sentence_each(caplog):
     box.update_faces((box.face_normals[:, 2] < 0.5) & (box.face_normals[:, 0] < 0.5))
     prepare_mesh(box, "box")
     assert [record.message for record in caplog.records] == [
-        "box: the mesh is wound inside out; physics turns its faces",
+        "box: the mesh is inside out; physics flips its faces",
         "box: the mesh is not closed; mass and inertia are those of its convex pieces",
     ]
 

@@ -42,7 +42,7 @@ def test_several_parts_pass(path: Path) -> None:
     [
         (EXRS["200,000 channels"](), r"channels must be listed in at most 65536 bytes \(got 4800001\)"),
         (exr({f"a{number}": ("int", bytes(4)) for number in range(3000)}), "must not hold more than 2000 attributes"),
-        (EXRS["attribute of -1 bytes"](), "cut short or damaged"),
+        (EXRS["attribute of -1 bytes"](), "truncated or damaged"),
         (exr({})[:10], "names of at most 255 bytes"),
         (exr({"a" * 300: ("int", bytes(4))}), "names of at most 255 bytes"),
     ],

@@ -83,7 +83,7 @@ def test_unknown_units_reach_the_scene_that_refuses_them(made: tuple[Path, Asset
     camera = "camera: {kind: orbit, radius: 1, height: 1, target: [0, 0, 0]}"
     common = f"name: s\nregion: {{min: [-1, -1, 0], max: [1, 1, 1]}}\n{camera}\n"
     scene.write_text(common + "objects: [{asset: asset}]\n")
-    with pytest.raises(InputError, match=r"objects\[0\].asset: asset 'part' is of unknown units"):
+    with pytest.raises(InputError, match=r"objects\[0\].asset: asset 'part' has unknown units"):
         load_scene(scene)
     scene.write_text(common + "objects: [{asset: asset, size: 0.3}]\n")
     loaded = load_scene(scene).assets[0]

@@ -137,19 +137,19 @@ def test_each_frame_or_layout_draws_a_background(scene_data: SceneData, write_sc
 @pytest.mark.parametrize(
     ("changes", "sentence"),
     [
-        ({"environment": "gone_*"}, "environment: must match at least one folder of an environment's asset (got "),
+        ({"environment": "gone_*"}, "environment: must match at least one asset folder of kind environment (got "),
         ({"environment": []}, "environment: must name at least one asset (got [])"),
         ({"environment": ["assets/cell_a", "assets/gone"]}, "environment[1]: "),
         (
             {"environment": "assets/cell_*", "environment_weights": [1]},
-            "environment_weights: must be as many as there are environments, 2 (got 1)",
+            "environment_weights: must have one weight per environment, 2 (got 1)",
         ),
         (
             {"environment": "assets/cell_a", "environment_weights": [1, 2]},
-            "environment_weights: must be as many as there are environments, 1 (got 2)",
+            "environment_weights: must have one weight per environment, 1 (got 2)",
         ),
-        ({"background": {"images": "photos"}}, "background.images: must name at least one image (got 'photos', where"),
-        ({"background": {"images": "*.jpg"}}, "background.images: must name at least one image (got '*.jpg', where"),
+        ({"background": {"images": "photos"}}, "background.images: must name at least one image (got 'photos', which"),
+        ({"background": {"images": "*.jpg"}}, "background.images: must name at least one image (got '*.jpg', which"),
         ({"background": {"images": []}}, "background.images: must name at least one image (got ()"),
         ({"background": {"images": ["gone.png"]}}, "gone.png: no such file"),
         ({"background": {"images": "bad.png"}}, "bad.png: not a readable image ("),

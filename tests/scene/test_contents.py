@@ -220,6 +220,6 @@ def test_environments_that_are_held_out_are_in_the_test_split_alone(
         seen[split_of(layout, 0.2, 0.25) == "test"].add(names[draw_environment(spec, layout)])
     assert seen == {True: set(names), False: {"assets/cell", "assets/yard"}}
     with pytest.raises(
-        InputError, match=r"hold_out\.environments: must leave an environment to training \(got all 3\)"
+        InputError, match=r"hold_out\.environments: must leave at least one environment for training \(got all 3\)"
     ):
         load_scene(write_scene(scene_data | {"hold_out": {"environments": list(names)}}))

@@ -90,7 +90,7 @@ def test_cameras_of_a_turn_see_the_same_moment(belt_data: SceneData, write_scene
 @pytest.mark.parametrize(
     ("change", "sentence"),
     [
-        ({"belt": "table"}, "conveyor.belt: must be a box among the shapes, belt (got table)"),
+        ({"belt": "table"}, "conveyor.belt: must be the name of a box among the shapes, belt (got table)"),
         ({"speed": 0.0}, "conveyor.speed: must not be 0"),
         ({"interval": 0.0}, "conveyor.interval: must be > 0"),
         ({"speed": -3.0}, "conveyor.belt: its box must be 1.45 m long, for the objects of its region not to leave"),
@@ -107,7 +107,7 @@ def test_what_no_belt_can_do_is_refused(
 
 def test_a_belt_below_no_region_is_refused(belt_data: SceneData, write_scene: WriteScene) -> None:
     belt_data["shapes"][0]["box"]["position"] = [3, 0, 0]
-    with pytest.raises(InputError, match=r"conveyor\.belt: must be below a region, whose objects it carries"):
+    with pytest.raises(InputError, match=r"conveyor\.belt: must be below a region, so that it carries objects"):
         scene_of(belt_data, write_scene)
 
 
@@ -115,5 +115,5 @@ def test_an_open_shutter_needs_something_that_moves(belt_data: SceneData, write_
     belt_data["camera"]["motion"] = {"exposure": [0.01, 0.02]}
     assert not scene_of(belt_data, write_scene).spec.camera.motion.is_moving  # type: ignore[union-attr]
     del belt_data["conveyor"]
-    with pytest.raises(InputError, match="motion: must have a speed or a rotation, or the scene a conveyor"):
+    with pytest.raises(InputError, match="motion: must have a speed or a rotation, unless the scene has a conveyor"):
         scene_of(belt_data, write_scene)

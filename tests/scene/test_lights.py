@@ -166,11 +166,11 @@ def test_lights_that_can_be_inside_of_a_shape_are_doubted(lit: Any) -> None:
         ({"kind": "area", "draw": {"radiance": [1, 2]}}, "lights[0].position: is required"),
         (
             {"kind": "point", "draw": {"distance": [1, 2], "size": [[1, 1], [2, 2]]}},
-            "lights[0].draw.size: is nothing that a light of kind point has",
+            "lights[0].draw.size: is not a key of lights of kind point",
         ),
         (
             {"kind": "environment", "draw": {"count": 2}},
-            "lights[0].draw.count: is nothing that a light of kind environment has",
+            "lights[0].draw.count: is not a key of lights of kind environment",
         ),
         ({"kind": "environment", "draw": {"distance": [1, 2]}}, "lights[0].draw.distance: is nothing that a light of"),
         (
@@ -201,7 +201,7 @@ def test_lights_that_can_be_inside_of_a_shape_are_doubted(lit: Any) -> None:
         ),
         (
             {"kind": "point", "draw": {"distance": [1, 2], "count": [0, 2]}},
-            "lights[0].draw.count: must be at least 1 where no other light is in every frame (got 0)",
+            "lights[0].draw.count: must be at least 1 if no other light is in every frame (got 0)",
         ),
         ({"kind": "point", "draw": {"distance": [1, 2], "vary": "view"}}, "lights[0].draw.vary: must be 'layout' or"),
         ({"kind": "area", "draw": {"distance": [1, 2], "dist": 3}}, "lights[0].draw.dist: is not a known key (did you"),

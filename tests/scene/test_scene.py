@@ -216,7 +216,7 @@ def changed(data: SceneData, **changes: Any) -> SceneData:
         ({"objects__0": {"pool": ["assets/nut", "assets/gone"]}}, "objects[0].pool[1]: "),
         (
             {"objects__0": {"pool": "gone/*"}},
-            "objects[0].pool: must match at least one folder of an object's asset (got 'gone/*', which matches none)",
+            "objects[0].pool: must match at least one asset folder of kind object (got 'gone/*', which matches none)",
         ),
         ({"objects__0": {"pool": "**a"}}, "objects[0].pool: must "),
         (
@@ -250,7 +250,7 @@ def changed(data: SceneData, **changes: Any) -> SceneData:
         ),
         (
             {"objects__0": {"pool": "primitives", "size": 0.1}},
-            "objects[0].size: must not be given for primitives, which take a scale",
+            "objects[0].size: must not be given for primitives (use scale)",
         ),
         ({"objects__0": {"pool": "primitives", "scale": 30}}, "objects[0].pool[0]: asset 'box_0' must fit into"),
         ({"empty": 1.5}, "empty: must be <= 1 (got 1.5)"),
@@ -285,9 +285,7 @@ def test_errors_in_assets_name_both_files(scene_data: SceneData, write_scene: Wr
 def test_an_asset_of_unknown_units_needs_a_size(scene_data: SceneData, write_scene: WriteScene) -> None:
     path = write_scene(scene_data)
     replace(box_asset("nut"), units="unknown").save(path.parent / "assets/nut")
-    with pytest.raises(
-        InputError, match=r"scene\.yaml:\d+: objects\[0\]\.asset: asset 'nut' is of unknown units: give"
-    ):
+    with pytest.raises(InputError, match=r"scene\.yaml:\d+: objects\[0\]\.asset: asset 'nut' has unknown units: set"):
         load_scene(path)
     scene_data["objects"][0] |= {"size": 0.06, "scale": 2}
     assert load_scene(write_scene(scene_data)).assets[0].mesh.extents.max() == pytest.approx(0.12)
@@ -298,7 +296,7 @@ def test_an_asset_of_unknown_units_needs_a_size(scene_data: SceneData, write_sce
         load_scene(write_scene(scene_data))
     scene_data["objects"][1].pop("size")
     scene_data["environment"] = "assets/nut"
-    with pytest.raises(InputError, match="environment: asset 'nut' is of unknown units"):
+    with pytest.raises(InputError, match="environment: asset 'nut' has unknown units"):
         load_scene(write_scene(scene_data))
 
 

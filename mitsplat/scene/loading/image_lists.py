@@ -72,7 +72,7 @@ def _matches(root: str, parts: Sequence[str], pattern: str) -> set[str]:
             for entry in inside:
                 num_visited += 1
                 if num_visited > MAX_ENTRIES:
-                    raise InputError(f"must look at {MAX_ENTRIES} files and folders at most (got {pattern!r})")
+                    raise InputError(f"must visit at most {MAX_ENTRIES} files and folders (got {pattern!r})")
                 for i in numbers & wild.keys():
                     if parts[i] == "**":
                         if entry.is_dir(follow_symlinks=False):
@@ -105,7 +105,7 @@ def image_names(folder: Path, images: str | tuple[str, ...]) -> tuple[str, ...]:
         wanted = [path for path in found if path.suffix.lower() in IMAGES and not path.name.startswith(".")]
         names = names_below(folder, pattern, wanted)
     if not names:
-        raise InputError(f"must name at least one image (got {images!r}, where there is none)")
+        raise InputError(f"must name at least one image (got {images!r}, which matches none)")
     for name in names:
         if not (folder / name).is_file():
             raise InputError(f"{folder / name}: no such file")

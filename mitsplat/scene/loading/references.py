@@ -147,7 +147,7 @@ def _matches(
     named = _checked_names(folder, names_below(folder, pattern, found), allow_outside)
     names = tuple(name for name in named if read_spec(folder / name).kind == kind)
     if not names:
-        raise InputError(f"must match at least one folder of an {kind}'s asset (got {pattern!r}, which matches none)")
+        raise InputError(f"must match at least one asset folder of kind {kind} (got {pattern!r}, which matches none)")
     return names
 
 
@@ -169,7 +169,7 @@ def _check_inside_folder(spec: SceneSpec, path: Path) -> None:
 
 def _refuse_outside(folder: Path, name: str) -> None:
     if not is_inside(folder, name):
-        raise InputError(f"must be inside the scene's folder (got {name:.200}); --allow-outside lifts this")
+        raise InputError(f"must be inside the scene's folder (got {name:.200}); --allow-outside permits other folders")
 
 
 def load_files(spec: SceneSpec, path: Path) -> LoadedFiles:

@@ -160,7 +160,9 @@ def _check_hold_out(spec: SceneSpec, path: Path) -> None:
                 raise InputError(f"{place}: must be among the {kind} of the scene, {listed} (got {name})")
     if spec.hold_out.environments and named["environments"] <= set(spec.hold_out.environments):
         place = key_place(path, ("hold_out", "environments"))
-        raise InputError(f"{place}: must leave an environment to training (got all {len(named['environments'])})")
+        raise InputError(
+            f"{place}: must leave at least one environment for training (got all {len(named['environments'])})"
+        )
 
 
 def scene_json_schema() -> dict[str, Any]:
@@ -177,7 +179,7 @@ def _check_units(asset: Asset) -> Asset:
     """
     if asset.units == "unknown":
         raise InputError(
-            f"asset {asset.name!r} is of unknown units: give its longest extent [m] as size, here or in asset.yaml"
+            f"asset {asset.name!r} has unknown units: set size, its longest extent [m], here or in asset.yaml"
         )
     return asset
 

@@ -148,9 +148,9 @@ def check_belt(spec: SceneSpec) -> None:
             reach = max(reach, float(abs(x).max()))
     wanted = 2 * (reach + abs(belt.travel))
     if not reach:
-        raise InputError("must be below a region, whose objects it carries")
+        raise InputError("must be below a region, so that it carries objects")
     if wanted > length:
         raise InputError(
-            f"its box must be {wanted:.3g} m long, for the objects of its region not to leave it within "
-            f"{abs(belt.travel):.3g} m either way (got {length:.3g} m)"
+            f"its box must be {wanted:.3g} m long, so that the objects of its region stay on it for "
+            f"{abs(belt.travel):.3g} m in both directions (got {length:.3g} m)"
         )

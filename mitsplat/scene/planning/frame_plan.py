@@ -120,10 +120,12 @@ def plan_frame(
     if lights is not None:
         spec = SceneSpec(**{**dict(spec), "lights": tuple(lights)})  # validates the lights
         if unknown := {name for _, name in light_images(spec)} - set(scene.images):
-            raise InputError(f"images of lights must be among those of the scene's own (got {min(unknown)!r})")
+            raise InputError(f"images of lights must be images that the scene file names (got {min(unknown)!r})")
         for light in spec.lights:
             if isinstance(light, EnvironmentLight) and isinstance(light.pool, str):
-                raise InputError(f"pools of lights must be lists of the scene's own images (got {light.pool!r})")
+                raise InputError(
+                    f"pools of lights must be lists of images that the scene file names (got {light.pool!r})"
+                )
     view = index - number * spec.output.views
     time = view / max(1, spec.output.views - 1)
     ranges = spec.randomise

@@ -196,16 +196,18 @@ class VisibilityPredictor:
         within, extents = projected.within[self.labelled], projected.extents[self.labelled]
         share = float(np.mean(within >= 0.5)) if len(within) else 1.0
         if share < rules.in_view:
-            text = f"shows {share:.3g} of the labelled objects, where in_view is {rules.in_view:g}"
+            text = f"shows {share:.3g} of the labelled objects, but in_view is {rules.in_view:g}"
             found.append((1 - share / rules.in_view, text))
         least = float(extents[within > 0].min(initial=np.inf))
         if least < rules.extent:
-            found.append((1 - least / rules.extent, f"shows one of {least:.3g} px, where extent is {rules.extent:g}"))
+            found.append(
+                (1 - least / rules.extent, f"shows an object of {least:.3g} px, but extent is {rules.extent:g}")
+            )
         away = self._clearance(eye, rules.clearance)
         if name := self._containing_solid(eye):
-            found.append((1.0, f"is from inside of {name}"))
+            found.append((1.0, f"is inside {name}"))
         elif away < rules.clearance:
-            text = f"is {away:.3g} m from what is nearest, where clearance is {rules.clearance:g}"
+            text = f"is {away:.3g} m from the nearest surface, but clearance is {rules.clearance:g}"
             found.append((1 - away / rules.clearance, text))
         return found
 

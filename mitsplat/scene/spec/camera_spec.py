@@ -55,7 +55,7 @@ class Intrinsics(StrictModel):
             raise FieldError("focus", f"must be beyond near, {self.near} (got {self.focus})")
         if self.lens == "fisheye":
             if self.fx is None or len(self.distortion) != 4:
-                raise FieldError("lens", "fisheye needs fx and 4 coefficients of distortion")
+                raise FieldError("lens", "fisheye needs fx and 4 distortion coefficients")
         elif len(self.distortion) not in (0, 4, 5, 8):
             raise FieldError("distortion", f"must have 0, 4, 5 or 8 coefficients (got {len(self.distortion)})")
         return self

@@ -90,7 +90,7 @@ class DrawnLight(StrictModel):
         local = "position" in type(self).model_fields
         for key in sorted(self.draw.model_fields_set - {"vary"}):
             if key not in type(self).model_fields and not (local and key in _DRAW_ONLY_KEYS):
-                raise FieldError(("draw", key), f"is nothing that a light of kind {getattr(self, 'kind', '')} has")
+                raise FieldError(("draw", key), f"is not a key of lights of kind {getattr(self, 'kind', '')}")
         if self.draw.distance is not None and self.draw.position is not None:
             raise FieldError(("draw", "distance"), "must not be given together with position")
         for key in ("azimuth", "elevation", "around"):

@@ -158,7 +158,7 @@ class ObjectSpec(StrictModel):
         if isinstance(self.pool, tuple) or self.pool == PRIMITIVES:
             self.check_weights(len(self.names))
         if self.pool == PRIMITIVES and self.size is not None:
-            raise FieldError("size", "must not be given for primitives, which take a scale")
+            raise FieldError("size", "must not be given for primitives (use scale)")
         if self.poses:
             for key in ("count", "pool", "region"):
                 if key in self.model_fields_set:

@@ -209,15 +209,15 @@ class SceneSpec(StrictModel):
                 raise FieldError(("shapes", position, "name"), f"must be unique (got {shape.name!r} again)")
             seen.add(shape.name)
             if self.backdrop is not None and shape.name.startswith(BACKDROP):
-                text = f"must not begin with {BACKDROP!r} beside a backdrop (got {shape.name!r})"
+                text = f"must not begin with {BACKDROP!r} if the scene has a backdrop (got {shape.name!r})"
                 raise FieldError(("shapes", position, "name"), text)
         for keys, camera in self.camera_entries:
             if camera.motion is not None and not camera.motion.is_moving and self.conveyor is None:
-                raise FieldError((*keys, "motion"), "must have a speed or a rotation, or the scene a conveyor")
+                raise FieldError((*keys, "motion"), "must have a speed or a rotation, unless the scene has a conveyor")
         boxes = [shape.name for shape in self.shapes if shape.box is not None]
         if self.conveyor is not None and self.conveyor.belt not in boxes:
             named, got = ", ".join(boxes) or "none", self.conveyor.belt
-            raise FieldError(("conveyor", "belt"), f"must be a box among the shapes, {named} (got {got})")
+            raise FieldError(("conveyor", "belt"), f"must be the name of a box among the shapes, {named} (got {got})")
         environment_lights = [
             i for i, light in enumerate(self.lights) if isinstance(light, EnvironmentLight | RoomLight)
         ]
@@ -227,24 +227,26 @@ class SceneSpec(StrictModel):
             self.check_environment_weights()
         if len(environment_lights) > 1:
             raise FieldError(
-                ("lights", environment_lights[1], "kind"), "must not be a second environment light, which rooms have"
+                ("lights", environment_lights[1], "kind"),
+                "must not be a second environment light (room lights include one)",
             )
         if self.lights and not any(isinstance(light, RoomLight) or light.always_present for light in self.lights):
             raise FieldError(
-                ("lights", 0, "draw", "count"), "must be at least 1 where no other light is in every frame (got 0)"
+                ("lights", 0, "draw", "count"), "must be at least 1 if no other light is in every frame (got 0)"
             )
         if "depth-sensor" in self.output.formats and self.depth_sensor is None:
-            raise FieldError(("output", "formats"), "depth-sensor needs a depth_sensor")
+            raise FieldError(("output", "formats"), "depth-sensor needs the key depth_sensor")
         lenses = [camera.intrinsics for _, camera in self.camera_entries]
         distorted = any(lens.lens == "fisheye" or any(lens.distortion) for lens in lenses)
         if isinstance(self.depth_sensor, StereoSensor) and distorted:
-            raise FieldError("depth_sensor", "stereo must have cameras without lens distortion")
+            raise FieldError("depth_sensor", "stereo needs cameras without lens distortion")
         if self.hold_out != HoldOut() and not self.output.test:
-            raise FieldError("hold_out", "needs a test split: give output.test")
+            raise FieldError("hold_out", "needs a test split: set output.test > 0")
         turn = len(self.views_of_turn)
         if any(camera.stereo for camera in (self.camera, *self.cameras)) and self.output.views % turn:
             raise FieldError(
-                ("output", "views"), f"must be a multiple of {turn}, so that pairs are whole (got {self.output.views})"
+                ("output", "views"),
+                f"must be a multiple of {turn}, so that stereo pairs are complete (got {self.output.views})",
             )
         self._check_regions()
         return self
@@ -305,5 +307,5 @@ class SceneSpec(StrictModel):
         """Check that there is one weight per environment, or none."""
         count = 1 if isinstance(self.environment, str) else len(self.environment or ())
         if self.environment_weights and len(self.environment_weights) != count:
-            text = f"must be as many as there are environments, {count} (got {len(self.environment_weights)})"
+            text = f"must have one weight per environment, {count} (got {len(self.environment_weights)})"
             raise FieldError("environment_weights", text)

@@ -78,7 +78,7 @@ class Conveyor(StrictModel):
     @model_validator(mode="after")
     def _check(self) -> Conveyor:
         if not self.speed:
-            raise FieldError("speed", "must not be 0 (a belt that stands still is a shape)")
+            raise FieldError("speed", "must not be 0 (use a shape for a belt that does not move)")
         return self
 
 

@@ -148,7 +148,7 @@ def test_an_object_that_is_not_there_leaves_its_id_free(scene: ms.Scene) -> None
     [
         ({"screw": [np.eye(4)]}, r"poses\['screw'\]: must be an asset of the scene \(bolt, nut\)"),
         ({7: [np.eye(4)]}, r"poses\[7\]: must be an asset of the scene"),
-        ({"nut": [np.eye(4)], 0: [np.eye(4)]}, r"poses\[0\]: must not be an asset that has poses already"),
+        ({"nut": [np.eye(4)], 0: [np.eye(4)]}, r"poses\[0\]: must not name an asset that already has poses"),
         ({"nut": [np.eye(4), 2 * np.eye(4)]}, r"poses\['nut'\]\[1\]: must have the last row 0, 0, 0, 1"),
         ({"nut": [np.diag([1, 1, 1.1, 1])]}, r"without scale or mirror \(got axes of lengths 1, 1, 1.1\)"),
         ({"nut": [np.diag([1, 1, -1, 1])]}, r"\(got axes of a left-handed frame of lengths 1, 1, 1\)"),

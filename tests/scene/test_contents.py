@@ -187,7 +187,7 @@ def test_what_is_held_out_is_in_the_test_split_alone(
 @pytest.mark.parametrize(
     ("change", "sentence"),
     [
-        ({"hold_out": {"assets": ["assets/nut"]}}, r"hold_out: needs a test split: give output\.test"),
+        ({"hold_out": {"assets": ["assets/nut"]}}, r"hold_out: needs a test split: set output\.test"),
         (
             {"hold_out": {"assets": ["assets/nail"]}, "output": {"test": 0.1}},
             r"hold_out\.assets\[0\]: must be among the assets of the scene, .*assets/nut \(got assets/nail\)",

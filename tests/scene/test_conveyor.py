@@ -93,7 +93,7 @@ def test_cameras_of_a_turn_see_the_same_moment(belt_data: SceneData, write_scene
         ({"belt": "table"}, "conveyor.belt: must be the name of a box among the shapes, belt (got table)"),
         ({"speed": 0.0}, "conveyor.speed: must not be 0"),
         ({"interval": 0.0}, "conveyor.interval: must be > 0"),
-        ({"speed": -3.0}, "conveyor.belt: its box must be 1.45 m long, for the objects of its region not to leave"),
+        ({"speed": -3.0}, "conveyor.belt: its box must be 1.45 m long, so that the objects of its region stay on it"),
     ],
 )
 def test_what_no_belt_can_do_is_refused(

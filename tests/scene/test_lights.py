@@ -172,7 +172,7 @@ def test_lights_that_can_be_inside_of_a_shape_are_doubted(lit: Any) -> None:
             {"kind": "environment", "draw": {"count": 2}},
             "lights[0].draw.count: is not a key of lights of kind environment",
         ),
-        ({"kind": "environment", "draw": {"distance": [1, 2]}}, "lights[0].draw.distance: is nothing that a light of"),
+        ({"kind": "environment", "draw": {"distance": [1, 2]}}, "lights[0].draw.distance: is not a key of lights of"),
         (
             {"kind": "area", "draw": {"distance": [1, 2], "position": [[0, 0, 1], [0, 0, 2]]}},
             "lights[0].draw.distance: must not be given together with position",
@@ -209,7 +209,7 @@ def test_lights_that_can_be_inside_of_a_shape_are_doubted(lit: Any) -> None:
         ({"kind": "environment", "pool": []}, "lights[0].pool: must name at least one image (got [])"),
         (
             {"kind": "environment", "pool": "no/*"},
-            "lights[0].pool: must name at least one image (got 'no/*', where there",
+            "lights[0].pool: must name at least one image (got 'no/*', which matches none",
         ),
         ({"kind": "environment", "pool": ["a.exr"], "weights": [1, 2]}, "lights[0].weights: must be as many as the"),
         ({"kind": "environment", "pool": ["a.exr"], "image": "b.exr"}, "lights[0].pool: must not be given together"),

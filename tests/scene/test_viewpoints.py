@@ -230,14 +230,15 @@ def test_accepted_views_are_as_they_must_be(scene: Scene) -> None:
 
 def test_a_camera_is_never_inside_of_what_it_would_see(scene: Scene) -> None:
     inside = seen_by(scene, accept={}, look_at="objects", radius=[0.001, 0.01], tries=3)
-    with pytest.raises(InputError, match=r"none of 3 views of frame 0 .* \(the best one is inside ob"):
+    with pytest.raises(InputError, match=r"none of 3 candidate views of frame 0 .* \(the best one is inside ob"):
         plan_frame(inside, 0, layouts(inside)[0])
 
 
 def test_what_no_view_fulfils_is_refused_with_how_near_it_came(scene: Scene) -> None:
     far = seen_by(scene, accept={"extent": 500}, tries=5)
     sentence = (
-        r"camera\.accept: none of 5 views of frame 2 .* \(the best one shows an object of [\d.]+ px, but extent is 500"
+        r"camera\.accept: none of 5 candidate views of frame 2 .* "
+        r"\(the best one shows an object of [\d.]+ px, but extent is 500"
     )
     with pytest.raises(InputError, match=sentence):
         plan_frame(far, 2, layouts(far)[0])

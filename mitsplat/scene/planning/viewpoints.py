@@ -295,8 +295,8 @@ def _hemisphere_view(scene: Scene, here: _CameraTurn, camera: CameraHemisphere, 
             break
     if best is None:
         raise InputError(
-            f"{scene.path}: camera.accept: none of {camera.tries} candidate views of frame {index} is acceptable (the best one "
-            f"{min(refused)[1]}); relax camera.accept, widen the camera's ranges or increase camera.tries"
+            f"{scene.path}: camera.accept: none of {camera.tries} candidate views of frame {index} is acceptable "
+            f"(the best one {min(refused)[1]}); relax camera.accept, widen the camera's ranges or increase camera.tries"
         )
     return best[1]
 

@@ -157,7 +157,7 @@ class Photo:
         size = (self.camera.width, self.camera.height)
         if pixels.size != size:
             raise InputError(
-                f"{path}: must be of its camera's {size[0]}x{size[1]} px (got {pixels.width}x{pixels.height})"
+                f"{path}: must have the size of its camera, {size[0]}x{size[1]} px (got {pixels.width}x{pixels.height})"
             )
         if window is not None:
             (left, top), size = window[:2], window[2:]

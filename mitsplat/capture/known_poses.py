@@ -80,7 +80,7 @@ def read_poses(source: Path, photos: Sequence[Prepared], folder: Path, progress:
         raise InputError(f"{source}: poses must be the folder of a COLMAP model or a transforms.json")
     names = _match(model.cameras, photos)
     if len(names) < 2:
-        raise InputError(f"{source}: must name the photos (got {next(iter(model.cameras))} and no match for it)")
+        raise InputError(f"{source}: must name the photos (got {next(iter(model.cameras))} which matches no photo)")
     _check_coordinates(source, model)
     sizes = {photo.file.name: photo.size for photo in photos}
     cameras = {file: _resized_camera(source, name, model.cameras[name], sizes[file]) for name, file in names.items()}
@@ -192,7 +192,7 @@ def _resized_camera(source: Path, name: str, camera: Camera, size: tuple[int, in
     """Return the camera resized to the pixels of a reduced copy."""
     if abs(camera.width * size[1] - camera.height * size[0]) > max(camera.width, camera.height, *size):
         raise InputError(
-            f"{source}: {name} must have the shape of its photo, {size[0]}x{size[1]} px (got {camera.width}x"
+            f"{source}: {name} must have the aspect ratio of its photo, {size[0]}x{size[1]} px (got {camera.width}x"
             f"{camera.height})"
         )
     return camera.resized(*size)

@@ -165,7 +165,7 @@ def find_metric_frame(
         origin = point
     distance = float(np.median(np.linalg.norm(centres - target, axis=1)))
     if not distance > 0:
-        raise InputError(f"the {len(centres)} cameras must stand apart from the place that they look at (got 0)")
+        raise InputError(f"the {len(centres)} cameras must not coincide with the point at which they are directed")
     factor = scale[0] if scale else 1 / distance
     rotation = _upright_rotation(normal, forward[0] if board_pose is None else board_pose[:3, 0])
     matrix = np.eye(4)

@@ -177,7 +177,7 @@ def given_masks(folder: Path, prepared: Mapping[str, Prepared]) -> MaskMaker:
         candidates = [f"{photo.name}.png", name.with_suffix(".png").as_posix(), photo.name]
         path = next((by_name[file.lower()] for file in candidates if file.lower() in by_name), None)
         if path is None:
-            raise InputError(f"{folder}: there must be a mask for every photo (got none named {candidates[1]})")
+            raise InputError(f"{folder}: every photo must have a mask (missing: {candidates[1]})")
         try:
             with Image.open(path) as image:
                 upright = ImageOps.exif_transpose(image)
@@ -192,7 +192,8 @@ def given_masks(folder: Path, prepared: Mapping[str, Prepared]) -> MaskMaker:
             mask = ImageOps.exif_transpose(mask)
         if shapes_differ(mask.size, size):
             raise InputError(
-                f"{path}: must have the shape of its photo, {size[0]}x{size[1]} px (got {mask.width}x{mask.height})"
+                f"{path}: must have the aspect ratio of its photo, {size[0]}x{size[1]} px "
+                f"(got {mask.width}x{mask.height})"
             )
         return np.asarray(mask.resize(size, Image.Resampling.BOX)) >= 128
 
@@ -299,7 +300,7 @@ def object_points(capture: Capture) -> Float64Array:
     points = points[(points[:, 2] > _MIN_HEIGHT * distance) & (np.linalg.norm(points, axis=1) < 0.9 * distance)]
     if len(points) < 20:
         raise InputError(
-            f"no object stands out of the table in the photos ({len(points)} points above it): give masks, or take "
+            f"no object was found above the table in the photos ({len(points)} points above it): give masks, or take "
             "photos of one object on a textured table"
         )
     tree = cKDTree(points)

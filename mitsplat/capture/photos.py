@@ -73,7 +73,7 @@ def find_photos(folder: Path, *, but: Path | None = None) -> list[Path]:
         InputError: If the folder does not exist, or two photographs would have copies of the same name.
     """
     if not folder.is_dir():
-        raise InputError(f"{folder}: must be a folder of photographs, or a video, that is there")
+        raise InputError(f"{folder}: must be an existing folder of photographs, or a video")
     found: dict[str, Path] = {}
     for path in files_below(folder, but=but):
         name = path.relative_to(folder).as_posix()
@@ -81,7 +81,7 @@ def find_photos(folder: Path, *, but: Path | None = None) -> list[Path]:
             continue
         other = found.setdefault(stored_name(name, path.suffix.lower()), path)
         if other != path:
-            raise InputError(f"{path}: its copy would have the name of that of {other}: rename one of them")
+            raise InputError(f"{path}: its copy would have the same name as that of {other}: rename one of them")
     return list(found.values())
 
 
@@ -141,7 +141,7 @@ def prepare_photos(
 def _prepare(path: Path, *, folder: Path, out: Path, max_size: int, upright: bool) -> _MeasuredPhoto | str:
     """Make the upright copy of a photo, or return the reason why it cannot be read."""
     if path.suffix.lower() in _UNSUPPORTED:
-        return f"{path.suffix[1:].upper()} files are not read; export it as JPEG or PNG"
+        return f"{path.suffix[1:].upper()} files are not supported; export it as JPEG or PNG"
     name = path.relative_to(folder).as_posix()
     try:
         with Image.open(path) as image:

@@ -315,8 +315,8 @@ def _read_arrays(arrays: Mapping[str, npt.NDArray[Any]], photos: Sequence[Prepar
     """
     if "names" not in arrays or not len(arrays["names"]):
         raise InputError(
-            f"no two of the {len(photos)} photos share enough points to find cameras from; take them closer together, "
-            "sharp, and with texture on or under the object"
+            f"no two of the {len(photos)} photos share enough points to find cameras; take sharp photos "
+            "closer together, with texture on or below the object"
         )
     names = [str(name) for name in arrays["names"]]
     cameras = {

@@ -146,9 +146,7 @@ def render(
         if scene.suffix == ".xml":
             ignored = engine != "local", overwrite, any_device, workers is not None
             if overrides or any(ignored) or any(given is not None for given in (frames, only, tolerance, shard)):
-                raise InputError(
-                    f"{scene}: a Mitsuba scene defines size, seed and quality itself: remove all options except --out"
-                )
+                raise InputError(f"{scene}: a Mitsuba scene has its own size, seed and quality: only --out applies")
             from mitsplat.frames.mitsuba_xml import render_apart
 
             typer.echo(f"picture: {render_apart(scene, out, allow_outside=allow_outside, device=chosen)}")

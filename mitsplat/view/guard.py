@@ -75,16 +75,16 @@ class Guard:
             origin: Header ``Origin``, which browsers add to requests of scripts.
         """
         if (_LOCAL if self.local else _HOST).fullmatch(host) is None:
-            return "not asked for by the name of this machine" + (", localhost" if self.local else "")
+            return "the host in the address is not this machine" + (", localhost" if self.local else "")
         if origin is not None and origin not in (f"http://{host}", f"https://{host}"):
-            return "asked for by another site"
+            return "requested by another site"
         place, _, query = path.partition("?")
         page = f"/{self.token}"
         if not secrets.compare_digest(_bytes(place.removesuffix("/")), _bytes(page)):
             return "the address must end in the token that `mitsplat view` printed"
         # viser's client adds the address of its own websocket as a query, and connects to any address in it.
         if query and query not in (f"websocket=ws://{host}{page}", f"websocket=wss://{host}{page}"):
-            return "the address must have nothing behind the token"
+            return "the address must end after the token"
         return None
 
     def answer_headers(self, host: str) -> dict[str, str]:
@@ -128,7 +128,7 @@ def guarded(guard: Guard) -> Iterator[Pool]:
             if reason := guard.refusal(request.path, host, header("Origin")):
                 return connection.respond(http.HTTPStatus.FORBIDDEN, f"mitsplat view: {reason}\n")
             if len(connection.server.connections) >= MOST_BROWSERS:
-                text = f"mitsplat view: {MOST_BROWSERS} browsers have this page open, which is the most\n"
+                text = f"mitsplat view: {MOST_BROWSERS} browsers have this page open, which is the maximum\n"
                 return connection.respond(http.HTTPStatus.SERVICE_UNAVAILABLE, text)
             if header("Upgrade") is not None:
                 return None  # the websocket
@@ -148,7 +148,9 @@ def guarded(guard: Guard) -> Iterator[Pool]:
     finally:
         server.serve = start
     if not started:
-        raise MissingResourceError("this viser cannot be guarded: install the one that mitsplat[view] asks for")
+        raise MissingResourceError(
+            "access control does not work with this version of viser: install the version of mitsplat[view]"
+        )
 
 
 def _logger() -> logging.Logger:

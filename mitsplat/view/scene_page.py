@@ -33,7 +33,7 @@ _INTERVAL = 0.04
 """Time between the displayed moments of a drop [s]."""
 _WIDTHS = ("320", "480", "640", "960", "1280")
 _NO_LIGHT = "none"
-_PLAIN = "Appearances and materials that are drawn are in the render alone; beside it, objects and shapes are plain."
+_PLAIN = "Random appearances and materials are visible only in the render, not in the 3D view."
 
 
 class ScenePage:
@@ -116,7 +116,7 @@ class ScenePage:
         with gui.add_folder("Frame"):
             self._frame = gui.add_slider("frame", 0, max(scene.num_frames - 1, 1), 1, 0)
             step = gui.add_button_group("layout", ("previous", "next"))
-            again = gui.add_button("Drop again", hint="Take the next seed, which decides everything that is random.")
+            again = gui.add_button("Drop again", hint="Use the next seed for all random numbers.")
             play = gui.add_button("Play the drop")
             self._seed = gui.add_text("YAML", seed_line(scene.spec.seed), multiline=True)
         with gui.add_folder("Render"):
@@ -362,8 +362,8 @@ def error_text(preview: Preview) -> str:
     """Return the text about the error of a preview, for its caption."""
     error = preview.frame.order_error
     if error is None:
-        return ", error of the order of blending unknown"
-    return f", error of the order of blending {error['mean']:.1g} on average, at most {error['largest']:.2g}"
+        return ", blending-order error unknown"
+    return f", blending-order error {error['mean']:.1g} on average, at most {error['largest']:.2g}"
 
 
 def _strength_of(light: LightSpec) -> str:

@@ -32,9 +32,9 @@ _PICK, _PICK_NOT, _REMOVE = "--pick", "--pick-not", "--remove"
 _NOTHING = "nothing"
 _CLICKS = {
     _NOTHING: None,
-    "this is the object": _PICK,
-    "this is not the object": _PICK_NOT,
-    "take this out of the place": _REMOVE,
+    "marks the object": _PICK,
+    "marks what is not the object": _PICK_NOT,
+    "removes a thing from the environment": _REMOVE,
 }
 """Meanings of a click, and the corresponding command line option."""
 _COLOURS = {_PICK: (255, 210, 0), _PICK_NOT: (60, 120, 255), _REMOVE: (255, 60, 60)}
@@ -97,7 +97,7 @@ class CapturePage(StillPage):
             raise InputError(f"{folder}: must have a photo to be shown (got none)")
         page.show(capture_parts(self._capture))
         with page.gui.add_folder("Pick things by clicks"):
-            self._click = page.gui.add_dropdown("a click says", tuple(_CLICKS), initial_value=_NOTHING)
+            self._click = page.gui.add_dropdown("a click", tuple(_CLICKS), initial_value=_NOTHING)
             self._summary = page.gui.add_markdown("")
             back = page.gui.add_button_group("forget", ("the last", "all"))
         self._photo = page.gui.add_slider("photo", 0, max(len(photos) - 1, 1), 1, 0)
@@ -187,7 +187,7 @@ class CapturePage(StillPage):
                 place = np.array([float(value) for value in pixel.split(",")]) * image.shape[1] / photo.camera.width
                 cv2.drawMarker(image, [round(value) for value in place], _COLOURS[option], cv2.MARKER_CROSS, 24, 2)
         masked = "" if photo.mask is None else ", with a mask"
-        self._page.show_picture(image, f"{_literal(photo.name)}: sees {len(photo.seen)} points{masked}")
+        self._page.show_picture(image, f"{_literal(photo.name)}: observes {len(photo.seen)} points{masked}")
 
 
 class DatasetPage(StillPage):
@@ -244,7 +244,7 @@ class DatasetPage(StillPage):
     def _show(self) -> None:
         with self._lock:
             if not self._found:
-                self._page.caption("no image has such a label")
+                self._page.caption("no image passes the filter")
                 return
             index = self._found[min(max(int(self._number.value), 0), len(self._found) - 1)]
             overlay: OverlayName = self._overlay.value if self._overlay.value in OVERLAYS else "none"

@@ -174,7 +174,7 @@ def test_missing_and_damaged_files_are_named(capture: Capture, tmp_path: Path) -
     points.write_bytes(whole)
     loaded = Capture.load(tmp_path / "a")
     Image.new("RGB", (40, 31)).save(loaded.photos[0].file)
-    with pytest.raises(InputError, match=r"view 0\.png: must be of its camera's 40x30 px \(got 40x31\)"):
+    with pytest.raises(InputError, match=r"view 0\.png: must have the size of its camera, 40x30 px \(got 40x31\)"):
         loaded.photos[0].picture()
     loaded.photos[0].file.write_bytes(b"rubbish")
     with pytest.raises(InputError, match="not a readable image"):

@@ -146,7 +146,7 @@ def test_textureless_photos(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
         Image.new("RGB", (120, 90), (90, 100, 110 + number)).save(tmp_path / f"photos/{number}.png")
     assert run("capture", tmp_path / "photos", "-o", tmp_path / "out") == 2
     err = capsys.readouterr().err
-    assert "no two of the 3 photos share enough points to find cameras from" in err
+    assert "no two of the 3 photos share enough points to find cameras" in err
     assert "Traceback" not in err
 
 
@@ -183,7 +183,10 @@ def test_photos_of_two_things_end_with_status_4(
     monkeypatch.setattr(take, "find_cameras", lambda *args: model)
     assert run("capture", given, "-o", tmp_path / "out", "--square", 0.035, "--kind", "environment") == 4
     out, err = capsys.readouterr()
-    assert "rejected: photo08.png: it only fits a smaller group of photos, as of another object or side\n" in out
+    assert (
+        "rejected: photo08.png: it matches only a smaller group of photos, for example of another object or side\n"
+        in out
+    )
     assert "rejected: photo15.png: it shares too few points with the other photos\n" in out
     assert "only 8 of 17 photos (47%) could be used, 75% are wanted" in err
     assert len(Capture.load(tmp_path / "out").photos) == 8
@@ -203,14 +206,14 @@ def test_cameras_that_explain_little_are_named_unless_a_board_confirms_them(
     monkeypatch.setattr(take, "find_cameras", lambda *args: model)
     assert run("capture", given, "-o", tmp_path / "sure", "--square", 0.035, "--kind", "environment") == 0
     said = capsys.readouterr().out
-    assert "rejected: photo03.png: its camera is wrong: it explains only 40% of its matches\n" in said
+    assert "rejected: photo03.png: its camera is wrong: it agrees with only 40% of its matches\n" in said
     assert "warning" not in said
     monkeypatch.setattr("mitsplat.capture.metric_frame._fit_board", lambda *args: None)
     for _ in range(2):  # made, and kept
         assert run("capture", given, "-o", tmp_path / "out", "--kind", "environment") == 0
         said = capsys.readouterr().out
         assert (
-            "warning: cameras explain few of their matches and may be wrong, leave them out or add others: "
+            "warning: cameras agree with few of their matches and may be wrong; remove these photos or add others: "
             f"{seen} (60%)\n" in said
         )
 
@@ -257,10 +260,10 @@ def test_a_capture_is_not_written_among_what_it_is_made_of(photos: tuple[Path, o
     with pytest.raises(InputError, match="must not lie in the folder of the photographs"):
         capture_photos(photos[0], photos[0] / "out")
     shutil.copytree(photos[0], tmp_path / "out/images")
-    with pytest.raises(InputError, match="images, which is written anew"):
+    with pytest.raises(InputError, match="images, which is overwritten"):
         capture_photos(tmp_path / "out/images", tmp_path / "out")
     shutil.copytree(photos[0], tmp_path / "out/masks/mine")
-    with pytest.raises(InputError, match="masks, which is written anew"):
+    with pytest.raises(InputError, match="masks, which is overwritten"):
         capture_photos(photos[0], tmp_path / "out", CaptureSettings(masks=tmp_path / "out/masks/mine"))
     assert len(list((tmp_path / "out").rglob("*.png"))) == 2 * len(list(photos[0].glob("*.png")))
 
@@ -401,9 +404,9 @@ def test_photos_of_another_thing_are_left_out(
     [
         (["--squares", "7"], "--squares must be COLUMNSxROWS, such as 7x5 (got 7)"),
         (["--tag", "0"], "the edge of tags must be > 0 m (got 0.0)"),
-        (["--metric"], "poses must be given to be taken as metric"),
+        (["--metric"], "--metric requires --poses"),
         (["--max-size", "10"], "the size of photos must be at least 64 px (got 10)"),
-        (["--masks", "a", "--mask-model", "b"], "give a folder of masks or a model, not both"),
+        (["--masks", "a", "--mask-model", "b"], "--masks and --mask-model both define the masks: give only one"),
     ],
 )
 def test_bad_options(tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[str], sentence: str) -> None:
@@ -441,7 +444,7 @@ def test_a_video_is_captured_by_its_frames(tmp_path: Path, monkeypatch: pytest.M
         assert photo.file.read_bytes() == (tmp_path / "out/frames" / photo.name).read_bytes()
     inside = tmp_path / "out/frames/a.avi"
     shutil.copyfile(tmp_path / "a.avi", inside)
-    with pytest.raises(InputError, match=r"a\.avi: must not lie in .*frames, which is written anew"):
+    with pytest.raises(InputError, match=r"a\.avi: must not lie in .*frames, which is overwritten"):
         capture_photos(inside, tmp_path / "out")
 
 

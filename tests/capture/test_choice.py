@@ -55,11 +55,11 @@ def test_a_ray_ends_at_what_stands_in_front(capture: Capture) -> None:
 
 @pytest.mark.parametrize("ahead", [(0, 0, 1), (1, -1, 0.3)])
 def test_a_ray_into_the_air_picks_nothing(capture: Capture, ahead: tuple[float, float, float]) -> None:
-    with pytest.raises(InputError, match="no point of the capture lies there"):
+    with pytest.raises(InputError, match="there is no point of the capture at this position"):
         pick_along(capture, EYE, ahead)
 
 
 def test_a_point_that_no_photo_shows_is_said(capture: Capture) -> None:
     blind = replace(capture, photos=tuple(replace(one, seen=one.seen[:0]) for one in capture.photos))
-    with pytest.raises(InputError, match="no photo that was kept shows"):
+    with pytest.raises(InputError, match="no photo of the capture observes"):
         pick_along(blind, EYE, top_of(0) - EYE)

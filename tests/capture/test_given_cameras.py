@@ -128,10 +128,12 @@ def test_given_masks_are_taken(
         there = replace(settings, poses=Path("../model"), masks=Path())
         assert len(capture_photos(given, Path("../out"), there).capture.photos) == 15
     (tmp_path / "masks/photo05.PNG").unlink()
-    with pytest.raises(InputError, match=r"there must be a mask for every photo \(got none named photo05\.png\)"):
+    with pytest.raises(InputError, match=r"every photo must have a mask \(missing: photo05\.png\)"):
         capture_photos(given, tmp_path / "out", settings)
     Image.new("L", (300, 300), 255).save(tmp_path / "masks/photo05.png")
-    with pytest.raises(InputError, match=r"photo05\.png: must have the shape of its photo, 480x360 px \(got 300x300\)"):
+    with pytest.raises(
+        InputError, match=r"photo05\.png: must have the aspect ratio of its photo, 480x360 px \(got 300x300\)"
+    ):
         capture_photos(given, tmp_path / "out", settings)
 
 

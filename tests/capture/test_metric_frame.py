@@ -370,5 +370,5 @@ def test_cameras_of_one_place_are_refused(tmp_path: Path) -> None:
     Image.new("L", (64, 48)).save(tmp_path / "black.png")
     camera = Camera(64, 48, 60.0, 60.0, 32.0, 24.0, np.eye(4))
     model = replace(model_of([camera] * 4, np.zeros((0, 3))), cameras=dict.fromkeys("abcd", camera))
-    with pytest.raises(InputError, match="the 4 cameras must stand apart from the place that they look at"):
+    with pytest.raises(InputError, match="the 4 cameras must not coincide with the point at which they are directed"):
         find_metric_frame(model, dict.fromkeys("abcd", tmp_path / "black.png"))

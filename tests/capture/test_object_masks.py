@@ -72,7 +72,9 @@ def test_photos_in_which_another_thing_stands_before_the_object_are_left_out() -
     found, hidden = _reject_occluded(capture, ChosenObject(ball, ball, (ball + np.array([0.12, 0, 0]),)))
     assert [photo.name for photo in found.photos] == [f"{turn:03}.jpg" for turn in range(45, 360, 45)]
     assert not hidden and found.rejected.keys() == {"blurred.jpg", "000.jpg"}
-    assert re.fullmatch(r"another thing stands before the object and may hide \d+% of it", found.rejected["000.jpg"])
+    assert re.fullmatch(
+        r"another thing is in front of the object and may occlude \d+% of it", found.rejected["000.jpg"]
+    )
     aside = 0.75 * ball + np.array([0.12, 0.05, 0.03])
     found, hidden = _reject_occluded(capture, ChosenObject(ball, ball, (aside,)))
     assert len(found.photos) == 8 and hidden.keys() == {"000.jpg", "045.jpg"}
@@ -108,7 +110,7 @@ def test_masks_are_transparent_where_the_object_may_be_hidden(
 
 def test_masks_need_an_object(captured: tuple[Path, Path, CaptureResult]) -> None:
     capture = captured[2].capture
-    with pytest.raises(InputError, match="no object stands out of the table"):
+    with pytest.raises(InputError, match="no object was found above the table"):
         object_points(replace(capture, points=capture.points * (1, 1, 0)))
     behind = geometric_masks(np.array([[0.0, 0, 50], [0.1, 0, 50], [0, 0.1, 50]]))
     assert not behind(capture.photos[1]).any()

@@ -97,14 +97,14 @@ def test_useless_photos_are_named_with_a_reason(folder: Path) -> None:
     assert set(photos) == {"0.png", "1.png", "2.png", "whole.jpg"}
     assert set(rejected) == {"torn.jpg", "text.jpg", "phone.heic", "moved.png", "night.png", "flash.png"}
     assert rejected["torn.jpg"].startswith("it cannot be read (")
-    assert rejected["phone.heic"] == "HEIC files are not read; export it as JPEG or PNG"
+    assert rejected["phone.heic"] == "HEIC files are not supported; export it as JPEG or PNG"
     assert rejected["moved.png"].startswith("it is blurred (sharpness ")
     assert rejected["night.png"] == "it is too dark (100% of it is black)"
     assert rejected["flash.png"] == "it is too bright (100% of it is white)"
 
 
 def test_missing_folder(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="gone: must be a folder of photographs, or a video, that is there"):
+    with pytest.raises(InputError, match="gone: must be an existing folder of photographs, or a video"):
         prepare_photos(tmp_path / "gone", tmp_path / "out", max_size=100)
 
 
@@ -139,12 +139,12 @@ def test_two_photographs_of_one_name_are_refused(folder: Path) -> None:
     (folder / "a").mkdir()
     for name in ("a/b.png", "a__b.png"):
         Image.fromarray(texture(8)).save(folder / name)
-    with pytest.raises(InputError, match=r"its copy would have the name of that of .*: rename one of them"):
+    with pytest.raises(InputError, match=r"its copy would have the same name as that of .*: rename one of them"):
         prepare(folder)
 
 
 def test_a_photograph_alone_is_no_folder(folder: Path) -> None:
-    with pytest.raises(InputError, match=r"0\.png: must be a folder of photographs, or a video"):
+    with pytest.raises(InputError, match=r"0\.png: must be an existing folder of photographs, or a video"):
         find_photos(folder / "0.png")
 
 

@@ -75,13 +75,13 @@ def test_lights_replace_their_own_alone(tmp_path: Path) -> None:
     out = tmp_path / "room.yaml"
     refuse_to_replace(out, [tmp_path / "sky.exr"])
     for given in ("room_panorama.exr", "room.png"):
-        with pytest.raises(InputError, match=f"{given}: would be replaced"):
+        with pytest.raises(InputError, match=f"{given} is an input and would be replaced"):
             refuse_to_replace(out, [tmp_path / given])
     (tmp_path / "room.png").write_text("mine")
-    with pytest.raises(InputError, match=r"room\.png: is there already, and not of `mitsplat lights`"):
+    with pytest.raises(InputError, match=r"room\.png: already exists and was not written by `mitsplat lights`"):
         refuse_to_replace(out, [])
     out.write_text("name: room\n")
-    with pytest.raises(InputError, match=r"room\.yaml: is there already"):
+    with pytest.raises(InputError, match=r"room\.yaml: already exists"):
         refuse_to_replace(out, [])
     out.write_text("# Captured light: 3 W/m^2\nlights:\n")
     refuse_to_replace(out, [])
@@ -131,15 +131,15 @@ def test_a_capture_removes_nothing_that_is_no_capture_s(tmp_path: Path) -> None:
     for made in ("images", "masks", "sfm"):
         (tmp_path / made / made).mkdir(parents=True)
         (tmp_path / made / made / "1.png").write_text("mine")
-        refused(made, f"{made}/{made}: is there already, and not of a capture")
+        refused(made, f"{made}/{made}: already exists and is not part of a capture")
         (tmp_path / f"link {made}").mkdir()
         (tmp_path / f"link {made}" / made).symlink_to(tmp_path / "mine")
-        refused(f"link {made}", "is there already, and not of a capture")
-    refused("out", "photographs cannot be their own masks", masks=photos)
+        refused(f"link {made}", "already exists and is not part of a capture")
+    refused("out", "the masks must not be the photographs", masks=photos)
     refused("out", "gone: no such folder of masks", masks=tmp_path / "gone")
     (tmp_path / "new/sfm").mkdir(parents=True)
     (tmp_path / "new/sfm/model.json").write_text("{}")
-    refused("new", "must not lie in .*sfm, which is written anew", poses=tmp_path / "new/sfm/model.json")
+    refused("new", "must not lie in .*sfm, which is overwritten", poses=tmp_path / "new/sfm/model.json")
 
 
 def test_frames_are_there_until_others_are(tmp_path: Path) -> None:
@@ -147,7 +147,7 @@ def test_frames_are_there_until_others_are(tmp_path: Path) -> None:
     frames.mkdir()
     (tmp_path / "torn.mp4").write_bytes(b"torn")
     (frames / "000001.jpg").write_text("a frame")
-    with pytest.raises(InputError, match="is there already, and not of frames of a video"):
+    with pytest.raises(InputError, match="already exists and contains no frames of a video"):
         choose_frames(tmp_path / "torn.mp4", frames, most=8, least=3)
     (frames / "video.json").write_text("{}")
     with pytest.raises(InputError, match="video"):

@@ -149,7 +149,7 @@ def test_render_xml(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pyt
     assert str(picture) in capsys.readouterr().out
     for ignored in (["--seed", 3], ["--workers", 2], ["--overwrite"], ["--any-device"], ["--engine", "ray"]):
         assert run("render", "one.xml", *ignored) == 2
-        assert "a Mitsuba scene defines size, seed and quality itself: remove all" in capsys.readouterr().err
+        assert "a Mitsuba scene has its own size, seed and quality: only" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

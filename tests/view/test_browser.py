@@ -256,7 +256,7 @@ def test_a_click_on_a_capture_picks_what_is_there(browser, tmp_path):
         assert yellow() == 0
         choice("nothing").click()
         choice("nothing").send_keys(Keys.ARROW_DOWN, Keys.ENTER)
-        until(lambda: choice("this is the object"))
+        until(lambda: choice("marks the object"))
         canvas = browser.find_elements(By.TAG_NAME, "canvas")[0]
 
         def picked() -> bool:
@@ -278,7 +278,7 @@ def use_page(browser: Any, scene_file: Path) -> None:
     def changed(before: np.ndarray) -> bool:
         return "exact" in text() and bool(np.abs(render(browser) - before).mean() > 1)
 
-    until(lambda: "exact" in text() and "order of blending" in text())
+    until(lambda: "exact" in text() and "blending-order error" in text())
     until(lambda: redness(screen(browser)[:, 490:770]) > 0.005)  # of the splats
     first = render(browser)
     assert redness(first) > 0.005

@@ -207,7 +207,7 @@ def test_the_address_of_a_number_of_version_6_has_brackets():
 
 
 def test_a_page_that_is_not_guarded_is_not_served():
-    with pytest.raises(MissingResourceError, match="cannot be guarded"), guarded(Guard.of_host("localhost")):
+    with pytest.raises(MissingResourceError, match="access control does not work"), guarded(Guard.of_host("localhost")):
         pass
 
 

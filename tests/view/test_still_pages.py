@@ -102,7 +102,7 @@ def test_the_page_of_a_dataset_steps_and_filters(page, clean):
     assert shown.found == tuple(DatasetIndex(clean).find(Filter("nut")))
     shown._visible.value = (0, 0)
     assert shown.found == ()
-    assert page._caption.content == "no image has such a label"
+    assert page._caption.content == "no image passes the filter"
     shown._class.value = "../../etc/passwd"  # as a browser might answer
     assert shown.found == ()
 
@@ -150,7 +150,7 @@ def test_clicks_on_a_capture_pick_things(page, tmp_path):
     click(0, "as no option says")  # as a browser might answer
     assert shown._summary.content == ""
     assert "/cameras/0" in page._shown
-    click(1, "this is the object")
+    click(1, "marks the object")
     assert "/cameras/0" not in page._shown  # a click on it would pick what is behind
     (pick,) = (text for _, text in shown._picks)
     assert shown._summary.content == f"```\n--pick {pick}\n```"
@@ -159,16 +159,16 @@ def test_clicks_on_a_capture_pick_things(page, tmp_path):
     points = page._shown["/chosen/object"].thing.points
     assert np.linalg.norm(points[:, :2] - THINGS[1], axis=1).max() < 0.05
 
-    click(1, "this is not the object")
-    assert "what was picked is also said not to be the object" in page._alert.content
+    click(1, "marks what is not the object")
+    assert "a thing is selected by both --pick and --pick-not" in page._alert.content
     assert shown._summary.content == f"```\n--pick {pick}\n```" and "/chosen/object" in page._shown
 
-    click(2, "take this out of the place")
+    click(2, "removes a thing from the environment")
     assert shown._summary.content.count("--remove") == 1 and not page._alert.visible
     points = page._shown["/chosen/removed"].thing.points
     assert np.linalg.norm(points[:, :2] - THINGS[2], axis=1).max() < 0.05
     shown._pointed(eye, np.array([0.0, 0.0, 1.0]))
-    assert "no point of the capture lies there" in page._alert.content
+    assert "there is no point of the capture at this position" in page._alert.content
     shown._forget(all_of_them=True)
     assert shown._summary.content == "" and not [name for name in page._shown if name.startswith("/chosen")]
     shown._forget(all_of_them=False)  # of none

@@ -120,8 +120,8 @@ def choose_object(
         stands &= ((points >= box[:3]) & (points <= box[3:])).all(axis=1)
     if np.count_nonzero(stands) < _MIN_POINTS:
         raise InputError(
-            f"no object stands out of its support in the photos ({np.count_nonzero(stands)} points above it): give "
-            "masks, or take photos of one object with texture on and under it"
+            f"no object was found above its support in the photos ({np.count_nonzero(stands)} points above it): give "
+            "masks, or take photos of one object with texture on and below it"
         )
     thing, count = _cluster_things(points, stands, distance)
     if picks:
@@ -134,7 +134,9 @@ def choose_object(
         chosen = np.array([int(scores.argmax())])
     refused = {_picked_thing(pick, points, thing) for pick in picks_not}
     if refused >= set(chosen.tolist()):
-        raise InputError(f"what was picked is also said not to be the object ({picks_not[0].name}): they touch")
+        raise InputError(
+            f"a thing is selected by both --pick and --pick-not ({picks_not[0].name}): the picked things touch"
+        )
     own = np.isin(thing, [number for number in chosen.tolist() if number not in refused])
     feet = _project_feet(points[own], height[own], support)
     large = np.flatnonzero(np.bincount(thing[stands]) >= _MIN_POINTS)
@@ -184,7 +186,7 @@ def _picked_thing(pick: Pick, points: Float64Array, thing: Int64Array) -> int:
     gaps = np.linalg.norm(camera.project(points[shown])[0] - pick.pixel, axis=1)
     limit = _PICK_RADIUS * max(camera.width, camera.height)
     if not len(gaps) or not gaps.min() < limit:
-        raise InputError(f"{pick.name}: the photo shows no point of a thing within {limit:.0f} px of this pixel")
+        raise InputError(f"{pick.name}: the photo observes no point of a thing within {limit:.0f} px of this pixel")
     return int(thing[shown[int(gaps.argmin())]])
 
 

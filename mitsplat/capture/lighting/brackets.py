@@ -105,23 +105,23 @@ def exposures_of(photographs: Sequence[Photograph], stated: Sequence[float] | No
         if photograph.pixels.shape != first.pixels.shape:
             size, other = photograph.pixels.shape[1::-1], first.pixels.shape[1::-1]
             raise InputError(
-                f"{photograph.path}: exposures must be of one size, {other[0]} x {other[1]} px as {first.path} "
+                f"{photograph.path}: photographs must have equal sizes, {other[0]} x {other[1]} px as {first.path} "
                 f"(got {size[0]} x {size[1]})"
             )
     if stated is not None and len(stated) != len(photographs):
-        raise InputError(f"--exposures must be as many as photographs, {len(photographs)} (got {len(stated)})")
+        raise InputError(f"--exposures must have one value per photograph, {len(photographs)} (got {len(stated)})")
     if len(photographs) == 1:
         return np.ones(1)
     found = [photograph.exposure for photograph in photographs] if stated is None else stated
     for photograph, exposure in zip(photographs, found, strict=True):
         if exposure is None:
-            raise InputError(f"{photograph.path}: EXIF must state the exposure time (got none): give --exposures")
+            raise InputError(f"{photograph.path}: EXIF has no exposure time: give --exposures")
     exposures = np.array(found, dtype=np.float64)
     if not (np.isfinite(exposures).all() and (exposures > 0).all()):
         raise InputError(f"exposures must be finite and > 0 (got {', '.join(f'{e:g}' for e in exposures)})")
     if exposures.max() < 1.2 * exposures.min():
         raise InputError(
-            f"{first.path}: exposures of several photographs must differ (got {', '.join(f'{e:g}' for e in exposures)})"
+            f"{first.path}: the exposures of the photographs must differ (got {', '.join(f'{e:g}' for e in exposures)})"
         )
     return exposures
 

@@ -164,9 +164,9 @@ def read_ball(paths: Sequence[Path], view: BallView) -> BallReading:
     warnings = list[str]()
     hdr = paths[0].suffix.lower() in HDR_SUFFIXES
     if hdr and len(paths) > 1:
-        raise InputError(f"{paths[1]}: an HDR photograph must be the only one (got {len(paths)})")
+        raise InputError(f"{paths[1]}: an HDR photograph must be the only input (got {len(paths)})")
     if hdr and view.exposures is not None:
-        raise InputError(f"{paths[0]}: --exposures is of photographs of 8 bits; an HDR photograph is taken as it is")
+        raise InputError(f"{paths[0]}: --exposures applies to 8-bit photographs, not to an HDR photograph")
     if hdr:
         image = read_radiance(paths[0])
         pixels, focal = [_tone_mapped(image)], None
@@ -177,12 +177,12 @@ def read_ball(paths: Sequence[Path], view: BallView) -> BallReading:
     picture = min(pixels, key=lambda levels: abs(float(levels.mean()) - _MEAN_LEVEL))
     ball = find_ball(*pixels) if view.ball is None else view.ball
     if ball is None:
-        raise InputError(f"{paths[0]}: no ball stands out in it: give --ball X Y RADIUS")
+        raise InputError(f"{paths[0]}: no ball was detected: give --ball X Y RADIUS")
     x, y, radius = ball
     height, width = picture.shape[:2]
     if min(x, y, width - x, height - y) < radius:
         raise InputError(
-            f"{paths[0]}: the ball must be whole in the photograph, {width} x {height} px (got one of radius "
+            f"{paths[0]}: the ball must be completely visible in the photograph, {width} x {height} px (got radius "
             f"{radius:.0f} around {x:.0f}, {y:.0f})"
         )
     if radius < _MIN_RADIUS:
@@ -194,21 +194,21 @@ def read_ball(paths: Sequence[Path], view: BallView) -> BallReading:
         image[part], clipped[part] = merge_exposures([levels[part] for levels in pixels], exposures)
         if len(paths) < 3:
             warnings.append(
-                f"{len(paths)} exposure{'s' * (len(paths) > 1)}: radiance is by the curve of sRGB, which cameras bend; "
-                "three or more would show the camera's own"
+                f"{len(paths)} exposure{'s' * (len(paths) > 1)}: the response of sRGB is assumed; with three "
+                "or more, the response of the camera is estimated"
             )
     if view.fov_x is not None:
         focal = 0.5 * width / float(np.tan(np.radians(view.fov_x) / 2))
     if focal is None:
-        warnings.append("no focal length in EXIF: the camera's rays count as parallel; give --fov-x")
+        warnings.append("no focal length in EXIF: parallel camera rays are assumed; give --fov-x")
     image /= np.array(view.reflectivity, dtype=np.float32)
     found = unwrap_ball(image, ball, focal, view.azimuth, view.elevation, clipped)
     if not level_irradiance(found.radiance).any():
-        raise InputError(f"{paths[0]}: the ball must mirror light from above the horizon (got none)")
+        raise InputError(f"{paths[0]}: the ball must reflect light from above the horizon (got none)")
     if found.clipped > 0:
         warnings.append(
-            f"{found.clipped:.2%} of the ball is white (from {CLIPPED} of 255) in the shortest exposure: what lamps "
-            "send there is a lower bound"
+            f"{found.clipped:.2%} of the ball is white (from {CLIPPED} of 255) in the shortest exposure: the light of "
+            "lamps there is a lower bound"
         )
     return BallReading(found, ball, _draw_circle(picture, ball), warnings)
 
@@ -259,10 +259,12 @@ def refuse_to_replace(out: Path, images: Sequence[Path]) -> None:
     """
     written, given = (out, *_output_files(out)), {image.resolve() for image in images}
     if lost := [file for file in written if file.resolve() in given]:
-        raise InputError(f"{lost[0]}: would be replaced: give another --out (got {out})")
+        raise InputError(f"{lost[0]} is an input and would be replaced: give another --out (got {out})")
     there = [file for file in written if file.exists()]
     if there and not (out.is_file() and out.read_bytes().startswith(_TITLE.encode())):
-        raise InputError(f"{there[0]}: is there already, and not of `mitsplat lights`: give another --out (got {out})")
+        raise InputError(
+            f"{there[0]}: already exists and was not written by `mitsplat lights`: give another --out (got {out})"
+        )
 
 
 _TITLE = "# Captured light: "

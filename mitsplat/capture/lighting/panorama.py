@@ -83,7 +83,7 @@ def read_panorama(path: Path) -> Float32Array:
     panorama = read_radiance(path)
     height, width = panorama.shape[:2]
     if width != 2 * height:
-        raise InputError(f"{path}: a panorama must be twice as wide as high, all around (got {width} x {height} px)")
+        raise InputError(f"{path}: a panorama must be twice as wide as high (got {width} x {height} px)")
     if not level_irradiance(panorama).any():
         raise InputError(f"{path}: a panorama must have light above the horizon (got none)")
     return panorama
@@ -97,7 +97,8 @@ def read_radiance(path: Path) -> Float32Array:
     """
     if path.suffix.lower() not in HDR_SUFFIXES:
         raise InputError(
-            f"{path}: a panorama must be HDR, {', '.join(HDR_SUFFIXES)}: others clip the lamps (got {path.suffix})"
+            f"{path}: a panorama must be HDR, {', '.join(HDR_SUFFIXES)}, because other formats clip the lamps "
+            f"(got {path.suffix})"
         )
     (reason,) = check_images([path])
     if reason is not None:

@@ -97,12 +97,15 @@ class CaptureSettings:
         rules = (
             (self.max_size < 64, f"the size of photos must be at least 64 px (got {self.max_size})"),
             (self.tag is not None and not self.tag > 0, f"the edge of tags must be > 0 m (got {self.tag})"),
-            (self.metric and self.poses is None, "poses must be given to be taken as metric"),
-            (self.masks is not None and self.mask_model is not None, "give a folder of masks or a model, not both"),
+            (self.metric and self.poses is None, "--metric requires --poses"),
+            (
+                self.masks is not None and self.mask_model is not None,
+                "--masks and --mask-model both define the masks: give only one",
+            ),
             (
                 self.hinted and not (self.kind == "object" and self.masks is None and self.mask_model is None),
-                "picks and a box choose an object to make masks of: leave them out with given masks, a model or an "
-                "environment",
+                "--pick, --pick-not and --box select an object to segment: remove them with --masks, --mask-model or "
+                "an environment",
             ),
             (
                 self.box is not None and not all(a < b for a, b in zip(self.box[:3], self.box[3:], strict=True)),
@@ -143,7 +146,7 @@ class CaptureResult:
     def exposure(self) -> str | None:
         """Range of the corrected exposure differences as a clause; None without correction."""
         gains = [np.log(photo.gain).mean() for photo in self.capture.photos if photo.gain is not None]
-        return f"photos differ by up to {np.expm1(np.ptp(gains)):.0%}, which is corrected" if gains else None
+        return f"photos differ by up to {np.expm1(np.ptp(gains)):.0%}; this is corrected" if gains else None
 
     @property
     def weak(self) -> dict[str, int]:
@@ -158,10 +161,10 @@ class CaptureResult:
         if self.doubtful:
             shares = ", ".join(f"{name} ({share:.0%})" for name, share in sorted(self.doubtful.items()))
             warnings.append(
-                f"cameras explain few of their matches and may be wrong, leave them out or add others: {shares}"
+                f"cameras agree with few of their matches and may be wrong; remove these photos or add others: {shares}"
             )
         if self.weak:
-            warnings.append(f"weakly held, more overlap would help: {', '.join(self.weak)}")
+            warnings.append(f"few matched points; add photos with more overlap: {', '.join(self.weak)}")
         return tuple(warnings)
 
     @property
@@ -171,8 +174,8 @@ class CaptureResult:
             return None
         return (
             f"only {len(self.capture.photos)} of {self.given} photos ({self.registered:.0%}) could be used, "
-            f"{MIN_REGISTERED:.0%} are wanted: take sharp photos of one thing at steps of about ten degrees, with "
-            "texture under it and even light"
+            f"{MIN_REGISTERED:.0%} are required: take sharp photos of one object at steps of about ten degrees, with "
+            "texture below it and even light"
         )
 
 
@@ -254,7 +257,7 @@ def _capture(photos: Path, out: Path, settings: CaptureSettings, progress: Progr
         if len(capture.photos) < MIN_PHOTOS:
             name, reason = sorted(set(capture.rejected.items()) - set(rejected.items()))[0]
             raise InputError(
-                f"{photos}: only {len(capture.photos)} photos can be cut out ({name}: {reason}); give masks"
+                f"{photos}: only {len(capture.photos)} photos can be segmented ({name}: {reason}); use --masks"
             )
     capture = capture.save(out)
     used = {photo.file.name for photo in capture.photos}
@@ -282,16 +285,16 @@ def _check_outputs(out: Path, photos: Path, settings: CaptureSettings) -> None:
     if out.resolve().is_relative_to(photos.resolve()):
         raise InputError(f"{out}: must not lie in the folder of the photographs, {photos}")
     if settings.masks is not None and settings.masks.resolve() == photos.resolve():
-        raise InputError(f"{settings.masks}: photographs cannot be their own masks")
+        raise InputError(f"{settings.masks}: the masks must not be the photographs")
     folders = [out / made for made in ("frames", "images", "masks", "sfm")]
     for given in (photos, settings.masks, settings.poses, settings.mask_model):
         for folder in folders:
             if given is not None and given.resolve().is_relative_to(folder.resolve()):
-                raise InputError(f"{given}: must not lie in {folder}, which is written anew")
+                raise InputError(f"{given}: must not lie in {folder}, which is overwritten")
     known = any((out / file).is_file() for file in (_PHOTOS, _INPUTS, CAPTURE_FILE))
     for folder in folders:
         if folder.is_symlink() or (folder.name != "frames" and not known and folder.exists() and any(folder.iterdir())):
-            raise InputError(f"{folder}: is there already, and not of a capture: choose another folder")
+            raise InputError(f"{folder}: already exists and is not part of a capture: choose another folder")
 
 
 def _inputs(photos: Path, files: Sequence[Path], settings: CaptureSettings) -> dict[str, object]:
@@ -351,15 +354,15 @@ def _find_model(
     frame = _metric_frame(model, by_file, settings)
     while frame.wrong:
         faults |= {
-            file: f"its camera is wrong: it sees the board {error:.0f} px from where it is"
+            file: f"its camera is wrong: it sees the board {error:.0f} px from its position"
             for file, error in frame.wrong.items()
         }
         model, further = _remove_faulty_cameras(model.without(frame.wrong), least=0 if settings.poses else MIN_POINTS)
         faults |= further
         _check_camera_count(photos, model, by_file, faults)
         frame = _metric_frame(model, by_file, settings)
-    absent = "the poses given do not name it" if settings.poses else "it shares too few points with the other photos"
-    elsewhere = "it only fits a smaller group of photos, as of another object or side"
+    absent = "the given poses do not contain it" if settings.poses else "it shares too few points with the other photos"
+    elsewhere = "it matches only a smaller group of photos, for example of another object or side"
     for file in by_file.keys() - model.cameras.keys() - faults.keys():
         faults[file] = elsewhere if file in model.elsewhere else absent
     return model, frame, faults
@@ -373,7 +376,7 @@ def _check_camera_count(
         reasons = "; ".join(f"{by_file[file].name}: {fault}" for file, fault in sorted(faults.items())[:3])
         raise InputError(
             f"{photos}: cameras of only {len(model.cameras)} of {len(by_file)} photos could be found, {MIN_PHOTOS} are "
-            f"needed{f' ({reasons})' if reasons else ''}; take them closer together, and with texture on or under the "
+            f"needed{f' ({reasons})' if reasons else ''}; take photos closer together, with texture on or below the "
             "object"
         )
 
@@ -384,7 +387,7 @@ def _remove_faulty_cameras(model: SparseModel, least: int = MIN_POINTS) -> tuple
     wrong = {file: share for file, share in shares.items() if share < MIN_AGREEMENT}
     model, weak = model.without(wrong).without_weak(least)
     faults = {
-        file: f"its camera is wrong: it explains only {share:.0%} of its matches" for file, share in wrong.items()
+        file: f"its camera is wrong: it agrees with only {share:.0%} of its matches" for file, share in wrong.items()
     }
     return model, faults | {
         file: f"only {points} points could be matched in it, {least} are needed" for file, points in weak.items()
@@ -436,8 +439,8 @@ def _with_masks(
         return add_masks(capture, model_masks(settings.mask_model), mask_folder, progress=progress)
     if not frame.table and not settings.hinted:
         raise InputError(
-            "no table was found under the object to cut it out by: pick it (--pick), give masks (--masks or "
-            "--mask-model), put it on something with texture, or capture it as an environment (--kind environment)"
+            "no table was found below the object to segment it: pick it (--pick), give masks (--masks or "
+            "--mask-model), place it on a textured surface, or capture it as an environment (--kind environment)"
         )
     hidden: dict[str, BoolArray] = {}
     bare = None if frame.board is None else partial(bare_squares, settings.board, frame.board)
@@ -461,7 +464,7 @@ def _reject_occluded(capture: Capture, chosen: ChosenObject) -> tuple[Capture, d
     for photo in capture.photos:
         hides, may_hide, pixels = hidden_part(photo.camera, chosen.above, chosen.others)
         if hides > _HIDDEN and may_hide > _MAX_HIDDEN:
-            rejected[photo.name] = f"another thing stands before the object and may hide {may_hide:.0%} of it"
+            rejected[photo.name] = f"another thing is in front of the object and may occlude {may_hide:.0%} of it"
             continue
         photos.append(photo)
         if hides > _HIDDEN:

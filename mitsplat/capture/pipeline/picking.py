@@ -66,10 +66,10 @@ def pick_along(capture: Capture, origin: npt.ArrayLike, direction: npt.ArrayLike
     elif len(aside) and aside.min() < _WIDE:
         point = int(aside.argmin())
     else:
-        raise InputError("no point of the capture lies there: click on one")
+        raise InputError("there is no point of the capture at this position: click on a point")
     shown = [photo for photo in capture.photos if (photo.seen == point).any()]
     if not shown:
-        raise InputError("no photo that was kept shows the point that lies there: click on another one")
+        raise InputError("no photo of the capture observes the point at this position: click on another point")
 
     def likeness(world_place: npt.NDArray[np.float64]) -> float:
         towards = capture.points[point] - world_place

@@ -62,8 +62,8 @@ class VideoReader:
         length = self.stated / self.rate
         if index < (1 - _MISSING) * self.stated and time + 1 / self.rate < (1 - _MISSING) * length:
             raise InputError(
-                f"{self.file}: must hold the {self.stated} frames that it is said to (got {index}, {time:.1f} of "
-                f"{length:.1f} s): it is cut short or damaged, copy it again"
+                f"{self.file}: must hold the {self.stated} frames that its header states (got {index}, {time:.1f} of "
+                f"{length:.1f} s): it is incomplete or damaged: copy it again"
             )
 
     def picture(self) -> ByteImage:
@@ -89,7 +89,7 @@ def open_video(file: Path) -> Iterator[VideoReader]:
     try:
         if not opened.isOpened():
             raise InputError(
-                f"{file}: must be a whole video that FFmpeg reads, such as .mp4, .mov or .avi (got a file of "
+                f"{file}: must be a complete video that FFmpeg reads, such as .mp4, .mov or .avi (got a file of "
                 f"{file.stat().st_size} bytes that it cannot open)"
             )
         opened.set(cv2.CAP_PROP_ORIENTATION_AUTO, 1)

@@ -50,10 +50,10 @@ class ChosenFrames:
         if not self.cuts:
             return ()
         times = ", ".join(f"{time:.1f} s" for time in self.cuts[:_MAX_LISTED_CUTS])
-        more = f" and {len(self.cuts) - _MAX_LISTED_CUTS} times more" if len(self.cuts) > _MAX_LISTED_CUTS else ""
+        more = f" and {len(self.cuts) - _MAX_LISTED_CUTS} more times" if len(self.cuts) > _MAX_LISTED_CUTS else ""
         return (
-            f"{self.video}: jumps at {times}{more}, by a cut or a movement too fast to follow: what shares no view "
-            "with the rest gets no cameras",
+            f"{self.video}: jumps at {times}{more}, by a cut or a movement too fast to track: parts without common "
+            "views with the rest have no cameras",
         )
 
 
@@ -82,7 +82,7 @@ def choose_frames(
     if (kept := _load_finished(video, folder, inputs)) is not None:
         return kept
     if folder.exists() and any(folder.iterdir()) and not (folder / _RECORD).is_file():
-        raise InputError(f"{folder}: is there already, and not of frames of a video: choose another folder")
+        raise InputError(f"{folder}: already exists and contains no frames of a video: choose another folder")
     # Written to another folder, so that earlier frames exist until all new ones do.
     made = folder.with_name(f".{folder.name}.part")
     shutil.rmtree(made, ignore_errors=True)

@@ -72,16 +72,16 @@ def _check_choice(video: Path, choice: Choice, seconds: float, most: int, least:
         if not choice.cuts and choice.moved < STEP:
             raise InputError(
                 f"{video}: its picture must move by {least * STEP:.0%} of its width or more (got {choice.moved:.1%} in "
-                f"{seconds:.1f} s): walk around what is filmed, which must have texture that can be followed"
+                f"{seconds:.1f} s): move around the object, which must have texture that can be tracked"
             )
         raise InputError(
             f"{video}: must show at least {least} views that differ by {STEP:.0%} of the picture's width (got "
-            f"{len(choice.frames)} in {seconds:.1f} s): walk farther around what is filmed"
+            f"{len(choice.frames)} in {seconds:.1f} s): move farther around the object"
         )
     if len(choice.frames) > most:
         raise InputError(
-            f"{video}: must not jump more often than frames are taken of it (got {len(choice.cuts)} cuts, or movements "
-            f"too fast to follow, for {most} frames): film in one go, slowly, or take more frames (--frames)"
+            f"{video}: must have fewer cuts than frames to take (got {len(choice.cuts)} cuts, or movements "
+            f"too fast to track, for {most} frames): film slowly without cuts, or take more frames (--frames)"
         )
 
 

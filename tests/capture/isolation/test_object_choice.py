@@ -67,7 +67,7 @@ def test_hints_choose_another_thing(place: tuple[Float64Array, Int64Array, list[
 def test_hints_that_fit_nothing_are_refused(place: tuple[Float64Array, Int64Array, list[PhotoView]]) -> None:
     points, labels, views = place
     one = pick(place, 1)
-    with pytest.raises(InputError, match=r"also said not to be the object \(one.jpg:1,2\)"):
+    with pytest.raises(InputError, match=r"selected by both --pick and --pick-not \(one.jpg:1,2\)"):
         choose_object(points, views, picks=[one], picks_not=[one])
     with pytest.raises(InputError, match="no point of a thing within 32 px"):
         choose_object(points, views, picks=[Pick("one.jpg:0,0", views[0], (0.0, 0.0))])
@@ -76,5 +76,5 @@ def test_hints_that_fit_nothing_are_refused(place: tuple[Float64Array, Int64Arra
     fewer = [
         PhotoView(v.camera, np.array([place_of[i] for i in v.seen.tolist() if i in place_of], np.int32)) for v in views
     ]
-    with pytest.raises(InputError, match="no object stands out of its support"):
+    with pytest.raises(InputError, match="no object was found above its support"):
         choose_object(points[bare], fewer)

@@ -417,7 +417,7 @@ class TestRoom:
 
     def test_one_photograph_is_said_to_be_a_bound(self, shots: list[Path]) -> None:
         reading = read_ball(shots[2:3], BallView(room.AZIMUTH, room.ELEVATION))
-        assert reading.warnings[0].startswith("1 exposure: radiance is by the curve of sRGB")
+        assert reading.warnings[0].startswith("1 exposure: the response of sRGB is assumed")
         assert "is white (from 250 of 255) in the shortest exposure" in reading.warnings[1]
         single = estimate_light(reading.panorama.radiance, LightSettings())
         assert between(single.lamps[0].direction, room.LAMPS[0].direction) < 15
@@ -486,34 +486,37 @@ class TestInput:
         [
             (["grey.png"], "grey.png: must be the only input and an HDR panorama, .exr, .hdr, .pfm; for"),
             (["nan.exr", "nan.exr"], "nan.exr: must be the only input and an HDR panorama"),
-            (["square.exr"], "square.exr: a panorama must be twice as wide as high, all around (got 8 x 8 px)"),
+            (["square.exr"], "square.exr: a panorama must be twice as wide as high (got 8 x 8 px)"),
             (["nan.exr"], "nan.exr: radiance must be finite (got nan at pixel 5, 3, and 1 such pixels)"),
             (["dark.exr"], "dark.exr: a panorama must have light above the horizon (got none)"),
             (["no.exr"], "no.exr: cannot be read (No such file or directory)"),
             (["no.png", *CAMERA], "no.png: no such file"),
             (["broken.jpg", *CAMERA], "broken.jpg: not a readable photograph"),
-            (["grey.png", *CAMERA], "grey.png: no ball stands out in it: give --ball X Y RADIUS"),
+            (["grey.png", *CAMERA], "grey.png: no ball was detected: give --ball X Y RADIUS"),
             (
                 ["grey.png", *CAMERA, "--ball", 20, 30, 25],
-                "grey.png: the ball must be whole in the photograph, 120 x 60 px (got one of radius 25 around 20, 30)",
+                "grey.png: the ball must be completely visible in the photograph, 120 x 60 px (got radius 25 around",
             ),
             (
                 ["grey.png", "small.png", *CAMERA],
-                "small.png: exposures must be of one size, 120 x 60 px as grey.png (got 100 x 60)",
+                "small.png: photographs must have equal sizes, 120 x 60 px as grey.png (got 100 x 60)",
             ),
             (
                 ["grey.png", "grey.png", *CAMERA],
-                "grey.png: EXIF must state the exposure time (got none): give --exposures",
+                "grey.png: EXIF has no exposure time: give --exposures",
             ),
             (
                 ["grey.png", "grey.png", *CAMERA, "--exposures", "1,1"],
-                "grey.png: exposures of several photographs must differ (got 1, 1)",
+                "grey.png: the exposures of the photographs must differ (got 1, 1)",
             ),
-            (["grey.png", *CAMERA, "--exposures", "1,2"], "--exposures must be as many as photographs, 1 (got 2)"),
+            (["grey.png", *CAMERA, "--exposures", "1,2"], "--exposures must have one value per photograph, 1 (got 2)"),
             (["grey.png", *CAMERA, "--exposures", "1/0"], "--exposures must be times such as 1/60,1/8,1 (got 1/0)"),
             (["grey.png", "grey.png", *CAMERA, "--exposures", "1,-2"], "exposures must be finite and > 0 (got 1, -2)"),
-            (["nan.exr", "grey.png", *CAMERA], "grey.png: an HDR photograph must be the only one (got 2)"),
-            (["nan.exr", *CAMERA, "--exposures", "1"], "nan.exr: --exposures is of photographs of 8 bits; an HDR"),
+            (["nan.exr", "grey.png", *CAMERA], "grey.png: an HDR photograph must be the only input (got 2)"),
+            (
+                ["nan.exr", *CAMERA, "--exposures", "1"],
+                "nan.exr: --exposures applies to 8-bit photographs, not to an HDR",
+            ),
             (
                 ["grey.png", "--camera", 0, 90],
                 "--camera must be an azimuth and an elevation between -90 and 90 (got 0 90)",

@@ -257,17 +257,17 @@ def jumpy(file: Path) -> Path:
     [
         (
             text,
-            r"must be a whole video that FFmpeg reads, such as .mp4, .mov or .avi \(got a file of 8 bytes that",
+            r"must be a complete video that FFmpeg reads, such as .mp4, .mov or .avi \(got a file of 8 bytes that",
         ),
-        (headless, r"must be a whole video that FFmpeg reads, .* that it cannot open\)"),
+        (headless, r"must be a complete video that FFmpeg reads, .* that it cannot open\)"),
         (
             torn,
-            r"must hold the 60 frames that it is said to \(got \d\d, \d\.\d of 2\.0 s\): it is cut short or damaged",
+            r"must hold the 60 frames that its header states \(got \d\d, \d\.\d of 2\.0 s\): it is incomplete",
         ),
-        (still, r"its picture must move by 15% of its width or more \(got 0\.\d% in 2\.0 s\): walk around"),
+        (still, r"its picture must move by 15% of its width or more \(got 0\.\d% in 2\.0 s\): move around"),
         (plain, r"its picture must move by 15% of its width or more \(got 0\.0% in 1\.0 s\).*must have texture"),
         (short, r"must show at least 3 views that differ by 5% of the picture's width \(got 2 in 2\.0 s\)"),
-        (jumpy, r"must not jump more often than frames are taken of it \(got 9 cuts, .* for 6 frames\)"),
+        (jumpy, r"must have fewer cuts than frames to take \(got 9 cuts, .* for 6 frames\)"),
     ],
     ids=lambda value: getattr(value, "__name__", ""),
 )

@@ -157,7 +157,7 @@ def test_a_crash_of_colmap_is_one_sentence(tmp_path: Path, monkeypatch: pytest.M
     crash = tmp_path / "crash"
     crash.write_text("#!/bin/sh\nkill -SEGV $$\n")
     crash.chmod(0o755)
-    monkeypatch.setattr(sfm.sys, "executable", str(crash))
+    monkeypatch.setattr(sys, "executable", str(crash))
     with pytest.raises(
         MissingResourceError, match=r"COLMAP ended with signal 11 while starting; its messages are in .*log"
     ):

@@ -73,7 +73,7 @@ class TestTrial:
             if lost == "static":
                 self.static = None
             else:
-                self.casting = ()
+                self.shadow_casters = ()
 
         monkeypatch.setattr(Proxies, "__init__", without)
         assert any(fault.startswith("light") for fault in trial_faults(render_trial()))

@@ -188,7 +188,7 @@ def test_photos_of_two_things_end_with_status_4(
         in out
     )
     assert "rejected: photo15.png: it shares too few points with the other photos\n" in out
-    assert "only 8 of 17 photos (47%) could be used, 75% are wanted" in err
+    assert "only 8 of 17 photos (47%) could be used, 75% are required" in err
     assert len(Capture.load(tmp_path / "out").photos) == 8
 
 
@@ -391,7 +391,7 @@ def test_photos_of_another_thing_are_left_out(
         shutil.copy(photos[0] / f"photo{number:02}.png", given)
     assert run("capture", given, "-o", out, "--square", 0.035, "--kind", "environment") == 4
     said, err = capsys.readouterr()
-    assert "only 6 of 10 photos (60%) could be used, 75% are wanted" in err
+    assert "only 6 of 10 photos (60%) could be used, 75% are required" in err
     assert "Traceback" not in err
     capture = Capture.load(out)
     assert {photo.name for photo in capture.photos} == {f"photo{number:02}.png" for number in range(6)}

@@ -159,7 +159,7 @@ def test_a_missed_threshold_is_status_4_and_a_sentence(
     monkeypatch.setattr(pipeline, "make_asset", Calls(finished(tmp_path, psnr=12.0)))
     assert run("mesh", "capture", "fit", "-o", tmp_path) == 4
     shown = capsys.readouterr()
-    assert "held-out photos are met at only 12.0 dB (at least 24 is wanted): use even light" in shown.err
+    assert "held-out photos have a PSNR of only 12.0 dB (at least 24 is required): use even light" in shown.err
     assert f"report: {tmp_path / 'report.html'}" in shown.out
     assert run("mesh", "capture", "fit", "-o", tmp_path, "--units", 0.001) == 2
 

@@ -53,7 +53,7 @@ SETTINGS: dict[str, tuple[dict[str, Any], str]] = {
     "small": ({"size": 32}, r"size must be 64 or more \(got 32\)"),
     "odd": ({"size": 100}, r"size must be a multiple of 32 px \(got 100\)"),
     "share": ({"share": 1.0}, r"share of real images must lie between 0 and 1 \(got 1\)"),
-    "real_size": ({"real_size": 320}, r"real_size must be no less than size, 640 px \(got 320\)"),
+    "real_size": ({"real_size": 320}, r"real_size must be at least size, 640 px \(got 320\)"),
     "large seed": ({"seed": 2**32}, r"seed must be less than 2\^32 \(got 4294967296\)"),
     "seed": ({"seed": -1}, r"seed must be 0 or more"),
     "device": ({"device": "gpu"}, r"device must be auto, cpu, cuda or cuda:N \(got gpu\)"),
@@ -204,7 +204,7 @@ REFUSED: dict[str, tuple[Callable[[Path], object], dict[str, Any], str]] = {
     "stranger": (_stranger, {}, r"run: must contain only a run \(got thesis.tex\)"),
     "own names": (_own_names, {}, r"run: must contain only a run \(got data\)"),
     "crowds": (_crowds, {"real": "crowds"}, "crowds: all labels are crowds"),
-    "empty": (_empty, {}, r"cell: there is no image for train \(it has 1 for val\)"),
+    "empty": (_empty, {}, r"cell: there are no images for train \(it has 1 for val\)"),
     "classes": (_others, {"more": "other"}, "other: its classes must be those of .*cell: it also has gear"),
     "real classes": (_others, {"real": "other"}, "other: its classes must be those of .*cell: it also has gear"),
     "boxes": (_boxes, {"real": "boxes"}, "boxes: a mask model needs mask labels, but photos/p0.png has only boxes"),
@@ -519,7 +519,7 @@ def test_what_cannot_be_judged_is_refused(data: Path, trained: Run, tmp_path: Pa
     for folder, options, message in (
         ("boxes", {}, "has only boxes"),
         ("gears", {}, r"gears: its classes must be those of .*run: it also has gear"),
-        ("boxes", {"split": "test"}, "there is no image for test"),
+        ("boxes", {"split": "test"}, "there are no images for test"),
         ("boxes", {"size": 100}, r"--size must be a multiple of 32 px \(got 100\)"),
         ("boxes", {"device": "cuda:all"}, "device must be auto, cpu, cuda or cuda:N"),
     ):

@@ -217,7 +217,7 @@ def test_a_frame_that_does_not_fit_even_alone(tmp_path, workers):
         made.extend(results)
     assert str(caught.value) == (
         "frame 7 cannot be made: memory is exhausted (jit_malloc(): out of memory! Could not allocate 4 GiB of device "
-        "memory.): smaller images and fewer samples take less; if it was a GPU's, use --device cpu; finished frames "
+        "memory.): use smaller images or fewer samples; if it was GPU memory, use --device cpu; finished frames "
         "are kept"
     )
 

@@ -386,7 +386,7 @@ def test_maps_move_the_surface_and_are_part_of_the_fit(capture: Capture, tmp_pat
     photos = replace(photos, photos=(photos.photos[0], few, *photos.photos[2:]))
     first = fit_capture(photos, tmp_path / "fit", settings, depths=maps)
     assert first.warnings == (
-        "depth maps that are left out, because fewer than 10 of the capture's points are in them: 01.png",
+        "depth maps that are not used, because fewer than 10 of the capture's points are in them: 01.png",
     )
     assert fit_capture(photos, tmp_path / "fit", settings, depths=maps).warnings == first.warnings
     without = fit_capture(photos, tmp_path / "without", settings)

@@ -62,7 +62,7 @@ def test_size_that_cannot_be_is_refused(width: float) -> None:
 
 
 def test_places_must_be_finite() -> None:
-    with pytest.raises(ValueError, match=r"must have finite places \(got \[0.0, 0.0, nan\]"):
+    with pytest.raises(ValueError, match=r"must be finite \(got \[0.0, 0.0, nan\]"):
         look_at_pose((0, 0, np.nan), (0, 0, 0))
 
 

@@ -185,7 +185,7 @@ def test_another_rule_settles_anew(change, scene_data, write_scene, tmp_path, mo
     shutil.copytree(settle.PACKAGE, package, ignore=shutil.ignore_patterns("__pycache__"))
     monkeypatch.setattr(settle, "PACKAGE", package)
     kept = settle._scene_hash.__wrapped__(scene)
-    (package / "render/layers.py").write_text("")
+    (package / "renderer/layers.py").write_text("")
     assert settle._scene_hash.__wrapped__(scene) == kept
     code = (package / f"{module}.py").read_text()
     assert text in code

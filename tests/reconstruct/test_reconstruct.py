@@ -145,7 +145,7 @@ def test_what_was_edited_is_kept_and_what_is_gone_is_made_anew(
     described.write_text(described.read_text().replace("friction: 0.5", "friction: 0.31"))
     assert make_asset(*given, out, job).kept
     result = make_asset(*given, out, replace(job, name="other"))
-    assert result.warnings == ("asset.yaml had been edited: as it was, it is asset.edited.yaml now",)
+    assert result.warnings == ("asset.yaml had been edited: the edited file is now asset.edited.yaml",)
     assert "friction: 0.31" in (out / "asset.edited.yaml").read_text() and "friction: 0.5" in described.read_text()
     assert make_asset(*given, out, job).warnings == ()
     described.write_text(described.read_text().replace("friction: 0.5", "friction: 0.4"))

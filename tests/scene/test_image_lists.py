@@ -51,7 +51,7 @@ def test_links_that_multiply_paths_are_bounded(tmp_path: Path, monkeypatch: pyte
     monkeypatch.setattr(image_lists, "MAX_ENTRIES", 5000)
     for number in range(3):
         (tmp_path / str(number)).symlink_to(".")
-    with pytest.raises(InputError, match=r"must look at 5000 files and folders at most \(got '\*/\*"):
+    with pytest.raises(InputError, match=r"must visit at most 5000 files and folders \(got '\*/\*"):
         glob_below(tmp_path, "/".join("*" * 30))
 
 

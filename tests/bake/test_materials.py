@@ -252,7 +252,7 @@ def test_colours_that_are_not_there_are_missed(tmp_path: Path) -> None:
     refused(tmp_path / "model.gltf", r"its texture not there\.png is missing")
     said["materials"][0]["pbrMetallicRoughness"]["baseColorTexture"]["index"] = 7
     (tmp_path / "model.gltf").write_text(json.dumps(said))
-    refused(tmp_path / "model.gltf", "a material's texture 7 is not there")
+    refused(tmp_path / "model.gltf", "a material's texture 7 is missing")
 
 
 def test_meshes_of_impossible_faces_are_refused(tmp_path: Path) -> None:

@@ -246,7 +246,7 @@ def test_photos_get_the_exposures_that_they_were_taken_with(tmp_path: Path, monk
 def test_corrections_are_shifted_to_the_identity_as_their_mean() -> None:
     ensure_variant()
     table = np.random.default_rng(2).normal(size=(12, 7)).astype(np.float32)
-    found = np.array(fit._centred(mi.Float(table.ravel()), 7)).reshape(12, 7)
+    found = np.array(fit._centre_exposure(mi.Float(table.ravel()), 7)).reshape(12, 7)
     np.testing.assert_allclose(found.mean(axis=1).reshape(3, 4), np.eye(3, 4), atol=1e-6)
     np.testing.assert_allclose(np.diff(found, axis=1), np.diff(table, axis=1), atol=1e-5)
 

@@ -45,7 +45,7 @@ def test_rays_of_a_fisheye_come_back_to_their_pixels(distortion: tuple[float, ..
 @pytest.mark.parametrize(
     ("changes", "sentence"),
     [
-        ({"distortion": (0.1, 0.0)}, "takes 4 coefficients"),
+        ({"distortion": (0.1, 0.0)}, "must have 4 coefficients"),
         ({"fx": 200.0}, "at most 85 degrees"),
         ({"distortion": (-0.5, 0.0, 0.0, 0.0)}, "in growing distance"),
     ],

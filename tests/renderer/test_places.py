@@ -159,7 +159,7 @@ def test_each_frame_or_layout_draws_a_background(scene_data: SceneData, write_sc
         ({"backdrop": {"size": [1, 1, 1], "walls": []}}, "backdrop.walls: must have at least one material (got [])"),
         (
             {"backdrop": {"size": [1, 1, 1], "floor": [{"kind": "image", "images": "gone.png"}]}},
-            "backdrop.floor[0].images: must name at least one image (got 'gone.png', where",
+            "backdrop.floor[0].images: must name at least one image (got 'gone.png', which",
         ),
         ({"materials": [{"kind": "glass"}]}, "shapes[0].materials[0].kind: must be "),
         ({"materials": [{"kind": "noise", "scale": [0, 1]}]}, "shapes[0].materials[0].scale[0]: must be > 0 (got 0)"),

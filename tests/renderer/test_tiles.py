@@ -101,7 +101,7 @@ def test_pictures_are_the_same_however_they_are_projected_and_walked(
                for z in (-2, 0, 9)]  # before the splats, among them, and with all of them behind it  # fmt: skip
     found: list[list[Layers]] = []
     for at_once, rows in ((False, 4), (True, 1)):
-        monkeypatch.setattr(tiles, "_at_once", lambda _, at_once=at_once: at_once)
+        monkeypatch.setattr(tiles, "_skips_culling", lambda _, at_once=at_once: at_once)
         monkeypatch.setattr(march, "rows_together", lambda order, rows=rows: rows if order == "tile" else 1)
         found.append([render_splats(make_splats(700, 8), camera, quality=quality) for camera in cameras])
     rounding = 5e-6 if mi.variant() == "cuda_ad_rgb" else 0.0  # there a branch rounds by how many rays are in it

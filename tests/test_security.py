@@ -454,7 +454,9 @@ class TestMeshes:
         said = {"asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0}]}
         empty, path = {"buffers": [], "bufferViews": []}, tmp_path / "a.gltf"
         path.write_text(json.dumps({**said, "meshes": [mesh], "accessors": [accessor], **empty}))
-        with pytest.raises(InputError, match=r"a\.gltf: not a mesh file that can be read \(reading it takes more memory"):
+        with pytest.raises(
+            InputError, match=r"a\.gltf: not a mesh file that can be read \(reading it takes more memory"
+        ):
             read(path)
 
     def test_a_swollen_3mf(self, tmp_path):

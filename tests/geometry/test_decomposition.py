@@ -159,7 +159,9 @@ def test_no_more_pieces_than_are_asked_for_however_rough_a_scan():
 @pytest.mark.parametrize("normal", [(1.0, 0, 0), (0.6, 0, 0.8)])
 @pytest.mark.parametrize("offset", [-0.013, 0.0, 0.004])
 def test_what_a_cut_leaves_empty_is_what_manifold_says_of_both_sides(bracket, normal, offset):
-    emptiness = decomposition._weighted_empty_volume(bracket, bracket.vertices @ normal - offset, offset * np.array(normal))
+    emptiness = decomposition._weighted_empty_volume(
+        bracket, bracket.vertices @ normal - offset, offset * np.array(normal)
+    )
     sides = decomposition._manifold(bracket).split_by_plane(normal, offset)
     hulls = [side.hull().volume() for side in sides]
     expected = sum(hull * (hull - side.volume()) for hull, side in zip(hulls, sides, strict=True))

@@ -258,7 +258,7 @@ def _window(view: CameraView, parts: Sequence[tuple[trimesh.Trimesh, np.ndarray]
     camera = view.camera
     points = np.concatenate([trimesh.transform_points(mesh.vertices, pose) for mesh, pose in parts])
     pixels, depth = camera.project(points)
-    if (depth <= view.near).any():
+    if (depth <= view.near).any() or np.isnan(pixels).any():  # NaN: beyond the turn of the lens distortion
         return (0, 0, view.width, view.height) if (depth > view.near).any() else None
     low = np.clip(np.floor(pixels.min(axis=0)) - 1, 0, (view.width, view.height)).astype(int)
     high = np.clip(np.ceil(pixels.max(axis=0)) + 1, 0, (view.width, view.height)).astype(int)

@@ -36,7 +36,7 @@ def image():
 
 
 def splats():
-    from mitsplat import splat_files
+    from mitsplat.gaussians import splat_files
     print(splat_files._convert(b"nothing", "ksplat", "ply"))
 
 

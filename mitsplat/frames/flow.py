@@ -55,7 +55,7 @@ def optical_flow(
     if belt is not None:
         points[np.ravel(ids == 0) & belt.on_surface(points)] += belt.interval * belt.velocity
     moved, ahead = following.project(points)
-    known &= ahead > following.near
+    known &= (ahead > following.near) & np.isfinite(moved).all(axis=1)
     flow = np.where(known[:, None], moved - pixels, UNKNOWN_FLOW)
     return flow.reshape(height, width, 2).astype(np.float32)
 

@@ -9,17 +9,7 @@ from collections.abc import Callable, Mapping
 
 from benchmarks.scale.attack.attack import ANY, REFUSED, Attack
 from benchmarks.scale.attack.images import bomb, zeros
-from benchmarks.scale.attack.samples import Place
-
-Build = Callable[[Place], str]
-
-
-def _file(name: str, make: Callable[[], str | bytes]) -> Build:
-    def build(place: Place) -> str:
-        place.write(name, make())
-        return name
-
-    return build
+from benchmarks.scale.attack.samples import Build, Place, file_of
 
 
 def _zipped(outer: str, inner: str, size: int) -> Build:
@@ -131,49 +121,51 @@ MESHES: Mapping[str, tuple[str, Build]] = {
     "3MF with entities that multiply": ("fill memory", _three_mf),
     "STL that promises 2^32 faces": (
         "fill memory",
-        _file("m.stl", lambda: bytes(80) + b"\xff\xff\xff\xff" + bytes(50)),
+        file_of("m.stl", lambda: bytes(80) + b"\xff\xff\xff\xff" + bytes(50)),
     ),
     "STL of 8 GB": ("fill memory", _sparse("m.stl", bytes(80) + struct.pack("<I", (8 << 30) // 50), 8 << 30)),
     "OBJ of 8 GB": ("fill memory", _sparse("m.obj", b"v 0 0 0\n", 8 << 30)),
-    "PLY that promises 10^10 vertices": ("fill memory", _file("m.ply", lambda: _ply(10**10, 1))),
-    "PLY that promises 10^18 faces": ("fill memory", _file("m.ply", lambda: _ply(0, 10**18))),
+    "PLY that promises 10^10 vertices": ("fill memory", file_of("m.ply", lambda: _ply(10**10, 1))),
+    "PLY that promises 10^18 faces": ("fill memory", file_of("m.ply", lambda: _ply(0, 10**18))),
     "PLY in text that promises 10^9 vertices": (
         "fill memory",
-        _file("m.ply", lambda: _ply(10**9, 1, "ascii") + "0 0 0\n"),
+        file_of("m.ply", lambda: _ply(10**9, 1, "ascii") + "0 0 0\n"),
     ),
     "OFF that promises 10^12 faces": (
         "fill memory",
-        _file("m.off", lambda: "OFF\n1000000000000 1000000000000 0\n0 0 0\n"),
+        file_of("m.off", lambda: "OFF\n1000000000000 1000000000000 0\n0 0 0\n"),
     ),
-    "OBJ face of vertex 10^12": ("crash", _file("m.obj", lambda: "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 1000000000000\n")),
-    "OBJ of no numbers": ("crash", _file("m.obj", lambda: "v nan nan nan\n" * 8 + "f 1 2 3\nf 2 3 4\nf 5 6 7\n")),
+    "OBJ face of vertex 10^12": ("crash", file_of("m.obj", lambda: "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 1000000000000\n")),
+    "OBJ of no numbers": ("crash", file_of("m.obj", lambda: "v nan nan nan\n" * 8 + "f 1 2 3\nf 2 3 4\nf 5 6 7\n")),
     "OBJ of infinite size": (
         "fill memory",
-        _file("m.obj", lambda: "v 1e300 0 0\nv 0 1e300 0\nv 0 0 1e300\nv 0 0 0\nf 1 2 3\nf 1 3 4\nf 1 4 2\nf 2 4 3\n"),
+        file_of(
+            "m.obj", lambda: "v 1e300 0 0\nv 0 1e300 0\nv 0 0 1e300\nv 0 0 0\nf 1 2 3\nf 1 3 4\nf 1 4 2\nf 2 4 3\n"
+        ),
     ),
     "OBJ of 3 million faces in a line": (
         "take long",
-        _file("m.obj", lambda: "v 0 0 0\n" * 9 + "f " + "1 " * 3_000_000),
+        file_of("m.obj", lambda: "v 0 0 0\n" * 9 + "f " + "1 " * 3_000_000),
     ),
-    "glTF with numbers from outside": ("read outside", _file("m.gltf", lambda: _gltf("../outside/secret.png"))),
-    "glTF with numbers from endless zeros": ("fill memory", _file("m.gltf", lambda: _gltf("/dev/zero"))),
-    "glTF that promises 10^12 vertices": ("fill memory", _file("m.gltf", lambda: _gltf("data:,", 10**12))),
+    "glTF with numbers from outside": ("read outside", file_of("m.gltf", lambda: _gltf("../outside/secret.png"))),
+    "glTF with numbers from endless zeros": ("fill memory", file_of("m.gltf", lambda: _gltf("/dev/zero"))),
+    "glTF that promises 10^12 vertices": ("fill memory", file_of("m.gltf", lambda: _gltf("data:,", 10**12))),
     "GLB chunk of 4 GB": (
         "fill memory",
-        _file("m.glb", lambda: _glb({})[:12] + struct.pack("<I4s", 0xFFFFFFFF, b"JSON")),
+        file_of("m.glb", lambda: _glb({})[:12] + struct.pack("<I4s", 0xFFFFFFFF, b"JSON")),
     ),
     "GLB nested 100,000 deep": (
         "crash",
-        _file(
+        file_of(
             "m.glb",
             lambda: (
                 lambda t: struct.pack("<4sII", b"glTF", 2, 20 + len(t)) + struct.pack("<I4s", len(t), b"JSON") + t
             )(b"[" * 100_000),
         ),
     ),
-    "COLLADA with entities that multiply": ("fill memory", _file("m.dae", lambda: _XML_BOMB)),
+    "COLLADA with entities that multiply": ("fill memory", file_of("m.dae", lambda: _XML_BOMB)),
     "link to endless zeros": ("fill memory", lambda place: (place.inside / "m.stl").symlink_to("/dev/zero") or "m.stl"),
-    "HDF5 named as a mesh": ("crash", _file("m.stl", lambda: b"\x89HDF\r\n\x1a\n" + bytes(4096))),
+    "HDF5 named as a mesh": ("crash", file_of("m.stl", lambda: b"\x89HDF\r\n\x1a\n" + bytes(4096))),
 }
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -130,3 +131,17 @@ class Place:
             stop = next((i for i in range(start + 1, len(lines)) if not lines[i].startswith(" ")), len(lines))
             lines[start:stop] = [f"{key}: {value}"]
         return self.write("scene.yaml", "\n".join(lines) + "\n")
+
+
+Build = Callable[[Place], str]
+"""Function that makes an input in a place and returns its name."""
+
+
+def file_of(name: str, make: Callable[[], str | bytes]) -> Build:
+    """Return a function that writes a file of the content that ``make`` returns."""
+
+    def build(place: Place) -> str:
+        place.write(name, make())
+        return name
+
+    return build

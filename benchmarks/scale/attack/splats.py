@@ -12,17 +12,7 @@ from pathlib import Path
 
 from benchmarks.scale.attack.attack import ANY, REFUSED, Attack
 from benchmarks.scale.attack.images import bomb
-from benchmarks.scale.attack.samples import Place
-
-Build = Callable[[Place], str]
-
-
-def _file(name: str, make: Callable[[], str | bytes]) -> Build:
-    def build(place: Place) -> str:
-        place.write(name, make())
-        return name
-
-    return build
+from benchmarks.scale.attack.samples import Build, Place, file_of
 
 
 def _changed(name: str, change: Callable[[bytes], bytes]) -> Build:
@@ -72,10 +62,10 @@ SPLATS: Mapping[str, tuple[str, Build]] = {
         _changed("a.ply", lambda d: d.replace(b"vertex 40", b"vertex 99999999999")),
     ),
     "PLY of no numbers": ("crash", _changed("a.ply", lambda d: d[:-400] + b"\xff\xff\xff\x7f" * 100)),
-    "PLY header of 10 MB": ("take long", _file("a.ply", lambda: b"ply\n" + b"comment a\n" * 1_000_000)),
+    "PLY header of 10 MB": ("take long", file_of("a.ply", lambda: b"ply\n" + b"comment a\n" * 1_000_000)),
     "PLY with 100,000 properties": (
         "take long",
-        _file(
+        file_of(
             "a.ply",
             lambda: (
                 "ply\nformat ascii 1.0\nelement vertex 1\n"
@@ -86,15 +76,15 @@ SPLATS: Mapping[str, tuple[str, Build]] = {
     ),
     "PLY of lists": (
         "crash",
-        _file(
+        file_of(
             "a.ply",
             lambda: "ply\nformat binary_little_endian 1.0\nelement vertex 9\nproperty list uchar int x\nend_header\n",
         ),
     ),
     "PLY cut short": ("crash", _changed("a.ply", lambda d: d[: len(d) // 2])),
-    "SPZ of 2^32": ("fill memory", _file("a.spz", lambda: _spz(0xFFFFFFFF))),
-    "SPZ bomb": ("fill memory", _file("a.spz", lambda: gzip.compress(bytes(1 << 30), 1))),
-    "SPZ in SPZ": ("crash", _file("a.spz", lambda: gzip.compress(_spz(40)))),
+    "SPZ of 2^32": ("fill memory", file_of("a.spz", lambda: _spz(0xFFFFFFFF))),
+    "SPZ bomb": ("fill memory", file_of("a.spz", lambda: gzip.compress(bytes(1 << 30), 1))),
+    "SPZ in SPZ": ("crash", file_of("a.spz", lambda: gzip.compress(_spz(40)))),
     "SPZ cut short": ("crash", _changed("a.spz", lambda d: d[:-9])),
     "SOG bomb": ("fill memory", _sog({"meta.json": 1 << 28})),
     "SOG with a path outside": ("write outside", _sog({"../../outside/made": b"x", "meta.json": b"{}"})),
@@ -112,9 +102,9 @@ SPLATS: Mapping[str, tuple[str, Build]] = {
         _changed("a.compressed.ply", lambda d: d.replace(b"vertex 40", b"vertex 1000000000")),
     ),
     "SPLAT of 64 GB": ("fill memory", _special("a.splat", _sparse)),
-    "SPLAT of zeros": ("crash", _file("a.splat", lambda: bytes(32 * 1000))),
-    "SPLAT of no numbers": ("crash", _file("a.splat", lambda: b"\xff" * 3200)),
-    "SPLAT of 31 bytes": ("crash", _file("a.splat", lambda: bytes(31))),
+    "SPLAT of zeros": ("crash", file_of("a.splat", lambda: bytes(32 * 1000))),
+    "SPLAT of no numbers": ("crash", file_of("a.splat", lambda: b"\xff" * 3200)),
+    "SPLAT of 31 bytes": ("crash", file_of("a.splat", lambda: bytes(31))),
     "named pipe": ("wait for ever", _special("a.ply", os.mkfifo)),
     "link to endless zeros": ("fill memory", _special("a.splat", lambda path: Path(path).symlink_to("/dev/zero"))),
     "folder": ("crash", _special("a.ply", os.mkdir)),

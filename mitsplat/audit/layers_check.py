@@ -140,10 +140,8 @@ class PlacementReader:
     """Check over the whole dataset that poses and cameras agree with the positions and depths of silhouettes.
 
     The position of an asset's geometry in its own coordinates is not stored. However, one point of the asset projects
-    to
-    the centre of all its silhouettes, at about the depth of its pixels. Sums over the dataset give the least-squares
-    point
-    and its residual.
+    to the centre of all its silhouettes, at about the depth of its pixels. Sums over the dataset give the least-squares
+    point and its residual.
     """
 
     def __init__(self) -> None:

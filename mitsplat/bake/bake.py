@@ -172,8 +172,7 @@ def bake_asset(
 
     Raises:
         InputError: Before work starts, if the mesh cannot be read, is empty, or has a size that indicates wrong units,
-            or
-            if another value breaks a rule.
+            or if another value breaks a rule.
     """
     ensure_variant()
     settings = settings or BakeSettings()

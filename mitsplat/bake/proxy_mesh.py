@@ -23,8 +23,7 @@ def make_proxy(parts: Sequence[MeshPart], most_faces: int) -> trimesh.Trimesh:
     """Merge all parts into one surface of at most about ``most_faces`` faces; labels on solids are left out.
 
     Open sheets are not decimated, because decimation would shrink them from their edges. Flat sheets are
-    re-triangulated
-    from their outlines.
+    re-triangulated from their outlines.
     """
     meshes = [_close_holes(part.mesh) for part in parts]
     solids = [mesh for mesh in meshes if mesh.is_volume]

@@ -82,8 +82,7 @@ def compare_with_textures(
 
     Trimesh reads the texture from the file's own image, independently of the colours used for baking. Under light of
     radiance 1 from all directions, a convex surface has the brightness of its texture plus that of its gloss. For a
-    dark
-    surface, the gloss is the larger part.
+    dark surface, the gloss is the larger part.
 
     Args:
         mesh: Mesh or its file.

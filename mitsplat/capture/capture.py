@@ -109,11 +109,9 @@ class Photo:
 
         Args:
             scale: Size relative to the camera, at most 1. Pixels are averages over the area they cover. The camera of
-                the
-                returned picture is ``camera.resized(W, H)``.
+                the returned picture is ``camera.resized(W, H)``.
             window: Rectangle of the photo to read: left, top, width and height [px], inside the photo. The camera is
-                then
-                ``camera.cropped(*window).resized(W, H)``.
+                then ``camera.cropped(*window).resized(W, H)``.
 
         Returns:
             Display-encoded colours in [0, 1], shape (H, W, 3), and the mask as alpha, shape (H, W), or None without a

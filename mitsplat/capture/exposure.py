@@ -39,9 +39,8 @@ def relative_gains(photos: Sequence[Photo], points: Float64Array) -> Float64Arra
     """Estimate the factors of linear red, green and blue for each photo, (N, 3); their logarithms have mean 0.
 
     The model is: log colour of a point in a photo = log colour of the point - log gain of the photo. It is solved by
-    linear
-    least squares with the points eliminated. Residuals have Cauchy weights, because glossy and occluded points carry no
-    information about exposure.
+    linear least squares with the points eliminated. Residuals have Cauchy weights, because glossy and occluded points
+    carry no information about exposure.
 
     Args:
         photos: Photos of a capture.

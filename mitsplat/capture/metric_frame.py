@@ -86,8 +86,7 @@ def find_metric_frame(
     """Find scale and gravity from the best available evidence.
 
     A ChArUco board determines both, and so do AprilTags of known size. Otherwise ``scale_from`` determines the scale,
-    and
-    the largest plane below the cameras the vertical. If only the camera attitudes suggest a vertical, ``up`` is
+    and the largest plane below the cameras the vertical. If only the camera attitudes suggest a vertical, ``up`` is
     unknown.
 
     Args:
@@ -100,8 +99,7 @@ def find_metric_frame(
 
     Raises:
         InputError: If ``scale_from`` names points that do not exist, or all cameras coincide with the point at which
-            they
-            are directed.
+            they are directed.
     """
     views, tag_views = _find_targets(model, images, board, tags=tag is not None)
     corners = _triangulate_corners(views, set(model.cameras))
@@ -240,8 +238,8 @@ def find_table(model: SparseModel, *, trials: int = 30000, seed: int = 0) -> tup
     """Find the plane on which objects stand, by RANSAC (Fischler and Bolles 1981) over the points.
 
     The plane with the most points is chosen, at least 2 % of them. At least 95 % of the cameras must be above it, and
-    less
-    than a tenth of the points below it. If the cameras suggest a vertical, the normal must be within 30 degrees of it.
+    less than a tenth of the points below it. If the cameras suggest a vertical, the normal must be within 30 degrees of
+    it.
 
     Args:
         model: Result of structure from motion.
@@ -292,8 +290,7 @@ def vertical_from_cameras(model: SparseModel) -> Float64Array | None:
     """Estimate the up direction, shape (3,), from the attitudes of cameras; None if they do not suggest one.
 
     The estimate requires photographs from several sides in portrait or landscape format, held level. Up is the
-    direction to
-    which one image axis of each photo is most nearly orthogonal, on the side of the cameras.
+    direction to which one image axis of each photo is most nearly orthogonal, on the side of the cameras.
     """
     poses = np.array([camera.world_from_camera[:3, :3] for camera in model.cameras.values()])
     sides = poses[:, :, :2]
@@ -361,8 +358,7 @@ def _scale_error(scale: float, measure: Callable[[set[str]], float | None], imag
     """Return the relative standard error of a scale, from the print and a jackknife over image groups (Tukey 1958).
 
     The residuals of corners are too optimistic, because a deformation of the whole model moves all corners together. So
-    the
-    scale is measured with every sixth image left out in turn, which also changes the mix of cameras.
+    the scale is measured with every sixth image left out in turn, which also changes the mix of cameras.
 
     Args:
         scale: Scale from all images.
@@ -398,8 +394,7 @@ def _check_cameras(views: _Views, corners: Mapping[int, Float64Array]) -> tuple[
     """Compare the cameras with the board.
 
     A camera is judged if it observes at least six corners. Cameras with few or repetitive points can be far off at
-    small
-    reprojection errors.
+    small reprojection errors.
 
     Args:
         views: Observations of board corners.

@@ -157,10 +157,8 @@ def given_masks(folder: Path, prepared: Mapping[str, Prepared]) -> MaskMaker:
     """Return a function that reads masks of the user.
 
     A mask file is ``<photo>.png``, with or without the photo's own suffix, in any case. It has the size of the photo.
-    White
-    marks the object; in a picture with transparency, opaque pixels do. A mask is oriented as viewers show the photo. A
-    mask
-    in the orientation of the sensor is rotated by the EXIF orientation of the photo.
+    White marks the object; in a picture with transparency, opaque pixels do. A mask is oriented as viewers show the
+    photo. A mask in the orientation of the sensor is rotated by the EXIF orientation of the photo.
 
     Args:
         folder: Folder of the masks.
@@ -336,8 +334,7 @@ def _segment_from_points(image: ByteImage, pixels: Float64Array, free: BoolArray
     """Segment a BGR image (H, W, 3) by GrabCut from projected object points (N, 2).
 
     Parts of the object without points lie outside the hull of the points. So the undecided band starts at the hull and
-    is
-    extended around the segmented region.
+    is extended around the segmented region.
     """
     height, width = image.shape[:2]
     nothing = np.zeros((height, width), dtype=bool)

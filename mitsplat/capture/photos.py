@@ -97,8 +97,7 @@ def prepare_photos(
     """Make upright copies of the usable photographs below ``folder``.
 
     EXIF orientation is applied because COLMAP ignores it. Photos larger than ``max_size`` are reduced. A photo that
-    needs
-    neither is copied byte by byte.
+    needs neither is copied byte by byte.
 
     Args:
         folder: Folder of photographs, at any depth.

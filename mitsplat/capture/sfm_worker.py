@@ -67,10 +67,9 @@ def run(job: dict[str, Any], folder: Path) -> None:
     Args:
         job: Mapping with the key ``task``. "read" reads a COLMAP model from ``model`` within ``memory`` [bytes].
             "reconstruct" uses ``groups`` (names of the photos with shared intrinsics), ``images`` (their folder,
-            relative
-            to ``folder``), ``features``, ``first_octave``, ``matching`` ("exhaustive" or "sequential") and ``enough``
-            (number of photos below which the global mapper is also tried). "triangulate" uses the same keys and
-            ``cameras`` (see :func:`known_model`).
+            relative to ``folder``), ``features``, ``first_octave``, ``matching`` ("exhaustive" or "sequential") and
+            ``enough`` (number of photos below which the global mapper is also tried). "triangulate" uses the same keys
+            and ``cameras`` (see :func:`known_model`).
         folder: Folder of the database and the results.
     """
     if job["task"] == "read":
@@ -102,8 +101,7 @@ def assign_ids(job: dict[str, Any], images: Path, database: Path) -> None:
     """Assign image ids in the order of the job; photos of a group share a camera.
 
     Several threads store features in arbitrary order. Without this step, ids would differ between runs, and with them
-    the
-    order within pairs, the order of pairs, and all cameras.
+    the order within pairs, the order of pairs, and all cameras.
     """
     reader = pycolmap.ImageReaderOptions()
     reader.camera_model = job["camera_model"]
@@ -251,8 +249,8 @@ def agreement(model: pycolmap.Reconstruction, database: Path) -> dict[str, float
     """Return, for each photo, the fraction of its verified matches that agree with the model's cameras.
 
     Points are triangulated only from matches that agree with the cameras. So a photo that is misplaced by a few matches
-    has
-    small reprojection errors, but a low fraction here. The error is the Sampson error (Hartley and Zisserman, 11.4.3).
+    has small reprojection errors, but a low fraction here. The error is the Sampson error (Hartley and Zisserman,
+    11.4.3).
     """
     explained: dict[int, list[int]] = {index: [0, 0] for index in model.reg_image_ids()}
     with pycolmap.Database.open(database) as opened:

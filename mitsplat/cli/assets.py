@@ -163,8 +163,8 @@ def import_(
     """Make an asset from a splat file of another tool.
 
     Invisible, oversized and isolated Gaussians are removed, and the up axis is estimated. An object gets a mesh and
-    convex
-    collision pieces. The page report.html shows the result. Warnings are printed; `mitsplat check` runs more checks.
+    convex collision pieces. The page report.html shows the result. Warnings are printed; `mitsplat check` runs more
+    checks.
     """
     from mitsplat.importing.import_report import check_scene_path, write_import_report, write_scene
     from mitsplat.importing.splat_import import ImportSettings, import_splats

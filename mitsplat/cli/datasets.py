@@ -251,8 +251,7 @@ def split(
     """Write image lists of DATASET for cross-validation.
 
     All images of a layout are in the same fold. Classes are spread evenly over the folds as far as whole layouts allow.
-    The
-    test split is not used.
+    The test split is not used.
     """
     from mitsplat.dataset.folds import write_folds
 
@@ -306,8 +305,7 @@ def chart(
     """Measure speed and accuracy of the rendering presets on SCENE.
 
     All presets and several cheaper light models are compared with the preset exact. Times are valid for this machine
-    only.
-    Memory is main memory, not GPU memory.
+    only. Memory is main memory, not GPU memory.
     """
     from rich.console import Console
     from rich.table import Table
@@ -372,8 +370,7 @@ def report(
     """Write an HTML report of DATASET.
 
     The report is a single file that works offline. It shows sample images with labels, statistics, random draws, the
-    audit
-    and the origin of the data. Properties of the images that a detector cannot learn are also printed.
+    audit and the origin of the data. Properties of the images that a detector cannot learn are also printed.
     """
     from mitsplat.report.dataset_report import write_report
 
@@ -439,8 +436,7 @@ def view(
     """Show a scene, asset, capture, dataset or splats in a browser.
 
     For a scene, the page shows the splats beside a real render of the same view, which is refined over time. Scene
-    values
-    can be changed on the page, and the scene file is read again when it changes. Press Ctrl-C to stop.
+    values can be changed on the page, and the scene file is read again when it changes. Press Ctrl-C to stop.
     """
     from importlib.util import find_spec
 

@@ -78,9 +78,8 @@ def lights(
     """Convert a panorama or mirror-ball photos to scene lights.
 
     Bright regions become area lights, which the scene file can vary per layout. The remaining light becomes an
-    environment
-    light. Together they give a level table the same irradiance as the panorama. A picture beside the output file shows
-    which regions became lamps.
+    environment light. Together they give a level table the same irradiance as the panorama. A picture beside the output
+    file shows which regions became lamps.
     """
     from mitsplat.capture.lighting import (
         BallView,

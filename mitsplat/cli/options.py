@@ -86,8 +86,7 @@ def command_log(
     """Report the progress of a command, by bars or as a JSON log that also contains its errors.
 
     The log has the event started, any number of progress events, and then finished or failed. A failed event has the
-    exit
-    status and a sentence.
+    exit status and a sentence.
 
     Args:
         json_log: Write the log to stderr instead of bars.
@@ -169,8 +168,7 @@ def stage_bar(unit: str = "%/s") -> Iterator[Progress]:
     """Show progress in stages on stderr: a bar on a terminal, otherwise one line per stage.
 
     Without a terminal, a stage that takes longer prints one more line per minute, with the remaining time. The text
-    after
-    a colon in the progress message is a detail and does not start a new stage.
+    after a colon in the progress message is a detail and does not start a new stage.
     """
     if sys.stderr.isatty():
         with progress_bar(unit) as bar:

@@ -344,8 +344,7 @@ def mesh(
 
     An object is isolated by its masks and its surface is reconstructed. Held-out photos check both, and the page
     report.html shows the result. An environment is kept whole, and its level surfaces are detected. The exit status is
-    4 if
-    a quality threshold is missed.
+    4 if a quality threshold is missed.
     """
     from mitsplat.asset import read_mesh
     from mitsplat.reconstruct.asset_pipeline import AssetJob, make_asset

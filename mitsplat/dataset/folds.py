@@ -111,10 +111,9 @@ def assign_folds(layouts: Mapping[int, Counter[str]], folds: int) -> dict[int, i
     """Assign each layout to a fold, so that the sizes of the folds differ by at most one layout.
 
     Layouts with the rarest classes are assigned first, as in the iterative stratification of Sechidis et al. (2011, "On
-    the
-    stratification of multi-label data"). Each layout goes to the fold where it reduces the sum of squared deficits
-    most.
-    Deficits are those of the instances of each class and of the layouts, as fractions of the target size of a fold.
+    the stratification of multi-label data"). Each layout goes to the fold where it reduces the sum of squared deficits
+    most. Deficits are those of the instances of each class and of the layouts, as fractions of the target size of a
+    fold.
 
     Args:
         layouts: Number of instances by class, for each layout.

@@ -98,8 +98,7 @@ class FrameMaker:
         """Parse a layout from JSON and cache it; return the cached object if the index is the same.
 
         A layout is always parsed from its file, so a resumed run uses exactly the same numbers. All views get the same
-        object,
-        because the renderer detects an unchanged layout by object identity.
+        object, because the renderer detects an unchanged layout by object identity.
         """
         stored = parse_json(text.encode() if isinstance(text, str) else text)
         if self._cached_layout is None or self._cached_layout.index != stored["index"]:

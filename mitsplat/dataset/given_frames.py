@@ -31,9 +31,8 @@ def write_frames(scene: Scene, out: str | Path, frames: Iterable[Frame], *, over
         ms.write_frames(scene, "out/film", ms.render_frames(scene, layouts=simulate(), cameras=camera))
 
     Frames are numbered in the order of the iterable. Each frame counts as a layout of its own, which determines its
-    split.
-    The audit compares pictures, labels, layouts and cameras of such a dataset with each other, but not cameras with the
-    scene. An interrupted run cannot be resumed.
+    split. The audit compares pictures, labels, layouts and cameras of such a dataset with each other, but not cameras
+    with the scene. An interrupted run cannot be resumed.
 
     Args:
         scene: Scene of all frames; image size and formats are in ``scene.spec``.
@@ -43,8 +42,7 @@ def write_frames(scene: Scene, out: str | Path, frames: Iterable[Frame], *, over
 
     Raises:
         InputError: If there are no frames, a frame does not have the scene's image size, or the folder holds other
-            files.
-            Also if flow is among the formats, because flow relates views of one layout.
+            files. Also if flow is among the formats, because flow relates views of one layout.
     """
     out, output = Path(out), scene.spec.output
     if "flow" in output.formats:

@@ -27,14 +27,12 @@ class Manifest:
     """Records of a dataset's frames on disk.
 
     Only the offsets of the lines are held in memory, 8 bytes per frame. Iteration is by ascending frame index. If two
-    lines
-    have the same index, the later one counts.
+    lines have the same index, the later one counts.
 
     Args:
         path: Manifest file; it is created if missing. An incomplete last line, left by an interrupted run, is cut off.
         keep: Predicate that is called once per record while the file is read. If it returns False, the record is
-            ignored.
-            All records count if None.
+            ignored. All records count if None.
         check: Function that raises ValueError if a line with a valid checksum is no record of the dataset.
         grow: Allow the file to be changed. If False, an incomplete last line stays in the file, but is ignored.
 
@@ -173,8 +171,7 @@ class _Places:
     """Sparse map from frame index to the offset of its line, iterated by ascending index.
 
     Offsets are stored in pages. Frame indices are contiguous, but those of a shard do not start at 0, and an untrusted
-    file
-    may contain any index.
+    file may contain any index.
     """
 
     _PAGE = 4096

@@ -75,8 +75,7 @@ def refuse_links(out: Path) -> None:
     """Refuse a dataset with linked folders, because writes and removals would change files outside of the dataset.
 
     The path of the dataset itself may contain a link. Files of single frames may be links too, because a new file
-    replaces
-    the link.
+    replaces the link.
 
     Raises:
         InputError: If a folder of the dataset, or a file directly in its folder, is a link.

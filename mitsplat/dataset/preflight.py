@@ -439,8 +439,7 @@ def _max_pixels(camera: Camera, size: float, depth: float) -> float:
     """Return an upper bound of the pixels that an object of a size [m] covers at a depth [m] or beyond.
 
     Perspective stretches the disc of a small sphere by 1 / cos^3 of its angle to the optical axis, which is largest in
-    the
-    corners of the image. Lens distortion may stretch it further.
+    the corners of the image. Lens distortion may stretch it further.
     """
     corners = np.array([[0, 0], [camera.width, 0], [0, camera.height], [camera.width, camera.height]], dtype=np.float64)
     steepest = float(np.linalg.norm(camera.ray_slopes(corners), axis=1).max())

@@ -42,8 +42,7 @@ class RemadeFrame:
         record: Manifest record of the frame.
         compared: Number of files of the dataset's frame; 0 if there is no dataset, or the dataset lacks this frame.
         differing: Files with different bytes, and files that only one of both has. They are files of the frame, the
-            file
-            of its layout, and ``manifest.jsonl`` if the record differs.
+            file of its layout, and ``manifest.jsonl`` if the record differs.
         cause: First difference of the inputs of both; empty if there is none.
     """
 

@@ -138,8 +138,7 @@ class CollectionWriter:
     """Writer of the files that describe a whole dataset, from the records of its frames by ascending index.
 
     Only the current frame is held in memory. No file gets its final name before all frames were added, except the files
-    of
-    BOP scenes, which are complete after their last frame.
+    of BOP scenes, which are complete after their last frame.
     """
 
     def __init__(self, root: Path, catalogue: Catalogue, formats: Iterable[str]) -> None:

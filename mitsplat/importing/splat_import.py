@@ -389,8 +389,7 @@ def _align_to_support(splats: Splats, plane: Plane) -> tuple[ImportSupport | Non
     """Return the horizontal surface of an environment, and the transform that moves its centre to the origin.
 
     The transform aligns the sides of the surface with x and y. If the Gaussians in the plane span no area, the surface
-    is
-    None and the transform is the identity.
+    is None and the transform is the identity.
     """
     inside = np.abs(splats.means[:, 2] - plane.height) <= 3 * plane.thickness
     flat = splats.means[inside & (splats.opacities > 0.1), :2].astype(np.float64)

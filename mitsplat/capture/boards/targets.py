@@ -45,8 +45,7 @@ class Board:
 
     Raises:
         InputError: If there are fewer than 3x4 squares (six inner corners) or more than the dictionary has markers, or
-            if
-            the square edge is out of range.
+            if the square edge is out of range.
     """
 
     columns: int = 7

@@ -26,14 +26,11 @@ def hidden_part(camera: Camera, own: Float64Array, others: Sequence[Float64Array
 
     The outline of the object is the convex hull of its points in the image, even for an object that is not convex. The
     first reason is that masks are searched in the hull and would include a thing in front of a notch. The second is
-    that
-    sparse points cannot separate a notch from a plain surface.
+    that sparse points cannot separate a notch from a plain surface.
 
     Another thing occludes the image where its points are dense and nearer to the camera than the middle of the object.
-    It
-    may surround the object. Plain surfaces have no points, so the thing may cover the whole hull of its points and half
-    a
-    gap beyond.
+    It may surround the object. Plain surfaces have no points, so the thing may cover the whole hull of its points and
+    half a gap beyond.
 
     Args:
         camera: Camera of the photo.

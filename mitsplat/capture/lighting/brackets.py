@@ -1,10 +1,9 @@
 """Merging of photographs of one view at several exposures to radiance (Debevec and Malik 1997).
 
 OpenCV's implementation is not suited to lamps. It recovers a response for each channel from a grid of pixels, which
-with
-two or three exposures makes lamps 10 to 50 % too dark, differently per channel. It also includes white pixels, so that
-a lamp that all exposures clip becomes three times darker than its lower bound. Here one response serves all channels.
-It is recovered from pixels spread over the levels, and white pixels count only in the shortest exposure.
+with two or three exposures makes lamps 10 to 50 % too dark, differently per channel. It also includes white pixels, so
+that a lamp that all exposures clip becomes three times darker than its lower bound. Here one response serves all
+channels. It is recovered from pixels spread over the levels, and white pixels count only in the shortest exposure.
 """
 
 from __future__ import annotations
@@ -47,8 +46,7 @@ class Photograph:
         path: Image file.
         pixels: Display-encoded RGB, (H, W, 3).
         exposure: Exposure time [s], multiplied by ISO / 100 and divided by the squared f-number if EXIF has them; None
-            if
-            EXIF has no exposure time.
+            if EXIF has no exposure time.
         focal: Focal length [px] from the 35 mm equivalent, which refers to the diagonal; None if EXIF has none.
     """
 
@@ -131,8 +129,7 @@ def merge_exposures(pixels: Sequence[ByteImage], exposures: npt.ArrayLike) -> tu
 
     Radiance is ``sum(w t f(z) / t) / sum(w t)`` with levels z, the response f, exposures t and a hat-shaped weight w of
     the level, as in Robertson, Borman and Stevenson (2003). Pixels from ``CLIPPED`` on count only in the shortest
-    exposure.
-    With three or more exposures, the response is recovered; otherwise it is that of sRGB.
+    exposure. With three or more exposures, the response is recovered; otherwise it is that of sRGB.
 
     Args:
         pixels: Photographs of equal size, (H, W, 3).
@@ -167,8 +164,7 @@ def recover_response(levels: npt.NDArray[np.uint8], exposures: npt.ArrayLike) ->
     """Recover the exposure of each level, (256,), 1 for level 128 (Debevec and Malik 1997, equation 3).
 
     It minimises the squares of ``w(z_ij) (g(z_ij) - ln E_i - ln t_j)`` and ``l w(z) g''(z)`` with a hat-shaped weight
-    w,
-    over the logarithm g of the response and the irradiances E of pixels.
+    w, over the logarithm g of the response and the irradiances E of pixels.
 
     Args:
         levels: Levels of pixels i in photographs j, (J, I).

@@ -219,8 +219,7 @@ def write_light(estimate: LightEstimate, out: Path, photograph: ByteImage | None
     Args:
         estimate: Light to write.
         out: Path NAME.yaml. The other files are NAME_panorama.exr with all light, NAME_rest.exr with the light without
-            the
-            lamps (if the lines reference it), and NAME.png.
+            the lamps (if the lines reference it), and NAME.png.
         photograph: Photograph to show in the picture beside the panorama.
 
     Returns:

@@ -165,10 +165,8 @@ def _fit_rectangle(
     """Fit a lamp to pixels; None if they extend too far or their centre is below the horizon.
 
     The centre of the lamp is the centroid of its light. The area and the aspect ratio are those of its core, projected
-    to
-    the plane perpendicular to the centre; the aspect ratio is from second moments. The core has at least half of the
-    mean
-    radiance, weighted by light, because images are blurred.
+    to the plane perpendicular to the centre; the aspect ratio is from second moments. The core has at least half of the
+    mean radiance, weighted by light, because images are blurred.
     """
     luminance = radiance @ LUMINANCE
     solid = np.broadcast_to(solid_angles(*pixels.shape), pixels.shape)[pixels]
@@ -204,8 +202,7 @@ def rectangle_irradiance(direction: Float64Array, extents: tuple[float, float]) 
     """Compute the irradiance of a horizontal plane by a rectangle of radiance 1 that faces the origin.
 
     Only the part of the rectangle above the horizon counts. It integrates ``cos(lamp) cos(plane) / r^2`` over the area
-    at
-    distance 1 by the midpoint rule.
+    at distance 1 by the midpoint rule.
 
     Args:
         direction: Direction to the centre of the rectangle.

@@ -69,10 +69,9 @@ def find_ball(*exposures: ByteImage) -> Circle | None:
     """Detect the outline of a ball in one of the exposures of a view; None if there is none.
 
     The score of a circle is the image gradient across it, averaged along it (Daugman 1993), minus the gradient along
-    it. The
-    gradient is limited, so that no part dominates. All circles are tested in a small picture, and the best are refined
-    in
-    larger ones. If the ball reflects a corner of the room as a circle inside its outline, the largest circle is taken.
+    it. The gradient is limited, so that no part dominates. All circles are tested in a small picture, and the best are
+    refined in larger ones. If the ball reflects a corner of the room as a circle inside its outline, the largest circle
+    is taken.
 
     Args:
         exposures: RGB, (H, W, 3).

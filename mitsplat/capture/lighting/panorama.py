@@ -43,8 +43,7 @@ def level_weights(height: int, width: int) -> Float64Array:
     """Return the irradiance of a horizontal plane per radiance of a pixel of each row [sr], shape (H, 1).
 
     It is the integral of the cosine over the part of the pixel above the horizon, ``dphi / 2 (sin(t1)^2 - sin(t0)^2)``
-    with
-    polar angles t. The pixels sum to pi.
+    with polar angles t. The pixels sum to pi.
     """
     edges = np.sin(np.minimum(np.pi * np.arange(height + 1) / height, np.pi / 2)) ** 2
     return np.pi / width * np.diff(edges)[:, None]
@@ -77,8 +76,7 @@ def read_panorama(path: Path) -> Float32Array:
 
     Raises:
         InputError: If the file has no HDR format, cannot be read, has non-finite values, is not twice as wide as high,
-            or
-            has no light above the horizon.
+            or has no light above the horizon.
     """
     panorama = read_radiance(path)
     height, width = panorama.shape[:2]

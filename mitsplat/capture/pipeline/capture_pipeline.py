@@ -67,8 +67,7 @@ class CaptureSettings:
         mask_model: ONNX file of a segmentation network.
         undistorted: Resample the photos to pinhole cameras.
         picks: Pixels on the object, PHOTO:X,Y in pixels of the capture's photos. Without picks, the object is the thing
-            at
-            which the photos are directed.
+            at which the photos are directed.
         picks_not: Pixels on things that do not belong to the object.
         box: Minimum and maximum x, y and z of a box that contains the object, in the frame of the capture.
     """
@@ -195,8 +194,7 @@ def capture_photos(
 
     Raises:
         InputError: If there are fewer than three usable photographs, if no cameras can be found, or if an input lies in
-            a
-            folder that is overwritten.
+            a folder that is overwritten.
         MissingResourceError: If COLMAP or the mask network fails to run.
     """
     _check_outputs(out, photos, settings)
@@ -342,8 +340,7 @@ def _find_model(
 
     Returns:
         The sparse model without cameras that contradict the other cameras or the board, its metric frame, and the
-        reason
-        for each file without a camera.
+        reason for each file without a camera.
     """
     faults: dict[str, str] = {}
     if settings.poses is not None:

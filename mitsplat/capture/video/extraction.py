@@ -73,8 +73,7 @@ def choose_frames(
 
     Raises:
         InputError: If the file is no video, ends too early, or has too few or too many different views, or if the
-            folder
-            contains something else.
+            folder contains something else.
     """
     if most < least:
         raise InputError(f"at least {least} frames must be taken of a video (got {most})")

@@ -58,10 +58,9 @@ def choose(measures: list[FrameMeasure], most: int) -> Choice:
     """Choose the sharpest frame of each step of motion.
 
     Each continuous segment is divided into equal steps of at most :data:`STEP`, or of longer steps if there would be
-    more
-    than ``most`` frames. Sharpness is compared only within a step. Its frames show nearly the same view, so that blur
-    determines the sharpness and not texture. Each segment gives at least one frame. So the result exceeds ``most`` only
-    for a video with at least as many discontinuities.
+    more than ``most`` frames. Sharpness is compared only within a step. Its frames show nearly the same view, so that
+    blur determines the sharpness and not texture. Each segment gives at least one frame. So the result exceeds ``most``
+    only for a video with at least as many discontinuities.
     """
     usable = [measure for measure in measures if measure.moved.followed]
     numbers = sorted({measure.moved.segment for measure in usable})

@@ -1,4 +1,8 @@
-"""Aliases of NumPy array types for annotations; shapes and units are stated in docstrings."""
+"""Aliases of NumPy array types for annotations; shapes and units are stated in docstrings.
+
+Device arrays are annotated with Mitsuba's names, such as ``mi.Float`` and ``mi.Color3f``. These types exist once per
+variant. Annotations are never evaluated, and mypy reads such names as ``Any``.
+"""
 
 from __future__ import annotations
 

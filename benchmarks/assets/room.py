@@ -38,7 +38,6 @@ from mitsplat.reconstruct.asset_evaluation import VERDICT_FILE
 from mitsplat.reconstruct.asset_pipeline import AssetJob
 from mitsplat.renderer.layers import ensure_variant
 from mitsplat.scene.loading.scene_loading import load_scene
-from mitsplat.scene.spec.light_spec import AreaLight, EnvironmentLight
 from mitsplat.surroundings import make_photo_surroundings
 
 PARTS = Path(__file__).parents[2] / "scenes" / "assets"
@@ -50,8 +49,6 @@ WANTED = {
     "table normal, degrees": 1.0,
     "table height, mm": 3.0,
     "table edge, mm": 20.0,
-    "strongest lamp, degrees": 15.0,
-    "share of light from all sides": 0.2,
     "instances on the table": 1,
 }
 LEAST = {"photos registered, %", "held-out PSNR, dB", "instances on the table"}
@@ -209,47 +206,6 @@ def compare(asset: Path, truth: Mapping[str, Camera]) -> dict[str, float]:
     return figures
 
 
-def compare_light(asset: Path, truth: Mapping[str, Camera]) -> dict[str, float]:
-    """What the lights of the scene beside an environment are off, told by where they are seen from the table's middle.
-
-    A white table without things says which share of the light is not the lamp's own.
-    """
-    lights = load_scene(asset.with_name(f"{asset.name}.yaml"), allow_outside=True).spec.lights
-    lamps = [light for light in lights if isinstance(light, AreaLight)]
-    _, matrix, _ = on_truth(asset, truth)
-    strongest = max(lamps, key=lambda lamp: lamp.radiance * lamp.size[0] * lamp.size[1])
-    told = matrix[:3, :3] @ np.array(strongest.position)
-    cosine = told @ LAMP / np.linalg.norm(told) / np.linalg.norm(LAMP)
-    level = sum(irradiance_of(lamp) for lamp in lamps)
-    rest = sum(np.pi * light.radiance for light in lights if isinstance(light, EnvironmentLight))
-    return {
-        "strongest lamp, degrees": float(np.degrees(np.arccos(np.clip(cosine, -1, 1)))),
-        "share of light from all sides": abs(rest / (rest + level) - true_ambient()),
-    }
-
-
-def irradiance_of(lamp: AreaLight) -> float:
-    """What a lamp that faces the table's middle sends there."""
-    place = np.array(lamp.position)
-    away = float(np.linalg.norm(place))
-    return float(lamp.radiance * lamp.size[0] * lamp.size[1] * place[2] / away**3)
-
-
-def true_ambient() -> float:
-    """The share of the light in the table's middle that is reflected by the room, by path tracing."""
-    empty = {name: part for name, part in room().items() if name != "board" and not name.startswith("thing")}
-    empty["top"] = empty["top"] | {"bsdf": {"type": "diffuse", "reflectance": 0.5}}
-    place, film = mi.ScalarTransform4f(), {"type": "hdrfilm", "width": 16, "height": 16, "rfilter": {"type": "box"}}
-    above = place.look_at([0, 0, 0.5], [0, 0, 0], [0, 1, 0]).scale([0.3, 0.3, 1])
-    sensor = mi.load_dict({"type": "orthographic", "to_world": above, "film": film})
-    loaded = mi.load_dict(empty)
-    direct, whole = (
-        np.array(mi.render(loaded, sensor=sensor, integrator=mi.load_dict({"type": "path", "max_depth": d}), spp=256))
-        for d in (2, 4)
-    )
-    return float(1 - direct.mean() / whole.mean())
-
-
 def drop(scene: Path, out: Path, parts: Path) -> int:
     """Instances in images of the scene with real parts in the place of its solids, which are left in ``out``."""
     text = scene.read_text().replace("pool: primitives", f"pool: {parts.resolve()}/*")
@@ -311,7 +267,6 @@ def measure(args: argparse.Namespace) -> int:
         print(f"  {what}: {text}", file=sys.stderr)
     found = compare(asset, by_name(views))
     if done.scene is not None:
-        found |= compare_light(asset, by_name(views))
         found["instances on the table"] = drop(done.scene, args.out / "dropped", PARTS)
     stage("parts dropped and rendered")
     for name, seconds in spent.items():

@@ -72,13 +72,6 @@ Remove = Annotated[
         help="Remove the thing at this pixel, in CAPTURE/images, from an environment; repeatable.",
     ),
 ]
-Delight = Annotated[
-    Path | None,
-    typer.Option(
-        metavar="LIGHTS",
-        help="File with the lights of the photographs; the colours of the object are divided by that light.",
-    ),
-]
 Box = Annotated[
     tuple[float, float, float, float, float, float] | None,
     typer.Option(metavar="X0 Y0 Z0 X1 Y1 Z1", help="Box that contains the object, in the frame of the capture."),
@@ -337,7 +330,6 @@ def mesh(
     units: Annotated[float | None, typer.Option(help="Metres per unit of the imported mesh.")] = None,
     refine: Refine = False,
     remove: Remove = None,
-    delight: Delight = None,
     device: DeviceName = "cpu",
 ) -> None:
     """Make an asset from SPLATS that were fitted to CAPTURE.
@@ -368,7 +360,6 @@ def mesh(
         settings=ReconstructSettings(surface=surface, size=size, refine=MeshRefineSettings() if refine else None),
         imported=imported,
         remove=tuple(remove or ()),
-        delight=delight,
     )
     select_device(device)
     with stage_bar("steps/s") as progress:
@@ -403,7 +394,6 @@ def asset(
     voxels: Voxels = 192,
     refine: Refine = False,
     remove: Remove = None,
-    delight: Delight = None,
     device: DeviceName = "cpu",
     seed: Seed = 0,
 ) -> None:
@@ -433,7 +423,6 @@ def asset(
             refine=MeshRefineSettings(seed=seed) if refine else None,
         ),
         remove=tuple(remove or ()),
-        delight=delight,
     )
     select_device(device)
     with stage_bar("steps/s") as progress:

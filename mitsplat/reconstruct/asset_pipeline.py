@@ -15,8 +15,6 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
-
 from mitsplat.asset import ASSET_FILE, read_spec
 from mitsplat.capture.capture import Capture
 from mitsplat.capture.pipeline.capture_pipeline import CaptureSettings, capture_photos
@@ -28,7 +26,6 @@ from mitsplat.pages.html import REPORT_FILE
 from mitsplat.progress import Progress
 from mitsplat.reconstruct.asset_evaluation import VERDICT_FILE, Verdict
 from mitsplat.reconstruct.asset_report import write_asset_report
-from mitsplat.reconstruct.delight import LightFile, delight
 from mitsplat.reconstruct.reconstruct import (
     ImportedMesh,
     Reconstruction,
@@ -52,11 +49,9 @@ class AssetJob:
         settings: Settings of the reconstruction.
         imported: Mesh that replaces the reconstructed one.
         remove: Things to remove from an environment, PHOTO:X,Y in pixels of the capture's photos.
-        delight: File of the capture's lights; their effect is removed from the colours of an object.
 
     Raises:
-        InputError: If an object's mesh cannot be refined, ``remove`` is used with an object or an imported mesh, or
-            ``delight`` is used with an environment.
+        InputError: If an object's mesh cannot be refined, or ``remove`` is used with an object or an imported mesh.
     """
 
     name: str
@@ -65,7 +60,6 @@ class AssetJob:
     settings: ReconstructSettings = field(default_factory=ReconstructSettings)
     imported: ImportedMesh | None = None
     remove: tuple[str, ...] = ()
-    delight: Path | None = None
 
     def __post_init__(self) -> None:
         check_refinable(self.settings, self.kind, self.imported)
@@ -73,10 +67,6 @@ class AssetJob:
             raise InputError("things can be removed only from an environment: use --kind environment, or omit --remove")
         if self.remove and self.imported is not None:
             raise InputError("things cannot be removed from an imported mesh: omit one of the two")
-        if self.delight is not None and self.kind != "object":
-            raise InputError(
-                "light can be removed only from the colours of objects: an environment keeps its captured light"
-            )
 
 
 @dataclass(frozen=True)
@@ -116,36 +106,12 @@ def reconstruct_job(
     """Reconstruct the asset of a job with :func:`~mitsplat.reconstruct.reconstruct.reconstruct_asset`; a :data:`Maker`.
 
     Raises:
-        InputError: As in that function. Also if the light file is invalid, or lights are given and the vertical
-            direction is unknown.
+        InputError: As in that function.
     """
-    light = None if job.delight is None else LightFile.load(job.delight)
-    if light is not None and capture.up != "z":
-        raise InputError(f"{light.path}: lights need a capture with a known vertical direction (got up: unknown)")
-    made = reconstruct_asset(
+    return reconstruct_asset(
         capture, splats, name=job.name, class_name=job.class_name, kind=job.kind, settings=job.settings,
         imported=job.imported, psnr=psnr, progress=progress,
     )  # fmt: skip
-    return made if light is None else delight_asset(made, light, capture.table, progress)
-
-
-def delight_asset(made: Reconstruction, light: LightFile, table: bool, progress: Progress | None) -> Reconstruction:
-    """Remove the effect of light from the colours of an asset, and add the result to the verdict."""
-    if progress is not None:
-        progress(0, 1, "removing light from colours")
-    if made.asset.mesh is None:
-        return made
-    turn = np.eye(4)  # from the asset's frame to the axes of the capture, which the lights share
-    turn[:3, :3] = made.asset_from_capture[:3, :3].T / np.cbrt(np.linalg.det(made.asset_from_capture[:3, :3]))
-    mesh = made.asset.mesh.copy().apply_transform(turn)
-    done = delight(made.asset.splats.transformed(turn), mesh, light, table=table)
-    splats = done.splats.transformed(np.linalg.inv(turn)) if done.kept else made.asset.splats
-    return replace(
-        made,
-        asset=replace(made.asset, splats=splats),
-        verdict=replace(made.verdict, rows={**made.verdict.rows, "Light": done.told}),
-        record={**made.record, "light": {name: getattr(done, name) for name in _LIGHT_FIELDS}},
-    )
 
 
 def read_fit(path: Path) -> tuple[Path, float | None]:
@@ -291,7 +257,6 @@ def _save_verdict(out: Path, result: Reconstruction, inputs: str) -> None:
     write_text(out / VERDICT_FILE, json.dumps(record, indent=1) + "\n")
 
 
-_LIGHT_FIELDS = ("kept", "uneven", "slope", "borne_out")
 _REMOVED_FIELDS = ("outside", "unseen", "needles", "floaters")
 
 
@@ -308,8 +273,7 @@ def _input_hash(folder: Path, capture: Capture, splats: Path, job: AssetJob) -> 
     decisive = [__version__, job.name, job.class_name, job.kind, asdict(job.settings), imported, job.remove]
     digest = ContentHash()
     digest.add_json(decisive)
-    lights = [] if job.delight is None else LightFile.load(job.delight).files
-    for path in (*_capture_files(folder, capture), splats, *lights):
+    for path in (*_capture_files(folder, capture), splats):
         digest.add_file(path)
     return digest.hexdigest()
 

@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 import trimesh
-from scipy.ndimage import binary_erosion
 
 from mitsplat.arrays import BoolArray, Float64Array
 from mitsplat.capture.capture import Capture, Photo
@@ -24,7 +23,6 @@ from mitsplat.fit.trainer import FitSettings
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.camera import Camera
 from mitsplat.geometry.triangulation import nearest_point_to_lines
-from mitsplat.images.colour import decode_srgb
 from mitsplat.pages.html import rgb_image
 from mitsplat.progress import Progress
 from mitsplat.reconstruct.asset_evaluation import VERDICT_FILE, HeldOutView, show_held_out, sized_photo
@@ -33,21 +31,17 @@ from mitsplat.reconstruct.reconstruct import ImportedMesh, Reconstruction, recon
 from mitsplat.reconstruct.surface import reconstruct_surface
 from mitsplat.storage.files import write_text
 from mitsplat.surroundings.coverage import (
-    MAX_THING_HEIGHT,
     MIN_PHOTOS,
-    SUPPORT_TOLERANCE,
     Coverage,
     Hole,
     find_coverage,
     find_holes,
     free_rectangle,
 )
-from mitsplat.surroundings.depth_views import SurfacePoints, depth_views, surface_points
+from mitsplat.surroundings.depth_views import depth_views, surface_points
 from mitsplat.surroundings.floaters import mean_psnr, remove_floaters
-from mitsplat.surroundings.ground import Ground
 from mitsplat.surroundings.ready_scene import Region, scene_text
 from mitsplat.surroundings.removal import RemovedThing, remove_things
-from mitsplat.surroundings.shading import ShadingLight, light_of_shading
 from mitsplat.surroundings.supports import Support, find_supports, flatten_mesh
 
 _FOREGROUND_DISTANCE = 3.0
@@ -68,8 +62,6 @@ _MAX_HIDDEN_SHARE = 0.1
 """Largest share of the support that too few photos may show."""
 _MAX_UNCHANGED = 1.5 / 255
 """Largest colour difference of a pixel that the removal of things left unchanged."""
-_LIGHT_CELLS = 256
-"""Largest number of cells along a support in the estimation of light."""
 _MIN_REGION = 0.1
 """Least edge of a drop region [m]."""
 
@@ -140,7 +132,7 @@ def reconstruct_surroundings(
         points, views = points.transformed(motion), [view.transformed(motion) for view in views]
         found = find_supports(points, np.array([0.0, 0.0, 1.0]), scale, within=_MAX_LEVEL_TILT)
     cameras = [photo.camera for photo in capture.training]
-    fitted, standing, things = splats, points, list[RemovedThing]()
+    fitted, things = splats, list[RemovedThing]()
     if job.remove:
         splats, things = remove_things(splats, job.remove, capture, found, points, scale, progress)
         views = depth_views(splats, cameras)
@@ -196,10 +188,8 @@ def reconstruct_surroundings(
             {"pose": s.pose.tolist(), "size": list(s.size), "tilt": s.tilt, "roughness": s.roughness} for s in supports
         ]
         if region is not None and made.asset.units == "metre":
-            light = _estimate_light(found[0], fitted, capture, standing, scale, factor)
-            rows["Light"] = "not determined by shadows" if light is None else _light_text(light)
             seen = [photo.camera for photo in capture.transformed(larger).photos]
-            record["scene"] = scene_text(job.name, "{folder}", supports, region, seen, light)
+            record["scene"] = scene_text(job.name, "{folder}", supports, region, seen)
     else:
         findings.append(
             "no level surface was found for things to stand on (one is required): photograph the table from above as "
@@ -216,38 +206,6 @@ def reconstruct_surroundings(
         shown = _unchanged_psnr(made.held_out, show_held_out(fitted, None, capture.held_out, job.settings.verdict_size))
     verdict = replace(made.verdict, psnr=shown, rows=rows, findings=tuple(findings))
     return replace(made, verdict=verdict, sections=tuple(sections), record=record)
-
-
-def _estimate_light(
-    support: Support, splats: Splats, capture: Capture, points: SurfacePoints, scale: float, factor: float
-) -> ShadingLight | None:
-    """Estimate the light from the shadows on a support, relative to its centre [m]; ``factor`` is metres per unit."""
-    ground = Ground.of(support, splats, capture, scale)
-    places = points.transformed(np.asarray(np.linalg.inv(support.pose))).places
-    heights = ground.grid.heights(places[places[:, 2] < MAX_THING_HEIGHT * scale], SUPPORT_TOLERANCE * scale)
-    linear, bare = decode_srgb(np.clip(ground.texture, 0, 1)), np.asarray(binary_erosion(ground.seen))
-    block = -(-max(heights.shape) // _LIGHT_CELLS)
-
-    def blocks(values: Float64Array | BoolArray) -> Any:
-        x, y = (count // block for count in values.shape[:2])
-        return values[: x * block, : y * block].reshape(x, block, y, block, *values.shape[2:])
-
-    return light_of_shading(
-        blocks(linear).mean(axis=(1, 3)),
-        factor * blocks(heights).max(axis=(1, 3)),
-        blocks(bare).all(axis=(1, 3)),
-        factor * block * ground.grid.cell,
-    )
-
-
-def _light_text(light: ShadingLight) -> str:
-    """Describe the directions of lamps and the share of ambient light as a clause."""
-    texts = []
-    for lamp in light.lamps:
-        x, y, z = lamp.position
-        turn, rise = np.degrees(np.arctan2(y, x)) % 360, np.degrees(np.arctan2(z, np.hypot(x, y)))
-        texts.append(f"a lamp at azimuth {turn:.0f}°, elevation {rise:.0f}°")
-    return f"{', '.join(texts)}; {light.ambient_share:.0%} ambient light, estimated from shadows on the support"
 
 
 def _typical_depth(capture: Capture) -> float:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from scipy.ndimage import binary_closing, binary_fill_holes, distance_transform_edt, grey_closing
+from scipy.ndimage import binary_closing, binary_fill_holes, distance_transform_edt
 
 from mitsplat.arrays import BoolArray, Float32Array, Float64Array, Int64Array
 from mitsplat.capture.capture import Capture
@@ -23,8 +23,6 @@ CELL = 0.004
 """Edge of the cells that fill a support, as a share of the typical depth."""
 _BARE_HEIGHT = 0.25
 """Largest height of the bare support, as a share of the height that separates it from things."""
-_MAX_GAP = 4
-"""Largest gap between points of one thing [cells]."""
 _VIEW_SIZE = 400
 """Longest edge of the pictures for the support's colours [px]."""
 _OPAQUE = 0.9
@@ -91,16 +89,6 @@ class Grid:
         covered[tuple(cells[(cells >= 0).all(axis=1)].T)] = True
         closed = np.asarray(binary_closing(np.pad(covered, 4), np.ones((3, 3)), iterations=3))
         return closed[4:-4, 4:-4]
-
-    def heights(self, points: Float64Array, floor: float) -> Float64Array:
-        """Return the heights of things in the cells (X, Y) from points (N, 3) above ``floor``; 0 elsewhere.
-
-        Gaps between points are closed.
-        """
-        top = self._top_heights(points[points[:, 2] > floor])
-        return np.asarray(
-            grey_closing(np.pad(top, _MAX_GAP), size=(2 * _MAX_GAP + 1,) * 2)[_MAX_GAP:-_MAX_GAP, _MAX_GAP:-_MAX_GAP]
-        )
 
     def _top_heights(self, points: Float64Array) -> Float64Array:
         """Return the largest height of points (N, 3) in each cell (X, Y), 0 without points."""

@@ -7,10 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from mitsplat.arrays import Float64Array
-from mitsplat.capture.lighting.estimate import area_line, radiance_keys
 from mitsplat.geometry.camera import Camera
-from mitsplat.images.colour import LUMINANCE
-from mitsplat.surroundings.shading import ShadingLight
 from mitsplat.surroundings.supports import Support
 
 _MARGIN = 0.05
@@ -32,7 +29,6 @@ def scene_text(
     supports: Sequence[Support],
     free: Region,
     cameras: Sequence[Camera],
-    light: ShadingLight | None = None,
 ) -> str:
     """Return the text of a scene file.
 
@@ -42,7 +38,6 @@ def scene_text(
         supports: Supports in the asset's frame [m]; objects are dropped on the first, whose top is z = 0.
         free: Free rectangle of the first support.
         cameras: Cameras of the photos, in the same frame.
-        light: Estimated light relative to the first support's centre; None for a generic room.
     """
     margin = min(_MARGIN, 0.25 * min(free[1] - free[0], free[3] - free[2]))
     spans = []
@@ -65,23 +60,7 @@ def scene_text(
         name=name, folder=folder, boxes=boxes, x0=_length(x0), x1=_length(x1), y0=_length(y0), y1=_length(y1),
         margin=_length(margin), tx=_length(target[0]), ty=_length(target[1]), near=_length(near), far=_length(far),
         low=f"{low:.0f}", high=f"{high:.0f}", start=f"{start:.0f}", end=f"{end:.0f}", fov=f"{min(fov, 120):.0f}",
-        lights=_ROOM_LIGHTS if light is None else _lights(light, supports[0]),
     )  # fmt: skip
-
-
-def _lights(light: ShadingLight, support: Support) -> str:
-    """Return the key ``lights``, with a total irradiance that makes white paper at the support's centre white."""
-    whole = light.ambient + np.sum([lamp.irradiance for lamp in light.lamps], axis=0)
-    white = np.pi / float(whole @ LUMINANCE)
-    middle = support.pose[:3, 3].round(3) + 0.0
-    lines = ["lights:  # estimated from shadows on the table; `mitsplat lights` measures yours"]
-    for lamp in light.lamps:
-        away = float(np.linalg.norm(lamp.position))
-        radiance = white * lamp.irradiance * away**3 / (lamp.size**2 * lamp.position[2])
-        place = support.pose[:3, :3] @ lamp.position + support.pose[:3, 3]
-        lines.append(area_line(place.round(3), middle, (lamp.size, lamp.size), radiance))
-    lines.append(f"  - {{kind: environment, {radiance_keys(white / np.pi * light.ambient)}}}")
-    return "\n".join(lines)
 
 
 def _camera_ranges(cameras: Sequence[Camera], target: Float64Array) -> tuple[float, float, float, float, float, float]:
@@ -133,10 +112,8 @@ camera:  # similar to the cameras of the photos
   azimuth: [{start}, {end}]
   accept: {{clearance: 0.1}}
   intrinsics: {{fov_x: {fov}}}
-{lights}
+lights:  # a generic room; `mitsplat lights` measures yours
+  - {{kind: area, position: [0.5, -0.4, 1.6], target: [0, 0, 0], size: [0.6, 0.6], radiance: 10}}
+  - {{kind: environment, radiance: 0.4}}
 output: {{width: 960, height: 540, layouts: 4, views: 3, image: jpg}}
 """
-_ROOM_LIGHTS = """\
-lights:  # a generic room; `mitsplat lights` measures yours
-  - {kind: area, position: [0.5, -0.4, 1.6], target: [0, 0, 0], size: [0.6, 0.6], radiance: 10}
-  - {kind: environment, radiance: 0.4}"""

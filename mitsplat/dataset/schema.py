@@ -153,7 +153,6 @@ class _Motion(_Stored):
     exposure: Annotated[float, Field(gt=0)]
     velocity: Point
     rotation: Point
-    readout: Annotated[float, Field(ge=0)] | None = None
 
 
 class _Viewpoint(_Stored):

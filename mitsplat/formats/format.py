@@ -24,10 +24,6 @@ if TYPE_CHECKING:
     from mitsplat.scene.spec.image_spec import DepthSensor
 
 
-_SINGLE_POSE_FORMATS = frozenset(("bop", "colmap", "flow"))
-"""Formats that describe an image by a single camera pose."""
-
-
 @dataclass(frozen=True, eq=False)
 class Catalogue:
     """Classes, keypoints and assets that the labels of a scene refer to.
@@ -85,15 +81,6 @@ class Catalogue:
                 raise InputError(
                     f"{scene.path}: output.formats: bop must have a camera without lens distortion "
                     f"(got {list(camera.intrinsics.distortion)})"
-                )
-            if (
-                camera.motion is not None
-                and camera.motion.readout[1]
-                and (one := _SINGLE_POSE_FORMATS.intersection(formats))
-            ):
-                raise InputError(
-                    f"{scene.path}: output.formats: {min(one)} must have a camera without rolling shutter "
-                    f"(got camera.motion.readout {list(camera.motion.readout)})"
                 )
         meshes = [asset.mesh for asset in scene.assets if asset.mesh is not None]
         distractors = [position for position, kind in enumerate(kinds) if kind is None]

@@ -22,12 +22,11 @@ from mitsplat.errors import InputError
 from mitsplat.frames.background import background_picture
 from mitsplat.frames.camera_response import BACKGROUND, develop_layers, light_layers
 from mitsplat.frames.flow import motions_of, optical_flow, swept_by
-from mitsplat.frames.rolling_shutter import Band, bands_of, project_by_row, stacked_silhouettes
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.camera import Camera
 from mitsplat.images.colour import decode_srgb
 from mitsplat.images.masks import Silhouette
-from mitsplat.labels.labels import Labels, Projection, Truth, label_instances
+from mitsplat.labels.labels import Labels, Truth, label_instances
 from mitsplat.labels.overlay import draw_labels
 from mitsplat.physics.settle import settle_layout
 from mitsplat.quality import Quality, resolve_quality
@@ -45,8 +44,8 @@ from mitsplat.renderer.rays.device_arrays import plain_mesh
 from mitsplat.renderer.scene_emitters import emitter_dict, movable
 from mitsplat.renderer.textures import bitmap_texture, finished_mesh, material, texture_image
 from mitsplat.runtime.variant import ensure_variant, one_at_a_time
-from mitsplat.scene.layout import Instance, Layout
-from mitsplat.scene.planning.conveyor import Belt, carried_instances, layout_at_view, layout_on_belt
+from mitsplat.scene.layout import Layout
+from mitsplat.scene.planning.conveyor import Belt, carried_instances, layout_at_view
 from mitsplat.scene.planning.frame_lights import expand_rooms
 from mitsplat.scene.planning.frame_plan import FramePlan, layout_of, plan_frame
 from mitsplat.scene.planning.layout_surroundings import (
@@ -144,11 +143,11 @@ class Frame(LazyValue):
 
     @property
     def flow(self) -> Float32Array | None:
-        """Motion of every pixel to the next image [px], (H, W, 2); None without a next image or with a rolling shutter.
+        """Motion of every pixel to the next image [px], (H, W, 2); None without a next image.
 
         Both components are 1e10 where the flow is unknown, see :func:`mitsplat.frames.flow.optical_flow`.
         """
-        if self.plan.next_camera is None or "readout" in self.plan.viewpoint.get("motion", {}):
+        if self.plan.next_camera is None:
             return None
         motions = {} if self.next_layout is None else motions_of(self.layout, self.next_layout)
         belt = self.plan.belt
@@ -204,16 +203,6 @@ def _cached_renderer(scene: Scene, quality: str | Quality | None, _variant: str)
     return Renderer(scene, quality=quality)
 
 
-@dataclass(frozen=True, eq=False)
-class _BandRender:
-    """Rendered band of rows; ``swept`` is the motion of its pixels during the exposure, to the right and down [px]."""
-
-    band: Band
-    layers: Layers
-    swept: tuple[Float32Array, Float32Array]
-    silhouettes: Mapping[int, Silhouette]
-
-
 def _exposure_motion(
     layers: Layers, camera: Camera, motion: Mapping[str, Any], layout: Layout, belt: Belt | None
 ) -> tuple[Float32Array, Float32Array]:
@@ -222,20 +211,6 @@ def _exposure_motion(
     if belt is not None:
         moving = belt, np.isin(layers.instance, list(carried_instances(layout, belt.box)))
     return swept_by(layers.depth, camera, motion, moving)
-
-
-def _projection(layout: Layout, plan: FramePlan) -> Projection | None:
-    """Return the point projection for an image with a rolling shutter, or None for a global shutter."""
-    motion, belt = plan.viewpoint.get("motion", {}), plan.belt
-    if "readout" not in motion:
-        return None
-    carried_ids = frozenset[int]() if belt is None else carried_instances(layout, belt.box)
-
-    def project(points: Float64Array, instance: Instance) -> tuple[Float64Array, Float64Array]:
-        velocity = belt.velocity if belt is not None and instance.id in carried_ids else np.zeros(3)
-        return project_by_row(plan.camera, motion, points, velocity)
-
-    return project
 
 
 @contextmanager
@@ -335,27 +310,15 @@ class Renderer:
                 next_camera=next_camera,
                 lights=lights,
             )
-            mitsuba_scene = self._load(layout, plan, lights is not None, plan.belt)
+            # A scene has few parts, so that loading them serially is faster than waking threads.
+            mitsuba_scene = mi.load_dict(
+                self.describe(layout, plan.lights, lights is not None, plan.belt), parallel=False
+            )
         with _timed(seconds, "render"):
             layers = render_layers(self.integrator, mitsuba_scene, plan.camera, seed=plan.seed)
-        motion, swept, band_renders = plan.viewpoint.get("motion"), None, list[_BandRender]()
-        if motion is not None:
-            with _timed(seconds, "composite"):
-                swept = _exposure_motion(layers, plan.camera, motion, layout, plan.belt)
-            with _timed(seconds, "render"):
-                bands = bands_of(plan.camera, motion, swept)
-                band_renders = [
-                    self._render_band(band, plan, motion, layout, lights is not None, mitsuba_scene) for band in bands
-                ]
-                if band_renders:
-                    layers = Layers.stacked(
-                        [(band_render.layers, band_render.band.rows) for band_render in band_renders]
-                    )
-                    swept = (
-                        np.concatenate([band_render.swept[0] for band_render in band_renders]),
-                        np.concatenate([band_render.swept[1] for band_render in band_renders]),
-                    )
         with _timed(seconds, "composite"):
+            motion = plan.viewpoint.get("motion")
+            swept = None if motion is None else _exposure_motion(layers, plan.camera, motion, layout, plan.belt)
             composite, shape = self.scene.spec.composite, layers.shape
             behind = self._background(draw_surroundings(self.scene.spec, index, layout.index).background, plan.camera)
             linear = light_layers(layers, composite, behind)
@@ -370,13 +333,9 @@ class Renderer:
                 metered=composite.exposure == "auto",
             )
         with _timed(seconds, "silhouettes"):
-            if band_renders:
-                silhouettes = stacked_silhouettes(
-                    [band_render.band for band_render in band_renders],
-                    [band_render.silhouettes for band_render in band_renders],
-                )
-            else:
-                silhouettes = self._silhouettes(mitsuba_scene, plan.camera)
+            silhouettes = render_silhouettes(
+                self.integrator, mitsuba_scene, plan.camera, source=self.scene.spec.labels.source
+            )
         with _timed(seconds, "label"):
             labels = self._label(layers, silhouettes, layout, plan)
         with _timed(seconds, "composite"):
@@ -385,36 +344,6 @@ class Renderer:
         made["order_error"] = layers.order_error
         made["appearances"] = draw_appearances(self.scene, layout)
         return Frame.later({"rgb": partial(host_array, linear, shape)}, **made, next_layout=next_layout)
-
-    def _silhouettes(self, mitsuba_scene: Any, camera: Camera) -> dict[int, Silhouette]:
-        return render_silhouettes(self.integrator, mitsuba_scene, camera, source=self.scene.spec.labels.source)
-
-    def _load(self, layout: Layout, plan: FramePlan, replaced: bool, belt: Belt | None) -> Any:
-        """Build the Mitsuba scene of a layout.
-
-        A scene has few parts, so that loading them serially is faster than waking threads.
-        """
-        return mi.load_dict(self.describe(layout, plan.lights, replaced, belt), parallel=False)
-
-    def _render_band(
-        self,
-        band: Band,
-        plan: FramePlan,
-        motion: Mapping[str, Any],
-        layout: Layout,
-        replaced: bool,
-        mitsuba_scene: Any,
-    ) -> _BandRender:
-        """Render a band of rows at its moment. Until then, only a belt changes the scene."""
-        belt = plan.belt
-        if belt is not None:
-            belt = replace(belt, time=belt.time + band.time)
-            layout = layout_on_belt(belt, layout)
-            mitsuba_scene = self._load(layout, plan, replaced, belt)
-        layers = render_layers(self.integrator, mitsuba_scene, band.camera, seed=plan.seed)
-        band_motion = _exposure_motion(layers, band.camera, motion, layout, belt)
-        silhouettes = self._silhouettes(mitsuba_scene, band.camera)
-        return _BandRender(band, layers, (band_motion[0][band.rows], band_motion[1][band.rows]), silhouettes)
 
     def _at_moment(self, layout: Layout, index: int) -> tuple[Layout, Layout | None]:
         """Return the layout at a frame's moment and at the next view's moment; None for the latter if nothing moves."""
@@ -445,7 +374,6 @@ class Renderer:
             rules,
             camera=plan.camera,
             keypoints={i: asset.keypoint_array for i, asset in enumerate(scene.assets) if asset.keypoints},
-            project=_projection(layout, plan),
         )
 
     def describe(

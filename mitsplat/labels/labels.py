@@ -18,7 +18,7 @@ Positions are in pixels with the image's corner at (0, 0), so pixel centres are 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -50,10 +50,6 @@ KEYPOINT_TOLERANCE = 0.005
 
 UNLABELLED, HIDDEN, VISIBLE = 0, 1, 2
 """Visibility of a keypoint, as in COCO: outside the image, occluded, visible."""
-
-
-Projection = Callable[[Float64Array, "Instance"], tuple[Float64Array, Float64Array]]
-"""Function that projects world points (N, 3) of an instance to pixels (N, 2) and depths [m] (N,)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -233,7 +229,6 @@ def label_instances(
     *,
     camera: Camera | None = None,
     keypoints: Mapping[int, Float64Array] | None = None,
-    project: Projection | None = None,
 ) -> Labels:
     """Label the visible ``instances`` of a frame.
 
@@ -244,7 +239,6 @@ def label_instances(
         rules: Thresholds for dropping and marking.
         camera: Camera; required for keypoints.
         keypoints: Keypoints by asset index, in the asset's coordinates [m], shape (K, 3) each.
-        project: Projection of an instance's points, if it does not follow from its pose and the camera alone.
 
     Raises:
         ValueError: If a map is not a 2-D integer array, the maps differ in shape, or a map contains an unknown id.
@@ -305,7 +299,7 @@ def label_instances(
                 world_from_object=instance.world_from_object,
                 keypoints=np.zeros((0, 3))
                 if points is None or camera is None
-                else _project_keypoints(points, instance, camera, truth, project),
+                else _project_keypoints(points, instance, camera, truth),
                 marks=marks,
             )
         )
@@ -356,13 +350,11 @@ def _agreement(
     return float(np.count_nonzero(one & other) / np.count_nonzero(one | other)), boundary_f1(one, other)
 
 
-def _project_keypoints(
-    points: Float64Array, instance: Instance, camera: Camera, truth: Truth, project: Projection | None
-) -> Float64Array:
+def _project_keypoints(points: Float64Array, instance: Instance, camera: Camera, truth: Truth) -> Float64Array:
     """Compute pixels and visibilities of an asset's keypoints, shape (K, 3)."""
     pose = instance.world_from_object
     points = points @ pose[:3, :3].T + pose[:3, 3]
-    pixels, depth = camera.project(points) if project is None else project(points, instance)
+    pixels, depth = camera.project(points)
     seen = np.zeros((len(points), 3))
     for row, (x, y), z in zip(seen, pixels, depth, strict=True):
         if not (z > camera.near and 0 <= x < camera.width and 0 <= y < camera.height):

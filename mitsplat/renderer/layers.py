@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from typing import Any
@@ -19,7 +19,7 @@ from mitsplat.geometry.camera import Camera
 from mitsplat.images.masks import Silhouette
 from mitsplat.quality import Quality, resolve_quality
 from mitsplat.renderer.lazy_value import LazyValue
-from mitsplat.renderer.rays.device_arrays import concatenated, wrapped
+from mitsplat.renderer.rays.device_arrays import wrapped
 from mitsplat.runtime.dropped_rays import refuse_lost_rays
 from mitsplat.runtime.variant import ensure_variant as ensure_variant
 from mitsplat.runtime.variant import one_at_a_time
@@ -69,28 +69,6 @@ class Layers(LazyValue):
         order_error = known.pop("order_error", None)
         makers = {name: partial(fetch[name], value, shape) for name, value in known.items()}
         return cls.later(makers, _channels=known, _shape=shape, _order_error=order_error)
-
-    @classmethod
-    def stacked(cls, parts: Sequence[tuple[Layers, slice]]) -> Layers:
-        """Stack row ranges of layers from top to bottom; all parts must be on the device and have equal width."""
-        width = parts[0][0].shape[1]
-        counts = [width * (rows.stop - rows.start) for _, rows in parts]
-
-        def taken(value: Any, rows: slice) -> Any:
-            if dr.depth_v(value) == 2:
-                return type(value)(*[taken(channel, rows) for channel in value])
-            place = dr.arange(mi.UInt32, width * (rows.stop - rows.start)) + dr.opaque(mi.UInt32, width * rows.start)
-            # A constant layer is one value on the device.
-            return dr.gather(type(value), value, place if dr.width(value) > 1 else 0 * place)
-
-        known = [(part.__dict__["_channels"], rows) for part, rows in parts]
-        channels = {name: concatenated([taken(own[name], rows) for own, rows in known]) for name in known[0][0]}
-        errors = [part.order_error for part, _ in parts]
-        if errors[0] is not None:
-            found = [(error["largest"], error["mean"]) for error in errors if error is not None]
-            largest, mean = np.array(found).T
-            channels["order_error"] = [largest.max(), np.average(mean, weights=counts)]
-        return cls.on_device(channels, (sum(counts) // width, width))
 
     @property
     def order_error(self) -> dict[str, float] | None:

@@ -242,7 +242,7 @@ def test_frames_of_a_scene_are_those_alone_and_go_on(scene: ms.Scene) -> None:
 
 
 def test_frames_before_a_moving_camera_are_those_alone(scene: ms.Scene) -> None:
-    motion = Motion(exposure=(0.05, 0.05), rotation=(200.0, 200.0), readout=(0.05, 0.05))
+    motion = Motion(exposure=(0.05, 0.05), rotation=(200.0, 200.0))
     camera = scene.spec.camera.model_copy(update={"motion": motion})
     scene = replace(scene, spec=scene.spec.model_copy(update={"camera": camera}))
     layout = ms.Layout.of_poses(scene, {"nut": [moved(0, 0, 0.005)]})

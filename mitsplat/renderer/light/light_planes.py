@@ -24,9 +24,7 @@ SAMPLES = (BLOCK // 2) ** 2
 """Number of traced pixels in a coarse tile."""
 
 MIN_ROWS = 128
-"""Smallest image height [px] at which planes are searched. Lower images, such as the bands of a rolling shutter, gain
-little. The rows beyond a band would also change which of its tiles are coarse.
-"""
+"""Smallest image height [px] at which planes are searched. Lower images gain little."""
 
 MAX_EVEN_STEP = 0.04
 """Largest difference between the light shares of adjacent tiles that counts as even light."""

@@ -87,14 +87,8 @@ def layout_at_view(spec: SceneSpec, layout: Layout, view: int) -> Layout:
         layout: The layout as it settled, or at the moment of another view.
         view: Index of the view in the layout.
     """
-    belt = belt_of(spec, view)
-    return layout if belt is None else layout_on_belt(belt, layout)
-
-
-def layout_on_belt(belt: Belt, layout: Layout) -> Layout:
-    """Return a settled layout at the moment of a belt. Layouts with given poses are returned unchanged."""
-    settled = layout.settled or layout
-    if not settled.certificate.attempts:  # without physics, poses are given
+    belt, settled = belt_of(spec, view), layout.settled or layout
+    if belt is None or not settled.certificate.attempts:  # without physics, poses are given
         return layout
     return _shifted_layout(settled, belt.box, tuple((belt.time * belt.velocity).tolist()))
 

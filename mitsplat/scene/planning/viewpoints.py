@@ -63,7 +63,7 @@ class Viewpoint:
             * ``zoom``: factor on the focal lengths;
             * ``aperture``, ``focus``: thin lens [m];
             * ``motion``: motion during the exposure: ``exposure`` [s]; ``velocity`` [m/s] and ``rotation`` [degrees/s]
-                in the camera's frame; ``readout`` [s] if the shutter is a rolling one;
+                in the camera's frame;
             * ``handheld``: handheld motion, see :func:`handheld_transform`;
             * ``target``: point in the centre of the image [m];
             * ``object``: id of the instance in the centre of the image;
@@ -124,12 +124,11 @@ class _CameraTurn:
         return taken, drawn
 
     def _draw_motion(self, motion: Motion) -> dict[str, Any]:
-        """Draw exposure and readout [s], velocity [m/s] and rotation rate [degrees/s], in the camera's frame."""
+        """Draw exposure [s], velocity [m/s] and rotation rate [degrees/s], in the camera's frame."""
         rng = random_stream(self.seed, "camera motion", self.index)
         exposure, *rates = (float(rng.uniform(*bounds)) for bounds in (motion.exposure, motion.speed, motion.rotation))
         velocity, rotation = (rate * direction(2 * np.pi * rng.uniform(), rng.uniform(-1, 1)) for rate in rates)
-        drawn = {"exposure": exposure, "velocity": velocity.tolist(), "rotation": rotation.tolist()}
-        return drawn | ({"readout": float(rng.uniform(*motion.readout))} if motion.readout[1] else {})
+        return {"exposure": exposure, "velocity": velocity.tolist(), "rotation": rotation.tolist()}
 
     def _handheld_motion(self, hand: Handheld) -> Float64Array:
         """Return displacement [m] and rotation vector [degrees] of the handheld camera at a turn, shape (6,).

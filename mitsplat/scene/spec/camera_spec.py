@@ -91,12 +91,6 @@ class Motion(StrictModel):
     rotation: NonNegativeRange = Field(
         (0.0, 0.0), description="Range of rotation rates [degrees/s]. The axis is uniform on the sphere."
     )
-    readout: NonNegativeRange = Field(
-        (0.0, 0.0),
-        exclude_if=lambda readout: readout == (0.0, 0.0),
-        description="Range of readout times [s]: delay of the exposure of the last row after that of the first row. "
-        "0 for a global shutter.",
-    )
 
     @property
     def is_moving(self) -> bool:

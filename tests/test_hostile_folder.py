@@ -101,7 +101,7 @@ KINDS = {
     "colmap": "[]",
     "cameras": "'task'",
     "video": "video.mp4: ",
-    "service": "does not serve",
+    "service": "does not work",
     "presets": "missing.ply: ",
 }
 

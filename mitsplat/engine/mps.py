@@ -63,7 +63,7 @@ class SharedGpu:
         self.lack = ""
         self._keeper: subprocess.Popen[bytes] | None = None
         if shutil.which(CONTROL) is None:
-            self.lack = f"{CONTROL} of NVIDIA's driver is absent"
+            self.lack = f"{CONTROL}, which is part of NVIDIA's driver, is missing"
         elif _control("get_server_list"):
             return  # an already running service is used
         else:
@@ -101,7 +101,7 @@ class SharedGpu:
             self.close()
             if not isinstance(error, OSError | subprocess.TimeoutExpired):
                 raise
-            self.lack = f"{CONTROL} does not serve ({error})"
+            self.lack = f"{CONTROL} does not work ({error})"
 
     def close(self) -> None:
         """Stop the service after its client processes have ended."""
@@ -133,4 +133,4 @@ def _control(command: str) -> bool:
 
 
 def _last_line(text: str) -> str:
-    return (text.strip().splitlines() or ["it says nothing"])[-1]
+    return (text.strip().splitlines() or ["no output"])[-1]

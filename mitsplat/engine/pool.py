@@ -129,7 +129,7 @@ class Failure:
 
 @dataclass(frozen=True)
 class Lost:
-    """Loss of a worker with its frame; ``how`` continues "the process making frame 3 ..."."""
+    """Loss of a worker with its frame; ``how`` continues "the worker of frame 3 ..."."""
 
     how: str
 
@@ -313,7 +313,7 @@ def run_pool(
                     raise _memory_error(frame, answer.message)
                 gone += 1
                 left = f"{len(live_workers)} worker{'s' * (len(live_workers) > 1)}"
-                note(f"memory is exhausted for frame {frame}: it is made again with {left}")
+                note(f"memory ran out in frame {frame}, which is repeated with {left}")
                 if not at_work:
                     assign(next(iter(live_workers)))
                 continue
@@ -323,11 +323,11 @@ def run_pool(
                 losses[frame] += 1
                 if losses[frame] == MOST_LOSSES:
                     raise LostWorkersError(
-                        f"the process making frame {frame} {answer.how}, {MOST_LOSSES} times (out of memory?); "
+                        f"the worker of frame {frame} {answer.how}, {MOST_LOSSES} times in a row (out of memory?); "
                         "finished frames are kept"
                     )
                 plan.put_back(worker, frame)
-                note(f"the process making frame {frame} {answer.how}: it is made again")
+                note(f"the worker of frame {frame} {answer.how}: the frame is repeated")
                 grow = False
                 if not at_work:
                     assign(pool.start())
@@ -566,7 +566,7 @@ def _describe_end(process: BaseProcess) -> str:
     process.join(_END_TIMEOUT)
     code = process.exitcode
     if code is None:
-        return "answers no more"
+        return "stopped responding"
     return f"was killed by {signal.Signals(-code).name}" if code < 0 else f"ended with status {code}"
 
 

@@ -94,14 +94,14 @@ class Cluster:
         """
         kind = device.kind if isinstance(device, Device) else device
         if kind not in (None, "cpu", "cuda"):
-            raise InputError(f"on a cluster, where Ray assigns the GPUs, the device must be cpu or cuda (got {kind})")
+            raise InputError(f"device must be cpu or cuda on a cluster, because Ray assigns the GPUs (got {kind})")
         resources = self.resources
         if resources is None:
             resources = GPU_SHARE if kind == "cuda" else {"CPU": 2.0}
         elif kind is not None and (kind == "cuda") != ("GPU" in resources):
-            lack = "a GPU too, such as GPU=0.125" if kind == "cuda" else "no GPU"
+            rule = "include a GPU, such as GPU=0.125," if kind == "cuda" else "not include a GPU"
             wanted = ",".join(f"{name}={amount:g}" for name, amount in resources.items())
-            raise InputError(f"resources of a worker on the device {kind} must name {lack} (got {wanted})")
+            raise InputError(f"resources must {rule} for the device {kind} (got {wanted})")
         return Device("cuda" if "GPU" in resources else "cpu"), replace(self, resources=resources)
 
 

@@ -118,7 +118,7 @@ def _split(part: trimesh.Trimesh, threshold: float, most: int) -> list[trimesh.T
     if ragged:
         threshold = max(threshold, _RAGGED_THRESHOLD)
         _logger.warning(
-            "a mesh of %d faces is ragged: its convex pieces follow it only to %g of its size",
+            "the surface of a mesh of %d faces is noisy: its convex pieces approximate it only to %g of its size",
             len(part.faces),
             threshold,
         )

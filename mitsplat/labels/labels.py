@@ -250,7 +250,7 @@ def label_instances(
     ids, second = truth.instance, truth.second
     found, found_second = bounds_of_ids(ids), bounds_of_ids(second)
     if unknown := (found.keys() | found_second.keys()) - {instance.id for instance in instances}:
-        raise ValueError(f"the id map holds {min(unknown)}, which is the id of no instance")
+        raise ValueError(f"ids of the id map must be those of instances, or 0 (got {min(unknown)})")
 
     labels = []
     dropped = dict.fromkeys(("fragments", "small", "occluded", "disagreeing", "hidden", "outside"), 0)
@@ -328,7 +328,7 @@ def _amodal(
     inside = full.inside(*size)
     cleaned = None if inside is None else without_fragments(inside.mask, min_fragment)[0]
     if inside is None or cleaned is None or not cleaned.any():
-        raise AssertionError("what is seen of an instance is part of its silhouette")
+        raise AssertionError("the visible mask of an instance must be part of its silhouette")
     return Silhouette.cropped(cleaned, *inside.box[:2]), full.box, full.area
 
 

@@ -321,7 +321,7 @@ class Drop:
     def _part(self, asset: Asset, progress: Note) -> _Part:
         """Build the physics data of an asset, once for all entries that share its mesh."""
         if asset.mesh is None:
-            raise InputError(f"asset {asset.name!r} must have a mesh to be dropped")
+            raise InputError(f"asset {asset.name!r} must have a mesh for physics (got none)")
         if id(asset.mesh) not in self._parts:
             mesh = prepare_mesh(asset.mesh, f"asset {asset.name!r}")
             surface = DistanceSurface(mesh)
@@ -364,7 +364,7 @@ class Drop:
             colliders.append(Collider(surroundings.friction, pieces=pieces))
             obstacles.append(PlacedSurface(surroundings.name, DistanceSurface(mesh)))
         if not colliders:
-            raise InputError(f"{scene.path}: objects must have something to rest on (no shape is a collider)")
+            raise InputError(f"{scene.path}: at least one shape must be a collider, on which objects rest (got none)")
         lows, highs = [], []
         for number, (region, arrangement) in enumerate(scene.spec.all_regions):
             beside = walls_beside(scene.spec, number, [item.name for item in obstacles], walls)
@@ -414,13 +414,13 @@ class Drop:
         if self.scene.spec.regions:
             counts = Counter(self.scene.spec.region_names[item.region] for item in items if item.pose is None)
             raise InputError(
-                f"{self.scene.path}: regions must be large enough to start all objects in (those of a layout find no "
-                f"room without overlap: {', '.join(f'{count} in {name}' for name, count in counts.items())})"
+                f"{self.scene.path}: regions must be large enough to hold all objects of a layout without overlap "
+                f"(got {', '.join(f'{count} objects in {name}' for name, count in counts.items())})"
             )
         size = np.subtract(region.max, region.min)
         raise InputError(
-            f"{self.scene.path}: region must be large enough to start all objects in (the {len(assets)} of a layout "
-            f"find no room without overlap in {size[0]:.3g} x {size[1]:.3g} x {size[2]:.3g} m"
+            f"{self.scene.path}: region must be large enough to hold all objects of a layout without overlap "
+            f"(got {len(assets)} objects in {size[0]:.3g} x {size[1]:.3g} x {size[2]:.3g} m"
             f"{self._describe_obstruction(self._grounds[ground].obstacles)}, settle.arrangement {arrangement})"
         )
 
@@ -448,7 +448,7 @@ class Drop:
         points = np.random.default_rng(0).uniform(self.scene.spec.region.min, self.scene.spec.region.max, (1000, 3))
         taken = [float((item.signed_distances(points) < 0).mean()) for item in obstacles]
         worst = int(np.argmax(taken))
-        return f", {taken[worst]:.0%} of which are inside of {obstacles[worst].name!r}" if taken[worst] >= 0.1 else ""
+        return f", {taken[worst]:.0%} of which are inside {obstacles[worst].name!r}" if taken[worst] >= 0.1 else ""
 
     def _arrangement_defect(
         self,
@@ -524,5 +524,5 @@ def _deepest(pairs: Iterable[Clearance]) -> float:
 def _pieces(
     mesh: trimesh.Trimesh, name: str, progress: Note, *, threshold: float = _THRESHOLDS[0]
 ) -> tuple[trimesh.Trimesh, ...]:
-    progress(f"convex pieces of {name}")
+    progress(f"computing convex pieces of {name}")
     return convex_pieces(mesh, threshold=threshold, most=round(MAX_PIECES * _THRESHOLDS[0] / threshold))

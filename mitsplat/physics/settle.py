@@ -205,7 +205,7 @@ def warp_settings(progress: Note | None = None) -> Iterator[None]:
         with quiet_warp():
             compiled = Path(wp.config.kernel_cache_dir or ".").glob("wp_newton._src.solvers.mujoco.kernels*")
             if progress is not None and not any(compiled):
-                progress("compiling physics, once (about a minute)")
+                progress("compiling physics kernels for the first time (about a minute)")
             yield
     finally:
         wp.config.enable_backward = kept

@@ -82,7 +82,7 @@ CPU = Device("cpu")
 
 
 class Lack(NamedTuple):
-    """Missing prerequisite of a GPU (continues "as ..."), and its remedy."""
+    """Missing prerequisite of a GPU (continues "because ..."), and its remedy."""
 
     what: str
     remedy: str
@@ -138,10 +138,10 @@ def find_device(device: str | Device) -> Device:
     if isinstance(gpus, Lack):
         if text == "auto":
             return Device("cpu", reason=gpus.what)
-        raise MissingResourceError(f"{text} cannot be used, as {gpus.what}: {gpus.remedy}, or use the device cpu")
+        raise MissingResourceError(f"{text} cannot be used, because {gpus.what}: {gpus.remedy}, or use the device cpu")
     first = tuple(gpu for gpu in gpus if gpu.ordinal == 0)
     if text == "auto":
-        return Device("cuda", first, "NVIDIA's driver and OptiX are whole")
+        return Device("cuda", first, "NVIDIA's driver and OptiX are complete")
     if text == "cuda":
         return Device("cuda", first)
     which = text.partition(":")[2]
@@ -151,14 +151,14 @@ def find_device(device: str | Device) -> Device:
         return Device("cuda", first)
     if int(which) >= len(gpus):
         numbers = f"cuda:0 to cuda:{len(gpus) - 1}" if len(gpus) > 1 else "cuda:0"
-        raise InputError(f"the GPUs that are visible here are {numbers} (got {text})")
+        raise InputError(f"device must be one of the visible GPUs, {numbers} (got {text})")
     return Device("cuda", (gpus[int(which)],))
 
 
 def _late_device_error(text: str, gpu: Gpu) -> LateDeviceError:
     return LateDeviceError(
-        f"{text} must be the first GPU that a process sees when it imports mitsplat: set {VISIBLE}={gpu.id} "
-        "before, and use the device cuda",
+        f"{text} must be the first visible GPU when mitsplat is imported: set {VISIBLE}={gpu.id} before the import, "
+        "and use the device cuda",
         {**gpu_environment(gpu), NUMBER: text.partition(":")[2]},
     )
 
@@ -199,19 +199,21 @@ def visible_gpus() -> tuple[Gpu, ...] | Lack:
     """Return the GPUs on which Mitsuba can trace rays (at least one), or the missing prerequisite."""
     driver = _library("libcuda.so.1")
     if driver is None:
-        return Lack("NVIDIA's driver is absent (libcuda.so.1)", "install it")
+        return Lack("NVIDIA's driver is missing (libcuda.so.1)", "install it")
     count = ctypes.c_int(0)
     status = driver.cuInit(0) or driver.cuDeviceGetCount(ctypes.byref(count))
     unused = unused_gpu_memory()
     if (status or not count.value) and any(memory < NEEDED for memory in unused.values()):
         most = max(unused.values()) / 2**30
-        return Lack(f"programs have taken all but {most:.1f} GiB of the GPU's memory", "end one (`nvidia-smi` tells)")
+        return Lack(
+            f"the GPU has only {most:.1f} GiB of unused memory", "end a program on it (`nvidia-smi` lists them)"
+        )
     if status or not count.value:
-        return Lack(f"NVIDIA's driver finds no GPU (status {status})", f"see what `nvidia-smi` and {VISIBLE} say")
+        return Lack(f"NVIDIA's driver finds no GPU (status {status})", f"check `nvidia-smi` and {VISIBLE}")
     if _library("libnvoptix.so.1") is None:
         return Lack(
             "NVIDIA's driver lacks OptiX, which traces rays (libnvoptix.so.1)",
-            "install all of the driver (of a container: run it with NVIDIA_DRIVER_CAPABILITIES=all)",
+            "install the complete driver (in a container, set NVIDIA_DRIVER_CAPABILITIES=all)",
         )
     found = [_gpu(driver, ordinal, unused, alone=count.value == 1) for ordinal in range(count.value)]
     return tuple(found if os.environ.get(VISIBLE) else sorted(found, key=lambda gpu: gpu.bus))

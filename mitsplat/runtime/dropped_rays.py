@@ -51,7 +51,7 @@ def refuse_lost_rays() -> None:
     if _dropped:
         text, count = _dropped[0], len(_dropped)
         _dropped.clear()
-        raise RuntimeError(f"the picture is wrong, because Dr.Jit left out rays ({count} times): {text}")
+        raise RuntimeError(f"the image is incorrect, because Dr.Jit dropped rays ({count} times): {text}")
 
 
 def _record(level: int, message: bytes) -> None:
@@ -73,8 +73,8 @@ def _set_callback() -> Callable[..., None]:
         function = ctypes.CDLL(str(Path(dr.__file__).with_name("libdrjit-core.so")))[SET_CALLBACK]
     except (OSError, AttributeError) as error:
         raise MissingResourceError(
-            f"Dr.Jit {dr.__version__} cannot be asked which rays it leaves out on a GPU ({error}): "
-            "install the drjit that mitsplat was tested with, or take the CPU"
+            f"Dr.Jit {dr.__version__} does not report rays that it drops on a GPU ({error}): "
+            "install a version of drjit that mitsplat requires, or use the CPU"
         ) from error
     function.argtypes, function.restype = (ctypes.c_uint32, _Callback), None
     # Dr.Jit may still log during Python's shutdown, when the callback no longer exists: this restores the default one.

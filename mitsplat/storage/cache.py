@@ -109,7 +109,7 @@ def _warn(lacks: dict[Path, str]) -> None:
     _reported.update(new)
     if new and parent_process() is None:
         where = ", ".join(f"{folder} ({lacks[folder]})" for folder in new)
-        _logger.warning("the cache cannot be used, so that work is done again in every run: %s", where)
+        _logger.warning("a cache folder cannot be written, so every run computes kernels or layouts again: %s", where)
 
 
 def _remove(folder: str, process: int) -> None:

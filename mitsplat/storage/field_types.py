@@ -68,7 +68,9 @@ def _each_ordered(bounds: tuple[Vector, Vector]) -> tuple[Vector, Vector]:
 def check_weights(weights: tuple[float, ...], members: int, what: str) -> None:
     """Check that the number of weights equals the number of members of a pool."""
     if weights and len(weights) != members:
-        raise FieldError("weights", f"must be as many as the pool has {what}, {members} (got {len(weights)})")
+        raise FieldError(
+            "weights", f"must have one weight for each of the {members} {what} of the pool (got {len(weights)})"
+        )
 
 
 def _count_range(count: Any) -> Any:
@@ -79,7 +81,7 @@ def _count_range(count: Any) -> Any:
         return (count, count)
     if not isinstance(count, list | tuple) or len(count) != 2:
         shown = "nothing" if count is None else json.dumps(count, default=str)
-        raise ValueError(f"must be a whole number, or [least, most] of them (got {shown})")
+        raise ValueError(f"must be a whole number or [minimum, maximum] (got {shown})")
     return tuple(count)
 
 
@@ -88,7 +90,7 @@ def _scale_range(scale: Any) -> Any:
     if not isinstance(scale, list | tuple):
         return scale
     if len(scale) != 2 or not all(isinstance(n, int | float) and not isinstance(n, bool) and n > 0 for n in scale):
-        raise ValueError(f"must be a number > 0, or [least, most] of them (got {json.dumps(scale, default=str)})")
+        raise ValueError(f"must be a number > 0 or [minimum, maximum] (got {json.dumps(scale, default=str)})")
     return ordered((float(scale[0]), float(scale[1])))
 
 

@@ -6,24 +6,24 @@ from pathlib import Path
 
 from mitsplat.errors import InputError
 
-_SPLATS = "splats, which an asset.yaml names under `splats:`; `mitsplat chart` renders them"
-_MESH = "a mesh, of which `mitsplat bake` makes an asset"
-_PICTURE = "a picture"
-_DRAWING = "solids of a CAD program: export them from there as a mesh, .glb with its colours, or .stl"
+_SPLATS = "a splat file: enter it in an asset.yaml under `splats:`"
+_MESH = "a mesh: `mitsplat bake` makes an asset from it"
+_PICTURE = "an image"
+_DRAWING = "a CAD file: export it as a mesh, .glb with colours or .stl"
 _BY_SUFFIX = {
     **dict.fromkeys((".splat", ".ksplat", ".spz", ".sog"), _SPLATS),
     **dict.fromkeys((".stl", ".obj", ".glb", ".gltf", ".off", ".3mf", ".dae"), _MESH),
     **dict.fromkeys((".png", ".jpg", ".jpeg", ".exr", ".hdr", ".tif", ".tiff"), _PICTURE),
     **dict.fromkeys((".step", ".stp", ".iges", ".igs", ".brep", ".sldprt", ".ipt", ".fcstd"), _DRAWING),
-    ".ply": "splats or a mesh: an asset.yaml names it under `splats:` or `mesh:`",
-    ".xml": "a Mitsuba scene, which `mitsplat render` renders",
+    ".ply": "splats or a mesh: enter it in an asset.yaml under `splats:` or `mesh:`",
+    ".xml": "a Mitsuba scene: `mitsplat render` renders it",
     ".yaml": "a scene or an asset.yaml",
     ".yml": "a scene or an asset.yaml",
 }
 _BY_CONTENT = {
-    "asset.yaml": "an asset, which a scene names under `objects:`; `mitsplat check` looks at it",
-    "dataset.json": "a dataset, which `mitsplat report` shows",
-    "capture.json": "a capture, which `mitsplat fit` takes",
+    "asset.yaml": "the folder of an asset: enter it in a scene under `objects:`; `mitsplat check` checks it",
+    "dataset.json": "the folder of a dataset: `mitsplat report` describes it",
+    "capture.json": "the folder of a capture: `mitsplat fit` fits splats to it",
 }
 
 
@@ -41,8 +41,8 @@ def refuse_others(path: Path, wanted: str, *suffixes: str) -> None:
         InputError: If the path is of another kind; the message names the kind.
     """
     if path.is_dir():
-        what = next((text for name, text in _BY_CONTENT.items() if (path / name).is_file()), None)
-        raise InputError(f"{path}: must be {wanted} (got a folder{f': {what}' if what else ''})")
+        found = next((text for name, text in _BY_CONTENT.items() if (path / name).is_file()), "a folder")
+        raise InputError(f"{path}: must be {wanted} (got {found})")
     suffix = path.suffix.lower()
     if path.is_file() and suffix in _BY_SUFFIX and suffix not in suffixes:
         raise InputError(f"{path}: must be {wanted} (got {_BY_SUFFIX[suffix]})")

@@ -148,7 +148,7 @@ def _open_unlinked(name: str, flags: int) -> int:
     try:
         _check_regular(number, name)
         if os.fstat(number).st_nlink > 1:
-            raise OSError(errno.EMLINK, "must not have a second name (a hard link): remove it, or copy it", str(name))
+            raise OSError(errno.EMLINK, "must not be a hard link: remove it, or replace it by a copy", str(name))
         if flags & os.O_TRUNC:
             os.ftruncate(number, 0)
     except BaseException:
@@ -296,7 +296,7 @@ def storage_errors(folder: Path) -> Iterator[None]:
         place = error.filename or folder
         if error.errno in FULL:
             raise MissingResourceError(
-                f"{place}: {error.strerror}: make room and run again; what is finished is kept"
+                f"{place}: {error.strerror}: free disk space and run again; finished files are kept"
             ) from error
         raise InputError(f"{place}: cannot be written or read ({error.strerror or error})") from error
 

@@ -40,5 +40,5 @@ def check_format_version(stored: object, newest: int, place: str | Path) -> None
     if found > newest:
         raise InputError(
             f"{place}: {FORMAT_VERSION} must be at most {newest}, the newest that mitsplat {__version__} reads "
-            f"(got {found}): update mitsplat, or make it anew with this one"
+            f"(got {found}): update mitsplat, or create the file again with this version"
         )

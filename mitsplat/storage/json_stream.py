@@ -140,7 +140,7 @@ def _read_object(path: Path, *, lists: bool) -> Iterator[tuple[str, Any]]:
                 window.expect(",")
             window.expect("}")
         if window.peek():
-            raise ValueError(f"something follows its end (got {window.peek()!r})")
+            raise ValueError(f"must end after the closing brace (got {window.peek()!r})")
 
 
 def _elements(window: _Window) -> Iterator[Any]:
@@ -173,7 +173,7 @@ class _Window:
 
     def expect(self, character: str) -> None:
         if self.peek() != character:
-            raise ValueError(f"{character!r} must follow (got {self._text[self._at : self._at + 20]!r})")
+            raise ValueError(f"must have {character!r} here (got {self._text[self._at : self._at + 20]!r})")
         self._at += 1
 
     def value(self) -> Any:

@@ -161,7 +161,7 @@ def _parse(path: Path) -> CommentedMap:
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from None
     except UnicodeDecodeError as error:
-        raise InputError(f"{path}: must be YAML, hence UTF-8 text ({error.reason} at byte {error.start})") from None
+        raise InputError(f"{path}: must be YAML in UTF-8 ({error.reason} at byte {error.start})") from None
     try:
         reader = YAML(typ="rt", pure=True)
         reader.Scanner = _Scanner

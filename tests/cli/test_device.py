@@ -40,7 +40,11 @@ class TestDevice:
         """Every command that renders refuses it in one sentence, before anything is written."""
         ball = tmp_path / "ball.ply"
         trimesh.creation.icosphere().export(ball)
-        words = "device must be cpu, cuda" if name == "tpu" else f"{name} cannot be used, as there is none: buy one, or"
+        words = (
+            "device must be cpu, cuda"
+            if name == "tpu"
+            else f"{name} cannot be used, because there is none: buy one, or"
+        )
         commands: list[list[object]] = [
             ["render", scene_path, "-o", tmp_path / "out"],
             ["render", tmp_path / "one.xml", "-o", tmp_path / "out"],

@@ -17,22 +17,25 @@ from tests.conftest import box_asset
     [
         (
             "bake plant.splat -o a",
-            "plant.splat: must be a mesh (.glb, .obj, .stl, .ply) (got splats, which an asset.yaml",
+            "plant.splat: must be a mesh (.glb, .obj, .stl, .ply) (got a splat file: enter it in an asset",
         ),
         (
             "bake nut.step -o a",
-            "nut.step: must be a mesh (.glb, .obj, .stl, .ply) (got solids of a CAD program",
+            "nut.step: must be a mesh (.glb, .obj, .stl, .ply) (got a CAD file",
         ),
         ("bake folder -o a", "folder: must be a mesh (.glb, .obj, .stl, .ply) (got a folder)"),
         ("bake part.stl -o part.stl", "--out must be a folder (got the file part.stl)"),
-        ("check plant.splat", "plant.splat: must be a scene file (.yaml) (got splats, which an asset.yaml names"),
-        ("render plant.splat", "plant.splat: must be a scene file (.yaml) (got splats, which an asset.yaml names"),
+        ("check plant.splat", "plant.splat: must be a scene file (.yaml) (got a splat file: enter it in an asset"),
+        (
+            "render plant.splat",
+            "plant.splat: must be a scene file (.yaml) (got a splat file: enter it in an asset",
+        ),
         (
             "render part.stl",
-            "part.stl: must be a scene file (.yaml) (got a mesh, of which `mitsplat bake` makes an asset)",
+            "part.stl: must be a scene file (.yaml) (got a mesh: `mitsplat bake` makes an asset from it)",
         ),
-        ("render nut", "nut: must be a scene file (.yaml) (got a folder: an asset, which a scene names"),
-        ("preview scene.xml", "scene.xml: must be a scene file (.yaml) (got a Mitsuba scene, which `mitsplat render`"),
+        ("render nut", "nut: must be a scene file (.yaml) (got the folder of an asset: enter it in a scene"),
+        ("preview scene.xml", "scene.xml: must be a scene file (.yaml) (got a Mitsuba scene: `mitsplat render`"),
         ("audit folder", "folder must be a dataset of mitsplat (dataset.json: No such file or directory)"),
         ("audit gone", "gone must be a dataset of mitsplat (no such folder)"),
         ("render gone.yaml --address auto", "--address and --resources apply to a Ray cluster: add --engine ray"),

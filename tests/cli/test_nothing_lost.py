@@ -50,7 +50,7 @@ def test_an_asset_is_whole_until_another_one_is(tmp_path: Path, monkeypatch: pyt
         raise OSError(errno.EFBIG, os.strerror(errno.EFBIG))
 
     monkeypatch.setattr("trimesh.Trimesh.export", full)
-    with pytest.raises(MissingResourceError, match="File too large: make room"):
+    with pytest.raises(MissingResourceError, match="File too large: free disk space"):
         box_asset("plate", (0.1, 0.1, 0.01)).save(tmp_path)
     assert contents(tmp_path) == before
     monkeypatch.undo()

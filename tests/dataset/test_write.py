@@ -238,7 +238,7 @@ class TestSameBytes:
         def fail(*args):
             raise OSError(28, "No space left on device")
 
-        with monkeypatch.context() as patch, pytest.raises(MissingResourceError, match=r"No space .*: make room"):
+        with monkeypatch.context() as patch, pytest.raises(MissingResourceError, match=r"No space .*: free disk space"):
             patch.setattr("mitsplat.formats.yolo.yolo_lines", fail)
             write(scene, out)
         assert (out / "images/train/000000.png").is_file()
@@ -470,7 +470,9 @@ class TestDevice:
     def test_one_that_is_not_here_is_refused_before_work(self, scene, tmp_path, device, monkeypatch):
         monkeypatch.setattr(devices, "visible_gpus", lambda: devices.Lack("there is none", "buy one"))
         words = (
-            "device must be cpu, cuda" if device == "tpu" else f"{device} cannot be used, as there is none: buy one, or"
+            "device must be cpu, cuda"
+            if device == "tpu"
+            else f"{device} cannot be used, because there is none: buy one, or"
         )
         with pytest.raises((InputError, MissingResourceError), match=words):
             write(scene, tmp_path / "out", render=never_render, device=device)

@@ -148,7 +148,7 @@ def test_a_worker_that_is_killed_costs_nothing(scene, tmp_path, undisturbed):
         progress=lambda *event: told.append(event[2]),
     )
     assert summary.rendered == 20
-    assert "the process making frame 7 was killed by SIGKILL: it is made again" in told
+    assert "the worker of frame 7 was killed by SIGKILL: the frame is repeated" in told
     assert contents(tmp_path / "out") == undisturbed
 
 
@@ -184,7 +184,7 @@ def test_no_room_in_a_file(scene, tmp_path, undisturbed):
     for size in (3000, 20000, 40000):
         resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
         try:
-            with pytest.raises(MissingResourceError, match="File too large: make room and run again"):
+            with pytest.raises(MissingResourceError, match="File too large: free disk space and run again"):
                 write(scene, out)
         finally:
             resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
@@ -217,7 +217,7 @@ def test_a_full_disk(scene, tmp_path, undisturbed):
     )
     assert done.returncode == 0, done.stderr
     sentence = next(line for line in done.stderr.splitlines() if line.startswith("mitsplat: "))
-    assert sentence.endswith("No space left on device: make room and run again; what is finished is kept")
+    assert sentence.endswith("No space left on device: free disk space and run again; finished files are kept")
     assert "Traceback" not in done.stderr
     assert 0 < int(done.stdout) < 20
     assert contents(tmp_path / "out") == undisturbed

@@ -78,14 +78,14 @@ def test_a_machine_without_it(log: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     monkeypatch.setenv("PATH", str(log.parent))
     shared = SharedGpu()
     assert shared.environment == {}
-    assert shared.lack == "nvidia-cuda-mps-control of NVIDIA's driver is absent"
+    assert shared.lack == "nvidia-cuda-mps-control, which is part of NVIDIA's driver, is missing"
 
 
 def test_one_that_does_not_start(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     install(log, monkeypatch, start="echo no permission >&2; exit 1")
     shared = SharedGpu()
     assert shared.environment == {}
-    assert shared.lack == "nvidia-cuda-mps-control does not serve (no permission)"
+    assert shared.lack == "nvidia-cuda-mps-control does not work (no permission)"
 
 
 def test_one_on_which_nothing_computes_is_ended(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -93,7 +93,7 @@ def test_one_on_which_nothing_computes_is_ended(log: Path, monkeypatch: pytest.M
     monkeypatch.setattr(mps, "_TRIAL", "raise SystemExit('CUDA_ERROR_MPS_SERVER_NOT_READY')")
     shared = SharedGpu()
     assert shared.environment == {}
-    assert shared.lack == "nvidia-cuda-mps-control does not serve (CUDA_ERROR_MPS_SERVER_NOT_READY)"
+    assert shared.lack == "nvidia-cuda-mps-control does not work (CUDA_ERROR_MPS_SERVER_NOT_READY)"
     assert told(log)[-1] == "quit -t 5"
 
 

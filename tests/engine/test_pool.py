@@ -108,7 +108,7 @@ def test_frames_of_lost_workers_are_made_again(tmp_path, workers):
     made = run(KillOnce(tmp_path, (1, 7)), workers, note=notes.append)
     assert sorted(made) == list(range(9))
     told = [note for note in notes if "made again" in note]
-    assert sorted(told) == [f"the process making frame {i} was killed by SIGKILL: it is made again" for i in (1, 7)]
+    assert sorted(told) == [f"the worker of frame {i} was killed by SIGKILL: the frame is repeated" for i in (1, 7)]
 
 
 @pytest.fixture
@@ -143,7 +143,7 @@ def test_the_start_of_a_worker_is_bounded(monkeypatch, interpreter, script, word
     with pytest.raises(LostWorkersError, match=rf"making frame 0 {words}, 3 times"):
         run(large, 2, {0: [0], 1: [1]}, notes.append)
     assert time.monotonic() - begun < 20
-    assert notes[0] == f"the process making frame 0 {words}: it is made again"
+    assert notes[0] == f"the worker of frame 0 {words}: the frame is repeated"
 
 
 def test_others_make_the_frame_of_a_worker_that_does_not_start(monkeypatch, tmp_path, interpreter):
@@ -153,7 +153,7 @@ def test_others_make_the_frame_of_a_worker_that_does_not_start(monkeypatch, tmp_
     notes = []
     made = run(Make(), 2, note=notes.append)
     assert sorted(index for index, _ in made) == list(range(9))
-    assert "the process making frame 0 did not start within 15 s: it is made again" in notes
+    assert "the worker of frame 0 did not start within 15 s: the frame is repeated" in notes
 
 
 def test_stopped_workers_are_ended(tmp_path):
@@ -206,7 +206,7 @@ def test_fewer_workers_where_memory_runs_out(tmp_path):
     made = run(Greedy(tmp_path, room=2), 5, layouts={0: range(20), 1: range(20, 40)}, note=notes.append)
     assert sorted(index for index, _ in made) == list(range(40))
     assert 1 <= len({process for _, process in made[-10:]}) <= 2
-    assert notes[0].startswith("memory is exhausted for frame ") and notes[0].endswith("is made again with 4 workers")
+    assert notes[0].startswith("memory ran out in frame ") and notes[0].endswith("is repeated with 4 workers")
     assert all(ended(path.name) for path in tmp_path.iterdir())
 
 
@@ -294,7 +294,9 @@ def test_a_gpu_that_is_not_here_is_missed_in_one_sentence():
     """What a worker finds when it takes its device is told as what its frame found."""
     lost = Device("cuda", (Gpu("gone", 2**40, 1, "", ""),))
     if isinstance(visible_gpus(), Lack):
-        words = r"^frame 0 cannot be made: cuda cannot be used, as .*, or use the device cpu; finished frames are kept$"
+        words = (
+            "^frame 0 cannot be made: cuda cannot be used, because .*, or use the device cpu; finished frames are kept"
+        )
         with pytest.raises(MissingResourceError, match=words):
             list(run_frames(Variant(), {0: [0]}, note=print, device=lost))
 

@@ -250,7 +250,7 @@ class TestRay:
         options = {"render": KilledOnce(tmp_path, 6), "settle": partial(only_later, 1), "workers": None}
         progress = lambda *event: told.append(event)  # noqa: E731
         assert write(scene, tmp_path / "out", cluster=Cluster(), progress=progress, **options).rendered == 9
-        assert any(text.startswith("the process making frame 6 was lost") for *_, text in told)
+        assert any(text.startswith("the worker of frame 6 was lost") for *_, text in told)
         assert told[-1][:2] == (12, 12)
         assert contents(tmp_path / "out") == whole
 
@@ -265,7 +265,7 @@ class TestRay:
             render=ExhaustedOnce(tmp_path, 6),
             progress=lambda *event: told.append(event[2]),
         )
-        assert "memory is exhausted for frame 6: it is made again with 3 workers" in told
+        assert "memory ran out in frame 6, which is repeated with 3 workers" in told
         assert contents(tmp_path / "out") == whole
 
     def test_bad_input_keeps_its_sentence(self, scene, tmp_path):
@@ -314,9 +314,9 @@ def test_the_device_of_a_cluster(resources, device, kind, reserved):
 @pytest.mark.parametrize(
     ("resources", "device", "words"),
     [
-        ({"CPU": 4.0}, "cuda", r"on the device cuda must name a GPU too, such as GPU=0\.125 \(got CPU=4\)"),
-        ({"CPU": 4, "GPU": 1}, "cpu", r"on the device cpu must name no GPU \(got CPU=4,GPU=1\)"),
-        (None, "cuda:1", r"where Ray assigns the GPUs, the device must be cpu or cuda \(got cuda:1\)"),
+        ({"CPU": 4.0}, "cuda", r"must include a GPU, such as GPU=0\.125, for the device cuda \(got CPU=4\)"),
+        ({"CPU": 4, "GPU": 1}, "cpu", r"must not include a GPU for the device cpu \(got CPU=4,GPU=1\)"),
+        (None, "cuda:1", r"device must be cpu or cuda on a cluster, because Ray assigns the GPUs \(got cuda:1\)"),
         (None, "auto", r"must be cpu or cuda \(got auto\)"),
     ],
 )

@@ -116,7 +116,7 @@ def test_what_is_ragged_is_followed_coarsely(caplog):
     factors = 1 + np.random.default_rng(1).uniform(-0.2, 0.2, (len(ball.vertices), 1))
     pieces = convex_pieces(trimesh.Trimesh(ball.vertices * factors, ball.faces, process=False))
     assert 8 < len(pieces) < 64
-    assert "a mesh of 320 faces is ragged" in caplog.text
+    assert "a mesh of 320 faces is noisy" in caplog.text
 
 
 @pytest.mark.parametrize("name", ["hex_bolt", "proximity_sensor", "spur_gear"])

@@ -88,7 +88,7 @@ def test_a_layout_goes_on_without_what_finds_no_room_beside_the_others(scene_dat
     assert [(one.id, one.reason) for one in layout.left_out] == [(5, "no room for all in 1 of 1 draws")]
     assert layout.certificate.refused.count("no room for all") == 1
     scene_data["objects"][0]["count"] = 9
-    with pytest.raises(InputError, match=r"region must be large enough .*the 9 of a layout"):
+    with pytest.raises(InputError, match=r"region must be large enough .*got 9 objects in"):
         settle_layout(load_scene(write_scene(scene_data)), 0, cached=False)
 
 
@@ -102,7 +102,7 @@ def test_each_object_is_tried_alone(needle_scene, scene_data):
 def test_a_region_too_small_is_an_error(scene_data, write_scene):
     scene_data["objects"][0]["count"] = 60
     scene_data["region"] = {"min": [-0.05, -0.05, 0.01], "max": [0.05, 0.05, 0.08]}
-    with pytest.raises(InputError, match=r"scene.yaml: region must be large enough .*the 61 of a layout"):
+    with pytest.raises(InputError, match=r"scene.yaml: region must be large enough .*got 61 objects in"):
         settle_layout(load_scene(write_scene(scene_data)), 0, cached=False)
 
 

@@ -296,7 +296,7 @@ def test_how_deep_an_object_may_be_grows_with_it(size, depth, refused):
 
 def test_a_scene_without_colliders_is_an_error(scene_data, write_scene):
     scene_data["shapes"][0]["collider"] = False
-    with pytest.raises(InputError, match="something to rest on"):
+    with pytest.raises(InputError, match="must be a collider, on which objects rest"):
         settle_layout(load_scene(write_scene(scene_data)), 0, cached=False)
 
 

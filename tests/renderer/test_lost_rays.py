@@ -44,7 +44,7 @@ def log(request):
 def test_lost_rays_are_an_error_once(log, text, capfd):
     log(text)
     log(text)
-    with pytest.raises(RuntimeError, match=r"left out rays \(2 times\): jit_eval\(\): more than one OptiX"):
+    with pytest.raises(RuntimeError, match=r"dropped rays \(2 times\): jit_eval\(\): more than one OptiX"):
         refuse_lost_rays()
     refuse_lost_rays()
     assert capfd.readouterr() == ("", "")

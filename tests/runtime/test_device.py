@@ -118,15 +118,15 @@ def test_a_device_that_is_none(text):
 @pytest.mark.parametrize(
     ("parts", "words"),
     [
-        ({}, r"NVIDIA's driver is absent \(libcuda.so.1\): install it"),
+        ({}, r"NVIDIA's driver is missing \(libcuda.so.1\): install it"),
         (
             {"gpus": [ONE], "optix": False},
-            r"lacks OptiX, which traces rays \(libnvoptix.so.1\): install all of the driver",
+            r"lacks OptiX, which traces rays \(libnvoptix.so.1\): install the complete driver",
         ),
-        ({"status": 100}, r"finds no GPU \(status 100\): see what `nvidia-smi` and CUDA_VISIBLE_DEVICES say"),
+        ({"status": 100}, r"finds no GPU \(status 100\): check `nvidia-smi` and CUDA_VISIBLE_DEVICES"),
         (
             {"status": 100, "unused": [0.25]},
-            r"programs have taken all but 0.2 GiB of the GPU's memory: end one \(`nvidia-smi` tells\)",
+            r"the GPU has only 0.2 GiB unused memory: end a program on it \(`nvidia-smi` lists them\)",
         ),
     ],
 )
@@ -135,7 +135,7 @@ def test_without_a_gpu(machine, parts, words):
     machine(*parts.get("gpus", ()), **{key: value for key, value in parts.items() if key != "gpus"})
     for text in ("cuda", "cuda:1", "cuda:all"):
         with pytest.raises(
-            MissingResourceError, match=rf"^{text} cannot be used, as .*{words}.*, or use the device cpu$"
+            MissingResourceError, match=rf"^{text} cannot be used, because .*{words}.*, or use the device cpu$"
         ):
             use_device(text)
     found = find_device("auto")
@@ -189,13 +189,13 @@ def test_what_others_have_taken_is_not_for_workers(machine):
 
 def test_gpus_by_name(machine):
     machine(ONE, TWO)
-    assert find_device("auto") == Device("cuda", find_device("cuda").gpus, "NVIDIA's driver and OptiX are whole")
+    assert find_device("auto") == Device("cuda", find_device("cuda").gpus, "NVIDIA's driver and OptiX are complete")
     assert str(find_device("cuda")) == "cuda (One)"  # the first that CUDA counts, which is what Dr.Jit takes
     assert str(find_device("cuda:all")) == "cuda (Two, One)"
     assert [find_device(f"cuda:{i}").gpus[0].name for i in range(2)] == ["Two", "One"]
     assert [gpu.memory / 2**30 for gpu in find_device("cuda:all").gpus] == [80, 24]
     assert gpu_environment(find_device("cuda:0").gpus[0]) == {"CUDA_VISIBLE_DEVICES": id_of(1)}
-    with pytest.raises(InputError, match=r"^the GPUs that are visible here are cuda:0 to cuda:1 \(got cuda:2\)$"):
+    with pytest.raises(InputError, match=r"^device must be one of the visible GPUs, cuda:0 to cuda:1 \(got cuda:2\)$"):
         find_device("cuda:2")
 
 
@@ -222,7 +222,7 @@ def test_a_process_takes_the_gpu_that_it_sees_first(machine, monkeypatch):
     assert use_device("cuda:0").gpus[0].name == "Two"
     assert gpu_environment(find_device("cuda").gpus[0]) == {}  # it is alone there
     machine(TWO)
-    with pytest.raises(InputError, match=r"^the GPUs that are visible here are cuda:0 \(got cuda:1\)$"):
+    with pytest.raises(InputError, match=r"^device must be one of the visible GPUs, cuda:0 \(got cuda:1\)$"):
         find_device("cuda:1")
 
 

@@ -172,7 +172,7 @@ def changed(data: SceneData, **changes: Any) -> SceneData:
         ({"objects__0__count": -3}, "objects[0].count: must be >= 1 (got -3)"),
         ({"objects__0__count": [3, 2]}, "objects[0].count: must be [low, high] with low <= high (got [3, 2])"),
         ({"objects__0__count": [-1, 2]}, "objects[0].count[0]: must be >= 0 (got -1)"),
-        ({"objects__0__count": 1.5}, "objects[0].count: must be a whole number, or [least, most] of them (got 1.5)"),
+        ({"objects__0__count": 1.5}, "objects[0].count: must be a whole number or [minimum, maximum] (got 1.5)"),
         ({"objects__0__scale": 0}, "objects[0].scale: must be > 0 (got 0)"),
         ({"region__max": [0.2, -0.3, 1]}, "region.max: must be above min along y (got -0.3, min is -0.2)"),
         ({"shapes__0__visible": False, "shapes__0__collider": False}, "must be visible, a collider or a proxy"),
@@ -221,11 +221,11 @@ def changed(data: SceneData, **changes: Any) -> SceneData:
         ({"objects__0": {"pool": "**a"}}, "objects[0].pool: must "),
         (
             {"objects__0": {"pool": ["assets/nut", "assets/bolt"], "weights": [1]}},
-            "objects[0].weights: must be as many as the pool has assets, 2 (got 1)",
+            "objects[0].weights: must have one weight for each of the 2 assets of the pool (got 1)",
         ),
         (
             {"objects__0": {"pool": "assets/*", "weights": [1, 2, 3]}},
-            "objects[0].weights: must be as many as the pool has assets, 2 (got 3)",
+            "objects[0].weights: must have one weight for each of the 2 assets of the pool (got 3)",
         ),
         ({"objects__0": {"pool": ["assets/nut"], "weights": [0]}}, "objects[0].weights[0]: must be > 0 (got 0)"),
         ({"objects__0__weights": [1]}, "objects[0].weights: needs a pool"),
@@ -238,7 +238,7 @@ def changed(data: SceneData, **changes: Any) -> SceneData:
         ({"objects__0__scale": [2, 1]}, "objects[0].scale: must be [low, high] with low <= high (got [2.0, 1.0])"),
         (
             {"objects__0__scale": [0, 1]},
-            "objects[0].scale: must be a number > 0, or [least, most] of them (got [0, 1])",
+            "objects[0].scale: must be a number > 0 or [minimum, maximum] (got [0, 1])",
         ),
         (
             {"objects__0": {"asset": "assets/nut", "scale": [1, 2], "poses": [{"position": [0, 0, 1]}]}},
@@ -246,7 +246,7 @@ def changed(data: SceneData, **changes: Any) -> SceneData:
         ),
         (
             {"objects__0": {"pool": "primitives", "weights": [1, 2]}},
-            "objects[0].weights: must be as many as the pool has assets, 15 (got 2)",
+            "objects[0].weights: must have one weight for each of the 15 assets of the pool (got 2)",
         ),
         (
             {"objects__0": {"pool": "primitives", "size": 0.1}},

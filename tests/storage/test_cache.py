@@ -52,7 +52,7 @@ def warnings_of(environment, *before):
 @pytest.mark.parametrize("environment", [{"HOME": "/dev/null"}, {"XDG_CACHE_HOME": "/dev/null/cache"}])
 def test_an_unwritable_cache_costs_time_only(environment):
     (line,) = warnings_of(environment)
-    assert "the cache cannot be used" in line and "Not a directory" in line
+    assert "a cache folder cannot be written" in line and "Not a directory" in line
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="needs the right to be another user")

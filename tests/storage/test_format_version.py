@@ -26,7 +26,7 @@ from tests.drawn import large_boxes, render_boxes, scatter_boxes
 
 NEWER = (
     rf"format_version must be at most 1, the newest that mitsplat {__version__} reads \(got 2\): "
-    r"update mitsplat, or make it anew with this one"
+    r"update mitsplat, or create the file again with this version"
 )
 NO_VERSIONS = ["two", True, 1.5, 0, None]
 

@@ -153,7 +153,7 @@ def test_unreadable_files(tmp_path: Path) -> None:
     for path, sentence in [
         (tmp_path / "absent.yaml", "no such file"),
         (tmp_path, "must be a file"),
-        (binary, "must be YAML, hence UTF-8 text (invalid start byte at byte 7)"),
+        (binary, "must be YAML in UTF-8 (invalid start byte at byte 7)"),
     ]:
         with pytest.raises(InputError) as caught:
             load_yaml(path, Drawing)

@@ -187,7 +187,7 @@ def _check_units(asset: Asset) -> Asset:
 def _check_object(asset: Asset) -> None:
     """Check that physics can move the asset."""
     if asset.kind != "object" or asset.mesh is None:
-        raise InputError(f"asset {asset.name!r} must be of kind object and have a mesh to be dropped")
+        raise InputError(f"asset {asset.name!r} must be of kind object and have a mesh for physics")
 
 
 def _check_fit(asset: Asset, region: Region, name: str) -> None:

@@ -1,6 +1,6 @@
-"""Records figures anew: runs the commands of results again, one after the other.
+"""Records figures again: runs the commands of results, one after the other.
 
-    python -m benchmarks.again NAME...      # of benchmarks/results/NAME.json; the name is enough to begin with
+    python -m benchmarks.again NAME...      # those whose names begin like this: render.frame
     python -m benchmarks.again --idle       # those by the clock, on a machine that does nothing else
     python -m benchmarks.again --all        # all that run on this machine from a checkout alone
     python -m benchmarks.again ... --list   # says what would run, and how long it took
@@ -20,7 +20,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from benchmarks.figures import read_results
-from benchmarks.record import ROOT
+from benchmarks.record import ROOT, refusal
 
 IDLE = (
     "render.frame",
@@ -73,6 +73,8 @@ def main() -> None:
         or (options.idle and name in IDLE)
         or (options.all and recordable(result))
     }
+    if not options.list and (refused := refusal()):
+        sys.exit(refused)
     failed = []
     for command, seconds in {shlex.join(command_of(one)): one["seconds"] for one in chosen.values()}.items():
         print(f"{command}  ({f'{seconds:.0f} s the last time' if seconds else 'time unknown'})", flush=True)

@@ -19,7 +19,6 @@ What is not there is an error. ``said.md`` lists sentences of pages that are wri
 from __future__ import annotations
 
 import argparse
-import json
 import re
 import subprocess
 import sys
@@ -29,7 +28,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.detector.table import experiment_table, mean_precision
-from benchmarks.record import MEASURED, RESULTS, ROOT
+from benchmarks.record import MEASURED, RESULTS, ROOT, read_recorded
 from benchmarks.scale.projection import project
 
 TEMPLATES = ROOT / "benchmarks" / "templates"
@@ -48,8 +47,8 @@ class FigureError(Exception):
 
 
 def read_results(folder: Path = RESULTS) -> dict[str, dict[str, Any]]:
-    """Everything recorded, by name, and what follows from it."""
-    results = {path.stem: json.loads(path.read_text(encoding="utf-8")) for path in sorted(folder.glob("*.json"))}
+    """Read all results, by name, and add the projection that is computed from them."""
+    results = read_recorded(folder)
     results["projection"] = {"figures": projected(results)}
     return results
 
@@ -115,7 +114,7 @@ def caption(result: Mapping[str, Any], newest: int = 0) -> str:
     if result["recorded"] == "transcribed":
         text += f"; taken over from the notes of revision {day}, not recorded anew since"
     else:
-        text += f"; recorded at revision {day}{' with changes' if result['changed'] else ''}"
+        text += f"; recorded at revision {day}{' with changes' if result.get('dirty') else ''}"
         text += f" in {result['seconds']:.0f} s"
     return text + (f". {result['note']}" if result.get("note") else ".")
 
@@ -145,7 +144,7 @@ def runs(results: Iterable[Mapping[str, Any]], newest: int) -> str:
         if result["recorded"] == "transcribed":
             how = "taken over from notes"
         else:
-            how = f"in {result['seconds']:.0f} s" + (", with changes" if result["changed"] else "")
+            how = f"in {result['seconds']:.0f} s" + (", with changes" if result.get("dirty") else "")
         how += f". {result['note']}" if result.get("note") else ""
         load, day = load_of(result).removeprefix("load "), f"{result['revision']}, {result['date']}"
         late = "–" if result.get("commits") is None else newest - result["commits"]

@@ -1,16 +1,21 @@
-"""Keeps what a benchmark measures as ``benchmarks/results/NAME.json``, from which the documentation's figures are made.
+"""Records the figures of benchmarks in ``benchmarks/results``, from which pages of the documentation are generated.
 
     with recording("render.frame", parser, options):
         ...
         figure(0.52, "s", "whole frame")
 
-Takes only the standard library, so that scripts in environments without mitsplat can use it too.
+Each benchmark has one file, ``BENCHMARK.jsonl``, with a line for each configuration: the arguments that change figures.
+A run replaces the line of its configuration. A run from a checkout with uncommitted changes prints its figures, but is
+not recorded and ends with an error. ``MITSPLAT_RECORD=0`` runs a benchmark without recording.
+
+The module needs the standard library only, because scripts in environments without mitsplat import it.
 """
 
 from __future__ import annotations
 
 import argparse
 import datetime
+import fcntl
 import json
 import math
 import os
@@ -30,30 +35,32 @@ ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "benchmarks" / "results"
 SHOWN = "results", "templates", "figures.py", "again.py", "README.md"
 MEASURED = "mitsplat", "plugins", "scenes", "benchmarks", *(f":!benchmarks/{name}" for name in SHOWN)
-"""What decides figures: a change of these that is not committed makes a revision a changed one."""
+"""Paths that determine figures: uncommitted changes of these prevent recording."""
+RECORDS = os.environ.get("MITSPLAT_RECORD") != "0"
+"""False if figures are printed only."""
 
 _open: list[dict[str, list[Any]]] = []
 
 
 def slug(text: object) -> str:
-    """A word of lower-case letters, digits and underscores."""
+    """Return a word of lower-case letters, digits and underscores."""
     return re.sub(r"[^a-z0-9]+", "_", str(text).lower()).strip("_")
 
 
 def figure(value: Any, unit: str, *path: object) -> None:
-    """Keep a figure of the benchmark that is being recorded, if one is.
+    """Add a figure to the benchmark that is being recorded, if there is one.
 
     Args:
         value: A number, some text, or a pair of the least and the most.
         unit: Such as ``s``, ``dB`` or ``MiB``; empty for counts, ratios and shares.
-        path: Words that name it, from the general to the particular.
+        path: Words of its name, from the general to the particular.
     """
     if _open:
         _open[-1][".".join(map(slug, path))] = [_plain(value), unit]
 
 
 def _plain(value: Any) -> Any:
-    """As JSON has it: numbers of six digits, an infinite one as text, and nothing for what is no number."""
+    """Return a value as JSON stores it: numbers of six digits, infinity as text, NaN as None."""
     if isinstance(value, str):
         return value
     if isinstance(value, Sequence):
@@ -66,12 +73,12 @@ def _plain(value: Any) -> Any:
     return int(number) if number == int(number) else float(f"{number:.6g}")
 
 
-def name_of(benchmark: str, parser: argparse.ArgumentParser, options: argparse.Namespace, ignore: Sequence[str]) -> str:
-    """The benchmark, its positional arguments, and the options that are not as by default.
+def configuration_of(parser: argparse.ArgumentParser, options: argparse.Namespace, ignore: Sequence[str] = ()) -> str:
+    """Return the positional arguments and the options that differ from their defaults, as one word.
 
-    Of a path only the name counts, and options in ``ignore`` do not.
+    Only the name of a path counts. Options in ``ignore`` do not count.
     """
-    parts = [benchmark]
+    parts = []
     for action in parser._actions:
         if action.dest in ("help", *ignore):
             continue
@@ -95,67 +102,100 @@ def recording(
     command: Sequence[str] | None = None,
     folder: Path = RESULTS,
 ) -> Iterator[None]:
-    """Write the figures of a run when it ends well, in place of those of the same command.
+    """Record the figures of a run that ends without an exception, in place of those of the same configuration.
 
     Args:
         benchmark: Its module below ``benchmarks``.
-        parser: Knows what is positional and what is as by default.
-        options: What was asked for.
-        ignore: Options that change no figure, such as where pictures go.
-        gpu: Whether it runs on one.
-        command: Words that start it, if they are not ``python -m benchmarks.`` and the module.
-        folder: Where to.
+        parser: Parser of the arguments, which has their defaults.
+        options: Parsed arguments.
+        ignore: Options that change no figure, such as the folder for pictures.
+        gpu: True if the benchmark uses a GPU.
+        command: Words that start the benchmark, if they are not ``python -m benchmarks.`` and the module.
+        folder: Folder of the results.
+
+    Raises:
+        SystemExit: At the end of a run from a checkout with uncommitted changes.
     """
     figures: dict[str, list[Any]] = {}
     at, load, cpu = revision(), os.getloadavg()[0], cpu_seconds()
+    if refused := refusal() if RECORDS else None:
+        print(refused, file=sys.stderr)
     start = time.monotonic()
     _open.append(figures)
     try:
         yield
     finally:
         _open.pop()
+    if refused:
+        sys.exit(refused)
+    if not RECORDS:
+        return
     words = command or ("python", "-m", f"benchmarks.{benchmark}")
-    write_result(
-        name_of(benchmark, parser, options, ignore),
-        {
-            "command": shlex.join([*words, *sys.argv[1:]]),
-            "recorded": "run",
-            "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
-            **at,
-            "machine": machine(gpu),
-            "load": {"start": round(load, 1), "end": round(os.getloadavg()[0], 1)},
-            "seconds": round(time.monotonic() - start, 1),
-            "cpu_seconds": round(cpu_seconds() - cpu, 1),
-        },
-        figures,
-        folder,
+    about = {
+        "command": shlex.join([*words, *sys.argv[1:]]),
+        "recorded": "run",
+        "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
+        **at,
+        "machine": machine(gpu),
+        "load": {"start": round(load, 1), "end": round(os.getloadavg()[0], 1)},
+        "seconds": round(time.monotonic() - start, 1),
+        "cpu_seconds": round(cpu_seconds() - cpu, 1),
+    }
+    write_result(benchmark, configuration_of(parser, options, ignore), {**about, "figures": figures}, folder)
+
+
+def write_result(benchmark: str, configuration: str, result: Mapping[str, Any], folder: Path) -> None:
+    """Replace the line of a configuration; print a message if that fails, because the figures were printed."""
+    line = json.dumps({"configuration": configuration, **result}, ensure_ascii=False)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with (folder / f"{benchmark}.jsonl").open("a+", encoding="utf-8") as file:
+            fcntl.flock(file, fcntl.LOCK_EX)  # several runs of the detector experiment end at the same time
+            file.seek(0)
+            lines = {json.loads(line)["configuration"]: line for line in file.read().splitlines()}
+            lines[configuration] = line
+            file.truncate(0)
+            file.writelines(f"{lines[key]}\n" for key in sorted(lines))
+    except OSError as error:
+        print(f"the result was not recorded: {error}", file=sys.stderr)
+
+
+def read_recorded(folder: Path = RESULTS) -> dict[str, dict[str, Any]]:
+    """Read all results, by benchmark and configuration: ``render.frame``, ``render.frame-ten``."""
+    return {
+        "-".join(filter(None, (path.stem, result["configuration"]))): result
+        for path in sorted(folder.glob("*.jsonl"))
+        for result in map(json.loads, path.read_text(encoding="utf-8").splitlines())
+    }
+
+
+def refusal(folder: Path = ROOT) -> str | None:
+    """Return the reason why a run from a checkout is not recorded, or None if it has no uncommitted changes."""
+    try:
+        changes = _output_of("git", "-C", str(folder), "status", "--porcelain", "--", *MEASURED).splitlines()
+    except (OSError, subprocess.CalledProcessError):
+        return None
+    if not changes:
+        return None
+    more = f" and {len(changes) - 1} more" if len(changes) > 1 else ""
+    return (
+        f"error: {folder}: results are recorded only without uncommitted changes (got {changes[0].split()[-1]}{more}); "
+        "commit them, or set MITSPLAT_RECORD=0 to print figures without recording"
     )
 
 
-def write_result(name: str, about: Mapping[str, Any], figures: Mapping[str, Sequence[Any]], folder: Path) -> None:
-    """Write one file, a figure a line; where that is not possible say so, for the figures were printed."""
-    lines = ",\n".join(f"  {json.dumps(key)}: {json.dumps(row, ensure_ascii=False)}" for key, row in figures.items())
-    head = json.dumps(about, indent=1, ensure_ascii=False).removesuffix("\n}")
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        (folder / f"{name}.json").write_text(f'{head},\n "figures": {{\n{lines}\n }}\n}}\n', encoding="utf-8")
-    except OSError as error:
-        print(f"the result was not kept: {error}", file=sys.stderr)
-
-
 def revision(folder: Path = ROOT) -> dict[str, Any]:
-    """The commit, how many led to it, and whether files that decide figures differ; unknown outside of a checkout."""
+    """Return the commit and the number of commits that led to it; unknown outside of a checkout."""
     try:
-        commit = _said("git", "-C", str(folder), "rev-parse", "--short=9", "HEAD")
-        number = int(_said("git", "-C", str(folder), "rev-list", "--count", "HEAD"))
-        changed = bool(_said("git", "-C", str(folder), "status", "--porcelain", "--", *MEASURED))
+        commit = _output_of("git", "-C", str(folder), "rev-parse", "--short=9", "HEAD")
+        number = int(_output_of("git", "-C", str(folder), "rev-list", "--count", "HEAD"))
     except (OSError, subprocess.CalledProcessError):
-        return {"revision": "unknown", "commits": None, "changed": None}
-    return {"revision": commit, "commits": number, "changed": changed}
+        return {"revision": "unknown", "commits": None}
+    return {"revision": commit, "commits": number}
 
 
 def machine(gpu: bool) -> dict[str, Any]:
-    """Processor, those of its cores that this process may run on, memory [GiB], and the GPU where one is used."""
+    """Describe the machine: processor, cores available to this process, memory [GiB], and the GPU if one is used."""
     cpuinfo = Path("/proc/cpuinfo")
     lines = cpuinfo.read_text().splitlines() if cpuinfo.exists() else []
     names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
@@ -171,17 +211,17 @@ def machine(gpu: bool) -> dict[str, Any]:
 def _gpu() -> str:
     program = shutil.which("nvidia-smi")
     try:
-        names = _said(program, "--query-gpu=name", "--format=csv,noheader") if program else ""
+        names = _output_of(program, "--query-gpu=name", "--format=csv,noheader") if program else ""
     except (OSError, subprocess.CalledProcessError):
         names = ""
     return names.partition("\n")[0] or "unknown"
 
 
-def _said(*command: str) -> str:
+def _output_of(*command: str) -> str:
     return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
 
 
 def cpu_seconds() -> float:
-    """Of this process and of its children that have ended [s]."""
+    """Return the processor time of this process and of its children that have ended [s]."""
     used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
     return sum(one.ru_utime + one.ru_stime for one in used)

@@ -1,4 +1,4 @@
-"""The documentation's figures: those that benchmarks recorded, and no others."""
+"""Figures of the documentation: recorded by benchmarks, filled into pages, and checked."""
 
 from __future__ import annotations
 
@@ -17,25 +17,25 @@ import pytest
 from benchmarks import again, figures, record
 from benchmarks.detector.table import experiment_table
 from benchmarks.figures import FigureError, caption, differences, filled, formatted, read_results, unsaid
-from benchmarks.record import figure, name_of, recording, revision
+from benchmarks.record import configuration_of, figure, read_recorded, recording, refusal, revision
 from mitsplat.checks import doctor
 
 ROOT = Path(__file__).parents[1]
 RESULTS = read_results()
 
 
-def test_the_pages_are_what_the_results_give() -> None:
+def test_pages_equal_those_generated_from_the_results() -> None:
     assert differences(RESULTS) == []
 
 
-def test_a_figure_that_changed_is_missed() -> None:
+def test_a_changed_figure_is_reported_for_the_page_that_shows_it() -> None:
     changed = copy.deepcopy(RESULTS)
     changed["scale.faults-seed_51-frames_6"]["figures"]["kills"][0] += 1
     found = " ".join(differences(changed))
     assert "docs/reliability.md is not" in found and "docs/figures.md" not in found
 
 
-def test_a_sentence_with_another_figure_is_missed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_sentence_with_another_figure_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(figures, "ROOT", tmp_path)
     monkeypatch.setattr(figures, "TEMPLATES", tmp_path)
     (tmp_path / "said.md").write_text("# page.md\n\n* It takes {{ one seconds .1f }} s.\n")
@@ -55,7 +55,7 @@ def test_detectors_are_compared_over_the_same_draws_of_scenes() -> None:
         "detector.experiment-synthetic-1": run(0.42, list(draws + 0.02)),
         "detector.experiment-no_shadow-0": run(0.35, list(draws - 0.05)),
         "detector.experiment-traced_shadow-0": run(0.45, list(draws + 0.05)),
-        "detector.experiment-images_900-0": run(0.38, list(draws - 0.02)),
+        "detector.experiment-images_3177-0": run(0.38, list(draws - 0.02)),
         "detector.experiment-traced_shadow-0-plan_workshop": run(0.3, list(draws - 0.1)),
         "detector.experiment-no_shadow-0-plan_workshop": run(0.2, list(draws - 0.2)),
     }
@@ -92,7 +92,7 @@ def test_detectors_are_compared_over_the_same_draws_of_scenes() -> None:
         "",
     ],
 )
-def test_what_no_result_has_is_an_error(text: str) -> None:
+def test_a_place_of_a_template_without_a_result_is_refused(text: str) -> None:
     with pytest.raises(FigureError):
         filled(f"{{{{ {text} }}}}", RESULTS)
 
@@ -111,11 +111,11 @@ def test_what_no_result_has_is_an_error(text: str) -> None:
         ("∞", ".1f", "∞"),
     ],
 )
-def test_how_figures_are_written(value: object, spec: str, text: str) -> None:
+def test_a_figure_is_formatted_by_its_specification(value: object, spec: str, text: str) -> None:
     assert formatted(value, spec) == text
 
 
-def test_a_figure_that_cannot_be_written_so_is_an_error() -> None:
+def test_a_specification_that_does_not_fit_the_figure_is_refused() -> None:
     with pytest.raises(FigureError, match=r"0\.5 cannot be written as ,d"):
         formatted(0.5, ",d")
 
@@ -131,56 +131,118 @@ def options(*words: str) -> tuple[argparse.ArgumentParser, argparse.Namespace]:
 
 
 @pytest.mark.parametrize(
-    ("words", "name"),
+    ("words", "configuration"),
     [
-        ((), "render.frame"),
-        (("--frames", "8", "--out", "a"), "render.frame"),
-        (("rate", "--frames", "6", "--ten"), "render.frame-rate-frames_6-ten"),
-        (("--scene", "scenes/real.yaml"), "render.frame-scene_real"),
-        (("--frames", "1"), "render.frame-frames_1"),
+        ((), ""),
+        (("--frames", "8", "--out", "a"), ""),
+        (("rate", "--frames", "6", "--ten"), "rate-frames_6-ten"),
+        (("--scene", "scenes/real.yaml"), "scene_real"),
+        (("--frames", "1"), "frames_1"),
     ],
 )
-def test_a_name_tells_runs_apart_by_what_matters(words: tuple[str, ...], name: str) -> None:
-    assert name_of("render.frame", *options(*words), ("out",)) == name
+def test_a_configuration_has_the_arguments_that_change_figures(words: tuple[str, ...], configuration: str) -> None:
+    assert configuration_of(*options(*words), ("out",)) == configuration
 
 
-def test_a_run_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture
+def clean(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A checkout without uncommitted changes, whatever the state of the one under test."""
+    monkeypatch.setattr(record, "refusal", lambda: None)
+    monkeypatch.setattr(record, "RECORDS", True)
+
+
+@pytest.mark.usefixtures("clean")
+def test_a_run_is_recorded_with_command_machine_and_figures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "argv", ["frame.py", "--frames", "3"])
     with recording("render.frame", *options("--frames", "3"), folder=tmp_path):
         figure(0.123456789, "s", "whole frame")
         figure([1, math.inf], "dB", "fast, EWA", "psnr")
         figure(math.nan, "", "none")
-    (path,) = tmp_path.iterdir()
-    found = json.loads(path.read_text())
-    assert path.name == "render.frame-frames_3.json"
+    ((name, found),) = read_recorded(tmp_path).items()
+    assert name == "render.frame-frames_3" and found["configuration"] == "frames_3"
     assert found["command"] == "python -m benchmarks.render.frame --frames 3"
     assert found["figures"] == {"whole_frame": [0.123457, "s"], "fast_ewa.psnr": [[1, "∞"], "dB"], "none": [None, ""]}
     assert found["recorded"] == "run" and found["machine"]["cores"] and found["load"]["start"] is not None
     assert caption(found).startswith("`python -m benchmarks.render.frame --frames 3` on ")
 
 
-def test_a_run_that_fails_is_not_kept(tmp_path: Path) -> None:
+@pytest.mark.usefixtures("clean")
+def test_the_last_run_of_a_configuration_replaces_its_line_only(tmp_path: Path) -> None:
+    path = tmp_path / "render.frame.jsonl"
+    for value, words in enumerate([("rate",), ("--ten",), (), ("--frames", "3")]):
+        with recording("render.frame", *options(*words), folder=tmp_path):
+            figure(value, "s", "whole frame")
+    before = path.read_text().splitlines()
+    assert [json.loads(line)["configuration"] for line in before] == ["", "frames_3", "rate", "ten"]
+    with recording("render.frame", *options("rate"), folder=tmp_path):
+        figure(9, "s", "whole frame")
+    after = path.read_text().splitlines()
+    assert [a == b for a, b in zip(before, after, strict=True)] == [True, True, False, True]
+    assert read_recorded(tmp_path)["render.frame-rate"]["figures"] == {"whole_frame": [9, "s"]}
+
+
+@pytest.mark.usefixtures("clean")
+def test_a_run_that_fails_is_not_recorded(tmp_path: Path) -> None:
     with pytest.raises(RuntimeError), recording("render.frame", *options(), folder=tmp_path):
         figure(1, "s", "whole frame")
         raise RuntimeError
-    figure(1, "s", "heard by none")
+    figure(1, "s", "after the recording")
     assert not list(tmp_path.iterdir())
 
 
-def test_a_revision_outside_of_a_checkout_is_unknown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert revision(tmp_path) == {"revision": "unknown", "commits": None, "changed": None}
+@pytest.mark.usefixtures("clean")
+def test_a_run_without_recording_writes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(record, "RECORDS", False)
+    monkeypatch.setattr(record, "refusal", lambda: "error: uncommitted changes")
+    with recording("render.frame", *options(), folder=tmp_path):
+        figure(1, "s", "whole frame")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_run_from_a_dirty_checkout_is_refused_after_it_has_printed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def git(*words: str) -> None:
+        subprocess.run(["git", "-C", str(tmp_path), "-c", "user.name=a", "-c", "user.email=a@b", *words], check=True)
+
+    git("init", "--quiet")
+    (tmp_path / "mitsplat").mkdir()
+    (tmp_path / "mitsplat/quality.py").write_text("FAST = 1\n")
+    (tmp_path / "README.md").write_text("Fast.\n")
+    git("add", ".")
+    git("commit", "--quiet", "-m", "first")
+    (tmp_path / "README.md").write_text("Faster.\n")
+    assert refusal(tmp_path) is None  # no figure depends on it
+    (tmp_path / "mitsplat/quality.py").write_text("FAST = 2\n")
+    (tmp_path / "mitsplat/new.py").touch()
+    monkeypatch.setattr(record, "RECORDS", True)
+    monkeypatch.setattr(record, "refusal", lambda: refusal(tmp_path))
+    with pytest.raises(SystemExit) as ended, recording("render.frame", *options(), folder=tmp_path / "results"):
+        sys.stdout.write("figures\n")
+    assert str(ended.value) == (
+        f"error: {tmp_path}: results are recorded only without uncommitted changes (got mitsplat/quality.py and 1 more)"
+        "; commit them, or set MITSPLAT_RECORD=0 to print figures without recording"
+    )
+    assert capsys.readouterr().out.endswith("figures\n") and not (tmp_path / "results").exists()
+
+
+def test_the_revision_is_unknown_outside_of_a_checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert revision(tmp_path) == {"revision": "unknown", "commits": None} and refusal(tmp_path) is None
     monkeypatch.setenv("PATH", "")
-    assert revision() == {"revision": "unknown", "commits": None, "changed": None}
+    assert revision() == {"revision": "unknown", "commits": None} and refusal() is None
 
 
-def test_a_result_that_cannot_be_kept_costs_no_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.usefixtures("clean")
+def test_a_result_that_cannot_be_written_does_not_fail_the_run(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     (tmp_path / "file").touch()
     with recording("render.frame", *options(), folder=tmp_path / "file"):
         figure(1, "s", "whole frame")
-    assert "the result was not kept" in capsys.readouterr().err
+    assert "the result was not recorded" in capsys.readouterr().err
 
 
-def test_which_commands_are_run_again() -> None:
+def test_commands_that_need_only_a_checkout_are_run_again() -> None:
     chosen = {name for name, result in RESULTS.items() if "command" in result and again.recordable(result)}
     assert {"render.frame", "labels.cost", "render.chart-workcell", "scale.fuzz-minutes_8-seed_1000"} <= chosen
     assert not {name for name in chosen if "cuda" in name}
@@ -196,18 +258,18 @@ def test_which_commands_are_run_again() -> None:
     assert words[1:] == ["-m", "benchmarks.render.chart", "scenes/workcell.yaml", "--frames", "2"]
 
 
-def test_captions_say_what_is_old_or_changed() -> None:
-    result = {**RESULTS["labels.cost"], "changed": True, "note": "So."}
+def test_captions_mark_old_dirty_and_transcribed_results() -> None:
+    result = {**RESULTS["labels.cost"], "dirty": True, "note": "So."}
     assert " with changes in " in caption(result) and caption(result).endswith("So.")
     assert "not recorded anew since" in caption({**result, "recorded": "transcribed"})
     assert "commits before" not in caption(result, result["commits"] + 49)
     assert "50 commits before the newest figure" in caption(result, result["commits"] + 50)
 
 
-def test_every_benchmark_keeps_its_figures() -> None:
+def test_every_benchmark_records_its_figures() -> None:
     scripts = [path for path in record.ROOT.glob("benchmarks/*/*.py") if "__main__" in path.read_text()]
     assert len(scripts) > 25
-    # What detectors learn from, which keep theirs; what runs these; and a chart.
+    # Data sets for detectors, scripts that start others, and a chart.
     others = {"arranged.py", "meshes.py", "__main__.py", "chart.py"}
     assert {path.name for path in scripts if "with recording(" not in path.read_text()} == others
 
@@ -221,7 +283,7 @@ def test_every_benchmark_can_be_imported() -> None:
     assert ended.returncode == 0, ended.stderr
 
 
-def test_the_doctor_asks_for_what_was_measured() -> None:
+def test_the_doctor_requires_the_measured_memory_and_disk() -> None:
     memory = {name: value / 1024 for name, (value, _) in RESULTS["scale.workers-budget"]["figures"].items()}
     peak, budget = memory["default_scene.peak"], memory["default_scene.budget"]
     assert peak < budget < doctor.NEEDED_MEMORY < budget + 0.5

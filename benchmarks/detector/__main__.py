@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.detector.experiment import PLAN, VIEWS, folds_of, read_arms, result_of, scenes_of, write_scene
-from benchmarks.record import RESULTS
+from benchmarks.record import read_recorded, refusal
 
 IMAGES = 32
 """For which it pays to start a process: reading the assets takes it as long as rendering some of them."""
@@ -50,12 +50,10 @@ def main() -> None:
     options.render_devices = options.render_devices or options.devices
     plan = read_arms(options.plan)
     arms = options.arms or list(plan["arms"])
-    todo = [
-        (arm, seed)
-        for seed in options.seeds
-        for arm in arms
-        if not (RESULTS / f"{result_of(arm, seed, options.plan)}.json").exists()
-    ]
+    if refused := refusal():
+        sys.exit(refused)
+    recorded = read_recorded()
+    todo = [(arm, seed) for seed in options.seeds for arm in arms if result_of(arm, seed, options.plan) not in recorded]
     free = {"render": options.render_devices * options.renders, "train": options.devices * options.jobs}
     run_jobs(all_jobs(todo, plan, options), free, options)
 

@@ -68,7 +68,7 @@ def work(tmp_path: Path) -> Path:
     return tmp_path
 
 
-@pytest.mark.parametrize("arm", ["real", "hybrid", "synthetic"])
+@pytest.mark.parametrize("arm", ["real", "hybrid_more", "synthetic"])
 def test_photographs_are_judged_by_what_has_not_seen_them(work, monkeypatch, arm):
     """A detector that finds what it has not learnt from, and nothing else: only leaving out scenes lets it see all."""
     seen: dict[str, set[str]] = {}
@@ -121,16 +121,16 @@ def test_folds_are_trained_side_by_side_and_judged_once_all_are(work, tmp_path):
     plan = experiment.read_arms()
     options = argparse.Namespace(work=work, plan=experiment.PLAN, workers=2, weights=None, hope=tmp_path)
     options.render_devices, options.render_workers = ["cuda:0", "cuda:1"], 8
-    todo = [("hybrid", 0), ("no_shadow", 0)]
+    todo = [("hybrid_more", 0), ("no_shadow", 0)]
     renders = {job.name: job for job in side_by_side.renders(todo, plan, options)}
     whole, changed = renders["render-table"], renders["render-table+no_shadow"]
     assert whole.everywhere and "--frames" not in whole.words and not changed.everywhere
     assert changed.after == ["render-table"] and changed.words[changed.words.index("--frames") + 1] == "128"
     trainings = {job.name: job for job in side_by_side.all_jobs(todo, plan, options) if job.kind == "train"}
-    all_whole = [f"render-{name}" for name in plan["arms"]["hybrid"]["scenes"]]
+    all_whole = [f"render-{name}" for name in plan["arms"]["hybrid_more"]["scenes"]]
     assert all(job.behind == all_whole for job in trainings.values())
-    assert set(trainings["hybrid-0"].after) == {f"hybrid-0-{fold}" for fold in range(5)}
-    assert trainings["hybrid-0-4"].after == all_whole
+    assert set(trainings["hybrid_more-0"].after) == {f"hybrid_more-0-{fold}" for fold in range(5)}
+    assert trainings["hybrid_more-0-4"].after == all_whole
     assert trainings["no_shadow-0"].after == ["no_shadow-0-0"]
 
 

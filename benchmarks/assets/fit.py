@@ -28,6 +28,7 @@ import numpy as np
 
 # isort: on
 from benchmarks.assets.photographed import photograph_asset
+from benchmarks.assets.strategy_classic import Classic
 from benchmarks.record import ROOT, figure, recording
 from mitsplat.capture.capture import Capture
 from mitsplat.fit.initial_points import seed_points
@@ -46,6 +47,7 @@ def main() -> None:
     parser.add_argument("--edge", type=int, default=800)
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--replay", choices=("on", "off"), default="on", help="recordings of kernels")
+    parser.add_argument("--classic", action="store_true", help="classic densification of 3DGS in place of MCMC")
     parser.add_argument("--gsplat", action="store_true")
     args = parser.parse_args()
     if (args.capture is None) == (args.synthetic is None):
@@ -61,6 +63,8 @@ def main() -> None:
             settings = replace(
                 settings, masks="off", background="black", coarse=0.0, opacity_weight=0.01, depth_weight=0.0
             )
+        if args.classic:  # it removes large Gaussians itself
+            settings = replace(settings, scale_weight=0.0)
         compare(args, capture, settings)
 
 
@@ -69,7 +73,8 @@ def compare(args: argparse.Namespace, capture: Capture, settings: FitSettings) -
     print("fit                  s      PSNR    SSIM   Gaussians")
     watch = Watch(settings.iterations)
     with tempfile.TemporaryDirectory() as folder:
-        own = fit_capture(capture, folder, settings, progress=watch)
+        classic = Classic(settings.gaussians, settings.refine_every) if args.classic else None
+        own = fit_capture(capture, folder, settings, densification=classic, progress=watch)
         digest = hashlib.sha256((Path(folder) / "splats.ply").read_bytes()).hexdigest()
     keep("mitsplat", own.seconds, own.psnr, own.ssim, len(own.splats))
     print(f"mitsplat {args.device:11} {own.seconds:7.1f} {own.psnr:7.2f} {own.ssim:7.4f} {len(own.splats)}")

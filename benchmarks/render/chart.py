@@ -2,7 +2,7 @@
 
     python -m benchmarks.render.chart FILE [--frames 2] [--size 1280x720] [--at 0.03 ...] [--picture chart.png]
 
-FILE is a scene, or a file of splats, for which Mitsuba's own path is measured as well.
+FILE is a scene, or a file of splats.
 """
 
 from __future__ import annotations

@@ -24,7 +24,7 @@ import numpy as np
 # isort: on
 from benchmarks.record import ROOT, figure, recording
 from benchmarks.render.frame import time_frames
-from mitsplat.frames.volprim import render_volprim, volprim_scene
+from benchmarks.render.volprim import render_volprim, volprim_scene
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.images.colour import encode_srgb
 from mitsplat.quality import resolve_quality

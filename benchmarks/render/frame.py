@@ -20,7 +20,7 @@ from ruamel.yaml import YAML
 import mitsplat as ms
 from benchmarks.record import figure, recording
 from benchmarks.render.captures import CAMERA, crowd
-from mitsplat.frames.volprim import render_volprim, volprim_scene
+from benchmarks.render.volprim import render_volprim, volprim_scene
 from mitsplat.scene.planning.frame_plan import layout_of
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -104,12 +104,6 @@ def fit(
     capture: CaptureFolder,
     out: Annotated[Path, typer.Option("--out", "-o", help="Fit folder to write.")],
     gaussians: Gaussians = 30000,
-    densification: Annotated[
-        Literal["mcmc", "classic"],
-        typer.Option(
-            help="Where Gaussians are added. mcmc: in opaque regions; classic: where image gradients are large."
-        ),
-    ] = "mcmc",
     iterations: Iterations = 3000,
     budget: Budget = None,
     target_psnr: Annotated[
@@ -171,7 +165,6 @@ def fit(
         raise InputError("--depth 0 disables depth maps: remove --depths or --depth-model, or increase --depth")
     settings = FitSettings(
         gaussians=gaussians,
-        densification=densification,
         iterations=iterations,
         budget=None if budget is None else _parse_duration(budget),
         target_psnr=target_psnr,

@@ -2,7 +2,7 @@
 
 Input: a :class:`~mitsplat.capture.capture.Capture`.
 Output: splats, and their image quality on held-out photos.
-The trainer starts from the points of the capture. A densification strategy (MCMC or classic) adds Gaussians.
+The trainer starts from the points of the capture. A densification strategy (MCMC) adds Gaussians.
 """
 
 from __future__ import annotations

@@ -2,9 +2,8 @@
 
 Kheradmand et al. 2024 treat the Gaussians as samples of a distribution. Noise moves Gaussians of low opacity. Dead
 Gaussians move to positions of opaque ones, and new Gaussians are added there. The rendered image stays the same: n
-Gaussians that replace one have the opacity ``1 - (1 - o)^(1/n)`` and scales by eq. 9 of the paper. The original
-densification of 3DGS is :mod:`mitsplat.fit.strategy_classic`. A fit uses both through the protocol
-:class:`Densification`.
+Gaussians that replace one have the opacity ``1 - (1 - o)^(1/n)`` and scales by eq. 9 of the paper. A fit accepts other
+strategies by the protocol :class:`Densification`.
 """
 
 from __future__ import annotations
@@ -44,13 +43,7 @@ _BINOMIALS = np.array(
 
 
 class Densification(Protocol):
-    """Strategy that changes the number and the positions of Gaussians during a fit.
-
-    Attributes:
-        scale_weight: Default weight of the mean scale in the loss.
-    """
-
-    scale_weight: float
+    """Strategy that changes the number and the positions of Gaussians during a fit."""
 
     def look(self, model: GaussianModel, camera: Camera) -> None:
         """Accumulate the gradients of a photo by this camera, before the optimiser step."""
@@ -82,8 +75,6 @@ class Mcmc:
         every: Steps between relocations and additions.
         seed: Seed of the noise.
     """
-
-    scale_weight = 0.01
 
     def __init__(self, most: int, start: int, every: int, seed: int) -> None:
         self._most, self._start, self._every, self._seed = most, start, every, seed

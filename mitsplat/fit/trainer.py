@@ -26,7 +26,6 @@ from mitsplat.fit.fit_folder import FitFolder, FitResult
 from mitsplat.fit.image_metrics import psnr_of
 from mitsplat.fit.initial_points import seed_points
 from mitsplat.fit.optimizer import Adam, GaussianModel
-from mitsplat.fit.strategy_classic import Classic
 from mitsplat.fit.strategy_mcmc import Densification, Mcmc, seed_splats
 from mitsplat.fit.training_view import HeldOut, TrainingView, unpacked
 from mitsplat.fit.windows import object_windows
@@ -47,9 +46,7 @@ class FitSettings:
     """Settings of a fit. Learning rates are those of 3DGS; regularisation is that of its MCMC densification.
 
     Attributes:
-        gaussians: Largest number of Gaussians; with MCMC their number grows to this by the middle of the fit.
-        densification: ``mcmc`` adds Gaussians at positions of opaque ones (Kheradmand et al. 2024); ``classic`` adds
-            them where image-space gradients are large (Kerbl et al. 2023), without a fixed target number.
+        gaussians: Largest number of Gaussians; their number grows to this by the middle of the fit.
         iterations: Optimiser steps, each with one photo; all photos are used in turn.
         budget: Time limit [s] of the schedule, which then skips iterations if necessary. The result then depends on the
             machine.
@@ -70,8 +67,7 @@ class FitSettings:
             of maps falls exponentially to a hundredth, as published, because maps are smooth and may be bent.
         opacity_weight: Weight of the mean opacity. The MCMC authors use 0.01 in fits ten times as long; in short fits
             it makes surfaces transparent.
-        scale_weight: Weight of the mean scale in units of the cameras' extent. The default is 0.01 with MCMC, as
-            published, and 0 with classic densification, which removes large Gaussians.
+        scale_weight: Weight of the mean scale in units of the cameras' extent, as published for MCMC.
         exposure: True to fit an affine colour correction (3 x 4) per photo. The mean of the corrections stays the
             identity, because photos alone do not separate the brightness of splats from that of corrections.
         coarse: Share of the fit that uses pictures of half the size.
@@ -87,7 +83,6 @@ class FitSettings:
     """
 
     gaussians: int = 30_000
-    densification: Literal["mcmc", "classic"] = "mcmc"
     iterations: int = 3000
     budget: float | None = None
     target_psnr: float | None = None
@@ -100,7 +95,7 @@ class FitSettings:
     alpha_weight: float = 0.1
     depth_weight: float = 0.5
     opacity_weight: float = 0.0
-    scale_weight: float | None = None
+    scale_weight: float = 0.01
     exposure: bool = False
     coarse: float = 0.25
     refine_every: int = 100
@@ -124,7 +119,6 @@ class FitSettings:
         if self.budget is not None and not self.budget > 0:
             raise InputError(f"budget must be > 0 s (got {self.budget})")
         for name, kinds in (
-            ("densification", ("mcmc", "classic")),
             ("masks", ("alpha", "ignore", "off")),
             ("background", ("random", "black")),
         ):
@@ -181,6 +175,7 @@ def fit_capture(
     settings: FitSettings = FitSettings(),
     *,
     depths: DepthMaps | None = None,
+    densification: Densification | None = None,
     overwrite: bool = False,
     progress: Callable[[FitProgress], None] | None = None,
 ) -> FitResult:
@@ -193,6 +188,7 @@ def fit_capture(
         out: Folder of the fit.
         settings: Settings of the fit.
         depths: Depth maps of photos, which replace the visible points in the depth loss.
+        densification: New strategy that adds and removes Gaussians; :class:`~mitsplat.fit.strategy_mcmc.Mcmc` if None.
         overwrite: True to replace files of other inputs, or damaged files, in the folder.
         progress: Called every few steps.
 
@@ -210,7 +206,7 @@ def fit_capture(
     if settings.target_psnr is not None:
         training, validation = _split_validation(training)
     ensure_variant()
-    folder = FitFolder(Path(out), _input_hash(capture, settings, depths))
+    folder = FitFolder(Path(out), _input_hash(capture, settings, depths, densification))
     if not overwrite:
         folder.refuse_others()
     done = folder.finished(overwrite=overwrite)
@@ -218,7 +214,7 @@ def fit_capture(
         return done
     state = folder.checkpoint(overwrite=overwrite)
     maps, warnings = ({}, ()) if depths is None else align_maps(training, capture.points, depths, settings.size)
-    fit = _Fit(capture, training, validation, settings, maps)
+    fit = _Fit(capture, training, validation, settings, maps, densification)
     if state is not None:
         fit.restore(state)
     held = [_training_view(photo, settings) for photo in held_out]
@@ -259,6 +255,7 @@ class _Fit:
         validation: tuple[Photo, ...],
         settings: FitSettings,
         maps: Mapping[str, DepthMap],
+        densification: Densification | None,
     ) -> None:
         self.settings, self.points = settings, capture.points
         with ThreadPoolExecutor(min(_MAX_READERS, usable_cores())) as threads:
@@ -284,8 +281,9 @@ class _Fit:
         points, colours = seed_points(capture.points, capture.colours, cameras, seen, masks, rng, settings.gaussians)
         self.extent = self.extent or float(np.linalg.norm(points - centres[0], axis=1).mean())
         self.model = GaussianModel(seed_splats(points, colours, settings.sh_degree), self.extent)
-        self.densification = _densification(settings, self.model.count)
-        self.scale_weight = self.densification.scale_weight if settings.scale_weight is None else settings.scale_weight
+        self.densification = densification or Mcmc(
+            settings.gaussians, self.model.count, settings.refine_every, settings.seed
+        )
         self.exposure = Adam({"exposure": np.repeat(np.eye(3, 4).reshape(-1, 1), len(self.photos), axis=1)})
         self.steps, self.seconds = 0, 0.0
         self.errors: list[Any] = []
@@ -376,7 +374,7 @@ class _Fit:
             quality,
             records,
             opacity_weight=s.opacity_weight / count,
-            scale_weight=self.scale_weight / (3 * count * self.extent),
+            scale_weight=s.scale_weight / (3 * count * self.extent),
         )
         return error
 
@@ -423,14 +421,6 @@ class _Fit:
     def _stateful_parts(self) -> dict[str, Adam | Densification]:
         """Parts with a state that changes in every step, by their names in checkpoints."""
         return {"model": self.model, "exposure": self.exposure, "densification": self.densification}
-
-
-def _densification(settings: FitSettings, start: int) -> Densification:
-    """Return the densification of the settings; ``start`` is the initial number of Gaussians."""
-    s = settings
-    if s.densification == "classic":
-        return Classic(s.gaussians, s.refine_every)
-    return Mcmc(s.gaussians, start, s.refine_every, s.seed)
 
 
 class _LossConstants(NamedTuple):
@@ -563,10 +553,12 @@ def _training_view(
     return TrainingView(photo, scale, masked=settings.masks != "off", inverse_depth=inverse_depth, window=window)
 
 
-def _input_hash(capture: Capture, settings: FitSettings, depths: DepthMaps | None) -> str:
+def _input_hash(
+    capture: Capture, settings: FitSettings, depths: DepthMaps | None, densification: Densification | None
+) -> str:
     """Return the SHA-256 of all inputs of a fit."""
     digest = ContentHash()
-    digest.add_json([__version__, asdict(settings)])
+    digest.add_json([__version__, asdict(settings), type(densification).__name__])
     for photo in capture.photos:
         camera = asdict(photo.camera) | {"world_from_camera": photo.camera.world_from_camera.tolist()}
         digest.add(json.dumps([photo.name, camera, photo.gain]), np.ascontiguousarray(photo.seen).tobytes())

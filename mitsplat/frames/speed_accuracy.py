@@ -26,13 +26,12 @@ from mitsplat.arrays import Float32Array
 from mitsplat.engine.pool import LostWorkersError, run_apart
 from mitsplat.errors import InputError, MissingResourceError
 from mitsplat.frames.frame import render_frame
-from mitsplat.frames.volprim import render_volprim, volprim_scene
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.camera import Camera
 from mitsplat.images.colour import encode_srgb
 from mitsplat.progress import Note, Progress
 from mitsplat.quality import PRESETS, Quality
-from mitsplat.renderer.layers import Layers, ensure_variant, render_splats
+from mitsplat.renderer.layers import Layers, render_splats
 from mitsplat.runtime.device import Device, current_device
 from mitsplat.scene.loading.scene_loading import load_scene
 from mitsplat.storage.files import storage_errors, write_file, write_text
@@ -43,13 +42,10 @@ INSTANCE_MIN = 50
 
 @dataclass(frozen=True)
 class Step:
-    """One configuration: the splat renderer's quality, and changes to the scene file by key.
-
-    Without a quality, Mitsuba's own ``ellipsoids`` and ``volprim_rf_basic`` render a file of splats.
-    """
+    """One configuration: the splat renderer's quality, and changes to the scene file by key."""
 
     name: str
-    quality: Quality | None
+    quality: Quality
     overrides: Mapping[str, Any] = field(default_factory=dict)
 
 
@@ -59,7 +55,6 @@ STEPS = (
     Step("fast, EWA response", replace(_FAST, response="ewa")),
     Step("fast, cut at 1/255, SH 1", replace(_FAST, alpha_min=1 / 255, sh_degree=1)),
 )
-SPLATS_STEPS = (Step("Mitsuba's volprim_rf_basic", None),)
 LIGHT_STEPS = (
     Step("fast, shadow error 0.1", _FAST, {"composite.shadow_error": 0.1}),
     Step("fast, shadows of splats", _FAST, {"composite.occluders": "splats"}),
@@ -94,7 +89,7 @@ class Row:
         psnr: The same in dB; infinite for ``exact``.
         largest: Largest error of a channel.
         ssim: Mean structural similarity (Wang et al. 2004).
-        mask_iou: Mean IoU of the instances' pixels; NaN without instances, or if the step has no instance ids.
+        mask_iou: Mean IoU of the instances' pixels; NaN without instances.
         memory: Peak memory of the process [GiB].
         estimate: Largest error due to the blending order by the step's own estimate; NaN without an estimate.
     """
@@ -115,7 +110,7 @@ class _StepResult:
     """Pictures (K, H, W, 3) and instances (K, H, W) of one step, their median time [s], peak memory [GiB], estimate."""
 
     pictures: Float32Array
-    instances: npt.NDArray[np.uint16] | None
+    instances: npt.NDArray[np.uint16]
     seconds: float
     memory: float
     estimate: float
@@ -152,7 +147,7 @@ def measure_steps(
     if frames < 1:
         raise InputError(f"frames must be at least 1 (got {frames})")
     if steps is None:
-        steps = STEPS + (SPLATS_STEPS if _is_splats(path) else LIGHT_STEPS)
+        steps = STEPS if _is_splats(path) else STEPS + LIGHT_STEPS
     steps = (*steps, *tolerance_steps(tolerances))
     exact = Step("exact", PRESETS["exact"])
     plan = [exact, *(step for step in steps if step != exact)]
@@ -229,7 +224,7 @@ def _run_alone(
 @dataclass(frozen=True)
 class _RenderJob:
     path: Path
-    quality: Quality | None
+    quality: Quality
     frames: int
     overrides: dict[str, Any]
     allow_outside: bool
@@ -239,12 +234,10 @@ class _RenderJob:
 
 
 def _render_pictures(
-    path: Path, quality: Quality | None, frames: int, overrides: dict[str, Any], allow_outside: bool
+    path: Path, quality: Quality, frames: int, overrides: dict[str, Any], allow_outside: bool
 ) -> _StepResult:
     """Render the pictures; the first one is rendered twice, because it compiles or loads kernels."""
-    if quality is None:
-        shoot = _volprim_renderer(path, frames, overrides)
-    elif _is_splats(path):
+    if _is_splats(path):
         shoot = _splats_renderer(path, quality, frames, overrides)
     else:
         shoot = _scene_shooter(path, quality, frames, overrides, allow_outside)
@@ -252,7 +245,7 @@ def _render_pictures(
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return _StepResult(
         np.stack([shot[0] for shot in shots]),
-        None if quality is None else np.stack([shot[1] for shot in shots]),
+        np.stack([shot[1] for shot in shots]),
         statistics.median(shot[2] for shot in shots),
         peak / 2 ** (30 if sys.platform == "darwin" else 20),
         max(shot[3] for shot in shots),
@@ -306,21 +299,6 @@ def picture_of(layers: Layers) -> Float32Array:
     return np.clip(encode_srgb(colour) * layers.alpha[..., None], 0, 1).astype(np.float32)
 
 
-def _volprim_renderer(path: Path, frames: int, overrides: dict[str, Any]) -> Callable[[int], Shot]:
-    ensure_variant()
-    splats = Splats.load(path)
-    width, height = overrides.get("output.width", 1280), overrides.get("output.height", 720)
-
-    def shoot(i: int) -> Shot:
-        scene = volprim_scene(splats, look_around(splats, i, frames, width=width, height=height))
-        start = time.perf_counter()
-        picture = render_volprim(scene)
-        seconds = time.perf_counter() - start
-        return np.clip(encode_srgb(picture), 0, 1).astype(np.float32), np.empty(0, np.uint16), seconds, math.nan
-
-    return shoot
-
-
 def look_around(splats: Splats, index: int, count: int, *, width: int, height: int) -> Camera:
     """Return camera ``index`` of ``count`` on a circle around splats whose up axis is -y, as in 3DGS files."""
     centre = np.median(splats.means, axis=0)
@@ -353,10 +331,8 @@ def _compare(name: str, shots: _StepResult, reference: _StepResult) -> Row:
     )
 
 
-def _mask_iou(mine: npt.NDArray[np.uint16] | None, true_ids: npt.NDArray[np.uint16] | None) -> float:
+def _mask_iou(mine: npt.NDArray[np.uint16], true_ids: npt.NDArray[np.uint16]) -> float:
     """Compute the mean IoU over the instances of all pictures, or NaN."""
-    if mine is None or true_ids is None:
-        return math.nan
     ious = []
     for a, b in zip(mine, true_ids, strict=True):
         ids, counts = np.unique(b[b > 0], return_counts=True)

@@ -7,7 +7,6 @@ import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
 
 import drjit as dr
 import mitsuba as mi
@@ -17,9 +16,10 @@ from PIL import Image
 from scipy.ndimage import binary_dilation
 from scipy.spatial.transform import Rotation
 
+from benchmarks.assets import strategy_classic
+from benchmarks.assets.strategy_classic import Classic
 from mitsplat.capture.capture import Capture, Photo
 from mitsplat.errors import InputError
-from mitsplat.fit import strategy_classic as densify_classic
 from mitsplat.fit import trainer as fit
 from mitsplat.fit.depth_priors import DepthMaps, align_maps
 from mitsplat.fit.fit_folder import FitResult
@@ -125,13 +125,19 @@ def test_finished_fit_is_read_and_not_made_again(fitted: Path, capture: Capture)
     assert again.iterations == 60 and again.psnr == json.loads((fitted / "fit.json").read_text())["psnr"]
 
 
-@pytest.mark.parametrize("densification", ["mcmc", "classic"])
+@pytest.mark.parametrize("strategy", [None, Classic])
 def test_interrupted_fit_goes_on_to_the_same_bytes(
-    capture: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, densification: Literal["mcmc", "classic"]
+    capture: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, strategy: type[Classic] | None
 ) -> None:
-    monkeypatch.setattr(densify_classic, "_RESET_STEPS", 20)  # one before the checkpoint, none soon after
-    settings, capture = replace(SMALL, densification=densification), seeing(capture)
-    whole = fit_capture(capture, tmp_path / "whole", settings)
+    """A given densification takes part with its state."""
+    monkeypatch.setattr(strategy_classic, "_RESET_STEPS", 20)  # one before the checkpoint, none soon after
+    capture = seeing(capture)
+
+    def fitted(out: Path, progress: Callable[[FitProgress], None] | None = None) -> FitResult:
+        densification = None if strategy is None else strategy(SMALL.gaussians, SMALL.refine_every)
+        return fit_capture(capture, out, SMALL, densification=densification, progress=progress)
+
+    whole = fitted(tmp_path / "whole")
     assert 600 < len(whole.splats) <= 800
     monkeypatch.setattr(fit, "_CHECKPOINT_SECONDS", 0.0)
     steps: list[int] = []
@@ -143,8 +149,8 @@ def test_interrupted_fit_goes_on_to_the_same_bytes(
 
     out = tmp_path / "interrupted"
     with pytest.raises(KeyboardInterrupt):
-        fit_capture(capture, out, settings, progress=interrupt)
-    fit_capture(capture, out, settings, progress=lambda state: steps.append(state.step))
+        fitted(out, interrupt)
+    fitted(out, lambda state: steps.append(state.step))
     assert steps == [25, 50, 50, 60]  # the first checkpoint is behind the first report
     assert (out / "splats.ply").read_bytes() == (tmp_path / "whole" / "splats.ply").read_bytes()
 
@@ -179,12 +185,9 @@ def test_interrupted_fit_ends_at_its_target_where_it_would_have(
     assert (tmp_path / "again/splats.ply").read_bytes() == (tmp_path / "whole/splats.ply").read_bytes()
 
 
-@pytest.mark.parametrize("densification", ["mcmc", "classic"])
-def test_no_fit_has_more_gaussians_than_asked_for(
-    capture: Capture, tmp_path: Path, densification: Literal["mcmc", "classic"]
-) -> None:
+def test_no_fit_has_more_gaussians_than_asked_for(capture: Capture, tmp_path: Path) -> None:
     counts: list[int] = []
-    settings = replace(SMALL, densification=densification, gaussians=700, refine_every=5)
+    settings = replace(SMALL, gaussians=700, refine_every=5)
     fit_capture(capture, tmp_path, settings, progress=lambda state: counts.append(state.gaussians))
     assert counts[0] > 600 and max(counts) == 700
 

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import pytest
@@ -25,8 +24,6 @@ from mitsplat.fit.trainer import FitSettings, fit_capture
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.renderer.layers import render_splats
 from tests.fit.test_fit import SMALL, photograph, seeing
-
-BOTH = pytest.mark.parametrize("densification", ["mcmc", "classic"])
 
 
 @pytest.fixture(scope="module")
@@ -48,12 +45,8 @@ def fitted(capture: Capture, folder: Path, matrix: np.ndarray, settings: FitSett
     return fit_capture(capture, folder / "still", settings), moved
 
 
-@BOTH
-def test_larger_by_a_power_of_two_is_the_same_to_the_bit(
-    capture: Capture, tmp_path: Path, densification: Literal["mcmc", "classic"]
-) -> None:
-    settings = replace(SMALL, densification=densification)
-    still, moved = fitted(capture, tmp_path, similarity(4, (0, 0, 0)), settings)
+def test_larger_by_a_power_of_two_is_the_same_to_the_bit(capture: Capture, tmp_path: Path) -> None:
+    still, moved = fitted(capture, tmp_path, similarity(4, (0, 0, 0)), SMALL)
     assert len(still.splats) > 600 and moved.psnr == still.psnr
     for name, factor in (("means", 4), ("scales", 4), ("quats", 1), ("opacities", 1), ("sh", 1)):
         expected = np.float32(factor) * getattr(still.splats, name)
@@ -79,11 +72,8 @@ def test_moved_and_larger_is_the_same_within_a_step_of_the_optimiser(capture: Ca
         assert steps.max() < 2 and (steps > 1 + 1e-6).mean() < 0.002
 
 
-@BOTH
-def test_turned_is_as_like_as_another_seed(
-    capture: Capture, tmp_path: Path, densification: Literal["mcmc", "classic"]
-) -> None:
-    settings = replace(SMALL, densification=densification, iterations=40, rate_sh=0.01)
+def test_turned_is_as_like_as_another_seed(capture: Capture, tmp_path: Path) -> None:
+    settings = replace(SMALL, iterations=40, rate_sh=0.01)
     matrix = similarity(1.7, (1, -2, 0.5), Rotation.from_rotvec([0.7, -0.4, 1.1]))
     still, moved = fitted(capture, tmp_path, matrix, settings)
     other = fit_capture(capture, tmp_path / "other", replace(settings, seed=1))

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from benchmarks.assets.strategy_classic import Classic, control_density, image_gradient, lower_opacities
 from mitsplat.fit.optimizer import GaussianModel
-from mitsplat.fit.strategy_classic import Classic, control_density, image_gradient, lower_opacities
 from mitsplat.fit.strategy_mcmc import seed_splats
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.renderer.layers import ensure_variant, make_sensor

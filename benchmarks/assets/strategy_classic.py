@@ -49,8 +49,6 @@ class Classic:
         every: Steps between changes.
     """
 
-    scale_weight = 0.0
-
     def __init__(self, most: int, every: int) -> None:
         self._most, self._every = most, every
         self._reset_step, self._reset_fraction = 0, 0.0

@@ -21,12 +21,12 @@ class Kernel:
 
     Attributes:
         variance: Variance added to the footprint's covariance [px^2].
-        keeps_light: True if opacity decreases as the footprint grows, so that small Gaussians emit the same light.
+        conserves_light: True if opacity decreases as the footprint grows, so that small Gaussians emit the same light.
         alpha_max: Largest opacity of one Gaussian along a ray.
     """
 
     variance: float
-    keeps_light: bool
+    conserves_light: bool
     alpha_max: float
 
 
@@ -55,11 +55,11 @@ class Quality:
             tolerance.
         alpha_min: Opacity along a ray below which a Gaussian is cut off. 3DGS trains with 1/255.
         transmittance_min: Transmittance at which a ray ends.
-        extends: True if the remaining transmittance of an ended ray takes the mean colour of the ray instead of black.
-            This is mostly closer to the result of a longer ray.
-        amends: True if out-of-order Gaussians are corrected where the tolerance is infinite. Such a Gaussian takes its
-            share of the colour from those that it occludes, as estimated from a few sums. Opacities, depths and
-            instances stay those of the tile's order.
+        normalise_ended_rays: True if the remaining transmittance of an ended ray takes the mean colour of the ray
+            instead of black. This is mostly closer to the result of a longer ray.
+        correct_late_gaussians: True if out-of-order Gaussians are corrected where the tolerance is infinite. Such a
+            Gaussian takes its share of the colour from those that it occludes, as estimated from a few sums. Opacities,
+            depths and instances stay those of the tile's order.
         sh_degree: Highest spherical-harmonic degree that is evaluated.
         samples: Rays per pixel along each axis (n x n on a regular grid, box-filtered). ``edges`` takes one ray, and 2
             x 2 at borders between instances, see :mod:`mitsplat.renderer.splatting.antialiasing`.
@@ -72,8 +72,8 @@ class Quality:
     tolerance: float = math.inf
     alpha_min: float = 1.0 / 255.0
     transmittance_min: float = 1e-3
-    extends: bool = False
-    amends: bool = False
+    normalise_ended_rays: bool = False
+    correct_late_gaussians: bool = False
     sh_degree: int = 3
     samples: Samples = 1
     lens_rings: int = 2
@@ -108,8 +108,10 @@ class Quality:
 
 
 PRESETS: dict[PresetName, Quality] = {
-    "fast": Quality(alpha_min=3e-3, transmittance_min=2e-2, extends=True, amends=True, sh_degree=2),
-    "balanced": Quality(tolerance=1.5e-2, alpha_min=1e-3, transmittance_min=5e-3, extends=True),
+    "fast": Quality(
+        alpha_min=3e-3, transmittance_min=2e-2, normalise_ended_rays=True, correct_late_gaussians=True, sh_degree=2
+    ),
+    "balanced": Quality(tolerance=1.5e-2, alpha_min=1e-3, transmittance_min=5e-3, normalise_ended_rays=True),
     "exact": Quality(tolerance=0.0, alpha_min=1e-5, transmittance_min=1e-6),
 }
 

@@ -98,7 +98,7 @@ def widened_responses(splats: Splats, camera: Camera, slopes: Array, quality: Qu
         jacobian = np.array([[1, 0, -x / depth], [0, 1, -y / depth]]) / depth
         footprint = jacobian @ rotation @ np.diag(scales**2) @ rotation.T @ jacobian.T
         widened = footprint + added
-        if kernel.keeps_light:
+        if kernel.conserves_light:
             opacity = opacity * np.sqrt(np.linalg.det(footprint) / np.linalg.det(widened))
         offset = slopes - np.array([x, y]) / depth
         whiten = np.diag(1 / scales) @ rotation.T

@@ -104,7 +104,7 @@ def print_estimate(name: str, picture: Picture) -> None:
     """How far the estimate agrees with the truth, for the cut-offs of ``balanced``."""
     from mitsplat.renderer.rays.camera_rays import TILE_HEIGHT, TILE_WIDTH
 
-    quality = replace(PRESETS["balanced"], extends=False)  # as the walk that estimates leaves a ray's end
+    quality = replace(PRESETS["balanced"], normalise_ended_rays=False)  # as the walk that estimates leaves a ray's end
     exact = picture.show(replace(quality, tolerance=0.0))
     rgb, estimate = picture.estimate(quality)
     error = np.abs(rgb - exact).max(axis=-1)

@@ -123,7 +123,7 @@ def test_image_is_that_of_the_plain_march(distortion: tuple[float, ...]) -> None
     assert np.array(rgb[0]).max() > 0.1
 
 
-@pytest.mark.parametrize("switch", ["extends", "amends"])
+@pytest.mark.parametrize("switch", ["normalise_ended_rays", "correct_late_gaussians"])
 def test_no_gradients_of_colours_that_are_put_right_afterwards(switch: str) -> None:
     ensure_variant()
     from mitsplat.plugins.splat_proxy import view_of

@@ -192,7 +192,7 @@ def test_late_by_one_place_is_amended_exactly() -> None:
 
 
 def test_amended_pictures_are_nearer_to_the_order_of_rays_and_show_the_same_things() -> None:
-    plain = replace(PRESETS["fast"], amends=False)
+    plain = replace(PRESETS["fast"], correct_late_gaussians=False)
     layers, amended = (render_splats(CROWD, WIDE, quality=quality) for quality in (plain, PRESETS["fast"]))
     exact = display(render_splats(CROWD, WIDE, quality=replace(plain, tolerance=0.0)))
     before, after = (float(np.sqrt(np.mean((display(each) - exact) ** 2))) for each in (layers, amended))
@@ -247,7 +247,7 @@ def test_the_estimate_ranks_pixels_as_the_benchmark_records_it() -> None:
     from benchmarks.render.order_error import Picture
 
     ensure_variant()
-    picture, quality = Picture(CROWD, WIDE), replace(PRESETS["balanced"], extends=False)
+    picture, quality = Picture(CROWD, WIDE), replace(PRESETS["balanced"], normalise_ended_rays=False)
     rgb, estimate = picture.estimate(quality)
     error = np.abs(rgb - picture.show(replace(quality, tolerance=0.0))).max(axis=-1)
     assert spearmanr(estimate[error > 1e-6], error[error > 1e-6]).statistic > 0.6

@@ -168,7 +168,9 @@ def test_a_ray_that_ended_shows_what_it_met_alone(tolerance: float) -> None:
     quality = Quality(tolerance=tolerance, alpha_min=1e-6, transmittance_min=0.02)
     for count, left in ((5, 0.7**5), (30, 0.7**11)):
         splats = one((50.0, 50.0, 0.001), opacity=0.3, count=count)
-        ended, extended = (render_splats(splats, CAMERA, quality=replace(quality, extends=e)) for e in (False, True))
+        ended, extended = (
+            render_splats(splats, CAMERA, quality=replace(quality, normalise_ended_rays=e)) for e in (False, True)
+        )
         expected = 1 - left, 1 if count == 30 else 1 - left
         for layers, alpha in zip((ended, extended), expected, strict=True):
             assert layers.alpha[12, 16] == pytest.approx(alpha, abs=1e-4)

@@ -71,10 +71,10 @@ _RED, _DEPTH = 6, 9
 def _check(view: CameraView, quality: Quality) -> None:
     if quality.order != "tile" or quality.samples != 1 or view.samples != 1:
         raise ValueError("gradients need an infinite quality.tolerance and one sample per pixel")
-    if quality.extends:
-        raise ValueError("gradients need rays that do not extend beyond their end (quality.extends)")
-    if quality.amends:
-        raise ValueError("gradients need colours in the order of tiles as it is (quality.amends)")
+    if quality.normalise_ended_rays:
+        raise ValueError("gradients need quality.normalise_ended_rays = False")
+    if quality.correct_late_gaussians:
+        raise ValueError("gradients need quality.correct_late_gaussians = False")
     if KERNELS[quality.kernel].alpha_max < 1:
         raise ValueError(f"gradients need a kernel that does not limit opacity (got {quality.kernel!r})")
 

@@ -20,9 +20,9 @@ share of these sums behind the late peak counts. It assumes that they extend eve
 distance in front of their mean. The state of a ray grows by seven numbers for this. A Gaussian so late that its ray has
 already ended is not detected.
 
-`fast` adds the difference to the colour instead (`amends`), so that a late Gaussian takes light from those it occludes.
-Its weight and theirs change by the same amount, so that a uniform colour stays uniform. Here the sums decay faster, by
-S / (S + 8 w).
+`fast` adds the difference to the colour instead (`correct_late_gaussians`), so that a late Gaussian takes light from
+those it occludes. Its weight and theirs change by the same amount, so that a uniform colour stays uniform. Here the
+sums decay faster, by S / (S + 8 w).
 
 Most tiles need only the order per tile. One walk in that order, with several rays per lane, finds the others: it ends
 where the estimate exceeds the tolerance. Such tiles are walked with a window. Tiles whose estimate still exceeds the
@@ -342,7 +342,7 @@ def _march(
 
 def _out_of_order(quality: Quality) -> OutOfOrder:
     """Return how late peaks are blended without an error estimate; in the order of rays no peak is late."""
-    return "corrected" if quality.amends and quality.order == "tile" else "ignored"
+    return "corrected" if quality.correct_late_gaussians and quality.order == "tile" else "ignored"
 
 
 def _without_extra(pixels: list[Pixel], late: OutOfOrder) -> list[Pixel]:
@@ -386,7 +386,7 @@ def march_tiles(lists: TileLists, view: CameraView, quality: Quality, z_max: Any
 def _picture(pixels: list[Pixel], lanes: Lanes, quality: Quality) -> list[Any]:
     """Return red, green, blue and opacity of the lanes' pixels as row-major arrays."""
     shown = [[*pixel[RED : BLUE + 1], 1.0 - pixel[T]] for pixel in pixels]
-    if quality.extends:
+    if quality.normalise_ended_rays:
         end = dr.opaque(mi.Float, quality.transmittance_min)
         whole = [dr.select(pixel[T] <= end, dr.rcp(1.0 - pixel[T]), 1.0) for pixel in pixels]
         shown = [[value * scale for value in values] for values, scale in zip(shown, whole, strict=True)]

@@ -206,10 +206,10 @@ class Projector:
         if kernel.variance > 0:
             # A filter is as wide as the view's pixels. The variance that trainers add refers to the picture's pixels,
             # however fine the view is.
-            variance = kernel.variance * (1 if kernel.keeps_light else view.zoom**2)
+            variance = kernel.variance * (1 if kernel.conserves_light else view.zoom**2)
             covariance = view.pixel_covariance(response.u0, response.v0, variance)
             response, det = response.filtered(*covariance)
-            if kernel.keeps_light:
+            if kernel.conserves_light:
                 opacity = opacity * dr.rsqrt(det)
         if self.quality.response == "ewa":
             response = response.parallel()

@@ -33,7 +33,7 @@ from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.mesh import check_faces
 from mitsplat.geometry.untrusted_meshes import check_mesh
 from mitsplat.storage.field_types import Name
-from mitsplat.storage.files import MESH_ERRORS, file_inside, storage_errors
+from mitsplat.storage.files import MESH_ERRORS, resolve_inside, storage_errors
 from mitsplat.storage.format_version import FORMAT_VERSIONS
 from mitsplat.storage.yaml_input import FieldError, key_place, load_yaml
 
@@ -363,9 +363,9 @@ def read_mesh(path: Path, *, merge: bool = True) -> trimesh.Trimesh:
 
 
 def _named_file(folder: Path, key: str, name: str) -> Path:
-    """Return the path of a file that ``asset.yaml`` names, see :func:`mitsplat.storage.files.file_inside`."""
+    """Return the path of a file that ``asset.yaml`` names, see :func:`mitsplat.storage.files.resolve_inside`."""
     try:
-        return file_inside(folder, name)
+        return resolve_inside(folder, name)
     except InputError as error:
         raise InputError(f"{key_place(folder / ASSET_FILE, (key,))}: {error}") from error
 

@@ -36,7 +36,7 @@ from mitsplat.renderer.rays.device_arrays import ray_scene
 from mitsplat.renderer.scene_emitters import emitter_dict, y_up_to_z_up
 from mitsplat.runtime.variant import ensure_variant
 from mitsplat.scene.spec.light_spec import LightSpec
-from mitsplat.storage.file_kinds import refuse_others
+from mitsplat.storage.file_kinds import refuse_other_kinds
 from mitsplat.storage.files import MESH_ERRORS
 
 _SUFFIXES = (".stl", ".obj", ".glb", ".gltf", ".off", ".3mf", ".dae", ".ply")
@@ -126,7 +126,7 @@ def read_parts(
     source = "mesh"
     if isinstance(mesh, str | Path):
         source, path = str(mesh), Path(mesh)
-        refuse_others(path, "a mesh (.glb, .obj, .stl, .ply)", *_SUFFIXES)
+        refuse_other_kinds(path, "a mesh (.glb, .obj, .stl, .ply)", *_SUFFIXES)
         if not path.is_file():
             raise InputError(f"{source}: no such mesh file")
         check_mesh(path)

@@ -26,7 +26,7 @@ from mitsplat.arrays import BoolArray, Float32Array, Float64Array, Int32Array
 from mitsplat.errors import InputError
 from mitsplat.geometry.camera import Camera, Lens
 from mitsplat.images.colour import decode_srgb, encode_srgb
-from mitsplat.storage.files import IMAGE_ERRORS, copied, file_inside, write_file, write_text
+from mitsplat.storage.files import IMAGE_ERRORS, copy_file, resolve_inside, write_file, write_text
 from mitsplat.storage.format_version import FORMAT_VERSIONS
 from mitsplat.storage.yaml_input import load_yaml
 
@@ -297,8 +297,8 @@ class Capture:
         try:
             (folder / CAPTURE_FILE).unlink(missing_ok=True)  # the file of an earlier capture describes other photos
             for photo in self.photos:
-                file = copied(photo.file, folder / "images" / stored_name(photo.name, photo.file.suffix))
-                mask = None if photo.mask is None else copied(photo.mask, folder / "masks" / mask_name(photo.name))
+                file = copy_file(photo.file, folder / "images" / stored_name(photo.name, photo.file.suffix))
+                mask = None if photo.mask is None else copy_file(photo.mask, folder / "masks" / mask_name(photo.name))
                 photos.append(replace(photo, file=file, mask=mask))
             files = {path for photo in photos for path in (photo.file, photo.mask) if path is not None}
             if len(files) < sum(1 + (photo.mask is not None) for photo in photos):
@@ -387,9 +387,9 @@ def mask_name(name: str) -> str:
 
 
 def _named_file(folder: Path, name: str) -> Path:
-    """Return the path of a file named in ``capture.json``, see :func:`mitsplat.storage.files.file_inside`."""
+    """Return the path of a file named in ``capture.json``, see :func:`mitsplat.storage.files.resolve_inside`."""
     try:
-        return file_inside(folder, name)
+        return resolve_inside(folder, name)
     except InputError as error:
         raise InputError(f"{folder / CAPTURE_FILE}: {error}") from error
 

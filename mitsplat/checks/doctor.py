@@ -20,7 +20,7 @@ from mitsplat.runtime.child_process import python_command, python_environment
 from mitsplat.runtime.device import Lack, gpu_environment, visible_gpus
 from mitsplat.runtime.llvm import OLDEST_USABLE, VARIABLE
 from mitsplat.runtime.warp_start import quiet_warp
-from mitsplat.storage.cache import cache_folder, drjit_folder, warp_folder, why_unusable
+from mitsplat.storage.cache import cache_folder, drjit_folder, unusable_reason, warp_folder
 
 NEEDED_MEMORY = 2.5
 """Memory of a worker of the default scene by :func:`mitsplat.frames.budget.worker_memory`, rounded up [GiB].
@@ -123,7 +123,7 @@ def _disk() -> Finding:
 
 def _cache() -> Finding:
     folders = (cache_folder(), warp_folder(), drjit_folder())
-    unusable = [f"{folder}: {reason}" for folder in folders if (reason := why_unusable(folder))]
+    unusable = [f"{folder}: {reason}" for folder in folders if (reason := unusable_reason(folder))]
     if unusable:
         remedy = (
             "set HOME or XDG_CACHE_HOME to a writable folder with free space; otherwise "

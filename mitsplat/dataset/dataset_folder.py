@@ -268,7 +268,7 @@ def finish_folder(
     sheet = ContactSheet(out, len(manifest))
     with CollectionWriter(out, catalogue, content["scene"]["output"]["formats"]) as collection:
         manifest.sort(describe)
-        collection.keep()
+        collection.commit()
     sheet.write(out / SHEET)
 
 

@@ -93,7 +93,7 @@ def write_folds(root: str | Path, folds: int) -> list[Fold]:
                 if described:
                     described[key].add(record)
         for file in files:
-            file.keep()
+            file.commit()
         for task in tasks:
             for name in names:
                 text = f"# Paths are relative to this file.\ntrain: ../{name}_train.txt\nval: ../{name}_val.txt\n"

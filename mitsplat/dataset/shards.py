@@ -26,7 +26,7 @@ from mitsplat.errors import InputError
 from mitsplat.formats.registry import Catalogue
 from mitsplat.progress import Progress
 from mitsplat.storage.content_hash import file_hash
-from mitsplat.storage.files import Record, file_inside, link_file, open_regular, read_json, splits_of, write_file
+from mitsplat.storage.files import Record, link_file, open_regular, read_json, resolve_inside, splits_of, write_file
 
 
 def merge_shards(
@@ -193,7 +193,7 @@ def _scene_file(folder: Path) -> Path:
 def _inside(folder: Path, path: Path) -> Path:
     """Return a file of a shard, and refuse it if it lies outside of the shard."""
     try:
-        return file_inside(folder, str(path.relative_to(folder)))
+        return resolve_inside(folder, str(path.relative_to(folder)))
     except InputError as error:
         raise InputError(f"{folder}: {error}") from error
 
@@ -218,7 +218,7 @@ def _source(folder: Path, file: str, record: Record) -> Path:
     try:
         if ".." in Path(file).parts:  # the path may leave the other dataset's folder
             raise InputError(f"files must not be named by .. (got {file})")
-        return file_inside(folder, file)
+        return resolve_inside(folder, file)
     except InputError as error:
         raise InputError(f"{folder}: frame {record['index']}: {error}; render that shard again") from error
 

@@ -104,10 +104,10 @@ class ScenesWriter:
         with ThreadPoolExecutor(_SYNC_THREADS) as pool:
             list(pool.map(GrowingFile.sync, self._completed))
         for file in self._completed:
-            file.name()
+            file.rename()
         self._completed = []
 
-    def keep(self) -> None:
+    def commit(self) -> None:
         """Give the files of the last scenes their final names, and write the models."""
         self._end_scene()
         self._finish_batch()

@@ -173,9 +173,9 @@ class _SplitWriters:
     def add(self, record: Record) -> None:
         self._writers[record["split"]].add(record)
 
-    def keep(self) -> None:
+    def commit(self) -> None:
         for writer in self._writers.values():
-            writer.file.keep()
+            writer.file.commit()
 
     def discard(self) -> None:
         for writer in self._writers.values():

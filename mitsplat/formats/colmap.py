@@ -38,10 +38,10 @@ class ModelWriter:
         name = image_file(record).removeprefix("images/")
         self._images.write(f"{record['index'] + 1} {values} {self._models[model]} {name}\n\n")
 
-    def keep(self) -> None:
+    def commit(self) -> None:
         """Give the files their final names."""
         for file in (self._cameras, self._images, self._points):
-            file.keep()
+            file.commit()
 
     def discard(self) -> None:
         """Remove the files if they do not have their final names yet."""

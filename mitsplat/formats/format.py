@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from mitsplat.errors import InputError
 from mitsplat.formats import maps
-from mitsplat.storage.field_types import plain
+from mitsplat.storage.field_types import check_name
 from mitsplat.storage.files import SPLITS, Record, link_file, splits_of, write_file
 
 if TYPE_CHECKING:
@@ -57,7 +57,7 @@ class Catalogue:
         """
         for name in scene.class_names:
             try:
-                plain(name)
+                check_name(name)
             except ValueError as error:
                 raise InputError(f"{scene.path}: class: {error}") from error
         points: dict[str, tuple[str, tuple[str, ...]]] = {}
@@ -190,7 +190,7 @@ class Describer(Protocol):
     def add(self, record: Record) -> None:
         """Add a frame; frames come by ascending index."""
 
-    def keep(self) -> None:
+    def commit(self) -> None:
         """Complete the files and give them their final names."""
 
     def discard(self) -> None:

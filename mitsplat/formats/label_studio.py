@@ -88,7 +88,7 @@ class ConfigWriter:
     def add(self, record: Record) -> None:
         """Do nothing; the interface is the same for every frame."""
 
-    def keep(self) -> None:
+    def commit(self) -> None:
         """Write the file."""
         view = ElementTree.Element("View")
         ElementTree.SubElement(view, "Image", name="image", value="$image", zoom="true")

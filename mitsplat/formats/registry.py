@@ -160,7 +160,7 @@ class CollectionWriter:
         for describer in self._describers:
             describer.add(record)
 
-    def keep(self) -> None:
+    def commit(self) -> None:
         """Give the files their final names."""
         for describer in self._describers:
-            describer.keep()
+            describer.commit()

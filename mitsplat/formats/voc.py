@@ -74,10 +74,10 @@ class SetsWriter:
         """Add a frame."""
         self._files[record["split"]].write(f"{record['index']:06d}\n")
 
-    def keep(self) -> None:
+    def commit(self) -> None:
         """Give the files their final names."""
         for file in (*self._files.values(), self._classes):
-            file.keep()
+            file.commit()
 
     def discard(self) -> None:
         """Remove the files if they do not have their final names yet."""

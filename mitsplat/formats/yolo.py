@@ -64,7 +64,7 @@ class DataYaml:
         """Record the frame's split."""
         self._splits.add(record["split"])
 
-    def keep(self) -> None:
+    def commit(self) -> None:
         """Write the file."""
         write_text(self._path, data_yaml(self._class_names, self._splits, self._keypoint_names))
 

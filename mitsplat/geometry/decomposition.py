@@ -21,7 +21,7 @@ from scipy.spatial import ConvexHull
 from mitsplat.arrays import Float64Array
 from mitsplat.geometry.mesh import SHARP, contact_points, simplify_solid
 from mitsplat.geometry.mesh_distance import DistanceSurface, max_outside_distance
-from mitsplat.storage.cache import cache_folder, keep_file
+from mitsplat.storage.cache import cache_folder, write_cache_file
 from mitsplat.storage.content_hash import ContentHash
 
 _logger = logging.getLogger(__name__)
@@ -355,4 +355,4 @@ def _read_pieces(path: Path) -> tuple[trimesh.Trimesh, ...] | None:
 def _write_pieces(path: Path, pieces: Sequence[trimesh.Trimesh]) -> None:
     arrays: dict[str, Any] = {f"vertices_{i}": piece.vertices for i, piece in enumerate(pieces)}
     arrays |= {f"faces_{i}": piece.faces for i, piece in enumerate(pieces)}
-    keep_file(path, lambda file: np.savez(file, **arrays))
+    write_cache_file(path, lambda file: np.savez(file, **arrays))

@@ -24,7 +24,7 @@ from mitsplat.scene.layout import Layout, NothingRests
 from mitsplat.scene.planning.frame_plan import to_index
 from mitsplat.scene.scene import Scene
 from mitsplat.scene.spec.object_spec import Arrangement
-from mitsplat.storage.cache import cache_folder, keep_file
+from mitsplat.storage.cache import cache_folder, write_cache_file
 from mitsplat.storage.content_hash import ContentHash
 
 PACKAGE = Path(__file__).parents[1]
@@ -77,7 +77,7 @@ def settle_layout(scene: Scene, index: int, *, progress: Note | None = None, cac
 
         layout = drop_of(scene, progress or (lambda text: None)).settle(index)
     if cached:
-        keep_file(path, lambda file: file.write(json.dumps(layout.to_json()).encode()))
+        write_cache_file(path, lambda file: file.write(json.dumps(layout.to_json()).encode()))
     return layout
 
 

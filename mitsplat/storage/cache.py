@@ -21,7 +21,7 @@ from typing import IO, Any
 
 _logger = logging.getLogger(__name__)
 
-ROOM = 16 * 2**20
+MIN_FREE_SPACE = 16 * 2**20
 """Minimum free space of a usable cache folder [bytes]; all kernels of physics take 8 MiB."""
 
 _WARP = "WARP_CACHE_PATH"
@@ -56,12 +56,12 @@ def _home() -> Path:
         return Path("/nonexistent")
 
 
-def why_unusable(folder: Path) -> str:
-    """Return the reason why a folder cannot hold a file of :data:`ROOM` bytes, or ""; the folder is created."""
+def unusable_reason(folder: Path) -> str:
+    """Create a folder, and return the reason why it cannot hold :data:`MIN_FREE_SPACE` bytes, or ""."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder) as file:
-            os.posix_fallocate(file.fileno(), 0, ROOM)
+            os.posix_fallocate(file.fileno(), 0, MIN_FREE_SPACE)
     except OSError as error:
         # These errors come from file systems that cannot reserve space.
         return "" if error.errno in (errno.EOPNOTSUPP, errno.EINVAL) else error.strerror or str(error)
@@ -76,18 +76,18 @@ def prepare_caches() -> None:
     the unusable folder are copied there.
     """
     own, kernels = cache_folder(), warp_folder()
-    lacks = {folder: lack for folder in (own, kernels) if (lack := why_unusable(folder))}
-    if kernels in lacks:
+    reasons = {folder: reason for folder in (own, kernels) if (reason := unusable_reason(folder))}
+    if kernels in reasons:
         temporary = tempfile.mkdtemp(prefix="mitsplat-kernels-")
         atexit.register(_remove, temporary, os.getpid())
         with suppress(OSError):  # there are none, or some cannot be read
             shutil.copytree(kernels, temporary, dirs_exist_ok=True)
         os.environ[_WARP] = temporary
-    if lacks:
-        _warn(lacks)
+    if reasons:
+        _warn(reasons)
 
 
-def keep_file(path: Path, write: Callable[[IO[bytes]], Any]) -> None:
+def write_cache_file(path: Path, write: Callable[[IO[bytes]], Any]) -> None:
     """Write a cache file atomically by ``write(open file)``; warn once if it cannot be written."""
     temporary = None
     try:
@@ -103,12 +103,12 @@ def keep_file(path: Path, write: Callable[[IO[bytes]], Any]) -> None:
         _warn({path.parent: error.strerror or str(error)})
 
 
-def _warn(lacks: dict[Path, str]) -> None:
+def _warn(reasons: dict[Path, str]) -> None:
     """Warn about newly found unusable folders in one line; in a worker process, the parent has already done so."""
-    new = [folder for folder in lacks if not any(folder.is_relative_to(known) for known in _reported)]
+    new = [folder for folder in reasons if not any(folder.is_relative_to(known) for known in _reported)]
     _reported.update(new)
     if new and parent_process() is None:
-        where = ", ".join(f"{folder} ({lacks[folder]})" for folder in new)
+        where = ", ".join(f"{folder} ({reasons[folder]})" for folder in new)
         _logger.warning("a cache folder cannot be written, so every run computes kernels or layouts again: %s", where)
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, NonNegativeFloat, ValidationError
 
 from mitsplat.errors import InputError
-from mitsplat.storage.yaml_input import FieldError, sentence_of_model
+from mitsplat.storage.yaml_input import FieldError, model_error_sentence
 
 if TYPE_CHECKING:
     from pydantic._internal._model_construction import ModelMetaclass
@@ -28,7 +28,7 @@ class _InputErrorMeta(ModelMetaclass):
             try:
                 return super().__call__(**values)
             except ValidationError as error:
-                raise InputError(sentence_of_model(error, cls, values)) from None
+                raise InputError(model_error_sentence(error, cls, values)) from None
 
 
 class StrictModel(BaseModel, metaclass=_InputErrorMeta):
@@ -37,14 +37,14 @@ class StrictModel(BaseModel, metaclass=_InputErrorMeta):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
-def ordered(bounds: tuple[float, float]) -> tuple[float, float]:
+def check_order(bounds: tuple[float, float]) -> tuple[float, float]:
     """Refuse a range with low > high."""
     if bounds[0] > bounds[1]:
         raise ValueError(f"must be [low, high] with low <= high (got {list(bounds)})")
     return bounds
 
 
-def plain(name: str) -> str:
+def check_name(name: str) -> str:
     """Refuse a name with control characters (invalid in XML) or line breaks (invalid in line-based label files)."""
     for character in name:
         if unicodedata.category(character) in ("Cc", "Cs", "Zl", "Zp") or ord(character) & 0xFFFE == 0xFFFE:
@@ -54,11 +54,11 @@ def plain(name: str) -> str:
     return name
 
 
-Name = Annotated[str, Field(min_length=1), AfterValidator(plain)]
+Name = Annotated[str, Field(min_length=1), AfterValidator(check_name)]
 """Name of a class, an asset or a keypoint in label files."""
 
 
-def _each_ordered(bounds: tuple[Vector, Vector]) -> tuple[Vector, Vector]:
+def _check_order_of_components(bounds: tuple[Vector, Vector]) -> tuple[Vector, Vector]:
     """Refuse a range of vectors with low > high in any component."""
     if any(low > high for low, high in zip(*bounds, strict=True)):
         raise ValueError(f"must be [low, high] with low <= high in each component (got {json.dumps(bounds)})")
@@ -91,10 +91,10 @@ def _scale_range(scale: Any) -> Any:
         return scale
     if len(scale) != 2 or not all(isinstance(n, int | float) and not isinstance(n, bool) and n > 0 for n in scale):
         raise ValueError(f"must be a number > 0 or [minimum, maximum] (got {json.dumps(scale, default=str)})")
-    return ordered((float(scale[0]), float(scale[1])))
+    return check_order((float(scale[0]), float(scale[1])))
 
 
-def _some_colour(colour: tuple[float, float, float]) -> tuple[float, float, float]:
+def _check_not_black(colour: tuple[float, float, float]) -> tuple[float, float, float]:
     if not any(colour):
         raise ValueError("must not be black (got [0, 0, 0])")
     return colour
@@ -103,19 +103,21 @@ def _some_colour(colour: tuple[float, float, float]) -> tuple[float, float, floa
 Vec3 = tuple[float, float, float]
 Positive = Annotated[float, Field(gt=0)]
 Unit = Annotated[float, Field(ge=0, le=1)]
-UnitRange = Annotated[tuple[Unit, Unit], AfterValidator(ordered)]
-Range = Annotated[tuple[float, float], AfterValidator(ordered)]
+UnitRange = Annotated[tuple[Unit, Unit], AfterValidator(check_order)]
+Range = Annotated[tuple[float, float], AfterValidator(check_order)]
 Stops = Annotated[float, Field(ge=-20, le=20)]
-StopsRange = Annotated[tuple[Stops, Stops], AfterValidator(ordered)]
+StopsRange = Annotated[tuple[Stops, Stops], AfterValidator(check_order)]
 Blur = Annotated[float, Field(ge=0, le=1000)]
-BlurRange = Annotated[tuple[Blur, Blur], AfterValidator(ordered)]
-PositiveRange = Annotated[tuple[Positive, Positive], AfterValidator(ordered)]
-Vec3Range = Annotated[tuple[Vec3, Vec3], AfterValidator(_each_ordered)]
-SizeRange = Annotated[tuple[tuple[Positive, Positive], tuple[Positive, Positive]], AfterValidator(_each_ordered)]
-NonNegativeRange = Annotated[tuple[NonNegativeFloat, NonNegativeFloat], AfterValidator(ordered)]
+BlurRange = Annotated[tuple[Blur, Blur], AfterValidator(check_order)]
+PositiveRange = Annotated[tuple[Positive, Positive], AfterValidator(check_order)]
+Vec3Range = Annotated[tuple[Vec3, Vec3], AfterValidator(_check_order_of_components)]
+SizeRange = Annotated[
+    tuple[tuple[Positive, Positive], tuple[Positive, Positive]], AfterValidator(_check_order_of_components)
+]
+NonNegativeRange = Annotated[tuple[NonNegativeFloat, NonNegativeFloat], AfterValidator(check_order)]
 CountRange = Annotated[
     tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=1)]],
-    AfterValidator(ordered),
+    AfterValidator(check_order),
     BeforeValidator(_count_range, json_schema_input_type=int | tuple[int, int]),
 ]
 Scale = Annotated[
@@ -123,12 +125,12 @@ Scale = Annotated[
     BeforeValidator(_scale_range, json_schema_input_type=Positive | tuple[Positive, Positive]),
 ]
 Elevation = Annotated[float, Field(ge=-90, le=90)]
-ElevationRange = Annotated[tuple[Elevation, Elevation], AfterValidator(ordered)]
+ElevationRange = Annotated[tuple[Elevation, Elevation], AfterValidator(check_order)]
 Kelvin = Annotated[float, Field(ge=1667, le=25000)]
-KelvinRange = Annotated[tuple[Kelvin, Kelvin], AfterValidator(ordered)]
+KelvinRange = Annotated[tuple[Kelvin, Kelvin], AfterValidator(check_order)]
 JpegQuality = Annotated[float, Field(ge=1, le=100)]
 EmittedColour = Annotated[
     tuple[NonNegativeFloat, NonNegativeFloat, NonNegativeFloat],
-    AfterValidator(_some_colour),
+    AfterValidator(_check_not_black),
     Field(description="Linear RGB factor on the emission."),
 ]

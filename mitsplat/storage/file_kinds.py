@@ -27,7 +27,7 @@ _BY_CONTENT = {
 }
 
 
-def refuse_others(path: Path, wanted: str, *suffixes: str) -> None:
+def refuse_other_kinds(path: Path, wanted: str, *suffixes: str) -> None:
     """Refuse a folder, or an existing file whose suffix belongs to another kind of file.
 
     A missing file is not refused here, but by its reader.

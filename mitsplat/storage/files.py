@@ -32,7 +32,7 @@ def splits_of(output: Mapping[str, Any]) -> tuple[str, ...]:
     return SPLITS if output.get("test") else SPLITS[:2]
 
 
-_LONGEST_PATH = 4096
+_MAX_PATH_LENGTH = 4096
 """Length of the longest path that the system resolves [characters]."""
 
 IMAGE_ERRORS = (OSError, SyntaxError, ValueError, TypeError, struct.error, Image.DecompressionBombError)
@@ -87,24 +87,24 @@ class GrowingFile:
         self._path, self._temporary = path, path.with_name(f".{path.name}.{os.getpid()}.part")
         self._temporary.unlink(missing_ok=True)
         self._file = self._temporary.open("x+b", buffering=1 << 16)
-        self._named = False
+        self._renamed = False
 
     def write(self, text: str) -> None:
         """Append UTF-8 text."""
         self._file.write(text.encode())
 
-    def take(self, other: GrowingFile) -> None:
+    def append_file(self, other: GrowingFile) -> None:
         """Append the content of another growing file, and discard that file."""
         other._file.seek(0)
         shutil.copyfileobj(other._file, self._file, 1 << 20)
         other.discard()
 
-    def keep(self) -> None:
+    def commit(self) -> None:
         """Sync the file to disk and give it its final name."""
         self._file.flush()
         os.fsync(self._file.fileno())
         self.close()
-        self.name()
+        self.rename()
 
     def close(self) -> None:
         """Close the file for writing."""
@@ -115,15 +115,15 @@ class GrowingFile:
         with self._temporary.open("rb") as file:
             os.fsync(file.fileno())
 
-    def name(self) -> None:
+    def rename(self) -> None:
         """Give a closed file its final name; it must be synced before."""
         self._temporary.replace(self._path)
-        self._named = True
+        self._renamed = True
 
     def discard(self) -> None:
         """Remove the temporary file, unless it has its final name."""
         self._file.close()
-        if not self._named:
+        if not self._renamed:
             self._temporary.unlink(missing_ok=True)
 
 
@@ -180,14 +180,14 @@ def _check_regular(number: int, path: str | Path) -> None:
         raise OSError(errno.EINVAL, "must be a regular file", str(path))
 
 
-MOST_JSON = 1 << 28
+MAX_JSON_BYTES = 1 << 28
 """Maximum size of a JSON file that is read as a whole [bytes]."""
-DEEPEST_JSON = 64
+MAX_JSON_DEPTH = 64
 """Maximum nesting depth of JSON; files of mitsplat and other tools use about ten levels."""
 _NO_BRACKETS = bytes(set(range(256)) - set(b'[]{}"'))
 
 
-def read_json(path: Path, most: int = MOST_JSON) -> Any:
+def read_json(path: Path, most: int = MAX_JSON_BYTES) -> Any:
     """Read an untrusted JSON file: a regular file of at most ``most`` bytes, with limited depth.
 
     Raises:
@@ -205,15 +205,15 @@ def parse_json(data: bytes) -> Any:
     """Parse JSON in UTF-8.
 
     Raises:
-        ValueError: If it has more than :data:`DEEPEST_JSON` levels, or is not JSON.
+        ValueError: If it has more than :data:`MAX_JSON_DEPTH` levels, or is not JSON.
     """
     text = data.decode("utf-8-sig")
-    if data.count(b"[") + data.count(b"{") > DEEPEST_JSON:
+    if data.count(b"[") + data.count(b"{") > MAX_JSON_DEPTH:
         bare = re.sub(rb"\\.", b"", data, flags=re.DOTALL) if b"\\" in data else data
         brackets = re.sub(rb'"[^"]*"', b"", bare.translate(None, _NO_BRACKETS))
         steps = np.frombuffer(brackets, dtype=np.uint8) & 2  # bit 1 is set for [ and {, but not for ] and }
-        if np.cumsum(steps.astype(np.int64) - 1).max(initial=0) > DEEPEST_JSON:
-            raise ValueError(f"must not be nested deeper than {DEEPEST_JSON} levels")
+        if np.cumsum(steps.astype(np.int64) - 1).max(initial=0) > MAX_JSON_DEPTH:
+            raise ValueError(f"must not be nested deeper than {MAX_JSON_DEPTH} levels")
     return json.loads(text)
 
 
@@ -241,7 +241,7 @@ def files_below(folder: Path, *, but: Path | None = None) -> list[Path]:
 
 def is_inside(folder: Path, name: str) -> bool:
     """Return True if a path (absolute or relative to ``folder``) lies in it after links and ``..`` are resolved."""
-    if len(name) > _LONGEST_PATH:  # resolving takes a time with the square of the length
+    if len(name) > _MAX_PATH_LENGTH:  # resolving takes a time with the square of the length
         return False
     try:
         return (folder / name).resolve().is_relative_to(folder.resolve())
@@ -249,7 +249,7 @@ def is_inside(folder: Path, name: str) -> bool:
         return False
 
 
-def file_inside(folder: Path, name: str) -> Path:
+def resolve_inside(folder: Path, name: str) -> Path:
     """Return the path of a file that must lie in ``folder`` after links and ``..`` are resolved.
 
     Raises:
@@ -301,7 +301,7 @@ def storage_errors(folder: Path) -> Iterator[None]:
         raise InputError(f"{place}: cannot be written or read ({error.strerror or error})") from error
 
 
-def copied(source: Path, target: Path) -> Path:
+def copy_file(source: Path, target: Path) -> Path:
     """Copy ``source`` to ``target`` unless both are the same file; return ``target``."""
     if not (target.exists() and target.samefile(source)):
         write_file(target, lambda temporary: shutil.copyfile(source, temporary))

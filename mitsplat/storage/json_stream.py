@@ -17,7 +17,7 @@ from mitsplat.storage.files import GrowingFile, open_regular
 _BLOCK = 1 << 16
 _LOOK_AHEAD = 3
 """Characters after a number that show that it has ended; it could continue with ``.5`` or ``e-5``."""
-MOST_ELEMENT = 1 << 26
+MAX_ELEMENT_LENGTH = 1 << 26
 """Maximum size of an element [characters]; frames need less."""
 
 
@@ -59,15 +59,15 @@ class ListsFile:
         """Return the current number of elements of a list."""
         return self._counts[name]
 
-    def keep(self) -> None:
+    def commit(self) -> None:
         """End the lists, and give the file its final name."""
         first = self._parts[self._first]
         for name in self._others:
             first.write(f"], {json.dumps(name)}: [")
-            first.take(self._parts[name])
+            first.append_file(self._parts[name])
         first.write("]" + "".join(f", {json.dumps(key)}: {json.dumps(value)}" for key, value in self._after.items()))
         first.write("}")
-        first.keep()
+        first.commit()
 
     def discard(self) -> None:
         """Remove the temporary files, unless the file was kept."""
@@ -183,7 +183,7 @@ class _Window:
             try:
                 value, end = self._decode(self._text, self._at)
             except json.JSONDecodeError as error:
-                if len(self._text) - self._at > MOST_ELEMENT or not self._read(len(self._text) - self._at):
+                if len(self._text) - self._at > MAX_ELEMENT_LENGTH or not self._read(len(self._text) - self._at):
                     raise ValueError(f"{error.msg} (at {self._text[self._at : self._at + 20]!r})") from error
             except RecursionError as error:
                 raise ValueError("it is nested too deeply") from error

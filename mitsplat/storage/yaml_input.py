@@ -120,7 +120,7 @@ def load_yaml(
     raise InputError(_sentence(path, first.line, first.path, first.rule))
 
 
-def sentence_of_model(error: ValidationError, model: type[BaseModel], values: Mapping[str, Any]) -> str:
+def model_error_sentence(error: ValidationError, model: type[BaseModel], values: Mapping[str, Any]) -> str:
     """Return the error sentence for ``values`` from Python code (not from a file) that break a rule of a model."""
     data = _to_file_values(values)
     findings = [_finding(details, model, data, None, {}) for details in error.errors()]

@@ -15,7 +15,7 @@ from mitsplat.errors import InputError
 from mitsplat.images.picture_files import read_picture
 from mitsplat.labels.labels import Labels
 from mitsplat.labels.overlay import class_colour, draw_labels
-from mitsplat.storage.files import Record, file_inside
+from mitsplat.storage.files import Record, resolve_inside
 
 OverlayName = Literal["labels", "silhouettes", "none"]
 OVERLAYS: tuple[OverlayName, ...] = get_args(OverlayName)
@@ -106,7 +106,7 @@ class DatasetIndex:
         record = self.record(index)
         name = next(file for file in record["files"] if file.startswith("images/"))
         try:
-            path = file_inside(self._root, name)
+            path = resolve_inside(self._root, name)
         except InputError as error:
             raise InputError(f"{self._root}: frame {index}: {error}") from error
         stored = read_picture(path, cv2.IMREAD_COLOR)

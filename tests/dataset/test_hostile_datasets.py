@@ -22,7 +22,7 @@ from mitsplat.detector.training import write_data
 from mitsplat.errors import InputError, PartialResultError
 from mitsplat.report.dataset_report import write_report
 from mitsplat.scene.loading.scene_loading import load_scene
-from mitsplat.storage.files import DEEPEST_JSON, open_in_place, parse_json, read_json, write_file
+from mitsplat.storage.files import MAX_JSON_DEPTH, open_in_place, parse_json, read_json, write_file
 from mitsplat.view.dataset_index import DatasetIndex
 from tests.conftest import BOTH, nut_and_bolt, small_scene
 from tests.dataset.test_write import contents, write
@@ -227,7 +227,7 @@ class TestJson:
     def test_brackets_in_strings_have_no_depth(self):
         text = json.dumps(["[" * 1000, '\\"[[' * 100, '"' + "{" * 500])
         assert parse_json(text.encode()) == json.loads(text)
-        levels = "[" * DEEPEST_JSON + "]" * DEEPEST_JSON
+        levels = "[" * MAX_JSON_DEPTH + "]" * MAX_JSON_DEPTH
         assert parse_json(levels.encode()) == json.loads(levels)
         with pytest.raises(ValueError, match="nested deeper"):
             parse_json(f"[{levels}]".encode())

@@ -174,7 +174,7 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Written:
     with CollectionWriter(root, catalogue, FORMATS) as collection:
         for record in records:
             collection.add(record)
-        collection.keep()
+        collection.commit()
     return Written(root, frames, records)
 
 

@@ -157,7 +157,7 @@ def test_code_that_decides_layouts_is_hashed():
     }
     given = types | {
         "storage.cache.cache_folder",
-        "storage.cache.keep_file",
+        "storage.cache.write_cache_file",
         "scene.layout.NO_PHYSICS",
         "runtime.warp_start.quiet_warp",
     }

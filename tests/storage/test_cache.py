@@ -13,19 +13,26 @@ from mitsplat.checks.doctor import _cache
 from mitsplat.errors import exit_status, sentence_of
 from mitsplat.runtime.warp_start import quiet_warp
 from mitsplat.storage import cache
-from mitsplat.storage.cache import cache_folder, drjit_folder, keep_file, prepare_caches, warp_folder, why_unusable
+from mitsplat.storage.cache import (
+    cache_folder,
+    drjit_folder,
+    prepare_caches,
+    unusable_reason,
+    warp_folder,
+    write_cache_file,
+)
 
 KEEP = """
 from pathlib import Path
 
 import warp as wp
-from mitsplat.storage.cache import cache_folder, keep_file
+from mitsplat.storage.cache import cache_folder, write_cache_file
 from mitsplat.runtime.warp_start import quiet_warp
 
 with quiet_warp():
     (Path(wp.config.kernel_cache_dir) / "kernel").write_bytes(bytes(1 << 20))
 for name in "ab":
-    keep_file(cache_folder() / "layouts" / name, lambda file: file.write(bytes(1 << 20)))
+    write_cache_file(cache_folder() / "layouts" / name, lambda file: file.write(bytes(1 << 20)))
 """
 """Starts Warp, writes as it does when it compiles, and keeps two files."""
 
@@ -84,7 +91,7 @@ def test_kernels_of_an_unusable_cache_are_read(fresh, tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     (tmp_path / "warp" / "1.0").mkdir(parents=True)
     (tmp_path / "warp" / "1.0" / "kernel.o").write_bytes(b"code")
-    monkeypatch.setattr(cache, "why_unusable", lambda folder: "Read-only file system")
+    monkeypatch.setattr(cache, "unusable_reason", lambda folder: "Read-only file system")
     prepare_caches()
     assert warp_folder() != tmp_path / "warp"
     assert (warp_folder() / "1.0" / "kernel.o").read_bytes() == b"code"
@@ -93,7 +100,7 @@ def test_kernels_of_an_unusable_cache_are_read(fresh, tmp_path, monkeypatch):
 def test_a_usable_cache_is_left_alone(fresh, tmp_path, monkeypatch, caplog):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     prepare_caches()
-    keep_file(cache_folder() / "layouts" / "a", lambda file: file.write(b"a"))
+    write_cache_file(cache_folder() / "layouts" / "a", lambda file: file.write(b"a"))
     assert warp_folder() == tmp_path / "warp"
     assert [path.name for path in tmp_path.rglob("*") if path.is_file()] == ["a"]
     assert caplog.records == []
@@ -104,8 +111,8 @@ def test_files_that_do_not_fit_leave_nothing_and_are_reported_once(fresh, tmp_pa
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     with caplog.at_level(logging.WARNING):
-        keep_file(tmp_path / "a", fill)
-        keep_file(tmp_path / "b", fill)
+        write_cache_file(tmp_path / "a", fill)
+        write_cache_file(tmp_path / "b", fill)
     assert list(tmp_path.iterdir()) == []
     assert [record.message.count("No space left on device") for record in caplog.records] == [1]
 
@@ -136,6 +143,6 @@ def test_room_is_tried(tmp_path, monkeypatch):
     def refuse(file, start, length):
         raise OSError(errno.EDQUOT, os.strerror(errno.EDQUOT))
 
-    assert why_unusable(tmp_path) == ""
+    assert unusable_reason(tmp_path) == ""
     monkeypatch.setattr(os, "posix_fallocate", refuse)
-    assert why_unusable(Path(tmp_path)) == os.strerror(errno.EDQUOT)
+    assert unusable_reason(Path(tmp_path)) == os.strerror(errno.EDQUOT)

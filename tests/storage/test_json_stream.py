@@ -42,7 +42,7 @@ def test_lists_are_what_json_writes(tmp_path: Path, one: list[Any], other: list[
             if i < len(values):
                 file.append(name, values[i])
     assert (file.count("one"), file.count("other")) == (len(one), len(other))
-    file.keep()
+    file.commit()
     whole = {"first": 1, "one": one, "other": other, **after}
     assert (tmp_path / "a.json").read_text() == json.dumps(whole)
     assert [path.name for path in tmp_path.iterdir()] == ["a.json"]
@@ -58,7 +58,7 @@ def test_entries_are_what_json_writes(tmp_path: Path, entries: dict[str, Any], i
     file = EntriesFile(tmp_path / "a.json")
     for key, value in entries.items():
         file.append(key, value)
-    file.end().name()
+    file.end().rename()
     assert (tmp_path / "a.json").read_text() == json.dumps(entries)
     (tmp_path / "b.json").write_text(json.dumps(entries, indent=indent))
     assert list(read_entries(tmp_path / "b.json")) == list(entries.items())
@@ -139,7 +139,7 @@ def test_memory_does_not_grow_with_the_frames(tmp_path: Path, monkeypatch: pytes
             formats = ["yolo", "coco", "amodal", "panoptic", "poses", "voc", "bop", "colmap"]
             with CollectionWriter(folder, catalogue, formats) as collection:
                 manifest.sort(hear)
-                collection.keep()
+                collection.commit()
         finally:  # what is counted from now on would be other tests'
             tracemalloc.stop()
         assert [found["index"] for found in Manifest(folder / "manifest.jsonl")] == list(range(count))

@@ -22,7 +22,7 @@ from mitsplat.scene.spec.object_spec import MAIN
 from mitsplat.scene.spec.scene_spec import SCHEMA_VERSION, SceneSpec
 from mitsplat.scene.spec.shape_spec import Region
 from mitsplat.scene.walls import backdrop_shapes, enclosure_walls
-from mitsplat.storage.file_kinds import refuse_others
+from mitsplat.storage.file_kinds import refuse_other_kinds
 from mitsplat.storage.yaml_input import key_place, load_yaml
 
 _PYTHON_SCENE_NAME = "<python>.yaml"
@@ -43,7 +43,7 @@ def load_scene(path: str | Path, *, overrides: Mapping[str, Any] | None = None, 
         InputError: If the scene file or a file that it names is missing or invalid.
     """
     path = Path(path)
-    refuse_others(path, "a scene file (.yaml)", ".yaml", ".yml")
+    refuse_other_kinds(path, "a scene file (.yaml)", ".yaml", ".yml")
     return _build_scene(load_yaml(path, SceneSpec, overrides=overrides), path, allow_outside=allow_outside)
 
 

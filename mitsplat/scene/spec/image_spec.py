@@ -18,7 +18,7 @@ from mitsplat.storage.field_types import (
     StopsRange,
     StrictModel,
     Unit,
-    ordered,
+    check_order,
 )
 
 
@@ -44,7 +44,7 @@ class Randomise(StrictModel):
         description="Angle of the hue axis of ``chroma_stretch`` from red towards green [degrees]. At 0, blue moves "
         "towards cyan and orange towards red.",
     )
-    white_balance: Annotated[tuple[Kelvin, Kelvin], AfterValidator(ordered)] = Field(
+    white_balance: Annotated[tuple[Kelvin, Kelvin], AfterValidator(check_order)] = Field(
         (6504.0, 6504.0), description="Correlated colour temperature that appears white [K]."
     )
     iso: PositiveRange | None = Field(
@@ -67,7 +67,7 @@ class Randomise(StrictModel):
         description="Strength of an unsharp mask: factor on the difference between the picture and its Gaussian blur "
         "of 1 px. It also amplifies noise.",
     )
-    jpeg: Annotated[tuple[JpegQuality, JpegQuality], AfterValidator(ordered)] | None = Field(
+    jpeg: Annotated[tuple[JpegQuality, JpegQuality], AfterValidator(check_order)] | None = Field(
         None, description="JPEG quality of a compression before the image is written. No compression if absent."
     )
     friction: PositiveRange = Field(

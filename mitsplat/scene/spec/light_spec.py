@@ -19,8 +19,8 @@ from mitsplat.storage.field_types import (
     StrictModel,
     Vec3,
     Vec3Range,
+    check_order,
     check_weights,
-    ordered,
 )
 from mitsplat.storage.yaml_input import FieldError
 
@@ -58,7 +58,7 @@ class LightDraw(StrictModel):
     )
     target: Vec3Range | None = Field(None, description="Opposite corners of a box that contains the target [m].")
     size: SizeRange | None = Field(None, description="Width and height [m].")
-    cone: Annotated[tuple[ConeAngle, ConeAngle], AfterValidator(ordered)] | None = Field(
+    cone: Annotated[tuple[ConeAngle, ConeAngle], AfterValidator(check_order)] | None = Field(
         None, description="Half angle of the cone [degrees]."
     )
     radiance: PositiveRange | None = Field(

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field
 
-from mitsplat.storage.field_types import PositiveRange, Range, StrictModel, UnitRange, ordered
+from mitsplat.storage.field_types import PositiveRange, Range, StrictModel, UnitRange, check_order
 
 Share = Annotated[float, Field(gt=0, le=1)]
 Turn = Annotated[Range, Field(description="Range of rotations of the pattern on the surface [degrees].")]
@@ -115,7 +115,7 @@ class Background(StrictModel):
     per: Literal["frame", "layout"] = Field(
         "frame", description="``frame`` draws an image for every frame, ``layout`` once per layout."
     )
-    crop: Annotated[tuple[Share, Share], AfterValidator(ordered)] = Field(
+    crop: Annotated[tuple[Share, Share], AfterValidator(check_order)] = Field(
         (0.5, 1.0),
         description="Range of sizes of the crop, relative to the largest crop with the aspect ratio of the output.",
     )

@@ -16,24 +16,24 @@ from mitsplat.storage.field_types import (
     Unit,
     UnitRange,
     Vec3,
+    check_order,
     check_weights,
-    ordered,
 )
 from mitsplat.storage.yaml_input import FieldError
 
 _Hue = Annotated[float, Field(ge=-180, le=180)]
-HueRange = Annotated[tuple[_Hue, _Hue], AfterValidator(ordered)]
+HueRange = Annotated[tuple[_Hue, _Hue], AfterValidator(check_order)]
 _Saturation = Annotated[float, Field(ge=0, le=2)]
-SaturationRange = Annotated[tuple[_Saturation, _Saturation], AfterValidator(ordered)]
+SaturationRange = Annotated[tuple[_Saturation, _Saturation], AfterValidator(check_order)]
 _Value = Annotated[float, Field(ge=0.1, le=4)]
-ValueRange = Annotated[tuple[_Value, _Value], AfterValidator(ordered)]
+ValueRange = Annotated[tuple[_Value, _Value], AfterValidator(check_order)]
 _Gain = Annotated[float, Field(ge=0.5, le=2)]
-GainRange = Annotated[tuple[_Gain, _Gain], AfterValidator(ordered)]
+GainRange = Annotated[tuple[_Gain, _Gain], AfterValidator(check_order)]
 _Roughness = Annotated[float, Field(ge=0.02, le=1)]
-RoughnessRange = Annotated[tuple[_Roughness, _Roughness], AfterValidator(ordered)]
+RoughnessRange = Annotated[tuple[_Roughness, _Roughness], AfterValidator(check_order)]
 
 _Yaw = Annotated[float, Field(ge=-360, le=360)]
-YawRange = Annotated[tuple[_Yaw, _Yaw], AfterValidator(ordered)]
+YawRange = Annotated[tuple[_Yaw, _Yaw], AfterValidator(check_order)]
 
 Arrangement = Literal["drop", "pile", "scatter", "stack", "upright", "tower", "packed"]
 

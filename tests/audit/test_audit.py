@@ -253,7 +253,7 @@ FAULTS: dict[Callable[[Path, list[Record]], None], tuple[str, str]] = {
 
 
 @pytest.mark.parametrize("plant", FAULTS, ids=lambda plant: plant.__name__)
-def test_a_planted_fault_is_found(
+def test_each_planted_fault_is_a_violation(
     dataset: Path, plant: Callable[[Path, list[Record]], None], capsys: pytest.CaptureFixture[str]
 ) -> None:
     records = records_of(dataset)
@@ -266,7 +266,7 @@ def test_a_planted_fault_is_found(
 
 
 @pytest.mark.parametrize("file", ["images/train/000000.png", "flow/train/000000.flo", "layers/train/000000.exr"])
-def test_a_file_that_changed_or_is_missing_is_found(dataset: Path, file: str) -> None:
+def test_a_changed_or_missing_file_is_a_violation(dataset: Path, file: str) -> None:
     path = dataset / file
     path.write_bytes(path.read_bytes()[:-1] + b"x")
     assert (file, "has another SHA-256 than the manifest states") in audit_dataset(dataset).violations
@@ -285,7 +285,7 @@ def test_a_file_that_changed_or_is_missing_is_found(dataset: Path, file: str) ->
         ("bop/train/000000/scene_gt_info.json", lambda c: c["0"][0].update(visib_fract=0.1), "visib_fract"),
     ],
 )
-def test_annotations_that_disagree_with_the_manifest_are_found(
+def test_annotations_that_disagree_with_the_manifest_are_violations(
     dataset: Path, file: str, change: Callable[[Any], None], place: str
 ) -> None:
     content = json.loads((dataset / file).read_text())
@@ -295,7 +295,7 @@ def test_annotations_that_disagree_with_the_manifest_are_found(
     assert found[0] == file and place in found[1]
 
 
-def test_permuted_class_names_are_found(dataset: Path) -> None:
+def test_permuted_class_names_are_violations(dataset: Path) -> None:
     path = dataset / "data.yaml"
     path.write_text(path.read_text().replace("bolt", "x").replace("nut", "bolt").replace("x", "nut"))
     assert [file for file, _ in audit_dataset(dataset).violations] == ["data.yaml"]
@@ -319,7 +319,7 @@ STRAY = (
 """Files that no frame owns, in the folder of every format; the dataset has no COLMAP cameras."""
 
 
-def test_files_of_no_frame_are_found(dataset: Path) -> None:
+def test_files_of_no_frame_are_violations(dataset: Path) -> None:
     for file in STRAY:
         (dataset / file).parent.mkdir(parents=True, exist_ok=True)
         (dataset / file).write_text("")
@@ -339,7 +339,7 @@ WHOLE = (
 )
 
 
-def test_missing_files_that_describe_frames_are_found(dataset: Path) -> None:
+def test_missing_files_that_describe_frames_are_violations(dataset: Path) -> None:
     for file in WHOLE:
         (dataset / file).unlink()
     found = dict(audit_dataset(dataset).violations)
@@ -350,7 +350,7 @@ def test_missing_files_that_describe_frames_are_found(dataset: Path) -> None:
 @pytest.mark.parametrize(
     "damage", [b"", b"{", b"[1, 2]", b'{"images": 3, "annotations": [3], "frames": [{}]}', b"\xff"]
 )
-def test_damaged_annotations_are_found(dataset: Path, damage: bytes) -> None:
+def test_damaged_annotations_are_one_violation_per_file(dataset: Path, damage: bytes) -> None:
     """Whatever is in them: one sentence for each file and no traceback."""
     files = [file for file in WHOLE if file.endswith((".json", ".yaml", ".txt"))]
     for file in files:
@@ -359,7 +359,7 @@ def test_damaged_annotations_are_found(dataset: Path, damage: bytes) -> None:
     assert set(files) - found <= {"voc/ImageSets/Main/val.txt"}
 
 
-def test_entries_of_no_frame_are_found(dataset: Path) -> None:
+def test_entries_of_no_frame_are_violations(dataset: Path) -> None:
     """At the end, in the middle, and twice."""
     for name in ("annotations/instances_val.json", "annotations/panoptic_train.json", "annotations/poses_train.json"):
         content = json.loads((dataset / name).read_text())
@@ -379,7 +379,7 @@ def test_entries_of_no_frame_are_found(dataset: Path) -> None:
     assert ("annotations/instances_val.json", "id 4 is not above those before it") not in found
 
 
-def test_a_damaged_manifest_is_found(dataset: Path) -> None:
+def test_a_damaged_manifest_is_a_violation(dataset: Path) -> None:
     with (dataset / "manifest.jsonl").open("a") as file:
         file.write('{"index": 7}\n')
     (found,) = [text for file, text in audit_dataset(dataset).violations]
@@ -406,7 +406,7 @@ def test_a_damaged_manifest_is_found(dataset: Path) -> None:
         (("split",), "exam", "split: Input should be 'train', 'val' or 'test'"),
     ],
 )
-def test_a_record_that_nothing_can_rely_on_is_one_violation(
+def test_an_invalid_manifest_record_is_one_violation(
     dataset: Path, keys: tuple[Any, ...], value: Any, text: str
 ) -> None:
     records = records_of(dataset)
@@ -428,7 +428,7 @@ def test_a_folder_without_a_dataset_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("instances", "violations"), [([], 0), ([{"id": 1}], 1)])
-def test_only_equal_pictures_with_objects_are_a_violation(instances: list[Any], violations: int) -> None:
+def test_identical_images_are_a_violation_only_if_they_show_objects(instances: list[Any], violations: int) -> None:
     """Empty layouts under a fixed camera show the same: the surroundings."""
     records = [
         {

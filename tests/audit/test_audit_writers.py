@@ -435,7 +435,9 @@ def rows_of(code: str, size: tuple[int, int]) -> str:
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-def test_a_wrong_writer_is_found(scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fault: str) -> None:
+def test_the_fault_of_each_wrong_writer_is_a_violation(
+    scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fault: str
+) -> None:
     formats, patch, file, text = FAULTS[fault]
     with monkeypatch.context() as patched:
         patch(patched)
@@ -444,7 +446,7 @@ def test_a_wrong_writer_is_found(scene: Scene, tmp_path: Path, monkeypatch: pyte
     assert any(where.startswith(file) and text in said for where, said in found), found
 
 
-def test_right_writers_pass(scene: Scene, tmp_path: Path) -> None:
+def test_all_formats_of_merged_shards_have_no_violations(scene: Scene, tmp_path: Path) -> None:
     """All formats together, of shards that were merged."""
     formats = list(FORMATS)
     shards = [write(scene, tmp_path / str(number), formats, shard=Shard(number, 2)) for number in (1, 2)]
@@ -452,7 +454,7 @@ def test_right_writers_pass(scene: Scene, tmp_path: Path) -> None:
     assert audit_dataset(tmp_path / "out").violations == ()
 
 
-def test_poses_that_are_not_those_of_the_layout_are_found(scene: Scene, tmp_path: Path) -> None:
+def test_poses_that_differ_from_the_layout_are_violations(scene: Scene, tmp_path: Path) -> None:
     out = write(scene, tmp_path / "out", ["yolo"])
     (out / "layouts/0000.json").write_text((out / "layouts/0001.json").read_text())
     said = [text for _, text in audit_dataset(out).violations]
@@ -464,7 +466,7 @@ WRITERS = ("formats", "frames", "labels", "masks", "render")
 """Where labels are made and written."""
 
 
-def test_the_audit_shares_nothing_with_the_writers() -> None:
+def test_the_audit_imports_no_writer() -> None:
     package = Path(mitsplat.__file__).parent
     readers = list((package / "audit").glob("*.py"))
     assert len(readers) > 8
@@ -483,7 +485,7 @@ def test_the_audit_shares_nothing_with_the_writers() -> None:
     ],
     ids=["fisheye", "distorted"],
 )
-def test_any_lens_is_understood(tmp_path: Path, lens: dict[str, Any]) -> None:
+def test_every_lens_passes_and_swapped_coefficients_are_violations(tmp_path: Path, lens: dict[str, Any]) -> None:
     """Right writers pass, and coefficients in the wrong order do not, whatever reads them."""
     scene = small_scene(tmp_path, large_boxes(), BOTH, layouts=2, views=2)
     seen = scene.spec.camera.model_copy(update={"intrinsics": Intrinsics(**lens)})
@@ -497,7 +499,7 @@ def test_any_lens_is_understood(tmp_path: Path, lens: dict[str, Any]) -> None:
     assert {file for file, _ in audit_dataset(out).violations} == {"colmap/images.txt"}
 
 
-def test_a_lens_focused_nearer_than_cameras_see_by_default(tmp_path: Path) -> None:
+def test_a_lens_focused_before_the_default_near_plane_passes(tmp_path: Path) -> None:
     """Formats and audit make the camera of a record anew, ``near`` included, without which it could not be focused."""
     scene = small_scene(tmp_path, large_boxes(), BOTH, layouts=1, views=2)
     lens = Intrinsics(fov_x=60.0, aperture=0.002, focus=0.008, near=0.004)

@@ -62,7 +62,7 @@ def outward_colours(splats: Splats) -> np.ndarray:
     return evaluate_sh(splats.sh, -normals)
 
 
-def test_white_sphere_in_a_furnace_has_radiance_one_from_everywhere() -> None:
+def test_white_sphere_in_a_furnace_emits_radiance_one_in_all_directions() -> None:
     """A convex diffuse body of albedo 1 under radiance 1 from everywhere emits E / pi = 1 into every direction."""
     splats = bake_asset(white(trimesh.creation.icosphere(3, 0.02)), name="ball", settings=quick()).asset.splats
     normals = Rotation.from_quat(splats.quats).as_matrix()[:, :, 2]
@@ -109,7 +109,7 @@ def test_gaussians_lie_just_below_the_surface_with_their_short_axis_along_the_no
     assert (splats.scales[:, 2] < 0.3 * splats.scales[:, :2].min(axis=1)).all()
 
 
-def test_surfels_cover_a_box_and_hardly_reach_past_its_edges() -> None:
+def test_surfels_cover_a_box_and_end_at_its_edges() -> None:
     half = np.array([0.02, 0.015, 0.01])
     box = trimesh.creation.box(extents=2.0 * half)
     surfels = place_surfels(box, 1.0, 3000, np.random.default_rng(0))
@@ -135,7 +135,7 @@ def transmittance(surfels: object, points: np.ndarray, normals: np.ndarray) -> n
     return np.prod(1.0 - response, axis=1)
 
 
-def test_poisson_subset_is_apart_and_maximal() -> None:
+def test_poisson_subset_keeps_its_distance_and_is_maximal() -> None:
     rng = np.random.default_rng(2)
     points = np.column_stack([rng.random((4000, 2)), np.zeros(4000)])
     normals, radius = np.tile([0.0, 0.0, 1.0], (4000, 1)), np.full(4000, 0.05)
@@ -154,14 +154,14 @@ def test_thin_sheet_keeps_surfels_on_both_sides() -> None:
     assert (up < -0.9).sum() > 350
 
 
-def test_what_lies_inside_another_solid_gets_no_gaussians() -> None:
+def test_a_solid_inside_another_one_gets_no_gaussians() -> None:
     hidden, outer = trimesh.creation.icosphere(2, 0.005), trimesh.creation.box(extents=(0.03, 0.03, 0.03))
     nested = trimesh.Scene({"hidden": white(hidden), "outer": white(outer)})
     splats = bake_asset(nested, name="nested", settings=quick()).asset.splats
     assert np.abs(splats.means).max(axis=1).min() > 0.0145
 
 
-def test_same_seed_same_asset_other_seed_another() -> None:
+def test_the_seed_determines_the_asset() -> None:
     box, _ = coloured_box()
     first, again, other = (
         bake_asset(box, name="box", settings=quick(gaussians=300, seed=seed)).asset.splats for seed in (3, 3, 4)
@@ -171,7 +171,7 @@ def test_same_seed_same_asset_other_seed_another() -> None:
     assert len(first) != len(other) or not np.array_equal(first.means, other.means)
 
 
-def test_baked_sphere_looks_like_its_mesh_from_unseen_views() -> None:
+def test_baked_sphere_has_30_db_from_views_that_were_not_fitted() -> None:
     ball = trimesh.creation.icosphere(4, 0.02)
     ball.visual.face_colors = [190, 150, 90, 255]
     result = bake_asset(ball, name="ball", settings=quick(gaussians=3000, samples=16, verify_views=2))
@@ -179,7 +179,7 @@ def test_baked_sphere_looks_like_its_mesh_from_unseen_views() -> None:
     assert result.psnr_object > 24.0
 
 
-def test_texture_lands_where_its_coordinates_say(tmp_path: Path) -> None:
+def test_texture_is_placed_by_its_coordinates(tmp_path: Path) -> None:
     """Lower half of the image (small v) red, upper half blue; v grows with y on the sheet."""
     from PIL import Image
     from trimesh.visual import TextureVisuals
@@ -208,7 +208,7 @@ def test_units_and_up_axis_apply_to_splats_and_mesh_alike() -> None:
     np.testing.assert_allclose(np.ptp(asset.splats.bounds, axis=0), (0.04, 0.01, 0.02), atol=1e-3)
 
 
-def test_kind_and_light_decide_pieces_and_capture_light(tmp_path: Path) -> None:
+def test_kind_and_light_determine_pieces_and_capture_light(tmp_path: Path) -> None:
     box, _ = coloured_box()
     thing = bake_asset(box, name="thing", settings=quick(gaussians=200)).asset
     assert (thing.capture_light, len(thing.pieces)) == ("uniform", 1)
@@ -232,7 +232,7 @@ def test_normals_are_smooth_on_a_sphere_and_sharp_on_a_box() -> None:
     )
 
 
-def test_slivers_have_normals_too() -> None:
+def test_degenerate_triangles_get_normals() -> None:
     """CAD files are full of them; a ray that meets one without a normal gives no number, and no splats."""
     corners = np.array([(0, 0, 0), (0.01, 0, 0), (0.005, 1e-13, 0), (0.005, 0, 0.01)])
     mesh = trimesh.Trimesh(corners, [(0, 1, 2), (0, 2, 3)], process=False)
@@ -242,7 +242,7 @@ def test_slivers_have_normals_too() -> None:
     np.testing.assert_allclose(np.linalg.norm(corner_normals(needle), axis=2), 1)
 
 
-def test_studio_has_mean_radiance_one() -> None:
+def test_studio_light_has_mean_radiance_one() -> None:
     ball = white(trimesh.creation.icosphere(2, 0.02))
     scene = mitsuba_scene(read_parts(ball), bake_lights("studio"))
     outward = np.random.default_rng(0).normal(size=(2000, 3))
@@ -283,13 +283,13 @@ def not_finite() -> trimesh.Trimesh:
         ({"kind": "part"}, "kind must be object or environment .got 'part'."),
     ],
 )
-def test_bad_input_is_refused_in_one_sentence(arguments: dict[str, object], sentence: str) -> None:
+def test_invalid_input_is_refused_in_one_sentence(arguments: dict[str, object], sentence: str) -> None:
     with pytest.raises(InputError, match=sentence):
         bake_asset(**{"mesh": trimesh.creation.box(), "name": "x", "settings": quick(), **arguments})
 
 
 @pytest.mark.parametrize(("field", "value"), [("gaussians", 0), ("gaussians", 10**9), ("sh_degree", 4), ("samples", 0)])
-def test_bad_settings_are_refused(field: str, value: int) -> None:
+def test_settings_out_of_range_are_refused(field: str, value: int) -> None:
     with pytest.raises(InputError, match=field):
         BakeSettings(**{field: value})
 
@@ -300,7 +300,7 @@ def test_damaged_mesh_file_is_refused(tmp_path: Path) -> None:
         bake_asset(tmp_path / "broken.glb", name="x", settings=quick())
 
 
-def test_large_object_bakes_where_the_user_insists_and_tells_its_stages() -> None:
+def test_large_object_bakes_with_any_size_and_reports_its_stages() -> None:
     told: list[tuple[int, int, str]] = []
     result = bake_asset(
         white(trimesh.creation.box((6.0, 4.0, 3.0))),
@@ -315,7 +315,7 @@ def test_large_object_bakes_where_the_user_insists_and_tells_its_stages() -> Non
     assert len({stage for _, _, stage in told}) == 6
 
 
-def test_picture_is_that_of_single_rays_through_the_same_pixels() -> None:
+def test_path_traced_image_equals_single_rays_through_its_pixels() -> None:
     """The readable twin: rays of the camera's own model, one by one. Light of radiance 1 on white leaves no noise."""
     ball = white(trimesh.creation.icosphere(3, 0.02))
     scene = mitsuba_scene(read_parts(ball), bake_lights("uniform"))
@@ -332,7 +332,7 @@ def test_picture_is_that_of_single_rays_through_the_same_pixels() -> None:
     np.testing.assert_allclose(picture.reshape(-1, 3)[hit], radiance[hit], atol=1e-3)
 
 
-def test_noise_differs_from_pixel_to_pixel() -> None:
+def test_noise_of_different_pixels_differs() -> None:
     """Were all paths to share their random numbers, the mean over the picture would be as noisy as one pixel."""
     cup = white(trimesh.creation.annulus(0.01, 0.02, 0.03))
     scene = mitsuba_scene(read_parts(cup), bake_lights("studio"))
@@ -342,7 +342,7 @@ def test_noise_differs_from_pixel_to_pixel() -> None:
     assert pictures.mean(axis=(1, 2, 3)).std() < 0.1 * inside
 
 
-def test_encoding_is_the_srgb_curve() -> None:
+def test_encoding_equals_the_srgb_curve() -> None:
     np.testing.assert_allclose(encode_srgb([0.0, 0.0031308, 0.21404, 1.0]), [0.0, 0.04045, 0.5, 1.0], atol=1e-4)
 
 
@@ -356,7 +356,7 @@ def test_area_light_faces_its_target_even_from_straight_above() -> None:
         np.testing.assert_allclose(np.ravel(sample.n), facing, atol=1e-5)
 
 
-def test_bake_is_public() -> None:
+def test_bake_asset_is_exported_by_the_package() -> None:
     assert mitsplat.bake_asset is bake_asset
 
 
@@ -375,7 +375,7 @@ def sheet(extent: float, height: float, texture: np.ndarray, *, steps: int = 1) 
     return mesh
 
 
-def test_proxy_keeps_a_textured_table_and_leaves_out_a_label() -> None:
+def test_proxy_keeps_a_textured_table_and_omits_a_label() -> None:
     texture = np.full((8, 8, 3), 200, np.uint8)
     table = sheet(1.0, 0.0, texture, steps=40)
     box = white(trimesh.creation.box(bounds=[[-0.05, -0.05, 0.0], [0.05, 0.05, 0.1]]))

@@ -79,14 +79,14 @@ def bakes(tmp_path_factory: pytest.TempPathFactory) -> dict[str, BakeResult]:
 
 
 @pytest.mark.parametrize("kind", ["obj", "ply", "stl"])
-def test_one_object_in_any_format_bakes_alike(bakes: dict[str, BakeResult], kind: str) -> None:
+def test_the_same_object_in_each_mesh_format_bakes_to_the_same_colours(bakes: dict[str, BakeResult], kind: str) -> None:
     """Of a face that sees nothing but light of radiance 1, the radiance is the albedo: the mean over it agrees."""
     found, wanted = (bakes[name].views[0] for name in (kind, "glb"))
     assert psnr_of(((found.splats - wanted.splats) ** 2).mean()) > 40
     assert psnr_of(((found.mesh - wanted.mesh) ** 2).mean()) > 40
 
 
-def test_splats_are_as_bright_as_the_texture_of_the_file(bakes: dict[str, BakeResult], tmp_path: Path) -> None:
+def test_splats_have_the_brightness_of_the_texture(bakes: dict[str, BakeResult], tmp_path: Path) -> None:
     assert bakes["obj"].brightness == pytest.approx(1.0, abs=0.05)
     assert bakes["glb"].brightness == pytest.approx(1.0, abs=0.05)
     assert bakes["ply"].brightness is None
@@ -95,7 +95,7 @@ def test_splats_are_as_bright_as_the_texture_of_the_file(bakes: dict[str, BakeRe
     assert "as bright as the textures of the file" in dark.warnings[0]
 
 
-def test_gloss_on_a_dark_texture_is_no_wrong_brightness(tmp_path: Path) -> None:
+def test_gloss_on_a_dark_texture_gives_no_brightness_warning(tmp_path: Path) -> None:
     """Of what a dark scan sends out under white light, much is its gloss; texels that no face shows do not count."""
     atlas = Image.new("RGB", (8, 8), "white")
     atlas.paste((58, 58, 58), (0, 0, 4, 8))
@@ -126,7 +126,9 @@ def test_report_shows_mesh_beside_splats(bakes: dict[str, BakeResult], tmp_path:
         ("Kd 1 1 1\nPr 0.3\nPm 1", np.ones(3), (True, 1.0, 0.3)),
     ],
 )
-def test_mtl_means_what_it_says(tmp_path: Path, lines: str, colour: np.ndarray, gloss: tuple[object, ...]) -> None:
+def test_each_supported_mtl_statement_sets_its_property(
+    tmp_path: Path, lines: str, colour: np.ndarray, gloss: tuple[object, ...]
+) -> None:
     part = part_of(tmp_path, lines)
     np.testing.assert_allclose(colour_of(part), colour, atol=0.005)
     assert (part.shiny, part.metallic, pytest.approx(part.roughness)) == gloss
@@ -142,7 +144,7 @@ def test_mtl_means_what_it_says(tmp_path: Path, lines: str, colour: np.ndarray, 
         ("Kd 1 1 1\nmap_Pr colour.png\nmap_Bump colour.png", "map_bump, map_pr are left out"),
     ],
 )
-def test_what_an_mtl_says_in_vain_is_told(tmp_path: Path, lines: str, sentence: str) -> None:
+def test_each_unsupported_mtl_statement_gives_a_warning(tmp_path: Path, lines: str, sentence: str) -> None:
     (warning,) = part_of(tmp_path, lines).warnings
     assert sentence in warning
 
@@ -162,14 +164,14 @@ def test_factors_and_vertex_colours_of_gltf_are_linear(tmp_path: Path) -> None:
         np.testing.assert_allclose(colour_of(part), colour, atol=1e-6)
 
 
-def test_texture_without_factor_counts_as_it_is_in_memory_too() -> None:
+def test_texture_without_a_factor_is_not_scaled() -> None:
     image = Image.new("RGB", (4, 4), COLOUR)
     np.testing.assert_array_equal(read_material(SimpleMaterial(image=image)).factor, 1.0)
     given = read_material(SimpleMaterial(image=image, diffuse=[51, 51, 51, 255]))
     np.testing.assert_allclose(given.factor, decode_srgb(0.2), rtol=1e-6)
 
 
-def test_finish_replaces_what_the_file_says(tmp_path: Path) -> None:
+def test_a_given_finish_replaces_the_material_of_the_file(tmp_path: Path) -> None:
     part = part_of(tmp_path, "map_Kd colour.png", colour=(0.2, 0.4, 0.6))
     np.testing.assert_allclose(colour_of(part), decode_srgb(np.array([0.2, 0.4, 0.6])))
     assert (part.texture, part.shiny) == (None, False)
@@ -193,7 +195,7 @@ def test_finish_replaces_what_the_file_says(tmp_path: Path) -> None:
         ({"specular": 0.5}, "specular must be from 0 to 0.08 .got 0.5. .for a metal, give metallic 1."),
     ],
 )
-def test_impossible_finishes_are_refused(finish: dict[str, object], sentence: str) -> None:
+def test_finishes_out_of_range_are_refused(finish: dict[str, object], sentence: str) -> None:
     with pytest.raises(InputError, match=sentence):
         SurfaceFinish(**finish)  # type: ignore[arg-type]
 
@@ -210,14 +212,14 @@ def test_missing_textures_are_refused_unless_a_colour_is_given(tmp_path: Path) -
         read_parts(path)
 
 
-def test_grey_of_sixteen_bits_is_as_dark_as_it_is(tmp_path: Path) -> None:
+def test_a_16_bit_grey_texture_keeps_its_brightness(tmp_path: Path) -> None:
     path = write_obj(tmp_path, "map_Kd colour.png")
     Image.fromarray(np.full((8, 8), 0x4080, dtype=np.uint16)).save(tmp_path / "colour.png")
     (part,) = read_parts(path)
     np.testing.assert_allclose(colour_of(part), decode_srgb(np.full(3, 0x40 / 255)), atol=1e-3)
 
 
-def test_colours_that_are_not_there_are_missed(tmp_path: Path) -> None:
+def test_textures_and_materials_that_cannot_be_read_are_refused(tmp_path: Path) -> None:
     path = write_obj(tmp_path, "map_Kd colour.png")
     cut = (tmp_path / "colour.png").read_bytes()[:-30]
 
@@ -255,7 +257,7 @@ def test_colours_that_are_not_there_are_missed(tmp_path: Path) -> None:
     refused(tmp_path / "model.gltf", "a material's texture 7 is missing")
 
 
-def test_meshes_of_impossible_faces_are_refused(tmp_path: Path) -> None:
+def test_meshes_with_invalid_faces_are_refused(tmp_path: Path) -> None:
     (tmp_path / "far.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n")
     (tmp_path / "empty.glb").write_bytes(b"")
     for name in ("far.obj", "empty.glb"):
@@ -263,7 +265,7 @@ def test_meshes_of_impossible_faces_are_refused(tmp_path: Path) -> None:
             read_parts(tmp_path / name)
 
 
-def test_what_reads_a_file_is_named_where_it_is_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_reader_of_a_format_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "box.dae").write_text("<COLLADA/>")
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     with pytest.raises(MissingResourceError, match=r"box\.dae: reading it needs `pip install pycollada`"):
@@ -271,6 +273,6 @@ def test_what_reads_a_file_is_named_where_it_is_missing(tmp_path: Path, monkeypa
 
 
 @pytest.mark.parametrize("gaussians", [1, 2])
-def test_few_gaussians_are_enough(gaussians: int) -> None:
+def test_one_or_two_gaussians_can_be_asked_for(gaussians: int) -> None:
     result = bake_asset(box(), name="box", settings=replace(QUICK, gaussians=gaussians))
     assert 0 < len(result.asset.splats) <= 12

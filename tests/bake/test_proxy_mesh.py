@@ -10,7 +10,7 @@ from mitsplat.bake.proxy_mesh import make_proxy
 from mitsplat.geometry.mesh_distance import DistanceSurface
 
 
-def test_a_scan_of_many_faces_stays_closed() -> None:
+def test_the_proxy_of_a_scan_with_many_faces_is_watertight() -> None:
     """Quadric decimation tears this one, and physics would rebuild it from voxels, for minutes."""
     ball = trimesh.creation.icosphere(subdivisions=5, radius=0.05)
     factors = 1 + 0.005 * np.random.default_rng(0).normal(size=(len(ball.vertices), 1))

@@ -49,7 +49,7 @@ def capture(tmp_path: Path) -> Capture:
     )
 
 
-def test_saved_captures_come_back_exactly(capture: Capture, tmp_path: Path) -> None:
+def test_a_saved_capture_is_loaded_unchanged(capture: Capture, tmp_path: Path) -> None:
     capture.save(tmp_path / "a")
     loaded = Capture.load(tmp_path / "a")
     assert loaded.photos[0].file == tmp_path / "a/images/view 0.png"
@@ -71,7 +71,7 @@ def test_saved_captures_come_back_exactly(capture: Capture, tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("place", range(1, 16))
-def test_a_save_over_an_earlier_capture_may_be_interrupted(
+def test_an_interrupted_save_leaves_the_earlier_or_the_new_capture(
     capture: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, place: int
 ) -> None:
     """Pictures of the one are never read with the cameras of the other: 10 photos, 5 masks, points, capture.json."""
@@ -98,7 +98,7 @@ def test_every_eighth_photo_is_held_out(capture: Capture) -> None:
     assert not set(capture.training) & set(capture.held_out)
 
 
-def test_pictures_are_averaged_down(capture: Capture) -> None:
+def test_reduced_pictures_are_averages(capture: Capture) -> None:
     photo = capture.photos[1]
     whole, mask = photo.picture()
     half, alpha = photo.picture(0.5)
@@ -112,7 +112,7 @@ def test_pictures_are_averaged_down(capture: Capture) -> None:
         photo.picture(0)
 
 
-def test_moving_a_capture_moves_no_picture(capture: Capture) -> None:
+def test_a_transformed_capture_keeps_the_pixels_of_its_points(capture: Capture) -> None:
     matrix = np.eye(4)
     matrix[:3, :3] = 2.5 * capture.photos[0].camera.world_from_camera[:3, :3]
     matrix[:3, 3] = (1, -2, 3)
@@ -151,7 +151,7 @@ def edit(folder: Path, **changes: object) -> None:
         ({"photos__3__name": "view 4.png"}, "names of photos must be unique (got view 4.png twice)"),
     ],
 )
-def test_a_wrong_capture_is_one_sentence(
+def test_a_damaged_capture_is_refused_in_one_sentence(
     capture: Capture, tmp_path: Path, changes: dict[str, object], sentence: str
 ) -> None:
     capture.save(tmp_path / "a")
@@ -184,7 +184,7 @@ def test_missing_and_damaged_files_are_named(capture: Capture, tmp_path: Path) -
 @pytest.mark.parametrize(
     "counts", [[-1, *[0] * 8, 1], [2**62, *[0] * 8, 2**62], [0.5] * 10], ids=["negative", "too many", "fractions"]
 )
-def test_counts_of_points_are_whole_numbers_of_what_is_there(
+def test_counts_of_points_that_do_not_fit_the_file_are_refused(
     capture: Capture, tmp_path: Path, counts: list[float]
 ) -> None:
     capture.save(tmp_path / "a")

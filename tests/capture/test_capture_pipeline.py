@@ -32,7 +32,7 @@ from tests import rendered
 from tests.cli.typed import run
 
 
-def test_a_rendered_capture_comes_back(
+def test_cameras_of_rendered_photos_are_recovered(
     photos: tuple[Path, dict[str, Camera]], captured: tuple[Path, Path, CaptureResult]
 ) -> None:
     _, truth = photos
@@ -60,7 +60,7 @@ def test_a_rendered_capture_comes_back(
         assert ((pixels > -5) & (pixels < np.array(rendered.SIZE) + 5)).all()
 
 
-def test_a_camera_in_a_wrong_place_contradicts_its_matches(captured: tuple[Path, Path, CaptureResult]) -> None:
+def test_a_camera_turned_in_the_model_explains_few_of_its_matches(captured: tuple[Path, Path, CaptureResult]) -> None:
     """A camera is turned about its own axis in the model, and must be the only one that explains little."""
     code = """
 import sys, json
@@ -85,7 +85,7 @@ print(json.dumps([before, agreement(model, folder / "database.db")]))
     assert min(share for name, share in after.items() if name != "photo05.png") > 0.5
 
 
-def test_a_capture_that_is_made_anew_is_none_until_it_is_whole(
+def test_an_interrupted_second_capture_leaves_no_readable_capture(
     captured: tuple[Path, Path, CaptureResult], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Copies of other photographs, or in another size, are never read with cameras of the earlier ones."""
@@ -102,7 +102,7 @@ def test_a_capture_that_is_made_anew_is_none_until_it_is_whole(
         Capture.load(out)
 
 
-def test_pycolmap_stays_in_its_own_process(captured: tuple[Path, Path, CaptureResult], tmp_path: Path) -> None:
+def test_pycolmap_is_not_imported_into_this_process(captured: tuple[Path, Path, CaptureResult], tmp_path: Path) -> None:
     assert "pycolmap" not in sys.modules
     assert zlib.decompress(zlib.compress(b"a" * 10000)) == b"a" * 10000
     Image.fromarray(np.zeros((500, 500, 3), dtype=np.uint8)).save(tmp_path / "a.png")
@@ -110,7 +110,7 @@ def test_pycolmap_stays_in_its_own_process(captured: tuple[Path, Path, CaptureRe
         assert sheet.width == 1280
 
 
-def test_a_finished_capture_is_not_made_again(
+def test_a_finished_capture_is_reused(
     captured: tuple[Path, Path, CaptureResult], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     given, finished, result = captured
@@ -129,7 +129,7 @@ def test_a_finished_capture_is_not_made_again(
 
 
 @pytest.mark.parametrize("count", [0, 1, 2])
-def test_too_few_photos(tmp_path: Path, capsys: pytest.CaptureFixture[str], count: int) -> None:
+def test_fewer_than_three_photos_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str], count: int) -> None:
     folder = tmp_path / "photos"
     folder.mkdir()
     for number in range(count):
@@ -140,7 +140,7 @@ def test_too_few_photos(tmp_path: Path, capsys: pytest.CaptureFixture[str], coun
     assert not (tmp_path / "out").exists()
 
 
-def test_textureless_photos(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_photos_without_texture_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "photos").mkdir()
     for number in range(3):
         Image.new("RGB", (120, 90), (90, 100, 110 + number)).save(tmp_path / f"photos/{number}.png")
@@ -150,7 +150,7 @@ def test_textureless_photos(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     assert "Traceback" not in err
 
 
-def test_a_crash_of_colmap_is_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_crash_of_colmap_is_reported_in_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "photos").mkdir()
     for number in range(3):
         Image.new("RGB", (40, 30), (90, 100, 110 + number)).save(tmp_path / f"photos/{number}.png")
@@ -192,7 +192,7 @@ def test_photos_of_two_things_end_with_status_4(
     assert len(Capture.load(tmp_path / "out").photos) == 8
 
 
-def test_cameras_that_explain_little_are_named_unless_a_board_confirms_them(
+def test_cameras_with_few_matches_are_named_unless_a_board_confirms_them(
     captured: tuple[Path, Path, CaptureResult],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -242,7 +242,7 @@ def test_a_camera_that_the_board_contradicts_is_left_out(
     assert again.doubtful == {doubted: 0.6}
 
 
-def test_undistorted_pictures_are_not_taken_for_photos(
+def test_a_run_without_undistort_starts_from_the_photos_again(
     captured: tuple[Path, Path, CaptureResult], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A run without --undistort, in the folder of one with it, starts from the photographs again."""
@@ -256,7 +256,7 @@ def test_undistorted_pictures_are_not_taken_for_photos(
         assert (photo.file.read_bytes() == (given / photo.name).read_bytes()) is not undistorted
 
 
-def test_a_capture_is_not_written_among_what_it_is_made_of(photos: tuple[Path, object], tmp_path: Path) -> None:
+def test_an_output_folder_that_holds_the_inputs_is_refused(photos: tuple[Path, object], tmp_path: Path) -> None:
     with pytest.raises(InputError, match="must not lie in the folder of the photographs"):
         capture_photos(photos[0], photos[0] / "out")
     shutil.copytree(photos[0], tmp_path / "out/images")
@@ -269,7 +269,7 @@ def test_a_capture_is_not_written_among_what_it_is_made_of(photos: tuple[Path, o
 
 
 @pytest.mark.slow
-def test_photos_as_they_come_end_in_a_capture(
+def test_mixed_and_damaged_photos_give_accurate_cameras(
     photos: tuple[Path, dict[str, Camera]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """One held upright, one sent smaller, one shaken and one cut short, among others.
@@ -309,7 +309,7 @@ def test_photos_as_they_come_end_in_a_capture(
 
 
 @pytest.mark.slow
-def test_a_capture_is_the_same_bytes_however_it_came_about(photos: tuple[Path, object], tmp_path: Path) -> None:
+def test_one_core_and_an_interruption_give_the_same_bytes(photos: tuple[Path, object], tmp_path: Path) -> None:
     """On all cores, or on one in a process that is killed while it matches and goes on later."""
     given = tmp_path / "given"
     given.mkdir()
@@ -342,7 +342,7 @@ capture_photos(given, out, CaptureSettings(board=rendered.BOARD, kind="environme
         assert (out / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
 
 
-def test_what_was_matched_is_of_use_in_another_place(
+def test_matches_are_reused_after_the_capture_folder_was_moved(
     captured: tuple[Path, Path, CaptureResult], tmp_path: Path
 ) -> None:
     """A finished capture is moved, and made anew as a place: its photos are the same, and so are their matches."""
@@ -378,7 +378,7 @@ sfm_child.main(sfm_child.Path({str(tmp_path / "job.json")!r}))
 
 
 @pytest.mark.slow
-def test_photos_of_another_thing_are_left_out(
+def test_photos_of_another_scene_are_rejected(
     photos: tuple[Path, dict[str, Camera]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The second thing stands on another table, without a board."""
@@ -409,19 +409,21 @@ def test_photos_of_another_thing_are_left_out(
         (["--masks", "a", "--mask-model", "b"], "--masks and --mask-model both define the masks: give only one"),
     ],
 )
-def test_bad_options(tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[str], sentence: str) -> None:
+def test_invalid_options_are_refused_in_one_sentence(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[str], sentence: str
+) -> None:
     assert run("capture", tmp_path, "-o", tmp_path / "out", *options) == 2
     assert sentence in capsys.readouterr().err
 
 
-def test_board_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_board_command_writes_a_pdf_only(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run("board", "-o", tmp_path / "b.pdf", "--paper", "letter", "--squares", "6x4", "--square", 0.04) == 0
     assert (tmp_path / "b.pdf").read_bytes().startswith(b"%PDF")
     assert run("board", "-o", tmp_path / "b.png") == 2
     assert "--out must end in .pdf" in capsys.readouterr().err
 
 
-def test_a_video_is_captured_by_its_frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_video_is_captured_from_its_chosen_frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Up to structure from motion, which sees photographs of one camera."""
     texture = np.kron(np.random.default_rng(0).integers(0, 255, (20, 100), dtype=np.uint8), np.ones((12, 12), np.uint8))
     writer = cv2.VideoWriter(str(tmp_path / "a.avi"), cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*"MJPG"), 30.0, (320, 240))
@@ -448,7 +450,7 @@ def test_a_video_is_captured_by_its_frames(tmp_path: Path, monkeypatch: pytest.M
         capture_photos(inside, tmp_path / "out")
 
 
-def test_how_many_frames_a_video_may_give_does_not_touch_a_capture_of_photographs(
+def test_the_number_of_video_frames_does_not_change_a_capture_of_photos(
     captured: tuple[Path, Path, CaptureResult], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     given, out, result = captured

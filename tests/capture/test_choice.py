@@ -26,14 +26,14 @@ def top_of(thing: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("thing", [0, 1, 2])
-def test_a_ray_picks_the_thing_that_it_meets(capture: Capture, thing: int) -> None:
+def test_a_ray_picks_the_object_that_it_hits(capture: Capture, thing: int) -> None:
     pick = pick_along(capture, EYE, top_of(thing) - EYE)
     chosen = chosen_object(capture, [pick]).above
     away = np.linalg.norm(chosen[:, :2] - THINGS[thing], axis=1)
     assert len(chosen) > 200 and away.max() < 0.05
 
 
-def test_the_photo_looks_about_as_the_ray_does(capture: Capture) -> None:
+def test_the_photo_of_a_pick_has_about_the_direction_of_the_ray(capture: Capture) -> None:
     ahead = top_of(0) - EYE
     photo, pixel = capture.picked(pick_along(capture, EYE, ahead))
     towards = top_of(0) - photo.camera.centre
@@ -44,7 +44,7 @@ def test_the_photo_looks_about_as_the_ray_does(capture: Capture) -> None:
     assert np.linalg.norm(shown - pixel) < 8  # px: half of a degree from the eye and what lies between points
 
 
-def test_a_ray_ends_at_what_stands_in_front(capture: Capture) -> None:
+def test_a_ray_picks_the_nearest_of_two_objects(capture: Capture) -> None:
     """Past the middle of the second ball to the first, level with both."""
     start = np.array([0.5, 0.02 + 0.02 * 0.34 / 0.16, 0.05])
     middle = np.array([*THINGS[1], 0.045])
@@ -54,12 +54,12 @@ def test_a_ray_ends_at_what_stands_in_front(capture: Capture) -> None:
 
 
 @pytest.mark.parametrize("ahead", [(0, 0, 1), (1, -1, 0.3)])
-def test_a_ray_into_the_air_picks_nothing(capture: Capture, ahead: tuple[float, float, float]) -> None:
+def test_a_ray_that_hits_no_point_is_refused(capture: Capture, ahead: tuple[float, float, float]) -> None:
     with pytest.raises(InputError, match="there is no point of the capture at this position"):
         pick_along(capture, EYE, ahead)
 
 
-def test_a_point_that_no_photo_shows_is_said(capture: Capture) -> None:
+def test_a_pick_that_no_photo_observes_is_refused(capture: Capture) -> None:
     blind = replace(capture, photos=tuple(replace(one, seen=one.seen[:0]) for one in capture.photos))
     with pytest.raises(InputError, match="no photo of the capture observes"):
         pick_along(blind, EYE, top_of(0) - EYE)

@@ -36,7 +36,7 @@ def drawn(folder: Path, gains: np.ndarray) -> Capture:
     return Capture(tuple(photos), points, np.zeros((POINTS, 3), np.uint8))
 
 
-def test_gains_take_exposures_back_in_spite_of_gloss(tmp_path: Path) -> None:
+def test_gains_equalise_exposures_despite_gloss(tmp_path: Path) -> None:
     gains = np.exp(np.random.default_rng(1).normal(0, 0.15, (COUNT, 3)))
     found = relative_gains((capture := drawn(tmp_path, gains)).photos, capture.points)
     left = found * gains
@@ -52,7 +52,7 @@ def test_gains_take_exposures_back_in_spite_of_gloss(tmp_path: Path) -> None:
     assert [photo.gain for photo in saved.photos] == [photo.gain for photo in again.photos]
 
 
-def test_fixed_exposure_is_left_alone(tmp_path: Path) -> None:
+def test_photos_of_equal_exposure_get_no_gains(tmp_path: Path) -> None:
     capture = drawn(tmp_path, np.ones((COUNT, 3)))
     assert even_exposure(capture) is capture
     capture.save(tmp_path / "capture")

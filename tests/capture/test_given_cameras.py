@@ -51,7 +51,7 @@ def write_colmap_text(folder: Path, capture: Capture) -> None:
         (folder / f"{name}.txt").write_text("\n".join(lines) + "\n")
 
 
-def test_colmap_models_are_read(captured: tuple[Path, Path, CaptureResult], tmp_path: Path) -> None:
+def test_cameras_of_a_colmap_model_are_read(captured: tuple[Path, Path, CaptureResult], tmp_path: Path) -> None:
     given, _, result = captured
     write_colmap_text(tmp_path / "model", result.capture)
     settings = CaptureSettings(kind="environment", poses=tmp_path / "model", metric=True, max_size=240)
@@ -67,7 +67,9 @@ def test_colmap_models_are_read(captured: tuple[Path, Path, CaptureResult], tmp_
         capture_photos(given, tmp_path / "broken", settings)
 
 
-def test_nerf_transforms_are_read_and_get_points(photos: tuple[Path, dict[str, Camera]], tmp_path: Path) -> None:
+def test_transforms_json_is_read_and_points_are_triangulated(
+    photos: tuple[Path, dict[str, Camera]], tmp_path: Path
+) -> None:
     folder, truth = (
         tmp_path / "four",
         {name: photos[1][name] for name in ("photo00.png", "photo01.png", "photo02.png", "photo03.png")},
@@ -101,7 +103,7 @@ def test_nerf_transforms_are_read_and_get_points(photos: tuple[Path, dict[str, C
         read_poses(tmp_path / "transforms.json", prepared, tmp_path / "work")
 
 
-def test_given_masks_are_taken(
+def test_given_masks_replace_computed_masks(
     captured: tuple[Path, Path, CaptureResult], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     given, _, result = captured
@@ -144,7 +146,7 @@ def test_lenses_of_other_models_are_refused() -> None:
         sfm.opencv_camera("OPENCV_FISHEYE", 4000, 3000, [300, 300, 2000, 1500, 0, 0, 0, 0], np.eye(4)[:3])
 
 
-def test_fisheyes_are_read(tmp_path: Path) -> None:
+def test_fisheye_cameras_are_read_from_colmap_and_transforms_json(tmp_path: Path) -> None:
     """From a COLMAP model and from a transforms.json: the angle to the axis grows as OpenCV's polynomial says."""
     values = 300.0, 301.0, 160.0, 120.0, 0.02, -0.01, 0.003, 0.001
     angle = 0.4
@@ -184,7 +186,9 @@ def small_model(folder: Path) -> tuple[Path, list[Prepared]]:
         ("points3D", "1 0 0 1", "1 nan 0 1", "not a readable COLMAP model"),
     ],
 )
-def test_models_with_places_nowhere_are_refused(tmp_path: Path, file: str, old: str, new: str, sentence: str) -> None:
+def test_models_with_positions_that_are_not_finite_are_refused(
+    tmp_path: Path, file: str, old: str, new: str, sentence: str
+) -> None:
     model, photos = small_model(tmp_path)
     path = model / f"{file}.txt"
     path.write_text(path.read_text().replace(old, new))
@@ -194,7 +198,7 @@ def test_models_with_places_nowhere_are_refused(tmp_path: Path, file: str, old: 
 
 
 @pytest.mark.parametrize("data", [struct.pack("<Q", 1 << 62), struct.pack("<Q3d3BdQ", 1, 0, 0, 1, 9, 9, 9, 0, 1 << 62)])
-def test_counts_in_a_model_take_no_more_memory_than_its_size_warrants(
+def test_counts_beyond_the_size_of_a_model_take_no_memory(
     tmp_path: Path, data: bytes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     model, photos = small_model(tmp_path)
@@ -208,14 +212,14 @@ def test_counts_in_a_model_take_no_more_memory_than_its_size_warrants(
         read_poses(model, photos, tmp_path / "work")
 
 
-def test_reading_a_model_takes_no_longer_than_its_bound(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_reading_a_model_beyond_the_time_limit_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     model, photos = small_model(tmp_path)
     monkeypatch.setattr(sfm, "_READ_SECONDS", 0.0)
     with pytest.raises(InputError, match="COLMAP did not end within 0 s"):
         read_poses(model, photos, tmp_path / "work")
 
 
-def test_a_pipe_in_a_model_is_refused(tmp_path: Path) -> None:
+def test_a_named_pipe_in_a_model_is_refused(tmp_path: Path) -> None:
     model, photos = small_model(tmp_path)
     (model / "points3D.txt").unlink()
     os.mkfifo(model / "points3D.txt")

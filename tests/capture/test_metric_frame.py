@@ -100,7 +100,7 @@ def errors(matrix: np.ndarray) -> tuple[float, float, float]:
     return scale - 1, float(np.degrees(np.arccos(min(1.0, whole[2, 2] / scale)))), float(whole[2, 3])
 
 
-def test_a_board_gives_metres_and_the_vertical(tmp_path: Path) -> None:
+def test_a_board_determines_scale_and_vertical(tmp_path: Path) -> None:
     cameras = ring()
     images = photos_of_the_board(cameras, tmp_path)
     model = model_of(cameras, table_and_thing())
@@ -127,7 +127,7 @@ def test_a_board_gives_metres_and_the_vertical(tmp_path: Path) -> None:
     assert abs(errors(spoilt.matrix)[0]) < 1e-3
 
 
-def test_the_board_is_known_where_the_reconstruction_is_put(tmp_path: Path) -> None:
+def test_the_metric_frame_knows_the_pose_of_the_board(tmp_path: Path) -> None:
     cameras = ring()
     images = photos_of_the_board(cameras, tmp_path)
     found = find_metric_frame(model_of(cameras, table_and_thing()), images, board=BOARD)
@@ -142,7 +142,7 @@ def test_the_board_is_known_where_the_reconstruction_is_put(tmp_path: Path) -> N
     ("usual", "off", "wrong"),
     [(0.0004, 0.004, True), (0.002, 0.004, False), (0.004, 0.012, True), (0.0004, np.inf, True)],
 )
-def test_a_camera_is_wrong_by_the_measure_of_the_others(usual: float, off: float, wrong: bool) -> None:
+def test_a_camera_is_rejected_if_its_error_stands_out(usual: float, off: float, wrong: bool) -> None:
     """Errors are shares of the width: a quarter of a per cent condemns a camera that stands out, one per cent any."""
     cameras, rng = ring(), np.random.default_rng(4)
     views: Any = {index: {} for index in range(len(BOARD.corners))}
@@ -157,7 +157,7 @@ def test_a_camera_is_wrong_by_the_measure_of_the_others(usual: float, off: float
     assert confirmed == ({f"{k:02}" for k in range(1, 10)} if usual < anchor.MAX_CONTRADICTION else set())
 
 
-def test_a_bent_print_condemns_no_camera() -> None:
+def test_a_bent_board_rejects_no_camera() -> None:
     """Cameras near the table see all of a bend that those above do not: 2 mm, as the print's own corners have it."""
     bent = BOARD.corners - (0, 0, 0.002) * (np.abs(BOARD.corners[:, :1]) / 0.06) ** 2
     high = ring(30, width=1200)
@@ -170,7 +170,7 @@ def test_a_bent_print_condemns_no_camera() -> None:
     assert anchor._check_cameras(views, corners) == ({}, frozenset(f"{k:02}" for k in range(33)))
 
 
-def test_the_error_of_the_scale_covers_what_wrong_cameras_do_to_it() -> None:
+def test_the_stated_scale_error_covers_drifting_cameras() -> None:
     """In 20 models whose cameras drift, the scale is off by as much as it is said to be, not by several times that."""
     cameras, rng = ring(), np.random.default_rng(0)
     names = [f"{k:02}.png" for k in range(len(cameras))]
@@ -200,7 +200,7 @@ def drift(rng: np.random.Generator) -> np.ndarray:
     return pose
 
 
-def test_tags_give_metres_and_the_vertical(tmp_path: Path) -> None:
+def test_tags_determine_scale_and_vertical(tmp_path: Path) -> None:
     family = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
     sheet = np.full((1200, 1600), 255, dtype=np.uint8)
     for number, (x, y) in enumerate(((100, 100), (1200, 150), (600, 800))):
@@ -224,7 +224,7 @@ def blank(tmp_path: Path) -> dict[str, Path]:
     return {f"{k:02}.png": tmp_path / "blank.png" for k in range(10)}
 
 
-def test_a_distance_gives_metres_and_the_table_the_vertical(blank: dict[str, Path]) -> None:
+def test_a_distance_determines_scale_and_the_table_the_vertical(blank: dict[str, Path]) -> None:
     cameras = ring(rolled=True)
     points = table_and_thing()
     model = model_of(cameras, points)
@@ -252,13 +252,15 @@ def test_a_distance_gives_metres_and_the_table_the_vertical(blank: dict[str, Pat
         (("00.png", "00.png", 1.0), "the distance of 00.png and 00.png must be 1e-6 to 1e6 m"),
     ],
 )
-def test_a_wrong_distance_is_one_sentence(blank: dict[str, Path], spots: tuple[str, str, float], sentence: str) -> None:
+def test_an_invalid_distance_is_refused_in_one_sentence(
+    blank: dict[str, Path], spots: tuple[str, str, float], sentence: str
+) -> None:
     with pytest.raises(InputError) as raised:
         find_metric_frame(model_of(ring(), table_and_thing()[:1000] * (0.1, 0.1, 1)), blank, scale_from=spots)
     assert sentence in str(raised.value)
 
 
-def test_without_evidence_nothing_is_claimed(blank: dict[str, Path]) -> None:
+def test_without_board_and_distance_scale_and_vertical_are_unknown(blank: dict[str, Path]) -> None:
     model = model_of(ring(), np.random.default_rng(0).normal(0, 0.05, (400, 3)))
     found = find_metric_frame(model, blank)
     assert (found.units, found.up, found.table, found.source) == ("unknown", "unknown", False, "the cameras' attitude")
@@ -267,7 +269,7 @@ def test_without_evidence_nothing_is_claimed(blank: dict[str, Path]) -> None:
     assert errors(found.matrix)[1] < 1.0  # the cameras are held level
 
 
-def test_the_table_is_no_wall_and_no_ceiling() -> None:
+def test_a_wall_or_ceiling_is_not_taken_for_the_table() -> None:
     rng = np.random.default_rng(1)
     wall = np.column_stack([np.full(600, -0.5), rng.uniform(-0.5, 0.5, 600), rng.uniform(0, 1, 600)])
     table = find_table(model_of(ring(), np.concatenate([table_and_thing(), wall])))
@@ -276,7 +278,7 @@ def test_the_table_is_no_wall_and_no_ceiling() -> None:
     assert find_table(model_of(ring(), wall)) is None
 
 
-def test_the_vertical_needs_views_from_several_sides() -> None:
+def test_the_vertical_from_cameras_needs_views_from_several_sides() -> None:
     found = vertical_from_cameras(model_of(ring(rolled=True), np.zeros((1, 3))))
     assert found is not None
     assert found @ LOST[:3, 2] / 3.7 > np.cos(np.radians(0.5))
@@ -289,7 +291,7 @@ def test_the_vertical_needs_views_from_several_sides() -> None:
     assert vertical_from_cameras(model_of(anyhow, np.zeros((1, 3)))) is None
 
 
-def test_triangulation_forgets_outliers() -> None:
+def test_triangulation_ignores_an_outlier() -> None:
     point = np.array([0.02, -0.01, 0.03])
     cameras = [replace(camera, distortion=(-0.1, 0.02, 0.001, 0.0)) for camera in ring()]
     views = [(camera, camera.project(point)[0][0]) for camera in cameras]
@@ -300,14 +302,14 @@ def test_triangulation_forgets_outliers() -> None:
     assert triangulate(views[3:6]) is None
 
 
-def test_similarities_come_back() -> None:
+def test_fit_similarity_recovers_a_similarity() -> None:
     points = np.random.default_rng(2).normal(size=(9, 3))
     matrix, residuals = fit_similarity(points, points @ LOST[:3, :3].T + LOST[:3, 3])
     np.testing.assert_allclose(matrix, LOST, atol=1e-12)
     np.testing.assert_allclose(residuals, 0, atol=1e-12)
 
 
-def test_lines_meet() -> None:
+def test_the_nearest_point_to_lines_is_their_intersection() -> None:
     rng = np.random.default_rng(3)
     directions = rng.normal(size=(5, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
@@ -317,7 +319,7 @@ def test_lines_meet() -> None:
     )
 
 
-def test_weak_images_are_dropped_with_what_only_they_see() -> None:
+def test_weak_images_are_dropped_with_the_points_that_only_they_observe() -> None:
     model = model_of(ring(4), np.random.default_rng(0).normal(size=(100, 3)))
     seen = [np.arange(0, 60), np.arange(0, 60), np.arange(50, 95), np.arange(70, 95)]
     model = replace(model, seen=dict(zip(model.cameras, (part.astype(np.int32) for part in seen), strict=True)))
@@ -328,7 +330,7 @@ def test_weak_images_are_dropped_with_what_only_they_see() -> None:
     np.testing.assert_array_equal(rest.seen["01.png"], np.arange(60))
 
 
-def test_the_printed_board_is_true_to_size(tmp_path: Path) -> None:
+def test_the_printed_board_has_its_stated_size(tmp_path: Path) -> None:
     import re
 
     board = Board()
@@ -360,13 +362,13 @@ def test_the_printed_board_is_true_to_size(tmp_path: Path) -> None:
         (lambda path: Board().write_pdf(path, "a4"), "cannot be written"),
     ],
 )
-def test_impossible_boards_are_one_sentence(tmp_path: Path, make: object, sentence: str) -> None:
+def test_invalid_boards_are_refused_in_one_sentence(tmp_path: Path, make: object, sentence: str) -> None:
     with pytest.raises(InputError) as raised:
         make(tmp_path)  # type: ignore[operator]
     assert sentence in str(raised.value)
 
 
-def test_cameras_of_one_place_are_refused(tmp_path: Path) -> None:
+def test_cameras_at_one_position_are_refused(tmp_path: Path) -> None:
     Image.new("L", (64, 48)).save(tmp_path / "black.png")
     camera = Camera(64, 48, 60.0, 60.0, 32.0, 24.0, np.eye(4))
     model = replace(model_of([camera] * 4, np.zeros((0, 3))), cameras=dict.fromkeys("abcd", camera))

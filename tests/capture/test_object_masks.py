@@ -30,7 +30,7 @@ def overlap(mask: np.ndarray, true: Camera) -> float:
     return float(np.sum(mask & (outline > 0)) / np.sum(mask | (outline > 0)))
 
 
-def test_the_rendered_object_is_cut_out(
+def test_masks_of_a_rendered_object_agree_with_the_truth(
     photos: tuple[Path, dict[str, Camera]], captured: tuple[Path, Path, CaptureResult]
 ) -> None:
     overlaps = []
@@ -42,7 +42,7 @@ def test_the_rendered_object_is_cut_out(
     assert min(overlaps) > 0.95
 
 
-def test_masks_are_set_right_by_those_of_other_photos(
+def test_masks_are_corrected_by_those_of_other_photos(
     photos: tuple[Path, dict[str, Camera]], captured: tuple[Path, Path, CaptureResult], tmp_path: Path
 ) -> None:
     """A mask that spills over the table and a photo that was refused one are like the others afterwards."""
@@ -59,7 +59,7 @@ def test_masks_are_set_right_by_those_of_other_photos(
         assert overlap(make(replace(photo, mask=None)), photos[1][photo.name]) > 0.95
 
 
-def test_photos_in_which_another_thing_stands_before_the_object_are_left_out() -> None:
+def test_photos_with_an_occluded_object_are_omitted() -> None:
     rng = np.random.default_rng(0)
     ball = rng.normal(size=(400, 3))
     ball *= 0.04 / np.linalg.norm(ball, axis=1, keepdims=True)
@@ -108,7 +108,7 @@ def test_masks_are_transparent_where_the_object_may_be_hidden(
     assert half is not None and half.shape == (40, 40) and half[:, 20:25].all() and not half[:, :16].any()
 
 
-def test_masks_need_an_object(captured: tuple[Path, Path, CaptureResult]) -> None:
+def test_a_capture_without_an_object_is_refused(captured: tuple[Path, Path, CaptureResult]) -> None:
     capture = captured[2].capture
     with pytest.raises(InputError, match="no object was found above the table"):
         object_points(replace(capture, points=capture.points * (1, 1, 0)))

@@ -35,7 +35,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))
-def test_exif_orientation_is_baked_in(folder: Path, orientation: int) -> None:
+def test_exif_orientation_is_applied_to_the_pixels(folder: Path, orientation: int) -> None:
     exif = Image.Exif()
     exif[ExifTags.Base.Orientation] = orientation
     exif[ExifTags.Base.Model] = "Box"
@@ -58,7 +58,7 @@ def test_exif_orientation_is_baked_in(folder: Path, orientation: int) -> None:
         np.testing.assert_array_equal(np.asarray(copy), stored)
 
 
-def test_what_needs_no_change_is_copied_byte_by_byte(folder: Path) -> None:
+def test_photos_that_need_no_change_are_copied_byte_by_byte(folder: Path) -> None:
     (folder / "below").mkdir()
     Image.fromarray(texture(9)).save(folder / "below/a.JPG", "JPEG", quality=70)
     photos, rejected = prepare(folder)
@@ -83,7 +83,7 @@ def test_16_bit_grey_is_not_clipped(folder: Path) -> None:
         np.testing.assert_array_equal(np.asarray(copy)[..., 1], texture()[..., 0])
 
 
-def test_useless_photos_are_named_with_a_reason(folder: Path) -> None:
+def test_unusable_photos_are_named_with_a_reason(folder: Path) -> None:
     Image.fromarray(texture(5)).save(folder / "whole.jpg")
     data = (folder / "whole.jpg").read_bytes()
     (folder / "torn.jpg").write_bytes(data[: len(data) // 2])
@@ -103,7 +103,7 @@ def test_useless_photos_are_named_with_a_reason(folder: Path) -> None:
     assert rejected["flash.png"] == "it is too bright (100% of it is white)"
 
 
-def test_missing_folder(tmp_path: Path) -> None:
+def test_a_missing_folder_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="gone: must be an existing folder of photographs, or a video"):
         prepare_photos(tmp_path / "gone", tmp_path / "out", max_size=100)
 
@@ -123,7 +123,7 @@ def test_undistorted_photos_show_the_same_directions(tmp_path: Path) -> None:
     assert np.abs((shown[..., :2] - (128 + 150 * slopes))[2:-2, 2:-2].mean()) < 0.05
 
 
-def test_photographs_are_found_through_links_and_masks_are_none(folder: Path) -> None:
+def test_photos_are_found_through_links_and_masks_are_ignored(folder: Path) -> None:
     ring = folder.parent / "ring"
     ring.mkdir()
     Image.fromarray(texture(7)).save(ring / "7.PNG")
@@ -135,7 +135,7 @@ def test_photographs_are_found_through_links_and_masks_are_none(folder: Path) ->
     assert [path.relative_to(folder).as_posix() for path in found] == ["0.png", "1.png", "2.png", "linked/7.PNG"]
 
 
-def test_two_photographs_of_one_name_are_refused(folder: Path) -> None:
+def test_photos_whose_copies_would_have_the_same_name_are_refused(folder: Path) -> None:
     (folder / "a").mkdir()
     for name in ("a/b.png", "a__b.png"):
         Image.fromarray(texture(8)).save(folder / name)
@@ -143,12 +143,12 @@ def test_two_photographs_of_one_name_are_refused(folder: Path) -> None:
         prepare(folder)
 
 
-def test_a_photograph_alone_is_no_folder(folder: Path) -> None:
+def test_a_single_photo_is_refused_as_a_folder(folder: Path) -> None:
     with pytest.raises(InputError, match=r"0\.png: must be an existing folder of photographs, or a video"):
         find_photos(folder / "0.png")
 
 
-def test_exif_that_no_file_can_hold_is_left_out(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_exif_that_cannot_be_written_is_omitted(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     exif = Image.Exif()
     exif[ExifTags.Base.Orientation] = 6
     exif[ExifTags.Base.ImageDescription] = "x" * 70_000

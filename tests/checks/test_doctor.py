@@ -20,7 +20,7 @@ def found():
     return {finding.name: finding for finding in examine()}
 
 
-def test_a_healthy_machine(monkeypatch):
+def test_a_healthy_machine_passes_every_check(monkeypatch):
     first = found()
     names = ["Python", "mitsuba", "drjit", "newton", "processor", "LLVM", "GPU", "cache", "warp", "memory", "disk"]
     assert list(first) == names
@@ -44,7 +44,7 @@ def test_a_healthy_machine(monkeypatch):
         ("newton", lambda patch: patch.setattr(doctor, "version", missing), "pip install newton"),
     ],
 )
-def test_a_fault_has_a_remedy(monkeypatch, name, change, remedy):
+def test_each_fault_is_reported_with_a_remedy(monkeypatch, name, change, remedy):
     monkeypatch.setattr(doctor, "_render_trial_on", lambda device, environment: ("23", ""))
     change(monkeypatch)
     finding = found()[name]
@@ -57,14 +57,14 @@ def trial():
 
 
 class TestTrial:
-    def test_it_is_as_known(self, trial):
+    def test_the_trial_scene_has_its_known_means(self, trial):
         """Far within the tolerance, or KNOWN is of another renderer; processors of two makers differ by 0.0014."""
         means = trial_means(trial)
         assert max(np.abs(means[name] - known).max() for name, known in KNOWN.items()) < TOLERANCE / 8
         assert trial_faults(trial) == []
 
     @pytest.mark.parametrize("lost", ["static", "dynamic"])
-    def test_shadows_of_either_kind_are_missed(self, monkeypatch, lost):
+    def test_missing_shadows_of_either_kind_are_faults(self, monkeypatch, lost):
         """What a GPU shows where rays at captured, or at added, things are left out."""
         build = Proxies.__init__
 
@@ -78,15 +78,15 @@ class TestTrial:
         monkeypatch.setattr(Proxies, "__init__", without)
         assert any(fault.startswith("light") for fault in trial_faults(render_trial()))
 
-    def test_lost_splats_are_missed(self, trial):
+    def test_missing_splats_are_a_fault(self, trial):
         assert [fault.split()[0] for fault in trial_faults(replace(trial, instance=0 * trial.instance))] == ["instance"]
 
-    def test_nan_is_wrong(self, trial):
+    def test_nan_is_a_fault(self, trial):
         assert trial_faults(replace(trial, light=np.nan * trial.light)) == ["light is off by nan"]
 
 
 @pytest.mark.parametrize("fault", ["", "renders the trial scene incorrectly (light is off by 0.52)"])
-def test_every_gpu_is_tried(monkeypatch, fault):
+def test_every_gpu_renders_the_trial_scene(monkeypatch, fault):
     tried = []
 
     def attempt(device, environment):
@@ -104,7 +104,7 @@ def test_every_gpu_is_tried(monkeypatch, fault):
 
 
 @pytest.mark.parametrize("libraries", ["/nonexistent/libLLVM.so"])
-def test_an_llvm_that_does_not_load(monkeypatch, libraries):
+def test_an_llvm_that_does_not_load_is_a_fault(monkeypatch, libraries):
     monkeypatch.setenv("DRJIT_LIBLLVM_PATH", libraries)
     finding = doctor._llvm()
     assert not finding.ok and "karellen-llvm-core" in finding.remedy
@@ -117,7 +117,7 @@ def missing(name):
     return "1"
 
 
-def test_memory_within_a_containers_limit(monkeypatch, tmp_path):
+def test_memory_is_bounded_by_the_limit_of_the_container(monkeypatch, tmp_path):
     """Other programs take and give back memory at any time, so what the machine has is said here."""
     monkeypatch.setattr(resources, "_CGROUP", tmp_path)
     read, machine = Path.read_text, "MemAvailable: 6291456 kB\n"

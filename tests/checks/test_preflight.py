@@ -33,7 +33,7 @@ def wrong(findings):
     return {finding.name: finding for finding in findings if not finding.ok}
 
 
-def test_a_good_asset_passes():
+def test_a_sound_asset_passes_every_check():
     assert wrong(check_asset(solid())) == {}
     surroundings = replace(
         solid(size=(2, 3, 0.5)), kind="environment", splats=solid(size=(2, 3, 0.5)).splats, pieces=()
@@ -71,7 +71,7 @@ FAULTS = {
 
 
 @pytest.mark.parametrize("name", FAULTS)
-def test_a_fault_is_found(name):
+def test_each_planted_fault_of_an_asset_is_found_with_its_remedy(name):
     asset, remedy = FAULTS[name]
     found = wrong(check_asset(asset))
     assert remedy in found[name.strip()].remedy
@@ -87,7 +87,7 @@ def test_a_fault_is_found(name):
         ("light", lambda data: data.update(lights=[])),
     ],
 )
-def test_a_fault_of_a_scene_is_found(scene_data, write_scene, name, change):
+def test_each_planted_fault_of_a_scene_is_found_with_its_remedy(scene_data, write_scene, name, change):
     good = wrong(check_scene(load_scene(write_scene(scene_data))))
     assert name not in good
     change(scene_data)
@@ -96,7 +96,7 @@ def test_a_fault_of_a_scene_is_found(scene_data, write_scene, name, change):
     assert found[name].remedy
 
 
-def test_assets_of_one_name_do_not_hide_each_other(tmp_path):
+def test_assets_of_the_same_name_are_checked_separately(tmp_path):
     bad = replace(GOOD, splats=changed(GOOD.splats, 900, opacities=1e-3))
     bad.save(tmp_path / "bad")
     GOOD.save(tmp_path / "good")
@@ -110,7 +110,7 @@ def test_assets_of_one_name_do_not_hide_each_other(tmp_path):
     assert "box: opacity" in wrong(check_scene(load_scene(tmp_path / "scene.yaml")))
 
 
-def test_an_asset_is_listed_once_in_all_its_sizes(scene_data, write_scene, monkeypatch):
+def test_an_asset_of_several_sizes_is_listed_once(scene_data, write_scene, monkeypatch):
     """A fault of one size is told of, and nothing is said to be well with the asset then."""
     monkeypatch.setitem(SIZES, "object", (0.016, 2.0))
     scene_data["objects"] = [{"asset": f"assets/{name}", "scale": [0.5, 1]} for name in ("nut", "bolt")]
@@ -127,7 +127,7 @@ def test_an_object_that_cannot_fit_is_refused(scene_data, write_scene, capsys):
     assert "must fit into the region" in capsys.readouterr().err
 
 
-def test_the_command(tmp_path, capsys):
+def test_the_check_command_prints_findings_and_sets_its_status(tmp_path, capsys):
     GOOD.save(tmp_path / "good")
     assert run("check", tmp_path / "good") == 0
     assert "ok    mass: 0.12 kg, of 1000 kg/m^3" in capsys.readouterr().out
@@ -137,7 +137,7 @@ def test_the_command(tmp_path, capsys):
     assert "      to do: close it" in lines[lines.index("look  watertightness: open") + 1]
 
 
-def test_an_open_mesh_weighs_what_its_pieces_do():
+def test_an_open_mesh_has_the_mass_of_its_pieces():
     half = GOOD.mesh.copy().apply_transform(np.diag([0.5, 1, 1, 1]))
     for pieces, said in (
         ((half,), "0.06 kg, of 1000 kg/m^3"),
@@ -147,7 +147,7 @@ def test_an_open_mesh_weighs_what_its_pieces_do():
         assert found["mass"].text == said
 
 
-def test_what_cannot_be_read_is_one_sentence(tmp_path, capsys):
+def test_an_unreadable_asset_is_refused_in_one_sentence(tmp_path, capsys):
     box_asset("nut").save(tmp_path / "nut")
     splats = tmp_path / "nut/splats.ply"
     splats.write_bytes(splats.read_bytes()[:-4] + np.float32(np.nan).tobytes())

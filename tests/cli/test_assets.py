@@ -15,7 +15,7 @@ from tests.cli.typed import run
 from tests.conftest import box_asset
 
 
-def test_bake_takes_every_option(
+def test_bake_applies_every_option(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """What each does is read from the asset; processes of their own bake in full in test_shell.py."""
@@ -52,7 +52,7 @@ def test_bake_takes_every_option(
         (["--gaussians", "0"], "gaussians must be at least 1 (got 0)"),
     ],
 )
-def test_bad_option_of_bake_is_one_sentence(
+def test_invalid_options_of_bake_are_refused_in_one_sentence(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[str], sentence: str
 ) -> None:
     box_asset("gear").mesh.export(tmp_path / "gear.stl")

@@ -18,7 +18,9 @@ from mitsplat.scene.layout import Layout
 from tests.cli.typed import Calls, run
 
 
-def test_preview_writes_a_picture(scene_path: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_preview_writes_the_image_of_the_frame(
+    scene_path: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     image = np.full((4, 6, 3), (10, 20, 30), dtype=np.uint8)
     calls = Calls(SimpleNamespace(image=image))
     monkeypatch.setattr(frame, "render_frame", calls)
@@ -30,21 +32,21 @@ def test_preview_writes_a_picture(scene_path: Path, monkeypatch: pytest.MonkeyPa
 
 
 @pytest.mark.parametrize("name", ["a.gif", "no/such/folder/a.png"])
-def test_preview_refuses_a_bad_output_before_rendering(
+def test_preview_refuses_an_invalid_output_before_rendering(
     scene_path: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, name: str
 ) -> None:
     monkeypatch.setattr(frame, "render_frame", Calls(error=AssertionError("rendered")))
     assert run("preview", scene_path, "-o", tmp_path / name) == 2
 
 
-def test_export(scene_path: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_export_writes_the_xml_of_the_frame(scene_path: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     calls = Calls()
     monkeypatch.setattr(xml_scene, "export_xml", calls)
     assert run("export", scene_path, "--frame", 2, "-o", tmp_path / "a.xml") == 0
     assert calls.args[1:] == (2, tmp_path / "a.xml")
 
 
-def test_settle_prints_certificates_and_shows_the_drop(
+def test_settle_prints_certificates_and_writes_the_animation(
     scene_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The GIF moves, ends on the layout at rest, and shows the drop every 0.04 s as fast as it was."""
@@ -83,19 +85,21 @@ def test_settle_prints_certificates_and_shows_the_drop(
         (["--workers", "0"], "workers must be at least 1 (got 0)"),
     ],
 )
-def test_bad_option_of_settle_is_one_sentence(
+def test_invalid_options_of_settle_are_refused_in_one_sentence(
     scene_path: Path, capsys: pytest.CaptureFixture[str], options: list[str], sentence: str
 ) -> None:
     assert run("settle", scene_path, *options) == 2
     assert sentence in capsys.readouterr().err
 
 
-def test_schema_is_json(capsys: pytest.CaptureFixture[str]) -> None:
+def test_schema_prints_json(capsys: pytest.CaptureFixture[str]) -> None:
     assert run("schema") == 0
     assert json.loads(capsys.readouterr().out)["properties"]["camera"]
 
 
-def test_doctor_says_what_to_do(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_doctor_prints_remedies_and_sets_its_status(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert run("doctor") == 0
     assert "LLVM" in capsys.readouterr().out
     monkeypatch.setenv("DRJIT_LIBLLVM_PATH", "/no/such/libLLVM.so")

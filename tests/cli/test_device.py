@@ -23,7 +23,7 @@ class TestDevice:
         monkeypatch.setattr(devices, "visible_gpus", lambda: devices.Lack("there is none", "buy one"))
 
     @pytest.mark.usefixtures("lacking")
-    def test_auto_says_in_one_line_which_and_why(
+    def test_auto_prints_the_chosen_device_and_the_reason(
         self, scene_path: Path, write_dataset: Calls, capsys: pytest.CaptureFixture[str]
     ) -> None:
         assert run("render", scene_path, "--device", "auto", "--any-device") == 0
@@ -34,7 +34,7 @@ class TestDevice:
 
     @pytest.mark.usefixtures("lacking")
     @pytest.mark.parametrize("name", ["cuda", "cuda:1", "tpu"])
-    def test_one_that_is_not_here(
+    def test_a_missing_device_is_refused_by_every_command_that_renders(
         self, scene_path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str
     ) -> None:
         """Every command that renders refuses it in one sentence, before anything is written."""
@@ -59,7 +59,7 @@ class TestDevice:
             assert words in capsys.readouterr().err, command
         assert not list(tmp_path.glob("out*"))
 
-    def test_commands_take_it_before_they_render(
+    def test_commands_select_the_device_before_they_render(
         self, scene_path: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, fit_capture: Calls
     ) -> None:
         taken: list[str] = []
@@ -72,7 +72,7 @@ class TestDevice:
         assert run("fit", "capture", "-o", tmp_path / "fit") == 0
         assert taken == ["cuda_ad_rgb", "cuda_ad_rgb", "llvm_ad_rgb"]
 
-    def test_another_gpu_is_taken_by_beginning_again(
+    def test_another_gpu_is_selected_by_restarting_the_process(
         self, scene_path: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     ) -> None:
         """By the command line itself only: whoever calls it is told what to set."""

@@ -41,7 +41,7 @@ from tests.conftest import box_asset
         ("render gone.yaml --address auto", "--address and --resources apply to a Ray cluster: add --engine ray"),
     ],
 )
-def test_another_kind_of_file_is_named(
+def test_a_file_of_the_wrong_kind_is_refused_with_its_kind(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], words: str, sentence: str
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -64,7 +64,7 @@ def test_another_kind_of_file_is_named(
         (OSError("disk on fire"), "mitsplat: disk on fire\n"),
     ],
 )
-def test_input_and_file_errors_are_one_sentence(
+def test_input_and_file_errors_are_one_sentence_with_status_2(
     scene_path: Path, write_dataset: Calls, capsys: pytest.CaptureFixture[str], error: Exception, sentence: str
 ) -> None:
     write_dataset.error = error
@@ -75,7 +75,7 @@ def test_input_and_file_errors_are_one_sentence(
 @pytest.mark.parametrize(
     ("error", "status"), [(MissingResourceError("no GPU"), 3), (PartialResultError("too dark"), 4)]
 )
-def test_other_errors_have_a_status_of_their_own(
+def test_other_errors_have_their_own_status(
     scene_path: Path, write_dataset: Calls, capsys: pytest.CaptureFixture[str], error: Exception, status: int
 ) -> None:
     write_dataset.error = error
@@ -83,7 +83,7 @@ def test_other_errors_have_a_status_of_their_own(
     assert f"mitsplat: {error}\n" in capsys.readouterr().err
 
 
-def test_our_own_bugs_are_a_sentence(
+def test_an_unexpected_exception_is_one_sentence_with_a_log(
     scene_path: Path, write_dataset: Calls, capsys: pytest.CaptureFixture[str]
 ) -> None:
     write_dataset.error = ZeroDivisionError()
@@ -104,7 +104,7 @@ def test_our_own_bugs_are_a_sentence(
         (KeyboardInterrupt(), 130),
     ],
 )
-def test_a_log_for_machines_holds_the_error(
+def test_the_json_log_has_the_error(
     scene_path: Path, write_dataset: Calls, capsys: pytest.CaptureFixture[str], error: BaseException, status: int
 ) -> None:
     write_dataset.error = error
@@ -114,12 +114,12 @@ def test_a_log_for_machines_holds_the_error(
     assert (events[-1]["status"], events[-1]["error"]) == (status, type(error).__name__)
 
 
-def test_a_log_for_machines_holds_bad_scenes_too(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_json_log_has_errors_of_scene_files(capsys: pytest.CaptureFixture[str]) -> None:
     assert run("render", "gone.yaml", "--json") == 2
     event = json.loads(capsys.readouterr().err.splitlines()[-1])
     assert (event["command"], event["status"], event["message"]) == ("render", 2, "gone.yaml: no such file")
 
 
-def test_interrupt_ends_with_130(scene_path: Path, write_dataset: Calls) -> None:
+def test_an_interrupt_ends_with_status_130(scene_path: Path, write_dataset: Calls) -> None:
     write_dataset.error = KeyboardInterrupt()
     assert run("render", scene_path) == 130

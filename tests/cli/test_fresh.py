@@ -155,7 +155,7 @@ def desk(scene_data: dict[str, object], write_scene: WriteScene, tmp_path: Path)
     return tmp_path
 
 
-def test_every_public_name_can_be_the_first_that_is_used(desk: Path) -> None:
+def test_every_public_name_works_in_a_new_process(desk: Path) -> None:
     assert sorted(CALLS) == mitsplat.__all__
     done = fresh(FORKS, json.dumps(CALLS | FURTHER), folder=desk)
     assert done.returncode == 0, done.stderr[-2000:]
@@ -165,7 +165,7 @@ def test_every_public_name_can_be_the_first_that_is_used(desk: Path) -> None:
 # Threads
 
 
-def test_first_renders_from_several_threads(desk: Path) -> None:
+def test_the_first_renders_of_a_process_may_run_in_several_threads(desk: Path) -> None:
     """Each has what it has alone: neither the plugins nor what is on the device may be half made by another one."""
     code = """
 import threading
@@ -196,7 +196,7 @@ for k, job in enumerate(jobs):
 
 
 @pytest.mark.parametrize("before", [True, False])
-def test_a_variant_that_cannot_run_the_plugins_is_refused_and_stays(before: bool) -> None:
+def test_a_mitsuba_variant_without_the_plugins_is_refused_and_kept(before: bool) -> None:
     chosen = "import mitsuba as mi; mi.set_variant('scalar_rgb')\n"
     code = """
 try:
@@ -236,7 +236,7 @@ main(["board", "-o", "board.pdf"])
 """
 
 
-def test_a_fault_is_a_sentence_and_a_log(tmp_path: Path) -> None:
+def test_a_crash_is_one_sentence_and_a_log(tmp_path: Path) -> None:
     done = fresh(FAULT, folder=tmp_path, XDG_CACHE_HOME=str(tmp_path / "cache"), MITSPLAT_TRACEBACK="")
     assert done.returncode == 70
     assert done.stderr.count("\n") == 1 and "Traceback" not in done.stderr
@@ -245,7 +245,7 @@ def test_a_fault_is_a_sentence_and_a_log(tmp_path: Path) -> None:
     assert "in write_pdf" in Path(log).read_text() and f"mitsplat {mitsplat.__version__}" in Path(log).read_text()
 
 
-def test_the_log_goes_where_it_can_be_written(tmp_path: Path) -> None:
+def test_the_log_is_written_to_a_writable_folder(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     places = {"XDG_CACHE_HOME": str(tmp_path / "file"), "TMPDIR": str(tmp_path), "MITSPLAT_TRACEBACK": "1"}
     done = fresh(FAULT, folder=tmp_path, **places)
@@ -274,7 +274,7 @@ if __name__ == "__main__":
 
 
 @pytest.mark.parametrize("options", [(), ("--json",)])
-def test_a_fault_in_a_worker_process_is_one_too(desk: Path, options: tuple[str, ...]) -> None:
+def test_a_crash_of_a_worker_process_is_one_sentence_and_a_log(desk: Path, options: tuple[str, ...]) -> None:
     (desk / "broken.py").write_text(WORKER)
     done = subprocess.run(
         [sys.executable, "broken.py", *options], cwd=desk, capture_output=True, text=True, timeout=400, check=False
@@ -288,7 +288,7 @@ def test_a_fault_in_a_worker_process_is_one_too(desk: Path, options: tuple[str, 
     assert 'raise KeyError("on purpose")' in log
 
 
-def test_a_reader_that_leaves_early_is_no_fault() -> None:
+def test_a_closed_pipe_ends_the_command_without_an_error() -> None:
     command = f"{sys.executable} -m mitsplat.cli schema | head -c 1; echo; echo ${{PIPESTATUS[0]}}"
     code = "from mitsplat.cli import main; main(['schema'])"
     command = f'{sys.executable} -c "{code}" | true; true'
@@ -299,7 +299,9 @@ def test_a_reader_that_leaves_early_is_no_fault() -> None:
 # Sentences
 
 
-def test_the_guide_shows_what_a_wrong_scene_is_told(scene_data: dict[str, object], write_scene: WriteScene) -> None:
+def test_the_error_in_the_guide_is_the_one_of_a_wrong_scene(
+    scene_data: dict[str, object], write_scene: WriteScene
+) -> None:
     shown = re.search(
         r"^    (scenes/cell\.yaml:\d+: objects\[2\]\.count: .*)$", (ROOT / "docs/first_dataset.md").read_text(), re.M
     )[1]

@@ -13,7 +13,7 @@ from mitsplat.cli import COMMAND_GROUPS, app
 from tests.cli.typed import run
 
 
-def test_every_command_and_option_is_explained() -> None:
+def test_every_command_and_option_has_a_help_text() -> None:
     group = typer.main.get_command(app)
     assert isinstance(group, typer.core.TyperGroup)
     for name, command in group.commands.items():
@@ -22,7 +22,7 @@ def test_every_command_and_option_is_explained() -> None:
         assert unexplained == [], name
 
 
-def test_version(capsys: pytest.CaptureFixture[str]) -> None:
+def test_version_prints_the_version_of_the_package(capsys: pytest.CaptureFixture[str]) -> None:
     from importlib.metadata import version
 
     assert run("--version") == 0

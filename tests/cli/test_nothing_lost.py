@@ -21,7 +21,7 @@ from tests.conftest import WriteScene, box_asset, contents
 
 
 @pytest.mark.parametrize("command", ["bake", "import"])
-def test_an_asset_is_replaced_where_that_is_wanted(
+def test_an_existing_asset_is_replaced_only_with_overwrite(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], command: str
 ) -> None:
     asset = box_asset("gear", (0.02, 0.03, 0.01))
@@ -42,7 +42,7 @@ def test_an_asset_is_replaced_where_that_is_wanted(
     assert contents(tmp_path) == before
 
 
-def test_an_asset_is_whole_until_another_one_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failed_save_keeps_the_earlier_asset(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     box_asset("gear", (0.02, 0.03, 0.01)).save(tmp_path)
     before = contents(tmp_path)
 
@@ -58,7 +58,7 @@ def test_an_asset_is_whole_until_another_one_is(tmp_path: Path, monkeypatch: pyt
     assert Asset.load(tmp_path).name == "plate" and contents(tmp_path).keys() == before.keys()
 
 
-def test_a_failed_write_leaves_nothing_and_names_the_file(tmp_path: Path) -> None:
+def test_a_failed_write_leaves_no_partial_file_and_names_the_file(tmp_path: Path) -> None:
     write_text(tmp_path / "page.html", "earlier")
 
     def fill(part: Path) -> None:
@@ -71,7 +71,7 @@ def test_a_failed_write_leaves_nothing_and_names_the_file(tmp_path: Path) -> Non
     assert contents(tmp_path) == {"page.html": b"earlier"}
 
 
-def test_lights_replace_their_own_alone(tmp_path: Path) -> None:
+def test_lights_replaces_only_its_own_files(tmp_path: Path) -> None:
     out = tmp_path / "room.yaml"
     refuse_to_replace(out, [tmp_path / "sky.exr"])
     for given in ("room_panorama.exr", "room.png"):
@@ -87,7 +87,7 @@ def test_lights_replace_their_own_alone(tmp_path: Path) -> None:
     refuse_to_replace(out, [])
 
 
-def test_a_sheet_is_replaced_where_that_is_wanted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_board_sheet_is_replaced_only_with_overwrite(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     sheet = tmp_path / "board.pdf"
     sheet.write_text("an invoice")
     assert run("board", "-o", sheet) == 2 and sheet.read_text() == "an invoice"
@@ -96,7 +96,7 @@ def test_a_sheet_is_replaced_where_that_is_wanted(tmp_path: Path, capsys: pytest
     assert run("board", "-o", sheet, "--overwrite") == 0 and sheet.read_bytes().startswith(b"%PDF")
 
 
-def test_an_export_is_edited_and_so_kept(
+def test_an_edited_export_is_kept(
     tmp_path: Path,
     scene_data: dict[str, Any],
     write_scene: WriteScene,
@@ -113,7 +113,7 @@ def test_an_export_is_edited_and_so_kept(
     assert run("export", scene, "-o", tmp_path, "--overwrite") == 2
 
 
-def test_a_capture_removes_nothing_that_is_no_capture_s(tmp_path: Path) -> None:
+def test_a_capture_removes_only_files_of_captures(tmp_path: Path) -> None:
     photos = tmp_path / "photos"
     photos.mkdir()
     for number in range(3):
@@ -142,7 +142,7 @@ def test_a_capture_removes_nothing_that_is_no_capture_s(tmp_path: Path) -> None:
     refused("new", "must not lie in .*sfm, which is overwritten", poses=tmp_path / "new/sfm/model.json")
 
 
-def test_frames_are_there_until_others_are(tmp_path: Path) -> None:
+def test_a_damaged_video_keeps_the_earlier_frames(tmp_path: Path) -> None:
     frames = tmp_path / "frames"
     frames.mkdir()
     (tmp_path / "torn.mp4").write_bytes(b"torn")
@@ -157,7 +157,7 @@ def test_frames_are_there_until_others_are(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("there", ["splats.ply", "held_out/photo.png"])
-def test_a_fit_refuses_a_folder_of_others(tmp_path: Path, there: str) -> None:
+def test_a_fit_refuses_a_folder_with_other_files(tmp_path: Path, there: str) -> None:
     write_text(tmp_path / there, "precious")
     with pytest.raises(InputError, match="exists already and does not belong to a fit; --overwrite replaces it"):
         FitFolder(tmp_path, "inputs").refuse_others()
@@ -165,7 +165,7 @@ def test_a_fit_refuses_a_folder_of_others(tmp_path: Path, there: str) -> None:
     FitFolder(tmp_path, "inputs").refuse_others()
 
 
-def test_an_interrupt_is_one_whatever_wraps_it() -> None:
+def test_an_interrupt_wrapped_in_another_exception_has_status_130() -> None:
     error = RuntimeError("dr.while_loop(): encountered an exception")
     assert exit_status(error) is None
     error.__cause__ = KeyboardInterrupt()

@@ -84,7 +84,7 @@ def test_fit_below_its_target_exits_with_4(
 
 
 @pytest.mark.parametrize("budget", ["10", "ten min", "1d"])
-def test_fit_wants_a_budget_with_a_unit(
+def test_fit_refuses_a_time_limit_without_a_unit(
     fit_capture: Calls, capsys: pytest.CaptureFixture[str], tmp_path: Path, budget: str
 ) -> None:
     assert run("fit", "photos", "-o", tmp_path, "--budget", budget) == 2
@@ -153,7 +153,7 @@ def test_mesh_passes_every_option_on(
     assert "held-out PSNR 27.00 dB; IoU with held-out masks splats 0.970, mesh 0.960" in capsys.readouterr().out
 
 
-def test_a_missed_threshold_is_status_4_and_a_sentence(
+def test_a_missed_threshold_has_status_4_and_one_sentence(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(pipeline, "make_asset", Calls(finished(tmp_path, psnr=12.0)))
@@ -195,7 +195,7 @@ def test_asset_passes_every_option_on(
     assert calls.kwargs["fit"] == FitSettings(gaussians=70, iterations=80, budget=90.0, size=90, seed=4, masks=masks)
 
 
-def test_a_log_tells_stages_and_the_time_left(
+def test_a_log_has_stages_and_the_remaining_time(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Where nobody sees a bar."""

@@ -55,7 +55,7 @@ def test_render_passes_every_option_on(
         ({"compared": 2, "differing": ("a.png",), "cause": "seed was 0 and is 1"}, 1, "a.png (seed was 0 and is 1)"),
     ],
 )
-def test_render_makes_one_frame_again(
+def test_render_only_makes_one_frame_and_compares_it(
     scene_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     tmp_path: Path,
@@ -74,7 +74,7 @@ def test_render_makes_one_frame_again(
     assert run("render", scene_path, "--only", 3, "-n", 2) == 2
 
 
-def test_render_leaves_to_the_file_what_no_option_says(scene_path: Path, write_dataset: Calls) -> None:
+def test_render_without_options_uses_the_values_of_the_file(scene_path: Path, write_dataset: Calls) -> None:
     assert run("render", scene_path) == 0
     scene, out = write_dataset.args
     assert out == Path("out/scene")
@@ -125,7 +125,7 @@ def test_render_chooses_the_preset_within_a_tolerance(
     assert "preset: fast (RMSE 0.01, 0.50 s an image)" in capsys.readouterr().out
 
 
-def test_progress_bar_tells_images_and_rate(
+def test_the_progress_bar_shows_images_and_rate(
     scene_path: Path, write_dataset: Calls, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def write(*args: Any, progress: Any, **kwargs: Any) -> DatasetSummary:
@@ -140,7 +140,9 @@ def test_progress_bar_tells_images_and_rate(
     assert "images/s" in bar
 
 
-def test_render_xml(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_render_writes_the_image_of_a_mitsuba_scene(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     picture = tmp_path / "one.png"
     calls = Calls(picture)
     monkeypatch.setattr(xml_scene, "render_apart", calls)
@@ -166,7 +168,7 @@ def test_render_xml(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pyt
         (["--quality", "fast", "--tolerance", "0.1"], "--quality and --tolerance both select the preset"),
     ],
 )
-def test_bad_option_is_one_sentence(
+def test_invalid_options_of_render_are_refused_in_one_sentence(
     scene_path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[str], sentence: str
 ) -> None:
     assert run("render", scene_path, "-o", tmp_path / "out", *options) == 2
@@ -177,7 +179,7 @@ def test_bad_option_is_one_sentence(
     assert not list(tmp_path.glob("out/images/*/*"))
 
 
-def test_missing_scene(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_missing_scene_file_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
     assert run("render", "gone.yaml") == 2
     assert capsys.readouterr().err == "mitsplat: gone.yaml: no such file\n"
 
@@ -196,7 +198,7 @@ def first_mean_nan(data: bytes) -> bytes:
 
 
 @pytest.mark.parametrize("damage", [cut, promise_billions, first_mean_nan])
-def test_damaged_splats_are_one_sentence(
+def test_damaged_splats_are_refused_in_one_sentence(
     scene_path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], damage: Callable[[bytes], bytes]
 ) -> None:
     splats = tmp_path / "assets/nut/splats.ply"
@@ -212,7 +214,7 @@ def test_damaged_splats_are_one_sentence(
     assert not (tmp_path / "out").exists()
 
 
-def test_output_that_is_no_folder_is_one_sentence(
+def test_an_output_that_is_not_a_folder_is_refused(
     scene_path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "out").write_text("in the way")

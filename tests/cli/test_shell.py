@@ -168,7 +168,7 @@ def obey(words: list[str], desk: Path, *, good: tuple[int, ...] = (0,)) -> None:
     assert "Traceback" not in done.stderr and "CUDA driver" not in done.stderr, told
 
 
-def test_every_command_is_shown() -> None:
+def test_every_command_is_shown_in_the_documentation() -> None:
     known = typer.main.get_command(app).commands
     assert {words[1] for words in SHOWN} == set(known)
     for words in DOCUMENTED:  # those that are not typed below, too
@@ -177,7 +177,7 @@ def test_every_command_is_shown() -> None:
 
 
 @pytest.mark.slow
-def test_every_command_runs_by_itself_as_documented(desk: Path) -> None:
+def test_every_documented_command_runs_in_its_own_process(desk: Path) -> None:
     for words in SHOWN:
         if words[1] in ("view", "compare", *DETECTORS):  # one serves until it is ended: tests/view; others come below
             continue
@@ -201,7 +201,7 @@ def lay_photographs(desk: Path) -> None:
 
 
 @pytest.mark.slow
-def test_photographs_are_compared_as_documented(desk: Path) -> None:
+def test_the_documented_compare_commands_run(desk: Path) -> None:
     lay_photographs(desk)
     for words in SHOWN:
         if words[1] == "compare":
@@ -209,7 +209,7 @@ def test_photographs_are_compared_as_documented(desk: Path) -> None:
 
 
 @pytest.mark.slow
-def test_detectors_learn_as_documented(desk: Path) -> None:
+def test_the_documented_detector_commands_run(desk: Path) -> None:
     """After the commands above, which have made the dataset."""
     if not all(map(find_spec, ("torch", "torchvision", "ultralytics"))):
         pytest.skip("Ultralytics and PyTorch are not installed")
@@ -224,7 +224,7 @@ def test_detectors_learn_as_documented(desk: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("page", [page for page in PAGES if blocks(page, "python")], ids=lambda page: page.stem)
-def test_python_examples_run_as_they_stand(desk: Path, page: Path) -> None:
+def test_the_documented_python_examples_run(desk: Path, page: Path) -> None:
     """Each page's in one process, after the commands above, which have made the datasets that some read."""
     # A loop over endless frames, with a detector of the reader's, is for tests/frames/test_torch_dataset.py.
     known = [text for text in blocks(page, "python") if "import torch" not in text and "from torch" not in text]
@@ -235,7 +235,7 @@ def test_python_examples_run_as_they_stand(desk: Path, page: Path) -> None:
     assert (done.returncode, done.stderr) == (0, "")
 
 
-def test_the_guides_scene_is_one(tmp_path: Path) -> None:
+def test_the_scene_of_the_guide_is_valid(tmp_path: Path) -> None:
     (text,) = (text for text in blocks(ROOT / "docs/first_dataset.md", "yaml") if text.startswith("# Parts"))
     (tmp_path / "tray.yaml").write_text(text)
     scene_data = YAML(typ="safe", pure=True).load(text)
@@ -247,7 +247,7 @@ def test_the_guides_scene_is_one(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_photographs_become_assets_as_documented(desk: Path, captured: tuple[Path, Path, CaptureResult]) -> None:
+def test_the_documented_photo_commands_make_an_asset(desk: Path, captured: tuple[Path, Path, CaptureResult]) -> None:
     """Their cameras are there, as if a first run had ended after structure from motion, which takes a minute.
 
     Status 4 is that of a tiny fit, which misses the thresholds of an asset.
@@ -267,7 +267,7 @@ def test_photographs_become_assets_as_documented(desk: Path, captured: tuple[Pat
 
 
 @pytest.mark.slow
-def test_videos_become_captures_as_documented(tmp_path: Path) -> None:
+def test_the_documented_video_commands_make_a_capture(tmp_path: Path) -> None:
     (tmp_path / "videos").mkdir()
     rendered.render_video(tmp_path / "videos/mug.mp4")
     for words in FILMED:
@@ -279,7 +279,7 @@ def test_videos_become_captures_as_documented(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("command", ["audit", "report", "render", "check", "schema"])
-def test_a_name_that_is_not_utf_8_is_one_sentence(command, capsys):
+def test_a_file_name_that_is_not_utf_8_is_refused(command, capsys):
     """Native libraries end the process instead, or take it for no text."""
     assert type_in(command, os.fsdecode(b"bad\xff/scene.yaml")) == 2
     assert capsys.readouterr().err == (
@@ -287,7 +287,7 @@ def test_a_name_that_is_not_utf_8_is_one_sentence(command, capsys):
     )
 
 
-def test_a_current_folder_that_is_not_utf_8_is_one_sentence(tmp_path, monkeypatch, capsys):
+def test_a_current_folder_that_is_not_utf_8_is_refused(tmp_path, monkeypatch, capsys):
     folder = tmp_path / os.fsdecode(b"bad\xff")
     folder.mkdir()
     monkeypatch.chdir(folder)

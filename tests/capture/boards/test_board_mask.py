@@ -35,7 +35,7 @@ def squares_of(found: np.ndarray, camera: Camera) -> set[tuple[int, int]]:
     return {place for place, (x, y) in zip(middles, pixels.astype(int), strict=True) if found[y, x]}
 
 
-def test_a_bare_board_is_bare_whatever_light_falls_on_it(photo: tuple[Camera, np.ndarray]) -> None:
+def test_all_squares_of_a_bare_board_are_found_in_even_and_dim_light(photo: tuple[Camera, np.ndarray]) -> None:
     camera, grey = photo
     x = np.linspace(0.5, 1, grey.shape[1])
     dim = np.random.default_rng(0).normal(20 + 0.6 * x * grey, 3).clip(0, 255).astype(np.uint8)
@@ -44,7 +44,7 @@ def test_a_bare_board_is_bare_whatever_light_falls_on_it(photo: tuple[Camera, np
 
 
 @pytest.mark.parametrize("grey_of_it", [5, 50, 120, 180, 250])
-def test_what_covers_a_corner_of_a_square_leaves_none_of_it(photo: tuple[Camera, np.ndarray], grey_of_it: int) -> None:
+def test_a_square_with_a_covered_corner_is_not_bare(photo: tuple[Camera, np.ndarray], grey_of_it: int) -> None:
     """A thing of any brightness lies over corners of the squares (1, 2) to (2, 3)."""
     camera, grey = photo
     corners = BOARD.square * np.array([[-0.35, -0.3, 0], [0.3, -0.3, 0], [0.3, 0.4, 0], [-0.35, 0.4, 0]])
@@ -60,7 +60,7 @@ def test_what_covers_a_corner_of_a_square_leaves_none_of_it(photo: tuple[Camera,
     assert len(places) >= ALL - 6
 
 
-def test_another_picture_is_no_board(photo: tuple[Camera, np.ndarray]) -> None:
+def test_images_without_the_board_have_no_bare_squares(photo: tuple[Camera, np.ndarray]) -> None:
     camera, grey = photo
     rng = np.random.default_rng(1)
     coarse = rng.integers(0, 255, (12, 16)).astype(np.uint8)

@@ -58,7 +58,7 @@ def thing() -> Any:
 
 
 @pytest.mark.parametrize("kind", GROUNDS)
-def test_an_object_among_things_is_cut_out_without_a_hint(kind: str, thing: Any, tmp_path: Path) -> None:
+def test_an_object_in_clutter_is_isolated_without_a_hint(kind: str, thing: Any, tmp_path: Path) -> None:
     scene, views = room(kind=kind) | {"solid": thing}, walk(VIEWS, WIDTH)
     photograph(scene, views, tmp_path / "photos", samples=4, noise=0.008, gains=exposures(VIEWS))
     show_where(scene, "solid", views, tmp_path / "truth")

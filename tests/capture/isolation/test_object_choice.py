@@ -35,7 +35,9 @@ def pick(place: tuple[Float64Array, Int64Array, list[PhotoView]], thing: int) ->
     return Pick("one.jpg:1,2", view, (float(u), float(v)))
 
 
-def test_uneven_ground_is_found_under_things(place: tuple[Float64Array, Int64Array, list[PhotoView]]) -> None:
+def test_uneven_ground_under_objects_is_found_within_2_mm(
+    place: tuple[Float64Array, Int64Array, list[PhotoView]],
+) -> None:
     points, labels, views = place
     support = find_support(points, focus_of([view.camera for view in views])[0], 0.28)
     near = (labels == 0) & (np.abs(points[:, :2]) < 0.2).all(axis=1)
@@ -44,7 +46,9 @@ def test_uneven_ground_is_found_under_things(place: tuple[Float64Array, Int64Arr
     assert support.roughness < 0.002
 
 
-def test_what_the_cameras_look_at_is_chosen(place: tuple[Float64Array, Int64Array, list[PhotoView]]) -> None:
+def test_the_object_in_the_focus_of_the_cameras_is_chosen(
+    place: tuple[Float64Array, Int64Array, list[PhotoView]],
+) -> None:
     points, labels, views = place
     found = choose_object(points, views)
     assert sorted(sorted(ball_of(other, place)) for other in found.others) == [[2], [3]]
@@ -54,7 +58,7 @@ def test_what_the_cameras_look_at_is_chosen(place: tuple[Float64Array, Int64Arra
     assert np.abs(feet[:, 2] - ground(feet)).max() < 0.006
 
 
-def test_hints_choose_another_thing(place: tuple[Float64Array, Int64Array, list[PhotoView]]) -> None:
+def test_picks_and_a_box_choose_another_object(place: tuple[Float64Array, Int64Array, list[PhotoView]]) -> None:
     points, _, views = place
     assert ball_of(choose_object(points, views, picks=[pick(place, 3)]).above, place) == {3}
     both = choose_object(points, views, picks=[pick(place, 1), pick(place, 2)])
@@ -64,7 +68,7 @@ def test_hints_choose_another_thing(place: tuple[Float64Array, Int64Array, list[
     assert ball_of(boxed.above, place) == {2}
 
 
-def test_hints_that_fit_nothing_are_refused(place: tuple[Float64Array, Int64Array, list[PhotoView]]) -> None:
+def test_hints_without_a_matching_object_are_refused(place: tuple[Float64Array, Int64Array, list[PhotoView]]) -> None:
     points, labels, views = place
     one = pick(place, 1)
     with pytest.raises(InputError, match=r"selected by both --pick and --pick-not \(one.jpg:1,2\)"):

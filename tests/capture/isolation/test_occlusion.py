@@ -27,7 +27,7 @@ CAMERA = Camera.look_at((0, -5, 0), (0, 0, 0), width=640, height=480, fov_x=3)
 
 
 @pytest.mark.parametrize("aside", [0.0, 0.02, 0.04, 0.06, 0.1])
-def test_a_ball_hides_as_much_of_another_as_their_discs_share(aside: float) -> None:
+def test_the_hidden_share_of_a_ball_is_the_overlap_of_two_discs(aside: float) -> None:
     own, before, behind = ball((0, 0, 0)), ball((aside, -0.2, 0)), ball((aside, 0.2, 0))
     # Two discs of radius r whose middles are d apart share 2 r^2 acos(d / 2r) - d sqrt(r^2 - d^2 / 4).
     half = min(aside / 0.08, 1.0)
@@ -37,25 +37,25 @@ def test_a_ball_hides_as_much_of_another_as_their_discs_share(aside: float) -> N
     assert hidden_share(CAMERA, own, [before, behind, before]) == pytest.approx(shared, abs=0.05)
 
 
-def test_a_ring_around_the_object_hides_only_what_stands_before_it() -> None:
+def test_a_ring_around_the_object_hides_only_with_its_front() -> None:
     turns = np.linspace(0, 2 * np.pi, 400, endpoint=False)
     ring = np.column_stack([0.07 * np.cos(turns), 0.07 * np.sin(turns), np.full(400, -0.035)])
     camera = Camera.look_at((0, -0.4, 0.25), (0, 0, 0), width=640, height=480, fov_x=40)
     assert hidden_share(camera, ball((0, 0, 0)), [ring]) < 0.1
 
 
-def test_too_few_points_hide_nothing() -> None:
+def test_too_few_points_give_no_hidden_share() -> None:
     assert hidden_share(CAMERA, ball((0, 0, 0)), []) == 0
     assert hidden_share(CAMERA, ball((0, 0, 0)), [ball((0, -0.2, 0))[:3]]) == 0
     assert hidden_share(CAMERA, ball((0, -6, 0)), [ball((0, -0.2, 0))]) == 0
 
 
-def test_a_few_points_are_enough_of_a_small_thing() -> None:
+def test_thirty_points_are_enough_to_hide_a_share() -> None:
     """Thirty points, as plain things have, are sparse: the thing lies between them nevertheless."""
     assert hidden_share(CAMERA, ball((0, 0, 0)), [ball((0.02, -0.2, 0), 0.03, count=30)]) > 0.2
 
 
-def test_pixels_are_those_of_what_stands_before_the_object_and_a_rim_of_them() -> None:
+def test_hidden_pixels_are_those_of_the_occluder_and_a_rim() -> None:
     _, may_hide, pixels = hidden_part(CAMERA, ball((0, 0, 0)), [ball((0.05, -0.2, 0)), ball((-0.05, 0.2, 0))])
     assert 0.3 < may_hide < 0.6
     y, x = np.mgrid[0:480, 0:640] + 0.5
@@ -65,7 +65,7 @@ def test_pixels_are_those_of_what_stands_before_the_object_and_a_rim_of_them() -
     assert pixels[near & (away < 0.97)].all() and not pixels[near & (away > 1.3)].any()
 
 
-def test_a_plain_side_between_points_may_hide_the_object() -> None:
+def test_a_can_with_points_on_its_rims_only_may_hide_the_object() -> None:
     """A can whose points are on its rims alone."""
     turns = np.linspace(0, 2 * np.pi, 60, endpoint=False)
     rims = [np.column_stack([0.04 * np.cos(turns), 0.04 * np.sin(turns) - 0.2, np.full(60, z)]) for z in (-0.04, 0.04)]

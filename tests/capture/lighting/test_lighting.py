@@ -70,7 +70,7 @@ def estimated(sky: Float32Array, **settings: Any) -> LightEstimate:
 
 
 class TestPanoramas:
-    def test_weights_are_exact(self) -> None:
+    def test_weights_sum_to_the_sphere_and_to_closed_form_irradiance(self) -> None:
         assert solid_angles(16, 32).sum() * 32 == pytest.approx(4 * np.pi)
         assert level_weights(16, 32).sum() * 32 == pytest.approx(np.pi)
         assert level_weights(15, 30).sum() * 30 == pytest.approx(np.pi)  # the horizon is inside of a row
@@ -78,7 +78,7 @@ class TestPanoramas:
         np.testing.assert_allclose(level_irradiance(sky), 2 * np.pi / 3, rtol=1e-3)
 
     @pytest.mark.parametrize("turn", [0.0, 130.0])
-    def test_directions_are_those_that_the_renderer_shows(self, tmp_path: Path, turn: float) -> None:
+    def test_directions_agree_with_those_of_the_renderer(self, tmp_path: Path, turn: float) -> None:
         sky = np.zeros((32, 64, 3), np.float32)
         sky[7, 50] = 1.0
         panorama.write_exr(tmp_path / "sky.exr", sky)
@@ -102,7 +102,9 @@ class TestLamps:
             (300, 15, 2, 0),
         ],
     )
-    def test_a_disc(self, azimuth: float, elevation: float, radius: float, turn: float) -> None:
+    def test_a_disc_has_the_irradiance_of_its_closed_form(
+        self, azimuth: float, elevation: float, radius: float, turn: float
+    ) -> None:
         """Irradiance by a disc of angular radius r and elevation e: pi L sin(r)^2 sin(e)."""
         bright, rest = np.array([30.0, 20.0, 10.0]), np.array([0.2, 0.25, 0.3])
         sky = painted((azimuth, elevation, radius, bright), rest=rest, turn=turn)
@@ -119,7 +121,7 @@ class TestLamps:
         np.testing.assert_allclose(lamp.colour, (bright - rest) / ((bright - rest) @ LUMINANCE), rtol=0.01)
 
     @pytest.mark.parametrize(("azimuth", "elevation"), [(40, 45), (90, 30), (200, 80)])
-    def test_a_large_rectangle(self, azimuth: float, elevation: float) -> None:
+    def test_a_rectangle_of_60_degrees_is_found_with_its_size(self, azimuth: float, elevation: float) -> None:
         """As wide as 60 degrees: what its edges cover is larger in the panorama than in its plane."""
         direction, extents = unit_vector(azimuth, elevation), np.array([1.15, 0.8])
         sight = directions(HEIGHT, WIDTH)
@@ -130,7 +132,7 @@ class TestLamps:
         np.testing.assert_allclose(lamp.extents, extents, rtol=0.03)
         np.testing.assert_allclose(lamp.radiance, 19.8, rtol=0.03)
 
-    def test_several_by_their_share(self) -> None:
+    def test_several_lamps_are_sorted_by_their_irradiance(self) -> None:
         discs = ((20, 50, 4, 20.0), (140, 30, 8, 5.0), (250, 60, 6, 20.0), (330, 20, 1, 10.0), (0, -40, 9, 40.0))
         sky = painted(*discs)
         found = estimated(sky)
@@ -147,7 +149,7 @@ class TestLamps:
 
     @pytest.mark.parametrize(("gap", "lamps"), [(2.5, 1), (5.0, 2)])
     @pytest.mark.parametrize("azimuth", [10.0, 90.0])
-    def test_what_is_close_is_one(self, gap: float, lamps: int, azimuth: float) -> None:
+    def test_lamps_closer_than_a_gap_are_one_lamp(self, gap: float, lamps: int, azimuth: float) -> None:
         tilt = 4.0 + gap / 2
         tubes = painted((azimuth, 30 - tilt, 4, 20.0), (azimuth, 30 + tilt, 4, 20.0))
         found = estimated(tubes)
@@ -156,14 +158,14 @@ class TestLamps:
             width, height = found.lamps[0].angular_size
             assert height > 1.8 * width and between(found.lamps[0].direction, unit_vector(azimuth, 30)) < 0.5
 
-    def test_skies_without_lamps(self) -> None:
+    def test_skies_without_lamps_give_none(self) -> None:
         height = directions(HEIGHT, WIDTH)[..., 2:].repeat(3, axis=2)
         overcast = (1 + 2 * height.clip(0)) / 3  # CIE 1955
         assert estimated(overcast).lamps == []
         windows = np.where((height > 0.2) & (height < 0.4), 30.0, 1.0).astype(np.float32)
         assert estimated(windows).lamps == []  # all around
 
-    def test_energy_is_kept_whatever_is_there(self) -> None:
+    def test_lamps_and_ambient_light_keep_the_irradiance(self) -> None:
         random = np.random.default_rng(5)
         for _ in range(6):
             discs = [
@@ -179,7 +181,7 @@ class TestLamps:
 
     @pytest.mark.parametrize("azimuth", [0.0, 77.0])
     @pytest.mark.parametrize(("elevation", "extents"), [(90, (0.3, 0.6)), (50, (0.5, 0.2)), (20, (0.2, 0.3))])
-    def test_a_rectangle_sends_what_lambert_says(
+    def test_a_rectangle_has_the_irradiance_of_lamberts_formula(
         self, azimuth: float, elevation: float, extents: tuple[float, float]
     ) -> None:
         direction = unit_vector(azimuth, elevation)
@@ -190,7 +192,7 @@ class TestLamps:
 
 class TestLines:
     @pytest.mark.parametrize("rest", ["image", "constant"])
-    def test_they_are_those_of_a_scene(
+    def test_written_lines_give_a_scene_the_light_of_the_panorama(
         self, tmp_path: Path, write_scene: WriteScene, scene_data: Any, rest: Any
     ) -> None:
         """Read by the scene file's own reader, they send the panorama's light onto a table."""
@@ -218,7 +220,7 @@ class TestLines:
             sent += level_irradiance(panorama.read_radiance(scene.images[environment.image]))
         np.testing.assert_allclose(sent, level_irradiance(sky), rtol=1e-3)
 
-    def test_irradiance_may_be_stated(self) -> None:
+    def test_a_stated_irradiance_scales_all_lights(self) -> None:
         sky = painted((10, 60, 6, 20.0))
         found = estimated(sky, irradiance=2.0)
         assert found.irradiance @ LUMINANCE == pytest.approx(2.0, rel=1e-4)
@@ -237,7 +239,7 @@ class TestBrackets:
             for t in times
         ]
 
-    def test_three_recover_the_curve(self) -> None:
+    def test_three_exposures_recover_the_response_curve(self) -> None:
         radiance = np.geomspace(0.02, 25, 120 * 120).reshape(120, 120, 1) * np.array([1.0, 0.9, 0.7])
         times = [2.0, 0.25, 0.03]
         shown, clipped = merge_exposures(self.shot(radiance, times), times)
@@ -250,14 +252,14 @@ class TestBrackets:
         # What only the shortest exposure does not clip is as bright as it is.
         assert ratio[radiance > 10].mean() == pytest.approx(1, abs=0.06)
 
-    def test_white_in_the_shortest_is_a_lower_bound(self) -> None:
+    def test_pixels_clipped_in_the_shortest_exposure_are_a_lower_bound(self) -> None:
         levels = np.full((8, 8, 3), 255, np.uint8)
         shown, clipped = merge_exposures([levels, levels], [0.5, 0.02])
         assert clipped.all() and shown == pytest.approx(1 / 0.02)
         (single, _) = merge_exposures([np.full((8, 8, 3), 100, np.uint8)], [1.0])
         assert single == pytest.approx(float(decode_srgb(100 / 255)), rel=1e-6)
 
-    def test_exif(self, tmp_path: Path) -> None:
+    def test_exposure_and_orientation_are_read_from_exif(self, tmp_path: Path) -> None:
         image = Image.new("RGB", (300, 200))
         exif = image.getexif()
         exif.get_ifd(0x8769).update({0x829A: 0.02, 0x829D: 4.0, 0x8827: 400, 0xA405: 50})
@@ -295,7 +297,7 @@ def mirrored() -> tuple[Float32Array, Float32Array]:
 class TestBall:
     """Below a sky that is far away, as the geometry has it."""
 
-    def test_it_is_unwrapped(self, mirrored: Any) -> None:
+    def test_an_unwrapped_ball_equals_its_panorama(self, mirrored: Any) -> None:
         sky, image = mirrored
         ball = seen_ball(240)
         focal = 120 / np.tan(np.radians(room.FOV) / 2)
@@ -318,7 +320,7 @@ class TestBall:
         assert error(None, 0) > 3 * error(focal, 0)  # parallel rays are a coarser model
         assert error(focal, 3) > 2 * error(focal, 0)  # so that three degrees would be found out
 
-    def test_the_blind_spot(self, mirrored: Any) -> None:
+    def test_the_blind_spot_has_the_angle_of_its_closed_form(self, mirrored: Any) -> None:
         """sin(a) = radius / distance, and the rim of 1.5 px: of 80 px, 11 degrees of parallel rays."""
         image = np.zeros((200, 200, 3), np.float32)
         nothing = np.zeros((200, 200), bool)
@@ -326,7 +328,7 @@ class TestBall:
         rim = np.degrees(np.pi - 2 * np.arcsin(1 - 1.5 / 80))
         assert found.blind == pytest.approx(rim, abs=0.2)
 
-    def test_it_is_found(self, mirrored: Any) -> None:
+    def test_a_ball_before_clutter_is_found(self, mirrored: Any) -> None:
         _, image = mirrored
         clutter = np.random.default_rng(2).uniform(0, 255, (16, 16, 3)).astype(np.uint8)
         behind = np.asarray(Image.fromarray(clutter).resize((240, 240), Image.Resampling.NEAREST))
@@ -371,20 +373,22 @@ def found(shots: list[Path]) -> LightEstimate:
 class TestRoom:
     """A path-traced room, photographed in exposures of 8 bits with noise and a tone curve."""
 
-    def test_where_the_lamps_are(self, found: LightEstimate) -> None:
+    def test_lamps_are_found_within_3_degrees(self, found: LightEstimate) -> None:
         """That light is mirrored 3 cm from the ball's middle is a degree of a lamp in 1.9 m."""
         assert len(found.lamps) == len(room.LAMPS)
         for lamp, true in zip(found.lamps, room.LAMPS, strict=True):
             assert between(lamp.direction, true.direction) < 3.0
 
-    def test_how_large_and_of_which_colour(self, found: LightEstimate) -> None:
+    def test_lamps_have_their_area_within_15_percent_and_their_colour(self, found: LightEstimate) -> None:
         for lamp, true in zip(found.lamps, room.LAMPS, strict=True):
             flat = true.corners / (true.corners @ true.direction)[:, None]
             area = 0.5 * np.linalg.norm(np.cross(flat[2] - flat[0], flat[3] - flat[1]))
             assert lamp.extents[0] * lamp.extents[1] == pytest.approx(area, rel=0.15)
             np.testing.assert_allclose(lamp.colour, np.array(true.radiance) / (true.radiance @ LUMINANCE), atol=0.06)
 
-    def test_shares(self, found: LightEstimate, direct: list[Float64Array], whole: Float64Array) -> None:
+    def test_lamps_and_ambient_light_have_their_shares_within_10_percent(
+        self, found: LightEstimate, direct: list[Float64Array], whole: Float64Array
+    ) -> None:
         ambient = 1 - float(sum(direct) @ LUMINANCE / (whole @ LUMINANCE))
         assert 0.25 < ambient < 0.4
         assert found.share(found.ambient) == pytest.approx(ambient, rel=0.1)
@@ -392,7 +396,7 @@ class TestRoom:
             assert found.share(lamp.irradiance) == pytest.approx(float(true @ LUMINANCE / (whole @ LUMINANCE)), rel=0.1)
         np.testing.assert_allclose(found.irradiance / np.pi, whole / (whole @ LUMINANCE), rtol=0.05)
 
-    def test_a_thing_under_it_looks_as_in_the_room(
+    def test_a_matt_ball_under_the_estimated_light_looks_as_in_the_room(
         self, found: LightEstimate, whole: Float64Array, tmp_path: Path
     ) -> None:
         """A matt ball, lit by the room and by the lines; and by lines that are turned, which show."""
@@ -415,20 +419,22 @@ class TestRoom:
         assert error(0) < 0.05
         assert error(15) > 2 * error(0)
 
-    def test_one_photograph_is_said_to_be_a_bound(self, shots: list[Path]) -> None:
+    def test_a_single_exposure_warns_that_clipped_lamps_are_a_bound(self, shots: list[Path]) -> None:
         reading = read_ball(shots[2:3], BallView(room.AZIMUTH, room.ELEVATION))
         assert reading.warnings[0].startswith("1 exposure: the response of sRGB is assumed")
         assert "is white (from 250 of 255) in the shortest exposure" in reading.warnings[1]
         single = estimate_light(reading.panorama.radiance, LightSettings())
         assert between(single.lamps[0].direction, room.LAMPS[0].direction) < 15
 
-    def test_what_the_ball_swallows(self, shots: list[Path]) -> None:
+    def test_the_reflectivity_of_the_ball_is_divided_out(self, shots: list[Path]) -> None:
         ball = BallView(room.AZIMUTH, room.ELEVATION, ball=seen_ball_in_the_middle())
         whole = read_ball(shots, ball).panorama.radiance
         tinted = read_ball(shots, replace(ball, reflectivity=(1.0, 0.8, 0.25))).panorama.radiance
         np.testing.assert_allclose(tinted * np.float32([1, 0.8, 0.25]), whole, rtol=1e-5)
 
-    def test_the_command(self, shots: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def test_the_lights_command_writes_lights_and_panorama(
+        self, shots: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
         camera = ("--camera", room.AZIMUTH, room.ELEVATION)
         assert run("lights", *shots, *camera, "-o", tmp_path / "cell.yaml") == 0
         out = capsys.readouterr().out
@@ -539,7 +545,7 @@ class TestInput:
             (["nan.exr", "--rotate-z", "nan"], "--around and --rotate-z must be finite"),
         ],
     )
-    def test_one_sentence(
+    def test_invalid_input_is_refused_in_one_sentence(
         self,
         folder: Path,
         capsys: pytest.CaptureFixture[str],
@@ -554,6 +560,6 @@ class TestInput:
         assert capsys.readouterr().err.startswith(f"mitsplat: {sentence}")
         assert not list(folder.glob("out*"))
 
-    def test_lines_are_yaml(self, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def test_an_output_that_is_not_yaml_is_refused(self, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
         assert run("lights", "dark.exr", "-o", "out.txt") == 2
         assert capsys.readouterr().err == "mitsplat: --out must end in .yaml or .yml (got out.txt)\n"

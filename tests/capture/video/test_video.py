@@ -87,7 +87,7 @@ def numbers(chosen: ChosenFrames) -> list[int]:
     return [round(time * RATE) for time in times]
 
 
-def test_frames_are_sharp_and_lie_evenly_in_displacement(pan: Path, tmp_path: Path) -> None:
+def test_chosen_frames_are_sharp_and_evenly_spaced_in_displacement(pan: Path, tmp_path: Path) -> None:
     chosen = choose_frames(pan, tmp_path / "frames", most=150, least=3)
     x = places()
     length = (x[-1] - x[0]) / SIZE[0]
@@ -108,14 +108,14 @@ def test_frames_are_sharp_and_lie_evenly_in_displacement(pan: Path, tmp_path: Pa
         assert np.sqrt(np.mean(error**2)) < 12  # of the video's own compression; the next frame's is 20 and more
 
 
-def test_no_more_frames_than_asked_for_and_then_farther_apart(few: ChosenFrames) -> None:
+def test_a_limit_of_frames_widens_their_spacing(few: ChosenFrames) -> None:
     assert 7 <= len(few.names) <= 8
     steps = np.diff(places()[numbers(few)])
     assert steps.max() < 3.5 * steps.min()
     assert not BLURRED & set(numbers(few))
 
 
-def test_the_same_video_gives_the_same_frames_and_they_are_kept(pan: Path, few: ChosenFrames, tmp_path: Path) -> None:
+def test_the_same_video_gives_the_same_frames_and_reuses_them(pan: Path, few: ChosenFrames, tmp_path: Path) -> None:
     one = choose_frames(pan, tmp_path / "one", most=8, least=3)
     data = {name: (one.folder / name).read_bytes() for name in one.names}
     assert data == {name: (few.folder / name).read_bytes() for name in few.names}
@@ -129,7 +129,7 @@ def test_the_same_video_gives_the_same_frames_and_they_are_kept(pan: Path, few: 
     assert {path.name for path in one.folder.glob("*.jpg")} == set(other.names) != set(one.names)
 
 
-def test_cuts_are_noticed_and_each_shot_has_its_frames(tmp_path: Path) -> None:
+def test_cuts_are_detected_and_each_shot_has_frames(tmp_path: Path) -> None:
     first, second = plane(1), plane(2)
     pictures = [seen(first, 2.0 * k) for k in range(60)] + [seen(second, 600 - 2.0 * k) for k in range(60)]
     chosen = choose_frames(write(tmp_path / "cut.avi", pictures, "MJPG"), tmp_path / "frames", most=150, least=3)
@@ -141,7 +141,7 @@ def test_cuts_are_noticed_and_each_shot_has_its_frames(tmp_path: Path) -> None:
     assert len(shots[0]) >= 7 and len(shots[1]) >= 6
 
 
-def test_a_moment_of_blur_is_no_cut(tmp_path: Path) -> None:
+def test_a_blurred_frame_is_not_a_cut(tmp_path: Path) -> None:
     texture = plane(3)
     pictures = [
         cv2.GaussianBlur(seen(texture, 2.0 * k), (0, 0), 25) if 50 <= k < 54 else seen(texture, 2.0 * k)
@@ -153,7 +153,7 @@ def test_a_moment_of_blur_is_no_cut(tmp_path: Path) -> None:
     assert not set(range(50, 54)) & set(numbers(chosen))
 
 
-def test_noise_and_a_trembling_hand_add_up_to_nothing() -> None:
+def test_noise_and_shake_give_no_displacement() -> None:
     texture, rng, clock = plane(4), np.random.default_rng(0), MotionClock()
     for _ in range(150):
         x, y = rng.normal(0, 0.6, 2)
@@ -163,7 +163,7 @@ def test_noise_and_a_trembling_hand_add_up_to_nothing() -> None:
     assert moved.path < 0.01
 
 
-def test_nothing_to_follow_is_not_taken(tmp_path: Path) -> None:
+def test_frames_without_texture_are_neither_a_shot_nor_chosen(tmp_path: Path) -> None:
     """A video that fades in from black: what shows nothing is neither a shot nor a frame to take."""
     texture = plane(5)
     pictures = [np.zeros((SIZE[1], SIZE[0], 3), np.uint8)] * 20 + [seen(texture, 2.0 * k) for k in range(60)]
@@ -172,7 +172,7 @@ def test_nothing_to_follow_is_not_taken(tmp_path: Path) -> None:
     assert min(numbers(chosen)) >= 20
 
 
-def test_blur_decides_and_not_texture() -> None:
+def test_sharpness_does_not_depend_on_texture() -> None:
     """A step of which every other frame is blurred, while texture grows tenfold from its begin to its end."""
     measures = [
         FrameMeasure(k, k / 30, Moved(0, 0.005 * k, followed=True), (0.2 if k % 2 else 1.0) * 10 ** (k / 100))
@@ -185,7 +185,7 @@ def test_blur_decides_and_not_texture() -> None:
     assert steps.min() > 0.5 * STEP and steps.max() < 1.5 * STEP
 
 
-def test_a_step_that_is_sharp_at_its_border_alone_is_taken_there() -> None:
+def test_the_sharp_frame_at_the_border_of_a_step_is_chosen() -> None:
     measures = [
         FrameMeasure(k, k / 30, Moved(0, 0.005 * k, followed=True), 1.0 if k % 10 == 1 else 0.1) for k in range(31)
     ]
@@ -206,7 +206,7 @@ def turned_by(file: Path, degrees: int) -> Path:
 
 
 @pytest.mark.parametrize("degrees", [90, 180, 270])
-def test_videos_of_a_phone_on_its_side_are_turned(pan: Path, few: ChosenFrames, tmp_path: Path, degrees: int) -> None:
+def test_the_rotation_stated_by_a_video_is_applied(pan: Path, few: ChosenFrames, tmp_path: Path, degrees: int) -> None:
     turned = choose_frames(turned_by(pan, degrees), tmp_path / "turned", most=8, least=3)
     with Image.open(turned.folder / turned.names[0]) as picture:
         shown = np.asarray(picture).astype(float)
@@ -271,19 +271,21 @@ def jumpy(file: Path) -> Path:
     ],
     ids=lambda value: getattr(value, "__name__", ""),
 )
-def test_what_is_no_use_is_refused_in_a_sentence(make, sentence: str, tmp_path: Path) -> None:
+def test_unusable_videos_are_refused_in_one_sentence(make, sentence: str, tmp_path: Path) -> None:
     file = make(tmp_path / "clip.mp4")
     with pytest.raises(InputError, match=rf"clip\.mp4: {sentence}") as refused:
         choose_frames(file, tmp_path / "frames", most=6, least=3)
     assert "\n" not in str(refused.value)
 
 
-def test_a_number_of_frames_that_is_no_use() -> None:
+def test_a_number_of_frames_out_of_range_is_refused() -> None:
     with pytest.raises(InputError, match=r"at least 3 frames must be taken of a video \(got 2\)"):
         choose_frames(Path("clip.mp4"), Path("frames"), most=2, least=3)
 
 
-def test_a_decoder_that_ends_its_process_is_told_of(pan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_crash_of_the_decoder_is_reported_in_one_sentence(
+    pan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     stand_in = tmp_path / "python"
     stand_in.write_text("#!/bin/sh\nkill -SEGV $$\n")
     stand_in.chmod(0o755)
@@ -292,7 +294,7 @@ def test_a_decoder_that_ends_its_process_is_told_of(pan: Path, tmp_path: Path, m
         choose_frames(pan, tmp_path / "frames", most=6, least=3)
 
 
-def test_lists_of_other_files_are_no_videos(pan: Path, tmp_path: Path) -> None:
+def test_playlists_of_other_files_are_refused(pan: Path, tmp_path: Path) -> None:
     for name, lines in {
         "list.m3u8": ["#EXTM3U", "#EXTINF:8,", "http://127.0.0.1:9/clip.ts", "#EXT-X-ENDLIST"],
         "list.ffconcat": ["ffconcat version 1.0", f"file '{pan}'"],
@@ -302,7 +304,7 @@ def test_lists_of_other_files_are_no_videos(pan: Path, tmp_path: Path) -> None:
             choose_frames(tmp_path / name, tmp_path / "frames", most=6, least=3)
 
 
-def test_the_worker_says_one_object_a_line_and_nothing_else(pan: Path, tmp_path: Path) -> None:
+def test_the_video_worker_prints_one_json_object_per_line_only(pan: Path, tmp_path: Path) -> None:
     command = [
         sys.executable,
         "-m",

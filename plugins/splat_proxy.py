@@ -40,7 +40,7 @@ from mitsplat.renderer.splatting.march import Image, largest_and_mean, trace
 from mitsplat.renderer.splatting.pairs import CrowdedError
 from mitsplat.renderer.splatting.projection import CloudSet, Placement, merge_clouds
 from mitsplat.renderer.splatting.static_tile_cache import StaticTileCache
-from mitsplat.runtime.dropped_rays import refuse_lost_rays
+from mitsplat.runtime.dropped_rays import check_dropped_rays
 
 AOVS = (
     "captured.R",
@@ -240,7 +240,7 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
         image = mi.TensorXf(flat, shape=(view.height, view.width, len(channels)))
         if evaluate:
             dr.eval(image)
-            refuse_lost_rays()
+            check_dropped_rays()
         return image
 
     def render_layers(self, scene: Any, sensor: Any, *, seed: int = 0) -> dict[str, Any]:

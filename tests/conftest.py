@@ -23,8 +23,8 @@ from mitsplat.errors import MissingResourceError
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.camera import Camera
 from mitsplat.physics.settle import warp_settings
-from mitsplat.runtime.device import Lack, use_device, visible_gpus
-from mitsplat.runtime.dropped_rays import refuse_lost_rays
+from mitsplat.runtime.device import MissingPrerequisite, use_device, visible_gpus
+from mitsplat.runtime.dropped_rays import check_dropped_rays
 from mitsplat.scene.loading.scene_loading import load_scene
 from mitsplat.scene.scene import Scene
 from mitsplat.scene.spec.scene_spec import FORMATS
@@ -68,14 +68,14 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 def no_lost_rays() -> Iterator[None]:
     """Whatever a test renders on a GPU, and looks at however late, it renders with all rays."""
     yield
-    refuse_lost_rays()
+    check_dropped_rays()
 
 
 @pytest.fixture(scope="session")
 def gpu() -> None:
     """Skips what needs a GPU where there is none."""
     gpus = visible_gpus()
-    if isinstance(gpus, Lack):
+    if isinstance(gpus, MissingPrerequisite):
         pytest.skip(gpus.what)
 
 

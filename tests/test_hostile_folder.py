@@ -72,7 +72,7 @@ def service():
     control.chmod(0o700)
     os.environ["PATH"] = f"{control.parent.resolve()}:{os.environ['PATH']}"
     with closing(mps.SharedGpu()) as shared:
-        print(shared.lack)
+        print(shared.problem)
 
 
 def presets():

@@ -187,7 +187,7 @@ def test_processes_of_multiprocessing_start_in_safe_path_mode() -> None:
     starts = [module for module, path in MODULES.items() if "import multiprocessing" in path.read_text()]
     assert starts == ["mitsplat.engine.pool"]
     source = MODULES["mitsplat.engine.pool"].read_text()
-    assert "with starting_safely(), starting_on(" in source
+    assert "with safe_path_children(), children_on_gpu(" in source
     assert source.count("process.start()") == 1
 
 

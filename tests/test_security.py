@@ -257,7 +257,7 @@ class TestXml:
         assert f'"{(scene.parent / "sub/good.ply").resolve()}"' in text and "ok.ply" not in text
 
     def test_the_command_checks_first(self, scene, capsys, monkeypatch):
-        monkeypatch.setattr(xml_scene, "run_apart", None)
+        monkeypatch.setattr(xml_scene, "run_in_process", None)
         scene.write_text('<!DOCTYPE a><scene version="3.9.0"/>')
         with pytest.raises(InputError, match="must not have a document type"):
             xml_scene.render_xml(scene, scene.parent / "out.png")

@@ -17,8 +17,8 @@ from pathlib import Path
 from mitsplat.engine.resources import unused_memory
 from mitsplat.findings import Finding
 from mitsplat.runtime.child_process import python_command, python_environment
-from mitsplat.runtime.device import Lack, gpu_environment, visible_gpus
-from mitsplat.runtime.llvm import OLDEST_USABLE, VARIABLE
+from mitsplat.runtime.device import MissingPrerequisite, gpu_environment, visible_gpus
+from mitsplat.runtime.llvm import MIN_LLVM, VARIABLE
 from mitsplat.runtime.warp_start import quiet_warp
 from mitsplat.storage.cache import cache_folder, drjit_folder, unusable_reason, warp_folder
 
@@ -58,7 +58,7 @@ def _package(name: str) -> Finding:
 
 def _llvm() -> Finding:
     path = os.environ.get(VARIABLE) or "the system's libLLVM"
-    remedy = f"pip install karellen-llvm-core, or set {VARIABLE} to a libLLVM of version {OLDEST_USABLE} or newer"
+    remedy = f"pip install karellen-llvm-core, or set {VARIABLE} to a libLLVM of version {MIN_LLVM} or newer"
     number, fault = _render_trial_on("cpu", {})
     if fault:
         return Finding("LLVM", False, f"{number} from {path} {fault}" if number else f"{path} {fault}", remedy)
@@ -96,7 +96,7 @@ def _processor() -> Finding:
 def _cuda() -> Finding:
     """Check the GPUs, which are optional; report a GPU without OptiX or with a wrong picture as a problem."""
     gpus = visible_gpus()
-    if isinstance(gpus, Lack):
+    if isinstance(gpus, MissingPrerequisite):
         return Finding("GPU", "OptiX" not in gpus.what, f"{gpus.what} (optional)", gpus.remedy)
     driver, texts, ok = _driver(), [], True
     for gpu in gpus:

@@ -165,7 +165,7 @@ class RemoteFrames:
         self._images = {name: (path.suffix, path.read_bytes()) for name, path in maker.scene.images.items()}
         self._unpacked = False
 
-    def known(self, layout: int) -> str | None:
+    def cached_layout(self, layout: int) -> str | None:
         """Return a layout from the dataset folder, or None; must be called on the machine that has the folder."""
         path = self.maker.out / f"layouts/{layout:04d}.json"
         return path.read_text() if path.exists() else None

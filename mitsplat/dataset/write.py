@@ -33,7 +33,7 @@ from mitsplat.dataset.own_files import SHEET, TIMINGS, remove_folds
 from mitsplat.dataset.preflight import refuse, run_faults
 from mitsplat.engine.pool import check_workers, run_frames
 from mitsplat.engine.ray import Cluster, load_ray, run_on_ray
-from mitsplat.engine.resources import TYPICAL
+from mitsplat.engine.resources import TYPICAL_MEMORY
 from mitsplat.errors import InputError
 from mitsplat.formats.registry import FORMATS, Catalogue
 from mitsplat.frames.budget import worker_memory
@@ -199,7 +199,7 @@ def _results(
 ) -> Generator[tuple[Record, dict[str, float]]]:
     """Yield the record and the seconds of the stages of each frame, after its files were written to the folder."""
     if cluster is None:
-        memory = TYPICAL if workers is not None else worker_memory(make.scene)
+        memory = TYPICAL_MEMORY if workers is not None else worker_memory(make.scene)
         with closing(run_frames(make, layouts, workers=workers, note=note, memory=memory, device=device)) as made:
             yield from made
         return

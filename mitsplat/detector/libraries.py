@@ -26,7 +26,7 @@ WEIGHTS_ERRORS = (
 )
 """Exceptions that a damaged weights file can raise."""
 
-OLDEST_TORCH = "2.6"
+MIN_TORCH = "2.6"
 """First PyTorch release that lists the classes of a file before it loads it; the safe loader needs this."""
 
 _DEVICE = re.compile(r"auto|cpu|cuda(:\d{1,2})?")
@@ -61,8 +61,8 @@ def load_libraries() -> None:
     # Without this function, Ultralytics silently uses a loader that executes code.
     if not hasattr(torch.serialization, "get_unsafe_globals_in_checkpoint"):
         raise MissingResourceError(
-            f"detectors need PyTorch {OLDEST_TORCH} or newer, which reads weights without executing code from them "
-            f"(got {torch.__version__}): pip install 'torch>={OLDEST_TORCH}'"
+            f"detectors need PyTorch {MIN_TORCH} or newer, which reads weights without executing code from them "
+            f"(got {torch.__version__}): pip install 'torch>={MIN_TORCH}'"
         )
     os.environ["YOLO_OFFLINE"] = "true"
     os.environ["YOLO_AUTOINSTALL"] = "false"

@@ -15,7 +15,7 @@ import tempfile
 from contextlib import suppress
 
 from mitsplat.runtime.child_process import python_command, python_environment
-from mitsplat.runtime.gpu_memory import VISIBLE
+from mitsplat.runtime.gpu_memory import VISIBLE_GPUS
 
 CONTROL = "nvidia-cuda-mps-control"
 """Program that starts and stops the service."""
@@ -23,7 +23,7 @@ CONTROL = "nvidia-cuda-mps-control"
 PIPES = "CUDA_MPS_PIPE_DIRECTORY"
 """Environment variable: folder through which client processes find the service."""
 
-MOST_CLIENTS = 48
+MAX_CLIENTS = 48
 """Maximum number of processes per GPU; the service refuses more (NVIDIA, "Multi-Process Service")."""
 
 _LOGS = "CUDA_MPS_LOG_DIRECTORY"
@@ -38,7 +38,7 @@ assert hit[0]
 """
 """Test program that traces one ray in a separate process, to verify that the service works."""
 
-_KEEPER = """
+_STOP_AT_END = """
 read nothing
 echo quit -t 5 | {control}
 rm -rf {folder}
@@ -55,15 +55,15 @@ class SharedGpu:
     Attributes:
         environment: Environment variables of processes that use the service; empty if it is unavailable, or if
             processes find it by default.
-        lack: Reason why the service is unavailable, as the rest of "because ..."; empty if it is available.
+        problem: Reason why the service is unavailable, as the rest of "because ..."; empty if it is available.
     """
 
     def __init__(self) -> None:
         self.environment: dict[str, str] = {}
-        self.lack = ""
-        self._keeper: subprocess.Popen[bytes] | None = None
+        self.problem = ""
+        self._stopper: subprocess.Popen[bytes] | None = None
         if shutil.which(CONTROL) is None:
-            self.lack = f"{CONTROL}, which is part of NVIDIA's driver, is missing"
+            self.problem = f"{CONTROL}, which is part of NVIDIA's driver, is missing"
         elif _control("get_server_list"):
             return  # an already running service is used
         else:
@@ -72,10 +72,10 @@ class SharedGpu:
     def _start(self) -> None:
         folder = tempfile.mkdtemp(prefix="mitsplat-mps-", dir="/tmp")  # a socket's path must be short
         service = {PIPES: folder, _LOGS: folder}
-        self.environment = service | _renumbered(os.environ.get(VISIBLE, ""))
+        self.environment = service | _renumbered(os.environ.get(VISIBLE_GPUS, ""))
         try:
-            self._keeper = subprocess.Popen(
-                ["/bin/sh", "-c", _KEEPER.format(control=CONTROL, folder=folder)],
+            self._stopper = subprocess.Popen(
+                ["/bin/sh", "-c", _STOP_AT_END.format(control=CONTROL, folder=folder)],
                 env=os.environ | service,
                 stdin=subprocess.PIPE,
                 stdout=subprocess.DEVNULL,
@@ -101,20 +101,22 @@ class SharedGpu:
             self.close()
             if not isinstance(error, OSError | subprocess.TimeoutExpired):
                 raise
-            self.lack = f"{CONTROL} does not work ({error})"
+            self.problem = f"{CONTROL} does not work ({error})"
 
     def close(self) -> None:
         """Stop the service after its client processes have ended."""
-        keeper, self._keeper, self.environment = self._keeper, None, {}
-        if keeper is not None:
+        stopper, self._stopper, self.environment = self._stopper, None, {}
+        if stopper is not None:
             with suppress(subprocess.TimeoutExpired):
-                keeper.communicate(timeout=_TIMEOUT)
+                stopper.communicate(timeout=_TIMEOUT)
 
 
 def _renumbered(visible: str) -> dict[str, str]:
     """Renumber GPUs that are selected by index for clients, because the service counts its visible GPUs from 0."""
     names = visible.split(",")
-    return {VISIBLE: ",".join(map(str, range(len(names))))} if all(name.strip().isdigit() for name in names) else {}
+    if all(name.strip().isdigit() for name in names):
+        return {VISIBLE_GPUS: ",".join(map(str, range(len(names))))}
+    return {}
 
 
 def _control(command: str) -> bool:

@@ -23,8 +23,8 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from typing import Generic, Protocol, TypeVar
 
-from mitsplat.engine.mps import MOST_CLIENTS, SharedGpu
-from mitsplat.engine.resources import TYPICAL, WorkerMemory, unused_memory
+from mitsplat.engine.mps import MAX_CLIENTS, SharedGpu
+from mitsplat.engine.resources import TYPICAL_MEMORY, WorkerMemory, unused_memory
 from mitsplat.engine.shared_arrays import SharedArrays
 from mitsplat.errors import (
     InputError,
@@ -35,18 +35,18 @@ from mitsplat.errors import (
     sentence_of,
 )
 from mitsplat.progress import Note
-from mitsplat.runtime.child_process import starting_safely
+from mitsplat.runtime.child_process import safe_path_children
 from mitsplat.runtime.cores import usable_cores
-from mitsplat.runtime.device import Device, Gpu, Kind, current_device, starting_on, use_device, use_share
+from mitsplat.runtime.device import Device, Gpu, Kind, children_on_gpu, current_device, use_device, use_shared_device
 from mitsplat.storage.cache import prepare_caches
 
-Made = TypeVar("Made", covariant=True)
+MadeFrame = TypeVar("MadeFrame", covariant=True)
 Result = TypeVar("Result")
 
-MOST_LOSSES = 3
+MAX_LOSSES = 3
 """Maximum number of workers that one frame may terminate before the run is aborted."""
 
-WORTHWHILE = 1.1
+MIN_SPEED_UP = 1.1
 """Minimum speed-up for keeping another worker, if the engine chooses the number of workers."""
 
 _SPEED_WINDOW = 6
@@ -54,7 +54,7 @@ _SPEED_WINDOW = 6
 _MAX_SERIAL_FRAMES = 16
 """Number of frames up to which worker processes are not worth their start-up time."""
 
-_START = 300.0
+_START_TIMEOUT = 300.0
 """Time limit for the start of a worker [s]. On an idle machine, imports take about two seconds."""
 
 _POLL_INTERVAL = 1.0
@@ -66,10 +66,10 @@ _END_TIMEOUT = 30.0
 _SENTENCES: tuple[type[Exception], ...] = (InputError, MissingResourceError, PartialResultError)
 
 
-class MakeFrame(Protocol[Made]):
+class MakeFrame(Protocol[MadeFrame]):
     """Function that makes one frame; must be picklable if worker processes are used."""
 
-    def __call__(self, index: int, note: Note, /) -> Made:
+    def __call__(self, index: int, note: Note, /) -> MadeFrame:
         """Make frame ``index``."""
 
 
@@ -151,13 +151,13 @@ class Pool(Protocol[Result]):
     def stop(self, worker: int) -> None:
         """Stop a worker."""
 
-    def give(self, worker: int, frame: int, layout: int) -> None:
+    def send_frame(self, worker: int, frame: int, layout: int) -> None:
         """Send a frame to an idle worker."""
 
     def wait(self) -> Iterator[tuple[int, Answer[Result]]]:
         """Wait for answers and yield those that arrived; there may be none."""
 
-    def openings(self) -> int:
+    def free_slots(self) -> int:
         """Return the number of workers that can be started on newly available resources; each is reported once."""
 
     def close(self) -> None:
@@ -180,7 +180,7 @@ def run_frames(
     *,
     workers: int | None = 1,
     note: Note,
-    memory: WorkerMemory = TYPICAL,
+    memory: WorkerMemory = TYPICAL_MEMORY,
     device: Device | None = None,
 ) -> Generator[Result]:
     """Call ``make`` for every frame and yield the results in order of completion.
@@ -201,14 +201,14 @@ def run_frames(
         InputError: If the input of a frame is invalid.
         MissingResourceError: If the memory does not suffice for a frame in a single worker.
         FrameError: If a frame fails otherwise in a worker.
-        LostWorkersError: If :data:`MOST_LOSSES` workers died while making the same frame. Workers are stopped before an
+        LostWorkersError: If :data:`MAX_LOSSES` workers died while making the same frame. Workers are stopped before an
             exception is raised, and when the iterator is closed.
     """
     check_workers(workers)
     total = sum(map(len, layouts.values()))
     most = affordable_workers(memory, device) if workers is None else workers
     few = min(most, total) <= 1 or (workers is None and total <= _MAX_SERIAL_FRAMES)
-    if few and (device is None or device.is_here):
+    if few and (device is None or device.is_usable_here):
         if device is not None and device != current_device():
             use_device(device)
         for frames in layouts.values():
@@ -227,8 +227,8 @@ def run_frames(
     grow = workers is None and (device is None or not device.gpus)
     shares = device is not None and 0 < len(device.gpus) < min(most, total)
     with closing(SharedGpu()) if shares else nullcontext() as shared:
-        if shared is not None and shared.lack:
-            note(f"workers take turns on the GPU, because {shared.lack}")
+        if shared is not None and shared.problem:
+            note(f"workers take turns on the GPU, because {shared.problem}")
         with (
             closing(_Processes(make, device, {} if shared is None else shared.environment)) as pool,
             closing(run_pool(pool, layouts, most, note, grow=grow)) as found,
@@ -236,7 +236,7 @@ def run_frames(
             yield from found
 
 
-def run_apart(make: MakeFrame[Result], device: Device | None = None) -> Generator[Result]:
+def run_in_process(make: MakeFrame[Result], device: Device | None = None) -> Generator[Result]:
     """Call ``make`` for frame 0 in a separate process and yield the result.
 
     Raises:
@@ -251,7 +251,7 @@ def affordable_workers(memory: WorkerMemory, device: Device | None = None) -> in
     most = min(usable_cores(), int((unused_memory() * 2**30 - memory.shared) / memory.own))
     if device is not None and device.gpus:
         held = int(min(gpu.memory for gpu in device.gpus) / memory.gpu)
-        most = min(most, len(device.gpus) * min(held, MOST_CLIENTS))
+        most = min(most, len(device.gpus) * min(held, MAX_CLIENTS))
     return max(1, most)
 
 
@@ -287,7 +287,7 @@ def run_pool(
         live_workers[worker] = gone
         if (task := plan.take(worker)) is not None:
             at_work[worker] = task[1]
-            pool.give(worker, task[1], task[0])
+            pool.send_frame(worker, task[1], task[0])
 
     for _ in range(min(1, most) if grow else most):
         assign(pool.start())
@@ -321,9 +321,9 @@ def run_pool(
                 del live_workers[worker]
                 gone += 1
                 losses[frame] += 1
-                if losses[frame] == MOST_LOSSES:
+                if losses[frame] == MAX_LOSSES:
                     raise LostWorkersError(
-                        f"the worker of frame {frame} {answer.how}, {MOST_LOSSES} times in a row (out of memory?); "
+                        f"the worker of frame {frame} {answer.how}, {MAX_LOSSES} times in a row (out of memory?); "
                         "finished frames are kept"
                     )
                 plan.put_back(worker, frame)
@@ -347,7 +347,7 @@ def run_pool(
                         grow = False
             assign(worker)
             yield answer.result
-        for _ in range(pool.openings()):
+        for _ in range(pool.free_slots()):
             if plan.left:
                 assign(pool.start())
 
@@ -462,7 +462,7 @@ class _Growth:
         if self._finished < _SPEED_WINDOW * count:
             return ""
         speed = self._finished / (now - self._since)
-        if speed < WORTHWHILE * self._speed:
+        if speed < MIN_SPEED_UP * self._speed:
             return "stop"
         self._speed = speed
         return "start" if count < self._most else "stay"
@@ -497,7 +497,7 @@ class _Processes(Generic[Result]):
         process = self._spawn.Process(target=_work, args=arguments, name=f"mitsplat-{worker}", daemon=True)
         load = Counter(self._taken.values())
         gpu = min(self._gpus, key=load.__getitem__, default=None)
-        with starting_safely(), starting_on(gpu, **self._environment):
+        with safe_path_children(), children_on_gpu(gpu, **self._environment):
             resource_tracker.ensure_running()  # its start together with the first worker would unblock SIGINT
             # Ctrl-C reaches all processes of a terminal, but only this one must handle it: workers inherit the blocked
             # signal.
@@ -508,7 +508,7 @@ class _Processes(Generic[Result]):
                 signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
         far_end.close()  # so that the worker's death closes the pipe
         self._workers[worker] = process, pipe
-        self._starting[worker] = _START
+        self._starting[worker] = _START_TIMEOUT
         if gpu is not None:
             self._taken[worker] = gpu
         return worker
@@ -521,7 +521,7 @@ class _Processes(Generic[Result]):
         process.join()
         pipe.close()
 
-    def give(self, worker: int, frame: int, layout: int) -> None:
+    def send_frame(self, worker: int, frame: int, layout: int) -> None:
         with suppress(BrokenPipeError, ConnectionResetError):  # a dead worker is detected when its answer is received
             self._workers[worker][1].send(frame)
 
@@ -536,7 +536,7 @@ class _Processes(Generic[Result]):
                     self._starting[worker] -= waited
                     if self._starting[worker] <= 0:
                         self.stop(worker)
-                        yield worker, Lost(f"did not start within {_START:g} s")
+                        yield worker, Lost(f"did not start within {_START_TIMEOUT:g} s")
                 continue
             try:
                 answer = pipe.recv()
@@ -550,7 +550,7 @@ class _Processes(Generic[Result]):
             else:
                 yield worker, answer
 
-    def openings(self) -> int:
+    def free_slots(self) -> int:
         return 0
 
     def close(self) -> None:
@@ -580,7 +580,7 @@ def _work(pipe: Connection, device: Kind | None, make: MakeFrame[Result]) -> Non
             try:
                 if device is not None:
                     try:
-                        use_share(device)
+                        use_shared_device(device)
                     except (ImportError, RuntimeError, MissingResourceError) as error:
                         if device == "cpu":
                             raise

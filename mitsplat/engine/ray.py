@@ -20,10 +20,10 @@ from typing import Any, Generic, Protocol, TypeVar
 from mitsplat.engine.pool import Answer, Failure, Finished, Lost, LostWorkersError, check_workers, run_pool
 from mitsplat.errors import InputError, MissingResourceError
 from mitsplat.progress import Note
-from mitsplat.runtime.device import Device, Kind, use_share
+from mitsplat.runtime.device import Device, Kind, use_shared_device
 
 Result = TypeVar("Result")
-Made = TypeVar("Made", covariant=True)
+MadeFrame = TypeVar("MadeFrame", covariant=True)
 
 GPU_SHARE = {"CPU": 1.0, "GPU": 0.125}
 """Resources of a worker on a GPU: eight workers of 3 GiB each share a GPU of 24 GiB."""
@@ -38,16 +38,16 @@ _MAX_STORED_LAYOUTS = 64
 """Maximum number of layouts in the object store; any other layout is settled again or read from a cache."""
 
 
-class ClusterJob(Protocol[Made]):
+class ClusterJob(Protocol[MadeFrame]):
     """Job that settles layouts and makes their frames; must be picklable."""
 
-    def known(self, layout: int) -> str | None:
+    def cached_layout(self, layout: int) -> str | None:
         """Return a layout that is already settled, or None; called in the caller's process, not on the cluster."""
 
     def settle(self, layout: int) -> str:
         """Settle a layout."""
 
-    def make(self, index: int, layout: str) -> Made:
+    def make(self, index: int, layout: str) -> MadeFrame:
         """Make a frame of a settled layout."""
 
 
@@ -169,12 +169,12 @@ class _Actors(Generic[Result]):
         device, cluster = cluster.on_device(None)
         self._wanted, self._most = cluster.resources or {}, sys.maxsize if most is None else most
         self._actors: dict[int, Any] = {}
-        room = self._room()
+        room = self._workers_per_node()
         self._nodes, self.room = set(room), min(self._most, sum(room.values()))
         self._last_search = self._last_room = time.monotonic()
         if not self.room:
             self.close()
-            raise MissingResourceError(self._no_room())
+            raise MissingResourceError(self._no_node_text())
         amounts = dict(self._wanted)
         options: dict[str, Any] = {"num_cpus": amounts.pop("CPU", 0), "num_gpus": amounts.pop("GPU", 0)}
         if "memory" in amounts:
@@ -187,7 +187,7 @@ class _Actors(Generic[Result]):
         self._layouts: OrderedDict[int, tuple[Any, int | None]] = OrderedDict()
         self._count = 0
 
-    def _room(self) -> dict[str, int]:
+    def _workers_per_node(self) -> dict[str, int]:
         """Return the number of workers that fit on each node."""
         nodes = [(node["NodeID"], node["Resources"]) for node in self._ray.nodes() if node["Alive"]]
         return {
@@ -195,20 +195,20 @@ class _Actors(Generic[Result]):
             for node, resources in nodes
         }
 
-    def _no_room(self) -> str:
+    def _no_node_text(self) -> str:
         wanted = ", ".join(f"{name}={amount:g}" for name, amount in self._wanted.items())
         return f"no node of the Ray cluster has {wanted} for a worker"
 
-    def openings(self) -> int:
+    def free_slots(self) -> int:
         now = time.monotonic()
         if now < self._last_search + _SEARCH_INTERVAL:
             return 0
-        room, known, self._last_search = self._room(), self._nodes, now
+        room, known, self._last_search = self._workers_per_node(), self._nodes, now
         self._nodes = set(room)
         if any(room.values()):
             self._last_room = now
         elif now > self._last_room + _MACHINE_TIMEOUT:
-            raise LostWorkersError(f"{self._no_room()} any more; finished frames are kept")
+            raise LostWorkersError(f"{self._no_node_text()} any more; finished frames are kept")
         joined = sum(count for node, count in room.items() if node not in known)
         return max(0, min(joined, self._most - len(self._actors)))
 
@@ -220,10 +220,10 @@ class _Actors(Generic[Result]):
     def stop(self, worker: int) -> None:
         self._ray.kill(self._actors.pop(worker))
 
-    def give(self, worker: int, frame: int, layout: int) -> None:
+    def send_frame(self, worker: int, frame: int, layout: int) -> None:
         actor = self._actors[worker]
         if layout not in self._layouts:
-            known = self._job.known(layout)
+            known = self._job.cached_layout(layout)
             # The first worker that needs a layout settles it; Ray passes the result to the others.
             self._layouts[layout] = (
                 (actor.settle.remote(layout), worker) if known is None else (self._ray.put(known), None)
@@ -241,7 +241,7 @@ class _Actors(Generic[Result]):
             except self._ray.exceptions.RayError as error:
                 _, settler = self._layouts.pop(layout, (None, None))
                 if settler not in (None, worker):
-                    self.give(worker, frame, layout)  # the lost worker may be the one that settled the layout
+                    self.send_frame(worker, frame, layout)  # the lost worker may be the one that settled the layout
                     continue
                 self.stop(worker)
                 yield worker, Lost(f"was lost ({str(error).strip().splitlines()[0]})")
@@ -273,7 +273,7 @@ class _Actor:
             return layout
         try:
             if self._kind is not None:
-                use_share(self._kind)
+                use_shared_device(self._kind)
                 self._kind = None
             return Finished(self._job.make(frame, layout))
         except Exception as error:  # noqa: BLE001 - the caller raises it

@@ -25,7 +25,7 @@ class WorkerMemory:
     gpu: float = 3.0 * 2**30
 
 
-TYPICAL = WorkerMemory(4.0 * 2**30)
+TYPICAL_MEMORY = WorkerMemory(4.0 * 2**30)
 """Requirements of work without an estimate."""
 
 

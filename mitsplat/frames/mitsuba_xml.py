@@ -16,7 +16,7 @@ import numpy as np
 import trimesh
 
 from mitsplat.asset import Asset
-from mitsplat.engine.pool import LostWorkersError, run_apart
+from mitsplat.engine.pool import LostWorkersError, run_in_process
 from mitsplat.errors import InputError
 from mitsplat.frames.camera_response import develop
 from mitsplat.frames.frame import light_properties
@@ -139,7 +139,7 @@ def render_apart(path: Path, out: Path, *, allow_outside: bool = False, device: 
         MissingResourceError: If the device cannot be used, or its memory does not suffice.
     """
     job = _RenderOne(path, out, allow_outside)
-    with closing(run_apart(job, device)) as results:
+    with closing(run_in_process(job, device)) as results:
         try:
             return next(results)
         except LostWorkersError as error:

@@ -23,7 +23,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsplat.arrays import Float32Array
-from mitsplat.engine.pool import LostWorkersError, run_apart
+from mitsplat.engine.pool import LostWorkersError, run_in_process
 from mitsplat.errors import InputError, MissingResourceError
 from mitsplat.frames.frame import render_frame
 from mitsplat.gaussians.splat_cloud import Splats
@@ -214,7 +214,7 @@ def _run_alone(
     path: Path, step: Step, frames: int, overrides: Mapping[str, Any], allow_outside: bool, device: Device
 ) -> _StepResult:
     job = _RenderJob(path, step.quality, frames, dict(overrides), allow_outside)
-    with closing(run_apart(job, device)) as results:
+    with closing(run_in_process(job, device)) as results:
         try:
             return next(results)
         except LostWorkersError as error:

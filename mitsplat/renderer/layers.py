@@ -20,7 +20,7 @@ from mitsplat.images.masks import Silhouette
 from mitsplat.quality import Quality, resolve_quality
 from mitsplat.renderer.lazy_value import LazyValue
 from mitsplat.renderer.rays.device_arrays import wrapped
-from mitsplat.runtime.dropped_rays import refuse_lost_rays
+from mitsplat.runtime.dropped_rays import check_dropped_rays
 from mitsplat.runtime.variant import ensure_variant as ensure_variant
 from mitsplat.runtime.variant import one_at_a_time
 
@@ -184,7 +184,7 @@ def _single_shape_scene(splats: Splats, variant: str) -> tuple[Any, Any]:
 def render_layers(integrator: Any, scene: Any, camera: Camera, *, seed: int = 0) -> Layers:
     """Run the integrator; each layer is copied to the host on first access, see :class:`Layers`."""
     layers = integrator.render_layers(scene, _sensor_of(camera, str(mi.variant())), seed=seed)
-    refuse_lost_rays()
+    check_dropped_rays()
     return Layers.on_device(layers, (camera.height, camera.width))
 
 
@@ -223,5 +223,5 @@ def _host_ids(ids: Any, shape: tuple[int, int]) -> npt.NDArray[np.uint16]:
 def render_silhouettes(integrator: Any, scene: Any, camera: Camera, *, source: str = "splats") -> dict[int, Silhouette]:
     """Return the unoccluded silhouette of every instance, by its ``splats`` or its ``proxies``."""
     silhouettes = dict(integrator.silhouettes(scene, _sensor_of(camera, str(mi.variant())), source=source))
-    refuse_lost_rays()
+    check_dropped_rays()
     return silhouettes

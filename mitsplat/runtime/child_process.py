@@ -24,7 +24,7 @@ from mitsplat.errors import InputError
 SAFE_PATH = "PYTHONSAFEPATH"
 """Environment variable: Python does not search the current folder for modules."""
 
-REFUSED = 2
+REFUSED_STATUS = 2
 """Exit status of a bounded child whose function raised :class:`InputError`."""
 
 _GRACE_TIME = 5.0
@@ -33,12 +33,12 @@ _GRACE_TIME = 5.0
 _BOUNDED = "from mitsplat.runtime.child_process import run_function; run_function()"
 
 
-class Ended(NamedTuple):
+class ChildResult(NamedTuple):
     """Result of a bounded child.
 
     Attributes:
-        status: 0 if the function returned, :data:`REFUSED` or 1 if it raised, negative for a signal, None after a
-            timeout.
+        status: 0 if the function returned, :data:`REFUSED_STATUS` or 1 if it raised, negative for a signal, None after
+            a timeout.
         output: Bytes that the function wrote; after a failure, those that it flushed.
         reason: Message of its exception, or a description of its end that continues "its reader ..."; empty on success.
     """
@@ -59,7 +59,7 @@ def python_environment(changes: Mapping[str, str] | None = None) -> dict[str, st
 
 
 @contextmanager
-def starting_safely() -> Iterator[None]:
+def safe_path_children() -> Iterator[None]:
     """Put processes that :mod:`multiprocessing` and libraries start in this context into safe-path mode.
 
     Such processes inherit this process's environment and import path, so that both are changed within the context. An
@@ -98,7 +98,7 @@ def run_bounded(
     imports: Sequence[str] = (),
     memory: int,
     seconds: float,
-) -> Ended:
+) -> ChildResult:
     """Run a function of an importable module in a child with limited memory and time.
 
     Args:
@@ -116,13 +116,13 @@ def run_bounded(
     try:
         done = subprocess.run(command, input=data, env=environment, capture_output=True, check=False, timeout=seconds)
     except subprocess.TimeoutExpired as error:
-        return Ended(None, error.stdout or b"", f"did not end within {seconds:.0f} s")
+        return ChildResult(None, error.stdout or b"", f"did not end within {seconds:.0f} s")
     if done.returncode == 0:
-        return Ended(0, done.stdout, "")
+        return ChildResult(0, done.stdout, "")
     lines = done.stderr.decode("utf-8", "replace").strip().splitlines()
     if lines and done.returncode > 0:
-        return Ended(done.returncode, done.stdout, lines[-1])
-    return Ended(done.returncode, done.stdout, f"stopped with status {done.returncode}")
+        return ChildResult(done.returncode, done.stdout, lines[-1])
+    return ChildResult(done.returncode, done.stdout, f"stopped with status {done.returncode}")
 
 
 def run_function() -> None:
@@ -148,7 +148,7 @@ def run_function() -> None:
         said = str(error).strip().splitlines() or [type(error).__name__]
         sys.stderr.write(f"\n{said[-1]}\n")
         sys.stderr.flush()
-        os._exit(REFUSED if isinstance(error, InputError) else 1)
+        os._exit(REFUSED_STATUS if isinstance(error, InputError) else 1)
     os._exit(0)  # with limited memory, the shutdown of a driver may hang
 
 

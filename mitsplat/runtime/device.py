@@ -24,12 +24,12 @@ import drjit as dr
 import mitsuba as mi
 
 from mitsplat.errors import InputError, LateDeviceError, MissingResourceError
-from mitsplat.runtime.gpu_memory import NEEDED, VISIBLE, unused_gpu_memory
+from mitsplat.runtime.gpu_memory import MIN_UNUSED_MEMORY, VISIBLE_GPUS, unused_gpu_memory
 from mitsplat.runtime.variant import VARIANTS, choose_variant
 
 Kind = Literal["cpu", "cuda"]
 
-NUMBER = "MITSPLAT_GPU"
+GPU_NUMBER = "MITSPLAT_GPU"
 """Environment variable: N of the ``cuda:N`` that is the only visible GPU of this process."""
 
 _DEVICE = re.compile(r"cpu|auto|cuda(:all|:\d{1,4})?")
@@ -73,7 +73,7 @@ class Device:
         return f"{self.kind} ({names})" if names else self.kind
 
     @property
-    def is_here(self) -> bool:
+    def is_usable_here(self) -> bool:
         """True if this process can compute on the device."""
         return self.kind == "cpu" or any(gpu.ordinal == 0 for gpu in self.gpus)
 
@@ -81,7 +81,7 @@ class Device:
 CPU = Device("cpu")
 
 
-class Lack(NamedTuple):
+class MissingPrerequisite(NamedTuple):
     """Missing prerequisite of a GPU (continues "because ..."), and its remedy."""
 
     what: str
@@ -102,13 +102,13 @@ def use_device(device: str | Device) -> Device:
         MissingResourceError: If there is no GPU, or no complete driver, or no usable LLVM for the CPU.
     """
     found = find_device(device)
-    if not found.is_here:
+    if not found.is_usable_here:
         raise _late_device_error(str(device), found.gpus[0])
     choose_variant(VARIANTS[found.kind == "cuda"])
     return found
 
 
-def use_share(kind: Kind) -> None:
+def use_shared_device(kind: Kind) -> None:
     """Select a device like :func:`use_device`, in one of several processes that share its cores.
 
     On a GPU, Dr.Jit's threads only build scenes. One thread does this in a tenth of the time of sixteen threads.
@@ -135,7 +135,7 @@ def find_device(device: str | Device) -> Device:
     if text == "cpu":
         return CPU
     gpus = visible_gpus()
-    if isinstance(gpus, Lack):
+    if isinstance(gpus, MissingPrerequisite):
         if text == "auto":
             return Device("cpu", reason=gpus.what)
         raise MissingResourceError(f"{text} cannot be used, because {gpus.what}: {gpus.remedy}, or use the device cpu")
@@ -147,7 +147,7 @@ def find_device(device: str | Device) -> Device:
     which = text.partition(":")[2]
     if which == "all":
         return Device("cuda", gpus)
-    if which == os.environ.get(NUMBER):
+    if which == os.environ.get(GPU_NUMBER):
         return Device("cuda", first)
     if int(which) >= len(gpus):
         numbers = f"cuda:0 to cuda:{len(gpus) - 1}" if len(gpus) > 1 else "cuda:0"
@@ -157,9 +157,9 @@ def find_device(device: str | Device) -> Device:
 
 def _late_device_error(text: str, gpu: Gpu) -> LateDeviceError:
     return LateDeviceError(
-        f"{text} must be the first visible GPU when mitsplat is imported: set {VISIBLE}={gpu.id} before the import, "
-        "and use the device cuda",
-        {**gpu_environment(gpu), NUMBER: text.partition(":")[2]},
+        f"{text} must be the first visible GPU when mitsplat is imported: set {VISIBLE_GPUS}={gpu.id} before the "
+        "import, and use the device cuda",
+        {**gpu_environment(gpu), GPU_NUMBER: text.partition(":")[2]},
     )
 
 
@@ -176,11 +176,11 @@ def check_name(device: str) -> str:
 
 def gpu_environment(gpu: Gpu) -> dict[str, str]:
     """Return the environment variables of a process for which this GPU is the only visible one."""
-    return {VISIBLE: gpu.id} if gpu.id else {}
+    return {VISIBLE_GPUS: gpu.id} if gpu.id else {}
 
 
 @contextmanager
-def starting_on(gpu: Gpu | None, **variables: str) -> Iterator[None]:
+def children_on_gpu(gpu: Gpu | None, **variables: str) -> Iterator[None]:
     """Start processes in this context with only this GPU visible (unchanged if None), and with more variables."""
     changes = variables if gpu is None else variables | gpu_environment(gpu)
     kept = {name: os.environ.get(name) for name in changes}
@@ -195,28 +195,29 @@ def starting_on(gpu: Gpu | None, **variables: str) -> Iterator[None]:
                 os.environ[name] = value
 
 
-def visible_gpus() -> tuple[Gpu, ...] | Lack:
+def visible_gpus() -> tuple[Gpu, ...] | MissingPrerequisite:
     """Return the GPUs on which Mitsuba can trace rays (at least one), or the missing prerequisite."""
     driver = _library("libcuda.so.1")
     if driver is None:
-        return Lack("NVIDIA's driver is missing (libcuda.so.1)", "install it")
+        return MissingPrerequisite("NVIDIA's driver is missing (libcuda.so.1)", "install it")
     count = ctypes.c_int(0)
     status = driver.cuInit(0) or driver.cuDeviceGetCount(ctypes.byref(count))
     unused = unused_gpu_memory()
-    if (status or not count.value) and any(memory < NEEDED for memory in unused.values()):
+    if (status or not count.value) and any(memory < MIN_UNUSED_MEMORY for memory in unused.values()):
         most = max(unused.values()) / 2**30
-        return Lack(
+        return MissingPrerequisite(
             f"the GPU has only {most:.1f} GiB of unused memory", "end a program on it (`nvidia-smi` lists them)"
         )
     if status or not count.value:
-        return Lack(f"NVIDIA's driver finds no GPU (status {status})", f"check `nvidia-smi` and {VISIBLE}")
+        problem = f"NVIDIA's driver finds no GPU (status {status})"
+        return MissingPrerequisite(problem, f"check `nvidia-smi` and {VISIBLE_GPUS}")
     if _library("libnvoptix.so.1") is None:
-        return Lack(
+        return MissingPrerequisite(
             "NVIDIA's driver lacks OptiX, which traces rays (libnvoptix.so.1)",
             "install the complete driver (in a container, set NVIDIA_DRIVER_CAPABILITIES=all)",
         )
     found = [_gpu(driver, ordinal, unused, alone=count.value == 1) for ordinal in range(count.value)]
-    return tuple(found if os.environ.get(VISIBLE) else sorted(found, key=lambda gpu: gpu.bus))
+    return tuple(found if os.environ.get(VISIBLE_GPUS) else sorted(found, key=lambda gpu: gpu.bus))
 
 
 def _gpu(driver: Any, ordinal: int, unused: Mapping[str, int], *, alone: bool) -> Gpu:

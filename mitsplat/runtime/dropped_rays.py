@@ -17,7 +17,7 @@ import drjit as dr
 
 from mitsplat.errors import MissingResourceError
 
-SIGN = b"ray tracing operation"
+DROPPED_RAYS = b"ray tracing operation"
 """Text common to Dr.Jit's warnings about several pipelines and about several shader binding tables."""
 
 SET_CALLBACK = "_Z26jit_set_log_level_callback8LogLevelPFvS_PKcE"
@@ -28,7 +28,7 @@ _Callback = ctypes.CFUNCTYPE(None, ctypes.c_uint32, ctypes.c_char_p)
 _dropped: list[str] = []
 
 
-def watch_rays() -> None:
+def record_dropped_rays() -> None:
     """Record Dr.Jit's log messages about dropped rays from now on, and print its other messages to stderr.
 
     Call this function again where other code may have set the log level, which replaces the callback. The callback
@@ -42,7 +42,7 @@ def watch_rays() -> None:
     _set_callback()(level, _callback)
 
 
-def refuse_lost_rays() -> None:
+def check_dropped_rays() -> None:
     """Raise an error if rays were dropped since the last call.
 
     Raises:
@@ -57,7 +57,7 @@ def refuse_lost_rays() -> None:
 def _record(level: int, message: bytes) -> None:
     """Record or print a log message. Dr.Jit calls this function, so it must not raise."""
     text = message.decode(errors="replace")
-    if SIGN in message:
+    if DROPPED_RAYS in message:
         _dropped.append(text)
     elif sys.stderr is not None:
         sys.stderr.write(f"{text}\n")

@@ -10,10 +10,10 @@ import ctypes
 import os
 from dataclasses import dataclass
 
-VISIBLE = "CUDA_VISIBLE_DEVICES"
-ORDER = "CUDA_DEVICE_ORDER"
+VISIBLE_GPUS = "CUDA_VISIBLE_DEVICES"
+GPU_ORDER = "CUDA_DEVICE_ORDER"
 
-NEEDED = 2**30
+MIN_UNUSED_MEMORY = 2**30
 """GPU memory for the start of a process [bytes]; on an H200, half of it is used before any computation."""
 
 
@@ -59,14 +59,14 @@ def unused_gpu_memory() -> dict[str, int]:
 
 
 def hide_full_gpus() -> None:
-    """Hide GPUs with less than :data:`NEEDED` unused memory from this process; CUDA must not have been started."""
+    """Hide GPUs with less than :data:`MIN_UNUSED_MEMORY` from this process; CUDA must not have been started."""
     found = gpu_memory()
-    memory = {name: one.unused for name, one in found.items()}
-    if all(unused >= NEEDED for unused in memory.values()):
+    full = {name for name, one in found.items() if one.unused < MIN_UNUSED_MEMORY}
+    if not full:
         return
-    ids = list(memory)
-    named = os.environ.get(VISIBLE, ",".join(ids)).split(",")
-    by_bus = os.environ.get(ORDER) == "PCI_BUS_ID" or len({one.model for one in found.values()}) == 1
+    ids = list(found)
+    named = os.environ.get(VISIBLE_GPUS, ",".join(ids)).split(",")
+    by_bus = os.environ.get(GPU_ORDER) == "PCI_BUS_ID" or len({one.model for one in found.values()}) == 1
     numbered = {str(number): name for number, name in enumerate(ids)} if by_bus else {}
-    kept = [name for name in named if memory.get(numbered.get(name.strip(), name.strip()), NEEDED) >= NEEDED]
-    os.environ[VISIBLE] = ",".join(kept)
+    usable = [name for name in named if numbered.get(name.strip(), name.strip()) not in full]
+    os.environ[VISIBLE_GPUS] = ",".join(usable)

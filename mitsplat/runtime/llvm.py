@@ -12,7 +12,7 @@ from pathlib import Path
 from mitsplat.errors import MissingResourceError
 
 VARIABLE = "DRJIT_LIBLLVM_PATH"
-OLDEST_USABLE = 16
+MIN_LLVM = 16
 
 
 def use_bundled_llvm() -> None:
@@ -45,10 +45,10 @@ def check_llvm() -> None:
     import drjit  # after `use_bundled_llvm`, because Dr.Jit searches for LLVM only once
 
     version = drjit.detail.llvm_version()
-    if version[0] >= OLDEST_USABLE:
+    if version[0] >= MIN_LLVM:
         return
     found = f"has loaded LLVM {'.'.join(map(str, version))}" if version[0] >= 0 else "has found no LLVM"
     raise MissingResourceError(
-        f"Dr.Jit {found}, but needs {OLDEST_USABLE} or newer: import mitsplat before drjit and mitsuba, "
+        f"Dr.Jit {found}, but needs {MIN_LLVM} or newer: import mitsplat before drjit and mitsuba, "
         f"or set {VARIABLE} to a newer libLLVM"
     )

@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 from mitsplat.errors import MissingResourceError
 
-OLDEST = (1, 24)
+MIN_ONNXRUNTIME = (1, 24)
 """First release of ONNX Runtime that reads no weights from outside the network's folder."""
 
 
@@ -30,8 +30,8 @@ def load_library(extra: Literal["depth", "masks"], name: str) -> Any:
             f"{extra.removesuffix('s')}s by a model need {name}: pip install 'mitsplat[{extra}]' ({error})"
         ) from error
     numbers = re.match(r"(\d+)\.(\d+)", runtime.__version__)
-    if numbers is None or tuple(map(int, numbers.groups())) < OLDEST:
-        oldest = ".".join(map(str, OLDEST))
+    if numbers is None or tuple(map(int, numbers.groups())) < MIN_ONNXRUNTIME:
+        oldest = ".".join(map(str, MIN_ONNXRUNTIME))
         raise MissingResourceError(
             f"networks need onnxruntime {oldest} or newer, which reads no files outside of the network's folder (got "
             f"{runtime.__version__}): pip install 'onnxruntime>={oldest}'"

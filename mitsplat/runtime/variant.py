@@ -15,14 +15,14 @@ from typing import ParamSpec, TypeVar
 import mitsuba as mi
 
 from mitsplat.errors import InputError
-from mitsplat.runtime.dropped_rays import watch_rays
+from mitsplat.runtime.dropped_rays import record_dropped_rays
 from mitsplat.runtime.llvm import check_llvm
 from mitsplat.runtime.plugin_registration import register_plugins
 
 VARIANTS = ("llvm_ad_rgb", "cuda_ad_rgb")
 """Variants in which the plugins run; the first is the default."""
 
-_turn = threading.RLock()
+_lock = threading.RLock()
 
 Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")
@@ -35,7 +35,7 @@ def ensure_variant() -> None:
         InputError: If the current variant cannot run the plugins.
         MissingResourceError: If Dr.Jit has no usable LLVM.
     """
-    with _turn:
+    with _lock:
         variant = mi.variant()
         if variant is not None and variant not in VARIANTS:
             raise InputError(
@@ -49,7 +49,7 @@ def ensure_variant() -> None:
         # Mitsuba changes the variant before it calls its callbacks, and another thread may be between both steps.
         register_plugins(mi.variant())
         if mi.variant() == "cuda_ad_rgb":
-            watch_rays()
+            record_dropped_rays()
 
 
 def choose_variant(variant: str) -> None:
@@ -58,7 +58,7 @@ def choose_variant(variant: str) -> None:
     Raises:
         MissingResourceError: If it is ``llvm_ad_rgb``, and Dr.Jit has no usable LLVM.
     """
-    with _turn:
+    with _lock:
         if variant == VARIANTS[0]:
             check_llvm()
         mi.set_variant(variant)
@@ -72,8 +72,8 @@ def one_at_a_time(function: Callable[Arguments, Result]) -> Callable[Arguments, 
     """
 
     @wraps(function)
-    def in_turn(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
-        with _turn:
+    def locked(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
+        with _lock:
             return function(*args, **kwargs)
 
-    return in_turn
+    return locked

@@ -13,7 +13,7 @@ from mitsplat.checks.trial import KNOWN, TOLERANCE, render_trial, trial_faults, 
 from mitsplat.engine import resources
 from mitsplat.engine.resources import unused_memory
 from mitsplat.renderer.occluders.proxies import Proxies
-from mitsplat.runtime.device import Gpu, Lack
+from mitsplat.runtime.device import Gpu, MissingPrerequisite
 
 
 def found():
@@ -35,7 +35,7 @@ def test_a_healthy_machine_passes_every_check(monkeypatch):
     [
         (
             "GPU",
-            lambda patch: patch.setattr(doctor, "visible_gpus", lambda: Lack("OptiX is absent", "fetch it")),
+            lambda patch: patch.setattr(doctor, "visible_gpus", lambda: MissingPrerequisite("no OptiX", "fetch it")),
             "fetch",
         ),
         ("disk", lambda patch: patch.setattr(doctor, "NEEDED_DISK", 1e9), "free at least"),

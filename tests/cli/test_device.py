@@ -20,7 +20,7 @@ class TestDevice:
 
     @pytest.fixture
     def lacking(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(devices, "visible_gpus", lambda: devices.Lack("there is none", "buy one"))
+        monkeypatch.setattr(devices, "visible_gpus", lambda: devices.MissingPrerequisite("there is none", "buy one"))
 
     @pytest.mark.usefixtures("lacking")
     def test_auto_prints_the_chosen_device_and_the_reason(
@@ -78,7 +78,7 @@ class TestDevice:
         """By the command line itself only: whoever calls it is told what to set."""
         gpus = tuple(devices.Gpu("One", 2**40, number, str(number), f"GPU-{number}") for number in range(2))
         monkeypatch.setattr(devices, "visible_gpus", lambda: gpus)
-        monkeypatch.delenv(devices.NUMBER, raising=False)
+        monkeypatch.delenv(devices.GPU_NUMBER, raising=False)
         command = ["preview", str(scene_path), "-o", str(tmp_path / "a.png"), "--device", "cuda:1"]
         assert run(*command) == 2
         assert "set CUDA_VISIBLE_DEVICES=GPU-1 before" in capsys.readouterr().err

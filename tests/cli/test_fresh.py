@@ -264,8 +264,8 @@ class Broken:
         raise KeyError("on purpose")
 
 def broken(*args, **kwargs):
-    from mitsplat.engine.pool import run_apart
-    next(run_apart(Broken()))
+    from mitsplat.engine.pool import run_in_process
+    next(run_in_process(Broken()))
 
 if __name__ == "__main__":
     dataset.write_dataset = broken

@@ -468,7 +468,7 @@ class TestDevice:
 
     @pytest.mark.parametrize("device", ["cuda", "cuda:all", "tpu"])
     def test_one_that_is_not_here_is_refused_before_work(self, scene, tmp_path, device, monkeypatch):
-        monkeypatch.setattr(devices, "visible_gpus", lambda: devices.Lack("there is none", "buy one"))
+        monkeypatch.setattr(devices, "visible_gpus", lambda: devices.MissingPrerequisite("there is none", "buy one"))
         words = (
             "device must be cpu, cuda"
             if device == "tpu"
@@ -479,7 +479,7 @@ class TestDevice:
         assert not (tmp_path / "out").exists()
 
     def test_auto_says_what_it_chose(self, scene, tmp_path, monkeypatch):
-        monkeypatch.setattr(devices, "visible_gpus", lambda: devices.Lack("there is none", "buy one"))
+        monkeypatch.setattr(devices, "visible_gpus", lambda: devices.MissingPrerequisite("there is none", "buy one"))
         told = []
         write(scene, tmp_path / "out", frames=1, device="auto", progress=lambda *event: told.append(event[2]))
         assert told[1] == "device cpu: there is none"

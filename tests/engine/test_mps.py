@@ -15,7 +15,7 @@ import pytest
 from mitsplat.engine import mps
 from mitsplat.engine.mps import CONTROL, PIPES, SharedGpu
 from mitsplat.engine.pool import run_frames
-from mitsplat.runtime.device import VISIBLE, Device, Gpu
+from mitsplat.runtime.device import VISIBLE_GPUS, Device, Gpu
 
 SERVICE = """#!/bin/sh
 # Notes what it is told; serves once it was started, where its environment says.
@@ -31,7 +31,7 @@ echo "$command" >> {log}
 def log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """What the service was told."""
     monkeypatch.delenv(PIPES, raising=False)
-    monkeypatch.delenv(VISIBLE, raising=False)
+    monkeypatch.delenv(VISIBLE_GPUS, raising=False)
     monkeypatch.setattr(mps, "_TRIAL", "pass")
     return tmp_path / "log"
 
@@ -52,7 +52,7 @@ def told(log: Path) -> list[str]:
 def test_it_is_started_and_ended(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     install(log, monkeypatch)
     shared = SharedGpu()
-    assert shared.lack == ""
+    assert shared.problem == ""
     folder = Path(shared.environment[PIPES])
     assert (folder / "control").exists()
     shared.close()
@@ -69,7 +69,7 @@ def test_one_that_runs_already_is_used_and_left_alone(
     (tmp_path / "control").touch()
     monkeypatch.setenv(PIPES, str(tmp_path))
     shared = SharedGpu()
-    assert (shared.environment, shared.lack) == ({}, "")
+    assert (shared.environment, shared.problem) == ({}, "")
     shared.close()
     assert told(log) == ["get_server_list"]
 
@@ -78,14 +78,14 @@ def test_a_machine_without_it(log: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     monkeypatch.setenv("PATH", str(log.parent))
     shared = SharedGpu()
     assert shared.environment == {}
-    assert shared.lack == "nvidia-cuda-mps-control, which is part of NVIDIA's driver, is missing"
+    assert shared.problem == "nvidia-cuda-mps-control, which is part of NVIDIA's driver, is missing"
 
 
 def test_one_that_does_not_start(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     install(log, monkeypatch, start="echo no permission >&2; exit 1")
     shared = SharedGpu()
     assert shared.environment == {}
-    assert shared.lack == "nvidia-cuda-mps-control does not work (no permission)"
+    assert shared.problem == "nvidia-cuda-mps-control does not work (no permission)"
 
 
 def test_one_on_which_nothing_computes_is_ended(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -93,7 +93,7 @@ def test_one_on_which_nothing_computes_is_ended(log: Path, monkeypatch: pytest.M
     monkeypatch.setattr(mps, "_TRIAL", "raise SystemExit('CUDA_ERROR_MPS_SERVER_NOT_READY')")
     shared = SharedGpu()
     assert shared.environment == {}
-    assert shared.lack == "nvidia-cuda-mps-control does not work (CUDA_ERROR_MPS_SERVER_NOT_READY)"
+    assert shared.problem == "nvidia-cuda-mps-control does not work (CUDA_ERROR_MPS_SERVER_NOT_READY)"
     assert told(log)[-1] == "quit -t 5"
 
 
@@ -138,9 +138,9 @@ def test_gpus_count_as_the_service_counts_them(
     log: Path, monkeypatch: pytest.MonkeyPatch, visible: str, own: str | None
 ) -> None:
     """It sees those that are visible here, from 0: of the second GPU alone, clients would ask for a second one."""
-    monkeypatch.setenv(VISIBLE, visible)
+    monkeypatch.setenv(VISIBLE_GPUS, visible)
     install(log, monkeypatch, start=f'[ "$CUDA_VISIBLE_DEVICES" = "{visible}" ] && touch {log.parent}/started; exit')
     shared = SharedGpu()
     assert (log.parent / "started").exists()
-    assert shared.environment.get(VISIBLE) == own
+    assert shared.environment.get(VISIBLE_GPUS) == own
     shared.close()

@@ -17,9 +17,9 @@ from hypothesis import strategies as st
 
 from mitsplat.engine import pool as engine
 from mitsplat.engine.pool import Failure, Finished, FrameError, LostWorkersError, run_frames, run_pool
-from mitsplat.engine.resources import TYPICAL
+from mitsplat.engine.resources import TYPICAL_MEMORY
 from mitsplat.errors import InputError, MissingResourceError
-from mitsplat.runtime.device import CPU, Device, Gpu, Lack, visible_gpus
+from mitsplat.runtime.device import CPU, Device, Gpu, MissingPrerequisite, visible_gpus
 
 LAYOUTS = {0: [0, 1, 2], 1: [3, 4, 5], 2: [6, 7, 8]}
 
@@ -136,7 +136,7 @@ def interpreter(tmp_path, monkeypatch):
 )
 def test_the_start_of_a_worker_is_bounded(monkeypatch, interpreter, script, words):
     """However large the work is that it does not take."""
-    monkeypatch.setattr(engine, "_START", 0.5)
+    monkeypatch.setattr(engine, "_START_TIMEOUT", 0.5)
     interpreter(script)
     begun, notes = time.monotonic(), []
     large = Make(how="x" * 10_000_000)
@@ -147,7 +147,7 @@ def test_the_start_of_a_worker_is_bounded(monkeypatch, interpreter, script, word
 
 
 def test_others_make_the_frame_of_a_worker_that_does_not_start(monkeypatch, tmp_path, interpreter):
-    monkeypatch.setattr(engine, "_START", 15.0)
+    monkeypatch.setattr(engine, "_START_TIMEOUT", 15.0)
     mark = tmp_path / "first"
     interpreter(f'if [ ! -e {mark} ]; then touch {mark}; kill -STOP $$; fi; exec {sys.executable} "$@"')
     notes = []
@@ -161,7 +161,7 @@ def test_stopped_workers_are_ended(tmp_path):
     (tmp_path / "pids").mkdir()
     with closing(engine._Processes(Linger(tmp_path / "pids"), None)) as pool:
         for index in range(2):
-            pool.give(pool.start(), index, 0)
+            pool.send_frame(pool.start(), index, 0)
         wait_for(lambda: len(list((tmp_path / "pids").iterdir())) == 2)
         for path in (tmp_path / "pids").iterdir():
             os.kill(int(path.name), signal.SIGSTOP)
@@ -252,7 +252,7 @@ class Short:
         self.alive.remove(worker)
         self.stopped.append(worker)
 
-    def give(self, worker, frame, layout):
+    def send_frame(self, worker, frame, layout):
         self.given[worker] = frame
 
     def wait(self):
@@ -260,7 +260,7 @@ class Short:
         for worker, frame in given.items():
             yield worker, Finished(frame) if self.fits(frame, alive) else EXHAUSTED
 
-    def openings(self):
+    def free_slots(self):
         return 0
 
 
@@ -273,7 +273,7 @@ def test_workers_take_the_device_before_anything_else(monkeypatch):
         assert {variant for _, variant, _ in results} == {"llvm_ad_rgb"}
     monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
     gpus = tuple(Gpu(name, 80 * 2**30, number, "", f"GPU-{name}") for number, name in enumerate("ab"))
-    monkeypatch.setattr(engine, "use_share", print)
+    monkeypatch.setattr(engine, "use_shared_device", print)
     pool = engine._Processes(Variant(), Device("cuda", gpus))
     pool._kind = None  # there is none to take
     with closing(pool):
@@ -282,7 +282,7 @@ def test_workers_take_the_device_before_anything_else(monkeypatch):
         workers[2] = pool.start()
         seen = []
         for worker in workers:
-            pool.give(worker, 0, 0)
+            pool.send_frame(worker, 0, 0)
             while not (answers := list(pool.wait())):
                 pass
             seen.append(answers[0][1].result[2])
@@ -293,7 +293,7 @@ def test_workers_take_the_device_before_anything_else(monkeypatch):
 def test_a_gpu_that_is_not_here_is_missed_in_one_sentence():
     """What a worker finds when it takes its device is told as what its frame found."""
     lost = Device("cuda", (Gpu("gone", 2**40, 1, "", ""),))
-    if isinstance(visible_gpus(), Lack):
+    if isinstance(visible_gpus(), MissingPrerequisite):
         words = (
             "^frame 0 cannot be made: cuda cannot be used, because .*, or use the device cpu; finished frames are kept"
         )
@@ -315,7 +315,7 @@ def test_a_gpu_that_does_not_start_costs_a_worker(monkeypatch, kind, exhausted):
             return next(frames)
         raise EOFError
 
-    monkeypatch.setattr(engine, "use_share", fail)
+    monkeypatch.setattr(engine, "use_shared_device", fail)
     monkeypatch.setattr(engine, "_end_with_parent", lambda: None)
     engine._work(SimpleNamespace(recv=receive, send=said.append), kind, Variant())
     assert isinstance(said.pop(0), engine.Started)
@@ -329,7 +329,7 @@ def test_workers_share_a_gpu_as_the_service_says(monkeypatch, own, seen):
     gpu = Gpu("a", 80 * 2**30, 0, "", own)
     with closing(engine._Processes(Variant(), Device("cuda", (gpu,)), {"CUDA_VISIBLE_DEVICES": "0"})) as pool:
         pool._kind = None  # there is none to take
-        pool.give(pool.start(), 0, 0)
+        pool.send_frame(pool.start(), 0, 0)
         while not (answers := list(pool.wait())):
             pass
     assert answers[0][1].result[2] == seen
@@ -352,7 +352,7 @@ def test_as_many_workers_at_once_as_gpus_hold(monkeypatch, gigabytes, count):
     monkeypatch.setattr(engine, "unused_memory", lambda: 32.0)
     monkeypatch.setattr(engine.os, "sched_getaffinity", lambda _: set(range(16)), raising=False)
     device = Device("cuda", tuple(Gpu("one", size * 2**30, 0, "", "") for size in gigabytes))
-    assert engine.affordable_workers(TYPICAL, device) == count
+    assert engine.affordable_workers(TYPICAL_MEMORY, device) == count
     began = []
     monkeypatch.setattr(engine, "use_device", began.append)
     monkeypatch.setattr(engine, "run_pool", lambda *args, **how: began.append((args[2], how)) or (i for i in ()))
@@ -364,7 +364,7 @@ def test_no_more_workers_than_a_gpu_serves(monkeypatch):
     monkeypatch.setattr(engine, "unused_memory", lambda: 4096.0)
     monkeypatch.setattr(engine.os, "sched_getaffinity", lambda _: set(range(256)), raising=False)
     gpus = tuple(Gpu("large", 288 * 2**30, number, "", "") for number in range(2))
-    assert [engine.affordable_workers(TYPICAL, Device("cuda", gpus[:count])) for count in (1, 2)] == [48, 96]
+    assert [engine.affordable_workers(TYPICAL_MEMORY, Device("cuda", gpus[:count])) for count in (1, 2)] == [48, 96]
 
 
 def test_few_frames_on_another_gpu_take_one_process(monkeypatch):
@@ -443,7 +443,7 @@ class Scripted:
     def stop(self, worker):
         self.alive.remove(worker)
 
-    def give(self, worker, frame, layout):
+    def send_frame(self, worker, frame, layout):
         self.due[worker] = self.clock + self.seconds(len(self.alive)), frame
 
     def wait(self):
@@ -451,7 +451,7 @@ class Scripted:
         self.clock, frame = self.due.pop(worker)
         yield worker, Finished(frame)
 
-    def openings(self):
+    def free_slots(self):
         return self.joining.pop(0) if self.joining else 0
 
     def close(self):

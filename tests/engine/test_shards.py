@@ -353,25 +353,25 @@ def test_machines_that_join_are_told_of_once(monkeypatch):
     monkeypatch.setitem(sys.modules, "ray", ray)
     monkeypatch.setattr(cluster.time, "monotonic", lambda: now[0])
 
-    def openings(**nodes):
+    def free_slots(**nodes):
         ray.alive |= nodes
         now[0] += 10.0
-        return pool.openings()
+        return pool.free_slots()
 
     pool = cluster._Actors(None, Cluster(resources={"CPU": 2.0}), None)
-    assert (pool.room, openings()) == (3, 0)
-    assert (openings(second=4.0), openings()) == (2, 0)
-    assert openings(second=0.0, first=0.0) == 0  # lost: theirs is what is made again
-    assert openings(again=4.0) == 2
+    assert (pool.room, free_slots()) == (3, 0)
+    assert (free_slots(second=4.0), free_slots()) == (2, 0)
+    assert free_slots(second=0.0, first=0.0) == 0  # lost: theirs is what is made again
+    assert free_slots(again=4.0) == 2
     few = pool = cluster._Actors(None, Cluster(resources={"CPU": 2.0}), 2)
     workers = [few.start(), few.start()]
-    assert (few.room, openings(third=8.0)) == (2, 0)
+    assert (few.room, free_slots(third=8.0)) == (2, 0)
     del few._actors[workers[0]]
-    assert openings(fourth=8.0) == 1
-    assert openings(**dict.fromkeys(ray.alive, 0.0)) == 0
+    assert free_slots(fourth=8.0) == 1
+    assert free_slots(**dict.fromkeys(ray.alive, 0.0)) == 0
     now[0] += cluster._MACHINE_TIMEOUT
     with pytest.raises(LostWorkersError, match=r"^no node .* CPU=2 for a worker any more; finished frames are kept"):
-        openings()
+        free_slots()
 
 
 def test_images_of_lights_travel_with_the_job(scene_data, write_scene, tmp_path):

@@ -27,7 +27,7 @@ import mitsplat as ms
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.quality import Quality
 from mitsplat.renderer.layers import make_integrator, make_splats_shape, render_layers, render_silhouettes
-from mitsplat.runtime.dropped_rays import refuse_lost_rays
+from mitsplat.runtime.dropped_rays import check_dropped_rays
 from tests.renderer.test_light import WHITE_SKY, floor, nothing, slab
 
 SIZE = 160, 120
@@ -190,7 +190,7 @@ def main() -> None:
     variant, out = sys.argv[1:]
     mi.set_variant(variant)
     arrays = {f"{case}/{name}": value for case, make in CASES.items() for name, value in make().items()}
-    refuse_lost_rays()
+    check_dropped_rays()
     np.savez(out, **arrays)
 
 

@@ -11,7 +11,7 @@ import mitsuba as mi
 import pytest
 
 from mitsplat.renderer.occluders.proxies import Proxies
-from mitsplat.runtime.dropped_rays import SIGN, refuse_lost_rays, watch_rays
+from mitsplat.runtime.dropped_rays import DROPPED_RAYS, check_dropped_rays, record_dropped_rays
 from mitsplat.runtime.variant import ensure_variant
 from tests.gpu.cases import CASES
 from tests.kernels import traced_scenes
@@ -35,7 +35,7 @@ def log(request):
     function = request.param(str(LIBRARY))["_Z7jit_log8LogLevelPKcz"]
     function.argtypes, function.restype = (ctypes.c_uint32, ctypes.c_char_p), None
     level = dr.log_level()
-    watch_rays()
+    record_dropped_rays()
     yield lambda text: function(dr.LogLevel.Warn.value, text.encode())
     dr.set_log_level(level)
 
@@ -45,14 +45,14 @@ def test_lost_rays_are_an_error_once(log, text, capfd):
     log(text)
     log(text)
     with pytest.raises(RuntimeError, match=r"dropped rays \(2 times\): jit_eval\(\): more than one OptiX"):
-        refuse_lost_rays()
-    refuse_lost_rays()
+        check_dropped_rays()
+    check_dropped_rays()
     assert capfd.readouterr() == ("", "")
 
 
 def test_other_messages_are_printed(log, capfd):
     log("something else")
-    refuse_lost_rays()
+    check_dropped_rays()
     assert "something else" in capfd.readouterr().err
 
 
@@ -60,13 +60,13 @@ def test_dr_jit_still_says_so():
     """Another release may word it differently, and nothing else would tell."""
     library = LIBRARY.read_bytes()
     for text in TEXTS:
-        assert SIGN in text.encode()
+        assert DROPPED_RAYS in text.encode()
         assert text.encode() in library
 
 
 def test_a_process_ends_with_the_callback_in_place():
     code = "import mitsuba as m; from mitsplat.runtime import dropped_rays as d; "
-    code += "m.set_variant('llvm_ad_rgb'); d.watch_rays(); m.Float(1)"
+    code += "m.set_variant('llvm_ad_rgb'); d.record_dropped_rays(); m.Float(1)"
     done = subprocess.run([sys.executable, "-c", code], env=os.environ, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr) == (0, "")
 

@@ -9,14 +9,14 @@ import pytest
 
 from mitsplat.errors import InputError
 from mitsplat.runtime.child_process import (
-    REFUSED,
+    REFUSED_STATUS,
     SAFE_PATH,
     leave_current_folder,
     limit_memory,
     python_command,
     python_environment,
     run_bounded,
-    starting_safely,
+    safe_path_children,
 )
 
 GIB = 1 << 30
@@ -71,7 +71,7 @@ class TestBounded:
         assert ended == (0, b"321a//b c", "")
 
     def test_a_refusal_gives_the_last_line_of_its_sentence(self):
-        assert run_bounded(refuse, memory=GIB, seconds=30) == (REFUSED, b"so far", "it holds nothing")
+        assert run_bounded(refuse, memory=GIB, seconds=30) == (REFUSED_STATUS, b"so far", "it holds nothing")
 
     def test_memory_is_bounded_on_top_of_what_is_held(self):
         assert run_bounded(fill, str(GIB // 2), imports=["numpy"], memory=GIB, seconds=30).output == b"%d" % (GIB // 2)
@@ -104,7 +104,7 @@ class TestSafePath:
         if before is not None:
             monkeypatch.setenv(SAFE_PATH, before)
         monkeypatch.setattr(sys, "path", ["", "/somewhere"])
-        with pytest.raises(OSError, match="x"), starting_safely():
+        with pytest.raises(OSError, match="x"), safe_path_children():
             assert (os.environ[SAFE_PATH], sys.path) == ("1", ["/somewhere"])
             raise OSError("x")
         assert (os.environ.get(SAFE_PATH), sys.path) == (before, ["", "/somewhere"])

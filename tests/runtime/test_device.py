@@ -85,9 +85,9 @@ def id_of(ordinal):
 @pytest.fixture
 def machine(monkeypatch):
     """Gives this machine a driver, with or without OptiX."""
-    monkeypatch.delenv(gpu_memory.VISIBLE, raising=False)
-    monkeypatch.delenv(gpu_memory.ORDER, raising=False)
-    monkeypatch.delenv(devices.NUMBER, raising=False)
+    monkeypatch.delenv(gpu_memory.VISIBLE_GPUS, raising=False)
+    monkeypatch.delenv(gpu_memory.GPU_ORDER, raising=False)
+    monkeypatch.delenv(devices.GPU_NUMBER, raising=False)
 
     def have(*gpus, optix=True, status=0, unused=None, models=None):
         libraries = {"libcuda.so.1": FakeDriver(*gpus, status=status)} if gpus or status else {}
@@ -163,23 +163,23 @@ def test_a_full_gpu_is_hidden(machine, monkeypatch, visible, unused, left):
     """Dr.Jit, which starts CUDA on all that it sees, would end the process there."""
     machine(unused=unused)
     if visible is not None:
-        monkeypatch.setenv(gpu_memory.VISIBLE, visible)
+        monkeypatch.setenv(gpu_memory.VISIBLE_GPUS, visible)
     else:
-        monkeypatch.setenv(gpu_memory.VISIBLE, "to be put back")
-        monkeypatch.delenv(gpu_memory.VISIBLE)
+        monkeypatch.setenv(gpu_memory.VISIBLE_GPUS, "to be put back")
+        monkeypatch.delenv(gpu_memory.VISIBLE_GPUS)
     gpu_memory.hide_full_gpus()
-    assert os.environ.get(gpu_memory.VISIBLE) == left
+    assert os.environ.get(gpu_memory.VISIBLE_GPUS) == left
 
 
 @pytest.mark.parametrize(("order", "left"), [(None, "0,1"), ("FASTEST_FIRST", "0,1"), ("PCI_BUS_ID", "1")])
 def test_numbers_of_different_gpus_are_read_in_the_order_of_cuda(machine, monkeypatch, order, left):
     """The first GPU on the bus is full; without PCI order its number is unknown, and none is hidden."""
     machine(unused=(0.5, 20), models=["Two", "One"])
-    monkeypatch.setenv(gpu_memory.VISIBLE, "0,1")
+    monkeypatch.setenv(gpu_memory.VISIBLE_GPUS, "0,1")
     if order is not None:
-        monkeypatch.setenv(gpu_memory.ORDER, order)
+        monkeypatch.setenv(gpu_memory.GPU_ORDER, order)
     gpu_memory.hide_full_gpus()
-    assert os.environ[gpu_memory.VISIBLE] == left
+    assert os.environ[gpu_memory.VISIBLE_GPUS] == left
 
 
 def test_what_others_have_taken_is_not_for_workers(machine):
@@ -201,7 +201,7 @@ def test_gpus_by_name(machine):
 
 def test_gpus_count_as_they_were_made_visible(machine, monkeypatch):
     machine(ONE, TWO)
-    monkeypatch.setenv(gpu_memory.VISIBLE, "3,1")
+    monkeypatch.setenv(gpu_memory.VISIBLE_GPUS, "3,1")
     assert [find_device(f"cuda:{i}").gpus[0].name for i in range(2)] == ["One", "Two"]
 
 
@@ -210,7 +210,7 @@ def test_a_process_takes_the_gpu_that_it_sees_first(machine, monkeypatch):
     taken = []
     monkeypatch.setattr(devices, "choose_variant", taken.append)
     assert use_device("cuda:1").gpus[0].name == "One"
-    assert use_device("cuda:all").is_here
+    assert use_device("cuda:all").is_usable_here
     with pytest.raises(
         LateDeviceError, match=rf"^cuda:0 must be the first .* set CUDA_VISIBLE_DEVICES={id_of(1)} before"
     ) as late:

@@ -81,7 +81,7 @@ def layouts():
             pose = np.eye(4)
             pose[:3, :3], pose[:3, 3] = data.body(name).xmat.reshape(3, 3), data.body(name).xpos
             poses[name] = [pose]
-        yield ms.Layout.of_poses(scene, poses)
+        yield ms.Layout.from_poses(scene, poses)
 
 
 camera = ms.Camera.look_at((0.35, -0.75, 0.45), (0, 0, 0.15), width=width, height=height, fov_x=45)

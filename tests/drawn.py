@@ -56,7 +56,7 @@ def render_boxes(scene: Any, index: int, *, layout: Layout) -> Any:
         silhouettes[instance.id] = Silhouette.cropped(canvas > 0, -MARGIN, -MARGIN)
         middles[instance.id] = float(camera.project(pose[:3, 3])[1][0])
     for number in sorted(middles, key=lambda number: -middles[number]):
-        covered = silhouettes[number].whole(camera.width, camera.height)
+        covered = silhouettes[number].image_mask(camera.width, camera.height)
         ids[covered], depth[covered] = number, middles[number]
     rng = np.random.default_rng(plan.seed)
     image = rng.integers(0, 256, (*shape, 3), dtype=np.uint8)

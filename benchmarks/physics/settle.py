@@ -232,8 +232,8 @@ def measure_rest(count: int) -> None:
             world = drop._world(assets, drop._draw_frictions(0), 1.0)
             world.reset(drop.draw_poses(assets, np.random.default_rng(seed)))
             outcome = run_to_rest(world, max_time=6.0, bounds=drop._grounds[0].bounds)
-            if outcome.refused:
-                print(f"  seed {seed}: {outcome.refused}")
+            if outcome.rejection:
+                print(f"  seed {seed}: {outcome.rejection}")
                 continue
             times.append(outcome.time)
             end = world.time + 5.0

@@ -135,13 +135,13 @@ def has_rested(
         def _advance(self) -> None:
             self._frame = next(self._frames)
 
-        def _let_roll(self, rolls: bool) -> None:
+        def _allow_rolling(self, rolls: bool) -> None:
             pass
 
         def _coordinates(self) -> Float64Array:
             return self._frame
 
     try:
-        return not run_to_rest(Recorded(), max_time=DURATION, bounds=bounds).refused
+        return not run_to_rest(Recorded(), max_time=DURATION, bounds=bounds).rejection
     except StopIteration:
         return False

@@ -26,9 +26,9 @@ from mitsplat.scene.planning.frame_plan import plan_frame
 from mitsplat.scene.scene import Scene
 from mitsplat.scene.spec.named_files import environments, object_assets
 
-SIZES = {"object": (0.002, 2.0), "environment": (0.2, 100.0)}
+SIZE_LIMITS = {"object": (0.002, 2.0), "environment": (0.2, 100.0)}
 """Expected range of the longest extent by kind of asset [m]."""
-DENSITIES = (20.0, 22600.0)
+DENSITY_LIMITS = (20.0, 22600.0)
 """Expected range of mass density, from foam to osmium [kg/m^3]."""
 MAX_FAULTY = 0.01
 """Fraction of Gaussians up to which needles and floaters are acceptable."""
@@ -39,7 +39,7 @@ MAX_SPREAD = 0.05
 """Maximum median distance between splats and mesh, as a fraction of the mesh's diagonal."""
 MAX_FILL = 0.35
 """Maximum fraction of the region's volume for dropped objects; loose packing of boxes ends at about 0.6."""
-TILT = 0.5
+MIN_SPREAD_DIFFERENCE = 0.5
 """Relative difference of spreads above which an environment that is thinner along x or y seems to lie on its side."""
 
 
@@ -72,7 +72,7 @@ def check_asset(asset: Asset) -> Iterator[Finding]:
 
 
 def _units(asset: Asset, size: float) -> Finding:
-    low, high = SIZES[asset.kind]
+    low, high = SIZE_LIMITS[asset.kind]
     if asset.units == "unknown":
         return Finding("units", False, "unknown", "measure the longest extent and give it as size [m] in asset.yaml")
     wrong = next((factor for factor in (1e-3, 1e3, 0.01, 100.0) if low <= size * factor <= high), None)
@@ -85,7 +85,7 @@ def _up(asset: Asset, core: Float64Array) -> Finding:
     if asset.kind == "object":
         return Finding("up axis", True, "z; physics determines the resting pose of an object")
     thin = int(np.argmin(spread))
-    tilted = thin != 2 and spread[thin] < (1 - TILT) * spread[2]
+    tilted = thin != 2 and spread[thin] < (1 - MIN_SPREAD_DIFFERENCE) * spread[2]
     text = f"z; the environment is thinnest along {'xyz'[thin]}"
     return Finding("up axis", not tilted, text, f"if it lies on its side, set up: {'xyz'[thin]} (or -) in asset.yaml")
 
@@ -158,7 +158,7 @@ def _mass(asset: Asset, mesh: trimesh.Trimesh) -> Iterator[Finding]:
     has_solid = solid is mesh or bool(asset.pieces)
     hull = "" if has_solid else " if it fills its convex hull; its convex pieces are not computed yet"
     yield Finding(
-        "mass", DENSITIES[0] <= density <= DENSITIES[1], f"{mass:.3g} kg, of {density:.0f} kg/m^3{hull}",
+        "mass", DENSITY_LIMITS[0] <= density <= DENSITY_LIMITS[1], f"{mass:.3g} kg, of {density:.0f} kg/m^3{hull}",
         "set mass [kg] or density [kg/m^3] in asset.yaml; a wrong unit of length shows here too",
     )  # fmt: skip
 

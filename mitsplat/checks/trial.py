@@ -28,7 +28,7 @@ TOLERANCE = 0.02
 """Maximum difference of a mean; 1 is white or unshadowed. One pixel at an edge changes a mean by 0.016."""
 
 # fmt: off
-KNOWN = {
+KNOWN_MEANS = {
     "picture": [
         [0.577, 0.540, 0.556, 0.560, 0.496, 0.577, 0.625, 0.640],
         [0.340, 0.331, 0.313, 0.128, 0.090, 0.112, 0.311, 0.334],
@@ -121,7 +121,7 @@ def trial_faults(layers: Layers) -> list[str]:
     """Return the differences from the known picture, a text each."""
     faults = []
     for name, means in trial_means(layers).items():
-        worst = float(np.abs(means - KNOWN[name]).max())
+        worst = float(np.abs(means - KNOWN_MEANS[name]).max())
         if not worst <= TOLERANCE:
             faults.append(f"{name} is off by {worst:.2f}")
     return faults

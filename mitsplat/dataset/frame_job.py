@@ -19,7 +19,7 @@ from mitsplat.dataset.own_files import LOCK
 from mitsplat.errors import InputError, PartialResultError
 from mitsplat.formats.registry import Catalogue, write_frame
 from mitsplat.progress import Note
-from mitsplat.scene.layout import Layout, NothingRests
+from mitsplat.scene.layout import Layout, UnsettledLayoutError
 from mitsplat.scene.planning.frame_plan import layout_of
 from mitsplat.scene.scene import Scene
 from mitsplat.storage.files import (
@@ -75,7 +75,7 @@ class FrameMaker:
         note(f"settling layout {index}")
         try:
             layout = self.settle(self.scene, index, progress=lambda text: note(f"layout {index}: {text}"))
-        except NothingRests as nothing:
+        except UnsettledLayoutError as nothing:
             layout = nothing.layout
         return json.dumps(layout.to_json())
 

@@ -179,8 +179,8 @@ def render_frame(
         index: Frame index, below ``scene.num_frames``.
         quality: Preset of the splat renderer, refined by the scene file's ``rendering``, or a complete `Quality`. By
             default, the preset of the scene file.
-        layout: Settled layout of the frame, or a custom one (:meth:`mitsplat.Layout.of_poses`). By default, the layout
-            is settled here.
+        layout: Settled layout of the frame, or a custom one (:meth:`mitsplat.Layout.from_poses`). By default, the
+            layout is settled here.
         camera: Camera in place of the scene's.
         lights: Lights in place of the scene's, as in a scene file: models, or mappings of keys to values.
         next_layout: Layout of the next image, for the flow. By default, the objects do not move.
@@ -454,7 +454,7 @@ class Renderer:
         if environment is not None:
             shapes["environment"] = _asset_shape(environment, np.eye(4), 0)
         for i, (shape, mesh) in enumerate(zip(self.scene.spec.shapes, self.scene.shape_meshes, strict=True)):
-            if shape.visible and (finish := place.finish_of(shape.name)) is not None:
+            if shape.visible and (finish := place.material_of(shape.name)) is not None:
                 image = texture_image(finish, self.scene.images)
                 bsdf = mi.load_dict(material(finish, None if image is None else bitmap_texture(image)))
                 shapes[f"shape_{i}"] = finished_mesh(mesh, shape, finish, image, bsdf)

@@ -73,7 +73,7 @@ def export_xml(scene: Scene, index: int, path: str | Path) -> None:
         if shape.visible:
             stem = files / f"shape_{number}"
             shapes[f"shape_{number}"] = _describe_shape(
-                shape, mesh, stem, place.finish_of(shape.name), scene, plan.belt
+                shape, mesh, stem, place.material_of(shape.name), scene, plan.belt
             )
     lights = {f"light_{i}": emitter_dict(light, scene.path.parent.resolve()) for i, light in enumerate(plan.lights)}
     description = {

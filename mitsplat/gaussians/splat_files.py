@@ -77,7 +77,7 @@ class SplatArrays(NamedTuple):
     sh: Float32Array
 
 
-def usual_up(path: Path) -> Axis:
+def default_up_axis(path: Path) -> Axis:
     """Return the usual up axis of a format: y for ``.spz``, -y for the others, as in structure from motion."""
     return "y" if path.suffix.lower() == ".spz" else "-y"
 

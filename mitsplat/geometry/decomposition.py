@@ -38,9 +38,9 @@ _MAX_PARTS = 64
 # [m], a third of the permitted penetration into a table. More is removed if necessary for few faces.
 _SCAN_FACES, _DEVIATION, _MAX_DEVIATION = 3000, 5e-4, 1e-4
 _TARGET_FACES, _MAX_ERROR = 5000, 0.003
-# A surface is ragged if sharp valleys have more than this share of the length of all edges. It is the result of a bad
+# A surface is noisy if sharp valleys have more than this share of the length of all edges. It is the result of a bad
 # fit and would be split into more pieces than it has faces. Parts and scans have 0.15 at most.
-_RAGGED, _RAGGED_THRESHOLD = 0.25, 0.1
+_NOISY, _NOISY_THRESHOLD = 0.25, 0.1
 # CoACD search iterations per cut. A scan has more cuts than concavities, so any of them is sufficient.
 _ITERATIONS, _SCAN_ITERATIONS = 150, 20
 # Number of cut planes that are tested along each direction.
@@ -114,9 +114,9 @@ def _split(part: trimesh.Trimesh, threshold: float, most: int) -> list[trimesh.T
     if scan and part.is_volume:
         limit = max_gap(float(part.extents.max())) * threshold / _THRESHOLD
         return _Cutter(part, limit).pieces(most)
-    ragged = _valleys(part) > _RAGGED
-    if ragged:
-        threshold = max(threshold, _RAGGED_THRESHOLD)
+    noisy = _concave_edge_share(part) > _NOISY
+    if noisy:
+        threshold = max(threshold, _NOISY_THRESHOLD)
         _logger.warning(
             "the surface of a mesh of %d faces is noisy: its convex pieces approximate it only to %g of its size",
             len(part.faces),
@@ -126,7 +126,7 @@ def _split(part: trimesh.Trimesh, threshold: float, most: int) -> list[trimesh.T
     found = coacd.run_coacd(
         coacd.Mesh(part.vertices, part.faces),
         threshold=threshold,
-        mcts_iterations=_SCAN_ITERATIONS if scan or ragged else _ITERATIONS,
+        mcts_iterations=_SCAN_ITERATIONS if scan or noisy else _ITERATIONS,
         seed=0,
     )
     pieces = [trimesh.Trimesh(vertices, faces, process=False).convex_hull for vertices, faces in found]
@@ -134,7 +134,7 @@ def _split(part: trimesh.Trimesh, threshold: float, most: int) -> list[trimesh.T
     return [piece for piece in pieces if piece.volume > 1e-6 * hull.volume]
 
 
-def _valleys(mesh: trimesh.Trimesh) -> float:
+def _concave_edge_share(mesh: trimesh.Trimesh) -> float:
     """Return the share of edges, by length, at which the surface folds inwards by more than :data:`SHARP`."""
     ends = mesh.vertices[mesh.face_adjacency_edges]
     lengths = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)

@@ -18,7 +18,7 @@ from mitsplat.geometry.mesh import contact_points, join_meshes
 from mitsplat.runtime.warp_start import quiet_warp
 
 _SAMPLES, _BATCH = 4000, 256
-ROUNDING = 1e-6
+ROUNDING_ERROR = 1e-6
 """Upper bound of the error of distances in single precision [m]."""
 _FAR = 1e6  # beyond the distance of any inside point from its surface [m]
 
@@ -126,7 +126,7 @@ def clearance(first: PlacedSurface, second: PlacedSurface, *, reach: float) -> C
         return Clearance(first, second, reach)
     distance = second.signed_distance(first.points, reach)
     # In the other direction only smaller distances matter. Overlaps always matter, because the meshes may have holes.
-    nearer = reach if distance < 0 else distance + ROUNDING
+    nearer = reach if distance < 0 else distance + ROUNDING_ERROR
     return Clearance(first, second, min(distance, first.signed_distance(second.points, nearer)))
 
 

@@ -53,7 +53,7 @@ class Silhouette:
         """Number of pixels."""
         return int(np.count_nonzero(self.mask))
 
-    def inside(self, width: int, height: int) -> Silhouette | None:
+    def clipped(self, width: int, height: int) -> Silhouette | None:
         """Return the part inside an image, or None if it is empty."""
         x0, y0, x1, y1 = self.box
         left, top, right, bottom = max(x0, 0), max(y0, 0), min(x1, width), min(y1, height)
@@ -62,10 +62,10 @@ class Silhouette:
         part = self.mask[top - y0 : bottom - y0, left - x0 : right - x0]
         return Silhouette.cropped(part, left, top) if part.any() else None
 
-    def whole(self, width: int, height: int) -> BoolArray:
+    def image_mask(self, width: int, height: int) -> BoolArray:
         """Return the mask in an image, shape (height, width)."""
         canvas = np.zeros((height, width), dtype=bool)
-        if part := self.inside(width, height):
+        if part := self.clipped(width, height):
             x0, y0, x1, y1 = part.box
             canvas[y0:y1, x0:x1] = part.mask
         return canvas

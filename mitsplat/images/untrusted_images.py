@@ -10,7 +10,7 @@ from typing import BinaryIO
 from mitsplat.images.exr_header import check_exr_header
 from mitsplat.runtime.child_process import limit_memory, run_bounded
 
-IMAGES = (".exr", ".hdr", ".pfm", ".png", ".jpg", ".jpeg", ".bmp", ".tga")
+IMAGE_SUFFIXES = (".exr", ".hdr", ".pfm", ".png", ".jpg", ".jpeg", ".bmp", ".tga")
 """Suffixes of image files that patterns match."""
 
 _SECONDS = 120

@@ -20,7 +20,7 @@ from mitsplat.arrays import BoolArray, Float64Array
 from mitsplat.asset import Asset
 from mitsplat.errors import InputError
 from mitsplat.gaussians.splat_cloud import Splats
-from mitsplat.gaussians.splat_files import Axis, usual_up
+from mitsplat.gaussians.splat_files import Axis, default_up_axis
 from mitsplat.geometry.camera import Camera, spiral
 from mitsplat.geometry.decomposition import convex_pieces
 from mitsplat.importing.upright import Plane, Upright, cut_support, find_up
@@ -231,7 +231,7 @@ def import_splats(
     report("removing floaters")
     cleaner.remove_floaters(kind)
     report("finding up")
-    upright = find_up(cleaner.splats, kind, usual_up(path), settings.up)
+    upright = find_up(cleaner.splats, kind, default_up_axis(path), settings.up)
     turn = np.eye(4)
     turn[:3, :3] = upright.rotation
     if settings.without_table:

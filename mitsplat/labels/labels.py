@@ -259,7 +259,7 @@ def label_instances(
             continue
         silhouette = truth.silhouettes.get(instance.id)
         if instance.id not in found:
-            dropped["outside" if silhouette is None or silhouette.inside(width, height) is None else "hidden"] += 1
+            dropped["outside" if silhouette is None or silhouette.clipped(width, height) is None else "hidden"] += 1
             continue
         x0, y0, x1, y1 = found[instance.id]
         mask, fragments = without_fragments(ids[y0:y1, x0:x1] == instance.id, rules.min_fragment)
@@ -325,7 +325,7 @@ def _amodal(
     full = Silhouette.cropped(without_fragments(canvas, min_fragment)[0], x0, y0)
     if min(full.box[:2]) >= 0 and full.box[2] <= size[0] and full.box[3] <= size[1]:
         return full, full.box, full.area
-    inside = full.inside(*size)
+    inside = full.clipped(*size)
     cleaned = None if inside is None else without_fragments(inside.mask, min_fragment)[0]
     if inside is None or cleaned is None or not cleaned.any():
         raise AssertionError("the visible mask of an instance must be part of its silhouette")

@@ -21,10 +21,10 @@ from mitsplat.geometry.mesh import mass_properties, prepare_mesh
 from mitsplat.geometry.mesh_distance import Clearance, DistanceSurface, PlacedSurface, all_clearances, standoff
 from mitsplat.physics.contacts import ContactFinder
 from mitsplat.physics.placement import Item, draw_poses
-from mitsplat.physics.rest import OVERFLOW, RestOutcome, run_to_rest
+from mitsplat.physics.rest import CONTACT_OVERFLOW, RestOutcome, run_to_rest
 from mitsplat.physics.worlds import Body, Collider, MujocoWorld, WarpWorld, World, all_pieces
 from mitsplat.progress import Note
-from mitsplat.scene.layout import NO_PHYSICS, Instance, Layout, LeftOut, NothingRests, RestCertificate
+from mitsplat.scene.layout import NO_PHYSICS, Instance, Layout, LeftOut, RestCertificate, UnsettledLayoutError
 from mitsplat.scene.planning.contents import draw_objects, draw_regions
 from mitsplat.scene.scene import Scene
 from mitsplat.scene.splits import draw_environment
@@ -40,12 +40,12 @@ _MIN_SCATTER_DISTANCE = 5e-4  # minimum distance of scattered objects at rest [m
 _FALLEN_TILT = 5.0  # tilt from which an upright object has fallen over [degrees]
 # Number of simulations between garbage collections. Newton leaves each model (1 MiB and more) in reference cycles,
 # which Python would collect only after a quarter of all objects. A collection takes 0.5 s.
-_GARBAGE = 24
+_COLLECTION_INTERVAL = 24
 CROWDED = "no room for all"
 _LEFT_OUT_PER_ROUND = 0.1  # share of the objects that is left out per round if they find no room,
 _MAX_LEFT_OUT = 0.5  # and maximum share in total: beyond it, the region is too small
 _POUR_SPEED = 1.0  # speed limit of poured objects [m/s]: at higher speed, heavy objects eject light ones
-_THRESHOLDS = (0.02, 0.01, 0.005)  # concavity of convex pieces, from coarse to fine
+_CONCAVITIES = (0.02, 0.01, 0.005)  # concavity of convex pieces, from coarse to fine
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +91,7 @@ class _Rejection:
     """Rejection of a draw: its reason, the positions of the objects that cause it, and an optional error message."""
 
     reason: str
-    blamed: Sequence[int]
+    causes: Sequence[int]
     sentence: str = ""
 
 
@@ -144,7 +144,7 @@ class Drop:
 
         Raises:
             InputError: If more than half of the objects find no room, although each of them fits alone.
-            NothingRests: If no draw passes, even with fewer objects.
+            UnsettledLayoutError: If no draw passes, even with fewer objects.
         """
         drawn = self._draw_contents(index)
         if not drawn:
@@ -164,7 +164,7 @@ class Drop:
                 refused.append(found.reason)
                 sentence = found.sentence
                 crowded = crowded or (sentence if found.reason == CROWDED else "")
-                for position in found.blamed:
+                for position in found.causes:
                     faults[drawn[position].id].append(found.reason)
             draws = len(refused) - before
             removed = [one for one in drawn if len(faults[one.id]) == draws]
@@ -178,9 +178,9 @@ class Drop:
                 left_out.append(LeftOut(one.id, one.asset, f"{short_reason} in {times} of {draws} draws"))
                 drawn.remove(one)
         reasons = ", ".join(f"{count} x {reason}" for reason, count in Counter(refused[:attempts]).items())
-        must = f"layout {index} must come to rest in settle.attempts = {attempts} draws (got {reasons})"
-        nothing = replace(NO_PHYSICS, attempts=len(refused), refused=tuple(refused))
-        raise NothingRests(sentence or f"{self.scene.path}: {must}", Layout(index, (), nothing, tuple(left_out)))
+        rule = f"layout {index} must come to rest in settle.attempts = {attempts} draws (got {reasons})"
+        failed = replace(NO_PHYSICS, attempts=len(refused), refused=tuple(refused))
+        raise UnsettledLayoutError(sentence or f"{self.scene.path}: {rule}", Layout(index, (), failed, tuple(left_out)))
 
     def _draw_contents(self, index: int) -> list[_DrawnObject]:
         """Return the objects that are drawn for a layout."""
@@ -201,20 +201,20 @@ class Drop:
             alone = [self._place([item], number, rng) is None for item in self._items(assets, given, regions)]
             reason = "no room for it" if any(alone) else CROWDED
             return _Rejection(reason, np.flatnonzero(alone).tolist(), str(error))
-        world = self._world(assets, self._draw_frictions(index), 2.0 ** refused.count(OVERFLOW), number)
+        world = self._world(assets, self._draw_frictions(index), 2.0 ** refused.count(CONTACT_OVERFLOW), number)
         world.reset(start)
         outcome = self._run(world, number, regions, given)
-        if outcome.refused:
-            return _Rejection(outcome.refused, outcome.blamed)
+        if outcome.rejection:
+            return _Rejection(outcome.rejection, outcome.causes)
         resting = [self._placed(asset, pose) for asset, pose in zip(assets, outcome.poses, strict=True)]
         clearances = all_clearances(resting, obstacles, reach=_MAX_MEASURED_GAP)
         gaps = _support_gaps(resting, clearances)
-        fault = _fault(clearances, gaps, obstacles) or self._arrangement_defect(
+        defect = _rest_defect(clearances, gaps, obstacles) or self._arrangement_defect(
             resting, clearances, obstacles, start, outcome.poses, given, regions
         )
-        if fault is not None:
-            reason, blamed = fault
-            return _Rejection(reason, [position for position, item in enumerate(resting) if item in blamed])
+        if defect is not None:
+            reason, causes = defect
+            return _Rejection(reason, [position for position, item in enumerate(resting) if item in causes])
         certificate = RestCertificate(
             rested=True,
             inside=True,
@@ -255,7 +255,7 @@ class Drop:
         assets, given = tuple(one.asset for one in drawn), [one.given for one in drawn]
         certificate = layout.certificate
         rng = random_stream(self.scene.spec.seed, "object poses", layout.index, certificate.attempts - 1)
-        capacity = 2.0 ** certificate.refused.count(OVERFLOW)
+        capacity = 2.0 ** certificate.refused.count(CONTACT_OVERFLOW)
         number, regions = self._ground_of(layout.index), [one.region for one in drawn]
         world = self._world(assets, self._draw_frictions(layout.index), capacity, number)
         world.reset(self.draw_poses(assets, rng, given, number, regions))
@@ -303,7 +303,7 @@ class Drop:
             bodies = [self._objects[asset].body.with_friction(frictions[asset]) for asset in assets]
             self._worlds.clear()
             self._world_count += 1
-            if self._world_count % _GARBAGE == 0:
+            if self._world_count % _COLLECTION_INTERVAL == 0:
                 gc.collect()
             self._worlds[key] = (
                 MujocoWorld(bodies, ground.colliders, timestep=settle.timestep)
@@ -330,7 +330,7 @@ class Drop:
                 standoff_distance = standoff(surface, pieces)
             else:
                 limit = max_gap(float(mesh.extents.max()))
-                for threshold in _THRESHOLDS:
+                for threshold in _CONCAVITIES:
                     pieces = _pieces(mesh, asset.name, progress, threshold=threshold)
                     standoff_distance = standoff(surface, pieces)
                     if standoff_distance <= limit:
@@ -499,7 +499,7 @@ def _support_gaps(resting: Sequence[PlacedSurface], clearances: Sequence[Clearan
     }
 
 
-def _fault(
+def _rest_defect(
     clearances: Sequence[Clearance], gaps: Mapping[PlacedSurface, float], obstacles: Sequence[PlacedSurface]
 ) -> _Defect | None:
     """Return the defect of a resting state (penetration or unsupported object), or None."""
@@ -522,7 +522,7 @@ def _deepest(pairs: Iterable[Clearance]) -> float:
 
 
 def _pieces(
-    mesh: trimesh.Trimesh, name: str, progress: Note, *, threshold: float = _THRESHOLDS[0]
+    mesh: trimesh.Trimesh, name: str, progress: Note, *, threshold: float = _CONCAVITIES[0]
 ) -> tuple[trimesh.Trimesh, ...]:
     progress(f"computing convex pieces of {name}")
-    return convex_pieces(mesh, threshold=threshold, most=round(MAX_PIECES * _THRESHOLDS[0] / threshold))
+    return convex_pieces(mesh, threshold=threshold, most=round(MAX_PIECES * _CONCAVITIES[0] / threshold))

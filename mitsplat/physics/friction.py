@@ -24,7 +24,7 @@ from newton.solvers import SolverMuJoCo
 
 from mitsplat.arrays import Float64Array
 
-LEAST_FRICTION = 2e-5
+MIN_FRICTION = 2e-5
 """Minimum friction. MuJoCo divides by the friction, and smaller values are unstable."""
 
 _vec5 = wp.types.vector(length=5, dtype=wp.float32)
@@ -34,7 +34,7 @@ def pair_friction(first: Float64Array, second: Float64Array) -> Float64Array:
     """Compute the friction of contacts (N, 5), as 2 x sliding, spin, 2 x rolling, from that of their geoms (N, 3)."""
     slide = np.sqrt(first[:, 0] * second[:, 0])
     spin, roll = np.maximum(first[:, 1:], second[:, 1:]).T
-    return np.asarray(np.maximum(np.stack([slide, slide, slide * spin, roll, roll], axis=1), LEAST_FRICTION))
+    return np.asarray(np.maximum(np.stack([slide, slide, slide * spin, roll, roll], axis=1), MIN_FRICTION))
 
 
 class PairFrictionSolver(SolverMuJoCo):
@@ -42,7 +42,7 @@ class PairFrictionSolver(SolverMuJoCo):
 
     def __init__(self, model: newton.Model, **options: Any) -> None:
         with warnings.catch_warnings():
-            # The friction of a geom is one factor of a pair's friction, which is at least LEAST_FRICTION.
+            # The friction of a geom is one factor of a pair's friction, which is at least MIN_FRICTION.
             warnings.filterwarnings("ignore", message=r"geom \d+: friction.* < MJ_MINMU")
             super().__init__(model, **options)
 
@@ -73,7 +73,7 @@ def _mix_friction(
     pair, world = geoms[contact], worlds[contact]
     first, second = geom_friction[world, pair[0]], geom_friction[world, pair[1]]
     slide = wp.sqrt(first[0] * second[0])
-    spin = wp.max(LEAST_FRICTION, slide * wp.max(first[1], second[1]))
-    roll = wp.max(LEAST_FRICTION, wp.max(first[2], second[2]))
-    slide = wp.max(LEAST_FRICTION, slide)
+    spin = wp.max(MIN_FRICTION, slide * wp.max(first[1], second[1]))
+    roll = wp.max(MIN_FRICTION, wp.max(first[2], second[2]))
+    slide = wp.max(MIN_FRICTION, slide)
     friction[contact] = _vec5(slide, slide, spin, roll, roll)

@@ -11,7 +11,7 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from mitsplat.arrays import BoolArray, Float64Array
-from mitsplat.geometry.mesh_distance import ROUNDING, DistanceSurface, PlacedSurface, clearance
+from mitsplat.geometry.mesh_distance import ROUNDING_ERROR, DistanceSurface, PlacedSurface, clearance
 from mitsplat.scene.spec.object_spec import Arrangement
 from mitsplat.scene.spec.shape_spec import Region
 from mitsplat.scene.walls import PILE_HEIGHT
@@ -323,7 +323,7 @@ class _Draw:
         while True:
             placed, distance = PlacedSurface("", self._items[i].surface, pose), reach
             for obstacle in obstacles:
-                nearer = clearance(placed, obstacle, reach=max(distance, 0.0) + ROUNDING).distance
+                nearer = clearance(placed, obstacle, reach=max(distance, 0.0) + ROUNDING_ERROR).distance
                 distance = min(distance, nearer)
             if distance < _START_GAP:
                 return distance > 0

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from mitsplat.arrays import Float64Array
 from mitsplat.physics.worlds import Body, ContactOverflow, World
 
-OVERFLOW = "contact buffer overflow"
+CONTACT_OVERFLOW = "contact buffer overflow"
 """Reason of :func:`run_to_rest` for rejecting a drop that may succeed with a larger capacity."""
 
 # Rest means that no surface moves farther than a limit [m] within a time [s]. The stricter first stage ends before
@@ -28,21 +28,21 @@ class RestOutcome:
     """Result of a drop.
 
     Attributes:
-        refused: Reason of a rejection, or empty.
+        rejection: Reason of a rejection, or empty.
         time: Simulated time from which the bodies were at rest [s].
         surface_motion: Largest displacement of a surface point in the second after that [m]; infinite if rejected.
         max_speed, max_spin: Maxima over the bodies at the end of that second [m/s, rad/s].
         poses: World-from-body transforms at that time, shape (N, 4, 4).
-        blamed: Positions of the bodies that cause the rejection.
+        causes: Positions of the bodies that cause the rejection.
     """
 
-    refused: str
+    rejection: str
     time: float
     max_speed: float
     max_spin: float
     surface_motion: float
     poses: Float64Array = field(repr=False)
-    blamed: tuple[int, ...] = ()
+    causes: tuple[int, ...] = ()
 
 
 def run_to_rest(
@@ -68,10 +68,10 @@ def run_to_rest(
     try:
         return _run_to_rest(world, max_time, bounds, fastest, observe)
     except ContactOverflow:
-        refused = _Rejected(OVERFLOW, np.zeros(len(world.bodies), dtype=bool))
+        refused = _Rejected(CONTACT_OVERFLOW, np.zeros(len(world.bodies), dtype=bool))
     except _Rejected as error:
         refused = error
-    return RestOutcome(str(refused), world.time, np.inf, np.inf, np.inf, world.poses, refused.blamed)
+    return RestOutcome(str(refused), world.time, np.inf, np.inf, np.inf, world.poses, refused.causes)
 
 
 class _Rejected(Exception):
@@ -79,7 +79,7 @@ class _Rejected(Exception):
 
     def __init__(self, reason: str, bodies: npt.ArrayLike) -> None:
         super().__init__(reason)
-        self.blamed = tuple(np.flatnonzero(bodies).tolist())
+        self.causes = tuple(np.flatnonzero(bodies).tolist())
 
 
 def _run_to_rest(
@@ -94,7 +94,7 @@ def _run_to_rest(
     since, rest = 0.0, world.poses
     motion = np.zeros(len(world.bodies))
     while world.time - since < _REST_TIME:
-        world.let_roll(world.time - since >= _QUIET_TIME)
+        world.allow_rolling(world.time - since >= _QUIET_TIME)
         poses = _advance_within(world, bounds, fastest)
         past.append(poses)
         observe(world.time, poses)

@@ -20,7 +20,7 @@ from mitsplat.errors import InputError
 from mitsplat.progress import Note
 from mitsplat.runtime.variant import one_at_a_time
 from mitsplat.runtime.warp_start import quiet_warp
-from mitsplat.scene.layout import Layout, NothingRests
+from mitsplat.scene.layout import Layout, UnsettledLayoutError
 from mitsplat.scene.planning.frame_plan import to_index
 from mitsplat.scene.scene import Scene
 from mitsplat.scene.spec.object_spec import Arrangement
@@ -91,7 +91,7 @@ class _SettleOne:
     def __call__(self, index: int, note: Note, /) -> Layout:
         try:
             return settle_layout(self.scene, index, progress=note, cached=self.cached)
-        except NothingRests as nothing:
+        except UnsettledLayoutError as nothing:
             return nothing.layout
 
 

@@ -125,7 +125,7 @@ class World(ABC):
         self.bodies = tuple(bodies)
         self.interval = _STEPS * timestep
         self.time = 0.0
-        self._rolls = False
+        self._rolling = False
 
     def reset(self, poses: Float64Array, velocities: Float64Array | None = None) -> None:
         """Set the state of all bodies and clear the solver's history.
@@ -135,7 +135,7 @@ class World(ABC):
             velocities: As :attr:`velocities`, shape (N, 2, 3); at rest if None.
         """
         self.time = 0.0
-        self.let_roll(False)
+        self.allow_rolling(False)
         self._reset(_coordinates(self.bodies, poses))
         self.set_velocities(np.zeros((len(self.bodies), 2, 3)) if velocities is None else velocities)
 
@@ -152,11 +152,11 @@ class World(ABC):
         self._advance()
         self.time += self.interval
 
-    def let_roll(self, rolls: bool) -> None:
-        """Disable rolling friction if ``rolls`` is true, else enable it."""
-        if rolls != self._rolls:
-            self._rolls = rolls
-            self._let_roll(rolls)
+    def allow_rolling(self, allowed: bool) -> None:
+        """Disable rolling friction if ``allowed`` is true, else enable it."""
+        if allowed != self._rolling:
+            self._rolling = allowed
+            self._allow_rolling(allowed)
 
     @property
     def poses(self) -> Float64Array:
@@ -183,7 +183,7 @@ class World(ABC):
     def _advance(self) -> None: ...
 
     @abstractmethod
-    def _let_roll(self, rolls: bool) -> None: ...
+    def _allow_rolling(self, allowed: bool) -> None: ...
 
     @abstractmethod
     def _coordinates(self) -> Float64Array:
@@ -256,8 +256,8 @@ class WarpWorld(World):
         if any(_array(observed.overflow).any() for observed in self._observables):
             raise ContactOverflow
 
-    def _let_roll(self, rolls: bool) -> None:
-        self._solver.mjw_model.geom_condim.fill_(_WITHOUT_ROLL if rolls else _WITH_ROLL)
+    def _allow_rolling(self, allowed: bool) -> None:
+        self._solver.mjw_model.geom_condim.fill_(_WITHOUT_ROLL if allowed else _WITH_ROLL)
 
     def _coordinates(self) -> Float64Array:
         return _array(self._states[0].body_q)
@@ -316,8 +316,8 @@ class MujocoWorld(World):
         for stage in _AFTER_CONTACTS:
             stage(model, data)
 
-    def _let_roll(self, rolls: bool) -> None:
-        self._model.geom_condim[:] = _WITHOUT_ROLL if rolls else _WITH_ROLL
+    def _allow_rolling(self, allowed: bool) -> None:
+        self._model.geom_condim[:] = _WITHOUT_ROLL if allowed else _WITH_ROLL
 
     def _coordinates(self) -> Float64Array:
         return np.array(self._data.qpos).reshape(-1, 7)[:, [0, 1, 2, 4, 5, 6, 3]]
@@ -332,7 +332,7 @@ def _assign(array: Any, values: Float64Array) -> None:
     array.assign(values.astype(np.float32))
 
 
-def _parking(bodies: Sequence[Body]) -> Float64Array:
+def _initial_coordinates(bodies: Sequence[Body]) -> Float64Array:
     """Return initial coordinates in a row high above the scene, far apart, shape (M, 7).
 
     Bodies without shape stay there. Models are built with these coordinates, so that no constant of the solver depends
@@ -347,7 +347,7 @@ def _parking(bodies: Sequence[Body]) -> Float64Array:
 
 def _coordinates(bodies: Sequence[Body], poses: Float64Array) -> Float64Array:
     """Return position and xyzw quaternion of bodies at poses (N, 4, 4), and of those without shape, shape (M, 7)."""
-    coordinates = _parking(bodies)
+    coordinates = _initial_coordinates(bodies)
     turns = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
     coordinates[: len(poses)] = np.concatenate([poses[:, :3, 3], turns], axis=1)
     return coordinates
@@ -378,7 +378,7 @@ def _build_scene(
             xform = wp.transform(wp.vec3(*pose[:3, 3]), wp.quat(*Rotation.from_matrix(pose[:3, :3]).as_quat()))
             builder.add_shape_box(-1, xform=xform, hx=hx, hy=hy, hz=hz, cfg=config, custom_attributes=contact)
         _add_hulls(builder, -1, [newton_hull(piece) for piece in collider.pieces], config, contact)
-    for i, place in enumerate(_parking(bodies)):
+    for i, place in enumerate(_initial_coordinates(bodies)):
         body = bodies[i] if i < len(bodies) else None
         mass = bodies[0].mass if body is None else body.mass
         link = builder.add_body(

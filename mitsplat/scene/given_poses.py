@@ -14,7 +14,7 @@ _RIGID = 1e-5
 """Maximum absolute entry of R R^T - 1 in a pose, as for cameras. Rotations in single precision pass; scales do not."""
 
 
-def asset_named(name: str | int, names: Sequence[tuple[str, str]]) -> int:
+def asset_index(name: str | int, names: Sequence[tuple[str, str]]) -> int:
     """Return the index of the asset with a name or number.
 
     Args:

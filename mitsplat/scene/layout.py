@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from mitsplat.arrays import Float64Array
 from mitsplat.errors import InputError
-from mitsplat.scene.given_poses import asset_named, rigid_pose
+from mitsplat.scene.given_poses import asset_index, rigid_pose
 
 if TYPE_CHECKING:
     from mitsplat.scene.scene import Scene
@@ -123,7 +123,7 @@ class Layout:
     settled: Layout | None = None
 
     @classmethod
-    def of_poses(
+    def from_poses(
         cls, scene: Scene, poses: Mapping[str | int, Sequence[npt.ArrayLike | None]], *, index: int = 0
     ) -> Layout:
         """Create a layout from given poses, such as those of a simulator.
@@ -148,7 +148,7 @@ class Layout:
         names = [(asset.name, path) for asset, path in zip(scene.assets, paths, strict=True)]
         lists: dict[int, Sequence[npt.ArrayLike | None]] = {}
         for name, given in poses.items():
-            asset = asset_named(name, names)
+            asset = asset_index(name, names)
             if asset in lists:
                 raise InputError(f"poses[{name!r}]: must not name an asset that already has poses (asset {asset})")
             lists[asset] = [
@@ -191,7 +191,7 @@ class Layout:
         )
 
 
-class NothingRests(InputError):
+class UnsettledLayoutError(InputError):
     """Error: no object of a layout came to rest.
 
     Attributes:
@@ -202,6 +202,6 @@ class NothingRests(InputError):
         super().__init__(text)
         self.layout = layout
 
-    def __reduce__(self) -> tuple[type[NothingRests], tuple[str, Layout]]:
+    def __reduce__(self) -> tuple[type[UnsettledLayoutError], tuple[str, Layout]]:
         """Return the arguments for pickling, which worker processes need."""
         return type(self), (str(self), self.layout)

@@ -17,7 +17,7 @@ from mitsplat.capture.capture import Capture, Photo
 from mitsplat.capture.pipeline.picking import chosen_object, pick_along
 from mitsplat.errors import InputError
 from mitsplat.gaussians.splat_cloud import Splats
-from mitsplat.gaussians.splat_files import Axis, usual_up
+from mitsplat.gaussians.splat_files import Axis, default_up_axis
 from mitsplat.view.dataset_index import OVERLAYS, DatasetIndex, Filter, OverlayName
 from mitsplat.view.page import Page
 from mitsplat.view.scene_parts import Frustum, ShownPart, ShownPoints, ShownSplats, asset_parts, capture_parts
@@ -77,7 +77,7 @@ class SplatsPage(StillPage):
         splats = Splats.load(path)
         page.show([ShownPart("/splats/file", ShownSplats(splats))])
         axes = get_args(Axis)
-        up = page.gui.add_dropdown("up axis", axes, initial_value=usual_up(path))
+        up = page.gui.add_dropdown("up axis", axes, initial_value=default_up_axis(path))
         up.on_update(lambda _: page.look_around(up.value) if up.value in axes else None)
         page.look_around(up.value)
         size = " × ".join(f"{side:.3g}" for side in np.ptp(splats.bounds, axis=0)) if len(splats) else "nothing"

@@ -9,7 +9,7 @@ import pytest
 
 from mitsplat.checks import doctor
 from mitsplat.checks.doctor import examine
-from mitsplat.checks.trial import KNOWN, TOLERANCE, render_trial, trial_faults, trial_means
+from mitsplat.checks.trial import KNOWN_MEANS, TOLERANCE, render_trial, trial_faults, trial_means
 from mitsplat.engine import resources
 from mitsplat.engine.resources import unused_memory
 from mitsplat.renderer.occluders.proxies import Proxies
@@ -58,9 +58,9 @@ def trial():
 
 class TestTrial:
     def test_the_trial_scene_has_its_known_means(self, trial):
-        """Far within the tolerance, or KNOWN is of another renderer; processors of two makers differ by 0.0014."""
+        """Far within the tolerance, or the means are of another renderer; processors of two makers differ by 0.0014."""
         means = trial_means(trial)
-        assert max(np.abs(means[name] - known).max() for name, known in KNOWN.items()) < TOLERANCE / 8
+        assert max(np.abs(means[name] - known).max() for name, known in KNOWN_MEANS.items()) < TOLERANCE / 8
         assert trial_faults(trial) == []
 
     @pytest.mark.parametrize("lost", ["static", "dynamic"])

@@ -8,7 +8,7 @@ import trimesh
 from ruamel.yaml import YAML
 
 from mitsplat.asset import Asset
-from mitsplat.checks.path_checks import SIZES, check_asset, check_scene
+from mitsplat.checks.path_checks import SIZE_LIMITS, check_asset, check_scene
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.scene.loading.scene_loading import load_scene
 from tests.cli.typed import run
@@ -112,7 +112,7 @@ def test_assets_of_the_same_name_are_checked_separately(tmp_path):
 
 def test_an_asset_of_several_sizes_is_listed_once(scene_data, write_scene, monkeypatch):
     """A fault of one size is told of, and nothing is said to be well with the asset then."""
-    monkeypatch.setitem(SIZES, "object", (0.016, 2.0))
+    monkeypatch.setitem(SIZE_LIMITS, "object", (0.016, 2.0))
     scene_data["objects"] = [{"asset": f"assets/{name}", "scale": [0.5, 1]} for name in ("nut", "bolt")]
     said = [(finding.name, finding.text) for finding in check_scene(load_scene(write_scene(scene_data)))]
     assert [(name, text) for name, text in said if name.startswith(("nut", "bolt"))] == [

@@ -35,7 +35,7 @@ def film(scene: Scene, count: int = 3, width: int = 64) -> list:
     for step in range(count):
         pose = np.eye(4)
         pose[:3, 3] = 0.05 + 0.01 * step, 0, 0.02
-        layouts.append(Layout.of_poses(scene, {"nut": [pose], "bolt": [np.diag([1, -1, -1, 1])]}))
+        layouts.append(Layout.from_poses(scene, {"nut": [pose], "bolt": [np.diag([1, -1, -1, 1])]}))
     above = Camera.look_at((0, -0.05, 0.5), (0, 0, 0), width=width, height=48, fov_x=40)
     return list(render_frames(scene, layouts=layouts, cameras=above, quality="fast", progress=False))
 
@@ -61,7 +61,7 @@ def test_the_motion_of_the_camera_is_stated(scene: Scene, tmp_path: Path) -> Non
     motion = Motion(exposure=(0.01, 0.01), rotation=(100.0, 100.0))
     camera = scene.spec.camera.model_copy(update={"motion": motion})
     scene = replace(scene, spec=scene.spec.model_copy(update={"camera": camera}))
-    layout = Layout.of_poses(scene, {"nut": [np.eye(4)], "bolt": [np.diag([1, -1, -1, 1])]})
+    layout = Layout.from_poses(scene, {"nut": [np.eye(4)], "bolt": [np.diag([1, -1, -1, 1])]})
     frame = next(render_frames(scene, layouts=layout, quality="fast", progress=False))
     out = write_frames(scene, tmp_path / "out", [frame]).path
     (record,) = [json.loads(line) for line in (out / "manifest.jsonl").read_text().splitlines()]

@@ -18,7 +18,7 @@ from mitsplat.dataset.shards import merge_shards
 from mitsplat.dataset.write import DatasetSummary, write_dataset
 from mitsplat.errors import InputError
 from mitsplat.report.dataset_report import write_report
-from mitsplat.scene.layout import Layout, LeftOut, NothingRests
+from mitsplat.scene.layout import Layout, LeftOut, UnsettledLayoutError
 from mitsplat.scene.scene import Scene
 from tests.conftest import BOTH, small_scene
 from tests.drawn import large_boxes, render_boxes, scatter_boxes
@@ -33,7 +33,7 @@ def settle_most(scene: Scene, index: int, *, progress: Any) -> Layout:
         return replace(layout, instances=(layout.instances[0], *layout.instances[2:]), left_out=(LeftOut(2, 1, WORDS),))
     if index == 5:
         gone = tuple(LeftOut(one.id, one.asset, "fell") for one in layout.instances)
-        raise NothingRests("nothing rests", replace(layout, instances=(), left_out=gone))
+        raise UnsettledLayoutError("nothing rests", replace(layout, instances=(), left_out=gone))
     return layout
 
 

@@ -58,7 +58,7 @@ class Drawn:
     def ids(self) -> np.ndarray:
         ids = np.zeros((HEIGHT, WIDTH), dtype=np.uint16)
         for number, (mask, x, y) in self.covered.items():
-            ids[Silhouette.cropped(mask, x, y).whole(WIDTH, HEIGHT)] = number
+            ids[Silhouette.cropped(mask, x, y).image_mask(WIDTH, HEIGHT)] = number
         return ids
 
 
@@ -313,7 +313,8 @@ class TestCoco:
                 if record["split"] != split:
                     continue
                 for label, entry in zip(frame.labels.instances, read.imgToAnns[frame.index], strict=True):
-                    expected = label.amodal.whole(WIDTH, HEIGHT) if name == "amodal" else whole(label, (HEIGHT, WIDTH))
+                    visible = whole(label, (HEIGHT, WIDTH))
+                    expected = label.amodal.image_mask(WIDTH, HEIGHT) if name == "amodal" else visible
                     np.testing.assert_array_equal(read.annToMask(entry), expected)
                     np.testing.assert_array_equal(coco_mask.toBbox(entry["segmentation"]), entry["bbox"])
                     assert (entry["area"], entry["category_id"]) == (expected.sum(), label.class_index + 1)
@@ -430,7 +431,7 @@ class TestBop:
             assert (folder / f"rgb/{frame.index:06d}.png").is_file()
             intrinsics = np.array(camera["cam_K"]).reshape(3, 3)
             for position, (label, pose, entry) in enumerate(zip(frame.labels.instances, gt, info, strict=True)):
-                silhouette = label.amodal.whole(WIDTH, HEIGHT)
+                silhouette = label.amodal.image_mask(WIDTH, HEIGHT)
                 mask = png(folder / f"mask/{frame.index:06d}_{position:06d}.png")
                 visible = png(folder / f"mask_visib/{frame.index:06d}_{position:06d}.png")
                 assert set(np.unique(visible)) <= {0, 255}

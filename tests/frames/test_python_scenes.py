@@ -127,8 +127,8 @@ def test_a_dataset_of_a_scene_made_in_python_keeps_a_file_that_makes_the_same(
 
 def test_poses_make_a_layout_whose_ids_do_not_depend_on_their_order(scene: ms.Scene) -> None:
     poses = [moved(0.1 * n, 0, turn=30 * n) for n in range(3)]
-    layout = ms.Layout.of_poses(scene, {"bolt": [poses[2]], "assets/nut": poses[:2]}, index=4)
-    other = ms.Layout.of_poses(scene, {0: np.array(poses[:2], dtype=np.float32), "bolt": poses[2:]})
+    layout = ms.Layout.from_poses(scene, {"bolt": [poses[2]], "assets/nut": poses[:2]}, index=4)
+    other = ms.Layout.from_poses(scene, {0: np.array(poses[:2], dtype=np.float32), "bolt": poses[2:]})
     assert [(one.id, one.asset, one.class_index) for one in layout.instances] == [(1, 0, 1), (2, 0, 1), (3, 1, 0)]
     assert scene.class_names == ("bolt", "nut") and layout.index == 4
     for one, same, pose in zip(layout.instances, other.instances, poses, strict=True):
@@ -139,7 +139,7 @@ def test_poses_make_a_layout_whose_ids_do_not_depend_on_their_order(scene: ms.Sc
 
 
 def test_an_object_that_is_not_there_leaves_its_id_free(scene: ms.Scene) -> None:
-    layout = ms.Layout.of_poses(scene, {"nut": [None, moved(0, 0)], "bolt": [moved(0.1, 0)]})
+    layout = ms.Layout.from_poses(scene, {"nut": [None, moved(0, 0)], "bolt": [moved(0.1, 0)]})
     assert [one.id for one in layout.instances] == [2, 3]
 
 
@@ -160,14 +160,14 @@ def test_an_object_that_is_not_there_leaves_its_id_free(scene: ms.Scene) -> None
 )
 def test_wrong_poses_are_one_sentence(scene: ms.Scene, poses: Any, sentence: str) -> None:
     with pytest.raises(ms.InputError, match=sentence):
-        ms.Layout.of_poses(scene, poses)
+        ms.Layout.from_poses(scene, poses)
 
 
 def test_an_asset_of_several_sizes_is_named_by_its_number(scene: ms.Scene) -> None:
     twice = replace(scene, assets=(scene.assets[0], replace(scene.assets[1], name="nut")))
     with pytest.raises(ms.InputError, match=r"must name one asset \(it names 2 of scene.assets: .* 0, 1\)"):
-        ms.Layout.of_poses(twice, {"nut": [np.eye(4)]})
-    assert ms.Layout.of_poses(twice, {1: [np.eye(4)]}).instances[0].asset == 1
+        ms.Layout.from_poses(twice, {"nut": [np.eye(4)]})
+    assert ms.Layout.from_poses(twice, {1: [np.eye(4)]}).instances[0].asset == 1
 
 
 # Flow
@@ -178,8 +178,8 @@ def test_flow_of_a_plane_that_turns_and_shifts_before_a_still_camera(scene: ms.S
     depth = np.full((48, 64), 0.2)
     ids = np.zeros((48, 64), dtype=np.uint16)
     ids[:, 32:] = 1
-    before = ms.Layout.of_poses(scene, {"nut": [moved(0.05, 0.02, turn=10)], "bolt": [moved(-0.1, 0)]})
-    after = ms.Layout.of_poses(scene, {"nut": [moved(0.07, 0.01, turn=40)], "bolt": [moved(-0.1, 0)]})
+    before = ms.Layout.from_poses(scene, {"nut": [moved(0.05, 0.02, turn=10)], "bolt": [moved(-0.1, 0)]})
+    after = ms.Layout.from_poses(scene, {"nut": [moved(0.07, 0.01, turn=40)], "bolt": [moved(-0.1, 0)]})
     motions = motions_of(before, after)
     assert set(motions) == {1}
     flow = optical_flow(depth, above, above, ids, motions)
@@ -199,8 +199,8 @@ def turned(x: np.ndarray, y: np.ndarray, scale: float) -> tuple[np.ndarray, np.n
 
 
 def test_flow_of_what_is_gone_is_unknown(scene: ms.Scene, above: ms.Camera) -> None:
-    before = ms.Layout.of_poses(scene, {"nut": [moved(0, 0), moved(0.1, 0)]})
-    after = ms.Layout.of_poses(scene, {"nut": [None, moved(0.1, 0)]})
+    before = ms.Layout.from_poses(scene, {"nut": [moved(0, 0), moved(0.1, 0)]})
+    after = ms.Layout.from_poses(scene, {"nut": [None, moved(0.1, 0)]})
     ids = np.array([[1, 2, 0]])
     flow = optical_flow(np.full((1, 3), 0.2), above, above, ids, motions_of(before, after))
     assert (flow[0, 0] == np.float32(UNKNOWN_FLOW)).all()
@@ -213,7 +213,7 @@ def test_flow_of_what_is_gone_is_unknown(scene: ms.Scene, above: ms.Camera) -> N
 def test_a_film_has_the_flow_of_its_objects_and_cameras(scene: ms.Scene, above: ms.Camera) -> None:
     """A nut that slides by 5 mm below the camera: f 0.005 / depth px, 0.19 m at its top, and the table stays."""
     steps = [{"nut": [moved(0.005 * n - 0.005, 0, 0.005)], "bolt": [moved(0.03, 0.02, 0.025)]} for n in range(3)]
-    layouts = (ms.Layout.of_poses(scene, poses, index=n) for n, poses in enumerate(steps))  # as a simulator gives them
+    layouts = (ms.Layout.from_poses(scene, poses, index=n) for n, poses in enumerate(steps))  # as of a simulator
     film = list(ms.render_frames(scene, layouts=layouts, cameras=above, quality="fast"))
     assert [frame.index for frame in film] == [0, 1, 2]
     assert film[-1].flow is None
@@ -231,7 +231,7 @@ def test_a_film_has_the_flow_of_its_objects_and_cameras(scene: ms.Scene, above: 
 
 def test_frames_of_a_scene_are_those_alone_and_go_on(scene: ms.Scene) -> None:
     """Beyond the scene's 12 frames as well; and a frame is the same in whichever order it is rendered."""
-    layout = ms.Layout.of_poses(scene, {"nut": [moved(0, 0, 0.005)]})
+    layout = ms.Layout.from_poses(scene, {"nut": [moved(0, 0, 0.005)]})
     alone = ms.render_frame(scene, 5, layout=layout, quality="fast")
     shown = {frame.index: frame for frame in ms.render_frames(scene, [70, 5], layouts=layout, quality="fast")}
     assert list(shown) == [70, 5]
@@ -245,7 +245,7 @@ def test_frames_before_a_moving_camera_are_those_alone(scene: ms.Scene) -> None:
     motion = Motion(exposure=(0.05, 0.05), rotation=(200.0, 200.0))
     camera = scene.spec.camera.model_copy(update={"motion": motion})
     scene = replace(scene, spec=scene.spec.model_copy(update={"camera": camera}))
-    layout = ms.Layout.of_poses(scene, {"nut": [moved(0, 0, 0.005)]})
+    layout = ms.Layout.from_poses(scene, {"nut": [moved(0, 0, 0.005)]})
     frame = next(ms.render_frames(scene, layouts=layout, quality="fast"))
     alone = ms.render_frame(scene, 0, layout=layout, quality="fast")
     assert frame.image.tobytes() == alone.image.tobytes()
@@ -265,7 +265,7 @@ def test_settled_frames_are_those_of_the_scene(
 
     def settle(scene: ms.Scene, index: int) -> ms.Layout:
         asked.append(index)
-        return ms.Layout.of_poses(scene, {"nut": [moved(0.01 * index, 0, 0.005)]}, index=index)
+        return ms.Layout.from_poses(scene, {"nut": [moved(0.01 * index, 0, 0.005)]}, index=index)
 
     monkeypatch.setattr("mitsplat.frames.frame.settle_layout", settle)
     frames = list(ms.render_frames(scene, 5, quality="fast"))
@@ -276,7 +276,7 @@ def test_settled_frames_are_those_of_the_scene(
 
 
 def test_lights_in_place_of_the_scenes(scene: ms.Scene) -> None:
-    layout = ms.Layout.of_poses(scene, {"nut": [moved(0, 0, 0.005)]})
+    layout = ms.Layout.from_poses(scene, {"nut": [moved(0, 0, 0.005)]})
 
     def lit(lights: Sequence[Any] | None) -> ms.Frame:
         return ms.render_frame(scene, 0, layout=layout, quality="fast", lights=lights)
@@ -297,7 +297,7 @@ def test_lights_in_place_of_the_scenes(scene: ms.Scene) -> None:
 
 
 def test_a_frame_shows_its_image_and_its_labels_side_by_side(scene: ms.Scene, above: ms.Camera) -> None:
-    layout = ms.Layout.of_poses(scene, {"nut": [moved(0, 0, 0.005)]})
+    layout = ms.Layout.from_poses(scene, {"nut": [moved(0, 0, 0.005)]})
     frame = ms.render_frame(scene, 0, layout=layout, camera=above, quality="fast")
     shown = cv2.imdecode(np.frombuffer(frame._repr_png_(), np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
     assert shown.shape == (48, 128, 3)
@@ -311,7 +311,7 @@ def test_the_example_of_the_documentation_runs(monkeypatch: pytest.MonkeyPatch) 
     """From a clone, as it stands there."""
     root = Path(__file__).parents[2]
     (code,) = (
-        part for part in (root / "docs/api.md").read_text().split("```") if "of_poses" in part and "import" in part
+        part for part in (root / "docs/api.md").read_text().split("```") if "from_poses" in part and "import" in part
     )
     monkeypatch.chdir(root)
     names: dict[str, Any] = {}

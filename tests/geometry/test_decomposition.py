@@ -121,7 +121,7 @@ def test_what_is_ragged_is_followed_coarsely(caplog):
 
 @pytest.mark.parametrize("name", ["hex_bolt", "proximity_sensor", "spur_gear"])
 def test_parts_are_not_ragged(name):
-    assert decomposition._valleys(trimesh.load_mesh(PARTS / name / "mesh.ply")) < 0.15
+    assert decomposition._concave_edge_share(trimesh.load_mesh(PARTS / name / "mesh.ply")) < 0.15
 
 
 def scanned_can(noise: float = 2e-5) -> trimesh.Trimesh:

@@ -99,7 +99,7 @@ def silhouettes(source: str) -> Arrays:
     integrator = make_integrator()
     scene = mi.load_dict({"type": "scene", **things(), **lights()})
     found = render_silhouettes(integrator, scene, camera(distortion=(-0.2, 0.05, 0.001, -0.001)), source=source)
-    return {f"mask_{number}": silhouette.whole(*SIZE) for number, silhouette in found.items()}
+    return {f"mask_{number}": silhouette.image_mask(*SIZE) for number, silhouette in found.items()}
 
 
 def gradients() -> Arrays:

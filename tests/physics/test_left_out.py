@@ -12,7 +12,7 @@ import trimesh
 
 from mitsplat.errors import InputError
 from mitsplat.physics.settle import replay_layout, settle_layout, settle_layouts, try_alone
-from mitsplat.scene.layout import Layout, NothingRests
+from mitsplat.scene.layout import Layout, UnsettledLayoutError
 from mitsplat.scene.loading.scene_loading import load_scene
 from tests.conftest import box_asset
 
@@ -52,7 +52,8 @@ def test_what_cannot_stand_is_left_out_and_the_others_keep_their_numbers(needle_
 def test_a_layout_of_which_nothing_rests_is_an_error_that_has_the_empty_layout(needle_scene, scene_data):
     scene_data["objects"] = [{"asset": "assets/needle", "count": 2}]
     scene = load_scene(needle_scene(scene_data))
-    with pytest.raises(NothingRests, match=r"layout 1 must come to rest .*[(]got 2 x needle fell over[)]") as error:
+    sentence = r"layout 1 must come to rest .*[(]got 2 x needle fell over[)]"
+    with pytest.raises(UnsettledLayoutError, match=sentence) as error:
         settle_layout(scene, 1, cached=False)
     again = pickle.loads(pickle.dumps(error.value))
     assert again.layout.instances == ()
@@ -74,7 +75,7 @@ def test_what_is_higher_than_the_region_leaves_room_for_the_others(scene_data, w
     assert [one.id for one in layout.instances] == [1]
     assert [(one.id, one.reason) for one in layout.left_out] == [(2, "no room for it in 1 of 1 draws")]
     scene_data["objects"] = [{"asset": "assets/plank"}]
-    with pytest.raises(NothingRests, match="region must be large enough"):
+    with pytest.raises(UnsettledLayoutError, match="region must be large enough"):
         settle_layout(load_scene(write_scene(scene_data)), 0, cached=False)
 
 

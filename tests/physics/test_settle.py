@@ -150,7 +150,8 @@ def test_code_that_decides_layouts_is_hashed():
     types = {
         *("arrays.BoolArray", "arrays.Float32Array", "arrays.Float64Array", "arrays.Int64Array", "progress.Note"),
         *("asset.Asset", "errors.InputError", "scene.scene.Scene"),
-        *(f"scene.layout.{name}" for name in ("Instance", "Layout", "LeftOut", "NothingRests", "RestCertificate")),
+        *(f"scene.layout.{name}" for name in ("Instance", "Layout", "LeftOut", "RestCertificate")),
+        "scene.layout.UnsettledLayoutError",
         *(f"scene.spec.object_spec.{name}" for name in ("Arrangement", "ObjectPose")),
         *(f"scene.spec.shape_spec.{name}" for name in ("Backdrop", "Bin", "Box", "Enclosure", "Region", "Shape")),
         *("scene.spec.scene_spec.SceneSpec", "storage.field_types.Vec3"),
@@ -235,7 +236,7 @@ def test_simulations_do_not_pile_up(scene_data, write_scene, monkeypatch):
     models = []
     build = physics._build_model
     monkeypatch.setattr(physics, "_build_model", lambda *args: (model := build(*args), models.append(ref(model)))[0])
-    monkeypatch.setattr(drop, "_GARBAGE", 2)
+    monkeypatch.setattr(drop, "_COLLECTION_INTERVAL", 2)
     gc.disable()
     try:
         with warp_settings():
@@ -285,12 +286,12 @@ def test_a_layout_that_never_rests_is_an_error(scene_data, write_scene):
 def test_how_deep_an_object_may_be_grows_with_it(size, depth, refused):
     """0.3 mm, or 0.3 % of its size: 0.6 mm of 200."""
     from mitsplat.geometry.mesh_distance import Clearance, DistanceSurface, PlacedSurface
-    from mitsplat.physics.drop import _fault
+    from mitsplat.physics.drop import _rest_defect
 
     item, table = (
         PlacedSurface(name, DistanceSurface(trimesh.creation.box((size,) * 3))) for name in ("part", "table")
     )
-    fault = _fault([Clearance(item, table, -depth)], {item: 0.0}, [table])
+    fault = _rest_defect([Clearance(item, table, -depth)], {item: 0.0}, [table])
     assert (fault is not None) == refused
 
 

@@ -103,7 +103,7 @@ def test_small_parts_come_to_rest_on_the_table(stepper):
     ]
     world = world_of(stepper, [body_of(mesh) for mesh in meshes], [table()], poses)
     outcome = run_to_rest(world, max_time=6.0, bounds=EVERYWHERE)
-    assert outcome.refused == ""
+    assert outcome.rejection == ""
     for mesh, pose, thickness in zip(meshes, outcome.poses, (0.01, 0.01, 0.0015, 0.012), strict=True):
         assert lowest(mesh, pose) == pytest.approx(0.0, abs=3e-4)
         heights = (mesh.vertices @ pose[:3, :3].T + pose[:3, 3])[:, 2]
@@ -208,12 +208,12 @@ def test_mujoco_in_c_is_stepped_as_by_itself(monkeypatch):
 
 
 def test_a_contact_buffer_that_is_too_small_is_noticed():
-    from mitsplat.physics.rest import OVERFLOW, run_to_rest
+    from mitsplat.physics.rest import CONTACT_OVERFLOW, run_to_rest
 
     boxes = [body_of(trimesh.creation.box((0.03, 0.03, 0.03)))] * 4
     poses = [pose_at((0.1 * i, 0, 0.016)) for i in range(4)]
     world = world_of("warp", boxes, [table()], poses, capacity=0.001)
-    assert run_to_rest(world, max_time=1.0, bounds=EVERYWHERE).refused == OVERFLOW
+    assert run_to_rest(world, max_time=1.0, bounds=EVERYWHERE).rejection == CONTACT_OVERFLOW
 
 
 def test_worlds_that_share_kernels_do_not_meet():
@@ -262,7 +262,7 @@ def test_a_light_part_carries_a_heavy_one():
     poses = [pose_at((-0.05, 0, 0.003)), pose_at((0.05, 0, 0.003)), pose_at((0, 0, 0.014))]
     world = world_of("warp", bodies, [table()], poses)
     outcome = run_to_rest(world, max_time=6.0, bounds=EVERYWHERE)
-    assert outcome.refused == ""
+    assert outcome.rejection == ""
     assert [lowest(mesh, pose) for mesh, pose in zip((nut, nut, plate), outcome.poses, strict=True)] == pytest.approx(
         [0.0, 0.0, 0.005], abs=1e-4
     )
@@ -299,7 +299,7 @@ def test_a_box_ends_on_a_face_however_it_is_dropped(stepper):
     poses = [pose_at((0.1 * i - 0.25, 0, 0.05), turn) for i, turn in enumerate(turns)]
     world = world_of(stepper, [body_of(box)] * len(turns), [table()], poses)
     outcome = run_to_rest(world, max_time=6.0, bounds=EVERYWHERE)
-    assert outcome.refused == ""
+    assert outcome.rejection == ""
     steepest = np.abs(outcome.poses[:, 2, :3]).max(axis=1)
     assert np.degrees(np.arccos(np.minimum(steepest, 1.0))).max() < 0.1
     np.testing.assert_array_equal(np.abs(outcome.poses[:3, 2, :3]).argmax(axis=1), [2, 1, 0])
@@ -320,7 +320,7 @@ def test_a_box_does_not_balance_on_its_edge(stepper):
         poses.append(pose_at((0, 0.1 * i, height), Rotation.from_euler("y", tilt) * upright))
     world = world_of(stepper, [body_of(slab)] * 2, [table()], poses)
     outcome = run_to_rest(world, max_time=6.0, bounds=EVERYWHERE)
-    assert outcome.refused == ""
+    assert outcome.rejection == ""
     # Back onto the narrow face, and over onto the large one.
     np.testing.assert_allclose(np.abs(outcome.poses[:, 2, 2]), [0, 1], atol=1e-3)
 
@@ -414,7 +414,7 @@ def test_a_ball_rests_inside_a_cup_and_not_on_its_hull(stepper):
         stepper, [body_of(ball)], [Collider(0.5, pieces=convex_pieces(cup)), table()], [pose_at((0.005, 0, 0.06))]
     )
     outcome = run_to_rest(world, max_time=6.0, bounds=EVERYWHERE)
-    assert outcome.refused == ""
+    assert outcome.rejection == ""
     assert lowest(ball, outcome.poses[0]) == pytest.approx(0.006, abs=5e-4)
 
 
@@ -454,11 +454,11 @@ def test_what_slides_slowly_is_refused_if_a_second_shows_it(stepper):
     def push(time, poses):
         world.set_velocities(velocities * (3 if time > 0.3 else 1))
 
-    refused = physics.run_to_rest(world, max_time=1.0, bounds=EVERYWHERE, observe=push).refused
+    refused = physics.run_to_rest(world, max_time=1.0, bounds=EVERYWHERE, observe=push).rejection
     assert refused == "not at rest within 1 s"
     world.reset(start, velocities)
     outcome = physics.run_to_rest(world, max_time=1.0, bounds=EVERYWHERE)
-    assert outcome.refused == ""
+    assert outcome.rejection == ""
     assert 2e-4 < outcome.surface_motion < 4.5e-4
 
 

@@ -61,10 +61,10 @@ def test_discs_lie_where_the_centres_of_pixels_see_them(samples: int, camera: Ca
     truth = expected(camera)
     half = (layers.depth > 0) & (layers.instance == 1)
     np.testing.assert_array_equal(layers.instance == 1, truth)
-    np.testing.assert_array_equal(silhouette.whole(camera.width, camera.height), truth)
+    np.testing.assert_array_equal(silhouette.image_mask(camera.width, camera.height), truth)
     np.testing.assert_allclose(layers.depth[truth], DEPTH, atol=1e-3)
     middle, _ = camera.project([(0.0, 0.0, DEPTH)])
-    for mask in (half, silhouette.whole(camera.width, camera.height)):
+    for mask in (half, silhouette.image_mask(camera.width, camera.height)):
         assert np.abs(centroid(mask) - middle).max() < 0.05
 
 

@@ -212,9 +212,8 @@ def test_a_backdrop_is_a_room_around_its_inside(scene_data: SceneData, write_sce
     assert not inside.any()
     assert [s.name for s in scene.spec.shapes if s.collider and s.visible] == ["table", "backdrop floor"]
     assert set(draw_surroundings(scene.spec, 0).finishes) == {"backdrop floor", "backdrop walls"}
-    assert draw_surroundings(scene.spec, 0).finish_of("backdrop wall +y") == draw_surroundings(scene.spec, 0).finish_of(
-        "backdrop wall -x"
-    )
+    drawn = draw_surroundings(scene.spec, 0)
+    assert drawn.material_of("backdrop wall +y") == drawn.material_of("backdrop wall -x")
     assert [finding.text for finding in scene_warnings(scene) if not finding.ok] == []
     assert light_properties(scene)["sky_reach"] == pytest.approx((1 - 0.2 * np.sin(np.pi / 6)) / 2)
     scene_data["backdrop"] = {"size": [0.7, 0.7, 0.9], "position": [0, 0, -0.2], "sides": ["+x", "-y"]}

@@ -84,7 +84,7 @@ def test_silhouettes_are_the_instances_rendered_alone(
         expected = (layers.instance if source == "splats" else layers.proxy_instance) == number
         if number in found:
             moved = replace_origin(found[number], WIDTH, HEIGHT)
-            shown = moved.whole(3 * WIDTH, 3 * HEIGHT)
+            shown = moved.image_mask(3 * WIDTH, 3 * HEIGHT)
         else:
             shown = np.zeros_like(expected)
         if distortion:  # the canvas may be smaller than the one that is compared with
@@ -95,7 +95,7 @@ def test_silhouettes_are_the_instances_rendered_alone(
             shown, expected = shown[tuple(edge)], expected[tuple(edge)]
         np.testing.assert_array_equal(shown, expected)
     if not distortion:
-        assert found[9].inside(WIDTH, HEIGHT) is None
+        assert found[9].clipped(WIDTH, HEIGHT) is None
         assert found[7].box[0] < 0 < found[7].box[2]
 
 
@@ -113,7 +113,7 @@ def test_what_is_seen_is_covered_alone() -> None:
     for number in (1, 2, 7):
         seen = layers.instance == number
         assert seen.any()
-        assert np.count_nonzero(seen & ~found[number].whole(WIDTH, HEIGHT)) <= 2  # three instances mix there
+        assert np.count_nonzero(seen & ~found[number].image_mask(WIDTH, HEIGHT)) <= 2  # three instances mix there
     assert 0 < np.count_nonzero(layers.instance == 2) < 0.9 * found[2].area  # hidden in part
 
 

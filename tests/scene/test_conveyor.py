@@ -66,7 +66,7 @@ def test_a_layout_is_carried_from_where_it_settled(belt_data: SceneData, write_s
 
 def test_poses_that_are_made_up_stay(belt_data: SceneData, write_scene: WriteScene) -> None:
     scene = scene_of(belt_data, write_scene)
-    given = Layout.of_poses(scene, {"nut": [np.eye(4)]})
+    given = Layout.from_poses(scene, {"nut": [np.eye(4)]})
     assert layout_at_view(scene.spec, given, 0) is given
 
 

@@ -39,7 +39,7 @@ def scene(scene_data, write_scene) -> Scene:
 
 
 def layout_at(scene: Scene, *heights: float) -> Layout:
-    return Layout.of_poses(scene, {"nut": [pose_at((0.1 * i, 0, z)) for i, z in enumerate(heights)]})
+    return Layout.from_poses(scene, {"nut": [pose_at((0.1 * i, 0, z)) for i, z in enumerate(heights)]})
 
 
 def named(parts) -> dict[str, ShownPart]:

@@ -11,7 +11,7 @@ from contextlib import nullcontext
 from pathlib import Path
 
 from mitsplat.errors import InputError
-from mitsplat.images.untrusted_images import IMAGES
+from mitsplat.images.untrusted_images import IMAGE_SUFFIXES
 
 WILDCARDS = frozenset("*?[")
 
@@ -102,7 +102,7 @@ def image_names(folder: Path, images: str | tuple[str, ...]) -> tuple[str, ...]:
     else:
         pattern = f"{images.rstrip('/')}/*" if (folder / images).is_dir() else images
         found = glob_below(folder, pattern) if WILDCARDS & set(pattern) else []
-        wanted = [path for path in found if path.suffix.lower() in IMAGES and not path.name.startswith(".")]
+        wanted = [path for path in found if path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith(".")]
         names = names_below(folder, pattern, wanted)
     if not names:
         raise InputError(f"must name at least one image (got {images!r}, which matches none)")

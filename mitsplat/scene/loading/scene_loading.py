@@ -18,7 +18,7 @@ from mitsplat.scene.planning.frame_lights import expand_rooms
 from mitsplat.scene.planning.viewpoints import camera_at
 from mitsplat.scene.scene import Scene
 from mitsplat.scene.spec.named_files import environments, object_assets
-from mitsplat.scene.spec.object_spec import MAIN
+from mitsplat.scene.spec.object_spec import MAIN_REGION
 from mitsplat.scene.spec.scene_spec import SCHEMA_VERSION, SceneSpec
 from mitsplat.scene.spec.shape_spec import Region
 from mitsplat.scene.walls import backdrop_shapes, enclosure_walls
@@ -192,7 +192,7 @@ def _check_object(asset: Asset) -> None:
 
 def _check_fit(asset: Asset, region: Region, name: str) -> None:
     """Check that an object fits into the region when it lies on its largest side."""
-    where = "the region" if name == MAIN else f"region {name!r}"
+    where = "the region" if name == MAIN_REGION else f"region {name!r}"
     footprint = np.sort(cast(trimesh.Trimesh, asset.mesh).extents)[1:]  # every object has a mesh
     space = np.sort(np.subtract(region.max, region.min)[:2])
     if (footprint > space).any():

@@ -93,7 +93,7 @@ class LayoutSurroundings:
     finishes: Mapping[str, MaterialDraw] = field(default_factory=dict)
     background: BackgroundDraw | None = None
 
-    def finish_of(self, shape: str) -> MaterialDraw | None:
+    def material_of(self, shape: str) -> MaterialDraw | None:
         """Return the drawn material of a shape; None if its material is fixed."""
         return self.finishes.get(material_name(shape))
 

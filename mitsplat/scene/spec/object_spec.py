@@ -50,10 +50,10 @@ PRIMITIVES = "primitives"
 
 NUM_PRIMITIVES = 15
 
-MAIN = "main"
+MAIN_REGION = "main"
 """Name of the region that the key ``region`` defines."""
 
-SIZES = 5
+NUM_SCALES = 5
 """Number of sizes in a range of scales, evenly spaced in ratio. Every format treats each size as a separate rigid
 model.
 """
@@ -125,14 +125,14 @@ class ObjectSpec(StrictModel):
     scale: Scale = Field(
         1.0,
         description="Uniform scale of the asset. The mass scales with the volume. With a range, each object has one "
-        f"of {SIZES} sizes, evenly spaced in ratio.",
+        f"of {NUM_SCALES} sizes, evenly spaced in ratio.",
     )
     class_name: Name | None = Field(None, description="Class name of the labels. The class of the asset if absent.")
     region: str | tuple[str, ...] | None = Field(
         None,
         exclude_if=lambda region: region is None,
         description="Name of the region in which objects start, or a list of names. Each object draws one of them by "
-        f"floor area. All regions if absent. The region of the key ``region`` has the name ``{MAIN}``.",
+        f"floor area. All regions if absent. The region of the key ``region`` has the name ``{MAIN_REGION}``.",
     )
     poses: tuple[ObjectPose, ...] = Field(
         (), description="Initial pose of each object, in place of ``count``. From there, objects settle as usual."
@@ -192,7 +192,8 @@ class ObjectSpec(StrictModel):
     def scales(self) -> tuple[float, ...]:
         """Scales of the objects of the entry."""
         if isinstance(self.scale, tuple):
-            return tuple(np.geomspace(*self.scale, SIZES).tolist()) if self.scale[0] < self.scale[1] else self.scale[:1]
+            low, high = self.scale
+            return tuple(np.geomspace(low, high, NUM_SCALES).tolist()) if low < high else (low,)
         return (self.scale,)
 
 

@@ -15,7 +15,7 @@ from mitsplat.scene.spec.camera_spec import CameraSpec
 from mitsplat.scene.spec.image_spec import Composite, DepthSensor, Randomise, Rendering, StereoSensor
 from mitsplat.scene.spec.light_spec import EnvironmentLight, LightEntry, RoomLight
 from mitsplat.scene.spec.material_spec import Background
-from mitsplat.scene.spec.object_spec import MAIN, Arrangement, ObjectSpec, Settle
+from mitsplat.scene.spec.object_spec import MAIN_REGION, Arrangement, ObjectSpec, Settle
 from mitsplat.scene.spec.shape_spec import Backdrop, Conveyor, Enclosure, NamedRegion, Region, Shape
 from mitsplat.storage.field_types import Positive, StrictModel, Unit
 from mitsplat.storage.yaml_input import FieldError, KeyPath
@@ -290,7 +290,7 @@ class SceneSpec(StrictModel):
     @property
     def region_names(self) -> tuple[str, ...]:
         """Names of all regions, the main region first."""
-        return (MAIN, *(region.name for region in self.regions))
+        return (MAIN_REGION, *(region.name for region in self.regions))
 
     @property
     def all_regions(self) -> tuple[tuple[Region, Arrangement], ...]:

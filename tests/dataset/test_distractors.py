@@ -69,13 +69,13 @@ def records_of(root: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in (root / "manifest.jsonl").read_bytes().splitlines()]
 
 
-def test_the_audit_finds_nothing(made: Path) -> None:
+def test_a_dataset_with_distractors_has_no_violations(made: Path) -> None:
     found = audit_dataset(made)
     assert found.violations == ()
     assert found.frames == 16 and found.instances > 16
 
 
-def test_the_audit_finds_nothing_where_nothing_is_labelled(tmp_path: Path) -> None:
+def test_a_dataset_without_labelled_objects_has_no_violations(tmp_path: Path) -> None:
     formats = [name for name in FORMATS if name not in ("colmap", "yolo-pose")]
     scene = small_scene(tmp_path, [*large_boxes(), box_asset("crate", (0.1, 0.1, 0.1))], OBJECTS[1:], formats=formats)
     out = write(scene, tmp_path / "out")
@@ -83,7 +83,7 @@ def test_the_audit_finds_nothing_where_nothing_is_labelled(tmp_path: Path) -> No
     assert audit_dataset(out).violations == ()
 
 
-def test_the_audit_finds_nothing_where_images_are_for_tests_but_none_for_validation(tmp_path: Path) -> None:
+def test_a_dataset_with_a_test_split_only_has_no_violations(tmp_path: Path) -> None:
     scene = small_scene(tmp_path, large_boxes(), OBJECTS[:1], layouts=2, formats=["yolo", "yolo-pose"])
     output = scene.spec.output.model_copy(update={"validation": 0.0, "test": 0.5})
     out = write(replace(scene, spec=scene.spec.model_copy(update={"output": output})), tmp_path / "out")
@@ -91,7 +91,7 @@ def test_the_audit_finds_nothing_where_images_are_for_tests_but_none_for_validat
     assert audit_dataset(out).violations == ()
 
 
-def test_the_manifest_states_every_draw(made: Path, scene: Scene) -> None:
+def test_the_manifest_records_every_draw(made: Path, scene: Scene) -> None:
     empty = set()
     for record in records_of(made):
         assets = draw_objects(scene, record["layout"])[0]
@@ -135,7 +135,7 @@ def test_distractors_are_in_no_label_file(made: Path) -> None:
 
 
 @pytest.mark.parametrize("part", ["workers", "shards"])
-def test_bytes_do_not_depend_on_who_makes_them(made: Path, scene: Scene, tmp_path: Path, part: str) -> None:
+def test_workers_and_merged_shards_make_the_same_bytes(made: Path, scene: Scene, tmp_path: Path, part: str) -> None:
     if part == "workers":
         out = write(scene, tmp_path / "out", workers=3)
     else:
@@ -155,7 +155,7 @@ def labelling_distractors(scene: Scene, index: int, *, layout: Layout) -> Any:
     )
 
 
-def test_a_distractor_that_is_labelled_is_found(scene: Scene, tmp_path: Path) -> None:
+def test_a_labelled_distractor_is_a_violation(scene: Scene, tmp_path: Path) -> None:
     out = write(scene, tmp_path / "out", render=labelling_distractors)
     texts = [text for _, text in audit_dataset(out).violations]
     assert any("is labelled, although its asset is a distractor" in text for text in texts)
@@ -170,7 +170,7 @@ def test_a_distractor_that_is_labelled_is_found(scene: Scene, tmp_path: Path) ->
         (lambda drawn: drawn[0].update(label=False), "instance 1 is not among the drawn objects"),
     ],
 )
-def test_draws_that_are_stated_wrongly_are_found(
+def test_wrongly_recorded_draws_are_violations(
     scene: Scene, tmp_path: Path, change: Callable[[Any], object], text: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def wrongly(*given: Any) -> Any:

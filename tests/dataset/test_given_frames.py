@@ -45,7 +45,7 @@ def frames(scene: Scene) -> list:
     return film(scene)
 
 
-def test_frames_of_ones_own_pass_the_audit_in_every_format(scene: Scene, frames: list, tmp_path: Path) -> None:
+def test_given_frames_have_no_violations_in_every_format(scene: Scene, frames: list, tmp_path: Path) -> None:
     summary = write_frames(scene, tmp_path / "out", iter(frames))
     assert summary.frames == 3
     assert summary.instances == {"bolt": 3, "nut": 3}
@@ -57,7 +57,7 @@ def test_frames_of_ones_own_pass_the_audit_in_every_format(scene: Scene, frames:
     assert poses[0][0][3] == pytest.approx(0.07)
 
 
-def test_the_motion_of_the_camera_is_stated(scene: Scene, tmp_path: Path) -> None:
+def test_the_manifest_records_the_motion_of_the_camera(scene: Scene, tmp_path: Path) -> None:
     motion = Motion(exposure=(0.01, 0.01), rotation=(100.0, 100.0))
     camera = scene.spec.camera.model_copy(update={"motion": motion})
     scene = replace(scene, spec=scene.spec.model_copy(update={"camera": camera}))
@@ -69,13 +69,13 @@ def test_the_motion_of_the_camera_is_stated(scene: Scene, tmp_path: Path) -> Non
     assert list(audit_dataset(out).violations) == []
 
 
-def test_the_audit_still_holds_such_frames_against_their_layouts(scene: Scene, frames: list, tmp_path: Path) -> None:
+def test_given_frames_that_differ_from_their_layouts_are_violations(scene: Scene, frames: list, tmp_path: Path) -> None:
     out = write_frames(scene, tmp_path / "out", frames).path
     (out / "layouts/0001.json").write_bytes((out / "layouts/0002.json").read_bytes())
     assert any("layouts/0001.json" in str(one) for one in audit_dataset(out).violations)
 
 
-def test_what_cannot_be_written_is_one_sentence(scene: Scene, frames: list, tmp_path: Path) -> None:
+def test_invalid_given_frames_are_refused_in_one_sentence(scene: Scene, frames: list, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="at least one frame"):
         write_frames(scene, tmp_path / "none", [])
     with pytest.raises(InputError, match="already holds a dataset"):

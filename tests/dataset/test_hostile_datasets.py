@@ -122,14 +122,14 @@ class TestLinks:
         assert not (out / "report.html").is_symlink()
         assert {path.read_text() for path in outside.iterdir()} == {PRECIOUS}
 
-    def test_links_of_the_names_of_files_in_the_making_are_not_followed(self, tmp_path, outside):
+    def test_links_with_the_names_of_partial_files_are_not_followed(self, tmp_path, outside):
         path = tmp_path / "picture.png"
         (tmp_path / f".picture.png.{os.getpid()}.part").symlink_to(outside / "thesis.txt")
         write_file(path, lambda part: part.write_bytes(b"picture"))
         assert path.read_bytes() == b"picture"
         assert (outside / "thesis.txt").read_text() == PRECIOUS
 
-    def test_a_copy_by_hard_links_leaves_its_original_alone(self, scene, tmp_path):
+    def test_resuming_a_copy_by_hard_links_does_not_change_the_original(self, scene, tmp_path):
         write(scene, tmp_path / "one", frames=3)
         before = contents(tmp_path / "one", without=())
         shutil.copytree(tmp_path / "one", tmp_path / "two", copy_function=os.link)
@@ -139,14 +139,14 @@ class TestLinks:
         assert contents(tmp_path / "one", without=()) == before
 
     @pytest.mark.parametrize("link", [os.symlink, os.link])
-    def test_a_file_with_another_name_is_not_opened_to_write(self, outside, tmp_path, link):
+    def test_a_file_with_a_second_name_is_not_opened_for_writing(self, outside, tmp_path, link):
         link(outside / "thesis.txt", tmp_path / "name")
         for mode in ("w", "a", "r+b"):
             with pytest.raises(OSError, match="must not"):
                 open_in_place(tmp_path / "name", mode)
         assert (outside / "thesis.txt").read_text() == PRECIOUS
 
-    def test_folders_of_a_training_are_made_anew(self, scene, out, outside):
+    def test_a_link_in_place_of_a_training_folder_is_not_followed(self, scene, out, outside):
         found = read_set(out, "train")
         (out.parent / "data").symlink_to(outside)
         write_data([found], out.parent / "data")
@@ -163,7 +163,7 @@ def test_merging_does_not_change_its_inputs(scene, out):
     assert len(Manifest(out.parent / "merged/manifest.jsonl")) == 6
 
 
-def test_merging_takes_no_files_from_outside(scene, out, outside):
+def test_merging_reads_no_files_outside_of_the_shards(scene, out, outside):
     for name in ("layouts/0000.json", "scene/scene.yaml"):
         kept = (out / name).read_bytes()
         (out / name).unlink()
@@ -175,7 +175,7 @@ def test_merging_takes_no_files_from_outside(scene, out, outside):
 
 
 class TestOverwriting:
-    def test_files_of_others_stay(self, scene, out):
+    def test_overwriting_keeps_files_of_other_programs(self, scene, out):
         own = ["labels/notes.txt", "labels/train/corrected.txt", "images/train/photo.jpg", "notes.md", "scene/why.md"]
         for name in own:
             (out / name).write_text(PRECIOUS)
@@ -185,7 +185,7 @@ class TestOverwriting:
         assert sorted(path.name for path in (out / "labels").rglob("*.txt")) == ["corrected.txt", "notes.txt"]
         assert len(list((out / "images").rglob("*.png"))) == 2
 
-    def test_every_file_of_every_format_is_known(self, clean):
+    def test_every_file_of_every_format_is_recognised(self, clean):
         files = [path.relative_to(clean).as_posix() for path in clean.rglob("*") if path.is_file()]
         inner = [name for name in files if "/" in name]
         assert len(inner) > 100
@@ -206,12 +206,12 @@ READERS = {
 class TestJson:
     @pytest.mark.parametrize("command", ["audit", "report", "merge", "split", "view"])
     @pytest.mark.parametrize("text", [DEEP, f'{{"mitsplat": {DEEP}}}', '{"a":' * 900 + "0" + "}" * 900, "[]", "0"])
-    def test_a_description_of_any_depth_is_refused(self, out, command, text):
+    def test_a_description_nested_too_deep_is_refused(self, out, command, text):
         (out / "dataset.json").write_text(text)
         with pytest.raises(InputError, match=r"dataset\.json"):
             READERS[command](out)
 
-    def test_a_deep_line_is_no_record(self, scene, out):
+    def test_a_manifest_line_nested_too_deep_is_refused(self, scene, out):
         for depth in (150, 900, 100_000):
             line = b'{"index":12,"deep":' + b"[" * depth + b"]" * depth + b"}"
             record = encode_line({"index": 12, "deep": 0})
@@ -224,7 +224,7 @@ class TestJson:
             assert any("line 1 is not the record" in text for _, text in audit_dataset(out).violations)
             (out / "manifest.jsonl").write_bytes(kept)
 
-    def test_brackets_in_strings_have_no_depth(self):
+    def test_brackets_in_strings_do_not_count_as_nesting(self):
         text = json.dumps(["[" * 1000, '\\"[[' * 100, '"' + "{" * 500])
         assert parse_json(text.encode()) == json.loads(text)
         levels = "[" * MAX_JSON_DEPTH + "]" * MAX_JSON_DEPTH
@@ -234,7 +234,7 @@ class TestJson:
 
     @pytest.mark.parametrize("command", READERS)
     @pytest.mark.parametrize("name", ["dataset.json", "manifest.jsonl", "runs.jsonl", "layouts/0000.json"])
-    def test_a_pipe_is_not_waited_for(self, out, name, command):
+    def test_a_named_pipe_is_refused_without_waiting(self, out, name, command):
         (out / name).unlink(missing_ok=True)
         os.mkfifo(out / name)
         signal.alarm(60)  # ends the process where a pipe is waited for
@@ -273,7 +273,7 @@ class TestTypes:
 
     @pytest.mark.parametrize("key", ["index", "files", "split", "labels", "camera", "layout"])
     @pytest.mark.parametrize("new", [KeyError, -1], ids=repr)
-    def test_no_key_of_a_line_is_trusted(self, scene, out, key, new):
+    def test_a_line_with_any_key_missing_or_of_another_type_is_refused(self, scene, out, key, new):
         lines = [json.loads(line) for line in (out / "manifest.jsonl").read_text().splitlines()]
         for line in lines:
             del line["check"]
@@ -287,7 +287,7 @@ class TestTypes:
         assert DatasetIndex(out).unreadable == 1
 
     @pytest.mark.filterwarnings("ignore::RuntimeWarning")  # of values that overflow
-    def test_no_value_anywhere_ends_in_a_fault(self, scene, out):
+    def test_random_changes_of_values_never_end_in_a_crash(self, scene, out):
         """Drawn changes of drawn values, of which each is refused in a sentence, named by the audit, or borne."""
         rng = random.Random(1)
         values = [KeyError, None, "x", -1, {}, [], 1e308, 10**30, True, "\u2028", [[[]]], float("nan")]
@@ -316,14 +316,14 @@ class TestTypes:
 
 
 @pytest.mark.parametrize("character", ["\n", "\r\n", "\0", "\x1b", "\u2028", "\uffff"], ids=ascii)
-def test_class_names_are_of_one_line(scene_data, write_scene, character):
+def test_class_names_with_line_breaks_or_control_characters_are_refused(scene_data, write_scene, character):
     scene_data["objects"][0]["class_name"] = f"nut{character}"
     with pytest.raises(InputError, match=r"class.*must have no control characters or line breaks"):
         load_scene(write_scene(scene_data))
 
 
 @pytest.mark.parametrize("key", ["name", "class"])
-def test_names_of_assets_are_of_one_line(scene_data, write_scene, key):
+def test_asset_names_with_line_breaks_are_refused(scene_data, write_scene, key):
     path = write_scene(scene_data).parent / "assets/nut/asset.yaml"
     kept = "".join(line for line in path.read_text().splitlines(keepends=True) if not line.startswith(f"{key}:"))
     path.write_text(f'{kept}{key}: "nut\\r\\nbolt"\n')
@@ -331,7 +331,7 @@ def test_names_of_assets_are_of_one_line(scene_data, write_scene, key):
         load_scene(path.parents[2] / "scene.yaml")
 
 
-def test_classes_of_a_dataset_are_of_one_line(out):
+def test_dataset_classes_with_line_breaks_are_refused(out):
     content = read_json(out / "dataset.json")
     content["classes"][0] = "nut\u2028bolt"
     (out / "dataset.json").write_text(json.dumps(content))

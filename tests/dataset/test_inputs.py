@@ -121,7 +121,7 @@ EDITS = [
 
 
 @pytest.mark.parametrize(("file", "edit", "key"), EDITS, ids=[f"{file} {key}" for file, _, key in EDITS])
-def test_an_edit_of_any_file_is_refused_by_its_place(copy, file, edit, key):
+def test_resuming_after_an_edit_of_an_input_is_refused_by_its_key(copy, file, edit, key):
     edit(copy / file)
     with pytest.raises(InputError) as caught:
         write(load_scene(copy / "scene.yaml"), copy / "out", render=never_render)
@@ -130,7 +130,7 @@ def test_an_edit_of_any_file_is_refused_by_its_place(copy, file, edit, key):
     assert str(caught.value).endswith("; overwrite it or choose another")
 
 
-def test_what_is_not_read_may_change(copy):
+def test_files_and_remarks_that_are_not_read_may_change(copy):
     """A remark, a file that nothing names, and the time of a file are not content."""
     with (copy / "assets/nut/asset.yaml").open("a") as file:
         file.write("# seen\n")
@@ -139,7 +139,7 @@ def test_what_is_not_read_may_change(copy):
     assert write(load_scene(copy / "scene.yaml"), copy / "out").rendered == 1
 
 
-def test_places_of_one_asset_are_told_apart(made):
+def test_entries_with_the_same_asset_have_different_hashes(made):
     found = describe_inputs(load_scene(made / "scene.yaml"))
     assert len({found[f"objects[{i}]"]["splats"] for i in range(5)}) == 5
     assert found["objects[0]"]["class_name"] == "nut"
@@ -147,7 +147,7 @@ def test_places_of_one_asset_are_told_apart(made):
     assert set(found["environment"]) == {f.name for f in fields(Asset)} - {"folder"}
 
 
-def test_an_exported_scene_holds_every_asset_of_one_name_as_it_is_now(copy, tmp_path, monkeypatch):
+def test_an_exported_scene_holds_each_asset_of_the_same_name(copy, tmp_path, monkeypatch):
     """Also where an earlier export left files, and where a name is none for a file."""
     monkeypatch.setattr("mitsplat.frames.mitsuba_xml.settle_layout", every_entry)
     for name in ("nut", "a/b"):

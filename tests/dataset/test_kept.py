@@ -41,7 +41,7 @@ def with_wide_shape(scene: Scene) -> Scene:
     return replace(make_scene(spec, scene.path.parent), path=scene.path)
 
 
-def test_nothing_is_overwritten_before_what_is_given_was_looked_at(scene: Scene, tmp_path: Path) -> None:
+def test_invalid_arguments_are_refused_before_anything_is_overwritten(scene: Scene, tmp_path: Path) -> None:
     out = write(scene, tmp_path / "out")
     before = contents(out)
     with pytest.raises(InputError, match=r"workers must be at least 1 \(got 0\)"):
@@ -51,7 +51,9 @@ def test_nothing_is_overwritten_before_what_is_given_was_looked_at(scene: Scene,
     assert contents(out) == before
 
 
-def test_nothing_is_overwritten_without_ray(scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_ray_is_refused_before_anything_is_overwritten(
+    scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     out = write(scene, tmp_path / "out")
     before = contents(out)
     monkeypatch.setitem(sys.modules, "ray", None)
@@ -60,7 +62,7 @@ def test_nothing_is_overwritten_without_ray(scene: Scene, tmp_path: Path, monkey
     assert contents(out) == before
 
 
-def test_a_merged_dataset_stays_where_a_shard_is_damaged(scene: Scene, tmp_path: Path) -> None:
+def test_a_damaged_shard_keeps_the_earlier_merged_dataset(scene: Scene, tmp_path: Path) -> None:
     shards = [write(scene, tmp_path / f"part{i}", shard=Shard(i, 2)) for i in (1, 2)]
     whole = merge_shards(shards, tmp_path / "whole").path
     before = contents(whole)
@@ -72,7 +74,7 @@ def test_a_merged_dataset_stays_where_a_shard_is_damaged(scene: Scene, tmp_path:
     assert contents(whole) == before
 
 
-def test_what_has_no_image_yet_is_not_merged(scene: Scene, tmp_path: Path) -> None:
+def test_a_shard_without_images_is_not_merged(scene: Scene, tmp_path: Path) -> None:
     out = write(scene, tmp_path / "out", frames=1)
     (out / "manifest.jsonl").write_bytes(b"")
     with pytest.raises(InputError, match=f"{out}: must have at least one image; finish this shard first"):
@@ -80,7 +82,7 @@ def test_what_has_no_image_yet_is_not_merged(scene: Scene, tmp_path: Path) -> No
     assert not (tmp_path / "whole").exists()
 
 
-def test_files_of_others_stay(scene: Scene, tmp_path: Path) -> None:
+def test_overwriting_keeps_files_of_other_programs(scene: Scene, tmp_path: Path) -> None:
     """Of formats that the dataset has not, and what looks like a file that is being written."""
     out = write(scene, tmp_path / "out", frames=2)
     for name in ("colmap/database.db", "depth/a.png", "annotations/mine.json", "notes/.mine.part"):
@@ -104,7 +106,9 @@ def test_a_damaged_layout_is_named(scene: Scene, tmp_path: Path, text: str) -> N
         write(scene, out)
 
 
-def test_folds_are_those_of_all_images_or_none(scene: Scene, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_folds_are_removed_when_images_are_added(
+    scene: Scene, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     out = write(scene, tmp_path / "out", frames=4)
     write_folds(out, 2)
     assert len(list(out.rglob("fold*_train.txt"))) == 4  # for two tasks
@@ -120,7 +124,7 @@ def test_folds_are_those_of_all_images_or_none(scene: Scene, tmp_path: Path, cap
     assert len(list(out.rglob("fold2*.*"))) == 6
 
 
-def test_a_frame_that_is_made_again_is_alone_in_its_folder(scene: Scene, tmp_path: Path) -> None:
+def test_a_remade_frame_replaces_files_of_an_earlier_one(scene: Scene, tmp_path: Path) -> None:
     def make(out: Path, of: Scene) -> dict[str, bytes]:
         remake_frame(of, 3, out, render=render_boxes, settle=scatter_boxes)
         return contents(out)
@@ -134,7 +138,9 @@ def test_a_frame_that_is_made_again_is_alone_in_its_folder(scene: Scene, tmp_pat
     assert found == make(tmp_path / "fresh", scene)
 
 
-def test_reports_go_to_files_of_their_kind(dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_reports_with_a_wrong_file_ending_are_refused(
+    dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     (tmp_path / "scene.yaml").write_text("mine")
     for words, kind in ((("report", dataset), ".html"), (("compare", dataset, dataset), ".json")):
         assert run(*words, "-o", tmp_path / "scene.yaml") == 2
@@ -142,7 +148,9 @@ def test_reports_go_to_files_of_their_kind(dataset: Path, tmp_path: Path, capsys
     assert (tmp_path / "scene.yaml").read_text() == "mine"
 
 
-def test_meshes_beside_an_exported_scene_stay(scene: Scene, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_export_keeps_meshes_of_other_programs(
+    scene: Scene, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     (tmp_path / "y_files").mkdir()
     (tmp_path / "y_files/object_0.ply").write_text("mine")
     assert run("export", scene.path, "-o", tmp_path / "y.xml") == 2
@@ -150,7 +158,7 @@ def test_meshes_beside_an_exported_scene_stay(scene: Scene, tmp_path: Path, caps
     assert (tmp_path / "y_files/object_0.ply").read_text() == "mine"
 
 
-def test_a_picture_stays_where_there_is_no_room_for_another(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_full_disk_keeps_the_earlier_picture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     text = '<scene version="3.0.0"><integrator type="splat_proxy"/><sensor type="perspective">'
     text += '<film type="hdrfilm"><integer name="width" value="8"/><integer name="height" value="8"/></film>'
     (tmp_path / "scene.xml").write_text(text + '</sensor><emitter type="constant"/></scene>')

@@ -67,7 +67,7 @@ def files_of(root: Path) -> dict[Path, bytes]:
     }
 
 
-def test_the_manifest_names_them_and_frames_keep_their_numbers(whole: DatasetSummary) -> None:
+def test_the_manifest_names_omitted_objects_and_frames_keep_their_numbers(whole: DatasetSummary) -> None:
     records = [json.loads(line) for line in (whole.path / "manifest.jsonl").read_bytes().splitlines()]
     assert [record["index"] for record in records] == list(range(16))
     lacking = {record["index"]: record["left_out"] for record in records if "left_out" in record}
@@ -79,7 +79,7 @@ def test_the_manifest_names_them_and_frames_keep_their_numbers(whole: DatasetSum
     assert audit_dataset(whole.path).violations == ()
 
 
-def test_the_report_tells_of_them(whole: DatasetSummary, tmp_path: Path) -> None:
+def test_the_report_counts_omitted_objects(whole: DatasetSummary, tmp_path: Path) -> None:
     page, _, _ = write_report(whole.path, tmp_path / "report.html")
     assert (
         f"2 layouts lack objects that did not come to rest: 2 nut (fell), 2 bolt (fell), 1 bolt ({WORDS})"
@@ -87,12 +87,12 @@ def test_the_report_tells_of_them(whole: DatasetSummary, tmp_path: Path) -> None
     )
 
 
-def test_several_workers_make_the_same_bytes(scene: Scene, whole: DatasetSummary, tmp_path: Path) -> None:
+def test_workers_make_the_same_bytes(scene: Scene, whole: DatasetSummary, tmp_path: Path) -> None:
     """As many as the layouts cannot be shared evenly among."""
     assert files_of(write(scene, tmp_path / "out", workers=3).path) == files_of(whole.path)
 
 
-def test_an_interrupted_run_goes_on_to_the_same_bytes(scene: Scene, whole: DatasetSummary, tmp_path: Path) -> None:
+def test_an_interrupted_run_resumes_to_the_same_bytes(scene: Scene, whole: DatasetSummary, tmp_path: Path) -> None:
     def broken(scene: Scene, index: int, *, layout: Layout) -> Any:
         if index == 11:  # the second view of the layout of which nothing is left
             raise KeyboardInterrupt
@@ -113,13 +113,13 @@ def test_shards_merge_into_the_same_bytes(scene: Scene, whole: DatasetSummary, t
 
 
 @pytest.mark.parametrize("index", [5, 10])
-def test_one_frame_is_made_again_as_it_was(scene: Scene, whole: DatasetSummary, tmp_path: Path, index: int) -> None:
+def test_a_remade_frame_has_the_same_bytes(scene: Scene, whole: DatasetSummary, tmp_path: Path, index: int) -> None:
     made = remake_frame(scene, index, tmp_path / "frame", dataset=whole.path, render=render_boxes, settle=settle_most)
     assert made.compared
     assert made.differing == ()
 
 
-def test_a_label_of_what_was_left_out_is_found(whole: DatasetSummary, tmp_path: Path) -> None:
+def test_a_label_of_an_omitted_object_is_a_violation(whole: DatasetSummary, tmp_path: Path) -> None:
     shutil.copytree(whole.path, tmp_path / "out")
     path = tmp_path / "out/manifest.jsonl"
     records = [parse_line(line) for line in path.read_bytes().splitlines()]
@@ -130,7 +130,7 @@ def test_a_label_of_what_was_left_out_is_found(whole: DatasetSummary, tmp_path: 
     assert found[0].endswith("is labelled, although its layout lacks it")
 
 
-def test_more_than_the_scene_bears_ends_the_run_whenever_it_is_met(scene: Scene, tmp_path: Path) -> None:
+def test_more_incomplete_layouts_than_allowed_end_the_run(scene: Scene, tmp_path: Path) -> None:
     few = with_share(scene, 0.2)  # 1.6 of 8
     words = r"settle.incomplete = 0.2 of the 8 layouts may lack .*got 2, among them 2 x nut: fell; .*mitsplat check"
     for _ in range(2):  # the second run finds both settled
@@ -143,5 +143,5 @@ def test_more_than_the_scene_bears_ends_the_run_whenever_it_is_met(scene: Scene,
     assert write(few, tmp_path / "part", shard=Shard(2, 2)).incomplete == 1
 
 
-def test_the_share_is_not_part_of_what_decides_the_bytes(whole: DatasetSummary) -> None:
+def test_the_allowed_share_is_not_recorded_as_an_input(whole: DatasetSummary) -> None:
     assert "incomplete" not in (whole.path / "dataset.json").read_text()

@@ -20,7 +20,7 @@ def test_a_line_is_json_and_reads_back():
 
 
 @given(st.integers(0, len(LINES[0]) - 2), st.integers(1, 255))
-def test_any_changed_byte_is_found(place, change):
+def test_every_changed_byte_of_a_line_is_found(place, change):
     line = bytearray(LINES[0])
     line[place] ^= change
     with pytest.raises(ValueError, match=r"checksum"):
@@ -35,7 +35,7 @@ def damaged(path, place):
 
 
 @pytest.mark.parametrize("number", [1, 2])
-def test_damage_in_the_middle_is_named_and_left_alone(tmp_path, number):
+def test_a_damaged_line_in_the_middle_is_named_and_kept(tmp_path, number):
     path = damaged(tmp_path / "manifest.jsonl", sum(map(len, LINES[: number - 1])) + 12)
     before = path.read_bytes()
     with pytest.raises(
@@ -46,7 +46,7 @@ def test_damage_in_the_middle_is_named_and_left_alone(tmp_path, number):
 
 
 @pytest.mark.parametrize("end", [b"\0" * 50, b"\0" * 50 + b"\n", LINES[2][:-1], LINES[2][:9], b'{"index":2}\n'])
-def test_a_torn_end_is_cut(tmp_path, end):
+def test_an_incomplete_last_line_is_removed(tmp_path, end):
     path = tmp_path / "manifest.jsonl"
     path.write_bytes(LINES[0] + LINES[1] + end)
     manifest = Manifest(path)
@@ -57,7 +57,7 @@ def test_a_torn_end_is_cut(tmp_path, end):
 
 
 @pytest.mark.parametrize("change", [lambda path: path.unlink(), lambda path: path.write_bytes(LINES[0] * 2)])
-def test_a_file_that_another_changes_is_not_written_on(tmp_path, change):
+def test_a_manifest_changed_by_another_process_is_not_written(tmp_path, change):
     path = tmp_path / "manifest.jsonl"
     manifest = Manifest(path)
     manifest.append(RECORDS[0])

@@ -70,7 +70,7 @@ def scene_with(scene_data, write_scene, change):
 
 @pytest.mark.parametrize("name", HOPELESS)
 @pytest.mark.usefixtures("machine")
-def test_what_cannot_work_is_refused(name, scene_data, write_scene):
+def test_each_hopeless_scene_is_refused_with_its_cause(name, scene_data, write_scene):
     assert list(run_faults(load_scene(write_scene(scene_data)))) == []
     change, cause = HOPELESS[name]
     scene = scene_with(scene_data, write_scene, change)
@@ -80,7 +80,7 @@ def test_what_cannot_work_is_refused(name, scene_data, write_scene):
 
 
 @pytest.mark.usefixtures("machine")
-def test_images_that_are_there_need_no_room(tmp_path):
+def test_finished_images_need_no_disk_space(tmp_path):
     (text,) = [fault.text for fault in disk_faults(2_000_000, tmp_path)]
     assert text == f"output: 2000000 images take at least 15.3 GiB (10.0 GiB are free at {tmp_path})"
     (tmp_path / "manifest.jsonl").write_text("{}\n" * 1_000_000)
@@ -88,7 +88,7 @@ def test_images_that_are_there_need_no_room(tmp_path):
 
 
 @pytest.mark.usefixtures("machine")
-def test_check_and_render_say_the_same(scene_data, write_scene, tmp_path, capsys):
+def test_check_and_render_report_the_same_fault(scene_data, write_scene, tmp_path, capsys):
     path = write_scene({**scene_data, "camera": path_of(INSIDE)})
     said = "camera: every view is from inside of shape 'table', which hides all objects"
     assert run("check", path) == 1
@@ -109,7 +109,7 @@ def test_check_and_render_say_the_same(scene_data, write_scene, tmp_path, capsys
 
 
 @pytest.mark.usefixtures("machine")
-def test_what_may_work_is_not_refused(scene_data, write_scene):
+def test_scenes_that_may_work_are_not_refused(scene_data, write_scene):
     """Closed rooms around camera and objects, near planes before them, close-ups, background without objects."""
     room = {"name": "room", "box": {"size": [3, 3, 3], "position": [0, 0, 1.39]}, "visible": True, "collider": False}
     fine = [
@@ -138,7 +138,7 @@ TOLD = "views", "lights", "bin"
         ({"shapes": [{"name": "table", "box": TABLE, "visible": True}, NARROW]}, "'nut' does not fit into 'bin'"),
     ],
 )
-def test_what_is_hardly_meant_is_told(change, found, scene_data, write_scene, machine):
+def test_each_doubtful_scene_gets_its_warning(change, found, scene_data, write_scene, machine):
     assert all(finding.ok for finding in scene_warnings(load_scene(write_scene(scene_data))))
     scene_data["output"] = {**scene_data["output"], "layouts": 1, "views": 12}
     scene = scene_with(scene_data, write_scene, change)
@@ -157,7 +157,7 @@ def test_check_warns_of_slow_settling_and_of_large_images(scene_data, write_scen
     assert re.match(r"an image of 3000x3000 px may take \d+\.\d GiB of memory \(5\.0 GiB are unused\)", found["memory"])
 
 
-def test_an_image_larger_than_the_memory_is_refused_before_work(scene_data, write_scene, monkeypatch):
+def test_an_image_larger_than_the_memory_is_refused_before_rendering(scene_data, write_scene, monkeypatch):
     monkeypatch.setattr(prospects, "unused_memory", lambda: 22.5)
     scene = load_scene(write_scene(scene_data), overrides={"output.width": 8000, "output.height": 6000})
     (fault,) = image_faults(scene)
@@ -174,7 +174,7 @@ def test_the_cost_of_checks_does_not_grow_with_layouts(scene_data, write_scene, 
     assert len(planned) <= 2 * prospects.VIEWS
 
 
-def test_points_inside():
+def test_points_inside_agrees_with_rings_and_open_boxes():
     """Of a ring: in its ring and not in its hole, whichever way it is wound; of an open box, where most of it is."""
     ring = trimesh.creation.annulus(r_min=0.5, r_max=1.0, height=0.4)
     points = np.array([[0, 0, 0], [0.75, 0, 0], [0, -0.75, 0.1], [0.75, 0, 0.3], [0.4, 0, 0.0], [5, 0, 0]])
@@ -186,7 +186,7 @@ def test_points_inside():
         assert points_inside(mesh.copy().apply_transform(turn), moved).tolist() == expected
 
 
-def test_sees():
+def test_visibility_of_boxes_agrees_with_many_points():
     """Against many points of boxes anywhere, for lenses of all widths."""
     rng, cases = np.random.default_rng(4), []
     for _ in range(200):
@@ -218,7 +218,7 @@ def test_a_tolerance_is_refused_before_anything_is_rendered(
     assert capsys.readouterr().err.count(f"tolerance must be at least 0 (got {float(tolerance)})") == 2
 
 
-def test_a_dataset_without_any_label_is_told(scene_data, write_scene, tmp_path, monkeypatch, capsys):
+def test_a_dataset_without_labels_ends_with_status_4(scene_data, write_scene, tmp_path, monkeypatch, capsys):
     """Status 4, and why; not where there is nothing to label, nor for a shard, whose others may have labels."""
     laid_out = settle
 

@@ -30,9 +30,7 @@ def made(scene: Scene, tmp_path: Path) -> Path:
     return write_dataset(scene, tmp_path / "out", frames=3, **DRAWN).path
 
 
-def test_rendered_frames_are_made_again_byte_for_byte(
-    scene_data: dict[str, Any], write_scene: WriteScene, tmp_path: Path
-) -> None:
+def test_remade_frames_have_the_same_bytes(scene_data: dict[str, Any], write_scene: WriteScene, tmp_path: Path) -> None:
     """From the scene alone: nothing but the comparison looks at the dataset."""
     path = write_scene(
         scene_data
@@ -49,7 +47,7 @@ def test_rendered_frames_are_made_again_byte_for_byte(
     assert json.loads((made.path / "frame.json").read_text()) == made.record
 
 
-def test_what_differs_is_named_with_its_cause(scene: Scene, made: Path, tmp_path: Path) -> None:
+def test_files_that_differ_are_named_with_the_cause(scene: Scene, made: Path, tmp_path: Path) -> None:
     line = (made / "manifest.jsonl").read_bytes().splitlines(keepends=True)[1]
     (made / "layouts/0000.json").write_text("{}")
     again = remake_frame(scene, 1, tmp_path / "again", dataset=made, **DRAWN)
@@ -63,20 +61,20 @@ def test_what_differs_is_named_with_its_cause(scene: Scene, made: Path, tmp_path
         remake_frame(scene, 1, tmp_path / "again", dataset=made, **DRAWN)
 
 
-def test_a_frame_that_the_dataset_has_not(scene: Scene, made: Path, tmp_path: Path) -> None:
+def test_a_frame_that_the_dataset_lacks_is_not_compared(scene: Scene, made: Path, tmp_path: Path) -> None:
     for index, dataset in ((3, made), (1, tmp_path / "none"), (1, None)):
         again = remake_frame(scene, index, tmp_path / f"again{index}", dataset=dataset, **DRAWN)
         assert again.compared == 0 and again.record["index"] == index
 
 
-def test_a_folder_of_something_else_is_left_alone(scene: Scene, made: Path) -> None:
+def test_a_folder_with_other_files_is_refused(scene: Scene, made: Path) -> None:
     with pytest.raises(InputError, match="must be absent, empty, or hold a frame of an earlier call"):
         remake_frame(scene, 1, made, **DRAWN)
     with pytest.raises(InputError, match="frame must be in 0 to 3"):
         remake_frame(scene, 4, made, **DRAWN)
 
 
-def test_the_dataset_is_only_read(scene: Scene, made: Path, tmp_path: Path) -> None:
+def test_remaking_a_frame_does_not_change_the_dataset(scene: Scene, made: Path, tmp_path: Path) -> None:
     """Another process may be writing it: its last line may be torn."""
     with (made / "manifest.jsonl").open("ab") as file:
         file.write(b'{"index":1,"layout"')

@@ -39,7 +39,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_dataset(scene, folder / "out", render=render_boxes, settle=scatter_drawn).path
 
 
-def test_every_format_has_three_splits_that_the_audit_finds_whole(made: Path) -> None:
+def test_three_splits_have_no_violations_in_every_format(made: Path) -> None:
     records = records_of(made)
     assert Counter(record["split"] for record in records) == {"train": 8, "val": 4, "test": 4}
     assert audit_dataset(made).violations == ()
@@ -57,7 +57,7 @@ def shows_a_crate(record: dict[str, Any]) -> bool:
     return any(label["class"] == "crate" for label in record["labels"]["instances"])
 
 
-def test_the_audit_finds_what_is_held_out_elsewhere(made: Path, tmp_path: Path) -> None:
+def test_a_held_out_asset_in_another_split_is_a_violation(made: Path, tmp_path: Path) -> None:
     copy = Path(shutil.copytree(made, tmp_path / "copy"))
     records = records_of(copy)
     next(record for record in records if shows_a_crate(record))["split"] = "train"
@@ -67,7 +67,7 @@ def test_the_audit_finds_what_is_held_out_elsewhere(made: Path, tmp_path: Path) 
     assert any("are in both train and test" in text for text in found)
 
 
-def test_folds_are_lists_that_lead_to_images_and_labels(made: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_folds_list_existing_images_and_labels(made: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run("split", made, "--folds", 3) == 0
     assert capsys.readouterr().out.count("validates with 4 images of 2 layouts") == 3
     records = [record for record in records_of(made) if record["split"] != "test"]
@@ -114,7 +114,7 @@ def test_overwriting_removes_folds(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("folds", [2, 5, 7])
-def test_folds_spread_classes_and_layouts(folds: int) -> None:
+def test_folds_distribute_classes_and_keep_layouts_together(folds: int) -> None:
     """Layouts to one; what is in as many layouts as there are folds is in each, and the rest within a few."""
     rng = np.random.default_rng(folds)
     layouts = {i: Counter({"nut": int(rng.integers(0, 4)), "bolt": int(rng.integers(1, 3))}) for i in range(101)}

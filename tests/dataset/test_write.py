@@ -148,13 +148,13 @@ class TestContent:
         expected = render(scene, 0, layout=settle(scene, 0, progress=print)).image
         np.testing.assert_array_equal(cv2.cvtColor(stored, cv2.COLOR_BGR2RGB), expected)
 
-    def test_data_yaml_names_splits_relative_to_itself(self, scene, tmp_path):
+    def test_data_yaml_has_relative_paths_of_splits(self, scene, tmp_path):
         write(scene, tmp_path / "out")
         data = YAML(typ="safe").load(tmp_path / "out/data.yaml")
         assert data == {"train": "images/train", "val": "images/val", "names": {0: "bolt", 1: "nut"}}
         assert [path.name for path in (tmp_path / "out").glob("*.y*ml")] == ["data.yaml"]
 
-    def test_data_yaml_of_one_split_and_of_odd_names(self):
+    def test_data_yaml_handles_one_split_and_quotes_class_names(self):
         data = YAML(typ="safe").load(data_yaml(["no", "12", 'a "b": c'], ["train"]))
         assert data["val"] == "images/train"
         assert data["names"] == {0: "no", 1: "12", 2: 'a "b": c'}
@@ -198,24 +198,24 @@ class TestContent:
         np.testing.assert_array_equal(channels["instance"], frame.instance)
         assert channels["instance"].dtype == np.uint32
 
-    def test_jpeg(self, scene_data, write_scene, tmp_path):
+    def test_images_can_be_jpeg_files(self, scene_data, write_scene, tmp_path):
         scene_data["output"]["image"] = "jpg"
         write(load_scene(write_scene(scene_data)), tmp_path / "out", frames=1)
         assert (tmp_path / "out/images/train/000000.jpg").read_bytes().startswith(b"\xff\xd8")
 
-    def test_the_scene_file_is_kept(self, scene, tmp_path):
+    def test_the_scene_file_is_stored(self, scene, tmp_path):
         write(scene, tmp_path / "out", frames=1)
         assert (tmp_path / "out/scene/scene.yaml").read_bytes() == scene.path.read_bytes()
         assert json.loads((tmp_path / "out/dataset.json").read_bytes())["scene"]["seed"] == 7
 
 
 class TestSameBytes:
-    def test_for_one_and_two_workers(self, scene, tmp_path, undisturbed):
+    def test_one_and_two_workers_make_the_same_bytes(self, scene, tmp_path, undisturbed):
         write(scene, tmp_path / "out", workers=2)
         assert contents(tmp_path / "out") == undisturbed
 
     @pytest.mark.parametrize("error", [KeyboardInterrupt, RuntimeError])
-    def test_stopped_in_a_frame_and_resumed(self, scene, tmp_path, undisturbed, error):
+    def test_a_run_stopped_in_a_frame_resumes_to_the_same_bytes(self, scene, tmp_path, undisturbed, error):
         out = tmp_path / "out"
         with pytest.raises(error):
             write(scene, out, render=RenderUntil(5, error))
@@ -223,7 +223,7 @@ class TestSameBytes:
         assert write(scene, out).rendered == 7
         assert contents(out) == undisturbed
 
-    def test_a_worker_that_fails_keeps_the_others_frames(self, scene, tmp_path, undisturbed):
+    def test_a_failed_worker_keeps_finished_frames(self, scene, tmp_path, undisturbed):
         out = tmp_path / "out"
         with pytest.raises(FrameError, match="frame 5 failed"):
             write(scene, out, render=RenderUntil(5, RuntimeError), workers=2)
@@ -232,7 +232,9 @@ class TestSameBytes:
         assert write(scene, out).rendered == 12 - kept
         assert contents(out) == undisturbed
 
-    def test_stopped_between_image_and_label(self, scene, tmp_path, undisturbed, monkeypatch):
+    def test_a_run_stopped_between_image_and_label_resumes_to_the_same_bytes(
+        self, scene, tmp_path, undisturbed, monkeypatch
+    ):
         out = tmp_path / "out"
 
         def fail(*args):
@@ -248,7 +250,7 @@ class TestSameBytes:
         assert contents(out) == undisturbed
 
     @pytest.mark.parametrize("torn", [1, 40, 300])
-    def test_torn_last_lines(self, scene, tmp_path, undisturbed, torn):
+    def test_incomplete_last_lines_resume_to_the_same_bytes(self, scene, tmp_path, undisturbed, torn):
         out = tmp_path / "out"
         write(scene, out, frames=6)
         for name in ("manifest.jsonl", "timings.jsonl"):
@@ -266,19 +268,19 @@ class TestSameBytes:
         assert write(scene, out).rendered == 1
         assert contents(out) == undisturbed
 
-    def test_in_two_goes(self, scene, tmp_path, undisturbed):
+    def test_two_runs_make_the_same_bytes_as_one(self, scene, tmp_path, undisturbed):
         write(scene, tmp_path / "out", frames=5)
         summary = write(scene, tmp_path / "out")
         assert (summary.frames, summary.rendered) == (12, 7)
         assert contents(tmp_path / "out") == undisturbed
 
-    def test_with_layouts_added(self, scene, tmp_path, undisturbed):
+    def test_added_layouts_make_the_same_bytes_as_one_run(self, scene, tmp_path, undisturbed):
         out = tmp_path / "out"
         write(load_scene(scene.path, overrides={"output.layouts": 2, "output.formats": scene.spec.output.formats}), out)
         assert write(scene, out).rendered == 4
         assert contents(out) == undisturbed
 
-    def test_partial_files_are_cleared(self, scene, tmp_path, undisturbed):
+    def test_partial_files_are_removed_on_resume(self, scene, tmp_path, undisturbed):
         out = tmp_path / "out"
         write(scene, out, frames=2)
         (out / "images/train/.000002.png.123.part").write_bytes(b"half")
@@ -317,7 +319,7 @@ def never_render(scene, index, *, layout):
         ([], [None], ("assets", "[]", "[null]")),
     ],
 )
-def test_difference_names_the_place(before, now, told):
+def test_first_difference_names_key_and_values(before, now, told):
     assert folder.first_difference({"assets": before}, {"assets": now}) == told
 
 
@@ -326,17 +328,17 @@ class TestRefusals:
         with pytest.raises(InputError, match=message):
             write(scene, out, render=never_render, **options)
 
-    def test_another_seed(self, scene, tmp_path):
+    def test_resuming_with_another_seed_is_refused(self, scene, tmp_path):
         write(scene, tmp_path / "out", frames=1)
         other = load_scene(scene.path, overrides={"seed": 8})
         self.refuse(other, tmp_path / "out", r"cannot be resumed: scene\.seed was 7 and is 8")
 
-    def test_another_size(self, scene, tmp_path):
+    def test_resuming_with_another_size_is_refused(self, scene, tmp_path):
         write(scene, tmp_path / "out", frames=1)
         other = load_scene(scene.path, overrides={"output.width": 80})
         self.refuse(other, tmp_path / "out", r"scene\.output\.width was 64 and is 80")
 
-    def test_a_changed_asset(self, scene, scene_data, write_scene, tmp_path):
+    def test_resuming_with_a_changed_asset_is_refused(self, scene, scene_data, write_scene, tmp_path):
         write(scene, tmp_path / "out", frames=1)
         shutil.rmtree(tmp_path / "assets/nut")
         shutil.copytree(tmp_path / "assets/bolt", tmp_path / "assets/nut")
@@ -344,7 +346,7 @@ class TestRefusals:
         manual.write_text(manual.read_text().replace("bolt", "nut"))
         self.refuse(load_scene(scene.path), tmp_path / "out", r"inputs\.objects\[0\]\.mesh was")
 
-    def test_overwriting_starts_anew(self, scene, tmp_path):
+    def test_overwriting_replaces_all_images(self, scene, tmp_path):
         out = tmp_path / "out"
         write(scene, out)
         other = load_scene(scene.path, overrides={"seed": 8, "output.formats": ["yolo"]})
@@ -352,13 +354,13 @@ class TestRefusals:
         assert len(list(out.rglob("*.png"))) == 2
         assert not (out / "annotations").exists()
 
-    def test_a_dataset_without_leave_to_resume(self, scene, tmp_path):
+    def test_an_existing_dataset_is_refused_without_resume(self, scene, tmp_path):
         write(scene, tmp_path / "out", frames=1)
         self.refuse(scene, tmp_path / "out", "already holds a dataset", resume=False)
 
     @pytest.mark.parametrize("overwrite", [False, True])
     @pytest.mark.parametrize("files", [["thesis.tex"], ["images/train/1.png", "labels/train/1.txt", "data.yaml"]])
-    def test_a_folder_of_something_else_stays_as_it_is(self, scene, tmp_path, files, overwrite):
+    def test_a_folder_with_other_files_is_refused_and_unchanged(self, scene, tmp_path, files, overwrite):
         out = tmp_path / "out"
         for file in files:
             (out / file).parent.mkdir(parents=True, exist_ok=True)
@@ -372,7 +374,7 @@ class TestRefusals:
         (out / "dataset.json").unlink()
         assert contents(out, without=()) == before
 
-    def test_a_second_writer(self, scene, tmp_path):
+    def test_a_second_writer_is_refused_by_process_and_host(self, scene, tmp_path):
         out = tmp_path / "out"
 
         def second(*args, **options):
@@ -383,12 +385,12 @@ class TestRefusals:
 
         write(scene, out, frames=1, render=second)
 
-    def test_a_file_in_the_way(self, scene, tmp_path):
+    def test_a_file_in_place_of_the_folder_is_refused(self, scene, tmp_path):
         (tmp_path / "out").write_text("")
         self.refuse(scene, tmp_path / "out", "cannot write into .*out: File exists")
         self.refuse(scene, tmp_path / "out/deeper", "cannot write into .*deeper: Not a directory")
 
-    def test_a_read_only_folder(self, scene, tmp_path, monkeypatch):
+    def test_a_read_only_folder_is_refused(self, scene, tmp_path, monkeypatch):
         """Simulated: the tests may run as root, who may write anywhere."""
 
         def denied(*args, **options):
@@ -397,7 +399,7 @@ class TestRefusals:
         monkeypatch.setattr(folder, "write_text", denied)
         self.refuse(scene, tmp_path / "out", r"out: cannot be written or read \(Permission denied\)")
 
-    def test_a_damaged_manifest(self, scene, tmp_path):
+    def test_a_damaged_manifest_is_refused_by_its_line(self, scene, tmp_path):
         write(scene, tmp_path / "out", frames=3)
         manifest = tmp_path / "out/manifest.jsonl"
         lines = manifest.read_text().splitlines()
@@ -405,13 +407,13 @@ class TestRefusals:
         self.refuse(scene, tmp_path / "out", r"manifest\.jsonl, line 2: must be the record of a frame")
 
     @pytest.mark.parametrize("frames", [0, 13])
-    def test_a_number_of_frames_that_is_not_there(self, scene, tmp_path, frames):
+    def test_a_number_of_frames_out_of_range_is_refused(self, scene, tmp_path, frames):
         self.refuse(scene, tmp_path / "out", rf"frames must be between 1 and 12, .* \(got {frames}\)", frames=frames)
         assert not (tmp_path / "out").exists()
 
 
 class TestDevice:
-    def test_is_recorded(self, scene, tmp_path):
+    def test_the_device_of_each_run_is_recorded(self, scene, tmp_path):
         write(scene, tmp_path / "out", frames=1)
         write(scene, tmp_path / "out", frames=2, device="cpu")
         assert json.loads((tmp_path / "out/dataset.json").read_bytes())["device"] == "cpu"
@@ -434,7 +436,7 @@ class TestDevice:
         del content["device"]
         (out / "dataset.json").write_text(json.dumps(content | ({"device": device} if device else {}), indent=1))
 
-    def test_the_other_one_is_refused_unless_allowed(self, scene, tmp_path, undisturbed):
+    def test_resuming_on_another_device_is_refused_unless_allowed(self, scene, tmp_path, undisturbed):
         out = tmp_path / "out"
         write(scene, out, frames=2)
         self.begun_on(out, "cuda")
@@ -448,26 +450,26 @@ class TestDevice:
         assert json.loads((out / "dataset.json").read_bytes())["device"] == "cuda"  # how it was begun
         assert {**contents(out), "dataset.json": ""} == {**undisturbed, "dataset.json": ""}
 
-    def test_a_dataset_that_names_none_is_of_the_cpu(self, scene, tmp_path):
+    def test_a_dataset_without_a_device_counts_as_cpu(self, scene, tmp_path):
         out = tmp_path / "out"
         write(scene, out, frames=2)
         self.begun_on(out, None)
         assert read_content(out)["scene"]["seed"] == 7
         assert write(scene, out).rendered == 10
 
-    def test_one_that_there_is_not_is_refused_by_readers(self, scene, tmp_path):
+    def test_a_dataset_of_an_unknown_device_is_refused(self, scene, tmp_path):
         write(scene, tmp_path / "out", frames=1)
         self.begun_on(tmp_path / "out", "tpu")
         with pytest.raises(InputError, match=r"must be a dataset of this version of mitsplat \(dataset.json: device: "):
             read_content(tmp_path / "out")
 
-    def test_workers_take_that_of_their_caller(self, scene, tmp_path):
+    def test_workers_use_the_device_of_their_caller(self, scene, tmp_path):
         """A worker says what it renders on; before, one fell back to LLVM whatever its caller had chosen."""
         write(scene, tmp_path / "out", render=Told(tmp_path), workers=2, device="cpu")
         assert {path.read_text() for path in tmp_path.glob("variant-*")} == {"llvm_ad_rgb"}
 
     @pytest.mark.parametrize("device", ["cuda", "cuda:all", "tpu"])
-    def test_one_that_is_not_here_is_refused_before_work(self, scene, tmp_path, device, monkeypatch):
+    def test_a_missing_device_is_refused_before_rendering(self, scene, tmp_path, device, monkeypatch):
         monkeypatch.setattr(devices, "visible_gpus", lambda: devices.MissingPrerequisite("there is none", "buy one"))
         words = (
             "device must be cpu, cuda"
@@ -478,7 +480,7 @@ class TestDevice:
             write(scene, tmp_path / "out", render=never_render, device=device)
         assert not (tmp_path / "out").exists()
 
-    def test_auto_says_what_it_chose(self, scene, tmp_path, monkeypatch):
+    def test_auto_reports_the_chosen_device(self, scene, tmp_path, monkeypatch):
         monkeypatch.setattr(devices, "visible_gpus", lambda: devices.MissingPrerequisite("there is none", "buy one"))
         told = []
         write(scene, tmp_path / "out", frames=1, device="auto", progress=lambda *event: told.append(event[2]))

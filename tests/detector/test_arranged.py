@@ -26,7 +26,7 @@ def place(*, in_bin: bool) -> Any:
 
 
 @pytest.mark.parametrize("in_bin", [False, True])
-def test_what_stands_without_physics_stands_beside_one_another(in_bin: bool) -> None:
+def test_objects_placed_without_physics_do_not_overlap(in_bin: bool) -> None:
     taken: list[Any] = []
     rng = np.random.default_rng(1)
     poses = [arranged._stand(place(in_bin=in_bin), BOX, 0, taken, rng) for _ in range(6)]
@@ -38,7 +38,7 @@ def test_what_stands_without_physics_stands_beside_one_another(in_bin: bool) -> 
     assert reach < 0.2 if in_bin else 0.2 < reach < 0.3
 
 
-def test_what_floats_is_apart_and_above_the_floor() -> None:
+def test_floating_objects_do_not_overlap_and_are_above_the_floor() -> None:
     taken: list[Any] = []
     rng = np.random.default_rng(2)
     found = [arranged._float(place(in_bin=False), BOX, 0, taken, rng) for _ in range(200)]
@@ -51,7 +51,7 @@ def test_what_floats_is_apart_and_above_the_floor() -> None:
     assert apart.min() > 2 * radius
 
 
-def test_a_mesh_looks_as_its_instance_does() -> None:
+def test_a_mesh_gets_the_appearance_of_its_instance() -> None:
     """Twice as bright, half of its red, moved, and rough; what would be brighter than white is white."""
     texture = np.rint(255 * encode_srgb(np.array([[[0.4, 0.3, 0.8]]]))).astype(np.uint8)
     part = MeshPart("box", BOX, None, texture, np.zeros((12, 3, 2)), 0.0, 0.9, True)

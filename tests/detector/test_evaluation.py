@@ -47,7 +47,7 @@ def judged(tmp_path_factory: pytest.TempPathFactory) -> tuple[LabelledSet, Evalu
     return found, write_evaluation(found, guesses(found), folder / "out", masks=True, about=about)
 
 
-def test_results_are_those_of_what_is_stored(judged: tuple[LabelledSet, Evaluation]) -> None:
+def test_stored_results_follow_from_stored_truth_and_detections(judged: tuple[LabelledSet, Evaluation]) -> None:
     found, evaluation = judged
     files = {path.name for path in evaluation.path.iterdir()}
     assert files == {"results.json", "detections.json", "truth.json", "report.html"}
@@ -66,7 +66,7 @@ def test_results_are_those_of_what_is_stored(judged: tuple[LabelledSet, Evaluati
     assert matrix[:-1].sum(axis=1).tolist() == [labelled["disc"], labelled["box"]]
 
 
-def test_the_page_is_whole_and_shows_the_worst_images(judged: tuple[LabelledSet, Evaluation]) -> None:
+def test_the_report_is_complete_and_shows_the_worst_images(judged: tuple[LabelledSet, Evaluation]) -> None:
     _, evaluation = judged
     page = evaluation.page.read_text()
     for heading in ("Summary", "Classes", "Charts", "Confusion", "Worst images"):
@@ -80,12 +80,12 @@ def test_the_page_is_whole_and_shows_the_worst_images(judged: tuple[LabelledSet,
     assert 'class="mask"' in page and 'class="box"' in page
 
 
-def test_the_worst_come_first() -> None:
+def test_images_with_most_errors_come_first() -> None:
     errors = {1: (3, 0, 0, 0), 2: (1, 1, 0, 0), 3: (0, 1, 0, 0), 4: (2, 0, 0, 2), 5: (0, 1, 1, 1)}
     assert worst_images(Confusion(np.zeros((1, 1), dtype=np.int64), errors)) == [5, 3, 4, 2]
 
 
-def test_no_foreign_folder_is_written_to(tmp_path: Path) -> None:
+def test_a_folder_with_other_files_is_not_written(tmp_path: Path) -> None:
     run = tmp_path / "run"
     run.mkdir()
     record = {"settings": {"size": 64}, "classes": ["disc", "box"], "masks": True, "finished": {"steps": 1}}
@@ -105,7 +105,7 @@ def test_no_foreign_folder_is_written_to(tmp_path: Path) -> None:
     assert contents(tmp_path) == before
 
 
-def test_boxes_alone_are_judged_as_such(tmp_path: Path) -> None:
+def test_boxes_without_masks_are_evaluated_as_boxes(tmp_path: Path) -> None:
     found = read_set(write_yolo(tmp_path / "cell", {"val": 3}, boxes=True), "val")
     detections = [
         {key: annotation[key] for key in ("image_id", "category_id", "bbox")} | {"score": 0.9}
@@ -116,7 +116,7 @@ def test_boxes_alone_are_judged_as_such(tmp_path: Path) -> None:
     assert "All detections are correct." in evaluation.page.read_text()
 
 
-def test_nothing_found_is_a_result(tmp_path: Path) -> None:
+def test_no_detections_give_a_result_of_zero(tmp_path: Path) -> None:
     found = read_set(write_yolo(tmp_path / "cell", {"val": 2}), "val")
     evaluation = write_evaluation(found, [], tmp_path / "out", masks=True, about={})
     assert evaluation.results["mask"] == {
@@ -126,7 +126,7 @@ def test_nothing_found_is_a_result(tmp_path: Path) -> None:
     }
 
 
-def test_crowds_need_not_be_found(tmp_path: Path) -> None:
+def test_crowds_that_are_not_detected_are_no_error(tmp_path: Path) -> None:
     found = read_set(write_coco(tmp_path / "crowds", 2, form="compressed", crowd=True), "all")
     results = write_evaluation(found, [], tmp_path / "out", masks=True, about={}).results
     assert results["box"]["map50_95"] is None and results["box"]["classes"] == {}

@@ -34,13 +34,13 @@ def scenes_of(plan: Path) -> list[str]:
 
 
 @pytest.mark.parametrize(("plan", "name"), [(plan, name) for plan in PLANS for name in scenes_of(plan)])
-def test_scenes_of_arms_may_be_written_so(tmp_path, plan, name):
+def test_every_scene_of_an_arm_is_valid(tmp_path, plan, name):
     written = YAML(typ="safe").load(experiment.write_scene(tmp_path, name, plan))
     assert SceneSpec.model_validate(written).name == ("groceries" if plan == experiment.PLAN else "workcell")
 
 
 @pytest.mark.parametrize("plan", PLANS)
-def test_every_change_is_that_of_a_scene(plan):
+def test_every_change_is_used_by_a_scene(plan):
     changes = experiment.read_arms(plan)["changes"]
     assert {change for scene in scenes_of(plan) for change in scene.split("+")} == set(changes)
 
@@ -69,7 +69,7 @@ def work(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize("arm", ["real", "hybrid_more", "synthetic"])
-def test_photographs_are_judged_by_what_has_not_seen_them(work, monkeypatch, arm):
+def test_photographs_are_judged_by_detectors_that_were_not_trained_on_them(work, monkeypatch, arm):
     """A detector that finds what it has not learnt from, and nothing else: only leaving out scenes lets it see all."""
     seen: dict[str, set[str]] = {}
 
@@ -109,7 +109,7 @@ def test_photographs_are_judged_by_what_has_not_seen_them(work, monkeypatch, arm
 
 
 @pytest.mark.parametrize(("arm", "starts"), [("real", "coco.pt"), ("scratch", None)])
-def test_an_arm_starts_from_what_it_says(work, monkeypatch, arm, starts):
+def test_an_arm_starts_from_its_stated_weights(work, monkeypatch, arm, starts):
     given: list[Path | None] = []
     monkeypatch.setattr(experiment, "train_detector", lambda *args, **_: given.append(args[2].weights))
     options = argparse.Namespace(work=work, arm=arm, seed=0, weights=Path("coco.pt"), device="cpu", workers=0)
@@ -117,7 +117,7 @@ def test_an_arm_starts_from_what_it_says(work, monkeypatch, arm, starts):
     assert given == [starts and Path(starts)]
 
 
-def test_folds_are_trained_side_by_side_and_judged_once_all_are(work, tmp_path):
+def test_folds_are_trained_in_parallel_and_judged_after_all_of_them(work, tmp_path):
     plan = experiment.read_arms()
     options = argparse.Namespace(work=work, plan=experiment.PLAN, workers=2, weights=None, hope=tmp_path)
     options.render_devices, options.render_workers = ["cuda:0", "cuda:1"], 8
@@ -134,7 +134,7 @@ def test_folds_are_trained_side_by_side_and_judged_once_all_are(work, tmp_path):
     assert trainings["no_shadow-0"].after == ["no_shadow-0-0"]
 
 
-def test_jobs_run_in_order_on_free_devices_after_what_they_need(tmp_path, capsys):
+def test_jobs_run_in_order_on_free_devices_after_their_dependencies(tmp_path, capsys):
     def job(name: str, then: str, after: Sequence[str] = ()) -> side_by_side.Job:
         code = f"import os, sys; print(sys.argv[2], os.environ.get('CUDA_VISIBLE_DEVICES')); {then}"
         return side_by_side.Job(name, "train", [sys.executable, "-c", code], after, hides=name == "shy")
@@ -161,7 +161,7 @@ def test_jobs_run_in_order_on_free_devices_after_what_they_need(tmp_path, capsys
     assert free["train"] == ["cuda:1"]
 
 
-def test_what_renders_on_the_processor_leaves_it_to_trainings(tmp_path, capsys):
+def test_rendering_on_the_cpu_has_a_lower_priority_than_training(tmp_path, capsys):
     nice = [sys.executable, "-c", "import os; print(os.nice(0))"]
     jobs = [side_by_side.Job(kind, kind, nice) for kind in ("render", "train")]
     side_by_side.run_jobs(jobs, {"train": ["cpu"], "render": ["cpu"]}, argparse.Namespace(work=tmp_path, minutes=5))
@@ -169,7 +169,7 @@ def test_what_renders_on_the_processor_leaves_it_to_trainings(tmp_path, capsys):
     assert said == {"render": "19", "train": str(os.nice(0))}
 
 
-def test_photographs_of_parts_are_labelled_by_what_is_seen(tmp_path, physics, monkeypatch):
+def test_labels_of_workshop_photographs_are_the_visible_pixels(tmp_path, physics, monkeypatch):
     monkeypatch.setattr(record, "_open", [{}])
     options = argparse.Namespace(work=tmp_path, scenes=2, views=1, width=160, samples=4)
     workshop.photograph_workshops(options)
@@ -186,7 +186,7 @@ def test_photographs_of_parts_are_labelled_by_what_is_seen(tmp_path, physics, mo
     assert experiment.scene_of(labels["images"][1]["file_name"]) == 1
 
 
-def test_a_brand_is_printed_in_the_colours_of_its_scan():
+def test_a_brand_has_the_hues_of_its_scan():
     scan = make_package(1)  # a can
     own, others = (relabel(scan, 5, 2, own_colours=own) for own in (True, False))
 
@@ -217,7 +217,7 @@ def test_bags_are_closed_and_folded(seed):
     assert bag.is_watertight and 0 < bag.volume < 0.8 * bag.convex_hull.volume
 
 
-def test_of_more_layouts_fewer_views_are_listed(tmp_path):
+def test_listed_images_have_the_stated_number_of_views_per_layout(tmp_path):
     folder = tmp_path / "table"
     (folder / "images/train").mkdir(parents=True)
     (folder / "data.yaml").write_text("names: {0: tin}\n")

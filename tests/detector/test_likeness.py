@@ -36,14 +36,14 @@ def change(photographs: Path, do: object) -> None:
         cv2.imwrite(str(path), np.clip(do(cv2.imread(str(path)).astype(float)), 0, 255).astype(np.uint8))  # type: ignore[operator]
 
 
-def test_what_is_painted_alike_needs_no_advice(rendered: Path, photographs: Path) -> None:
+def test_equal_distributions_get_no_advice(rendered: Path, photographs: Path) -> None:
     found = compare_with_photographs([rendered], photographs, size=WIDTH)
     assert (found.images, found.photographs) == (40, 20)
     assert [one.name for one in found.traits if one.advice] == []
     assert not any(one.advice for traits in found.classes.values() for one in traits)
 
 
-def test_what_is_measured_is_what_was_painted(rendered: Path, photographs: Path) -> None:
+def test_measured_colours_equal_the_painted_ones(rendered: Path, photographs: Path) -> None:
     found = compare_with_photographs([rendered], photographs, size=WIDTH)
     for name, hue in HUES.items():
         bright, saturation = found.classes[name]
@@ -55,7 +55,7 @@ def test_what_is_measured_is_what_was_painted(rendered: Path, photographs: Path)
 
 
 @pytest.mark.parametrize("turn", [0, -21, 15])
-def test_hues_that_a_camera_turns_are_told(rendered: Path, photographs: Path, turn: int) -> None:
+def test_a_hue_shift_of_the_camera_is_reported(rendered: Path, photographs: Path, turn: int) -> None:
     def turned(image: np.ndarray) -> np.ndarray:
         hsv = cv2.cvtColor((image / 255).astype(np.float32), cv2.COLOR_BGR2HSV)
         hsv[..., 0] = (hsv[..., 0] + turn) % 360
@@ -67,7 +67,7 @@ def test_hues_that_a_camera_turns_are_told(rendered: Path, photographs: Path, tu
     assert bool(found.hue_advice) == (turn != 0)
 
 
-def test_photographs_that_show_things_small_are_searched_large(tmp_path: Path, rendered: Path) -> None:
+def test_photographs_with_small_objects_get_a_larger_search_size(tmp_path: Path, rendered: Path) -> None:
     photographs = write_coco(tmp_path / "photographs", 20, form="boxes", first=1000)
     labels = json.loads((photographs / "labels.json").read_text())
     for image in labels["images"]:  # each in the corner of a picture twice as large
@@ -92,7 +92,7 @@ def test_photographs_that_show_things_small_are_searched_large(tmp_path: Path, r
         ("brightness of images", lambda image: image + 60, "brighten the backdrop"),
     ],
 )
-def test_what_differs_is_named_with_what_changes_it(
+def test_each_difference_is_named_with_the_key_that_changes_it(
     rendered: Path, photographs: Path, name: str, do: object, says: str
 ) -> None:
     change(photographs, do)
@@ -101,7 +101,7 @@ def test_what_differs_is_named_with_what_changes_it(
     assert max(found.below, found.above) > 0.9
 
 
-def test_photographs_that_differ_both_ways_ask_for_a_wider_range(rendered: Path, photographs: Path) -> None:
+def test_photographs_that_differ_both_ways_get_advice_for_a_wider_range(rendered: Path, photographs: Path) -> None:
     for number, path in enumerate(sorted((photographs / "photos").iterdir())):
         image = cv2.imread(str(path)).astype(float) * (0.5 if number % 2 else 1.1)
         cv2.imwrite(str(path), np.clip(image, 0, 255).astype(np.uint8))
@@ -110,7 +110,7 @@ def test_photographs_that_differ_both_ways_ask_for_a_wider_range(rendered: Path,
     assert found.below > 0.3 and found.above > 0.3
 
 
-def test_a_class_alone_can_differ(rendered: Path, photographs: Path) -> None:
+def test_a_difference_of_one_class_is_reported(rendered: Path, photographs: Path) -> None:
     """Discs are red and boxes blue: without half of the blue the boxes are dark."""
     change(photographs, lambda image: image * (0.5, 1, 1))
     found = compare_with_photographs([rendered], photographs, size=WIDTH)
@@ -118,7 +118,7 @@ def test_a_class_alone_can_differ(rendered: Path, photographs: Path) -> None:
     assert not found.classes["disc"][0].advice
 
 
-def test_size_is_that_of_the_scaled_image(rendered: Path, photographs: Path) -> None:
+def test_object_size_is_that_in_the_scaled_image(rendered: Path, photographs: Path) -> None:
     once, twice = (
         trait(compare_with_photographs([rendered], photographs, size=size), "size of objects")
         for size in (WIDTH, 2 * WIDTH)
@@ -126,7 +126,7 @@ def test_size_is_that_of_the_scaled_image(rendered: Path, photographs: Path) -> 
     assert np.allclose(twice.real, 2 * np.array(once.real))
 
 
-def test_the_form_of_labels_does_not_matter(rendered: Path, tmp_path: Path) -> None:
+def test_all_forms_of_labels_give_the_same_traits(rendered: Path, tmp_path: Path) -> None:
     found = [
         compare_with_photographs([rendered], write_coco(tmp_path / form, 12, form=form), size=WIDTH)
         for form in ("polygons", "lengths", "compressed", "boxes")
@@ -152,12 +152,12 @@ def test_photographs_of_another_size_are_compared(rendered: Path, photographs: P
         assert np.allclose(trait(other, name).real, trait(once, name).real, rtol=0.02), name
 
 
-def test_images_are_drawn_evenly(rendered: Path, photographs: Path) -> None:
+def test_most_limits_both_image_counts(rendered: Path, photographs: Path) -> None:
     found = compare_with_photographs([rendered], photographs, size=WIDTH, most=7)
     assert (found.images, found.photographs) == (7, 7)
 
 
-def test_other_classes_are_refused(rendered: Path, tmp_path: Path) -> None:
+def test_photographs_with_other_classes_are_refused(rendered: Path, tmp_path: Path) -> None:
     other = write_yolo(tmp_path / "other", {"train": 2}, classes=("disc", "box", "cone"))
     with pytest.raises(InputError, match="it lacks cone"):
         compare_with_photographs([rendered], other)
@@ -165,7 +165,7 @@ def test_other_classes_are_refused(rendered: Path, tmp_path: Path) -> None:
         compare_with_photographs([rendered], rendered, most=0)
 
 
-def test_the_command_says_it_and_writes_it(rendered: Path, photographs: Path, tmp_path: Path) -> None:
+def test_the_compare_command_prints_and_writes_the_traits(rendered: Path, photographs: Path, tmp_path: Path) -> None:
     change(photographs, lambda image: image * 0.4)
     out = tmp_path / "likeness.json"
     done = CliRunner().invoke(app, ["compare", str(rendered), str(photographs), "--size", str(WIDTH), "-o", str(out)])
@@ -178,7 +178,7 @@ def test_the_command_says_it_and_writes_it(rendered: Path, photographs: Path, tm
     assert CliRunner().invoke(app, ["compare", str(rendered)]).exit_code != 0
 
 
-def test_what_is_drawn_alike_gets_advice_by_chance_alone() -> None:
+def test_equal_distributions_get_advice_rarely() -> None:
     """Objects of one image share its light, and so are no opinions of their own."""
     rng, advised = np.random.default_rng(3), 0
     for _ in range(100):

@@ -47,35 +47,37 @@ TWO = truth((1, 1, A), (1, 2, B))
         ([found(1, 1, A), found(1, 2, [50, 50, 20, 8])], "place", 0.5),
     ],
 )
-def test_a_single_error_is_worth_what_it_costs(detections: list[dict[str, Any]], kind: str, gain: float) -> None:
+def test_a_single_error_has_the_gain_of_its_closed_form(
+    detections: list[dict[str, Any]], kind: str, gain: float
+) -> None:
     worth = gains(TWO, detections)
     assert worth.keys() == ERROR_KINDS.keys()
     assert worth[kind] == pytest.approx(gain, abs=1e-6)
     assert all(value == pytest.approx(0, abs=1e-6) for other, value in worth.items() if other not in (kind, "missed"))
 
 
-def test_what_is_missed_counts_alone() -> None:
+def test_a_missed_object_counts_as_missed_only() -> None:
     """Of two of a class one is found: precision 1 up to recall 0.5, which 51 of 101 recalls are."""
     worth = gains(truth((1, 1, A), (2, 1, B)), [found(1, 1, A)])
     assert worth["missed"] == pytest.approx(50 / 101, abs=1e-6)
     assert worth["another_class"] == worth["nothing"] == worth["place"] == 0
 
 
-def test_all_right_leaves_nothing_to_gain() -> None:
+def test_perfect_detections_have_no_gain() -> None:
     assert gains(TWO, [found(1, 1, A), found(1, 2, B)]) == dict.fromkeys(ERROR_KINDS, 0.0)
 
 
-def test_one_label_is_found_once() -> None:
+def test_a_second_detection_of_a_label_stays_wrong() -> None:
     """Of two detections that are taken for another class one becomes right; a second one of a box stays wrong."""
     worth = gains(truth((1, 2, B)), [found(1, 1, B, 0.9), found(1, 1, B, 0.8)])
     assert worth["another_class"] == pytest.approx(1.0)
 
 
-def test_a_crowd_is_no_label_to_find() -> None:
+def test_a_crowd_is_not_a_missed_label() -> None:
     worth = gains(truth((1, 1, A), crowd=1), [found(1, 1, A)])
     assert worth == {}
 
 
-def test_nothing_found_and_nothing_labelled() -> None:
+def test_no_labels_give_no_gains_and_no_detections_are_missed() -> None:
     assert gains(truth(), [found(1, 1, A)]) == {}
     assert gains(TWO, [])["missed"] == pytest.approx(1.0)

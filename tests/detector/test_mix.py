@@ -35,17 +35,17 @@ def test_shares_are_even_and_every_image_is_taken_in_turn(
             assert often.max() - often.min() <= 1
 
 
-def test_a_seed_decides_the_order() -> None:
+def test_the_seed_determines_the_order() -> None:
     plans = [plan_images(30, 5, share=0.1, steps=10, batch=4, seed=seed) for seed in (0, 0, 1)]
     assert np.array_equal(plans[0], plans[1]) and not np.array_equal(plans[0], plans[2])
     assert np.count_nonzero(plans[0] >= 30) == 4
 
 
-def test_steps_do_not_depend_on_how_many_images_there_are() -> None:
+def test_the_number_of_steps_does_not_depend_on_the_number_of_images() -> None:
     assert {plan_images(count, 0, share=0.5, steps=7, batch=3, seed=0).shape for count in (1, 10, 1000)} == {(7, 3)}
 
 
 @pytest.mark.parametrize("share", [0.0, 1.0, -0.1, 1.5])
-def test_a_share_that_leaves_out_one_kind_is_refused(share: float) -> None:
+def test_a_share_that_omits_one_kind_is_refused(share: float) -> None:
     with pytest.raises(InputError, match="must lie between 0 and 1"):
         plan_images(3, 2, share=share, steps=1, batch=1, seed=0)

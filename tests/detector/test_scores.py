@@ -36,7 +36,7 @@ def found(image: int, kind: int, box: list[float], score: float) -> dict[str, An
 TRUE = truth({1: [(1, [0, 0, 10, 10]), (1, [50, 50, 20, 20])], 2: [(1, [0, 0, 10, 10])], 3: [(2, [10, 10, 30, 30])]})
 
 
-def test_average_precision_of_a_hand_made_case() -> None:
+def test_average_precision_equals_a_case_computed_by_hand() -> None:
     """Class a: 3 labelled; by score right, wrong, right: precisions 1, 1/2, 2/3 at recalls 1/3, 1/3, 2/3.
 
     Of the 101 recalls, 0 to 0.33 (34) have precision 1, 0.34 to 0.66 (33) the 2/3, and the rest 0. Class b: one box
@@ -57,7 +57,7 @@ def test_average_precision_of_a_hand_made_case() -> None:
     assert score.curves["a"][[0, 33, 34, 66, 67]] == pytest.approx([1, 1, 2 / 3, 2 / 3, 0], abs=1e-9)
 
 
-def test_all_found_is_one_and_nothing_found_is_zero() -> None:
+def test_perfect_detections_score_one_and_none_score_zero() -> None:
     perfect = [
         found(a["image_id"], a["category_id"], a["bbox"], 0.5) | {"segmentation": a["segmentation"]}
         for a in TRUE["annotations"]
@@ -68,7 +68,7 @@ def test_all_found_is_one_and_nothing_found_is_zero() -> None:
     assert average_precision(TRUE, []).map50_95 == 0.0
 
 
-def test_some_images_are_judged_as_if_there_were_no_others() -> None:
+def test_a_subset_of_images_is_scored_independently() -> None:
     rng = np.random.default_rng(0)
     images = {i: [(int(rng.integers(1, 3)), [*rng.integers(0, 60, 2).tolist(), 20, 20])] for i in range(1, 9)}
     labelled = truth(images)
@@ -101,7 +101,7 @@ def test_classes_without_a_label_do_not_count() -> None:
     assert (*score.classes["b"], score.map50_95) == pytest.approx((1, 1, 1))
 
 
-def test_what_is_not_labelled_is_refused() -> None:
+def test_detections_of_unlabelled_images_and_classes_are_refused() -> None:
     with pytest.raises(InputError, match="got image 9, class 1"):
         average_precision(TRUE, [found(9, 1, [0, 0, 5, 5], 0.5)])
     for images in ([], [7]):
@@ -109,7 +109,7 @@ def test_what_is_not_labelled_is_refused() -> None:
             average_precision(TRUE, [], images)
 
 
-def test_the_confusion_matrix_counts_what_was_taken_for_what() -> None:
+def test_the_confusion_matrix_counts_each_kind_of_error() -> None:
     detections = [
         found(1, 1, [0, 0, 10, 10], 0.9),  # right
         found(1, 2, [51, 50, 20, 20], 0.6),  # another class
@@ -122,7 +122,7 @@ def test_the_confusion_matrix_counts_what_was_taken_for_what() -> None:
     assert confusion.errors == {1: (1, 0, 1, 0), 2: (0, 1, 0, 0), 3: (1, 0, 0, 1)}
 
 
-def test_boxes_that_were_taken_are_not_taken_again() -> None:
+def test_a_label_is_matched_once() -> None:
     labelled = [[0.0, 0.0, 10.0, 10.0], [4.0, 0.0, 10.0, 10.0]]
     assert match_boxes([[0, 0, 10, 10], [1, 0, 10, 10]], labelled) == {0: 0, 1: 1}
     assert match_boxes([[0, 0, 10, 10], [0, 0, 10, 10]], labelled) == {0: 0}

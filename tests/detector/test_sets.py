@@ -28,7 +28,7 @@ def masks_of(found: LabelledSet) -> list[list[tuple[str, np.ndarray]]]:
 
 
 @pytest.mark.parametrize("kind", ["mitsplat", "yolo", "polygons", "compressed", "lengths"])
-def test_masks_come_back_from_every_kind_of_folder(tmp_path: Path, kind: str) -> None:
+def test_masks_are_read_from_every_kind_of_folder(tmp_path: Path, kind: str) -> None:
     if kind in ("mitsplat", "yolo"):
         write_yolo(tmp_path, {"train": 4}, mitsplat=kind == "mitsplat")
     else:
@@ -44,7 +44,7 @@ def test_masks_come_back_from_every_kind_of_folder(tmp_path: Path, kind: str) ->
             assert iou > 0.98
 
 
-def test_a_split_is_what_was_asked_for(tmp_path: Path) -> None:
+def test_the_requested_split_is_read(tmp_path: Path) -> None:
     root = write_yolo(tmp_path, {"train": 3, "val": 2, "test": 1})
     assert [len(read_set(root, split).samples) for split in ("train", "val", "test", "all")] == [3, 2, 1, 6]  # type: ignore[arg-type]
     alone = write_yolo(tmp_path / "mitsplat", {"train": 3}, mitsplat=True)
@@ -53,7 +53,7 @@ def test_a_split_is_what_was_asked_for(tmp_path: Path) -> None:
         read_set(alone, "val")
 
 
-def test_the_folder_that_one_is_in_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_current_folder_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_yolo(tmp_path, {"train": 2})
     monkeypatch.chdir(tmp_path)
     assert [sample.name for sample in read_set(".", "train").samples] == [f"images/train/00000{i}.png" for i in (0, 1)]
@@ -91,7 +91,7 @@ def test_classes_are_matched_by_name(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("boxes", [False, True])
-def test_what_is_written_for_ultralytics_is_what_was_read(tmp_path: Path, boxes: bool) -> None:
+def test_data_written_for_ultralytics_equals_the_data_read(tmp_path: Path, boxes: bool) -> None:
     write_yolo(tmp_path / "a", {"train": 2}, mitsplat=True, boxes=boxes)
     write_coco(tmp_path / "b", 2, first=50, form="compressed")
     sets, real = read_sets([tmp_path / "a"], tmp_path / "b", masks=not boxes)
@@ -111,20 +111,20 @@ def test_what_is_written_for_ultralytics_is_what_was_read(tmp_path: Path, boxes:
             assert instance.has_mask != boxes
 
 
-def test_masks_are_not_learnt_from_boxes(tmp_path: Path) -> None:
+def test_masks_from_datasets_with_boxes_are_refused(tmp_path: Path) -> None:
     found = read_set(write_yolo(tmp_path, {"train": 2}, boxes=True), "train")
     with pytest.raises(InputError, match=r"images/train/000000.png has only boxes: .* such as yolo11n"):
         check_masks(found)
     assert check_masks(read_set(write_yolo(tmp_path / "b", {"train": 2}), "train")) is None
 
 
-def test_crowds_are_not_learnt(tmp_path: Path) -> None:
+def test_crowds_are_not_written_as_labels(tmp_path: Path) -> None:
     found = read_set(write_coco(tmp_path / "c", 1, form="compressed", crowd=True), "train")
     write_data([found], tmp_path / "data")
     assert (tmp_path / "data/labels/0000000.txt").read_text() == ""
 
 
-def test_a_turned_photograph_has_the_size_that_is_seen(tmp_path: Path) -> None:
+def test_a_photograph_with_exif_rotation_has_its_displayed_size(tmp_path: Path) -> None:
     root = write_yolo(tmp_path, {"train": 1})
     exif = Image.Exif()
     exif[274] = 6
@@ -217,7 +217,7 @@ YOLO_FAULTS: dict[str, tuple[Callable[[Path], object], str]] = {
 
 
 @pytest.mark.parametrize("fault", YOLO_FAULTS)
-def test_what_is_wrong_with_a_yolo_folder_is_one_sentence(tmp_path: Path, fault: str) -> None:
+def test_each_fault_of_a_yolo_folder_is_one_sentence(tmp_path: Path, fault: str) -> None:
     root = write_yolo(tmp_path, {"train": 2})
     spoil, message = YOLO_FAULTS[fault]
     spoil(root)
@@ -275,7 +275,7 @@ COCO_FAULTS: dict[str, tuple[Callable[[dict], object], str]] = {  # type: ignore
 
 
 @pytest.mark.parametrize("fault", COCO_FAULTS)
-def test_what_is_wrong_with_a_coco_folder_is_one_sentence(tmp_path: Path, fault: str) -> None:
+def test_each_fault_of_a_coco_folder_is_one_sentence(tmp_path: Path, fault: str) -> None:
     root = write_coco(tmp_path, 2)
     content = json.loads((root / "labels.json").read_text())
     spoil, message = COCO_FAULTS[fault]
@@ -286,14 +286,14 @@ def test_what_is_wrong_with_a_coco_folder_is_one_sentence(tmp_path: Path, fault:
     assert "\n" not in str(told.value)
 
 
-def test_a_folder_of_nothing_is_refused(tmp_path: Path) -> None:
+def test_an_empty_or_missing_folder_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"must be a dataset of mitsplat \(dataset.json\), a YOLO folder"):
         read_set(tmp_path, "train")
     with pytest.raises(InputError, match=r"must be the folder of a dataset \(got nothing\)"):
         read_set(tmp_path / "none", "train")
 
 
-def test_run_lengths_are_those_of_the_code() -> None:
+def test_run_lengths_agree_with_pycocotools() -> None:
     rng = np.random.default_rng(2)
     for _ in range(50):
         height, width = rng.integers(1, 300, 2).tolist()
@@ -314,14 +314,14 @@ def test_linked_folders_are_followed_once(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("where", ["absolute", "beside"])
-def test_folders_are_found_where_exports_say(tmp_path: Path, where: str) -> None:
+def test_image_folders_of_data_yaml_are_found(tmp_path: Path, where: str) -> None:
     root = write_yolo(tmp_path / "root", {"train": 2})
     entry = {"absolute": root / "images/train", "beside": "../images/train"}[where]
     (root / "data.yaml").write_text(f"train: {entry}\nnames: [disc, box]\n")
     assert len(read_set(root, "train").samples) == 2
 
 
-def test_all_of_coco_is_all_of_its_files(tmp_path: Path) -> None:
+def test_the_split_all_of_coco_reads_all_files(tmp_path: Path) -> None:
     root = write_coco(tmp_path, 4)
     content = json.loads((root / "labels.json").read_text())
     (root / "labels.json").unlink()
@@ -338,7 +338,7 @@ def test_all_of_coco_is_all_of_its_files(tmp_path: Path) -> None:
         read_set(root, "all")
 
 
-def test_pictures_are_read_by_any_name(tmp_path: Path) -> None:
+def test_image_files_are_read_with_any_name(tmp_path: Path) -> None:
     path = Path(os.fsdecode(os.fsencode(tmp_path) + b"/caf\xe9.jpg"))
     turned = Image.Exif()
     turned[274] = 6
@@ -351,7 +351,7 @@ def test_pictures_are_read_by_any_name(tmp_path: Path) -> None:
         read_picture(tmp_path / "empty.png")
 
 
-def test_a_digest_tells_of_every_change(tmp_path: Path) -> None:
+def test_the_digest_changes_with_images_and_labels(tmp_path: Path) -> None:
     root = write_yolo(tmp_path, {"train": 2})
     first = read_set(root, "train").described()
     assert first == read_set(root, "train").described()

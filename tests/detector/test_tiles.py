@@ -58,7 +58,7 @@ def test_tiles_of_a_few_pixels_are_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("longer", [97, 128, 200, 480])
-def test_a_thing_of_a_third_of_a_tile_is_whole_in_one(tmp_path: Path, longer: int) -> None:
+def test_an_object_of_a_third_of_a_tile_is_complete_in_one_tile(tmp_path: Path, longer: int) -> None:
     photographs = read_set(write_yolo(tmp_path / "photographs", {"train": 1}), "all")
     tiles = cut_photographs(photographs, longer, 96, tmp_path / "tiles").samples
     corners = np.array([[int(part) for part in tile.path.stem.split("_")[1:]] for tile in tiles])

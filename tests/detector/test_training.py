@@ -40,7 +40,7 @@ needs_ultralytics = pytest.mark.skipif(
 
 
 @pytest.mark.parametrize("module", ["mitsplat.detector", "mitsplat.cli"])
-def test_training_starts_without_mitsuba(module: str) -> None:
+def test_importing_detector_and_cli_loads_no_heavy_library(module: str) -> None:
     heavy = ["mitsuba", "drjit", "warp", "torch", "ultralytics"]
     code = f"import {module}, sys; print([name for name in {heavy} if name in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
@@ -67,7 +67,7 @@ def test_settings_out_of_range_are_refused(wrong: str) -> None:
         TrainSettings(**given)
 
 
-def test_what_is_missing_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_missing_libraries_are_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(libraries, "find_spec", lambda name: None)
     with pytest.raises(MissingResourceError, match=r"detectors need torch and .*: pip install 'mitsplat\[train\]'"):
         train_detector([tmp_path], tmp_path / "run")
@@ -103,7 +103,7 @@ def no_libraries(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
     return asked
 
 
-def test_a_run_records_what_it_was_made_of(no_libraries: list[dict[str, Any]], tmp_path: Path) -> None:
+def test_a_run_records_its_datasets_and_settings(no_libraries: list[dict[str, Any]], tmp_path: Path) -> None:
     cell = write_yolo(tmp_path / "cell", {"train": 5, "val": 1}, mitsplat=True)
     photographs = write_coco(tmp_path / "photographs", 3, first=50)
     told: list[tuple[int, int, str]] = []
@@ -126,9 +126,7 @@ def test_a_run_records_what_it_was_made_of(no_libraries: list[dict[str, Any]], t
     assert not over.was_finished and len(no_libraries) == 2
 
 
-def test_photographs_are_cut_to_the_size_at_which_they_will_be_searched(
-    no_libraries: list[dict[str, Any]], tmp_path: Path
-) -> None:
+def test_photographs_are_cut_to_tiles_of_the_test_size(no_libraries: list[dict[str, Any]], tmp_path: Path) -> None:
     cell = write_yolo(tmp_path / "cell", {"train": 5}, mitsplat=True)
     photographs = write_coco(tmp_path / "photographs", 3, first=50)
     listed: list[str] = []
@@ -153,7 +151,7 @@ def _other(**changes: Any) -> TrainSettings:
     return TrainSettings(**(vars(TINY) | changes))
 
 
-def test_a_run_is_not_gone_on_with_by_other_means(no_libraries: list[dict[str, Any]], tmp_path: Path) -> None:
+def test_a_run_is_not_resumed_with_other_settings(no_libraries: list[dict[str, Any]], tmp_path: Path) -> None:
     cell = write_yolo(tmp_path / "cell", {"train": 5}, mitsplat=True)
     train_detector([cell], tmp_path / "run", TINY)
     for changes, message in (
@@ -218,7 +216,7 @@ REFUSED: dict[str, tuple[Callable[[Path], object], dict[str, Any], str]] = {
 
 
 @pytest.mark.parametrize("wrong", REFUSED)
-def test_what_cannot_be_learnt_is_refused_before_it_begins(
+def test_invalid_training_data_is_refused_before_training(
     no_libraries: list[dict[str, Any]], tmp_path: Path, wrong: str
 ) -> None:
     cell = write_yolo(tmp_path / "cell", {"train": 2, "val": 1}, mitsplat=True)
@@ -233,9 +231,7 @@ def test_what_cannot_be_learnt_is_refused_before_it_begins(
     assert not (tmp_path / "run" / RUN).exists()
 
 
-def test_what_is_learnt_from_is_never_in_the_folder_of_the_run(
-    no_libraries: list[dict[str, Any]], tmp_path: Path
-) -> None:
+def test_a_dataset_inside_of_the_run_folder_is_refused(no_libraries: list[dict[str, Any]], tmp_path: Path) -> None:
     write_yolo(tmp_path / "run/data", {"train": 2}, mitsplat=True)
     (tmp_path / "run" / RUN).write_text(json.dumps({"settings": {}, "classes": ["a"], "masks": True}))
     before = contents(tmp_path)
@@ -246,13 +242,13 @@ def test_what_is_learnt_from_is_never_in_the_folder_of_the_run(
     assert {path: data for path, data in contents(tmp_path).items() if "/link/" not in path} == before
 
 
-def test_boxes_are_learnt_by_a_network_of_boxes(no_libraries: list[dict[str, Any]], tmp_path: Path) -> None:
+def test_datasets_with_boxes_are_trained_by_a_box_network(no_libraries: list[dict[str, Any]], tmp_path: Path) -> None:
     cell = write_yolo(tmp_path / "cell", {"train": 2}, boxes=True)
     train_detector([cell], tmp_path / "run", _other(model="yolo11n"))
     assert no_libraries[0]["job"].masks is False
 
 
-def test_a_run_that_is_not_finished_is_not_judged(tmp_path: Path) -> None:
+def test_an_unfinished_run_is_not_evaluated(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"must be the folder of `mitsplat train` \(there is no run.json\)"):
         open_run(tmp_path)
     record = {"settings": {}, "classes": ["a"], "masks": True, "finished": None}
@@ -357,7 +353,7 @@ def test_the_same_command_gives_the_same_weights(data: Path, tmp_path: Path) -> 
 
 @needs_ultralytics
 @pytest.mark.slow
-def test_what_began_with_weights_of_many_classes_is_judged_and_learnt_on_from(
+def test_weights_of_many_classes_can_be_trained_further_and_evaluated(
     data: Path, torchvision: None, tmp_path: Path
 ) -> None:
     """As COCO's, of which Ultralytics keeps a branch that is wider than that of a few classes."""
@@ -375,7 +371,7 @@ def test_what_began_with_weights_of_many_classes_is_judged_and_learnt_on_from(
 
 @needs_ultralytics
 @pytest.mark.slow
-def test_an_interrupted_run_goes_on_to_the_same_number_of_steps(
+def test_an_interrupted_run_resumes_to_the_same_number_of_steps(
     data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from mitsplat.detector import fixed_steps
@@ -409,7 +405,7 @@ def test_an_interrupted_run_goes_on_to_the_same_number_of_steps(
 
 
 @needs_ultralytics
-def test_a_step_is_not_made_smaller_where_memory_has_run_out(torchvision: None) -> None:
+def test_a_batch_is_not_reduced_when_memory_runs_out(torchvision: None) -> None:
     from mitsplat.detector import fixed_steps
 
     trainer = SimpleNamespace(
@@ -423,7 +419,7 @@ def test_a_step_is_not_made_smaller_where_memory_has_run_out(torchvision: None) 
 
 @needs_ultralytics
 @pytest.mark.slow
-def test_every_step_takes_the_images_of_the_plan(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_every_step_uses_the_images_of_the_plan(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """And mosaics, of four images each, take theirs from it as well."""
     from mitsplat.detector import fixed_steps
 
@@ -453,7 +449,7 @@ def test_every_step_takes_the_images_of_the_plan(data: Path, tmp_path: Path, mon
 @needs_ultralytics
 @pytest.mark.slow
 @pytest.mark.parametrize("mirror", [True, False])
-def test_images_are_mirrored_only_if_wanted(
+def test_images_are_mirrored_only_with_the_option(
     data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mirror: bool
 ) -> None:
     from ultralytics.data.augment import RandomFlip
@@ -476,7 +472,7 @@ def test_images_are_mirrored_only_if_wanted(
 
 @needs_ultralytics
 @pytest.mark.slow
-def test_figures_are_those_of_ultralytics(data: Path, trained: Run, tmp_path: Path) -> None:
+def test_precision_agrees_with_ultralytics(data: Path, trained: Run, tmp_path: Path) -> None:
     """Its own validation, told to do what else differs: images letterboxed to squares, masks compared in all pixels.
 
     What it finds then scores the same by COCO's rules, although it gives a box several classes and keeps empty masks,
@@ -513,7 +509,7 @@ def test_figures_are_those_of_ultralytics(data: Path, trained: Run, tmp_path: Pa
 
 @needs_ultralytics
 @pytest.mark.slow
-def test_what_cannot_be_judged_is_refused(data: Path, trained: Run, tmp_path: Path) -> None:
+def test_invalid_evaluation_data_is_refused(data: Path, trained: Run, tmp_path: Path) -> None:
     write_yolo(tmp_path / "boxes", {"val": 1}, boxes=True)
     write_yolo(tmp_path / "gears", {"val": 1}, classes=("disc", "gear", "box"))
     for folder, options, message in (
@@ -530,7 +526,7 @@ def test_what_cannot_be_judged_is_refused(data: Path, trained: Run, tmp_path: Pa
 
 @needs_ultralytics
 @pytest.mark.slow
-def test_weights_are_read_by_whatever_name_and_kept(
+def test_weights_with_any_name_are_read_offline_and_not_changed(
     data: Path, trained: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def refuse(*args: Any, **kwargs: Any) -> None:
@@ -555,7 +551,7 @@ def test_weights_are_read_by_whatever_name_and_kept(
 
 
 @needs_ultralytics
-def test_nothing_is_asked_of_a_network(torchvision: None, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_check_of_mixed_precision_downloads_nothing(torchvision: None, monkeypatch: pytest.MonkeyPatch) -> None:
     """The check of mixed precision on a GPU wants weights that it would download: offline, it goes on without."""
     import torch
     from ultralytics.utils import ONLINE

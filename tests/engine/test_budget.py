@@ -71,7 +71,7 @@ def room(scene):
     return replace(scene, environments=(replace(scene.assets[0], splats=floor(200_000), kind="environment"),))
 
 
-def test_it_covers_the_peak_of_a_process_that_renders(room):
+def test_the_budget_covers_the_peak_of_a_rendering_process(room):
     folder = room.path.parent
     room.environments[0].save(folder / "assets/room")
     text = room.path.read_text()
@@ -81,12 +81,12 @@ def test_it_covers_the_peak_of_a_process_that_renders(room):
     assert peak < need < 4 * peak
 
 
-def test_doctor_asks_for_what_the_default_scene_takes():
+def test_doctor_requires_the_memory_of_the_default_scene():
     need = worker_memory(load_scene(Path(__file__).parents[2] / "scenes/workcell.yaml"))
     assert 0.5 < (need.own + need.shared) / 2**30 / doctor.NEEDED_MEMORY < 1
 
 
-def test_it_grows_with_what_a_scene_holds(scene, room):
+def test_the_budget_grows_with_the_contents_of_a_scene(scene, room):
     def changed(**output):
         spec = room.spec
         return replace(room, spec=spec.model_copy(update={"output": spec.output.model_copy(update=output)}))
@@ -106,7 +106,7 @@ def test_it_grows_with_what_a_scene_holds(scene, room):
 
 @pytest.mark.parametrize("preset", PRESETS)
 @pytest.mark.parametrize("rendering", [{}, {"samples": 2}, {"kernel": "3dgs"}])
-def test_pairs_of_gaussians_and_tiles_are_no_fewer_than_there_are(preset, rendering):
+def test_the_estimated_pairs_bound_the_true_number(preset, rendering):
     """Of discs that face the camera: as many as the renderer lists, and not many more where they are wide."""
     camera = Camera.look_at((0, 0, -2), (0, 0, 0), up=(0, -1, 0), width=256, height=192, fov_x=50)
     quality = replace(PRESETS[preset], **rendering)
@@ -125,7 +125,7 @@ def test_pairs_of_gaussians_and_tiles_are_no_fewer_than_there_are(preset, render
 
 
 @pytest.mark.parametrize(("own", "shared", "expected"), [(1, 0, 8), (2, 0, 5), (2, 5, 2), (20, 0, 1)])
-def test_as_many_workers_as_memory_holds(monkeypatch, own, shared, expected):
+def test_the_number_of_workers_is_bounded_by_memory(monkeypatch, own, shared, expected):
     monkeypatch.setattr(engine, "unused_memory", lambda: 10.5)
     monkeypatch.setattr(engine.os, "sched_getaffinity", lambda _: set(range(8)), raising=False)
     assert engine.affordable_workers(WorkerMemory(own * 2**30, shared * 2**30)) == expected

@@ -92,7 +92,7 @@ def wait_for_frames(process, out, count):
         time.sleep(0.002)
 
 
-def test_killed_at_random_moments(scene, tmp_path, undisturbed):
+def test_a_run_killed_at_random_moments_resumes_to_the_same_bytes(scene, tmp_path, undisturbed):
     """Three runs are killed while they write; the lock refuses others by name and goes with its holder."""
     out, rng = tmp_path / "out", random.Random(8)
     for options in (["--workers", "1"], ["--workers", "2"], ["--workers", "2"]):
@@ -109,7 +109,7 @@ def test_killed_at_random_moments(scene, tmp_path, undisturbed):
     assert contents(out) == undisturbed
 
 
-def test_interrupted(scene, tmp_path, undisturbed):
+def test_an_interrupted_run_ends_with_130_and_resumes_to_the_same_bytes(scene, tmp_path, undisturbed):
     """Ctrl-C, which goes to all processes of a terminal, stops at once with status 130 and leaves nothing half done."""
     out = tmp_path / "out"
     process = start(tmp_path, scene, out, "--workers", 2, frames=4)
@@ -138,7 +138,7 @@ class KilledOnce:
         return render(scene, index, layout=layout)
 
 
-def test_a_worker_that_is_killed_costs_nothing(scene, tmp_path, undisturbed):
+def test_a_killed_worker_loses_no_frame(scene, tmp_path, undisturbed):
     told = []
     summary = write(
         scene,
@@ -165,7 +165,7 @@ class TooLarge:
 
 
 @pytest.mark.parametrize("workers", [1, 3])
-def test_memory_that_runs_out_costs_no_frame(scene, tmp_path, undisturbed, workers):
+def test_a_worker_without_memory_loses_no_frame(scene, tmp_path, undisturbed, workers):
     out = tmp_path / "out"
     with pytest.raises(
         MissingResourceError, match=r"^frame 7 cannot be made: memory is exhausted \(jit_malloc.*are kept$"
@@ -177,7 +177,7 @@ def test_memory_that_runs_out_costs_no_frame(scene, tmp_path, undisturbed, worke
     assert contents(out) == undisturbed
 
 
-def test_no_room_in_a_file(scene, tmp_path, undisturbed):
+def test_a_file_size_limit_ends_with_one_sentence_and_resumes(scene, tmp_path, undisturbed):
     """A limit on the size of files stops the run like a full disk does, also within the manifest's line."""
     out = tmp_path / "out"
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
@@ -207,7 +207,7 @@ def run_script(script):
     return subprocess.run(["unshare", "-m", "sh", "-c", script], capture_output=True, text=True, check=False)
 
 
-def test_a_full_disk(scene, tmp_path, undisturbed):
+def test_a_full_disk_ends_with_status_3_and_resumes(scene, tmp_path, undisturbed):
     """With 300 KiB the run ends with status 3 and one sentence; with room it goes on from what it has."""
     folder, begin = mounted(tmp_path, "size=300k")
     again = " ".join(command(tmp_path, scene.path, "-o", folder / "out", "--workers", 2, seconds=0))
@@ -223,7 +223,7 @@ def test_a_full_disk(scene, tmp_path, undisturbed):
     assert contents(tmp_path / "out") == undisturbed
 
 
-def test_a_read_only_disk(scene, tmp_path):
+def test_a_read_only_disk_ends_with_status_2(scene, tmp_path):
     folder, begin = mounted(tmp_path, "ro")
     done = run_script(begin + " ".join(command(tmp_path, scene.path, "-o", folder / "out")))
     assert done.returncode == 2
@@ -251,7 +251,7 @@ class Remove:
         ("manifest.jsonl", InputError),
     ],
 )
-def test_a_file_is_removed_while_running(scene, tmp_path, undisturbed, file, error):
+def test_a_file_removed_while_running_is_reported_and_made_again(scene, tmp_path, undisturbed, file, error):
     out = tmp_path / "out"
     with pytest.raises(error, match=rf"{file}: must not be (changed or )?removed while"):
         write(scene, out, render=Remove(out / file))
@@ -263,7 +263,7 @@ def test_a_file_is_removed_while_running(scene, tmp_path, undisturbed, file, err
     assert contents(out) == undisturbed
 
 
-def test_a_layout_is_removed_while_running(scene, tmp_path, undisturbed):
+def test_a_layout_removed_while_running_is_reported_and_made_again(scene, tmp_path, undisturbed):
     out = tmp_path / "out"
     write(scene, out, render=Remove(out / "layouts/0001.json"))
     assert len(Manifest(out / "manifest.jsonl")) == 20

@@ -49,7 +49,7 @@ def told(log: Path) -> list[str]:
     return [line for line in log.read_text().splitlines() if line]
 
 
-def test_it_is_started_and_ended(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_service_is_started_and_stopped(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     install(log, monkeypatch)
     shared = SharedGpu()
     assert shared.problem == ""
@@ -62,9 +62,7 @@ def test_it_is_started_and_ended(log: Path, monkeypatch: pytest.MonkeyPatch) -> 
     assert len(told(log)) == 3
 
 
-def test_one_that_runs_already_is_used_and_left_alone(
-    log: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_a_running_service_is_used_and_not_stopped(log: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     install(log, monkeypatch)
     (tmp_path / "control").touch()
     monkeypatch.setenv(PIPES, str(tmp_path))
@@ -74,21 +72,21 @@ def test_one_that_runs_already_is_used_and_left_alone(
     assert told(log) == ["get_server_list"]
 
 
-def test_a_machine_without_it(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_machine_without_the_service_is_reported(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PATH", str(log.parent))
     shared = SharedGpu()
     assert shared.environment == {}
     assert shared.problem == "nvidia-cuda-mps-control, which is part of NVIDIA's driver, is missing"
 
 
-def test_one_that_does_not_start(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_service_that_does_not_start_is_reported(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     install(log, monkeypatch, start="echo no permission >&2; exit 1")
     shared = SharedGpu()
     assert shared.environment == {}
     assert shared.problem == "nvidia-cuda-mps-control does not work (no permission)"
 
 
-def test_one_on_which_nothing_computes_is_ended(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_service_on_which_the_trial_fails_is_stopped(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     install(log, monkeypatch)
     monkeypatch.setattr(mps, "_TRIAL", "raise SystemExit('CUDA_ERROR_MPS_SERVER_NOT_READY')")
     shared = SharedGpu()
@@ -97,7 +95,7 @@ def test_one_on_which_nothing_computes_is_ended(log: Path, monkeypatch: pytest.M
     assert told(log)[-1] == "quit -t 5"
 
 
-def test_it_is_ended_where_workers_cannot_start(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_service_is_stopped_if_workers_cannot_start(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     install(log, monkeypatch)
     device = Device("cuda", (Gpu("One", 2**40, 0, "", ""),))
     with pytest.raises((AttributeError, pickle.PicklingError)):
@@ -106,7 +104,9 @@ def test_it_is_ended_where_workers_cannot_start(log: Path, monkeypatch: pytest.M
 
 
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
-def test_it_ends_with_the_process_that_started_it(log: Path, monkeypatch: pytest.MonkeyPatch, how: int) -> None:
+def test_the_service_ends_with_the_process_that_started_it(
+    log: Path, monkeypatch: pytest.MonkeyPatch, how: int
+) -> None:
     """However that ends: nobody else would end it."""
     install(log, monkeypatch)
     code = (
@@ -134,7 +134,7 @@ def test_it_ends_with_the_process_that_started_it(log: Path, monkeypatch: pytest
 
 
 @pytest.mark.parametrize(("visible", "own"), [("1", "0"), ("2,3", "0,1"), ("GPU-5e0b", None), ("", None)])
-def test_gpus_count_as_the_service_counts_them(
+def test_gpus_are_numbered_as_the_service_numbers_them(
     log: Path, monkeypatch: pytest.MonkeyPatch, visible: str, own: str | None
 ) -> None:
     """It sees those that are visible here, from 0: of the second GPU alone, clients would ask for a second one."""

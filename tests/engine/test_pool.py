@@ -55,12 +55,12 @@ def run(make, workers=1, layouts=LAYOUTS, note=lambda text: None):
         return list(results)
 
 
-def test_one_worker_stays_in_this_process_and_in_order():
+def test_one_worker_runs_in_this_process_in_order():
     assert run(Make()) == [(index, os.getpid()) for index in range(9)]
 
 
 @pytest.mark.parametrize("workers", [2, 4])
-def test_workers_make_every_frame_once_and_nothing_remains(workers):
+def test_workers_make_every_frame_once_and_leave_no_process(workers):
     notes = []
     made = run(Make(), workers, note=notes.append)
     assert sorted(index for index, _ in made) == list(range(9))
@@ -72,37 +72,37 @@ def test_workers_make_every_frame_once_and_nothing_remains(workers):
             os.kill(process, 0)
 
 
-def test_a_worker_keeps_to_its_layout_while_there_are_others():
+def test_each_worker_starts_with_its_own_layout():
     made = run(Make(), 2, {0: [0, 1, 2, 3], 1: [4, 5, 6, 7]})
     first = {index: process for index, process in made if index in (0, 4)}
     assert first[0] != first[4]
 
 
-def test_no_more_workers_than_frames_and_none_for_no_frames():
+def test_there_are_no_more_workers_than_frames():
     assert run(Make(), 8, {0: [5]}) == [(5, os.getpid())]
     assert run(Make(), 8, {0: []}) == []
 
 
 @pytest.mark.parametrize("workers", [1, 2])
-def test_bad_input_keeps_its_sentence(workers):
+def test_an_input_error_of_a_worker_keeps_its_sentence(workers):
     with pytest.raises(InputError, match=r"^no 4$"):
         run(Make(fail_at=4, how="input"), workers)
 
 
-def test_any_other_failure_names_the_frame_and_has_the_trace():
+def test_another_exception_of_a_worker_names_the_frame_with_its_traceback():
     with pytest.raises(FrameError, match=r"^frame 4 failed: Unpicklable: no 4") as caught:
         run(Make(fail_at=4, how="bug"), 2)
     assert "in __call__" in caught.value.__notes__[0]
 
 
 @pytest.mark.parametrize(("how", "words"), [("killed", "was killed by SIGKILL"), ("exits", "ended with status 3")])
-def test_a_frame_that_ends_every_process_is_reported(how, words):
+def test_a_frame_that_kills_every_worker_ends_the_run(how, words):
     with pytest.raises(LostWorkersError, match=f"making frame 4 {words}, 3 times"):
         run(Make(fail_at=4, how=how), 2)
 
 
 @pytest.mark.parametrize("workers", [2, 4])
-def test_frames_of_lost_workers_are_made_again(tmp_path, workers):
+def test_frames_of_lost_workers_are_made_by_others(tmp_path, workers):
     """Two frames kill the process that tries them first; every frame is made, once, and the losses are told."""
     notes = []
     made = run(KillOnce(tmp_path, (1, 7)), workers, note=notes.append)
@@ -134,7 +134,7 @@ def interpreter(tmp_path, monkeypatch):
         ("sleep 60", "did not start within 0.5 s"),
     ],
 )
-def test_the_start_of_a_worker_is_bounded(monkeypatch, interpreter, script, words):
+def test_a_worker_that_does_not_start_in_time_is_reported(monkeypatch, interpreter, script, words):
     """However large the work is that it does not take."""
     monkeypatch.setattr(engine, "_START_TIMEOUT", 0.5)
     interpreter(script)
@@ -146,7 +146,7 @@ def test_the_start_of_a_worker_is_bounded(monkeypatch, interpreter, script, word
     assert notes[0] == f"the worker of frame 0 {words}: the frame is repeated"
 
 
-def test_others_make_the_frame_of_a_worker_that_does_not_start(monkeypatch, tmp_path, interpreter):
+def test_frames_of_a_worker_that_does_not_start_are_made_by_others(monkeypatch, tmp_path, interpreter):
     monkeypatch.setattr(engine, "_START_TIMEOUT", 15.0)
     mark = tmp_path / "first"
     interpreter(f'if [ ! -e {mark} ]; then touch {mark}; kill -STOP $$; fi; exec {sys.executable} "$@"')
@@ -156,7 +156,7 @@ def test_others_make_the_frame_of_a_worker_that_does_not_start(monkeypatch, tmp_
     assert "the worker of frame 0 did not start within 15 s: the frame is repeated" in notes
 
 
-def test_stopped_workers_are_ended(tmp_path):
+def test_suspended_workers_are_killed(tmp_path):
     """SIGTERM would wait until they go on."""
     (tmp_path / "pids").mkdir()
     with closing(engine._Processes(Linger(tmp_path / "pids"), None)) as pool:
@@ -201,7 +201,7 @@ class Greedy:
         return index, os.getpid()
 
 
-def test_fewer_workers_where_memory_runs_out(tmp_path):
+def test_a_worker_without_memory_is_not_replaced(tmp_path):
     notes = []
     made = run(Greedy(tmp_path, room=2), 5, layouts={0: range(20), 1: range(20, 40)}, note=notes.append)
     assert sorted(index for index, _ in made) == list(range(40))
@@ -211,7 +211,7 @@ def test_fewer_workers_where_memory_runs_out(tmp_path):
 
 
 @pytest.mark.parametrize("workers", [1, 3])
-def test_a_frame_that_does_not_fit_even_alone(tmp_path, workers):
+def test_a_frame_that_does_not_fit_into_memory_alone_ends_the_run(tmp_path, workers):
     results, made = run_frames(Greedy(tmp_path, 99, too_large=7), LAYOUTS, workers=workers, note=lambda text: None), []
     with closing(results), pytest.raises(MissingResourceError) as caught:
         made.extend(results)
@@ -222,14 +222,14 @@ def test_a_frame_that_does_not_fit_even_alone(tmp_path, workers):
     )
 
 
-def test_the_last_frame_goes_to_an_idle_worker():
+def test_the_last_frame_is_given_to_an_idle_worker():
     """The last frame only fits alone: who has nothing to do takes it over, one after the other, until one is left."""
     pool = Short(lambda frame, alive: frame < 2 or alive == 1)
     assert list(run_pool(pool, {0: range(3)}, 3, print)) == [0, 1, 2]
     assert (pool.stopped, pool.alive) == ([2, 0], {1})
 
 
-def test_who_runs_out_beside_another_tries_again():
+def test_workers_without_memory_are_restarted_beside_fewer_others():
     """Four run out at once: one is dismissed, and the others, made anew, fit beside what is left."""
     pool = Short(lambda frame, alive: alive <= 3)
     assert sorted(run_pool(pool, {0: range(8)}, 4, print)) == list(range(8))
@@ -267,7 +267,7 @@ class Short:
 EXHAUSTED = Failure(MissingResourceError, "RuntimeError", "memory is exhausted", "", exhausted=True)
 
 
-def test_workers_take_the_device_before_anything_else(monkeypatch):
+def test_workers_select_the_device_first(monkeypatch):
     """The variant is told by the worker; GPUs are given in turn, each alone visible to its workers."""
     with closing(run_frames(Variant(), LAYOUTS, workers=2, note=print, device=CPU)) as results:
         assert {variant for _, variant, _ in results} == {"llvm_ad_rgb"}
@@ -290,7 +290,7 @@ def test_workers_take_the_device_before_anything_else(monkeypatch):
     assert "CUDA_VISIBLE_DEVICES" not in os.environ
 
 
-def test_a_gpu_that_is_not_here_is_missed_in_one_sentence():
+def test_a_missing_gpu_is_reported_in_one_sentence():
     """What a worker finds when it takes its device is told as what its frame found."""
     lost = Device("cuda", (Gpu("gone", 2**40, 1, "", ""),))
     if isinstance(visible_gpus(), MissingPrerequisite):
@@ -302,7 +302,7 @@ def test_a_gpu_that_is_not_here_is_missed_in_one_sentence():
 
 
 @pytest.mark.parametrize(("kind", "exhausted"), [("cuda", True), ("cpu", False)])
-def test_a_gpu_that_does_not_start_costs_a_worker(monkeypatch, kind, exhausted):
+def test_a_gpu_that_does_not_start_loses_its_worker(monkeypatch, kind, exhausted):
     """As where one process has just brought it down for all; not so a CPU, for which waiting changes nothing."""
 
     def fail(device):
@@ -323,7 +323,7 @@ def test_a_gpu_that_does_not_start_costs_a_worker(monkeypatch, kind, exhausted):
 
 
 @pytest.mark.parametrize(("own", "seen"), [("", "0"), ("GPU-a", "GPU-a")])
-def test_workers_share_a_gpu_as_the_service_says(monkeypatch, own, seen):
+def test_workers_get_the_environment_of_the_gpu_service(monkeypatch, own, seen):
     """Its variables are the workers' alone, and a GPU that is one of several has its own name."""
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "1")
     gpu = Gpu("a", 80 * 2**30, 0, "", own)
@@ -347,7 +347,7 @@ class Variant:
 
 
 @pytest.mark.parametrize(("gigabytes", "count"), [((80, 80), 8), ((80, 7), 4), ((7,), 2), ((1,), 1)])
-def test_as_many_workers_at_once_as_gpus_hold(monkeypatch, gigabytes, count):
+def test_the_number_of_workers_is_bounded_by_gpu_memory(monkeypatch, gigabytes, count):
     """All of them from the start; on a GPU of 7 GiB there are two of 3."""
     monkeypatch.setattr(engine, "unused_memory", lambda: 32.0)
     monkeypatch.setattr(engine.os, "sched_getaffinity", lambda _: set(range(16)), raising=False)
@@ -360,14 +360,14 @@ def test_as_many_workers_at_once_as_gpus_hold(monkeypatch, gigabytes, count):
     assert began == ([(count, {"grow": False})] if count > 1 else [device])
 
 
-def test_no_more_workers_than_a_gpu_serves(monkeypatch):
+def test_the_number_of_workers_per_gpu_is_bounded(monkeypatch):
     monkeypatch.setattr(engine, "unused_memory", lambda: 4096.0)
     monkeypatch.setattr(engine.os, "sched_getaffinity", lambda _: set(range(256)), raising=False)
     gpus = tuple(Gpu("large", 288 * 2**30, number, "", "") for number in range(2))
     assert [engine.affordable_workers(TYPICAL_MEMORY, Device("cuda", gpus[:count])) for count in (1, 2)] == [48, 96]
 
 
-def test_few_frames_on_another_gpu_take_one_process(monkeypatch):
+def test_few_frames_on_another_gpu_run_in_one_process(monkeypatch):
     """A process of its own has to see that GPU; more of them would start for as long as the frames take."""
     began = []
     monkeypatch.setattr(engine, "affordable_workers", lambda memory, device: 8)
@@ -466,7 +466,7 @@ class Scripted:
         (lambda count: 1.0 if count <= 2 else 0.6 * count, 2, 3),  # the third does not pay
     ],
 )
-def test_as_many_workers_as_pay(monkeypatch, seconds, settled_at, most):
+def test_workers_are_added_while_they_increase_the_speed(monkeypatch, seconds, settled_at, most):
     pool = Scripted(seconds)
     monkeypatch.setattr(engine.time, "monotonic", lambda: pool.clock)
     made = list(run_pool(pool, {0: range(400)}, 4, print, grow=True))
@@ -474,7 +474,7 @@ def test_as_many_workers_as_pay(monkeypatch, seconds, settled_at, most):
     assert (len(pool.alive), pool.most) == (settled_at, most)
 
 
-def test_workers_are_hired_where_machines_join():
+def test_workers_start_on_machines_that_join():
     """None of them more than once, and none without a frame for it."""
     pool = Scripted(lambda count: 1.0, joining=[0, 0, 2, 0, 0, 50])
     assert sorted(run_pool(pool, {0: range(20)}, 1, print)) == list(range(20))
@@ -514,7 +514,7 @@ class SlowPlan:
     sizes=st.lists(st.integers(0, 6), max_size=9),
     events=st.lists(st.tuples(st.integers(0, 4), st.sampled_from(["take"] * 6 + ["lost", "dismissed"])), max_size=80),
 )
-def test_the_plan_keeps_to_its_rule(sizes, events):
+def test_the_plan_agrees_with_its_slow_twin(sizes, events):
     """Workers that take, are lost with their frame, and are dismissed, in any order."""
     layouts = {7 * number: [100 * number + view for view in range(size)] for number, size in enumerate(sizes)}
     fast, slow = engine._Plan(layouts), SlowPlan(layouts)
@@ -547,7 +547,7 @@ class Counted(int):
         return int.__eq__(self, other)
 
 
-def test_a_frame_of_many_layouts_costs_no_more_than_one_of_few():
+def test_the_cost_of_a_frame_grows_with_the_logarithm_of_layouts():
     """Looks at layouts for each frame; a layout goes to one worker, the last ones to several."""
     looks = {}
     for count in (100, 3200):
@@ -559,11 +559,11 @@ def test_a_frame_of_many_layouts_costs_no_more_than_one_of_few():
     assert looks[3200] < 1.2 * looks[100] < 15
 
 
-def test_few_frames_start_no_process():
+def test_few_frames_run_in_this_process():
     assert run(Make(), None) == [(index, os.getpid()) for index in range(9)]
 
 
-def test_closing_stops_the_workers_at_once():
+def test_closing_stops_workers_at_once():
     results = run_frames(Make(how="slow"), LAYOUTS, workers=2, note=lambda text: stop())
     stopped = []
 

@@ -58,18 +58,18 @@ def write_shards(scene, folder, count, **options):
 
 
 class TestSameBytes:
-    def test_of_more_workers_than_layouts(self, scene, tmp_path, whole):
+    def test_more_workers_than_layouts_make_the_same_bytes(self, scene, tmp_path, whole):
         write(scene, tmp_path / "out", workers=4)
         assert contents(tmp_path / "out") == whole
 
     @pytest.mark.parametrize("count", [1, 2, 3, 5])
-    def test_of_merged_shards_in_any_order(self, scene, tmp_path, whole, count):
+    def test_shards_merged_in_any_order_make_the_same_bytes(self, scene, tmp_path, whole, count):
         shards = write_shards(scene, tmp_path / "shards", count)
         assert merge_shards(shards[::-1], tmp_path / "out").frames == 12
         assert contents(tmp_path / "out") == whole
         assert len((tmp_path / "out/timings.jsonl").read_text().splitlines()) == 12
 
-    def test_of_a_merge_that_was_stopped(self, scene, tmp_path, whole):
+    def test_a_stopped_merge_resumes_to_the_same_bytes(self, scene, tmp_path, whole):
         shards = write_shards(scene, tmp_path / "shards", 3)
 
         def stop(done, total, text):
@@ -90,7 +90,7 @@ class TestSameBytes:
         assert contents(tmp_path / "out") == whole
 
     @pytest.mark.parametrize("locked", [True, False])
-    def test_of_shards_that_cannot_be_written_to(self, scene, tmp_path, whole, locked, monkeypatch):
+    def test_read_only_shards_merge_to_the_same_bytes(self, scene, tmp_path, whole, locked, monkeypatch):
         """As on a share of another machine; a run that still writes one from elsewhere holds its lock."""
         shards = write_shards(scene, tmp_path / "shards", 2)
         if not locked:
@@ -123,7 +123,7 @@ def test_shards_divide_the_frames(total, views, count):
 
 
 @pytest.mark.parametrize("text", ["0/3", "4/3", "1", "a/b", "1/0", "-1/2", ""])
-def test_a_shard_that_is_none(text):
+def test_an_invalid_shard_is_refused(text):
     with pytest.raises(InputError, match=r"a shard must be I/N"):
         Shard.parse(text)
 
@@ -137,19 +137,19 @@ class TestRefusals:
         with pytest.raises(InputError, match=message):
             merge_shards(shards, out)
 
-    def test_a_missing_shard(self, shards, tmp_path):
+    def test_a_missing_or_repeated_shard_is_refused(self, shards, tmp_path):
         self.refuse(shards[:2], tmp_path / "out", r"each of the 3 shards must be given once \(missing: \[3\]\)")
         self.refuse([*shards, shards[0]], tmp_path / "out", "each shard must be given once")
         assert not (tmp_path / "out").exists()
 
-    def test_an_unfinished_shard(self, shards, tmp_path):
+    def test_an_unfinished_shard_is_refused(self, shards, tmp_path):
         manifest = shards[1] / "manifest.jsonl"
         manifest.write_bytes(b"".join(manifest.read_bytes().splitlines(keepends=True)[:-1]))
         self.refuse(
             shards, tmp_path / "out", r"1 of 12 frames are in no shard, the first is 7: finish the shards first"
         )
 
-    def test_a_damaged_file(self, shards, tmp_path):
+    def test_a_damaged_file_is_refused(self, shards, tmp_path):
         picture = next((shards[1] / "images").rglob("000005.png"))
         data = bytearray(picture.read_bytes())
         data[-20] ^= 1
@@ -157,26 +157,26 @@ class TestRefusals:
         self.refuse(shards, tmp_path / "out", rf"{picture}: must have the SHA-256 [0-9a-f]+, as its manifest states")
         assert not (tmp_path / "out" / picture.relative_to(shards[1])).exists()
 
-    def test_a_damaged_manifest(self, shards, tmp_path):
+    def test_a_damaged_manifest_is_refused(self, shards, tmp_path):
         manifest = shards[2] / "manifest.jsonl"
         data = bytearray(manifest.read_bytes())
         data[100] ^= 1
         manifest.write_bytes(data)
         self.refuse(shards, tmp_path / "out", r"manifest\.jsonl, line 1: must be the record of a frame \(its checksum")
 
-    def test_another_scene(self, scene, shards, tmp_path):
+    def test_a_shard_of_another_scene_is_refused(self, scene, shards, tmp_path):
         other = load_scene(scene.path, overrides={"seed": 8})
         write(other, shards[1], shard=Shard(2, 3), overwrite=True)
         self.refuse(shards, tmp_path / "out", r"are not of one dataset: scene\.seed is 0 in the first, 8 in the second")
 
-    def test_another_device(self, shards, tmp_path):
+    def test_a_shard_of_another_device_is_refused(self, shards, tmp_path):
         file = shards[1] / "dataset.json"
         file.write_text(file.read_text().replace('"device": "cpu"', '"device": "cuda"'))
         self.refuse(
             shards, tmp_path / "out", 'are not of one dataset: device is "cpu" in the first, "cuda" in the second'
         )
 
-    def test_another_division(self, scene, shards, tmp_path):
+    def test_a_shard_of_another_division_is_refused(self, scene, shards, tmp_path):
         write(scene, tmp_path / "whole")
         self.refuse([*shards, tmp_path / "whole"], tmp_path / "out", "must be of one division of one dataset")
         with pytest.raises(InputError, match="it was shard 1/3 of 12 images and is shard 2/3 of 12"):
@@ -184,13 +184,13 @@ class TestRefusals:
         with pytest.raises(InputError, match="it was shard 1/3 of 12 images and is a whole dataset"):
             write(scene, shards[0])
 
-    def test_another_layout(self, shards, tmp_path):
+    def test_a_layout_that_differs_between_shards_is_refused(self, shards, tmp_path):
         shutil.copy(shards[0] / "layouts/0000.json", shards[1] / "layouts/0000.json")
         with (shards[1] / "layouts/0000.json").open("a") as file:
             file.write(" ")
         self.refuse(shards, tmp_path / "out", "must be the same: the shards settled one layout differently")
 
-    def test_files_outside(self, shards, tmp_path):
+    def test_a_manifest_that_names_files_outside_is_refused(self, shards, tmp_path):
         """A manifest that names files elsewhere, with a checksum that fits."""
         manifest = shards[0] / "manifest.jsonl"
         records = list(Manifest(manifest))
@@ -204,10 +204,10 @@ class TestRefusals:
                 r"file names must be relative to the dataset and lie in its folder \(got '" + name,
             )
 
-    def test_itself(self, shards):
+    def test_a_shard_as_output_folder_is_refused(self, shards):
         self.refuse(shards, shards[0], "must not be one of the shards")
 
-    def test_a_shard_that_is_being_written(self, scene, shards, tmp_path):
+    def test_a_shard_that_is_being_written_is_refused(self, scene, shards, tmp_path):
         def merge(*args, **options):
             self.refuse(shards, tmp_path / "out", f"is being written by another run \\(process {os.getpid()}")
             return render(*args, **options)
@@ -216,7 +216,7 @@ class TestRefusals:
         write(scene, shards[1], shard=Shard(2, 3), render=merge)
 
 
-def test_the_command(scene, tmp_path, whole, capsys):
+def test_the_merge_command_merges_and_logs(scene, tmp_path, whole, capsys):
     shards = write_shards(scene, tmp_path / "shards", 2)
     assert run("merge", *shards, "-o", tmp_path / "out", "--json") == 0
     out, err = capsys.readouterr()
@@ -243,7 +243,7 @@ def ray():
 
 @pytest.mark.usefixtures("ray")
 class TestRay:
-    def test_same_bytes(self, scene, tmp_path, whole):
+    def test_a_run_resumed_on_ray_with_a_killed_worker_makes_the_same_bytes(self, scene, tmp_path, whole):
         """Begun here, gone on with on Ray, where a worker is killed: no layout is settled twice, no frame is lost."""
         told = []
         write(scene, tmp_path / "out", frames=3)
@@ -254,7 +254,7 @@ class TestRay:
         assert told[-1][:2] == (12, 12)
         assert contents(tmp_path / "out") == whole
 
-    def test_where_memory_runs_out(self, scene, tmp_path, whole):
+    def test_a_ray_worker_without_memory_loses_no_frame(self, scene, tmp_path, whole):
         """A worker says so, as Dr.Jit does of a GPU: its frame is made by another, and it is not replaced."""
         told = []
         write(
@@ -268,11 +268,11 @@ class TestRay:
         assert "memory ran out in frame 6, which is repeated with 3 workers" in told
         assert contents(tmp_path / "out") == whole
 
-    def test_bad_input_keeps_its_sentence(self, scene, tmp_path):
+    def test_an_input_error_of_a_ray_worker_keeps_its_sentence(self, scene, tmp_path):
         with pytest.raises(InputError, match=r"^no frame 5$"):
             write(scene, tmp_path / "out", cluster=Cluster(), workers=1, render=refuse_5)
 
-    def test_workers_take_resources(self, scene, tmp_path):
+    def test_ray_workers_reserve_the_stated_resources(self, scene, tmp_path):
         summary = write(scene, tmp_path / "out", frames=2, cluster=Cluster(resources={"camera": 1, "CPU": 1}))
         assert summary.rendered == 2
         with pytest.raises(MissingResourceError, match=r"no node of the Ray cluster has CPU=1, camera=2 for a worker"):
@@ -306,7 +306,7 @@ class ExhaustedOnce:
         ({"CPU": 4}, "cpu", "cpu", {"CPU": 4}),
     ],
 )
-def test_the_device_of_a_cluster(resources, device, kind, reserved):
+def test_the_device_determines_the_reserved_resources(resources, device, kind, reserved):
     found, cluster = Cluster(resources=resources).on_device(device)
     assert (found.kind, cluster.resources) == (kind, reserved)
 
@@ -320,7 +320,7 @@ def test_the_device_of_a_cluster(resources, device, kind, reserved):
         (None, "auto", r"must be cpu or cuda \(got auto\)"),
     ],
 )
-def test_devices_that_a_cluster_does_not_have(scene, tmp_path, capsys, resources, device, words):
+def test_devices_that_a_cluster_lacks_are_refused(scene, tmp_path, capsys, resources, device, words):
     with pytest.raises(InputError, match=words):
         write(scene, tmp_path / "out", cluster=Cluster(resources=resources), device=device)
     options = ["--resources", ",".join(f"{name}={amount}" for name, amount in resources.items())] if resources else []
@@ -348,7 +348,7 @@ class FakeRay:
         return SimpleNamespace(options=lambda **options: SimpleNamespace(remote=lambda *arguments: object()))
 
 
-def test_machines_that_join_are_told_of_once(monkeypatch):
+def test_machines_that_join_are_reported_once(monkeypatch):
     ray, now = FakeRay(head=2.0, first=5.0), [0.0]
     monkeypatch.setitem(sys.modules, "ray", ray)
     monkeypatch.setattr(cluster.time, "monotonic", lambda: now[0])
@@ -374,7 +374,7 @@ def test_machines_that_join_are_told_of_once(monkeypatch):
         free_slots()
 
 
-def test_images_of_lights_travel_with_the_job(scene_data, write_scene, tmp_path):
+def test_images_of_lights_are_sent_with_the_job(scene_data, write_scene, tmp_path):
     """Where frames are made no path of the caller's is opened: its folder is gone."""
     cv2.imwrite(str(tmp_path / "sky.png"), np.full((4, 8, 3), 90, dtype=np.uint8))
     scene_data["lights"] = [{"kind": "environment", "image": "sky.png"}]
@@ -411,12 +411,12 @@ def refuse_5(scene, index, *, layout):
 
 
 @pytest.mark.parametrize("text", ["CPU", "CPU=0", "=3", "CPU=x", "CPU=nan", "CPU=2,,"])
-def test_resources_that_are_none(text):
+def test_invalid_resources_are_refused(text):
     with pytest.raises(InputError, match=r"resources must be NAME=AMOUNT"):
         Cluster.parse_resources(text)
 
 
-def test_without_ray(scene, tmp_path, monkeypatch):
+def test_missing_ray_is_named(scene, tmp_path, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "ray", None)
     with pytest.raises(MissingResourceError, match=r"needs Ray: pip install 'mitsplat\[cluster\]'"):
         write(scene, tmp_path / "out", cluster=Cluster())

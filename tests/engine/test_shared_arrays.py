@@ -59,7 +59,7 @@ def total_of(splats: Splats) -> float:
     return float(sum(array.sum(dtype=np.float64) for array in vars(splats).values()))
 
 
-def test_workers_map_one_copy_of_what_was_sent(tmp_path, monkeypatch):
+def test_workers_map_one_copy_of_the_arrays_and_leave_no_file(tmp_path, monkeypatch):
     """And nothing of it is left behind, not even by one that is killed."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     splats = splats_of(50_000)
@@ -80,7 +80,7 @@ def test_workers_map_one_copy_of_what_was_sent(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("reason", ["read-only", "full"])
-def test_without_a_file_they_share_memory(tmp_path, monkeypatch, caplog, reason):
+def test_an_unusable_cache_folder_falls_back_to_shared_memory(tmp_path, monkeypatch, caplog, reason):
     if reason == "full":
         monkeypatch.setattr(shared_arrays.tempfile, "TemporaryFile", lambda dir: Path("/dev/full").open("wb"))  # noqa: SIM115
     else:
@@ -96,7 +96,7 @@ def test_without_a_file_they_share_memory(tmp_path, monkeypatch, caplog, reason)
     assert "/memfd:mitsplat" in Path("/proc/self/maps").read_text()
 
 
-def test_what_a_process_begins_with_is_small():
+def test_the_start_message_of_a_process_is_small():
     """However much is shared, and in however many arrays: more than a pipe holds would be waited for."""
     value = [np.arange(3) for _ in range(20_000)], "text" * 100_000
     with closing(shared_arrays.SharedArrays(value)) as packed:

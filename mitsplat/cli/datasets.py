@@ -448,13 +448,13 @@ def view(
         raise MissingResourceError("the viewer requires viser: pip install 'mitsplat[view]'")
     from mitsplat.view import Address, serve
 
-    def tell(url: str) -> None:
+    def print_url(url: str) -> None:
         typer.echo(f"view: {url}  (Ctrl-C stops it)")
         if browser:
             typer.launch(url)
 
     select_device(device)
-    serve(path, Address(host, port), gaussians=gaussians, allow_outside=allow_outside, ready=tell)
+    serve(path, Address(host, port), gaussians=gaussians, allow_outside=allow_outside, ready=print_url)
 
 
 def settle(

@@ -203,7 +203,7 @@ def coco_truth(found: LabelledSet, *, masks: bool) -> dict[str, Any]:
                 "iscrowd": int(instance.crowd),
             }
             if masks:
-                annotation["segmentation"] = instance.encoded(sample.width, sample.height)
+                annotation["segmentation"] = instance.encode_mask(sample.width, sample.height)
             annotations.append(annotation)
     return {
         "images": [
@@ -234,7 +234,7 @@ def write_evaluation(
     confusion = confuse(truth, detections)
     results = {
         **about,
-        "data": found.described(),
+        "data": found.to_record(),
         "rules": {
             "least_score": MIN_SCORE,
             "nms_iou": NMS_IOU,

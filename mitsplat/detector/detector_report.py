@@ -18,7 +18,7 @@ from mitsplat.labels.overlay import class_colour
 from mitsplat.pages.html import inline_image, make_page, mask_path
 from mitsplat.pages.svg_charts import bars, curves
 
-WORST = 8
+NUM_WORST_IMAGES = 8
 """Number of images in the report; those with the lowest share of correct detections."""
 _THUMBNAIL = 560
 _PLURALS = {"box": "boxes", "mask": "masks"}
@@ -132,7 +132,7 @@ def _confusion(confusion: Confusion, class_names: Sequence[str]) -> str:
 
 
 def _worst(found: LabelledSet, truth: Mapping[str, Any], detections: Sequence[Detection], confusion: Confusion) -> str:
-    order = worst_images(confusion)[:WORST]
+    order = worst_images(confusion)[:NUM_WORST_IMAGES]
     labelled: dict[int, list[dict[str, Any]]] = {image: [] for image in order}
     predicted: dict[int, list[dict[str, Any]]] = {image: [] for image in order}
     for annotation in truth["annotations"]:

@@ -44,7 +44,7 @@ Ultralytics' ``auto`` has the same rule, but derives the number of steps from th
 _OUTLINE_POINTS = 1000
 """Number of points to which Ultralytics resamples every outline with no more points."""
 
-LAST = "weights/last.pt"
+LAST_CHECKPOINT = "weights/last.pt"
 """Path of the last checkpoint, relative to the run folder."""
 
 
@@ -139,7 +139,7 @@ def train_job(
     callbacks: defaultdict[str, list[Callable[[Any], None]]] = defaultdict(list)
     callbacks["on_train_epoch_start"].append(_FixedStepsTrainer.begin_epoch)
     callbacks["on_train_batch_end"].append(_FixedStepsTrainer.end_step)
-    last = job.run / LAST
+    last = job.run / LAST_CHECKPOINT
     with ExitStack() as links:
         settings["pretrained"] = links.enter_context(linked_weights(weights)) if weights else False
         if last.is_file():
@@ -153,7 +153,7 @@ def finish_checkpoint(run: Path) -> Path:
     """Write the final weights of a run from its last checkpoint, and return their path."""
     final, part = run / "weights.pt", run / ".weights.pt.part"
     part.unlink(missing_ok=True)  # an existing link of this name would be followed
-    strip_optimizer(run / LAST, str(part))
+    strip_optimizer(run / LAST_CHECKPOINT, str(part))
     part.replace(final)
     return final
 
@@ -165,11 +165,11 @@ def epochs_done(run: Path) -> int:
         InputError: If the checkpoint cannot be read.
     """
     try:
-        with linked_weights(run / LAST) as name:
+        with linked_weights(run / LAST_CHECKPOINT) as name:
             return int(torch_safe_load(name)[0]["epoch"]) + 1
     except WEIGHTS_ERRORS as error:
         raise InputError(
-            f"{run / LAST}: cannot be read ({type(error).__name__}): start again with --overwrite"
+            f"{run / LAST_CHECKPOINT}: cannot be read ({type(error).__name__}): start again with --overwrite"
         ) from error
 
 

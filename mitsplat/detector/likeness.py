@@ -277,7 +277,7 @@ def _object_pixels(instance: LabelledObject, sample: Sample, width: int, height:
     """Return the pixels of an object in the scaled image, shape (height, width)."""
     factor = np.array([width / sample.width, height / sample.height])
     if instance.has_mask:
-        return fill_polygon(instance.outlined() * factor, width, height)
+        return fill_polygon(instance.outline_points() * factor, width, height)
     inside = np.zeros((height, width), dtype=bool)
     (x0, y0), (x1, y1) = (np.array(corner) * factor for corner in (instance.box[:2], instance.box[2:]))
     rows, columns = (

@@ -51,7 +51,7 @@ def cut_photographs(photographs: LabelledSet, real_size: int, size: int, folder:
                 f"a --real-size nearer to --size, {size}"
             )
         masks = [
-            np.asarray(decode_rle(one.encoded(sample.width, sample.height)), dtype=bool) if one.has_mask else None
+            np.asarray(decode_rle(one.encode_mask(sample.width, sample.height)), dtype=bool) if one.has_mask else None
             for one in sample.instances
         ]
         for top in _tile_starts(sample.height, height):

@@ -69,7 +69,7 @@ class LabelledObject:
         """True if the label has an outline or a mask, not only a box."""
         return self.polygon is not None or self.rle is not None
 
-    def encoded(self, width: int, height: int) -> dict[str, Any]:
+    def encode_mask(self, width: int, height: int) -> dict[str, Any]:
         """Return the mask in an image of this size [px] as COCO's compressed run-length code.
 
         For a label without a mask, the mask is the filled box.
@@ -83,7 +83,7 @@ class LabelledObject:
         corners = [[x0, y0, x1, y0, x1, y1, x0, y1]]
         return _rle_text(coco_mask.merge(coco_mask.frPyObjects(corners, height, width)))
 
-    def outlined(self) -> Float64Array:
+    def outline_points(self) -> Float64Array:
         """Return the outline [px], shape (M, 2)."""
         if self.polygon is not None:
             return self.polygon
@@ -129,7 +129,7 @@ class LabelledSet:
     class_names: tuple[str, ...]
     samples: tuple[Sample, ...]
 
-    def described(self) -> dict[str, Any]:
+    def to_record(self) -> dict[str, Any]:
         """Return the record of the set; its digest covers images, labels and classes."""
         sha = ContentHash()
         sha.add_json([self.class_names, [(sample.name, sample.digest) for sample in self.samples]])
@@ -163,10 +163,10 @@ def read_set(path: str | Path, split: Split, progress: Progress | None = None) -
     if (root / "dataset.json").is_file():
         if not (root / "labels").is_dir():
             raise InputError(f"{root}: training needs YOLO labels: add yolo to output.formats of the scene")
-        classes = _class_names(_yaml(root / "data.yaml"), root / "data.yaml")
-        return _yolo(root, "mitsplat", split, classes, {name: [f"images/{name}"] for name in SPLITS}, progress)
+        classes = _class_names(_read_yaml(root / "data.yaml"), root / "data.yaml")
+        return _read_yolo(root, "mitsplat", split, classes, {name: [f"images/{name}"] for name in SPLITS}, progress)
     if (root / "data.yaml").is_file():
-        content = _yaml(root / "data.yaml")
+        content = _read_yaml(root / "data.yaml")
         if "kpt_shape" in content:
             raise InputError(f"{root / 'data.yaml'}: labels must be boxes or masks (got keypoints, kpt_shape)")
         base = str(content.get("path") or ".")
@@ -175,8 +175,8 @@ def read_set(path: str | Path, split: Split, progress: Progress | None = None) -
             name: [_split_entry(root, base, str(entry)) for entry in (given if isinstance(given, list) else [given])]
             for name, given in entries.items()
         }
-        return _yolo(root, "yolo", split, _class_names(content, root / "data.yaml"), listed, progress)
-    return _coco(root, split, progress)
+        return _read_yolo(root, "yolo", split, _class_names(content, root / "data.yaml"), listed, progress)
+    return _read_coco(root, split, progress)
 
 
 def reorder_classes(found: LabelledSet, class_names: Sequence[str], owner: str) -> LabelledSet:
@@ -218,7 +218,7 @@ def _rle_text(rle: dict[str, Any]) -> dict[str, Any]:
     return {"size": [int(side) for side in rle["size"]], "counts": rle["counts"].decode("ascii")}
 
 
-def _yaml(path: Path) -> dict[str, Any]:
+def _read_yaml(path: Path) -> dict[str, Any]:
     try:
         content = YAML(typ="safe", pure=True).load(path)
     except (OSError, ValueError, RecursionError, YAMLError) as error:
@@ -237,7 +237,7 @@ def _class_names(content: dict[str, Any], path: Path) -> tuple[str, ...]:
     return tuple(map(str, names))
 
 
-def _yolo(
+def _read_yolo(
     root: Path,
     kind: Literal["mitsplat", "yolo"],
     split: Split,
@@ -361,7 +361,7 @@ def _clip_points(points: Float64Array, size: tuple[int, int], place: str) -> Flo
     return np.clip(points, 0, size)
 
 
-def _coco(root: Path, split: Split, progress: Progress | None) -> LabelledSet:
+def _read_coco(root: Path, split: Split, progress: Progress | None) -> LabelledSet:
     parts = [_coco_part(root, split, *file, progress) for file in _coco_files(root, split).items()]
     parts = [reorder_classes(part, parts[0].class_names, str(root)) for part in parts]
     samples = tuple(sample for part in parts for sample in part.samples)
@@ -412,7 +412,8 @@ def _coco_part(root: Path, split: Split, path: Path, content: dict[str, Any], pr
 
 def _coco_files(root: Path, split: Split) -> dict[Path, dict[str, Any]]:
     """Return the COCO files of a split and their contents: one file, or all files for the split ``all``."""
-    files = {path: _json(path) for folder in (root, root / "annotations") for path in sorted(folder.glob("*.json"))}
+    paths = [path for folder in (root, root / "annotations") for path in sorted(folder.glob("*.json"))]
+    files = {path: _read_json(path) for path in paths}
     files = {
         path: content
         for path, content in files.items()
@@ -435,7 +436,7 @@ def _file_names(files: Iterable[Path]) -> str:
     return ", ".join(path.name for path in files)
 
 
-def _json(path: Path) -> Any:
+def _read_json(path: Path) -> Any:
     try:
         return read_json(path, _MAX_COCO_BYTES)
     except (OSError, ValueError) as error:

@@ -40,10 +40,12 @@ from mitsplat.runtime.cores import usable_cores
 from mitsplat.storage.content_hash import file_hash
 from mitsplat.storage.files import open_in_place, read_json, remove_folder, storage_errors, write_text
 
-RUN = "run.json"
+RUN_FILE = "run.json"
 WEIGHTS = "weights.pt"
 _TILES = "tiles"
-_RUN_FILES = frozenset((RUN, WEIGHTS, "weights", "data", _TILES, "results.csv", "args.yaml", ".lock", "evaluation"))
+_RUN_FILES = frozenset(
+    (RUN_FILE, WEIGHTS, "weights", "data", _TILES, "results.csv", "args.yaml", ".lock", "evaluation")
+)
 """Names of files that a run folder may contain, in addition to temporary files."""
 _SET_KEYS = ("datasets", "real")
 _MAX_WORKERS = 8
@@ -98,7 +100,7 @@ class TrainSettings:
         if self.weights is not None:
             object.__setattr__(self, "weights", Path(self.weights))
 
-    def decisive(self) -> dict[str, Any]:
+    def weight_settings(self) -> dict[str, Any]:
         """Return the settings that affect the weights, without ``device`` and ``workers``."""
         settings = asdict(self) | {"weights": None if self.weights is None else file_hash(self.weights)}
         return {name: value for name, value in settings.items() if name not in ("device", "workers")}
@@ -167,7 +169,7 @@ def train_detector(
         raise InputError("--real-size needs photographs: give them with --real")
     if settings.weights is not None and not settings.weights.is_file():
         raise InputError(f"--weights must be an existing weights file of Ultralytics (.pt) (got {settings.weights})")
-    if not (out / RUN).is_file():
+    if not (out / RUN_FILE).is_file():
         check_folder(out, "a run")
     load_libraries()
     network, masks = read_network(settings.model)
@@ -179,11 +181,11 @@ def train_detector(
         check_weights(settings.weights, network, masks=masks)
     device, device_name = torch_device(settings.device)
     record = {
-        "settings": settings.decisive() | ({} if photographs else {"share": None}),
+        "settings": settings.weight_settings() | ({} if photographs else {"share": None}),
         "masks": masks,
         "classes": list(sets[0].class_names),
-        "datasets": [found.described() for found in sets],
-        "real": None if photographs is None else photographs.described(),
+        "datasets": [found.to_record() for found in sets],
+        "real": None if photographs is None else photographs.to_record(),
     }
     with storage_errors(out), _locked(out):
         if overwrite:
@@ -193,9 +195,9 @@ def train_detector(
             return replace(kept, was_finished=True)
         start = {"weights": str(settings.weights)} if settings.weights else {"network": network}
         record |= {"start": start, "device": device_name, "versions": versions(), "finished": None}
-        write_text(out / RUN, json.dumps(record, indent=2) + "\n")
+        write_text(out / RUN_FILE, json.dumps(record, indent=2) + "\n")
         finished = _train(sets, photographs, out, settings, masks=masks, device=device, progress=progress)
-        write_text(out / RUN, json.dumps(record | {"finished": finished}, indent=2) + "\n")
+        write_text(out / RUN_FILE, json.dumps(record | {"finished": finished}, indent=2) + "\n")
         for name in ("data", _TILES, "weights"):
             remove_folder(out / name)
         return Run(out, record | {"finished": finished})
@@ -210,7 +212,7 @@ def open_run(path: str | Path) -> Run:
     path = Path(path)
     run = _read_run(path)
     if run is None:
-        raise InputError(f"{path}: must be the folder of `mitsplat train` (there is no {RUN})")
+        raise InputError(f"{path}: must be the folder of `mitsplat train` (there is no {RUN_FILE})")
     if not run.record.get("finished") or not run.weights.is_file():
         raise InputError(f"{path}: this training is not finished: run `mitsplat train` again with the same settings")
     return run
@@ -258,7 +260,7 @@ def write_data(sets: Sequence[LabelledSet], folder: Path) -> Path:
             if instance.crowd:
                 continue
             if polygons:
-                values = (instance.outlined() / (sample.width, sample.height)).ravel().tolist()
+                values = (instance.outline_points() / (sample.width, sample.height)).ravel().tolist()
             else:
                 x0, y0, x1, y1 = instance.box
                 w, h = sample.width, sample.height
@@ -310,7 +312,7 @@ def _train(
         "real_images_taken": int((plan >= rendered).sum()),
     }
     started = time.perf_counter()
-    if (out / fixed_steps.LAST).is_file() and fixed_steps.epochs_done(out) in (0, job.epochs):
+    if (out / fixed_steps.LAST_CHECKPOINT).is_file() and fixed_steps.epochs_done(out) in (0, job.epochs):
         fixed_steps.finish_checkpoint(out)  # the process ended between the last step and the export of the weights
         return counts | {"seconds": 0.0, "resumed_at_step": settings.steps}
     outcome = fixed_steps.train_job(
@@ -333,14 +335,14 @@ def _train(
 
 
 def _read_run(path: Path) -> Run | None:
-    if not (path / RUN).is_file():
+    if not (path / RUN_FILE).is_file():
         return None
     try:
-        record = read_json(path / RUN)
+        record = read_json(path / RUN_FILE)
     except (OSError, ValueError) as error:
-        raise InputError(f"{path / RUN}: cannot be read ({error})") from error
+        raise InputError(f"{path / RUN_FILE}: cannot be read ({error})") from error
     if not isinstance(record, dict) or not {"settings", "classes", "masks"} <= record.keys():
-        raise InputError(f"{path / RUN}: must be a file written by `mitsplat train`")
+        raise InputError(f"{path / RUN_FILE}: must be a file written by `mitsplat train`")
     return Run(path, record)
 
 

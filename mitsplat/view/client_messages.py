@@ -16,7 +16,7 @@ import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
 from websockets.asyncio.server import ServerConnection
 
-LARGEST = 2**16
+MAX_MESSAGE_BYTES = 2**16
 """Maximum message size [bytes]; a connection that sends a larger message is closed."""
 
 
@@ -133,7 +133,7 @@ class Pool:
 
     threads: Executor | None = None
 
-    async def caught_up(self) -> None:
+    async def wait_for_queue(self) -> None:
         """Wait until all queued jobs have started, so that a browser cannot queue an unlimited number."""
         if self.threads is not None:
             try:
@@ -156,7 +156,7 @@ class Connection(ServerConnection):  # type: ignore[misc]  # of the extra `view`
             ConnectionClosed: If the connection is closed.
         """
         while True:
-            await self._pool.caught_up()
+            await self._pool.wait_for_queue()
             message = await super().recv(decode)
             if is_expected(message):
                 return message

@@ -20,13 +20,13 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from mitsplat.errors import InputError, MissingResourceError
-from mitsplat.view.client_messages import LARGEST, Connection, Pool
+from mitsplat.view.client_messages import MAX_MESSAGE_BYTES, Connection, Pool
 
 if TYPE_CHECKING:
     from websockets.http11 import Request, Response
 
 LOOPBACK = ("localhost", "127.0.0.1", "::1")
-MOST_BROWSERS = 16
+MAX_BROWSERS = 16
 """Maximum number of connected browsers; each uses memory for all displayed parts until it has received them."""
 
 _LOCAL = re.compile(r"(localhost|127\.0\.0\.1|\[::1\])(:\d{1,5})?")
@@ -62,11 +62,11 @@ class Guard:
     local: bool
 
     @classmethod
-    def of_host(cls, host: str) -> Guard:
+    def for_host(cls, host: str) -> Guard:
         """Return a guard with a new token for a server that listens on ``host``."""
         return cls(secrets.token_urlsafe(16), host in LOOPBACK)
 
-    def refusal(self, path: str, host: str, origin: str | None) -> str | None:
+    def rejection_reason(self, path: str, host: str, origin: str | None) -> str | None:
         """Return the reason why a request is rejected, or None if it is accepted.
 
         Args:
@@ -120,15 +120,15 @@ def guarded(guard: Guard) -> Iterator[Pool]:
     start, started, pool = server.serve, [], Pool()
 
     def serve(*args: Any, process_request: Callable[[Any, Request], Response | None], **options: Any) -> Any:
-        def ask(connection: Any, request: Request) -> Response | None:
+        def answer(connection: Any, request: Request) -> Response | None:
             def header(name: str) -> str | None:
                 return ", ".join(request.headers.get_all(name)) or None
 
             host = header("Host") or ""
-            if reason := guard.refusal(request.path, host, header("Origin")):
+            if reason := guard.rejection_reason(request.path, host, header("Origin")):
                 return connection.respond(http.HTTPStatus.FORBIDDEN, f"mitsplat view: {reason}\n")
-            if len(connection.server.connections) >= MOST_BROWSERS:
-                text = f"mitsplat view: {MOST_BROWSERS} browsers have this page open, which is the maximum\n"
+            if len(connection.server.connections) >= MAX_BROWSERS:
+                text = f"mitsplat view: {MAX_BROWSERS} browsers have this page open, which is the maximum\n"
                 return connection.respond(http.HTTPStatus.SERVICE_UNAVAILABLE, text)
             if header("Upgrade") is not None:
                 return None  # the websocket
@@ -139,8 +139,8 @@ def guarded(guard: Guard) -> Iterator[Pool]:
             return response
 
         started.append(True)
-        own = {"process_request": ask, "create_connection": partial(Connection, pool=pool), "logger": _logger()}
-        return start(*args, **options | own | {"max_size": LARGEST})
+        own = {"process_request": answer, "create_connection": partial(Connection, pool=pool), "logger": _logger()}
+        return start(*args, **options | own | {"max_size": MAX_MESSAGE_BYTES})
 
     server.serve = serve
     try:

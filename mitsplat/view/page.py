@@ -19,7 +19,7 @@ from mitsplat.gaussians.splat_files import Axis
 from mitsplat.geometry.camera import Camera
 from mitsplat.view.guard import Guard, check_address, guarded
 from mitsplat.view.scene_parts import (
-    HIDDEN_FIRST,
+    HIDDEN_AT_START,
     Frustum,
     Lines,
     ShownMesh,
@@ -69,8 +69,8 @@ class Page:
 
     def __init__(self, title: str, address: Address, *, gaussians: int) -> None:
         check_address(address.host, address.port)
-        guard = Guard.of_host(address.host)
-        with _silence(), guarded(guard) as pool:
+        guard = Guard.for_host(address.host)
+        with _without_messages(), guarded(guard) as pool:
             self._server = viser.ViserServer(address.host, address.port, label=title, verbose=False)
         pool.threads = self._server._thread_executor
         self.port = self._server.get_port()
@@ -97,7 +97,7 @@ class Page:
 
     def close(self) -> None:
         """Stop the server."""
-        with _silence():
+        with _without_messages():
             self._server.stop()
 
     def on_click(self, clicked: Callable[[int], object]) -> None:
@@ -107,10 +107,10 @@ class Page:
     def on_point(self, pointed: Callable[[Float64Array, Float64Array], object]) -> None:
         """Set the callback for a click anywhere; its arguments are origin and direction of the ray, (3,) each."""
 
-        def tell(event: viser.SceneClickEvent) -> None:
+        def handle(event: viser.SceneClickEvent) -> None:
             pointed(np.array(event.ray_origin), np.array(event.ray_direction))
 
-        self._server.scene.on_click()(tell)
+        self._server.scene.on_click()(handle)
 
     def on_move(self, moved: Callable[[Any], object]) -> None:
         """Set the callback for a moved view; its argument is viser's camera.
@@ -121,13 +121,13 @@ class Page:
         def listen(client: Any) -> None:
             begun = False
 
-            def tell(camera: Any) -> None:
+            def handle(camera: Any) -> None:
                 nonlocal begun
                 begun = begun or np.allclose(camera.position, self._server.initial_camera.position, atol=1e-4)
                 if begun:
                     moved(camera)
 
-            client.camera.on_update(tell)
+            client.camera.on_update(handle)
 
         self._server.on_client_connect(listen)
 
@@ -159,7 +159,7 @@ class Page:
         self._picture.image, self._picture.visible = image, True
         self._caption.content = caption
 
-    def widen(self, width: int) -> None:
+    def set_picture_width(self, width: int) -> None:
         """Set the width of the picture panel [px]."""
         self._panel.set_width(width)
 
@@ -198,7 +198,7 @@ class Page:
         away = [
             np.linalg.norm(part.pose[:3, 3] - middle)
             for part in self._shown.values()
-            if isinstance(part.thing, Frustum)
+            if isinstance(part.drawable, Frustum)
         ]
         size = max(float(np.linalg.norm(high - low)), 1.5 * float(max(away, default=0.0)))
         eye = middle + size * (0.7 * aside - 0.9 * np.cross(above, aside) + 0.6 * above)
@@ -213,7 +213,7 @@ class Page:
     def _add_group(self, group: str) -> None:
         if group in self._boxes:
             return
-        visible, self._groups.visible = group not in HIDDEN_FIRST, True
+        visible, self._groups.visible = group not in HIDDEN_AT_START, True
         root = self._server.scene.add_frame(f"/{group}", show_axes=False, visible=visible)
         with self._groups:
             box = self.gui.add_checkbox(group, visible)
@@ -222,18 +222,18 @@ class Page:
         box.on_update(lambda _: setattr(root, "visible", box.value))
 
     def _add(self, part: ShownPart) -> Any:
-        scene, thing = self._server.scene, part.thing
+        scene, drawable = self._server.scene, part.drawable
         place = {"position": part.pose[:3, 3], "wxyz": _wxyz(part.pose)}
-        if isinstance(thing, ShownSplats):
-            return scene.add_gaussian_splats(part.name, **splat_arrays(thing.thinned(self._gaussians)), **place)
-        if isinstance(thing, ShownMesh):
-            opacity = None if thing.opacity == 1.0 else thing.opacity
-            vertices, faces = np.asarray(thing.mesh.vertices, dtype=np.float32), np.asarray(thing.mesh.faces)
+        if isinstance(drawable, ShownSplats):
+            return scene.add_gaussian_splats(part.name, **splat_arrays(drawable.thinned(self._gaussians)), **place)
+        if isinstance(drawable, ShownMesh):
+            opacity = None if drawable.opacity == 1.0 else drawable.opacity
+            vertices, faces = np.asarray(drawable.mesh.vertices, dtype=np.float32), np.asarray(drawable.mesh.faces)
             return scene.add_mesh_simple(
                 part.name,
                 vertices,
                 faces,
-                color=thing.colour,
+                color=drawable.colour,
                 opacity=opacity,
                 flat_shading=True,
                 side="double",
@@ -241,30 +241,32 @@ class Page:
                 receive_shadow=False,
                 **place,
             )
-        if isinstance(thing, Lines):
-            colours = np.array(thing.colour, dtype=np.uint8)
+        if isinstance(drawable, Lines):
+            colours = np.array(drawable.colour, dtype=np.uint8)
             return scene.add_line_segments(
-                part.name, thing.segments, colours, thickness=2.0, thickness_units="screen", **place
+                part.name, drawable.segments, colours, thickness=2.0, thickness_units="screen", **place
             )
-        if isinstance(thing, ShownPoints):
-            return scene.add_point_cloud(part.name, thing.points, thing.colours, point_size=thing.edge, **place)
-        return self._add_frustum(part.name, thing, place)
+        if isinstance(drawable, ShownPoints):
+            return scene.add_point_cloud(
+                part.name, drawable.points, drawable.colours, point_size=drawable.edge, **place
+            )
+        return self._add_frustum(part.name, drawable, place)
 
-    def _add_frustum(self, name: str, thing: Frustum, place: dict[str, Any]) -> Any:
-        camera, height = thing.camera, 0.5 * thing.camera.height / thing.camera.fy
+    def _add_frustum(self, name: str, drawable: Frustum, place: dict[str, Any]) -> Any:
+        camera, height = drawable.camera, 0.5 * drawable.camera.height / drawable.camera.fy
         aspect = camera.width / camera.height
         handle = self._server.scene.add_camera_frustum(
             name,
             fov=2 * float(np.arctan(height)),
             aspect=aspect,
-            scale=thing.depth
+            scale=drawable.depth
             * float(np.cbrt(height * height * aspect / 3)),  # viser expects the edge of a cube of equal volume
             thickness=1.5,
             thickness_units="screen",
-            color=thing.colour,
+            color=drawable.colour,
             **place,
         )
-        handle.on_click(lambda _: self._clicked(thing.index))
+        handle.on_click(lambda _: self._clicked(drawable.index))
         return handle
 
 
@@ -287,7 +289,7 @@ def splat_arrays(splats: Splats) -> dict[str, Any]:
 
 
 @contextmanager
-def _silence() -> Iterator[None]:
+def _without_messages() -> Iterator[None]:
     """Suppress viser's messages about start, address and stop."""
     console = rich.get_console()
     before, console.quiet = console.quiet, True

@@ -24,26 +24,26 @@ from mitsplat.scene.spec.light_spec import LightSpec
 Request = TypeVar("Request")
 Result = TypeVar("Result")
 
-PAUSES: dict[PresetName, float] = {"fast": 0.0, "balanced": 0.3, "exact": 0.6}
+PRESET_DELAYS: dict[PresetName, float] = {"fast": 0.0, "balanced": 0.3, "exact": 0.6}
 """Time without new requests before a preset starts [s], because a running render cannot be cancelled."""
 
 
-class NewestFirst(Generic[Request, Result]):
+class LatestRequestWorker(Generic[Request, Result]):
     """Worker thread for the newest request, which it processes in steps; a newer request replaces it between two steps.
 
     Args:
         work: Generator of the results of a request; it is not resumed after a newer request.
-        tell: Callback with a request and one of its results.
-        refuse: Callback with the InputError that ended a request.
+        on_result: Callback with a request and one of its results.
+        on_error: Callback with the InputError that ended a request.
     """
 
     def __init__(
         self,
         work: Callable[[Request], Iterator[Result]],
-        tell: Callable[[Request, Result], object],
-        refuse: Callable[[InputError], object],
+        on_result: Callable[[Request, Result], object],
+        on_error: Callable[[InputError], object],
     ) -> None:
-        self._work, self._tell, self._refuse = work, tell, refuse
+        self._work, self._on_result, self._on_error = work, on_result, on_error
         self._changed = threading.Condition()
         self._waiting: Request | None = None
         self._closed = False
@@ -51,7 +51,7 @@ class NewestFirst(Generic[Request, Result]):
         self._thread = threading.Thread(target=self._run, name="mitsplat view: renders", daemon=True)
         self._thread.start()
 
-    def ask(self, request: Request) -> None:
+    def submit(self, request: Request) -> None:
         """Replace all earlier requests by this one."""
         with self._changed:
             self._waiting = request
@@ -91,11 +91,11 @@ class NewestFirst(Generic[Request, Result]):
     def _answer(self, request: Request) -> None:
         try:
             for result in self._work(request):
-                self._tell(request, result)
+                self._on_result(request, result)
                 if not self.wait(0):
                     return
         except InputError as error:
-            self._refuse(error)
+            self._on_error(error)
 
 
 @dataclass(frozen=True, eq=False)

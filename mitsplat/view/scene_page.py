@@ -25,7 +25,7 @@ from mitsplat.scene.scene import Scene
 from mitsplat.scene.spec.light_spec import AreaLight, EnvironmentLight, LightSpec, PointLight, SpotLight
 from mitsplat.scene.spec.object_spec import PRIMITIVES
 from mitsplat.view.page import Page
-from mitsplat.view.previews import PAUSES, NewestFirst, Preview, SceneRenders, ViewRequest, presets_up_to
+from mitsplat.view.previews import PRESET_DELAYS, LatestRequestWorker, Preview, SceneRenders, ViewRequest, presets_up_to
 from mitsplat.view.scene_parts import ShownPart, camera_parts, scene_parts
 from mitsplat.view.yaml_lines import camera_lines, light_line, rounded, seed_line
 
@@ -65,7 +65,7 @@ class ScenePage:
         self._last_request: ViewRequest | None = None
         self._preview: tuple[ViewRequest, Preview] | None = None
         self._renders = SceneRenders(lambda text: page.caption(f"{text} …"))
-        self._worker: NewestFirst[_Request, Layout | Preview] = NewestFirst(
+        self._worker: LatestRequestWorker[_Request, Layout | Preview] = LatestRequestWorker(
             self._process, self._handle_result, self._handle_error
         )
         self._make_controls()
@@ -286,7 +286,7 @@ class ScenePage:
             finest: PresetName = self._finest.value if self._finest.value in PRESETS else "exact"
             width = int(self._width.value) if self._width.value in _WIDTHS else 640
             self._last_request = ViewRequest(self._scene, self._index, self._pose, lights, width, finest)
-            self._worker.ask((self._last_request, self._playing))
+            self._worker.submit((self._last_request, self._playing))
 
     # Render thread
 
@@ -299,7 +299,7 @@ class ScenePage:
                 self._worker.wait(_INTERVAL)
         yield layout
         for preset in presets_up_to(view.finest):
-            if self._worker.wait(PAUSES[preset]):
+            if self._worker.wait(PRESET_DELAYS[preset]):
                 yield self._renders.render(view, preset)
 
     def _handle_result(self, request: _Request, result: Layout | Preview) -> None:

@@ -32,10 +32,10 @@ from mitsplat.scene.walls import ENCLOSURE
 
 Colour = tuple[int, int, int]
 
-HIDDEN_FIRST = frozenset({"meshes", "pieces", "colliders", "enclosure", "other cameras"})
+HIDDEN_AT_START = frozenset({"meshes", "pieces", "colliders", "enclosure", "other cameras"})
 """Groups that are hidden initially."""
 
-MOST_CAMERAS = 200
+MAX_CAMERAS = 200
 """Maximum number of evenly spaced camera frusta, and of frusta of the current layout."""
 
 _GREY, _WALL, _REGION, _LIGHT, _CAMERA, _OTHER = (
@@ -112,21 +112,21 @@ class Frustum:
     index: int
 
 
-Thing = ShownSplats | ShownMesh | Lines | ShownPoints | Frustum
+Drawable = ShownSplats | ShownMesh | Lines | ShownPoints | Frustum
 
 
 @dataclass(frozen=True, eq=False)
 class ShownPart:
-    """Displayed thing with its pose.
+    """Drawable with its pose.
 
     Attributes:
         name: Path in the tree of displayed parts, ``/group/name``.
-        thing: Displayed value.
-        pose: ``world_from_thing``, rotation and translation [m], shape (4, 4).
+        drawable: Geometry to display.
+        pose: ``world_from_drawable``, rotation and translation [m], shape (4, 4).
     """
 
     name: str
-    thing: Thing
+    drawable: Drawable
     pose: Float64Array = field(default_factory=lambda: np.eye(4))
 
     @property
@@ -135,18 +135,18 @@ class ShownPart:
         return self.name.split("/")[1]
 
 
-def same(one: Any, other: Any) -> bool:
-    """Return True if two things, or their fields, look the same, so that nothing must be sent again."""
+def look_same(one: Any, other: Any) -> bool:
+    """Return True if two drawables, or their fields, look the same, so that nothing must be sent again."""
     if one is other:
         return True
     if type(one) is not type(other):
         return False
     if isinstance(one, trimesh.Trimesh):
-        return same(np.asarray(one.vertices), np.asarray(other.vertices)) and same(
+        return look_same(np.asarray(one.vertices), np.asarray(other.vertices)) and look_same(
             np.asarray(one.faces), np.asarray(other.faces)
         )
     if is_dataclass(one):
-        return all(same(getattr(one, entry.name), getattr(other, entry.name)) for entry in fields(one))
+        return all(look_same(getattr(one, entry.name), getattr(other, entry.name)) for entry in fields(one))
     return np.array_equal(one, other)
 
 
@@ -258,9 +258,9 @@ def camera_parts(scene: Scene, index: int, layout: Layout | None) -> Iterator[Sh
     """Iterate over the cameras of the frames of the current layout, and of other frames at even intervals."""
     views = scene.spec.output.views
     own = range(index // views * views, (index // views + 1) * views)
-    spread = np.linspace(0, scene.num_frames - 1, min(scene.num_frames, MOST_CAMERAS)).astype(int)
+    spread = np.linspace(0, scene.num_frames - 1, min(scene.num_frames, MAX_CAMERAS)).astype(int)
     size = float(np.linalg.norm(np.subtract(scene.spec.region.max, scene.spec.region.min)))
-    for frame in sorted({*own[:MOST_CAMERAS], *spread.tolist()}):
+    for frame in sorted({*own[:MAX_CAMERAS], *spread.tolist()}):
         there = None if layout is None or frame not in own else layout_at_view(scene.spec, layout, frame % views)
         camera = view_of(scene, frame, there).camera
         group, colour = ("cameras", _CAMERA) if frame in own else ("other cameras", _OTHER)
@@ -271,8 +271,8 @@ def bounds_of(parts: Iterable[ShownPart]) -> Float64Array:
     """Return the minimum and maximum coordinates [m] of the central 96 % of splats and points, shape (2, 3)."""
     found = []
     for part in parts:
-        if isinstance(part.thing, ShownSplats | ShownPoints):
-            points = part.thing.splats.means if isinstance(part.thing, ShownSplats) else part.thing.points
+        if isinstance(part.drawable, ShownSplats | ShownPoints):
+            points = part.drawable.splats.means if isinstance(part.drawable, ShownSplats) else part.drawable.points
             if len(points):
                 low, high = np.percentile(points, (2, 98), axis=0)
                 corners = _corners(low, high) @ part.pose[:3, :3].T + part.pose[:3, 3]
@@ -288,7 +288,7 @@ def changes(
     Returns:
         Names to remove, parts to add, and parts of which only the pose changed.
     """
-    kept = {name for name, part in wanted.items() if name in shown and same(shown[name].thing, part.thing)}
+    kept = {name for name, part in wanted.items() if name in shown and look_same(shown[name].drawable, part.drawable)}
     moved = [wanted[name] for name in kept if not np.array_equal(shown[name].pose, wanted[name].pose)]
     return [name for name in shown if name not in kept], [wanted[n] for n in wanted if n not in kept], moved
 

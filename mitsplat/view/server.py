@@ -14,7 +14,7 @@ from mitsplat.view.page import Address, Page
 
 if TYPE_CHECKING:
     from mitsplat.view.scene_page import ScenePage
-    from mitsplat.view.still_pages import StillPage
+    from mitsplat.view.static_pages import StaticPage
 
 Kind = Literal["scene", "asset", "capture", "dataset", "splats"]
 
@@ -63,19 +63,19 @@ def serve(
         page.close()
 
 
-def _fill_page(page: Page, path: Path, kind: Kind, allow_outside: bool) -> ScenePage | StillPage:
+def _fill_page(page: Page, path: Path, kind: Kind, allow_outside: bool) -> ScenePage | StaticPage:
     """Fill the page with the content of a path; only the modules of its kind are imported, for a fast start."""
     if kind == "scene":
         from mitsplat.view.scene_page import ScenePage  # fast start: renders, physics
 
         return ScenePage(page, path, allow_outside=allow_outside)
-    from mitsplat.view import still_pages  # fast start: datasets and captures
+    from mitsplat.view import static_pages  # fast start: datasets and captures
 
     pages = {
-        "asset": still_pages.AssetPage,
-        "capture": still_pages.CapturePage,
-        "dataset": still_pages.DatasetPage,
-        "splats": still_pages.SplatsPage,
+        "asset": static_pages.AssetPage,
+        "capture": static_pages.CapturePage,
+        "dataset": static_pages.DatasetPage,
+        "splats": static_pages.SplatsPage,
     }
     return pages[kind](page, path)
 

@@ -22,8 +22,11 @@ from tests.detector.painted import CLASSES, HEIGHT, WIDTH, paint, write_coco, wr
 
 def masks_of(found: LabelledSet) -> list[list[tuple[str, np.ndarray]]]:
     return [
-        [(found.class_names[i.class_index], coco_mask.decode(i.encoded(s.width, s.height)) > 0) for i in s.instances]
-        for s in found.samples
+        [
+            (found.class_names[one.class_index], coco_mask.decode(one.encode_mask(sample.width, sample.height)) > 0)
+            for one in sample.instances
+        ]
+        for sample in found.samples
     ]
 
 
@@ -353,11 +356,11 @@ def test_image_files_are_read_with_any_name(tmp_path: Path) -> None:
 
 def test_the_digest_changes_with_images_and_labels(tmp_path: Path) -> None:
     root = write_yolo(tmp_path, {"train": 2})
-    first = read_set(root, "train").described()
-    assert first == read_set(root, "train").described()
+    first = read_set(root, "train").to_record()
+    assert first == read_set(root, "train").to_record()
     assert first["images"] == 2 and sum(first["instances"].values()) == sum(len(paint(seed)[1]) for seed in (0, 1))
     label = root / "labels/train/000001.txt"
     label.write_text(
         label.read_text().replace("0 ", "1 ", 1) if label.read_text()[0] == "0" else "0" + label.read_text()[1:]
     )
-    assert read_set(root, "train").described()["digest"] != first["digest"]
+    assert read_set(root, "train").to_record()["digest"] != first["digest"]

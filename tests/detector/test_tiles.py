@@ -31,7 +31,7 @@ def test_tiles_show_the_photograph_and_its_labels(tmp_path: Path) -> None:
             expected = [(name, mask[window]) for name, mask in shown if mask[window].sum() >= max(0.15 * mask.sum(), 1)]
             assert [cut.class_names[one.class_index] for one in sample.instances] == [name for name, _ in expected]
             for instance, (_, mask) in zip(sample.instances, expected, strict=True):
-                np.testing.assert_array_equal(fill_polygon(instance.outlined(), 64, 43), mask)
+                np.testing.assert_array_equal(fill_polygon(instance.outline_points(), 64, 43), mask)
                 rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
                 assert instance.box == (columns[0], rows[0], columns[-1] + 1, rows[-1] + 1)
 

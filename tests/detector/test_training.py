@@ -26,7 +26,7 @@ from mitsplat.detector.libraries import check_weights, load_weights
 from mitsplat.detector.mix import plan_images
 from mitsplat.detector.scores import average_precision
 from mitsplat.detector.sets import read_set
-from mitsplat.detector.training import RUN, Run, TrainSettings, open_run, train_detector, write_data
+from mitsplat.detector.training import RUN_FILE, Run, TrainSettings, open_run, train_detector, write_data
 from mitsplat.errors import InputError, MissingResourceError
 from mitsplat.storage.content_hash import file_hash
 from tests.conftest import contents
@@ -86,7 +86,7 @@ def no_libraries(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
         return SimpleNamespace(updates=len(job.plan), optimizer="AdamW", losses={}, resumed_at=0)
 
     steps = ModuleType("mitsplat.detector.fixed_steps")
-    vars(steps).update(LAST="weights/last.pt", Job=SimpleNamespace, train_job=train_job)
+    vars(steps).update(LAST_CHECKPOINT="weights/last.pt", Job=SimpleNamespace, train_job=train_job)
     steps.Job = lambda run, images, classes, plan, masks, step: SimpleNamespace(  # type: ignore[attr-defined]
         run=run, images=images, class_names=classes, plan=plan, masks=masks, step=step
     )
@@ -228,12 +228,12 @@ def test_invalid_training_data_is_refused_before_training(
     with pytest.raises(InputError, match=message) as told:
         train_detector(datasets, tmp_path / "run", settings, real=real)
     assert "\n" not in str(told.value) and not no_libraries
-    assert not (tmp_path / "run" / RUN).exists()
+    assert not (tmp_path / "run" / RUN_FILE).exists()
 
 
 def test_a_dataset_inside_of_the_run_folder_is_refused(no_libraries: list[dict[str, Any]], tmp_path: Path) -> None:
     write_yolo(tmp_path / "run/data", {"train": 2}, mitsplat=True)
-    (tmp_path / "run" / RUN).write_text(json.dumps({"settings": {}, "classes": ["a"], "masks": True}))
+    (tmp_path / "run" / RUN_FILE).write_text(json.dumps({"settings": {}, "classes": ["a"], "masks": True}))
     before = contents(tmp_path)
     (tmp_path / "link").symlink_to(tmp_path / "run/data")
     for dataset in (tmp_path / "run/data", tmp_path / "link"):
@@ -252,10 +252,10 @@ def test_an_unfinished_run_is_not_evaluated(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"must be the folder of `mitsplat train` \(there is no run.json\)"):
         open_run(tmp_path)
     record = {"settings": {}, "classes": ["a"], "masks": True, "finished": None}
-    (tmp_path / RUN).write_text(json.dumps(record))
+    (tmp_path / RUN_FILE).write_text(json.dumps(record))
     with pytest.raises(InputError, match="this training is not finished: run `mitsplat train` again"):
         open_run(tmp_path)
-    (tmp_path / RUN).write_text("{")
+    (tmp_path / RUN_FILE).write_text("{")
     with pytest.raises(InputError, match=r"run\.json: cannot be read"):
         open_run(tmp_path)
 

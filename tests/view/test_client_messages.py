@@ -13,7 +13,7 @@ import viser
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection, connect
 
-from mitsplat.view.client_messages import LARGEST, is_expected
+from mitsplat.view.client_messages import MAX_MESSAGE_BYTES, is_expected
 from mitsplat.view.page import Address, Page
 
 CAMERA: dict[str, Any] = {
@@ -158,7 +158,7 @@ def test_a_dropped_message_does_not_end_the_connection(page):
 def test_a_large_message_ends_its_own_connection_only(page):
     with joined(page) as other, joined(page) as browser:
         until(lambda: len(page._server.get_clients()) == 2)
-        browser.send(b"x" * (LARGEST + 1))
+        browser.send(b"x" * (MAX_MESSAGE_BYTES + 1))
         with pytest.raises(ConnectionClosed, match="1009"):
             while True:
                 browser.recv(timeout=20)

@@ -14,7 +14,7 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
 from mitsplat.errors import InputError, MissingResourceError
-from mitsplat.view.guard import MOST_BROWSERS, Guard, check_address, guarded
+from mitsplat.view.guard import MAX_BROWSERS, Guard, check_address, guarded
 from mitsplat.view.page import Address, Page
 
 TOKEN = "a-token"
@@ -42,7 +42,7 @@ PAGE = f"/{TOKEN}"
     ],
 )
 def test_a_local_page_is_asked_for_by_the_name_of_this_machine(host, origin, refused):
-    assert (Guard(TOKEN, local=True).refusal(PAGE, host, origin) is not None) == refused
+    assert (Guard(TOKEN, local=True).rejection_reason(PAGE, host, origin) is not None) == refused
 
 
 @pytest.mark.parametrize(
@@ -58,7 +58,7 @@ def test_a_local_page_is_asked_for_by_the_name_of_this_machine(host, origin, ref
     ],
 )
 def test_a_page_on_the_network_is_asked_for_by_any_name(host, origin, refused):
-    assert (Guard(TOKEN, local=False).refusal(PAGE, host, origin) is not None) == refused
+    assert (Guard(TOKEN, local=False).rejection_reason(PAGE, host, origin) is not None) == refused
 
 
 @pytest.mark.parametrize("local", [True, False])
@@ -82,11 +82,11 @@ def test_a_page_on_the_network_is_asked_for_by_any_name(host, origin, refused):
     ],
 )
 def test_the_address_has_the_token_and_nothing_else(path, refused, local):
-    assert (Guard(TOKEN, local).refusal(path, "localhost:1", None) is not None) == refused
+    assert (Guard(TOKEN, local).rejection_reason(path, "localhost:1", None) is not None) == refused
 
 
 def test_every_page_has_a_token_of_its_own():
-    guards = [Guard.of_host(host) for host in ("localhost", "localhost", "127.0.0.1", "0.0.0.0")]
+    guards = [Guard.for_host(host) for host in ("localhost", "localhost", "127.0.0.1", "0.0.0.0")]
     assert [guard.local for guard in guards] == [True, True, True, False]
     assert len({guard.token for guard in guards}) == 4
     assert all(len(guard.token) >= 20 for guard in guards)
@@ -189,7 +189,7 @@ def test_who_asks_for_nothing_is_not_logged(page, caplog):
 
 def test_only_so_many_browsers_are_connected(page):
     with ExitStack() as opened:
-        first = [opened.enter_context(browser(page, place(page))) for _ in range(MOST_BROWSERS)]
+        first = [opened.enter_context(browser(page, place(page))) for _ in range(MAX_BROWSERS)]
         with pytest.raises(InvalidStatus, match="503"):
             browser(page, place(page))
         assert answer(page, place(page)).status == 503
@@ -207,7 +207,8 @@ def test_the_address_of_a_number_of_version_6_has_brackets():
 
 
 def test_a_page_that_is_not_guarded_is_not_served():
-    with pytest.raises(MissingResourceError, match="access control does not work"), guarded(Guard.of_host("localhost")):
+    guard = Guard.for_host("localhost")
+    with pytest.raises(MissingResourceError, match="access control does not work"), guarded(guard):
         pass
 
 

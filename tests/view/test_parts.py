@@ -56,12 +56,12 @@ def test_a_scene_shows_everything_once(scene):
         *("splats", "meshes", "pieces", "shapes", "enclosure", "regions", "lights", "cameras", "other cameras"),
     }
     assert sum(part.group == "splats" for part in parts) == 2
-    frusta = [part.thing for part in parts if isinstance(part.thing, Frustum)]
+    frusta = [part.drawable for part in parts if isinstance(part.drawable, Frustum)]
     assert sorted(frustum.index for frustum in frusta) == list(range(scene.num_frames))
-    assert found["/cameras/3"].thing.index == 3
-    assert found["/other cameras/4"].thing.index == 4
+    assert found["/cameras/3"].drawable.index == 3
+    assert found["/other cameras/4"].drawable.index == 4
     assert sum(part.group == "enclosure" for part in parts) == 5
-    box = found["/regions/main"].thing.segments
+    box = found["/regions/main"].drawable.segments
     assert box.min(axis=(0, 1)) == pytest.approx(scene.spec.region.min)
     assert box.max(axis=(0, 1)) == pytest.approx(scene.spec.region.max)
     assert len(np.unique(np.sort(box.reshape(12, 6)), axis=0)) > 1
@@ -104,9 +104,9 @@ def test_lights_are_where_they_shine_from(scene):
     found = named(light_parts(lights))
     assert sorted(found) == ["/lights/0", "/lights/0-aim", "/lights/1", "/lights/1-aim", "/lights/2"]
     area = found["/lights/0"]
-    corners = area.thing.mesh.vertices @ area.pose[:3, :3].T + area.pose[:3, 3]
+    corners = area.drawable.mesh.vertices @ area.pose[:3, :3].T + area.pose[:3, 3]
     assert np.ptp(corners, axis=0) == pytest.approx([0.4, 0.2, 0])
-    spot = found["/lights/1"].thing.segments[:24].reshape(-1, 3)
+    spot = found["/lights/1"].drawable.segments[:24].reshape(-1, 3)
     assert np.degrees(np.arctan2(np.hypot(spot[:, 0], spot[:, 1]), spot[:, 2])) == pytest.approx(20)
     assert np.linalg.norm(spot, axis=1) == pytest.approx(0.15)
     assert found["/lights/2"].pose[:3, 3] == pytest.approx([0, 1, 1])
@@ -115,7 +115,7 @@ def test_lights_are_where_they_shine_from(scene):
 def test_the_path_of_a_light_is_a_line(scene_data, write_scene):
     scene_data["lights"][0]["path"] = [{"position": [0, 0, 1]}, {"intensity": 3}, {"position": [0, 1, 1]}]
     found = named(scene_parts(load_scene(write_scene(scene_data)), 0))
-    assert found["/lights/path-0"].thing.segments.tolist() == [[[0, 0, 1], [0.5, 0, 1]], [[0.5, 0, 1], [0, 1, 1]]]
+    assert found["/lights/path-0"].drawable.segments.tolist() == [[[0, 0, 1], [0.5, 0, 1]], [[0.5, 0, 1], [0, 1, 1]]]
 
 
 def test_a_large_cloud_is_thinned_and_covers_as_much():
@@ -162,5 +162,5 @@ def test_things_that_look_the_same_are_not_sent_again():
         "b": ShownPart("/b/b", ShownMesh(box_asset("x").mesh, (1, 1, 1))),
     }
     assert changes(one, other) == ([], [], [])
-    other["b"] = replace(other["b"], thing=ShownMesh(box_asset("x", (0.1, 0.1, 0.1)).mesh, (1, 1, 1)))
+    other["b"] = replace(other["b"], drawable=ShownMesh(box_asset("x", (0.1, 0.1, 0.1)).mesh, (1, 1, 1)))
     assert changes(one, other)[0] == ["b"]

@@ -9,7 +9,7 @@ from queue import Queue
 import pytest
 
 from mitsplat.errors import InputError
-from mitsplat.view.previews import NewestFirst, presets_up_to
+from mitsplat.view.previews import LatestRequestWorker, presets_up_to
 
 LONG = 20  # seconds, for what should take none
 
@@ -20,7 +20,7 @@ class Steps:
     def __init__(self) -> None:
         self.begun, self.told, self.refused = Queue[str](), Queue[str](), Queue[str]()
         self.go = threading.Semaphore(0)
-        self.worker = NewestFirst[str, str](
+        self.worker = LatestRequestWorker[str, str](
             self.work, lambda request, result: self.told.put(result), lambda error: self.refused.put(str(error))
         )
 
@@ -46,31 +46,31 @@ def steps() -> Iterator[Steps]:
 
 def test_a_request_sharpens_step_by_step(steps):
     steps.go.release(3)
-    steps.worker.ask("a")
+    steps.worker.submit("a")
     assert [steps.told.get(timeout=LONG) for _ in range(3)] == ["a0", "a1", "a2"]
 
 
 def test_the_newest_request_replaces_all_before_it(steps):
-    steps.worker.ask("a")
+    steps.worker.submit("a")
     assert steps.begun.get(timeout=LONG) == "a0"
-    steps.worker.ask("b")
-    steps.worker.ask("c")
+    steps.worker.submit("b")
+    steps.worker.submit("c")
     steps.go.release(4)
     assert [steps.told.get(timeout=LONG) for _ in range(4)] == ["a0", "c0", "c1", "c2"]
 
 
 def test_bad_input_is_told_and_the_next_request_is_worked_on(steps):
     steps.go.release(4)
-    steps.worker.ask("bad")
+    steps.worker.submit("bad")
     assert steps.refused.get(timeout=LONG) == "must be good"
-    steps.worker.ask("d")
+    steps.worker.submit("d")
     assert steps.told.get(timeout=LONG) == "d0"
     steps.worker.check()
 
 
 def test_a_fault_is_raised_where_it_is_looked_for(steps):
     steps.go.release(1)
-    steps.worker.ask("worse")
+    steps.worker.submit("worse")
     steps.worker._thread.join(LONG)
     with pytest.raises(RuntimeError, match="a fault"):
         steps.worker.check()
@@ -78,9 +78,9 @@ def test_a_fault_is_raised_where_it_is_looked_for(steps):
 
 def test_who_waits_within_a_request_is_woken_by_a_newer_one(steps):
     assert steps.worker.wait(0)
-    steps.worker.ask("a")
+    steps.worker.submit("a")
     steps.begun.get(timeout=LONG)
-    steps.worker.ask("b")
+    steps.worker.submit("b")
     assert not steps.worker.wait(LONG)
 
 

@@ -40,7 +40,7 @@ _CLICKS = {
 _COLOURS = {_PICK: (255, 210, 0), _PICK_NOT: (60, 120, 255), _REMOVE: (255, 60, 60)}
 
 
-class StillPage:
+class StaticPage:
     """Page with static content."""
 
     def close(self) -> None:
@@ -50,7 +50,7 @@ class StillPage:
         """Do nothing; static content has no later errors."""
 
 
-class AssetPage(StillPage):
+class AssetPage(StaticPage):
     """Page of an asset: its splats, mesh, convex pieces and keypoints."""
 
     def __init__(self, page: Page, folder: Path) -> None:
@@ -70,7 +70,7 @@ class AssetPage(StillPage):
         page.caption("\n\n".join(facts))
 
 
-class SplatsPage(StillPage):
+class SplatsPage(StaticPage):
     """Page of a splat file; units are unknown, and the usual up axis of the format is assumed."""
 
     def __init__(self, page: Page, path: Path) -> None:
@@ -86,7 +86,7 @@ class SplatsPage(StillPage):
         )
 
 
-class CapturePage(StillPage):
+class CapturePage(StaticPage):
     """Page of a capture: points, cameras, and the selected photo with its mask; a click picks a thing."""
 
     def __init__(self, page: Page, folder: Path) -> None:
@@ -145,7 +145,7 @@ class CapturePage(StillPage):
         chosen, self._picks = self._selected_parts(picks), picks
         parts = list(capture_parts(self._capture))
         if _CLICKS.get(self._click.value) is not None:  # a click on a camera would also pick
-            parts = [part for part in parts if not isinstance(part.thing, Frustum)]
+            parts = [part for part in parts if not isinstance(part.drawable, Frustum)]
         self._page.show([*parts, *chosen])
         self._show()
         words = " ".join(f"{option} {shlex.quote(pick)}" for option, pick in self._picks)
@@ -190,7 +190,7 @@ class CapturePage(StillPage):
         self._page.show_picture(image, f"{_literal(photo.name)}: observes {len(photo.seen)} points{masked}")
 
 
-class DatasetPage(StillPage):
+class DatasetPage(StaticPage):
     """Page of a dataset: images with their labels, and a filter."""
 
     def __init__(self, page: Page, folder: Path) -> None:
@@ -198,7 +198,7 @@ class DatasetPage(StillPage):
         if not len(self._index):
             raise InputError(f"{folder}: must have an image to be shown (got none)")
         self._lock = threading.RLock()
-        page.widen(_WIDE)  # the page has no other content
+        page.set_picture_width(_WIDE)  # the page has no other content
         gui, largest = page.gui, self._index.largest
         self._number = gui.add_slider("image", 0, 1, 1, 0)
         step = gui.add_button_group("step", ("previous", "next"))

@@ -17,7 +17,7 @@ from mitsplat.errors import InputError
 from mitsplat.view.dataset_index import DatasetIndex, Filter
 from mitsplat.view.page import Address, Page, splat_arrays
 from mitsplat.view.server import kind_of
-from mitsplat.view.still_pages import AssetPage, CapturePage, DatasetPage, SplatsPage, photo_picture
+from mitsplat.view.static_pages import AssetPage, CapturePage, DatasetPage, SplatsPage, photo_picture
 from tests.capture.isolation.balls import THINGS, capture_of_balls
 from tests.conftest import KnownObject, box_asset
 
@@ -127,7 +127,7 @@ def test_the_page_of_a_capture_shows_photos_with_their_masks(page, known_object:
         assert np.degrees(np.arccos(offset @ ahead / np.linalg.norm(offset))) < 35
     half = np.tan(frustum.fov / 2)
     depth = frustum.scale / np.cbrt(half * half * frustum.aspect / 3)  # as viser's client draws it
-    assert depth == pytest.approx(page._shown["/cameras/0"].thing.depth, rel=1e-5)
+    assert depth == pytest.approx(page._shown["/cameras/0"].drawable.depth, rel=1e-5)
     shown._clicked(3)
     assert page._caption.content.startswith("03\\.png")
     darkened, whole = (photo_picture(capture.photos[3], masked=masked).astype(int) for masked in (True, False))
@@ -156,7 +156,7 @@ def test_clicks_on_a_capture_pick_things(page, tmp_path):
     assert shown._summary.content == f"```\n--pick {pick}\n```"
     assert page._caption.content.startswith(pick.partition(".")[0])  # its photo is shown, with a cross
     assert (page._picture.image != 90).any()
-    points = page._shown["/chosen/object"].thing.points
+    points = page._shown["/chosen/object"].drawable.points
     assert np.linalg.norm(points[:, :2] - THINGS[1], axis=1).max() < 0.05
 
     click(1, "marks what is not the object")
@@ -165,7 +165,7 @@ def test_clicks_on_a_capture_pick_things(page, tmp_path):
 
     click(2, "removes a thing from the environment")
     assert shown._summary.content.count("--remove") == 1 and not page._alert.visible
-    points = page._shown["/chosen/removed"].thing.points
+    points = page._shown["/chosen/removed"].drawable.points
     assert np.linalg.norm(points[:, :2] - THINGS[2], axis=1).max() < 0.05
     shown._pointed(eye, np.array([0.0, 0.0, 1.0]))
     assert "there is no point of the capture at this position" in page._alert.content

@@ -46,7 +46,7 @@ def seeing(count: int = 60) -> tuple[Photo, np.ndarray]:
 
 
 @pytest.mark.parametrize("shift", [True, False])
-def test_line_is_found_among_a_third_of_outliers(shift: bool) -> None:
+def test_a_line_is_fitted_with_a_third_of_outliers(shift: bool) -> None:
     rng = np.random.default_rng(1)
     values = rng.uniform(1, 3, 90)
     wanted = 0.4 * values + 0.2 * shift + rng.normal(0, 1e-3, 90)
@@ -57,7 +57,7 @@ def test_line_is_found_among_a_third_of_outliers(shift: bool) -> None:
     assert abs(np.polyfit(values, wanted, 1)[1] - 0.2 * shift) > 0.1
 
 
-def test_exact_values_and_equal_ones() -> None:
+def test_a_line_is_fitted_to_exact_values_and_is_flat_for_equal_ones() -> None:
     values = np.array([1.0, 2, 4, 8])
     assert fit_line(values, 3 * values - 1, shift=True) == pytest.approx((3, -1))
     assert fit_line(np.full(9, 2.0), np.arange(9.0), shift=True)[0] == pytest.approx(0, abs=1e-12)
@@ -65,7 +65,7 @@ def test_exact_values_and_equal_ones() -> None:
 
 @pytest.mark.parametrize("kind", ["inverse", "metric"])
 @pytest.mark.parametrize("size", [(WIDTH, HEIGHT), (256, 192), (32, 24)])
-def test_maps_come_to_the_depths_of_what_the_photo_shows(kind: DepthKind, size: tuple[int, int]) -> None:
+def test_maps_are_aligned_with_the_depths_of_points(kind: DepthKind, size: tuple[int, int]) -> None:
     """Of a map of any size, scale and, if it is inverse, shift."""
     photo, points = seeing()
     truth = floor_depth(CAMERA, *size)
@@ -79,7 +79,7 @@ def test_maps_come_to_the_depths_of_what_the_photo_shows(kind: DepthKind, size: 
     np.testing.assert_allclose(found[known], 1 / truth[known], rtol=1e-4)
 
 
-def test_far_away_is_no_negative_inverse_depth() -> None:
+def test_infinite_distance_gives_no_negative_inverse_depth() -> None:
     photo, points = seeing()
     values = (1 / floor_depth(CAMERA, WIDTH, HEIGHT)).astype(np.float32)
     values[0] = -9
@@ -87,7 +87,7 @@ def test_far_away_is_no_negative_inverse_depth() -> None:
     assert not isinstance(found, str) and (found[0] == 0).all() and found.min() == 0
 
 
-def test_maps_that_say_nothing_are_left_out_by_name() -> None:
+def test_maps_without_information_are_omitted_by_name() -> None:
     truth = floor_depth(CAMERA, WIDTH, HEIGHT).astype(np.float32)
     photo, points = seeing()
     for count in (0, 9):
@@ -104,7 +104,7 @@ def test_maps_that_say_nothing_are_left_out_by_name() -> None:
         )
 
 
-def test_all_maps_of_a_capture(tmp_path: Path) -> None:
+def test_all_maps_of_a_capture_are_aligned(tmp_path: Path) -> None:
     photo, points = seeing()
     (tmp_path / "a").mkdir()
     np.save(tmp_path / "a/floor.npy", 1 / floor_depth(CAMERA, WIDTH, HEIGHT))
@@ -121,7 +121,7 @@ def test_all_maps_of_a_capture(tmp_path: Path) -> None:
     )
 
 
-def test_maps_are_found_by_the_names_of_a_captures_files(tmp_path: Path) -> None:
+def test_maps_are_found_by_the_file_names_of_the_capture(tmp_path: Path) -> None:
     photo = replace(seeing()[0], file=Path("images/a__floor.jpg"))
     (tmp_path / "a__floor.tif").touch()
     assert find_maps(tmp_path, [photo], "metric") == DepthMaps({photo.name: tmp_path / "a__floor.tif"}, "metric")
@@ -158,7 +158,7 @@ def test_every_format_gives_the_same_values(tmp_path: Path) -> None:
         np.testing.assert_array_equal(read_map(tmp_path / name), values, err_msg=name)
 
 
-def test_files_that_are_no_maps_are_refused_in_a_sentence(tmp_path: Path) -> None:
+def test_files_that_are_not_maps_are_refused_in_one_sentence(tmp_path: Path) -> None:
     for suffix in ("png", "npy", "exr", "tiff"):
         path = tmp_path / f"bad.{suffix}"
         path.write_bytes(b"nothing")
@@ -181,7 +181,7 @@ def test_files_that_are_no_maps_are_refused_in_a_sentence(tmp_path: Path) -> Non
         (np.full((48, 64), -1.0), "metric", r"a\.npy: depths must be >= 0 \(got -1\)"),
     ],
 )
-def test_maps_that_cannot_be_of_their_photo_are_refused(
+def test_maps_that_do_not_fit_their_photo_are_refused(
     values: np.ndarray, kind: DepthKind, text: str, tmp_path: Path
 ) -> None:
     photo, points = seeing()
@@ -190,7 +190,7 @@ def test_maps_that_cannot_be_of_their_photo_are_refused(
         align_maps([photo], points, DepthMaps({photo.name: tmp_path / "a.npy"}, kind), 64)
 
 
-def test_sizes_are_changed_without_mixing_in_what_is_unknown() -> None:
+def test_resized_maps_ignore_unknown_pixels() -> None:
     values = np.full((4, 6), 2, np.float32)
     values[:, 0] = values[:2, 2:4] = np.nan
     half = resize_map(values, 3, 2)
@@ -229,7 +229,7 @@ def ramp(height: int, width: int) -> np.ndarray:
         ([1, 3, None, None], "tensor(float16)", (518, 686), (300, 400)),
     ],
 )
-def test_network_sees_the_picture_as_it_was_trained(
+def test_the_network_gets_a_normalised_picture_of_its_size(
     shape: list[Any], kind: str, seen: tuple[int, int], kept: tuple[int, int]
 ) -> None:
     """Normalised as ImageNet, edges multiples of 14; the map comes back in the photo's aspect."""
@@ -265,7 +265,7 @@ def photo(tmp_path: Path) -> Photo:
     return Photo("a.png", tmp_path / "a.png", CAMERA)
 
 
-def test_maps_are_kept_until_photo_or_network_change(
+def test_maps_are_reused_until_photo_or_network_change(
     photo: Photo, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     model, session = tmp_path / "any.onnx", Session([1, 3, 28, 42])
@@ -282,7 +282,7 @@ def test_maps_are_kept_until_photo_or_network_change(
     assert len(session.given) == 3
 
 
-def test_network_of_a_file(photo: Photo, tmp_path: Path) -> None:
+def test_a_network_file_is_run_by_onnxruntime(photo: Photo, tmp_path: Path) -> None:
     """A convolution that is the red channel, run by onnxruntime."""
     pytest.importorskip("onnxruntime")
     onnx = pytest.importorskip("onnx")
@@ -303,7 +303,9 @@ def test_network_of_a_file(photo: Photo, tmp_path: Path) -> None:
         model_maps([photo], tmp_path / "bad.onnx", tmp_path / "maps")
 
 
-def test_what_a_network_needs_is_named(photo: Photo, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_files_and_libraries_of_a_network_are_named(
+    photo: Photo, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     with pytest.raises(InputError, match=r"gone\.onnx: no such file"):
         model_maps([photo], tmp_path / "gone.onnx", tmp_path)
     (tmp_path / "any.onnx").write_bytes(b"weights")

@@ -91,7 +91,7 @@ def fitted(capture: Capture, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_fit_shows_photos_that_it_has_not_seen(capture: Capture, tmp_path: Path) -> None:
+def test_a_fit_has_24_db_on_photos_that_were_held_out(capture: Capture, tmp_path: Path) -> None:
     states: list[FitProgress] = []
     settings = FitSettings(gaussians=900, iterations=300, sh_degree=1, refine_every=20, coarse=0.0, rate_sh=0.01)
     result = fit_capture(capture, tmp_path, settings, progress=states.append)
@@ -106,7 +106,7 @@ def test_fit_shows_photos_that_it_has_not_seen(capture: Capture, tmp_path: Path)
     assert layers.alpha[inside].mean() > 0.97 and layers.alpha[outside].mean() < 0.02
 
 
-def test_folder_holds_splats_record_and_comparisons(fitted: Path, capture: Capture) -> None:
+def test_the_folder_has_splats_record_and_comparisons(fitted: Path, capture: Capture) -> None:
     record = json.loads((fitted / "fit.json").read_text())
     assert record["gaussians"] == len(Splats.load(fitted / "splats.ply")) and record["iterations"] == 60
     assert record["units"] == "metre" and record["settings"]["masks"] == "alpha"
@@ -118,7 +118,7 @@ def test_folder_holds_splats_record_and_comparisons(fitted: Path, capture: Captu
     assert not (fitted / "checkpoint.npz").exists()
 
 
-def test_finished_fit_is_read_and_not_made_again(fitted: Path, capture: Capture) -> None:
+def test_a_finished_fit_is_reused(fitted: Path, capture: Capture) -> None:
     before = (fitted / "splats.ply").stat().st_mtime_ns
     again = fit_capture(capture, fitted, SMALL)
     assert (fitted / "splats.ply").stat().st_mtime_ns == before
@@ -126,7 +126,7 @@ def test_finished_fit_is_read_and_not_made_again(fitted: Path, capture: Capture)
 
 
 @pytest.mark.parametrize("strategy", [None, Classic])
-def test_interrupted_fit_goes_on_to_the_same_bytes(
+def test_an_interrupted_fit_resumes_to_the_same_bytes(
     capture: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, strategy: type[Classic] | None
 ) -> None:
     """A given densification takes part with its state."""
@@ -155,7 +155,7 @@ def test_interrupted_fit_goes_on_to_the_same_bytes(
     assert (out / "splats.ply").read_bytes() == (tmp_path / "whole" / "splats.ply").read_bytes()
 
 
-def test_interrupted_fit_ends_at_its_target_where_it_would_have(
+def test_an_interrupted_fit_ends_at_its_target_at_the_same_step(
     capture: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It looks every 10 steps, also after an interruption in between."""
@@ -185,19 +185,19 @@ def test_interrupted_fit_ends_at_its_target_where_it_would_have(
     assert (tmp_path / "again/splats.ply").read_bytes() == (tmp_path / "whole/splats.ply").read_bytes()
 
 
-def test_no_fit_has_more_gaussians_than_asked_for(capture: Capture, tmp_path: Path) -> None:
+def test_a_fit_has_no_more_gaussians_than_its_limit(capture: Capture, tmp_path: Path) -> None:
     counts: list[int] = []
     settings = replace(SMALL, gaussians=700, refine_every=5)
     fit_capture(capture, tmp_path, settings, progress=lambda state: counts.append(state.gaussians))
     assert counts[0] > 600 and max(counts) == 700
 
 
-def test_another_seed_gives_other_splats(fitted: Path, capture: Capture, tmp_path: Path) -> None:
+def test_another_seed_changes_the_splats(fitted: Path, capture: Capture, tmp_path: Path) -> None:
     fit_capture(capture, tmp_path, replace(SMALL, seed=1))
     assert (tmp_path / "splats.ply").read_bytes() != (fitted / "splats.ply").read_bytes()
 
 
-def test_folder_of_another_fit_is_refused_unless_overwritten(fitted: Path, capture: Capture, tmp_path: Path) -> None:
+def test_the_folder_of_another_fit_is_refused_without_overwrite(fitted: Path, capture: Capture, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"fit\.json: belongs to a fit of other photos or settings"):
         fit_capture(capture, fitted, replace(SMALL, seed=2))
     (tmp_path / "checkpoint.npz").write_bytes(b"nothing")
@@ -207,7 +207,7 @@ def test_folder_of_another_fit_is_refused_unless_overwritten(fitted: Path, captu
     assert json.loads((tmp_path / "fit.json").read_text())["iterations"] == 5
 
 
-def test_more_gaussians_take_no_new_kernels(capture: Capture, tmp_path: Path) -> None:
+def test_more_gaussians_compile_no_new_kernels(capture: Capture, tmp_path: Path) -> None:
     """Nor do depths, whatever number of Gaussians or points a photo shows."""
     seen: list[set[int]] = []
     counts: list[int] = []
@@ -226,7 +226,7 @@ def test_more_gaussians_take_no_new_kernels(capture: Capture, tmp_path: Path) ->
     assert seen[2] and seen[3] and seen[2] | seen[3] <= seen[0] | seen[1]
 
 
-def test_photos_get_the_exposures_that_they_were_taken_with(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_fitted_exposures_equal_those_of_the_photos(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fit, "_CHECKPOINT_SECONDS", 0.0)
     gains = np.random.default_rng(1).uniform(0.5, 1.0, (VIEWS, 1))
     varied = photograph(tmp_path, gains=gains)
@@ -246,7 +246,7 @@ def test_photos_get_the_exposures_that_they_were_taken_with(tmp_path: Path, monk
     np.testing.assert_allclose(learned[0].mean(axis=0), np.eye(3, 4), atol=1e-5)
 
 
-def test_corrections_are_shifted_to_the_identity_as_their_mean() -> None:
+def test_the_mean_of_the_exposure_corrections_is_the_identity() -> None:
     ensure_variant()
     table = np.random.default_rng(2).normal(size=(12, 7)).astype(np.float32)
     found = np.array(fit._centre_exposure(mi.Float(table.ravel()), 7)).reshape(12, 7)
@@ -254,7 +254,7 @@ def test_corrections_are_shifted_to_the_identity_as_their_mean() -> None:
     np.testing.assert_allclose(np.diff(found, axis=1), np.diff(table, axis=1), atol=1e-5)
 
 
-def test_fit_keeps_to_its_time(capture: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_fit_ends_within_its_time_limit(capture: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """On a clock that goes on by 10 ms whenever it is read."""
     now = itertools.count()
     monkeypatch.setattr(fit.time, "monotonic", lambda: 0.01 * next(now))
@@ -263,7 +263,7 @@ def test_fit_keeps_to_its_time(capture: Capture, tmp_path: Path, monkeypatch: py
     assert short.validation == ()
 
 
-def test_fit_ends_at_its_target_on_photos_apart_from_those_reported(capture: Capture, tmp_path: Path) -> None:
+def test_the_target_is_measured_on_photos_other_than_those_held_out(capture: Capture, tmp_path: Path) -> None:
     """What is held out may be replaced by noise: it moves what is reported, and neither splats nor end."""
     settings = replace(SMALL, iterations=400, target_psnr=12.0)
     early = fit_capture(capture, tmp_path / "early", settings)
@@ -282,7 +282,7 @@ def test_fit_ends_at_its_target_on_photos_apart_from_those_reported(capture: Cap
 
 
 @pytest.mark.parametrize("masks", ["ignore", "off"])
-def test_only_what_is_asked_for_is_read_of_the_masks(capture: Capture, tmp_path: Path, masks: str) -> None:
+def test_masks_are_used_only_as_the_setting_states(capture: Capture, tmp_path: Path, masks: str) -> None:
     """The wall is another one in every photo: its mean is the best that a fit of all pixels can show."""
     settings = replace(SMALL, masks=masks, iterations=30, coarse=0.0)  # type: ignore[arg-type]
     result = fit_capture(capture, tmp_path, settings)
@@ -303,7 +303,7 @@ def seeing(capture: Capture) -> Capture:
     return replace(capture, photos=photos)
 
 
-def test_what_is_hidden_takes_no_part(capture: Capture, tmp_path: Path) -> None:
+def test_pixels_that_may_be_hidden_do_not_change_the_fit(capture: Capture, tmp_path: Path) -> None:
     """Splats are the same whatever stands before the object, and nothing is missing behind it."""
     veil = np.zeros((HEIGHT, WIDTH), dtype=bool)
     veil[:, 24:34] = True
@@ -334,14 +334,14 @@ def test_what_is_hidden_takes_no_part(capture: Capture, tmp_path: Path) -> None:
     assert layers.alpha[behind].mean() > 0.9
 
 
-def test_depths_of_points_take_part(capture: Capture, tmp_path: Path) -> None:
+def test_depths_of_points_move_the_surface(capture: Capture, tmp_path: Path) -> None:
     settings = replace(SMALL, iterations=20, coarse=0.0, depth_weight=1.0)
     with_depths = fit_capture(seeing(capture), tmp_path / "with", settings).splats
     without = fit_capture(seeing(capture), tmp_path / "without", replace(settings, depth_weight=0.0)).splats
     assert np.abs(with_depths.means - without.means).max() > 1e-5
 
 
-def test_of_points_in_one_pixel_the_nearest_counts(capture: Capture) -> None:
+def test_the_nearest_of_several_points_in_a_pixel_counts(capture: Capture) -> None:
     """Gradients of several would be added in any order, and no two fits would be the same."""
     ensure_variant()
     camera = look(np.array([1.0, 0, 0]))
@@ -367,7 +367,7 @@ def depth_maps(capture: Capture, folder: Path) -> DepthMaps:
     return DepthMaps(files)
 
 
-def test_maps_take_the_place_of_points(capture: Capture, tmp_path: Path) -> None:
+def test_depth_maps_replace_points(capture: Capture, tmp_path: Path) -> None:
     """A map knows every pixel of the object, the points only theirs."""
     photo = seeing(capture).training[0]
     maps = depth_maps(capture, tmp_path)
@@ -382,7 +382,7 @@ def test_maps_take_the_place_of_points(capture: Capture, tmp_path: Path) -> None
         assert np.median(np.abs(found * depth - 1)) < 0.02
 
 
-def test_maps_move_the_surface_and_are_part_of_the_fit(capture: Capture, tmp_path: Path) -> None:
+def test_depth_maps_move_the_surface_and_are_hashed_as_inputs(capture: Capture, tmp_path: Path) -> None:
     settings = replace(SMALL, iterations=20, coarse=0.0, depth_weight=1.0)
     photos, maps = seeing(capture), depth_maps(capture, tmp_path)
     few = replace(photos.photos[1], seen=photos.photos[1].seen[:5])
@@ -402,7 +402,7 @@ def test_maps_move_the_surface_and_are_part_of_the_fit(capture: Capture, tmp_pat
         fit_capture(photos, tmp_path / "fit", settings, depths=maps)
 
 
-def test_weight_of_maps_falls_and_that_of_points_does_not(capture: Capture) -> None:
+def test_the_weight_of_maps_decays_and_that_of_points_does_not(capture: Capture) -> None:
     ensure_variant()
     photo = capture.training[0]
     state = fit._Fit(capture, (photo,), (photo,), replace(SMALL, depth_weight=2.0), {})
@@ -415,7 +415,7 @@ def test_weight_of_maps_falls_and_that_of_points_does_not(capture: Capture) -> N
     assert state._depth_weight(dense, 0.0) == 0
 
 
-def test_depth_error_is_the_difference_of_inverse_depths_that_are_known() -> None:
+def test_depth_error_is_the_difference_of_known_inverse_depths() -> None:
     ensure_variant()
     camera = replace(look(np.ones(3)), width=2, height=2)
     alpha, moment = mi.Float([1.0, 0.5, 0.05, 1.0]), mi.Float([2.0, 2.0, 1.0, 5.0])
@@ -452,14 +452,14 @@ def seeds(capture: Capture, points: np.ndarray, *, masked: bool = True) -> np.nd
     return seed_points(points, colours, cameras, nothing, masks, np.random.default_rng(0), 10_000)[0]
 
 
-def test_seeds_are_the_points_inside_the_masks(capture: Capture) -> None:
+def test_initial_gaussians_are_the_points_inside_the_masks(capture: Capture) -> None:
     inside = np.random.default_rng(1).normal(size=(600, 3))
     inside *= 0.35 / np.linalg.norm(inside, axis=1, keepdims=True)
     outside = inside + np.array([0, 0, 1.3])
     np.testing.assert_array_equal(seeds(capture, np.concatenate([inside, outside])), inside)
 
 
-def test_without_points_the_hull_of_the_masks_is_filled(capture: Capture) -> None:
+def test_without_points_the_visual_hull_is_filled(capture: Capture) -> None:
     radius = np.linalg.norm(seeds(capture, np.zeros((0, 3))), axis=1)
     assert len(radius) > 1000 and np.percentile(radius, 95) < 0.6
     free = seeds(capture, np.zeros((0, 3)), masked=False)

@@ -134,7 +134,7 @@ def interrupted(fits: Fits, out: Path, place: int) -> bool:
     return False
 
 
-def test_a_fit_that_replaces_another_may_be_interrupted_anywhere(fits: Fits, tmp_path: Path) -> None:
+def test_a_replacing_fit_interrupted_anywhere_ends_in_the_same_bytes(fits: Fits, tmp_path: Path) -> None:
     """After each step and each change of the folder; whichever way it is run again, it ends in the same bytes."""
     left, place = [], 1
     while interrupted(fits, out := tmp_path / str(place), place):
@@ -153,7 +153,7 @@ def test_a_fit_that_replaces_another_may_be_interrupted_anywhere(fits: Fits, tmp
 
 
 @pytest.mark.parametrize("place", [2, 7, 12])
-def test_an_asset_whose_fit_was_interrupted_goes_on(
+def test_an_asset_with_an_interrupted_fit_resumes_to_the_same_bytes(
     fits: Fits, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, place: int
 ) -> None:
     """`asset` has no --overwrite to be told of: settings that changed, an interruption, the same command again."""
@@ -181,7 +181,9 @@ def test_an_asset_whose_fit_was_interrupted_goes_on(
 
 @pytest.mark.cpu(reason="the processes that are ended fit on the CPU, and their fit goes on in this one")
 @pytest.mark.parametrize(("place", "how"), [(1, "SIGINT"), (10, "SIGKILL")])
-def test_processes_that_are_ended(fits: Fits, tmp_path: Path, place: int, how: str) -> None:
+def test_a_fit_process_that_is_killed_resumes_to_the_same_bytes(
+    fits: Fits, tmp_path: Path, place: int, how: str
+) -> None:
     """As by Ctrl-C, or by the kernel when memory runs out; what they leave is what any process can go on with."""
     out = Path(shutil.copytree(fits.old, tmp_path / "out"))
     names = {"tests": str(Path(__file__).parents[2]), "capture": str(fits.old.parent / "capture"), "out": str(out)}
@@ -200,7 +202,7 @@ def test_processes_that_are_ended(fits: Fits, tmp_path: Path, place: int, how: s
     assert fits.is_new(out)
 
 
-def test_what_is_damaged_is_replaced_if_that_is_asked_for(fits: Fits, tmp_path: Path) -> None:
+def test_damaged_files_are_replaced_with_overwrite(fits: Fits, tmp_path: Path) -> None:
     for name, content in (("splats.ply", None), ("splats.ply", b"ply"), ("fit.json", b"[]"), ("checkpoint.npz", b"")):
         out = Path(shutil.copytree(fits.new, tmp_path / "out"))
         (out / name).unlink(missing_ok=True)

@@ -45,7 +45,7 @@ def fitted(capture: Capture, folder: Path, matrix: np.ndarray, settings: FitSett
     return fit_capture(capture, folder / "still", settings), moved
 
 
-def test_larger_by_a_power_of_two_is_the_same_to_the_bit(capture: Capture, tmp_path: Path) -> None:
+def test_scaling_by_a_power_of_two_changes_no_bit_of_a_fit(capture: Capture, tmp_path: Path) -> None:
     still, moved = fitted(capture, tmp_path, similarity(4, (0, 0, 0)), SMALL)
     assert len(still.splats) > 600 and moved.psnr == still.psnr
     for name, factor in (("means", 4), ("scales", 4), ("quats", 1), ("opacities", 1), ("sh", 1)):
@@ -53,7 +53,7 @@ def test_larger_by_a_power_of_two_is_the_same_to_the_bit(capture: Capture, tmp_p
         np.testing.assert_array_equal(getattr(moved.splats, name), expected, err_msg=name)
 
 
-def test_moved_and_larger_is_the_same_within_a_step_of_the_optimiser(capture: Capture, tmp_path: Path) -> None:
+def test_moving_and_scaling_changes_a_fit_by_less_than_an_optimiser_step(capture: Capture, tmp_path: Path) -> None:
     matrix = similarity(1.7, (1, -2, 0.5))
     still, moved = fitted(capture, tmp_path, matrix, replace(SMALL, iterations=20, refine_every=5))
     splats, expected = moved.splats, still.splats.transformed(matrix)
@@ -72,7 +72,7 @@ def test_moved_and_larger_is_the_same_within_a_step_of_the_optimiser(capture: Ca
         assert steps.max() < 2 and (steps > 1 + 1e-6).mean() < 0.002
 
 
-def test_turned_is_as_like_as_another_seed(capture: Capture, tmp_path: Path) -> None:
+def test_rotating_changes_a_fit_no_more_than_another_seed(capture: Capture, tmp_path: Path) -> None:
     settings = replace(SMALL, iterations=40, rate_sh=0.01)
     matrix = similarity(1.7, (1, -2, 0.5), Rotation.from_rotvec([0.7, -0.4, 1.1]))
     still, moved = fitted(capture, tmp_path, matrix, settings)

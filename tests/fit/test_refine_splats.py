@@ -32,7 +32,7 @@ def error(splats: Splats, truth: Splats, camera: Camera) -> float:
     return float(np.mean((picture(splats, camera).rgb - picture(truth, camera).rgb) ** 2))
 
 
-def test_fit_comes_back_to_disturbed_splats_and_generalises() -> None:
+def test_refinement_recovers_disturbed_splats_on_unseen_views() -> None:
     truth = make_splats(60, 41, bands=4)
     rng = np.random.default_rng(0)
     start = replace(
@@ -49,6 +49,6 @@ def test_fit_comes_back_to_disturbed_splats_and_generalises() -> None:
     assert error(fitted, truth, unseen) < 0.15 * error(start, truth, unseen)
 
 
-def test_fit_without_pictures_is_refused() -> None:
+def test_refinement_without_pictures_is_refused() -> None:
     with pytest.raises(ValueError, match="pictures"):
         refine_splats(make_splats(2), [])

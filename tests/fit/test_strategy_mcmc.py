@@ -18,7 +18,7 @@ from tests.renderer.test_render import CAMERA, make_splats
 
 @pytest.mark.parametrize("copies", [1, 2, 3, 7, 20])
 @pytest.mark.parametrize("opacity", [0.05, 0.5, 0.97])
-def test_copies_absorb_along_a_line_what_one_did(copies: int, opacity: float) -> None:
+def test_copies_absorb_as_much_light_along_a_line_as_one_gaussian(copies: int, opacity: float) -> None:
     """Integral over x of 1 - (1 - o' exp(-x^2 / 2 s^2))^n equals that of o exp(-x^2 / 2)."""
     (own,), (factor,) = split_opacity(np.array([opacity]), np.array([copies]))
     x = np.linspace(-12, 12, 20001)
@@ -33,7 +33,7 @@ def model() -> GaussianModel:
     return GaussianModel(replace(splats, opacities=np.where(np.arange(40) < 10, 0.001, splats.opacities)), 1.0)
 
 
-def test_model_gives_back_what_it_was_given() -> None:
+def test_a_model_returns_its_splats_unchanged() -> None:
     ensure_variant()
     splats = make_splats(12, 3, bands=4)
     again = GaussianModel(splats, 0.7).splats()
@@ -41,7 +41,7 @@ def test_model_gives_back_what_it_was_given() -> None:
         np.testing.assert_allclose(getattr(again, name), getattr(splats, name), rtol=2e-5, atol=1e-6, err_msg=name)
 
 
-def test_dead_gaussians_go_where_others_are() -> None:
+def test_dead_gaussians_are_moved_onto_live_ones() -> None:
     own = model()
     own.second["means"] = own.second["means"] + 1
     before = own.splats()
@@ -57,7 +57,7 @@ def test_dead_gaussians_go_where_others_are() -> None:
     assert (moments[:10] == 0).all() and 0 < (moments[10:, 0] == 0).sum() < 30
 
 
-def test_growing_keeps_the_picture_and_reaches_the_count() -> None:
+def test_growing_keeps_the_picture_and_reaches_the_requested_count() -> None:
     own = model()
     picture = render_splats(own.splats(), CAMERA).rgb
     grow(own, 55, np.random.default_rng(0))
@@ -95,7 +95,7 @@ def test_gradients_and_rates_move_parameters_as_adam_does() -> None:
     np.testing.assert_allclose(np.array(own.values["means"]), before - 1e-3 * np.sign(weight), atol=1e-6)
 
 
-def test_gaussians_at_the_camera_stay_finite_and_where_they_are() -> None:
+def test_gaussians_at_the_camera_stay_finite_and_do_not_move() -> None:
     ensure_variant()
     from mitsplat.plugins.splat_proxy import view_of
     from mitsplat.renderer.differentiation.backward import render_differentiable

@@ -34,7 +34,7 @@ def photos(tmp_path: Path) -> list[Photo]:
     return made
 
 
-def test_windows_hold_the_object_and_are_of_one_size(photos: list[Photo]) -> None:
+def test_windows_contain_the_object_and_have_the_same_size(photos: list[Photo]) -> None:
     windows = object_windows(photos)
     assert windows[-1] is None
     for window, (x0, y0, x1, y1) in zip(windows, BOXES.values(), strict=False):
@@ -46,7 +46,7 @@ def test_windows_hold_the_object_and_are_of_one_size(photos: list[Photo]) -> Non
     assert object_windows(photos) == [None] * 4  # one needs all of it, and so do others of its size
 
 
-def test_a_window_shows_what_the_photo_shows_there(photos: list[Photo]) -> None:
+def test_a_window_has_the_pixels_of_the_photo(photos: list[Photo]) -> None:
     photo, window = photos[1], (50, 20, 100, 60)
     whole, mask = photo.picture()
     part, cut = photo.picture(window=window)
@@ -60,7 +60,7 @@ def test_a_window_shows_what_the_photo_shows_there(photos: list[Photo]) -> None:
     np.testing.assert_allclose(photo.camera.cropped(*window).project(points)[0], pixels - (50, 20), atol=1e-9)
 
 
-def test_a_fit_sees_the_window_as_finely_as_its_size_allows(photos: list[Photo]) -> None:
+def test_a_window_is_scaled_to_the_size_of_the_fit(photos: list[Photo]) -> None:
     depth = np.arange(20_000, dtype=np.float32).reshape(100, 200)
     view = _training_view(photos[1], FitSettings(size=80), depth, (50, 20, 100, 60))
     assert (view.camera.width, view.camera.height, view.half.camera.width) == (80, 48, 40)

@@ -192,7 +192,7 @@ def png(path: Path) -> np.ndarray:
     return cv2.cvtColor(picture, cv2.COLOR_BGR2RGB) if picture.ndim == 3 else picture
 
 
-def test_the_layouts_are_what_they_say(written: Written) -> None:
+def test_the_drawn_layouts_have_their_stated_occlusions(written: Written) -> None:
     by_name = dict(zip(LAYOUTS, written.frames, strict=True))
     assert [label.truncation > 0.3 for label in by_name["cut by the border"].labels.instances] == [True] * 3
     assert by_name["seen through a hole"].labels.instances[0].visible_fraction < 0.4
@@ -209,7 +209,7 @@ def test_the_layouts_are_what_they_say(written: Written) -> None:
 
 
 class TestYolo:
-    def test_segments(self, written: Written) -> None:
+    def test_segments_fill_to_the_masks(self, written: Written) -> None:
         for frame, record in written.pairs:
             text = (written.root / f"labels/{record['split']}/{record['index']:06d}.txt").read_text()
             if not frame.labels.instances:
@@ -227,7 +227,7 @@ class TestYolo:
                 else:  # a bridge crosses what hides the instance, and is painted by readers
                     assert np.count_nonzero(back & ~mask) <= 20
 
-    def test_boxes(self, written: Written) -> None:
+    def test_boxes_equal_those_of_the_labels(self, written: Written) -> None:
         for frame, rows in self.rows(written, "yolo-detect"):
             for label, (kind, x, y, width, height) in zip(frame.labels.instances, rows, strict=True):
                 assert kind == label.class_index
@@ -247,14 +247,14 @@ class TestYolo:
                 for x, y in zip(xs, ys, strict=True):
                     assert cv2.pointPolygonTest(corners.astype(np.float32), (x + 0.5, y + 0.5), True) >= 0.45
 
-    def test_a_turned_bar_has_a_box_of_its_own_size(self) -> None:
+    def test_a_rotated_bar_has_a_rotated_box_of_its_size(self) -> None:
         ids = np.zeros((HEIGHT, WIDTH), dtype=np.uint8)
         cv2.fillPoly(ids, [cv2.boxPoints(((80, 60), (80, 20), 30)).astype(np.int32)], 1)
         frame = frame_of(Drawn({1: (ids > 0, 0, 0)}), 0)
         _, size, _ = cv2.minAreaRect(rotated_box(frame.labels.instances[0]).astype(np.float32))
         np.testing.assert_allclose(sorted(size), (21, 81), atol=1.5)
 
-    def test_keypoints(self, written: Written) -> None:
+    def test_keypoints_have_position_and_visibility(self, written: Written) -> None:
         seen = set()
         for frame, rows in self.rows(written, "yolo-pose"):
             for label, row in zip(frame.labels.instances, rows, strict=True):
@@ -306,7 +306,7 @@ class TestYolo:
 
 class TestCoco:
     @pytest.mark.parametrize("name", ["instances", "amodal"])
-    def test_masks(self, written: Written, name: str) -> None:
+    def test_pycocotools_reads_the_masks_of_the_labels(self, written: Written, name: str) -> None:
         for split in ("train", "val"):
             read = COCO(written.root / f"annotations/{name}_{split}.json")
             for frame, record in written.pairs:
@@ -325,7 +325,7 @@ class TestCoco:
                         )
             assert read.cats[1]["keypoints"] == ["head", "tip"]
 
-    def test_panoptic(self, written: Written) -> None:
+    def test_panoptic_annotations_agree_with_their_picture(self, written: Written) -> None:
         """By the rules that panopticapi checks: ids in picture and annotation are the same, areas are pixel counts."""
         for split in ("train", "val"):
             content = json.loads((written.root / f"annotations/panoptic_{split}.json").read_text())
@@ -347,7 +347,7 @@ class TestCoco:
                 (stuff,) = (s for s in segments.values() if not kinds[s["category_id"]]["isthing"])
                 np.testing.assert_array_equal(ids == stuff["id"], frame.instance == 0)
 
-    def test_poses(self, written: Written) -> None:
+    def test_poses_equal_those_of_the_labels(self, written: Written) -> None:
         content = json.loads((written.root / "annotations/poses_train.json").read_text())
         frames = {entry["id"]: entry for entry in content["frames"]}
         for frame, record in written.pairs:
@@ -419,7 +419,7 @@ class TestVoc:
 class TestBop:
     """Against docs/bop_datasets_format.md and scripts/calc_gt_info.py of the BOP toolkit."""
 
-    def test_scenes(self, written: Written) -> None:
+    def test_scenes_have_cameras_poses_masks_and_depth_of_the_frames(self, written: Written) -> None:
         for frame, record in written.pairs:
             folder = written.root / f"bop/{record['split']}/{record['layout']:06d}"
             camera, gt, info = (
@@ -457,7 +457,7 @@ class TestBop:
         ys, xs = mask.nonzero()
         return [int(xs.min()), int(ys.min()), int(xs.max() - xs.min()), int(ys.max() - ys.min())]
 
-    def test_models(self, written: Written) -> None:
+    def test_models_are_in_millimetres_with_their_extents(self, written: Written) -> None:
         info = json.loads((written.root / "bop/models/models_info.json").read_text())
         for number, mesh in enumerate(MESHES, start=1):
             back = trimesh.load_mesh(written.root / f"bop/models/obj_{number:06d}.ply")
@@ -468,7 +468,7 @@ class TestBop:
 
 
 class TestMaps:
-    def test_instances_and_classes(self, written: Written) -> None:
+    def test_instance_and_semantic_maps_equal_the_labels(self, written: Written) -> None:
         for frame, record in written.pairs:
             name = f"{record['split']}/{frame.index:06d}.png"
             instances, semantic = png(written.root / "instances" / name), png(written.root / "semantic" / name)
@@ -489,7 +489,7 @@ class TestMaps:
         assert picture[10, 10].tolist() == [0, 0, 0]
         assert picture[0, 0].tolist() == [environment["id"], 0, 0]
 
-    def test_depth_and_normals(self, written: Written) -> None:
+    def test_depth_and_normal_maps_equal_the_frame(self, written: Written) -> None:
         for frame, record in written.pairs:
             name = f"{record['split']}/{frame.index:06d}.png"
             assert record["depth_scale"] == 0.1
@@ -502,7 +502,7 @@ class TestMaps:
             assert (normals[frame.instance > 0] == [32768, 13107, 58982]).all()
             assert (normals[frame.instance == 0] == 0).all()
 
-    def test_layers(self, written: Written) -> None:
+    def test_exr_layers_equal_the_frame(self, written: Written) -> None:
         for frame, record in written.pairs:
             path = written.root / f"layers/{record['split']}/{frame.index:06d}.exr"
             with OpenEXR.File(str(path), separate_channels=True) as file:
@@ -511,7 +511,7 @@ class TestMaps:
             np.testing.assert_array_equal(pixels["Z"], frame.depth)
 
     @pytest.mark.parametrize(("farthest", "scale"), [(6.5, 0.1), (6.6, 1.0), (70.0, 10.0), (9e9, 100.0)])
-    def test_the_unit_of_depth_fits_the_farthest(self, farthest: float, scale: float) -> None:
+    def test_the_depth_scale_fits_the_largest_depth(self, farthest: float, scale: float) -> None:
         depth = np.array([[0.0, 0.00001, farthest]])
         assert maps.depth_scale(depth) == scale
         assert maps.depth_picture(depth).tolist()[0][:2] == [0, 1]
@@ -524,13 +524,13 @@ class TestMaps:
             np.testing.assert_allclose(flow[..., 0], -CAMERA.fx * 0.05 / frame.depth, rtol=1e-4)
             np.testing.assert_allclose(flow[..., 1], 0, atol=1e-4)
 
-    def test_flow_is_unknown_where_nothing_is(self) -> None:
+    def test_flow_is_unknown_where_depth_is_missing(self) -> None:
         flow = optical_flow(np.array([[0.0, 1.0]]), CAMERA.resized(2, 1), CAMERA.resized(2, 1))
         assert (np.abs(flow[0, 0]) > 1e9).all()
         np.testing.assert_allclose(flow[0, 1], 0, atol=1e-5)
 
 
-def test_colmap_reads_the_cameras(written: Written) -> None:
+def test_pycolmap_reads_the_cameras_of_the_frames(written: Written) -> None:
     code = (
         "import zlib, sys, json, pycolmap\n"
         "model = pycolmap.Reconstruction(sys.argv[1])\n"
@@ -564,7 +564,9 @@ class TestCatalogue:
         manual.write_text(manual.read_text() + "keypoints: {top: [0, 0, 0.005]}\n")
         assert Catalogue.of(load_scene(path)).keypoint_names == ((), ("top",))
 
-    def test_a_class_has_one_set_of_keypoints(self, scene_data: dict[str, Any], write_scene: Any) -> None:
+    def test_assets_of_a_class_with_different_keypoints_are_refused(
+        self, scene_data: dict[str, Any], write_scene: Any
+    ) -> None:
         scene_data["objects"] = [
             {"asset": "assets/nut", "class_name": "a"},
             {"asset": "assets/bolt", "class_name": "a"},

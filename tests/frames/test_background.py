@@ -27,12 +27,12 @@ def ramp(width: int, height: int) -> np.ndarray:
     return np.asarray(np.rint(255 * np.stack([x, y, 0 * x], axis=2)), dtype=np.uint8)
 
 
-def test_an_image_of_the_pictures_size_is_shown_as_it_is() -> None:
+def test_an_image_of_the_same_size_is_shown_unchanged() -> None:
     image = np.random.default_rng(0).integers(0, 256, (30, 40, 3), dtype=np.uint8)
     np.testing.assert_allclose(cut_out(image, backing(), 40, 30), decode_srgb(image / 255), atol=1e-6)
 
 
-def test_what_is_larger_is_averaged() -> None:
+def test_a_larger_image_is_averaged() -> None:
     image = np.random.default_rng(0).integers(0, 256, (120, 160, 3), dtype=np.uint8)
     means = decode_srgb(image / 255).reshape(30, 4, 40, 4, 3).mean(axis=(1, 3))
     np.testing.assert_allclose(cut_out(image, backing(), 40, 30), means, atol=1e-5)
@@ -41,7 +41,9 @@ def test_what_is_larger_is_averaged() -> None:
 @pytest.mark.parametrize("angle", [-170.0, -40.0, 0.0, 12.0, 90.0])
 @pytest.mark.parametrize("size", [(400, 300), (250, 600), (60, 50)])
 @pytest.mark.parametrize(("crop", "place"), [(1.0, (0.5, 0.5)), (0.4, (0.0, 1.0)), (0.4, (0.7, 0.2))])
-def test_the_part_that_is_shown(angle: float, size: tuple[int, int], crop: float, place: tuple[float, float]) -> None:
+def test_the_shown_part_of_an_image_is_that_of_its_draw(
+    angle: float, size: tuple[int, int], crop: float, place: tuple[float, float]
+) -> None:
     """Of a ramp, colours say where they are from: a turned rectangle of the picture's proportions, inside of it."""
     width, height = 80, 60
     colours = cut_out(ramp(*size), backing(rotate=angle, crop=crop, place=place), width, height)
@@ -62,7 +64,7 @@ def test_the_part_that_is_shown(angle: float, size: tuple[int, int], crop: float
     assert np.abs(shown - expected)[inner].max() < rounding.max() + 0.01 * max(size)
 
 
-def test_it_is_seen_where_nothing_is_and_changes_no_label(
+def test_a_background_is_seen_in_empty_pixels_and_changes_no_label(
     scene_data: dict[str, Any], write_scene: WriteScene, tmp_path: Path
 ) -> None:
     scene_data["shapes"][0]["box"]["size"] = [0.4, 0.4, 0.1]

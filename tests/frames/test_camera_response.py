@@ -47,7 +47,7 @@ def test_one_stop_doubles_linear_light() -> None:
     np.testing.assert_allclose(develop(linear, {"exposure": 1.0}) / 255, encode(np.full((2, 2, 3), 0.2)), atol=0.003)
 
 
-def test_hue_turns_and_keeps_grey() -> None:
+def test_hue_rotates_colours_and_keeps_grey() -> None:
     matrix = colour_matrix(hue=120.0)
     np.testing.assert_allclose(matrix @ [1, 0, 0], [0, 1, 0], atol=1e-12)
     np.testing.assert_allclose(matrix @ [1, 1, 1], [1, 1, 1], atol=1e-12)
@@ -74,7 +74,7 @@ def test_white_balance_for_a_warm_light_makes_white_cooler() -> None:
     np.testing.assert_allclose(colour_matrix(white_balance=6504.0), np.eye(3))
 
 
-def test_pixels_without_a_number_harm_no_others() -> None:
+def test_nan_and_infinite_pixels_change_no_other_pixel() -> None:
     linear = np.full((4, 8, 3), 0.2, np.float32)
     linear[1, 2:5] = [[np.inf], [np.nan], [-np.inf]]
     for draws in ({}, {"iso": 100.0, "hue": 3.0}):
@@ -174,7 +174,7 @@ def developed_slowly(linear: np.ndarray, draws: Mapping[str, float]) -> np.ndarr
     return 255 * np.clip(encode(linear @ colour_matrix(**colours).T), 0, 1)
 
 
-def test_development_follows_its_steps_in_their_order() -> None:
+def test_developed_images_equal_the_slow_twin() -> None:
     linear = np.random.default_rng(0).random((37, 53, 3)).astype(np.float32)
     draws = {"exposure": -0.4, "vignetting": 1.5, "motion_blur": 5.0, "motion_angle": 130.0}
     draws |= {"white_balance": 5200.0, "hue": 6.0, "saturation": 1.2}
@@ -193,7 +193,7 @@ def test_motion_blur_is_a_correlation_beyond_replicated_borders(length: float, a
     np.testing.assert_allclose(got, expected, atol=1e-6)
 
 
-def test_other_draws_compile_nothing() -> None:
+def test_other_draws_compile_no_new_kernels() -> None:
     linear = np.random.default_rng(2).random((30, 40, 3)).astype(np.float32)
     names = ("exposure", "vignetting", "motion_blur", "motion_angle", "iso", "white_balance", "hue", "saturation")
     names += ("chromatic_aberration", "chroma_stretch", "chroma_angle")
@@ -214,7 +214,7 @@ def test_other_draws_compile_nothing() -> None:
     assert first and second == first
 
 
-def test_vignetting_takes_its_stops_in_the_corner_and_none_in_the_middle() -> None:
+def test_vignetting_darkens_the_corner_by_its_stops_and_not_the_centre() -> None:
     linear = np.full((101, 201, 3), 0.4, np.float32)
     encoded = develop(linear, {"vignetting": 2.0}) / 255
     assert encoded[50, 100, 0] == pytest.approx(encode(np.array(0.4)), abs=0.004)
@@ -223,7 +223,7 @@ def test_vignetting_takes_its_stops_in_the_corner_and_none_in_the_middle() -> No
 
 @pytest.mark.parametrize("angle", [0.0, 30.0, 90.0, 215.0])
 @pytest.mark.parametrize("length", [0.5, 3.0, 12.0])
-def test_motion_kernel_is_a_line_of_its_length_and_angle(length: float, angle: float) -> None:
+def test_the_motion_kernel_is_a_line_of_its_length_and_angle(length: float, angle: float) -> None:
     """A uniform line of length L has variance L^2 / 12 along itself; bilinear weights add at most 1/4 px^2 each way."""
     kernel = motion_kernel(length, angle)
     reach = kernel.shape[0] // 2
@@ -236,7 +236,7 @@ def test_motion_kernel_is_a_line_of_its_length_and_angle(length: float, angle: f
     assert (kernel * across**2).sum() < 0.26
 
 
-def test_motion_keeps_even_pictures_and_smears_points() -> None:
+def test_motion_blur_keeps_even_pictures_and_spreads_points() -> None:
     even = np.full((20, 30, 3), 0.3, np.float32)
     draws = {"motion_blur": 6.0, "motion_angle": 40.0}
     assert np.array_equal(develop(even, draws), develop(even, {}))
@@ -247,7 +247,7 @@ def test_motion_keeps_even_pictures_and_smears_points() -> None:
     assert np.flatnonzero(smeared.any(axis=1)).tolist() == [10]
 
 
-def test_sharpening_overshoots_an_edge_by_its_share_of_what_a_blur_takes() -> None:
+def test_sharpening_overshoots_an_edge_by_its_closed_form() -> None:
     """Next to a step the blur takes the weight that a Gaussian has beyond it."""
     even = np.full((9, 21, 3), 0.3, np.float32)
     assert np.array_equal(develop(even, {"sharpening": 2.0}), develop(even, {}))
@@ -285,7 +285,7 @@ def test_the_published_matrix_adapts_white() -> None:
     np.testing.assert_allclose(white_balance_matrix(5003.0), expected / (LUMINANCE @ expected @ np.ones(3)), atol=2e-3)
 
 
-def test_the_transfer_is_that_of_colour_science() -> None:
+def test_the_srgb_transfer_agrees_with_colour_science() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # it says as it is imported that it could plot with Matplotlib
         import colour
@@ -327,7 +327,7 @@ def test_metered_pictures_are_grey_on_average_in_any_light(light: float, tone: A
     assert develop(grey, {"exposure": -1.0}, tone=tone, metered=True).mean() < GREY - 20
 
 
-def test_metering_takes_a_lamp_for_no_more_than_white() -> None:
+def test_metering_counts_a_lamp_as_white_at_most() -> None:
     room = np.full((90, 160, 3), 0.1, np.float32)
     room[:9, :16] = 1000.0
     lamp, paper = room.copy(), room.copy()
@@ -335,5 +335,5 @@ def test_metering_takes_a_lamp_for_no_more_than_white() -> None:
     assert np.array_equal(develop(lamp, {}, metered=True), develop(paper, {}, metered=True))
 
 
-def test_metering_of_darkness_ends() -> None:
+def test_metering_of_a_black_picture_stays_black() -> None:
     assert develop(np.zeros((9, 16, 3), np.float32), {}, metered=True).max() == 0

@@ -59,7 +59,7 @@ def belt_data(scene_data: SceneData) -> SceneData:
     }
 
 
-def test_flow_is_the_belts_and_what_lies_on_it(belt_data: SceneData, write_scene: WriteScene) -> None:
+def test_belt_and_objects_on_it_have_the_flow_of_the_belt(belt_data: SceneData, write_scene: WriteScene) -> None:
     scene = ms.load_scene(write_scene(belt_data))
     frame = ms.render_frame(scene, 0, layout=lying(scene, 0))
     flow = frame.flow
@@ -75,7 +75,7 @@ def test_flow_is_the_belts_and_what_lies_on_it(belt_data: SceneData, write_scene
     assert ms.render_frame(scene, 2, layout=lying(scene, 0)).flow is None
 
 
-def test_flow_of_a_film_of_settled_layouts_is_the_scenes(belt_data: SceneData, write_scene: WriteScene) -> None:
+def test_the_flow_of_settled_layouts_equals_that_of_the_scene(belt_data: SceneData, write_scene: WriteScene) -> None:
     scene = ms.load_scene(write_scene(belt_data))
     layout = lying(scene, 0)
     film = list(ms.render_frames(scene, 3, layouts=layout))
@@ -86,7 +86,7 @@ def test_flow_of_a_film_of_settled_layouts_is_the_scenes(belt_data: SceneData, w
         np.testing.assert_array_equal(frame.flow if frame.index < 2 else 0, alone.flow if frame.index < 2 else 0)
 
 
-def test_the_pattern_runs_with_the_belt(belt_data: SceneData, write_scene: WriteScene) -> None:
+def test_the_pattern_moves_with_the_belt(belt_data: SceneData, write_scene: WriteScene) -> None:
     belt_data["objects"] = []
     scene = ms.load_scene(write_scene(belt_data))
     empty = Layout(0, (), NO_PHYSICS)
@@ -101,7 +101,7 @@ def test_the_pattern_runs_with_the_belt(belt_data: SceneData, write_scene: Write
         np.testing.assert_allclose(renderer.render(1, layout=empty).rgb[10:38], second, atol=1e-5)  # the middle view
 
 
-def test_what_runs_is_blurred(belt_data: SceneData) -> None:
+def test_moving_surfaces_are_swept_by_the_exposure(belt_data: SceneData) -> None:
     belt = Belt(Box(size=(1.0, 0.2, 0.1), position=(0.0, 0.0, -0.05)), 0.3, 0.0, 0.1)
     camera = Camera.look_at((0.1, -0.3, 0.5), (0, 0, 0), width=32, height=24, fov_x=56)
     pixels = np.stack(np.meshgrid(np.arange(32) + 0.5, np.arange(24) + 0.5), axis=-1).reshape(-1, 2)
@@ -120,7 +120,7 @@ def test_what_runs_is_blurred(belt_data: SceneData) -> None:
     np.testing.assert_allclose(np.stack([right, down], axis=-1), expected, atol=1e-4)
 
 
-def test_a_dataset_of_a_belt(belt_data: SceneData, write_scene: WriteScene, tmp_path: Path) -> None:
+def test_a_dataset_with_a_belt_has_no_violations(belt_data: SceneData, write_scene: WriteScene, tmp_path: Path) -> None:
     """Labels follow what is carried, the audit knows where that is, and a frame is made again as it was."""
     belt_data["labels"] = {"min_pixels": 1, "min_fragment": 1}
     belt_data["camera"]["motion"] = {"exposure": [0.01, 0.02]}
@@ -144,7 +144,7 @@ def test_a_dataset_of_a_belt(belt_data: SceneData, write_scene: WriteScene, tmp_
     assert any("has another pose than in layouts/0000.json" in text for text in found), found
 
 
-def test_flow_of_a_belt_that_stands_still_is_found_out(
+def test_flow_of_a_belt_recorded_as_still_is_a_violation(
     belt_data: SceneData, write_scene: WriteScene, tmp_path: Path
 ) -> None:
     belt_data["labels"] = {"min_pixels": 1, "min_fragment": 1}

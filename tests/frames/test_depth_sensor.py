@@ -55,7 +55,7 @@ class TestStereo:
         np.testing.assert_allclose(steps, np.rint(steps), atol=1e-4)
         assert len(np.unique(np.rint(steps))) in (2, 3)
 
-    def test_what_the_second_camera_does_not_see_has_no_depth(self) -> None:
+    def test_pixels_hidden_from_the_second_camera_have_no_depth(self) -> None:
         """Beside a box before a wall: a strip to its left, as wide as the disparities differ, and the left border."""
         near, far = FOCAL * 0.1 / 20, FOCAL * 0.1 / 6  # disparities of 20 and 6 px
         depth = np.full((96, 128), far)
@@ -68,20 +68,20 @@ class TestStereo:
         np.testing.assert_array_equal(holes, expected)
         np.testing.assert_allclose(found[~holes], depth[~holes], rtol=1e-6)
 
-    def test_the_wall_beyond_a_thin_bar_is_seen(self) -> None:
+    def test_the_wall_behind_a_thin_bar_has_depth(self) -> None:
         """The bar hides a strip of its own width, at the difference of the disparities from it."""
         disparity = np.full((4, 60), 3.0)
         disparity[:, 40:42] = 15.0
         hidden = hidden_from_second(disparity)
         assert np.flatnonzero(hidden[0]).tolist() == [0, 1, 2, 28, 29]
 
-    def test_a_slope_is_seen_whole(self) -> None:
+    def test_every_pixel_of_a_slope_has_depth(self) -> None:
         """Disparities that grow to the right by up to 0.4 px a pixel hide nothing of themselves."""
         for slope in (-3.0, -0.9, 0.2, 0.4):
             disparity = 60 + slope * (np.arange(40) - 20.0)
             assert not hidden_from_second(np.tile(np.pad(disparity, (140, 0)), (3, 1)))[:, 141:].any()
 
-    def test_a_scan_line_at_a_time_is_the_same(self) -> None:
+    def test_processing_by_scan_lines_gives_the_same_depth(self) -> None:
         """A slow twin: every pixel against every other of its row."""
         rng = np.random.default_rng(3)
         disparity = np.repeat(rng.uniform(0, 12, (6, 10)), 5, axis=1)
@@ -98,14 +98,14 @@ class TestStereo:
                 ]
                 assert hidden_from_second(disparity)[row, x] == (own < 0 or bool(covering)), (row, x)
 
-    def test_plain_surfaces_need_a_pattern(self) -> None:
+    def test_plain_surfaces_have_no_depth_without_a_pattern(self) -> None:
         picture = PLAIN.copy()
         picture[:, 64:] = np.where(np.indices((96, 64)).sum(0)[..., None] % 2, 100, 150)
         found = stereo(np.full((96, 128), 1.0), picture, contrast=0.05, shift=0)
         assert not found[:, :59].any() and (found[:, 70:] > 0).all()
         assert (stereo(np.full((96, 128), 1.0), picture)[:, 40:] > 0).all()
 
-    def test_range_and_nothing(self) -> None:
+    def test_pixels_out_of_range_or_without_depth_have_none(self) -> None:
         depth = np.full((96, 128), 0.5)
         depth[:40], depth[40:50] = 3.0, 0.0
         found = stereo(depth, range=(0.2, 2.0), shift=0)
@@ -114,7 +114,7 @@ class TestStereo:
 
 class TestTimeOfFlight:
     @pytest.mark.parametrize(("away", "reflectance", "ambient"), [(1.0, 1.0, 0.0), (2.0, 0.5, 0.0), (1.5, 0.3, 2.0)])
-    def test_errors_are_of_the_light_that_comes_back(self, away: float, reflectance: float, ambient: float) -> None:
+    def test_errors_follow_the_returned_light(self, away: float, reflectance: float, ambient: float) -> None:
         """Around the axis, where ray and axis are the same but for a per cent."""
         found = flight(np.full((96, 128), away), reflectance, noise=0.001, ambient=ambient)[38:58, 50:78]
         signal = reflectance / away**2
@@ -122,13 +122,13 @@ class TestTimeOfFlight:
         assert found.std() == pytest.approx(expected, rel=0.1)
         assert found.mean() == pytest.approx(away, abs=4 * expected / np.sqrt(found.size))
 
-    def test_a_surface_that_turns_away_returns_less(self) -> None:
+    def test_an_inclined_surface_returns_less_light(self) -> None:
         normal = np.zeros((96, 128, 3), dtype=np.float32)
         normal[:] = (0, -0.5, np.sqrt(0.75))  # 60 degrees from the axis, which is +y
         facing, turned = (flight(np.full((96, 128), 1.0), normal=n, noise=0.001)[38:58, 50:78] for n in (None, normal))
         assert turned.std() / facing.std() == pytest.approx(np.sqrt(2), rel=0.1)
 
-    def test_pixels_at_an_edge_fly(self) -> None:
+    def test_pixels_at_an_edge_mix_both_depths(self) -> None:
         """Phasors of both surfaces add up, by the Gaussian's share of each; away from the edge nothing changes."""
         depth = np.full((96, 128), 1.0)
         depth[:, 64:] = 1.5
@@ -144,12 +144,12 @@ class TestTimeOfFlight:
         sharp = flight(depth, noise=0, blur=0)
         np.testing.assert_allclose(sharp, depth, atol=1e-5)
 
-    def test_distances_wrap_around(self) -> None:
+    def test_distances_wrap_at_the_modulation_length(self) -> None:
         longest = LIGHT_SPEED / 2e8  # at 100 MHz
         found = flight(np.full((96, 128), longest + 0.4), noise=0, blur=0, modulation=100)
         assert found[48, 64] == pytest.approx(0.4, abs=1e-3)
 
-    def test_dark_and_far_things_are_not_measured(self) -> None:
+    def test_dark_and_empty_pixels_are_not_measured(self) -> None:
         depth = np.full((96, 128), 2.0)
         depth[:, 64:] = 0
         assert not flight(depth, reflectance=0.02, min_signal=0.006, blur=0).any()
@@ -158,7 +158,7 @@ class TestTimeOfFlight:
 
 
 @pytest.mark.parametrize("sensor", [StereoSensor(), TimeOfFlightSensor()])
-def test_the_frame_s_seed_decides(sensor: Any) -> None:
+def test_the_seed_of_the_frame_determines_the_noise(sensor: Any) -> None:
     depth = np.tile(np.linspace(0.8, 1.2, 128, dtype=np.float32), (96, 1))
     layers = SimpleNamespace(captured=np.full((96, 128, 3), 0.5))
     made = {"camera": CAMERA, "image": PLAIN, "layers": layers, "normal": np.zeros((96, 128, 3))}
@@ -207,7 +207,7 @@ def test_the_frame_s_seed_decides(sensor: Any) -> None:
         ),
     ],
 )
-def test_sensors_that_cannot_be_are_refused(
+def test_invalid_sensors_are_refused(
     scene_data: dict[str, Any], write_scene: WriteScene, change: dict[str, Any], sentence: str
 ) -> None:
     with pytest.raises(InputError, match=sentence):

@@ -32,7 +32,7 @@ def scene(scene_data: dict[str, Any], write_scene: WriteScene, tmp_path: Path) -
     return ms.load_scene(write_scene(scene_data | {"lights": LIGHTS}))
 
 
-def test_a_renderer_that_has_made_others_makes_the_same_frame(scene: ms.Scene) -> None:
+def test_earlier_frames_of_a_renderer_do_not_change_a_frame(scene: ms.Scene) -> None:
     layouts = [scatter_boxes(scene, layout, progress=None) for layout in range(4)]
     with ms.Renderer(scene, quality="fast") as renderer:
         frames = [renderer.render(index, layout=layouts[index // 3]) for index in range(8)]
@@ -46,7 +46,7 @@ def test_a_renderer_that_has_made_others_makes_the_same_frame(scene: ms.Scene) -
     assert (frames[6].light != frames[7].light).any()  # another turn of the same sky
 
 
-def test_the_manifest_states_lights_as_they_were(scene: ms.Scene, tmp_path: Path) -> None:
+def test_the_manifest_records_the_drawn_lights(scene: ms.Scene, tmp_path: Path) -> None:
     layout = scatter_boxes(scene, 0, progress=None)
     with ms.Renderer(scene, quality="fast") as renderer:
         frame = renderer.render(1, layout=layout)
@@ -71,7 +71,7 @@ def _apart() -> Layout:
 APART = _apart()
 
 
-def test_appearances_change_colours_and_nothing_else(scene_data: Any, write_scene: WriteScene, tmp_path: Path) -> None:
+def test_appearances_change_colours_only(scene_data: Any, write_scene: WriteScene, tmp_path: Path) -> None:
     def frames(**keys: Any) -> list[ms.Frame]:
         scene_data["camera"] |= {"radius": 0.15, "height": 0.15}
         scene_data["objects"] = [{"asset": "assets/nut", "count": 3, **keys}, {"asset": "assets/bolt"}]
@@ -105,7 +105,7 @@ def test_appearances_change_colours_and_nothing_else(scene_data: Any, write_scen
     )
 
 
-def test_xml_shows_appearances(
+def test_exported_xml_renders_appearances(
     scene_data: Any, write_scene: WriteScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("mitsplat.frames.mitsuba_xml.settle_layout", lambda scene, index: APART)

@@ -48,7 +48,7 @@ def layout_of_small_scene(scene: ms.Scene, settled: dict[str, Any]) -> ms.Layout
     return settled["layout"]
 
 
-def test_frame_shows_and_labels_its_objects(scene: ms.Scene, settled: dict[str, Any]) -> None:
+def test_a_frame_shows_and_labels_its_objects(scene: ms.Scene, settled: dict[str, Any]) -> None:
     layout = layout_of_small_scene(scene, settled)
     frame = ms.render_frame(scene, 1, layout=layout)
     assert frame.image.shape == (144, 192, 3) and frame.image.dtype == np.uint8
@@ -65,7 +65,7 @@ def test_frame_shows_and_labels_its_objects(scene: ms.Scene, settled: dict[str, 
     assert frame._repr_png_().startswith(b"\x89PNG")
 
 
-def test_same_frame_has_the_same_bytes(scene: ms.Scene, settled: dict[str, Any]) -> None:
+def test_the_same_frame_has_the_same_bytes(scene: ms.Scene, settled: dict[str, Any]) -> None:
     layout = layout_of_small_scene(scene, settled)
     first = ms.render_frame(scene, 2, layout=layout)
     ms.render_frame(scene, 3, layout=layout)
@@ -75,7 +75,7 @@ def test_same_frame_has_the_same_bytes(scene: ms.Scene, settled: dict[str, Any])
 
 
 @pytest.mark.parametrize("source", ["splats", "proxies"])
-def test_silhouettes_are_labels_of_the_instances_alone(
+def test_silhouettes_equal_renderings_of_single_instances(
     write_scene: WriteScene, scene_data: dict[str, Any], settled: dict[str, Any], scene: ms.Scene, source: str
 ) -> None:
     """Each instance placed alone in the scene is labelled with exactly what it covers among the others."""
@@ -97,7 +97,7 @@ def test_silhouettes_are_labels_of_the_instances_alone(
         assert label.visible_fraction == label.area / only.area
 
 
-def test_frame_is_remade_from_its_record(
+def test_a_frame_rendered_from_its_record_is_the_same(
     scene_data: dict[str, Any],
     write_scene: WriteScene,
     scene: ms.Scene,
@@ -183,7 +183,7 @@ def test_exported_xml_renders_the_same_picture(
     assert np.abs(ours - frame.image)[covered].mean() < 1.0
 
 
-def test_bad_xml_is_one_sentence(tmp_path: Any) -> None:
+def test_invalid_xml_is_refused_in_one_sentence(tmp_path: Any) -> None:
     (tmp_path / "bad.xml").write_text('<scene version="3.0.0"><shape type="splats"/></scene>')
     with pytest.raises(InputError, match="filename"):
         render_xml(tmp_path / "bad.xml", tmp_path)
@@ -191,7 +191,7 @@ def test_bad_xml_is_one_sentence(tmp_path: Any) -> None:
         render_xml(tmp_path / "absent.xml", tmp_path)
 
 
-def test_a_frame_keeps_what_it_was_made_of(scene: ms.Scene, settled: dict[str, Any]) -> None:
+def test_a_frame_has_its_plan_and_layers(scene: ms.Scene, settled: dict[str, Any]) -> None:
     layout = layout_of_small_scene(scene, settled)
     frame = ms.render_frame(scene, 1, layout=layout)
     assert (frame.index, frame.camera, frame.draws) == (1, frame.plan.camera, frame.plan.draws)
@@ -203,7 +203,7 @@ def test_a_frame_keeps_what_it_was_made_of(scene: ms.Scene, settled: dict[str, A
 
 
 @pytest.mark.parametrize(("source", "depth"), [("splats", "depth"), ("proxies", "proxy_depth")])
-def test_labels_bring_ids_and_one_depth_to_the_host(
+def test_labels_transfer_only_ids_and_one_depth_to_the_host(
     scene_data: dict[str, Any],
     write_scene: WriteScene,
     scene: ms.Scene,
@@ -222,7 +222,9 @@ def test_labels_bring_ids_and_one_depth_to_the_host(
     np.testing.assert_array_equal(again, frame.image)
 
 
-def test_a_closed_renderer_says_so(scene: ms.Scene, settled: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_closed_renderer_is_refused(
+    scene: ms.Scene, settled: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
     layout = layout_of_small_scene(scene, settled)
     with ms.Renderer(scene) as renderer, monkeypatch.context() as patch:
         variant = mi.variant()
@@ -241,7 +243,7 @@ def test_frame_out_of_range_is_refused(scene: ms.Scene) -> None:
 @pytest.mark.parametrize("samples", [1, 2, "edges"])
 @pytest.mark.parametrize("quality", ["fast", "balanced"])
 @pytest.mark.parametrize("close", [False, True])
-def test_a_camera_that_stands_still_sees_the_same_bytes(quality: str, samples: Any, close: bool) -> None:
+def test_a_still_camera_renders_the_same_bytes_as_a_new_renderer(quality: str, samples: Any, close: bool) -> None:
     """From the third picture on only tiles with objects are made anew, also where something static is before them."""
     ms.render_splats(make_splats(1), Camera.look_at((0, 0, -2), (0, 0, 0), width=8, height=8, fov_x=50))
     static = make_splats_shape(make_splats(300, 1, scales=(0.02, 0.1)))
@@ -269,7 +271,7 @@ def test_a_camera_that_stands_still_sees_the_same_bytes(quality: str, samples: A
     assert still._static_tiles[1] is None
 
 
-def test_a_camera_that_stands_still_before_surroundings_without_splats() -> None:
+def test_a_still_camera_renders_surroundings_without_splats() -> None:
     """As of a proxy that is not seen, which has none."""
     integrator = make_integrator(shadow="none")
     wall = make_splats_shape(NOTHING, proxy=trimesh.creation.box((1, 1, 0.1)))
@@ -282,7 +284,7 @@ def test_a_camera_that_stands_still_before_surroundings_without_splats() -> None
     assert pictures[0] == pictures[1] == pictures[2]
 
 
-def test_a_camera_that_stands_still_before_an_object_without_splats() -> None:
+def test_a_still_camera_renders_an_object_without_splats() -> None:
     """Its proxy is all that there is of it; the same picture comes from a camera that just arrived."""
     around = make_splats_shape(make_splats(20, 3))
     bare = make_splats_shape(NOTHING, instance=1, proxy=trimesh.creation.box((0.2, 0.2, 0.1)))
@@ -293,7 +295,7 @@ def test_a_camera_that_stands_still_before_an_object_without_splats() -> None:
     assert set(pictures) == {render_layers(make_integrator(shadow="none"), scene, camera).rgb.tobytes()}
 
 
-def test_views_of_a_layout_share_what_was_uploaded(
+def test_views_of_a_layout_share_uploaded_arrays(
     write_scene: WriteScene,
     scene_data: dict[str, Any],
     settled: dict[str, Any],

@@ -55,7 +55,7 @@ def compiled(renderer: Renderer, index: int, layout: Layout) -> tuple[int, int]:
     return len(run), sum(not entry["cache_hit"] or entry["cache_disk"] for entry in run)
 
 
-def test_another_layout_compiles_nothing() -> None:
+def test_another_layout_compiles_no_new_kernels() -> None:
     scene = load_scene(WORKCELL)
     with Renderer(scene) as renderer, dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         first = strewn(0, [0, 1, 2, 3, 3])
@@ -73,7 +73,7 @@ def test_another_layout_compiles_nothing() -> None:
             assert new == 0, f"frame {index}: {new} of {run} kernels"
 
 
-def test_lights_that_are_drawn_compile_nothing() -> None:
+def test_drawn_lights_compile_no_new_kernels() -> None:
     """Where they are, how large and bright, and how many up to four: once each set of kinds has been seen."""
     scene = load_scene(WORKCELL)
     sides = LightDraw(vary="frame", count=(0, 3), distance=(0.5, 1.5), size=((0.1, 0.1), (0.4, 0.2)))

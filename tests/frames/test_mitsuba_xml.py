@@ -115,18 +115,18 @@ def write(folder: Path, text: str) -> Path:
         (SCENE.format('<shape type="sphere"> <float name="radius"/> </shape>'), ":7: missing required attribute"),
     ],
 )  # fmt: skip
-def test_what_a_scene_has_wrong_is_one_sentence(small: Path, text: str, sentence: str) -> None:
+def test_each_fault_of_a_scene_is_one_sentence_with_its_line(small: Path, text: str, sentence: str) -> None:
     with pytest.raises(InputError, match=sentence) as caught:
         render_xml(write(small, text), small / "out.png")
     assert "\n" not in str(caught.value) and str(caught.value).startswith(f"{small}/scene.xml")
 
 
-def test_a_sentence_without_a_place_is_kept() -> None:
+def test_an_error_without_a_line_is_kept() -> None:
     assert one_sentence(Path("a.xml"), "[scene.cpp:12] nothing works") == "a.xml: nothing works"
     assert one_sentence(Path("a.xml"), "") == "a.xml: Mitsuba refuses it without a reason"
 
 
-def test_a_camera_that_shears_is_refused(small: Path) -> None:
+def test_a_camera_with_shear_is_refused(small: Path) -> None:
     sensor = (
         f'<sensor type="opencv_camera">{FILM} <float name="fx" value="8"/> <float name="fy" value="8"/> '
         '<transform name="to_world"> <scale value="2"/> </transform> </sensor>'
@@ -135,7 +135,7 @@ def test_a_camera_that_shears_is_refused(small: Path) -> None:
         render_xml(write(small, f'<scene version="3.0.0">{sensor}</scene>'), small / "out.png")
 
 
-def test_an_asset_is_read_in_metres_with_its_mesh_and_material(small: Path) -> None:
+def test_an_asset_shape_has_metres_mesh_and_material(small: Path) -> None:
     ensure_variant()
     named = '<shape type="splats"> <string name="asset" value="{}"/> <integer name="instance" value="{}"/> </shape>'
     by_unit = (
@@ -200,7 +200,7 @@ NAMES = """<scene version="3.9.0">
 """
 
 
-def test_a_scene_of_parts_renders_as_mitsuba_alone_renders_it(tmp_path: Path) -> None:
+def test_a_scene_with_includes_renders_as_mitsuba_renders_it(tmp_path: Path) -> None:
     """With one sample for a pixel: Mitsuba adds up several in any order."""
     ensure_variant()
     for folder in ("maps", "parts/deeper"):
@@ -233,7 +233,7 @@ def test_an_error_in_an_included_file_names_its_line(small: Path) -> None:
 
 
 @pytest.mark.parametrize("place", ["scene", "here"])
-def test_no_native_plugin_of_a_folder_is_loaded(small: Path, place: str) -> None:
+def test_native_plugins_in_the_scene_folder_are_not_loaded(small: Path, place: str) -> None:
     """Mitsuba looks for plugins in the current folder and in that of the scene, before its own."""
     compiler = shutil.which("cc")
     if compiler is None:
@@ -254,7 +254,7 @@ def test_no_native_plugin_of_a_folder_is_loaded(small: Path, place: str) -> None
     assert not (small / "ran").exists()
 
 
-def test_the_documented_scene_renders_as_it_stands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_documented_scene_renders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its size alone is less, so that the test is fast."""
     (text,) = re.findall(r"```xml\n(.*?)```", (ROOT / "docs/xml_and_plugins.md").read_text(), re.DOTALL)
     for name in set(re.findall(r'name="asset" value="([^"]+)"', text)):

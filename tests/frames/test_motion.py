@@ -20,7 +20,7 @@ SHAPE = 23, 31
 
 
 @pytest.mark.parametrize("distortion", [(), (-0.2, 0.05, 0.01, -0.005)])
-def test_pixels_move_as_the_camera_does(distortion: tuple[float, ...]) -> None:
+def test_pixel_motion_agrees_with_projections_of_the_moved_camera(distortion: tuple[float, ...]) -> None:
     """Slowly, by optical flow to where the camera is before and after the middle of the exposure."""
     camera = Camera.look_at((0.3, -0.5, 0.4), (0, 0, 0), width=80, height=60, fov_x=60, distortion=distortion)
     depth = np.random.default_rng(0).uniform(0.4, 2.0, (60, 80))
@@ -35,7 +35,7 @@ def test_pixels_move_as_the_camera_does(distortion: tuple[float, ...]) -> None:
         assert np.abs(got).max() > 0.02
 
 
-def test_what_has_no_depth_moves_by_rotation_alone() -> None:
+def test_pixels_without_depth_move_by_rotation_only() -> None:
     camera = Camera.look_at((0.3, -0.5, 0.4), (0, 0, 0), width=80, height=60, fov_x=60)
     motion = {"exposure": 0.01, "velocity": [1.0, 2.0, 3.0], "rotation": [0.0, 30.0, 0.0]}
     right, down = swept_by(np.zeros((60, 80)), camera, motion)
@@ -44,7 +44,7 @@ def test_what_has_no_depth_moves_by_rotation_alone() -> None:
     np.testing.assert_allclose(down, -np.radians(0.3) * camera.fx * x * y, rtol=1e-5, atol=1e-6)
 
 
-def test_each_pixel_is_smeared_along_its_own_motion() -> None:
+def test_each_pixel_is_blurred_along_its_own_motion() -> None:
     rng = np.random.default_rng(1)
     linear = rng.random((*SHAPE, 3)).astype(np.float32)
     swept = rng.uniform(-9, 9, (2, *SHAPE)).astype(np.float32)
@@ -58,14 +58,14 @@ def test_each_pixel_is_smeared_along_its_own_motion() -> None:
         np.testing.assert_allclose(got[..., channel], expected, atol=1e-5)
 
 
-def test_a_camera_that_stands_still_blurs_nothing() -> None:
+def test_a_still_camera_gives_no_blur() -> None:
     linear = np.random.default_rng(2).random((*SHAPE, 3)).astype(np.float32)
     still = np.zeros((2, *SHAPE), np.float32)
     np.testing.assert_array_equal(develop(linear, {}, swept=(still[0], still[1])), develop(linear, {}))
 
 
 @pytest.mark.parametrize("corner", [1.5, -2.0])
-def test_red_is_magnified_and_blue_reduced_about_the_middle(corner: float) -> None:
+def test_chromatic_aberration_magnifies_red_and_reduces_blue(corner: float) -> None:
     """Of a slope, whose interpolation is exact, red at a point is what green is nearer to the middle by its shift."""
     y, x = np.mgrid[: SHAPE[0], : SHAPE[1]]
     linear = np.repeat((0.3 + 0.02 * x + 0.01 * y)[..., None], 3, axis=2).astype(np.float32)

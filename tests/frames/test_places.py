@@ -60,7 +60,7 @@ def places(scene_data: SceneData, write_scene: WriteScene, tmp_path: Path) -> Sc
     return scene_data
 
 
-def test_a_drawn_place_looks_as_a_stated_one(places: SceneData, write_scene: WriteScene) -> None:
+def test_a_drawn_environment_renders_as_a_stated_one(places: SceneData, write_scene: WriteScene) -> None:
     del places["shapes"][0]["materials"]
     del places["background"]
     drawn = ms.load_scene(write_scene(places))
@@ -78,7 +78,7 @@ def test_a_drawn_place_looks_as_a_stated_one(places: SceneData, write_scene: Wri
         )
 
 
-def test_one_colour_looks_as_the_key_colour(places: SceneData, write_scene: WriteScene) -> None:
+def test_a_material_of_one_colour_renders_as_the_colour_key(places: SceneData, write_scene: WriteScene) -> None:
     del places["environment"], places["background"]
     places["shapes"][0]["materials"] = [{"kind": "colour"}]
     scene = ms.load_scene(write_scene(places))
@@ -89,7 +89,7 @@ def test_one_colour_looks_as_the_key_colour(places: SceneData, write_scene: Writ
     np.testing.assert_array_equal(ms.render_frame(stated, 0, layout=lying(stated, 0)).image, frame.image)
 
 
-def test_order_does_not_matter(places: SceneData, write_scene: WriteScene) -> None:
+def test_the_order_of_frames_does_not_change_them(places: SceneData, write_scene: WriteScene) -> None:
     scene = ms.load_scene(write_scene(places))
     frames = [*range(6)]
     with ms.Renderer(scene) as renderer:
@@ -100,7 +100,9 @@ def test_order_does_not_matter(places: SceneData, write_scene: WriteScene) -> No
     np.testing.assert_array_equal(forth, back)
 
 
-def test_a_dataset_of_places(places: SceneData, write_scene: WriteScene, tmp_path: Path) -> None:
+def test_a_dataset_with_drawn_environments_has_no_violations(
+    places: SceneData, write_scene: WriteScene, tmp_path: Path
+) -> None:
     """Every draw is in the manifest, which its schema reads, and no label has anything of it."""
     places["labels"] = {"min_pixels": 1, "min_fragment": 1}
     places["depth_sensor"] = {"kind": "tof"}
@@ -120,7 +122,7 @@ def test_a_dataset_of_places(places: SceneData, write_scene: WriteScene, tmp_pat
 
 
 @pytest.mark.parametrize("kind", ["colour", "wood"])
-def test_xml_shows_the_same_place(
+def test_exported_xml_renders_the_same_environment(
     places: SceneData, write_scene: WriteScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
 ) -> None:
     del places["background"]
@@ -136,7 +138,7 @@ def test_xml_shows_the_same_place(
     assert np.abs(shown - expected).mean() < 0.004
 
 
-def test_the_manifest_states_the_region_of_each_object(
+def test_the_manifest_records_the_region_of_each_object(
     scene_data: SceneData, write_scene: WriteScene, tmp_path: Path
 ) -> None:
     scene_data |= {"regions": [{"name": "shelf", "min": [-0.2, -0.2, 0.3], "max": [0.2, 0.2, 0.5]}]}

@@ -64,7 +64,7 @@ def above() -> ms.Camera:
 # Scenes
 
 
-def test_a_scene_made_in_python_is_that_of_the_file(
+def test_a_scene_made_in_python_equals_that_of_the_file(
     write_scene: WriteScene, scene_data: dict[str, Any], tmp_path: Path
 ) -> None:
     read, made = load_scene(write_scene(scene_data)), ms.make_scene(ms.SceneSpec(**scene_data), tmp_path)
@@ -89,7 +89,7 @@ def test_a_scene_made_in_python_is_that_of_the_file(
         ),
     ],
 )
-def test_a_wrong_specification_is_one_sentence_with_its_key(
+def test_an_invalid_specification_is_refused_with_its_key(
     scene_data: dict[str, Any], change: dict[str, Any], sentence: str
 ) -> None:
     with pytest.raises(ms.InputError) as caught:
@@ -97,18 +97,18 @@ def test_a_wrong_specification_is_one_sentence_with_its_key(
     assert str(caught.value).startswith(sentence) and "\n" not in str(caught.value)
 
 
-def test_parts_of_a_specification_speak_for_themselves() -> None:
+def test_errors_in_parts_of_a_specification_name_the_part() -> None:
     with pytest.raises(ms.InputError, match=r"^CameraOrbit: radius: must be > 0 \(got -1\)$"):
         CameraOrbit(kind="orbit", target=(0, 0, 0), radius=-1, height=0.4)
 
 
-def test_what_a_scene_made_in_python_names_must_be_there(scene_data: dict[str, Any], tmp_path: Path) -> None:
+def test_a_missing_asset_of_a_scene_made_in_python_is_refused(scene_data: dict[str, Any], tmp_path: Path) -> None:
     with pytest.raises(ms.InputError, match=r"<python>\.yaml: objects\[0\]\.asset: .*assets/nut") as caught:
         ms.make_scene(ms.SceneSpec(**scene_data), tmp_path)
     assert "\n" not in str(caught.value)
 
 
-def test_a_dataset_of_a_scene_made_in_python_keeps_a_file_that_makes_the_same(
+def test_a_scene_made_in_python_is_stored_as_a_file_that_makes_the_same_dataset(
     scene_data: dict[str, Any], tmp_path: Path
 ) -> None:
     for size, name in (((0.12, 0.16, 0.08), "nut"), ((0.06, 0.07, 0.25), "bolt")):
@@ -125,7 +125,7 @@ def test_a_dataset_of_a_scene_made_in_python_keeps_a_file_that_makes_the_same(
 # Layouts
 
 
-def test_poses_make_a_layout_whose_ids_do_not_depend_on_their_order(scene: ms.Scene) -> None:
+def test_the_order_of_given_poses_does_not_change_ids(scene: ms.Scene) -> None:
     poses = [moved(0.1 * n, 0, turn=30 * n) for n in range(3)]
     layout = ms.Layout.from_poses(scene, {"bolt": [poses[2]], "assets/nut": poses[:2]}, index=4)
     other = ms.Layout.from_poses(scene, {0: np.array(poses[:2], dtype=np.float32), "bolt": poses[2:]})
@@ -138,7 +138,7 @@ def test_poses_make_a_layout_whose_ids_do_not_depend_on_their_order(scene: ms.Sc
     assert ms.Layout.from_json(layout.to_json()).to_json() == layout.to_json()
 
 
-def test_an_object_that_is_not_there_leaves_its_id_free(scene: ms.Scene) -> None:
+def test_a_missing_object_keeps_its_id_unused(scene: ms.Scene) -> None:
     layout = ms.Layout.from_poses(scene, {"nut": [None, moved(0, 0)], "bolt": [moved(0.1, 0)]})
     assert [one.id for one in layout.instances] == [2, 3]
 
@@ -158,12 +158,12 @@ def test_an_object_that_is_not_there_leaves_its_id_free(scene: ms.Scene) -> None
         ({"nut": ["here"]}, r"must be a finite 4x4 matrix world_from_object \(got 'here'\)"),
     ],
 )
-def test_wrong_poses_are_one_sentence(scene: ms.Scene, poses: Any, sentence: str) -> None:
+def test_invalid_poses_are_refused_in_one_sentence(scene: ms.Scene, poses: Any, sentence: str) -> None:
     with pytest.raises(ms.InputError, match=sentence):
         ms.Layout.from_poses(scene, poses)
 
 
-def test_an_asset_of_several_sizes_is_named_by_its_number(scene: ms.Scene) -> None:
+def test_assets_with_the_same_name_are_given_by_number(scene: ms.Scene) -> None:
     twice = replace(scene, assets=(scene.assets[0], replace(scene.assets[1], name="nut")))
     with pytest.raises(ms.InputError, match=r"must name one asset \(it names 2 of scene.assets: .* 0, 1\)"):
         ms.Layout.from_poses(twice, {"nut": [np.eye(4)]})
@@ -198,7 +198,7 @@ def turned(x: np.ndarray, y: np.ndarray, scale: float) -> tuple[np.ndarray, np.n
     return scale * goes[0] + 32 - x, 24 - scale * goes[1] - y
 
 
-def test_flow_of_what_is_gone_is_unknown(scene: ms.Scene, above: ms.Camera) -> None:
+def test_flow_of_a_removed_object_is_unknown(scene: ms.Scene, above: ms.Camera) -> None:
     before = ms.Layout.from_poses(scene, {"nut": [moved(0, 0), moved(0.1, 0)]})
     after = ms.Layout.from_poses(scene, {"nut": [None, moved(0.1, 0)]})
     ids = np.array([[1, 2, 0]])
@@ -210,7 +210,7 @@ def test_flow_of_what_is_gone_is_unknown(scene: ms.Scene, above: ms.Camera) -> N
 # Frames
 
 
-def test_a_film_has_the_flow_of_its_objects_and_cameras(scene: ms.Scene, above: ms.Camera) -> None:
+def test_a_sequence_has_the_flow_of_its_objects_and_cameras(scene: ms.Scene, above: ms.Camera) -> None:
     """A nut that slides by 5 mm below the camera: f 0.005 / depth px, 0.19 m at its top, and the table stays."""
     steps = [{"nut": [moved(0.005 * n - 0.005, 0, 0.005)], "bolt": [moved(0.03, 0.02, 0.025)]} for n in range(3)]
     layouts = (ms.Layout.from_poses(scene, poses, index=n) for n, poses in enumerate(steps))  # as of a simulator
@@ -229,7 +229,7 @@ def test_a_film_has_the_flow_of_its_objects_and_cameras(scene: ms.Scene, above: 
     np.testing.assert_allclose(np.diff(x), 160 * 0.005 / 0.19, atol=0.5)  # of whole pixels
 
 
-def test_frames_of_a_scene_are_those_alone_and_go_on(scene: ms.Scene) -> None:
+def test_render_frames_yields_the_frames_of_the_scene(scene: ms.Scene) -> None:
     """Beyond the scene's 12 frames as well; and a frame is the same in whichever order it is rendered."""
     layout = ms.Layout.from_poses(scene, {"nut": [moved(0, 0, 0.005)]})
     alone = ms.render_frame(scene, 5, layout=layout, quality="fast")
@@ -241,7 +241,7 @@ def test_frames_of_a_scene_are_those_alone_and_go_on(scene: ms.Scene) -> None:
     assert [frame.index for frame in itertools.islice(endless, 3)] == [11, 12, 13]
 
 
-def test_frames_before_a_moving_camera_are_those_alone(scene: ms.Scene) -> None:
+def test_frames_with_a_moving_camera_equal_single_frames(scene: ms.Scene) -> None:
     motion = Motion(exposure=(0.05, 0.05), rotation=(200.0, 200.0))
     camera = scene.spec.camera.model_copy(update={"motion": motion})
     scene = replace(scene, spec=scene.spec.model_copy(update={"camera": camera}))
@@ -252,12 +252,12 @@ def test_frames_before_a_moving_camera_are_those_alone(scene: ms.Scene) -> None:
     assert frame.plan.viewpoint["motion"] == alone.plan.viewpoint["motion"]
 
 
-def test_fewer_frames_than_none_are_refused(scene: ms.Scene) -> None:
+def test_a_negative_number_of_frames_is_refused(scene: ms.Scene) -> None:
     with pytest.raises(ms.InputError, match=r"frames must be 0 or more \(got -3\)"):
         next(ms.render_frames(scene, -3))
 
 
-def test_settled_frames_are_those_of_the_scene(
+def test_settled_frames_equal_those_of_the_scene(
     scene: ms.Scene, monkeypatch: pytest.MonkeyPatch, above: ms.Camera
 ) -> None:
     """Without a layout of one's own, each is settled once, and flow does not lead from one to the next."""
@@ -275,7 +275,7 @@ def test_settled_frames_are_those_of_the_scene(
     assert [frame.flow is None for frame in film] == [False, False, False, True, True]
 
 
-def test_lights_in_place_of_the_scenes(scene: ms.Scene) -> None:
+def test_given_lights_replace_those_of_the_scene(scene: ms.Scene) -> None:
     layout = ms.Layout.from_poses(scene, {"nut": [moved(0, 0, 0.005)]})
 
     def lit(lights: Sequence[Any] | None) -> ms.Frame:
@@ -296,7 +296,7 @@ def test_lights_in_place_of_the_scenes(scene: ms.Scene) -> None:
         lit([{"kind": "environment", "pool": "skies/*"}])
 
 
-def test_a_frame_shows_its_image_and_its_labels_side_by_side(scene: ms.Scene, above: ms.Camera) -> None:
+def test_the_notebook_picture_shows_image_and_labels(scene: ms.Scene, above: ms.Camera) -> None:
     layout = ms.Layout.from_poses(scene, {"nut": [moved(0, 0, 0.005)]})
     frame = ms.render_frame(scene, 0, layout=layout, camera=above, quality="fast")
     shown = cv2.imdecode(np.frombuffer(frame._repr_png_(), np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
@@ -307,7 +307,7 @@ def test_a_frame_shows_its_image_and_its_labels_side_by_side(scene: ms.Scene, ab
     assert (shown[:, 64:][y0, x0] != frame.image[y0, x0]).any()
 
 
-def test_the_example_of_the_documentation_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_documented_example_runs(monkeypatch: pytest.MonkeyPatch) -> None:
     """From a clone, as it stands there."""
     root = Path(__file__).parents[2]
     (code,) = (

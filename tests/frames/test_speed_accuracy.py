@@ -35,7 +35,7 @@ ROWS = [row("fast", 1.0, 0.01), row("balanced", 2.0, 0.001), row("exact", 9.0, 0
 
 
 @pytest.mark.parametrize(("tolerance", "name"), [(0.02, "fast"), (0.002, "balanced"), (0.0, "exact")])
-def test_cheapest_preset_within_a_tolerance(tolerance: float, name: str) -> None:
+def test_the_cheapest_preset_within_a_tolerance_is_chosen(tolerance: float, name: str) -> None:
     assert cheapest(ROWS, tolerance).name == name
 
 
@@ -44,7 +44,7 @@ def test_negative_tolerance_is_refused() -> None:
         cheapest(ROWS, -1.0)
 
 
-def test_coarser_steps_are_measured_to_be_less_exact(splat_file: Path) -> None:
+def test_coarser_presets_have_larger_measured_errors(splat_file: Path) -> None:
     coarse = Step("coarse", replace(PRESETS["fast"], alpha_min=0.2))
     steps = (coarse, Step("fast", PRESETS["fast"]), Step("exact", PRESETS["exact"]))
     rows = measure_steps(splat_file, steps, frames=2, overrides={"output.width": 64, "output.height": 48})

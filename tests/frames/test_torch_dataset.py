@@ -25,7 +25,7 @@ def scene(scene_data: dict[str, Any], write_scene: WriteScene) -> Scene:
     return load_scene(write_scene(scene_data))
 
 
-def test_a_target_is_what_the_labels_say(scene: Scene) -> None:
+def test_a_target_equals_the_labels(scene: Scene) -> None:
     frame = render_frame(scene, 0, quality="fast")
     image, target = sample_of(frame)
     assert image.shape == (3, 48, 64)

@@ -128,20 +128,20 @@ class TestRules:
             ("sh", np.inf, r"sh must be finite \(got inf at row 17\)"),
         ],
     )
-    def test_values(self, name, value, sentence):
+    def test_values_out_of_range_are_refused_with_their_row(self, name, value, sentence):
         array = getattr(random_splats(), name).astype(np.float64)
         array[17] = value
         with pytest.raises(InputError, match=sentence):
             replace(random_splats(), **{name: array})
 
     @pytest.mark.parametrize("field", [f.name for f in fields(Splats)])
-    def test_shapes(self, field):
+    def test_arrays_of_wrong_shape_are_refused(self, field):
         with pytest.raises(InputError, match=f"^{field if field != 'means' else 'quats'} must have shape"):
             replace(random_splats(), **{field: getattr(random_splats(), field)[:-1]})
         with pytest.raises(InputError, match="sh must have shape"):
             replace(random_splats(), sh=np.zeros((200, 2, 3)))
 
-    def test_no_gaussians_is_allowed(self, tmp_path):
+    def test_a_cloud_without_gaussians_is_valid(self, tmp_path):
         empty = random_splats().select(slice(0))
         assert len(empty) == 0 and len(empty.transformed(pose())) == 0
         empty.save(tmp_path / "empty.ply")
@@ -149,7 +149,7 @@ class TestRules:
         with pytest.raises(ValueError, match="at least one"):
             _ = empty.bounds
 
-    def test_select(self):
+    def test_select_takes_masks_indices_and_slices(self):
         splats = random_splats(degree=1)
         mask = splats.means[:, 0] > 0
         assert np.array_equal(splats.select(mask).sh, splats.sh[mask])
@@ -168,7 +168,7 @@ class TestRules:
 
 
 class TestSphericalHarmonics:
-    def test_basis_is_the_real_one_with_the_condon_shortley_phase(self):
+    def test_the_basis_is_real_with_the_condon_shortley_phase(self):
         d = directions()
         theta, phi = np.arccos(d[:, 2]), np.arctan2(d[:, 1], d[:, 0])
         expected = []
@@ -185,13 +185,13 @@ class TestSphericalHarmonics:
         assert np.allclose(sh_basis([y, z, x], 1)[:, 1:], constant * np.diag([-1, 1, -1]))
 
     @pytest.mark.parametrize("degree", range(4))
-    def test_rotation_matrix_turns_functions(self, degree):
+    def test_rotated_coefficients_give_the_rotated_function(self, degree):
         turn = sh_rotation(TURN.as_matrix(), degree)
         sh = np.random.default_rng(0).normal(size=(degree + 1) ** 2)
         d = directions()
         assert np.abs(sh_basis(TURN.apply(d), degree) @ turn @ sh - sh_basis(d, degree) @ sh).max() < 1e-12
 
-    def test_rotation_matrix_represents_rotations(self):
+    def test_rotation_matrices_are_orthogonal_and_compose(self):
         other = Rotation.from_rotvec([-2.0, 0.4, 0.1])
         a, b, ab = (sh_rotation(r.as_matrix(), 3) for r in (TURN, other, TURN * other))
         assert np.allclose(a @ b, ab, atol=1e-12)
@@ -204,7 +204,7 @@ class TestSphericalHarmonics:
 
 class TestTransformed:
     @pytest.mark.parametrize("degree", range(4))
-    def test_colours_turn_with_the_object(self, degree):
+    def test_colours_rotate_with_the_object(self, degree):
         splats = random_splats(100, degree)
         turned = splats.transformed(pose(scale=2.5))
         d = directions()
@@ -217,7 +217,7 @@ class TestTransformed:
         assert np.allclose(moved.means, splats.means @ linear.T + (1.0, -2.0, 0.5), atol=1e-6)
         assert np.allclose(covariances(moved), linear @ covariances(splats) @ linear.T, rtol=1e-5, atol=1e-9)
 
-    def test_composition(self):
+    def test_two_transformations_equal_their_product(self):
         splats, first, second = random_splats(degree=3), pose(2.0), pose(0.7, Rotation.from_rotvec([2, 0, -1]))
         stepwise, at_once = splats.transformed(first).transformed(second), splats.transformed(second @ first)
         assert_close(stepwise, at_once, mean=1e-6, log_scale=1e-6, opacity=0, sh=1e-6)
@@ -237,7 +237,7 @@ class TestTransformed:
             (np.eye(3), "4x4"),
         ],
     )
-    def test_refusals(self, matrix, sentence):
+    def test_matrices_that_are_no_similarity_are_refused(self, matrix, sentence):
         with pytest.raises(ValueError, match=sentence):
             random_splats().transformed(matrix)
 
@@ -245,13 +245,13 @@ class TestTransformed:
 class TestFiles:
     @pytest.mark.parametrize("degree", range(4))
     @pytest.mark.parametrize("order", ["<", ">", "a"])
-    def test_reads_what_3dgs_writes(self, tmp_path, degree, order):
+    def test_ply_files_of_3dgs_are_read(self, tmp_path, degree, order):
         splats = random_splats(20, degree)
         (tmp_path / "trained.ply").write_bytes(trained_ply(splats, order, normals=degree % 2 == 0, extra=degree == 3))
         assert_close(Splats.load(tmp_path / "trained.ply"), splats, mean=1e-7, log_scale=2e-6, opacity=1e-6, sh=1e-7)
 
     @pytest.mark.parametrize("degree", range(4))
-    def test_ply_round_trip(self, tmp_path, degree):
+    def test_ply_files_keep_all_values(self, tmp_path, degree):
         splats = random_splats(degree=degree)
         splats = replace(splats, opacities=np.r_[0.0, 1.0, 1e-30, 1 - 2.0**-24, splats.opacities[4:]])
         splats.save(tmp_path / "a.ply")
@@ -264,7 +264,7 @@ class TestFiles:
         )
         assert np.isfinite(np.frombuffer((tmp_path / "a.ply").read_bytes().partition(b"end_header\n")[2], "<f4")).all()
 
-    def test_splat_bytes(self, tmp_path):
+    def test_a_splat_file_is_read_byte_by_byte(self, tmp_path):
         row = struct.pack("<6f4B4B", 1, 2, 3, 0.1, 0.2, 0.3, 255, 0, 51, 102, 128, 255, 128, 128)  # half a turn about x
         (tmp_path / "a.splat").write_bytes(row)
         splats = Splats.load(tmp_path / "a.splat")
@@ -274,7 +274,7 @@ class TestFiles:
         splats.save(tmp_path / "b.splat")
         assert (tmp_path / "b.splat").read_bytes() == row
 
-    def test_splat_round_trip_drops_view_dependence(self, tmp_path):
+    def test_splat_files_keep_all_but_view_dependence(self, tmp_path):
         splats = random_splats(degree=2)
         splats.save(tmp_path / "a.splat")
         flat = replace(splats, sh=splats.sh[:, :1])
@@ -283,7 +283,7 @@ class TestFiles:
 
     @pytest.mark.parametrize("extent", [0.01, 1.0, 3000.0])
     @pytest.mark.parametrize("degree", range(4))
-    def test_spz_round_trip(self, tmp_path, degree, extent):
+    def test_spz_files_keep_values_within_their_quantisation(self, tmp_path, degree, extent):
         splats = replace(random_splats(degree=degree, extent=extent), scales=random_splats().scales)
         splats.save(tmp_path / "a.spz")
         # Positions to 23 bits but not below 2^-24 units, log scales to half of 1/16, SH to half of 1/8 and of 1/128.
@@ -300,7 +300,7 @@ class TestFiles:
         assert (tmp_path / "a.spz").read_bytes() == again
 
     @pytest.mark.parametrize("degree", range(4))
-    def test_spz_is_what_gaussforge_makes_of_it_to_the_bit(self, tmp_path, degree):
+    def test_spz_files_are_decoded_as_by_gaussforge(self, tmp_path, degree):
         random_splats(500, degree=degree).save(tmp_path / "a.spz")
         data = bytearray(gzip.decompress((tmp_path / "a.spz").read_bytes()))
         turns = slice(16 + 500 * 16, 16 + 500 * 20)  # anything is allowed before and after
@@ -311,7 +311,7 @@ class TestFiles:
         for name, array in splat_files.read_splats(tmp_path / "a.spz")._asdict().items():
             np.testing.assert_array_equal(array, getattr(converted, name), err_msg=name, strict=True)
 
-    def test_spz_of_an_earlier_version(self, tmp_path):
+    def test_spz_files_of_version_2_are_read(self, tmp_path):
         means, quats = np.float32([[0.5, -0.25, 2.0]]), np.float32([[0.5, -0.5, 0.5, 0.5]])
         positions = (means * 4096).astype("<i4").view(np.uint8).reshape(1, 3, 4)[..., :3].tobytes()
         turns = np.rint(127.5 * (quats[:, :3] + 1)).astype(np.uint8).tobytes()
@@ -324,7 +324,7 @@ class TestFiles:
         np.testing.assert_allclose(loaded.quats, quats, atol=0.01)
         np.testing.assert_allclose(loaded.scales, np.exp(-4), rtol=1e-6)
 
-    def test_spz_keeps_full_and_no_opacity(self, tmp_path):
+    def test_spz_files_keep_opacities_zero_and_one(self, tmp_path):
         replace(random_splats(2), opacities=[0.0, 1.0]).save(tmp_path / "a.spz")
         assert Splats.load(tmp_path / "a.spz").opacities.tolist() == [0.0, 1.0]
 
@@ -336,7 +336,7 @@ class TestFiles:
             ("sog", 1e-4, 0.05, 0.004, 0.05),
         ],
     )
-    def test_reads_other_formats(self, tmp_path, form, mean, log_scale, opacity, sh):
+    def test_converted_formats_are_read_within_their_quantisation(self, tmp_path, form, mean, log_scale, opacity, sh):
         splats = random_splats(degree=3)
         source = splats
         if form == "compressed.ply":  # its writer swaps the axes of the higher bands
@@ -348,7 +348,7 @@ class TestFiles:
         loaded = loaded.select(cKDTree(loaded.means).query(splats.means)[1])  # sog reorders
         assert_close(loaded, splats, mean=mean, log_scale=log_scale, opacity=opacity, sh=sh)
 
-    def test_units(self, tmp_path):
+    def test_units_scale_means_and_scales(self, tmp_path):
         random_splats().save(tmp_path / "a.ply")
         loaded = Splats.load(tmp_path / "a.ply", units=0.001)
         assert np.allclose(loaded.means, 0.001 * random_splats().means)
@@ -358,7 +358,7 @@ class TestFiles:
     @pytest.mark.parametrize(
         ("name", "count"), [("plant", 113648), ("academic_tarot_cards", 114865), ("torus_10k", 10000)]
     )
-    def test_real_captures(self, tmp_path, name, count):
+    def test_published_captures_are_read_with_their_counts(self, tmp_path, name, count):
         splats = Splats.load(DATA / f"{name}.splat")
         assert len(splats) == count and splats.sh_degree == 0
         assert np.ptp(splats.bounds, axis=0).max() == pytest.approx(1, abs=1e-3)
@@ -408,7 +408,7 @@ class TestBadFiles:
             ("a.sog", b"not zip", "not a valid sog file"),
         ],
     )
-    def test_is_one_sentence_that_names_the_file(self, tmp_path, name, data, sentence):
+    def test_a_damaged_file_is_refused_in_one_sentence_with_its_name(self, tmp_path, name, data, sentence):
         path = tmp_path / name
         path.write_bytes(data)
         tracemalloc.start()
@@ -420,14 +420,14 @@ class TestBadFiles:
             tracemalloc.stop()
         assert str(error.value).startswith(f"{path}: ") and "\n" not in str(error.value)
 
-    def test_missing_file_and_folder(self, tmp_path):
+    def test_a_missing_file_and_a_folder_are_refused(self, tmp_path):
         with pytest.raises(InputError, match=r"none\.ply: cannot be read \(No such file"):
             Splats.load(tmp_path / "none.ply")
         (tmp_path / "folder.ply").mkdir()
         with pytest.raises(InputError, match="must be a file"):
             Splats.load(tmp_path / "folder.ply")
 
-    def test_a_crash_of_a_decoder_is_an_error(self, tmp_path):
+    def test_a_crash_of_a_decoder_is_reported_in_one_sentence(self, tmp_path):
         data = bytearray(encoded(random_splats(), "ksplat", tmp_path))
         data[4096:4100] = struct.pack("<I", 4_000_000_000)  # Gaussians of the first section, which gaussforge trusts
         (tmp_path / "a.ksplat").write_bytes(data)
@@ -435,11 +435,11 @@ class TestBadFiles:
             Splats.load(tmp_path / "a.ksplat")
 
     @pytest.mark.parametrize("name", ["a.obj", "a.compressed.ply", "a"])
-    def test_formats_that_are_not_written(self, tmp_path, name):
+    def test_formats_that_cannot_be_written_are_refused(self, tmp_path, name):
         with pytest.raises(InputError, match="can be written as"):
             random_splats().save(tmp_path / name)
 
-    def test_writing_fails_without_a_trace(self, tmp_path):
+    def test_a_failed_write_leaves_no_file(self, tmp_path):
         with pytest.raises(InputError, match="cannot be written"):
             random_splats().save(tmp_path / "none" / "a.ply")
         (tmp_path / "a.ply").mkdir()
@@ -456,7 +456,7 @@ class TestBadFiles:
         changes=st.lists(st.tuples(st.floats(0, 1, exclude_max=True), st.integers(0, 255)), max_size=4),
         tail=st.binary(max_size=40),
     )
-    def test_damage_is_refused_or_harmless(self, tmp_path, form, keep, changes, tail):
+    def test_random_damage_is_refused_or_gives_valid_splats(self, tmp_path, form, keep, changes, tail):
         random_splats(10, degree=1).save(tmp_path / f"a.{form}")
         data = bytearray((tmp_path / f"a.{form}").read_bytes())
         for place, value in changes:
@@ -465,7 +465,7 @@ class TestBadFiles:
         self.load_or_refuse(tmp_path / f"b.{form}")
 
     @pytest.mark.parametrize("form", CONVERTED)
-    def test_damage_of_converted_formats(self, tmp_path, form):
+    def test_random_damage_of_converted_formats_is_refused_or_gives_valid_splats(self, tmp_path, form):
         whole, rng = encoded(random_splats(300, degree=1), form, tmp_path), np.random.default_rng(0)
         path = tmp_path / f"a.{form}"
         for _ in range(15):

@@ -20,7 +20,7 @@ BENT = (0.02, -0.01, 0.004, -0.001)
 FISHEYE = replace(PINHOLE, fx=300.0, fy=290.0, cx=330.0, cy=235.0, distortion=BENT, lens="fisheye")
 
 
-def test_fisheye_is_that_of_opencv() -> None:
+def test_fisheye_projection_agrees_with_opencv() -> None:
     angle, turn = np.meshgrid(np.linspace(0, 1.3, 14), np.linspace(0, 2 * np.pi, 9))
     slope = np.tan(angle.ravel())
     points = np.stack([slope * np.cos(turn.ravel()), slope * np.sin(turn.ravel()), np.ones_like(slope)], axis=1)
@@ -33,7 +33,7 @@ def test_fisheye_is_that_of_opencv() -> None:
 
 
 @pytest.mark.parametrize("distortion", [(0.0, 0.0, 0.0, 0.0), BENT])
-def test_rays_of_a_fisheye_come_back_to_their_pixels(distortion: tuple[float, ...]) -> None:
+def test_rays_of_a_fisheye_project_to_their_pixels(distortion: tuple[float, ...]) -> None:
     camera = replace(FISHEYE, distortion=distortion)
     x, y = np.meshgrid(np.linspace(0, 640, 9), np.linspace(0, 480, 7))
     pixels = np.stack([x.ravel(), y.ravel()], axis=1)
@@ -50,23 +50,23 @@ def test_rays_of_a_fisheye_come_back_to_their_pixels(distortion: tuple[float, ..
         ({"distortion": (-0.5, 0.0, 0.0, 0.0)}, "in growing distance"),
     ],
 )
-def test_fisheye_that_cannot_be_is_refused(changes: dict[str, object], sentence: str) -> None:
+def test_an_invalid_fisheye_is_refused(changes: dict[str, object], sentence: str) -> None:
     with pytest.raises(ValueError, match=sentence):
         replace(FISHEYE, **changes)
 
 
 @pytest.mark.parametrize("width", [0, 10.5, 200_000])
-def test_size_that_cannot_be_is_refused(width: float) -> None:
+def test_an_invalid_image_size_is_refused(width: float) -> None:
     with pytest.raises(ValueError, match=rf"whole numbers of 1 to 16384 px \(got {width}x480\)"):
         Camera(width, 480, 100.0, 100.0, 5.0, 240.0, np.eye(4))  # type: ignore[arg-type]
 
 
-def test_places_must_be_finite() -> None:
+def test_positions_that_are_not_finite_are_refused() -> None:
     with pytest.raises(ValueError, match=r"must be finite \(got \[0.0, 0.0, nan\]"):
         look_at_pose((0, 0, np.nan), (0, 0, 0))
 
 
-def test_sensor_plugin_sends_the_same_rays() -> None:
+def test_the_sensor_plugin_traces_the_rays_of_the_camera() -> None:
     ensure_variant()
     from mitsplat.plugins.splat_proxy import view_of
 
@@ -76,7 +76,7 @@ def test_sensor_plugin_sends_the_same_rays() -> None:
     np.testing.assert_allclose(np.stack([u, v], axis=1), expected, rtol=2e-5, atol=1e-5)
 
 
-def test_other_integrators_see_through_the_sensor_what_mitsubas_own_sees() -> None:
+def test_the_sensor_plugin_renders_the_image_of_mitsubas_perspective_sensor() -> None:
     ensure_variant()
     camera = Camera.look_at((0.3, -3, 1), (0, 0, 0), width=32, height=24, fov_x=50)
     ours = describe_sensor(camera)
@@ -90,13 +90,13 @@ def test_other_integrators_see_through_the_sensor_what_mitsubas_own_sees() -> No
 
 
 @pytest.mark.parametrize("wrong", [{"distortion": "0.1"}, {"lens": "mirror"}, {"lens": "fisheye"}])
-def test_sensor_plugin_refuses_what_is_no_lens(wrong: dict[str, str]) -> None:
+def test_the_sensor_plugin_refuses_invalid_lenses(wrong: dict[str, str]) -> None:
     ensure_variant()
     with pytest.raises((InputError, RuntimeError), match=r"opencv_camera.*(coefficients|lens)"):
         mi.load_dict({**describe_sensor(PINHOLE), **wrong})
 
 
-def test_colmap_names_the_fisheye() -> None:
+def test_the_colmap_model_of_a_fisheye_is_opencv_fisheye() -> None:
     assert camera_model(FISHEYE).split() == (
         ["OPENCV_FISHEYE", "640", "480", "300.0", "290.0", "330.0", "235.0", "0.02", "-0.01", "0.004", "-0.001"]
     )
@@ -107,7 +107,7 @@ THIN = replace(PINHOLE, aperture_radius=0.002, focus_distance=0.008, near=0.004)
 
 
 @pytest.mark.parametrize("camera", [PINHOLE, FISHEYE, THIN, replace(PINHOLE, fy=1 / 3, cx=-7.1, distortion=BENT)])
-def test_json_brings_back_every_field(camera: Camera) -> None:
+def test_json_keeps_every_field_of_a_camera(camera: Camera) -> None:
     back = Camera.from_json(json.loads(json.dumps(camera.to_json())))
     for field in fields(Camera):
         np.testing.assert_array_equal(getattr(back, field.name), getattr(camera, field.name))
@@ -122,7 +122,7 @@ def test_json_brings_back_every_field(camera: Camera) -> None:
         ((0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0), 1.0),
     ],
 )
-def test_distortion_turns_where_its_derivative_vanishes(distortion: tuple[float, ...], turn: float) -> None:
+def test_the_turning_slope_is_the_root_of_the_derivative(distortion: tuple[float, ...], turn: float) -> None:
     """r - 0.3 r^3 turns at r^2 = 1 / 0.9, r / (1 + r^2) at r = 1; positive coefficients never turn."""
     assert turning_slope(distortion) == pytest.approx(turn, rel=1e-9)
 

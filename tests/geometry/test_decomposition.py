@@ -34,7 +34,7 @@ def _inside(hull, point):
     return bool((np.einsum("ij,ij->i", hull.face_normals, point - hull.triangles[:, 0]) < 0).all())
 
 
-def test_a_convex_solid_is_its_own_piece():
+def test_a_convex_solid_is_one_piece():
     box = trimesh.creation.box((0.01, 0.02, 0.03))
     (piece,) = convex_pieces(box)
     assert piece.volume == pytest.approx(box.volume, rel=1e-9)
@@ -57,7 +57,7 @@ def test_separate_parts_are_split_apart():
     assert len(convex_pieces(apart)) == 2
 
 
-def test_pieces_are_kept_on_disk_and_damaged_files_made_anew(cache, bracket, caplog):
+def test_pieces_are_cached_and_damaged_cache_files_replaced(cache, bracket, caplog):
     shifted = bracket.copy().apply_translation((0.001, 0, 0))  # not yet in memory
     first = convex_pieces(shifted)
     (path,) = cache.iterdir()
@@ -73,7 +73,7 @@ def test_pieces_are_kept_on_disk_and_damaged_files_made_anew(cache, bracket, cap
     assert "computed again" in caplog.text
 
 
-def test_scan_that_lacks_a_triangle_is_closed_first():
+def test_a_scan_without_a_triangle_is_closed_first():
     """CoACD would rebuild an open mesh of voxels: slowly, and too thick."""
     ball = trimesh.creation.icosphere(3, 0.05)
     torn = trimesh.Trimesh(ball.vertices, ball.faces[1:], process=False)
@@ -91,7 +91,7 @@ def scanned_angle() -> trimesh.Trimesh:
     return trimesh.Trimesh(solid.vertices + noise, solid.faces, process=False)
 
 
-def test_scan_is_thinned_before_it_is_split_and_its_pieces_follow_it():
+def test_a_scan_is_simplified_before_it_is_split():
     scan = scanned_angle()
     assert scan.is_volume
     assert len(scan.faces) > 5000
@@ -110,7 +110,7 @@ def test_scan_is_thinned_before_it_is_split_and_its_pieces_follow_it():
     assert np.min(outside, axis=0).max() < 3e-4
 
 
-def test_what_is_ragged_is_followed_coarsely(caplog):
+def test_a_ragged_mesh_is_split_into_few_pieces(caplog):
     """In fine pieces it has more than 300, which take minutes."""
     ball = trimesh.creation.icosphere(subdivisions=2, radius=0.05)
     factors = 1 + np.random.default_rng(1).uniform(-0.2, 0.2, (len(ball.vertices), 1))
@@ -120,7 +120,7 @@ def test_what_is_ragged_is_followed_coarsely(caplog):
 
 
 @pytest.mark.parametrize("name", ["hex_bolt", "proximity_sensor", "spur_gear"])
-def test_parts_are_not_ragged(name):
+def test_shipped_parts_do_not_count_as_ragged(name):
     assert decomposition._concave_edge_share(trimesh.load_mesh(PARTS / name / "mesh.ply")) < 0.15
 
 
@@ -138,7 +138,7 @@ def scanned_can(noise: float = 2e-5) -> trimesh.Trimesh:
     )
 
 
-def test_pieces_of_a_scan_are_few_and_stand_off_no_more_than_layouts_bear():
+def test_pieces_of_a_scan_are_few_and_within_the_allowed_standoff():
     can = scanned_can()
     assert can.is_volume
     assert len(can.faces) > 3000
@@ -149,7 +149,7 @@ def test_pieces_of_a_scan_are_few_and_stand_off_no_more_than_layouts_bear():
     assert standoff(DistanceSurface(can), [can.convex_hull]) > 3 * max_gap(0)
 
 
-def test_no_more_pieces_than_are_asked_for_however_rough_a_scan():
+def test_the_number_of_pieces_is_bounded_for_rough_scans():
     ball = trimesh.creation.icosphere(subdivisions=4, radius=0.05)
     rough = 1 + np.random.default_rng(1).uniform(-0.2, 0.2, (len(ball.vertices), 1))
     pieces = convex_pieces(trimesh.Trimesh(ball.vertices * rough, ball.faces, process=False), most=5)
@@ -158,7 +158,7 @@ def test_no_more_pieces_than_are_asked_for_however_rough_a_scan():
 
 @pytest.mark.parametrize("normal", [(1.0, 0, 0), (0.6, 0, 0.8)])
 @pytest.mark.parametrize("offset", [-0.013, 0.0, 0.004])
-def test_what_a_cut_leaves_empty_is_what_manifold_says_of_both_sides(bracket, normal, offset):
+def test_the_empty_volume_of_a_cut_agrees_with_manifold(bracket, normal, offset):
     emptiness = decomposition._weighted_empty_volume(
         bracket, bracket.vertices @ normal - offset, offset * np.array(normal)
     )
@@ -168,7 +168,7 @@ def test_what_a_cut_leaves_empty_is_what_manifold_says_of_both_sides(bracket, no
     assert emptiness == pytest.approx(expected, rel=1e-9, abs=1e-18)
 
 
-def test_a_scan_is_thinned_to_5000_faces_unless_that_moves_its_surface():
+def test_a_scan_is_simplified_to_5000_faces_within_its_tolerance():
     ball = trimesh.creation.icosphere(5, 0.05)
     assert len(ball.faces) == 20480
     thin = denoise_solid(ball)
@@ -183,7 +183,7 @@ def test_a_scan_is_thinned_to_5000_faces_unless_that_moves_its_surface():
     assert np.abs(DistanceSurface(kept).signed_distances(rough)).max() < 0.003 * ball.scale * 1.01
 
 
-def test_a_small_dent_of_a_large_face_is_not_overlooked():
+def test_a_small_dent_of_a_large_face_gets_its_own_pieces():
     plate, drill = trimesh.creation.box((0.16, 0.12, 0.012)), trimesh.creation.cylinder(0.004, 0.008, sections=32)
     drill.apply_translation((0.031, 0.017, 0.006))
     dented = trimesh.boolean.difference([plate.subdivide().subdivide().subdivide(), drill]).subdivide().subdivide()

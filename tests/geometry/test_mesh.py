@@ -8,7 +8,7 @@ from mitsplat.errors import InputError
 from mitsplat.geometry.mesh import contact_points, mass_properties, prepare_mesh
 
 
-def test_mass_and_inertia_of_a_box():
+def test_mass_and_inertia_of_a_box_equal_their_closed_forms():
     # I_xx = m (b^2 + c^2) / 12
     a, b, c = 0.02, 0.03, 0.05
     box = trimesh.creation.box((a, b, c))
@@ -28,7 +28,7 @@ def test_a_given_mass_overrules_density():
     np.testing.assert_allclose(np.diag(found.inertia), 3.0 * 0.02 / 12)
 
 
-def test_an_open_mesh_takes_its_mass_from_its_pieces():
+def test_an_open_mesh_has_the_mass_of_its_pieces():
     box = trimesh.creation.box((0.1, 0.1, 0.1))
     lidless = box.copy()
     lidless.update_faces(lidless.face_normals[:, 2] < 0.5)
@@ -36,19 +36,19 @@ def test_an_open_mesh_takes_its_mass_from_its_pieces():
     assert mass_properties(lidless, (box,), density=1000.0).mass == pytest.approx(1.0)
 
 
-def test_a_mesh_inside_out_is_turned():
+def test_an_inverted_mesh_is_repaired():
     box = trimesh.creation.box((0.1, 0.1, 0.1))
     box.invert()
     assert prepare_mesh(box, "box").volume == pytest.approx(1e-3)
 
 
-def test_a_missing_triangle_is_put_back():
+def test_a_missing_triangle_is_restored():
     box = trimesh.creation.box((0.1, 0.1, 0.1))
     box.update_faces(np.arange(len(box.faces)) != 3)
     assert prepare_mesh(box, "box").is_volume
 
 
-def test_repairs_are_told_in_a_sentence_each(caplog):
+def test_each_repair_is_logged_in_one_sentence(caplog):
     box = trimesh.creation.box((0.1, 0.1, 0.1))
     box.invert()
     box.update_faces((box.face_normals[:, 2] < 0.5) & (box.face_normals[:, 0] < 0.5))
@@ -86,7 +86,7 @@ def test_unwelded_triangles_are_welded():
         (trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [0, np.nan, 0]], [[0, 1, 2]], process=False), "nan.* at vertex 2"),
     ],
 )
-def test_useless_meshes_are_refused_by_name(mesh, message):
+def test_unusable_meshes_are_refused_by_name(mesh, message):
     with pytest.raises(InputError, match=f"nut: .*{message}"):
         prepare_mesh(mesh, "nut")
 

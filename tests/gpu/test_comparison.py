@@ -11,11 +11,11 @@ PICTURE = np.random.default_rng(0).random((100, 100, 3)).astype(np.float32)
 
 
 @pytest.mark.parametrize("name", ["rgb", "instance", "depth", "normal", "mask_1", "gradient_means", "boxes"])
-def test_equal_arrays_have_no_fault(name: str) -> None:
+def test_equal_arrays_pass(name: str) -> None:
     assert not fault(name, PICTURE, PICTURE.copy())
 
 
-def test_one_pixel_in_a_thousand_is_too_many_ids() -> None:
+def test_one_different_id_in_a_thousand_is_a_fault() -> None:
     ids = np.zeros((100, 100), np.uint16)
     other = ids.copy()
     other[0, :5] = 1
@@ -24,7 +24,7 @@ def test_one_pixel_in_a_thousand_is_too_many_ids() -> None:
     assert fault("instance", ids, other) == "0.10 % of the pixels differ"
 
 
-def test_a_lost_shadow_is_seen() -> None:
+def test_a_missing_shadow_is_a_fault() -> None:
     light = np.ones((100, 100, 3), np.float32)
     light[:10, :20] = 0.4
     assert "dB < 60" in fault("light", light, np.ones_like(light))

@@ -18,7 +18,9 @@ COMMAND = "from mitsplat.cli import main; main()"
 
 @pytest.mark.slow
 @pytest.mark.parametrize("device", ["cpu", "cuda"])
-def test_processes_make_the_same_bytes(device: str, tmp_path: Path, request: pytest.FixtureRequest) -> None:
+def test_processes_sharing_a_gpu_make_the_same_bytes(
+    device: str, tmp_path: Path, request: pytest.FixtureRequest
+) -> None:
     """One process, and two that share the device."""
     if device != "cpu":
         request.getfixturevalue("gpu")

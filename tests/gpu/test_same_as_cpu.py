@@ -36,7 +36,7 @@ def rendered(tmp_path_factory: pytest.TempPathFactory, gpu: None) -> dict[str, d
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_case(case: str, rendered: dict[str, dict[str, np.ndarray]]) -> None:
+def test_gpu_and_cpu_arrays_of_a_case_agree(case: str, rendered: dict[str, dict[str, np.ndarray]]) -> None:
     cpu, gpu = (
         {name.partition("/")[2]: value for name, value in arrays.items() if name.startswith(f"{case}/")}
         for arrays in rendered.values()

@@ -30,7 +30,7 @@ def test_valid_files_pass(path: Path, kind: int) -> None:
     check_exr_header(path)
 
 
-def test_several_parts_pass(path: Path) -> None:
+def test_files_with_several_parts_pass(path: Path) -> None:
     parts = [OpenEXR.Part({}, {"Z": np.zeros((8, 16), np.float32)}, name) for name in "abc"]
     with OpenEXR.File(parts) as file:
         file.write(str(path))
@@ -57,7 +57,7 @@ def test_long_and_damaged_headers_are_refused(path: Path, data: bytes, rule: str
     assert time.process_time() - begun < 1
 
 
-def test_the_images_of_lights_are_asked_too(path: Path) -> None:
+def test_images_of_lights_with_long_headers_are_refused(path: Path) -> None:
     path.write_bytes(EXRS["200,000 channels"]())
     (reason,) = check_images([path])
     assert reason is not None and "channels must be listed in at most 65536 bytes" in reason

@@ -11,7 +11,7 @@ from mitsplat.images.picture_files import read_picture
 
 
 @pytest.mark.parametrize("name", [b"a.png", b"bad\xff.png"])
-def test_pixels_are_those_of_the_file(tmp_path, name):
+def test_pixels_equal_those_of_the_file(tmp_path, name):
     pixels = np.arange(4 * 5 * 3, dtype=np.uint8).reshape(4, 5, 3)
     path = Path(os.fsdecode(os.fsencode(tmp_path) + b"/" + name))
     path.write_bytes(cv2.imencode(".png", pixels)[1].tobytes())
@@ -20,7 +20,7 @@ def test_pixels_are_those_of_the_file(tmp_path, name):
 
 @pytest.mark.parametrize("data", [None, b"", b"no picture"])
 @pytest.mark.parametrize("name", ["a.png", "bad\udcff.png", "worse\ud800.png"])
-def test_what_is_no_picture_is_none(tmp_path, name, data):
+def test_files_that_are_not_pictures_give_none(tmp_path, name, data):
     if data is not None and "\ud800" not in name:
         (tmp_path / name).write_bytes(data)
     assert read_picture(tmp_path / name) is None

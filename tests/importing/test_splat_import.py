@@ -68,14 +68,14 @@ def test_the_smallest_rotation_takes_every_axis_up() -> None:
 
 
 @pytest.mark.parametrize("tilt", [0.0, 17.0])
-def test_a_table_says_how_far_a_capture_is_tilted(on_mat: Splats, tilt: float) -> None:
+def test_the_up_direction_of_a_tilted_capture_is_that_of_its_table(on_mat: Splats, tilt: float) -> None:
     rotation = Rotation.from_euler("zx", [tilt, 90], degrees=True)  # z up to -y, then askew
     found = find_up(turned(on_mat, rotation), "object", "-y")
     assert np.degrees(np.arccos(found.up @ rotation.apply((0, 0, 1)))) < 0.5
     assert found.support is not None
 
 
-def test_without_anything_flat_up_is_as_usual() -> None:
+def test_without_a_plane_the_up_direction_is_the_stated_one() -> None:
     ball = splats_on(trimesh.creation.icosphere(3, 0.1), 500)
     found = find_up(ball, "object", "y")
     assert np.allclose(found.up, (0, 1, 0))
@@ -83,7 +83,7 @@ def test_without_anything_flat_up_is_as_usual() -> None:
     assert np.allclose(find_up(ball, "object", "y", "-x").up, (-1, 0, 0))
 
 
-def test_surroundings_stand_on_their_floor_though_a_wall_is_larger() -> None:
+def test_the_floor_supports_surroundings_with_a_larger_wall() -> None:
     floor = trimesh.creation.box(bounds=[[-1, -1, -0.01], [1, 1, 0]])
     wall = trimesh.creation.box(bounds=[[-1, 1, 0], [1, 1.01, 3]])
     room = Splats.concatenate([splats_on(floor, 1500), splats_on(wall, 2500)])
@@ -92,7 +92,7 @@ def test_surroundings_stand_on_their_floor_though_a_wall_is_larger() -> None:
     assert np.degrees(np.arccos(found.up @ rotation.apply((0, 0, 1)))) < 0.5
 
 
-def test_the_table_goes_and_what_stands_on_it_stays(on_mat: Splats) -> None:
+def test_the_table_is_removed_and_the_object_on_it_is_kept(on_mat: Splats) -> None:
     support = find_up(on_mat, "object", "z").support
     assert support is not None
     kept = cut_support(on_mat, support)
@@ -122,7 +122,7 @@ def imported(file: Path) -> Imported:
     return import_splats(file, name="pin", settings=settings, mass=0.3)
 
 
-def test_an_object_comes_out_upright_clean_and_of_its_size(imported: Imported, pin: trimesh.Trimesh) -> None:
+def test_an_imported_object_is_upright_clean_and_to_scale(imported: Imported, pin: trimesh.Trimesh) -> None:
     asset = imported.asset
     assert imported.removed["invisible"] == 2
     assert imported.removed["haze and needles"] == 1
@@ -143,7 +143,7 @@ def test_an_object_comes_out_upright_clean_and_of_its_size(imported: Imported, p
     assert imported.mesh_iou > 0.9
 
 
-def test_the_asset_its_report_and_its_scene_are_whole(imported: Imported, tmp_path: Path) -> None:
+def test_asset_report_and_scene_of_an_import_are_complete(imported: Imported, tmp_path: Path) -> None:
     folder = tmp_path / "assets" / "pin"
     imported.asset.save(folder)
     assert len(Asset.load(folder).splats) == len(imported.asset.splats)
@@ -164,7 +164,7 @@ def test_the_asset_its_report_and_its_scene_are_whole(imported: Imported, tmp_pa
         write_scene(tmp_path / "elsewhere" / "table.yaml", folder, imported)
 
 
-def test_what_hangs_below_a_base_is_cut_off(pin: trimesh.Trimesh) -> None:
+def test_parts_below_the_base_are_removed(pin: trimesh.Trimesh) -> None:
     bulge = trimesh.creation.icosphere(3, 0.03)
     bulge.apply_translation((0.02, 0, 0.015))
     swollen = trimesh.boolean.union([pin, bulge], engine="manifold")
@@ -178,7 +178,7 @@ def test_what_hangs_below_a_base_is_cut_off(pin: trimesh.Trimesh) -> None:
         _cut_base(Path("ball.ply"), trimesh.creation.cone(0.05, 0.5, transform=np.diag([1, -1, -1, 1])))
 
 
-def test_surroundings_get_a_surface_to_drop_on(tmp_path: Path) -> None:
+def test_imported_surroundings_get_a_support(tmp_path: Path) -> None:
     table = trimesh.creation.box(bounds=[[-0.6, -0.4, -0.02], [0.6, 0.4, 0]])
     box = trimesh.creation.box(bounds=[[0.3, 0.1, 0], [0.5, 0.3, 0.2]])
     rotation = Rotation.from_euler("zx", [30, 90], degrees=True)
@@ -214,7 +214,7 @@ def block(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Imported]:
 @pytest.mark.parametrize(
     ("form", "precision"), [("spz", 2e-4), ("sog", 1e-4), ("ksplat", 1e-6), ("compressed.ply", 1e-3)]
 )
-def test_other_formats_become_what_a_ply_becomes(
+def test_other_formats_import_as_ply_files_do(
     block: tuple[Path, Imported], tmp_path: Path, form: str, precision: float
 ) -> None:
     source, one = block
@@ -232,7 +232,7 @@ def test_other_formats_become_what_a_ply_becomes(
     assert other.support.size == pytest.approx(one.support.size, abs=0.1 * precision * 4)
 
 
-def test_surroundings_without_anything_flat_are_imported_with_a_warning(tmp_path: Path) -> None:
+def test_surroundings_without_a_plane_are_imported_with_a_warning(tmp_path: Path) -> None:
     splats_on(trimesh.creation.icosphere(3, 0.5), 100).save(tmp_path / "ball.ply")
     found = import_splats(tmp_path / "ball.ply", name="ball", kind="environment", settings=SMALL)
     assert found.support is None
@@ -240,7 +240,7 @@ def test_surroundings_without_anything_flat_are_imported_with_a_warning(tmp_path
 
 
 @pytest.mark.parametrize("form", ["spz", "sog", "ksplat", "compressed.ply"])
-def test_what_is_left_of_a_torn_file_is_refused_in_one_sentence(tmp_path: Path, form: str) -> None:
+def test_truncated_files_are_refused_in_one_sentence(tmp_path: Path, form: str) -> None:
     splats_on(trimesh.creation.icosphere(2, 0.5), 100).save(tmp_path / "a.ply")
     data = gaussforge.GaussForge().convert((tmp_path / "a.ply").read_bytes(), "ply", form)["data"]
     path = tmp_path / f"torn.{form}"
@@ -267,7 +267,7 @@ def test_what_is_left_of_a_torn_file_is_refused_in_one_sentence(tmp_path: Path, 
         (["pin.ply", "--scene", "x.yaml"], "x.yaml: a scene is in metres: give --size or --units"),
     ],
 )
-def test_what_is_wrong_is_one_sentence(
+def test_invalid_arguments_are_refused_in_one_sentence(
     arguments: list[str], sentence: str, file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)

@@ -111,7 +111,7 @@ def blob_mask(seed, size, smoothing, share):
 
 
 class TestRules:
-    def test_a_fragment_is_dropped_below_the_limit_and_kept_at_it(self):
+    def test_a_fragment_below_the_limit_is_dropped_and_at_the_limit_kept(self):
         ids = np.zeros((20, 30), dtype=np.uint16)
         ids[2:12, 2:12] = 1
         ids[2:4, 20:24] = 1  # 8 px
@@ -126,13 +126,13 @@ class TestRules:
         ids[2:5, 2:5] = ids[5:8, 5:8] = 1
         assert label(ids, min_fragment=18, min_pixels=1).instances[0].area == 18
 
-    def test_an_instance_is_dropped_below_the_limit_and_kept_at_it(self):
+    def test_an_instance_below_the_limit_is_dropped_and_at_the_limit_kept(self):
         ids = np.zeros((12, 12), dtype=np.uint16)
         ids[2:6, 2:6] = 1  # 16 px
         assert label(ids, min_pixels=16).instances[0].area == 16
         assert label(ids, min_pixels=17).dropped["small"] == 1
 
-    def test_fragments_go_before_an_instance_is_measured(self):
+    def test_fragments_are_dropped_before_an_instance_is_measured(self):
         ids = np.zeros((12, 40), dtype=np.uint16)
         ids[2, 0:35:5] = 1
         ids[5:8, 2:7] = 1
@@ -170,7 +170,7 @@ class TestRules:
         assert label(ids, alone={1: (alone, 0, 0)}).instances[0].visible_fraction == 1
 
     @pytest.mark.parametrize("action", ["mark", "drop"])
-    def test_what_is_below_a_threshold_is_marked_or_dropped_and_counted(self, action):
+    def test_instances_below_a_threshold_are_marked_or_dropped_and_counted(self, action):
         ids = np.zeros((20, 40), dtype=np.uint16)
         ids[5:15, 0:4] = 1
         ids[5:15, 10:20] = 2
@@ -189,7 +189,7 @@ class TestRules:
         kept = label(ids, second, alone, min_visible=0.4, min_agreement=0.4, below_threshold="drop")
         assert [entry.id for entry in kept.instances] == [1, 2, 3]
 
-    def test_agreement_of_shifted_masks(self):
+    def test_agreement_of_shifted_masks_equals_its_closed_form(self):
         """Two 20 x 20 squares, one 3 px to the right of the other: IoU 17/23; only parallel edges lie within 2 px."""
         ids = np.zeros((40, 60), dtype=np.uint16)
         ids[10:30, 10:30] = 1
@@ -205,11 +205,11 @@ class TestRules:
         with pytest.raises(ValueError, match=r"must be those of instances, or 0 \(got 3\)"):
             label_instances(truth_of(np.full((4, 4), 3)), [], CLASSES, LabelRules())
 
-    def test_a_map_that_is_not_of_integers_is_refused(self):
+    def test_a_map_without_integers_is_refused(self):
         with pytest.raises(ValueError, match="2-D integer arrays"):
             label_instances(truth_of(np.zeros((4, 4))), [], CLASSES, LabelRules())
 
-    def test_ids_of_sixteen_bits(self):
+    def test_ids_have_sixteen_bits(self):
         ids = np.zeros((20, 20), dtype=np.uint16)
         ids[4:12, 4:12] = 65535
         labels = label_instances(truth_of(ids), [Seen(65535, 1, np.eye(4))], CLASSES, LabelRules())
@@ -227,14 +227,14 @@ class TestOutline:
     @pytest.mark.parametrize(
         "pixels", [[(5, 5)], [(5, 5), (6, 5)], [(5, 5), (6, 6)], [(0, 0)], [(x, 4) for x in range(9)]]
     )
-    def test_masks_without_inner_pixels(self, pixels):
+    def test_masks_without_inner_pixels_are_read_back_exactly(self, pixels):
         ids = np.zeros((10, 10), dtype=np.uint16)
         for x, y in pixels:
             ids[y, x] = 1
         [(_, mask, _, back)] = through_yolo(ids, min_pixels=1, min_fragment=1)
         np.testing.assert_array_equal(back, mask)
 
-    def test_a_ring_around_a_bolt(self):
+    def test_a_ring_around_another_instance_is_read_back(self):
         ids = disc((120, 160), (80, 60), 45)
         disc(None, (80, 60), 25, 0, ids)
         disc(None, (82, 61), 12, 2, ids)
@@ -242,20 +242,20 @@ class TestOutline:
             np.testing.assert_array_equal(back, mask)
             assert entry.polygon_iou == 1.0
 
-    def test_many_holes_and_walls_of_one_pixel(self):
+    def test_masks_with_many_holes_are_read_back(self):
         ids = np.ones((41, 61), dtype=np.uint16)
         ids[1:-1:2, 1:-1:2] = 0
         ids[10:20, 20:40] = 0
         [(_, mask, _, back)] = through_yolo(ids)
         np.testing.assert_array_equal(back, mask)
 
-    def test_cut_by_every_border(self):
+    def test_a_mask_cut_by_every_border_is_read_back_exactly(self):
         ids = disc((60, 60), (30, 30), 38)
         [(_, mask, box, back)] = through_yolo(ids)
         np.testing.assert_array_equal(back, mask)
         np.testing.assert_allclose(box, (0, 0, 60, 60), atol=0.03)
 
-    def test_touching_instances_stay_apart(self):
+    def test_touching_instances_are_read_back_separately(self):
         ids = np.zeros((40, 60), dtype=np.uint16)
         ids[10:30, 10:30] = 1
         ids[10:30, 30:50] = 2
@@ -273,7 +273,7 @@ class TestOutline:
         assert np.count_nonzero(back & ~mask) == 7 + 2
         assert entry.polygon_iou == np.count_nonzero(mask) / np.count_nonzero(back)
 
-    def test_a_part_inside_a_hole_of_another(self):
+    def test_a_part_inside_a_hole_is_read_back(self):
         ids = disc((120, 160), (80, 60), 45)
         disc(None, (80, 60), 25, 0, ids)
         disc(None, (80, 60), 15, 1, ids)
@@ -284,7 +284,7 @@ class TestOutline:
     @settings(max_examples=150, deadline=None)
     @given(st.integers(0, 2**32), st.integers(4, 60), st.floats(0.5, 5.0), st.floats(0.05, 0.95))
     @example(55, 55, 3.5, 0.05078125)
-    def test_random_blobs(self, seed, size, smoothing, share):
+    def test_random_masks_are_read_back_up_to_bridges(self, seed, size, smoothing, share):
         mask = blob_mask(seed, size, smoothing, share)
         for entry, labelled, box, back in through_yolo(mask.astype(np.uint16), min_pixels=1, min_fragment=1):
             parts = cv2.connectedComponents(labelled.astype(np.uint8), connectivity=8)[0] - 1
@@ -299,7 +299,7 @@ class TestOutline:
 
     @settings(max_examples=30, deadline=None)
     @given(st.integers(0, 2**32), st.sampled_from([(1280, 720), (1920, 1080), (333, 4001), (16384, 100)]))
-    def test_normalised_positions_survive_the_text(self, seed, size):
+    def test_normalised_positions_keep_their_pixels_as_text(self, seed, size):
         width, height = size
         blob = blob_mask(seed, 40, 3.0, 0.5)
         ids = np.zeros((height, width), dtype=np.uint16)
@@ -315,7 +315,7 @@ class TestOutline:
         assert exact <= np.count_nonzero(half) <= exact + 0.5 * np.pi * 150
 
 
-def test_masks_are_exclusive_and_cover_the_map():
+def test_instance_masks_are_disjoint_and_cover_the_map():
     rng = np.random.default_rng(5)
     ids = np.zeros((200, 300), dtype=np.int32)
     for value in range(1, 121):
@@ -329,7 +329,7 @@ def test_masks_are_exclusive_and_cover_the_map():
     "box", [(0, 0, 40, 30), (5, 3, 20, 17), (30, 20, 40, 30), (0, 29, 40, 30), (39, 0, 40, 30), (3, 0, 9, 30)]
 )
 @pytest.mark.parametrize("share", [0.3, 0.9, 1.0])
-def test_run_lengths_are_those_of_pycocotools(box, share):
+def test_run_lengths_agree_with_pycocotools(box, share):
     x0, y0, x1, y1 = box
     mask = np.random.default_rng(x0 + y1).random((y1 - y0, x1 - x0)) <= share
     canvas = np.zeros((30, 40), dtype=np.uint8, order="F")
@@ -339,7 +339,7 @@ def test_run_lengths_are_those_of_pycocotools(box, share):
 
 @given(st.integers(0, 2**32 - 1), st.integers(1, 25), st.integers(1, 25), st.integers(1, 5))
 @settings(max_examples=60, deadline=None)
-def test_bounds_of_ids_are_those_of_scipy(seed, height, width, count):
+def test_bounds_of_ids_agree_with_scipy(seed, height, width, count):
     ids = np.random.default_rng(seed).integers(0, count + 1, (height, width)).astype(np.uint16)
     ids[ids == count] = 40000  # not every id is there
     expected = {
@@ -354,7 +354,7 @@ def test_bounds_of_ids_are_those_of_scipy(seed, height, width, count):
 
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0.2, 0.5, 0.8]), st.integers(0, 40))
 @settings(max_examples=60, deadline=None)
-def test_fragments_are_the_small_parts(seed, share, least):
+def test_fragments_are_the_parts_below_the_limit(seed, share, least):
     mask = np.random.default_rng(seed).random((9, 12)) < share
     kept, removed = without_fragments(mask, least)
     parts, count = ndimage.label(mask, structure=np.ones((3, 3)))
@@ -365,7 +365,7 @@ def test_fragments_are_the_small_parts(seed, share, least):
 
 @pytest.mark.parametrize("size", [(1, 1), (7, 5), (300, 2), (41, 700)])
 @pytest.mark.parametrize("share", [0.0, 0.5, 1.0])
-def test_a_mask_as_png_is_what_readers_of_png_read(size, share):
+def test_masks_written_as_png_are_read_by_opencv_and_pillow(size, share):
     """OpenCV (libpng) and Pillow both check every checksum."""
     width, height = size
     rng = np.random.default_rng(width)
@@ -383,7 +383,7 @@ def test_a_mask_as_png_is_what_readers_of_png_read(size, share):
         Image.open(io.BytesIO(data)).verify()
 
 
-def test_json_gives_the_labels_back():
+def test_json_keeps_the_labels():
     ids = disc((50, 70), (30, 20), 15)
     disc(None, (60, 40), 9, 2, ids)
     labels = label(ids)
@@ -394,7 +394,7 @@ def test_json_gives_the_labels_back():
         np.testing.assert_array_equal(one.world_from_object, other.world_from_object)
 
 
-def test_a_distractor_hides_and_has_no_label():
+def test_a_distractor_occludes_and_has_no_label():
     """Half of a square is behind what has no class."""
     ids = np.zeros((40, 40), dtype=np.uint16)
     ids[10:30, 10:20], ids[5:35, 20:35] = 1, 2

@@ -37,7 +37,7 @@ def test_the_compatibility_page_names_every_layer() -> None:
     from mitsplat.plugins.splat_proxy import AOVS
 
     page = (ROOT / "docs/compatibility.md").read_text()
-    rows = page.partition("### Layers")[2].partition("## How something goes")[0]
+    rows = page.partition("### Layers")[2].partition("## Deprecation")[0]
     cells = re.findall(r"^\| (`[^|]*`) \|", rows, re.MULTILINE)
     assert re.findall(r"`([\w.]+)`", " ".join(cells)) == list(AOVS)
 

@@ -40,7 +40,7 @@ def placed_clearances(scene, layout):
 BIN = {"name": "bin", "bin": {"size": [0.12, 0.09, 0.05], "position": [0, 0, 0.004], "rotate_z": 20}, "visible": True}
 
 
-def test_a_bin_is_five_boxes_around_its_inside(scene_data, write_scene):
+def test_a_bin_has_five_walls_around_its_interior(scene_data, write_scene):
     """Volume of the walls: outer less inner; the inside is empty and the middle of its floor where it should be."""
     from mitsplat.geometry.mesh_distance import DistanceSurface
 
@@ -75,7 +75,7 @@ def test_a_pile_fills_a_bin(scene_data, write_scene):
     assert layout.certificate.pair_penetration < 5e-4
 
 
-def test_a_pile_that_finds_no_room_is_an_error(scene_data, write_scene):
+def test_a_pile_without_room_is_refused(scene_data, write_scene):
     with pytest.raises(InputError, match=r"region must be large enough .* settle\.arrangement pile"):
         drop_layout(
             scene_data,
@@ -86,7 +86,7 @@ def test_a_pile_that_finds_no_room_is_an_error(scene_data, write_scene):
         )
 
 
-def test_what_is_scattered_does_not_touch(scene_data, write_scene):
+def test_scattered_objects_do_not_touch(scene_data, write_scene):
     scene, layout = drop_layout(
         scene_data,
         write_scene,
@@ -108,7 +108,7 @@ def test_a_stack_lies_on_its_largest_faces(scene_data, write_scene):
 
 
 @pytest.mark.parametrize("arrangement", ["stack", "upright", "tower", "packed"])
-def test_things_are_put_down_below_the_lid_of_an_enclosure(scene_data, write_scene, arrangement):
+def test_placed_objects_start_below_the_lid_of_an_enclosure(scene_data, write_scene, arrangement):
     """They start at the region's top, where the lid is, but stand on the ground from the first moment on."""
     scene_data["objects"] = [{"asset": "assets/nut", "count": 2}]
     scene_data["enclosure"] = {"margin": 0.05}
@@ -117,7 +117,7 @@ def test_things_are_put_down_below_the_lid_of_an_enclosure(scene_data, write_sce
     assert layout.certificate.time_to_rest < 0.1
 
 
-def test_what_is_upright_stands_as_the_asset_does(scene_data, write_scene):
+def test_upright_objects_keep_their_vertical(scene_data, write_scene):
     """Bolts of 10 x 10 x 50 mm, which lie down when dropped, stand: the vertical stays, its turn is random."""
     scene_data["objects"] = [{"asset": "assets/bolt", "count": 5}]
     _, layout = drop_layout(scene_data, write_scene, settle={"arrangement": "upright", "stepper": "mujoco"})
@@ -127,7 +127,7 @@ def test_what_is_upright_stands_as_the_asset_does(scene_data, write_scene):
     assert np.ptp(np.arctan2(poses[:, 1, 0], poses[:, 0, 0])) > 0.5
 
 
-def test_what_is_packed_stands_side_by_side_in_rows(scene_data, write_scene):
+def test_packed_objects_stand_in_rows(scene_data, write_scene):
     """Bolts of 10 x 10 mm, turned by quarters up to 3 degrees off, have at most 11 mm by 11 mm and gaps of 2 to 5 mm.
 
     So at most five stand in a row of 60 mm, the rows are as many as they must be, and none is far from the next.
@@ -150,7 +150,7 @@ def test_what_is_packed_stands_side_by_side_in_rows(scene_data, write_scene):
         drop_layout(scene_data, write_scene, settle={"arrangement": "packed", "stepper": "mujoco"})
 
 
-def test_what_is_a_tower_stands_on_one_another_the_widest_below(scene_data, write_scene):
+def test_a_tower_stands_on_its_widest_object(scene_data, write_scene):
     """A bolt of 50 mm stands on three nuts of 10 mm, whatever order they are listed in; each is turned for itself."""
     scene_data["objects"] = [{"asset": "assets/bolt", "count": 1}, {"asset": "assets/nut", "count": 3}]
     _, layout = drop_layout(scene_data, write_scene, settle={"arrangement": "tower", "stepper": "mujoco"})
@@ -168,7 +168,7 @@ def test_what_is_a_tower_stands_on_one_another_the_widest_below(scene_data, writ
 
 
 @pytest.mark.parametrize("arrangement", ["upright", "tower", "packed"])
-def test_fronts_look_where_yaw_says(scene_data, write_scene, arrangement):
+def test_yaw_limits_the_direction_of_fronts(scene_data, write_scene, arrangement):
     scene_data["objects"] = [{"asset": "assets/nut", "count": 8}]
     settle = {"arrangement": arrangement, "stepper": "mujoco", "yaw": [80, 110]}
     _, layout = drop_layout(scene_data, write_scene, settle=settle)
@@ -177,7 +177,7 @@ def test_fronts_look_where_yaw_says(scene_data, write_scene, arrangement):
     assert turns.min() > 79.9 and turns.max() < 110.1 and np.ptp(turns) > 5
 
 
-def test_yaw_is_for_what_is_put_down(scene_data, write_scene):
+def test_yaw_is_refused_for_dropped_objects(scene_data, write_scene):
     scene_data["settle"] = {"arrangement": "pile", "yaw": [0, 90]}
     with pytest.raises(InputError, match=r"settle.yaw: needs settle.arrangement upright, tower or packed \(got pile\)"):
         load_scene(write_scene(scene_data))
@@ -197,13 +197,13 @@ def test_yaw_is_for_what_is_put_down(scene_data, write_scene):
     ],
     ids=["box", "board", "can", "cone", "ball"],
 )
-def test_what_stands_on_another_side(mesh, quarters):
+def test_standing_turns_are_those_of_stable_sides(mesh, quarters):
     turns = [Rotation.from_matrix(turn).as_euler("YXZ", degrees=True)[0] for turn in standing_turns(mesh.vertices)]
     np.testing.assert_allclose(np.mod(turns, 360), np.multiply(quarters, 90.0), atol=1e-9)
 
 
 @pytest.mark.parametrize("arrangement", ["upright", "tower", "packed"])
-def test_what_is_put_down_may_stand_on_another_side(scene_data, write_scene, tmp_path, arrangement):
+def test_turned_over_places_objects_on_other_sides(scene_data, write_scene, tmp_path, arrangement):
     box_asset("block", (0.05, 0.03, 0.04)).save(tmp_path / "assets/block")
     scene_data["objects"] = [{"asset": "assets/block", "count": 3}]
     settle = {"arrangement": arrangement, "stepper": "mujoco", "yaw": [-10, 10], "turned_over": 0.8}
@@ -214,7 +214,7 @@ def test_what_is_put_down_may_stand_on_another_side(scene_data, write_scene, tmp
     assert ups - {0}
 
 
-def test_poses_may_be_given(scene_data, write_scene):
+def test_objects_with_given_poses_stay_there(scene_data, write_scene):
     """A nut put down turned by 30 degrees stays there; one above it comes down by its clearance; others keep off."""
     given = [
         {"position": [0.05, 0.02, 0.005], "rotate": [0, 0, 30]},
@@ -320,7 +320,7 @@ def test_wrong_regions_are_refused(shelf, write_scene, changes, sentence):
         load_scene(write_scene({**shelf, **changes}))
 
 
-def test_a_region_above_nothing_is_told_before_work_begins(shelf, write_scene):
+def test_a_region_without_a_collider_below_is_a_fault(shelf, write_scene):
     shelf["regions"][1] |= {"min": [0.9, 0.9, 0.02], "max": [1.1, 1.1, 0.2]}
     found = [fault.text for fault in layout_faults(load_scene(write_scene(shelf)))]
     assert found == ["regions[1]: no collider is below it, so all objects fall forever"]

@@ -32,7 +32,7 @@ def needle_scene(scene_data, write_scene, tmp_path):
     return write_scene
 
 
-def test_what_cannot_stand_is_left_out_and_the_others_keep_their_numbers(needle_scene, scene_data):
+def test_an_object_that_falls_over_is_omitted_and_others_keep_their_ids(needle_scene, scene_data):
     scene = load_scene(needle_scene(scene_data))
     layout = settle_layout(scene, 0, cached=False)
     assert [(one.id, scene.assets[one.asset].name) for one in layout.instances] == [(2, "nut"), (3, "nut")]
@@ -49,7 +49,7 @@ def test_what_cannot_stand_is_left_out_and_the_others_keep_their_numbers(needle_
     assert np.abs(start - resting).max() < 2e-3  # they were put down where they lie
 
 
-def test_a_layout_of_which_nothing_rests_is_an_error_that_has_the_empty_layout(needle_scene, scene_data):
+def test_a_layout_without_resting_objects_is_an_error_with_the_empty_layout(needle_scene, scene_data):
     scene_data["objects"] = [{"asset": "assets/needle", "count": 2}]
     scene = load_scene(needle_scene(scene_data))
     sentence = r"layout 1 must come to rest .*[(]got 2 x needle fell over[)]"
@@ -63,7 +63,7 @@ def test_a_layout_of_which_nothing_rests_is_an_error_that_has_the_empty_layout(n
     assert layout.to_json() == again.layout.to_json()
 
 
-def test_what_is_higher_than_the_region_leaves_room_for_the_others(scene_data, write_scene, tmp_path, monkeypatch):
+def test_an_object_higher_than_the_region_is_omitted(scene_data, write_scene, tmp_path, monkeypatch):
     from mitsplat.physics import placement
 
     monkeypatch.setattr(placement, "_MAX_DRAWS", 2)
@@ -79,7 +79,7 @@ def test_what_is_higher_than_the_region_leaves_room_for_the_others(scene_data, w
         settle_layout(load_scene(write_scene(scene_data)), 0, cached=False)
 
 
-def test_a_layout_goes_on_without_what_finds_no_room_beside_the_others(scene_data, write_scene, tmp_path):
+def test_an_object_without_room_beside_others_is_omitted(scene_data, write_scene, tmp_path):
     box_asset("tile", (0.04, 0.04, 0.01)).save(tmp_path / "assets/tile")
     scene_data["objects"] = [{"asset": "assets/tile", "count": 5}]
     scene_data["region"] = {"min": [-0.045, -0.045, 0.01], "max": [0.045, 0.045, 0.03]}
@@ -93,21 +93,21 @@ def test_a_layout_goes_on_without_what_finds_no_room_beside_the_others(scene_dat
         settle_layout(load_scene(write_scene(scene_data)), 0, cached=False)
 
 
-def test_each_object_is_tried_alone(needle_scene, scene_data):
+def test_each_omitted_object_is_tried_alone(needle_scene, scene_data):
     tried = list(try_alone(load_scene(needle_scene(scene_data))))
     assert tried == [("needle", "upright", ["needle fell over"] * 3), ("nut", "upright", [])]
     scene_data["settle"]["arrangement"] = "drop"
     assert not any(refused for _, _, refused in try_alone(load_scene(needle_scene(scene_data))))
 
 
-def test_a_region_too_small_is_an_error(scene_data, write_scene):
+def test_a_region_too_small_is_refused(scene_data, write_scene):
     scene_data["objects"][0]["count"] = 60
     scene_data["region"] = {"min": [-0.05, -0.05, 0.01], "max": [0.05, 0.05, 0.08]}
     with pytest.raises(InputError, match=r"scene.yaml: region must be large enough .*got 61 objects in"):
         settle_layout(load_scene(write_scene(scene_data)), 0, cached=False)
 
 
-def test_a_region_mostly_inside_of_a_table_is_blamed_on_it(scene_data, write_scene, monkeypatch):
+def test_a_region_mostly_inside_of_a_table_is_refused_with_its_name(scene_data, write_scene, monkeypatch):
     from mitsplat.physics import placement as place
     from mitsplat.physics.drop import drop_of
 

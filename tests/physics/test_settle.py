@@ -29,7 +29,7 @@ from tests.bodies import STEPPERS, lowest, pose_at
 pytestmark = pytest.mark.usefixtures("physics")
 
 
-def test_clearance_of_boxes():
+def test_clearance_of_boxes_equals_its_closed_form():
     from mitsplat.geometry.mesh_distance import DistanceSurface, PlacedSurface, clearance
 
     box = DistanceSurface(trimesh.creation.box((0.02, 0.02, 0.02)))
@@ -48,7 +48,7 @@ def test_clearance_of_boxes():
     assert clearance(upright, above, reach=0.005).distance == pytest.approx(-0.001 / np.sqrt(2), rel=0.1)
 
 
-def test_draws_are_uniform_and_apart(scene_data, write_scene):
+def test_drawn_poses_are_uniform_and_do_not_overlap(scene_data, write_scene):
     from mitsplat.geometry.mesh_distance import all_clearances
     from mitsplat.physics.drop import drop_of
 
@@ -72,7 +72,7 @@ def test_draws_are_uniform_and_apart(scene_data, write_scene):
     assert kstest(angles, lambda t: (t - np.sin(t)) / np.pi).pvalue > 1e-3
 
 
-def test_a_layout_holds_what_its_certificate_says(scene_data, write_scene):
+def test_a_layout_satisfies_its_certificate(scene_data, write_scene):
     scene = load_scene(write_scene(scene_data))
     layout = settle_layout(scene, 0, cached=False)
     names = [scene.class_names[instance.class_index] for instance in layout.instances]
@@ -95,7 +95,7 @@ def test_a_layout_holds_what_its_certificate_says(scene_data, write_scene):
 
 
 @pytest.mark.parametrize("stepper", STEPPERS)
-def test_a_replay_is_the_drop_that_was(stepper, scene_data, write_scene):
+def test_a_replay_ends_in_the_poses_of_the_layout(stepper, scene_data, write_scene):
     """It starts high, and where it ends no object is farther than 2 mm from where the layout has it."""
     scene_data["settle"] = {"stepper": stepper}
     scene = load_scene(write_scene(scene_data))
@@ -109,7 +109,7 @@ def test_a_replay_is_the_drop_that_was(stepper, scene_data, write_scene):
     np.testing.assert_allclose(positions[-1], resting, atol=2e-3)
 
 
-def test_layouts_survive_json(scene_data, write_scene):
+def test_json_keeps_layouts(scene_data, write_scene):
     layout = settle_layout(load_scene(write_scene(scene_data)), 1, cached=False)
     again = Layout.from_json(json.loads(json.dumps(layout.to_json())))
     assert again.certificate == layout.certificate
@@ -118,7 +118,7 @@ def test_layouts_survive_json(scene_data, write_scene):
         np.testing.assert_array_equal(one.world_from_object, other.world_from_object)
 
 
-def test_a_layout_is_settled_once(scene_data, write_scene, tmp_path, monkeypatch):
+def test_a_layout_is_settled_once_and_cached(scene_data, write_scene, tmp_path, monkeypatch):
     """What changes the picture only does not settle anew; seed, index and meshes do, and so does a damaged file."""
     from mitsplat.physics import drop, settle
 
@@ -176,7 +176,7 @@ def test_code_that_decides_layouts_is_hashed():
 @pytest.mark.parametrize(
     "change", [("scene/walls", "PILE_HEIGHT = 1.0", "PILE_HEIGHT = 0.9"), ("physics/friction", "sqrt", "cbrt")]
 )
-def test_another_rule_settles_anew(change, scene_data, write_scene, tmp_path, monkeypatch):
+def test_a_changed_rule_invalidates_cached_layouts(change, scene_data, write_scene, tmp_path, monkeypatch):
     """The height of piles, the walls of bins and the rule of friction are part of what a layout is kept by."""
     from mitsplat.physics import settle
 
@@ -195,7 +195,7 @@ def test_another_rule_settles_anew(change, scene_data, write_scene, tmp_path, mo
 
 
 @pytest.mark.slow
-def test_processes_settle_what_one_process_settles(scene_data, write_scene):
+def test_several_processes_settle_the_same_layouts_as_one(scene_data, write_scene):
     scene_data["settle"] = {"stepper": "mujoco"}
     scene = load_scene(write_scene(scene_data))
     found = {layout.index: layout.to_json() for layout in settle_layouts(scene, range(3), workers=2, cached=False)}
@@ -203,7 +203,7 @@ def test_processes_settle_what_one_process_settles(scene_data, write_scene):
 
 
 @pytest.mark.parametrize("stepper", STEPPERS)
-def test_seed_and_index_decide_every_byte(stepper, scene_data, write_scene):
+def test_seed_and_index_determine_every_byte(stepper, scene_data, write_scene):
     """A process that settles layout 2 alone, and one that has settled another before, agree."""
     scene_data["settle"] = {"stepper": stepper}
     path = write_scene(scene_data)
@@ -227,7 +227,7 @@ def test_seed_and_index_decide_every_byte(stepper, scene_data, write_scene):
     )
 
 
-def test_simulations_do_not_pile_up(scene_data, write_scene, monkeypatch):
+def test_simulations_are_freed(scene_data, write_scene, monkeypatch):
     """Models that Newton leaves in reference cycles are let go of, however seldom Python collects."""
     from mitsplat.physics import drop
     from mitsplat.physics import worlds as physics
@@ -249,7 +249,7 @@ def test_simulations_do_not_pile_up(scene_data, write_scene, monkeypatch):
     assert gone == [True, True, True, False]
 
 
-def test_draws_that_fall_off_are_refused_and_counted(scene_data, write_scene):
+def test_drops_that_fall_off_are_rejected_and_counted(scene_data, write_scene):
     """On a pedestal narrower than the region some draws stay and some leave."""
     scene_data["shapes"][0]["box"] = {"size": [0.12, 0.12, 0.1], "position": [0, 0, -0.05]}
     scene_data["region"] = {"min": [-0.1, -0.1, 0.01], "max": [0.1, 0.1, 0.1]}
@@ -263,7 +263,7 @@ def test_draws_that_fall_off_are_refused_and_counted(scene_data, write_scene):
 
 
 @pytest.mark.parametrize(("distance", "settles"), [(3e-4, False), (3e-3, True)])
-def test_what_rests_against_the_enclosure_is_drawn_again(distance, settles, scene_data, write_scene):
+def test_an_object_resting_against_the_enclosure_is_drawn_again(distance, settles, scene_data, write_scene):
     """A nut of 20 x 30 x 10 mm is put down flat, its face as far from the wall at x = 0.2 m as said."""
     scene_data["enclosure"] = {"margin": 0}
     scene_data["objects"] = [{"asset": "assets/nut", "poses": [{"position": [0.19 - distance, 0, 0.005]}]}]
@@ -283,7 +283,7 @@ def test_a_layout_that_never_rests_is_an_error(scene_data, write_scene):
 
 
 @pytest.mark.parametrize(("size", "depth", "refused"), [(0.05, 3.5e-4, True), (0.2, 3.5e-4, False), (0.2, 7e-4, True)])
-def test_how_deep_an_object_may_be_grows_with_it(size, depth, refused):
+def test_the_allowed_depth_grows_with_the_size_of_an_object(size, depth, refused):
     """0.3 mm, or 0.3 % of its size: 0.6 mm of 200."""
     from mitsplat.geometry.mesh_distance import Clearance, DistanceSurface, PlacedSurface
     from mitsplat.physics.drop import _rest_defect
@@ -295,7 +295,7 @@ def test_how_deep_an_object_may_be_grows_with_it(size, depth, refused):
     assert (fault is not None) == refused
 
 
-def test_a_scene_without_colliders_is_an_error(scene_data, write_scene):
+def test_a_scene_without_colliders_is_refused(scene_data, write_scene):
     scene_data["shapes"][0]["collider"] = False
     with pytest.raises(InputError, match="must be a collider, on which objects rest"):
         settle_layout(load_scene(write_scene(scene_data)), 0, cached=False)
@@ -314,7 +314,7 @@ def test_an_environment_carries_objects(scene_data, write_scene):
         assert lowest(mesh, instance.world_from_object) == pytest.approx(0.015, abs=3e-4)
 
 
-def test_objects_lie_on_the_environment_that_their_layout_draws(scene_data, write_scene):
+def test_objects_rest_on_the_drawn_environment(scene_data, write_scene):
     """Steps of two heights: what is settled after another is no other than what is settled alone."""
     scene_data["shapes"] = []
     scene = load_scene(write_scene({**scene_data, "settle": {"stepper": "mujoco"}}))
@@ -336,7 +336,7 @@ def test_objects_lie_on_the_environment_that_their_layout_draws(scene_data, writ
     assert alone.to_json() == layout.to_json()
 
 
-def test_friction_is_drawn_anew_for_each_layout(scene_data, write_scene):
+def test_friction_is_drawn_for_each_layout(scene_data, write_scene):
     from mitsplat.physics.drop import drop_of
 
     scene = load_scene(write_scene({**scene_data, "randomise": {"friction": [0.5, 1.5]}}))
@@ -349,7 +349,7 @@ def test_friction_is_drawn_anew_for_each_layout(scene_data, write_scene):
     assert [body.friction for body in bodies] == [drawn[3, 0], drawn[3, 0], drawn[3, 1]]
 
 
-def test_standoff_of_a_hull():
+def test_standoff_of_a_hull_equals_its_closed_form():
     """Pieces that are the mesh stand off by nothing; the hull of an L by half a leg, where its long face spans it."""
     from mitsplat.geometry.mesh_distance import DistanceSurface, standoff
 
@@ -363,7 +363,7 @@ def test_standoff_of_a_hull():
     assert standoff(surface, [bracket.convex_hull]) == pytest.approx(0.01, abs=2e-4)
 
 
-def test_standoff_is_the_largest_signed_distance_of_all_points():
+def test_standoff_equals_the_largest_signed_distance_of_points():
     """What is deep inside is farther from the surface than what stands off, and must not count."""
     from mitsplat.geometry.mesh import contact_points
     from mitsplat.geometry.mesh_distance import _SAMPLES, DistanceSurface, standoff

@@ -63,7 +63,7 @@ def energy(world):
 
 
 @pytest.mark.parametrize("stepper", STEPPERS)
-def test_free_fall(stepper):
+def test_free_fall_equals_its_closed_form(stepper):
     """z = z0 - g t^2 / 2 and v = -g t; semi-implicit steps of h add g h t / 2."""
     box = trimesh.creation.box((0.02, 0.02, 0.02))
     world = world_of(stepper, [body_of(box)], [table()], [pose_at((0, 0, 2.0))])
@@ -74,7 +74,7 @@ def test_free_fall(stepper):
 
 
 @pytest.mark.parametrize("stepper", STEPPERS)
-def test_the_frame_is_the_meshs_and_not_the_centre_of_mass(stepper):
+def test_poses_are_those_of_the_mesh_frame(stepper):
     """A body spinning in free fall turns about its centre of mass, which follows the parabola; its origin does not."""
     box = trimesh.creation.box((0.02, 0.04, 0.06)).apply_translation((0.3, -0.2, 0.1))
     start = pose_at((0, 0, 2), Rotation.from_rotvec((0.4, -1.0, 0.3)))
@@ -127,7 +127,7 @@ def inclines(angle, frictions):
 
 
 @pytest.mark.parametrize("stepper", STEPPERS)
-def test_friction_on_an_incline(stepper):
+def test_sliding_on_an_incline_equals_its_closed_form(stepper):
     """On 25 degrees a block slides by g (sin a - mu cos a) t (t + h) / 2, mu the geometric mean, h the step."""
     angle = np.radians(25.0)
     tables, frames = inclines(angle, [friction for _, friction in FRICTIONS])
@@ -142,7 +142,7 @@ def test_friction_on_an_incline(stepper):
 
 
 @pytest.mark.parametrize("stepper", STEPPERS)
-def test_what_slides_on_an_incline(stepper):
+def test_a_block_slides_beyond_the_friction_angle_only(stepper):
     """A block slides iff tan a > sqrt(mu mu'), whichever of the two is the smoother, on a table or on a slab."""
     angle = np.radians(20.0)
     pairs = [(low, (share * np.tan(angle)) ** 2 / low) for share in (0.9, 1.1) for low in (0.1, 0.3, 1.0)]
@@ -164,7 +164,7 @@ def test_what_slides_on_an_incline(stepper):
 
 
 @pytest.mark.parametrize("stepper", STEPPERS)
-def test_friction_of_spin(stepper):
+def test_spin_friction_equals_its_closed_form(stepper):
     """A top on a square foot slows by g m mu sqrt(p^2 + r^2) / I: sliding at the corners, p from the axis, and spin.
 
     Spin friction of each corner is mu r, r = 10 mm the radius of contact; the cone of both is an ellipsoid.
@@ -185,7 +185,7 @@ def test_friction_of_spin(stepper):
     np.testing.assert_allclose(slowed, slowing, rtol=0.01, atol=0.6)
 
 
-def test_mujoco_in_c_is_stepped_as_by_itself(monkeypatch):
+def test_stepping_mujoco_in_stages_changes_no_bit(monkeypatch):
     """With the friction that MuJoCo takes, the stages called one by one leave what mj_step does, to the bit."""
     import mujoco
 
@@ -207,7 +207,7 @@ def test_mujoco_in_c_is_stepped_as_by_itself(monkeypatch):
     np.testing.assert_array_equal(ours._data.qvel, own._data.qvel)
 
 
-def test_a_contact_buffer_that_is_too_small_is_noticed():
+def test_a_full_contact_buffer_is_an_error():
     from mitsplat.physics.rest import CONTACT_OVERFLOW, run_to_rest
 
     boxes = [body_of(trimesh.creation.box((0.03, 0.03, 0.03)))] * 4
@@ -216,7 +216,7 @@ def test_a_contact_buffer_that_is_too_small_is_noticed():
     assert run_to_rest(world, max_time=1.0, bounds=EVERYWHERE).rejection == CONTACT_OVERFLOW
 
 
-def test_worlds_that_share_kernels_do_not_meet():
+def test_worlds_in_one_simulation_do_not_interact():
     """A world falls as it does alone while another of more pieces, made after it by the same kernels, runs too."""
     from mitsplat.physics.contacts import ContactFinder
     from mitsplat.physics.worlds import WarpWorld, all_pieces
@@ -241,7 +241,7 @@ def test_worlds_that_share_kernels_do_not_meet():
     assert (second.poses[:, 2, 3] > 0.009).all()
 
 
-def test_mean_speeds():
+def test_mean_speeds_equal_displacement_by_time():
     """A turn of t about an axis through the centre of mass, and a way of w, in s seconds: t / s and w / s."""
     from mitsplat.physics.rest import _mean_speeds
 
@@ -252,7 +252,7 @@ def test_mean_speeds():
         assert _mean_speeds([body], before, after, 0.05) == pytest.approx((6e-3, turn / 0.05), rel=1e-6)
 
 
-def test_a_light_part_carries_a_heavy_one():
+def test_light_parts_carry_a_plate_a_hundred_times_as_heavy():
     """A plate a hundred times as heavy rests on two nuts: none of them sinks by more than 0.1 mm."""
     from mitsplat.physics.rest import run_to_rest
 
@@ -269,7 +269,7 @@ def test_a_light_part_carries_a_heavy_one():
 
 
 @pytest.mark.parametrize("stepper", STEPPERS)
-def test_an_incline_is_crept_down_by_less_than_a_tenth_of_a_millimetre(stepper):
+def test_creep_on_an_incline_is_below_a_tenth_of_a_millimetre(stepper):
     """tan 20 = 0.36 < mu = 0.5: a block at rest stays; 3 s."""
     block = trimesh.creation.box((0.04, 0.04, 0.01))
     tilt = pose_at((0, 0, 0), Rotation.from_euler("y", 20, degrees=True))
@@ -281,7 +281,7 @@ def test_an_incline_is_crept_down_by_less_than_a_tenth_of_a_millimetre(stepper):
 
 
 @pytest.mark.parametrize("stepper", STEPPERS)
-def test_a_box_ends_on_a_face_however_it_is_dropped(stepper):
+def test_a_box_dropped_in_any_pose_rests_on_a_face(stepper):
     """Flat on each face, on edges, and on a corner below the centre of mass: the energy is least on a face."""
     from mitsplat.physics.rest import run_to_rest
 
@@ -326,7 +326,7 @@ def test_a_box_does_not_balance_on_its_edge(stepper):
 
 
 @pytest.mark.parametrize("stepper", STEPPERS)
-def test_a_stack_of_five_stands(stepper):
+def test_a_stack_of_five_drifts_by_less_than_a_tenth_of_a_millimetre(stepper):
     """Drift below 0.1 mm in 5 s."""
     box = trimesh.creation.box((0.04, 0.04, 0.02))
     poses = [pose_at((0, 0, 0.01 + 0.0201 * i)) for i in range(5)]
@@ -338,7 +338,7 @@ def test_a_stack_of_five_stands(stepper):
 
 
 @pytest.mark.parametrize("stepper", STEPPERS)
-def test_a_drop_neither_rebounds_nor_gains_energy(stepper):
+def test_a_drop_does_not_rebound_or_gain_energy(stepper):
     """Contact only takes from E = sum m (g z + v v / 2) + w I w / 2; after impact nothing rises by 1 mm."""
     shapes = [
         trimesh.creation.box((0.03, 0.03, 0.03)),
@@ -387,7 +387,7 @@ def test_a_thin_plate_does_not_tunnel(stepper, speed):
 
 
 @pytest.mark.parametrize("stepper", STEPPERS)
-def test_an_overlap_of_ten_millimetres_ejects_nothing(stepper):
+def test_overlapping_boxes_part_at_less_than_one_metre_per_second(stepper):
     """Boxes 10 mm in one another, and one 10 mm in the table, part at less than 1 m/s."""
     box = trimesh.creation.box((0.04, 0.04, 0.04))
     poses = [pose_at((0, 0, 0.02)), pose_at((0.03, 0, 0.021)), pose_at((0.2, 0, 0.01))]
@@ -402,7 +402,7 @@ def test_an_overlap_of_ten_millimetres_ejects_nothing(stepper):
 
 
 @pytest.mark.parametrize("stepper", STEPPERS)
-def test_a_ball_rests_inside_a_cup_and_not_on_its_hull(stepper):
+def test_a_ball_rests_inside_a_cup(stepper):
     """The floor of the cup is 6 mm thick: the ball's centre comes to rest a radius above it, not above the rim."""
     from mitsplat.physics.rest import run_to_rest
     from mitsplat.physics.worlds import Collider
@@ -419,7 +419,7 @@ def test_a_ball_rests_inside_a_cup_and_not_on_its_hull(stepper):
 
 
 @pytest.mark.parametrize("stepper", STEPPERS)
-def test_bodies_are_thrown_as_said(stepper):
+def test_thrown_bodies_follow_their_closed_form(stepper):
     """After t at r + v t - g t (t + h) / 2, for semi-implicit steps of h; spin w about a principal axis stays.
 
     MuJoCo integrates the frame's origin: the centre of mass, a apart, is off by the centripetal h w^2 a t / 2.
@@ -441,7 +441,7 @@ def test_bodies_are_thrown_as_said(stepper):
 
 
 @pytest.mark.parametrize("stepper", STEPPERS)
-def test_what_slides_slowly_is_refused_if_a_second_shows_it(stepper):
+def test_slow_sliding_is_not_rest(stepper):
     """A block at 0.3 mm/s moves by less than 0.1 mm in a quarter of a second and 0.5 mm in one; not if it speeds up."""
     from mitsplat.physics import rest as physics
 
@@ -463,7 +463,7 @@ def test_what_slides_slowly_is_refused_if_a_second_shows_it(stepper):
 
 
 @pytest.mark.parametrize("stepper", STEPPERS)
-def test_what_is_poured_falls_no_faster_than_it_may(stepper):
+def test_a_poured_ball_keeps_its_speed_limit(stepper):
     """A ball falls 0.5 m in h / v + v / 2 g = 0.55 s at v = 1 m/s, and no faster."""
     from mitsplat.physics import rest as physics
 

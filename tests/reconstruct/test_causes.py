@@ -23,11 +23,11 @@ def ring(height, turns):
 ALL_AROUND = np.arange(5, 360, 15)
 
 
-def test_views_from_all_heights_and_sides_leave_nothing_to_say():
+def test_views_from_all_heights_and_sides_give_no_advice():
     assert missing_views(np.concatenate([ring(h, ALL_AROUND) for h in (10, 30)] + [ring(60, [0])])) == []
 
 
-def test_a_height_that_nobody_photographed_from_is_named():
+def test_a_missing_height_of_views_is_named():
     assert missing_views(np.concatenate([ring(30, ALL_AROUND), ring(70, ALL_AROUND)])) == [
         "0 to 20 degrees above the object"
     ]
@@ -37,7 +37,7 @@ def test_a_height_that_nobody_photographed_from_is_named():
 
 
 @pytest.mark.parametrize(("first", "last", "words"), [(100, 200, "120 to 180"), (300, 420, "300 to 60")])
-def test_a_side_that_nobody_photographed_is_named_across_the_north_too(first, last, words):
+def test_a_missing_side_of_views_is_named(first, last, words):
     there = [turn for turn in ALL_AROUND if not first <= turn < last and not first <= turn + 360 < last]
     low = ring(10, there)
     found = missing_views(np.concatenate([low, ring(30, ALL_AROUND), ring(60, [0])]))
@@ -47,14 +47,14 @@ def test_a_side_that_nobody_photographed_is_named_across_the_north_too(first, la
         assert found == [f"0 to 20 degrees above the object, {words} degrees around the object"]
 
 
-def test_directions_are_those_from_what_the_cameras_look_at():
+def test_view_directions_start_at_the_focus_of_the_cameras():
     offsets = 0.5 * np.concatenate([ring(20, ALL_AROUND), ring(50, ALL_AROUND)])
     middle = np.array([0.3, -0.2, 0.1])
     cameras = [Camera.look_at(middle + o, middle, width=8, height=8, fov_x=40) for o in offsets]
     np.testing.assert_allclose(views_from(cameras), offsets, atol=1e-9)
 
 
-def test_blurred_photos_are_named_the_worst_first_and_no_smooth_side_of_the_object():
+def test_blurred_photos_are_named_and_smooth_objects_are_not():
     rng = np.random.default_rng(0)
     pictures = []
     for number in range(10):
@@ -71,7 +71,7 @@ def test_blurred_photos_are_named_the_worst_first_and_no_smooth_side_of_the_obje
     assert blurred_photos([f"{n}.jpg" for n in range(10)], blank) == []
 
 
-def test_a_miss_names_what_was_measured_before_what_helps():
+def test_a_missed_threshold_names_measured_causes_before_advice():
     found = replace(GOOD, psnr=20.0, causes={"psnr": "2 of 9 photos are blurred (a.jpg, b.jpg)", "mesh_iou": "unused"})
     (sentence,) = found.misses(Thresholds())
     assert "is required): 2 of 9 photos are blurred (a.jpg, b.jpg); use even light" in sentence
@@ -90,7 +90,7 @@ def dotted(points, masked):
     return Capture(tuple(photos), points, np.zeros(points.shape, np.uint8), up="z", table=True), pictures
 
 
-def test_what_masks_show_of_the_support_is_told_and_what_would_change_it():
+def test_masks_that_include_the_support_are_reported_with_advice():
     rng = np.random.default_rng(2)
     body, cloth = (
         rng.uniform((-0.1, -0.1, 0.01), (0.1, 0.1, 0.1), (300, 3)),
@@ -105,7 +105,7 @@ def test_what_masks_show_of_the_support_is_told_and_what_would_change_it():
     assert "photograph the object on another surface, or pick it; check for parts of the object" in miss
 
 
-def test_an_object_without_texture_is_told():
+def test_an_object_without_texture_is_reported():
     rng = np.random.default_rng(2)
     body, cloth = (
         rng.uniform((-0.1, -0.1, 0.01), (0.1, 0.1, 0.1), (30, 3)),

@@ -54,9 +54,7 @@ def made(known_object: KnownObject, tmp_path_factory: pytest.TempPathFactory) ->
     return folder, make_asset(folder / "capture", folder / "fit", folder / "asset", job)
 
 
-def test_mesh_and_splats_share_the_frame_of_the_truth(
-    known_object: KnownObject, made: tuple[Path, AssetResult]
-) -> None:
+def test_mesh_and_splats_have_the_frame_of_the_truth(known_object: KnownObject, made: tuple[Path, AssetResult]) -> None:
     folder, done = made
     asset = Asset.load(folder / "asset")
     assert asset.class_name == "bracket"
@@ -77,7 +75,7 @@ def test_mesh_and_splats_share_the_frame_of_the_truth(
     assert done.shortcoming is None
 
 
-def test_unknown_units_reach_the_scene_that_refuses_them(made: tuple[Path, AssetResult]) -> None:
+def test_an_asset_of_unknown_units_is_refused_by_a_scene(made: tuple[Path, AssetResult]) -> None:
     folder, _ = made
     scene = folder / "scene.yaml"
     camera = "camera: {kind: orbit, radius: 1, height: 1, target: [0, 0, 0]}"
@@ -92,7 +90,7 @@ def test_unknown_units_reach_the_scene_that_refuses_them(made: tuple[Path, Asset
     assert loaded.mesh.extents.max() == pytest.approx(0.3)
 
 
-def test_the_page_is_one_file_with_every_part(made: tuple[Path, AssetResult]) -> None:
+def test_the_report_is_one_file_with_every_section(made: tuple[Path, AssetResult]) -> None:
     page = (made[0] / "asset" / "report.html").read_text()
     assert not re.search(r'(src|href)="(?!data:)', page)
     for heading in ("Verdict", "Held-out views", "Cameras", "Photos", "Rejected"):
@@ -103,7 +101,7 @@ def test_the_page_is_one_file_with_every_part(made: tuple[Path, AssetResult]) ->
     assert "All thresholds are met" in page
 
 
-def test_the_same_inputs_are_kept_and_others_are_not(
+def test_an_asset_is_reused_for_the_same_inputs_only(
     made: tuple[Path, AssetResult], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     folder, first = made
@@ -134,7 +132,7 @@ def test_the_same_inputs_are_kept_and_others_are_not(
     (folder / "asset" / "verdict.json").write_bytes(record)
 
 
-def test_what_was_edited_is_kept_and_what_is_gone_is_made_anew(
+def test_edited_files_are_kept_and_missing_ones_made_again(
     made: tuple[Path, AssetResult], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     folder, _ = made
@@ -163,13 +161,13 @@ def test_what_was_edited_is_kept_and_what_is_gone_is_made_anew(
 
 
 @pytest.mark.parametrize("psnr", ['"abc"', "NaN", "[]"])
-def test_a_fit_s_record_has_a_number(tmp_path: Path, psnr: str) -> None:
+def test_the_record_of_a_fit_must_have_its_numbers(tmp_path: Path, psnr: str) -> None:
     (tmp_path / "fit.json").write_text(f'{{"psnr": {psnr}}}')
     with pytest.raises(InputError, match=r"fit\.json: "):
         read_fit(tmp_path)
 
 
-def test_a_drawing_gives_a_capture_its_scale(known_object: KnownObject) -> None:
+def test_a_drawing_determines_the_scale_of_a_capture(known_object: KnownObject) -> None:
     """The capture is in no unit, the drawing in millimetres: the asset has the size of the drawing."""
     tenth = np.diag([0.1, 0.1, 0.1, 1.0])
     capture = replace(known_object.capture.transformed(tenth), units="unknown")
@@ -192,7 +190,7 @@ def test_a_drawing_gives_a_capture_its_scale(known_object: KnownObject) -> None:
 
 
 @pytest.mark.parametrize(("height", "lowest"), [(0.049, 0.0), (0.0, -0.05)])
-def test_an_object_ends_on_the_table_that_it_stands_on(known_object: KnownObject, height: float, lowest: float) -> None:
+def test_an_object_is_cut_at_the_table_below_it(known_object: KnownObject, height: float, lowest: float) -> None:
     """What is 1 mm below the table is cut off; a plane through the middle of an object is none that it stands on."""
     lifted = np.eye(4)
     lifted[2, 3] = height
@@ -203,7 +201,7 @@ def test_an_object_ends_on_the_table_that_it_stands_on(known_object: KnownObject
     assert found.asset.mesh.is_volume
 
 
-def test_surroundings_need_no_masks_and_get_an_open_mesh(known_object: KnownObject) -> None:
+def test_surroundings_without_masks_get_an_open_mesh(known_object: KnownObject) -> None:
     photos = tuple(replace(photo, mask=None) for photo in known_object.capture.photos)
     capture = replace(known_object.capture, photos=photos)
     found = reconstruct_asset(capture, known_object.splats, name="cell", kind="environment", settings=SETTINGS)
@@ -235,12 +233,12 @@ def test_each_missed_threshold_is_one_sentence_with_advice(change: dict[str, flo
     assert " is required): " in miss
 
 
-def test_a_capture_in_metres_takes_no_size(known_object: KnownObject) -> None:
+def test_a_size_is_refused_for_a_capture_in_metres(known_object: KnownObject) -> None:
     with pytest.raises(InputError, match="already in metres and must have no size"):
         reconstruct_asset(known_object.capture, known_object.splats, name="part", settings=replace(SETTINGS, size=0.2))
 
 
-def test_a_size_is_what_a_ruler_finds_whichever_way_the_capture_lies(known_object: KnownObject) -> None:
+def test_a_given_size_is_the_longest_edge_in_any_orientation(known_object: KnownObject) -> None:
     """The capture's axes have nothing to do with the edges of the smallest upright box around the solid."""
     turn = trimesh.transformations.rotation_matrix(0.6, (0, 0, 1)) @ np.diag([3.0, 3.0, 3.0, 1.0])
     capture = replace(known_object.capture.transformed(turn), units="unknown")
@@ -260,7 +258,7 @@ def test_a_size_is_what_a_ruler_finds_whichever_way_the_capture_lies(known_objec
     np.testing.assert_allclose(found.asset.splats.means, kept.means, atol=1e-6)
 
 
-def test_photos_go_through_all_stages(
+def test_photos_become_an_asset_through_all_stages(
     known_object: KnownObject, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     """A fit of other inputs is replaced, see test_fit_interrupted.py, so that there is nothing to be asked for."""
@@ -289,7 +287,7 @@ def test_photos_go_through_all_stages(
     assert overwritten == [True, True, True]
 
 
-def test_fits_that_are_not_there_are_refused(tmp_path: Path) -> None:
+def test_missing_fits_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="has the fit finished"):
         read_fit(tmp_path)
     (tmp_path / "fit.json").write_text("[]")
@@ -298,7 +296,7 @@ def test_fits_that_are_not_there_are_refused(tmp_path: Path) -> None:
     assert read_fit(tmp_path / "one.ply") == (tmp_path / "one.ply", None)
 
 
-def test_directions_of_photos_lie_in_their_drawing_straight_above_in_its_middle() -> None:
+def test_the_diagram_of_views_has_the_zenith_in_its_centre() -> None:
     offsets = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.1, 0.0, -1.0]])
     cameras = [Camera.look_at(o, (0, 0, 0), up=(0.1, 0.2, 0.3), width=8, height=8, fov_x=40) for o in offsets]
     photos = tuple(Photo(f"{number}.jpg", Path("none"), camera) for number, camera in enumerate(cameras))

@@ -15,7 +15,7 @@ from tests.renderer.test_backward import separated
 from tests.renderer.test_render import CAMERA
 
 
-def test_weights_are_those_of_the_twin() -> None:
+def test_weights_equal_those_of_the_slow_twin() -> None:
     """Blended weight T a of every Gaussian, ray by ray in float64."""
     splats = separated(12, 1)
     mask = np.random.default_rng(0).random((CAMERA.height, CAMERA.width)).astype(np.float32)
@@ -76,7 +76,7 @@ def test_surroundings_floaters_and_needles_are_removed(known_object: KnownObject
     assert len(found.splats) == found.kept.sum()
 
 
-def test_lost_tells_what_masks_leave_out(known_object: KnownObject) -> None:
+def test_lost_alpha_is_the_share_that_masks_omit(known_object: KnownObject) -> None:
     """Where splats are missing in the middle of the masks, as much alpha is lost as pixels are bare."""
     views = [
         MaskedView(camera, mask if number % 2 else np.zeros_like(mask))
@@ -86,7 +86,7 @@ def test_lost_tells_what_masks_leave_out(known_object: KnownObject) -> None:
     assert isolate_object(known_object.splats, views).lost > 0.05
 
 
-def test_masks_of_something_else_are_refused(known_object: KnownObject) -> None:
+def test_masks_that_do_not_fit_the_splats_are_refused(known_object: KnownObject) -> None:
     views = [
         MaskedView(photo.camera, np.zeros((photo.camera.height, photo.camera.width), dtype=np.float32))
         for photo in known_object.capture.photos[:4]
@@ -97,7 +97,7 @@ def test_masks_of_something_else_are_refused(known_object: KnownObject) -> None:
         isolate_object(known_object.splats, [])
 
 
-def test_places_with_many_gaussians_each_do_not_float() -> None:
+def test_separate_dense_clusters_are_not_floaters() -> None:
     """A row of sixty places that touch, twenty Gaussians in each, and one such place apart."""
     places = np.append(np.arange(60) * 0.01, 1.0)
     means = np.zeros((61 * 20, 3))

@@ -57,7 +57,7 @@ def views(truth: trimesh.Trimesh) -> list[MaskedView]:
 @pytest.mark.parametrize(
     "bumps, scale, settings, factor", [(0.1, 1.03, QUICK, 5.0), (0.05, 1.0, DETAIL, 1.8)], ids=["swollen", "smoothed"]
 )
-def test_a_disturbed_mesh_comes_back_to_the_solid(
+def test_a_disturbed_mesh_is_refined_to_the_solid(
     truth: trimesh.Trimesh,
     views: list[MaskedView],
     bumps: float,
@@ -78,14 +78,16 @@ def test_a_disturbed_mesh_comes_back_to_the_solid(
     assert not len(edges_through_faces(found.mesh, found.mesh.vertices))
 
 
-def test_a_true_mesh_is_not_made_worse(truth: trimesh.Trimesh, views: list[MaskedView]) -> None:
+def test_refining_a_true_mesh_keeps_its_shape(truth: trimesh.Trimesh, views: list[MaskedView]) -> None:
     found = refine_mesh(truth, views, QUICK)
     assert found.kept == (found.mesh is not truth)
     assert chamfer(found.mesh, truth) < 5e-4
     assert overlap(found.mesh, truth) > 0.99
 
 
-def test_what_the_photos_set_aside_deny_is_dropped(truth: trimesh.Trimesh, views: list[MaskedView]) -> None:
+def test_a_refinement_that_held_out_photos_contradict_is_rejected(
+    truth: trimesh.Trimesh, views: list[MaskedView]
+) -> None:
     """All masks but those that judge are of a solid 6 % larger."""
     larger = masked(bumpy(scale=1.06), [view.camera for view in views])
     conflicting = [views[number] if number % 6 == 3 else view for number, view in enumerate(larger)]
@@ -96,7 +98,7 @@ def test_what_the_photos_set_aside_deny_is_dropped(truth: trimesh.Trimesh, views
     assert str(found).startswith("rejected: silhouettes and masks of the 4 validation photos differ by ")
 
 
-def test_what_stands_on_the_table_stays_on_it() -> None:
+def test_refinement_keeps_the_base_on_the_table() -> None:
     """A box that is too large on all sides but the one that it stands on."""
     box = trimesh.creation.box((0.06, 0.05, 0.04)).subdivide().subdivide().subdivide()
     box.apply_translation((0, 0, 0.02))
@@ -112,7 +114,7 @@ def test_what_stands_on_the_table_stays_on_it() -> None:
     assert abs(found.mesh.volume - box.volume) < 0.4 * abs(start.volume - box.volume)
 
 
-def test_motion_that_breaks_a_mesh_is_held_back() -> None:
+def test_motion_that_breaks_a_mesh_is_limited() -> None:
     """One vertex goes through the other side, and the rest outwards by a tenth."""
     ball = trimesh.creation.icosphere(3)
     wanted = 1.1 * ball.vertices
@@ -127,12 +129,12 @@ def test_motion_that_breaks_a_mesh_is_held_back() -> None:
     assert (np.linalg.norm(found - wanted, axis=1) < 1e-9).mean() > 0.9
 
 
-def test_motion_that_nothing_can_be_kept_of_is_refused() -> None:
+def test_motion_without_finite_vertices_is_refused() -> None:
     ball = trimesh.creation.icosphere(2)
     assert limit_motion(ball, np.full_like(ball.vertices, np.nan)) is None
 
 
-def test_area_of_a_balls_silhouette_grows_as_its_radius_says() -> None:
+def test_the_gradient_of_a_silhouette_area_equals_its_closed_form() -> None:
     r"""A ball of radius r at distance d is seen as a disc of area A = pi f^2 r^2 / (d^2 - r^2), in pixels."""
     ball = trimesh.creation.icosphere(4)
     camera = Camera.look_at((4, 0, 0), (0, 0, 0), width=96, height=96, fov_x=40)
@@ -152,7 +154,7 @@ def test_area_of_a_balls_silhouette_grows_as_its_radius_says() -> None:
 @pytest.mark.parametrize(
     "distortion, lens", [((-0.35, 0.12, 0.004, -0.006), "opencv"), ((0.05, -0.01, 0.0, 0.0), "fisheye")]
 )
-def test_masks_through_a_lens_are_those_of_a_pinhole(
+def test_masks_of_a_distorted_lens_are_undistorted(
     truth: trimesh.Trimesh, distortion: tuple[float, ...], lens: str
 ) -> None:
     """Seen aside, where the lens bends most: taken for those of a pinhole they would be ten times as wrong."""
@@ -167,19 +169,21 @@ def test_masks_through_a_lens_are_those_of_a_pinhole(
 
 
 @pytest.mark.parametrize(("field", "value"), [("steps", 0), ("size", 8), ("rate", 0.0), ("smoothness", np.nan)])
-def test_settings_are_checked(field: str, value: float) -> None:
+def test_settings_out_of_range_are_refused(field: str, value: float) -> None:
     with pytest.raises(InputError, match=field):
         MeshRefineSettings(**{field: value})
 
 
-def test_of_few_views_two_judge_and_of_fewer_nothing_comes(truth: trimesh.Trimesh, views: list[MaskedView]) -> None:
+def test_at_least_two_views_judge_and_fewer_than_four_are_refused(
+    truth: trimesh.Trimesh, views: list[MaskedView]
+) -> None:
     found = refine_mesh(truth, views[:3], QUICK)
     assert found.mesh is truth and str(found) == "rejected: refinement needs masks from 4 positions outside the mesh"
     for count, judges in ((4, 2), (9, 3)):
         assert refine_mesh(truth, views[:count], replace(QUICK, steps=1)).judges == judges
 
 
-def test_assets_say_what_came_of_it(
+def test_assets_record_the_result_of_the_refinement(
     known_object: KnownObject, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("mitsplat.reconstruct.reconstruct.convex_pieces", lambda mesh: (mesh.convex_hull,))

@@ -25,13 +25,13 @@ def views_of(known: KnownObject) -> list[MaskedView]:
     return [MaskedView(camera, mask) for camera, _, mask, _ in sized if mask is not None]
 
 
-def test_what_masks_and_splats_bear_out_is_kept_as_fine_as_it_is(known_object: KnownObject) -> None:
+def test_a_surface_consistent_with_masks_is_kept_at_full_resolution(known_object: KnownObject) -> None:
     found = find_proxy_surface(known_object.splats, views_of(known_object), SETTINGS)
     assert (found.source, found.faults) == (FINEST, ())
     assert chamfer(found.mesh, known_object.mesh) < 0.004
 
 
-def test_depth_that_is_wrong_gives_way_to_the_hull_of_the_masks(known_object: KnownObject) -> None:
+def test_wrong_depth_falls_back_to_the_hull_of_masks(known_object: KnownObject) -> None:
     """Most of the Gaussians have shrunk towards the middle, and are seen through the others."""
     splats = known_object.splats
     inner = np.arange(len(splats)) % 3 > 0
@@ -45,7 +45,7 @@ def test_depth_that_is_wrong_gives_way_to_the_hull_of_the_masks(known_object: Kn
     assert chamfer(found.mesh, known_object.mesh) < 0.02
 
 
-def test_masks_that_contradict_each_other_give_way_to_the_splats(known_object: KnownObject) -> None:
+def test_inconsistent_masks_fall_back_to_the_splats(known_object: KnownObject) -> None:
     views = [
         MaskedView(view.camera, np.roll(view.mask, 70 if number % 2 else -70, axis=1))
         for number, view in enumerate(views_of(known_object))
@@ -67,7 +67,7 @@ def test_the_hull_of_splats_ends_at_the_floor(known_object: KnownObject) -> None
     assert found.mesh.bounds[0, 2] == pytest.approx(-0.03)
 
 
-def test_masks_do_not_cut_what_another_thing_may_hide(known_object: KnownObject) -> None:
+def test_masks_do_not_cut_parts_that_may_be_hidden(known_object: KnownObject) -> None:
     """A third of each picture is hidden: as background it would cut the object, the hull of masks alone as well."""
     veil = np.zeros(views_of(known_object)[0].mask.shape, dtype=np.float32)
     veil[:, : veil.shape[1] // 2] = 1

@@ -33,14 +33,14 @@ def surface(known_object: KnownObject) -> trimesh.Trimesh:
     return reconstruct_surface(known_object.splats, *views_of(known_object), SurfaceSettings(voxels=96, faces=6000))
 
 
-def test_surface_is_that_of_the_solid(known_object: KnownObject, surface: trimesh.Trimesh) -> None:
+def test_the_surface_agrees_with_the_solid(known_object: KnownObject, surface: trimesh.Trimesh) -> None:
     assert surface.is_volume
     assert 5000 < len(surface.faces) <= 6000
     assert chamfer(surface, known_object.mesh) < 0.003
     assert surface.volume == pytest.approx(known_object.mesh.volume, rel=0.03)
 
 
-def test_depth_opens_the_pocket_that_no_silhouette_shows(known_object: KnownObject, surface: trimesh.Trimesh) -> None:
+def test_depth_carves_a_pocket_that_no_silhouette_shows(known_object: KnownObject, surface: trimesh.Trimesh) -> None:
     middle = np.array([[-0.01, 0.0, 0.035]])
     assert DistanceSurface(known_object.mesh.convex_hull).signed_distances(middle)[0] < -0.005
     depth = float(DistanceSurface(known_object.mesh).signed_distances(middle)[0])
@@ -48,7 +48,7 @@ def test_depth_opens_the_pocket_that_no_silhouette_shows(known_object: KnownObje
     assert DistanceSurface(surface).signed_distances(middle)[0] == pytest.approx(depth, abs=0.001)
 
 
-def test_the_table_ends_what_no_camera_looks_under(known_object: KnownObject) -> None:
+def test_the_surface_ends_at_the_table(known_object: KnownObject) -> None:
     """Photos from above alone: the hull hangs through the table that the ball stands on, z = -0.05."""
     cameras, masks = views_of(known_object)
     above = [number for number, camera in enumerate(cameras) if camera.centre[2] > 0.05]
@@ -62,7 +62,7 @@ def test_the_table_ends_what_no_camera_looks_under(known_object: KnownObject) ->
     assert chamfer(standing, known_object.mesh) < chamfer(hanging, known_object.mesh)
 
 
-def test_surroundings_need_no_masks(known_object: KnownObject) -> None:
+def test_the_surface_of_surroundings_needs_no_masks(known_object: KnownObject) -> None:
     cameras, _ = views_of(known_object)
     found = reconstruct_surface(known_object.splats, cameras, settings=SurfaceSettings(voxels=64))
     assert np.abs(DistanceSurface(known_object.mesh).signed_distances(np.asarray(found.vertices))).mean() < 0.002
@@ -84,7 +84,7 @@ def test_simplified_surfaces_stay_watertight() -> None:
 
 
 @pytest.mark.parametrize("seed", [0, 2])
-def test_simplified_surfaces_stay_closed_when_they_are_welded(tmp_path: Path, seed: int) -> None:
+def test_simplified_surfaces_are_watertight_after_reloading(tmp_path: Path, seed: int) -> None:
     """A sponge, whose simplification touches itself at vertices and edges, is one closed solid from its file too."""
     noise = np.pad(gaussian_filter(np.random.default_rng(seed).normal(size=(14, 14, 14)), 1.2), 1, constant_values=-1)
     vertices, faces, _, _ = marching_cubes(noise.astype(np.float32), 0.0, gradient_direction="ascent")
@@ -98,14 +98,14 @@ def test_simplified_surfaces_stay_closed_when_they_are_welded(tmp_path: Path, se
     assert solid.is_watertight and solid.volume == pytest.approx(simple.volume, rel=1e-6)
 
 
-def test_masks_that_exclude_each_other_are_refused(known_object: KnownObject) -> None:
+def test_masks_without_a_common_solid_are_refused(known_object: KnownObject) -> None:
     cameras, masks = views_of(known_object)
     with pytest.raises(InputError, match="do masks, cameras and splats belong together"):
         reconstruct_surface(known_object.splats, cameras, [0 * mask for mask in masks], SurfaceSettings(voxels=32))
 
 
 @pytest.mark.parametrize(("field", "value"), [("voxels", 5), ("faces", 3), ("dissent", 9)])
-def test_settings_are_checked(field: str, value: int) -> None:
+def test_settings_out_of_range_are_refused(field: str, value: int) -> None:
     with pytest.raises(InputError, match=field):
         SurfaceSettings(**{field: value})
 
@@ -133,7 +133,7 @@ def test_a_drawing_is_registered_with_its_scale(known_object: KnownObject, seed:
 
 
 @pytest.mark.parametrize("seed", [1, 4, 6])
-def test_a_nearly_round_drawing_is_turned_as_its_few_edges_say(known_object: KnownObject, seed: int) -> None:
+def test_a_nearly_round_drawing_is_rotated_by_its_edges(known_object: KnownObject, seed: int) -> None:
     """Nine of ten points of a ball lie on it however it is turned: what is left of a box and a pocket decides."""
     points = np.asarray(trimesh.sample.sample_surface(known_object.mesh, 1000, seed=seed)[0])
     points += np.random.default_rng(seed).normal(0, 1e-4, points.shape)
@@ -144,7 +144,7 @@ def test_a_nearly_round_drawing_is_turned_as_its_few_edges_say(known_object: Kno
     assert distance < 0.001 * known_object.mesh.scale
 
 
-def test_offset_is_the_shift_that_was_made(known_object: KnownObject) -> None:
+def test_offset_equals_the_applied_shift(known_object: KnownObject) -> None:
     points = surface_points(known_object.splats, [photo.camera for photo in known_object.capture.held_out])
     assert measure_offset(known_object.mesh, points).shift < 5e-4
     moved = known_object.mesh.copy()
@@ -152,7 +152,7 @@ def test_offset_is_the_shift_that_was_made(known_object: KnownObject) -> None:
     assert measure_offset(moved, points).shift * moved.scale == pytest.approx(np.hypot(0.001, 0.0005), rel=0.1)
 
 
-def test_the_inverse_of_a_normalisation_takes_a_mesh_back(tmp_path: Path, known_object: KnownObject) -> None:
+def test_the_inverse_normalisation_restores_a_mesh(tmp_path: Path, known_object: KnownObject) -> None:
     matrix = similarity(7.0, 4)
     np.savetxt(tmp_path / "normalisation.txt", matrix[:3])
     mesh = known_object.mesh.copy()
@@ -173,7 +173,7 @@ def test_files_without_a_similarity_are_refused(tmp_path: Path, text: str, rule:
         invert_transform(tmp_path / "none.txt")
 
 
-def test_passages_are_closed_and_hollows_are_not() -> None:
+def test_narrow_passages_are_closed_and_hollows_are_kept() -> None:
     """A block with a void that a thin channel joins with the outside, and a pocket."""
     solid = np.zeros((40, 40, 40), dtype=bool)
     solid[4:36, 4:36, 4:36] = True

@@ -56,7 +56,7 @@ def twin(encoded: np.ndarray, points: np.ndarray, matrix: np.ndarray, wear: floa
     return np.array(result)
 
 
-def test_colours_and_dirt_are_those_of_the_slow_twin() -> None:
+def test_colours_and_dirt_equal_those_of_the_slow_twin() -> None:
     ensure_variant()
     from mitsplat.renderer.splatting.splat_appearance import SplatAppearance, apply_appearance
 
@@ -81,7 +81,7 @@ def test_colours_and_dirt_are_those_of_the_slow_twin() -> None:
     assert all((np.array(a) == np.array(b)).all() for a, b in zip(same, colours, strict=True))
 
 
-def test_dirt_lies_in_patches_of_the_object_s_size_and_elsewhere_for_another_seed() -> None:
+def test_dirt_patches_scale_with_the_object_and_depend_on_the_seed() -> None:
     ensure_variant()
     from mitsplat.renderer.splatting.splat_appearance import dirt_thickness
 
@@ -120,7 +120,7 @@ def seen(shape: Any) -> Any:
     return camera, render_layers(integrator, mi.load_dict({"type": "scene", "ball": shape}), camera)
 
 
-def test_a_renderer_shows_what_splats_of_the_changed_colours_show() -> None:
+def test_appearance_renders_as_splats_with_changed_colours() -> None:
     splats, shape = ball(colours=TEXT, wear=0.7, wear_seed=99)
     camera, layers = seen(shape)
     towards = splats.means - camera.centre
@@ -135,7 +135,7 @@ def test_a_renderer_shows_what_splats_of_the_changed_colours_show() -> None:
         np.testing.assert_array_equal(getattr(layers, name), getattr(plain, name))
 
 
-def test_dirt_turns_with_its_object() -> None:
+def test_dirt_rotates_with_its_object() -> None:
     """A part and the camera turned alike: the picture is the same."""
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = Rotation.from_rotvec([0.3, 0.7, 1.0]).as_matrix(), (0.4, -0.2, 0.1)
@@ -182,7 +182,7 @@ def test_mirrors_show_appearances() -> None:
         ({"wear_seed": -1}, "'wear_seed' must be from 0 to 8388607"),
     ],
 )
-def test_wrong_properties_are_refused(properties: dict[str, Any], sentence: str) -> None:
+def test_invalid_properties_are_refused(properties: dict[str, Any], sentence: str) -> None:
     with pytest.raises(InputError) as error:
         ball(**properties)
     assert sentence in str(error.value)

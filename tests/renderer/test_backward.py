@@ -84,7 +84,7 @@ def test_gradients_equal_finite_differences_of_the_twin(bands: int) -> None:
 
 @pytest.mark.parametrize("distortion", [(), (-0.2, 0.05, 0.01, -0.01)])
 @pytest.mark.parametrize("at_once", [1, 1500])
-def test_gradients_made_in_parts_are_those_of_the_whole(
+def test_gradients_computed_in_parts_equal_those_of_the_whole(
     at_once: int, distortion: tuple[float, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """As a view's are whose pairs do not fit in the memory: tile by tile, or in parts of many tiles."""
@@ -110,7 +110,7 @@ def test_needles_thinner_than_rounding_have_finite_gradients() -> None:
 
 
 @pytest.mark.parametrize("distortion", [(), (-0.2, 0.05, 0.01, -0.01)])
-def test_image_is_that_of_the_plain_march(distortion: tuple[float, ...]) -> None:
+def test_the_differentiable_image_equals_the_plain_march(distortion: tuple[float, ...]) -> None:
     ensure_variant()
     from mitsplat.plugins.splat_proxy import view_of
     from mitsplat.renderer.layers import render_splats
@@ -124,7 +124,7 @@ def test_image_is_that_of_the_plain_march(distortion: tuple[float, ...]) -> None
 
 
 @pytest.mark.parametrize("switch", ["normalise_ended_rays", "correct_late_gaussians"])
-def test_no_gradients_of_colours_that_are_put_right_afterwards(switch: str) -> None:
+def test_corrected_colours_are_refused_for_gradients(switch: str) -> None:
     ensure_variant()
     from mitsplat.plugins.splat_proxy import view_of
 
@@ -134,7 +134,7 @@ def test_no_gradients_of_colours_that_are_put_right_afterwards(switch: str) -> N
         backward.render_differentiable(cloud, view_of(make_sensor(CAMERA)), replace(QUALITY, **{switch: True}))
 
 
-def test_depth_of_an_opaque_gaussian_is_that_of_its_centre() -> None:
+def test_depth_of_an_opaque_gaussian_has_unit_gradient() -> None:
     """Moving the camera's only Gaussian away by dz moves depth by dz, whatever its alpha."""
     ensure_variant()
     from mitsplat.plugins.splat_proxy import view_of

@@ -39,7 +39,7 @@ def visible_wall() -> Any:
 
 
 @pytest.mark.parametrize("wall", [captured_wall, visible_wall])
-def test_red_wall_lights_what_stands_before_it(wall: Any) -> None:
+def test_a_red_wall_reflects_half_of_its_colour(wall: Any) -> None:
     """A sky of which a red wall hides half: E_bounce over that of white is half the wall's colour.
 
     A captured wall shines so by itself, a mesh because of the other half of the sky, which is all that it sees.
@@ -57,7 +57,7 @@ def test_red_wall_lights_what_stands_before_it(wall: Any) -> None:
     np.testing.assert_allclose(without, 0.5, atol=0.03)
 
 
-def test_light_from_a_bright_spot_leaves_no_patches_on_a_mesh() -> None:
+def test_a_bright_spot_leaves_no_patches_on_a_mesh() -> None:
     """Few rays from a table meet the spot that a lamp makes on the ceiling."""
     make_integrator()
     grey = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.5}}

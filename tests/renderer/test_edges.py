@@ -59,7 +59,7 @@ def means_of_four(values: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize(("preset", "lens"), [*(("fast", lens) for lens in LENSES), ("balanced", "pinhole")])
-def test_borders_are_means_of_a_picture_twice_as_large(preset: str, lens: str) -> None:
+def test_edge_pixels_are_means_of_an_image_twice_as_large(preset: str, lens: str) -> None:
     camera, scene = replace(CAMERA, **LENSES[lens]), scene_of(plate=CUTTING)
     quality = replace(PRESETS[preset], kernel="mip")
     smooth, plain = (layers_of(scene, camera, replace(quality, samples=samples)) for samples in ("edges", 1))
@@ -77,7 +77,7 @@ def test_borders_are_means_of_a_picture_twice_as_large(preset: str, lens: str) -
         assert np.array_equal(own, other), field.name
 
 
-def test_each_point_of_a_lens_sees_smooth_borders() -> None:
+def test_edges_are_smooth_for_each_point_of_a_lens() -> None:
     camera, scene = replace(CAMERA, aperture_radius=0.02, focus_distance=1.5), scene_of()
     smooth, plain = (layers_of(scene, camera, replace(FINE, samples=samples, lens_rings=1)) for samples in ("edges", 1))
     size = 2 * camera.width, 2 * camera.height
@@ -87,7 +87,7 @@ def test_each_point_of_a_lens_sees_smooth_borders() -> None:
     assert after < 0.5 * before
 
 
-def test_a_pixel_is_looked_at_again_where_one_around_it_shows_something_else() -> None:
+def test_pixels_beside_another_instance_are_sampled_again() -> None:
     from mitsplat.renderer.layers import make_sensor
     from mitsplat.renderer.rays.sensors import view_of
     from mitsplat.renderer.splatting.antialiasing import BLOCK_HEIGHT, BLOCK_WIDTH, Edges
@@ -106,7 +106,7 @@ def test_a_pixel_is_looked_at_again_where_one_around_it_shows_something_else() -
     assert np.array_equal(np.array(edges.subset.number), blocks)
 
 
-def test_chosen_tiles_are_counted_as_by_hand() -> None:
+def test_selected_tiles_agree_with_a_slow_count() -> None:
     from mitsplat.renderer.layers import make_sensor
     from mitsplat.renderer.rays.sensors import view_of
     from mitsplat.renderer.splatting.tile_subset import TileSubset
@@ -126,7 +126,7 @@ def test_chosen_tiles_are_counted_as_by_hand() -> None:
     assert np.array_equal(np.concatenate([np.array(half.number) for half in halves]), np.flatnonzero(flags))
 
 
-def test_a_box_of_tiles_counts_as_the_same_tiles_chosen_one_by_one() -> None:
+def test_a_box_of_tiles_equals_the_same_tiles_selected_singly() -> None:
     from mitsplat.renderer.layers import make_sensor
     from mitsplat.renderer.rays.sensors import view_of
     from mitsplat.renderer.splatting.tile_subset import TileBox, TileSubset
@@ -142,7 +142,7 @@ def test_a_box_of_tiles_counts_as_the_same_tiles_chosen_one_by_one() -> None:
         assert np.array(own).tolist() == np.array(other).tolist()
 
 
-def test_splats_stay_as_wide_as_trainers_dilate_them() -> None:
+def test_antialiasing_keeps_the_dilation_of_splats() -> None:
     """Their dilation is in pixels of the picture, as in four rays of every pixel."""
     quality, scene = replace(PRESETS["exact"], kernel="3dgs"), scene_of()
     smooth, plain, everywhere = (layers_of(scene, CAMERA, replace(quality, samples=s)) for s in ("edges", 1, 2))
@@ -186,7 +186,7 @@ def test_both_sides_of_a_border_have_their_own_light() -> None:
     assert error(smooth) < 0.15 * min(error(plain), error(centres))
 
 
-def test_what_is_too_crowded_is_looked_at_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_crowded_edges_are_sampled_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
     from mitsplat.renderer.splatting import antialiasing as edges
     from mitsplat.renderer.splatting import pairs
 

@@ -65,7 +65,7 @@ def test_ridges_finer_than_a_pixel_have_the_mean_light_of_its_points(monkeypatch
         assert np.abs(getattr(middles, name)[inner, inner] - twin).max() > 0.05
 
 
-def test_pixels_that_have_no_like_get_the_rays_that_the_others_save() -> None:
+def test_pixels_without_similar_neighbours_get_the_saved_rays() -> None:
     make_integrator()
     camera = down_camera(size=9)
     view = CameraView(9, 9, camera.fx, camera.fy, camera.cx, camera.cy, camera.world_from_camera)
@@ -92,7 +92,7 @@ def test_pixels_that_have_no_like_get_the_rays_that_the_others_save() -> None:
     assert wanted(pixel) == pytest.approx(twin(1, 1), rel=1e-4)
 
 
-def test_rays_follow_how_light_looks() -> None:
+def test_the_number_of_rays_follows_perceived_brightness() -> None:
     """In equal steps of the display: fewest where it is bright, and where a dark picture is exposed for, more."""
     make_integrator()
     camera = down_camera(size=9)

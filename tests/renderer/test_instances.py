@@ -74,7 +74,7 @@ def differences(found: npt.NDArray, shares: npt.NDArray) -> tuple[int, int]:
 
 
 @pytest.mark.parametrize("count", range(3, 9))
-def test_porous_instances_in_one_place_have_the_ids_of_the_twin(count: int) -> None:
+def test_porous_instances_in_one_place_have_the_ids_of_the_slow_twin(count: int) -> None:
     splats, ids = porous(count, count)
     shares = reference_shares(splats, ids, CAMERA)
     assert len(np.unique(shares.argmax(axis=2))) >= count  # all of them are seen somewhere
@@ -83,7 +83,7 @@ def test_porous_instances_in_one_place_have_the_ids_of_the_twin(count: int) -> N
 
 
 @pytest.mark.parametrize("before", range(1, 4))
-def test_shapes_without_gaussians_move_no_other(before: int) -> None:
+def test_shapes_without_gaussians_do_not_shift_other_ids(before: int) -> None:
     """Proxies have none, and come first in a scene without an environment."""
     ensure_variant()
     ball = gaussians([(0, 0, 0)], [(0, 0, 0, 1)], [(0.1, 0.1, 0.1)], [0.9])
@@ -101,7 +101,7 @@ def test_shapes_without_gaussians_move_no_other(before: int) -> None:
 
 
 @pytest.mark.parametrize("tolerance", [0.0, 1e-3, math.inf])
-def test_sheets_in_any_order_have_the_ids_of_the_twin(tolerance: float) -> None:
+def test_sheets_in_any_order_have_the_ids_of_the_slow_twin(tolerance: float) -> None:
     wrong = ties = 0
     for count, seed in itertools.product((3, 4, 5, 8, 20), (1, 2)):
         splats, ids = layered(count, seed)
@@ -111,7 +111,7 @@ def test_sheets_in_any_order_have_the_ids_of_the_twin(tolerance: float) -> None:
 
 
 @pytest.mark.parametrize("tolerance", [0.0, 1e-3, math.inf])
-def test_three_sheets_of_which_the_last_is_met_in_small_pieces(tolerance: float) -> None:
+def test_the_largest_share_wins_for_a_sheet_met_in_small_pieces(tolerance: float) -> None:
     """Weights .20, .16 and .636, the last in forty Gaussians of which none outweighs the others."""
     last = 1 - (1 - 0.636 / 0.64) ** (1 / 40)
     opacities = np.array([0.2, 0.2, *[last] * 40])
@@ -123,7 +123,7 @@ def test_three_sheets_of_which_the_last_is_met_in_small_pieces(tolerance: float)
     assert (shown(splats, ids, replace(EXACT, tolerance=tolerance)) == 3).all()
 
 
-def test_hundred_instances_on_one_ray() -> None:
+def test_a_hundred_instances_on_one_ray_have_the_id_of_the_largest_share() -> None:
     """More than one further walk can tell apart; the largest is met last, in pieces that weigh less than all others."""
     rng = np.random.default_rng(1)
     ids = np.concatenate([rng.permutation(np.arange(1, 101)), np.resize([101, 50, 101, 7], 600)])
@@ -138,7 +138,7 @@ def test_hundred_instances_on_one_ray() -> None:
 
 
 @pytest.mark.cpu(reason="there is nothing else to compare with on a GPU, which is never waited for")
-def test_ids_on_a_device_that_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_ids_are_equal_without_waiting_for_the_device(monkeypatch: pytest.MonkeyPatch) -> None:
     """Without the look whether any ray is unsure, as on a GPU, nothing changes."""
     from mitsplat.renderer.splatting import march
 

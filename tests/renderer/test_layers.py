@@ -36,7 +36,7 @@ def channels(shape: tuple[int, int], *, even: bool = False) -> dict[str, Any]:
 
 @pytest.mark.parametrize("even", [False, True])
 @pytest.mark.parametrize("shape", [(1, 1), (5, 7), (8, 6)])
-def test_layers_are_what_the_device_holds(shape: tuple[int, int], even: bool) -> None:
+def test_layers_equal_the_arrays_on_the_device(shape: tuple[int, int], even: bool) -> None:
     device = channels(shape, even=even)
     layers = Layers.on_device(device, shape)
     assert layers.shape == shape
@@ -50,7 +50,7 @@ def test_layers_are_what_the_device_holds(shape: tuple[int, int], even: bool) ->
         assert got.flags.c_contiguous and got.flags.writeable == (colour or field.name in IDS)
 
 
-def test_only_what_is_looked_at_comes_to_the_host() -> None:
+def test_layers_are_transferred_when_they_are_read() -> None:
     layers = Layers.on_device(channels((4, 6)), (4, 6))
     assert not {field.name for field in fields(Layers)} & vars(layers).keys()
     assert layers.depth is layers.depth
@@ -62,7 +62,7 @@ def test_only_what_is_looked_at_comes_to_the_host() -> None:
         layers.colour  # type: ignore[attr-defined]  # noqa: B018
 
 
-def test_copies_hold_values() -> None:
+def test_copies_have_the_same_values() -> None:
     layers = Layers.on_device(channels((4, 6)), (4, 6))
     for other in (pickle.loads(pickle.dumps(layers)), copy.copy(layers), replace(layers)):
         for field in fields(Layers):

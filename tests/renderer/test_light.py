@@ -50,7 +50,7 @@ def render(shapes: dict[str, Any], camera: Camera, *, samples: int = 64, **optio
     return render_layers(integrator, mi.load_dict({"type": "scene", **shapes}), camera)
 
 
-def test_without_dynamic_objects_nothing_changes_bit_for_bit() -> None:
+def test_light_without_dynamic_objects_changes_no_bit() -> None:
     make_integrator()
     shapes = {"floor": make_splats_shape(floor(), proxy=slab()), "sky": WHITE_SKY}
     lit = render(shapes, down_camera())
@@ -74,7 +74,7 @@ def test_wall_hides_half_of_a_uniform_sky() -> None:
     assert light.mean() == pytest.approx(0.5, abs=0.02)
 
 
-def test_a_sky_within_reach_is_hidden_by_what_is_near_alone() -> None:
+def test_an_occluder_hides_the_sky_within_its_reach_only() -> None:
     """A ceiling at height h hides the directions in which it is within reach r; (h / r)^2 of a sky's light is left."""
     make_integrator()
     sun = {"type": "directional", "direction": [0, 0, -1], "irradiance": {"type": "rgb", "value": 2.0}}
@@ -91,7 +91,7 @@ def test_a_sky_within_reach_is_hidden_by_what_is_near_alone() -> None:
             assert render({**shapes, "sun": sun}, camera, sky_reach=reach).light.max() == 0
 
 
-def test_object_between_a_point_light_and_the_floor_leaves_none() -> None:
+def test_an_object_before_a_point_light_leaves_no_light() -> None:
     make_integrator()
     blocker = trimesh.creation.box(bounds=[[-0.05, -0.05, 0.4], [0.05, 0.05, 0.41]])
     lamp = {"type": "point", "position": [0.0, 0.0, 2.0], "intensity": {"type": "rgb", "value": 5.0}}
@@ -161,7 +161,7 @@ def test_highlight_lies_at_the_mirror_direction_and_only_there() -> None:
     assert highlight[32, 60] < 0.01 * highlight.max()
 
 
-def test_visible_mesh_and_splats_hide_each_other() -> None:
+def test_visible_meshes_and_splats_occlude_each_other() -> None:
     make_integrator()
     red = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.8, 0.1, 0.1]}}
     cube = {
@@ -184,7 +184,7 @@ def test_visible_mesh_and_splats_hide_each_other() -> None:
     assert layers.rgb[above].min() > layers.rgb[below].max()
 
 
-def test_layers_say_where_the_proxy_is() -> None:
+def test_layers_have_depth_and_normal_of_the_proxy() -> None:
     make_integrator()
     shapes = {"floor": make_splats_shape(floor(), proxy=slab(), instance=7)}
     layers = render(shapes, down_camera())
@@ -236,7 +236,7 @@ def test_relit_surface_shows_no_pattern_of_the_sampling() -> None:
     assert np.abs(np.diff(light, 2, axis=1)).max() < 1e-3
 
 
-def test_point_seen_beside_its_proxy_takes_the_light_of_its_neighbours() -> None:
+def test_a_point_beside_its_proxy_gets_the_light_of_its_neighbours() -> None:
     """A proxy wider than its object by a few pixels: the floor seen there is not under the object."""
     make_integrator()
     base = trimesh.creation.box(bounds=[[-0.125, -0.125, 0.0], [0.125, 0.125, 0.05]])
@@ -285,7 +285,7 @@ def test_penumbra_of_a_square_light_has_the_width_of_similar_triangles() -> None
     assert -middle / slope + 0.5 / slope == pytest.approx(0.0, abs=0.02 / slope)
 
 
-def test_default_accuracy_keeps_its_promise_in_the_penumbra() -> None:
+def test_the_default_accuracy_holds_in_the_penumbra() -> None:
     """Rays are spent until light has the stated error as it looks, and not evenly."""
     make_integrator()
     blocker = trimesh.creation.box(bounds=[[-0.1, -0.1, 0.15], [0.1, 0.1, 0.2]])
@@ -342,7 +342,7 @@ def test_no_acne_beside_an_object_and_no_gap_under_it(unit: float) -> None:
 
 
 @pytest.mark.parametrize("subdivisions", [2, 3])
-def test_grazing_light_ends_on_a_coarse_ball_where_it_ends_on_a_round_one(subdivisions: int) -> None:
+def test_the_terminator_of_a_coarse_ball_is_that_of_a_smooth_one(subdivisions: int) -> None:
     """No dark facets at the terminator: irradiance is max(0, n.l) of the round ball, though it has few faces."""
     make_integrator()
     ball = trimesh.creation.icosphere(subdivisions, 0.3)
@@ -368,7 +368,7 @@ def test_grazing_light_ends_on_a_coarse_ball_where_it_ends_on_a_round_one(subdiv
     assert np.percentile(difference, 99) < 0.12
 
 
-def test_scan_that_is_rough_everywhere_has_no_creases_and_a_drawing_keeps_its_own() -> None:
+def test_creases_are_those_of_drawings_and_not_of_rough_scans() -> None:
     rng = np.random.default_rng(0)
     scan = trimesh.creation.icosphere(3, 0.1)
     scan.vertices *= 1 + 0.025 * rng.normal(size=(len(scan.vertices), 1))
@@ -433,7 +433,7 @@ def test_highlight_takes_no_more_light_than_arrives() -> None:
             assert 0.25 < highlight.mean() < 1.02
 
 
-def test_bad_accuracy_is_refused() -> None:
+def test_accuracy_out_of_range_is_refused() -> None:
     make_integrator()
     for name, value in (
         ("shadow_error", 1.0),
@@ -447,7 +447,7 @@ def test_bad_accuracy_is_refused() -> None:
 
 
 @pytest.mark.parametrize("roughness", [0.3, 0.6, 1.0])
-def test_in_the_light_of_its_capture_an_object_looks_as_captured(roughness: float) -> None:
+def test_an_object_in_the_light_of_its_capture_is_unchanged(roughness: float) -> None:
     """Even light of radiance 1: the ratio is 1 to 1e-3, and the highlight replaces what the capture held of it."""
     make_integrator()
     ground = make_splats_shape(
@@ -462,7 +462,7 @@ def test_in_the_light_of_its_capture_an_object_looks_as_captured(roughness: floa
 
 @pytest.mark.parametrize("occluders", ["proxies", "splats"])
 @pytest.mark.parametrize("rays", [8, 80])
-def test_one_scene_in_each_kernel_makes_the_same_light(
+def test_kernels_that_trace_one_scene_give_the_same_light(
     occluders: str, rays: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """As on CUDA, where a kernel cannot trace several: what static and dynamic things stop is kept from one to the
@@ -508,7 +508,7 @@ def test_one_scene_in_each_kernel_makes_the_same_light(
 
 
 @pytest.mark.parametrize(("stride", "apart"), [(1, 0.18), (BLOCK * BLOCK, 0.24), (len(OFFSETS) * BLOCK * BLOCK, 0.06)])
-def test_points_of_rays_stay_apart(stride: int, apart: float) -> None:
+def test_sample_points_of_rays_do_not_repeat(stride: int, apart: float) -> None:
     """Those of neighbours, of a pixel, and of each of a bent pixel's points.
 
     The least n d^2 of points n steps apart, which sets that do not repeat keep from 0: Roberts' is 0.245.

@@ -38,7 +38,7 @@ def planes_of(codes: npt.NDArray[np.uint32], needed: npt.NDArray[np.bool_]) -> P
 
 
 @pytest.mark.parametrize(("width", "height"), [(96, 64), (100, 52)])
-def test_planes_are_those_of_a_loop(width: int, height: int) -> None:
+def test_planes_equal_those_of_a_slow_loop(width: int, height: int) -> None:
     rng = np.random.default_rng(width)
     codes = np.full((height, width), PLAIN, np.uint32)
     codes[:, width // 2 + 3 :] = PLAIN + 1
@@ -68,7 +68,7 @@ def test_planes_are_those_of_a_loop(width: int, height: int) -> None:
     assert not ((pixel % width | pixel // width) & 1).any()
 
 
-def test_tiles_beside_a_shadow_or_another_thing_are_not_coarse() -> None:
+def test_tiles_beside_a_shadow_or_another_instance_are_not_coarse() -> None:
     width, height = 10 * BLOCK, 6 * BLOCK
     codes, needed = np.full((height, width), PLAIN, np.uint32), np.ones((height, width), bool)
     codes[: BLOCK // 2, : BLOCK // 2] = 0
@@ -146,7 +146,7 @@ def board(*, size: int = 160, error: float = 0.03, rays: int = 64, seed: int = 0
     return render_layers(integrator, mi.load_dict({"type": "scene", **scene}), camera, seed=seed)
 
 
-def test_shadows_on_planes_are_those_of_all_pixels(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_shadows_on_planes_equal_those_of_all_pixels(monkeypatch: pytest.MonkeyPatch) -> None:
     truth = np.mean([board(error=0, rays=1024, seed=s).light for s in (10, 11)], axis=0).mean(axis=-1)
     chosen: list[npt.NDArray[np.bool_]] = []
     judge = Planes.coarse
@@ -174,7 +174,7 @@ def test_shadows_on_planes_are_those_of_all_pixels(monkeypatch: pytest.MonkeyPat
     assert np.sqrt(np.mean(steps[:, border] ** 2)) < 1.3 * np.sqrt(np.mean(steps[:, within] ** 2))
 
 
-def test_an_open_plane_under_an_even_sky_is_lit_evenly() -> None:
+def test_an_open_plane_under_a_uniform_sky_is_lit_evenly() -> None:
     ground = trimesh.creation.box(bounds=[[-3, -3, -0.1], [3, 3, 0]])
     camera = Camera.look_at((0.2, -0.7, 1.2), (0, 0, 0), width=160, height=136, fov_x=60)
     scene = mi.load_dict({"type": "scene", "board": plain_mesh(ground), "sky": WHITE_SKY})

@@ -21,7 +21,7 @@ from mitsplat.renderer.light.light_tiles import BLOCK, MIN_SHADOW_HITS, ShadowTi
 
 
 @pytest.mark.parametrize(("width", "height"), [(8, 8), (100, 52), (130, 70)])
-def test_tiles_are_those_of_a_loop(width: int, height: int) -> None:
+def test_tiles_equal_those_of_a_slow_loop(width: int, height: int) -> None:
     view: Any = SimpleNamespace(width=width, height=height)
     rng = np.random.default_rng(width)
     arriving = rng.random((height, width, 3)).astype(np.float32) * (rng.random((height, width, 1)) < 0.9)
@@ -86,7 +86,7 @@ def light_below_plate(camera: Camera, edge: float, height: float, **others: dict
     return np.stack([render_layers(integrator, scene, camera, seed=seed).light[..., 0] for seed in range(4)])
 
 
-def test_faint_shadow_is_that_of_the_form_factor() -> None:
+def test_a_faint_shadow_equals_its_form_factor() -> None:
     """A small plate takes of an even sky the share of its form factor, A h^2 / (pi d^4), by one ray a pixel."""
     edge, height = 0.12, 0.3
     camera = down_camera(3.0, 192, 24.0)
@@ -103,7 +103,7 @@ def test_faint_shadow_is_that_of_the_form_factor() -> None:
     assert len(np.unique(light[0, faint])) > 100  # no steps
 
 
-def test_faint_shadow_is_a_share_of_what_static_things_leave() -> None:
+def test_a_faint_shadow_is_a_share_of_the_light_left_by_static_objects() -> None:
     """A roof hides a part F of the sky: a plate before the rest takes f / (1 - F), and one before the roof nothing."""
     edge, height, top = 0.12, 0.3, 1.0
     roof = trimesh.creation.box(bounds=[[0.5, -1.5, top], [3.5, 1.5, top + 0.01]])
@@ -128,7 +128,7 @@ def test_faint_shadow_is_a_share_of_what_static_things_leave() -> None:
 
 @pytest.mark.parametrize("roughness", [0.2, 0.5, 1.0])
 @pytest.mark.parametrize("cosine", [1.0, 0.6, 0.15])
-def test_lobe_mirrors_of_an_even_sky_what_its_reflectance_adds_up_to(roughness: float, cosine: float) -> None:
+def test_the_mean_lobe_weight_equals_the_reflectance_integral(roughness: float, cosine: float) -> None:
     """The mean weight of sampled directions is the integral of reflectance times cosine over the hemisphere."""
     n = 1 << 18
     # Opaque, so that one kernel serves all.

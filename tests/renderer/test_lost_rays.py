@@ -41,7 +41,7 @@ def log(request):
 
 
 @pytest.mark.parametrize("text", TEXTS)
-def test_lost_rays_are_an_error_once(log, text, capfd):
+def test_dropped_rays_are_an_error_once(log, text, capfd):
     log(text)
     log(text)
     with pytest.raises(RuntimeError, match=r"dropped rays \(2 times\): jit_eval\(\): more than one OptiX"):
@@ -56,7 +56,7 @@ def test_other_messages_are_printed(log, capfd):
     assert "something else" in capfd.readouterr().err
 
 
-def test_dr_jit_still_says_so():
+def test_the_library_has_the_message_of_dropped_rays():
     """Another release may word it differently, and nothing else would tell."""
     library = LIBRARY.read_bytes()
     for text in TEXTS:
@@ -74,7 +74,7 @@ def test_a_process_ends_with_the_callback_in_place():
 @pytest.mark.cpu(reason="reads kernels in LLVM's language")
 class TestKernels:
     @pytest.mark.parametrize("case", CASES)
-    def test_each_traces_one_scene(self, monkeypatch, case):
+    def test_every_kernel_traces_one_scene(self, monkeypatch, case):
         """As they are split on CUDA."""
         build = Proxies.__init__
 

@@ -103,7 +103,7 @@ def test_layers_of_leaves_let_through_the_product(opacities: tuple[float, ...]) 
     assert light.mean() == pytest.approx(expected, abs=0.01)
 
 
-def test_light_falls_through_a_hole_that_the_mesh_does_not_have() -> None:
+def test_light_passes_a_hole_of_the_splats_that_the_mesh_lacks() -> None:
     plate = trimesh.creation.box(bounds=[[-0.1, -0.1, 0.699], [0.1, 0.1, 0.701]])
     shapes = {"plate": make_splats_shape(pane(0.7, 0.95, hole=0.04), proxy=plate, instance=1)}
     centres = (np.arange(64) + 0.5 - 32) / 64 * 2 * 0.6 * np.tan(np.radians(10))
@@ -118,7 +118,7 @@ def test_light_falls_through_a_hole_that_the_mesh_does_not_have() -> None:
     assert render_layers(integrator, mi.load_dict(scene), camera).light[radius < 0.09].max() < 0.01
 
 
-def test_leaf_on_the_floor_shadows_it_up_to_its_edge() -> None:
+def test_a_leaf_on_the_floor_casts_a_shadow_up_to_its_edge() -> None:
     """The floor lies within the ellipsoids of the leaf's Gaussians, and none of its light arrives."""
     leaf = pane(0.0004, 0.95, width=0.08)
     floor_below = Camera.look_at((0, 0, 0.0002), (0.05, 0, 0), up=(0, 0, 1), width=32, height=32, fov_x=60, near=1e-6)
@@ -130,7 +130,7 @@ def test_leaf_on_the_floor_shadows_it_up_to_its_edge() -> None:
     assert below.light[20:][on_floor].max() < 0.05
 
 
-def test_the_gaussians_of_a_surface_do_not_shadow_it() -> None:
+def test_a_surface_is_not_shadowed_by_its_own_gaussians() -> None:
     """A sheet whose Gaussians scatter by their thickness, in slanting light, is as bright as its flat mesh."""
     sheet = pane(0.05, 0.9)
     rng = np.random.default_rng(1)

@@ -84,7 +84,7 @@ VIEWS = {
 @pytest.mark.parametrize("samples", [1, 2])
 @pytest.mark.parametrize("lens", VIEWS)
 @pytest.mark.parametrize("mesh", [False, True])
-def test_no_tolerance_is_the_order_of_rays(lens: str, samples: int, mesh: bool) -> None:
+def test_tolerance_zero_sorts_along_each_ray(lens: str, samples: int, mesh: bool) -> None:
     """Whatever is late at all is walked again: colours, depths and ids are those of the exact order.
 
     But for pixels where two Gaussians are equally far: kernels of a GPU round the same depth in more than one way.
@@ -136,7 +136,7 @@ def sheets(colour: Any) -> Splats:
 
 
 @pytest.mark.parametrize("samples", [1, 2])
-def test_tiles_leave_no_seams(monkeypatch: pytest.MonkeyPatch, samples: int) -> None:
+def test_tiles_of_different_orders_have_no_seams(monkeypatch: pytest.MonkeyPatch, samples: int) -> None:
     """A picture of one colour keeps it, and a ramp has no steps, where tiles of all three orders lie side by side."""
     from mitsplat.renderer.splatting import march
 
@@ -160,7 +160,7 @@ def test_tiles_leave_no_seams(monkeypatch: pytest.MonkeyPatch, samples: int) -> 
     assert steps[7::8].max() < 2e-3  # from the last column of a tile to the first of the next
 
 
-def test_late_by_one_place_is_estimated_exactly() -> None:
+def test_the_error_of_one_swapped_pair_is_estimated_exactly() -> None:
     """Two neighbours that change places change a colour by the product of their opacities times what they differ."""
     ensure_variant()
     from mitsplat.renderer.splatting.march import ERROR, _blend, _fresh
@@ -173,7 +173,7 @@ def test_late_by_one_place_is_estimated_exactly() -> None:
     assert np.array(pixel[ERROR]).item() == pytest.approx(0.6 * 0.5 * 0.6)
 
 
-def test_late_by_one_place_is_amended_exactly() -> None:
+def test_the_colour_of_one_swapped_pair_is_corrected_exactly() -> None:
     """The colour is that of the right order, and a third one, late behind both, is blended as it comes."""
     ensure_variant()
     from mitsplat.renderer.splatting.march import BLUE, RED, _blend, _fresh
@@ -191,7 +191,7 @@ def test_late_by_one_place_is_amended_exactly() -> None:
     assert np.array(pixel[0]).item() == pytest.approx(transmittance)
 
 
-def test_amended_pictures_are_nearer_to_the_order_of_rays_and_show_the_same_things() -> None:
+def test_corrected_images_have_a_smaller_error_and_the_same_ids() -> None:
     plain = replace(PRESETS["fast"], correct_late_gaussians=False)
     layers, amended = (render_splats(CROWD, WIDE, quality=quality) for quality in (plain, PRESETS["fast"]))
     exact = display(render_splats(CROWD, WIDE, quality=replace(plain, tolerance=0.0)))
@@ -201,12 +201,12 @@ def test_amended_pictures_are_nearer_to_the_order_of_rays_and_show_the_same_thin
         np.testing.assert_array_equal(getattr(amended, name), getattr(layers, name))
 
 
-def test_amended_pictures_of_one_colour_keep_it() -> None:
+def test_corrected_images_of_one_colour_keep_it() -> None:
     even = render_splats(sheets(lambda x: np.full_like(x, 0.7)), WIDE, quality="fast")
     assert np.ptp(even.rgb / even.alpha[..., None]) < 1e-5
 
 
-def test_the_error_that_is_left_is_told_with_the_picture() -> None:
+def test_the_remaining_order_error_is_reported_with_the_image() -> None:
     """The largest within the tolerance, since tiles above it are made again; the mean by any order of its sum."""
     small, large = (render_splats(CROWD, WIDE, quality=replace(RAY, tolerance=t)).order_error for t in (5e-3, 0.1))
     assert small is not None and large is not None
@@ -217,7 +217,7 @@ def test_the_error_that_is_left_is_told_with_the_picture() -> None:
     assert render_splats(CROWD, WIDE, quality=replace(RAY, tolerance=math.inf)).order_error is None
 
 
-def test_the_largest_and_the_mean_error_are_those_of_the_pixels() -> None:
+def test_reported_order_errors_equal_those_of_the_pixels() -> None:
     from mitsplat.renderer.splatting.march import largest_and_mean
 
     ensure_variant()
@@ -261,7 +261,7 @@ def turned(degrees: float) -> Camera:
 TURNING = [turned(0.02 * step) for step in range(6)]
 
 
-def test_tiles_sort_by_depth_where_they_see_most_of_a_gaussian() -> None:
+def test_tiles_sort_by_the_depth_at_the_visible_footprint() -> None:
     """Around the mean of the product of two normal distributions: the footprint's, and that of the tile's pixels."""
     ensure_variant()
     from mitsplat.renderer.splatting.tile_depths import depth_where_seen

@@ -20,7 +20,7 @@ def given(**values: Any) -> Parameters:
     return Parameters(props, "shape 'splats'")
 
 
-def test_what_is_absent_is_the_default() -> None:
+def test_missing_parameters_have_their_defaults() -> None:
     none = given()
     assert (none.string("a", "b"), none.boolean("a", True), none.number("a", 2), none.integer("a", 3, 0, 9)) == (
         "b",
@@ -33,7 +33,7 @@ def test_what_is_absent_is_the_default() -> None:
         none.positive("a", None)
 
 
-def test_what_is_given_is_taken() -> None:
+def test_given_parameters_are_read() -> None:
     some = given(text="b", truth=False, whole=3, number=0.5)
     assert (some.string("text", ""), some.boolean("truth", True), some.integer("whole", 0, 0, 3)) == ("b", False, 3)
     assert (some.number("number", 1), some.number("whole", 1), some.choice("text", "a", "b")) == (0.5, 3.0, "b")
@@ -53,7 +53,9 @@ def test_what_is_given_is_taken() -> None:
         ("c", "choice", ("a", "b"), "'x' must be 'a' or 'b' (got 'c')"),
     ],
 )
-def test_anything_else_is_refused(value: Any, method: str, limits: tuple[Any, ...], sentence: str) -> None:
+def test_parameters_of_another_type_or_range_are_refused(
+    value: Any, method: str, limits: tuple[Any, ...], sentence: str
+) -> None:
     with pytest.raises(InputError) as caught:
         getattr(given(x=value), method)("x", *limits)
     assert str(caught.value) == f"shape 'splats': {sentence}"

@@ -37,7 +37,7 @@ def loss(a: np.ndarray, b: np.ndarray, share: float) -> tuple[float, np.ndarray]
     return result, np.stack([np.array(dr.grad(c)).reshape(HEIGHT, WIDTH) for c in seen])
 
 
-def test_dssim_is_that_of_scikit_image() -> None:
+def test_dssim_agrees_with_scikit_image() -> None:
     a, b = pictures()
     _, full = structural_similarity(
         a, b, gaussian_weights=True, sigma=1.5, use_sample_covariance=False, data_range=1.0, channel_axis=0, full=True
@@ -61,7 +61,7 @@ def test_gradient_equals_finite_differences() -> None:
         np.testing.assert_allclose((gradient * direction).sum(), expected, rtol=5e-3)
 
 
-def test_metrics_of_equal_and_shifted_pictures() -> None:
+def test_ssim_of_equal_and_psnr_of_shifted_images_equal_closed_forms() -> None:
     a = np.full((20, 30, 3), 0.5)
     assert metrics.ssim(a, a) == 1
     assert abs(metrics.psnr(a, a + 0.1) - 20) < 1e-9

@@ -52,7 +52,7 @@ def expected(camera: Camera) -> npt.NDArray[np.bool_]:
 
 @pytest.mark.parametrize("camera", [PINHOLE, THIN, DISTORTED], ids=["pinhole", "thin lens", "distorted"])
 @pytest.mark.parametrize("samples", [1, 2, 3, 4, 8])
-def test_discs_lie_where_the_centres_of_pixels_see_them(samples: int, camera: Camera) -> None:
+def test_discs_cover_the_pixels_whose_centres_see_them(samples: int, camera: Camera) -> None:
     ensure_variant()
     integrator = make_integrator(quality=Quality(samples=samples, lens_rings=1), shadow="none")
     scene = mi.load_dict({"type": "scene", "disc": disc()})
@@ -69,7 +69,7 @@ def test_discs_lie_where_the_centres_of_pixels_see_them(samples: int, camera: Ca
 
 
 @pytest.mark.parametrize("samples", [1, 2, 3])
-def test_a_mesh_behind_splats_shows_where_their_centres_say(samples: int) -> None:
+def test_a_mesh_behind_splats_has_the_id_where_pixel_centres_see_it(samples: int) -> None:
     """Where less than half of the centre's ray is blocked, id and depth are those of the visible mesh behind."""
     ensure_variant()
     import trimesh

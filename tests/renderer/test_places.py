@@ -55,7 +55,7 @@ def test_each_layout_draws_an_environment(scene_data: SceneData, write_scene: Wr
     assert f"assets/{chosen.name}" == told["environment"]["name"]
 
 
-def test_a_scene_of_one_place_tells_nothing(scene_data: SceneData, write_scene: WriteScene) -> None:
+def test_a_scene_with_one_environment_records_no_draw(scene_data: SceneData, write_scene: WriteScene) -> None:
     scene = load_scene(write_scene(scene_data))
     assert draw_surroundings(scene.spec, 0).to_json(scene.spec) == {}
     stated = json.loads(scene.spec.model_dump_json())
@@ -102,7 +102,7 @@ def test_a_further_material_shifts_no_other_draw(scene_data: SceneData, write_sc
     assert finishes() == alone
 
 
-def test_images_are_those_of_a_folder_a_pattern_or_a_list(scene_data: SceneData, write_scene: WriteScene) -> None:
+def test_images_come_from_a_folder_a_pattern_or_a_list(scene_data: SceneData, write_scene: WriteScene) -> None:
     folder = write_scene(scene_data).parent
     write_images(folder, "photos/a.png", "photos/b.jpg", "photos/c.png")
     (folder / "photos/notes.txt").write_text("no image")
@@ -168,7 +168,7 @@ def test_each_frame_or_layout_draws_a_background(scene_data: SceneData, write_sc
         ({"materials": [{"kind": "colour"}], "visible": False}, "shapes[0].materials: must not be given for shape"),
     ],
 )
-def test_wrong_places_are_refused(
+def test_invalid_environments_and_backgrounds_are_refused(
     scene_data: SceneData, write_scene: WriteScene, tmp_path: Path, changes: SceneData, sentence: str
 ) -> None:
     (tmp_path / "bad.png").write_bytes(b"no image at all")
@@ -194,7 +194,7 @@ def test_the_first_unreadable_image_of_many_is_named(
         load_scene(write_scene(scene_data))
 
 
-def test_a_backdrop_is_a_room_around_its_inside(scene_data: SceneData, write_scene: WriteScene) -> None:
+def test_a_backdrop_is_a_room_around_its_interior(scene_data: SceneData, write_scene: WriteScene) -> None:
     """Walls leave the inside free, overlap nowhere, and share one material; without sides there is only the floor."""
     room = {"size": [3, 2, 2.5], "position": [0.2, 0, -0.7], "rotate_z": 30, "ceiling": True, "collider": True}
     scene_data |= {"backdrop": room, "enclosure": {}}

@@ -23,7 +23,7 @@ from tests.fit.test_fit import SMALL, photograph, seeing
 from tests.renderer.test_render import CAMERA, make_splats
 
 
-def test_numbers_and_widths_choose_the_recording_and_values_do_not() -> None:
+def test_recordings_depend_on_counts_and_sizes_and_not_on_values() -> None:
     """Dr.Jit's own choice takes some numbers for others, in calls such as these."""
     ensure_variant()
     traced: list[tuple[int, int]] = []
@@ -49,9 +49,7 @@ def test_numbers_and_widths_choose_the_recording_and_values_do_not() -> None:
 
 
 @pytest.mark.parametrize("distortion", [(), (-0.2, 0.05, 0.01, -0.01)])
-def test_gradients_of_many_views_are_those_of_traced_ones(
-    distortion: tuple[float, ...], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_recorded_gradients_equal_traced_ones(distortion: tuple[float, ...], monkeypatch: pytest.MonkeyPatch) -> None:
     """Views differ in how many pairs of a Gaussian and a tile they have, down to none."""
     ensure_variant()
     model = GaussianModel(make_splats(300, 36, bands=4), 1.0)
@@ -87,7 +85,7 @@ def test_gradients_of_many_views_are_those_of_traced_ones(
 
 
 @pytest.mark.cpu(reason="what GPUs round otherwise grows over the steps of a fit")
-def test_a_fit_has_the_bytes_of_a_traced_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_fit_with_recordings_has_the_bytes_of_a_traced_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """With all that changes its kernels: sizes, degrees, depths, numbers of Gaussians and colour corrections."""
     ensure_variant()
     (tmp_path / "photos").mkdir()

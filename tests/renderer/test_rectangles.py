@@ -31,7 +31,7 @@ LAMPS = {
 }
 
 
-def test_directions_and_light_are_those_of_mitsuba() -> None:
+def test_sampled_directions_and_light_equal_those_of_mitsuba() -> None:
     scene = mi.load_dict({"type": "scene", **LAMPS})
     emitters, pointers = scene.emitters(), scene.emitters_dr()
     sky = next(i for i, emitter in enumerate(emitters) if emitter.class_name() == "ConstantBackgroundEmitter")
@@ -62,12 +62,12 @@ def test_directions_and_light_are_those_of_mitsuba() -> None:
     ],
     ids=["point", "disk", "textured"],
 )
-def test_other_lamps_are_left_to_mitsuba(other: dict[str, Any]) -> None:
+def test_other_lamps_are_sampled_by_mitsuba(other: dict[str, Any]) -> None:
     scene = mi.load_dict({"type": "scene", "lamp": LAMPS["plain"], "other": other})
     assert Rectangles.of(scene.emitters(), None) is None
 
 
-def test_light_without_a_lobe_is_the_same_and_mirrors_nothing() -> None:
+def test_light_without_a_lobe_has_no_highlight() -> None:
     scene = mi.load_dict({"type": "scene", **LAMPS})
     emitters = Emitters(scene, (0.0, 0.0, 0.0))
     count = 100

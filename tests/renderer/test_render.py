@@ -63,13 +63,13 @@ def error(layers: Layers, splats: Splats, camera: Camera, quality: Quality = PRE
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_exact_preset_equals_the_twin(seed: int) -> None:
+def test_the_exact_preset_equals_the_slow_twin(seed: int) -> None:
     splats = make_splats(60, seed)
     assert error(render_splats(splats, CAMERA, quality="exact"), splats, CAMERA) < 1e-4
 
 
 @pytest.mark.parametrize("preset", PRESETS)
-def test_depth_of_a_thin_fog_is_the_mean_of_what_was_met(preset: str) -> None:
+def test_depth_of_a_thin_fog_is_the_weighted_mean(preset: str) -> None:
     splats = replace(make_splats(40, 13), opacities=np.random.default_rng(1).uniform(0.05, 0.3, 40))
     layers, twin = render_splats(splats, CAMERA, quality=preset), render_reference(splats, CAMERA)
     thin = (twin.alpha > 0.02) & (twin.alpha < 0.49)
@@ -97,14 +97,14 @@ def test_all_spherical_harmonic_bands_follow_the_twin_from_every_side() -> None:
 
 @pytest.mark.parametrize("aspect", [10.0, 100.0, 1000.0])
 @pytest.mark.parametrize("tilt", [0.0, 30.0, 60.0, 85.0, 90.0])
-def test_flat_gaussian_is_met_exactly_once(aspect: float, tilt: float) -> None:
+def test_a_flat_gaussian_is_blended_once(aspect: float, tilt: float) -> None:
     quat = Rotation.from_euler("x", tilt, degrees=True).as_quat()
     splats = one((0.3, 0.3, 0.3 / aspect), quat=quat, opacity=0.7)
     assert error(render_splats(splats, CAMERA, quality="exact"), splats, CAMERA) < 1e-4
 
 
 @pytest.mark.parametrize("angle", [0.0, 17.0, 45.0, 90.0])
-def test_needle_follows_the_twin(angle: float) -> None:
+def test_a_needle_equals_the_slow_twin(angle: float) -> None:
     quat = Rotation.from_euler("zy", [angle, 20.0], degrees=True).as_quat()
     splats = one((0.5, 0.001, 0.001), quat=quat, opacity=0.9)
     assert error(render_splats(splats, CAMERA, quality="exact"), splats, CAMERA) < 1e-4
@@ -118,7 +118,7 @@ def test_kernels_and_responses_follow_the_twin(response: str, kernel: str) -> No
     assert error(render_splats(splats, CAMERA, quality=quality), splats, CAMERA, quality) < 1e-4
 
 
-def test_small_gaussians_keep_their_light_wherever_they_fall_in_a_pixel() -> None:
+def test_small_gaussians_keep_their_light_at_any_position_in_a_pixel() -> None:
     """Under ``mip`` the opacities of all pixels add up to about 2 pi sigma^2 o. Point samples sparkle.
 
     Poisson's summation formula bounds the sum of a Gaussian's samples: 1 +- 2 exp(-2 pi^2 v) along each axis, with the
@@ -154,7 +154,7 @@ def test_kernel_of_a_distorted_lens_has_the_size_of_its_pixels() -> None:
 
 @pytest.mark.parametrize("count", [20, 200])
 @pytest.mark.parametrize("tolerance", [0.0, 1e-3, math.inf])
-def test_coincident_layers_multiply(count: int, tolerance: float) -> None:
+def test_coincident_layers_multiply_their_transmittances(count: int, tolerance: float) -> None:
     """K layers of opacity a at one place leave (1 - a)^K of the light."""
     splats = one((50.0, 50.0, 0.001), opacity=0.01, count=count)
     quality = Quality(tolerance=tolerance, alpha_min=1e-6, transmittance_min=0)
@@ -163,7 +163,7 @@ def test_coincident_layers_multiply(count: int, tolerance: float) -> None:
 
 
 @pytest.mark.parametrize("tolerance", [0.0, 1e-3, math.inf])
-def test_a_ray_that_ended_shows_what_it_met_alone(tolerance: float) -> None:
+def test_an_ended_ray_has_the_colour_of_its_gaussians_only(tolerance: float) -> None:
     """Eleven layers of opacity 0.3 leave less than 0.02 of the light, which goes to nothing, or is of their colour."""
     quality = Quality(tolerance=tolerance, alpha_min=1e-6, transmittance_min=0.02)
     for count, left in ((5, 0.7**5), (30, 0.7**11)):
@@ -178,7 +178,7 @@ def test_a_ray_that_ended_shows_what_it_met_alone(tolerance: float) -> None:
             np.testing.assert_allclose(layers.rgb[12, 16], colour, atol=2e-4)
 
 
-def test_powers_of_two_are_those_of_numpy() -> None:
+def test_powers_of_two_agree_with_numpy() -> None:
     ensure_variant()
     from mitsplat.renderer.splatting.walk import exp2
 
@@ -226,7 +226,7 @@ LENSES = {
 
 
 @pytest.mark.parametrize("lens", LENSES)
-def test_lens_follows_the_twin(lens: str) -> None:
+def test_each_lens_equals_the_slow_twin(lens: str) -> None:
     camera = Camera.look_at((0, 0, -2), (0, 0, 0), up=(0, -1, 0), width=40, height=30, fov_x=70)
     camera = replace(camera, **LENSES[lens])
     splats = make_splats(60, 13, spread=1.0 if lens == "opencv" else 2.0)
@@ -234,7 +234,7 @@ def test_lens_follows_the_twin(lens: str) -> None:
 
 
 @pytest.mark.parametrize("lens", LENSES)
-def test_picture_through_a_lens_undistorts_to_the_pinhole(lens: str) -> None:
+def test_an_undistorted_lens_image_equals_the_pinhole_image(lens: str) -> None:
     """Every pixel of a pinhole is looked up where OpenCV says that the lens shows it."""
     pinhole = Camera.look_at((0, 0, -2), (0, 0, 0), up=(0, -1, 0), width=48, height=36, fov_x=60)
     focal = {"fx": 8 * 48.0, "fy": 8 * 48.0}
@@ -310,7 +310,7 @@ def test_thin_lens_blurs_by_its_circle_of_confusion(z: float) -> None:
     assert added == pytest.approx(radius**2 / 4, rel=0.01, abs=1e-4)
 
 
-def test_other_integrators_see_through_the_thin_lens() -> None:
+def test_other_integrators_render_through_the_thin_lens() -> None:
     """A far bright disk in Mitsuba's path tracer is blurred to the same size."""
     camera = Camera(64, 48, 100.0, 100.0, 32.0, 24.0, np.eye(4), aperture_radius=0.1, focus_distance=1.0)
     light = {"type": "area", "radiance": {"type": "rgb", "value": 1.0}}
@@ -323,7 +323,7 @@ def test_other_integrators_see_through_the_thin_lens() -> None:
     assert variance == pytest.approx((100 * 0.1 * 0.75) ** 2 / 4 + (100 * 0.04 / 4) ** 2 / 4 + 1 / 12, rel=0.02)
 
 
-def test_means_far_from_the_origin_keep_their_place() -> None:
+def test_gaussians_far_from_the_origin_keep_their_pixels() -> None:
     """10 km from the origin, on coordinates that float32 can hold."""
     near = make_splats(30, 15)
     shift = np.array([8192.0, -4096.0, 2048.0])
@@ -336,7 +336,7 @@ def test_means_far_from_the_origin_keep_their_place() -> None:
     assert np.abs(render_splats(far, camera, quality="exact").rgb - expected).max() < 1e-4
 
 
-def test_rotating_object_and_camera_together_changes_nothing() -> None:
+def test_rotating_object_and_camera_together_does_not_change_the_image() -> None:
     splats = make_splats(60, 17)
     turn = np.eye(4)
     turn[:3, :3] = Rotation.from_rotvec([0.3, -1.1, 0.7]).as_matrix()
@@ -396,7 +396,7 @@ def test_harmonics_that_overshoot_below_black_are_clamped(preset: str) -> None:
         assert error(layers, splats, CAMERA) < 1e-3 * render_reference(splats, CAMERA).rgb.max() ** 2.4
 
 
-def test_opaque_gaussian_hides_what_is_behind() -> None:
+def test_an_opaque_gaussian_hides_gaussians_behind_it() -> None:
     front, behind = one((500, 500, 0.01), mean=(0, 0, -0.5)), one((500, 500, 0.01), mean=(0, 0, 0.5))
     behind = Splats(behind.means, behind.quats, behind.scales, behind.opacities, behind.sh * -3)
     both = render_splats(Splats.concatenate([behind, front]), CAMERA)
@@ -414,7 +414,7 @@ def test_opacity_at_the_cut_off_and_below_is_not_seen(preset: str) -> None:
 
 
 @pytest.mark.parametrize("size", [(1, 1), (401, 3), (9, 17)])
-def test_odd_image_sizes(size: tuple[int, int]) -> None:
+def test_images_of_odd_sizes_equal_the_slow_twin(size: tuple[int, int]) -> None:
     camera = Camera.look_at((0, 0, -2), (0, 0, 0), up=(0, -1, 0), width=size[0], height=size[1], fov_x=40)
     splats = make_splats(20, 19)
     layers = render_splats(splats, camera, quality="exact")
@@ -422,7 +422,7 @@ def test_odd_image_sizes(size: tuple[int, int]) -> None:
     assert error(layers, splats, camera) < 1e-4
 
 
-def test_nothing_to_see_is_black_and_empty() -> None:
+def test_an_image_without_gaussians_is_black_and_empty() -> None:
     behind = one((0.1, 0.1, 0.1), mean=(0, 0, -5))
     for splats in (behind.select(np.zeros(1, bool)), behind):
         layers = render_splats(splats, CAMERA)
@@ -430,7 +430,7 @@ def test_nothing_to_see_is_black_and_empty() -> None:
 
 
 @pytest.mark.parametrize("distortion", [(), (0.05, 0.0, 0.0, 0.0)])
-def test_what_reaches_the_camera_from_behind_a_wall_stays_behind_it(distortion: tuple[float, ...]) -> None:
+def test_a_gaussian_reaching_the_camera_from_behind_a_wall_stays_hidden(distortion: tuple[float, ...]) -> None:
     x, y = np.meshgrid(np.linspace(-1.2, 1.2, 49), np.linspace(-0.9, 0.9, 37))
     wall = np.stack([x.ravel(), y.ravel(), np.ones(x.size)], axis=1)
     count = len(wall) + 1
@@ -448,7 +448,7 @@ def test_what_reaches_the_camera_from_behind_a_wall_stays_behind_it(distortion: 
 
 
 @pytest.mark.parametrize("samples", [1, 2])
-def test_crowded_view_is_made_in_parts(monkeypatch: pytest.MonkeyPatch, samples: int) -> None:
+def test_a_crowded_view_is_rendered_in_parts(monkeypatch: pytest.MonkeyPatch, samples: int) -> None:
     from mitsplat.renderer.splatting import march, pairs
 
     joined = []
@@ -468,7 +468,7 @@ def test_crowded_view_is_made_in_parts(monkeypatch: pytest.MonkeyPatch, samples:
         render_splats(splats, camera, quality=quality)
 
 
-def test_instance_is_the_one_with_the_largest_share() -> None:
+def test_the_instance_is_the_one_with_the_largest_share() -> None:
     layers = render_splats(one((0.1, 0.1, 0.1)), CAMERA)
     assert layers.instance[12, 16] == 1
     assert layers.instance[0, 0] == 0
@@ -481,7 +481,7 @@ def test_denormal_scales_stay_finite() -> None:
 
 
 @pytest.mark.parametrize("preset", ["fast", "balanced", "exact"])
-def test_needles_thinner_than_rounding_neither_flash_nor_go_dark(preset: str) -> None:
+def test_needles_thinner_than_rounding_keep_their_brightness(preset: str) -> None:
     """Axes of 0.1 nm seen from 2 m: rounding made responses of any size of them, and pixels that were no numbers."""
     splats = make_splats(400, 41)
     rng = np.random.default_rng(41)
@@ -502,7 +502,7 @@ def test_samples_average_the_pixel() -> None:
     assert np.abs(coarse.alpha - boxed).max() < 1e-4
 
 
-def test_same_bytes_from_run_to_run_and_on_one_thread() -> None:
+def test_repeated_runs_and_one_thread_give_the_same_bytes() -> None:
     splats = make_splats(500, 23)
     first = render_splats(splats, CAMERA).rgb.tobytes()
     assert render_splats(splats, CAMERA).rgb.tobytes() == first
@@ -514,7 +514,7 @@ def test_same_bytes_from_run_to_run_and_on_one_thread() -> None:
         dr.set_thread_count(threads)
 
 
-def test_second_frame_needs_no_new_kernel() -> None:
+def test_a_second_frame_compiles_no_new_kernel() -> None:
     """The kernels of another camera and other splats are those of the first frame, not merely on disk by chance."""
 
     def kernels(splats: Splats, camera: Camera) -> set[int]:
@@ -547,7 +547,7 @@ def test_unknown_quality_is_refused() -> None:
 
 
 @pytest.mark.parametrize("name", ["plant", "academic_tarot_cards"])
-def test_presets_come_close_to_the_exact_one_on_captures(name: str) -> None:
+def test_presets_are_close_to_exact_on_captures(name: str) -> None:
     file = CAPTURES / f"{name}.splat"
     if not file.exists():
         pytest.skip(f"no capture {file}")

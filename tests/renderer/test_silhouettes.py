@@ -68,7 +68,7 @@ def camera(distortion: tuple[float, ...] = ()) -> ms.Camera:
     ],
     ids=["balanced", "samples", "exact", "distorted"],
 )
-def test_silhouettes_are_the_instances_rendered_alone(
+def test_silhouettes_equal_renderings_of_single_instances(
     source: str, quality: Quality, distortion: tuple[float, ...]
 ) -> None:
     ensure_variant()
@@ -104,7 +104,7 @@ def replace_origin(silhouette: Any, x: int, y: int) -> Any:
     return replace(silhouette, box=(x0 + x, y0 + y, x1 + x, y1 + y))
 
 
-def test_what_is_seen_is_covered_alone() -> None:
+def test_visible_pixels_lie_inside_of_silhouettes() -> None:
     ensure_variant()
     scene = mi.load_dict({"type": "scene", **placed()})
     integrator = make_integrator(shadow="none")
@@ -126,7 +126,7 @@ def test_a_scene_without_instances_has_no_silhouettes() -> None:
 
 
 @pytest.mark.parametrize("samples", [1, 2])
-def test_crowded_silhouettes_are_made_in_parts(monkeypatch: pytest.MonkeyPatch, samples: int) -> None:
+def test_crowded_silhouettes_are_rendered_in_parts(monkeypatch: pytest.MonkeyPatch, samples: int) -> None:
     from mitsplat.renderer.splatting import pairs
 
     ensure_variant()
@@ -144,7 +144,7 @@ def test_crowded_silhouettes_are_made_in_parts(monkeypatch: pytest.MonkeyPatch, 
         render_silhouettes(integrator, scene, camera())
 
 
-def test_many_instances_have_their_silhouettes_where_they_are() -> None:
+def test_more_instances_than_bits_have_their_silhouettes() -> None:
     """More instances than a word has bits, with ids that are far apart."""
     ensure_variant()
     splats, _ = ball(1, radius=0.01, count=40)

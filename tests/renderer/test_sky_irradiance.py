@@ -34,7 +34,7 @@ def by_quadrature(emitter: object, normals: np.ndarray) -> np.ndarray:
     return np.maximum(normals @ directions.T, 0) @ (radiance * weight[:, None])
 
 
-def test_table_agrees_with_a_quadrature() -> None:
+def test_the_irradiance_table_agrees_with_a_quadrature() -> None:
     """Within 1 % of the sky's largest where the sun sets, and 0.25 % in the mean of all normals."""
     ensure_variant()
     scene = mi.load_dict({"type": "scene", "sky": sky_with_a_sun()})
@@ -49,7 +49,7 @@ def test_table_agrees_with_a_quadrature() -> None:
     assert error.mean() < 0.0025
 
 
-def test_octahedral_map_is_one_to_one() -> None:
+def test_the_octahedral_map_is_bijective() -> None:
     """Directions come back, those on the fold and on the axes too."""
     ensure_variant()
     rng = np.random.default_rng(1)

@@ -38,7 +38,7 @@ def finish(kind: str, **values: object) -> MaterialDraw:
 
 
 @pytest.mark.parametrize("kind", ["noise", "wood", "brushed_metal", "checker", "stripes"])
-def test_patterns_stay_between_their_colours_and_have_no_seam(kind: str) -> None:
+def test_patterns_are_between_their_colours_without_seams(kind: str) -> None:
     image = texture_image(finish(kind), {})
     assert image is not None and image.shape == (SIZE, SIZE, 3)
     assert image.min(axis=(0, 1)).tolist() >= [102, 76, 51] and image.max(axis=(0, 1)).tolist() <= [204, 153, 102]
@@ -51,7 +51,7 @@ def test_patterns_stay_between_their_colours_and_have_no_seam(kind: str) -> None
         assert seam <= steps.max() + 1
 
 
-def test_a_pattern_lies_on_every_face_in_its_size() -> None:
+def test_a_pattern_has_its_size_on_every_face() -> None:
     """Lengths on a face are lengths in its image: the projection is along the faces of a turned box."""
     shape = Shape(name="a", box=Box(size=(0.4, 0.3, 0.2), rotate=(20, 30, 40)), visible=True)
     assert shape.box is not None
@@ -67,7 +67,7 @@ def test_a_pattern_lies_on_every_face_in_its_size() -> None:
         assert a * d - b * c < 0
 
 
-def test_gain_is_of_linear_colours() -> None:
+def test_gain_scales_linear_colours() -> None:
     image = np.arange(256, dtype=np.uint8).reshape(16, 16, 1).repeat(3, axis=2)
     expected = np.rint(255 * encode_srgb(np.minimum(0.5 * decode_srgb(image / 255), 1)))
     np.testing.assert_array_equal(with_gain(image, 0.5), expected)
@@ -75,7 +75,7 @@ def test_gain_is_of_linear_colours() -> None:
 
 
 @pytest.mark.parametrize("distance", [0.5, 4.0])
-def test_a_pixel_shows_the_mean_of_what_it_covers(tmp_path: Path, distance: float) -> None:
+def test_a_pixel_is_the_mean_of_its_footprint(tmp_path: Path, distance: float) -> None:
     """Held against the mean of many rays through each pixel, near and far from a picture of fine squares."""
     ensure_variant()
     cells = np.indices((64, 64)).sum(axis=0) % 2

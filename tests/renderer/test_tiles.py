@@ -76,7 +76,7 @@ def test_processors_on_which_numpy_sorts_slowly_are_known(
     assert sorting.numpy_sorts_slowly.__wrapped__() is slow
 
 
-def test_lists_are_the_same_however_they_are_sorted(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_both_sorts_give_the_same_lists(monkeypatch: pytest.MonkeyPatch) -> None:
     from mitsplat.renderer.splatting import tiles
 
     splats, found = make_splats(3000, 5), []
@@ -89,7 +89,7 @@ def test_lists_are_the_same_however_they_are_sorted(monkeypatch: pytest.MonkeyPa
 
 @pytest.mark.parametrize("preset", ["fast", "balanced", "exact"])
 @pytest.mark.parametrize("lens", [{}, {"distortion": (-0.25, 0.08, 0.002, -0.001, -0.01)}])
-def test_pictures_are_the_same_however_they_are_projected_and_walked(
+def test_projection_and_walk_of_both_devices_give_the_same_images(
     preset: PresetName, lens: dict[str, tuple[float, ...]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """All Gaussians at once and a ray a lane, as on a GPU, or what is seen and four: also near the camera's plane."""

@@ -101,7 +101,7 @@ def compare(scene: Any, depth: int) -> tuple[float, float, float, float]:
 
 @pytest.mark.parametrize("light", ["constant", "point", "area", "envmap"])
 @pytest.mark.parametrize("material", ["diffuse", "roughconductor", "plastic", "principled"])
-def test_materials_look_as_mitsuba_traces_them(material: str, light: str) -> None:
+def test_materials_equal_those_traced_by_mitsuba(material: str, light: str) -> None:
     """The difference of two unbiased pictures has the variance of both: 256 paths a pixel each."""
     ours, theirs, rmse, noise = compare(scene_of(material, light), 2 if material == "diffuse" else 6)
     assert theirs > 0.03
@@ -147,7 +147,7 @@ def stripes(z: float) -> Splats:
     )
 
 
-def test_a_mirror_shows_the_splats_above_it() -> None:
+def test_a_mirror_reflects_the_splats_above_it() -> None:
     ensure_variant()
     shapes = {"mirror": mirror(), "ceiling": make_splats_shape(stripes(1.5))}
     scene = mi.load_dict({"type": "scene", **shapes, "sky": WHITE_SKY})
@@ -159,7 +159,7 @@ def test_a_mirror_shows_the_splats_above_it() -> None:
     assert np.abs(seen.rgb[16, 18] - low).max() < 0.1 and np.abs(seen.rgb[16, 25] - high).max() < 0.1
 
 
-def test_uniform_splats_are_lit_anew_in_a_mirror() -> None:
+def test_uniform_splats_are_relit_in_a_mirror() -> None:
     """Lit by a sky that shines along the plane's own normal only by half: a wall beside hides the other half."""
     ensure_variant()
     below, above = (make_splats_shape(floor(1.0, 0.6, 1.5), instance=i, proxy=None) for i in (0, 1))
@@ -205,7 +205,7 @@ def test_the_camera_sees_emitters_unless_they_are_hidden() -> None:
 
 
 @pytest.mark.parametrize(("material", "dark"), [("diffuse", True), ("roughconductor", True), ("dielectric", False)])
-def test_meshes_cast_shadows_on_what_was_captured_without_them(material: str, dark: bool) -> None:
+def test_meshes_cast_shadows_on_captured_splats(material: str, dark: bool) -> None:
     ensure_variant()
     ball = {"type": "sphere", "center": [0, 0, 0.5], "radius": 0.05, "bsdf": MATERIALS[material]}
     lamp = {"type": "point", "position": [0.5, 0, 1.0], "intensity": 1.0}
@@ -217,7 +217,7 @@ def test_meshes_cast_shadows_on_what_was_captured_without_them(material: str, da
     assert seen.light[2, 2].min() == 1
 
 
-def test_light_goes_by_shape_in_whatever_order_they_come() -> None:
+def test_light_is_the_same_in_any_order_of_shapes() -> None:
     """A proxy without splats says nothing of the light under which an environment was captured."""
     ensure_variant()
     sky = {"type": "constant", "radiance": {"type": "rgb", "value": 0.25}}
@@ -233,7 +233,7 @@ def test_light_goes_by_shape_in_whatever_order_they_come() -> None:
     np.testing.assert_array_equal(first.rgb, last.rgb)
 
 
-def test_shapes_of_one_instance_are_lit_each_by_its_own_capture() -> None:
+def test_shapes_of_one_instance_are_relit_by_their_own_capture_light() -> None:
     ensure_variant()
     sky = {"type": "constant", "radiance": {"type": "rgb", "value": 0.25}}
     moved = [mi.ScalarTransform4f().translate([x, 0, 0]).matrix for x in (-0.2, 0.15)]
@@ -250,7 +250,7 @@ def test_shapes_of_one_instance_are_lit_each_by_its_own_capture() -> None:
         np.testing.assert_array_equal(light[4:28, 19:28], 1)
 
 
-def test_a_thin_lens_is_that_of_our_own_camera() -> None:
+def test_mitsubas_thin_lens_equals_the_camera_plugin() -> None:
     ensure_variant()
     camera = down_camera(fov=40)
     pose = camera.world_from_camera @ np.diag([-1.0, -1, 1, 1])

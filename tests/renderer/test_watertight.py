@@ -83,7 +83,7 @@ def test_cameras_see_the_front_of_solids_in_every_pixel(name: str) -> None:
 
 
 @pytest.mark.parametrize("up", [(0, 1, 0), (1, 0, 0)])
-def test_a_table_is_lit_wherever_it_is_seen_from_above(up: tuple[float, float, float]) -> None:
+def test_every_pixel_of_a_table_seen_from_above_is_lit(up: tuple[float, float, float]) -> None:
     """The pose of bin picking: rays between its two triangles used to meet the underside, where it is dark."""
     ensure_variant()
     camera = Camera.look_at((0, 0, 0.52), (0, 0, 0.02), up=up, width=320, height=240, fov_x=50)
@@ -118,7 +118,7 @@ def test_the_silhouette_of_a_plate_has_no_holes() -> None:
             assert mask.sum() > 100 and mask.all()
 
 
-def test_a_lamp_that_is_a_shape_hides_nothing() -> None:
+def test_the_shape_of_a_lamp_hides_nothing() -> None:
     ensure_variant()
     camera = Camera.look_at((0, 0, 0.52), (0, 0, 0.02), up=(0, 1, 0), width=32, height=24, fov_x=50)
     place = mi.ScalarTransform4f().translate([0, 0, 0.3]).rotate([1, 0, 0], 180).scale(0.02)

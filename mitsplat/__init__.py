@@ -40,7 +40,7 @@ _HOME = {
     "Scene": "scene.scene",
     "SceneSpec": "scene.spec.scene_spec",
     "Splats": "gaussians.splat_cloud",
-    "asset_from_photos": "reconstruct.asset_pipeline",
+    "asset_from_photos": "reconstruct.pipeline.asset_pipeline",
     "bake_asset": "bake.bake",
     "capture_photos": "capture.pipeline.capture_pipeline",
     "fit_capture": "fit.trainer",
@@ -81,7 +81,7 @@ if TYPE_CHECKING:
     from mitsplat.labels.labels import Labels as Labels
     from mitsplat.physics.settle import settle_layout as settle_layout
     from mitsplat.quality import Quality as Quality
-    from mitsplat.reconstruct.asset_pipeline import asset_from_photos as asset_from_photos
+    from mitsplat.reconstruct.pipeline.asset_pipeline import asset_from_photos as asset_from_photos
     from mitsplat.renderer.layers import Layers as Layers
     from mitsplat.renderer.layers import render_splats as render_splats
     from mitsplat.runtime.device import use_device as use_device

@@ -15,7 +15,7 @@ ROOT = Path(__file__).parents[1]
 
 LAYERS = (
     ("cli",),
-    ("report",),
+    ("reconstruct.pipeline", "report"),
     ("audit", "checks", "surroundings", "view"),
     ("dataset", "importing"),
     ("bake", "formats", "reconstruct"),

@@ -35,8 +35,8 @@ from mitsplat.capture.pipeline.capture_pipeline import CaptureSettings
 from mitsplat.fit.trainer import FitSettings
 from mitsplat.geometry.camera import Camera
 from mitsplat.reconstruct.asset_evaluation import iou, show_asset
-from mitsplat.reconstruct.asset_pipeline import AssetJob, asset_from_photos
-from mitsplat.reconstruct.reconstruct import ReconstructSettings
+from mitsplat.reconstruct.pipeline.asset_pipeline import asset_from_photos
+from mitsplat.reconstruct.reconstruct import AssetJob, ReconstructSettings
 from mitsplat.renderer.layers import ensure_variant
 
 WANTED = {

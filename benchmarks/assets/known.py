@@ -36,7 +36,8 @@ from mitsplat.fit.trainer import FitSettings
 from mitsplat.geometry.camera import Camera
 from mitsplat.geometry.mesh_distance import DistanceSurface
 from mitsplat.reconstruct.asset_evaluation import iou
-from mitsplat.reconstruct.asset_pipeline import AssetJob, asset_from_photos
+from mitsplat.reconstruct.pipeline.asset_pipeline import asset_from_photos
+from mitsplat.reconstruct.reconstruct import AssetJob
 from mitsplat.renderer.layers import ensure_variant
 from mitsplat.scene.loading.scene_loading import load_scene
 

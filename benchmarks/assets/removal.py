@@ -32,9 +32,9 @@ from mitsplat.fit.image_metrics import psnr_of
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.camera import Camera
 from mitsplat.reconstruct.asset_evaluation import VERDICT_FILE, show_held_out
-from mitsplat.reconstruct.asset_pipeline import AssetJob
+from mitsplat.reconstruct.pipeline.asset_pipeline import make_asset
+from mitsplat.reconstruct.reconstruct import AssetJob
 from mitsplat.storage.files import write_text
-from mitsplat.surroundings import make_surroundings
 
 WANTED = {"things removed": len(things())}
 _DIFFERENT = 0.08
@@ -92,7 +92,7 @@ def measure(args: argparse.Namespace) -> int:
     spots = picks(capture, truth)
     job = AssetJob(name="room", kind="environment", remove=tuple(spots))
     (args.out / "cleared" / VERDICT_FILE).unlink(missing_ok=True)  # made anew, by what the code is now
-    done = make_surroundings(args.out / "cell" / "capture", args.out / "cell" / "fit", args.out / "cleared", job)
+    done = make_asset(capture, args.out / "cell" / "fit", args.out / "cleared", job)
     for what, text in done.verdict.rows.items():
         print(f"  {what}: {text}", file=sys.stderr)
     record = json.loads((args.out / "cleared" / VERDICT_FILE).read_text())

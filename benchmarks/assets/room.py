@@ -35,10 +35,10 @@ from mitsplat.dataset.write import write_dataset
 from mitsplat.fit.trainer import FitSettings, fit_capture
 from mitsplat.geometry.camera import Camera
 from mitsplat.reconstruct.asset_evaluation import VERDICT_FILE
-from mitsplat.reconstruct.asset_pipeline import AssetJob
+from mitsplat.reconstruct.pipeline.asset_pipeline import asset_from_photos
+from mitsplat.reconstruct.reconstruct import AssetJob
 from mitsplat.renderer.layers import ensure_variant
 from mitsplat.scene.loading.scene_loading import load_scene
-from mitsplat.surroundings import make_photo_surroundings
 
 PARTS = Path(__file__).parents[2] / "scenes" / "assets"
 
@@ -259,7 +259,7 @@ def measure(args: argparse.Namespace) -> int:
     fit_capture(taken.capture, asset / "fit", fit, overwrite=True)
     stage("fit")
     job = AssetJob(name="room", kind="environment")
-    done = make_photo_surroundings(photos, asset, job, capture=capture, fit=fit)
+    done = asset_from_photos(photos, asset, job, capture=capture, fit=fit)
     stage("environment")
     for sentence in done.verdict.misses():
         print(f"  verdict: {sentence}", file=sys.stderr)

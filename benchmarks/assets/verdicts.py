@@ -38,8 +38,8 @@ from mitsplat.errors import InputError
 from mitsplat.fit.trainer import FitSettings
 from mitsplat.geometry.camera import Camera, spiral
 from mitsplat.reconstruct.asset_evaluation import VERDICT_FILE, iou, show_asset
-from mitsplat.reconstruct.asset_pipeline import AssetJob, asset_from_photos
-from mitsplat.reconstruct.reconstruct import ReconstructSettings
+from mitsplat.reconstruct.pipeline.asset_pipeline import asset_from_photos
+from mitsplat.reconstruct.reconstruct import AssetJob, ReconstructSettings
 from mitsplat.reconstruct.surface import SurfaceSettings
 from mitsplat.renderer.layers import ensure_variant
 

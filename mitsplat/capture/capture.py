@@ -11,7 +11,8 @@ import json
 import zipfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
+from functools import cached_property
 from os import PathLike
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -26,6 +27,7 @@ from mitsplat.arrays import BoolArray, Float32Array, Float64Array, Int32Array
 from mitsplat.errors import InputError
 from mitsplat.geometry.camera import Camera, Lens
 from mitsplat.images.colour import decode_srgb, encode_srgb
+from mitsplat.storage.content_hash import ContentHash
 from mitsplat.storage.files import IMAGE_ERRORS, copy_file, resolve_inside, write_file, write_text
 from mitsplat.storage.format_version import FORMAT_VERSIONS
 from mitsplat.storage.yaml_input import load_yaml
@@ -142,6 +144,17 @@ class Photo:
         """Read the possible occlusion of the object by other things, (H, W) in [0, 1]; None without occlusion."""
         return self._read_mask(scale, window)[1]
 
+    @cached_property
+    def image_hash(self) -> str:
+        """SHA-256 of the image file, computed once.
+
+        Raises:
+            InputError: If the file cannot be read.
+        """
+        digest = ContentHash()
+        digest.add_file(self.file)
+        return digest.hexdigest()
+
     def _read_mask(self, scale: float, window: Window | None) -> tuple[Float32Array | None, Float32Array | None]:
         if self.mask is None:
             return None, None
@@ -242,6 +255,25 @@ class Capture:
     def training(self) -> tuple[Photo, ...]:
         """Photos that are not held out."""
         return tuple(photo for index, photo in enumerate(self.photos) if index % HELD_OUT_EVERY)
+
+    @cached_property
+    def content_hash(self) -> str:
+        """SHA-256 of all values and files of the capture, computed once; file names in the folder do not matter.
+
+        Raises:
+            InputError: If a file cannot be read.
+        """
+        digest = ContentHash()
+        digest.add_json([self.units, self.up, self.table, self.scale_error, dict(self.rejected)])
+        for photo in self.photos:
+            camera = asdict(photo.camera) | {"world_from_camera": photo.camera.world_from_camera.tolist()}
+            digest.add_json([photo.name, camera, photo.gain, photo.image_hash, photo.mask is not None])
+            digest.add_array(photo.seen.astype(np.int32))
+            if photo.mask is not None:
+                digest.add_file(photo.mask)
+        digest.add_array(self.points)
+        digest.add_array(self.colours)
+        return digest.hexdigest()
 
     def picked(self, pick: str) -> tuple[Photo, tuple[float, float]]:
         """Return the photo and the pixel of a text PHOTO:X,Y.

@@ -31,7 +31,7 @@ from mitsplat.errors import InputError, PartialResultError
 if TYPE_CHECKING:
     from mitsplat.capture.boards.targets import Board
     from mitsplat.capture.pipeline.capture_pipeline import CaptureSettings
-    from mitsplat.reconstruct.asset_pipeline import AssetResult
+    from mitsplat.reconstruct.pipeline.asset_pipeline import AssetResult
 
 CaptureFolder = Annotated[Path, typer.Argument(metavar="CAPTURE", help="Capture folder; an object needs masks.")]
 Photos = Annotated[
@@ -332,12 +332,12 @@ def mesh(
     4 if a quality threshold is missed.
     """
     from mitsplat.asset import read_mesh
-    from mitsplat.reconstruct.asset_pipeline import AssetJob, make_asset
-    from mitsplat.reconstruct.reconstruct import ImportedMesh, ReconstructSettings
+    from mitsplat.capture.capture import Capture
+    from mitsplat.reconstruct.pipeline.asset_pipeline import make_asset
+    from mitsplat.reconstruct.reconstruct import AssetJob, ImportedMesh, ReconstructSettings
     from mitsplat.reconstruct.registration import invert_transform
     from mitsplat.reconstruct.silhouette_refinement import MeshRefineSettings
     from mitsplat.reconstruct.surface import SurfaceSettings
-    from mitsplat.surroundings import make_surroundings
 
     if take is None and (normalisation is not None or units is not None):
         raise InputError("--normalisation and --units apply to an imported mesh: add --import")
@@ -356,8 +356,7 @@ def mesh(
     )
     select_device(device)
     with stage_bar("steps/s") as progress:
-        make = make_asset if kind == "object" else make_surroundings
-        done = make(capture, splats, out, job, progress=progress)
+        done = make_asset(Capture.load(capture), splats, out, job, progress=progress)
     _print_result(done)
 
 
@@ -398,14 +397,12 @@ def asset(
     threshold is missed.
     """
     from mitsplat.fit.trainer import FitSettings
-    from mitsplat.reconstruct.asset_pipeline import AssetJob, asset_from_photos
-    from mitsplat.reconstruct.reconstruct import ReconstructSettings
+    from mitsplat.reconstruct.pipeline.asset_pipeline import asset_from_photos
+    from mitsplat.reconstruct.reconstruct import AssetJob, ReconstructSettings
     from mitsplat.reconstruct.silhouette_refinement import MeshRefineSettings
     from mitsplat.reconstruct.surface import SurfaceSettings
-    from mitsplat.surroundings import make_photo_surroundings
 
     whole = kind == "environment"
-    make = make_photo_surroundings if whole else asset_from_photos
     job = AssetJob(
         name=name or out.resolve().name,
         class_name=class_name,
@@ -419,7 +416,7 @@ def asset(
     )
     select_device(device)
     with stage_bar("steps/s") as progress:
-        done = make(
+        done = asset_from_photos(
             photos,
             out,
             job,

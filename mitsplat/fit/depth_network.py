@@ -61,7 +61,7 @@ def model_maps(
     network = None
     for done, photo in enumerate(photos, start=1):
         gain = b"" if photo.gain is None else repr(photo.gain).encode()
-        key = ContentHash(weights, photo.file.read_bytes(), gain).hexdigest()[:16]
+        key = ContentHash(weights, photo.image_hash, gain).hexdigest()[:16]
         file = folder / f"{key}_{stored_name(photo.name, '.npy')}"
         if not file.exists():
             network = network or DepthNetwork(open_session(model), model)

@@ -6,7 +6,6 @@ are described in :mod:`mitsplat.fit.fit_folder`.
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -557,14 +556,8 @@ def _input_hash(
     capture: Capture, settings: FitSettings, depths: DepthMaps | None, densification: Densification | None
 ) -> str:
     """Return the SHA-256 of all inputs of a fit."""
-    digest = ContentHash()
+    digest = ContentHash(capture.content_hash)
     digest.add_json([__version__, asdict(settings), type(densification).__name__])
-    for photo in capture.photos:
-        camera = asdict(photo.camera) | {"world_from_camera": photo.camera.world_from_camera.tolist()}
-        digest.add(json.dumps([photo.name, camera, photo.gain]), np.ascontiguousarray(photo.seen).tobytes())
-        for file in (photo.file, photo.mask):
-            digest.add(b"-" if file is None else file.read_bytes())
-    digest.add(capture.points.tobytes(), capture.colours.tobytes())
     if depths is not None:
         digest.add(depths.kind)
         for name, file in sorted(depths.files.items()):

@@ -201,6 +201,11 @@ class Camera:
             cy=self.cy * sy,
         )
 
+    def fitted(self, size: int) -> Camera:
+        """Return the same camera with a longest edge of at most ``size`` px."""
+        scale = min(1.0, size / max(self.width, self.height))
+        return self.resized(max(1, round(self.width * scale)), max(1, round(self.height * scale)))
+
     def transformed(self, matrix: npt.ArrayLike) -> Camera:
         """Return the camera after a similarity transform (4, 4). The near distance is scaled."""
         matrix = np.asarray(matrix, dtype=np.float64)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import mitsuba as mi
 import numpy as np
@@ -235,10 +236,19 @@ def show_asset(splats: Splats, mesh: trimesh.Trimesh | None, cameras: Sequence[C
     return views
 
 
-def sized_photo(photo: Photo, size: int) -> tuple[Camera, Float32Array, Float32Array | None, Float32Array | None]:
-    """Return camera, colours, mask and hidden area of a photo, with a longest edge of at most ``size`` px."""
-    rgb, mask, hidden = photo.read(min(1.0, size / max(photo.camera.width, photo.camera.height)))
-    return photo.camera.resized(rgb.shape[1], rgb.shape[0]), rgb, mask, hidden
+class SizedPhoto(NamedTuple):
+    """Camera, colours (H, W, 3), mask (H, W) or None, and hidden area (H, W) or None of a reduced photo."""
+
+    camera: Camera
+    rgb: Float32Array
+    mask: Float32Array | None
+    hidden: Float32Array | None
+
+
+def sized_photo(photo: Photo, size: int) -> SizedPhoto:
+    """Read a photo with a longest edge of at most ``size`` px."""
+    camera = photo.camera
+    return SizedPhoto(camera.fitted(size), *photo.read(min(1.0, size / max(camera.width, camera.height))))
 
 
 def compute_verdict(

@@ -71,6 +71,39 @@ class ImportedMesh:
 
 
 @dataclass(frozen=True, eq=False)
+class AssetJob:
+    """Description of the asset to make.
+
+    Attributes:
+        name: Name of the asset.
+        class_name: Class for detectors; the name if None.
+        kind: Objects are isolated, get convex pieces and can be dropped; environments stay whole and get an open mesh.
+        settings: Settings of the reconstruction.
+        imported: Mesh that replaces the reconstructed one.
+        remove: Things to remove from an environment, PHOTO:X,Y in pixels of the capture's photos.
+
+    Raises:
+        InputError: If refinement is requested for a mesh that is not reconstructed from masks, or ``remove`` is used
+            with an object or an imported mesh.
+    """
+
+    name: str
+    class_name: str | None = None
+    kind: Literal["object", "environment"] = "object"
+    settings: ReconstructSettings = field(default_factory=ReconstructSettings)
+    imported: ImportedMesh | None = None
+    remove: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.settings.refine is not None and (self.kind != "object" or self.imported is not None):
+            raise InputError("only the mesh of an object that is reconstructed from masks can be refined")
+        if self.remove and self.kind != "environment":
+            raise InputError("things can be removed only from an environment: use --kind environment, or omit --remove")
+        if self.remove and self.imported is not None:
+            raise InputError("things cannot be removed from an imported mesh: omit one of the two")
+
+
+@dataclass(frozen=True, eq=False)
 class Reconstruction:
     """A reconstructed asset and its evaluation.
 
@@ -99,52 +132,45 @@ class Reconstruction:
 
 
 def reconstruct_asset(
-    capture: Capture,
-    splats: Splats,
-    *,
-    name: str,
-    class_name: str | None = None,
-    kind: Literal["object", "environment"] = "object",
-    settings: ReconstructSettings = ReconstructSettings(),
-    imported: ImportedMesh | None = None,
-    psnr: float | None = None,
-    progress: Progress | None = None,
+    capture: Capture, splats: Splats, job: AssetJob, *, psnr: float | None = None, progress: Progress | None = None
 ) -> Reconstruction:
     """Make an asset from splats that were fitted to a capture.
 
     Args:
         capture: Photos with cameras, and for an object with masks.
         splats: Splats in the capture's frame, with or without surroundings.
-        name: Name of the asset.
-        class_name: Class for detectors; the name if None.
-        kind: Objects are isolated and get convex pieces; environments stay whole and get an open mesh.
-        settings: Resolutions and size.
-        imported: Mesh that replaces the reconstructed one.
+        job: Description of the asset.
         psnr: Held-out PSNR of the fit [dB].
         progress: Progress callback.
 
     Raises:
-        InputError: If an object has no masks, a size is given for a capture in metres, refinement is requested for a
-            mesh that was not reconstructed from masks, or masks and splats do not match.
+        InputError: If an object has no masks, a size is given for a capture in metres, or masks and splats do not
+            match.
     """
+    settings, imported = job.settings, job.imported
     if settings.size is not None and capture.units == "metre":
-        raise InputError(f"{name}: the capture is already in metres and must have no size (got {settings.size:g} m)")
-    check_refinable(settings, kind, imported)
-    pictures = [sized_photo(photo, settings.view_size) for photo in capture.training]
-    isolation = None
-    views: Sequence[MaskedView] = [
-        MaskedView(camera, mask, hidden) for camera, _, mask, hidden in pictures if mask is not None
-    ]
-    if kind == "object":
+        raise InputError(
+            f"{job.name}: the capture is already in metres and must have no size (got {settings.size:g} m)"
+        )
+    isolation = causes = None
+    views: list[MaskedView] = []
+    if job.kind == "object":
+        pictures = {photo.name: sized_photo(photo, settings.view_size) for photo in capture.photos}
+        views = [
+            MaskedView(picture.camera, picture.mask, picture.hidden)
+            for picture in (pictures[photo.name] for photo in capture.training)
+            if picture.mask is not None
+        ]
         if len(views) < 3:
             raise InputError(f"an object needs photos with masks from at least 3 sides (got {len(views)})")
+        causes = find_causes(capture, [picture[:3] for picture in pictures.values()])
         isolation = isolate_object(splats, views, progress=progress)
         splats = isolation.splats
-    cameras = [camera for camera, *_ in pictures]
+    cameras = [photo.camera.fitted(settings.view_size) for photo in capture.training]
     alignment = refinement = proxy = None
     if imported is None:
-        floor = 0.0 if kind == "object" and capture.table and _may_stand_on_table(splats) else None
-        if kind == "object":
+        floor = 0.0 if job.kind == "object" and capture.table and _may_stand_on_table(splats) else None
+        if job.kind == "object":
             proxy = find_proxy_surface(splats, views, settings.surface, floor=floor, progress=progress)
             mesh = proxy.mesh
         else:
@@ -158,23 +184,19 @@ def reconstruct_asset(
     if progress is not None:
         progress(0, 1, "evaluating held-out photos")
     held_out = show_held_out(splats, mesh, capture.held_out, settings.verdict_size)
-    causes = None
-    if kind == "object":
-        seen = [sized_photo(photo, settings.view_size)[:3] for photo in capture.photos]
-        causes = find_causes(capture, seen)
     verdict = compute_verdict(
         capture, splats, mesh, held_out, isolation=isolation, psnr=psnr, refinement=refinement, causes=causes
     )
     if proxy is not None:
         verdict = replace(verdict, surface=proxy.source, surface_faults=proxy.faults)
     asset = Asset(
-        name=name,
-        class_name=class_name or name,
+        name=job.name,
+        class_name=job.class_name or job.name,
         splats=splats,
         mesh=mesh,
-        kind=kind,
+        kind=job.kind,
         units=capture.units,
-        capture_light="uniform" if kind == "object" else "scene",
+        capture_light="uniform" if job.kind == "object" else "scene",
     )
     asset_from_capture = np.eye(4)
     if settings.size is not None:
@@ -186,22 +208,12 @@ def reconstruct_asset(
         metres = imported.metres_per_unit / alignment.scale
         asset = replace(asset.scaled(metres), units="metre")
         asset_from_capture = np.diag([metres, metres, metres, 1.0])
-    if kind == "object":
+    if job.kind == "object":
         if progress is not None:
             progress(0, 1, "splitting the mesh into convex pieces")
         asset = replace(asset, pieces=convex_pieces(mesh if asset.mesh is None else asset.mesh))
     verdict = replace(verdict, units=asset.units)
     return Reconstruction(asset, verdict, held_out, isolation, alignment, refinement, asset_from_capture)
-
-
-def check_refinable(settings: ReconstructSettings, kind: str, imported: ImportedMesh | None) -> None:
-    """Check that mesh refinement is possible: only for an object whose mesh is reconstructed from masks.
-
-    Raises:
-        InputError: If refinement is requested for any other mesh.
-    """
-    if settings.refine is not None and (kind != "object" or imported is not None):
-        raise InputError("only the mesh of an object that is reconstructed from masks can be refined")
 
 
 _MAX_SHARE_BELOW = 0.02

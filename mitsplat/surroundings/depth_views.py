@@ -83,8 +83,7 @@ def depth_views(splats: Splats, cameras: Sequence[Camera], size: int = SIZE) -> 
 
 def render_sized(splats: Splats, camera: Camera, size: int) -> tuple[Camera, Layers]:
     """Render splats with a longest edge of at most ``size`` px; return the resized camera and the layers."""
-    scale = min(1.0, size / max(camera.width, camera.height))
-    small = camera.resized(max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
+    small = camera.fitted(size)
     return small, render_splats(splats, small, quality="balanced")
 
 

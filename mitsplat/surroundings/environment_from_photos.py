@@ -6,10 +6,8 @@ The environment is cleaned and level. It has supports, quality figures and an ex
 from __future__ import annotations
 
 import html
-import json
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,19 +15,15 @@ import trimesh
 
 from mitsplat.arrays import BoolArray, Float64Array
 from mitsplat.capture.capture import Capture, Photo
-from mitsplat.capture.pipeline.capture_pipeline import CaptureSettings
-from mitsplat.fit.image_metrics import psnr_of
-from mitsplat.fit.trainer import FitSettings
+from mitsplat.fit.image_metrics import psnr
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.camera import Camera
 from mitsplat.geometry.triangulation import nearest_point_to_lines
 from mitsplat.pages.html import rgb_image
 from mitsplat.progress import Progress
-from mitsplat.reconstruct.asset_evaluation import VERDICT_FILE, HeldOutView, show_held_out, sized_photo
-from mitsplat.reconstruct.asset_pipeline import AssetJob, AssetResult, asset_from_photos, make_asset
-from mitsplat.reconstruct.reconstruct import ImportedMesh, Reconstruction, reconstruct_asset
+from mitsplat.reconstruct.asset_evaluation import HeldOutView, show_asset
+from mitsplat.reconstruct.reconstruct import AssetJob, ImportedMesh, Reconstruction, reconstruct_asset
 from mitsplat.reconstruct.surface import reconstruct_surface
-from mitsplat.storage.files import write_text
 from mitsplat.surroundings.coverage import (
     MIN_PHOTOS,
     Coverage,
@@ -39,7 +33,7 @@ from mitsplat.surroundings.coverage import (
     free_rectangle,
 )
 from mitsplat.surroundings.depth_views import depth_views, surface_points
-from mitsplat.surroundings.floaters import mean_psnr, remove_floaters
+from mitsplat.surroundings.floaters import remove_floaters
 from mitsplat.surroundings.ready_scene import Region, scene_text
 from mitsplat.surroundings.removal import RemovedThing, remove_things
 from mitsplat.surroundings.supports import Support, find_supports, flatten_mesh
@@ -66,39 +60,14 @@ _MIN_REGION = 0.1
 """Least edge of a drop region [m]."""
 
 
-def make_surroundings(
-    capture_folder: Path, fit: Path, out: Path, job: AssetJob, *, progress: Progress | None = None
-) -> AssetResult:
-    """Write an environment and a scene file; see :func:`~mitsplat.reconstruct.asset_pipeline.make_asset`.
-
-    The scene file lies next to the asset's folder and has the same name. A scene file that was edited by hand is not
-    replaced.
-    """
-    before = _recorded_scene(out)
-    return _write_scene(
-        make_asset(capture_folder, fit, out, job, make=reconstruct_surroundings, progress=progress), before
-    )
-
-
-def make_photo_surroundings(
-    photos: Path,
-    out: Path,
+def reconstruct_environment(
+    capture: Capture,
+    splats: Splats,
     job: AssetJob,
     *,
-    capture: CaptureSettings,
-    fit: FitSettings,
+    psnr: float | None = None,
+    source: str | None = None,
     progress: Progress | None = None,
-) -> AssetResult:
-    """Make an environment from photographs; see :func:`mitsplat.reconstruct.asset_pipeline.asset_from_photos`."""
-    before = _recorded_scene(out)
-    done = asset_from_photos(
-        photos, out, job, capture=capture, fit=fit, make=reconstruct_surroundings, progress=progress
-    )
-    return _write_scene(done, before)
-
-
-def reconstruct_surroundings(
-    capture: Capture, splats: Splats, job: AssetJob, psnr: float | None, source: str | None, progress: Progress | None
 ) -> Reconstruction:
     """Make an environment from splats that were fitted to a capture.
 
@@ -107,7 +76,7 @@ def reconstruct_surroundings(
         splats: Splats in the capture's frame.
         job: Description of the asset.
         psnr: Held-out PSNR of the fit [dB].
-        source: Source of the capture's scale and gravity.
+        source: Source of the capture's scale and gravity, a clause.
         progress: Progress callback.
 
     Raises:
@@ -142,10 +111,7 @@ def reconstruct_surroundings(
     if imported is None:
         mesh = _mesh(splats.select(~background), capture.training, job, found, scale, progress)
         imported = ImportedMesh(mesh, np.eye(4))
-    made = reconstruct_asset(
-        capture, splats, name=job.name, class_name=job.class_name, kind="environment", settings=job.settings,
-        imported=imported, psnr=psnr, progress=progress,
-    )  # fmt: skip
+    made = reconstruct_asset(capture, splats, replace(job, imported=imported, remove=()), psnr=psnr, progress=progress)
     # A given size rotates the asset to its mesh. This rotation is undone, because the support is already parallel to
     # the axes.
     factor = float(np.cbrt(np.linalg.det(made.asset_from_capture[:3, :3])))
@@ -189,7 +155,7 @@ def reconstruct_surroundings(
         ]
         if region is not None and made.asset.units == "metre":
             seen = [photo.camera for photo in capture.transformed(larger).photos]
-            record["scene"] = scene_text(job.name, "{folder}", supports, region, seen)
+            record["scene"] = scene_text(job.name, supports, region, seen)
     else:
         findings.append(
             "no level surface was found for things to stand on (one is required): photograph the table from above as "
@@ -201,10 +167,9 @@ def reconstruct_surroundings(
             "or use --scale-from"
         )
     # The PSNR is that of the asset after all changes, not that of the fit.
-    shown = mean_psnr(made.held_out) if made.held_out else psnr
-    if made.held_out and things:
-        shown = _unchanged_psnr(made.held_out, show_held_out(fitted, None, capture.held_out, job.settings.verdict_size))
-    verdict = replace(made.verdict, psnr=shown, rows=rows, findings=tuple(findings))
+    if made.held_out:
+        psnr = _mean_psnr(made.held_out, fitted if things else None)
+    verdict = replace(made.verdict, psnr=psnr, rows=rows, findings=tuple(findings))
     return replace(made, verdict=verdict, sections=tuple(sections), record=record)
 
 
@@ -231,7 +196,7 @@ def _mesh(
     scale: float,
     progress: Progress | None,
 ) -> trimesh.Trimesh:
-    cameras = [sized_photo(photo, job.settings.view_size)[0] for photo in photos]
+    cameras = [photo.camera.fitted(job.settings.view_size) for photo in photos]
     mesh = reconstruct_surface(splats, cameras, settings=job.settings.surface, progress=progress)
     return flatten_mesh(mesh, supports, _FLATTEN_RANGE * scale)
 
@@ -295,14 +260,16 @@ def _removal_text(thing: RemovedThing, factor: float, unit: str) -> str:
     )
 
 
-def _unchanged_psnr(after: Sequence[HeldOutView], before: Sequence[HeldOutView]) -> float:
-    """Return the mean PSNR [dB] of held-out photos at pixels that the removal left unchanged."""
-    errors = []
-    for view, old in zip(after, before, strict=True):
-        same = np.abs(view.render - old.render).max(axis=2) < _MAX_UNCHANGED
+def _mean_psnr(views: Sequence[HeldOutView], fitted: Splats | None) -> float:
+    """Return the mean PSNR of held-out photos [dB], without pixels that differ from ``fitted`` if it is not None."""
+    if fitted is None:
+        return float(np.mean([psnr(view.render, view.photo) for view in views]))
+    found = []
+    for view, before in zip(views, show_asset(fitted, None, [view.camera for view in views]), strict=True):
+        same = np.abs(view.render - before.render).max(axis=2) < _MAX_UNCHANGED
         if same.any():
-            errors.append(psnr_of(float(((view.render - view.photo)[same] ** 2).mean())))
-    return float(np.mean(errors))
+            found.append(psnr(view.render[same], view.photo[same]))
+    return float(np.mean(found))
 
 
 def _findings(
@@ -340,28 +307,3 @@ def _support_map(coverage: Coverage, filled: BoolArray) -> str:
         f'<section aria-labelledby="support"><h2 id="support">Support</h2><p>{html.escape(note)}</p><figure>'
         f'<img alt="support from above" src="{rgb_image(picture, 420)}"></figure></section>'
     )
-
-
-def _scene_file(out: Path) -> Path:
-    return out.resolve().parent / f"{out.resolve().name}.yaml"
-
-
-def _recorded_scene(out: Path) -> str | None:
-    """Return the scene text in the asset's verdict file, or None."""
-    try:
-        scene = json.loads((out / VERDICT_FILE).read_text()).get("scene")
-    except (OSError, ValueError, AttributeError):
-        return None
-    return scene.replace("{folder}", out.resolve().name) if isinstance(scene, str) else None
-
-
-def _write_scene(done: AssetResult, before: str | None) -> AssetResult:
-    """Write the scene file and return the result with its path; keep a scene file that was edited."""
-    text, path = _recorded_scene(done.folder), _scene_file(done.folder)
-    if text is None:
-        return done
-    if path.exists() and path.read_text() not in (text, before):
-        changed = f"{path}: contains another scene and was not replaced; remove it to write a new one"
-        return replace(done, scene=path, warnings=(*done.warnings, changed))
-    write_text(path, text)
-    return replace(done, scene=path)

@@ -16,7 +16,7 @@ from mitsplat.arrays import BoolArray, Int64Array
 from mitsplat.capture.capture import Photo
 from mitsplat.fit.image_metrics import psnr
 from mitsplat.gaussians.splat_cloud import Splats
-from mitsplat.reconstruct.asset_evaluation import HeldOutView, show_held_out
+from mitsplat.reconstruct.asset_evaluation import SizedPhoto, show_asset, sized_photo
 from mitsplat.surroundings.depth_views import DepthView, depth_views
 
 _HAZE_LIMITS = (2.0, 1.0, 0.6, 0.4, 0.3)
@@ -46,7 +46,8 @@ def remove_floaters(splats: Splats, photos: Sequence[Photo], scale: float) -> tu
         photos: Photos of the fit.
         scale: Typical depth of the photos.
     """
-    test_photos = [photos[int(i)] for i in np.unique(np.linspace(0, len(photos) - 1, _TEST_PHOTOS).round())]
+    numbers = np.unique(np.linspace(0, len(photos) - 1, _TEST_PHOTOS).round())
+    test_photos = [sized_photo(photos[int(number)], _SIZE) for number in numbers]
     best, kept = _psnr(splats, test_photos), splats
     for limit in _HAZE_LIMITS:
         tried = splats.select(splats.scales.max(axis=1) <= limit * scale)
@@ -62,13 +63,10 @@ def remove_floaters(splats: Splats, photos: Sequence[Photo], scale: float) -> tu
     return kept.select(~unseen), removed
 
 
-def _psnr(splats: Splats, photos: Sequence[Photo]) -> float:
-    return mean_psnr(show_held_out(splats, None, photos, _SIZE))
-
-
-def mean_psnr(views: Sequence[HeldOutView]) -> float:
-    """Return the mean PSNR of renderings relative to their photos [dB]."""
-    return float(np.mean([psnr(view.render, view.photo) for view in views]))
+def _psnr(splats: Splats, photos: Sequence[SizedPhoto]) -> float:
+    """Return the mean PSNR of the splats in photos [dB]."""
+    views = show_asset(splats, None, [photo.camera for photo in photos])
+    return float(np.mean([psnr(view.render, photo.rgb) for view, photo in zip(views, photos, strict=True)]))
 
 
 def find_unsupported(splats: Splats, views: Sequence[DepthView], near: float) -> tuple[BoolArray, BoolArray]:

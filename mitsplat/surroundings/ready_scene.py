@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 
 from mitsplat.arrays import Float64Array
 from mitsplat.geometry.camera import Camera
+from mitsplat.reconstruct.asset_evaluation import VERDICT_FILE
+from mitsplat.storage.files import write_text
 from mitsplat.surroundings.supports import Support
 
 _MARGIN = 0.05
@@ -19,22 +23,22 @@ _MIN_GAP = 40.0
 _BOX_THICKNESS = 0.04
 """Thickness of the boxes [m]."""
 
+_FOLDER = "{folder}"
+
 Region = tuple[float, float, float, float]
 """Rectangle: least and largest x, least and largest y [m]."""
 
 
 def scene_text(
     name: str,
-    folder: str,
     supports: Sequence[Support],
     free: Region,
     cameras: Sequence[Camera],
 ) -> str:
-    """Return the text of a scene file.
+    """Return the text of a scene file, with ``{folder}`` in place of the name of the asset's folder.
 
     Args:
         name: Name of the environment.
-        folder: Folder of its asset, relative to the scene file.
         supports: Supports in the asset's frame [m]; objects are dropped on the first, whose top is z = 0.
         free: Free rectangle of the first support.
         cameras: Cameras of the photos, in the same frame.
@@ -57,7 +61,7 @@ def scene_text(
         for number, s in enumerate(supports)
     )
     return _SCENE.format(
-        name=name, folder=folder, boxes=boxes, x0=_length(x0), x1=_length(x1), y0=_length(y0), y1=_length(y1),
+        name=name, folder=_FOLDER, boxes=boxes, x0=_length(x0), x1=_length(x1), y0=_length(y0), y1=_length(y1),
         margin=_length(margin), tx=_length(target[0]), ty=_length(target[1]), near=_length(near), far=_length(far),
         low=f"{low:.0f}", high=f"{high:.0f}", start=f"{start:.0f}", end=f"{end:.0f}", fov=f"{min(fov, 120):.0f}",
     )  # fmt: skip
@@ -87,6 +91,31 @@ def _surface_name(number: int) -> str:
 def _length(length: float) -> str:
     """Format a length to a tenth of a millimetre."""
     return f"{round(float(length), 4) + 0.0:g}"
+
+
+def recorded_scene(out: Path) -> str | None:
+    """Return the scene text in the verdict file of an asset's folder, or None."""
+    try:
+        scene = json.loads((out / VERDICT_FILE).read_text()).get("scene")
+    except (OSError, ValueError, AttributeError):
+        return None
+    return scene.replace(_FOLDER, out.resolve().name) if isinstance(scene, str) else None
+
+
+def write_scene(out: Path, earlier: str | None) -> tuple[Path | None, str | None]:
+    """Write the recorded scene of an asset, next to its folder; return the file, and a warning if it was edited.
+
+    Args:
+        out: Folder of the asset.
+        earlier: Scene that an earlier run recorded; a file with another text was edited and is not replaced.
+    """
+    text, path = recorded_scene(out), out.resolve().parent / f"{out.resolve().name}.yaml"
+    if text is None:
+        return None, None
+    if path.exists() and path.read_text() not in (text, earlier):
+        return path, f"{path}: contains another scene and was not replaced; remove it to write a new one"
+    write_text(path, text)
+    return path, None
 
 
 _SCENE = """\

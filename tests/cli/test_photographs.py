@@ -11,7 +11,6 @@ from typing import Any, Literal
 import numpy as np
 import pytest
 
-from mitsplat import surroundings
 from mitsplat.capture.boards.targets import Board
 from mitsplat.capture.capture import Capture
 from mitsplat.capture.pipeline.capture_pipeline import CaptureSettings
@@ -21,9 +20,9 @@ from mitsplat.fit import depth_network as depth_model
 from mitsplat.fit import depth_priors as depth_maps
 from mitsplat.fit.depth_priors import DepthMaps
 from mitsplat.fit.trainer import FitProgress, FitSettings
-from mitsplat.reconstruct import asset_pipeline as pipeline
 from mitsplat.reconstruct.asset_evaluation import Verdict
-from mitsplat.reconstruct.asset_pipeline import AssetResult
+from mitsplat.reconstruct.pipeline import asset_pipeline as pipeline
+from mitsplat.reconstruct.pipeline.asset_pipeline import AssetResult
 from mitsplat.reconstruct.surface import SurfaceSettings
 from tests.cli.typed import Calls, run
 from tests.conftest import box_asset
@@ -124,20 +123,15 @@ def test_capture_passes_every_option_on(monkeypatch: pytest.MonkeyPatch, tmp_pat
         assert calls.args == (Path("photos"), tmp_path, CaptureSettings(**told, **further))
 
 
-@pytest.mark.parametrize(
-    ("kind", "maker"), [("object", (pipeline, "make_asset")), ("environment", (surroundings, "make_surroundings"))]
-)
+@pytest.mark.parametrize("kind", ["object", "environment"])
 def test_mesh_passes_every_option_on(
-    monkeypatch: pytest.MonkeyPatch,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    kind: str,
-    maker: tuple[Any, str],
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str], kind: str
 ) -> None:
     box_asset("nut").mesh.export(tmp_path / "cad.stl")
     (tmp_path / "matrix.txt").write_text("2 0 0 1\n0 2 0 0\n0 0 2 0\n")
     calls = Calls(finished(tmp_path / "nut"))
-    monkeypatch.setattr(*maker, calls)
+    monkeypatch.setattr(pipeline, "make_asset", calls)
+    monkeypatch.setattr(Capture, "load", lambda folder: folder)
     status = run(
         "mesh", "capture", "fit", "-o", tmp_path / "nut", "--name", "m6", "--class", "nut", "--kind", kind,
         "--faces", 500, "--voxels", 64, "--dissent", 1, "--size", 0.1, "--import", tmp_path / "cad.stl",
@@ -157,6 +151,7 @@ def test_a_missed_threshold_has_status_4_and_one_sentence(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(pipeline, "make_asset", Calls(finished(tmp_path, psnr=12.0)))
+    monkeypatch.setattr(Capture, "load", lambda folder: folder)
     assert run("mesh", "capture", "fit", "-o", tmp_path) == 4
     shown = capsys.readouterr()
     assert "held-out photos have a PSNR of only 12.0 dB (at least 24 is required): use even light" in shown.err
@@ -164,22 +159,15 @@ def test_a_missed_threshold_has_status_4_and_one_sentence(
     assert run("mesh", "capture", "fit", "-o", tmp_path, "--units", 0.001) == 2
 
 
-@pytest.mark.parametrize(
-    ("kind", "maker", "masks"),
-    [
-        ("object", (pipeline, "asset_from_photos"), "alpha"),
-        ("environment", (surroundings, "make_photo_surroundings"), "off"),
-    ],
-)
+@pytest.mark.parametrize(("kind", "masks"), [("object", "alpha"), ("environment", "off")])
 def test_asset_passes_every_option_on(
     monkeypatch: pytest.MonkeyPatch,
     tmp_path: Path,
     kind: Literal["object", "environment"],
-    maker: tuple[Any, str],
     masks: Literal["alpha", "off"],
 ) -> None:
     calls = Calls(finished(tmp_path))
-    monkeypatch.setattr(*maker, calls)
+    monkeypatch.setattr(pipeline, "asset_from_photos", calls)
     status = run(
         "asset", "photos", "-o", tmp_path / "mug", "--class", "cup", "--kind", kind, "--size", 0.1,
         "--scale-from", "a.jpg", "b.jpg", 0.5, "--poses", "model", "--masks", "masks", "--gaussians", 70,

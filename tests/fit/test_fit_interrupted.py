@@ -21,7 +21,8 @@ from mitsplat.errors import InputError
 from mitsplat.fit import fit_folder
 from mitsplat.fit import trainer as fit
 from mitsplat.fit.trainer import fit_capture
-from mitsplat.reconstruct.asset_pipeline import AssetJob, AssetResult, asset_from_photos
+from mitsplat.reconstruct.pipeline.asset_pipeline import AssetResult, asset_from_photos
+from mitsplat.reconstruct.reconstruct import AssetJob
 from tests.fit.test_fit import SMALL, photograph
 from tests.reconstruct.test_reconstruct import GOOD
 
@@ -159,10 +160,10 @@ def test_an_asset_with_an_interrupted_fit_resumes_to_the_same_bytes(
     """`asset` has no --overwrite to be told of: settings that changed, an interruption, the same command again."""
     captured = CaptureResult(fits.capture, 20, "a board", 0.5, doubtful={})
     monkeypatch.setattr(
-        "mitsplat.reconstruct.asset_pipeline.capture_photos", lambda photos, out, settings, progress: captured
+        "mitsplat.reconstruct.pipeline.asset_pipeline.capture_photos", lambda photos, out, settings, progress: captured
     )
     monkeypatch.setattr(
-        "mitsplat.reconstruct.asset_pipeline.make_asset",
+        "mitsplat.reconstruct.pipeline.asset_pipeline.make_asset",
         lambda *args, **kwargs: AssetResult(tmp_path, GOOD, kept=False),
     )
 

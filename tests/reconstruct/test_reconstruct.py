@@ -20,9 +20,9 @@ from mitsplat.fit.trainer import FitSettings
 from mitsplat.geometry.camera import Camera
 from mitsplat.geometry.mesh_distance import DistanceSurface
 from mitsplat.reconstruct.asset_evaluation import Verdict
-from mitsplat.reconstruct.asset_pipeline import AssetJob, AssetResult, asset_from_photos, make_asset, read_fit
 from mitsplat.reconstruct.asset_report import _directions
-from mitsplat.reconstruct.reconstruct import ImportedMesh, ReconstructSettings, reconstruct_asset
+from mitsplat.reconstruct.pipeline.asset_pipeline import AssetResult, asset_from_photos, make_asset, read_fit
+from mitsplat.reconstruct.reconstruct import AssetJob, ImportedMesh, ReconstructSettings, reconstruct_asset
 from mitsplat.reconstruct.surface import SurfaceSettings
 from mitsplat.scene.loading.scene_loading import load_scene
 from tests.conftest import KnownObject
@@ -51,7 +51,7 @@ def made(known_object: KnownObject, tmp_path_factory: pytest.TempPathFactory) ->
     capture = replace(known_object.capture, units="unknown", rejected={"blurred.jpg": "it is <blurred>"})
     capture.save(folder / "capture")
     job = AssetJob(name="part", class_name="bracket", settings=SETTINGS)
-    return folder, make_asset(folder / "capture", folder / "fit", folder / "asset", job)
+    return folder, make_asset(Capture.load(folder / "capture"), folder / "fit", folder / "asset", job)
 
 
 def test_mesh_and_splats_have_the_frame_of_the_truth(known_object: KnownObject, made: tuple[Path, AssetResult]) -> None:
@@ -110,25 +110,25 @@ def test_an_asset_is_reused_for_the_same_inputs_only(
     def never(*args: object, **kwargs: object) -> None:
         raise InputError("made anew")
 
-    monkeypatch.setattr("mitsplat.reconstruct.asset_pipeline.reconstruct_asset", never)
-    again = make_asset(folder / "capture", folder / "fit", folder / "asset", job)
+    monkeypatch.setattr("mitsplat.reconstruct.pipeline.asset_pipeline.reconstruct_asset", never)
+    again = make_asset(Capture.load(folder / "capture"), folder / "fit", folder / "asset", job)
     assert again.kept
     assert again.verdict == first.verdict
     others = (replace(job, name="other"), replace(job, settings=replace(SETTINGS, size=0.2)))
     record = (folder / "asset" / "verdict.json").read_bytes()
     for other in others:
         with pytest.raises(InputError, match="made anew"):
-            make_asset(folder / "capture", folder / "fit", folder / "asset", other)
+            make_asset(Capture.load(folder / "capture"), folder / "fit", folder / "asset", other)
         (folder / "asset" / "verdict.json").write_bytes(record)
     mask = next((folder / "capture" / "masks").glob("*.png"))
     content = mask.read_bytes()
     mask.write_bytes(content + b"\0")
     with pytest.raises(InputError, match="made anew"):
-        make_asset(folder / "capture", folder / "fit", folder / "asset", job)
+        make_asset(Capture.load(folder / "capture"), folder / "fit", folder / "asset", job)
     mask.write_bytes(content)
     (folder / "asset" / "verdict.json").write_bytes(record[:50])
     with pytest.raises(InputError, match="made anew"):
-        make_asset(folder / "capture", folder / "fit", folder / "asset", job)
+        make_asset(Capture.load(folder / "capture"), folder / "fit", folder / "asset", job)
     (folder / "asset" / "verdict.json").write_bytes(record)
 
 
@@ -136,7 +136,7 @@ def test_edited_files_are_kept_and_missing_ones_made_again(
     made: tuple[Path, AssetResult], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     folder, _ = made
-    given, out = (folder / "capture", folder / "fit"), tmp_path / "asset"
+    given, out = (Capture.load(folder / "capture"), folder / "fit"), tmp_path / "asset"
     job = AssetJob(name="part", class_name="bracket", settings=SETTINGS)
     shutil.copytree(folder / "asset", out)
     described = out / "asset.yaml"
@@ -174,13 +174,8 @@ def test_a_drawing_determines_the_scale_of_a_capture(known_object: KnownObject) 
     drawing = known_object.mesh.copy()
     drawing.apply_transform(trimesh.transformations.rotation_matrix(2.0, (1, 2, 3)))
     drawing.apply_scale(1000.0)
-    found = reconstruct_asset(
-        capture,
-        known_object.splats.transformed(tenth),
-        name="part",
-        settings=SETTINGS,
-        imported=ImportedMesh(drawing, metres_per_unit=1e-3),
-    )
+    job = AssetJob(name="part", settings=SETTINGS, imported=ImportedMesh(drawing, metres_per_unit=1e-3))
+    found = reconstruct_asset(capture, known_object.splats.transformed(tenth), job)
     assert found.alignment is not None
     assert found.asset.units == found.verdict.units == "metre"
     assert found.asset.mesh is not None
@@ -195,7 +190,7 @@ def test_an_object_is_cut_at_the_table_below_it(known_object: KnownObject, heigh
     lifted = np.eye(4)
     lifted[2, 3] = height
     capture = replace(known_object.capture.transformed(lifted), table=True)
-    found = reconstruct_asset(capture, known_object.splats.transformed(lifted), name="part", settings=SETTINGS)
+    found = reconstruct_asset(capture, known_object.splats.transformed(lifted), AssetJob("part", settings=SETTINGS))
     assert found.asset.mesh is not None
     assert found.asset.mesh.bounds[0, 2] == pytest.approx(lowest, abs=4e-4)
     assert found.asset.mesh.is_volume
@@ -204,13 +199,13 @@ def test_an_object_is_cut_at_the_table_below_it(known_object: KnownObject, heigh
 def test_surroundings_without_masks_get_an_open_mesh(known_object: KnownObject) -> None:
     photos = tuple(replace(photo, mask=None) for photo in known_object.capture.photos)
     capture = replace(known_object.capture, photos=photos)
-    found = reconstruct_asset(capture, known_object.splats, name="cell", kind="environment", settings=SETTINGS)
+    found = reconstruct_asset(capture, known_object.splats, AssetJob("cell", kind="environment", settings=SETTINGS))
     assert found.isolation is None
     assert found.asset.pieces == ()
     assert len(found.asset.splats) == len(known_object.splats)
     assert (found.verdict.mesh_iou, found.verdict.lost) == (None, None)
     with pytest.raises(InputError, match="masks from at least 3 sides"):
-        reconstruct_asset(capture, known_object.splats, name="part", settings=SETTINGS)
+        reconstruct_asset(capture, known_object.splats, AssetJob("part", settings=SETTINGS))
 
 
 @pytest.mark.parametrize(
@@ -235,7 +230,8 @@ def test_each_missed_threshold_is_one_sentence_with_advice(change: dict[str, flo
 
 def test_a_size_is_refused_for_a_capture_in_metres(known_object: KnownObject) -> None:
     with pytest.raises(InputError, match="already in metres and must have no size"):
-        reconstruct_asset(known_object.capture, known_object.splats, name="part", settings=replace(SETTINGS, size=0.2))
+        job = AssetJob("part", settings=replace(SETTINGS, size=0.2))
+        reconstruct_asset(known_object.capture, known_object.splats, job)
 
 
 def test_a_given_size_is_the_longest_edge_in_any_orientation(known_object: KnownObject) -> None:
@@ -245,7 +241,7 @@ def test_a_given_size_is_the_longest_edge_in_any_orientation(known_object: Known
     vertices = np.asarray(known_object.mesh.vertices)
     edges = trimesh.bounds.oriented_bounds_2D(vertices[:, :2])[1]
     settings = replace(SETTINGS, size=float(max(*edges, np.ptp(vertices[:, 2]))))
-    found = reconstruct_asset(capture, known_object.splats.transformed(turn), name="part", settings=settings)
+    found = reconstruct_asset(capture, known_object.splats.transformed(turn), AssetJob("part", settings=settings))
     assert found.asset.mesh is not None
     assert found.asset.mesh.extents.max() == pytest.approx(settings.size, rel=1e-12)
     assert found.asset.units == "metre"
@@ -267,17 +263,17 @@ def test_photos_become_an_asset_through_all_stages(
     def fit_capture(capture: object, out: Path, settings: FitSettings, *, overwrite: bool, progress: object) -> None:
         overwritten.append(overwrite)
 
-    def made_of(capture: Path, fit: Path, out: Path, job: AssetJob, **_: object) -> AssetResult:
-        assert (capture, fit) == (out / "capture", out / "fit")
+    def made_of(found: Capture, fit: Path, out: Path, job: AssetJob, **_: object) -> AssetResult:
+        assert (found, fit) == (capture, out / "fit")
         return AssetResult(out, GOOD, kept=False)
 
     capture = known_object.capture.save(tmp_path / "asset" / "capture")
     captured = CaptureResult(capture, 32, "a board", 0.5, doubtful={"05.png": 0.6})
     monkeypatch.setattr(
-        "mitsplat.reconstruct.asset_pipeline.capture_photos", lambda photos, out, settings, progress: captured
+        "mitsplat.reconstruct.pipeline.asset_pipeline.capture_photos", lambda photos, out, settings, progress: captured
     )
-    monkeypatch.setattr("mitsplat.reconstruct.asset_pipeline.fit_capture", fit_capture)
-    monkeypatch.setattr("mitsplat.reconstruct.asset_pipeline.make_asset", made_of)
+    monkeypatch.setattr("mitsplat.reconstruct.pipeline.asset_pipeline.fit_capture", fit_capture)
+    monkeypatch.setattr("mitsplat.reconstruct.pipeline.asset_pipeline.make_asset", made_of)
     job = AssetJob(name="part")
     for settings in (FitSettings(), FitSettings(), FitSettings(iterations=5)):
         made = asset_from_photos(tmp_path, tmp_path / "asset", job, capture=CaptureSettings(), fit=settings)

@@ -17,7 +17,7 @@ from mitsplat.geometry.camera import Camera
 from mitsplat.reconstruct.asset_evaluation import iou
 from mitsplat.reconstruct.asset_report import write_asset_report
 from mitsplat.reconstruct.fold_repair import edges_through_faces, limit_motion
-from mitsplat.reconstruct.reconstruct import ImportedMesh, reconstruct_asset
+from mitsplat.reconstruct.reconstruct import AssetJob, ImportedMesh, reconstruct_asset
 from mitsplat.reconstruct.segment_splats import MaskedView
 from mitsplat.reconstruct.silhouette_refinement import MeshRefineSettings, Outline, Silhouettes, refine_mesh
 from mitsplat.reconstruct.surface import SurfaceSettings
@@ -189,11 +189,11 @@ def test_assets_record_the_result_of_the_refinement(
     monkeypatch.setattr("mitsplat.reconstruct.reconstruct.convex_pieces", lambda mesh: (mesh.convex_hull,))
     surface = SurfaceSettings(voxels=48, faces=1000)
     settings = replace(SETTINGS, surface=surface, view_size=64, verdict_size=64, refine=replace(QUICK, steps=1))
-    found = reconstruct_asset(known_object.capture, known_object.splats, name="part", settings=settings)
+    found = reconstruct_asset(known_object.capture, known_object.splats, AssetJob("part", settings=settings))
     assert found.refinement is not None
     assert found.verdict.refinement == str(found.refinement)
     page = write_asset_report(tmp_path_factory.mktemp("page"), known_object.capture, found).read_text()
     assert "Refinement of the mesh" in page and str(found.refinement) in page
     for other in ({"kind": "environment"}, {"imported": ImportedMesh(known_object.mesh)}):
         with pytest.raises(InputError, match="reconstructed from masks"):
-            reconstruct_asset(known_object.capture, known_object.splats, name="part", settings=settings, **other)
+            AssetJob("part", settings=settings, **other)

@@ -17,7 +17,7 @@ from mitsplat.dataset.write import write_dataset
 from mitsplat.errors import InputError
 from mitsplat.fit.fit_folder import FitFolder, FitResult
 from mitsplat.fit.training_view import HeldOut
-from mitsplat.reconstruct.asset_pipeline import read_fit
+from mitsplat.reconstruct.pipeline.asset_pipeline import read_fit
 from mitsplat.scene.scene import Scene
 from mitsplat.storage.format_version import FORMAT_VERSION, FORMAT_VERSIONS, check_format_version
 from mitsplat.version import __version__

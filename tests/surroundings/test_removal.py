@@ -20,10 +20,8 @@ from mitsplat.gaussians.spherical_harmonics import SH_C0
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.camera import Camera
 from mitsplat.reconstruct.asset_evaluation import show_asset
-from mitsplat.reconstruct.asset_pipeline import AssetJob
-from mitsplat.reconstruct.reconstruct import ImportedMesh
-from mitsplat.surroundings import environment_from_photos as pipeline
-from mitsplat.surroundings import make_surroundings
+from mitsplat.reconstruct.pipeline import asset_pipeline
+from mitsplat.reconstruct.reconstruct import AssetJob, ImportedMesh
 from mitsplat.surroundings.depth_views import depth_views, surface_points
 from mitsplat.surroundings.removal import remove_things
 from mitsplat.surroundings.supports import find_supports, find_walls
@@ -183,13 +181,13 @@ def test_what_is_not_on_a_surface_is_not_removed(captured: Capture) -> None:
 def test_an_environment_says_what_was_removed(
     captured: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    captured.save(tmp_path / "capture")
+    capture = captured.save(tmp_path / "capture")
     (tmp_path / "fit").mkdir()
     Splats.concatenate([place(), cube()]).save(tmp_path / "fit" / "splats.ply")
     (tmp_path / "fit" / "fit.json").write_text('{"psnr": 31.5}')
     what = pick(12, (*BESIDE, HEIGHT + CUBE))
     job = AssetJob(name="cell", kind="environment", settings=SMALL, remove=(what,))
-    done = make_surroundings(tmp_path / "capture", tmp_path / "fit", tmp_path / "cell", job)
+    done = asset_pipeline.make_asset(capture, tmp_path / "fit", tmp_path / "cell", job)
     size = done.verdict.rows["Removed things"].split(" m around x -0.")[0]
     assert [float(edge) for edge in size.split(" x ")] == pytest.approx([CUBE, CUBE, CUBE], abs=0.015)
     assert what in done.verdict.rows["Removed things"] and "are synthesised" in done.verdict.rows["Removed things"]
@@ -202,11 +200,11 @@ def test_an_environment_says_what_was_removed(
     near = np.linalg.norm(asset.mesh.vertices[:, :2] - BESIDE, axis=1) < 0.08
     level = asset.mesh.vertices[near & (np.abs(asset.mesh.vertices[:, 2]) < 0.5), 2]
     assert len(level) and np.abs(level).max() < 0.01
-    monkeypatch.setattr(pipeline, "reconstruct_surroundings", None)
-    again = make_surroundings(tmp_path / "capture", tmp_path / "fit", tmp_path / "cell", job)
+    monkeypatch.setattr(asset_pipeline, "reconstruct_environment", None)
+    again = asset_pipeline.make_asset(capture, tmp_path / "fit", tmp_path / "cell", job)
     assert again.kept
     with pytest.raises(TypeError, match="not callable"):  # without what was removed it is made anew
-        make_surroundings(tmp_path / "capture", tmp_path / "fit", tmp_path / "cell", replace(job, remove=()))
+        asset_pipeline.make_asset(capture, tmp_path / "fit", tmp_path / "cell", replace(job, remove=()))
 
 
 @pytest.mark.slow

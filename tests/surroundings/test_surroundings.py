@@ -17,14 +17,13 @@ from mitsplat.checks.path_checks import check_scene
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.camera import Camera
 from mitsplat.reconstruct.asset_evaluation import show_asset
-from mitsplat.reconstruct.asset_pipeline import AssetJob, AssetResult
-from mitsplat.reconstruct.reconstruct import ReconstructSettings
+from mitsplat.reconstruct.pipeline.asset_pipeline import AssetResult, make_asset
+from mitsplat.reconstruct.reconstruct import AssetJob, ReconstructSettings
 from mitsplat.reconstruct.surface import SurfaceSettings
 from mitsplat.scene.loading.scene_loading import load_scene
-from mitsplat.surroundings import make_surroundings
 from mitsplat.surroundings.coverage import MIN_PHOTOS, find_coverage, find_holes, free_rectangle
 from mitsplat.surroundings.depth_views import depth_views, surface_points
-from mitsplat.surroundings.environment_from_photos import reconstruct_surroundings
+from mitsplat.surroundings.environment_from_photos import reconstruct_environment
 from mitsplat.surroundings.floaters import find_unsupported, remove_floaters
 from mitsplat.surroundings.supports import find_supports, fit_plane
 
@@ -196,7 +195,7 @@ def made(splats: Splats, captured: Capture, tmp_path_factory: pytest.TempPathFac
     splats.save(folder / "fit" / "splats.ply")
     (folder / "fit" / "fit.json").write_text('{"psnr": 31.5}')
     job = AssetJob(name="cell", kind="environment", settings=SMALL)
-    return folder, make_surroundings(folder / "capture", folder / "fit", folder / "cell", job)
+    return folder, make_asset(Capture.load(folder / "capture"), folder / "fit", folder / "cell", job)
 
 
 def test_the_asset_has_its_table_in_z_0(made: tuple[Path, AssetResult]) -> None:
@@ -222,7 +221,7 @@ def test_up_is_the_tables_where_nothing_says_where_it_is(splats: Splats, capture
     fallen[:3, :3] = np.roll(np.eye(3), 1, axis=0)
     capture = replace(captured.transformed(fallen), up="unknown", units="unknown")
     job = AssetJob(name="cell", kind="environment", settings=SMALL)
-    found = reconstruct_surroundings(capture, splats.transformed(fallen), job, None, None, None)
+    found = reconstruct_environment(capture, splats.transformed(fallen), job)
     assert (found.asset_from_capture @ fallen)[2] == pytest.approx([0, 0, 1, -HEIGHT], abs=2e-3)
     assert "scene" not in found.record
     assert any("the scale is unknown" in sentence for sentence in found.verdict.misses())
@@ -246,10 +245,10 @@ def test_a_changed_scene_is_kept_and_a_lost_one_written_again(made: tuple[Path, 
     folder, _done = made
     text = (folder / "cell.yaml").read_text()
     job = AssetJob(name="cell", kind="environment", settings=SMALL)
-    arguments = folder / "capture", folder / "fit", folder / "cell", job
+    arguments = Capture.load(folder / "capture"), folder / "fit", folder / "cell", job
     (folder / "cell.yaml").unlink()
-    assert make_surroundings(*arguments).kept and (folder / "cell.yaml").read_text() == text
+    assert make_asset(*arguments).kept and (folder / "cell.yaml").read_text() == text
     (folder / "cell.yaml").write_text(text + "seed: 3\n")
-    again = make_surroundings(*arguments)
+    again = make_asset(*arguments)
     assert "was not replaced" in again.warnings[-1] and (folder / "cell.yaml").read_text().endswith("seed: 3\n")
     (folder / "cell.yaml").write_text(text)

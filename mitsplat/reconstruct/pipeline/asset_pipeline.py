@@ -1,4 +1,4 @@
-"""Pipeline from photographs to an asset folder: capture, fit, isolation, mesh and evaluation.
+"""Pipeline from photographs to an asset folder: capture, fit, reconstruction and evaluation.
 
 Each stage is repeated only if its inputs change. The work folders ``capture/`` and ``fit/`` inside the asset folder
 contain the results of those stages, which check their own inputs. The last stage stores a hash of all its inputs in
@@ -10,10 +10,9 @@ from __future__ import annotations
 import itertools
 import json
 import math
-from collections.abc import Callable
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from mitsplat.asset import ASSET_FILE, read_spec
 from mitsplat.capture.capture import Capture
@@ -26,47 +25,12 @@ from mitsplat.pages.html import REPORT_FILE
 from mitsplat.progress import Progress
 from mitsplat.reconstruct.asset_evaluation import VERDICT_FILE, Verdict
 from mitsplat.reconstruct.asset_report import write_asset_report
-from mitsplat.reconstruct.reconstruct import (
-    ImportedMesh,
-    Reconstruction,
-    ReconstructSettings,
-    check_refinable,
-    reconstruct_asset,
-)
+from mitsplat.reconstruct.reconstruct import AssetJob, Reconstruction, reconstruct_asset
 from mitsplat.storage.content_hash import ContentHash, file_hash
 from mitsplat.storage.files import write_text
+from mitsplat.surroundings.environment_from_photos import reconstruct_environment
+from mitsplat.surroundings.ready_scene import recorded_scene, write_scene
 from mitsplat.version import __version__
-
-
-@dataclass(frozen=True, eq=False)
-class AssetJob:
-    """Description of the asset to make.
-
-    Attributes:
-        name: Name of the asset.
-        class_name: Class for detectors; the name if None.
-        kind: Objects are isolated and can be dropped; environments stay whole.
-        settings: Settings of the reconstruction.
-        imported: Mesh that replaces the reconstructed one.
-        remove: Things to remove from an environment, PHOTO:X,Y in pixels of the capture's photos.
-
-    Raises:
-        InputError: If an object's mesh cannot be refined, or ``remove`` is used with an object or an imported mesh.
-    """
-
-    name: str
-    class_name: str | None = None
-    kind: Literal["object", "environment"] = "object"
-    settings: ReconstructSettings = field(default_factory=ReconstructSettings)
-    imported: ImportedMesh | None = None
-    remove: tuple[str, ...] = ()
-
-    def __post_init__(self) -> None:
-        check_refinable(self.settings, self.kind, self.imported)
-        if self.remove and self.kind != "environment":
-            raise InputError("things can be removed only from an environment: use --kind environment, or omit --remove")
-        if self.remove and self.imported is not None:
-            raise InputError("things cannot be removed from an imported mesh: omit one of the two")
 
 
 @dataclass(frozen=True)
@@ -93,25 +57,89 @@ class AssetResult:
         return "; ".join(self.verdict.misses()) or None
 
 
-Maker = Callable[[Capture, Splats, AssetJob, float | None, str | None, Progress | None], Reconstruction]
-"""Function that makes an asset from a capture and splats.
+def asset_from_photos(
+    photos: Path,
+    out: Path,
+    job: AssetJob,
+    *,
+    capture: CaptureSettings | None = None,
+    fit: FitSettings | None = None,
+    progress: Progress | None = None,
+) -> AssetResult:
+    """Make an asset from a folder of photographs; stages with unchanged inputs are not repeated.
 
-Further arguments are the job, the held-out PSNR of the fit [dB], the source of the scale, and a progress callback.
-"""
-
-
-def reconstruct_job(
-    capture: Capture, splats: Splats, job: AssetJob, psnr: float | None, source: str | None, progress: Progress | None
-) -> Reconstruction:
-    """Reconstruct the asset of a job with :func:`~mitsplat.reconstruct.reconstruct.reconstruct_asset`; a :data:`Maker`.
+    Args:
+        photos: Folder of photographs of one object or place.
+        out: Folder of the asset, with the work folders ``capture/`` and ``fit/``.
+        job: Description of the asset.
+        capture: Settings for cameras, scale and masks; defaults if None.
+        fit: Settings of the fit; defaults if None.
+        progress: Progress callback.
 
     Raises:
-        InputError: As in that function.
+        InputError: If the photographs do not suffice.
+        MissingResourceError: If a required program or model is missing.
     """
-    return reconstruct_asset(
-        capture, splats, name=job.name, class_name=job.class_name, kind=job.kind, settings=job.settings,
-        imported=job.imported, psnr=psnr, progress=progress,
-    )  # fmt: skip
+    fit = fit or FitSettings()
+    taken = capture_photos(photos, out / "capture", capture or CaptureSettings(kind=job.kind), progress=progress)
+
+    def fitting(now: FitProgress) -> None:
+        if progress is not None:
+            done = int(now.fraction * fit.iterations)
+            progress(done, fit.iterations, f"fitting: {now.psnr:.1f} dB, {now.gaussians} Gaussians")
+
+    fit_capture(taken.capture, out / "fit", fit, overwrite=True, progress=fitting)
+    done = make_asset(taken.capture, out / "fit", out, job, source=taken.source, progress=progress)
+    return replace(done, warnings=(*taken.warnings, *done.warnings))
+
+
+def make_asset(
+    capture: Capture,
+    fit: Path,
+    out: Path,
+    job: AssetJob,
+    *,
+    source: str | None = None,
+    progress: Progress | None = None,
+) -> AssetResult:
+    """Write the asset of a capture and a fit with its verdict and its report, unless they already exist.
+
+    For an environment, an example scene is written next to the folder of the asset.
+
+    Args:
+        capture: The capture.
+        fit: Folder of ``mitsplat fit``, or a splat file in the capture's frame.
+        out: Folder of the asset.
+        job: Description of the asset.
+        source: Source of the capture's scale and gravity, a clause.
+        progress: Progress callback.
+
+    Raises:
+        InputError: If a file is missing or damaged, or an object has no masks.
+    """
+    splat_file, psnr = read_fit(fit)
+    inputs = _input_hash(capture, splat_file, job)
+    earlier_scene = recorded_scene(out)
+    done = _existing_asset(out, inputs)
+    if done is None:
+        refuse_to_replace(out, splat_file)
+        edited = _edited_backup(out)
+        splats = Splats.load(splat_file)
+        if job.kind == "object":
+            result = reconstruct_asset(capture, splats, job, psnr=psnr, progress=progress)
+        else:
+            result = reconstruct_environment(capture, splats, job, psnr=psnr, source=source, progress=progress)
+        (out / VERDICT_FILE).unlink(missing_ok=True)
+        if edited is not None:
+            (out / ASSET_FILE).replace(edited)
+        result.asset.save(out)
+        write_asset_report(out, capture, result)
+        # Written last, so that an interrupted run does not look finished.
+        _save_verdict(out, result, inputs)
+        warnings = () if edited is None else (f"{ASSET_FILE} had been edited: the edited file is now {edited.name}",)
+        done = AssetResult(out, result.verdict, kept=False, warnings=warnings)
+    scene, warning = write_scene(out, earlier_scene)
+    return replace(done, scene=scene, warnings=done.warnings if warning is None else (*done.warnings, warning))
 
 
 def read_fit(path: Path) -> tuple[Path, float | None]:
@@ -132,89 +160,6 @@ def read_fit(path: Path) -> tuple[Path, float | None]:
     if known is not None and not math.isfinite(known):
         raise InputError(f"{record}: psnr must be finite (got {known})")
     return path / "splats.ply", known
-
-
-def asset_from_photos(
-    photos: Path,
-    out: Path,
-    job: AssetJob,
-    *,
-    capture: CaptureSettings | None = None,
-    fit: FitSettings | None = None,
-    make: Maker = reconstruct_job,
-    progress: Progress | None = None,
-) -> AssetResult:
-    """Make an asset from a folder of photographs; stages with unchanged inputs are not repeated.
-
-    Args:
-        photos: Folder of photographs of one object or place.
-        out: Folder of the asset, with the work folders ``capture/`` and ``fit/``.
-        job: Description of the asset.
-        capture: Settings for cameras, scale and masks; defaults if None.
-        fit: Settings of the fit; defaults if None.
-        make: Function of the last stage.
-        progress: Progress callback.
-
-    Raises:
-        InputError: If the photographs do not suffice.
-        MissingResourceError: If a required program or model is missing.
-    """
-    fit = fit or FitSettings()
-    taken = capture_photos(photos, out / "capture", capture or CaptureSettings(), progress=progress)
-    found = taken.capture
-
-    def fitting(now: FitProgress) -> None:
-        if progress is not None:
-            done = int(now.fraction * fit.iterations)
-            progress(done, fit.iterations, f"fitting: {now.psnr:.1f} dB, {now.gaussians} Gaussians")
-
-    fit_capture(found, out / "fit", fit, overwrite=True, progress=fitting)
-    done = make_asset(out / "capture", out / "fit", out, job, make=make, source=taken.source, progress=progress)
-    return replace(done, warnings=(*taken.warnings, *done.warnings))
-
-
-def make_asset(
-    capture_folder: Path,
-    fit: Path,
-    out: Path,
-    job: AssetJob,
-    *,
-    make: Maker = reconstruct_job,
-    source: str | None = None,
-    progress: Progress | None = None,
-) -> AssetResult:
-    """Write the asset of a capture and a fit with its verdict and its report, unless they already exist.
-
-    Args:
-        capture_folder: Folder of ``mitsplat capture``.
-        fit: Folder of ``mitsplat fit``, or a splat file in the capture's frame.
-        out: Folder of the asset.
-        job: Description of the asset.
-        make: Function that makes the asset.
-        source: Source of the capture's scale and gravity, a clause.
-        progress: Progress callback.
-
-    Raises:
-        InputError: If a file is missing or damaged, or an object has no masks.
-    """
-    capture = Capture.load(capture_folder)
-    splat_file, psnr = read_fit(fit)
-    inputs = _input_hash(capture_folder, capture, splat_file, job)
-    done = _existing_asset(out, inputs)
-    if done is not None:
-        return done
-    refuse_to_replace(out, splat_file)
-    edited = _edited_backup(out)
-    result = make(capture, Splats.load(splat_file), job, psnr, source, progress)
-    (out / VERDICT_FILE).unlink(missing_ok=True)
-    if edited is not None:
-        (out / ASSET_FILE).replace(edited)
-    result.asset.save(out)
-    write_asset_report(out, capture, result)
-    # Written last, so that an interrupted run does not look finished.
-    _save_verdict(out, result, inputs)
-    warnings = () if edited is None else (f"{ASSET_FILE} had been edited: the edited file is now {edited.name}",)
-    return AssetResult(out, result.verdict, kept=False, warnings=warnings)
 
 
 def refuse_to_replace(out: Path, splats: Path) -> None:
@@ -242,6 +187,9 @@ def _edited_backup(out: Path) -> Path | None:
     return next(path for path in names if not path.exists())
 
 
+_REMOVED_FIELDS = ("outside", "unseen", "needles", "floaters")
+
+
 def _save_verdict(out: Path, result: Reconstruction, inputs: str) -> None:
     record: dict[str, Any] = {"inputs": inputs, **asdict(result.verdict), **result.record}
     record[ASSET_FILE] = file_hash(out / ASSET_FILE)
@@ -257,10 +205,7 @@ def _save_verdict(out: Path, result: Reconstruction, inputs: str) -> None:
     write_text(out / VERDICT_FILE, json.dumps(record, indent=1) + "\n")
 
 
-_REMOVED_FIELDS = ("outside", "unseen", "needles", "floaters")
-
-
-def _input_hash(folder: Path, capture: Capture, splats: Path, job: AssetJob) -> str:
+def _input_hash(capture: Capture, splats: Path, job: AssetJob) -> str:
     """Return the hash of all inputs of the asset."""
     imported = None
     if job.imported is not None:
@@ -270,18 +215,10 @@ def _input_hash(folder: Path, capture: Capture, splats: Path, job: AssetJob) -> 
             None if matrix is None else matrix.tolist(),
             job.imported.metres_per_unit,
         ]
-    decisive = [__version__, job.name, job.class_name, job.kind, asdict(job.settings), imported, job.remove]
-    digest = ContentHash()
-    digest.add_json(decisive)
-    for path in (*_capture_files(folder, capture), splats):
-        digest.add_file(path)
+    digest = ContentHash(capture.content_hash)
+    digest.add_json([__version__, job.name, job.class_name, job.kind, asdict(job.settings), imported, job.remove])
+    digest.add_file(splats)
     return digest.hexdigest()
-
-
-def _capture_files(folder: Path, capture: Capture) -> list[Path]:
-    """Return all files of a capture."""
-    pictures = [path for photo in capture.photos for path in (photo.file, photo.mask) if path is not None]
-    return [folder / "capture.json", folder / "points.npz", *pictures]
 
 
 def _existing_asset(out: Path, inputs: str) -> AssetResult | None:

@@ -7,8 +7,8 @@
 PHOTOS is a folder. ``clutter`` are 97 of 12 megapixels, of the scene of ``benchmarks.assets.clutter``: path-traced on
 the device where OUT does not hold them, which takes a GPU. The command runs in a process of its own that starts anew,
 and stages are told by its log; the processor's seconds of COLMAP count when it ends, with its last stage. With
-``--refine`` the last stages run once more for it, which is not in the time. The exit status is 1 if more time is taken
-than is wanted of ``clutter``: of the processor, or by the clock with a GPU.
+``--refine`` ``mitsplat mesh --refine`` runs afterwards, which is not in the time. The exit status is 1 if more time is
+taken than is wanted of ``clutter``: of the processor, or by the clock with a GPU.
 """
 
 from __future__ import annotations
@@ -67,14 +67,14 @@ def processor_seconds(process: int) -> float:
 
 
 def run(log: Path, words: Sequence[str | Path]) -> dict[str, tuple[float, float]]:
-    """Stages of ``mitsplat asset``: seconds by the clock, and of the processor.
+    """Stages of a command of ``mitsplat``: seconds by the clock, and of the processor.
 
     Raises:
         RuntimeError: If it fails; that a threshold is missed is no failure.
     """
     began, used = time.monotonic(), cpu_seconds()
     times: list[tuple[str, float, float]] = [("starting", 0.0, 0.0)]
-    command = [sys.executable, "-c", "from mitsplat.cli import main; main()", "asset", *map(str, words)]
+    command = [sys.executable, "-c", "from mitsplat.cli import main; main()", *map(str, words)]
     with log.open("w") as kept, subprocess.Popen(command, stdout=kept, stderr=subprocess.PIPE, text=True) as child:
         for line in child.stderr or ():
             kept.write(line)
@@ -84,7 +84,7 @@ def run(log: Path, words: Sequence[str | Path]) -> dict[str, tuple[float, float]
             if told is not None and told[1] != times[-1][0]:
                 times.append((told[1], time.monotonic() - began, processor_seconds(child.pid)))
     if child.returncode not in (0, 4):
-        raise RuntimeError(f"mitsplat asset ended with status {child.returncode}; see {log}")
+        raise RuntimeError(f"mitsplat {words[0]} ended with status {child.returncode}; see {log}")
     times.append(("", time.monotonic() - began, cpu_seconds() - used))
     stages: dict[str, tuple[float, float]] = {}
     for (stage, start, spent), (_, end, all_spent) in pairwise(times):
@@ -100,7 +100,6 @@ def main() -> None:
     parser.add_argument("--views", type=int, default=97, help="of the clutter")
     parser.add_argument("--width", type=int, default=4000)
     parser.add_argument("--samples", type=int, default=16)
-    parser.add_argument("--iterations", type=int, default=3000, help="of the fit")
     parser.add_argument("--size", type=float, help="longest edge of the object [m]; known of the clutter")
     parser.add_argument("--refine", action="store_true", help="refine the mesh as well")
     parser.add_argument("--device", default="cpu")
@@ -118,9 +117,8 @@ def measure(args: argparse.Namespace, kind: str) -> int:
     photos, size = take_photos(args) if ours else (Path(args.photos), args.size)
     asset = args.out / f"asset-{kind}"
     shutil.rmtree(asset, ignore_errors=True)
-    words = [photos, "-o", asset, "--device", args.device, "--iterations", str(args.iterations)]
-    words += [] if size is None else ["--size", str(size)]
-    stages = run(args.out / f"{kind}.log", words)
+    words = ["-o", asset, "--device", args.device] + ([] if size is None else ["--size", str(size)])
+    stages = run(args.out / f"{kind}.log", ["asset", photos, *words])
     for stage, (wall, cpu) in stages.items():
         print(f"{stage:45} {wall:8.1f} s {cpu:8.1f} CPU s")
         figure(wall, "s", "stages", stage)
@@ -133,7 +131,7 @@ def measure(args: argparse.Namespace, kind: str) -> int:
         print(f"{name:45} {verdict[name]}")
         figure(float("nan") if verdict[name] is None else verdict[name], "dB" if "psnr" in name else "", name)
     if args.refine:
-        refined = run(args.out / f"{kind}-refined.log", [*words, "--refine"])
+        refined = run(args.out / f"{kind}-refined.log", ["mesh", asset / "capture", asset / "fit", *words, "--refine"])
         iou = json.loads((asset / VERDICT_FILE).read_text())["mesh_iou"]
         seconds = sum(cpu for _, cpu in refined.values())
         print(f"{'refined mesh_iou':45} {iou}, in {seconds:.1f} CPU s")

@@ -82,20 +82,10 @@ Size = Annotated[
         help="Longest edge of the smallest upright box around the object [m]; only for captures without a scale."
     ),
 ]
-Gaussians = Annotated[int, typer.Option(help="Maximum number of Gaussians.")]
-Iterations = Annotated[int, typer.Option(help="Number of optimiser steps; each uses one photo.")]
 Budget = Annotated[
     str | None,
     typer.Option(
         metavar="TIME", help="Time limit of the fit, such as 90s, 10min or 1h; the schedule is shortened to it."
-    ),
-]
-Edge = Annotated[int, typer.Option(help="Longest edge of the training images [px]; objects are cropped first.")]
-Voxels = Annotated[int, typer.Option(help="Grid cells along the longest extent for the mesh reconstruction.")]
-Refine = Annotated[
-    bool,
-    typer.Option(
-        "--refine", help="Refine the mesh with the masks; the result is used only if it improves on validation photos."
     ),
 ]
 
@@ -103,28 +93,17 @@ Refine = Annotated[
 def fit(
     capture: CaptureFolder,
     out: Annotated[Path, typer.Option("--out", "-o", help="Fit folder to write.")],
-    gaussians: Gaussians = 30000,
-    iterations: Iterations = 3000,
+    gaussians: Annotated[int, typer.Option(help="Maximum number of Gaussians.")] = 30000,
+    iterations: Annotated[int, typer.Option(help="Number of optimiser steps; each uses one photo.")] = 3000,
     budget: Budget = None,
     target_psnr: Annotated[
         float | None,
         typer.Option(help="Stop early at this PSNR [dB] on validation photos, which are then excluded from training."),
     ] = None,
-    edge: Edge = 800,
+    edge: Annotated[
+        int, typer.Option(help="Longest edge of the training images [px]; objects are cropped first.")
+    ] = 800,
     sh_degree: ShDegree = 3,
-    masks: Annotated[
-        Literal["alpha", "ignore", "off"],
-        typer.Option(
-            help="alpha: masks supervise alpha; ignore: pixels outside masks have no loss; off: masks are not read."
-        ),
-    ] = "alpha",
-    background: Annotated[
-        Literal["random", "black"], typer.Option(help="Background colour during training.")
-    ] = "random",
-    depth: Annotated[
-        float,
-        typer.Option(help="Weight of the depth loss, on the points of the capture or on depth maps; 0 disables it."),
-    ] = 0.5,
     depths: Annotated[
         Path | None, typer.Option(help="Folder of depth maps, PHOTO.png (16-bit), .npy, .exr or .tiff.")
     ] = None,
@@ -137,9 +116,6 @@ def fit(
     depth_model: Annotated[
         Path | None, typer.Option(help="Depth network that computes the depth maps (.onnx, such as Depth Anything v2).")
     ] = None,
-    exposure: Annotated[
-        bool, typer.Option("--exposure/--no-exposure", help="Estimate a colour correction for each photo.")
-    ] = False,
     device: DeviceName = "cpu",
     seed: Seed = 0,
     overwrite: Annotated[
@@ -161,8 +137,6 @@ def fit(
     mapped = depths is not None or depth_model is not None
     if depth_kind != "inverse" and not mapped:
         raise InputError(f"--depth-kind {depth_kind} requires depth maps: add --depths or --depth-model")
-    if depth == 0 and mapped:
-        raise InputError("--depth 0 disables depth maps: remove --depths or --depth-model, or increase --depth")
     settings = FitSettings(
         gaussians=gaussians,
         iterations=iterations,
@@ -170,10 +144,6 @@ def fit(
         target_psnr=target_psnr,
         size=edge,
         sh_degree=sh_degree,
-        masks=masks,
-        background=background,
-        depth_weight=depth,
-        exposure=exposure,
         seed=seed,
     )
     loaded = Capture.load(capture)
@@ -300,10 +270,7 @@ def mesh(
     class_name: ClassName = None,
     kind: Kind = "object",
     faces: Faces = 10000,
-    voxels: Voxels = 192,
-    dissent: Annotated[
-        int, typer.Option(help="Number of masks, 0 to 3, that may show a point as background without removing it.")
-    ] = 2,
+    voxels: Annotated[int, typer.Option(help="Grid cells along the longest extent for the mesh reconstruction.")] = 192,
     size: Size = None,
     take: Annotated[
         Path | None,
@@ -321,7 +288,13 @@ def mesh(
         ),
     ] = None,
     units: Annotated[float | None, typer.Option(help="Metres per unit of the imported mesh.")] = None,
-    refine: Refine = False,
+    refine: Annotated[
+        bool,
+        typer.Option(
+            "--refine",
+            help="Refine the mesh with the masks; the result is used only if it improves on validation photos.",
+        ),
+    ] = False,
     remove: Remove = None,
     device: DeviceName = "cpu",
 ) -> None:
@@ -345,7 +318,7 @@ def mesh(
     if take is not None:
         matrix = None if normalisation is None else invert_transform(normalisation)
         imported = ImportedMesh(read_mesh(take), matrix, units)
-    surface = SurfaceSettings(voxels=voxels, faces=faces, dissent=dissent)
+    surface = SurfaceSettings(voxels=voxels, faces=faces)
     job = AssetJob(
         name=name or out.resolve().name,
         class_name=class_name,
@@ -375,62 +348,33 @@ def asset(
     pick: Picks = None,
     pick_not: PicksNot = None,
     box: Box = None,
-    gaussians: Annotated[
-        int | None,
-        typer.Option(help="Maximum number of Gaussians; by default 30000 for an object, 60000 for an environment."),
-    ] = None,
-    iterations: Iterations = 3000,
     budget: Budget = None,
-    edge: Edge = 800,
-    faces: Faces = 10000,
-    voxels: Voxels = 192,
-    refine: Refine = False,
     remove: Remove = None,
     device: DeviceName = "cpu",
-    seed: Seed = 0,
 ) -> None:
     """Make an asset from PHOTOS.
 
-    The command runs the stages `capture`, `fit` and `mesh`. An interrupted run continues when the command runs again.
+    The command runs the stages `capture`, `fit` and `mesh`, whose commands have further options. An interrupted run
+    continues when the command runs again.
     The page report.html shows the result. For an environment, level surfaces are detected. A scene file beside the
     asset folder then drops objects on the surface at which the photos are directed. The exit status is 4 if a quality
     threshold is missed.
     """
-    from mitsplat.fit.trainer import FitSettings
-    from mitsplat.reconstruct.pipeline.asset_pipeline import asset_from_photos
+    from mitsplat.reconstruct.pipeline.asset_pipeline import asset_from_photos, default_fit
     from mitsplat.reconstruct.reconstruct import AssetJob, ReconstructSettings
-    from mitsplat.reconstruct.silhouette_refinement import MeshRefineSettings
-    from mitsplat.reconstruct.surface import SurfaceSettings
 
-    whole = kind == "environment"
     job = AssetJob(
         name=name or out.resolve().name,
         class_name=class_name,
         kind=kind,
-        settings=ReconstructSettings(
-            surface=SurfaceSettings(voxels=voxels, faces=faces),
-            size=size,
-            refine=MeshRefineSettings(seed=seed) if refine else None,
-        ),
+        settings=ReconstructSettings(size=size),
         remove=tuple(remove or ()),
     )
+    capture = _capture_settings(kind, frames, scale_from, poses, masks, mask_model, pick, pick_not, box)
+    fit = replace(default_fit(kind), budget=None if budget is None else _parse_duration(budget))
     select_device(device)
     with stage_bar("steps/s") as progress:
-        done = asset_from_photos(
-            photos,
-            out,
-            job,
-            capture=_capture_settings(kind, frames, scale_from, poses, masks, mask_model, pick, pick_not, box),
-            fit=FitSettings(
-                gaussians=gaussians if gaussians is not None else 60_000 if whole else 30_000,
-                iterations=iterations,
-                budget=None if budget is None else _parse_duration(budget),
-                masks="off" if whole else "alpha",
-                size=edge,
-                seed=seed,
-            ),
-            progress=progress,
-        )
+        done = asset_from_photos(photos, out, job, capture=capture, fit=fit, progress=progress)
     _print_result(done)
 
 

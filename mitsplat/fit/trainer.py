@@ -33,7 +33,7 @@ from mitsplat.quality import Quality
 from mitsplat.renderer.differentiation.backward import DepthRendering
 from mitsplat.renderer.differentiation.photometric_loss import photometric_loss
 from mitsplat.renderer.layers import ensure_variant
-from mitsplat.renderer.rays.device_arrays import number, on_device, wrapped
+from mitsplat.renderer.rays.device_arrays import number, on_device
 from mitsplat.runtime.cores import usable_cores
 from mitsplat.runtime.recorded_kernels import recorded
 from mitsplat.storage.content_hash import ContentHash
@@ -55,8 +55,7 @@ class FitSettings:
         crop: True to fit only the area around the object in each photo, with ``size`` for this area; only if masks
             supervise alpha. Held-out photos are compared as a whole.
         sh_degree: Degree of the spherical harmonics, 0 to 3; it increases by one every fifth of the fit.
-        masks: ``alpha``: only masked pixels are fitted, and masks supervise alpha; ``ignore``: pixels outside masks
-            have no loss; ``off``: masks are not read.
+        masks: ``alpha``: only masked pixels are fitted, and masks supervise alpha; ``off``: masks are not read.
         background: Background behind splats and mask: a random colour in every step, or black.
         ssim_share: Weight of D-SSIM relative to L1.
         alpha_weight: Weight of the difference between alpha and mask.
@@ -67,8 +66,6 @@ class FitSettings:
         opacity_weight: Weight of the mean opacity. The MCMC authors use 0.01 in fits ten times as long; in short fits
             it makes surfaces transparent.
         scale_weight: Weight of the mean scale in units of the cameras' extent, as published for MCMC.
-        exposure: True to fit an affine colour correction (3 x 4) per photo. The mean of the corrections stays the
-            identity, because photos alone do not separate the brightness of splats from that of corrections.
         coarse: Share of the fit that uses pictures of half the size.
         refine_every: Steps between removals or relocations of dead Gaussians and additions of new ones.
         rate_means: Initial learning rate of the means in units of the cameras' extent; falls exponentially to a
@@ -77,7 +74,6 @@ class FitSettings:
         rate_scales: Learning rate of the logarithms of the scales.
         rate_opacities: Learning rate of the logits of the opacities.
         rate_sh: Learning rate of the constant SH coefficients; the others have a twentieth.
-        rate_exposure: Initial learning rate of the colour corrections; falls exponentially to a tenth.
         seed: Seed of all random numbers.
     """
 
@@ -88,14 +84,13 @@ class FitSettings:
     size: int = 800
     crop: bool = True
     sh_degree: int = 3
-    masks: Literal["alpha", "ignore", "off"] = "alpha"
+    masks: Literal["alpha", "off"] = "alpha"
     background: Literal["random", "black"] = "random"
     ssim_share: float = 0.2
     alpha_weight: float = 0.1
     depth_weight: float = 0.5
     opacity_weight: float = 0.0
     scale_weight: float = 0.01
-    exposure: bool = False
     coarse: float = 0.25
     refine_every: int = 100
     rate_means: float = 1.6e-4
@@ -103,7 +98,6 @@ class FitSettings:
     rate_scales: float = 5e-3
     rate_opacities: float = 5e-2
     rate_sh: float = 2.5e-3
-    rate_exposure: float = 1e-2
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -117,12 +111,9 @@ class FitSettings:
             raise InputError(f"target_psnr must be finite (got {self.target_psnr})")
         if self.budget is not None and not self.budget > 0:
             raise InputError(f"budget must be > 0 s (got {self.budget})")
-        for name, kinds in (
-            ("masks", ("alpha", "ignore", "off")),
-            ("background", ("random", "black")),
-        ):
+        for name, kinds in (("masks", ("alpha", "off")), ("background", ("random", "black"))):
             if getattr(self, name) not in kinds:
-                raise InputError(f"{name} must be {', '.join(kinds[:-1])} or {kinds[-1]} (got {getattr(self, name)})")
+                raise InputError(f"{name} must be {' or '.join(kinds)} (got {getattr(self, name)})")
         if not 0 <= self.depth_weight < np.inf:
             raise InputError(f"depth_weight must be a number of at least 0 (got {self.depth_weight})")
         for name in ("ssim_share", "coarse"):
@@ -254,7 +245,7 @@ class _Fit:
         validation: tuple[Photo, ...],
         settings: FitSettings,
         maps: Mapping[str, DepthMap],
-        densification: Densification | None,
+        densification: Densification | None = None,
     ) -> None:
         self.settings, self.points = settings, capture.points
         with ThreadPoolExecutor(min(_MAX_READERS, usable_cores())) as threads:
@@ -283,7 +274,6 @@ class _Fit:
         self.densification = densification or Mcmc(
             settings.gaussians, self.model.count, settings.refine_every, settings.seed
         )
-        self.exposure = Adam({"exposure": np.repeat(np.eye(3, 4).reshape(-1, 1), len(self.photos), axis=1)})
         self.steps, self.seconds = 0, 0.0
         self.errors: list[Any] = []
         self.began = time.monotonic()
@@ -308,7 +298,7 @@ class _Fit:
         rng = np.random.default_rng([s.seed, 2, self.steps])
         view = self.photos[number].half if fraction < s.coarse else self.photos[number]
         degree = min(s.sh_degree, int(5 * fraction))
-        error = self._backpropagate(view, number, replace(QUALITY, sh_degree=degree), fraction, rng)
+        error = self._backpropagate(view, replace(QUALITY, sh_degree=degree), fraction, rng)
         self.densification.look(self.model, view.camera)
         rate = s.rate_means * 0.01**fraction
         self.model.update(
@@ -320,9 +310,6 @@ class _Fit:
                 "sh": self.model.sh_rates(s.rate_sh, s.rate_sh / 20),
             }
         )
-        if s.exposure:
-            self.exposure.update({"exposure": s.rate_exposure * 0.1**fraction})
-            self.exposure.values["exposure"] = _centre_exposure(self.exposure.values["exposure"], len(self.photos))
         self.steps += 1
         self.densification.refine(self.model, self.steps, fraction, rate, rng)
         self.errors.append(error)
@@ -333,9 +320,7 @@ class _Fit:
             return 0.0
         return self.settings.depth_weight * (1 if view.inverse_depth is None else _FINAL_MAP_WEIGHT**fraction)
 
-    def _backpropagate(
-        self, view: TrainingView, number: int, quality: Quality, fraction: float, rng: np.random.Generator
-    ) -> Any:
+    def _backpropagate(self, view: TrainingView, quality: Quality, fraction: float, rng: np.random.Generator) -> Any:
         """Set the parameter gradients of the loss of a photo, and return its mean squared error."""
         s = self.settings
         weight = self._depth_weight(view, fraction)
@@ -349,24 +334,13 @@ class _Fit:
             view.camera.height,
             s.ssim_share,
             s.alpha_weight if s.masks == "alpha" and view.masked else None,
-            only_masked=s.masks == "ignore",
             background=s.background == "random",
         )
-        correction = (
-            (self.exposure.values["exposure"], wrapped(mi.UInt32, np.array([number], dtype=np.uint32)))
-            if s.exposure
-            else None
-        )
         depth = (seen.moment, _depth_image(view.camera, pixel, inverse)) if isinstance(seen, DepthRendering) else None
-        gradient, error = _gradients(
-            seen.rgb, seen.alpha, depth, (view.packed, view.hidden), correction, numbers, constants
-        )
+        gradient, error = _gradients(seen.rgb, seen.alpha, depth, (view.packed, view.hidden), numbers, constants)
         records = [seen.gradient(gradient["rgb"], gradient["alpha"])]
         if isinstance(seen, DepthRendering):
             records.append(seen.gradient_of_moment(gradient["moment"]))
-        if s.exposure:
-            self.exposure.track()
-            dr.set_grad(self.exposure.values["exposure"], gradient["exposure"])
         count = self.model.count
         self.model.learn(
             view.eye,
@@ -391,13 +365,7 @@ class _Fit:
     def check(self, photos: Sequence[TrainingView], folder: Path | None) -> tuple[HeldOut, ...]:
         """Evaluate photos that are not fitted, and write a comparison of each to the folder if it is not None."""
         quality = replace(QUALITY, sh_degree=self.settings.sh_degree)
-        found = []
-        for view in photos:
-            seen, _ = view.render(self.model, quality)
-            if self.settings.masks == "ignore":
-                seen = seen * view.mask[..., None]
-            found.append(view.compare(seen, folder))
-        return tuple(found)
+        return tuple(view.compare(view.render(self.model, quality)[0], folder) for view in photos)
 
     def state(self) -> dict[str, Any]:
         """Return everything that determines the rest of the fit after a report, as arrays for :meth:`restore`."""
@@ -419,7 +387,7 @@ class _Fit:
     @property
     def _stateful_parts(self) -> dict[str, Adam | Densification]:
         """Parts with a state that changes in every step, by their names in checkpoints."""
-        return {"model": self.model, "exposure": self.exposure, "densification": self.densification}
+        return {"model": self.model, "densification": self.densification}
 
 
 class _LossConstants(NamedTuple):
@@ -429,7 +397,6 @@ class _LossConstants(NamedTuple):
     height: int
     ssim_share: float
     alpha_weight: float | None
-    only_masked: bool
     background: bool
 
 
@@ -439,7 +406,6 @@ def _gradients(
     alpha: Any,
     depth: tuple[Any, Any] | None,
     photo: tuple[Any, Any | None],
-    correction: tuple[Any, Any] | None,
     numbers: Any,
     constants: _LossConstants,
 ) -> tuple[dict[str, Any], Any]:
@@ -450,28 +416,20 @@ def _gradients(
         alpha: Rendered opacity.
         depth: Depth moment of the rendering, and known inverse depths from :func:`_depth_image`.
         photo: Packed pixels, and a mask of the pixels where the object may be hidden, or None.
-        correction: Table of colour corrections, and the index of the photo in it.
         numbers: Background red, green and blue; weight of depth; inverse number of known depths.
         constants: Constants of the loss.
 
     Returns:
-        Gradients of ``rgb``, ``alpha``, and of ``moment`` and ``exposure`` if they exist; and the error.
+        Gradients of ``rgb``, ``alpha``, and of ``moment`` if it exists; and the error.
     """
     inputs: dict[str, Any] = {"rgb": [mi.Float(c) for c in rgb], "alpha": mi.Float(alpha)}
     if depth is not None:
         inputs["moment"] = mi.Float(depth[0])
-    if correction is not None:
-        inputs["exposure"] = mi.Float(correction[0])
     dr.enable_grad(inputs)
     rgb, alpha, loss = inputs["rgb"], inputs["alpha"], mi.Float(0)
     if depth is not None:
         loss += number(numbers, 3) * number(numbers, 4) * _depth_error(alpha, inputs["moment"], depth[1])
     target, mask = unpacked(photo[0])
-    if correction is not None:
-        table = inputs["exposure"]
-        rgb = _apply_exposure(rgb, alpha, table, correction[1], dr.width(table) // 12)
-    if constants.only_masked:
-        rgb, target, alpha = [c * mask for c in rgb], [c * mask for c in target], alpha * mask
     if constants.background:
         behind = [number(numbers, channel) for channel in range(3)]
         rgb = [c + b * (1 - alpha) for c, b in zip(rgb, behind, strict=True)]
@@ -506,21 +464,6 @@ def _depth_error(alpha: Any, moment: Any, inverse: Any) -> Any:
     seen = known & (cover > 0.1) & (depth > 0)
     found = dr.select(seen, cover / dr.select(seen, depth, 1), wanted)
     return dr.sum(dr.abs(found - wanted))
-
-
-def _apply_exposure(rgb: list[Any], alpha: Any, table: Any, place: Any, photos: int) -> list[Any]:
-    """Apply a photo's affine colour correction to premultiplied colours; ``table`` is a flat (12, photos) array."""
-    m = [dr.gather(mi.Float, table, place + i * photos) for i in range(12)]
-    return [sum(m[4 * i + j] * rgb[j] for j in range(3)) + m[4 * i + 3] * alpha for i in range(3)]
-
-
-def _centre_exposure(table: Any, photos: int) -> Any:
-    """Return the table of corrections, shifted so that their mean is the identity."""
-    entry = dr.arange(mi.UInt32, 12 * photos) // photos
-    mean = dr.block_sum(table, photos) * dr.opaque(mi.Float, 1 / photos)
-    centred = table - dr.gather(mi.Float, mean, entry) + dr.select(entry % 5 == 0, 1, 0)
-    dr.eval(centred)
-    return centred
 
 
 def _usable_photos(photos: tuple[Photo, ...], settings: FitSettings) -> tuple[Photo, ...]:

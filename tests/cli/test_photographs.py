@@ -23,6 +23,7 @@ from mitsplat.fit.trainer import FitProgress, FitSettings
 from mitsplat.reconstruct.asset_evaluation import Verdict
 from mitsplat.reconstruct.pipeline import asset_pipeline as pipeline
 from mitsplat.reconstruct.pipeline.asset_pipeline import AssetResult
+from mitsplat.reconstruct.reconstruct import ReconstructSettings
 from mitsplat.reconstruct.surface import SurfaceSettings
 from tests.cli.typed import Calls, run
 from tests.conftest import box_asset
@@ -31,14 +32,12 @@ from tests.conftest import box_asset
 def test_fit_passes_every_option_on(fit_capture: Calls, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     status = run(
         "fit", "photos", "-o", tmp_path, "--gaussians", 70, "--iterations", 80,
-        "--budget", "1.5min", "--target-psnr", 27, "--edge", 90, "--sh-degree", 2, "--masks", "ignore",
-        "--background", "black", "--depth", 0.7, "--exposure", "--seed", 4, "--overwrite",
+        "--budget", "1.5min", "--target-psnr", 27, "--edge", 90, "--sh-degree", 2, "--seed", 4, "--overwrite",
     )  # fmt: skip
     assert status == 0
     assert fit_capture.args[:2] == (Path("photos"), tmp_path) and fit_capture.kwargs["overwrite"]
     assert fit_capture.args[2] == FitSettings(
-        gaussians=70, iterations=80, budget=90.0, target_psnr=27, size=90, sh_degree=2,
-        masks="ignore", background="black", depth_weight=0.7, exposure=True, seed=4,
+        gaussians=70, iterations=80, budget=90.0, target_psnr=27, size=90, sh_degree=2, seed=4,
     )  # fmt: skip
     assert "(12 Gaussians; 1 held-out photos: 28.00 dB, SSIM 0.900)" in capsys.readouterr().out
     fit_capture.kwargs["progress"](FitProgress(40, 0.5, 24.5, 23.0, 60))
@@ -67,7 +66,6 @@ def test_fit_takes_depth_maps_of_a_folder_or_of_a_network(
     for options, text in (
         (("--depths", "maps", "--depth-model", "a.onnx"), "both define the depth maps: give only one"),
         (("--depth-kind", "metric"), "--depth-kind metric requires depth maps: add --depths or --depth-model"),
-        (("--depths", "maps", "--depth", 0), "--depth 0 disables depth maps"),
     ):
         assert run("fit", "photos", "-o", tmp_path, *options) == 2
         assert text in capsys.readouterr().err
@@ -134,14 +132,14 @@ def test_mesh_passes_every_option_on(
     monkeypatch.setattr(Capture, "load", lambda folder: folder)
     status = run(
         "mesh", "capture", "fit", "-o", tmp_path / "nut", "--name", "m6", "--class", "nut", "--kind", kind,
-        "--faces", 500, "--voxels", 64, "--dissent", 1, "--size", 0.1, "--import", tmp_path / "cad.stl",
+        "--faces", 500, "--voxels", 64, "--size", 0.1, "--import", tmp_path / "cad.stl",
         "--normalisation", tmp_path / "matrix.txt", "--units", 0.001,
     )  # fmt: skip
     assert status == 0
     capture, fit_folder, out, job = calls.args
     assert (capture, fit_folder, out) == (Path("capture"), Path("fit"), tmp_path / "nut")
     assert (job.name, job.class_name, job.kind, job.settings.size) == ("m6", "nut", kind, 0.1)
-    assert job.settings.surface == SurfaceSettings(voxels=64, faces=500, dissent=1)
+    assert job.settings.surface == SurfaceSettings(voxels=64, faces=500)
     assert job.imported.metres_per_unit == 0.001
     np.testing.assert_allclose(job.imported.capture_from_mesh @ [1, 0, 0, 1], [0, 0, 0, 1], atol=1e-12)
     assert "held-out PSNR 27.00 dB; IoU with held-out masks splats 0.970, mesh 0.960" in capsys.readouterr().out
@@ -159,28 +157,24 @@ def test_a_missed_threshold_has_status_4_and_one_sentence(
     assert run("mesh", "capture", "fit", "-o", tmp_path, "--units", 0.001) == 2
 
 
-@pytest.mark.parametrize(("kind", "masks"), [("object", "alpha"), ("environment", "off")])
+@pytest.mark.parametrize(("kind", "gaussians"), [("object", 30_000), ("environment", 60_000)])
 def test_asset_passes_every_option_on(
-    monkeypatch: pytest.MonkeyPatch,
-    tmp_path: Path,
-    kind: Literal["object", "environment"],
-    masks: Literal["alpha", "off"],
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, kind: Literal["object", "environment"], gaussians: int
 ) -> None:
     calls = Calls(finished(tmp_path))
     monkeypatch.setattr(pipeline, "asset_from_photos", calls)
     status = run(
         "asset", "photos", "-o", tmp_path / "mug", "--class", "cup", "--kind", kind, "--size", 0.1,
-        "--scale-from", "a.jpg", "b.jpg", 0.5, "--poses", "model", "--masks", "masks", "--gaussians", 70,
-        "--iterations", 80, "--budget", "1.5min", "--edge", 90, "--faces", 500, "--voxels", 64, "--seed", 4,
+        "--scale-from", "a.jpg", "b.jpg", 0.5, "--poses", "model", "--masks", "masks", "--budget", "1.5min",
     )  # fmt: skip
     assert status == 0
     photos, out, job = calls.args
     assert (photos, out, job.name, job.class_name) == (Path("photos"), tmp_path / "mug", "mug", "cup")
-    assert (job.kind, job.settings.size, job.settings.surface) == (kind, 0.1, SurfaceSettings(voxels=64, faces=500))
+    assert (job.kind, job.settings) == (kind, ReconstructSettings(size=0.1))
     assert calls.kwargs["capture"] == CaptureSettings(
         kind=kind, scale_from=("a.jpg", "b.jpg", 0.5), poses=Path("model"), masks=Path("masks")
     )
-    assert calls.kwargs["fit"] == FitSettings(gaussians=70, iterations=80, budget=90.0, size=90, seed=4, masks=masks)
+    assert calls.kwargs["fit"] == FitSettings(gaussians=gaussians, budget=90.0)
 
 
 def test_a_log_has_stages_and_the_remaining_time(

@@ -49,7 +49,7 @@ SMALLER = {
     "chart": ["-n", "1", "--size", "32x18"],
     "bake": ["--gaussians", "60", "--sh-degree", "0"],
     "capture": ["--frames", "17"],
-    "asset": ["--gaussians", "300", "--iterations", "20", "--edge", "64", "--faces", "300", "--voxels", "48"],
+    "asset": ["--budget", "10s"],
     "fit": ["--gaussians", "200", "--iterations", "20", "--edge", "64"],
     "mesh": ["--faces", "300", "--voxels", "48"],
     "import": ["--faces", "300", "--voxels", "48"],

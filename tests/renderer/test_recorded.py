@@ -86,11 +86,11 @@ def test_recorded_gradients_equal_traced_ones(distortion: tuple[float, ...], mon
 
 @pytest.mark.cpu(reason="what GPUs round otherwise grows over the steps of a fit")
 def test_a_fit_with_recordings_has_the_bytes_of_a_traced_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """With all that changes its kernels: sizes, degrees, depths, numbers of Gaussians and colour corrections."""
+    """With all that changes its kernels: sizes, degrees, depths and numbers of Gaussians."""
     ensure_variant()
     (tmp_path / "photos").mkdir()
     capture = seeing(photograph(tmp_path / "photos"))
-    settings = replace(SMALL, sh_degree=2, coarse=0.3, exposure=True, iterations=50)
+    settings = replace(SMALL, sh_degree=2, coarse=0.3, iterations=50)
     monkeypatch.setattr(recorded, "REPLAY", True)
     replayed = fit_capture(capture, tmp_path / "replayed", settings)
     monkeypatch.setattr(recorded, "REPLAY", False)

@@ -12,7 +12,7 @@ import json
 import math
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from mitsplat.asset import ASSET_FILE, read_spec
 from mitsplat.capture.capture import Capture
@@ -73,14 +73,14 @@ def asset_from_photos(
         out: Folder of the asset, with the work folders ``capture/`` and ``fit/``.
         job: Description of the asset.
         capture: Settings for cameras, scale and masks; defaults if None.
-        fit: Settings of the fit; defaults if None.
+        fit: Settings of the fit; :func:`default_fit` if None.
         progress: Progress callback.
 
     Raises:
         InputError: If the photographs do not suffice.
         MissingResourceError: If a required program or model is missing.
     """
-    fit = fit or FitSettings()
+    fit = fit or default_fit(job.kind)
     taken = capture_photos(photos, out / "capture", capture or CaptureSettings(kind=job.kind), progress=progress)
 
     def fitting(now: FitProgress) -> None:
@@ -91,6 +91,11 @@ def asset_from_photos(
     fit_capture(taken.capture, out / "fit", fit, overwrite=True, progress=fitting)
     done = make_asset(taken.capture, out / "fit", out, job, source=taken.source, progress=progress)
     return replace(done, warnings=(*taken.warnings, *done.warnings))
+
+
+def default_fit(kind: Literal["object", "environment"]) -> FitSettings:
+    """Return the settings of the fit of an object or an environment; an environment has twice as many Gaussians."""
+    return FitSettings() if kind == "object" else FitSettings(gaussians=60_000)
 
 
 def make_asset(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from itertools import pairwise
+from types import SimpleNamespace
 from typing import Any
 
 import drjit as dr
@@ -168,7 +169,7 @@ def test_the_error_of_one_swapped_pair_is_estimated_exactly() -> None:
     colours, opacities = ((0.9, 0.2, 0.1), (0.3, 0.6, 0.4)), (0.6, 0.5)
     pixel = _fresh(False, "estimated")
     for colour, opacity, z in zip(colours, opacities, (2.0, 1.0), strict=True):
-        record = {6: colour[0], 7: colour[1], 8: colour[2]}
+        record = SimpleNamespace(colour=colour)
         pixel = _blend(pixel, mi.Float(opacity), record, mi.Float(z), False, "estimated")
     assert np.array(pixel[ERROR]).item() == pytest.approx(0.6 * 0.5 * 0.6)
 
@@ -181,7 +182,7 @@ def test_the_colour_of_one_swapped_pair_is_corrected_exactly() -> None:
     met = [((0.9, 0.2, 0.1), 0.6, 2.0), ((0.3, 0.6, 0.4), 0.5, 1.0), ((0.1, 0.8, 0.5), 0.7, 3.0)]
     pixel = _fresh(False, "corrected")
     for colour, opacity, z in met:
-        record = {6: colour[0], 7: colour[1], 8: colour[2]}
+        record = SimpleNamespace(colour=colour)
         pixel = _blend(pixel, mi.Float(opacity), record, mi.Float(z), False, "corrected")
     expected, transmittance = np.zeros(3), 1.0
     for colour, opacity, _ in sorted(met, key=lambda peak: peak[2]):
@@ -264,6 +265,7 @@ TURNING = [turned(0.02 * step) for step in range(6)]
 def test_tiles_sort_by_the_depth_at_the_visible_footprint() -> None:
     """Around the mean of the product of two normal distributions: the footprint's, and that of the tile's pixels."""
     ensure_variant()
+    from mitsplat.renderer.splatting.records import GaussianRecord
     from mitsplat.renderer.splatting.tile_depths import depth_where_seen
 
     box, centre, depth = (0.10, 0.14, -0.02, 0.01), np.array([0.125, -0.012]), 2.0
@@ -276,7 +278,7 @@ def test_tiles_sort_by_the_depth_at_the_visible_footprint() -> None:
         mean = np.linalg.solve(inverse + np.linalg.inv(spread), inverse @ centre + np.linalg.inv(spread) @ middle)
         du, dv = mean - centre
         record = [*centre, scaled[0, 0], 2 * scaled[0, 1], scaled[1, 1], 0, 0, 0, 0, depth, *tilt, 0, 0, 0, 0]
-        found = depth_where_seen([mi.Float(value) for value in record], tuple(mi.Float(side) for side in box))
+        found = depth_where_seen(GaussianRecord(*map(mi.Float, record)), tuple(mi.Float(side) for side in box))
         expected = depth * (1 + (tilt @ (du, dv)) / 2) / (1 + tilt @ (du, dv))
         assert np.array(found).item() == pytest.approx(expected, rel=1e-5)
         assert abs(expected - depth) > 1e-4

@@ -21,9 +21,10 @@ import numpy as np
 
 from mitsplat.quality import KERNELS, Quality
 from mitsplat.renderer.rays.camera_rays import TILE_WIDTH, CameraView
-from mitsplat.renderer.splatting.gaussian import RECORD, SCALE_RATIO_MIN, Cloud
+from mitsplat.renderer.splatting.gaussian import SCALE_RATIO_MIN, Cloud
 from mitsplat.renderer.splatting.march import march
 from mitsplat.renderer.splatting.projection import CloudSet, Placement, Projector, placement_table
+from mitsplat.renderer.splatting.records import RECORD, GaussianRecord, Geometry
 from mitsplat.renderer.splatting.tiles import TileLists, bin_gaussians, bin_records
 from mitsplat.renderer.splatting.walk import Lanes, max_of
 from mitsplat.runtime.recorded_kernels import Table, recorded
@@ -64,7 +65,7 @@ def _with_depth_as_red(records: Any) -> Any:
     return with_depth
 
 
-_RED, _DEPTH = 6, 9
+_RED, _DEPTH = GaussianRecord.place("red"), GaussianRecord.place("depth")
 """Indices in a view record."""
 
 
@@ -137,7 +138,7 @@ def gather_gradients(
     leaf_cloud = replace(cloud, geometry=leaves[0], scales=leaves[1], sh=leaves[2])
     records, _, _, visible = project_cloud(leaf_cloud, kind, numbers, quality)
     _propagate(records, found)
-    for values, leaf, width in zip(packed, leaves, (8, 4, cloud.sh_stride), strict=True):
+    for values, leaf, width in zip(packed, leaves, (Geometry.WIDTH, 4, cloud.sh_stride), strict=True):
         own = dr.gather(mi.Bool, visible, dr.arange(mi.UInt32, width * cloud.count) // width)
         _propagate(values, dr.select(own, dr.grad(leaf), 0))
 
@@ -275,7 +276,7 @@ def pack_cloud(means: Any, quats: Any, scales: Any, opacities: Any, sh: Any, ban
     quat = dr.normalize(mi.Vector4f(*dr.gather(mi.Array4f, quats, i, mode=own)))
     sigma = dr.maximum(sigma, SCALE_RATIO_MIN * dr.max(dr.detach(sigma)))
     stride = -(-3 * bands // 4) * 4
-    geometry, padded = dr.zeros(mi.Float, 8 * count), dr.zeros(mi.Float, 4 * count)
+    geometry, padded = dr.zeros(mi.Float, Geometry.WIDTH * count), dr.zeros(mi.Float, 4 * count)
     dr.scatter(geometry, mi.ArrayXf([*mean, opacities, *quat]), i)
     dr.scatter(padded, mi.Array4f(sigma.x, sigma.y, sigma.z, 0), i)
     coefficients = sh
@@ -394,8 +395,7 @@ def _gradient(
     ]
 
     def body(i: Any, light: list[Any], rest: list[Any]) -> tuple[Any, list[Any], list[Any]]:
-        number = dr.gather(mi.UInt32, lists.entries, i)
-        record = dr.gather(mi.ArrayXf, lists.records, number, shape=(RECORD, dr.width(i)))
+        record = GaussianRecord.fetch(lists.records, dr.gather(mi.UInt32, lists.entries, i))
         u0, v0, a, b2, c, log_opacity, red, green, blue, depth, e, f, g, h, k, _ = record
         sums = [mi.Float(0) for _ in range(RECORD)]
         new_light, new_rest = [], []
@@ -416,9 +416,24 @@ def _gradient(
             d_top, d_bottom = -d_log * inverse, d_log * q * inverse
             d_du = d_top * (2 * a * du + b2 * dv) + d_bottom * (e + 2 * g * du + h * dv)
             d_dv = d_top * (2 * c * dv + b2 * du) + d_bottom * (f + 2 * k * dv + h * du)
-            parts = [-d_du, -d_dv, d_top * du * du, d_top * du * dv, d_top * dv * dv, d_log]
-            parts += [weight * d for d in ds]
-            parts += [0, d_bottom * du, d_bottom * dv, d_bottom * du * du, d_bottom * du * dv, d_bottom * dv * dv, 0]
+            parts = GaussianRecord(
+                u0=-d_du,
+                v0=-d_dv,
+                a=d_top * du * du,
+                b2=d_top * du * dv,
+                c=d_top * dv * dv,
+                log_opacity=d_log,
+                red=weight * ds[0],
+                green=weight * ds[1],
+                blue=weight * ds[2],
+                depth=0,
+                e=d_bottom * du,
+                f=d_bottom * dv,
+                g=d_bottom * du * du,
+                h=d_bottom * du * dv,
+                i=d_bottom * dv * dv,
+                instance=0,
+            )
             sums = [total + part for total, part in zip(sums, parts, strict=True)]
             new_light.append(t - weight)
             new_rest.append(r)

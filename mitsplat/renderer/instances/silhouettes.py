@@ -24,9 +24,9 @@ from mitsplat.images.masks import Silhouette
 from mitsplat.quality import Quality
 from mitsplat.renderer.rays.camera_rays import TILE_HEIGHT, TILE_WIDTH, CameraView
 from mitsplat.renderer.rays.device_arrays import plain_mesh, ray_scene, wrapped
-from mitsplat.renderer.splatting.gaussian import RECORD
 from mitsplat.renderer.splatting.pairs import CrowdedError
 from mitsplat.renderer.splatting.projection import CloudSet, Placement
+from mitsplat.renderer.splatting.records import GaussianRecord
 from mitsplat.renderer.splatting.tile_depths import DEPTH_BITS
 from mitsplat.renderer.splatting.tiles import TileLists, bin_gaussians
 from mitsplat.renderer.splatting.walk import exp2, max_of, min_log_opacity, respond_along
@@ -206,9 +206,7 @@ def _covered(lists: TileLists, view: CameraView, quality: Quality, runs: _Runs) 
     cut, near, shared_column = min_log_opacity(quality), view.near_plane, not view.distortion
 
     def body(i: Any, through: list[Any]) -> tuple[Any, list[Any]]:
-        record = dr.gather(
-            mi.ArrayXf, lists.records, dr.gather(mi.UInt32, lists.entries, i), shape=(RECORD, dr.width(i))
-        )
+        record = GaussianRecord.fetch(lists.records, dr.gather(mi.UInt32, lists.entries, i))
         responses = respond_along(record, lists, us, vs, shared_column, cap=None)
         return i + 1, [
             dr.select((log_alpha > cut) & (z > near), t * (1 - exp2(log_alpha)), t)

@@ -46,6 +46,14 @@ UNTRACED = 0xFFFFFFFF
 """Place of a pixel without traced light."""
 
 
+class _Traits:
+    """Columns of the packed data of a pixel by which the filter compares neighbours."""
+
+    POSITION, NORMAL = slice(0, 3), slice(3, 6)
+    TRAIT, KNOWN, RAYS, SHARE, VARIANCE = range(6, 11)
+    WIDTH = 12
+
+
 @dataclass(frozen=True, eq=False)
 class Estimate:
     """Sums over the shadow rays of every point.
@@ -197,7 +205,7 @@ class LightFilter:
         """
         here = self.here
         known = dr.select(here.known, mi.Float(1), 0)
-        traits = packed([*here.position, *here.normal, here.trait, known, rays, *(share or (0, 0))])
+        traits = packed([*here.position, *here.normal, here.trait, known, rays, *(share or (0, 0))])  # see _Traits
         alike = mi.Float(1)
         for direction in ((1, 0), (0, 1)):
             values, along = self._average_along(values, traits, direction, radius, share)
@@ -216,7 +224,9 @@ class LightFilter:
         x, y = mi.Int32(self.index % view.width), mi.Int32(self.index // view.width)
         along_x, along_y = (dr.opaque(mi.Int32, step) * self.stride for step in direction)
         images = packed(values)
-        own_rays = dr.gather(mi.ArrayXf, traits, dr.arange(mi.UInt32, width), shape=(_TRAITS, width))[8]
+        own_rays = dr.gather(mi.ArrayXf, traits, dr.arange(mi.UInt32, width), shape=(_Traits.WIDTH, width))[
+            _Traits.RAYS
+        ]
         last = dr.opaque(mi.UInt32, radius)
 
         def add(step: Any, weights: Any, squares: Any, *sums: Any) -> tuple[Any, ...]:
@@ -226,14 +236,15 @@ class LightFilter:
             inside = (nx >= 0) & (nx < view.width) & (ny >= 0) & (ny < view.height)
             place = dr.gather(mi.UInt32, self.shown, mi.UInt32(ny * view.width + nx), inside)
             same = inside & (place != UNTRACED)
-            other = dr.gather(mi.ArrayXf, traits, place, same, shape=(_TRAITS, width))
-            position, normal = mi.Point3f(*other[:3]), mi.Vector3f(*other[3:6])
-            trait, known, rays = other[6], other[7] > 0, other[8]
+            other = dr.gather(mi.ArrayXf, traits, place, same, shape=(_Traits.WIDTH, width))
+            position, normal = mi.Point3f(*other[_Traits.POSITION]), mi.Vector3f(*other[_Traits.NORMAL])
+            trait, known, rays = other[_Traits.TRAIT], other[_Traits.KNOWN] > 0, other[_Traits.RAYS]
             same &= trait == here.trait
             plane = dr.abs(dr.dot(here.normal, position - here.position))
             near = (dr.dot(here.normal, normal) > 0.95) & (plane < here.offset * mi.Float(8 * distance))
             if share is not None:
-                near &= dr.square(other[9] - share[0]) <= NOISE_LIMIT * (share[1] + other[10])
+                difference, variance = other[_Traits.SHARE] - share[0], share[1] + other[_Traits.VARIANCE]
+                near &= dr.square(difference) <= NOISE_LIMIT * variance
             same &= (near & (known == here.known)) | (known & ~here.known)
             # With half weights at the ends, the filter spans exactly one period of the dither.
             weight = dr.select(known, 1.0, GUESS_WEIGHT) * dr.select(distance == last, mi.Float(0.5), 1.0)
@@ -268,9 +279,6 @@ def _metered(light: Any, area: Any, pixels: int) -> Any:
     mean = mi.Float(looks) / dr.opaque(mi.Float, pixels * _STEPS)
     exposure = MID_GREY * dr.power(dr.maximum(mean, 1e-6), -1 / DISPLAY)
     return dr.clip(exposure, DIMMEST, BRIGHTEST)
-
-
-_TRAITS = 12
 
 
 def _padded(count: int) -> int:

@@ -15,7 +15,12 @@ import numpy as np
 
 from mitsplat.renderer.rays.device_arrays import wrapped
 
-_COLUMNS = 16
+
+class _Columns:
+    """Columns of a rectangle: corner [m], two edges [m], normal times area [m^2], and radiance."""
+
+    CORNER, ACROSS, UP, NORMAL, RADIANCE = (slice(start, start + 3) for start in range(0, 15, 3))
+    WIDTH = 16
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,7 +28,7 @@ class Rectangles:
     """Rectangular emitters, indexed like the emitters of the scene.
 
     Attributes:
-        rows: Corner [m], two edges [m], normal times area [m^2], and radiance of each, packed.
+        rows: One row of ``_Columns`` per emitter.
     """
 
     rows: Any
@@ -31,7 +36,7 @@ class Rectangles:
     @classmethod
     def of(cls, emitters: Sequence[Any], sky: int | None) -> Rectangles | None:
         """Collect all emitters except the sky; return None if one of them is not a rectangle of uniform radiance."""
-        rows = np.zeros((len(emitters), _COLUMNS), np.float32)
+        rows = np.zeros((len(emitters), _Columns.WIDTH), np.float32)
         for i, emitter in enumerate(emitters):
             if i == sky:
                 continue
@@ -46,16 +51,18 @@ class Rectangles:
             normal = np.linalg.inv(pose[:3, :3])[2]
             normal *= np.linalg.norm(np.cross(across, up)) / np.linalg.norm(normal)
             normal *= -1 if shape.has_flipped_normals() else 1
-            rows[i, :12] = np.concatenate([middle - (across + up) / 2, across, up, normal])
-            rows[i, 12:15] = np.array(light["radiance.value"]).ravel()
+            rows[i, _Columns.CORNER] = middle - (across + up) / 2
+            rows[i, _Columns.ACROSS], rows[i, _Columns.UP], rows[i, _Columns.NORMAL] = across, up, normal
+            rows[i, _Columns.RADIANCE] = np.array(light["radiance.value"]).ravel()
         return cls(wrapped(mi.Float, rows))
 
     def towards(self, place: Any, index: Any, point: Any) -> tuple[Any, Any, Any]:
         """Return unit vectors and distances [m] to points of rectangles, and radiance over sampling density."""
-        row = dr.gather(mi.ArrayXf, self.rows, index, shape=(_COLUMNS, dr.width(index)))
-        corner, across, up, normal = (mi.Vector3f(*row[3 * k : 3 * k + 3]) for k in range(4))
+        row = dr.gather(mi.ArrayXf, self.rows, index, shape=(_Columns.WIDTH, dr.width(index)))
+        columns = _Columns.CORNER, _Columns.ACROSS, _Columns.UP, _Columns.NORMAL
+        corner, across, up, normal = (mi.Vector3f(*row[column]) for column in columns)
         way = corner + across * point.x + up * point.y - mi.Vector3f(place)
         inverse = dr.rsqrt(dr.squared_norm(way))
         direction = way * inverse
         seen = dr.maximum(-dr.dot(direction, normal), 0) * dr.square(inverse)
-        return direction, dr.rcp(inverse), mi.Color3f(*row[12:15]) * seen
+        return direction, dr.rcp(inverse), mi.Color3f(*row[_Columns.RADIANCE]) * seen

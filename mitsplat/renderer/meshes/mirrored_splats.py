@@ -18,13 +18,18 @@ from mitsplat.renderer.occluders.splat_occlusion import SETS, Caster, Solids
 from mitsplat.renderer.rays.device_arrays import wrapped
 from mitsplat.renderer.splatting.gaussian import evaluate_sh, rotation_axes
 from mitsplat.renderer.splatting.projection import CloudSet, Placement
-from mitsplat.renderer.splatting.splat_appearance import ROW, appearance_rows, apply_appearance
+from mitsplat.renderer.splatting.records import AppearanceRow, Geometry
+from mitsplat.renderer.splatting.splat_appearance import appearance_rows, apply_appearance
 
 MOST_SOLIDS = 1_000_000
 """Approximate limit of the solids in all sets. Larger scenes have fewer sets, but at least two."""
 
-_ROW = 16
-"""Floats per placement: rotation into the splats' frame (9), relit flag, footprint [m], padding."""
+
+class _MirrorRow:
+    """Columns of a placement: rotation into the splats' frame row by row, relit flag, and footprint [m]."""
+
+    ROTATION, RELIT, FOOTPRINT = slice(0, 9), 9, 10
+    WIDTH = 16
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,9 +59,9 @@ class SplatMirror:
         solids: Stochastic solids that rays hit.
         clouds: Colours of the splats.
         gaussians: Placement and Gaussian number in the clouds for each triangle, two numbers per triangle.
-        table: ``_ROW`` floats per placement.
-        appearances: Floats per placement, see :mod:`mitsplat.renderer.splatting.splat_appearance`; None if no placement
-            has an appearance.
+        table: One ``_MirrorRow`` per placement.
+        appearances: One :class:`AppearanceRow` per placement, padded to the same width; None if no placement has an
+            appearance.
     """
 
     solids: Solids
@@ -77,19 +82,19 @@ class SplatMirror:
         solids = Solids.build(casters, int(np.clip(MOST_SOLIDS // total, 2, SETS)))
         if solids is None:
             return None
-        rows = np.zeros((len(placements), _ROW), np.float32)
+        rows = np.zeros((len(placements), _MirrorRow.WIDTH), np.float32)
         firsts = np.array([clouds.first[p.cloud] for p in placements], np.uint32)
         for row, placement, anew, footprint in zip(rows, placements, relit, solids.footprints, strict=True):
             turn = placement.world_from_cloud[:3, :3]
-            row[:9] = (turn / np.cbrt(np.linalg.det(turn))).T.ravel()
-            row[9], row[10] = anew, footprint
+            row[_MirrorRow.ROTATION] = (turn / np.cbrt(np.linalg.det(turn))).T.ravel()
+            row[_MirrorRow.RELIT], row[_MirrorRow.FOOTPRINT] = anew, footprint
         caster, gaussian = solids.owners
         owners = np.stack([caster, firsts[caster] + gaussian], axis=1)
         appearances = None
         if any(p.appearance is not None for p in placements):
-            appearances = wrapped(
-                mi.Float, np.pad(appearance_rows([p.appearance for p in placements]), ((0, 0), (0, _ROW - ROW)))
-            )
+            padding = _MirrorRow.WIDTH - AppearanceRow.WIDTH
+            looks = np.pad(appearance_rows([p.appearance for p in placements]), ((0, 0), (0, padding)))
+            appearances = wrapped(mi.Float, looks)
         return cls(solids, clouds, wrapped(mi.UInt32, owners), wrapped(mi.Float, rows), appearances)
 
     def trace(self, ray: Any, key: Any, active: Any) -> SplatHits:
@@ -98,19 +103,20 @@ class SplatMirror:
         hit = self.solids.scene.ray_intersect_preliminary(inside, active=active & met)
         found = active & met & hit.is_valid()
         owner = dr.gather(mi.Point2u, self.gaussians, hit.prim_index, found)
-        row = dr.gather(mi.ArrayXf, self.table, owner.x, found, shape=(_ROW, dr.width(owner)))
-        axes_of = [mi.Vector3f(*[row[3 * i + j] for j in range(3)]) for i in range(3)]
+        row = dr.gather(mi.ArrayXf, self.table, owner.x, found, shape=(_MirrorRow.WIDTH, dr.width(owner)))
+        rotation = row[_MirrorRow.ROTATION]
+        axes_of = [mi.Vector3f(*[rotation[3 * i + j] for j in range(3)]) for i in range(3)]
         own = mi.Vector3f(*[dr.dot(axis, ray.d) for axis in axes_of])
         stride = self.clouds.sh_stride
         packet = dr.gather(mi.ArrayXf, self.clouds.sh, owner.y, found, shape=(stride, dr.width(owner)))
         colour = evaluate_sh(own, lambda k: [packet[3 * k + i] for i in range(3)], self.clouds.sh_count)
-        geometry = dr.gather(mi.ArrayXf, self.clouds.geometry, owner.y, found, shape=(8, dr.width(owner)))
+        geometry = dr.gather(mi.ArrayXf, self.clouds.geometry, owner.y, found, shape=(Geometry.WIDTH, dr.width(owner)))
         if self.appearances is not None:
-            looks = dr.gather(mi.ArrayXf, self.appearances, owner.x, found, shape=(_ROW, dr.width(owner)))
-            centre = mi.Vector3f(*[geometry[i] for i in range(3)])
-            colour = apply_appearance(colour, [looks[i] for i in range(ROW)], centre)
+            looks = dr.gather(mi.ArrayXf, self.appearances, owner.x, found, shape=(_MirrorRow.WIDTH, dr.width(owner)))
+            centre = mi.Vector3f(*geometry[Geometry.MEAN])
+            colour = apply_appearance(colour, [*looks[: AppearanceRow.WIDTH]], centre)
         sigma = dr.gather(mi.Vector4f, self.clouds.scales, owner.y, found)
-        axes = rotation_axes([geometry[4 + i] for i in range(4)])
+        axes = rotation_axes(geometry[Geometry.QUATERNION])
         thin_x, thin_y = (sigma.x < sigma.y) & (sigma.x < sigma.z), sigma.y < sigma.z
         side = dr.select(thin_x, axes[0], dr.select(thin_y, axes[1], axes[2]))
         side = dr.select(dr.dot(side, own) > 0, -side, side)
@@ -118,6 +124,6 @@ class SplatMirror:
             distance=dr.select(found, start + hit.t, dr.inf),
             colour=colour,
             normal=axes_of[0] * side.x + axes_of[1] * side.y + axes_of[2] * side.z,
-            relit=found & (row[9] > 0),
-            footprint=row[10],
+            relit=found & (row[_MirrorRow.RELIT] > 0),
+            footprint=row[_MirrorRow.FOOTPRINT],
         )

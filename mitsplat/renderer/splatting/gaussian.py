@@ -37,11 +37,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitsplat.renderer.rays.device_arrays import wrapped
-
-RECORD = 16
-"""Floats in a view record: u0, v0, A, 2B, C, log2(opacity), red, green | blue, m_z, E, F, G, H, I, instance bits. A, 2B
-and C include the factor log2(e)/2, so that opacity along a ray is ``exp2(log2(opacity) - q)``.
-"""
+from mitsplat.renderer.splatting.records import Geometry, PlaneRecord
 
 LOG2_E_HALF = 0.5 * 1.4426950408889634
 
@@ -57,7 +53,7 @@ class Cloud:
 
     Attributes:
         count: Number of Gaussians, N.
-        geometry: Mean (3), opacity, quaternion xyzw (4) per Gaussian: 8 N floats.
+        geometry: Mean, opacity and quaternion xyzw, one row of :class:`Geometry` per Gaussian.
         scales: Standard deviations (3) and a zero per Gaussian: 4 N floats.
         sh: Coefficients per Gaussian, channel-last, ``sh_stride`` floats each.
         sh_count: Number of SH coefficients per channel, 1, 4, 9 or 16.
@@ -83,7 +79,12 @@ def upload_cloud(
     widest = scales.max(axis=1, keepdims=True) if count else scales[:, :1]
     sigma = np.zeros((count, 4), np.float32)
     sigma[:, :3] = np.maximum(scales, SCALE_RATIO_MIN * widest)
-    geometry = np.concatenate([means, opacities[:, None], quats], axis=1, dtype=np.float32)
+    geometry = np.empty((count, Geometry.WIDTH), np.float32)
+    geometry[:, Geometry.MEAN], geometry[:, Geometry.OPACITY], geometry[:, Geometry.QUATERNION] = (
+        means,
+        opacities,
+        quats,
+    )
     return Cloud(count, wrapped(mi.Float, geometry), wrapped(mi.Float, sigma), wrapped(mi.Float, padded), bands, stride)
 
 
@@ -217,18 +218,36 @@ class Response:
         )
 
 
-def project_gaussian(mean: Any, axes: Axes, sigma: Any, right: Any, down: Any, forward: Any, scale: Any) -> Response:
-    """Compute the response coefficients of Gaussians.
+@dataclass(frozen=True, eq=False)
+class PlacedGaussian:
+    """Gaussians and the camera in the frame of a cloud.
 
-    Args:
-        mean: Centre relative to the camera's centre, in the Gaussians' frame.
-        axes: The three principal axes in the same frame.
+    Attributes:
+        mean: Centre relative to the camera's centre.
+        axes: The three principal axes.
         sigma: Standard deviations along them.
-        right: The camera's x axis in the same frame.
-        down: The camera's y axis.
-        forward: The camera's z axis.
-        scale: Size of one unit of that frame in the camera's units [m].
+        right, down, forward: The camera's x, y and z axes.
+        scale: Size of one unit of the frame [m].
     """
+
+    mean: Any
+    axes: Axes
+    sigma: list[Any]
+    right: Any
+    down: Any
+    forward: Any
+    scale: Any
+
+
+def project_gaussian(gaussian: PlacedGaussian) -> Response:
+    """Compute the response coefficients of Gaussians."""
+    mean, sigma, right, down, forward = (
+        gaussian.mean,
+        gaussian.sigma,
+        gaussian.right,
+        gaussian.down,
+        gaussian.forward,
+    )
     depth = dr.dot(forward, mean)
     inv_depth = dr.rcp(depth)
     u0, v0 = dr.dot(right, mean) * inv_depth, dr.dot(down, mean) * inv_depth
@@ -237,7 +256,7 @@ def project_gaussian(mean: Any, axes: Axes, sigma: Any, right: Any, down: Any, f
     ratio = [thinnest / s for s in sigma]
 
     def whiten(vector: Any) -> Any:
-        return mi.Vector3f(*[dr.dot(axis, vector) * r for axis, r in zip(axes, ratio, strict=True)])
+        return mi.Vector3f(*[dr.dot(axis, vector) * r for axis, r in zip(gaussian.axes, ratio, strict=True)])
 
     w0, w1, w2 = whiten(ray), whiten(right), whiten(down)
     n0 = dr.rcp(dr.squared_norm(w0))
@@ -254,7 +273,7 @@ def project_gaussian(mean: Any, axes: Axes, sigma: Any, right: Any, down: Any, f
         n0 * dr.squared_norm(w1),
         2 * n0 * dr.dot(w1, w2),
         n0 * dr.squared_norm(w2),
-        depth * scale,
+        depth * gaussian.scale,
         dr.square(gain * dr.dot(w0, dr.cross(w1, w2))) * dr.squared_norm(w0),
     )
 
@@ -325,29 +344,21 @@ def conic_touches_rectangle(conic: Conic6, lo_u: Any, hi_u: Any, lo_v: Any, hi_v
     return least <= 0
 
 
-def general_response(mean: Any, axes: Axes, sigma: Any, right: Any, down: Any, forward: Any, scale: Any) -> list[Any]:
-    """Compute the response without a reference ray, for Gaussians at the camera's plane.
+def respond_at_plane(gaussian: PlacedGaussian) -> PlaneRecord:
+    """Compute the response of Gaussians at the camera's plane, without a reference ray.
 
-    With d = (u, v, 1): q = |W m x W d|^2 / |W d|^2 and z = (W m . W d) / |W d|^2. Arguments are those of
-    `project_gaussian`.
-
-    Returns:
-        15 coefficients: of u^2, uv, v^2, u, v, 1 in the first numerator and in the denominator, and of u, v, 1 in the
-            second numerator.
+    With d = (u, v, 1): q = |W m x W d|^2 / |W d|^2 and z = (W m . W d) / |W d|^2.
     """
     w1, w2, w3, wm = (
-        mi.Vector3f(*[dr.dot(axis, vector) / s for axis, s in zip(axes, sigma, strict=True)])
-        for vector in (right, down, forward, mean)
+        mi.Vector3f(*[dr.dot(axis, vector) / s for axis, s in zip(gaussian.axes, gaussian.sigma, strict=True)])
+        for vector in (gaussian.right, gaussian.down, gaussian.forward, gaussian.mean)
     )
     c1, c2, c3 = dr.cross(wm, w1), dr.cross(wm, w2), dr.cross(wm, w3)
 
     def quadratic(p: Any, q: Any, r: Any) -> list[Any]:
         return [dr.dot(p, p), 2 * dr.dot(p, q), dr.dot(q, q), 2 * dr.dot(p, r), 2 * dr.dot(q, r), dr.dot(r, r)]
 
-    return [*quadratic(c1, c2, c3), *quadratic(w1, w2, w3), *(scale * dr.dot(wm, w) for w in (w1, w2, w3))]
-
-
-def general_depth(k: Any, u: Any, v: Any) -> tuple[Any, Any]:
-    """Return 1 / |W d|^2 and the peak depth along the ray of slopes u and v, from `general_response`."""
-    inverse = dr.rcp((k[6] * u + k[7] * v + k[9]) * u + (k[8] * v + k[10]) * v + k[11])
-    return inverse, (k[12] * u + k[13] * v + k[14]) * inverse
+    numerator = [value * LOG2_E_HALF for value in map(dr.detach, quadratic(c1, c2, c3))]
+    denominator = map(dr.detach, quadratic(w1, w2, w3))
+    depth = (dr.detach(gaussian.scale * dr.dot(wm, w)) for w in (w1, w2, w3))
+    return PlaneRecord(*numerator, *denominator, *depth, mi.Float(0))

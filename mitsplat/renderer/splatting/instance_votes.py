@@ -16,7 +16,7 @@ import mitsuba as mi
 from mitsplat.quality import Order, Quality
 from mitsplat.renderer.rays.camera_rays import CameraView
 from mitsplat.renderer.splatting.tiles import TileLists
-from mitsplat.renderer.splatting.walk import Lanes, Pixel, Rays, walk
+from mitsplat.renderer.splatting.walk import TRANSMITTANCE, Lanes, Pixel, Rays, walk
 
 FIRST_SLOTS = 3
 """Number of instances with a slot in the first walk."""
@@ -82,7 +82,7 @@ def resolve_instances(
             rays,
             order,
             _initial_votes,
-            lambda pixel, alpha, record, _: _add_vote(pixel, pixel[0] * alpha, record[15], last),
+            lambda pixel, alpha, record, _: _add_vote(pixel, pixel[TRANSMITTANCE] * alpha, record.instance, last),
         )
         # This value is the same in every walk: the share of the environment.
         most = dr.maximum(most, own + transmittance)

@@ -46,8 +46,18 @@ from mitsplat.renderer.rays.camera_rays import TILE_HEIGHT, TILE_PIXELS, CameraV
 from mitsplat.renderer.splatting.instance_votes import add_to_tally, new_tally, resolve_instances, winner_of_tally
 from mitsplat.renderer.splatting.pairs import CrowdedError
 from mitsplat.renderer.splatting.projection import CloudSet, Placement
+from mitsplat.renderer.splatting.records import GaussianRecord
 from mitsplat.renderer.splatting.tiles import TileLists, bin_gaussians, select_tiles, sort_by_ray
-from mitsplat.renderer.splatting.walk import Lanes, Pixel, Rays, max_of, rows_together, walk
+from mitsplat.renderer.splatting.walk import (
+    TRANSMITTANCE,
+    FieldsOnAccess,
+    Lanes,
+    Pixel,
+    Rays,
+    max_of,
+    rows_together,
+    walk,
+)
 
 
 @dataclass(eq=False)
@@ -115,10 +125,10 @@ def largest_and_mean(error: Any) -> tuple[Any, Any]:
     return dr.minimum(dr.max(error), 1.0), mi.Float(total) / (unit * dr.width(error))
 
 
-T, RED, GREEN, BLUE, SUM_Z, HALF_Z, TALLY = range(7)
-"""Indices of a ray's state: transmittance, red, green, blue, sum of weighted depths, depth at half transmittance, and
-first entry of the instance tally (if there are several instances). The state of late peaks comes last, see
-:data:`_EXTRA_STATE`.
+RED, GREEN, BLUE, SUM_Z, HALF_Z, TALLY = range(1, 7)
+"""Indices of a ray's state after the transmittance: red, green, blue, sum of weighted depths, depth at half
+transmittance, and first entry of the instance tally (if there are several instances). The state of late peaks comes
+last, see :data:`_EXTRA_STATE`.
 """
 
 OutOfOrder = Literal["ignored", "estimated", "corrected"]
@@ -145,11 +155,13 @@ def _fresh(several: bool, late: OutOfOrder) -> Pixel:
     return [mi.Float(1.0), *nothing, *tally, *extra]
 
 
-def _blend(pixel: Pixel, alpha: Any, record: Any, z: Any, several: bool, late: OutOfOrder) -> Pixel:
+def _blend(
+    pixel: Pixel, alpha: Any, record: GaussianRecord | FieldsOnAccess, z: Any, several: bool, late: OutOfOrder
+) -> Pixel:
     """Return the state of a ray after one more Gaussian."""
-    weight = pixel[T] * alpha
-    transmittance = pixel[T] - weight
-    colour = [record[6], record[7], record[8]]
+    weight = pixel[TRANSMITTANCE] * alpha
+    transmittance = pixel[TRANSMITTANCE] - weight
+    colour = record.colour
     sums = [dr.fma(weight, c, sum_c) for c, sum_c in zip(colour, pixel[RED : BLUE + 1], strict=True)]
     extra: list[Any] = []
     if late == "estimated":
@@ -161,8 +173,8 @@ def _blend(pixel: Pixel, alpha: Any, record: Any, z: Any, several: bool, late: O
         transmittance,
         *sums,
         dr.fma(weight, z, pixel[SUM_Z]),
-        dr.select((pixel[T] >= 0.5) & (transmittance < 0.5), z, pixel[HALF_Z]),
-        *(add_to_tally(pixel[TALLY : len(pixel) - len(extra)], weight, record[15]) if several else []),
+        dr.select((pixel[TRANSMITTANCE] >= 0.5) & (transmittance < 0.5), z, pixel[HALF_Z]),
+        *(add_to_tally(pixel[TALLY : len(pixel) - len(extra)], weight, record.instance) if several else []),
         *extra,
     ]
 
@@ -385,10 +397,10 @@ def march_tiles(lists: TileLists, view: CameraView, quality: Quality, z_max: Any
 
 def _picture(pixels: list[Pixel], lanes: Lanes, quality: Quality) -> list[Any]:
     """Return red, green, blue and opacity of the lanes' pixels as row-major arrays."""
-    shown = [[*pixel[RED : BLUE + 1], 1.0 - pixel[T]] for pixel in pixels]
+    shown = [[*pixel[RED : BLUE + 1], 1.0 - pixel[TRANSMITTANCE]] for pixel in pixels]
     if quality.normalise_ended_rays:
         end = dr.opaque(mi.Float, quality.transmittance_min)
-        whole = [dr.select(pixel[T] <= end, dr.rcp(1.0 - pixel[T]), 1.0) for pixel in pixels]
+        whole = [dr.select(pixel[TRANSMITTANCE] <= end, dr.rcp(1.0 - pixel[TRANSMITTANCE]), 1.0) for pixel in pixels]
         shown = [[value * scale for value in values] for values, scale in zip(shown, whole, strict=True)]
     return [lanes.image(mi.Float, list(channel)) for channel in zip(*shown, strict=True)]
 
@@ -401,16 +413,16 @@ def _collect(pixels: list[Pixel], lanes: Lanes, only: int | None, quality: Quali
     *rgb, alpha = _picture(pixels, lanes, quality)
     depths = []
     for pixel in pixels:
-        opacity = 1.0 - pixel[T]
+        opacity = 1.0 - pixel[TRANSMITTANCE]
         mean = dr.select(opacity > 0, pixel[SUM_Z] / opacity, 0.0)
-        depths.append(dr.select(pixel[T] < 0.5, pixel[HALF_Z], mean))
+        depths.append(dr.select(pixel[TRANSMITTANCE] < 0.5, pixel[HALF_Z], mean))
     uncertain = None
     if only is None:
-        winners = [winner_of_tally(pixel[TALLY:], pixel[T]) for pixel in pixels]
+        winners = [winner_of_tally(pixel[TALLY:], pixel[TRANSMITTANCE]) for pixel in pixels]
         numbers = [number for number, _ in winners]
         uncertain = lanes.image(mi.Bool, [doubt for _, doubt in winners])
     else:
         everything = dr.opaque(mi.Float, only)
-        numbers = [dr.select(1.0 - pixel[T] > pixel[T], everything, 0.0) for pixel in pixels]
+        numbers = [dr.select(1.0 - pixel[TRANSMITTANCE] > pixel[TRANSMITTANCE], everything, 0.0) for pixel in pixels]
     depth, instance = lanes.image(mi.Float, depths), lanes.image(mi.UInt32, numbers)
     return Image(rgb, alpha, depth, instance, alpha, None), uncertain

@@ -13,7 +13,8 @@ import numpy as np
 from mitsplat.errors import MissingResourceError
 from mitsplat.quality import Quality
 from mitsplat.renderer.rays.camera_rays import CameraView
-from mitsplat.renderer.splatting.gaussian import RECORD, conic_touches_rectangle, ellipse_spans
+from mitsplat.renderer.splatting.gaussian import conic_touches_rectangle, ellipse_spans
+from mitsplat.renderer.splatting.records import GaussianRecord
 from mitsplat.renderer.splatting.tile_depths import DEPTH_BITS, depths_by_tile, level_of
 from mitsplat.renderer.splatting.tile_subset import TileBox, TileSubset
 
@@ -61,7 +62,7 @@ class Pairs:
 
 def pair_records(
     records: Any,
-    near: Any | None,
+    plane_records: Any | None,
     least: Any,
     box: Any,
     view: CameraView,
@@ -87,11 +88,10 @@ def pair_records(
     if rows == 0:
         return None
     # Rows first: one lane finds the spans of one record, then one lane fills one span.
-    record = dr.gather(mi.ArrayXf, records, order, shape=(RECORD, count))
     cut = dr.log2(dr.opaque(mi.Float, quality.alpha_min))
     owner, first_tile = dr.empty(mi.UInt32, rows), dr.empty(mi.UInt32, rows)
     length = dr.empty(mi.UInt32, rows)
-    span_of = _spans(record, cut, x0, x1, view)
+    span_of = _spans(GaussianRecord.fetch(records, order), cut, x0, x1, view)
 
     def one_row(y: Any) -> tuple[Any]:
         lo, hi = span_of(y)
@@ -109,7 +109,7 @@ def pair_records(
     pair_of, pairs = prefix_ranges(length, view.tiles_x)
     if pairs == 0:
         return None
-    record = dr.gather(mi.ArrayXf, records, owner, shape=(RECORD, rows))
+    record = GaussianRecord.fetch(records, owner)
     ellipsoid = dr.gather(mi.Float, least, owner)
     key, number = dr.empty(mi.UInt64, pairs), dr.empty(mi.UInt32, pairs) if numbered else None
 
@@ -117,7 +117,7 @@ def pair_records(
         return tile if subset is None else dr.gather(mi.UInt32, subset.number, tile, active)
 
     if groups is None:
-        depth_of = depths_by_tile(record, near, ellipsoid, in_view(first_tile, length > 0), view, quality)
+        depth_of = depths_by_tile(record, plane_records, ellipsoid, in_view(first_tile, length > 0), view, quality)
     else:
         group = dr.gather(mi.UInt32, groups, owner)
 
@@ -159,16 +159,16 @@ def prefix_ranges(sizes: Any, most: int) -> tuple[Any, int]:
     return begin, totals[0]
 
 
-def _spans(record: Any, cut: Any, x0: Any, x1: Any, view: CameraView) -> Callable[[Any], tuple[Any, Any]]:
+def _spans(record: GaussianRecord, cut: Any, x0: Any, x1: Any, view: CameraView) -> Callable[[Any], tuple[Any, Any]]:
     """Return a function from a row of tiles to the half-open range that a record's ellipse intersects.
 
     Gaussians at the camera's plane take their whole box. Under lens distortion, rows of tiles are not bands of slopes,
     so that the tiles of the box are tested one by one.
     """
-    u0, v0, a, b2, c, opacity, _, _, _, _, e, f, g, h, i, _ = record
-    k2 = opacity - cut
-    conic = a - k2 * g, b2 - k2 * h, c - k2 * i, -k2 * e, -k2 * f, -k2
-    whole = a < 0
+    u0, v0, k2 = record.u0, record.v0, record.log_opacity - cut
+    squares = record.a - k2 * record.g, record.b2 - k2 * record.h, record.c - k2 * record.i
+    conic = *squares, -k2 * record.e, -k2 * record.f, -k2
+    whole = record.at_plane
     if not view.distortion:
         span_between = ellipse_spans(conic)
         _, (first_v, step_v, height) = view.tile_grid()

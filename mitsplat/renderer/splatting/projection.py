@@ -18,26 +18,19 @@ from mitsplat.renderer.rays.camera_rays import CameraView, Kind
 from mitsplat.renderer.rays.device_arrays import concatenated, wrapped
 from mitsplat.renderer.splatting.gaussian import (
     LOG2_E_HALF,
-    RECORD,
     Cloud,
+    PlacedGaussian,
     Response,
     ellipse_bounds,
     evaluate_sh,
-    general_response,
     project_gaussian,
+    respond_at_plane,
     rotation_axes,
 )
-from mitsplat.renderer.splatting.splat_appearance import ROW, SplatAppearance, appearance_rows, apply_appearance
+from mitsplat.renderer.splatting.records import RECORD, GaussianRecord, Geometry, PlacementRow
+from mitsplat.renderer.splatting.splat_appearance import SplatAppearance, appearance_rows, apply_appearance
 from mitsplat.renderer.splatting.tile_subset import TileSubset
 from mitsplat.runtime.recorded_kernels import Table, recorded
-
-PLACEMENT = 32
-"""Floats per placement: camera axes in the cloud's frame (9), scale, instance id, first Gaussian, camera centre in the
-cloud's frame as a sum of two floats (3 + 3), appearance (13). The sum of two floats keeps differences exact far from
-the origin.
-"""
-
-_APPEARANCE = PLACEMENT - ROW
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,7 +132,7 @@ change.
 
 def placement_table(clouds: CloudSet, placements: Sequence[Placement], view: CameraView) -> tuple[Any, Any, Any]:
     """Return placement rows on the device, and for every placed Gaussian its row and its number in the clouds."""
-    rows = np.zeros((max(1, len(placements)), PLACEMENT), np.float32)
+    rows = np.zeros((max(1, len(placements)), PlacementRow.WIDTH), np.float32)
     if placements:
         matrix = np.array([p.world_from_cloud for p in placements], dtype=np.float64)
         turn, shift = matrix[:, :3, :3], matrix[:, :3, 3]
@@ -147,13 +140,53 @@ def placement_table(clouds: CloudSet, placements: Sequence[Placement], view: Cam
         pose = view.world_from_camera
         centre = np.linalg.solve(turn, (pose[:3, 3] - shift)[..., None])[..., 0]
         coarse = centre.astype(np.float32)
-        rows[:, :9] = (pose[:3, :3].T @ (turn / scale[:, None, None])).reshape(-1, 9)
-        rows[:, 9] = scale
-        rows[:, 10] = [p.instance for p in placements]
-        rows[:, 12:15] = coarse
-        rows[:, 16:19] = centre - coarse
-        rows[:, _APPEARANCE:] = appearance_rows([p.appearance for p in placements])
+        axes = pose[:3, :3].T @ (turn / scale[:, None, None])
+        for column, axis in zip((PlacementRow.RIGHT, PlacementRow.DOWN, PlacementRow.FORWARD), range(3), strict=True):
+            rows[:, column] = axes[:, axis]
+        rows[:, PlacementRow.SCALE] = scale
+        rows[:, PlacementRow.INSTANCE] = [p.instance for p in placements]
+        rows[:, PlacementRow.CENTRE] = coarse
+        rows[:, PlacementRow.CENTRE_REST] = centre - coarse
+        rows[:, PlacementRow.APPEARANCE] = appearance_rows([p.appearance for p in placements])
     return wrapped(mi.Float, rows), *clouds.numbers([p.cloud for p in placements])
+
+
+@dataclass(frozen=True, eq=False)
+class _Input:
+    """Placed Gaussians as fetched by a kernel.
+
+    Attributes:
+        gaussian: Geometry.
+        opacity, instance: Opacity, and instance id of the placement.
+        appearance: Columns of :class:`AppearanceRow` of the placement.
+        point: Centre in the cloud's frame.
+    """
+
+    gaussian: PlacedGaussian
+    opacity: Any
+    instance: Any
+    appearance: list[Any]
+    point: Any
+
+
+@dataclass(frozen=True, eq=False)
+class _Bounds:
+    """Response and bounds of Gaussians.
+
+    Attributes:
+        response, opacity: Response and opacity under the low-pass filter.
+        at_plane: True if the Gaussian reaches the camera's plane z = 0.
+        visible: True if it may be visible.
+        slope_box: Limits (u0, u1, v0, v1) of the cut-off ellipsoid.
+        least_depth: Depth [m] in front of which the ellipsoid does not reach.
+    """
+
+    response: Response
+    opacity: Any
+    at_plane: Any
+    visible: Any
+    slope_box: tuple[Any, Any, Any, Any]
+    least_depth: Any
 
 
 class Projector:
@@ -166,43 +199,45 @@ class Projector:
         self.changed = changed
         self.cut = dr.opaque(mi.Float, quality.alpha_min)
 
-    def _load(self, owner: Any, local: Any) -> dict[str, Any]:
-        row = dr.gather(mi.ArrayXf, self.table, owner, shape=(PLACEMENT, dr.width(owner)))
-        packet = dr.gather(mi.ArrayXf, self.clouds.geometry, local, mode=_ADJOINT, shape=(8, dr.width(local)))
+    def _load(self, owner: Any, local: Any) -> _Input:
+        row = dr.gather(mi.ArrayXf, self.table, owner, shape=(PlacementRow.WIDTH, dr.width(owner)))
+        packet = dr.gather(
+            mi.ArrayXf, self.clouds.geometry, local, mode=_ADJOINT, shape=(Geometry.WIDTH, dr.width(local))
+        )
         sigma = dr.gather(mi.ArrayXf, self.clouds.scales, local, mode=_ADJOINT, shape=(4, dr.width(local)))
-        mean = mi.Vector3f(*[packet[i] - row[12 + i] - row[16 + i] for i in range(3)])
-        return {
-            "mean": mean,
-            "axes": rotation_axes([packet[4 + i] for i in range(4)]),
-            "sigma": [sigma[i] for i in range(3)],
-            "right": mi.Vector3f(row[0], row[1], row[2]),
-            "down": mi.Vector3f(row[3], row[4], row[5]),
-            "forward": mi.Vector3f(row[6], row[7], row[8]),
-            "scale": row[9],
-        } | {
-            "opacity": packet[3],
-            "instance": row[10],
-            "row": row,
-            "point": mi.Vector3f(*[packet[i] for i in range(3)]),
-        }
+        point, centre, rest = packet[Geometry.MEAN], row[PlacementRow.CENTRE], row[PlacementRow.CENTRE_REST]
+        return _Input(
+            PlacedGaussian(
+                mi.Vector3f(*[point[i] - centre[i] - rest[i] for i in range(3)]),
+                rotation_axes(packet[Geometry.QUATERNION]),
+                [sigma[i] for i in range(3)],
+                *(mi.Vector3f(*row[axis]) for axis in (PlacementRow.RIGHT, PlacementRow.DOWN, PlacementRow.FORWARD)),
+                row[PlacementRow.SCALE],
+            ),
+            packet[Geometry.OPACITY],
+            row[PlacementRow.INSTANCE],
+            [*row[PlacementRow.APPEARANCE]],
+            mi.Vector3f(*point),
+        )
 
-    def _bounds(self, g: dict[str, Any]) -> tuple[Any, ...]:
-        """Return response, opacity, squared cut-off, near flag, visibility, slope box and least depth.
+    def _bounds(self, g: _Input) -> _Bounds:
+        """Return response, opacity and bounds of Gaussians.
 
-        The near flag marks Gaussians that reach the plane z = 0. They keep the exact response without a filter, because
-        they are large relative to a pixel and have no central ray.
+        Gaussians that reach the camera's plane keep the exact response without a filter, because they are large
+        relative to a pixel and have no central ray.
         """
-        view, kernel = self.view, KERNELS[self.quality.kernel]
-        shape = {k: g[k] for k in ("mean", "axes", "sigma", "right", "down", "forward", "scale")}
-        k = dr.safe_sqrt(2 * dr.log(g["opacity"] / self.cut))
+        view, kernel, gaussian = self.view, KERNELS[self.quality.kernel], g.gaussian
+        k = dr.safe_sqrt(2 * dr.log(g.opacity / self.cut))
         reach = [
-            g["scale"]
+            gaussian.scale
             * k
-            * dr.norm(mi.Vector3f(*[dr.dot(a, v) * s for a, s in zip(g["axes"], g["sigma"], strict=True)]))
-            for v in (g["right"], g["down"], g["forward"])
+            * dr.norm(mi.Vector3f(*[dr.dot(a, v) * s for a, s in zip(gaussian.axes, gaussian.sigma, strict=True)]))
+            for v in (gaussian.right, gaussian.down, gaussian.forward)
         ]
-        centre = [g["scale"] * dr.dot(g[axis], g["mean"]) for axis in ("right", "down", "forward")]
-        response, opacity = project_gaussian(**shape), g["opacity"]
+        centre = [
+            gaussian.scale * dr.dot(axis, gaussian.mean) for axis in (gaussian.right, gaussian.down, gaussian.forward)
+        ]
+        response, opacity = project_gaussian(gaussian), g.opacity
         if kernel.variance > 0:
             # A filter is as wide as the view's pixels. The variance that trainers add refers to the picture's pixels,
             # however fine the view is.
@@ -215,8 +250,8 @@ class Projector:
             response = response.parallel()
         k2 = 2 * dr.log(opacity / self.cut)
         du0, du1, dv0, dv1, ellipse = ellipse_bounds(response.cutoff(k2))
-        near = ~ellipse | (centre[2] - reach[2] < view.near_plane)
-        opacity, k2 = dr.select(near, g["opacity"], opacity), dr.select(near, k * k, k2)
+        at_plane = ~ellipse | (centre[2] - reach[2] < view.near_plane)
+        opacity, k2 = dr.select(at_plane, g.opacity, opacity), dr.select(at_plane, k * k, k2)
         farthest = dr.maximum(centre[2] + reach[2], view.near_plane)
 
         # Slopes of the ellipsoid's box behind the near plane: a loose bound, but few Gaussians need it.
@@ -227,60 +262,60 @@ class Projector:
                 hi / dr.select(hi > 0, view.near_plane, farthest),
             )
 
-        (near_u0, near_u1), (near_v0, near_v1) = slopes(0), slopes(1)
+        (loose_u0, loose_u1), (loose_v0, loose_v1) = slopes(0), slopes(1)
         box = (
-            dr.select(near, near_u0, response.u0 + du0),
-            dr.select(near, near_u1, response.u0 + du1),
-            dr.select(near, near_v0, response.v0 + dv0),
-            dr.select(near, near_v1, response.v0 + dv1),
+            dr.select(at_plane, loose_u0, response.u0 + du0),
+            dr.select(at_plane, loose_u1, response.u0 + du1),
+            dr.select(at_plane, loose_v0, response.v0 + dv0),
+            dr.select(at_plane, loose_v1, response.v0 + dv1),
         )
         visible = (k2 > 0) & (centre[2] + reach[2] > view.near_plane)
         if not self.at_camera:
-            visible &= ~near
-        return response, opacity, k2, near, visible, box, centre[2] - reach[2]
+            visible &= ~at_plane
+        return _Bounds(response, opacity, at_plane, visible, box, centre[2] - reach[2])
 
     def cull(self, owner: Any, local: Any, subset: TileSubset | None = None) -> tuple[Any, Any]:
         """Return two flags per Gaussian: it is in view (and in ``subset`` tiles), and it reaches the camera's plane."""
-        g = self._load(owner, local)
-        _, _, _, near, visible, box, _ = self._bounds(g)
-        x0, x1, y0, y1 = self.view.tile_box(*box)
-        visible, near = dr.detach(visible & (x1 > x0) & (y1 > y0)), dr.detach(near)
+        bounds = self._bounds(self._load(owner, local))
+        x0, x1, y0, y1 = self.view.tile_box(*bounds.slope_box)
+        visible, at_plane = dr.detach(bounds.visible & (x1 > x0) & (y1 > y0)), dr.detach(bounds.at_plane)
         if subset is not None:
             visible &= subset.any_in(x0, x1, y0, y1, visible)
-        dr.eval(visible, near)
-        return visible, near
+        dr.eval(visible, at_plane)
+        return visible, at_plane
 
-    def records(self, owner: Any, local: Any, near: Any) -> tuple[Any, Any, Any, Any]:
-        """Return view records, rows of Gaussians at the camera's plane, least depths, and tile boxes."""
-        count = dr.width(local)
+    def records(self, owner: Any, local: Any, at_plane: Any) -> tuple[Any, Any, Any, Any]:
+        """Return view records, records of Gaussians at the camera's plane, least depths, and tile boxes."""
         g = self._load(owner, local)
-        response, opacity, _, _, _, box, least = self._bounds(g)
-        record = self._record(g, response, opacity, local)
-        near_rows = None
-        near_index = dr.compress(near)
-        near_number = dr.zeros(mi.UInt32, count)
-        if dr.width(near_index) > 0:
-            near_rows = self._near_rows(near_index, owner, local)
-            dr.scatter(near_number, dr.arange(mi.UInt32, dr.width(near_index)), near_index)
-        record[0], record[2] = dr.select(near, mi.Float(near_number), record[0]), dr.select(near, -1.0, record[2])
-        records, tile_box = _rows(mi.Float, record), _rows(mi.UInt32, self._tile_box(box))
-        least = dr.detach(least)
+        bounds = self._bounds(g)
+        record = self._record(g, bounds, local)
+        plane_records = None
+        index, number = dr.compress(at_plane), dr.zeros(mi.UInt32, dr.width(local))
+        if dr.width(index) > 0:
+            plane_records = self._plane_records(index, owner, local)
+            dr.scatter(number, dr.arange(mi.UInt32, dr.width(index)), index)
+        record = record._replace(
+            u0=dr.select(at_plane, mi.Float(number), record.u0), a=dr.select(at_plane, -1.0, record.a)
+        )
+        records, tile_box = _rows(mi.Float, [*record]), _rows(mi.UInt32, self._tile_box(bounds))
+        least = dr.detach(bounds.least_depth)
         dr.eval(records, tile_box, least)
-        return records, near_rows, least, tile_box
+        return records, plane_records, least, tile_box
 
     def all_records(self, owner: Any, local: Any) -> tuple[Any, Any, Any, Any, Any]:
-        """Return view records of all Gaussians, least depths, tile boxes, visibility, and near flags.
+        """Return view records of all Gaussians, least depths, tile boxes, visibility, and flags of the camera's plane.
 
         Invisible Gaussians have empty boxes. Records of Gaussians that reach the camera's plane are not marked. Unlike
         after :meth:`cull`, no array size depends on the view.
         """
         g = self._load(owner, local)
-        response, opacity, _, near, visible, box, least = self._bounds(g)
-        x0, x1, y0, y1 = self._tile_box(box)
-        visible = dr.detach(visible) & (x1 > x0) & (y1 > y0)
-        record = self._record(g, response, opacity, local)
+        bounds = self._bounds(g)
+        x0, x1, y0, y1 = self._tile_box(bounds)
+        visible = dr.detach(bounds.visible) & (x1 > x0) & (y1 > y0)
+        record = self._record(g, bounds, local)
         boxes = _rows(mi.UInt32, [x0, x1, y0, dr.select(visible, y1, y0)])
-        return _rows(mi.Float, record), dr.detach(least), boxes, visible, visible & dr.detach(near)
+        at_plane = visible & dr.detach(bounds.at_plane)
+        return _rows(mi.Float, [*record]), dr.detach(bounds.least_depth), boxes, visible, at_plane
 
     def records_unculled(self, owner: Any, local: Any) -> tuple[Any, Any, Any, Any]:
         """Return the results of :meth:`records` for all Gaussians, with recorded kernels and without gradients.
@@ -290,51 +325,51 @@ class Projector:
         clouds, view = self.clouds, self.view
         shape = self.quality, self.at_camera, self.changed, clouds.sh_count, clouds.sh_stride
         arrays = Table(clouds.geometry), Table(clouds.scales), Table(clouds.sh), Table(self.table)
-        records, least, boxes, near = _all_records(view.kind, view.numbers, shape, arrays, owner, local)
-        if not dr.any(near):
+        records, least, boxes, at_plane = _all_records(view.kind, view.numbers, shape, arrays, owner, local)
+        if not dr.any(at_plane):
             return records, None, least, boxes
-        index = dr.compress(near)
-        rows = self._near_rows(index, owner, local)
-        dr.scatter(records, mi.Float(dr.arange(mi.UInt32, dr.width(index))), index * RECORD)
-        dr.scatter(records, mi.Float(-1.0), index * RECORD + 2)
+        index = dr.compress(at_plane)
+        plane_records, row = self._plane_records(index, owner, local), index * RECORD
+        number = mi.Float(dr.arange(mi.UInt32, dr.width(index)))
+        dr.scatter(records, number, row + GaussianRecord.place("u0"))
+        dr.scatter(records, mi.Float(-1.0), row + GaussianRecord.place("a"))
         dr.eval(records)
-        return records, rows, least, boxes
+        return records, plane_records, least, boxes
 
-    def _record(self, g: dict[str, Any], response: Response, opacity: Any, local: Any) -> list[Any]:
+    def _record(self, g: _Input, bounds: _Bounds, local: Any) -> GaussianRecord:
         """Return view records of Gaussians that do not reach the camera's plane."""
-        scaled = LOG2_E_HALF
-        colour = self._colour(g["mean"], local)
+        response, colour = bounds.response, self._colour(g.gaussian.mean, local)
         if self.changed:
-            colour = apply_appearance(colour, [g["row"][_APPEARANCE + i] for i in range(ROW)], g["point"])
-        return [
-            response.u0,
-            response.v0,
-            response.a * scaled,
-            response.b2 * scaled,
-            response.c * scaled,
-            dr.log2(opacity),
-            *colour,
-            response.depth,
-            response.e,
-            response.f,
-            response.g,
-            response.h,
-            response.i,
-            g["instance"],
-        ]
+            colour = apply_appearance(colour, g.appearance, g.point)
+        red, green, blue = colour
+        return GaussianRecord(
+            u0=response.u0,
+            v0=response.v0,
+            a=response.a * LOG2_E_HALF,
+            b2=response.b2 * LOG2_E_HALF,
+            c=response.c * LOG2_E_HALF,
+            log_opacity=dr.log2(bounds.opacity),
+            red=red,
+            green=green,
+            blue=blue,
+            depth=response.depth,
+            e=response.e,
+            f=response.f,
+            g=response.g,
+            h=response.h,
+            i=response.i,
+            instance=g.instance,
+        )
 
-    def _tile_box(self, box: tuple[Any, ...]) -> list[Any]:
-        return list(self.view.tile_box(*(dr.detach(side) for side in box)))
+    def _tile_box(self, bounds: _Bounds) -> list[Any]:
+        return list(self.view.tile_box(*(dr.detach(side) for side in bounds.slope_box)))
 
-    def _near_rows(self, index: Any, owner: Any, local: Any) -> Any:
-        """Return general responses of Gaussians at the camera's plane."""
-        count = dr.width(index)
+    def _plane_records(self, index: Any, owner: Any, local: Any) -> Any:
+        """Return the records of Gaussians at the camera's plane."""
         g = self._load(dr.gather(mi.UInt32, owner, index), dr.gather(mi.UInt32, local, index))
-        shape = {k: g[k] for k in ("mean", "axes", "sigma", "right", "down", "forward", "scale")}
-        c = [dr.detach(v) for v in general_response(**shape)]
-        rows = dr.empty(mi.Float, RECORD * count)
-        row = [*[x * LOG2_E_HALF for x in c[:6]], *c[6:], mi.Float(0)]
-        dr.scatter(rows, mi.ArrayXf(row), dr.arange(mi.UInt32, count))
+        rows = dr.empty(mi.Float, RECORD * dr.width(index))
+        record = respond_at_plane(g.gaussian)
+        dr.scatter(rows, mi.ArrayXf([*record]), dr.arange(mi.UInt32, dr.width(index)))
         dr.eval(rows)
         return rows
 
@@ -362,13 +397,13 @@ def _all_records(
     owner: Any,
     local: Any,
 ) -> tuple[Any, Any, Any, Any]:
-    """Return records, least depths, tile boxes and near flags, see ``Projector.all_records``."""
+    """Return records, least depths, tile boxes and flags of the camera's plane, see ``Projector.all_records``."""
     quality, at_camera, changed, sh_count, sh_stride = shape
     geometry, scales, sh, table = arrays
     clouds = CloudSet((dr.width(owner),), (0,), geometry, scales, sh, sh_count, sh_stride)
     projector = Projector(clouds, table, CameraView.of_numbers(kind, numbers), quality, at_camera, changed)
-    records, least, boxes, _, near = projector.all_records(owner, local)
-    return records, least, boxes, near
+    records, least, boxes, _, at_plane = projector.all_records(owner, local)
+    return records, least, boxes, at_plane
 
 
 def _rows(kind: Any, columns: list[Any]) -> Any:

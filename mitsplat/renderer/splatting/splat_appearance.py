@@ -17,9 +17,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitsplat.renderer.splatting.gaussian import linear_to_srgb, srgb_to_linear
-
-ROW = 13
-"""Floats of an appearance: presence flag, matrix row by row, wear, seed, and cells per unit of length."""
+from mitsplat.renderer.splatting.records import AppearanceRow
 
 CELLS = 3.0
 """Cells of the coarsest noise along the longest side of an object."""
@@ -54,13 +52,16 @@ class SplatAppearance:
 
     @property
     def row(self) -> list[float]:
-        """Row of floats for the kernels."""
+        """The columns of :class:`AppearanceRow`."""
         return [1.0, *self.matrix, self.wear, float(self.seed), CELLS / self.size]
 
 
 def appearance_rows(appearances: list[SplatAppearance | None]) -> np.ndarray:
-    """Return rows of :data:`ROW` floats; zeros where the appearance is None."""
-    return np.array([[0.0] * ROW if one is None else one.row for one in appearances], np.float32).reshape(-1, ROW)
+    """Return one :class:`AppearanceRow` per appearance; zeros where it is None."""
+    nothing = [0.0] * AppearanceRow.WIDTH
+    return np.array([nothing if one is None else one.row for one in appearances], np.float32).reshape(
+        -1, AppearanceRow.WIDTH
+    )
 
 
 def apply_appearance(colour: list[Any], row: list[Any], point: Any) -> list[Any]:
@@ -71,17 +72,17 @@ def apply_appearance(colour: list[Any], row: list[Any], point: Any) -> list[Any]
 
     def change(colour: list[Any], row: list[Any], point: Any) -> list[Any]:
         linear = [srgb_to_linear(c) for c in colour]
-        cover = row[10] * dirt_thickness(point * row[12], mi.UInt32(row[11]))
+        thickness = dirt_thickness(point * row[AppearanceRow.CELLS], mi.UInt32(row[AppearanceRow.SEED]))
+        cover, matrix = row[AppearanceRow.WEAR] * thickness, row[AppearanceRow.MATRIX]
         white = dr.maximum(dr.maximum(colour[0], colour[1]), dr.maximum(colour[2], 1.0))
         result = []
         for i in range(3):
-            mixed = sum(row[1 + 3 * i + j] * linear[j] for j in range(3))
+            mixed = sum(matrix[3 * i + j] * linear[j] for j in range(3))
             result.append(dr.minimum(linear_to_srgb(mixed * (1 - cover * (1 - DIRT[i]))), white))
         return result
 
-    return list(
-        dr.if_stmt((colour, row, point), row[0] > 0, change, lambda colour, *_: list(colour), label="appearance")
-    )
+    present = row[AppearanceRow.PRESENT] > 0
+    return list(dr.if_stmt((colour, row, point), present, change, lambda colour, *_: list(colour), label="appearance"))
 
 
 def dirt_thickness(point: Any, seed: Any) -> Any:

@@ -15,7 +15,8 @@ import mitsuba as mi
 
 from mitsplat.quality import Quality
 from mitsplat.renderer.rays.camera_rays import CameraView
-from mitsplat.renderer.splatting.gaussian import LOG2_E_HALF, RECORD, general_depth
+from mitsplat.renderer.splatting.gaussian import LOG2_E_HALF
+from mitsplat.renderer.splatting.records import GaussianRecord, PlaneRecord
 
 DEPTH_BITS = 16
 """Bits of a depth in sort keys: 11 bits of its mantissa separate depths that differ by 0.05 %, and 5 bits of its
@@ -39,12 +40,12 @@ def depth_of_level(level: Any, view: CameraView) -> Any:
 
 
 def depths_by_tile(
-    record: Any, near: Any | None, ellipsoid: Any, first: Any, view: CameraView, quality: Quality
+    record: GaussianRecord, plane_records: Any | None, ellipsoid: Any, first: Any, view: CameraView, quality: Quality
 ) -> Callable[[Any], Any]:
     """Return a function from a tile to the sort depth of a record in it.
 
     The tile must be in the same row of tiles as ``first``. In an undistorted view, most of the computation is the same
-    for a whole row. ``near`` is as in :class:`mitsplat.renderer.splatting.tiles.TileLists`.
+    for a whole row. ``plane_records`` are as in :class:`mitsplat.renderer.splatting.tiles.TileLists`.
     """
     if quality.order == "ray":
         return lambda tile: least_depth(record, ellipsoid, view.tile_slopes(tile))
@@ -61,34 +62,33 @@ def depths_by_tile(
 
         def usual(tile: Any) -> tuple[Any, Any, Any]:
             u = dr.fma(mi.Float(tile - begin), step_u, first_u)
-            return u, v, depth_around(u - record[0], v - record[1])
+            return u, v, depth_around(u - record.u0, v - record.v0)
 
-    if near is None:
+    if plane_records is None:
         return lambda tile: usual(tile)[2]
-    at_camera = record[2] < 0
-    number = dr.select(at_camera, mi.UInt32(record[0]), 0)
-    general = dr.gather(mi.ArrayXf, near, number, shape=(RECORD, dr.width(number)))
+    at_plane = record.at_plane
+    plane_record = PlaneRecord.fetch(plane_records, dr.select(at_plane, mi.UInt32(record.u0), 0))
 
     def depth_of(tile: Any) -> Any:
         u, v, depth = usual(tile)
         # Gaussians that reach the camera's plane are large relative to a tile, so the depth at the tile's centre is
         # used.
-        return dr.select(at_camera, dr.maximum(general_depth(general, u, v)[1], 0), depth)
+        return dr.select(at_plane, dr.maximum(plane_record.depth(u, v), 0), depth)
 
     return depth_of
 
 
-def depth_where_seen(record: Any, slopes: tuple[Any, Any, Any, Any]) -> Any:
+def depth_where_seen(record: GaussianRecord, slopes: tuple[Any, Any, Any, Any]) -> Any:
     """Return the peak depth of a Gaussian along the ray around which a tile sees most of it.
 
     ``slopes`` are the limits of the tile (lo_u, hi_u, lo_v, hi_v).
     """
     lo_u, hi_u, lo_v, hi_v = slopes
     depth_around = _depths_where_seen(record, hi_u - lo_u, hi_v - lo_v)
-    return depth_around(0.5 * (lo_u + hi_u) - record[0], 0.5 * (lo_v + hi_v) - record[1])
+    return depth_around(0.5 * (lo_u + hi_u) - record.u0, 0.5 * (lo_v + hi_v) - record.v0)
 
 
-def _depths_where_seen(record: Any, width: Any, height: Any) -> Callable[[Any, Any], Any]:
+def _depths_where_seen(record: GaussianRecord, width: Any, height: Any) -> Callable[[Any, Any], Any]:
     """Return a function from a tile centre, relative to the footprint's centre, to :func:`depth_where_seen`.
 
     All tiles have the size ``width`` x ``height`` in slopes. Let M be the inverse covariance of the footprint, and V
@@ -96,7 +96,7 @@ def _depths_where_seen(record: Any, width: Any, height: Any) -> Callable[[Any, A
     has its mean at (I + V M)^-1 m from the footprint's centre. This mean lies near the footprint's centre for small
     Gaussians, and at the tile centre for large ones.
     """
-    a, b2, c = (record[k] for k in (2, 3, 4))
+    a, b2, c = record.a, record.b2, record.c
     variance_u, variance_v = (dr.square(w) / (12 * LOG2_E_HALF) for w in (width, height))
     # The limits avoid overflow; a Gaussian so much smaller than the tile is seen at its own centre.
     p11, p22 = 1 + dr.minimum(variance_u * a, 1e15), 1 + dr.minimum(variance_v * c, 1e15)
@@ -111,12 +111,12 @@ def _depths_where_seen(record: Any, width: Any, height: Any) -> Callable[[Any, A
         du = dr.clip(du, middle_u - half_u, middle_u + half_u)
         dv = dr.clip(dv, middle_v - half_v, middle_v + half_v)
         top, bottom = _depth_fraction(record, du, dv)
-        return record[9] * dr.maximum(top, 0) / bottom
+        return record.depth * dr.maximum(top, 0) / bottom
 
     return depth_around
 
 
-def least_depth(record: Any, ellipsoid: Any, slopes: tuple[Any, Any, Any, Any]) -> Any:
+def least_depth(record: GaussianRecord, ellipsoid: Any, slopes: tuple[Any, Any, Any, Any]) -> Any:
     """Return a lower bound of the depth of a Gaussian's peak along all rays of a tile.
 
     The numerator of the depth is linear in the slopes and the denominator is convex, so that both are bounded at the
@@ -126,14 +126,14 @@ def least_depth(record: Any, ellipsoid: Any, slopes: tuple[Any, Any, Any, Any]) 
     least, largest = mi.Float(dr.inf), mi.Float(0)
     for u in (lo_u, hi_u):
         for v in (lo_v, hi_v):
-            top, bottom = _depth_fraction(record, u - record[0], v - record[1])
+            top, bottom = _depth_fraction(record, u - record.u0, v - record.v0)
             least, largest = dr.minimum(least, top), dr.maximum(largest, bottom)
-    bound = dr.maximum(record[9] * dr.maximum(least, 0) / largest, ellipsoid)
-    return dr.select(record[2] < 0, 0, dr.maximum(bound, 0))
+    bound = dr.maximum(record.depth * dr.maximum(least, 0) / largest, ellipsoid)
+    return dr.select(record.at_plane, 0, dr.maximum(bound, 0))
 
 
-def _depth_fraction(record: Any, du: Any, dv: Any) -> tuple[Any, Any]:
+def _depth_fraction(record: GaussianRecord, du: Any, dv: Any) -> tuple[Any, Any]:
     """Return numerator and denominator of a peak's depth relative to the depth of the centre."""
-    _, _, _, _, _, _, _, _, _, _, e, f, g, h, i, _ = record
+    e, f, g, h, i = record.e, record.f, record.g, record.h, record.i
     top = dr.fma(0.5, dr.fma(du, e, dv * f), 1)
     return top, dr.fma(dv, dr.fma(dv, i, dr.fma(du, h, f)), dr.fma(du, dr.fma(du, g, e), 1))

@@ -19,9 +19,9 @@ import mitsuba as mi
 from mitsplat.quality import Quality
 from mitsplat.renderer.rays.camera_rays import CameraView
 from mitsplat.renderer.rays.device_arrays import concatenated
-from mitsplat.renderer.splatting.gaussian import RECORD
 from mitsplat.renderer.splatting.pairs import NUMBER_BITS, Pairs, pair_records, prefix_ranges
 from mitsplat.renderer.splatting.projection import CloudSet, Placement, Projector, placement_table
+from mitsplat.renderer.splatting.records import RECORD, GaussianRecord
 from mitsplat.renderer.splatting.sorting import numpy_sorts_slowly, sort_in_threads, stable_order
 from mitsplat.renderer.splatting.tile_depths import DEPTH_BITS, depth_of_level, least_depth, level_of
 from mitsplat.renderer.splatting.tile_subset import TileBox, TileSubset
@@ -35,10 +35,9 @@ class TileLists:
     """Depth-sorted Gaussians of every tile.
 
     Attributes:
-        records: View records, see :data:`mitsplat.renderer.splatting.gaussian.RECORD`.
-        near: Coefficients of :func:`mitsplat.renderer.splatting.gaussian.general_response`, 16 floats each, of the
-            Gaussians that reach the camera's plane; None if there are none. Records of these Gaussians hold -1 for A
-            and the row number for u0.
+        records: One :class:`mitsplat.renderer.splatting.records.GaussianRecord` per visible Gaussian.
+        plane_records: One :class:`mitsplat.renderer.splatting.records.PlaneRecord` per Gaussian that reaches the
+            camera's plane; None if there are none.
         entries: Record numbers, tile after tile.
         slots: Position of every entry in the order by record number; for gradients only.
         first: First of those positions of each record, followed by the number of entries; for gradients only.
@@ -52,7 +51,7 @@ class TileLists:
     """
 
     records: Any
-    near: Any | None
+    plane_records: Any | None
     entries: Any
     slots: Any
     first: Any
@@ -102,24 +101,24 @@ def bin_gaussians(
     source = Projector(clouds, table, view, quality, at_camera, changed)
 
     if subset is None and not (fitted or for_gradients) and _skips_culling(dr.width(local)):
-        records, near_rows, least, box = source.records_unculled(owner, local)
+        records, plane_records, least, box = source.records_unculled(owner, local)
     else:
-        visible, near = source.cull(owner, local, subset)
+        visible, at_plane = source.cull(owner, local, subset)
         index = dr.compress(visible)
         if dr.width(index) == 0:
             return _empty(view, subset)
         owner, local = dr.gather(mi.UInt32, owner, index), dr.gather(mi.UInt32, local, index)
-        near = dr.gather(mi.Bool, near, index)
-        dr.eval(owner, local, near)
-        records, near_rows, least, box = source.records(owner, local, near)
+        at_plane = dr.gather(mi.Bool, at_plane, index)
+        dr.eval(owner, local, at_plane)
+        records, plane_records, least, box = source.records(owner, local, at_plane)
     ids = {placement.instance for placement in placements}
     only = ids.pop() if len(ids) == 1 else None
     listed: TileSubset | TileBox | None = TileBox.around(box, view) if fitted else subset
     if groups is not None:
-        row = dr.arange(mi.UInt32, dr.width(least)) * RECORD
-        groups = dr.gather(mi.UInt32, groups, mi.UInt32(dr.gather(mi.Float, records, row + (RECORD - 1))))
+        place = dr.arange(mi.UInt32, dr.width(least)) * RECORD + GaussianRecord.place("instance")
+        groups = dr.gather(mi.UInt32, groups, mi.UInt32(dr.gather(mi.Float, records, place)))
     return bin_records(
-        records, near_rows, least, box, view, quality, only, listed, groups=groups, for_gradients=for_gradients
+        records, plane_records, least, box, view, quality, only, listed, groups=groups, for_gradients=for_gradients
     )
 
 
@@ -133,7 +132,7 @@ def _skips_culling(count: int) -> bool:
 
 def bin_records(
     records: Any,
-    near: Any,
+    plane_records: Any,
     least: Any,
     box: Any,
     view: CameraView,
@@ -152,16 +151,16 @@ def bin_records(
     Raises:
         CrowdedError: If there are too many pairs.
     """
-    pairs = pair_records(dr.detach(records), near, least, box, view, quality, subset, for_gradients, groups)
+    pairs = pair_records(dr.detach(records), plane_records, least, box, view, quality, subset, for_gradients, groups)
     if pairs is None:
         return _empty(view, subset, records)
     tiles, own = _tile_numbers(view, subset)
-    return _sorted_lists(records, near, pairs, least, dr.width(least), tiles, view, only, own)
+    return _sorted_lists(records, plane_records, pairs, least, dr.width(least), tiles, view, only, own)
 
 
 def _sorted_lists(
     records: Any,
-    near: Any,
+    plane_records: Any,
     pairs: Pairs,
     least: Any,
     visible: int,
@@ -182,7 +181,7 @@ def _sorted_lists(
     levels = mi.UInt32(key >> NUMBER_BITS) & ((1 << DEPTH_BITS) - 1)
     return TileLists(
         records=records,
-        near=near,
+        plane_records=plane_records,
         entries=entries,
         slots=slots,
         first=pairs.first,
@@ -224,17 +223,20 @@ def merge_lists(first: TileLists, second: TileLists, tiles: Any, view: CameraVie
     both = [p for p in (_pairs_in(first, tiles, 0), _pairs_in(second, tiles, visible)) if p is not None]
     pairs = Pairs(Pairs.key_of(*(concatenated(parts) for parts in zip(*both, strict=True))))
     dr.eval(pairs.key)
-    records, near = second.records, second.near
-    if near is not None and first.near is not None:
-        # The rows of the second list follow those of the first.
-        row, before = dr.arange(mi.UInt32, second.visible) * RECORD, dr.opaque(mi.Float, dr.width(first.near) // RECORD)
-        shifted, at_camera = dr.copy(records), dr.gather(mi.Float, records, row + 2) < 0
-        dr.scatter(shifted, dr.gather(mi.Float, records, row) + before, row, at_camera)
-        records, near = shifted, concatenated([first.near, near])
+    records, plane_records = second.records, second.plane_records
+    if plane_records is not None and first.plane_records is not None:
+        # The plane records of the second list follow those of the first.
+        row, before = dr.arange(mi.UInt32, second.visible) * RECORD, dr.width(first.plane_records) // RECORD
+        number = row + GaussianRecord.place("u0")
+        shifted, at_plane = dr.copy(records), dr.gather(mi.Float, records, row + GaussianRecord.place("a")) < 0
+        dr.scatter(shifted, dr.gather(mi.Float, records, number) + dr.opaque(mi.Float, before), number, at_plane)
+        records, plane_records = shifted, concatenated([first.plane_records, plane_records])
     records = concatenated([first.records, records])
-    near = first.near if near is None else near
+    plane_records = first.plane_records if plane_records is None else plane_records
     least = concatenated([first.least, second.least])
-    return _sorted_lists(records, near, pairs, least, visible + second.visible, dr.width(tiles), view, None, tiles)
+    return _sorted_lists(
+        records, plane_records, pairs, least, visible + second.visible, dr.width(tiles), view, None, tiles
+    )
 
 
 def select_tiles(lists: TileLists, places: Any) -> TileLists:
@@ -249,13 +251,13 @@ def sort_by_ray(lists: TileLists, places: Any, view: CameraView) -> TileLists:
     """Sort some non-empty tiles, given by their places in ``lists``, for the order per ray."""
     place, _, number = cast("tuple[Any, Any, Any]", _pairs_in(lists, places, 0))
     tiles = places if lists.tiles is None else dr.gather(mi.UInt32, lists.tiles, places)
-    record = dr.gather(mi.ArrayXf, dr.detach(lists.records), number, shape=(RECORD, dr.width(number)))
+    record = GaussianRecord.fetch(dr.detach(lists.records), number)
     slopes = view.tile_slopes(dr.gather(mi.UInt32, tiles, place))
     level = level_of(least_depth(record, dr.gather(mi.Float, lists.least, number), slopes), view)
     again, count = Pairs(Pairs.key_of(place, level, number)), dr.width(tiles)
     dr.eval(again.key)
     return _sorted_lists(
-        lists.records, lists.near, again, lists.least, lists.visible, count, view, lists.instance, tiles
+        lists.records, lists.plane_records, again, lists.least, lists.visible, count, view, lists.instance, tiles
     )
 
 

@@ -17,7 +17,7 @@ import mitsuba as mi
 
 from mitsplat.quality import KERNELS, Order, Quality
 from mitsplat.renderer.rays.camera_rays import TILE_HEIGHT, TILE_PIXELS, TILE_WIDTH, CameraView
-from mitsplat.renderer.splatting.gaussian import RECORD, general_depth
+from mitsplat.renderer.splatting.records import RECORD, GaussianRecord, PlaneRecord
 from mitsplat.renderer.splatting.tiles import TileLists
 
 SORT_SLOTS = 8
@@ -29,11 +29,8 @@ WINDOW_SLOTS = 8
 Pixel = list[Any]
 """State of a ray, the transmittance first."""
 
-Blend = Callable[[Pixel, Any, Any, Any], Pixel]
-"""Function that returns the state of a ray after one more Gaussian in front-to-back order. Arguments: state, opacity of
-the Gaussian on the ray, its record (for colour and instance), and depth of its peak. An opacity of 0 leaves the state
-unchanged.
-"""
+TRANSMITTANCE = 0
+"""Index of the transmittance in the state of a ray."""
 
 
 def rows_together(order: Order) -> int:
@@ -156,7 +153,7 @@ class Rays:
             column=not view.distortion,
         )
 
-    def respond(self, record: Any) -> list[tuple[Any, Any]]:
+    def respond(self, record: GaussianRecord) -> list[tuple[Any, Any]]:
         """Return (log2 of the opacity along the ray, depth of the peak) of one Gaussian per lane, for each ray."""
         return respond_along(record, self.lists, self.us, self.vs, self.column, self.cap)
 
@@ -217,22 +214,39 @@ _EXP2 = 1.0, 0.69314700, 0.24022242, 0.055507336, 0.0096715130, 0.0013264727
 
 
 @dataclass(frozen=True, eq=False)
-class _Fields:
-    """Record fields that are fetched on access, because the rays of a lane blend different records."""
+class FieldsOnAccess:
+    """Fields of records that are fetched on access, because the rays of a lane blend different records."""
 
     records: Any
     number: Any
     mask: Any
 
-    def __getitem__(self, field: int) -> Any:
-        return dr.gather(mi.Float, self.records, self.number * RECORD + field, self.mask)
+    @property
+    def colour(self) -> list[Any]:
+        """Red, green and blue."""
+        return [self._field(name) for name in ("red", "green", "blue")]
+
+    @property
+    def instance(self) -> Any:
+        """Instance id."""
+        return self._field("instance")
+
+    def _field(self, name: str) -> Any:
+        return dr.gather(mi.Float, self.records, self.number * RECORD + GaussianRecord.place(name), self.mask)
+
+
+Blend = Callable[[Pixel, Any, GaussianRecord | FieldsOnAccess, Any], Pixel]
+"""Function that returns the state of a ray after one more Gaussian in front-to-back order. Arguments: state, opacity of
+the Gaussian on the ray, its record (for colour and instance), and depth of its peak. An opacity of 0 leaves the state
+unchanged.
+"""
 
 
 def respond_along(
-    record: Any, lists: TileLists, us: list[Any], vs: list[Any], shared_column: bool, cap: Any | None
+    record: GaussianRecord, lists: TileLists, us: list[Any], vs: list[Any], shared_column: bool, cap: Any | None
 ) -> list[tuple[Any, Any]]:
     """Return (log2 of the opacity along the ray, peak depth) of a Gaussian on several rays, see `gaussian`."""
-    u0, v0, a, b2, c, opacity, _, _, _, depth, e, f, g, h, i, _ = record
+    u0, v0, a, b2, c, opacity, *_, depth, e, f, g, h, i, _ = record
     result: list[Any] = []
     previous: Any = None
     slant = 0.5 * depth * f
@@ -248,15 +262,14 @@ def respond_along(
         result += [dr.fma(-numerator, inverse, opacity), dr.fma(dv, slant, ahead) * inverse]
 
     def at_the_camera(result: list[Any], row: Any) -> tuple[list[Any], Any]:
-        k = dr.gather(mi.ArrayXf, lists.near, mi.UInt32(row), shape=(RECORD, dr.width(row)))
+        plane_record = PlaneRecord.fetch(lists.plane_records, mi.UInt32(row))
         found: list[Any] = []
         for u, v in zip(us, vs, strict=True):
-            inverse, depth = general_depth(k, u, v)
-            numerator = (k[0] * u + k[1] * v + k[3]) * u + (k[2] * v + k[4]) * v + k[5]
-            found += [opacity - numerator * inverse, depth]
+            q, depth = plane_record.respond(u, v)
+            found += [opacity - q, depth]
         return found, row
 
-    if lists.near is not None:
+    if lists.plane_records is not None:
         result, _ = dr.if_stmt(
             (result, u0), a < 0, at_the_camera, lambda result, row: (result, row), label="gaussian at the camera"
         )
@@ -273,19 +286,17 @@ def _walk_in_tile_order(
     lists, far, near, cut, end = rays.lists, rays.far, rays.near, rays.cut, rays.end
 
     def body(i: Any, pixels: list[Pixel]) -> tuple[Any, list[Pixel]]:
-        record = dr.gather(
-            mi.ArrayXf, lists.records, dr.gather(mi.UInt32, lists.entries, i), shape=(RECORD, dr.width(i))
-        )
+        record = GaussianRecord.fetch(lists.records, dr.gather(mi.UInt32, lists.entries, i))
         blended = []
         responses = rays.respond(record)
         for pixel, (log_alpha, z), z_far in zip(pixels, responses, far, strict=True):
-            hit = (log_alpha > cut) & (z > near) & (z < z_far) & (pixel[0] > end)
+            hit = (log_alpha > cut) & (z > near) & (z < z_far) & (pixel[TRANSMITTANCE] > end)
             alpha, z = dr.select(hit, exp2(log_alpha), 0.0), dr.select(hit, z, 0.0)
             blended.append(blend(pixel, alpha, record, z))
         return i + 1, blended
 
     def alive(i: Any, pixels: list[Pixel]) -> Any:
-        unfinished = (i < rays.stop) & (max_of([pixel[0] for pixel in pixels]) > end)
+        unfinished = (i < rays.stop) & (max_of([pixel[TRANSMITTANCE] for pixel in pixels]) > end)
         return unfinished if continues is None else unfinished & continues(pixels)
 
     _, pixels = dr.while_loop((rays.start, [fresh() for _ in far]), alive, body, label="march")
@@ -315,17 +326,17 @@ def _walk_in_window(rays: Rays, fresh: Callable[[], Pixel], blend: Blend) -> lis
             )
             alpha, number = dr.select(deeper, slot_alpha, alpha), dr.select(deeper, slot_number, number)
             z = dr.minimum(z, slot_z)
-        return blend(pixel, alpha, _Fields(lists.records, number, mi.Bool(True)), z), result
+        return blend(pixel, alpha, FieldsOnAccess(lists.records, number, mi.Bool(True)), z), result
 
     def alive(i: Any, pixels: list[Pixel], windows: list[_Slots]) -> Any:
-        return (i < rays.stop) & (max_of([pixel[0] for pixel in pixels]) > end)
+        return (i < rays.stop) & (max_of([pixel[TRANSMITTANCE] for pixel in pixels]) > end)
 
     def body(i: Any, pixels: list[Pixel], windows: list[_Slots]) -> tuple[Any, list[Pixel], list[_Slots]]:
         number = dr.gather(mi.UInt32, lists.entries, i)
-        record = dr.gather(mi.ArrayXf, lists.records, number, shape=(RECORD, dr.width(i)))
+        record = GaussianRecord.fetch(lists.records, number)
         states = []
         for pixel, window, (log_alpha, z), z_far in zip(pixels, windows, rays.respond(record), far, strict=True):
-            hit = (log_alpha > cut) & (z > near) & (z < z_far) & (pixel[0] > end)
+            hit = (log_alpha > cut) & (z > near) & (z < z_far) & (pixel[TRANSMITTANCE] > end)
             state = pixel, window, z, exp2(log_alpha), number
             states.append(dr.if_stmt(state, hit, push, lambda pixel, window, *_: (pixel, window), label="push"))
         return i + 1, [pixel for pixel, _ in states], [window for _, window in states]
@@ -337,8 +348,8 @@ def _walk_in_window(rays: Rays, fresh: Callable[[], Pixel], blend: Blend) -> lis
     ends = []
     for pixel, window in zip(pixels, windows, strict=True):
         for z, alpha, number in window:
-            seen = (alpha > 0) & (pixel[0] > end)
-            pixel = blend(pixel, dr.select(seen, alpha, 0.0), _Fields(lists.records, number, seen), z)
+            seen = (alpha > 0) & (pixel[TRANSMITTANCE] > end)
+            pixel = blend(pixel, dr.select(seen, alpha, 0.0), FieldsOnAccess(lists.records, number, seen), z)
         ends.append(pixel)
     return ends
 
@@ -353,7 +364,6 @@ def _walk_in_ray_order(rays: Rays, fresh: Callable[[], Pixel], blend: Blend) -> 
     """
     lists, start, stop, far = rays.lists, rays.start, rays.stop, rays.far
     near, cut, end = rays.near, rays.cut, rays.end
-    width = dr.width(start)
     none = 0xFFFFFFFF
 
     def insert(slots: _Slots, left: Any, z: Any, alpha: Any, i: Any) -> tuple[_Slots, Any]:
@@ -376,7 +386,7 @@ def _walk_in_ray_order(rays: Rays, fresh: Callable[[], Pixel], blend: Blend) -> 
             return (i < limit) & wanted
 
         def body(i: Any, slots: list[_Slots], left: list[Any]) -> tuple[Any, list[_Slots], list[Any]]:
-            record = dr.gather(mi.ArrayXf, lists.records, dr.gather(mi.UInt32, lists.entries, i), shape=(RECORD, width))
+            record = GaussianRecord.fetch(lists.records, dr.gather(mi.UInt32, lists.entries, i))
             new_slots, new_left = [], []
             responses = rays.respond(record)
             for (log_alpha, z), own, first_left, z_far, (last_z, last_i) in zip(
@@ -410,13 +420,13 @@ def _walk_in_ray_order(rays: Rays, fresh: Callable[[], Pixel], blend: Blend) -> 
         blended, new_last, unfinished, next_begin = [], [], mi.Bool(False), mi.UInt32(reached)
         for pixel, own, first_left, (last_z, last_i) in zip(pixels, slots, left, last, strict=True):
             for z, alpha, i in own:
-                found = active & (z < dr.inf) & (pixel[0] > end)
+                found = active & (z < dr.inf) & (pixel[TRANSMITTANCE] > end)
                 number = dr.gather(mi.UInt32, lists.entries, i, found)
-                record = _Fields(lists.records, number, found)
+                record = FieldsOnAccess(lists.records, number, found)
                 z = dr.select(found, z, 0.0)  # an empty slot lies at infinity, and 0 * inf is NaN
                 pixel = blend(pixel, dr.select(found, alpha, 0.0), record, z)
             # A ray that has ended gets infinity as its last depth, behind which no peak lies.
-            open_ray = pixel[0] > end
+            open_ray = pixel[TRANSMITTANCE] > end
             z, _, i = own[-1]
             last_i = dr.select(z < last_z, last_i, i)
             blended.append(pixel)

@@ -37,8 +37,8 @@ ensure_variant()
 import drjit as dr  # noqa: E402
 import mitsuba as mi  # noqa: E402
 
-from mitsplat.renderer.light import light  # noqa: E402
-from mitsplat.renderer.light.light_filter import Estimate, LightFilter  # noqa: E402
+from mitsplat.renderer.light import bounce  # noqa: E402
+from mitsplat.renderer.light.light_filter import Estimate, LightFilter, LightMeans  # noqa: E402
 
 ROOT = Path(__file__).resolve().parents[2]
 SMOOTH = LightFilter.smooth
@@ -46,18 +46,15 @@ REFLECTED = 96
 """Rays of reflected light for every pixel of the truth."""
 
 
-def means(
-    light_filter: LightFilter, estimate: Estimate, extra: tuple[Any, Any] | None = None
-) -> tuple[Any, Any, Any, Any, Any]:
+def means(light_filter: LightFilter, estimate: Estimate, bounced: tuple[Any, Any] | None = None) -> LightMeans:
     """What a filter of one pixel would give; bounced light is that of a few rays, and always averaged."""
     count = dr.rcp(dr.maximum(estimate.rays, 1))
-    other = SMOOTH(light_filter, estimate, extra)[4]
-    return (
+    return LightMeans(
         estimate.lit * count,
         estimate.base * count,
         estimate.specular_lit * count,
         estimate.specular_base * count,
-        other,
+        SMOOTH(light_filter, estimate, bounced).bounced,
     )
 
 
@@ -74,7 +71,7 @@ def filtered(by_neighbours: bool) -> Iterator[None]:
 @contextmanager
 def reflected() -> Iterator[None]:
     """Reflected light of many rays, which on meshes is no mean over cells."""
-    rays = patch.multiple(light, BOUNCE_RAYS=REFLECTED, MESH_RAYS=REFLECTED)
+    rays = patch.multiple(bounce, BOUNCE_RAYS=REFLECTED, MESH_RAYS=REFLECTED)
     with rays, patch.object(LightFilter, "average", lambda _, values: values):
         yield
 

@@ -14,9 +14,9 @@ from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.camera import Camera
 from mitsplat.geometry.mesh_normals import CREASE_ANGLE
 from mitsplat.renderer.layers import Layers, make_integrator, make_splats_shape, render_layers
-from mitsplat.renderer.light.light import RECURRENCE
 from mitsplat.renderer.light.light_points import OFFSETS
 from mitsplat.renderer.light.light_tiles import BLOCK
+from mitsplat.renderer.light.shadow_rays import RECURRENCE
 from mitsplat.renderer.occluders.proxies import Proxies, smooth_normals
 
 WHITE_SKY = {"type": "constant", "radiance": {"type": "rgb", "value": 1.0}}

@@ -8,7 +8,7 @@ emitters' light that its diffuse material reflects.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
@@ -20,9 +20,11 @@ from mitsplat.gaussians.spherical_harmonics import SH_C0
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.images.colour import decode_srgb
 from mitsplat.renderer.light.emitter_sampling import Emitters, receiver
+from mitsplat.renderer.light.light_filter import RADIUS, LightFilter
 from mitsplat.renderer.light.light_tiles import STRIDE
+from mitsplat.renderer.light.shadow_rays import ROBERTS, ShadowTracer, ray_origin, sequence_point
 from mitsplat.renderer.occluders.proxies import Proxies
-from mitsplat.renderer.rays.device_arrays import wrapped
+from mitsplat.renderer.rays.device_arrays import gathered, wrapped
 
 CELLS = 80
 """Cells of the grid along its longest side."""
@@ -184,3 +186,44 @@ class Reflectors:
             free = free & ~occluder_scene.occluded(shadow, mi.UInt32(0), key, free)
             dr.eval(free)
         return dr.select(free, colour, 0)
+
+
+def trace_bounce(tracer: ShadowTracer, reflectors: Reflectors) -> tuple[Any, Any]:
+    """Return the reflected irradiance (Color3f) over that of display white, and a flag (Float) where it is known.
+
+    Relit points of objects use a few rays each, so that their neighbours must be averaged. On visible meshes, one
+    pixel in each cell of 2 x 2 is traced, and the result is already a mean over many cells. This mean is necessary,
+    because few rays hit small bright regions such as a wall near a lamp.
+    """
+    surface, view, pixel = tracer.surface, tracer.view, tracer.pixel
+    cells = replace(view, width=-(-view.width // 2), height=-(-view.height // 2))
+    x, y = pixel % view.width, pixel // view.width
+    column, row = x >> 1, y >> 1
+    selected = ((x & 1) == (row & 1)) & (
+        (y & 1) == ((column + row) & 1)
+    )  # equally often in each row and in each column
+    if tracer.lattice is not None:
+        selected |= dr.gather(mi.Bool, tracer.lattice, pixel)
+    thing, count = surface.instance > 0, dr.width(pixel)
+    total, known = mi.Color3f(dr.zeros(mi.Float, count)), dr.zeros(mi.Float, count)
+    for on_mesh, which, rays in ((False, thing, BOUNCE_RAYS), (True, ~thing & selected, MESH_RAYS)):
+        places = dr.compress(surface.relit & which)
+        if not dr.width(places):
+            continue
+        own = gathered(surface, places)
+        start = tracer.sequence_start(dr.gather(mi.UInt32, pixel, places))
+        origin, normal = mi.Point3f(ray_origin(own)), mi.Vector3f(own.normal)
+        dr.eval(own, start, origin, normal)
+        found = reflectors.irradiance(origin, normal, start, rays, _two_points)
+        if on_mesh:
+            cell = dr.gather(mi.UInt32, row * cells.width + column, places)
+            for stride in (1, RADIUS):
+                found = LightFilter(own, cells, cell, stride=stride).average([*found])
+        dr.scatter(total, mi.Color3f(*found), places)
+        dr.scatter(known, mi.Float(1), places)
+        dr.eval(total, known)
+    return total, known
+
+
+def _two_points(i: Any) -> tuple[Any, Any]:
+    return sequence_point(i), sequence_point(i, ROBERTS)

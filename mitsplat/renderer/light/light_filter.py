@@ -96,6 +96,23 @@ class Estimate:
         return self
 
 
+@dataclass(frozen=True, eq=False)
+class LightMeans:
+    """Means of light per ray, over the neighbours of every pixel.
+
+    Attributes:
+        lit, base: Arriving light and reference light (Color3f).
+        specular_lit, specular_base: Arriving and unoccluded light mirrored to the camera.
+        bounced: Reflected light (Color3f) over the irradiance of white, or None.
+    """
+
+    lit: Any
+    base: Any
+    specular_lit: Any
+    specular_base: Any
+    bounced: Any | None
+
+
 class LightFilter:
     """Separable edge-preserving filter at the pixels of an image where light was traced.
 
@@ -162,22 +179,22 @@ class LightFilter:
         allowed = error * dr.power(dr.clip(light, MIN_LIGHT, 1) / MID_GREY, 1 - DISPLAY)
         return estimate.rays * variance * dr.square(unshadowed / allowed) / gain
 
-    def smooth(self, estimate: Estimate, extra: tuple[Any, Any] | None = None) -> tuple[Any, Any, Any, Any, Any]:
-        """Average the first four sums of the estimate, per ray, over neighbours of the pixels of ``index``.
+    def smooth(self, estimate: Estimate, bounced: tuple[Any, Any] | None = None) -> LightMeans:
+        """Average the light of the estimate per ray over neighbours of the pixels of ``index``.
 
-        ``extra`` is additional light (Color3f) and the flag (Float) where it is known (1, otherwise 0). Its average is
-        0 where no neighbour knows it.
+        ``bounced`` is reflected light and the flag (Float) where it is known (1, otherwise 0). Its average is 0 where
+        no neighbour knows it.
         """
         weight = dr.rcp(dr.maximum(estimate.rays, 1))
         values = [c * weight for c in (*estimate.lit, *estimate.base, estimate.specular_lit, estimate.specular_base)]
-        if extra is not None:
-            values += [*extra[0], extra[1]]
+        if bounced is not None:
+            values += [*bounced[0], bounced[1]]
         values, _ = self._average(values, estimate.rays, RADIUS, self._share(estimate)[:2])
-        other = None
-        if extra is not None:
+        mean_bounced = None
+        if bounced is not None:
             *colour, share = values[8:]
-            other = dr.select(share > 1e-6, mi.Color3f(*colour) / share, 0)
-        return mi.Color3f(*values[:3]), mi.Color3f(*values[3:6]), values[6], values[7], other
+            mean_bounced = dr.select(share > 1e-6, mi.Color3f(*colour) / share, 0)
+        return LightMeans(mi.Color3f(*values[:3]), mi.Color3f(*values[3:6]), values[6], values[7], mean_bounced)
 
     def _share(self, estimate: Estimate) -> tuple[Any, Any, Any]:
         """Return the light share over 3 x 3 pixels, its variance, and the number of pixels that contribute."""

@@ -15,10 +15,13 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from mitsplat.renderer.light.emitter_sampling import Emitters
 from mitsplat.renderer.light.light_filter import Estimate
 from mitsplat.renderer.light.light_tiles import BLOCK
-from mitsplat.renderer.light.lit_surface import LitSurface
+from mitsplat.renderer.light.lit_surface import LitSurface, VisibleSurfaces
+from mitsplat.renderer.light.shadow_rays import ShadowTracer
 from mitsplat.renderer.rays.camera_rays import CameraView
+from mitsplat.renderer.rays.device_arrays import gathered
 
 SAMPLES = (BLOCK // 2) ** 2
 """Number of traced pixels in a coarse tile."""
@@ -172,6 +175,49 @@ class Planes:
     @property
     def _across(self) -> int:
         return -(-self.view.width // BLOCK)
+
+
+@dataclass(frozen=True, eq=False)
+class CoarseLight:
+    """First rays of the traced pixels of coarse tiles.
+
+    Attributes:
+        coarse: True for pixels in such a tile, by pixel of the image.
+        lattice: True for traced pixels of such tiles, by pixel of the image.
+        pixel: Numbers of these traced pixels.
+        estimate: Estimate at these pixels.
+    """
+
+    coarse: Any
+    lattice: Any
+    pixel: Any
+    estimate: Estimate
+
+    @classmethod
+    def of(
+        cls, planes: Planes, visible: VisibleSurfaces, emitters: Emitters, seed: int, rays: int
+    ) -> CoarseLight | None:
+        """Trace ``rays`` rays at the samples of planes and keep the evenly lit tiles; return None if there are none."""
+        if not planes.count:
+            return None
+        pixel, view = planes.samples(), visible.view
+        lattice = dr.full(mi.Bool, False, view.width * view.height)
+        dr.scatter(lattice, mi.Bool(True), pixel)
+        surface = visible.at(pixel)
+        dr.eval(surface, lattice)
+        tracer = ShadowTracer(emitters, visible.proxies, surface, pixel, view, seed, lattice)
+        count, steps = dr.width(pixel), (mi.UInt32(0), mi.UInt32(1))
+        rows, rounds = dr.arange(mi.UInt32, count), dr.opaque(mi.UInt32, rays)
+        estimate = tracer.trace(rows, Estimate.empty(count), rounds, rays, steps, matt=True)
+        coarse = planes.coarse(estimate)
+        # In a tile that is not coarse, the samples took other points of the sequence than the rest of its pixels will
+        # take.
+        lattice &= coarse
+        dr.eval(coarse, lattice)
+        kept = dr.compress(dr.gather(mi.Bool, lattice, pixel))
+        if not dr.width(kept):
+            return None
+        return cls(coarse, lattice, dr.gather(mi.UInt32, pixel, kept), gathered(estimate, kept))
 
 
 def between_samples(light: Any, coarse: Any, view: CameraView) -> Any:

@@ -1,0 +1,259 @@
+"""Shadow rays from visible points to sampled emitters, and the low-discrepancy sequence that they take."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from mitsplat.renderer.light.emitter_sampling import Beam, Emitters, receiver
+from mitsplat.renderer.light.highlight import Lobe
+from mitsplat.renderer.light.light_filter import Estimate, packed
+from mitsplat.renderer.light.light_tiles import BLOCK, STRIDE, ShadowTiles, block_order, parity
+from mitsplat.renderer.light.lit_surface import LitSurface
+from mitsplat.renderer.occluders.proxies import OccluderScene, Proxies
+from mitsplat.renderer.rays.camera_rays import CameraView
+from mitsplat.renderer.rays.device_arrays import gathered
+
+ROBERTS = (3242174889, 2447445414)
+"""Additive recurrence of the two-dimensional golden ratio in units of 2^-32 (Roberts 2018, "The unreasonable
+effectiveness of quasirandom sequences"). The shadow search takes one point of it per pixel.
+"""
+
+RECURRENCE = (1996816038, 1246200886)
+"""Additive recurrence of the shadow rays: a pixel takes every 64th point, and its 8 x 8 neighbours take the others.
+
+Every 64th point of this recurrence is a point of Roberts' recurrence, in whose own order every 16th point is nearly the
+same. There are 4096 recurrences of this kind; in this one consecutive points are farthest apart.
+"""
+
+WORD_BITS = 32
+"""Number of rays whose occlusion is stored as bits of one integer."""
+
+
+@dataclass(frozen=True, eq=False)
+class ShadowTracer:
+    """Shadow rays from visible points.
+
+    Attributes:
+        emitters: Emitters of the scene.
+        proxies: Occluders.
+        surface: The points.
+        pixel: Number of the image's pixel of each point; None if the points are those of all pixels.
+        view: Camera.
+        seed: Offset into the sequence.
+        lattice: True for traced pixels of coarse tiles, by pixel of the image; None if there are no coarse tiles.
+    """
+
+    emitters: Emitters
+    proxies: Proxies
+    surface: LitSurface
+    pixel: Any | None
+    view: CameraView
+    seed: int
+    lattice: Any | None = None
+
+    def search(self, captured: Any) -> ShadowTiles:
+        """Estimate by tiles the light that dynamic objects occlude, with one ray per captured point of all pixels.
+
+        The four blocks of a 2 x 2 group have different points; otherwise a shadow too small for the points of one block
+        would be missed in all of them. The light without dynamic objects is only a divisor, for which a quarter of the
+        rays is sufficient. The other rays test static occluders only if a dynamic object occludes them as well.
+        """
+        proxies, width = self.proxies, self.view.width
+        pixel, inside = block_order(self.view)
+        origin, normal, offset, instance = _packed_rays(self.surface, captured, pixel)
+        x, y = pixel % width, pixel // width
+        number = self.sequence_start(pixel) + parity(x // BLOCK, y // BLOCK) * STRIDE
+        active = inside & (offset > 0)
+        beam = self.emitters.sample(receiver(origin, normal), sequence_point(number, ROBERTS), active)
+        ray, key = _shadow_ray(origin, beam, offset), pixel * RECURRENCE[0] + number
+        active &= dr.sum(beam.irradiance) > 0
+        blocked, counts, share = mi.Bool(False), active, 1
+        for occluder_scene in proxies.shadow_casters:
+            blocked |= occluder_scene.occluded(ray, instance, key, active & ~blocked)
+            if proxies.separate_kernels:
+                dr.eval(blocked)
+        if proxies.static is not None:
+            one_of_four = ((x | y) & 1) == 0
+            stopped = proxies.static.occluded(ray, instance, key, active & (blocked | one_of_four))
+            blocked &= ~stopped
+            counts, share = active & one_of_four & ~stopped, 4
+        arriving = dr.select(counts, beam.irradiance * share, 0)
+        lost = dr.select(blocked, beam.irradiance, 0)
+        dr.eval(arriving, lost)
+        return ShadowTiles.of(arriving, lost, self.view)
+
+    def trace(
+        self, places: Any, before: Estimate, rays: Any, most: int, steps: tuple[Any, Any], *, matt: bool = False
+    ) -> Estimate:
+        """Add ``rays`` more rays to an estimate at ``places``.
+
+        Args:
+            places: Indices of the points.
+            before: Estimate so far.
+            rays: Number of additional rays per point.
+            most: Upper limit of ``rays``.
+            steps: First number in the sequence of the pixel, and the step to the next number, by point.
+            matt: True if no point mirrors light, so that the highlight sums are skipped.
+        """
+        separate_kernels = self.proxies.separate_kernels
+        if separate_kernels and most > WORD_BITS:
+            for begin in range(0, most, WORD_BITS):
+                part = dr.minimum(dr.maximum(rays, begin) - begin, WORD_BITS)
+                before = self.trace(places, before, part, min(WORD_BITS, most - begin), steps, matt=matt)
+            return before
+        batch = _RayBatch.of(self, places, before, steps)
+        known: list[Any] = []
+        if separate_kernels:  # one bit per ray and scene except the last, one kernel each
+            for occluder_scene in self.proxies.occluder_scenes[:-1]:
+                known.append(batch.occlusion_bits(occluder_scene, rays, known))
+        sums = batch.add_light([dr.gather(type(v), v, places) for v in before.sums], rays, known, matt)
+        return before.updated(places, *sums, dr.gather(mi.Float, before.rays, places) + mi.Float(rays))
+
+    def sequence_start(self, pixel: Any) -> Any:
+        """Return the number of the first point of pixels in the sequence."""
+        start = dr.opaque(mi.UInt32, self.seed * 2654435761 % (1 << 32))
+        x, y = pixel % self.view.width, pixel // self.view.width
+        if self.lattice is not None:
+            # Traced neighbours are two pixels apart there.
+            shift = dr.select(dr.gather(mi.Bool, self.lattice, pixel), mi.UInt32(1), 0)
+            x, y = x >> shift, y >> shift
+        return start + _bayer(x, y)
+
+
+@dataclass(frozen=True, eq=False)
+class _RayBatch:
+    """Shadow rays from some points: ray i of a point takes point ``start + i * step`` of the sequence.
+
+    Attributes:
+        tracer: Emitters and occluders.
+        surface, pixel: The points and their pixels.
+        origin: Ray origins [m].
+        start, step: Numbers in the sequence, by point.
+    """
+
+    tracer: ShadowTracer
+    surface: LitSurface
+    pixel: Any
+    origin: Any
+    start: Any
+    step: Any
+
+    @classmethod
+    def of(cls, tracer: ShadowTracer, places: Any, before: Estimate, steps: tuple[Any, Any]) -> _RayBatch:
+        """Create the rays that follow those of an estimate."""
+        surface = gathered(tracer.surface, places)
+        pixel = dr.gather(mi.UInt32, tracer.pixel, places)
+        begin, step = steps
+        done = mi.UInt32(dr.gather(mi.Float, before.rays, places))
+        start = tracer.sequence_start(pixel) + (begin + done * step) * STRIDE
+        return cls(tracer, surface, pixel, ray_origin(surface), start, step * STRIDE)
+
+    def sample(self, i: Any) -> tuple[Beam, Any, Any]:
+        """Sample ray ``i`` of every point: its beam, its number in the sequence, and True if it carries light."""
+        surface, number = self.surface, self.start + i * self.step
+        beam = self.tracer.emitters.sample(
+            receiver(surface.position, surface.normal), sequence_point(number), surface.valid
+        )
+        return beam, number, surface.valid & (dr.sum(beam.irradiance) > 0)
+
+    def occluded(self, occluder_scene: OccluderScene, beam: Beam, number: Any, active: Any) -> Any:
+        """Return True for rays that a scene occludes."""
+        ray = _shadow_ray(self.origin, beam, self.surface.offset)
+        return occluder_scene.occluded(ray, self.surface.instance, self.pixel * RECURRENCE[0] + number, active)
+
+    def occlusion_bits(self, occluder_scene: OccluderScene, rays: Any, known: Sequence[Any]) -> Any:
+        """Return the rays that a scene occludes and the scenes of ``known`` do not, as bits of an integer per point."""
+
+        def add_bit(i: Any, word: Any) -> tuple[Any, Any]:
+            beam, number, free = self.sample(i)
+            for occluded in _bits(known, i):
+                free = free & ~occluded
+            return i + 1, word | dr.select(self.occluded(occluder_scene, beam, number, free), mi.UInt32(1) << i, 0)
+
+        nothing = dr.zeros(mi.UInt32, dr.width(self.pixel))
+        _, word = dr.while_loop((nothing, mi.UInt32(nothing)), lambda i, _: i < rays, add_bit, label="stopped")
+        dr.eval(word)
+        return word
+
+    def add_light(self, sums: list[Any], rays: Any, known: Sequence[Any], matt: bool) -> list[Any]:
+        """Add the light of rays to the sums of an :class:`Estimate`.
+
+        With the unoccluded estimate e = L(w) max(0, n.w) / p(w) of a ray (Veach 1997, section 2.4.2), visibility V
+        past all occluders and V_0 past static occluders, a point adds V e to ``lit`` and V_0 e to ``base`` if its
+        captured colours contain shadows, or e if it is relit. ``known`` holds the occlusion of the first scenes as
+        bits; the other scenes are traced here.
+        """
+        proxies, surface, lobe = self.tracer.proxies, self.surface, Lobe.of(self.surface)
+
+        def add(i: Any, lit: Any, base: Any, specular_lit: Any, specular_base: Any, squares: Any) -> tuple[Any, ...]:
+            beam, number, active = self.sample(i)
+            occluded = _bits(known, i)
+            static_light = free = active
+            for each, occluder_scene in enumerate(proxies.occluder_scenes):
+                if each < len(occluded):
+                    free = free & ~occluded[each]
+                else:
+                    free = free & ~self.occluded(occluder_scene, beam, number, free)
+                if occluder_scene is proxies.static:
+                    static_light = free
+            light, unshadowed = (dr.select(where, beam.irradiance, 0) for where in (free, static_light))
+            compared = dr.select(surface.relit, dr.select(active, beam.irradiance, 0), unshadowed)
+            lit += light
+            base += compared
+            if not matt:
+                reflectance = lobe.reflectance(beam.direction)
+                specular_lit += dr.sum(light) * reflectance
+                specular_base += dr.select(active, dr.sum(beam.irradiance) * reflectance, 0)
+            squares += dr.square(dr.sum(compared))
+            return i + 1, lit, base, specular_lit, specular_base, squares
+
+        state = dr.zeros(mi.UInt32, dr.width(self.pixel)), *sums
+        _, *sums = dr.while_loop(state, lambda i, *_: i < rays, add, label="light")
+        return sums
+
+
+def _bits(words: Sequence[Any], i: Any) -> list[Any]:
+    """Return bit ``i`` (Bool) of words."""
+    return [(word >> i & 1) != 0 for word in words]
+
+
+def ray_origin(surface: LitSurface) -> Any:
+    """Return the origins of shadow rays: on the smooth surface of the proxy, and off the triangle itself."""
+    return surface.position + surface.lift + surface.face * surface.offset
+
+
+def _packed_rays(surface: LitSurface, selected: Any, pixel: Any) -> tuple[Any, Any, Any, Any]:
+    """Return ray origins, normals, offsets and instances of pixels in any order, given the points of all pixels.
+
+    The offset is 0 where ``selected`` is False. The values are packed, because separate fetches take half of the
+    time.
+    """
+    offset = dr.select(selected, surface.offset, 0)
+    rows = packed([*ray_origin(surface), *surface.normal, offset, surface.instance])
+    row = dr.gather(mi.ArrayXf, rows, pixel, shape=(8, dr.width(pixel)))
+    return mi.Point3f(*row[:3]), mi.Vector3f(*row[3:6]), row[6], row[7]
+
+
+def _shadow_ray(origin: Any, beam: Any, offset: Any) -> Any:
+    ray = mi.Ray3f(origin, beam.direction)
+    ray.maxt = dr.maximum(beam.reach - 2 * offset, 0)
+    return ray
+
+
+def sequence_point(i: Any, recurrence: tuple[int, int] = RECURRENCE) -> Any:
+    """Return point ``i`` of a low-discrepancy sequence with 24 bits of precision for every ``i``."""
+    return mi.Point2f(*[mi.Float((i * step) >> 8) * 2.0**-24 for step in recurrence])
+
+
+def _bayer(x: Any, y: Any) -> Any:
+    """Return the rank of a pixel in an 8 x 8 ordered-dither matrix: neighbours take distant points of the sequence."""
+    result = mi.UInt32(0)
+    for bit in range(3):
+        a, b = (x >> bit) & 1, (y >> bit) & 1
+        result |= ((a ^ b) << (5 - 2 * bit)) | (b << (4 - 2 * bit))
+    return result

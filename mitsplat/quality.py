@@ -62,7 +62,7 @@ class Quality:
             depths and instances stay those of the tile's order.
         sh_degree: Highest spherical-harmonic degree that is evaluated.
         samples: Rays per pixel along each axis (n x n on a regular grid, box-filtered). ``edges`` takes one ray, and 2
-            x 2 at borders between instances, see :mod:`mitsplat.renderer.splatting.antialiasing`.
+            x 2 at borders between instances, see :mod:`mitsplat.renderer.instances.antialiasing`.
         lens_rings: Rings of sample points around the centre of a thin lens: 1, 2, 3 take 7, 19, 37 images. Wide blur
             shows single points, and more rings make it smooth.
     """

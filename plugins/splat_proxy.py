@@ -15,6 +15,7 @@ import numpy as np
 from mitsplat.images.masks import Silhouette
 from mitsplat.plugins.parameters import Parameters
 from mitsplat.quality import Quality, resolve_quality
+from mitsplat.renderer.instances.antialiasing import Edges
 from mitsplat.renderer.instances.primary_visibility import PrimaryVisibility
 from mitsplat.renderer.instances.silhouettes import proxy_silhouettes, splat_silhouettes
 from mitsplat.renderer.light.bounce import RadianceGrid
@@ -34,7 +35,6 @@ from mitsplat.renderer.occluders.proxies import Occluder, Proxies
 from mitsplat.renderer.occluders.splat_occlusion import Caster
 from mitsplat.renderer.rays.camera_rays import CameraView
 from mitsplat.renderer.rays.sensors import view_of
-from mitsplat.renderer.splatting.antialiasing import Edges
 from mitsplat.renderer.splatting.gaussian import Cloud, upload_cloud
 from mitsplat.renderer.splatting.march import Image, largest_and_mean, trace
 from mitsplat.renderer.splatting.pairs import CrowdedError

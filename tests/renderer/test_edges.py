@@ -90,7 +90,7 @@ def test_edges_are_smooth_for_each_point_of_a_lens() -> None:
 def test_pixels_beside_another_instance_are_sampled_again() -> None:
     from mitsplat.renderer.layers import make_sensor
     from mitsplat.renderer.rays.sensors import view_of
-    from mitsplat.renderer.splatting.antialiasing import BLOCK_HEIGHT, BLOCK_WIDTH, Edges
+    from mitsplat.renderer.instances.antialiasing import BLOCK_HEIGHT, BLOCK_WIDTH, Edges
 
     view = view_of(make_sensor(CAMERA))
     keys = np.zeros((CAMERA.height, CAMERA.width), np.uint32)
@@ -187,7 +187,7 @@ def test_both_sides_of_a_border_have_their_own_light() -> None:
 
 
 def test_crowded_edges_are_sampled_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
-    from mitsplat.renderer.splatting import antialiasing as edges
+    from mitsplat.renderer.instances import antialiasing as edges
     from mitsplat.renderer.splatting import pairs
 
     scene = scene_of()

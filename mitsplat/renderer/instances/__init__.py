@@ -1,5 +1,5 @@
-"""Primary visibility and complete silhouettes of instances.
+"""Primary visibility, complete silhouettes and antialiased borders of instances.
 
-In: tile lists and visible meshes. Out: the instance that each pixel shows, and the mask that each instance would have
-without occluders.
+In: tile lists and visible meshes. Out: the instance that each pixel shows, the mask that each instance would have
+without occluders, and finer rays at the borders of instances.
 """

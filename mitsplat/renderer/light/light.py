@@ -183,7 +183,8 @@ def search_shadows(lighting: Lighting) -> tuple[Any, Any, Any | None]:
         :func:`mitsplat.renderer.light.light_planes.plane_codes`, None if no plane is visible.
     """
     visible, error = lighting.visible, lighting.accuracy.error
-    everything = visible.at(dr.arange(mi.UInt32, lighting.pixels))
+    pixel = dr.arange(mi.UInt32, lighting.pixels)
+    everything = visible.at(pixel)
     needed, light, codes = everything.valid, mi.Color3f(1), None
     if error > 0:
         captured = everything.valid & ~(everything.relit | (everything.specular > 0))
@@ -191,7 +192,7 @@ def search_shadows(lighting: Lighting) -> tuple[Any, Any, Any | None]:
         some_captured, some_planes = dr.any(captured), dr.any(plane_code != 0)
         dr.eval(everything.valid, captured, plane_code)
         if some_captured:
-            tracer = ShadowTracer(lighting.emitters, lighting.proxies, everything, None, lighting.view, lighting.seed)
+            tracer = ShadowTracer(lighting.emitters, lighting.proxies, everything, pixel, lighting.view, lighting.seed)
             tiles = tracer.search(captured)
             needed = everything.valid & (~captured | tiles.differs(error))
             light = dr.select(everything.valid, tiles.light(), 1)

@@ -42,7 +42,7 @@ class ShadowTracer:
         emitters: Emitters of the scene.
         proxies: Occluders.
         surface: The points.
-        pixel: Number of the image's pixel of each point; None if the points are those of all pixels.
+        pixel: Number of the image's pixel of each point.
         view: Camera.
         seed: Offset into the sequence.
         lattice: True for traced pixels of coarse tiles, by pixel of the image; None if there are no coarse tiles.
@@ -51,7 +51,7 @@ class ShadowTracer:
     emitters: Emitters
     proxies: Proxies
     surface: LitSurface
-    pixel: Any | None
+    pixel: Any
     view: CameraView
     seed: int
     lattice: Any | None = None

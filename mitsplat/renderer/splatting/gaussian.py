@@ -361,4 +361,4 @@ def respond_at_plane(gaussian: PlacedGaussian) -> PlaneRecord:
     numerator = [value * LOG2_E_HALF for value in map(dr.detach, quadratic(c1, c2, c3))]
     denominator = map(dr.detach, quadratic(w1, w2, w3))
     depth = (dr.detach(gaussian.scale * dr.dot(wm, w)) for w in (w1, w2, w3))
-    return PlaneRecord(*numerator, *denominator, *depth, mi.Float(0))
+    return PlaneRecord._make([*numerator, *denominator, *depth, mi.Float(0)])

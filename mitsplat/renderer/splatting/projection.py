@@ -206,19 +206,19 @@ class Projector:
         )
         sigma = dr.gather(mi.ArrayXf, self.clouds.scales, local, mode=_ADJOINT, shape=(4, dr.width(local)))
         point, centre, rest = packet[Geometry.MEAN], row[PlacementRow.CENTRE], row[PlacementRow.CENTRE_REST]
-        return _Input(
-            PlacedGaussian(
-                mi.Vector3f(*[point[i] - centre[i] - rest[i] for i in range(3)]),
-                rotation_axes(packet[Geometry.QUATERNION]),
-                [sigma[i] for i in range(3)],
-                *(mi.Vector3f(*row[axis]) for axis in (PlacementRow.RIGHT, PlacementRow.DOWN, PlacementRow.FORWARD)),
-                row[PlacementRow.SCALE],
-            ),
-            packet[Geometry.OPACITY],
-            row[PlacementRow.INSTANCE],
-            [*row[PlacementRow.APPEARANCE]],
-            mi.Vector3f(*point),
+        columns = PlacementRow.RIGHT, PlacementRow.DOWN, PlacementRow.FORWARD
+        right, down, forward = (mi.Vector3f(*row[column]) for column in columns)
+        gaussian = PlacedGaussian(
+            mean=mi.Vector3f(*[point[i] - centre[i] - rest[i] for i in range(3)]),
+            axes=rotation_axes(packet[Geometry.QUATERNION]),
+            sigma=[sigma[i] for i in range(3)],
+            right=right,
+            down=down,
+            forward=forward,
+            scale=row[PlacementRow.SCALE],
         )
+        appearance = [*row[PlacementRow.APPEARANCE]]
+        return _Input(gaussian, packet[Geometry.OPACITY], row[PlacementRow.INSTANCE], appearance, mi.Vector3f(*point))
 
     def _bounds(self, g: _Input) -> _Bounds:
         """Return response, opacity and bounds of Gaussians.

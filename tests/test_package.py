@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 import mitsplat
-from mitsplat.renderer.layers import ensure_variant
+from mitsplat.runtime.variant import ensure_variant
 
 ROOT = Path(__file__).parents[1]
 

@@ -37,7 +37,7 @@ from mitsplat.geometry.camera import Camera
 from mitsplat.reconstruct.asset_evaluation import iou, show_asset
 from mitsplat.reconstruct.pipeline.asset_pipeline import asset_from_photos
 from mitsplat.reconstruct.reconstruct import AssetJob, ReconstructSettings
-from mitsplat.renderer.layers import ensure_variant
+from mitsplat.runtime.variant import ensure_variant
 
 WANTED = {
     "photos kept, %": 95.0,

@@ -38,7 +38,7 @@ from mitsplat.geometry.mesh_distance import DistanceSurface
 from mitsplat.reconstruct.asset_evaluation import iou
 from mitsplat.reconstruct.pipeline.asset_pipeline import asset_from_photos
 from mitsplat.reconstruct.reconstruct import AssetJob
-from mitsplat.renderer.layers import ensure_variant
+from mitsplat.runtime.variant import ensure_variant
 from mitsplat.scene.loading.scene_loading import load_scene
 
 BOARD = Board(7, 5, 0.035)

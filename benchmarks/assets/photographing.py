@@ -13,8 +13,8 @@ import numpy as np
 from PIL import Image
 
 from mitsplat.geometry.camera import Camera
-from mitsplat.renderer.layers import ensure_variant
 from mitsplat.runtime.cores import usable_cores
+from mitsplat.runtime.variant import ensure_variant
 
 
 class Sensors:

@@ -21,7 +21,7 @@ from mitsplat.bake.mesh_parts import read_parts
 from mitsplat.bake.proxy_mesh import make_proxy
 from mitsplat.geometry.decomposition import convex_pieces, denoise_solid, max_gap
 from mitsplat.geometry.mesh_distance import DistanceSurface, standoff
-from mitsplat.renderer.layers import ensure_variant
+from mitsplat.runtime.variant import ensure_variant
 
 
 def main() -> None:

@@ -26,8 +26,8 @@ from mitsplat.reconstruct.asset_evaluation import iou
 from mitsplat.reconstruct.segment_splats import MaskedView
 from mitsplat.reconstruct.silhouette_refinement import MeshRefineSettings, refine_mesh
 from mitsplat.reconstruct.surface import SurfaceSettings, reconstruct_surface
-from mitsplat.renderer.layers import ensure_variant
 from mitsplat.renderer.rays.device_arrays import plain_mesh, ray_scene
+from mitsplat.runtime.variant import ensure_variant
 
 WAVE = 8.0
 """Length over which an outline wavers [px]."""

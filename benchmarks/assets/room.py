@@ -37,7 +37,7 @@ from mitsplat.geometry.camera import Camera
 from mitsplat.reconstruct.asset_evaluation import VERDICT_FILE
 from mitsplat.reconstruct.pipeline.asset_pipeline import asset_from_photos
 from mitsplat.reconstruct.reconstruct import AssetJob
-from mitsplat.renderer.layers import ensure_variant
+from mitsplat.runtime.variant import ensure_variant
 from mitsplat.scene.loading.scene_loading import load_scene
 
 PARTS = Path(__file__).parents[2] / "scenes" / "assets"

@@ -41,7 +41,7 @@ from mitsplat.reconstruct.asset_evaluation import VERDICT_FILE, iou, show_asset
 from mitsplat.reconstruct.pipeline.asset_pipeline import asset_from_photos
 from mitsplat.reconstruct.reconstruct import AssetJob, ReconstructSettings
 from mitsplat.reconstruct.surface import SurfaceSettings
-from mitsplat.renderer.layers import ensure_variant
+from mitsplat.runtime.variant import ensure_variant
 
 WIDTH, SAMPLES = 320, 12
 AROUND, CLOSE, FINE = 8, 26.0, 24

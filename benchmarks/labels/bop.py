@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 
 from benchmarks.record import figure, recording
-from mitsplat.renderer.layers import ensure_variant
 from mitsplat.renderer.rays.device_arrays import ray_scene
+from mitsplat.runtime.variant import ensure_variant
 
 
 def cast(mesh: Any, rotation: Any, shift: Any, matrix: Any, width: int, height: int) -> np.ndarray:

@@ -48,16 +48,10 @@ from mitsplat.bake.mesh_parts import MeshPart, bake_lights, mitsuba_scene, read_
 from mitsplat.frames.camera_response import light_image
 from mitsplat.geometry.camera import Camera
 from mitsplat.images.colour import LUMINANCE, encode_srgb
-from mitsplat.renderer.layers import (
-    Layers,
-    ensure_variant,
-    make_integrator,
-    make_sensor,
-    make_splats_shape,
-    render_layers,
-)
+from mitsplat.renderer.layers import Layers, make_integrator, make_sensor, make_splats_shape, render_layers
 from mitsplat.renderer.occluders.proxies import Occluder, Proxies
 from mitsplat.renderer.path_tracing import trace_radiance
+from mitsplat.runtime.variant import ensure_variant
 from mitsplat.scene.spec.image_spec import Composite
 from mitsplat.scene.spec.light_spec import AreaLight, EnvironmentLight, LightSpec, SpotLight
 from scenes.build import materials as m

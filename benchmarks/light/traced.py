@@ -30,7 +30,8 @@ from mitsplat.arrays import Float32Array
 from mitsplat.frames.camera_response import develop, light_image
 from mitsplat.frames.frame import Renderer, light_properties
 from mitsplat.quality import resolve_quality
-from mitsplat.renderer.layers import Layers, ensure_variant, make_integrator, render_layers
+from mitsplat.renderer.layers import Layers, make_integrator, render_layers
+from mitsplat.runtime.variant import ensure_variant
 from mitsplat.scene.planning.frame_plan import FramePlan, layout_of, plan_frame
 
 ensure_variant()

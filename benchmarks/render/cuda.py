@@ -46,7 +46,7 @@ def median_ms(run: Callable[[], object], sync: Callable[[], None], repeats: int 
 
 def time_ours(splats: Splats) -> None:
     """Print the time of binning and march, per preset."""
-    from mitsplat.plugins.splat_proxy import view_of
+    from mitsplat.renderer.rays.sensors import view_of
     from mitsplat.renderer.splatting.gaussian import upload_cloud
     from mitsplat.renderer.splatting.march import march
     from mitsplat.renderer.splatting.projection import Placement, merge_clouds

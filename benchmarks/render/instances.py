@@ -27,7 +27,8 @@ from benchmarks.record import figure, recording
 from mitsplat.frames.frame import Renderer
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.quality import PRESETS
-from mitsplat.renderer.layers import ensure_variant, make_integrator, make_sensor, make_splats_shape
+from mitsplat.renderer.layers import make_integrator, make_sensor, make_splats_shape
+from mitsplat.runtime.variant import ensure_variant
 from mitsplat.scene.planning.frame_plan import layout_of, plan_frame
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -69,7 +70,7 @@ def crowd(count: int = 8, each: int = 4000) -> dict[str, Any]:
 
 def print_costs(name: str, integrator: Any, scene: Any, camera: ms.Camera, repeats: int = 7) -> None:
     """Time of the march with all instances told apart, with the first walk alone, and with all taken for one."""
-    from mitsplat.plugins.splat_proxy import view_of
+    from mitsplat.renderer.rays.sensors import view_of
     from mitsplat.renderer.splatting import march
     from mitsplat.renderer.splatting.tiles import bin_gaussians
 

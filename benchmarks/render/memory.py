@@ -25,13 +25,8 @@ import numpy as np
 # isort: on
 from benchmarks.record import figure, recording
 from mitsplat.quality import PRESETS, Quality
-from mitsplat.renderer.layers import (
-    ensure_variant,
-    make_integrator,
-    make_splats_shape,
-    render_layers,
-    render_silhouettes,
-)
+from mitsplat.renderer.layers import make_integrator, make_splats_shape, render_layers, render_silhouettes
+from mitsplat.runtime.variant import ensure_variant
 
 
 def peak() -> float:
@@ -59,9 +54,9 @@ def forward(count: int) -> None:
 
 def backward(count: int) -> None:
     """Gradients of an image of many Gaussians."""
-    from mitsplat.plugins.splat_proxy import view_of
     from mitsplat.renderer.differentiation.backward import pack_cloud, render_differentiable
     from mitsplat.renderer.layers import make_sensor
+    from mitsplat.renderer.rays.sensors import view_of
 
     splats = synthetic(count)
     names = ("means", "quats", "scales", "opacities", "sh")

@@ -37,7 +37,8 @@ from mitsplat.frames.speed_accuracy import look_around
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.camera import Camera
 from mitsplat.quality import PRESETS, Quality
-from mitsplat.renderer.layers import ensure_variant, make_sensor
+from mitsplat.renderer.layers import make_sensor
+from mitsplat.runtime.variant import ensure_variant
 from mitsplat.scene.planning.frame_plan import layout_of, plan_frame
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -68,7 +69,7 @@ class Picture:
     """Splats on the device, as one camera sees them."""
 
     def __init__(self, splats: Splats, camera: Camera) -> None:
-        from mitsplat.plugins.splat_proxy import view_of
+        from mitsplat.renderer.rays.sensors import view_of
         from mitsplat.renderer.splatting.gaussian import upload_cloud
         from mitsplat.renderer.splatting.projection import Placement, merge_clouds
 

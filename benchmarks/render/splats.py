@@ -33,7 +33,8 @@ from mitsplat.frames.speed_accuracy import look_around, picture_of
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.camera import Camera
 from mitsplat.quality import PRESETS, Quality
-from mitsplat.renderer.layers import ensure_variant, make_sensor, render_splats
+from mitsplat.renderer.layers import make_sensor, render_splats
+from mitsplat.runtime.variant import ensure_variant
 
 FMA_PER_EVALUATION = 20
 """Fused multiply-adds, or operations that cost as much, of one Gaussian on one ray: response, blending, ids."""
@@ -58,7 +59,7 @@ def timed(run: Callable[[], object]) -> float:
 
 def stages(splats: Splats, camera: Camera, quality: Quality) -> tuple[float, float, int]:
     """Seconds of projecting, binning and sorting, seconds of the march, and pairs of a Gaussian and a tile."""
-    from mitsplat.plugins.splat_proxy import view_of
+    from mitsplat.renderer.rays.sensors import view_of
     from mitsplat.renderer.splatting.gaussian import upload_cloud
     from mitsplat.renderer.splatting.march import march
     from mitsplat.renderer.splatting.projection import Placement, merge_clouds

@@ -32,9 +32,8 @@ from mitsplat.geometry.camera import Camera, spiral
 from mitsplat.geometry.decomposition import convex_pieces
 from mitsplat.images.colour import encode_srgb
 from mitsplat.progress import Progress
-from mitsplat.renderer.layers import ensure_variant
 from mitsplat.renderer.path_tracing import RAYS_PER_LAUNCH, render_mesh, trace_radiance
-from mitsplat.runtime.variant import one_at_a_time
+from mitsplat.runtime.variant import ensure_variant, one_at_a_time
 from mitsplat.scene.spec.light_spec import LightSpec
 
 _MIN_RADIANCE = 0.01

@@ -17,10 +17,11 @@ from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.camera import Camera
 from mitsplat.quality import Quality
 from mitsplat.renderer.differentiation.backward import Eye
-from mitsplat.renderer.layers import ensure_variant, make_sensor
+from mitsplat.renderer.layers import make_sensor
 from mitsplat.renderer.rays.device_arrays import number, on_device, wrapped
 from mitsplat.renderer.rays.sensors import view_of
 from mitsplat.runtime.recorded_kernels import recorded
+from mitsplat.runtime.variant import ensure_variant
 
 
 @dataclass(frozen=True, eq=False)

@@ -32,10 +32,10 @@ from mitsplat.geometry.camera import Camera
 from mitsplat.quality import Quality
 from mitsplat.renderer.differentiation.backward import DepthRendering
 from mitsplat.renderer.differentiation.photometric_loss import photometric_loss
-from mitsplat.renderer.layers import ensure_variant
 from mitsplat.renderer.rays.device_arrays import number, on_device
 from mitsplat.runtime.cores import usable_cores
 from mitsplat.runtime.recorded_kernels import recorded
+from mitsplat.runtime.variant import ensure_variant
 from mitsplat.storage.content_hash import ContentHash
 from mitsplat.version import __version__
 

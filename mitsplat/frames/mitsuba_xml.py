@@ -24,11 +24,12 @@ from mitsplat.frames.untrusted_xml import check_xml
 from mitsplat.images.colour import decode_srgb
 from mitsplat.physics.settle import settle_layout
 from mitsplat.progress import Note
-from mitsplat.renderer.layers import describe_sensor, ensure_variant
+from mitsplat.renderer.layers import describe_sensor
 from mitsplat.renderer.rays.sensors import view_of
 from mitsplat.renderer.scene_emitters import emitter_dict
 from mitsplat.renderer.textures import finished_mesh, material, texture_image
 from mitsplat.runtime.device import Device
+from mitsplat.runtime.variant import ensure_variant
 from mitsplat.scene.planning.conveyor import Belt, layout_at_view
 from mitsplat.scene.planning.frame_plan import layout_of, plan_frame
 from mitsplat.scene.planning.layout_surroundings import MaterialDraw, draw_surroundings

@@ -10,8 +10,8 @@ import numpy.typing as npt
 import trimesh
 
 from mitsplat.arrays import Float64Array
-from mitsplat.renderer.layers import ensure_variant
 from mitsplat.renderer.rays.device_arrays import plain_mesh
+from mitsplat.runtime.variant import ensure_variant
 
 _MIN_AREA_RATIO = 1e-3
 """Least signed area of a moved face, projected onto its original plane, as a share of its original area."""

@@ -31,8 +31,9 @@ from mitsplat.geometry.camera import Camera
 from mitsplat.progress import Progress
 from mitsplat.quality import Quality
 from mitsplat.renderer.differentiation.backward import pack_cloud, render_differentiable
-from mitsplat.renderer.layers import ensure_variant, make_sensor, render_splats
+from mitsplat.renderer.layers import make_sensor, render_splats
 from mitsplat.renderer.rays.sensors import view_of
+from mitsplat.runtime.variant import ensure_variant
 
 MIN_INSIDE_SHARE = 0.5
 """Least share of a Gaussian's visible weight inside the masks."""

@@ -33,8 +33,8 @@ from mitsplat.geometry.camera import Camera
 from mitsplat.progress import Progress
 from mitsplat.reconstruct.fold_repair import limit_motion
 from mitsplat.reconstruct.segment_splats import MaskedView
-from mitsplat.renderer.layers import ensure_variant
 from mitsplat.renderer.rays.device_arrays import plain_mesh, ray_scene, wrapped
+from mitsplat.runtime.variant import ensure_variant
 
 _VIEW_RADIUS = 1.1
 """Radius that a view shows around the centre of the mesh, in radii of the mesh."""

@@ -30,8 +30,9 @@ from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.camera import Camera
 from mitsplat.geometry.mesh import join_meshes
 from mitsplat.progress import Progress
-from mitsplat.renderer.layers import ensure_variant, make_sensor, render_splats
+from mitsplat.renderer.layers import make_sensor, render_splats
 from mitsplat.renderer.rays.sensors import view_of
+from mitsplat.runtime.variant import ensure_variant
 
 _OPAQUE = 0.5
 """Least alpha of a pixel that shows the splats' surface."""

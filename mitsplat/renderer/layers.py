@@ -21,8 +21,7 @@ from mitsplat.quality import Quality, resolve_quality
 from mitsplat.renderer.lazy_value import LazyValue
 from mitsplat.renderer.rays.device_arrays import wrapped
 from mitsplat.runtime.dropped_rays import check_dropped_rays
-from mitsplat.runtime.variant import ensure_variant as ensure_variant
-from mitsplat.runtime.variant import one_at_a_time
+from mitsplat.runtime.variant import ensure_variant, one_at_a_time
 
 
 @dataclass(frozen=True, eq=False)

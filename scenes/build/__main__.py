@@ -13,7 +13,7 @@ import mitsplat
 from benchmarks.record import figure, recording
 from mitsplat.bake.bake import BakeResult, BakeSettings, bake_asset
 from mitsplat.geometry.camera import Camera
-from mitsplat.renderer.layers import ensure_variant
+from mitsplat.runtime.variant import ensure_variant
 from mitsplat.scene.spec.scene_spec import SceneSpec
 from mitsplat.storage.yaml_input import load_yaml
 from scenes.build.parts import PARTS, build_part

@@ -21,9 +21,9 @@ from mitsplat.gaussians.surfels import place_surfels, poisson_subset
 from mitsplat.geometry.camera import Camera
 from mitsplat.geometry.mesh_normals import CREASE_ANGLE, corner_normals
 from mitsplat.images.colour import encode_srgb
-from mitsplat.renderer.layers import ensure_variant
 from mitsplat.renderer.path_tracing import render_mesh, trace_radiance
 from mitsplat.renderer.scene_emitters import emitter_dict
+from mitsplat.runtime.variant import ensure_variant
 from mitsplat.scene.spec.light_spec import AreaLight, EnvironmentLight
 
 FACE_COLOURS = np.array(

@@ -30,7 +30,8 @@ from mitsplat.gaussians.spherical_harmonics import SH_C0
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.camera import Camera
 from mitsplat.images.colour import encode_srgb
-from mitsplat.renderer.layers import ensure_variant, render_splats
+from mitsplat.renderer.layers import render_splats
+from mitsplat.runtime.variant import ensure_variant
 
 WIDTH, HEIGHT, VIEWS = 64, 48, 20
 SMALL = FitSettings(gaussians=800, iterations=60, sh_degree=1, refine_every=10, coarse=0.1)

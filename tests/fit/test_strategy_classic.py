@@ -14,7 +14,8 @@ from benchmarks.assets.strategy_classic import Classic, control_density, image_g
 from mitsplat.fit.optimizer import GaussianModel
 from mitsplat.fit.strategy_mcmc import seed_splats
 from mitsplat.gaussians.splat_cloud import Splats
-from mitsplat.renderer.layers import ensure_variant, make_sensor
+from mitsplat.renderer.layers import make_sensor
+from mitsplat.runtime.variant import ensure_variant
 from tests.renderer.test_backward import QUALITY, loss_of_twin, separated, weights
 from tests.renderer.test_render import CAMERA
 
@@ -24,8 +25,8 @@ UNIT = 0.7
 def tracked(splats: Splats) -> GaussianModel:
     """A model with the gradients of the loss of :func:`loss_of_twin`."""
     ensure_variant()
-    from mitsplat.plugins.splat_proxy import view_of
     from mitsplat.renderer.differentiation.backward import render_differentiable
+    from mitsplat.renderer.rays.sensors import view_of
 
     own = GaussianModel(splats, UNIT)
     own.track()

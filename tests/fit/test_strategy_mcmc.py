@@ -12,7 +12,8 @@ import pytest
 from mitsplat.fit.optimizer import GaussianModel
 from mitsplat.fit.refine_splats import QUALITY
 from mitsplat.fit.strategy_mcmc import grow, jitter, relocate, seed_splats, split_opacity
-from mitsplat.renderer.layers import ensure_variant, make_sensor, render_splats
+from mitsplat.renderer.layers import make_sensor, render_splats
+from mitsplat.runtime.variant import ensure_variant
 from tests.renderer.test_render import CAMERA, make_splats
 
 
@@ -97,8 +98,8 @@ def test_gradients_and_rates_move_parameters_as_adam_does() -> None:
 
 def test_gaussians_at_the_camera_stay_finite_and_do_not_move() -> None:
     ensure_variant()
-    from mitsplat.plugins.splat_proxy import view_of
     from mitsplat.renderer.differentiation.backward import render_differentiable
+    from mitsplat.renderer.rays.sensors import view_of
 
     splats = make_splats(20, 3, bands=4)
     means = splats.means.copy()

@@ -19,7 +19,7 @@ from mitsplat.cli import app
 from mitsplat.errors import InputError
 from mitsplat.frames.mitsuba_xml import one_sentence, render_xml
 from mitsplat.frames.untrusted_xml import check_xml
-from mitsplat.renderer.layers import ensure_variant
+from mitsplat.runtime.variant import ensure_variant
 from tests.conftest import box_asset
 
 ROOT = Path(__file__).parents[2]

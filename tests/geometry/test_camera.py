@@ -13,7 +13,8 @@ import pytest
 from mitsplat.errors import InputError
 from mitsplat.formats.colmap import camera_model
 from mitsplat.geometry.camera import Camera, look_at_pose, turning_slope
-from mitsplat.renderer.layers import describe_sensor, ensure_variant
+from mitsplat.renderer.layers import describe_sensor
+from mitsplat.runtime.variant import ensure_variant
 
 PINHOLE = Camera.look_at((0, 0, 0), (0, 0, 1), up=(0, -1, 0), width=640, height=480, fov_x=60)
 BENT = (0.02, -0.01, 0.004, -0.001)
@@ -68,7 +69,7 @@ def test_positions_that_are_not_finite_are_refused() -> None:
 
 def test_the_sensor_plugin_traces_the_rays_of_the_camera() -> None:
     ensure_variant()
-    from mitsplat.plugins.splat_proxy import view_of
+    from mitsplat.renderer.rays.sensors import view_of
 
     x, y = np.meshgrid(np.linspace(1, 639, 9), np.linspace(1, 479, 7))
     u, v = view_of(mi.load_dict(describe_sensor(FISHEYE))).slopes(mi.Float(x.ravel()), mi.Float(y.ravel()))

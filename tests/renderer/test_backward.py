@@ -14,7 +14,8 @@ from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.camera import Camera
 from mitsplat.quality import Quality
 from mitsplat.renderer.differentiation import backward
-from mitsplat.renderer.layers import ensure_variant, make_sensor
+from mitsplat.renderer.layers import make_sensor
+from mitsplat.runtime.variant import ensure_variant
 from tests.reference import render_reference
 from tests.renderer.test_render import CAMERA, make_splats
 
@@ -45,7 +46,7 @@ def loss_of_twin(splats: Splats) -> float:
 
 def gradients(splats: Splats, camera: Camera = CAMERA) -> dict[str, np.ndarray]:
     ensure_variant()
-    from mitsplat.plugins.splat_proxy import view_of
+    from mitsplat.renderer.rays.sensors import view_of
 
     inputs: dict[str, Any] = {name: mi.Float(np.asarray(getattr(splats, name)).ravel()) for name in FIELDS}
     for value in inputs.values():
@@ -112,8 +113,8 @@ def test_needles_thinner_than_rounding_have_finite_gradients() -> None:
 @pytest.mark.parametrize("distortion", [(), (-0.2, 0.05, 0.01, -0.01)])
 def test_the_differentiable_image_equals_the_plain_march(distortion: tuple[float, ...]) -> None:
     ensure_variant()
-    from mitsplat.plugins.splat_proxy import view_of
     from mitsplat.renderer.layers import render_splats
+    from mitsplat.renderer.rays.sensors import view_of
 
     splats, camera = make_splats(40, 33), replace(CAMERA, distortion=distortion)
     inputs = [mi.Float(np.asarray(getattr(splats, name)).ravel()) for name in FIELDS]
@@ -126,7 +127,7 @@ def test_the_differentiable_image_equals_the_plain_march(distortion: tuple[float
 @pytest.mark.parametrize("switch", ["normalise_ended_rays", "correct_late_gaussians"])
 def test_corrected_colours_are_refused_for_gradients(switch: str) -> None:
     ensure_variant()
-    from mitsplat.plugins.splat_proxy import view_of
+    from mitsplat.renderer.rays.sensors import view_of
 
     splats = make_splats(1, 3)
     cloud = backward.pack_cloud(*[mi.Float(np.asarray(getattr(splats, name)).ravel()) for name in FIELDS], 16)
@@ -137,7 +138,7 @@ def test_corrected_colours_are_refused_for_gradients(switch: str) -> None:
 def test_depth_of_an_opaque_gaussian_has_unit_gradient() -> None:
     """Moving the camera's only Gaussian away by dz moves depth by dz, whatever its alpha."""
     ensure_variant()
-    from mitsplat.plugins.splat_proxy import view_of
+    from mitsplat.renderer.rays.sensors import view_of
 
     splats = make_splats(1, 3, spread=0.05, scales=(0.2, 0.3))
     inputs: dict[str, Any] = {name: mi.Float(np.asarray(getattr(splats, name)).ravel()) for name in FIELDS}

@@ -12,7 +12,8 @@ import pytest
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.camera import Camera
 from mitsplat.quality import PRESETS, Quality
-from mitsplat.renderer.layers import Layers, ensure_variant, make_integrator, make_splats_shape, render_layers
+from mitsplat.renderer.layers import Layers, make_integrator, make_splats_shape, render_layers
+from mitsplat.runtime.variant import ensure_variant
 from tests.renderer.test_render import make_splats
 
 ensure_variant()
@@ -88,9 +89,9 @@ def test_edges_are_smooth_for_each_point_of_a_lens() -> None:
 
 
 def test_pixels_beside_another_instance_are_sampled_again() -> None:
+    from mitsplat.renderer.instances.antialiasing import BLOCK_HEIGHT, BLOCK_WIDTH, Edges
     from mitsplat.renderer.layers import make_sensor
     from mitsplat.renderer.rays.sensors import view_of
-    from mitsplat.renderer.instances.antialiasing import BLOCK_HEIGHT, BLOCK_WIDTH, Edges
 
     view = view_of(make_sensor(CAMERA))
     keys = np.zeros((CAMERA.height, CAMERA.width), np.uint32)

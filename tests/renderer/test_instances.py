@@ -18,7 +18,8 @@ from mitsplat.frames.frame import NOTHING
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.camera import Camera
 from mitsplat.quality import PRESETS, Quality
-from mitsplat.renderer.layers import ensure_variant, make_integrator, make_splats_shape, render_layers
+from mitsplat.renderer.layers import make_integrator, make_splats_shape, render_layers
+from mitsplat.runtime.variant import ensure_variant
 from tests.reference import reference_shares
 
 CAMERA = Camera.look_at((0, 0, -2), (0, 0, 0), up=(0, -1, 0), width=24, height=20, fov_x=40)

@@ -12,7 +12,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsplat.renderer.layers import Layers, ensure_variant
+from mitsplat.renderer.layers import Layers
+from mitsplat.runtime.variant import ensure_variant
 
 COLOURS = ("rgb", "captured", "normal", "light", "highlight")
 IDS = ("instance", "proxy_instance")

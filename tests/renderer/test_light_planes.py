@@ -13,7 +13,8 @@ import pytest
 import trimesh
 
 from mitsplat.geometry.camera import Camera
-from mitsplat.renderer.layers import Layers, ensure_variant, make_integrator, make_splats_shape, render_layers
+from mitsplat.renderer.layers import Layers, make_integrator, make_splats_shape, render_layers
+from mitsplat.runtime.variant import ensure_variant
 from tests.renderer.test_light import WHITE_SKY, nothing
 
 ensure_variant()

@@ -12,7 +12,8 @@ import pytest
 import trimesh
 
 from mitsplat.geometry.camera import Camera
-from mitsplat.renderer.layers import ensure_variant, make_integrator, make_splats_shape, render_layers
+from mitsplat.renderer.layers import make_integrator, make_splats_shape, render_layers
+from mitsplat.runtime.variant import ensure_variant
 from tests.renderer.test_light import WHITE_SKY, down_camera, floor, nothing, slab
 
 ensure_variant()

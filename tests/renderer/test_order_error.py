@@ -18,14 +18,8 @@ from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.camera import Camera, look_at_pose
 from mitsplat.images.colour import encode_srgb
 from mitsplat.quality import PRESETS, PresetName, Quality
-from mitsplat.renderer.layers import (
-    Layers,
-    ensure_variant,
-    make_integrator,
-    make_splats_shape,
-    render_layers,
-    render_splats,
-)
+from mitsplat.renderer.layers import Layers, make_integrator, make_splats_shape, render_layers, render_splats
+from mitsplat.runtime.variant import ensure_variant
 from tests.renderer.test_render import CAMERA, make_splats
 
 WIDE = CAMERA.resized(96, 72)

@@ -8,7 +8,7 @@ import numpy as np
 from skimage.metrics import structural_similarity
 
 from mitsplat.fit import image_metrics as metrics
-from mitsplat.renderer.layers import ensure_variant
+from mitsplat.runtime.variant import ensure_variant
 
 WIDTH, HEIGHT = 45, 37
 BORDER = 11

@@ -13,14 +13,9 @@ import pytest
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.camera import Camera
 from mitsplat.quality import Quality
-from mitsplat.renderer.layers import (
-    ensure_variant,
-    make_integrator,
-    make_splats_shape,
-    render_layers,
-    render_silhouettes,
-)
+from mitsplat.renderer.layers import make_integrator, make_splats_shape, render_layers, render_silhouettes
 from mitsplat.renderer.rays.device_arrays import plain_mesh
+from mitsplat.runtime.variant import ensure_variant
 
 PINHOLE = Camera(96, 72, 300.0, 300.0, 48.3, 36.4, np.eye(4), focus_distance=1.0)
 THIN = replace(PINHOLE, aperture_radius=0.02)

@@ -15,10 +15,11 @@ from mitsplat.fit.refine_splats import QUALITY
 from mitsplat.fit.trainer import fit_capture
 from mitsplat.quality import Quality
 from mitsplat.renderer.differentiation import backward
-from mitsplat.renderer.layers import ensure_variant, make_sensor
+from mitsplat.renderer.layers import make_sensor
 from mitsplat.renderer.rays.device_arrays import wrapped
 from mitsplat.renderer.rays.sensors import view_of
 from mitsplat.runtime import recorded_kernels as recorded
+from mitsplat.runtime.variant import ensure_variant
 from tests.fit.test_fit import SMALL, photograph, seeing
 from tests.renderer.test_render import CAMERA, make_splats
 

@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsplat.renderer.layers import ensure_variant
+from mitsplat.runtime.variant import ensure_variant
 
 ensure_variant()
 from mitsplat.renderer.light.emitter_sampling import Emitters, receiver  # noqa: E402

@@ -24,7 +24,8 @@ from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.camera import Camera
 from mitsplat.images.colour import decode_srgb, encode_srgb
 from mitsplat.quality import KERNELS, PRESETS, Quality
-from mitsplat.renderer.layers import Layers, ensure_variant, make_sensor, render_splats
+from mitsplat.renderer.layers import Layers, make_sensor, render_splats
+from mitsplat.runtime.variant import ensure_variant
 from tests.reference import render_reference
 
 EXAMPLES = int(os.environ.get("MITSPLAT_EXAMPLES", "25"))
@@ -140,7 +141,7 @@ def test_small_gaussians_keep_their_light_at_any_position_in_a_pixel() -> None:
 def test_kernel_of_a_distorted_lens_has_the_size_of_its_pixels() -> None:
     camera = replace(CAMERA, distortion=(-0.2, 0.05, 0.01, -0.02, 0.01))
     sensor = make_sensor(camera)
-    from mitsplat.plugins.splat_proxy import view_of
+    from mitsplat.renderer.rays.sensors import view_of
 
     view = view_of(sensor)
     pixel = np.array([3.0, 20.0])

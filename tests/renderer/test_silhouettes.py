@@ -13,13 +13,8 @@ import trimesh
 import mitsplat as ms
 from mitsplat.errors import MissingResourceError
 from mitsplat.quality import Quality
-from mitsplat.renderer.layers import (
-    ensure_variant,
-    make_integrator,
-    make_splats_shape,
-    render_layers,
-    render_silhouettes,
-)
+from mitsplat.renderer.layers import make_integrator, make_splats_shape, render_layers, render_silhouettes
+from mitsplat.runtime.variant import ensure_variant
 
 WIDTH, HEIGHT = 96, 64
 

@@ -6,9 +6,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsplat.renderer.layers import ensure_variant
 from mitsplat.renderer.light.emitter_sampling import sky_irradiance
 from mitsplat.renderer.light.sky_irradiance import _folded, _unfolded
+from mitsplat.runtime.variant import ensure_variant
 
 
 def sky_with_a_sun() -> dict[str, object]:

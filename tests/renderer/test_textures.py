@@ -12,7 +12,7 @@ import trimesh
 
 from mitsplat.geometry.camera import Camera, look_at_pose
 from mitsplat.images.colour import decode_srgb, encode_srgb
-from mitsplat.renderer.layers import ensure_variant, make_sensor
+from mitsplat.renderer.layers import make_sensor
 from mitsplat.renderer.meshes.visible_meshes import VisibleMeshes
 from mitsplat.renderer.rays.sensors import view_of
 from mitsplat.renderer.textures import (
@@ -25,6 +25,7 @@ from mitsplat.renderer.textures import (
     texture_image,
     with_gain,
 )
+from mitsplat.runtime.variant import ensure_variant
 from mitsplat.scene.planning.layout_surroundings import MaterialDraw
 from mitsplat.scene.spec.shape_spec import Box, Shape
 from mitsplat.scene.walls import pose_matrix

@@ -10,7 +10,8 @@ import pytest
 
 from mitsplat.geometry.camera import Camera
 from mitsplat.quality import PRESETS, PresetName
-from mitsplat.renderer.layers import Layers, ensure_variant, make_sensor, render_splats
+from mitsplat.renderer.layers import Layers, make_sensor, render_splats
+from mitsplat.runtime.variant import ensure_variant
 from tests.renderer.test_render import make_splats
 
 CAMERA = Camera.look_at((0, 0, -2), (0, 0, 0), up=(0, -1, 0), width=75, height=50, fov_x=50)
@@ -19,7 +20,7 @@ CAMERA = Camera.look_at((0, 0, -2), (0, 0, 0), up=(0, -1, 0), width=75, height=5
 @pytest.mark.parametrize("lens", [{}, {"distortion": (-0.25, 0.08, 0.002, -0.001, -0.01)}])
 def test_entries_ascend_by_depth_and_number_and_have_a_place_by_record(lens: dict[str, tuple[float, ...]]) -> None:
     ensure_variant()
-    from mitsplat.plugins.splat_proxy import view_of
+    from mitsplat.renderer.rays.sensors import view_of
     from mitsplat.renderer.splatting.gaussian import upload_cloud
     from mitsplat.renderer.splatting.projection import Placement, merge_clouds
     from mitsplat.renderer.splatting.tiles import bin_gaussians

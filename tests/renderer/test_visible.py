@@ -12,14 +12,8 @@ import pytest
 
 from mitsplat.gaussians.spherical_harmonics import SH_C0
 from mitsplat.gaussians.splat_cloud import Splats
-from mitsplat.renderer.layers import (
-    Layers,
-    ensure_variant,
-    make_integrator,
-    make_sensor,
-    make_splats_shape,
-    render_layers,
-)
+from mitsplat.renderer.layers import Layers, make_integrator, make_sensor, make_splats_shape, render_layers
+from mitsplat.runtime.variant import ensure_variant
 from tests.renderer.test_light import WHITE_SKY, down_camera, floor, nothing, slab
 
 SEEDS = 4

@@ -12,15 +12,9 @@ import trimesh
 
 from mitsplat.frames.frame import NOTHING
 from mitsplat.geometry.camera import Camera
-from mitsplat.renderer.layers import (
-    Layers,
-    ensure_variant,
-    make_integrator,
-    make_splats_shape,
-    render_layers,
-    render_silhouettes,
-)
+from mitsplat.renderer.layers import Layers, make_integrator, make_splats_shape, render_layers, render_silhouettes
 from mitsplat.renderer.rays.device_arrays import plain_mesh
+from mitsplat.runtime.variant import ensure_variant
 
 SKY = {"type": "constant"}
 SOLIDS = {

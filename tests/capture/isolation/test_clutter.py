@@ -21,7 +21,7 @@ from mitsplat.capture.capture import Capture, Photo
 from mitsplat.capture.photo_masks import object_masks
 from mitsplat.capture.pipeline.picking import chosen_object
 from mitsplat.reconstruct.asset_evaluation import iou
-from mitsplat.renderer.layers import ensure_variant
+from mitsplat.runtime.variant import ensure_variant
 
 pytestmark = pytest.mark.slow
 

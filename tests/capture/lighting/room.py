@@ -14,7 +14,7 @@ from PIL import Image
 from mitsplat.arrays import Float32Array, Float64Array
 from mitsplat.capture.lighting.panorama import directions, unit_vector
 from mitsplat.images.colour import encode_srgb
-from mitsplat.renderer.layers import ensure_variant
+from mitsplat.runtime.variant import ensure_variant
 
 ensure_variant()
 

@@ -126,7 +126,7 @@ def test_a_device_that_is_none(text):
         ({"status": 100}, r"finds no GPU \(status 100\): check `nvidia-smi` and CUDA_VISIBLE_DEVICES"),
         (
             {"status": 100, "unused": [0.25]},
-            r"the GPU has only 0.2 GiB unused memory: end a program on it \(`nvidia-smi` lists them\)",
+            r"the GPU has only 0.2 GiB of unused memory: end a program on it \(`nvidia-smi` lists them\)",
         ),
     ],
 )

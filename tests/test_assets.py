@@ -47,7 +47,7 @@ def write(folder: Path, text: str, **files: bytes) -> Path:
     return folder
 
 
-def test_a_save_over_an_earlier_asset_may_be_interrupted(asset, tmp_path, monkeypatch):
+def test_an_interrupted_save_leaves_the_earlier_or_the_new_asset(asset, tmp_path, monkeypatch):
     """Splats of the one are never read with the mesh of the other."""
     asset.save(tmp_path)
 
@@ -65,7 +65,7 @@ def test_a_save_over_an_earlier_asset_may_be_interrupted(asset, tmp_path, monkey
 
 class TestRoundTrip:
     @pytest.mark.parametrize(("splats", "tolerance"), [("splats.ply", 1e-8), ("splats.spz", 1e-8), ("a.splat", 1e-8)])
-    def test_geometry(self, asset, tmp_path, splats, tolerance):
+    def test_saved_assets_keep_splats_and_mesh(self, asset, tmp_path, splats, tolerance):
         asset.save(tmp_path / "a", splats=splats)
         loaded = Asset.load(tmp_path / "a")
         assert np.abs(loaded.splats.means - asset.splats.means).max() < tolerance
@@ -75,7 +75,7 @@ class TestRoundTrip:
         for piece, original in zip(sorted(loaded.pieces, key=lambda p: p.bounds[0, 0]), asset.pieces, strict=True):
             assert np.allclose(piece.bounds, original.bounds, atol=1e-8) and piece.is_watertight
 
-    def test_properties(self, asset, tmp_path):
+    def test_saved_assets_keep_their_properties(self, asset, tmp_path):
         for given_asset in (asset, replace(asset, kind="environment", mesh=None, pieces=()), replace(asset, mass=0.3)):
             given_asset.save(tmp_path / "a")
             loaded = Asset.load(tmp_path / "a")
@@ -84,11 +84,11 @@ class TestRoundTrip:
             assert loaded.mass is not None or loaded.density == given_asset.density
             assert loaded.folder == tmp_path / "a"
 
-    def test_pieces_that_share_a_face_stay_apart(self, asset, tmp_path):
+    def test_pieces_that_share_a_face_stay_separate(self, asset, tmp_path):
         asset.save(tmp_path)
         assert [round(p.volume, 9) for p in Asset.load(tmp_path).pieces] == [round(p.volume, 9) for p in asset.pieces]
 
-    def test_refuses_what_it_could_not_read(self, asset, tmp_path):
+    def test_assets_that_could_not_be_read_are_not_saved(self, asset, tmp_path):
         for change, sentence in [
             ({"mesh": None, "pieces": ()}, "an object needs a mesh"),
             ({"friction": -1.0}, "friction: .*greater than or equal to 0"),
@@ -104,7 +104,7 @@ class TestRoundTrip:
 
 class TestUnitsAndAxes:
     @pytest.mark.parametrize("up", AXES)
-    def test_up_becomes_z_by_a_rotation(self, asset, tmp_path, up):
+    def test_the_up_axis_is_rotated_to_z(self, asset, tmp_path, up):
         asset.save(tmp_path)
         text = (tmp_path / "asset.yaml").read_text()
         write(tmp_path, text.replace("up: z", f"up: {up}"))
@@ -134,7 +134,7 @@ class TestUnitsAndAxes:
         assert Asset.load(tmp_path).units == "metre"
 
     @pytest.mark.parametrize(("key", "factor"), [("units: 0.001", 0.001), ("size: 0.3", 0.3 / 0.06), ("", 1.0)])
-    def test_units_and_size(self, asset, tmp_path, key, factor):
+    def test_units_and_size_scale_the_asset(self, asset, tmp_path, key, factor):
         asset.save(tmp_path)
         write(tmp_path, (tmp_path / "asset.yaml").read_text().replace("units: 1.0", key))
         loaded = Asset.load(tmp_path)
@@ -144,12 +144,12 @@ class TestUnitsAndAxes:
         assert loaded.pieces[0].volume == pytest.approx(factor**3 * asset.pieces[0].volume)
         assert loaded.density == 2700.0
 
-    def test_size_of_an_environment_is_that_of_its_opaque_splats(self, asset, tmp_path):
+    def test_the_size_of_an_environment_is_that_of_its_opaque_splats(self, asset, tmp_path):
         asset.splats.save(tmp_path / "a.ply")
         write(tmp_path, "name: room\nkind: environment\nsplats: a.ply\nsize: 6\n")
         assert np.allclose(np.ptp(Asset.load(tmp_path).splats.bounds, axis=0), np.multiply(SIZE, 100), rtol=1e-3)
 
-    def test_scaled(self, asset):
+    def test_scaling_an_asset_scales_mass_mesh_and_splats(self, asset):
         heavy = replace(asset, mass=0.5).scaled(2.0)
         assert heavy.mass == 4.0 and np.allclose(heavy.mesh.extents, np.multiply(SIZE, 2))
         assert heavy.pieces[0].volume == pytest.approx(8 * asset.pieces[0].volume)
@@ -161,7 +161,7 @@ class TestUnitsAndAxes:
 
 
 class TestHull:
-    def test_leaves_out_faint_splats_and_floaters(self, asset, tmp_path):
+    def test_the_hull_omits_faint_splats_and_floaters(self, asset, tmp_path):
         box = trimesh.creation.box((1, 1, 1))
         faint = surface_splats(box, 50, opacity=0.3)
         floaters = surface_splats(box, 9, opacity=0.9).select(slice(3))
@@ -170,7 +170,7 @@ class TestHull:
         write(tmp_path, "name: brick\nsplats: a.ply\nmesh: hull\n")
         assert np.allclose(Asset.load(tmp_path).mesh.extents, SIZE, rtol=1e-5)
 
-    def test_needs_a_volume(self, asset, tmp_path):
+    def test_a_hull_without_volume_is_refused(self, asset, tmp_path):
         for splats in (asset.splats.select(slice(3)), replace(asset.splats, opacities=np.full(400, 0.1))):
             splats.save(tmp_path / "a.ply")
             write(tmp_path, "name: brick\nsplats: a.ply\nmesh: hull\n")
@@ -178,7 +178,7 @@ class TestHull:
                 Asset.load(tmp_path)
 
     @pytest.mark.skipif(not DATA.is_dir(), reason="the shared test data is not here")
-    def test_real_capture_stands_upright_at_its_size(self, tmp_path):
+    def test_a_published_capture_is_upright_with_its_size(self, tmp_path):
         (tmp_path / "plant.splat").symlink_to(DATA / "plant.splat")
         write(tmp_path, "name: plant\nsplats: plant.splat\nmesh: hull\nup: -y\nsize: 0.2\n")
         with pytest.raises(InputError, match=r"asset.yaml:2: splats: must be a file inside"):
@@ -195,10 +195,10 @@ class TestHull:
 
 
 class TestCheck:
-    def test_a_sound_asset_has_no_findings(self, asset):
+    def test_a_consistent_asset_has_no_findings(self, asset):
         assert asset.check() == ()
 
-    def test_findings(self, asset):
+    def test_inconsistent_assets_have_findings(self, asset):
         shifted = np.eye(4)
         shifted[0, 3] = 0.01
         assert (
@@ -236,7 +236,7 @@ class TestBadInput:
             ("name: [\n", "asset.yaml:2: not YAML"),
         ],
     )
-    def test_is_one_sentence_that_names_the_place(self, asset, tmp_path, text, sentence):
+    def test_an_invalid_asset_is_refused_in_one_sentence_with_its_place(self, asset, tmp_path, text, sentence):
         asset.splats.save(tmp_path / "a.ply")
         flat = trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]])
         write(tmp_path, text, bad_ply=b"ply nonsense", flat_ply=flat.export(file_type="ply"))
@@ -247,11 +247,11 @@ class TestBadInput:
             Asset.load(tmp_path)
         assert "\n" not in str(error.value)
 
-    def test_missing_folder(self, tmp_path):
+    def test_a_missing_asset_folder_is_refused(self, tmp_path):
         with pytest.raises(InputError, match=r"none/asset.yaml: no such file"):
             Asset.load(tmp_path / "none")
 
-    def test_mesh_vertices_must_be_finite(self, tmp_path):
+    def test_mesh_vertices_that_are_not_finite_are_refused(self, tmp_path):
         (tmp_path / "a.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 nan 0\nf 1 2 3\n")
         with pytest.raises(InputError, match=r"a.obj: (vertices must be finite|a mesh must have triangles)"):
             read_mesh(tmp_path / "a.obj", merge=False)
@@ -262,7 +262,7 @@ class TestBadInput:
         keep=st.floats(0, 1),
         changes=st.lists(st.tuples(st.floats(0, 1, exclude_max=True), st.integers(0, 255)), max_size=4),
     )
-    def test_damaged_meshes_are_refused_or_harmless(self, tmp_path, form, keep, changes, monkeypatch):
+    def test_random_damage_of_meshes_is_refused_or_gives_valid_assets(self, tmp_path, form, keep, changes, monkeypatch):
         """By the reader itself, without the trial in a process that comes before it."""
         monkeypatch.setattr("mitsplat.asset.check_mesh", lambda path: None)
         whole = trimesh.creation.box().export(file_type=form)

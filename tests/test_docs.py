@@ -27,7 +27,7 @@ def _docs_on_path() -> Iterator[None]:
         sys.path.remove(folder)
 
 
-def test_pictures_are_of_keys_that_there_are() -> None:
+def test_pictures_show_existing_scene_keys() -> None:
     from pictures import read_pictures
     from scene_reference import scene_keys
 
@@ -36,7 +36,7 @@ def test_pictures_are_of_keys_that_there_are() -> None:
     assert {picture.key for picture in read_pictures()} <= set(keys)
 
 
-def test_every_picture_is_there_and_none_is_left_over() -> None:
+def test_every_referenced_picture_exists_and_no_other() -> None:
     from pictures import FOLDER, GALLERY, SHEETS, read_pictures
 
     asked = {picture.file.name for picture in read_pictures()}
@@ -46,7 +46,7 @@ def test_every_picture_is_there_and_none_is_left_over() -> None:
     assert sum(path.stat().st_size for path in FOLDER.iterdir()) < 2_400_000
 
 
-def test_every_fragment_below_a_picture_makes_a_scene() -> None:
+def test_every_fragment_below_a_picture_is_valid() -> None:
     """By the models alone: rendering all of them is ``python docs/pictures.py``."""
     from pictures import read_pictures
 
@@ -55,7 +55,7 @@ def test_every_fragment_below_a_picture_makes_a_scene() -> None:
 
 
 @pytest.mark.slow
-def test_scenes_of_the_gallery_have_nothing_questionable() -> None:
+def test_scenes_of_the_gallery_get_no_warning() -> None:
     from pictures import GALLERY, SCENES
 
     check_xml(SCENES / "mirror_ball.xml")
@@ -81,7 +81,9 @@ def test_scenes_of_the_gallery_have_nothing_questionable() -> None:
         ("    [a](missing.md)", None),  # code
     ],
 )
-def test_links(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str, fault: str | None) -> None:
+def test_links_to_missing_files_and_places_are_reported(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str, fault: str | None
+) -> None:
     import links
 
     monkeypatch.setattr(links, "ROOT", tmp_path)
@@ -92,7 +94,7 @@ def test_links(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str, fault
     )
 
 
-def test_the_command_line_is_documented() -> None:
+def test_every_command_is_documented() -> None:
     """Typer's reference, which the site shows, has every command."""
     from mitsplat.cli import app
 

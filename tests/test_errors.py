@@ -15,12 +15,12 @@ from mitsplat.errors import InputError, exit_status, sentence_of
         RuntimeError("[enforce fail at alloc_cpu.cpp:117] DefaultCPUAllocator: can't allocate memory: you tried to"),
     ],
 )
-def test_memory_that_has_run_out_is_missing_on_the_machine(error: Exception) -> None:
+def test_out_of_memory_errors_have_status_3(error: Exception) -> None:
     assert exit_status(error) == 3
     assert sentence_of(error).startswith("memory is exhausted")
 
 
-def test_opencv_tells_of_memory_too() -> None:
+def test_out_of_memory_errors_of_opencv_have_status_3() -> None:
     with pytest.raises(cv2.error) as told:
         cv2.resize(np.zeros((9, 9, 3), np.uint8), (10**6, 10**6))
     assert exit_status(told.value) == 3
@@ -29,6 +29,6 @@ def test_opencv_tells_of_memory_too() -> None:
     assert exit_status(other.value) is None
 
 
-def test_other_errors_are_none_of_memory() -> None:
+def test_other_errors_are_not_taken_for_out_of_memory() -> None:
     assert exit_status(RuntimeError("out of ideas")) is None
     assert exit_status(InputError("insufficient memory for jokes")) == 2

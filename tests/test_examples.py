@@ -19,12 +19,12 @@ def code_of(path: Path) -> list[str]:
     return ["".join(cell["source"]) for cell in cells if cell["cell_type"] == "code"]
 
 
-def test_there_are_notebooks() -> None:
+def test_the_four_notebooks_exist() -> None:
     assert {path.stem for path in NOTEBOOKS} == {"first_dataset", "own_scene", "speed_and_accuracy", "xml_authoring"}
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
-def test_notebook_is_stored_without_outputs_and_ends_in_checks(path: Path) -> None:
+def test_a_notebook_is_stored_without_outputs_and_ends_in_checks(path: Path) -> None:
     cells = json.loads(path.read_text())["cells"]
     assert not any(cell.get("outputs") or cell.get("execution_count") for cell in cells)
     assert cells[0]["cell_type"] == "markdown"
@@ -33,7 +33,7 @@ def test_notebook_is_stored_without_outputs_and_ends_in_checks(path: Path) -> No
 
 @pytest.mark.slow
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
-def test_notebook_runs(path: Path) -> None:
+def test_each_notebook_runs(path: Path) -> None:
     """In a process of its own, since its code chooses Mitsuba's variant and imports as a user would."""
     done = subprocess.run(
         [sys.executable, "-c", "\n\n".join(code_of(path))], cwd=EXAMPLES, capture_output=True, text=True, timeout=600
@@ -43,7 +43,7 @@ def test_notebook_runs(path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("path", SCRIPTS, ids=lambda path: path.stem)
-def test_script_runs(path: Path, tmp_path: Path) -> None:
+def test_each_example_script_runs(path: Path, tmp_path: Path) -> None:
     assert "\nassert " in path.read_text()
     given = [] if path.stem == "read_labels" else [tmp_path]
     done = subprocess.run([sys.executable, path, *given], cwd=tmp_path, capture_output=True, text=True, timeout=600)

@@ -28,13 +28,13 @@ def samples(tmp_path_factory):
 
 
 @pytest.mark.parametrize("name", READERS)
-def test_samples_are_read(samples, name):
+def test_undamaged_samples_are_read(samples, name):
     assert attempt(READERS[name], samples) == "read"
 
 
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("name", READERS)
-def test_damaged_files(samples, name):
+def test_damaged_files_are_read_or_refused_in_one_sentence(samples, name):
     """Slow readers, which start a process, get three inputs; the others 40."""
     reader = READERS[name]
     path = samples / reader.file
@@ -55,7 +55,7 @@ def test_damaged_files(samples, name):
 
 @pytest.mark.parametrize("name", [name for name, reader in READERS.items() if not reader.slow])
 @pytest.mark.parametrize("data", [b"", b"\0", b"\0" * 4096, b"ply\n", b"{" * 2000, b"[" * 2000, b"\xff\xfe" * 50])
-def test_rubbish(samples, name, data):
+def test_arbitrary_bytes_are_refused_in_one_sentence(samples, name, data):
     reader = READERS[name]
     path = samples / reader.file
     sample = path.read_bytes()

@@ -124,7 +124,7 @@ def start(tmp_path, monkeypatch):
     return start
 
 
-def test_a_child_without_safe_path_mode_would_run_them(start, tmp_path):
+def test_a_child_without_safe_path_mode_runs_files_of_the_folder(start, tmp_path):
     assert "random" in start(sys.executable, tmp_path / "script/parent.py", "nothing")[1]
 
 

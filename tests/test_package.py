@@ -17,7 +17,7 @@ from mitsplat.runtime.variant import ensure_variant
 ROOT = Path(__file__).parents[1]
 
 
-def test_all_is_sorted_and_importable() -> None:
+def test_public_names_are_sorted_and_importable() -> None:
     assert list(mitsplat.__all__) == sorted(set(mitsplat.__all__))
     for name in mitsplat.__all__:
         assert getattr(mitsplat, name) is not None
@@ -26,7 +26,7 @@ def test_all_is_sorted_and_importable() -> None:
         mitsplat.no_such_name  # noqa: B018
 
 
-def test_the_compatibility_page_names_what_is_public() -> None:
+def test_the_compatibility_page_names_every_public_name() -> None:
     page = (ROOT / "docs/compatibility.md").read_text()
     names = page.partition("### Public names")[2].partition("### Layers")[0]
     assert re.findall(r"^\| `(\w+)` \|", names, re.MULTILINE) == list(mitsplat.__all__)
@@ -42,14 +42,14 @@ def test_the_compatibility_page_names_every_layer() -> None:
     assert re.findall(r"`([\w.]+)`", " ".join(cells)) == list(AOVS)
 
 
-def test_import_is_light() -> None:
+def test_importing_the_package_loads_no_heavy_library() -> None:
     heavy = ["mitsuba", "drjit", "warp", "newton", "mujoco", "pycolmap", "torch", "cv2", "skimage", "colour", "coacd"]
     code = f"import mitsplat, mitsplat.cli, sys; print([name for name in {heavy} if name in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
 
 
-def test_versions_agree() -> None:
+def test_version_is_the_same_in_all_files() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     assert mitsplat.__version__ == project["version"]
     assert f"version: {project['version']}\n" in (ROOT / "CITATION.cff").read_text()
@@ -93,7 +93,7 @@ def test_wheel_ships_package_and_plugins(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("first", ["mitsplat", "mitsuba"])
-def test_plugins_are_there_whichever_is_imported_first(first: str) -> None:
+def test_plugins_are_registered_in_any_order_of_imports(first: str) -> None:
     """``import mitsplat`` waits for Mitsuba, whose variant may be chosen before and after."""
     chosen = "import mitsuba as mi; mi.set_variant('llvm_ad_rgb')"
     lines = {"mitsplat": f"import mitsplat\n{chosen}", "mitsuba": f"{chosen}\nimport mitsplat"}[first]

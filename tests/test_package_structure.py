@@ -122,14 +122,14 @@ def test_every_package_has_a_layer_and_a_docstring() -> None:
             assert len(ast.get_docstring(ast.parse(path.read_text())) or "") > 100, module
 
 
-def test_packages_are_small() -> None:
+def test_packages_keep_their_limit_of_lines() -> None:
     lines = Counter[str]()
     for module, path in MODULES.items():
         lines[unit_of(module)] += len(path.read_text().splitlines())
     assert {unit: count for unit, count in lines.items() if count > MAX_LINES} == {}
 
 
-def test_few_modules_lie_outside_of_packages() -> None:
+def test_few_modules_are_outside_of_packages() -> None:
     assert len(list((ROOT / "mitsplat").glob("*.py"))) <= MAX_TOP_MODULES
     assert len(list((ROOT / "plugins").glob("*.py"))) <= MAX_PLUGIN_FILES
 
@@ -183,7 +183,7 @@ def test_one_module_builds_command_lines_of_python() -> None:
     assert found == {"mitsplat.runtime.child_process: sys.executable"}
 
 
-def test_processes_of_multiprocessing_start_in_safe_path_mode() -> None:
+def test_multiprocessing_starts_in_safe_path_mode() -> None:
     starts = [module for module, path in MODULES.items() if "import multiprocessing" in path.read_text()]
     assert starts == ["mitsplat.engine.pool"]
     source = MODULES["mitsplat.engine.pool"].read_text()

@@ -35,7 +35,7 @@ def test_public_docstrings_do_not_open_with_a_question_word(path: Path) -> None:
     assert found == []
 
 
-def test_a_question_word_is_found(tmp_path: Path) -> None:
+def test_a_docstring_with_a_question_word_is_found(tmp_path: Path) -> None:
     source = tmp_path / "a.py"
     source.write_text('"""Good."""\n\n\ndef f():\n    """Whether it rains."""\n\n\ndef _g():\n    """What it is."""\n')
     assert [line for line, text in public_docstrings(source) if QUESTION.match(text)] == [4]

@@ -32,7 +32,7 @@ class TestScenes:
         "name", ["../elsewhere", "{folder}", "assets/link", "assets/../../elsewhere", "assets/loop"]
     )
     @pytest.mark.parametrize("key", ["environment", "objects", "shapes", "lights"])
-    def test_what_is_outside_is_refused(self, scene_data, write_scene, tmp_path, name, key):
+    def test_files_outside_of_the_scene_folder_are_refused(self, scene_data, write_scene, tmp_path, name, key):
         elsewhere = tmp_path.with_name(f"{tmp_path.name}-elsewhere")
         box_asset("nut").save(elsewhere)
         path = write_scene(scene_data)
@@ -56,7 +56,7 @@ class TestScenes:
         if key == "objects" and "loop" not in name:
             assert load_scene(path, allow_outside=True).assets[0].name == "nut"
 
-    def test_an_asset_never_names_files_outside(self, tmp_path):
+    def test_files_outside_of_the_asset_folder_are_refused(self, tmp_path):
         box_asset("nut").save(tmp_path / "nut")
         (tmp_path / "secret.ply").write_bytes((tmp_path / "nut/splats.ply").read_bytes())
         text = (tmp_path / "nut/asset.yaml").read_text()
@@ -65,7 +65,7 @@ class TestScenes:
             Asset.load(tmp_path / "nut")
 
     @pytest.mark.parametrize("opening", ["[", "{", "[ ", "- "])
-    def test_deep_nesting_takes_no_time(self, tmp_path, opening):
+    def test_deep_nesting_is_refused_in_bounded_time(self, tmp_path, opening):
         """It would take ruamel.yaml a time with the square of the depth, 6 s for 2,000 brackets."""
         path = tmp_path / "scene.yaml"
         path.write_text(opening * 2000)
@@ -75,7 +75,7 @@ class TestScenes:
         assert time.process_time() - begun < 1
 
     @pytest.mark.parametrize("key", ["asset", "pool"])
-    def test_long_names_take_no_time(self, scene_data, write_scene, key):
+    def test_long_names_are_refused_in_bounded_time(self, scene_data, write_scene, key):
         """Resolving them would take a time with the square of the length."""
         scene_data["objects"] = [{key: "*/" * 200_000}]
         path = write_scene(scene_data)
@@ -84,7 +84,7 @@ class TestScenes:
             load_scene(path)
         assert time.process_time() - begun < 5 and len(str(raised.value)) < 1000
 
-    def test_aliases_do_not_multiply(self, tmp_path):
+    def test_aliases_that_multiply_are_refused(self, tmp_path):
         """The billion laughs: ten levels of ten aliases each."""
         levels = ["a0: &a0 [x]\n"] + [f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 10)}]\n" for i in range(1, 10)]
         (tmp_path / "scene.yaml").write_text("".join(levels))
@@ -94,14 +94,14 @@ class TestScenes:
     @pytest.mark.parametrize(
         "text", ["name: !!python/object/apply:os.system ['touch pwned']", "name: !!python/name:os"]
     )
-    def test_no_code_is_run(self, tmp_path, text, monkeypatch):
+    def test_yaml_tags_run_no_code(self, tmp_path, text, monkeypatch):
         monkeypatch.chdir(tmp_path)
         (tmp_path / "scene.yaml").write_text(text)
         with pytest.raises(InputError, match="must not have a YAML tag"):
             load_scene(tmp_path / "scene.yaml")
         assert not (tmp_path / "pwned").exists()
 
-    def test_a_pipe_is_no_file(self, tmp_path):
+    def test_a_named_pipe_is_refused(self, tmp_path):
         """Opening it would wait for ever."""
         for name in ("scene.yaml", "a.ply", "a.xml"):
             os.mkfifo(tmp_path / name)
@@ -178,12 +178,12 @@ class TestXml:
             ("", "not XML"),
         ],
     )
-    def test_hostile_files(self, scene, text, message):
+    def test_hostile_xml_is_refused(self, scene, text, message):
         scene.write_text(text)
         with pytest.raises(InputError, match=rf"scene\.xml:\d+: .*{message}"):
             check_xml(scene)
 
-    def test_includes_are_checked_too(self, scene):
+    def test_included_files_are_checked(self, scene):
         scene.write_text(XML.format('<include filename="b.xml"/>'))
         (scene.parent / "b.xml").write_text(XML.format('<string name="filename" value="mesh.ply"/>'))
         check_xml(scene)
@@ -192,7 +192,7 @@ class TestXml:
             check_xml(scene)
         check_xml(scene, allow_outside=True)
 
-    def test_includes_do_not_multiply(self, scene):
+    def test_includes_that_multiply_are_refused(self, scene):
         for number in range(10):
             (scene.parent / f"{number}.xml").write_text(XML.format(f'<include filename="{number + 1}.xml"/>' * 2))
         (scene.parent / "10.xml").write_text(XML.format(""))
@@ -200,7 +200,7 @@ class TestXml:
         with pytest.raises(InputError, match=r"scene\.xml: must not include more than 100 files"):
             check_xml(scene)
 
-    def test_parameters_do_not_multiply(self, scene):
+    def test_parameters_that_multiply_are_refused(self, scene):
         levels = ['<default name="a0" value="xxxxxxxxxx"/>']
         levels += [f'<default name="a{i}" value="{f"$a{i - 1}" * 10}"/>' for i in range(1, 10)]
         scene.write_text(XML.format("\n".join(levels)))
@@ -224,7 +224,7 @@ class TestXml:
             '<default name="d" value="../.."/><path value="sub"/><include filename="$d/secret.xml"/>',
         ],
     )
-    def test_folders_to_search_do_not_lead_outside(self, scene, text):
+    def test_search_paths_outside_of_the_scene_folder_are_refused(self, scene, text):
         (scene.parent / "sub/deep").mkdir(parents=True)
         (scene.parent / "sub/ok.ply").symlink_to(scene.parents[1] / "secret.xml")
         scene.write_text(XML.format(text))
@@ -239,7 +239,7 @@ class TestXml:
             (XML.format('<shape type="ply"><string name="filename" value="{}"/></shape>'), "must not name a file"),
         ],
     )
-    def test_what_is_included_by_way_of_a_folder_is_checked(self, scene, text, message):
+    def test_files_included_by_a_search_path_are_checked(self, scene, text, message):
         (scene.parent / "sub").mkdir()
         (scene.parent / "sub/inner.xml").write_text(text.replace("{}", str(scene.parents[1] / "secret.xml")))
         scene.write_text(XML.format('<path value="sub"/>\n<include filename="inner.xml"/>'))
@@ -256,13 +256,13 @@ class TestXml:
         assert text.splitlines()[1].startswith('<shape type="ply"><string name="filename" value=')
         assert f'"{(scene.parent / "sub/good.ply").resolve()}"' in text and "ok.ply" not in text
 
-    def test_the_command_checks_first(self, scene, capsys, monkeypatch):
+    def test_xml_is_checked_before_mitsuba_reads_it(self, scene, capsys, monkeypatch):
         monkeypatch.setattr(xml_scene, "run_in_process", None)
         scene.write_text('<!DOCTYPE a><scene version="3.9.0"/>')
         with pytest.raises(InputError, match="must not have a document type"):
             xml_scene.render_xml(scene, scene.parent / "out.png")
 
-    def test_what_ends_mitsubas_process_is_a_sentence(self, scene, capsys, monkeypatch):
+    def test_a_crash_of_mitsuba_is_reported_in_one_sentence(self, scene, capsys, monkeypatch):
         """A native reader that crashes, in its stead a process that is killed."""
         monkeypatch.setattr(xml_scene, "_RenderOne", Dies)
         assert run("render", scene) == 2
@@ -290,13 +290,13 @@ class TestImages:
         scene_data["lights"] = [{"kind": "environment", "image": "sky.exr"}]
         return write_scene(scene_data)
 
-    def test_a_good_one(self, scene):
+    def test_a_valid_image_of_a_light_is_read(self, scene):
         load_scene(scene)
 
     @pytest.mark.parametrize(
         "damage", [lambda data: data[:200], lambda data: b"", lambda data: data.replace(b"channels", b"chan")]
     )
-    def test_a_damaged_one(self, scene, tmp_path, damage):
+    def test_a_damaged_image_of_a_light_is_refused(self, scene, tmp_path, damage):
         path = tmp_path / "sky.exr"
         path.write_bytes(damage(path.read_bytes()))
         with pytest.raises(
@@ -305,7 +305,7 @@ class TestImages:
             load_scene(scene)
         assert "\n" not in str(caught.value)
 
-    def test_one_that_promises_too_much(self, scene, tmp_path):
+    def test_an_image_header_that_states_too_many_pixels_is_refused(self, scene, tmp_path):
         """An EXR whose window is 2^30 pixels wide and 2^20 high."""
         path = tmp_path / "sky.exr"
         data = path.read_bytes()
@@ -325,7 +325,7 @@ class TestArchives:
         yield
         assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 300e3
 
-    def test_a_bomb_of_spz(self, tmp_path):
+    def test_an_spz_bomb_is_refused(self, tmp_path):
         with gzip.open(tmp_path / "a.spz", "wb") as file:
             for _ in range(100):
                 file.write(bytes(1 << 20))
@@ -335,13 +335,13 @@ class TestArchives:
             Splats.load(tmp_path / "a.spz")
 
     @pytest.mark.parametrize("name", ["../a", "/etc/a", "x/../../a", "..\\a"])
-    def test_a_path_that_leaves_sog(self, tmp_path, name):
+    def test_a_sog_path_outside_of_the_archive_is_refused(self, tmp_path, name):
         with zipfile.ZipFile(tmp_path / "a.sog", "w") as archive:
             archive.writestr(name, b"x")
         with pytest.raises(InputError, match=r"a\.sog: an archive must not hold files outside of it"):
             Splats.load(tmp_path / "a.sog")
 
-    def test_a_damaged_entry_of_sog(self, tmp_path):
+    def test_a_damaged_sog_entry_is_refused(self, tmp_path):
         with zipfile.ZipFile(tmp_path / "a.sog", "w") as archive:
             archive.writestr("meta.json", "{ meant }")
         data = (tmp_path / "a.sog").read_bytes()
@@ -349,7 +349,7 @@ class TestArchives:
         with pytest.raises(InputError, match=r"a\.sog: not a valid sog file \(meta\.json in it is damaged\)"):
             Splats.load(tmp_path / "a.sog")
 
-    def test_a_bomb_of_sog(self, tmp_path):
+    def test_a_sog_bomb_is_refused(self, tmp_path):
         with zipfile.ZipFile(tmp_path / "a.sog", "w", zipfile.ZIP_DEFLATED) as archive:
             archive.writestr("meta.json", bytes(64 << 20))
         with pytest.raises(
@@ -357,13 +357,13 @@ class TestArchives:
         ):
             Splats.load(tmp_path / "a.sog")
 
-    def test_an_archive_that_is_none(self, tmp_path):
+    def test_invalid_archives_are_refused(self, tmp_path):
         for name, data in (("a.sog", b"PK\3\4rubbish"), ("a.spz", b"\x1f\x8b rubbish")):
             (tmp_path / name).write_bytes(data)
             with pytest.raises(InputError, match=rf"{name}: not a valid"):
                 Splats.load(tmp_path / name)
 
-    def test_a_header_that_promises_billions(self, tmp_path):
+    def test_a_header_that_states_billions_of_gaussians_is_refused(self, tmp_path):
         box_asset("nut").splats.save(tmp_path / "a.ply")
         data = (tmp_path / "a.ply").read_bytes()
         (tmp_path / "a.ply").write_bytes(data.replace(b"vertex 12\n", b"vertex 99999999999\n"))
@@ -386,11 +386,11 @@ class TestAttacks:
     @pytest.mark.parametrize(
         "name", ["exr: panorama, deep", "splats: SPZ bomb", "xml: absolute path", "yaml: aliases that multiply"]
     )
-    def test_is_held_off(self, place, name):
+    def test_a_known_attack_has_no_effect(self, place, name):
         (attack,) = (attack for attack in all_attacks() if attack.name == name)
         assert judge(attack, place).faults == ()
 
-    def test_names_are_unique(self):
+    def test_attack_names_are_unique(self):
         names = [attack.name for attack in all_attacks()]
         assert len(set(names)) == len(names)
 
@@ -415,7 +415,7 @@ class TestAttacks:
             ("{python} -c 'a = bytearray(80 << 20); a[::4096] = a[::4096]; input()' < pipe", "takes more than 60 MiB"),
         ],
     )
-    def test_verdicts(self, place, script, fault):
+    def test_each_effect_of_an_attack_is_a_fault(self, place, script, fault):
         def build(place):
             place.write("kept", "a")
             os.mkfifo(place.inside / "pipe")
@@ -436,7 +436,7 @@ class TestMeshes:
         assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 300e3
 
     @pytest.mark.parametrize("name", ["m.zip", "m.ZIP", "m.tar.gz", "m.bz2"])
-    def test_an_archive_is_no_mesh(self, scene_data, write_scene, tmp_path, name):
+    def test_archives_are_refused_as_meshes(self, scene_data, write_scene, tmp_path, name):
         (tmp_path / name).write_bytes(b"PK")
         scene_data["shapes"] = [{"name": "a", "mesh": name}]
         with pytest.raises(
@@ -447,7 +447,7 @@ class TestMeshes:
             read_parts(tmp_path / name)
 
     @pytest.mark.parametrize("read", [read_mesh, read_parts])
-    def test_a_count_without_data(self, tmp_path, read):
+    def test_a_count_of_vertices_without_data_is_refused(self, tmp_path, read):
         """Positions of 10^10 vertices in no buffer, which are zeros by the rules of glTF."""
         accessor = {"componentType": 5126, "count": 10**10, "type": "VEC3"}
         mesh = {"primitives": [{"attributes": {"POSITION": 0}}]}
@@ -459,7 +459,7 @@ class TestMeshes:
         ):
             read(path)
 
-    def test_a_swollen_3mf(self, tmp_path):
+    def test_a_3mf_bomb_is_refused(self, tmp_path):
         pytest.importorskip("lxml")
         path = tmp_path / "a.3mf"
         with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive, archive.open("3D/a.model", "w") as file:
@@ -470,7 +470,7 @@ class TestMeshes:
         with pytest.raises(InputError, match=r"a\.3mf: not a mesh file that can be read \("):
             read_mesh(path)
 
-    def test_a_buffer_outside_is_not_read(self, tmp_path):
+    def test_a_gltf_buffer_outside_of_the_folder_is_not_read(self, tmp_path):
         (tmp_path / "in").mkdir()
         files = trimesh.exchange.gltf.export_gltf(trimesh.Scene(trimesh.creation.box()))
         for name, data in files.items():
@@ -489,7 +489,7 @@ class TestMeshes:
                 read_mesh(tmp_path / "in/a.gltf")
 
     @pytest.mark.parametrize("name", ["a.stl", "a.obj", "a.glb"])
-    def test_a_file_of_gigabytes_is_not_read(self, tmp_path, name):
+    def test_a_mesh_file_of_gigabytes_is_not_read(self, tmp_path, name):
         size = 84 + 50 * (1 << 25)
         (tmp_path / name).write_bytes(bytes(80) + struct.pack("<I", 1 << 25))
         os.truncate(tmp_path / name, size)
@@ -498,7 +498,7 @@ class TestMeshes:
         ):
             read_mesh(tmp_path / name)
 
-    def test_plain_triangles_take_no_process(self, tmp_path, monkeypatch):
+    def test_plain_triangles_are_read_without_a_child_process(self, tmp_path, monkeypatch):
         monkeypatch.setattr(untrusted_meshes, "run_bounded", None)
         box = trimesh.creation.box()
         for name in ("a.ply", "a.stl"):

@@ -51,7 +51,7 @@ def page(clean: Path, tmp_path: Path) -> Page:
     return Page(path.read_text())
 
 
-def test_the_page_says_what_the_dataset_is(page: Page) -> None:
+def test_the_report_states_contents_and_settings_of_the_dataset(page: Page) -> None:
     for text in ("small", "4 train, 2 val", "64 x 48 px", "No violations in", "Seed", "Device", "hidden", "yolo-pose"):
         assert text in page.text
     assert "2.0e-05 of the range on average, 0.0040 at most" in page.text  # of frames that all state their error
@@ -68,7 +68,7 @@ def test_the_page_says_what_the_dataset_is(page: Page) -> None:
         assert caption in page.text
 
 
-def test_the_page_needs_nothing_else(page: Page) -> None:
+def test_the_report_loads_no_other_file(page: Page) -> None:
     for tag, attributes in page.elements:
         for name in ("src", "href", "srcset", "data", "action"):
             if name in attributes:
@@ -76,7 +76,7 @@ def test_the_page_needs_nothing_else(page: Page) -> None:
     assert not page.all("link") and not page.all("iframe")
 
 
-def test_the_page_is_well_formed_and_named_for_screen_readers(page: Page) -> None:
+def test_the_report_is_well_formed_with_names_for_screen_readers(page: Page) -> None:
     assert page.open == []
     assert page.all("html")[0]["lang"] == "en"
     assert len(page.all("h1")) == 1 and len(page.all("main")) == 1
@@ -90,7 +90,7 @@ def test_the_page_is_well_formed_and_named_for_screen_readers(page: Page) -> Non
     assert not any("tabindex" in attributes and attributes["tabindex"] != "0" for _, attributes in page.elements)
 
 
-def test_overlays_are_toggled_in_a_browser(clean: Path, tmp_path: Path) -> None:
+def test_overlays_of_the_report_are_toggled_in_a_browser(clean: Path, tmp_path: Path) -> None:
     chromium = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
     if chromium is None:
         pytest.skip("no Chromium on this machine")
@@ -109,7 +109,7 @@ def test_overlays_are_toggled_in_a_browser(clean: Path, tmp_path: Path) -> None:
     assert body is not None and 'data-shown="true"' in body[0] and 'data-hidden="true"' in body[0]
 
 
-def test_violations_are_shown_and_escaped(dataset: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_violations_are_shown_with_escaped_text(dataset: Path, capsys: pytest.CaptureFixture[str]) -> None:
     records = records_of(dataset)
     swap_a_class(dataset, records)
     (dataset / "images/train/<b>.png").write_bytes(b"")
@@ -121,7 +121,7 @@ def test_violations_are_shown_and_escaped(dataset: Path, capsys: pytest.CaptureF
     assert "<b>.png" not in text
 
 
-def test_a_damaged_dataset_has_a_page_too(dataset: Path) -> None:
+def test_a_damaged_dataset_has_a_report(dataset: Path) -> None:
     (dataset / "images/train/000000.png").unlink()
     with (dataset / "manifest.jsonl").open("a") as file:
         file.write("{\n")
@@ -140,18 +140,18 @@ class TestCharts:
         counts = dict(re.findall(r'<th scope="row">([^<]+)</th><td>(\d+)</td>', text))
         assert counts == {"0 to 0.1": "2", "0.5 to 0.6": "1", "0.9 to 1": "2"}
 
-    def test_heights_are_in_proportion(self) -> None:
+    def test_bars_and_columns_are_proportional_to_counts(self) -> None:
         heights = [float(h) for h in re.findall(r'class="bar"[^>]* height="([\d.]+)"', columns("c", [1, 4, 2], "abc"))]
         np.testing.assert_allclose(np.array(heights) / heights[1], (0.25, 1, 0.5), atol=0.01)
         widths = [float(w) for w in re.findall(r'class="bar"[^>]* width="([\d.]+)"', bars("c", {"a": 3, "b": 6}))]
         assert widths[0] == pytest.approx(widths[1] / 2)
 
-    def test_a_heat_map_puts_points_where_they_are(self) -> None:
+    def test_a_heat_map_counts_points_in_their_cells(self) -> None:
         counted = HeatMap((100, 50), (10, 5))
         counted.add([99.0, 99.0, 1.0], [49.0, 49.0, 1.0])
         text = counted.draw("m", "px")
         assert "<td>10, 5: 2</td>" in text and "<td>2 of 50</td>" in text
 
     @pytest.mark.parametrize("chart", [bars("c", {}), Histogram((0, 1)).draw("c"), columns("c", [0], ["0"])])
-    def test_nothing_is_no_error(self, chart: str) -> None:
+    def test_charts_without_data_are_well_formed(self, chart: str) -> None:
         assert Page(chart).open == []

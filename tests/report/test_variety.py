@@ -65,7 +65,7 @@ def test_cells_have_equal_areas() -> None:
     assert {cell_of(np.array([0.1, 0.1, z]))[0] for z in (9, 0.01, -0.01, -9)} == {0, RINGS - 1, RINGS, 2 * RINGS - 1}
 
 
-def test_directions_are_counted_in_each_object_s_own_coordinates() -> None:
+def test_view_directions_are_counted_in_object_coordinates() -> None:
     """Whatever turns object and camera together changes nothing."""
     rng = np.random.default_rng(1)
     for turn in (np.eye(3), Rotation.random(rng=rng).as_matrix()):
@@ -81,7 +81,7 @@ def test_directions_are_counted_in_each_object_s_own_coordinates() -> None:
         assert numbers(page, "Covered view directions below objects") == {"long bolt": "0 %"}
 
 
-def test_who_hides_whom_is_what_masks_say(clean: Path) -> None:
+def test_occlusion_counts_agree_with_masks(clean: Path) -> None:
     """By masks of drawn frames, decoded and compared pixel by pixel."""
     expected = Counter[str]()
     for one in records_of(clean):
@@ -123,7 +123,7 @@ def test_every_draw_has_its_histogram() -> None:
     assert "objects[3].id" not in page
 
 
-def test_camera_angles_are_those_of_where_it_is() -> None:
+def test_camera_angles_follow_from_its_position() -> None:
     values = dict(variety._camera_values(record(eye=(0, -1, 1))))
     assert values["camera elevation [degrees]"] == pytest.approx(45)
     assert values["camera azimuth [degrees]"] == pytest.approx(270)
@@ -135,7 +135,7 @@ def test_camera_angles_are_those_of_where_it_is() -> None:
     assert dict(variety._camera_values(tilted))["camera roll [degrees]"] == pytest.approx(10)
 
 
-def test_samples_are_thinned_out_evenly(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_samples_are_thinned_evenly(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(variety, "_MAX_NUMBERS", 8)
     sample = variety._Sample()
     for value in range(100):
@@ -146,7 +146,7 @@ def test_samples_are_thinned_out_evenly(monkeypatch: pytest.MonkeyPatch) -> None
 
 
 class TestWarnings:
-    def test_what_varies_is_not_warned_of(self) -> None:
+    def test_varied_datasets_get_no_warning(self) -> None:
         rng = np.random.default_rng(2)
         records = []
         for number in range(4 * MIN_VIEWS):
@@ -162,7 +162,7 @@ class TestWarnings:
         assert found.warnings() == []
         assert "No warnings" in found.sections()
 
-    def test_what_does_not_vary_is_named(self) -> None:
+    def test_each_constant_property_gets_a_warning(self) -> None:
         lamp = [{"position": [-1, 0, 1], "intensity": 1.0}, {"position": [5, 0, 1], "intensity": 2.0}]
         records = [record(label(0), label(0), label(0), label(0), label(1), lights=lamp) for _ in range(30)]
         assert counted(*records, record(label(0), split="val")).warnings() == [
@@ -176,7 +176,7 @@ class TestWarnings:
             "light comes from the left in 30 of 30 images",
         ]
 
-    def test_light_counts_by_how_bright_it_is(self) -> None:
+    def test_lights_are_weighted_by_their_irradiance(self) -> None:
         """A panel at 1 m beside a lamp ten times as strong at 10 m, which gives a tenth of its light."""
         lamps = [
             {"position": [1, 0, 0], "radiance": 4.0, "size": [0.5, 0.5]},
@@ -186,12 +186,12 @@ class TestWarnings:
         records = [record(label(0), lights=lamps) for _ in range(30)]
         assert "light comes from the right in 30 of 30 images" in counted(*records).warnings()
 
-    def test_few_images_are_not_judged(self) -> None:
+    def test_few_images_get_no_warning(self) -> None:
         assert counted(record(label(0), label(1))).warnings() == ["there are 2 instances, too few to learn from"]
         assert counted().warnings() == ["there are 0 instances, too few to learn from"]
 
 
-def test_the_command_prints_the_warnings(dataset: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_report_command_prints_the_warnings(dataset: Path, capsys: pytest.CaptureFixture[str]) -> None:
     records = records_of(dataset)
     for one in records:
         one["draws"]["odd"] = {"nested": [float("inf"), None, "<b>"]}  # nobody checks what draws are
@@ -202,7 +202,7 @@ def test_the_command_prints_the_warnings(dataset: Path, capsys: pytest.CaptureFi
     assert "<b>" not in (dataset / "report.html").read_text()
 
 
-def test_discs_show_cells_where_they_are() -> None:
+def test_discs_show_cells_at_their_directions() -> None:
     """The cell around +x and above lies right of the middle and above it."""
     cells = np.zeros((2, 4), dtype=np.int64)
     cells[1, 0] = 3

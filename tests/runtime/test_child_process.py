@@ -66,14 +66,14 @@ class TestBounded:
     def importable(self, monkeypatch):
         monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[2]))
 
-    def test_output_is_what_the_function_writes(self):
+    def test_the_output_is_that_of_the_function(self):
         ended = run_bounded(echo, "a", Path("/b c"), data=b"123", imports=["numpy"], memory=GIB, seconds=30)
         assert ended == (0, b"321a//b c", "")
 
-    def test_a_refusal_gives_the_last_line_of_its_sentence(self):
+    def test_an_input_error_returns_its_sentence(self):
         assert run_bounded(refuse, memory=GIB, seconds=30) == (REFUSED_STATUS, b"so far", "it holds nothing")
 
-    def test_memory_is_bounded_on_top_of_what_is_held(self):
+    def test_memory_is_bounded_beyond_that_of_the_imports(self):
         assert run_bounded(fill, str(GIB // 2), imports=["numpy"], memory=GIB, seconds=30).output == b"%d" % (GIB // 2)
         assert run_bounded(fill, str(GIB), imports=["numpy"], memory=GIB, seconds=30) == (1, b"", "MemoryError")
 
@@ -81,7 +81,7 @@ class TestBounded:
         ended = run_bounded(fill_twice, str(GIB // 8), str(GIB // 2), memory=GIB, seconds=30)
         assert ended == (1, b"small ", "MemoryError")
 
-    def test_a_signal_is_told_by_its_number(self):
+    def test_a_signal_is_reported_by_its_number(self):
         assert run_bounded(die, memory=GIB, seconds=30) == (-6, b"", "stopped with status -6")
 
     def test_time_is_bounded(self):
@@ -89,17 +89,17 @@ class TestBounded:
         assert run_bounded(sleep, memory=GIB, seconds=1) == (None, b"", "did not end within 1 s")
         assert time.monotonic() - begun < 10
 
-    def test_it_is_safe_and_dumps_no_core(self):
+    def test_the_process_runs_in_safe_path_mode_without_core_dumps(self):
         assert run_bounded(show_settings, memory=GIB, seconds=30).output == b"(True, '1', (0, 0))"
 
 
 class TestSafePath:
-    def test_every_command_is_safe(self):
+    def test_every_command_runs_in_safe_path_mode(self):
         assert python_command("-m", Path("a")) == [sys.executable, "-P", "-m", "a"]
         assert python_environment({"A": "b"}) == {**os.environ, "A": "b", SAFE_PATH: "1"}
 
     @pytest.mark.parametrize("before", [None, "", "1"])
-    def test_the_environment_and_the_path_are_as_before(self, monkeypatch, before):
+    def test_the_environment_and_the_path_are_restored(self, monkeypatch, before):
         monkeypatch.delenv(SAFE_PATH, raising=False)
         if before is not None:
             monkeypatch.setenv(SAFE_PATH, before)
@@ -111,7 +111,7 @@ class TestSafePath:
 
     @pytest.mark.skipif(sys.flags.safe_path, reason="Python was started in safe-path mode")
     @pytest.mark.parametrize(("first", "kept"), [("", False), ("{cwd}", False), ("/usr/bin", True)])
-    def test_the_current_folder_is_left(self, monkeypatch, tmp_path, first, kept):
+    def test_the_current_folder_is_removed_from_the_path(self, monkeypatch, tmp_path, first, kept):
         monkeypatch.setenv(SAFE_PATH, "0")
         monkeypatch.chdir(tmp_path)
         first = first.format(cwd=tmp_path)
@@ -120,7 +120,7 @@ class TestSafePath:
         assert (os.environ[SAFE_PATH], sys.path) == ("1", [first, "/somewhere"] if kept else ["/somewhere"])
 
     @pytest.mark.skipif(sys.flags.safe_path, reason="Python was started in safe-path mode")
-    def test_a_current_folder_that_was_removed_is_left(self, monkeypatch, tmp_path):
+    def test_a_deleted_current_folder_is_removed_from_the_path(self, monkeypatch, tmp_path):
         monkeypatch.setenv(SAFE_PATH, "0")
         (tmp_path / "gone").mkdir()
         monkeypatch.chdir(tmp_path / "gone")
@@ -129,7 +129,7 @@ class TestSafePath:
         leave_current_folder()
         assert sys.path == ["/somewhere"]
 
-    def test_the_folder_that_mitsplat_is_in_stays(self, monkeypatch):
+    def test_the_folder_of_mitsplat_stays_on_the_path(self, monkeypatch):
         monkeypatch.setenv(SAFE_PATH, "0")
         monkeypatch.chdir(Path(__file__).parents[2])
         monkeypatch.setattr(sys, "path", ["", "/somewhere"])

@@ -110,7 +110,7 @@ TWO = ("Two", 80, "0000:1A:00.0")
 
 
 @pytest.mark.parametrize("text", ["gpu", "cuda:", "cuda:-1", "cuda:one", "cuda:0,1", "CPU", "", "cuda: 1", "cuda\n"])
-def test_a_device_that_is_none(text):
+def test_invalid_device_names_are_refused(text):
     with pytest.raises(InputError, match=r"^device must be cpu, cuda, cuda:N, cuda:all or auto \(got "):
         use_device(text)
 
@@ -130,7 +130,7 @@ def test_a_device_that_is_none(text):
         ),
     ],
 )
-def test_without_a_gpu(machine, parts, words):
+def test_a_missing_gpu_is_reported_and_auto_selects_the_cpu(machine, parts, words):
     """A GPU that was asked for is missed in one sentence; ``auto`` takes the CPU and says why."""
     machine(*parts.get("gpus", ()), **{key: value for key, value in parts.items() if key != "gpus"})
     for text in ("cuda", "cuda:1", "cuda:all"):
@@ -182,12 +182,12 @@ def test_numbers_of_different_gpus_are_read_in_the_order_of_cuda(machine, monkey
     assert os.environ[gpu_memory.VISIBLE_GPUS] == left
 
 
-def test_what_others_have_taken_is_not_for_workers(machine):
+def test_the_memory_of_gpus_excludes_that_of_other_processes(machine):
     machine(ONE, TWO, unused=(60, 5))
     assert [gpu.memory / 2**30 for gpu in find_device("cuda:all").gpus] == [60, 5]
 
 
-def test_gpus_by_name(machine):
+def test_devices_select_gpus_by_number_and_all(machine):
     machine(ONE, TWO)
     assert find_device("auto") == Device("cuda", find_device("cuda").gpus, "NVIDIA's driver and OptiX are complete")
     assert str(find_device("cuda")) == "cuda (One)"  # the first that CUDA counts, which is what Dr.Jit takes
@@ -199,13 +199,13 @@ def test_gpus_by_name(machine):
         find_device("cuda:2")
 
 
-def test_gpus_count_as_they_were_made_visible(machine, monkeypatch):
+def test_gpus_are_numbered_in_the_order_of_visible_devices(machine, monkeypatch):
     machine(ONE, TWO)
     monkeypatch.setenv(gpu_memory.VISIBLE_GPUS, "3,1")
     assert [find_device(f"cuda:{i}").gpus[0].name for i in range(2)] == ["One", "Two"]
 
 
-def test_a_process_takes_the_gpu_that_it_sees_first(machine, monkeypatch):
+def test_a_process_uses_the_first_visible_gpu(machine, monkeypatch):
     machine(ONE, TWO)
     taken = []
     monkeypatch.setattr(devices, "choose_variant", taken.append)
@@ -226,7 +226,7 @@ def test_a_process_takes_the_gpu_that_it_sees_first(machine, monkeypatch):
         find_device("cuda:1")
 
 
-def test_the_variant_follows(monkeypatch):
+def test_the_device_determines_the_mitsuba_variant(monkeypatch):
     chosen = mi.variant()
     assert ms.use_device("cpu") == CPU == current_device()
     assert mi.variant() == "llvm_ad_rgb"
@@ -238,7 +238,7 @@ def test_the_variant_follows(monkeypatch):
 
 
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="nothing to restrict processes by")
-def test_cores_are_those_that_a_process_may_run_on() -> None:
+def test_cores_are_those_of_the_processor_affinity() -> None:
     restrict = "import os\nos.sched_setaffinity(0, [min(os.sched_getaffinity(0))])\n"
     script = f"{restrict}from mitsplat.runtime.cores import usable_cores\nprint(usable_cores())"
     assert subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout == "1\n"

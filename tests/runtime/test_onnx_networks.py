@@ -27,14 +27,14 @@ def test_old_releases_are_refused(version: str, good: bool, monkeypatch: pytest.
             load_library("depth", "onnxruntime")
 
 
-def test_what_masks_need_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_missing_library_of_mask_networks_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
     with pytest.raises(MissingResourceError, match=r"masks by a model need rembg: pip install 'mitsplat\[masks\]'"):
         load_library("masks", "rembg")
 
 
 @pytest.mark.parametrize("name", [name for name in NETWORKS if name.startswith("numbers from")])
-def test_weights_outside_are_not_read(tmp_path: Path, name: str) -> None:
+def test_weights_outside_of_the_network_folder_are_not_read(tmp_path: Path, name: str) -> None:
     pytest.importorskip("onnxruntime")
     for folder in ("inside", "outside"):
         (tmp_path / folder).mkdir()

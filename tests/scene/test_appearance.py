@@ -45,7 +45,7 @@ def layout(index: int, nuts: int = 3) -> Layout:
     return Layout(index, tuple(instances), NO_PHYSICS)
 
 
-def test_each_object_is_drawn_in_its_ranges(varied: Any) -> None:
+def test_appearances_are_drawn_within_their_ranges(varied: Any) -> None:
     scene = varied()
     drawn = [one for index in range(100) for one in draw_appearances(scene, layout(index)).values()]
     assert len(drawn) == 300 and {one.entry for one in drawn} == {0}
@@ -62,7 +62,7 @@ def test_each_object_is_drawn_in_its_ranges(varied: Any) -> None:
     assert np.abs(np.corrcoef(columns.T) - np.eye(7)).max() < 0.25
 
 
-def test_seed_layout_and_id_decide_an_appearance(varied: Any) -> None:
+def test_seed_layout_and_id_determine_an_appearance(varied: Any) -> None:
     scene = varied()
     one = draw_appearances(scene, layout(4))
     assert one == draw_appearances(scene, layout(4))
@@ -74,7 +74,7 @@ def test_seed_layout_and_id_decide_an_appearance(varied: Any) -> None:
     assert {k: replace(v, hue=0.0) for k, v in one.items()} == narrowed
 
 
-def test_what_is_absent_stays_as_it_was(varied: Any) -> None:
+def test_properties_without_a_range_are_unchanged(varied: Any) -> None:
     scene = varied({"wear": [0.3, 0.3]})
     one = draw_appearances(scene, layout(0))[1]
     own = scene.assets[0]
@@ -83,7 +83,7 @@ def test_what_is_absent_stays_as_it_was(varied: Any) -> None:
     assert set(one.properties()) == {"roughness", "specular", "wear", "wear_seed"}
 
 
-def test_properties_are_those_of_the_shape() -> None:
+def test_drawn_properties_are_those_of_the_shape() -> None:
     one = ObjectAppearance(1, 0, 30.0, 0.5, 0.8, (1.0, 0.9, 1.2), 0.3, 0.05, 0.0, 7)
     matrix = np.array(one.properties()["colours"].split(), dtype=float).reshape(3, 3)
     colour = np.array([0.2, 0.5, 0.7])
@@ -92,7 +92,7 @@ def test_properties_are_those_of_the_shape() -> None:
     assert "wear" not in one.properties()
 
 
-def test_layouts_are_the_same_however_objects_look(varied: Any, scene_data: Any, write_scene: WriteScene) -> None:
+def test_appearances_do_not_change_layouts(varied: Any, scene_data: Any, write_scene: WriteScene) -> None:
     """And the keys of the layouts that were settled before appearances were known stay theirs."""
     dull, worn = varied({"wear": [0, 1]}), varied()
     del scene_data["objects"][0]["appearance"]
@@ -117,7 +117,7 @@ def test_layouts_are_the_same_however_objects_look(varied: Any, scene_data: Any,
         ({"dirt": [0, 1]}, "objects[0].appearance.dirt: is not a known key"),
     ],
 )
-def test_wrong_ranges_are_refused(varied: Any, ranges: Any, sentence: str) -> None:
+def test_invalid_ranges_are_refused(varied: Any, ranges: Any, sentence: str) -> None:
     with pytest.raises(InputError) as error:
         varied(ranges)
     assert sentence in str(error.value)

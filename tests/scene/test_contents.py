@@ -39,7 +39,7 @@ def counted(scene: Scene, split: str | None = None, layouts: int = 200) -> Count
     return Counter(scene.assets[asset].class_name for i in wanted for asset in draw_objects(scene, i)[0])
 
 
-def test_each_object_is_drawn_anew(pool_of_four: SceneData, write_scene: WriteScene) -> None:
+def test_each_object_of_a_pool_is_drawn_independently(pool_of_four: SceneData, write_scene: WriteScene) -> None:
     scene = load_scene(write_scene(pool_of_four))
     layouts = [drawn(scene, index) for index in range(200)]
     assert {len(names) for names in layouts} == {1, 2, 3, 4}
@@ -49,7 +49,7 @@ def test_each_object_is_drawn_anew(pool_of_four: SceneData, write_scene: WriteSc
     assert all(abs(count - expected) < 4 * expected**0.5 for count in counts.values())
 
 
-def test_weights_are_relative(pool_of_four: SceneData, write_scene: WriteScene) -> None:
+def test_pool_weights_are_relative(pool_of_four: SceneData, write_scene: WriteScene) -> None:
     pool_of_four["objects"][0]["weights"] = [1, 1, 2, 4]
     scene = load_scene(write_scene(pool_of_four))
     counts = Counter(name for index in range(200) for name in drawn(scene, index))
@@ -59,7 +59,7 @@ def test_weights_are_relative(pool_of_four: SceneData, write_scene: WriteScene) 
 
 
 @pytest.mark.parametrize("layouts", [7, 50, 200])
-def test_balance_deals_classes_out_in_turn(pool_of_four: SceneData, write_scene: WriteScene, layouts: int) -> None:
+def test_balance_draws_classes_in_turn(pool_of_four: SceneData, write_scene: WriteScene, layouts: int) -> None:
     """However many layouts there are, and in each split: no class is ahead by two."""
     pool_of_four["objects"][0] |= {"balance": True, "weights": [9, 1, 1, 1]}
     scene = load_scene(write_scene(pool_of_four | {"empty": 0.1}))
@@ -71,7 +71,7 @@ def test_balance_deals_classes_out_in_turn(pool_of_four: SceneData, write_scene:
     assert len({tuple(drawn(scene, index)) for index in range(200)}) > 40
 
 
-def test_any_order_of_layouts_draws_the_same(pool_of_four: SceneData, write_scene: WriteScene) -> None:
+def test_the_order_of_layouts_does_not_change_draws(pool_of_four: SceneData, write_scene: WriteScene) -> None:
     pool_of_four["objects"][0]["balance"] = True
     path = write_scene(pool_of_four)
     one, other = load_scene(path), load_scene(path, overrides={"output.layouts": 3})
@@ -79,7 +79,7 @@ def test_any_order_of_layouts_draws_the_same(pool_of_four: SceneData, write_scen
     assert backwards == {index: draw_objects(other, index)[0] for index in range(41)}
 
 
-def test_a_pool_leaves_what_other_entries_draw_alone(scene_data: SceneData, write_scene: WriteScene) -> None:
+def test_a_pool_does_not_change_draws_of_other_entries(scene_data: SceneData, write_scene: WriteScene) -> None:
     plain = load_scene(write_scene(scene_data))
     scene_data["objects"].append({"pool": ["assets/nut", "assets/bolt"], "count": [0, 3], "label": False})
     more = load_scene(write_scene(scene_data))
@@ -104,14 +104,14 @@ def test_each_split_has_its_share_of_empty_layouts(
             assert scene.pools[1][0] in draw_objects(scene, index)[0]  # distractors lie in all of them
 
 
-def test_classes_are_those_of_what_is_labelled(scene_data: SceneData, write_scene: WriteScene) -> None:
+def test_classes_are_those_of_labelled_objects(scene_data: SceneData, write_scene: WriteScene) -> None:
     scene_data["objects"][0]["label"] = False
     scene = load_scene(write_scene(scene_data))
     assert scene.class_names == ("bolt",)
     assert [scene.class_index(asset) for asset in (0, 1)] == [None, 0]
 
 
-def test_a_pattern_is_what_it_matches(scene_data: SceneData, write_scene: WriteScene, tmp_path: Path) -> None:
+def test_a_pattern_is_replaced_by_its_matches(scene_data: SceneData, write_scene: WriteScene, tmp_path: Path) -> None:
     """By name, objects alone, and written into the scene, so that a dataset knows what it was made of."""
     path = write_scene(scene_data | {"objects": [{"pool": "assets/*", "count": 2}]})
     box_asset("around").save(tmp_path / "assets/around")
@@ -125,7 +125,7 @@ def test_a_pattern_is_what_it_matches(scene_data: SceneData, write_scene: WriteS
         load_scene(write_scene(scene_data | {"objects": [{"pool": "../*"}]}))
 
 
-def test_a_range_of_scales_is_sizes_of_their_own(scene_data: SceneData, write_scene: WriteScene) -> None:
+def test_a_range_of_scales_gives_assets_of_several_sizes(scene_data: SceneData, write_scene: WriteScene) -> None:
     """Each is a whole asset, with mesh, splats, pieces and mass in its size: poses stay rigid."""
     scene_data["objects"] = [{"pool": ["assets/nut", "assets/bolt"], "scale": [0.5, 2], "count": 3}]
     scene = load_scene(write_scene(scene_data))
@@ -167,7 +167,7 @@ def test_each_of_three_splits_is_balanced_and_has_its_empty_layouts(
 
 
 @pytest.mark.parametrize("balance", [False, True])
-def test_what_is_held_out_is_in_the_test_split_alone(
+def test_held_out_assets_are_in_the_test_split_only(
     pool_of_four: SceneData, write_scene: WriteScene, balance: bool
 ) -> None:
     """Members of pools, and entries of their own, which then have nothing to draw; the number of others stays."""
@@ -199,14 +199,14 @@ def test_what_is_held_out_is_in_the_test_split_alone(
         ({"output": {"validation": 0.5, "test": 0.6}}, r"test: must be at most 1 - validation, 0\.5 \(got 0\.6\)"),
     ],
 )
-def test_splits_that_cannot_be_are_refused(
+def test_invalid_splits_are_refused(
     scene_data: SceneData, write_scene: WriteScene, change: SceneData, sentence: str
 ) -> None:
     with pytest.raises(InputError, match=sentence):
         load_scene(write_scene(scene_data | change))
 
 
-def test_environments_that_are_held_out_are_in_the_test_split_alone(
+def test_held_out_environments_are_in_the_test_split_only(
     scene_data: SceneData, write_scene: WriteScene, tmp_path: Path
 ) -> None:
     for name in ("hall", "yard", "cell"):

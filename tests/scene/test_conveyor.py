@@ -45,7 +45,7 @@ def scene_of(data: SceneData, write_scene: WriteScene) -> Scene:
     return load_scene(write_scene(data))
 
 
-def test_what_is_above_the_belt_runs_along_it(belt_data: SceneData, write_scene: WriteScene) -> None:
+def test_objects_above_the_belt_move_along_it(belt_data: SceneData, write_scene: WriteScene) -> None:
     spec = scene_of(belt_data, write_scene).spec
     beside, below = (0.0, 0.45, 0.01), (0.0, 0.0, -0.2)
     layout = lying((0.1, 0.0, 0.01), beside, below, (-0.1, 0.05, 0.3))
@@ -56,7 +56,7 @@ def test_what_is_above_the_belt_runs_along_it(belt_data: SceneData, write_scene:
         np.testing.assert_array_equal(moved[[1, 2]], 0)
 
 
-def test_a_layout_is_carried_from_where_it_settled(belt_data: SceneData, write_scene: WriteScene) -> None:
+def test_a_layout_moves_from_its_settled_poses(belt_data: SceneData, write_scene: WriteScene) -> None:
     spec = scene_of(belt_data, write_scene).spec
     layout = lying((0.1, 0.0, 0.01))
     last = layout_at_view(spec, layout, 3)
@@ -64,18 +64,18 @@ def test_a_layout_is_carried_from_where_it_settled(belt_data: SceneData, write_s
     np.testing.assert_array_equal(places_of(layout_at_view(spec, last, 0)), places_of(layout_at_view(spec, layout, 0)))
 
 
-def test_poses_that_are_made_up_stay(belt_data: SceneData, write_scene: WriteScene) -> None:
+def test_given_poses_do_not_move(belt_data: SceneData, write_scene: WriteScene) -> None:
     scene = scene_of(belt_data, write_scene)
     given = Layout.from_poses(scene, {"nut": [np.eye(4)]})
     assert layout_at_view(scene.spec, given, 0) is given
 
 
-def test_a_scene_without_a_belt_has_the_layout_itself(scene_data: SceneData, write_scene: WriteScene) -> None:
+def test_a_scene_without_a_belt_keeps_its_layout(scene_data: SceneData, write_scene: WriteScene) -> None:
     layout = lying((0.1, 0.0, 0.01))
     assert layout_at_view(scene_of(scene_data, write_scene).spec, layout, 1) is layout
 
 
-def test_cameras_of_a_turn_see_the_same_moment(belt_data: SceneData, write_scene: WriteScene) -> None:
+def test_cameras_of_a_rig_see_the_same_moment(belt_data: SceneData, write_scene: WriteScene) -> None:
     belt_data["cameras"] = [{**belt_data["camera"], "height": 0.5}]
     belt_data["camera"]["stereo"] = {"baseline": 0.05}
     belt_data["output"]["views"] = 9
@@ -96,7 +96,7 @@ def test_cameras_of_a_turn_see_the_same_moment(belt_data: SceneData, write_scene
         ({"speed": -3.0}, "conveyor.belt: its box must be 1.45 m long, so that the objects of its region stay on it"),
     ],
 )
-def test_what_no_belt_can_do_is_refused(
+def test_invalid_belts_are_refused(
     belt_data: SceneData, write_scene: WriteScene, change: dict[str, Any], sentence: str
 ) -> None:
     belt_data["conveyor"] |= change
@@ -111,7 +111,7 @@ def test_a_belt_below_no_region_is_refused(belt_data: SceneData, write_scene: Wr
         scene_of(belt_data, write_scene)
 
 
-def test_an_open_shutter_needs_something_that_moves(belt_data: SceneData, write_scene: WriteScene) -> None:
+def test_exposure_without_motion_is_refused(belt_data: SceneData, write_scene: WriteScene) -> None:
     belt_data["camera"]["motion"] = {"exposure": [0.01, 0.02]}
     assert not scene_of(belt_data, write_scene).spec.camera.motion.is_moving  # type: ignore[union-attr]
     del belt_data["conveyor"]

@@ -56,7 +56,7 @@ def spread(values: Any, low: float, high: float) -> None:
     assert abs(values.mean() - (low + high) / 2) < 5 * (high - low) / np.sqrt(12 * len(values))
 
 
-def test_lights_come_from_all_sides_in_their_ranges(lit: Any) -> None:
+def test_drawn_lights_come_from_all_sides_within_their_ranges(lit: Any) -> None:
     drawn = lights_of(lit(SIDES, SKY))
     assert {len(lights) for lights in drawn} == {1, 2, 3, 4}
     areas = [light for lights in drawn[::2] for light in lights if isinstance(light, AreaLight)]
@@ -79,7 +79,7 @@ def test_lights_come_from_all_sides_in_their_ranges(lit: Any) -> None:
     assert all("draw" not in light.model_dump(mode="json") for lights in drawn for light in lights)
 
 
-def test_a_box_is_filled_in_each_component(lit: Any) -> None:
+def test_lights_drawn_in_a_box_fill_each_component(lit: Any) -> None:
     box = [[-1, 2, 0.5], [1, 2.5, 0.5]]
     lamp = {"kind": "spot", "draw": {"position": box, "target": [[-0.1, -0.1, 0], [0.1, 0.1, 0]], "cone": [10, 40]}}
     drawn = [light for (light,) in lights_of(lit(lamp))[::2]]
@@ -102,7 +102,7 @@ def test_lights_vary_by_layout_or_by_frame(lit: Any) -> None:
     assert [sky for _, sky in drawn[::2]] == [sky for _, sky in drawn[1::2]]
 
 
-def test_drawing_a_light_shifts_no_other_draw(lit: Any) -> None:
+def test_drawing_a_light_does_not_change_other_draws(lit: Any) -> None:
     fixed = {"kind": "point", "position": [0, 0, 1], "intensity": 3}
     ranges = {"randomise": {"light_intensity": [0.5, 2], "exposure": [-1, 1]}}
     plain, drawn = lit(fixed, fixed, **ranges), lit(fixed, SIDES | {"kind": "area"}, SKY, **ranges)
@@ -151,7 +151,7 @@ def test_skies_are_drawn_from_a_folder_by_their_weights(lit: Any, tmp_path: Any)
     assert "pool" not in drawn[0].model_dump(mode="json")
 
 
-def test_lights_that_can_be_inside_of_a_shape_are_doubted(lit: Any) -> None:
+def test_lights_that_may_be_inside_of_a_shape_get_a_warning(lit: Any) -> None:
     block = {"name": "block", "box": {"size": [1, 1, 1], "position": [0, 0, 5]}, "visible": True}
     table = {"name": "table", "box": {"size": [1, 1, 0.1], "position": [0, 0, -0.05]}}
     lamp = {"kind": "point", "draw": {"position": [[-0.4, -0.4, 4.6], [0.4, 0.4, 7]]}}
@@ -219,19 +219,19 @@ def test_lights_that_can_be_inside_of_a_shape_are_doubted(lit: Any) -> None:
         ({"kind": "room", "size": 0}, "lights[0].size: must be > 0 (got 0)"),
     ],
 )
-def test_wrong_lights_are_refused(scene_data: Any, write_scene: WriteScene, light: Any, sentence: str) -> None:
+def test_invalid_lights_are_refused(scene_data: Any, write_scene: WriteScene, light: Any, sentence: str) -> None:
     with pytest.raises(InputError) as error:
         load_scene(write_scene(scene_data | {"lights": [light]}))
     assert sentence in str(error.value) and "\n" not in str(error.value)
 
 
-def test_a_room_has_the_only_sky(scene_data: Any, write_scene: WriteScene) -> None:
+def test_a_second_sky_beside_a_room_is_refused(scene_data: Any, write_scene: WriteScene) -> None:
     lights = [{"kind": "environment"}, {"kind": "room"}]
     with pytest.raises(InputError, match=r"lights\[1\]\.kind: must not be a second environment light"):
         load_scene(write_scene(scene_data | {"lights": lights}))
 
 
-def test_the_first_bad_image_of_a_pool_is_named(scene_data: Any, write_scene: WriteScene, tmp_path: Any) -> None:
+def test_the_first_unreadable_image_of_a_pool_is_named(scene_data: Any, write_scene: WriteScene, tmp_path: Any) -> None:
     for name in ("a.png", "c.png"):
         cv2.imwrite(str(tmp_path / name), np.full((4, 8, 3), 90, dtype=np.uint8))
     (tmp_path / "b.png").write_bytes((tmp_path / "a.png").read_bytes()[:40])

@@ -32,7 +32,7 @@ def test_primitives_are_solids_that_their_splats_cover() -> None:
     assert any(len(np.unique(asset.splats.sh.round(3), axis=0)) == 2 for asset in primitives)
 
 
-def test_a_seed_decides_them() -> None:
+def test_the_seed_determines_primitives() -> None:
     """One of each kind."""
     first, again, other = (
         make_primitives(random_stream(seed, "primitive", number) for number in range(5)) for seed in (3, 3, 4)
@@ -45,7 +45,7 @@ def test_a_seed_decides_them() -> None:
     assert first[0].splats.sh.tolist() != other[0].splats.sh.tolist()
 
 
-def test_entries_share_primitives_and_size_them(scene_data: dict[str, Any], write_scene: WriteScene) -> None:
+def test_entries_share_primitives_and_scale_them(scene_data: dict[str, Any], write_scene: WriteScene) -> None:
     scene_data["objects"] = [
         {"asset": "assets/nut"},
         {"pool": "primitives", "label": False},

@@ -46,7 +46,7 @@ def with_output(scene: Scene, **changes: Any) -> Scene:
 # Reading
 
 
-def test_scene_holds_what_the_file_names(scene_data: SceneData, write_scene: WriteScene) -> None:
+def test_a_scene_has_the_contents_of_its_file(scene_data: SceneData, write_scene: WriteScene) -> None:
     scene_data["objects"][1] |= {"class_name": "screw", "scale": 2.0}
     scene = load_scene(write_scene(scene_data))
     assert scene.class_names == ("nut", "screw")
@@ -66,7 +66,7 @@ def test_entries_of_one_asset_share_its_data(scene_data: SceneData, write_scene:
     assert (first.class_name, second.class_name) == ("nut", "other")
 
 
-def test_all_is_read_once_before_any_of_it_is_judged(
+def test_every_file_is_read_once_before_errors_are_reported(
     scene_data: SceneData, write_scene: WriteScene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The first object does not fit into the region, the asset of the last one is absent: the latter is told."""
@@ -79,20 +79,22 @@ def test_all_is_read_once_before_any_of_it_is_judged(
     assert "assets/absent" in refusal(write_scene(scene_data))
 
 
-def test_overrides_replace_what_the_file_says(scene_data: SceneData, write_scene: WriteScene) -> None:
+def test_overrides_replace_values_of_the_file(scene_data: SceneData, write_scene: WriteScene) -> None:
     scene = load_scene(write_scene(scene_data), overrides={"output.width": 32, "seed": 3, "quality": "fast"})
     assert (scene.spec.output.width, scene.spec.output.height) == (32, 48)
     assert (scene.spec.seed, scene.spec.quality) == (3, "fast")
 
 
-def test_overrides_may_be_numpys(scene_data: SceneData, write_scene: WriteScene) -> None:
+def test_overrides_may_be_numpy_values(scene_data: SceneData, write_scene: WriteScene) -> None:
     given = {"seed": np.int64(3), "camera.target": np.zeros(3), "randomise.exposure": [np.float32(-0.5), 1]}
     spec = load_scene(write_scene(scene_data), overrides=given).spec
     assert (spec.seed, spec.camera.target, spec.randomise.exposure) == (3, (0, 0, 0), (-0.5, 1))
 
 
 @pytest.mark.parametrize(("key", "most"), [("exposure", 20), ("motion_blur", 1000)])
-def test_what_no_picture_shows_is_refused(scene_data: SceneData, write_scene: WriteScene, key: str, most: int) -> None:
+def test_values_beyond_any_visible_effect_are_refused(
+    scene_data: SceneData, write_scene: WriteScene, key: str, most: int
+) -> None:
     with pytest.raises(InputError, match=rf"randomise.{key}\[0\]: must be <= {most} "):
         load_scene(write_scene(scene_data), overrides={f"randomise.{key}": [1100, 1100]})
 
@@ -105,7 +107,7 @@ def test_box_is_turned_about_fixed_axes_in_order_x_y_z(scene_data: SceneData, wr
     np.testing.assert_allclose(mesh.centroid, (0, 0, 3), atol=1e-12)
 
 
-def test_shape_from_a_mesh_file(scene_data: SceneData, write_scene: WriteScene, tmp_path: Path) -> None:
+def test_a_shape_is_read_from_a_mesh_file(scene_data: SceneData, write_scene: WriteScene, tmp_path: Path) -> None:
     mesh = box_asset("x").mesh
     assert mesh is not None
     mesh.export(tmp_path / "bin.ply")
@@ -262,14 +264,14 @@ def changed(data: SceneData, **changes: Any) -> SceneData:
         ),
     ],
 )
-def test_wrong_scene_is_refused(
+def test_an_invalid_scene_is_refused_with_its_key(
     scene_data: SceneData, write_scene: WriteScene, changes: SceneData, sentence: str
 ) -> None:
     assert sentence in refusal(write_scene(changed(scene_data, **changes)))
 
 
 @pytest.mark.parametrize("key", ["name", "region", "camera"])
-def test_required_keys(scene_data: SceneData, write_scene: WriteScene, key: str) -> None:
+def test_missing_required_keys_are_refused(scene_data: SceneData, write_scene: WriteScene, key: str) -> None:
     del scene_data[key]
     assert refusal(write_scene(scene_data)) == f"{key}: is required"
 
@@ -300,7 +302,7 @@ def test_an_asset_of_unknown_units_needs_a_size(scene_data: SceneData, write_sce
         load_scene(write_scene(scene_data))
 
 
-def test_environment_cannot_be_dropped(scene_data: SceneData, write_scene: WriteScene) -> None:
+def test_an_environment_as_object_is_refused(scene_data: SceneData, write_scene: WriteScene) -> None:
     path = write_scene(scene_data)
     replace(box_asset("room"), kind="environment", pieces=()).save(path.parent / "assets/room")
     scene_data["objects"][1]["asset"] = "assets/room"
@@ -345,7 +347,7 @@ def random_scene(scene_data: SceneData, write_scene: WriteScene) -> Scene:
     return load_scene(write_scene(scene_data))
 
 
-def test_seed_and_index_decide_a_frame(random_scene: Scene, scene_data: SceneData, write_scene: WriteScene) -> None:
+def test_seed_and_index_determine_a_frame(random_scene: Scene, scene_data: SceneData, write_scene: WriteScene) -> None:
     again = load_scene(write_scene(scene_data))
     forward = [planned(random_scene, index) for index in range(12)]
     backward = [planned(again, index) for index in reversed(range(12))][::-1]
@@ -355,7 +357,7 @@ def test_seed_and_index_decide_a_frame(random_scene: Scene, scene_data: SceneDat
     assert planned(other, 0) != forward[0]
 
 
-def test_adding_layouts_or_a_draw_changes_no_earlier_frame(random_scene: Scene) -> None:
+def test_adding_layouts_or_a_draw_does_not_change_earlier_frames(random_scene: Scene) -> None:
     longer = with_output(random_scene, layouts=50)
     assert [planned(longer, index) for index in range(12)] == [planned(random_scene, index) for index in range(12)]
     spec = random_scene.spec
@@ -375,7 +377,7 @@ def test_draws_fill_their_ranges(random_scene: Scene) -> None:
     assert all(-1 <= exposure <= 1 for exposure in exposures)
 
 
-def test_colours_of_a_camera_are_drawn_where_a_scene_asks_for_them(random_scene: Scene) -> None:
+def test_camera_colours_are_drawn_only_if_the_scene_states_them(random_scene: Scene) -> None:
     spec = random_scene.spec
     varied = spec.model_copy(update={"randomise": spec.randomise.model_copy(update={"chroma_stretch": (1.0, 1.4)})})
     plain = plan_frame(random_scene, 3).draws
@@ -394,7 +396,7 @@ def test_light_factor_is_drawn_once_per_layout(random_scene: Scene) -> None:
     assert all(5 <= value <= 20 for value in radiance)
 
 
-def test_streams_are_independent() -> None:
+def test_random_streams_are_independent() -> None:
     values = [random_stream(*key).random() for key in [(0, "a", 0), (0, "a", 1), (0, "b", 0), (1, "a", 0)]]
     assert len(set(values)) == 4
     assert random_stream(0, "a", 0).random() == values[0]
@@ -542,7 +544,7 @@ def test_schema_describes_every_key() -> None:
     assert [option["type"] for option in count["anyOf"]] == ["integer", "array"]
 
 
-def test_a_fisheye_that_sees_too_far_aside_is_refused(scene_data: SceneData, write_scene: WriteScene) -> None:
+def test_a_fisheye_with_a_field_beyond_85_degrees_is_refused(scene_data: SceneData, write_scene: WriteScene) -> None:
     """Its corner lies 1000 / 500 = 2 focal lengths from the middle; without distortion 85 degrees lie at 1.48."""
     lens = {"fx": 500, "size": [1600, 1200], "lens": "fisheye", "distortion": [0, 0, 0, 0]}
     scene_data["output"] = {"width": 160, "height": 120}

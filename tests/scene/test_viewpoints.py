@@ -115,7 +115,7 @@ def test_even_coverage_has_half_the_discrepancy_of_random_views(scene: Scene) ->
 
 
 @pytest.mark.parametrize("coverage", ["random", "even"])
-def test_views_look_at_objects_that_are_there(scene: Scene, coverage: str) -> None:
+def test_views_look_at_existing_objects(scene: Scene, coverage: str) -> None:
     drawn = seen_by(scene, look_at="objects", coverage=coverage)
     looked_at = set()
     for plan, layout in views(drawn):
@@ -157,7 +157,7 @@ def test_frames_are_planned_in_any_order(scene: Scene) -> None:
             assert plan.next_camera.world_from_camera.tolist() == forwards[index + 1]
 
 
-def test_the_first_try_is_the_view_that_is_not_chosen(scene: Scene) -> None:
+def test_the_first_try_is_the_view_without_selection(scene: Scene) -> None:
     """So that a view which is accepted at once is the same with and without the rule."""
     plain, chosen = seen_by(scene), seen_by(scene, accept={"in_view": 0.0})
     for index, (plan, _) in enumerate(views(chosen)):
@@ -166,7 +166,7 @@ def test_the_first_try_is_the_view_that_is_not_chosen(scene: Scene) -> None:
         assert not plan_frame(plain, index).viewpoint
 
 
-def test_tries_are_refused_where_nothing_is_chosen(scene: Scene) -> None:
+def test_tries_without_a_selection_rule_are_refused(scene: Scene) -> None:
     with pytest.raises(InputError, match=r"camera\.tries: needs accept, occlusion or truncation"):
         seen_by(scene, tries=4)
 
@@ -194,7 +194,7 @@ def test_prediction_agrees_with_rays_through_every_pixel(scene: Scene, wall: boo
     assert max(errors) < 0.12
 
 
-def test_prediction_counts_what_is_hidden_and_cut(scene: Scene) -> None:
+def test_prediction_counts_occlusion_and_truncation(scene: Scene) -> None:
     layout = layouts(scene)[0]
     camera = Camera.look_at((0.1, -0.7, 0.2), (0.1, 0, 0), width=64, height=48, fov_x=25)
     sight = VisibilityPredictor.of(scene, layout)
@@ -209,7 +209,7 @@ def test_prediction_counts_what_is_hidden_and_cut(scene: Scene) -> None:
 # Acceptance
 
 
-def test_accepted_views_are_as_they_must_be(scene: Scene) -> None:
+def test_accepted_views_satisfy_their_rules(scene: Scene) -> None:
     rules = {"in_view": 0.75, "extent": 9.0, "clearance": 0.32}
     drawn = seen_by(scene, accept=rules, tries=200, radius=[0.2, 1.0])
     attempts = []
@@ -228,13 +228,13 @@ def test_accepted_views_are_as_they_must_be(scene: Scene) -> None:
     assert len(set(attempts)) > 1  # some were refused
 
 
-def test_a_camera_is_never_inside_of_what_it_would_see(scene: Scene) -> None:
+def test_views_from_inside_of_an_object_are_rejected(scene: Scene) -> None:
     inside = seen_by(scene, accept={}, look_at="objects", radius=[0.001, 0.01], tries=3)
     with pytest.raises(InputError, match=r"none of 3 candidate views of frame 0 .* \(the best one is inside ob"):
         plan_frame(inside, 0, layouts(inside)[0])
 
 
-def test_what_no_view_fulfils_is_refused_with_how_near_it_came(scene: Scene) -> None:
+def test_rules_that_no_view_satisfies_are_refused_with_the_best_view(scene: Scene) -> None:
     far = seen_by(scene, accept={"extent": 500}, tries=5)
     sentence = (
         r"camera\.accept: none of 5 candidate views of frame 2 .* "
@@ -269,7 +269,7 @@ def test_shares_of_hidden_and_cut_objects_are_reached(scene: Scene) -> None:
 # Datasets
 
 
-def test_chosen_views_are_stated_and_audited(scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_chosen_views_are_recorded_and_audited(scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asked = {"accept": {"clearance": 0.2}, "occlusion": {"share": 0.3}, "truncation": {"share": 0.2}}
     output = {"output.formats": ["flow", "poses"], "output.views": 2}
     drawn = load_scene(scene.path, overrides={"camera": HEMISPHERE | {"look_at": "objects"} | asked, **output})
@@ -287,7 +287,7 @@ def test_chosen_views_are_stated_and_audited(scene: Scene, tmp_path: Path, monke
     assert any("looks past the scene's target" in text for _, text in audit_dataset(wrong).violations)
 
 
-def test_what_is_off_is_not_in_the_specification(scene: Scene) -> None:
+def test_unused_view_rules_are_not_stored(scene: Scene) -> None:
     stored = seen_by(scene).spec.camera.model_dump(mode="json")
     assert isinstance(scene.spec.camera, StrictModel)
     assert not stored.keys() & {"look_at", "coverage", "accept", "occlusion", "truncation", "tries"}
@@ -314,7 +314,7 @@ def test_cameras_take_views_in_turn(scene: Scene) -> None:
 
 
 @pytest.mark.parametrize("camera", [HEMISPHERE | {"look_at": "objects", "occlusion": {"share": 0.4}}, ABOVE])
-def test_pairs_are_rectified(scene: Scene, camera: dict[str, Any]) -> None:
+def test_stereo_pairs_are_rectified(scene: Scene, camera: dict[str, Any]) -> None:
     """A point has the same row in both images, and a disparity of focal length times baseline over depth."""
     drawn = moving(scene, camera | {"stereo": {"baseline": 0.06}, "zoom": [0.8, 1.4]}, views=4)
     layout = layouts(drawn)[0]
@@ -329,7 +329,7 @@ def test_pairs_are_rectified(scene: Scene, camera: dict[str, Any]) -> None:
         )
 
 
-def test_half_a_pair_is_refused(scene: Scene) -> None:
+def test_an_incomplete_stereo_pair_is_refused(scene: Scene) -> None:
     with pytest.raises(
         InputError, match=r"output\.views: must be a multiple of 3, so that stereo pairs are complete \(got 8\)"
     ):
@@ -343,14 +343,14 @@ def test_zoom_multiplies_focal_lengths(scene: Scene) -> None:
     assert 0.5 <= ratios.min() < 0.8 < 1.7 < ratios.max() <= 2.0
 
 
-def test_a_fisheye_is_refused_where_zoom_shows_more_than_it_can(scene: Scene) -> None:
+def test_a_zoom_beyond_the_field_of_a_fisheye_is_refused(scene: Scene) -> None:
     lens = {"lens": "fisheye", "fx": 24.0, "distortion": [0, 0, 0, 0]}  # corners at 40 px, 96 degrees
     with pytest.raises(InputError, match=r"camera\.intrinsics: a fisheye must show at most 85 degrees"):
         seen_by(scene, intrinsics=lens | {"fx": 30.0}, zoom=[0.8, 1.2])
     seen_by(scene, intrinsics=lens | {"fx": 30.0}, zoom=[1.0, 1.2])
 
 
-def test_a_hand_moves_smoothly_and_as_far_as_it_says(scene: Scene) -> None:
+def test_handheld_motion_is_smooth_with_its_stated_deviation(scene: Scene) -> None:
     drawn = moving(scene, ABOVE | {"handheld": {"position": 0.01, "rotation": 2.0}}, layouts=40, views=16)
     still = plan_frame(moving(scene, ABOVE), 0).camera.camera_from_world
     motions = []
@@ -370,7 +370,7 @@ def test_a_hand_moves_smoothly_and_as_far_as_it_says(scene: Scene) -> None:
     assert np.mean(np.diff(sway, axis=1) ** 2) == pytest.approx(expected, rel=0.2)
 
 
-def test_a_walk_is_smooth_and_stays_in_its_ranges(scene: Scene) -> None:
+def test_a_random_walk_is_smooth_and_within_its_ranges(scene: Scene) -> None:
     ranges = {name: HEMISPHERE[name] for name in ("target", "radius", "elevation", "intrinsics")}
     drawn = moving(scene, {"kind": "walk", "azimuth": [-60, 60], "places": 5, **ranges}, layouts=4, views=100)
     eyes = np.array([plan_frame(drawn, index).camera.centre for index in range(400)]).reshape(4, 100, 3)
@@ -390,7 +390,7 @@ def test_a_walk_is_smooth_and_stays_in_its_ranges(scene: Scene) -> None:
     assert np.linalg.norm(np.diff(step, axis=1), axis=2).max() < 0.2 * np.linalg.norm(step, axis=2).max()
 
 
-def test_rigs_are_audited(scene: Scene, tmp_path: Path) -> None:
+def test_datasets_of_rigs_have_no_violations(scene: Scene, tmp_path: Path) -> None:
     hand = HEMISPHERE | {
         "stereo": {"baseline": 0.05},
         "handheld": {"position": 0.01, "rotation": 3},
@@ -464,7 +464,9 @@ def test_lenses_and_motions_are_drawn_within_their_ranges(scene: Scene) -> None:
         ),
     ],
 )
-def test_wrong_lenses_and_motions_are_one_sentence(scene: Scene, camera: dict[str, Any], text: str) -> None:
+def test_invalid_lenses_and_motions_are_refused_in_one_sentence(
+    scene: Scene, camera: dict[str, Any], text: str
+) -> None:
     with pytest.raises(InputError) as error:
         moving(scene, HEMISPHERE | camera)
     assert f"camera.{text}" in str(error.value)

@@ -57,13 +57,13 @@ def warnings_of(environment, *before):
 
 
 @pytest.mark.parametrize("environment", [{"HOME": "/dev/null"}, {"XDG_CACHE_HOME": "/dev/null/cache"}])
-def test_an_unwritable_cache_costs_time_only(environment):
+def test_an_unwritable_cache_gives_one_warning(environment):
     (line,) = warnings_of(environment)
     assert "a cache folder cannot be written" in line and "Not a directory" in line
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="needs the right to be another user")
-def test_users_without_a_home_work_without_a_cache(tmp_path):
+def test_users_without_a_home_folder_work_without_a_cache(tmp_path):
     """The root folder as home cannot be written by others; the environment is read by one privilege that is left."""
     kept = "-all,+dac_read_search"
     nobody = ["setpriv", "--reuid=54321", "--regid=54321", "--clear-groups"]
@@ -77,7 +77,7 @@ def test_users_without_a_home_work_without_a_cache(tmp_path):
 
 
 @pytest.mark.parametrize("options", ["size=100k", "ro"])
-def test_a_full_or_read_only_disk_of_the_cache_costs_time_only(tmp_path, options):
+def test_a_full_or_read_only_cache_disk_gives_one_warning(tmp_path, options):
     mount = f'mount -t tmpfs -o {options} tmpfs {tmp_path} || exit 99; exec "$@"'
     inside = ["unshare", "-m", "sh", "-c", mount, "sh"]
     if subprocess.run([*inside, "true"], capture_output=True, check=False).returncode:
@@ -86,7 +86,7 @@ def test_a_full_or_read_only_disk_of_the_cache_costs_time_only(tmp_path, options
     assert str(tmp_path) in line
 
 
-def test_kernels_of_an_unusable_cache_are_read(fresh, tmp_path, monkeypatch):
+def test_kernels_of_a_read_only_cache_are_read(fresh, tmp_path, monkeypatch):
     """A cache that came with a read-only image is not compiled again."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     (tmp_path / "warp" / "1.0").mkdir(parents=True)
@@ -97,7 +97,7 @@ def test_kernels_of_an_unusable_cache_are_read(fresh, tmp_path, monkeypatch):
     assert (warp_folder() / "1.0" / "kernel.o").read_bytes() == b"code"
 
 
-def test_a_usable_cache_is_left_alone(fresh, tmp_path, monkeypatch, caplog):
+def test_a_usable_cache_is_not_replaced(fresh, tmp_path, monkeypatch, caplog):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     prepare_caches()
     write_cache_file(cache_folder() / "layouts" / "a", lambda file: file.write(b"a"))
@@ -106,7 +106,7 @@ def test_a_usable_cache_is_left_alone(fresh, tmp_path, monkeypatch, caplog):
     assert caplog.records == []
 
 
-def test_files_that_do_not_fit_leave_nothing_and_are_reported_once(fresh, tmp_path, caplog):
+def test_cache_files_without_room_are_removed_and_reported_once(fresh, tmp_path, caplog):
     def fill(file):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
@@ -128,7 +128,7 @@ def test_a_cache_that_fills_up_while_compiling_is_named(fresh):
     assert sentence_of(raised.value).startswith(wp.config.kernel_cache_dir)
 
 
-def test_the_doctor_names_every_folder(fresh, tmp_path, monkeypatch):
+def test_the_doctor_names_every_cache_folder(fresh, tmp_path, monkeypatch):
     for name in ("XDG_CACHE_HOME", "DRJIT_CACHE_DIR"):
         monkeypatch.setenv(name, str(tmp_path / name))
     finding = _cache()
@@ -139,7 +139,7 @@ def test_the_doctor_names_every_folder(fresh, tmp_path, monkeypatch):
     assert not finding.ok and finding.text == "/dev/null/kernels: Not a directory"
 
 
-def test_room_is_tried(tmp_path, monkeypatch):
+def test_free_space_is_tested_by_writing(tmp_path, monkeypatch):
     def refuse(file, start, length):
         raise OSError(errno.EDQUOT, os.strerror(errno.EDQUOT))
 

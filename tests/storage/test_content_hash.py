@@ -19,7 +19,7 @@ def sha256(data: bytes) -> str:
     return hashlib.sha256(data).hexdigest()
 
 
-def test_files(tmp_path: Path) -> None:
+def test_file_hash_is_the_sha256_of_the_content(tmp_path: Path) -> None:
     (tmp_path / "a").write_bytes(b"content")
     assert file_hash(tmp_path / "a") == sha256(b"content")
     with (tmp_path / "a").open("rb") as opened:
@@ -28,7 +28,7 @@ def test_files(tmp_path: Path) -> None:
         file_hash(tmp_path / "none")
 
 
-def test_parts_follow_each_other(tmp_path: Path) -> None:
+def test_a_content_hash_is_that_of_concatenated_parts(tmp_path: Path) -> None:
     digest = ContentHash(b"one", "twö")
     assert digest.hexdigest() == sha256("onetwö".encode())
     digest.add_json({"b": 1, "a": [None, 0.1]})
@@ -56,7 +56,7 @@ def test_arrays_of_equal_bytes_differ_by_type_and_shape() -> None:
     assert one.hexdigest() == other.hexdigest() == sha256(b"float64 (3, 2)" + every_other.tobytes())
 
 
-def test_content_is_hashed_in_one_place() -> None:
+def test_one_module_computes_hashes() -> None:
     """But for the audit, which keeps names as small numbers."""
     found = {
         path.relative_to(PACKAGE).as_posix()

@@ -39,12 +39,12 @@ def state(file: Path, version: Any) -> None:
 
 
 @pytest.mark.parametrize("version", NO_VERSIONS)
-def test_what_is_no_version_is_refused(version: Any) -> None:
+def test_invalid_versions_are_refused(version: Any) -> None:
     with pytest.raises(InputError, match=r"^a\.json: format_version must be a whole number of at least 1 \(got "):
         check_format_version({FORMAT_VERSION: version}, 3, "a.json")
 
 
-def test_versions_up_to_the_newest_are_read() -> None:
+def test_versions_up_to_the_newest_are_accepted() -> None:
     for stored in ({}, {FORMAT_VERSION: 1}, {FORMAT_VERSION: 3}, []):
         check_format_version(stored, 3, "a.json")
     with pytest.raises(InputError, match=r"must be at most 3"):
@@ -52,30 +52,30 @@ def test_versions_up_to_the_newest_are_read() -> None:
 
 
 class TestAssets:
-    def test_states_its_version_first(self, tmp_path: Path) -> None:
+    def test_an_asset_file_starts_with_its_version(self, tmp_path: Path) -> None:
         box_asset("nut").save(tmp_path)
         assert (tmp_path / "asset.yaml").read_text().startswith("format_version: 1\nname: nut\n")
 
-    def test_without_one_is_of_version_1(self, tmp_path: Path) -> None:
+    def test_an_asset_without_a_version_counts_as_version_1(self, tmp_path: Path) -> None:
         box_asset("nut").save(tmp_path)
         manual = tmp_path / "asset.yaml"
         manual.write_text(manual.read_text().replace("format_version: 1\n", ""))
         assert Asset.load(tmp_path).name == "nut"
 
-    def test_newer_ones_are_refused_before_keys_that_are_not_known(self, tmp_path: Path) -> None:
+    def test_a_newer_asset_is_refused_before_its_unknown_keys(self, tmp_path: Path) -> None:
         box_asset("nut").save(tmp_path)
         manual = tmp_path / "asset.yaml"
         manual.write_text("hardness: 3\n" + manual.read_text().replace("version: 1", "version: 2"))
         with pytest.raises(InputError, match=rf"asset\.yaml:2: {NEWER}$"):
             Asset.load(tmp_path)
 
-    def test_no_version_is_refused_by_its_line(self, tmp_path: Path) -> None:
+    def test_an_invalid_asset_version_is_refused_with_its_line(self, tmp_path: Path) -> None:
         (tmp_path / "asset.yaml").write_text("name: a\nformat_version: one\nsplats: a.ply\nmesh: hull\n")
         with pytest.raises(InputError, match=r'asset\.yaml:2: format_version must be a whole number .* \(got "one"\)$'):
             Asset.load(tmp_path)
 
 
-def test_captures(tmp_path: Path) -> None:
+def test_captures_have_a_version_and_newer_ones_are_refused(tmp_path: Path) -> None:
     Capture((), np.zeros((0, 3)), np.zeros((0, 3), dtype=np.uint8)).save(tmp_path)
     state(tmp_path / "capture.json", ...)
     assert Capture.load(tmp_path).photos == ()
@@ -85,7 +85,7 @@ def test_captures(tmp_path: Path) -> None:
         Capture.load(tmp_path)
 
 
-def test_fits(tmp_path: Path) -> None:
+def test_fits_have_a_version_and_newer_ones_are_refused(tmp_path: Path) -> None:
     folder, held_out = FitFolder(tmp_path, "abc"), (HeldOut("a.png", 31.5, 0.9, 31.5, 32.0),)
     result = FitResult(box_asset("nut").splats, 5, 1.0, held_out, "abc")
     folder.save(result, {})
@@ -111,7 +111,7 @@ class TestDatasets:
     def write(self, scene: Scene, out: Path, **options: Any) -> Path:
         return write_dataset(scene, out, render=render_boxes, settle=scatter_boxes, **options).path
 
-    def test_without_one_is_of_version_1(self, scene: Scene, tmp_path: Path) -> None:
+    def test_a_dataset_without_a_version_counts_as_version_1(self, scene: Scene, tmp_path: Path) -> None:
         out = self.write(scene, tmp_path / "out", frames=1)
         state(out / "dataset.json", ...)
         assert audit_dataset(out).violations == ()
@@ -120,7 +120,7 @@ class TestDatasets:
         assert json.loads((tmp_path / "whole/dataset.json").read_text())[FORMAT_VERSION] == 1
 
     @pytest.mark.parametrize("overwrite", [False, True])
-    def test_newer_ones_are_refused_and_left_alone(self, scene: Scene, tmp_path: Path, overwrite: bool) -> None:
+    def test_a_newer_dataset_is_refused_and_unchanged(self, scene: Scene, tmp_path: Path, overwrite: bool) -> None:
         out = self.write(scene, tmp_path / "out", frames=1)
         state(out / "dataset.json", 2)
         before = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
@@ -134,7 +134,7 @@ class TestDatasets:
         assert {path: path.read_bytes() for path in out.rglob("*") if path.is_file()} == before
 
 
-def test_the_page_states_every_version() -> None:
+def test_the_compatibility_page_states_every_version() -> None:
     page = (Path(__file__).parents[2] / "docs/compatibility.md").read_text()
     for file, version in FORMAT_VERSIONS.items():
         assert f"| `{file}` | {version} |" in page, file

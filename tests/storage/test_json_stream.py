@@ -34,7 +34,9 @@ def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @KEPT
 @given(st.lists(VALUES, max_size=4), st.lists(VALUES, max_size=4), st.dictionaries(st.text(), VALUES, max_size=2))
-def test_lists_are_what_json_writes(tmp_path: Path, one: list[Any], other: list[Any], rest: dict[str, Any]) -> None:
+def test_streamed_lists_equal_those_of_json(
+    tmp_path: Path, one: list[Any], other: list[Any], rest: dict[str, Any]
+) -> None:
     after = {f"z{key}": value for key, value in rest.items()}
     file = ListsFile(tmp_path / "a.json", ("one", "other"), before={"first": 1}, after=after)
     for i in range(max(len(one), len(other))):  # in turns
@@ -54,7 +56,7 @@ def test_lists_are_what_json_writes(tmp_path: Path, one: list[Any], other: list[
 
 @KEPT
 @given(st.dictionaries(st.text(), VALUES, max_size=5), st.sampled_from([None, 1]))
-def test_entries_are_what_json_writes(tmp_path: Path, entries: dict[str, Any], indent: int | None) -> None:
+def test_streamed_entries_equal_those_of_json(tmp_path: Path, entries: dict[str, Any], indent: int | None) -> None:
     file = EntriesFile(tmp_path / "a.json")
     for key, value in entries.items():
         file.append(key, value)
@@ -71,7 +73,7 @@ def test_entries_are_what_json_writes(tmp_path: Path, entries: dict[str, Any], i
         *('{"a": [}', '{"a": ' + "[" * 100_000, '{"a": tru'),
     ],
 )
-def test_what_is_no_json_object_is_refused(tmp_path: Path, text: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_text_that_is_not_a_json_object_is_refused(tmp_path: Path, text: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(json_stream, "_BLOCK", 1 << 16)
     (tmp_path / "a.json").write_text(text)
     for read in (read_lists, read_entries):
@@ -79,7 +81,7 @@ def test_what_is_no_json_object_is_refused(tmp_path: Path, text: str, monkeypatc
             list(read(tmp_path / "a.json"))
 
 
-def test_what_was_not_kept_leaves_nothing(tmp_path: Path) -> None:
+def test_a_discarded_file_leaves_the_earlier_one(tmp_path: Path) -> None:
     (tmp_path / "a.json").write_text("before")
     file = ListsFile(tmp_path / "a.json", ("one", "other"))
     file.append("other", 3)
@@ -111,7 +113,7 @@ def record(index: int) -> dict[str, Any]:
     }
 
 
-def test_memory_does_not_grow_with_the_frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_memory_does_not_grow_with_the_number_of_frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Opening, describing in every format and sorting a manifest whose frames came in the wrong order.
 
     Held whole, a frame took 5 kB and more.

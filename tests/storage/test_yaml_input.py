@@ -62,7 +62,7 @@ def refusal(path: Path, text: str, **overrides: object) -> str:
     return message.removeprefix(str(path))
 
 
-def test_valid_file_fills_the_model(drawing: Path) -> None:
+def test_a_valid_file_fills_the_model(drawing: Path) -> None:
     drawing.write_text(
         "title: a\nshapes:\n- {kind: circle, radius: 2}\n- {kind: polygon, corners: [[0, 0], [1, 0], [0, 1]]}\n"
     )
@@ -125,11 +125,11 @@ def test_valid_file_fills_the_model(drawing: Path) -> None:
         ("1: a\n", ":1: keys must be text (got 1)"),
     ],
 )
-def test_wrong_file_is_refused(drawing: Path, text: str, sentence: str) -> None:
+def test_an_invalid_file_is_refused_with_line_and_key(drawing: Path, text: str, sentence: str) -> None:
     assert refusal(drawing, text) == sentence
 
 
-def test_no_code_is_run(drawing: Path, tmp_path: Path) -> None:
+def test_yaml_tags_run_no_code(drawing: Path, tmp_path: Path) -> None:
     witness = tmp_path / "witness"
     text = f"title: !!python/object/apply:os.mkdir ['{witness}']\n"
     assert "title: must not have a YAML tag" in refusal(drawing, text)
@@ -137,17 +137,17 @@ def test_no_code_is_run(drawing: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("text", ["&x\ntitle: *x\n", "title: " + "[" * 2000 + "]" * 2000])
-def test_endless_nesting_is_refused(drawing: Path, text: str) -> None:
+def test_deep_or_recursive_nesting_is_refused(drawing: Path, text: str) -> None:
     assert refusal(drawing, text) == ": must not nest deeper than 32 levels"
 
 
-def test_bad_override_has_no_line(drawing: Path) -> None:
+def test_an_invalid_override_is_refused_without_a_line(drawing: Path) -> None:
     text = "title: a\ncopies: 2\n"
     assert refusal(drawing, text, copies=0) == ": copies: must be >= 1 (got 0)"
     assert refusal(drawing, text, inner__hihg=0) == ": inner.hihg: is not a known key (did you mean 'high'?)"
 
 
-def test_unreadable_files(tmp_path: Path) -> None:
+def test_unreadable_files_are_refused(tmp_path: Path) -> None:
     binary = tmp_path / "binary.yaml"
     binary.write_bytes(b"title: \xff\n")
     for path, sentence in [
@@ -160,13 +160,13 @@ def test_unreadable_files(tmp_path: Path) -> None:
         assert str(caught.value) == f"{path}: {sentence}"
 
 
-def test_key_place_names_the_line(drawing: Path) -> None:
+def test_the_place_of_a_key_has_its_line(drawing: Path) -> None:
     drawing.write_text("title: a\nshapes:\n- kind: circle\n  radius: 1\n")
     assert key_place(drawing, ("shapes", 0, "radius")) == f"{drawing}:4: shapes[0].radius"
 
 
 @given(text=st.text(alphabet="abc:-[]{}&*!|>'\"#, \n\t0.", max_size=60))
-def test_any_text_is_read_or_refused(tmp_path_factory: pytest.TempPathFactory, text: str) -> None:
+def test_random_text_is_read_or_refused(tmp_path_factory: pytest.TempPathFactory, text: str) -> None:
     path = tmp_path_factory.getbasetemp() / "any.yaml"
     path.write_text(text)
     try:

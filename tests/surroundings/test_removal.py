@@ -91,7 +91,7 @@ def above(splats: Splats, low: tuple[float, float], high: tuple[float, float]) -
     return np.asarray(inside & (splats.means[:, 2] > HEIGHT + 0.012))
 
 
-def test_one_thing_goes_and_the_other_stays(captured: Capture) -> None:
+def test_a_picked_object_is_removed_and_another_kept(captured: Capture) -> None:
     bare, box = table_and_box()
     whole = Splats.concatenate([bare, box, cube()])
     left = removed(whole, captured, pick(12, (BESIDE[0], BESIDE[1], HEIGHT + CUBE)))
@@ -108,7 +108,7 @@ def test_one_thing_goes_and_the_other_stays(captured: Capture) -> None:
         assert np.abs(shown.alpha - true.alpha).max() < 0.05
 
 
-def test_all_things_go(captured: Capture) -> None:
+def test_all_picked_objects_are_removed(captured: Capture) -> None:
     """From a table of an even slope, whose colour goes on below them."""
     bare, box = table_and_box()
     on_box = (TABLE[0] / 2 - 0.7 * BOX[0], TABLE[1] / 2 - BOX[1], HEIGHT + BOX[2] / 2)
@@ -133,7 +133,7 @@ def wall(y: float) -> tuple[Splats, Splats]:
 
 
 @pytest.mark.parametrize("gap", [0.0, 0.03])
-def test_a_wall_close_behind_is_filled_too(gap: float, tmp_path: Path) -> None:
+def test_a_wall_close_behind_an_object_is_filled(gap: float, tmp_path: Path) -> None:
     """The thing may touch it; the wall stays, and what was not seen of it is filled."""
     bare, _ = table_and_box()
     y = BESIDE[1] + CUBE / 2 + gap
@@ -153,13 +153,13 @@ def test_a_wall_close_behind_is_filled_too(gap: float, tmp_path: Path) -> None:
         assert np.abs(shown.alpha - whole.alpha).max() < 0.05
 
 
-def test_sides_of_things_are_no_walls(captured: Capture) -> None:
+def test_sides_of_objects_are_not_taken_for_walls(captured: Capture) -> None:
     splats = Splats.concatenate([place(), cube()])
     points = surface_points(depth_views(splats, [photo.camera for photo in captured.training]))
     assert find_walls(points, DEPTH) == []
 
 
-def test_what_is_not_on_a_surface_is_not_removed(captured: Capture) -> None:
+def test_picks_without_an_object_on_a_surface_are_refused(captured: Capture) -> None:
     splats = Splats.concatenate([place(), cube()])
     on_table, on_floor = (pick(5, spot) for spot in ((0.1, -0.1, HEIGHT), (0.0, -1.2, HEIGHT - 0.8)))
     for spot in (on_table, on_floor, "photo05.png:3,1", "photo05.png:-50,900"):  # and where nothing is
@@ -178,7 +178,7 @@ def test_what_is_not_on_a_surface_is_not_removed(captured: Capture) -> None:
         AssetJob(name="cell", kind="environment", imported=mesh, remove=("photo05.png:3,4",))
 
 
-def test_an_environment_says_what_was_removed(
+def test_an_environment_records_removed_objects(
     captured: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     capture = captured.save(tmp_path / "capture")
@@ -208,7 +208,7 @@ def test_an_environment_says_what_was_removed(
 
 
 @pytest.mark.slow
-def test_the_command_removes_by_itself(captured: Capture, tmp_path: Path) -> None:
+def test_the_mesh_command_removes_picked_objects(captured: Capture, tmp_path: Path) -> None:
     captured.save(tmp_path / "capture")
     Splats.concatenate([place(), cube()]).save(tmp_path / "splats.ply")
     what = pick(12, (*BESIDE, HEIGHT + CUBE))
@@ -241,18 +241,18 @@ class TestFill:
         assert (result[outside] == broken[outside]).all()
         return result, copied
 
-    def test_a_plain_colour_stays(self) -> None:
+    def test_a_plain_colour_is_continued(self) -> None:
         texture = np.broadcast_to([0.2, 0.5, 0.7], (60, 50, 3))
         result, copied = self.filled(texture)
         np.testing.assert_allclose(result, texture, atol=1e-6)
         assert copied == 1
 
-    def test_a_slope_goes_on(self) -> None:
+    def test_a_colour_gradient_is_continued(self) -> None:
         x, y = np.mgrid[0:60, 0:50] / 60
         texture = np.stack([0.2 + 0.5 * x, 0.8 - 0.4 * y, 0.3 + 0.3 * x * y], axis=-1)
         np.testing.assert_allclose(self.filled(texture)[0], texture, atol=0.01)
 
-    def test_a_pattern_goes_on_in_step(self) -> None:
+    def test_a_periodic_pattern_is_continued_in_phase(self) -> None:
         x, y = np.mgrid[0:60, 0:50]
         pattern = 0.5 + 0.2 * np.sin(2 * np.pi * x / 7) * np.cos(2 * np.pi * y / 5) + 0.002 * x
         texture = np.repeat(pattern[..., None], 3, axis=2)
@@ -260,7 +260,7 @@ class TestFill:
         assert copied == 1
         np.testing.assert_allclose(result, texture, atol=0.02)
 
-    def test_where_nothing_is_large_enough_it_is_plain(self) -> None:
+    def test_a_hole_without_large_surroundings_is_filled_smoothly(self) -> None:
         """A frame of three cells around the hole is all that is known."""
         hole = self.hole()
         known = np.zeros_like(hole)
@@ -271,7 +271,7 @@ class TestFill:
         assert copied < 1
         np.testing.assert_allclose(result[hole], texture[hole], atol=0.02)
 
-    def test_where_nothing_is_known_nothing_breaks(self) -> None:
+    def test_a_texture_without_known_cells_is_filled_with_finite_values(self) -> None:
         hole = self.hole()
         result, copied = fill_texture(np.full((60, 50, 3), 0.4), np.zeros_like(hole), hole)
         assert copied == 0 and np.isfinite(result).all()

@@ -108,7 +108,7 @@ def test_the_table_is_found_with_its_edges(splats: Splats) -> None:
     assert table.looked_at > 0.5
 
 
-def test_a_leaning_table_is_found_as_it_leans(splats: Splats) -> None:
+def test_an_inclined_table_is_found_with_its_inclination(splats: Splats) -> None:
     lean = np.eye(4)
     lean[1:3, 1:3] = [[np.cos(0.2), -np.sin(0.2)], [np.sin(0.2), np.cos(0.2)]]
     turned = [replace(camera, world_from_camera=lean @ camera.world_from_camera) for camera in cameras()]
@@ -117,7 +117,7 @@ def test_a_leaning_table_is_found_as_it_leans(splats: Splats) -> None:
     assert not [one for one in find_supports(points, UP, 0.9, within=5) if one.looked_at > 0.1]
 
 
-def test_a_plane_is_fitted_past_what_stands_on_it() -> None:
+def test_a_plane_is_fitted_despite_clutter_on_it() -> None:
     rng = np.random.default_rng(1)
     flat = np.column_stack([rng.uniform(-1, 1, (4000, 2)), rng.normal(0, 1e-3, 4000)])
     clutter = np.column_stack([rng.uniform(0, 1, (1500, 2)), rng.uniform(0, 0.02, 1500)])
@@ -126,7 +126,7 @@ def test_a_plane_is_fitted_past_what_stands_on_it() -> None:
     assert spread < 3e-3
 
 
-def test_what_stands_on_it_is_covered_and_what_nobody_saw_is_named(splats: Splats) -> None:
+def test_coverage_marks_occupied_and_unseen_parts_of_the_table(splats: Splats) -> None:
     shown = [camera for camera in cameras() if camera.centre[0] < -0.2]
     views = depth_views(splats, shown)
     points = surface_points(depth_views(splats, cameras()))
@@ -151,7 +151,7 @@ def test_what_stands_on_it_is_covered_and_what_nobody_saw_is_named(splats: Splat
     assert hole.area == pytest.approx(behind.sum() * coverage.cell.prod()) and hole.shown > 0.9
 
 
-def test_the_largest_free_rectangle_is_that_of_all_rectangles() -> None:
+def test_the_largest_free_rectangle_agrees_with_a_full_search() -> None:
     rng = np.random.default_rng(2)
     for _ in range(20):
         free = rng.random((7, 9)) < 0.7
@@ -172,7 +172,7 @@ def speck(place: Float64Array, size: float, opacity: float) -> Splats:
     return replace(one, means=np.float32(place[None]), scales=scales, opacities=np.float32([opacity]))
 
 
-def test_specks_in_free_space_and_haze_go_and_surfaces_stay(splats: Splats, captured: Capture) -> None:
+def test_floaters_and_haze_are_removed_and_surfaces_kept(splats: Splats, captured: Capture) -> None:
     camera = captured.photos[9].camera
     close, amid = camera.centre + 0.1 * camera.world_from_camera[:3, 2], np.array([-0.1, 0, HEIGHT + 0.3])
     dirty = Splats.concatenate(
@@ -198,7 +198,7 @@ def made(splats: Splats, captured: Capture, tmp_path_factory: pytest.TempPathFac
     return folder, make_asset(Capture.load(folder / "capture"), folder / "fit", folder / "cell", job)
 
 
-def test_the_asset_has_its_table_in_z_0(made: tuple[Path, AssetResult]) -> None:
+def test_the_table_of_the_asset_lies_at_height_0(made: tuple[Path, AssetResult]) -> None:
     folder, done = made
     asset = Asset.load(folder / "cell")
     record = json.loads((folder / "cell" / "verdict.json").read_text())
@@ -216,7 +216,7 @@ def test_the_asset_has_its_table_in_z_0(made: tuple[Path, AssetResult]) -> None:
     assert "Support" in done.verdict.rows and "Support" in (folder / "cell" / "report.html").read_text()
 
 
-def test_up_is_the_tables_where_nothing_says_where_it_is(splats: Splats, captured: Capture) -> None:
+def test_an_unknown_vertical_is_that_of_the_table(splats: Splats, captured: Capture) -> None:
     fallen = np.eye(4)
     fallen[:3, :3] = np.roll(np.eye(3), 1, axis=0)
     capture = replace(captured.transformed(fallen), up="unknown", units="unknown")
@@ -227,7 +227,7 @@ def test_up_is_the_tables_where_nothing_says_where_it_is(splats: Splats, capture
     assert any("the scale is unknown" in sentence for sentence in found.verdict.misses())
 
 
-def test_its_scene_is_valid_and_drops_beside_the_box(made: tuple[Path, AssetResult]) -> None:
+def test_the_scene_of_surroundings_drops_objects_beside_the_box(made: tuple[Path, AssetResult]) -> None:
     folder, done = made
     assert done.scene == folder / "cell.yaml"
     scene = load_scene(folder / "cell.yaml")
@@ -237,11 +237,11 @@ def test_its_scene_is_valid_and_drops_beside_the_box(made: tuple[Path, AssetResu
 
 
 @pytest.mark.slow
-def test_its_scene_has_nothing_questionable(made: tuple[Path, AssetResult]) -> None:
+def test_the_scene_of_surroundings_gets_no_warning(made: tuple[Path, AssetResult]) -> None:
     assert [finding for finding in check_scene(load_scene(made[0] / "cell.yaml")) if not finding.ok] == []
 
 
-def test_a_changed_scene_is_kept_and_a_lost_one_written_again(made: tuple[Path, AssetResult]) -> None:
+def test_an_edited_scene_is_kept_and_a_missing_one_written_again(made: tuple[Path, AssetResult]) -> None:
     folder, _done = made
     text = (folder / "cell.yaml").read_text()
     job = AssetJob(name="cell", kind="environment", settings=SMALL)

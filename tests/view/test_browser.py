@@ -117,7 +117,7 @@ def served(browser: Any, path: Path) -> Iterator[None]:
             assert serving.wait(LONG) == 0
 
 
-def test_the_page_of_a_scene(browser, scene_file):
+def test_the_page_of_a_scene_works_in_chromium(browser, scene_file):
     with served(browser, scene_file):
         use_page(browser, scene_file)
 
@@ -167,7 +167,7 @@ socket.onerror = () => done("refused");
 """
 
 
-def test_a_foreign_page_neither_frames_the_page_nor_connects_it_elsewhere(browser):
+def test_another_site_cannot_frame_or_redirect_the_page(browser):
     page = Page("test", Address(port=0), gaussians=10)
     foreign = "websocket={own}"
     addresses = [page.url, f"{page.url}?{foreign}", f"{page.url.rpartition('/')[0]}/?{foreign}"]
@@ -196,7 +196,7 @@ def test_a_foreign_page_neither_frames_the_page_nor_connects_it_elsewhere(browse
         page.close()
 
 
-def test_a_page_is_reached_through_another_port(browser):
+def test_a_page_works_through_a_forwarded_port(browser):
     """As by ``ssh -L 9090:localhost:8080``."""
     page = Page("test", Address(port=0), gaussians=10)
     try:
@@ -233,7 +233,7 @@ def forwarded(target: int) -> Iterator[int]:
         server.shutdown()
 
 
-def test_a_click_on_a_capture_picks_what_is_there(browser, tmp_path):
+def test_a_click_on_a_capture_picks_the_object(browser, tmp_path):
     from selenium.webdriver.common.action_chains import ActionChains
     from selenium.webdriver.common.by import By
     from selenium.webdriver.common.keys import Keys

@@ -64,7 +64,7 @@ def control(**updates: Any) -> dict[str, Any]:
     ],
     ids=str,
 )
-def test_messages_of_the_pages_own_script_are_taken(message):
+def test_messages_of_the_page_are_accepted(message):
     assert is_expected(packed(message))
     viser._messages.Message.deserialize(packed(message))  # viser has not renamed it
 
@@ -109,7 +109,7 @@ def test_other_messages_are_dropped(message):
 
 
 @pytest.mark.parametrize("raw", ["text", b"", b"\xc1", b"\x91" * 60_000, b"\xdd\xff\xff\xff\xff", packed(CAMERA)[:-3]])
-def test_what_is_no_message_is_dropped(raw):
+def test_bytes_that_are_not_a_message_are_dropped(raw):
     assert not is_expected(raw)
 
 
@@ -155,7 +155,7 @@ def test_a_dropped_message_does_not_end_the_connection(page):
         assert client.camera.look_at == pytest.approx((0, 0, 0))
 
 
-def test_a_large_message_ends_its_own_connection_only(page):
+def test_a_large_message_closes_its_own_connection_only(page):
     with joined(page) as other, joined(page) as browser:
         until(lambda: len(page._server.get_clients()) == 2)
         browser.send(b"x" * (MAX_MESSAGE_BYTES + 1))
@@ -166,7 +166,7 @@ def test_a_large_message_ends_its_own_connection_only(page):
         other.ping().wait(20)
 
 
-def test_messages_are_taken_no_faster_than_they_are_handled(page):
+def test_messages_are_read_no_faster_than_they_are_handled(page):
     """Jobs that wait for a thread stay few, however many messages a browser sends."""
     held: Future[None] = Future()
     page.on_move(lambda camera: held.result())

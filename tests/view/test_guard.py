@@ -41,7 +41,7 @@ PAGE = f"/{TOKEN}"
         ("", None, True),
     ],
 )
-def test_a_local_page_is_asked_for_by_the_name_of_this_machine(host, origin, refused):
+def test_a_local_page_accepts_names_of_this_machine_only(host, origin, refused):
     assert (Guard(TOKEN, local=True).rejection_reason(PAGE, host, origin) is not None) == refused
 
 
@@ -57,7 +57,7 @@ def test_a_local_page_is_asked_for_by_the_name_of_this_machine(host, origin, ref
         ("", None, True),
     ],
 )
-def test_a_page_on_the_network_is_asked_for_by_any_name(host, origin, refused):
+def test_a_page_on_the_network_accepts_any_host_name(host, origin, refused):
     assert (Guard(TOKEN, local=False).rejection_reason(PAGE, host, origin) is not None) == refused
 
 
@@ -81,7 +81,7 @@ def test_a_page_on_the_network_is_asked_for_by_any_name(host, origin, refused):
         (f"{PAGE}?playbackPath=http://evil.example/x.viser", True),
     ],
 )
-def test_the_address_has_the_token_and_nothing_else(path, refused, local):
+def test_paths_other_than_the_token_are_refused(path, refused, local):
     assert (Guard(TOKEN, local).rejection_reason(path, "localhost:1", None) is not None) == refused
 
 
@@ -124,7 +124,7 @@ def browser(page: Page, path: str, **options: object) -> ClientConnection:
     return connect(address, subprotocols=[f"viser-v{viser.__version__}"], max_size=None, **options)
 
 
-def test_a_server_asks_its_visitors(page):
+def test_requests_without_the_token_are_refused(page):
     assert answer(page, "/").status == 403
     assert answer(page, place(page)).status == 200
     for path in ("/../../../../../../etc/passwd", "/%2e%2e/%2e%2e/pyproject.toml", "/etc/passwd", "/index.html"):
@@ -137,7 +137,7 @@ def test_a_server_asks_its_visitors(page):
     browser(page, place(page)).close()
 
 
-def test_the_page_connects_to_its_own_server_and_is_shown_in_no_frame(page):
+def test_the_content_policy_allows_the_own_server_and_no_frame(page):
     headers = answer(page, place(page)).headers
     policy = dict(rule.split(" ", 1) for rule in headers["Content-Security-Policy"].split("; "))
     own = f"127.0.0.1:{page.port}"
@@ -148,7 +148,7 @@ def test_the_page_connects_to_its_own_server_and_is_shown_in_no_frame(page):
     assert headers["Set-Cookie"] is None
 
 
-def test_the_page_of_one_server_does_not_end_that_of_another(page):
+def test_pages_of_two_servers_work_at_the_same_time(page):
     """Cookies are those of a host and not of a port, so neither page may need one."""
     other = Page("other", Address("0.0.0.0", 0), gaussians=10)
     try:
@@ -160,7 +160,7 @@ def test_the_page_of_one_server_does_not_end_that_of_another(page):
         other.close()
 
 
-def test_an_odd_request_is_refused_and_no_fault_of_the_server(page):
+def test_malformed_requests_are_refused_without_an_error(page):
     get = b"GET " + place(page).encode() + b" HTTP/1.1"
     host = b"Host: localhost:1"
     assert status(page, get, host) == 200
@@ -178,7 +178,7 @@ def test_an_odd_request_is_refused_and_no_fault_of_the_server(page):
     assert status(page, get, host, b"Upgrade: h2c") in (400, 426)
 
 
-def test_who_asks_for_nothing_is_not_logged(page, caplog):
+def test_empty_requests_are_not_logged(page, caplog):
     for data in (b"", b"\r\n", b"\xff\r\n\r\n", b"POST / HTTP/1.1\r\n\r\n", b"GET / HTTP/1.1\r\nHost: "):
         with closing(socket.create_connection(("127.0.0.1", page.port), timeout=20)) as connection:
             connection.sendall(data)
@@ -187,7 +187,7 @@ def test_who_asks_for_nothing_is_not_logged(page, caplog):
     assert [record for record in caplog.records if record.exc_info] == []
 
 
-def test_only_so_many_browsers_are_connected(page):
+def test_the_number_of_browsers_is_bounded(page):
     with ExitStack() as opened:
         first = [opened.enter_context(browser(page, place(page))) for _ in range(MAX_BROWSERS)]
         with pytest.raises(InvalidStatus, match="503"):
@@ -197,7 +197,7 @@ def test_only_so_many_browsers_are_connected(page):
         browser(page, place(page)).close()
 
 
-def test_the_address_of_a_number_of_version_6_has_brackets():
+def test_an_ipv6_address_has_brackets():
     try:
         page = Page("test", Address("::1", 0), gaussians=10)
     except InputError as error:
@@ -206,13 +206,13 @@ def test_the_address_of_a_number_of_version_6_has_brackets():
     assert re.fullmatch(r"http://\[::1\]:\d+/[\w-]{20,}", page.url)
 
 
-def test_a_page_that_is_not_guarded_is_not_served():
+def test_a_page_without_a_guard_is_not_served():
     guard = Guard.for_host("localhost")
     with pytest.raises(MissingResourceError, match="access control does not work"), guarded(guard):
         pass
 
 
-def test_what_cannot_be_listened_on_is_refused(page):
+def test_addresses_that_cannot_be_listened_on_are_refused(page):
     with pytest.raises(InputError, match="free to listen on"):
         check_address("0.0.0.0", page.port)
     with pytest.raises(InputError, match="from 0 to 65535"):

@@ -68,11 +68,11 @@ def test_a_scene_shows_everything_once(scene):
     assert np.count_nonzero(box[:, 1] - box[:, 0], axis=1).tolist() == [1] * 12  # every edge is along one axis
 
 
-def test_before_a_layout_is_known_all_but_its_objects_is_shown(scene):
+def test_a_scene_without_a_layout_shows_no_objects(scene):
     assert {part.group for part in scene_parts(scene, 0)} == {"shapes", "enclosure", "regions"}
 
 
-def test_a_drop_moves_what_is_there_and_sends_nothing_else(scene):
+def test_another_layout_sends_changed_poses_only(scene):
     before, after = (named(scene_parts(scene, 0, layout_at(scene, *heights))) for heights in ((0.1, 0.2), (0.0, 0.2)))
     removed, added, moved = changes(before, after)
     assert (removed, added) == ([], [])
@@ -83,7 +83,7 @@ def test_a_drop_moves_what_is_there_and_sends_nothing_else(scene):
     assert (added, moved) == ([], [])
 
 
-def test_a_scene_that_is_read_again_sends_what_differs_alone(scene_data, write_scene):
+def test_a_reloaded_scene_sends_changed_parts_only(scene_data, write_scene):
     path = write_scene(scene_data)
     before = load_scene(path)
     scene_data["shapes"][0]["box"]["size"] = [1, 1, 0.2]
@@ -94,7 +94,7 @@ def test_a_scene_that_is_read_again_sends_what_differs_alone(scene_data, write_s
     assert moved == []
 
 
-def test_lights_are_where_they_shine_from(scene):
+def test_lights_are_shown_at_their_positions(scene):
     lights = (
         AreaLight(position=(0, 0, 1), target=(0, 0, 0), size=(0.4, 0.2)),
         SpotLight(position=(1, 0, 1), target=(0, 0, 0), cone=20),
@@ -112,13 +112,13 @@ def test_lights_are_where_they_shine_from(scene):
     assert found["/lights/2"].pose[:3, 3] == pytest.approx([0, 1, 1])
 
 
-def test_the_path_of_a_light_is_a_line(scene_data, write_scene):
+def test_the_path_of_a_light_is_shown_as_a_line(scene_data, write_scene):
     scene_data["lights"][0]["path"] = [{"position": [0, 0, 1]}, {"intensity": 3}, {"position": [0, 1, 1]}]
     found = named(scene_parts(load_scene(write_scene(scene_data)), 0))
     assert found["/lights/path-0"].drawable.segments.tolist() == [[[0, 0, 1], [0.5, 0, 1]], [[0.5, 0, 1], [0, 1, 1]]]
 
 
-def test_a_large_cloud_is_thinned_and_covers_as_much():
+def test_a_thinned_cloud_keeps_its_coverage():
     count = 100
     splats = Splats(
         means=np.arange(3 * count).reshape(count, 3),
@@ -135,7 +135,7 @@ def test_a_large_cloud_is_thinned_and_covers_as_much():
     assert ShownSplats(splats).thinned(count) is splats
 
 
-def test_colours_are_those_from_all_sides_on_average():
+def test_shown_colours_are_averages_over_directions():
     splats = box_asset("nut").splats
     sh = np.zeros((12, 4, 3), dtype=np.float32)
     sh[:, 0], sh[:, 1:] = 0.25 / 0.28209479, 7.0
@@ -150,7 +150,7 @@ def test_an_asset_shows_its_splats_mesh_pieces_and_keypoints():
     assert (high - low <= asset.mesh.extents + 1e-6).all()
 
 
-def test_things_that_look_the_same_are_not_sent_again():
+def test_parts_of_the_same_look_are_not_sent_again():
     pose = look_at_pose((1, 0, 1), (0, 0, 0))
     line = np.zeros((1, 2, 3))
     one = {

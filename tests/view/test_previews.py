@@ -50,7 +50,7 @@ def test_a_request_sharpens_step_by_step(steps):
     assert [steps.told.get(timeout=LONG) for _ in range(3)] == ["a0", "a1", "a2"]
 
 
-def test_the_newest_request_replaces_all_before_it(steps):
+def test_the_newest_request_replaces_earlier_ones(steps):
     steps.worker.submit("a")
     assert steps.begun.get(timeout=LONG) == "a0"
     steps.worker.submit("b")
@@ -59,7 +59,7 @@ def test_the_newest_request_replaces_all_before_it(steps):
     assert [steps.told.get(timeout=LONG) for _ in range(4)] == ["a0", "c0", "c1", "c2"]
 
 
-def test_bad_input_is_told_and_the_next_request_is_worked_on(steps):
+def test_an_input_error_is_reported_and_the_next_request_handled(steps):
     steps.go.release(4)
     steps.worker.submit("bad")
     assert steps.refused.get(timeout=LONG) == "must be good"
@@ -68,7 +68,7 @@ def test_bad_input_is_told_and_the_next_request_is_worked_on(steps):
     steps.worker.check()
 
 
-def test_a_fault_is_raised_where_it_is_looked_for(steps):
+def test_an_exception_of_the_worker_is_raised_by_check(steps):
     steps.go.release(1)
     steps.worker.submit("worse")
     steps.worker._thread.join(LONG)
@@ -76,7 +76,7 @@ def test_a_fault_is_raised_where_it_is_looked_for(steps):
         steps.worker.check()
 
 
-def test_who_waits_within_a_request_is_woken_by_a_newer_one(steps):
+def test_a_waiting_request_is_ended_by_a_newer_one(steps):
     assert steps.worker.wait(0)
     steps.worker.submit("a")
     steps.begun.get(timeout=LONG)
@@ -84,6 +84,6 @@ def test_who_waits_within_a_request_is_woken_by_a_newer_one(steps):
     assert not steps.worker.wait(LONG)
 
 
-def test_presets_go_from_the_fastest_to_the_finest_that_is_wanted():
+def test_presets_go_from_the_fastest_to_the_requested_one():
     assert presets_up_to("fast") == ["fast"]
     assert presets_up_to("exact") == ["fast", "balanced", "exact"]

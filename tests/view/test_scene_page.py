@@ -100,14 +100,14 @@ def poses(shown: Shown) -> dict[str, np.ndarray]:
     return {name: part.pose for name, part in shown.page._shown.items() if part.group == "splats"}
 
 
-def test_the_view_is_rendered_in_the_size_that_is_asked_for(shown):
+def test_the_view_is_rendered_in_the_requested_size(shown):
     first = shown.picture()
     assert first.shape == (240, 320, 3)
     assert first.std() > 10
     assert sorted(poses(shown)) == ["/splats/0-nut-0", "/splats/1-bolt-0"]
 
 
-def test_a_frame_is_looked_through_and_left_by_moving(shown):
+def test_a_frame_is_shown_until_the_camera_moves(shown):
     first = shown.picture()
     shown.scene_page._frame.value = 1
     second = shown.picture()
@@ -127,14 +127,14 @@ def test_a_frame_is_looked_through_and_left_by_moving(shown):
     assert np.abs(shown.picture().astype(int) - first).mean() < 1
 
 
-def test_layers_are_of_the_same_picture(shown):
+def test_layers_belong_to_the_shown_picture(shown):
     shown.picture()
     for layer in ("labels", "ids", "depth", "light", "highlight", "picture"):
         shown.scene_page._layer.value = layer
         assert layer in shown.told.pictures[-1][1]
 
 
-def test_a_light_is_moved_and_told_as_a_line(shown):
+def test_a_moved_light_is_shown_as_yaml(shown):
     shown.scene_page._look_at_frame(0)
     before = shown.picture()
     shown.scene_page._light.value = "0: area"
@@ -159,7 +159,7 @@ def test_a_light_is_moved_and_told_as_a_line(shown):
     ],
     ids=str,
 )
-def test_a_light_that_cannot_be_is_not_taken(shown, changed):
+def test_an_invalid_light_is_not_applied(shown, changed):
     shown.scene_page._light.value = "0: area"
     before = shown.scene_page._lights_now()
     shown.scene_page._move_light(**changed)
@@ -181,7 +181,7 @@ def test_a_light_that_cannot_be_is_not_taken(shown, changed):
     ],
     ids=str,
 )
-def test_no_camera_of_a_browser_ends_the_page(shown, camera):
+def test_invalid_cameras_of_a_browser_do_not_end_the_page(shown, camera):
     shown.scene_page._look_at_frame(0)
     shown.picture()
     with joined(shown.page) as browser:
@@ -195,7 +195,7 @@ def test_no_camera_of_a_browser_ends_the_page(shown, camera):
     shown.scene_page._look_at_frame(0)
 
 
-def test_another_drop_moves_objects(shown):
+def test_another_layout_moves_objects(shown):
     shown.picture()
     before = poses(shown)
     shown.scene_page._drop_again()
@@ -207,7 +207,7 @@ def test_another_drop_moves_objects(shown):
     shown.wait(lambda: shown.scene_page._layout is not None and shown.scene_page._layout.index == 1)
 
 
-def test_a_drop_is_played(shown):
+def test_the_drop_of_a_layout_is_played(shown):
     shown.scene_page._look_at_frame(0)
     shown.picture()
     seen = []
@@ -220,7 +220,7 @@ def test_a_drop_is_played(shown):
     assert max(heights[:3]) > heights[-1] + 0.01
 
 
-def test_the_file_is_read_again_and_a_fault_keeps_the_last_good_scene(shown):
+def test_the_file_is_reloaded_and_an_invalid_one_keeps_the_last_scene(shown):
     data = YAML(typ="safe").load(shown.path)
     write(shown.path, {**data, "region": {"min": [-0.2, -0.2, 0.02], "max": [0.2, 0.2, -1]}})
     sentence = shown.wait(lambda: shown.told.alerts and shown.told.alerts[-1])
@@ -239,7 +239,7 @@ def test_the_file_is_read_again_and_a_fault_keeps_the_last_good_scene(shown):
     shown.picture()
 
 
-def test_a_view_from_elsewhere_compiles_nothing(shown):
+def test_another_view_compiles_no_new_kernels(shown):
     import drjit as dr
 
     scene = shown.scene_page._scene

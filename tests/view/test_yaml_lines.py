@@ -22,13 +22,13 @@ LIGHTS = [
 ]
 
 
-def test_lights_are_written_as_the_file_would_state_them(scene_data, write_scene):
+def test_lights_are_written_as_lines_of_a_scene_file(scene_data, write_scene):
     path = write_scene({**scene_data, "lights": []})
     path.write_text(path.read_text().replace("lights: []", "lights:\n" + "".join(map(light_line, LIGHTS))))
     assert load_scene(path).spec.lights == tuple(LIGHTS)
 
 
-def test_a_camera_is_written_where_the_view_was(scene_data, write_scene):
+def test_the_view_is_written_as_a_camera_of_a_scene_file(scene_data, write_scene):
     pose = look_at_pose((0.5, -0.4, 0.6), (0.02, 0.01, 0.1), up=(0.1, 0, 1))
     del scene_data["camera"]
     path = write_scene(scene_data)
@@ -38,7 +38,7 @@ def test_a_camera_is_written_where_the_view_was(scene_data, write_scene):
     assert np.degrees(2 * np.arctan(0.5 * camera.width / camera.fx)) == pytest.approx(50)
 
 
-def test_a_light_takes_what_it_has():
+def test_changing_a_light_ignores_keys_of_other_kinds():
     moved = changed_light(LIGHTS[0], position=(1.00004, 2, 3), target=(0, 0, 1), strength=2)
     assert (moved.position, moved.target, moved.radiance) == ((1.0, 2.0, 3.0), (0, 0, 1), 2)
     assert changed_light(LIGHTS[2], target=(0, 0, 0), strength=2) == LIGHTS[2].model_copy(update={"intensity": 2.0})

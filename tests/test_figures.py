@@ -6,6 +6,7 @@ import argparse
 import copy
 import json
 import math
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -26,6 +27,16 @@ RESULTS = read_results()
 
 def test_pages_equal_those_generated_from_the_results() -> None:
     assert differences(RESULTS) == []
+
+
+def test_pages_name_existing_tests() -> None:
+    names = set()
+    for path in (ROOT / "tests").rglob("test_*.py"):
+        names |= {path.stem, *re.findall(r"def (test_\w+)\(", path.read_text())}
+    pages = [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *(ROOT / "benchmarks").rglob("*.md")]
+    named = {(page.name, name) for page in pages for name in re.findall(r"[`/:](test_\w+)", page.read_text())}
+    assert len(named) > 50
+    assert {(page, name) for page, name in named if name not in names} == set()
 
 
 def test_a_changed_figure_is_reported_for_the_page_that_shows_it() -> None:

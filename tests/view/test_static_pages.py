@@ -38,7 +38,7 @@ def longest(label: dict) -> int:
     return max(x1 - x0, y1 - y0)
 
 
-def test_a_filter_finds_images_with_one_label_that_has_it_all(clean):
+def test_a_filter_finds_images_with_one_label_that_satisfies_all_conditions(clean):
     index, labels = DatasetIndex(clean), labels_of(clean)
     assert len(index) == len(labels) == 6
     assert index.find(Filter()) == sorted(labels)
@@ -66,7 +66,7 @@ def test_a_filter_finds_images_with_one_label_that_has_it_all(clean):
     assert index.largest == max(map(longest, every))
 
 
-def test_a_picture_shows_the_labels_of_its_own_frame(clean):
+def test_a_picture_has_the_labels_of_its_frame(clean):
     index = DatasetIndex(clean)
     number = next(number for number, found in labels_of(clean).items() if found)
     caption, plain = index.picture(number, "none")
@@ -80,7 +80,7 @@ def test_a_picture_shows_the_labels_of_its_own_frame(clean):
     assert (index.picture(number, "silhouettes")[1] != plain).any()
 
 
-def test_a_dataset_that_names_a_file_outside_of_it_is_not_followed(dataset):
+def test_files_outside_of_a_dataset_are_not_shown(dataset):
     manifest = Manifest(dataset / "manifest.jsonl")
     records = list(manifest)
     (dataset / "manifest.jsonl").unlink()
@@ -93,7 +93,7 @@ def test_a_dataset_that_names_a_file_outside_of_it_is_not_followed(dataset):
         DatasetIndex(dataset).picture(records[0]["index"])
 
 
-def test_the_page_of_a_dataset_steps_and_filters(page, clean):
+def test_the_page_of_a_dataset_steps_through_filtered_images(page, clean):
     shown = DatasetPage(page, clean)
     assert len(shown.found) == 6
     shown._step(1)
@@ -107,7 +107,7 @@ def test_the_page_of_a_dataset_steps_and_filters(page, clean):
     assert shown.found == ()
 
 
-def test_the_page_of_an_asset_tells_of_it(page, tmp_path):
+def test_the_page_of_an_asset_shows_its_properties(page, tmp_path):
     box_asset("nut").save(tmp_path / "nut")
     AssetPage(page, tmp_path / "nut")
     assert sorted(page._shown) == ["/meshes/nut", "/pieces/nut/0", "/splats/nut"]
@@ -136,7 +136,7 @@ def test_the_page_of_a_capture_shows_photos_with_their_masks(page, known_object:
     assert darkened[outside] == pytest.approx(0.25 * whole[outside], abs=1)
 
 
-def test_clicks_on_a_capture_pick_things(page, tmp_path):
+def test_clicks_on_a_capture_pick_objects(page, tmp_path):
     capture_of_balls(tmp_path)
     shown = CapturePage(page, tmp_path / "capture")
     eye = np.array([0.5, -0.4, 0.5])
@@ -174,7 +174,7 @@ def test_clicks_on_a_capture_pick_things(page, tmp_path):
     shown._forget(all_of_them=False)  # of none
 
 
-def test_the_page_of_a_file_of_splats(page, tmp_path):
+def test_the_page_of_a_splat_file_shows_its_gaussians(page, tmp_path):
     box_asset("nut").splats.save(tmp_path / "nut.ply")
     SplatsPage(page, tmp_path / "nut.ply")
     assert list(page._shown) == ["/splats/file"]
@@ -184,7 +184,7 @@ def test_the_page_of_a_file_of_splats(page, tmp_path):
     assert camera.up[2] > 0.5 and camera.position[2] > 0
 
 
-def test_viser_gets_covariances_that_half_floats_can_hold():
+def test_covariances_sent_to_viser_fit_half_floats():
     splats = box_asset("nut").splats
     arrays = splat_arrays(splats)
     halves = arrays["covariances"].astype(np.float16).astype(np.float64) * arrays["scale"] ** 2
@@ -193,7 +193,7 @@ def test_viser_gets_covariances_that_half_floats_can_hold():
     assert splat_arrays(splats.select(slice(0, 0)))["centers"].shape == (0, 3)
 
 
-def test_a_path_is_told_by_what_it_holds(tmp_path):
+def test_the_kind_of_a_path_follows_from_its_contents(tmp_path):
     for name, kind in (("asset.yaml", "asset"), ("capture.json", "capture"), ("dataset.json", "dataset")):
         (tmp_path / kind).mkdir()
         (tmp_path / kind / name).write_text(json.dumps({}))
@@ -215,7 +215,7 @@ def test_a_path_is_told_by_what_it_holds(tmp_path):
         (["Makefile"], "must be a scene"),
     ],
 )
-def test_the_command_refuses_in_one_sentence(options, rule, capsys, monkeypatch):
+def test_invalid_paths_of_the_view_command_are_refused_in_one_sentence(options, rule, capsys, monkeypatch):
     monkeypatch.chdir(Path(__file__).parents[2])
     with pytest.raises(SystemExit) as exit_:
         main(["view", *options])

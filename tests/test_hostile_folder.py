@@ -80,6 +80,23 @@ def presets():
     measure_steps(Path("missing.ply"), [])
 
 
+def cluster():
+    from mitsplat.engine.ray import Cluster, run_on_ray
+    print(list(run_on_ray(Job(), {0: [7]}, Cluster(resources={"CPU": 1}), note=print)))
+
+
+class Job:
+    def known(self, layout):
+        return None
+
+    def settle(self, layout):
+        return ""
+
+    def make(self, index, layout):
+        import random
+        return index, random.__name__
+
+
 def nothing():
     import subprocess
     subprocess.run([sys.executable, "-c", "import random"])
@@ -103,6 +120,7 @@ KINDS = {
     "video": "video.mp4: ",
     "service": "does not work",
     "presets": "missing.ply: ",
+    "cluster": "[(7, 'random')]",
 }
 
 
@@ -130,6 +148,8 @@ def test_a_child_without_safe_path_mode_runs_files_of_the_folder(start, tmp_path
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_no_child_runs_python_files_of_the_current_folder(start, tmp_path, kind):
+    if kind == "cluster":
+        pytest.importorskip("ray", reason="Ray is not installed: pip install 'mitsplat[cluster]'")
     said, run = start(sys.executable, tmp_path / "script/parent.py", kind)
     assert run == []
     assert KINDS[kind] in said

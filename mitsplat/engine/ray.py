@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import logging
 import sys
+import tempfile
 import time
 from collections import OrderedDict
 from collections.abc import Generator, Iterator, Mapping, Sequence
@@ -20,6 +21,7 @@ from typing import Any, Generic, Protocol, TypeVar
 from mitsplat.engine.pool import Answer, Failure, Finished, Lost, LostWorkersError, check_workers, run_pool
 from mitsplat.errors import InputError, MissingResourceError
 from mitsplat.progress import Note
+from mitsplat.runtime.child_process import SAFE_PATH, safe_path_children
 from mitsplat.runtime.device import Device, Kind, use_shared_device
 
 Result = TypeVar("Result")
@@ -160,8 +162,13 @@ class _Actors(Generic[Result]):
         if self._started:
             where: dict[str, Any] = {"include_dashboard": False} if cluster.address is None else {}
             try:
+                # Ray puts the caller's current folder on the import path of workers that have no working directory.
                 # Output of a worker is contained in its answers or in Ray's logs.
-                ray.init(address=cluster.address or "local", log_to_driver=False, logging_level=logging.ERROR, **where)
+                with safe_path_children(), tempfile.TemporaryDirectory() as empty:
+                    where["runtime_env"] = {"working_dir": empty, "env_vars": {SAFE_PATH: "1"}}
+                    ray.init(
+                        address=cluster.address or "local", log_to_driver=False, logging_level=logging.ERROR, **where
+                    )
             except (ConnectionError, ValueError, RuntimeError) as error:
                 raise MissingResourceError(
                     f"no Ray cluster at {cluster.address!r}: {str(error).splitlines()[0]}"

@@ -374,6 +374,25 @@ def test_machines_that_join_are_reported_once(monkeypatch):
         free_slots()
 
 
+def test_ray_starts_without_the_current_folder_of_the_caller(monkeypatch):
+    """It would put this folder on the import path of its workers if they had no other one."""
+
+    class Started(FakeRay):
+        def is_initialized(self):
+            return False
+
+        def init(self, runtime_env, **options):
+            self.environment = runtime_env["env_vars"], os.environ["PYTHONSAFEPATH"]
+            self.content = list(Path(runtime_env["working_dir"]).iterdir())
+
+    ray = Started(head=2.0)
+    monkeypatch.setitem(sys.modules, "ray", ray)
+    monkeypatch.delenv("PYTHONSAFEPATH", raising=False)
+    cluster._Actors(None, Cluster(resources={"CPU": 2.0}), None)
+    assert (ray.environment, ray.content) == (({"PYTHONSAFEPATH": "1"}, "1"), [])
+    assert "PYTHONSAFEPATH" not in os.environ
+
+
 def test_images_of_lights_are_sent_with_the_job(scene_data, write_scene, tmp_path):
     """Where frames are made no path of the caller's is opened: its folder is gone."""
     cv2.imwrite(str(tmp_path / "sky.png"), np.full((4, 8, 3), 90, dtype=np.uint8))

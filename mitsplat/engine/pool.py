@@ -10,12 +10,13 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
+import sys
 import threading
 import time
 import traceback
 from collections import Counter, deque
 from collections.abc import Generator, Iterator, Mapping, Sequence
-from contextlib import closing, nullcontext, suppress
+from contextlib import closing, contextmanager, nullcontext, suppress
 from dataclasses import dataclass, replace
 from heapq import heapify, heappop, heappush, heapreplace
 from multiprocessing import resource_tracker
@@ -59,6 +60,9 @@ _START_TIMEOUT = 300.0
 
 _POLL_INTERVAL = 1.0
 """Polling interval while workers start [s]."""
+
+_MAX_ARGUMENTS = 1 << 14
+"""Maximum length of a command line that is part of a worker's start data [bytes]."""
 
 _END_TIMEOUT = 30.0
 """Time limit for the end of a worker that has closed its pipe [s]."""
@@ -497,7 +501,7 @@ class _Processes(Generic[Result]):
         process = self._spawn.Process(target=_work, args=arguments, name=f"mitsplat-{worker}", daemon=True)
         load = Counter(self._taken.values())
         gpu = min(self._gpus, key=load.__getitem__, default=None)
-        with safe_path_children(), children_on_gpu(gpu, **self._environment):
+        with safe_path_children(), children_on_gpu(gpu, **self._environment), _short_arguments():
             resource_tracker.ensure_running()  # its start together with the first worker would unblock SIGINT
             # Ctrl-C reaches all processes of a terminal, but only this one must handle it: workers inherit the blocked
             # signal.
@@ -559,6 +563,18 @@ class _Processes(Generic[Result]):
         for worker in list(self._workers):
             self.stop(worker)
         self._make.close()
+
+
+@contextmanager
+def _short_arguments() -> Iterator[None]:
+    """Omit the arguments of a long command line from the start data of processes that start in this context."""
+    arguments = list(sys.argv)
+    if sum(len(os.fsencode(argument)) for argument in arguments) > _MAX_ARGUMENTS:
+        del sys.argv[1:]
+    try:
+        yield
+    finally:
+        sys.argv[:] = arguments
 
 
 def _describe_end(process: BaseProcess) -> str:

@@ -135,8 +135,9 @@ def interpreter(tmp_path, monkeypatch):
     ],
 )
 def test_a_worker_that_does_not_start_in_time_is_reported(monkeypatch, interpreter, script, words):
-    """However large the work is that it does not take."""
+    """However large the work and the command line are that it does not read."""
     monkeypatch.setattr(engine, "_START_TIMEOUT", 0.5)
+    monkeypatch.setattr(sys, "argv", ["run", "x" * 200_000])
     interpreter(script)
     begun, notes = time.monotonic(), []
     large = Make(how="x" * 10_000_000)
@@ -144,6 +145,21 @@ def test_a_worker_that_does_not_start_in_time_is_reported(monkeypatch, interpret
         run(large, 2, {0: [0], 1: [1]}, notes.append)
     assert time.monotonic() - begun < 20
     assert notes[0] == f"the worker of frame 0 {words}: the frame is repeated"
+
+
+@pytest.mark.parametrize(("arguments", "received"), [(["a", "b"], ("a", "b")), (["a" * 20_000], ())])
+def test_workers_receive_a_command_line_only_if_it_is_short(monkeypatch, arguments, received):
+    monkeypatch.setattr(sys, "argv", ["run", *arguments])
+    assert run(CommandLine(), 2) == [("run", *received)] * 9
+    assert sys.argv == ["run", *arguments]
+
+
+@dataclass(frozen=True)
+class CommandLine:
+    """Returns the command line of its process."""
+
+    def __call__(self, index, note, /):
+        return tuple(sys.argv)
 
 
 def test_frames_of_a_worker_that_does_not_start_are_made_by_others(monkeypatch, tmp_path, interpreter):

@@ -23,7 +23,7 @@ from trimesh.visual.material import PBRMaterial, SimpleMaterial
 from mitsplat.arrays import Float64Array
 from mitsplat.errors import InputError
 from mitsplat.images.colour import decode_srgb, eight_bit
-from mitsplat.storage.files import IMAGE_ERRORS
+from mitsplat.storage.files import IMAGE_ERRORS, is_inside
 
 DIELECTRIC_SPECULAR = 0.04
 """Reflectance at normal incidence of common plastics, lacquers and glass."""
@@ -208,7 +208,8 @@ def check_textures(mesh: Path) -> None:
     """Refuse a mesh whose material file, materials or textures are missing, because it would be baked in grey.
 
     Raises:
-        InputError: If a file that an OBJ, its MTL, a glTF or a PLY names is missing, or is no image.
+        InputError: If a file that an OBJ, its MTL, a glTF or a PLY names is missing, outside of its folder, or no
+            image.
     """
     kind = mesh.suffix.lower()
     if kind == ".obj":
@@ -231,6 +232,10 @@ def _check_obj(mesh: Path) -> None:
     known: list[str] = []
     for library in libraries:
         path = mesh.parent / library
+        if not is_inside(mesh.parent, library):
+            raise InputError(
+                f"{mesh}: its material file {library} is outside of its folder; put it there, or give a colour"
+            )
         if not path.is_file():
             if all((mesh.parent / word).is_file() for word in library.split()):
                 raise InputError(f"{mesh}: must have one material file (got {library})")
@@ -266,6 +271,8 @@ def _check_gltf(mesh: Path) -> None:
 
 
 def _check_texture(path: Path, texture: str) -> None:
+    if not is_inside(path.parent, texture):  # trimesh would omit it
+        raise InputError(f"{path}: its texture {texture} is outside of its folder; put it there, or give a colour")
     try:
         with Image.open(path.parent / texture) as image:
             image.load()

@@ -212,6 +212,21 @@ def test_missing_textures_are_refused_unless_a_colour_is_given(tmp_path: Path) -
         read_parts(path)
 
 
+@pytest.mark.parametrize("name", ["../colour.png", "{folder}/colour.png", "link.png"])
+def test_textures_outside_of_the_folder_are_refused(tmp_path: Path, name: str) -> None:
+    (tmp_path / "in").mkdir()
+    Image.new("RGB", (8, 8), COLOUR).save(tmp_path / "colour.png")
+    (tmp_path / "in/link.png").symlink_to(tmp_path / "colour.png")
+    name = name.replace("{folder}", str(tmp_path))
+    path = write_obj(tmp_path / "in", f"map_Kd {name}")
+    with pytest.raises(InputError, match=r"box\.mtl: its texture .* is outside of its folder; put it there"):
+        read_parts(path)
+    (tmp_path / "in/box.mtl").rename(tmp_path / "box.mtl")
+    path.write_text(path.read_text().replace("mtllib box.mtl", "mtllib ../box.mtl"))
+    with pytest.raises(InputError, match=r"box\.obj: its material file \.\./box\.mtl is outside of its folder"):
+        read_parts(path)
+
+
 def test_a_16_bit_grey_texture_keeps_its_brightness(tmp_path: Path) -> None:
     path = write_obj(tmp_path, "map_Kd colour.png")
     Image.fromarray(np.full((8, 8), 0x4080, dtype=np.uint16)).save(tmp_path / "colour.png")

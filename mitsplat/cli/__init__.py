@@ -22,8 +22,9 @@ import typer
 from typer.core import TyperGroup
 
 from mitsplat.cli import assets, datasets, detectors, fault, lights, photographs
-from mitsplat.errors import InputError, LateDeviceError, exit_status, sentence_of
+from mitsplat.errors import LateDeviceError, exit_status, sentence_of
 from mitsplat.runtime.child_process import leave_current_folder, python_command, python_environment
+from mitsplat.storage.file_kinds import check_name
 from mitsplat.version import __version__
 
 COMMAND_GROUPS: Mapping[str, Sequence[Callable[..., None]]] = {
@@ -111,7 +112,8 @@ def main(args: Sequence[str] | None = None) -> None:
     if args is None:
         leave_current_folder()
     try:
-        _check_text([*(sys.argv[1:] if args is None else args), os.fspath(Path.cwd())])
+        for name in (*(sys.argv[1:] if args is None else args), os.fspath(Path.cwd())):
+            check_name(name)
         app(args)
     except Exception as error:  # noqa: BLE001 - last handler before the traceback would be printed
         if args is None and isinstance(error, LateDeviceError):
@@ -120,18 +122,6 @@ def main(args: Sequence[str] | None = None) -> None:
         status = exit_status(error)
         typer.echo(f"mitsplat: {fault.report_fault(error) if status is None else sentence_of(error)}", err=True)
         sys.exit(fault.STATUS if status is None else status)
-
-
-def _check_text(texts: Sequence[str]) -> None:
-    """Raise InputError for names that are not valid UTF-8.
-
-    Native libraries reject such names or abort the process.
-    """
-    for text in texts:
-        try:
-            text.encode()
-        except UnicodeEncodeError:
-            raise InputError(f"names of files and folders must be UTF-8 (got {os.fsencode(text)!r})") from None
 
 
 def _show_version(wanted: bool) -> None:

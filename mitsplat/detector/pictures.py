@@ -12,6 +12,7 @@ from PIL import Image, UnidentifiedImageError
 from mitsplat.arrays import ByteImage
 from mitsplat.errors import InputError
 from mitsplat.storage.content_hash import ContentHash
+from mitsplat.storage.file_kinds import check_name
 from mitsplat.storage.files import IMAGE_ERRORS, files_below
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
@@ -26,8 +27,15 @@ _ORIENTATION, _TRANSPOSED = 274, (5, 6, 7, 8)
 
 
 def images_below(folder: Path) -> list[Path]:
-    """Return all images in a folder and its subfolders, including linked folders, sorted by name."""
-    return [path for path in files_below(folder) if path.suffix.lower() in SUFFIXES]
+    """Return all images in a folder and its subfolders, including linked folders, sorted by name.
+
+    Raises:
+        InputError: If the name of an image is not UTF-8.
+    """
+    images = [path for path in files_below(folder) if path.suffix.lower() in SUFFIXES]
+    for path in images:
+        check_name(path)
+    return images
 
 
 def read_picture(path: Path) -> ByteImage:

@@ -1,7 +1,8 @@
-"""File kinds by name, for error messages about files of the wrong kind."""
+"""File kinds by name, and checks of names and kinds."""
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 from mitsplat.errors import InputError
@@ -46,3 +47,15 @@ def refuse_other_kinds(path: Path, wanted: str, *suffixes: str) -> None:
     suffix = path.suffix.lower()
     if path.is_file() and suffix in _BY_SUFFIX and suffix not in suffixes:
         raise InputError(f"{path}: must be {wanted} (got {_BY_SUFFIX[suffix]})")
+
+
+def check_name(path: str | Path) -> None:
+    """Refuse a path that is not valid UTF-8. Native libraries reject such paths or abort the process.
+
+    Raises:
+        InputError: If it is not UTF-8.
+    """
+    try:
+        str(path).encode()
+    except UnicodeEncodeError:
+        raise InputError(f"names of files and folders must be UTF-8 (got {os.fsencode(path)!r})") from None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import cv2
@@ -106,6 +107,15 @@ def test_unusable_photos_are_named_with_a_reason(folder: Path) -> None:
 def test_a_missing_folder_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="gone: must be an existing folder of photographs, or a video"):
         prepare_photos(tmp_path / "gone", tmp_path / "out", max_size=100)
+
+
+def test_a_photograph_whose_name_is_not_utf_8_is_refused(folder: Path) -> None:
+    """COLMAP accepts no such name."""
+    (folder / os.fsdecode(b"caf\xe9.txt")).write_text("")
+    assert len(find_photos(folder)) == 3
+    (folder / os.fsdecode(b"caf\xe9.png")).write_bytes((folder / "0.png").read_bytes())
+    with pytest.raises(InputError, match=r"names of files and folders must be UTF-8 \(got b'.*/caf\\xe9\.png'\)$"):
+        prepare(folder)
 
 
 def test_undistorted_photos_show_the_same_directions(tmp_path: Path) -> None:

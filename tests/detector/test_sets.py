@@ -213,6 +213,10 @@ YOLO_FAULTS: dict[str, tuple[Callable[[Path], object], str]] = {
         ),
         r"images/train/none.png: cannot be read \(No such file",
     ),
+    "bytes": (
+        lambda root: (root / "images/train" / os.fsdecode(b"caf\xe9.png")).write_bytes(b""),
+        r"names of files and folders must be UTF-8 \(got b'.*caf\\xe9\.png'\)$",
+    ),
     "names": (lambda root: (root / "data.yaml").write_text("train: images/train\nnames: [a, a]\n"), "names must be"),
     "yaml": (lambda root: (root / "data.yaml").write_text("train: [\n"), "data.yaml: cannot be read as YAML"),
     "nothing": (lambda root: [path.write_text("") for path in root.glob("labels/*/*")], "images have no labels"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from pathlib import Path
 
@@ -9,7 +10,7 @@ import pytest
 
 from mitsplat.errors import InputError
 from mitsplat.scene.loading import image_lists
-from mitsplat.scene.loading.image_lists import glob_below
+from mitsplat.scene.loading.image_lists import glob_below, image_names
 
 PATTERNS = [
     *("*", "a/*", "**", "**/*", "*/b", "a/**", "a/**/*.png", "**/b/*", "**/**/c.png", "?/[bc]*", "./a/*", "a//b/*"),
@@ -45,6 +46,15 @@ def test_repeated_wildcards_take_linear_time(tmp_path: Path, pattern: str) -> No
     begun = time.process_time()
     assert glob_below(tmp_path, pattern) == []
     assert time.process_time() - begun < 2
+
+
+@pytest.mark.parametrize("images", [".", "*", "*.png"])
+def test_an_image_whose_name_is_not_utf_8_is_refused(tmp_path: Path, images: str) -> None:
+    (tmp_path / "a.png").write_text("")
+    assert image_names(tmp_path, images) == ("a.png",)
+    (tmp_path / os.fsdecode(b"caf\xe9.png")).write_text("")
+    with pytest.raises(InputError, match=r"must be UTF-8 \(got b'.*caf\\xe9\.png'\)$"):
+        image_names(tmp_path, images)
 
 
 def test_links_that_multiply_paths_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

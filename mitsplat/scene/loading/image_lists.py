@@ -12,6 +12,7 @@ from pathlib import Path
 
 from mitsplat.errors import InputError
 from mitsplat.images.untrusted_images import IMAGE_SUFFIXES
+from mitsplat.storage.file_kinds import check_name
 
 WILDCARDS = frozenset("*?[")
 
@@ -84,8 +85,15 @@ def _matches(root: str, parts: Sequence[str], pattern: str) -> set[str]:
 
 
 def names_below(folder: Path, pattern: str, paths: Iterable[Path]) -> tuple[str, ...]:
-    """Return matched paths as names in the form that a scene file in ``folder`` would use."""
+    """Return matched paths as names in the form that a scene file in ``folder`` would use.
+
+    Raises:
+        InputError: If a name is not UTF-8.
+    """
     absolute = Path(pattern).is_absolute()
+    paths = list(paths)
+    for path in paths:
+        check_name(path)
     return tuple(path.as_posix() if absolute else path.relative_to(folder).as_posix() for path in paths)
 
 

@@ -410,6 +410,8 @@ class TestAttacks:
             ("cp {outside}/secret.png made.png", "made.png shows what lies outside"),
             ("cat {outside}/secret.yaml > made.txt", "made.txt shows what lies outside"),
             ("echo >> kept", "kept was changed"),
+            ("n=ma; touch ${n}de", "made was made, which no command names"),
+            ("touch made", None),
             ("sleep 60", "did not end within"),
             ("sleep 60 & exit 0", "leaves 1 processes"),
             ("{python} -c 'a = bytearray(80 << 20); a[::4096] = a[::4096]; input()' < pipe", "takes more than 60 MiB"),

@@ -1,6 +1,6 @@
 """Attack mitsplat with hostile files and machines, and print what came of each attack.
 
-    python -m benchmarks.scale.attack [--list] [--only PATTERN] [--quick] [--jobs N]
+    python -m benchmarks.scale.attack [--list] [--only PATTERN] [--quick] [--jobs N] [--slowdown FACTOR]
 
 An attack is held off if its commands end with a status and a sentence of theirs, within bounds of time and memory, and
 neither change nor show anything outside of their folder. The exit status is 1 if one was not held off. The commands are
@@ -19,6 +19,7 @@ import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 
 import benchmarks.scale.attack as package
@@ -36,7 +37,7 @@ def all_attacks() -> list[Attack]:
     return [attack for module in modules for attack in module.ATTACKS]
 
 
-def verdicts(attacks: Sequence[Attack], jobs: int = 1) -> Iterator[tuple[Attack, Verdict]]:
+def verdicts(attacks: Sequence[Attack], jobs: int, slowdown: float) -> Iterator[tuple[Attack, Verdict]]:
     """Attacks and what came of them, each in a folder of its own, which is removed."""
     with tempfile.TemporaryDirectory(prefix="mitsplat-attack-") as folder, ThreadPoolExecutor(jobs) as pool:
         valid = Samples(Path(folder) / "samples")
@@ -45,7 +46,8 @@ def verdicts(attacks: Sequence[Attack], jobs: int = 1) -> Iterator[tuple[Attack,
 
         def held(attack: Attack) -> Verdict:
             with tempfile.TemporaryDirectory(dir=folder, ignore_cleanup_errors=True) as own:
-                return judge(attack, Place.make(Path(own), valid, SECRET_COLOUR, SECRET_WORD))
+                slower = replace(attack, seconds=slowdown * attack.seconds)
+                return judge(slower, Place.make(Path(own), valid, SECRET_COLOUR, SECRET_WORD))
 
         yield from zip(attacks, pool.map(held, attacks), strict=True)
 
@@ -57,6 +59,7 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="only attacks that render nothing")
     parser.add_argument("--list", action="store_true", help="print the attacks and run none")
     parser.add_argument("--jobs", type=int, default=2, help="attacks at a time")
+    parser.add_argument("--slowdown", type=float, default=1.0, help="factor of all bounds of time, on a busy machine")
     options = parser.parse_args()
     wanted = [
         attack
@@ -71,18 +74,22 @@ def main() -> None:
             print(f"{attack.name}: tries to {attack.tries}")
         return
     # A part that was chosen by name is no result.
-    with nullcontext() if options.only else recording("scale.attack", parser, options, ignore=("list", "jobs")):
-        failed = measure(wanted, options.jobs)
+    with (
+        nullcontext()
+        if options.only
+        else recording("scale.attack", parser, options, ignore=("list", "jobs", "slowdown"))
+    ):
+        failed = measure(wanted, options.jobs, options.slowdown)
     sys.exit(1 if failed else 0)
 
 
-def measure(wanted: Sequence[Attack], jobs: int) -> int:
+def measure(wanted: Sequence[Attack], jobs: int, slowdown: float) -> int:
     """Run attacks, print a line for each, record the counts; returns how many were not held off."""
     begun = time.monotonic()
     absent = [attack for attack in wanted if attack.missing]
     done: list[tuple[Attack, Verdict]] = []
     print(f"{'attack':<64} {'verdict':<8} {'s':>6} {'MiB':>6}")
-    for attack, verdict in verdicts([attack for attack in wanted if not attack.missing], jobs):
+    for attack, verdict in verdicts([attack for attack in wanted if not attack.missing], jobs, slowdown):
         done.append((attack, verdict))
         word = "FAILED" if verdict.faults else "held"
         print(f"{attack.name:<64} {word:<8} {verdict.seconds:>6.1f} {verdict.mebibytes:>6.0f}", flush=True)
@@ -95,6 +102,7 @@ def measure(wanted: Sequence[Attack], jobs: int) -> int:
     figure(failed, "", "failed")
     figure(len(absent), "", "not run")
     kinds = sorted({attack.name.partition(":")[0] for attack, _ in done})
+    figure(len(kinds), "", "kinds")
     for kind in kinds:
         figure(sum(attack.name.partition(":")[0] == kind for attack, _ in done), "", "of kind", kind)
     figure(max((verdict.seconds for _, verdict in done), default=0), "s", "longest")

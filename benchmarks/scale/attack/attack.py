@@ -135,6 +135,7 @@ def judge(attack: Attack, place: Place) -> Verdict:
     faults += [f"outside/{path} was changed, made or removed" for path in sorted(_differing(before, after))[:3]]
     faults += [f"{name} was changed" for name, was in kept.items() if _fingerprint(place.inside / name) != was]
     faults += [f"{path} shows what lies outside" for path in _leaks(place.inside, inputs)]
+    faults += [f"{path} was made, which no command names" for path in _unnamed(attack, place, inputs)]
     return Verdict(tuple(faults), seconds, mebibytes, said)
 
 
@@ -311,6 +312,17 @@ def _fingerprint(path: Path) -> str:
         return "folder" if path.is_dir() else "other" if path.exists() else "absent"
     except OSError as error:
         return f"unreadable: {error.errno}"
+
+
+def _unnamed(attack: Attack, place: Place, inputs: set[str]) -> Iterator[str]:
+    """New files and folders beside the input whose names do not begin with a name in the attack or with ``out``."""
+    words = " ".join(
+        [*(word for command in attack.commands for word in command), *map(str, attack.environment.values())]
+    )
+    names = tuple(Path(word).name.partition(".")[0] or word for word in words.split() if word.strip("./"))
+    for path in sorted(place.inside.iterdir()):
+        if path.name not in inputs and not path.name.startswith((*names, "out")):
+            yield path.name
 
 
 def _differing(before: Sequence[tuple[str, str]], after: Sequence[tuple[str, str]]) -> set[str]:

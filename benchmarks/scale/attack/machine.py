@@ -4,19 +4,63 @@ from __future__ import annotations
 
 import json
 import os
+import shlex
 import shutil
+import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 from benchmarks.scale.attack.attack import ANY, FINE, REFUSED, Attack
-from benchmarks.scale.attack.samples import Place
+from benchmarks.scale.attack.images import noise_photos, png_sky
+from benchmarks.scale.attack.samples import ROOT, Place
 
 RENDER = ("mitsplat", "render", "scene.yaml", "-o", "made", "--workers", "1")
 TWO = ("mitsplat", "render", "scene.yaml", "-o", "made", "--workers", "2")
 _ODD = os.fsdecode(b"caf\xe9\xff")
 """A name that is no UTF-8."""
+_MESH = "[{name: table, box: {size: [1, 1, 0.1], position: [0, 0, -0.05]}}, {name: a, mesh: mesh.stl}]"
+_SKY = "[{kind: environment, image: sky.png}]"
+_LONG = ("--seed", f"{'7':>120000}")
+"""Arguments of 120 kB, more than a pipe holds."""
+_JUMPING_CLOCK = """
+#define _GNU_SOURCE
+#include <dlfcn.h>
+#include <sys/time.h>
+#include <time.h>
+
+static long jump(void) {
+    static const long jumps[] = {0, 86400, -86400, 1000000000, -1000000000};
+    static unsigned calls;
+    return jumps[calls++ % 5];
+}
+
+int clock_gettime(clockid_t clock, struct timespec *now) {
+    static int (*real)(clockid_t, struct timespec *);
+    if (!real) real = (int (*)(clockid_t, struct timespec *))dlsym(RTLD_NEXT, "clock_gettime");
+    int failed = real(clock, now);
+    if (!failed && (clock == CLOCK_REALTIME || clock == CLOCK_REALTIME_COARSE)) now->tv_sec += jump();
+    return failed;
+}
+
+int gettimeofday(struct timeval *now, void *zone) {
+    struct timespec found;
+    (void)zone;
+    int failed = clock_gettime(CLOCK_REALTIME, &found);
+    now->tv_sec = found.tv_sec;
+    now->tv_usec = found.tv_nsec / 1000;
+    return failed;
+}
+
+time_t time(time_t *now) {
+    struct timespec found;
+    clock_gettime(CLOCK_REALTIME, &found);
+    if (now) *now = found.tv_sec;
+    return found.tv_sec;
+}
+"""
+"""Library in C whose clock of the date jumps by days and decades at every call."""
 
 
 def _scene(place: Place) -> None:
@@ -35,14 +79,56 @@ def _odd_folder(what: str) -> Callable[[Place], object]:
             place.take("nut")
             (place.inside / "nut").rename(place.inside / _ODD)
         elif what == "photos":
-            from benchmarks.scale.attack.images import noise_photos
-
             noise_photos(place)
             (place.inside / "photos/1.png").rename(place.inside / f"photos/{_ODD}.png")
         else:
             place.take(what).rename(place.inside / f"{_ODD}{Path(what).suffix}")
 
     return build
+
+
+def _odd_link(name: str, **changes: str) -> Callable[[Place], object]:
+    """A valid scene or capture that reads a file or folder through a link to a name that is no UTF-8."""
+
+    def build(place: Place) -> None:
+        path = place.inside / name
+        noise_photos(place)
+        png_sky(place.inside / "sky.png")
+        place.take("mesh.stl", "walk.avi")
+        place.scene(**changes)
+        path.rename(path.with_name(_ODD))
+        path.symlink_to(_ODD)
+
+    return build
+
+
+def _odd_home(place: Place) -> None:
+    """A scene in a folder that is reached by a link."""
+    home = place.inside / _ODD
+    home.mkdir()
+    place.scene().rename(home / "scene.yaml")
+    (place.inside / "nut").rename(home / "nut")
+    (place.inside / "home").symlink_to(_ODD)
+
+
+def _odd_match(place: Place) -> None:
+    """A pool of assets of which one has a name that is no UTF-8."""
+    place.scene(objects="[{pool: 'parts/*', count: 1}]")
+    shutil.copytree(place.inside / "nut", place.inside / "parts" / _ODD)
+
+
+def _odd_image(place: Place) -> None:
+    place.scene(background="{images: skies}")
+    (place.inside / "skies").mkdir()
+    png_sky(place.inside / "skies" / f"{_ODD}.png")
+
+
+def _odd_entry(place: Place) -> None:
+    """An image of a dataset whose name is no UTF-8, in its manifest too."""
+    dataset = place.take_dataset()
+    manifest = dataset / "manifest.jsonl"
+    manifest.write_text(manifest.read_text().replace("train/000000.png", "train/caf\\udce9.png"))
+    (dataset / "images/train/000000.png").rename(dataset / "images/train" / os.fsdecode(b"caf\xe9.png"))
 
 
 def _name_attacks() -> Iterator[Attack]:
@@ -73,6 +159,32 @@ def _name_attacks() -> Iterator[Attack]:
             quick=quick,
             seconds=90,
         )
+    capture, home = ("mitsplat", "capture", "photos", "-o", "made"), ("mitsplat", "render", "home/scene.yaml")
+    cases: tuple[tuple[str, Callable[[Place], object], tuple[str, ...], frozenset[int]], ...] = (
+        ("folder of the scene behind a link", _odd_home, (*home, *RENDER[3:]), FINE),
+        ("asset behind a link", _odd_link("nut"), RENDER, ANY),
+        ("mesh behind a link", _odd_link("mesh.stl", shapes=_MESH), RENDER, ANY),
+        ("image of a light behind a link", _odd_link("sky.png", lights=_SKY), RENDER, ANY),
+        ("photograph behind a link", _odd_link("photos/1.png"), capture, ANY),
+        ("folder of photographs behind a link", _odd_link("photos"), capture, ANY),
+        ("video behind a link", _odd_link("walk.avi"), ("mitsplat", "capture", "walk.avi", "-o", "made"), ANY),
+        ("asset of a pool", _odd_match, RENDER, REFUSED),
+        ("image of a list", _odd_image, RENDER, REFUSED),
+        ("file of a dataset, audit", _odd_entry, ("mitsplat", "audit", "dataset"), frozenset({1, 2})),
+        ("file of a dataset, report", _odd_entry, ("mitsplat", "report", "dataset"), ANY),
+        ("file of a dataset, merge", _odd_entry, ("mitsplat", "merge", "dataset", "-o", "made"), ANY),
+        ("file of a dataset, split", _odd_entry, ("mitsplat", "split", "dataset", "--folds", "2"), ANY),
+    )
+    for name, build, words, status in cases:
+        yield Attack(
+            f"name: {name}, no UTF-8",
+            "crash native code that expects text",
+            build,
+            [words],
+            status,
+            quick=False,
+            seconds=90,
+        )
 
 
 def _shell(text: str, *words: str) -> tuple[str, ...]:
@@ -87,6 +199,13 @@ def _mounted(folder: str, size: str, *words: str) -> tuple[str, ...]:
 
 def _read_only(folder: str, *words: str) -> tuple[str, ...]:
     return ("unshare", "-rm", *_shell(f"mkdir -p {folder} && mount -t tmpfs -o ro none {folder} &&", *words))
+
+
+def _installed_read_only(*words: str) -> tuple[str, ...]:
+    """A command that can write neither to mitsplat's folder nor to those of Python; needs user namespaces."""
+    folders = " ".join(shlex.quote(str(folder)) for folder in (ROOT, Path(sys.prefix), Path(sys.base_prefix)))
+    mount = f"for f in {folders}; do mount --bind $f $f && mount -o remount,bind,ro $f || exit 99; done;"
+    return ("unshare", "-rm", *_shell(mount, *words))
 
 
 def _rendered(place: Place, output: str) -> Iterable[str]:
@@ -119,6 +238,12 @@ def _times(seconds: float) -> Callable[[Place], object]:
             os.utime(path, (seconds, seconds))
 
     return build
+
+
+def _jumping_clock(place: Place) -> None:
+    place.scene()
+    source = place.write("clock.c", _JUMPING_CLOCK)
+    subprocess.run(["cc", "-shared", "-fPIC", "-o", source.with_suffix(".so"), source, "-ldl"], check=True)
 
 
 def _earlier_runs(place: Place) -> None:
@@ -297,6 +422,16 @@ ATTACKS = tuple(
             environment={"PYTHONPATH": "{inside}/start"},
         ),
         Attack(
+            "workers: end as they start, with a command line of 120 kB",
+            "have the run wait for ever",
+            _start("os._exit(9)"),
+            [(*TWO, *_LONG)],
+            ANY,
+            quick=False,
+            seconds=150,
+            environment={"PYTHONPATH": "{inside}/start"},
+        ),
+        Attack(
             "workers: are killed as they start",
             "have the run wait for ever",
             _start("os.kill(os.getpid(), 9)"),
@@ -373,6 +508,38 @@ ATTACKS = tuple(
             ANY,
         ),
         Attack(
+            "machine: read-only installation",
+            "have renders refused",
+            _scene,
+            [_installed_read_only(*RENDER[1:])],
+            FINE,
+            quick=False,
+            seconds=300,
+            environment=_CACHE,
+            check=_rendered,
+        ),
+        Attack(
+            "machine: read-only installation and cache",
+            "have renders refused",
+            _scene,
+            [_installed_read_only(*RENDER[1:])],
+            FINE,
+            quick=False,
+            seconds=300,
+            environment={"HOME": "/proc", "XDG_CACHE_HOME": "/proc/cache"},
+            check=_rendered,
+        ),
+        Attack(
+            "machine: command line of 120 kB",
+            "have workers wait for ever",
+            _scene,
+            [(*TWO, *_LONG)],
+            FINE,
+            quick=False,
+            seconds=150,
+            check=_rendered,
+        ),
+        Attack(
             "machine: no home folder",
             "end as a fault",
             _scene,
@@ -398,6 +565,21 @@ ATTACKS = tuple(
             [("mitsplat", "render", "scene.yaml", "-o", "dataset", "--workers", "1")],
             FINE,
             quick=False,
+        ),
+        *(
+            Attack(
+                f"clock: jumps during a run, {name}",
+                "hang, or tear a dataset",
+                _jumping_clock,
+                [command],
+                FINE,
+                quick=False,
+                seconds=200,
+                environment={"LD_PRELOAD": "{inside}/clock.so"},
+                check=_rendered,
+            )
+            for name, command in (("one process", RENDER), ("two workers", TWO))
+            if shutil.which("cc")
         ),
         Attack(
             "clock: set back between runs",

@@ -211,6 +211,14 @@ ATTACKS = (
         for name, file in _BAKED.items()
     ),
     Attack(
+        "bake: texture outside",
+        "read outside",
+        _textured("../outside/secret.png"),
+        [_bake("m.obj")],
+        REFUSED,
+        quick=False,
+    ),
+    Attack(
         "bake: texture bomb",
         "fill memory",
         lambda place: (_textured("bomb.png")(place), place.write("bomb.png", bomb(40_000))),

@@ -192,6 +192,7 @@ def _attack(name: str, tries: str, during: Callable[[Place], Iterator[str]], por
         quick=False,
         needs=("viser",),
         during=during,
+        keep=("nut/asset.yaml", "nut/splats.ply"),
     )
 
 

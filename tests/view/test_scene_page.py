@@ -20,7 +20,8 @@ from mitsplat.scene.planning.viewpoints import view_of
 from mitsplat.view.page import Address, Page
 from mitsplat.view.previews import SceneRenders, ViewRequest
 from mitsplat.view.scene_page import ScenePage
-from tests.conftest import box_asset, small_scene
+from tests.cli.typed import run
+from tests.conftest import WriteScene, box_asset, small_scene
 from tests.view.test_client_messages import CAMERA, joined, packed
 
 LONG = 60
@@ -253,3 +254,11 @@ def test_another_view_compiles_no_new_kernels(shown):
         kernels = [kernel for kernel in dr.kernel_history() if kernel["type"] == dr.KernelType.JIT]
     assert len(kernels) > 5
     assert all(kernel["cache_hit"] for kernel in kernels)
+
+
+def test_a_scene_with_files_outside_of_its_folder_is_refused(
+    scene_data: dict[str, Any], write_scene: WriteScene, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = write_scene(scene_data | {"lights": [{"kind": "environment", "image": "../sky.png"}]})
+    assert run("view", path, "--port", 0) == 2
+    assert "lights[0].image: must be inside the scene's folder" in capsys.readouterr().err

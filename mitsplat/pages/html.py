@@ -18,7 +18,8 @@ REPORT_FILE = "report.html"
 
 
 def make_page(title: str, body: str, *, script: str = "") -> str:
-    """Build an HTML page from an HTML body."""
+    """Build an HTML page from an HTML body; bytes of file names that are not UTF-8 are written as escapes."""
+    body = body.encode(errors="backslashreplace").decode()
     page = _PAGE.replace("{{title}}", html.escape(title)).replace("{{body}}", body)
     return page.replace("{{script}}", f"<script>{script}</script>\n" if script else "")
 

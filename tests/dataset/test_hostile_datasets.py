@@ -244,6 +244,11 @@ class TestJson:
         finally:
             assert signal.alarm(0) > 0
 
+    def test_a_report_shows_names_of_strays_that_are_not_utf_8(self, out):
+        (out / "images/train" / os.fsdecode(b"caf\xe9.png")).write_bytes(b"")
+        READERS["report"](out)
+        assert r"images/train/caf\udce9.png" in (out / "report.html").read_text()
+
 
 def _checked(text):
     """A line of a manifest with the checksum that fits, of JSON that Python does not write."""

@@ -162,7 +162,7 @@ def compare(path: Path, frames: int, machines: Machines) -> bool:
             if events["frames"] == frames // 2:
                 machines.start()
                 print(f"machine 3 is started after frame {events['frames']}", flush=True)
-        elif "made again" in said:
+        elif "is repeated" in said:
             events["lost"] += 1
             print(said[:100], flush=True)
 

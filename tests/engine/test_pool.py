@@ -97,7 +97,7 @@ def test_another_exception_of_a_worker_names_the_frame_with_its_traceback():
 
 @pytest.mark.parametrize(("how", "words"), [("killed", "was killed by SIGKILL"), ("exits", "ended with status 3")])
 def test_a_frame_that_kills_every_worker_ends_the_run(how, words):
-    with pytest.raises(LostWorkersError, match=f"making frame 4 {words}, 3 times"):
+    with pytest.raises(LostWorkersError, match=f"the worker of frame 4 {words}, 3 times"):
         run(Make(fail_at=4, how=how), 2)
 
 
@@ -107,7 +107,7 @@ def test_frames_of_lost_workers_are_made_by_others(tmp_path, workers):
     notes = []
     made = run(KillOnce(tmp_path, (1, 7)), workers, note=notes.append)
     assert sorted(made) == list(range(9))
-    told = [note for note in notes if "made again" in note]
+    told = [note for note in notes if "repeated" in note]
     assert sorted(told) == [f"the worker of frame {i} was killed by SIGKILL: the frame is repeated" for i in (1, 7)]
 
 
@@ -141,7 +141,7 @@ def test_a_worker_that_does_not_start_in_time_is_reported(monkeypatch, interpret
     interpreter(script)
     begun, notes = time.monotonic(), []
     large = Make(how="x" * 10_000_000)
-    with pytest.raises(LostWorkersError, match=rf"making frame 0 {words}, 3 times"):
+    with pytest.raises(LostWorkersError, match=rf"the worker of frame 0 {words}, 3 times"):
         run(large, 2, {0: [0], 1: [1]}, notes.append)
     assert time.monotonic() - begun < 20
     assert notes[0] == f"the worker of frame 0 {words}: the frame is repeated"

@@ -266,7 +266,7 @@ class TestXml:
         """A native reader that crashes, in its stead a process that is killed."""
         monkeypatch.setattr(xml_scene, "_RenderOne", Dies)
         assert run("render", scene) == 2
-        assert "scene.xml: something that it names ends Mitsuba's process" in capsys.readouterr().err
+        assert "scene.xml: Mitsuba's process ended at a file that the scene names" in capsys.readouterr().err
 
 
 class Dies:

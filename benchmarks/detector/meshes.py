@@ -77,7 +77,7 @@ def frames(scene: Scene, parts: Mapping[str, tuple[MeshPart, ...]], indices: ran
                 layout = ms.settle_layout(scene, layout_of(scene, index))
                 objects = object_shapes(scene, layout, parts)
             frame, start = renderer.render(index, layout=layout), time.process_time()
-            described = renderer.describe(layout, frame.plan.lights)
+            described = renderer.scene_builder.describe(layout, frame.plan.lights)
             room = {name: described[name] for name in described if _stands(scene, name)}
             room |= {f"light_{k}": emitter_dict(light) for k, light in enumerate(frame.plan.lights)}
             radiance, cover = render_mesh(

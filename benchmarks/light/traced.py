@@ -28,7 +28,8 @@ import mitsplat as ms
 from benchmarks.record import figure, recording
 from mitsplat.arrays import Float32Array
 from mitsplat.frames.camera_response import develop, light_image
-from mitsplat.frames.frame import Renderer, light_properties
+from mitsplat.frames.frame import Renderer
+from mitsplat.frames.light_properties import light_properties
 from mitsplat.quality import resolve_quality
 from mitsplat.renderer.layers import Layers, make_integrator, render_layers
 from mitsplat.runtime.variant import ensure_variant
@@ -90,7 +91,7 @@ class Pictures:
         self.plans: list[FramePlan] = []
         for index in range(frames):
             plan = plan_frame(self.scene, index, layout)
-            self.frames.append((mi.load_dict(self.renderer.describe(layout, plan.lights)), plan.camera))
+            self.frames.append((mi.load_dict(self.renderer.scene_builder.describe(layout, plan.lights)), plan.camera))
             self.plans.append(plan)
 
     def integrator(self, **properties: Any) -> Any:

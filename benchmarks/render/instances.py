@@ -122,7 +122,7 @@ def measure(path: Path, scenes: int) -> None:
     scene = ms.load_scene(path)
     layout, plan = ms.settle_layout(scene, layout_of(scene, 0)), plan_frame(scene, 3)
     renderer = Renderer(scene, quality=PRESETS["fast"])
-    placed = mi.load_dict(renderer.describe(layout, plan.lights))
+    placed = mi.load_dict(renderer.scene_builder.describe(layout, plan.lights))
     print_costs(path.name, renderer.integrator, placed, plan.camera)
     camera = ms.Camera.look_at((0, 0, -2), (0, 0, 0), up=(0, -1, 0), width=1280, height=720, fov_x=50)
     crowded = mi.load_dict({"type": "scene", **crowd()})

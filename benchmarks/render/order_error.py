@@ -58,8 +58,8 @@ def subjects(captures: Path, names: list[str], width: int, height: int) -> Itera
         from mitsplat.plugins.splats import SplatsShape  # derives from a class of the variant
 
         with Renderer(ms.load_scene(ROOT / "scenes/workcell.yaml")) as renderer:
-            layout, plan = renderer._settle(layout_of(renderer.scene, 0)), plan_frame(renderer.scene, 0)
-            shapes = mi.load_dict(renderer.describe(layout, plan.lights)).shapes()
+            layout, plan = ms.settle_layout(renderer.scene, layout_of(renderer.scene, 0)), plan_frame(renderer.scene, 0)
+            shapes = mi.load_dict(renderer.scene_builder.describe(layout, plan.lights)).shapes()
             parts = [shape for shape in shapes if isinstance(shape, SplatsShape)]
             splats = Splats.concatenate([part.splats.transformed(part.world_from_splats) for part in parts])
         yield "workcell", splats, plan.camera.resized(width, height)

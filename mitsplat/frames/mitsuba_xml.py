@@ -13,15 +13,14 @@ from typing import Any
 
 import mitsuba as mi
 import numpy as np
-import trimesh
 
 from mitsplat.asset import Asset
 from mitsplat.engine.pool import LostWorkersError, run_in_process
 from mitsplat.errors import InputError
 from mitsplat.frames.camera_response import develop
-from mitsplat.frames.frame import light_properties
+from mitsplat.frames.light_properties import light_properties
+from mitsplat.frames.scene_builder import asset_properties
 from mitsplat.frames.untrusted_xml import check_xml
-from mitsplat.images.colour import decode_srgb
 from mitsplat.physics.settle import settle_layout
 from mitsplat.progress import Note
 from mitsplat.renderer.layers import describe_sensor
@@ -30,12 +29,12 @@ from mitsplat.renderer.scene_emitters import emitter_dict
 from mitsplat.renderer.textures import finished_mesh, material, texture_image
 from mitsplat.runtime.device import Device
 from mitsplat.runtime.variant import ensure_variant
-from mitsplat.scene.planning.conveyor import Belt, layout_at_view
-from mitsplat.scene.planning.frame_plan import layout_of, plan_frame
-from mitsplat.scene.planning.layout_surroundings import MaterialDraw, draw_surroundings
+from mitsplat.scene.layout import Layout
+from mitsplat.scene.planning.conveyor import layout_at_view
+from mitsplat.scene.planning.frame_plan import FramePlan, layout_of, plan_frame
+from mitsplat.scene.planning.layout_surroundings import draw_surroundings
 from mitsplat.scene.planning.object_appearance import draw_appearances
 from mitsplat.scene.scene import Scene
-from mitsplat.scene.spec.shape_spec import Shape
 from mitsplat.storage.files import library_errors, storage_errors, write_file
 
 
@@ -55,27 +54,8 @@ def export_xml(scene: Scene, index: int, path: str | Path) -> None:
     layout = layout_at_view(scene.spec, settle_layout(scene, number), index - number * scene.spec.output.views)
     plan = plan_frame(scene, index, layout)
     if files.is_symlink():
-        raise InputError(f"{files}: must not be a link, for files are written into it; remove it")
+        raise InputError(f"{files}: must not be a link, because files are written into it; remove the link")
     files.mkdir(parents=True, exist_ok=True)
-    shapes: dict[str, Any] = {}
-    place = draw_surroundings(scene.spec, index)
-    environment = scene.environment_of(layout.index)
-    if environment is not None:
-        stem = _write_asset(environment, files / "environment")
-        shapes["environment"] = _describe_asset(environment, stem, np.eye(4), 0)
-    # File names use positions, because asset names may repeat and need not be valid file names.
-    stems = {i: _write_asset(scene.assets[i], files / f"object_{i}") for i in {one.asset for one in layout.instances}}
-    appearances = draw_appearances(scene, layout)
-    for one in layout.instances:
-        description = _describe_asset(scene.assets[one.asset], stems[one.asset], one.world_from_object, one.id)
-        drawn = appearances[one.id].properties() if one.id in appearances else {}
-        shapes[f"instance_{one.id}"] = description | drawn
-    for number, (shape, mesh) in enumerate(zip(scene.spec.shapes, scene.shape_meshes, strict=True)):
-        if shape.visible:
-            stem = files / f"shape_{number}"
-            shapes[f"shape_{number}"] = _describe_shape(
-                shape, mesh, stem, place.material_of(shape.name), scene, plan.belt
-            )
     lights = {f"light_{i}": emitter_dict(light, scene.path.parent.resolve()) for i, light in enumerate(plan.lights)}
     description = {
         "type": "scene",
@@ -84,16 +64,72 @@ def export_xml(scene: Scene, index: int, path: str | Path) -> None:
             "type": "splat_proxy",
             "quality": scene.spec.quality,
             **scene.spec.rendering.model_dump(),
-            **light_properties(scene, place),
+            **light_properties(scene, number),
         },
         "sensor": describe_sensor(plan.camera),
-        **shapes,
+        **_export_assets(scene, layout, files),
+        **_export_visible_shapes(scene, plan, files),
         **lights,
     }
     _register_plugin_kinds()
     state = mi.parser.parse_dict(mi.parser.ParserConfig(str(mi.variant())), description)
     with library_errors(path):
         write_file(path, lambda part: mi.parser.write_file(state, str(part)))
+
+
+def _export_assets(scene: Scene, layout: Layout, folder: Path) -> dict[str, Any]:
+    """Write the splats and meshes of environment and objects; return the Mitsuba dictionaries of their shapes."""
+    environment, shapes = scene.environment_of(layout.index), {}
+    if environment is not None:
+        files = _write_asset(environment, folder, "environment")
+        shapes["environment"] = {"type": "splats", **files, **asset_properties(environment, 0)}
+    # File names use positions, because asset names may repeat and need not be valid file names.
+    used = {instance.asset for instance in layout.instances}
+    asset_files = {number: _write_asset(scene.assets[number], folder, f"object_{number}") for number in used}
+    appearances = draw_appearances(scene, layout)
+    for instance in layout.instances:
+        asset, appearance = scene.assets[instance.asset], appearances.get(instance.id)
+        shapes[f"instance_{instance.id}"] = {
+            "type": "splats",
+            **asset_files[instance.asset],
+            **asset_properties(asset, instance.id, appearance),
+            "to_world": mi.ScalarTransform4f(instance.world_from_object),
+        }
+    return shapes
+
+
+def _write_asset(asset: Asset, folder: Path, name: str) -> dict[str, str]:
+    """Write splats and mesh of an asset; return their file properties for the shape plugin ``splats``."""
+    asset.splats.save(folder / f"{name}.ply")
+    files, mesh = {"filename": f"{folder.name}/{name}.ply"}, asset.mesh
+    if mesh is not None:
+        write_file(folder / f"{name}_proxy.ply", lambda part: mesh.export(part, file_type="ply"))
+        files["proxy"] = f"{folder.name}/{name}_proxy.ply"
+    return files
+
+
+def _export_visible_shapes(scene: Scene, plan: FramePlan, folder: Path) -> dict[str, Any]:
+    """Write the meshes and patterns of visible shapes; return their Mitsuba dictionaries."""
+    surroundings, shapes = draw_surroundings(scene.spec, plan.index), {}
+    for number, (shape, mesh) in enumerate(zip(scene.spec.shapes, scene.shape_meshes, strict=True)):
+        if not shape.visible:
+            continue
+        name, drawn = f"shape_{number}", surroundings.material_of(shape)
+        image, texture = texture_image(drawn, scene.images), None
+        if image is not None:
+            bitmap = mi.Bitmap(image)
+            write_file(folder / f"{name}.png", lambda part, it=bitmap: it.write(str(part), mi.Bitmap.FileFormat.PNG))
+            texture = {"type": "bitmap", "filename": f"{folder.name}/{name}.png"}
+        travel = plan.belt.travel if plan.belt is not None and shape.box == plan.belt.box else 0.0
+        finished = finished_mesh(mesh, shape, drawn, image, travel=travel)
+        write_file(folder / f"{name}.ply", lambda part, it=finished: it.write_ply(str(part)))
+        shapes[name] = {
+            "type": "ply",
+            "filename": f"{folder.name}/{name}.ply",
+            "face_normals": True,
+            "bsdf": material(drawn, texture),
+        }
+    return shapes
 
 
 def render_xml(path: str | Path, out: str | Path, *, allow_outside: bool = False) -> Path:
@@ -144,7 +180,7 @@ def render_apart(path: Path, out: Path, *, allow_outside: bool = False, device: 
         try:
             return next(results)
         except LostWorkersError as error:
-            raise InputError(f"{path}: something that it names ends Mitsuba's process ({error})") from error
+            raise InputError(f"{path}: Mitsuba's process ended at a file that the scene names ({error})") from error
 
 
 @dataclass(frozen=True)
@@ -161,7 +197,7 @@ def _render(path: Path, scene: Any) -> Any:
     from mitsplat.plugins.splat_proxy import SplatProxyIntegrator  # derives from a class of the variant
 
     if not scene.sensors():
-        raise InputError(f"{path}: the scene has no sensor")
+        raise InputError(f"{path}: the scene must have a sensor (got none)")
     integrator, sensor = scene.integrator(), scene.sensors()[0]
     if isinstance(integrator, SplatProxyIntegrator):
         try:
@@ -169,7 +205,7 @@ def _render(path: Path, scene: Any) -> Any:
         except InputError as error:
             raise InputError(f"{path}: {error}") from None
     elif any(hasattr(shape, "world_from_splats") for shape in scene.shapes()):
-        raise InputError(f"{path}: shape 'splats' is only seen by the integrator 'splat_proxy'")
+        raise InputError(f"{path}: shape 'splats' needs the integrator 'splat_proxy' (got {integrator.class_name()})")
     # mi.render would replace the cause of an error by "see above".
     return integrator.render(scene, sensor)
 
@@ -194,10 +230,11 @@ def one_sentence(path: Path, message: str, stands_for: Mapping[Path, Path] | Non
     unknown = _UNKNOWN.search(message)
     if unknown:
         names = ", ".join(repr(name) for name in _PROPERTY.findall(message[unknown.end() :]))
-        known = f"; it takes {', '.join(documented)}" if (documented := _documented(unknown["type"])) else ""
+        documented = _documented_properties(unknown["type"])
+        known = f"; it takes {', '.join(documented)}" if documented else ""
         return f"{place}: {unknown['kind']} {unknown['type']!r} takes no {names}{known}"
     lines = [line.strip() for line in message.splitlines() if line.strip()]
-    last = lines[-1] if lines else "Mitsuba refuses it without a reason"
+    last = lines[-1] if lines else "Mitsuba reported an error without a message"
     last = last.removeprefix(f"{InputError.__name__}: ")
     last = re.sub(r"^\[\w+\.cpp:\d+\] ", "", last)
     last = _PLACE.sub("", last.removeprefix("Error "))
@@ -205,7 +242,7 @@ def one_sentence(path: Path, message: str, stands_for: Mapping[Path, Path] | Non
     return last if last.startswith(place) else f"{place}: {last}"
 
 
-def _documented(plugin: str) -> list[str]:
+def _documented_properties(plugin: str) -> list[str]:
     """Return the documented properties of a mitsplat plugin; empty for other plugins."""
     from mitsplat.plugins import opencv_camera, splat_proxy, splats  # derive from classes of the variant
 
@@ -217,61 +254,6 @@ def _documented(plugin: str) -> list[str]:
     text = classes[plugin].__doc__ if plugin in classes else None
     rows = re.findall(r"\* - ([\w, ]+)\n\s+- \|", text or "")
     return [name for row in rows for name in row.split(", ")]
-
-
-def _write_asset(asset: Asset, stem: Path) -> Path:
-    """Write splats and mesh as ``stem.ply`` and ``stem_proxy.ply``; return ``stem``."""
-    asset.splats.save(stem.with_suffix(".ply"))
-    if asset.mesh is not None:
-        _write_mesh(asset.mesh, stem.with_name(f"{stem.name}_proxy.ply"))
-    return stem
-
-
-def _write_mesh(mesh: trimesh.Trimesh, path: Path) -> None:
-    write_file(path, lambda part: mesh.export(part, file_type="ply"))
-
-
-def _describe_asset(asset: Asset, stem: Path, world_from_asset: np.ndarray, instance: int) -> dict[str, Any]:
-    relative = f"{stem.parent.name}/{stem.name}"
-    return {
-        "type": "splats",
-        "filename": f"{relative}.ply",
-        "instance": instance,
-        "capture_light": asset.capture_light,
-        "roughness": float(asset.roughness),
-        "specular": float(asset.specular) if instance else 0.0,
-        "to_world": mi.ScalarTransform4f(world_from_asset),
-        **({"proxy": f"{relative}_proxy.ply"} if asset.mesh is not None else {}),
-    }
-
-
-def _describe_shape(
-    shape: Shape, mesh: trimesh.Trimesh, stem: Path, finish: MaterialDraw | None, scene: Scene, belt: Belt | None
-) -> dict[str, Any]:
-    """Write a mesh as ``stem.ply``, and its pattern, if any, as ``stem.png``; return its Mitsuba dictionary."""
-    path = stem.with_suffix(".ply")
-    if finish is not None:
-        image, texture = texture_image(finish, scene.images), None
-        if image is not None:
-            bitmap = mi.Bitmap(image)
-            write_file(stem.with_suffix(".png"), lambda part: bitmap.write(str(part), mi.Bitmap.FileFormat.PNG))
-            texture = {"type": "bitmap", "filename": f"{path.parent.name}/{stem.name}.png"}
-        travel = belt.travel if belt is not None and shape.box == belt.box else 0.0
-        finished = finished_mesh(mesh, shape, finish, image, travel=travel)
-        write_file(path, lambda part: finished.write_ply(str(part)))
-        return {
-            "type": "ply",
-            "filename": f"{path.parent.name}/{path.name}",
-            "face_normals": True,
-            "bsdf": material(finish, texture),
-        }
-    _write_mesh(trimesh.Trimesh(mesh.vertices, mesh.faces, process=False), path)
-    return {
-        "type": "ply",
-        "filename": f"{path.parent.name}/{path.name}",
-        "face_normals": True,
-        "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": decode_srgb(shape.colour).tolist()}},
-    }
 
 
 def _register_plugin_kinds() -> None:

@@ -18,8 +18,8 @@ import mitsplat as ms
 from mitsplat.errors import InputError
 from mitsplat.formats.registry import Catalogue, write_frame
 from mitsplat.frames.camera_response import develop, light_image
-from mitsplat.frames.frame import NOTHING
 from mitsplat.frames.mitsuba_xml import export_xml, render_xml
+from mitsplat.frames.scene_builder import NO_SPLATS
 from mitsplat.geometry.camera import Camera
 from mitsplat.quality import PRESETS
 from mitsplat.renderer.layers import make_integrator, make_splats_shape, render_layers
@@ -229,7 +229,7 @@ def test_a_closed_renderer_is_refused(
     with ms.Renderer(scene) as renderer, monkeypatch.context() as patch:
         variant = mi.variant()
         patch.setattr("mitsplat.frames.frame.mi.variant", lambda: "scalar_rgb")
-        with pytest.raises(InputError, match=f"was made in Mitsuba's variant {variant}"):
+        with pytest.raises(InputError, match=f"Mitsuba's variant must stay {variant}"):
             renderer.render(0, layout=layout)
     with pytest.raises(InputError, match="closed"):
         renderer.render(0, layout=layout)
@@ -274,7 +274,7 @@ def test_a_still_camera_renders_the_same_bytes_as_a_new_renderer(quality: str, s
 def test_a_still_camera_renders_surroundings_without_splats() -> None:
     """As of a proxy that is not seen, which has none."""
     integrator = make_integrator(shadow="none")
-    wall = make_splats_shape(NOTHING, proxy=trimesh.creation.box((1, 1, 0.1)))
+    wall = make_splats_shape(NO_SPLATS, proxy=trimesh.creation.box((1, 1, 0.1)))
     seen = make_splats_shape(make_splats(20, 3), instance=1)
     camera = Camera.look_at((0, 0, -2), (0, 0, 0), up=(0, -1, 0), width=32, height=24, fov_x=40)
     pictures = [
@@ -287,7 +287,7 @@ def test_a_still_camera_renders_surroundings_without_splats() -> None:
 def test_a_still_camera_renders_an_object_without_splats() -> None:
     """Its proxy is all that there is of it; the same picture comes from a camera that just arrived."""
     around = make_splats_shape(make_splats(20, 3))
-    bare = make_splats_shape(NOTHING, instance=1, proxy=trimesh.creation.box((0.2, 0.2, 0.1)))
+    bare = make_splats_shape(NO_SPLATS, instance=1, proxy=trimesh.creation.box((0.2, 0.2, 0.1)))
     camera = Camera.look_at((0, 0, -2), (0, 0, 0), up=(0, -1, 0), width=32, height=24, fov_x=40)
     scene, still = mi.load_dict({"type": "scene", "around": around, "bare": bare}), make_integrator(shadow="none")
     pictures = [render_layers(still, scene, camera).rgb.tobytes() for _ in range(3)]

@@ -48,7 +48,7 @@ def compiled(renderer: Renderer, index: int, layout: Layout) -> tuple[int, int]:
     eye = 0.4 * np.cos(azimuth), 0.4 * np.sin(azimuth) - 0.08, 0.5
     camera = Camera.look_at(eye, (0, -0.08, 0), width=96, height=54, fov_x=50)
     dr.kernel_history_clear()
-    scene = mi.load_dict(renderer.describe(layout, plan.lights))
+    scene = mi.load_dict(renderer.scene_builder.describe(layout, plan.lights))
     render_layers(renderer.integrator, scene, camera, seed=plan.seed)
     render_silhouettes(renderer.integrator, scene, camera)
     run = [entry for entry in dr.kernel_history() if entry["type"] == dr.KernelType.JIT]

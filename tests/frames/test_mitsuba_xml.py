@@ -95,7 +95,7 @@ def write(folder: Path, text: str) -> Path:
         ),
         (
             SCENE.format(NUT.format("")).replace("splat_proxy", "path"),
-            "scene.xml: shape 'splats' is only seen by the integrator 'splat_proxy'$",
+            r"scene.xml: shape 'splats' needs the integrator 'splat_proxy' \(got PathIntegrator\)$",
         ),
         (
             SCENE.format('<shape type="splats"> <string name="asset" value="bolt"/> </shape>'),
@@ -123,7 +123,7 @@ def test_each_fault_of_a_scene_is_one_sentence_with_its_line(small: Path, text: 
 
 def test_an_error_without_a_line_is_kept() -> None:
     assert one_sentence(Path("a.xml"), "[scene.cpp:12] nothing works") == "a.xml: nothing works"
-    assert one_sentence(Path("a.xml"), "") == "a.xml: Mitsuba refuses it without a reason"
+    assert one_sentence(Path("a.xml"), "") == "a.xml: Mitsuba reported an error without a message"
 
 
 def test_a_camera_with_shear_is_refused(small: Path) -> None:

@@ -84,7 +84,7 @@ def test_a_material_of_one_colour_renders_as_the_colour_key(places: SceneData, w
     scene = ms.load_scene(write_scene(places))
     frame = ms.render_frame(scene, 0, layout=lying(scene, 0))
     del places["shapes"][0]["materials"]
-    places["shapes"][0]["colour"] = draw_surroundings(scene.spec, frame.index).finishes["table"].colours[0]
+    places["shapes"][0]["colour"] = draw_surroundings(scene.spec, frame.index).materials["table"].colours[0]
     stated = ms.load_scene(write_scene(places))
     np.testing.assert_array_equal(ms.render_frame(stated, 0, layout=lying(stated, 0)).image, frame.image)
 

@@ -14,7 +14,7 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from mitsplat.frames.frame import NOTHING
+from mitsplat.frames.scene_builder import NO_SPLATS
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.camera import Camera
 from mitsplat.quality import PRESETS, Quality
@@ -91,7 +91,7 @@ def test_shapes_without_gaussians_do_not_shift_other_ids(before: int) -> None:
     poses = [mi.ScalarTransform4f().translate([x, y, 0]).matrix for x, y in ((-0.4, 0.2), (0, -0.3), (0.4, 0.1))]
     balls = {f"ball_{i}": make_splats_shape(ball, np.array(pose), instance=i) for i, pose in enumerate(poses, start=1)}
     proxy = trimesh.creation.box((0.1, 0.1, 0.1), np.array(mi.ScalarTransform4f().translate([0, 0, 9]).matrix))
-    proxies = {f"proxy_{i}": make_splats_shape(NOTHING, proxy=proxy) for i in range(before)}
+    proxies = {f"proxy_{i}": make_splats_shape(NO_SPLATS, proxy=proxy) for i in range(before)}
     integrator = make_integrator(quality=EXACT, shadow="none")
     alone, first = (
         render_layers(integrator, mi.load_dict({"type": "scene", **shapes}), CAMERA).instance

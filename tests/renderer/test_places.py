@@ -14,9 +14,9 @@ import pytest
 
 from mitsplat.dataset.preflight import scene_warnings
 from mitsplat.errors import InputError
-from mitsplat.frames.frame import light_properties
+from mitsplat.frames.light_properties import light_properties
 from mitsplat.scene.loading.scene_loading import load_scene
-from mitsplat.scene.planning.layout_surroundings import MaterialDraw, draw_surroundings, drawn_environment
+from mitsplat.scene.planning.layout_surroundings import MaterialDraw, draw_surroundings
 from tests.conftest import WriteScene, box_asset
 
 SceneData = dict[str, Any]
@@ -50,7 +50,7 @@ def test_each_layout_draws_an_environment(scene_data: SceneData, write_scene: Wr
     assert abs(counts[1] - 150) < 4 * (200 * 0.25 * 0.75) ** 0.5
     told = plans[0].to_json(scene.spec)
     assert told == {"environment": {"number": told["environment"]["number"], "name": told["environment"]["name"]}}
-    chosen = drawn_environment(scene, plans[0])
+    chosen = scene.environment_of(0)
     assert chosen is not None
     assert f"assets/{chosen.name}" == told["environment"]["name"]
 
@@ -71,7 +71,7 @@ def test_every_value_of_a_material_is_within_its_range(
     scene_data["output"]["layouts"] = 60
     scene = load_scene(write_scene(scene_data))
     (material,) = scene.spec.shapes[0].materials
-    drawn = [draw_surroundings(scene.spec, 4 * layout).finishes["table"] for layout in range(60)]
+    drawn = [draw_surroundings(scene.spec, 4 * layout).materials["table"] for layout in range(60)]
     assert len({finish.colours for finish in drawn}) == 60
     for finish in drawn:
         red, green, blue = finish.colours[0]
@@ -89,7 +89,7 @@ def test_every_value_of_a_material_is_within_its_range(
 def test_a_further_material_shifts_no_other_draw(scene_data: SceneData, write_scene: WriteScene) -> None:
     def finishes() -> list[MaterialDraw]:
         scene = load_scene(write_scene(scene_data))
-        return [draw_surroundings(scene.spec, index).finishes["table"] for index in range(12)]
+        return [draw_surroundings(scene.spec, index).materials["table"] for index in range(12)]
 
     scene_data["shapes"][0]["materials"] = [{"kind": "noise"}, {"kind": "wood"}]
     alone = finishes()
@@ -211,9 +211,11 @@ def test_a_backdrop_is_a_room_around_its_interior(scene_data: SceneData, write_s
     inside = (np.abs(own[:, :2]) < (1.499, 0.999)).all(axis=1) & (own[:, 2] > 0.001) & (own[:, 2] < 2.499)
     assert not inside.any()
     assert [s.name for s in scene.spec.shapes if s.collider and s.visible] == ["table", "backdrop floor"]
-    assert set(draw_surroundings(scene.spec, 0).finishes) == {"backdrop floor", "backdrop walls"}
-    drawn = draw_surroundings(scene.spec, 0)
-    assert drawn.material_of("backdrop wall +y") == drawn.material_of("backdrop wall -x")
+    surroundings = draw_surroundings(scene.spec, 0)
+    assert set(surroundings.materials) == {"backdrop floor", "backdrop walls"}
+    shapes = {shape.name: shape for shape in scene.spec.shapes}
+    walls = [surroundings.material_of(shapes[f"backdrop wall {side}"]) for side in ("+y", "-x")]
+    assert walls[0] == walls[1] == surroundings.materials["backdrop walls"]
     assert [finding.text for finding in scene_warnings(scene) if not finding.ok] == []
     assert light_properties(scene)["sky_reach"] == pytest.approx((1 - 0.2 * np.sin(np.pi / 6)) / 2)
     scene_data["backdrop"] = {"size": [0.7, 0.7, 0.9], "position": [0, 0, -0.2], "sides": ["+x", "-y"]}

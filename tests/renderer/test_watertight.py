@@ -10,7 +10,7 @@ import numpy.typing as npt
 import pytest
 import trimesh
 
-from mitsplat.frames.frame import NOTHING
+from mitsplat.frames.scene_builder import NO_SPLATS
 from mitsplat.geometry.camera import Camera
 from mitsplat.renderer.layers import Layers, make_integrator, make_splats_shape, render_layers, render_silhouettes
 from mitsplat.renderer.rays.device_arrays import plain_mesh
@@ -66,7 +66,7 @@ def render(camera: Camera, shapes: dict[str, Any], **properties: Any) -> Layers:
 def test_cameras_see_the_front_of_solids_in_every_pixel(name: str) -> None:
     ensure_variant()
     mesh = SOLIDS[name]
-    shapes = {"visible": plain_mesh(mesh), "proxy": make_splats_shape(NOTHING, proxy=mesh, instance=1)}
+    shapes = {"visible": plain_mesh(mesh), "proxy": make_splats_shape(NO_SPLATS, proxy=mesh, instance=1)}
     for camera in cameras(mesh.bounds[1, 2]):
         expected, sure = true_depth(mesh, camera)
         assert sure.mean() > 0.99 and (expected > 0).sum() > 500
@@ -92,7 +92,7 @@ def test_no_light_passes_through_a_plate(kind: str) -> None:
     ensure_variant()
     mesh = PLATE.copy().apply_translation((0, 0, 0.5))
     instance = 1 if kind == "dynamic" else 0
-    plate = plain_mesh(mesh) if kind == "visible" else make_splats_shape(NOTHING, proxy=mesh, instance=instance)
+    plate = plain_mesh(mesh) if kind == "visible" else make_splats_shape(NO_SPLATS, proxy=mesh, instance=instance)
     lamp = {"type": "point", "position": [0, 0, 1], "intensity": {"type": "rgb", "value": 1.0}}
     for width, height in [(96, 96), (65, 65), (128, 72)]:
         camera = Camera.look_at((0, 0, 0.4), (0, 0, 0), up=(0, 1, 0), width=width, height=height, fov_x=48)
@@ -104,7 +104,7 @@ def test_no_light_passes_through_a_plate(kind: str) -> None:
 
 def test_the_silhouette_of_a_plate_has_no_holes() -> None:
     ensure_variant()
-    scene = mi.load_dict({"type": "scene", "plate": make_splats_shape(NOTHING, proxy=PLATE, instance=1)})
+    scene = mi.load_dict({"type": "scene", "plate": make_splats_shape(NO_SPLATS, proxy=PLATE, instance=1)})
     for eye in [(0, 0, 0.5), (0.1, 0.1, 0.25), (0, 0, 1)]:
         for up in [(0, 1, 0), (1, 0, 0)]:
             camera = Camera.look_at(eye, (*eye[:2], 0), up=up, width=120, height=90, fov_x=50)

@@ -8,19 +8,16 @@ from __future__ import annotations
 import colorsys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from mitsplat.scene.spec.material_spec import Background, BrushedMetalMaterial, ColourMaterial, ImageMaterial, Material
 from mitsplat.scene.spec.scene_spec import SceneSpec
+from mitsplat.scene.spec.shape_spec import Shape
 from mitsplat.scene.splits import draw_environment
 from mitsplat.scene.streams import random_stream
 from mitsplat.scene.walls import material_name
-
-if TYPE_CHECKING:
-    from mitsplat.asset import Asset
-    from mitsplat.scene.scene import Scene
 
 Colour = tuple[float, float, float]
 
@@ -85,25 +82,25 @@ class LayoutSurroundings:
 
     Attributes:
         environment: Index among the environments of the scene; 0 if there are none.
-        finishes: Drawn materials, by the names of visible shapes. All walls of a backdrop share one entry.
+        materials: Drawn materials, by the names of visible shapes. All walls of a backdrop share one entry.
         background: Background image, if the scene has one.
     """
 
     environment: int = 0
-    finishes: Mapping[str, MaterialDraw] = field(default_factory=dict)
+    materials: Mapping[str, MaterialDraw] = field(default_factory=dict)
     background: BackgroundDraw | None = None
 
-    def material_of(self, shape: str) -> MaterialDraw | None:
-        """Return the drawn material of a shape; None if its material is fixed."""
-        return self.finishes.get(material_name(shape))
+    def material_of(self, shape: Shape) -> MaterialDraw:
+        """Return the drawn material of a shape, or its fixed colour."""
+        return self.materials.get(material_name(shape.name)) or MaterialDraw("colour", (shape.colour,))
 
     def to_json(self, spec: SceneSpec) -> dict[str, Any]:
         """Return the values that the scene file leaves open as JSON values; empty if there are none."""
         values: dict[str, Any] = {}
         if isinstance(spec.environment, tuple):
             values["environment"] = {"number": self.environment, "name": spec.environment[self.environment]}
-        if self.finishes:
-            values["materials"] = {name: finish.to_json() for name, finish in self.finishes.items()}
+        if self.materials:
+            values["materials"] = {name: drawn.to_json() for name, drawn in self.materials.items()}
         if self.background is not None:
             values["background"] = self.background.to_json()
         return values
@@ -112,17 +109,12 @@ class LayoutSurroundings:
 def draw_surroundings(spec: SceneSpec, index: int, layout: int | None = None) -> LayoutSurroundings:
     """Draw the surroundings of frame ``index``, or of the layout whose number is given."""
     layout = index // spec.output.views if layout is None else layout
-    materials = {material_name(shape.name): shape.materials for shape in spec.shapes if shape.materials}
-    finishes = {name: draw_material(among, spec.seed, name, layout) for name, among in materials.items()}
+    choices = {material_name(shape.name): shape.materials for shape in spec.shapes if shape.materials}
+    materials = {name: draw_material(among, spec.seed, name, layout) for name, among in choices.items()}
     background = None
     if spec.background is not None:
         background = draw_background(spec.background, spec.seed, index if spec.background.per == "frame" else layout)
-    return LayoutSurroundings(draw_environment(spec, layout), finishes, background)
-
-
-def drawn_environment(scene: Scene, place: LayoutSurroundings) -> Asset | None:
-    """Return the environment of drawn surroundings; None if the scene has none."""
-    return scene.environments[place.environment] if scene.environments else None
+    return LayoutSurroundings(draw_environment(spec, layout), materials, background)
 
 
 def draw_material(materials: Sequence[Material], seed: int, name: str, layout: int) -> MaterialDraw:

@@ -93,15 +93,8 @@ def developed(frame: Frame, radiance: np.ndarray, cover: np.ndarray, scene: Scen
     if empty.sum() < LEAST:
         empty = cover == 1
     gain = np.median(frame.rgb[empty], axis=0) / np.maximum(np.median(radiance[empty], axis=0), 1e-6)
-    composite = scene.spec.composite
-    return develop(
-        (gain * radiance + frame.rgb * (1 - cover[..., None])).astype(np.float32),
-        frame.draws,
-        tone=composite.tone,
-        sensor=composite.sensor,
-        seed=frame.plan.seed,
-        metered=composite.exposure == "auto",
-    )
+    linear = (gain * radiance + frame.rgb * (1 - cover[..., None])).astype(np.float32)
+    return develop(linear, frame.draws, scene.spec.composite, seed=frame.plan.seed)
 
 
 def _stands(scene: Scene, name: str) -> bool:

@@ -102,7 +102,7 @@ class Pictures:
         """The picture of a frame, 0 to 255."""
         plan, composite = self.plans[number], self.scene.spec.composite
         linear = light_image(layers, composite)
-        image = develop(linear, plan.draws, tone=composite.tone, sensor=composite.sensor, seed=plan.seed)
+        image = develop(linear, plan.draws, composite, seed=plan.seed)
         return image.astype(np.float32)
 
     def render(self, number: int, integrator: Any, seed: int) -> tuple[Layers, float]:

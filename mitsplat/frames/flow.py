@@ -60,7 +60,7 @@ def optical_flow(
     return flow.reshape(height, width, 2).astype(np.float32)
 
 
-def swept_by(
+def exposure_flow(
     depth: npt.NDArray[np.floating[Any]],
     camera: Camera,
     motion: Mapping[str, Any],
@@ -107,14 +107,14 @@ def swept_by(
     return (u * y_down - v * x_down) / determinant, (v * x_right - u * y_right) / determinant
 
 
-def motions_of(before: Layout, after: Layout) -> dict[int, Float64Array | None]:
+def instance_motions(before: Layout, after: Layout) -> dict[int, Float64Array | None]:
     """Compute the motions of instances between two layouts, for :func:`optical_flow`."""
-    found: dict[int, Float64Array | None] = {}
+    motions: dict[int, Float64Array | None] = {}
     next_poses = {instance.id: instance.world_from_object for instance in after.instances}
     for instance in before.instances:
         pose, following = instance.world_from_object, next_poses.get(instance.id)
         if following is None:
-            found[instance.id] = None
+            motions[instance.id] = None
         elif not np.array_equal(pose, following):
-            found[instance.id] = following @ np.linalg.inv(pose)
-    return found
+            motions[instance.id] = following @ np.linalg.inv(pose)
+    return motions

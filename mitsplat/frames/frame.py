@@ -15,8 +15,8 @@ import numpy.typing as npt
 
 from mitsplat.arrays import Float32Array
 from mitsplat.errors import InputError
-from mitsplat.frames.camera_response import BACKGROUND, Development, develop_layers, light_layers
-from mitsplat.frames.flow import motions_of, optical_flow, swept_by
+from mitsplat.frames.camera_response import BACKGROUND, Development, light_layers, start_development
+from mitsplat.frames.flow import exposure_flow, instance_motions, optical_flow
 from mitsplat.frames.light_properties import light_properties, white_irradiance
 from mitsplat.frames.scene_builder import SceneBuilder
 from mitsplat.geometry.camera import Camera
@@ -127,7 +127,7 @@ class Frame(LazyValue):
         """
         if self.plan.next_camera is None:
             return None
-        motions = {} if self.next_layout is None else motions_of(self.layout, self.next_layout)
+        motions = {} if self.next_layout is None else instance_motions(self.layout, self.next_layout)
         belt = self.plan.belt
         ids = self.instance if motions or belt is not None else None
         return optical_flow(self.depth, self.camera, self.plan.next_camera, ids, motions, belt)
@@ -321,22 +321,13 @@ class Renderer:
 
     def _start_development(self, linear: mi.Color3f, layers: Layers, layout: Layout, plan: FramePlan) -> Development:
         """Start the camera response on the device, with blur by the motion of the camera and of a belt."""
-        composite, motion, belt, swept = self.scene.spec.composite, plan.viewpoint.get("motion"), plan.belt, None
+        motion, belt, flow, moving = plan.viewpoint.get("motion"), plan.belt, None, None
         if motion is not None:
-            moving = None
             if belt is not None:
                 moving = belt, np.isin(layers.instance, list(carried_instances(layout, belt.box)))
-            swept = swept_by(layers.depth, plan.camera, motion, moving)
-        return develop_layers(
-            linear,
-            layers.shape,
-            plan.draws,
-            tone=composite.tone,
-            sensor=composite.sensor,
-            seed=plan.seed,
-            swept=swept,
-            metered=composite.exposure == "auto",
-        )
+            flow = exposure_flow(layers.depth, plan.camera, motion, moving)
+        composite = self.scene.spec.composite
+        return start_development(linear, layers.shape, plan.draws, composite, seed=plan.seed, exposure_flow=flow)
 
     def _label(self, layers: Layers, silhouettes: Mapping[int, Silhouette], layout: Layout, camera: Camera) -> Labels:
         """Label the instances by the ids of splats or proxies. The depth that is not used stays on the device."""

@@ -9,23 +9,20 @@ from typing import Any
 
 import cv2
 import drjit as dr
-import mitsuba as mi
 import numpy as np
 import pytest
 from scipy import stats
 
 from mitsplat.frames.camera_response import (
     GREY,
-    SENSOR,
-    blurred,
+    add_noise,
     colour_matrix,
     develop,
     light_image,
-    motion_kernel,
-    sensed,
     shadow_from_image,
     tone_curve,
 )
+from mitsplat.frames.image_filters import correlate, motion_kernel
 from mitsplat.images.colour import LUMINANCE, black_body_colour, decode_srgb, encode_srgb, white_balance_matrix
 from mitsplat.renderer.layers import Layers, device_array, host_array
 from mitsplat.scene.spec.image_spec import Composite, ImageShadow, Sensor
@@ -48,7 +45,7 @@ def test_one_stop_doubles_linear_light() -> None:
 
 
 def test_hue_rotates_colours_and_keeps_grey() -> None:
-    matrix = colour_matrix(hue=120.0)
+    matrix = colour_matrix({"hue": 120.0})
     np.testing.assert_allclose(matrix @ [1, 0, 0], [0, 1, 0], atol=1e-12)
     np.testing.assert_allclose(matrix @ [1, 1, 1], [1, 1, 1], atol=1e-12)
 
@@ -56,22 +53,22 @@ def test_hue_rotates_colours_and_keeps_grey() -> None:
 @pytest.mark.parametrize("angle", [0.0, 50.0, 120.0])
 def test_chroma_is_stretched_along_a_hue_and_its_opposite(angle: float) -> None:
     """Hues are those of colours about the grey axis: at 120 degrees from red lies green."""
-    turned, across = colour_matrix(hue=angle) @ [1, 0, 0], colour_matrix(hue=angle + 90) @ [1, 0, 0]
-    matrix, grey = colour_matrix(chroma=(1.5, angle)), np.full(3, 1 / 3)
+    turned, across = colour_matrix({"hue": angle}) @ [1, 0, 0], colour_matrix({"hue": angle + 90}) @ [1, 0, 0]
+    matrix, grey = colour_matrix({"chroma_stretch": 1.5, "chroma_angle": angle}), np.full(3, 1 / 3)
     np.testing.assert_allclose(matrix @ (turned - grey), 1.5 * (turned - grey), atol=1e-12)
     np.testing.assert_allclose(matrix @ (across - grey), (across - grey) / 1.5, atol=1e-12)
     np.testing.assert_allclose(matrix @ [1, 1, 1], [1, 1, 1], atol=1e-12)
 
 
 def test_saturation_zero_is_grey_of_equal_luminance() -> None:
-    grey = colour_matrix(saturation=0.0) @ [0.2, 0.6, 0.1]
+    grey = colour_matrix({"saturation": 0.0}) @ [0.2, 0.6, 0.1]
     np.testing.assert_allclose(grey, 0.2126 * 0.2 + 0.7152 * 0.6 + 0.0722 * 0.1, rtol=1e-6)
 
 
 def test_white_balance_for_a_warm_light_makes_white_cooler() -> None:
-    red, _, blue = colour_matrix(white_balance=4500.0) @ [1, 1, 1]
+    red, _, blue = colour_matrix({"white_balance": 4500.0}) @ [1, 1, 1]
     assert blue > 1 > red
-    np.testing.assert_allclose(colour_matrix(white_balance=6504.0), np.eye(3))
+    np.testing.assert_allclose(colour_matrix({"white_balance": 6504.0}), np.eye(3))
 
 
 def test_nan_and_infinite_pixels_change_no_other_pixel() -> None:
@@ -93,7 +90,7 @@ def test_tone_curves_rise_from_black_to_white(tone: str) -> None:
 
 
 def test_filmic_keeps_mid_grey() -> None:
-    image = develop(np.full((1, 1, 3), 0.18, np.float32), {}, tone="filmic")
+    image = develop(np.full((1, 1, 3), 0.18, np.float32), {}, Composite(tone="filmic"))
     assert abs(int(image[0, 0, 0]) - 118) <= 1
 
 
@@ -103,7 +100,7 @@ def test_sensor_noise_has_the_variance_of_its_electrons(iso: float, level: float
     """N = level * full well * 100 / ISO electrons: variance N + read noise squared, seen through the tone curve."""
     sensor = Sensor(full_well=10000, read_noise=5)
     linear = np.full((128, 128, 3), level, np.float32)
-    a, b, c = (develop(linear, {"iso": iso}, sensor=sensor, seed=s) for s in (1, 1, 2))
+    a, b, c = (develop(linear, {"iso": iso}, Composite(sensor=sensor), seed=s) for s in (1, 1, 2))
     assert a.tobytes() == b.tobytes() != c.tobytes()
     white = 10000 * 100 / iso
     deviation = np.sqrt(level * white + 25) / white
@@ -115,11 +112,10 @@ def test_sensor_noise_has_the_variance_of_its_electrons(iso: float, level: float
     assert np.mean(a / 255.0) == pytest.approx(middle, abs=1e-3)
 
 
-def noise(shape: tuple[int, int], level: float, iso: float, seed: int, sensor: Sensor = SENSOR) -> np.ndarray:
+def noise(shape: tuple[int, int], level: float, iso: float, seed: int, sensor: Sensor) -> np.ndarray:
     """What a sensor adds to an even linear picture of some level, (H, W, 3)."""
     linear = device_array(np.full((*shape, 3), level, np.float32))
-    pixel = dr.arange(mi.UInt32, shape[0] * shape[1])
-    return host_array(sensed(linear, pixel, iso, sensor, seed), shape).astype(np.float64) - level
+    return host_array(add_noise(linear, shape, iso, sensor, seed), shape).astype(np.float64) - level
 
 
 @pytest.mark.parametrize(("level", "iso"), [(0.0, 3200.0), (0.18, 100.0), (0.6, 1600.0)])
@@ -170,8 +166,7 @@ def developed_slowly(linear: np.ndarray, draws: Mapping[str, float]) -> np.ndarr
         linear[y, x] *= 2 ** (-draws["vignetting"] * square / ((height / 2) ** 2 + (width / 2) ** 2))
     kernel = motion_kernel(draws["motion_blur"], draws["motion_angle"]).astype(np.float64)
     linear = cv2.filter2D(linear, -1, kernel, borderType=cv2.BORDER_REPLICATE)
-    colours = {name: draws[name] for name in ("white_balance", "hue", "saturation")}
-    return 255 * np.clip(encode(linear @ colour_matrix(**colours).T), 0, 1)
+    return 255 * np.clip(encode(linear @ colour_matrix(draws).T), 0, 1)
 
 
 def test_developed_images_equal_the_slow_twin() -> None:
@@ -188,7 +183,7 @@ def test_motion_blur_is_a_correlation_beyond_replicated_borders(length: float, a
     shape = 23, 31
     linear = np.random.default_rng(1).random((*shape, 3)).astype(np.float32)
     kernel = motion_kernel(length, angle)
-    got = host_array(blurred(device_array(linear), dr.arange(mi.UInt32, 23 * 31), shape, kernel), shape)
+    got = host_array(correlate(device_array(linear), shape, kernel), shape)
     expected = cv2.filter2D(linear.astype(np.float64), -1, kernel.astype(np.float64), borderType=cv2.BORDER_REPLICATE)
     np.testing.assert_allclose(got, expected, atol=1e-6)
 
@@ -205,9 +200,9 @@ def test_other_draws_compile_no_new_kernels() -> None:
     def kernels(draws: tuple[float, ...], seed: int) -> set[Any]:
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
             dr.kernel_history_clear()
-            sensor = Sensor(full_well=5000 + seed, read_noise=seed)
-            swept = np.full((30, 40), 3.0 * seed, np.float32), np.full((30, 40), 1.0, np.float32)
-            develop(linear, dict(zip(names, draws, strict=True)), sensor=sensor, seed=seed, swept=swept)
+            composite = Composite(sensor=Sensor(full_well=5000 + seed, read_noise=seed))
+            flow = np.full((30, 40), 3.0 * seed, np.float32), np.full((30, 40), 1.0, np.float32)
+            develop(linear, dict(zip(names, draws, strict=True)), composite, seed=seed, exposure_flow=flow)
             return {entry["hash"] for entry in dr.kernel_history([dr.KernelType.JIT])}
 
     first, second = kernels(drawn[0], 1), kernels(drawn[1], 2)
@@ -299,11 +294,11 @@ def test_published_shadow_is_darkest_in_shadow_and_one_in_light() -> None:
     shadow_map = np.ones((64, 128), np.float32)
     shadow_map[:, :40] = 0.0
     parameters = ImageShadow(blur=20.0, darkest=0.4)
-    factor, shine = shadow_from_image(shadow_map, parameters)
+    factor, highlight = shadow_from_image(shadow_map, parameters)
     assert factor[32, 2] == pytest.approx(0.4, abs=0.01)
     assert factor[32, 120] == pytest.approx(1.0, abs=0.01)
     assert (np.diff(factor[32]) >= -1e-6).all()
-    assert shine[32, 2] == 0 and shine[32, 120] == pytest.approx(parameters.highlight_gain, rel=0.01)
+    assert highlight[32, 2] == 0 and highlight[32, 120] == pytest.approx(parameters.highlight_gain, rel=0.01)
 
 
 def test_parameters_of_the_published_shadow_reach_the_picture() -> None:
@@ -323,8 +318,9 @@ def test_parameters_of_the_published_shadow_reach_the_picture() -> None:
 @pytest.mark.parametrize("light", [0.05, 1.0, 20.0])
 def test_metered_pictures_are_grey_on_average_in_any_light(light: float, tone: Any) -> None:
     grey = np.repeat(np.random.default_rng(0).uniform(0, light, (90, 160, 1)), 3, axis=2).astype(np.float32)
-    assert develop(grey, {}, tone=tone, metered=True).mean() == pytest.approx(GREY, abs=1)
-    assert develop(grey, {"exposure": -1.0}, tone=tone, metered=True).mean() < GREY - 20
+    metered = Composite(tone=tone, exposure="auto")
+    assert develop(grey, {}, metered).mean() == pytest.approx(GREY, abs=1)
+    assert develop(grey, {"exposure": -1.0}, metered).mean() < GREY - 20
 
 
 def test_metering_counts_a_lamp_as_white_at_most() -> None:
@@ -332,8 +328,9 @@ def test_metering_counts_a_lamp_as_white_at_most() -> None:
     room[:9, :16] = 1000.0
     lamp, paper = room.copy(), room.copy()
     paper[:9, :16] = 50.0
-    assert np.array_equal(develop(lamp, {}, metered=True), develop(paper, {}, metered=True))
+    metered = Composite(exposure="auto")
+    assert np.array_equal(develop(lamp, {}, metered), develop(paper, {}, metered))
 
 
 def test_metering_of_a_black_picture_stays_black() -> None:
-    assert develop(np.zeros((9, 16, 3), np.float32), {}, metered=True).max() == 0
+    assert develop(np.zeros((9, 16, 3), np.float32), {}, Composite(exposure="auto")).max() == 0

@@ -15,7 +15,7 @@ import mitsplat as ms
 from mitsplat.audit.audit import audit_dataset
 from mitsplat.dataset.remake import remake_frame
 from mitsplat.dataset.write import write_dataset
-from mitsplat.frames.flow import UNKNOWN_FLOW, swept_by
+from mitsplat.frames.flow import UNKNOWN_FLOW, exposure_flow
 from mitsplat.geometry.camera import Camera
 from mitsplat.scene.layout import NO_PHYSICS, Instance, Layout
 from mitsplat.scene.planning.conveyor import Belt
@@ -112,7 +112,7 @@ def test_moving_surfaces_are_swept_by_the_exposure(belt_data: SceneData) -> None
     other = np.zeros((24, 32), dtype=bool)
     other[5, 7] = True  # what is carried there
     motion = {"exposure": 0.004, "velocity": [0.0, 0.0, 0.0], "rotation": [0.0, 0.0, 0.0]}
-    right, down = swept_by(depth, camera, motion, (belt, other))
+    right, down = exposure_flow(depth, camera, motion, (belt, other))
     ends = [camera.project(points + np.array([side * 0.5 * 0.004 * 0.3, 0, 0]))[0] for side in (-1, 1)]
     runs = ((abs(points[:, 1]) < 0.1) & (abs(points[:, 0]) < 0.5)).reshape(24, 32) | other
     assert 50 < np.count_nonzero(runs) < 700

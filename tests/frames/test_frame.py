@@ -217,8 +217,7 @@ def test_labels_transfer_only_ids_and_one_depth_to_the_host(
     assert names & vars(frame.layers).keys() == {"instance", "proxy_instance", depth}
     assert "rgb" not in vars(frame)
     np.testing.assert_array_equal(frame.rgb, light_image(frame.layers, chosen.spec.composite))
-    how = chosen.spec.composite
-    again = develop(frame.rgb, frame.draws, tone=how.tone, sensor=how.sensor, seed=frame.plan.seed)
+    again = develop(frame.rgb, frame.draws, chosen.spec.composite, seed=frame.plan.seed)
     np.testing.assert_array_equal(again, frame.image)
 
 

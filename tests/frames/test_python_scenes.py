@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 import mitsplat as ms
 from mitsplat.dataset.write import write_dataset
-from mitsplat.frames.flow import UNKNOWN_FLOW, motions_of, optical_flow
+from mitsplat.frames.flow import UNKNOWN_FLOW, instance_motions, optical_flow
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.scene.loading.scene_loading import load_scene
 from mitsplat.scene.planning.frame_plan import plan_frame
@@ -180,7 +180,7 @@ def test_flow_of_a_plane_that_turns_and_shifts_before_a_still_camera(scene: ms.S
     ids[:, 32:] = 1
     before = ms.Layout.from_poses(scene, {"nut": [moved(0.05, 0.02, turn=10)], "bolt": [moved(-0.1, 0)]})
     after = ms.Layout.from_poses(scene, {"nut": [moved(0.07, 0.01, turn=40)], "bolt": [moved(-0.1, 0)]})
-    motions = motions_of(before, after)
+    motions = instance_motions(before, after)
     assert set(motions) == {1}
     flow = optical_flow(depth, above, above, ids, motions)
     np.testing.assert_allclose(flow[:, :32], 0, atol=1e-5)
@@ -202,7 +202,7 @@ def test_flow_of_a_removed_object_is_unknown(scene: ms.Scene, above: ms.Camera) 
     before = ms.Layout.from_poses(scene, {"nut": [moved(0, 0), moved(0.1, 0)]})
     after = ms.Layout.from_poses(scene, {"nut": [None, moved(0.1, 0)]})
     ids = np.array([[1, 2, 0]])
-    flow = optical_flow(np.full((1, 3), 0.2), above, above, ids, motions_of(before, after))
+    flow = optical_flow(np.full((1, 3), 0.2), above, above, ids, instance_motions(before, after))
     assert (flow[0, 0] == np.float32(UNKNOWN_FLOW)).all()
     np.testing.assert_allclose(flow[0, 1:], 0, atol=1e-5)
 

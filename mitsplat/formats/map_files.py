@@ -9,7 +9,7 @@ import numpy as np
 import OpenEXR
 
 from mitsplat.formats.maps import depth_picture, depth_scale, encode_flow, normal_picture, semantic_picture
-from mitsplat.frames.depth_sensor import sensed_depth
+from mitsplat.frames.depth_sensor import measure_depth
 from mitsplat.storage.files import library_errors
 
 if TYPE_CHECKING:
@@ -36,7 +36,7 @@ def write_depth(files: FrameFiles) -> None:
 def write_depth_sensor(files: FrameFiles) -> None:
     """Write the depth that the scene's depth sensor measures, and its unit as ``depth_sensor_scale`` [mm]."""
     assert files.catalogue.depth_sensor is not None  # noqa: S101 - guaranteed by the scene
-    measured = sensed_depth(files.frame, files.catalogue.depth_sensor)
+    measured = measure_depth(files.frame, files.catalogue.depth_sensor)
     files.record["depth_sensor_scale"] = depth_scale(measured)
     files.add_png(f"depth-sensor/{files.name}.png", depth_picture(measured))
 

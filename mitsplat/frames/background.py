@@ -15,24 +15,24 @@ from mitsplat.renderer.textures import read_image
 from mitsplat.scene.planning.layout_surroundings import BackgroundDraw
 
 
-def background_picture(backing: BackgroundDraw, path: Path, width: int, height: int) -> Float32Array:
+def background_picture(background: BackgroundDraw, path: Path, width: int, height: int) -> Float32Array:
     """Return the linear background picture (H, W, 3) from an image file."""
-    return backing.gain * cut_out(read_image(path), backing, width, height)
+    return background.gain * crop_background(read_image(path), background, width, height)
 
 
-def cut_out(image: ByteImage, backing: BackgroundDraw, width: int, height: int) -> Float32Array:
+def crop_background(image: ByteImage, background: BackgroundDraw, width: int, height: int) -> Float32Array:
     """Cut a rotated rectangle out of an image and resample it to linear colours (H, W, 3).
 
     The rectangle has the picture's aspect ratio and lies entirely inside the image. If it has more pixels than the
     picture, the result averages them.
     """
-    turn = np.radians(backing.rotate)
+    turn = np.radians(background.rotate)
     cosine, sine = np.cos(turn), np.sin(turn)
     bounds = np.abs([[cosine, sine], [sine, cosine]]) @ (width, height)  # of the rotated picture [px of the picture]
     size = np.array(image.shape[1::-1])
-    step = float((size / bounds).min()) * backing.crop  # pixels of the image per pixel of the picture
+    step = float((size / bounds).min()) * background.crop  # pixels of the image per pixel of the picture
     reach = step * bounds / 2
-    middle = reach + np.array(backing.place) * (size - 2 * reach)
+    middle = reach + np.array(background.place) * (size - 2 * reach)
     low, high = np.floor(middle - reach).astype(int), np.ceil(middle + reach).astype(int)
     low, high = np.maximum(low, 0), np.minimum(high, size)
     values = decode_srgb(np.arange(256) / 255).astype(np.float32)

@@ -8,10 +8,11 @@ machine's memory.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import itertools
 from dataclasses import fields, replace
 
 import numpy as np
+import numpy.typing as npt
 
 from mitsplat.engine.resources import WorkerMemory
 from mitsplat.gaussians.splat_cloud import Splats
@@ -40,7 +41,7 @@ PER_RAY = 400
 PER_OBJECT = 12 * 2**20
 """Memory per object of a layout, for simulation and ray intersection [bytes]."""
 
-PER_SEEN = 2.25
+PER_SILHOUETTE_PIXEL = 2.25
 """Memory per pixel and instance for silhouettes, rendered in tiles up to one image size beyond each border [bytes]."""
 
 _CAMERAS = 5
@@ -57,49 +58,48 @@ def worker_memory(scene: Scene) -> WorkerMemory:
     middle of the region.
     """
     spec = scene.spec
-    most = [entry.max_count for entry in spec.objects]
-    pools = [[scene.assets[i].splats for i in pool] for pool in scene.pools]
-    placed = [(max(pool, key=len), count) for pool, count in zip(pools, most, strict=True)]
+    max_counts = [entry.max_count for entry in spec.objects]
+    pools = [[scene.assets[asset].splats for asset in pool] for pool in scene.pools]
+    placed = [(max(pool, key=len), count) for pool, count in zip(pools, max_counts, strict=True)]
     middle = np.add(spec.region.min, spec.region.max) / 2
-    around = [environment.splats for environment in scene.environments]
-    static = [max(around, key=len)] if around else []
-    splats = {id(one): one for one in (*around, *(one for pool in pools for one in pool))}.values()
-    stored = sum(getattr(one, f.name).nbytes for one in splats for f in fields(one))
-    count = sum(map(len, static)) + sum(number * len(one) for one, number in placed)
+    environments = [environment.splats for environment in scene.environments]
+    static = [max(environments, key=len)] if environments else []
+    all_splats = {id(splats): splats for splats in itertools.chain(environments, *pools)}.values()
+    stored = sum(getattr(splats, field.name).nbytes for splats in all_splats for field in fields(splats))
+    num_gaussians = sum(map(len, static)) + sum(count * len(splats) for splats, count in placed)
     quality = replace(resolve_quality(spec.quality), **spec.rendering.model_dump())
     pixels = spec.output.width * spec.output.height
-    cameras = [plan_frame(scene, int(i)).camera for i in np.linspace(0, scene.num_frames - 1, _CAMERAS)]
+    cameras = [plan_frame(scene, int(index)).camera for index in np.linspace(0, scene.num_frames - 1, _CAMERAS)]
     pairs = max(
-        sum(_pairs(one, camera, quality) for one in static)
-        + sum(number * _pairs(one, camera, quality, at=middle) for one, number in placed)
+        sum(_pairs(splats, camera, quality) for splats in static)
+        + sum(count * _pairs(splats, camera, quality, position=middle) for splats, count in placed)
         for camera in cameras
     )
     own = (
         BASE
         + COPIES * stored
-        + PER_PLACED * count
+        + PER_PLACED * num_gaussians
         + PER_PAIR * min(pairs, PAIRS_MAX)
         + PER_RAY * pixels * quality.grid**2
-        + (PER_OBJECT + PER_SEEN * pixels) * sum(most)
+        + (PER_OBJECT + PER_SILHOUETTE_PIXEL * pixels) * sum(max_counts)
     )
     return WorkerMemory(own, shared=stored, gpu=max(own, WorkerMemory.gpu))
 
 
-def _pairs(splats: Splats, camera: Camera, quality: Quality, *, at: Iterable[float] = (0.0, 0.0, 0.0)) -> float:
+def _pairs(splats: Splats, camera: Camera, quality: Quality, *, position: npt.ArrayLike = (0.0, 0.0, 0.0)) -> float:
     """Estimate an upper bound of the (Gaussian, tile) pairs of an asset at a position [m]; a tile has 8 x 4 pixels.
 
     The footprint of a Gaussian ends where its opacity falls below the quality's cut. The kernel's variance widens it.
     """
     step = 1 + len(splats) // _MAX_SAMPLES
-    means = splats.means[::step] + np.asarray(tuple(at), dtype=np.float32)
+    means = splats.means[::step] + np.asarray(position, dtype=np.float32)
     pixel, depth = camera.project(means)
-    above = splats.opacities[::step] / quality.alpha_min
-    seen = (depth > camera.near) & (above > 1)
-    slope = max(camera.fx, camera.fy) / np.maximum(depth[seen], 1e-6)
-    axes = np.sort(splats.scales[::step][seen], axis=1)[:, 1:] * slope[:, None]  # of the widest possible outline
-    reach = np.sqrt(2 * np.log(above[seen]))[:, None] * np.sqrt(axes**2 + KERNELS[quality.kernel].variance)  # [px]
-    tiles = np.prod(2 * reach / _TILE + 1, axis=1)
-    image = np.array([camera.width, camera.height])
-    across, widest = image / _TILE, reach[:, 1:]
-    inside = ((pixel[seen] > -widest) & (pixel[seen] < image + widest)).all(axis=1)
-    return step * float(np.minimum(tiles, np.prod(across + 1))[inside].sum())
+    excess = splats.opacities[::step] / quality.alpha_min
+    visible = (depth > camera.near) & (excess > 1)
+    slope = max(camera.fx, camera.fy) / np.maximum(depth[visible], 1e-6)
+    axes = np.sort(splats.scales[::step][visible], axis=1)[:, 1:] * slope[:, None]  # of the widest possible outline
+    radii = np.sqrt(2 * np.log(excess[visible]))[:, None] * np.sqrt(axes**2 + KERNELS[quality.kernel].variance)  # [px]
+    tiles = np.prod(2 * radii / _TILE + 1, axis=1)
+    size, largest = np.array([camera.width, camera.height]), radii[:, 1:]
+    inside = ((pixel[visible] > -largest) & (pixel[visible] < size + largest)).all(axis=1)
+    return step * float(np.minimum(tiles, np.prod(size / _TILE + 1))[inside].sum())

@@ -16,24 +16,24 @@ from mitsplat.images.colour import LUMINANCE
 from mitsplat.scene.spec.image_spec import DepthSensor, StereoSensor, TimeOfFlightSensor
 from mitsplat.scene.streams import random_stream
 
-LIGHT_SPEED = 299_792_458.0
-WINDOW = 9
+SPEED_OF_LIGHT = 299_792_458.0
+MATCHING_WINDOW = 9
 """Side length of the matching window of passive stereo [px]."""
-DARKEST = 0.02
+MIN_REFLECTANCE = 0.02
 """Minimum reflectance for time of flight."""
 
 
-def sensed_depth(frame: Frame, sensor: DepthSensor) -> Float32Array:
+def measure_depth(frame: Frame, sensor: DepthSensor) -> Float32Array:
     """Simulate the measured depth of a frame along the optical axis [m], 0 for no measurement, (H, W)."""
     rng = random_stream(frame.plan.seed, "depth sensor")
     depth = frame.depth.astype(np.float64)
     if isinstance(sensor, StereoSensor):
-        return stereo_depth(depth, frame.camera.fx, sensor, rng, frame.image)
-    reflectance = np.clip(frame.layers.captured @ LUMINANCE, DARKEST, 1.0)
-    return time_of_flight_depth(depth, frame.camera, sensor, rng, reflectance, frame.normal)
+        return simulate_stereo(depth, frame.camera.fx, sensor, rng, frame.image)
+    reflectance = np.clip(frame.layers.captured @ LUMINANCE, MIN_REFLECTANCE, 1.0)
+    return simulate_time_of_flight(depth, frame.camera, sensor, rng, reflectance, frame.normal)
 
 
-def stereo_depth(
+def simulate_stereo(
     depth: Float64Array, focal: float, sensor: StereoSensor, rng: np.random.Generator, picture: ByteImage
 ) -> Float32Array:
     """Simulate the depth (H, W) of a stereo pair whose second camera is displaced in +x.
@@ -55,43 +55,43 @@ def stereo_depth(
     height, width = depth.shape
     rows, columns = np.mgrid[:height, :width]
     disparity = np.divide(focal * sensor.baseline, depth, out=np.zeros_like(depth), where=depth > 0)
-    seen = (depth > 0) & ~hidden_from_second(disparity)
+    valid = (depth > 0) & ~occluded_in_second_camera(disparity)
     if sensor.contrast > 0:
         grey = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY).astype(np.float64) / 255
-        mean, square = (cv2.blur(values, (WINDOW, WINDOW)) for values in (grey, grey * grey))
-        seen &= np.sqrt(np.maximum(square - mean**2, 0)) >= sensor.contrast
-    beside, below, error = rng.standard_normal((3, height, width))
-    rows = np.clip(np.rint(rows + sensor.shift * below).astype(int), 0, height - 1)
-    columns = np.clip(np.rint(columns + sensor.shift * beside).astype(int), 0, width - 1)
-    seen &= seen[rows, columns]
-    matched = sensor.step * np.rint((disparity[rows, columns] + sensor.noise * error) / sensor.step)
-    seen &= matched > 0
-    found = np.divide(focal * sensor.baseline, matched, out=np.zeros_like(depth), where=seen)
+        mean, square = (cv2.blur(values, (MATCHING_WINDOW, MATCHING_WINDOW)) for values in (grey, grey * grey))
+        valid &= np.sqrt(np.maximum(square - mean**2, 0)) >= sensor.contrast
+    right, down, error = rng.standard_normal((3, height, width))
+    rows = np.clip(np.rint(rows + sensor.shift * down).astype(int), 0, height - 1)
+    columns = np.clip(np.rint(columns + sensor.shift * right).astype(int), 0, width - 1)
+    valid &= valid[rows, columns]
+    measured = sensor.step * np.rint((disparity[rows, columns] + sensor.noise * error) / sensor.step)
+    valid &= measured > 0
+    distance = np.divide(focal * sensor.baseline, measured, out=np.zeros_like(depth), where=valid)
     low, high = sensor.range
-    return np.where((found >= low) & (found <= high), found, 0).astype(np.float32)
+    return np.where((distance >= low) & (distance <= high), distance, 0).astype(np.float32)
 
 
-def hidden_from_second(disparity: Float64Array) -> BoolArray:
+def occluded_in_second_camera(disparity: Float64Array) -> BoolArray:
     """Return a mask (H, W) of the pixels that an identical second camera in +x does not see.
 
     A pixel with disparity d appears d pixels further left in the second image. There it covers the two pixels around
-    its position. It hides every pixel of that place whose disparity is smaller by more than one pixel. Such pixels
+    its position. It hides every pixel at that position whose disparity is smaller by more than one pixel. Such pixels
     belong to other surfaces, or to a surface at a grazing angle, with disparities that grow by more than 0.4 px per
     pixel; no window matches the latter. Pixels beyond the left border are not visible either.
     """
     height, width = disparity.shape
     rows, columns = np.mgrid[:height, :width]
-    place = columns - disparity
+    position = columns - disparity
     nearest = np.zeros_like(disparity)
-    for covered in (np.floor(place), np.ceil(place)):
+    for covered in (np.floor(position), np.ceil(position)):
         column = covered.astype(int)
         inside = (disparity > 0) & (column >= 0) & (column < width)
         np.maximum.at(nearest, (rows[inside], column[inside]), disparity[inside])
-    own = np.rint(place).astype(int)
-    return np.asarray((own < 0) | (nearest[rows, np.clip(own, 0, width - 1)] > disparity + 1))
+    column = np.rint(position).astype(int)
+    return np.asarray((column < 0) | (nearest[rows, np.clip(column, 0, width - 1)] > disparity + 1))
 
 
-def time_of_flight_depth(
+def simulate_time_of_flight(
     depth: Float64Array,
     camera: Camera,
     sensor: TimeOfFlightSensor,
@@ -124,14 +124,14 @@ def time_of_flight_depth(
     facing = np.abs(np.einsum("hwi,hwi->hw", normal @ camera.world_from_camera[:3, :3], rays)) / length
     facing = np.where(normal.any(axis=-1), facing, 1.0)
     signal = np.divide(reflectance * facing, distance**2, out=np.zeros_like(depth), where=distance > 0)
-    longest = LIGHT_SPEED / (2e6 * sensor.modulation)
-    waves = signal * np.exp(2j * np.pi * distance / longest)
+    unambiguous_range = SPEED_OF_LIGHT / (2e6 * sensor.modulation)
+    waves = signal * np.exp(2j * np.pi * distance / unambiguous_range)
     if sensor.blur > 0:
         waves = sum(
             cv2.GaussianBlur(part, (0, 0), sensor.blur) * unit for part, unit in ((waves.real, 1), (waves.imag, 1j))
         )
     signal = np.maximum(np.abs(waves), 1e-12)
-    spread = sensor.noise * np.sqrt(signal + sensor.ambient) / signal
-    measured = longest * np.angle(waves) / (2 * np.pi) + spread * rng.standard_normal((height, width))
-    found = measured % longest / length
-    return np.where(signal >= sensor.min_signal, found, 0).astype(np.float32)
+    deviation = sensor.noise * np.sqrt(signal + sensor.ambient) / signal
+    measured = unambiguous_range * np.angle(waves) / (2 * np.pi) + deviation * rng.standard_normal((height, width))
+    measured_depth = measured % unambiguous_range / length
+    return np.where(signal >= sensor.min_signal, measured_depth, 0).astype(np.float32)

@@ -24,19 +24,11 @@ def layer_sheet(frame: Frame) -> ByteImage:
     tiles = [draw_layer(frame, name) for name in LAYERS]
     height, width = frame.image.shape[:2]
     sheet = np.full((2 * (height + _CAPTION) + _GAP, 3 * width + 2 * _GAP, 3), 32, dtype=np.uint8)
-    for i, (caption, tile) in enumerate(tiles):
-        top, left = i // 3 * (height + _CAPTION + _GAP), i % 3 * (width + _GAP)
+    for number, (caption, tile) in enumerate(tiles):
+        top, left = number // 3 * (height + _CAPTION + _GAP), number % 3 * (width + _GAP)
         sheet[top : top + height, left : left + width] = tile
-        cv2.putText(
-            sheet,
-            caption,
-            (left + 6, top + height + 17),
-            cv2.FONT_HERSHEY_SIMPLEX,
-            0.5,
-            (230, 230, 230),
-            1,
-            cv2.LINE_AA,
-        )
+        place, font, colour = (left + 6, top + height + 17), cv2.FONT_HERSHEY_SIMPLEX, (230, 230, 230)
+        cv2.putText(sheet, caption, place, font, 0.5, colour, 1, cv2.LINE_AA)
     return sheet
 
 

@@ -65,17 +65,16 @@ def render_frames(
         InputError: As in :func:`mitsplat.render_frame`.
     """
     if frames is None:
-        given = any(isinstance(each, Iterable) for each in (layouts, cameras))
-        indices: Iterable[int] = itertools.count() if given else range(scene.num_frames)
+        is_film = isinstance(layouts, Iterable) or isinstance(cameras, Iterable)
+        indices: Iterable[int] = itertools.count() if is_film else range(scene.num_frames)
     elif isinstance(frames, Iterable):
         indices = frames
     else:
         if (count := to_index(frames, "frames")) < 0:
             raise InputError(f"frames must be 0 or more (got {count})")
         indices = range(count)
-    parts: tuple[object, ...] = (indices, layouts, cameras)
-    total = min((len(each) for each in parts if isinstance(each, Sized)), default=None)
-    scene = without_end(scene)
+    total = min((len(each) for each in (indices, layouts, cameras) if isinstance(each, Sized)), default=None)
+    scene = with_unlimited_layouts(scene)
     with Renderer(scene, quality=quality) as renderer:
         if layouts is None and cameras is None:
             for index in _with_progress_bar(indices, total, progress):
@@ -93,7 +92,7 @@ def render_frames(
             yield frame
 
 
-def without_end(scene: Scene) -> Scene:
+def with_unlimited_layouts(scene: Scene) -> Scene:
     """Return the scene with a practically unlimited number of layouts; its first frames do not change."""
     output = scene.spec.output.model_copy(update={"layouts": _UNLIMITED_LAYOUTS})
     return replace(scene, spec=scene.spec.model_copy(update={"output": output}))

@@ -29,14 +29,14 @@ def certificate_table(layouts: Iterable[Layout]) -> Table:
         table.add_column(title, justify="right")
     table.add_column("refused")
     for layout in layouts:
-        found = layout.certificate
-        lengths = (found.surface_motion, found.collider_penetration, found.pair_penetration, found.support_gap)
-        motion, in_collider, in_object, gap = (f"{length * 1e3:.3f}" for length in lengths)
+        rest = layout.certificate
+        lengths = rest.surface_motion, rest.collider_penetration, rest.pair_penetration, rest.support_gap
         table.add_row(
-            *(str(layout.index), str(len(layout.instances)), f"{found.time_to_rest:.2f}"),
-            *(f"{found.max_speed * 1e3:.3f}", f"{found.max_spin:.4f}", motion),
-            *(in_collider, in_object, gap, str(found.attempts)),
-            ", ".join(f"{count} x {reason}" for reason, count in Counter(found.refused).items()),
+            *(str(layout.index), str(len(layout.instances)), f"{rest.time_to_rest:.2f}"),
+            *(f"{rest.max_speed * 1e3:.3f}", f"{rest.max_spin:.4f}"),
+            *(f"{length * 1e3:.3f}" for length in lengths),
+            str(rest.attempts),
+            ", ".join(f"{count} x {reason}" for reason, count in Counter(rest.refused).items()),
         )
     return table
 

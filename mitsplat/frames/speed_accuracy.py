@@ -153,13 +153,13 @@ def measure_steps(
     plan = [exact, *(step for step in steps if step != exact)]
     rows: dict[str, Row] = {}
     reference: _StepResult | None = None
-    for i, step in enumerate(plan):
+    for number, step in enumerate(plan):
         if progress is not None:
-            progress(i, len(plan), step.name)
-        changes = {**(overrides or {}), **step.overrides}
-        shots = _run_alone(path, step, frames, changes, allow_outside, device or current_device())
-        reference = reference or shots
-        rows[step.name] = _compare(step.name, shots, reference)
+            progress(number, len(plan), step.name)
+        job = _RenderJob(path, step, frames, {**(overrides or {}), **step.overrides}, allow_outside)
+        result = _run_job(job, device or current_device())
+        reference = reference or result
+        rows[step.name] = _compare(step.name, result, reference)
     return [rows[step.name] for step in steps]
 
 
@@ -210,87 +210,75 @@ def _is_splats(path: Path) -> bool:
     return path.suffix.lower() not in (".yaml", ".yml")
 
 
-def _run_alone(
-    path: Path, step: Step, frames: int, overrides: Mapping[str, Any], allow_outside: bool, device: Device
-) -> _StepResult:
-    job = _RenderJob(path, step.quality, frames, dict(overrides), allow_outside)
+@dataclass(frozen=True)
+class _RenderJob:
+    """Job of a process: the pictures of one step."""
+
+    path: Path
+    step: Step
+    frames: int
+    overrides: Mapping[str, Any]
+    allow_outside: bool
+
+    def __call__(self, _index: int, _note: Note, /) -> _StepResult:
+        """Render the pictures; the first one is rendered twice, because it compiles or loads kernels."""
+        render = _splats_renderer(self) if _is_splats(self.path) else _scene_renderer(self)
+        views = [render(number) for number in (0, *range(self.frames))][1:]
+        pictures, instances, seconds, estimates = zip(*views, strict=True)
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2 ** (30 if sys.platform == "darwin" else 20)
+        return _StepResult(np.stack(pictures), np.stack(instances), statistics.median(seconds), peak, max(estimates))
+
+
+def _run_job(job: _RenderJob, device: Device) -> _StepResult:
+    """Run a job in a process of its own."""
     with closing(run_in_process(job, device)) as results:
         try:
             return next(results)
         except LostWorkersError as error:
-            raise MissingResourceError(f"{path}: the process of '{step.name}' died; is there enough memory?") from error
+            raise MissingResourceError(
+                f"{job.path}: the process of step '{job.step.name}' died, possibly because memory is exhausted"
+            ) from error
 
 
-@dataclass(frozen=True)
-class _RenderJob:
-    path: Path
-    quality: Quality
-    frames: int
-    overrides: dict[str, Any]
-    allow_outside: bool
-
-    def __call__(self, _index: int, _note: Note, /) -> _StepResult:
-        return _render_pictures(self.path, self.quality, self.frames, self.overrides, self.allow_outside)
-
-
-def _render_pictures(
-    path: Path, quality: Quality, frames: int, overrides: dict[str, Any], allow_outside: bool
-) -> _StepResult:
-    """Render the pictures; the first one is rendered twice, because it compiles or loads kernels."""
-    if _is_splats(path):
-        shoot = _splats_renderer(path, quality, frames, overrides)
-    else:
-        shoot = _scene_shooter(path, quality, frames, overrides, allow_outside)
-    shots = [shoot(i) for i in (0, *range(frames))][1:]
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return _StepResult(
-        np.stack([shot[0] for shot in shots]),
-        np.stack([shot[1] for shot in shots]),
-        statistics.median(shot[2] for shot in shots),
-        peak / 2 ** (30 if sys.platform == "darwin" else 20),
-        max(shot[3] for shot in shots),
-    )
-
-
-Shot = tuple[Float32Array, npt.NDArray[np.uint16], float, float]
+View = tuple[Float32Array, npt.NDArray[np.uint16], float, float]
 """Picture, instances, time [s], and the estimated largest error, or NaN."""
 
 
-def _largest(order_error: Mapping[str, float] | None) -> float:
-    return math.nan if order_error is None else order_error["largest"]
+def _scene_renderer(job: _RenderJob) -> Callable[[int], View]:
+    """Return a function that renders one of the pictures of a scene."""
+    scene = load_scene(job.path, overrides=dict(job.overrides), allow_outside=job.allow_outside)
+    options = scene.spec.rendering.model_dump()
+    if job.step.quality.response == "ewa":  # the step itself sets the response
+        del options["response"]
+    quality = replace(job.step.quality, **options)
+    indices = np.linspace(0, scene.num_frames - 1, job.frames).round().astype(int)
 
-
-def _scene_shooter(
-    path: Path, quality: Quality, frames: int, overrides: dict[str, Any], allow_outside: bool
-) -> Callable[[int], Shot]:
-    scene = load_scene(path, overrides=overrides, allow_outside=allow_outside)
-    drawn = scene.spec.rendering.model_dump()
-    if quality.response == "ewa":  # the step itself sets the response
-        del drawn["response"]
-    quality = replace(quality, **drawn)
-    indices = np.linspace(0, scene.num_frames - 1, frames).round().astype(int)
-
-    def shoot(i: int) -> Shot:
-        frame = render_frame(scene, int(indices[i]), quality=quality)
+    def render(number: int) -> View:
+        frame = render_frame(scene, int(indices[number]), quality=quality)
         seconds = sum(value for stage, value in frame.seconds.items() if stage != "settle")
         picture = encode_srgb(np.clip(frame.rgb, 0, 1)).astype(np.float32)
-        return picture, frame.instance, seconds, _largest(frame.order_error)
+        return picture, frame.instance, seconds, _largest_error(frame.order_error)
 
-    return shoot
+    return render
 
 
-def _splats_renderer(path: Path, quality: Quality, frames: int, overrides: dict[str, Any]) -> Callable[[int], Shot]:
-    splats = Splats.load(path)
-    width, height = overrides.get("output.width", 1280), overrides.get("output.height", 720)
+def _splats_renderer(job: _RenderJob) -> Callable[[int], View]:
+    """Return a function that renders one of the pictures of a file of splats."""
+    splats = Splats.load(job.path)
+    width, height = job.overrides.get("output.width", 1280), job.overrides.get("output.height", 720)
 
-    def shoot(i: int) -> Shot:
-        camera = look_around(splats, i, frames, width=width, height=height)
+    def render(number: int) -> View:
+        camera = look_around(splats, number, job.frames, width=width, height=height)
         start = time.perf_counter()
-        layers = render_splats(splats, camera, quality=quality)
+        layers = render_splats(splats, camera, quality=job.step.quality)
         seconds = time.perf_counter() - start
-        return picture_of(layers), layers.instance, seconds, _largest(layers.order_error)
+        return picture_of(layers), layers.instance, seconds, _largest_error(layers.order_error)
 
-    return shoot
+    return render
+
+
+def _largest_error(order_error: Mapping[str, float] | None) -> float:
+    return math.nan if order_error is None else order_error["largest"]
 
 
 def picture_of(layers: Layers) -> Float32Array:
@@ -308,37 +296,37 @@ def look_around(splats: Splats, index: int, count: int, *, width: int, height: i
     return Camera.look_at(eye, centre, up=(0, -1, 0), width=width, height=height, fov_x=50)
 
 
-def _compare(name: str, shots: _StepResult, reference: _StepResult) -> Row:
+def _compare(name: str, result: _StepResult, reference: _StepResult) -> Row:
     # Imported here, because it would add to the peak memory of the measuring processes.
     from skimage.metrics import structural_similarity
 
-    difference = shots.pictures.astype(np.float64) - reference.pictures
+    difference = result.pictures.astype(np.float64) - reference.pictures
     rmse = float(np.sqrt(np.mean(difference**2)))
     ssim = [
-        structural_similarity(a, b, channel_axis=-1, data_range=1.0)  # type: ignore[no-untyped-call]
-        for a, b in zip(shots.pictures, reference.pictures, strict=True)
+        structural_similarity(one, true, channel_axis=-1, data_range=1.0)  # type: ignore[no-untyped-call]
+        for one, true in zip(result.pictures, reference.pictures, strict=True)
     ]
     return Row(
         name,
-        shots.seconds,
+        result.seconds,
         rmse,
-        -20 * math.log10(rmse) if rmse > 0 else math.inf,
-        float(np.abs(difference).max()),
-        float(np.mean(ssim)),
-        _mask_iou(shots.instances, reference.instances),
-        shots.memory,
-        shots.estimate,
+        psnr=-20 * math.log10(rmse) if rmse > 0 else math.inf,
+        largest=float(np.abs(difference).max()),
+        ssim=float(np.mean(ssim)),
+        mask_iou=_mask_iou(result.instances, reference.instances),
+        memory=result.memory,
+        estimate=result.estimate,
     )
 
 
-def _mask_iou(mine: npt.NDArray[np.uint16], true_ids: npt.NDArray[np.uint16]) -> float:
+def _mask_iou(instances: npt.NDArray[np.uint16], true_instances: npt.NDArray[np.uint16]) -> float:
     """Compute the mean IoU over the instances of all pictures, or NaN."""
     ious = []
-    for a, b in zip(mine, true_ids, strict=True):
-        ids, counts = np.unique(b[b > 0], return_counts=True)
-        for instance in ids[counts >= INSTANCE_MIN]:
-            own, other = a == instance, b == instance
-            ious.append(np.count_nonzero(own & other) / np.count_nonzero(own | other))
+    for ids, true_ids in zip(instances, true_instances, strict=True):
+        present, counts = np.unique(true_ids[true_ids > 0], return_counts=True)
+        for instance in present[counts >= INSTANCE_MIN]:
+            mask, true_mask = ids == instance, true_ids == instance
+            ious.append(np.count_nonzero(mask & true_mask) / np.count_nonzero(mask | true_mask))
     return float(np.mean(ious)) if ious else math.nan
 
 

@@ -95,8 +95,8 @@ def test_presets_are_measured_on_a_scene_with_files_outside_only_if_allowed(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    def load(path: Path, step: chart.Step, frames: int, overrides: Any, allow_outside: bool, _device: Device) -> None:
-        chart._scene_shooter(path, step.quality or chart.PRESETS["fast"], frames, overrides, allow_outside)
+    def load(job: chart._RenderJob, _device: Device) -> None:
+        chart._scene_renderer(job)
         raise InputError("loaded")
 
     write_scene(scene_data)
@@ -104,7 +104,7 @@ def test_presets_are_measured_on_a_scene_with_files_outside_only_if_allowed(
     inner = tmp_path / "inner" / "scene.yaml"
     asset = (tmp_path / scene_data["objects"][0]["asset"]).resolve()
     YAML(typ="safe", pure=True).dump(scene_data | {"objects": [{"asset": str(asset)}]}, inner)
-    monkeypatch.setattr(chart, "_run_alone", load)
+    monkeypatch.setattr(chart, "_run_job", load)
     out = "-o", tmp_path / "chart.png"
     assert run(command[0], inner, *command[1:], *out) == 2
     assert "must be inside the scene's folder" in capsys.readouterr().err

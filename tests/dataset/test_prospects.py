@@ -211,7 +211,7 @@ def test_visibility_of_boxes_agrees_with_many_points():
 def test_a_tolerance_is_refused_before_anything_is_rendered(
     tolerance, scene_data, write_scene, monkeypatch, capsys, tmp_path
 ):
-    monkeypatch.setattr(chart, "_run_alone", lambda *args: pytest.fail("rendered"))
+    monkeypatch.setattr(chart, "_run_job", lambda *args: pytest.fail("rendered"))
     path = write_scene(scene_data)
     assert run("render", path, f"--tolerance={tolerance}", "-o", tmp_path / "out") == 2
     assert run("chart", path, f"--tolerance={tolerance}", "-o", tmp_path / "chart.png") == 2

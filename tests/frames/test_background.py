@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import mitsplat as ms
-from mitsplat.frames.background import cut_out
+from mitsplat.frames.background import crop_background
 from mitsplat.images.colour import decode_srgb
 from mitsplat.scene.layout import NO_PHYSICS, Layout
 from mitsplat.scene.planning.layout_surroundings import BackgroundDraw
@@ -29,13 +29,13 @@ def ramp(width: int, height: int) -> np.ndarray:
 
 def test_an_image_of_the_same_size_is_shown_unchanged() -> None:
     image = np.random.default_rng(0).integers(0, 256, (30, 40, 3), dtype=np.uint8)
-    np.testing.assert_allclose(cut_out(image, backing(), 40, 30), decode_srgb(image / 255), atol=1e-6)
+    np.testing.assert_allclose(crop_background(image, backing(), 40, 30), decode_srgb(image / 255), atol=1e-6)
 
 
 def test_a_larger_image_is_averaged() -> None:
     image = np.random.default_rng(0).integers(0, 256, (120, 160, 3), dtype=np.uint8)
     means = decode_srgb(image / 255).reshape(30, 4, 40, 4, 3).mean(axis=(1, 3))
-    np.testing.assert_allclose(cut_out(image, backing(), 40, 30), means, atol=1e-5)
+    np.testing.assert_allclose(crop_background(image, backing(), 40, 30), means, atol=1e-5)
 
 
 @pytest.mark.parametrize("angle", [-170.0, -40.0, 0.0, 12.0, 90.0])
@@ -46,7 +46,7 @@ def test_the_shown_part_of_an_image_is_that_of_its_draw(
 ) -> None:
     """Of a ramp, colours say where they are from: a turned rectangle of the picture's proportions, inside of it."""
     width, height = 80, 60
-    colours = cut_out(ramp(*size), backing(rotate=angle, crop=crop, place=place), width, height)
+    colours = crop_background(ramp(*size), backing(rotate=angle, crop=crop, place=place), width, height)
     from mitsplat.images.colour import encode_srgb
 
     shown = encode_srgb(colours)[..., :2] * size

@@ -10,11 +10,11 @@ import pytest
 
 from mitsplat.errors import InputError
 from mitsplat.frames.depth_sensor import (
-    LIGHT_SPEED,
-    hidden_from_second,
-    sensed_depth,
-    stereo_depth,
-    time_of_flight_depth,
+    SPEED_OF_LIGHT,
+    measure_depth,
+    occluded_in_second_camera,
+    simulate_stereo,
+    simulate_time_of_flight,
 )
 from mitsplat.geometry.camera import Camera
 from mitsplat.scene.loading.scene_loading import load_scene
@@ -28,13 +28,13 @@ CAMERA = Camera.look_at((0, 0, 0), (0, 1, 0), width=128, height=96, fov_x=30)
 
 def stereo(depth: Any, picture: Any = PLAIN, seed: int = 0, **values: Any) -> Any:
     sensor = StereoSensor(**values)
-    return stereo_depth(np.asarray(depth, dtype=np.float64), FOCAL, sensor, np.random.default_rng(seed), picture)
+    return simulate_stereo(np.asarray(depth, dtype=np.float64), FOCAL, sensor, np.random.default_rng(seed), picture)
 
 
 def flight(depth: Any, reflectance: float = 1.0, normal: Any = None, **values: Any) -> Any:
     normal = np.zeros((96, 128, 3), dtype=np.float32) if normal is None else normal
     given = np.full((96, 128), reflectance), normal
-    return time_of_flight_depth(depth, CAMERA, TimeOfFlightSensor(**values), np.random.default_rng(0), *given)
+    return simulate_time_of_flight(depth, CAMERA, TimeOfFlightSensor(**values), np.random.default_rng(0), *given)
 
 
 class TestStereo:
@@ -72,14 +72,14 @@ class TestStereo:
         """The bar hides a strip of its own width, at the difference of the disparities from it."""
         disparity = np.full((4, 60), 3.0)
         disparity[:, 40:42] = 15.0
-        hidden = hidden_from_second(disparity)
+        hidden = occluded_in_second_camera(disparity)
         assert np.flatnonzero(hidden[0]).tolist() == [0, 1, 2, 28, 29]
 
     def test_every_pixel_of_a_slope_has_depth(self) -> None:
         """Disparities that grow to the right by up to 0.4 px a pixel hide nothing of themselves."""
         for slope in (-3.0, -0.9, 0.2, 0.4):
             disparity = 60 + slope * (np.arange(40) - 20.0)
-            assert not hidden_from_second(np.tile(np.pad(disparity, (140, 0)), (3, 1)))[:, 141:].any()
+            assert not occluded_in_second_camera(np.tile(np.pad(disparity, (140, 0)), (3, 1)))[:, 141:].any()
 
     def test_processing_by_scan_lines_gives_the_same_depth(self) -> None:
         """A slow twin: every pixel against every other of its row."""
@@ -96,7 +96,7 @@ class TestStereo:
                     if disparity[row, other] > disparity[row, x] + 1
                     and own in (np.floor(place[row, other]), np.ceil(place[row, other]))
                 ]
-                assert hidden_from_second(disparity)[row, x] == (own < 0 or bool(covering)), (row, x)
+                assert occluded_in_second_camera(disparity)[row, x] == (own < 0 or bool(covering)), (row, x)
 
     def test_plain_surfaces_have_no_depth_without_a_pattern(self) -> None:
         picture = PLAIN.copy()
@@ -136,8 +136,10 @@ class TestTimeOfFlight:
         taps = np.exp(-0.5 * np.arange(-4, 5) ** 2)
         for beyond in range(4):  # pixels 63, 62, ... and as much of the Gaussian as lies on the other side
             share = taps[5 + beyond :].sum() / taps.sum()
-            wave = (1 - share) * np.exp(8e7j * np.pi / LIGHT_SPEED) + share / 2.25 * np.exp(12e7j * np.pi / LIGHT_SPEED)
-            assert found[48, 63 - beyond] == pytest.approx(np.angle(wave) * LIGHT_SPEED / 8e7 / np.pi, abs=2e-3)
+            wave = (1 - share) * np.exp(8e7j * np.pi / SPEED_OF_LIGHT) + share / 2.25 * np.exp(
+                12e7j * np.pi / SPEED_OF_LIGHT
+            )
+            assert found[48, 63 - beyond] == pytest.approx(np.angle(wave) * SPEED_OF_LIGHT / 8e7 / np.pi, abs=2e-3)
         assert 1.05 < found[48, 63] < found[48, 64] < 1.45
         np.testing.assert_allclose(found[:, :58], 1.0, atol=2e-3)  # whose rays differ in length, too
         np.testing.assert_allclose(found[:, 70:], 1.5, atol=2e-3)
@@ -145,7 +147,7 @@ class TestTimeOfFlight:
         np.testing.assert_allclose(sharp, depth, atol=1e-5)
 
     def test_distances_wrap_at_the_modulation_length(self) -> None:
-        longest = LIGHT_SPEED / 2e8  # at 100 MHz
+        longest = SPEED_OF_LIGHT / 2e8  # at 100 MHz
         found = flight(np.full((96, 128), longest + 0.4), noise=0, blur=0, modulation=100)
         assert found[48, 64] == pytest.approx(0.4, abs=1e-3)
 
@@ -163,10 +165,10 @@ def test_the_seed_of_the_frame_determines_the_noise(sensor: Any) -> None:
     layers = SimpleNamespace(captured=np.full((96, 128, 3), 0.5))
     made = {"camera": CAMERA, "image": PLAIN, "layers": layers, "normal": np.zeros((96, 128, 3))}
     frame: Any = SimpleNamespace(depth=depth, plan=SimpleNamespace(seed=5), **made)
-    one, again = sensed_depth(frame, sensor), sensed_depth(frame, sensor)
+    one, again = measure_depth(frame, sensor), measure_depth(frame, sensor)
     frame.plan.seed = 6
     np.testing.assert_array_equal(one, again)
-    assert (one != sensed_depth(frame, sensor)).mean() > 0.3
+    assert (one != measure_depth(frame, sensor)).mean() > 0.3
     assert one.dtype == np.float32
 
 

@@ -87,3 +87,19 @@ def test_a_background_is_seen_in_empty_pixels_and_changes_no_label(
     np.testing.assert_allclose(frame.rgb[border], frame.layers.rgb[border] + through * red, atol=1e-6)
     for name in ("rgb", "alpha", "depth", "instance", "normal", "proxy_depth"):
         np.testing.assert_array_equal(getattr(frame.layers, name), getattr(plain.layers, name))
+
+
+def test_background_has_the_size_of_each_camera(
+    scene_data: dict[str, Any], write_scene: WriteScene, tmp_path: Path
+) -> None:
+    scene_data["objects"] = []
+    cv2.imwrite(str(tmp_path / "ramp.png"), ramp(80, 60)[..., ::-1])
+    scene_data["background"] = {"images": "ramp.png"}
+    scene, layout = ms.load_scene(write_scene(scene_data)), Layout(0, (), NO_PHYSICS)
+    with ms.Renderer(scene) as renderer:
+        camera = renderer.render(0, layout=layout).camera.resized(40, 30)
+        second = renderer.render(0, layout=layout, camera=camera)
+    with ms.Renderer(scene) as renderer:
+        alone = renderer.render(0, layout=layout, camera=camera)
+    assert second.image.shape == (30, 40, 3)
+    np.testing.assert_array_equal(second.rgb, alone.rgb)

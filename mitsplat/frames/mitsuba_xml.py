@@ -14,6 +14,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
+from mitsplat.arrays import ByteImage
 from mitsplat.asset import Asset
 from mitsplat.engine.pool import LostWorkersError, run_in_process
 from mitsplat.errors import InputError
@@ -32,7 +33,7 @@ from mitsplat.runtime.variant import ensure_variant
 from mitsplat.scene.layout import Layout
 from mitsplat.scene.planning.conveyor import layout_at_view
 from mitsplat.scene.planning.frame_plan import FramePlan, layout_of, plan_frame
-from mitsplat.scene.planning.layout_surroundings import draw_surroundings
+from mitsplat.scene.planning.layout_surroundings import MaterialDraw, draw_surroundings
 from mitsplat.scene.planning.object_appearance import draw_appearances
 from mitsplat.scene.scene import Scene
 from mitsplat.storage.files import library_errors, storage_errors, write_file
@@ -112,24 +113,27 @@ def _export_visible_shapes(scene: Scene, plan: FramePlan, folder: Path) -> dict[
     """Write the meshes and patterns of visible shapes; return their Mitsuba dictionaries."""
     surroundings, shapes = draw_surroundings(scene.spec, plan.index), {}
     for number, (shape, mesh) in enumerate(zip(scene.spec.shapes, scene.shape_meshes, strict=True)):
-        if not shape.visible:
-            continue
-        name, drawn = f"shape_{number}", surroundings.material_of(shape)
-        image, texture = texture_image(drawn, scene.images), None
-        if image is not None:
-            bitmap = mi.Bitmap(image)
-            write_file(folder / f"{name}.png", lambda part, it=bitmap: it.write(str(part), mi.Bitmap.FileFormat.PNG))
-            texture = {"type": "bitmap", "filename": f"{folder.name}/{name}.png"}
-        travel = plan.belt.travel if plan.belt is not None and shape.box == plan.belt.box else 0.0
-        finished = finished_mesh(mesh, shape, drawn, image, travel=travel)
-        write_file(folder / f"{name}.ply", lambda part, it=finished: it.write_ply(str(part)))
-        shapes[name] = {
-            "type": "ply",
-            "filename": f"{folder.name}/{name}.ply",
-            "face_normals": True,
-            "bsdf": material(drawn, texture),
-        }
+        if shape.visible:
+            drawn, belt = surroundings.material_of(shape), plan.belt
+            image = texture_image(drawn, scene.images)
+            travel = belt.travel if belt is not None and shape.box == belt.box else 0.0
+            made = finished_mesh(mesh, shape, drawn, image, travel=travel)
+            shapes[f"shape_{number}"] = _write_shape(made, drawn, image, folder, f"shape_{number}")
     return shapes
+
+
+def _write_shape(
+    shape: mi.Shape, drawn: MaterialDraw, image: ByteImage | None, folder: Path, name: str
+) -> dict[str, Any]:
+    """Write a mesh and the pattern of its material; return its Mitsuba dictionary."""
+    write_file(folder / f"{name}.ply", lambda part: shape.write_ply(str(part)))
+    texture = None
+    if image is not None:
+        bitmap = mi.Bitmap(image)
+        write_file(folder / f"{name}.png", lambda part: bitmap.write(str(part), mi.Bitmap.FileFormat.PNG))
+        texture = {"type": "bitmap", "filename": f"{folder.name}/{name}.png"}
+    file = f"{folder.name}/{name}.ply"
+    return {"type": "ply", "filename": file, "face_normals": True, "bsdf": material(drawn, texture)}
 
 
 def render_xml(path: str | Path, out: str | Path, *, allow_outside: bool = False) -> Path:

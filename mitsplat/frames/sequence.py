@@ -73,7 +73,8 @@ def render_frames(
         if (count := to_index(frames, "frames")) < 0:
             raise InputError(f"frames must be 0 or more (got {count})")
         indices = range(count)
-    total = min((len(each) for each in (indices, layouts, cameras) if isinstance(each, Sized)), default=None)
+    parts: tuple[object, ...] = (indices, layouts, cameras)
+    total = min((len(part) for part in parts if isinstance(part, Sized)), default=None)
     scene = with_unlimited_layouts(scene)
     with Renderer(scene, quality=quality) as renderer:
         if layouts is None and cameras is None:

@@ -14,6 +14,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 
 from mitsplat.arrays import BoolArray, Float64Array, Int64Array
 from mitsplat.images.masks import decode_rle
@@ -218,7 +219,7 @@ class TrueFrame:
         return np.asarray(slopes, dtype=np.float64).reshape(-1, 2)
 
 
-def bounds_of(mask: BoolArray) -> Box:
+def bounds_of(mask: BoolArray | npt.NDArray[np.uint8]) -> Box:
     """Return the bounds of a mask's pixels; all are 0 for an empty mask."""
     ys, xs = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     return (int(xs[0]), int(ys[0]), int(xs[-1]) + 1, int(ys[-1]) + 1) if len(xs) else (0, 0, 0, 0)

@@ -87,7 +87,9 @@ class LabelledObject:
         """Return the outline [px], shape (M, 2)."""
         if self.polygon is not None:
             return self.polygon
-        return outline(np.asarray(decode_rle(self.rle), dtype=bool))
+        if self.rle is None:
+            raise ValueError("a label without a mask has no outline")
+        return outline(decode_rle(self.rle).astype(bool))
 
 
 @dataclass(frozen=True, eq=False)

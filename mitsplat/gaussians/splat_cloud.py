@@ -122,7 +122,7 @@ class Splats:
         """
         write_splats(SplatArrays(self.means, self.quats, self.scales, self.opacities, self.sh), Path(path))
 
-    def select(self, index: Any) -> Splats:
+    def select(self, index: slice | npt.ArrayLike) -> Splats:
         """Return the Gaussians selected by a Boolean mask (N,), an integer array or a slice, in its order."""
         rows = index if isinstance(index, slice) else np.atleast_1d(np.asarray(index))
         return Splats(**{f.name: getattr(self, f.name)[rows] for f in fields(self)})

@@ -218,13 +218,13 @@ def _vertex_rows(
     return numbers.view([(name, np.float64) for name in row.names or ()])
 
 
-def _exp(logarithms: npt.NDArray[Any]) -> Float32Array:
+def _exp(logarithms: npt.ArrayLike) -> Float32Array:
     with np.errstate(over="ignore"):  # overflow becomes inf, which Splats refuses
-        return np.exp(logarithms.astype(np.float64)).astype(np.float32)
+        return np.exp(np.asarray(logarithms, dtype=np.float64)).astype(np.float32)
 
 
-def _sigmoid(logits: npt.NDArray[Any]) -> Float32Array:
-    return np.asarray(expit(logits.astype(np.float64)), dtype=np.float32)
+def _sigmoid(logits: npt.ArrayLike) -> Float32Array:
+    return np.asarray(expit(np.asarray(logits, dtype=np.float64)), dtype=np.float32)
 
 
 def _columns(rows: npt.NDArray[np.void], names: tuple[str, ...] | list[str]) -> Float32Array:

@@ -285,12 +285,12 @@ def _independent_set(count: int, pairs: Int64Array, rng: np.random.Generator) ->
     return chosen
 
 
-def _query(tree: KDTree, points: npt.ArrayLike, **options: Any) -> tuple[npt.NDArray[Any], npt.NDArray[Any]]:
+def _query(tree: KDTree, points: npt.ArrayLike, **options: Any) -> tuple[Float64Array, Int64Array]:
     """Return distances and indices of nearest neighbours.
 
     All processors are used; the result does not depend on their number.
     """
-    found: tuple[npt.NDArray[Any], npt.NDArray[Any]] = tree.query(points, workers=-1, **options)
+    found: tuple[Float64Array, Int64Array] = tree.query(points, workers=-1, **options)
     return found
 
 

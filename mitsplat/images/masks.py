@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -21,12 +22,13 @@ BOUNDARY_TOLERANCE = 2
 """Maximum distance between matching boundary pixels [px]."""
 
 
-def decode_rle(rle: Any) -> Any:
+def decode_rle(rle: Mapping[str, object]) -> npt.NDArray[np.uint8]:
     """Decode a COCO run-length code to a mask of 0 and 1, shape (H, W)."""
     with warnings.catch_warnings():
         # pycocotools causes this warning with NumPy 2; with Python's option -W error it would end the run.
         warnings.filterwarnings("ignore", "__array__ implementation", DeprecationWarning)
-        return coco_mask.decode(rle)
+        decoded: npt.NDArray[np.uint8] = coco_mask.decode(rle)
+    return decoded
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,10 +5,9 @@ from __future__ import annotations
 import gc
 import math
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 import trimesh
@@ -265,7 +264,7 @@ class Drop:
             if len(moments) * interval <= time <= certificate.time_to_rest:
                 moments.append(poses)
 
-        self._run(world, number, regions, given, observe=observe)
+        self._run(world, number, regions, given, observe)
         yield from moments
 
     def _ground_of(self, layout: int) -> int:
@@ -278,7 +277,7 @@ class Drop:
         ground: int,
         regions: Sequence[int],
         given: Sequence[Float64Array | None],
-        **options: Any,
+        observe: Callable[[float, Float64Array], None] = lambda time, poses: None,
     ) -> RestOutcome:
         settle = self.scene.spec.settle
         fastest = _POUR_SPEED if any(self._arrangements[i] == "pile" for i in regions) else np.inf
@@ -287,7 +286,7 @@ class Drop:
         free = np.array([pose is None for pose in given])[:, None]
         own = np.asarray(regions)
         bounds = np.where(free, low[own], low.min(axis=0)), np.where(free, high[own], high.max(axis=0))
-        return run_to_rest(world, max_time=settle.max_time, bounds=bounds, fastest=fastest, **options)
+        return run_to_rest(world, max_time=settle.max_time, bounds=bounds, fastest=fastest, observe=observe)
 
     def _draw_frictions(self, index: int) -> tuple[float, ...]:
         """Draw the friction coefficient of each asset in a layout."""

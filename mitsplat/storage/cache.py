@@ -17,7 +17,7 @@ from contextlib import suppress
 from functools import lru_cache
 from multiprocessing import parent_process
 from pathlib import Path
-from typing import IO, Any
+from typing import IO
 
 _logger = logging.getLogger(__name__)
 
@@ -87,7 +87,7 @@ def prepare_caches() -> None:
         _warn(reasons)
 
 
-def write_cache_file(path: Path, write: Callable[[IO[bytes]], Any]) -> None:
+def write_cache_file(path: Path, write: Callable[[IO[bytes]], object]) -> None:
     """Write a cache file atomically by ``write(open file)``; warn once if it cannot be written."""
     temporary = None
     try:

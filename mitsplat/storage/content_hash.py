@@ -6,9 +6,9 @@ import hashlib
 import json
 from io import BufferedReader
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from mitsplat.errors import InputError
 
@@ -44,11 +44,11 @@ class ContentHash:
         for part in parts:
             self._sha.update(part.encode() if isinstance(part, str) else part)
 
-    def add_json(self, value: Any) -> None:
+    def add_json(self, value: object) -> None:
         """Add a JSON value, independent of the order of its keys."""
         self.add(json.dumps(value, sort_keys=True))
 
-    def add_array(self, array: Any) -> None:
+    def add_array(self, array: npt.NDArray[np.generic]) -> None:
         """Add the type, shape and values of an array."""
         self.add(f"{array.dtype} {np.shape(array)}")
         self._sha.update(np.ascontiguousarray(array).data)

@@ -73,7 +73,7 @@ def check_weights(weights: tuple[float, ...], members: int, what: str) -> None:
         )
 
 
-def _count_range(count: Any) -> Any:
+def _count_range(count: object) -> tuple[object, ...]:
     """Convert a number n to (n, n), and a list to a tuple, which strict mode requires."""
     if isinstance(count, int) and not isinstance(count, bool):
         if count < 1:
@@ -85,7 +85,7 @@ def _count_range(count: Any) -> Any:
     return tuple(count)
 
 
-def _scale_range(scale: Any) -> Any:
+def _scale_range(scale: object) -> object:
     """Validate a range and convert it to a tuple; otherwise pydantic would report the union's other member."""
     if not isinstance(scale, list | tuple):
         return scale

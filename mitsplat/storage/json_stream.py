@@ -10,7 +10,7 @@ import io
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, NoReturn
 
 from mitsplat.storage.files import GrowingFile, open_regular
 
@@ -38,8 +38,8 @@ class ListsFile:
         path: Path,
         lists: Sequence[str],
         *,
-        before: Mapping[str, Any] | None = None,
-        after: Mapping[str, Any] | None = None,
+        before: Mapping[str, object] | None = None,
+        after: Mapping[str, object] | None = None,
     ) -> None:
         head = "".join(f"{json.dumps(key)}: {json.dumps(value)}, " for key, value in (before or {}).items())
         self._after = after or {}
@@ -49,7 +49,7 @@ class ListsFile:
         self._first, *self._others = lists
         self._parts[self._first].write(f"{{{head}{json.dumps(self._first)}: [")
 
-    def append(self, name: str, element: Any) -> None:
+    def append(self, name: str, element: object) -> None:
         """Append an element to a list."""
         text = json.dumps(element)
         self._parts[name].write(f", {text}" if self._counts[name] else text)
@@ -82,7 +82,7 @@ class EntriesFile:
         self._file = GrowingFile(path)
         self._separator = "{"
 
-    def append(self, key: str, value: Any) -> None:
+    def append(self, key: str, value: object) -> None:
         """Append an entry."""
         self._file.write(f"{self._separator}{json.dumps(key)}: {json.dumps(value)}")
         self._separator = ", "
@@ -208,5 +208,5 @@ def _skip_space(text: str, at: int) -> int:
     return at
 
 
-def _refuse_constant(name: str) -> Any:
+def _refuse_constant(name: str) -> NoReturn:
     raise ValueError(f"{name} is no JSON")

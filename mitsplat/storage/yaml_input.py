@@ -89,7 +89,11 @@ class _Finding(NamedTuple):
 
 
 def load_yaml(
-    path: str | Path, model: type[Validated], *, overrides: Mapping[str, Any] | None = None, newest: int | None = None
+    path: str | Path,
+    model: type[Validated],
+    *,
+    overrides: Mapping[str, object] | None = None,
+    newest: int | None = None,
 ) -> Validated:
     """Read a YAML 1.2 file into ``model``. Types are checked strictly (no text for numbers), and no code is executed.
 
@@ -120,7 +124,7 @@ def load_yaml(
     raise InputError(_sentence(path, first.line, first.path, first.rule))
 
 
-def model_error_sentence(error: ValidationError, model: type[BaseModel], values: Mapping[str, Any]) -> str:
+def model_error_sentence(error: ValidationError, model: type[BaseModel], values: Mapping[str, object]) -> str:
     """Return the error sentence for ``values`` from Python code (not from a file) that break a rule of a model."""
     data = _to_file_values(values)
     findings = [_finding(details, model, data, None, {}) for details in error.errors()]
@@ -212,7 +216,7 @@ def _plain(node: Any, keys: KeyPath, tree: CommentedMap, path: Path, values: Ite
     return str(node)
 
 
-def _set(data: dict[str, Any], keys: tuple[str, ...], value: Any) -> None:
+def _set(data: dict[str, Any], keys: tuple[str, ...], value: object) -> None:
     """Replace one value of nested mappings, and create missing mappings."""
     for key in keys[:-1]:
         inner = data.get(key)
@@ -337,7 +341,7 @@ def _sentence(path: Path, line: int | None, keys: KeyPath, rule: str) -> str:
     return f"{_place(path, line, keys)}: {rule}"
 
 
-def _format_value(value: Any) -> str:
+def _format_value(value: object) -> str:
     """Return the value in the notation of the file, shortened."""
     text = "nothing" if value is None else json.dumps(value, default=str, ensure_ascii=False)
     return text if len(text) <= 60 else f"{text[:57]}..."

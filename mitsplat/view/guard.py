@@ -23,6 +23,7 @@ from mitsplat.errors import InputError, MissingResourceError
 from mitsplat.view.client_messages import MAX_MESSAGE_BYTES, Connection, Pool
 
 if TYPE_CHECKING:
+    from websockets.asyncio.server import ServerConnection
     from websockets.http11 import Request, Response
 
 LOOPBACK = ("localhost", "127.0.0.1", "::1")
@@ -119,8 +120,10 @@ def guarded(guard: Guard) -> Iterator[Pool]:
 
     start, started, pool = server.serve, [], Pool()
 
-    def serve(*args: Any, process_request: Callable[[Any, Request], Response | None], **options: Any) -> Any:
-        def answer(connection: Any, request: Request) -> Response | None:
+    def serve(
+        *args: Any, process_request: Callable[[ServerConnection, Request], Response | None], **options: Any
+    ) -> Any:
+        def answer(connection: ServerConnection, request: Request) -> Response | None:
             def header(name: str) -> str | None:
                 return ", ".join(request.headers.get_all(name)) or None
 

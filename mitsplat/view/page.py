@@ -112,16 +112,16 @@ class Page:
 
         self._server.scene.on_click()(handle)
 
-    def on_move(self, moved: Callable[[Any], object]) -> None:
+    def on_move(self, moved: Callable[[viser.CameraHandle], object]) -> None:
         """Set the callback for a moved view; its argument is viser's camera.
 
         It is first called after the view of the browser has reached the initial camera of the page.
         """
 
-        def listen(client: Any) -> None:
+        def listen(client: viser.ClientHandle) -> None:
             begun = False
 
-            def handle(camera: Any) -> None:
+            def handle(camera: viser.CameraHandle) -> None:
                 nonlocal begun
                 begun = begun or np.allclose(camera.position, self._server.initial_camera.position, atol=1e-4)
                 if begun:
@@ -131,7 +131,7 @@ class Page:
 
         self._server.on_client_connect(listen)
 
-    def add_handle(self, moved: Callable[[Float64Array], object]) -> Any:
+    def add_handle(self, moved: Callable[[Float64Array], object]) -> viser.TransformControlsHandle:
         """Add a hidden handle of viser for dragging; ``moved`` is called with the new position [m]."""
         handle = self._server.scene.add_transform_controls(
             "/handle", scale=0.15, disable_rotations=True, visible=False, depth_test=False

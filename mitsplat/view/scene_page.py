@@ -9,6 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
+import viser
 from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 
@@ -175,7 +177,7 @@ class ScenePage:
             self._playing = True
             self._request_render()
 
-    def _moved(self, camera: Any) -> None:
+    def _moved(self, camera: viser.CameraHandle) -> None:
         """Handle a moved view of a browser; it is a manual move unless the view equals the camera of the frame."""
         with self._lock:
             pose = np.eye(4)
@@ -342,7 +344,13 @@ def _varies_appearance(scene: Scene) -> bool:
     return drawn or any(shape.materials for shape in scene.spec.shapes)
 
 
-def changed_light(light: LightSpec, *, position: Any = None, target: Any = None, strength: Any = None) -> LightSpec:
+def changed_light(
+    light: LightSpec,
+    *,
+    position: npt.ArrayLike | None = None,
+    target: npt.ArrayLike | None = None,
+    strength: float | None = None,
+) -> LightSpec:
     """Return a light with changed properties; properties that its kind does not have are ignored.
 
     Raises:

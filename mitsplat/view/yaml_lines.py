@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -43,7 +42,7 @@ def rounded(vector: npt.ArrayLike) -> tuple[float, ...]:
     return tuple(round(float(value), 4) + 0.0 for value in np.asarray(vector))  # no negative zero
 
 
-def _flow(value: Mapping[str, Any]) -> str:
+def _flow(value: Mapping[str, object]) -> str:
     """Format a mapping as one line of YAML."""
     yaml = YAML(typ="safe", pure=True)
     yaml.default_flow_style, yaml.width = True, 10_000
@@ -53,7 +52,7 @@ def _flow(value: Mapping[str, Any]) -> str:
     return out.getvalue().strip()
 
 
-def _plain(value: Any) -> Any:
+def _plain(value: object) -> object:
     if isinstance(value, Mapping):
         return {key: _plain(entry) for key, entry in value.items()}
     return [_plain(entry) for entry in value] if isinstance(value, tuple) else value

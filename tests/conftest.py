@@ -65,8 +65,8 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 
 
 @pytest.fixture(autouse=True)
-def no_lost_rays() -> Iterator[None]:
-    """Whatever a test renders on a GPU, and looks at however late, it renders with all rays."""
+def no_dropped_rays() -> Iterator[None]:
+    """Fails a test that drops rays on a GPU, even if it reads the result late."""
     yield
     check_dropped_rays()
 
@@ -103,7 +103,7 @@ def caches(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def unsynced() -> Iterator[None]:
+def no_fsync() -> Iterator[None]:
     """Files of this process are left to the operating system: no test pulls the plug, and many would wait for disks."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(os, "fsync", lambda file: None)
@@ -148,7 +148,7 @@ def write_scene(tmp_path: Path) -> WriteScene:
 
 
 def contents(folder: Path) -> dict[str, bytes]:
-    """What all files of a folder hold, by their paths in it."""
+    """Return the contents of all files of a folder, by their relative paths."""
     return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 

@@ -14,7 +14,7 @@ TRACE = re.compile(r"call void %rd\d+\(ptr %u\d+_in_0_\w+, ptr (%rd\d+), ptr %u\
 
 @contextmanager
 def traced_scenes() -> Iterator[list[int]]:
-    """How many ray-tracing scenes each kernel traces that is launched in the block; of the variant llvm_ad_rgb.
+    """Count the ray-tracing scenes of each kernel that is launched in the block; of the variant llvm_ad_rgb.
 
     On CUDA, rays of a second one are left out.
     """

@@ -89,7 +89,7 @@ def imports(module: str, *, for_types: bool) -> Iterator[tuple[str, int]]:
 
 
 def is_own_part(module: str, target: str) -> bool:
-    """Whether ``target`` lies in the package whose ``__init__.py`` is ``module``."""
+    """Return True if ``target`` lies in the package whose ``__init__.py`` is ``module``."""
     return MODULES[module].name == "__init__.py" and target.startswith(f"{module}.")
 
 

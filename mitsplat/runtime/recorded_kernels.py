@@ -18,7 +18,7 @@ REPLAY = True
 """Use of recordings. If false, every call is traced.
 
 On a CPU, both give the same bytes. On a GPU, both agree up to rounding, because division by a compile-time constant
-differs from division by a variable (``tests/renderer/test_recorded.py``,
+differs from division by a variable (``tests/renderer/test_recorded_kernels.py``,
 ``python -m benchmarks.assets.fit --synthetic spur_gear --replay off``).
 """
 

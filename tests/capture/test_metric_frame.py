@@ -73,7 +73,7 @@ def table_and_thing(seed: int = 0) -> np.ndarray:
 
 
 def draw(flat: np.ndarray, per_metre: float, camera: Camera, folder: Path, name: str) -> Path:
-    """What the camera sees of a picture that lies on z = 0 about the origin; four samples a pixel's edge."""
+    """Draw the image of a picture that lies on z = 0 about the origin; four samples a pixel's edge."""
     fine = camera.resized(4 * camera.width, 4 * camera.height)
     height, width = flat.shape
     corners = np.array([[0, 0], [width, 0], [width, height], [0, height]], dtype=np.float64)

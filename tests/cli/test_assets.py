@@ -18,7 +18,7 @@ from tests.conftest import box_asset
 def test_bake_applies_every_option(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """What each does is read from the asset; processes of their own bake in full in test_shell.py."""
+    """What each does is read from the asset; processes of their own bake in full in test_documented_commands.py."""
     few = partial(BakeSettings, directions=4, samples=2, fit_views=2, fit_steps=2, verify_views=1)
     monkeypatch.setattr("mitsplat.bake.bake.BakeSettings", few)
     box_asset("gear", (20.0, 30.0, 10.0)).mesh.export(tmp_path / "gear.glb")

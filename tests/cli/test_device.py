@@ -16,7 +16,7 @@ from tests.cli.typed import Calls, run
 
 
 class TestDevice:
-    """What commands do with ``--device``, on a machine with or without a GPU."""
+    """Commands with ``--device`` on a machine with or without a GPU."""
 
     @pytest.fixture
     def lacking(self, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -35,7 +35,7 @@ OBJECTS = [
 
 
 def scatter_drawn(scene: Scene, index: int, *, progress: Any) -> Layout:
-    """What is drawn for a layout, at random poses; no physics."""
+    """Return a layout of the drawn objects at random poses, without physics."""
     rng = random_stream(scene.spec.seed, "drawn layout", index)
     instances = []
     for number, asset in enumerate(draw_objects(scene, index)[0]):

@@ -431,7 +431,7 @@ class TestDevice:
         assert read_content(tmp_path / "out")["device"] == "cuda"
 
     def begun_on(self, out, device):
-        """What is in a folder is from now on of a device, or of a version that named none."""
+        """Change the device that a dataset records, or remove it."""
         content = json.loads((out / "dataset.json").read_bytes())
         del content["device"]
         (out / "dataset.json").write_text(json.dumps(content | ({"device": device} if device else {}), indent=1))

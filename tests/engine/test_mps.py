@@ -29,7 +29,7 @@ echo "$command" >> {log}
 
 @pytest.fixture
 def log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """What the service was told."""
+    """File with the commands that the service received."""
     monkeypatch.delenv(PIPES, raising=False)
     monkeypatch.delenv(VISIBLE_GPUS, raising=False)
     monkeypatch.setattr(mps, "_TRIAL", "pass")

@@ -416,7 +416,7 @@ def test_workers_end_with_their_parent(tmp_path):
 
 
 def ended(process):
-    """Whether a process is gone, or a zombie; it may go while it is looked at."""
+    """Return True if a process has ended or is a zombie; it may end during the call."""
     try:
         return "Z" in Path("/proc", process, "stat").read_text().rpartition(")")[2].split()[0]
     except (FileNotFoundError, ProcessLookupError):

@@ -41,7 +41,7 @@ with Places({place}, signal.{how}).watched():
 
 
 class Interrupted(BaseException):
-    """What nobody catches."""
+    """An exception that no code catches."""
 
 
 @dataclass
@@ -95,7 +95,7 @@ class Fits:
     new: Path
 
     def is_whole(self, folder: Path) -> bool:
-        """Whether a folder holds a finished fit, which must be one of these in all its parts."""
+        """Return True if a folder has a finished fit; all its files must be of the same fit."""
         if not (folder / "fit.json").exists():
             return False
         seed = json.loads((folder / "fit.json").read_text())["settings"]["seed"]
@@ -105,7 +105,7 @@ class Fits:
         return True
 
     def is_new(self, folder: Path) -> bool:
-        """Whether a folder holds the second fit and nothing else."""
+        """Return True if a folder has the second fit and nothing else."""
         names = ("fit.json", "held_out", "held_out/00.png", "held_out/08.png", "held_out/16.png", "splats.ply")
         return (
             self.is_whole(folder)

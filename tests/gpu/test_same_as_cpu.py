@@ -47,7 +47,7 @@ def test_gpu_and_cpu_arrays_of_a_case_agree(case: str, rendered: dict[str, dict[
 
 
 def fault(name: str, cpu: np.ndarray, gpu: np.ndarray, case: str = "") -> str:
-    """How two arrays differ more than they may, or nothing.
+    """Describe how two arrays differ by more than is allowed; return an empty text if they do not.
 
     Ids and masks: equal but for :data:`SHARE` of the pixels. Depth [m], normals and boxes [px] likewise, where equal
     means within 1e-4 of the depth, 1e-3, and one pixel. Colours and light: a PSNR of 60 dB, 1 being white. Gradients:

@@ -86,7 +86,7 @@ def removed(splats: Splats, capture: Capture, *what: str) -> Splats:
 
 
 def above(splats: Splats, low: tuple[float, float], high: tuple[float, float]) -> BoolArray:
-    """Which Gaussians are above the table in a rectangle."""
+    """Return a mask of the Gaussians above the table in a rectangle."""
     inside = ((splats.means[:, :2] > low) & (splats.means[:, :2] < high)).all(axis=1)
     return np.asarray(inside & (splats.means[:, 2] > HEIGHT + 0.012))
 

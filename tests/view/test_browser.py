@@ -87,7 +87,7 @@ def until(what: Callable[[], Any]) -> Any:
 
 
 def screen(browser: Any) -> np.ndarray:
-    """What the browser shows, (H, W, 3): the render on the left, splats in the middle, controls on the right."""
+    """Return the screen, (H, W, 3): the render on the left, splats in the middle, controls on the right."""
     image = Image.open(io.BytesIO(browser.get_screenshot_as_png())).convert("RGB")
     return np.asarray(image).astype(int)
 
@@ -123,7 +123,7 @@ def test_the_page_of_a_scene_works_in_chromium(browser, scene_file):
 
 
 def faults(browser: Any) -> list[str]:
-    """What the browser has refused or failed to do since it was asked last."""
+    """Return errors of the browser since the last call."""
     return [entry["message"] for entry in browser.get_log("browser") if entry["level"] == "SEVERE"]
 
 

@@ -29,7 +29,7 @@ LONG = 60
 
 @dataclass
 class Told:
-    """What the page was told to show."""
+    """Records the parts that the page shows."""
 
     pictures: list[tuple[ByteImage, str]] = field(default_factory=list)
     alerts: list[str | None] = field(default_factory=list)
@@ -92,7 +92,7 @@ def write(path: Path, data: dict[str, Any]) -> None:
 
 
 def look(pose: np.ndarray) -> Any:
-    """What viser tells of a browser's camera."""
+    """Return a camera message as viser reports it."""
     wxyz = Rotation.from_matrix(pose[:3, :3]).as_quat(scalar_first=True)
     return SimpleNamespace(wxyz=wxyz, position=pose[:3, 3], look_at=np.zeros(3))
 

@@ -114,7 +114,7 @@ def ball(**bsdf: Any) -> dict[str, Any]:
 def render(
     scene: dict[str, Any], size: tuple[int, int], samples: int, *, aside: tuple[float, float, float] = (0, 0, 0)
 ) -> Float32Array:
-    """What the level camera sees that looks at the ball, or beside it."""
+    """Render the image of the level camera that looks at the ball, or beside it."""
     eye = CENTRE + AWAY * unit_vector(AZIMUTH, ELEVATION)
     pose = mi.ScalarTransform4f().look_at(origin=eye.tolist(), target=(CENTRE + aside).tolist(), up=[0, 0, 1])
     sensor = {

@@ -469,7 +469,7 @@ def turned(light: LightSpec, degrees: float, around: Float64Array) -> LightSpec:
 
 
 class TestInput:
-    """What is wrong is told in a sentence."""
+    """Invalid input, which is refused in one sentence."""
 
     CAMERA = ("--camera", 0, 10)
 

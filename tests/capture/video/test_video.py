@@ -35,7 +35,7 @@ def plane(seed: int = 0, size: tuple[int, int] = (360, 2400)) -> np.ndarray:
 
 
 def seen(texture: np.ndarray, x: float, y: float = 40.0) -> np.ndarray:
-    """What a camera shows whose left upper corner lies at x, y [px] of a texture, BGR."""
+    """Return the part of a texture whose left upper corner lies at x, y [px], BGR."""
     move = np.float32([[1, 0, -x], [0, 1, -y]])
     return cv2.cvtColor(cv2.warpAffine(texture, move, SIZE), cv2.COLOR_GRAY2BGR)
 
@@ -54,7 +54,7 @@ def write(file: Path, pictures: Sequence[np.ndarray], code: str = "mp4v") -> Pat
 
 
 def places() -> np.ndarray:
-    """Where a camera is that starts slowly, stands still for a second, and goes on three times as fast [px]."""
+    """Return positions [px] of a camera that starts slowly, stands still for a second, and goes on at triple speed."""
     slow, fast = np.arange(120) * 2.0, np.arange(1, 91) * 6.0
     return np.concatenate([slow, np.full(30, slow[-1]), slow[-1] + fast])
 

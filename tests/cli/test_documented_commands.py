@@ -81,7 +81,7 @@ def blocks(page: Path, language: str) -> list[str]:
 
 
 def commands(page: Path) -> list[list[str]]:
-    """What a page shows of commands of mitsplat, without their comments."""
+    """Return the commands of mitsplat that a page shows, without their comments."""
     lines = (line for text in blocks(page, "sh") for line in text.splitlines())
     return [words for line in lines if (words := shlex.split(line, comments=True))[:1] == ["mitsplat"]]
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib
 import sys
-from typing import Any
 
 import mitsuba as mi
 
@@ -43,7 +42,7 @@ def register() -> None:
 def refuse(variant: str) -> None:
     """Register plugins that raise an error on use, for a variant that cannot run them."""
 
-    def refused(props: Any) -> Any:
+    def refused(props: mi.Properties) -> mi.Object:
         raise RuntimeError(
             f"plugin {props.plugin_name()!r} needs the variant llvm_ad_rgb or cuda_ad_rgb (got {variant})"
         )

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -95,8 +93,8 @@ class OpenCVCamera(mi.Sensor):
         )
 
     def sample_ray(  # noqa: D102 - Mitsuba's interface
-        self, time: Any, wavelength: Any, position: Any, aperture: Any, active: Any = True
-    ) -> tuple[Any, Any]:
+        self, time: mi.Float, wavelength: mi.Float, position: mi.Point2f, aperture: mi.Point2f, active: mi.Bool = True
+    ) -> tuple[mi.Ray3f, mi.Color3f]:
         width, height = self.film().size()
         u, v = self.view().slopes(position.x * width, position.y * height)
         ray = dr.zeros(mi.Ray3f, dr.width(position))
@@ -110,8 +108,8 @@ class OpenCVCamera(mi.Sensor):
         return ray, mi.Color3f(1)
 
     def sample_ray_differential(  # noqa: D102 - Mitsuba's interface
-        self, time: Any, wavelength: Any, position: Any, aperture: Any, active: Any = True
-    ) -> Any:
+        self, time: mi.Float, wavelength: mi.Float, position: mi.Point2f, aperture: mi.Point2f, active: mi.Bool = True
+    ) -> tuple[mi.RayDifferential3f, mi.Color3f]:
         ray, weight = self.sample_ray(time, wavelength, position, aperture, active)
         return mi.RayDifferential3f(ray), weight
 

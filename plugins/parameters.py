@@ -59,7 +59,7 @@ class Parameters:
             self.refuse(name, f"be from {least} to {most}", value)
         return int(value)
 
-    def refuse(self, name: str, rule: str, value: Any) -> None:
+    def refuse(self, name: str, rule: str, value: object) -> None:
         """Raise an error that a parameter violates a rule."""
         raise InputError(f"{self._plugin}: {name!r} must {rule} (got {value!r})")
 

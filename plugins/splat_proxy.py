@@ -11,7 +11,9 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+import trimesh
 
+from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.images.masks import Silhouette
 from mitsplat.plugins.parameters import Parameters
 from mitsplat.quality import Quality, resolve_quality
@@ -63,11 +65,15 @@ AOVS = (
 """Channels after R, G, B, A: linear colour before light, depths along z [m], ids, world normal, light, highlight."""
 
 
+_CacheKey = tuple[tuple[Any, ...], Quality, list["mi.Shape"]]
+"""Camera, quality and visible shapes."""
+
+
 @dataclass(frozen=True, eq=False)
 class _Contents:
     """Device data of all shapes of a scene that emit no light; reused while these shapes stay the same."""
 
-    shapes: tuple[Any, ...]
+    shapes: tuple[mi.Shape, ...]
     clouds: CloudSet | None
     placements: tuple[Placement, ...]
     proxies: Proxies
@@ -214,17 +220,23 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
             given.refuse("sky_reach", "be >= 0", self.sky_reach)
         self.reference = tuple(float(v) for v in np.array(props.get("reference", mi.ScalarPoint3f(0))).ravel())
         self._contents: _Contents | None = None
-        self._uploaded: list[tuple[Any, Cloud]] = []
-        self._grid: tuple[Any, RadianceGrid | None] | None = None
-        self._static_tiles: tuple[tuple[Any, Quality, list[Any]], StaticTileCache | None] | None = None
+        self._uploaded: list[tuple[Splats, Cloud]] = []
+        self._grid: tuple[mi.Shape, RadianceGrid | None] | None = None
+        self._static_tiles: tuple[_CacheKey, StaticTileCache | None] | None = None
 
     def aov_names(self) -> list[str]:
         """Return the names of the channels after R, G, B and A."""
         return list(AOVS)
 
     def render(
-        self, scene: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0, develop: bool = True, evaluate: bool = True
-    ) -> Any:
+        self,
+        scene: mi.Scene,
+        sensor: mi.Sensor | int = 0,
+        seed: int = 0,
+        spp: int = 0,
+        develop: bool = True,
+        evaluate: bool = True,
+    ) -> mi.TensorXf:
         """Render an image tensor (H, W, 4 + AOVs), linear RGBA first."""
         if not isinstance(sensor, mi.Sensor):
             sensor = scene.sensors()[sensor]
@@ -243,7 +255,7 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
             check_dropped_rays()
         return image
 
-    def render_layers(self, scene: Any, sensor: Any, *, seed: int = 0) -> dict[str, Any]:
+    def render_layers(self, scene: mi.Scene, sensor: mi.Sensor, *, seed: int = 0) -> dict[str, dr.ArrayBase]:
         """Render all layers as flat row-major device arrays: colours linear, depths along z [m].
 
         Through a thin lens, colours and opacity are means over its aperture; all other layers are those of its centre.
@@ -274,8 +286,8 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
         return layers
 
     def _layers(
-        self, contents: _Contents, scene: Any, view: CameraView, accuracy: Accuracy, paths: int, seed: int
-    ) -> dict[str, Any]:
+        self, contents: _Contents, scene: mi.Scene, view: CameraView, accuracy: Accuracy, paths: int, seed: int
+    ) -> dict[str, dr.ArrayBase]:
         """Render the layers through one point of the lens."""
         rays = view.rays()
         behind, emitters, z_max = self._trace_background(contents, scene, view, rays)
@@ -337,13 +349,13 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
     def _smooth_edges(
         self,
         contents: _Contents,
-        scene: Any,
+        scene: mi.Scene,
         view: CameraView,
-        layers: dict[str, Any],
-        key: Any,
-        radiance: Any,
-        white: Any,
-    ) -> dict[str, Any]:
+        layers: dict[str, dr.ArrayBase],
+        key: mi.UInt32,
+        radiance: mi.Color3f,
+        white: mi.Color3f,
+    ) -> dict[str, mi.Float | mi.Color3f]:
         """Return colours and opacity with several rays averaged at borders between pixels of different ``key``."""
         edges = Edges.find(key, view)
         if edges is None:
@@ -356,7 +368,7 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
         shown = PrimaryVisibility.of(splat, behind, emitters, z_max, dr.pi / white)
         pixel = edges.nearest_same(key, shown.key)
 
-        def near(values: Any) -> Any:
+        def near(values: mi.Color3f) -> mi.Color3f:
             """Return the values of the nearest pixel with the same key."""
             return values if dr.width(values) == 1 else dr.gather(type(values), values, pixel)
 
@@ -369,8 +381,13 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
         return smooth
 
     def _trace_background(
-        self, contents: _Contents, scene: Any, view: CameraView, rays: Any, at: tuple[Any, Any] | None = None
-    ) -> tuple[MeshHits | None, VisibleEmitters | None, Any | None]:
+        self,
+        contents: _Contents,
+        scene: mi.Scene,
+        view: CameraView,
+        rays: mi.Ray3f,
+        at: tuple[mi.Float, mi.Float] | None = None,
+    ) -> tuple[MeshHits | None, VisibleEmitters | None, mi.Float | None]:
         """Return visible meshes and emitters along rays, and the depths [m] of the nearest of them.
 
         Rays pass through the positions ``at`` of the view [px], or through the centres of all its pixels.
@@ -385,15 +402,15 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
     def _radiance(
         self,
         contents: _Contents,
-        scene: Any,
+        scene: mi.Scene,
         view: CameraView,
-        rays: Any,
+        rays: mi.Ray3f,
         behind: MeshHits | None,
         shown: PrimaryVisibility,
-        white: Any,
+        white: mi.Color3f,
         paths: int,
         seed: int,
-    ) -> Any | None:
+    ) -> mi.Color3f | None:
         """Return the radiance (Color3f) of path-traced meshes along their visible rays, in the picture's scale."""
         if behind is None or contents.meshes is None or contents.meshes.diffuse is None:
             return None
@@ -418,7 +435,7 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
         dr.scatter(radiance, found, pixel)
         return radiance
 
-    def silhouettes(self, scene: Any, sensor: Any, *, source: str = "splats") -> dict[int, Silhouette]:
+    def silhouettes(self, scene: mi.Scene, sensor: mi.Sensor, *, source: str = "splats") -> dict[int, Silhouette]:
         """Return the unoccluded silhouette of every instance above 0, by its splats or its proxies (``source``).
 
         Positions are relative to the image and may lie outside it. An instance without pixels is omitted.
@@ -429,19 +446,19 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
             if contents.clouds is None:
                 return {}
             return splat_silhouettes(contents.clouds, contents.placements, view, self.quality)
-        proxies: dict[int, list[tuple[Any, np.ndarray]]] = {}
+        proxies: dict[int, list[tuple[trimesh.Trimesh, np.ndarray]]] = {}
         for shape in contents.shapes:
             if getattr(shape, "instance", 0) and shape.proxy is not None:
                 proxies.setdefault(shape.instance, []).append((shape.proxy, shape.world_from_splats))
         return proxy_silhouettes(proxies, view)
 
-    def _white(self, scene: Any) -> Any:
+    def _white(self, scene: mi.Scene) -> mi.Color3f:
         """Return the irradiance (Color3f) at which uniformly captured objects keep their colours."""
         return (
             mi.Color3f(dr.opaque(mi.Float, self.white)) if self.white else reference_irradiance(scene, self.reference)
         )
 
-    def _shape_votes(self, contents: _Contents, view: CameraView, z_max: Any | None) -> Any | None:
+    def _shape_votes(self, contents: _Contents, view: CameraView, z_max: mi.Float | None) -> mi.UInt32 | None:
         """Return the shape of an instance that each pixel shows, or None if all its shapes are lit alike.
 
         Shapes are rows of :class:`Traits`.
@@ -451,7 +468,7 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
         fine = view.sampled(self.quality.grid)
         return trace(contents.clouds, contents.traits.placements, fine, self.quality, z_max=z_max).instance
 
-    def _trace_splats(self, contents: _Contents, scene: Any, view: CameraView, z_max: Any | None) -> Image:
+    def _trace_splats(self, contents: _Contents, scene: mi.Scene, view: CameraView, z_max: mi.Float | None) -> Image:
         if contents.clouds is None:
             return Image.empty(view.width * view.height)
         fine = view.sampled(self.quality.grid)
@@ -463,7 +480,7 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
         return trace(contents.clouds, contents.placements, fine, self.quality, z_max=z_max)
 
     def _static_tile_cache(
-        self, contents: _Contents, scene: Any, view: CameraView, z_max: Any | None
+        self, contents: _Contents, scene: mi.Scene, view: CameraView, z_max: mi.Float | None
     ) -> StaticTileCache | None:
         """Return the static tile cache of a camera, from its second use on."""
         static = [p for p in contents.placements if p.instance == 0]
@@ -482,7 +499,7 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
                 self._static_tiles = seen, StaticTileCache.of(contents.clouds, static, view, self.quality, z_max)
         return self._static_tiles[1]
 
-    def _read(self, scene: Any) -> _Contents:
+    def _read(self, scene: mi.Scene) -> _Contents:
         """Upload the data of the shapes unless they are those of the last call."""
         # Emitter shapes change from frame to frame; as contents they are neither visible nor occluders.
         shapes = tuple(s for s in scene.shapes() if not s.is_emitter())
@@ -518,7 +535,7 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
         )
         return self._contents
 
-    def _surroundings(self, carriers: list[Any]) -> RadianceGrid | None:
+    def _surroundings(self, carriers: list[mi.Shape]) -> RadianceGrid | None:
         """Return the radiance grid of the largest splats that were captured under the scene's light."""
         static = [c for c in carriers if not c.dynamic and c.capture_light == "scene" and len(c.splats)]
         if not static:
@@ -528,7 +545,7 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
             self._grid = largest, RadianceGrid.build(largest.splats, largest.world_from_splats)
         return self._grid[1]
 
-    def _upload(self, distinct: list[Any]) -> CloudSet | None:
+    def _upload(self, distinct: list[Splats]) -> CloudSet | None:
         """Upload splats; copies of the last call are reused, because layouts of a scene share their assets."""
         kept = {id(splats): (splats, cloud) for splats, cloud in self._uploaded}
         self._uploaded = [
@@ -542,12 +559,12 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
         return f"SplatProxyIntegrator[quality = {self.quality}, shadow = {self.shadow}]"
 
 
-def _same_key(a: tuple[Any, Quality, list[Any]], b: tuple[Any, Quality, list[Any]]) -> bool:
+def _same_key(a: _CacheKey, b: _CacheKey) -> bool:
     """Return True if two keys of camera, quality and shapes are the same."""
     return a[:2] == b[:2] and _identical(a[2], b[2])
 
 
-def _identical(some: Sequence[Any], others: Sequence[Any]) -> bool:
+def _identical(some: Sequence[mi.Shape], others: Sequence[mi.Shape]) -> bool:
     return len(some) == len(others) and all(a is b for a, b in zip(some, others, strict=True))
 
 

@@ -12,6 +12,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
+import trimesh
 
 from mitsplat.arrays import Float32Array
 from mitsplat.gaussians.splat_cloud import Splats
@@ -61,7 +62,7 @@ class Layers(LazyValue):
     highlight: Float32Array
 
     @classmethod
-    def on_device(cls, channels: Mapping[str, Any], shape: tuple[int, int]) -> Layers:
+    def on_device(cls, channels: Mapping[str, dr.ArrayBase], shape: tuple[int, int]) -> Layers:
         """Create layers of (H, W) pixels from flat row-major device arrays; colours have three channels."""
         fetch = {name: _host_ids if name.endswith("instance") else host_array for name in channels}
         known = dict(channels)
@@ -84,13 +85,13 @@ class Layers(LazyValue):
         height, width = self.__dict__.get("_shape") or self.alpha.shape
         return height, width
 
-    def device_array(self, name: str) -> Any:
+    def device_array(self, name: str) -> mi.Float | mi.Color3f:
         """Return a float layer as a flat row-major device array; colours and normals as Color3f."""
         channels = self.__dict__.get("_channels")
         return device_array(getattr(self, name)) if channels is None else channels[name]
 
 
-def make_integrator(*, quality: str | Quality = "balanced", **properties: Any) -> Any:
+def make_integrator(*, quality: str | Quality = "balanced", **properties: Any) -> mi.Integrator:
     """Create the integrator ``splat_proxy``; ``properties`` are those of the plugin.
 
     The integrator keeps its uploads as long as the shapes of the scene stay the same.
@@ -101,19 +102,21 @@ def make_integrator(*, quality: str | Quality = "balanced", **properties: Any) -
     return integrator
 
 
-def make_sensor(camera: Camera) -> Any:
+def make_sensor(camera: Camera) -> mi.Sensor:
     """Create the sensor plugin ``opencv_camera`` of a camera."""
     ensure_variant()
     return mi.load_dict(describe_sensor(camera), parallel=False)
 
 
 @lru_cache(maxsize=1)
-def _sensor_of(camera: Camera, _variant: str) -> Any:
+def _sensor_of(camera: Camera, _variant: str) -> mi.Sensor:
     """Return the cached sensor of the last camera, because a frame uses it twice."""
     return make_sensor(camera)
 
 
-def describe_sensor(camera: Camera) -> dict[str, Any]:
+def describe_sensor(
+    camera: Camera,
+) -> dict[str, Any]:
     """Return Mitsuba's dictionary of a camera."""
     pose = camera.world_from_camera @ np.diag([-1.0, -1.0, 1.0, 1.0])
     return {
@@ -139,8 +142,11 @@ def describe_sensor(camera: Camera) -> dict[str, Any]:
 
 
 def make_splats_shape(
-    splats: Splats, world_from_splats: npt.ArrayLike | None = None, proxy: Any = None, **properties: Any
-) -> Any:
+    splats: Splats,
+    world_from_splats: npt.ArrayLike | None = None,
+    proxy: trimesh.Trimesh | None = None,
+    **properties: Any,
+) -> mi.Shape:
     """Create the shape plugin ``splats`` from data in memory; ``properties`` are those of the plugin."""
     ensure_variant()
     from mitsplat.plugins.splats import SplatsShape  # derives from a class of the variant
@@ -174,27 +180,27 @@ def render_splats(splats: Splats, camera: Camera, *, quality: str | Quality = "b
 
 
 @lru_cache(maxsize=2)
-def _single_shape_scene(splats: Splats, variant: str) -> tuple[Any, Any]:
+def _single_shape_scene(splats: Splats, variant: str) -> tuple[mi.Integrator, mi.Scene]:
     """Return cached integrator and scene of splats, so that the next view of them needs no upload."""
     scene = mi.load_dict({"type": "scene", "splats": make_splats_shape(splats, instance=1)})
     return make_integrator(shadow="none"), scene
 
 
-def render_layers(integrator: Any, scene: Any, camera: Camera, *, seed: int = 0) -> Layers:
+def render_layers(integrator: mi.Integrator, scene: mi.Scene, camera: Camera, *, seed: int = 0) -> Layers:
     """Run the integrator; each layer is copied to the host on first access, see :class:`Layers`."""
     layers = integrator.render_layers(scene, _sensor_of(camera, str(mi.variant())), seed=seed)
     check_dropped_rays()
     return Layers.on_device(layers, (camera.height, camera.width))
 
 
-def device_array(values: npt.NDArray[Any]) -> Any:
+def device_array(values: npt.NDArray[Any]) -> mi.Float | mi.Color3f:
     """Upload values as flat row-major floats: (H, W) as Float, (H, W, 3) as Color3f."""
     ensure_variant()
     flat = wrapped(mi.Float, values.astype(np.float32, copy=False))
     return flat if values.ndim == 2 else dr.unravel(mi.Color3f, flat)
 
 
-def host_array(values: Any, shape: tuple[int, int]) -> Float32Array:
+def host_array(values: dr.ArrayBase, shape: tuple[int, int]) -> Float32Array:
     """Copy flat row-major device values to the host: (H, W), or (H, W, 3) for three channels.
 
     Arrays of one channel are read-only, because on a CPU they share the device's memory.
@@ -208,7 +214,7 @@ def host_array(values: Any, shape: tuple[int, int]) -> Float32Array:
     return np.asarray(array.reshape(size), dtype=np.float32)
 
 
-def _host_ids(ids: Any, shape: tuple[int, int]) -> npt.NDArray[np.uint16]:
+def _host_ids(ids: mi.UInt32, shape: tuple[int, int]) -> npt.NDArray[np.uint16]:
     """Copy ids to the host, (H, W); two ids are packed into 32 bits, because Dr.Jit has no 16-bit integers."""
     count = dr.width(ids)
     if count > 1:
@@ -219,7 +225,9 @@ def _host_ids(ids: Any, shape: tuple[int, int]) -> npt.NDArray[np.uint16]:
     return halves.reshape(shape) if count > 1 else np.full(shape, halves)
 
 
-def render_silhouettes(integrator: Any, scene: Any, camera: Camera, *, source: str = "splats") -> dict[int, Silhouette]:
+def render_silhouettes(
+    integrator: mi.Integrator, scene: mi.Scene, camera: Camera, *, source: str = "splats"
+) -> dict[int, Silhouette]:
     """Return the unoccluded silhouette of every instance, by its ``splats`` or its ``proxies``."""
     silhouettes = dict(integrator.silhouettes(scene, _sensor_of(camera, str(mi.variant())), source=source))
     check_dropped_rays()

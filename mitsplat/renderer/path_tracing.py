@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -53,7 +52,7 @@ def trace_radiance(
 
 
 def _mean_radiance(
-    scene: mi.Scene, origins: Any, directions: Any, *, samples: int, bounces: int, seed: int
+    scene: mi.Scene, origins: mi.Point3f, directions: mi.Vector3f, *, samples: int, bounces: int, seed: int
 ) -> tuple[Float64Array, Float64Array]:
     """Return mean radiance (N, 3) of every ``samples`` consecutive rays, black for misses, and hit share (N,).
 
@@ -76,7 +75,7 @@ def _mean_radiance(
 
 
 @lru_cache(maxsize=4)
-def _path_tracer(bounces: int, samples: int, variant: str) -> tuple[Any, Any]:
+def _path_tracer(bounces: int, samples: int, variant: str) -> tuple[mi.Integrator, mi.Sampler]:
     """Return cached integrator and sampler; seeding resets the sampler.
 
     Loading them would delay the next launch on a GPU.

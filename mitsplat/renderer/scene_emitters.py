@@ -49,7 +49,7 @@ def emitter_dict(light: LightSpec, folder: Path | None = None) -> dict[str, Any]
     }
 
 
-def movable(description: dict[str, Any]) -> Any:
+def movable(description: dict[str, Any]) -> dict[str, Any] | mi.Shape:
     """Return an emitter whose pose may change in every frame without a new compilation of kernels.
 
     A rectangle is loaded here and its pose made opaque. Its frame is then computed on the device, and may differ in the

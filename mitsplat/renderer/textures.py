@@ -92,9 +92,9 @@ def finished_mesh(
     shape: Shape,
     finish: MaterialDraw,
     image: ByteImage | None,
-    bsdf: Any = None,
+    bsdf: mi.BSDF | None = None,
     travel: float = 0.0,
-) -> Any:
+) -> mi.Mesh:
     """Create Mitsuba's shape of a mesh with texture coordinates.
 
     Args:

@@ -11,16 +11,15 @@ view records. Dr.Jit's automatic differentiation continues through the projectio
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import replace
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from mitsplat.quality import KERNELS, Quality
-from mitsplat.renderer.rays.camera_rays import TILE_WIDTH, CameraView
+from mitsplat.renderer.rays.camera_rays import TILE_WIDTH, CameraView, Kind, ViewNumbers
 from mitsplat.renderer.splatting.gaussian import SCALE_RATIO_MIN, Cloud
 from mitsplat.renderer.splatting.march import march
 from mitsplat.renderer.splatting.projection import CloudSet, Placement, Projector, placement_table
@@ -35,7 +34,7 @@ PAIRS_AT_ONCE = 1 << 20
 """Number of pairs of a Gaussian and a tile whose gradients are stored at once, 512 bytes each."""
 
 
-def render_differentiable(cloud: Cloud, view: CameraView, quality: Quality) -> tuple[list[Any], Any]:
+def render_differentiable(cloud: Cloud, view: CameraView, quality: Quality) -> tuple[list[mi.Float], mi.Float]:
     """Render display-encoded colour (three flat row-major arrays, times alpha) and alpha with gradients.
 
     Gaussians that reach the camera's plane are omitted, because they would have no gradient and a fit could not move
@@ -56,7 +55,7 @@ def render_differentiable(cloud: Cloud, view: CameraView, quality: Quality) -> t
     return rgb, alpha
 
 
-def _with_depth_as_red(records: Any) -> Any:
+def _with_depth_as_red(records: mi.Float) -> mi.Float:
     """Return view records with the depth of the centre as red."""
     row = dr.arange(mi.UInt32, dr.width(records) // RECORD) * RECORD
     with_depth = dr.copy(records)
@@ -102,8 +101,8 @@ class Eye:
 
 
 def project_cloud(
-    cloud: Cloud, kind: tuple[Any, ...], numbers: Mapping[str, Any], quality: Quality
-) -> tuple[Any, Any, Any, Any]:
+    cloud: Cloud, kind: Kind, numbers: ViewNumbers, quality: Quality
+) -> tuple[mi.Float, mi.Float, mi.UInt32, mi.Bool]:
     """Return view records, least depths, tile boxes and visibility of all Gaussians, not evaluated.
 
     Args:
@@ -119,7 +118,11 @@ def project_cloud(
 
 
 def gather_gradients(
-    cloud: Cloud, kind: tuple[Any, ...], numbers: Mapping[str, Any], quality: Quality, found: Any
+    cloud: Cloud,
+    kind: Kind,
+    numbers: ViewNumbers,
+    quality: Quality,
+    found: mi.Float,
 ) -> None:
     """Add the gradients of view records to those of a cloud's parameters.
 
@@ -143,7 +146,7 @@ def gather_gradients(
         _propagate(values, dr.select(own, dr.grad(leaf), 0))
 
 
-def _propagate(values: Any, gradient: Any) -> None:
+def _propagate(values: mi.Float, gradient: mi.Float) -> None:
     """Propagate a gradient to all inputs of ``values``."""
     dr.set_grad(values, gradient)
     dr.enqueue(dr.ADMode.Backward, values)
@@ -168,7 +171,7 @@ class RenderOp:
         tiles = Table(lists.entries), lists.records, lists.start, lists.stop
         self.rgb, self.alpha, self._slopes = _image(view.kind, view.numbers, quality, *tiles)
 
-    def gradient(self, colour: list[Any], alpha: Any) -> Any:
+    def gradient(self, colour: list[mi.Float], alpha: mi.Float) -> mi.Float:
         """Return the gradient of the flat records from evaluated gradients of colour and alpha."""
         lists, view, seen = self._lists, self._view, [*self.rgb, self.alpha]
         gradient = [*colour, alpha]
@@ -187,8 +190,14 @@ def _rounded_up(pairs: int) -> int:
 
 @recorded
 def _image(
-    kind: tuple[Any, ...], numbers: dict[str, Any], quality: Quality, entries: Any, records: Any, start: Any, stop: Any
-) -> tuple[list[Any], Any, Any]:
+    kind: Kind,
+    numbers: ViewNumbers,
+    quality: Quality,
+    entries: mi.UInt32,
+    records: mi.Float,
+    start: mi.UInt32,
+    stop: mi.UInt32,
+) -> tuple[list[mi.Float], mi.Float, tuple[list[mi.Float], list[mi.Float]] | None]:
     """Return colours and alpha of the rays of a view, and the slopes of the rays of a distorted lens."""
     view = CameraView.of_numbers(kind, numbers)
     lists = _bare_lists(entries, None, None, records, start, stop, dr.width(entries))
@@ -200,27 +209,35 @@ def _image(
 
 @recorded
 def _image_gradient(
-    kind: tuple[Any, ...],
-    numbers: dict[str, Any],
+    kind: Kind,
+    numbers: ViewNumbers,
     quality: Quality,
     max_pairs: int,
-    entries: Any,
-    slots: Any,
-    first: Any,
-    records: Any,
-    start: Any,
-    stop: Any,
-    seen: list[Any],
-    gradient: list[Any],
-    slopes: Any,
-) -> Any:
+    entries: mi.UInt32,
+    slots: mi.UInt32,
+    first: mi.UInt32,
+    records: mi.Float,
+    start: mi.UInt32,
+    stop: mi.UInt32,
+    seen: list[mi.Float],
+    gradient: list[mi.Float],
+    slopes: tuple[list[mi.Float], list[mi.Float]] | None,
+) -> mi.Float:
     """Return the gradient of the view records from those of colours and alpha, for at most ``max_pairs`` pairs."""
     view = CameraView.of_numbers(kind, numbers)
     lists = _bare_lists(entries, slots, first, records, start, stop, max_pairs)
     return _gradient(lists, view, quality, seen, gradient, slopes or Lanes(lists, view).centre_slopes())
 
 
-def _bare_lists(entries: Any, slots: Any, first: Any, records: Any, start: Any, stop: Any, pairs: int) -> TileLists:
+def _bare_lists(
+    entries: mi.UInt32,
+    slots: mi.UInt32 | None,
+    first: mi.UInt32 | None,
+    records: mi.Float,
+    start: mi.UInt32,
+    stop: mi.UInt32,
+    pairs: int,
+) -> TileLists:
     """Return tile lists of one instance for the order per tile."""
     visible = dr.width(records) // RECORD
     return TileLists(records, None, entries, slots, first, None, start, stop, visible, pairs, _PLACEMENT.instance, None)
@@ -234,7 +251,7 @@ class DepthRendering(RenderOp):
         self._depths = RenderOp(replace(lists, records=_with_depth_as_red(lists.records)), view, quality)
         self.moment = self._depths.rgb[0]
 
-    def gradient_of_moment(self, moment: Any) -> Any:
+    def gradient_of_moment(self, moment: mi.Float) -> mi.Float:
         """Return the gradient of the records from an evaluated gradient of the moment."""
         nothing = dr.zeros(mi.Float, dr.width(moment))
         with_depth = self._depths.gradient([moment, nothing, nothing], nothing)
@@ -245,7 +262,7 @@ class DepthRendering(RenderOp):
 
 
 def render_records(
-    records: Any, least: Any, box: Any, view: CameraView, quality: Quality, *, depth: bool = False
+    records: mi.Float, least: mi.Float, box: mi.UInt32, view: CameraView, quality: Quality, *, depth: bool = False
 ) -> RenderOp:
     """Render the result of :func:`project_cloud`; with ``depth``, as a :class:`DepthRendering`.
 
@@ -258,7 +275,9 @@ def render_records(
     return (DepthRendering if depth else RenderOp)(lists, view, quality)
 
 
-def pack_cloud(means: Any, quats: Any, scales: Any, opacities: Any, sh: Any, bands: int) -> Cloud:
+def pack_cloud(
+    means: mi.Float, quats: mi.Float, scales: mi.Float, opacities: mi.Float, sh: mi.Float, bands: int
+) -> Cloud:
     """Pack differentiable parameters like :func:`mitsplat.renderer.splatting.gaussian.upload_cloud`.
 
     Args:
@@ -291,7 +310,9 @@ def pack_cloud(means: Any, quats: Any, scales: Any, opacities: Any, sh: Any, ban
 class _March(dr.CustomOp):
     """March as a differentiable function of the view records."""
 
-    def eval(self, records: Any, context: Callable[[], tuple[TileLists, CameraView, Quality]]) -> tuple[Any, ...]:
+    def eval(
+        self, records: mi.Float, context: Callable[[], tuple[TileLists, CameraView, Quality]]
+    ) -> tuple[mi.Float, mi.Float, mi.Float, mi.Float]:
         lists, view, quality = context()
         self.rendering = RenderOp(replace(lists, records=records), view, quality)
         return (*self.rendering.rgb, self.rendering.alpha)
@@ -309,10 +330,10 @@ def march_backward(
     lists: TileLists,
     view: CameraView,
     quality: Quality,
-    seen: list[Any],
-    gradient: list[Any],
-    slopes: tuple[list[Any], list[Any]] | None,
-) -> Any:
+    seen: list[mi.Float],
+    gradient: list[mi.Float],
+    slopes: tuple[list[mi.Float], list[mi.Float]] | None,
+) -> mi.Float:
     """Return the gradient of the flat view records from gradients of red, green, blue and alpha.
 
     Args:
@@ -336,7 +357,7 @@ def march_backward(
     return total
 
 
-def _parts(lists: TileLists) -> Iterator[tuple[TileLists, Any]]:
+def _parts(lists: TileLists) -> Iterator[tuple[TileLists, mi.UInt32]]:
     """Yield lists of consecutive tiles with at most :data:`PAIRS_AT_ONCE` pairs, and their lane numbers.
 
     A single tile may have more pairs. Positions by record are counted within each part.
@@ -371,10 +392,10 @@ def _gradient(
     lists: TileLists,
     view: CameraView,
     quality: Quality,
-    seen: list[Any],
-    gradient: list[Any],
-    slopes: tuple[list[Any], list[Any]],
-) -> Any:
+    seen: list[mi.Float],
+    gradient: list[mi.Float],
+    slopes: tuple[list[mi.Float], list[mi.Float]],
+) -> mi.Float:
     """Return the gradient from the tiles of lists; ``lists.pairs`` is an upper bound of their pairs."""
     lanes = Lanes(lists, view)
     us, vs = slopes
@@ -383,7 +404,7 @@ def _gradient(
     cut = dr.log2(dr.opaque(mi.Float, quality.alpha_min))
     end, near = dr.opaque(mi.Float, quality.transmittance_min), view.near_plane
 
-    def load(values: Any) -> list[Any]:
+    def load(values: mi.Float) -> list[mi.Float]:
         return [dr.gather(mi.Float, values, p, m) for p, m in zip(lanes.pixel, lanes.inside, strict=True)]
 
     d_colour = list(zip(*(load(g) for g in gradient[:3]), strict=True))
@@ -394,7 +415,9 @@ def _gradient(
         for cs, ds, a, d_alpha in zip(whole, d_colour, load(seen[3]), load(gradient[3]), strict=True)
     ]
 
-    def body(i: Any, light: list[Any], rest: list[Any]) -> tuple[Any, list[Any], list[Any]]:
+    def body(
+        i: mi.UInt32, light: list[mi.Float], rest: list[mi.Float]
+    ) -> tuple[mi.UInt32, list[mi.Float], list[mi.Float]]:
         record = GaussianRecord.fetch(lists.records, dr.gather(mi.UInt32, lists.entries, i))
         u0, v0, a, b2, c, log_opacity, red, green, blue, depth, e, f, g, h, k, _ = record
         sums = [mi.Float(0) for _ in range(RECORD)]
@@ -440,7 +463,7 @@ def _gradient(
         dr.scatter(shares, mi.ArrayXf(sums), dr.gather(mi.UInt32, lists.slots, i) * TILE_WIDTH + column)
         return i + 1, new_light, new_rest
 
-    def alive(i: Any, light: list[Any], rest: list[Any]) -> Any:
+    def alive(i: mi.UInt32, light: list[mi.Float], rest: list[mi.Float]) -> mi.Bool:
         return (i < lanes.stop) & (max_of(light) > end)
 
     state = lanes.start, [mi.Float(1) for _ in us], behind
@@ -449,7 +472,7 @@ def _gradient(
     return _sum_shares(shares, lists)
 
 
-def _sum_shares(shares: Any, lists: TileLists) -> Any:
+def _sum_shares(shares: mi.Float, lists: TileLists) -> mi.Float:
     """Sum the gradients of each record over the columns of its tiles.
 
     The order of additions is fixed, so that every run is bit-identical; atomic additions are not. A record that covers
@@ -475,11 +498,11 @@ _TILES_PER_LANE = 32
 """Number of tiles whose gradients one lane adds."""
 
 
-def _sum_rows(rows: Any, start: Any, stop: Any) -> Any:
+def _sum_rows(rows: mi.Float, start: mi.UInt32, stop: mi.UInt32) -> mi.Float:
     """Sum the rows of :data:`RECORD` floats from ``start`` to ``stop`` (exclusive); return one row per range."""
     width = dr.width(start)
 
-    def add(i: Any, sums: list[Any]) -> tuple[Any, list[Any]]:
+    def add(i: mi.UInt32, sums: list[mi.Float]) -> tuple[mi.UInt32, list[mi.Float]]:
         row = dr.gather(mi.ArrayXf, rows, i, shape=(RECORD, dr.width(i)))
         return i + 1, [total + own for total, own in zip(sums, row, strict=True)]
 

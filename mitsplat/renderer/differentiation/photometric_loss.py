@@ -6,7 +6,6 @@ SSIM is that of Wang et al. 2004 with an 11 x 11 Gaussian window of 1.5 px, zero
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -19,7 +18,9 @@ _taps = np.exp(-0.5 * (np.arange(-RADIUS, RADIUS + 1) / SIGMA) ** 2)
 _WEIGHTS = tuple(float(w) for w in _taps / _taps.sum())
 
 
-def photometric_loss(seen: list[Any], target: list[Any], width: int, height: int, ssim_share: float) -> Any:
+def photometric_loss(
+    seen: list[mi.Float], target: list[mi.Float], width: int, height: int, ssim_share: float
+) -> mi.Float:
     """Compute ``(1 - s) L1 + s (1 - SSIM)`` of two pictures (Kerbl et al. 2023, eq. 7).
 
     The loss has gradients to the first picture.
@@ -44,19 +45,19 @@ def photometric_loss(seen: list[Any], target: list[Any], width: int, height: int
 class _Ssim(dr.CustomOp):
     """Mean SSIM of one picture against a fixed one."""
 
-    def eval(self, seen: list[Any], context: Callable[[], tuple[list[Any], int, int]]) -> Any:
+    def eval(self, seen: list[mi.Float], context: Callable[[], tuple[list[mi.Float], int, int]]) -> mi.Float:
         target, self.width, self.height = context()
         pixel = dr.arange(mi.UInt32, self.width * self.height)
         self.pictures = _pack([*(dr.detach(x) for x in seen), *target, 0, 0], pixel)
         value, self.slopes = dr.empty(mi.Float, dr.width(pixel)), dr.empty(mi.Float, 12 * dr.width(pixel))
 
-        def moments(index: Any, inside: Any) -> list[Any]:
+        def moments(index: mi.UInt32, inside: mi.Bool) -> list[mi.Float]:
             p = dr.gather(mi.ArrayXf, self.pictures, index, inside, shape=(8, dr.width(index)))
             x, y = [p[0], p[1], p[2]], [p[3], p[4], p[5]]
             pairs = list(zip(x, y, strict=True))
             return [*x, *y, *(a * a for a in x), *(b * b for b in y), *(a * b for a, b in pairs)]
 
-        def finish(index: Any, means: list[Any]) -> None:
+        def finish(index: mi.UInt32, means: list[mi.Float]) -> None:
             values, slopes = zip(*(_ssim_of(*means[c::3]) for c in range(3)), strict=True)
             dr.scatter(value, sum(values) / 3, index, mode=dr.ReduceMode.Permute)
             by_kind = [slope for kind in zip(*slopes, strict=True) for slope in kind]
@@ -70,10 +71,10 @@ class _Ssim(dr.CustomOp):
         gain = self.grad_out() / (3 * size)
         gradient = [dr.empty(mi.Float, size) for _ in range(3)]
 
-        def slopes(index: Any, inside: Any) -> list[Any]:
+        def slopes(index: mi.UInt32, inside: mi.Bool) -> list[mi.Float]:
             return list(dr.gather(mi.ArrayXf, self.slopes, index, inside, shape=(12, dr.width(index))))[:9]
 
-        def finish(index: Any, means: list[Any]) -> None:
+        def finish(index: mi.UInt32, means: list[mi.Float]) -> None:
             p = dr.gather(mi.ArrayXf, self.pictures, index, shape=(8, dr.width(index)))
             for c, (by_mean, by_square, by_product) in enumerate(zip(means[:3], means[3:6], means[6:], strict=True)):
                 slope = gain * (by_mean + 2 * p[c] * by_square + p[3 + c] * by_product)
@@ -86,7 +87,7 @@ class _Ssim(dr.CustomOp):
         return "ssim"
 
 
-def _ssim_of(mx: Any, my: Any, xx: Any, yy: Any, xy: Any) -> tuple[Any, list[Any]]:
+def _ssim_of(mx: mi.Float, my: mi.Float, xx: mi.Float, yy: mi.Float, xy: mi.Float) -> tuple[mi.Float, list[mi.Float]]:
     """Return SSIM and its derivatives by the means of x, x^2 and xy.
 
     Arguments are a window's means of x, y, x^2, y^2 and xy.
@@ -100,7 +101,7 @@ def _ssim_of(mx: Any, my: Any, xx: Any, yy: Any, xy: Any) -> tuple[Any, list[Any
     return value, [by_mean, by_square, by_product]
 
 
-def _pack(planes: list[Any], pixel: Any) -> Any:
+def _pack(planes: list[mi.Float], pixel: mi.UInt32) -> mi.Float:
     """Interleave planes per pixel, so that one fetch reads all of them."""
     packed = dr.empty(mi.Float, len(planes) * dr.width(pixel))
     dr.scatter(packed, mi.ArrayXf(planes), pixel)
@@ -108,8 +109,8 @@ def _pack(planes: list[Any], pixel: Any) -> Any:
     return packed
 
 
-_Read = Callable[[Any, Any], list[Any]]
-_Write = Callable[[Any, list[Any]], None]
+_Read = Callable[["mi.UInt32", "mi.Bool"], "list[mi.Float]"]
+_Write = Callable[["mi.UInt32", "list[mi.Float]"], None]
 
 
 def _blur(read: _Read, write: _Write, width: int, height: int) -> None:
@@ -128,19 +129,19 @@ def _blur(read: _Read, write: _Write, width: int, height: int) -> None:
     count = -(-len(along_x) // 4) * 4
     rows = _pack([*along_x, *[0] * (count - len(along_x))], pixel)
 
-    def load(index: Any, inside: Any) -> list[Any]:
+    def load(index: mi.UInt32, inside: mi.Bool) -> list[mi.Float]:
         return list(dr.gather(mi.ArrayXf, rows, index, inside, shape=(count, dr.width(index))))
 
     write(pixel, _window(load, pixel, y, width, height)[: len(along_x)])
     dr.eval()
 
 
-def _window(read: _Read, pixel: Any, place: Any, step: int, length: int) -> list[Any]:
+def _window(read: _Read, pixel: mi.UInt32, place: mi.UInt32, step: int, length: int) -> list[mi.Float]:
     """Return weighted means around each pixel along one axis.
 
     ``place`` is the pixel's coordinate on the axis, and ``length`` the size of the axis.
     """
-    sums: list[Any] = []
+    sums: list[mi.Float] = []
     for offset, weight in zip(range(-RADIUS, RADIUS + 1), _WEIGHTS, strict=True):
         inside = (mi.Int32(place) + offset >= 0) & (mi.Int32(place) + offset < length)
         values = read(mi.UInt32(mi.Int32(pixel) + offset * step), inside)

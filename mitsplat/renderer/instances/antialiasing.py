@@ -14,7 +14,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -52,7 +51,7 @@ class Edges:
     subset: TileSubset
 
     @classmethod
-    def find(cls, key: Any, view: CameraView) -> Edges | None:
+    def find(cls, key: mi.UInt32, view: CameraView) -> Edges | None:
         """Find the pixels whose ``key`` (UInt32, row-major) differs from one of their eight neighbours.
 
         Returns None if there are none.
@@ -68,18 +67,20 @@ class Edges:
         subset = TileSubset.of(differs, fine)
         return cls(view, fine, subset) if subset.count else None
 
-    def rays(self) -> Any:
+    def rays(self) -> mi.Ray3f:
         """Return the world-space rays of the finer view, with unit direction."""
         rays = self.fine.rays_through(*self.positions())
         dr.eval(rays)
         return rays
 
-    def positions(self) -> tuple[Any, Any]:
+    def positions(self) -> tuple[mi.Float, mi.Float]:
         """Return the pixel positions (x, y) of those rays in the finer view [px]."""
         x, y = self._places()
         return mi.Float(x) + 0.5, mi.Float(y) + 0.5
 
-    def trace(self, clouds: CloudSet, placements: Sequence[Placement], quality: Quality, z_max: Any | None) -> Image:
+    def trace(
+        self, clouds: CloudSet, placements: Sequence[Placement], quality: Quality, z_max: mi.Float | None
+    ) -> Image:
         """Render splats along those rays; arguments as in :func:`mitsplat.renderer.splatting.march.trace`.
 
         The rays are few, so that the order per ray replaces every order with a finite tolerance.
@@ -90,7 +91,7 @@ class Edges:
         exact = quality if quality.order == "tile" else replace(quality, tolerance=0.0)
         return _trace(clouds, placements, self.fine, self.subset, exact, z_max)
 
-    def nearest_same(self, keys: Any, own: Any) -> Any:
+    def nearest_same(self, keys: mi.UInt32, own: mi.UInt32) -> mi.UInt32:
         """Return for each ray the nearest pixel with the same key; the ray's own pixel if there is none.
 
         Args:
@@ -108,7 +109,7 @@ class Edges:
             pixel, found = dr.select(same, other, pixel), found | same
         return pixel
 
-    def averaged(self, values: Any, fine: Any) -> Any:
+    def averaged(self, values: mi.Float | mi.Color3f, fine: mi.Float | mi.Color3f) -> mi.Float | mi.Color3f:
         """Return the picture ``values`` (Float or Color3f) with means over the rays in the blocks with borders."""
         size = BLOCK_WIDTH * BLOCK_HEIGHT
         lane = dr.arange(mi.UInt32, self.subset.count * size)
@@ -126,7 +127,7 @@ class Edges:
         dr.scatter(result, total / (ZOOM * ZOOM), y * self.view.width + x, inside, mode=dr.ReduceMode.Permute)
         return result
 
-    def _places(self) -> tuple[Any, Any]:
+    def _places(self) -> tuple[mi.UInt32, mi.UInt32]:
         """Return column and row of the finer view's pixels."""
         lane = dr.arange(mi.UInt32, self.subset.count * TILE_PIXELS)
         number = dr.gather(mi.UInt32, self.subset.number, lane // TILE_PIXELS)
@@ -135,7 +136,7 @@ class Edges:
         return x, row * TILE_HEIGHT + lane // TILE_WIDTH % TILE_HEIGHT
 
 
-def _pixel(x: Any, y: Any, view: CameraView) -> Any:
+def _pixel(x: mi.Int32, y: mi.Int32, view: CameraView) -> mi.UInt32:
     """Return the number of a pixel, clamped to the image."""
     return mi.UInt32(dr.clip(y, 0, view.height - 1) * view.width + dr.clip(x, 0, view.width - 1))
 
@@ -146,7 +147,7 @@ def _trace(
     view: CameraView,
     subset: TileSubset,
     quality: Quality,
-    z_max: Any | None,
+    z_max: mi.Float | None,
 ) -> Image:
     try:
         return march_tiles(bin_gaussians(clouds, placements, view, quality, subset=subset), view, quality, z_max)

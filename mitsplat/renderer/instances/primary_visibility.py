@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -32,19 +31,24 @@ class PrimaryVisibility:
         key: Equal for rays that show the same instance or the same mesh.
     """
 
-    colour: Any
-    alpha: Any
-    splat_alpha: Any
-    cover: Any
-    solid: Any
-    diffuse: Any
-    front: Any
-    emission: Any
-    key: Any
+    colour: mi.Color3f
+    alpha: mi.Float
+    splat_alpha: mi.Float
+    cover: mi.Float
+    solid: mi.Bool
+    diffuse: mi.Bool
+    front: mi.Bool
+    emission: mi.Color3f
+    key: mi.UInt32
 
     @classmethod
     def of(
-        cls, splat: Image, behind: MeshHits | None, emitters: VisibleEmitters | None, z_max: Any | None, scale: Any
+        cls,
+        splat: Image,
+        behind: MeshHits | None,
+        emitters: VisibleEmitters | None,
+        z_max: mi.Float | None,
+        scale: mi.Color3f,
     ) -> PrimaryVisibility:
         """Combine splats, meshes and emitters.
 
@@ -71,7 +75,9 @@ class PrimaryVisibility:
         cover = dr.select(diffuse, 1, splat.alpha)
         return cls(colour, alpha, splat.alpha, cover, solid, diffuse, front, emission, key)
 
-    def lit(self, light: Any, highlight: Any, radiance: Any | None) -> tuple[Any, Any]:
+    def lit(
+        self, light: mi.Color3f, highlight: mi.Color3f, radiance: mi.Color3f | None
+    ) -> tuple[mi.Color3f, mi.Color3f]:
         """Return linear colours (Color3f) with light and as captured.
 
         ``radiance`` is that of meshes that are not purely diffuse, or None.

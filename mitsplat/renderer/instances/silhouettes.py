@@ -12,7 +12,6 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -159,10 +158,10 @@ class _Runs:
         start, stop: Range of the entries.
     """
 
-    place: Any
-    slot: Any
-    start: Any
-    stop: Any
+    place: mi.UInt32
+    slot: mi.UInt32
+    start: mi.UInt32
+    stop: mi.UInt32
 
 
 def _runs(lists: TileLists) -> _Runs:
@@ -181,7 +180,7 @@ def _runs(lists: TileLists) -> _Runs:
     own = dr.gather(mi.UInt32, before, lists.start, filled)
     after = dr.select(inside, dr.gather(mi.UInt32, before, lists.stop, inside), count)
 
-    def name(k: Any) -> tuple[Any]:
+    def name(k: mi.UInt32) -> tuple[mi.UInt32]:
         dr.scatter(place, tile, k, mode=dr.ReduceMode.Permute)
         return (k + 1,)
 
@@ -191,7 +190,7 @@ def _runs(lists: TileLists) -> _Runs:
     return _Runs(place, slot, start, stop)
 
 
-def _covered(lists: TileLists, view: CameraView, quality: Quality, runs: _Runs) -> Any:
+def _covered(lists: TileLists, view: CameraView, quality: Quality, runs: _Runs) -> mi.UInt32:
     """Return the covered pixels of every run, for each column of its tile, as bits from the top."""
     lane = dr.arange(mi.UInt32, dr.width(runs.place) * TILE_WIDTH)
     run, column = lane // TILE_WIDTH, lane % TILE_WIDTH
@@ -205,7 +204,7 @@ def _covered(lists: TileLists, view: CameraView, quality: Quality, runs: _Runs) 
     start, stop = dr.gather(mi.UInt32, runs.start, run), dr.gather(mi.UInt32, runs.stop, run)
     cut, near, shared_column = min_log_opacity(quality), view.near_plane, not view.distortion
 
-    def body(i: Any, through: list[Any]) -> tuple[Any, list[Any]]:
+    def body(i: mi.UInt32, through: list[mi.Float]) -> tuple[mi.UInt32, list[mi.Float]]:
         record = GaussianRecord.fetch(lists.records, dr.gather(mi.UInt32, lists.entries, i))
         responses = respond_along(record, lists, us, vs, shared_column, cap=None)
         return i + 1, [
@@ -213,7 +212,7 @@ def _covered(lists: TileLists, view: CameraView, quality: Quality, runs: _Runs) 
             for t, (log_alpha, z) in zip(through, responses, strict=True)
         ]
 
-    def undecided(i: Any, through: list[Any]) -> Any:
+    def undecided(i: mi.UInt32, through: list[mi.Float]) -> mi.Bool:
         return (i < stop) & (max_of(through) >= 0.5)
 
     ones = [mi.Float(1.0) for _ in range(TILE_HEIGHT)]
@@ -263,7 +262,9 @@ def _window(view: CameraView, parts: Sequence[tuple[trimesh.Trimesh, np.ndarray]
     return (int(low[0]), int(low[1]), int(high[0]), int(high[1])) if (high > low).all() else None
 
 
-def _trace_alone(view: CameraView, window: tuple[int, int, int, int], mesh: trimesh.Trimesh, pose: np.ndarray) -> Any:
+def _trace_alone(
+    view: CameraView, window: tuple[int, int, int, int], mesh: trimesh.Trimesh, pose: np.ndarray
+) -> mi.Bool:
     """Return True for the pixels of a window whose rays hit a mesh."""
     x0, y0, x1, y1 = window
     lane = dr.arange(mi.UInt32, (x1 - x0) * (y1 - y0))
@@ -284,5 +285,5 @@ def _trace_alone(view: CameraView, window: tuple[int, int, int, int], mesh: trim
 
 
 @lru_cache(maxsize=128)
-def _scene_of(mesh: trimesh.Trimesh, _variant: str) -> Any:
+def _scene_of(mesh: trimesh.Trimesh, _variant: str) -> mi.Scene:
     return ray_scene({"mesh": plain_mesh(mesh)})

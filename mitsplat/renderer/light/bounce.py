@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -51,10 +50,10 @@ class RadianceGrid:
         cells: Number of cells along x, y and z.
     """
 
-    colours: Any
-    low: Any
-    size: Any
-    cells: Any
+    colours: mi.Float
+    low: mi.Point3f
+    size: mi.Float
+    cells: mi.Point3i
 
     @classmethod
     def build(cls, splats: Splats, world_from_splats: np.ndarray) -> RadianceGrid | None:
@@ -85,7 +84,7 @@ class RadianceGrid:
             mi.Point3i(*[dr.opaque(mi.Int32, int(v)) for v in cells]),
         )
 
-    def at(self, point: Any, active: Any) -> Any:
+    def at(self, point: mi.Point3f, active: mi.Bool) -> mi.Color3f:
         """Return the linear colour (Color3f) at points [m]."""
         i = dr.clip(mi.Point3i(dr.floor((point - self.low) / self.size)), 0, self.cells - 1)
         return dr.gather(mi.Color3f, self.colours, mi.UInt32((i.z * self.cells.y + i.y) * self.cells.x + i.x), active)
@@ -105,7 +104,7 @@ class Reflectors:
     grid: RadianceGrid | None
     proxies: Proxies
     emitters: Emitters
-    white: Any
+    white: mi.Color3f
 
     @property
     def any(self) -> bool:
@@ -113,8 +112,13 @@ class Reflectors:
         return self.proxies.shows_meshes or (self.grid is not None and self.proxies.static is not None)
 
     def irradiance(
-        self, origin: Any, normal: Any, start: Any, rays: int, sequence: Callable[[Any], tuple[Any, Any]]
-    ) -> Any:
+        self,
+        origin: mi.Point3f,
+        normal: mi.Vector3f,
+        start: mi.UInt32,
+        rays: int,
+        sequence: Callable[[mi.UInt32], tuple[mi.Point2f, mi.Point2f]],
+    ) -> mi.Color3f:
         """Compute the reflected irradiance at points (Color3f) over the irradiance of display white.
 
         Args:
@@ -141,7 +145,7 @@ class Reflectors:
             dr.eval(total)
         return total / rays
 
-    def _colour(self, ray: Any, key: Any, light: Any) -> Any:
+    def _colour(self, ray: mi.Ray3f, key: mi.UInt32, light: mi.Point2f) -> mi.Color3f:
         """Return the colour (Color3f) at the hits of rays.
 
         Each scene is traced by a kernel of its own, see ``Proxies.separate_kernels``.
@@ -171,7 +175,9 @@ class Reflectors:
                 dr.scatter(colour, self._lit_mesh(*some), lane)
         return colour
 
-    def _lit_mesh(self, ray: Any, hit: Any, key: Any, light: Any) -> Any:
+    def _lit_mesh(
+        self, ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, key: mi.UInt32, light: mi.Point2f
+    ) -> mi.Color3f:
         """Return the colour (Color3f) of visible meshes: reflected light of one ray to an emitter."""
         si = hit.compute_surface_interaction(ray)
         normal = dr.select(dr.dot(si.n, ray.d) > 0, -si.n, si.n)
@@ -188,7 +194,7 @@ class Reflectors:
         return dr.select(free, colour, 0)
 
 
-def trace_bounce(tracer: ShadowTracer, reflectors: Reflectors) -> tuple[Any, Any]:
+def trace_bounce(tracer: ShadowTracer, reflectors: Reflectors) -> tuple[mi.Color3f, mi.Float]:
     """Return the reflected irradiance (Color3f) over that of display white, and a flag (Float) where it is known.
 
     Relit points of objects use a few rays each, so that their neighbours must be averaged. On visible meshes, one
@@ -225,5 +231,5 @@ def trace_bounce(tracer: ShadowTracer, reflectors: Reflectors) -> tuple[Any, Any
     return total, known
 
 
-def _two_points(i: Any) -> tuple[Any, Any]:
+def _two_points(i: mi.UInt32) -> tuple[mi.Point2f, mi.Point2f]:
     return sequence_point(i), sequence_point(i, ROBERTS)

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mitsplat.arrays import Float64Array
 from mitsplat.renderer.light.highlight import Lobe
 from mitsplat.renderer.light.rectangle_lights import Rectangles
 from mitsplat.renderer.light.sky_irradiance import SkyIrradiance
@@ -30,7 +30,7 @@ _COUNT_STEP = 4
 """Emitter counts are rounded up to multiples of this number, so that one kernel serves several counts."""
 
 
-def receiver(position: Any, normal: Any) -> Any:
+def receiver(position: mi.Point3f, normal: mi.Vector3f) -> mi.SurfaceInteraction3f:
     """Return a surface interaction to sample light for."""
     si = dr.zeros(mi.SurfaceInteraction3f, dr.width(position))
     si.p = position
@@ -39,7 +39,7 @@ def receiver(position: Any, normal: Any) -> Any:
     return si
 
 
-def lattice_point(i: Any, lattice: tuple[int, int]) -> Any:
+def lattice_point(i: mi.UInt32, lattice: tuple[int, int]) -> mi.Point2f:
     """Return point ``i`` of a centred rank-1 lattice in the unit square."""
     count, generator = lattice
     return mi.Point2f((mi.Float(i) + 0.5) / count, (mi.Float(i * generator % count) + 0.5) / count)
@@ -55,9 +55,9 @@ class Beam:
         irradiance: Unoccluded irradiance estimate (Color3f) of this single sample.
     """
 
-    direction: Any
-    reach: Any
-    irradiance: Any
+    direction: mi.Vector3f
+    reach: mi.Float
+    irradiance: mi.Color3f
 
 
 class Emitters:
@@ -67,7 +67,7 @@ class Emitters:
     is sampled half by the cosine and half by its radiance, with the balance heuristic (Veach 1997, section 9.2.2).
     """
 
-    def __init__(self, scene: Any, reference: Sequence[float], sky_reach: float = np.inf) -> None:
+    def __init__(self, scene: mi.Scene, reference: Sequence[float], sky_reach: float = np.inf) -> None:
         """Collect the emitters of a scene.
 
         Args:
@@ -99,7 +99,7 @@ class Emitters:
             dr.make_opaque(self.sky_colour)
         dr.make_opaque(self.infinite)
 
-    def _survey(self, count: int, point: Any) -> Any:
+    def _survey(self, count: int, point: mi.Point3f) -> Float64Array:
         """Return the mean radiance (count,) of each emitter around a point."""
         i = dr.arange(mi.UInt32, count * SURVEY_LATTICE[0])
         emitter = dr.gather(mi.EmitterPtr, self.pointers, i // SURVEY_LATTICE[0])
@@ -107,7 +107,7 @@ class Emitters:
         _, radiance = emitter.sample_direction(receiver(point, mi.Normal3f(0, 0, 1)), sample, True)
         return np.array(dr.sum(radiance)).reshape(count, -1).mean(axis=1)
 
-    def sample(self, si: Any, point: Any, active: Any) -> Beam:
+    def sample(self, si: mi.SurfaceInteraction3f, point: mi.Point2f, active: mi.Bool) -> Beam:
         """Sample one random direction from ``si`` for each point of the unit square."""
         index, x, chance = self.choice.sample(point.x)
         is_sky = mi.Bool(False) if self.sky is None else index == self.sky
@@ -135,7 +135,9 @@ class Emitters:
         reach = dr.select(is_sky, self.sky_reach, dr.select(infinite, dr.inf, distance))
         return Beam(direction, reach, irradiance / chance)
 
-    def _towards(self, si: Any, index: Any, point: Any, active: Any) -> tuple[Any, Any, Any]:
+    def _towards(
+        self, si: mi.SurfaceInteraction3f, index: mi.UInt32, point: mi.Point2f, active: mi.Bool
+    ) -> tuple[mi.Vector3f, mi.Float, mi.Color3f]:
         """Return unit vector and distance [m] from ``si`` to points of emitters, and radiance over sampling density."""
         if self.rectangles is None or not (self.sky is None or self.even_sky):
             emitter = dr.gather(mi.EmitterPtr, self.pointers, index, active)
@@ -144,13 +146,17 @@ class Emitters:
         return self.rectangles.towards(si.p, index, point)
 
     @staticmethod
-    def _sky_radiance(si: Any, direction: Any, emitter: Any, active: Any = True) -> Any:
+    def _sky_radiance(
+        si: mi.SurfaceInteraction3f, direction: mi.Vector3f, emitter: mi.EmitterPtr, active: mi.Bool = True
+    ) -> mi.Color3f:
         outside = dr.zeros(mi.SurfaceInteraction3f, dr.width(direction))
         outside.p = si.p
         outside.wi = -direction
         return mi.Color3f(emitter.eval(outside, active))
 
-    def open_light(self, si: Any, lobe: Lobe | None, active: Any) -> tuple[Any, Any]:
+    def open_light(
+        self, si: mi.SurfaceInteraction3f, lobe: Lobe | None, active: mi.Bool
+    ) -> tuple[mi.Color3f, mi.Color3f]:
         """Compute unoccluded irradiance and mirrored radiance (Color3f) from one fixed set of directions.
 
         ``lobe`` is None where nothing is mirrored, which takes less time.
@@ -159,7 +165,7 @@ class Emitters:
         if self.local_choice is not None:
             choice = self.local_choice
 
-            def local(point: Any) -> tuple[Any, Any]:
+            def local(point: mi.Point2f) -> tuple[mi.Color3f, mi.Color3f]:
                 index, x, chance = choice.sample(point.x)
                 direction, _, radiance = self._towards(si, index, mi.Point2f(x, point.y), active)
                 light = dr.select(active, radiance * dr.maximum(dr.dot(si.sh_frame.n, direction), 0), 0)
@@ -172,7 +178,7 @@ class Emitters:
             if lobe is not None:
                 sample_lobe = lobe.sample
 
-                def mirrored(point: Any) -> tuple[Any, Any]:
+                def mirrored(point: mi.Point2f) -> tuple[mi.Color3f, mi.Color3f]:
                     direction, weight = sample_lobe(point)
                     radiance = self.sky_colour if self.even_sky else self._sky_radiance(si, direction, emitter, active)
                     return mi.Color3f(0), dr.select(weight > 0, radiance * weight, 0)
@@ -181,10 +187,15 @@ class Emitters:
         return total, specular_lit
 
     @staticmethod
-    def _integrate(si: Any, active: Any, lattice: tuple[int, int], light: Any) -> tuple[Any, Any]:
+    def _integrate(
+        si: mi.SurfaceInteraction3f,
+        active: mi.Bool,
+        lattice: tuple[int, int],
+        light: Callable[[mi.Point2f], tuple[mi.Color3f, mi.Color3f]],
+    ) -> tuple[mi.Color3f, mi.Color3f]:
         rounds = dr.opaque(mi.UInt32, lattice[0])
 
-        def body(i: Any, total: Any, specular_lit: Any) -> tuple[Any, Any, Any]:
+        def body(i: mi.UInt32, total: mi.Color3f, specular_lit: mi.Color3f) -> tuple[mi.UInt32, mi.Color3f, mi.Color3f]:
             arriving, mirrored = light(lattice_point(i, lattice))
             return i + 1, total + arriving, specular_lit + mirrored
 
@@ -197,7 +208,7 @@ class Emitters:
 class _DiscreteDistribution:
     """Discrete distribution over a few items."""
 
-    def __init__(self, share: Any) -> None:
+    def __init__(self, share: Float64Array) -> None:
         """Set the probabilities in proportion to ``share`` (N,)."""
         chance = share / share.sum()
         # Padding with infinite limits lets one kernel serve two to four items, another five to eight, and so on.
@@ -209,7 +220,7 @@ class _DiscreteDistribution:
         self.chances = wrapped(mi.Float, chance.astype(np.float32))
         dr.make_opaque(self.starts, self.chances)
 
-    def sample(self, x: Any) -> tuple[Any, Any, Any]:
+    def sample(self, x: mi.Float) -> tuple[mi.UInt32, mi.Float, mi.Float]:
         """Sample an index from a number in [0, 1).
 
         Returns:
@@ -221,20 +232,22 @@ class _DiscreteDistribution:
         return index, dr.clip(left, 0, 1 - 2.0**-24), chance
 
 
-def _is_sky(emitter: Any) -> bool:
+def _is_sky(emitter: mi.Emitter) -> bool:
     flags = emitter.flags()
     infinite = mi.has_flag(flags, mi.EmitterFlags.Infinite)
     return bool(infinite and not mi.has_flag(flags, mi.EmitterFlags.DeltaDirection))
 
 
-def sky_irradiance(emitter: Any) -> SkyIrradiance:
+def sky_irradiance(emitter: mi.EmitterPtr) -> SkyIrradiance:
     """Compute the irradiance of an infinite emitter for every orientation, sampled in proportion to its radiance."""
     point = lattice_point(dr.arange(mi.UInt32, SPHERE_LATTICE[0]), SPHERE_LATTICE)
     sample, radiance = emitter.sample_direction(receiver(mi.Point3f(0), mi.Vector3f(0, 0, 1)), point, True)
     return SkyIrradiance(sample.d, radiance)
 
 
-def reference_irradiance(scene: Any, point: Sequence[float], normal: Sequence[float] = (0.0, 0.0, 1.0)) -> Any:
+def reference_irradiance(
+    scene: mi.Scene, point: Sequence[float], normal: Sequence[float] = (0.0, 0.0, 1.0)
+) -> mi.Color3f:
     """Compute the unoccluded irradiance (Color3f) of the scene's emitters on a surface element.
 
     Where almost no light reaches that element, the result is the mean over all orientations (a quarter of the fluence).

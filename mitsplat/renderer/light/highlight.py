@@ -9,7 +9,6 @@ or blurred by the filter.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -39,10 +38,10 @@ class Lobe:
         specular: Reflectance at normal incidence.
     """
 
-    normal: Any
-    to_camera: Any
-    alpha: Any
-    specular: Any
+    normal: mi.Vector3f
+    to_camera: mi.Vector3f
+    alpha: mi.Float
+    specular: mi.Float
 
     @classmethod
     def of(cls, surface: LitSurface) -> Lobe:
@@ -50,7 +49,7 @@ class Lobe:
         alpha = dr.square(dr.maximum(surface.roughness, MIN_ROUGHNESS))
         return cls(surface.normal, surface.to_camera, alpha, surface.specular)
 
-    def reflectance(self, to_light: Any) -> Any:
+    def reflectance(self, to_light: mi.Vector3f) -> mi.Float:
         """Return the radiance towards the camera per irradiance from unit vectors towards the light."""
         alpha2, cos_camera = dr.square(self.alpha), self._cos_camera()
         cos_light = dr.dot(self.normal, to_light)
@@ -62,7 +61,7 @@ class Lobe:
         fresnel = self._fresnel(dr.dot(half, to_light))
         return dr.select(cos_light > 0, distribution * fresnel * 0.5 / dr.maximum(masking, 1e-6), 0)
 
-    def sample(self, point: Any) -> tuple[Any, Any]:
+    def sample(self, point: mi.Point2f) -> tuple[mi.Vector3f, mi.Float]:
         """Sample a direction from a point of the unit square.
 
         Uses the distribution of visible normals (Heitz 2018, "Sampling the GGX Distribution of Visible Normals").
@@ -83,19 +82,19 @@ class Lobe:
         masking = cos_light * (cos_camera + own) / dr.maximum(cos_light * own + cos_camera * other, 1e-6)
         return frame.to_world(direction), dr.select(cos_light > 0, self._fresnel(cos_half) * masking, 0)
 
-    def _cos_camera(self) -> Any:
+    def _cos_camera(self) -> mi.Float:
         return dr.maximum(dr.dot(self.normal, self.to_camera), 1e-3)
 
     @staticmethod
-    def _reach(cosine: Any, alpha2: Any) -> Any:
+    def _reach(cosine: mi.Float, alpha2: mi.Float) -> mi.Float:
         return dr.sqrt(dr.fma(cosine * cosine, 1 - alpha2, alpha2))
 
-    def _fresnel(self, cosine: Any) -> Any:
+    def _fresnel(self, cosine: mi.Float) -> mi.Float:
         grazing = dr.power(dr.clip(1 - cosine, 0, 1), 5)
         return dr.select(self.specular > 0, dr.fma(1 - self.specular, grazing, self.specular), 0)
 
 
-def mirrored_tent(surface: LitSurface) -> Any:
+def mirrored_tent(surface: LitSurface) -> mi.Float:
     """Return the specular part of the captured colour: the lobe's reflectance under even light.
 
     The fit is that of Karis (2014, "Physically Based Shading on Mobile", Unreal Engine) without its rise beyond 60

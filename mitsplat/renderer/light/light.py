@@ -23,7 +23,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -105,7 +104,7 @@ class Lighting:
     visible: VisibleSurfaces
     accuracy: Accuracy
     seed: int
-    white: Any
+    white: mi.Color3f
 
     @property
     def view(self) -> CameraView:
@@ -119,18 +118,18 @@ class Lighting:
 
 
 def light_factor(
-    scene: Any,
+    scene: mi.Scene,
     proxies: Proxies,
     visible: VisibleSurfaces,
     *,
     accuracy: Accuracy,
     seed: int,
     reference: tuple[float, ...],
-    white: Any,
+    white: mi.Color3f,
     sky_reach: float = float("inf"),
     grid: RadianceGrid | None = None,
     bounce: bool = False,
-) -> tuple[Any, Any]:
+) -> tuple[mi.Color3f, mi.Color3f]:
     """Compute light factor and highlight (Color3f) of every visible point, see the module docstring.
 
     The stages are: search for shadows, coarse light on planes, first rays, unoccluded light, bounce, further rays,
@@ -173,7 +172,7 @@ def light_factor(
     return light, highlight
 
 
-def search_shadows(lighting: Lighting) -> tuple[Any, Any, Any | None]:
+def search_shadows(lighting: Lighting) -> tuple[mi.Bool, mi.Color3f, mi.UInt32 | None]:
     """Find the pixels whose light must be traced, by one ray per captured pixel.
 
     Captured points in tiles where dynamic objects occlude a share f below the wanted error take the factor 1 - f.
@@ -201,7 +200,7 @@ def search_shadows(lighting: Lighting) -> tuple[Any, Any, Any | None]:
     return needed, light, codes
 
 
-def trace_planes(lighting: Lighting, needed: Any, codes: Any | None) -> CoarseLight | None:
+def trace_planes(lighting: Lighting, needed: mi.Bool, codes: mi.UInt32 | None) -> CoarseLight | None:
     """Trace the first rays on visible planes in even light, at one pixel of four; return None if there are none."""
     if codes is None or lighting.view.height < MIN_ROWS:
         return None
@@ -224,15 +223,15 @@ class TracedPixels:
     """
 
     lighting: Lighting
-    index: Any
+    index: mi.UInt32
     here: LitSurface
     light_filter: LightFilter
     points: LightPoints
-    order: Any
+    order: mi.UInt32
     coarse: CoarseLight | None
 
     @classmethod
-    def of(cls, lighting: Lighting, index: Any, coarse: CoarseLight | None) -> TracedPixels:
+    def of(cls, lighting: Lighting, index: mi.UInt32, coarse: CoarseLight | None) -> TracedPixels:
         """Place the sample points of the pixels ``index``."""
         visible, view = lighting.visible, lighting.view
         here = visible.at(index)
@@ -242,7 +241,7 @@ class TracedPixels:
         points = LightPoints.of(visible, here, index, light_filter.place, order)
         return cls(lighting, index, here, light_filter, points, order, coarse)
 
-    def _tracer(self, surface: LitSurface, pixel: Any) -> ShadowTracer:
+    def _tracer(self, surface: LitSurface, pixel: mi.UInt32) -> ShadowTracer:
         lighting, lattice = self.lighting, self.coarse and self.coarse.lattice
         return ShadowTracer(lighting.emitters, lighting.proxies, surface, pixel, lighting.view, lighting.seed, lattice)
 
@@ -273,7 +272,7 @@ class TracedPixels:
             estimate = tracer.trace(rows, estimate, rays, first, points.steps(rows))
         return estimate
 
-    def trace_further_rays(self, estimate: Estimate, level: Any) -> Estimate:
+    def trace_further_rays(self, estimate: Estimate, level: mi.Float) -> Estimate:
         """Trace more rays from pixels whose light has not reached the wanted error.
 
         The number of rays is doubled until it suffices for the variance of the first rays, see
@@ -301,7 +300,9 @@ class TracedPixels:
         rows, extra = (dr.gather(mi.UInt32, values, lane) for values in (rows, points.ray_count(extra, rows)))
         return self._point_tracer.trace(rows, estimate, extra, accuracy.most - first, points.steps(rows))
 
-    def combine(self, light: Any, unoccluded: UnoccludedLight, means: LightMeans) -> tuple[Any, Any]:
+    def combine(
+        self, light: mi.Color3f, unoccluded: UnoccludedLight, means: LightMeans
+    ) -> tuple[mi.Color3f, mi.Color3f]:
         """Combine filtered sums into light factor and highlight of all pixels.
 
         With the arriving share s = lit / base, unoccluded irradiance E and mirrored radiance R:
@@ -348,7 +349,7 @@ class TracedPixels:
         return light, highlight
 
 
-def _doublings(wanted: Any, rays: int, most: int) -> tuple[Any, Any]:
+def _doublings(wanted: mi.Float, rays: int, most: int) -> tuple[mi.UInt32, mi.UInt32]:
     """Return the number of doublings of ``rays`` up to ``wanted`` or ``most``, and the number of additional rays."""
     level, extra = (dr.zeros(mi.UInt32, dr.width(wanted)) for _ in range(2))
     while rays < most:
@@ -360,7 +361,7 @@ def _doublings(wanted: Any, rays: int, most: int) -> tuple[Any, Any]:
     return level, extra
 
 
-def _in_blocks(place: Any, view: CameraView) -> Any:
+def _in_blocks(place: mi.UInt32, view: CameraView) -> mi.UInt32:
     """Return the values of an image ``place``, except UNTRACED, in the order of :func:`block_order`."""
     pixel, inside = block_order(view)
     ordered = dr.select(inside, dr.gather(mi.UInt32, place, pixel), UNTRACED)

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
+from mitsplat.renderer.light.lit_surface import LitSurface
 from mitsplat.renderer.rays.camera_rays import CameraView
 
 RADIUS = 4
@@ -65,12 +65,12 @@ class Estimate:
         rays: Number of rays.
     """
 
-    lit: Any
-    base: Any
-    specular_lit: Any
-    specular_base: Any
-    squares: Any
-    rays: Any
+    lit: mi.Color3f
+    base: mi.Color3f
+    specular_lit: mi.Float
+    specular_base: mi.Float
+    squares: mi.Float
+    rays: mi.Float
 
     @classmethod
     def empty(cls, count: int) -> Estimate:
@@ -79,15 +79,15 @@ class Estimate:
         return cls(*colours, *numbers)
 
     @property
-    def sums(self) -> tuple[Any, ...]:
+    def sums(self) -> tuple[mi.Color3f, mi.Color3f, mi.Float, mi.Float, mi.Float]:
         """All fields except the number of rays."""
         return self.lit, self.base, self.specular_lit, self.specular_base, self.squares
 
-    def scattered(self, places: Any, count: int) -> Estimate:
+    def scattered(self, places: mi.UInt32, count: int) -> Estimate:
         """Return this estimate at ``places`` of ``count`` points, without rays at the others."""
         return Estimate.empty(count).updated(places, *self.sums, self.rays)
 
-    def updated(self, places: Any, *values: Any) -> Estimate:
+    def updated(self, places: mi.UInt32, *values: mi.Float | mi.Color3f) -> Estimate:
         """Write new values at some points in place and return the estimate."""
         dr.eval(values)  # avoids a copy of the source arrays before the write
         for old, new in zip((*self.sums, self.rays), values, strict=True):
@@ -106,11 +106,11 @@ class LightMeans:
         bounced: Reflected light (Color3f) over the irradiance of white, or None.
     """
 
-    lit: Any
-    base: Any
-    specular_lit: Any
-    specular_base: Any
-    bounced: Any | None
+    lit: mi.Color3f
+    base: mi.Color3f
+    specular_lit: mi.Float
+    specular_base: mi.Float
+    bounced: mi.Color3f | None
 
 
 class LightFilter:
@@ -126,7 +126,9 @@ class LightFilter:
     from known neighbours that show the same instance.
     """
 
-    def __init__(self, here: Any, view: CameraView, index: Any, coarse: Any = None, stride: int = 1) -> None:
+    def __init__(
+        self, here: LitSurface, view: CameraView, index: mi.UInt32, coarse: mi.Bool | None = None, stride: int = 1
+    ) -> None:
         """Prepare the filter.
 
         Args:
@@ -155,7 +157,7 @@ class LightFilter:
             self.shown = dr.select(coarse, dr.gather(mi.UInt32, self.place, stands, coarse), self.place)
             dr.eval(self.shown)
 
-    def rays_for(self, estimate: Estimate, error: float, unshadowed: Any, metered: int = 0) -> Any:
+    def rays_for(self, estimate: Estimate, error: float, unshadowed: mi.Float, metered: int = 0) -> mi.Float:
         """Compute the number of rays per pixel of ``index`` at which light reaches the wanted error.
 
         The wanted error applies at mid-grey (HALF). At other levels the same perceptual error is tolerated: a smaller
@@ -179,7 +181,7 @@ class LightFilter:
         allowed = error * dr.power(dr.clip(light, MIN_LIGHT, 1) / MID_GREY, 1 - DISPLAY)
         return estimate.rays * variance * dr.square(unshadowed / allowed) / gain
 
-    def smooth(self, estimate: Estimate, bounced: tuple[Any, Any] | None = None) -> LightMeans:
+    def smooth(self, estimate: Estimate, bounced: tuple[mi.Color3f, mi.Float] | None = None) -> LightMeans:
         """Average the light of the estimate per ray over neighbours of the pixels of ``index``.
 
         ``bounced`` is reflected light and the flag (Float) where it is known (1, otherwise 0). Its average is 0 where
@@ -196,7 +198,7 @@ class LightFilter:
             mean_bounced = dr.select(share > 1e-6, mi.Color3f(*colour) / share, 0)
         return LightMeans(mi.Color3f(*values[:3]), mi.Color3f(*values[3:6]), values[6], values[7], mean_bounced)
 
-    def _share(self, estimate: Estimate) -> tuple[Any, Any, Any]:
+    def _share(self, estimate: Estimate) -> tuple[mi.Float, mi.Float, mi.Float]:
         """Return the light share over 3 x 3 pixels, its variance, and the number of pixels that contribute."""
         weight = dr.rcp(dr.maximum(estimate.rays, 1))
         values = [dr.sum(estimate.lit) * weight, dr.sum(estimate.base) * weight, estimate.squares * weight]
@@ -208,13 +210,13 @@ class LightFilter:
         dr.eval(share, variance)
         return share, variance, shared
 
-    def average(self, values: list[Any]) -> list[Any]:
+    def average(self, values: list[mi.Float]) -> list[mi.Float]:
         """Average values at the pixels of ``index`` that all have the same number of rays."""
         return self._average(values, dr.full(mi.Float, 1, dr.width(self.index)), RADIUS)[0]
 
     def _average(
-        self, values: list[Any], rays: Any, radius: int, share: tuple[Any, Any] | None = None
-    ) -> tuple[list[Any], Any]:
+        self, values: list[mi.Float], rays: mi.Float, radius: int, share: tuple[mi.Float, mi.Float] | None = None
+    ) -> tuple[list[mi.Float], mi.Float]:
         """Return averages, and the effective number of equally weighted pixels with the same number of rays.
 
         If ``share`` (light share and variance) is given, only neighbours whose share differs by no more than noise
@@ -231,8 +233,13 @@ class LightFilter:
         return values, alike
 
     def _average_along(
-        self, values: list[Any], traits: Any, direction: tuple[int, int], radius: int, share: tuple[Any, Any] | None
-    ) -> tuple[list[Any], Any]:
+        self,
+        values: list[mi.Float],
+        traits: mi.Float,
+        direction: tuple[int, int],
+        radius: int,
+        share: tuple[mi.Float, mi.Float] | None,
+    ) -> tuple[list[mi.Float], mi.Float]:
         """Average over pixels up to ``radius`` away along a direction (x, y); the outermost pixels have half weight.
 
         The loop is symbolic, because tracing a step on the host takes as long as its execution on the device.
@@ -246,7 +253,9 @@ class LightFilter:
         ]
         last = dr.opaque(mi.UInt32, radius)
 
-        def add(step: Any, weights: Any, squares: Any, *sums: Any) -> tuple[Any, ...]:
+        def add(
+            step: mi.UInt32, weights: mi.Float, squares: mi.Float, *sums: mi.Float
+        ) -> tuple[mi.UInt32 | mi.Float, ...]:
             distance = (step >> 1) + 1
             signed = dr.select((step & 1) == 0, -mi.Int32(distance), mi.Int32(distance))
             nx, ny = x + signed * along_x, y + signed * along_y
@@ -284,7 +293,7 @@ class LightFilter:
         return averages, weights * weights / (squares * own_rays)
 
 
-def _metered(light: Any, area: Any, pixels: int) -> Any:
+def _metered(light: mi.Float, area: mi.Int32, pixels: int) -> mi.Float:
     """Return the exposure factor that makes the mean of a picture look like HALF.
 
     Each value of ``light`` represents ``area`` pixels. All other pixels count as 1.
@@ -302,7 +311,7 @@ def _padded(count: int) -> int:
     return -(-count // 4) * 4
 
 
-def packed(columns: list[Any]) -> Any:
+def packed(columns: list[mi.Float]) -> mi.Float:
     """Pack columns into one row of floats per pixel, padded to packets of four."""
     columns = [mi.Float(column) for column in columns]
     count, stride = max(dr.width(column) for column in columns), _padded(len(columns))

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -43,7 +42,7 @@ _PRIMES = (0x9E3779B1, 0x85EBCA77, 0xC2B2AE3D, 0x27D4EB2F, 0x165667B1)
 _NEEDED, _PLAIN = 0x80000000, 0x40000000
 
 
-def plane_codes(surface: LitSurface, eye: Any) -> Any:
+def plane_codes(surface: LitSurface, eye: mi.Point3f) -> mi.UInt32:
     """Return a hash (UInt32) of the plane and the material at every pixel.
 
     The hash is 0 on instances, shiny surfaces and unknown points.
@@ -75,12 +74,12 @@ class Planes:
         view: Camera.
     """
 
-    number: Any
-    place: Any
+    number: mi.UInt32
+    place: mi.UInt32
     view: CameraView
 
     @classmethod
-    def of(cls, codes: Any, needed: Any, view: CameraView) -> Planes:
+    def of(cls, codes: mi.UInt32, needed: mi.Bool, view: CameraView) -> Planes:
         """Find the tiles that need light and have one code in all pixels.
 
         The code must also hold in the adjacent row below and in the adjacent column to the right.
@@ -93,7 +92,7 @@ class Planes:
         rounds, side = dr.opaque(mi.UInt32, (BLOCK + 1) ** 2), BLOCK + 1
         whole = (x + BLOCK <= view.width) & (y + BLOCK <= view.height)
 
-        def look(i: Any, same: Any, wanted: Any) -> tuple[Any, Any, Any]:
+        def look(i: mi.UInt32, same: mi.Bool, wanted: mi.Bool) -> tuple[mi.UInt32, mi.Bool, mi.Bool]:
             px, py = x + i % side, y + i // side
             inside = (px < view.width) & (py < view.height)
             code = dr.gather(mi.UInt32, codes, py * view.width + px, inside)
@@ -119,7 +118,7 @@ class Planes:
         """Number of tiles that show a plane."""
         return int(dr.width(self.number))
 
-    def samples(self) -> Any:
+    def samples(self) -> mi.UInt32:
         """Return the traced pixels, ordered by their place in the tile and then by tile."""
         i, count, across = dr.arange(mi.UInt32, SAMPLES * self.count), dr.opaque(mi.UInt32, self.count), self._across
         within = i // count
@@ -127,12 +126,12 @@ class Planes:
         x, y = tile % across * BLOCK + within % (BLOCK // 2) * 2, tile // across * BLOCK + within // (BLOCK // 2) * 2
         return y * self.view.width + x
 
-    def coarse(self, estimate: Estimate) -> Any:
+    def coarse(self, estimate: Estimate) -> mi.Bool:
         """Return for every pixel (Bool) if it lies in a coarse tile, given the estimate at the :meth:`samples`."""
         count = dr.opaque(mi.UInt32, self.count)
         lane, rounds = dr.arange(mi.UInt32, self.count), dr.opaque(mi.UInt32, SAMPLES)
 
-        def add(i: Any, *sums: Any) -> tuple[Any, ...]:
+        def add(i: mi.UInt32, *sums: mi.Float) -> tuple[mi.UInt32, mi.Float, mi.Float, mi.Float]:
             at = lane + i * count
             more = [dr.sum(dr.gather(mi.Color3f, colour, at)) for colour in (estimate.lit, estimate.base)]
             more.append(dr.gather(mi.Float, estimate.squares, at))
@@ -160,7 +159,7 @@ class Planes:
         tile = pixel // self.view.width // BLOCK * self._across + pixel % self.view.width // BLOCK
         return dr.gather(mi.Bool, by_tile, tile)
 
-    def _neighbours(self) -> Iterator[Any]:
+    def _neighbours(self) -> Iterator[mi.UInt32]:
         """Yield the places of the eight neighbours of each tile, and of the tile itself.
 
         Coordinates are clamped to the image.
@@ -188,9 +187,9 @@ class CoarseLight:
         estimate: Estimate at these pixels.
     """
 
-    coarse: Any
-    lattice: Any
-    pixel: Any
+    coarse: mi.Bool
+    lattice: mi.Bool
+    pixel: mi.UInt32
     estimate: Estimate
 
     @classmethod
@@ -220,7 +219,7 @@ class CoarseLight:
         return cls(coarse, lattice, dr.gather(mi.UInt32, pixel, kept), gathered(estimate, kept))
 
 
-def between_samples(light: Any, coarse: Any, view: CameraView) -> Any:
+def between_samples(light: mi.Color3f, coarse: mi.Bool, view: CameraView) -> mi.Color3f:
     """Interpolate light (Color3f) linearly between the traced pixels of coarse tiles."""
     pixel = dr.arange(mi.UInt32, view.width * view.height)
     x, y = pixel % view.width, pixel // view.width

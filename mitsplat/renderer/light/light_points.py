@@ -9,7 +9,6 @@ so that only their unoccluded light costs extra time.
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -41,13 +40,15 @@ class LightPoints:
     """
 
     surface: LitSurface
-    owner: Any
-    slot: Any
+    owner: mi.UInt32
+    slot: mi.UInt32
     count: int
     bent: int
 
     @classmethod
-    def of(cls, visible: VisibleSurfaces, here: LitSurface, index: Any, place: Any, order: Any) -> LightPoints:
+    def of(
+        cls, visible: VisibleSurfaces, here: LitSurface, index: mi.UInt32, place: mi.UInt32, order: mi.UInt32
+    ) -> LightPoints:
         """Place the points of pixels.
 
         Args:
@@ -86,7 +87,7 @@ class LightPoints:
         dr.eval(surface, owner, slot)
         return cls(surface, owner, slot, count, bent)
 
-    def rows(self, places: Any) -> Any:
+    def rows(self, places: mi.UInt32) -> mi.UInt32:
         """Return the rows of the points of some pixels (possibly none)."""
         if not dr.width(places):
             return places
@@ -98,18 +99,18 @@ class LightPoints:
         dr.eval(rows)
         return rows
 
-    def ray_count(self, rays: Any, rows: Any) -> Any:
+    def ray_count(self, rays: mi.UInt32, rows: mi.UInt32) -> mi.UInt32:
         """Return the number of rays (at least 1) of the points ``rows``, given the ``rays`` (UInt32) of pixels."""
         return dr.select(rows < dr.opaque(mi.UInt32, self.count), rays, dr.maximum(rays // len(OFFSETS), 1))
 
-    def steps(self, rows: Any) -> tuple[Any, Any]:
+    def steps(self, rows: mi.UInt32) -> tuple[mi.UInt32, mi.UInt32]:
         """Return the first ray number of each point in the sequence of its pixel, and the step to its next ray."""
         count = dr.opaque(mi.UInt32, self.count)
         number = (rows - count) // dr.opaque(mi.UInt32, max(self.bent, 1))
         middle = rows < count
         return dr.select(middle, 0, number), dr.select(middle, mi.UInt32(1), len(OFFSETS))
 
-    def sum_by_pixel(self, values: Any) -> Any:
+    def sum_by_pixel(self, values: mi.Float | mi.Color3f) -> mi.Float | mi.Color3f:
         """Sum values by row into values by pixel, in a fixed order."""
         slot = dr.gather(mi.UInt32, self.slot, dr.arange(mi.UInt32, self.count))
         several, total = slot != UNTRACED, type(values)(0)
@@ -125,11 +126,11 @@ class LightPoints:
         dr.eval(result)
         return result
 
-    def _starts(self) -> list[Any]:
+    def _starts(self) -> list[mi.UInt32]:
         return [dr.opaque(mi.UInt32, self.count + number * self.bent) for number in range(len(OFFSETS))]
 
 
-def _bends(here: LitSurface, index: Any, place: Any, view: CameraView) -> Any:
+def _bends(here: LitSurface, index: mi.UInt32, place: mi.UInt32, view: CameraView) -> mi.Bool:
     """Return for each pixel (Bool) if it borders on another shape or, on an instance, on another surface direction."""
     x, y = mi.Int32(index % view.width), mi.Int32(index // view.width)
     thing, bends = here.instance > 0, mi.Bool(False)

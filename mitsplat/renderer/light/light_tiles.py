@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -22,7 +21,7 @@ MIN_SHADOW_HITS = 3
 """Number of occluded rays in a quarter of a tile that indicates a shadow instead of noise."""
 
 
-def block_order(view: CameraView) -> tuple[Any, Any]:
+def block_order(view: CameraView) -> tuple[mi.UInt32, mi.Bool]:
     """Return the pixels in tracing order, and a flag (Bool) for pixels inside the image.
 
     Pixels with the same place in blocks of one :func:`parity` take the same point of the low-discrepancy sequence.
@@ -41,7 +40,7 @@ def block_order(view: CameraView) -> tuple[Any, Any]:
     return dr.select(inside, y * view.width + x, 0), inside
 
 
-def parity(block_x: Any, block_y: Any) -> Any:
+def parity(block_x: mi.UInt32, block_y: mi.UInt32) -> mi.UInt32:
     """Return the index (0 to 3) of a block in its group of 2 x 2 blocks."""
     return (block_x & 1) | (block_y & 1) << 1
 
@@ -58,14 +57,14 @@ class ShadowTiles:
         view: Camera.
     """
 
-    occluded: Any
-    known: Any
-    mean_occluded: Any
-    concentrated: Any
+    occluded: mi.Color3f
+    known: mi.Bool
+    mean_occluded: mi.Float
+    concentrated: mi.Bool
     view: CameraView
 
     @classmethod
-    def of(cls, arriving: Any, lost: Any, view: CameraView) -> ShadowTiles:
+    def of(cls, arriving: mi.Color3f, lost: mi.Color3f, view: CameraView) -> ShadowTiles:
         """Sum light by tile.
 
         Sums have a fixed order, so that they do not depend on the number of threads.
@@ -84,7 +83,9 @@ class ShadowTiles:
         start = (y // BLOCK * squares_x + x // BLOCK) * BLOCK**4 + block
         rounds = dr.opaque(mi.UInt32, BLOCK**2)
 
-        def add(i: Any, total: Any, away: Any, hits: Any) -> tuple[Any, Any, Any, Any]:
+        def add(
+            i: mi.UInt32, total: mi.Color3f, away: mi.Color3f, hits: mi.UInt32
+        ) -> tuple[mi.UInt32, mi.Color3f, mi.Color3f, mi.UInt32]:
             place = start + i * BLOCK**2
             off = dr.gather(mi.Color3f, lost, place)
             # Each byte counts the occluded rays of a quarter of the tile.
@@ -113,13 +114,13 @@ class ShadowTiles:
         dr.eval(occluded, known, mean_occluded, concentrated)
         return cls(occluded, known, mean_occluded, concentrated, view)
 
-    def differs(self, error: float) -> Any:
+    def differs(self, error: float) -> mi.Bool:
         """Return for each pixel (Bool) if dynamic objects occlude at least the share ``error``, or one place in it."""
         pixel = dr.arange(mi.UInt32, self.view.width * self.view.height)
         tile = pixel // self.view.width // BLOCK * -(-self.view.width // BLOCK) + pixel % self.view.width // BLOCK
         return dr.gather(mi.Bool, self.concentrated | (self.mean_occluded >= dr.opaque(mi.Float, error)), tile)
 
-    def light(self) -> Any:
+    def light(self) -> mi.Color3f:
         """Return the remaining share of light (Color3f) at every pixel, interpolated between tile centres."""
         width, height = -(-self.view.width // BLOCK), -(-self.view.height // BLOCK)
         pixel = dr.arange(mi.UInt32, self.view.width * self.view.height)

@@ -29,14 +29,14 @@ class Traits:
             row.
     """
 
-    relit: Any
-    roughness: Any
-    specular: Any
-    owner: Any
+    relit: mi.Bool
+    roughness: mi.Float
+    specular: mi.Float
+    owner: mi.UInt32
     placements: tuple[Placement, ...] | None
 
     @classmethod
-    def of(cls, shapes: Sequence[Any], placements: Sequence[Placement]) -> Traits:
+    def of(cls, shapes: Sequence[mi.Shape], placements: Sequence[Placement]) -> Traits:
         """Build the table from ``splats`` shapes and their placements."""
         count = 1 + max([0, *(s.instance for s in shapes)])
         plain = False, 0.4, 0.0
@@ -64,7 +64,7 @@ class Traits:
             tuple(replace(p, instance=row) for p, row in zip(placements, placed, strict=True)) if several else None,
         )
 
-    def seen(self, row: Any | None, instance: Any) -> Any:
+    def seen(self, row: mi.UInt32 | None, instance: mi.UInt32) -> mi.UInt32:
         """Return the row of every pixel that shows ``instance``, given the row with the largest share of the pixel."""
         if row is None:
             return instance

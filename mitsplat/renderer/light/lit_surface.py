@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -36,19 +35,19 @@ class LitSurface:
         valid: True if there is a point.
     """
 
-    position: Any
-    normal: Any
-    face: Any
-    lift: Any
-    to_camera: Any
-    offset: Any
-    instance: Any
-    trait: Any
-    relit: Any
-    roughness: Any
-    specular: Any
-    known: Any
-    valid: Any
+    position: mi.Point3f
+    normal: mi.Vector3f
+    face: mi.Vector3f
+    lift: mi.Vector3f
+    to_camera: mi.Vector3f
+    offset: mi.Float
+    instance: mi.Float
+    trait: mi.Float
+    relit: mi.Bool
+    roughness: mi.Float
+    specular: mi.Float
+    known: mi.Bool
+    valid: mi.Bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,12 +61,12 @@ class VisiblePixels:
         mesh: True if the pixel shows a visible mesh.
     """
 
-    direction: Any
-    alpha: Any
-    depth: Any
-    instance: Any
-    trait: Any
-    mesh: Any
+    direction: mi.Vector3f
+    alpha: mi.Float
+    depth: mi.Float
+    instance: mi.UInt32
+    trait: mi.UInt32
+    mesh: mi.Bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,19 +86,19 @@ class VisibleSurfaces:
     traits: Traits
     view: CameraView
     proxies: Proxies
-    eye: Any
+    eye: mi.Point3f
     seen: VisiblePixels
     hit: Hit
     static: Hit
 
-    def at(self, pixel: Any) -> LitSurface:
+    def at(self, pixel: mi.UInt32) -> LitSurface:
         """Return the points at pixel centres.
 
         They lie on the proxy where it agrees with the visible depth, and otherwise at that depth.
         """
         return self._surface(gathered(self.seen, pixel), gathered(self.hit, pixel), gathered(self.static, pixel))
 
-    def at_offset(self, pixel: Any, offset: Any) -> LitSurface:
+    def at_offset(self, pixel: mi.UInt32, offset: mi.Point2f) -> LitSurface:
         """Return the points at ``offset`` [px] (Point2f) from pixel centres.
 
         A point is valid where the ray hits a proxy of the same instance.

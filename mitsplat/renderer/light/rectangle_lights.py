@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -31,10 +30,10 @@ class Rectangles:
         rows: One row of ``_Columns`` per emitter.
     """
 
-    rows: Any
+    rows: mi.Float
 
     @classmethod
-    def of(cls, emitters: Sequence[Any], sky: int | None) -> Rectangles | None:
+    def of(cls, emitters: Sequence[mi.Emitter], sky: int | None) -> Rectangles | None:
         """Collect all emitters except the sky; return None if one of them is not a rectangle of uniform radiance."""
         rows = np.zeros((len(emitters), _Columns.WIDTH), np.float32)
         for i, emitter in enumerate(emitters):
@@ -56,7 +55,9 @@ class Rectangles:
             rows[i, _Columns.RADIANCE] = np.array(light["radiance.value"]).ravel()
         return cls(wrapped(mi.Float, rows))
 
-    def towards(self, place: Any, index: Any, point: Any) -> tuple[Any, Any, Any]:
+    def towards(
+        self, place: mi.Point3f, index: mi.UInt32, point: mi.Point2f
+    ) -> tuple[mi.Vector3f, mi.Float, mi.Color3f]:
         """Return unit vectors and distances [m] to points of rectangles, and radiance over sampling density."""
         row = dr.gather(mi.ArrayXf, self.rows, index, shape=(_Columns.WIDTH, dr.width(index)))
         columns = _Columns.CORNER, _Columns.ACROSS, _Columns.UP, _Columns.NORMAL

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -51,12 +50,12 @@ class ShadowTracer:
     emitters: Emitters
     proxies: Proxies
     surface: LitSurface
-    pixel: Any
+    pixel: mi.UInt32
     view: CameraView
     seed: int
-    lattice: Any | None = None
+    lattice: mi.Bool | None = None
 
-    def search(self, captured: Any) -> ShadowTiles:
+    def search(self, captured: mi.Bool) -> ShadowTiles:
         """Estimate by tiles the light that dynamic objects occlude, with one ray per captured point of all pixels.
 
         The four blocks of a 2 x 2 group have different points; otherwise a shadow too small for the points of one block
@@ -88,7 +87,14 @@ class ShadowTracer:
         return ShadowTiles.of(arriving, lost, self.view)
 
     def trace(
-        self, places: Any, before: Estimate, rays: Any, most: int, steps: tuple[Any, Any], *, matt: bool = False
+        self,
+        places: mi.UInt32,
+        before: Estimate,
+        rays: mi.UInt32,
+        most: int,
+        steps: tuple[mi.UInt32, mi.UInt32],
+        *,
+        matt: bool = False,
     ) -> Estimate:
         """Add ``rays`` more rays to an estimate at ``places``.
 
@@ -107,14 +113,14 @@ class ShadowTracer:
                 before = self.trace(places, before, part, min(WORD_BITS, most - begin), steps, matt=matt)
             return before
         batch = _RayBatch.of(self, places, before, steps)
-        known: list[Any] = []
+        known: list[mi.UInt32] = []
         if separate_kernels:  # one bit per ray and scene except the last, one kernel each
             for occluder_scene in self.proxies.occluder_scenes[:-1]:
                 known.append(batch.occlusion_bits(occluder_scene, rays, known))
         sums = batch.add_light([dr.gather(type(v), v, places) for v in before.sums], rays, known, matt)
         return before.updated(places, *sums, dr.gather(mi.Float, before.rays, places) + mi.Float(rays))
 
-    def sequence_start(self, pixel: Any) -> Any:
+    def sequence_start(self, pixel: mi.UInt32) -> mi.UInt32:
         """Return the number of the first point of pixels in the sequence."""
         start = dr.opaque(mi.UInt32, self.seed * 2654435761 % (1 << 32))
         x, y = pixel % self.view.width, pixel // self.view.width
@@ -138,13 +144,15 @@ class _RayBatch:
 
     tracer: ShadowTracer
     surface: LitSurface
-    pixel: Any
-    origin: Any
-    start: Any
-    step: Any
+    pixel: mi.UInt32
+    origin: mi.Vector3f
+    start: mi.UInt32
+    step: mi.UInt32
 
     @classmethod
-    def of(cls, tracer: ShadowTracer, places: Any, before: Estimate, steps: tuple[Any, Any]) -> _RayBatch:
+    def of(
+        cls, tracer: ShadowTracer, places: mi.UInt32, before: Estimate, steps: tuple[mi.UInt32, mi.UInt32]
+    ) -> _RayBatch:
         """Create the rays that follow those of an estimate."""
         surface = gathered(tracer.surface, places)
         pixel = dr.gather(mi.UInt32, tracer.pixel, places)
@@ -153,7 +161,7 @@ class _RayBatch:
         start = tracer.sequence_start(pixel) + (begin + done * step) * STRIDE
         return cls(tracer, surface, pixel, ray_origin(surface), start, step * STRIDE)
 
-    def sample(self, i: Any) -> tuple[Beam, Any, Any]:
+    def sample(self, i: mi.UInt32) -> tuple[Beam, mi.UInt32, mi.Bool]:
         """Sample ray ``i`` of every point: its beam, its number in the sequence, and True if it carries light."""
         surface, number = self.surface, self.start + i * self.step
         beam = self.tracer.emitters.sample(
@@ -161,15 +169,15 @@ class _RayBatch:
         )
         return beam, number, surface.valid & (dr.sum(beam.irradiance) > 0)
 
-    def occluded(self, occluder_scene: OccluderScene, beam: Beam, number: Any, active: Any) -> Any:
+    def occluded(self, occluder_scene: OccluderScene, beam: Beam, number: mi.UInt32, active: mi.Bool) -> mi.Bool:
         """Return True for rays that a scene occludes."""
         ray = _shadow_ray(self.origin, beam, self.surface.offset)
         return occluder_scene.occluded(ray, self.surface.instance, self.pixel * RECURRENCE[0] + number, active)
 
-    def occlusion_bits(self, occluder_scene: OccluderScene, rays: Any, known: Sequence[Any]) -> Any:
+    def occlusion_bits(self, occluder_scene: OccluderScene, rays: mi.UInt32, known: Sequence[mi.UInt32]) -> mi.UInt32:
         """Return the rays that a scene occludes and the scenes of ``known`` do not, as bits of an integer per point."""
 
-        def add_bit(i: Any, word: Any) -> tuple[Any, Any]:
+        def add_bit(i: mi.UInt32, word: mi.UInt32) -> tuple[mi.UInt32, mi.UInt32]:
             beam, number, free = self.sample(i)
             for occluded in _bits(known, i):
                 free = free & ~occluded
@@ -180,7 +188,9 @@ class _RayBatch:
         dr.eval(word)
         return word
 
-    def add_light(self, sums: list[Any], rays: Any, known: Sequence[Any], matt: bool) -> list[Any]:
+    def add_light(
+        self, sums: list[mi.Float | mi.Color3f], rays: mi.UInt32, known: Sequence[mi.UInt32], matt: bool
+    ) -> list[mi.Float | mi.Color3f]:
         """Add the light of rays to the sums of an :class:`Estimate`.
 
         With the unoccluded estimate e = L(w) max(0, n.w) / p(w) of a ray (Veach 1997, section 2.4.2), visibility V
@@ -190,7 +200,14 @@ class _RayBatch:
         """
         proxies, surface, lobe = self.tracer.proxies, self.surface, Lobe.of(self.surface)
 
-        def add(i: Any, lit: Any, base: Any, specular_lit: Any, specular_base: Any, squares: Any) -> tuple[Any, ...]:
+        def add(
+            i: mi.UInt32,
+            lit: mi.Color3f,
+            base: mi.Color3f,
+            specular_lit: mi.Float,
+            specular_base: mi.Float,
+            squares: mi.Float,
+        ) -> tuple[mi.UInt32, mi.Color3f, mi.Color3f, mi.Float, mi.Float, mi.Float]:
             beam, number, active = self.sample(i)
             occluded = _bits(known, i)
             static_light = free = active
@@ -217,17 +234,19 @@ class _RayBatch:
         return sums
 
 
-def _bits(words: Sequence[Any], i: Any) -> list[Any]:
+def _bits(words: Sequence[mi.UInt32], i: mi.UInt32) -> list[mi.Bool]:
     """Return bit ``i`` (Bool) of words."""
     return [(word >> i & 1) != 0 for word in words]
 
 
-def ray_origin(surface: LitSurface) -> Any:
+def ray_origin(surface: LitSurface) -> mi.Vector3f:
     """Return the origins of shadow rays: on the smooth surface of the proxy, and off the triangle itself."""
     return surface.position + surface.lift + surface.face * surface.offset
 
 
-def _packed_rays(surface: LitSurface, selected: Any, pixel: Any) -> tuple[Any, Any, Any, Any]:
+def _packed_rays(
+    surface: LitSurface, selected: mi.Bool, pixel: mi.UInt32
+) -> tuple[mi.Point3f, mi.Vector3f, mi.Float, mi.Float]:
     """Return ray origins, normals, offsets and instances of pixels in any order, given the points of all pixels.
 
     The offset is 0 where ``selected`` is False. The values are packed, because separate fetches take half of the
@@ -239,18 +258,18 @@ def _packed_rays(surface: LitSurface, selected: Any, pixel: Any) -> tuple[Any, A
     return mi.Point3f(*row[:3]), mi.Vector3f(*row[3:6]), row[6], row[7]
 
 
-def _shadow_ray(origin: Any, beam: Any, offset: Any) -> Any:
+def _shadow_ray(origin: mi.Vector3f, beam: Beam, offset: mi.Float) -> mi.Ray3f:
     ray = mi.Ray3f(origin, beam.direction)
     ray.maxt = dr.maximum(beam.reach - 2 * offset, 0)
     return ray
 
 
-def sequence_point(i: Any, recurrence: tuple[int, int] = RECURRENCE) -> Any:
+def sequence_point(i: mi.UInt32, recurrence: tuple[int, int] = RECURRENCE) -> mi.Point2f:
     """Return point ``i`` of a low-discrepancy sequence with 24 bits of precision for every ``i``."""
     return mi.Point2f(*[mi.Float((i * step) >> 8) * 2.0**-24 for step in recurrence])
 
 
-def _bayer(x: Any, y: Any) -> Any:
+def _bayer(x: mi.UInt32, y: mi.UInt32) -> mi.UInt32:
     """Return the rank of a pixel in an 8 x 8 ordered-dither matrix: neighbours take distant points of the sequence."""
     result = mi.UInt32(0)
     for bit in range(3):

@@ -6,8 +6,6 @@ all normals of the table. A point then costs four look-ups instead of a set of d
 
 from __future__ import annotations
 
-from typing import Any
-
 import drjit as dr
 import mitsuba as mi
 
@@ -24,7 +22,7 @@ class SkyIrradiance:
     normals are the corners of the cells, so that border normals are defined on both sides of the fold.
     """
 
-    def __init__(self, direction: Any, radiance: Any) -> None:
+    def __init__(self, direction: mi.Vector3f, radiance: mi.Color3f) -> None:
         """Integrate N directions towards light (Vector3f) with their radiance over sampling density (Color3f)."""
         corner = dr.arange(mi.UInt32, (CELLS + 1) ** 2)
         normal = _unfolded(mi.Float(corner % (CELLS + 1)) / CELLS, mi.Float(corner // (CELLS + 1)) / CELLS)
@@ -32,7 +30,7 @@ class SkyIrradiance:
         count = dr.width(radiance)
         rounds = dr.opaque(mi.UInt32, count)
 
-        def add(i: Any, total: Any) -> tuple[Any, Any]:
+        def add(i: mi.UInt32, total: mi.Color3f) -> tuple[mi.UInt32, mi.Color3f]:
             cosine = dr.maximum(dr.dot(normal, dr.gather(mi.Vector3f, direction, i)), 0)
             return i + 1, total + cosine * dr.gather(mi.Color3f, radiance, i)
 
@@ -40,19 +38,19 @@ class SkyIrradiance:
         self._table = dr.while_loop(state, lambda i, _: i < rounds, add, label="sky")[1] / mi.Float(count)
         dr.eval(self._table)
 
-    def at(self, normal: Any, active: Any) -> Any:
+    def at(self, normal: mi.Normal3f, active: mi.Bool) -> mi.Color3f:
         """Return the irradiance (Color3f) on surfaces with unit normals (Vector3f)."""
         x, y = _folded(normal)
         column, row = (dr.minimum(mi.UInt32(dr.maximum(v * CELLS, 0)), CELLS - 1) for v in (x, y))
         right, down = x * CELLS - mi.Float(column), y * CELLS - mi.Float(row)
 
-        def corner(i: int, j: int) -> Any:
+        def corner(i: int, j: int) -> mi.Color3f:
             return dr.gather(mi.Color3f, self._table, (row + j) * (CELLS + 1) + column + i, active)
 
         return dr.lerp(dr.lerp(corner(0, 0), corner(1, 0), right), dr.lerp(corner(0, 1), corner(1, 1), right), down)
 
 
-def _unfolded(x: Any, y: Any) -> Any:
+def _unfolded(x: mi.Float, y: mi.Float) -> mi.Vector3f:
     """Return the unit vectors of points of the octahedral map (unit square)."""
     x, y = 2 * x - 1, 2 * y - 1
     z = 1 - abs(x) - abs(y)
@@ -60,7 +58,7 @@ def _unfolded(x: Any, y: Any) -> Any:
     return dr.normalize(mi.Vector3f(x - dr.copysign(back, x), y - dr.copysign(back, y), z))
 
 
-def _folded(vector: Any) -> tuple[Any, Any]:
+def _folded(vector: mi.Normal3f) -> tuple[mi.Float, mi.Float]:
     """Return the points of the octahedral map (unit square) of unit vectors."""
     length = abs(vector.x) + abs(vector.y) + abs(vector.z)
     x, y = vector.x / length, vector.y / length

@@ -7,7 +7,6 @@ Illumination and Stochastic Shadows").
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -31,14 +30,14 @@ class UnoccludedLight:
         level: Mean over channels of irradiance over white for relit points, otherwise 1, by traced pixel.
     """
 
-    place: Any
-    irradiance: Any
-    mirrored: Any
-    tent: Any
-    level: Any
+    place: mi.UInt32
+    irradiance: mi.Color3f | None
+    mirrored: mi.Color3f | None
+    tent: mi.Float | None
+    level: mi.Float
 
     @classmethod
-    def integrate(cls, emitters: Emitters, points: LightPoints, here: LitSurface, white: Any) -> UnoccludedLight:
+    def integrate(cls, emitters: Emitters, points: LightPoints, here: LitSurface, white: mi.Color3f) -> UnoccludedLight:
         """Integrate the light at those of the pixels ``here`` that are relit or have a highlight.
 
         E = integral of L(w) max(0, n.w) dw, and R = integral of L(w) f(w) max(0, n.w) dw with the lobe f, over all
@@ -55,13 +54,19 @@ class UnoccludedLight:
         return cls(place, irradiance, mirrored, tent, level)
 
 
-def _mean_over_points(emitters: Emitters, points: LightPoints, place: Any) -> tuple[Any, Any, Any]:
+def _mean_over_points(
+    emitters: Emitters, points: LightPoints, place: mi.UInt32
+) -> tuple[mi.Color3f, mi.Color3f, mi.Float]:
     """Return unoccluded means over the points of pixels: irradiance, mirrored light, and mirrored tent."""
     rows = points.rows(place)
     own = gathered(points.surface, rows)
     dr.eval(own)
     count = dr.width(rows)
-    columns: Any = [dr.zeros(mi.Color3f, count), dr.zeros(mi.Color3f, count), mirrored_tent(own)]
+    columns: list[mi.Float | mi.Color3f] = [
+        dr.zeros(mi.Color3f, count),
+        dr.zeros(mi.Color3f, count),
+        mirrored_tent(own),
+    ]
     columns.append(dr.select(own.valid, mi.Float(1), 0))
     dr.eval(columns)
     for shiny in (False, True):

@@ -8,12 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.renderer.occluders.splat_occlusion import SETS, Caster, Solids
 from mitsplat.renderer.rays.device_arrays import wrapped
 from mitsplat.renderer.splatting.gaussian import evaluate_sh, rotation_axes
@@ -44,11 +44,11 @@ class SplatHits:
         footprint: Distance from the surface within which its own splats cast no shadow [m].
     """
 
-    distance: Any
-    colour: list[Any]
-    normal: Any
-    relit: Any
-    footprint: Any
+    distance: mi.Float
+    colour: list[mi.Float]
+    normal: mi.Vector3f
+    relit: mi.Bool
+    footprint: mi.Float
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,13 +66,13 @@ class SplatMirror:
 
     solids: Solids
     clouds: CloudSet
-    gaussians: Any
-    table: Any
-    appearances: Any | None = None
+    gaussians: mi.UInt32
+    table: mi.Float
+    appearances: mi.Float | None = None
 
     @classmethod
     def build(
-        cls, clouds: CloudSet | None, placements: Sequence[Placement], splats: Sequence[Any], relit: Sequence[bool]
+        cls, clouds: CloudSet | None, placements: Sequence[Placement], splats: Sequence[Splats], relit: Sequence[bool]
     ) -> SplatMirror | None:
         """Build the solids of the placements' splats; ``relit`` marks placements captured under uniform light."""
         total = sum(len(splats[p.cloud]) for p in placements)
@@ -97,7 +97,7 @@ class SplatMirror:
             appearances = wrapped(mi.Float, looks)
         return cls(solids, clouds, wrapped(mi.UInt32, owners), wrapped(mi.Float, rows), appearances)
 
-    def trace(self, ray: Any, key: Any, active: Any) -> SplatHits:
+    def trace(self, ray: mi.Ray3f, key: mi.UInt32, active: bool) -> SplatHits:
         """Trace rays against splats; the ``key`` of a ray selects its set of solids."""
         inside, start, met = self.solids.enter(ray, key, mi.Float(0))
         hit = self.solids.scene.ray_intersect_preliminary(inside, active=active & met)

@@ -12,7 +12,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import reduce
 from operator import or_
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -46,22 +45,22 @@ _NORMAL_MODIFIERS = ("NormalMap", "BumpMap")
 """Materials that perturb the normals of their nested material."""
 
 
-def _has(flags: Any, *names: str) -> Any:
+def _has(flags: mi.UInt32, *names: str) -> mi.Bool:
     return (flags & reduce(or_, (int(getattr(mi.BSDFFlags, name)) for name in names))) != 0
 
 
-def is_diffuse(bsdf: Any) -> bool:
+def is_diffuse(bsdf: mi.BSDF) -> bool:
     """Return True if a material is purely diffuse."""
     flags, diffuse = int(bsdf.flags()), int(mi.BSDFFlags.DiffuseReflection)
     return (flags & int(mi.BSDFFlags.All)) == diffuse and not any(name in str(bsdf) for name in _NORMAL_MODIFIERS)
 
 
-def is_transmissive(bsdf: Any) -> bool:
+def is_transmissive(bsdf: mi.BSDF) -> bool:
     """Return True if light passes through a material, which then casts no shadow on splats and diffuse meshes."""
     return bool(_has(int(bsdf.flags()), "GlossyTransmission", "DeltaTransmission")) or "ThinDielectric" in str(bsdf)
 
 
-def has_texture(bsdf: Any) -> bool:
+def has_texture(bsdf: mi.BSDF) -> bool:
     """Return True if a material depends on texture coordinates; Mitsuba does not set its flag for textures."""
     return any(key.endswith(".to_uv") for key in mi.traverse(bsdf).keys())  # noqa: SIM118 - no mapping
 
@@ -79,13 +78,13 @@ class MeshHits:
         hit: Mitsuba's intersection.
     """
 
-    depth: Any
-    reflectance: Any
-    valid: Any
-    diffuse: Any
-    normal: Any
-    face: Any
-    hit: Any
+    depth: mi.Float
+    reflectance: mi.Color3f
+    valid: mi.Bool
+    diffuse: mi.Bool
+    normal: mi.Normal3f
+    face: mi.Normal3f
+    hit: mi.PreliminaryIntersection3f
 
     def before(self, other: Hit) -> Hit:
         """Return the nearer of these hits and other hits of the same rays."""
@@ -109,12 +108,12 @@ class VisibleMeshes:
         textured: True if the reflectance of any mesh varies over its surface.
     """
 
-    scene: Any
-    diffuse: Any
+    scene: mi.Scene
+    diffuse: mi.Bool | None
     textured: bool
 
     @classmethod
-    def build(cls, shapes: Sequence[Any]) -> VisibleMeshes | None:
+    def build(cls, shapes: Sequence[mi.Shape]) -> VisibleMeshes | None:
         """Build the scene of the visible ``shapes``; return None if there are none."""
         if not shapes:
             return None
@@ -128,13 +127,13 @@ class VisibleMeshes:
         table[numbers] = diffuse
         return cls(scene, wrapped(mi.Bool, table), textured)
 
-    def is_diffuse(self, hit: Any) -> Any:
+    def is_diffuse(self, hit: mi.PreliminaryIntersection3f) -> mi.Bool:
         """Return True for hits on purely diffuse meshes, False for misses."""
         if self.diffuse is None:
             return hit.is_valid()
         return dr.gather(mi.Bool, self.diffuse, dr.reinterpret_array(mi.UInt32, hit.shape), hit.is_valid())
 
-    def trace(self, view: CameraView, rays: Any, at: tuple[Any, Any] | None = None) -> MeshHits:
+    def trace(self, view: CameraView, rays: mi.Ray3f, at: tuple[mi.Float, mi.Float] | None = None) -> MeshHits:
         """Trace camera rays through positions ``at`` [px], or through the centres of all pixels."""
         hit = self.scene.ray_intersect_preliminary(rays, coherent=True)
         si = hit.compute_surface_interaction(rays)
@@ -147,7 +146,14 @@ class VisibleMeshes:
         dr.eval(behind)
         return behind
 
-    def _reflectance(self, view: CameraView, rays: Any, at: tuple[Any, Any] | None, si: Any, active: Any) -> Any:
+    def _reflectance(
+        self,
+        view: CameraView,
+        rays: mi.Ray3f,
+        at: tuple[mi.Float, mi.Float] | None,
+        si: mi.SurfaceInteraction3f,
+        active: mi.Bool,
+    ) -> mi.Color3f:
         """Return the diffuse albedo (Color3f) of hits; for textures, its mean over the pixel's footprint.
 
         The footprint is the parallelogram of ray differentials (Igehy 1999), sampled at ``FOOTPRINT`` squared points.
@@ -179,12 +185,12 @@ class VisibleEmitters:
         everywhere: True if there is a sky.
     """
 
-    depth: Any
-    radiance: Any
+    depth: mi.Float
+    radiance: mi.Color3f
     everywhere: bool
 
     @classmethod
-    def trace(cls, scene: Any, view: CameraView, rays: Any) -> VisibleEmitters | None:
+    def trace(cls, scene: mi.Scene, view: CameraView, rays: mi.Ray3f) -> VisibleEmitters | None:
         """Trace camera rays to a scene's emitters; return None if no emitter can be visible."""
         sky = scene.environment()
         if any(shape.is_emitter() for shape in scene.shapes()):
@@ -213,10 +219,10 @@ class _Path:
         throughput: Radiance at the camera per radiance that leaves the vertex (Color3f).
     """
 
-    lane: Any
-    ray: Any
-    hit: Any
-    throughput: Any
+    lane: mi.UInt32
+    ray: mi.Ray3f
+    hit: mi.PreliminaryIntersection3f
+    throughput: mi.Color3f
 
 
 @dataclass(frozen=True, eq=False)
@@ -236,16 +242,18 @@ class PathTracer:
     """
 
     meshes: VisibleMeshes
-    scene: Any
+    scene: mi.Scene
     proxies: Proxies
     mirror: SplatMirror | None
-    exposure: Any
-    white: Any
+    exposure: mi.Color3f
+    white: mi.Color3f
     max_depth: int
     bounce: bool
     seed: int
 
-    def radiance(self, view: CameraView, ray: Any, hit: Any, pixel: Any, samples: int) -> Any:
+    def radiance(
+        self, view: CameraView, ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, pixel: mi.UInt32, samples: int
+    ) -> mi.Color3f:
         """Return the mean radiance (Color3f) over ``samples`` paths per pixel, in the picture's scale.
 
         ``ray`` through the pixel's centre hits a mesh at ``hit``. Paths start along other rays of the pixel where these
@@ -272,7 +280,9 @@ class PathTracer:
             done += own
         return total / samples
 
-    def _jittered(self, view: CameraView, numbers: _RandomNumbers, ray: Any, hit: Any) -> tuple[Any, Any]:
+    def _jittered(
+        self, view: CameraView, numbers: _RandomNumbers, ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f
+    ) -> tuple[mi.Ray3f, mi.PreliminaryIntersection3f]:
         """Return rays through random points of the pixels and their hits.
 
         The ray through the centre is used where the random ray misses or hits a purely diffuse mesh.
@@ -285,7 +295,7 @@ class PathTracer:
         usable = jittered.is_valid() & ~self.meshes.is_diffuse(jittered)
         return dr.select(usable, other, ray), dr.select(usable, jittered, hit)
 
-    def _trace(self, path: _Path, numbers: _RandomNumbers) -> Any:
+    def _trace(self, path: _Path, numbers: _RandomNumbers) -> mi.Color3f:
         """Return the radiance (Color3f) of every path."""
         result = mi.Color3f(dr.zeros(mi.Float, dr.width(path.lane)))
         lights = bool(self.scene.emitters())
@@ -336,7 +346,7 @@ class PathTracer:
         return result
 
     @staticmethod
-    def _interaction(path: _Path) -> Any:
+    def _interaction(path: _Path) -> mi.SurfaceInteraction3f:
         """Return the surface at path vertices, flipped towards the path if its material is opaque and one-sided."""
         si = path.hit.compute_surface_interaction(path.ray, mi.RayFlags.All)
         flags = si.bsdf().flags()
@@ -349,7 +359,16 @@ class PathTracer:
         si.wi = si.to_local(-path.ray.d)
         return si
 
-    def _add_direct(self, result: Any, path: _Path, si: Any, bsdf: Any, context: Any, point: Any, key: Any) -> None:
+    def _add_direct(
+        self,
+        result: mi.Color3f,
+        path: _Path,
+        si: mi.SurfaceInteraction3f,
+        bsdf: mi.BSDFPtr,
+        context: mi.BSDFContext,
+        point: mi.Point2f,
+        key: mi.UInt32,
+    ) -> None:
         """Add the direct light of one sampled emitter."""
         rough = _has(bsdf.flags(), "Smooth")
         towards, light = self.scene.sample_emitter_direction(si, point, False, rough)
@@ -363,7 +382,9 @@ class PathTracer:
         ray.maxt = dr.select(infinite, dr.inf, ray.maxt)
         self._add_unoccluded(result, path.lane, ray, arrives, key)
 
-    def _add_unoccluded(self, result: Any, lane: Any, ray: Any, light: Any, key: Any) -> None:
+    def _add_unoccluded(
+        self, result: mi.Color3f, lane: mi.UInt32, ray: mi.Ray3f, light: mi.Color3f, key: mi.UInt32
+    ) -> None:
         """Add light to paths whose shadow rays are unoccluded; each traced scene has a kernel of its own."""
         dr.eval(ray, light, key)
         free = dr.max(light) > 0
@@ -374,7 +395,7 @@ class PathTracer:
         _add(result, lane, dr.select(free, light, 0))
 
     def _add_splats(
-        self, path: _Path, smooth: Any, numbers: _RandomNumbers, depth: int, result: Any
+        self, path: _Path, smooth: mi.Bool, numbers: _RandomNumbers, depth: int, result: mi.Color3f
     ) -> SplatHits | None:
         """Add the light of splats that paths hit."""
         if self.mirror is None:
@@ -407,7 +428,15 @@ class PathTracer:
             self._add_unoccluded(result, lane, shadow, lit, dr.gather(mi.UInt32, key, anew))
         return splat_hits
 
-    def _add_emission(self, result: Any, path: _Path, reference: Any, density: Any, delta: Any, active: Any) -> None:
+    def _add_emission(
+        self,
+        result: mi.Color3f,
+        path: _Path,
+        reference: mi.Interaction3f,
+        density: mi.Float,
+        delta: mi.Bool,
+        active: mi.Bool,
+    ) -> None:
         """Add the light of emitters that paths hit."""
         si = path.hit.compute_surface_interaction(path.ray, mi.RayFlags.All)
         emitter = si.emitter(self.scene)
@@ -422,15 +451,15 @@ class PathTracer:
 class _RandomNumbers:
     """Random numbers of paths; the first vertices of a pixel's paths share a low-discrepancy sequence."""
 
-    pixel: Any
-    number: Any
-    seed: Any
+    pixel: mi.UInt32
+    number: mi.UInt32
+    seed: mi.UInt32
 
-    def key(self, depth: int) -> Any:
+    def key(self, depth: int) -> mi.UInt32:
         """Return an integer that differs between paths and vertices."""
         return self.pixel * 0x9E3779B1 + self.number * PER_VERTEX * 64 + self._dimension(depth, 9) + self.seed
 
-    def number_of(self, depth: int, dimension: int) -> Any:
+    def number_of(self, depth: int, dimension: int) -> mi.Float:
         """Return a random number in [0, 1)."""
         if depth == 0 and dimension < len(R7):
             shift = mi.sample_tea_32(self.pixel, self.seed + self._dimension(0, dimension), ROUNDS)[0]
@@ -439,19 +468,19 @@ class _RandomNumbers:
         return mi.sample_tea_float32(own, self._dimension(depth, dimension), ROUNDS)
 
     @staticmethod
-    def _dimension(depth: int, dimension: int) -> Any:
+    def _dimension(depth: int, dimension: int) -> mi.UInt32:
         return dr.opaque(mi.UInt32, depth * PER_VERTEX + dimension)
 
 
-def _has_emitter_flag(emitter: Any, flag: Any) -> Any:
+def _has_emitter_flag(emitter: mi.EmitterPtr, flag: mi.EmitterFlags) -> mi.Bool:
     return (emitter.flags() & int(flag)) != 0
 
 
-def _power(own: Any, other: Any) -> Any:
+def _power(own: mi.Float, other: mi.Float) -> mi.Float:
     return dr.select(own > 0, dr.rcp(1 + dr.square(other / own)), 0)
 
 
-def _add(total: Any, lane: Any, light: Any) -> None:
+def _add(total: mi.Color3f, lane: mi.UInt32, light: mi.Color3f) -> None:
     """Add ``light`` to the paths ``lane``, which must be distinct."""
     light = dr.gather(mi.Color3f, total, lane) + light
     dr.eval(light)

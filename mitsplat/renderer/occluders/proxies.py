@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
-from typing import Any, Protocol
+from typing import Protocol
 
 import drjit as dr
 import mitsuba as mi
@@ -54,11 +54,11 @@ class Hit:
         instance: Instance id, 0 for a miss.
     """
 
-    distance: Any
-    face: Any
-    normal: Any
-    lift: Any
-    instance: Any
+    distance: mi.Float
+    face: mi.Normal3f
+    normal: mi.Normal3f
+    lift: mi.Vector3f
+    instance: mi.UInt32
 
     @classmethod
     def miss(cls) -> Hit:
@@ -69,7 +69,7 @@ class Hit:
 class OccluderScene(Protocol):
     """Ray-traceable scene of occluders."""
 
-    def occluded(self, ray: Any, instance: Any, key: Any, active: Any) -> Any:
+    def occluded(self, ray: mi.Ray3f, instance: mi.UInt32, key: mi.UInt32, active: mi.Bool) -> mi.Bool:
         """Return True for occluded rays from points of instances; ``key`` selects the random outcome of a ray."""
 
 
@@ -84,7 +84,7 @@ class Proxies:
     """
 
     def __init__(
-        self, occluders: Sequence[Occluder], visible: Sequence[Any] = (), casters: Sequence[Caster] | None = None
+        self, occluders: Sequence[Occluder], visible: Sequence[mi.Shape] = (), casters: Sequence[Caster] | None = None
     ) -> None:
         """Build the scenes from proxy meshes and visible Mitsuba shapes.
 
@@ -107,7 +107,7 @@ class Proxies:
         """All occluder scenes, the static proxies first."""
         return self.shadow_casters if self.static is None else (self.static, *self.shadow_casters)
 
-    def nearest(self, ray: Any) -> tuple[Hit, Hit]:
+    def nearest(self, ray: mi.Ray3f) -> tuple[Hit, Hit]:
         """Return the first hits of rays, and the first hits without the dynamic proxies."""
         static = _TraceScene.nearest(self.static, ray, Hit.miss())
         dr.eval(static)  # a separate kernel, see `separate_kernels`
@@ -118,13 +118,13 @@ class Proxies:
 class _TraceScene:
     """All meshes merged into one (or None), with the instance id of every triangle, and visible shapes."""
 
-    scene: Any
-    mesh: Any
-    instances: Any
-    corners: Any
-    normals: Any
+    scene: mi.Scene
+    mesh: mi.ShapePtr | None
+    instances: mi.UInt32
+    corners: mi.Float
+    normals: mi.Float
 
-    def nearest(self: _TraceScene | None, ray: Any, other: Hit) -> Hit:
+    def nearest(self: _TraceScene | None, ray: mi.Ray3f, other: Hit) -> Hit:
         """Return the nearer of ``other`` and the hits in this scene."""
         if self is None:
             return other
@@ -143,15 +143,15 @@ class _TraceScene:
             dr.select(closer, number, other.instance),
         )
 
-    def is_visible(self, hit: Any) -> Any:
+    def is_visible(self, hit: mi.PreliminaryIntersection3f) -> mi.Bool:
         """Return True for hits on visible shapes."""
         return mi.Bool(True) if self.mesh is None else hit.shape != self.mesh
 
-    def occluded(self, ray: Any, instance: Any, key: Any, active: Any) -> Any:
+    def occluded(self, ray: mi.Ray3f, instance: mi.UInt32, key: mi.UInt32, active: mi.Bool) -> mi.Bool:
         """Return True for occluded rays."""
         return self.scene.ray_test(ray, active=active)
 
-    def _smooth(self, si: Any, flip: Any, proxy: Any) -> tuple[Any, Any]:
+    def _smooth(self, si: mi.SurfaceInteraction3f, flip: mi.Float, proxy: mi.Bool) -> tuple[mi.Normal3f, mi.Normal3f]:
         """Return the interpolated normal, and the displacement to the convex surface through a triangle's corners.
 
         That surface is the mean of the projections on the corners' tangent planes. From there, grazing light is not
@@ -168,7 +168,7 @@ class _TraceScene:
         return mi.Normal3f(dr.normalize(normal)), lift
 
     @classmethod
-    def build(cls, occluders: Sequence[Occluder], visible: Sequence[Any] = ()) -> _TraceScene | None:
+    def build(cls, occluders: Sequence[Occluder], visible: Sequence[mi.Shape] = ()) -> _TraceScene | None:
         others = {f"visible_{i}": shape for i, shape in enumerate(visible)}
         occluders = [o for o in occluders if len(o.mesh.faces)]
         if not occluders:
@@ -190,7 +190,7 @@ def _cached_scene(parts: _Parts, _variant: str) -> _TraceScene:
     return _merged_scene(parts, {})
 
 
-def _merged_scene(parts: _Parts, others: Mapping[str, Any]) -> _TraceScene:
+def _merged_scene(parts: _Parts, others: Mapping[str, mi.Shape]) -> _TraceScene:
     corners, normals = [], []
     for part, _, pose in parts:
         world_from_mesh = np.frombuffer(pose).reshape(4, 4)

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -80,9 +79,9 @@ class Solids:
         footprints: Distance [m] within which the splats of each caster do not shadow their own object, shape (N,).
     """
 
-    scene: Any
-    middle: Any
-    radius: Any
+    scene: mi.Scene
+    middle: mi.Point3f
+    radius: mi.Float
     sets: int
     owners: npt.NDArray[np.uint32]
     footprints: Float64Array
@@ -134,7 +133,7 @@ class Solids:
             footprints,
         )
 
-    def enter(self, ray: Any, key: Any, near: Any) -> tuple[Any, Any, Any]:
+    def enter(self, ray: mi.Ray3f, key: mi.UInt32, near: mi.Float) -> tuple[mi.Ray3f, mi.Float, mi.Bool]:
         """Transform rays into one of the sets.
 
         Args:
@@ -167,7 +166,7 @@ class SplatOccluders:
     """
 
     solids: Solids
-    skip_distance: Any
+    skip_distance: mi.Float
 
     @classmethod
     def build(cls, casters: Sequence[Caster], sets: int = SETS) -> SplatOccluders | None:
@@ -179,7 +178,7 @@ class SplatOccluders:
         np.maximum.at(skip_distance, [c.instance for c in casters], solids.footprints.astype(np.float32))
         return cls(solids, wrapped(mi.Float, skip_distance))
 
-    def occluded(self, ray: Any, instance: Any, key: Any, active: Any) -> Any:
+    def occluded(self, ray: mi.Ray3f, instance: mi.UInt32, key: mi.UInt32, active: mi.Bool) -> mi.Bool:
         """Return True for occluded rays from points of instances; ``key`` selects the random outcome of a ray."""
         instance = mi.UInt32(instance)
         near = dr.gather(mi.Float, self.skip_distance, instance, active & (instance < dr.width(self.skip_distance)))

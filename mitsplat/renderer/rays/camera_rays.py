@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -23,6 +22,9 @@ TILE_PIXELS = TILE_WIDTH * TILE_HEIGHT
 
 Kind = tuple[int, int, int, Lens, int, int]
 """Width, height, number of distortion coefficients, lens, samples and zoom of a view."""
+
+ViewNumbers = dict[str, "mi.Float | tuple[mi.Float, ...]"]
+"""Device values of a view by name; ``extent`` is a box of slopes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +59,7 @@ class CameraView:
     focus_distance: float = 1.0
     shift: tuple[float, float] = (0.0, 0.0)
     zoom: int = 1
-    _opaque: dict[str, Any] = field(default_factory=dict, init=False, repr=False)
+    _opaque: dict[str, mi.Float] = field(default_factory=dict, init=False, repr=False)
 
     def __post_init__(self) -> None:
         if self.lens == "opencv":
@@ -72,7 +74,7 @@ class CameraView:
             self._opaque["du"], self._opaque["dv"] = (dr.opaque(mi.Float, value) for value in self.shift)
 
     @property
-    def near_plane(self) -> Any:
+    def near_plane(self) -> mi.Float:
         """``near`` as an opaque value."""
         return self._opaque["near"]
 
@@ -88,12 +90,12 @@ class CameraView:
         return self.width, self.height, len(self.distortion), self.lens, self.samples, self.zoom
 
     @property
-    def numbers(self) -> dict[str, Any]:
+    def numbers(self) -> ViewNumbers:
         """Device values that differ between views of one kind; the pose is in the table of placements."""
         return self._opaque | ({"extent": self._extent} if self.distortion else {})
 
     @classmethod
-    def of_numbers(cls, kind: Kind, numbers: Mapping[str, Any]) -> CameraView:
+    def of_numbers(cls, kind: Kind, numbers: ViewNumbers) -> CameraView:
         """Create a view from its kind and :attr:`numbers` only, sufficient for projection but not for the march."""
         view = object.__new__(cls)
         width, height, coefficients, lens, samples, zoom = kind
@@ -165,19 +167,19 @@ class CameraView:
         """Return the part of the view from pixel row ``start`` to ``stop`` (exclusive)."""
         return replace(self, height=stop - start, cy=self.cy - start)
 
-    def rays(self) -> Any:
+    def rays(self) -> mi.Ray3f:
         """Return the world-space rays through pixel centres, row-major, with unit direction."""
         ray = self.rays_through(*self.centres())
         dr.eval(ray)
         return ray
 
-    def centres(self) -> tuple[Any, Any]:
+    def centres(self) -> tuple[mi.Float, mi.Float]:
         """Return the positions (x, y) of pixel centres, row-major [px]."""
         pixel = dr.arange(mi.UInt32, self.width * self.height)
         row = pixel // self.width
         return mi.Float(pixel - row * self.width) + 0.5, mi.Float(row) + 0.5
 
-    def rays_through(self, x: Any, y: Any) -> Any:
+    def rays_through(self, x: mi.Float, y: mi.Float) -> mi.Ray3f:
         """Return the world-space rays through pixel positions (x, y) [px], with unit direction."""
         ray = dr.zeros(mi.Ray3f, dr.width(x))
         ray.d = self.direction(x, y)
@@ -185,19 +187,19 @@ class CameraView:
         ray.maxt = dr.inf
         return ray
 
-    def direction(self, x: Any, y: Any) -> Any:
+    def direction(self, x: mi.Float, y: mi.Float) -> mi.Vector3f:
         """Return the world-space unit vectors of the rays through pixel positions (x, y) [px]."""
         u, v = self.slopes(x, y)
         axes = [[dr.opaque(mi.Float, float(value)) for value in column] for column in self.world_from_camera[:3, :3].T]
         right, down, forward = axes
         return dr.normalize(mi.Vector3f(*[right[i] * u + down[i] * v + forward[i] for i in range(3)]))
 
-    def cosine(self, rays: Any) -> Any:
+    def cosine(self, rays: mi.Ray3f) -> mi.Float:
         """Return the depth along z per unit of distance along each ray."""
         forward = mi.Vector3f(*[dr.opaque(mi.Float, float(value)) for value in self.world_from_camera[:3, 2]])
         return dr.dot(rays.d, forward)
 
-    def slopes(self, x: Any, y: Any) -> tuple[Any, Any]:
+    def slopes(self, x: mi.Float, y: mi.Float) -> tuple[mi.Float, mi.Float]:
         """Return the undistorted slopes (u, v) of the rays through pixel positions (x, y) [px]."""
         o = self._opaque
         xd, yd = (x - o["cx"]) / o["fx"], (y - o["cy"]) / o["fy"]
@@ -215,7 +217,7 @@ class CameraView:
             u, v = u + (j[3] * ru - j[1] * rv) / det, v + (j[0] * rv - j[2] * ru) / det
         return u - o["du"], v - o["dv"]
 
-    def _fisheye_slopes(self, x: Any, y: Any) -> tuple[Any, Any]:
+    def _fisheye_slopes(self, x: mi.Float, y: mi.Float) -> tuple[mi.Float, mi.Float]:
         radius = dr.maximum(dr.sqrt(x * x + y * y), 1e-9)
         angle = mi.Float(radius)
         for _ in range(8):
@@ -224,10 +226,12 @@ class CameraView:
         return x * scale, y * scale
 
     @property
-    def _k(self) -> list[Any]:
+    def _k(self) -> list[mi.Float]:
         return [self._opaque[f"k{i}"] for i in range(len(self.distortion))]
 
-    def _fisheye_distort(self, u: Any, v: Any) -> tuple[Any, Any, tuple[Any, Any, Any, Any]]:
+    def _fisheye_distort(
+        self, u: mi.Float, v: mi.Float
+    ) -> tuple[mi.Float, mi.Float, tuple[mi.Float, mi.Float, mi.Float, mi.Float]]:
         slope2 = dr.maximum(u * u + v * v, 1e-12)
         slope = dr.sqrt(slope2)
         angle = dr.atan(slope)
@@ -236,7 +240,9 @@ class CameraView:
         growth = (rate / (1 + slope2) - scale) / slope2
         return u * scale, v * scale, (scale + growth * u * u, growth * u * v, growth * u * v, scale + growth * v * v)
 
-    def distort(self, u: Any, v: Any) -> tuple[Any, Any, tuple[Any, Any, Any, Any]]:
+    def distort(
+        self, u: mi.Float, v: mi.Float
+    ) -> tuple[mi.Float, mi.Float, tuple[mi.Float, mi.Float, mi.Float, mi.Float]]:
         """Apply OpenCV's distortion to slopes; return them with the Jacobian (du'/du, du'/dv, dv'/du, dv'/dv).
 
         Source: OpenCV documentation, "Camera Calibration and 3D Reconstruction", rational model, and "Fisheye camera
@@ -263,7 +269,7 @@ class CameraView:
             ),
         )
 
-    def pixel_covariance(self, u: Any, v: Any, variance: float) -> tuple[Any, Any, Any]:
+    def pixel_covariance(self, u: mi.Float, v: mi.Float, variance: float) -> tuple[mi.Float, mi.Float, mi.Float]:
         """Return the covariance (uu, uv, vv) in slopes at (u, v) of an isotropic ``variance`` [px^2]."""
         o = self._opaque
         variance = dr.opaque(mi.Float, variance)
@@ -276,7 +282,9 @@ class CameraView:
         a, b, c, d = d * o["fy"] / det, -b * o["fx"] / det, -c * o["fy"] / det, a * o["fx"] / det
         return variance * (a * a + b * b), variance * (a * c + b * d), variance * (c * c + d * d)
 
-    def tile_box(self, u0: Any, u1: Any, v0: Any, v1: Any) -> tuple[Any, Any, Any, Any]:
+    def tile_box(
+        self, u0: mi.Float, u1: mi.Float, v0: mi.Float, v1: mi.Float
+    ) -> tuple[mi.UInt32, mi.UInt32, mi.UInt32, mi.UInt32]:
         """Return half-open tile ranges (x0, x1, y0, y1) that a box of slopes may intersect, clipped to the image."""
         o = self._opaque
         if not self.distortion:
@@ -302,23 +310,25 @@ class CameraView:
         x0, x1, y0, y1 = self._clip_tiles(lo_x, hi_x, lo_y, hi_y, margin)
         return x0, dr.select(empty, x0, x1), y0, y1
 
-    def tile_columns(self, u0: Any, u1: Any) -> tuple[Any, Any]:
+    def tile_columns(self, u0: mi.Float, u1: mi.Float) -> tuple[mi.UInt32, mi.UInt32]:
         """Return the half-open range of tile columns that a range of slopes intersects in an undistorted view."""
         o = self._opaque
         return self._tile_range(u0 * o["fx"] + o["cx"], u1 * o["fx"] + o["cx"], TILE_WIDTH, self.tiles_x)
 
-    def _clip_tiles(self, x0: Any, x1: Any, y0: Any, y1: Any, margin: Any) -> tuple[Any, Any, Any, Any]:
+    def _clip_tiles(
+        self, x0: mi.Float, x1: mi.Float, y0: mi.Float, y1: mi.Float, margin: mi.Float
+    ) -> tuple[mi.UInt32, mi.UInt32, mi.UInt32, mi.UInt32]:
         columns = self._tile_range(x0 - margin, x1 + margin, TILE_WIDTH, self.tiles_x)
         return *columns, *self._tile_range(y0 - margin, y1 + margin, TILE_HEIGHT, self.tiles_y)
 
-    def _tile_range(self, low: Any, high: Any, size: int, tiles: int) -> tuple[Any, Any]:
+    def _tile_range(self, low: mi.Float, high: mi.Float, size: int, tiles: int) -> tuple[mi.UInt32, mi.UInt32]:
         # Pixels are sampled at their centres, so ranges that end before the first or start after the last centre are
         # empty.
         half = 0.5 if self.samples == 1 else 0.0
         first, last = dr.floor((low + half) / size), dr.floor((high - half) / size) + 1.0
         return mi.UInt32(dr.clip(first, 0.0, float(tiles))), mi.UInt32(dr.clip(last, 0.0, float(tiles)))
 
-    def tile_slopes(self, tile: Any) -> tuple[Any, Any, Any, Any]:
+    def tile_slopes(self, tile: mi.UInt32) -> tuple[mi.Float, mi.Float, mi.Float, mi.Float]:
         """Return the box (u_min, u_max, v_min, v_max) of the slopes of a tile's rays."""
         if self.distortion:
             box = dr.gather(mi.Array4f, self._tile_table, tile)
@@ -334,7 +344,7 @@ class CameraView:
             (y + (TILE_HEIGHT - half) - o["cy"]) / o["fy"],
         )
 
-    def tile_grid(self) -> tuple[tuple[Any, Any, Any], tuple[Any, Any, Any]]:
+    def tile_grid(self) -> tuple[tuple[mi.Float, mi.Float, mi.Float], tuple[mi.Float, mi.Float, mi.Float]]:
         """Return slope of the first tile's centre, step between tiles, and tile width, along u and along v.
 
         The view must be undistorted.
@@ -346,7 +356,7 @@ class CameraView:
         )
 
     @cached_property
-    def _tile_table(self) -> Any:
+    def _tile_table(self) -> mi.Float:
         """Slope boxes of all tiles of a distorted view, 4 floats each, from the slopes along each tile's border."""
         tiles = self.tiles_x * self.tiles_y
         tile = dr.arange(mi.UInt32, tiles)
@@ -365,7 +375,7 @@ class CameraView:
         return table
 
     @cached_property
-    def _extent(self) -> tuple[Any, Any, Any, Any]:
+    def _extent(self) -> tuple[mi.Float, mi.Float, mi.Float, mi.Float]:
         rows = np.array(self._tile_table).reshape(-1, 4)
         lo, hi = rows.min(axis=0), rows.max(axis=0)
         return tuple(dr.opaque(mi.Float, float(v)) for v in (lo[0], hi[1], lo[2], hi[3]))

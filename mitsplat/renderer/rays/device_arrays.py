@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import drjit as dr
 import mitsuba as mi
@@ -12,7 +12,7 @@ import numpy as np
 import trimesh
 
 
-def wrapped(kind: type, values: np.ndarray) -> Any:
+def wrapped(kind: type, values: np.ndarray) -> dr.ArrayBase:
     """Return a device array of type ``kind`` on a copy of ``values`` that starts at a cache line.
 
     Dr.Jit compiles different kernels for unaligned memory, and the alignment of NumPy's memory is random.
@@ -25,7 +25,7 @@ def wrapped(kind: type, values: np.ndarray) -> Any:
     return kind(line)
 
 
-def concatenated(parts: Sequence[Any]) -> Any:
+def concatenated(parts: Sequence[dr.ArrayBase]) -> dr.ArrayBase:
     """Concatenate device arrays of one type without evaluation.
 
     ``dr.concat`` writes the start of each part into its kernels, so that other sizes cause a new compilation.
@@ -40,12 +40,12 @@ def concatenated(parts: Sequence[Any]) -> Any:
     return whole
 
 
-def on_device(*numbers: float) -> Any:
+def on_device(*numbers: float) -> mi.Float:
     """Return a few numbers in one device array; one copy, and kernels do not contain the values."""
     return wrapped(mi.Float, np.array(numbers, dtype=np.float32))
 
 
-def number(values: Any, place: int) -> Any:
+def number(values: mi.Float, place: int) -> mi.Float:
     """Return one of the numbers of :func:`on_device`."""
     return dr.gather(mi.Float, values, place)
 
@@ -53,13 +53,13 @@ def number(values: Any, place: int) -> Any:
 Columns = TypeVar("Columns")
 
 
-def gathered(columns: Columns, index: Any) -> Columns:
+def gathered(columns: Columns, index: mi.UInt32) -> Columns:
     """Return the rows ``index`` of a dataclass of device arrays; arrays of one element hold for all rows."""
     values = [getattr(columns, f.name) for f in fields(columns)]  # type: ignore[arg-type]
     return type(columns)(*[v if dr.width(v) == 1 else dr.gather(type(v), v, index) for v in values])
 
 
-def ray_scene(contents: Mapping[str, Any]) -> mi.Scene:
+def ray_scene(contents: Mapping[str, mi.Shape]) -> mi.Scene:
     """Load a Mitsuba scene of ``contents`` (shapes, lights and others) with watertight triangle edges.
 
     By default Embree misses rays on an edge that two triangles share; OptiX does not.

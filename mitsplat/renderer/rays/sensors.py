@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -17,7 +16,7 @@ SMALLEST_APERTURE = 1e-6
 _PERSPECTIVE = ("PerspectiveCamera", "ThinLensCamera")
 
 
-def view_of(sensor: Any) -> CameraView:
+def view_of(sensor: mi.Sensor) -> CameraView:
     """Return the camera of a sensor: ``opencv_camera``, or Mitsuba's ``perspective`` or ``thinlens``.
 
     Raises:
@@ -56,7 +55,7 @@ def view_of(sensor: Any) -> CameraView:
     return cropped(view, sensor.film())
 
 
-def cropped(view: CameraView, film: Any) -> CameraView:
+def cropped(view: CameraView, film: mi.Film) -> CameraView:
     """Return the part of a view inside the crop window of a film."""
     (width, height), (x, y) = film.crop_size(), film.crop_offset()
     return replace(view, width=int(width), height=int(height), cx=view.cx - int(x), cy=view.cy - int(y))

@@ -30,7 +30,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -61,9 +60,9 @@ class Cloud:
     """
 
     count: int
-    geometry: Any
-    scales: Any
-    sh: Any
+    geometry: mi.Float
+    scales: mi.Float
+    sh: mi.Float
     sh_count: int
     sh_stride: int
 
@@ -88,7 +87,7 @@ def upload_cloud(
     return Cloud(count, wrapped(mi.Float, geometry), wrapped(mi.Float, sigma), wrapped(mi.Float, padded), bands, stride)
 
 
-def evaluate_sh(direction: Any, coefficient: Any, bands: int) -> list[Any]:
+def evaluate_sh(direction: mi.Vector3f, coefficient: Callable[[int], list[mi.Float]], bands: int) -> list[mi.Float]:
     """Evaluate the display-encoded colour of Gaussians along unit vectors.
 
     The basis is that of 3DGS, real spherical harmonics (Kerbl et al. 2023).
@@ -100,7 +99,7 @@ def evaluate_sh(direction: Any, coefficient: Any, bands: int) -> list[Any]:
         bands: Number of coefficients to use, 1, 4, 9 or 16.
     """
     x, y, z = direction.x, direction.y, direction.z
-    basis: list[Any] = [0.28209479177387814]
+    basis: list[mi.Float] = [0.28209479177387814]
     if bands > 1:
         basis += [-0.4886025119029199 * y, 0.4886025119029199 * z, -0.4886025119029199 * x]
     if bands > 4:
@@ -129,20 +128,20 @@ def evaluate_sh(direction: Any, coefficient: Any, bands: int) -> list[Any]:
     return [dr.maximum(c, 0.0) for c in colour]
 
 
-def srgb_to_linear(value: Any) -> Any:
+def srgb_to_linear(value: mi.Float) -> mi.Float:
     """Apply the electro-optical transfer of IEC 61966-2-1, extended above 1."""
     return dr.select(
         value <= 0.04045, value / 12.92, dr.power(dr.fma(dr.maximum(value, 0), 1 / 1.055, 0.055 / 1.055), 2.4)
     )
 
 
-def linear_to_srgb(value: Any) -> Any:
+def linear_to_srgb(value: mi.Float) -> mi.Float:
     """Apply the inverse of :func:`srgb_to_linear`; values below 0 count as 0."""
     value = dr.maximum(value, 0)
     return dr.select(value <= 0.0031308, 12.92 * value, 1.055 * dr.power(dr.maximum(value, 1e-9), 1 / 2.4) - 0.055)
 
 
-def rotation_axes(q: Any) -> Axes:
+def rotation_axes(q: mi.Array4f) -> Axes:
     """Return the columns of a quaternion's (xyzw) rotation matrix: the Gaussian's axes in its frame."""
     x, y, z, w = q
     return (
@@ -152,8 +151,8 @@ def rotation_axes(q: Any) -> Axes:
     )
 
 
-Axes = tuple[Any, Any, Any]
-Conic6 = tuple[Any, Any, Any, Any, Any, Any]
+Axes = tuple["mi.Vector3f", "mi.Vector3f", "mi.Vector3f"]
+Conic6 = tuple["mi.Float", "mi.Float", "mi.Float", "mi.Float", "mi.Float", "mi.Float"]
 """Coefficients of u^2, uv, v^2, u, v and 1."""
 
 
@@ -161,20 +160,20 @@ Conic6 = tuple[Any, Any, Any, Any, Any, Any]
 class Response:
     """Response of a Gaussian to rays: centre, coefficients (module docstring), depth and det(M)."""
 
-    u0: Any
-    v0: Any
-    a: Any
-    b2: Any
-    c: Any
-    e: Any
-    f: Any
-    g: Any
-    h: Any
-    i: Any
-    depth: Any
-    det: Any
+    u0: mi.Float
+    v0: mi.Float
+    a: mi.Float
+    b2: mi.Float
+    c: mi.Float
+    e: mi.Float
+    f: mi.Float
+    g: mi.Float
+    h: mi.Float
+    i: mi.Float
+    depth: mi.Float
+    det: mi.Float
 
-    def filtered(self, k11: Any, k12: Any, k22: Any) -> tuple[Response, Any]:
+    def filtered(self, k11: mi.Float, k12: mi.Float, k22: mi.Float) -> tuple[Response, mi.Float]:
         """Return the response under a low-pass filter of covariance K in slopes, and det(I + M K).
 
         See the module docstring.
@@ -206,7 +205,7 @@ class Response:
         """Return the response along rays parallel to the central one, without perspective within the footprint."""
         return replace(self, e=mi.Float(0), f=mi.Float(0), g=mi.Float(0), h=mi.Float(0), i=mi.Float(0))
 
-    def cutoff(self, k2: Any) -> Conic6:
+    def cutoff(self, k2: mi.Float) -> Conic6:
         """Return coefficients of du^2, du dv, dv^2, du, dv and 1 of the conic that is <= 0 where q <= k^2."""
         return (
             self.a - k2 * self.g,
@@ -230,13 +229,13 @@ class PlacedGaussian:
         scale: Size of one unit of the frame [m].
     """
 
-    mean: Any
+    mean: mi.Vector3f
     axes: Axes
-    sigma: list[Any]
-    right: Any
-    down: Any
-    forward: Any
-    scale: Any
+    sigma: list[mi.Float]
+    right: mi.Vector3f
+    down: mi.Vector3f
+    forward: mi.Vector3f
+    scale: mi.Float
 
 
 def project_gaussian(gaussian: PlacedGaussian) -> Response:
@@ -255,7 +254,7 @@ def project_gaussian(gaussian: PlacedGaussian) -> Response:
     thinnest = dr.minimum(dr.minimum(sigma[0], sigma[1]), sigma[2])
     ratio = [thinnest / s for s in sigma]
 
-    def whiten(vector: Any) -> Any:
+    def whiten(vector: mi.Vector3f) -> mi.Vector3f:
         return mi.Vector3f(*[dr.dot(axis, vector) * r for axis, r in zip(gaussian.axes, ratio, strict=True)])
 
     w0, w1, w2 = whiten(ray), whiten(right), whiten(down)
@@ -278,7 +277,7 @@ def project_gaussian(gaussian: PlacedGaussian) -> Response:
     )
 
 
-def ellipse_bounds(cutoff: Conic6) -> tuple[Any, Any, Any, Any, Any]:
+def ellipse_bounds(cutoff: Conic6) -> tuple[mi.Float, mi.Float, mi.Float, mi.Float, mi.Bool]:
     """Return the bounding box (du_min, du_max, dv_min, dv_max) of a conic, and True where it is an ellipse."""
     a, b, c, d, e, f = cutoff
     det = 4 * a * c - b * b
@@ -290,7 +289,7 @@ def ellipse_bounds(cutoff: Conic6) -> tuple[Any, Any, Any, Any, Any]:
     return (mid_u - half_u) * inv, (mid_u + half_u) * inv, (mid_v - half_v) * inv, (mid_v + half_v) * inv, ellipse
 
 
-def ellipse_spans(cutoff: Conic6) -> Callable[[Any, Any], tuple[Any, Any, Any]]:
+def ellipse_spans(cutoff: Conic6) -> Callable[[mi.Float, mi.Float], tuple[mi.Float, mi.Float, mi.Bool]]:
     """Return a function that clips an ellipse to a band of v.
 
     The function maps the limits of the band to (du_min, du_max) of the ellipse in it, and to True if they intersect.
@@ -300,12 +299,12 @@ def ellipse_spans(cutoff: Conic6) -> Callable[[Any, Any], tuple[Any, Any, Any]]:
     half = 0.5 * dr.rcp(a)
     extremes = [-0.5 * (b * du + e) / c for du in (du_min, du_max)]
 
-    def edge(v: Any, sign: float) -> tuple[Any, Any]:
+    def edge(v: mi.Float, sign: float) -> tuple[mi.Float, mi.Bool]:
         linear = dr.fma(b, v, d)
         root = dr.square(linear) - 4 * a * dr.fma(dr.fma(c, v, e), v, f)
         return (sign * dr.safe_sqrt(root) - linear) * half, root >= 0
 
-    def span(lo_v: Any, hi_v: Any) -> tuple[Any, Any, Any]:
+    def span(lo_v: mi.Float, hi_v: mi.Float) -> tuple[mi.Float, mi.Float, mi.Bool]:
         # The outline recedes on both sides of the ellipse's extreme point, so that the nearest v of the band is
         # decisive.
         lo, below = edge(dr.clip(extremes[0], lo_v, hi_v), -1.0)
@@ -315,7 +314,7 @@ def ellipse_spans(cutoff: Conic6) -> Callable[[Any, Any], tuple[Any, Any, Any]]:
     return span
 
 
-def conic_touches_rectangle(conic: Conic6, lo_u: Any, hi_u: Any, lo_v: Any, hi_v: Any) -> Any:
+def conic_touches_rectangle(conic: Conic6, lo_u: mi.Float, hi_u: mi.Float, lo_v: mi.Float, hi_v: mi.Float) -> mi.Bool:
     """Return True if a conic is <= 0 anywhere in an axis-aligned rectangle; exact for every kind of conic.
 
     The minimum of a quadratic over a rectangle lies at a corner, at the vertex of an edge along which it is convex, or,
@@ -323,15 +322,15 @@ def conic_touches_rectangle(conic: Conic6, lo_u: Any, hi_u: Any, lo_v: Any, hi_v
     """
     a, b, c, d, e, f = conic
 
-    def along_u(v: Any) -> Any:
+    def along_u(v: mi.Float) -> mi.Float:
         u = dr.clip(dr.select(a > 0, -0.5 * (b * v + d) / a, lo_u), lo_u, hi_u)
         return (a * u + b * v + d) * u + (c * v + e) * v + f
 
-    def along_v(u: Any) -> Any:
+    def along_v(u: mi.Float) -> mi.Float:
         v = dr.clip(dr.select(c > 0, -0.5 * (b * u + e) / c, lo_v), lo_v, hi_v)
         return (c * v + b * u + e) * v + (a * u + d) * u + f
 
-    def at(u: Any, v: Any) -> Any:
+    def at(u: mi.Float, v: mi.Float) -> mi.Float:
         return (a * u + b * v + d) * u + (c * v + e) * v + f
 
     det = 4 * a * c - b * b
@@ -355,7 +354,7 @@ def respond_at_plane(gaussian: PlacedGaussian) -> PlaneRecord:
     )
     c1, c2, c3 = dr.cross(wm, w1), dr.cross(wm, w2), dr.cross(wm, w3)
 
-    def quadratic(p: Any, q: Any, r: Any) -> list[Any]:
+    def quadratic(p: mi.Vector3f, q: mi.Vector3f, r: mi.Vector3f) -> list[mi.Float]:
         return [dr.dot(p, p), 2 * dr.dot(p, q), dr.dot(q, q), 2 * dr.dot(p, r), 2 * dr.dot(q, r), dr.dot(r, r)]
 
     numerator = [value * LOG2_E_HALF for value in map(dr.detach, quadratic(c1, c2, c3))]

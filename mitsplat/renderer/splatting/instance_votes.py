@@ -8,8 +8,6 @@ order of ids, until the remaining instances together weigh less than the best on
 
 from __future__ import annotations
 
-from typing import Any
-
 import drjit as dr
 import mitsuba as mi
 
@@ -30,12 +28,12 @@ Each slot holds id and weight, 0 if empty.
 """
 
 
-def new_tally() -> list[Any]:
+def new_tally() -> list[mi.Float]:
     """Return the empty tally of a ray."""
     return [mi.Float(0.0) for _ in range(SLOTS + 2 * FIRST_SLOTS)]
 
 
-def add_to_tally(tally: list[Any], weight: Any, instance: Any) -> list[Any]:
+def add_to_tally(tally: list[mi.Float], weight: mi.Float, instance: mi.Float) -> list[mi.Float]:
     """Return the tally after one more Gaussian."""
     placed = instance == 0
     result = [dr.select(placed, tally[ENVIRONMENT] + weight, tally[ENVIRONMENT]), tally[OTHERS]]
@@ -48,7 +46,7 @@ def add_to_tally(tally: list[Any], weight: Any, instance: Any) -> list[Any]:
     return result
 
 
-def winner_of_tally(tally: list[Any], transmittance: Any) -> tuple[Any, Any]:
+def winner_of_tally(tally: list[mi.Float], transmittance: mi.Float) -> tuple[mi.Float, mi.Bool]:
     """Return the instance (Float) with the largest share of a ray, and True if another one may have more.
 
     The remaining transmittance counts as environment.
@@ -60,8 +58,14 @@ def winner_of_tally(tally: list[Any], transmittance: Any) -> tuple[Any, Any]:
 
 
 def resolve_instances(
-    instance: Any, uncertain: Any, lists: TileLists, view: CameraView, quality: Quality, order: Order, z_max: Any | None
-) -> Any:
+    instance: mi.UInt32,
+    uncertain: mi.Bool,
+    lists: TileLists,
+    view: CameraView,
+    quality: Quality,
+    order: Order,
+    z_max: mi.Float | None,
+) -> mi.UInt32:
     """Return the instance image (UInt32, row-major) with exact ids where it is ``uncertain`` (Bool).
 
     Rays are walked in the ``order`` of the picture. Other rays are not walked, but their lanes are launched, which
@@ -74,7 +78,9 @@ def resolve_instances(
     far = mi.Float(dr.inf) if z_max is None else dr.gather(mi.Float, z_max, pixel, wanted)
     slopes = lanes.slopes(*(dr.opaque(mi.Float, 0.5) for _ in range(2)))
 
-    def body(last: Any, best: Any, most: Any, active: Any) -> tuple[Any, Any, Any, Any]:
+    def body(
+        last: mi.Float, best: mi.Float, most: mi.Float, active: mi.Bool
+    ) -> tuple[mi.Float, mi.Float, mi.Float, mi.Bool]:
         rays = Rays.through(
             lists, view, quality, slopes, [far], lanes.start, dr.select(active, lanes.stop, lanes.start)
         )
@@ -104,7 +110,7 @@ def _initial_votes() -> Pixel:
     return [mi.Float(1.0), mi.Float(0.0), mi.Float(0.0), *slots]
 
 
-def _add_vote(pixel: Pixel, weight: Any, instance: Any, last: Any) -> Pixel:
+def _add_vote(pixel: Pixel, weight: mi.Float, instance: mi.Float, last: mi.Float) -> Pixel:
     """Return the state after one more Gaussian: the smallest ids above ``last`` keep their slots.
 
     An id that is among them at the end always had a slot, so that its sum is complete.

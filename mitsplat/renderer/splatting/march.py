@@ -75,12 +75,12 @@ class Image:
         error: Estimated error of ``rgb`` due to the blending order, see the module; None without an estimate.
     """
 
-    rgb: list[Any]
-    alpha: Any
-    depth: Any
-    instance: Any
-    centre_alpha: Any
-    error: Any | None
+    rgb: list[mi.Float]
+    alpha: mi.Float
+    depth: mi.Float
+    instance: mi.UInt32
+    centre_alpha: mi.Float
+    error: mi.Float | None
 
     @classmethod
     def empty(cls, count: int) -> Image:
@@ -104,10 +104,15 @@ class Image:
         for pixel, inside in zip(lanes.pixel, lanes.inside, strict=True):
             dr.scatter(changed, mi.Bool(True), pixel, inside)
         dr.eval(changed, part)
-        return Image(**{f.name: _select(changed, getattr(part, f.name), getattr(self, f.name)) for f in fields(Image)})
+        values: dict[str, Any] = {
+            f.name: _select(changed, getattr(part, f.name), getattr(self, f.name)) for f in fields(Image)
+        }
+        return Image(**values)
 
 
-def _select(changed: Any, new: Any, old: Any) -> Any:
+def _select(
+    changed: mi.Bool, new: list[mi.Float] | dr.ArrayBase | None, old: list[mi.Float] | dr.ArrayBase | None
+) -> list[mi.Float] | dr.ArrayBase | None:
     if new is None or old is None:
         return None
     if isinstance(new, list):
@@ -115,7 +120,7 @@ def _select(changed: Any, new: Any, old: Any) -> Any:
     return dr.select(changed, new, old)
 
 
-def largest_and_mean(error: Any) -> tuple[Any, Any]:
+def largest_and_mean(error: mi.Float) -> tuple[mi.Float, mi.Float]:
     """Return maximum and mean of the pixels' errors, each clamped to 1.
 
     The mean uses integers, whose sum does not depend on the order.
@@ -156,14 +161,14 @@ def _fresh(several: bool, late: OutOfOrder) -> Pixel:
 
 
 def _blend(
-    pixel: Pixel, alpha: Any, record: GaussianRecord | FieldsOnAccess, z: Any, several: bool, late: OutOfOrder
+    pixel: Pixel, alpha: mi.Float, record: GaussianRecord | FieldsOnAccess, z: mi.Float, several: bool, late: OutOfOrder
 ) -> Pixel:
     """Return the state of a ray after one more Gaussian."""
     weight = pixel[TRANSMITTANCE] * alpha
     transmittance = pixel[TRANSMITTANCE] - weight
     colour = record.colour
     sums = [dr.fma(weight, c, sum_c) for c, sum_c in zip(colour, pixel[RED : BLUE + 1], strict=True)]
-    extra: list[Any] = []
+    extra: list[mi.Float] = []
     if late == "estimated":
         extra = _add_to_error(pixel, alpha, weight, colour, z)
     elif late == "corrected":
@@ -179,7 +184,7 @@ def _blend(
     ]
 
 
-def _shares(pixel: Pixel, weight: Any, late: Any, z: Any, decay: int) -> tuple[Any, Any]:
+def _shares(pixel: Pixel, weight: mi.Float, late: mi.Bool, z: mi.Float, decay: int) -> tuple[mi.Float, mi.Float]:
     """Return the share of the sums behind a late peak, and the share kept after a new deepest peak.
 
     See the module. Both cases use the same division.
@@ -190,7 +195,9 @@ def _shares(pixel: Pixel, weight: Any, late: Any, z: Any, decay: int) -> tuple[A
     return dr.select(gap < reach, ratio, 1.0), ratio
 
 
-def _add_to_error(pixel: Pixel, alpha: Any, weight: Any, colour: list[Any], z: Any) -> list[Any]:
+def _add_to_error(
+    pixel: Pixel, alpha: mi.Float, weight: mi.Float, colour: list[mi.Float], z: mi.Float
+) -> list[mi.Float]:
     """Return the state of late peaks with the error estimate after one more Gaussian, see the module."""
     total, _, *colours = pixel[SUMS]
     deepest, met = pixel[DEEPEST], weight > 0
@@ -207,7 +214,9 @@ def _add_to_error(pixel: Pixel, alpha: Any, weight: Any, colour: list[Any], z: A
     ]
 
 
-def _corrected(pixel: Pixel, alpha: Any, weight: Any, colour: list[Any], z: Any) -> tuple[list[Any], list[Any]]:
+def _corrected(
+    pixel: Pixel, alpha: mi.Float, weight: mi.Float, colour: list[mi.Float], z: mi.Float
+) -> tuple[list[mi.Float], list[mi.Float]]:
     """Return the colour correction for a late Gaussian, and the state of late peaks after it."""
     total, _, *colours = pixel[SUMS]
     deepest, met = pixel[DEEPEST], weight > 0
@@ -224,7 +233,12 @@ def _corrected(pixel: Pixel, alpha: Any, weight: Any, colour: list[Any], z: Any)
 
 
 def trace(
-    clouds: CloudSet, placements: Sequence[Placement], view: CameraView, quality: Quality, *, z_max: Any | None = None
+    clouds: CloudSet,
+    placements: Sequence[Placement],
+    view: CameraView,
+    quality: Quality,
+    *,
+    z_max: mi.Float | None = None,
 ) -> Image:
     """Render all placements; an image with too many pairs for the memory is rendered in parts.
 
@@ -258,8 +272,8 @@ def march(
     view: CameraView,
     quality: Quality,
     *,
-    z_max: Any | None = None,
-    slopes: tuple[list[Any], list[Any]] | None = None,
+    z_max: mi.Float | None = None,
+    slopes: tuple[list[mi.Float], list[mi.Float]] | None = None,
 ) -> Image:
     """Blend every ray of a view front to back, and average the colours of each pixel.
 
@@ -291,10 +305,10 @@ def _march(
     view: CameraView,
     quality: Quality,
     order: Order,
-    z_max: Any | None,
-    slopes: tuple[list[Any], list[Any]] | None = None,
+    z_max: mi.Float | None,
+    slopes: tuple[list[mi.Float], list[mi.Float]] | None = None,
     estimated: bool = False,
-) -> tuple[Image, Any]:
+) -> tuple[Image, mi.UInt32 | None]:
     """Return the image of one march, and the places of tiles whose estimated error exceeds the tolerance.
 
     The places are None unless ``estimated`` is True.
@@ -311,11 +325,11 @@ def _march(
     stops_early = estimated and order == "tile"
     late: OutOfOrder = "estimated" if estimated else _out_of_order(quality)
 
-    def within_tolerance(pixels: list[Pixel]) -> Any:
+    def within_tolerance(pixels: list[Pixel]) -> mi.Bool:
         """Return True for lanes in which no ray's error exceeds the tolerance."""
         return ~_exceeds_tolerance([pixel[ERROR] for pixel in pixels], lanes.inside, tolerance)
 
-    def pixels(dx: float, dy: float, labelled: bool) -> tuple[list[Pixel], list[Any]]:
+    def pixels(dx: float, dy: float, labelled: bool) -> tuple[list[Pixel], list[mi.Float]]:
         """Return the states of the rays at an offset in the pixels, and their error estimates."""
         state: dict[str, Any] = {"several": labelled and several, "late": late}
         where = slopes or lanes.slopes(dr.opaque(mi.Float, dx), dr.opaque(mi.Float, dy))
@@ -362,12 +376,12 @@ def _without_extra(pixels: list[Pixel], late: OutOfOrder) -> list[Pixel]:
     return [pixel[: len(pixel) - _EXTRA_STATE[late]] for pixel in pixels]
 
 
-def _exceeds_tolerance(errors: list[Any], inside: list[Any], tolerance: Any) -> Any:
+def _exceeds_tolerance(errors: list[mi.Float], inside: list[mi.Bool], tolerance: mi.Float) -> mi.Bool:
     """Return True for lanes in which the estimate of a ray inside the image exceeds the tolerance."""
     return max_of([dr.select(m, error, 0.0) for error, m in zip(errors, inside, strict=True)]) > tolerance
 
 
-def _tiles_of(flags: Any, lanes: Lanes) -> Any:
+def _tiles_of(flags: mi.Bool, lanes: Lanes) -> mi.UInt32:
     """Return the places of tiles that have flagged lanes."""
     dr.eval(flags)
     per_tile = TILE_PIXELS // lanes.rows
@@ -375,7 +389,7 @@ def _tiles_of(flags: Any, lanes: Lanes) -> Any:
     return dr.compress(reduce(or_, [dr.gather(mi.Bool, flags, lane + k) for k in range(per_tile)]))
 
 
-def march_tiles(lists: TileLists, view: CameraView, quality: Quality, z_max: Any | None = None) -> Image:
+def march_tiles(lists: TileLists, view: CameraView, quality: Quality, z_max: mi.Float | None = None) -> Image:
     """Render the pixels of some tiles, tile after tile, with one ray through each pixel's centre.
 
     Arguments are those of :func:`march`. Nothing is repaired: the order is per tile or per ray.
@@ -395,7 +409,7 @@ def march_tiles(lists: TileLists, view: CameraView, quality: Quality, z_max: Any
     return image
 
 
-def _picture(pixels: list[Pixel], lanes: Lanes, quality: Quality) -> list[Any]:
+def _picture(pixels: list[Pixel], lanes: Lanes, quality: Quality) -> list[mi.Float]:
     """Return red, green, blue and opacity of the lanes' pixels as row-major arrays."""
     shown = [[*pixel[RED : BLUE + 1], 1.0 - pixel[TRANSMITTANCE]] for pixel in pixels]
     if quality.normalise_ended_rays:
@@ -405,7 +419,7 @@ def _picture(pixels: list[Pixel], lanes: Lanes, quality: Quality) -> list[Any]:
     return [lanes.image(mi.Float, list(channel)) for channel in zip(*shown, strict=True)]
 
 
-def _collect(pixels: list[Pixel], lanes: Lanes, only: int | None, quality: Quality) -> tuple[Image, Any]:
+def _collect(pixels: list[Pixel], lanes: Lanes, only: int | None, quality: Quality) -> tuple[Image, mi.Bool | None]:
     """Return the lanes' pixels as row-major arrays, and a flag (Bool) where an instance is uncertain.
 
     ``only`` is the instance id of all Gaussians, or None if there are several.

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -50,26 +49,26 @@ class Pairs:
         first: First pair of each record, followed by the number of pairs; None unless the pairs are numbered.
     """
 
-    key: Any
-    record: Any | None = None
-    first: Any | None = None
+    key: mi.UInt64
+    record: mi.UInt32 | None = None
+    first: mi.UInt32 | None = None
 
     @staticmethod
-    def key_of(tile: Any, level: Any, number: Any) -> Any:
+    def key_of(tile: mi.UInt32, level: mi.UInt32, number: mi.UInt32) -> mi.UInt64:
         """Combine tile, depth level, and the number of the record or pair in one sort key."""
         return mi.UInt64(tile) << (DEPTH_BITS + NUMBER_BITS) | mi.UInt64(level) << NUMBER_BITS | mi.UInt64(number)
 
 
 def pair_records(
-    records: Any,
-    plane_records: Any | None,
-    least: Any,
-    box: Any,
+    records: mi.Float,
+    plane_records: mi.Float | None,
+    least: mi.Float,
+    box: mi.UInt32,
     view: CameraView,
     quality: Quality,
     subset: TileSubset | TileBox | None,
     numbered: bool,
-    groups: Any | None = None,
+    groups: mi.UInt32 | None = None,
 ) -> Pairs | None:
     """Pair every record with the tiles it intersects; return None if there are no pairs.
 
@@ -93,7 +92,7 @@ def pair_records(
     length = dr.empty(mi.UInt32, rows)
     span_of = _spans(GaussianRecord.fetch(records, order), cut, x0, x1, view)
 
-    def one_row(y: Any) -> tuple[Any]:
+    def one_row(y: mi.UInt32) -> tuple[mi.UInt32]:
         lo, hi = span_of(y)
         row = row_of + (y - y0)
         begin, size = y * view.tiles_x + lo, dr.select(hi > lo, hi - lo, 0)
@@ -113,7 +112,7 @@ def pair_records(
     ellipsoid = dr.gather(mi.Float, least, owner)
     key, number = dr.empty(mi.UInt64, pairs), dr.empty(mi.UInt32, pairs) if numbered else None
 
-    def in_view(tile: Any, active: Any = True) -> Any:
+    def in_view(tile: mi.UInt32, active: mi.Bool = True) -> mi.UInt32:
         return tile if subset is None else dr.gather(mi.UInt32, subset.number, tile, active)
 
     if groups is None:
@@ -121,7 +120,7 @@ def pair_records(
     else:
         group = dr.gather(mi.UInt32, groups, owner)
 
-    def one_tile(k: Any) -> tuple[Any]:
+    def one_tile(k: mi.UInt32) -> tuple[mi.UInt32]:
         tile, pair = first_tile + k, pair_of + k
         level = level_of(depth_of(in_view(tile)), view) if groups is None else group
         own = Pairs.key_of(tile, level, pair if numbered else owner)
@@ -142,7 +141,7 @@ def pair_records(
     return Pairs(key, number, first)
 
 
-def prefix_ranges(sizes: Any, most: int) -> tuple[Any, int]:
+def prefix_ranges(sizes: mi.UInt32, most: int) -> tuple[mi.UInt32, int]:
     """Return the start of each of consecutive ranges of size at most ``most``, and their total size.
 
     Raises:
@@ -159,7 +158,9 @@ def prefix_ranges(sizes: Any, most: int) -> tuple[Any, int]:
     return begin, totals[0]
 
 
-def _spans(record: GaussianRecord, cut: Any, x0: Any, x1: Any, view: CameraView) -> Callable[[Any], tuple[Any, Any]]:
+def _spans(
+    record: GaussianRecord, cut: mi.Float, x0: mi.UInt32, x1: mi.UInt32, view: CameraView
+) -> Callable[[mi.UInt32], tuple[mi.UInt32, mi.UInt32]]:
     """Return a function from a row of tiles to the half-open range that a record's ellipse intersects.
 
     Gaussians at the camera's plane take their whole box. Under lens distortion, rows of tiles are not bands of slopes,
@@ -173,15 +174,15 @@ def _spans(record: GaussianRecord, cut: Any, x0: Any, x1: Any, view: CameraView)
         span_between = ellipse_spans(conic)
         _, (first_v, step_v, height) = view.tile_grid()
 
-    def straight(y: Any) -> tuple[Any, Any]:
+    def straight(y: mi.UInt32) -> tuple[mi.UInt32, mi.UInt32]:
         dv = dr.fma(mi.Float(y), step_v, first_v) - v0
         lo_u, hi_u, meets = span_between(dv - 0.5 * height, dv + 0.5 * height)
         lo, hi = view.tile_columns(u0 + lo_u, u0 + hi_u)
         lo, hi = dr.maximum(lo, x0), dr.minimum(dr.select(meets, hi, 0), x1)
         return dr.select(whole, x0, lo), dr.select(whole, x1, hi)
 
-    def distorted(y: Any) -> tuple[Any, Any]:
-        def one_tile(x: Any, lo: Any, hi: Any) -> tuple[Any, Any, Any]:
+    def distorted(y: mi.UInt32) -> tuple[mi.UInt32, mi.UInt32]:
+        def one_tile(x: mi.UInt32, lo: mi.UInt32, hi: mi.UInt32) -> tuple[mi.UInt32, mi.UInt32, mi.UInt32]:
             lo_u, hi_u, lo_v, hi_v = view.tile_slopes(y * view.tiles_x + x)
             meets = whole | conic_touches_rectangle(conic, lo_u - u0, hi_u - u0, lo_v - v0, hi_v - v0)
             return x + 1, dr.select(meets, dr.minimum(lo, x), lo), dr.select(meets, x + 1, hi)

@@ -5,16 +5,15 @@ All clouds lie in one set of device arrays.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from mitsplat.quality import KERNELS, Quality
-from mitsplat.renderer.rays.camera_rays import CameraView, Kind
+from mitsplat.renderer.rays.camera_rays import CameraView, Kind, ViewNumbers
 from mitsplat.renderer.rays.device_arrays import concatenated, wrapped
 from mitsplat.renderer.splatting.gaussian import (
     LOG2_E_HALF,
@@ -56,14 +55,14 @@ class CloudSet:
 
     counts: tuple[int, ...]
     first: tuple[int, ...]
-    geometry: Any
-    scales: Any
-    sh: Any
+    geometry: mi.Float
+    scales: mi.Float
+    sh: mi.Float
     sh_count: int
     sh_stride: int
-    _numbers: dict[tuple[int, ...], tuple[Any, Any]] = field(default_factory=dict, init=False, repr=False)
+    _numbers: dict[tuple[int, ...], tuple[mi.UInt32, mi.UInt32]] = field(default_factory=dict, init=False, repr=False)
 
-    def numbers(self, indices: Sequence[int]) -> tuple[Any, Any]:
+    def numbers(self, indices: Sequence[int]) -> tuple[mi.UInt32, mi.UInt32]:
         """Return, for every Gaussian of the clouds ``indices``, its index into ``indices`` and its number.
 
         The last two results are cached: all placements of a layout, and its objects alone.
@@ -75,7 +74,7 @@ class CloudSet:
             self._numbers[key] = self._enumerate(key)
         return self._numbers[key]
 
-    def _enumerate(self, indices: tuple[int, ...]) -> tuple[Any, Any]:
+    def _enumerate(self, indices: tuple[int, ...]) -> tuple[mi.UInt32, mi.UInt32]:
         counts = [self.counts[cloud] for cloud in indices]
         total = int(sum(counts))
         number = dr.arange(mi.UInt32, total)
@@ -130,7 +129,9 @@ change.
 """
 
 
-def placement_table(clouds: CloudSet, placements: Sequence[Placement], view: CameraView) -> tuple[Any, Any, Any]:
+def placement_table(
+    clouds: CloudSet, placements: Sequence[Placement], view: CameraView
+) -> tuple[mi.Float, mi.UInt32, mi.UInt32]:
     """Return placement rows on the device, and for every placed Gaussian its row and its number in the clouds."""
     rows = np.zeros((max(1, len(placements)), PlacementRow.WIDTH), np.float32)
     if placements:
@@ -163,10 +164,10 @@ class _Input:
     """
 
     gaussian: PlacedGaussian
-    opacity: Any
-    instance: Any
-    appearance: list[Any]
-    point: Any
+    opacity: mi.Float
+    instance: mi.Float
+    appearance: list[mi.Float]
+    point: mi.Vector3f
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,24 +183,30 @@ class _Bounds:
     """
 
     response: Response
-    opacity: Any
-    at_plane: Any
-    visible: Any
-    slope_box: tuple[Any, Any, Any, Any]
-    least_depth: Any
+    opacity: mi.Float
+    at_plane: mi.Bool
+    visible: mi.Bool
+    slope_box: tuple[mi.Float, mi.Float, mi.Float, mi.Float]
+    least_depth: mi.Float
 
 
 class Projector:
     """Input of the projection kernels; ``changed`` is True if any placement has an appearance."""
 
     def __init__(
-        self, clouds: CloudSet, table: Any, view: CameraView, quality: Quality, at_camera: bool, changed: bool = False
+        self,
+        clouds: CloudSet,
+        table: mi.Float,
+        view: CameraView,
+        quality: Quality,
+        at_camera: bool,
+        changed: bool = False,
     ) -> None:
         self.clouds, self.table, self.view, self.quality, self.at_camera = clouds, table, view, quality, at_camera
         self.changed = changed
         self.cut = dr.opaque(mi.Float, quality.alpha_min)
 
-    def _load(self, owner: Any, local: Any) -> _Input:
+    def _load(self, owner: mi.UInt32, local: mi.UInt32) -> _Input:
         row = dr.gather(mi.ArrayXf, self.table, owner, shape=(PlacementRow.WIDTH, dr.width(owner)))
         packet = dr.gather(
             mi.ArrayXf, self.clouds.geometry, local, mode=_ADJOINT, shape=(Geometry.WIDTH, dr.width(local))
@@ -255,7 +262,7 @@ class Projector:
         farthest = dr.maximum(centre[2] + reach[2], view.near_plane)
 
         # Slopes of the ellipsoid's box behind the near plane: a loose bound, but few Gaussians need it.
-        def slopes(axis: int) -> tuple[Any, Any]:
+        def slopes(axis: int) -> tuple[mi.Float, mi.Float]:
             lo, hi = centre[axis] - reach[axis], centre[axis] + reach[axis]
             return (
                 lo / dr.select(lo < 0, view.near_plane, farthest),
@@ -274,7 +281,7 @@ class Projector:
             visible &= ~at_plane
         return _Bounds(response, opacity, at_plane, visible, box, centre[2] - reach[2])
 
-    def cull(self, owner: Any, local: Any, subset: TileSubset | None = None) -> tuple[Any, Any]:
+    def cull(self, owner: mi.UInt32, local: mi.UInt32, subset: TileSubset | None = None) -> tuple[mi.Bool, mi.Bool]:
         """Return two flags per Gaussian: it is in view (and in ``subset`` tiles), and it reaches the camera's plane."""
         bounds = self._bounds(self._load(owner, local))
         x0, x1, y0, y1 = self.view.tile_box(*bounds.slope_box)
@@ -284,7 +291,9 @@ class Projector:
         dr.eval(visible, at_plane)
         return visible, at_plane
 
-    def records(self, owner: Any, local: Any, at_plane: Any) -> tuple[Any, Any, Any, Any]:
+    def records(
+        self, owner: mi.UInt32, local: mi.UInt32, at_plane: mi.Bool
+    ) -> tuple[mi.Float, mi.Float | None, mi.Float, mi.UInt32]:
         """Return view records, records of Gaussians at the camera's plane, least depths, and tile boxes."""
         g = self._load(owner, local)
         bounds = self._bounds(g)
@@ -302,7 +311,7 @@ class Projector:
         dr.eval(records, tile_box, least)
         return records, plane_records, least, tile_box
 
-    def all_records(self, owner: Any, local: Any) -> tuple[Any, Any, Any, Any, Any]:
+    def all_records(self, owner: mi.UInt32, local: mi.UInt32) -> tuple[mi.Float, mi.Float, mi.UInt32, mi.Bool, mi.Bool]:
         """Return view records of all Gaussians, least depths, tile boxes, visibility, and flags of the camera's plane.
 
         Invisible Gaussians have empty boxes. Records of Gaussians that reach the camera's plane are not marked. Unlike
@@ -317,7 +326,9 @@ class Projector:
         at_plane = visible & dr.detach(bounds.at_plane)
         return _rows(mi.Float, [*record]), dr.detach(bounds.least_depth), boxes, visible, at_plane
 
-    def records_unculled(self, owner: Any, local: Any) -> tuple[Any, Any, Any, Any]:
+    def records_unculled(
+        self, owner: mi.UInt32, local: mi.UInt32
+    ) -> tuple[mi.Float, mi.Float | None, mi.Float, mi.UInt32]:
         """Return the results of :meth:`records` for all Gaussians, with recorded kernels and without gradients.
 
         Invisible Gaussians have empty boxes.
@@ -336,7 +347,7 @@ class Projector:
         dr.eval(records)
         return records, plane_records, least, boxes
 
-    def _record(self, g: _Input, bounds: _Bounds, local: Any) -> GaussianRecord:
+    def _record(self, g: _Input, bounds: _Bounds, local: mi.UInt32) -> GaussianRecord:
         """Return view records of Gaussians that do not reach the camera's plane."""
         response, colour = bounds.response, self._colour(g.gaussian.mean, local)
         if self.changed:
@@ -361,10 +372,10 @@ class Projector:
             instance=g.instance,
         )
 
-    def _tile_box(self, bounds: _Bounds) -> list[Any]:
+    def _tile_box(self, bounds: _Bounds) -> list[mi.UInt32]:
         return list(self.view.tile_box(*(dr.detach(side) for side in bounds.slope_box)))
 
-    def _plane_records(self, index: Any, owner: Any, local: Any) -> Any:
+    def _plane_records(self, index: mi.UInt32, owner: mi.UInt32, local: mi.UInt32) -> mi.Float:
         """Return the records of Gaussians at the camera's plane."""
         g = self._load(dr.gather(mi.UInt32, owner, index), dr.gather(mi.UInt32, local, index))
         rows = dr.empty(mi.Float, RECORD * dr.width(index))
@@ -373,14 +384,14 @@ class Projector:
         dr.eval(rows)
         return rows
 
-    def _colour(self, mean: Any, local: Any) -> list[Any]:
+    def _colour(self, mean: mi.Vector3f, local: mi.UInt32) -> list[mi.Float]:
         clouds = self.clouds
         bands = min(clouds.sh_count, (self.quality.sh_degree + 1) ** 2)
         floats = -(-3 * bands // 4) * 4
         base = local * (clouds.sh_stride // 4)
         packets = [dr.gather(mi.Array4f, clouds.sh, base + j, mode=_ADJOINT) for j in range(floats // 4)]
 
-        def coefficient(k: int) -> list[Any]:
+        def coefficient(k: int) -> list[mi.Float]:
             return [packets[(3 * k + c) // 4][(3 * k + c) % 4] for c in range(3)]
 
         # A Gaussian centred on the camera has no direction, so only its constant band counts.
@@ -391,12 +402,12 @@ class Projector:
 @recorded
 def _all_records(
     kind: Kind,
-    numbers: Mapping[str, Any],
+    numbers: ViewNumbers,
     shape: tuple[Quality, bool, bool, int, int],
-    arrays: tuple[Any, Any, Any, Any],
-    owner: Any,
-    local: Any,
-) -> tuple[Any, Any, Any, Any]:
+    arrays: tuple[mi.Float, mi.Float, mi.Float, mi.Float],
+    owner: mi.UInt32,
+    local: mi.UInt32,
+) -> tuple[mi.Float, mi.Float, mi.UInt32, mi.Bool]:
     """Return records, least depths, tile boxes and flags of the camera's plane, see ``Projector.all_records``."""
     quality, at_camera, changed, sh_count, sh_stride = shape
     geometry, scales, sh, table = arrays
@@ -406,7 +417,7 @@ def _all_records(
     return records, least, boxes, at_plane
 
 
-def _rows(kind: Any, columns: list[Any]) -> Any:
+def _rows(kind: type[dr.ArrayBase], columns: list[dr.ArrayBase]) -> dr.ArrayBase:
     """Interleave columns into a flat array of type ``kind``."""
     count = dr.width(columns)
     rows = dr.empty(kind, len(columns) * count)

@@ -6,14 +6,13 @@ import re
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 
-def stable_order(key: Any, bits: int) -> Any:
+def stable_order(key: mi.UInt32, bits: int) -> mi.UInt32:
     """Return the stable sort order of keys with ``bits`` bits, as positions in ``key``.
 
     This is a radix sort like Dr.Jit's own, which always sorts 32 bits or more.

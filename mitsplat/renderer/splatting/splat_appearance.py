@@ -10,7 +10,6 @@ chapter 2).
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -64,13 +63,13 @@ def appearance_rows(appearances: list[SplatAppearance | None]) -> np.ndarray:
     )
 
 
-def apply_appearance(colour: list[Any], row: list[Any], point: Any) -> list[Any]:
+def apply_appearance(colour: list[mi.Float], row: list[mi.Float], point: mi.Vector3f) -> list[mi.Float]:
     """Apply the appearance rows of placements to display-encoded colours of Gaussians.
 
     ``point`` are the centres of the Gaussians in their own frames.
     """
 
-    def change(colour: list[Any], row: list[Any], point: Any) -> list[Any]:
+    def change(colour: list[mi.Float], row: list[mi.Float], point: mi.Vector3f) -> list[mi.Float]:
         linear = [srgb_to_linear(c) for c in colour]
         thickness = dirt_thickness(point * row[AppearanceRow.CELLS], mi.UInt32(row[AppearanceRow.SEED]))
         cover, matrix = row[AppearanceRow.WEAR] * thickness, row[AppearanceRow.MATRIX]
@@ -85,7 +84,7 @@ def apply_appearance(colour: list[Any], row: list[Any], point: Any) -> list[Any]
     return list(dr.if_stmt((colour, row, point), present, change, lambda colour, *_: list(colour), label="appearance"))
 
 
-def dirt_thickness(point: Any, seed: Any) -> Any:
+def dirt_thickness(point: mi.Vector3f, seed: mi.UInt32) -> mi.Float:
     """Return the thickness of dirt in [0, 1] at points, given in cells of the coarsest noise."""
     total, weight = mi.Float(0), 0.0
     for octave in range(OCTAVES):
@@ -95,7 +94,7 @@ def dirt_thickness(point: Any, seed: Any) -> Any:
     return t * t * (3 - 2 * t)
 
 
-def _value_noise(point: Any, seed: Any) -> Any:
+def _value_noise(point: mi.Vector3f, seed: mi.UInt32) -> mi.Float:
     """Return random values in [0, 1) at integer coordinates, with cubic interpolation between them."""
     low = [mi.Int32(dr.floor(c)) for c in point]
     share = [c - mi.Float(i) for c, i in zip(point, low, strict=True)]
@@ -112,7 +111,7 @@ def _value_noise(point: Any, seed: Any) -> Any:
     return total
 
 
-def _hashed(key: Any) -> Any:
+def _hashed(key: mi.UInt32) -> mi.UInt32:
     """Return a 32-bit hash (Wellons 2018, "Hash Function Prospector", lowbias32)."""
     key = (key ^ (key >> 16)) * 0x7FEB352D
     key = (key ^ (key >> 15)) * 0x846CA68B

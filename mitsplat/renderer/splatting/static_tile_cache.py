@@ -9,9 +9,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import drjit as dr
+import mitsuba as mi
 
 from mitsplat.quality import Quality
 from mitsplat.renderer.rays.camera_rays import CameraView
@@ -34,7 +34,12 @@ class StaticTileCache:
 
     @classmethod
     def of(
-        cls, clouds: CloudSet, placements: Sequence[Placement], view: CameraView, quality: Quality, z_max: Any | None
+        cls,
+        clouds: CloudSet,
+        placements: Sequence[Placement],
+        view: CameraView,
+        quality: Quality,
+        z_max: mi.Float | None,
     ) -> StaticTileCache:
         """Render and store the static placements; arguments as in :func:`mitsplat.renderer.splatting.march.trace`.
 
@@ -48,7 +53,12 @@ class StaticTileCache:
         return cls(lists, image)
 
     def with_objects(
-        self, clouds: CloudSet, placements: Sequence[Placement], view: CameraView, quality: Quality, z_max: Any | None
+        self,
+        clouds: CloudSet,
+        placements: Sequence[Placement],
+        view: CameraView,
+        quality: Quality,
+        z_max: mi.Float | None,
     ) -> Image:
         """Return the picture with additional placements.
 

@@ -8,7 +8,6 @@ first.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -27,21 +26,26 @@ _BITS_OF_1 = 0x3F800000
 """Bit pattern of the float 1."""
 
 
-def level_of(depth: Any, view: CameraView) -> Any:
+def level_of(depth: mi.Float, view: CameraView) -> mi.UInt32:
     """Quantise a depth to its level: the leading bits of its ratio to the near plane, which increase with the ratio."""
     ratio = dr.clip(depth / view.near_plane, 1.0, 0.9999 * 2.0**32)
     return (dr.reinterpret_array(mi.UInt32, ratio) - _BITS_OF_1) >> (23 + 5 - DEPTH_BITS)
 
 
-def depth_of_level(level: Any, view: CameraView) -> Any:
+def depth_of_level(level: mi.UInt32, view: CameraView) -> mi.Float:
     """Return the least depth of a level; depths in front of the near plane have level 0."""
     ratio = dr.reinterpret_array(mi.Float, (level << (23 + 5 - DEPTH_BITS)) + _BITS_OF_1)
     return dr.select(level == 0, 0, (1 - 1e-6) * ratio * view.near_plane)
 
 
 def depths_by_tile(
-    record: GaussianRecord, plane_records: Any | None, ellipsoid: Any, first: Any, view: CameraView, quality: Quality
-) -> Callable[[Any], Any]:
+    record: GaussianRecord,
+    plane_records: mi.Float | None,
+    ellipsoid: mi.Float,
+    first: mi.UInt32,
+    view: CameraView,
+    quality: Quality,
+) -> Callable[[mi.UInt32], mi.Float]:
     """Return a function from a tile to the sort depth of a record in it.
 
     The tile must be in the same row of tiles as ``first``. In an undistorted view, most of the computation is the same
@@ -51,7 +55,7 @@ def depths_by_tile(
         return lambda tile: least_depth(record, ellipsoid, view.tile_slopes(tile))
     if view.distortion:
 
-        def usual(tile: Any) -> tuple[Any, Any, Any]:
+        def usual(tile: mi.UInt32) -> tuple[mi.Float, mi.Float, mi.Float]:
             lo_u, hi_u, lo_v, hi_v = slopes = view.tile_slopes(tile)
             return 0.5 * (lo_u + hi_u), 0.5 * (lo_v + hi_v), depth_where_seen(record, slopes)
     else:
@@ -60,7 +64,7 @@ def depths_by_tile(
         depth_around, begin = _depths_where_seen(record, width, height), row * view.tiles_x
         v = dr.fma(mi.Float(row), step_v, first_v)
 
-        def usual(tile: Any) -> tuple[Any, Any, Any]:
+        def usual(tile: mi.UInt32) -> tuple[mi.Float, mi.Float, mi.Float]:
             u = dr.fma(mi.Float(tile - begin), step_u, first_u)
             return u, v, depth_around(u - record.u0, v - record.v0)
 
@@ -69,7 +73,7 @@ def depths_by_tile(
     at_plane = record.at_plane
     plane_record = PlaneRecord.fetch(plane_records, dr.select(at_plane, mi.UInt32(record.u0), 0))
 
-    def depth_of(tile: Any) -> Any:
+    def depth_of(tile: mi.UInt32) -> mi.Float:
         u, v, depth = usual(tile)
         # Gaussians that reach the camera's plane are large relative to a tile, so the depth at the tile's centre is
         # used.
@@ -78,7 +82,7 @@ def depths_by_tile(
     return depth_of
 
 
-def depth_where_seen(record: GaussianRecord, slopes: tuple[Any, Any, Any, Any]) -> Any:
+def depth_where_seen(record: GaussianRecord, slopes: tuple[mi.Float, mi.Float, mi.Float, mi.Float]) -> mi.Float:
     """Return the peak depth of a Gaussian along the ray around which a tile sees most of it.
 
     ``slopes`` are the limits of the tile (lo_u, hi_u, lo_v, hi_v).
@@ -88,7 +92,9 @@ def depth_where_seen(record: GaussianRecord, slopes: tuple[Any, Any, Any, Any]) 
     return depth_around(0.5 * (lo_u + hi_u) - record.u0, 0.5 * (lo_v + hi_v) - record.v0)
 
 
-def _depths_where_seen(record: GaussianRecord, width: Any, height: Any) -> Callable[[Any, Any], Any]:
+def _depths_where_seen(
+    record: GaussianRecord, width: mi.Float, height: mi.Float
+) -> Callable[[mi.Float, mi.Float], mi.Float]:
     """Return a function from a tile centre, relative to the footprint's centre, to :func:`depth_where_seen`.
 
     All tiles have the size ``width`` x ``height`` in slopes. Let M be the inverse covariance of the footprint, and V
@@ -106,7 +112,7 @@ def _depths_where_seen(record: GaussianRecord, width: Any, height: Any) -> Calla
     vu, vv = inverse * (variance_v * b), inverse * p11
     half_u, half_v = 0.5 * width, 0.5 * height
 
-    def depth_around(middle_u: Any, middle_v: Any) -> Any:
+    def depth_around(middle_u: mi.Float, middle_v: mi.Float) -> mi.Float:
         du, dv = uu * middle_u - uv * middle_v, vv * middle_v - vu * middle_u
         du = dr.clip(du, middle_u - half_u, middle_u + half_u)
         dv = dr.clip(dv, middle_v - half_v, middle_v + half_v)
@@ -116,7 +122,9 @@ def _depths_where_seen(record: GaussianRecord, width: Any, height: Any) -> Calla
     return depth_around
 
 
-def least_depth(record: GaussianRecord, ellipsoid: Any, slopes: tuple[Any, Any, Any, Any]) -> Any:
+def least_depth(
+    record: GaussianRecord, ellipsoid: mi.Float, slopes: tuple[mi.Float, mi.Float, mi.Float, mi.Float]
+) -> mi.Float:
     """Return a lower bound of the depth of a Gaussian's peak along all rays of a tile.
 
     The numerator of the depth is linear in the slopes and the denominator is convex, so that both are bounded at the
@@ -132,7 +140,7 @@ def least_depth(record: GaussianRecord, ellipsoid: Any, slopes: tuple[Any, Any, 
     return dr.select(record.at_plane, 0, dr.maximum(bound, 0))
 
 
-def _depth_fraction(record: GaussianRecord, du: Any, dv: Any) -> tuple[Any, Any]:
+def _depth_fraction(record: GaussianRecord, du: mi.Float, dv: mi.Float) -> tuple[mi.Float, mi.Float]:
     """Return numerator and denominator of a peak's depth relative to the depth of the centre."""
     e, f, g, h, i = record.e, record.f, record.g, record.h, record.i
     top = dr.fma(0.5, dr.fma(du, e, dv * f), 1)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -25,14 +24,14 @@ class TileSubset:
         columns: Number of corners in a row.
     """
 
-    number: Any
+    number: mi.UInt32
     count: int
-    before: Any
-    above: Any
+    before: mi.UInt32
+    above: mi.UInt32
     columns: int
 
     @classmethod
-    def of(cls, flags: Any, view: CameraView) -> TileSubset:
+    def of(cls, flags: mi.Bool, view: CameraView) -> TileSubset:
         """Create the subset of a view's tiles that are flagged (Bool)."""
         columns, rows = view.tiles_x + 1, view.tiles_y + 1
         number = dr.compress(flags)
@@ -70,15 +69,15 @@ class TileSubset:
         first, second = (TileSubset.of(flag, view) for flag in flags)
         return first, second
 
-    def any_in(self, x0: Any, x1: Any, y0: Any, y1: Any, active: Any = True) -> Any:
+    def any_in(self, x0: mi.UInt32, x1: mi.UInt32, y0: mi.UInt32, y1: mi.UInt32, active: mi.Bool = True) -> mi.Bool:
         """Return True for half-open ranges of columns and rows that contain a tile of the subset."""
 
-        def above(x: Any, y: Any) -> Any:
+        def above(x: mi.UInt32, y: mi.UInt32) -> mi.UInt32:
             return dr.gather(mi.UInt32, self.above, y * self.columns + x, active)
 
         return above(x1, y1) + above(x0, y0) > above(x0, y1) + above(x1, y0)
 
-    def among(self, begin: Any, size: Any) -> tuple[Any, Any]:
+    def among(self, begin: mi.UInt32, size: mi.UInt32) -> tuple[mi.UInt32, mi.UInt32]:
         """Return first place and number of the subset's tiles among ``size`` consecutive tiles from ``begin`` on."""
         first = dr.gather(mi.UInt32, self.before, begin)
         return first, dr.gather(mi.UInt32, self.before, begin + size) - first
@@ -95,15 +94,15 @@ class TileBox:
         across: Number of the view's columns.
     """
 
-    number: Any
+    number: mi.UInt32
     count: int
-    left: Any
-    top: Any
-    columns: Any
+    left: mi.UInt32
+    top: mi.UInt32
+    columns: mi.UInt32
     across: int
 
     @classmethod
-    def around(cls, boxes: Any, view: CameraView) -> TileBox:
+    def around(cls, boxes: mi.UInt32, view: CameraView) -> TileBox:
         """Create the smallest box around non-empty half-open ranges (x0, x1, y0, y1), four numbers each."""
         x0, x1, y0, y1 = dr.gather(mi.Array4u, boxes, dr.arange(mi.UInt32, dr.width(boxes) // 4))
         ends = np.array(dr.concat([dr.min(x0), dr.max(x1), dr.min(y0), dr.max(y1)])).tolist()
@@ -115,7 +114,7 @@ class TileBox:
         dr.eval(number)
         return cls(number, dr.width(number), first_column, first_row, columns, view.tiles_x)
 
-    def among(self, begin: Any, size: Any) -> tuple[Any, Any]:
+    def among(self, begin: mi.UInt32, size: mi.UInt32) -> tuple[mi.UInt32, mi.UInt32]:
         """Return first place and number of ``size`` consecutive tiles in the box from ``begin`` on."""
         row = begin // self.across
         return (row - self.top) * self.columns + (begin - row * self.across - self.left), size

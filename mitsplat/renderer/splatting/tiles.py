@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, cast
+from typing import cast
 
 import drjit as dr
 import mitsuba as mi
@@ -50,20 +50,20 @@ class TileLists:
         least: Depth [m] in front of which the peak of a record cannot lie, for tiles that are sorted again.
     """
 
-    records: Any
-    plane_records: Any | None
-    entries: Any
-    slots: Any
-    first: Any
-    nearest: Any
-    start: Any
-    stop: Any
+    records: mi.Float
+    plane_records: mi.Float | None
+    entries: mi.UInt32
+    slots: mi.UInt32 | None
+    first: mi.UInt32 | None
+    nearest: mi.Float | None
+    start: mi.UInt32
+    stop: mi.UInt32
     visible: int
     pairs: int
     instance: int | None
-    levels: Any
-    tiles: Any | None = None
-    least: Any | None = None
+    levels: mi.UInt32 | None
+    tiles: mi.UInt32 | None = None
+    least: mi.Float | None = None
 
 
 def bin_gaussians(
@@ -75,7 +75,7 @@ def bin_gaussians(
     at_camera: bool = True,
     subset: TileSubset | None = None,
     fitted: bool = False,
-    groups: Any | None = None,
+    groups: mi.UInt32 | None = None,
     for_gradients: bool = False,
 ) -> TileLists:
     """Build the tile lists of all placements for a view from :meth:`View.sampled`.
@@ -131,16 +131,16 @@ def _skips_culling(count: int) -> bool:
 
 
 def bin_records(
-    records: Any,
-    plane_records: Any,
-    least: Any,
-    box: Any,
+    records: mi.Float,
+    plane_records: mi.Float | None,
+    least: mi.Float,
+    box: mi.UInt32,
     view: CameraView,
     quality: Quality,
     only: int | None,
     subset: TileSubset | TileBox | None = None,
     *,
-    groups: Any | None = None,
+    groups: mi.UInt32 | None = None,
     for_gradients: bool = False,
 ) -> TileLists:
     """Build tile lists from view records, least depths and tile boxes.
@@ -159,15 +159,15 @@ def bin_records(
 
 
 def _sorted_lists(
-    records: Any,
-    plane_records: Any,
+    records: mi.Float,
+    plane_records: mi.Float | None,
     pairs: Pairs,
-    least: Any,
+    least: mi.Float,
     visible: int,
     tiles: int,
     view: CameraView,
     only: int | None,
-    own: Any = None,
+    own: mi.UInt32 | None = None,
 ) -> TileLists:
     """Sort pairs by tile and depth into lists. Levels and least depths are evaluated on use."""
     count = dr.width(pairs.key)
@@ -197,12 +197,12 @@ def _sorted_lists(
     )
 
 
-def _tile_numbers(view: CameraView, subset: TileSubset | TileBox | None) -> tuple[int, Any]:
+def _tile_numbers(view: CameraView, subset: TileSubset | TileBox | None) -> tuple[int, mi.UInt32 | None]:
     """Return the number of tiles with lists, and their numbers in the view (None for all tiles)."""
     return (view.tiles_x * view.tiles_y, None) if subset is None else (subset.count, subset.number)
 
 
-def _empty(view: CameraView, subset: TileSubset | TileBox | None, records: Any | None = None) -> TileLists:
+def _empty(view: CameraView, subset: TileSubset | TileBox | None, records: mi.Float | None = None) -> TileLists:
     tiles, own = _tile_numbers(view, subset)
     zeros = dr.zeros(mi.UInt32, tiles)
     dr.eval(zeros)
@@ -213,7 +213,7 @@ def _empty(view: CameraView, subset: TileSubset | TileBox | None, records: Any |
     return TileLists(records, None, entry, entry, entry, none, zeros, zeros, visible, 0, None, entry, own, none)
 
 
-def merge_lists(first: TileLists, second: TileLists, tiles: Any, view: CameraView) -> TileLists:
+def merge_lists(first: TileLists, second: TileLists, tiles: mi.UInt32, view: CameraView) -> TileLists:
     """Merge two lists in some tiles of a view, as if their Gaussians had been binned together.
 
     Raises:
@@ -239,7 +239,7 @@ def merge_lists(first: TileLists, second: TileLists, tiles: Any, view: CameraVie
     )
 
 
-def select_tiles(lists: TileLists, places: Any) -> TileLists:
+def select_tiles(lists: TileLists, places: mi.UInt32) -> TileLists:
     """Return the unchanged lists of some tiles, given by their places."""
     tiles = places if lists.tiles is None else dr.gather(mi.UInt32, lists.tiles, places)
     start, stop = dr.gather(mi.UInt32, lists.start, places), dr.gather(mi.UInt32, lists.stop, places)
@@ -247,9 +247,9 @@ def select_tiles(lists: TileLists, places: Any) -> TileLists:
     return replace(lists, start=start, stop=stop, tiles=tiles)
 
 
-def sort_by_ray(lists: TileLists, places: Any, view: CameraView) -> TileLists:
+def sort_by_ray(lists: TileLists, places: mi.UInt32, view: CameraView) -> TileLists:
     """Sort some non-empty tiles, given by their places in ``lists``, for the order per ray."""
-    place, _, number = cast("tuple[Any, Any, Any]", _pairs_in(lists, places, 0))
+    place, _, number = cast("tuple[mi.UInt32, mi.UInt32, mi.UInt32]", _pairs_in(lists, places, 0))
     tiles = places if lists.tiles is None else dr.gather(mi.UInt32, lists.tiles, places)
     record = GaussianRecord.fetch(dr.detach(lists.records), number)
     slopes = view.tile_slopes(dr.gather(mi.UInt32, tiles, place))
@@ -261,7 +261,7 @@ def sort_by_ray(lists: TileLists, places: Any, view: CameraView) -> TileLists:
     )
 
 
-def _pairs_in(lists: TileLists, tiles: Any, shift: int) -> tuple[Any, Any, Any] | None:
+def _pairs_in(lists: TileLists, tiles: mi.UInt32, shift: int) -> tuple[mi.UInt32, mi.UInt32, mi.UInt32] | None:
     """Return the entries of some tiles as places in ``tiles``, levels, and record numbers plus ``shift``.
 
     Returns None if there are no entries.
@@ -274,7 +274,7 @@ def _pairs_in(lists: TileLists, tiles: Any, shift: int) -> tuple[Any, Any, Any] 
     number, place, level = (dr.empty(mi.UInt32, size) for _ in range(3))
     offset, own = dr.opaque(mi.UInt32, shift), dr.arange(mi.UInt32, dr.width(tiles))
 
-    def one_pair(k: Any) -> tuple[Any]:
+    def one_pair(k: mi.UInt32) -> tuple[mi.UInt32]:
         entry, at = start + k, begin + k
         dr.scatter(number, dr.gather(mi.UInt32, lists.entries, entry) + offset, at, mode=dr.ReduceMode.Permute)
         dr.scatter(place, own, at, mode=dr.ReduceMode.Permute)
@@ -286,7 +286,7 @@ def _pairs_in(lists: TileLists, tiles: Any, shift: int) -> tuple[Any, Any, Any] 
     return place, level, number
 
 
-def _sort_keys(key: Any, bits: int) -> Any:
+def _sort_keys(key: mi.UInt64, bits: int) -> mi.UInt64:
     """Sort the keys of pairs (UInt64, evaluated) by their leading ``bits``; the numbers below already ascend.
 
     On most CPUs, NumPy sorts them in place with vector instructions.
@@ -299,12 +299,12 @@ def _sort_keys(key: Any, bits: int) -> Any:
     return in_order
 
 
-def _first_entries(key: Any, tiles: int) -> Any:
+def _first_entries(key: mi.UInt64, tiles: int) -> mi.UInt32:
     """Return the number of the first entry of every tile, and of all entries, by bisection of sorted keys."""
     wanted = Pairs.key_of(dr.arange(mi.UInt32, tiles + 1), mi.UInt32(0), mi.UInt32(0))
     pairs = dr.opaque(mi.UInt32, dr.width(key))
 
-    def halve(low: Any, high: Any) -> tuple[Any, Any]:
+    def halve(low: mi.UInt32, high: mi.UInt32) -> tuple[mi.UInt32, mi.UInt32]:
         middle = (low + high) // 2
         before = dr.gather(mi.UInt64, key, middle, low < high) < wanted
         return dr.select(before, middle + 1, low), dr.select(before, high, middle)

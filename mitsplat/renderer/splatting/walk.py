@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import reduce
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -26,7 +25,7 @@ SORT_SLOTS = 8
 WINDOW_SLOTS = 8
 """Number of Gaussians of a list that a ray holds back for sorting."""
 
-Pixel = list[Any]
+Pixel = list["mi.Float"]
 """State of a ray, the transmittance first."""
 
 TRANSMITTANCE = 0
@@ -76,7 +75,7 @@ class Lanes:
         self.start = dr.gather(mi.UInt32, lists.start, own)
         self.stop = dr.select(self.inside[0], dr.gather(mi.UInt32, lists.stop, own), self.start)
 
-    def centre_slopes(self) -> tuple[list[Any], list[Any]]:
+    def centre_slopes(self) -> tuple[list[mi.Float], list[mi.Float]]:
         """Return slopes u and v of the rays through pixel centres; those of a distorted view are stored in memory."""
         if not self.view.distortion:
             return self.slopes(0.5, 0.5)
@@ -87,14 +86,14 @@ class Lanes:
         places = list(zip(self.pixel, self.inside, strict=True))
         return [dr.gather(mi.Float, u, p, m) for p, m in places], [dr.gather(mi.Float, v, p, m) for p, m in places]
 
-    def image(self, kind: Any, values: list[Any]) -> Any:
+    def image(self, kind: type[dr.ArrayBase], values: list[dr.ArrayBase]) -> dr.ArrayBase:
         """Return a row-major array of type ``kind`` from one value per pixel of the lane."""
         target = dr.empty(kind, self.count)
         for value, number, mask in zip(values, self.pixel, self.inside, strict=True):
             dr.scatter(target, kind(value), number, mask, mode=dr.ReduceMode.Permute)
         return target
 
-    def slopes(self, dx: Any, dy: Any) -> tuple[list[Any], list[Any]]:
+    def slopes(self, dx: mi.Float, dy: mi.Float) -> tuple[list[mi.Float], list[mi.Float]]:
         """Return slopes u and v of the rays at offset (dx, dy) in the lane's pixels."""
         pairs = [self.view.slopes(mi.Float(self.x) + dx, mi.Float(self.y + k) + dy) for k in range(self.rows)]
         return [u for u, _ in pairs], [v for _, v in pairs]
@@ -116,15 +115,15 @@ class Rays:
     """
 
     lists: TileLists
-    us: list[Any]
-    vs: list[Any]
-    far: list[Any]
-    start: Any
-    stop: Any
-    near: Any
-    cut: Any
-    cap: Any | None
-    end: Any
+    us: list[mi.Float]
+    vs: list[mi.Float]
+    far: list[mi.Float]
+    start: mi.UInt32
+    stop: mi.UInt32
+    near: mi.Float
+    cut: mi.Float
+    cap: mi.Float | None
+    end: mi.Float
     column: bool
 
     @classmethod
@@ -133,10 +132,10 @@ class Rays:
         lists: TileLists,
         view: CameraView,
         quality: Quality,
-        slopes: tuple[list[Any], list[Any]],
-        far: list[Any],
-        start: Any,
-        stop: Any,
+        slopes: tuple[list[mi.Float], list[mi.Float]],
+        far: list[mi.Float],
+        start: mi.UInt32,
+        stop: mi.UInt32,
     ) -> Rays:
         """Create the rays of a view with the limits of a quality."""
         highest = KERNELS[quality.kernel].alpha_max
@@ -153,7 +152,7 @@ class Rays:
             column=not view.distortion,
         )
 
-    def respond(self, record: GaussianRecord) -> list[tuple[Any, Any]]:
+    def respond(self, record: GaussianRecord) -> list[tuple[mi.Float, mi.Float]]:
         """Return (log2 of the opacity along the ray, depth of the peak) of one Gaussian per lane, for each ray."""
         return respond_along(record, self.lists, self.us, self.vs, self.column, self.cap)
 
@@ -163,7 +162,7 @@ def walk(
     order: Order,
     fresh: Callable[[], Pixel],
     blend: Blend,
-    continues: Callable[[list[Pixel]], Any] | None = None,
+    continues: Callable[[list[Pixel]], mi.Bool] | None = None,
 ) -> list[Pixel]:
     """Return the final states of rays: in the order of the tile's list, of their own peaks, or with a window.
 
@@ -179,17 +178,17 @@ def walk(
     return (_walk_in_window if order == "window" else _walk_in_ray_order)(rays, fresh, blend)
 
 
-def max_of(values: Sequence[Any]) -> Any:
+def max_of(values: Sequence[mi.Float]) -> mi.Float:
     """Return the maximum over the values of a lane's rays, none of which is NaN."""
     return reduce(lambda a, b: dr.select(a > b, a, b), values)
 
 
-def min_log_opacity(quality: Quality) -> Any:
+def min_log_opacity(quality: Quality) -> mi.Float:
     """Return log2 of the smallest opacity that counts, limited to the domain of :func:`exp2`."""
     return dr.maximum(dr.log2(dr.opaque(mi.Float, quality.alpha_min)), -126)
 
 
-def exp2(x: Any) -> Any:
+def exp2(x: mi.Float) -> mi.Float:
     """Compute 2^x for x in [-126, 126] with relative error below 2e-7; the result is undefined outside.
 
     On a CPU, the nearest integer is added to the exponent, and a polynomial that is 1 at 0 covers the remainder. This
@@ -217,25 +216,25 @@ _EXP2 = 1.0, 0.69314700, 0.24022242, 0.055507336, 0.0096715130, 0.0013264727
 class FieldsOnAccess:
     """Fields of records that are fetched on access, because the rays of a lane blend different records."""
 
-    records: Any
-    number: Any
-    mask: Any
+    records: mi.Float
+    number: mi.UInt32
+    mask: mi.Bool
 
     @property
-    def colour(self) -> list[Any]:
+    def colour(self) -> list[mi.Float]:
         """Red, green and blue."""
         return [self._field(name) for name in ("red", "green", "blue")]
 
     @property
-    def instance(self) -> Any:
+    def instance(self) -> mi.Float:
         """Instance id."""
         return self._field("instance")
 
-    def _field(self, name: str) -> Any:
+    def _field(self, name: str) -> mi.Float:
         return dr.gather(mi.Float, self.records, self.number * RECORD + GaussianRecord.place(name), self.mask)
 
 
-Blend = Callable[[Pixel, Any, GaussianRecord | FieldsOnAccess, Any], Pixel]
+Blend = Callable[[Pixel, "mi.Float", GaussianRecord | FieldsOnAccess, "mi.Float"], Pixel]
 """Function that returns the state of a ray after one more Gaussian in front-to-back order. Arguments: state, opacity of
 the Gaussian on the ray, its record (for colour and instance), and depth of its peak. An opacity of 0 leaves the state
 unchanged.
@@ -243,12 +242,17 @@ unchanged.
 
 
 def respond_along(
-    record: GaussianRecord, lists: TileLists, us: list[Any], vs: list[Any], shared_column: bool, cap: Any | None
-) -> list[tuple[Any, Any]]:
+    record: GaussianRecord,
+    lists: TileLists,
+    us: list[mi.Float],
+    vs: list[mi.Float],
+    shared_column: bool,
+    cap: mi.Float | None,
+) -> list[tuple[mi.Float, mi.Float]]:
     """Return (log2 of the opacity along the ray, peak depth) of a Gaussian on several rays, see `gaussian`."""
     u0, v0, a, b2, c, opacity, *_, depth, e, f, g, h, i, _ = record
-    result: list[Any] = []
-    previous: Any = None
+    result: list[mi.Float] = []
+    previous: tuple[mi.Float, ...] | None = None
     slant = 0.5 * depth * f
     for u, v in zip(us, vs, strict=True):
         if previous is None or not shared_column:
@@ -261,9 +265,9 @@ def respond_along(
         inverse = dr.rcp(dr.fma(dv, dr.fma(dv, i, bottom_v), bottom))
         result += [dr.fma(-numerator, inverse, opacity), dr.fma(dv, slant, ahead) * inverse]
 
-    def at_the_camera(result: list[Any], row: Any) -> tuple[list[Any], Any]:
+    def at_the_camera(result: list[mi.Float], row: mi.Float) -> tuple[list[mi.Float], mi.Float]:
         plane_record = PlaneRecord.fetch(lists.plane_records, mi.UInt32(row))
-        found: list[Any] = []
+        found: list[mi.Float] = []
         for u, v in zip(us, vs, strict=True):
             q, depth = plane_record.respond(u, v)
             found += [opacity - q, depth]
@@ -280,12 +284,12 @@ def respond_along(
 
 
 def _walk_in_tile_order(
-    rays: Rays, fresh: Callable[[], Pixel], blend: Blend, continues: Callable[[list[Pixel]], Any] | None
+    rays: Rays, fresh: Callable[[], Pixel], blend: Blend, continues: Callable[[list[Pixel]], mi.Bool] | None
 ) -> list[Pixel]:
     """Blend in the order of the tile's list, which is that of the peaks along one of the tile's rays."""
     lists, far, near, cut, end = rays.lists, rays.far, rays.near, rays.cut, rays.end
 
-    def body(i: Any, pixels: list[Pixel]) -> tuple[Any, list[Pixel]]:
+    def body(i: mi.UInt32, pixels: list[Pixel]) -> tuple[mi.UInt32, list[Pixel]]:
         record = GaussianRecord.fetch(lists.records, dr.gather(mi.UInt32, lists.entries, i))
         blended = []
         responses = rays.respond(record)
@@ -295,7 +299,7 @@ def _walk_in_tile_order(
             blended.append(blend(pixel, alpha, record, z))
         return i + 1, blended
 
-    def alive(i: Any, pixels: list[Pixel]) -> Any:
+    def alive(i: mi.UInt32, pixels: list[Pixel]) -> mi.Bool:
         unfinished = (i < rays.stop) & (max_of([pixel[TRANSMITTANCE] for pixel in pixels]) > end)
         return unfinished if continues is None else unfinished & continues(pixels)
 
@@ -311,7 +315,7 @@ def _walk_in_window(rays: Rays, fresh: Callable[[], Pixel], blend: Blend) -> lis
     """
     lists, far, near, cut, end = rays.lists, rays.far, rays.near, rays.cut, rays.end
 
-    def push(pixel: Pixel, window: _Slots, z: Any, alpha: Any, number: Any) -> tuple[Pixel, _Slots]:
+    def push(pixel: Pixel, window: _Slots, z: mi.Float, alpha: mi.Float, number: mi.UInt32) -> tuple[Pixel, _Slots]:
         result: _Slots = []
         for slot_z, slot_alpha, slot_number in reversed(window):
             # Peaks in front of the new one, or equal to it, move forward by one slot.
@@ -328,10 +332,10 @@ def _walk_in_window(rays: Rays, fresh: Callable[[], Pixel], blend: Blend) -> lis
             z = dr.minimum(z, slot_z)
         return blend(pixel, alpha, FieldsOnAccess(lists.records, number, mi.Bool(True)), z), result
 
-    def alive(i: Any, pixels: list[Pixel], windows: list[_Slots]) -> Any:
+    def alive(i: mi.UInt32, pixels: list[Pixel], windows: list[_Slots]) -> mi.Bool:
         return (i < rays.stop) & (max_of([pixel[TRANSMITTANCE] for pixel in pixels]) > end)
 
-    def body(i: Any, pixels: list[Pixel], windows: list[_Slots]) -> tuple[Any, list[Pixel], list[_Slots]]:
+    def body(i: mi.UInt32, pixels: list[Pixel], windows: list[_Slots]) -> tuple[mi.UInt32, list[Pixel], list[_Slots]]:
         number = dr.gather(mi.UInt32, lists.entries, i)
         record = GaussianRecord.fetch(lists.records, number)
         states = []
@@ -366,7 +370,7 @@ def _walk_in_ray_order(rays: Rays, fresh: Callable[[], Pixel], blend: Blend) -> 
     near, cut, end = rays.near, rays.cut, rays.end
     none = 0xFFFFFFFF
 
-    def insert(slots: _Slots, left: Any, z: Any, alpha: Any, i: Any) -> tuple[_Slots, Any]:
+    def insert(slots: _Slots, left: mi.UInt32, z: mi.Float, alpha: mi.Float, i: mi.UInt32) -> tuple[_Slots, mi.UInt32]:
         """Return the depth-sorted slots with one more peak, and the first entry that found no slot."""
         result: _Slots = []
         behind = mi.Bool(False)
@@ -377,15 +381,19 @@ def _walk_in_ray_order(rays: Rays, fresh: Callable[[], Pixel], blend: Blend) -> 
             z, alpha, i = dr.maximum(z, slot_z), dr.select(behind, slot_alpha, alpha), dr.select(behind, slot_i, i)
         return result, dr.select(z < dr.inf, dr.minimum(left, i), left)
 
-    def collect(begin: Any, limit: Any, seen: Any, last: list[tuple[Any, Any]]) -> tuple[Any, list[_Slots], list[Any]]:
-        def unfilled(i: Any, slots: list[_Slots], left: list[Any]) -> Any:
+    def collect(
+        begin: mi.UInt32, limit: mi.UInt32, seen: mi.UInt32, last: list[tuple[mi.Float, mi.UInt32]]
+    ) -> tuple[mi.UInt32, list[_Slots], list[mi.UInt32]]:
+        def unfilled(i: mi.UInt32, slots: list[_Slots], left: list[mi.UInt32]) -> mi.Bool:
             nearest = dr.gather(mi.Float, lists.nearest, i, i < limit)
             wanted = mi.Bool(False)
             for own in slots:
                 wanted |= nearest <= own[-1][0]
             return (i < limit) & wanted
 
-        def body(i: Any, slots: list[_Slots], left: list[Any]) -> tuple[Any, list[_Slots], list[Any]]:
+        def body(
+            i: mi.UInt32, slots: list[_Slots], left: list[mi.UInt32]
+        ) -> tuple[mi.UInt32, list[_Slots], list[mi.UInt32]]:
             record = GaussianRecord.fetch(lists.records, dr.gather(mi.UInt32, lists.entries, i))
             new_slots, new_left = [], []
             responses = rays.respond(record)
@@ -414,8 +422,8 @@ def _walk_in_ray_order(rays: Rays, fresh: Callable[[], Pixel], blend: Blend) -> 
         return i, slots, left
 
     def body(
-        pixels: list[Pixel], last: list[tuple[Any, Any]], begin: Any, seen: Any, active: Any
-    ) -> tuple[list[Pixel], list[tuple[Any, Any]], Any, Any, Any]:
+        pixels: list[Pixel], last: list[tuple[mi.Float, mi.UInt32]], begin: mi.UInt32, seen: mi.UInt32, active: mi.Bool
+    ) -> tuple[list[Pixel], list[tuple[mi.Float, mi.UInt32]], mi.UInt32, mi.UInt32, mi.Bool]:
         reached, slots, left = collect(begin, dr.select(active, stop, begin), seen, last)
         blended, new_last, unfinished, next_begin = [], [], mi.Bool(False), mi.UInt32(reached)
         for pixel, own, first_left, (last_z, last_i) in zip(pixels, slots, left, last, strict=True):
@@ -446,5 +454,5 @@ def _walk_in_ray_order(rays: Rays, fresh: Callable[[], Pixel], blend: Blend) -> 
     return pixels
 
 
-_Slots = list[tuple[Any, Any, Any]]
+_Slots = list[tuple["mi.Float", "mi.Float", "mi.UInt32"]]
 """Depth-sorted peaks: depth, opacity and entry."""

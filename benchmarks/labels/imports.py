@@ -1,12 +1,10 @@
-"""A dataset's COCO, VOC and Label Studio files read by others' tools, and compared with the manifest.
+"""COCO files of a dataset, read by other tools and compared with the manifest.
 
     python benchmarks/labels/imports.py datumaro DATASET      # pip install datumaro pycocotools; CVAT imports by it
     python benchmarks/labels/imports.py fiftyone DATASET      # pip install fiftyone pycocotools
-    python benchmarks/labels/imports.py labelstudio DATASET   # pip install label-studio-sdk pycocotools
 
-Each tool has an environment of its own, which needs no mitsplat. The dataset has the formats coco, voc and
-label-studio. Every image, class, box and pixel must be what the manifest says. FiftyOne's importers are asked
-themselves, without its database, and Label Studio's brush strokes are decoded by its own converter.
+Each tool has its own environment, which needs no mitsplat. The dataset must have the format coco. Every image, class,
+box and mask must equal that of the manifest. FiftyOne's importer is called without its database.
 """
 
 from __future__ import annotations
@@ -56,31 +54,28 @@ class Truth:
 
 
 def by_datumaro(root: Path, truth: Truth) -> None:
-    """COCO and VOC."""
+    """Read COCO by Datumaro."""
     import datumaro
 
     logging.getLogger().setLevel(logging.ERROR)  # it names every JSON file of another format
-    for folder, form in ((root, "coco_instances"), (root / "voc", "voc_detection")):
-        read = datumaro.Dataset.import_from(str(folder), form)
-        names = [label.name for label in read.categories()[datumaro.AnnotationType.label]]
-        for split, items in read.subsets().items():
-            for item in items:
-                labels = truth.splits[split].pop(item.id) if form == "voc_detection" else truth.splits[split][item.id]
-                truth.images += item.media.data.shape[:2] == (truth.height, truth.width)
-                chosen = sorted(item.annotations, key=lambda one: one.id)
-                for kind in (datumaro.AnnotationType.bbox, datumaro.AnnotationType.mask):
-                    found = [one for one in chosen if one.type == kind]
-                    for label, one in zip(labels, found, strict=bool(found) or not labels):
-                        if kind == datumaro.AnnotationType.mask:
-                            truth.check_mask(label, np.asarray(one.image))
-                        else:
-                            # VOC's positions are imported as they are: from 1, the last pixel included.
-                            shift = [-1, -1, 1, 1] if form == "voc_detection" else [0, 0, 0, 0]
-                            truth.check_box(label, names[one.label], np.add(one.get_bbox(), shift))
+    read = datumaro.Dataset.import_from(str(root), "coco_instances")
+    names = [label.name for label in read.categories()[datumaro.AnnotationType.label]]
+    for split, items in read.subsets().items():
+        for item in items:
+            labels = truth.splits[split].pop(item.id)
+            truth.images += item.media.data.shape[:2] == (truth.height, truth.width)
+            annotations = sorted(item.annotations, key=lambda one: one.id)
+            for kind in (datumaro.AnnotationType.bbox, datumaro.AnnotationType.mask):
+                found = [one for one in annotations if one.type == kind]
+                for label, one in zip(labels, found, strict=bool(found) or not labels):
+                    if kind == datumaro.AnnotationType.mask:
+                        truth.check_mask(label, np.asarray(one.image))
+                    else:
+                        truth.check_box(label, names[one.label], one.get_bbox())
 
 
 def by_fiftyone(root: Path, truth: Truth) -> None:
-    """COCO."""
+    """Read COCO by FiftyOne."""
     from fiftyone.utils.coco import COCODetectionDatasetImporter
 
     for split, instances in truth.splits.items():
@@ -99,26 +94,10 @@ def by_fiftyone(root: Path, truth: Truth) -> None:
                     truth.check_mask(label, one.mask)
 
 
-def by_labelstudio(root: Path, truth: Truth) -> None:
-    """Tasks."""
-    from label_studio_sdk.converter.brush import decode_rle
-
-    for split, instances in truth.splits.items():
-        for path in sorted((root / "label-studio" / split).glob("*.json")):
-            task = json.loads(path.read_bytes())
-            truth.images += task["data"]["image"].endswith((f"images/{split}/{path.stem}.jpg", f"{path.stem}.png"))
-            regions = task["annotations"][0]["result"]
-            for label, region in zip(instances.pop(path.stem), regions, strict=True):
-                if region["value"]["brushlabels"] != [label["class"]]:
-                    raise SystemExit(f"{region['value']['brushlabels']} is {label['class']} in the manifest")
-                values = decode_rle(region["value"]["rle"]).reshape(truth.height, truth.width, 4)
-                truth.check_mask(label, values[..., 3] > 0)
-
-
 def main() -> None:
     """Print what was compared."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("tool", choices=("datumaro", "fiftyone", "labelstudio"))
+    parser.add_argument("tool", choices=("datumaro", "fiftyone"))
     parser.add_argument("dataset", type=Path)
     options = parser.parse_args()
     command = "python", "benchmarks/labels/imports.py"
@@ -132,7 +111,7 @@ def compare(options: argparse.Namespace) -> None:
     held = [instances for split in truth.splits.values() for instances in split.values()]
     figure(len(held), "", "images")
     figure(sum(map(len, held)), "", "instances")
-    tools = {"datumaro": by_datumaro, "fiftyone": by_fiftyone, "labelstudio": by_labelstudio}
+    tools = {"datumaro": by_datumaro, "fiftyone": by_fiftyone}
     tools[options.tool](options.dataset, truth)
     if missing := [name for instances in truth.splits.values() for name in instances]:
         raise SystemExit(f"images that were not imported: {missing}")

@@ -24,9 +24,8 @@ import numpy as np
 from mitsplat.arrays import Float64Array
 from mitsplat.audit.bop_check import BopReader
 from mitsplat.audit.described import InstancesReader, PanopticReader, PosesReader, Reader
-from mitsplat.audit.label_studio_check import ConfigReader, check_task
 from mitsplat.audit.layers_check import LayersReader, PlacementReader
-from mitsplat.audit.listed import ColmapReader, LayoutReader, VocReader, YoloReader
+from mitsplat.audit.listed import ColmapReader, LayoutReader, YoloReader
 from mitsplat.audit.owned import OwnedFiles, check_listed
 from mitsplat.audit.read_back import CHECKS, POLYGON_AREA, POLYGON_IOU, Violations, check_bop
 from mitsplat.audit.scene_check import SceneReader
@@ -39,9 +38,6 @@ from mitsplat.storage.files import SPLITS, Record, splits_of
 
 _FRACTION_TOLERANCE = 1e-5
 """Tolerance of fractions that are stored with six decimals."""
-
-
-_CHECKS = {**CHECKS, "label-studio/": check_task}
 
 __all__ = ["POLYGON_AREA", "POLYGON_IOU", "Audit", "audit_dataset"]
 
@@ -94,7 +90,7 @@ def audit_dataset(root: str | Path, visit: Callable[[Record], object] = lambda r
         violations += check_listed(record, content)
         violations += ((f"manifest.jsonl, frame {frame.index}", text) for text in _check_labels(frame))
         for file in record["files"]:
-            check = next((check for prefix, check in _CHECKS.items() if file.startswith(prefix)), None)
+            check = next((check for prefix, check in CHECKS.items() if file.startswith(prefix)), None)
             if check is not None and file not in damaged:
                 violations += ((file, text) for text in check(frame, root / file))
         violations += check_bop(frame, damaged)
@@ -138,8 +134,6 @@ def _readers(root: Path, content: Mapping[str, Any]) -> list[Reader]:
         "amodal": lambda: [InstancesReader(root, content, "amodal", split) for split in splits],
         "panoptic": lambda: [PanopticReader(root, content, split) for split in splits],
         "poses": lambda: [PosesReader(root, content, split) for split in splits],
-        "voc": lambda: [VocReader(root, content)],
-        "label-studio": lambda: [ConfigReader(root, content)],
         "bop": lambda: [BopReader(root, content)],
         "colmap": lambda: [ColmapReader(root)],
     }

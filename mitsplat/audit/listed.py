@@ -1,4 +1,4 @@
-"""Audit of text files that describe all frames: VOC lists, Ultralytics' ``data.yaml``, COLMAP models and layouts."""
+"""Audit of text files that describe all frames: Ultralytics' ``data.yaml``, COLMAP models and layouts."""
 
 from __future__ import annotations
 
@@ -20,56 +20,12 @@ from mitsplat.audit.owned import YOLO_FOLDERS
 from mitsplat.audit.read_back import Violations
 from mitsplat.audit.truth import TrueFrame
 from mitsplat.runtime.child_process import python_command, python_environment
-from mitsplat.storage.files import SPLITS, read_json, splits_of
+from mitsplat.storage.files import SPLITS, read_json
 
 _POINTS = np.array([[0.0, 0.0, 1.0], [0.1, 0.0, 1.0], [0.0, 0.1, 1.0], [-0.15, 0.05, 0.8], [0.12, -0.2, 1.5]])
 """Points in front of a camera, in its frame, whose pixels determine its model and parameters, shape (5, 3)."""
 _PIXEL_TOLERANCE = 1e-6
 """Tolerance between projections of OpenCV and COLMAP [px]."""
-
-
-class VocReader:
-    """Reader of VOC's image list of each split, and of ``labelmap.txt``."""
-
-    def __init__(self, root: Path, content: Mapping[str, Any]) -> None:
-        self._root, self._content = root, content
-        self._sets = {
-            split: Cursor(file := f"voc/ImageSets/Main/{split}.txt", _numbers_of(root / file))
-            for split in splits_of(content["scene"]["output"])
-        }
-
-    def check(self, frame: TrueFrame) -> Violations:
-        """Check that the frame is in the list of its split."""
-        cursor = self._sets[frame.split]
-        if cursor.broken:
-            return
-        found = list(cursor.take(frame.index))
-        yield from cursor.errors()
-        if not cursor.broken and len(found) != 1:
-            yield cursor.file, f"names image {frame.index:06d} {len(found)} times"
-
-    def finish(self) -> Violations:
-        """Check the remaining entries and the classes."""
-        for cursor in self._sets.values():
-            if not cursor.broken:
-                yield from cursor.finish()
-        file = "voc/labelmap.txt"
-        expected = [f"{name}:::" for name in ("background", *self._content["classes"])]
-        try:
-            lines = (self._root / file).read_text().splitlines()
-        except FileNotFoundError:
-            yield file, "is missing"
-        except (OSError, ValueError) as error:
-            yield file, f"cannot be read ({error})"
-        else:
-            if [line for line in lines if not line.startswith("#")] != expected:
-                yield file, "does not name the dataset's classes"
-
-
-def _numbers_of(path: Path) -> Iterator[tuple[int, str]]:
-    with path.open() as file:
-        for line in file:
-            yield int(line), line
 
 
 class YoloReader:

@@ -22,7 +22,7 @@ _ANNOTATIONS = {"coco": "instances", "amodal": "amodal", "panoptic": "panoptic",
 _MAPS = ("depth", "depth-sensor", "normals", "instances", "semantic", "panoptic")
 _FOLDERS = (
     *("images", "labels", "layers", "annotations", "layouts", *_YOLO, *_MAPS),
-    *("flow", "voc", "label-studio", "bop", "colmap"),
+    *("flow", "bop", "colmap"),
 )
 """Folders that contain only files of a dataset."""
 _FOLD = re.compile(r"fold[0-9]+(_train|_val)?\.(txt|yaml)")
@@ -39,10 +39,6 @@ def files_of_frame(record: Record, content: Mapping[str, Any]) -> dict[str, str]
     for name, folder in _YOLO.items():
         if name in formats:
             files |= {f"{folder}images/{split}/{image}": name, f"{folder}labels/{split}/{number}.txt": name}
-    if "voc" in formats:
-        files |= {f"voc/JPEGImages/{image}": "voc", f"voc/Annotations/{number}.xml": "voc"}
-    if "label-studio" in formats:
-        files[f"label-studio/{split}/{number}.json"] = "label-studio"
     for name in _MAPS:
         if name in formats:
             files[f"{name}/{split}/{png}"] = name
@@ -93,10 +89,6 @@ class OwnedFiles:
             if name in self._formats:
                 yield from (f"annotations/{described}_{split}.json" for split in self._splits)
         yield from (f"{folder}data.yaml" for name, folder in _YOLO.items() if name in self._formats)
-        if "voc" in self._formats:
-            yield from ("voc/labelmap.txt", *(f"voc/ImageSets/Main/{split}.txt" for split in self._splits))
-        if "label-studio" in self._formats:
-            yield "label-studio/config.xml"
         if "bop" in self._formats:
             yield "bop/models/models_info.json"
             yield from (f"bop/models/obj_{position + 1:06d}.ply" for position in self._models)

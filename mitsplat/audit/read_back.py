@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterator
 from functools import partial
 from pathlib import Path
-from xml.etree import ElementTree
 
 import cv2
 import numpy as np
@@ -159,31 +158,6 @@ def _check_pose(frame: TrueFrame, label: TrueInstance, values: list[float]) -> I
         yield f"{label.name}: its keypoints differ from the manifest's"
 
 
-def _check_voc(frame: TrueFrame, path: Path) -> Iterator[str]:
-    try:
-        tree = ElementTree.parse(path)
-    except ElementTree.ParseError as error:
-        yield f"cannot be read as XML ({error})"
-        return
-    objects = tree.findall("object")
-    if [tree.findtext(f"size/{name}") for name in ("width", "height", "depth")] != [*map(str, frame.size), "3"]:
-        yield "does not state the size of its picture"
-    if tree.findtext("filename") != frame.image_name:
-        yield f"names the picture {tree.findtext('filename')}, not {frame.image_name}"
-    if len(objects) != len(frame.instances):
-        yield f"has {len(objects)} objects for {len(frame.instances)} instances"
-        return
-    for label, entry in zip(frame.instances, objects, strict=True):
-        if entry.findtext("name") != frame.content["classes"][label.kind]:
-            yield f"{label.name}: class is {entry.findtext('name')}, not {frame.content['classes'][label.kind]}"
-        box = [entry.findtext(f"bndbox/{name}") for name in ("xmin", "ymin", "xmax", "ymax")]
-        x0, y0, x1, y1 = label.box
-        if box != [str(value) for value in (x0 + 1, y0 + 1, x1, y1)]:  # from 1, last included
-            yield f"{label.name}: its box does not match its mask"
-        if [entry.findtext(name) for name in ("truncated", "occluded")] != [str(int(flag)) for flag in label.voc_flags]:
-            yield f"{label.name}: its flags do not match its masks"
-
-
 def read_grey(path: Path, frame: TrueFrame) -> Int64Array | None:
     """Read a grey picture of 8 or 16 bits; return None if it does not have the frame's size."""
     picture = read_picture(path, cv2.IMREAD_UNCHANGED)
@@ -281,8 +255,6 @@ CHECKS: dict[str, Callable[[TrueFrame, Path], Iterator[str]]] = {
     "yolo-obb/labels/": partial(_check_lines, _check_rotated),
     "yolo-pose/labels/": partial(_check_lines, _check_pose),
     **{f"{folder}/": _check_copy for folder in ("yolo-detect/images", "yolo-obb/images", "yolo-pose/images")},
-    "voc/JPEGImages/": _check_copy,
-    "voc/Annotations/": _check_voc,
     "instances/": _check_instances,
     "semantic/": _check_semantic,
     "panoptic/": _check_panoptic,

@@ -23,9 +23,6 @@ from mitsplat.storage.files import Record
 Box = tuple[int, int, int, int]
 """Bounds (x0, y0, x1, y1) [px], half-open."""
 
-VOC_TRUNCATED, VOC_OCCLUDED = 0.15, 0.05
-"""Fractions of an object outside of the box of its visible part, and hidden in it, above which VOC sets its flags."""
-
 
 def seats_of(scene: Mapping[str, Any]) -> list[tuple[int, int]]:
     """Return camera position and side for each view of a turn; side is 1 for the right camera of a pair."""
@@ -89,16 +86,6 @@ class TrueInstance:
     def silhouette_area(self) -> int:
         """Number of pixels of the silhouette, also beyond the image's border, as stated in the manifest."""
         return int(self.entry["silhouette_area"])
-
-    @cached_property
-    def voc_flags(self) -> tuple[bool, bool]:
-        """Flags *truncated* and *occluded* of VOC."""
-        x0, y0, x1, y1 = self.box
-        left, top = self.amodal_box[:2]
-        boxed = int(np.count_nonzero(self.amodal[max(0, y0 - top) : y1 - top, max(0, x0 - left) : x1 - left]))
-        hidden = boxed - self.area
-        beyond = self.silhouette_area - boxed
-        return bool(beyond > VOC_TRUNCATED * self.silhouette_area), bool(hidden > VOC_OCCLUDED * boxed)
 
 
 @dataclass(frozen=True, eq=False)

@@ -47,8 +47,6 @@ _WRITTEN = re.compile(
             rf"annotations/(?:instances|amodal|panoptic|poses)_{_SPLIT}\.json",
             rf"(?:depth|depth-sensor|normals|instances|semantic|panoptic)/{_SPLIT}/{_FRAME}\.png",
             rf"flow/{_SPLIT}/{_FRAME}\.flo",
-            rf"voc/(?:JPEGImages/{_IMAGE}|Annotations/{_FRAME}\.xml|ImageSets/Main/{_SPLIT}\.txt|labelmap\.txt)",
-            rf"label-studio/(?:{_SPLIT}/{_FRAME}\.json|config\.xml)",
             rf"bop/{_SPLIT}/\d+/(?:rgb|depth)/{_IMAGE}",
             rf"bop/{_SPLIT}/\d+/(?:mask|mask_visib)/{_FRAME}_\d+\.png",
             rf"bop/{_SPLIT}/\d+/scene_(?:camera|gt|gt_info)\.json",

@@ -1,4 +1,4 @@
-"""Writers of label files: YOLO, COCO, Pascal VOC, BOP, COLMAP, maps and EXR.
+"""Writers of label files: YOLO, COCO, BOP, COLMAP, maps and EXR.
 
 In: a :class:`~mitsplat.frames.frame.Frame`. Out: its files in every requested format, and the files that describe all
 frames, which grow frame by frame. A format is one module here and one entry in :mod:`.registry`.

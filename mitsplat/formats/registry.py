@@ -7,10 +7,6 @@ the manifest. Names of formats in a scene file's ``output.formats``:
     See :mod:`mitsplat.formats.yolo`.
 ``coco``, ``amodal``, ``panoptic``, ``poses``
     See :mod:`mitsplat.formats.coco`.
-``voc``
-    See :mod:`mitsplat.formats.voc`.
-``label-studio``
-    See :mod:`mitsplat.formats.label_studio`.
 ``bop``
     See :mod:`mitsplat.formats.bop`; for cameras without lens distortion.
 ``colmap``
@@ -34,7 +30,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from mitsplat.formats import bop, coco, label_studio, map_files, maps, voc, yolo
+from mitsplat.formats import bop, coco, map_files, maps, yolo
 from mitsplat.formats.colmap import ModelWriter
 from mitsplat.formats.format import Catalogue, Describer, Format, FrameFiles
 from mitsplat.scene.planning.contents import draw_regions
@@ -50,8 +46,6 @@ __all__ = ["FORMATS", "TABLE", "Catalogue", "CollectionWriter", "encode_image", 
 
 TABLE = {
     **{task: yolo.format_of(task) for task in yolo.TASKS},
-    "voc": Format(("voc",), voc.write, voc.SetsWriter),
-    "label-studio": Format(("label-studio",), label_studio.write, label_studio.ConfigWriter),
     "instances": Format(("instances",), map_files.write_instances),
     "coco": Format(("annotations",), describe=coco.describe_instances),
     "amodal": Format(("annotations",), describe=partial(coco.describe_instances, amodal=True)),

@@ -169,23 +169,6 @@ def shift_segments(root: Path, records: list[Record]) -> None:
     cv2.imwrite(str(path), np.roll(cv2.imread(str(path)), 3, axis=1))
 
 
-def name_another_class(root: Path, records: list[Record]) -> None:
-    path = root / "voc/Annotations/000000.xml"
-    name = first(records)["class"]
-    path.write_text(path.read_text().replace(f"<name>{name}</name>", "<name>screw</name>", 1))
-
-
-def count_from_zero(root: Path, records: list[Record]) -> None:
-    path = root / "voc/Annotations/000000.xml"
-    x0 = first(records)["box"][0]
-    path.write_text(path.read_text().replace(f"<xmin>{x0 + 1}</xmin>", f"<xmin>{x0}</xmin>", 1))
-
-
-def deny_occlusion(root: Path, records: list[Record]) -> None:
-    path = root / "voc/Annotations/000000.xml"
-    path.write_text(path.read_text().replace("<occluded>0</occluded>", "<occluded>1</occluded>", 1))
-
-
 def write_nan(root: Path, records: list[Record]) -> None:
     path = root / "yolo-obb/labels/train/000000.txt"
     values = path.read_text().split(" ")
@@ -236,9 +219,6 @@ FAULTS: dict[Callable[[Path, list[Record]], None], tuple[str, str]] = {
     widen_a_box: ("yolo-detect/labels/train/000000.txt", "does not match its box"),
     turn_a_rotated_box: ("yolo-obb/labels/train/000000.txt", "is no rectangle"),
     flip_a_keypoint: ("yolo-pose/labels/train/000000.txt", "keypoints differ"),
-    name_another_class: ("voc/Annotations/000000.xml", "class is screw"),
-    count_from_zero: ("voc/Annotations/000000.xml", "its box does not match its mask"),
-    deny_occlusion: ("voc/Annotations/000000.xml", "its flags do not match"),
     write_nan: ("yolo-obb/labels/train/000000.txt", "not finite"),
     shorten_a_line: ("yolo-detect/labels/train/000000.txt", "does not match its box"),
     shift_segments: ("panoptic/train/000000.png", "differ from the masks"),
@@ -310,10 +290,9 @@ STRAY = (
         "depth/train/000099.png",
     ),
     *("flow/train/000001.flo", "images/train/000099.png", "images/val/000000.png", "instances/train/000099.png"),
-    "label-studio/train/000099.json",
     *("labels/train/000099.txt", "layers/train/000099.exr", "layouts/0009.json", "normals/train/000099.png"),
-    *("panoptic/train/000099.png", "semantic/train/000099.png", "voc/Annotations/000099.xml"),
-    *("voc/JPEGImages/000099.png", "yolo-detect/labels/train/000099.txt", "yolo-obb/images/train/000099.png"),
+    *("panoptic/train/000099.png", "semantic/train/000099.png"),
+    *("yolo-detect/labels/train/000099.txt", "yolo-obb/images/train/000099.png"),
     "yolo-pose/images/train/000099.png",
 )
 """Files that no frame owns, in the folder of every format; the dataset has no COLMAP cameras."""
@@ -331,9 +310,8 @@ def test_files_of_no_frame_are_violations(dataset: Path) -> None:
 
 WHOLE = (
     *(f"annotations/{n}_{s}.json" for n in ("instances", "amodal", "panoptic", "poses") for s in ("train", "val")),
-    *("data.yaml", "yolo-detect/data.yaml", "yolo-obb/data.yaml", "yolo-pose/data.yaml", "voc/labelmap.txt"),
-    "label-studio/config.xml",
-    *("voc/ImageSets/Main/train.txt", "voc/ImageSets/Main/val.txt", "layouts/0000.json", "layouts/0002.json"),
+    *("data.yaml", "yolo-detect/data.yaml", "yolo-obb/data.yaml", "yolo-pose/data.yaml"),
+    *("layouts/0000.json", "layouts/0002.json"),
     *(f"bop/train/000000/scene_{part}.json" for part in ("camera", "gt", "gt_info")),
     *("bop/models/models_info.json", "bop/models/obj_000001.ply", "contact_sheet.jpg"),
 )
@@ -356,7 +334,7 @@ def test_damaged_annotations_are_one_violation_per_file(dataset: Path, damage: b
     for file in files:
         (dataset / file).write_bytes(damage)
     found = {file for file, _ in audit_dataset(dataset).violations}
-    assert set(files) - found <= {"voc/ImageSets/Main/val.txt"}
+    assert set(files) <= found
 
 
 def test_entries_of_no_frame_are_violations(dataset: Path) -> None:

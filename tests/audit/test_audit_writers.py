@@ -19,7 +19,7 @@ from mitsplat.audit.audit import audit_dataset
 from mitsplat.dataset.dataset_folder import Shard
 from mitsplat.dataset.shards import merge_shards
 from mitsplat.dataset.write import write_dataset
-from mitsplat.formats import bop, coco, colmap, label_studio, map_files, maps, voc, yolo
+from mitsplat.formats import bop, coco, colmap, map_files, maps, yolo
 from mitsplat.formats import registry as writers
 from mitsplat.frames import frame
 from mitsplat.geometry import camera
@@ -170,8 +170,6 @@ PANOPTIC, POSES = "annotations/panoptic_train.json", "annotations/poses_train.js
 GT, INFO, BOP_CAMERA = (f"bop/train/000000/scene_{part}.json" for part in ("gt", "gt_info", "camera"))
 OTHER = {1: 2, 2: 1, 3: 3}
 
-REAL_STROKE = label_studio.encode_brush
-
 FAULTS: dict[str, tuple[str, Patch, str, str]] = {
     "coco: box one too far": ("coco", each_annotation(lambda e: add_to(e["bbox"], 0, 1)), COCO, "bbox is"),
     "coco: box to its last pixel": ("coco", each_annotation(lambda e: add_to(e["bbox"], 2, -1)), COCO, "bbox is"),
@@ -243,18 +241,6 @@ FAULTS: dict[str, tuple[str, Patch, str, str]] = {
         ),
         POSES,
         "object is",
-    ),
-    "voc: pixels from zero": (
-        "voc",
-        changing(voc, "annotation", lambda made, *args: made.replace("<xmin>", "<xmin>1")),
-        "voc/Annotations/000000.xml",
-        "its box does not match",
-    ),
-    "voc: flags swapped": (
-        "voc",
-        changing(voc, "flags", lambda made, *args: (not made[0], not made[1])),
-        "voc/Annotations/000000.xml",
-        "its flags do not match",
     ),
     "bop: millimetres and metres": ("bop", models_in_metres, GT, "cam_t_m2c is"),
     "bop: world for camera": ("bop", with_camera(world_for_camera), GT, "cam_R_m2c is"),
@@ -352,18 +338,6 @@ FAULTS: dict[str, tuple[str, Patch, str, str]] = {
         task("yolo-obb", lambda made: made.mean(axis=0) + 1.4 * (made - made.mean(axis=0))),
         "yolo-obb/labels/train/000000.txt",
         "fits",
-    ),
-    "label-studio: along columns": (
-        "label-studio",
-        changing(label_studio, "encode_brush", lambda made, mask: REAL_STROKE(mask.T.copy())),
-        "label-studio/train/000000.json",
-        "differ from its mask",
-    ),
-    "label-studio: neighbours' classes": (
-        "label-studio",
-        changing(label_studio, "region", lambda made, *args: made | {"value": made["value"] | {"brushlabels": ["?"]}}),
-        "label-studio/train/000000.json",
-        "class is",
     ),
     "instances: classes for ids": (
         "instances",

@@ -27,7 +27,7 @@ from mitsplat.view.dataset_index import DatasetIndex
 from tests.conftest import BOTH, nut_and_bolt, small_scene
 from tests.dataset.test_write import contents, write
 
-FORMATS = ["yolo", "yolo-detect", "coco", "voc", "label-studio", "depth", "exr"]
+FORMATS = ["yolo", "yolo-detect", "coco", "depth", "exr"]
 PRECIOUS = "years of work\n"
 
 

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
-from xml.etree import ElementTree
 
 import cv2
 import numpy as np
@@ -21,7 +20,7 @@ from pycocotools.coco import COCO
 from ruamel.yaml import YAML
 
 from mitsplat.errors import InputError
-from mitsplat.formats import coco, maps, voc
+from mitsplat.formats import coco, maps
 from mitsplat.formats.registry import Catalogue, CollectionWriter, write_frame
 from mitsplat.formats.yolo import rotated_box
 from mitsplat.frames.flow import optical_flow
@@ -356,64 +355,6 @@ class TestCoco:
                     expected = CAMERA.camera_from_world @ label.world_from_object
                     np.testing.assert_allclose(entry["camera_from_object"], expected, atol=1e-12)
                     assert entry["object"] == label.asset
-
-
-class TestVoc:
-    """Against the VOC2012 development kit and the annotation guidelines of 2009."""
-
-    def test_boxes_count_from_one_and_include_their_last_pixel(self, written: Written) -> None:
-        for frame, record in written.pairs:
-            root = ElementTree.parse(written.root / f"voc/Annotations/{frame.index:06d}.xml").getroot()
-            assert [int(root.findtext(f"size/{name}", "")) for name in ("width", "height", "depth")] == [160, 120, 3]
-            image = written.root / "voc/JPEGImages" / root.findtext("filename", "")
-            assert image.read_bytes() == (written.root / f"images/{record['split']}/{image.name}").read_bytes()
-            entries = root.findall("object")
-            for label, mask, entry in zip(frame.labels.instances, masks(frame), entries, strict=True):
-                assert entry.findtext("name") == CLASSES[label.class_index]
-                ys, xs = mask.nonzero()
-                box = [int(entry.findtext(f"bndbox/{name}", "")) for name in ("xmin", "ymin", "xmax", "ymax")]
-                assert box == [xs.min() + 1, ys.min() + 1, xs.max() + 1, ys.max() + 1]
-
-    def test_flags(self, written: Written) -> None:
-        """Closed forms: what the border cuts lies outside the box of what is seen, and nothing in it is hidden.
-
-        Of a disc behind a round hole of half its radius, 3/4 less the box's corners lies outside, and the corners,
-        1 - pi/4 of the box, are hidden. A bar hides 1/6 of a block in the box of its two ends.
-        """
-
-        def flags_of(name: str, position: int) -> tuple[str | None, ...]:
-            index = list(LAYOUTS).index(name)
-            entries = ElementTree.parse(written.root / f"voc/Annotations/{index:06d}.xml").findall("object")
-            return tuple(entries[position].findtext(flag) for flag in ("truncated", "occluded"))
-
-        assert flags_of("cut by the border", 0) == ("1", "0")
-        assert flags_of("seen through a hole", 0) == ("1", "1")
-        assert flags_of("cut in two", 0) == ("0", "1")
-        assert flags_of("two of a class touch", 1) == ("0", "0")
-
-    @pytest.mark.parametrize(
-        ("seen", "boxed", "whole", "flags"),
-        [
-            (95, 100, 100, (False, False)),
-            (94, 100, 100, (False, True)),
-            (17, 17, 20, (False, False)),
-            (16, 16, 20, (True, False)),
-        ],
-    )
-    def test_shares_at_the_limits_set_no_flag(
-        self, seen: int, boxed: int, whole: int, flags: tuple[bool, bool]
-    ) -> None:
-        """5 % hidden and 15 % beyond the box are not more than that, though 1 - 95/100 > 0.05 in floating point."""
-        amodal = SimpleNamespace(box=(3, 4, 3 + boxed, 5), mask=np.ones((1, boxed), dtype=bool))
-        label = SimpleNamespace(box=amodal.box, amodal=amodal, area=seen, silhouette_area=whole)
-        assert voc.flags(label) == flags  # type: ignore[arg-type]
-
-    def test_splits_and_classes(self, written: Written) -> None:
-        for split in ("train", "val"):
-            names = (written.root / f"voc/ImageSets/Main/{split}.txt").read_text().split()
-            assert names == [f"{r['index']:06d}" for r in written.records if r["split"] == split]
-        classes = (written.root / "voc/labelmap.txt").read_text().splitlines()[1:]
-        assert classes == ["background:::", "bolt:::", "nut:::"]
 
 
 class TestBop:

@@ -138,7 +138,7 @@ def test_memory_does_not_grow_with_the_number_of_frames(tmp_path: Path, monkeypa
                     kept = tracemalloc.take_snapshot().filter_traces([paths]).statistics("filename")
                     held.append(sum(entry.size for entry in kept))
 
-            formats = ["yolo", "coco", "amodal", "panoptic", "poses", "voc", "bop", "colmap"]
+            formats = ["yolo", "coco", "amodal", "panoptic", "poses", "bop", "colmap"]
             with CollectionWriter(folder, catalogue, formats) as collection:
                 manifest.sort(hear)
                 collection.commit()

@@ -212,7 +212,7 @@ ATTACKS = (
         "write outside",
         lambda p: p.scene(
             objects="[{asset: nut, count: 1, class_name: '../../../outside/made'}]",
-            output="{width: 64, height: 48, layouts: 1, views: 1, formats: [yolo, coco, voc, bop, colmap]}",
+            output="{width: 64, height: 48, layouts: 1, views: 1, formats: [yolo, coco, bop, colmap]}",
         ),
         [RENDER],
         ANY,

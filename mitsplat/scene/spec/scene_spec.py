@@ -38,8 +38,6 @@ FormatName = Literal[
     "amodal",
     "panoptic",
     "poses",
-    "voc",
-    "label-studio",
     "bop",
     "colmap",
     "depth",

@@ -46,11 +46,11 @@ def doctor():
 
 
 def colmap():
-    from mitsplat.audit.listed import ColmapReader
+    from mitsplat.audit.colmap_check import ColmapCheck
     Path("colmap").mkdir()
     for name in ("cameras", "images", "points3D"):
         Path("colmap", f"{name}.txt").write_text("")
-    print(list(ColmapReader(Path.cwd())._read()))
+    print(list(ColmapCheck(Path.cwd())._read_images()))
 
 
 def cameras():

@@ -4,7 +4,7 @@ The masks in the manifest are the reference for all other files. First they are 
 and each other: they must be exclusive, lie inside their silhouettes, have the stated boxes, areas and fractions, and
 exceed the thresholds. Then every file of every format is read as its users read it, by pycocotools, pycolmap, OpenCV
 and the logic of the BOP toolkit. Its content is compared with values recomputed from masks, cameras and poses
-(:mod:`mitsplat.audit.truth`). The code that wrote the dataset is not used.
+(:mod:`mitsplat.audit.decoded_frame`). The code that wrote the dataset is not used.
 
 The manifest and the files that describe all frames are read in parallel, one frame at a time.
 """
@@ -14,30 +14,31 @@ from __future__ import annotations
 import os
 from array import array
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from mitsplat.arrays import Float64Array
-from mitsplat.audit.bop_check import BopReader
-from mitsplat.audit.described import InstancesReader, PanopticReader, PosesReader, Reader
-from mitsplat.audit.layers_check import LayersReader, PlacementReader
-from mitsplat.audit.listed import ColmapReader, LayoutReader, YoloReader
-from mitsplat.audit.owned import OwnedFiles, check_listed
-from mitsplat.audit.read_back import CHECKS, POLYGON_AREA, POLYGON_IOU, Violations, check_bop
-from mitsplat.audit.scene_check import SceneReader
-from mitsplat.audit.truth import TrueFrame
+from mitsplat.audit import picture_check, yolo_check
+from mitsplat.audit.bop_check import BopCheck
+from mitsplat.audit.coco_check import InstancesCheck, PanopticCheck, PosesCheck
+from mitsplat.audit.colmap_check import ColmapCheck
+from mitsplat.audit.dataset_check import FRACTION_TOLERANCE, DatasetCheck, Violation, Violations
+from mitsplat.audit.decoded_frame import DecodedFrame
+from mitsplat.audit.expected_files import ExpectedFiles
+from mitsplat.audit.layers_check import LayersCheck, PlacementCheck
+from mitsplat.audit.layout_check import LayoutCheck
+from mitsplat.audit.scene_check import SceneCheck
+from mitsplat.audit.yolo_check import POLYGON_AREA, POLYGON_IOU, DataYamlCheck
 from mitsplat.dataset.schema import Records, read_content
 from mitsplat.errors import InputError
 from mitsplat.images.picture_files import read_picture
 from mitsplat.storage.content_hash import file_hash
-from mitsplat.storage.files import SPLITS, Record, splits_of
+from mitsplat.storage.files import SPLITS, JsonObject, Record, splits_of
 
-_FRACTION_TOLERANCE = 1e-5
-"""Tolerance of fractions that are stored with six decimals."""
+_FILE_CHECKS = {**picture_check.CHECKS, **yolo_check.CHECKS}
 
 __all__ = ["POLYGON_AREA", "POLYGON_IOU", "Audit", "audit_dataset"]
 
@@ -78,37 +79,34 @@ def audit_dataset(root: str | Path, visit: Callable[[Record], object] = lambda r
     content = read_content(root)
     _refuse_special(root)
     records = Records(root, content)
-    readers, cross_frame, owned = _readers(root, content), CrossFrameCheck(), OwnedFiles(content)
-    violations: list[tuple[str, str]] = []
+    checks, cross_frame, expected = _create_checks(root, content), CrossFrameCheck(), ExpectedFiles(content)
+    violations: list[Violation] = []
     marked, dropped = Counter[str](), Counter[str]()
     frames = instances = low = files = 0
     for record in records:
         visit(record)
-        frame, found = TrueFrame.of(root, record, content), list(_check_files(root, record))
-        damaged = {name for name, _ in found}
-        violations += found
-        violations += check_listed(record, content)
+        frame, damaged = DecodedFrame.of(root, record, content), dict(_check_hashes(root, record))
+        violations += damaged.items()
+        violations += expected.check_record(record)
         violations += ((f"manifest.jsonl, frame {frame.index}", text) for text in _check_labels(frame))
         for file in record["files"]:
-            check = next((check for prefix, check in CHECKS.items() if file.startswith(prefix)), None)
-            if check is not None and file not in damaged:
-                violations += ((file, text) for text in check(frame, root / file))
-        violations += check_bop(frame, damaged)
+            check_file = next((check for folder, check in _FILE_CHECKS.items() if file.startswith(folder)), None)
+            if check_file is not None and file not in damaged:
+                violations += ((file, text) for text in check_file(frame, root / file))
         repeated = cross_frame.add(record)
         violations += repeated
         if not repeated:
-            for reader in readers:
-                violations += reader.check(frame)
-        owned.add(record)
+            for check in checks:
+                violations += check.check(frame)
         frames, instances, files = frames + 1, instances + len(frame.instances), files + len(record["files"])
         low += sum(i.area > POLYGON_AREA and i.entry["polygon_iou"] < POLYGON_IOU for i in frame.instances)
         marked.update(mark for instance in frame.instances for mark in instance.entry["marks"])
         dropped.update(record["labels"]["dropped"])
     violations += records.violations
-    for reader in readers:
-        violations += reader.finish()
+    for check in checks:
+        violations += check.finish()
     violations += cross_frame.check(records)
-    violations += owned.orphans(root)
+    violations += expected.check_folders(root)
     violations += _check_rest(root)
     return Audit(frames, instances, files, tuple(violations), low, dict(marked), dict(dropped))
 
@@ -126,31 +124,29 @@ def _refuse_special(root: Path) -> None:
                     raise InputError(f"{entry.path}: must be a regular file or a folder")
 
 
-def _readers(root: Path, content: Mapping[str, Any]) -> list[Reader]:
-    """Create the readers of files that describe all frames, and the checks across frames and against the scene."""
-    splits = splits_of(content["scene"]["output"])
-    make: dict[str, Callable[[], list[Reader]]] = {
-        "coco": lambda: [InstancesReader(root, content, "instances", split) for split in splits],
-        "amodal": lambda: [InstancesReader(root, content, "amodal", split) for split in splits],
-        "panoptic": lambda: [PanopticReader(root, content, split) for split in splits],
-        "poses": lambda: [PosesReader(root, content, split) for split in splits],
-        "bop": lambda: [BopReader(root, content)],
-        "colmap": lambda: [ColmapReader(root)],
+def _create_checks(root: Path, content: JsonObject) -> list[DatasetCheck]:
+    """Create the checks of files that describe all frames, and the checks across frames and against the scene."""
+    output = content["scene"]["output"]
+    splits = splits_of(output)
+    by_format: dict[str, Callable[[], list[DatasetCheck]]] = {
+        "coco": lambda: [InstancesCheck(root, content, "instances", split) for split in splits],
+        "amodal": lambda: [InstancesCheck(root, content, "amodal", split) for split in splits],
+        "panoptic": lambda: [PanopticCheck(root, content, split) for split in splits],
+        "poses": lambda: [PosesCheck(root, content, split) for split in splits],
+        "bop": lambda: [BopCheck(root, content)],
+        "colmap": lambda: [ColmapCheck(root)],
     }
-    readers: list[Reader] = [
-        SceneReader(content),
-        LayoutReader(root, content),
-        LayersReader(content),
-        PlacementReader(),
+    return [
+        SceneCheck(content),
+        LayoutCheck(root, content),
+        LayersCheck(content),
+        PlacementCheck(),
+        DataYamlCheck(root, content),
+        *(check for name, create in by_format.items() if name in output["formats"] for check in create()),
     ]
-    readers.append(YoloReader(root, content))
-    for name in make:
-        if name in content["scene"]["output"]["formats"]:
-            readers += make[name]()
-    return readers
 
 
-def _check_files(root: Path, record: Record) -> Violations:
+def _check_hashes(root: Path, record: Record) -> Violations:
     for file, digest in record["files"].items():
         if not (root / file).is_file():
             yield file, "is missing"
@@ -168,7 +164,7 @@ def _check_rest(root: Path) -> Violations:
         yield "scene", "must contain the scene file"
 
 
-def _check_labels(frame: TrueFrame) -> Iterator[str]:
+def _check_labels(frame: DecodedFrame) -> Iterator[str]:
     """Check that the labels of a frame are consistent."""
     classes, rules = frame.content["classes"], frame.content["scene"]["labels"]
     for number, count in Counter(label.id for label in frame.instances).items():
@@ -179,8 +175,8 @@ def _check_labels(frame: TrueFrame) -> Iterator[str]:
         entry, name = label.entry, label.name
         mask, amodal = frame.full_mask(label), frame.full_mask(label, amodal=True)
         times += mask
-        if classes[label.kind] != entry["class"]:
-            yield f"{name}: class {label.kind} is not {entry['class']!r}"
+        if classes[label.class_index] != entry["class"]:
+            yield f"{name}: class {label.class_index} is not {entry['class']!r}"
         for key, box, area, stated in (
             ("box", label.box, label.area, entry["area"]),
             ("amodal_box", label.amodal_box, label.amodal_area, entry["amodal_area"]),
@@ -197,14 +193,12 @@ def _check_labels(frame: TrueFrame) -> Iterator[str]:
             label.amodal_area == label.silhouette_area and (x0, y0, x1, y1) != label.amodal_box
         ):
             yield f"{name}: silhouette_box {entry['silhouette_box']} does not match its silhouette"
-        fraction = label.area / label.amodal_area
-        if abs(fraction - entry["visible_fraction"]) > _FRACTION_TOLERANCE:
-            yield f"{name}: its visible fraction is {fraction:.6f}, not {entry['visible_fraction']}"
-        truncation = 1 - label.amodal_area / label.silhouette_area
-        if abs(truncation - entry["truncation"]) > _FRACTION_TOLERANCE:
-            yield f"{name}: its truncation is {truncation:.6f}, not {entry['truncation']}"
-        below = {"occluded": fraction < rules["min_visible"] - _FRACTION_TOLERANCE}
-        below["disagreeing"] = entry["agreement"] < rules["min_agreement"] - _FRACTION_TOLERANCE
+        if abs(label.visible_fraction - entry["visible_fraction"]) > FRACTION_TOLERANCE:
+            yield f"{name}: its visible fraction is {label.visible_fraction:.6f}, not {entry['visible_fraction']}"
+        if abs(label.truncation - entry["truncation"]) > FRACTION_TOLERANCE:
+            yield f"{name}: its truncation is {label.truncation:.6f}, not {entry['truncation']}"
+        below = {"occluded": label.visible_fraction < rules["min_visible"] - FRACTION_TOLERANCE}
+        below["disagreeing"] = entry["agreement"] < rules["min_agreement"] - FRACTION_TOLERANCE
         if set(entry["marks"]) != {mark for mark, is_below in below.items() if is_below}:
             yield f"{name}: its marks {entry['marks']} do not match the thresholds"
         if label.area < rules["min_pixels"]:

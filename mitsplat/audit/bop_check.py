@@ -6,24 +6,33 @@ lengths in millimetres, boxes (x, y, x_max - x_min, y_max - y_min), pixel centre
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Generator, Iterator, Mapping
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.distance import pdist
 
 from mitsplat.arrays import Float64Array
 from mitsplat.asset import read_mesh
-from mitsplat.audit.described import Cursor, are_objects, differing, is_close
-from mitsplat.audit.owned import labelled_assets
-from mitsplat.audit.read_back import Violations
-from mitsplat.audit.truth import Box, TrueFrame, TrueInstance, bounds_of
+from mitsplat.audit.dataset_check import (
+    DatasetCheck,
+    EntryCursor,
+    Violation,
+    Violations,
+    are_objects,
+    compare_keys,
+    is_close,
+    prefixed,
+)
+from mitsplat.audit.decoded_frame import DecodedFrame, DecodedInstance, bounds_of
+from mitsplat.audit.expected_files import labelled_assets
 from mitsplat.errors import InputError
+from mitsplat.images.masks import Box
 from mitsplat.images.picture_files import read_picture
-from mitsplat.storage.files import read_json
+from mitsplat.storage.files import JsonObject, read_json
 from mitsplat.storage.json_stream import read_entries
 
 _PARTS = ("camera", "gt", "gt_info")
@@ -38,76 +47,70 @@ _MIN_AREA = 64
 """Minimum area of silhouettes for the check of a model [px]."""
 
 
-class BopReader:
-    """Reader of ``scene_camera.json``, ``scene_gt.json``, ``scene_gt_info.json`` and the models of all scenes."""
+class BopCheck(DatasetCheck):
+    """Check of ``scene_camera.json``, ``scene_gt.json``, ``scene_gt_info.json`` and the models of all scenes."""
 
-    def __init__(self, root: Path, content: Mapping[str, Any]) -> None:
+    def __init__(self, root: Path, content: JsonObject) -> None:
         self._root, self._content = root, content
         self._folder = ""
-        self._cursors: dict[str, Cursor] = {}
+        self._cursors: dict[str, EntryCursor[object]] = {}
         self._corners: dict[int, Float64Array] = {}
         self._fits: dict[int, list[int]] = {}
         self._models = list(self._check_models())
 
-    def check(self, frame: TrueFrame) -> Violations:
+    def check(self, frame: DecodedFrame) -> Violations:
         """Compare the entries of a frame with its masks, depth picture, camera and poses."""
         if frame.bop_folder != self._folder:
             yield from self._finish_scene()
             self._folder = frame.bop_folder
             self._cursors = {
-                part: Cursor(file := f"{self._folder}/scene_{part}.json", _by_frame(self._root / file))
+                part: EntryCursor(file := f"{self._folder}/scene_{part}.json", _read_scene(self._root / file))
                 for part in _PARTS
             }
-        found = {}
-        for part, cursor in self._cursors.items():
-            entries = [] if cursor.broken else list(cursor.take(frame.index))
-            yield from cursor.errors()
-            if cursor.broken:
-                continue
-            if len(entries) != 1:
-                yield cursor.file, f"has {len(entries)} entries of frame {frame.index}"
-                continue
-            if part != "camera" and (not are_objects(entries[0]) or len(entries[0]) != len(frame.instances)):
-                yield cursor.file, f"frame {frame.index} must have {len(frame.instances)} instances"
-                continue
-            found[part] = entries[0]
-        if "camera" in found:
-            yield from self._prefix("camera", frame, _check_camera(frame, found["camera"]))
-        if "gt" in found:
-            for label, pose in zip(frame.instances, found["gt"], strict=True):
-                yield from self._prefix("gt", frame, _check_pose(frame, label, pose))
-                self._count_fit(frame, label, found.get("camera", {}), pose)
-        if "gt_info" in found:
-            picture = self._root / f"{frame.bop_folder}/depth/{frame.index:06d}.png"
-            depth = read_picture(picture, cv2.IMREAD_UNCHANGED) if picture.is_file() else None
-            for label, info in zip(frame.instances, found["gt_info"], strict=True):
-                yield from self._prefix("gt_info", frame, _check_info(frame, label, info, depth))
+        cameras = yield from self._cursors["camera"].entry_of(frame)
+        for camera in cameras:
+            yield from prefixed(self._cursors["camera"].file, f"frame {frame.index}", _check_camera(frame, camera))
+        for label, pose in (yield from self._instances_of(frame, "gt")):
+            place = f"frame {frame.index}, {label.name}"
+            yield from prefixed(self._cursors["gt"].file, place, _check_pose(frame, label, pose))
+            self._count_fit(frame, label, cameras[0] if cameras else None, pose)
+        picture = self._root / f"{frame.bop_folder}/depth/{frame.index:06d}.png"
+        depth = read_picture(picture, cv2.IMREAD_UNCHANGED) if picture.is_file() else None
+        for label, info in (yield from self._instances_of(frame, "gt_info")):
+            place = f"frame {frame.index}, {label.name}"
+            yield from prefixed(self._cursors["gt_info"].file, place, _check_info(frame, label, info, depth))
 
-    def _prefix(self, part: str, frame: TrueFrame, texts: Iterator[str]) -> Violations:
-        for text in texts:
-            yield self._cursors[part].file, f"frame {frame.index}{text}"
+    def _instances_of(
+        self, frame: DecodedFrame, part: str
+    ) -> Generator[Violation, None, list[tuple[DecodedInstance, JsonObject]]]:
+        """Return the instances of a frame with their entries in a file; the list is empty after a violation."""
+        cursor = self._cursors[part]
+        for entry in (yield from cursor.entry_of(frame)):
+            if are_objects(entry) and len(entry) == len(frame.instances):
+                return list(zip(frame.instances, entry, strict=True))
+            yield cursor.file, f"frame {frame.index} must have {len(frame.instances)} instances"
+        return []
 
-    def _count_fit(self, frame: TrueFrame, label: TrueInstance, camera: Any, pose: Any) -> None:
+    def _count_fit(self, frame: DecodedFrame, label: DecodedInstance, camera: object, pose: JsonObject) -> None:
         """Project the model by the camera and pose in the files, and count the IoU with the silhouette's box."""
         number = label.entry["asset"] + 1
         corners = self._corners.get(number)
-        stated = _numbers(camera, cam_K=9), _numbers(pose, cam_R_m2c=9), _numbers(pose, cam_t_m2c=3)
-        if corners is None or any(values is None for values in stated) or label.silhouette_area < _MIN_AREA:
+        matrix = _read_numbers(camera, "cam_K", 9)
+        rotation, shift = _read_numbers(pose, "cam_R_m2c", 9), _read_numbers(pose, "cam_t_m2c", 3)
+        if corners is None or matrix is None or rotation is None or shift is None or label.silhouette_area < _MIN_AREA:
             return
-        matrix, rotation, shift = (np.zeros(9) if values is None else values for values in stated)
-        seen = (corners @ rotation.reshape(3, 3).T + shift) @ matrix.reshape(3, 3).T
-        if seen[:, 2].max() > 0 >= seen[:, 2].min():
+        projected = (corners @ rotation.reshape(3, 3).T + shift) @ matrix.reshape(3, 3).T
+        if projected[:, 2].max() > 0 >= projected[:, 2].min():
             return  # the model reaches behind the camera, so its box is unbounded
         with np.errstate(all="ignore"):
-            pixels = seen[:, :2] / seen[:, 2:]
+            pixels = projected[:, :2] / projected[:, 2:]
         box = np.concatenate([pixels.min(axis=0), pixels.max(axis=0) + 1])
-        fit = _box_iou(box, np.array(label.entry["silhouette_box"])) if seen[:, 2].min() > 0 else 0.0
-        self._fits.setdefault(number, [0] * _BINS)[min(_BINS - 1, int(np.nan_to_num(fit) * _BINS))] += 1
+        iou = _box_iou(box, np.array(label.entry["silhouette_box"])) if projected[:, 2].min() > 0 else 0.0
+        self._fits.setdefault(number, [0] * _BINS)[min(_BINS - 1, int(np.nan_to_num(iou) * _BINS))] += 1
 
     def _finish_scene(self) -> Violations:
         for cursor in self._cursors.values():
-            if not cursor.broken:
-                yield from cursor.finish()
+            yield from cursor.finish()
 
     def finish(self) -> Violations:
         """Check the remaining entries and the models, and that the models match the masks."""
@@ -125,14 +128,13 @@ class BopReader:
     def _check_models(self) -> Violations:
         """Check that the model files exist and have the stated measures."""
         file = "bop/models/models_info.json"
+        info: object = None
         try:
             info = read_json(self._root / file)
         except FileNotFoundError:
             yield file, "is missing"
-            info = None
         except (OSError, ValueError) as error:
             yield file, f"cannot be read ({error})"
-            info = None
         labelled = labelled_assets(self._content)
         numbers = {str(position + 1) for position in labelled}
         if isinstance(info, dict) and info.keys() - numbers:
@@ -160,31 +162,30 @@ class BopReader:
                 yield file, f"does not state the measures of {model}"
 
 
-def _by_frame(path: Path) -> Iterator[tuple[int, Any]]:
+def _read_scene(path: Path) -> Iterator[tuple[int, object]]:
     for key, value in read_entries(path):
         yield int(key), value
 
 
-def _check_camera(frame: TrueFrame, entry: Any) -> Iterator[str]:
+def _check_camera(frame: DecodedFrame, entry: object) -> Iterator[str]:
     centres = frame.intrinsics - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
     pose = frame.camera_from_world
     yield from _check_numbers(
         entry, {"cam_K": centres.ravel(), "cam_R_w2c": pose[:3, :3].ravel(), "cam_t_w2c": 1000 * pose[:3, 3]}
     )
-    if wrong := differing(entry, {"depth_scale": frame.record["depth_scale"]}):
-        yield f": {wrong}"
+    yield from compare_keys(entry, {"depth_scale": frame.record["depth_scale"]})
 
 
-def _check_pose(frame: TrueFrame, label: TrueInstance, entry: Mapping[str, Any]) -> Iterator[str]:
+def _check_pose(frame: DecodedFrame, label: DecodedInstance, entry: JsonObject) -> Iterator[str]:
     pose = frame.camera_from_world @ label.pose
     numbers = {"cam_R_m2c": pose[:3, :3].ravel(), "cam_t_m2c": 1000 * pose[:3, 3]}
-    for text in _check_numbers(entry, numbers):
-        yield f", {label.name}{text}"
-    if wrong := differing(entry, {"obj_id": label.entry["asset"] + 1}):
-        yield f", {label.name}: {wrong}"
+    yield from _check_numbers(entry, numbers)
+    yield from compare_keys(entry, {"obj_id": label.entry["asset"] + 1})
 
 
-def _check_info(frame: TrueFrame, label: TrueInstance, info: Mapping[str, Any], depth: Any) -> Iterator[str]:
+def _check_info(
+    frame: DecodedFrame, label: DecodedInstance, info: JsonObject, depth: npt.NDArray[np.generic] | None
+) -> Iterator[str]:
     x0, y0, x1, y1 = label.amodal_box
     expected = {
         "bbox_obj": _bop_box(label.entry["silhouette_box"]),
@@ -193,25 +194,24 @@ def _check_info(frame: TrueFrame, label: TrueInstance, info: Mapping[str, Any], 
         "px_count_visib": label.area,
     }
     if depth is not None and depth.shape == frame.size[::-1]:
-        expected["px_count_valid"] = int(np.count_nonzero(label.amodal & (depth[y0:y1, x0:x1] > 0)))
-    if wrong := differing(info, expected):
-        yield f", {label.name}: {wrong}"
-    if not is_close(info.get("visib_fract"), label.area / label.silhouette_area):
-        yield f", {label.name}: visib_fract is {info.get('visib_fract')}, not {label.area / label.silhouette_area:.6f}"
+        expected["px_count_valid"] = int(np.count_nonzero(depth[y0:y1, x0:x1][label.amodal]))
+    yield from compare_keys(info, expected)
+    fraction = label.area / label.silhouette_area
+    if not is_close(info.get("visib_fract"), fraction):
+        yield f"visib_fract is {info.get('visib_fract')}, not {fraction:.6f}"
 
 
-def _check_numbers(entry: Any, expected: Mapping[str, Float64Array]) -> Iterator[str]:
+def _check_numbers(entry: object, expected: Mapping[str, Float64Array]) -> Iterator[str]:
     for key, values in expected.items():
         found = entry.get(key) if isinstance(entry, dict) else None
         if not is_close(found, values):
-            yield f": {key} is {str(found)[:60]}, which differs from the manifest's camera and poses"
+            yield f"{key} is {str(found)[:60]}, which differs from the manifest's camera and poses"
 
 
-def _numbers(entry: Any, **sizes: int) -> Float64Array | None:
-    ((key, size),) = sizes.items()
+def _read_numbers(entry: object, key: str, size: int) -> Float64Array | None:
     try:
-        values = np.array(entry[key], dtype=np.float64)
-    except (KeyError, TypeError, ValueError):
+        values = np.array(entry.get(key) if isinstance(entry, dict) else None, dtype=np.float64)
+    except (TypeError, ValueError):
         return None
     return values if values.shape == (size,) and np.isfinite(values).all() else None
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -13,11 +12,12 @@ import numpy.typing as npt
 import OpenEXR
 
 from mitsplat.arrays import BoolArray, Float64Array
-from mitsplat.audit.conveyor_check import BeltTruth
-from mitsplat.audit.read_back import Violations
-from mitsplat.audit.truth import TrueFrame
+from mitsplat.audit.conveyor_motion import BeltMotion
+from mitsplat.audit.dataset_check import DatasetCheck, Violations
+from mitsplat.audit.decoded_frame import DecodedFrame
+from mitsplat.audit.picture_check import read_16_bits
 from mitsplat.images.exr_header import check_exr_header
-from mitsplat.images.picture_files import read_picture
+from mitsplat.storage.files import JsonObject
 
 _FLOW_TOLERANCE = 0.02
 """Tolerance of optical flow for single precision and lens models [px]."""
@@ -36,17 +36,16 @@ Values of rendered scenes were up to 0.09 and 0.04. With inverted cameras, silho
 """
 
 
-class LayersReader:
-    """Reader of ``depth/``, ``normals/``, ``flow/`` and ``layers/``, frame by frame."""
+class LayersCheck(DatasetCheck):
+    """Check of ``depth/``, ``normals/``, ``flow/`` and ``layers/``, frame by frame."""
 
-    def __init__(self, content: Mapping[str, Any]) -> None:
-        self._content = content
-        self._belt = BeltTruth(content)
-        self._last: tuple[TrueFrame, Float64Array, float] | None = None
+    def __init__(self, content: JsonObject) -> None:
+        self._belt = BeltMotion(content)
+        self._last: tuple[DecodedFrame, Float64Array, float] | None = None
 
-    def check(self, frame: TrueFrame) -> Violations:
+    def check(self, frame: DecodedFrame) -> Violations:
         """Check the frame's maps against each other, and the flow from the previous frame to this one."""
-        channels = dict[str, npt.NDArray[Any]]()
+        channels = dict[str, npt.NDArray[np.generic]]()
         layers = f"layers/{frame.split}/{frame.index:06d}.exr"
         if "exr" in frame.formats and (frame.root / layers).is_file():
             channels, error = _read_exr(frame.root / layers)
@@ -55,7 +54,7 @@ class LayersReader:
         if "Z" in channels and channels["Z"].shape == frame.size[::-1]:
             depth = channels["Z"].astype(np.float64)
         for file in _depth_files(frame):
-            stored = _read_16_bits(frame.root / file, (*frame.size[::-1],))
+            stored = read_16_bits(frame.root / file, frame.size[::-1])
             if stored is None:
                 continue
             unit = frame.record["depth_scale"] / 1000
@@ -71,7 +70,7 @@ class LayersReader:
             yield from self._check_flow(frame)
         self._last = None if depth is None else (frame, depth, step)
 
-    def _check_flow(self, frame: TrueFrame) -> Violations:
+    def _check_flow(self, frame: DecodedFrame) -> Violations:
         """Compare the flow of the previous frame with that computed from its depth and both cameras."""
         assert self._last is not None  # noqa: S101
         before, depth, step = self._last
@@ -87,7 +86,7 @@ class LayersReader:
         height, width = depth.shape
         x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
         pixels = np.stack([x.ravel(), y.ravel()], axis=1)
-        slopes = np.column_stack([before.slopes(pixels), np.ones(len(pixels))])
+        slopes = np.column_stack([before.ray_slopes(pixels), np.ones(len(pixels))])
         known = depth.ravel() > step
         motion = frame.camera_from_world @ before.world_from_camera
         found = flow.reshape(-1, 2)[known]
@@ -122,7 +121,7 @@ class LayersReader:
         if count := np.count_nonzero(wrong):
             yield file, f"{count} pixels have a flow that contradicts depth and cameras"
 
-    def _pixels_of(self, frame: TrueFrame, carried: bool) -> BoolArray:
+    def _pixels_of(self, frame: DecodedFrame, carried: bool) -> BoolArray:
         """Return the pixels (H, W) of the labelled instances that the belt carries, or of the others."""
         width, height = frame.size
         seen = np.zeros((height, width), dtype=bool)
@@ -131,12 +130,8 @@ class LayersReader:
                 seen |= frame.full_mask(instance)
         return seen
 
-    def finish(self) -> Violations:
-        """Do nothing; all checks are done per frame."""
-        yield from ()
 
-
-class PlacementReader:
+class PlacementCheck(DatasetCheck):
     """Check over the whole dataset that poses and cameras agree with the positions and depths of silhouettes.
 
     The position of an asset's geometry in its own coordinates is not stored. However, one point of the asset projects
@@ -147,18 +142,18 @@ class PlacementReader:
     def __init__(self) -> None:
         self._places, self._depths = defaultdict[int, _PointFit](_PointFit), defaultdict[int, _PointFit](_PointFit)
 
-    def check(self, frame: TrueFrame) -> Violations:
+    def check(self, frame: DecodedFrame) -> Violations:
         """Add the frame's instances to the sums."""
         depth = None
         if (file := next(iter(_depth_files(frame)), None)) is not None:
-            depth = _read_16_bits(frame.root / file, (*frame.size[::-1],))
+            depth = read_16_bits(frame.root / file, frame.size[::-1])
         for label in frame.instances:
             asset, pose = label.entry["asset"], frame.camera_from_world @ label.pose
             rotation, shift = pose[:3, :3], pose[:3, 3]
             away = max(abs(float(shift[2])), 1e-6)
             x0, y0, x1, y1 = label.entry["silhouette_box"]
             if label.entry["truncation"] <= _MAX_TRUNCATION:
-                slopes = frame.slopes(np.array([[(x0 + x1) / 2, (y0 + y1) / 2]]))[0]
+                slopes = frame.ray_slopes(np.array([[(x0 + x1) / 2, (y0 + y1) / 2]]))[0]
                 reach = away * max(x1 - x0, y1 - y0) / 2 / frame.intrinsics[0, 0]
                 rows = rotation[:2] - np.outer(slopes, rotation[2])
                 self._places[asset].add(rows / reach, (slopes * shift[2] - shift[:2]) / reach)
@@ -207,19 +202,19 @@ class _PointFit:
         return float(np.sqrt(max(0.0, self._total - float(self._product @ point)) / max(1, self.count)))
 
 
-def _depth_files(frame: TrueFrame) -> list[str]:
+def _depth_files(frame: DecodedFrame) -> list[str]:
     """Return the existing depth pictures of the frame."""
     name = f"{frame.index:06d}.png"
     files = [f"depth/{frame.split}/{name}", f"{frame.bop_folder}/depth/{name}"]
     return [file for file in files if file in frame.record["files"] and (frame.root / file).is_file()]
 
 
-def _check_sensed(frame: TrueFrame, depth: Float64Array | None) -> Violations:
+def _check_sensed(frame: DecodedFrame, depth: Float64Array | None) -> Violations:
     """Check the size of measured depth, and its median error where the true depth is known."""
     file = f"depth-sensor/{frame.split}/{frame.index:06d}.png"
     if file not in frame.record["files"] or not (frame.root / file).is_file():
         return
-    stored = _read_16_bits(frame.root / file, (*frame.size[::-1],))
+    stored = read_16_bits(frame.root / file, frame.size[::-1])
     if stored is None:
         yield file, "cannot be read as a 16-bit grey image of the frame's size"
     elif depth is not None and (both := (stored > 0) & (depth > 0)).any():
@@ -229,14 +224,7 @@ def _check_sensed(frame: TrueFrame, depth: Float64Array | None) -> Violations:
             yield file, f"depths have a median error of {error:.0%}"
 
 
-def _read_16_bits(path: Path, shape: tuple[int, ...]) -> npt.NDArray[np.uint16] | None:
-    picture = read_picture(path, cv2.IMREAD_UNCHANGED)
-    if picture is None or picture.dtype != np.uint16 or picture.shape != shape:
-        return None
-    return picture.astype(np.uint16, copy=False)
-
-
-def _read_exr(path: Path) -> tuple[dict[str, npt.NDArray[Any]], str]:
+def _read_exr(path: Path) -> tuple[dict[str, npt.NDArray[np.generic]], str]:
     """Return channels by name, and the read error, which is empty if there is none."""
     try:
         check_exr_header(path)
@@ -246,7 +234,7 @@ def _read_exr(path: Path) -> tuple[dict[str, npt.NDArray[Any]], str]:
         return {}, f"cannot be read as OpenEXR ({error})"
 
 
-def _check_channels(frame: TrueFrame, channels: Mapping[str, npt.NDArray[Any]], error: str) -> list[str]:
+def _check_channels(frame: DecodedFrame, channels: Mapping[str, npt.NDArray[np.generic]], error: str) -> list[str]:
     if error:
         return [error]
     required = {*"RGBAZ", "instance", "proxy_instance", "normal.X", "normal.Y", "normal.Z"}
@@ -259,9 +247,9 @@ def _check_channels(frame: TrueFrame, channels: Mapping[str, npt.NDArray[Any]], 
     return [f"{wrong} pixels of the channel {source} differ from the masks"] if wrong else []
 
 
-def _check_normals(frame: TrueFrame, file: str, channels: Mapping[str, npt.NDArray[Any]]) -> list[str]:
+def _check_normals(frame: DecodedFrame, file: str, channels: Mapping[str, npt.NDArray[np.generic]]) -> list[str]:
     """Compare the normal map with the exact normals in ``layers/``, if the dataset has them."""
-    picture = _read_16_bits(frame.root / file, (*frame.size[::-1], 3)) if (frame.root / file).is_file() else None
+    picture = read_16_bits(frame.root / file, (*frame.size[::-1], 3)) if (frame.root / file).is_file() else None
     if picture is None:
         return ["cannot be read as a 16-bit colour image of the frame's size"]
     if any(f"normal.{axis}" not in channels for axis in "XYZ"):

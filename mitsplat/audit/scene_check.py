@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from typing import Any
+from collections.abc import Iterator
+from itertools import chain
 
 import cv2
 import numpy as np
 
 from mitsplat.arrays import Float64Array
-from mitsplat.audit.read_back import Violations
-from mitsplat.audit.truth import TrueFrame, seats_of
+from mitsplat.audit.dataset_check import DatasetCheck, Violations
+from mitsplat.audit.decoded_frame import DecodedFrame, camera_slots
+from mitsplat.storage.files import JsonObject
 
 _SIGMAS = 6.0
 """Maximum jitter of cameras, in standard deviations."""
@@ -18,40 +19,36 @@ _POSITION_TOLERANCE = 1e-6
 """Tolerance of positions [m]."""
 
 
-class SceneReader:
+class SceneCheck(DatasetCheck):
     """Comparison of frames with the scene of ``dataset.json``."""
 
-    def __init__(self, content: Mapping[str, Any]) -> None:
+    def __init__(self, content: JsonObject) -> None:
         scene = content["scene"]
         self._cameras, self._output = (scene["camera"], *scene.get("cameras", ())), scene["output"]
-        self._seats = seats_of(scene)
+        self._slots = camera_slots(scene)
         self._distractors = set(content.get("distractors", ()))
         self._held_out = _held_out(content["scene"])
-        self._given = content.get("given", False)
+        self._checks_cameras = not content.get("given", False)
 
-    def check(self, frame: TrueFrame) -> Violations:
+    def check(self, frame: DecodedFrame) -> Violations:
         """Check that the scene can have the frame's camera and labels; a camera given by the caller is not checked."""
-        width, height = self._output["width"], self._output["height"]
-        if frame.size != (width, height):
-            text = f"is {frame.size[0]}x{frame.size[1]} px, not {width}x{height} as in the scene"
-            yield f"manifest.jsonl, frame {frame.index}", text
-        for text in (*(() if self._given else self._check_camera(frame)), *self._check_objects(frame)):
+        for text in chain(self._check_objects(frame), self._check_camera(frame) if self._checks_cameras else ()):
             yield f"manifest.jsonl, frame {frame.index}", text
 
-    def _check_camera(self, frame: TrueFrame) -> Iterator[str]:
-        drawn, (number, right) = frame.record.get("viewpoint") or {}, self._camera_slot(frame)
+    def _check_camera(self, frame: DecodedFrame) -> Iterator[str]:
+        viewpoint, (number, right) = _viewpoint(frame), self._camera_slot(frame)
         sides = ("left", "right") if self._cameras[number].get("stereo") else (None, None)
-        if (drawn.get("camera", 0), drawn.get("side")) != (number, sides[right]):
+        if (viewpoint.get("camera", 0), viewpoint.get("side")) != (number, sides[right]):
             yield "its camera is not the scene's camera for this view"
         yield from self._check_lens(frame)
-        yield from self._check_place(frame)
+        yield from self._check_camera_pose(frame)
 
-    def finish(self) -> Violations:
-        """Do nothing; all checks are done per frame."""
-        yield from ()
-
-    def _check_objects(self, frame: TrueFrame) -> Iterator[str]:
+    def _check_objects(self, frame: DecodedFrame) -> Iterator[str]:
+        width, height = self._output["width"], self._output["height"]
+        if frame.size != (width, height):
+            yield f"is {frame.size[0]}x{frame.size[1]} px, not {width}x{height} as in the scene"
         drawn = frame.record.get("objects")
+        left_out = {one["id"] for one in frame.record.get("left_out", ())}
         for label in frame.instances:
             asset = label.entry["asset"]
             if asset in self._held_out and frame.split != "test":
@@ -62,63 +59,61 @@ class SceneReader:
                 (one["id"], one["asset"], one["label"]) == (label.id, asset, True) for one in drawn
             ):
                 yield f"{label.name} is not among the drawn objects"
-        left_out = {one["id"] for one in frame.record.get("left_out", ())}
-        for label in frame.instances:
             if label.id in left_out:
                 yield f"{label.name} is labelled, although its layout lacks it"
         if frame.record.get("empty") and frame.instances:
             yield f"has {len(frame.instances)} labels, although its layout is empty"
 
-    def _check_lens(self, frame: TrueFrame) -> Iterator[str]:
-        camera, drawn = self._camera_of(frame), frame.record.get("viewpoint") or {}
+    def _check_lens(self, frame: DecodedFrame) -> Iterator[str]:
+        camera, viewpoint = self._camera_of(frame), _viewpoint(frame)
         lens, (width, height) = camera["intrinsics"], (self._output["width"], self._output["height"])
         low, high = camera.get("zoom", (1.0, 1.0))
-        zoom = drawn.get("zoom", low)
-        if not low <= zoom <= high or (low < high and "zoom" not in drawn):
-            yield f"its zoom must be stated and within the scene's {low:g} to {high:g} (got {drawn.get('zoom')})"
-        wide, tall = lens["size"] or (width, height)
+        zoom = viewpoint.get("zoom", low)
+        if not low <= zoom <= high or (low < high and "zoom" not in viewpoint):
+            yield f"its zoom must be stated and within the scene's {low:g} to {high:g} (got {viewpoint.get('zoom')})"
+        full_width, full_height = lens["size"] or (width, height)
         if lens["fov_x"] is not None:
-            fx = fy = wide / (2 * np.tan(np.radians(lens["fov_x"]) / 2))
+            fx = fy = full_width / (2 * np.tan(np.radians(lens["fov_x"]) / 2))
         else:
             fx, fy = lens["fx"], lens["fx"] if lens["fy"] is None else lens["fy"]
-        cx, cy = (wide / 2 if lens["cx"] is None else lens["cx"]), (tall / 2 if lens["cy"] is None else lens["cy"])
-        scale = np.diag([width / wide, height / tall, 1.0])
+        cx = full_width / 2 if lens["cx"] is None else lens["cx"]
+        cy = full_height / 2 if lens["cy"] is None else lens["cy"]
+        scale = np.diag([width / full_width, height / full_height, 1.0])
         expected = scale @ [[zoom * fx, 0, cx], [0, zoom * fy, cy], [0, 0, 1]]
         if np.abs(frame.intrinsics - expected).max() > 1e-9 * max(fx, fy, width, height):
             yield f"its intrinsics are not the scene's, {expected[0, 0]:.6g}, {expected[1, 1]:.6g} px"
         if list(frame.distortion) != list(lens["distortion"]) or frame.record["camera"]["lens"] != lens["lens"]:
             yield "its lens distortion is not the scene's"
 
-    def _camera_of(self, frame: TrueFrame) -> Mapping[str, Any]:
+    def _camera_of(self, frame: DecodedFrame) -> JsonObject:
         """Return the camera of the scene that took a frame."""
-        camera: Mapping[str, Any] = self._cameras[self._camera_slot(frame)[0]]
+        camera: JsonObject = self._cameras[self._camera_slot(frame)[0]]
         return camera
 
-    def _camera_slot(self, frame: TrueFrame) -> tuple[int, bool]:
+    def _camera_slot(self, frame: DecodedFrame) -> tuple[int, bool]:
         """Return the position of a frame's camera in the scene, and True for the right camera of a stereo pair."""
-        number, side = self._seats[frame.record["view"] % len(self._seats)]
+        number, side = self._slots[frame.record["view"] % len(self._slots)]
         return number, side == 1
 
-    def _view_of_camera(self, frame: TrueFrame) -> tuple[int, int]:
+    def _view_of_camera(self, frame: DecodedFrame) -> tuple[int, int]:
         """Return the position of a frame among the views of its camera in the layout, and the number of these views."""
-        seats = len(self._seats)
-        turn, seat = divmod(frame.record["view"], seats)
-        return turn, len(range(seat, self._output["views"], seats))
+        turn, slot = divmod(frame.record["view"], len(self._slots))
+        return turn, len(range(slot, self._output["views"], len(self._slots)))
 
-    def _steady_pose(self, frame: TrueFrame) -> Float64Array:
+    def _steady_pose(self, frame: DecodedFrame) -> Float64Array:
         """Return the pose of a frame's camera without hand-held motion; a right camera is moved to its left camera."""
         pose = np.array(frame.world_from_camera, dtype=np.float64)
         number, right = self._camera_slot(frame)
         if right:
             pose[:3, 3] -= self._cameras[number]["stereo"]["baseline"] * pose[:3, 0]
-        if (motion := (frame.record.get("viewpoint") or {}).get("handheld")) is not None:
+        if (motion := _viewpoint(frame).get("handheld")) is not None:
             moved = np.eye(4)
             moved[:3, :3], _ = cv2.Rodrigues(np.radians(motion[3:]))
             moved[:3, 3] = motion[:3]
             pose = pose @ np.linalg.inv(moved)
         return pose
 
-    def _check_place(self, frame: TrueFrame) -> Iterator[str]:
+    def _check_camera_pose(self, frame: DecodedFrame) -> Iterator[str]:
         """Check the camera's position and direction: distance and direction to the target, or the ends of a path."""
         camera, pose = self._camera_of(frame), self._steady_pose(frame)
         eye, axis = pose[:3, 3], pose[:3, 2]
@@ -135,7 +130,7 @@ class SceneReader:
                 yield "its camera does not look at the target of the scene's path"
             return
         target, tolerance = camera["target"], _SIGMAS * camera.get("target_jitter", 0.0) + _POSITION_TOLERANCE
-        if (stated := (frame.record.get("viewpoint") or {}).get("target")) is not None:
+        if (stated := _viewpoint(frame).get("target")) is not None:
             target, tolerance = stated, _POSITION_TOLERANCE  # the record states the drawn target
         offset = eye - target
         if camera["kind"] == "orbit":
@@ -152,7 +147,12 @@ class SceneReader:
             yield f"its camera looks past the scene's target by {distance:.3g} m"
 
 
-def _held_out(scene: Mapping[str, Any]) -> set[int]:
+def _viewpoint(frame: DecodedFrame) -> JsonObject:
+    """Return the drawn values of a frame's camera."""
+    return frame.record.get("viewpoint") or {}
+
+
+def _held_out(scene: JsonObject) -> set[int]:
     """Return the positions, in the order of the scene's assets, of assets that only the test split may have."""
     names = set(scene.get("hold_out", {}).get("assets", ()))
     found, position = set[int](), 0

@@ -20,7 +20,9 @@ from PIL import Image
 from mitsplat.errors import FULL, InputError, MissingResourceError
 from mitsplat.storage.content_hash import file_hash
 
-Record = dict[str, Any]
+JsonObject = dict[str, Any]
+"""JSON object, parsed or to be written."""
+Record = JsonObject
 """Line of one frame in ``manifest.jsonl``."""
 
 SPLITS = ("train", "val", "test")

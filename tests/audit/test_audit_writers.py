@@ -436,7 +436,7 @@ def test_poses_that_differ_from_the_layout_are_violations(scene: Scene, tmp_path
     assert "is of layout 1" in said
 
 
-WRITERS = ("formats", "frames", "labels", "masks", "render")
+WRITERS = ("formats", "frames", "labels", "plugins", "renderer")
 """Where labels are made and written."""
 
 

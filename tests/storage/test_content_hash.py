@@ -64,4 +64,4 @@ def test_one_module_computes_hashes() -> None:
         for node in ast.walk(ast.parse(path.read_text()))
         if isinstance(node, ast.Import) and any(alias.name == "hashlib" for alias in node.names)
     }
-    assert found == {"storage/content_hash.py", "audit/owned.py"}
+    assert found == {"storage/content_hash.py", "audit/expected_files.py"}

@@ -3,52 +3,51 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from mitsplat.arrays import Float64Array
-from mitsplat.audit.truth import TrueFrame, seats_of
+from mitsplat.audit.decoded_frame import DecodedFrame, camera_slots
+from mitsplat.storage.files import JsonObject
 
 _MAX_DEPTH = 1e-3
 """Maximum depth of a carried object's origin below the top of the belt [m]."""
 
 
-class BeltTruth:
-    """Reference motion of a belt along its box's own x axis; nothing moves in a scene without a belt.
+class BeltMotion:
+    """Motion of a belt along the x axis of its box; nothing moves in a scene without a belt.
 
     Args:
         content: Content of ``dataset.json``.
     """
 
-    def __init__(self, content: Mapping[str, Any]) -> None:
+    def __init__(self, content: JsonObject) -> None:
         scene = content["scene"]
         self._conveyor = None if content.get("given", False) else scene.get("conveyor")
         if self._conveyor is None:
             return
         self._box = next(shape["box"] for shape in scene["shapes"] if shape["name"] == self._conveyor["belt"])
         self._turn = Rotation.from_euler("xyz", self._box["rotate"], degrees=True)
-        self._seats = len(seats_of(scene))
-        self._last = math.ceil(scene["output"]["views"] / self._seats) - 1
+        self._views_per_step = len(camera_slots(scene))
+        self._last_step = math.ceil(scene["output"]["views"] / self._views_per_step) - 1
 
     def carries(self, pose: Float64Array) -> bool:
         """Return True if the belt carries an object at a pose (4, 4), because the object's origin is above the belt."""
         if self._conveyor is None:
             return False
-        place, half = self._turn.inv().apply(pose[:3, 3] - self._box["position"]), np.array(self._box["size"]) / 2
-        return bool((abs(place[:2]) <= half[:2]).all() and place[2] > half[2] - _MAX_DEPTH)
+        position, half = self._turn.inv().apply(pose[:3, 3] - self._box["position"]), np.array(self._box["size"]) / 2
+        return bool((abs(position[:2]) <= half[:2]).all() and position[2] > half[2] - _MAX_DEPTH)
 
-    def displacement(self, pose: Float64Array, frame: TrueFrame) -> Float64Array:
+    def displacement(self, pose: Float64Array, frame: DecodedFrame) -> Float64Array:
         """Return the displacement at the time of a frame of an object that settled at a pose (4, 4) [m], shape (3,)."""
-        return self._run(frame) if self.carries(pose) else np.zeros(3)
+        return self._travel(frame) if self.carries(pose) else np.zeros(3)
 
-    def between(self, frame: TrueFrame, following: TrueFrame) -> Float64Array:
+    def between(self, frame: DecodedFrame, following: DecodedFrame) -> Float64Array:
         """Return the displacement of the belt between two frames of the same layout [m], shape (3,)."""
-        return np.zeros(3) if self._conveyor is None else self._run(following) - self._run(frame)
+        return np.zeros(3) if self._conveyor is None else self._travel(following) - self._travel(frame)
 
-    def _run(self, frame: TrueFrame) -> Float64Array:
+    def _travel(self, frame: DecodedFrame) -> Float64Array:
         assert self._conveyor is not None  # noqa: S101
-        time = self._conveyor["interval"] * (frame.record["view"] // self._seats - self._last / 2)
+        time = self._conveyor["interval"] * (frame.record["view"] // self._views_per_step - self._last_step / 2)
         return np.asarray(time * self._conveyor["speed"] * self._turn.apply((1.0, 0.0, 0.0)))

@@ -1,37 +1,32 @@
-"""Reference values of a frame, recomputed from the masks, poses and intrinsics in its manifest line.
+"""Frame of the manifest with decoded masks, poses and camera; the audit compares all other files with its values.
 
-The audit compares files with these values. The code that wrote the files is not used: masks are decoded by pycocotools,
-poses inverted by NumPy, points projected by OpenCV, and all other values are counted.
+The code that wrote the files is not used. Masks are decoded by pycocotools, poses are inverted by NumPy, points are
+projected by OpenCV, and all other values are counted.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
 from mitsplat.arrays import BoolArray, Float64Array, Int64Array
-from mitsplat.images.masks import decode_rle
-from mitsplat.storage.files import Record
-
-Box = tuple[int, int, int, int]
-"""Bounds (x0, y0, x1, y1) [px], half-open."""
+from mitsplat.images.masks import Box, decode_rle
+from mitsplat.storage.files import JsonObject, Record
 
 
-def seats_of(scene: Mapping[str, Any]) -> list[tuple[int, int]]:
+def camera_slots(scene: JsonObject) -> list[tuple[int, int]]:
     """Return camera position and side for each view of a turn; side is 1 for the right camera of a pair."""
     cameras = enumerate((scene["camera"], *scene.get("cameras", ())))
     return [(number, side) for number, camera in cameras for side in range(2 if camera.get("stereo") else 1)]
 
 
 @dataclass(frozen=True, eq=False)
-class TrueInstance:
+class DecodedInstance:
     """Instance of a frame.
 
     Attributes:
@@ -41,14 +36,14 @@ class TrueInstance:
         amodal_box, amodal: Bounds and pixels of the whole silhouette in the image.
     """
 
-    entry: Mapping[str, Any]
+    entry: JsonObject
     box: Box
     mask: BoolArray
     amodal_box: Box
     amodal: BoolArray
 
     @classmethod
-    def of(cls, entry: Mapping[str, Any], width: int, height: int) -> TrueInstance:
+    def of(cls, entry: JsonObject, width: int, height: int) -> DecodedInstance:
         """Decode both masks, which are not empty."""
         return cls(entry, *_decode(entry["rle"], width, height), *_decode(entry["amodal_rle"], width, height))
 
@@ -58,7 +53,7 @@ class TrueInstance:
         return int(self.entry["id"])
 
     @property
-    def kind(self) -> int:
+    def class_index(self) -> int:
         """Class index."""
         return int(self.entry["class_index"])
 
@@ -87,26 +82,32 @@ class TrueInstance:
         """Number of pixels of the silhouette, also beyond the image's border, as stated in the manifest."""
         return int(self.entry["silhouette_area"])
 
+    @property
+    def visible_fraction(self) -> float:
+        """Visible pixels over the pixels of the silhouette in the image."""
+        return self.area / self.amodal_area
+
+    @property
+    def truncation(self) -> float:
+        """Fraction of the silhouette beyond the image's border."""
+        return 1 - self.amodal_area / self.silhouette_area
+
 
 @dataclass(frozen=True, eq=False)
-class TrueFrame:
+class DecodedFrame:
     """Record of a frame, with its dataset and its decoded instances."""
 
     root: Path
     record: Record
-    content: Mapping[str, Any]
-    instances: tuple[TrueInstance, ...]
+    content: JsonObject
+    instances: tuple[DecodedInstance, ...]
 
     @classmethod
-    def of(cls, root: Path, record: Record, content: Mapping[str, Any]) -> TrueFrame:
+    def of(cls, root: Path, record: Record, content: JsonObject) -> DecodedFrame:
         """Create the frame from a record that :mod:`mitsplat.dataset.schema` has checked."""
-        width, height = record["labels"]["size"]
-        return cls(
-            root,
-            record,
-            content,
-            tuple(TrueInstance.of(entry, width, height) for entry in record["labels"]["instances"]),
-        )
+        labels = record["labels"]
+        instances = (DecodedInstance.of(entry, *labels["size"]) for entry in labels["instances"])
+        return cls(root, record, content, tuple(instances))
 
     @property
     def index(self) -> int:
@@ -130,6 +131,11 @@ class TrueFrame:
         return list(self.content["scene"]["output"]["formats"])
 
     @property
+    def has_splat_labels(self) -> bool:
+        """True if labels come from the splats, as depths do."""
+        return bool(self.content["scene"]["labels"]["source"] == "splats")
+
+    @property
     def image_name(self) -> str:
         """File name of the frame's picture."""
         return f"{self.index:06d}.{self.content['scene']['output']['image']}"
@@ -139,7 +145,7 @@ class TrueFrame:
         """Folder of the frame's layout in BOP, relative to the dataset."""
         return f"bop/{self.split}/{self.record['layout']:06d}"
 
-    def full_mask(self, instance: TrueInstance, *, amodal: bool = False) -> BoolArray:
+    def full_mask(self, instance: DecodedInstance, *, amodal: bool = False) -> BoolArray:
         """Return the visible pixels of an instance, or its whole silhouette, in the whole image (H, W)."""
         width, height = self.size
         canvas = np.zeros((height, width), dtype=bool)
@@ -150,14 +156,14 @@ class TrueFrame:
     @cached_property
     def ids(self) -> Int64Array:
         """Id of the labelled instance of every pixel, shape (H, W); 0 is any other pixel."""
-        return self._painted([instance.id for instance in self.instances])
+        return self._paint([instance.id for instance in self.instances])
 
     @cached_property
     def classes(self) -> Int64Array:
         """Class index + 1 of every labelled pixel, shape (H, W); 0 is any other pixel."""
-        return self._painted([instance.kind + 1 for instance in self.instances])
+        return self._paint([instance.class_index + 1 for instance in self.instances])
 
-    def _painted(self, values: list[int]) -> Int64Array:
+    def _paint(self, values: list[int]) -> Int64Array:
         width, height = self.size
         canvas = np.zeros((height, width), dtype=np.int64)
         for instance, value in zip(self.instances, values, strict=True):
@@ -194,7 +200,7 @@ class TrueFrame:
             pixels, _ = cv2.projectPoints(points, zero, zero, self.intrinsics, self.distortion)
         return np.asarray(pixels, dtype=np.float64).reshape(-1, 2)
 
-    def slopes(self, pixels: Float64Array) -> Float64Array:
+    def ray_slopes(self, pixels: Float64Array) -> Float64Array:
         """Return the ray slopes (x / z, y / z) of pixels; both have shape (N, 2)."""
         pixels = np.ascontiguousarray(pixels, dtype=np.float64).reshape(-1, 1, 2)
         criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-12)
@@ -213,6 +219,6 @@ def bounds_of(mask: BoolArray | npt.NDArray[np.uint8]) -> Box:
 
 
 def _decode(code: str, width: int, height: int) -> tuple[Box, BoolArray]:
-    whole = decode_rle({"size": [height, width], "counts": code})
-    x0, y0, x1, y1 = box = bounds_of(whole)
-    return box, np.ascontiguousarray(whole[y0:y1, x0:x1], dtype=bool)
+    mask = decode_rle({"size": [height, width], "counts": code})
+    x0, y0, x1, y1 = box = bounds_of(mask)
+    return box, np.ascontiguousarray(mask[y0:y1, x0:x1], dtype=bool)

@@ -6,14 +6,13 @@ import hashlib
 import os
 import re
 from array import array
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from mitsplat.audit.read_back import Violations
-from mitsplat.storage.files import Record, splits_of
+from mitsplat.audit.dataset_check import Violations
+from mitsplat.storage.files import JsonObject, Record, splits_of
 
 YOLO_FOLDERS = {"yolo": "", "yolo-detect": "yolo-detect/", "yolo-obb": "yolo-obb/", "yolo-pose": "yolo-pose/"}
 """Folders of Ultralytics' tasks, in which labels lie beside their images."""
@@ -28,7 +27,7 @@ _FOLDERS = (
 _FOLD = re.compile(r"fold[0-9]+(_train|_val)?\.(txt|yaml)")
 
 
-def files_of_frame(record: Record, content: Mapping[str, Any]) -> dict[str, str]:
+def expected_files(record: Record, content: JsonObject) -> dict[str, str]:
     """Return the files that a frame must have, each with its format."""
     output = content["scene"]["output"]
     formats, number, split = output["formats"], f"{record['index']:06d}", record["split"]
@@ -55,65 +54,40 @@ def files_of_frame(record: Record, content: Mapping[str, Any]) -> dict[str, str]
     return files
 
 
-def check_listed(record: Record, content: Mapping[str, Any]) -> Violations:
-    """Check that the manifest lists exactly the files that the frame must have."""
-    where, required = f"manifest.jsonl, frame {record['index']}", files_of_frame(record, content)
-    for file, name in required.items():
-        if file not in record["files"]:
-            yield where, f"does not list {file} of the format {name}"
-    for file in record["files"]:
-        if file not in required:
-            yield where, f"lists {file}, which belongs to no format of the dataset"
-
-
-def labelled_assets(content: Mapping[str, Any]) -> list[int]:
+def labelled_assets(content: JsonObject) -> list[int]:
     """Return the positions of the assets that have labels and therefore models."""
     return sorted(set(range(len(content["assets"]))) - set(content.get("distractors", ())))
 
 
-class OwnedFiles:
+class ExpectedFiles:
     """Hashes of the names of all files that belong to the dataset, 8 bytes each."""
 
-    def __init__(self, content: Mapping[str, Any]) -> None:
-        self._formats = content["scene"]["output"]["formats"]
-        self._splits = splits_of(content["scene"]["output"])
-        self._models = labelled_assets(content)
-        self._names = array("Q")
-        self._last = ("", -1)
-        for file in self._collection_files():
-            self._add(file)
+    def __init__(self, content: JsonObject) -> None:
+        self._content = content
+        self._hashes = array("Q", map(_hash, _annotation_files(content)))
+        self._last_scene = ("", -1)
 
-    def _collection_files(self) -> Iterator[str]:
-        """Yield the files that describe all frames."""
-        for name, described in _ANNOTATIONS.items():
-            if name in self._formats:
-                yield from (f"annotations/{described}_{split}.json" for split in self._splits)
-        yield from (f"{folder}data.yaml" for name, folder in _YOLO.items() if name in self._formats)
-        if "bop" in self._formats:
-            yield "bop/models/models_info.json"
-            yield from (f"bop/models/obj_{position + 1:06d}.ply" for position in self._models)
-        if "colmap" in self._formats:
-            yield from (f"colmap/{name}.txt" for name in ("cameras", "images", "points3D"))
-
-    def add(self, record: Record) -> None:
-        """Add the files of a frame and of its layout."""
+    def check_record(self, record: Record) -> Violations:
+        """Check that the manifest lists exactly the files that a frame must have; add the files of its layout."""
+        where, required = f"manifest.jsonl, frame {record['index']}", expected_files(record, self._content)
+        for file, name in required.items():
+            if file not in record["files"]:
+                yield where, f"does not list {file} of the format {name}"
         for file in record["files"]:
-            self._add(file)
-        scene = record["split"], record["layout"]
-        if scene != self._last:
-            self._last = scene
-            self._add(f"layouts/{record['layout']:04d}.json")
-            if "bop" in self._formats:
-                folder = f"bop/{record['split']}/{record['layout']:06d}"
-                for part in ("camera", "gt", "gt_info"):
-                    self._add(f"{folder}/scene_{part}.json")
+            if file not in required:
+                yield where, f"lists {file}, which belongs to no format of the dataset"
+        self._hashes.extend(map(_hash, record["files"]))
+        split, layout = scene = record["split"], record["layout"]
+        if scene != self._last_scene:
+            self._last_scene = scene
+            self._hashes.append(_hash(f"layouts/{layout:04d}.json"))
+            if "bop" in self._content["scene"]["output"]["formats"]:
+                parts = ("camera", "gt", "gt_info")
+                self._hashes.extend(_hash(f"bop/{split}/{layout:06d}/scene_{part}.json") for part in parts)
 
-    def _add(self, file: str) -> None:
-        self._names.append(_hash(file))
-
-    def orphans(self, root: Path) -> Violations:
+    def check_folders(self, root: Path) -> Violations:
         """Yield the files in the dataset's folders that do not belong to the dataset."""
-        known = np.sort(np.array(self._names, dtype=np.uint64))
+        known = np.sort(np.array(self._hashes, dtype=np.uint64))
         for top in sorted(_FOLDERS):
             for folder, folders, names in os.walk(root / top):
                 folders.sort()
@@ -128,6 +102,21 @@ class OwnedFiles:
                 for file, is_known in zip(files, found, strict=True):
                     if not is_known:
                         yield file, "belongs to no frame of the manifest"
+
+
+def _annotation_files(content: JsonObject) -> Iterator[str]:
+    """Yield the files that describe all frames."""
+    output = content["scene"]["output"]
+    formats = output["formats"]
+    for name, prefix in _ANNOTATIONS.items():
+        if name in formats:
+            yield from (f"annotations/{prefix}_{split}.json" for split in splits_of(output))
+    yield from (f"{folder}data.yaml" for name, folder in _YOLO.items() if name in formats)
+    if "bop" in formats:
+        yield "bop/models/models_info.json"
+        yield from (f"bop/models/obj_{position + 1:06d}.ply" for position in labelled_assets(content))
+    if "colmap" in formats:
+        yield from (f"colmap/{name}.txt" for name in ("cameras", "images", "points3D"))
 
 
 def _hash(file: str) -> int:

@@ -23,7 +23,7 @@ from mitsplat.dataset.dataset_folder import open_finished
 from mitsplat.dataset.own_files import remove_folds
 from mitsplat.dataset.schema import read_content
 from mitsplat.errors import InputError
-from mitsplat.formats.coco import InstancesWriter, image_file
+from mitsplat.formats.coco import append_instances, create_instances_file, image_file
 from mitsplat.formats.yolo import TASKS, names_yaml
 from mitsplat.storage.files import GrowingFile, storage_errors, write_text
 from mitsplat.storage.json_stream import ListsFile
@@ -77,21 +77,21 @@ def write_folds(root: str | Path, folds: int) -> list[Fold]:
             for name in names
             for split in ("train", "val")
         }
-        described = {
-            key: InstancesWriter(root / f"folds/{key[0]}_{key[1]}.json", classes, keypoints, folders=True)
-            for key in (lists if "coco" in formats else ())
+        coco_files = {
+            (name, split): create_instances_file(root / f"folds/{name}_{split}.json", classes, keypoints)
+            for name, split in (lists if "coco" in formats else ())
         }
         files: list[GrowingFile | ListsFile] = [file for found in lists.values() for file in found]
-        files += [writer.file for writer in described.values()]
+        files += coco_files.values()
         for file in files:
             cleanup.callback(file.discard)
         for record in records:
             for fold, name in enumerate(names) if record["split"] != "test" else ():
                 key = name, "val" if fold_of[record["layout"]] == fold else "train"
-                for names_file in lists[key]:
-                    names_file.write(f"./{image_file(record)}\n")
-                if described:
-                    described[key].add(record)
+                for image_list in lists[key]:
+                    image_list.write(f"./{image_file(record)}\n")
+                if coco_files:
+                    append_instances(coco_files[key], record, keypoints, folders=True)
         for file in files:
             file.commit()
         for task in tasks:
@@ -99,12 +99,14 @@ def write_folds(root: str | Path, folds: int) -> list[Fold]:
                 text = f"# Paths are relative to this file.\ntrain: ../{name}_train.txt\nval: ../{name}_val.txt\n"
                 text += names_yaml(classes, keypoints if task == "yolo-pose" else None)
                 write_text(root / f"{TASKS[task].folder}folds/{name}.yaml", text)
-    found = []
+    statistics = []
     for fold in range(folds):
-        own = [layout for layout in layouts if fold_of[layout] == fold]
-        instances = sum((layouts[layout] for layout in own), Counter[str]())
-        found.append(Fold(len(own), sum(images[layout] for layout in own), dict(sorted(instances.items()))))
-    return found
+        members = [layout for layout in layouts if fold_of[layout] == fold]
+        instances = sum((layouts[layout] for layout in members), Counter[str]())
+        statistics.append(
+            Fold(len(members), sum(images[layout] for layout in members), dict(sorted(instances.items())))
+        )
+    return statistics
 
 
 def assign_folds(layouts: Mapping[int, Counter[str]], folds: int) -> dict[int, int]:

@@ -17,18 +17,17 @@ import json
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import trimesh
 from scipy.spatial import ConvexHull
 from scipy.spatial.distance import pdist
 
-from mitsplat.formats.format import Catalogue, FrameFiles
+from mitsplat.formats.format import AnnotationWriter, Catalogue, FrameFiles
 from mitsplat.formats.maps import encode_mask_png
 from mitsplat.geometry.camera import Camera
 from mitsplat.labels.labels import Labels
-from mitsplat.storage.files import GrowingFile, Record, write_file, write_text
+from mitsplat.storage.files import GrowingFile, JsonObject, Record, write_file, write_text
 from mitsplat.storage.json_stream import EntriesFile
 
 MILLIMETRES = 1000.0
@@ -58,7 +57,7 @@ def mask_pictures(labels: Labels) -> Iterable[tuple[str, int, bytes]]:
         yield "mask_visib", position, encode_mask_png(label.mask, label.box, size)
 
 
-class ScenesWriter:
+class ScenesWriter(AnnotationWriter):
     """Writer of the annotations of all scenes and of the models; frames must be added by ascending layout.
 
     The files of scenes are flushed to disk in parallel, in batches of :data:`_BATCH_FILES`. A million images have
@@ -66,6 +65,7 @@ class ScenesWriter:
     """
 
     def __init__(self, root: Path, catalogue: Catalogue) -> None:
+        super().__init__()
         self._root = root
         self._meshes = {
             position + 1: mesh
@@ -73,7 +73,7 @@ class ScenesWriter:
             if position not in catalogue.distractors
         }
         self._folder, self._layout = "", -1
-        self._files: dict[str, EntriesFile] = {}
+        self._scene_files: dict[str, EntriesFile] = {}
         self._completed: list[GrowingFile] = []
 
     def add(self, record: Record) -> None:
@@ -88,17 +88,17 @@ class ScenesWriter:
             if len(self._completed) >= _BATCH_FILES:
                 self._finish_batch()
             self._folder, self._layout = folder, record["layout"]
-            self._files = {
+            self._scene_files = {
                 part: EntriesFile(self._root / folder / f"scene_{part}.json") for part in ("camera", "gt", "gt_info")
             }
         index, camera = str(record["index"]), Camera.from_json(record["camera"])
-        self._files["camera"].append(index, camera_entry(record, camera))
-        self._files["gt"].append(index, pose_entries(record, camera))
-        self._files["gt_info"].append(index, info_entries(record))
+        self._scene_files["camera"].append(index, camera_entry(record, camera))
+        self._scene_files["gt"].append(index, pose_entries(record, camera))
+        self._scene_files["gt_info"].append(index, info_entries(record))
 
     def _end_scene(self) -> None:
-        self._completed += (file.end() for file in self._files.values())
-        self._files = {}
+        self._completed += (file.end() for file in self._scene_files.values())
+        self._scene_files = {}
 
     def _finish_batch(self) -> None:
         with ThreadPoolExecutor(_SYNC_THREADS) as pool:
@@ -115,9 +115,8 @@ class ScenesWriter:
 
     def discard(self) -> None:
         """Remove the files that do not have their final name yet."""
-        for open_file in self._files.values():
-            open_file.discard()
-        for file in self._completed:
+        files: tuple[EntriesFile | GrowingFile, ...] = (*self._scene_files.values(), *self._completed)
+        for file in files:
             file.discard()
 
 
@@ -149,7 +148,7 @@ def diameter(mesh: trimesh.Trimesh) -> float:
     return float(pdist(corners).max())
 
 
-def camera_entry(record: Record, camera: Camera) -> dict[str, Any]:
+def camera_entry(record: Record, camera: Camera) -> JsonObject:
     """Return the frame's entry in ``scene_camera.json``."""
     intrinsics = camera.intrinsics
     intrinsics[:2, 2] -= 0.5
@@ -162,7 +161,7 @@ def camera_entry(record: Record, camera: Camera) -> dict[str, Any]:
     }
 
 
-def pose_entries(record: Record, camera: Camera) -> list[dict[str, Any]]:
+def pose_entries(record: Record, camera: Camera) -> list[JsonObject]:
     """Return the frame's entry in ``scene_gt.json``."""
     camera_from_world = camera.camera_from_world
     entries = []
@@ -178,7 +177,7 @@ def pose_entries(record: Record, camera: Camera) -> list[dict[str, Any]]:
     return entries
 
 
-def info_entries(record: Record) -> list[dict[str, Any]]:
+def info_entries(record: Record) -> list[JsonObject]:
     """Return the frame's entry in ``scene_gt_info.json``."""
 
     def box(bounds: Sequence[int]) -> list[int]:

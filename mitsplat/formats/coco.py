@@ -15,17 +15,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
-from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
-from mitsplat.formats.format import Catalogue, Describer, FrameFiles
+from mitsplat.formats.format import AnnotationWriter, Catalogue, FrameFiles
 from mitsplat.geometry.camera import Camera
 from mitsplat.labels.labels import UNLABELLED, Labels
-from mitsplat.storage.files import Record
+from mitsplat.storage.files import JsonObject, Record
 from mitsplat.storage.json_stream import ListsFile
 
 ENVIRONMENT = "environment"
@@ -34,7 +34,7 @@ ENVIRONMENT = "environment"
 
 def annotations_of(
     record: Record, keypoint_names: Sequence[Sequence[str]], *, first: int, amodal: bool
-) -> Iterator[dict[str, Any]]:
+) -> Iterator[JsonObject]:
     """Yield the visible or amodal annotations of a frame's instances, with ids from ``first`` on."""
     width, height = record["labels"]["size"]
     for number, label in enumerate(record["labels"]["instances"], start=first):
@@ -60,7 +60,7 @@ def annotations_of(
         yield annotation
 
 
-def panoptic_annotation(record: Record, num_classes: int) -> dict[str, Any]:
+def panoptic_annotation(record: Record, num_classes: int) -> JsonObject:
     """Return the segments of a frame, for the picture of :func:`panoptic_image`."""
     segments = [
         {
@@ -81,7 +81,7 @@ def panoptic_annotation(record: Record, num_classes: int) -> dict[str, Any]:
     return {"image_id": record["index"], "file_name": f"{record['index']:06d}.png", "segments_info": segments}
 
 
-def pose_entry(record: Record, assets: Sequence[str]) -> dict[str, Any]:
+def pose_entry(record: Record, assets: Sequence[str]) -> JsonObject:
     """Return the camera and the 6-DoF poses of a frame."""
     camera_from_world = Camera.from_json(record["camera"]).camera_from_world
     return {
@@ -101,105 +101,94 @@ def pose_entry(record: Record, assets: Sequence[str]) -> dict[str, Any]:
     }
 
 
-class InstancesWriter:
-    """Writer of ``instances_<split>.json`` or ``amodal_<split>.json``.
+def create_instances_file(path: Path, class_names: Sequence[str], keypoint_names: Sequence[Sequence[str]]) -> ListsFile:
+    """Create ``instances_<split>.json`` or ``amodal_<split>.json`` without frames."""
+    categories = _categories(class_names, keypoint_names)
+    return ListsFile(path, ("images", "annotations"), after={"categories": categories})
+
+
+def append_instances(
+    file: ListsFile,
+    record: Record,
+    keypoint_names: Sequence[Sequence[str]],
+    *,
+    amodal: bool = False,
+    folders: bool = False,
+) -> None:
+    """Append a frame to a file of :func:`create_instances_file`.
 
     Image names have no folder part by default, because the file belongs to one split. With ``folders``, image names are
     relative to ``images/``.
     """
+    name = {"file_name": image_file(record).removeprefix("images/")} if folders else {}
+    file.append("images", _image(record) | name)
+    first = file.count("annotations") + 1
+    for annotation in annotations_of(record, keypoint_names, first=first, amodal=amodal):
+        file.append("annotations", annotation)
+
+
+class SplitsWriter(AnnotationWriter):
+    """Writer of one annotation file for each split.
+
+    Args:
+        root: Dataset folder.
+        name: Name of the files before the split.
+        splits: Names of the splits.
+        create: Function that creates a file.
+        append: Function that appends a frame to a file.
+    """
 
     def __init__(
         self,
-        path: Path,
-        class_names: Sequence[str],
-        keypoint_names: Sequence[Sequence[str]],
-        *,
-        amodal: bool = False,
-        folders: bool = False,
+        root: Path,
+        name: str,
+        splits: Iterable[str],
+        create: Callable[[Path], ListsFile],
+        append: Callable[[ListsFile, Record], None],
     ) -> None:
-        self.file = ListsFile(
-            path, ("images", "annotations"), after={"categories": _categories(class_names, keypoint_names)}
-        )
-        self._keypoint_names, self._amodal, self._folders = keypoint_names, amodal, folders
+        self._by_split = {split: create(root / f"annotations/{name}_{split}.json") for split in splits}
+        self._append = append
+        super().__init__(self._by_split.values())
 
     def add(self, record: Record) -> None:
         """Add a frame."""
-        name = {"file_name": image_file(record).removeprefix("images/")} if self._folders else {}
-        self.file.append("images", _image(record) | name)
-        first = self.file.count("annotations") + 1
-        for annotation in annotations_of(record, self._keypoint_names, first=first, amodal=self._amodal):
-            self.file.append("annotations", annotation)
+        self._append(self._by_split[record["split"]], record)
 
 
-class PanopticWriter:
-    """Writer of ``panoptic_<split>.json``."""
-
-    def __init__(self, path: Path, class_names: Sequence[str]) -> None:
-        self._stuff = len(class_names)
-        categories = [{**category, "isthing": 1} for category in _categories(class_names, [()] * len(class_names))]
-        categories.append({"id": self._stuff + 1, "name": ENVIRONMENT, "supercategory": ENVIRONMENT, "isthing": 0})
-        self.file = ListsFile(path, ("images", "annotations"), after={"categories": categories})
-
-    def add(self, record: Record) -> None:
-        """Add a frame."""
-        self.file.append("images", _image(record))
-        self.file.append("annotations", panoptic_annotation(record, self._stuff))
-
-
-class PosesWriter:
-    """Writer of ``poses_<split>.json``."""
-
-    def __init__(self, path: Path, class_names: Sequence[str], assets: Sequence[str]) -> None:
-        self.file = ListsFile(path, ("frames",), before={"classes": list(class_names)})
-        self._assets = assets
-
-    def add(self, record: Record) -> None:
-        """Add a frame."""
-        self.file.append("frames", pose_entry(record, self._assets))
-
-
-class _SplitWriter(Protocol):
-    file: ListsFile
-
-    def add(self, record: Record) -> None: ...
-
-
-class _SplitWriters:
-    """Writers of one annotation file for each split."""
-
-    def __init__(self, root: Path, name: str, catalogue: Catalogue, make: Callable[[Path], _SplitWriter]) -> None:
-        self._writers = {split: make(root / f"annotations/{name}_{split}.json") for split in catalogue.splits}
-
-    def add(self, record: Record) -> None:
-        self._writers[record["split"]].add(record)
-
-    def commit(self) -> None:
-        for writer in self._writers.values():
-            writer.file.commit()
-
-    def discard(self) -> None:
-        for writer in self._writers.values():
-            writer.file.discard()
-
-
-def describe_instances(root: Path, catalogue: Catalogue, *, amodal: bool = False) -> Describer:
+def instances_writer(root: Path, catalogue: Catalogue, *, amodal: bool = False) -> SplitsWriter:
     """Create the writer of ``instances_<split>.json`` or ``amodal_<split>.json``."""
-    names = catalogue.class_names, catalogue.keypoint_names
-    return _SplitWriters(
-        root, "amodal" if amodal else "instances", catalogue, lambda path: InstancesWriter(path, *names, amodal=amodal)
+    classes, keypoints = catalogue.class_names, catalogue.keypoint_names
+    return SplitsWriter(
+        root,
+        "amodal" if amodal else "instances",
+        catalogue.splits,
+        partial(create_instances_file, class_names=classes, keypoint_names=keypoints),
+        partial(append_instances, keypoint_names=keypoints, amodal=amodal),
     )
 
 
-def describe_panoptic(root: Path, catalogue: Catalogue) -> Describer:
+def panoptic_writer(root: Path, catalogue: Catalogue) -> SplitsWriter:
     """Create the writer of ``panoptic_<split>.json``."""
-    return _SplitWriters(root, "panoptic", catalogue, lambda path: PanopticWriter(path, catalogue.class_names))
+    count = len(catalogue.class_names)
+    categories = [category | {"isthing": 1} for category in _categories(catalogue.class_names, [()] * count)]
+    categories.append({"id": count + 1, "name": ENVIRONMENT, "supercategory": ENVIRONMENT, "isthing": 0})
+
+    def append(file: ListsFile, record: Record) -> None:
+        file.append("images", _image(record))
+        file.append("annotations", panoptic_annotation(record, count))
+
+    create = partial(ListsFile, lists=("images", "annotations"), after={"categories": categories})
+    return SplitsWriter(root, "panoptic", catalogue.splits, create, append)
 
 
-def describe_poses(root: Path, catalogue: Catalogue) -> Describer:
+def poses_writer(root: Path, catalogue: Catalogue) -> SplitsWriter:
     """Create the writer of ``poses_<split>.json``."""
-    return _SplitWriters(
-        root, "poses", catalogue, lambda path: PosesWriter(path, catalogue.class_names, catalogue.assets)
-    )
+
+    def append(file: ListsFile, record: Record) -> None:
+        file.append("frames", pose_entry(record, catalogue.assets))
+
+    create = partial(ListsFile, lists=("frames",), before={"classes": list(catalogue.class_names)})
+    return SplitsWriter(root, "poses", catalogue.splits, create, append)
 
 
 def write_panoptic(files: FrameFiles) -> None:
@@ -211,7 +200,7 @@ def write_panoptic(files: FrameFiles) -> None:
     files.add_png(f"panoptic/{files.name}.png", picture)
 
 
-def environment_segment(labels: Labels, ids: npt.NDArray[np.integer[Any]]) -> dict[str, Any] | None:
+def environment_segment(labels: Labels, ids: npt.NDArray[np.integer]) -> JsonObject | None:
     """Return id, area and box of the pixels where an id map is 0, or None if there are none."""
     ys, xs = np.nonzero(ids == 0)
     if not len(ys):
@@ -222,7 +211,7 @@ def environment_segment(labels: Labels, ids: npt.NDArray[np.integer[Any]]) -> di
 
 
 def panoptic_image(
-    labelled: npt.NDArray[np.uint16], ids: npt.NDArray[np.integer[Any]], environment: Mapping[str, Any] | None
+    labelled: npt.NDArray[np.uint16], ids: npt.NDArray[np.integer], environment: JsonObject | None
 ) -> npt.NDArray[np.uint8]:
     """Return the RGB picture of segment ids, shape (H, W, 3), from the labelled ids and all ids, shape (H, W)."""
     segments = labelled.astype(np.uint32)
@@ -236,12 +225,12 @@ def image_file(record: Record) -> str:
     return str(next(file for file in record["files"] if file.startswith("images/")))
 
 
-def _image(record: Record) -> dict[str, Any]:
+def _image(record: Record) -> JsonObject:
     width, height = record["labels"]["size"]
     return {"id": record["index"], "file_name": Path(image_file(record)).name, "width": width, "height": height}
 
 
-def _categories(class_names: Sequence[str], keypoint_names: Sequence[Sequence[str]]) -> list[dict[str, Any]]:
+def _categories(class_names: Sequence[str], keypoint_names: Sequence[Sequence[str]]) -> list[JsonObject]:
     return [
         {"id": i, "name": name, "supercategory": "object"}
         | ({"keypoints": list(points), "skeleton": []} if points else {})

@@ -11,18 +11,18 @@ from pathlib import Path
 from scipy.spatial.transform import Rotation
 
 from mitsplat.formats.coco import image_file
-from mitsplat.formats.format import Catalogue
+from mitsplat.formats.format import AnnotationWriter, Catalogue
 from mitsplat.geometry.camera import Camera
 from mitsplat.storage.files import GrowingFile, Record
 
 
-class ModelWriter:
+class ModelWriter(AnnotationWriter):
     """Writer of the three files."""
 
     def __init__(self, root: Path, catalogue: Catalogue) -> None:
-        self._cameras, self._images, self._points = (
-            GrowingFile(root / f"colmap/{name}.txt") for name in ("cameras", "images", "points3D")
-        )
+        names = ("cameras", "images", "points3D")
+        self._cameras, self._images, points = (GrowingFile(root / f"colmap/{name}.txt") for name in names)
+        super().__init__((self._cameras, self._images, points))
         self._models: dict[str, int] = {}
 
     def add(self, record: Record) -> None:
@@ -37,16 +37,6 @@ class ModelWriter:
         values = " ".join(repr(float(value)) for value in (w, x, y, z, *pose[:3, 3]))
         name = image_file(record).removeprefix("images/")
         self._images.write(f"{record['index'] + 1} {values} {self._models[model]} {name}\n\n")
-
-    def commit(self) -> None:
-        """Give the files their final names."""
-        for file in (self._cameras, self._images, self._points):
-            file.commit()
-
-    def discard(self) -> None:
-        """Remove the files if they do not have their final names yet."""
-        for file in (self._cameras, self._images, self._points):
-            file.discard()
 
 
 def camera_model(camera: Camera) -> str:

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -14,7 +14,8 @@ import numpy.typing as npt
 from mitsplat.errors import InputError
 from mitsplat.formats import maps
 from mitsplat.storage.field_types import check_name
-from mitsplat.storage.files import SPLITS, Record, link_file, splits_of, write_file
+from mitsplat.storage.files import SPLITS, GrowingFile, JsonObject, Record, link_file, splits_of, write_file
+from mitsplat.storage.json_stream import ListsFile
 
 if TYPE_CHECKING:
     import trimesh
@@ -44,7 +45,7 @@ class Catalogue:
     assets: Sequence[str]
     meshes: Sequence[trimesh.Trimesh]
     distractors: Sequence[int] = ()
-    drawn: Sequence[Mapping[str, Any]] = ()
+    drawn: Sequence[JsonObject] = ()
     splits: Sequence[str] = SPLITS[:2]
     depth_sensor: DepthSensor | None = None
 
@@ -103,7 +104,7 @@ class Catalogue:
         return max(map(len, self.keypoint_names), default=0)
 
 
-def _drawn_objects(scene: Scene) -> list[dict[str, Any]]:
+def _drawn_objects(scene: Scene) -> list[JsonObject]:
     """Return the manifest entry of each asset's instances, or an empty list.
 
     Entries are needed only if the scene file does not determine which objects are in a layout.
@@ -112,7 +113,7 @@ def _drawn_objects(scene: Scene) -> list[dict[str, Any]]:
     draws_objects = any(entry.pool is not None or len(entry.scales) > 1 or not entry.label for entry in spec.objects)
     if not draws_objects and not spec.regions:
         return []
-    found: list[dict[str, Any]] = []
+    found: list[JsonObject] = []
     for position, entry in enumerate(scene.spec.objects):
         for scale in [scale for _ in entry.names for scale in entry.scales]:
             name = scene.assets[len(found)].name
@@ -136,7 +137,7 @@ class FrameFiles:
     catalogue: Catalogue
     record: Record
     image: str
-    ids: npt.NDArray[np.integer[Any]] = field(repr=False)
+    ids: npt.NDArray[np.integer] = field(repr=False)
 
     @property
     def number(self) -> str:
@@ -170,7 +171,7 @@ class FrameFiles:
         """Write a file with the given content."""
         self.add(file, lambda path: path.write_bytes(content))
 
-    def add_png(self, file: str, picture: npt.NDArray[Any]) -> None:
+    def add_png(self, file: str, picture: npt.NDArray[np.unsignedinteger]) -> None:
         """Write a picture as PNG."""
         self.add_bytes(file, maps.encode_png(picture))
 
@@ -184,17 +185,29 @@ class FrameFiles:
         self.add(file, lambda path: link_file(self.root / self.image, path))
 
 
-class Describer(Protocol):
-    """Writer of files that describe a whole dataset, frame by frame; ``keep`` gives them their final names."""
+class AnnotationWriter:
+    """Base class of writers of the files that describe a whole dataset.
+
+    Args:
+        files: Files that grow frame by frame.
+    """
+
+    def __init__(self, files: Iterable[GrowingFile | ListsFile] = ()) -> None:
+        self.files = tuple(files)
 
     def add(self, record: Record) -> None:
         """Add a frame; frames come by ascending index."""
+        raise NotImplementedError
 
     def commit(self) -> None:
         """Complete the files and give them their final names."""
+        for file in self.files:
+            file.commit()
 
     def discard(self) -> None:
         """Remove the files that do not have their final name yet."""
+        for file in self.files:
+            file.discard()
 
 
 @dataclass(frozen=True)
@@ -204,9 +217,9 @@ class Format:
     Attributes:
         entries: Names of its files and folders at the top level of the dataset folder.
         write: Function that writes the files of a frame, or None.
-        describe: Function that creates the writer of the files that describe all frames, or None.
+        create_writer: Function that creates the writer of the files that describe all frames, or None.
     """
 
     entries: tuple[str, ...]
     write: Callable[[FrameFiles], None] | None = None
-    describe: Callable[[Path, Catalogue], Describer] | None = None
+    create_writer: Callable[[Path, Catalogue], AnnotationWriter] | None = None

@@ -6,7 +6,6 @@ import struct
 import zlib
 from collections.abc import Sequence
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
@@ -16,15 +15,11 @@ from mitsplat.arrays import BoolArray, Float32Array
 from mitsplat.images.masks import Box
 from mitsplat.labels.labels import Labels
 
-if TYPE_CHECKING:
-    pass
-
-
 DEPTH_SCALES = (0.1, 1.0, 10.0, 100.0)
 """Possible units of a depth picture [mm]; the smallest unit is used with which the largest depth fits into 16 bits."""
 
 
-def encode_png(picture: npt.NDArray[Any]) -> bytes:
+def encode_png(picture: npt.NDArray[np.unsignedinteger]) -> bytes:
     """Encode a grey (H, W) or RGB (H, W, 3) picture of 8 or 16 bits as PNG.
 
     OpenCV's defaults (one filter, run-length strategy) take a third of the time of its explicit level 3. They need 5 to
@@ -88,19 +83,19 @@ def _deflated_zeros(count: int) -> bytes:
     return packer.compress(bytes(count)) + packer.flush(zlib.Z_FULL_FLUSH)
 
 
-def depth_scale(depth: npt.NDArray[np.floating[Any]]) -> float:
+def depth_scale(depth: npt.NDArray[np.floating]) -> float:
     """Return the unit of the frame's depth picture [mm]."""
     farthest = float(depth.max(initial=0.0)) * 1000
     return next((scale for scale in DEPTH_SCALES if farthest <= 65535 * scale), DEPTH_SCALES[-1])
 
 
-def depth_picture(depth: npt.NDArray[np.floating[Any]]) -> npt.NDArray[np.uint16]:
+def depth_picture(depth: npt.NDArray[np.floating]) -> npt.NDArray[np.uint16]:
     """Convert depths along the optical axis [m] to units of :func:`depth_scale`, shape (H, W); 0 is no surface."""
     units = np.rint(depth * (1000 / depth_scale(depth)))
     return np.where(depth > 0, np.clip(units, 1, 65535), 0).astype(np.uint16)
 
 
-def normal_picture(normal: npt.NDArray[np.floating[Any]]) -> npt.NDArray[np.uint16]:
+def normal_picture(normal: npt.NDArray[np.floating]) -> npt.NDArray[np.uint16]:
     """Encode world-space normals (H, W, 3) as 16-bit RGB, 65535 (n + 1) / 2; black is no surface."""
     encoded = np.rint(65535 * (np.clip(normal, -1, 1) + 1) / 2)
     return np.where(normal.any(axis=-1, keepdims=True), encoded, 0).astype(np.uint16)
@@ -115,7 +110,9 @@ def instance_picture(labels: Labels) -> npt.NDArray[np.uint16]:
     return picture
 
 
-def semantic_picture(labels: Labels, ids: npt.NDArray[np.integer[Any]], class_names: Sequence[str]) -> npt.NDArray[Any]:
+def semantic_picture(
+    labels: Labels, ids: npt.NDArray[np.integer], class_names: Sequence[str]
+) -> npt.NDArray[np.unsignedinteger]:
     """Return class index + 1 of every pixel, shape (H, W).
 
     The environment is 0; instances without a label have the largest value of the type.
@@ -125,7 +122,7 @@ def semantic_picture(labels: Labels, ids: npt.NDArray[np.integer[Any]], class_na
         ids: Id map of the labels' source, shape (H, W).
         class_names: Names of all classes; up to 254 classes fit into 8 bits.
     """
-    kind = np.uint8 if len(class_names) < 255 else np.uint16
+    kind = np.dtype("uint8" if len(class_names) < 255 else "uint16")
     picture = np.where(ids > 0, np.iinfo(kind).max, 0).astype(kind)
     for label in labels.instances:
         x0, y0, x1, y1 = label.box

@@ -32,7 +32,7 @@ import numpy.typing as npt
 
 from mitsplat.formats import bop, coco, map_files, maps, yolo
 from mitsplat.formats.colmap import ModelWriter
-from mitsplat.formats.format import Catalogue, Describer, Format, FrameFiles
+from mitsplat.formats.format import AnnotationWriter, Catalogue, Format, FrameFiles
 from mitsplat.scene.planning.contents import draw_regions
 from mitsplat.scene.planning.layout_surroundings import draw_surroundings
 from mitsplat.scene.spec.scene_spec import FORMATS, Output, SceneSpec
@@ -47,15 +47,15 @@ __all__ = ["FORMATS", "TABLE", "Catalogue", "CollectionWriter", "encode_image", 
 TABLE = {
     **{task: yolo.format_of(task) for task in yolo.TASKS},
     "instances": Format(("instances",), map_files.write_instances),
-    "coco": Format(("annotations",), describe=coco.describe_instances),
-    "amodal": Format(("annotations",), describe=partial(coco.describe_instances, amodal=True)),
-    "panoptic": Format(("panoptic", "annotations"), coco.write_panoptic, coco.describe_panoptic),
-    "poses": Format(("annotations",), describe=coco.describe_poses),
+    "coco": Format(("annotations",), create_writer=coco.instances_writer),
+    "amodal": Format(("annotations",), create_writer=partial(coco.instances_writer, amodal=True)),
+    "panoptic": Format(("panoptic", "annotations"), coco.write_panoptic, coco.panoptic_writer),
+    "poses": Format(("annotations",), create_writer=coco.poses_writer),
     "semantic": Format(("semantic",), map_files.write_semantic),
     "depth": Format(("depth",), map_files.write_depth),
     "depth-sensor": Format(("depth-sensor",), map_files.write_depth_sensor),
     "bop": Format(("bop",), bop.write, bop.ScenesWriter),
-    "colmap": Format(("colmap",), describe=ModelWriter),
+    "colmap": Format(("colmap",), create_writer=ModelWriter),
     "normals": Format(("normals",), map_files.write_normals),
     "flow": Format(("flow",), map_files.write_flow),
     "exr": Format(("layers",), map_files.write_exr),
@@ -137,24 +137,24 @@ class CollectionWriter:
 
     def __init__(self, root: Path, catalogue: Catalogue, formats: Iterable[str]) -> None:
         self._root, self._catalogue, self._formats = root, catalogue, set(formats)
-        self._describers: list[Describer] = []
+        self._writers: list[AnnotationWriter] = []
 
     def __enter__(self) -> CollectionWriter:
         for name, format in TABLE.items():
-            if name in self._formats and format.describe is not None:
-                self._describers.append(format.describe(self._root, self._catalogue))
+            if name in self._formats and format.create_writer is not None:
+                self._writers.append(format.create_writer(self._root, self._catalogue))
         return self
 
     def __exit__(self, *error: object) -> None:
-        for describer in self._describers:
-            describer.discard()
+        for writer in self._writers:
+            writer.discard()
 
     def add(self, record: Record) -> None:
         """Add a frame."""
-        for describer in self._describers:
-            describer.add(record)
+        for writer in self._writers:
+            writer.add(record)
 
     def commit(self) -> None:
         """Give the files their final names."""
-        for describer in self._describers:
-            describer.commit()
+        for writer in self._writers:
+            writer.commit()

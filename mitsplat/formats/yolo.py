@@ -25,7 +25,7 @@ import cv2
 import numpy as np
 
 from mitsplat.arrays import Float64Array
-from mitsplat.formats.format import Catalogue, Format, FrameFiles
+from mitsplat.formats.format import AnnotationWriter, Catalogue, Format, FrameFiles
 from mitsplat.labels.labels import UNLABELLED, InstanceLabel, Labels
 from mitsplat.storage.files import SPLITS, Record, write_text
 
@@ -52,10 +52,11 @@ def write(files: FrameFiles, task: str) -> None:
     files.add_bytes(f"{folder}labels/{files.name}.txt", text.encode())
 
 
-class DataYaml:
+class DataYaml(AnnotationWriter):
     """Writer of the ``data.yaml`` of a task."""
 
     def __init__(self, root: Path, catalogue: Catalogue, task: str) -> None:
+        super().__init__()
         self._path, self._class_names = root / TASKS[task].folder / "data.yaml", catalogue.class_names
         self._keypoint_names = catalogue.keypoint_names if task == "yolo-pose" else None
         self._splits: set[str] = set()
@@ -67,9 +68,6 @@ class DataYaml:
     def commit(self) -> None:
         """Write the file."""
         write_text(self._path, data_yaml(self._class_names, self._splits, self._keypoint_names))
-
-    def discard(self) -> None:
-        """Do nothing; the file is written only by ``keep``."""
 
 
 def yolo_lines(labels: Labels, task: str = "yolo", num_keypoints: int = 0) -> str:

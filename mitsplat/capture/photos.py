@@ -77,7 +77,7 @@ def find_photos(folder: Path, *, but: Path | None = None) -> list[Path]:
     if not folder.is_dir():
         raise InputError(f"{folder}: must be an existing folder of photographs, or a video")
     found: dict[str, Path] = {}
-    for path in files_below(folder, but=but):
+    for path in files_below(folder, skip=but):
         name = path.relative_to(folder).as_posix()
         if path.suffix.lower() not in SUFFIXES + _UNSUPPORTED or not path.is_file() or "/." in f"/{name}":
             continue

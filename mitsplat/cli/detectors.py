@@ -177,7 +177,9 @@ def compare(
 
     check_ending(out, ".json")
     with command_log(json_log, "compare") as progress_bars, progress_bars() as progress:
-        found = compare_with_photographs(datasets, photographs, split=split, size=size, most=images, progress=progress)
+        found = compare_with_photographs(
+            datasets, photographs, split=split, size=size, max_images=images, progress=progress
+        )
     typer.echo(f"{found.images} rendered images, {found.photographs} photographs; 5 %, median and 95 %:")
     for trait in found.traits:
         _print_trait(trait.name, trait)

@@ -138,7 +138,7 @@ def compare_with_photographs(
     *,
     split: Split = "train",
     size: int = 640,
-    most: int = 400,
+    max_images: int = 400,
     progress: Progress | None = None,
 ) -> Likeness:
     """Compare rendered images with labelled photographs.
@@ -150,7 +150,7 @@ def compare_with_photographs(
         photographs: A folder of the same kinds; all splits are used. The order of its classes may differ.
         split: Split of the rendered images.
         size: Longer side to which images are scaled before measurement [px].
-        most: Largest number of images of each side, drawn at equal intervals.
+        max_images: Maximum number of images of each side, drawn at equal intervals.
         progress: Called after each image.
 
     Raises:
@@ -158,14 +158,14 @@ def compare_with_photographs(
     """
     if size < 32:
         raise InputError(f"size must be 32 px or more (got {size})")
-    if most < 1:
-        raise InputError(f"the number of images per side must be at least 1 (got {most})")
+    if max_images < 1:
+        raise InputError(f"the number of images per side must be at least 1 (got {max_images})")
     real = read_set(photographs, "all")
     sets = [reorder_classes(read_set(one, split), real.class_names, str(photographs)) for one in rendered]
     if not sets:
         raise InputError("there are no rendered images to compare")
-    ours = _sample_evenly([sample for one in sets for sample in one.samples], most)
-    theirs = _sample_evenly(list(real.samples), most)
+    ours = _sample_evenly([sample for one in sets for sample in one.samples], max_images)
+    theirs = _sample_evenly(list(real.samples), max_images)
     sides: tuple[_Values, _Values] = defaultdict(list), defaultdict(list)
     hues: tuple[_HueSums, _HueSums] = defaultdict(_zero_hue_sums), defaultdict(_zero_hue_sums)
     for number, sample in enumerate(ours + theirs):
@@ -234,8 +234,8 @@ def _size_ratio(sides: tuple[_Values, _Values], classes: int) -> float | None:
     return float(np.median(ratios)) if ratios else None
 
 
-def _sample_evenly(samples: list[Sample], most: int) -> list[Sample]:
-    places = np.unique(np.linspace(0, len(samples) - 1, min(most, len(samples))).round().astype(int))
+def _sample_evenly(samples: list[Sample], max_images: int) -> list[Sample]:
+    places = np.unique(np.linspace(0, len(samples) - 1, min(max_images, len(samples))).round().astype(int))
     return [samples[place] for place in places]
 
 

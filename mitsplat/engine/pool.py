@@ -210,9 +210,9 @@ def run_frames(
     """
     check_workers(workers)
     total = sum(map(len, layouts.values()))
-    most = affordable_workers(memory, device) if workers is None else workers
-    few = min(most, total) <= 1 or (workers is None and total <= _MAX_SERIAL_FRAMES)
-    if few and (device is None or device.is_usable_here):
+    max_workers = affordable_workers(memory, device) if workers is None else workers
+    serial = min(max_workers, total) <= 1 or (workers is None and total <= _MAX_SERIAL_FRAMES)
+    if serial and (device is None or device.is_usable_here):
         if device is not None and device != current_device():
             use_device(device)
         for frames in layouts.values():
@@ -225,17 +225,17 @@ def run_frames(
                     raise
                 yield made
         return
-    if few:
-        most = 1
+    if serial:
+        max_workers = 1
     # On a GPU, starting workers one by one would take longer than most runs.
     grow = workers is None and (device is None or not device.gpus)
-    shares = device is not None and 0 < len(device.gpus) < min(most, total)
+    shares = device is not None and 0 < len(device.gpus) < min(max_workers, total)
     with closing(SharedGpu()) if shares else nullcontext() as shared:
         if shared is not None and shared.problem:
             note(f"workers take turns on the GPU, because {shared.problem}")
         with (
             closing(_Processes(make, device, {} if shared is None else shared.environment)) as pool,
-            closing(run_pool(pool, layouts, most, note, grow=grow)) as found,
+            closing(run_pool(pool, layouts, max_workers, note, grow=grow)) as found,
         ):
             yield from found
 
@@ -252,15 +252,15 @@ def run_in_process(make: MakeFrame[Result], device: Device | None = None) -> Gen
 
 def affordable_workers(memory: WorkerMemory, device: Device | None = None) -> int:
     """Return the number of workers for which cores, unused memory and GPU memory suffice, at least 1."""
-    most = min(usable_cores(), int((unused_memory() * 2**30 - memory.shared) / memory.own))
+    max_workers = min(usable_cores(), int((unused_memory() * 2**30 - memory.shared) / memory.own))
     if device is not None and device.gpus:
-        held = int(min(gpu.memory for gpu in device.gpus) / memory.gpu)
-        most = min(most, len(device.gpus) * min(held, MAX_CLIENTS))
-    return max(1, most)
+        fitting = int(min(gpu.memory for gpu in device.gpus) / memory.gpu)
+        max_workers = min(max_workers, len(device.gpus) * min(fitting, MAX_CLIENTS))
+    return max(1, max_workers)
 
 
 def run_pool(
-    pool: Pool[Result], layouts: Mapping[int, Sequence[int]], most: int, note: Note, *, grow: bool = False
+    pool: Pool[Result], layouts: Mapping[int, Sequence[int]], max_workers: int, note: Note, *, grow: bool = False
 ) -> Generator[Result]:
     """Distribute all frames over the pool's workers and yield the results in order of completion.
 
@@ -272,7 +272,7 @@ def run_pool(
     Args:
         pool: Pool that starts the workers and receives their answers.
         layouts: Frame indices by layout.
-        most: Maximum number of workers; at most one per frame is started.
+        max_workers: Maximum number of workers; at most one per frame is started.
         note: Callback that receives a short description of the current operation.
         grow: Begin with one worker, and start the next one only while the last one sped up the run.
 
@@ -280,8 +280,8 @@ def run_pool(
         InputError, MissingResourceError, FrameError, LostWorkersError: As :func:`run_frames`.
     """
     plan = _Plan(layouts)
-    most = min(most, plan.left)
-    growth = _Growth(most)
+    max_workers = min(max_workers, plan.left)
+    growth = _Growth(max_workers)
     losses: Counter[int] = Counter()
     at_work: dict[int, int] = {}
     gone = 0
@@ -293,7 +293,7 @@ def run_pool(
             at_work[worker] = task[1]
             pool.send_frame(worker, task[1], task[0])
 
-    for _ in range(min(1, most) if grow else most):
+    for _ in range(min(1, max_workers) if grow else max_workers):
         assign(pool.start())
     while at_work:
         for worker, answer in pool.wait():
@@ -442,8 +442,8 @@ class _Plan:
 class _Growth:
     """Decision about another worker, from the frame rates with n and with n - 1 workers."""
 
-    def __init__(self, most: int) -> None:
-        self._most = most
+    def __init__(self, max_workers: int) -> None:
+        self._max_workers = max_workers
         self._speed = 0.0
         self._count = 0
         self._warm: set[int] = set()
@@ -469,7 +469,7 @@ class _Growth:
         if speed < MIN_SPEED_UP * self._speed:
             return "stop"
         self._speed = speed
-        return "start" if count < self._most else "stay"
+        return "start" if count < self._max_workers else "stay"
 
 
 class _Processes(Generic[Result]):

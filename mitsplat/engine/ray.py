@@ -155,7 +155,7 @@ class _Actors(Generic[Result]):
         room: Maximum number of workers at the start.
     """
 
-    def __init__(self, job: ClusterJob[Result], cluster: Cluster, most: int | None) -> None:
+    def __init__(self, job: ClusterJob[Result], cluster: Cluster, max_workers: int | None) -> None:
         ray = load_ray()
         self._ray = ray
         self._started = not ray.is_initialized()
@@ -174,10 +174,10 @@ class _Actors(Generic[Result]):
                     f"no Ray cluster at {cluster.address!r}: {str(error).splitlines()[0]}"
                 ) from error
         device, cluster = cluster.on_device(None)
-        self._wanted, self._most = cluster.resources or {}, sys.maxsize if most is None else most
+        self._wanted, self._max_workers = cluster.resources or {}, sys.maxsize if max_workers is None else max_workers
         self._actors: dict[int, Any] = {}
         room = self._workers_per_node()
-        self._nodes, self.room = set(room), min(self._most, sum(room.values()))
+        self._nodes, self.room = set(room), min(self._max_workers, sum(room.values()))
         self._last_search = self._last_room = time.monotonic()
         if not self.room:
             self.close()
@@ -217,7 +217,7 @@ class _Actors(Generic[Result]):
         elif now > self._last_room + _MACHINE_TIMEOUT:
             raise LostWorkersError(f"{self._no_node_text()} any more; finished frames are kept")
         joined = sum(count for node, count in room.items() if node not in known)
-        return max(0, min(joined, self._most - len(self._actors)))
+        return max(0, min(joined, self._max_workers - len(self._actors)))
 
     def start(self) -> int:
         worker, self._count = self._count, self._count + 1

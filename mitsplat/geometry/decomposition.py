@@ -60,7 +60,7 @@ def max_gap(size: float) -> float:
 
 
 def convex_pieces(
-    mesh: trimesh.Trimesh, *, threshold: float = _THRESHOLD, most: int = MAX_PIECES
+    mesh: trimesh.Trimesh, *, threshold: float = _THRESHOLD, max_pieces: int = MAX_PIECES
 ) -> tuple[trimesh.Trimesh, ...]:
     """Split a solid into convex pieces whose union follows its surface.
 
@@ -75,23 +75,23 @@ def convex_pieces(
         mesh: Surface of one object [m].
         threshold: Concavity below which a piece counts as convex, relative to half of the part's size. For scans, the
             acceptable gap is scaled by the ratio of the threshold to its default.
-        most: Maximum number of pieces of a closed scan.
+        max_pieces: Maximum number of pieces of a closed scan.
     """
     vertices = np.ascontiguousarray(mesh.vertices, dtype=np.float64)
     faces = np.ascontiguousarray(mesh.faces, dtype=np.int64)
-    return _cached_pieces(vertices.tobytes(), faces.tobytes(), threshold, most)
+    return _cached_pieces(vertices.tobytes(), faces.tobytes(), threshold, max_pieces)
 
 
 @lru_cache(maxsize=256)
-def _cached_pieces(vertices: bytes, faces: bytes, threshold: float, most: int) -> tuple[trimesh.Trimesh, ...]:
-    digest = ContentHash("pieces 4", f"{version('coacd')} {threshold!r} {most}", vertices, faces)
+def _cached_pieces(vertices: bytes, faces: bytes, threshold: float, max_pieces: int) -> tuple[trimesh.Trimesh, ...]:
+    digest = ContentHash("pieces 4", f"{version('coacd')} {threshold!r} {max_pieces}", vertices, faces)
     path = cache_folder() / "pieces" / f"{digest.hexdigest()}.npz"
     pieces = _read_pieces(path)
     if pieces is None:
         mesh = trimesh.Trimesh(
             np.frombuffer(vertices).reshape(-1, 3), np.frombuffer(faces, dtype=np.int64).reshape(-1, 3), process=False
         )
-        pieces = tuple(piece for part in _parts(mesh) for piece in _split(part, threshold, most))
+        pieces = tuple(piece for part in _parts(mesh) for piece in _split(part, threshold, max_pieces))
         _write_pieces(path, pieces)
     return pieces
 
@@ -106,14 +106,14 @@ def _parts(mesh: trimesh.Trimesh) -> list[trimesh.Trimesh]:
     return parts if 0 < len(parts) <= _MAX_PARTS else [mesh]
 
 
-def _split(part: trimesh.Trimesh, threshold: float, most: int) -> list[trimesh.Trimesh]:
+def _split(part: trimesh.Trimesh, threshold: float, max_pieces: int) -> list[trimesh.Trimesh]:
     hull = part.convex_hull
     if part.is_watertight and part.volume >= _CONVEX * hull.volume:
         return [hull]
     scan = len(part.faces) > _SCAN_FACES
     if scan and part.is_volume:
         limit = max_gap(float(part.extents.max())) * threshold / _THRESHOLD
-        return _Cutter(part, limit).pieces(most)
+        return _Cutter(part, limit).pieces(max_pieces)
     noisy = _concave_edge_share(part) > _NOISY
     if noisy:
         threshold = max(threshold, _NOISY_THRESHOLD)
@@ -199,14 +199,14 @@ class _Cutter:
         self._points = _mesh(self._solid).vertices
         self._contact_distance = 1e-4 * part.scale
 
-    def pieces(self, most: int) -> list[trimesh.Trimesh]:
-        """Return at most ``most`` convex pieces.
+    def pieces(self, max_pieces: int) -> list[trimesh.Trimesh]:
+        """Return at most ``max_pieces`` convex pieces.
 
         More pieces are cut at first. They are then joined where that adds the smallest gap.
         """
         pieces = [self._piece(self._solid)]
         done: list[_Piece] = []
-        while pieces and len(pieces) + len(done) < _OVERSHOOT * most:
+        while pieces and len(pieces) + len(done) < _OVERSHOOT * max_pieces:
             worst = max(range(len(pieces)), key=lambda i: pieces[i].gap)
             if pieces[worst].gap <= self._limit:
                 break
@@ -216,7 +216,7 @@ class _Cutter:
                 pieces += cut
             else:
                 done.append(piece)
-        return [_mesh(hull).convex_hull for hull in self._join(pieces + done, most)]
+        return [_mesh(hull).convex_hull for hull in self._join(pieces + done, max_pieces)]
 
     def _piece(self, body: manifold3d.Manifold) -> _Piece:
         hull = body.hull()
@@ -234,9 +234,9 @@ class _Cutter:
         above = (inside + depth * normals[face])[depth[:, 0] > self._limit]
         samples = min(_SAMPLES, round(float(mesh.area) / (3 * self._limit) ** 2))
         points = np.concatenate([above, contact_points(mesh), mesh.sample(samples, seed=0)])
-        return max_outside_distance(self._surface, points, least=self._limit, batch=_BATCH)
+        return max_outside_distance(self._surface, points, min_distance=self._limit, batch=_BATCH)
 
-    def _join(self, pieces: Sequence[_Piece], most: int) -> list[manifold3d.Manifold]:
+    def _join(self, pieces: Sequence[_Piece], max_pieces: int) -> list[manifold3d.Manifold]:
         """Join pieces if the gap of their common hull is acceptable, or if there are too many; return all hulls."""
         hulls: dict[int, manifold3d.Manifold] = {}
         joints: dict[tuple[int, int], tuple[float, manifold3d.Manifold]] = {}
@@ -259,7 +259,7 @@ class _Cutter:
             candidates = sorted(joints, key=lambda pair: (joints[pair][0], pair))[:_PAIRS_PER_STEP]
             gaps |= {pair: self._gap(joints[pair][1]) for pair in candidates if pair not in gaps}
             pair = min(candidates, key=lambda pair: (gaps[pair], pair))
-            if gaps[pair] > self._limit and len(hulls) <= most:
+            if gaps[pair] > self._limit and len(hulls) <= max_pieces:
                 break
             joint = joints[pair][1]
             joints = {other: found for other, found in joints.items() if not {*pair} & {*other}}

@@ -148,16 +148,16 @@ def standoff(surface: DistanceSurface, pieces: Sequence[trimesh.Trimesh]) -> flo
 
 
 def max_outside_distance(
-    surface: DistanceSurface, points: Float64Array, *, least: float = 0.0, batch: int = _BATCH
+    surface: DistanceSurface, points: Float64Array, *, min_distance: float = 0.0, batch: int = _BATCH
 ) -> float:
     """Return the maximum distance from a mesh of those points (N, 3) that are outside of it [m].
 
-    Distances below ``least`` count as 0. The side of a point costs ten times as much as its distance. Sides are
+    Distances below ``min_distance`` count as 0. The side of a point costs ten times as much as its distance. Sides are
     therefore computed in order of decreasing distance, and only up to the first ``batch`` that contains an outside
     point.
     """
     distances = surface.nearest(points)[2]
-    farthest_first = np.argsort(-distances, kind="stable")[: int((distances >= least).sum())]
+    farthest_first = np.argsort(-distances, kind="stable")[: int((distances >= min_distance).sum())]
     for start in range(0, len(farthest_first), batch):
         distance = float(surface.signed_distances(points[farthest_first[start : start + batch]]).max())
         if distance > 0:

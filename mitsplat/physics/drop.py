@@ -524,4 +524,4 @@ def _pieces(
     mesh: trimesh.Trimesh, name: str, progress: Note, *, threshold: float = _CONCAVITIES[0]
 ) -> tuple[trimesh.Trimesh, ...]:
     progress(f"computing convex pieces of {name}")
-    return convex_pieces(mesh, threshold=threshold, most=round(MAX_PIECES * _CONCAVITIES[0] / threshold))
+    return convex_pieces(mesh, threshold=threshold, max_pieces=round(MAX_PIECES * _CONCAVITIES[0] / threshold))

@@ -234,11 +234,11 @@ class WarpWorld(World):
         return _array(self._states[0].body_qd)[: len(self.bodies)].reshape(-1, 2, 3)
 
     def _record(self, steps: Sequence[Any]) -> None:
-        here, there = self._states
+        current, after = self._states
         for observables in steps:
-            self._pipeline.collide(here, self._contacts)
-            self._solver.step(here, there, self._control, self._contacts, self._timestep, observables=observables)
-            here, there = there, here
+            self._pipeline.collide(current, self._contacts)
+            self._solver.step(current, after, self._control, self._contacts, self._timestep, observables=observables)
+            current, after = after, current
 
     def _reset(self, coordinates: Float64Array) -> None:
         state = self._states[0]

@@ -189,8 +189,8 @@ MAX_JSON_DEPTH = 64
 _NO_BRACKETS = bytes(set(range(256)) - set(b'[]{}"'))
 
 
-def read_json(path: Path, most: int = MAX_JSON_BYTES) -> Any:
-    """Read an untrusted JSON file: a regular file of at most ``most`` bytes, with limited depth.
+def read_json(path: Path, max_bytes: int = MAX_JSON_BYTES) -> Any:
+    """Read an untrusted JSON file: a regular file of at most ``max_bytes``, with limited depth.
 
     Raises:
         OSError: If the file cannot be read.
@@ -198,8 +198,8 @@ def read_json(path: Path, most: int = MAX_JSON_BYTES) -> Any:
     """
     with open_regular(path) as file:
         size = os.fstat(file.fileno()).st_size
-        if size > most:
-            raise ValueError(f"must have at most {most} bytes (got {size})")
+        if size > max_bytes:
+            raise ValueError(f"must have at most {max_bytes} bytes (got {size})")
         return parse_json(file.read())
 
 
@@ -231,9 +231,9 @@ def write_text(path: Path, text: str) -> str:
     return write_file(path, lambda temporary: temporary.write_bytes(text.encode()))
 
 
-def files_below(folder: Path, *, but: Path | None = None) -> list[Path]:
-    """List all files in a folder and in linked folders, each once, sorted by name; the folder ``but`` is skipped."""
-    found, seen = list[Path](), set[str]() if but is None else {os.path.realpath(but)}
+def files_below(folder: Path, *, skip: Path | None = None) -> list[Path]:
+    """List all files in a folder and in linked folders, each once, sorted by name; the folder ``skip`` is left out."""
+    found, seen = list[Path](), set[str]() if skip is None else {os.path.realpath(skip)}
     for place, folders, files in os.walk(folder, followlinks=True):
         seen.add(os.path.realpath(place))
         folders[:] = [name for name in folders if os.path.realpath(Path(place, name)) not in seen]

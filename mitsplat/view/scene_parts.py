@@ -57,16 +57,16 @@ class ShownSplats:
 
     splats: Splats
 
-    def thinned(self, most: int) -> Splats:
-        """Return at most ``most`` Gaussians.
+    def thinned(self, max_count: int) -> Splats:
+        """Return at most ``max_count`` Gaussians.
 
         Every n-th Gaussian is taken and enlarged by the square root of n, so that surfaces stay covered.
         """
         count = len(self.splats)
-        if count <= most:
+        if count <= max_count:
             return self.splats
-        sample = self.splats.select(np.linspace(0, count - 1, most).astype(int))
-        return replace(sample, scales=sample.scales * np.float32(np.sqrt(count / most)))
+        sample = self.splats.select(np.linspace(0, count - 1, max_count).astype(int))
+        return replace(sample, scales=sample.scales * np.float32(np.sqrt(count / max_count)))
 
 
 @dataclass(frozen=True, eq=False)

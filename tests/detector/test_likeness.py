@@ -76,7 +76,7 @@ def test_photographs_with_small_objects_get_a_larger_search_size(tmp_path: Path,
         image.update(width=2 * WIDTH, height=2 * HEIGHT)
     (photographs / "labels.json").write_text(json.dumps(labels))
     assert compare_with_photographs([rendered], photographs, size=640).same_size == pytest.approx(1280, abs=130)
-    assert compare_with_photographs([rendered], photographs, size=640, most=4).same_size is None  # too few to tell
+    assert compare_with_photographs([rendered], photographs, size=640, max_images=4).same_size is None  # too few
 
 
 @pytest.mark.parametrize(
@@ -153,7 +153,7 @@ def test_photographs_of_another_size_are_compared(rendered: Path, photographs: P
 
 
 def test_most_limits_both_image_counts(rendered: Path, photographs: Path) -> None:
-    found = compare_with_photographs([rendered], photographs, size=WIDTH, most=7)
+    found = compare_with_photographs([rendered], photographs, size=WIDTH, max_images=7)
     assert (found.images, found.photographs) == (7, 7)
 
 
@@ -162,7 +162,7 @@ def test_photographs_with_other_classes_are_refused(rendered: Path, tmp_path: Pa
     with pytest.raises(InputError, match="it lacks cone"):
         compare_with_photographs([rendered], other)
     with pytest.raises(InputError, match="at least 1"):
-        compare_with_photographs([rendered], rendered, most=0)
+        compare_with_photographs([rendered], rendered, max_images=0)
 
 
 def test_the_compare_command_prints_and_writes_the_traits(rendered: Path, photographs: Path, tmp_path: Path) -> None:

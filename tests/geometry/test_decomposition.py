@@ -152,7 +152,7 @@ def test_pieces_of_a_scan_are_few_and_within_the_allowed_standoff():
 def test_the_number_of_pieces_is_bounded_for_rough_scans():
     ball = trimesh.creation.icosphere(subdivisions=4, radius=0.05)
     rough = 1 + np.random.default_rng(1).uniform(-0.2, 0.2, (len(ball.vertices), 1))
-    pieces = convex_pieces(trimesh.Trimesh(ball.vertices * rough, ball.faces, process=False), most=5)
+    pieces = convex_pieces(trimesh.Trimesh(ball.vertices * rough, ball.faces, process=False), max_pieces=5)
     assert 1 < len(pieces) <= 5
 
 

@@ -129,7 +129,7 @@ def plan_frame(
     view = index - number * spec.output.views
     time = view / max(1, spec.output.views - 1)
     ranges = spec.randomise
-    here = view_of(scene, index, layout) if camera is None else Viewpoint(camera)
+    viewpoint = view_of(scene, index, layout) if camera is None else Viewpoint(camera)
     if next_camera is None and camera is not None:
         next_camera = None if next_layout is None else camera
     elif next_camera is None and view + 1 < spec.output.views:
@@ -139,7 +139,7 @@ def plan_frame(
         layout=number,
         view=view,
         split=split_of(number, spec.output.validation, spec.output.test),
-        camera=here.camera,
+        camera=viewpoint.camera,
         next_camera=next_camera,
         lights=lights_at(spec, number, index, time),
         draws={
@@ -148,7 +148,7 @@ def plan_frame(
             if (bounds := _range_of(ranges, name)) is not None
         },
         seed=int(random_stream(spec.seed, "pixel noise", index).integers(2**31)),
-        viewpoint=here.drawn,
+        viewpoint=viewpoint.drawn,
         belt=belt_of(spec, view),
     )
 

@@ -162,22 +162,22 @@ def view_of(scene: Scene, index: int, layout: Layout | None = None) -> Viewpoint
         pose[:3, 3] += camera.stereo.baseline * pose[:3, 0]
         return Viewpoint(replace(left.camera, world_from_camera=pose), {**left.drawn, "side": "right"})
     turns = 1 + (spec.output.views - 1 - place_in_turn) // len(views_of_turn)
-    here = _CameraTurn(spec.seed, index, number, camera, spec.output, number_of_layout, turn, turns)
+    camera_turn = _CameraTurn(spec.seed, index, number, camera, spec.output, number_of_layout, turn, turns)
     own: dict[str, Any] = {"camera": number} if spec.cameras else {}
     own |= {"side": "left"} if camera.stereo else {}
     if isinstance(camera, CameraHemisphere):
-        found = _hemisphere_view(scene, here, camera, layout)
+        found = _hemisphere_view(scene, camera_turn, camera, layout)
         return Viewpoint(found.camera, {**own, **found.drawn})
     if isinstance(camera, CameraWalk):
-        pose = _walk_pose(camera, here)
+        pose = _walk_pose(camera, camera_turn)
     else:
         if isinstance(camera, CameraOrbit):
             pose = _orbit_pose(camera, turn, turns)
         else:
             keys = [look_at_pose(key.eye, key.target, key.up) for key in camera.keys]
-            pose = interpolate_poses(keys, here.time)[0]
+            pose = interpolate_poses(keys, camera_turn.time)[0]
         pose[:3, 3] += camera.jitter * random_stream(spec.seed, "camera jitter", index).standard_normal(3)
-    view_camera, drawn = here.camera_at_pose(pose)
+    view_camera, drawn = camera_turn.camera_at_pose(pose)
     return Viewpoint(view_camera, own | drawn)
 
 
@@ -230,15 +230,15 @@ def _orbit_pose(camera: CameraOrbit, view: int, views: int) -> Float64Array:
     return look_at_pose(np.add(camera.target, offset), camera.target)
 
 
-def _walk_pose(camera: CameraWalk, here: _CameraTurn) -> Float64Array:
+def _walk_pose(camera: CameraWalk, camera_turn: _CameraTurn) -> Float64Array:
     """Return a pose by interpolation between the waypoints of the layout.
 
     The interpolation is monotone piecewise cubic (Fritsch and Carlson 1980).
     """
-    rng = random_stream(here.seed, "camera walk", here.layout, here.number)
+    rng = random_stream(camera_turn.seed, "camera walk", camera_turn.layout, camera_turn.number)
     ranges = np.array([camera.azimuth, np.sin(np.radians(camera.elevation)), camera.radius])
     places = rng.uniform(ranges[:, 0], ranges[:, 1], (camera.places, 3))
-    azimuth, sine, radius = PchipInterpolator(np.linspace(0, 1, camera.places), places)(here.time)
+    azimuth, sine, radius = PchipInterpolator(np.linspace(0, 1, camera.places), places)(camera_turn.time)
     return _pose_around(np.array(camera.target, dtype=np.float64), np.radians(azimuth), sine, radius)
 
 
@@ -247,12 +247,14 @@ def _pose_around(target: Float64Array, azimuth: float, sine: float, radius: floa
     return look_at_pose(target + radius * direction(azimuth, sine), target)
 
 
-def _hemisphere_view(scene: Scene, here: _CameraTurn, camera: CameraHemisphere, layout: Layout | None) -> Viewpoint:
+def _hemisphere_view(
+    scene: Scene, camera_turn: _CameraTurn, camera: CameraHemisphere, layout: Layout | None
+) -> Viewpoint:
     """Return the accepted candidate view whose shares of hidden and cut objects are nearest to the targets.
 
     The search ends at the first accepted candidate that meets the targets exactly.
     """
-    spec, index = scene.spec, here.index
+    spec, index = scene.spec, camera_turn.index
     predictor = (
         None
         if layout is None or (camera.look_at == "target" and not camera.selects_views)
@@ -260,8 +262,8 @@ def _hemisphere_view(scene: Scene, here: _CameraTurn, camera: CameraHemisphere, 
     )
     if predictor is None or not camera.selects_views:
         target, seen = _target(camera, spec.seed, index, 0, predictor)
-        pose, target = _hemisphere_pose(camera, here, 0, target)
-        view_camera, drawn = here.camera_at_pose(pose)
+        pose, target = _hemisphere_pose(camera, camera_turn, 0, target)
+        view_camera, drawn = camera_turn.camera_at_pose(pose)
         return Viewpoint(
             view_camera, drawn if camera.look_at == "target" else {**drawn, "target": target.tolist(), "object": seen}
         )
@@ -271,11 +273,11 @@ def _hemisphere_view(scene: Scene, here: _CameraTurn, camera: CameraHemisphere, 
     refused: list[tuple[float, str]] = []
     for number in range(camera.tries):
         target, seen = _target(camera, spec.seed, index, number, predictor)
-        pose, target = _hemisphere_pose(camera, here, number, target)
+        pose, target = _hemisphere_pose(camera, camera_turn, number, target)
         if camera.truncation is not None and number % 2:
             rng = _stream(spec.seed, "camera border", index, number)
-            pose, target = _rotate_target_to_border(here.camera_at_pose(pose)[0], pose, target, rng)
-        view_camera, motion_draws = here.camera_at_pose(pose)
+            pose, target = _rotate_target_to_border(camera_turn.camera_at_pose(pose)[0], pose, target, rng)
+        view_camera, motion_draws = camera_turn.camera_at_pose(pose)
         projected = predictor.project(view_camera)
         if camera.accept is not None and (violations := predictor.find_violations(projected, camera.accept)):
             refused.append((sum(miss for miss, _ in violations), " and ".join(text for _, text in violations)))
@@ -329,10 +331,10 @@ def _target(
 
 
 def _hemisphere_pose(
-    camera: CameraHemisphere, here: _CameraTurn, number: int, middle: Float64Array
+    camera: CameraHemisphere, camera_turn: _CameraTurn, number: int, middle: Float64Array
 ) -> tuple[Float64Array, Float64Array]:
     """Return the pose of a candidate view around a point [m], and its target with jitter [m]."""
-    seed, index = here.seed, here.index
+    seed, index = camera_turn.seed, camera_turn.index
 
     def draw(name: str, low: float, high: float) -> float:
         return float(_stream(seed, f"camera {name}", index, number).uniform(low, high))
@@ -342,7 +344,7 @@ def _hemisphere_pose(
     if camera.coverage == "even":
         shift = random_stream(seed, "camera coverage", number).uniform(size=3)
         low, high = np.array([camera.azimuth, sines, camera.radius], dtype=np.float64).T
-        nth = here.layout * here.turns + here.turn + 1  # of all views of this camera
+        nth = camera_turn.layout * camera_turn.turns + camera_turn.turn + 1  # of all views of this camera
         azimuth, sine, radius = (low + (high - low) * np.mod(shift + nth * _STEPS, 1.0)).tolist()
     else:
         radius, azimuth = draw("radius", *camera.radius), draw("azimuth", *camera.azimuth)

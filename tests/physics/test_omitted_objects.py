@@ -114,5 +114,5 @@ def test_a_region_mostly_inside_of_a_table_is_refused_with_its_name(scene_data, 
     monkeypatch.setattr(place, "_MAX_DRAWS", 1)
     rng = np.random.default_rng(0)
     scene_data["region"] = {"min": [-0.2, -0.2, -0.09], "max": [0.2, 0.2, 0.01]}
-    with pytest.raises(InputError, match=r"in 0.4 x 0.4 x 0.1 m, (89|90|91)% of which are inside of 'table', settle"):
+    with pytest.raises(InputError, match=r"in 0.4 x 0.4 x 0.1 m, (89|90|91)% of which are inside 'table', settle"):
         drop_of(load_scene(write_scene(scene_data)), lambda text: None).draw_poses((0,), rng)

@@ -97,7 +97,7 @@ class Quality:
             raise InputError(f"quality: lens_rings must be from 1 to 8 (got {self.lens_rings})")
 
     @property
-    def grid(self) -> int:
+    def rays_per_axis(self) -> int:
         """Rays per pixel along each axis."""
         return 1 if self.samples == "edges" else self.samples
 

@@ -465,13 +465,13 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
         """
         if contents.traits.placements is None or contents.clouds is None:
             return None
-        fine = view.sampled(self.quality.grid)
+        fine = view.sampled(self.quality.rays_per_axis)
         return trace(contents.clouds, contents.traits.placements, fine, self.quality, z_max=z_max).instance
 
     def _trace_splats(self, contents: _Contents, scene: mi.Scene, view: CameraView, z_max: mi.Float | None) -> Image:
         if contents.clouds is None:
             return Image.empty(view.width * view.height)
-        fine = view.sampled(self.quality.grid)
+        fine = view.sampled(self.quality.rays_per_axis)
         static_tiles = self._static_tile_cache(contents, scene, fine, z_max)
         if static_tiles is not None:
             objects = [p for p in contents.placements if p.instance]

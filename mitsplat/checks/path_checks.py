@@ -60,7 +60,7 @@ def check_asset(asset: Asset) -> Iterator[Finding]:
     splats = asset.splats
     core = opaque_core(splats).astype(np.float64)
     if not len(core):
-        yield Finding("splats", False, f"none of {len(splats)} is opaque", "fit or bake the asset anew")
+        yield Finding("splats", False, f"none of {len(splats)} is opaque", "fit or bake the asset again")
         return
     yield Finding("splats", True, f"{len(splats)}, all values finite")  # loading refuses non-finite values
     extents = np.ptp(core, axis=0) if asset.mesh is None else asset.mesh.extents

@@ -80,7 +80,7 @@ def worker_memory(scene: Scene) -> WorkerMemory:
         + COPIES * stored
         + PER_PLACED * num_gaussians
         + PER_PAIR * min(pairs, PAIRS_MAX)
-        + PER_RAY * pixels * quality.grid**2
+        + PER_RAY * pixels * quality.rays_per_axis**2
         + (PER_OBJECT + PER_SILHOUETTE_PIXEL * pixels) * sum(max_counts)
     )
     return WorkerMemory(own, shared=stored, gpu=max(own, WorkerMemory.gpu))

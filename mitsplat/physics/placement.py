@@ -16,7 +16,7 @@ from mitsplat.scene.spec.object_spec import Arrangement
 from mitsplat.scene.spec.shape_spec import Region
 from mitsplat.scene.walls import PILE_HEIGHT
 
-_MAX_POSITIONS = 200  # positions tried per object before all objects are drawn anew
+_MAX_POSITIONS = 200  # positions tried per object before all objects are drawn again
 _MAX_POSITIONS_IN_LAYER = 20  # positions tried per layer of a pile
 _MAX_DRAWS = 20
 _SPACING = 1e-3  # minimum distance of bounding boxes at the start [m]

@@ -70,7 +70,7 @@ def settle_layout(scene: Scene, index: int, *, progress: Note | None = None, cac
         raise InputError(f"layout must be at least 0 (got {index})")
     path = cache_folder() / "layouts" / f"{_scene_hash(scene)[:32]}-{index:04d}.json"
     if cached:
-        with suppress(OSError, ValueError, KeyError, TypeError):  # a damaged or missing file is made anew
+        with suppress(OSError, ValueError, KeyError, TypeError):  # a damaged or missing file is replaced
             return Layout.from_json(json.loads(path.read_bytes()))
     with warp_settings(progress):
         from mitsplat.physics.drop import drop_of  # Newton reads these settings when it compiles

@@ -145,18 +145,18 @@ class ScenePage:
         self._layer.on_update(lambda _: self._show_preview())
         self._finest.on_update(lambda _: self._request_render())
         self._width.on_update(lambda _: self._request_render())
-        back.on_click(lambda _: self._look_at_frame(self._index, anew=True))
+        back.on_click(lambda _: self._look_at_frame(self._index, force=True))
         self._light.on_update(lambda _: self._choose_light())
         self._position.on_update(lambda _: self._move_light(position=self._position.value))
         self._target.on_update(lambda _: self._move_light(target=self._target.value))
         self._strength.on_update(lambda _: self._move_light(strength=self._strength.value))
         as_stated.on_click(lambda _: self._reset_lights())
 
-    def _look_at_frame(self, index: int, *, anew: bool = False) -> None:
+    def _look_at_frame(self, index: int, *, force: bool = False) -> None:
         """Move the view to the camera of a frame, as soon as the layout is known, which can determine the camera."""
         with self._lock:
             index = min(max(int(index), 0), self._scene.num_frames - 1)
-            if index == self._index and not anew and self._pose is None:
+            if index == self._index and not force and self._pose is None:
                 return
             if index // self._views != self._index // self._views:
                 self._layout = None

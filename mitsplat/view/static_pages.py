@@ -33,7 +33,7 @@ _NOTHING = "nothing"
 _CLICKS = {
     _NOTHING: None,
     "marks the object": _PICK,
-    "marks what is not the object": _PICK_NOT,
+    "excludes a thing from the object": _PICK_NOT,
     "removes a thing from the environment": _REMOVE,
 }
 """Meanings of a click, and the corresponding command line option."""

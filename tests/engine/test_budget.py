@@ -110,7 +110,7 @@ def test_the_estimated_pairs_bound_the_true_number(preset, rendering):
     """Of discs that face the camera: as many as the renderer lists, and not many more where they are wide."""
     camera = Camera.look_at((0, 0, -2), (0, 0, 0), up=(0, -1, 0), width=256, height=192, fov_x=50)
     quality = replace(PRESETS[preset], **rendering)
-    view = view_of(make_sensor(camera)).sampled(quality.grid)
+    view = view_of(make_sensor(camera)).sampled(quality.rays_per_axis)
     count, rng = 300, np.random.default_rng(0)
     means = np.concatenate([rng.uniform(-0.3, 0.3, (count, 2)), np.zeros((count, 1))], axis=1)
     for radius, opacity in itertools.product((0.001, 0.01, 0.05), (0.05, 0.99)):

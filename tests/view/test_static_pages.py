@@ -159,7 +159,7 @@ def test_clicks_on_a_capture_pick_objects(page, tmp_path):
     points = page._shown["/chosen/object"].drawable.points
     assert np.linalg.norm(points[:, :2] - THINGS[1], axis=1).max() < 0.05
 
-    click(1, "marks what is not the object")
+    click(1, "excludes a thing from the object")
     assert "a thing is selected by both --pick and --pick-not" in page._alert.content
     assert shown._summary.content == f"```\n--pick {pick}\n```" and "/chosen/object" in page._shown
 

@@ -52,7 +52,7 @@ def splat_silhouettes(
     canvas, left, top = _canvas(view)
     ids = np.unique([placement.instance for placement in objects])
     quality = replace(quality, tolerance=math.inf, sh_degree=0)
-    covered = _cover(clouds, objects, canvas.sampled(quality.grid), quality, ids)
+    covered = _cover(clouds, objects, canvas.sampled(quality.rays_per_axis), quality, ids)
     return _assemble(*covered, ids, canvas, left, top)
 
 

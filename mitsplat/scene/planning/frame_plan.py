@@ -29,7 +29,7 @@ _FRAME_DRAWS = (
     *("exposure", "vignetting", "chromatic_aberration", "motion_blur", "motion_angle", "iso"),
     *("white_balance", "hue", "saturation", "chroma_stretch", "chroma_angle", "sharpening", "jpeg"),
 )
-"""Names of the values that are drawn anew for every frame."""
+"""Names of the values that are drawn for every frame."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -75,14 +75,14 @@ class Handheld(StrictModel):
 
 
 class Defocus(StrictModel):
-    """Thin lens whose parameters are drawn anew for every view, in place of those of ``intrinsics``."""
+    """Thin lens whose parameters are drawn for every view, in place of those of ``intrinsics``."""
 
     aperture: NonNegativeRange = Field(description="Range of aperture radii [m]. 0 for a pinhole camera.")
     focus: PositiveRange = Field(description="Range of focus depths [m].")
 
 
 class Motion(StrictModel):
-    """Constant camera motion while the shutter is open, drawn anew for every view in the camera's frame."""
+    """Constant camera motion while the shutter is open, drawn for every view in the camera's frame."""
 
     exposure: PositiveRange = Field(description="Range of exposure times [s].")
     speed: NonNegativeRange = Field(
@@ -105,7 +105,7 @@ class Viewpoint(StrictModel):
     zoom: PositiveRange = Field(
         (1.0, 1.0),
         exclude_if=lambda zoom: zoom == (1.0, 1.0),
-        description="Range of factors on the focal lengths, drawn anew for every view.",
+        description="Range of factors on the focal lengths, drawn for every view.",
     )
     handheld: Handheld | None = Field(
         None,
@@ -115,7 +115,7 @@ class Viewpoint(StrictModel):
     defocus: Defocus | None = Field(
         None,
         exclude_if=lambda defocus: defocus is None,
-        description="Ranges of aperture and focus, drawn anew for every view.",
+        description="Ranges of aperture and focus, drawn for every view.",
     )
     motion: Motion | None = Field(
         None,
@@ -225,7 +225,7 @@ class CameraHemisphere(Viewpoint):
         "target",
         exclude_if=lambda look_at: look_at == "target",
         description="Point in the centre of the image. ``target`` takes the target. ``objects`` takes the centre of "
-        "a labelled object that is drawn anew for every view. ``clusters`` takes the centre of such an "
+        "a labelled object that is drawn for every view. ``clusters`` takes the centre of such an "
         "object and its two nearest neighbours. Layouts without labelled objects use the target.",
     )
     coverage: Literal["random", "even"] = Field(

@@ -23,7 +23,7 @@ from mitsplat.storage.field_types import (
 
 
 class Randomise(StrictModel):
-    """Ranges of uniformly distributed values, drawn anew for every frame unless stated otherwise.
+    """Ranges of uniformly distributed values, drawn for every frame unless stated otherwise.
 
     A range with equal ends fixes the value.
     """
@@ -59,7 +59,7 @@ class Randomise(StrictModel):
     )
     motion_blur: BlurRange = Field(
         (0.0, 0.0),
-        description="Length of the motion blur in the image [px]. Its direction is drawn anew for every frame.",
+        description="Length of the motion blur in the image [px]. Its direction is drawn for every frame.",
     )
     sharpening: NonNegativeRange = Field(
         (0.0, 0.0),

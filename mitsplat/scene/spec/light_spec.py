@@ -35,7 +35,7 @@ class LightDraw(StrictModel):
     and sizes. A drawn value replaces the light's own value of the same key.
     """
 
-    vary: Vary = Field("layout", description="``layout`` draws values once per layout, ``frame`` anew for every frame.")
+    vary: Vary = Field("layout", description="``layout`` draws values once per layout, ``frame`` for every frame.")
     count: CountRange = Field(
         (1, 1),
         description="Number of such lights, a number or an inclusive range. The values of each light are drawn "
@@ -258,9 +258,7 @@ class RoomLight(StrictModel):
     around: Vec3 = Field((0, 0, 0), description="Centre of the lit area [m].")
     size: Positive = Field(4.0, description="Width of the room [m].")
     lamps: CountRange = Field((1, 3), description="Number of lamps, a number or an inclusive range.")
-    vary: Vary = Field(
-        "layout", description="``layout`` draws all values once per layout, ``frame`` anew for every frame."
-    )
+    vary: Vary = Field("layout", description="``layout`` draws all values once per layout, ``frame`` for every frame.")
 
     def expand(self) -> tuple[AreaLight, AreaLight, EnvironmentLight]:
         """Return the three entries that the room expands to: window, lamps and walls."""

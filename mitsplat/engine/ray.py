@@ -169,10 +169,10 @@ class _Actors(Generic[Result]):
                     ray.init(
                         address=cluster.address or "local", log_to_driver=False, logging_level=logging.ERROR, **where
                     )
-            except (ConnectionError, ValueError, RuntimeError) as error:
-                raise MissingResourceError(
-                    f"no Ray cluster at {cluster.address!r}: {str(error).splitlines()[0]}"
-                ) from error
+            except Exception as error:  # Ray also raises errors without a type, such as after a timeout
+                place = "on this machine" if cluster.address is None else f"at {cluster.address!r}"
+                reason = str(error).partition("\n")[0]
+                raise MissingResourceError(f"no Ray cluster {place}: {reason}") from error
         device, cluster = cluster.on_device(None)
         self._wanted, self._max_workers = cluster.resources or {}, sys.maxsize if max_workers is None else max_workers
         self._actors: dict[int, Any] = {}

@@ -374,6 +374,20 @@ def test_machines_that_join_are_reported_once(monkeypatch):
         free_slots()
 
 
+@pytest.mark.parametrize(("address", "place"), [(None, "on this machine"), ("auto", "at 'auto'")])
+def test_a_ray_that_does_not_start_is_reported(monkeypatch, address, place):
+    class Late(FakeRay):
+        def is_initialized(self):
+            return False
+
+        def init(self, **options):
+            raise Exception("The node timed out.\nSee its log.")
+
+    monkeypatch.setitem(sys.modules, "ray", Late())
+    with pytest.raises(MissingResourceError, match=rf"^no Ray cluster {place}: The node timed out\.$"):
+        cluster._Actors(None, Cluster(address), None)
+
+
 def test_ray_starts_without_the_current_folder_of_the_caller(monkeypatch):
     """It would put this folder on the import path of its workers if they had no other one."""
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from mitsplat.arrays import ByteImage
 from mitsplat.formats.coco import image_file
-from mitsplat.images.picture_files import read_picture
+from mitsplat.images.picture_files import read_picture_inside
 from mitsplat.labels.labels import Labels
 from mitsplat.labels.overlay import draw_labels
 from mitsplat.storage.files import Record, write_file
@@ -58,10 +58,9 @@ class ContactSheet:
 
 
 def _tile(root: Path, record: Record) -> ByteImage:
-    file = root / image_file(record)
-    image = read_picture(file)
+    image = read_picture_inside(root, image_file(record))
     if image is None:
-        raise OSError(f"{file} cannot be read as an image")
+        raise OSError(f"{root / image_file(record)} cannot be read as an image")
     rgb = cv2.cvtColor(image, cv2.COLOR_BGR2RGB).astype(np.uint8, copy=False)
     drawn = draw_labels(rgb, Labels.from_json(record["labels"]))
     height = max(1, round(drawn.shape[0] * _TILE_WIDTH / drawn.shape[1]))

@@ -11,9 +11,10 @@ from PIL import Image, UnidentifiedImageError
 
 from mitsplat.arrays import ByteImage
 from mitsplat.errors import InputError
+from mitsplat.images.picture_files import MAX_FILE_BYTES
 from mitsplat.storage.content_hash import ContentHash
 from mitsplat.storage.file_kinds import check_name
-from mitsplat.storage.files import IMAGE_ERRORS, files_below
+from mitsplat.storage.files import IMAGE_ERRORS, files_below, read_regular
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
 """Suffixes of images that Ultralytics also reads."""
@@ -49,9 +50,10 @@ def read_picture(path: Path) -> ByteImage:
 
 def _read_bytes(path: Path) -> bytes:
     try:
-        return path.read_bytes()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
+        return read_regular(path, MAX_FILE_BYTES)
+    except (OSError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise InputError(f"{path}: cannot be read ({reason})") from error
 
 
 def _decode(data: bytes, path: Path) -> ByteImage:

@@ -1,19 +1,37 @@
-"""Reading of images by OpenCV from any path. OpenCV itself crashes on paths that are not UTF-8."""
+"""Reading of untrusted images by OpenCV from any path. OpenCV itself crashes on paths that are not UTF-8."""
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import numpy.typing as npt
+from PIL import Image
+
+from mitsplat.storage.files import IMAGE_ERRORS, is_inside, read_regular
+
+MAX_FILE_BYTES = 1 << 29
+"""Maximum size of an image file [bytes]."""
 
 
 def read_picture(path: Path, flags: int = cv2.IMREAD_COLOR) -> npt.NDArray[Any] | None:
-    """Return the pixels of an image file as ``cv2.imread`` does; None if the file cannot be read or is no image."""
+    """Return the pixels of an image file as ``cv2.imread`` does.
+
+    Returns:
+        None if the file cannot be read, is no image, or has more bytes than :data:`MAX_FILE_BYTES` or more pixels than
+        Pillow accepts.
+    """
     try:
-        data = np.frombuffer(path.read_bytes(), np.uint8)
-    except (OSError, ValueError):
+        data = read_regular(path, MAX_FILE_BYTES)
+        Image.open(io.BytesIO(data)).close()  # reads the header
+        return cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    except (*IMAGE_ERRORS, cv2.error):
         return None
-    return cv2.imdecode(data, flags) if len(data) else None
+
+
+def read_picture_inside(folder: Path, name: str, flags: int = cv2.IMREAD_COLOR) -> npt.NDArray[Any] | None:
+    """Return the pixels of an image file as :func:`read_picture`; None also if a link leads out of the folder."""
+    return read_picture(folder / name, flags) if is_inside(folder, name) else None

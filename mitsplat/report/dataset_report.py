@@ -20,7 +20,7 @@ from mitsplat.dataset.manifest import read_lines
 from mitsplat.dataset.schema import Records, read_content
 from mitsplat.formats.coco import image_file
 from mitsplat.images.masks import Silhouette
-from mitsplat.images.picture_files import read_picture
+from mitsplat.images.picture_files import read_picture_inside
 from mitsplat.labels.labels import Labels
 from mitsplat.labels.overlay import class_colour
 from mitsplat.pages.html import inline_image, make_page, mask_path
@@ -174,7 +174,7 @@ def _samples(root: Path, records: Iterable[Record]) -> str:
 
 
 def _sample(root: Path, record: Record) -> str:
-    image = read_picture(root / image_file(record))
+    image = read_picture_inside(root, image_file(record))
     if image is None:
         return f"<figure><figcaption>Frame {record['index']}: its image cannot be read</figcaption></figure>"
     labels = Labels.from_json(record["labels"])
@@ -217,7 +217,7 @@ def _brightness(root: Path, records: Iterable[Record]) -> tuple[np.ndarray, Hist
     """Count pixels by luma in 32 bins, and images by their mean luma."""
     counts, means = np.zeros(32, dtype=np.int64), Histogram((0, 255))
     for record in records:
-        grey = read_picture(root / image_file(record), cv2.IMREAD_GRAYSCALE)
+        grey = read_picture_inside(root, image_file(record), cv2.IMREAD_GRAYSCALE)
         if grey is not None:
             counts += np.histogram(grey, bins=32, range=(0, 256))[0]
             means.add(grey.mean())

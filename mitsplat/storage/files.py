@@ -174,6 +174,20 @@ def open_regular(path: Path) -> IO[bytes]:
         raise
 
 
+def read_regular(path: Path, max_bytes: int) -> bytes:
+    """Read an untrusted file of at most ``max_bytes`` bytes.
+
+    Raises:
+        OSError: As :func:`open_regular`.
+        ValueError: If it is larger.
+    """
+    with open_regular(path) as file:
+        size = os.fstat(file.fileno()).st_size
+        if size > max_bytes:
+            raise ValueError(f"must have at most {max_bytes} bytes (got {size})")
+        return file.read()
+
+
 def _check_regular(number: int, path: str | Path) -> None:
     mode = os.fstat(number).st_mode
     if stat.S_ISDIR(mode):
@@ -196,11 +210,7 @@ def read_json(path: Path, max_bytes: int = MAX_JSON_BYTES) -> Any:
         OSError: If the file cannot be read.
         ValueError: If it is too large, too deep, or not JSON.
     """
-    with open_regular(path) as file:
-        size = os.fstat(file.fileno()).st_size
-        if size > max_bytes:
-            raise ValueError(f"must have at most {max_bytes} bytes (got {size})")
-        return parse_json(file.read())
+    return parse_json(read_regular(path, max_bytes))
 
 
 def parse_json(data: bytes) -> Any:

@@ -244,6 +244,13 @@ class TestJson:
         finally:
             assert signal.alarm(0) > 0
 
+    def test_a_report_shows_no_image_from_outside(self, out, outside):
+        image = next((out / "images").rglob("*.*"))
+        shutil.move(image, outside)
+        image.symlink_to(outside / image.name)
+        READERS["report"](out)
+        assert f"Frame {int(image.stem)}: its image cannot be read" in (out / "report.html").read_text()
+
     def test_a_report_shows_names_of_strays_that_are_not_utf_8(self, out):
         (out / "images/train" / os.fsdecode(b"caf\xe9.png")).write_bytes(b"")
         READERS["report"](out)

@@ -141,12 +141,12 @@ def _replaced(name: str, content: Callable[[], bytes]) -> Build:
 
 
 def _large(name: str, head: bytes = b"") -> Build:
-    """A file of a dataset of 8 GB that takes no room."""
+    """A file of a dataset of 3 GB that takes no room."""
 
     def build(place: Place) -> None:
         path = place.take_dataset() / name
         path.write_bytes(head)
-        os.truncate(path, 8 << 30)
+        os.truncate(path, 3 << 30)
 
     return build
 
@@ -243,11 +243,11 @@ BUILDS: Mapping[str, tuple[str, Build, tuple[str, ...]]] = {
     "label that is a pipe": ("wait for ever", _pipe("labels/train/000000.txt"), ("audit",)),
     "scene that is a pipe": ("wait for ever", _pipe("scene/scene.yaml"), ("audit", "report")),
     "lock that is a pipe": ("wait for ever", _pipe(".lock"), ("split", "merge", "resume")),
-    "description of 8 GB": ("fill memory", _large("dataset.json"), ("audit", "split")),
-    "manifest line of 8 GB": ("fill memory", _large("manifest.jsonl"), ("audit", "resume")),
-    "image of 8 GB": ("fill memory", _large("images/train/000000.png"), ("audit", "report")),
-    "labels of 8 GB": ("fill memory", _large("labels/train/000000.txt"), ("audit",)),
-    "annotations of 8 GB": ("fill memory", _large("annotations/instances_train.json", b"{"), ("audit",)),
+    "description of 3 GB": ("fill memory", _large("dataset.json"), ("audit", "split")),
+    "manifest line of 3 GB": ("fill memory", _large("manifest.jsonl"), ("audit", "resume")),
+    "image of 3 GB": ("fill memory", _large("images/train/000000.png"), ("audit", "report")),
+    "labels of 3 GB": ("fill memory", _large("labels/train/000000.txt"), ("audit",)),
+    "annotations of 3 GB": ("fill memory", _large("annotations/instances_train.json", b"{"), ("audit",)),
     "image bomb": ("fill memory", _replaced("images/train/000000.png", lambda: bomb(40_000)), ("audit", "report")),
     "image linked to a secret": ("show a picture from outside", _linked_image, ("report", "audit")),
 }

@@ -1,4 +1,4 @@
-"""A part that is drawn in code becomes an asset, falls into a tray, and comes out with its labels.
+"""Make an asset from a part that is modelled in code, drop it into a tray, and render labelled images.
 
 python examples/part_from_cad.py [FOLDER]
 """
@@ -22,7 +22,7 @@ bore = trimesh.creation.cylinder(radius=0.005, height=0.06)
 flange = trimesh.boolean.difference([trimesh.boolean.union([plate, hub]), bore])
 flange.visual.face_colors = (190, 110, 40, 255)
 
-# 1,000 Gaussians are quick to bake; leave `settings` out for 20,000.
+# 1,000 Gaussians bake quickly. Without `settings`, the asset has 20,000.
 result = ms.bake_asset(flange, name="flange", density=7800, settings=BakeSettings(gaussians=1000, sh_degree=1))
 result.asset.save(folder / "flange")
 print(f"baked: {result.psnr:.1f} dB against path-traced views")

@@ -1,8 +1,8 @@
-"""Masks, boxes and statistics of a dataset by pycocotools alone, as a trainer reads them.
+"""Read masks, boxes and statistics of a dataset by pycocotools alone, like a training program.
 
     python examples/read_labels.py [DATASET]
 
-Without a dataset it makes a small one.
+Without a dataset, the script renders a small one.
 """
 
 import sys

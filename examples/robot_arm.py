@@ -1,10 +1,10 @@
-"""A robot arm stepped by MuJoCo, filmed in the workcell: images, depth, ids of its links and optical flow.
+"""Render a robot arm that MuJoCo simulates in the workcell: images, depth, ids of its links and optical flow.
 
     python examples/robot_arm.py [FOLDER] [--frames N] [--size WIDTHxHEIGHT]
 
-Each link of `arm.xml`, whose shapes are boxes and cylinders, is baked as an asset of its own. In every frame the links
-are where MuJoCo has them: 4x4 matrices world_from_body, which a robot's own kinematics give as well. At last the frames
-become a dataset, which the audit checks.
+Each link of `arm.xml` consists of boxes and cylinders and is baked as an asset of its own. In every frame, the poses of
+the links are those of MuJoCo: 4x4 matrices world_from_body, which the kinematics of a robot also provide. Finally the
+frames are written as a dataset, which the audit checks.
 """
 
 import argparse
@@ -35,7 +35,7 @@ links = [model.body(number).name for number in range(1, model.nbody)]
 
 
 def shape_of(geom):
-    """A geom of MuJoCo in its body's frame."""
+    """Return a geom of MuJoCo as a mesh in the frame of its body."""
     make = {
         mujoco.mjtGeom.mjGEOM_BOX: lambda size: trimesh.creation.box(2 * size),
         mujoco.mjtGeom.mjGEOM_CYLINDER: lambda size: trimesh.creation.cylinder(size[0], 2 * size[1]),
@@ -72,7 +72,7 @@ scene = ms.make_scene(
 
 
 def layouts():
-    """Where the links are, every tenth of a second of a movement."""
+    """Yield the poses of the links at every tenth of a second of a movement."""
     while True:
         data.ctrl[:] = 0.9 * np.sin(3 * data.time + np.arange(model.nu))
         mujoco.mj_step(model, data, nstep=round(0.1 / model.opt.timestep))
@@ -100,5 +100,5 @@ flow = frames[0].flow
 moved = np.abs(flow).max(axis=2) < 1e9
 assert all(len(frame.labels.instances) == len(links) for frame in frames)
 assert np.abs(flow[moved & (frames[0].instance == len(links))]).max() > 0.3  # the forearm moves
-assert np.abs(flow[moved & (frames[0].instance == 0)]).max() < 1e-3  # and nothing of the cell does
+assert np.abs(flow[moved & (frames[0].instance == 0)]).max() < 1e-3  # and nothing of the workcell moves
 assert not audit_dataset(out).violations

@@ -1,10 +1,10 @@
-"""Images from where the robot's camera was: poses from a log become the views of a scene, each with its true pose.
+"""Render images from the recorded poses of a robot's camera; each image has its true pose.
 
     python examples/robot_poses.py [FOLDER]
 
-A log has a row for every photograph: position [m] and direction of view of the camera in the cell's frame, z up. What
-hand-eye calibration gives as a matrix `world_from_camera` (x right, y down, z forward) has them in its last and third
-column.
+The log has one row per photograph: position [m] and viewing direction of the camera in the frame of the workcell, z up.
+Hand-eye calibration gives a matrix `world_from_camera` (x right, y down, z forward), whose last and third columns
+contain these values.
 """
 
 import json

@@ -1,1 +1,1 @@
-"""Builds the shipped scene: parts and workcell as meshes with procedural materials, baked into assets."""
+"""Build the shipped scene: parts and workcell as meshes with procedural materials, baked into assets."""

@@ -1,4 +1,4 @@
-"""Bake the shipped scene's assets: ``python -m scenes.build [NAME ...] [--out FOLDER]``, all of them without a name."""
+"""Bake the assets of the shipped scene: ``python -m scenes.build [NAME ...] [--out FOLDER]``; all assets by default."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ ENVIRONMENT = "workcell"
 
 
 def bake_part(name: str, seed: int) -> BakeResult:
-    """One object, in the soft boxes of a studio, so that metal looks like metal before the scene's lights come on."""
+    """Bake one object under the soft boxes of a studio, so that metal looks like metal."""
     part, pieces = build_part(name, seed)
     return bake_asset(
         part,
@@ -38,7 +38,7 @@ def bake_part(name: str, seed: int) -> BakeResult:
 
 
 def bake_environment(seed: int) -> BakeResult:
-    """The workcell under the lights of ``stacks.yaml``, which is the one place that states them."""
+    """Bake the workcell under the lights of ``stacks.yaml``."""
     scene = build_workcell(seed)
     lights = load_yaml(SCENES / "stacks.yaml", SceneSpec).lights
     target = (0.0, -0.08, 0.01)
@@ -70,7 +70,7 @@ def bake_environment(seed: int) -> BakeResult:
 
 
 def _fit_offsets() -> list[tuple[float, float, float]]:
-    """Where the environment is looked at from: the range of the scene's camera, and a little beyond."""
+    """Return camera offsets for the fit of the environment: the range of the scene's camera with a margin."""
     directions = [(a, e, r) for r in (0.4, 0.68) for e in (25.0, 60.0) for a in (220.0, 250.0, 290.0, 320.0)]
     return [
         (
@@ -98,7 +98,7 @@ def main() -> None:
 
 
 def bake_all(arguments: argparse.Namespace) -> None:
-    """Bake, save, and say how close each is to its mesh."""
+    """Bake and save all assets, and print their error against their meshes."""
     parts: list[float] = []
     for name in arguments.names or [ENVIRONMENT, *PARTS]:
         start = time.perf_counter()

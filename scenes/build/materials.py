@@ -1,4 +1,4 @@
-"""Procedural textures, and meshes that wear them."""
+"""Procedural textures, and meshes with these textures."""
 
 from __future__ import annotations
 
@@ -149,7 +149,7 @@ def circular_text(text: str, *, paper: Colour, ink: Colour, radius: float, heigh
 def wear(
     mesh: trimesh.Trimesh, image: Pixels, uv: npt.NDArray[np.float64], *, roughness: float, metallic: float = 0.0
 ) -> trimesh.Trimesh:
-    """``mesh`` with a texture; ``uv`` are the coordinates of every face corner (F, 3, 2), v up."""
+    """Return ``mesh`` with a texture; ``uv`` are the coordinates of every face corner (F, 3, 2), v up."""
     worn = trimesh.Trimesh(mesh.triangles.reshape(-1, 3), np.arange(3 * len(mesh.faces)).reshape(-1, 3), process=False)
     material = PBRMaterial(
         baseColorTexture=Image.fromarray(image.round().astype(np.uint8)),
@@ -190,7 +190,7 @@ def decal(image: Pixels, size: tuple[float, float], pose: npt.NDArray[np.float64
 
 
 def subdivided(mesh: trimesh.Trimesh, longest: float) -> trimesh.Trimesh:
-    """Faces split until no edge is longer than ``longest``, so that detail can be told from face to face."""
+    """Split faces until no edge is longer than ``longest``, so that colours per face resolve the detail."""
     while mesh.edges_unique_length.max() > longest:
         mesh = mesh.subdivide()
     return mesh

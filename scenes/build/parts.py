@@ -34,8 +34,8 @@ def common(*solids: trimesh.Trimesh) -> trimesh.Trimesh:
 
 
 def welded(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
-    """Without the slivers of zero length that Boolean operations leave."""
-    # Rounded where possible, so that no two vertices are left whose distance a change of units could lose.
+    """Remove the slivers of zero length that Boolean operations leave."""
+    # Coordinates are rounded if possible, so that a change of units cannot merge two close vertices.
     for rounded in (True, False):
         tidy = trimesh.Trimesh(mesh.vertices, mesh.faces)
         for digits in (4, 3, 2):
@@ -340,11 +340,11 @@ PARTS: dict[str, tuple[Callable[[np.random.Generator], Parts], float]] = {
     "brass_fitting": (brass_fitting, 8500.0),
     "proximity_sensor": (proximity_sensor, 4000.0),
 }
-"""Class name: how to make it, and its density [kg/m^3]."""
+"""Builder and density [kg/m^3] of every class."""
 
 
 def build_part(name: str, seed: int) -> tuple[trimesh.Scene, Sequence[trimesh.Trimesh]]:
-    """One part as a scene of materials, and its convex pieces; in metres, the centre of volume at the origin."""
+    """Build one part as a scene of materials with its convex pieces, in metres, centred at the centre of volume."""
     make, _ = PARTS[name]
     parts = make(np.random.default_rng([seed, sorted(PARTS).index(name)]))
     pieces = COLLISION[name]()
@@ -355,7 +355,7 @@ def build_part(name: str, seed: int) -> tuple[trimesh.Scene, Sequence[trimesh.Tr
 
 
 def merged(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
-    """Geometry alone, vertices at one position merged."""
+    """Return the geometry without materials; vertices at equal positions are merged."""
     mesh = trimesh.Trimesh(mesh.vertices, mesh.faces)
     mesh.update_faces(np.diff(np.sort(mesh.faces, axis=1), axis=1).all(axis=1))
     return mesh

@@ -17,7 +17,7 @@ OUT = Path(__file__).resolve().parents[1] / "assets" / "real"
 
 @dataclass(frozen=True)
 class Capture:
-    """What a file does not say about the object in it: its longest extent [m], mass [kg], gloss, and a bottom."""
+    """Properties that a splat file does not state: longest extent [m], mass [kg], gloss, and the shape of its base."""
 
     file: str
     size: float
@@ -39,7 +39,7 @@ CAPTURES = {
 
 
 def build_capture(name: str, folder: Path) -> Asset:
-    """One capture as ``mitsplat import`` makes it: cleaned, in metres, z up, on its base, with a closed mesh."""
+    """Import one capture: cleaned, in metres, z up, on its base, with a closed mesh."""
     capture = CAPTURES[name]
     settings = ImportSettings(size=capture.size, flat_base=capture.flat_base)
     imported = import_splats(folder / capture.file, name=name, settings=settings, mass=capture.mass)

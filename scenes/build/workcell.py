@@ -1,4 +1,4 @@
-"""The environment: a robot's workstation, in metres, the table's top at z = 0 and the wall behind it at y > 0."""
+"""The environment: a robot workcell in metres, with the table top at z = 0 and the wall behind it at y > 0."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ MAT = (0.70, 0.50)
 MAT_CENTRE = (0.0, -0.10)
 WALL_Y = 0.43
 SINK = 0.0006
-"""How far solids reach into what they stand on [m], so that no two faces coincide."""
+"""Overlap of solids with the surface on which they stand [m], so that no two faces coincide."""
 
 DENSITY = {
     "mat": 1.0,
@@ -36,7 +36,7 @@ DENSITY = {
     "bin": 0.07,
     "paper": 0.6,
 }
-"""Gaussians per area relative to the mat's; every part that is not named has :data:`DENSITY_ELSEWHERE`."""
+"""Density of Gaussians relative to that of the mat; other parts have :data:`DENSITY_ELSEWHERE`."""
 DENSITY_ELSEWHERE = 0.10
 
 
@@ -50,7 +50,7 @@ def build_workcell(seed: int) -> trimesh.Scene:
 
 
 def densities(scene: trimesh.Scene) -> dict[str, float]:
-    """Relative density of Gaussians by part; what is printed needs more."""
+    """Return the relative density of Gaussians by part; printed parts need more."""
     return {name: DENSITY.get(name, 0.8 if name.endswith("label") else DENSITY_ELSEWHERE) for name in scene.geometry}
 
 

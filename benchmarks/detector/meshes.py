@@ -94,7 +94,7 @@ def developed(frame: Frame, radiance: np.ndarray, cover: np.ndarray, scene: Scen
         empty = cover == 1
     gain = np.median(frame.rgb[empty], axis=0) / np.maximum(np.median(radiance[empty], axis=0), 1e-6)
     linear = (gain * radiance + frame.rgb * (1 - cover[..., None])).astype(np.float32)
-    return develop(linear, frame.draws, scene.spec.composite, seed=frame.plan.seed)
+    return develop(linear, frame.plan.draws, scene.spec.composite, seed=frame.plan.seed)
 
 
 def _stands(scene: Scene, name: str) -> bool:

@@ -56,7 +56,7 @@ def grid(scene: ms.Scene) -> Layout:
 def truth_of(frame: ms.Frame) -> Truth:
     """The maps of a frame, with the silhouettes of its labels."""
     alone = {label.id: label.amodal for label in frame.labels.instances}
-    return Truth(frame.instance, frame.proxy_instance, alone, frame.depth)
+    return Truth(frame.instance, frame.layers.proxy_instance, alone, frame.depth)
 
 
 def clocks() -> np.ndarray:

@@ -43,7 +43,7 @@ def write_depth_sensor(files: FrameFiles) -> None:
 
 def write_normals(files: FrameFiles) -> None:
     """Write a frame's normal map."""
-    files.add_png(f"normals/{files.name}.png", normal_picture(files.frame.normal))
+    files.add_png(f"normals/{files.name}.png", normal_picture(files.frame.layers.normal))
 
 
 def write_flow(files: FrameFiles) -> None:

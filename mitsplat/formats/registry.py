@@ -69,7 +69,7 @@ def write_frame(frame: Frame, root: Path, spec: SceneSpec, catalogue: Catalogue,
     If the layout was ``given`` by the caller, the record contains no values that are drawn together with a layout.
     """
     plan, output = frame.plan, spec.output
-    ids = frame.instance if spec.labels.source == "splats" else frame.proxy_instance
+    ids = frame.instance if spec.labels.source == "splats" else frame.layers.proxy_instance
     if distractors := [instance.id for instance in frame.layout.instances if instance.class_index is None]:
         ids = np.where(np.isin(ids, distractors), ids.dtype.type(0), ids)
     record: Record = {
@@ -79,7 +79,7 @@ def write_frame(frame: Frame, root: Path, spec: SceneSpec, catalogue: Catalogue,
         "split": plan.split,
         "seed": plan.seed,
         "files": {},
-        "draws": dict(frame.draws),
+        "draws": dict(frame.plan.draws),
         "lights": [light.model_dump(mode="json") for light in plan.lights],
         "camera": frame.camera.to_json(),
         "labels": frame.labels.to_json(),

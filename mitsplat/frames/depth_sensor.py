@@ -30,7 +30,7 @@ def measure_depth(frame: Frame, sensor: DepthSensor) -> Float32Array:
     if isinstance(sensor, StereoSensor):
         return simulate_stereo(depth, frame.camera.fx, sensor, rng, frame.image)
     reflectance = np.clip(frame.layers.captured @ LUMINANCE, MIN_REFLECTANCE, 1.0)
-    return simulate_time_of_flight(depth, frame.camera, sensor, rng, reflectance, frame.normal)
+    return simulate_time_of_flight(depth, frame.camera, sensor, rng, reflectance, frame.layers.normal)
 
 
 def simulate_stereo(

@@ -20,7 +20,7 @@ UNKNOWN_FLOW = 1e10
 def optical_flow(
     depth: npt.NDArray[np.floating[Any]],
     camera: Camera,
-    following: Camera,
+    next_camera: Camera,
     ids: npt.NDArray[np.integer[Any]] | None = None,
     motions: Mapping[int, Float64Array | None] | None = None,
     belt: Belt | None = None,
@@ -33,7 +33,7 @@ def optical_flow(
     Args:
         depth: Depth along the optical axis [m], 0 for no surface, (H, W).
         camera: Camera of the depth image.
-        following: Camera of the next image.
+        next_camera: Camera of the next image.
         ids: Instance of every pixel, (H, W); required for moving objects.
         motions: For each moving instance, the world transform (4, 4) from its present to its next pose, or None if the
             instance is removed. Instances that are not listed do not move.
@@ -47,16 +47,16 @@ def optical_flow(
     pose = camera.world_from_camera
     points = np.concatenate([camera.ray_slopes(pixels) * z, z], axis=1) @ pose[:3, :3].T + pose[:3, 3]
     for instance, motion in (motions or {}).items():
-        shown = np.ravel(ids == instance)
+        mask = np.ravel(ids == instance)
         if motion is None:
-            known &= ~shown
+            known &= ~mask
         else:
-            points[shown] = points[shown] @ motion[:3, :3].T + motion[:3, 3]
+            points[mask] = points[mask] @ motion[:3, :3].T + motion[:3, 3]
     if belt is not None:
         points[np.ravel(ids == 0) & belt.on_surface(points)] += belt.interval * belt.velocity
-    moved, ahead = following.project(points)
-    known &= (ahead > following.near) & np.isfinite(moved).all(axis=1)
-    flow = np.where(known[:, None], moved - pixels, UNKNOWN_FLOW)
+    next_pixels, next_depth = next_camera.project(points)
+    known &= (next_depth > next_camera.near) & np.isfinite(next_pixels).all(axis=1)
+    flow = np.where(known[:, None], next_pixels - pixels, UNKNOWN_FLOW)
     return flow.reshape(height, width, 2).astype(np.float32)
 
 
@@ -87,19 +87,19 @@ def exposure_flow(
     else:
         x = ((columns - camera.cx) / camera.fx).astype(np.float32)[None, :]
         y = ((rows - camera.cy) / camera.fy).astype(np.float32)[:, None]
-    near = np.divide(1, depth, where=depth > 0, out=np.zeros(depth.shape, dtype=np.float32))
+    inverse_depth = np.divide(1, depth, where=depth > 0, out=np.zeros(depth.shape, dtype=np.float32))
     vx, vy, vz = np.multiply(motion["exposure"], motion["velocity"]).astype(np.float32)
     if moving is not None:
         belt, carried = moving
         rotation, centre = camera.world_from_camera[:3, :3], camera.centre
-        seen = np.stack(np.broadcast_arrays(x * depth, y * depth, depth), axis=-1) @ rotation.T + centre
-        on_belt = carried | belt.on_surface(seen.reshape(-1, 3)).reshape(height, width)
+        points = np.stack(np.broadcast_arrays(x * depth, y * depth, depth), axis=-1) @ rotation.T + centre
+        on_belt = carried | belt.on_surface(points.reshape(-1, 3)).reshape(height, width)
         # The motion field depends on the camera's motion relative to the pixel's surface.
         belt_motion = motion["exposure"] * (rotation.T @ belt.velocity)
         vx, vy, vz = (np.float32(v) - np.float32(w) * on_belt for v, w in zip((vx, vy, vz), belt_motion, strict=True))
     wx, wy, wz = np.radians(np.multiply(motion["exposure"], motion["rotation"])).astype(np.float32)
-    u = near * (x * vz - vx) + (x * y * wx - (1 + x * x) * wy + y * wz)
-    v = near * (y * vz - vy) + ((1 + y * y) * wx - x * y * wy - x * wz)
+    u = inverse_depth * (x * vz - vx) + (x * y * wx - (1 + x * x) * wy + y * wz)
+    v = inverse_depth * (y * vz - vy) + ((1 + y * y) * wx - x * y * wy - x * wz)
     if not distorted:
         return u * np.float32(camera.fx), v * np.float32(camera.fy)
     (x_down, x_right), (y_down, y_right) = np.gradient(x), np.gradient(y)
@@ -107,14 +107,14 @@ def exposure_flow(
     return (u * y_down - v * x_down) / determinant, (v * x_right - u * y_right) / determinant
 
 
-def instance_motions(before: Layout, after: Layout) -> dict[int, Float64Array | None]:
+def instance_motions(layout: Layout, next_layout: Layout) -> dict[int, Float64Array | None]:
     """Compute the motions of instances between two layouts, for :func:`optical_flow`."""
     motions: dict[int, Float64Array | None] = {}
-    next_poses = {instance.id: instance.world_from_object for instance in after.instances}
-    for instance in before.instances:
-        pose, following = instance.world_from_object, next_poses.get(instance.id)
-        if following is None:
+    next_poses = {instance.id: instance.world_from_object for instance in next_layout.instances}
+    for instance in layout.instances:
+        pose, next_pose = instance.world_from_object, next_poses.get(instance.id)
+        if next_pose is None:
             motions[instance.id] = None
-        elif not np.array_equal(pose, following):
-            motions[instance.id] = following @ np.linalg.inv(pose)
+        elif not np.array_equal(pose, next_pose):
+            motions[instance.id] = next_pose @ np.linalg.inv(pose)
     return motions

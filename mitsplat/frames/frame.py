@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from mitsplat.arrays import Float32Array
 from mitsplat.errors import InputError
-from mitsplat.frames.camera_response import BACKGROUND, Development, light_layers, start_development
+from mitsplat.frames.camera_response import Development, light_layers, start_development
 from mitsplat.frames.flow import exposure_flow, instance_motions, optical_flow
 from mitsplat.frames.light_properties import light_properties, white_irradiance
 from mitsplat.frames.scene_builder import SceneBuilder
@@ -25,21 +25,12 @@ from mitsplat.labels.labels import Labels, Truth, label_instances
 from mitsplat.labels.overlay import draw_labels
 from mitsplat.physics.settle import settle_layout
 from mitsplat.quality import Quality, resolve_quality
-from mitsplat.renderer.layers import (
-    Layers,
-    host_array,
-    make_integrator,
-    render_layers,
-    render_silhouettes,
-)
+from mitsplat.renderer.layers import Layers, host_array, make_integrator, render_layers, render_silhouettes
 from mitsplat.renderer.lazy_value import LazyValue
 from mitsplat.runtime.variant import ensure_variant, one_at_a_time
 from mitsplat.scene.layout import Layout
 from mitsplat.scene.planning.conveyor import carried_instances, layout_at_view
 from mitsplat.scene.planning.frame_plan import FramePlan, layout_of, plan_frame
-from mitsplat.scene.planning.layout_surroundings import (
-    draw_surroundings,
-)
 from mitsplat.scene.planning.object_appearance import ObjectAppearance, draw_appearances
 from mitsplat.scene.scene import Scene
 from mitsplat.scene.spec.light_spec import LightEntry
@@ -90,11 +81,6 @@ class Frame(LazyValue):
         return self.plan.camera
 
     @property
-    def draws(self) -> Mapping[str, float]:
-        """Random values by name."""
-        return self.plan.draws
-
-    @property
     def depth(self) -> Float32Array:
         """Depth along the optical axis [m], 0 for no surface, (H, W)."""
         return self.layers.depth
@@ -103,21 +89,6 @@ class Frame(LazyValue):
     def instance(self) -> npt.NDArray[np.uint16]:
         """Instance id per pixel from the splats, 0 for the environment, (H, W)."""
         return self.layers.instance
-
-    @property
-    def proxy_instance(self) -> npt.NDArray[np.uint16]:
-        """Instance id per pixel from the proxy meshes, 0 for the environment, (H, W)."""
-        return self.layers.proxy_instance
-
-    @property
-    def normal(self) -> Float32Array:
-        """World-space normal of the proxies, (H, W, 3)."""
-        return self.layers.normal
-
-    @property
-    def light(self) -> Float32Array:
-        """Factor of light and shadow on the linear colour, (H, W, 3)."""
-        return self.layers.light
 
     @property
     def flow(self) -> Float32Array | None:
@@ -274,7 +245,8 @@ class Renderer:
         with _timed(seconds, "render"):
             layers = render_layers(self.integrator, mitsuba_scene, plan.camera, seed=plan.seed)
         with _timed(seconds, "composite"):
-            linear = light_layers(layers, self.scene.spec.composite, self._background(layout, plan))
+            background = self.scene_builder.background(index, layout.index, plan.camera)
+            linear = light_layers(layers, self.scene.spec.composite, background)
             development = self._start_development(linear, layers, layout, plan)
         with _timed(seconds, "silhouettes"):
             silhouettes = render_silhouettes(
@@ -311,13 +283,6 @@ class Renderer:
         description = self.scene_builder.describe(layout, plan.lights, replaced_lights=replaced_lights, belt=plan.belt)
         # A scene has few parts, so that loading them serially is faster than waking threads.
         return mi.load_dict(description, parallel=False)
-
-    def _background(self, layout: Layout, plan: FramePlan) -> mi.Color3f | float:
-        """Return the linear background picture on the device, or the grey of scenes without one."""
-        background = draw_surroundings(self.scene.spec, plan.index, layout.index).background
-        if background is None:
-            return BACKGROUND
-        return self.scene_builder.background(background, plan.camera.width, plan.camera.height)
 
     def _start_development(self, linear: mi.Color3f, layers: Layers, layout: Layout, plan: FramePlan) -> Development:
         """Start the camera response on the device, with blur by the motion of the camera and of a belt."""

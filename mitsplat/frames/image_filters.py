@@ -63,14 +63,14 @@ def _bilinear(picture: mi.Float, shape: tuple[int, int], x: mi.Float, y: mi.Floa
     x, y = dr.clip(x, 0.0, width - 1.0), dr.clip(y, 0.0, height - 1.0)
     left, top = dr.minimum(mi.UInt32(x), max(0, width - 2)), dr.minimum(mi.UInt32(y), max(0, height - 2))
     right, down = x - mi.Float(left), y - mi.Float(top)
-    one, line = min(1, width - 1), min(1, height - 1) * width
+    next_column, next_row = min(1, width - 1), min(1, height - 1) * width
     corner = top * width + left
 
     def at(offset: int) -> mi.Vector4f:
         return dr.gather(mi.Vector4f, picture, corner + offset)
 
-    upper = at(0) * (1 - right) + at(one) * right
-    lower = at(line) * (1 - right) + at(line + one) * right
+    upper = at(0) * (1 - right) + at(next_column) * right
+    lower = at(next_row) * (1 - right) + at(next_row + next_column) * right
     return upper * (1 - down) + lower * down
 
 
@@ -97,8 +97,8 @@ def blur_along_flow(linear: mi.Color3f, shape: tuple[int, int], exposure_flow: P
 
     def sample(number: mi.UInt32) -> mi.Color3f:
         time = (mi.Float(number) + 0.5) / mi.Float(count) - 0.5
-        seen = _bilinear(picture, shape, x + time * right, y + time * down)
-        return mi.Color3f(seen.x, seen.y, seen.z)
+        colour = _bilinear(picture, shape, x + time * right, y + time * down)
+        return mi.Color3f(colour.x, colour.y, colour.z)
 
     return _sum_samples(count, sample, "motion") / mi.Float(count)
 
@@ -116,8 +116,8 @@ def correlate(linear: mi.Color3f, shape: tuple[int, int], kernel: Float32Array) 
     def sample(number: mi.UInt32) -> mi.Color3f:
         tap = dr.gather(mi.Vector4f, taps, number)
         column, row = dr.clip(x + mi.Int32(tap.x), 0, width - 1), dr.clip(y + mi.Int32(tap.y), 0, height - 1)
-        seen = dr.gather(mi.Vector4f, picture, mi.UInt32(row * width + column))
-        return tap.z * mi.Color3f(seen.x, seen.y, seen.z)
+        colour = dr.gather(mi.Vector4f, picture, mi.UInt32(row * width + column))
+        return tap.z * mi.Color3f(colour.x, colour.y, colour.z)
 
     return _sum_samples(count, sample, "motion blur")
 

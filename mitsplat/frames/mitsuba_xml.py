@@ -163,7 +163,7 @@ def render_xml(path: str | Path, out: str | Path, *, allow_outside: bool = False
             scene = mi.load_file(str(next(iter(names))))
             image = np.array(_render(path, scene))
         except RuntimeError as error:
-            raise InputError(one_sentence(path, str(error), names)) from error
+            raise InputError(describe_error(path, str(error), names)) from error
     suffix = picture.suffix.lower()
     bitmap = mi.Bitmap(image[..., :3] if suffix == ".exr" else develop(image[..., :3], {}))
     kind = getattr(mi.Bitmap.FileFormat, {".exr": "OpenEXR", ".jpg": "JPEG", ".png": "PNG"}[suffix])
@@ -197,7 +197,8 @@ class _RenderOne:
         return render_xml(self.path, self.out, allow_outside=self.allow_outside)
 
 
-def _render(path: Path, scene: Any) -> Any:
+def _render(path: Path, scene: mi.Scene) -> mi.TensorXf:
+    """Render a scene with its integrator and its first sensor."""
     from mitsplat.plugins.splat_proxy import SplatProxyIntegrator  # derives from a class of the variant
 
     if not scene.sensors():
@@ -219,18 +220,18 @@ _UNKNOWN = re.compile(r'unreferenced propert\w+ in (?P<kind>\w+) plugin of type 
 _PROPERTY = re.compile(r'- \S+ "(?P<name>[^"]+)"')
 
 
-def one_sentence(path: Path, message: str, stands_for: Mapping[Path, Path] | None = None) -> str:
+def describe_error(path: Path, message: str, original_paths: Mapping[Path, Path] | None = None) -> str:
     """Convert an error message of Mitsuba to one sentence with place, rule and value, without the call stack.
 
     Args:
         path: The scene.
         message: Text of Mitsuba's error.
-        stands_for: Original file of each file that Mitsuba has read.
+        original_paths: Original file of each file that Mitsuba has read.
     """
     place = str(path)
-    for found in _PLACE.finditer(message):  # an included file follows the files that include it
-        file = Path(found["file"])
-        place = f"{(stands_for or {}).get(file, file)}:{found['line']}"
+    for match in _PLACE.finditer(message):  # an included file follows the files that include it
+        file = Path(match["file"])
+        place = f"{(original_paths or {}).get(file, file)}:{match['line']}"
     unknown = _UNKNOWN.search(message)
     if unknown:
         names = ", ".join(repr(name) for name in _PROPERTY.findall(message[unknown.end() :]))
@@ -264,7 +265,7 @@ def _register_plugin_kinds() -> None:
     """Register the kinds of our plugins in a scalar variant, where Mitsuba's XML writer looks them up."""
     scalar = importlib.import_module("mitsuba.scalar_rgb")
 
-    def refuse(props: Any) -> Any:
+    def refuse(props: mi.Properties) -> None:
         raise RuntimeError(f"plugin {props.plugin_name()!r} needs an llvm or cuda variant")
 
     scalar.register_integrator("splat_proxy", refuse)

@@ -19,14 +19,16 @@ import trimesh
 from mitsplat.arrays import ByteImage, Float64Array
 from mitsplat.asset import Asset
 from mitsplat.frames.background import background_picture
+from mitsplat.frames.camera_response import BACKGROUND
 from mitsplat.gaussians.splat_cloud import Splats
+from mitsplat.geometry.camera import Camera
 from mitsplat.renderer.layers import device_array, make_splats_shape
 from mitsplat.renderer.scene_emitters import emitter_dict, movable
 from mitsplat.renderer.textures import bitmap_texture, finished_mesh, material, texture_image
 from mitsplat.scene.layout import Layout
 from mitsplat.scene.planning.conveyor import Belt
 from mitsplat.scene.planning.frame_lights import expand_rooms
-from mitsplat.scene.planning.layout_surroundings import BackgroundDraw, MaterialDraw, draw_surroundings
+from mitsplat.scene.planning.layout_surroundings import MaterialDraw, draw_surroundings
 from mitsplat.scene.planning.object_appearance import ObjectAppearance, draw_appearances
 from mitsplat.scene.scene import Scene
 from mitsplat.scene.spec.light_spec import EnvironmentLight, LightSpec
@@ -77,12 +79,13 @@ class SceneBuilder:
             **{f"light_{number}": self._emitter(light, movable_lights) for number, light in enumerate(lights)},
         }
 
-    def background(self, background: BackgroundDraw, width: int, height: int) -> mi.Color3f:
-        """Return the linear background picture on the device, flat and row-major."""
-        path, size = self._scene.images[background.image], (width, height)
-        return self._reuse(
-            "background", (background, size), lambda: device_array(background_picture(background, path, *size))
-        )
+    def background(self, index: int, layout: int, camera: Camera) -> mi.Color3f | float:
+        """Return the linear background picture of a frame on the device; a grey if the scene has no background."""
+        drawn, size = draw_surroundings(self._scene.spec, index, layout).background, (camera.width, camera.height)
+        if drawn is None:
+            return BACKGROUND
+        path = self._scene.images[drawn.image]
+        return self._reuse("background", (drawn, size), lambda: device_array(background_picture(drawn, path, *size)))
 
     def _surroundings(self, layout: int, belt: Belt | None) -> dict[str, mi.Shape]:
         """Return the shapes of the environment, and of visible shapes and proxies of the scene file."""

@@ -303,8 +303,8 @@ def _compare(name: str, result: _StepResult, reference: _StepResult) -> Row:
     difference = result.pictures.astype(np.float64) - reference.pictures
     rmse = float(np.sqrt(np.mean(difference**2)))
     ssim = [
-        structural_similarity(one, true, channel_axis=-1, data_range=1.0)  # type: ignore[no-untyped-call]
-        for one, true in zip(result.pictures, reference.pictures, strict=True)
+        structural_similarity(picture, exact, channel_axis=-1, data_range=1.0)  # type: ignore[no-untyped-call]
+        for picture, exact in zip(result.pictures, reference.pictures, strict=True)
     ]
     return Row(
         name,
@@ -351,14 +351,8 @@ def draw_chart(rows: Sequence[Row], file: Path, *, title: str, tolerance: float)
     axes = figure.add_subplot()
     least = min((row.rmse for row in rows if row.rmse > 0), default=1e-3) / 4
     errors = [max(row.rmse, least) for row in rows]
-    front = sorted(
-        (row.seconds, error)
-        for row, error in zip(rows, errors, strict=True)
-        if not any(
-            other.seconds <= row.seconds and e <= error and (other.seconds, e) != (row.seconds, error)
-            for other, e in zip(rows, errors, strict=True)
-        )
-    )
+    points = [(row.seconds, error) for row, error in zip(rows, errors, strict=True)]
+    front = sorted(p for p in points if not any(q != p and q[0] <= p[0] and q[1] <= p[1] for q in points))
     axes.step(*zip(*front, strict=True), where="post", color="0.7", zorder=1)
     axes.plot(*zip(*curve_of(rows, least), strict=True), color="C0", linewidth=1, zorder=1)
     chosen = cheapest(rows, tolerance)
@@ -378,13 +372,7 @@ def draw_chart(rows: Sequence[Row], file: Path, *, title: str, tolerance: float)
 
 def curve_of(rows: Sequence[Row], least: float = 0.0) -> list[tuple[float, float]]:
     """Return (seconds, error >= ``least``) of ``balanced`` at all its tolerances, in descending order."""
-    at = {
-        f"{_TOLERANCE_PREFIX}{PRESETS['balanced'].tolerance:g}" if row.name == "balanced" else row.name: row
-        for row in rows
-    }
-    known = {
-        float(name.removeprefix(_TOLERANCE_PREFIX)): row
-        for name, row in at.items()
-        if name.startswith(_TOLERANCE_PREFIX)
-    }
-    return [(row.seconds, max(row.rmse, least)) for _, row in sorted(known.items(), reverse=True)]
+    preset = f"{_TOLERANCE_PREFIX}{PRESETS['balanced'].tolerance:g}"
+    named = {preset if row.name == "balanced" else row.name: row for row in rows}
+    curve = {name.removeprefix(_TOLERANCE_PREFIX): named[name] for name in named if name.startswith(_TOLERANCE_PREFIX)}
+    return [(curve[key].seconds, max(curve[key].rmse, least)) for key in sorted(curve, key=float, reverse=True)]

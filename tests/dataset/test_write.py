@@ -194,7 +194,7 @@ class TestContent:
         colours = {f"{layer}.{axis}" for layer in ("light", "captured", "highlight") for axis in "RGB"}
         assert set(channels) == single | colours | {f"normal.{axis}" for axis in "XYZ"}
         np.testing.assert_array_equal(channels["R"], frame.rgb[..., 0])
-        np.testing.assert_array_equal(channels["normal.Y"], frame.normal[..., 1])
+        np.testing.assert_array_equal(channels["normal.Y"], frame.layers.normal[..., 1])
         np.testing.assert_array_equal(channels["instance"], frame.instance)
         assert channels["instance"].dtype == np.uint32
 

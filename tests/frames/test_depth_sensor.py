@@ -162,9 +162,9 @@ class TestTimeOfFlight:
 @pytest.mark.parametrize("sensor", [StereoSensor(), TimeOfFlightSensor()])
 def test_the_seed_of_the_frame_determines_the_noise(sensor: Any) -> None:
     depth = np.tile(np.linspace(0.8, 1.2, 128, dtype=np.float32), (96, 1))
-    layers = SimpleNamespace(captured=np.full((96, 128, 3), 0.5))
-    made = {"camera": CAMERA, "image": PLAIN, "layers": layers, "normal": np.zeros((96, 128, 3))}
-    frame: Any = SimpleNamespace(depth=depth, plan=SimpleNamespace(seed=5), **made)
+    layers = SimpleNamespace(captured=np.full((96, 128, 3), 0.5), normal=np.zeros((96, 128, 3)))
+    plan = SimpleNamespace(seed=5)
+    frame: Any = SimpleNamespace(depth=depth, plan=plan, camera=CAMERA, image=PLAIN, layers=layers)
     one, again = measure_depth(frame, sensor), measure_depth(frame, sensor)
     frame.plan.seed = 6
     np.testing.assert_array_equal(one, again)

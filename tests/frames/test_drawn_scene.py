@@ -42,8 +42,8 @@ def test_earlier_frames_of_a_renderer_do_not_change_a_frame(scene: ms.Scene) -> 
         with ms.Renderer(scene, quality="fast") as renderer:
             alone = renderer.render(index, layout=layouts[index // 3])
         np.testing.assert_array_equal(alone.image, frames[index].image)
-        np.testing.assert_array_equal(alone.light, frames[index].light)
-    assert (frames[6].light != frames[7].light).any()  # another turn of the same sky
+        np.testing.assert_array_equal(alone.layers.light, frames[index].layers.light)
+    assert (frames[6].layers.light != frames[7].layers.light).any()  # another turn of the same sky
 
 
 def test_the_manifest_records_the_drawn_lights(scene: ms.Scene, tmp_path: Path) -> None:

@@ -84,7 +84,7 @@ def test_silhouettes_equal_renderings_of_single_instances(
     data = {**scene_data, "shapes": [table], "labels": {"source": source}}
     chosen = ms.load_scene(write_scene(data, f"{source}.yaml"))
     frame = ms.render_frame(chosen, 1, layout=layout)
-    ids = frame.instance if source == "splats" else frame.proxy_instance
+    ids = frame.instance if source == "splats" else frame.layers.proxy_instance
     assert len(frame.labels.instances) >= 2
     for label in frame.labels.instances:
         x0, y0, x1, y1 = label.box
@@ -194,8 +194,8 @@ def test_invalid_xml_is_refused_in_one_sentence(tmp_path: Any) -> None:
 def test_a_frame_has_its_plan_and_layers(scene: ms.Scene, settled: dict[str, Any]) -> None:
     layout = layout_of_small_scene(scene, settled)
     frame = ms.render_frame(scene, 1, layout=layout)
-    assert (frame.index, frame.camera, frame.draws) == (1, frame.plan.camera, frame.plan.draws)
-    for name in ("depth", "instance", "proxy_instance", "normal", "light"):
+    assert (frame.index, frame.camera) == (1, frame.plan.camera)
+    for name in ("depth", "instance"):
         assert getattr(frame, name) is getattr(frame.layers, name)
     again = pickle.loads(pickle.dumps(frame))
     np.testing.assert_array_equal(again.image, frame.image)
@@ -217,7 +217,7 @@ def test_labels_transfer_only_ids_and_one_depth_to_the_host(
     assert names & vars(frame.layers).keys() == {"instance", "proxy_instance", depth}
     assert "rgb" not in vars(frame)
     np.testing.assert_array_equal(frame.rgb, light_image(frame.layers, chosen.spec.composite))
-    again = develop(frame.rgb, frame.draws, chosen.spec.composite, seed=frame.plan.seed)
+    again = develop(frame.rgb, frame.plan.draws, chosen.spec.composite, seed=frame.plan.seed)
     np.testing.assert_array_equal(again, frame.image)
 
 

@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 from mitsplat.asset import Asset
 from mitsplat.cli import app
 from mitsplat.errors import InputError
-from mitsplat.frames.mitsuba_xml import one_sentence, render_xml
+from mitsplat.frames.mitsuba_xml import describe_error, render_xml
 from mitsplat.frames.untrusted_xml import check_xml
 from mitsplat.runtime.variant import ensure_variant
 from tests.conftest import box_asset
@@ -115,15 +115,15 @@ def write(folder: Path, text: str) -> Path:
         (SCENE.format('<shape type="sphere"> <float name="radius"/> </shape>'), ":7: missing required attribute"),
     ],
 )  # fmt: skip
-def test_each_fault_of_a_scene_is_one_sentence_with_its_line(small: Path, text: str, sentence: str) -> None:
+def test_each_fault_of_a_scene_is_describe_error_with_its_line(small: Path, text: str, sentence: str) -> None:
     with pytest.raises(InputError, match=sentence) as caught:
         render_xml(write(small, text), small / "out.png")
     assert "\n" not in str(caught.value) and str(caught.value).startswith(f"{small}/scene.xml")
 
 
 def test_an_error_without_a_line_is_kept() -> None:
-    assert one_sentence(Path("a.xml"), "[scene.cpp:12] nothing works") == "a.xml: nothing works"
-    assert one_sentence(Path("a.xml"), "") == "a.xml: Mitsuba reported an error without a message"
+    assert describe_error(Path("a.xml"), "[scene.cpp:12] nothing works") == "a.xml: nothing works"
+    assert describe_error(Path("a.xml"), "") == "a.xml: Mitsuba reported an error without a message"
 
 
 def test_a_camera_with_shear_is_refused(small: Path) -> None:

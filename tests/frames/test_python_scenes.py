@@ -283,7 +283,7 @@ def test_given_lights_replace_those_of_the_scene(scene: ms.Scene) -> None:
 
     red = AreaLight(position=(0.5, 0, 1), colour=(1.0, 0.0, 0.0))
     one, other = lit([red]), lit([{"kind": "area", "position": [0.5, 0, 1], "colour": [1, 0, 0]}])
-    table = one.rgb[one.proxy_instance == 0]
+    table = one.rgb[one.layers.proxy_instance == 0]
     assert len(table) > 1000 and np.median(table[:, 0]) > 0.05 and not table[:, 1:].any()
     assert other.plan.lights == one.plan.lights == (red,)
     assert other.image.tobytes() == one.image.tobytes()

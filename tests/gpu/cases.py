@@ -131,7 +131,13 @@ def frame() -> Arrays:
         scene = drawn_scene(Path(folder), width=SIZE[0], height=SIZE[1])
         made = ms.render_frame(scene, 0, layout=scatter_boxes(scene, 0, progress=None))
     boxes = np.array([[label.id, *label.box] for label in made.labels.instances], dtype=np.float64)
-    return {"image": made.image, "instance": made.instance, "depth": made.depth, "light": made.light, "boxes": boxes}
+    return {
+        "image": made.image,
+        "instance": made.instance,
+        "depth": made.depth,
+        "light": made.layers.light,
+        "boxes": boxes,
+    }
 
 
 def drawn_scene(folder: Path, **output: Any) -> ms.Scene:

@@ -61,7 +61,7 @@ FAULTS = {
         replace(GOOD, splats=replace(GOOD.splats, sh=np.zeros((2000, 4, 3)))),
         "store degree 0",
     ),
-    "splats": (replace(GOOD, splats=changed(GOOD.splats, 2000, opacities=0.1)), "anew"),
+    "splats": (replace(GOOD, splats=changed(GOOD.splats, 2000, opacities=0.1)), "again"),
     "overlap": (replace(GOOD, mesh=GOOD.mesh.copy().apply_translation((0.03, 0, 0))), "register"),
     "offset": (replace(GOOD, mesh=GOOD.mesh.copy().apply_translation((0.005, 0, 0))), "register"),
     "watertightness": (replace(GOOD, mesh=OPEN), "close it"),

@@ -35,7 +35,6 @@ objects:
   - {asset: flange, count: 4}
 region: {min: [-0.05, -0.05, 0.03], max: [0.05, 0.05, 0.1]}
 enclosure: {margin: 0.03}
-settle: {stepper: mujoco}
 camera: {kind: orbit, target: [0, 0, 0.01], radius: 0.2, height: 0.25, intrinsics: {fov_x: 45}}
 lights:
   - {kind: area, position: [0.3, -0.3, 0.8], target: [0, 0, 0], size: [0.3, 0.3], radiance: 12}

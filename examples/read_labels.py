@@ -22,7 +22,7 @@ else:
     dataset = Path(tempfile.mkdtemp()) / "cell"
     output = {"width": 320, "height": 180, "layouts": 1, "views": 2, "formats": ["coco"]}
     path = Path(__file__).parents[1] / "scenes/workcell.yaml"
-    scene = ms.load_scene(path, overrides={"output": output, "settle.stepper": "mujoco"})
+    scene = ms.load_scene(path, overrides={"output": output})
     ms.write_dataset(scene, dataset)
 
 coco = COCO(dataset / "annotations/instances_train.json")

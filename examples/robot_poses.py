@@ -35,7 +35,6 @@ scene = ms.load_scene(
             "intrinsics": {"fx": 300.0, "fy": 300.0, "cx": 160.0, "cy": 90.0},
         },
         "output": {"width": 320, "height": 180, "layouts": 1, "views": len(log), "formats": ["coco", "poses"]},
-        "settle.stepper": "mujoco",
     },
 )
 out = folder / "cell"

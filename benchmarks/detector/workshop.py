@@ -126,7 +126,7 @@ def settled(work: Path, number: int, *, poured: bool) -> list[tuple[str, np.ndar
         "objects": [{"pool": "assets/*", "count": [10, 16] if poured else [8, 14]}],
         "region": {"min": [-half, -0.8 * half, 0.03], "max": [half, 0.8 * half, 0.3]},
         "enclosure": {"margin": 0.01 if poured else 0.15, "floor": 0.004 if poured else 0.0},
-        "settle": {"arrangement": "pile" if poured else "drop", "stepper": "mujoco", "attempts": 40},
+        "settle": {"arrangement": "pile" if poured else "drop", "attempts": 40},
         "camera": {"kind": "orbit", "target": [0, 0, 0], "radius": 0.6, "height": 0.4},
         "output": {"width": 64, "height": 48, "layouts": 1, "views": 1},
         "seed": 1000 + number,

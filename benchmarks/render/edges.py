@@ -32,7 +32,7 @@ SETTINGS = (1, "edges", 2, 4)
 def renderer(path: Path, width: int, height: int, samples: Any) -> ms.Renderer:
     """A renderer of the scene without the sensor's noise."""
     size = {"output.width": width, "output.height": height, "rendering.samples": samples, "randomise.iso": None}
-    return ms.Renderer(ms.load_scene(path, overrides={"settle.stepper": "mujoco", **size}))
+    return ms.Renderer(ms.load_scene(path, overrides=size))
 
 
 def shown(frame: ms.Frame, fold: int = 1) -> Float32Array:

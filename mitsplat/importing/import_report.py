@@ -186,7 +186,7 @@ objects:
   - {{asset: {asset}, count: [1, 2]}}
 region: {{min: [-{reach}, -{reach}, {low}], max: [{reach}, {reach}, {top}]}}
 enclosure: {{}}
-settle: {{arrangement: upright, stepper: mujoco}}  # as it stands; `drop` lets it tumble
+settle: {{arrangement: upright}}  # as it stands; `drop` lets it tumble
 
 camera:
   kind: hemisphere
@@ -213,7 +213,6 @@ objects:
   - {{pool: primitives, count: [2, 5]}}
 region: {{min: [-{x}, -{y}, 0.04], max: [{x}, {y}, 0.25]}}
 enclosure: {{}}
-settle: {{stepper: mujoco}}
 
 camera:
   kind: hemisphere

@@ -72,7 +72,7 @@ def settle_layout(scene: Scene, index: int, *, progress: Note | None = None, cac
     if cached:
         with suppress(OSError, ValueError, KeyError, TypeError):  # a damaged or missing file is replaced
             return Layout.from_json(json.loads(path.read_bytes()))
-    with warp_settings(progress):
+    with warp_settings(progress if scene.spec.settle.stepper == "warp" else None):
         from mitsplat.physics.drop import drop_of  # Newton reads these settings when it compiles
 
         layout = drop_of(scene, progress or (lambda text: None)).settle(index)

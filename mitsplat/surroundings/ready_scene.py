@@ -131,7 +131,6 @@ objects:
   - {{pool: primitives, count: [3, 6]}}
 region: {{min: [{x0}, {y0}, 0.04], max: [{x1}, {y1}, 0.25]}}
 enclosure: {{margin: {margin}}}
-settle: {{stepper: mujoco}}
 
 camera:  # similar to the cameras of the photos
   kind: hemisphere

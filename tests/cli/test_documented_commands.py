@@ -119,7 +119,6 @@ def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name in (*parts, shipped["environment"]):
         shutil.copytree(ROOT / "scenes" / name, folder / "scenes" / name)
     shipped["objects"] = [{"asset": name} for name in parts]
-    shipped["settle"] = {"stepper": "mujoco"}
     shipped["output"] |= {"width": 128, "height": 72, "layouts": 12, "views": 1}
     for name in ("workcell", "tray"):
         YAML(typ="safe", pure=True).dump(shipped, folder / f"scenes/{name}.yaml")

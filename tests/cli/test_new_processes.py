@@ -144,7 +144,7 @@ print(json.dumps(failed))
 
 
 def small(scene: dict[str, object]) -> dict[str, object]:
-    return scene | {"settle": {"stepper": "mujoco"}, "output": {"width": 32, "height": 24, "layouts": 3, "views": 1}}
+    return scene | {"output": {"width": 32, "height": 24, "layouts": 3, "views": 1}}
 
 
 @pytest.fixture

@@ -25,7 +25,6 @@ from tests.conftest import WriteScene, box_asset
 
 SceneData = dict[str, Any]
 
-SETTLE = {"stepper": "mujoco"}
 
 
 def lying(scene: ms.Scene, index: int, **_: Any) -> Layout:
@@ -50,7 +49,6 @@ def places(scene_data: SceneData, write_scene: WriteScene, tmp_path: Path) -> Sc
     scene_data |= {
         "environment": "assets/cell_*",
         "background": {"images": "*.png"},
-        "settle": SETTLE,
         "objects": [{"asset": "assets/nut", "scale": 4}],
     }
     table = {"size": [0.4, 0.4, 0.1], "position": [0, 0, -0.05], "rotate": [0, 0, 10]}

@@ -19,7 +19,6 @@ from mitsplat.frames.torch_dataset import FrameStream, sample_of  # noqa: E402 -
 
 @pytest.fixture
 def scene(scene_data: dict[str, Any], write_scene: WriteScene) -> Scene:
-    scene_data["settle"] = {"stepper": "mujoco"}
     scene_data["output"] = {"width": 64, "height": 48, "layouts": 1, "views": 2}
     scene_data["objects"] = [{"asset": "assets/nut", "scale": 6.0}]
     return load_scene(write_scene(scene_data))

@@ -158,7 +158,6 @@ def drawn_scene(folder: Path, **output: Any) -> ms.Scene:
         "camera": {"kind": "orbit", "target": [0, 0, 0], "radius": 0.7, "height": 0.6},
         "lights": [{"kind": "area", "position": [0.5, 0, 1]}, {"kind": "environment", "radiance": 0.5}],
         "randomise": {"iso": [400, 400], "vignetting": [0.1, 0.1], "motion_blur": [2, 2]},
-        "settle": {"stepper": "mujoco"},
         "output": output,
         "seed": 7,
     }

@@ -65,7 +65,7 @@ def test_a_pile_fills_a_bin(scene_data, write_scene):
         write_scene,
         objects=[{"asset": "assets/nut", "count": 7}, {"asset": "assets/bolt", "count": 5}],
         region={"min": [-0.04, -0.03, 0.02], "max": [0.04, 0.03, 0.06]},
-        settle={"arrangement": "pile", "stepper": "mujoco"},
+        settle={"arrangement": "pile"},
     )
     assert len(layout.instances) == 12
     positions = np.array([instance.world_from_object[:3, 3] for instance in layout.instances]) - [0, 0, 0.004]
@@ -91,7 +91,7 @@ def test_scattered_objects_do_not_touch(scene_data, write_scene):
         scene_data,
         write_scene,
         objects=[{"asset": "assets/nut", "count": 6}, {"asset": "assets/bolt", "count": 3}],
-        settle={"arrangement": "scatter", "stepper": "mujoco"},
+        settle={"arrangement": "scatter"},
     )
     assert min(pair.distance for pair in placed_clearances(scene, layout)) > 5e-4
 
@@ -112,7 +112,7 @@ def test_placed_objects_start_below_the_lid_of_an_enclosure(scene_data, write_sc
     """They start at the region's top, where the lid is, but stand on the ground from the first moment on."""
     scene_data["objects"] = [{"asset": "assets/nut", "count": 2}]
     scene_data["enclosure"] = {"margin": 0.05}
-    settle = {"arrangement": arrangement, "stepper": "mujoco", "attempts": 1}
+    settle = {"arrangement": arrangement, "attempts": 1}
     _, layout = drop_layout(scene_data, write_scene, settle=settle)
     assert layout.certificate.time_to_rest < 0.1
 
@@ -120,7 +120,7 @@ def test_placed_objects_start_below_the_lid_of_an_enclosure(scene_data, write_sc
 def test_upright_objects_keep_their_vertical(scene_data, write_scene):
     """Bolts of 10 x 10 x 50 mm, which lie down when dropped, stand: the vertical stays, its turn is random."""
     scene_data["objects"] = [{"asset": "assets/bolt", "count": 5}]
-    _, layout = drop_layout(scene_data, write_scene, settle={"arrangement": "upright", "stepper": "mujoco"})
+    _, layout = drop_layout(scene_data, write_scene, settle={"arrangement": "upright"})
     poses = np.array([instance.world_from_object for instance in layout.instances])
     np.testing.assert_allclose(poses[:, 2, 2], 1.0, atol=1e-4)
     np.testing.assert_allclose(poses[:, 2, 3], 0.025, atol=3e-4)
@@ -134,7 +134,7 @@ def test_packed_objects_stand_in_rows(scene_data, write_scene):
     """
     scene_data["objects"] = [{"asset": "assets/bolt", "count": 9}]
     scene_data["region"] = {"min": [-0.03, -0.03, 0.0], "max": [0.03, 0.03, 0.08]}
-    scene, layout = drop_layout(scene_data, write_scene, settle={"arrangement": "packed", "stepper": "mujoco"})
+    scene, layout = drop_layout(scene_data, write_scene, settle={"arrangement": "packed"})
     poses = np.array([instance.world_from_object for instance in layout.instances])
     np.testing.assert_allclose(poses[:, 2, 2], 1.0, atol=1e-4)
     turns = np.degrees(np.arctan2(poses[:, 1, 0], poses[:, 0, 0]))
@@ -147,13 +147,13 @@ def test_packed_objects_stand_in_rows(scene_data, write_scene):
     assert min(gaps) > 5e-4 and nearest.max() < 0.0165
     scene_data["objects"][0]["count"] = 40
     with pytest.raises(InputError, match=r"region must be large enough .* settle.arrangement packed"):
-        drop_layout(scene_data, write_scene, settle={"arrangement": "packed", "stepper": "mujoco"})
+        drop_layout(scene_data, write_scene, settle={"arrangement": "packed"})
 
 
 def test_a_tower_stands_on_its_widest_object(scene_data, write_scene):
     """A bolt of 50 mm stands on three nuts of 10 mm, whatever order they are listed in; each is turned for itself."""
     scene_data["objects"] = [{"asset": "assets/bolt", "count": 1}, {"asset": "assets/nut", "count": 3}]
-    _, layout = drop_layout(scene_data, write_scene, settle={"arrangement": "tower", "stepper": "mujoco"})
+    _, layout = drop_layout(scene_data, write_scene, settle={"arrangement": "tower"})
     poses = {one.asset: [] for one in layout.instances}
     for one in layout.instances:
         poses[one.asset].append(one.world_from_object)
@@ -164,13 +164,13 @@ def test_a_tower_stands_on_its_widest_object(scene_data, write_scene):
     assert np.ptp(np.arctan2(nuts[:, 1, 0], nuts[:, 0, 0])) > 0.1
     scene_data["objects"][1]["count"] = 30
     with pytest.raises(InputError, match=r"region must be large enough .* settle.arrangement tower"):
-        drop_layout(scene_data, write_scene, settle={"arrangement": "tower", "stepper": "mujoco"})
+        drop_layout(scene_data, write_scene, settle={"arrangement": "tower"})
 
 
 @pytest.mark.parametrize("arrangement", ["upright", "tower", "packed"])
 def test_yaw_limits_the_direction_of_fronts(scene_data, write_scene, arrangement):
     scene_data["objects"] = [{"asset": "assets/nut", "count": 8}]
-    settle = {"arrangement": arrangement, "stepper": "mujoco", "yaw": [80, 110]}
+    settle = {"arrangement": arrangement, "yaw": [80, 110]}
     _, layout = drop_layout(scene_data, write_scene, settle=settle)
     poses = np.array([instance.world_from_object for instance in layout.instances])
     turns = np.degrees(np.arctan2(poses[:, 1, 0], poses[:, 0, 0]))
@@ -206,7 +206,7 @@ def test_standing_turns_are_those_of_stable_sides(mesh, quarters):
 def test_turned_over_places_objects_on_other_sides(scene_data, write_scene, tmp_path, arrangement):
     box_asset("block", (0.05, 0.03, 0.04)).save(tmp_path / "assets/block")
     scene_data["objects"] = [{"asset": "assets/block", "count": 3}]
-    settle = {"arrangement": arrangement, "stepper": "mujoco", "yaw": [-10, 10], "turned_over": 0.8}
+    settle = {"arrangement": arrangement, "yaw": [-10, 10], "turned_over": 0.8}
     _, layout = drop_layout(scene_data, write_scene, settle=settle)
     poses = np.array([instance.world_from_object for instance in layout.instances])
     assert (poses[:, 1, 1] > np.cos(np.radians(11))).all()  # fronts stay where yaw has them
@@ -221,7 +221,7 @@ def test_objects_with_given_poses_stay_there(scene_data, write_scene):
         {"position": [0.05, 0.02, 0.0153], "rotate": [0, 0, 30]},
     ]
     scene_data["objects"] = [{"asset": "assets/nut", "poses": given}, {"asset": "assets/bolt", "count": 2}]
-    _, layout = drop_layout(scene_data, write_scene, settle={"stepper": "mujoco"})
+    _, layout = drop_layout(scene_data, write_scene)
     assert len(layout.instances) == 4
     for i, instance in enumerate(layout.instances[:2]):
         expected = pose_at((0.05, 0.02, 0.005 + 0.01 * i), Rotation.from_euler("z", 30, degrees=True))
@@ -261,7 +261,7 @@ def shelf(scene_data):
         {"asset": "assets/bolt", "count": 2, "region": "bin"},
         {"asset": "assets/nut", "count": 2, "region": ["main", "board"]},
     ]
-    return {**scene_data, "enclosure": {"margin": 0.03}, "settle": {"stepper": "mujoco"}}
+    return {**scene_data, "enclosure": {"margin": 0.03}}
 
 
 def test_each_object_lies_in_its_region(shelf, write_scene):

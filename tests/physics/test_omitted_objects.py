@@ -28,7 +28,7 @@ def needle_scene(scene_data, write_scene, tmp_path):
     cone.invert()
     replace(box_asset("needle"), mesh=cone, pieces=()).save(tmp_path / "assets/needle")
     scene_data["objects"] = [{"asset": "assets/needle"}, {"asset": "assets/nut", "count": 2}]
-    scene_data["settle"] = {"arrangement": "upright", "attempts": 2, "stepper": "mujoco"}
+    scene_data["settle"] = {"arrangement": "upright", "attempts": 2}
     return write_scene
 
 
@@ -69,7 +69,7 @@ def test_an_object_higher_than_the_region_is_omitted(scene_data, write_scene, tm
     monkeypatch.setattr(placement, "_MAX_DRAWS", 2)
     box_asset("plank", (0.02, 0.02, 0.3)).save(tmp_path / "assets/plank")
     scene_data["objects"] = [{"asset": "assets/nut"}, {"asset": "assets/plank"}]
-    scene_data["settle"] = {"arrangement": "upright", "attempts": 1, "stepper": "mujoco"}
+    scene_data["settle"] = {"arrangement": "upright", "attempts": 1}
     scene = load_scene(write_scene(scene_data))
     layout = settle_layout(scene, 0, cached=False)
     assert [one.id for one in layout.instances] == [1]
@@ -83,7 +83,7 @@ def test_an_object_without_room_beside_others_is_omitted(scene_data, write_scene
     box_asset("tile", (0.04, 0.04, 0.01)).save(tmp_path / "assets/tile")
     scene_data["objects"] = [{"asset": "assets/tile", "count": 5}]
     scene_data["region"] = {"min": [-0.045, -0.045, 0.01], "max": [0.045, 0.045, 0.03]}
-    scene_data["settle"] = {"arrangement": "packed", "stepper": "mujoco"}
+    scene_data["settle"] = {"arrangement": "packed"}
     layout = settle_layout(load_scene(write_scene(scene_data)), 0, cached=False)
     assert [one.id for one in layout.instances] == [1, 2, 3, 4]
     assert [(one.id, one.reason) for one in layout.left_out] == [(5, "no room for all in 1 of 1 draws")]

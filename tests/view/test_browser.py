@@ -70,7 +70,6 @@ def scene_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = folder / "scene.yaml"
     data = YAML(typ="safe").load(path)
     data["shapes"] = [{"name": "table", "box": {"size": [1, 1, 0.1], "position": [0, 0, -0.05]}}]
-    data["settle"] = {"stepper": "mujoco"}
     data["quality"] = "fast"
     YAML(typ="safe", pure=True).dump(data, path)
     return path

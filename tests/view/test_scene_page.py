@@ -73,7 +73,6 @@ def shown(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Shown]:
     data = YAML(typ="safe").load(path)
     data["shapes"] = [{"name": "table", "box": {"size": [1, 1, 0.1], "position": [0, 0, -0.05]}, "visible": True}]
     data["lights"] = [{"kind": "area", "position": [0.5, 0, 1]}]
-    data["settle"] = {"stepper": "mujoco"}
     write(path, data)
     page = Page("test", Address(port=0), gaussians=100)
     told = Told()

@@ -25,7 +25,6 @@ shapes:
 camera: {kind: orbit, target: [0, 0, 0], radius: 0.2, height: 0.2}
 lights:
   - {kind: area, position: [0.5, 0, 1]}
-settle: {stepper: mujoco}
 output: {width: 64, height: 48, layouts: 1, views: 2, formats: [yolo, coco]}
 seed: 7
 """

@@ -229,7 +229,7 @@ def measure_rest(count: int) -> None:
         times, moved, total = [], 0, 0
         for seed in range(count):
             assets, _ = draw_objects(drop.scene, 0)
-            world = drop._world(assets, drop._draw_frictions(0), 1.0)
+            world = drop._world(assets, 1.0)
             world.reset(drop.draw_poses(assets, np.random.default_rng(seed)))
             outcome = run_to_rest(world, max_time=6.0, bounds=drop._grounds[0].bounds)
             if outcome.rejection:
@@ -260,7 +260,7 @@ def measure_rest(count: int) -> None:
 def measure_worlds(count: int, device: str) -> None:
     """Layouts of ten objects in one simulation of 1, 8, 64 and 256 worlds, ``count`` at most, on any Warp device."""
     from benchmarks.physics.worlds import time_worlds
-    from mitsplat.physics.drop import drop_of
+    from mitsplat.physics.drop import TIMESTEP, drop_of
 
     scene = make_scene(parts(), 2, "warp")
     drop = drop_of(scene, lambda text: None)
@@ -272,7 +272,7 @@ def measure_worlds(count: int, device: str) -> None:
         drop._grounds[0].colliders,
         starts,
         drop._grounds[0].bounds,
-        timestep=scene.spec.settle.timestep,
+        timestep=TIMESTEP,
         device=device,
     )
 

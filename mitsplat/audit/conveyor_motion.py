@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from mitsplat.arrays import Float64Array
-from mitsplat.audit.decoded_frame import DecodedFrame, camera_slots
+from mitsplat.audit.decoded_frame import DecodedFrame
 from mitsplat.storage.files import JsonObject
 
 _MAX_DEPTH = 1e-3
@@ -29,8 +27,7 @@ class BeltMotion:
             return
         self._box = next(shape["box"] for shape in scene["shapes"] if shape["name"] == self._conveyor["belt"])
         self._turn = Rotation.from_euler("xyz", self._box["rotate"], degrees=True)
-        self._views_per_step = len(camera_slots(scene))
-        self._last_step = math.ceil(scene["output"]["views"] / self._views_per_step) - 1
+        self._last_view = scene["output"]["views"] - 1
 
     def carries(self, pose: Float64Array) -> bool:
         """Return True if the belt carries an object at a pose (4, 4), because the object's origin is above the belt."""
@@ -49,5 +46,5 @@ class BeltMotion:
 
     def _travel(self, frame: DecodedFrame) -> Float64Array:
         assert self._conveyor is not None  # noqa: S101
-        time = self._conveyor["interval"] * (frame.record["view"] // self._views_per_step - self._last_step / 2)
+        time = self._conveyor["interval"] * (frame.record["view"] - self._last_view / 2)
         return np.asarray(time * self._conveyor["speed"] * self._turn.apply((1.0, 0.0, 0.0)))

@@ -19,12 +19,6 @@ from mitsplat.images.masks import Box, decode_rle
 from mitsplat.storage.files import JsonObject, Record
 
 
-def camera_slots(scene: JsonObject) -> list[tuple[int, int]]:
-    """Return camera position and side for each view of a turn; side is 1 for the right camera of a pair."""
-    cameras = enumerate((scene["camera"], *scene.get("cameras", ())))
-    return [(number, side) for number, camera in cameras for side in range(2 if camera.get("stereo") else 1)]
-
-
 @dataclass(frozen=True, eq=False)
 class DecodedInstance:
     """Instance of a frame.

@@ -5,12 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 from itertools import chain
 
-import cv2
 import numpy as np
 
-from mitsplat.arrays import Float64Array
 from mitsplat.audit.dataset_check import DatasetCheck, Violations
-from mitsplat.audit.decoded_frame import DecodedFrame, camera_slots
+from mitsplat.audit.decoded_frame import DecodedFrame
 from mitsplat.storage.files import JsonObject
 
 _SIGMAS = 6.0
@@ -24,8 +22,7 @@ class SceneCheck(DatasetCheck):
 
     def __init__(self, content: JsonObject) -> None:
         scene = content["scene"]
-        self._cameras, self._output = (scene["camera"], *scene.get("cameras", ())), scene["output"]
-        self._slots = camera_slots(scene)
+        self._camera, self._output = scene["camera"], scene["output"]
         self._distractors = set(content.get("distractors", ()))
         self._held_out = _held_out(content["scene"])
         self._checks_cameras = not content.get("given", False)
@@ -36,10 +33,6 @@ class SceneCheck(DatasetCheck):
             yield f"manifest.jsonl, frame {frame.index}", text
 
     def _check_camera(self, frame: DecodedFrame) -> Iterator[str]:
-        viewpoint, (number, right) = _viewpoint(frame), self._camera_slot(frame)
-        sides = ("left", "right") if self._cameras[number].get("stereo") else (None, None)
-        if (viewpoint.get("camera", 0), viewpoint.get("side")) != (number, sides[right]):
-            yield "its camera is not the scene's camera for this view"
         yield from self._check_lens(frame)
         yield from self._check_camera_pose(frame)
 
@@ -65,12 +58,7 @@ class SceneCheck(DatasetCheck):
             yield f"has {len(frame.instances)} labels, although its layout is empty"
 
     def _check_lens(self, frame: DecodedFrame) -> Iterator[str]:
-        camera, viewpoint = self._camera_of(frame), _viewpoint(frame)
-        lens, (width, height) = camera["intrinsics"], (self._output["width"], self._output["height"])
-        low, high = camera.get("zoom", (1.0, 1.0))
-        zoom = viewpoint.get("zoom", low)
-        if not low <= zoom <= high or (low < high and "zoom" not in viewpoint):
-            yield f"its zoom must be stated and within the scene's {low:g} to {high:g} (got {viewpoint.get('zoom')})"
+        lens, (width, height) = self._camera["intrinsics"], (self._output["width"], self._output["height"])
         full_width, full_height = lens["size"] or (width, height)
         if lens["fov_x"] is not None:
             fx = fy = full_width / (2 * np.tan(np.radians(lens["fov_x"]) / 2))
@@ -79,48 +67,20 @@ class SceneCheck(DatasetCheck):
         cx = full_width / 2 if lens["cx"] is None else lens["cx"]
         cy = full_height / 2 if lens["cy"] is None else lens["cy"]
         scale = np.diag([width / full_width, height / full_height, 1.0])
-        expected = scale @ [[zoom * fx, 0, cx], [0, zoom * fy, cy], [0, 0, 1]]
+        expected = scale @ [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]
         if np.abs(frame.intrinsics - expected).max() > 1e-9 * max(fx, fy, width, height):
             yield f"its intrinsics are not the scene's, {expected[0, 0]:.6g}, {expected[1, 1]:.6g} px"
         if list(frame.distortion) != list(lens["distortion"]) or frame.record["camera"]["lens"] != lens["lens"]:
             yield "its lens distortion is not the scene's"
 
-    def _camera_of(self, frame: DecodedFrame) -> JsonObject:
-        """Return the camera of the scene that took a frame."""
-        camera: JsonObject = self._cameras[self._camera_slot(frame)[0]]
-        return camera
-
-    def _camera_slot(self, frame: DecodedFrame) -> tuple[int, bool]:
-        """Return the position of a frame's camera in the scene, and True for the right camera of a stereo pair."""
-        number, side = self._slots[frame.record["view"] % len(self._slots)]
-        return number, side == 1
-
-    def _view_of_camera(self, frame: DecodedFrame) -> tuple[int, int]:
-        """Return the position of a frame among the views of its camera in the layout, and the number of these views."""
-        turn, slot = divmod(frame.record["view"], len(self._slots))
-        return turn, len(range(slot, self._output["views"], len(self._slots)))
-
-    def _steady_pose(self, frame: DecodedFrame) -> Float64Array:
-        """Return the pose of a frame's camera without hand-held motion; a right camera is moved to its left camera."""
-        pose = np.array(frame.world_from_camera, dtype=np.float64)
-        number, right = self._camera_slot(frame)
-        if right:
-            pose[:3, 3] -= self._cameras[number]["stereo"]["baseline"] * pose[:3, 0]
-        if (motion := _viewpoint(frame).get("handheld")) is not None:
-            moved = np.eye(4)
-            moved[:3, :3], _ = cv2.Rodrigues(np.radians(motion[3:]))
-            moved[:3, 3] = motion[:3]
-            pose = pose @ np.linalg.inv(moved)
-        return pose
-
     def _check_camera_pose(self, frame: DecodedFrame) -> Iterator[str]:
         """Check the camera's position and direction: distance and direction to the target, or the ends of a path."""
-        camera, pose = self._camera_of(frame), self._steady_pose(frame)
+        camera, pose = self._camera, np.array(frame.world_from_camera, dtype=np.float64)
         eye, axis = pose[:3, 3], pose[:3, 2]
         if camera["kind"] == "path":
-            turn, turns = self._view_of_camera(frame)
-            ends = {0: camera["keys"][0], turns - 1: camera["keys"][-1]}
-            if (key := ends.get(turn)) is None or turns == 1:
+            views = self._output["views"]
+            ends = {0: camera["keys"][0], views - 1: camera["keys"][-1]}
+            if (key := ends.get(frame.record["view"])) is None or views == 1:
                 return
             away = float(np.linalg.norm(eye - key["eye"]))
             if away > _SIGMAS * camera["jitter"] + _POSITION_TOLERANCE:

@@ -46,7 +46,6 @@ class _Scene(_Stored):
     name: str
     seed: Count
     camera: CameraSpec
-    cameras: tuple[CameraSpec, ...] = ()
     labels: LabelRules
     output: Output
 
@@ -151,20 +150,12 @@ class _Predicted(_Stored):
 
 class _Motion(_Stored):
     exposure: Annotated[float, Field(gt=0)]
-    velocity: Point
-    rotation: Point
 
 
 class _Viewpoint(_Stored):
     """Drawn values of a camera, in the units of :class:`mitsplat.scene.planning.viewpoints.Viewpoint`."""
 
-    camera: Count = 0
-    side: Literal["left", "right"] | None = None
-    zoom: Annotated[float, Field(gt=0)] | None = None
-    aperture: Annotated[float, Field(ge=0)] | None = None
-    focus: Annotated[float, Field(gt=0)] | None = None
     motion: _Motion | None = None
-    handheld: tuple[float, float, float, float, float, float] | None = None
     target: Point | None = None
     object: Annotated[int, Field(ge=1, le=65535)] | None = None
     attempt: Count = 0
@@ -187,8 +178,6 @@ class _Finish(_Stored):
     scale: Annotated[float, Field(gt=0)]
     rotate: float
     offset: tuple[float, float]
-    roughness: Share | None = None
-    gain: Annotated[float, Field(gt=0)] | None = None
     image: str | None = None
     seed: Count
 
@@ -267,7 +256,7 @@ def read_content(root: Path) -> dict[str, Any]:
         )
     if not (root / "manifest.jsonl").is_file():
         raise InputError(f"{root} must be a dataset of mitsplat (it has no manifest.jsonl)")
-    content["scene"] |= checked.scene.model_dump(mode="json", include={"camera", "cameras", "labels", "output"})
+    content["scene"] |= checked.scene.model_dump(mode="json", include={"camera", "labels", "output"})
     return content
 
 

@@ -77,12 +77,11 @@ class Catalogue:
         formats = scene.spec.output.formats
         if "yolo-pose" in formats and not any(keypoint_names):
             raise InputError(f"{scene.path}: output.formats: yolo-pose needs an asset with keypoints (got none)")
-        for camera in (scene.spec.camera, *scene.spec.cameras):
-            if "bop" in formats and any(camera.intrinsics.distortion):
-                raise InputError(
-                    f"{scene.path}: output.formats: bop must have a camera without lens distortion "
-                    f"(got {list(camera.intrinsics.distortion)})"
-                )
+        distortion = scene.spec.camera.intrinsics.distortion
+        if "bop" in formats and any(distortion):
+            raise InputError(
+                f"{scene.path}: output.formats: bop must have a camera without lens distortion (got {list(distortion)})"
+            )
         meshes = [asset.mesh for asset in scene.assets if asset.mesh is not None]
         distractors = [position for position, kind in enumerate(kinds) if kind is None]
         assets = [asset.name for asset in scene.assets]

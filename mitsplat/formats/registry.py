@@ -121,7 +121,7 @@ def encode_image(image: npt.NDArray[np.uint8], output: Output) -> bytes:
     """Encode an RGB image (H, W, 3) as PNG or JPEG."""
     if output.image == "png":
         return maps.encode_png(image)
-    options = [cv2.IMWRITE_JPEG_QUALITY, output.jpeg_quality]
+    options = [cv2.IMWRITE_JPEG_QUALITY, 95]
     done, data = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), options)
     if not done:
         raise OSError(f"OpenCV could not encode an image of shape {image.shape} as jpg")

@@ -35,12 +35,15 @@ from mitsplat.images.colour import (
 from mitsplat.renderer.layers import Layers, device_array, host_array
 from mitsplat.renderer.rays.device_arrays import wrapped
 from mitsplat.runtime.variant import one_at_a_time
-from mitsplat.scene.spec.image_spec import Composite, ImageShadow, Sensor
+from mitsplat.scene.spec.image_spec import Composite, ImageShadow
 
 Tone: TypeAlias = Literal["neutral", "filmic"]
 
 BACKGROUND = 0.18
 """Linear grey of pixels in which a scene has no surface."""
+
+FULL_WELL, READ_NOISE = 20000.0, 3.0
+"""Electrons of a pixel at display white and ISO 100, and read noise [electrons], 1 sigma."""
 
 CURVE_STEPS = 1 << 14
 """Entries of the tone curve's table, evenly spaced in the square root of the input."""
@@ -110,8 +113,8 @@ def develop(
             ``white_balance`` [K], ``chroma_stretch`` along ``chroma_angle`` [degrees], ``hue`` [degrees],
             ``saturation``, ``sharpening`` [factor of the difference to a blur of 1 px], ``jpeg`` [quality]. A missing
             entry has no effect.
-        composite: Tone curve, sensor whose parameters determine the noise at ``iso``, and automatic exposure, to which
-            ``exposure`` is added. By default, that of a scene file without `composite`.
+        composite: Tone curve, and automatic exposure, to which ``exposure`` is added. By default, that of a scene file
+            without `composite`.
         seed: Seed of the noise, below 2^64. The noise is a function of seed, row-major index and channel of a pixel.
         exposure_flow: Motion of every pixel during the exposure; None for no motion.
     """
@@ -141,7 +144,7 @@ def start_development(
     if draws.get("motion_blur", 0.0):
         linear = correlate(linear, shape, motion_kernel(draws["motion_blur"], draws.get("motion_angle", 0.0)))
     if "iso" in draws:
-        linear = add_noise(linear, shape, draws["iso"], composite.sensor, seed)
+        linear = add_noise(linear, shape, draws["iso"], seed)
     matrix = colour_matrix(draws)
     if not np.array_equal(matrix, np.eye(3)):
         linear = mi.Color3f(*[sum(opaque_float(m) * c for m, c in zip(row, linear, strict=True)) for row in matrix])
@@ -222,16 +225,16 @@ def _apply_lens(linear: mi.Color3f, shape: tuple[int, int], draws: Mapping[str, 
     return linear
 
 
-def add_noise(linear: mi.Color3f, shape: tuple[int, int], iso: float, sensor: Sensor, seed: int) -> mi.Color3f:
-    """Add shot and read noise: a variance of N + read_noise^2 for N electrons (EMVA 1288, section 2).
+def add_noise(linear: mi.Color3f, shape: tuple[int, int], iso: float, seed: int) -> mi.Color3f:
+    """Add shot and read noise: a variance of N + r^2 for N electrons and a read noise r (EMVA 1288, section 2).
 
     Display white fills the wells at ISO 100. The Poisson noise of N is approximated as normal. The random numbers are a
     function of the pixel index (Philox 4x32, Salmon et al. 2011, "Parallel random numbers: as easy as 1, 2, 3"), so
     that they do not depend on the order of evaluation.
     """
-    electrons = sensor.full_well * 100.0 / iso
+    electrons = FULL_WELL * 100.0 / iso
     numbers = mi.Philox4x32(dr.opaque(mi.UInt64, seed), pixel_index(shape)).next_float32x4_normal()
-    shot, read = opaque_float(1 / electrons), opaque_float((sensor.read_noise / electrons) ** 2)
+    shot, read = opaque_float(1 / electrons), opaque_float((READ_NOISE / electrons) ** 2)
     return linear + dr.sqrt(dr.maximum(linear, 0.0) * shot + read) * mi.Color3f(numbers.x, numbers.y, numbers.z)
 
 

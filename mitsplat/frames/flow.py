@@ -63,20 +63,21 @@ def optical_flow(
 def exposure_flow(
     depth: npt.NDArray[np.floating[Any]],
     camera: Camera,
-    motion: Mapping[str, Any],
-    moving: tuple[Belt, BoolArray] | None = None,
+    exposure: float,
+    belt: Belt,
+    carried: BoolArray,
 ) -> tuple[Float32Array, Float32Array]:
     """Compute the motion of every pixel to the right and down [px] during the exposure, each (H, W).
 
-    The motion field is evaluated in the middle of the exposure (Longuet-Higgins and Prazdny 1980, "The interpretation
-    of a moving retinal image"). Pixels without depth are treated as infinitely distant.
+    The camera stands still; a belt and the objects that it carries move. The motion field is evaluated in the middle of
+    the exposure (Longuet-Higgins and Prazdny 1980, "The interpretation of a moving retinal image").
 
     Args:
         depth: Depth along the optical axis [m], 0 for no surface, (H, W).
-        camera: Camera in the middle of the exposure.
-        motion: Camera motion as in :class:`mitsplat.scene.planning.viewpoints.Viewpoint`.
-        moving: Conveyor belt, and a mask of the pixels that show carried objects (H, W). Pixels of the belt's surface
-            are found from their depth.
+        camera: The camera.
+        exposure: Exposure time [s].
+        belt: Conveyor belt. Pixels of its surface are found from their depth.
+        carried: Mask of the pixels that show carried objects, (H, W).
     """
     height, width = depth.shape
     columns, rows = np.arange(width) + 0.5, np.arange(height) + 0.5
@@ -88,18 +89,12 @@ def exposure_flow(
         x = ((columns - camera.cx) / camera.fx).astype(np.float32)[None, :]
         y = ((rows - camera.cy) / camera.fy).astype(np.float32)[:, None]
     inverse_depth = np.divide(1, depth, where=depth > 0, out=np.zeros(depth.shape, dtype=np.float32))
-    vx, vy, vz = np.multiply(motion["exposure"], motion["velocity"]).astype(np.float32)
-    if moving is not None:
-        belt, carried = moving
-        rotation, centre = camera.world_from_camera[:3, :3], camera.centre
-        points = np.stack(np.broadcast_arrays(x * depth, y * depth, depth), axis=-1) @ rotation.T + centre
-        on_belt = carried | belt.on_surface(points.reshape(-1, 3)).reshape(height, width)
-        # The motion field depends on the camera's motion relative to the pixel's surface.
-        belt_motion = motion["exposure"] * (rotation.T @ belt.velocity)
-        vx, vy, vz = (np.float32(v) - np.float32(w) * on_belt for v, w in zip((vx, vy, vz), belt_motion, strict=True))
-    wx, wy, wz = np.radians(np.multiply(motion["exposure"], motion["rotation"])).astype(np.float32)
-    u = inverse_depth * (x * vz - vx) + (x * y * wx - (1 + x * x) * wy + y * wz)
-    v = inverse_depth * (y * vz - vy) + ((1 + y * y) * wx - x * y * wy - x * wz)
+    rotation, centre = camera.world_from_camera[:3, :3], camera.centre
+    points = np.stack(np.broadcast_arrays(x * depth, y * depth, depth), axis=-1) @ rotation.T + centre
+    moving = carried | belt.on_surface(points.reshape(-1, 3)).reshape(height, width)
+    # The motion field depends on the camera's motion relative to the pixel's surface.
+    vx, vy, vz = (-np.float32(v) * moving for v in exposure * (rotation.T @ belt.velocity))
+    u, v = inverse_depth * (x * vz - vx), inverse_depth * (y * vz - vy)
     if not distorted:
         return u * np.float32(camera.fx), v * np.float32(camera.fy)
     (x_down, x_right), (y_down, y_right) = np.gradient(x), np.gradient(y)

@@ -285,12 +285,11 @@ class Renderer:
         return mi.load_dict(description, parallel=False)
 
     def _start_development(self, linear: mi.Color3f, layers: Layers, layout: Layout, plan: FramePlan) -> Development:
-        """Start the camera response on the device, with blur by the motion of the camera and of a belt."""
-        motion, belt, flow, moving = plan.viewpoint.get("motion"), plan.belt, None, None
-        if motion is not None:
-            if belt is not None:
-                moving = belt, np.isin(layers.instance, list(carried_instances(layout, belt.box)))
-            flow = exposure_flow(layers.depth, plan.camera, motion, moving)
+        """Start the camera response on the device, with blur by the motion of a belt."""
+        motion, belt, flow = plan.viewpoint.get("motion"), plan.belt, None
+        if motion is not None and belt is not None:
+            carried = np.isin(layers.instance, list(carried_instances(layout, belt.box)))
+            flow = exposure_flow(layers.depth, plan.camera, motion["exposure"], belt, carried)
         composite = self.scene.spec.composite
         return start_development(linear, layers.shape, plan.draws, composite, seed=plan.seed, exposure_flow=flow)
 

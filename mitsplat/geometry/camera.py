@@ -32,6 +32,9 @@ degrees.
 MAX_IMAGE_SIDE = 16384
 """Maximum side length of an image [px]."""
 
+NEAR = 0.01
+"""Near clipping depth of cameras in scene files [m]."""
+
 
 @dataclass(frozen=True, eq=False)
 class Camera:
@@ -63,7 +66,7 @@ class Camera:
     cy: float
     world_from_camera: Float64Array
     distortion: tuple[float, ...] = ()
-    near: float = 0.01
+    near: float = NEAR
     lens: Lens = "opencv"
     aperture_radius: float = 0.0
     focus_distance: float = 1.0
@@ -119,7 +122,7 @@ class Camera:
         height: int,
         fov_x: float,
         distortion: Sequence[float] = (),
-        near: float = 0.01,
+        near: float = NEAR,
     ) -> Camera:
         """Create a camera at ``eye`` [m] that faces ``target`` [m].
 

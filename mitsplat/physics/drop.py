@@ -30,6 +30,7 @@ from mitsplat.scene.splits import draw_environment
 from mitsplat.scene.streams import random_stream
 from mitsplat.scene.walls import ENCLOSURE, PILE_HEIGHT, bin_walls, enclosed_bounds, pose_matrix, walls_beside
 
+TIMESTEP = 0.002  # of the simulation [s]
 _MAX_MEASURED_GAP = 5e-3  # larger gaps are not measured [m]
 # Maximum penetration at rest [m], or as a share of the object's size if that is larger: convex pieces of scans deviate
 # by that much.
@@ -125,7 +126,7 @@ class Drop:
     def __init__(self, scene: Scene, progress: Note) -> None:
         self.scene = scene
         self._parts: dict[int, _Part] = {}
-        self._worlds: dict[tuple[tuple[int, ...], tuple[float, ...], float, int], World] = {}
+        self._worlds: dict[tuple[tuple[int, ...], float, int], World] = {}
         self._world_count = 0
         self._objects = [self._part(asset, progress) for asset in scene.assets]
         self._arrangements = tuple(arrangement for _, arrangement in scene.spec.all_regions)
@@ -200,7 +201,7 @@ class Drop:
             alone = [self._place([item], number, rng) is None for item in self._items(assets, given, regions)]
             reason = "no room for it" if any(alone) else CROWDED
             return _Rejection(reason, np.flatnonzero(alone).tolist(), str(error))
-        world = self._world(assets, self._draw_frictions(index), 2.0 ** refused.count(CONTACT_OVERFLOW), number)
+        world = self._world(assets, 2.0 ** refused.count(CONTACT_OVERFLOW), number)
         world.reset(start)
         outcome = self._run(world, number, regions, given)
         if outcome.rejection:
@@ -256,7 +257,7 @@ class Drop:
         rng = random_stream(self.scene.spec.seed, "object poses", layout.index, certificate.attempts - 1)
         capacity = 2.0 ** certificate.refused.count(CONTACT_OVERFLOW)
         number, regions = self._ground_of(layout.index), [one.region for one in drawn]
-        world = self._world(assets, self._draw_frictions(layout.index), capacity, number)
+        world = self._world(assets, capacity, number)
         world.reset(self.draw_poses(assets, rng, given, number, regions))
         moments = [world.poses]
 
@@ -288,29 +289,23 @@ class Drop:
         bounds = np.where(free, low[own], low.min(axis=0)), np.where(free, high[own], high.max(axis=0))
         return run_to_rest(world, max_time=settle.max_time, bounds=bounds, fastest=fastest, observe=observe)
 
-    def _draw_frictions(self, index: int) -> tuple[float, ...]:
-        """Draw the friction coefficient of each asset in a layout."""
-        spec = self.scene.spec
-        rng = random_stream(spec.seed, "friction", index)
-        return tuple(asset.friction * float(rng.uniform(*spec.randomise.friction)) for asset in self.scene.assets)
-
-    def _world(self, assets: tuple[int, ...], frictions: tuple[float, ...], capacity: float, number: int = 0) -> World:
+    def _world(self, assets: tuple[int, ...], capacity: float, number: int = 0) -> World:
         """Return the simulation of these assets on a ground; the last one is cached."""
-        key = assets, frictions, capacity, number
+        key = assets, capacity, number
         if key not in self._worlds:
-            settle, ground = self.scene.spec.settle, self._grounds[number]
-            bodies = [self._objects[asset].body.with_friction(frictions[asset]) for asset in assets]
+            ground = self._grounds[number]
+            bodies = [self._objects[asset].body for asset in assets]
             self._worlds.clear()
             self._world_count += 1
             if self._world_count % _COLLECTION_INTERVAL == 0:
                 gc.collect()
             self._worlds[key] = (
-                MujocoWorld(bodies, ground.colliders, timestep=settle.timestep)
-                if settle.stepper == "mujoco"
+                MujocoWorld(bodies, ground.colliders, timestep=TIMESTEP)
+                if self.scene.spec.settle.stepper == "mujoco"
                 else WarpWorld(
                     bodies,
                     ground.colliders,
-                    timestep=settle.timestep,
+                    timestep=TIMESTEP,
                     capacity=capacity,
                     contact_finder=ground.contact_finder,
                 )

@@ -175,7 +175,7 @@ def _scene_hash(scene: Scene) -> str:
         digest.add((PACKAGE / f"{module.replace('.', '/')}.py").read_bytes())
     solid = [shape.collider for shape in spec.shapes]
     shapes = [shape.model_copy(update={"materials": ()}) for shape in compress(spec.shapes, solid)]
-    add(platform.machine(), spec.seed, spec.settle, spec.region, spec.objects, shapes, spec.randomise.friction)
+    add(platform.machine(), spec.seed, spec.settle, spec.region, spec.objects, shapes)
     add(scene.class_names, spec.environment_collides)
     held_out = spec.hold_out.assets or spec.hold_out.environments
     if spec.empty or held_out or any(entry.balance for entry in spec.objects):  # these depend on splits
@@ -185,8 +185,6 @@ def _scene_hash(scene: Scene) -> str:
     surroundings = scene.environments if spec.environment_collides else ()
     if spec.regions:
         add(spec.regions)
-    if len(surroundings) > 1:
-        add(spec.environment_weights)
     for asset in (*scene.assets, *surroundings):
         add(asset.name, asset.class_name, asset.density, asset.mass, asset.friction)
         for mesh in (asset.mesh, *asset.pieces):

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -87,12 +87,6 @@ class Body:
     def hulls(self) -> list[newton.Mesh]:
         """The pieces as Newton meshes."""
         return [newton_hull(piece) for piece in self.pieces]
-
-    def with_friction(self, friction: float) -> Body:
-        """Return the same body with another friction; both share the data derived from the pieces."""
-        body = replace(self, friction=friction)
-        vars(body).update(outline=self.outline, size=self.size, hulls=self.hulls)
-        return body
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,7 +11,7 @@ import numpy as np
 import trimesh
 
 from mitsplat.arrays import ByteImage, Float64Array
-from mitsplat.images.colour import decode_srgb, encode_srgb
+from mitsplat.images.colour import decode_srgb
 from mitsplat.renderer.rays.device_arrays import plain_mesh, wrapped
 from mitsplat.scene.planning.layout_surroundings import MaterialDraw
 from mitsplat.scene.spec.shape_spec import Shape
@@ -32,7 +32,7 @@ def texture_image(finish: MaterialDraw, images: Mapping[str, Path]) -> ByteImage
         images: Image files by the names that finishes use.
     """
     if finish.image is not None:
-        return with_gain(read_image(images[finish.image]), finish.gain or 1.0)
+        return read_image(images[finish.image])
     if finish.kind == "colour":
         return None
     share = _PATTERNS[finish.kind](np.random.default_rng(finish.seed))[..., None]
@@ -43,7 +43,7 @@ def texture_image(finish: MaterialDraw, images: Mapping[str, Path]) -> ByteImage
 
 def repeat_width(finish: MaterialDraw) -> float:
     """Return the width of a finish's image on a surface [m]."""
-    repeats = {"image": 1, "checker": 2, "wood": 2 * FEATURES, "brushed_metal": 2}
+    repeats = {"image": 1, "checker": 2, "wood": 2 * FEATURES}
     return finish.scale * repeats.get(finish.kind, FEATURES)
 
 
@@ -51,14 +51,6 @@ def read_image(path: Path) -> ByteImage:
     """Read an image file as sRGB-encoded bytes, shape (H, W, 3)."""
     bitmap = mi.Bitmap(str(path)).convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.UInt8, srgb_gamma=True)
     return np.array(bitmap)
-
-
-def with_gain(image: ByteImage, gain: float) -> ByteImage:
-    """Multiply the linear colours of an sRGB-encoded image by a gain, clipped at white."""
-    if gain == 1.0:
-        return image
-    table = encode_srgb(np.minimum(gain * decode_srgb(np.arange(256) / 255), 1.0))
-    return np.rint(255 * table).astype(np.uint8)[image]
 
 
 def material(finish: MaterialDraw, texture: dict[str, Any] | None) -> dict[str, Any]:
@@ -69,17 +61,7 @@ def material(finish: MaterialDraw, texture: dict[str, Any] | None) -> dict[str, 
         texture: Mitsuba's texture of :func:`texture_image`; None for a single colour.
     """
     colour = texture or {"type": "rgb", "value": decode_srgb(np.array(finish.colours[0])).tolist()}
-    if finish.roughness is None:
-        return {"type": "diffuse", "reflectance": colour}
-    # Scratches run along u, so that the roughness along u is lower.
-    return {
-        "type": "roughconductor",
-        "distribution": "ggx",
-        "material": "none",
-        "specular_reflectance": colour,
-        "alpha_u": finish.roughness / 3,
-        "alpha_v": finish.roughness,
-    }
+    return {"type": "diffuse", "reflectance": colour}
 
 
 def bitmap_texture(image: ByteImage) -> dict[str, Any]:
@@ -123,13 +105,8 @@ def finished_mesh(
 
 
 def pattern_axes(shape: Shape) -> Float64Array:
-    """Return the axes of a pattern's box projection as columns (3, 3): those of a box or bin, otherwise world axes."""
-    if shape.box is not None:
-        return pose_matrix(shape.box)[:3, :3]
-    if shape.bin is not None:
-        turn = np.radians(shape.bin.rotate_z)
-        return np.array([[np.cos(turn), -np.sin(turn), 0], [np.sin(turn), np.cos(turn), 0], [0, 0, 1.0]])
-    return np.eye(3)
+    """Return the axes of a pattern's box projection as columns (3, 3): those of a box, otherwise world axes."""
+    return np.eye(3) if shape.box is None else pose_matrix(shape.box)[:3, :3]
 
 
 def box_projection(
@@ -191,10 +168,6 @@ def _wood(rng: np.random.Generator) -> Float64Array:
     return np.asarray(np.clip(0.75 * lines + 0.5 * (_clouds(rng, 6, 200, 1.0) - 0.25), 0.0, 1.0))
 
 
-def _brushed(rng: np.random.Generator) -> Float64Array:
-    return _clouds(rng, 2, 300, 0.8)
-
-
 def _checks(rng: np.random.Generator) -> Float64Array:
     half = np.arange(SIZE) < SIZE // 2
     return np.asarray((half[:, None] ^ half), dtype=np.float64)
@@ -206,4 +179,4 @@ def _stripes(_: np.random.Generator) -> Float64Array:
     return np.repeat(across[:, None] ** 3, SIZE, axis=1)
 
 
-_PATTERNS = {"noise": _noise, "wood": _wood, "brushed_metal": _brushed, "checker": _checks, "stripes": _stripes}
+_PATTERNS = {"noise": _noise, "wood": _wood, "checker": _checks, "stripes": _stripes}

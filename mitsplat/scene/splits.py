@@ -4,16 +4,12 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 
 from mitsplat.scene.spec.scene_spec import SceneSpec
 from mitsplat.scene.streams import random_stream, weighted_choice
-
-if TYPE_CHECKING:
-    pass
-
 
 Split = Literal["train", "val", "test"]
 
@@ -67,7 +63,7 @@ def draw_environment(spec: SceneSpec, layout: int) -> int:
     """Draw the index of the environment of a layout."""
     if not isinstance(spec.environment, tuple) or len(spec.environment) == 1:
         return 0
-    weights = np.array(spec.environment_weights or np.ones(len(spec.environment)))
+    weights = np.ones(len(spec.environment))
     if spec.hold_out.environments and split_of(layout, spec.output.validation, spec.output.test) != "test":
         weights = weights * [name not in spec.hold_out.environments for name in spec.environment]
     return weighted_choice(random_stream(spec.seed, "environment", layout), weights)[0]

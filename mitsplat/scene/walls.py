@@ -22,6 +22,9 @@ if TYPE_CHECKING:
 ENCLOSURE = "enclosure "
 """Prefix of the names of the shapes that an enclosure expands to."""
 
+_ENCLOSURE_THICKNESS = 0.05
+"""Thickness of the walls and lid of an enclosure [m]."""
+
 BACKDROP_THICKNESS = 0.1
 """Thickness of the floor and walls of a backdrop [m]."""
 
@@ -53,7 +56,7 @@ def enclosure_walls(
     low[2], high[2] = enclosure.floor, inner_high[2]
     if arrangement == "pile":
         high[2] += PILE_HEIGHT
-    middle, size, thickness = (low + high) / 2, high - low, enclosure.thickness
+    middle, size, thickness = (low + high) / 2, high - low, _ENCLOSURE_THICKNESS
     walls = []
     for name, axis, side in (("-x", 0, -1), ("+x", 0, 1), ("-y", 1, -1), ("+y", 1, 1), ("lid", 2, 1)):
         position = middle.copy()
@@ -81,11 +84,10 @@ def walls_beside(spec: SceneSpec, number: int, names: Sequence[str], walls: Sequ
 def backdrop_shapes(room: Backdrop) -> list[Shape]:
     """Return a backdrop as visible boxes: floor, walls on the floor, and ceiling, all outside of the room."""
     width, depth, height = room.size
-    turn = Rotation.from_euler("z", room.rotate_z, degrees=True).as_matrix()
     edge = BACKDROP_THICKNESS
     wide = width + 2 * edge, depth + 2 * edge
     parts: list[tuple[str, Vec3, Vec3]] = [("floor", (*wide, edge), (0.0, 0.0, -edge / 2))]
-    for side in room.sides:
+    for side in ("-x", "+x", "-y", "+y"):
         axis, sign = "xy".index(side[1]), -1.0 if side[0] == "-" else 1.0
         size, middle = [width, wide[1], height], [0.0, 0.0, height / 2]
         if axis == 1:  # between the other walls, so that no faces coincide
@@ -99,9 +101,9 @@ def backdrop_shapes(room: Backdrop) -> list[Shape]:
     return [
         Shape(
             name=f"{BACKDROP}{name}",
-            box=Box(size=size, position=tuple((turn @ middle + room.position).tolist()), rotate=(0, 0, room.rotate_z)),
+            box=Box(size=size, position=tuple(np.add(middle, room.position).tolist())),
             visible=True,
-            collider=room.collider and name == "floor",
+            collider=False,
             materials=room.floor if name == "floor" else room.walls,
         )
         for name, size, middle in parts
@@ -145,13 +147,10 @@ def bin_walls(shape: Bin) -> tuple[trimesh.Trimesh, ...]:
     walls = [((width + 2 * edge, depth + 2 * edge, edge), (0.0, 0.0, -edge / 2))]
     walls += [((width + 2 * edge, edge, height), (0.0, side * (depth + edge) / 2, height / 2)) for side in (-1, 1)]
     walls += [((edge, depth, height), (side * (width + edge) / 2, 0.0, height / 2)) for side in (-1, 1)]
-    turn = Rotation.from_euler("z", shape.rotate_z, degrees=True).as_matrix()
-    boxes = []
-    for size, middle in walls:
-        transform = np.eye(4)
-        transform[:3, :3], transform[:3, 3] = turn, turn @ middle + shape.position
-        boxes.append(trimesh.creation.box(extents=size, transform=transform))
-    return tuple(boxes)
+    return tuple(
+        trimesh.creation.box(size, trimesh.transformations.translation_matrix(np.add(middle, shape.position)))
+        for size, middle in walls
+    )
 
 
 def enclosed_bounds(

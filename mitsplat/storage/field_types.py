@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, NonNegativeFloat, ValidationError
 
 from mitsplat.errors import InputError
-from mitsplat.storage.yaml_input import FieldError, model_error_sentence
+from mitsplat.storage.yaml_input import model_error_sentence
 
 if TYPE_CHECKING:
     from pydantic._internal._model_construction import ModelMetaclass
@@ -63,14 +63,6 @@ def _check_order_of_components(bounds: tuple[Vector, Vector]) -> tuple[Vector, V
     if any(low > high for low, high in zip(*bounds, strict=True)):
         raise ValueError(f"must be [low, high] with low <= high in each component (got {json.dumps(bounds)})")
     return bounds
-
-
-def check_weights(weights: tuple[float, ...], members: int, what: str) -> None:
-    """Check that the number of weights equals the number of members of a pool."""
-    if weights and len(weights) != members:
-        raise FieldError(
-            "weights", f"must have one weight for each of the {members} {what} of the pool (got {len(weights)})"
-        )
 
 
 def _count_range(count: object) -> tuple[object, ...]:

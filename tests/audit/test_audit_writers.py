@@ -471,13 +471,3 @@ def test_every_lens_passes_and_swapped_coefficients_are_violations(tmp_path: Pat
     words[8], words[9] = words[9], words[8]
     path.write_text(" ".join(words) + "\n")
     assert {file for file, _ in audit_dataset(out).violations} == {"colmap/images.txt"}
-
-
-def test_a_lens_focused_before_the_default_near_plane_passes(tmp_path: Path) -> None:
-    """Formats and audit make the camera of a record anew, ``near`` included, without which it could not be focused."""
-    scene = small_scene(tmp_path, large_boxes(), BOTH, layouts=1, views=2)
-    lens = Intrinsics(fov_x=60.0, aperture=0.002, focus=0.008, near=0.004)
-    seen = scene.spec.camera.model_copy(update={"intrinsics": lens})
-    scene = replace(scene, spec=scene.spec.model_copy(update={"camera": seen}))
-    out = write(scene, tmp_path / "out", ["bop", "colmap", "poses"])
-    assert audit_dataset(out).violations == ()

@@ -38,7 +38,6 @@ BIN, NARROW = ({"name": "bin", "bin": {"size": [0.012, depth, 0.03]}} for depth 
 HOPELESS = {
     "inside": ({"camera": path_of(INSIDE, (0.2, 0, -0.05))}, "camera: every view is from inside of shape 'table'"),
     "away": ({"camera": path_of(ABOVE, target=(3, 3, 4))}, "camera: no view shows any place that objects can reach"),
-    "near": ({"camera": path_of(ABOVE, fov_x=60, near=5)}, r"near: must be below .*, 1\.\d+ m \(got 5\)"),
     "narrow": ({"camera": path_of(ABOVE, fx=1e9)}, r"camera.intrinsics: an image shows at most .*e-08 m"),
     "far": ({"camera": path_of((200, 0, 200), fov_x=60)}, r"no object covers more than .* \(labels.min_pixels is 16\)"),
     "tiny": ({"output": {"width": 1, "height": 1}}, "an image of 1 px cannot show labels.min_pixels = 16"),
@@ -53,7 +52,7 @@ HOPELESS = {
     "buried": ({"region": {"min": [-0.1, -0.1, -0.09], "max": [0.1, 0.1, -0.01]}}, "inside of .*, 'table'"),
     "nothing below": ({"region": {"min": [1, 1, 0.1], "max": [1.2, 1.2, 0.2]}}, "no collider is below it"),
     "below": ({"region": {"min": [0, 0, -0.5], "max": [0.2, 0.2, -0.3]}}, "no collider is below it"),
-    "steps": ({"settle": {"timestep": 1e-9}}, r"max_time / timestep must be at most .* \(got 6 s / 1e-09 s\)"),
+    "time": ({"settle": {"max_time": 1e9}}, r"max_time must be at most 2000 s \(got 1e\+09 s\)"),
 }
 
 
@@ -110,12 +109,11 @@ def test_check_and_render_report_the_same_fault(scene_data, write_scene, tmp_pat
 
 @pytest.mark.usefixtures("machine")
 def test_scenes_that_may_work_are_not_refused(scene_data, write_scene):
-    """Closed rooms around camera and objects, near planes before them, close-ups, background without objects."""
+    """Closed rooms around camera and objects, close-ups, background without objects."""
     room = {"name": "room", "box": {"size": [3, 3, 3], "position": [0, 0, 1.39]}, "visible": True, "collider": False}
     fine = [
         {"shapes": [*scene_data["shapes"], room]},
         {"camera": path_of((0.3, 0.3, 0.4), INSIDE)},
-        {"camera": path_of(ABOVE, fov_x=60, near=0.3)},
         {"camera": path_of((0.03, 0.0, 0.03), fov_x=20)},
         {"camera": path_of((0.0, 0.0, 9.0), fov_x=3)},
         {"objects": [], "camera": path_of(ABOVE, target=(3, 3, 4))},

@@ -158,7 +158,7 @@ MESHES = [trimesh.creation.box(extents=(0.02, 0.03, 0.05)), trimesh.creation.ico
 def written(tmp_path_factory: pytest.TempPathFactory) -> Written:
     root = tmp_path_factory.mktemp("formats")
     spec = SimpleNamespace(
-        output=SimpleNamespace(formats=FORMATS, image="png", jpeg_quality=95, views=2),
+        output=SimpleNamespace(formats=FORMATS, image="png", views=2),
         labels=SimpleNamespace(source="splats"),
         empty=0.0,
         environment=None,

@@ -13,7 +13,7 @@ import mitsplat as ms
 from mitsplat.frames.background import crop_background
 from mitsplat.images.colour import decode_srgb
 from mitsplat.scene.layout import NO_PHYSICS, Layout
-from mitsplat.scene.planning.layout_surroundings import BackgroundDraw
+from mitsplat.scene.planning.layout_surroundings import BackgroundDraw, draw_surroundings
 from tests.conftest import WriteScene
 
 
@@ -72,11 +72,14 @@ def test_a_background_is_seen_in_empty_pixels_and_changes_no_label(
     layout = Layout(0, (), NO_PHYSICS)
     plain = ms.render_frame(ms.load_scene(write_scene(scene_data)), 0, layout=layout)
     cv2.imwrite(str(tmp_path / "red.png"), np.full((30, 40, 3), (0, 0, 200), dtype=np.uint8))
-    scene_data["background"] = {"images": "red.png", "gain": [0.5, 0.5]}
-    frame = ms.render_frame(ms.load_scene(write_scene(scene_data)), 0, layout=layout)
+    scene_data["background"] = {"images": "red.png"}
+    scene = ms.load_scene(write_scene(scene_data))
+    frame = ms.render_frame(scene, 0, layout=layout)
+    drawn = draw_surroundings(scene.spec, 0).background
+    assert drawn is not None
     empty = frame.layers.alpha == 0
     assert 0.1 < empty.mean() < 0.9
-    red = np.array([0.5 * decode_srgb(200 / 255), 0, 0])
+    red = np.array([drawn.gain * decode_srgb(200 / 255), 0, 0])
     np.testing.assert_allclose(frame.rgb[empty], np.tile(red, (empty.sum(), 1)), 1e-5)
     full = frame.layers.alpha == 1
     assert 0.1 < full.mean() < 0.9

@@ -14,7 +14,9 @@ import pytest
 from scipy import stats
 
 from mitsplat.frames.camera_response import (
+    FULL_WELL,
     GREY,
+    READ_NOISE,
     add_noise,
     colour_matrix,
     develop,
@@ -25,7 +27,7 @@ from mitsplat.frames.camera_response import (
 from mitsplat.frames.image_filters import correlate, motion_kernel
 from mitsplat.images.colour import LUMINANCE, black_body_colour, decode_srgb, encode_srgb, white_balance_matrix
 from mitsplat.renderer.layers import Layers, device_array, host_array
-from mitsplat.scene.spec.image_spec import Composite, ImageShadow, Sensor
+from mitsplat.scene.spec.image_spec import Composite, ImageShadow
 
 
 def encode(linear: np.ndarray) -> np.ndarray:
@@ -98,12 +100,11 @@ def test_filmic_keeps_mid_grey() -> None:
 @pytest.mark.parametrize("level", [0.02, 0.18, 0.6])
 def test_sensor_noise_has_the_variance_of_its_electrons(iso: float, level: float) -> None:
     """N = level * full well * 100 / ISO electrons: variance N + read noise squared, seen through the tone curve."""
-    sensor = Sensor(full_well=10000, read_noise=5)
     linear = np.full((128, 128, 3), level, np.float32)
-    a, b, c = (develop(linear, {"iso": iso}, Composite(sensor=sensor), seed=s) for s in (1, 1, 2))
+    a, b, c = (develop(linear, {"iso": iso}, seed=s) for s in (1, 1, 2))
     assert a.tobytes() == b.tobytes() != c.tobytes()
-    white = 10000 * 100 / iso
-    deviation = np.sqrt(level * white + 25) / white
+    white = FULL_WELL * 100 / iso
+    deviation = np.sqrt(level * white + READ_NOISE**2) / white
     encoded = encode(np.maximum(level + np.linspace(-4, 4, 4001) * deviation, 0))
     weight = np.exp(-0.5 * np.linspace(-4, 4, 4001) ** 2)
     middle = np.average(encoded, weights=weight)
@@ -112,20 +113,19 @@ def test_sensor_noise_has_the_variance_of_its_electrons(iso: float, level: float
     assert np.mean(a / 255.0) == pytest.approx(middle, abs=1e-3)
 
 
-def noise(shape: tuple[int, int], level: float, iso: float, seed: int, sensor: Sensor) -> np.ndarray:
+def noise(shape: tuple[int, int], level: float, iso: float, seed: int) -> np.ndarray:
     """What a sensor adds to an even linear picture of some level, (H, W, 3)."""
     linear = device_array(np.full((*shape, 3), level, np.float32))
-    return host_array(add_noise(linear, shape, iso, sensor, seed), shape).astype(np.float64) - level
+    return host_array(add_noise(linear, shape, iso, seed), shape).astype(np.float64) - level
 
 
 @pytest.mark.parametrize(("level", "iso"), [(0.0, 3200.0), (0.18, 100.0), (0.6, 1600.0)])
 def test_noise_is_normal_and_without_correlation(level: float, iso: float) -> None:
     """Mean 0 and variance N + read_noise^2 of N electrons; each statistic within 5 of its standard errors."""
     shape = 400, 500
-    sensor = Sensor(full_well=10000, read_noise=5)
-    white = 10000 * 100 / iso
-    deviation = np.sqrt(level * white + 25) / white
-    frames = [noise(shape, level, iso, seed, sensor) / deviation for seed in (7, 8, 7 + 2**32)]
+    white = FULL_WELL * 100 / iso
+    deviation = np.sqrt(level * white + READ_NOISE**2) / white
+    frames = [noise(shape, level, iso, seed) / deviation for seed in (7, 8, 7 + 2**32)]
     count = frames[0].size
     for frame in frames:
         assert abs(frame.mean()) < 5 / np.sqrt(count)
@@ -200,9 +200,8 @@ def test_other_draws_compile_no_new_kernels() -> None:
     def kernels(draws: tuple[float, ...], seed: int) -> set[Any]:
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
             dr.kernel_history_clear()
-            composite = Composite(sensor=Sensor(full_well=5000 + seed, read_noise=seed))
             flow = np.full((30, 40), 3.0 * seed, np.float32), np.full((30, 40), 1.0, np.float32)
-            develop(linear, dict(zip(names, draws, strict=True)), composite, seed=seed, exposure_flow=flow)
+            develop(linear, dict(zip(names, draws, strict=True)), seed=seed, exposure_flow=flow)
             return {entry["hash"] for entry in dr.kernel_history([dr.KernelType.JIT])}
 
     first, second = kernels(drawn[0], 1), kernels(drawn[1], 2)

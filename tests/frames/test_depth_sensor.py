@@ -190,22 +190,20 @@ def test_the_seed_of_the_frame_determines_the_noise(sensor: Any) -> None:
                     "intrinsics": {"fov_x": 40, "distortion": [0.1, 0, 0, 0]},
                 },
             },
-            "depth_sensor: stereo needs cameras without lens distortion",
+            "depth_sensor: stereo needs a camera without lens distortion",
         ),
         (
             {
                 "depth_sensor": {"kind": "stereo"},
-                "cameras": [
-                    {
-                        "kind": "orbit",
-                        "target": [0, 0, 0],
-                        "radius": 1,
-                        "height": 1,
-                        "intrinsics": {"fx": 80, "lens": "fisheye", "distortion": [0, 0, 0, 0]},
-                    }
-                ],
+                "camera": {
+                    "kind": "orbit",
+                    "target": [0, 0, 0],
+                    "radius": 1,
+                    "height": 1,
+                    "intrinsics": {"fx": 80, "lens": "fisheye", "distortion": [0, 0, 0, 0]},
+                },
             },
-            "depth_sensor: stereo needs cameras without lens distortion",
+            "depth_sensor: stereo needs a camera without lens distortion",
         ),
     ],
 )

@@ -26,7 +26,6 @@ from tests.conftest import WriteScene, box_asset
 SceneData = dict[str, Any]
 
 
-
 def lying(scene: ms.Scene, index: int, **_: Any) -> Layout:
     """One object, above the table's middle."""
     pose = np.eye(4)

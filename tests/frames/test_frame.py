@@ -114,7 +114,7 @@ def test_a_frame_rendered_from_its_record_is_the_same(
     ]
     scene_data["randomise"] = {
         "exposure": [-1, 1], "hue": [-5, 5], "saturation": [0.8, 1.2], "white_balance": [5000, 7000], "iso": [100, 800],
-        "vignetting": [0, 1], "motion_blur": [0, 3], "jpeg": [40, 95], "light_intensity": [0.5, 2],
+        "vignetting": [0, 1], "motion_blur": [0, 3], "jpeg": [40, 95],
     }  # fmt: skip
     first = ms.load_scene(write_scene(scene_data))
     frame = ms.render_frame(first, 2, layout=layout)

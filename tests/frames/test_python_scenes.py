@@ -20,7 +20,7 @@ from mitsplat.frames.flow import UNKNOWN_FLOW, instance_motions, optical_flow
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.scene.loading.scene_loading import load_scene
 from mitsplat.scene.planning.frame_plan import plan_frame
-from mitsplat.scene.spec.camera_spec import CameraOrbit, Motion
+from mitsplat.scene.spec.camera_spec import CameraOrbit
 from mitsplat.scene.spec.light_spec import AreaLight
 from mitsplat.scene.spec.shape_spec import Shape
 from tests.conftest import WriteScene, box_asset
@@ -239,17 +239,6 @@ def test_render_frames_yields_the_frames_of_the_scene(scene: ms.Scene) -> None:
     assert shown[5].camera.world_from_camera.tolist() == alone.camera.world_from_camera.tolist()
     endless = ms.render_frames(scene, itertools.count(11), layouts=itertools.repeat(layout), quality="fast")
     assert [frame.index for frame in itertools.islice(endless, 3)] == [11, 12, 13]
-
-
-def test_frames_with_a_moving_camera_equal_single_frames(scene: ms.Scene) -> None:
-    motion = Motion(exposure=(0.05, 0.05), rotation=(200.0, 200.0))
-    camera = scene.spec.camera.model_copy(update={"motion": motion})
-    scene = replace(scene, spec=scene.spec.model_copy(update={"camera": camera}))
-    layout = ms.Layout.from_poses(scene, {"nut": [moved(0, 0, 0.005)]})
-    frame = next(ms.render_frames(scene, layouts=layout, quality="fast"))
-    alone = ms.render_frame(scene, 0, layout=layout, quality="fast")
-    assert frame.image.tobytes() == alone.image.tobytes()
-    assert frame.plan.viewpoint["motion"] == alone.plan.viewpoint["motion"]
 
 
 def test_a_negative_number_of_frames_is_refused(scene: ms.Scene) -> None:

@@ -253,7 +253,7 @@ def test_simulations_are_freed(scene_data, write_scene, monkeypatch):
         with warp_settings():
             made = drop.Drop(load_scene(write_scene(scene_data)), lambda text: None)
             for number in range(4):
-                made._world((0, 1)[: 1 + number % 2], (0.5, 0.5), 1.0)
+                made._world((0, 1)[: 1 + number % 2], 1.0)
         gone = [model() is None for model in models]
     finally:
         gc.enable()
@@ -345,19 +345,6 @@ def test_objects_rest_on_the_drawn_environment(scene_data, write_scene):
             assert lowest(mesh, instance.world_from_object) == pytest.approx(tops[number], abs=5e-4)
     alone = settle_layout(replace(scene), index, cached=False)
     assert alone.to_json() == layout.to_json()
-
-
-def test_friction_is_drawn_for_each_layout(scene_data, write_scene):
-    from mitsplat.physics.drop import drop_of
-
-    scene = load_scene(write_scene({**scene_data, "randomise": {"friction": [0.5, 1.5]}}))
-    drop = drop_of(scene, lambda text: None)
-    drawn = np.array([drop._draw_frictions(index) for index in range(200)])
-    nominal = scene.assets[0].friction
-    assert kstest(drawn.ravel(), "uniform", args=(0.5 * nominal, nominal)).pvalue > 1e-3
-    assert abs(np.corrcoef(drawn.T)[0, 1]) < 0.2
-    bodies = drop._world((0, 0, 1), drop._draw_frictions(3), 1.0).bodies
-    assert [body.friction for body in bodies] == [drawn[3, 0], drawn[3, 0], drawn[3, 1]]
 
 
 def test_standoff_of_a_hull_equals_its_closed_form():

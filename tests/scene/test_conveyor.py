@@ -11,7 +11,8 @@ import pytest
 from mitsplat.errors import InputError
 from mitsplat.scene.layout import NO_PHYSICS, Instance, Layout
 from mitsplat.scene.loading.scene_loading import load_scene
-from mitsplat.scene.planning.conveyor import belt_of, layout_at_view
+from mitsplat.scene.planning.conveyor import layout_at_view
+from mitsplat.scene.planning.frame_plan import plan_frame
 from mitsplat.scene.scene import Scene
 from tests.conftest import WriteScene
 
@@ -75,18 +76,6 @@ def test_a_scene_without_a_belt_keeps_its_layout(scene_data: SceneData, write_sc
     assert layout_at_view(scene_of(scene_data, write_scene).spec, layout, 1) is layout
 
 
-def test_cameras_of_a_rig_see_the_same_moment(belt_data: SceneData, write_scene: WriteScene) -> None:
-    belt_data["cameras"] = [{**belt_data["camera"], "height": 0.5}]
-    belt_data["camera"]["stereo"] = {"baseline": 0.05}
-    belt_data["output"]["views"] = 9
-    spec = scene_of(belt_data, write_scene).spec
-    belts = [belt_of(spec, view) for view in range(9)]
-    assert [belt and round(belt.time, 9) for belt in belts] == [-0.1] * 3 + [0.0] * 3 + [0.1] * 3
-    assert [belt and belt.interval for belt in belts] == [0, 0, 0.1, 0, 0, 0.1, 0, 0, 0]
-    layout = lying((0.1, 0.0, 0.01))
-    assert layout_at_view(spec, layout, 0) is layout_at_view(spec, layout, 2)
-
-
 @pytest.mark.parametrize(
     ("change", "sentence"),
     [
@@ -111,9 +100,14 @@ def test_a_belt_below_no_region_is_refused(belt_data: SceneData, write_scene: Wr
         scene_of(belt_data, write_scene)
 
 
-def test_exposure_without_motion_is_refused(belt_data: SceneData, write_scene: WriteScene) -> None:
+def test_exposures_are_drawn_within_their_range_and_need_a_conveyor(
+    belt_data: SceneData, write_scene: WriteScene
+) -> None:
     belt_data["camera"]["motion"] = {"exposure": [0.01, 0.02]}
-    assert not scene_of(belt_data, write_scene).spec.camera.motion.is_moving  # type: ignore[union-attr]
+    scene = scene_of(belt_data, write_scene)
+    exposures = [plan_frame(scene, index).viewpoint["motion"]["exposure"] for index in range(scene.num_frames)]
+    assert len(set(exposures)) == scene.num_frames
+    assert 0.01 <= min(exposures) < max(exposures) <= 0.02
     del belt_data["conveyor"]
-    with pytest.raises(InputError, match="motion: must have a speed or a rotation, unless the scene has a conveyor"):
+    with pytest.raises(InputError, match=r"camera\.motion: needs a conveyor"):
         scene_of(belt_data, write_scene)

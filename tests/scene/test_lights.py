@@ -81,13 +81,11 @@ def test_drawn_lights_come_from_all_sides_within_their_ranges(lit: Any) -> None:
 
 def test_lights_drawn_in_a_box_fill_each_component(lit: Any) -> None:
     box = [[-1, 2, 0.5], [1, 2.5, 0.5]]
-    lamp = {"kind": "spot", "draw": {"position": box, "target": [[-0.1, -0.1, 0], [0.1, 0.1, 0]], "cone": [10, 40]}}
+    lamp = {"kind": "spot", "draw": {"position": box}}
     drawn = [light for (light,) in lights_of(lit(lamp))[::2]]
     spread([light.position[0] for light in drawn], -1, 1)
     spread([light.position[1] for light in drawn], 2, 2.5)
     assert {light.position[2] for light in drawn} == {0.5}
-    spread([light.target[1] for light in drawn], -0.1, 0.1)
-    spread([light.cone for light in drawn], 10, 40)
     along = np.corrcoef([light.position[0] for light in drawn], [light.position[1] for light in drawn])[0, 1]
     assert abs(along) < 0.4  # of 150 independent pairs it has a standard deviation of 0.08
 
@@ -104,7 +102,7 @@ def test_lights_vary_by_layout_or_by_frame(lit: Any) -> None:
 
 def test_drawing_a_light_does_not_change_other_draws(lit: Any) -> None:
     fixed = {"kind": "point", "position": [0, 0, 1], "intensity": 3}
-    ranges = {"randomise": {"light_intensity": [0.5, 2], "exposure": [-1, 1]}}
+    ranges = {"randomise": {"exposure": [-1, 1]}}
     plain, drawn = lit(fixed, fixed, **ranges), lit(fixed, SIDES | {"kind": "area"}, SKY, **ranges)
     for index in range(6):
         one, other = plan_frame(plain, index), plan_frame(drawn, index)
@@ -118,10 +116,10 @@ def test_drawing_a_light_does_not_change_other_draws(lit: Any) -> None:
 
 
 def test_a_room_has_a_window_lamps_and_walls(lit: Any) -> None:
-    scene = lit({"kind": "room", "around": [1, 0, 0.5], "size": 2, "lamps": [0, 2], "vary": "frame"})
+    scene = lit({"kind": "room", "around": [1, 0, 0.5], "size": 2})
     assert [light.kind for light in scene.spec.lights] == ["area", "area", "environment"]
     drawn = lights_of(scene)
-    assert {len(lights) for lights in drawn} == {2, 3, 4}
+    assert {len(lights) for lights in drawn} == {3, 4, 5}
     for window, *lamps, walls in drawn:
         assert isinstance(walls, EnvironmentLight) and 0.1 <= walls.radiance <= 0.4
         for light, low, high, widest in ((window, 12, 35, 0.9), *((lamp, 50, 85, 0.3) for lamp in lamps)):
@@ -129,15 +127,15 @@ def test_a_room_has_a_window_lamps_and_walls(lit: Any) -> None:
             away = np.linalg.norm(arm)
             assert 0.7 <= away <= 1.2 and low <= np.degrees(np.arcsin(arm[2] / away)) <= high
             assert light.target == (1, 0, 0.5) and light.size[0] <= widest
-    assert len({window.position for window, *_ in drawn}) == len(drawn)
+    assert len({window.position for window, *_ in drawn}) == len(drawn) / 2
 
 
-def test_skies_are_drawn_from_a_folder_by_their_weights(lit: Any, tmp_path: Any) -> None:
+def test_skies_are_drawn_from_a_folder(lit: Any, tmp_path: Any) -> None:
     (tmp_path / "skies").mkdir()
     for name in ("a.png", "b.png", "c.png"):
         cv2.imwrite(str(tmp_path / "skies" / name), np.full((4, 8, 3), 90, dtype=np.uint8))
     (tmp_path / "skies/notes.txt").write_text("no image")
-    moving = {**SKY, "pool": "skies/*", "weights": [1, 2, 1], "draw": {"rotate_z": [0, 360], "vary": "frame"}}
+    moving = {**SKY, "pool": "skies/*", "draw": {"rotate_z": [0, 360], "vary": "frame"}}
     scene = lit(moving)
     assert scene.spec.lights[0].pool == ("skies/a.png", "skies/b.png", "skies/c.png")
     assert set(scene.images) == set(scene.spec.lights[0].pool)
@@ -146,8 +144,8 @@ def test_skies_are_drawn_from_a_folder_by_their_weights(lit: Any, tmp_path: Any)
     images = [sky.image for sky in drawn]
     assert images[::2] == images[1::2]  # read once for a layout, whatever else varies
     assert len({sky.rotate_z for sky in drawn}) == 300
-    # Of 150 draws 75 are expected of the middle one, with a standard deviation of 6.
-    assert abs(images[::2].count("skies/b.png") - 75) < 25 and set(images) == set(scene.images)
+    # Of 150 draws 50 are expected of each, with a standard deviation of 6.
+    assert abs(images[::2].count("skies/b.png") - 50) < 25 and set(images) == set(scene.images)
     assert "pool" not in drawn[0].model_dump(mode="json")
 
 
@@ -178,8 +176,8 @@ def test_lights_that_may_be_inside_of_a_shape_get_a_warning(lit: Any) -> None:
             "lights[0].draw.distance: must not be given together with position",
         ),
         (
-            {"kind": "area", "position": [0, 0, 1], "draw": {"azimuth": [0, 90]}},
-            "lights[0].draw.azimuth: needs a distance",
+            {"kind": "area", "position": [0, 0, 1], "draw": {"elevation": [0, 90]}},
+            "lights[0].draw.elevation: needs a distance",
         ),
         ({"kind": "area", "draw": {"distance": [0, 2]}}, "lights[0].draw.distance[0]: must be > 0 (got 0)"),
         (
@@ -196,7 +194,7 @@ def test_lights_that_may_be_inside_of_a_shape_get_a_warning(lit: Any) -> None:
             "lights[0].draw.colour[1]: must not be black",
         ),
         (
-            {"kind": "point", "draw": {"distance": [1, 2]}, "path": [{"intensity": 2}]},
+            {"kind": "point", "draw": {"distance": [1, 2]}, "path": [{"position": [0, 0, 2]}]},
             "lights[0].draw: must not be given together with a path",
         ),
         (
@@ -205,17 +203,14 @@ def test_lights_that_may_be_inside_of_a_shape_get_a_warning(lit: Any) -> None:
         ),
         ({"kind": "point", "draw": {"distance": [1, 2], "vary": "view"}}, "lights[0].draw.vary: must be 'layout' or"),
         ({"kind": "area", "draw": {"distance": [1, 2], "dist": 3}}, "lights[0].draw.dist: is not a known key (did you"),
-        ({"kind": "environment", "weights": [1]}, "lights[0].weights: needs a pool"),
         ({"kind": "environment", "pool": []}, "lights[0].pool: must name at least one image (got [])"),
         (
             {"kind": "environment", "pool": "no/*"},
             "lights[0].pool: must name at least one image (got 'no/*', which matches none",
         ),
-        ({"kind": "environment", "pool": ["a.exr"], "weights": [1, 2]}, "lights[0].weights: must have one weight"),
         ({"kind": "environment", "pool": ["a.exr"], "image": "b.exr"}, "lights[0].pool: must not be given together"),
         ({"kind": "environment", "pool": ["/etc/a.exr"]}, "lights[0].pool[0]: must be inside the scene's folder"),
         ({"kind": "environment", "pool": "../*.png"}, "lights[0].pool: must be inside the scene's folder"),
-        ({"kind": "room", "lamps": 0}, "lights[0].lamps: must be >= 1 (got 0)"),
         ({"kind": "room", "size": 0}, "lights[0].size: must be > 0 (got 0)"),
     ],
 )

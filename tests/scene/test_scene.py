@@ -197,7 +197,7 @@ def changed(data: SceneData, **changes: Any) -> SceneData:
         ({"lights__0": {"kind": "spot", "position": [0, 0, 1], "cone": 90}}, "lights[0].cone: must be < 90 (got 90)"),
         ({"lights__0__target": [0.5, 0, 1]}, "lights[0].target: must differ from the light's positions"),
         ({"lights__0__colour": [0, 0, 0]}, "lights[0].colour: must not be black"),
-        ({"lights__0__path": [{}]}, "lights[0].path[0]: must have a position, an intensity or a temperature"),
+        ({"lights__0__path": [{}]}, "lights[0].path[0]: must have a position or a temperature"),
         ({"lights": [{"kind": "environment"}] * 2}, "lights[1].kind: must not be a second environment light"),
         ({"lights": [{"kind": "environment", "image": "sky.exr"}]}, "sky.exr: no such file"),
         ({"randomise": {"vignetting": [-1, 0]}}, "randomise.vignetting[0]: must be >= 0 (got -1)"),
@@ -221,16 +221,6 @@ def changed(data: SceneData, **changes: Any) -> SceneData:
             "objects[0].pool: must match at least one asset folder of kind object (got 'gone/*', which matches none)",
         ),
         ({"objects__0": {"pool": "**a"}}, "objects[0].pool: must "),
-        (
-            {"objects__0": {"pool": ["assets/nut", "assets/bolt"], "weights": [1]}},
-            "objects[0].weights: must have one weight for each of the 2 assets of the pool (got 1)",
-        ),
-        (
-            {"objects__0": {"pool": "assets/*", "weights": [1, 2, 3]}},
-            "objects[0].weights: must have one weight for each of the 2 assets of the pool (got 3)",
-        ),
-        ({"objects__0": {"pool": ["assets/nut"], "weights": [0]}}, "objects[0].weights[0]: must be > 0 (got 0)"),
-        ({"objects__0__weights": [1]}, "objects[0].weights: needs a pool"),
         ({"objects__0__balance": True}, "objects[0].balance: needs a pool"),
         ({"objects__0__label": "no"}, 'objects[0].label: must be true or false (got "no")'),
         (
@@ -245,10 +235,6 @@ def changed(data: SceneData, **changes: Any) -> SceneData:
         (
             {"objects__0": {"asset": "assets/nut", "scale": [1, 2], "poses": [{"position": [0, 0, 1]}]}},
             "objects[0].scale: must be one number together with poses",
-        ),
-        (
-            {"objects__0": {"pool": "primitives", "weights": [1, 2]}},
-            "objects[0].weights: must have one weight for each of the 15 assets of the pool (got 2)",
         ),
         (
             {"objects__0": {"pool": "primitives", "size": 0.1}},
@@ -342,7 +328,7 @@ def random_scene(scene_data: SceneData, write_scene: WriteScene) -> Scene:
     }  # fmt: skip
     scene_data["randomise"] = {
         "exposure": [-1, 1], "hue": [-5, 5], "saturation": [0.8, 1.2], "white_balance": [5000, 7000],
-        "iso": [100, 800], "jpeg": [40, 95], "motion_blur": [0, 3], "light_intensity": [0.5, 2],
+        "iso": [100, 800], "jpeg": [40, 95], "motion_blur": [0, 3],
     }  # fmt: skip
     return load_scene(write_scene(scene_data))
 
@@ -387,13 +373,6 @@ def test_camera_colours_are_drawn_only_if_the_scene_states_them(random_scene: Sc
     stretches, angles = ([one[name] for one in draws] for name in ("chroma_stretch", "chroma_angle"))
     assert 1 <= min(stretches) < 1.2 < max(stretches) <= 1.4
     assert 0 <= min(angles) < 60 and 120 < max(angles) <= 180
-
-
-def test_light_factor_is_drawn_once_per_layout(random_scene: Scene) -> None:
-    radiance = [plan_frame(random_scene, index).lights[0].radiance for index in range(12)]
-    assert len(set(radiance)) == 3
-    assert len(set(radiance[:4])) == 1
-    assert all(5 <= value <= 20 for value in radiance)
 
 
 def test_random_streams_are_independent() -> None:
@@ -493,21 +472,18 @@ def test_intrinsics_follow_the_output_size(scene_data: SceneData, write_scene: W
 
 
 def test_light_path_is_linear_in_time(scene_data: SceneData, write_scene: WriteScene) -> None:
-    path = [{"position": [0, 0, 1]}, {"position": [1, 0, 1], "intensity": 40}, {"position": [1, 2, 1]}]
+    path = [{"position": [0, 0, 1]}, {"position": [1, 0, 1]}, {"position": [1, 2, 1]}]
     scene_data["lights"] = [
         {"kind": "spot", "position": [9, 9, 9], "intensity": 10, "path": path},
-        {"kind": "area", "position": [1, 0, 1], "radiance": 3, "path": [{"intensity": 3}, {"intensity": 6}]},
+        {"kind": "area", "position": [1, 0, 1], "radiance": 3},
         {"kind": "environment", "radiance": 0.5},
     ]
     scene_data["output"]["views"] = 5
     scene = load_scene(write_scene(scene_data))
     plans = [plan_frame(scene, index).lights for index in range(5)]
     assert [spot.position for spot, _, _ in plans] == [(0, 0, 1), (0.5, 0, 1), (1, 0, 1), (1, 1, 1), (1, 2, 1)]
-    assert [spot.intensity for spot, _, _ in plans] == [10, 25, 40, 25, 10]
-    assert [area.radiance for _, area, _ in plans] == [3, 3.75, 4.5, 5.25, 6]
-    assert {area.position for _, area, _ in plans} == {(1, 0, 1)}
-    assert all(sky == scene.spec.lights[2] for _, _, sky in plans)
-    assert all(not light.path for light in plans[0][:2])
+    assert all((area, sky) == scene.spec.lights[1:] for _, area, sky in plans)
+    assert not plans[0][0].path
 
 
 def test_light_path_warms_evenly_in_reciprocal_temperature(scene_data: SceneData, write_scene: WriteScene) -> None:

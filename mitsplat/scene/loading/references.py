@@ -65,7 +65,7 @@ def expand_patterns(spec: SceneSpec, path: Path, *, allow_outside: bool) -> Scen
     """Return the specification with patterns replaced by the sorted names of the folders or images that they match.
 
     Raises:
-        InputError: If nothing matches, if the number of weights differs, or if a file is outside of the allowed folder.
+        InputError: If nothing matches, or if a file is outside of the allowed folder.
     """
     if not allow_outside:
         _check_inside_folder(spec, path)
@@ -75,15 +75,11 @@ def expand_patterns(spec: SceneSpec, path: Path, *, allow_outside: bool) -> Scen
         if isinstance(entry.pool, str) and entry.pool != PRIMITIVES:
             with errors_at_key(path, "objects", position, "pool"):
                 names = _matches(path.parent, entry.pool, "object", allow_outside=allow_outside)
-            with errors_at_key(path, "objects", position):
-                entry.check_weights(len(names))
             objects[position] = entry.model_copy(update={"pool": names})
     for position, light in enumerate(lights):
         if isinstance(light, EnvironmentLight) and isinstance(light.pool, str):
             with errors_at_key(path, "lights", position, "pool"):
                 names = _checked_names(path.parent, image_names(path.parent, light.pool), allow_outside)
-            with errors_at_key(path, "lights", position):
-                light.check_weights(len(names))
             lights[position] = light.model_copy(update={"pool": names})
     return spec.model_copy(update={"objects": tuple(objects), "lights": tuple(lights)})
 
@@ -103,8 +99,6 @@ def _matched_environments(spec: SceneSpec, path: Path, allow_outside: bool) -> S
         with errors_at_key(path, "environment"):
             names = _matches(path.parent, pattern, "environment", allow_outside=allow_outside)
         spec = spec.model_copy(update={"environment": names})
-    with errors_at_key(path):
-        spec.check_environment_weights()
     return spec
 
 

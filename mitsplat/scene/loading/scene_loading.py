@@ -138,12 +138,11 @@ def _expand_enclosures(
 
 def _check_lens(spec: SceneSpec, path: Path) -> None:
     """Check that the intrinsics are valid for the image size; a fisheye lens must not see backwards, for example."""
-    for keys, camera in spec.camera_entries:
-        with errors_at_key(path, *keys, "intrinsics"):
-            try:
-                camera_at(np.eye(4), camera.intrinsics, spec.output, camera.zoom[0])  # the widest view
-            except ValueError as error:
-                raise InputError(str(error)) from error
+    with errors_at_key(path, "camera", "intrinsics"):
+        try:
+            camera_at(np.eye(4), spec.camera.intrinsics, spec.output)
+        except ValueError as error:
+            raise InputError(str(error)) from error
 
 
 def _check_hold_out(spec: SceneSpec, path: Path) -> None:

@@ -72,7 +72,7 @@ def _draw_entry(scene: Scene, position: int, layout: int, count: int) -> list[in
         return []
     held_out = _held_out(spec, layout)
     allowed = [name not in held_out for name in entry.names]
-    weights = np.repeat(np.multiply(entry.weights or np.ones(len(allowed)), allowed), len(entry.scales))
+    weights = np.repeat(np.asarray(allowed, dtype=np.float64), len(entry.scales))
     rng = random_stream(spec.seed, f"object pool {position}", layout)
     if not entry.balance:
         return [pool[i] for i in weighted_choice(rng, weights, count)]

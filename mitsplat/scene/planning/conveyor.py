@@ -1,8 +1,7 @@
 """Motion of objects on a conveyor belt between the views of a layout.
 
-Objects settle while the belt stands still; then the belt runs. Each turn of the cameras is one moment of the run. At
-the middle between the first and the last moment, the layout is as it settled. Objects above the belt move with it
-rigidly.
+Objects settle while the belt stands still; then the belt runs. Each view is one moment of the run. At the middle
+between the first and the last moment, the layout is as it settled. Objects above the belt move with it rigidly.
 """
 
 from __future__ import annotations
@@ -36,7 +35,7 @@ class Belt:
         box: Box of the belt, which runs along its own x axis.
         speed: Speed of the belt surface [m/s].
         time: Time since the moment at which the layout is as it settled [s]; negative before it.
-        interval: Time until the next image of the layout [s]; 0 if that shows the same moment, or if there is none.
+        interval: Time until the next image of the layout [s]; 0 if there is none.
     """
 
     box: Box
@@ -68,15 +67,13 @@ def _above_box(box: Box, points: Float64Array, height: float) -> BoolArray:
 
 
 def belt_of(spec: SceneSpec, view: int) -> Belt | None:
-    """Return the belt at the moment of a view of a layout. All cameras of one turn see the same moment."""
+    """Return the belt at the moment of a view of a layout."""
     if spec.conveyor is None:
         return None
     box = next(shape.box for shape in spec.shapes if shape.name == spec.conveyor.belt and shape.box is not None)
-    views_per_turn = len(spec.views_of_turn)
-    turn, turns = view // views_per_turn, -(-spec.output.views // views_per_turn)
-    follows = view + 1 < spec.output.views and (view + 1) // views_per_turn != turn
-    interval = spec.conveyor.interval
-    return Belt(box, spec.conveyor.speed, interval * (turn - (turns - 1) / 2), interval if follows else 0.0)
+    views, interval = spec.output.views, spec.conveyor.interval
+    time = interval * (view - (views - 1) / 2)
+    return Belt(box, spec.conveyor.speed, time, interval if view + 1 < views else 0.0)
 
 
 def layout_at_view(spec: SceneSpec, layout: Layout, view: int) -> Layout:

@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 
 from mitsplat.geometry.camera import direction
-from mitsplat.scene.spec.light_spec import EnvironmentLight, LightDraw, LightSpec, PointLight, RoomLight, SpotLight
+from mitsplat.scene.spec.light_spec import EnvironmentLight, LightDraw, LightSpec, RoomLight
 from mitsplat.scene.spec.scene_spec import SceneSpec
 from mitsplat.scene.streams import random_stream, weighted_choice
 
-_UNIFORM = ("position", "target", "size", "cone", "radiance", "intensity", "rotate_z")
+_UNIFORM = ("position", "size", "radiance", "rotate_z")
 """Keys whose values, or components, are uniform between two bounds."""
 
 
@@ -44,9 +44,7 @@ def lights_at(spec: SceneSpec, layout: int, index: int, time: float) -> tuple[Li
                 if light.draw is None
                 else _draw_values(light, light.draw, spec.seed, f"{position}.{copy}", number)
             )
-            name = f"{position}" if not copy else f"{position}.{copy}"
-            factors = random_stream(spec.seed, f"light intensity {name}", layout)
-            found.append(_at_time(one, time, float(factors.uniform(*spec.randomise.light_intensity))))
+            found.append(_at_time(one, time))
     return tuple(found)
 
 
@@ -54,8 +52,8 @@ def _with_image(sky: EnvironmentLight, rng: np.random.Generator) -> EnvironmentL
     """Return an environment light with one image of its pool."""
     if sky.pool is None:
         return sky
-    image = sky.names[weighted_choice(rng, sky.weights or np.ones(len(sky.names)))[0]]
-    return sky.model_copy(update={"image": image, "pool": None, "weights": ()})
+    image = sky.names[weighted_choice(rng, np.ones(len(sky.names)))[0]]
+    return sky.model_copy(update={"image": image, "pool": None})
 
 
 def _draw_values(light: LightSpec, draw: LightDraw, seed: int, name: str, number: int) -> LightSpec:
@@ -75,30 +73,24 @@ def _draw_values(light: LightSpec, draw: LightDraw, seed: int, name: str, number
         one, other = np.array(draw.colour)
         state["colour"] = tuple((one + uniform("colour", 0.0, 1.0) * (other - one)).tolist())
     if draw.distance is not None:
-        around: Any = draw.around or state.get("target") or getattr(light, "target", (0.0, 0.0, 0.0))
-        azimuth = np.radians(uniform("azimuth", *draw.azimuth))
+        target: Any = getattr(light, "target", (0.0, 0.0, 0.0))
+        azimuth = np.radians(uniform("azimuth", 0.0, 360.0))
         # Uniform by area on the sphere: the sine of the elevation is uniform (Archimedes).
         sine = uniform("elevation", *np.sin(np.radians(draw.elevation)))
         offset = uniform("distance", *draw.distance) * direction(azimuth, sine)
-        state["position"] = tuple(np.add(around, offset).tolist())
+        state["position"] = tuple(np.add(target, offset).tolist())
     return light.model_copy(update=state)
 
 
-def _at_time(light: LightSpec, time: float, factor: float) -> LightSpec:
-    """Return a light at ``time`` in [0, 1] of its path, with its intensity multiplied by a factor."""
-    strength = "intensity" if isinstance(light, SpotLight | PointLight) else "radiance"
-    state: dict[str, Any] = {strength: getattr(light, strength)}
-    if not isinstance(light, EnvironmentLight) and light.path:
-        times = np.linspace(0.0, 1.0, len(light.path))
-        strengths = [key.intensity or state[strength] for key in light.path]
-        positions = np.array([key.position or light.position for key in light.path])
-        state = {
-            strength: float(np.interp(time, times, strengths)),
-            "position": tuple(float(np.interp(time, times, positions[:, axis])) for axis in range(3)),
-            "path": (),
-        }
-        if light.temperature is not None:
-            inverse_kelvins = [1.0 / (key.temperature or light.temperature) for key in light.path]
-            state["temperature"] = float(1.0 / np.interp(time, times, inverse_kelvins))
-    state[strength] *= factor
+def _at_time(light: LightSpec, time: float) -> LightSpec:
+    """Return a light at ``time`` in [0, 1] of its path."""
+    if isinstance(light, EnvironmentLight) or not light.path:
+        return light
+    times = np.linspace(0.0, 1.0, len(light.path))
+    positions = np.array([key.position or light.position for key in light.path])
+    place = tuple(float(np.interp(time, times, positions[:, axis])) for axis in range(3))
+    state: dict[str, Any] = {"position": place, "path": ()}
+    if light.temperature is not None:
+        inverse_kelvins = [1.0 / (key.temperature or light.temperature) for key in light.path]
+        state["temperature"] = float(1.0 / np.interp(time, times, inverse_kelvins))
     return light.model_copy(update=state)

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from mitsplat.scene.spec.material_spec import Background, BrushedMetalMaterial, ColourMaterial, ImageMaterial, Material
+from mitsplat.scene.spec.material_spec import Background, ColourMaterial, ImageMaterial, Material
 from mitsplat.scene.spec.scene_spec import SceneSpec
 from mitsplat.scene.spec.shape_spec import Shape
 from mitsplat.scene.splits import draw_environment
@@ -20,6 +20,9 @@ from mitsplat.scene.streams import random_stream
 from mitsplat.scene.walls import material_name
 
 Colour = tuple[float, float, float]
+
+_CROP, _ROTATION, _GAIN = (0.5, 1.0), (-15.0, 15.0), (0.7, 1.3)
+"""Ranges of the size [of the largest crop], the rotation [degrees] and the linear gain of background images."""
 
 
 @dataclass(frozen=True)
@@ -32,8 +35,6 @@ class MaterialDraw:
         scale: Size of the largest features of the pattern, or width of the image [m].
         rotate: Rotation on the surface [degrees].
         offset: Shift on the surface, as a fraction of a repetition.
-        roughness: GGX roughness across the scratches of brushed metal.
-        gain: Factor on the linear colours of the image.
         image: Name of the image file.
         seed: Seed of the pattern.
     """
@@ -43,8 +44,6 @@ class MaterialDraw:
     scale: float = 1.0
     rotate: float = 0.0
     offset: tuple[float, float] = (0.0, 0.0)
-    roughness: float | None = None
-    gain: float | None = None
     image: str | None = None
     seed: int = 0
 
@@ -111,9 +110,7 @@ def draw_surroundings(spec: SceneSpec, index: int, layout: int | None = None) ->
     layout = index // spec.output.views if layout is None else layout
     choices = {material_name(shape.name): shape.materials for shape in spec.shapes if shape.materials}
     materials = {name: draw_material(among, spec.seed, name, layout) for name, among in choices.items()}
-    background = None
-    if spec.background is not None:
-        background = draw_background(spec.background, spec.seed, index if spec.background.per == "frame" else layout)
+    background = None if spec.background is None else draw_background(spec.background, spec.seed, index)
     return LayoutSurroundings(draw_environment(spec, layout), materials, background)
 
 
@@ -123,14 +120,13 @@ def draw_material(materials: Sequence[Material], seed: int, name: str, layout: i
     material = materials[int(rng.integers(len(materials)))]
     pattern = int(rng.integers(2**31))
     # All values are drawn always, so that no value depends on the other values of the material.
-    hue, saturation, value, contrast, scale, rotate, other, u, v, choice = map(float, rng.random(10))
+    hue, saturation, value, contrast, scale, rotate, _, u, v, choice = map(float, rng.random(10))
     if isinstance(material, ImageMaterial):
         return MaterialDraw(
             kind=material.kind,
             scale=_lerp(material.scale, scale),
-            rotate=_lerp(material.rotate, rotate),
+            rotate=360 * rotate,
             offset=(u, v),
-            gain=_lerp(material.gain, other),
             image=material.images[int(choice * len(material.images))],
         )
     tint = _lerp(material.hue, hue) / 360 % 1.0, _lerp(material.saturation, saturation)
@@ -142,23 +138,22 @@ def draw_material(materials: Sequence[Material], seed: int, name: str, layout: i
         kind=material.kind,
         colours=(first, colorsys.hsv_to_rgb(*tint, bright * (1 - _lerp(material.contrast, contrast)))),
         scale=_lerp(material.scale, scale),
-        rotate=_lerp(material.rotate, rotate),
+        rotate=360 * rotate,
         offset=(u, v),
-        roughness=_lerp(material.roughness, other) if isinstance(material, BrushedMetalMaterial) else None,
         seed=pattern,
     )
 
 
-def draw_background(background: Background, seed: int, number: int) -> BackgroundDraw:
-    """Draw the background image of frame or layout ``number``."""
-    rng = random_stream(seed, "background", number)
+def draw_background(background: Background, seed: int, index: int) -> BackgroundDraw:
+    """Draw the background image of frame ``index``."""
+    rng = random_stream(seed, "background", index)
     choice, crop, x, y, rotate, gain = map(float, rng.random(6))
     return BackgroundDraw(
         image=background.images[int(choice * len(background.images))],
-        crop=_lerp(background.crop, crop),
+        crop=_lerp(_CROP, crop),
         place=(x, y),
-        rotate=_lerp(background.rotate, rotate),
-        gain=_lerp(background.gain, gain),
+        rotate=_lerp(_ROTATION, rotate),
+        gain=_lerp(_GAIN, gain),
     )
 
 

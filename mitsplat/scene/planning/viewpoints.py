@@ -7,37 +7,26 @@ viewpoint instead.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy.interpolate import PchipInterpolator
 from scipy.spatial.transform import Rotation
 
 from mitsplat.arrays import Float64Array
 from mitsplat.errors import InputError
 from mitsplat.geometry.camera import Camera, direction, interpolate_poses, look_at_pose
 from mitsplat.scene.planning.visibility_prediction import PredictedView, VisibilityPredictor
-from mitsplat.scene.spec.camera_spec import (
-    CameraHemisphere,
-    CameraOrbit,
-    CameraSpec,
-    CameraWalk,
-    Handheld,
-    Intrinsics,
-    Motion,
-)
-from mitsplat.scene.spec.scene_spec import Output
+from mitsplat.scene.spec.camera_spec import CameraHemisphere, CameraOrbit, Intrinsics
+from mitsplat.scene.spec.scene_spec import Output, SceneSpec
 from mitsplat.scene.streams import random_stream
 
 if TYPE_CHECKING:
     from mitsplat.scene.layout import Layout
     from mitsplat.scene.scene import Scene
 
-_NEIGHBOURS = 2
-"""Number of neighbours that form a cluster with an object."""
 _STEPS = 1.2207440846057596 ** -np.arange(1.0, 4.0)
 """Steps of the low-discrepancy sequence in three dimensions: powers of the root of x^4 = x + 1.
 
@@ -46,8 +35,6 @@ points before it.
 """
 _BORDER = (0.6, 1.0)
 """Range of the distance between target and image centre of views that should cut objects, in half widths or heights."""
-_WAVES, _FASTEST = 8, 0.15
-"""Number of cosines of the handheld motion along each axis, and their maximum frequency in periods per view."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,13 +45,7 @@ class Viewpoint:
         camera: The camera.
         drawn: Random values and selection results as JSON values, empty if the scene has none. Keys:
 
-            * ``camera``: index of the camera among several;
-            * ``side``: side of a stereo pair;
-            * ``zoom``: factor on the focal lengths;
-            * ``aperture``, ``focus``: thin lens [m];
-            * ``motion``: motion during the exposure: ``exposure`` [s]; ``velocity`` [m/s] and ``rotation`` [degrees/s]
-                in the camera's frame;
-            * ``handheld``: handheld motion, see :func:`handheld_transform`;
+            * ``motion``: ``exposure`` [s];
             * ``target``: point in the centre of the image [m];
             * ``object``: id of the instance in the centre of the image;
             * ``attempt``: number of the candidate view;
@@ -75,73 +56,6 @@ class Viewpoint:
     drawn: Mapping[str, Any] = field(default_factory=dict)
 
 
-@dataclass(frozen=True, eq=False)
-class _CameraTurn:
-    """Frame as one of the views of its camera.
-
-    Attributes:
-        seed: Seed of the scene.
-        index: Index of the frame.
-        number: Index of the camera among the cameras of the scene.
-        camera: Specification of the camera.
-        output: Size of the images.
-        layout: Index of the layout.
-        turn: Index of the view among the views of this camera in the layout.
-        turns: Number of views of this camera in the layout.
-    """
-
-    seed: int
-    index: int
-    number: int
-    camera: CameraSpec
-    output: Output
-    layout: int
-    turn: int
-    turns: int
-
-    @property
-    def time(self) -> float:
-        """Time in [0, 1] over the views of the camera in the layout."""
-        return self.turn / max(1, self.turns - 1)
-
-    def camera_at_pose(self, pose: Float64Array) -> tuple[Camera, dict[str, Any]]:
-        """Return the camera at a pose plus handheld motion, and the values drawn for it."""
-        camera, drawn = self.camera, dict[str, Any]()
-        if camera.zoom[0] < camera.zoom[1]:
-            drawn["zoom"] = float(random_stream(self.seed, "camera zoom", self.index).uniform(*camera.zoom))
-        if camera.handheld is not None:
-            drawn["handheld"] = self._handheld_motion(camera.handheld).tolist()
-            pose = pose @ handheld_transform(drawn["handheld"])
-        taken = camera_at(pose, camera.intrinsics, self.output, drawn.get("zoom", camera.zoom[0]))
-        if camera.defocus is not None:
-            rng = random_stream(self.seed, "camera defocus", self.index)
-            drawn["aperture"], drawn["focus"] = (
-                float(rng.uniform(*bounds)) for bounds in (camera.defocus.aperture, camera.defocus.focus)
-            )
-            taken = replace(taken, aperture_radius=drawn["aperture"], focus_distance=drawn["focus"])
-        if camera.motion is not None:
-            drawn["motion"] = self._draw_motion(camera.motion)
-        return taken, drawn
-
-    def _draw_motion(self, motion: Motion) -> dict[str, Any]:
-        """Draw exposure [s], velocity [m/s] and rotation rate [degrees/s], in the camera's frame."""
-        rng = random_stream(self.seed, "camera motion", self.index)
-        exposure, *rates = (float(rng.uniform(*bounds)) for bounds in (motion.exposure, motion.speed, motion.rotation))
-        velocity, rotation = (rate * direction(2 * np.pi * rng.uniform(), rng.uniform(-1, 1)) for rate in rates)
-        return {"exposure": exposure, "velocity": velocity.tolist(), "rotation": rotation.tolist()}
-
-    def _handheld_motion(self, hand: Handheld) -> Float64Array:
-        """Return displacement [m] and rotation vector [degrees] of the handheld camera at a turn, shape (6,).
-
-        A sum of N cosines with random phases is approximately normal and has a variance of N/2, whatever the
-        frequencies. The periods here are about seven views or more, which makes the motion smooth.
-        """
-        rng = random_stream(self.seed, "camera handheld", self.layout, self.number)
-        rates, phases = rng.uniform(0, _FASTEST, (6, _WAVES)), rng.uniform(0, 1, (6, _WAVES))
-        waves = np.cos(2 * np.pi * (rates * self.turn + phases)).sum(axis=1) * np.sqrt(2 / _WAVES)
-        return np.asarray(waves * np.repeat([hand.position, hand.rotation], 3))
-
-
 @lru_cache(maxsize=4)
 def view_of(scene: Scene, index: int, layout: Layout | None = None) -> Viewpoint:
     """Return the viewpoint of frame ``index``. The layout is needed only if the viewpoint depends on the objects.
@@ -149,50 +63,30 @@ def view_of(scene: Scene, index: int, layout: Layout | None = None) -> Viewpoint
     Raises:
         InputError: If no candidate view of the frame fulfils the conditions of the scene file.
     """
-    spec = scene.spec
-    cameras = (spec.camera, *spec.cameras)
-    number_of_layout, view = divmod(index, spec.output.views)
-    views_of_turn = spec.views_of_turn
-    turn, place_in_turn = divmod(view, len(views_of_turn))
-    number, side = views_of_turn[place_in_turn]
-    camera = cameras[number]
-    if side and camera.stereo is not None:
-        left = view_of(scene, index - 1, layout)
-        pose = left.camera.world_from_camera.copy()
-        pose[:3, 3] += camera.stereo.baseline * pose[:3, 0]
-        return Viewpoint(replace(left.camera, world_from_camera=pose), {**left.drawn, "side": "right"})
-    turns = 1 + (spec.output.views - 1 - place_in_turn) // len(views_of_turn)
-    camera_turn = _CameraTurn(spec.seed, index, number, camera, spec.output, number_of_layout, turn, turns)
-    own: dict[str, Any] = {"camera": number} if spec.cameras else {}
-    own |= {"side": "left"} if camera.stereo else {}
+    spec, camera = scene.spec, scene.spec.camera
     if isinstance(camera, CameraHemisphere):
-        found = _hemisphere_view(scene, camera_turn, camera, layout)
-        return Viewpoint(found.camera, {**own, **found.drawn})
-    if isinstance(camera, CameraWalk):
-        pose = _walk_pose(camera, camera_turn)
+        return _hemisphere_view(scene, index, camera, layout)
+    view, views = index % spec.output.views, spec.output.views
+    if isinstance(camera, CameraOrbit):
+        pose = _orbit_pose(camera, view, views)
     else:
-        if isinstance(camera, CameraOrbit):
-            pose = _orbit_pose(camera, turn, turns)
-        else:
-            keys = [look_at_pose(key.eye, key.target, key.up) for key in camera.keys]
-            pose = interpolate_poses(keys, camera_turn.time)[0]
-        pose[:3, 3] += camera.jitter * random_stream(spec.seed, "camera jitter", index).standard_normal(3)
-    view_camera, drawn = camera_turn.camera_at_pose(pose)
-    return Viewpoint(view_camera, own | drawn)
+        keys = [look_at_pose(key.eye, key.target) for key in camera.keys]
+        pose = interpolate_poses(keys, view / max(1, views - 1))[0]
+    pose[:3, 3] += camera.jitter * random_stream(spec.seed, "camera jitter", index).standard_normal(3)
+    return Viewpoint(*_camera_of_frame(spec, index, pose))
 
 
-def handheld_transform(motion: Sequence[float]) -> Float64Array:
-    """Return the rigid transform (4, 4) of a displacement [m] and a rotation vector [degrees] in the camera's frame."""
-    moved = np.eye(4)
-    moved[:3, 3] = motion[:3]
-    moved[:3, :3] = Rotation.from_rotvec(motion[3:], degrees=True).as_matrix()
-    return moved
+def _camera_of_frame(spec: SceneSpec, index: int, pose: Float64Array) -> tuple[Camera, dict[str, Any]]:
+    """Return the camera of a frame at a pose, and the values drawn for it."""
+    drawn, motion = dict[str, Any](), spec.camera.motion
+    if motion is not None:
+        exposure = random_stream(spec.seed, "camera motion", index).uniform(*motion.exposure)
+        drawn["motion"] = {"exposure": float(exposure)}
+    return camera_at(pose, spec.camera.intrinsics, spec.output), drawn
 
 
-def camera_at(pose: Float64Array, intrinsics: Intrinsics, output: Output, zoom: float = 1.0) -> Camera:
+def camera_at(pose: Float64Array, intrinsics: Intrinsics, output: Output) -> Camera:
     """Return a camera of the scene file at a pose, for images of the output's size.
-
-    The focal lengths are multiplied by ``zoom``.
 
     Raises:
         ValueError: If the intrinsics are invalid, such as those of a fisheye lens that sees backwards.
@@ -205,13 +99,12 @@ def camera_at(pose: Float64Array, intrinsics: Intrinsics, output: Output, zoom: 
     camera = Camera(
         width=width,
         height=height,
-        fx=fx * zoom,
-        fy=(fx if intrinsics.fy is None else intrinsics.fy) * zoom,
+        fx=fx,
+        fy=fx if intrinsics.fy is None else intrinsics.fy,
         cx=width / 2 if intrinsics.cx is None else intrinsics.cx,
         cy=height / 2 if intrinsics.cy is None else intrinsics.cy,
         world_from_camera=pose,
         distortion=intrinsics.distortion,
-        near=intrinsics.near,
         lens=intrinsics.lens,
         aperture_radius=intrinsics.aperture,
         focus_distance=intrinsics.focus,
@@ -230,31 +123,12 @@ def _orbit_pose(camera: CameraOrbit, view: int, views: int) -> Float64Array:
     return look_at_pose(np.add(camera.target, offset), camera.target)
 
 
-def _walk_pose(camera: CameraWalk, camera_turn: _CameraTurn) -> Float64Array:
-    """Return a pose by interpolation between the waypoints of the layout.
-
-    The interpolation is monotone piecewise cubic (Fritsch and Carlson 1980).
-    """
-    rng = random_stream(camera_turn.seed, "camera walk", camera_turn.layout, camera_turn.number)
-    ranges = np.array([camera.azimuth, np.sin(np.radians(camera.elevation)), camera.radius])
-    places = rng.uniform(ranges[:, 0], ranges[:, 1], (camera.places, 3))
-    azimuth, sine, radius = PchipInterpolator(np.linspace(0, 1, camera.places), places)(camera_turn.time)
-    return _pose_around(np.array(camera.target, dtype=np.float64), np.radians(azimuth), sine, radius)
-
-
-def _pose_around(target: Float64Array, azimuth: float, sine: float, radius: float) -> Float64Array:
-    """Return the pose that looks at a target [m] from an azimuth [rad], a sine of the elevation and a distance [m]."""
-    return look_at_pose(target + radius * direction(azimuth, sine), target)
-
-
-def _hemisphere_view(
-    scene: Scene, camera_turn: _CameraTurn, camera: CameraHemisphere, layout: Layout | None
-) -> Viewpoint:
+def _hemisphere_view(scene: Scene, index: int, camera: CameraHemisphere, layout: Layout | None) -> Viewpoint:
     """Return the accepted candidate view whose shares of hidden and cut objects are nearest to the targets.
 
     The search ends at the first accepted candidate that meets the targets exactly.
     """
-    spec, index = scene.spec, camera_turn.index
+    spec = scene.spec
     predictor = (
         None
         if layout is None or (camera.look_at == "target" and not camera.selects_views)
@@ -262,8 +136,8 @@ def _hemisphere_view(
     )
     if predictor is None or not camera.selects_views:
         target, seen = _target(camera, spec.seed, index, 0, predictor)
-        pose, target = _hemisphere_pose(camera, camera_turn, 0, target)
-        view_camera, drawn = camera_turn.camera_at_pose(pose)
+        pose, target = _hemisphere_pose(camera, spec.seed, index, 0, target)
+        view_camera, drawn = _camera_of_frame(spec, index, pose)
         return Viewpoint(
             view_camera, drawn if camera.look_at == "target" else {**drawn, "target": target.tolist(), "object": seen}
         )
@@ -273,11 +147,11 @@ def _hemisphere_view(
     refused: list[tuple[float, str]] = []
     for number in range(camera.tries):
         target, seen = _target(camera, spec.seed, index, number, predictor)
-        pose, target = _hemisphere_pose(camera, camera_turn, number, target)
+        pose, target = _hemisphere_pose(camera, spec.seed, index, number, target)
         if camera.truncation is not None and number % 2:
             rng = _stream(spec.seed, "camera border", index, number)
-            pose, target = _rotate_target_to_border(camera_turn.camera_at_pose(pose)[0], pose, target, rng)
-        view_camera, motion_draws = camera_turn.camera_at_pose(pose)
+            pose, target = _rotate_target_to_border(_camera_of_frame(spec, index, pose)[0], pose, target, rng)
+        view_camera, motion_draws = _camera_of_frame(spec, index, pose)
         projected = predictor.project(view_camera)
         if camera.accept is not None and (violations := predictor.find_violations(projected, camera.accept)):
             refused.append((sum(miss for miss, _ in violations), " and ".join(text for _, text in violations)))
@@ -323,18 +197,13 @@ def _target(
         return np.array(camera.target, dtype=np.float64), None
     among = np.flatnonzero(predictor.labelled)
     drawn = int(among[_stream(seed, "camera look at", index, number).integers(len(among))])
-    if camera.look_at == "objects":
-        return predictor.centres[drawn], int(predictor.ids[drawn])
-    away = np.linalg.norm(predictor.centres[among] - predictor.centres[drawn], axis=1)
-    nearest = among[np.argsort(away, kind="stable")[: 1 + _NEIGHBOURS]]
-    return predictor.centres[nearest].mean(axis=0), int(predictor.ids[drawn])
+    return predictor.centres[drawn], int(predictor.ids[drawn])
 
 
 def _hemisphere_pose(
-    camera: CameraHemisphere, camera_turn: _CameraTurn, number: int, middle: Float64Array
+    camera: CameraHemisphere, seed: int, index: int, number: int, middle: Float64Array
 ) -> tuple[Float64Array, Float64Array]:
     """Return the pose of a candidate view around a point [m], and its target with jitter [m]."""
-    seed, index = camera_turn.seed, camera_turn.index
 
     def draw(name: str, low: float, high: float) -> float:
         return float(_stream(seed, f"camera {name}", index, number).uniform(low, high))
@@ -344,15 +213,14 @@ def _hemisphere_pose(
     if camera.coverage == "even":
         shift = random_stream(seed, "camera coverage", number).uniform(size=3)
         low, high = np.array([camera.azimuth, sines, camera.radius], dtype=np.float64).T
-        nth = camera_turn.layout * camera_turn.turns + camera_turn.turn + 1  # of all views of this camera
-        azimuth, sine, radius = (low + (high - low) * np.mod(shift + nth * _STEPS, 1.0)).tolist()
+        azimuth, sine, radius = (low + (high - low) * np.mod(shift + (index + 1) * _STEPS, 1.0)).tolist()
     else:
         radius, azimuth = draw("radius", *camera.radius), draw("azimuth", *camera.azimuth)
         sine = draw("elevation", *sines)
     azimuth, roll = np.radians(azimuth), np.radians(draw("roll", *camera.roll))
     jitter = camera.target_jitter * _stream(seed, "camera target", index, number).standard_normal(3)
     target = np.add(middle, jitter)
-    pose = _pose_around(target, azimuth, sine, radius)
+    pose = look_at_pose(target + radius * direction(azimuth, sine), target)
     pose[:3, :3] = pose[:3, :3] @ Rotation.from_euler("z", roll).as_matrix()
     return pose, target
 

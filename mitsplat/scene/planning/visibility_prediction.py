@@ -32,6 +32,10 @@ _LARGEST_OBJECT_POINTS = 800
 _MIN_POINTS = 100
 _CELL_SIZE = 1.25
 """Size of a raster cell, in point spacings."""
+_PARTLY_HIDDEN = (0.2, 0.9)
+"""Range of visible fractions of a partly hidden object."""
+_CUT = (0.05, 0.8)
+"""Range of the share beyond the border of an object that the border cuts."""
 _MAX_TESTS = 2_000_000
 """Maximum number of ray-triangle pairs that are tested together."""
 
@@ -46,7 +50,6 @@ class ProjectedPoints:
         raster: Mask of the points in front of the camera and in the image or a margin of one image size around it.
         cell_size: Size of the raster cells [px].
         within: Share of the surface of each object that is in front of the camera and in the image, shape (N,).
-        extents: Longer side of the bounding box of each object in the image [px], 0 outside of the image, shape (N,).
         outside_raster: Share of each object outside of the raster, shape (N,).
     """
 
@@ -57,7 +60,6 @@ class ProjectedPoints:
     raster: BoolArray
     cell_size: float
     within: Float64Array
-    extents: Float64Array
     outside_raster: Float64Array
 
 
@@ -136,17 +138,11 @@ class VisibilityPredictor:
             # Distortion far outside of the image is undefined, and the raster must be finite.
             raster = front & _within(x, y, camera, 1)
         within, in_raster = (np.bincount(owner[some], minlength=count) / self._counts for some in (inside, raster))
-        extents, cell_size = np.zeros(count), 1.0
-        if count:  # points are sorted by owner, and every owner has points
-            starts = np.cumsum(self._counts) - self._counts
-            for at in (x, y):
-                high = np.maximum.reduceat(np.where(inside, at, -np.inf), starts)
-                low = np.minimum.reduceat(np.where(inside, at, np.inf), starts)
-                extents = np.maximum(extents, np.where(within > 0, high - low, 0.0))
+        cell_size = 1.0
         if front.any():
             away = max(float(np.median(depth[front])), camera.near)
             cell_size = _CELL_SIZE * self._spacing * max(camera.fx, camera.fy) / away
-        return ProjectedPoints(camera, x, y, depth, raster, cell_size, within, extents, 1.0 - in_raster)
+        return ProjectedPoints(camera, x, y, depth, raster, cell_size, within, 1.0 - in_raster)
 
     def predict(
         self, projected: ProjectedPoints, occlusion: Occlusion | None, truncation: Truncation | None, min_pixels: int
@@ -157,9 +153,9 @@ class VisibilityPredictor:
         shown = self.labelled & (seen * projected.cell_size**2 >= min_pixels)
         hidden = cut = 0
         if occlusion is not None:
-            hidden = int(np.count_nonzero(shown & _in_range(visible, occlusion.visible)))
+            hidden = int(np.count_nonzero(shown & _in_range(visible, _PARTLY_HIDDEN)))
         if truncation is not None:
-            cut = int(np.count_nonzero(shown & _in_range(beyond, truncation.cut)))
+            cut = int(np.count_nonzero(shown & _in_range(beyond, _CUT)))
         labelled = self.labelled
         return PredictedView(visible[labelled], beyond[labelled], int(np.count_nonzero(shown)), hidden, cut)
 
@@ -193,16 +189,11 @@ class VisibilityPredictor:
     def find_violations(self, projected: ProjectedPoints, rules: Acceptance) -> list[tuple[float, str]]:
         """Return the rules that a view violates: the relative shortfall, and a description."""
         found, eye = [], projected.camera.centre
-        within, extents = projected.within[self.labelled], projected.extents[self.labelled]
+        within = projected.within[self.labelled]
         share = float(np.mean(within >= 0.5)) if len(within) else 1.0
         if share < rules.in_view:
             text = f"shows {share:.3g} of the labelled objects, but in_view is {rules.in_view:g}"
             found.append((1 - share / rules.in_view, text))
-        least = float(extents[within > 0].min(initial=np.inf))
-        if least < rules.extent:
-            found.append(
-                (1 - least / rules.extent, f"shows an object of {least:.3g} px, but extent is {rules.extent:g}")
-            )
         away = self._clearance(eye, rules.clearance)
         if name := self._containing_solid(eye):
             found.append((1.0, f"is inside {name}"))

@@ -6,16 +6,14 @@ from typing import Annotated, Literal
 
 from pydantic import Field, NonNegativeFloat, model_validator
 
-from mitsplat.geometry.camera import Lens
+from mitsplat.geometry.camera import NEAR, Lens
 from mitsplat.storage.field_types import (
     ElevationRange,
-    NonNegativeRange,
     Positive,
     PositiveRange,
     Range,
     StrictModel,
     Unit,
-    UnitRange,
     Vec3,
 )
 from mitsplat.storage.yaml_input import FieldError
@@ -42,7 +40,6 @@ class Intrinsics(StrictModel):
     lens: Lens = Field("opencv", description="OpenCV camera model.")
     aperture: NonNegativeFloat = Field(0.0, description="Aperture radius of a thin lens [m]. 0 for a pinhole camera.")
     focus: Positive = Field(1.0, description="Focus depth of a thin lens [m].")
-    near: Positive = Field(0.01, description="Near clipping depth [m].")
 
     @model_validator(mode="after")
     def _check(self) -> Intrinsics:
@@ -51,8 +48,8 @@ class Intrinsics(StrictModel):
         for key in ("fy", "cx", "cy", "size"):
             if self.fx is None and getattr(self, key) is not None:
                 raise FieldError(key, "needs fx")
-        if self.aperture > 0 and self.focus <= self.near:
-            raise FieldError("focus", f"must be beyond near, {self.near} (got {self.focus})")
+        if self.aperture > 0 and self.focus <= NEAR:
+            raise FieldError("focus", f"must be beyond the near clipping depth, {NEAR} m (got {self.focus})")
         if self.lens == "fisheye":
             if self.fx is None or len(self.distortion) != 4:
                 raise FieldError("lens", "fisheye needs fx and 4 distortion coefficients")
@@ -61,84 +58,21 @@ class Intrinsics(StrictModel):
         return self
 
 
-class Stereo(StrictModel):
-    """Second camera of a rectified pair, with the same intrinsics and parallel to the first."""
-
-    baseline: Positive = Field(description="Distance of the right camera from the left camera, along its x axis [m].")
-
-
-class Handheld(StrictModel):
-    """Motion of a handheld camera, smooth over the views of a layout and different in every layout."""
-
-    position: NonNegativeFloat = Field(0.0, description="Displacement along each axis, 1 sigma [m].")
-    rotation: NonNegativeFloat = Field(0.0, description="Rotation about each axis, 1 sigma [degrees].")
-
-
-class Defocus(StrictModel):
-    """Thin lens whose parameters are drawn for every view, in place of those of ``intrinsics``."""
-
-    aperture: NonNegativeRange = Field(description="Range of aperture radii [m]. 0 for a pinhole camera.")
-    focus: PositiveRange = Field(description="Range of focus depths [m].")
-
-
 class Motion(StrictModel):
-    """Constant camera motion while the shutter is open, drawn for every view in the camera's frame."""
+    """Exposure, in which a conveyor's belt and the objects on it move."""
 
-    exposure: PositiveRange = Field(description="Range of exposure times [s].")
-    speed: NonNegativeRange = Field(
-        (0.0, 0.0), description="Range of speeds [m/s]. The direction is uniform on the sphere."
-    )
-    rotation: NonNegativeRange = Field(
-        (0.0, 0.0), description="Range of rotation rates [degrees/s]. The axis is uniform on the sphere."
-    )
-
-    @property
-    def is_moving(self) -> bool:
-        """True if the camera moves during the exposure."""
-        return bool(self.speed[1] or self.rotation[1])
+    exposure: PositiveRange = Field(description="Range of exposure times [s], drawn for every view.")
 
 
 class Viewpoint(StrictModel):
     """Keys that all kinds of cameras have."""
 
     intrinsics: Intrinsics = Field(Intrinsics(fov_x=60), description="Lens and sensor geometry.")
-    zoom: PositiveRange = Field(
-        (1.0, 1.0),
-        exclude_if=lambda zoom: zoom == (1.0, 1.0),
-        description="Range of factors on the focal lengths, drawn for every view.",
-    )
-    handheld: Handheld | None = Field(
-        None,
-        exclude_if=lambda handheld: handheld is None,
-        description="Smooth random motion that is added to the pose.",
-    )
-    defocus: Defocus | None = Field(
-        None,
-        exclude_if=lambda defocus: defocus is None,
-        description="Ranges of aperture and focus, drawn for every view.",
-    )
     motion: Motion | None = Field(
         None,
         exclude_if=lambda motion: motion is None,
-        description="Camera motion during the exposure, which blurs near things more than far ones. Pose and labels "
-        "refer to the middle of the exposure.",
+        description="Exposure, which blurs what the conveyor moves. Labels refer to its middle. Needs a conveyor.",
     )
-    stereo: Stereo | None = Field(
-        None,
-        exclude_if=lambda stereo: stereo is None,
-        description="Takes a stereo pair of every view: the left image, then the right one. A pair counts as two of "
-        "``output.views``.",
-    )
-
-    @model_validator(mode="after")
-    def _check_defocus(self) -> Viewpoint:
-        if self.defocus is not None:
-            if self.intrinsics.aperture:
-                raise FieldError("defocus", "must not be given together with an aperture of the intrinsics")
-            if self.defocus.focus[0] <= self.intrinsics.near:
-                text = f"must be beyond near, {self.intrinsics.near:g} (got {self.defocus.focus[0]:g})"
-                raise FieldError(("defocus", "focus"), text)
-        return self
 
 
 class PoseKey(StrictModel):
@@ -146,14 +80,11 @@ class PoseKey(StrictModel):
 
     eye: Vec3 = Field(description="Centre of projection [m].")
     target: Vec3 = Field(description="Point in the centre of the image [m].")
-    up: Vec3 = Field((0, 0, 1), description="Direction that appears upwards in the image.")
 
     @model_validator(mode="after")
     def _check(self) -> PoseKey:
         if self.eye == self.target:
             raise FieldError("target", f"must differ from eye (got {list(self.target)})")
-        if not any(self.up):
-            raise FieldError("up", "must not be zero (got [0, 0, 0])")
         return self
 
 
@@ -186,9 +117,6 @@ class Acceptance(StrictModel):
     in_view: Unit = Field(
         0.0, description="Minimum share of the labelled objects that have at least half of their surface in the image."
     )
-    extent: NonNegativeFloat = Field(
-        0.0, description="Minimum length of the longer side of the bounding box, for each labelled object in view [px]."
-    )
     clearance: NonNegativeFloat = Field(
         0.0,
         description="Minimum distance of the camera from objects, visible shapes and the mesh of the environment [m].",
@@ -196,17 +124,15 @@ class Acceptance(StrictModel):
 
 
 class Occlusion(StrictModel):
-    """Target share of partly hidden objects among the labelled objects in view."""
+    """Target share of objects of which 10 to 80 % are hidden, among the labelled objects in view."""
 
     share: Unit = Field(description="Target share of partly hidden objects among the labelled objects in view.")
-    visible: UnitRange = Field((0.2, 0.9), description="Range of visible fractions of a partly hidden object.")
 
 
 class Truncation(StrictModel):
-    """Target share of objects that the border of the image cuts, among the labelled objects in view."""
+    """Target share of objects of which the border of the image cuts off 5 to 80 %, among those in view."""
 
     share: Unit = Field(description="Target share of truncated objects among the labelled objects in view.")
-    cut: UnitRange = Field((0.05, 0.8), description="Range of the share beyond the border of a truncated object.")
 
 
 class CameraHemisphere(Viewpoint):
@@ -221,12 +147,11 @@ class CameraHemisphere(Viewpoint):
     )
     roll: Range = Field((0.0, 0.0), description="Range of rotations about the optical axis [degrees].")
     target_jitter: NonNegativeFloat = Field(0.0, description="Random displacement of the target, 1 sigma [m].")
-    look_at: Literal["target", "objects", "clusters"] = Field(
+    look_at: Literal["target", "objects"] = Field(
         "target",
         exclude_if=lambda look_at: look_at == "target",
         description="Point in the centre of the image. ``target`` takes the target. ``objects`` takes the centre of "
-        "a labelled object that is drawn for every view. ``clusters`` takes the centre of such an "
-        "object and its two nearest neighbours. Layouts without labelled objects use the target.",
+        "a labelled object that is drawn for every view. Layouts without labelled objects use the target.",
     )
     coverage: Literal["random", "even"] = Field(
         "random",
@@ -270,21 +195,4 @@ class CameraHemisphere(Viewpoint):
         return self
 
 
-class CameraWalk(Viewpoint):
-    """Video of each layout: a smooth path around the target through random waypoints of a hemisphere.
-
-    Azimuth, sine of the elevation, and radius are interpolated by monotone cubics and therefore stay within their
-    ranges.
-    """
-
-    kind: Literal["walk"] = Field("walk", description="Smooth random path around a target, for videos.")
-    target: Vec3 = Field(description="Point in the centre of the images [m].")
-    radius: PositiveRange = Field(description="Range of distances from the target [m].")
-    elevation: ElevationRange = Field((25.0, 80.0), description="Range of elevations above the horizon [degrees].")
-    azimuth: Range = Field(
-        (0.0, 360.0), description="Range of azimuths, 0 along +x, counter-clockwise seen from above [degrees]."
-    )
-    places: int = Field(4, ge=2, le=1000, description="Number of random waypoints, evenly spaced in time.")
-
-
-CameraSpec = Annotated[CameraPath | CameraOrbit | CameraHemisphere | CameraWalk, Field(discriminator="kind")]
+CameraSpec = Annotated[CameraPath | CameraOrbit | CameraHemisphere, Field(discriminator="kind")]

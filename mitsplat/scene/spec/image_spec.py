@@ -70,21 +70,6 @@ class Randomise(StrictModel):
     jpeg: Annotated[tuple[JpegQuality, JpegQuality], AfterValidator(check_order)] | None = Field(
         None, description="JPEG quality of a compression before the image is written. No compression if absent."
     )
-    friction: PositiveRange = Field(
-        (1.0, 1.0),
-        description="Factor on the friction of each entry of ``objects``, drawn once per layout. Contacts with the "
-        "table get the square root of the factor.",
-    )
-    light_intensity: PositiveRange = Field(
-        (1.0, 1.0), description="Factor on the intensity of each light, drawn once per layout."
-    )
-
-
-class Sensor(StrictModel):
-    """Noise parameters of the sensor for ``randomise.iso``."""
-
-    full_well: Positive = Field(20000.0, description="Electrons of a pixel at display white and ISO 100.")
-    read_noise: NonNegativeFloat = Field(3.0, description="Read noise [electrons], 1 sigma.")
 
 
 class StereoSensor(StrictModel):
@@ -181,7 +166,6 @@ class Composite(StrictModel):
         "neutral",
         description="Tone curve. ``neutral`` preserves the captured colours; ``filmic`` compresses highlights.",
     )
-    sensor: Sensor = Field(Sensor(), description="Noise model of the sensor.")
 
 
 class Rendering(StrictModel):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import Field, model_validator
 
 from mitsplat.storage.field_types import (
     CountRange,
@@ -19,8 +19,6 @@ from mitsplat.storage.field_types import (
     StrictModel,
     Vec3,
     Vec3Range,
-    check_order,
-    check_weights,
 )
 from mitsplat.storage.yaml_input import FieldError
 
@@ -31,8 +29,8 @@ ConeAngle = Annotated[float, Field(gt=0, lt=90)]
 class LightDraw(StrictModel):
     """Ranges ``[low, high]`` of random values of a light. Each end of a range has the form of the light's own key.
 
-    Values are uniform in their range and independent of each other. This includes the components of positions, targets
-    and sizes. A drawn value replaces the light's own value of the same key.
+    Values are uniform in their range and independent of each other. This includes the components of positions and
+    sizes. A drawn value replaces the light's own value of the same key.
     """
 
     vary: Vary = Field("layout", description="``layout`` draws values once per layout, ``frame`` for every frame.")
@@ -44,27 +42,14 @@ class LightDraw(StrictModel):
     position: Vec3Range | None = Field(None, description="Opposite corners of a box that contains the position [m].")
     distance: PositiveRange | None = Field(
         None,
-        description="Distance from ``around`` [m], in place of ``position``. The direction is uniform by area on the "
-        "part of the sphere that ``azimuth`` and ``elevation`` select.",
-    )
-    azimuth: Range = Field(
-        (0.0, 360.0), description="Azimuth, 0 along +x, counter-clockwise seen from above [degrees]."
+        description="Distance from the target of the light [m], or from the origin if it has none, in place of "
+        "``position``. The direction is uniform by area on the part of the sphere that ``elevation`` selects.",
     )
     elevation: ElevationRange = Field((15.0, 85.0), description="Elevation above the horizon [degrees].")
-    around: Vec3 | None = Field(
-        None,
-        description="Point from which ``distance`` is measured [m]. If absent, the target of the light, or the "
-        "origin if the light has no target.",
-    )
-    target: Vec3Range | None = Field(None, description="Opposite corners of a box that contains the target [m].")
     size: SizeRange | None = Field(None, description="Width and height [m].")
-    cone: Annotated[tuple[ConeAngle, ConeAngle], AfterValidator(check_order)] | None = Field(
-        None, description="Half angle of the cone [degrees]."
-    )
     radiance: PositiveRange | None = Field(
         None, description="Radiance [W/(m^2 sr)], or the factor on an environment image."
     )
-    intensity: PositiveRange | None = Field(None, description="Radiant intensity [W/sr].")
     temperature: KelvinRange | None = Field(None, description="Temperature of the black body [K], uniform in 1/K.")
     colour: tuple[EmittedColour, EmittedColour] | None = Field(
         None, description="Two colours. The drawn colour lies on the straight line between them."
@@ -72,7 +57,7 @@ class LightDraw(StrictModel):
     rotate_z: Range | None = Field(None, description="Rotation about the vertical axis [degrees].")
 
 
-_DRAW_ONLY_KEYS = frozenset({"vary", "count", "distance", "azimuth", "elevation", "around"})
+_DRAW_ONLY_KEYS = frozenset({"vary", "count", "distance", "elevation"})
 """Keys of a draw that lights themselves do not have."""
 
 
@@ -93,9 +78,8 @@ class DrawnLight(StrictModel):
                 raise FieldError(("draw", key), f"is not a key of lights of kind {getattr(self, 'kind', '')}")
         if self.draw.distance is not None and self.draw.position is not None:
             raise FieldError(("draw", "distance"), "must not be given together with position")
-        for key in ("azimuth", "elevation", "around"):
-            if key in self.draw.model_fields_set and self.draw.distance is None:
-                raise FieldError(("draw", key), "needs a distance")
+        if "elevation" in self.draw.model_fields_set and self.draw.distance is None:
+            raise FieldError(("draw", "elevation"), "needs a distance")
         if getattr(self, "path", ()):
             raise FieldError("draw", "must not be given together with a path")
         return self
@@ -110,17 +94,14 @@ class LightKey(StrictModel):
     """State of a light at one time of its path. Absent values are those of the light itself."""
 
     position: Vec3 | None = Field(None, description="Position [m].")
-    intensity: Positive | None = Field(
-        None, description="Intensity [W/sr], or the radiance of an area light [W/(m^2 sr)]."
-    )
     temperature: Kelvin | None = Field(
         None, description="Colour temperature [K]. Requires ``temperature`` of the light."
     )
 
     @model_validator(mode="after")
     def _check(self) -> LightKey:
-        if self.position is None and self.intensity is None and self.temperature is None:
-            raise FieldError((), "must have a position, an intensity or a temperature")
+        if self.position is None and self.temperature is None:
+            raise FieldError((), "must have a position or a temperature")
         return self
 
 
@@ -164,7 +145,7 @@ class AimedLight(LocalLight):
 
     @model_validator(mode="after")
     def _check(self) -> AimedLight:
-        if self.has_drawn_position or (self.draw is not None and self.draw.target is not None):
+        if self.has_drawn_position:
             return self
         for position in (self.position, *(key.position for key in self.path)):
             if position == self.target:
@@ -208,30 +189,17 @@ class EnvironmentLight(DrawnLight):
         description="List of HDR or EXR files, a folder, or a pattern such as ``skies/*``, whose images are sorted "
         "by name. Each layout draws one image, even if other values vary from frame to frame.",
     )
-    weights: tuple[Positive, ...] = Field(
-        (),
-        exclude_if=lambda weights: not weights,
-        description="Relative probabilities of the images of the pool. All are equally probable if absent.",
-    )
     rotate_z: float = Field(0.0, description="Rotation about the vertical axis [degrees].")
 
     @model_validator(mode="after")
     def _check(self) -> EnvironmentLight:
         if self.pool is None:
-            if self.weights:
-                raise FieldError("weights", "needs a pool")
             return self
         if self.image is not None:
             raise FieldError("pool", "must not be given together with an image")
         if self.pool == ():
             raise FieldError("pool", "must name at least one image (got [])")
-        if isinstance(self.pool, tuple):
-            self.check_weights(len(self.pool))
         return self
-
-    def check_weights(self, members: int) -> None:
-        """Check that there is one weight per member of the pool, or none."""
-        check_weights(self.weights, members, "images")
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -249,22 +217,20 @@ class RoomLight(StrictModel):
 
     * Window: an area light 12 to 35 degrees above the horizon, at a distance of 0.35 to 0.6. Its size is 0.2 x 0.25 to
       0.45 x 0.4, its temperature 5000 to 8000 K, its radiance 3 to 10.
-    * Lamps: area lights 50 to 85 degrees above the horizon, at the same distances. Their size is 0.05 x 0.05 to 0.15 x
-      0.35, their temperature 2700 to 5000 K, their radiance 8 to 30.
+    * One to three lamps: area lights 50 to 85 degrees above the horizon, at the same distances. Their size is 0.05 x
+      0.05 to 0.15 x 0.35, their temperature 2700 to 5000 K, their radiance 8 to 30.
     * Walls: an environment light with a radiance of 0.1 to 0.4 and a colour from white to warm white.
     """
 
     kind: Literal["room"] = Field("room", description="Window, lamps and light reflected by walls.")
     around: Vec3 = Field((0, 0, 0), description="Centre of the lit area [m].")
     size: Positive = Field(4.0, description="Width of the room [m].")
-    lamps: CountRange = Field((1, 3), description="Number of lamps, a number or an inclusive range.")
-    vary: Vary = Field("layout", description="``layout`` draws all values once per layout, ``frame`` for every frame.")
 
     def expand(self) -> tuple[AreaLight, AreaLight, EnvironmentLight]:
         """Return the three entries that the room expands to: window, lamps and walls."""
 
         def place(elevation: tuple[float, float]) -> dict[str, Any]:
-            return {"vary": self.vary, "distance": (0.35 * self.size, 0.6 * self.size), "elevation": elevation}
+            return {"distance": (0.35 * self.size, 0.6 * self.size), "elevation": elevation}
 
         def sizes(*shares: tuple[float, float]) -> Any:
             return tuple((width * self.size, height * self.size) for width, height in shares)
@@ -277,12 +243,12 @@ class RoomLight(StrictModel):
         )
         lamp = LightDraw(
             **place((50.0, 85.0)),
-            count=self.lamps,
+            count=(1, 3),
             size=sizes((0.05, 0.05), (0.15, 0.35)),
             radiance=(8.0, 30.0),
             temperature=(2700.0, 5000.0),
         )
-        walls = LightDraw(vary=self.vary, radiance=(0.1, 0.4), colour=((1.0, 1.0, 1.0), (1.0, 0.9, 0.78)))
+        walls = LightDraw(radiance=(0.1, 0.4), colour=((1.0, 1.0, 1.0), (1.0, 0.9, 0.78)))
         area = [AreaLight(target=self.around, draw=draw) for draw in (window, lamp)]
         return area[0], area[1], EnvironmentLight(draw=walls)
 

@@ -4,12 +4,9 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import AfterValidator, Field
+from pydantic import Field
 
-from mitsplat.storage.field_types import PositiveRange, Range, StrictModel, UnitRange, check_order
-
-Share = Annotated[float, Field(gt=0, le=1)]
-Turn = Annotated[Range, Field(description="Range of rotations of the pattern on the surface [degrees].")]
+from mitsplat.storage.field_types import PositiveRange, Range, StrictModel, UnitRange
 
 
 class _Coloured(StrictModel):
@@ -24,7 +21,6 @@ class _Patterned(_Coloured):
         description="Range of contrasts: 1 minus the ratio of the HSV value of the second colour to that of the first.",
     )
     scale: PositiveRange = Field((0.02, 0.1), description="Range of sizes of the largest features of the pattern [m].")
-    rotate: Turn = (0, 360)
 
 
 class ColourMaterial(_Coloured):
@@ -47,21 +43,6 @@ class WoodMaterial(_Patterned):
     saturation: UnitRange = Field((0.3, 0.65), description="Range of saturations.")
     value: UnitRange = Field((0.35, 0.85), description="Range of values.")
     scale: PositiveRange = Field((0.01, 0.03), description="Range of distances between grain lines [m].")
-
-
-class BrushedMetalMaterial(_Patterned):
-    """Metal with scratches along one direction. It is path traced, which takes longer than diffuse materials."""
-
-    kind: Literal["brushed_metal"] = Field("brushed_metal", description="Brushed metal.")
-    hue: Range = Field((20, 230), description="Range of hues [degrees].")
-    saturation: UnitRange = Field((0, 0.08), description="Range of saturations.")
-    value: UnitRange = Field((0.7, 0.9), description="Range of values.")
-    contrast: UnitRange = Field((0.03, 0.15), description="Range of contrasts of the scratches.")
-    scale: PositiveRange = Field((0.05, 0.2), description="Range of lengths of the scratches [m].")
-    roughness: UnitRange = Field(
-        (0.15, 0.35),
-        description="Range of GGX roughness across the scratches. The roughness along them is a third of it.",
-    )
 
 
 class CheckerMaterial(_Patterned):
@@ -89,37 +70,21 @@ class ImageMaterial(StrictModel):
         "the scene file. Of several images, one is drawn."
     )
     scale: PositiveRange = Field((0.3, 1.0), description="Range of widths of the image on the surface [m].")
-    rotate: Turn = (0, 360)
-    gain: PositiveRange = Field((1.0, 1.0), description="Range of factors on the linear colours of the image.")
 
 
 Material = Annotated[
-    ColourMaterial
-    | NoiseMaterial
-    | WoodMaterial
-    | BrushedMetalMaterial
-    | CheckerMaterial
-    | StripesMaterial
-    | ImageMaterial,
+    ColourMaterial | NoiseMaterial | WoodMaterial | CheckerMaterial | StripesMaterial | ImageMaterial,
     Field(discriminator="kind"),
 ]
 
 
 class Background(StrictModel):
-    """Images behind the scene. They are visible where a ray hits nothing, have no label and emit no light."""
+    """Images behind the scene. They are visible where a ray hits nothing, have no label and emit no light.
+
+    Every frame draws an image and a crop of it: one half to all of the largest crop with the aspect ratio of the
+    output, rotated by at most 15 degrees, 0.7 to 1.3 times as bright.
+    """
 
     images: str | tuple[str, ...] = Field(
-        description="Folder of images, pattern such as ``photos/*.jpg``, or list of files, relative to the scene "
-        "file. One of the images is drawn."
+        description="Folder of images, pattern such as ``photos/*.jpg``, or list of files, relative to the scene file."
     )
-    per: Literal["frame", "layout"] = Field(
-        "frame", description="``frame`` draws an image for every frame, ``layout`` once per layout."
-    )
-    crop: Annotated[tuple[Share, Share], AfterValidator(check_order)] = Field(
-        (0.5, 1.0),
-        description="Range of sizes of the crop, relative to the largest crop with the aspect ratio of the output.",
-    )
-    rotate: Range = Field(
-        (-15, 15), description="Range of rotations of the crop [degrees]. A rotated crop stays inside the image."
-    )
-    gain: PositiveRange = Field((0.7, 1.3), description="Range of factors on the linear colours of the image.")

@@ -17,7 +17,6 @@ from mitsplat.storage.field_types import (
     UnitRange,
     Vec3,
     check_order,
-    check_weights,
 )
 from mitsplat.storage.yaml_input import FieldError
 
@@ -104,16 +103,11 @@ class ObjectSpec(StrictModel):
         "materials. The seed determines the primitives; they need no folder.",
     )
     count: CountRange = Field((1, 1), description="Number of objects per layout, a number or an inclusive range.")
-    weights: tuple[Positive, ...] = Field(
-        (),
-        exclude_if=lambda weights: not weights,
-        description="Relative probabilities of the assets of the pool. All are equally probable if absent.",
-    )
     balance: bool = Field(
         False,
         exclude_if=lambda balance: not balance,
         description="Draws the classes of the pool in turn, so that within each split the counts of any two classes "
-        "differ by at most one. Weights then apply within a class.",
+        "differ by at most one.",
     )
     label: bool = Field(
         True,
@@ -152,11 +146,8 @@ class ObjectSpec(StrictModel):
             raise FieldError((), "must have either an asset or a pool")
         if self.pool == ():
             raise FieldError("pool", "must name at least one asset (got [])")
-        for key in ("weights", "balance"):
-            if self.pool is None and getattr(self, key):
-                raise FieldError(key, "needs a pool")
-        if isinstance(self.pool, tuple) or self.pool == PRIMITIVES:
-            self.check_weights(len(self.names))
+        if self.balance and self.pool is None:
+            raise FieldError("balance", "needs a pool")
         if self.pool == PRIMITIVES and self.size is not None:
             raise FieldError("size", "must not be given for primitives (use scale)")
         if self.poses:
@@ -166,10 +157,6 @@ class ObjectSpec(StrictModel):
             if isinstance(self.scale, tuple):
                 raise FieldError("scale", "must be one number together with poses")
         return self
-
-    def check_weights(self, members: int) -> None:
-        """Check that there is one weight per member of the pool, or none."""
-        check_weights(self.weights, members, "assets")
 
     @property
     def max_count(self) -> int:
@@ -242,10 +229,9 @@ class Settle(StrictModel):
         description="Maximum share of layouts that lack objects because these did not come to rest. A dataset with a "
         "larger share ends with an error.",
     )
-    timestep: Positive = Field(0.002, description="Time step of the simulation [s].")
     stepper: Literal["mujoco", "warp"] = Field(
         "mujoco",
-        description="Physics engine: ``mujoco`` for MuJoCo in C, ``warp`` for the MuJoCo solver of Newton on Warp. Both "
-        "layouts pass the same rest certificate, but differ. The machine never changes the engine. MuJoCo is the "
+        description="Physics engine: ``mujoco`` for MuJoCo in C, ``warp`` for the MuJoCo solver of Newton on Warp. The "
+        "layouts differ, but pass the same rest certificate. The machine never changes the engine. MuJoCo is the "
         "default because it takes a half to a sixth of Warp's time and compiles nothing.",
     )

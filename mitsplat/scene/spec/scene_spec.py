@@ -17,8 +17,8 @@ from mitsplat.scene.spec.light_spec import EnvironmentLight, LightEntry, RoomLig
 from mitsplat.scene.spec.material_spec import Background
 from mitsplat.scene.spec.object_spec import MAIN_REGION, Arrangement, ObjectSpec, Settle
 from mitsplat.scene.spec.shape_spec import Backdrop, Conveyor, Enclosure, NamedRegion, Region, Shape
-from mitsplat.storage.field_types import Positive, StrictModel, Unit
-from mitsplat.storage.yaml_input import FieldError, KeyPath
+from mitsplat.storage.field_types import StrictModel, Unit
+from mitsplat.storage.yaml_input import FieldError
 
 BACKDROP = "backdrop "
 """Prefix of the names of the shapes that a backdrop expands to."""
@@ -62,7 +62,6 @@ class Output(StrictModel):
         ("yolo",), min_length=1, description="Formats of the labels. ``exr`` writes all layers of an image."
     )
     image: Literal["png", "jpg"] = Field("png", description="Image file format.")
-    jpeg_quality: int = Field(95, ge=1, le=100, description="Quality of jpg images.")
     validation: Unit = Field(
         0.2,
         description="Share of layouts in the validation split. Of the two splits, the smaller one starts with the "
@@ -128,11 +127,6 @@ class SceneSpec(StrictModel):
         "such as ``assets/cell_*``, which selects the environments among the matching folders, sorted by "
         "name. Each layout draws one environment.",
     )
-    environment_weights: tuple[Positive, ...] = Field(
-        (),
-        exclude_if=lambda weights: not weights,
-        description="Relative probabilities of the environments. All are equally probable if absent.",
-    )
     environment_collides: bool = Field(
         False,
         description="Objects also rest on the mesh of the environment. Its convex decomposition takes minutes.",
@@ -170,12 +164,6 @@ class SceneSpec(StrictModel):
     enclosure: Enclosure | None = Field(None, description="Invisible walls around the region.")
     settle: Settle = Field(Settle(), description="Initial arrangement and physics simulation of the objects.")
     camera: CameraSpec = Field(description="The camera: lens and viewpoints.")
-    cameras: tuple[CameraSpec, ...] = Field(
-        (),
-        exclude_if=lambda cameras: not cameras,
-        description="Further cameras, such as one on the robot's hand and one above it. ``camera`` and these take "
-        "the views of a layout in turn. A camera that is listed twice takes twice as many views.",
-    )
     lights: tuple[LightEntry, ...] = Field((), description="Light sources.")
     randomise: Randomise = Field(Randomise(), description="Ranges of the values that vary between images or layouts.")
     composite: Composite = Field(Composite(), description="Shadows, highlights, exposure and tone curve.")
@@ -209,9 +197,8 @@ class SceneSpec(StrictModel):
             if self.backdrop is not None and shape.name.startswith(BACKDROP):
                 text = f"must not begin with {BACKDROP!r} if the scene has a backdrop (got {shape.name!r})"
                 raise FieldError(("shapes", position, "name"), text)
-        for keys, camera in self.camera_entries:
-            if camera.motion is not None and not camera.motion.is_moving and self.conveyor is None:
-                raise FieldError((*keys, "motion"), "must have a speed or a rotation, unless the scene has a conveyor")
+        if self.camera.motion is not None and self.conveyor is None:
+            raise FieldError(("camera", "motion"), "needs a conveyor")
         boxes = [shape.name for shape in self.shapes if shape.box is not None]
         if self.conveyor is not None and self.conveyor.belt not in boxes:
             named, got = ", ".join(boxes) or "none", self.conveyor.belt
@@ -221,8 +208,6 @@ class SceneSpec(StrictModel):
         ]
         if self.environment == ():
             raise FieldError("environment", "must name at least one asset (got [])")
-        if not isinstance(self.environment, str):
-            self.check_environment_weights()
         if len(environment_lights) > 1:
             raise FieldError(
                 ("lights", environment_lights[1], "kind"),
@@ -234,18 +219,12 @@ class SceneSpec(StrictModel):
             )
         if "depth-sensor" in self.output.formats and self.depth_sensor is None:
             raise FieldError(("output", "formats"), "depth-sensor needs the key depth_sensor")
-        lenses = [camera.intrinsics for _, camera in self.camera_entries]
-        distorted = any(lens.lens == "fisheye" or any(lens.distortion) for lens in lenses)
+        lens = self.camera.intrinsics
+        distorted = lens.lens == "fisheye" or any(lens.distortion)
         if isinstance(self.depth_sensor, StereoSensor) and distorted:
-            raise FieldError("depth_sensor", "stereo needs cameras without lens distortion")
+            raise FieldError("depth_sensor", "stereo needs a camera without lens distortion")
         if self.hold_out != HoldOut() and not self.output.test:
             raise FieldError("hold_out", "needs a test split: set output.test > 0")
-        turn = len(self.views_of_turn)
-        if any(camera.stereo for camera in (self.camera, *self.cameras)) and self.output.views % turn:
-            raise FieldError(
-                ("output", "views"),
-                f"must be a multiple of {turn}, so that stereo pairs are complete (got {self.output.views})",
-            )
         self._check_regions()
         return self
 
@@ -275,17 +254,6 @@ class SceneSpec(StrictModel):
                 raise FieldError(("objects", number, "region"), "must name at least one region (got [])")
 
     @property
-    def camera_entries(self) -> tuple[tuple[KeyPath, CameraSpec], ...]:
-        """All cameras, with their keys in the file."""
-        return ((("camera",), self.camera), *((("cameras", i), camera) for i, camera in enumerate(self.cameras)))
-
-    @property
-    def views_of_turn(self) -> tuple[tuple[int, int], ...]:
-        """For each view of a turn: index of the camera, and 1 for the right image of a stereo pair, else 0."""
-        cameras = enumerate((self.camera, *self.cameras))
-        return tuple((number, side) for number, camera in cameras for side in range(2 if camera.stereo else 1))
-
-    @property
     def region_names(self) -> tuple[str, ...]:
         """Names of all regions, the main region first."""
         return (MAIN_REGION, *(region.name for region in self.regions))
@@ -300,10 +268,3 @@ class SceneSpec(StrictModel):
         """Return the indices of the regions in which objects of an entry may start."""
         named = (entry.region,) if isinstance(entry.region, str) else entry.region or self.region_names
         return tuple(map(self.region_names.index, named))
-
-    def check_environment_weights(self) -> None:
-        """Check that there is one weight per environment, or none."""
-        count = 1 if isinstance(self.environment, str) else len(self.environment or ())
-        if self.environment_weights and len(self.environment_weights) != count:
-            text = f"must have one weight per environment, {count} (got {len(self.environment_weights)})"
-            raise FieldError("environment_weights", text)

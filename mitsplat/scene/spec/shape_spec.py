@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Literal
-
 from pydantic import Field, NonNegativeFloat, model_validator
 
 from mitsplat.scene.spec.material_spec import ColourMaterial, Material, NoiseMaterial
@@ -25,7 +23,6 @@ class Bin(StrictModel):
 
     size: tuple[Positive, Positive, Positive] = Field(description="Width, depth and height of the interior [m].")
     position: Vec3 = Field((0, 0, 0), description="Centre of the inner floor [m].")
-    rotate_z: float = Field(0.0, description="Rotation about the vertical axis [degrees].")
     thickness: Positive = Field(0.004, description="Thickness of floor and walls [m].")
 
 
@@ -73,7 +70,7 @@ class Conveyor(StrictModel):
 
     belt: str = Field(description="Name of the belt shape, a box. The belt runs along the x axis of the box.")
     speed: float = Field(description="Speed of the belt surface [m/s]. Negative towards -x.")
-    interval: Positive = Field(description="Time between two turns of the cameras [s].")
+    interval: Positive = Field(description="Time between two images of a layout [s].")
 
     @model_validator(mode="after")
     def _check(self) -> Conveyor:
@@ -87,12 +84,7 @@ class Backdrop(StrictModel):
 
     size: tuple[Positive, Positive, Positive] = Field(description="Inner width, depth and height of the room [m].")
     position: Vec3 = Field((0, 0, 0), description="Centre of the floor [m].")
-    rotate_z: float = Field(0.0, description="Rotation about the vertical axis [degrees].")
-    sides: tuple[Literal["-x", "+x", "-y", "+y"], ...] = Field(
-        ("-x", "+x", "-y", "+y"), description="Sides with a wall, before the rotation."
-    )
     ceiling: bool = Field(False, description="Adds a ceiling with the material of the walls.")
-    collider: bool = Field(False, description="Objects can rest on the floor of the room.")
     floor: tuple[Material, ...] = Field(
         (NoiseMaterial(saturation=(0, 0.3), scale=(0.1, 0.5)),),
         description="Materials of the floor. Each layout draws one of them.",
@@ -136,7 +128,6 @@ class Enclosure(StrictModel):
         "object, but not beyond the bounds of the colliders.",
     )
     floor: float = Field(0.0, description="Height of the lower edge of the walls [m].")
-    thickness: Positive = Field(0.05, description="Thickness of walls and lid [m].")
 
 
 class NamedRegion(Region):

@@ -25,22 +25,16 @@ from mitsplat.renderer.light.emitter_sampling import reference_irradiance
 from mitsplat.renderer.light.light import Accuracy, light_factor
 from mitsplat.renderer.light.light_traits import Traits
 from mitsplat.renderer.light.lit_surface import VisiblePixels, VisibleSurfaces
+from mitsplat.renderer.meshes.mesh_radiance import PathTracer
 from mitsplat.renderer.meshes.mirrored_splats import SplatMirror
-from mitsplat.renderer.meshes.visible_meshes import (
-    MeshHits,
-    PathTracer,
-    VisibleEmitters,
-    VisibleMeshes,
-    is_transmissive,
-)
+from mitsplat.renderer.meshes.visible_meshes import MeshHits, VisibleEmitters, VisibleMeshes, is_transmissive
 from mitsplat.renderer.occluders.proxies import Occluder, Proxies
 from mitsplat.renderer.occluders.splat_occlusion import Caster
+from mitsplat.renderer.projection.clouds import Cloud, CloudSet, Placement, merge_clouds, upload_cloud
 from mitsplat.renderer.rays.camera_rays import CameraView
 from mitsplat.renderer.rays.sensors import view_of
-from mitsplat.renderer.splatting.gaussian import Cloud, upload_cloud
 from mitsplat.renderer.splatting.march import Image, largest_and_mean, trace
 from mitsplat.renderer.splatting.pairs import CrowdedError
-from mitsplat.renderer.splatting.projection import CloudSet, Placement, merge_clouds
 from mitsplat.renderer.splatting.static_tile_cache import StaticTileCache
 from mitsplat.runtime.dropped_rays import check_dropped_rays
 

@@ -13,7 +13,7 @@ from mitsplat.asset import ASSET_FILE, Asset, read_mesh, read_spec
 from mitsplat.errors import InputError
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.plugins.parameters import Parameters
-from mitsplat.renderer.splatting.splat_appearance import SplatAppearance
+from mitsplat.renderer.projection.splat_appearance import SplatAppearance
 
 
 class SplatsShape(mi.Mesh):

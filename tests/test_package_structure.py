@@ -28,7 +28,7 @@ LAYERS = (
     ("capture.pipeline",),
     ("capture", "renderer.occluders", "renderer.splatting", "scene.planning"),
     ("scene",),
-    ("asset",),
+    ("asset", "renderer.projection"),
     ("capture.boards", "capture.isolation", "capture.lighting", "gaussians", "pages", "renderer.rays", "scene.spec"),
     ("capture.video", "engine", "geometry", "images"),
     ("quality", "runtime"),

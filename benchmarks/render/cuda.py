@@ -46,10 +46,9 @@ def median_ms(run: Callable[[], object], sync: Callable[[], None], repeats: int 
 
 def time_ours(splats: Splats) -> None:
     """Print the time of binning and march, per preset."""
+    from mitsplat.renderer.projection.clouds import Placement, merge_clouds, upload_cloud
     from mitsplat.renderer.rays.sensors import view_of
-    from mitsplat.renderer.splatting.gaussian import upload_cloud
     from mitsplat.renderer.splatting.march import march
-    from mitsplat.renderer.splatting.projection import Placement, merge_clouds
     from mitsplat.renderer.splatting.tiles import TileLists, bin_gaussians
 
     clouds = merge_clouds([upload_cloud(splats.means, splats.quats, splats.scales, splats.opacities, splats.sh)])

@@ -69,9 +69,8 @@ class Picture:
     """Splats on the device, as one camera sees them."""
 
     def __init__(self, splats: Splats, camera: Camera) -> None:
+        from mitsplat.renderer.projection.clouds import Placement, merge_clouds, upload_cloud
         from mitsplat.renderer.rays.sensors import view_of
-        from mitsplat.renderer.splatting.gaussian import upload_cloud
-        from mitsplat.renderer.splatting.projection import Placement, merge_clouds
 
         cloud = upload_cloud(splats.means, splats.quats, splats.scales, splats.opacities, splats.sh)
         self.clouds, self.placements = merge_clouds([cloud]), [Placement(0, np.eye(4), 1)]
@@ -87,15 +86,16 @@ class Picture:
 
     def estimate(self, quality: Quality) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
         """Colours before any tile is walked again, and the estimate of their errors, (pixels,)."""
-        from mitsplat.renderer.splatting.march import ERROR, _blend, _fresh
+        from mitsplat.renderer.splatting.blending import ERROR, blend, new_state
+        from mitsplat.renderer.splatting.lanes import Lanes
         from mitsplat.renderer.splatting.tiles import bin_gaussians
-        from mitsplat.renderer.splatting.walk import Lanes, Rays, walk
+        from mitsplat.renderer.splatting.walk import Rays, walk
 
         lists = bin_gaussians(self.clouds, self.placements, self.view, quality)
         lanes = Lanes(lists, self.view, rows=1)
         far = [mi.Float(dr.inf)]
         rays = Rays.through(lists, self.view, quality, lanes.slopes(0.5, 0.5), far, lanes.start, lanes.stop)
-        fresh, blend = (partial(step, several=False, late="estimated") for step in (_fresh, _blend))
+        fresh, blend = (partial(step, several=False, late="estimated") for step in (new_state, blend))
         (pixel,) = walk(rays, "window", fresh, blend)
         *rgb, error = (lanes.image(mi.Float, [pixel[k]]).numpy() for k in (1, 2, 3, ERROR))
         return np.stack(rgb, axis=-1), error

@@ -59,10 +59,9 @@ def timed(run: Callable[[], object]) -> float:
 
 def stages(splats: Splats, camera: Camera, quality: Quality) -> tuple[float, float, int]:
     """Seconds of projecting, binning and sorting, seconds of the march, and pairs of a Gaussian and a tile."""
+    from mitsplat.renderer.projection.clouds import Placement, merge_clouds, upload_cloud
     from mitsplat.renderer.rays.sensors import view_of
-    from mitsplat.renderer.splatting.gaussian import upload_cloud
     from mitsplat.renderer.splatting.march import march
-    from mitsplat.renderer.splatting.projection import Placement, merge_clouds
     from mitsplat.renderer.splatting.tiles import bin_gaussians
 
     clouds = merge_clouds([upload_cloud(splats.means, splats.quats, splats.scales, splats.opacities, splats.sh)])

@@ -22,8 +22,8 @@ from mitsplat.renderer.differentiation.backward import (
     project_cloud,
     render_records,
 )
+from mitsplat.renderer.projection.clouds import Cloud
 from mitsplat.renderer.rays.device_arrays import number, on_device, wrapped
-from mitsplat.renderer.splatting.gaussian import Cloud
 from mitsplat.runtime.recorded_kernels import recorded
 
 _BETA_1, _BETA_2, _EPSILON = 0.9, 0.999, 1e-15

@@ -23,8 +23,8 @@ from mitsplat.fit.optimizer import GaussianModel
 from mitsplat.gaussians.spherical_harmonics import SH_C0
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.camera import Camera
+from mitsplat.renderer.projection.gaussian import rotation_axes
 from mitsplat.renderer.rays.device_arrays import number, on_device, wrapped
-from mitsplat.renderer.splatting.gaussian import rotation_axes
 from mitsplat.runtime.recorded_kernels import recorded
 
 DEAD_OPACITY = 0.005

@@ -18,9 +18,8 @@ from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.camera import Camera
 from mitsplat.quality import PRESETS
 from mitsplat.renderer.layers import make_sensor
+from mitsplat.renderer.projection.clouds import Placement, merge_clouds, upload_cloud
 from mitsplat.renderer.rays.sensors import view_of
-from mitsplat.renderer.splatting.gaussian import upload_cloud
-from mitsplat.renderer.splatting.projection import Placement, merge_clouds
 from mitsplat.renderer.splatting.tiles import bin_gaussians
 from mitsplat.scene.loading.scene_loading import load_scene
 from tests.conftest import BOTH, nut_and_bolt, small_scene

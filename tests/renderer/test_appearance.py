@@ -58,7 +58,7 @@ def twin(encoded: np.ndarray, points: np.ndarray, matrix: np.ndarray, wear: floa
 
 def test_colours_and_dirt_equal_those_of_the_slow_twin() -> None:
     ensure_variant()
-    from mitsplat.renderer.splatting.splat_appearance import SplatAppearance, apply_appearance
+    from mitsplat.renderer.projection.splat_appearance import SplatAppearance, apply_appearance
 
     rng = np.random.default_rng(1)
     encoded, points = rng.uniform(0, 1.2, (300, 3)), rng.uniform(-0.05, 0.05, (300, 3))
@@ -83,7 +83,7 @@ def test_colours_and_dirt_equal_those_of_the_slow_twin() -> None:
 
 def test_dirt_patches_scale_with_the_object_and_depend_on_the_seed() -> None:
     ensure_variant()
-    from mitsplat.renderer.splatting.splat_appearance import dirt_thickness
+    from mitsplat.renderer.projection.splat_appearance import dirt_thickness
 
     rng = np.random.default_rng(2)
     points = rng.uniform(-50, 50, (20000, 3))

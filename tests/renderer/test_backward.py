@@ -13,7 +13,7 @@ import pytest
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.camera import Camera
 from mitsplat.quality import Quality
-from mitsplat.renderer.differentiation import backward
+from mitsplat.renderer.differentiation import backward, record_gradients
 from mitsplat.renderer.layers import make_sensor
 from mitsplat.runtime.variant import ensure_variant
 from tests.reference import render_reference
@@ -92,9 +92,12 @@ def test_gradients_computed_in_parts_equal_those_of_the_whole(
     splats, camera = make_splats(300, 36, bands=4), replace(CAMERA, distortion=distortion)
     whole = gradients(splats, camera)
     parts: list[int] = []
-    gradient = backward._gradient
-    monkeypatch.setattr(backward, "_gradient", lambda lists, *rest: parts.append(lists.pairs) or gradient(lists, *rest))
-    monkeypatch.setattr(backward, "PAIRS_AT_ONCE", at_once)
+    gradient = record_gradients.tile_gradient
+    monkeypatch.setattr(
+        record_gradients, "tile_gradient", lambda lists, *rest: parts.append(lists.pairs) or gradient(lists, *rest)
+    )
+    for module in (backward, record_gradients):
+        monkeypatch.setattr(module, "PAIRS_AT_ONCE", at_once)
     found = gradients(splats, camera)
     assert len(parts) > 1 and max(parts) <= max(at_once, len(splats))  # a tile has no more than all
     for name, values in whole.items():

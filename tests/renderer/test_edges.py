@@ -110,7 +110,7 @@ def test_pixels_beside_another_instance_are_sampled_again() -> None:
 def test_selected_tiles_agree_with_a_slow_count() -> None:
     from mitsplat.renderer.layers import make_sensor
     from mitsplat.renderer.rays.sensors import view_of
-    from mitsplat.renderer.splatting.tile_subset import TileSubset
+    from mitsplat.renderer.rays.tile_subset import TileSubset
 
     view, random = view_of(make_sensor(CAMERA)), np.random.default_rng(1)
     flags = random.random((view.tiles_y, view.tiles_x)) < 0.1
@@ -130,7 +130,7 @@ def test_selected_tiles_agree_with_a_slow_count() -> None:
 def test_a_box_of_tiles_equals_the_same_tiles_selected_singly() -> None:
     from mitsplat.renderer.layers import make_sensor
     from mitsplat.renderer.rays.sensors import view_of
-    from mitsplat.renderer.splatting.tile_subset import TileBox, TileSubset
+    from mitsplat.renderer.rays.tile_subset import TileBox, TileSubset
 
     view = view_of(make_sensor(CAMERA))
     box = TileBox.around(mi.UInt32([3, 5, 2, 4, 2, 4, 3, 7]), view)

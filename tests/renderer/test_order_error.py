@@ -158,26 +158,26 @@ def test_tiles_of_different_orders_have_no_seams(monkeypatch: pytest.MonkeyPatch
 def test_the_error_of_one_swapped_pair_is_estimated_exactly() -> None:
     """Two neighbours that change places change a colour by the product of their opacities times what they differ."""
     ensure_variant()
-    from mitsplat.renderer.splatting.march import ERROR, _blend, _fresh
+    from mitsplat.renderer.splatting.blending import ERROR, blend, new_state
 
     colours, opacities = ((0.9, 0.2, 0.1), (0.3, 0.6, 0.4)), (0.6, 0.5)
-    pixel = _fresh(False, "estimated")
+    pixel = new_state(False, "estimated")
     for colour, opacity, z in zip(colours, opacities, (2.0, 1.0), strict=True):
         record = SimpleNamespace(colour=colour)
-        pixel = _blend(pixel, mi.Float(opacity), record, mi.Float(z), False, "estimated")
+        pixel = blend(pixel, mi.Float(opacity), record, mi.Float(z), False, "estimated")
     assert np.array(pixel[ERROR]).item() == pytest.approx(0.6 * 0.5 * 0.6)
 
 
 def test_the_colour_of_one_swapped_pair_is_corrected_exactly() -> None:
     """The colour is that of the right order, and a third one, late behind both, is blended as it comes."""
     ensure_variant()
-    from mitsplat.renderer.splatting.march import BLUE, RED, _blend, _fresh
+    from mitsplat.renderer.splatting.blending import BLUE, RED, blend, new_state
 
     met = [((0.9, 0.2, 0.1), 0.6, 2.0), ((0.3, 0.6, 0.4), 0.5, 1.0), ((0.1, 0.8, 0.5), 0.7, 3.0)]
-    pixel = _fresh(False, "corrected")
+    pixel = new_state(False, "corrected")
     for colour, opacity, z in met:
         record = SimpleNamespace(colour=colour)
-        pixel = _blend(pixel, mi.Float(opacity), record, mi.Float(z), False, "corrected")
+        pixel = blend(pixel, mi.Float(opacity), record, mi.Float(z), False, "corrected")
     expected, transmittance = np.zeros(3), 1.0
     for colour, opacity, _ in sorted(met, key=lambda peak: peak[2]):
         expected += transmittance * opacity * np.array(colour)
@@ -259,7 +259,7 @@ TURNING = [turned(0.02 * step) for step in range(6)]
 def test_tiles_sort_by_the_depth_at_the_visible_footprint() -> None:
     """Around the mean of the product of two normal distributions: the footprint's, and that of the tile's pixels."""
     ensure_variant()
-    from mitsplat.renderer.splatting.records import GaussianRecord
+    from mitsplat.renderer.projection.records import GaussianRecord
     from mitsplat.renderer.splatting.tile_depths import depth_where_seen
 
     box, centre, depth = (0.10, 0.14, -0.02, 0.01), np.array([0.125, -0.012]), 2.0

@@ -20,9 +20,8 @@ CAMERA = Camera.look_at((0, 0, -2), (0, 0, 0), up=(0, -1, 0), width=75, height=5
 @pytest.mark.parametrize("lens", [{}, {"distortion": (-0.25, 0.08, 0.002, -0.001, -0.01)}])
 def test_entries_ascend_by_depth_and_number_and_have_a_place_by_record(lens: dict[str, tuple[float, ...]]) -> None:
     ensure_variant()
+    from mitsplat.renderer.projection.clouds import Placement, merge_clouds, upload_cloud
     from mitsplat.renderer.rays.sensors import view_of
-    from mitsplat.renderer.splatting.gaussian import upload_cloud
-    from mitsplat.renderer.splatting.projection import Placement, merge_clouds
     from mitsplat.renderer.splatting.tiles import bin_gaussians
 
     splats = make_splats(400, 3)
@@ -95,7 +94,7 @@ def test_projection_and_walk_of_both_devices_give_the_same_images(
 ) -> None:
     """All Gaussians at once and a ray a lane, as on a GPU, or what is seen and four: also near the camera's plane."""
     from mitsplat.renderer.splatting import march, tiles
-    from mitsplat.renderer.splatting.walk import rows_together
+    from mitsplat.renderer.splatting.lanes import rows_together
 
     quality = replace(PRESETS[preset], kernel="mip")
     cameras = [replace(Camera.look_at((0, 0, z), (0, 0, z + 1), up=(0, -1, 0), width=75, height=50, fov_x=50), **lens)

@@ -20,11 +20,11 @@ import mitsuba as mi
 import numpy as np
 
 from mitsplat.quality import Quality
+from mitsplat.renderer.projection.clouds import CloudSet, Placement
 from mitsplat.renderer.rays.camera_rays import TILE_HEIGHT, TILE_PIXELS, TILE_WIDTH, CameraView
+from mitsplat.renderer.rays.tile_subset import TileSubset
 from mitsplat.renderer.splatting.march import Image, march_tiles
 from mitsplat.renderer.splatting.pairs import CrowdedError
-from mitsplat.renderer.splatting.projection import CloudSet, Placement
-from mitsplat.renderer.splatting.tile_subset import TileSubset
 from mitsplat.renderer.splatting.tiles import bin_gaussians
 
 ZOOM = 2

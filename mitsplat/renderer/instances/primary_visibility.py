@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mitsplat.renderer.meshes.visible_meshes import MeshHits, VisibleEmitters
-from mitsplat.renderer.splatting.gaussian import srgb_to_linear
+from mitsplat.renderer.projection.gaussian import srgb_to_linear
 from mitsplat.renderer.splatting.march import Image
 
 NO_SPLAT = 1 << 16

@@ -21,11 +21,11 @@ import trimesh
 from mitsplat.geometry.camera import Camera, Lens
 from mitsplat.images.masks import Silhouette
 from mitsplat.quality import Quality
+from mitsplat.renderer.projection.clouds import CloudSet, Placement
+from mitsplat.renderer.projection.records import GaussianRecord
 from mitsplat.renderer.rays.camera_rays import TILE_HEIGHT, TILE_WIDTH, CameraView
 from mitsplat.renderer.rays.device_arrays import plain_mesh, ray_scene, wrapped
 from mitsplat.renderer.splatting.pairs import CrowdedError
-from mitsplat.renderer.splatting.projection import CloudSet, Placement
-from mitsplat.renderer.splatting.records import GaussianRecord
 from mitsplat.renderer.splatting.tile_depths import DEPTH_BITS
 from mitsplat.renderer.splatting.tiles import TileLists, bin_gaussians
 from mitsplat.renderer.splatting.walk import exp2, max_of, min_log_opacity, respond_along

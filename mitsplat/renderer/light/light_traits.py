@@ -10,8 +10,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mitsplat.renderer.projection.clouds import Placement
 from mitsplat.renderer.rays.device_arrays import wrapped
-from mitsplat.renderer.splatting.projection import Placement
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,11 +15,11 @@ import numpy as np
 
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.renderer.occluders.splat_occlusion import SETS, Caster, Solids
+from mitsplat.renderer.projection.clouds import CloudSet, Placement
+from mitsplat.renderer.projection.gaussian import evaluate_sh, rotation_axes
+from mitsplat.renderer.projection.records import AppearanceRow, Geometry
+from mitsplat.renderer.projection.splat_appearance import appearance_rows, apply_appearance
 from mitsplat.renderer.rays.device_arrays import wrapped
-from mitsplat.renderer.splatting.gaussian import evaluate_sh, rotation_axes
-from mitsplat.renderer.splatting.projection import CloudSet, Placement
-from mitsplat.renderer.splatting.records import AppearanceRow, Geometry
-from mitsplat.renderer.splatting.splat_appearance import appearance_rows, apply_appearance
 
 MOST_SOLIDS = 1_000_000
 """Approximate limit of the solids in all sets. Larger scenes have fewer sets, but at least two."""

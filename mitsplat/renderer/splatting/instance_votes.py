@@ -13,8 +13,9 @@ import mitsuba as mi
 
 from mitsplat.quality import Order, Quality
 from mitsplat.renderer.rays.camera_rays import CameraView
+from mitsplat.renderer.splatting.lanes import Lanes
 from mitsplat.renderer.splatting.tiles import TileLists
-from mitsplat.renderer.splatting.walk import TRANSMITTANCE, Lanes, Pixel, Rays, walk
+from mitsplat.renderer.splatting.walk import TRANSMITTANCE, Pixel, Rays, walk
 
 FIRST_SLOTS = 3
 """Number of instances with a slot in the first walk."""

@@ -11,11 +11,11 @@ import numpy as np
 
 from mitsplat.errors import MissingResourceError
 from mitsplat.quality import Quality
+from mitsplat.renderer.projection.gaussian import conic_touches_rectangle, ellipse_spans
+from mitsplat.renderer.projection.records import GaussianRecord
 from mitsplat.renderer.rays.camera_rays import CameraView
-from mitsplat.renderer.splatting.gaussian import conic_touches_rectangle, ellipse_spans
-from mitsplat.renderer.splatting.records import GaussianRecord
+from mitsplat.renderer.rays.tile_subset import TileBox, TileSubset
 from mitsplat.renderer.splatting.tile_depths import DEPTH_BITS, depths_by_tile, level_of
-from mitsplat.renderer.splatting.tile_subset import TileBox, TileSubset
 
 NUMBER_BITS = 26
 """Bits of a record number or pair number in sort keys."""

@@ -14,9 +14,9 @@ import drjit as dr
 import mitsuba as mi
 
 from mitsplat.quality import Quality
+from mitsplat.renderer.projection.clouds import CloudSet, Placement
 from mitsplat.renderer.rays.camera_rays import CameraView
 from mitsplat.renderer.splatting.march import Image, march
-from mitsplat.renderer.splatting.projection import CloudSet, Placement
 from mitsplat.renderer.splatting.tiles import TileLists, bin_gaussians, merge_lists
 
 

@@ -13,9 +13,9 @@ import drjit as dr
 import mitsuba as mi
 
 from mitsplat.quality import Quality
+from mitsplat.renderer.projection.gaussian import LOG2_E_HALF
+from mitsplat.renderer.projection.records import GaussianRecord, PlaneRecord
 from mitsplat.renderer.rays.camera_rays import CameraView
-from mitsplat.renderer.splatting.gaussian import LOG2_E_HALF
-from mitsplat.renderer.splatting.records import GaussianRecord, PlaneRecord
 
 DEPTH_BITS = 16
 """Bits of a depth in sort keys: 11 bits of its mantissa separate depths that differ by 0.05 %, and 5 bits of its

@@ -1,7 +1,7 @@
 """Depth-sorted lists of Gaussians per image tile, built on the device.
 
 1. *Cull* every Gaussian of every placement by the exact screen box of its cut-off ellipsoid (one kernel).
-2. *Project* the others to view records (one kernel), see :mod:`mitsplat.renderer.splatting.projection`. On a GPU, one
+2. *Project* the others to view records (one kernel), see :mod:`mitsplat.renderer.projection.projector`. On a GPU, one
    kernel does both.
 3. *Pair* each record with the tiles that its cut-off ellipse intersects, see :mod:`mitsplat.renderer.splatting.pairs`.
 4. *Sort* the pairs by tile and by depth there, see :mod:`mitsplat.renderer.splatting.tile_depths`.
@@ -17,14 +17,15 @@ import drjit as dr
 import mitsuba as mi
 
 from mitsplat.quality import Quality
+from mitsplat.renderer.projection.clouds import CloudSet, Placement, placement_table
+from mitsplat.renderer.projection.projector import Projector
+from mitsplat.renderer.projection.records import RECORD, GaussianRecord
 from mitsplat.renderer.rays.camera_rays import CameraView
 from mitsplat.renderer.rays.device_arrays import concatenated
+from mitsplat.renderer.rays.tile_subset import TileBox, TileSubset
 from mitsplat.renderer.splatting.pairs import NUMBER_BITS, Pairs, pair_records, prefix_ranges
-from mitsplat.renderer.splatting.projection import CloudSet, Placement, Projector, placement_table
-from mitsplat.renderer.splatting.records import RECORD, GaussianRecord
 from mitsplat.renderer.splatting.sorting import numpy_sorts_slowly, sort_in_threads, stable_order
 from mitsplat.renderer.splatting.tile_depths import DEPTH_BITS, depth_of_level, least_depth, level_of
-from mitsplat.renderer.splatting.tile_subset import TileBox, TileSubset
 
 MAX_UNCULLED = 1 << 22
 """Largest number of Gaussians that are projected without prior culling; records take 84 bytes each."""
@@ -35,8 +36,8 @@ class TileLists:
     """Depth-sorted Gaussians of every tile.
 
     Attributes:
-        records: One :class:`mitsplat.renderer.splatting.records.GaussianRecord` per visible Gaussian.
-        plane_records: One :class:`mitsplat.renderer.splatting.records.PlaneRecord` per Gaussian that reaches the
+        records: One :class:`mitsplat.renderer.projection.records.GaussianRecord` per visible Gaussian.
+        plane_records: One :class:`mitsplat.renderer.projection.records.PlaneRecord` per Gaussian that reaches the
             camera's plane; None if there are none.
         entries: Record numbers, tile after tile.
         slots: Position of every entry in the order by record number; for gradients only.

@@ -12,7 +12,7 @@ import mitsuba as mi
 
 
 class GaussianRecord(NamedTuple):
-    """View record of a Gaussian, see :mod:`mitsplat.renderer.splatting.gaussian` for the symbols.
+    """View record of a Gaussian, see :mod:`mitsplat.renderer.projection.gaussian` for the symbols.
 
     ``a``, ``b2`` and ``c`` include the factor log2(e)/2, so that opacity along a ray is ``exp2(log_opacity - q)``.
 

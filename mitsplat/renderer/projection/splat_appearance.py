@@ -15,8 +15,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsplat.renderer.splatting.gaussian import linear_to_srgb, srgb_to_linear
-from mitsplat.renderer.splatting.records import AppearanceRow
+from mitsplat.renderer.projection.gaussian import linear_to_srgb, srgb_to_linear
+from mitsplat.renderer.projection.records import AppearanceRow
 
 CELLS = 3.0
 """Cells of the coarsest noise along the longest side of an object."""

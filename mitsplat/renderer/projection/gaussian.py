@@ -33,58 +33,10 @@ from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
-from mitsplat.renderer.rays.device_arrays import wrapped
-from mitsplat.renderer.splatting.records import Geometry, PlaneRecord
+from mitsplat.renderer.projection.records import PlaneRecord
 
 LOG2_E_HALF = 0.5 * 1.4426950408889634
-
-SCALE_RATIO_MIN = 1e-6
-"""Smallest ratio of an axis to the largest axis. Thinner axes are widened to it: a disk stays a disk, and 1/sigma stays
-finite.
-"""
-
-
-@dataclass(frozen=True, eq=False)
-class Cloud:
-    """Gaussians on the device, in their own frame.
-
-    Attributes:
-        count: Number of Gaussians, N.
-        geometry: Mean, opacity and quaternion xyzw, one row of :class:`Geometry` per Gaussian.
-        scales: Standard deviations (3) and a zero per Gaussian: 4 N floats.
-        sh: Coefficients per Gaussian, channel-last, ``sh_stride`` floats each.
-        sh_count: Number of SH coefficients per channel, 1, 4, 9 or 16.
-        sh_stride: Floats per Gaussian in ``sh``, padded so that packets of 4 stay aligned.
-    """
-
-    count: int
-    geometry: mi.Float
-    scales: mi.Float
-    sh: mi.Float
-    sh_count: int
-    sh_stride: int
-
-
-def upload_cloud(
-    means: np.ndarray, quats: np.ndarray, scales: np.ndarray, opacities: np.ndarray, sh: np.ndarray
-) -> Cloud:
-    """Copy N Gaussians to the device (shapes as in :class:`mitsplat.gaussians.splat_cloud.Splats`)."""
-    count, bands = len(means), sh.shape[1]
-    stride = -(-3 * bands // 4) * 4
-    padded = np.zeros((count, stride), np.float32)
-    padded[:, : 3 * bands] = sh.reshape(count, 3 * bands)
-    widest = scales.max(axis=1, keepdims=True) if count else scales[:, :1]
-    sigma = np.zeros((count, 4), np.float32)
-    sigma[:, :3] = np.maximum(scales, SCALE_RATIO_MIN * widest)
-    geometry = np.empty((count, Geometry.WIDTH), np.float32)
-    geometry[:, Geometry.MEAN], geometry[:, Geometry.OPACITY], geometry[:, Geometry.QUATERNION] = (
-        means,
-        opacities,
-        quats,
-    )
-    return Cloud(count, wrapped(mi.Float, geometry), wrapped(mi.Float, sigma), wrapped(mi.Float, padded), bands, stride)
 
 
 def evaluate_sh(direction: mi.Vector3f, coefficient: Callable[[int], list[mi.Float]], bands: int) -> list[mi.Float]:

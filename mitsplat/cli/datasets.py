@@ -386,12 +386,6 @@ def preview(
     frame: FrameIndex = 0,
     out: Annotated[Path, typer.Option("--out", "-o", help="Image to write (.png or .jpg).")] = Path("preview.png"),
     size: FrameSize = None,
-    seed: SceneSeed = None,
-    quality: Preset = None,
-    layers: Annotated[
-        bool,
-        typer.Option("--layers/--no-layers", help="Show instance ids, depth, light and highlights beside the image."),
-    ] = True,
     device: DeviceName = "cpu",
     allow_outside: AllowOutside = False,
 ) -> None:
@@ -405,11 +399,11 @@ def preview(
     from mitsplat.scene.loading.scene_loading import load_scene
     from mitsplat.storage.files import write_file
 
-    loaded = load_scene(scene, overrides=_overrides(size=size, seed=seed, quality=quality), allow_outside=allow_outside)
+    loaded = load_scene(scene, overrides=_overrides(size=size), allow_outside=allow_outside)
     refuse(loaded, chain(count_faults(loaded), layout_faults(loaded), image_faults(loaded)))
     select_device(device)
     rendered = render_frame(loaded, frame)
-    picture = Image.fromarray(layer_sheet(rendered) if layers else rendered.image)
+    picture = Image.fromarray(layer_sheet(rendered))
     write_file(out, lambda part: picture.save(part, "PNG" if out.suffix.lower() == ".png" else "JPEG"))
     typer.echo(f"picture: {out}")
 
@@ -429,7 +423,6 @@ def view(
         int,
         typer.Option(help="Maximum number of Gaussians per cloud in the browser; larger clouds are subsampled evenly."),
     ] = 300_000,
-    browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open the page in a browser.")] = False,
     device: DeviceName = "cpu",
     allow_outside: AllowOutside = False,
 ) -> None:
@@ -450,8 +443,6 @@ def view(
 
     def print_url(url: str) -> None:
         typer.echo(f"view: {url}  (Ctrl-C stops it)")
-        if browser:
-            typer.launch(url)
 
     select_device(device)
     serve(path, Address(host, port), gaussians=gaussians, allow_outside=allow_outside, ready=print_url)
@@ -465,7 +456,6 @@ def settle(
     ] = False,
     out: Annotated[Path, typer.Option("--out", "-o", help="GIF file to write.")] = Path("settle.gif"),
     size: Annotated[str, typer.Option(metavar="WxH", help="Size of the GIF [px].")] = "480x270",
-    seed: SceneSeed = None,
     workers: Annotated[int, typer.Option(help="Number of processes that settle layouts.")] = 1,
     allow_outside: AllowOutside = False,
 ) -> None:
@@ -481,7 +471,7 @@ def settle(
     from mitsplat.physics.settle import settle_layouts
     from mitsplat.scene.loading.scene_loading import load_scene
 
-    loaded = load_scene(scene, overrides=_overrides(size=size, seed=seed), allow_outside=allow_outside)
+    loaded = load_scene(scene, overrides=_overrides(size=size), allow_outside=allow_outside)
     wanted = loaded.spec.output.layouts if layouts is None else layouts
     if not 1 <= wanted <= loaded.spec.output.layouts:
         raise InputError(

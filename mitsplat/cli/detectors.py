@@ -160,7 +160,6 @@ def compare(
         Literal["train", "val", "test", "all"], typer.Option(help="Split of the rendered images to measure.")
     ] = "train",
     size: Annotated[int, typer.Option(help="Longer side of the images when they are measured [px].")] = 640,
-    images: Annotated[int, typer.Option(help="Maximum number of images to measure on each side, drawn evenly.")] = 400,
     out: Annotated[
         Path | None, typer.Option("--out", "-o", metavar="FILE", help="JSON file for the measured values.")
     ] = None,
@@ -177,9 +176,7 @@ def compare(
 
     check_ending(out, ".json")
     with command_log(json_log, "compare") as progress_bars, progress_bars() as progress:
-        found = compare_with_photographs(
-            datasets, photographs, split=split, size=size, max_images=images, progress=progress
-        )
+        found = compare_with_photographs(datasets, photographs, split=split, size=size, progress=progress)
     typer.echo(f"{found.images} rendered images, {found.photographs} photographs; 5 %, median and 95 %:")
     for trait in found.traits:
         _print_trait(trait.name, trait)

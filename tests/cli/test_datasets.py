@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image, ImageSequence
 
-from mitsplat.frames import frame
+from mitsplat.frames import frame, layer_sheet
 from mitsplat.frames import mitsuba_xml as xml_scene
 from mitsplat.physics import settle
 from mitsplat.scene.layout import Layout
@@ -24,7 +24,8 @@ def test_preview_writes_the_image_of_the_frame(
     image = np.full((4, 6, 3), (10, 20, 30), dtype=np.uint8)
     calls = Calls(SimpleNamespace(image=image))
     monkeypatch.setattr(frame, "render_frame", calls)
-    options = ("--frame", 5, "-o", tmp_path / "a.png", "--size", "6x4", "--no-layers")
+    monkeypatch.setattr(layer_sheet, "layer_sheet", lambda rendered: rendered.image)
+    options = ("--frame", 5, "-o", tmp_path / "a.png", "--size", "6x4")
     assert run("preview", scene_path, *options) == 0
     scene, index = calls.args
     assert (scene.spec.output.width, index) == (6, 5)

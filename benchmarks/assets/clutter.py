@@ -250,8 +250,8 @@ def linear(path: Path) -> np.ndarray:
 
 def overlap(photo: Photo, truth: np.ndarray) -> float:
     """IoU of a photo's mask with the truth, where it does not say that another thing may hide the solid."""
-    known = known_where(photo.hidden(), photo.camera)
-    return iou((photo.alpha() >= 0.5) & known, truth & known)
+    known = known_where(photo.read_mask()[1], photo.camera)
+    return iou((photo.read_mask()[0] >= 0.5) & known, truth & known)
 
 
 def compare(asset: Path, truth: Mapping[str, Camera], mesh: trimesh.Trimesh, out: Path) -> dict[str, float]:

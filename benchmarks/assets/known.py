@@ -182,7 +182,7 @@ def mask_overlaps(capture: Capture, truth: Mapping[str, Camera], mesh: trimesh.T
     depths = mi.load_dict({"type": "aov", "aovs": "depth:depth"})
     overlaps, sensors = [], Sensors()
     for photo in capture.photos:
-        _, alpha = photo.picture()
+        _, alpha, _ = photo.read()
         true = np.array(mi.render(solid, integrator=depths, sensor=sensors.like(truth[photo.name]), spp=1))[..., -1] > 0
         overlaps.append(0.0 if alpha is None else iou(alpha >= 0.5, true))
     return overlaps

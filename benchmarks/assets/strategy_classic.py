@@ -55,7 +55,7 @@ class Classic:
         self._gradient_sum: Any = mi.Float(0)
         self._photo_counts: Any = mi.Float(0)
 
-    def look(self, model: GaussianModel, camera: Camera) -> None:
+    def accumulate(self, model: GaussianModel, camera: Camera) -> None:
         """Accumulate the gradients of a photo since the last change."""
         pull, seen = image_gradient(model, camera)
         self._gradient_sum += dr.select(seen, pull, 0)

@@ -12,8 +12,7 @@ from mitsplat.bake.verification import BakedView
 from mitsplat.geometry.decomposition import max_gap
 from mitsplat.geometry.mesh import mass_properties
 from mitsplat.geometry.mesh_distance import DistanceSurface, standoff
-from mitsplat.pages.html import REPORT_FILE, figure_of, make_page, rgb_image, verdict_of
-from mitsplat.storage.files import write_text
+from mitsplat.pages.html import figure_of, make_figure, make_section, rgb_image, verdict_of, write_report
 
 _VIEW = 420
 _WHITE_DIFFERENCE = 0.3
@@ -26,11 +25,7 @@ def write_bake_report(folder: Path, result: BakeResult) -> Path:
     Raises:
         OSError: If the page cannot be written.
     """
-    name = result.asset.name
-    path = folder / REPORT_FILE
-    body = "\n".join([f"<h1>{html.escape(name)}</h1>", _figures(result), _views(result)])
-    write_text(path, make_page(f"{name}: bake report", body))
-    return path
+    return write_report(folder, result.asset.name, "bake", [_figures(result), _views(result)])
 
 
 def _figures(result: BakeResult) -> str:
@@ -55,8 +50,7 @@ def _figures(result: BakeResult) -> str:
                     f"convex pieces fill cavities of the mesh by up to {1e3 * gap:.1f} mm, more than the "
                     f"{1e3 * bearable:.1f} mm that layouts allow: layouts with an object resting there are drawn again"
                 )
-    verdict = verdict_of(warnings, "Nothing to note.", rows)
-    return f'<section aria-labelledby="figures"><h2 id="figures">Figures</h2>{verdict}</section>'
+    return make_section("figures", "Figures", verdict_of(warnings, "Nothing to note.", rows))
 
 
 def _views(result: BakeResult) -> str:
@@ -65,9 +59,7 @@ def _views(result: BakeResult) -> str:
         f"White in the difference is an error of {_WHITE_DIFFERENCE:g} of the range."
     )
     figures = "".join(_view(number + 1, view) for number, view in enumerate(result.views))
-    return (
-        f'<section aria-labelledby="views"><h2 id="views">Views</h2><p>{note}</p>{figures or "<p>none</p>"}</section>'
-    )
+    return make_section("views", "Views", f"<p>{note}</p>{figures or '<p>none</p>'}")
 
 
 def _view(number: int, view: BakedView) -> str:
@@ -77,8 +69,7 @@ def _view(number: int, view: BakedView) -> str:
         "difference": np.abs(view.splats - view.mesh) / _WHITE_DIFFERENCE,
     }
     images = "".join(
-        f'<figure><img alt="view {number}, {html.escape(kind, quote=True)}" src="{rgb_image(picture, _VIEW)}">'
-        f"<figcaption>{kind}</figcaption></figure>"
+        make_figure(f"view {number}, {html.escape(kind, quote=True)}", kind, rgb_image(picture, _VIEW))
         for kind, picture in pictures.items()
     )
     return f'<div class="row">{images}</div>'

@@ -15,7 +15,7 @@ from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from os import PathLike
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
 import cv2
 import numpy as np
@@ -86,6 +86,29 @@ Window = tuple[int, int, int, int]
 """Rectangle in a photo: left, top, width and height [px]."""
 
 
+class PhotoPixels(NamedTuple):
+    """Pixels of a photo.
+
+    Attributes:
+        rgb: Display-encoded colours in [0, 1], shape (H, W, 3).
+        mask: Share of each pixel that the object covers, shape (H, W), or None without a mask.
+        hidden: Possible occlusion of the object by other things, (H, W) in [0, 1], or None without occlusion.
+    """
+
+    rgb: Float32Array
+    mask: Float32Array | None
+    hidden: Float32Array | None
+
+
+class SizedPhoto(NamedTuple):
+    """Camera and pixels of a reduced photo, as in :class:`PhotoPixels`."""
+
+    camera: Camera
+    rgb: Float32Array
+    mask: Float32Array | None
+    hidden: Float32Array | None
+
+
 @dataclass(frozen=True, eq=False)
 class Photo:
     """Registered photograph.
@@ -106,7 +129,7 @@ class Photo:
     seen: Int32Array = field(default_factory=lambda: np.zeros(0, dtype=np.int32))
     gain: tuple[float, float, float] | None = None
 
-    def picture(self, scale: float = 1.0, window: Window | None = None) -> tuple[Float32Array, Float32Array | None]:
+    def read(self, scale: float = 1.0, window: Window | None = None) -> PhotoPixels:
         """Read the photo, with its exposure corrected by ``gain``, and its mask.
 
         Args:
@@ -115,34 +138,30 @@ class Photo:
             window: Rectangle of the photo to read: left, top, width and height [px], inside the photo. The camera is
                 then ``camera.cropped(*window).resized(W, H)``.
 
-        Returns:
-            Display-encoded colours in [0, 1], shape (H, W, 3), and the mask as alpha, shape (H, W), or None without a
-            mask.
-
         Raises:
             InputError: If a file cannot be read or its size differs from that of the camera.
             ValueError: If ``scale`` is not in (0, 1].
         """
-        return self.read(scale, window)[:2]
-
-    def read(
-        self, scale: float = 1.0, window: Window | None = None
-    ) -> tuple[Float32Array, Float32Array | None, Float32Array | None]:
-        """Read the results of :meth:`picture` and :meth:`hidden`, with one access to the mask file."""
         if not 0 < scale <= 1:
             raise ValueError(f"scale must be in (0, 1] (got {scale})")
         rgb = self._read_pixels(self.file, ("RGB",), scale, window)
         if self.gain is not None:
             rgb = np.clip(encode_srgb(decode_srgb(rgb) * self.gain), 0, 1).astype(np.float32)
-        return rgb, *self._read_mask(scale, window)
+        return PhotoPixels(rgb, *self.read_mask(scale, window))
 
-    def alpha(self, scale: float = 1.0, window: Window | None = None) -> Float32Array | None:
-        """Read only the mask of :meth:`picture`."""
-        return self._read_mask(scale, window)[0]
+    def read_mask(
+        self, scale: float = 1.0, window: Window | None = None
+    ) -> tuple[Float32Array | None, Float32Array | None]:
+        """Read only the mask and the hidden area of :meth:`read`."""
+        if self.mask is None:
+            return None, None
+        values = self._read_pixels(self.mask, ("L", "LA"), scale, window)
+        return (values, None) if values.ndim == 2 else (values[..., 0].copy(), 1 - values[..., 1])
 
-    def hidden(self, scale: float = 1.0, window: Window | None = None) -> Float32Array | None:
-        """Read the possible occlusion of the object by other things, (H, W) in [0, 1]; None without occlusion."""
-        return self._read_mask(scale, window)[1]
+    def fitted(self, size: float) -> SizedPhoto:
+        """Read the photo with a longest edge of at most ``size`` px."""
+        scale = min(1.0, size / max(self.camera.width, self.camera.height))
+        return SizedPhoto(self.camera.fitted(size), *self.read(scale))
 
     @cached_property
     def image_hash(self) -> str:
@@ -154,12 +173,6 @@ class Photo:
         digest = ContentHash()
         digest.add_file(self.file)
         return digest.hexdigest()
-
-    def _read_mask(self, scale: float, window: Window | None) -> tuple[Float32Array | None, Float32Array | None]:
-        if self.mask is None:
-            return None, None
-        values = self._read_pixels(self.mask, ("L", "LA"), scale, window)
-        return (values, None) if values.ndim == 2 else (values[..., 0].copy(), 1 - values[..., 1])
 
     def _read_pixels(self, path: Path, modes: Sequence[str], scale: float, window: Window | None) -> Float32Array:
         """Read an image, converted to the first of ``modes`` unless its mode is among them."""
@@ -182,7 +195,7 @@ def known_where(hidden: Float32Array | None, camera: Camera) -> BoolArray:
     """Return the pixels in which nothing occludes the object, so that the mask is valid, shape (H, W).
 
     Args:
-        hidden: Result of :meth:`Photo.hidden`.
+        hidden: Hidden area of a photo.
         camera: Camera that gives the size of the result.
     """
     return np.ones((camera.height, camera.width), dtype=bool) if hidden is None else np.asarray(hidden == 0)
@@ -365,7 +378,7 @@ class Capture:
 
     @classmethod
     def load(cls, folder: str | PathLike[str]) -> Capture:
-        """Read a capture folder; images are read later by :meth:`Photo.picture`.
+        """Read a capture folder; images are read later by :meth:`Photo.read`.
 
         Raises:
             InputError: If a file is missing, has a newer format version or is invalid.

@@ -75,12 +75,8 @@ def _observations(photos: Sequence[Photo], points: Float64Array) -> tuple[Int64A
     """Return photo index and point index of each observation, (K,), and its log linear colour, (K, 3)."""
     found = []
     for number, photo in enumerate(photos):
-        scale = min(1.0, _LOOKUP_EDGE / max(photo.camera.width, photo.camera.height))
-        rgb, _ = photo.picture(scale)
-        size = rgb.shape[1], rgb.shape[0]
-        pixels, _ = photo.camera.resized(*size).project(points[photo.seen])
-        inside = ((pixels >= 0) & (pixels < size)).all(axis=1)
-        x, y = pixels[inside].astype(np.int64).T
+        camera, rgb, *_ = photo.fitted(_LOOKUP_EDGE)
+        inside, x, y = camera.visible_pixels(points[photo.seen])
         values = rgb[y, x]
         reliable = ((values > _RELIABLE_RANGE[0]) & (values < _RELIABLE_RANGE[1])).all(axis=1)
         own = photo.seen[inside][reliable].astype(np.int64)

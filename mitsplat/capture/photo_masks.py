@@ -413,9 +413,7 @@ def _agreed_hull(views: Sequence[tuple[Camera, BoolArray]], points: Float64Array
     seen = np.zeros(len(cells), dtype=np.int64)
     for camera, mask in views:
         left = np.flatnonzero(misses <= most)
-        pixels, _ = camera.project(cells[left])
-        inside = ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(axis=1)
-        x, y = pixels[inside].astype(np.intp).T
+        inside, x, y = camera.visible_pixels(cells[left])
         seen[left[inside]] += 1
         misses[left[inside]] += ~mask[y, x]
     return cells[(misses <= most) & (seen > len(views) // 4)], cell
@@ -448,11 +446,9 @@ def _reduce_photo(photo: Photo, share: float = 1.0) -> tuple[Camera, ByteImage, 
         photo: Photo to reduce.
         share: Extent of the object as a fraction of the photo's longer edge.
     """
-    scale = min(1.0, _WORK_EDGE / share / max(photo.camera.width, photo.camera.height))
-    rgb, mask = photo.picture(scale)
+    camera, rgb, mask, _ = photo.fitted(_WORK_EDGE / share)
     bgr = np.rint(255 * rgb[..., ::-1]).astype(np.uint8)
-    height, width = bgr.shape[:2]
-    return photo.camera.resized(width, height), bgr, np.zeros((height, width), bool) if mask is None else mask >= 0.5
+    return camera, bgr, np.zeros(bgr.shape[:2], bool) if mask is None else mask >= 0.5
 
 
 def _resize_mask(mask: BoolArray, camera: Camera) -> BoolArray:
@@ -485,9 +481,7 @@ def _mask_fault(mask: BoolArray, camera: Camera, points: Float64Array | None, hi
     if share > 0.98:
         return f"its mask covers {share:.1%} of it"
     if points is not None:
-        pixels, _ = camera.project(points)
-        pixels = pixels[((pixels >= 0) & (pixels < (camera.width, camera.height))).all(axis=1)]
-        x, y = pixels.astype(np.intp).T
+        _, x, y = camera.visible_pixels(points)
         if hidden is not None:
             x, y = x[~hidden[y, x]], y[~hidden[y, x]]
         agreement = float(mask[y, x].mean()) if len(x) else 0.0

@@ -198,7 +198,7 @@ def undistort(photo: Photo) -> Photo:
     camera = photo.camera
     if not camera.distortion:
         return photo
-    pixels, pinhole = camera.undistorted(np.rint(255 * photo.picture()[0]).astype(np.uint8))
+    pixels, pinhole = camera.undistorted(np.rint(255 * photo.read().rgb).astype(np.uint8))
     file = photo.file.with_name(f"{photo.file.name}.undistorted.png")
     write_file(file, lambda part: Image.fromarray(pixels).save(part, "PNG"))
     return replace(photo, file=file, camera=pinhole)

@@ -65,7 +65,7 @@ def model_maps(
         file = folder / f"{key}_{stored_name(photo.name, '.npy')}"
         if not file.exists():
             network = network or DepthNetwork(open_session(model), model)
-            write_file(file, partial(_save, network.depths(photo.picture()[0])))
+            write_file(file, partial(_save, network.depths(photo.read().rgb)))
         files[photo.name] = file
         if progress is not None:
             progress(done, len(photos), "depths")

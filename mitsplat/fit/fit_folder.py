@@ -184,12 +184,12 @@ class FitFolder:
             if there.exists():
                 raise InputError(f"{there}: exists already and does not belong to a fit; --overwrite replaces it")
 
-    def begin(self, *, goes_on: bool) -> None:
+    def start(self, *, resumed: bool) -> None:
         """Remove the files of an earlier fit, the record first; keep the checkpoint if the fit resumes from it."""
         self.path.mkdir(parents=True, exist_ok=True)
         (self.path / _RUNNING_MARKER).touch()
         (self.path / FIT_FILE).unlink(missing_ok=True)
-        if not goes_on:
+        if not resumed:
             (self.path / "checkpoint.npz").unlink(missing_ok=True)
         (self.path / "splats.ply").unlink(missing_ok=True)
         shutil.rmtree(self.held_out, ignore_errors=True)

@@ -46,7 +46,7 @@ def seed_points(
         votes, voters = np.zeros(len(points)), np.zeros(len(points))
         for camera, indices, mask in zip(cameras, seen, masks, strict=True):
             own = indices if len(indices) else np.arange(len(points))
-            shown = _mask_values(camera, mask, points[own])
+            shown = camera.sample(mask, points[own], missing=-1.0)
             known = shown >= 0
             np.add.at(votes, own[known], shown[known] > 0.5)
             np.add.at(voters, own[known], 1)
@@ -83,16 +83,6 @@ def _random_points(cameras: Sequence[Camera], masks: Sequence[Mask] | None, rng:
         return ball
     inside = np.zeros(len(ball))
     for camera, mask in zip(cameras, masks, strict=True):
-        inside += _mask_values(camera, mask, ball) > 0.5
+        inside += camera.sample(mask, ball, missing=-1.0) > 0.5
     hull: Float64Array = ball[inside >= max(1.0, 0.9 * inside.max())]
     return hull[:_RANDOM_POINTS]
-
-
-def _mask_values(camera: Camera, mask: Mask, points: Float64Array) -> Float64Array:
-    """Return the share of each point's pixel that the object covers; -1 outside the picture."""
-    pixels, depth = camera.project(points)
-    x, y = np.nan_to_num(np.floor(pixels), nan=-1.0).clip(-1, 1e6).astype(int).T
-    inside = (depth > 0) & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
-    result = np.full(len(points), -1.0)
-    result[inside] = mask[y[inside], x[inside]]
-    return result

@@ -39,6 +39,7 @@ class BandRates(NamedTuple):
 
 
 Rate = float | BandRates
+_Arrays = dict[str, "mi.Float"]
 
 
 class Adam:
@@ -52,9 +53,9 @@ class Adam:
     """
 
     def __init__(self, values: Mapping[str, npt.NDArray[Any]]) -> None:
-        self.values: dict[str, Any] = {k: wrapped(mi.Float, np.asarray(v, dtype=np.float32)) for k, v in values.items()}
-        self.first: dict[str, Any] = {k: dr.zeros(mi.Float, dr.width(v)) for k, v in self.values.items()}
-        self.second: dict[str, Any] = {k: dr.zeros(mi.Float, dr.width(v)) for k, v in self.values.items()}
+        self.values: _Arrays = {k: wrapped(mi.Float, np.asarray(v, dtype=np.float32)) for k, v in values.items()}
+        self.first: _Arrays = {k: dr.zeros(mi.Float, dr.width(v)) for k, v in self.values.items()}
+        self.second: _Arrays = {k: dr.zeros(mi.Float, dr.width(v)) for k, v in self.values.items()}
         self.steps = 0
         self._evaluate()
 
@@ -121,12 +122,9 @@ class Adam:
         dr.eval(self.values, self.first, self.second)
 
 
-_Arrays = dict[str, Any]
-
-
 @recorded
 def _adam_step(
-    values: _Arrays, gradients: _Arrays, first: _Arrays, second: _Arrays, rates: Any, bands: dict[str, int]
+    values: _Arrays, gradients: _Arrays, first: _Arrays, second: _Arrays, rates: mi.Float, bands: dict[str, int]
 ) -> tuple[_Arrays, _Arrays, _Arrays]:
     """Return parameters and moments after a step.
 
@@ -181,7 +179,7 @@ class GaussianModel(Adam):
         """Floats per Gaussian, by parameter."""
         return {"means": 3, "quats": 4, "scales": 3, "opacities": 1, "sh": 3 * self.bands}
 
-    def activated(self) -> tuple[Any, Any, Any, Any, Any]:
+    def activated(self) -> tuple[mi.Float, mi.Float, mi.Float, mi.Float, mi.Float]:
         """Return means [m], quaternions, scales [m], opacities and SH coefficients as flat arrays.
 
         The arrays carry gradients if :meth:`track` was called.
@@ -193,7 +191,7 @@ class GaussianModel(Adam):
         return pack_cloud(*self.activated(), self.bands)
 
     def render(self, eye: Eye, quality: Quality, *, depth: bool = False) -> RenderOp:
-        """Render the Gaussians; :meth:`learn` computes the gradients of the parameters.
+        """Render the Gaussians; :meth:`set_gradients` computes the gradients of the parameters.
 
         Args:
             eye: The camera.
@@ -206,11 +204,11 @@ class GaussianModel(Adam):
         found = _project(dr.detach(self.values), self._unit, eye.view.kind, eye.numbers, quality, self.bands)
         return render_records(*found, eye.view, quality, depth=depth)
 
-    def learn(
+    def set_gradients(
         self,
         eye: Eye,
         quality: Quality,
-        gradients: Sequence[Any],
+        gradients: Sequence[mi.Float],
         *,
         opacity_weight: float = 0,
         scale_weight: float = 0,
@@ -249,11 +247,11 @@ class GaussianModel(Adam):
         )
 
     @cached_property
-    def _unit(self) -> Any:
+    def _unit(self) -> mi.Float:
         return dr.opaque(mi.Float, self.unit)
 
 
-def _activated(values: _Arrays, unit: Any) -> tuple[Any, Any, Any, Any, Any]:
+def _activated(values: _Arrays, unit: mi.Float) -> tuple[mi.Float, mi.Float, mi.Float, mi.Float, mi.Float]:
     return (
         values["means"] * unit,
         values["quats"],
@@ -265,8 +263,8 @@ def _activated(values: _Arrays, unit: Any) -> tuple[Any, Any, Any, Any, Any]:
 
 @recorded
 def _project(
-    values: _Arrays, unit: Any, kind: tuple[Any, ...], numbers: _Arrays, quality: Quality, bands: int
-) -> tuple[Any, Any, Any]:
+    values: _Arrays, unit: mi.Float, kind: tuple[Any, ...], numbers: _Arrays, quality: Quality, bands: int
+) -> tuple[mi.Float, mi.Float, mi.UInt32]:
     """Return the view records of Gaussians, their least depths and their tile boxes."""
     records, least, box, _ = project_cloud(pack_cloud(*_activated(values, unit), bands), kind, numbers, quality)
     return records, least, box
@@ -275,13 +273,13 @@ def _project(
 @recorded
 def _gradients(
     values: _Arrays,
-    unit: Any,
+    unit: mi.Float,
     kind: tuple[Any, ...],
     numbers: _Arrays,
     quality: Quality,
     bands: int,
-    found: list[Any],
-    weights: Any,
+    found: list[mi.Float],
+    weights: mi.Float,
 ) -> _Arrays:
     """Return parameter gradients from gradients of view records and from the weights of opacities and scales."""
     values = {name: mi.Float(value) for name, value in values.items()}

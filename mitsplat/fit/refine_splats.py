@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -111,7 +110,7 @@ def refine_splats(
         picture = order.pop()
         seen = model.render(eyes[picture], QUALITY)
         colour, alpha, loss = _gradients(seen.rgb, seen.alpha, *targets[picture], on_device(rng.random()))
-        model.learn(eyes[picture], QUALITY, [seen.gradient(colour, alpha)])
+        model.set_gradients(eyes[picture], QUALITY, [seen.gradient(colour, alpha)])
         decay = settings.final_rate ** (step / max(1, settings.iterations - 1))
         rates = {name: getattr(settings, f"rate_{name}") * decay for name in model.values}
         model.update(rates | {"sh": model.sh_rates(rates["sh"], rates["sh"] * settings.rest_rate)})
@@ -121,7 +120,9 @@ def refine_splats(
 
 
 @recorded
-def _gradients(rgb: list[Any], alpha: Any, target: list[Any], cover: Any, grey: Any) -> tuple[list[Any], Any, Any]:
+def _gradients(
+    rgb: list[mi.Float], alpha: mi.Float, target: list[mi.Float], cover: mi.Float, grey: mi.Float
+) -> tuple[list[mi.Float], mi.Float, mi.Float]:
     """Return the gradients of the loss with respect to colours and alpha, and the loss."""
     rgb, alpha = [mi.Float(channel) for channel in rgb], mi.Float(alpha)
     dr.enable_grad(rgb, alpha)

@@ -45,7 +45,7 @@ _BINOMIALS = np.array(
 class Densification(Protocol):
     """Strategy that changes the number and the positions of Gaussians during a fit."""
 
-    def look(self, model: GaussianModel, camera: Camera) -> None:
+    def accumulate(self, model: GaussianModel, camera: Camera) -> None:
         """Accumulate the gradients of a photo by this camera, before the optimiser step."""
 
     def refine(self, model: GaussianModel, step: int, fraction: float, rate: float, rng: np.random.Generator) -> None:
@@ -79,7 +79,7 @@ class Mcmc:
     def __init__(self, most: int, start: int, every: int, seed: int) -> None:
         self._most, self._start, self._every, self._seed = most, start, every, seed
 
-    def look(self, model: GaussianModel, camera: Camera) -> None:
+    def accumulate(self, model: GaussianModel, camera: Camera) -> None:
         """Do nothing, because MCMC depends only on opacities."""
 
     def refine(self, model: GaussianModel, step: int, fraction: float, rate: float, rng: np.random.Generator) -> None:
@@ -164,7 +164,9 @@ def jitter(model: GaussianModel, rate: float, seed: Sequence[int]) -> None:
 
 
 @recorded
-def _jittered(means: Any, scales: Any, quats: Any, opacities: Any, size: Any, seed: Any) -> Any:
+def _jittered(
+    means: mi.Float, scales: mi.Float, quats: mi.Float, opacities: mi.Float, size: mi.Float, seed: mi.UInt32
+) -> mi.Float:
     i = dr.arange(mi.UInt32, dr.width(opacities))
     sigma = dr.exp(dr.gather(mi.Vector3f, scales, i))
     axes = rotation_axes(dr.normalize(dr.gather(mi.Array4f, quats, i)))

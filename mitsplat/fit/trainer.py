@@ -208,7 +208,7 @@ def fit_capture(
     if state is not None:
         fit.restore(state)
     held = [_training_view(photo, settings) for photo in held_out]
-    folder.begin(goes_on=state is not None)
+    folder.start(resumed=state is not None)
     saved = time.monotonic()
     while fit.fraction < 1:
         fit.step()
@@ -226,10 +226,10 @@ def fit_capture(
         fit.model.splats(),
         fit.steps,
         seconds,
-        fit.check(held, folder.held_out),
+        fit.evaluate(held, folder.held_out),
         folder.inputs,
         warnings,
-        fit.check(fit.validation, None),
+        fit.evaluate(fit.validation, None),
     )
     folder.save(result, {"units": capture.units, "variant": mi.variant(), "settings": asdict(settings)})
     return result
@@ -275,7 +275,7 @@ class _Fit:
             settings.gaussians, self.model.count, settings.refine_every, settings.seed
         )
         self.steps, self.seconds = 0, 0.0
-        self.errors: list[Any] = []
+        self.errors: list[mi.Float] = []
         self.began = time.monotonic()
         self.last_validation, self.validation_psnr = 0.0, float("nan")
 
@@ -299,7 +299,7 @@ class _Fit:
         view = self.photos[number].half if fraction < s.coarse else self.photos[number]
         degree = min(s.sh_degree, int(5 * fraction))
         error = self._backpropagate(view, replace(QUALITY, sh_degree=degree), fraction, rng)
-        self.densification.look(self.model, view.camera)
+        self.densification.accumulate(self.model, view.camera)
         rate = s.rate_means * 0.01**fraction
         self.model.update(
             {
@@ -320,7 +320,9 @@ class _Fit:
             return 0.0
         return self.settings.depth_weight * (1 if view.inverse_depth is None else _FINAL_MAP_WEIGHT**fraction)
 
-    def _backpropagate(self, view: TrainingView, quality: Quality, fraction: float, rng: np.random.Generator) -> Any:
+    def _backpropagate(
+        self, view: TrainingView, quality: Quality, fraction: float, rng: np.random.Generator
+    ) -> mi.Float:
         """Set the parameter gradients of the loss of a photo, and return its mean squared error."""
         s = self.settings
         weight = self._depth_weight(view, fraction)
@@ -342,7 +344,7 @@ class _Fit:
         if isinstance(seen, DepthRendering):
             records.append(seen.gradient_of_moment(gradient["moment"]))
         count = self.model.count
-        self.model.learn(
+        self.model.set_gradients(
             view.eye,
             quality,
             records,
@@ -358,11 +360,11 @@ class _Fit:
         fraction = self.fraction
         if self.validation and (fraction >= self.last_validation + _VALIDATION_INTERVAL or fraction >= 1):
             self.last_validation = fraction
-            self.validation_psnr = float(np.mean([photo.psnr for photo in self.check(self.validation, None)]))
+            self.validation_psnr = float(np.mean([photo.psnr for photo in self.evaluate(self.validation, None)]))
         validation_psnr = None if np.isnan(self.validation_psnr) else self.validation_psnr
         return FitProgress(self.steps, fraction, psnr_of(error), validation_psnr, self.model.count)
 
-    def check(self, photos: Sequence[TrainingView], folder: Path | None) -> tuple[HeldOut, ...]:
+    def evaluate(self, photos: Sequence[TrainingView], folder: Path | None) -> tuple[HeldOut, ...]:
         """Evaluate photos that are not fitted, and write a comparison of each to the folder if it is not None."""
         quality = replace(QUALITY, sh_degree=self.settings.sh_degree)
         return tuple(view.compare(view.render(self.model, quality)[0], folder) for view in photos)
@@ -372,15 +374,15 @@ class _Fit:
         own = {
             "steps": self.steps,
             "seconds": self.elapsed,
-            "looked": self.last_validation,
-            "validated": self.validation_psnr,
+            "last_validation": self.last_validation,
+            "validation_psnr": self.validation_psnr,
         }
         return own | {f"{name}.{k}": v for name, part in self._stateful_parts.items() for k, v in part.state().items()}
 
     def restore(self, state: Mapping[str, npt.NDArray[Any]]) -> None:
         """Restore a state from :meth:`state`."""
         self.steps, self.seconds = int(state["steps"]), float(state["seconds"])
-        self.last_validation, self.validation_psnr = float(state["looked"]), float(state["validated"])
+        self.last_validation, self.validation_psnr = float(state["last_validation"]), float(state["validation_psnr"])
         for name, part in self._stateful_parts.items():
             part.restore({k.removeprefix(f"{name}."): v for k, v in state.items() if k.startswith(f"{name}.")})
 
@@ -402,13 +404,13 @@ class _LossConstants(NamedTuple):
 
 @recorded
 def _gradients(
-    rgb: list[Any],
-    alpha: Any,
-    depth: tuple[Any, Any] | None,
-    photo: tuple[Any, Any | None],
-    numbers: Any,
+    rgb: list[mi.Float],
+    alpha: mi.Float,
+    depth: tuple[mi.Float, mi.Float] | None,
+    photo: tuple[mi.UInt32, mi.Bool | None],
+    numbers: mi.Float,
     constants: _LossConstants,
-) -> tuple[dict[str, Any], Any]:
+) -> tuple[dict[str, Any], mi.Float]:
     """Return the gradients of the loss of one photo, and the mean squared error of its pixels.
 
     Args:
@@ -445,7 +447,7 @@ def _gradients(
     return {name: dr.grad(value) for name, value in inputs.items()}, error
 
 
-def _depth_image(camera: Camera, pixel: Any, inverse: Any) -> Any:
+def _depth_image(camera: Camera, pixel: mi.UInt32, inverse: mi.Float) -> mi.Float:
     """Return inverse depths [1/m] at distinct pixels as a flat row-major image, NaN elsewhere."""
     image = dr.full(mi.Float, dr.nan, camera.width * camera.height)
     dr.scatter(image, inverse, pixel)
@@ -453,7 +455,7 @@ def _depth_image(camera: Camera, pixel: Any, inverse: Any) -> Any:
     return image
 
 
-def _depth_error(alpha: Any, moment: Any, inverse: Any) -> Any:
+def _depth_error(alpha: mi.Float, moment: mi.Float, inverse: mi.Float) -> mi.Float:
     """Return the sum of absolute differences between the inverse depths of splats and of an image [1/m]."""
     known = dr.isfinite(inverse)
     wanted = dr.select(known, inverse, 0)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -83,7 +82,7 @@ class TrainingView:
         self._photo, self._scale, self._mask_used, self._window = photo, scale, masked, window
         self._hidden = np.asarray(hidden > 0) if self.masked and hidden is not None else None
         self.inverse_depth = None if inverse_depth is None else resize_map(inverse_depth, width, height)
-        self._depths: tuple[Any, Any] | None = None
+        self._depths: tuple[mi.UInt32, mi.Float] | None = None
         self._half: TrainingView | None = None
 
     @property
@@ -105,7 +104,7 @@ class TrainingView:
         return Eye(view_of(make_sensor(self.camera)))
 
     @cached_property
-    def packed(self) -> Any:
+    def packed(self) -> mi.UInt32:
         """Flat pixels on the device, red in the lowest byte, the mask in the highest; see :func:`unpacked`.
 
         Pixels have four bytes, so that hundreds of photos fit in device memory. Kernels convert them to floats.
@@ -115,7 +114,7 @@ class TrainingView:
         return wrapped(mi.UInt32, pixels.view(np.uint32))
 
     @cached_property
-    def hidden(self) -> Any:
+    def hidden(self) -> mi.Bool | None:
         """Flat mask on the device of the pixels where another thing may hide the object; None if there are none."""
         return None if self._hidden is None else wrapped(mi.Bool, self._hidden.ravel())
 
@@ -136,7 +135,7 @@ class TrainingView:
         pixels: npt.NDArray[np.uint8] = np.array(self.packed).view(np.uint8)
         return pixels.reshape(self.camera.height, self.camera.width, 4)
 
-    def depths(self, points: Float64Array) -> tuple[Any, Any]:
+    def depths(self, points: Float64Array) -> tuple[mi.UInt32, mi.Float]:
         """Return pixels and inverse depths [1/m] on the device: of the depth map, or else of the visible points.
 
         ``points`` has shape (N, 3).
@@ -146,14 +145,12 @@ class TrainingView:
             number = np.flatnonzero(np.isfinite(self.inverse_depth) & (self.mask > 0.5))
             return wrapped(mi.UInt32, number.astype(np.uint32)), wrapped(mi.Float, self.inverse_depth.ravel()[number])
         if self._depths is None:
-            pixels, depth = self.camera.project(points[self._photo.seen])
-            inside = (
-                (depth > 0) & (pixels >= 0).all(axis=1) & (pixels < [self.camera.width, self.camera.height]).all(axis=1)
-            )
-            column, row = pixels[inside].astype(np.uint32).T
+            seen = points[self._photo.seen]
+            inside, column, row = self.camera.visible_pixels(seen)
+            depth = self.camera.project(seen)[1][inside]
             shown = self.mask[row, column] > 0.5
-            number = (row * self.camera.width + column)[shown]
-            inverse = (1 / depth[inside][shown]).astype(np.float32)
+            number = (row * self.camera.width + column)[shown].astype(np.uint32)
+            inverse = (1 / depth[shown]).astype(np.float32)
             # One point per pixel, the nearest: gradients of several points would be summed in an undefined order.
             order = np.lexsort((-inverse, number))
             number, first = np.unique(number[order], return_index=True)
@@ -194,7 +191,7 @@ class TrainingView:
         )
 
 
-def unpacked(packed: Any) -> tuple[list[Any], Any]:
+def unpacked(packed: mi.UInt32) -> tuple[list[mi.Float], mi.Float]:
     """Return display-encoded colour times mask, and the mask, of the pixels of a :class:`TrainingView`."""
     red, green, blue, mask = (mi.Float((packed >> shift) & 0xFF) / 255 for shift in (0, 8, 16, 24))
     return [red * mask, green * mask, blue * mask], mask

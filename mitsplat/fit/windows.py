@@ -39,6 +39,6 @@ def _window(photo: Photo, box: Int64Array, room: Int64Array) -> Window | None:
 
 def _box(photo: Photo) -> Int64Array | None:
     """Return the bounds of the object in a photo's mask [px]: least x and y, and exclusive ends, shape (2, 2)."""
-    mask = photo.alpha()
+    mask, _ = photo.read_mask()
     shown = np.argwhere(mask >= 0.5) if mask is not None else np.zeros((0, 2), dtype=np.int64)
     return np.stack([shown.min(axis=0)[::-1], shown.max(axis=0)[::-1] + 1]) if len(shown) else None

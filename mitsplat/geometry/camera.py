@@ -18,7 +18,7 @@ from numpy.polynomial import Polynomial
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
-from mitsplat.arrays import Float64Array
+from mitsplat.arrays import Float64Array, Int64Array
 
 Lens = Literal["opencv", "fisheye"]
 """OpenCV camera models: rational with tangential distortion, or fisheye."""
@@ -204,7 +204,7 @@ class Camera:
             cy=self.cy * sy,
         )
 
-    def fitted(self, size: int) -> Camera:
+    def fitted(self, size: float) -> Camera:
         """Return the same camera with a longest edge of at most ``size`` px."""
         scale = min(1.0, size / max(self.width, self.height))
         return self.resized(max(1, round(self.width * scale)), max(1, round(self.height * scale)))
@@ -248,6 +248,20 @@ class Camera:
             slopes = local[front, :2] / depth[front, None]
             pixels[np.flatnonzero(front)[np.linalg.norm(slopes, axis=1) >= turning_slope(self.distortion)]] = np.nan
         return pixels, depth
+
+    def visible_pixels(self, points: npt.ArrayLike) -> tuple[Int64Array, Int64Array, Int64Array]:
+        """Return the indices of the world points (N, 3) inside the image, and the columns and rows of their pixels."""
+        pixels, _ = self.project(points)
+        inside = np.flatnonzero(((pixels >= 0) & (pixels < (self.width, self.height))).all(axis=1))
+        x, y = pixels[inside].astype(np.int64).T
+        return inside, x, y
+
+    def sample(self, image: npt.NDArray[Any], points: npt.ArrayLike, missing: float) -> Float64Array:
+        """Return the pixel values (N,) of an image at world points (N, 3); ``missing`` for points outside the image."""
+        values = np.full(len(np.atleast_2d(points)), missing)
+        inside, x, y = self.visible_pixels(points)
+        values[inside] = image[y, x]
+        return values
 
     def undistorted(self, image: npt.NDArray[np.uint8]) -> tuple[npt.NDArray[np.uint8], Camera]:
         """Return an image of this camera resampled for a pinhole camera, and that pinhole camera.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import html
 import json
 import os
 import re
@@ -11,13 +10,12 @@ from pathlib import Path
 
 import numpy as np
 
-from mitsplat.arrays import Float32Array
 from mitsplat.errors import InputError
 from mitsplat.gaussians.spherical_harmonics import SH_C0
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.mesh import mass_properties
 from mitsplat.importing.splat_import import Imported
-from mitsplat.pages.html import REPORT_FILE, figure_of, make_page, rgb_image, verdict_of
+from mitsplat.pages.html import figure_of, make_figure, make_section, rgb_image, verdict_of, write_report
 from mitsplat.reconstruct.asset_evaluation import show_asset
 from mitsplat.storage.files import is_inside, write_text
 
@@ -32,11 +30,9 @@ def write_import_report(folder: Path, imported: Imported) -> Path:
     Raises:
         OSError: If the page cannot be written.
     """
-    name = imported.asset.name
-    body = [f"<h1>{html.escape(name)}</h1>", _verdict(imported), _views(imported), _removed(imported)]
-    path = folder / REPORT_FILE
-    write_text(path, make_page(f"{name}: import report", "\n".join(body)))
-    return path
+    return write_report(
+        folder, imported.asset.name, "import", [_verdict(imported), _views(imported), _removed(imported)]
+    )
 
 
 def _verdict(imported: Imported) -> str:
@@ -60,7 +56,7 @@ def _verdict(imported: Imported) -> str:
         rows["Surface to drop on"] = (
             f"{width:.3g} x {depth:.3g} {unit}, {imported.support.share:.0%} of the visible area"
         )
-    return _section("Verdict", verdict_of(imported.misses, "Nothing to note.", rows))
+    return make_section("verdict", "Verdict", verdict_of(imported.misses, "Nothing to note.", rows))
 
 
 def _views(imported: Imported) -> str:
@@ -71,10 +67,12 @@ def _views(imported: Imported) -> str:
             "mesh": view.shaded(0.5),
             "mesh over splats": view.shaded(view.picture, 0.5),
         }
-        images = "".join(_figure(f"view {number}, {kind}", kind, shown) for kind, shown in pictures.items())
+        images = "".join(
+            make_figure(f"view {number}, {kind}", kind, rgb_image(shown, _VIEW)) for kind, shown in pictures.items()
+        )
         rows.append(f'<div class="row">{images}</div>')
     note = "<p>The pictures have the up direction of scenes. The mesh was reconstructed from other views.</p>"
-    return _section("Views", note + ("".join(rows) or "<p>none</p>"))
+    return make_section("views", "Views", note + ("".join(rows) or "<p>none</p>"))
 
 
 def _removed(imported: Imported) -> str:
@@ -87,20 +85,10 @@ def _removed(imported: Imported) -> str:
     everything = Splats.concatenate([imported.asset.splats, replace(removed_splats, sh=red)])
     cameras = [view.camera for view in imported.views[:_REMOVED_VIEWS]]
     images = "".join(
-        _figure(f"view {number}, removed in red", f"view {number}", view.picture)
+        make_figure(f"view {number}, removed in red", f"view {number}", rgb_image(view.picture, _VIEW))
         for number, view in enumerate(show_asset(everything, None, cameras), 1)
     )
-    return _section("Removed", f'<p>Removed Gaussians are red.</p><div class="row">{images}</div>')
-
-
-def _section(title: str, body: str) -> str:
-    key = title.lower()
-    return f'<section aria-labelledby="{key}"><h2 id="{key}">{title}</h2>{body}</section>'
-
-
-def _figure(alt: str, caption: str, picture: Float32Array) -> str:
-    source = rgb_image(picture, _VIEW)
-    return f'<figure><img alt="{alt}" src="{source}"><figcaption>{caption}</figcaption></figure>'
+    return make_section("removed", "Removed", f'<p>Removed Gaussians are red.</p><div class="row">{images}</div>')
 
 
 def check_scene_path(path: Path, asset_folder: Path, *, known: bool) -> None:

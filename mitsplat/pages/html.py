@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import base64
 import html
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -13,6 +14,7 @@ import numpy.typing as npt
 
 from mitsplat.arrays import ByteImage
 from mitsplat.images.masks import Silhouette
+from mitsplat.storage.files import write_text
 
 REPORT_FILE = "report.html"
 
@@ -22,6 +24,28 @@ def make_page(title: str, body: str, *, script: str = "") -> str:
     body = body.encode(errors="backslashreplace").decode()
     page = _PAGE.replace("{{title}}", html.escape(title)).replace("{{body}}", body)
     return page.replace("{{script}}", f"<script>{script}</script>\n" if script else "")
+
+
+def write_report(folder: Path, name: str, kind: str, sections: Iterable[str]) -> Path:
+    """Write the page ``report.html`` of an asset into its folder, and return its path.
+
+    Raises:
+        OSError: If the page cannot be written.
+    """
+    path = folder / REPORT_FILE
+    body = "\n".join([f"<h1>{html.escape(name)}</h1>", *sections])
+    write_text(path, make_page(f"{name}: {kind} report", body))
+    return path
+
+
+def make_section(key: str, title: str, body: str) -> str:
+    """Build a section with a heading."""
+    return f'<section aria-labelledby="{key}"><h2 id="{key}">{title}</h2>{body}</section>'
+
+
+def make_figure(alt: str, caption: str, source: str) -> str:
+    """Build a picture with a caption; ``source`` is a data URL."""
+    return f'<figure><img alt="{alt}" src="{source}"><figcaption>{caption}</figcaption></figure>'
 
 
 def inline_image(pixels: npt.NDArray[Any], *, quality: int = 82) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import TypeVar
 
 import mitsuba as mi
 import numpy as np
@@ -23,6 +23,7 @@ from mitsplat.reconstruct.silhouette_refinement import RefinedMesh
 from mitsplat.renderer.layers import make_integrator, make_splats_shape, render_layers
 
 VERDICT_FILE = "verdict.json"
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -208,7 +209,7 @@ def show_held_out(
     splats: Splats, mesh: trimesh.Trimesh | None, photos: Sequence[Photo], size: int
 ) -> list[HeldOutView]:
     """Render splats and mesh from the cameras of photos; the longest edge is at most ``size`` px."""
-    sized = [sized_photo(photo, size) for photo in photos]
+    sized = [photo.fitted(size) for photo in photos]
     shown = show_asset(splats, mesh, [camera for camera, *_ in sized])
     return [
         HeldOutView(**vars(view), name=photo.name, photo=rgb, mask=mask, known=known_where(hidden, camera))
@@ -234,21 +235,6 @@ def show_asset(splats: Splats, mesh: trimesh.Trimesh | None, cameras: Sequence[C
             )
         )
     return views
-
-
-class SizedPhoto(NamedTuple):
-    """Camera, colours (H, W, 3), mask (H, W) or None, and hidden area (H, W) or None of a reduced photo."""
-
-    camera: Camera
-    rgb: Float32Array
-    mask: Float32Array | None
-    hidden: Float32Array | None
-
-
-def sized_photo(photo: Photo, size: int) -> SizedPhoto:
-    """Read a photo with a longest edge of at most ``size`` px."""
-    camera = photo.camera
-    return SizedPhoto(camera.fitted(size), *photo.read(min(1.0, size / max(camera.width, camera.height))))
 
 
 def compute_verdict(
@@ -300,6 +286,11 @@ def iou(one: BoolArray, other: BoolArray) -> float:
     """Return the intersection over union; 1 if both are empty."""
     union = int((one | other).sum())
     return int((one & other).sum()) / union if union else 1.0
+
+
+def take_evenly(items: Sequence[T], count: int) -> list[T]:
+    """Return at most ``count`` of the items, at equal intervals."""
+    return [items[int(i)] for i in np.unique(np.linspace(0, len(items) - 1, min(count, len(items))).round())]
 
 
 def _inside(mask: BoolArray) -> BoolArray:

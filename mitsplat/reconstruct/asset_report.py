@@ -5,20 +5,24 @@ from __future__ import annotations
 import html
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TypeVar
 
 import cv2
 import numpy as np
 
 from mitsplat.arrays import ByteImage, Float32Array, Float64Array
 from mitsplat.capture.capture import Capture, Photo
-from mitsplat.pages.html import REPORT_FILE, eight_bit, figure_of, make_page, shrunk_image, verdict_of
-from mitsplat.reconstruct.asset_evaluation import HeldOutView, sized_photo
+from mitsplat.pages.html import (
+    eight_bit,
+    figure_of,
+    make_figure,
+    make_section,
+    shrunk_image,
+    verdict_of,
+    write_report,
+)
+from mitsplat.reconstruct.asset_evaluation import HeldOutView, take_evenly
 from mitsplat.reconstruct.causes import views_from
 from mitsplat.reconstruct.reconstruct import Reconstruction
-from mitsplat.storage.files import write_text
-
-T = TypeVar("T")
 
 PHOTOS = 24
 """Largest number of registered photos in the report, taken at equal intervals."""
@@ -39,18 +43,8 @@ def write_asset_report(folder: Path, capture: Capture, result: Reconstruction) -
         InputError: If a photo cannot be read.
         OSError: If the page cannot be written.
     """
-    name = result.asset.name
-    parts = [
-        f"<h1>{html.escape(name)}</h1>",
-        _verdict(result),
-        *result.sections,
-        _held_out(result.held_out),
-        _cameras(capture),
-        _photos(capture),
-    ]
-    path = folder / REPORT_FILE
-    write_text(path, make_page(f"{name}: asset report", "\n".join(parts)))
-    return path
+    sections = (_verdict(result), *result.sections, _held_out(result.held_out), _cameras(capture), _photos(capture))
+    return write_report(folder, result.asset.name, "asset", sections)
 
 
 def _verdict(result: Reconstruction) -> str:
@@ -82,13 +76,12 @@ def _verdict(result: Reconstruction) -> str:
             f"{removed.floaters} floaters"
         )
     rows |= found.rows
-    table = verdict_of(misses, "All thresholds are met.", rows)
-    return f'<section aria-labelledby="verdict"><h2 id="verdict">Verdict</h2>{table}</section>'
+    return make_section("verdict", "Verdict", verdict_of(misses, "All thresholds are met.", rows))
 
 
 def _held_out(views: Sequence[HeldOutView]) -> str:
     figures = []
-    for view in _take_evenly(views, HELD_OUT):
+    for view in take_evenly(views, HELD_OUT):
         mask = np.ones(view.alpha.shape, dtype=np.float32) if view.mask is None else view.mask
         difference = np.abs(view.render - view.photo * mask[..., None]) / _MAX_DIFFERENCE
         pictures = {
@@ -98,8 +91,7 @@ def _held_out(views: Sequence[HeldOutView]) -> str:
             "mesh over photo": eight_bit(view.shaded(view.photo, 0.85)),
         }
         images = "".join(
-            f'<figure><img alt="{kind} {html.escape(view.name, quote=True)}" src="{shrunk_image(picture, _VIEW)}">'
-            f"<figcaption>{kind}</figcaption></figure>"
+            make_figure(f"{kind} {html.escape(view.name, quote=True)}", kind, shrunk_image(picture, _VIEW))
             for kind, picture in pictures.items()
         )
         figures.append(f'<h3>{html.escape(view.name)}</h3><div class="row">{images}</div>')
@@ -107,10 +99,7 @@ def _held_out(views: Sequence[HeldOutView]) -> str:
         f"Photos that were not fitted, and the asset from their cameras. Yellow lines outline the masks; "
         f"in difference images, white is an error of {_MAX_DIFFERENCE:g} of the range."
     )
-    return (
-        f'<section aria-labelledby="held-out"><h2 id="held-out">Held-out views</h2><p>{note}</p>'
-        f"{''.join(figures) or '<p>none</p>'}</section>"
-    )
+    return make_section("held-out", "Held-out views", f"<p>{note}</p>{''.join(figures) or '<p>none</p>'}")
 
 
 def _cameras(capture: Capture) -> str:
@@ -146,11 +135,8 @@ def _cameras(capture: Capture) -> str:
         )
     if capture.up == "z":
         figures.append(_directions(capture))
-    return (
-        f'<section aria-labelledby="cameras"><h2 id="cameras">Cameras</h2>'
-        f"<p>{len(capture.photos)} cameras, {len(capture.points)} points.</p>"
-        f'<div class="charts">{"".join(figures)}</div></section>'
-    )
+    counts = f"<p>{len(capture.photos)} cameras, {len(capture.points)} points.</p>"
+    return make_section("cameras", "Cameras", f'{counts}<div class="charts">{"".join(figures)}</div>')
 
 
 def _directions(capture: Capture) -> str:
@@ -190,25 +176,23 @@ def _frustum(photo: Photo, at: Callable[[Float64Array], Float64Array], depth: fl
 
 
 def _photos(capture: Capture) -> str:
-    shown = _take_evenly(capture.photos, PHOTOS)
+    shown = take_evenly(capture.photos, PHOTOS)
     figures = []
     for photo in shown:
-        _, rgb, mask, _ = sized_photo(photo, _THUMBNAIL)
+        _, rgb, mask, _ = photo.fitted(_THUMBNAIL)
         note = "" if photo.mask is not None else ", no mask"
-        figures.append(
-            f'<figure><img alt="{html.escape(photo.name, quote=True)}" '
-            f'src="{shrunk_image(_outlined(eight_bit(rgb), mask), _THUMBNAIL)}">'
-            f"<figcaption>{html.escape(photo.name)}{note}</figcaption></figure>"
-        )
+        picture = shrunk_image(_outlined(eight_bit(rgb), mask), _THUMBNAIL)
+        figures.append(make_figure(html.escape(photo.name, quote=True), f"{html.escape(photo.name)}{note}", picture))
     rejected = "".join(
         f"<li><b>{html.escape(name)}</b>: {html.escape(reason)}</li>"
         for name, reason in sorted(capture.rejected.items())
     )
-    return (
-        f'<section aria-labelledby="photos"><h2 id="photos">Photos</h2>'
+    return make_section(
+        "photos",
+        "Photos",
         f"<p>{len(shown)} of {len(capture.photos)} registered photos, with the outlines of their masks.</p>"
         f'<div class="thumbnails">{"".join(figures)}</div>'
-        f"<h3>Rejected</h3>{f'<ul>{rejected}</ul>' if rejected else '<p>none</p>'}</section>"
+        f"<h3>Rejected</h3>{f'<ul>{rejected}</ul>' if rejected else '<p>none</p>'}",
     )
 
 
@@ -217,8 +201,3 @@ def _outlined(picture: ByteImage, mask: Float32Array | None) -> ByteImage:
         return picture
     rings, _ = cv2.findContours((mask >= 0.5).astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
     return np.asarray(cv2.drawContours(picture.copy(), rings, -1, (255, 220, 0), max(1, round(picture.shape[1] / 400))))
-
-
-def _take_evenly(items: Sequence[T], count: int) -> list[T]:
-    subset = np.unique(np.linspace(0, len(items) - 1, min(count, len(items))).round().astype(int))
-    return [items[int(i)] for i in subset]

@@ -10,6 +10,7 @@ import numpy as np
 from mitsplat.arrays import BoolArray, Float32Array, Float64Array
 from mitsplat.capture.capture import Capture
 from mitsplat.geometry.camera import Camera
+from mitsplat.geometry.triangulation import nearest_point_to_lines
 
 Pictures = Sequence[tuple[Camera, Float32Array, Float32Array | None]]
 """Camera, colours (H, W, 3) and mask (H, W) of each photo, all with the same longest edge."""
@@ -70,9 +71,7 @@ def masked_points(capture: Capture, pictures: Pictures) -> Float64Array:
     for photo, (camera, _, mask) in zip(capture.photos, pictures, strict=True):
         if mask is None:
             continue
-        pixels, _ = camera.project(capture.points[photo.seen])
-        shown = ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(axis=1)
-        x, y = pixels[shown].astype(np.int64).T
+        shown, x, y = camera.visible_pixels(capture.points[photo.seen])
         own = photo.seen[shown]
         seen[own] += 1
         inside[own] += mask[y, x] >= 0.5
@@ -108,9 +107,7 @@ def views_from(cameras: Sequence[Camera]) -> Float64Array:
     """Return camera centres (N, 3) relative to the point nearest to all optical axes."""
     centres = np.array([camera.centre for camera in cameras])
     axes = np.array([camera.world_from_camera[:3, 2] for camera in cameras])
-    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
-    middle = np.linalg.lstsq(across.sum(axis=0), np.einsum("nij,nj->i", across, centres), rcond=None)[0]
-    return np.asarray(centres - middle)
+    return np.asarray(centres - nearest_point_to_lines(centres, axes))
 
 
 def missing_views(offsets: Float64Array) -> list[str]:

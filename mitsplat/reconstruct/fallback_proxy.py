@@ -19,7 +19,7 @@ from mitsplat.asset import opaque_core
 from mitsplat.errors import InputError
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.progress import Progress
-from mitsplat.reconstruct.asset_evaluation import iou, is_closed, show_asset
+from mitsplat.reconstruct.asset_evaluation import iou, is_closed, show_asset, take_evenly
 from mitsplat.reconstruct.registration import measure_offset, surface_points
 from mitsplat.reconstruct.segment_splats import MaskedView
 from mitsplat.reconstruct.surface import SurfaceSettings, reconstruct_surface
@@ -83,7 +83,7 @@ def find_proxy_surface(
         HULL: lambda: fused(depth=False),
         CONVEX: lambda: _convex_hull(splats, floor),
     }
-    seen = [views[number] for number in np.unique(np.linspace(0, len(views) - 1, _VIEWS).round().astype(int))]
+    seen = take_evenly(views, _VIEWS)
     faults: list[str] = []
     found: list[tuple[float, str, trimesh.Trimesh]] = []
     for source, make in makers.items():

@@ -17,7 +17,7 @@ from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.camera import Camera
 from mitsplat.geometry.decomposition import convex_pieces
 from mitsplat.progress import Progress
-from mitsplat.reconstruct.asset_evaluation import HeldOutView, Verdict, compute_verdict, show_held_out, sized_photo
+from mitsplat.reconstruct.asset_evaluation import HeldOutView, Verdict, compute_verdict, show_held_out
 from mitsplat.reconstruct.causes import find_causes
 from mitsplat.reconstruct.fallback_proxy import find_proxy_surface
 from mitsplat.reconstruct.registration import Alignment, register_mesh, surface_points
@@ -155,7 +155,7 @@ def reconstruct_asset(
     isolation = causes = None
     views: list[MaskedView] = []
     if job.kind == "object":
-        pictures = {photo.name: sized_photo(photo, settings.view_size) for photo in capture.photos}
+        pictures = {photo.name: photo.fitted(settings.view_size) for photo in capture.photos}
         views = [
             MaskedView(picture.camera, picture.mask, picture.hidden)
             for picture in (pictures[photo.name] for photo in capture.training)

@@ -10,13 +10,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import cv2
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-import numpy.typing as npt
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
@@ -201,7 +199,7 @@ def _needles(splats: Splats, views: Sequence[MaskedView]) -> BoolArray:
     outside: Int64Array = np.zeros(len(tips), dtype=np.int64)
     for view in views:
         away = cv2.distanceTransform((view.possible < 0.5).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-        outside += sample_nearest(away, view.camera, tips, missing=0.0) > TIP_MARGIN
+        outside += view.camera.sample(away, tips, missing=0.0) > TIP_MARGIN
     result[needle] = (outside.reshape(2, -1) > 1).any(axis=0)
     return result
 
@@ -216,22 +214,6 @@ def visible_area(splats: Splats) -> Float64Array:
     """Return the largest projected area of each Gaussian times its opacity, up to a constant factor, shape (N,)."""
     ordered = np.sort(splats.scales, axis=1).astype(np.float64)
     return np.asarray(splats.opacities * ordered[:, 1] * ordered[:, 2])
-
-
-def sample_nearest(
-    image: npt.NDArray[Any], camera: Camera, points: npt.NDArray[np.floating], missing: float
-) -> npt.NDArray[Any]:
-    """Return the pixel values at world points (N, 3).
-
-    Points outside the picture or behind the camera get the value ``missing``.
-    """
-    pixels, _ = camera.project(points)
-    known = np.isfinite(pixels[:, 0])
-    x, y = np.floor(np.where(known[:, None], pixels, -1)).clip(-1, 1 << 30).astype(np.int64).T
-    known &= (x >= 0) & (y >= 0) & (x < camera.width) & (y < camera.height)
-    values = np.full(len(pixels), missing, dtype=np.float64)
-    values[known] = image[y[known], x[known]]
-    return values
 
 
 def find_floaters(splats: Splats, weight: Float64Array) -> Int64Array:

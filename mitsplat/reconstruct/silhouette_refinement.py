@@ -19,7 +19,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import cv2
 import drjit as dr
@@ -92,18 +91,18 @@ class RefinedMesh:
         before: Mean of 1 - IoU between the silhouettes of the given mesh and the masks of the validation views.
         after: The same of the best refined mesh; infinite if none was valid. The best mesh is selected by these views,
             so other views may differ by slightly more. A verdict uses photos that affected nothing.
-        judges: Number of validation views; 0 if there were too few views.
+        validation_views: Number of validation views; 0 if there were too few views.
     """
 
     mesh: trimesh.Trimesh
     kept: bool
     before: float
     after: float
-    judges: int
+    validation_views: int
 
     def __str__(self) -> str:
         """Return the result as one clause."""
-        if not self.judges:
+        if not self.validation_views:
             return f"rejected: refinement needs masks from {_MIN_VIEWS} positions outside the mesh"
         if not np.isfinite(self.after):
             return "rejected: the refined mesh is invalid"
@@ -111,7 +110,7 @@ class RefinedMesh:
             "accepted" if self.kept else "rejected" if self.after >= self.before else "rejected, as not significant"
         )
         return (
-            f"{outcome}: silhouettes and masks of the {self.judges} validation photos differ by "
+            f"{outcome}: silhouettes and masks of the {self.validation_views} validation photos differ by "
             f"{self.before:.2%} of the object before and by {self.after:.2%} after"
         )
 
@@ -147,9 +146,8 @@ def refine_mesh(
         return RefinedMesh(mesh, False, np.inf, np.inf, 0)
     outlines = [Outline(view, middle, radius, settings.size) for view in outside]
     every = min(_VALIDATION_EVERY, max(2, len(outlines) // 3))
-    judges = range(every // 2, len(outlines), every)
-    held = [outlines[index] for index in judges]
-    shown = [outline for index, outline in enumerate(outlines) if index not in judges]
+    validation = outlines[every // 2 :: every]
+    training = [outline for outline in outlines if outline not in validation]
     start = trimesh.Trimesh((mesh.vertices - middle) / radius, mesh.faces, process=False)
     lowest = -np.inf if floor is None else (floor - middle[2]) / radius
     on_table = np.abs(start.vertices[:, 2] - lowest) < _BASE_HEIGHT
@@ -160,31 +158,31 @@ def refine_mesh(
     descent = mi.ad.Adam(lr=settings.rate, uniform=True, params={"latent": smoothing.to_differential(positions)})
     height, fixed = (wrapped(mi.Float, v.astype(np.float32)) for v in (start.vertices[:, 2], on_table))
 
-    def moved() -> Any:
+    def moved() -> mi.Float:
         vertices = dr.unravel(mi.Point3f, smoothing.from_differential(descent["latent"]))
         above = dr.maximum(vertices.z, dr.minimum(height, float(lowest)))
         vertices.z = dr.select(fixed > 0, height, above)
         return dr.ravel(vertices)
 
     rng = np.random.default_rng(settings.seed)
-    before = scene.errors(start.vertices, held)
-    refined, after = start.vertices, np.full(len(held), np.inf)
+    before = scene.errors(start.vertices, validation)
+    refined, after = start.vertices, np.full(len(validation), np.inf)
     for step in range(settings.steps):
         descent.set_learning_rate(settings.rate * (1 - step / settings.steps))
-        chosen = rng.choice(len(shown), min(_BATCH, len(shown)), replace=False)
-        dr.backward(scene.loss(moved(), [shown[index] for index in chosen], rng))
+        chosen = rng.choice(len(training), min(_BATCH, len(training)), replace=False)
+        dr.backward(scene.loss(moved(), [training[index] for index in chosen], rng))
         descent.step()
         if (step + 1) % max(1, settings.steps // _VALIDATIONS) == 0 or step + 1 == settings.steps:
             found = limit_motion(start, np.array(dr.detach(moved()), dtype=np.float64).reshape(-1, 3))
-            if found is not None and (errors := scene.errors(found, held)).mean() < after.mean():
+            if found is not None and (errors := scene.errors(found, validation)).mean() < after.mean():
                 refined, after = found, errors
         if progress is not None:
             progress(step + 1, settings.steps, "refining the mesh")
     gain = before - after
-    kept = bool(np.isfinite(gain).all() and gain.mean() > gain.std() / np.sqrt(max(len(held) - 1, 1)))
+    kept = bool(np.isfinite(gain).all() and gain.mean() > gain.std() / np.sqrt(max(len(validation) - 1, 1)))
     if kept:
         mesh = trimesh.Trimesh(refined * radius + middle, mesh.faces, process=False)
-    return RefinedMesh(mesh, kept, float(before.mean()), float(after.mean()), len(held))
+    return RefinedMesh(mesh, kept, float(before.mean()), float(after.mean()), len(validation))
 
 
 class Outline:
@@ -238,31 +236,31 @@ class Silhouettes:
         self.integrator.sample_border_warning = False
         self.params = mi.traverse(self.scene)
 
-    def loss(self, vertices: Any, views: Sequence[Outline], rng: np.random.Generator) -> Any:
+    def loss(self, vertices: mi.Float, views: Sequence[Outline], rng: np.random.Generator) -> mi.Float:
         """Return the mean squared difference between silhouettes and masks, with gradients."""
-        self.move(vertices)
+        self.set_vertices(vertices)
         total = mi.Float(0)
         for view in views:
-            shown = self.shown(view, _SAMPLES, int(rng.integers(2**31)), self.params)
+            shown = self.render(view, _SAMPLES, int(rng.integers(2**31)), self.params)
             total += dr.mean(dr.square(shown - view.mask) * view.known)
         return total
 
     def errors(self, vertices: Float64Array, views: Sequence[Outline]) -> Float64Array:
         """Return 1 - IoU of silhouette and mask per view, computed with fractional pixel coverage."""
-        self.move(wrapped(mi.Float, vertices.ravel().astype(np.float32)))
+        self.set_vertices(wrapped(mi.Float, vertices.ravel().astype(np.float32)))
         errors = []
         for view in views:
-            shown = self.shown(view, 4 * _SAMPLES, 0)
+            shown = self.render(view, 4 * _SAMPLES, 0)
             both, either = (dr.sum(pick(shown, view.mask) * view.known)[0] for pick in (dr.minimum, dr.maximum))
             errors.append(1 - both / max(either, 1e-9))
         return np.array(errors, dtype=np.float64)
 
-    def move(self, vertices: Any) -> None:
+    def set_vertices(self, vertices: mi.Float) -> None:
         """Set the vertex positions."""
         self.params["mesh.vertex_positions"] = vertices
         self.params.update()
 
-    def shown(self, view: Outline, samples: int, seed: int, params: Any = None) -> Any:
+    def render(self, view: Outline, samples: int, seed: int, params: mi.SceneParameters | None = None) -> mi.Float:
         """Render the share of each pixel that the mesh covers, (size * size,), with gradients to ``params``."""
         picture = mi.render(self.scene, params, view.sensor, self.integrator, seed=seed, spp=samples, spp_grad=1)
         return picture.array

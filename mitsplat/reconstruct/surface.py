@@ -229,11 +229,11 @@ class _State:
         towards: Number of views that see a surface in the direction of the cell.
     """
 
-    hull: list[Any]
-    total: Any
-    squares: Any
-    count: Any
-    towards: Any
+    hull: list[mi.Float]
+    total: mi.Float
+    squares: mi.Float
+    count: mi.Float
+    towards: mi.Float
 
 
 @dataclass(frozen=True, eq=False)
@@ -300,7 +300,7 @@ class _Grid:
         state.towards = state.towards + dr.select(ahead & (low > 0), 1, 0)
         dr.eval(state.total, state.squares, state.count, state.towards)
 
-    def _seen_from(self, camera: Camera) -> tuple[Any, Any, Any]:
+    def _seen_from(self, camera: Camera) -> tuple[mi.Point2f, mi.Float, mi.Bool]:
         """Return image positions of all cell centres [px], their depths [m], and True for those inside the picture."""
         view = view_of(make_sensor(camera))
         x, y, z = self._in_camera(camera)
@@ -359,7 +359,7 @@ class _Grid:
             thin_cells &= np.array(state.hull[-1]).reshape(self.shape) > -self.cell
         return np.asarray(binary_dilation(thin_cells))
 
-    def _in_camera(self, camera: Camera) -> tuple[Any, Any, Any]:
+    def _in_camera(self, camera: Camera) -> tuple[mi.Float, mi.Float, mi.Float]:
         """Return the camera coordinates of all cell centres [m]."""
         index = dr.arange(mi.UInt32, self.count)
         nz, nyz = self.shape[2], self.shape[1] * self.shape[2]
@@ -411,7 +411,9 @@ def _signed_distance(mask: Float32Array) -> Float32Array:
     return np.where(inside > 0, within - 0.5, 0.5 - without).astype(np.float32)
 
 
-def _bilinear(image: Float32Array, camera: Camera, pixel: Any, active: Any) -> tuple[Any, Any, Any]:
+def _bilinear(
+    image: Float32Array, camera: Camera, pixel: mi.Point2f, active: mi.Bool
+) -> tuple[mi.Float, mi.Float, mi.Float]:
     """Return the interpolated values at pixel positions, and the minimum and maximum of the four source pixels."""
     flat = mi.Float(np.ravel(image))
     width = dr.opaque(mi.UInt32, camera.width)
@@ -421,7 +423,7 @@ def _bilinear(image: Float32Array, camera: Camera, pixel: Any, active: Any) -> t
     x0, y0 = dr.floor(x), dr.floor(y)
     x1, y1 = dr.minimum(x0 + 1, last_x), dr.minimum(y0 + 1, last_y)
 
-    def at(column: Any, row: Any) -> Any:
+    def at(column: mi.Float, row: mi.Float) -> mi.Float:
         return dr.gather(mi.Float, flat, mi.UInt32(row) * width + mi.UInt32(column), active)
 
     a, b, c, d = at(x0, y0), at(x1, y0), at(x0, y1), at(x1, y1)

@@ -36,18 +36,19 @@ class Hole:
     """A part of a support that too few photos show.
 
     Attributes:
-        middle: Centre in the support's frame, x and y.
+        centre: Centre in the support's frame, x and y.
         area: Area of the hole.
-        near: Name of the photo whose camera is nearest to the best viewpoint, or None if no viewpoint sees the hole.
-        height: Elevation of the best viewpoint above the hole [degrees].
-        shown: Share of the hole that is visible from there.
+        nearest_photo: Name of the photo whose camera is nearest to the best viewpoint; None if no viewpoint sees the
+            hole.
+        elevation: Elevation of the best viewpoint above the hole [degrees].
+        visible_share: Share of the hole that is visible from there.
     """
 
-    middle: tuple[float, float]
+    centre: tuple[float, float]
     area: float
-    near: str | None
-    height: float
-    shown: float
+    nearest_photo: str | None
+    elevation: float
+    visible_share: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,13 +76,13 @@ class Coverage:
         good = (self.photos >= MIN_PHOTOS) & ~binary_dilation(self.covered, np.ones((3, 3)))
         return np.asarray(binary_erosion(good))
 
-    def middle(self, cells: npt.ArrayLike) -> Float64Array:
+    def cell_centres(self, cells: npt.ArrayLike) -> Float64Array:
         """Return the centres of cells (N, 2) in the support's frame, (N, 2)."""
         return np.asarray(
             (np.asarray(cells, dtype=np.float64) + 0.5) * self.cell - np.array(self.photos.shape) * self.cell / 2
         )
 
-    def holding(self, flat: Float64Array) -> BoolArray:
+    def cells_with(self, flat: Float64Array) -> BoolArray:
         """Return True for cells that contain points (N, 2) of the support's frame, (X, Y)."""
         shape = self.photos.shape
         index = np.floor(flat / self.cell + np.array(shape) / 2).astype(np.int64)
@@ -104,17 +105,17 @@ def find_coverage(support: Support, views: Sequence[DepthView], points: SurfaceP
     cell = np.array(support.size) / shape
     photos: Int64Array = np.zeros(shape, dtype=np.int64)
     empty = Coverage(cell, photos, np.zeros(shape, dtype=bool))
-    flat = empty.middle(np.argwhere(np.ones(shape)))
+    flat = empty.cell_centres(np.argwhere(np.ones(shape)))
     world = _to_scene(support, flat)
     for view in views:
-        depth, surface = view.look(world)
+        depth, surface = view.depths_at(world)
         height = float((view.camera.centre - support.pose[:3, 3]) @ support.pose[:3, 2])
         # Height above the support of the surface point that the ray to a cell hits.
         above = height * (1 - surface / depth)
         photos += (np.abs(above) < SUPPORT_TOLERANCE * scale).reshape(shape)
     local = support.local(points.places)
     standing = (local[:, 2] > SUPPORT_TOLERANCE * scale) & (local[:, 2] < MAX_THING_HEIGHT * scale)
-    covered = empty.holding(local[standing, :2])
+    covered = empty.cells_with(local[standing, :2])
     return Coverage(
         cell, photos, np.asarray(binary_closing(np.pad(covered, 3), np.ones((3, 3)), iterations=2)[3:-3, 3:-3])
     )
@@ -162,7 +163,7 @@ def find_holes(
     for number in np.argsort(-sizes, kind="stable")[:_MAX_HOLES]:
         if sizes[number] < least:
             break
-        flat = coverage.middle(np.argwhere(parts == number + 1))
+        flat = coverage.cell_centres(np.argwhere(parts == number + 1))
         found.append(_hole(support, flat, float(sizes[number] * coverage.cell.prod()), splats, cameras))
     return found
 
@@ -188,7 +189,7 @@ def _hole(
             tried.append(pose)
             degrees.append(elevation)
     for view, elevation in zip(depth_views(splats, tried, min(_VIEW_SIZE, edge)), degrees, strict=True):
-        depth, surface = view.look(cells)
+        depth, surface = view.depths_at(cells)
         # A hole may have no splats, so the test is that no surface lies in front of it.
         shown = float(np.nanmean(surface > 0.97 * depth)) if np.isfinite(depth).any() else 0.0
         if shown > best + 0.05:

@@ -43,17 +43,15 @@ class DepthView:
         """Return the view after a rigid motion (4, 4) of camera and scene."""
         return DepthView(self.camera.transformed(motion), self.depth)
 
-    def look(self, points: Float64Array) -> tuple[Float64Array, Float64Array]:
+    def depths_at(self, points: Float64Array) -> tuple[Float64Array, Float64Array]:
         """Return the depths of points (N, 3) and of the surface at their pixels, (N,) each.
 
         Points outside the view get NaN.
         """
-        pixels, z = self.camera.project(points)
-        x, y = np.nan_to_num(np.floor(pixels), nan=-1.0).clip(-1, 1e6).astype(np.int64).T
-        inside = (z > self.camera.near) & (x >= 0) & (y >= 0) & (x < self.camera.width) & (y < self.camera.height)
-        shown = np.full(len(points), np.nan)
-        shown[inside] = self.depth[y[inside], x[inside]]
-        return np.where(inside, z, np.nan), shown
+        z = self.camera.project(points)[1]
+        surface = self.camera.sample(self.depth, points, missing=np.nan)
+        ahead = ~np.isnan(surface) & (z > self.camera.near)
+        return np.where(ahead, z, np.nan), np.where(ahead, surface, np.nan)
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,7 +19,7 @@ from mitsplat.fit.image_metrics import psnr
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.camera import Camera
 from mitsplat.geometry.triangulation import nearest_point_to_lines
-from mitsplat.pages.html import rgb_image
+from mitsplat.pages.html import make_section, rgb_image
 from mitsplat.progress import Progress
 from mitsplat.reconstruct.asset_evaluation import HeldOutView, show_asset
 from mitsplat.reconstruct.reconstruct import AssetJob, ImportedMesh, Reconstruction, reconstruct_asset
@@ -93,7 +93,7 @@ def reconstruct_environment(
     if not found and capture.up == "unknown":
         axes = np.concatenate([np.eye(3), -np.eye(3)])
         candidates = (find_supports(points, axis, scale, within=_MAX_AXIS_ANGLE) for axis in axes)
-        found = max(candidates, key=lambda supports: supports[0].looked_at if supports else 0.0)
+        found = max(candidates, key=lambda supports: supports[0].central_share if supports else 0.0)
     motion: Float64Array = np.eye(4)
     if found:
         motion = np.asarray(np.linalg.inv(found[0].pose))
@@ -132,7 +132,7 @@ def reconstruct_environment(
         named = [(photo.name, photo.camera) for photo in capture.training]
         holes = find_holes(found[0], coverage, splats, named)
         supports = [support.transformed(larger) for support in found]
-        filled = coverage.holding(np.concatenate([np.zeros((0, 2)), *(t.filled for t in things if t.support == 0)]))
+        filled = coverage.cells_with(np.concatenate([np.zeros((0, 2)), *(t.filled for t in things if t.support == 0)]))
         region = _region(coverage, found[0], factor)
         unit = "m" if made.asset.units == "metre" else "units"
         rows |= _rows(supports, coverage, holes, region, factor, unit)
@@ -206,8 +206,8 @@ def _region(coverage: Coverage, support: Support, factor: float) -> Region | Non
     cells = free_rectangle(coverage.free)
     if cells is None:
         return None
-    low = coverage.middle(np.array([[cells[0] - 0.5, cells[2] - 0.5]]))[0] * factor
-    high = coverage.middle(np.array([[cells[1] - 0.5, cells[3] - 0.5]]))[0] * factor
+    low = coverage.cell_centres(np.array([[cells[0] - 0.5, cells[2] - 0.5]]))[0] * factor
+    high = coverage.cell_centres(np.array([[cells[1] - 0.5, cells[3] - 0.5]]))[0] * factor
     return float(low[0]), float(high[0]), float(low[1]), float(high[1])
 
 
@@ -222,7 +222,7 @@ def _rows(
     first = supports[0]
     rows = {
         "Support": f"{first.size[0]:.3g} x {first.size[1]:.3g} {unit}, {first.filled:.0%} of it visible as flat, "
-        f"roughness {first.roughness:.2g} {unit}; {first.looked_at:.0%} of the photos' central points lie on it"
+        f"roughness {first.roughness:.2g} {unit}; {first.central_share:.0%} of the photos' central points lie on it"
     }
     if len(supports) > 1:
         rows["Other level surfaces"] = "; ".join(
@@ -241,11 +241,14 @@ def _rows(
 
 def _hole_text(hole: Hole, factor: float, unit: str) -> str:
     """Describe a hole and its best viewpoint as a clause."""
-    x, y = (factor * value for value in hole.middle)
+    x, y = (factor * value for value in hole.centre)
     place = f"{factor**2 * hole.area:.2g} {unit}² around x {x:.2f}, y {y:.2f}"
-    if hole.near is None:
+    if hole.nearest_photo is None:
         return f"{place}, hidden from all directions by things: move them"
-    return f"{place}: photograph it from near {hole.near}, {hole.height:.0f} degrees above it (shows {hole.shown:.0%})"
+    return (
+        f"{place}: photograph it from near {hole.nearest_photo}, {hole.elevation:.0f} degrees above it "
+        f"(shows {hole.visible_share:.0%})"
+    )
 
 
 def _removal_text(thing: RemovedThing, factor: float, unit: str) -> str:
@@ -303,7 +306,5 @@ def _support_map(coverage: Coverage, filled: BoolArray) -> str:
         "The support from above, x to the right and y up: green is free, dark is covered, red is visible "
         f"in fewer than {MIN_PHOTOS} photos{invented}."
     )
-    return (
-        f'<section aria-labelledby="support"><h2 id="support">Support</h2><p>{html.escape(note)}</p><figure>'
-        f'<img alt="support from above" src="{rgb_image(picture, 420)}"></figure></section>'
-    )
+    figure = f'<figure><img alt="support from above" src="{rgb_image(picture, 420)}"></figure>'
+    return make_section("support", "Support", f"<p>{html.escape(note)}</p>{figure}")

@@ -13,10 +13,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from mitsplat.arrays import BoolArray, Int64Array
-from mitsplat.capture.capture import Photo
+from mitsplat.capture.capture import Photo, SizedPhoto
 from mitsplat.fit.image_metrics import psnr
 from mitsplat.gaussians.splat_cloud import Splats
-from mitsplat.reconstruct.asset_evaluation import SizedPhoto, show_asset, sized_photo
+from mitsplat.reconstruct.asset_evaluation import show_asset, take_evenly
 from mitsplat.surroundings.depth_views import DepthView, depth_views
 
 _HAZE_LIMITS = (2.0, 1.0, 0.6, 0.4, 0.3)
@@ -46,8 +46,7 @@ def remove_floaters(splats: Splats, photos: Sequence[Photo], scale: float) -> tu
         photos: Photos of the fit.
         scale: Typical depth of the photos.
     """
-    numbers = np.unique(np.linspace(0, len(photos) - 1, _TEST_PHOTOS).round())
-    test_photos = [sized_photo(photos[int(number)], _SIZE) for number in numbers]
+    test_photos = [photo.fitted(_SIZE) for photo in take_evenly(photos, _TEST_PHOTOS)]
     best, kept = _psnr(splats, test_photos), splats
     for limit in _HAZE_LIMITS:
         tried = splats.select(splats.scales.max(axis=1) <= limit * scale)
@@ -81,7 +80,7 @@ def find_unsupported(splats: Splats, views: Sequence[DepthView], near: float) ->
     confirmed, shown, close = seen_through.copy(), seen_through.copy(), np.zeros(len(splats), dtype=bool)
     means, reach = splats.means.astype(np.float64), _RADIUS_SIGMAS * splats.scales.max(axis=1).astype(np.float64)
     for view in views:
-        depth, surface = view.look(means)
+        depth, surface = view.depths_at(means)
         shown += np.isfinite(depth)
         room = reach + _DEPTH_TOLERANCE * np.where(np.isfinite(surface), surface, depth)
         seen_through += depth < surface - room

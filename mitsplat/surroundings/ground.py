@@ -53,7 +53,9 @@ class Ground:
         inverse, grid = np.linalg.inv(support.pose), Grid.of(support, CELL * scale)
         cameras = [photo.camera.transformed(inverse) for photo in capture.training]
         return cls(
-            support, grid, *grid.look(splats.transformed(inverse), cameras, _BARE_HEIGHT * SUPPORT_TOLERANCE * scale)
+            support,
+            grid,
+            *grid.bare_colours(splats.transformed(inverse), cameras, _BARE_HEIGHT * SUPPORT_TOLERANCE * scale),
         )
 
 
@@ -119,7 +121,7 @@ class Grid:
         """Return the covered cells of one thing, with holes filled."""
         return np.asarray(binary_fill_holes(self.covered(points)))
 
-    def look(self, splats: Splats, cameras: Sequence[Camera], height: float) -> tuple[Float64Array, BoolArray]:
+    def bare_colours(self, splats: Splats, cameras: Sequence[Camera], height: float) -> tuple[Float64Array, BoolArray]:
         """Return display-encoded colours (X, Y, 3) of the bare support, and True for cells with enough bare views.
 
         Cameras with near and steep views have larger weights.
@@ -129,7 +131,7 @@ class Grid:
         colours, weights, count = np.zeros((*shape, 3)), np.full(shape, 1e-12), np.zeros(shape, dtype=np.int64)
         for camera in cameras:
             view, shown = _render_view(splats, camera)
-            depth, surface = view.look(places)
+            depth, surface = view.depths_at(places)
             bare = np.abs(view.camera.centre[2] * (1 - surface / depth)) < height  # False for NaN
             towards = places - view.camera.centre
             weight = np.where(bare, -towards[:, 2] / np.linalg.norm(towards, axis=1) ** 3, 0.0).reshape(shape)

@@ -148,7 +148,7 @@ def _remove_thing(
     inverse = np.asarray(np.linalg.inv(support.pose))
     # Points on walls are excluded, so that a thing that touches a wall ends there.
     loose = ~np.any(
-        [np.zeros(len(places), dtype=bool), *(w.holds(places, SUPPORT_TOLERANCE * scale) for w in walls)], axis=0
+        [np.zeros(len(places), dtype=bool), *(w.contains(places, SUPPORT_TOLERANCE * scale) for w in walls)], axis=0
     )
     thing, others = _separate_thing(support.local(places), loose, spot, support, scale)
     if thing is None:
@@ -242,7 +242,7 @@ def _find_pick(
     ray = np.append(camera.ray_slopes([pixel])[0], 1.0)
     (view,) = depth_views(splats, [camera])
     ray = ray @ camera.world_from_camera[:3, :3].T
-    depth = float(view.look((camera.centre + scale * ray)[None])[1][0])
+    depth = float(view.depths_at((camera.centre + scale * ray)[None])[1][0])
     spot = camera.centre + (depth if np.isfinite(depth) else np.nan) * ray  # NaN stands on no support
     found, lowest = -1, np.inf
     for number, support in enumerate(supports):

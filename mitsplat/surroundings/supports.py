@@ -58,7 +58,7 @@ class Support:
         roughness: Median distance of its points from its plane.
         tilt: Angle of its normal to z [degrees].
         filled: Share of the rectangle that is visible as surface.
-        looked_at: Share of the central points of all photos that lie on it.
+        central_share: Share of the central points of all photos that lie on it.
     """
 
     pose: Float64Array
@@ -66,7 +66,7 @@ class Support:
     roughness: float
     tilt: float
     filled: float
-    looked_at: float
+    central_share: float
 
     @property
     def height(self) -> float:
@@ -82,7 +82,7 @@ class Support:
         """Transform points (N, 3) from the scene to the support's frame."""
         return np.asarray((points - self.pose[:3, 3]) @ self.pose[:3, :3])
 
-    def holds(self, points: Float64Array, margin: float) -> BoolArray:
+    def contains(self, points: Float64Array, margin: float) -> BoolArray:
         """Return True for points (N, 3) of the scene in the rectangle, up to a distance ``margin``."""
         return np.asarray((np.abs(self.local(points)) <= (*(np.array(self.size) / 2 + margin), margin)).all(axis=1))
 
@@ -97,7 +97,7 @@ class Support:
             scale * self.roughness,
             float(np.degrees(np.arccos(np.clip(pose[2, 2], -1, 1)))),
             self.filled,
-            self.looked_at,
+            self.central_share,
         )
 
 
@@ -131,7 +131,7 @@ def find_supports(points: SurfacePoints, up: Float64Array, scale: float, within:
         if inside.any():
             found += _plane_parts(places[inside], weights[inside], normal, height, spread, up, scale)
     found = [support for support in found if support.filled >= _MIN_FILLED]
-    return sorted(found, key=lambda support: -support.looked_at)
+    return sorted(found, key=lambda support: -support.central_share)
 
 
 def find_walls(points: SurfacePoints, scale: float) -> list[Support]:
@@ -168,7 +168,7 @@ def _is_boundary(wall: Support, points: SurfacePoints, scale: float) -> bool:
 
 def _coincide(one: Support, other: Support, scale: float) -> bool:
     """Return True if the centre of one surface lies in another with the same orientation."""
-    inside = other.holds(one.pose[None, :3, 3], _TOLERANCE * scale)[0]
+    inside = other.contains(one.pose[None, :3, 3], _TOLERANCE * scale)[0]
     return bool(inside and one.pose[:3, 2] @ other.pose[:3, 2] > np.cos(np.radians(_NORMAL_ANGLE)))
 
 
@@ -232,7 +232,7 @@ def _plane_parts(
                 roughness=spread,
                 tilt=float(np.degrees(np.arccos(np.clip(normal @ up, -1, 1)))),
                 filled=min(1.0, len(cells) * cell**2 / (size[0] * size[1])),
-                looked_at=float(weights[of_part == number].sum()),
+                central_share=float(weights[of_part == number].sum()),
             )
         )
     return found
@@ -259,7 +259,7 @@ def flatten_mesh(mesh: trimesh.Trimesh, supports: Sequence[Support], margin: flo
     """Move vertices within ``margin`` of supports onto them, because the depth of splats is noisy."""
     vertices = np.array(mesh.vertices, dtype=np.float64)
     for support in supports:
-        local, inside = support.local(vertices), support.holds(vertices, margin)
+        local, inside = support.local(vertices), support.contains(vertices, margin)
         local[inside, 2] = 0
         vertices[inside] = local[inside] @ support.pose[:3, :3].T + support.pose[:3, 3]
     return trimesh.Trimesh(vertices, mesh.faces, process=False)

@@ -263,7 +263,7 @@ def photo_picture(photo: Photo, *, masked: bool) -> ByteImage:
     Raises:
         InputError: If it cannot be read.
     """
-    rgb, alpha = photo.picture(min(1.0, _EDGE / max(photo.camera.width, photo.camera.height)))
+    _, rgb, alpha, _ = photo.fitted(_EDGE)
     if masked and alpha is not None:
         rgb = rgb * (0.25 + 0.75 * alpha[..., None])
     return np.asarray(np.rint(255 * rgb), dtype=np.uint8)

@@ -66,7 +66,7 @@ def test_a_saved_capture_is_loaded_unchanged(capture: Capture, tmp_path: Path) -
         assert a == b
         np.testing.assert_array_equal(one.seen, other.seen)
         assert (one.mask is None) == (other.mask is None)
-        for mine, theirs in zip(one.picture(), other.picture(), strict=True):
+        for mine, theirs in zip(one.read(), other.read(), strict=True):
             np.testing.assert_array_equal(mine, theirs)
 
 
@@ -100,8 +100,8 @@ def test_every_eighth_photo_is_held_out(capture: Capture) -> None:
 
 def test_reduced_pictures_are_averages(capture: Capture) -> None:
     photo = capture.photos[1]
-    whole, mask = photo.picture()
-    half, alpha = photo.picture(0.5)
+    whole, mask, _ = photo.read()
+    half, alpha, _ = photo.read(0.5)
     assert whole.dtype == half.dtype == np.float32
     assert half.shape == (15, 20, 3)
     np.testing.assert_allclose(half, whole.reshape(15, 2, 20, 2, 3).mean(axis=(1, 3)), atol=1e-6)
@@ -109,7 +109,7 @@ def test_reduced_pictures_are_averages(capture: Capture) -> None:
     assert alpha is not None
     np.testing.assert_allclose(alpha, mask.reshape(15, 2, 20, 2).mean(axis=(1, 3)), atol=1e-6)
     with pytest.raises(ValueError, match=r"scale must be in \(0, 1\] \(got 0\)"):
-        photo.picture(0)
+        photo.read(0)
 
 
 def test_a_transformed_capture_keeps_the_pixels_of_its_points(capture: Capture) -> None:
@@ -175,10 +175,10 @@ def test_missing_and_damaged_files_are_named(capture: Capture, tmp_path: Path) -
     loaded = Capture.load(tmp_path / "a")
     Image.new("RGB", (40, 31)).save(loaded.photos[0].file)
     with pytest.raises(InputError, match=r"view 0\.png: must have the size of its camera, 40x30 px \(got 40x31\)"):
-        loaded.photos[0].picture()
+        loaded.photos[0].read()
     loaded.photos[0].file.write_bytes(b"rubbish")
     with pytest.raises(InputError, match="not a readable image"):
-        loaded.photos[0].picture()
+        loaded.photos[0].read()
 
 
 @pytest.mark.parametrize(

@@ -121,7 +121,7 @@ def test_given_masks_replace_computed_masks(
     capture = capture_photos(given, tmp_path / "out", settings).capture
     assert capture.rejected["photo03.png"] == "its mask covers only 0.0% of it"
     assert len(capture.photos) == 15
-    alpha = capture.photos[0].picture()[1]
+    alpha = capture.photos[0].read().mask
     assert alpha is not None
     assert alpha.sum() == alpha[80:250, 100:300].sum() == 170 * 200
     with monkeypatch.context() as elsewhere:

@@ -35,7 +35,7 @@ def test_masks_of_a_rendered_object_agree_with_the_truth(
 ) -> None:
     overlaps = []
     for photo in captured[2].capture.photos:
-        alpha = photo.picture()[1]
+        alpha = photo.read().mask
         assert alpha is not None
         overlaps.append(overlap(alpha > 0.5, photos[1][photo.name]))
     assert np.median(overlaps) > 0.97
@@ -87,8 +87,8 @@ def test_masks_are_transparent_where_the_object_may_be_hidden(
     captured: tuple[Path, Path, CaptureResult], tmp_path: Path
 ) -> None:
     capture = captured[2].capture
-    whole = capture.photos[1].alpha()
-    assert whole is not None and capture.photos[1].hidden() is None
+    whole = capture.photos[1].read_mask()[0]
+    assert whole is not None and capture.photos[1].read_mask()[1] is None
     veil = np.zeros(whole.shape, dtype=bool)
     column = int(np.median(np.nonzero(whole)[1]))
     veil[:, column - 5 : column + 15] = True  # across the middle: both sides stay
@@ -97,14 +97,14 @@ def test_masks_are_transparent_where_the_object_may_be_hidden(
     found = object_masks(capture, points, points[points[:, 2] > 0], tmp_path, hidden={name: veil})
     saved = Capture.load(found.save(tmp_path / "saved") and tmp_path / "saved")
     assert len(saved.photos) == len(capture.photos)
-    assert [photo.name for photo in saved.photos if photo.hidden() is not None] == [name]
+    assert [photo.name for photo in saved.photos if photo.read_mask()[1] is not None] == [name]
     photo = next(photo for photo in saved.photos if photo.name == name)
-    mask, hidden = photo.alpha(), photo.hidden()
+    mask, hidden = photo.read_mask()[0], photo.read_mask()[1]
     assert mask is not None and hidden is not None
     np.testing.assert_array_equal(hidden, veil)
     assert not mask[veil].any()
     assert iou((mask >= 0.5) & ~veil, (whole >= 0.5) & ~veil) > 0.95
-    half = photo.hidden(0.5, (column - 40, 0, 80, 80))
+    half = photo.read_mask(0.5, (column - 40, 0, 80, 80))[1]
     assert half is not None and half.shape == (40, 40) and half[:, 20:25].all() and not half[:, :16].any()
 
 

@@ -127,7 +127,7 @@ def test_undistorted_photos_show_the_same_directions(tmp_path: Path) -> None:
     Image.fromarray(np.rint(code).clip(0, 255).astype(np.uint8)).save(tmp_path / "a.png")
     photo = undistort(Photo("a.png", tmp_path / "a.png", camera))
     assert photo.camera.distortion == ()
-    shown = 255 * photo.picture()[0]
+    shown = 255 * photo.read().rgb
     slopes = photo.camera.ray_slopes(np.column_stack([x.ravel(), y.ravel()])).reshape(120, 160, 2)
     assert np.abs(shown[..., :2] - (128 + 150 * slopes))[2:-2, 2:-2].max() < 1.2  # a pixel is 1.15 of code
     assert np.abs((shown[..., :2] - (128 + 150 * slopes))[2:-2, 2:-2].mean()) < 0.05

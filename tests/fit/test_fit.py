@@ -418,7 +418,7 @@ def test_settings_out_of_range_are_refused(change: dict[str, float], text: str) 
 
 def seeds(capture: Capture, points: np.ndarray, *, masked: bool = True) -> np.ndarray:
     cameras = [photo.camera for photo in capture.training]
-    masks = [photo.picture()[1] for photo in capture.training] if masked else None
+    masks = [photo.read().mask for photo in capture.training] if masked else None
     colours = np.zeros(points.shape, np.uint8)
     nothing = [np.zeros(0, np.int32)] * len(cameras)
     return seed_points(points, colours, cameras, nothing, masks, np.random.default_rng(0), 10_000)[0]

@@ -153,7 +153,7 @@ def test_gradients_are_averaged_over_the_photos_that_show_a_gaussian() -> None:
     away = replace(CAMERA, world_from_camera=CAMERA.world_from_camera @ np.diag([-1.0, 1, -1, 1]))
     classic = Classic(100, 10)
     for camera in (CAMERA, away, CAMERA):
-        classic.look(own, camera)
+        classic.accumulate(own, camera)
     again = Classic(100, 10)
     again.restore(classic.state())
     np.testing.assert_allclose(again.state()["pull"] / again.state()["photos"], once, rtol=1e-6)
@@ -162,6 +162,6 @@ def test_gradients_are_averaged_over_the_photos_that_show_a_gaussian() -> None:
     changed = tracked(own.splats())
     expected = np.array(image_gradient(changed, CAMERA)[0])
     for _ in range(3):
-        classic.look(changed, CAMERA)
+        classic.accumulate(changed, CAMERA)
     assert (classic.state()["photos"] == 3).all()
     np.testing.assert_allclose(classic.state()["pull"] / 3, expected, rtol=1e-6)

@@ -48,12 +48,12 @@ def test_windows_contain_the_object_and_have_the_same_size(photos: list[Photo]) 
 
 def test_a_window_has_the_pixels_of_the_photo(photos: list[Photo]) -> None:
     photo, window = photos[1], (50, 20, 100, 60)
-    whole, mask = photo.picture()
-    part, cut = photo.picture(window=window)
+    whole, mask, _ = photo.read()
+    part, cut, _ = photo.read(window=window)
     np.testing.assert_array_equal(part, whole[20:80, 50:150])
     assert mask is not None and cut is not None
     np.testing.assert_array_equal(cut, mask[20:80, 50:150])
-    half, _ = photo.picture(0.5, window)
+    half, *_ = photo.read(0.5, window)
     np.testing.assert_allclose(half, part.reshape(30, 2, 50, 2, 3).mean(axis=(1, 3)), atol=1e-6)
     points = np.random.default_rng(3).uniform(-0.3, 0.3, (20, 3))
     pixels = photo.camera.project(points)[0]

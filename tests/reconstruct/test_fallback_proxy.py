@@ -10,7 +10,6 @@ import pytest
 from benchmarks.assets.known import chamfer
 from mitsplat.errors import InputError
 from mitsplat.gaussians.splat_cloud import Splats
-from mitsplat.reconstruct.asset_evaluation import sized_photo
 from mitsplat.reconstruct.fallback_proxy import CONVEX, FINEST, HULL, find_proxy_surface
 from mitsplat.reconstruct.segment_splats import MaskedView, isolate_object
 from mitsplat.reconstruct.surface import SurfaceSettings
@@ -21,7 +20,7 @@ SETTINGS = SurfaceSettings(voxels=64, faces=4000)
 
 
 def views_of(known: KnownObject) -> list[MaskedView]:
-    sized = [sized_photo(photo, 160) for photo in known.capture.training]
+    sized = [photo.fitted(160) for photo in known.capture.training]
     return [MaskedView(camera, mask) for camera, _, mask, _ in sized if mask is not None]
 
 

@@ -7,7 +7,6 @@ import pytest
 
 from mitsplat.errors import InputError
 from mitsplat.gaussians.splat_cloud import Splats
-from mitsplat.reconstruct.asset_evaluation import sized_photo
 from mitsplat.reconstruct.segment_splats import MaskedView, VisibleWeights, find_floaters, isolate_object
 from tests.conftest import KnownObject
 from tests.reference import responses
@@ -57,7 +56,7 @@ def test_surroundings_floaters_and_needles_are_removed(known_object: KnownObject
     parts = [known_object.splats, table, speck, needle, buried]
     views = [
         MaskedView(camera, mask)
-        for camera, _, mask, _ in (sized_photo(photo, 160) for photo in known_object.capture.photos)
+        for camera, _, mask, _ in (photo.fitted(160) for photo in known_object.capture.photos)
         if mask is not None and camera.centre[2] > 0  # nobody looks through the table
     ]
     found = isolate_object(Splats.concatenate(parts), views)
@@ -80,7 +79,7 @@ def test_lost_alpha_is_the_share_that_masks_omit(known_object: KnownObject) -> N
     """Where splats are missing in the middle of the masks, as much alpha is lost as pixels are bare."""
     views = [
         MaskedView(camera, mask if number % 2 else np.zeros_like(mask))
-        for number, (camera, _, mask, _) in enumerate(sized_photo(photo, 160) for photo in known_object.capture.photos)
+        for number, (camera, _, mask, _) in enumerate(photo.fitted(160) for photo in known_object.capture.photos)
         if mask is not None
     ]
     assert isolate_object(known_object.splats, views).lost > 0.05

@@ -69,7 +69,7 @@ def test_a_disturbed_mesh_is_refined_to_the_solid(
     told: list[tuple[int, int, str]] = []
     found = refine_mesh(start, views, settings, progress=lambda *step: told.append(step))
     assert found.kept and found.after < found.before
-    assert (found.judges, told[-1]) == (4, (40, 40, "refining the mesh"))
+    assert (found.validation_views, told[-1]) == (4, (40, 40, "refining the mesh"))
     assert chamfer(start, truth) > factor * chamfer(found.mesh, truth)
     assert overlap(found.mesh, truth) > overlap(start, truth)
     assert found.mesh.is_volume
@@ -142,8 +142,8 @@ def test_the_gradient_of_a_silhouette_area_equals_its_closed_form() -> None:
     scene = Silhouettes(ball)
     radius = mi.Float(1)
     dr.enable_grad(radius)
-    scene.move(mi.Float(scene.params["mesh.vertex_positions"]) * radius)
-    area = dr.sum(scene.shown(outline, 4, 0, scene.params))
+    scene.set_vertices(mi.Float(scene.params["mesh.vertex_positions"]) * radius)
+    area = dr.sum(scene.render(outline, 4, 0, scene.params))
     dr.backward(area)
     focal, distance = outline.focal, 4.0
     assert area[0] == pytest.approx(np.pi * focal**2 / (distance**2 - 1), rel=5e-3)
@@ -180,7 +180,7 @@ def test_at_least_two_views_judge_and_fewer_than_four_are_refused(
     found = refine_mesh(truth, views[:3], QUICK)
     assert found.mesh is truth and str(found) == "rejected: refinement needs masks from 4 positions outside the mesh"
     for count, judges in ((4, 2), (9, 3)):
-        assert refine_mesh(truth, views[:count], replace(QUICK, steps=1)).judges == judges
+        assert refine_mesh(truth, views[:count], replace(QUICK, steps=1)).validation_views == judges
 
 
 def test_assets_record_the_result_of_the_refinement(

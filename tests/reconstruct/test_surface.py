@@ -17,14 +17,13 @@ from mitsplat.errors import InputError
 from mitsplat.geometry.camera import Camera
 from mitsplat.geometry.mesh import prepare_mesh
 from mitsplat.geometry.mesh_distance import DistanceSurface
-from mitsplat.reconstruct.asset_evaluation import sized_photo
 from mitsplat.reconstruct.registration import invert_transform, measure_offset, register_mesh, surface_points
 from mitsplat.reconstruct.surface import SurfaceSettings, _close_voids, reconstruct_surface, simplify_surface
 from tests.conftest import KnownObject
 
 
 def views_of(known: KnownObject) -> tuple[list[Camera], list[np.ndarray]]:
-    sized = [sized_photo(photo, 160) for photo in known.capture.training]
+    sized = [photo.fitted(160) for photo in known.capture.training]
     return [camera for camera, *_ in sized], [mask for _, _, mask, _ in sized if mask is not None]
 
 

@@ -66,7 +66,7 @@ def test_recorded_gradients_equal_traced_ones(distortion: tuple[float, ...], mon
         pairs.append(seen._lists.pairs)
         weight = mi.Float(np.random.default_rng(1).normal(size=dr.width(seen.alpha)).astype(np.float32))
         found = [seen.gradient([weight, weight, weight], weight), seen.gradient_of_moment(weight)]
-        model.learn(eye, QUALITY, found, opacity_weight=0.1, scale_weight=0.2)
+        model.set_gradients(eye, QUALITY, found, opacity_weight=0.1, scale_weight=0.2)
         return [np.array(dr.grad(value)) for value in model.values.values()] + [np.array(seen.moment)]
 
     shifts = [0.0, 0.3, 100.0, 0.7, 1.5, 0.1]

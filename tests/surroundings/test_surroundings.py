@@ -105,7 +105,7 @@ def test_the_table_is_found_with_its_edges(splats: Splats) -> None:
     assert abs(table.height - HEIGHT) < 1e-3 and table.tilt < 0.2
     assert np.allclose(table.size, TABLE, atol=0.05)
     assert np.allclose(table.pose[:2, 3], 0, atol=0.03)
-    assert table.looked_at > 0.5
+    assert table.central_share > 0.5
 
 
 def test_an_inclined_table_is_found_with_its_inclination(splats: Splats) -> None:
@@ -114,7 +114,7 @@ def test_an_inclined_table_is_found_with_its_inclination(splats: Splats) -> None
     turned = [replace(camera, world_from_camera=lean @ camera.world_from_camera) for camera in cameras()]
     points = surface_points(depth_views(splats.transformed(lean), turned))
     assert find_supports(points, UP, 0.9, within=30)[0].pose[:3, 2] == pytest.approx(lean[:3, 2], abs=0.003)
-    assert not [one for one in find_supports(points, UP, 0.9, within=5) if one.looked_at > 0.1]
+    assert not [one for one in find_supports(points, UP, 0.9, within=5) if one.central_share > 0.1]
 
 
 def test_a_plane_is_fitted_despite_clutter_on_it() -> None:
@@ -132,7 +132,7 @@ def test_coverage_marks_occupied_and_unseen_parts_of_the_table(splats: Splats) -
     points = surface_points(depth_views(splats, cameras()))
     table = find_supports(points, UP, 0.9, within=5)[0]
     coverage = find_coverage(table, views, points, 0.9)
-    middles = coverage.middle(np.argwhere(np.ones(coverage.photos.shape))).reshape(*coverage.photos.shape, 2)
+    middles = coverage.cell_centres(np.argwhere(np.ones(coverage.photos.shape))).reshape(*coverage.photos.shape, 2)
     x, y = middles[..., 0], middles[..., 1]
     inside = (x > TABLE[0] / 2 - BOX[0] + 0.03) & (y > TABLE[1] / 2 - BOX[1] + 0.03)
     assert coverage.covered[inside & (x < 0.54) & (y < 0.29)].mean() > 0.95
@@ -141,14 +141,14 @@ def test_coverage_marks_occupied_and_unseen_parts_of_the_table(splats: Splats) -
     named = [(str(number), camera) for number, camera in enumerate(cameras())]
     holes = find_holes(table, coverage, splats, named)
     if coverage.hidden.any():
-        assert all(hole.near is not None and hole.shown > 0.5 for hole in holes)
+        assert all(hole.nearest_photo is not None and hole.visible_share > 0.5 for hole in holes)
     behind = np.zeros_like(coverage.covered)
     behind[60:70, 5:20] = True
     gap = replace(
         coverage, photos=np.where(behind, 0, coverage.photos + MIN_PHOTOS), covered=coverage.covered & ~behind
     )
     (hole,) = find_holes(table, gap, splats, named)
-    assert hole.area == pytest.approx(behind.sum() * coverage.cell.prod()) and hole.shown > 0.9
+    assert hole.area == pytest.approx(behind.sum() * coverage.cell.prod()) and hole.visible_share > 0.9
 
 
 def test_the_largest_free_rectangle_agrees_with_a_full_search() -> None:

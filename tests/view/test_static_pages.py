@@ -131,7 +131,7 @@ def test_the_page_of_a_capture_shows_photos_with_their_masks(page, known_object:
     shown._clicked(3)
     assert page._caption.content.startswith("03\\.png")
     darkened, whole = (photo_picture(capture.photos[3], masked=masked).astype(int) for masked in (True, False))
-    outside = capture.photos[3].picture()[1] == 0
+    outside = capture.photos[3].read().mask == 0
     assert np.array_equal(darkened[~outside], whole[~outside])
     assert darkened[outside] == pytest.approx(0.25 * whole[outside], abs=1)
 

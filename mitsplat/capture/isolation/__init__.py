@@ -8,6 +8,6 @@ and captures.
 from __future__ import annotations
 
 from mitsplat.capture.isolation.object_choice import ChosenObject, PhotoView, Pick, choose_object
-from mitsplat.capture.isolation.occluding_points import hidden_part
+from mitsplat.capture.isolation.occluding_points import occluded_part
 
-__all__ = ["ChosenObject", "PhotoView", "Pick", "choose_object", "hidden_part"]
+__all__ = ["ChosenObject", "PhotoView", "Pick", "choose_object", "occluded_part"]

@@ -21,7 +21,7 @@ The gap is twice the median distance to the third nearest point.
 """
 
 
-def hidden_part(camera: Camera, own: Float64Array, others: Sequence[Float64Array]) -> tuple[float, float, BoolArray]:
+def occluded_part(camera: Camera, own: Float64Array, others: Sequence[Float64Array]) -> tuple[float, float, BoolArray]:
     """Estimate the part of an object that other things occlude from a camera.
 
     The outline of the object is the convex hull of its points in the image, even for an object that is not convex. The
@@ -73,8 +73,8 @@ def hidden_part(camera: Camera, own: Float64Array, others: Sequence[Float64Array
     x, y = step * (0.5 - low) + _EDGE / 2 - 0.5
     back = np.array([[step, 0, x], [0, step, y]])
     seen = cv2.warpAffine(possible, back, (camera.width, camera.height), flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP)
-    hides, may_hide = (float(part[outline > 0].mean()) for part in (hidden, possible))
-    return hides, may_hide, np.asarray(seen > 0)
+    occluded, possibly_occluded = (float(part[outline > 0].mean()) for part in (hidden, possible))
+    return occluded, possibly_occluded, np.asarray(seen > 0)
 
 
 def _fill_hull(picture: npt.NDArray[np.uint8], pixels: Float64Array) -> None:

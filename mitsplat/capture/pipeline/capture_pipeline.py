@@ -17,7 +17,7 @@ from mitsplat.capture.boards.board_mask import bare_squares
 from mitsplat.capture.boards.targets import Board
 from mitsplat.capture.capture import CAPTURE_FILE, Capture, Photo
 from mitsplat.capture.exposure import even_exposure
-from mitsplat.capture.isolation import ChosenObject, hidden_part
+from mitsplat.capture.isolation import ChosenObject, occluded_part
 from mitsplat.capture.known_poses import read_poses
 from mitsplat.capture.metric_frame import DEFAULT_BOARD, MetricFrame, find_metric_frame
 from mitsplat.capture.photo_masks import add_masks, given_masks, model_masks, object_masks, object_points
@@ -88,7 +88,7 @@ class CaptureSettings:
     box: tuple[float, float, float, float, float, float] | None = None
 
     @property
-    def hinted(self) -> bool:
+    def has_hints(self) -> bool:
         """True if picks or a box indicate the object."""
         return bool(self.picks or self.picks_not or self.box)
 
@@ -102,7 +102,7 @@ class CaptureSettings:
                 "--masks and --mask-model both define the masks: give only one",
             ),
             (
-                self.hinted and not (self.kind == "object" and self.masks is None and self.mask_model is None),
+                self.has_hints and not (self.kind == "object" and self.masks is None and self.mask_model is None),
                 "--pick, --pick-not and --box select an object to segment: remove them with --masks, --mask-model or "
                 "an environment",
             ),
@@ -434,14 +434,14 @@ def _with_masks(
         return add_masks(capture, given_masks(settings.masks, made), mask_folder, progress=progress)
     if settings.mask_model is not None:
         return add_masks(capture, model_masks(settings.mask_model), mask_folder, progress=progress)
-    if not frame.table and not settings.hinted:
+    if not frame.table and not settings.has_hints:
         raise InputError(
             "no table was found below the object to segment it: pick it (--pick), give masks (--masks or "
             "--mask-model), place it on a textured surface, or capture it as an environment (--kind environment)"
         )
     hidden: dict[str, BoolArray] = {}
     bare = None if frame.board is None else partial(bare_squares, settings.board, frame.board)
-    if frame.board is not None and not settings.hinted:
+    if frame.board is not None and not settings.has_hints:
         points = object_points(capture)
         above = points[points[:, 2] > 0]  # below them, the board may be visible under the object
     else:
@@ -459,11 +459,11 @@ def _reject_occluded(capture: Capture, chosen: ChosenObject) -> tuple[Capture, d
     """
     photos, rejected, hidden = [], dict(capture.rejected), dict[str, BoolArray]()
     for photo in capture.photos:
-        hides, may_hide, pixels = hidden_part(photo.camera, chosen.above, chosen.others)
-        if hides > _HIDDEN and may_hide > _MAX_HIDDEN:
-            rejected[photo.name] = f"another thing is in front of the object and may occlude {may_hide:.0%} of it"
+        occluded, possible, pixels = occluded_part(photo.camera, chosen.above, chosen.others)
+        if occluded > _HIDDEN and possible > _MAX_HIDDEN:
+            rejected[photo.name] = f"another thing is in front of the object and may occlude {possible:.0%} of it"
             continue
         photos.append(photo)
-        if hides > _HIDDEN:
+        if occluded > _HIDDEN:
             hidden[photo.name] = pixels
     return replace(capture, photos=tuple(photos), rejected=rejected), hidden

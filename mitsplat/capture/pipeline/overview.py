@@ -57,10 +57,9 @@ def _panel(
 
 def _tile(capture: Capture, index: int) -> npt.NDArray[np.uint8]:
     """Return a square thumbnail of a photo, with the background of its mask tinted."""
-    photo = capture.photos[index]
-    rgb, alpha = photo.picture(min(1.0, _TILE / max(photo.camera.width, photo.camera.height)))
-    if alpha is not None:
-        rgb = alpha[..., None] * rgb + (1 - alpha[..., None]) * (0.3 * rgb + _TINT)
+    _, rgb, mask, _ = capture.photos[index].fitted(_TILE)
+    if mask is not None:
+        rgb = mask[..., None] * rgb + (1 - mask[..., None]) * (0.3 * rgb + _TINT)
     tile = np.zeros((_TILE, _TILE, 3), dtype=np.uint8)
     height, width = rgb.shape[:2]
     y, x = (_TILE - height) // 2, (_TILE - width) // 2

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mitsplat.arrays import Float64Array, Int64Array
-from mitsplat.capture.video.motion import Moved
+from mitsplat.capture.video.motion import MotionPosition
 
 STEP = 0.05
 """Image motion between chosen frames, as a fraction of the image width.
@@ -35,7 +35,7 @@ class FrameMeasure:
 
     index: int
     time: float
-    moved: Moved
+    moved: MotionPosition
     sharpness: float
 
 
@@ -62,7 +62,7 @@ def choose(measures: list[FrameMeasure], most: int) -> Choice:
     blur determines the sharpness and not texture. Each segment gives at least one frame. So the result exceeds ``most``
     only for a video with at least as many discontinuities.
     """
-    usable = [measure for measure in measures if measure.moved.followed]
+    usable = [measure for measure in measures if measure.moved.tracked]
     numbers = sorted({measure.moved.segment for measure in usable})
     segments = [[measure for measure in usable if measure.moved.segment == number] for number in numbers]
     paths = [np.maximum.accumulate([measure.moved.path for measure in segment]) for segment in segments]

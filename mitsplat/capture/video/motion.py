@@ -27,18 +27,18 @@ _MAX_LOST_FRAMES = 5
 
 
 @dataclass(frozen=True)
-class Moved:
+class MotionPosition:
     """Position of a frame in the motion of a video.
 
     Attributes:
         segment: Index of the continuous segment.
         path: Accumulated image motion over all segments, as a fraction of the image width.
-        followed: True if motion was measured in this frame; otherwise ``path`` is that of the frame before.
+        tracked: True if motion was measured in this frame; otherwise ``path`` is that of the frame before.
     """
 
     segment: int
     path: float
-    followed: bool
+    tracked: bool
 
 
 class MotionClock:
@@ -53,24 +53,24 @@ class MotionClock:
         self._corners: Float32Array = np.zeros((0, 1, 2), dtype=np.float32)
         self._segment, self._path, self._beyond, self._lost = 0, 0.0, 0.0, 0
 
-    def add(self, grey: ByteImage) -> Moved:
+    def add(self, grey: ByteImage) -> MotionPosition:
         """Add the next image, grey, shape (H, W), and return its position in the motion."""
         grey = shrink(grey, _EDGE)
         if self._anchor is None or len(self._corners) < _MIN_CORNERS:  # use the first image with corners
             self._set_anchor(grey)
-            return Moved(self._segment, self._path, len(self._corners) >= _MIN_CORNERS)
+            return MotionPosition(self._segment, self._path, len(self._corners) >= _MIN_CORNERS)
         moves = _track_corners(self._anchor, grey, self._corners)
         if len(moves) < max(_MIN_CORNERS, _MIN_SURVIVING * len(self._corners)):
             self._lost += 1
             if self._lost <= _MAX_LOST_FRAMES:
-                return Moved(self._segment, self._path + self._beyond, followed=False)
+                return MotionPosition(self._segment, self._path + self._beyond, tracked=False)
             self._path += self._beyond
             self._segment += 1
             self._set_anchor(grey)
-            return Moved(self._segment, self._path, len(self._corners) >= _MIN_CORNERS)
+            return MotionPosition(self._segment, self._path, len(self._corners) >= _MIN_CORNERS)
         self._lost = 0
         self._beyond = float(np.median(np.linalg.norm(moves, axis=1))) / grey.shape[1]
-        moved = Moved(self._segment, self._path + self._beyond, followed=True)
+        moved = MotionPosition(self._segment, self._path + self._beyond, tracked=True)
         if self._beyond >= _ANCHOR_MOTION:
             self._path = moved.path
             self._set_anchor(grey)

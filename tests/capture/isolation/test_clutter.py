@@ -68,5 +68,5 @@ def test_an_object_in_clutter_is_isolated_without_a_hint(kind: str, thing: Any, 
     masked = object_masks(capture, chosen.points, chosen.above, tmp_path / "masks")
     assert len(masked.photos) == VIEWS
     truth = [np.array(Image.open(tmp_path / "truth" / photo.name)) > 0 for photo in masked.photos]
-    shares = [iou(photo.alpha() >= 0.5, shown) for photo, shown in zip(masked.photos, truth, strict=True)]
+    shares = [iou(photo.read_mask()[0] >= 0.5, shown) for photo, shown in zip(masked.photos, truth, strict=True)]
     assert np.mean(shares) > 0.95 and min(shares) > 0.9  # a pixel all around is 0.04

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mitsplat.arrays import Float64Array
-from mitsplat.capture.isolation.occluding_points import hidden_part
+from mitsplat.capture.isolation.occluding_points import occluded_part
 from mitsplat.geometry.camera import Camera
 
 
@@ -17,9 +17,9 @@ def ball(middle: tuple[float, float, float], radius: float = 0.04, count: int = 
 
 
 def hidden_share(camera: Camera, own: Float64Array, others: list[Float64Array]) -> float:
-    hides, may_hide, pixels = hidden_part(camera, own, others)
-    assert hides <= may_hide and pixels.shape == (480, 640) and (pixels.any() or may_hide == 0)
-    return hides
+    occluded, possibly_occluded, pixels = occluded_part(camera, own, others)
+    assert occluded <= possibly_occluded and pixels.shape == (480, 640) and (pixels.any() or possibly_occluded == 0)
+    return occluded
 
 
 CAMERA = Camera.look_at((0, -5, 0), (0, 0, 0), width=640, height=480, fov_x=3)
@@ -56,8 +56,10 @@ def test_thirty_points_are_enough_to_hide_a_share() -> None:
 
 
 def test_hidden_pixels_are_those_of_the_occluder_and_a_rim() -> None:
-    _, may_hide, pixels = hidden_part(CAMERA, ball((0, 0, 0)), [ball((0.05, -0.2, 0)), ball((-0.05, 0.2, 0))])
-    assert 0.3 < may_hide < 0.6
+    _, possibly_occluded, pixels = occluded_part(
+        CAMERA, ball((0, 0, 0)), [ball((0.05, -0.2, 0)), ball((-0.05, 0.2, 0))]
+    )
+    assert 0.3 < possibly_occluded < 0.6
     y, x = np.mgrid[0:480, 0:640] + 0.5
     (middle,), _ = CAMERA.project(np.array([[0.05, -0.2, 0]]))
     away = np.hypot(x - middle[0], y - middle[1]) / (0.04 / 4.8 * CAMERA.fx)
@@ -69,5 +71,5 @@ def test_a_can_with_points_on_its_rims_only_may_hide_the_object() -> None:
     """A can whose points are on its rims alone."""
     turns = np.linspace(0, 2 * np.pi, 60, endpoint=False)
     rims = [np.column_stack([0.04 * np.cos(turns), 0.04 * np.sin(turns) - 0.2, np.full(60, z)]) for z in (-0.04, 0.04)]
-    hides, may_hide, _ = hidden_part(CAMERA, ball((0, 0, 0)), [np.concatenate(rims)])
-    assert hides < 0.7 and may_hide > 0.95
+    occluded, possibly_occluded, _ = occluded_part(CAMERA, ball((0, 0, 0)), [np.concatenate(rims)])
+    assert occluded < 0.7 and possibly_occluded > 0.95

@@ -17,7 +17,7 @@ from PIL import Image
 
 from mitsplat.capture.video import ChosenFrames, choose_frames
 from mitsplat.capture.video.frame_selection import STEP, FrameMeasure, choose
-from mitsplat.capture.video.motion import MotionClock, Moved
+from mitsplat.capture.video.motion import MotionClock, MotionPosition
 from mitsplat.errors import InputError
 
 SIZE = (320, 240)
@@ -159,7 +159,7 @@ def test_noise_and_shake_give_no_displacement() -> None:
         x, y = rng.normal(0, 0.6, 2)
         noisy = seen(texture, 300 + x, 40 + y)[..., 0] + rng.normal(0, 4, SIZE[::-1])
         moved = clock.add(np.clip(noisy, 0, 255).astype(np.uint8))
-    assert moved.followed and moved.segment == 0
+    assert moved.tracked and moved.segment == 0
     assert moved.path < 0.01
 
 
@@ -175,7 +175,7 @@ def test_frames_without_texture_are_neither_a_shot_nor_chosen(tmp_path: Path) ->
 def test_sharpness_does_not_depend_on_texture() -> None:
     """A step of which every other frame is blurred, while texture grows tenfold from its begin to its end."""
     measures = [
-        FrameMeasure(k, k / 30, Moved(0, 0.005 * k, followed=True), (0.2 if k % 2 else 1.0) * 10 ** (k / 100))
+        FrameMeasure(k, k / 30, MotionPosition(0, 0.005 * k, tracked=True), (0.2 if k % 2 else 1.0) * 10 ** (k / 100))
         for k in range(101)
     ]
     frames = choose(measures, 150).frames
@@ -187,7 +187,8 @@ def test_sharpness_does_not_depend_on_texture() -> None:
 
 def test_the_sharp_frame_at_the_border_of_a_step_is_chosen() -> None:
     measures = [
-        FrameMeasure(k, k / 30, Moved(0, 0.005 * k, followed=True), 1.0 if k % 10 == 1 else 0.1) for k in range(31)
+        FrameMeasure(k, k / 30, MotionPosition(0, 0.005 * k, tracked=True), 1.0 if k % 10 == 1 else 0.1)
+        for k in range(31)
     ]
     assert [frame.index for frame in choose(measures, 150).frames][:3] == [1, 11, 21]
 

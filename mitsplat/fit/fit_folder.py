@@ -10,10 +10,10 @@ from __future__ import annotations
 import json
 import shutil
 import zipfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -25,6 +25,7 @@ from mitsplat.storage.files import write_file, write_text
 from mitsplat.storage.format_version import FORMAT_VERSION, FORMAT_VERSIONS, check_format_version
 
 FIT_FILE = "fit.json"
+T = TypeVar("T")
 _RUNNING_MARKER = ".unfinished"
 """Marker file of a running or interrupted fit."""
 
@@ -106,26 +107,35 @@ class FitFolder:
         return self.path / "held_out"
 
     def finished(self, *, overwrite: bool) -> FitResult | None:
-        """Return the finished fit of these inputs, or None.
+        """Return the finished fit of these inputs, or None; arguments and errors are as in :meth:`checkpoint`."""
+        result = self._existing(FIT_FILE, self._read, overwrite)
+        if result is not None:
+            for name in ("checkpoint.npz", _RUNNING_MARKER):  # left by a run that was interrupted after its last step
+                (self.path / name).unlink(missing_ok=True)
+        return result
+
+    def checkpoint(self, *, overwrite: bool) -> dict[str, npt.NDArray[Any]] | None:
+        """Return the checkpoint of an unfinished fit of these inputs, or None.
 
         Args:
-            overwrite: True to treat a fit of other inputs, or a damaged fit, as absent.
+            overwrite: True to treat a file of other inputs, or a damaged file, as absent.
 
         Raises:
-            InputError: If the folder contains such a fit and ``overwrite`` is False.
+            InputError: If the folder contains such a file and ``overwrite`` is False.
         """
-        path = self.path / FIT_FILE
+        return self._existing("checkpoint.npz", self._read_checkpoint, overwrite)
+
+    def _existing(self, name: str, read: Callable[[Path], T], overwrite: bool) -> T | None:
+        """Return the content of a file if it exists and belongs to this fit."""
+        path = self.path / name
         if not path.exists():
             return None
         try:
-            result = self._read(path)
+            return read(path)
         except InputError as error:
             if overwrite:
                 return None
             raise InputError(f"{error}; --overwrite replaces it") from error
-        for name in ("checkpoint.npz", _RUNNING_MARKER):  # left by a run that was interrupted after its last step
-            (self.path / name).unlink(missing_ok=True)
-        return result
 
     def _read(self, path: Path) -> FitResult:
         record = read_record(path)
@@ -139,38 +149,23 @@ class FitFolder:
             raise InputError(f"{path}: not the record of a fit by this version (it lacks {error})") from error
         except (ValueError, TypeError) as error:
             raise InputError(f"{path}: not the record of a fit ({error})") from error
-        if found != self.inputs:
-            raise InputError(f"{path}: belongs to a fit of other photos or settings, or by another version")
+        self._check_inputs(path, found)
         splats = Splats.load(self.path / "splats.ply")
         return FitResult(splats, iterations, seconds, held_out, self.inputs, warnings, validation)
 
-    def checkpoint(self, *, overwrite: bool) -> dict[str, npt.NDArray[Any]] | None:
-        """Return the checkpoint of an unfinished fit of these inputs, or None.
-
-        Args:
-            overwrite: True to treat a checkpoint of other inputs, or a damaged checkpoint, as absent.
-
-        Raises:
-            InputError: If the folder contains such a checkpoint and ``overwrite`` is False.
-        """
-        path = self.path / "checkpoint.npz"
-        if not path.exists():
-            return None
+    def _read_checkpoint(self, path: Path) -> dict[str, npt.NDArray[Any]]:
         try:
             with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
                 state = dict(stored)
             found = str(state.pop("inputs"))
         except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-            if overwrite:
-                return None
-            raise InputError(f"{path}: not a checkpoint of a fit ({error}); --overwrite replaces it") from error
-        if found == self.inputs:
-            return state
-        if overwrite:
-            return None
-        raise InputError(
-            f"{path}: belongs to a fit of other photos or settings, or by another version; --overwrite replaces it"
-        )
+            raise InputError(f"{path}: not a checkpoint of a fit ({error})") from error
+        self._check_inputs(path, found)
+        return state
+
+    def _check_inputs(self, path: Path, found: str) -> None:
+        if found != self.inputs:
+            raise InputError(f"{path}: belongs to a fit of other photos or settings, or by another version")
 
     def refuse_others(self) -> None:
         """Refuse a folder whose files a fit would replace, if they are not from a fit.

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from mitsplat.arrays import ByteImage, Float32Array
-from mitsplat.capture.video.shrink import shrink
+from mitsplat.capture.video.sharpness import shrink
 
 _EDGE = 480
 """Longer edge of the images in which motion is measured [px]."""

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import cv2
+import numpy as np
 
 from mitsplat.arrays import ByteImage
-from mitsplat.capture.video.shrink import shrink
 
 _JUDGED_EDGE = 800
 """Longer edge at which sharpness is measured [px], so that picture size and noise have little effect."""
@@ -14,3 +14,11 @@ _JUDGED_EDGE = 800
 def sharpness(grey: ByteImage) -> float:
     """Return the variance of the Laplacian (Pech-Pacheco et al. 2000) of a reduced grey picture, shape (H, W)."""
     return float(cv2.Laplacian(shrink(grey, _JUDGED_EDGE), cv2.CV_32F).var())
+
+
+def shrink(grey: ByteImage, edge: int) -> ByteImage:
+    """Reduce a grey picture, shape (H, W), so that its longer edge is at most ``edge`` px."""
+    scale = edge / max(grey.shape)
+    if scale >= 1:
+        return grey
+    return np.asarray(cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), dtype=np.uint8)

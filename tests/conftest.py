@@ -21,6 +21,7 @@ from mitsplat.capture.capture import Capture, Photo
 from mitsplat.dataset.write import write_dataset
 from mitsplat.errors import MissingResourceError
 from mitsplat.gaussians.splat_cloud import Splats
+from mitsplat.geometry import untrusted_meshes
 from mitsplat.geometry.camera import Camera
 from mitsplat.physics.settle import warp_settings
 from mitsplat.runtime.device import MissingPrerequisite, use_device, visible_gpus
@@ -107,6 +108,25 @@ def no_fsync() -> Iterator[None]:
     """Files of this process are left to the operating system: no test pulls the plug, and many would wait for disks."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(os, "fsync", lambda file: None)
+        yield
+
+
+_tried_meshes: dict[tuple[str, bytes], str] = {}
+
+
+@pytest.fixture(scope="module")
+def meshes_tried_once() -> Iterator[None]:
+    """Tries each mesh in a child process once, wherever its copies lie: an audit tries each model of BOP."""
+    try_mesh = untrusted_meshes._try_mesh
+
+    def try_once(path: Path, modified: int, size: int) -> str:
+        key = path.suffix, path.read_bytes()
+        if key not in _tried_meshes:
+            _tried_meshes[key] = try_mesh(path, modified, size)
+        return _tried_meshes[key]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(untrusted_meshes, "_try_mesh", try_once)
         yield
 
 

@@ -31,6 +31,8 @@ from mitsplat.scene.spec.scene_spec import FORMATS
 from tests.conftest import BOTH, small_scene
 from tests.drawn import large_boxes, render_boxes, scatter_boxes
 
+pytestmark = pytest.mark.usefixtures("meshes_tried_once")
+
 Patch = Callable[[pytest.MonkeyPatch], None]
 
 

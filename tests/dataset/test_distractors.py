@@ -28,6 +28,8 @@ from tests.conftest import box_asset, small_scene
 from tests.drawn import large_boxes, render_boxes
 from tests.synthetic import CERTIFICATE
 
+pytestmark = pytest.mark.usefixtures("meshes_tried_once")
+
 OBJECTS = [
     {"pool": ["assets/nut", "assets/bolt"], "count": [2, 4], "balance": True, "scale": [0.7, 1.2]},
     {"asset": "assets/crate", "count": 2, "label": False},
@@ -148,6 +150,13 @@ def test_workers_and_merged_shards_make_the_same_bytes(made: Path, scene: Scene,
         assert (out / name).read_bytes() == whole[name].read_bytes(), name
 
 
+@pytest.fixture(scope="module")
+def yolo_scene(scene: Scene) -> Scene:
+    """The scene in one format, for faults that the manifest and the layouts show."""
+    output = scene.spec.output.model_copy(update={"formats": ("yolo",)})
+    return replace(scene, spec=scene.spec.model_copy(update={"output": output}))
+
+
 def labelling_distractors(scene: Scene, index: int, *, layout: Layout) -> Any:
     """Renders as :func:`render_boxes`, but takes all for the first class."""
     return render_boxes(
@@ -155,8 +164,8 @@ def labelling_distractors(scene: Scene, index: int, *, layout: Layout) -> Any:
     )
 
 
-def test_a_labelled_distractor_is_a_violation(scene: Scene, tmp_path: Path) -> None:
-    out = write(scene, tmp_path / "out", render=labelling_distractors)
+def test_a_labelled_distractor_is_a_violation(yolo_scene: Scene, tmp_path: Path) -> None:
+    out = write(yolo_scene, tmp_path / "out", render=labelling_distractors)
     texts = [text for _, text in audit_dataset(out).violations]
     assert any("is labelled, although its asset is a distractor" in text for text in texts)
     assert any("although its layout is empty" in text for text in texts)
@@ -171,7 +180,7 @@ def test_a_labelled_distractor_is_a_violation(scene: Scene, tmp_path: Path) -> N
     ],
 )
 def test_wrongly_recorded_draws_are_violations(
-    scene: Scene, tmp_path: Path, change: Callable[[Any], object], text: str, monkeypatch: pytest.MonkeyPatch
+    yolo_scene: Scene, tmp_path: Path, change: Callable[[Any], object], text: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def wrongly(*given: Any) -> Any:
         record = write_frame(*given)
@@ -179,5 +188,5 @@ def test_wrongly_recorded_draws_are_violations(
         return record
 
     monkeypatch.setattr(frame_job, "write_frame", wrongly)
-    out = write(scene, tmp_path / "out")
+    out = write(yolo_scene, tmp_path / "out")
     assert any(text in found for _, found in audit_dataset(out).violations)

@@ -23,6 +23,8 @@ from mitsplat.scene.scene import Scene
 from tests.conftest import BOTH, small_scene
 from tests.drawn import large_boxes, render_boxes, scatter_boxes
 
+pytestmark = pytest.mark.usefixtures("meshes_tried_once")
+
 WORDS = "fell over in 5 of 5 draws"
 
 

@@ -23,6 +23,8 @@ from mitsplat.scene.spec.shape_spec import Box
 from tests.audit.test_audit import records_of, store
 from tests.conftest import WriteScene
 
+pytestmark = pytest.mark.usefixtures("meshes_tried_once")
+
 SceneData = dict[str, Any]
 STEP = 0.02
 """How far the belt runs from view to view [m]: 4 pixels, seen from 0.5 m with a focal length of 100 px."""

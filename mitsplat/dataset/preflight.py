@@ -43,7 +43,8 @@ MIN_VIEW_WIDTH = 0.01
 MIN_PIXEL_BYTES, MIN_PROCESS_GIB = 500, 0.5
 """Minimum peak memory per pixel of a frame [bytes], and of a process in addition [GiB].
 
-Measured with the workcell scene: 1.0 GiB at 640x360, 2.6 GiB at 2000x2000, 8.4 GiB at 4000x4000.
+Measured with the workcell scene: 1.0 GiB at 640x360, 2.6 GiB at 2000x2000, 8.4 GiB at 4000x4000. Other scenes need
+more, up to the estimate of :func:`mitsplat.frames.budget.worker_memory`.
 """
 SLOW_OBJECTS = 40
 """Number of objects per layout above which settling takes minutes on two cores; 25 took 27 s, 50 took 212 s."""

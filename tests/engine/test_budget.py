@@ -120,7 +120,15 @@ def test_the_estimated_pairs_bound_the_true_number(preset, rendering):
         need = budget._pairs(discs, camera, quality)
         assert real <= need
         assert radius == 0.001 or need < 1.5 * real
-    assert budget._pairs(discs, camera, quality, at=(0, 0, -3)) == 0
+    assert budget._pairs(discs, camera, quality, position=(0, 0, -3)) == 0
+
+
+def test_the_canvas_of_silhouettes_extends_by_one_image_size_beyond_each_border():
+    camera = Camera.look_at((0, 0, -2), (0, 0, 0), up=(0, -1, 0), width=256, height=192, fov_x=50)
+    canvas = budget._silhouette_canvas(camera)
+    assert (canvas.width, canvas.height) == (3 * 256, 3 * 192)
+    points = np.random.default_rng(0).uniform(-1, 1, (20, 3))
+    np.testing.assert_allclose(canvas.project(points)[0], camera.project(points)[0] + (256, 192))
 
 
 @pytest.mark.parametrize(("own", "shared", "expected"), [(1, 0, 8), (2, 0, 5), (2, 5, 2), (20, 0, 1)])

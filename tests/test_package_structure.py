@@ -22,6 +22,7 @@ LAYERS = (
     ("fit", "frames"),
     ("renderer",),
     ("plugins",),
+    ("renderer.composition",),
     ("detector", "renderer.instances"),
     ("labels", "physics", "renderer.meshes"),
     ("renderer.differentiation", "renderer.light", "scene.loading"),

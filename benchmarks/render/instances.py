@@ -74,7 +74,8 @@ def print_costs(name: str, integrator: Any, scene: Any, camera: ms.Camera, repea
     from mitsplat.renderer.splatting import march
     from mitsplat.renderer.splatting.tiles import bin_gaussians
 
-    contents, view, settle = integrator._read(scene), view_of(make_sensor(camera)), march.resolve_instances
+    contents = integrator.renderer._contents.read(scene, splat_shadows=False)
+    view, settle = view_of(make_sensor(camera)), march.resolve_instances
     unsure: list[float] = []
 
     def count(instance: Any, doubt: Any, *rest: Any) -> Any:

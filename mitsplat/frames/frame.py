@@ -279,7 +279,7 @@ class Renderer:
 
     def _build_scene(self, layout: Layout, plan: FramePlan, *, replaced_lights: bool) -> mi.Scene:
         """Load the Mitsuba scene of a frame, and set the integrator's white to that of the layout's environment."""
-        self.integrator.white = white_irradiance(self.scene, layout.index)
+        self.integrator.renderer.white = white_irradiance(self.scene, layout.index)
         description = self.scene_builder.describe(layout, plan.lights, replaced_lights=replaced_lights, belt=plan.belt)
         # A scene has few parts, so that loading them serially is faster than waking threads.
         return mi.load_dict(description, parallel=False)

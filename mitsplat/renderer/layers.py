@@ -98,7 +98,7 @@ def make_integrator(*, quality: str | Quality = "balanced", **properties: Any) -
     """
     ensure_variant()
     integrator = mi.load_dict({"type": "splat_proxy", **properties})
-    integrator.quality = resolve_quality(quality)
+    integrator.renderer.quality = resolve_quality(quality)
     return integrator
 
 
@@ -173,7 +173,7 @@ def render_splats(splats: Splats, camera: Camera, *, quality: str | Quality = "b
     """
     ensure_variant()
     integrator, scene = _single_shape_scene(splats, str(mi.variant()))
-    integrator.quality = resolve_quality(quality)
+    integrator.renderer.quality = resolve_quality(quality)
     layers = render_layers(integrator, scene, camera)
     dr.sync_thread()
     return layers
@@ -188,7 +188,7 @@ def _single_shape_scene(splats: Splats, variant: str) -> tuple[mi.Integrator, mi
 
 def render_layers(integrator: mi.Integrator, scene: mi.Scene, camera: Camera, *, seed: int = 0) -> Layers:
     """Run the integrator; each layer is copied to the host on first access, see :class:`Layers`."""
-    layers = integrator.render_layers(scene, _sensor_of(camera, str(mi.variant())), seed=seed)
+    layers = integrator.renderer.render_layers(scene, _sensor_of(camera, str(mi.variant())), seed=seed)
     check_dropped_rays()
     return Layers.on_device(layers, (camera.height, camera.width))
 
@@ -229,6 +229,6 @@ def render_silhouettes(
     integrator: mi.Integrator, scene: mi.Scene, camera: Camera, *, source: str = "splats"
 ) -> dict[int, Silhouette]:
     """Return the unoccluded silhouette of every instance, by its ``splats`` or its ``proxies``."""
-    silhouettes = dict(integrator.silhouettes(scene, _sensor_of(camera, str(mi.variant())), source=source))
+    silhouettes = dict(integrator.renderer.silhouettes(scene, _sensor_of(camera, str(mi.variant())), source=source))
     check_dropped_rays()
     return silhouettes

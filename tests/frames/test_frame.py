@@ -264,10 +264,10 @@ def test_a_still_camera_renders_the_same_bytes_as_a_new_renderer(quality: str, s
         got, fresh = layers(still, number), layers(make_integrator(quality=chosen, shadow="none"), number)
         for field in fields(got):
             assert np.array_equal(getattr(got, field.name), getattr(fresh, field.name)), (number, field.name)
-    assert still._static_tiles is not None and still._static_tiles[1] is not None
+    assert still.renderer._static_tiles is not None and still.renderer._static_tiles[1] is not None
     elsewhere = replace(camera, cx=camera.cx + 1)
     render_layers(still, scene(0), elsewhere)
-    assert still._static_tiles[1] is None
+    assert still.renderer._static_tiles[1] is None
 
 
 def test_a_still_camera_renders_surroundings_without_splats() -> None:
@@ -290,7 +290,7 @@ def test_a_still_camera_renders_an_object_without_splats() -> None:
     camera = Camera.look_at((0, 0, -2), (0, 0, 0), up=(0, -1, 0), width=32, height=24, fov_x=40)
     scene, still = mi.load_dict({"type": "scene", "around": around, "bare": bare}), make_integrator(shadow="none")
     pictures = [render_layers(still, scene, camera).rgb.tobytes() for _ in range(3)]
-    assert still._static_tiles is not None and still._static_tiles[1] is not None
+    assert still.renderer._static_tiles is not None and still.renderer._static_tiles[1] is not None
     assert set(pictures) == {render_layers(make_integrator(shadow="none"), scene, camera).rgb.tobytes()}
 
 
@@ -302,11 +302,11 @@ def test_views_of_a_layout_share_uploaded_arrays(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Area lights are shapes that are made anew for every frame; they must not count as a change of what is there."""
-    from mitsplat.plugins import splat_proxy
+    from mitsplat.renderer.composition import scene_contents
 
     uploads = []
-    merge = splat_proxy.merge_clouds
-    monkeypatch.setattr(splat_proxy, "merge_clouds", lambda clouds: uploads.append(1) or merge(clouds))
+    merge = scene_contents.merge_clouds
+    monkeypatch.setattr(scene_contents, "merge_clouds", lambda clouds: uploads.append(1) or merge(clouds))
     layout = layout_of_small_scene(scene, settled)
     lit = scene_data | {"lights": [{"kind": "area", "position": [0, 0, 1], "target": [0, 0, 0]}]}
     chosen = ms.load_scene(write_scene(lit, "lit.yaml"))

@@ -1,0 +1,309 @@
+"""Rendering of all layers of a view: primary visibility, light, materials of meshes, and antialiased borders."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from dataclasses import dataclass, field
+from functools import reduce
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import trimesh
+
+from mitsplat.images.masks import Silhouette
+from mitsplat.quality import Quality
+from mitsplat.renderer.composition.scene_contents import ContentsReader, SceneContents, same_shapes
+from mitsplat.renderer.instances.antialiasing import Edges
+from mitsplat.renderer.instances.primary_visibility import PrimaryVisibility
+from mitsplat.renderer.instances.silhouettes import proxy_silhouettes, splat_silhouettes
+from mitsplat.renderer.light.emitter_sampling import reference_irradiance
+from mitsplat.renderer.light.light import Accuracy, light_factor
+from mitsplat.renderer.light.lit_surface import VisiblePixels, VisibleSurfaces
+from mitsplat.renderer.meshes.mesh_radiance import PathTracer
+from mitsplat.renderer.meshes.visible_meshes import MeshHits, VisibleEmitters
+from mitsplat.renderer.rays.camera_rays import CameraView
+from mitsplat.renderer.rays.sensors import view_of
+from mitsplat.renderer.splatting.march import Image, largest_and_mean, trace
+from mitsplat.renderer.splatting.pairs import CrowdedError
+from mitsplat.renderer.splatting.static_tile_cache import StaticTileCache
+
+_CacheKey = tuple[tuple[Any, ...], Quality, list["mi.Shape"]]
+"""Camera, quality and visible shapes."""
+
+
+@dataclass(eq=False)
+class LayerRenderer:
+    """Renderer of the layers of views, with caches that serve the next view.
+
+    The fields are the parameters of the integrator :mod:`mitsplat.plugins.splat_proxy`.
+    """
+
+    quality: Quality
+    shadow: str
+    occluders: str
+    shadow_error: float
+    metered: bool
+    shadow_samples: int
+    bounce: bool
+    highlight: bool
+    hide_emitters: bool
+    mesh_samples: int
+    max_depth: int
+    white: float
+    sky_reach: float
+    reference: tuple[float, ...]
+    _contents: ContentsReader = field(default_factory=ContentsReader, init=False, repr=False)
+    _static_tiles: tuple[_CacheKey, StaticTileCache | None] | None = field(default=None, init=False, repr=False)
+
+    def render_layers(self, scene: mi.Scene, sensor: mi.Sensor, *, seed: int = 0) -> dict[str, dr.ArrayBase]:
+        """Render all layers as flat row-major device arrays: colours linear, depths along z [m].
+
+        Through a thin lens, colours and opacity are means over its aperture; all other layers are those of its centre.
+        ``order_error`` holds the largest and the mean error due to the blending order, see :class:`Image`. It is absent
+        if the quality has no estimate.
+        """
+        contents = self._contents.read(scene, self.occluders == "splats")
+        views = view_of(sensor).apertures(self.quality.lens_rings)
+        accuracy = Accuracy(self.shadow_error, self.shadow_samples, self.metered)
+        paths = -(-self.mesh_samples // len(views))
+        layers, errors = self._layers(contents, scene, views[0], accuracy, paths, seed), []
+        errors.append(layers.pop("order_error"))
+        if len(views) > 1:
+            # The mean of n views has sqrt(n) times less noise than each view.
+            error, most = self.shadow_error * len(views) ** 0.5, -(-self.shadow_samples // len(views))
+            coarse = Accuracy(error, most, self.metered)
+            blurred = {name: layers[name] for name in ("rgb", "alpha", "captured")}
+            for number, view in enumerate(views[1:], start=1):
+                seen = self._layers(contents, scene, view, coarse, paths, seed + number)
+                errors.append(seen["order_error"])
+                blurred = {name: value + seen[name] for name, value in blurred.items()}
+                dr.eval(blurred)
+            layers |= {name: value / len(views) for name, value in blurred.items()}
+            dr.eval(layers)
+        if errors[0] is not None:
+            layers["order_error"] = dr.concat([reduce(dr.maximum, [e[0] for e in errors]), sum(e[1] for e in errors)])
+            layers["order_error"] /= mi.Float([1, len(views)])
+        return layers
+
+    def _layers(
+        self, contents: SceneContents, scene: mi.Scene, view: CameraView, accuracy: Accuracy, paths: int, seed: int
+    ) -> dict[str, dr.ArrayBase]:
+        """Render the layers through one point of the lens."""
+        rays = view.rays()
+        behind, emitters, z_max = self._trace_background(contents, scene, view, rays)
+        splat = self._trace_splats(contents, scene, view, z_max)
+        hit, static = contents.proxies.nearest(rays)
+        proxy_depth = dr.select(hit.distance < dr.inf, hit.distance * view.cosine(rays), 0)
+        dr.eval(splat, proxy_depth, hit, static)
+
+        white = self._white(scene) if scene.emitters() else mi.Color3f(dr.opaque(mi.Float, float(np.pi)))
+        shown = PrimaryVisibility.of(splat, behind, emitters, z_max, dr.pi / white)
+        radiance = self._radiance(contents, scene, view, rays, behind, shown, white, paths, seed)
+        light, highlight = mi.Color3f(1), mi.Color3f(0)
+        if self.shadow == "traced" and scene.emitters():
+            mesh = shown.diffuse & shown.front
+            seen = VisiblePixels(
+                rays.d,
+                shown.cover,
+                dr.select(mesh, behind.depth, splat.depth) if behind else splat.depth,
+                dr.select(mesh, 0, splat.instance),
+                contents.traits.seen(self._shape_votes(contents, view, z_max), splat.instance),
+                mesh,
+            )
+            # Visible meshes receive light like static proxies, also where splats touch them.
+            ground = behind.before(static) if behind else static
+            dr.eval(seen, ground)
+            light, highlight = light_factor(
+                scene,
+                contents.proxies,
+                VisibleSurfaces(contents.traits, view, contents.proxies, rays.o, seen, hit, ground),
+                accuracy=accuracy,
+                seed=seed,
+                reference=self.reference,
+                white=white,
+                sky_reach=self.sky_reach or np.inf,
+                grid=contents.grid,
+                bounce=self.bounce,
+            )
+        if not self.highlight:
+            highlight = mi.Color3f(0)
+        rgb, captured = shown.lit(light, highlight, radiance)
+        layers = {
+            "rgb": rgb,
+            "alpha": shown.alpha,
+            "captured": captured,
+            "depth": splat.depth if z_max is None else dr.select(shown.front, z_max, splat.depth),
+            "instance": splat.instance if z_max is None else dr.select(shown.front, 0, splat.instance),
+            "proxy_depth": proxy_depth,
+            "proxy_instance": hit.instance,
+            "normal": mi.Vector3f(hit.normal),
+            "light": light,
+            "highlight": highlight,
+            "order_error": None if splat.error is None else largest_and_mean(splat.error),
+        }
+        dr.eval(layers, shown.key)
+        if self.quality.samples == "edges":
+            layers |= self._smooth_edges(contents, scene, view, layers, shown.key, radiance, white)
+        return layers
+
+    def _smooth_edges(
+        self,
+        contents: SceneContents,
+        scene: mi.Scene,
+        view: CameraView,
+        layers: dict[str, dr.ArrayBase],
+        key: mi.UInt32,
+        radiance: mi.Color3f,
+        white: mi.Color3f,
+    ) -> dict[str, mi.Float | mi.Color3f]:
+        """Return colours and opacity with several rays averaged at borders between pixels of different ``key``."""
+        edges = Edges.find(key, view)
+        if edges is None:
+            return {}
+        rays = edges.rays()
+        behind, emitters, z_max = self._trace_background(contents, scene, edges.fine, rays, edges.positions())
+        splat = Image.empty(dr.width(rays.d))
+        if contents.clouds is not None:
+            splat = edges.trace(contents.clouds, contents.placements, self.quality, z_max)
+        shown = PrimaryVisibility.of(splat, behind, emitters, z_max, dr.pi / white)
+        pixel = edges.nearest_same(key, shown.key)
+
+        def near(values: mi.Color3f) -> mi.Color3f:
+            """Return the values of the nearest pixel with the same key."""
+            return values if dr.width(values) == 1 else dr.gather(type(values), values, pixel)
+
+        lights = near(layers["light"]), near(layers["highlight"])
+        rgb, captured = shown.lit(*lights, None if radiance is None else near(radiance))
+        fine = {"rgb": rgb, "alpha": shown.alpha, "captured": captured}
+        dr.eval(fine)
+        smooth = {name: edges.averaged(layers[name], values) for name, values in fine.items()}
+        dr.eval(smooth)
+        return smooth
+
+    def _trace_background(
+        self,
+        contents: SceneContents,
+        scene: mi.Scene,
+        view: CameraView,
+        rays: mi.Ray3f,
+        at: tuple[mi.Float, mi.Float] | None = None,
+    ) -> tuple[MeshHits | None, VisibleEmitters | None, mi.Float | None]:
+        """Return visible meshes and emitters along rays, and the depths [m] of the nearest of them.
+
+        Rays pass through the positions ``at`` of the view [px], or through the centres of all its pixels.
+        """
+        behind = contents.meshes.trace(view, rays, at) if contents.meshes else None
+        emitters = None if self.hide_emitters else VisibleEmitters.trace(scene, view, rays)
+        z_max = behind.depth if behind else None
+        if emitters:
+            z_max = emitters.depth if z_max is None else dr.minimum(z_max, emitters.depth)
+        return behind, emitters, z_max
+
+    def _radiance(
+        self,
+        contents: SceneContents,
+        scene: mi.Scene,
+        view: CameraView,
+        rays: mi.Ray3f,
+        behind: MeshHits | None,
+        shown: PrimaryVisibility,
+        white: mi.Color3f,
+        paths: int,
+        seed: int,
+    ) -> mi.Color3f | None:
+        """Return the radiance (Color3f) of path-traced meshes along their visible rays, in the picture's scale."""
+        if behind is None or contents.meshes is None or contents.meshes.diffuse is None:
+            return None
+        pixel = dr.compress(shown.solid & ~shown.diffuse & (shown.splat_alpha < 1 - 1e-3))
+        if not dr.width(pixel):
+            return None
+        ray, hit = (dr.gather(type(v), v, pixel) for v in (mi.Ray3f(rays), behind.hit))
+        tracer = PathTracer(
+            contents.meshes,
+            scene,
+            contents.proxies,
+            contents.mirror,
+            exposure=dr.pi / white,
+            white=white,
+            max_depth=self.max_depth,
+            bounce=self.bounce,
+            seed=seed,
+        )
+        found = tracer.radiance(view, ray, hit, pixel, paths)
+        radiance = mi.Color3f(dr.zeros(mi.Float, dr.width(shown.splat_alpha)))
+        dr.eval(radiance, found)
+        dr.scatter(radiance, found, pixel)
+        return radiance
+
+    def silhouettes(self, scene: mi.Scene, sensor: mi.Sensor, *, source: str = "splats") -> dict[int, Silhouette]:
+        """Return the unoccluded silhouette of every instance above 0, by its splats or its proxies (``source``).
+
+        Positions are relative to the image and may lie outside it. An instance without pixels is omitted.
+        """
+        contents = self._contents.read(scene, self.occluders == "splats")
+        view = view_of(sensor)
+        if source == "splats":
+            if contents.clouds is None:
+                return {}
+            return splat_silhouettes(contents.clouds, contents.placements, view, self.quality)
+        proxies: dict[int, list[tuple[trimesh.Trimesh, np.ndarray]]] = {}
+        for shape in contents.shapes:
+            if getattr(shape, "instance", 0) and shape.proxy is not None:
+                proxies.setdefault(shape.instance, []).append((shape.proxy, shape.world_from_splats))
+        return proxy_silhouettes(proxies, view)
+
+    def _white(self, scene: mi.Scene) -> mi.Color3f:
+        """Return the irradiance (Color3f) at which uniformly captured objects keep their colours."""
+        return (
+            mi.Color3f(dr.opaque(mi.Float, self.white)) if self.white else reference_irradiance(scene, self.reference)
+        )
+
+    def _shape_votes(self, contents: SceneContents, view: CameraView, z_max: mi.Float | None) -> mi.UInt32 | None:
+        """Return the shape of an instance that each pixel shows, or None if all its shapes are lit alike.
+
+        Shapes are rows of :class:`Traits`.
+        """
+        if contents.traits.placements is None or contents.clouds is None:
+            return None
+        fine = view.sampled(self.quality.rays_per_axis)
+        return trace(contents.clouds, contents.traits.placements, fine, self.quality, z_max=z_max).instance
+
+    def _trace_splats(
+        self, contents: SceneContents, scene: mi.Scene, view: CameraView, z_max: mi.Float | None
+    ) -> Image:
+        if contents.clouds is None:
+            return Image.empty(view.width * view.height)
+        fine = view.sampled(self.quality.rays_per_axis)
+        static_tiles = self._static_tile_cache(contents, scene, fine, z_max)
+        if static_tiles is not None:
+            objects = [p for p in contents.placements if p.instance]
+            with suppress(CrowdedError):
+                return static_tiles.with_objects(contents.clouds, objects, fine, self.quality, z_max)
+        return trace(contents.clouds, contents.placements, fine, self.quality, z_max=z_max)
+
+    def _static_tile_cache(
+        self, contents: SceneContents, scene: mi.Scene, view: CameraView, z_max: mi.Float | None
+    ) -> StaticTileCache | None:
+        """Return the static tile cache of a camera, from its second use on."""
+        static = [p for p in contents.placements if p.instance == 0]
+        if contents.clouds is None or len(static) == len(contents.placements):
+            return None
+        if not any(contents.clouds.counts[p.cloud] for p in static):
+            return None
+        fixed = [s for s in contents.shapes if getattr(s, "instance", 0) == 0]
+        if not self.hide_emitters:
+            fixed += [s for s in scene.shapes() if s.is_emitter()]
+        seen = view.key, self.quality, fixed
+        if self._static_tiles is None or not _same_key(self._static_tiles[0], seen):
+            self._static_tiles = seen, None
+        elif self._static_tiles[1] is None:
+            with suppress(CrowdedError):
+                self._static_tiles = seen, StaticTileCache.of(contents.clouds, static, view, self.quality, z_max)
+        return self._static_tiles[1]
+
+
+def _same_key(a: _CacheKey, b: _CacheKey) -> bool:
+    """Return True if two keys of camera, quality and shapes are the same."""
+    return a[:2] == b[:2] and same_shapes(a[2], b[2])

@@ -1,0 +1,103 @@
+"""Device data of the shapes of a scene, reused from view to view."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import mitsuba as mi
+
+from mitsplat.gaussians.splat_cloud import Splats
+from mitsplat.renderer.light.bounce import RadianceGrid
+from mitsplat.renderer.light.light_traits import Traits
+from mitsplat.renderer.meshes.mirrored_splats import SplatMirror
+from mitsplat.renderer.meshes.visible_meshes import VisibleMeshes, is_transmissive
+from mitsplat.renderer.occluders.proxies import Occluder, Proxies
+from mitsplat.renderer.occluders.splat_occlusion import Caster
+from mitsplat.renderer.projection.clouds import Cloud, CloudSet, Placement, merge_clouds, upload_cloud
+
+
+@dataclass(frozen=True, eq=False)
+class SceneContents:
+    """Device data of all shapes of a scene that emit no light; reused while these shapes stay the same."""
+
+    shapes: tuple[mi.Shape, ...]
+    clouds: CloudSet | None
+    placements: tuple[Placement, ...]
+    proxies: Proxies
+    meshes: VisibleMeshes | None
+    mirror: SplatMirror | None
+    traits: Traits
+    grid: RadianceGrid | None
+
+
+class ContentsReader:
+    """Upload of the shapes of scenes; uploads of the last scene are reused."""
+
+    def __init__(self) -> None:
+        self._contents: SceneContents | None = None
+        self._uploaded: list[tuple[Splats, Cloud]] = []
+        self._grid: tuple[mi.Shape, RadianceGrid | None] | None = None
+
+    def read(self, scene: mi.Scene, splat_shadows: bool) -> SceneContents:
+        """Upload the data of the shapes unless they are those of the last call.
+
+        With ``splat_shadows``, the splats of dynamic objects cast shadows instead of their proxies.
+        """
+        # Emitter shapes change from frame to frame; as contents they are neither visible nor occluders.
+        shapes = tuple(s for s in scene.shapes() if not s.is_emitter())
+        known = self._contents
+        if known is not None and same_shapes(known.shapes, shapes):
+            return known
+        carriers = [s for s in shapes if hasattr(s, "world_from_splats")]
+        visible = [s for s in shapes if not hasattr(s, "world_from_splats")]
+        distinct = list({id(c.splats): c.splats for c in carriers}.values())
+        number = {id(splats): i for i, splats in enumerate(distinct)}
+        placements = tuple(
+            Placement(number[id(c.splats)], c.world_from_splats, c.instance, c.appearance) for c in carriers
+        )
+        occluders = [
+            Occluder(c.proxy, c.instance, c.dynamic, c.world_from_splats) for c in carriers if c.proxy is not None
+        ]
+        casters = None
+        if splat_shadows:
+            casters = [Caster(c.splats, c.instance, c.world_from_splats) for c in carriers if c.dynamic]
+        clouds, meshes = self._upload(distinct), VisibleMeshes.build(visible)
+        mirror = None
+        if meshes is not None and meshes.diffuse is not None:
+            mirror = SplatMirror.build(clouds, placements, distinct, [c.capture_light == "uniform" for c in carriers])
+        self._contents = SceneContents(
+            shapes,
+            clouds,
+            placements,
+            Proxies(occluders, [s for s in visible if not is_transmissive(s.bsdf())], casters),
+            meshes,
+            mirror,
+            Traits.of(carriers, placements),
+            self._surroundings(carriers),
+        )
+        return self._contents
+
+    def _surroundings(self, carriers: list[mi.Shape]) -> RadianceGrid | None:
+        """Return the radiance grid of the largest splats that were captured under the scene's light."""
+        static = [c for c in carriers if not c.dynamic and c.capture_light == "scene" and len(c.splats)]
+        if not static:
+            return None
+        largest = max(static, key=lambda c: len(c.splats))
+        if self._grid is None or self._grid[0] is not largest:
+            self._grid = largest, RadianceGrid.build(largest.splats, largest.world_from_splats)
+        return self._grid[1]
+
+    def _upload(self, distinct: list[Splats]) -> CloudSet | None:
+        """Upload splats; copies of the last call are reused, because layouts of a scene share their assets."""
+        kept = {id(splats): (splats, cloud) for splats, cloud in self._uploaded}
+        self._uploaded = [
+            kept.get(id(s)) or (s, upload_cloud(s.means, s.quats, s.scales, s.opacities, s.sh)) for s in distinct
+        ]
+        clouds = [cloud for _, cloud in self._uploaded]
+        return merge_clouds(clouds) if sum(c.count for c in clouds) else None
+
+
+def same_shapes(some: Sequence[mi.Shape], others: Sequence[mi.Shape]) -> bool:
+    """Return True if both sequences hold the same objects in the same order."""
+    return len(some) == len(others) and all(a is b for a, b in zip(some, others, strict=True))

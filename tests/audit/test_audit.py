@@ -1,4 +1,4 @@
-"""The audit: a clean dataset passes, and each planted fault is found though its hash says that all is well."""
+"""Dataset audit: no violations in a clean dataset; each inserted fault is reported although its checksum matches."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def records_of(root: Path) -> list[Record]:
 
 
 def store(root: Path, records: list[Record]) -> None:
-    """Write the manifest with the hashes of the files as they are, and its lines' own."""
+    """Write the manifest with the current hashes of the files and valid line checksums."""
     for record in records:
         for file in record["files"]:
             record["files"][file] = hashlib.sha256((root / file).read_bytes()).hexdigest()
@@ -83,7 +83,7 @@ def move_a_polygon(root: Path, records: list[Record]) -> None:
 
 
 def fill_a_hole(root: Path, records: list[Record]) -> None:
-    """The manifest's mask has a hole, the polygon does not."""
+    """Cut a hole into the mask in the manifest and leave the polygon unchanged."""
     label = first(records)
     mask = decode(records, label)
     x0, y0, x1, y1 = label["box"]
@@ -297,14 +297,14 @@ STRAY = (
     *("yolo-detect/labels/train/000099.txt", "yolo-obb/images/train/000099.png"),
     "yolo-pose/images/train/000099.png",
 )
-"""Files that no frame owns, in the folder of every format; the dataset has no COLMAP cameras."""
+"""Files that belong to no frame, in the folder of every format. The dataset has no COLMAP cameras."""
 
 
 def test_files_of_no_frame_are_violations(dataset: Path) -> None:
     for file in STRAY:
         (dataset / file).parent.mkdir(parents=True, exist_ok=True)
         (dataset / file).write_text("")
-    (dataset / "labels/train.cache").write_text("")  # Ultralytics leaves it there
+    (dataset / "labels/train.cache").write_text("")  # cache file written by Ultralytics
     (dataset / "notes.txt").write_text("mine")
     found = audit_dataset(dataset).violations
     assert found == tuple((file, "belongs to no frame of the manifest") for file in STRAY)
@@ -331,7 +331,7 @@ def test_missing_files_that_describe_frames_are_violations(dataset: Path) -> Non
     "damage", [b"", b"{", b"[1, 2]", b'{"images": 3, "annotations": [3], "frames": [{}]}', b"\xff"]
 )
 def test_damaged_annotations_are_one_violation_per_file(dataset: Path, damage: bytes) -> None:
-    """Whatever is in them: one sentence for each file and no traceback."""
+    """Each damaged file gives one violation and no traceback, for any content."""
     files = [file for file in WHOLE if file.endswith((".json", ".yaml", ".txt"))]
     for file in files:
         (dataset / file).write_bytes(damage)
@@ -340,7 +340,7 @@ def test_damaged_annotations_are_one_violation_per_file(dataset: Path, damage: b
 
 
 def test_entries_of_no_frame_are_violations(dataset: Path) -> None:
-    """At the end, in the middle, and twice."""
+    """Extra entries are reported at the end and in the middle of a file, and as duplicates."""
     for name in ("annotations/instances_val.json", "annotations/panoptic_train.json", "annotations/poses_train.json"):
         content = json.loads((dataset / name).read_text())
         entries = content["frames" if "poses" in name else "annotations"]
@@ -409,7 +409,7 @@ def test_a_folder_without_a_dataset_is_refused(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("instances", "violations"), [([], 0), ([{"id": 1}], 1)])
 def test_identical_images_are_a_violation_only_if_they_show_objects(instances: list[Any], violations: int) -> None:
-    """Empty layouts under a fixed camera show the same: the surroundings."""
+    """Empty layouts under a fixed camera give identical images of the environment."""
     records = [
         {
             "index": index,

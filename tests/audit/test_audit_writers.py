@@ -1,4 +1,6 @@
-"""The audit beside writers that are wrong: each writes a whole dataset, consistent in its fault, and is found out."""
+"""Audit of datasets from faulty writers: each writes a complete, self-consistent dataset with one fault that is
+reported.
+"""
 
 from __future__ import annotations
 
@@ -49,7 +51,7 @@ def write(scene: Scene, out: Path, formats: list[str], **options: Any) -> Path:
 
 
 def changing(owner: Any, name: str, change: Callable[..., Any]) -> Patch:
-    """``change(what the writer made, its arguments)`` in the place of what the writer made."""
+    """Patch a writer to return ``change(result, *args)``."""
     made = getattr(owner, name)
 
     def wrapped(*args: Any, **options: Any) -> Any:
@@ -94,13 +96,13 @@ def entry(owner: Any, name: str, change: Callable[[dict[str, Any]], object]) -> 
 
 
 def task(name: str, change: Callable[[Any], Any]) -> Patch:
-    """Other numbers on every line of a YOLO task [px]."""
+    """Patch a YOLO task to write changed numbers on every line [px]."""
     real = yolo.TASKS[name]
     return lambda patch: patch.setitem(yolo.TASKS, name, yolo.Task(real.folder, lambda it: change(real.numbers(it))))
 
 
 def by_rows(code: dict[str, Any]) -> dict[str, Any]:
-    """The code of the same mask, its runs counted along rows instead of columns."""
+    """Encode the same mask with its runs counted along rows instead of columns."""
     mask = coco_mask.decode(code)
     turned = np.asfortranarray(mask.ravel(order="C").reshape(mask.shape, order="F"))
     return {"size": code["size"], "counts": coco_mask.encode(turned)["counts"].decode()}
@@ -111,7 +113,7 @@ def inverse(flat: list[float]) -> list[float]:
 
 
 class Swapped(Rotation):
-    """Scalar first where COLMAP's writer takes it for last."""
+    """Rotation whose quaternion is scalar-first, although COLMAP's writer expects scalar-last."""
 
     @classmethod
     def from_matrix(cls, matrix: Any) -> Any:
@@ -120,7 +122,7 @@ class Swapped(Rotation):
 
 
 def with_camera(change: Callable[[camera.Camera], Any]) -> Patch:
-    """Another camera in a module that writes cameras."""
+    """Patch the modules that write cameras to write a changed camera."""
 
     def patch(monkeypatch: pytest.MonkeyPatch) -> None:
         for owner in (coco, bop, colmap):
@@ -149,11 +151,11 @@ def add_to(place: list[Any], position: int, amount: float) -> None:
 
 
 def models_in_metres(patch: pytest.MonkeyPatch) -> None:
-    patch.setattr(bop, "MILLIMETRES", 1.0)  # poses as well, all of it consistent
+    patch.setattr(bop, "MILLIMETRES", 1.0)  # also scales poses, so that all values are consistent
 
 
 def record_camera(change: Callable[[Any], Any]) -> Patch:
-    """A manifest that states another camera than that of the picture, for every format to follow."""
+    """Patch the manifest to record a camera that differs from that of the image; all formats follow the manifest."""
     real = writers.write_frame
 
     def write_frame(frame: Any, *args: Any) -> Any:
@@ -423,7 +425,7 @@ def test_the_fault_of_each_wrong_writer_is_a_violation(
 
 
 def test_all_formats_of_merged_shards_have_no_violations(scene: Scene, tmp_path: Path) -> None:
-    """All formats together, of shards that were merged."""
+    """Merged shards with all formats pass the audit."""
     formats = list(FORMATS)
     shards = [write(scene, tmp_path / str(number), formats, shard=Shard(number, 2)) for number in (1, 2)]
     merge_shards(shards, tmp_path / "out")
@@ -439,7 +441,7 @@ def test_poses_that_differ_from_the_layout_are_violations(scene: Scene, tmp_path
 
 
 WRITERS = ("formats", "frames", "labels", "plugins", "renderer")
-"""Where labels are made and written."""
+"""Packages that make and write labels."""
 
 
 def test_the_audit_imports_no_writer() -> None:
@@ -462,7 +464,7 @@ def test_the_audit_imports_no_writer() -> None:
     ids=["fisheye", "distorted"],
 )
 def test_every_lens_passes_and_swapped_coefficients_are_violations(tmp_path: Path, lens: dict[str, Any]) -> None:
-    """Right writers pass, and coefficients in the wrong order do not, whatever reads them."""
+    """Correct writers pass for every lens. Coefficients in the wrong order are a violation."""
     scene = small_scene(tmp_path, large_boxes(), BOTH, layouts=2, views=2)
     seen = scene.spec.camera.model_copy(update={"intrinsics": Intrinsics(**lens)})
     scene = replace(scene, spec=scene.spec.model_copy(update={"camera": seen}))

@@ -1,4 +1,4 @@
-"""Baking against closed forms: what leaves a surface is known, and so is where the surface is."""
+"""Baking against closed forms: emitted radiance and surface positions are known."""
 
 from __future__ import annotations
 
@@ -37,13 +37,13 @@ def _variant() -> None:
 
 
 def quick(**changes: object) -> BakeSettings:
-    """Settings small enough for a test; neither fitted nor compared unless asked for."""
+    """Build bake settings small enough for a test, without fit and verification by default."""
     small = {"gaussians": 700, "sh_degree": 1, "directions": 12, "samples": 16, "fit_steps": 0, "verify_views": 0}
     return BakeSettings(**{**small, **changes})
 
 
 def coloured_box() -> tuple[trimesh.Trimesh, np.ndarray]:
-    """A box of one colour a side, and the index of the colour of every face."""
+    """Build a box with one colour per side, and the colour index of every face."""
     box = trimesh.creation.box(extents=(0.04, 0.03, 0.02))
     axis = np.abs(box.face_normals).argmax(axis=1)
     side = 2 * axis + (box.face_normals[np.arange(12), axis] > 0)
@@ -57,13 +57,13 @@ def white(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
 
 
 def outward_colours(splats: Splats) -> np.ndarray:
-    """Display-encoded colours seen head-on, shape (N, 3)."""
+    """Evaluate display-encoded colours along the surface normals, shape (N, 3)."""
     normals = Rotation.from_quat(splats.quats).as_matrix()[:, :, 2]
     return evaluate_sh(splats.sh, -normals)
 
 
 def test_white_sphere_in_a_furnace_emits_radiance_one_in_all_directions() -> None:
-    """A convex diffuse body of albedo 1 under radiance 1 from everywhere emits E / pi = 1 into every direction."""
+    """A convex diffuse body of albedo 1 under uniform radiance 1 emits E / pi = 1 in every direction."""
     splats = bake_asset(white(trimesh.creation.icosphere(3, 0.02)), name="ball", settings=quick()).asset.splats
     normals = Rotation.from_quat(splats.quats).as_matrix()[:, :, 2]
     for tilt in (0.0, 0.5, 1.0):
@@ -75,7 +75,7 @@ def test_white_sphere_in_a_furnace_emits_radiance_one_in_all_directions() -> Non
 
 
 def test_traced_radiance_of_a_lit_plane_is_albedo_times_irradiance_over_pi() -> None:
-    """A small lamp of radiance L and area A, facing the plane at height h: E = L A / h^2 below it."""
+    """A small light of radiance L and area A, facing the plane at height h, gives E = L A / h^2 below it."""
     plane = trimesh.Trimesh([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], [[0, 1, 2], [0, 2, 3]])
     plane.visual.face_colors = [255, 255, 255, 255]
     lamp = AreaLight(position=(0, 0, 2.0), target=(0, 0, 0), size=(0.1, 0.2), radiance=50.0)
@@ -128,7 +128,7 @@ def test_surfels_cover_a_box_and_end_at_its_edges() -> None:
 
 
 def transmittance(surfels: object, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """Share of light along the normal that the surfels' discs let through at ``points``, all pairs."""
+    """Compute the transmittance of the surfels' discs along the normals at ``points``, for all pairs."""
     local = np.einsum("pnj,nji->pni", points[:, None] - surfels.points, surfels.frames)
     response = np.exp(-0.5 * ((local[..., :2] / surfels.scales[:, :2]) ** 2).sum(axis=2))
     response *= (normals @ surfels.normals.T > 0.7) & (np.abs(local[..., 2]) < 1e-4)
@@ -180,7 +180,7 @@ def test_baked_sphere_has_30_db_from_views_that_were_not_fitted() -> None:
 
 
 def test_texture_is_placed_by_its_coordinates(tmp_path: Path) -> None:
-    """Lower half of the image (small v) red, upper half blue; v grows with y on the sheet."""
+    """The lower half of the image (small v) is red, the upper half blue; v grows with y on the sheet."""
     from PIL import Image
     from trimesh.visual import TextureVisuals
     from trimesh.visual.material import PBRMaterial
@@ -233,7 +233,8 @@ def test_normals_are_smooth_on_a_sphere_and_sharp_on_a_box() -> None:
 
 
 def test_degenerate_triangles_get_normals() -> None:
-    """CAD files are full of them; a ray that meets one without a normal gives no number, and no splats."""
+    """Degenerate triangles are common in CAD files. A ray that hits one without a normal would give NaN and no splats.
+    """
     corners = np.array([(0, 0, 0), (0.01, 0, 0), (0.005, 1e-13, 0), (0.005, 0, 0.01)])
     mesh = trimesh.Trimesh(corners, [(0, 1, 2), (0, 2, 3)], process=False)
     assert not mesh.face_normals[0].any()
@@ -316,7 +317,7 @@ def test_large_object_bakes_with_any_size_and_reports_its_stages() -> None:
 
 
 def test_path_traced_image_equals_single_rays_through_its_pixels() -> None:
-    """The readable twin: rays of the camera's own model, one by one. Light of radiance 1 on white leaves no noise."""
+    """Slow reference: the camera model's rays are traced one by one. Radiance 1 on white gives no noise."""
     ball = white(trimesh.creation.icosphere(3, 0.02))
     scene = mitsuba_scene(read_parts(ball), bake_lights("uniform"))
     camera = Camera.look_at((0.05, -0.06, 0.04), (0, 0, 0), width=24, height=18, fov_x=40, near=0.01)
@@ -333,7 +334,7 @@ def test_path_traced_image_equals_single_rays_through_its_pixels() -> None:
 
 
 def test_noise_of_different_pixels_differs() -> None:
-    """Were all paths to share their random numbers, the mean over the picture would be as noisy as one pixel."""
+    """If all paths shared their random numbers, the mean of the image would be as noisy as one pixel."""
     cup = white(trimesh.creation.annulus(0.01, 0.02, 0.03))
     scene = mitsuba_scene(read_parts(cup), bake_lights("studio"))
     camera = Camera.look_at((0.0, -0.04, 0.06), (0, 0, 0), width=48, height=48, fov_x=30, near=0.01)
@@ -361,7 +362,7 @@ def test_bake_asset_is_exported_by_the_package() -> None:
 
 
 def sheet(extent: float, height: float, texture: np.ndarray, *, steps: int = 1) -> trimesh.Trimesh:
-    """A square open sheet with a texture, of ``2 * steps**2`` faces."""
+    """Build a square open sheet with a texture and ``2 * steps**2`` faces."""
     line = np.linspace(0.0, 1.0, steps + 1)
     u, v = (a.ravel() for a in np.meshgrid(line, line))
     corner = (np.arange(steps)[:, None] * (steps + 1) + np.arange(steps)).ravel()
@@ -391,7 +392,7 @@ def test_proxy_keeps_a_textured_table_and_omits_a_label() -> None:
 
 
 def test_picture_of_few_samples_is_no_darker_than_one_of_many() -> None:
-    """One path a ray, two emitters: noise must be averaged before it is encoded (Jensen's inequality)."""
+    """With one path per ray and two emitters, noise must be averaged before encoding (Jensen's inequality)."""
     lights = [
         AreaLight(position=(0.3, 0.2, 0.8), size=(0.3, 0.3), radiance=14.0),
         AreaLight(position=(-0.6, 0.2, 0.8), size=(0.3, 0.3), radiance=7.0),

@@ -1,4 +1,4 @@
-"""One object in several formats, and what users say of its surface: the same colours must reach the splats."""
+"""Materials: the same object in several mesh formats and finishes must give splats of the same colours."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ QUICK = BakeSettings(gaussians=300, sh_degree=0, directions=8, samples=4, fit_st
 
 
 def box(visual: object = None) -> trimesh.Trimesh:
-    """A box whose faces share no vertices."""
+    """Build a box whose faces share no vertices."""
     mesh = trimesh.creation.box((0.04, 0.03, 0.02))
     return trimesh.Trimesh(mesh.triangles.reshape(-1, 3), np.arange(36).reshape(-1, 3), process=False, visual=visual)
 
 
 def write_obj(folder: Path, lines: str, *, name: str = "box") -> Path:
-    """The box as an OBJ whose MTL says ``lines``, with a texture of one colour to name."""
+    """Write the box as an OBJ with ``lines`` in its MTL, and a texture of one colour for reference."""
     Image.new("RGB", (8, 8), COLOUR).save(folder / "colour.png")
     (folder / f"{name}.mtl").write_text(f"newmtl paint\n{lines}\n")
     rows = [f"mtllib {name}.mtl", *("v {:.6f} {:.6f} {:.6f}".format(*corner) for corner in box().vertices)]
@@ -48,7 +48,7 @@ def part_of(folder: Path, lines: str, **finish: object) -> MeshPart:
 
 
 def colour_of(part: MeshPart) -> np.ndarray:
-    """Mean linear colour."""
+    """Return the mean linear colour of a mesh part."""
     if part.colours is not None:
         return np.asarray(part.colours.mean(axis=(0, 1)))
     return np.asarray(decode_srgb(part.texture / 255.0).mean(axis=(0, 1)))
@@ -56,7 +56,8 @@ def colour_of(part: MeshPart) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def bakes(tmp_path_factory: pytest.TempPathFactory) -> dict[str, BakeResult]:
-    """The box in one colour, as a scan in OBJ, as GLB, as PLY with vertex colours, and as STL with ``--colour``."""
+    """Bake the box in one colour: as a scan in OBJ, as GLB, as PLY with vertex colours, and as STL with ``--colour``.
+    """
     folder = tmp_path_factory.mktemp("formats")
     image, uv = Image.new("RGB", (8, 8), COLOUR), np.tile([[0.1, 0.1], [0.9, 0.1], [0.5, 0.9]], (12, 1))
     matt = PBRMaterial(baseColorTexture=image, metallicFactor=0.0, roughnessFactor=1.0)
@@ -80,7 +81,7 @@ def bakes(tmp_path_factory: pytest.TempPathFactory) -> dict[str, BakeResult]:
 
 @pytest.mark.parametrize("kind", ["obj", "ply", "stl"])
 def test_the_same_object_in_each_mesh_format_bakes_to_the_same_colours(bakes: dict[str, BakeResult], kind: str) -> None:
-    """Of a face that sees nothing but light of radiance 1, the radiance is the albedo: the mean over it agrees."""
+    """A face that receives only radiance 1 has a radiance equal to its albedo. The mean over the face agrees."""
     found, wanted = (bakes[name].views[0] for name in (kind, "glb"))
     assert psnr_of(((found.splats - wanted.splats) ** 2).mean()) > 40
     assert psnr_of(((found.mesh - wanted.mesh) ** 2).mean()) > 40
@@ -96,7 +97,7 @@ def test_splats_have_the_brightness_of_the_texture(bakes: dict[str, BakeResult],
 
 
 def test_gloss_on_a_dark_texture_gives_no_brightness_warning(tmp_path: Path) -> None:
-    """Of what a dark scan sends out under white light, much is its gloss; texels that no face shows do not count."""
+    """Gloss is a large part of a dark scan's radiance under white light. Texels outside all faces are not counted."""
     atlas = Image.new("RGB", (8, 8), "white")
     atlas.paste((58, 58, 58), (0, 0, 4, 8))
     uv = np.tile([[0.05, 0.1], [0.4, 0.1], [0.2, 0.9]], (12, 1))
@@ -150,7 +151,7 @@ def test_each_unsupported_mtl_statement_gives_a_warning(tmp_path: Path, lines: s
 
 
 def test_factors_and_vertex_colours_of_gltf_are_linear(tmp_path: Path) -> None:
-    """glTF 2.0: 3.9.2 and 3.7.2.1."""
+    """glTF 2.0, sections 3.9.2 and 3.7.2.1."""
     grey = PBRMaterial(baseColorFactor=[128, 128, 128, 255], metallicFactor=0.0, roughnessFactor=1.0)
     box(TextureVisuals(material=grey)).export(tmp_path / "factor.glb")
     (part,) = read_parts(tmp_path / "factor.glb")

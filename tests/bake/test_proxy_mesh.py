@@ -1,4 +1,4 @@
-"""The one surface of an asset that physics and shadows use."""
+"""Proxy mesh of an asset, shared by physics and shadows."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ from mitsplat.geometry.mesh_distance import DistanceSurface
 
 
 def test_the_proxy_of_a_scan_with_many_faces_is_watertight() -> None:
-    """Quadric decimation tears this one, and physics would rebuild it from voxels, for minutes."""
+    """Quadric decimation leaves holes in this scan. Physics would rebuild its surface from voxels, which takes minutes.
+    """
     ball = trimesh.creation.icosphere(subdivisions=5, radius=0.05)
     factors = 1 + 0.005 * np.random.default_rng(0).normal(size=(len(ball.vertices), 1))
     scan = trimesh.Trimesh(ball.vertices * factors, ball.faces, process=False)

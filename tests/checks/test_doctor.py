@@ -1,4 +1,4 @@
-"""The doctor: every line says what to do when it fails."""
+"""``mitsplat doctor``: every failed check states a remedy."""
 
 import re
 from dataclasses import replace
@@ -58,14 +58,17 @@ def trial():
 
 class TestTrial:
     def test_the_trial_scene_has_its_known_means(self, trial):
-        """Far within the tolerance, or the means are of another renderer; processors of two makers differ by 0.0014."""
+        """Differences are below an eighth of the tolerance. CPUs of two manufacturers differ by 0.0014.
+
+        A larger difference would mean that the means come from another renderer.
+        """
         means = trial_means(trial)
         assert max(np.abs(means[name] - known).max() for name, known in KNOWN_MEANS.items()) < TOLERANCE / 8
         assert trial_faults(trial) == []
 
     @pytest.mark.parametrize("lost", ["static", "dynamic"])
     def test_missing_shadows_of_either_kind_are_faults(self, monkeypatch, lost):
-        """What a GPU shows where rays at captured, or at added, things are left out."""
+        """A GPU that omits rays to captured (static) or to added (dynamic) objects gives such images."""
         build = Proxies.__init__
 
         def without(self, *args):
@@ -118,7 +121,7 @@ def missing(name):
 
 
 def test_memory_is_bounded_by_the_limit_of_the_container(monkeypatch, tmp_path):
-    """Other programs take and give back memory at any time, so what the machine has is said here."""
+    """The machine's memory is mocked, because other programs allocate and free memory at any time."""
     monkeypatch.setattr(resources, "_CGROUP", tmp_path)
     read, machine = Path.read_text, "MemAvailable: 6291456 kB\n"
     monkeypatch.setattr(Path, "read_text", lambda path: machine if path == Path("/proc/meminfo") else read(path))

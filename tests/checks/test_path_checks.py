@@ -1,4 +1,4 @@
-"""The preflight: a good asset and scene pass, and each planted fault is found, with a word on what to do."""
+"""Preflight checks: a valid asset and scene pass; each inserted fault is found and comes with a remedy."""
 
 from dataclasses import replace
 
@@ -16,7 +16,7 @@ from tests.conftest import box_asset
 
 
 def solid(count=2000, size=(0.06, 0.04, 0.05)):
-    """A box with Gaussians all over its surface."""
+    """Build a box with Gaussians all over its surface."""
     mesh = trimesh.creation.box(size)
     points, _ = trimesh.sample.sample_surface(mesh, count, seed=1)
     splats = Splats(
@@ -75,7 +75,7 @@ def test_each_planted_fault_of_an_asset_is_found_with_its_remedy(name):
     asset, remedy = FAULTS[name]
     found = wrong(check_asset(asset))
     assert remedy in found[name.strip()].remedy
-    assert set(found) <= {name.strip(), "offset", "overlap", "colliders"}  # a moved mesh is all three
+    assert set(found) <= {name.strip(), "offset", "overlap", "colliders"}  # a displaced mesh causes all three
 
 
 @pytest.mark.parametrize(
@@ -111,7 +111,7 @@ def test_assets_of_the_same_name_are_checked_separately(tmp_path):
 
 
 def test_an_asset_of_several_sizes_is_listed_once(scene_data, write_scene, monkeypatch):
-    """A fault of one size is told of, and nothing is said to be well with the asset then."""
+    """A fault of one size is reported. The asset is then not also listed with "no problems"."""
     monkeypatch.setitem(SIZE_LIMITS, "object", (0.016, 2.0))
     scene_data["objects"] = [{"asset": f"assets/{name}", "scale": [0.5, 1]} for name in ("nut", "bolt")]
     said = [(finding.name, finding.text) for finding in check_scene(load_scene(write_scene(scene_data)))]

@@ -41,6 +41,12 @@ SceneSeed = Annotated[int | None, typer.Option(help="Seed of all random numbers;
 AllowOutside = Annotated[
     bool, typer.Option("--allow-outside", help="Allow SCENE to reference files outside its folder.")
 ]
+OverwriteDataset = Annotated[
+    bool,
+    typer.Option(
+        "--overwrite/--resume", help="Replace the dataset in the folder, or continue it and keep its finished images."
+    ),
+]
 Preset = Annotated[PresetName | None, typer.Option(help="Rendering preset; replaces the preset of the scene.")]
 
 
@@ -116,13 +122,7 @@ def render(
             help="Label formats, separated by commas; replaces output.formats of the scene.",
         ),
     ] = None,
-    overwrite: Annotated[
-        bool,
-        typer.Option(
-            "--overwrite/--resume",
-            help="Replace the dataset in the folder, or continue it and keep its finished images.",
-        ),
-    ] = False,
+    overwrite: OverwriteDataset = False,
     allow_outside: AllowOutside = False,
 ) -> None:
     """Render the labelled dataset of SCENE.
@@ -222,13 +222,7 @@ def merge(
         list[Path], typer.Argument(metavar="SHARDS...", help="Dataset folders with all shards of one dataset.")
     ],
     out: Annotated[Path, typer.Option("--out", "-o", help="Dataset folder to write.")],
-    overwrite: Annotated[
-        bool,
-        typer.Option(
-            "--overwrite/--resume",
-            help="Replace the dataset in the folder, or continue it and keep its finished images.",
-        ),
-    ] = False,
+    overwrite: OverwriteDataset = False,
     json_log: JsonLog = False,
 ) -> None:
     """Join the shards of a dataset into one dataset.

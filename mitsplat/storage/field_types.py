@@ -65,6 +65,11 @@ def _check_order_of_components(bounds: tuple[Vector, Vector]) -> tuple[Vector, V
     return bounds
 
 
+def optional_field(description: str) -> Any:
+    """Return the default of a key that may be absent. Dumps of the model omit an absent key."""
+    return Field(None, exclude_if=lambda value: value is None, description=description)
+
+
 def _count_range(count: object) -> tuple[object, ...]:
     """Convert a number n to (n, n), and a list to a tuple, which strict mode requires."""
     if isinstance(count, int) and not isinstance(count, bool):

@@ -15,6 +15,7 @@ from mitsplat.storage.field_types import (
     StrictModel,
     Unit,
     Vec3,
+    optional_field,
 )
 from mitsplat.storage.yaml_input import FieldError
 
@@ -68,10 +69,8 @@ class Viewpoint(StrictModel):
     """Keys that all kinds of cameras have."""
 
     intrinsics: Intrinsics = Field(Intrinsics(fov_x=60), description="Lens and sensor geometry.")
-    motion: Motion | None = Field(
-        None,
-        exclude_if=lambda motion: motion is None,
-        description="Exposure, which blurs what the conveyor moves. Labels refer to its middle. Needs a conveyor.",
+    motion: Motion | None = optional_field(
+        "Exposure, which blurs what the conveyor moves. Labels refer to its middle. Needs a conveyor."
     )
 
 
@@ -159,21 +158,15 @@ class CameraHemisphere(Viewpoint):
         description="``random`` draws azimuth, sine of the elevation, and radius independently. ``even`` takes them "
         "from a low-discrepancy sequence over the frames, which leaves smaller gaps.",
     )
-    accept: Acceptance | None = Field(
-        None,
-        exclude_if=lambda accept: accept is None,
-        description="Conditions that every view must fulfil. Rejected views are drawn again.",
+    accept: Acceptance | None = optional_field(
+        "Conditions that every view must fulfil. Rejected views are drawn again."
     )
-    occlusion: Occlusion | None = Field(
-        None,
-        exclude_if=lambda occlusion: occlusion is None,
-        description="Target share of partly hidden objects. The candidate view nearest to it is selected.",
+    occlusion: Occlusion | None = optional_field(
+        "Target share of partly hidden objects. The candidate view nearest to it is selected."
     )
-    truncation: Truncation | None = Field(
-        None,
-        exclude_if=lambda truncation: truncation is None,
-        description="Target share of objects cut by the border. The candidate view nearest to it is selected. Every "
-        "other candidate is turned so that the target is near the border.",
+    truncation: Truncation | None = optional_field(
+        "Target share of objects cut by the border. The candidate view nearest to it is selected. Every "
+        "other candidate is turned so that the target is near the border."
     )
     tries: int = Field(
         TRIES,

@@ -19,6 +19,7 @@ from mitsplat.storage.field_types import (
     StrictModel,
     Vec3,
     Vec3Range,
+    optional_field,
 )
 from mitsplat.storage.yaml_input import FieldError
 
@@ -64,9 +65,7 @@ _DRAW_ONLY_KEYS = frozenset({"vary", "count", "distance", "elevation"})
 class DrawnLight(StrictModel):
     """Keys that all kinds of lights have."""
 
-    draw: LightDraw | None = Field(
-        None, exclude_if=lambda draw: draw is None, description="Ranges of values that are drawn at random."
-    )
+    draw: LightDraw | None = optional_field("Ranges of values that are drawn at random.")
 
     @model_validator(mode="after")
     def _check_draw(self) -> DrawnLight:
@@ -183,11 +182,9 @@ class EnvironmentLight(DrawnLight):
     radiance: Positive = Field(1.0, description="Radiance [W/(m^2 sr)], or the factor on the image.")
     colour: EmittedColour = (1, 1, 1)
     image: str | None = Field(None, description="HDR or EXR file, relative to the scene file.")
-    pool: str | tuple[str, ...] | None = Field(
-        None,
-        exclude_if=lambda pool: pool is None,
-        description="List of HDR or EXR files, a folder, or a pattern such as ``skies/*``, whose images are sorted "
-        "by name. Each layout draws one image, even if other values vary from frame to frame.",
+    pool: str | tuple[str, ...] | None = optional_field(
+        "List of HDR or EXR files, a folder, or a pattern such as ``skies/*``, whose images are sorted "
+        "by name. Each layout draws one image, even if other values vary from frame to frame."
     )
     rotate_z: float = Field(0.0, description="Rotation about the vertical axis [degrees].")
 

@@ -17,6 +17,7 @@ from mitsplat.storage.field_types import (
     UnitRange,
     Vec3,
     check_order,
+    optional_field,
 )
 from mitsplat.storage.yaml_input import FieldError
 
@@ -94,13 +95,11 @@ class ObjectSpec(StrictModel):
     asset: str | None = Field(
         None, description="Asset folder, relative to the scene file. An entry has either ``asset`` or ``pool``."
     )
-    pool: str | tuple[str, ...] | None = Field(
-        None,
-        exclude_if=lambda pool: pool is None,
-        description="List of asset folders, or a pattern such as ``assets/*``, which selects the objects among the "
+    pool: str | tuple[str, ...] | None = optional_field(
+        "List of asset folders, or a pattern such as ``assets/*``, which selects the objects among the "
         "matching folders, sorted by name. Each object of the entry draws one asset. Or ``primitives``: "
         f"{NUM_PRIMITIVES} boxes, cylinders, spheres, capsules and cones of 25 to 60 mm with random "
-        "materials. The seed determines the primitives; they need no folder.",
+        "materials. The seed determines the primitives; they need no folder."
     )
     count: CountRange = Field((1, 1), description="Number of objects per layout, a number or an inclusive range.")
     balance: bool = Field(
@@ -122,11 +121,9 @@ class ObjectSpec(StrictModel):
         f"of {NUM_SCALES} sizes, evenly spaced in ratio.",
     )
     class_name: Name | None = Field(None, description="Class name of the labels. The class of the asset if absent.")
-    region: str | tuple[str, ...] | None = Field(
-        None,
-        exclude_if=lambda region: region is None,
-        description="Name of the region in which objects start, or a list of names. Each object draws one of them by "
-        f"floor area. All regions if absent. The region of the key ``region`` has the name ``{MAIN_REGION}``.",
+    region: str | tuple[str, ...] | None = optional_field(
+        "Name of the region in which objects start, or a list of names. Each object draws one of them by "
+        f"floor area. All regions if absent. The region of the key ``region`` has the name ``{MAIN_REGION}``."
     )
     poses: tuple[ObjectPose, ...] = Field(
         (), description="Initial pose of each object, in place of ``count``. From there, objects settle as usual."
@@ -201,12 +198,10 @@ class Settle(StrictModel):
         description="Initial arrangement of the objects: random drop, pile, sparse scatter, stacks, upright, a "
         "tower, or packed side by side.",
     )
-    yaw: YawRange | None = Field(
-        None,
-        exclude_if=lambda yaw: yaw is None,
-        description="Range of rotations about the vertical axis [degrees] for the arrangements ``upright``, "
+    yaw: YawRange | None = optional_field(
+        "Range of rotations about the vertical axis [degrees] for the arrangements ``upright``, "
         "``tower`` and ``packed``. 0 is the orientation of the asset, so the range controls the "
-        "direction of the fronts. If absent, any rotation, or quarter turns for ``packed``.",
+        "direction of the fronts. If absent, any rotation, or quarter turns for ``packed``."
     )
     turned_over: Unit = Field(
         0.0,

@@ -17,7 +17,7 @@ from mitsplat.scene.spec.light_spec import EnvironmentLight, LightEntry, RoomLig
 from mitsplat.scene.spec.material_spec import Background
 from mitsplat.scene.spec.object_spec import MAIN_REGION, Arrangement, ObjectSpec, Settle
 from mitsplat.scene.spec.shape_spec import Backdrop, Conveyor, Enclosure, NamedRegion, Region, Shape
-from mitsplat.storage.field_types import StrictModel, Unit
+from mitsplat.storage.field_types import StrictModel, Unit, optional_field
 from mitsplat.storage.yaml_input import FieldError
 
 BACKDROP = "backdrop "
@@ -132,23 +132,14 @@ class SceneSpec(StrictModel):
         description="Objects also rest on the mesh of the environment. Its convex decomposition takes minutes.",
     )
     shapes: tuple[Shape, ...] = Field((), description="Static shapes, such as a tabletop or walls.")
-    backdrop: Backdrop | None = Field(
-        None,
-        exclude_if=lambda backdrop: backdrop is None,
-        description="Room around the scene. It is useful if the environment is only a table, or if the scene has "
-        "only shapes.",
+    backdrop: Backdrop | None = optional_field(
+        "Room around the scene. It is useful if the environment is only a table, or if the scene has only shapes."
     )
-    conveyor: Conveyor | None = Field(
-        None,
-        exclude_if=lambda conveyor: conveyor is None,
-        description="Belt, one of the shapes, that moves objects between the views of a layout. At the middle of the "
-        "run, the objects are where they settled.",
+    conveyor: Conveyor | None = optional_field(
+        "Belt, one of the shapes, that moves objects between the views of a layout. At the middle of the "
+        "run, the objects are where they settled."
     )
-    background: Background | None = Field(
-        None,
-        exclude_if=lambda background: background is None,
-        description="Images behind the scene, in place of grey.",
-    )
+    background: Background | None = optional_field("Images behind the scene, in place of grey.")
     objects: tuple[ObjectSpec, ...] = Field((), description="Objects that are dropped and labelled.")
     empty: Unit = Field(
         0.0,
@@ -167,11 +158,7 @@ class SceneSpec(StrictModel):
     lights: tuple[LightEntry, ...] = Field((), description="Light sources.")
     randomise: Randomise = Field(Randomise(), description="Ranges of the values that vary between images or layouts.")
     composite: Composite = Field(Composite(), description="Shadows, highlights, exposure and tone curve.")
-    depth_sensor: DepthSensor | None = Field(
-        None,
-        exclude_if=lambda sensor: sensor is None,
-        description="Simulated sensor for the format ``depth-sensor``.",
-    )
+    depth_sensor: DepthSensor | None = optional_field("Simulated sensor for the format ``depth-sensor``.")
     labels: LabelRules = Field(LabelRules(), description="Rules for labels.")
     output: Output = Field(Output(), description="Number, size and formats of the images.")
     hold_out: HoldOut = Field(

@@ -233,7 +233,7 @@ def test_normals_are_smooth_on_a_sphere_and_sharp_on_a_box() -> None:
 
 
 def test_degenerate_triangles_get_normals() -> None:
-    """Degenerate triangles are common in CAD files. A ray that hits one without a normal would give NaN and no splats."""
+    """CAD files have many degenerate triangles. A ray that hits one without a normal would give NaN and no splats."""
     corners = np.array([(0, 0, 0), (0.01, 0, 0), (0.005, 1e-13, 0), (0.005, 0, 0.01)])
     mesh = trimesh.Trimesh(corners, [(0, 1, 2), (0, 2, 3)], process=False)
     assert not mesh.face_normals[0].any()

@@ -56,7 +56,7 @@ def colour_of(part: MeshPart) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def bakes(tmp_path_factory: pytest.TempPathFactory) -> dict[str, BakeResult]:
-    """Bake the box in one colour: as a scan in OBJ, as GLB, as PLY with vertex colours, and as STL with ``--colour``."""
+    """Bake the box in one colour: as OBJ scan, as GLB, as PLY with vertex colours, and as STL with ``--colour``."""
     folder = tmp_path_factory.mktemp("formats")
     image, uv = Image.new("RGB", (8, 8), COLOUR), np.tile([[0.1, 0.1], [0.9, 0.1], [0.5, 0.9]], (12, 1))
     matt = PBRMaterial(baseColorTexture=image, metallicFactor=0.0, roughnessFactor=1.0)

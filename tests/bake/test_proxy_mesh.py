@@ -11,7 +11,7 @@ from mitsplat.geometry.mesh_distance import DistanceSurface
 
 
 def test_the_proxy_of_a_scan_with_many_faces_is_watertight() -> None:
-    """Quadric decimation leaves holes in this scan. Physics would rebuild its surface from voxels, which takes minutes."""
+    """Quadric decimation tears holes into this scan. Rebuilding its surface from voxels would take physics minutes."""
     ball = trimesh.creation.icosphere(subdivisions=5, radius=0.05)
     factors = 1 + 0.005 * np.random.default_rng(0).normal(size=(len(ball.vertices), 1))
     scan = trimesh.Trimesh(ball.vertices * factors, ball.faces, process=False)

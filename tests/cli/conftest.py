@@ -1,4 +1,4 @@
-"""What tests of several commands are given."""
+"""Fixtures shared by tests of several commands."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``mitsplat bake``."""
+"""Command ``mitsplat bake``."""
 
 from __future__ import annotations
 
@@ -18,7 +18,9 @@ from tests.conftest import box_asset
 def test_bake_applies_every_option(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """What each does is read from the asset; processes of their own bake in full in test_documented_commands.py."""
+    """Every option changes the written asset. test_documented_commands.py runs complete bakes in processes of their
+    own.
+    """
     few = partial(BakeSettings, directions=4, samples=2, fit_views=2, fit_steps=2, verify_views=1)
     monkeypatch.setattr("mitsplat.bake.bake.BakeSettings", few)
     box_asset("gear", (20.0, 30.0, 10.0)).mesh.export(tmp_path / "gear.glb")

@@ -1,4 +1,4 @@
-"""Commands that take a scene beside ``render``, and those that need nothing."""
+"""Commands that read a scene, except ``render``, and commands without input."""
 
 from __future__ import annotations
 
@@ -50,9 +50,9 @@ def test_export_writes_the_xml_of_the_frame(scene_path: Path, monkeypatch: pytes
 def test_settle_prints_certificates_and_writes_the_animation(
     scene_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The GIF moves, ends on the layout at rest, and shows the drop every 0.04 s as fast as it was."""
+    """The GIF moves, ends on the layout at rest, and shows the drop in real time with a frame every 0.04 s."""
     monkeypatch.setattr(settle, "cache_folder", lambda: tmp_path / "cache")
-    monkeypatch.setenv("COLUMNS", "80")  # its headings and numbers are whole all the same
+    monkeypatch.setenv("COLUMNS", "80")  # headings and numbers are not truncated at this width
     gif = tmp_path / "drop.gif"
     assert run("settle", scene_path, "-n", 2, "--preview", "-o", gif, "--size", "64x36") == 0
     out = capsys.readouterr().out
@@ -73,7 +73,7 @@ def test_settle_prints_certificates_and_writes_the_animation(
         ]
     assert shown[0][0].shape == (36, 64, 3)
     assert np.abs(shown[0][0] - shown[-1][0]).max() > 10
-    # Equal pictures are stored once: only how long all are shown tells their number.
+    # Equal images are stored once, so the number of images follows only from the total duration.
     assert sum(duration for _, duration in shown) == (pictures - 1) * 40 + 1500
 
 

@@ -1,4 +1,4 @@
-"""``--device``, of every command that renders."""
+"""Option ``--device`` of all commands that render."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class TestDevice:
     def test_a_missing_device_is_refused_by_every_command_that_renders(
         self, scene_path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str
     ) -> None:
-        """Every command that renders refuses it in one sentence, before anything is written."""
+        """The refusal is one sentence, given before anything is written."""
         ball = tmp_path / "ball.ply"
         trimesh.creation.icosphere().export(ball)
         words = (
@@ -75,7 +75,7 @@ class TestDevice:
     def test_another_gpu_is_selected_by_restarting_the_process(
         self, scene_path: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     ) -> None:
-        """By the command line itself only: whoever calls it is told what to set."""
+        """Only the command line restarts the process. A caller in Python gets a sentence with the variable to set."""
         gpus = tuple(devices.Gpu("One", 2**40, number, str(number), f"GPU-{number}") for number in range(2))
         monkeypatch.setattr(devices, "visible_gpus", lambda: gpus)
         monkeypatch.delenv(devices.GPU_NUMBER, raising=False)
@@ -83,7 +83,7 @@ class TestDevice:
         assert run(*command) == 2
         assert "set CUDA_VISIBLE_DEVICES=GPU-1 before" in capsys.readouterr().err
         begun = Calls(error=SystemExit(0))
-        monkeypatch.setenv("PYTHONSAFEPATH", "1")  # main sets it
+        monkeypatch.setenv("PYTHONSAFEPATH", "1")  # set by main
         monkeypatch.setattr("mitsplat.cli.os.execve", begun)
         monkeypatch.setattr("sys.argv", ["mitsplat", *command])
         monkeypatch.setattr("sys.orig_argv", ["python", "/bin/mitsplat", *command])

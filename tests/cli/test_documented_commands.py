@@ -1,7 +1,7 @@
-"""What README and docs tell users to type, each command in a process of its own, on real input and without stand-ins.
+"""Commands in README and docs, each run in a process of its own on real input without mocks.
 
-Other tests call the same code in a process where imports, Mitsuba's variant and caches are set up by whatever ran
-before; here nothing is.
+Other tests call the same code in a process where earlier tests have set up imports, Mitsuba's variant and caches. Here
+nothing is set up.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
 ROOT = Path(__file__).parents[2]
 PAGES = (ROOT / "README.md", *sorted(path for path in (ROOT / "docs").rglob("*.md") if "_build" not in path.parts))
-"""What tells users what to type; README comes first, and makes most of what the others name."""
+"""Pages with documented commands. README comes first, because it creates most files that the others name."""
 MITSPLAT = Path(sys.executable).with_name("mitsplat")
 
 SMALLER = {
@@ -58,7 +58,7 @@ SMALLER = {
     "evaluate": ["--size", "64", "--device", "cpu"],
     "compare": ["--size", "64"],
 }
-"""Options that are added to documented commands, in place of their own, so that they are quick."""
+"""Options that replace or extend those of documented commands to make them fast."""
 
 
 def run(command: list[str] | str, folder: Path, **variables: str) -> subprocess.CompletedProcess[str]:
@@ -76,31 +76,34 @@ def run(command: list[str] | str, folder: Path, **variables: str) -> subprocess.
 
 
 def blocks(page: Path, language: str) -> list[str]:
-    """A page's blocks in a language."""
+    """Return the code blocks of a page in one language."""
     return re.findall(rf"^```{language}\n(.*?)^```", page.read_text(), re.DOTALL | re.MULTILINE)
 
 
 def commands(page: Path) -> list[list[str]]:
-    """Return the commands of mitsplat that a page shows, without their comments."""
+    """Return the mitsplat commands of a page, without their comments."""
     lines = (line for text in blocks(page, "sh") for line in text.splitlines())
     return [words for line in lines if (words := shlex.split(line, comments=True))[:1] == ["mitsplat"]]
 
 
 def form(words: list[str]) -> tuple[str, ...]:
-    """A command without what is only a name or a number in it: its options, and the kinds of files it is given."""
+    """Reduce a command to its options and the file types of its arguments, without names and numbers."""
     kept = re.compile(r"-|\d+/\d+")
     return (words[1], *sorted(word if kept.match(word) else Path(word).suffix for word in smaller(words)))
 
 
 def smaller(words: list[str]) -> list[str]:
-    """A documented command made quick; a Mitsuba scene says its size itself, and one image has no number of them."""
+    """Make a documented command fast.
+
+    A Mitsuba scene states its own size, and a single image takes no ``-n``.
+    """
     added = [] if words[2:3] == ["frame.xml"] else SMALLER.get(words[1], [])
     kept = list(words)
     for option in (word for word in added if word.startswith("-")):
         if option in kept:
             place = kept.index(option)
             del kept[place : place + 2]
-    if "--real-size" in kept:  # no more than half as much again as the smaller --size
+    if "--real-size" in kept:  # at most 1.5 times the reduced --size
         kept[kept.index("--real-size") + 1] = "96"
     if "--only" in kept and "-n" in added:
         added = added[: added.index("-n")] + added[added.index("-n") + 2 :]
@@ -109,9 +112,10 @@ def smaller(words: list[str]) -> list[str]:
 
 @pytest.fixture(scope="session")
 def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with what documented commands name: a scene with two kinds of parts, a mesh in mm, splats, light.
+    """Create the files that documented commands name: a scene with two kinds of parts, a mesh in mm, splats, light.
 
-    The first commands settle layouts from nothing. Those that later ones take are there already: it is the same code.
+    The first commands settle layouts from an empty cache. The layouts of later commands are settled here with the same
+    code.
     """
     folder = tmp_path_factory.mktemp("desk")
     shipped = YAML(typ="safe", pure=True).load(ROOT / "scenes/workcell.yaml")
@@ -150,17 +154,19 @@ DETECTORS = ("train", "evaluate")
 DOCUMENTED = [words for page in PAGES for words in commands(page)]
 
 SHOWN = [words for words in {form(words): words for words in reversed(DOCUMENTED)}.values() if "--engine" not in words]
-"""The first of each form: what differs in names and numbers alone is typed once. Clusters have tests of their own."""
-SHOWN.sort(key=DOCUMENTED.index)  # what needs something that another one has made comes after it
+"""First command of each form. Commands that differ only in names and numbers run once. Clusters have tests of their
+own.
+"""
+SHOWN.sort(key=DOCUMENTED.index)  # a command comes after those whose output it needs
 
 
 FILMED = [words for words in SHOWN if words[1] in PHOTOGRAPHS and any(word.endswith(".mp4") for word in words)]
-"""Those that begin with a video."""
+"""Commands that begin with a video."""
 
 
 def obey(words: list[str], desk: Path, *, good: tuple[int, ...] = (0,)) -> None:
-    """Type a command, made quick; it must end well and say nothing that is for developers."""
-    typed = re.sub(r"'([^' ]*[>*][^' ]*)'", r"\1", shlex.join(smaller(words)))  # those are for the shell to read
+    """Run a fast version of a command and check that it ends without an error or developer messages."""
+    typed = re.sub(r"'([^' ]*[>*][^' ]*)'", r"\1", shlex.join(smaller(words)))  # quotes for the shell
     done = run(typed, desk)
     told = f"{typed}: status {done.returncode}\n{done.stdout[-800:]}\n{done.stderr[-2000:]}"
     assert done.returncode in good, told
@@ -170,7 +176,7 @@ def obey(words: list[str], desk: Path, *, good: tuple[int, ...] = (0,)) -> None:
 def test_every_command_is_shown_in_the_documentation() -> None:
     known = typer.main.get_command(app).commands
     assert {words[1] for words in SHOWN} == set(known)
-    for words in DOCUMENTED:  # those that are not typed below, too
+    for words in DOCUMENTED:  # includes commands that are not run below
         given = words[2 : words.index(">") if ">" in words else None]
         assert known[words[1]].make_context(words[1], list(given)), words
 
@@ -178,10 +184,10 @@ def test_every_command_is_shown_in_the_documentation() -> None:
 @pytest.mark.slow
 def test_every_documented_command_runs_in_its_own_process(desk: Path) -> None:
     for words in SHOWN:
-        if words[1] in ("view", "compare", *DETECTORS):  # one serves until it is ended: tests/view; others come below
+        if words[1] in ("view", "compare", *DETECTORS):  # view is tested in tests/view; the others run below
             continue
         if words[1] not in PHOTOGRAPHS and "assets/mug" not in words:
-            # 1 is that of findings, which a box of sixty Gaussians and small machines may give.
+            # Status 1 means findings, which a box of 60 Gaussians and small machines may give.
             obey(words, desk, good=(0, 1) if words[1] in ("check", "doctor") else (0,))
     made = ("out/cell/report.html", "frame.png", "drop.gif", "assets/gear/asset.yaml", "board.pdf", "frame.xml")
     assert [
@@ -192,7 +198,7 @@ def test_every_documented_command_runs_in_its_own_process(desk: Path) -> None:
 
 
 def lay_photographs(desk: Path) -> None:
-    """Labelled photographs, which are images of the dataset that the commands above have made."""
+    """Make labelled photographs from images of the dataset that the commands above have written."""
     if not (desk / "photographs").is_dir():
         for name in ("images", "labels"):
             shutil.copytree(desk / "out/cell" / name, desk / "photographs" / name)
@@ -209,7 +215,7 @@ def test_the_documented_compare_commands_run(desk: Path) -> None:
 
 @pytest.mark.slow
 def test_the_documented_detector_commands_run(desk: Path) -> None:
-    """After the commands above, which have made the dataset."""
+    """Runs after the commands above, which have written the dataset."""
     if not all(map(find_spec, ("torch", "torchvision", "ultralytics"))):
         pytest.skip("Ultralytics and PyTorch are not installed")
     if subprocess.run([sys.executable, "-c", "import torchvision"], capture_output=True, check=False).returncode:
@@ -224,8 +230,8 @@ def test_the_documented_detector_commands_run(desk: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("page", [page for page in PAGES if blocks(page, "python")], ids=lambda page: page.stem)
 def test_the_documented_python_examples_run(desk: Path, page: Path) -> None:
-    """Each page's in one process, after the commands above, which have made the datasets that some read."""
-    # A loop over endless frames, with a detector of the reader's, is for tests/frames/test_torch_dataset.py.
+    """Each page runs in one process, after the commands above, which have written the datasets of some pages."""
+    # tests/frames/test_torch_dataset.py tests the loop over endless frames with a detector of the reader's.
     known = [text for text in blocks(page, "python") if "import torch" not in text and "from torch" not in text]
     if not (desk / "runs").is_dir():
         known = [text for text in known if "runs/" not in text]
@@ -247,9 +253,9 @@ def test_the_scene_of_the_guide_is_valid(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_the_documented_photo_commands_make_an_asset(desk: Path, captured: tuple[Path, Path, CaptureResult]) -> None:
-    """Their cameras are there, as if a first run had ended after structure from motion, which takes a minute.
+    """The cameras exist already, as if a first run had ended after structure from motion, which takes a minute.
 
-    Status 4 is that of a tiny fit, which misses the thresholds of an asset.
+    Status 4 comes from a tiny fit, which misses the quality thresholds of an asset.
     """
     given, out, _ = captured
     for name in ("mug", "cell"):
@@ -257,7 +263,7 @@ def test_the_documented_photo_commands_make_an_asset(desk: Path, captured: tuple
     for place in ("captures/mug", "assets/mug/capture", "assets/cell/capture"):
         shutil.copytree(out, desk / place)
     for words in SHOWN:
-        if "--remove" in words:  # the table must be found: tests/surroundings/test_removal.py types it
+        if "--remove" in words:  # needs a detected table; runs in tests/surroundings/test_removal.py
             continue
         if words not in FILMED and (words[1] in PHOTOGRAPHS or "assets/mug" in words):
             obey(words, desk, good={"asset": (0, 4), "mesh": (0, 4), "check": (0, 1)}.get(words[1], (0,)))
@@ -279,7 +285,7 @@ def test_the_documented_video_commands_make_a_capture(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("command", ["audit", "report", "render", "check", "schema"])
 def test_a_file_name_that_is_not_utf_8_is_refused(command, capsys):
-    """Native libraries end the process instead, or take it for no text."""
+    """Native libraries would end the process or reject the name as text."""
     assert type_in(command, os.fsdecode(b"bad\xff/scene.yaml")) == 2
     assert capsys.readouterr().err == (
         "mitsplat: names of files and folders must be UTF-8 (got b'bad\\xff/scene.yaml')\n"

@@ -1,4 +1,4 @@
-"""What goes wrong: a sentence, a status, and a log for machines."""
+"""Errors of the command line: one sentence, an exit status, and a machine-readable log."""
 
 from __future__ import annotations
 

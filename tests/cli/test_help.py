@@ -1,4 +1,4 @@
-"""Every command and option is explained, by itself and in the guide."""
+"""Help texts of every command and option, and their entries in the guide."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What must hold in a process that has only just imported mitsplat: entry points, threads, variants, faults."""
+"""Behaviour of a process that has just imported mitsplat: entry points, threads, variants, errors."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ camera = ms.Camera.look_at((0, 0, -1), (0, 0, 0), up=(0, -1, 0), width=32, heigh
 def fresh(
     code: str, *arguments: object, folder: Path | None = None, **variables: str
 ) -> subprocess.CompletedProcess[str]:
-    """Run code in a process of its own; Dr.Jit finds its LLVM even where Mitsuba is imported before mitsplat."""
+    """Run code in a new process. Dr.Jit finds its LLVM even if Mitsuba is imported before mitsplat."""
     command = [sys.executable, "-c", code, *map(str, arguments)]
     environment = {**os.environ, **variables}
     return subprocess.run(
@@ -76,7 +76,7 @@ CALLS = {
     "write_dataset": "assert ms.write_dataset(ms.load_scene('scene.yaml'), 'out', frames=1, workers=1).frames == 1",
     "write_frames": "scene = ms.load_scene('scene.yaml'); ms.write_frames(scene, 'own', ms.render_frames(scene, 1))",
 }
-"""Each public name, used as the first thing in a process."""
+"""First use of each public name in a process."""
 
 FURTHER = {
     **{f"bake {kind}": f"assert len(bake('part.{kind}').asset.splats)" for kind in ("obj", "glb", "ply")},
@@ -140,7 +140,10 @@ for name, call in json.loads(sys.argv[1]).items():
 print(json.dumps(failed))
 """
 )
-"""Every call in a fork of a process that has imported mitsplat and chosen no variant, as good as one of its own."""
+"""Code that runs every call in a fork of a process that has imported mitsplat without choosing a variant.
+
+A fork is equivalent to a new process here.
+"""
 
 
 def small(scene: dict[str, object]) -> dict[str, object]:
@@ -166,7 +169,7 @@ def test_every_public_name_works_in_a_new_process(desk: Path) -> None:
 
 
 def test_the_first_renders_of_a_process_may_run_in_several_threads(desk: Path) -> None:
-    """Each has what it has alone: neither the plugins nor what is on the device may be half made by another one."""
+    """Each thread gets the result of a serial run: plugin registration and device state must be complete before use."""
     code = """
 import threading
 scene = ms.load_scene("scene.yaml")
@@ -222,7 +225,7 @@ except RuntimeError as error:
     assert "plugin 'splat_proxy' needs the variant llvm_ad_rgb or cuda_ad_rgb (got scalar_rgb)" in plugin
 
 
-# Faults
+# Errors
 
 FAULT = """
 from mitsplat.cli import main
@@ -250,7 +253,7 @@ def test_the_log_is_written_to_a_writable_folder(tmp_path: Path) -> None:
     places = {"XDG_CACHE_HOME": str(tmp_path / "file"), "TMPDIR": str(tmp_path), "MITSPLAT_TRACEBACK": "1"}
     done = fresh(FAULT, folder=tmp_path, **places)
     assert done.returncode == 70
-    assert "in write_pdf" in done.stderr  # for developers
+    assert "in write_pdf" in done.stderr  # traceback for developers
     assert Path(re.search(r"the log is (.+)\)$", done.stderr.strip())[1]).parent == tmp_path
 
 

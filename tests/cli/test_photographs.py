@@ -1,4 +1,4 @@
-"""Commands that make assets of photographs: ``capture``, ``fit``, ``mesh`` and ``asset``."""
+"""Commands that make assets from photographs: ``capture``, ``fit``, ``mesh`` and ``asset``."""
 
 from __future__ import annotations
 
@@ -180,7 +180,7 @@ def test_asset_passes_every_option_on(
 def test_a_log_has_stages_and_the_remaining_time(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Where nobody sees a bar."""
+    """The log replaces the progress bar if standard error is no terminal."""
     clock = iter([0.0, 5.0, 70.0, 80.0, 90.0])
     monkeypatch.setattr("mitsplat.cli.options.time.monotonic", lambda: next(clock))
     with stage_bar() as progress:

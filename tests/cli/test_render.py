@@ -1,4 +1,4 @@
-"""``mitsplat render``: what it passes on, what it refuses, and how it chooses a preset."""
+"""Command ``mitsplat render``: arguments passed on, refused input, and choice of the preset."""
 
 from __future__ import annotations
 

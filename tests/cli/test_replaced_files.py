@@ -1,4 +1,4 @@
-"""Commands that write where something is already: what they have not made stays, and they say so before any work."""
+"""Overwrite protection: commands keep files that they did not write, and refuse to replace them before any work."""
 
 from __future__ import annotations
 

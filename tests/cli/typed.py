@@ -1,4 +1,4 @@
-"""How tests type commands, and what stands in for what these call."""
+"""Helpers to run commands, and a stand-in for the functions that commands call."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def run(*args: object) -> int:
 
 
 class Calls:
-    """Stands in for a function: keeps what it was called with."""
+    """Stand-in for a function that records the arguments of its last call."""
 
     def __init__(self, result: Any = None, error: BaseException | None = None) -> None:
         self.result, self.error = result, error

@@ -160,15 +160,15 @@ class LightFilter:
     def rays_for(self, estimate: Estimate, error: float, unshadowed: mi.Float, metered: int = 0) -> mi.Float:
         """Compute the number of rays per pixel of ``index`` at which light reaches the wanted error.
 
-        The wanted error applies at mid-grey (HALF). At other levels the same perceptual error is tolerated: a smaller
+        The wanted error applies at ``MID_GREY``. At other levels the same perceptual error is tolerated: a smaller
         standard error in the dark, a larger one where it is bright.
 
         Args:
             estimate: Estimate from the rays so far.
             error: Target standard error of mid-grey light.
             unshadowed: Light without occluders at each pixel; 1 is white. Rays estimate the share of it that arrives.
-            metered: Number of pixels of the picture under automatic exposure, which makes the mean look like HALF.
-                Pixels without traced light count as lit by 1. The value 0 means exposure for white.
+            metered: Number of pixels of the picture under automatic exposure, which makes the mean look like
+                ``MID_GREY``. Pixels without traced light count as lit by 1. The value 0 means exposure for white.
         """
         share, variance, shared = self._share(estimate)
         # If few of the 3 x 3 pixels are similar, almost none of the more distant pixels are.
@@ -177,7 +177,7 @@ class LightFilter:
         if metered:
             exposure = _metered(light, self.stride * self.stride, metered)
             light, unshadowed = light * exposure, unshadowed * exposure
-        # The tolerated error follows the slope of the display curve, relative to HALF.
+        # The tolerated error follows the slope of the display curve, relative to ``MID_GREY``.
         allowed = error * dr.power(dr.clip(light, MIN_LIGHT, 1) / MID_GREY, 1 - DISPLAY)
         return estimate.rays * variance * dr.square(unshadowed / allowed) / gain
 
@@ -294,7 +294,7 @@ class LightFilter:
 
 
 def _metered(light: mi.Float, area: mi.Int32, pixels: int) -> mi.Float:
-    """Return the exposure factor that makes the mean of a picture look like HALF.
+    """Return the exposure factor that makes the mean of a picture look like ``MID_GREY``.
 
     Each value of ``light`` represents ``area`` pixels. All other pixels count as 1.
     """

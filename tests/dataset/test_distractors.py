@@ -1,4 +1,4 @@
-"""Datasets with pools, distractors and empty layouts: what no label may say, and what the manifest states."""
+"""Datasets with pools, distractors and empty layouts: label files without distractors, and their manifest."""
 
 from __future__ import annotations
 
@@ -113,7 +113,7 @@ def test_the_manifest_records_every_draw(made: Path, scene: Scene) -> None:
 
 
 def test_distractors_are_in_no_label_file(made: Path) -> None:
-    """Nor in maps of labels: their pixels are the environment's, where they hide an object too."""
+    """Label maps omit distractors too: their pixels are the environment's, also where they occlude an object."""
     seen = 0
     for path in made.rglob("*"):
         if path.suffix in (".txt", ".json", ".xml", ".yaml", ".ply") and path.parent.name not in ("scene", "layouts"):
@@ -152,13 +152,13 @@ def test_workers_and_merged_shards_make_the_same_bytes(made: Path, scene: Scene,
 
 @pytest.fixture(scope="module")
 def yolo_scene(scene: Scene) -> Scene:
-    """The scene in one format, for faults that the manifest and the layouts show."""
+    """Return the scene with the YOLO format only, for faults that the manifest and the layouts show."""
     output = scene.spec.output.model_copy(update={"formats": ("yolo",)})
     return replace(scene, spec=scene.spec.model_copy(update={"output": output}))
 
 
 def labelling_distractors(scene: Scene, index: int, *, layout: Layout) -> Any:
-    """Renders as :func:`render_boxes`, but takes all for the first class."""
+    """Render as :func:`render_boxes`, but label all objects as the first class."""
     return render_boxes(
         scene, index, layout=replace(layout, instances=tuple(replace(one, class_index=0) for one in layout.instances))
     )

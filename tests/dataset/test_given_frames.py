@@ -1,4 +1,4 @@
-"""Datasets of frames that were made in Python pass the audit, and what such frames cannot be is refused."""
+"""Datasets of frames rendered from Python: valid ones pass the audit, unsupported ones are refused."""
 
 from __future__ import annotations
 
@@ -26,13 +26,16 @@ pytestmark = pytest.mark.usefixtures("meshes_tried_once")
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
-    """One that draws places and empty layouts, which frames of one's own are not drawn by."""
+    """Return a small scene in every format except flow, COLMAP and depth-sensor.
+
+    Given frames have layouts and cameras of their own.
+    """
     formats = [name for name in FORMATS if name not in ("flow", "colmap", "depth-sensor")]
     return small_scene(tmp_path_factory.mktemp("scene"), large_boxes(), BOTH, layouts=1, views=4, formats=formats)
 
 
 def film(scene: Scene, count: int = 3, width: int = 64) -> list:
-    """The nut moves, below a camera that is none of the scene's."""
+    """Render frames of a moving nut, with a camera above it that is not one of the scene's."""
     layouts = []
     for step in range(count):
         pose = np.eye(4)

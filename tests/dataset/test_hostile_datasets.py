@@ -1,4 +1,4 @@
-"""Datasets of strangers: links, pipes, deep JSON and records of other types harm no other file and are no fault."""
+"""Untrusted datasets: links, pipes, deep JSON and records of other types are handled without changing other files."""
 
 import copy
 import hashlib
@@ -237,7 +237,7 @@ class TestJson:
     def test_a_named_pipe_is_refused_without_waiting(self, out, name, command):
         (out / name).unlink(missing_ok=True)
         os.mkfifo(out / name)
-        signal.alarm(60)  # ends the process where a pipe is waited for
+        signal.alarm(60)  # ends the process if opening a pipe blocks
         try:
             with suppress(InputError, OSError):
                 READERS[command](out)
@@ -258,7 +258,7 @@ class TestJson:
 
 
 def _checked(text):
-    """A line of a manifest with the checksum that fits, of JSON that Python does not write."""
+    """Encode a manifest line with a valid checksum, from JSON text that Python's encoder does not produce."""
     return text[:-1] + f',"check":"{hashlib.sha256(text).hexdigest()[:16]}"}}\n'.encode()
 
 
@@ -281,7 +281,7 @@ def _changed(value, at, new):
 
 
 class TestTypes:
-    """Keys that are missing or of another type; the checksum fits."""
+    """Keys that are missing or have another type, in lines with a valid checksum."""
 
     @pytest.mark.parametrize("key", ["index", "files", "split", "labels", "camera", "layout"])
     @pytest.mark.parametrize("new", [KeyError, -1], ids=repr)
@@ -298,9 +298,9 @@ class TestTypes:
         assert any("line 2 is not the record" in text for _, text in audit_dataset(out).violations)
         assert DatasetIndex(out).unreadable == 1
 
-    @pytest.mark.filterwarnings("ignore::RuntimeWarning")  # of values that overflow
+    @pytest.mark.filterwarnings("ignore::RuntimeWarning")  # from values that overflow
     def test_random_changes_of_values_never_end_in_a_crash(self, scene, out):
-        """Drawn changes of drawn values, of which each is refused in a sentence, named by the audit, or borne."""
+        """Random changes of random values are refused in one sentence, reported by the audit, or accepted."""
         rng = random.Random(1)
         values = [KeyError, None, "x", -1, {}, [], 1e308, 10**30, True, "\u2028", [[[]]], float("nan")]
         tried = 0

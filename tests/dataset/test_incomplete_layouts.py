@@ -1,4 +1,4 @@
-"""Datasets of which some layouts lack objects that did not come to rest: all who make or read one agree about them."""
+"""Datasets with layouts that lack objects which did not come to rest: writers and readers agree on them."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ WORDS = "fell over in 5 of 5 draws"
 
 
 def settle_most(scene: Scene, index: int, *, progress: Any) -> Layout:
-    """Layout 2 lacks a bolt, and nothing of layout 5 came to rest."""
+    """Settle layouts. Layout 2 lacks a bolt, and no object of layout 5 comes to rest."""
     layout = scatter_boxes(scene, index, progress=progress)
     if index == 2:
         return replace(layout, instances=(layout.instances[0], *layout.instances[2:]), left_out=(LeftOut(2, 1, WORDS),))
@@ -90,13 +90,13 @@ def test_the_report_counts_omitted_objects(whole: DatasetSummary, tmp_path: Path
 
 
 def test_workers_make_the_same_bytes(scene: Scene, whole: DatasetSummary, tmp_path: Path) -> None:
-    """As many as the layouts cannot be shared evenly among."""
+    """The number of workers does not divide the number of layouts."""
     assert files_of(write(scene, tmp_path / "out", workers=3).path) == files_of(whole.path)
 
 
 def test_an_interrupted_run_resumes_to_the_same_bytes(scene: Scene, whole: DatasetSummary, tmp_path: Path) -> None:
     def broken(scene: Scene, index: int, *, layout: Layout) -> Any:
-        if index == 11:  # the second view of the layout of which nothing is left
+        if index == 11:  # second view of the layout without objects
             raise KeyboardInterrupt
         return render_boxes(scene, index, layout=layout)
 
@@ -135,13 +135,13 @@ def test_a_label_of_an_omitted_object_is_a_violation(whole: DatasetSummary, tmp_
 def test_more_incomplete_layouts_than_allowed_end_the_run(scene: Scene, tmp_path: Path) -> None:
     few = with_share(scene, 0.2)  # 1.6 of 8
     words = r"settle.incomplete = 0.2 of the 8 layouts may lack .*got 2, among them 2 x nut: fell; .*mitsplat check"
-    for _ in range(2):  # the second run finds both settled
+    for _ in range(2):  # the second run finds both layouts settled
         with pytest.raises(InputError, match=words):
             write(few, tmp_path / "out")
-    summary = write(scene, tmp_path / "out")  # which changes no byte, so that it goes on
+    summary = write(scene, tmp_path / "out")  # the allowed share changes no byte, so the run resumes
     assert 0 < summary.rendered < 16
     assert summary.incomplete == 2
-    # A shard bears what the whole dataset does.
+    # The limit of a shard is that of the whole dataset.
     assert write(few, tmp_path / "part", shard=Shard(2, 2)).incomplete == 1
 
 

@@ -1,4 +1,4 @@
-"""What a scene reads decides whether its dataset can be resumed: every file of every entry, whatever its name."""
+"""Inputs of a scene that decide whether its dataset can be resumed: every file of every entry, with any name."""
 
 import re
 import shutil
@@ -26,13 +26,13 @@ SCENE = {
     "environment": "assets/room",
     "objects": [
         {"asset": "assets/nut"},
-        {"asset": "assets/other_nut"},  # of the same name
+        {"asset": "assets/other_nut"},  # same asset name
         {"asset": "assets/loose", "size": 0.04},
         {"asset": "assets/loose", "size": 0.05},
         {"asset": "assets/nut", "class_name": "large", "scale": 2},
     ],
     "shapes": [
-        {"name": "nut", "mesh": "table.ply", "visible": True},  # as the assets are called
+        {"name": "nut", "mesh": "table.ply", "visible": True},  # same name as the assets
         {"name": "assets/sky.png", "mesh": "stand.obj", "visible": True},
     ],
     "region": {"min": [-0.2, -0.2, 0.02], "max": [0.2, 0.2, 0.2]},
@@ -44,7 +44,7 @@ SCENE = {
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory) -> Path:
-    """A scene of everything that can be read, and its dataset of one frame."""
+    """Build a scene with every kind of input file, and its dataset of one frame."""
     folder = tmp_path_factory.mktemp("inputs")
     points = {"top": (0.0, 0.0, 0.005), "tip": (0.01, 0.0, 0.0)}
     for name, size in (("nut", 0.02), ("other_nut", 0.03)):
@@ -65,7 +65,7 @@ def copy(made, tmp_path) -> Path:
 
 
 def colour(path: Path) -> None:
-    """One Gaussian of a PLY gets another red."""
+    """Change the red value of one Gaussian in a PLY file."""
     splats = Asset.load(path.parent).splats
     sh = splats.sh.copy()
     sh[3, 0, 0] += 0.25
@@ -73,7 +73,7 @@ def colour(path: Path) -> None:
 
 
 def bend(path: Path) -> None:
-    """The first vertex of a mesh moves by a little of its size, to the inside."""
+    """Move the first vertex of a mesh inwards by 1 % of its coordinates."""
     mesh = trimesh.load_mesh(path, process=False)
     mesh.vertices[0] *= 0.99
     mesh.export(path)
@@ -131,7 +131,7 @@ def test_resuming_after_an_edit_of_an_input_is_refused_by_its_key(copy, file, ed
 
 
 def test_files_and_remarks_that_are_not_read_may_change(copy):
-    """A remark, a file that nothing names, and the time of a file are not content."""
+    """Comments, files that nothing refers to, and modification times are not content."""
     with (copy / "assets/nut/asset.yaml").open("a") as file:
         file.write("# seen\n")
     (copy / "assets/nut/notes.txt").write_text("")
@@ -148,7 +148,7 @@ def test_entries_with_the_same_asset_have_different_hashes(made):
 
 
 def test_an_exported_scene_holds_each_asset_of_the_same_name(copy, tmp_path, monkeypatch):
-    """Also where an earlier export left files, and where a name is none for a file."""
+    """This holds if an earlier export left files in the folder, and for an asset name that is no valid file name."""
     monkeypatch.setattr("mitsplat.frames.mitsuba_xml.settle_layout", every_entry)
     for name in ("nut", "a/b"):
         for folder in ("nut", "other_nut"):

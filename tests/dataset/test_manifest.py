@@ -1,4 +1,4 @@
-"""Lines with checksums: damage is named, and a torn end repaired."""
+"""Manifest lines with checksums: damage is reported, and an incomplete last line is repaired."""
 
 import json
 

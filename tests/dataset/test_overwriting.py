@@ -1,4 +1,4 @@
-"""What a dataset's folder holds when something is refused, made again or divided anew."""
+"""Content of a dataset's folder after a refusal, a rewrite or a new split."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def write(scene: Scene, out: Path, **options: Any) -> Path:
 
 
 def with_wide_shape(scene: Scene) -> Scene:
-    """The scene with a table of 40 m, as of wrong units."""
+    """Return the scene with a table of 40 m, a size that results from wrong units."""
     table = {"name": "table", "box": {"size": [40, 40, 0.02], "position": [0, 0, -0.01]}}
     spec = type(scene.spec)(**{**scene.spec.model_dump(), "shapes": (table,)})
     return replace(make_scene(spec, scene.path.parent), path=scene.path)
@@ -67,7 +67,7 @@ def test_a_damaged_shard_keeps_the_earlier_merged_dataset(scene: Scene, tmp_path
     whole = merge_shards(shards, tmp_path / "whole").path
     before = contents(whole)
     damaged = shards[1] / "labels/train/000004.txt"
-    damaged.unlink()  # which is a further name of the whole's
+    damaged.unlink()  # a hard link to the file of the merged dataset
     damaged.write_text("0 0 0\n")
     with pytest.raises(InputError, match=f"{damaged}: must have the SHA-256"):
         merge_shards(shards, whole, overwrite=True)
@@ -83,7 +83,7 @@ def test_a_shard_without_images_is_not_merged(scene: Scene, tmp_path: Path) -> N
 
 
 def test_overwriting_keeps_files_of_other_programs(scene: Scene, tmp_path: Path) -> None:
-    """Of formats that the dataset has not, and what looks like a file that is being written."""
+    """The kept files are in folders of unused formats, or have the name of a partially written file."""
     out = write(scene, tmp_path / "out", frames=2)
     for name in ("colmap/database.db", "depth/a.png", "annotations/mine.json", "notes/.mine.part"):
         (out / name).parent.mkdir(exist_ok=True)
@@ -111,7 +111,7 @@ def test_folds_are_removed_when_images_are_added(
 ) -> None:
     out = write(scene, tmp_path / "out", frames=4)
     write_folds(out, 2)
-    assert len(list(out.rglob("fold*_train.txt"))) == 4  # for two tasks
+    assert len(list(out.rglob("fold*_train.txt"))) == 4  # two tasks
     write(scene, out)
     assert not list(out.rglob("fold*_*")) and not list(out.rglob("folds"))
     assert caplog.messages == [
@@ -120,7 +120,7 @@ def test_folds_are_removed_when_images_are_added(
     write_folds(out, 3)
     write_folds(out, 2)
     assert not list(out.rglob("fold3*")) and len(list(out.rglob("fold2*.*"))) == 6
-    write(scene, out)  # adds nothing
+    write(scene, out)  # adds no image
     assert len(list(out.rglob("fold2*.*"))) == 6
 
 

@@ -1,4 +1,4 @@
-"""Runs that would end in nothing, or in more than the machine holds, are refused before they start, with the cause."""
+"""Preflight checks: runs that would produce no labels or exceed this machine are refused with the cause."""
 
 import re
 import shutil
@@ -27,7 +27,7 @@ from tests.dataset.test_write import render, settle
 
 
 def path_of(*eyes, target=(0, 0, 0.02), **intrinsics):
-    """A camera on a path that looks from each eye to a target."""
+    """Describe a camera path with views from each eye to the target."""
     lens = {"intrinsics": intrinsics} if intrinsics else {}
     return {"kind": "path", "keys": [{"eye": list(eye), "target": list(target)} for eye in eyes], **lens}
 
@@ -58,7 +58,7 @@ HOPELESS = {
 
 @pytest.fixture
 def machine(monkeypatch):
-    """One with 8 GiB of memory and 10 of disk."""
+    """Mock a machine with 8 GiB of memory and 10 GiB of free disk space."""
     monkeypatch.setattr(prospects, "unused_memory", lambda: 8.0)
     monkeypatch.setattr(shutil, "disk_usage", lambda path: shutil._ntuple_diskusage(2**40, 0, 10 * 2**30))
 
@@ -109,7 +109,7 @@ def test_check_and_render_report_the_same_fault(scene_data, write_scene, tmp_pat
 
 @pytest.mark.usefixtures("machine")
 def test_scenes_that_may_work_are_not_refused(scene_data, write_scene):
-    """Closed rooms around camera and objects, close-ups, background without objects."""
+    """Accepted: closed rooms around camera and objects, close-ups, and background without objects."""
     room = {"name": "room", "box": {"size": [3, 3, 3], "position": [0, 0, 1.39]}, "visible": True, "collider": False}
     fine = [
         {"shapes": [*scene_data["shapes"], room]},
@@ -173,7 +173,10 @@ def test_the_cost_of_checks_does_not_grow_with_layouts(scene_data, write_scene, 
 
 
 def test_points_inside_agrees_with_rings_and_open_boxes():
-    """Of a ring: in its ring and not in its hole, whichever way it is wound; of an open box, where most of it is."""
+    """Points in the ring are inside and points in its hole are outside, for both face windings.
+
+    For an open box, most of its volume is inside.
+    """
     ring = trimesh.creation.annulus(r_min=0.5, r_max=1.0, height=0.4)
     points = np.array([[0, 0, 0], [0.75, 0, 0], [0, -0.75, 0.1], [0.75, 0, 0.3], [0.4, 0, 0.0], [5, 0, 0]])
     expected = [False, True, True, False, False, False]
@@ -185,7 +188,7 @@ def test_points_inside_agrees_with_rings_and_open_boxes():
 
 
 def test_visibility_of_boxes_agrees_with_many_points():
-    """Against many points of boxes anywhere, for lenses of all widths."""
+    """Visibility equals that of many points sampled in randomly placed boxes, for lenses of all fields of view."""
     rng, cases = np.random.default_rng(4), []
     for _ in range(200):
         eye, target = rng.normal(size=(2, 3))
@@ -217,7 +220,10 @@ def test_a_tolerance_is_refused_before_anything_is_rendered(
 
 
 def test_a_dataset_without_labels_ends_with_status_4(scene_data, write_scene, tmp_path, monkeypatch, capsys):
-    """Status 4, and why; not where there is nothing to label, nor for a shard, whose others may have labels."""
+    """The message states the cause. Scenes without objects to label end with status 0.
+
+    Single shards end with status 0 too, because the other shards may have labels.
+    """
     laid_out = settle
 
     def away(scene, index, *, layout):

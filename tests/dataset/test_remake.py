@@ -1,4 +1,4 @@
-"""One frame made again: the bytes of its dataset, whatever was made before it, and what is told where they differ."""
+"""Single frames made again: the same bytes as in the dataset for any earlier frames, and reports of differences."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def made(scene: Scene, tmp_path: Path) -> Path:
 
 
 def test_remade_frames_have_the_same_bytes(scene_data: dict[str, Any], write_scene: WriteScene, tmp_path: Path) -> None:
-    """From the scene alone: nothing but the comparison looks at the dataset."""
+    """The frame is made from the scene alone. Only the comparison reads the dataset."""
     path = write_scene(
         scene_data
         | {
@@ -75,7 +75,7 @@ def test_a_folder_with_other_files_is_refused(scene: Scene, made: Path) -> None:
 
 
 def test_remaking_a_frame_does_not_change_the_dataset(scene: Scene, made: Path, tmp_path: Path) -> None:
-    """Another process may be writing it: its last line may be torn."""
+    """Another process may be writing the dataset, so its last line may be incomplete."""
     with (made / "manifest.jsonl").open("ab") as file:
         file.write(b'{"index":1,"layout"')
     before = {path: path.read_bytes() for path in made.rglob("*") if path.is_file()}

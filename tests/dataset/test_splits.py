@@ -1,4 +1,4 @@
-"""Datasets with a test split and with folds: no layout in two of them, classes spread, files that can be read."""
+"""Datasets with a test split and with folds: disjoint layouts, evenly spread classes, and readable list files."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def test_folds_list_existing_images_and_labels(made: Path, capsys: pytest.Captur
             assert sorted(named["train"] + named["val"]) == sorted(f"./{image}" for image in images)
             for split, path in lists.items():
                 for line in named[split]:
-                    image = Path(line.replace("./", f"{path.parent}/"))  # as Ultralytics does
+                    image = Path(line.replace("./", f"{path.parent}/"))  # the path rule of Ultralytics
                     assert image.is_file()
                     assert Path(str(image).replace("/images/", "/labels/")).with_suffix(".txt").is_file()
         layouts = {s: {images[line.removeprefix("./")]["layout"] for line in lines} for s, lines in named.items()}
@@ -114,7 +114,11 @@ def test_overwriting_removes_folds(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("folds", [2, 5, 7])
 def test_folds_distribute_classes_and_keep_layouts_together(folds: int) -> None:
-    """Layouts to one; what is in as many layouts as there are folds is in each, and the rest within a few."""
+    """Fold sizes differ by at most one layout.
+
+    A class that is in as many layouts as there are folds is in each fold. Counts of the other classes
+    differ by at most 6.
+    """
     rng = np.random.default_rng(folds)
     layouts = {i: Counter({"nut": int(rng.integers(0, 4)), "bolt": int(rng.integers(1, 3))}) for i in range(101)}
     for number in rng.choice(101, folds, replace=False):

@@ -1,4 +1,4 @@
-"""Dataset folders: content, resumption, interruption and refusals, with a synthetic renderer for the real one."""
+"""Dataset folders: content, resumption, interruption and refusals, with a synthetic renderer."""
 
 import hashlib
 import json
@@ -42,7 +42,7 @@ PARSE_LINE = manifest.parse_line
 
 
 def settle(scene, index, *, progress):
-    """Three objects at random places; no physics."""
+    """Place three objects at random positions, without physics."""
     rng = random_stream(scene.spec.seed, "synthetic layout", index)
     instances = []
     for i in range(3):
@@ -53,7 +53,7 @@ def settle(scene, index, *, progress):
 
 
 def render(scene, index, *, layout):
-    """A disc per object on noise."""
+    """Draw a disc per object on noise."""
     plan = plan_frame(scene, index, layout)
     camera = plan.camera
     rng = np.random.default_rng(plan.seed)
@@ -70,7 +70,7 @@ def render(scene, index, *, layout):
 
 @dataclass(frozen=True)
 class RenderUntil:
-    """Renders as :func:`render`, but raises at one frame."""
+    """Renderer that acts as :func:`render` but raises an exception at one frame."""
 
     index: int
     error: type[BaseException]
@@ -92,7 +92,7 @@ def write(scene, out, **options):
 
 
 def contents(root, *, without=("timings.jsonl", "runs.jsonl", ".lock")):
-    """SHA-256 of every file that must not depend on how the dataset was made."""
+    """Return the SHA-256 of every file that must not depend on how the dataset was made."""
     files = (path for path in sorted(root.rglob("*")) if path.is_file() and path.name not in without)
     return {str(path.relative_to(root)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
 
@@ -124,7 +124,7 @@ class TestContent:
         assert all(set(line) == {"index", "march", "settle", "write"} for line in timings)
 
     def test_the_manifest_is_read_once_to_open_and_once_to_end(self, scene, tmp_path, monkeypatch):
-        """Whatever the number of formats: reading and hashing it is most of what the end of a run takes."""
+        """The number of formats does not matter. Reading and hashing take most of the time at the end of a run."""
         read = []
         monkeypatch.setattr(manifest, "parse_line", lambda line: read.append(1) or PARSE_LINE(line))
         write(scene, tmp_path / "out")
@@ -391,7 +391,7 @@ class TestRefusals:
         self.refuse(scene, tmp_path / "out/deeper", "cannot write into .*deeper: Not a directory")
 
     def test_a_read_only_folder_is_refused(self, scene, tmp_path, monkeypatch):
-        """Simulated: the tests may run as root, who may write anywhere."""
+        """The refusal is simulated, because the tests may run as root, who may write anywhere."""
 
         def denied(*args, **options):
             raise PermissionError(13, "Permission denied", "out")
@@ -421,7 +421,7 @@ class TestDevice:
         assert [(run["device"], run.get("gpus")) for run in runs] == [("cpu", None)] * 2
 
     def test_a_gpu_is_recorded_with_its_name(self, scene, tmp_path, monkeypatch):
-        """Without one: what renders is drawn, and the process is told that it has one already."""
+        """The test needs no GPU: frames are drawn, and the current device of the process is mocked."""
         gpus = tuple(Gpu(name, 80 * 2**30, number, "", "") for number, name in enumerate(("One", "Two")))
         monkeypatch.setattr(pool, "current_device", lambda: Device("cuda", gpus))
         write(scene, tmp_path / "out", frames=1, device=Device("cuda", gpus))
@@ -431,7 +431,7 @@ class TestDevice:
         assert read_content(tmp_path / "out")["device"] == "cuda"
 
     def begun_on(self, out, device):
-        """Change the device that a dataset records, or remove it."""
+        """Change or remove the device that a dataset records."""
         content = json.loads((out / "dataset.json").read_bytes())
         del content["device"]
         (out / "dataset.json").write_text(json.dumps(content | ({"device": device} if device else {}), indent=1))
@@ -447,7 +447,7 @@ class TestDevice:
             "--device cuda, or --any-device for frames of both"
         )
         assert write(scene, out, any_device=True).rendered == 10
-        assert json.loads((out / "dataset.json").read_bytes())["device"] == "cuda"  # how it was begun
+        assert json.loads((out / "dataset.json").read_bytes())["device"] == "cuda"  # device at the start
         assert {**contents(out), "dataset.json": ""} == {**undisturbed, "dataset.json": ""}
 
     def test_a_dataset_without_a_device_counts_as_cpu(self, scene, tmp_path):
@@ -464,7 +464,7 @@ class TestDevice:
             read_content(tmp_path / "out")
 
     def test_workers_use_the_device_of_their_caller(self, scene, tmp_path):
-        """A worker says what it renders on; before, one fell back to LLVM whatever its caller had chosen."""
+        """Each worker records its device. Earlier versions fell back to LLVM for any device of the caller."""
         write(scene, tmp_path / "out", render=Told(tmp_path), workers=2, device="cpu")
         assert {path.read_text() for path in tmp_path.glob("variant-*")} == {"llvm_ad_rgb"}
 
@@ -489,7 +489,7 @@ class TestDevice:
 
 @dataclass(frozen=True)
 class Told:
-    """Renders as :func:`render`, and leaves Mitsuba's variant in a file."""
+    """Renderer that acts as :func:`render` and writes Mitsuba's variant to a file."""
 
     folder: Path
 

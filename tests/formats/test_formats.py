@@ -1,4 +1,4 @@
-"""Every format read back: adversarial frames are written, and rasterising each file gives the same masks again."""
+"""Round trip of every format: adversarial frames are written, and rasterising each file gives the same masks."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def disc(ids: np.ndarray, centre: tuple[int, int], radius: int, value: int) -> n
 
 @dataclass(frozen=True)
 class Drawn:
-    """Instances drawn one over the other: the truth of what each covers, and of what remains visible."""
+    """Instances drawn one over the other, with the ground truth of covered and of visible pixels."""
 
     covered: dict[int, tuple[np.ndarray, int, int]]
 
@@ -62,7 +62,7 @@ class Drawn:
 
 
 def shape(draw: Any, *, margin: int = 60) -> tuple[np.ndarray, int, int]:
-    """A mask drawn on a canvas that reaches ``margin`` pixels beyond the image."""
+    """Draw a mask on a canvas that extends ``margin`` pixels beyond the image."""
     canvas = np.zeros((HEIGHT + 2 * margin, WIDTH + 2 * margin), dtype=np.int32)
     draw(canvas, margin)
     return canvas > 0, -margin, -margin
@@ -100,7 +100,7 @@ LAYOUTS = {
 
 
 def frame_of(drawn: Drawn, index: int, *, rules: LabelRules | None = None) -> Any:
-    """The frame that a renderer would make of the drawing."""
+    """Build the frame that a renderer would make of the drawing."""
     ids = drawn.ids
     rng = np.random.default_rng(index)
     instances = []
@@ -140,7 +140,7 @@ def frame_of(drawn: Drawn, index: int, *, rules: LabelRules | None = None) -> An
 
 @dataclass(frozen=True)
 class Written:
-    """A dataset of all layouts in all formats."""
+    """Dataset of all layouts in all formats."""
 
     root: Path
     frames: list[Any]
@@ -223,7 +223,7 @@ class TestYolo:
                 assert not (mask & ~back).any()
                 if cv2.connectedComponents(mask.astype(np.uint8), connectivity=8)[0] == 2:
                     assert iou(mask, back) >= 0.99
-                else:  # a bridge crosses what hides the instance, and is painted by readers
+                else:  # readers also fill the bridge that crosses the occluder
                     assert np.count_nonzero(back & ~mask) <= 20
 
     def test_boxes_equal_those_of_the_labels(self, written: Written) -> None:
@@ -238,7 +238,7 @@ class TestYolo:
         for frame, rows in self.rows(written, "yolo-obb"):
             for label, mask, row in zip(frame.labels.instances, masks(frame), rows, strict=True):
                 corners = np.array(row[1:]).reshape(4, 2) * (WIDTH, HEIGHT)
-                middle, size, _ = cv2.minAreaRect(corners.astype(np.float32))  # as Ultralytics reads them
+                middle, size, _ = cv2.minAreaRect(corners.astype(np.float32))  # as Ultralytics reads rotated boxes
                 assert 0 <= middle[0] <= WIDTH and 0 <= middle[1] <= HEIGHT
                 x0, y0, x1, y1 = label.box
                 assert np.prod(size) <= (x1 - x0) * (y1 - y0) + 0.5
@@ -280,10 +280,10 @@ class TestYolo:
         depth = np.full((HEIGHT, WIDTH), 0.9)
         silhouettes = {1: Silhouette.cropped(ids == 1, 0, 0)}
         pose = np.eye(4)
-        pose[2, 3] = 0.1  # 0.9 m before the camera
+        pose[2, 3] = 0.1  # 0.9 m in front of the camera
         instances = [Seen(1, 0, pose), Seen(2, 0, np.eye(4))]
         covered = ids.copy()
-        covered[HEIGHT // 2 - 5 : HEIGHT // 2 + 5, WIDTH // 2 - 5 : WIDTH // 2 + 5] = 2  # over both points
+        covered[HEIGHT // 2 - 5 : HEIGHT // 2 + 5, WIDTH // 2 - 5 : WIDTH // 2 + 5] = 2  # covers both points
         for shown, expected in ((ids, [VISIBLE, HIDDEN]), (covered, [HIDDEN, HIDDEN])):
             truth = Truth(shown, shown, silhouettes, depth)
             labels = label_instances(truth, instances, CLASSES, LabelRules(), camera=CAMERA, keypoints=POINTS)
@@ -325,7 +325,7 @@ class TestCoco:
             assert read.cats[1]["keypoints"] == ["head", "tip"]
 
     def test_panoptic_annotations_agree_with_their_picture(self, written: Written) -> None:
-        """By the rules that panopticapi checks: ids in picture and annotation are the same, areas are pixel counts."""
+        """panopticapi's rules hold: image and annotation have the same ids, and areas are pixel counts."""
         for split in ("train", "val"):
             content = json.loads((written.root / f"annotations/panoptic_{split}.json").read_text())
             kinds = {category["id"]: category for category in content["categories"]}
@@ -358,7 +358,7 @@ class TestCoco:
 
 
 class TestBop:
-    """Against docs/bop_datasets_format.md and scripts/calc_gt_info.py of the BOP toolkit."""
+    """BOP output against docs/bop_datasets_format.md and scripts/calc_gt_info.py of the BOP toolkit."""
 
     def test_scenes_have_cameras_poses_masks_and_depth_of_the_frames(self, written: Written) -> None:
         for frame, record in written.pairs:
@@ -394,7 +394,7 @@ class TestBop:
 
     @staticmethod
     def bbox(mask: np.ndarray) -> list[int]:
-        """As misc.calc_2d_bbox."""
+        """Compute a bounding box by the rule of misc.calc_2d_bbox."""
         ys, xs = mask.nonzero()
         return [int(xs.min()), int(ys.min()), int(xs.max() - xs.min()), int(ys.max() - ys.min())]
 
@@ -437,7 +437,7 @@ class TestMaps:
             np.testing.assert_array_equal(png(written.root / "depth" / name), np.where(frame.instance > 0, 8000, 10000))
             assert record["depth_sensor_scale"] == 0.1
             measured = png(written.root / "depth-sensor" / name)
-            assert not measured[frame.instance > 0].any()  # which are nearer than what is measured
+            assert not measured[frame.instance > 0].any()  # nearer than the sensor's range
             assert set(np.unique(measured)) == {0, 10000}
             normals = png(written.root / "normals" / name)
             assert (normals[frame.instance > 0] == [32768, 13107, 58982]).all()
@@ -458,7 +458,7 @@ class TestMaps:
         assert maps.depth_picture(depth).tolist()[0][:2] == [0, 1]
 
     def test_flow_of_a_plane_before_a_camera_that_moves_sideways(self, written: Written) -> None:
-        """A camera that moves by b across a plane at depth z shifts its picture by -f b / z."""
+        """A camera that moves by b parallel to a plane at depth z shifts the plane's image by -f b / z."""
         for frame, record in written.pairs:
             flow = cv2.readOpticalFlow(str(written.root / f"flow/{record['split']}/{frame.index:06d}.flo"))
             assert flow.shape == (HEIGHT, WIDTH, 2)
@@ -520,7 +520,10 @@ class TestCatalogue:
 
 
 def test_polygons_of_visible_parts_survive_resampling() -> None:
-    """Instances of more than 200 pixels: IoU >= 0.99 unless something cuts them in parts, which a bridge must cross."""
+    """IoU is at least 0.99 for instances of more than 200 pixels in one part.
+
+    An instance cut into parts needs a bridge across the occluder.
+    """
     for covered in LAYOUTS.values():
         for label in frame_of(Drawn(covered), 0).labels.instances:
             mask = whole(label, (HEIGHT, WIDTH))

@@ -21,6 +21,8 @@ from mitsplat.errors import InputError, MissingResourceError
 from mitsplat.fit.image_metrics import psnr_of
 from mitsplat.images.colour import decode_srgb
 
+pytestmark = pytest.mark.usefixtures("meshes_tried_once")
+
 COLOUR = (200, 120, 40)
 QUICK = BakeSettings(gaussians=300, sh_degree=0, directions=8, samples=4, fit_steps=0, fit_views=1, verify_views=1)
 

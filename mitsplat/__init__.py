@@ -47,14 +47,14 @@ _HOME = {
     "import_splats": "importing.splat_import",
     "load_scene": "scene.loading.scene_loading",
     "make_scene": "scene.loading.scene_loading",
-    "remake_frame": "dataset.remake",
     "render_frame": "frames.frame",
     "render_frames": "frames.sequence",
     "render_splats": "renderer.layers",
+    "rerender_frame": "dataset.rerender",
     "settle_layout": "physics.settle",
     "use_device": "runtime.device",
     "write_dataset": "dataset.write",
-    "write_frames": "dataset.given_frames",
+    "write_frames": "dataset.python_frames",
 }
 
 __all__ = sorted(_HOME)
@@ -63,8 +63,8 @@ if TYPE_CHECKING:
     from mitsplat.asset import Asset as Asset
     from mitsplat.bake.bake import bake_asset as bake_asset
     from mitsplat.capture.pipeline.capture_pipeline import capture_photos as capture_photos
-    from mitsplat.dataset.given_frames import write_frames as write_frames
-    from mitsplat.dataset.remake import remake_frame as remake_frame
+    from mitsplat.dataset.python_frames import write_frames as write_frames
+    from mitsplat.dataset.rerender import rerender_frame as rerender_frame
     from mitsplat.dataset.write import write_dataset as write_dataset
     from mitsplat.errors import InputError as InputError
     from mitsplat.errors import LateDeviceError as LateDeviceError

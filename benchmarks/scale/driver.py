@@ -47,7 +47,7 @@ def split_of(index: int) -> str:
 
 
 class Frames:
-    """Stands for :class:`mitsplat.dataset.frame_job.FrameMaker`: frames whose files workers have put in the folder."""
+    """Stands for :class:`mitsplat.dataset.frame_job.FrameJob`: frames whose files workers have put in the folder."""
 
     seconds, cpu = 0.0, 0.0
     """Time that workers would have spent, in all."""
@@ -228,7 +228,7 @@ def main() -> None:
 def measure(options: argparse.Namespace) -> None:
     """Both runs."""
     Frames.instances = options.instances
-    dataset.FrameMaker = Frames  # type: ignore[misc, assignment]
+    dataset.FrameJob = Frames  # type: ignore[misc, assignment]
     os.fsync = syncs = Syncs(options.sync_every)  # type: ignore[assignment]
     with tempfile.TemporaryDirectory(dir=options.folder) as folder:
         path, out = Path(folder) / "scene.yaml", Path(folder) / "out"

@@ -85,7 +85,7 @@ def audit_dataset(root: str | Path, visit: Callable[[Record], object] = lambda r
     frames = instances = low = files = 0
     for record in records:
         visit(record)
-        frame, damaged = DecodedFrame.of(root, record, content), dict(_check_hashes(root, record))
+        frame, damaged = DecodedFrame(root, record, content), dict(_check_hashes(root, record))
         violations += damaged.items()
         violations += expected.check_record(record)
         violations += ((f"manifest.jsonl, frame {frame.index}", text) for text in _check_labels(frame))

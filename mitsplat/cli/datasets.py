@@ -203,9 +203,9 @@ def render(
 
 def _render_again(scene: Scene, index: int, dataset: Path, device: str | Device | None) -> None:
     """Render one frame again and exit with status 1 if it differs from the frame in the dataset."""
-    from mitsplat.dataset.remake import remake_frame
+    from mitsplat.dataset.rerender import rerender_frame
 
-    made = remake_frame(scene, index, Path(f"{dataset}-{index:06d}"), dataset=dataset, device=device)
+    made = rerender_frame(scene, index, Path(f"{dataset}-{index:06d}"), dataset=dataset, device=device)
     typer.echo(f"frame {index}: {made.path} ({len(made.record['files'])} files)")
     if not made.compared:
         typer.echo(f"not compared: {dataset} has no frame {index}")

@@ -8,18 +8,18 @@ from __future__ import annotations
 
 from mitsplat.dataset.dataset_folder import Shard
 from mitsplat.dataset.folds import Fold, write_folds
-from mitsplat.dataset.given_frames import write_frames
-from mitsplat.dataset.remake import RemadeFrame, remake_frame
+from mitsplat.dataset.python_frames import write_frames
+from mitsplat.dataset.rerender import RerenderedFrame, rerender_frame
 from mitsplat.dataset.shards import merge_shards
 from mitsplat.dataset.write import DatasetSummary, write_dataset
 
 __all__ = [
     "DatasetSummary",
     "Fold",
-    "RemadeFrame",
+    "RerenderedFrame",
     "Shard",
     "merge_shards",
-    "remake_frame",
+    "rerender_frame",
     "write_dataset",
     "write_folds",
     "write_frames",

@@ -14,7 +14,7 @@ from mitsplat.labels.labels import Labels
 from mitsplat.labels.overlay import draw_labels
 from mitsplat.storage.files import Record, write_file
 
-_COLUMNS = 4
+_TILES, _COLUMNS = 16, 4
 _TILE_WIDTH = 480
 _CAPTION = 24
 _GAP = 6
@@ -26,11 +26,11 @@ def spread(total: int, count: int) -> set[int]:
 
 
 class ContactSheet:
-    """Picture of up to ``count`` labelled frames, evenly spread over the ``total`` frames of the dataset."""
+    """Picture of up to :data:`_TILES` labelled frames, evenly spread over the ``total`` frames of the dataset."""
 
-    def __init__(self, root: Path, total: int, *, count: int = 16) -> None:
+    def __init__(self, root: Path, total: int) -> None:
         self._root = root
-        self._selected = spread(total, count)
+        self._selected = spread(total, _TILES)
         self._count = 0
         self._tiles: list[ByteImage] = []
 

@@ -13,21 +13,19 @@ import shlex
 import shutil
 import socket
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from functools import partial
 from itertools import zip_longest
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any
+from typing import IO, TYPE_CHECKING
 
 from pydantic import BaseModel, ConfigDict
 from ruamel.yaml import YAML
 
 from mitsplat.dataset.contact_sheet import ContactSheet
-from mitsplat.dataset.inputs import describe_inputs
-from mitsplat.dataset.manifest import Manifest, append_line, cut_torn_line
-from mitsplat.dataset.own_files import (
+from mitsplat.dataset.dataset_files import (
     CONTENT,
     LOCK,
     MANIFEST,
@@ -40,10 +38,13 @@ from mitsplat.dataset.own_files import (
     remove_dataset,
     remove_partial,
 )
+from mitsplat.dataset.inputs import describe_inputs
+from mitsplat.dataset.manifest import Manifest, append_line, remove_incomplete_line
 from mitsplat.dataset.schema import check_record
 from mitsplat.errors import InputError, PartialResultError
 from mitsplat.formats.registry import Catalogue, CollectionWriter
 from mitsplat.storage.files import (
+    JsonObject,
     Record,
     open_in_place,
     open_regular,
@@ -59,7 +60,7 @@ if TYPE_CHECKING:
     from mitsplat.runtime.device import Kind
     from mitsplat.scene.scene import Scene
 
-IMPLIED = {FORMAT_VERSION: 1, "device": "cpu"}
+DEFAULT_CONTENT = {FORMAT_VERSION: 1, "device": "cpu"}
 """Default values of keys that are absent in ``dataset.json``."""
 _MAX_LOCK_TEXT = 200
 """Maximum number of characters of a lock file that an error message shows."""
@@ -129,7 +130,7 @@ class _StoredShard(BaseModel):
 @contextmanager
 def open_folder(
     out: Path,
-    content: dict[str, Any],
+    content: JsonObject,
     scene_file: Path,
     shard: dict[str, int] | None,
     *,
@@ -172,7 +173,7 @@ def open_folder(
                 _prepare(out, scene_file, content, shard)
                 yield Manifest(
                     out / MANIFEST,
-                    keep=lambda record: missing_file(out, record) is None,
+                    is_valid=lambda record: missing_file(out, record) is None,
                     check=partial(check_record, content=content),
                 )
         finally:
@@ -186,7 +187,7 @@ def _lock_error(out: Path, error: OSError) -> str:
 
 
 @contextmanager
-def open_finished(out: Path, content: Mapping[str, Any], *, write: bool) -> Iterator[Manifest]:
+def open_finished(out: Path, content: JsonObject, *, write: bool) -> Iterator[Manifest]:
     """Lock a finished dataset against writers and yield its manifest.
 
     Args:
@@ -211,7 +212,7 @@ def open_finished(out: Path, content: Mapping[str, Any], *, write: bool) -> Iter
             _take_lock(out, lock)
         if write:
             refuse_links(out)
-        yield Manifest(out / MANIFEST, check=partial(check_record, content=content), grow=False)
+        yield Manifest(out / MANIFEST, check=partial(check_record, content=content), writable=False)
 
 
 def _take_lock(out: Path, lock: IO[str]) -> None:
@@ -237,7 +238,7 @@ def append_run(out: Path, workers: int | None, device: str, gpus: Sequence[str] 
 def finish_folder(
     out: Path,
     manifest: Manifest,
-    content: dict[str, Any],
+    content: JsonObject,
     catalogue: Catalogue,
     visit: Callable[[Record], object],
 ) -> None:
@@ -254,20 +255,20 @@ def finish_folder(
         PartialResultError: If a file was removed in the meantime.
     """
 
-    def check(missing: Path | None) -> None:
-        if missing is not None:
-            raise PartialResultError(f"{missing}: must not be removed while its dataset is written; run again")
+    def refuse_missing(file: Path | None) -> None:
+        if file is not None:
+            raise PartialResultError(f"{file}: must not be removed while its dataset is written; run again")
 
-    def describe(record: Record) -> None:
-        check(missing_file(out, record))
+    def add(record: Record) -> None:
+        refuse_missing(missing_file(out, record))
         collection.add(record)
         sheet.add(record)
         visit(record)
 
-    check(None if (out / CONTENT).is_file() else out / CONTENT)
+    refuse_missing(None if (out / CONTENT).is_file() else out / CONTENT)
     sheet = ContactSheet(out, len(manifest))
     with CollectionWriter(out, catalogue, content["scene"]["output"]["formats"]) as collection:
-        manifest.sort(describe)
+        manifest.sort(add)
         collection.commit()
     sheet.write(out / SHEET)
 
@@ -283,7 +284,7 @@ def _check_is_dataset(out: Path) -> None:
 
     Other files must not be mixed with a dataset or removed.
     """
-    present: Any = None
+    present: object = None
     try:
         present = read_json(out / CONTENT)
         is_dataset = isinstance(present, dict) and "mitsplat" in present
@@ -297,16 +298,16 @@ def _check_is_dataset(out: Path) -> None:
 
 
 def _check_resumable(
-    out: Path, content: dict[str, Any], shard: dict[str, int] | None, *, resume: bool, any_device: bool
+    out: Path, content: JsonObject, shard: dict[str, int] | None, *, resume: bool, any_device: bool
 ) -> None:
     """Refuse an existing dataset if ``resume`` is False, or if another scene, device or shard started it."""
     if not (out / CONTENT).exists():
         return
     if not resume:
         raise InputError(f"{out} already holds a dataset; resume it or overwrite it")
-    present = {**IMPLIED, **read_json(out / CONTENT)}
-    elsewhere: dict[str, Any] = {"libraries": None, "device": None}
-    if difference := first_difference({**present, **elsewhere}, {**content, **elsewhere}):
+    present = {**DEFAULT_CONTENT, **read_json(out / CONTENT)}
+    not_compared = {"libraries": None, "device": None}
+    if difference := first_difference(present | not_compared, content | not_compared):
         key, before, now = difference
         raise InputError(f"{out} cannot be resumed: {key} was {before} and is {now}; overwrite it or choose another")
     if present["device"] != content["device"] and not any_device:
@@ -343,7 +344,7 @@ def read_shard(out: Path) -> dict[str, int] | None:
     return stored.model_dump()
 
 
-def _prepare(out: Path, scene_file: Path, content: dict[str, Any], shard: dict[str, int] | None) -> None:
+def _prepare(out: Path, scene_file: Path, content: JsonObject, shard: dict[str, int] | None) -> None:
     """Write the files that describe the run, create the other files and folders, and remove unfinished files and lines.
 
     ``dataset.json`` marks the folder as a dataset, so it is written before the other files.
@@ -359,11 +360,11 @@ def _prepare(out: Path, scene_file: Path, content: dict[str, Any], shard: dict[s
     for file in (out / name for name in (MANIFEST, TIMINGS, RUNS)):
         if file.is_file() and file.stat().st_nlink > 1:  # the original of a hard-linked copy must not change
             write_file(file, partial(shutil.copyfile, file))
-    cut_torn_line(out / TIMINGS)
-    cut_torn_line(out / RUNS)
+    remove_incomplete_line(out / TIMINGS)
+    remove_incomplete_line(out / RUNS)
 
 
-def _write_scene(scene_file: Path, content: dict[str, Any], path: Path) -> None:
+def _write_scene(scene_file: Path, content: JsonObject, path: Path) -> None:
     """Copy the scene file; write an equivalent file for a scene made in Python."""
     if scene_file.exists():
         shutil.copyfile(scene_file, path)
@@ -371,21 +372,13 @@ def _write_scene(scene_file: Path, content: dict[str, Any], path: Path) -> None:
         YAML(typ="safe", pure=True).dump(content["scene"], path)
 
 
-def content_of(scene: Scene, catalogue: Catalogue, device: Kind) -> dict[str, Any]:
+def content_of(scene: Scene, catalogue: Catalogue, device: Kind) -> JsonObject:
     """Return the content of ``dataset.json``: everything that determines the bytes of a dataset, and library versions.
 
     The library versions are informative only; they are not compared on resume.
     """
-    libraries = (
-        "mitsuba",
-        "drjit",
-        "newton",
-        "mujoco",
-        "mujoco-warp",
-        "warp-lang",
-        "numpy",
-        "opencv-contrib-python-headless",
-    )
+    simulation = ("mitsuba", "drjit", "newton", "mujoco", "mujoco-warp", "warp-lang")
+    libraries = (*simulation, "numpy", "opencv-contrib-python-headless")
     return {
         FORMAT_VERSION: FORMAT_VERSIONS[CONTENT],
         "device": device,
@@ -401,7 +394,7 @@ def content_of(scene: Scene, catalogue: Catalogue, device: Kind) -> dict[str, An
     }
 
 
-def first_difference(before: Any, now: Any, key: str = "") -> tuple[str, str, str] | None:
+def first_difference(before: object, now: object, key: str = "") -> tuple[str, str, str] | None:
     """Return the first difference of two JSON values, or None if they are equal.
 
     The difference is its dotted key and both values as JSON text; a missing value is ``null``.

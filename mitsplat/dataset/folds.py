@@ -19,8 +19,8 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
+from mitsplat.dataset.dataset_files import remove_folds
 from mitsplat.dataset.dataset_folder import open_finished
-from mitsplat.dataset.own_files import remove_folds
 from mitsplat.dataset.schema import read_content
 from mitsplat.errors import InputError
 from mitsplat.formats.coco import append_instances, create_instances_file, image_file

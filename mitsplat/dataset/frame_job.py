@@ -15,7 +15,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from mitsplat.dataset.own_files import LOCK
+from mitsplat.dataset.dataset_files import LOCK
 from mitsplat.errors import InputError, PartialResultError
 from mitsplat.formats.registry import Catalogue, write_frame
 from mitsplat.progress import Note
@@ -43,7 +43,7 @@ Settle = Callable[..., Layout]
 
 
 @dataclass
-class FrameMaker:
+class FrameJob:
     """Callable that renders one frame and writes its files; the unit of work of the engine."""
 
     scene: Scene
@@ -116,8 +116,8 @@ def layout_errors(path: Path) -> Iterator[None]:
 
 
 @dataclass(frozen=True)
-class Parcel:
-    """Frame that was made on another machine.
+class RemoteFrame:
+    """Frame that was rendered on another machine.
 
     Attributes:
         record: Manifest record of the frame.
@@ -131,7 +131,7 @@ class Parcel:
     contents: dict[str, bytes]
     layout: str
 
-    def unpack(self, out: Path) -> Record:
+    def write(self, out: Path) -> Record:
         """Write the files into a dataset folder; files with equal contents become hard links.
 
         Raises:
@@ -141,47 +141,43 @@ class Parcel:
         layout = out / f"layouts/{self.record['layout']:04d}.json"
         if not layout.exists():
             write_text(layout, self.layout)
-        first: dict[str, Path] = {}
+        written: dict[str, Path] = {}
         for file, digest in self.record["files"].items():
-            if digest in first:
-                found = write_file(out / file, partial(link_file, first[digest]))
+            if digest in written:
+                found = write_file(out / file, partial(link_file, written[digest]))
             else:
                 found = write_file(out / file, partial(_write_bytes, self.contents[digest]))
             if found != digest:
                 raise PartialResultError(f"{out / file}: must have the SHA-256 {digest} (got {found}); run again")
-            first.setdefault(digest, out / file)
+            written.setdefault(digest, out / file)
         return self.record
 
 
-class RemoteFrames:
-    """Settling of layouts and rendering of frames on a machine without the caller's files; results are returned.
+class RemoteFrameJob:
+    """Settling of layouts and rendering of frames on a machine without the caller's files; results are returned."""
 
-    Args:
-        maker: Callable that makes the frames.
-    """
-
-    def __init__(self, maker: FrameMaker) -> None:
-        self.maker = maker
-        self._images = {name: (path.suffix, path.read_bytes()) for name, path in maker.scene.images.items()}
+    def __init__(self, job: FrameJob) -> None:
+        self.job = job
+        self._images = {name: (path.suffix, path.read_bytes()) for name, path in job.scene.images.items()}
         self._unpacked = False
 
     def cached_layout(self, layout: int) -> str | None:
         """Return a layout from the dataset folder, or None; must be called on the machine that has the folder."""
-        path = self.maker.out / f"layouts/{layout:04d}.json"
+        path = self.job.out / f"layouts/{layout:04d}.json"
         return path.read_text() if path.exists() else None
 
     def settle(self, layout: int) -> str:
         """Settle a layout and return it as JSON."""
-        return self.maker.settle_to_json(layout, lambda text: None)
+        return self.job.settle_to_json(layout, lambda text: None)
 
-    def make(self, index: int, layout: str) -> Parcel:
+    def make(self, index: int, layout: str) -> RemoteFrame:
         """Make frame ``index`` of a layout."""
         self._unpack_images()
         with tempfile.TemporaryDirectory(prefix="mitsplat-") as folder:
-            self.maker.out = Path(folder)
-            record, seconds = self.maker.write(index, self.maker.load_layout(layout))
+            self.job.out = Path(folder)
+            record, seconds = self.job.write(index, self.job.load_layout(layout))
             contents = {digest: (Path(folder) / file).read_bytes() for file, digest in record["files"].items()}
-        return Parcel(record, seconds, contents, layout)
+        return RemoteFrame(record, seconds, contents, layout)
 
     def _unpack_images(self) -> None:
         """Write the images of lights into a temporary folder, because Mitsuba reads them from files.
@@ -196,7 +192,7 @@ class RemoteFrames:
         for number, (name, (suffix, content)) in enumerate(self._images.items()):
             images[name] = folder / f"{number}{suffix}"
             images[name].write_bytes(content)
-        self.maker.scene = replace(self.maker.scene, images=images)
+        self.job.scene = replace(self.job.scene, images=images)
         self._unpacked = True
 
 

@@ -12,7 +12,7 @@ from array import array
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
-from typing import IO, Any
+from typing import IO
 
 from mitsplat.errors import InputError
 from mitsplat.storage.content_hash import ContentHash
@@ -31,10 +31,10 @@ class Manifest:
 
     Args:
         path: Manifest file; it is created if missing. An incomplete last line, left by an interrupted run, is cut off.
-        keep: Predicate that is called once per record while the file is read. If it returns False, the record is
+        is_valid: Predicate that is called once per record while the file is read. If it returns False, the record is
             ignored. All records count if None.
         check: Function that raises ValueError if a line with a valid checksum is no record of the dataset.
-        grow: Allow the file to be changed. If False, an incomplete last line stays in the file, but is ignored.
+        writable: Allow the file to be changed. If False, an incomplete last line stays in the file, but is ignored.
 
     Raises:
         InputError: If any other line is damaged.
@@ -43,53 +43,52 @@ class Manifest:
     def __init__(
         self,
         path: Path,
-        keep: Callable[[Record], bool] | None = None,
+        is_valid: Callable[[Record], bool] | None = None,
         check: Callable[[bytes, Record], object] = lambda line, record: None,
         *,
-        grow: bool = True,
+        writable: bool = True,
     ) -> None:
         self.path = path
-        self._places = _Places()
-        self._in_order = True
-        if grow:
-            cut_torn_line(path)
-        place = 0
-        last = -1
-        torn: InputError | None = None
+        self._offsets = _LineOffsets()
+        self._in_order, self._end, self._last = True, 0, -1
+        if writable:
+            remove_incomplete_line(path)
+        damaged: InputError | None = None
         with open_regular(path) as file:
             for number, line in enumerate(read_lines(file), start=1):
-                if torn is not None:
-                    raise torn
+                if damaged is not None:
+                    raise damaged
                 try:
                     if not line.endswith(b"\n"):
                         raise ValueError("the line is incomplete")
                     record = parse_line(line)
                 except ValueError as error:
-                    torn = _damaged(path, number, error)
+                    damaged = _line_error(path, number, error)
                 else:
                     try:
                         check(line, record)
                         index = _index_of(record)
                     except ValueError as error:
-                        raise _damaged(path, number, error) from error
-                    self._in_order &= index > last
-                    last = max(last, index)
-                    if keep is None or keep(record):
-                        self._places[index] = place
-                    else:
+                        raise _line_error(path, number, error) from error
+                    self._add_line(index, len(line))
+                    if is_valid is not None and not is_valid(record):
                         self._in_order = False
-                        self._places.pop(index)
-                    place += len(line)
-        if torn is not None and grow:
+                        self._offsets.pop(index)
+        if damaged is not None and writable:
             with open_in_place(path, "r+b") as file:
-                file.truncate(place)
-        self._end, self._last = place, last
+                file.truncate(self._end)
+
+    def _add_line(self, index: int, length: int) -> None:
+        self._offsets[index] = self._end
+        self._end += length
+        self._in_order &= index > self._last
+        self._last = max(self._last, index)
 
     def __len__(self) -> int:
-        return len(self._places)
+        return len(self._offsets)
 
     def __contains__(self, index: object) -> bool:
-        return isinstance(index, int) and index in self._places
+        return isinstance(index, int) and index in self._offsets
 
     def __iter__(self) -> Iterator[Record]:
         for _, line in self._lines():
@@ -98,7 +97,7 @@ class Manifest:
     @property
     def indices(self) -> Iterator[int]:
         """Indices of the frames, ascending."""
-        return (index for index, _ in self._places)
+        return (index for index, _ in self._offsets)
 
     def append(self, record: Record) -> None:
         """Add a record; it is on disk when this method returns.
@@ -107,16 +106,13 @@ class Manifest:
             InputError: If another process changed or removed the file.
         """
         line = encode_line(record)
-        place = _append(self.path, line)
-        if place != self._end:
+        offset = _append(self.path, line)
+        if offset != self._end:
             raise InputError(
                 f"{self.path}: must not be changed or removed while it is written (it had {self._end} bytes, "
-                f"then {place}); run again"
+                f"then {offset}); run again"
             )
-        self._places[record["index"]] = place
-        self._end = place + len(line)
-        self._in_order &= record["index"] > self._last
-        self._last = max(self._last, record["index"])
+        self._add_line(record["index"], len(line))
 
     def sort(self, visit: Callable[[Record], object] = lambda record: None) -> None:
         """Sort the file to one line per frame by ascending index, and call ``visit`` with every record in that order.
@@ -129,35 +125,35 @@ class Manifest:
             return
 
         def write(temporary: Path) -> None:
-            place = 0
+            offset = 0
             with temporary.open("wb") as new:
                 for index, line in self._lines():
                     visit(parse_line(line))
                     new.write(line)
-                    places[index] = place
-                    place += len(line)
+                    offsets[index] = offset
+                    offset += len(line)
 
-        places = _Places()
+        offsets = _LineOffsets()
         write_file(self.path, write)
-        self._places, self._end, self._in_order = places, self.path.stat().st_size, True
+        self._offsets, self._end, self._in_order = offsets, self.path.stat().st_size, True
 
     def _lines(self) -> Iterator[tuple[int, bytes]]:
         with open_regular(self.path) as file:
             position = 0
-            for index, place in self._places:
-                if place != position:  # a seek discards the read buffer
-                    file.seek(place)
+            for index, offset in self._offsets:
+                if offset != position:  # a seek discards the read buffer
+                    file.seek(offset)
                 line = file.readline()
-                position = place + len(line)
+                position = offset + len(line)
                 yield index, line
 
 
-def _damaged(path: Path, number: int, error: ValueError) -> InputError:
-    damaged = InputError(
+def _line_error(path: Path, number: int, error: ValueError) -> InputError:
+    line_error = InputError(
         f"{path}, line {number}: must be the record of a frame ({error}); remove the line to render its frame again"
     )
-    damaged.__cause__ = error
-    return damaged
+    line_error.__cause__ = error
+    return line_error
 
 
 def _index_of(record: Record) -> int:
@@ -167,7 +163,7 @@ def _index_of(record: Record) -> int:
     return index
 
 
-class _Places:
+class _LineOffsets:
     """Sparse map from frame index to the offset of its line, iterated by ascending index.
 
     Offsets are stored in pages. Frame indices are contiguous, but those of a shard do not start at 0, and an untrusted
@@ -188,9 +184,9 @@ class _Places:
         page = self._pages.get(index // self._PAGE)
         return page is not None and page[index % self._PAGE] >= 0
 
-    def __setitem__(self, index: int, place: int) -> None:
+    def __setitem__(self, index: int, offset: int) -> None:
         self._count += index not in self
-        self._pages.setdefault(index // self._PAGE, self._BLANK[:])[index % self._PAGE] = place
+        self._pages.setdefault(index // self._PAGE, self._BLANK[:])[index % self._PAGE] = offset
 
     def pop(self, index: int) -> None:
         if index in self:
@@ -199,9 +195,9 @@ class _Places:
 
     def __iter__(self) -> Iterator[tuple[int, int]]:
         for number in sorted(self._pages):
-            for position, place in enumerate(self._pages[number]):
-                if place >= 0:
-                    yield number * self._PAGE + position, place
+            for position, offset in enumerate(self._pages[number]):
+                if offset >= 0:
+                    yield number * self._PAGE + position, offset
 
 
 def encode_line(record: Record) -> bytes:
@@ -234,7 +230,7 @@ def read_lines(file: IO[bytes]) -> Iterator[bytes]:
     return iter(partial(file.readline, LONGEST_LINE), b"")
 
 
-def append_line(path: Path, record: Mapping[str, Any]) -> None:
+def append_line(path: Path, record: Mapping[str, object]) -> None:
     """Append a record without a checksum; it is on disk when this function returns."""
     _append(path, json.dumps(record, separators=(",", ":")).encode() + b"\n")
 
@@ -246,14 +242,14 @@ def _checksum(text: bytes) -> str:
 def _append(path: Path, line: bytes) -> int:
     """Append a line and flush it to disk, and return its offset in the file."""
     with open_in_place(path, "ab") as file:
-        place = file.tell()
+        offset = file.tell()
         file.write(line)
         file.flush()
         os.fsync(file.fileno())
-    return place
+    return offset
 
 
-def cut_torn_line(path: Path) -> None:
+def remove_incomplete_line(path: Path) -> None:
     """Create the file if it is missing, and cut off an incomplete last line."""
     with open_in_place(path, "a+b") as file:
         size = end = file.seek(0, os.SEEK_END)

@@ -15,7 +15,7 @@ import numpy as np
 import trimesh
 
 from mitsplat.arrays import Float64Array
-from mitsplat.dataset.own_files import MANIFEST
+from mitsplat.dataset.dataset_files import MANIFEST
 from mitsplat.engine.resources import unused_memory
 from mitsplat.errors import InputError, MissingResourceError
 from mitsplat.findings import Finding
@@ -51,6 +51,10 @@ SLOW_OBJECTS = 40
 MIN_FRAME_BYTES = 8192
 """Minimum disk space of a frame [bytes]: one block for the image, one for the label."""
 _MAX_CELLS = 24  # per axis of a region, in the search for free volume
+
+
+def _fault(name: str, text: str, remedy: str) -> Finding:
+    return Finding(name, False, text, remedy)
 
 
 def refuse(scene: Scene, faults: Iterable[Finding]) -> None:
@@ -98,10 +102,10 @@ def count_faults(scene: Scene) -> Iterator[Finding]:
         text = (
             f"objects: a layout must have at most {MAX_OBJECTS} objects, because instance ids have 16 bits (got {most})"
         )
-        yield Finding("count", False, text, "lower objects[].count")
+        yield _fault("count", text, "lower objects[].count")
     if scene.num_frames > MAX_FRAMES:
         text = f"output: layouts x views must be at most {MAX_FRAMES} images (got {scene.num_frames})"
-        yield Finding("frames", False, text, "lower output.layouts or output.views")
+        yield _fault("frames", text, "lower output.layouts or output.views")
 
 
 def layout_faults(scene: Scene) -> Iterator[Finding]:
@@ -109,7 +113,7 @@ def layout_faults(scene: Scene) -> Iterator[Finding]:
     settle = scene.spec.settle
     if settle.max_time > MAX_TIME:
         text = f"settle: max_time must be at most {MAX_TIME:g} s (got {settle.max_time:g} s)"
-        yield Finding("time", False, text, "lower settle.max_time")
+        yield _fault("time", text, "lower settle.max_time")
     dropped = [i for i, entry in enumerate(scene.spec.objects) if not entry.poses]
     if not dropped:
         return
@@ -118,7 +122,7 @@ def layout_faults(scene: Scene) -> Iterator[Finding]:
             try:
                 check_size(mesh, f"shapes[{number}]")
             except InputError as error:
-                yield Finding("shape", False, str(error), "correct the mesh, or set collider: false")
+                yield _fault("shape", str(error), "correct the mesh, or set collider: false")
                 return
     for number, (region, arrangement) in enumerate(scene.spec.all_regions):
         where = f"regions[{number - 1}]" if number else "region"
@@ -137,7 +141,7 @@ def _region_faults(
         (box[0, :2] < high[:2]).all() and (box[1, :2] > low[:2]).all() and box[0, 2] < high[2] for box in supports
     ):
         text = f"{where}: no collider is below it, so all objects fall forever"
-        yield Finding("support", False, text, "move region above the table, or the table below it")
+        yield _fault("support", text, "move region above the table, or the table below it")
         return
     if arrangement == "pile":
         high[2] += PILE_HEIGHT
@@ -163,20 +167,16 @@ def _room_faults(
         taken |= inside
     if taken.all():
         text = f"{where}: lies inside of colliders, {' and '.join(in_way)}"
-        yield Finding("region", False, text, "move region above it")
+        yield _fault("region", text, "move region above it")
         return
     volume = float(np.prod(high - low)) * float((~taken).mean())
     hulls = {id(mesh): float(mesh.convex_hull.volume) for mesh in meshes}
     numbers = [scene.spec.objects[i].count[1] for i in dropped]
     need = float(np.dot(numbers, [min(hulls[id(mesh)] for mesh in pool) for pool in pools]))
     if need > volume:
-        yield Finding(
-            "room",
-            False,
-            f"{where}: at most {sum(numbers)} objects of {1e3 * need:.3g} l start in it at once "
-            f"(its free volume is {1e3 * volume:.3g} l)",
-            "lower objects[].count or make region larger",
-        )
+        objects = f"{sum(numbers)} objects of {1e3 * need:.3g} l"
+        text = f"{where}: at most {objects} start in it at once (its free volume is {1e3 * volume:.3g} l)"
+        yield _fault("room", text, "lower objects[].count or make region larger")
 
 
 def image_faults(scene: Scene, workers: int | None = None) -> Iterator[Finding]:
@@ -186,27 +186,26 @@ def image_faults(scene: Scene, workers: int | None = None) -> Iterator[Finding]:
     size = f"an image of {output.width}x{output.height} px"
     if need > free:
         text = f"output: {size} takes at least {need:.1f} GiB of memory ({free:.1f} GiB are unused)"
-        yield Finding("memory", False, text, "lower output.width and height")
+        yield _fault("memory", text, "lower output.width and height")
     elif workers is not None and workers * need > free:
         text = f"workers: {workers} that each render {size} take at least {workers * need:.0f} GiB of memory"
-        yield Finding("memory", False, f"{text} ({free:.1f} GiB are unused)", "use fewer workers")
+        yield _fault("memory", f"{text} ({free:.1f} GiB are unused)", "use fewer workers")
 
 
 def disk_faults(frames: int, out: Path | None) -> Iterator[Finding]:
     """Check that the disk has space for the images that are not there yet."""
-    place = (out or Path.cwd()).absolute()
-    while not place.is_dir():
-        place = place.parent
-    free = shutil.disk_usage(place).free
+    folder = (out or Path.cwd()).absolute()
+    while not folder.is_dir():
+        folder = folder.parent
+    free = shutil.disk_usage(folder).free
     if frames * MIN_FRAME_BYTES > free and out is not None and (out / MANIFEST).is_file():
         with (out / MANIFEST).open("rb") as lines:
             frames -= sum(1 for _ in lines)
     need = frames * MIN_FRAME_BYTES
     if need > free:
-        text = (
-            f"output: {frames} images take at least {_format_bytes(need)} ({_format_bytes(free)} are free at {place})"
-        )
-        yield Finding("disk", False, text, "lower output.layouts or views, give --frames, or write to another disk")
+        sizes = f"{_format_bytes(need)} ({_format_bytes(free)} are free at {folder})"
+        text = f"output: {frames} images take at least {sizes}"
+        yield _fault("disk", text, "lower output.layouts or views, give --frames, or write to another disk")
 
 
 def _format_bytes(size: int) -> str:
@@ -227,34 +226,32 @@ def label_faults(scene: Scene, frames: Sequence[int]) -> Iterator[Finding]:
     pixels = spec.output.width * spec.output.height
     if pixels < least:
         text = f"output: an image of {pixels} px cannot show labels.min_pixels = {least}"
-        yield Finding("labels", False, text, "make output.width and height larger")
+        yield _fault("labels", text, "make output.width and height larger")
         return
-    cameras = _cameras(scene, frames)
+    cameras = [plan.camera for plan in _plans(scene, frames)]
     hidden = [name for camera in cameras if (name := enclosing_shape(scene, camera.centre))]
     if len(hidden) == len(cameras):
         text = f"camera: every view is from inside of shape {hidden[0]!r}, which hides all objects"
-        yield Finding("visibility", False, text, "move camera out of it")
+        yield _fault("visibility", text, "move camera out of it")
         return
     low, high = _reachable_box(scene)
     if not any(sees(camera, low, high) for camera in cameras):
         text = f"camera: no view shows any place that objects can reach ({len(cameras)} views tested)"
         remedy = "turn camera to region: `mitsplat preview` shows where it looks"
-        yield Finding("visibility", False, text, remedy)
+        yield _fault("visibility", text, remedy)
         return
     depths = [_depth_range(camera, low, high) for camera in cameras]
     across = [far * c.width / c.fx for c, (_, far) in zip(cameras, depths, strict=True)]
     smallest = min(float(mesh.extents.max()) for mesh in meshes)
     if max(across) < MIN_VIEW_WIDTH * smallest:
-        text = (
-            f"camera.intrinsics: an image shows at most {max(across):.2g} m (the "
-            f"smallest object is {smallest:.2g} m long)"
-        )
-        yield Finding("lens", False, text, "fx and fy are focal lengths in pixels")
+        view = f"{max(across):.2g} m (the smallest object is {smallest:.2g} m long)"
+        text = f"camera.intrinsics: an image shows at most {view}"
+        yield _fault("lens", text, "fx and fy are focal lengths in pixels")
     largest = max(float(np.linalg.norm(mesh.extents)) for mesh in meshes)
     shown = max(_max_pixels(c, largest, near) for c, (near, _) in zip(cameras, depths, strict=True))
     if shown < least:
         text = f"camera: no object covers more than {shown:.2g} px in any view (labels.min_pixels is {least})"
-        yield Finding("labels", False, text, "move camera nearer, or make fx or the image larger")
+        yield _fault("labels", text, "move camera nearer, or make fx or the image larger")
 
 
 def scene_warnings(scene: Scene) -> Iterator[Finding]:
@@ -280,16 +277,16 @@ def scene_warnings(scene: Scene) -> Iterator[Finding]:
         if (
             isinstance(light, LocalLight)
             and not light.has_drawn_position
-            and (name := _shape_around_light(scene, light))
+            and (name := enclosing_shape(scene, np.array(light.position)))
         ):
             text = f"lights[{number}] is inside of shape {name!r}"
-            yield Finding("lights", False, text, "move it out: it lights nothing")
+            yield _fault("lights", text, "move it out: it lights nothing")
     if any(isinstance(light, LocalLight) and light.has_drawn_position for light in spec.lights):
         lights = {light for plan in plans for light in plan.lights if isinstance(light, LocalLight)}
-        names = [name for light in lights if (name := _shape_around_light(scene, light))]
+        names = [name for light in lights if (name := enclosing_shape(scene, np.array(light.position)))]
         if names:
             text = f"{len(names)} of {len(lights)} drawn lights are inside of a shape, such as {names[0]!r}"
-            yield Finding("lights", False, text, "narrow lights[].draw: they light nothing")
+            yield _fault("lights", text, "narrow lights[].draw: they light nothing")
     for shape in spec.shapes:
         if shape.bin is None:
             continue
@@ -297,7 +294,7 @@ def scene_warnings(scene: Scene) -> Iterator[Finding]:
         for asset in {asset.name: asset for asset in scene.assets}.values():
             if asset.mesh is not None and (np.sort(asset.mesh.extents)[:2] > opening).any():
                 text = f"{asset.name!r} does not fit into {shape.name!r}"
-                yield Finding("bin", False, text, "make the bin larger, or the object smaller by scale")
+                yield _fault("bin", text, "make the bin larger, or the object smaller by scale")
 
 
 def _cost_warnings(scene: Scene) -> Iterator[Finding]:
@@ -307,11 +304,11 @@ def _cost_warnings(scene: Scene) -> Iterator[Finding]:
     if need > free:
         size = f"{output.width}x{output.height} px"
         text = f"an image of {size} may take {need:.1f} GiB of memory ({free:.1f} GiB are unused)"
-        yield Finding("memory", False, text, "lower output.width and height: it may be refused after the first layout")
+        yield _fault("memory", text, "lower output.width and height: it may be refused after the first layout")
     most = sum(entry.max_count for entry in scene.spec.objects if not entry.poses)
     if most > SLOW_OBJECTS:
         text = f"a layout of up to {most} objects takes minutes to settle"
-        yield Finding("settling", False, text, "lower objects[].count, or add views to each layout by output.views")
+        yield _fault("settling", text, "lower objects[].count, or add views to each layout by output.views")
 
 
 def _backdrop_warnings(scene: Scene, plans: Sequence[FramePlan]) -> Iterator[Finding]:
@@ -331,11 +328,11 @@ def _backdrop_warnings(scene: Scene, plans: Sequence[FramePlan]) -> Iterator[Fin
 
     if hidden := sum(behind(plan.camera.centre) for plan in plans):
         text = f"of {len(plans)} views {hidden} are from behind a wall of the backdrop, which hides everything"
-        yield Finding("backdrop", False, text, "make backdrop.size larger")
+        yield _fault("backdrop", text, "make backdrop.size larger")
     lights = {light for plan in plans for light in plan.lights if isinstance(light, LocalLight)}
     if hidden := sum(behind(light.position) for light in lights):
         text = f"{hidden} of {len(lights)} lights are behind a wall of the backdrop"
-        yield Finding("backdrop", False, text, "move lights into the room")
+        yield _fault("backdrop", text, "move lights into the room")
 
 
 def sees(camera: Camera, low: Float64Array, high: Float64Array) -> bool:
@@ -359,20 +356,10 @@ def sees(camera: Camera, low: Float64Array, high: Float64Array) -> bool:
     return bool((np.maximum(first, camera.near) < last).any())
 
 
-def _cameras(scene: Scene, frames: Sequence[int]) -> list[Camera]:
-    """Return the cameras of up to :data:`VIEWS` of the frames."""
-    return [plan.camera for plan in _plans(scene, frames)]
-
-
 def _plans(scene: Scene, frames: Sequence[int]) -> list[FramePlan]:
     """Plan up to :data:`VIEWS` of the frames, evenly spread."""
     positions = {round(share * (len(frames) - 1)) for share in np.linspace(0, 1, min(len(frames), VIEWS))}
     return [plan_frame(scene, frames[position]) for position in sorted(positions)]
-
-
-def _shape_around_light(scene: Scene, light: LocalLight) -> str:
-    """Return the name of a visible shape that contains a light but not the region, or an empty string."""
-    return enclosing_shape(scene, np.array(light.position))
 
 
 def _colliders(scene: Scene) -> Iterator[tuple[str, trimesh.Trimesh]]:
@@ -391,13 +378,8 @@ def _reachable_box(scene: Scene) -> tuple[Float64Array, Float64Array]:
     region = scene.spec.region
     colliders = list(_colliders(scene))
     boxes = [np.asarray(mesh.bounds) for _, mesh in colliders] or [np.array([region.min, region.max])]
-    walls = [
-        position
-        for position, (shape, _) in enumerate(
-            pair for pair in zip(scene.spec.shapes, scene.shape_meshes, strict=True) if pair[0].collider
-        )
-        if not (shape.visible or shape.proxy)
-    ]
+    shapes = [shape for shape in scene.spec.shapes if shape.collider]
+    walls = [position for position, shape in enumerate(shapes) if not (shape.visible or shape.proxy)]
     names = [name for name, _ in colliders]
     lows, highs = [], []
     for number, (place, arrangement) in enumerate(scene.spec.all_regions):

@@ -8,9 +8,9 @@ from __future__ import annotations
 import json
 import re
 from array import array
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -24,7 +24,7 @@ from mitsplat.images.masks import decode_rle
 from mitsplat.scene.spec.camera_spec import CameraSpec
 from mitsplat.scene.spec.scene_spec import LabelRules, Output
 from mitsplat.storage.field_types import Name
-from mitsplat.storage.files import Record, open_regular, read_json, splits_of
+from mitsplat.storage.files import JsonObject, Record, open_regular, read_json, splits_of
 from mitsplat.storage.format_version import FORMAT_VERSIONS, check_format_version
 
 Count = Annotated[int, Field(ge=0, lt=2**31)]
@@ -229,7 +229,7 @@ class _Record(_Stored):
     order_error: _OrderError | None = None
 
 
-def read_content(root: Path) -> dict[str, Any]:
+def read_content(root: Path) -> JsonObject:
     """Read ``dataset.json``, which contains everything that determines the bytes of a dataset.
 
     Raises:
@@ -237,7 +237,7 @@ def read_content(root: Path) -> dict[str, Any]:
             version.
     """
     try:
-        content: dict[str, Any] = read_json(root / "dataset.json")
+        content: JsonObject = read_json(root / "dataset.json")
     except OSError as error:
         reason = f"dataset.json: {error.strerror}" if root.is_dir() else "no such folder"
         raise InputError(f"{root} must be a dataset of mitsplat ({reason})") from error
@@ -247,7 +247,7 @@ def read_content(root: Path) -> dict[str, Any]:
     try:
         checked = _Content.model_validate_json(json.dumps(content))
     except ValidationError as error:
-        reason = f"dataset.json: {_first(error)}"
+        reason = f"dataset.json: {_first_message(error)}"
         raise InputError(f"{root} must be a dataset of this version of mitsplat ({reason})") from error
     if len(content["keypoints"]) != len(content["classes"]):
         raise InputError(
@@ -267,31 +267,31 @@ class Records:
         violations: File and description for each unreadable line, filled by iteration.
     """
 
-    def __init__(self, root: Path, content: dict[str, Any]) -> None:
+    def __init__(self, root: Path, content: JsonObject) -> None:
         self._path, self._content = root / "manifest.jsonl", content
         self.violations: list[tuple[str, str]] = []
-        indices, places, place = array("q"), array("q"), 0
+        indices, offsets, offset = array("q"), array("q"), 0
         with open_regular(self._path) as file:
             for line in read_lines(file):
                 found = _INDEX.match(line)
                 indices.append(int(found[1]) if found else -1)
-                places.append(place)
-                place += len(line)
-        self._places = np.array(places, dtype=np.int64)
+                offsets.append(offset)
+                offset += len(line)
+        self._offsets = np.array(offsets, dtype=np.int64)
         self._indices = np.array(indices, dtype=np.int64)
         self._order = np.argsort(self._indices, kind="stable")
 
     def __len__(self) -> int:
-        return len(self._places)
+        return len(self._offsets)
 
     def __iter__(self) -> Iterator[Record]:
         self.violations = []
         yield from self._read(self._order)
 
-    def some(self, count: int) -> Iterator[Record]:
+    def sample(self, count: int) -> Iterator[Record]:
         """Iterate over up to ``count`` evenly spread records; unreadable lines among them are skipped."""
-        places = np.unique(np.linspace(0, len(self) - 1, min(count, len(self))).round().astype(int))
-        yield from self._read(self._order[places])
+        positions = np.unique(np.linspace(0, len(self) - 1, min(count, len(self))).round().astype(int))
+        yield from self._read(self._order[positions])
 
     def of_frame(self, index: int) -> Iterator[Record]:
         """Iterate over the readable records of one frame index."""
@@ -301,24 +301,22 @@ class Records:
         with open_regular(self._path) as file:
             end = 0
             for number in map(int, numbers):
-                if self._places[number] != end:
-                    file.seek(self._places[number])
+                if self._offsets[number] != end:
+                    file.seek(self._offsets[number])
                 line = file.readline(LONGEST_LINE)
-                end = self._places[number] + len(line)
+                end = self._offsets[number] + len(line)
                 try:
                     record = parse_line(line)
                     check_record(line, record, self._content)
                     _check_masks(record)
                 except ValueError as error:
-                    self._add_violation(number, str(error))
+                    text = f"line {number + 1} is not the record of a frame ({error})"
+                    self.violations.append(("manifest.jsonl", text))
                 else:
                     yield record
 
-    def _add_violation(self, number: int, text: str) -> None:
-        self.violations.append(("manifest.jsonl", f"line {number + 1} is not the record of a frame ({text})"))
 
-
-def check_record(line: bytes, record: Record, content: Mapping[str, Any]) -> None:
+def check_record(line: bytes, record: Record, content: JsonObject) -> None:
     """Refuse a record whose keys, types or values are not those of a frame; masks are not checked.
 
     Args:
@@ -332,7 +330,7 @@ def check_record(line: bytes, record: Record, content: Mapping[str, Any]) -> Non
     try:
         _Record.model_validate_json(line)
     except ValidationError as error:
-        raise ValueError(_first(error)) from error
+        raise ValueError(_first_message(error)) from error
     for file in record["files"]:
         if not file or "\0" in file or file.startswith("/") or ".." in file.split("/"):
             raise ValueError(f"file names must be relative to the dataset and lie in its folder (got {file[:80]!r})")
@@ -378,6 +376,6 @@ def _check_mask(code: str, box: list[int], width: int, height: int) -> None:
         raise ValueError(f"must be a complete run-length code of a mask in its box (got {code[:20]!r} for {box})")
 
 
-def _first(error: ValidationError) -> str:
+def _first_message(error: ValidationError) -> str:
     found = error.errors(include_url=False)[0]
     return f"{'.'.join(map(str, found['loc']))}: {found['msg']}"

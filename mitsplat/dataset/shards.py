@@ -8,10 +8,10 @@ from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, suppress
 from functools import partial
 from pathlib import Path
-from typing import Any
 
+from mitsplat.dataset.dataset_files import CONTENT, RUNS, TIMINGS
 from mitsplat.dataset.dataset_folder import (
-    IMPLIED,
+    DEFAULT_CONTENT,
     finish_folder,
     first_difference,
     open_finished,
@@ -19,14 +19,22 @@ from mitsplat.dataset.dataset_folder import (
     read_shard,
 )
 from mitsplat.dataset.manifest import Manifest, read_lines
-from mitsplat.dataset.own_files import CONTENT, RUNS, TIMINGS
 from mitsplat.dataset.schema import read_content
 from mitsplat.dataset.write import DatasetSummary, FrameCounts
 from mitsplat.errors import InputError
 from mitsplat.formats.registry import Catalogue
 from mitsplat.progress import Progress
 from mitsplat.storage.content_hash import file_hash
-from mitsplat.storage.files import Record, link_file, open_regular, read_json, resolve_inside, splits_of, write_file
+from mitsplat.storage.files import (
+    JsonObject,
+    Record,
+    link_file,
+    open_regular,
+    read_json,
+    resolve_inside,
+    splits_of,
+    write_file,
+)
 
 
 def merge_shards(
@@ -69,7 +77,7 @@ def merge_shards(
             for record in part:
                 index = record["index"]
                 if index not in manifest:
-                    _take_files(folder, out, record)
+                    _link_files(folder, out, record)
                     manifest.append(record)
                 if progress is not None:
                     progress(len(manifest), total, f"frame {index}")
@@ -86,12 +94,12 @@ def merge_shards(
         return counts.summary(out, rendered=0)
 
 
-def _common_content(folders: Sequence[Path]) -> dict[str, Any]:
+def _common_content(folders: Sequence[Path]) -> JsonObject:
     """Return the content of ``dataset.json``, which must be equal in all shards."""
-    contents: list[dict[str, Any]] = []
+    contents: list[JsonObject] = []
     for folder in folders:
         read_content(folder)  # validates the file; the raw content is read next
-        contents.append({**IMPLIED, **read_json(folder / CONTENT)})
+        contents.append({**DEFAULT_CONTENT, **read_json(folder / CONTENT)})
         if difference := first_difference(contents[0], contents[-1]):
             key, one, other = difference
             raise InputError(
@@ -115,7 +123,9 @@ def _check_complete(folders: Sequence[Path]) -> int | None:
     if len(parts) < len(stored) or len(sizes) > 1:
         raise InputError(
             "shards must be of one division of one dataset (got "
-            + ", ".join(f"{folder}: {'whole' if part is None else _named(part)}" for folder, part in stored.items())
+            + ", ".join(
+                f"{folder}: {'whole' if part is None else _shard_name(part)}" for folder, part in stored.items()
+            )
             + ")"
         )
     count, frames = next(iter(sizes))
@@ -125,31 +135,28 @@ def _check_complete(folders: Sequence[Path]) -> int | None:
     return frames
 
 
-def _named(part: dict[str, int]) -> str:
+def _shard_name(part: dict[str, int]) -> str:
     return f"{part['shard']}/{part['of']} of {part['frames']} frames"
 
 
 def _check_frames(manifests: Mapping[Path, Manifest], stated: int | None) -> int:
     """Return the number of frames of all shards together; refuse missing frames and frames in two shards."""
-    found = [((index, folder) for index in manifest.indices) for folder, manifest in manifests.items()]
-    last, place = -1, Path()
-    missing, first = 0, 0
-    for index, folder in heapq.merge(*found):
+    indices = [((index, folder) for index in manifest.indices) for folder, manifest in manifests.items()]
+    last, last_folder, first_missing = -1, Path(), -1
+    for index, folder in heapq.merge(*indices):
         if index == last:
-            raise InputError(f"frame {index} is in both {place} and {folder}")
-        if index > last + 1 and not missing:
-            first = last + 1
-        missing += index - last - 1
-        last, place = index, folder
+            raise InputError(f"frame {index} is in both {last_folder} and {folder}")
+        if index > last + 1 and first_missing < 0:
+            first_missing = last + 1
+        last, last_folder = index, folder
     if last < 0 and stated is None:
         raise InputError(f"{', '.join(map(str, manifests))}: must have at least one image; finish this shard first")
+    total = sum(map(len, manifests.values()))
     count = last + 1 if stated is None else stated
-    if count > last + 1 and not missing:
-        first = last + 1
-    missing += max(0, count - last - 1)
-    if missing:
+    if missing := max(count, last + 1) - total:
+        first = last + 1 if first_missing < 0 else first_missing
         raise InputError(f"{missing} of {count} frames are in no shard, the first is {first}: finish the shards first")
-    return sum(map(len, manifests.values()))
+    return total
 
 
 def _join_lines(files: Sequence[Path], target: Path) -> None:
@@ -175,7 +182,7 @@ def _layouts(folder: Path) -> list[Path]:
     return [_inside(folder, path) for path in sorted((folder / "layouts").glob("[0-9]*.json"))]
 
 
-def _models(folder: Path, content: Mapping[str, Any]) -> list[Path]:
+def _models(folder: Path, content: JsonObject) -> list[Path]:
     """Return the files of the BOP models."""
     numbers = sorted(set(range(1, len(content["assets"]) + 1)) - {one + 1 for one in content.get("distractors", ())})
     names = ["models_info.json", *(f"obj_{number:06d}.ply" for number in numbers)]
@@ -204,7 +211,7 @@ def _check_files(folder: Path, record: Record) -> None:
         _check_content(source, file_hash(source), digest)
 
 
-def _take_files(folder: Path, out: Path, record: Record) -> None:
+def _link_files(folder: Path, out: Path, record: Record) -> None:
     for file, digest in record["files"].items():
         source = _source(folder, file, record)
         found = write_file(out / file, partial(link_file, source))

@@ -26,10 +26,10 @@ from contextlib import closing, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from mitsplat.dataset.dataset_files import SHEET, TIMINGS, remove_folds
 from mitsplat.dataset.dataset_folder import Shard, append_run, content_of, finish_folder, open_folder
-from mitsplat.dataset.frame_job import FrameMaker, RemoteFrames, Render, Settle, layout_errors
+from mitsplat.dataset.frame_job import FrameJob, RemoteFrameJob, Render, Settle, layout_errors
 from mitsplat.dataset.manifest import append_line
-from mitsplat.dataset.own_files import SHEET, TIMINGS, remove_folds
 from mitsplat.dataset.preflight import refuse, run_faults
 from mitsplat.engine.pool import check_workers, run_frames
 from mitsplat.engine.ray import Cluster, load_ray, run_on_ray
@@ -174,23 +174,23 @@ def write_dataset(
                     out,
                 )
             append_run(out, workers, used_device.kind, [gpu.name for gpu in used_device.gpus])
-        shortfall = Shortfall(scene, -(-count // scene.spec.output.views))
+        incomplete = IncompleteLayouts(scene, -(-count // scene.spec.output.views))
         for layout in sorted({layout_of(scene, index) for index in indices}):
-            shortfall.read(out / f"layouts/{layout:04d}.json")
-        make = FrameMaker(scene, catalogue, out, render or render_frame, settle or settle_layout)
-        with closing(_results(make, layouts, workers, cluster, used_device, note)) as results:
+            incomplete.read(out / f"layouts/{layout:04d}.json")
+        job = FrameJob(scene, catalogue, out, render or render_frame, settle or settle_layout)
+        with closing(_results(job, layouts, workers, cluster, used_device, note)) as results:
             for record, seconds in results:
                 append_line(out / TIMINGS, {"index": record["index"], **seconds})
                 manifest.append(record)
                 note(f"frame {record['index']}")
-                shortfall.add(record["layout"], [(one["name"], one["reason"]) for one in record.get("left_out", ())])
+                incomplete.add(record["layout"], [(one["name"], one["reason"]) for one in record.get("left_out", ())])
         counts = FrameCounts()
         finish_folder(out, manifest, content, catalogue, counts.add)
         return counts.summary(out, rendered=sum(map(len, layouts.values())))
 
 
 def _results(
-    make: FrameMaker,
+    job: FrameJob,
     layouts: dict[int, list[int]],
     workers: int | None,
     cluster: Cluster | None,
@@ -199,17 +199,17 @@ def _results(
 ) -> Generator[tuple[Record, dict[str, float]]]:
     """Yield the record and the seconds of the stages of each frame, after its files were written to the folder."""
     if cluster is None:
-        memory = TYPICAL_MEMORY if workers is not None else worker_memory(make.scene)
-        with closing(run_frames(make, layouts, workers=workers, note=note, memory=memory, device=device)) as made:
-            yield from made
+        memory = TYPICAL_MEMORY if workers is not None else worker_memory(job.scene)
+        with closing(run_frames(job, layouts, workers=workers, note=note, memory=memory, device=device)) as results:
+            yield from results
         return
-    with closing(run_on_ray(RemoteFrames(make), layouts, cluster, workers=workers, note=note)) as parcels:
-        for parcel in parcels:
-            with storage_errors(make.out):
-                yield parcel.unpack(make.out), parcel.seconds
+    with closing(run_on_ray(RemoteFrameJob(job), layouts, cluster, workers=workers, note=note)) as frames:
+        for frame in frames:
+            with storage_errors(job.out):
+                yield frame.write(job.out), frame.seconds
 
 
-class Shortfall:
+class IncompleteLayouts:
     """Limit of the number of layouts that lack objects.
 
     Args:

@@ -67,11 +67,8 @@ class ScenesWriter(AnnotationWriter):
     def __init__(self, root: Path, catalogue: Catalogue) -> None:
         super().__init__()
         self._root = root
-        self._meshes = {
-            position + 1: mesh
-            for position, mesh in enumerate(catalogue.meshes)
-            if position not in catalogue.distractors
-        }
+        meshes = enumerate(catalogue.meshes)
+        self._meshes = {position + 1: mesh for position, mesh in meshes if position not in catalogue.distractors}
         self._folder, self._layout = "", -1
         self._scene_files: dict[str, EntriesFile] = {}
         self._completed: list[GrowingFile] = []
@@ -126,26 +123,15 @@ def write_models(root: Path, meshes: Mapping[int, trimesh.Trimesh]) -> None:
     for number, mesh in meshes.items():
         scaled = mesh.copy()
         scaled.apply_scale(MILLIMETRES)
-        info[str(number)] = model_info(scaled)
+        corners = scaled.vertices[ConvexHull(scaled.vertices).vertices]
+        info[str(number)] = {
+            "diameter": float(pdist(corners).max()),
+            **{f"min_{axis}": float(value) for axis, value in zip("xyz", scaled.bounds[0], strict=True)},
+            **{f"size_{axis}": float(value) for axis, value in zip("xyz", scaled.extents, strict=True)},
+        }
         data = trimesh.exchange.ply.export_ply(scaled, encoding="ascii", vertex_normal=True)
         write_file(root / f"bop/models/obj_{number:06d}.ply", lambda path, data=data: path.write_bytes(data))  # type: ignore[misc]
     write_text(root / "bop/models/models_info.json", json.dumps(info, indent=1))
-
-
-def model_info(mesh: trimesh.Trimesh) -> dict[str, float]:
-    """Return diameter, lower corner and extents of a mesh, in its units."""
-    return {
-        "diameter": diameter(mesh),
-        **{f"min_{axis}": float(value) for axis, value in zip("xyz", mesh.bounds[0], strict=True)},
-        **{f"size_{axis}": float(value) for axis, value in zip("xyz", mesh.extents, strict=True)},
-    }
-
-
-def diameter(mesh: trimesh.Trimesh) -> float:
-    """Return the largest distance between two vertices."""
-    points = mesh.vertices
-    corners = points[ConvexHull(points).vertices]
-    return float(pdist(corners).max())
 
 
 def camera_entry(record: Record, camera: Camera) -> JsonObject:
@@ -163,17 +149,11 @@ def camera_entry(record: Record, camera: Camera) -> JsonObject:
 
 def pose_entries(record: Record, camera: Camera) -> list[JsonObject]:
     """Return the frame's entry in ``scene_gt.json``."""
-    camera_from_world = camera.camera_from_world
     entries = []
     for label in record["labels"]["instances"]:
-        pose = camera_from_world @ np.array(label["world_from_object"])
-        entries.append(
-            {
-                "cam_R_m2c": pose[:3, :3].ravel().tolist(),
-                "cam_t_m2c": (MILLIMETRES * pose[:3, 3]).tolist(),
-                "obj_id": label["asset"] + 1,
-            }
-        )
+        pose = camera.camera_from_world @ np.array(label["world_from_object"])
+        rotation, translation = pose[:3, :3].ravel().tolist(), (MILLIMETRES * pose[:3, 3]).tolist()
+        entries.append({"cam_R_m2c": rotation, "cam_t_m2c": translation, "obj_id": label["asset"] + 1})
     return entries
 
 

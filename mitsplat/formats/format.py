@@ -35,7 +35,7 @@ class Catalogue:
         assets: Names of the assets, by position among the scene's assets.
         meshes: Proxy meshes of the assets [m].
         distractors: Positions of the assets that have no labels.
-        drawn: Manifest entry of each asset's instances, for a scene that draws its objects; empty otherwise.
+        drawn_objects: Manifest entry of each asset's instances, for a scene that draws its objects; empty otherwise.
         splits: Names of the dataset's splits.
         depth_sensor: Simulated sensor of the format ``depth-sensor``.
     """
@@ -45,7 +45,7 @@ class Catalogue:
     assets: Sequence[str]
     meshes: Sequence[trimesh.Trimesh]
     distractors: Sequence[int] = ()
-    drawn: Sequence[JsonObject] = ()
+    drawn_objects: Sequence[JsonObject] = ()
     splits: Sequence[str] = SPLITS[:2]
     depth_sensor: DepthSensor | None = None
 
@@ -62,16 +62,15 @@ class Catalogue:
             except ValueError as error:
                 raise InputError(f"{scene.path}: class: {error}") from error
         points: dict[str, tuple[str, tuple[str, ...]]] = {}
-        kinds = [scene.class_index(position) for position in range(len(scene.assets))]
-        for asset, kind in zip(scene.assets, kinds, strict=True):
-            if kind is None:
-                continue
+        for position, asset in enumerate(scene.assets):
             names = tuple(asset.keypoints)
-            other, known = points.setdefault(asset.class_name, (asset.name, names))
-            if known != names:
+            if scene.class_index(position) is None:
+                continue
+            other, other_names = points.setdefault(asset.class_name, (asset.name, names))
+            if other_names != names:
                 raise InputError(
                     f"{scene.path}: assets of class {asset.class_name!r} must define the same keypoints "
-                    f"(got {list(known)} in {other} and {list(names)} in {asset.name})"
+                    f"(got {list(other_names)} in {other} and {list(names)} in {asset.name})"
                 )
         keypoint_names = tuple(points[name][1] if name in points else () for name in scene.class_names)
         formats = scene.spec.output.formats
@@ -82,19 +81,15 @@ class Catalogue:
             raise InputError(
                 f"{scene.path}: output.formats: bop must have a camera without lens distortion (got {list(distortion)})"
             )
-        meshes = [asset.mesh for asset in scene.assets if asset.mesh is not None]
-        distractors = [position for position, kind in enumerate(kinds) if kind is None]
-        assets = [asset.name for asset in scene.assets]
-        splits = splits_of(scene.spec.output.model_dump())
         return cls(
             scene.class_names,
             keypoint_names,
-            assets,
-            meshes,
-            distractors,
-            _drawn_objects(scene),
-            splits,
-            scene.spec.depth_sensor,
+            assets=[asset.name for asset in scene.assets],
+            meshes=[asset.mesh for asset in scene.assets if asset.mesh is not None],
+            distractors=[position for position in range(len(scene.assets)) if scene.class_index(position) is None],
+            drawn_objects=_draw_entries(scene),
+            splits=splits_of(scene.spec.output.model_dump()),
+            depth_sensor=scene.spec.depth_sensor,
         )
 
     @property
@@ -103,7 +98,7 @@ class Catalogue:
         return max(map(len, self.keypoint_names), default=0)
 
 
-def _drawn_objects(scene: Scene) -> list[JsonObject]:
+def _draw_entries(scene: Scene) -> list[JsonObject]:
     """Return the manifest entry of each asset's instances, or an empty list.
 
     Entries are needed only if the scene file does not determine which objects are in a layout.

@@ -21,28 +21,26 @@ the manifest. Names of formats in a scene file's ``output.formats``:
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Collection
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import cv2
 import numpy as np
-import numpy.typing as npt
 
 from mitsplat.formats import bop, coco, map_files, maps, yolo
 from mitsplat.formats.colmap import ModelWriter
-from mitsplat.formats.format import AnnotationWriter, Catalogue, Format, FrameFiles
+from mitsplat.formats.format import Catalogue, Format, FrameFiles
 from mitsplat.scene.planning.contents import draw_regions
 from mitsplat.scene.planning.layout_surroundings import draw_surroundings
-from mitsplat.scene.spec.scene_spec import FORMATS, Output, SceneSpec
+from mitsplat.scene.spec.scene_spec import FORMATS, SceneSpec
 from mitsplat.scene.splits import is_empty
 from mitsplat.storage.files import Record
 
 if TYPE_CHECKING:
     from mitsplat.frames.frame import Frame
 
-__all__ = ["FORMATS", "TABLE", "Catalogue", "CollectionWriter", "encode_image", "write_frame"]
+__all__ = ["FORMATS", "TABLE", "Catalogue", "CollectionWriter", "write_frame"]
 
 TABLE = {
     **{task: yolo.format_of(task) for task in yolo.TASKS},
@@ -63,10 +61,12 @@ TABLE = {
 """Formats in the order in which they are written."""
 
 
-def write_frame(frame: Frame, root: Path, spec: SceneSpec, catalogue: Catalogue, *, given: bool = False) -> Record:
+def write_frame(
+    frame: Frame, root: Path, spec: SceneSpec, catalogue: Catalogue, *, custom_layout: bool = False
+) -> Record:
     """Write the files of one frame below ``root``, and return its manifest record, which lists the files.
 
-    If the layout was ``given`` by the caller, the record contains no values that are drawn together with a layout.
+    With a ``custom_layout`` of the caller, the record contains no values that are drawn together with a layout.
     """
     plan, output = frame.plan, spec.output
     ids = frame.instance if spec.labels.source == "splats" else frame.layers.proxy_instance
@@ -85,9 +85,9 @@ def write_frame(frame: Frame, root: Path, spec: SceneSpec, catalogue: Catalogue,
         "labels": frame.labels.to_json(),
         "rest": frame.layout.certificate.to_json(),
     }
-    if catalogue.drawn:
-        record["objects"] = [{"id": one.id, **catalogue.drawn[one.asset]} for one in frame.layout.instances]
-        if spec.regions and not given:
+    if catalogue.drawn_objects:
+        record["objects"] = [{"id": one.id, **catalogue.drawn_objects[one.asset]} for one in frame.layout.instances]
+        if spec.regions and not custom_layout:
             regions = draw_regions(spec, plan.layout)
             for drawn in record["objects"]:
                 drawn["region"] = spec.region_names[regions[drawn["id"] - 1]]
@@ -98,34 +98,24 @@ def write_frame(frame: Frame, root: Path, spec: SceneSpec, catalogue: Catalogue,
         ]
     if plan.viewpoint:
         record["viewpoint"] = dict(plan.viewpoint)
-    if plan.belt is not None and not given:
+    if plan.belt is not None and not custom_layout:
         record["conveyor"] = {"time": plan.belt.time}
     if place := draw_surroundings(spec, frame.index, frame.layout.index).to_json(spec):
         record["place"] = place
     if any(entry.appearance for entry in spec.objects):
         record["appearance"] = [one.to_json() for one in frame.appearances.values()]
-    if spec.empty and not given:
+    if spec.empty and not custom_layout:
         record["empty"] = is_empty(spec, plan.layout)
     if frame.order_error is not None:
         record["order_error"] = {name: round(value, 6) for name, value in frame.order_error.items()}
     image = f"images/{plan.split}/{frame.index:06d}.{output.image}"
     files = FrameFiles(root, frame, catalogue, record, image, ids)
-    files.add_bytes(image, encode_image(frame.image, output))
+    encode = maps.encode_png if output.image == "png" else maps.encode_jpg
+    files.add_bytes(image, encode(frame.image))
     for name, format in TABLE.items():
         if name in output.formats and format.write is not None:
             format.write(files)
     return record
-
-
-def encode_image(image: npt.NDArray[np.uint8], output: Output) -> bytes:
-    """Encode an RGB image (H, W, 3) as PNG or JPEG."""
-    if output.image == "png":
-        return maps.encode_png(image)
-    options = [cv2.IMWRITE_JPEG_QUALITY, 95]
-    done, data = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), options)
-    if not done:
-        raise OSError(f"OpenCV could not encode an image of shape {image.shape} as jpg")
-    return bytes(data)
 
 
 class CollectionWriter:
@@ -135,14 +125,11 @@ class CollectionWriter:
     of BOP scenes, which are complete after their last frame.
     """
 
-    def __init__(self, root: Path, catalogue: Catalogue, formats: Iterable[str]) -> None:
-        self._root, self._catalogue, self._formats = root, catalogue, set(formats)
-        self._writers: list[AnnotationWriter] = []
+    def __init__(self, root: Path, catalogue: Catalogue, formats: Collection[str]) -> None:
+        selected = [format for name, format in TABLE.items() if name in formats]
+        self._writers = [format.create_writer(root, catalogue) for format in selected if format.create_writer]
 
     def __enter__(self) -> CollectionWriter:
-        for name, format in TABLE.items():
-            if name in self._formats and format.create_writer is not None:
-                self._writers.append(format.create_writer(self._root, self._catalogue))
         return self
 
     def __exit__(self, *error: object) -> None:

@@ -6,8 +6,7 @@ rules, in this order, select the labels. All omissions and marks are counted:
 1. a connected part (8-connectivity) of fewer than ``min_fragment`` pixels is removed from its instance;
 2. an instance left with fewer than ``min_pixels`` pixels is dropped;
 3. an instance with a visible fraction below ``min_visible`` is ``occluded``. An instance whose splats and proxy agree
-by
-   less than ``min_agreement`` is ``disagreeing``. Both are dropped or only marked, depending on ``below_threshold``.
+   by less than ``min_agreement`` is ``disagreeing``. Both are dropped or only marked, depending on ``below_threshold``.
 
 The *silhouette* of an instance is its mask when rendered alone, by the same rule for a pixel and after rule 1. The
 visible fraction is exact and uses no depth tolerance: visible pixels over the silhouette's pixels in the image. The
@@ -21,7 +20,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -39,6 +38,7 @@ from mitsplat.images.masks import (
 )
 from mitsplat.labels.polygons import fill_polygon, outline
 from mitsplat.scene.spec.scene_spec import LabelRules as LabelRules
+from mitsplat.storage.files import JsonObject
 
 if TYPE_CHECKING:
     from mitsplat.geometry.camera import Camera
@@ -50,6 +50,9 @@ KEYPOINT_TOLERANCE = 0.005
 
 UNLABELLED, HIDDEN, VISIBLE = 0, 1, 2
 """Visibility of a keypoint, as in COCO: outside the image, occluded, visible."""
+
+_STORED_FIELDS = ("id", "asset", "class_index", "silhouette_area", "depth_area", "agreement", "boundary_f1")
+"""Fields of a label that have the same name and value in the manifest."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,10 +66,10 @@ class Truth:
         depth: Depth of the visible surface along the optical axis [m], (H, W), for the visibility of keypoints.
     """
 
-    instance: npt.NDArray[np.integer[Any]]
-    second: npt.NDArray[np.integer[Any]]
+    instance: npt.NDArray[np.integer]
+    second: npt.NDArray[np.integer]
     silhouettes: Mapping[int, Silhouette]
-    depth: npt.NDArray[np.floating[Any]]
+    depth: npt.NDArray[np.floating]
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,7 +155,7 @@ class Labels:
     instances: tuple[InstanceLabel, ...]
     dropped: dict[str, int]
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> JsonObject:
         """Return all labels as JSON values; masks are COCO run-length codes over the whole image."""
         size = self.width, self.height
         return {
@@ -187,7 +190,7 @@ class Labels:
         }
 
     @classmethod
-    def from_json(cls, record: dict[str, Any]) -> Labels:
+    def from_json(cls, record: JsonObject) -> Labels:
         """Restore labels from the output of :meth:`to_json`."""
         width, height = record["size"]
 
@@ -196,28 +199,20 @@ class Labels:
             mask = decode_rle({"size": [height, width], "counts": code})
             return np.ascontiguousarray(mask[y0:y1, x0:x1], dtype=bool)
 
-        instances = []
-        for entry in record["instances"]:
-            amodal = Silhouette(tuple(entry["amodal_box"]), decode(entry["amodal_rle"], entry["amodal_box"]))
-            instances.append(
-                InstanceLabel(
-                    id=entry["id"],
-                    asset=entry["asset"],
-                    class_index=entry["class_index"],
-                    class_name=entry["class"],
-                    box=tuple(entry["box"]),
-                    mask=decode(entry["rle"], entry["box"]),
-                    amodal=amodal,
-                    silhouette_box=tuple(entry["silhouette_box"]),
-                    silhouette_area=entry["silhouette_area"],
-                    depth_area=entry["depth_area"],
-                    agreement=entry["agreement"],
-                    boundary_f1=entry["boundary_f1"],
-                    world_from_object=np.array(entry["world_from_object"]),
-                    keypoints=np.array(entry["keypoints"], dtype=np.float64).reshape(-1, 3),
-                    marks=tuple(entry["marks"]),
-                )
+        instances = [
+            InstanceLabel(
+                **{name: entry[name] for name in _STORED_FIELDS},
+                class_name=entry["class"],
+                box=tuple(entry["box"]),
+                mask=decode(entry["rle"], entry["box"]),
+                amodal=Silhouette(tuple(entry["amodal_box"]), decode(entry["amodal_rle"], entry["amodal_box"])),
+                silhouette_box=tuple(entry["silhouette_box"]),
+                world_from_object=np.array(entry["world_from_object"]),
+                keypoints=np.array(entry["keypoints"], dtype=np.float64).reshape(-1, 3),
+                marks=tuple(entry["marks"]),
             )
+            for entry in record["instances"]
+        ]
         return cls(width, height, tuple(instances), dict(record["dropped"]))
 
 
@@ -267,13 +262,13 @@ def label_instances(
         if np.count_nonzero(mask) < rules.min_pixels:
             dropped["small"] += 1
             continue
-        seen = Silhouette.cropped(mask, x0, y0)
-        amodal, box, area = _amodal(silhouette, seen, rules.min_fragment, (width, height))
-        agreement, boundary = _agreement(seen, second, instance.id, found_second.get(instance.id))
+        visible = Silhouette.cropped(mask, x0, y0)
+        amodal, box, area = _amodal(silhouette, visible, rules.min_fragment, (width, height))
+        agreement, boundary = _agreement(visible, second, instance.id, found_second.get(instance.id))
         marks = tuple(
             name
             for name, value, least in (
-                ("occluded", seen.area / amodal.area, rules.min_visible),
+                ("occluded", visible.area / amodal.area, rules.min_visible),
                 ("disagreeing", agreement, rules.min_agreement),
             )
             if value < least
@@ -288,8 +283,8 @@ def label_instances(
                 asset=instance.asset,
                 class_index=instance.class_index,
                 class_name=class_names[instance.class_index],
-                box=seen.box,
-                mask=seen.mask,
+                box=visible.box,
+                mask=visible.mask,
                 amodal=amodal,
                 silhouette_box=box,
                 silhouette_area=area,
@@ -307,14 +302,14 @@ def label_instances(
 
 
 def _amodal(
-    silhouette: Silhouette | None, seen: Silhouette, min_fragment: int, size: tuple[int, int]
+    silhouette: Silhouette | None, visible: Silhouette, min_fragment: int, size: tuple[int, int]
 ) -> tuple[Silhouette, Box, int]:
     """Return the silhouette inside the image, and the bounds and area of the complete silhouette.
 
     Where three instances overlap in a pixel, one may have the largest share there that would not cover the pixel alone.
     Visible pixels therefore always belong to the silhouette.
     """
-    parts = [seen] if silhouette is None else [silhouette, seen]
+    parts = [visible] if silhouette is None else [silhouette, visible]
     x0, y0 = min(part.box[0] for part in parts), min(part.box[1] for part in parts)
     x1, y1 = max(part.box[2] for part in parts), max(part.box[3] for part in parts)
     canvas = np.zeros((y1 - y0, x1 - x0), dtype=bool)
@@ -333,11 +328,11 @@ def _amodal(
 
 
 def _agreement(
-    seen: Silhouette, second: npt.NDArray[np.integer[Any]], number: int, bounds: Box | None
+    visible: Silhouette, second: npt.NDArray[np.integer], number: int, bounds: Box | None
 ) -> tuple[float, float]:
     """Compute IoU and boundary F1 between an instance's mask and its mask (within ``bounds``) in the other id map."""
     height, width = second.shape
-    x0, y0, x1, y1 = seen.box
+    x0, y0, x1, y1 = visible.box
     if bounds is not None:
         left, top, right, bottom = bounds
         x0, y0, x1, y1 = min(x0, left), min(y0, top), max(x1, right), max(y1, bottom)
@@ -345,8 +340,8 @@ def _agreement(
     x0, y0, x1, y1 = max(x0 - margin, 0), max(y0 - margin, 0), min(x1 + margin, width), min(y1 + margin, height)
     other = second[y0:y1, x0:x1] == number
     one = np.zeros_like(other)
-    left, top, right, bottom = seen.box
-    one[top - y0 : bottom - y0, left - x0 : right - x0] = seen.mask
+    left, top, right, bottom = visible.box
+    one[top - y0 : bottom - y0, left - x0 : right - x0] = visible.mask
     return float(np.count_nonzero(one & other) / np.count_nonzero(one | other)), boundary_f1(one, other)
 
 
@@ -355,14 +350,14 @@ def _project_keypoints(points: Float64Array, instance: Instance, camera: Camera,
     pose = instance.world_from_object
     points = points @ pose[:3, :3].T + pose[:3, 3]
     pixels, depth = camera.project(points)
-    seen = np.zeros((len(points), 3))
-    for row, (x, y), z in zip(seen, pixels, depth, strict=True):
+    keypoints = np.zeros((len(points), 3))
+    for row, (x, y), z in zip(keypoints, pixels, depth, strict=True):
         if not (z > camera.near and 0 <= x < camera.width and 0 <= y < camera.height):
             continue
-        at = int(y), int(x)
-        shown = truth.instance[at] == instance.id and z <= truth.depth[at] * (1 + KEYPOINT_TOLERANCE)
-        row[:] = x, y, VISIBLE if shown else HIDDEN
-    return seen
+        pixel = int(y), int(x)
+        is_visible = truth.instance[pixel] == instance.id and z <= truth.depth[pixel] * (1 + KEYPOINT_TOLERANCE)
+        row[:] = x, y, VISIBLE if is_visible else HIDDEN
+    return keypoints
 
 
 def _with_depth(amodal: Silhouette, truth: Truth) -> int:

@@ -10,7 +10,6 @@ from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -23,31 +22,29 @@ from mitsplat.images.masks import Silhouette
 from mitsplat.images.picture_files import read_picture_inside
 from mitsplat.labels.labels import Labels
 from mitsplat.labels.overlay import class_colour
-from mitsplat.pages.html import inline_image, make_page, mask_path
+from mitsplat.pages.html import make_page, mask_path, shrunk_image
 from mitsplat.pages.svg_charts import HeatMap, Histogram, bars, columns
-from mitsplat.report.variety import Variety
-from mitsplat.storage.files import Record, open_regular, parse_json, write_text
+from mitsplat.report.variety import Variety, make_table
+from mitsplat.storage.files import JsonObject, Record, open_regular, parse_json, write_text
 
 SAMPLES = 12
 """Number of sample images, evenly spread over the dataset."""
 BRIGHTNESS_IMAGES = 200
 """Number of images for the brightness statistics, evenly spread over the dataset."""
 
-_THUMBNAIL = 640
+_THUMBNAIL_WIDTH = 640
 _OVERLAYS = {"mask": "Masks", "box": "Boxes", "name": "Names", "alone": "Silhouettes, hidden parts included"}
 _SHOWN_FIRST = ("mask", "name")
-
-
-_SHARES = ("visible_fraction", "truncation", "agreement", "boundary_f1")
+_FRACTIONS = ("visible_fraction", "truncation", "agreement", "boundary_f1")
 
 
 class _Statistics:
-    """Statistics of the manifest, counted in one pass, for images of ``size`` (width, height) [px]."""
+    """Statistics of the manifest, statistics in one pass, for images of ``size`` (width, height) [px]."""
 
     def __init__(self, size: tuple[int, int]) -> None:
         self.size = size
         self.images, self.classes, self.per_image = Counter[str](), Counter[str](), Counter[int]()
-        self.shares = {key: Histogram((0, 1)) for key in _SHARES}
+        self.fractions = {key: Histogram((0, 1)) for key in _FRACTIONS}
         self.order_errors: list[tuple[float, float]] = []
         self.left_out: dict[int, list[str]] = {}
         cells = 24, max(2, round(24 * size[1] / size[0]))
@@ -65,8 +62,8 @@ class _Statistics:
         boxes = np.array([label["box"] for label in labels["instances"]], dtype=np.float64).reshape(-1, 4)
         self.places.add((boxes[:, 0] + boxes[:, 2]) / 2, (boxes[:, 1] + boxes[:, 3]) / 2)
         self.sizes.add(boxes[:, 2] - boxes[:, 0], boxes[:, 3] - boxes[:, 1])
-        for key, counted in self.shares.items():
-            counted.add([label[key] for label in labels["instances"]])
+        for key, histogram in self.fractions.items():
+            histogram.add([label[key] for label in labels["instances"]])
 
 
 def write_report(root: str | Path, out: str | Path | None = None) -> tuple[Path, Audit, list[str]]:
@@ -84,38 +81,38 @@ def write_report(root: str | Path, out: str | Path | None = None) -> tuple[Path,
     content = read_content(root)
     records = Records(root, content)
     output = content["scene"]["output"]
-    counted = _Statistics((output["width"], output["height"]))
+    statistics = _Statistics((output["width"], output["height"]))
     variety = Variety(content)
 
     def visit(record: Record) -> None:
-        counted.add(record)
+        statistics.add(record)
         variety.add(record)
 
     audit = audit_dataset(root, visit)
     name = str(content["scene"]["name"])
     parts = [
         f"<h1>{html.escape(name)}</h1>",
-        _summary(content, counted, audit, root),
+        _summary(content, statistics, audit, root),
         _audit(audit),
-        _samples(root, records.some(SAMPLES)),
+        _samples(root, records.sample(SAMPLES)),
         variety.sections(),
-        _charts(counted, _brightness(root, records.some(BRIGHTNESS_IMAGES)), _seconds(root)),
+        _charts(statistics, _brightness(root, records.sample(BRIGHTNESS_IMAGES)), _seconds(root)),
         _details(content),
     ]
     write_text(out, make_page(f"{name}: dataset report", "\n".join(parts), script=_SCRIPT))
     return out, audit, variety.warnings()
 
 
-def _summary(content: dict[str, Any], counted: _Statistics, audit: Audit, root: Path) -> str:
+def _summary(content: JsonObject, statistics: _Statistics, audit: Audit, root: Path) -> str:
     runs = _lines(root / "runs.jsonl")
     rows = {
-        "Images": ", ".join(f"{count} {split}" for split, count in sorted(counted.images.items())),
-        "Size": f"{counted.size[0]} x {counted.size[1]} px",
-        "Instances": str(sum(counted.classes.values())),
-        "Not labelled": _counts(audit.dropped),
-        "Marked": _counts(audit.marked),
-        **({"Left out": _left_out(counted)} if counted.left_out else {}),
-        "Estimated blending-order error": _order_error(counted),
+        "Images": ", ".join(f"{count} {split}" for split, count in sorted(statistics.images.items())),
+        "Size": f"{statistics.size[0]} x {statistics.size[1]} px",
+        "Instances": str(sum(statistics.classes.values())),
+        "Not labelled": _format_counts(audit.dropped),
+        "Marked": _format_counts(audit.marked),
+        **({"Left out": _left_out(statistics)} if statistics.left_out else {}),
+        "Estimated blending-order error": _order_error(statistics),
         "Labels from": content["scene"]["labels"]["source"],
         "Formats": ", ".join(content["scene"]["output"]["formats"]),
         "Seed": str(content["scene"]["seed"]),
@@ -123,20 +120,19 @@ def _summary(content: dict[str, Any], counted: _Statistics, audit: Audit, root: 
         "Device": content.get("device", "cpu"),
         "mitsplat": content["mitsplat"],
     }
-    lines = "".join(f'<tr><th scope="row">{key}</th><td>{html.escape(value)}</td></tr>' for key, value in rows.items())
-    return f'<section aria-labelledby="summary"><h2 id="summary">Summary</h2><table>{lines}</table></section>'
+    return f'<section aria-labelledby="summary"><h2 id="summary">Summary</h2>{make_table(rows.items())}</section>'
 
 
-def _left_out(counted: _Statistics) -> str:
+def _left_out(statistics: _Statistics) -> str:
     """List the objects that did not come to rest, most frequent first."""
-    reasons = Counter(text for objects in counted.left_out.values() for text in objects).most_common(5)
+    reasons = Counter(text for objects in statistics.left_out.values() for text in objects).most_common(5)
     often = ", ".join(f"{count} {text}" for text, count in reasons)
-    return f"{len(counted.left_out)} layouts lack objects that did not come to rest: {often}"
+    return f"{len(statistics.left_out)} layouts lack objects that did not come to rest: {often}"
 
 
-def _order_error(counted: _Statistics) -> str:
+def _order_error(statistics: _Statistics) -> str:
     """Format the estimated order error of display-encoded colours, over the images that have an estimate."""
-    found, images = counted.order_errors, sum(counted.images.values())
+    found, images = statistics.order_errors, sum(statistics.images.values())
     if not found:
         return "not estimated by this preset"
     largest, mean = max(e for e, _ in found), sum(e for _, e in found) / len(found)
@@ -179,11 +175,7 @@ def _sample(root: Path, record: Record) -> str:
         return f"<figure><figcaption>Frame {record['index']}: its image cannot be read</figcaption></figure>"
     labels = Labels.from_json(record["labels"])
     height, width = image.shape[:2]
-    scale = min(1.0, _THUMBNAIL / width)
-    small = cv2.resize(
-        image, (max(1, round(width * scale)), max(1, round(height * scale))), interpolation=cv2.INTER_AREA
-    )
-    source = inline_image(small)
+    rgb = cv2.cvtColor(image, cv2.COLOR_BGR2RGB).astype(np.uint8, copy=False)
     unit = width / 640
     marks, names = [], []
     for label in labels.instances:
@@ -203,11 +195,10 @@ def _sample(root: Path, record: Record) -> str:
             f'<text class="name" x="{x0}" y="{max(y0 - 3 * unit, 11 * unit):.0f}" font-size="{12 * unit:.1f}">'
             f"{html.escape(label.class_name)}</text>"
         )
-    classes = _counts(Counter(label.class_name for label in labels.instances))
-    caption = f"Frame {record['index']}, {record['split']}: {classes}"
-    text = html.escape(caption, quote=True)
+    classes = _format_counts(Counter(label.class_name for label in labels.instances))
+    text = html.escape(f"Frame {record['index']}, {record['split']}: {classes}", quote=True)
     return (
-        f'<figure><div class="picture"><img alt="{text}" src="{source}">'
+        f'<figure><div class="picture"><img alt="{text}" src="{shrunk_image(rgb, _THUMBNAIL_WIDTH)}">'
         f'<svg aria-hidden="true" viewBox="0 0 {width} {height}">{"".join(marks + names)}</svg></div>'
         f"<figcaption>{text}</figcaption></figure>"
     )
@@ -234,29 +225,22 @@ def _seconds(root: Path) -> dict[str, float]:
     return {stage: round(float(np.median(values)), 4) for stage, values in stages.items()}
 
 
-def _charts(counted: _Statistics, brightness: tuple[np.ndarray, Histogram], seconds: dict[str, float]) -> str:
-    share = counted.shares
-    most = max([1, *counted.per_image])
+def _charts(statistics: _Statistics, brightness: tuple[np.ndarray, Histogram], seconds: dict[str, float]) -> str:
+    fractions = statistics.fractions
+    numbers = range(max([1, *statistics.per_image]) + 1)
+    luma = [f"{8 * i} to {8 * i + 7}" for i in range(len(brightness[0]))]
     charts = [
-        bars("Instances by class", dict(sorted(counted.classes.items()))),
+        bars("Instances by class", dict(sorted(statistics.classes.items()))),
         columns(
-            "Instances per image",
-            [counted.per_image[number] for number in range(most + 1)],
-            [str(number) for number in range(most + 1)],
-            "instances",
+            "Instances per image", [statistics.per_image[i] for i in numbers], list(map(str, numbers)), "instances"
         ),
-        counted.places.draw("Positions of boxes", "centre of the box [px]"),
-        counted.sizes.draw("Sizes of boxes", "width to the right, height down [px]"),
-        share["visible_fraction"].draw("Visible fraction of instances", "visible fraction"),
-        share["truncation"].draw("Truncation of instances", "fraction beyond the border"),
-        share["agreement"].draw("Agreement of splats and proxies", "IoU"),
-        share["boundary_f1"].draw("Agreement of their boundaries", "boundary F1"),
-        columns(
-            "Brightness of pixels",
-            brightness[0],
-            [f"{8 * i} to {8 * i + 7}" for i in range(len(brightness[0]))],
-            "luma",
-        ),
+        statistics.places.draw("Positions of boxes", "centre of the box [px]"),
+        statistics.sizes.draw("Sizes of boxes", "width to the right, height down [px]"),
+        fractions["visible_fraction"].draw("Visible fraction of instances", "visible fraction"),
+        fractions["truncation"].draw("Truncation of instances", "fraction beyond the border"),
+        fractions["agreement"].draw("Agreement of splats and proxies", "IoU"),
+        fractions["boundary_f1"].draw("Agreement of their boundaries", "boundary F1"),
+        columns("Brightness of pixels", brightness[0], luma, "luma"),
         brightness[1].draw("Brightness of images", "mean luma"),
         bars("Seconds per frame by stage, median", seconds, unit=" s"),
     ]
@@ -266,20 +250,16 @@ def _charts(counted: _Statistics, brightness: tuple[np.ndarray, Histogram], seco
     )
 
 
-def _details(content: dict[str, Any]) -> str:
-    libraries = "".join(
-        f'<tr><th scope="row">{html.escape(name)}</th><td>{html.escape(version)}</td></tr>'
-        for name, version in content["libraries"].items()
-    )
+def _details(content: JsonObject) -> str:
     scene = html.escape(json.dumps(content["scene"], indent=1))
     return (
         f'<section aria-labelledby="origin"><h2 id="origin">Origin</h2>'
-        f"<details><summary>Libraries</summary><table>{libraries}</table></details>"
+        f"<details><summary>Libraries</summary>{make_table(content['libraries'].items())}</details>"
         f'<details><summary>Effective scene</summary><pre tabindex="0">{scene}</pre></details></section>'
     )
 
 
-def _lines(path: Path) -> Iterator[dict[str, Any]]:
+def _lines(path: Path) -> Iterator[JsonObject]:
     """Yield the JSON objects in the lines of a file; the file may be missing or damaged."""
     with suppress(FileNotFoundError), open_regular(path) as file:
         for line in read_lines(file):
@@ -288,7 +268,7 @@ def _lines(path: Path) -> Iterator[dict[str, Any]]:
                     yield found
 
 
-def _counts(counts: dict[str, int]) -> str:
+def _format_counts(counts: dict[str, int]) -> str:
     return ", ".join(f"{count} {name}" for name, count in sorted(counts.items()) if count) or "none"
 
 

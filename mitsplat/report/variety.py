@@ -6,15 +6,14 @@ import html
 import math
 from array import array
 from collections import Counter
-from collections.abc import Iterator, Mapping
-from typing import Any
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 from pycocotools import mask as coco_mask
 
 from mitsplat.arrays import Float64Array, Int64Array
 from mitsplat.pages.svg_charts import Histogram, bars, discs
-from mitsplat.storage.files import Record
+from mitsplat.storage.files import JsonObject, Record
 
 OCCLUDED = 0.05
 """Fraction of hidden pixels above which an instance counts as occluded."""
@@ -31,21 +30,10 @@ wide.
 """
 
 _NOT_DRAWN_KEYS = frozenset(
-    {
-        "index",
-        "layout",
-        "view",
-        "split",
-        "seed",
-        "files",
-        "camera",
-        "labels",
-        "environment",
-        "rest",
-        "depth_scale",
-        "order_error",
-        "depth_sensor_scale",
-    }
+    (
+        *("index", "layout", "view", "split", "seed", "files", "camera", "labels", "environment", "rest"),
+        *("depth_scale", "depth_sensor_scale", "order_error"),
+    )
 )
 """Keys of a frame's record that contain no drawn values, or that are evaluated separately."""
 _IGNORED_KEYS = frozenset({"id", "entry", "asset", "seed"})
@@ -59,14 +47,14 @@ class Variety:
         content: Content of ``dataset.json``.
     """
 
-    def __init__(self, content: Mapping[str, Any]) -> None:
+    def __init__(self, content: JsonObject) -> None:
         self._classes: list[str] = content["classes"]
         self._assets: list[str] = content["assets"]
         self._numbers, self._texts = dict[str, _Sample](), dict[str, Counter[str]]()
         self._images, self._truncated = Counter[str](), 0
         self._instances, self._of_split = Counter[str](), Counter[tuple[str, str]]()
         self._occluded, self._pairs = Counter[str](), Counter[str]()
-        self._seen: dict[str, Int64Array] = {}
+        self._directions: dict[str, Int64Array] = {}
         self._sides, self._lit = Counter[str](), Histogram((-180, 180), bins=24)
 
     def add(self, record: Record) -> None:
@@ -86,16 +74,16 @@ class Variety:
         self._add_occlusion(labels, record["labels"]["size"])
         self._add_directions(record)
 
-    def _add_occlusion(self, labels: list[dict[str, Any]], size: list[int]) -> None:
+    def _add_occlusion(self, labels: list[JsonObject], size: list[int]) -> None:
         """Count the pairs of classes where the visible part of one overlaps the silhouette of the other."""
         hidden = [label for label in labels if label["visible_fraction"] < 1 - OCCLUDED]
         self._occluded.update(label["class"] for label in hidden)
         if not hidden:
             return
-        whole = [{"size": size[::-1], "counts": label["amodal_rle"]} for label in hidden]
-        seen = [{"size": size[::-1], "counts": label["rle"]} for label in labels]
+        silhouettes = [{"size": size[::-1], "counts": label["amodal_rle"]} for label in hidden]
+        visible = [{"size": size[::-1], "counts": label["rle"]} for label in labels]
         # For crowd annotations, pycocotools divides the intersection by the area of the first mask alone.
-        shares = np.asarray(coco_mask.iou(whole, seen, [1] * len(seen))).reshape(len(hidden), len(labels))
+        shares = np.asarray(coco_mask.iou(silhouettes, visible, [1] * len(visible))).reshape(len(hidden), len(labels))
         for label, row in zip(hidden, shares, strict=True):
             near = {
                 other["class"]
@@ -109,10 +97,11 @@ class Variety:
         labels, camera = record["labels"]["instances"], np.array(record["camera"]["world_from_camera"])
         places = []
         for label in labels:
-            own = np.array(label["world_from_object"])
-            places.append(own[:3, 3])
-            counts = self._seen.setdefault(self._assets[label["asset"]], np.zeros((2 * RINGS, SECTORS), dtype=np.int64))
-            counts[cell_of(own[:3, :3].T @ (camera[:3, 3] - own[:3, 3]))] += 1
+            pose = np.array(label["world_from_object"])
+            places.append(pose[:3, 3])
+            asset = self._assets[label["asset"]]
+            counts = self._directions.setdefault(asset, np.zeros((2 * RINGS, SECTORS), dtype=np.int64))
+            counts[cell_of(pose[:3, :3].T @ (camera[:3, 3] - pose[:3, 3]))] += 1
         if places and (light := _key_light(record.get("lights", []), np.mean(places, axis=0))) is not None:
             x, y, _ = camera[:3, :3].T @ light
             self._lit.add(math.degrees(math.atan2(-y, x)))
@@ -121,7 +110,7 @@ class Variety:
     def warnings(self) -> list[str]:
         """Return warnings about gaps that a detector cannot learn from these images, a sentence each."""
         found = [*self._class_warnings(), *self._instance_warnings()]
-        for name, counts in sorted(self._seen.items()):
+        for name, counts in sorted(self._directions.items()):
             cells = np.count_nonzero(counts[:RINGS])
             if counts.sum() >= MIN_VIEWS and cells < MIN_DIRECTIONS * RINGS * SECTORS:
                 found.append(f"{name} is seen from {cells} of the {RINGS * SECTORS} directions above it")
@@ -158,23 +147,19 @@ class Variety:
         """Return parts of the page: warnings, view directions, and the histogram of every drawn value."""
         warned = "".join(f"<li>{html.escape(text)}</li>" for text in self.warnings())
         warned = f"<ul>{warned}</ul>" if warned else '<p class="good">No warnings</p>'
-        seen = dict(sorted(self._seen.items()))
-        upper = {name: 100 * np.count_nonzero(counts[:RINGS]) / counts[:RINGS].size for name, counts in seen.items()}
-        lower = {name: 100 * np.count_nonzero(counts[RINGS:]) / counts[RINGS:].size for name, counts in seen.items()}
+        directions = dict(sorted(self._directions.items()))
+        upper, lower = (
+            {name: 100 * np.count_nonzero(counts[half]) / (RINGS * SECTORS) for name, counts in directions.items()}
+            for half in (slice(RINGS), slice(RINGS, None))
+        )
         occluded = {name: 100 * self._occluded[name] / count for name, count in sorted(self._instances.items())}
+        pairs = dict(self._pairs.most_common(_MAX_PAIRS))
         charts = [
-            discs(
-                "View directions above objects",
-                {name: cells[:RINGS] for name, cells in seen.items()},
-            ),
+            discs("View directions above objects", {name: counts[:RINGS] for name, counts in directions.items()}),
             bars("Covered view directions above objects", upper, unit=" %"),
             bars("Covered view directions below objects", lower, unit=" %"),
             bars("Occluded instances of each class", occluded, unit=" %"),
-            bars(
-                "Most frequent pairs of occluder and occluded class",
-                dict(self._pairs.most_common(_MAX_PAIRS)),
-                name_width=240,
-            ),
+            bars("Most frequent pairs of occluder and occluded class", pairs, name_width=240),
             self._lit.draw("Direction of light in the image", "from the right 0, from above 90 [degrees]"),
         ]
         drawn, fixed = [], []
@@ -183,21 +168,20 @@ class Variety:
             if low == high:
                 fixed.append((name, f"{low:.6g}"))
                 continue
-            counted = Histogram((low, high))
-            counted.add(sample.values)
-            drawn.append(counted.draw(name))
+            histogram = Histogram((low, high))
+            histogram.add(sample.values)
+            drawn.append(histogram.draw(name))
         for name, texts in sorted(self._texts.items()):
             if len(texts) == 1:
                 fixed.append((name, next(iter(texts))))
             else:
                 drawn.append(bars(name, dict(texts.most_common(_MAX_PAIRS))))
-        rows = "".join(f'<tr><th scope="row">{html.escape(a)}</th><td>{html.escape(b)}</td></tr>' for a, b in fixed)
         return (
             '<section aria-labelledby="variety"><h2 id="variety">Variety</h2>'
             f'{warned}<div class="charts">{"".join(charts)}</div></section>'
             '<section aria-labelledby="draws"><h2 id="draws">Draws</h2>'
             f'<div class="charts">{"".join(drawn)}</div>'
-            f"<details><summary>Constant in all images</summary><table>{rows}</table></details></section>"
+            f"<details><summary>Constant in all images</summary>{make_table(fixed)}</details></section>"
         )
 
 
@@ -217,6 +201,12 @@ class _Sample:
         self._count += 1
 
 
+def make_table(rows: Iterable[tuple[str, str]]) -> str:
+    """Return an HTML table of a name and a value in each row."""
+    cells = (f'<th scope="row">{html.escape(name)}</th><td>{html.escape(value)}</td>' for name, value in rows)
+    return f"<table>{''.join(f'<tr>{row}</tr>' for row in cells)}</table>"
+
+
 def cell_of(direction: Float64Array) -> tuple[int, int]:
     """Return ring, from the top down, and sector of a direction; both hemispheres have :data:`RINGS` rings."""
     x, y, z = direction / max(float(np.linalg.norm(direction)), 1e-12)
@@ -225,7 +215,7 @@ def cell_of(direction: Float64Array) -> tuple[int, int]:
     return min(ring, 2 * RINGS - 1), min(sector, SECTORS - 1)
 
 
-def _values(value: Any, name: str) -> Iterator[tuple[str, float | str]]:
+def _values(value: object, name: str) -> Iterator[tuple[str, float | str]]:
     """Yield numbers and texts in a part of a record by key path; values of an entry are grouped by its number."""
     if isinstance(value, bool | str):
         yield name, str(value)
@@ -258,7 +248,7 @@ def _camera_values(record: Record) -> Iterator[tuple[str, float]]:
     yield "camera aperture radius [m]", camera["aperture_radius"]
 
 
-def _key_light(lights: list[dict[str, Any]], point: Float64Array) -> Float64Array | None:
+def _key_light(lights: list[JsonObject], point: Float64Array) -> Float64Array | None:
     """Return the sum of the directions to local lights, weighted by their irradiance at a point without cosine terms.
 
     The result is None if there is no local light.

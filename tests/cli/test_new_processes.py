@@ -67,7 +67,7 @@ CALLS = {
     "Renderer": "assert ms.Renderer(ms.load_scene('scene.yaml')).render(0).image.any()",
     "load_scene": "ms.load_scene('scene.yaml')",
     "make_scene": "ms.make_scene(ms.load_scene('scene.yaml').spec)",
-    "remake_frame": "assert ms.remake_frame(ms.load_scene('scene.yaml'), 0, 'again').record",
+    "rerender_frame": "assert ms.rerender_frame(ms.load_scene('scene.yaml'), 0, 'again').record",
     "render_frames": "assert all(f.image.any() for f in ms.render_frames(ms.load_scene('scene.yaml'), 1))",
     "render_frame": "assert ms.render_frame(ms.load_scene('scene.yaml'), 0).image.any()",
     "render_splats": "assert ms.render_splats(ball(), camera).alpha.any()",

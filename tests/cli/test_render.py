@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from ruamel.yaml import YAML
 
-from mitsplat.dataset import remake
+from mitsplat.dataset import rerender
 from mitsplat.dataset import write as dataset
 from mitsplat.dataset.write import DatasetSummary
 from mitsplat.errors import InputError
@@ -64,8 +64,8 @@ def test_render_only_makes_one_frame_and_compares_it(
     status: int,
     told: str,
 ) -> None:
-    calls = Calls(remake.RemadeFrame(tmp_path, {"files": {}}, **made))
-    monkeypatch.setattr(remake, "remake_frame", calls)
+    calls = Calls(rerender.RerenderedFrame(tmp_path, {"files": {}}, **made))
+    monkeypatch.setattr(rerender, "rerender_frame", calls)
     assert run("render", scene_path, "-o", tmp_path / "out", "--only", 3, "--size", "32x24") == status
     scene, index, out = calls.args
     assert (scene.spec.output.width, index, out) == (32, 3, tmp_path / "out-000003")

@@ -13,9 +13,9 @@ from pathlib import Path
 import pytest
 
 from mitsplat.audit.audit import audit_dataset
+from mitsplat.dataset.dataset_files import is_written
 from mitsplat.dataset.folds import write_folds
 from mitsplat.dataset.manifest import Manifest, encode_line
-from mitsplat.dataset.own_files import is_written
 from mitsplat.dataset.shards import merge_shards
 from mitsplat.detector.sets import read_set
 from mitsplat.detector.training import write_data

@@ -13,7 +13,7 @@ import pytest
 from mitsplat.audit.audit import audit_dataset
 from mitsplat.dataset.dataset_folder import Shard
 from mitsplat.dataset.manifest import encode_line, parse_line
-from mitsplat.dataset.remake import remake_frame
+from mitsplat.dataset.rerender import rerender_frame
 from mitsplat.dataset.shards import merge_shards
 from mitsplat.dataset.write import DatasetSummary, write_dataset
 from mitsplat.errors import InputError
@@ -116,7 +116,7 @@ def test_shards_merge_into_the_same_bytes(scene: Scene, whole: DatasetSummary, t
 
 @pytest.mark.parametrize("index", [5, 10])
 def test_a_remade_frame_has_the_same_bytes(scene: Scene, whole: DatasetSummary, tmp_path: Path, index: int) -> None:
-    made = remake_frame(scene, index, tmp_path / "frame", dataset=whole.path, render=render_boxes, settle=settle_most)
+    made = rerender_frame(scene, index, tmp_path / "frame", dataset=whole.path, render=render_boxes, settle=settle_most)
     assert made.compared
     assert made.differing == ()
 

@@ -12,7 +12,7 @@ import pytest
 
 from mitsplat.dataset.dataset_folder import Shard
 from mitsplat.dataset.folds import write_folds
-from mitsplat.dataset.remake import remake_frame
+from mitsplat.dataset.rerender import rerender_frame
 from mitsplat.dataset.shards import merge_shards
 from mitsplat.dataset.write import write_dataset
 from mitsplat.engine.ray import Cluster
@@ -126,7 +126,7 @@ def test_folds_are_removed_when_images_are_added(
 
 def test_a_remade_frame_replaces_files_of_an_earlier_one(scene: Scene, tmp_path: Path) -> None:
     def make(out: Path, of: Scene) -> dict[str, bytes]:
-        remake_frame(of, 3, out, render=render_boxes, settle=scatter_boxes)
+        rerender_frame(of, 3, out, render=render_boxes, settle=scatter_boxes)
         return contents(out)
 
     output = scene.spec.output.model_copy(update={"formats": ("yolo", "depth")})

@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 
 from mitsplat.dataset.dataset_folder import Shard
-from mitsplat.dataset.frame_job import FrameMaker, RemoteFrames
+from mitsplat.dataset.frame_job import FrameJob, RemoteFrameJob
 from mitsplat.dataset.manifest import Manifest, encode_line
 from mitsplat.dataset.shards import merge_shards
 from mitsplat.engine import ray as cluster
@@ -413,20 +413,20 @@ def test_images_of_lights_are_sent_with_the_job(scene_data, write_scene, tmp_pat
     scene_data["lights"] = [{"kind": "environment", "image": "sky.png"}]
     home = load_scene(write_scene(scene_data))
     image = home.images["sky.png"].read_bytes()
-    job = RemoteFrames(FrameMaker(home, Catalogue.of(home), tmp_path / "out", render, settle))
+    job = RemoteFrameJob(FrameJob(home, Catalogue.of(home), tmp_path / "out", render, settle))
     sent = pickle.dumps(job)
     for path in (*home.path.parent.glob("*.yaml"), tmp_path / "sky.png"):
         path.unlink()
     there = pickle.loads(sent)
     parcel = there.make(0, there.settle(0))
     assert parcel.record["lights"][0]["image"] == "sky.png"
-    (copy,) = there.maker.scene.images.values()
+    (copy,) = there.job.scene.images.values()
     assert copy.read_bytes() == image and tmp_path not in copy.parents
-    renderer = Renderer(there.maker.scene, quality="fast")
-    assert renderer._emitter(plan_frame(there.maker.scene, 0).lights[0])["filename"] == str(copy)
-    scene = there.maker.scene
+    renderer = Renderer(there.job.scene, quality="fast")
+    assert renderer._emitter(plan_frame(there.job.scene, 0).lights[0])["filename"] == str(copy)
+    scene = there.job.scene
     there.make(1, there.settle(0))
-    assert there.maker.scene is scene  # by which the renderer knows its uploads
+    assert there.job.scene is scene  # by which the renderer knows its uploads
     del there, renderer
     assert not copy.exists()
 

@@ -13,7 +13,7 @@ import pytest
 
 import mitsplat as ms
 from mitsplat.audit.audit import audit_dataset
-from mitsplat.dataset.remake import remake_frame
+from mitsplat.dataset.rerender import rerender_frame
 from mitsplat.dataset.write import write_dataset
 from mitsplat.frames.flow import UNKNOWN_FLOW, exposure_flow
 from mitsplat.geometry.camera import Camera
@@ -135,7 +135,7 @@ def test_a_dataset_with_a_belt_has_no_violations(belt_data: SceneData, write_sce
     assert [record["conveyor"]["time"] for record in records] == pytest.approx([-0.1, 0, 0.1] * 2)
     boxes = [record["labels"]["instances"][0]["box"][0] for record in records[:3]]
     assert boxes[2] - boxes[1] == boxes[1] - boxes[0] == pytest.approx(100 * STEP / 0.47, abs=1)
-    again = remake_frame(scene, 2, tmp_path / "again", dataset=out, settle=lying)
+    again = rerender_frame(scene, 2, tmp_path / "again", dataset=out, settle=lying)
     assert again.compared and not again.differing
     # A layout that settled elsewhere is found out.
     stored = json.loads((out / "layouts/0000.json").read_bytes())

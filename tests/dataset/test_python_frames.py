@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from mitsplat.audit import audit_dataset
-from mitsplat.dataset.given_frames import write_frames
+from mitsplat.dataset.python_frames import write_frames
 from mitsplat.errors import InputError
 from mitsplat.frames.sequence import render_frames
 from mitsplat.geometry.camera import Camera

@@ -78,7 +78,7 @@ def refuse_links(out: Path) -> None:
     Raises:
         InputError: If a folder of the dataset, or a file directly in its folder, is a link.
     """
-    for name in sorted({*_ENTRIES, *_entries_of_all(), "folds"}):
+    for name in sorted({*_ENTRIES, *_format_entries(), "folds"}):
         top = out / name
         links = [top] if top.is_symlink() else []
         for folder, folders, _ in os.walk(top) if not links else ():
@@ -92,7 +92,7 @@ def refuse_links(out: Path) -> None:
 def remove_dataset(out: Path) -> None:
     """Remove only files that mitsplat writes; ``dataset.json`` goes last, so an interrupted removal can be repeated."""
     remove_folds(out)
-    for name in sorted({*_entries(out), *_ENTRIES} - {LOCK, CONTENT}):
+    for name in sorted({*_format_entries(out), *_ENTRIES} - {LOCK, CONTENT}):
         entry = out / name
         if entry.is_dir():
             _remove_written(out, entry)
@@ -112,17 +112,13 @@ def _remove_written(out: Path, top: Path) -> None:
             Path(folder).rmdir()
 
 
-def _entries(out: Path) -> list[str]:
+def _format_entries(out: Path | None = None) -> list[str]:
     """Return the top-level entries of a dataset's formats, or of all formats if ``dataset.json`` cannot be read."""
     try:
-        formats = read_json(out / CONTENT)["scene"]["output"]["formats"]
+        formats = TABLE if out is None else read_json(out / CONTENT)["scene"]["output"]["formats"]
         return [entry for name in formats for entry in TABLE[name].entries]
     except (OSError, ValueError, LookupError, TypeError):
-        return _entries_of_all()
-
-
-def _entries_of_all() -> list[str]:
-    return [entry for format in TABLE.values() for entry in format.entries]
+        return _format_entries()
 
 
 def remove_folds(out: Path) -> bool:

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from mitsplat.dataset.remake import remake_frame
+from mitsplat.dataset.rerender import rerender_frame
 from mitsplat.dataset.write import write_dataset
 from mitsplat.errors import InputError
 from mitsplat.scene.loading.scene_loading import load_scene
@@ -40,7 +40,7 @@ def test_remade_frames_have_the_same_bytes(scene_data: dict[str, Any], write_sce
         }
     )
     out = write_dataset(load_scene(path), tmp_path / "out", settle=scatter_boxes).path
-    made = remake_frame(load_scene(path), 2, tmp_path / "again", dataset=out, settle=scatter_boxes)
+    made = rerender_frame(load_scene(path), 2, tmp_path / "again", dataset=out, settle=scatter_boxes)
     assert (made.compared, made.differing, made.cause) == (3, (), "")
     for file in [*made.record["files"], "layouts/0001.json"]:
         assert (made.path / file).read_bytes() == (out / file).read_bytes()
@@ -50,28 +50,28 @@ def test_remade_frames_have_the_same_bytes(scene_data: dict[str, Any], write_sce
 def test_files_that_differ_are_named_with_the_cause(scene: Scene, made: Path, tmp_path: Path) -> None:
     line = (made / "manifest.jsonl").read_bytes().splitlines(keepends=True)[1]
     (made / "layouts/0000.json").write_text("{}")
-    again = remake_frame(scene, 1, tmp_path / "again", dataset=made, **DRAWN)
+    again = rerender_frame(scene, 1, tmp_path / "again", dataset=made, **DRAWN)
     assert again.differing == ("layouts/0000.json",)
     other = replace(scene, spec=scene.spec.model_copy(update={"seed": 1}))
-    again = remake_frame(other, 1, tmp_path / "again", dataset=made, **DRAWN)
+    again = rerender_frame(other, 1, tmp_path / "again", dataset=made, **DRAWN)
     assert set(again.differing) >= {"images/train/000001.png", "manifest.jsonl"}
     assert again.cause == "scene.seed was 0 and is 1"
     (made / "manifest.jsonl").write_bytes(line.replace(b'"view":1', b'"view":2'))
     with pytest.raises(InputError, match=r"manifest\.jsonl: must hold the record of frame 1 \(its checksum"):
-        remake_frame(scene, 1, tmp_path / "again", dataset=made, **DRAWN)
+        rerender_frame(scene, 1, tmp_path / "again", dataset=made, **DRAWN)
 
 
 def test_a_frame_that_the_dataset_lacks_is_not_compared(scene: Scene, made: Path, tmp_path: Path) -> None:
     for index, dataset in ((3, made), (1, tmp_path / "none"), (1, None)):
-        again = remake_frame(scene, index, tmp_path / f"again{index}", dataset=dataset, **DRAWN)
+        again = rerender_frame(scene, index, tmp_path / f"again{index}", dataset=dataset, **DRAWN)
         assert again.compared == 0 and again.record["index"] == index
 
 
 def test_a_folder_with_other_files_is_refused(scene: Scene, made: Path) -> None:
     with pytest.raises(InputError, match="must be absent, empty, or hold a frame of an earlier call"):
-        remake_frame(scene, 1, made, **DRAWN)
+        rerender_frame(scene, 1, made, **DRAWN)
     with pytest.raises(InputError, match="frame must be in 0 to 3"):
-        remake_frame(scene, 4, made, **DRAWN)
+        rerender_frame(scene, 4, made, **DRAWN)
 
 
 def test_remaking_a_frame_does_not_change_the_dataset(scene: Scene, made: Path, tmp_path: Path) -> None:
@@ -79,5 +79,5 @@ def test_remaking_a_frame_does_not_change_the_dataset(scene: Scene, made: Path, 
     with (made / "manifest.jsonl").open("ab") as file:
         file.write(b'{"index":1,"layout"')
     before = {path: path.read_bytes() for path in made.rglob("*") if path.is_file()}
-    assert remake_frame(scene, 1, tmp_path / "again", dataset=made, **DRAWN).differing == ()
+    assert rerender_frame(scene, 1, tmp_path / "again", dataset=made, **DRAWN).differing == ()
     assert before == {path: path.read_bytes() for path in made.rglob("*") if path.is_file()}

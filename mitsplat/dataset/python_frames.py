@@ -8,9 +8,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from mitsplat.dataset.dataset_files import TIMINGS
 from mitsplat.dataset.dataset_folder import append_run, content_of, finish_folder, open_folder
 from mitsplat.dataset.manifest import append_line
-from mitsplat.dataset.own_files import TIMINGS
 from mitsplat.dataset.write import DatasetSummary, FrameCounts
 from mitsplat.errors import InputError
 from mitsplat.formats.registry import Catalogue, write_frame
@@ -50,10 +50,11 @@ def write_frames(scene: Scene, out: str | Path, frames: Iterable[Frame], *, over
             "output.formats: flow is not available for frames made in Python, because it "
             "relates views of one layout; save frame.flow instead"
         )
-    alone = replace(scene, spec=scene.spec.model_copy(update={"output": output.model_copy(update={"views": 1})}))
+    # Each frame is a layout of its own.
+    one_view = replace(scene, spec=scene.spec.model_copy(update={"output": output.model_copy(update={"views": 1})}))
     catalogue = Catalogue.of(scene)
     device = current_device().kind
-    content = content_of(alone, catalogue, device) | {"given": True}
+    content = content_of(one_view, catalogue, device) | {"given": True}
     counts = FrameCounts()
     with open_folder(out, content, scene.path, None, resume=False, overwrite=overwrite) as manifest:
         append_run(out, 1, device)
@@ -64,15 +65,15 @@ def write_frames(scene: Scene, out: str | Path, frames: Iterable[Frame], *, over
                     f"frame {index}: must be of the scene's {output.width}x{output.height} px (got {width}x{height})"
                 )
             split = split_of(index, output.validation, output.test)
-            # Only the motion is kept: the camera's pose and lens contain the other drawn values.
-            moved = {name: drawn for name, drawn in frame.plan.viewpoint.items() if name == "motion"}
+            # The camera's pose and lens contain all drawn values except the motion.
+            motion = {name: value for name, value in frame.plan.viewpoint.items() if name == "motion"}
             plan = replace(
-                frame.plan, index=index, layout=index, view=0, split=split, next_camera=None, viewpoint=moved
+                frame.plan, index=index, layout=index, view=0, split=split, next_camera=None, viewpoint=motion
             )
             layout = replace(frame.layout, index=index)
             with storage_errors(out):
                 write_text(out / f"layouts/{index:04d}.json", json.dumps(layout.to_json()))
-                record = write_frame(replace(frame, plan=plan), out, scene.spec, catalogue, given=True)
+                record = write_frame(replace(frame, plan=plan), out, scene.spec, catalogue, custom_layout=True)
             append_line(out / TIMINGS, {"index": index, **{k: round(v, 4) for k, v in frame.seconds.items()}})
             manifest.append(record)
         if not len(manifest):

@@ -15,10 +15,10 @@ from itertools import chain
 from pathlib import Path
 from typing import SupportsIndex
 
-from mitsplat.dataset.dataset_folder import IMPLIED, content_of, first_difference
-from mitsplat.dataset.frame_job import FrameMaker, Render, Settle
+from mitsplat.dataset.dataset_files import CONTENT, MANIFEST, is_written, refuse_links
+from mitsplat.dataset.dataset_folder import DEFAULT_CONTENT, content_of, first_difference
+from mitsplat.dataset.frame_job import FrameJob, Render, Settle
 from mitsplat.dataset.manifest import parse_line, read_lines
-from mitsplat.dataset.own_files import CONTENT, MANIFEST, is_written, refuse_links
 from mitsplat.dataset.preflight import count_faults, image_faults, layout_faults, refuse
 from mitsplat.dataset.schema import check_record, read_content
 from mitsplat.errors import InputError
@@ -34,7 +34,7 @@ FRAME = "frame.json"
 
 
 @dataclass(frozen=True)
-class RemadeFrame:
+class RerenderedFrame:
     """Frame that was rendered again.
 
     Attributes:
@@ -53,7 +53,7 @@ class RemadeFrame:
     cause: str = ""
 
 
-def remake_frame(
+def rerender_frame(
     scene: Scene,
     index: SupportsIndex,
     out: str | Path,
@@ -62,7 +62,7 @@ def remake_frame(
     device: str | Device | None = None,
     render: Render = render_frame,
     settle: Settle = settle_layout,
-) -> RemadeFrame:
+) -> RerenderedFrame:
     """Render one frame again from the scene and the frame's index alone, byte for byte as in the dataset.
 
     Args:
@@ -86,27 +86,29 @@ def remake_frame(
         raise InputError(f"{out} must be absent, empty, or hold a frame of an earlier call (it holds other files)")
     refuse_links(out)
     used_device = current_device() if device is None else use_device(device)
-    place = f"layouts/{layout:04d}.json"
-    maker = FrameMaker(scene, catalogue, out, render, settle)
+    layout_file = f"layouts/{layout:04d}.json"
+    job = FrameJob(scene, catalogue, out, render, settle)
     with storage_errors(out):
-        text = maker.settle_to_json(layout, lambda text: None)
+        text = job.settle_to_json(layout, lambda text: None)
         _remove_frame(out)
-        write_text(out / place, text)
-        record, _ = maker.write(index, maker.load_layout(text))
+        write_text(out / layout_file, text)
+        record, _ = job.write(index, job.load_layout(text))
         write_text(out / FRAME, json.dumps(record, indent=1) + "\n")
-    known = None if dataset is None else _frame_of(Path(dataset), index)
-    if dataset is None or known is None:
-        return RemadeFrame(out, record)
-    before, now = known["files"], record["files"]
+    dataset = None if dataset is None else Path(dataset)
+    stored = None if dataset is None else _read_frame(dataset, index)
+    if dataset is None or stored is None:
+        return RerenderedFrame(out, record)
+    before, now = stored["files"], record["files"]
     differing = sorted(file for file in {*before, *now} if before.get(file) != now.get(file))
-    if known != {**json.loads(json.dumps(record)), "files": before}:
+    if stored != {**json.loads(json.dumps(record)), "files": before}:
         differing.append(MANIFEST)
-    if (Path(dataset) / place).is_file() and (Path(dataset) / place).read_bytes() != text.encode():
-        differing.append(place)
-    present = {**IMPLIED, **read_json(Path(dataset) / CONTENT)}
-    found = first_difference(present, content_of(scene, catalogue, used_device.kind))
-    cause = "" if found is None else "{} was {} and is {}".format(*found)
-    return RemadeFrame(out, record, len(before), tuple(differing), cause)
+    if (dataset / layout_file).is_file() and (dataset / layout_file).read_bytes() != text.encode():
+        differing.append(layout_file)
+    difference = first_difference(
+        DEFAULT_CONTENT | read_json(dataset / CONTENT), content_of(scene, catalogue, used_device.kind)
+    )
+    cause = "" if difference is None else "{} was {} and is {}".format(*difference)
+    return RerenderedFrame(out, record, len(before), tuple(differing), cause)
 
 
 def _remove_frame(out: Path) -> None:
@@ -120,7 +122,7 @@ def _remove_frame(out: Path) -> None:
             (out / name).unlink(missing_ok=True)
 
 
-def _frame_of(dataset: Path, index: int) -> Record | None:
+def _read_frame(dataset: Path, index: int) -> Record | None:
     """Read the record of a frame from the manifest of a dataset, which another process may be writing.
 
     Raises:
@@ -129,16 +131,16 @@ def _frame_of(dataset: Path, index: int) -> Record | None:
     if not (dataset / CONTENT).is_file() or not (dataset / MANIFEST).is_file():
         return None
     content = read_content(dataset)
-    start, found = f'{{"index":{index},'.encode(), None
+    start, last_line = f'{{"index":{index},'.encode(), None
     with open_regular(dataset / MANIFEST) as file:
         for line in read_lines(file):
             if line.startswith(start) and line.endswith(b"\n"):
-                found = line  # the last of several lines counts
+                last_line = line  # the last of several lines counts
+    if last_line is None:
+        return None
     try:
-        if found is None:
-            return None
-        record = parse_line(found)
-        check_record(found, record, content)
+        record = parse_line(last_line)
+        check_record(last_line, record, content)
         return record
     except ValueError as error:
         raise InputError(f"{dataset / MANIFEST}: must hold the record of frame {index} ({error})") from error

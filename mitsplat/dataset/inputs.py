@@ -75,7 +75,7 @@ class _InputHashes:
                 digest = ContentHash()
                 for name in names:
                     digest.add_array(getattr(value, name))
-                self._known[id(value)] = value, digest.hexdigest()  # the value keeps its id
+                self._known[id(value)] = value, digest.hexdigest()  # holding the value keeps its id unique
             return self._known[id(value)][1]
         if isinstance(value, Mapping):
             return {name: self.describe_value(entry) for name, entry in value.items()}

@@ -39,7 +39,7 @@ _FRACTIONS = ("visible_fraction", "truncation", "agreement", "boundary_f1")
 
 
 class _Statistics:
-    """Statistics of the manifest, statistics in one pass, for images of ``size`` (width, height) [px]."""
+    """Statistics of the manifest, computed in one pass, for images of ``size`` (width, height) [px]."""
 
     def __init__(self, size: tuple[int, int]) -> None:
         self.size = size

@@ -110,8 +110,8 @@ def write_frame(
         record["order_error"] = {name: round(value, 6) for name, value in frame.order_error.items()}
     image = f"images/{plan.split}/{frame.index:06d}.{output.image}"
     files = FrameFiles(root, frame, catalogue, record, image, ids)
-    encode = maps.encode_png if output.image == "png" else maps.encode_jpg
-    files.add_bytes(image, encode(frame.image))
+    data = maps.encode_png(frame.image) if output.image == "png" else maps.encode_jpg(frame.image)
+    files.add_bytes(image, data)
     for name, format in TABLE.items():
         if name in output.formats and format.write is not None:
             format.write(files)

@@ -1,4 +1,4 @@
-"""Images behind a scene: which part of them is shown, and where."""
+"""Background images: crop, rotation and pixel coverage."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def backing(**values: Any) -> BackgroundDraw:
 
 
 def ramp(width: int, height: int) -> np.ndarray:
-    """An image whose encoded red and green say where a pixel's centre is, in shares of width and height."""
+    """Return an image whose red and green encode the pixel centre's x and y as fractions of width and height."""
     x, y = np.meshgrid((np.arange(width) + 0.5) / width, (np.arange(height) + 0.5) / height)
     return np.asarray(np.rint(255 * np.stack([x, y, 0 * x], axis=2)), dtype=np.uint8)
 
@@ -44,7 +44,10 @@ def test_a_larger_image_is_averaged() -> None:
 def test_the_shown_part_of_an_image_is_that_of_its_draw(
     angle: float, size: tuple[int, int], crop: float, place: tuple[float, float]
 ) -> None:
-    """Of a ramp, colours say where they are from: a turned rectangle of the picture's proportions, inside of it."""
+    """The crop is a rotated rectangle with the picture's aspect ratio inside the image.
+
+    The colours of the ramp give the source position of every pixel.
+    """
     width, height = 80, 60
     colours = crop_background(ramp(*size), backing(rotate=angle, crop=crop, place=place), width, height)
     from mitsplat.images.colour import encode_srgb
@@ -60,7 +63,7 @@ def test_the_shown_part_of_an_image_is_that_of_its_draw(
     middle = reach + place * (size - 2 * reach)
     x, y = np.meshgrid(np.arange(width) + 0.5 - width / 2, np.arange(height) + 0.5 - height / 2)
     expected = middle + step * (x[..., None] * right + y[..., None] * down)
-    inner = (slice(3, -3), slice(3, -3))  # where nothing beyond the image is blended in
+    inner = (slice(3, -3), slice(3, -3))  # excludes pixels blended with the image border
     assert np.abs(shown - expected)[inner].max() < rounding.max() + 0.01 * max(size)
 
 
@@ -84,7 +87,7 @@ def test_a_background_is_seen_in_empty_pixels_and_changes_no_label(
     full = frame.layers.alpha == 1
     assert 0.1 < full.mean() < 0.9
     np.testing.assert_array_equal(frame.image[full], plain.image[full])
-    border = ~empty & ~full  # of antialiased silhouettes, where some of a pixel's rays meet nothing
+    border = ~empty & ~full  # antialiased silhouettes: some rays of the pixel miss all surfaces
     assert 0 < border.mean() < 0.1
     through = 1 - frame.layers.alpha[border][:, None]
     np.testing.assert_allclose(frame.rgb[border], frame.layers.rgb[border] + through * red, atol=1e-6)

@@ -1,4 +1,4 @@
-"""Development of linear pictures: identities and the published shadow chain."""
+"""Camera response: identities and the published processing chain of linear images."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def test_hue_rotates_colours_and_keeps_grey() -> None:
 
 @pytest.mark.parametrize("angle", [0.0, 50.0, 120.0])
 def test_chroma_is_stretched_along_a_hue_and_its_opposite(angle: float) -> None:
-    """Hues are those of colours about the grey axis: at 120 degrees from red lies green."""
+    """Hues are angles about the grey axis; 120 degrees from red is green."""
     turned, across = colour_matrix({"hue": angle}) @ [1, 0, 0], colour_matrix({"hue": angle + 90}) @ [1, 0, 0]
     matrix, grey = colour_matrix({"chroma_stretch": 1.5, "chroma_angle": angle}), np.full(3, 1 / 3)
     np.testing.assert_allclose(matrix @ (turned - grey), 1.5 * (turned - grey), atol=1e-12)
@@ -99,7 +99,7 @@ def test_filmic_keeps_mid_grey() -> None:
 @pytest.mark.parametrize("iso", [100.0, 1600.0])
 @pytest.mark.parametrize("level", [0.02, 0.18, 0.6])
 def test_sensor_noise_has_the_variance_of_its_electrons(iso: float, level: float) -> None:
-    """N = level * full well * 100 / ISO electrons: variance N + read noise squared, seen through the tone curve."""
+    """N = level * full well * 100 / ISO electrons: variance N + read noise squared, after the tone curve."""
     linear = np.full((128, 128, 3), level, np.float32)
     a, b, c = (develop(linear, {"iso": iso}, seed=s) for s in (1, 1, 2))
     assert a.tobytes() == b.tobytes() != c.tobytes()
@@ -114,14 +114,14 @@ def test_sensor_noise_has_the_variance_of_its_electrons(iso: float, level: float
 
 
 def noise(shape: tuple[int, int], level: float, iso: float, seed: int) -> np.ndarray:
-    """What a sensor adds to an even linear picture of some level, (H, W, 3)."""
+    """Return the sensor noise added to a uniform linear image of a given level, shape (H, W, 3)."""
     linear = device_array(np.full((*shape, 3), level, np.float32))
     return host_array(add_noise(linear, shape, iso, seed), shape).astype(np.float64) - level
 
 
 @pytest.mark.parametrize(("level", "iso"), [(0.0, 3200.0), (0.18, 100.0), (0.6, 1600.0)])
 def test_noise_is_normal_and_without_correlation(level: float, iso: float) -> None:
-    """Mean 0 and variance N + read_noise^2 of N electrons; each statistic within 5 of its standard errors."""
+    """Mean 0 and variance N + read_noise^2 for N electrons; each statistic lies within 5 of its standard errors."""
     shape = 400, 500
     white = FULL_WELL * 100 / iso
     deviation = np.sqrt(level * white + READ_NOISE**2) / white
@@ -139,7 +139,7 @@ def test_noise_is_normal_and_without_correlation(level: float, iso: float) -> No
     pairs += [(first, second), (first, far), (first[:, 1:], second[:, :-1])]
     for a, b in pairs:
         assert abs(np.mean(a * b)) < 5 / np.sqrt(a.size)
-        # Of what two numbers share, their sizes would show what their products do not.
+        # Products of values miss dependences with random sign; products of squares reveal them.
         assert abs(np.mean((a**2 - 1) * (b**2 - 1))) < 5 * 2 / np.sqrt(a.size)
 
 
@@ -158,7 +158,7 @@ def test_noise_of_a_pixel_depends_on_no_other_and_on_no_thread() -> None:
 
 
 def developed_slowly(linear: np.ndarray, draws: Mapping[str, float]) -> np.ndarray:
-    """A picture developed without noise, in double precision and without a table, (H, W, 3) in [0, 255]."""
+    """Develop a picture without noise, in double precision and without a table, shape (H, W, 3) in [0, 255]."""
     height, width = linear.shape[:2]
     linear = linear.astype(np.float64) * 2 ** draws["exposure"]
     for y, x in np.ndindex(height, width):
@@ -173,7 +173,7 @@ def test_developed_images_equal_the_slow_twin() -> None:
     linear = np.random.default_rng(0).random((37, 53, 3)).astype(np.float32)
     draws = {"exposure": -0.4, "vignetting": 1.5, "motion_blur": 5.0, "motion_angle": 130.0}
     draws |= {"white_balance": 5200.0, "hue": 6.0, "saturation": 1.2}
-    # Half a step of rounding, and what the table's entries are apart.
+    # Half a rounding step, plus the spacing of the table's entries.
     assert np.abs(develop(linear, draws) - developed_slowly(linear, draws)).max() < 0.5 + 0.05
 
 
@@ -242,7 +242,7 @@ def test_motion_blur_keeps_even_pictures_and_spreads_points() -> None:
 
 
 def test_sharpening_overshoots_an_edge_by_its_closed_form() -> None:
-    """Next to a step the blur takes the weight that a Gaussian has beyond it."""
+    """Next to a step, the blur takes the weight of the Gaussian beyond the step."""
     even = np.full((9, 21, 3), 0.3, np.float32)
     assert np.array_equal(develop(even, {"sharpening": 2.0}), develop(even, {}))
     even[:, 10:] = 0.1
@@ -270,7 +270,7 @@ def test_black_bodies_are_warm_below_daylight_and_of_luminance_one() -> None:
 
 
 def test_the_published_matrix_adapts_white() -> None:
-    """Lindbloom's Bradford matrix from D50 to D65; the daylight of 5003 K is D50 within the published digits."""
+    """Lindbloom's Bradford matrix from D50 to D65; daylight of 5003 K equals D50 within the published digits."""
     space = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
     adapt = np.array(
         [[0.9555766, -0.0230393, 0.0631636], [-0.0282895, 1.0099416, 0.0210077], [0.0122982, -0.0204830, 1.3299098]]
@@ -281,7 +281,7 @@ def test_the_published_matrix_adapts_white() -> None:
 
 def test_the_srgb_transfer_agrees_with_colour_science() -> None:
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # it says as it is imported that it could plot with Matplotlib
+        warnings.simplefilter("ignore")  # colour warns on import if Matplotlib is missing
         import colour
     linear = np.linspace(0.0, 1.0, 1001)
     expected = colour.cctf_encoding(linear, function="sRGB")

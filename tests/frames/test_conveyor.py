@@ -1,4 +1,4 @@
-"""Pictures and labels of what runs on a belt: poses, flow, blur, and the belt's own pattern."""
+"""Frames of a conveyor belt: poses, flow, blur, and the belt's texture."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ pytestmark = pytest.mark.usefixtures("meshes_tried_once")
 
 SceneData = dict[str, Any]
 STEP = 0.02
-"""How far the belt runs from view to view [m]: 4 pixels, seen from 0.5 m with a focal length of 100 px."""
+"""Travel of the belt between views [m]: 4 pixels at a distance of 0.5 m and a focal length of 100 px."""
 
 
 def lying(scene: ms.Scene, index: int, **_: Any) -> Layout:
-    """Two large nuts: one on the belt, one beside it."""
+    """Return a layout of two large nuts: one on the belt, one beside it."""
     poses = np.tile(np.eye(4), (2, 1, 1))
     poses[:, :3, 3] = (0.0, 0.0, 0.02), (0.0, 0.14, 0.02)
     instances = [Instance(i, 0, scene.class_index(0), pose) for i, pose in enumerate(poses, start=1)]
@@ -40,7 +40,7 @@ def lying(scene: ms.Scene, index: int, **_: Any) -> Layout:
 
 @pytest.fixture
 def belt_data(scene_data: SceneData) -> SceneData:
-    """A camera that looks straight down on a checkered belt, which runs to the right."""
+    """Return a scene with a downward camera over a checkered belt that moves to the right."""
     box = {"size": [1, 0.2, 0.1], "position": [0, 0, -0.05]}
     checkers = {"kind": "checker", "scale": [0.05, 0.05]}
     return scene_data | {
@@ -68,7 +68,7 @@ def test_belt_and_objects_on_it_have_the_flow_of_the_belt(belt_data: SceneData, 
     assert flow is not None
     expected = np.where(frame.instance == 2, 0.0, 100 * STEP / frame.depth)  # f b / z
     y = (np.arange(48) + 0.5 - 24) / 100 * 0.5
-    expected[abs(y) > 0.11] = 0.0  # the floor; points of what lies beside the belt are no part of it
+    expected[abs(y) > 0.11] = 0.0  # the floor; points beside the belt do not move
     expected[(abs(y) > 0.09) & (abs(y) < 0.11)] = np.nan
     sure = np.isfinite(expected) & (flow[..., 0] < UNKNOWN_FLOW)
     assert {1, 2} <= set(frame.instance[sure].tolist())
@@ -109,10 +109,10 @@ def test_moving_surfaces_are_swept_by_the_exposure(belt_data: SceneData) -> None
     pixels = np.stack(np.meshgrid(np.arange(32) + 0.5, np.arange(24) + 0.5), axis=-1).reshape(-1, 2)
     rays = np.concatenate([camera.ray_slopes(pixels), np.ones((len(pixels), 1))], axis=1)
     rotation, centre = camera.world_from_camera[:3, :3], camera.centre
-    depth = (-centre[2] / (rays @ rotation.T)[:, 2]).reshape(24, 32)  # of the plane z = 0
+    depth = (-centre[2] / (rays @ rotation.T)[:, 2]).reshape(24, 32)  # depth of the plane z = 0
     points = (rays * depth.reshape(-1, 1)) @ rotation.T + centre
     other = np.zeros((24, 32), dtype=bool)
-    other[5, 7] = True  # what is carried there
+    other[5, 7] = True  # an object on the belt
     right, down = exposure_flow(depth, camera, 0.004, belt, other)
     ends = [camera.project(points + np.array([side * 0.5 * 0.004 * 0.3, 0, 0]))[0] for side in (-1, 1)]
     runs = ((abs(points[:, 1]) < 0.1) & (abs(points[:, 0]) < 0.5)).reshape(24, 32) | other
@@ -122,7 +122,9 @@ def test_moving_surfaces_are_swept_by_the_exposure(belt_data: SceneData) -> None
 
 
 def test_a_dataset_with_a_belt_has_no_violations(belt_data: SceneData, write_scene: WriteScene, tmp_path: Path) -> None:
-    """Labels follow what is carried, the audit knows where that is, and a frame is made again as it was."""
+    """Labels follow the carried objects, the audit accepts their poses, and a frame remade from the dataset is
+    identical.
+    """
     belt_data["labels"] = {"min_pixels": 1, "min_fragment": 1}
     belt_data["camera"]["motion"] = {"exposure": [0.01, 0.02]}
     belt_data["output"]["formats"] = ["yolo", "coco", "poses", "bop", "flow", "depth", "colmap"]
@@ -137,7 +139,7 @@ def test_a_dataset_with_a_belt_has_no_violations(belt_data: SceneData, write_sce
     assert boxes[2] - boxes[1] == boxes[1] - boxes[0] == pytest.approx(100 * STEP / 0.47, abs=1)
     again = rerender_frame(scene, 2, tmp_path / "again", dataset=out, settle=lying)
     assert again.compared and not again.differing
-    # A layout that settled elsewhere is found out.
+    # The audit reports a layout with another pose.
     stored = json.loads((out / "layouts/0000.json").read_bytes())
     stored["instances"][0]["world_from_object"][0][3] = 0.001
     (out / "layouts/0000.json").write_text(json.dumps(stored))

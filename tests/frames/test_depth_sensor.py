@@ -1,4 +1,4 @@
-"""Measured depth against closed forms: the spread of its errors, what a second camera does not see, flying pixels."""
+"""Depth sensors against closed forms: error spread, occlusion from the second camera, flying pixels."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def flight(depth: Any, reflectance: float = 1.0, normal: Any = None, **values: A
 class TestStereo:
     @pytest.mark.parametrize("away", [0.5, 1.0, 2.0])
     def test_errors_grow_with_the_square_of_distance(self, away: float) -> None:
-        """Of a wall: the disparity's variance is noise^2 + step^2 / 12 (Sheppard), to first order in depth's error."""
+        """Disparity of a wall has variance noise^2 + step^2 / 12 (Sheppard), to first order in the depth error."""
         noise, step, baseline = 0.2, 0.25, 0.055
         found = stereo(np.full((96, 128), away), noise=noise, step=step, baseline=baseline)[:, 50:]
         expected = away**2 / (FOCAL * baseline) * np.sqrt(noise**2 + step**2 / 12)
@@ -56,8 +56,8 @@ class TestStereo:
         assert len(np.unique(np.rint(steps))) in (2, 3)
 
     def test_pixels_hidden_from_the_second_camera_have_no_depth(self) -> None:
-        """Beside a box before a wall: a strip to its left, as wide as the disparities differ, and the left border."""
-        near, far = FOCAL * 0.1 / 20, FOCAL * 0.1 / 6  # disparities of 20 and 6 px
+        """A box hides a strip of wall to its left, as wide as the difference of disparities, and the left border."""
+        near, far = FOCAL * 0.1 / 20, FOCAL * 0.1 / 6  # disparities: 20 and 6 px
         depth = np.full((96, 128), far)
         depth[20:70, 60:90] = near
         found = stereo(depth, baseline=0.1, noise=0, shift=0, step=1)
@@ -69,20 +69,20 @@ class TestStereo:
         np.testing.assert_allclose(found[~holes], depth[~holes], rtol=1e-6)
 
     def test_the_wall_behind_a_thin_bar_has_depth(self) -> None:
-        """The bar hides a strip of its own width, at the difference of the disparities from it."""
+        """The bar hides a strip of its own width, offset by the difference of the disparities."""
         disparity = np.full((4, 60), 3.0)
         disparity[:, 40:42] = 15.0
         hidden = occluded_in_second_camera(disparity)
         assert np.flatnonzero(hidden[0]).tolist() == [0, 1, 2, 28, 29]
 
     def test_every_pixel_of_a_slope_has_depth(self) -> None:
-        """Disparities that grow to the right by up to 0.4 px a pixel hide nothing of themselves."""
+        """Disparities that grow to the right by up to 0.4 px per pixel cause no self-occlusion."""
         for slope in (-3.0, -0.9, 0.2, 0.4):
             disparity = 60 + slope * (np.arange(40) - 20.0)
             assert not occluded_in_second_camera(np.tile(np.pad(disparity, (140, 0)), (3, 1)))[:, 141:].any()
 
     def test_processing_by_scan_lines_gives_the_same_depth(self) -> None:
-        """A slow twin: every pixel against every other of its row."""
+        """Slow twin: compares every pixel with every other pixel of its row."""
         rng = np.random.default_rng(3)
         disparity = np.repeat(rng.uniform(0, 12, (6, 10)), 5, axis=1)
         disparity[rng.random(disparity.shape) < 0.1] = 0
@@ -115,7 +115,7 @@ class TestStereo:
 class TestTimeOfFlight:
     @pytest.mark.parametrize(("away", "reflectance", "ambient"), [(1.0, 1.0, 0.0), (2.0, 0.5, 0.0), (1.5, 0.3, 2.0)])
     def test_errors_follow_the_returned_light(self, away: float, reflectance: float, ambient: float) -> None:
-        """Around the axis, where ray and axis are the same but for a per cent."""
+        """Pixels near the optical axis, where distance along the ray and depth differ by at most a per cent."""
         found = flight(np.full((96, 128), away), reflectance, noise=0.001, ambient=ambient)[38:58, 50:78]
         signal = reflectance / away**2
         expected = 0.001 * np.sqrt(signal + ambient) / signal
@@ -124,30 +124,32 @@ class TestTimeOfFlight:
 
     def test_an_inclined_surface_returns_less_light(self) -> None:
         normal = np.zeros((96, 128, 3), dtype=np.float32)
-        normal[:] = (0, -0.5, np.sqrt(0.75))  # 60 degrees from the axis, which is +y
+        normal[:] = (0, -0.5, np.sqrt(0.75))  # 60 degrees from the axis, tilted in y
         facing, turned = (flight(np.full((96, 128), 1.0), normal=n, noise=0.001)[38:58, 50:78] for n in (None, normal))
         assert turned.std() / facing.std() == pytest.approx(np.sqrt(2), rel=0.1)
 
     def test_pixels_at_an_edge_mix_both_depths(self) -> None:
-        """Phasors of both surfaces add up, by the Gaussian's share of each; away from the edge nothing changes."""
+        """The phasors of both surfaces add up, weighted by the Gaussian's share of each; pixels away from the edge do
+        not change.
+        """
         depth = np.full((96, 128), 1.0)
         depth[:, 64:] = 1.5
         found = flight(depth, reflectance=0.4, noise=0, blur=1.0)
         taps = np.exp(-0.5 * np.arange(-4, 5) ** 2)
-        for beyond in range(4):  # pixels 63, 62, ... and as much of the Gaussian as lies on the other side
+        for beyond in range(4):  # pixels 63, 62, ... and the weight of the Gaussian beyond the edge
             share = taps[5 + beyond :].sum() / taps.sum()
             wave = (1 - share) * np.exp(8e7j * np.pi / SPEED_OF_LIGHT) + share / 2.25 * np.exp(
                 12e7j * np.pi / SPEED_OF_LIGHT
             )
             assert found[48, 63 - beyond] == pytest.approx(np.angle(wave) * SPEED_OF_LIGHT / 8e7 / np.pi, abs=2e-3)
         assert 1.05 < found[48, 63] < found[48, 64] < 1.45
-        np.testing.assert_allclose(found[:, :58], 1.0, atol=2e-3)  # whose rays differ in length, too
+        np.testing.assert_allclose(found[:, :58], 1.0, atol=2e-3)  # ray lengths differ as well
         np.testing.assert_allclose(found[:, 70:], 1.5, atol=2e-3)
         sharp = flight(depth, noise=0, blur=0)
         np.testing.assert_allclose(sharp, depth, atol=1e-5)
 
     def test_distances_wrap_at_the_modulation_length(self) -> None:
-        longest = SPEED_OF_LIGHT / 2e8  # at 100 MHz
+        longest = SPEED_OF_LIGHT / 2e8  # modulation of 100 MHz
         found = flight(np.full((96, 128), longest + 0.4), noise=0, blur=0, modulation=100)
         assert found[48, 64] == pytest.approx(0.4, abs=1e-3)
 

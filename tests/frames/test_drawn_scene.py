@@ -1,4 +1,4 @@
-"""Frames of scenes whose lights and appearances are drawn: what is stated of them, and what decides them."""
+"""Frames of scenes with drawn lights and appearances: records and determinism."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def test_earlier_frames_of_a_renderer_do_not_change_a_frame(scene: ms.Scene) -> 
             alone = renderer.render(index, layout=layouts[index // 3])
         np.testing.assert_array_equal(alone.image, frames[index].image)
         np.testing.assert_array_equal(alone.layers.light, frames[index].layers.light)
-    assert (frames[6].layers.light != frames[7].layers.light).any()  # another turn of the same sky
+    assert (frames[6].layers.light != frames[7].layers.light).any()  # another rotation of the same sky
 
 
 def test_the_manifest_records_the_drawn_lights(scene: ms.Scene, tmp_path: Path) -> None:
@@ -61,7 +61,7 @@ APPEARANCE = {"hue": [-30, 30], "value": [0.4, 0.9], "gain": [0.8, 1.2], "roughn
 
 
 def _apart() -> Layout:
-    """Three nuts and a bolt around the middle."""
+    """Return a layout of three nuts and a bolt around the middle."""
     poses = np.tile(np.eye(4), (4, 1, 1))
     poses[:, :3, 3] = (-0.05, 0, 0.005), (0, 0.05, 0.005), (0.05, 0, 0.005), (0, -0.05, 0.025)
     instances = [Instance(i + 1, int(i == 3), int(i < 3), pose) for i, pose in enumerate(poses)]
@@ -89,7 +89,7 @@ def test_appearances_change_colours_only(scene_data: Any, write_scene: WriteScen
         change = np.abs(one.layers.captured - other.layers.captured).max(axis=-1)
         nuts = np.isin(one.instance, [i.id for i in one.layout.instances if i.asset == 0])
         assert nuts.sum() > 30 and np.mean(change[nuts] > 0.01) > 0.95
-        # Gaussians reach a few pixels beyond what is an instance's; the table and the bolt stay as they were.
+        # Gaussians extend a few pixels beyond the instance mask; the table and the bolt do not change.
         assert change[~cv2.dilate(nuts.astype(np.uint8), np.ones((13, 13))).astype(bool)].max() == 0
     record = write_frame(varied[0], tmp_path / "out", scene.spec, Catalogue.of(scene))
     drawn = {one["id"]: one for one in record["appearance"]}

@@ -1,4 +1,4 @@
-"""Pictures of places: the same as of a scene that states what was drawn, in any order, as files and as XML."""
+"""Frames of drawn surroundings equal those of fixed scenes, in any order, as files and as XML."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ SceneData = dict[str, Any]
 
 
 def lying(scene: ms.Scene, index: int, **_: Any) -> Layout:
-    """One object, above the table's middle."""
+    """Return a layout of one object above the table's middle."""
     pose = np.eye(4)
     pose[:3, 3] = 0, 0, 0.006
     return Layout(index, (Instance(1, 0, scene.class_index(0), pose),), NO_PHYSICS)
@@ -37,7 +37,7 @@ def lying(scene: ms.Scene, index: int, **_: Any) -> Layout:
 
 @pytest.fixture
 def places(scene_data: SceneData, write_scene: WriteScene, tmp_path: Path) -> SceneData:
-    """Two environments beside a table of many materials, before images."""
+    """Return a scene with two environments, a table of many materials, and background images."""
     for name, grey in (("cell_a", 0.3), ("cell_b", -0.5)):
         wall = box_asset(name, (0.3, 0.3, 0.1))
         splats = replace(wall.splats, means=wall.splats.means + np.float32([0, 0.35, 0]), sh=wall.splats.sh + grey)
@@ -102,7 +102,7 @@ def test_the_order_of_frames_does_not_change_them(places: SceneData, write_scene
 def test_a_dataset_with_drawn_environments_has_no_violations(
     places: SceneData, write_scene: WriteScene, tmp_path: Path
 ) -> None:
-    """Every draw is in the manifest, which its schema reads, and no label has anything of it."""
+    """The manifest records every draw and passes its schema; no label includes surroundings."""
     places["labels"] = {"min_pixels": 1, "min_fragment": 1}
     places["depth_sensor"] = {"kind": "tof"}
     places["output"] |= {"layouts": 3, "formats": [name for name in FORMATS if name not in ("colmap", "yolo-pose")]}

@@ -1,4 +1,4 @@
-"""Whole frames of a small scene: from the plan to picture and labels, and through XML."""
+"""Frames of a small scene, from the plan to image, labels and XML."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from tests.renderer.test_render import make_splats
 
 @pytest.fixture(scope="module")
 def settled() -> dict[str, Any]:
-    """The layout of the small scene, settled once for all tests of this module."""
+    """Settle the layout of the small scene once for all tests of this module."""
     return {}
 
 
@@ -78,9 +78,10 @@ def test_the_same_frame_has_the_same_bytes(scene: ms.Scene, settled: dict[str, A
 def test_silhouettes_equal_renderings_of_single_instances(
     write_scene: WriteScene, scene_data: dict[str, Any], settled: dict[str, Any], scene: ms.Scene, source: str
 ) -> None:
-    """Each instance placed alone in the scene is labelled with exactly what it covers among the others."""
+    """The mask of an instance rendered alone equals its covered pixels among the other instances."""
     layout = layout_of_small_scene(scene, settled)
-    table = {**scene_data["shapes"][0], "visible": False}  # surroundings may hide an instance; alone it has none
+    # Surroundings may hide an instance; rendered alone, it is unoccluded.
+    table = {**scene_data["shapes"][0], "visible": False}
     data = {**scene_data, "shapes": [table], "labels": {"source": source}}
     chosen = ms.load_scene(write_scene(data, f"{source}.yaml"))
     frame = ms.render_frame(chosen, 1, layout=layout)
@@ -105,7 +106,7 @@ def test_a_frame_rendered_from_its_record_is_the_same(
     tmp_path: Any,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """A scene of another seed, given only what the manifest says of a frame, shows the same picture."""
+    """A scene with another seed renders the same image from the manifest record of a frame."""
     layout = layout_of_small_scene(scene, settled)
     path = [{"position": [0.1, 0, 0.4], "temperature": 3000}, {"position": [-0.1, 0, 0.5], "temperature": 8000}]
     scene_data["lights"] = [
@@ -243,7 +244,7 @@ def test_frame_out_of_range_is_refused(scene: ms.Scene) -> None:
 @pytest.mark.parametrize("quality", ["fast", "balanced"])
 @pytest.mark.parametrize("close", [False, True])
 def test_a_still_camera_renders_the_same_bytes_as_a_new_renderer(quality: str, samples: Any, close: bool) -> None:
-    """From the third picture on only tiles with objects are made anew, also where something static is before them."""
+    """From the third image on, only tiles with objects are rendered, also where static splats occlude them."""
     ms.render_splats(make_splats(1), Camera.look_at((0, 0, -2), (0, 0, 0), width=8, height=8, fov_x=50))
     static = make_splats_shape(make_splats(300, 1, scales=(0.02, 0.1)))
     things = [make_splats(40, seed, spread=0.15, scales=(0.01, 0.05)) for seed in (2, 3, 4)]
@@ -271,7 +272,7 @@ def test_a_still_camera_renders_the_same_bytes_as_a_new_renderer(quality: str, s
 
 
 def test_a_still_camera_renders_surroundings_without_splats() -> None:
-    """As of a proxy that is not seen, which has none."""
+    """The wall has a proxy but no splats."""
     integrator = make_integrator(shadow="none")
     wall = make_splats_shape(NO_SPLATS, proxy=trimesh.creation.box((1, 1, 0.1)))
     seen = make_splats_shape(make_splats(20, 3), instance=1)
@@ -284,7 +285,7 @@ def test_a_still_camera_renders_surroundings_without_splats() -> None:
 
 
 def test_a_still_camera_renders_an_object_without_splats() -> None:
-    """Its proxy is all that there is of it; the same picture comes from a camera that just arrived."""
+    """The object has only a proxy; a new renderer gives the same image."""
     around = make_splats_shape(make_splats(20, 3))
     bare = make_splats_shape(NO_SPLATS, instance=1, proxy=trimesh.creation.box((0.2, 0.2, 0.1)))
     camera = Camera.look_at((0, 0, -2), (0, 0, 0), up=(0, -1, 0), width=32, height=24, fov_x=40)
@@ -301,7 +302,7 @@ def test_views_of_a_layout_share_uploaded_arrays(
     scene: ms.Scene,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Area lights are shapes that are made anew for every frame; they must not count as a change of what is there."""
+    """Area lights are rebuilt for every frame; the renderer must not treat them as changed splats."""
     from mitsplat.renderer.composition import scene_contents
 
     uploads = []

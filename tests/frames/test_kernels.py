@@ -1,4 +1,4 @@
-"""Kernels are compiled once: what changes from frame to frame is no part of them."""
+"""Kernel compilation: later frames reuse compiled kernels."""
 
 from __future__ import annotations
 
@@ -24,12 +24,17 @@ WORKCELL = Path(__file__).parents[2] / "scenes/workcell.yaml"
 
 @pytest.fixture(autouse=True)
 def nothing_of_earlier_tests() -> None:
-    """Kernels serve all kinds of emitters and materials that live: if some went meanwhile, others would be compiled."""
+    """Free emitters and materials of earlier tests.
+
+    Kernels cover all kinds of emitters and materials that exist; if some were freed during a test, other kernels would
+    be
+    compiled.
+    """
     gc.collect()
 
 
 def strewn(index: int, assets: list[int]) -> Layout:
-    """A layout of the workcell that nothing has settled: objects side by side over the mat."""
+    """Return an unsettled layout of the workcell: objects side by side over the mat."""
     instances = []
     for number, asset in enumerate(assets, start=1):
         pose = np.eye(4)
@@ -39,12 +44,12 @@ def strewn(index: int, assets: list[int]) -> Layout:
 
 
 def compiled(renderer: Renderer, index: int, layout: Layout) -> tuple[int, int]:
-    """Kernels that a frame runs, and how many of them no frame before has run.
+    """Count the kernels that a frame runs, and those not run by any earlier frame.
 
-    All objects are seen well, and nothing reaches the camera's plane: such rare views have a few kernels of their own.
+    All objects are in view, and none reaches the camera's plane: such rare views need a few kernels of their own.
     """
     plan = plan_frame(renderer.scene, index)
-    azimuth = np.radians(180 + 37 * index % 220)  # as the scene has it, not from behind the wall
+    azimuth = np.radians(180 + 37 * index % 220)  # in the scene's range of azimuths, not from behind the wall
     eye = 0.4 * np.cos(azimuth), 0.4 * np.sin(azimuth) - 0.08, 0.5
     camera = Camera.look_at(eye, (0, -0.08, 0), width=96, height=54, fov_x=50)
     dr.kernel_history_clear()
@@ -59,7 +64,7 @@ def test_another_layout_compiles_no_new_kernels() -> None:
     scene = load_scene(WORKCELL)
     with Renderer(scene) as renderer, dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         first = strewn(0, [0, 1, 2, 3, 3])
-        # The first view of a layout makes what its other views share.
+        # The first view of a layout builds data shared by its other views.
         compiled(renderer, 0, first)
         compiled(renderer, 1, first)
         for index, layout in (
@@ -74,7 +79,7 @@ def test_another_layout_compiles_no_new_kernels() -> None:
 
 
 def test_drawn_lights_compile_no_new_kernels() -> None:
-    """Where they are, how large and bright, and how many up to four: once each set of kinds has been seen."""
+    """Position, size, radiance and number of up to four lights vary; each set of kinds was rendered before."""
     scene = load_scene(WORKCELL)
     sides = LightDraw(vary="frame", count=(0, 3), distance=(0.5, 1.5), size=((0.1, 0.1), (0.4, 0.2)))
     lights = (AreaLight(draw=sides), EnvironmentLight(draw=LightDraw(vary="frame", radiance=(0.3, 1.0))))
@@ -82,8 +87,9 @@ def test_drawn_lights_compile_no_new_kernels() -> None:
     numbers = [len(plan_frame(scene, index).lights) for index in range(40)]
     layout = strewn(0, [0, 1, 2, 3, 3])
     with Renderer(scene) as renderer, dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
-        # The second view of a layout makes what its other views share, and on a GPU an emitter that is alone has
-        # kernels of its own once others have been.
+        # The second view of a layout builds data shared by its other views. On a GPU, a single emitter has kernels of
+        # its own
+        # after several emitters were rendered.
         for number in (1, 2, 1):
             for _ in range(2):
                 compiled(renderer, numbers.index(number), layout)

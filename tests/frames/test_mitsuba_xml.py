@@ -1,4 +1,4 @@
-"""Scenes that are written in XML by hand: what they may name, what is refused and how, and the documented one."""
+"""Hand-written XML scenes: accepted plugins and properties, errors, and the documented scene."""
 
 from __future__ import annotations
 
@@ -42,13 +42,13 @@ FILM = '<film type="hdrfilm"> <integer name="width" value="8"/> </film>'
 
 
 def tuned(properties: str, text: str = SCENE.format("")) -> str:
-    """A scene whose integrator has these properties."""
+    """Return a scene whose integrator has the given properties."""
     return text.replace('"splat_proxy"/>', f'"splat_proxy"> {properties} </integrator>')
 
 
 @pytest.fixture
 def small(tmp_path: Path) -> Path:
-    """A folder with an asset in metres, one in millimetres, and room for a scene."""
+    """Create a folder with an asset in metres and one in millimetres."""
     box_asset("nut").save(tmp_path / "nut")
     box_asset("nut").save(tmp_path / "milli", splats="splats.spz")
     return tmp_path
@@ -201,12 +201,12 @@ NAMES = """<scene version="3.9.0">
 
 
 def test_a_scene_with_includes_renders_as_mitsuba_renders_it(tmp_path: Path) -> None:
-    """With one sample for a pixel: Mitsuba adds up several in any order."""
+    """One sample per pixel: Mitsuba sums several in arbitrary order."""
     ensure_variant()
     for folder in ("maps", "parts/deeper"):
         (tmp_path / folder).mkdir(parents=True)
     (tmp_path / "parts/look.xml").write_text(LOOK)
-    # Mitsuba adds only folders of files that include others to those where it looks up a spectrum.
+    # Mitsuba resolves spectra only in folders of files that include others.
     (tmp_path / "parts/deeper/names.xml").write_text(NAMES)
     (tmp_path / "parts/flat.spd").write_text("400 0.1\n500 0.2\n700 0.4\n")
     grid = np.linspace(0, 1, 48, dtype=np.float32).reshape(4, 4, 3)
@@ -234,7 +234,7 @@ def test_an_error_in_an_included_file_names_its_line(small: Path) -> None:
 
 @pytest.mark.parametrize("place", ["scene", "here"])
 def test_native_plugins_in_the_scene_folder_are_not_loaded(small: Path, place: str) -> None:
-    """Mitsuba looks for plugins in the current folder and in that of the scene, before its own."""
+    """Mitsuba searches the current folder and the scene's folder for plugins before its own."""
     compiler = shutil.which("cc")
     if compiler is None:
         pytest.skip("needs a C compiler")
@@ -255,7 +255,7 @@ def test_native_plugins_in_the_scene_folder_are_not_loaded(small: Path, place: s
 
 
 def test_the_documented_scene_renders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its size alone is less, so that the test is fast."""
+    """The image is 8 times smaller than documented, so that the test is fast."""
     (text,) = re.findall(r"```xml\n(.*?)```", (ROOT / "docs/xml_and_plugins.md").read_text(), re.DOTALL)
     for name in set(re.findall(r'name="asset" value="([^"]+)"', text)):
         shutil.copytree(ROOT / name, tmp_path / name)

@@ -1,4 +1,4 @@
-"""Blur by the camera's own motion, and colours that a lens draws apart: against closed forms and a slow twin."""
+"""Camera motion blur and chromatic aberration against closed forms and a slow twin."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def test_a_still_camera_gives_no_blur() -> None:
 
 @pytest.mark.parametrize("corner", [1.5, -2.0])
 def test_chromatic_aberration_magnifies_red_and_reduces_blue(corner: float) -> None:
-    """Of a slope, whose interpolation is exact, red at a point is what green is nearer to the middle by its shift."""
+    """On a linear ramp, where interpolation is exact, red at a point equals green nearer to the centre by the shift."""
     y, x = np.mgrid[: SHAPE[0], : SHAPE[1]]
     linear = np.repeat((0.3 + 0.02 * x + 0.01 * y)[..., None], 3, axis=2).astype(np.float32)
     got = host_array(apply_chromatic_aberration(device_array(linear), SHAPE, corner), SHAPE)

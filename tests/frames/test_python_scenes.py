@@ -1,4 +1,4 @@
-"""Scenes, layouts and cameras that Python code gives in place of files and physics, and the films made of them."""
+"""Scenes, layouts and cameras defined in Python, and image sequences rendered from them."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from tests.drawn import render_boxes, scatter_boxes
 
 
 def moved(x: float, y: float, z: float = 0.0, turn: float = 0.0) -> np.ndarray:
-    """A pose at a place [m], turned about z [degrees]."""
+    """Return a pose at a position [m], rotated about z [degrees]."""
     pose = np.eye(4)
     pose[:3, :3] = Rotation.from_euler("z", turn, degrees=True).as_matrix()
     pose[:3, 3] = x, y, z
@@ -37,7 +37,7 @@ def moved(x: float, y: float, z: float = 0.0, turn: float = 0.0) -> np.ndarray:
 
 @pytest.fixture
 def scene(write_scene: WriteScene, scene_data: dict[str, Any], tmp_path: Path) -> ms.Scene:
-    """The small scene, made in Python next to its assets, of which the nut has a top that nothing shows through."""
+    """Return the small scene, defined in Python next to its assets; the nut has an opaque top."""
     nut = box_asset("nut", (0.04, 0.03, 0.01))
     x, y = np.meshgrid(np.linspace(-0.018, 0.018, 10), np.linspace(-0.013, 0.013, 8))
     top = Splats(
@@ -55,7 +55,7 @@ def scene(write_scene: WriteScene, scene_data: dict[str, Any], tmp_path: Path) -
 
 @pytest.fixture
 def above() -> ms.Camera:
-    """A camera 0.2 m above the table that looks down, its x to the world's and its y against it."""
+    """Return a camera 0.2 m above the table that looks down, with x along the world's x and y against its y."""
     pose = np.diag([1.0, -1.0, -1.0, 1.0])
     pose[2, 3] = 0.2
     return ms.Camera(64, 48, 160.0, 160.0, 32.0, 24.0, pose)
@@ -174,7 +174,7 @@ def test_assets_with_the_same_name_are_given_by_number(scene: ms.Scene) -> None:
 
 
 def test_flow_of_a_plane_that_turns_and_shifts_before_a_still_camera(scene: ms.Scene, above: ms.Camera) -> None:
-    """Seen from above, a turn of the world by a about z is one of the picture by -a about the foot of the axis."""
+    """Seen from above, a rotation of the world by a about z is an image rotation by -a about the axis' foot."""
     depth = np.full((48, 64), 0.2)
     ids = np.zeros((48, 64), dtype=np.uint16)
     ids[:, 32:] = 1
@@ -184,14 +184,14 @@ def test_flow_of_a_plane_that_turns_and_shifts_before_a_still_camera(scene: ms.S
     assert set(motions) == {1}
     flow = optical_flow(depth, above, above, ids, motions)
     np.testing.assert_allclose(flow[:, :32], 0, atol=1e-5)
-    scale = 160.0 / 0.2  # px per metre in the plane
+    scale = 160.0 / 0.2  # pixels per metre in the plane
     x, y = np.meshgrid(np.arange(32, 64) + 0.5, np.arange(48) + 0.5)
     for part, expected in zip(np.moveaxis(flow[:, 32:], -1, 0), turned(x, y, scale), strict=True):
         np.testing.assert_allclose(part, expected, atol=1e-4)
 
 
 def turned(x: np.ndarray, y: np.ndarray, scale: float) -> tuple[np.ndarray, np.ndarray]:
-    """Flow of the object above: by 30 degrees about its place (0.05, 0.02), which goes to (0.07, 0.01)."""
+    """Compute the flow of the object above: rotation by 30 degrees, translation from (0.05, 0.02) to (0.07, 0.01)."""
     right, up = (x - 32) / scale - 0.05, (24 - y) / scale - 0.02
     c, s = math.cos(math.radians(30)), math.sin(math.radians(30))
     goes = c * right - s * up + 0.07, s * right + c * up + 0.01
@@ -211,9 +211,11 @@ def test_flow_of_a_removed_object_is_unknown(scene: ms.Scene, above: ms.Camera) 
 
 
 def test_a_sequence_has_the_flow_of_its_objects_and_cameras(scene: ms.Scene, above: ms.Camera) -> None:
-    """A nut that slides by 5 mm below the camera: f 0.005 / depth px, 0.19 m at its top, and the table stays."""
+    """A nut slides by 5 mm per frame below the camera: flow f 0.005 / depth px, depth 0.19 m at its top; the table is
+    static.
+    """
     steps = [{"nut": [moved(0.005 * n - 0.005, 0, 0.005)], "bolt": [moved(0.03, 0.02, 0.025)]} for n in range(3)]
-    layouts = (ms.Layout.from_poses(scene, poses, index=n) for n, poses in enumerate(steps))  # as of a simulator
+    layouts = (ms.Layout.from_poses(scene, poses, index=n) for n, poses in enumerate(steps))  # like a simulator
     film = list(ms.render_frames(scene, layouts=layouts, cameras=above, quality="fast"))
     assert [frame.index for frame in film] == [0, 1, 2]
     assert film[-1].flow is None
@@ -226,11 +228,11 @@ def test_a_sequence_has_the_flow_of_its_objects_and_cameras(scene: ms.Scene, abo
         np.testing.assert_allclose(flow[~nut & (frame.depth > 0)], 0, atol=1e-4)
     assert np.array_equal(film[1].camera.world_from_camera, above.world_from_camera)
     x = [np.flatnonzero((frame.instance == 1).any(axis=0)).mean() for frame in film]
-    np.testing.assert_allclose(np.diff(x), 160 * 0.005 / 0.19, atol=0.5)  # of whole pixels
+    np.testing.assert_allclose(np.diff(x), 160 * 0.005 / 0.19, atol=0.5)  # tolerance: whole pixels
 
 
 def test_render_frames_yields_the_frames_of_the_scene(scene: ms.Scene) -> None:
-    """Beyond the scene's 12 frames as well; and a frame is the same in whichever order it is rendered."""
+    """Indices beyond the scene's 12 frames are valid; the rendering order does not change a frame."""
     layout = ms.Layout.from_poses(scene, {"nut": [moved(0, 0, 0.005)]})
     alone = ms.render_frame(scene, 5, layout=layout, quality="fast")
     shown = {frame.index: frame for frame in ms.render_frames(scene, [70, 5], layouts=layout, quality="fast")}
@@ -249,7 +251,7 @@ def test_a_negative_number_of_frames_is_refused(scene: ms.Scene) -> None:
 def test_settled_frames_equal_those_of_the_scene(
     scene: ms.Scene, monkeypatch: pytest.MonkeyPatch, above: ms.Camera
 ) -> None:
-    """Without a layout of one's own, each is settled once, and flow does not lead from one to the next."""
+    """Without given layouts, each layout is settled once, and flow does not span two layouts."""
     asked = []
 
     def settle(scene: ms.Scene, index: int) -> ms.Layout:
@@ -297,7 +299,7 @@ def test_the_notebook_picture_shows_image_and_labels(scene: ms.Scene, above: ms.
 
 
 def test_the_documented_example_runs(monkeypatch: pytest.MonkeyPatch) -> None:
-    """From a clone, as it stands there."""
+    """The code of docs/api.md runs unchanged in a clone."""
     root = Path(__file__).parents[2]
     (code,) = (
         part for part in (root / "docs/api.md").read_text().split("```") if "from_poses" in part and "import" in part

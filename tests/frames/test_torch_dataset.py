@@ -1,4 +1,4 @@
-"""Endless frames for PyTorch: each worker its own, the same from run to run, targets as the labels say."""
+"""Endless frames for PyTorch: frames per worker, reproducibility, and targets equal to the labels."""
 
 from __future__ import annotations
 
@@ -38,7 +38,9 @@ def test_a_target_equals_the_labels(scene: Scene) -> None:
 
 
 def test_workers_share_the_layouts_of_an_endless_scene(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What a DataLoader tells its workers is told here; two processes would compile their kernels for nothing else."""
+    """Sets the worker information of a DataLoader in this process; two worker processes would only compile kernels
+    again.
+    """
     from torch.utils.data._utils.worker import WorkerInfo
 
     found = {}

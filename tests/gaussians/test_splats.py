@@ -1,4 +1,4 @@
-"""Splats: rules, colours that turn with the object, files there and back, and every way a file can be bad."""
+"""Splats: validation, SH rotation, round trips through files, and malformed files."""
 
 import gzip
 import struct
@@ -28,7 +28,7 @@ CONVERTED = ["compressed.ply", "ksplat", "spz", "sog"]
 def random_splats(count: int = 200, degree: int = 0, extent: float = 1.0) -> Splats:
     rng = np.random.default_rng(degree)
     return Splats(
-        means=rng.uniform(-extent, extent, (count, 3)) * (1.0, 0.5, 0.25),  # unlike along x, y and z
+        means=rng.uniform(-extent, extent, (count, 3)) * (1.0, 0.5, 0.25),  # unequal along x, y and z
         quats=rng.normal(size=(count, 4)),
         scales=extent * np.exp(rng.uniform(-5, -2, (count, 3))),
         opacities=rng.uniform(0.05, 0.95, count),
@@ -54,13 +54,13 @@ def pose(scale: float = 1.0, turn: Rotation = TURN, shift: tuple[float, float, f
 
 
 def encoded(splats: Splats, form: str, folder: Path) -> bytes:
-    """A file of another program's making."""
+    """Encode splats as a file of another program."""
     splats.save(folder / "source.ply")
     return bytes(gaussforge.GaussForge().convert((folder / "source.ply").read_bytes(), "ply", form)["data"])
 
 
 def trained_ply(splats: Splats, order: str = "<", normals: bool = False, extra: bool = False) -> bytes:
-    """The layout of 3DGS's save_ply, written without mitsplat."""
+    """Write the layout of save_ply of 3DGS, without mitsplat."""
     width = splats.sh.shape[1] - 1
     table = {name: splats.means[:, i] for i, name in enumerate("xyz")}
     if normals:
@@ -89,7 +89,10 @@ def trained_ply(splats: Splats, order: str = "<", normals: bool = False, extra: 
 
 
 def assert_close(actual: Splats, expected: Splats, *, mean: float, log_scale: float, opacity: float, sh: float) -> None:
-    """Same Gaussians in the same order; ``mean`` is relative to the extent, quaternions are equal up to sign."""
+    """Assert that two splats have the same Gaussians in the same order.
+
+    ``mean`` is relative to the extent; quaternions are equal up to sign.
+    """
     extent = np.abs(expected.means).max()
     assert np.abs(actual.means - expected.means).max() <= mean * extent
     assert np.abs(np.log(actual.scales / expected.scales)).max() <= log_scale
@@ -265,7 +268,8 @@ class TestFiles:
         assert np.isfinite(np.frombuffer((tmp_path / "a.ply").read_bytes().partition(b"end_header\n")[2], "<f4")).all()
 
     def test_a_splat_file_is_read_byte_by_byte(self, tmp_path):
-        row = struct.pack("<6f4B4B", 1, 2, 3, 0.1, 0.2, 0.3, 255, 0, 51, 102, 128, 255, 128, 128)  # half a turn about x
+        # The last four bytes are a rotation by 180 degrees about x.
+        row = struct.pack("<6f4B4B", 1, 2, 3, 0.1, 0.2, 0.3, 255, 0, 51, 102, 128, 255, 128, 128)
         (tmp_path / "a.splat").write_bytes(row)
         splats = Splats.load(tmp_path / "a.splat")
         assert np.allclose(splats.means, [[1, 2, 3]]) and np.allclose(splats.scales, [[0.1, 0.2, 0.3]])
@@ -278,7 +282,7 @@ class TestFiles:
         splats = random_splats(degree=2)
         splats.save(tmp_path / "a.splat")
         flat = replace(splats, sh=splats.sh[:, :1])
-        # Colours and opacities to half a step of 1/255.
+        # Colours and opacities: half a step of 1/255.
         assert_close(Splats.load(tmp_path / "a.splat"), flat, mean=0, log_scale=0, opacity=0.00197, sh=0.00197 / SH_C0)
 
     @pytest.mark.parametrize("extent", [0.01, 1.0, 3000.0])
@@ -286,7 +290,7 @@ class TestFiles:
     def test_spz_files_keep_values_within_their_quantisation(self, tmp_path, degree, extent):
         splats = replace(random_splats(degree=degree, extent=extent), scales=random_splats().scales)
         splats.save(tmp_path / "a.spz")
-        # Positions to 23 bits but not below 2^-24 units, log scales to half of 1/16, SH to half of 1/8 and of 1/128.
+        # Positions: 23 bits, at least 2^-24 units; log scales: half of 1/16; SH: half of 1/8 and of 1/128.
         assert_close(
             Splats.load(tmp_path / "a.spz"),
             splats,
@@ -303,7 +307,7 @@ class TestFiles:
     def test_spz_files_are_decoded_as_by_gaussforge(self, tmp_path, degree):
         random_splats(500, degree=degree).save(tmp_path / "a.spz")
         data = bytearray(gzip.decompress((tmp_path / "a.spz").read_bytes()))
-        turns = slice(16 + 500 * 16, 16 + 500 * 20)  # anything is allowed before and after
+        turns = slice(16 + 500 * 16, 16 + 500 * 20)  # rotations; all other bytes may be random
         kept, data[16:] = data[turns], np.random.default_rng(degree).bytes(len(data) - 16)
         data[turns] = kept
         (tmp_path / "a.spz").write_bytes(gzip.compress(bytes(data)))
@@ -339,13 +343,13 @@ class TestFiles:
     def test_converted_formats_are_read_within_their_quantisation(self, tmp_path, form, mean, log_scale, opacity, sh):
         splats = random_splats(degree=3)
         source = splats
-        if form == "compressed.ply":  # its writer swaps the axes of the higher bands
+        if form == "compressed.ply":  # the writer swaps the axes of the higher bands
             swapped = splats.sh[:, 1:].transpose(0, 2, 1).reshape(-1, 15, 3)
             source = replace(splats, sh=np.concatenate([splats.sh[:, :1], swapped], axis=1))
         (tmp_path / f"a.{form}").write_bytes(encoded(source, form, tmp_path))
         loaded = Splats.load(tmp_path / f"a.{form}")
         assert len(loaded) == len(splats)
-        loaded = loaded.select(cKDTree(loaded.means).query(splats.means)[1])  # sog reorders
+        loaded = loaded.select(cKDTree(loaded.means).query(splats.means)[1])  # SOG reorders Gaussians
         assert_close(loaded, splats, mean=mean, log_scale=log_scale, opacity=opacity, sh=sh)
 
     def test_units_scale_means_and_scales(self, tmp_path):
@@ -429,7 +433,8 @@ class TestBadFiles:
 
     def test_a_crash_of_a_decoder_is_reported_in_one_sentence(self, tmp_path):
         data = bytearray(encoded(random_splats(), "ksplat", tmp_path))
-        data[4096:4100] = struct.pack("<I", 4_000_000_000)  # Gaussians of the first section, which gaussforge trusts
+        # Number of Gaussians in the first section, which gaussforge does not check.
+        data[4096:4100] = struct.pack("<I", 4_000_000_000)
         (tmp_path / "a.ksplat").write_bytes(data)
         with pytest.raises(InputError, match=r"not a valid ksplat file \(its decoder stopped with status -\d+\)"):
             Splats.load(tmp_path / "a.ksplat")

@@ -1,4 +1,4 @@
-"""Cameras against OpenCV's own functions."""
+"""Camera models against OpenCV's functions."""
 
 from __future__ import annotations
 
@@ -104,7 +104,7 @@ def test_the_colmap_model_of_a_fisheye_is_opencv_fisheye() -> None:
 
 
 THIN = replace(PINHOLE, aperture_radius=0.002, focus_distance=0.008, near=0.004)
-"""Focused nearer than the nearest depth that cameras have by default."""
+"""A lens focused nearer than the default minimum depth of cameras."""
 
 
 @pytest.mark.parametrize("camera", [PINHOLE, FISHEYE, THIN, replace(PINHOLE, fy=1 / 3, cx=-7.1, distortion=BENT)])
@@ -124,7 +124,7 @@ def test_json_keeps_every_field_of_a_camera(camera: Camera) -> None:
     ],
 )
 def test_the_turning_slope_is_the_root_of_the_derivative(distortion: tuple[float, ...], turn: float) -> None:
-    """r - 0.3 r^3 turns at r^2 = 1 / 0.9, r / (1 + r^2) at r = 1; positive coefficients never turn."""
+    """r - 0.3 r^3 has its maximum at r^2 = 1 / 0.9, r / (1 + r^2) at r = 1; positive coefficients have none."""
     assert turning_slope(distortion) == pytest.approx(turn, rel=1e-9)
 
 

@@ -1,4 +1,4 @@
-"""Convex pieces: few, convex, and close to the solids that they stand for."""
+"""Convex decompositions: few convex pieces close to the solid."""
 
 from itertools import pairwise
 from pathlib import Path
@@ -24,7 +24,7 @@ def cache(tmp_path, monkeypatch):
 
 @pytest.fixture(scope="module")
 def bracket():
-    """An L of two plates, 40 x 20 x 4 and 4 x 20 x 30 mm."""
+    """Return an L of two plates, 40 x 20 x 4 and 4 x 20 x 30 mm."""
     floor, wall = trimesh.creation.box((0.04, 0.02, 0.004)), trimesh.creation.box((0.004, 0.02, 0.03))
     wall.apply_translation((-0.018, 0, 0.013))
     return trimesh.boolean.union([floor, wall])
@@ -45,7 +45,7 @@ def test_pieces_fill_a_concave_solid_and_nothing_else(bracket):
     assert len(pieces) >= 2
     assert all(piece.is_convex for piece in pieces)
     assert sum(piece.volume for piece in pieces) == pytest.approx(bracket.volume, rel=0.03)
-    # The hull is three times the volume: its middle must stay free.
+    # The hull has three times the volume; the space inside of the L must stay free.
     middle = np.array([0.0, 0.0, 0.005])
     assert _inside(bracket.convex_hull, middle)
     assert not any(_inside(piece, middle) for piece in pieces)
@@ -58,7 +58,7 @@ def test_separate_parts_are_split_apart():
 
 
 def test_pieces_are_cached_and_damaged_cache_files_replaced(cache, bracket, caplog):
-    shifted = bracket.copy().apply_translation((0.001, 0, 0))  # not yet in memory
+    shifted = bracket.copy().apply_translation((0.001, 0, 0))  # not in the cache
     first = convex_pieces(shifted)
     (path,) = cache.iterdir()
     again = np.load(path)
@@ -74,7 +74,7 @@ def test_pieces_are_cached_and_damaged_cache_files_replaced(cache, bracket, capl
 
 
 def test_a_scan_without_a_triangle_is_closed_first():
-    """CoACD would rebuild an open mesh of voxels: slowly, and too thick."""
+    """CoACD would remesh an open mesh through voxels, which is slow and thickens the mesh."""
     ball = trimesh.creation.icosphere(3, 0.05)
     torn = trimesh.Trimesh(ball.vertices, ball.faces[1:], process=False)
     (piece,) = convex_pieces(torn)
@@ -82,7 +82,7 @@ def test_a_scan_without_a_triangle_is_closed_first():
 
 
 def scanned_angle() -> trimesh.Trimesh:
-    """An L of two plates as a scanner sees it: 7168 triangles, 0.02 mm of noise."""
+    """Return an L of two plates as a scan: 7168 triangles, 0.02 mm of noise."""
     outline = shapely.box(0, 0, 0.06, 0.01).union(shapely.box(0, 0, 0.01, 0.05))
     solid = trimesh.creation.extrude_polygon(outline, 0.03)
     for _ in range(4):
@@ -102,7 +102,7 @@ def test_a_scan_is_simplified_before_it_is_split():
     assert np.abs(truth.signed_distances(np.concatenate([thin.vertices, thin.sample(2000, seed=0)]))).max() < 2e-4
     pieces = convex_pieces(scan)
     assert standoff(truth, pieces) < 6.4e-4
-    # Nor does the scan reach out of its pieces by more than objects may sink into a table.
+    # The scan protrudes from its pieces by no more than the allowed penetration of a table.
     outside = [
         np.einsum("fvd,fd->vf", scan.vertices - piece.triangles[:, :1], piece.face_normals).max(axis=1)
         for piece in pieces
@@ -111,7 +111,7 @@ def test_a_scan_is_simplified_before_it_is_split():
 
 
 def test_a_ragged_mesh_is_split_into_few_pieces(caplog):
-    """In fine pieces it has more than 300, which take minutes."""
+    """A fine decomposition has more than 300 pieces and takes minutes."""
     ball = trimesh.creation.icosphere(subdivisions=2, radius=0.05)
     factors = 1 + np.random.default_rng(1).uniform(-0.2, 0.2, (len(ball.vertices), 1))
     pieces = convex_pieces(trimesh.Trimesh(ball.vertices * factors, ball.faces, process=False))
@@ -125,7 +125,7 @@ def test_shipped_parts_do_not_count_as_ragged(name):
 
 
 def scanned_can(noise: float = 2e-5) -> trimesh.Trimesh:
-    """A can of 66 x 84 mm, its lid 4 mm deep behind its rim, in more than 3000 triangles."""
+    """Return a can of 66 x 84 mm with more than 3000 triangles, whose lid is 4 mm below its rim."""
     outline = [(0, 0), (0.033, 0), (0.033, 0.084), (0.029, 0.084), (0.028, 0.08), (0, 0.08)]
     dense = [
         (1 - t) * np.array(start) + t * np.array(end)
@@ -175,7 +175,7 @@ def test_a_scan_is_simplified_to_5000_faces_within_its_tolerance():
     assert thin.is_volume
     assert len(thin.faces) <= 5000
     points = np.concatenate([thin.vertices, thin.sample(2000, seed=0)])
-    # Radius against a sphere's: the chords of both meshes lie within.
+    # The radius of a sphere is the reference; the chords of both meshes lie inside.
     assert np.abs(np.linalg.norm(points, axis=1) - 0.05).max() < 0.003 * ball.scale
     rough = ball.vertices * (1 + np.random.default_rng(1).uniform(-0.02, 0.02, (len(ball.vertices), 1)))
     kept = denoise_solid(trimesh.Trimesh(rough, ball.faces, process=False))

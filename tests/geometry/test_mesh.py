@@ -1,4 +1,4 @@
-"""Mass and inertia against closed forms, and meshes that are refused."""
+"""Mass and inertia against closed forms, and invalid meshes."""
 
 import numpy as np
 import pytest
@@ -61,7 +61,7 @@ def test_each_repair_is_logged_in_one_sentence(caplog):
 
 @pytest.mark.slow
 def test_a_million_triangles_are_simplified(caplog):
-    """The volume of a ball of 1.3 M triangles stays within 0.1 %."""
+    """A ball of 1.3 M triangles keeps its volume within 0.1 %."""
     ball = trimesh.creation.icosphere(8, 0.05)
     assert len(ball.faces) > 1e6
     simple = prepare_mesh(ball, "ball")
@@ -94,7 +94,7 @@ def test_unusable_meshes_are_refused_by_name(mesh, message):
 def test_contact_points_are_dense_along_edges():
     box = trimesh.creation.box((0.02, 0.02, 0.02))
     points = contact_points(box)
-    assert len(points) == 8 + 12 * 39  # every 0.5 mm of 20
+    assert len(points) == 8 + 12 * 39  # one value per 0.5 mm of 20 mm
     at_edge = (np.abs(np.abs(points) - 0.01) < 1e-12).sum(axis=1)
     assert (at_edge >= 2).all()
     along = np.sort(points[np.linalg.norm(points[:, :2] - 0.01, axis=1) < 1e-9, 2])

@@ -1,8 +1,8 @@
-"""What is rendered on CPU and GPU to be compared: small scenes that together need every stage of the renderer.
+"""Scenes for the comparison of CPU and GPU; together they use every stage of the renderer.
 
     python -m tests.gpu.cases VARIANT OUT.npz
 
-renders all of them in one of Mitsuba's variants, which a process has one of.
+renders all of them in one Mitsuba variant. A process can only use one variant.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 # isort: off
-from mitsplat.geometry.camera import Camera  # sets up LLVM before Dr.Jit
+from mitsplat.geometry.camera import Camera  # initialises LLVM before Dr.Jit
 
 import mitsuba as mi
 import numpy as np
@@ -40,7 +40,7 @@ def camera(**options: Any) -> Camera:
 
 
 def ball(seed: int, at: tuple[float, float, float], radius: float = 0.05) -> tuple[Splats, trimesh.Trimesh]:
-    """Coloured Gaussians of three bands on a ball, and the ball."""
+    """Return coloured Gaussians of three bands on a ball, and the ball's mesh."""
     mesh = trimesh.creation.icosphere(3, radius)
     mesh.apply_translation(at)
     rng = np.random.default_rng(seed)
@@ -62,7 +62,7 @@ def lights() -> dict[str, Any]:
 
 
 def things() -> dict[str, Any]:
-    """A floor and a wall that were captured with their light, a ball that was captured with its own, one without."""
+    """Return a floor and a wall with captured light, a ball with its own captured light, and a ball without."""
     wall = trimesh.creation.box(bounds=[[-0.16, -0.2, 0.001], [-0.15, 0.2, 0.1]])
     first, second = ball(1, (-0.06, 0, 0.06)), ball(2, (0.07, 0.02, 0.051))
     return {
@@ -74,7 +74,7 @@ def things() -> dict[str, Any]:
 
 
 def visible(kind: str) -> dict[str, Any]:
-    """A mesh of a material of Mitsuba's, beside the balls."""
+    """Return a mesh with a Mitsuba material, beside the balls."""
     transform = mi.ScalarTransform4f()
     if kind == "plain":
         diffuse = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.7, 0.4, 0.2]}}
@@ -109,7 +109,7 @@ def gradients() -> Arrays:
 
 
 def fit_gradients() -> Arrays:
-    """Those of the loss that fits descend."""
+    """Compute the gradients of the loss that a fit minimises."""
     import drjit as dr
 
     from mitsplat.renderer.differentiation.photometric_loss import photometric_loss
@@ -124,7 +124,7 @@ def fit_gradients() -> Arrays:
 
 
 def frame() -> Arrays:
-    """A frame of a scene file, developed and labelled."""
+    """Render a frame of a scene file, developed and labelled."""
     from tests.drawn import scatter_boxes
 
     with tempfile.TemporaryDirectory() as folder:
@@ -141,7 +141,7 @@ def frame() -> Arrays:
 
 
 def drawn_scene(folder: Path, **output: Any) -> ms.Scene:
-    """Boxes on a table under a lamp and a sky, seen by a camera with noise."""
+    """Return a scene of boxes on a table under a lamp and a sky, with camera noise."""
     from tests.conftest import BOTH
     from tests.drawn import large_boxes
 

@@ -1,4 +1,4 @@
-"""What :func:`tests.gpu.test_same_as_cpu.fault` sees; needs no GPU."""
+"""Tests of :func:`tests.gpu.test_same_as_cpu.fault`, without a GPU."""
 
 from __future__ import annotations
 

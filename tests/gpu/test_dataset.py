@@ -1,4 +1,4 @@
-"""Datasets that a GPU makes: the same bytes from any process on it, and labels that hold."""
+"""Datasets rendered on a GPU: identical bytes from every process, and consistent labels."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ COMMAND = "from mitsplat.cli import main; main()"
 def test_processes_sharing_a_gpu_make_the_same_bytes(
     device: str, tmp_path: Path, request: pytest.FixtureRequest
 ) -> None:
-    """One process, and two that share the device."""
+    """Compares one process with two processes that share the GPU."""
     if device != "cpu":
         request.getfixturevalue("gpu")
     scene = drawn_scene(tmp_path, width=160, height=120, layouts=2, views=2, formats=["yolo", "coco"])

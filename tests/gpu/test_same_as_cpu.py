@@ -1,4 +1,4 @@
-"""The GPU renders what the CPU renders; both in processes of their own, because a process has one variant."""
+"""Equality of GPU and CPU renderings; each runs in its own process, because a process has one Mitsuba variant."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ import pytest
 from tests.gpu.cases import CASES
 
 SHARE = 5e-4
-"""Of the pixels, which may differ in ids, depth and normals: float32 rounds at edges either way."""
+"""Share of pixels whose ids, depth and normals may differ: float32 rounds either way at edges."""
 
 DECIBEL = {"path-traced": 45.0}
-"""PSNR that pictures must have where it is not 60: one path in thousands takes another turn where it is rounded."""
+"""Minimum PSNR of cases with a limit other than 60 dB: rounding changes one light path in thousands."""
 
 
 @pytest.fixture(scope="module")
 def rendered(tmp_path_factory: pytest.TempPathFactory, gpu: None) -> dict[str, dict[str, np.ndarray]]:
-    """Every array of every case, by variant."""
+    """Render every array of every case, by variant."""
     folder, found = tmp_path_factory.mktemp("rendered"), {}
     root = Path(__file__).resolve().parents[2]
     processes = {}
@@ -47,10 +47,10 @@ def test_gpu_and_cpu_arrays_of_a_case_agree(case: str, rendered: dict[str, dict[
 
 
 def fault(name: str, cpu: np.ndarray, gpu: np.ndarray, case: str = "") -> str:
-    """Describe how two arrays differ by more than is allowed; return an empty text if they do not.
+    """Describe how two arrays differ by more than the tolerance; return an empty text if they do not.
 
     Ids and masks: equal but for :data:`SHARE` of the pixels. Depth [m], normals and boxes [px] likewise, where equal
-    means within 1e-4 of the depth, 1e-3, and one pixel. Colours and light: a PSNR of 60 dB, 1 being white. Gradients:
+    means within 1e-4 of the depth, 1e-3, and one pixel. Colours and light: a PSNR of 60 dB with white = 1. Gradients:
     within a thousandth of the largest.
     """
     if cpu.shape != gpu.shape or cpu.dtype != gpu.dtype:

@@ -1,4 +1,4 @@
-"""OpenEXR files whose header would take a reader minutes are refused before one reads them."""
+"""Rejection of OpenEXR files whose header would occupy a reader for minutes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Run-length codes of masks."""
+"""Run-length encoding of masks."""
 
 import warnings
 

@@ -1,4 +1,4 @@
-"""Pictures in files of any name."""
+"""Image files with arbitrary names."""
 
 import os
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Splat files made elsewhere, whose axes, units and rubbish are planted here."""
+"""Import of splat files from other programs, with planted axes, units and floaters."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def splats_on(mesh: trimesh.Trimesh, count: int, opacity: float = 0.98) -> Splat
 
 @pytest.fixture(scope="module")
 def pin() -> trimesh.Trimesh:
-    """A column on a foot, 0.5 high, from z = 0."""
+    """Return a column on a foot, 0.5 high, starting at z = 0."""
     foot = trimesh.creation.box(bounds=[[-0.1, -0.15, 0], [0.1, 0.15, 0.1]])
     column = trimesh.creation.box(bounds=[[-0.05, -0.05, 0.05], [0.05, 0.05, 0.5]])
     return trimesh.boolean.union([foot, column], engine="manifold")
@@ -47,7 +47,7 @@ def pin() -> trimesh.Trimesh:
 
 @pytest.fixture(scope="module")
 def on_mat(pin: trimesh.Trimesh) -> Splats:
-    """The same on a mat of half a unit, z up."""
+    """Return the pin on a mat of half a unit, z up."""
     mat = trimesh.creation.box(bounds=[[-0.25, -0.25, -0.001], [0.25, 0.25, 0.0]])
     return Splats.concatenate([splats_on(pin, 2500), splats_on(mat, 1500)])
 
@@ -69,7 +69,7 @@ def test_the_smallest_rotation_takes_every_axis_up() -> None:
 
 @pytest.mark.parametrize("tilt", [0.0, 17.0])
 def test_the_up_direction_of_a_tilted_capture_is_that_of_its_table(on_mat: Splats, tilt: float) -> None:
-    rotation = Rotation.from_euler("zx", [tilt, 90], degrees=True)  # z up to -y, then askew
+    rotation = Rotation.from_euler("zx", [tilt, 90], degrees=True)  # z up to -y, then tilted
     found = find_up(turned(on_mat, rotation), "object", "-y")
     assert np.degrees(np.arccos(found.up @ rotation.apply((0, 0, 1)))) < 0.5
     assert found.support is not None
@@ -104,7 +104,7 @@ def test_the_table_is_removed_and_the_object_on_it_is_kept(on_mat: Splats) -> No
 
 @pytest.fixture(scope="module")
 def file(on_mat: Splats, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The pin on its mat with y down, in units of 2, among what is no part of it."""
+    """Write the pin on its mat with y down, in units of 2, among floaters."""
     rotation = Rotation.from_euler("x", 90, degrees=True)
     lone = splats_on(trimesh.creation.icosphere(1, 0.01), 20)
     lone = replace(lone, means=lone.means + np.float32([0.2, 0.2, 0.45]))
@@ -205,7 +205,7 @@ SMALL = ImportSettings(
 
 @pytest.fixture(scope="module")
 def block(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Imported]:
-    """A hundred Gaussians on a block as .ply, and what becomes of them: surroundings, to do without convex pieces."""
+    """Write a hundred Gaussians on a block as .ply, imported as surroundings, which need no convex decomposition."""
     path = tmp_path_factory.mktemp("block") / "block.ply"
     splats_on(trimesh.creation.box((1.0, 0.8, 0.5)), 100).save(path)
     return path, import_splats(path, name="block", kind="environment", settings=SMALL)
@@ -223,8 +223,8 @@ def test_other_formats_import_as_ply_files_do(
     other = import_splats(path, name="block", kind="environment", settings=SMALL)
     assert other.found == one.found and other.removed == one.removed
     splats, expected = other.asset.splats, one.asset.splats
-    means, expected_means = (each.means - each.means.mean(axis=0) for each in (splats, expected))  # each on its mesh
-    away, nearest = cKDTree(means).query(expected_means)  # some formats sort them
+    means, expected_means = (each.means - each.means.mean(axis=0) for each in (splats, expected))
+    away, nearest = cKDTree(means).query(expected_means)  # some formats sort the Gaussians
     assert sorted(nearest) == list(range(len(expected)))
     assert away.max() < 0.1 * precision
     assert np.abs(splats.opacities[nearest] - expected.opacities).max() < 0.005

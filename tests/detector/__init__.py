@@ -1,1 +1,1 @@
-"""Detectors."""
+"""Tests of detectors."""

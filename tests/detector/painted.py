@@ -1,4 +1,4 @@
-"""Small labelled images of discs and boxes, in every form that a detector's data may have."""
+"""Small labelled images of discs and boxes, in every data format of a detector."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ WIDTH, HEIGHT = 96, 64
 HUES = {"disc": (220, 60, 40), "box": (40, 80, 220)}
 
 Shown = list[tuple[str, BoolArray]]
-"""Classes and masks (H, W) of what an image shows."""
+"""Class names and masks (H, W) of the objects in an image."""
 
 
 def paint(seed: int, *, noise: float = 20.0) -> tuple[np.ndarray, Shown]:
-    """A picture (H, W, 3) in blue, green, red order with one or two things that do not touch, and what they are."""
+    """Draw an image (H, W, 3) in BGR order with one or two disjoint objects, and return both."""
     rng = np.random.default_rng(seed)
     image = np.clip(rng.normal(110, noise, (HEIGHT, WIDTH, 3)), 0, 255)
     shown = []
@@ -41,7 +41,7 @@ def paint(seed: int, *, noise: float = 20.0) -> tuple[np.ndarray, Shown]:
 
 
 def yolo_text(shown: Shown, classes: tuple[str, ...] = CLASSES, *, boxes: bool = False) -> str:
-    """A label file."""
+    """Format the label file of an image."""
     lines = []
     for name, mask in shown:
         points = outline(mask) / (WIDTH, HEIGHT)
@@ -61,7 +61,7 @@ def write_yolo(
     first: int = 0,
     mitsplat: bool = False,
 ) -> Path:
-    """A YOLO folder, or as much of a dataset of mitsplat as a detector reads."""
+    """Write a YOLO folder, or the parts of a mitsplat dataset that a detector reads."""
     seed = first
     for split, count in counts.items():
         for folder in ("images", "labels"):
@@ -78,7 +78,10 @@ def write_yolo(
 
 
 def write_coco(root: Path, count: int, *, form: str = "polygons", first: int = 0, crowd: bool = False) -> Path:
-    """A COCO folder, masks as polygons, run lengths, compressed run lengths or none; its classes the other way."""
+    """Write a COCO folder with masks as polygons, run lengths, compressed run lengths, or none.
+
+    Its class order is the reverse of that of :func:`write_yolo`.
+    """
     (root / "photos").mkdir(parents=True)
     images, annotations = [], []
     for number in range(count):
@@ -96,7 +99,7 @@ def write_coco(root: Path, count: int, *, form: str = "polygons", first: int = 0
                 "iscrowd": int(crowd),
             }
             if form == "polygons":
-                fine = np.kron(mask, np.ones((8, 8), dtype=bool))  # so that corners are almost at the pixels' edges
+                fine = np.kron(mask, np.ones((8, 8), dtype=bool))  # places corners almost at the pixels' edges
                 annotation["segmentation"] = [(outline(fine) / 8).ravel().tolist()]
             elif form == "compressed":
                 annotation["segmentation"] = {"size": [HEIGHT, WIDTH], "counts": rle["counts"].decode()}

@@ -1,4 +1,4 @@
-"""What detectors learn from for comparison: objects without physics, and meshes in place of splats."""
+"""Training data for comparison: objects placed without physics, and meshes instead of splats."""
 
 from __future__ import annotations
 
@@ -52,7 +52,9 @@ def test_floating_objects_do_not_overlap_and_are_above_the_floor() -> None:
 
 
 def test_a_mesh_gets_the_appearance_of_its_instance() -> None:
-    """Twice as bright, half of its red, moved, and rough; what would be brighter than white is white."""
+    """The instance is twice as bright, has half of the red, is moved, and is rough. Values above white are clipped to
+    white.
+    """
     texture = np.rint(255 * encode_srgb(np.array([[[0.4, 0.3, 0.8]]]))).astype(np.uint8)
     part = MeshPart("box", BOX, None, texture, np.zeros((12, 3, 2)), 0.0, 0.9, True)
     look = ObjectAppearance(1, 0, 0.0, 1.0, 2.0, (0.5, 1.0, 1.0), 0.3, 0.02, 0.0, 0)

@@ -1,4 +1,4 @@
-"""What is written of detections, however they came to be."""
+"""Evaluation reports for given detections."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from tests.detector.painted import write_coco, write_yolo
 
 
 def guesses(found: LabelledSet, seed: int = 0) -> list[dict[str, Any]]:
-    """Detections that are the labels, some of them shifted, of another class, of low score, or left out."""
+    """Return the labels as detections, some of them shifted, of another class, of low score, or omitted."""
     rng, detections = np.random.default_rng(seed), []
     for annotation in coco_truth(found, masks=True)["annotations"]:
         x, y, w, h = annotation["bbox"]

@@ -1,4 +1,4 @@
-"""The experiment on detectors: its arms, the photographs that each run may see, and what is judged."""
+"""Detector experiment: its arms, the photographs available to each run, and the evaluated images."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def test_every_change_is_used_by_a_scene(plan):
 
 @pytest.fixture
 def work(tmp_path: Path) -> Path:
-    """Two photographs of each of five scenes, each with one object."""
+    """Write two photographs of each of five scenes, each with one object."""
     folder = tmp_path / "photos"
     folder.mkdir()
     images = []
@@ -70,7 +70,10 @@ def work(tmp_path: Path) -> Path:
 
 @pytest.mark.parametrize("arm", ["real", "hybrid_more", "synthetic"])
 def test_photographs_are_judged_by_detectors_that_were_not_trained_on_them(work, monkeypatch, arm):
-    """A detector that finds what it has not learnt from, and nothing else: only leaving out scenes lets it see all."""
+    """The mock detector finds only objects in images outside its training set.
+
+    It finds all objects only if the scenes to evaluate are left out of the training.
+    """
     seen: dict[str, set[str]] = {}
 
     def train(datasets: list[Path], run: Path, settings: Any, real: Path | None) -> Any:
@@ -177,12 +180,12 @@ def test_labels_of_workshop_photographs_are_the_visible_pixels(tmp_path, physics
     assert [image["file_name"] for image in labels["images"]] == ["scene_0000_0000.jpg", "scene_0001_0000.jpg"]
     assert len(labels["categories"]) == 12 and len(labels["annotations"]) >= 8
     masks = [coco_mask.decode(one["segmentation"]) for one in labels["annotations"] if one["image_id"] == 1]
-    assert np.max(np.sum(masks, axis=0)) == 1  # of each pixel there is one part
+    assert np.max(np.sum(masks, axis=0)) == 1  # masks do not overlap
     photograph = cv2.imread(str(tmp_path / "photos/scene_0001_0000.jpg")).astype(float).mean(axis=2)
     assert photograph.shape == masks[0].shape == (120, 160) and 40 < photograph.mean() < 215
     edges = cv2.morphologyEx(np.max(masks, axis=0), cv2.MORPH_GRADIENT, np.ones((3, 3))) > 0
     change = cv2.morphologyEx(photograph, cv2.MORPH_GRADIENT, np.ones((3, 3)))
-    assert change[edges].mean() > 1.5 * np.median(change)  # outlines lie where the picture changes
+    assert change[edges].mean() > 1.5 * np.median(change)  # outlines lie on image edges
     assert experiment.scene_of(labels["images"][1]["file_name"]) == 1
 
 

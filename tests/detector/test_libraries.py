@@ -1,4 +1,4 @@
-"""Weights are never read by a loader that executes code."""
+"""Loading of detector weights without a loader that executes code."""
 
 import os
 import sys
@@ -12,7 +12,7 @@ from mitsplat.errors import MissingResourceError
 
 @pytest.fixture
 def stand_ins(monkeypatch):
-    """Modules in place of PyTorch and Ultralytics, as far as they are looked at while they are loaded."""
+    """Mock the parts of PyTorch and Ultralytics that are read while they are loaded."""
     monkeypatch.setattr(libraries, "find_spec", lambda name: name)
     monkeypatch.setenv("YOLO_CONFIG_DIR", "/nonexistent")
     for name in ("YOLO_OFFLINE", "YOLO_AUTOINSTALL", "YOLO_VERBOSE", "ULTRALYTICS_SAFE_LOAD"):

@@ -1,4 +1,4 @@
-"""Rendered images beside photographs: what is measured of both, and what is advised."""
+"""Comparison of rendered images with photographs: measured properties and advice."""
 
 from __future__ import annotations
 
@@ -70,13 +70,13 @@ def test_a_hue_shift_of_the_camera_is_reported(rendered: Path, photographs: Path
 def test_photographs_with_small_objects_get_a_larger_search_size(tmp_path: Path, rendered: Path) -> None:
     photographs = write_coco(tmp_path / "photographs", 20, form="boxes", first=1000)
     labels = json.loads((photographs / "labels.json").read_text())
-    for image in labels["images"]:  # each in the corner of a picture twice as large
+    for image in labels["images"]:  # puts each in the corner of an image of twice the size
         path = photographs / "photos" / image["file_name"]
         cv2.imwrite(str(path), np.pad(cv2.imread(str(path)), ((0, HEIGHT), (0, WIDTH), (0, 0))))
         image.update(width=2 * WIDTH, height=2 * HEIGHT)
     (photographs / "labels.json").write_text(json.dumps(labels))
     assert compare_with_photographs([rendered], photographs, size=640).same_size == pytest.approx(1280, abs=130)
-    assert compare_with_photographs([rendered], photographs, size=640, max_images=4).same_size is None  # too few
+    assert compare_with_photographs([rendered], photographs, size=640, max_images=4).same_size is None  # too few images
 
 
 @pytest.mark.parametrize(
@@ -111,7 +111,7 @@ def test_photographs_that_differ_both_ways_get_advice_for_a_wider_range(rendered
 
 
 def test_a_difference_of_one_class_is_reported(rendered: Path, photographs: Path) -> None:
-    """Discs are red and boxes blue: without half of the blue the boxes are dark."""
+    """Discs are red and boxes are blue. Boxes become dark if half of the blue is removed."""
     change(photographs, lambda image: image * (0.5, 1, 1))
     found = compare_with_photographs([rendered], photographs, size=WIDTH)
     assert "lower" in found.classes["box"][0].advice
@@ -179,7 +179,7 @@ def test_the_compare_command_prints_and_writes_the_traits(rendered: Path, photog
 
 
 def test_equal_distributions_get_advice_rarely() -> None:
-    """Objects of one image share its light, and so are no opinions of their own."""
+    """Objects of one image share its light, so they are not independent samples."""
     rng, advised = np.random.default_rng(3), 0
     for _ in range(100):
         lights = rng.normal(100, 20, 42)
@@ -188,4 +188,4 @@ def test_equal_distributions_get_advice_rarely() -> None:
     assert advised <= 6
     darker = [(image, value - 60) for image, value in values[30 * 6 :]]
     assert _trait(BRIGHTNESS, values[: 30 * 6], darker).advice.startswith("lower randomise.exposure")
-    assert _trait(BRIGHTNESS, values[: 30 * 6], darker[:4]).advice == ""  # too few
+    assert _trait(BRIGHTNESS, values[: 30 * 6], darker[:4]).advice == ""  # too few images

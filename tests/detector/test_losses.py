@@ -1,4 +1,4 @@
-"""What mending each kind of error is worth, against cases that are counted by hand."""
+"""Gain in average precision from correcting each kind of error, compared with cases counted by hand."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ A, B = [0.0, 0.0, 10.0, 10.0], [50.0, 50.0, 20.0, 20.0]
 
 
 def truth(*labels: tuple[int, int, list[float]], crowd: int = 0) -> dict[str, Any]:
-    """Labels of (image, class, box) in two images, of two classes."""
+    """Return labels of (image, class, box) in two images and two classes."""
     return {
         "images": [{"id": image, "width": 100, "height": 100, "file_name": f"{image}.png"} for image in (1, 2)],
         "annotations": [
@@ -43,7 +43,7 @@ TWO = truth((1, 1, A), (1, 2, B))
         ([found(1, 1, A), found(1, 1, B)], "another_class", 0.5),
         ([found(1, 1, A), found(1, 2, B), found(2, 2, A, 0.95)], "nothing", 0.25),
         ([found(1, 1, A), found(1, 2, B), found(1, 2, A, 0.5), found(2, 2, B, 0.95)], "nothing", 0.25),
-        ([found(1, 1, A), found(1, 2, [50, 50, 20, 12])], "place", 0.35),  # IoU 0.6: right at 0.5, 0.55 and 0.6
+        ([found(1, 1, A), found(1, 2, [50, 50, 20, 12])], "place", 0.35),  # IoU 0.6: correct at 0.5, 0.55 and 0.6
         ([found(1, 1, A), found(1, 2, [50, 50, 20, 8])], "place", 0.5),
     ],
 )
@@ -57,7 +57,7 @@ def test_a_single_error_has_the_gain_of_its_closed_form(
 
 
 def test_a_missed_object_counts_as_missed_only() -> None:
-    """Of two of a class one is found: precision 1 up to recall 0.5, which 51 of 101 recalls are."""
+    """One of two objects of a class is found. Precision is 1 up to recall 0.5, that is at 51 of 101 recalls."""
     worth = gains(truth((1, 1, A), (2, 1, B)), [found(1, 1, A)])
     assert worth["missed"] == pytest.approx(50 / 101, abs=1e-6)
     assert worth["another_class"] == worth["nothing"] == worth["place"] == 0
@@ -68,7 +68,7 @@ def test_perfect_detections_have_no_gain() -> None:
 
 
 def test_a_second_detection_of_a_label_stays_wrong() -> None:
-    """Of two detections that are taken for another class one becomes right; a second one of a box stays wrong."""
+    """Correcting the class makes one of two detections of a box correct. The second one stays wrong."""
     worth = gains(truth((1, 2, B)), [found(1, 1, B, 0.9), found(1, 1, B, 0.8)])
     assert worth["another_class"] == pytest.approx(1.0)
 

@@ -1,4 +1,4 @@
-"""Which images are taken at which step."""
+"""Plan of the images used at each training step."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Average precision against cases that are counted by hand."""
+"""Average precision compared with cases counted by hand."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from mitsplat.errors import InputError
 
 
 def truth(boxes: dict[int, list[tuple[int, list[float]]]]) -> dict[str, Any]:
-    """Boxes by image, each with its class; masks are the boxes."""
+    """Return labels from boxes by image, each with its class. Masks equal the boxes."""
     annotations = []
     for image, shown in boxes.items():
         for kind, (x, y, w, h) in shown:
@@ -37,10 +37,13 @@ TRUE = truth({1: [(1, [0, 0, 10, 10]), (1, [50, 50, 20, 20])], 2: [(1, [0, 0, 10
 
 
 def test_average_precision_equals_a_case_computed_by_hand() -> None:
-    """Class a: 3 labelled; by score right, wrong, right: precisions 1, 1/2, 2/3 at recalls 1/3, 1/3, 2/3.
+    """The average precision of two classes equals values computed by hand.
 
-    Of the 101 recalls, 0 to 0.33 (34) have precision 1, 0.34 to 0.66 (33) the 2/3, and the rest 0. Class b: one box
-    that overlaps by 0.6, so that it counts at thresholds 0.5, 0.55 and 0.6.
+    Class a has 3 labels. Its detections by score are right, wrong, right: precisions 1, 1/2, 2/3 at recalls 1/3, 1/3,
+    2/3.
+    Of the 101 recalls, 0 to 0.33 (34) have precision 1, 0.34 to 0.66 (33) have 2/3, and the rest have 0.
+
+    Class b has one box with an IoU of 0.6. It counts at the thresholds 0.5, 0.55 and 0.6.
     """
     detections = [
         found(1, 1, [0, 0, 10, 10], 0.9),
@@ -84,11 +87,11 @@ def test_a_subset_of_images_is_scored_independently() -> None:
         assert matches.average_precision(chosen).classes == expected.classes
         assert average_precision(labelled, detections, chosen).map50_95 == expected.map50_95
     assert matches.average_precision().classes == average_precision(labelled, detections).classes
-    # An image that is drawn twice is as two images with the same in them.
+    # An image that is drawn twice counts as two images with the same content.
     twice = truth({1: images[1], 2: images[2], 3: images[1]})
     drawn = [d | {"image_id": n} for n, i in ((1, 1), (2, 2), (3, 1)) for d in detections if d["image_id"] == i]
     assert matches.average_precision([1, 2, 1]).classes == average_precision(twice, drawn).classes
-    # What was asked before is not changed by it.
+    # Earlier calls do not change the result.
     assert (
         matches.average_precision([1, 2, 3]).classes
         == DetectionMatches(labelled, detections).average_precision([1, 2, 3]).classes
@@ -111,11 +114,11 @@ def test_detections_of_unlabelled_images_and_classes_are_refused() -> None:
 
 def test_the_confusion_matrix_counts_each_kind_of_error() -> None:
     detections = [
-        found(1, 1, [0, 0, 10, 10], 0.9),  # right
+        found(1, 1, [0, 0, 10, 10], 0.9),  # correct
         found(1, 2, [51, 50, 20, 20], 0.6),  # another class
-        found(2, 1, [0, 0, 10, 10], 0.2),  # too low: missed
-        found(3, 2, [10, 10, 30, 30], 0.8),  # right
-        found(3, 1, [10, 10, 30, 29], 0.7),  # taken already: nothing
+        found(2, 1, [0, 0, 10, 10], 0.2),  # score too low: missed
+        found(3, 2, [10, 10, 30, 30], 0.8),  # correct
+        found(3, 1, [10, 10, 30, 29], 0.7),  # label already matched: background
     ]
     confusion = confuse(TRUE, detections)
     assert confusion.matrix.tolist() == [[1, 1, 1], [0, 1, 0], [1, 0, 0]]

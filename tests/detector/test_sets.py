@@ -1,4 +1,4 @@
-"""Labelled images as they are read from folders, and what is refused of them."""
+"""Labelled images read from folders, and refused input."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def test_the_requested_split_is_read(tmp_path: Path) -> None:
     root = write_yolo(tmp_path, {"train": 3, "val": 2, "test": 1})
     assert [len(read_set(root, split).samples) for split in ("train", "val", "test", "all")] == [3, 2, 1, 6]  # type: ignore[arg-type]
     alone = write_yolo(tmp_path / "mitsplat", {"train": 3}, mitsplat=True)
-    assert "val: images/train" in (alone / "data.yaml").read_text()  # for Ultralytics, which wants some
+    assert "val: images/train" in (alone / "data.yaml").read_text()  # Ultralytics requires an entry
     with pytest.raises(InputError, match=r"there are no images for val \(it has 3 for train\)"):
         read_set(alone, "val")
 
@@ -84,7 +84,7 @@ def test_coco_files_are_chosen_by_split_and_images_found_below(tmp_path: Path) -
 
 def test_classes_are_matched_by_name(tmp_path: Path) -> None:
     found = read_set(write_coco(tmp_path, 3), "train")
-    assert found.class_names == ("box", "disc")  # by the ids of the file
+    assert found.class_names == ("box", "disc")  # ordered by the ids of the file
     turned = reorder_classes(found, CLASSES, "out/cell")
     assert turned.class_names == CLASSES
     for sample, seed in zip(turned.samples, range(3), strict=True):

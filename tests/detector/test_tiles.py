@@ -1,4 +1,4 @@
-"""Photographs cut to tiles: what they show, and what is labelled in them."""
+"""Photographs cut into tiles: their pixels and labels."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Trainings of a few steps on small images, and what is refused before one begins."""
+"""Trainings of a few steps on small images, and input refused before the start."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def test_missing_libraries_are_named(monkeypatch: pytest.MonkeyPatch, tmp_path: 
 
 @pytest.fixture
 def no_libraries(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
-    """As if Ultralytics were there; what it would have been told to train."""
+    """Mock an installed Ultralytics, and return the recorded training jobs."""
     asked: list[dict[str, Any]] = []
 
     def train_job(job: Any, **settings: Any) -> SimpleNamespace:
@@ -262,7 +262,7 @@ def test_an_unfinished_run_is_not_evaluated(tmp_path: Path) -> None:
 
 @pytest.fixture(scope="module")
 def torchvision() -> None:
-    """Stands in for a torchvision that cannot be imported because it was built for another PyTorch."""
+    """Replace a torchvision that cannot be imported because it was built for another PyTorch."""
     libraries.load_libraries()
     try:
         import torchvision  # noqa: F401
@@ -279,7 +279,7 @@ def torchvision() -> None:
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a dataset and with photographs."""
+    """Write a folder with a dataset and photographs."""
     folder = tmp_path_factory.mktemp("data")
     write_yolo(folder / "cell", {"train": 40, "val": 16}, mitsplat=True)
     write_coco(folder / "photographs", 3, first=900)
@@ -288,7 +288,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def trained(data: Path, torchvision: None, tmp_path_factory: pytest.TempPathFactory) -> Run:
-    """A run that has learnt something."""
+    """Train a detector for 100 steps, so that it finds some objects."""
     return train_detector([data / "cell"], tmp_path_factory.mktemp("runs") / "run", _other(steps=100, batch=8, size=96))
 
 
@@ -300,7 +300,7 @@ def tensors(run: Run) -> dict[str, Any]:
 
 
 def typed(data: Path, folder: Path) -> Run:
-    """A run as TINY, by the command in a process of its own, which leaves nothing elsewhere."""
+    """Train with the settings TINY by the command line in a new process, and check that no other files are left."""
     for name in ("home", "tmp"):
         (folder / name).mkdir()
     hidden = ("YOLO_CONFIG_DIR", "XDG_CONFIG_HOME", "XDG_CACHE_HOME", "MPLCONFIGDIR")
@@ -333,7 +333,7 @@ def test_the_same_command_gives_the_same_weights(data: Path, tmp_path: Path) -> 
     first, second, third = tensors(run), tensors(again), tensors(other)
     assert first.keys() == second.keys() and all(first[name].equal(second[name]) for name in first)
     assert not all(first[name].equal(third[name]) for name in first)
-    # What was learnt can be learnt on from, by the same network alone.
+    # Training can continue from the trained weights, with the same network only.
     onward = train("onward", weights=run.weights)
     assert onward.record["settings"]["weights"] == file_hash(run.weights)
     for model, message in (("yolo11n", r"does not fit yolo11n.yaml: .* must have"), ("yolo11s-seg", "does not fit")):
@@ -356,7 +356,7 @@ def test_the_same_command_gives_the_same_weights(data: Path, tmp_path: Path) -> 
 def test_weights_of_many_classes_can_be_trained_further_and_evaluated(
     data: Path, torchvision: None, tmp_path: Path
 ) -> None:
-    """As COCO's, of which Ultralytics keeps a branch that is wider than that of a few classes."""
+    """Weights with many classes, such as COCO's, have a wider branch in Ultralytics than weights with few classes."""
     import torch
     from ultralytics.nn.tasks import SegmentationModel
 
@@ -395,7 +395,7 @@ def test_an_interrupted_run_resumes_to_the_same_number_of_steps(
         open_run(tmp_path / "run")
     shutil.copytree(tmp_path / "run", tmp_path / "torn", symlinks=True)
     run = train("run")
-    assert told == [1, 2, 3, 4, 5, 5, 6, 7]  # from the checkpoint after step 4
+    assert told == [1, 2, 3, 4, 5, 5, 6, 7]  # continues from the checkpoint after step 4
     finished = run.record["finished"]
     assert (finished["resumed_at_step"], finished["updates_of_weights"], finished["steps"]) == (4, 7, 7)
     assert run.weights.is_file() and not (run.path / "weights").exists()
@@ -420,7 +420,7 @@ def test_a_batch_is_not_reduced_when_memory_runs_out(torchvision: None) -> None:
 @needs_ultralytics
 @pytest.mark.slow
 def test_every_step_uses_the_images_of_the_plan(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """And mosaics, of four images each, take theirs from it as well."""
+    """Mosaics of four images each take their images from the plan as well."""
     from mitsplat.detector import fixed_steps
 
     batches: list[list[str]] = []
@@ -442,7 +442,7 @@ def test_every_step_uses_the_images_of_the_plan(data: Path, tmp_path: Path, monk
     plan = plan_images(40, 3, share=0.25, steps=4, batch=4, seed=0)
     assert batches == [[f"{index:07d}" for index in step] for step in plan.tolist()]
     assert len(others) == 3 * 16 and set(others) <= set(plan.ravel().tolist()) < set(range(43))
-    assert 4 <= sum(index >= 40 for index in others) <= 24  # a quarter of them are 12; of all images, 3 were
+    assert 4 <= sum(index >= 40 for index in others) <= 24  # 12 are expected from a quarter, 3 from all images alike
     assert run.record["finished"]["real_images_taken"] == 4
 
 
@@ -473,11 +473,14 @@ def test_images_are_mirrored_only_with_the_option(
 @needs_ultralytics
 @pytest.mark.slow
 def test_precision_agrees_with_ultralytics(data: Path, trained: Run, tmp_path: Path) -> None:
-    """Its own validation, told to do what else differs: images letterboxed to squares, masks compared in all pixels.
+    """The precision equals that of Ultralytics' validation with its settings aligned to those of mitsplat.
 
-    What it finds then scores the same by COCO's rules, although it gives a box several classes and keeps empty masks,
-    neither of which it does where it predicts. Its own figures for that are within 0.006: areas of trapezoids, where
-    COCO takes the mean of 101 precisions, so that a perfect class has 0.995.
+    Aligned settings: images letterboxed to squares, and masks compared in all pixels. The detections of that validation
+    then score the same by COCO's rules. They differ from predictions: a box may have several classes, and empty masks
+    are
+    included. The precision that Ultralytics itself computes is within 0.006. It uses areas of trapezoids, whereas COCO
+    takes
+    the mean of 101 precisions, so that a perfect class has 0.995.
     """
     from ultralytics import YOLO
 
@@ -535,7 +538,7 @@ def test_weights_with_any_name_are_read_offline_and_not_changed(
     for name in ("getaddrinfo", "create_connection"):
         monkeypatch.setattr(socket, name, refuse)
     monkeypatch.chdir(tmp_path)
-    for name in ("yolo11n-seg.pt", "yolov5n.pt", "o'clock.pt"):  # of which Ultralytics downloads the first two
+    for name in ("yolo11n-seg.pt", "yolov5n.pt", "o'clock.pt"):  # Ultralytics would download the first two
         Path(name).write_bytes(b"torn" * 1000)
         with pytest.raises(InputError, match="cannot be read as weights"):
             load_weights(Path(name))
@@ -552,7 +555,7 @@ def test_weights_with_any_name_are_read_offline_and_not_changed(
 
 @needs_ultralytics
 def test_the_check_of_mixed_precision_downloads_nothing(torchvision: None, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The check of mixed precision on a GPU wants weights that it would download: offline, it goes on without."""
+    """Ultralytics' check of mixed precision on a GPU needs weights. Offline it continues without downloading them."""
     import torch
     from ultralytics.utils import ONLINE
     from ultralytics.utils.checks import check_amp

@@ -1,4 +1,4 @@
-"""The memory that workers are counted on to take: above real peaks, and following the scene."""
+"""Memory budget of workers: an upper bound of measured peaks that scales with the scene."""
 
 import itertools
 import subprocess
@@ -66,7 +66,7 @@ def scene(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def room(scene):
-    """The scene in surroundings of 200,000 Gaussians."""
+    """Return the scene in an environment of 200,000 Gaussians."""
     return replace(scene, environments=(replace(scene.assets[0], splats=floor(200_000), kind="environment"),))
 
 
@@ -106,7 +106,10 @@ def test_the_budget_grows_with_the_contents_of_a_scene(scene, room):
 @pytest.mark.parametrize("preset", PRESETS)
 @pytest.mark.parametrize("rendering", [{}, {"samples": 2}, {"kernel": "3dgs"}])
 def test_the_estimated_pairs_bound_the_true_number(preset, rendering):
-    """Of discs that face the camera: as many as the renderer lists, and not many more where they are wide."""
+    """For discs that face the camera, the estimate is at least the number of pairs in the renderer.
+
+    For wide discs it is below 1.5 times that number.
+    """
     camera = Camera.look_at((0, 0, -2), (0, 0, 0), up=(0, -1, 0), width=256, height=192, fov_x=50)
     quality = replace(PRESETS[preset], **rendering)
     view = view_of(make_sensor(camera)).sampled(quality.rays_per_axis)

@@ -1,4 +1,4 @@
-"""Faults while a dataset is written: kills, a full disk, files that vanish; the finished dataset loses no byte.
+"""Faults while a dataset is written: kills, a full disk, files that vanish. The finished dataset has the same bytes.
 
 Frames are synthetic; ``python -m benchmarks.scale.faults`` kills real renderings many times.
 """
@@ -39,7 +39,11 @@ if __name__ == "__main__":
 
 
 def slow(seconds, stop, scene, index, *, layout):
-    """A drawn frame, after a while; none once a folder holds so many, for whoever is to end the process may be late."""
+    """Draw a frame after a delay.
+
+    Block once the folder in ``stop`` holds the given number of frames, because the process that sends the signal may be
+    late.
+    """
     if stop is not None and lines(Path(stop[0])) >= stop[1]:
         time.sleep(3600)
     time.sleep(seconds)
@@ -67,7 +71,7 @@ def command(tmp_path, *args, seconds=0.05, stop=None):
 
 
 def start(tmp_path, scene, out, *options, frames):
-    """The command line on so many synthetic frames, in a session of its own, as from a terminal."""
+    """Start the command line on ``frames`` synthetic frames, in a session of its own as from a terminal."""
     stop = str(out), lines(out) + frames
     with (tmp_path / "said").open("w") as said:
         return subprocess.Popen(
@@ -75,7 +79,7 @@ def start(tmp_path, scene, out, *options, frames):
             stdout=said,
             stderr=said,
             start_new_session=True,
-            # Who starts the tests in the background has them, and what they start, ignore Ctrl-C.
+            # Children of a background shell job ignore Ctrl-C, and so would this process without the default handler.
             preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
         )
 
@@ -93,7 +97,9 @@ def wait_for_frames(process, out, count):
 
 
 def test_a_run_killed_at_random_moments_resumes_to_the_same_bytes(scene, tmp_path, undisturbed):
-    """Three runs are killed while they write; the lock refuses others by name and goes with its holder."""
+    """Three runs are killed while they write. The lock error names the running process, and the lock ends with that
+    process.
+    """
     out, rng = tmp_path / "out", random.Random(8)
     for options in (["--workers", "1"], ["--workers", "2"], ["--workers", "2"]):
         process = start(tmp_path, scene, out, *options, frames=4)
@@ -110,7 +116,7 @@ def test_a_run_killed_at_random_moments_resumes_to_the_same_bytes(scene, tmp_pat
 
 
 def test_an_interrupted_run_ends_with_130_and_resumes_to_the_same_bytes(scene, tmp_path, undisturbed):
-    """Ctrl-C, which goes to all processes of a terminal, stops at once with status 130 and leaves nothing half done."""
+    """Ctrl-C, sent to all processes of a terminal, ends the run at once with status 130 and no partial files."""
     out = tmp_path / "out"
     process = start(tmp_path, scene, out, "--workers", 2, frames=4)
     wait_for_frames(process, out, 3)
@@ -125,7 +131,7 @@ def test_an_interrupted_run_ends_with_130_and_resumes_to_the_same_bytes(scene, t
 
 @dataclass(frozen=True)
 class KilledOnce:
-    """Renders, but the process of one frame is killed, as by the kernel when memory runs out."""
+    """Renderer whose process is killed at one frame, as by the kernel when memory runs out."""
 
     folder: Path
     index: int
@@ -154,7 +160,7 @@ def test_a_killed_worker_loses_no_frame(scene, tmp_path, undisturbed):
 
 @dataclass(frozen=True)
 class TooLarge:
-    """Renders, but one frame takes more memory than there is."""
+    """Renderer that runs out of memory at one frame."""
 
     index: int
 
@@ -178,7 +184,7 @@ def test_a_worker_without_memory_loses_no_frame(scene, tmp_path, undisturbed, wo
 
 
 def test_a_file_size_limit_ends_with_one_sentence_and_resumes(scene, tmp_path, undisturbed):
-    """A limit on the size of files stops the run like a full disk does, also within the manifest's line."""
+    """A limit on the size of files ends the run like a full disk, also within a line of the manifest."""
     out = tmp_path / "out"
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     for size in (3000, 20000, 40000):
@@ -194,7 +200,7 @@ def test_a_file_size_limit_ends_with_one_sentence_and_resumes(scene, tmp_path, u
 
 
 def mounted(tmp_path, options):
-    """A folder for a file system of its own, and how to begin a shell script that sees it."""
+    """Return a mount point for a new file system, and the start of a shell script that mounts it."""
     folder = tmp_path / "mounted"
     folder.mkdir()
     begin = f"mount -t tmpfs -o {options} tmpfs {folder} || exit 99\n"
@@ -208,7 +214,7 @@ def run_script(script):
 
 
 def test_a_full_disk_ends_with_status_3_and_resumes(scene, tmp_path, undisturbed):
-    """With 300 KiB the run ends with status 3 and one sentence; with room it goes on from what it has."""
+    """With 300 KiB the run ends with status 3 and one sentence. With more space it resumes from the finished frames."""
     folder, begin = mounted(tmp_path, "size=300k")
     again = " ".join(command(tmp_path, scene.path, "-o", folder / "out", "--workers", 2, seconds=0))
     done = run_script(
@@ -232,7 +238,7 @@ def test_a_read_only_disk_ends_with_status_2(scene, tmp_path):
 
 @dataclass(frozen=True)
 class Remove:
-    """Renders, and removes a file of the dataset at frame 8."""
+    """Renderer that removes a file of the dataset at frame 8."""
 
     path: Path
 
@@ -255,7 +261,7 @@ def test_a_file_removed_while_running_is_reported_and_made_again(scene, tmp_path
     out = tmp_path / "out"
     with pytest.raises(error, match=rf"{file}: must not be (changed or )?removed while"):
         write(scene, out, render=Remove(out / file))
-    if file == "dataset.json":  # without it the folder is no dataset, and is left alone
+    if file == "dataset.json":  # without it the folder is not a dataset and is not changed
         with pytest.raises(InputError, match="must be empty or a dataset"):
             write(scene, out)
         return

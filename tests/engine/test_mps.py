@@ -1,4 +1,4 @@
-"""NVIDIA's Multi-Process Service, played by a script: started, tried, ended, or done without."""
+"""NVIDIA's Multi-Process Service, mocked by a script: start, trial, end, and fallback without it."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ echo "$command" >> {log}
 
 @pytest.fixture
 def log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """File with the commands that the service received."""
+    """Return the file with the commands that the service received."""
     monkeypatch.delenv(PIPES, raising=False)
     monkeypatch.delenv(VISIBLE_GPUS, raising=False)
     monkeypatch.setattr(mps, "_TRIAL", "pass")
@@ -107,7 +107,7 @@ def test_the_service_is_stopped_if_workers_cannot_start(log: Path, monkeypatch: 
 def test_the_service_ends_with_the_process_that_started_it(
     log: Path, monkeypatch: pytest.MonkeyPatch, how: int
 ) -> None:
-    """However that ends: nobody else would end it."""
+    """No other process would end the service. It ends for every signal."""
     install(log, monkeypatch)
     code = (
         "import time, mitsplat.engine.mps as mps; mps._TRIAL = 'pass'; shared = mps.SharedGpu(); "
@@ -118,14 +118,14 @@ def test_the_service_ends_with_the_process_that_started_it(
         stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL,
         start_new_session=True,
-        # As in a terminal: jobs in the background of a shell ignore Ctrl-C, and would sleep to their end.
+        # Jobs in the background of a shell ignore Ctrl-C, and would sleep to their end.
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
     )
     with process:
         assert process.stdout is not None
         folder = Path(process.stdout.readline().decode().strip())
         assert (folder / "control").exists()
-        os.killpg(process.pid, how)  # as a terminal does
+        os.killpg(process.pid, how)  # sent to the process group, as a terminal does
     end = time.monotonic() + 60
     while folder.exists():
         assert time.monotonic() < end
@@ -137,7 +137,10 @@ def test_the_service_ends_with_the_process_that_started_it(
 def test_gpus_are_numbered_as_the_service_numbers_them(
     log: Path, monkeypatch: pytest.MonkeyPatch, visible: str, own: str | None
 ) -> None:
-    """It sees those that are visible here, from 0: of the second GPU alone, clients would ask for a second one."""
+    """The service sees the GPUs that are visible here, numbered from 0.
+
+    If only the second GPU is visible, clients with the outer number would request a second GPU of the service.
+    """
     monkeypatch.setenv(VISIBLE_GPUS, visible)
     install(log, monkeypatch, start=f'[ "$CUDA_VISIBLE_DEVICES" = "{visible}" ] && touch {log.parent}/started; exit')
     shared = SharedGpu()

@@ -1,4 +1,4 @@
-"""Frames in worker processes: order, notes, and what happens when a worker fails or dies."""
+"""Frames in worker processes: order, notes, and failed or killed workers."""
 
 import os
 import signal
@@ -26,7 +26,7 @@ LAYOUTS = {0: [0, 1, 2], 1: [3, 4, 5], 2: [6, 7, 8]}
 
 @dataclass(frozen=True)
 class Make:
-    """Returns (index, process id); fails in a chosen way at one frame."""
+    """Job that returns (index, process id), and fails in a chosen way at one frame."""
 
     fail_at: int = -1
     how: str = ""
@@ -103,7 +103,7 @@ def test_a_frame_that_kills_every_worker_ends_the_run(how, words):
 
 @pytest.mark.parametrize("workers", [2, 4])
 def test_frames_of_lost_workers_are_made_by_others(tmp_path, workers):
-    """Two frames kill the process that tries them first; every frame is made, once, and the losses are told."""
+    """Two frames kill the first process that renders them. Every frame is made once, and the losses are reported."""
     notes = []
     made = run(KillOnce(tmp_path, (1, 7)), workers, note=notes.append)
     assert sorted(made) == list(range(9))
@@ -113,8 +113,8 @@ def test_frames_of_lost_workers_are_made_by_others(tmp_path, workers):
 
 @pytest.fixture
 def interpreter(tmp_path, monkeypatch):
-    """Starts worker processes by a shell script in place of Python."""
-    resource_tracker.ensure_running()  # by Python
+    """Replace Python by a shell script in worker processes."""
+    resource_tracker.ensure_running()  # started by Python
 
     def use(script):
         path = tmp_path / "python"
@@ -135,7 +135,7 @@ def interpreter(tmp_path, monkeypatch):
     ],
 )
 def test_a_worker_that_does_not_start_in_time_is_reported(monkeypatch, interpreter, script, words):
-    """However large the work and the command line are that it does not read."""
+    """The start timeout holds for a large job and a large command line that the process does not read."""
     monkeypatch.setattr(engine, "_START_TIMEOUT", 0.5)
     monkeypatch.setattr(sys, "argv", ["run", "x" * 200_000])
     interpreter(script)
@@ -156,7 +156,7 @@ def test_workers_receive_a_command_line_only_if_it_is_short(monkeypatch, argumen
 
 @dataclass(frozen=True)
 class CommandLine:
-    """Returns the command line of its process."""
+    """Job that returns the command line of its process."""
 
     def __call__(self, index, note, /):
         return tuple(sys.argv)
@@ -173,7 +173,7 @@ def test_frames_of_a_worker_that_does_not_start_are_made_by_others(monkeypatch, 
 
 
 def test_suspended_workers_are_killed(tmp_path):
-    """SIGTERM would wait until they go on."""
+    """SIGTERM would have no effect until the processes continue."""
     (tmp_path / "pids").mkdir()
     with closing(engine._Processes(Linger(tmp_path / "pids"), None)) as pool:
         for index in range(2):
@@ -188,7 +188,7 @@ def test_suspended_workers_are_killed(tmp_path):
 
 @dataclass(frozen=True)
 class KillOnce:
-    """Kills its process at some frames, unless it has done so."""
+    """Job that kills its process once at each of the given frames."""
 
     folder: Path
     frames: tuple[int, ...]
@@ -203,7 +203,7 @@ class KillOnce:
 
 @dataclass(frozen=True)
 class Greedy:
-    """Memory runs out, as Dr.Jit says it, while more processes live than there is room for, and at one frame always."""
+    """Job that raises Dr.Jit's out-of-memory error if more than ``room`` processes live, and always at one frame."""
 
     folder: Path
     room: int
@@ -213,7 +213,7 @@ class Greedy:
         (self.folder / str(os.getpid())).touch()
         if index == self.too_large or sum(not ended(path.name) for path in self.folder.iterdir()) > self.room:
             raise RuntimeError("jit_malloc(): out of memory! Could not allocate 4 GiB of device memory.\n(and more)")
-        time.sleep(0.1)  # the others are at work meanwhile
+        time.sleep(0.1)  # the other workers are busy meanwhile
         return index, os.getpid()
 
 
@@ -239,21 +239,21 @@ def test_a_frame_that_does_not_fit_into_memory_alone_ends_the_run(tmp_path, work
 
 
 def test_the_last_frame_is_given_to_an_idle_worker():
-    """The last frame only fits alone: who has nothing to do takes it over, one after the other, until one is left."""
+    """The last frame fits only without other workers. Idle workers take it in turn until one is left."""
     pool = Short(lambda frame, alive: frame < 2 or alive == 1)
     assert list(run_pool(pool, {0: range(3)}, 3, print)) == [0, 1, 2]
     assert (pool.stopped, pool.alive) == ([2, 0], {1})
 
 
 def test_workers_without_memory_are_restarted_beside_fewer_others():
-    """Four run out at once: one is dismissed, and the others, made anew, fit beside what is left."""
+    """Four workers run out of memory at once. One is stopped, and the other three are restarted."""
     pool = Short(lambda frame, alive: alive <= 3)
     assert sorted(run_pool(pool, {0: range(8)}, 4, print)) == list(range(8))
     assert (len(pool.alive), pool.hired) == (3, 4 + 3)
 
 
 class Short:
-    """A pool without processes, whose workers answer all at once; a frame may not fit beside others that are alive."""
+    """Pool without processes, whose workers all answer at once. A frame may not fit beside the other live workers."""
 
     def __init__(self, fits):
         self.fits, self.hired = fits, 0
@@ -284,14 +284,14 @@ EXHAUSTED = Failure(MissingResourceError, "RuntimeError", "memory is exhausted",
 
 
 def test_workers_select_the_device_first(monkeypatch):
-    """The variant is told by the worker; GPUs are given in turn, each alone visible to its workers."""
+    """The worker reports its variant. GPUs are assigned in turn, and each worker sees only its own GPU."""
     with closing(run_frames(Variant(), LAYOUTS, workers=2, note=print, device=CPU)) as results:
         assert {variant for _, variant, _ in results} == {"llvm_ad_rgb"}
     monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
     gpus = tuple(Gpu(name, 80 * 2**30, number, "", f"GPU-{name}") for number, name in enumerate("ab"))
     monkeypatch.setattr(engine, "use_shared_device", print)
     pool = engine._Processes(Variant(), Device("cuda", gpus))
-    pool._kind = None  # there is none to take
+    pool._kind = None  # no device is selected
     with closing(pool):
         workers = [pool.start() for _ in range(4)]
         pool.stop(workers[2])
@@ -307,7 +307,7 @@ def test_workers_select_the_device_first(monkeypatch):
 
 
 def test_a_missing_gpu_is_reported_in_one_sentence():
-    """What a worker finds when it takes its device is told as what its frame found."""
+    """An error of device selection in a worker is reported as the error of its frame."""
     lost = Device("cuda", (Gpu("gone", 2**40, 1, "", ""),))
     if isinstance(visible_gpus(), MissingPrerequisite):
         words = (
@@ -319,7 +319,10 @@ def test_a_missing_gpu_is_reported_in_one_sentence():
 
 @pytest.mark.parametrize(("kind", "exhausted"), [("cuda", True), ("cpu", False)])
 def test_a_gpu_that_does_not_start_loses_its_worker(monkeypatch, kind, exhausted):
-    """As where one process has just brought it down for all; not so a CPU, for which waiting changes nothing."""
+    """A GPU may fail for all processes just after one of them made it fail, so a later attempt can succeed.
+
+    A CPU that fails would fail again.
+    """
 
     def fail(device):
         raise ImportError("cuInit() failed")
@@ -340,11 +343,11 @@ def test_a_gpu_that_does_not_start_loses_its_worker(monkeypatch, kind, exhausted
 
 @pytest.mark.parametrize(("own", "seen"), [("", "0"), ("GPU-a", "GPU-a")])
 def test_workers_get_the_environment_of_the_gpu_service(monkeypatch, own, seen):
-    """Its variables are the workers' alone, and a GPU that is one of several has its own name."""
+    """The service's variables are set in the workers only. One of several GPUs has a name of its own."""
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "1")
     gpu = Gpu("a", 80 * 2**30, 0, "", own)
     with closing(engine._Processes(Variant(), Device("cuda", (gpu,)), {"CUDA_VISIBLE_DEVICES": "0"})) as pool:
-        pool._kind = None  # there is none to take
+        pool._kind = None  # no device is selected
         pool.send_frame(pool.start(), 0, 0)
         while not (answers := list(pool.wait())):
             pass
@@ -354,7 +357,7 @@ def test_workers_get_the_environment_of_the_gpu_service(monkeypatch, own, seen):
 
 @dataclass(frozen=True)
 class Variant:
-    """Tells of Mitsuba's variant, and of what GPU is visible."""
+    """Job that returns Mitsuba's variant and the visible GPU."""
 
     def __call__(self, index, note, /):
         import mitsuba as mi
@@ -364,7 +367,7 @@ class Variant:
 
 @pytest.mark.parametrize(("gigabytes", "count"), [((80, 80), 8), ((80, 7), 4), ((7,), 2), ((1,), 1)])
 def test_the_number_of_workers_is_bounded_by_gpu_memory(monkeypatch, gigabytes, count):
-    """All of them from the start; on a GPU of 7 GiB there are two of 3."""
+    """All workers start at once. A GPU of 7 GiB gets two workers of 3 GiB."""
     monkeypatch.setattr(engine, "unused_memory", lambda: 32.0)
     monkeypatch.setattr(engine.os, "sched_getaffinity", lambda _: set(range(16)), raising=False)
     device = Device("cuda", tuple(Gpu("one", size * 2**30, 0, "", "") for size in gigabytes))
@@ -384,7 +387,7 @@ def test_the_number_of_workers_per_gpu_is_bounded(monkeypatch):
 
 
 def test_few_frames_on_another_gpu_run_in_one_process(monkeypatch):
-    """A process of its own has to see that GPU; more of them would start for as long as the frames take."""
+    """Another GPU needs a process of its own. More processes would take as long to start as the frames take."""
     began = []
     monkeypatch.setattr(engine, "affordable_workers", lambda memory, device: 8)
     monkeypatch.setattr(engine, "SharedGpu", None)
@@ -395,7 +398,7 @@ def test_few_frames_on_another_gpu_run_in_one_process(monkeypatch):
 
 
 def test_workers_end_with_their_parent(tmp_path):
-    """A parent that is killed leaves no process behind that could still write."""
+    """A killed parent leaves no process that could still write."""
     script = (
         "import sys; sys.path.insert(0, sys.argv[1])\n"
         "from pathlib import Path\n"
@@ -432,7 +435,7 @@ def wait_for(condition, seconds=300):
 
 @dataclass(frozen=True)
 class Linger:
-    """Says who it is and stays."""
+    """Job that records its process id and blocks."""
 
     folder: Path
 
@@ -442,7 +445,7 @@ class Linger:
 
 
 class Scripted:
-    """A pool whose workers take given times, one after the other on a clock of its own, for the growth of a staff."""
+    """Pool whose workers take given times on a simulated clock, one after the other, to test the number of workers."""
 
     def __init__(self, seconds, joining=()):
         self.seconds, self.joining, self.clock, self.most = seconds, list(joining), 0.0, 0
@@ -478,8 +481,8 @@ class Scripted:
     ("seconds", "settled_at", "most"),
     [
         (lambda count: 1.0, 4, 4),  # every worker adds its full speed
-        (lambda count: float(count), 1, 2),  # they share one core: the second is dismissed
-        (lambda count: 1.0 if count <= 2 else 0.6 * count, 2, 3),  # the third does not pay
+        (lambda count: float(count), 1, 2),  # all share one core: the second is stopped
+        (lambda count: 1.0 if count <= 2 else 0.6 * count, 2, 3),  # the third adds no speed
     ],
 )
 def test_workers_are_added_while_they_increase_the_speed(monkeypatch, seconds, settled_at, most):
@@ -491,14 +494,17 @@ def test_workers_are_added_while_they_increase_the_speed(monkeypatch, seconds, s
 
 
 def test_workers_start_on_machines_that_join():
-    """None of them more than once, and none without a frame for it."""
+    """No worker starts twice, and none starts without a frame to render."""
     pool = Scripted(lambda count: 1.0, joining=[0, 0, 2, 0, 0, 50])
     assert sorted(run_pool(pool, {0: range(20)}, 1, print)) == list(range(20))
-    assert pool.hired == 1 + 2 + 11  # by then 9 of 20 frames were given out
+    assert pool.hired == 1 + 2 + 11  # by then 9 of 20 frames were assigned
 
 
 class SlowPlan:
-    """The rule of the plan, readable: a worker's own layout, the first that nobody has, that with most left."""
+    """Slow reference of the plan.
+
+    Order of choice: the worker's own layout, the first layout without a worker, the layout with the most frames left.
+    """
 
     def __init__(self, layouts):
         self.waiting = {layout: list(frames) for layout, frames in layouts.items() if frames}
@@ -531,7 +537,7 @@ class SlowPlan:
     events=st.lists(st.tuples(st.integers(0, 4), st.sampled_from(["take"] * 6 + ["lost", "dismissed"])), max_size=80),
 )
 def test_the_plan_agrees_with_its_slow_twin(sizes, events):
-    """Workers that take, are lost with their frame, and are dismissed, in any order."""
+    """Workers take frames, are lost with their frame, and are stopped, in any order."""
     layouts = {7 * number: [100 * number + view for view in range(size)] for number, size in enumerate(sizes)}
     fast, slow = engine._Plan(layouts), SlowPlan(layouts)
     at_work = {}
@@ -550,7 +556,7 @@ def test_the_plan_agrees_with_its_slow_twin(sizes, events):
 
 
 class Counted(int):
-    """A layout's number that counts how often it is looked at."""
+    """Layout number that counts its comparisons and hash calls."""
 
     looks = 0
 
@@ -564,7 +570,10 @@ class Counted(int):
 
 
 def test_the_cost_of_a_frame_grows_with_the_logarithm_of_layouts():
-    """Looks at layouts for each frame; a layout goes to one worker, the last ones to several."""
+    """The number of layout accesses per frame hardly grows from 100 to 3200 layouts.
+
+    A layout goes to one worker, the last ones go to several.
+    """
     looks = {}
     for count in (100, 3200):
         plan = engine._Plan({Counted(layout): range(3) for layout in range(count)})
@@ -584,7 +593,7 @@ def test_closing_stops_workers_at_once():
     stopped = []
 
     def stop():
-        stopped.append(time.monotonic())  # starting takes as long as it takes
+        stopped.append(time.monotonic())  # excludes the start-up time
         raise KeyboardInterrupt
 
     with closing(results), pytest.raises(KeyboardInterrupt):

@@ -1,4 +1,4 @@
-"""Datasets made in parts, on Ray or by other numbers of workers are the same bytes as one run's."""
+"""Datasets made in shards, on Ray or with other numbers of workers: the same bytes as from one run."""
 
 import errno
 import fcntl
@@ -91,7 +91,7 @@ class TestSameBytes:
 
     @pytest.mark.parametrize("locked", [True, False])
     def test_read_only_shards_merge_to_the_same_bytes(self, scene, tmp_path, whole, locked, monkeypatch):
-        """As on a share of another machine; a run that still writes one from elsewhere holds its lock."""
+        """Shards may be on a read-only share. A run on another machine that writes a shard holds its lock."""
         shards = write_shards(scene, tmp_path / "shards", 2)
         if not locked:
             for shard in shards:
@@ -118,7 +118,7 @@ def test_shards_divide_the_frames(total, views, count):
     parts = [list(Shard(number, count).frames(total, views)) for number in range(1, count + 1)]
     assert list(chain(*parts)) == list(range(total))
     assert all(parts)
-    if -(-total // views) >= count:  # whole layouts
+    if -(-total // views) >= count:  # shards of whole layouts
         assert all(part[0] % views == 0 for part in parts)
 
 
@@ -191,7 +191,7 @@ class TestRefusals:
         self.refuse(shards, tmp_path / "out", "must be the same: the shards settled one layout differently")
 
     def test_a_manifest_that_names_files_outside_is_refused(self, shards, tmp_path):
-        """A manifest that names files elsewhere, with a checksum that fits."""
+        """The manifest refers to files outside of the folder and has a valid checksum."""
         manifest = shards[0] / "manifest.jsonl"
         records = list(Manifest(manifest))
         (tmp_path / "secret").write_text("")
@@ -232,7 +232,7 @@ def test_the_merge_command_merges_and_logs(scene, tmp_path, whole, capsys):
 
 @pytest.fixture(scope="module")
 def ray():
-    """Ray on this machine with four CPUs, whatever it has, and a made-up resource."""
+    """Start Ray on this machine with four CPUs, for any real number, and a custom resource."""
     ray = pytest.importorskip("ray", reason="Ray is not installed: pip install 'mitsplat[cluster]'")
     os.environ["PYTHONPATH"] = str(Path(__file__).parents[2])
     ray.init("local", num_cpus=4, resources={"camera": 1}, include_dashboard=False, log_to_driver=False)
@@ -244,7 +244,7 @@ def ray():
 @pytest.mark.usefixtures("ray")
 class TestRay:
     def test_a_run_resumed_on_ray_with_a_killed_worker_makes_the_same_bytes(self, scene, tmp_path, whole):
-        """Begun here, gone on with on Ray, where a worker is killed: no layout is settled twice, no frame is lost."""
+        """The run resumes on Ray, where a worker is killed. No layout is settled twice and no frame is lost."""
         told = []
         write(scene, tmp_path / "out", frames=3)
         options = {"render": KilledOnce(tmp_path, 6), "settle": partial(only_later, 1), "workers": None}
@@ -255,7 +255,7 @@ class TestRay:
         assert contents(tmp_path / "out") == whole
 
     def test_a_ray_worker_without_memory_loses_no_frame(self, scene, tmp_path, whole):
-        """A worker says so, as Dr.Jit does of a GPU: its frame is made by another, and it is not replaced."""
+        """The worker raises Dr.Jit's GPU out-of-memory error. Another one makes its frame, and no worker is added."""
         told = []
         write(
             scene,
@@ -281,7 +281,7 @@ class TestRay:
 
 @dataclass(frozen=True)
 class ExhaustedOnce:
-    """Renders, but memory runs out at a frame, unless it has done so."""
+    """Renderer that runs out of memory once, at one frame."""
 
     folder: Path
     index: int
@@ -330,7 +330,7 @@ def test_devices_that_a_cluster_lacks_are_refused(scene, tmp_path, capsys, resou
 
 
 class FakeRay:
-    """As much of Ray as tells of machines."""
+    """Mock of the parts of Ray that describe machines."""
 
     def __init__(self, **nodes):
         self.alive = nodes
@@ -361,7 +361,7 @@ def test_machines_that_join_are_reported_once(monkeypatch):
     pool = cluster._Actors(None, Cluster(resources={"CPU": 2.0}), None)
     assert (pool.room, free_slots()) == (3, 0)
     assert (free_slots(second=4.0), free_slots()) == (2, 0)
-    assert free_slots(second=0.0, first=0.0) == 0  # lost: theirs is what is made again
+    assert free_slots(second=0.0, first=0.0) == 0  # lost workers are restarted there, so these are no new places
     assert free_slots(again=4.0) == 2
     few = pool = cluster._Actors(None, Cluster(resources={"CPU": 2.0}), 2)
     workers = [few.start(), few.start()]
@@ -389,7 +389,7 @@ def test_a_ray_that_does_not_start_is_reported(monkeypatch, address, place):
 
 
 def test_ray_starts_without_the_current_folder_of_the_caller(monkeypatch):
-    """It would put this folder on the import path of its workers if they had no other one."""
+    """Ray would otherwise put this folder on the import path of its workers."""
 
     class Started(FakeRay):
         def is_initialized(self):
@@ -408,7 +408,7 @@ def test_ray_starts_without_the_current_folder_of_the_caller(monkeypatch):
 
 
 def test_images_of_lights_are_sent_with_the_job(scene_data, write_scene, tmp_path):
-    """Where frames are made no path of the caller's is opened: its folder is gone."""
+    """Remote workers open no path of the caller's machine: the folder has been removed."""
     cv2.imwrite(str(tmp_path / "sky.png"), np.full((4, 8, 3), 90, dtype=np.uint8))
     scene_data["lights"] = [{"kind": "environment", "image": "sky.png"}]
     home = load_scene(write_scene(scene_data))
@@ -426,13 +426,13 @@ def test_images_of_lights_are_sent_with_the_job(scene_data, write_scene, tmp_pat
     assert renderer._emitter(plan_frame(there.job.scene, 0).lights[0])["filename"] == str(copy)
     scene = there.job.scene
     there.make(1, there.settle(0))
-    assert there.job.scene is scene  # by which the renderer knows its uploads
+    assert there.job.scene is scene  # the renderer identifies its uploads by the scene object
     del there, renderer
     assert not copy.exists()
 
 
 def only_later(first, scene, index, *, progress):
-    """Settles, but no layout that was settled before."""
+    """Settle a layout, and fail for layouts that were settled before."""
     assert index >= first
     return settle(scene, index, progress=progress)
 

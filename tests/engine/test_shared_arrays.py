@@ -1,4 +1,4 @@
-"""Arrays that worker processes share: as they were sent, in one memory, for nobody to change, gone in the end."""
+"""Arrays shared by worker processes: equal to the originals, one copy in memory, read-only, removed at the end."""
 
 import os
 import signal
@@ -23,7 +23,7 @@ MIB = 2**20
 
 @dataclass(frozen=True)
 class Describe:
-    """Tells of its arrays from within a worker."""
+    """Job that describes its arrays from within a worker."""
 
     splats: Splats
     asset: Asset
@@ -60,7 +60,7 @@ def total_of(splats: Splats) -> float:
 
 
 def test_workers_map_one_copy_of_the_arrays_and_leave_no_file(tmp_path, monkeypatch):
-    """And nothing of it is left behind, not even by one that is killed."""
+    """No file is left, not even by a killed worker."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     splats = splats_of(50_000)
     size = sum(array.nbytes for array in vars(splats).values()) / MIB
@@ -97,7 +97,7 @@ def test_an_unusable_cache_folder_falls_back_to_shared_memory(tmp_path, monkeypa
 
 
 def test_the_start_message_of_a_process_is_small():
-    """However much is shared, and in however many arrays: more than a pipe holds would be waited for."""
+    """Its size is constant for any number of arrays. A message larger than a pipe's buffer would block."""
     value = [np.arange(3) for _ in range(20_000)], "text" * 100_000
     with closing(shared_arrays.SharedArrays(value)) as packed:
         assert packed.size > 20_000 * 64

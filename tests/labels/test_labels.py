@@ -1,4 +1,4 @@
-"""Labels: what is kept, exclusivity, and outlines that come back through Ultralytics' way of reading them."""
+"""Labels: filter rules, exclusive masks, and outlines read back as Ultralytics reads them."""
 
 import io
 import json
@@ -22,7 +22,7 @@ from mitsplat.labels.polygons import fill_polygon, outline
 
 @dataclass(frozen=True)
 class Seen:
-    """Stands for mitsplat.scene.layout.Instance, of which labels need no more."""
+    """The fields of mitsplat.scene.layout.Instance that labels use."""
 
     id: int
     class_index: int | None
@@ -32,11 +32,16 @@ class Seen:
 
 CLASSES = ("bolt", "nut")
 ROUNDED = 4
-"""Pixels that may differ because a resampled point fell on a pixel's corner, in the middle of a diagonal step."""
+"""Number of pixels that may differ if a resampled point lies on a pixel's corner, in the middle of a diagonal
+step.
+"""
 
 
 def truth_of(instance_map, second=None, alone=None):
-    """A frame's truth; every instance alone covers what is seen of it, unless ``alone`` says more."""
+    """Return the ground truth of a frame.
+
+    Each silhouette equals the visible mask unless ``alone`` gives another.
+    """
     ids = np.asarray(instance_map)
     silhouettes = {int(i): Silhouette.cropped(ids == i, 0, 0) for i in np.unique(ids[ids > 0])}
     silhouettes |= {i: Silhouette.cropped(mask, x, y) for i, (mask, x, y) in (alone or {}).items()}
@@ -50,9 +55,9 @@ def label(instance_map, second=None, alone=None, **limits):
 
 
 def read_yolo(text, width, height):
-    """Boxes and masks of a label file as Ultralytics 8.4 makes them at the image's own size.
+    """Return the boxes and masks of a label file as Ultralytics 8.4 computes them at the image's own size.
 
-    After ultralytics/data: utils.verify_image_label (float32), dataset.update_labels_info with ops.resample_segments,
+    Follows ultralytics/data: utils.verify_image_label (float32), dataset.update_labels_info with ops.resample_segments,
     instance.Instances.denormalize and utils.polygon2mask.
     """
     rows = [line.split() for line in text.strip().splitlines()]
@@ -70,7 +75,7 @@ def read_yolo(text, width, height):
 
 
 def resample(segment, n):
-    """As ultralytics.utils.ops.resample_segments."""
+    """Resample an outline like ultralytics.utils.ops.resample_segments."""
     if len(segment) == n:
         return segment
     closed = np.concatenate((segment, segment[:1]))
@@ -81,7 +86,7 @@ def resample(segment, n):
 
 
 def through_yolo(instance_map, **limits):
-    """(label, mask of the whole image as labelled, box and mask as read back), per instance."""
+    """Return (label, labelled mask of the whole image, box and mask as read back) of each instance."""
     height, width = np.shape(instance_map)
     labels = label(instance_map, **limits)
     classes, boxes, masks = read_yolo(yolo_lines(labels), width, height)
@@ -166,7 +171,7 @@ class TestRules:
         ids = np.zeros((20, 30), dtype=np.uint16)
         ids[5:15, 5:15] = 1
         alone = ids == 1
-        alone[2, 20:24] = True  # a floater, which rule 1 takes from the mask as well
+        alone[2, 20:24] = True  # a floater; rule 1 also removes it from the mask
         assert label(ids, alone={1: (alone, 0, 0)}).instances[0].visible_fraction == 1
 
     @pytest.mark.parametrize("action", ["mark", "drop"])
@@ -190,7 +195,9 @@ class TestRules:
         assert [entry.id for entry in kept.instances] == [1, 2, 3]
 
     def test_agreement_of_shifted_masks_equals_its_closed_form(self):
-        """Two 20 x 20 squares, one 3 px to the right of the other: IoU 17/23; only parallel edges lie within 2 px."""
+        """Two 20 x 20 squares, one 3 px to the right of the other: IoU 17/23; only the parallel edges are within 2
+        px.
+        """
         ids = np.zeros((40, 60), dtype=np.uint16)
         ids[10:30, 10:30] = 1
         (entry,) = label(ids, np.roll(ids, 3, axis=1)).instances
@@ -263,10 +270,10 @@ class TestOutline:
         assert not (read[0] & read[1]).any()
 
     def test_parts_are_joined_over_the_fewest_pixels(self):
-        """A bridge between parts is painted by the reader: exactly the gap's width here, and nothing else."""
+        """The reader fills the bridge between two parts: it is exactly as wide as the gap and adds nothing else."""
         ids = np.zeros((60, 100), dtype=np.uint16)
         ids[10:50, 10:40] = 1
-        ids[20:30, 47:80] = 1  # 7 px apart, nearest in the middle of a side
+        ids[20:30, 47:80] = 1  # 7 px apart, nearest in the middle of an edge
         ids[52:58, 12:20] = 1  # 2 px apart
         [(entry, mask, _, back)] = through_yolo(ids)
         assert not (mask & ~back).any()
@@ -292,7 +299,7 @@ class TestOutline:
             assert not (labelled & ~exact).any()
             if parts == 1:
                 np.testing.assert_array_equal(exact, labelled)
-            # Bridges between parts are long diagonals more, outside of all parts.
+            # Bridges between parts are additional long diagonals, outside of all parts.
             assert np.count_nonzero((back ^ exact) & labelled) <= ROUNDED
             assert np.count_nonzero(back ^ exact) <= ROUNDED + parts - 1
             np.testing.assert_allclose(box, entry.box, atol=0.03)
@@ -341,7 +348,7 @@ def test_run_lengths_agree_with_pycocotools(box, share):
 @settings(max_examples=60, deadline=None)
 def test_bounds_of_ids_agree_with_scipy(seed, height, width, count):
     ids = np.random.default_rng(seed).integers(0, count + 1, (height, width)).astype(np.uint16)
-    ids[ids == count] = 40000  # not every id is there
+    ids[ids == count] = 40000  # ids have gaps
     expected = {
         number: (columns.start, rows.start, columns.stop, rows.stop)
         for number, bounds in enumerate(ndimage.find_objects(ids.astype(np.int32)), start=1)
@@ -366,7 +373,7 @@ def test_fragments_are_the_parts_below_the_limit(seed, share, least):
 @pytest.mark.parametrize("size", [(1, 1), (7, 5), (300, 2), (41, 700)])
 @pytest.mark.parametrize("share", [0.0, 0.5, 1.0])
 def test_masks_written_as_png_are_read_by_opencv_and_pillow(size, share):
-    """OpenCV (libpng) and Pillow both check every checksum."""
+    """OpenCV (libpng) and Pillow both verify every checksum."""
     width, height = size
     rng = np.random.default_rng(width)
     for _ in range(8):
@@ -395,7 +402,7 @@ def test_json_keeps_the_labels():
 
 
 def test_a_distractor_occludes_and_has_no_label():
-    """Half of a square is behind what has no class."""
+    """An object without a class occludes half of a square."""
     ids = np.zeros((40, 40), dtype=np.uint16)
     ids[10:30, 10:20], ids[5:35, 20:35] = 1, 2
     square = np.ones((20, 20), dtype=bool)

@@ -1,4 +1,4 @@
-"""How objects lie, stand or are put in their regions, against what each arrangement promises."""
+"""Arrangements: poses of dropped, upright, packed and stacked objects in their regions."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def drop_layout(scene_data, write_scene, **changes):
 
 
 def placed_clearances(scene, layout):
-    """Clearances of a layout's objects from one another and from the colliders."""
+    """Return the clearances of a layout's objects from one another and from the colliders."""
     from mitsplat.geometry.mesh_distance import all_clearances
     from mitsplat.physics.drop import drop_of
 
@@ -41,7 +41,9 @@ BIN = {"name": "bin", "bin": {"size": [0.12, 0.09, 0.05], "position": [0, 0, 0.0
 
 
 def test_a_bin_has_five_walls_around_its_interior(scene_data, write_scene):
-    """Volume of the walls: outer less inner; the inside is empty and the middle of its floor where it should be."""
+    """The volume of the walls is outer minus inner; the inside is empty, and the middle of its floor is where
+    stated.
+    """
     from mitsplat.geometry.mesh_distance import DistanceSurface
 
     scene_data["shapes"].append(BIN)
@@ -58,7 +60,7 @@ def test_a_bin_has_five_walls_around_its_interior(scene_data, write_scene):
 
 
 def test_a_pile_fills_a_bin(scene_data, write_scene):
-    """A dozen parts, more than the region has room for, come to rest in the bin, none beside it."""
+    """A dozen parts, more than fit in the region, come to rest in the bin; none rests beside it."""
     scene_data["shapes"].append(BIN)
     _, layout = drop_layout(
         scene_data,
@@ -96,7 +98,7 @@ def test_scattered_objects_do_not_touch(scene_data, write_scene):
 
 
 def test_a_stack_lies_on_its_largest_faces(scene_data, write_scene):
-    """Box i of thickness h lies with its centre at (i + 1/2) h, all turned alike and in one line."""
+    """Box i of thickness h has its centre at (i + 1/2) h; all boxes have the same rotation and one vertical axis."""
     scene_data["objects"] = [{"asset": "assets/nut", "count": 4}]
     _, layout = drop_layout(scene_data, write_scene, settle={"arrangement": "stack"})
     poses = np.array(sorted((one.world_from_object for one in layout.instances), key=lambda pose: pose[2, 3]))
@@ -108,7 +110,7 @@ def test_a_stack_lies_on_its_largest_faces(scene_data, write_scene):
 
 @pytest.mark.parametrize("arrangement", ["stack", "upright", "tower", "packed"])
 def test_placed_objects_start_below_the_lid_of_an_enclosure(scene_data, write_scene, arrangement):
-    """They start at the region's top, where the lid is, but stand on the ground from the first moment on."""
+    """Objects start at the region's top, where the lid is, but are placed on the ground before the first step."""
     scene_data["objects"] = [{"asset": "assets/nut", "count": 2}]
     scene_data["enclosure"] = {"margin": 0.05}
     settle = {"arrangement": arrangement, "attempts": 1}
@@ -117,7 +119,7 @@ def test_placed_objects_start_below_the_lid_of_an_enclosure(scene_data, write_sc
 
 
 def test_upright_objects_keep_their_vertical(scene_data, write_scene):
-    """Bolts of 10 x 10 x 50 mm, which lie down when dropped, stand: the vertical stays, its turn is random."""
+    """Bolts of 10 x 10 x 50 mm, which would lie down when dropped, stand: the vertical is fixed, the yaw random."""
     scene_data["objects"] = [{"asset": "assets/bolt", "count": 5}]
     _, layout = drop_layout(scene_data, write_scene, settle={"arrangement": "upright"})
     poses = np.array([instance.world_from_object for instance in layout.instances])
@@ -127,9 +129,10 @@ def test_upright_objects_keep_their_vertical(scene_data, write_scene):
 
 
 def test_packed_objects_stand_in_rows(scene_data, write_scene):
-    """Bolts of 10 x 10 mm, turned by quarters up to 3 degrees off, have at most 11 mm by 11 mm and gaps of 2 to 5 mm.
+    """Bolts of 10 x 10 mm, rotated by quarter turns up to 3 degrees off, take at most 11 mm by 11 mm; gaps are 2 to 5
+    mm.
 
-    So at most five stand in a row of 60 mm, the rows are as many as they must be, and none is far from the next.
+    At most five stand in a row of 60 mm. The number of rows is minimal, and no row is far from the next.
     """
     scene_data["objects"] = [{"asset": "assets/bolt", "count": 9}]
     scene_data["region"] = {"min": [-0.03, -0.03, 0.0], "max": [0.03, 0.03, 0.08]}
@@ -150,7 +153,7 @@ def test_packed_objects_stand_in_rows(scene_data, write_scene):
 
 
 def test_a_tower_stands_on_its_widest_object(scene_data, write_scene):
-    """A bolt of 50 mm stands on three nuts of 10 mm, whatever order they are listed in; each is turned for itself."""
+    """A bolt of 50 mm stands on three nuts of 10 mm in any order of the list; each has its own random yaw."""
     scene_data["objects"] = [{"asset": "assets/bolt", "count": 1}, {"asset": "assets/nut", "count": 3}]
     _, layout = drop_layout(scene_data, write_scene, settle={"arrangement": "tower"})
     poses = {one.asset: [] for one in layout.instances}
@@ -208,13 +211,16 @@ def test_turned_over_places_objects_on_other_sides(scene_data, write_scene, tmp_
     settle = {"arrangement": arrangement, "yaw": [-10, 10], "turned_over": 0.8}
     _, layout = drop_layout(scene_data, write_scene, settle=settle)
     poses = np.array([instance.world_from_object for instance in layout.instances])
-    assert (poses[:, 1, 1] > np.cos(np.radians(11))).all()  # fronts stay where yaw has them
+    assert (poses[:, 1, 1] > np.cos(np.radians(11))).all()  # yaw stays in its range
     ups = {round(np.degrees(np.arctan2(pose[0, 2], pose[2, 2])) / 90) % 4 for pose in poses}
     assert ups - {0}
 
 
 def test_objects_with_given_poses_stay_there(scene_data, write_scene):
-    """A nut put down turned by 30 degrees stays there; one above it comes down by its clearance; others keep off."""
+    """A nut with a given pose, rotated by 30 degrees, keeps it.
+
+    A nut with a pose above it comes down by its clearance. Other objects avoid both.
+    """
     given = [
         {"position": [0.05, 0.02, 0.005], "rotate": [0, 0, 30]},
         {"position": [0.05, 0.02, 0.0153], "rotate": [0, 0, 30]},
@@ -234,7 +240,7 @@ def test_objects_with_given_poses_stay_there(scene_data, write_scene):
     ("height", "other", "overlap"), [(0.002, "collider 'table'", "3.0"), (0.013, r"objects\[0\].poses\[1\]", "2.0")]
 )
 def test_given_poses_must_not_overlap(scene_data, write_scene, height, other, overlap):
-    """A nut of 10 mm whose centre is 2 mm above the table, or 8 mm above that of one below."""
+    """Refuses a nut of 10 mm whose centre is 2 mm above the table, or 8 mm above that of the nut below."""
     given = [{"position": [0.05, 0.02, height], "rotate": [0, 0, 30]}, {"position": [0.05, 0.02, 0.005]}]
     given = given if height > 0.005 else given[:1]
     scene_data["objects"] = [{"asset": "assets/nut", "poses": given}]
@@ -245,7 +251,7 @@ def test_given_poses_must_not_overlap(scene_data, write_scene, height, other, ov
 
 @pytest.fixture
 def shelf(scene_data):
-    """A table, a board above it and a bin beside it; objects of three entries."""
+    """Return a scene of a table, a board above it and a bin beside it, with three object entries."""
     scene_data["shapes"] += [
         {"name": "board", "box": {"size": [0.5, 0.5, 0.02], "position": [0, 0, 0.29]}},
         {"name": "bin", "bin": {"size": [0.15, 0.15, 0.06], "position": [0.4, 0, 0.004]}, "visible": True},
@@ -264,7 +270,7 @@ def shelf(scene_data):
 
 
 def test_each_object_lies_in_its_region(shelf, write_scene):
-    """On the board at 0.3 m, put upright; on the table below it; and within the walls of the bin."""
+    """Objects lie upright on the board at 0.3 m, on the table below, and within the walls of the bin."""
     scene = load_scene(write_scene(shelf))
     seen = set()
     for index in range(2):

@@ -1,4 +1,4 @@
-"""What a layout leaves out: what finds no rest, and what finds no room."""
+"""Objects omitted from a layout: unstable ones, and those without free space."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ pytestmark = pytest.mark.usefixtures("physics")
 
 @pytest.fixture
 def needle_scene(scene_data, write_scene, tmp_path):
-    """Nuts beside a needle on its point, its weight beside that."""
+    """Return a scene of nuts and a needle that stands on its point with its centre of mass beside it."""
     cone = trimesh.creation.cone(0.004, 0.08, sections=16)
     cone.vertices[:, 2] = 0.08 - cone.vertices[:, 2]
     cone.vertices[:, 0] += 0.2 * cone.vertices[:, 2]
@@ -46,7 +46,7 @@ def test_an_object_that_falls_over_is_omitted_and_others_keep_their_ids(needle_s
     start = np.array([one.world_from_object[:3, 3] for one in moments[0].instances])
     resting = np.array([one.world_from_object[:3, 3] for one in layout.instances])
     assert start.shape == (2, 3)
-    assert np.abs(start - resting).max() < 2e-3  # they were put down where they lie
+    assert np.abs(start - resting).max() < 2e-3  # they were placed at rest
 
 
 def test_a_layout_without_resting_objects_is_an_error_with_the_empty_layout(needle_scene, scene_data):

@@ -1,4 +1,4 @@
-"""Layouts against what they promise."""
+"""Settled layouts: clearances, randomness, caching and determinism."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def test_clearance_of_boxes_equals_its_closed_form():
     assert from_here(pose_at((0.023, 0, 0))) == pytest.approx(0.003, abs=1e-6)
     assert from_here(pose_at((0.018, 0.005, 0.005))) == pytest.approx(-0.002, abs=1e-6)
     assert from_here(pose_at((0.05, 0, 0))) == 0.005
-    # Edges that cross with no vertex inside: each is sqrt(2) cm from its centre, less 1 mm.
+    # Edges cross with no vertex inside: each is sqrt(2) cm from its centre, less 1 mm.
     crossed = Rotation.from_euler("xz", (45, 90), degrees=True)
     upright = PlacedSurface("edge up", box, pose_at((0, 0, 0), Rotation.from_euler("x", 45, degrees=True)))
     above = PlacedSurface("edge down", box, pose_at((0, 0, 2 * 0.01 * np.sqrt(2) - 0.001), crossed))
@@ -90,13 +90,13 @@ def test_a_layout_satisfies_its_certificate(scene_data, write_scene):
     assert certificate.collider_penetration < 3e-4
     assert certificate.pair_penetration < 5e-4
     assert certificate.support_gap < 1e-3
-    assert certificate.standoff < 1e-6  # boxes are their own pieces
+    assert certificate.standoff < 1e-6  # a box is its own convex piece
     assert certificate.attempts == len(certificate.refused) + 1
 
 
 @pytest.mark.parametrize("stepper", STEPPERS)
 def test_a_replay_ends_in_the_poses_of_the_layout(stepper, scene_data, write_scene):
-    """It starts high, and where it ends no object is farther than 2 mm from where the layout has it."""
+    """The replay starts high and ends with no object farther than 2 mm from its pose in the layout."""
     scene_data["settle"] = {"stepper": stepper}
     scene = load_scene(write_scene(scene_data))
     layout = settle_layout(scene, 0, cached=False)
@@ -119,7 +119,7 @@ def test_json_keeps_layouts(scene_data, write_scene):
 
 
 def test_a_layout_is_settled_once_and_cached(scene_data, write_scene, tmp_path, monkeypatch):
-    """What changes the picture only does not settle anew; seed, index and meshes do, and so does a damaged file."""
+    """Keys that only change the image reuse the layout; seed, index, meshes or a damaged file settle it again."""
     from mitsplat.physics import drop, settle
 
     monkeypatch.setattr(settle, "cache_folder", lambda: tmp_path / "cache")
@@ -143,7 +143,7 @@ def test_a_layout_is_settled_once_and_cached(scene_data, write_scene, tmp_path, 
 
 
 def test_code_that_decides_layouts_is_hashed():
-    """Whatever mitsplat's modules of MODULES take from others of its modules is a type, or hashed as a value."""
+    """Names that modules of MODULES import from other modules of mitsplat are types, or are hashed as values."""
     from mitsplat.physics import settle
 
     types = {
@@ -161,9 +161,9 @@ def test_code_that_decides_layouts_is_hashed():
         "scene.layout.NO_PHYSICS",
         "runtime.warp_start.quiet_warp",
     }
-    given |= {"storage.content_hash.ContentHash"}  # names what is kept
-    given |= {"storage.files.SPLITS"}  # names of tallies; which layout is of which split is decided in scene.contents
-    given |= {"scene.spec.scene_spec.BACKDROP"}  # begins the names of shapes, which are hashed
+    given |= {"storage.content_hash.ContentHash"}  # names the cached files
+    given |= {"storage.files.SPLITS"}  # names of counts; scene.contents assigns layouts to splits
+    given |= {"scene.spec.scene_spec.BACKDROP"}  # prefix of the names of shapes, which are hashed
     for module in settle.MODULES:
         for node in ast.walk(ast.parse((settle.PACKAGE / f"{module.replace('.', '/')}.py").read_text())):
             if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("mitsplat."):
@@ -176,7 +176,7 @@ def test_code_that_decides_layouts_is_hashed():
     "change", [("scene/walls", "PILE_HEIGHT = 1.0", "PILE_HEIGHT = 0.9"), ("physics/friction", "sqrt", "cbrt")]
 )
 def test_a_changed_rule_invalidates_cached_layouts(change, scene_data, write_scene, tmp_path, monkeypatch):
-    """The height of piles, the walls of bins and the rule of friction are part of what a layout is kept by."""
+    """The height of piles, the walls of bins and the friction rule are part of a layout's cache key."""
     from mitsplat.physics import settle
 
     module, text, other = change
@@ -202,7 +202,7 @@ def test_several_processes_settle_the_same_layouts_as_one(scene_data, write_scen
 
 @pytest.mark.parametrize("stepper", STEPPERS)
 def test_seed_and_index_determine_every_byte(stepper, scene_data, write_scene):
-    """A process that settles layout 2 alone, and one that has settled another before, agree."""
+    """A process that settles only layout 2 and one that settled another layout first agree."""
     scene_data["settle"] = {"stepper": stepper}
     path = write_scene(scene_data)
     scene = load_scene(path)
@@ -226,7 +226,7 @@ def test_seed_and_index_determine_every_byte(stepper, scene_data, write_scene):
 
 
 def test_steppers_leave_upright_objects_at_the_same_poses(scene_data, write_scene):
-    """Objects put down upright from the same draw do not tumble, so that both physics engines agree closely."""
+    """Objects placed upright from the same draw do not tumble, so that both physics engines agree closely."""
     layouts = []
     for stepper in STEPPERS:
         scene_data["settle"] = {"arrangement": "upright", "stepper": stepper}
@@ -239,7 +239,7 @@ def test_steppers_leave_upright_objects_at_the_same_poses(scene_data, write_scen
 
 
 def test_simulations_are_freed(scene_data, write_scene, monkeypatch):
-    """Models that Newton leaves in reference cycles are let go of, however seldom Python collects."""
+    """Models in Newton's reference cycles are freed, however seldom Python's garbage collector runs."""
     from mitsplat.physics import drop
     from mitsplat.physics import worlds as physics
     from mitsplat.physics.settle import warp_settings
@@ -261,7 +261,7 @@ def test_simulations_are_freed(scene_data, write_scene, monkeypatch):
 
 
 def test_drops_that_fall_off_are_rejected_and_counted(scene_data, write_scene):
-    """On a pedestal narrower than the region some draws stay and some leave."""
+    """On a pedestal narrower than the region, some draws stay and some fall off."""
     scene_data["shapes"][0]["box"] = {"size": [0.12, 0.12, 0.1], "position": [0, 0, -0.05]}
     scene_data["region"] = {"min": [-0.1, -0.1, 0.01], "max": [0.1, 0.1, 0.1]}
     scene_data["settle"] = {"attempts": 30}
@@ -275,7 +275,7 @@ def test_drops_that_fall_off_are_rejected_and_counted(scene_data, write_scene):
 
 @pytest.mark.parametrize(("distance", "settles"), [(3e-4, False), (3e-3, True)])
 def test_an_object_resting_against_the_enclosure_is_drawn_again(distance, settles, scene_data, write_scene):
-    """A nut of 20 x 30 x 10 mm is put down flat, its face as far from the wall at x = 0.2 m as said."""
+    """A nut of 20 x 30 x 10 mm is placed flat, with its face at the given distance from the wall at x = 0.2 m."""
     scene_data["enclosure"] = {"margin": 0}
     scene_data["objects"] = [{"asset": "assets/nut", "poses": [{"position": [0.19 - distance, 0, 0.005]}]}]
     scene_data["settle"] = {"attempts": 2}
@@ -295,7 +295,7 @@ def test_a_layout_that_never_rests_is_an_error(scene_data, write_scene):
 
 @pytest.mark.parametrize(("size", "depth", "refused"), [(0.05, 3.5e-4, True), (0.2, 3.5e-4, False), (0.2, 7e-4, True)])
 def test_the_allowed_depth_grows_with_the_size_of_an_object(size, depth, refused):
-    """0.3 mm, or 0.3 % of its size: 0.6 mm of 200."""
+    """The allowed depth is 0.3 mm, or 0.3 % of the object's size: 0.6 mm for 200 mm."""
     from mitsplat.geometry.mesh_distance import Clearance, DistanceSurface, PlacedSurface
     from mitsplat.physics.drop import _rest_defect
 
@@ -326,7 +326,7 @@ def test_an_environment_carries_objects(scene_data, write_scene):
 
 
 def test_objects_rest_on_the_drawn_environment(scene_data, write_scene):
-    """Steps of two heights: what is settled after another is no other than what is settled alone."""
+    """Two environments have steps of different heights; a layout settled after another equals one settled alone."""
     scene_data["shapes"] = []
     scene = load_scene(write_scene(scene_data))
     tops = (0.015, -0.03)
@@ -348,7 +348,9 @@ def test_objects_rest_on_the_drawn_environment(scene_data, write_scene):
 
 
 def test_standoff_of_a_hull_equals_its_closed_form():
-    """Pieces that are the mesh stand off by nothing; the hull of an L by half a leg, where its long face spans it."""
+    """Pieces equal to the mesh have no standoff; the hull of an L has half a leg, where its long face spans the
+    notch.
+    """
     from mitsplat.geometry.mesh_distance import DistanceSurface, standoff
 
     floor, wall = trimesh.creation.box((0.022, 0.01, 0.002)), trimesh.creation.box((0.002, 0.01, 0.022))
@@ -362,7 +364,7 @@ def test_standoff_of_a_hull_equals_its_closed_form():
 
 
 def test_standoff_equals_the_largest_signed_distance_of_points():
-    """What is deep inside is farther from the surface than what stands off, and must not count."""
+    """Points deep inside are farther from the surface than the standoff, and must not count."""
     from mitsplat.geometry.mesh import contact_points
     from mitsplat.geometry.mesh_distance import _SAMPLES, DistanceSurface, standoff
 

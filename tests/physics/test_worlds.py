@@ -1,4 +1,4 @@
-"""Rigid bodies against closed forms."""
+"""Rigid body simulation against closed forms."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def body_of(*pieces, friction=0.5, density=3000.0):
 
 
 def table(pose=None, friction=0.5):
-    """A box whose top is the plane z = 0 of its pose."""
+    """Return a box whose top is the plane z = 0 of its pose."""
     from mitsplat.physics.worlds import Collider
 
     top_from_box = trimesh.transformations.translation_matrix((0, 0, -0.05))
@@ -47,12 +47,12 @@ def run_until(world, time):
 
 
 def centres(world):
-    """Centres of mass [m], shape (N, 3)."""
+    """Return the centres of mass [m], shape (N, 3)."""
     return np.array([(pose @ [*body.mass.centre, 1])[:3] for body, pose in zip(world.bodies, world.poses, strict=True)])
 
 
 def energy(world):
-    """Kinetic and potential energy of the bodies [J]."""
+    """Return the kinetic and potential energy of the bodies [J]."""
     total = 0.0
     for body, pose, centre, (speed, spin) in zip(
         world.bodies, world.poses, centres(world), world.velocities, strict=True
@@ -75,7 +75,9 @@ def test_free_fall_equals_its_closed_form(stepper):
 
 @pytest.mark.parametrize("stepper", STEPPERS)
 def test_poses_are_those_of_the_mesh_frame(stepper):
-    """A body spinning in free fall turns about its centre of mass, which follows the parabola; its origin does not."""
+    """A body spinning in free fall rotates about its centre of mass, which follows the parabola; its origin does
+    not.
+    """
     box = trimesh.creation.box((0.02, 0.04, 0.06)).apply_translation((0.3, -0.2, 0.1))
     start = pose_at((0, 0, 2), Rotation.from_rotvec((0.4, -1.0, 0.3)))
     world = world_of(stepper, [body_of(box)], [table()], [start])
@@ -88,7 +90,7 @@ def test_poses_are_those_of_the_mesh_frame(stepper):
 
 @pytest.mark.parametrize("stepper", STEPPERS)
 def test_small_parts_come_to_rest_on_the_table(stepper):
-    """A box of 10 mm flat, one on edge, a washer-thin disc on its rim, and one with its origin elsewhere."""
+    """A box of 10 mm lies flat, one starts on its edge, a washer-thin disc on its rim; one has its origin elsewhere."""
     from mitsplat.physics.rest import run_to_rest
 
     box = trimesh.creation.box((0.010, 0.010, 0.010))
@@ -115,11 +117,11 @@ def test_small_parts_come_to_rest_on_the_table(stepper):
 
 
 FRICTIONS = [(0.2, 0.6), (0.6, 0.2), (0.05, 0.8), (0.8, 0.05), (0.35, 0.5), (0.9, 0.0), (0.0, 0.9), (0.4, 0.4)]
-"""Of a block and of what it lies on."""
+"""Friction coefficients of a block and of the surface below."""
 
 
 def inclines(angle, frictions):
-    """Tables side by side that fall towards +x by an angle [rad], and the frame of each one's surface."""
+    """Return tables side by side, inclined towards +x by an angle [rad], and the frame of each one's surface."""
     frames = [
         pose_at((0, 1.1 * i, 0)) @ pose_at((0, 0, 0), Rotation.from_euler("y", angle)) for i in range(len(frictions))
     ]
@@ -128,7 +130,7 @@ def inclines(angle, frictions):
 
 @pytest.mark.parametrize("stepper", STEPPERS)
 def test_sliding_on_an_incline_equals_its_closed_form(stepper):
-    """On 25 degrees a block slides by g (sin a - mu cos a) t (t + h) / 2, mu the geometric mean, h the step."""
+    """On 25 degrees a block slides by g (sin a - mu cos a) t (t + h) / 2; mu is the geometric mean, h the step."""
     angle = np.radians(25.0)
     tables, frames = inclines(angle, [friction for _, friction in FRICTIONS])
     starts = np.stack([frame @ pose_at((-0.45, 0, 0.005)) for frame in frames])
@@ -143,11 +145,11 @@ def test_sliding_on_an_incline_equals_its_closed_form(stepper):
 
 @pytest.mark.parametrize("stepper", STEPPERS)
 def test_a_block_slides_beyond_the_friction_angle_only(stepper):
-    """A block slides iff tan a > sqrt(mu mu'), whichever of the two is the smoother, on a table or on a slab."""
+    """A block slides iff tan a > sqrt(mu mu'), whichever surface is the smoother, on a table or on a slab."""
     angle = np.radians(20.0)
     pairs = [(low, (share * np.tan(angle)) ** 2 / low) for share in (0.9, 1.1) for low in (0.1, 0.3, 1.0)]
     block, slab = trimesh.creation.box((0.02, 0.02, 0.01)), trimesh.creation.box((0.3, 0.1, 0.02))
-    rough = 9.0  # of the tables on which slabs lie, which must not slide themselves
+    rough = 9.0  # friction of tables under slabs, which must not slide
     tables, frames = inclines(angle, [mu for _, mu in pairs] + [rough] * len(pairs))
     bodies = [body_of(block, friction=mu) for mu, _ in pairs * 2]
     bodies += [body_of(slab, friction=mu) for _, mu in pairs]
@@ -155,7 +157,7 @@ def test_a_block_slides_beyond_the_friction_angle_only(stepper):
     starts = [frame @ pose_at((-0.1, 0, z)) for frame, z in zip(frames, height, strict=True)]
     starts += [frame @ pose_at((0, 0, 0.01)) for frame in frames[len(pairs) :]]
     world = world_of(stepper, bodies, tables, starts)
-    run_until(world, 0.1)  # let them sink in
+    run_until(world, 0.1)  # settle into contact
     before = world.poses[:, :3, 3]
     run_until(world, 0.4)
     way = np.linalg.norm(world.poses[:, :3, 3] - before, axis=1)
@@ -165,9 +167,10 @@ def test_a_block_slides_beyond_the_friction_angle_only(stepper):
 
 @pytest.mark.parametrize("stepper", STEPPERS)
 def test_spin_friction_equals_its_closed_form(stepper):
-    """A top on a square foot slows by g m mu sqrt(p^2 + r^2) / I: sliding at the corners, p from the axis, and spin.
+    """A spinning top on a square foot is decelerated by g m mu sqrt(p^2 + r^2) / I.
 
-    Spin friction of each corner is mu r, r = 10 mm the radius of contact; the cone of both is an ellipsoid.
+    Its corners at distance p from the axis slide and spin. Spin friction of each corner is mu r, with r = 10 mm the
+    radius of contact; the cone of both is an ellipsoid.
     """
     foot = trimesh.creation.box((0.004, 0.004, 0.004)).apply_translation((0, 0, 0.002))
     disc = trimesh.creation.box((0.05, 0.05, 0.006)).apply_translation((0, 0, 0.007))
@@ -186,7 +189,7 @@ def test_spin_friction_equals_its_closed_form(stepper):
 
 
 def test_stepping_mujoco_in_stages_changes_no_bit(monkeypatch):
-    """With the friction that MuJoCo takes, the stages called one by one leave what mj_step does, to the bit."""
+    """With MuJoCo's friction, separate calls of the stages give the same bits as mj_step."""
     import mujoco
 
     from mitsplat.physics import worlds as physics
@@ -217,7 +220,7 @@ def test_a_full_contact_buffer_is_an_error():
 
 
 def test_worlds_in_one_simulation_do_not_interact():
-    """A world falls as it does alone while another of more pieces, made after it by the same kernels, runs too."""
+    """A world falls as it does alone while a second world with more pieces runs on the same kernels."""
     from mitsplat.physics.contacts import ContactFinder
     from mitsplat.physics.worlds import WarpWorld, all_pieces
 
@@ -242,7 +245,9 @@ def test_worlds_in_one_simulation_do_not_interact():
 
 
 def test_mean_speeds_equal_displacement_by_time():
-    """A turn of t about an axis through the centre of mass, and a way of w, in s seconds: t / s and w / s."""
+    """A rotation of t about an axis through the centre of mass and a displacement of w in s seconds: t / s and w /
+    s.
+    """
     from mitsplat.physics.rest import _mean_speeds
 
     body = body_of(trimesh.creation.box((0.02, 0.03, 0.01)))
@@ -253,7 +258,7 @@ def test_mean_speeds_equal_displacement_by_time():
 
 
 def test_light_parts_carry_a_plate_a_hundred_times_as_heavy():
-    """A plate a hundred times as heavy rests on two nuts: none of them sinks by more than 0.1 mm."""
+    """A plate a hundred times as heavy rests on two nuts, which sink by at most 0.1 mm."""
     from mitsplat.physics.rest import run_to_rest
 
     nut, plate = trimesh.creation.box((0.01, 0.01, 0.005)), trimesh.creation.box((0.15, 0.05, 0.0135))
@@ -270,11 +275,11 @@ def test_light_parts_carry_a_plate_a_hundred_times_as_heavy():
 
 @pytest.mark.parametrize("stepper", STEPPERS)
 def test_creep_on_an_incline_is_below_a_tenth_of_a_millimetre(stepper):
-    """tan 20 = 0.36 < mu = 0.5: a block at rest stays; 3 s."""
+    """tan 20 = 0.36 < mu = 0.5: a block at rest does not move for 3 s."""
     block = trimesh.creation.box((0.04, 0.04, 0.01))
     tilt = pose_at((0, 0, 0), Rotation.from_euler("y", 20, degrees=True))
     world = world_of(stepper, [body_of(block)], [table(tilt)], [tilt @ pose_at((0, 0, 0.005))])
-    run_until(world, 0.2)  # let it sink in
+    run_until(world, 0.2)  # settle into contact
     before = world.poses
     run_until(world, 3.2)
     assert np.linalg.norm(world.poses[0, :3, 3] - before[0, :3, 3]) < 1e-4
@@ -282,7 +287,7 @@ def test_creep_on_an_incline_is_below_a_tenth_of_a_millimetre(stepper):
 
 @pytest.mark.parametrize("stepper", STEPPERS)
 def test_a_box_dropped_in_any_pose_rests_on_a_face(stepper):
-    """Flat on each face, on edges, and on a corner below the centre of mass: the energy is least on a face."""
+    """Starts on each face, on edges, and on a corner below the centre of mass: the energy is least on a face."""
     from mitsplat.physics.rest import run_to_rest
 
     box = trimesh.creation.box((0.02, 0.03, 0.01))
@@ -293,7 +298,7 @@ def test_a_box_dropped_in_any_pose_rests_on_a_face(stepper):
         Rotation.from_euler("y", 90, degrees=True),
         Rotation.from_euler("x", 45, degrees=True),
         Rotation.from_euler("y", 30, degrees=True),
-        # Exactly balanced it would stay: three degrees off.
+        # An exactly balanced box would stay; this one starts three degrees off.
         on_corner * Rotation.from_euler("x", 3, degrees=True),
     ]
     poses = [pose_at((0.1 * i - 0.25, 0, 0.05), turn) for i, turn in enumerate(turns)]
@@ -307,7 +312,7 @@ def test_a_box_dropped_in_any_pose_rests_on_a_face(stepper):
 
 @pytest.mark.parametrize("stepper", STEPPERS)
 def test_a_box_does_not_balance_on_its_edge(stepper):
-    """The centre of mass stands above the edge at a tilt of atan(d / b), where only roll friction could hold it."""
+    """The centre of mass is above the edge at a tilt of atan(d / b), where only rolling friction could hold it."""
     from mitsplat.physics.rest import run_to_rest
 
     breadth, depth = 0.03, 0.009
@@ -321,7 +326,7 @@ def test_a_box_does_not_balance_on_its_edge(stepper):
     world = world_of(stepper, [body_of(slab)] * 2, [table()], poses)
     outcome = run_to_rest(world, max_time=6.0, bounds=EVERYWHERE)
     assert outcome.rejection == ""
-    # Back onto the narrow face, and over onto the large one.
+    # It falls back onto the narrow face, or over onto the large one.
     np.testing.assert_allclose(np.abs(outcome.poses[:, 2, 2]), [0, 1], atol=1e-3)
 
 
@@ -339,7 +344,7 @@ def test_a_stack_of_five_drifts_by_less_than_a_tenth_of_a_millimetre(stepper):
 
 @pytest.mark.parametrize("stepper", STEPPERS)
 def test_a_drop_does_not_rebound_or_gain_energy(stepper):
-    """Contact only takes from E = sum m (g z + v v / 2) + w I w / 2; after impact nothing rises by 1 mm."""
+    """Contact only dissipates E = sum m (g z + v v / 2) + w I w / 2; after impact no body rises by 1 mm."""
     shapes = [
         trimesh.creation.box((0.03, 0.03, 0.03)),
         trimesh.creation.icosphere(3, 0.015),
@@ -363,7 +368,7 @@ def test_a_drop_does_not_rebound_or_gain_energy(stepper):
 @pytest.mark.parametrize("stepper", STEPPERS)
 @pytest.mark.parametrize("speed", [3.0, 6.0])
 def test_a_thin_plate_does_not_tunnel(stepper, speed):
-    """A plate of 2 mm, 12 mm a step at 6 m/s, thrown flat, on edge and on a corner at table and wall."""
+    """A plate of 2 mm moves 12 mm per step at 6 m/s, thrown flat, on edge and on a corner at table and wall."""
     from mitsplat.physics.worlds import Collider
 
     plate = trimesh.creation.box((0.05, 0.04, 0.002))
@@ -388,7 +393,7 @@ def test_a_thin_plate_does_not_tunnel(stepper, speed):
 
 @pytest.mark.parametrize("stepper", STEPPERS)
 def test_overlapping_boxes_part_at_less_than_one_metre_per_second(stepper):
-    """Boxes 10 mm in one another, and one 10 mm in the table, part at less than 1 m/s."""
+    """Boxes that overlap by 10 mm, and one that overlaps the table by 10 mm, part at less than 1 m/s."""
     box = trimesh.creation.box((0.04, 0.04, 0.04))
     poses = [pose_at((0, 0, 0.02)), pose_at((0.03, 0, 0.021)), pose_at((0.2, 0, 0.01))]
     world = world_of(stepper, [body_of(box)] * 3, [table()], poses)
@@ -403,7 +408,7 @@ def test_overlapping_boxes_part_at_less_than_one_metre_per_second(stepper):
 
 @pytest.mark.parametrize("stepper", STEPPERS)
 def test_a_ball_rests_inside_a_cup(stepper):
-    """The floor of the cup is 6 mm thick: the ball's centre comes to rest a radius above it, not above the rim."""
+    """The floor of the cup is 6 mm thick: the ball's centre rests one radius above it, not above the rim."""
     from mitsplat.physics.rest import run_to_rest
     from mitsplat.physics.worlds import Collider
 
@@ -420,9 +425,11 @@ def test_a_ball_rests_inside_a_cup(stepper):
 
 @pytest.mark.parametrize("stepper", STEPPERS)
 def test_thrown_bodies_follow_their_closed_form(stepper):
-    """After t at r + v t - g t (t + h) / 2, for semi-implicit steps of h; spin w about a principal axis stays.
+    """The position after t is r + v t - g t (t + h) / 2 with semi-implicit steps of h; spin w about a principal axis
+    is constant.
 
-    MuJoCo integrates the frame's origin: the centre of mass, a apart, is off by the centripetal h w^2 a t / 2.
+    MuJoCo integrates the frame's origin: at a distance a from it, the centre of mass is off by the centripetal
+    h w^2 a t / 2.
     """
     box = trimesh.creation.box((0.02, 0.04, 0.06)).apply_translation((0.1, 0, 0))
     start = pose_at((0, 0, 1.0), Rotation.from_euler("z", 30, degrees=True))
@@ -442,7 +449,7 @@ def test_thrown_bodies_follow_their_closed_form(stepper):
 
 @pytest.mark.parametrize("stepper", STEPPERS)
 def test_slow_sliding_is_not_rest(stepper):
-    """A block at 0.3 mm/s moves by less than 0.1 mm in a quarter of a second and 0.5 mm in one; not if it speeds up."""
+    """A block at 0.3 mm/s moves by less than 0.1 mm in 0.25 s and 0.5 mm in 1 s, unless it accelerates."""
     from mitsplat.physics import rest as physics
 
     block = trimesh.creation.box((0.04, 0.04, 0.01))

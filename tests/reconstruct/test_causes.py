@@ -1,4 +1,4 @@
-"""What is wrong with photographs, measured on photographs of which that is known."""
+"""Diagnosis of capture faults on photographs with known faults."""
 
 from dataclasses import replace
 
@@ -14,7 +14,7 @@ from tests.reconstruct.test_reconstruct import GOOD
 
 
 def ring(height, turns):
-    """Unit directions at a height above the horizon [degrees]."""
+    """Return unit directions at an elevation above the horizon [degrees]."""
     turns = np.radians(turns)
     flat = np.stack([np.cos(turns), np.sin(turns), np.full(len(turns), np.tan(np.radians(height)))], axis=1)
     return flat / np.linalg.norm(flat, axis=1, keepdims=True)
@@ -41,7 +41,7 @@ def test_a_missing_side_of_views_is_named(first, last, words):
     there = [turn for turn in ALL_AROUND if not first <= turn < last and not first <= turn + 360 < last]
     low = ring(10, there)
     found = missing_views(np.concatenate([low, ring(30, ALL_AROUND), ring(60, [0])]))
-    if last - first < 110:  # two whole sectors are a step that people leave
+    if last - first < 110:  # a gap of two whole sectors is a common step between photos
         assert found == []
     else:
         assert found == [f"0 to 20 degrees above the object, {words} degrees around the object"]
@@ -60,7 +60,7 @@ def test_blurred_photos_are_named_and_smooth_objects_are_not():
     for number in range(10):
         noise = cv2.GaussianBlur(rng.uniform(size=(120, 160, 3)).astype(np.float32), (0, 0), 1.0)
         if number == 2:
-            noise = 0.5 + 0.02 * (noise - 0.5)  # of little contrast, but sharp
+            noise = 0.5 + 0.02 * (noise - 0.5)  # low contrast, but sharp
         if number in (4, 7):
             noise = cv2.GaussianBlur(noise, (0, 0), 2.0 if number == 4 else 4.0)
         mask = np.zeros((120, 160), dtype=np.float32)
@@ -78,7 +78,7 @@ def test_a_missed_threshold_names_measured_causes_before_advice():
 
 
 def dotted(points, masked):
-    """A capture of points on a table, all seen by all photos, and pictures whose masks show some of them."""
+    """Return a capture of points on a table that all photos observe, and images whose masks cover some of them."""
     photos, pictures = [], []
     for number, offset in enumerate(np.concatenate([ring(h, ALL_AROUND) for h in (10, 30, 60)])):
         camera = Camera.look_at(offset, (0, 0, 0.05), width=160, height=120, fov_x=50)

@@ -1,4 +1,4 @@
-"""Which surface is kept where splats or masks are wrong."""
+"""Choice of the proxy surface when splats or masks are wrong."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def test_a_surface_consistent_with_masks_is_kept_at_full_resolution(known_object
 
 
 def test_wrong_depth_falls_back_to_the_hull_of_masks(known_object: KnownObject) -> None:
-    """Most of the Gaussians have shrunk towards the middle, and are seen through the others."""
+    """Most Gaussians have moved towards the middle, and are visible through the others."""
     splats = known_object.splats
     inner = np.arange(len(splats)) % 3 > 0
     means = np.where(inner[:, None], 0.4 * splats.means, splats.means)
@@ -67,7 +67,9 @@ def test_the_hull_of_splats_ends_at_the_floor(known_object: KnownObject) -> None
 
 
 def test_masks_do_not_cut_parts_that_may_be_hidden(known_object: KnownObject) -> None:
-    """A third of each picture is hidden: as background it would cut the object, the hull of masks alone as well."""
+    """A third of each image is occluded: as background, it would cut the object, and so would the hull of masks
+    alone.
+    """
     veil = np.zeros(views_of(known_object)[0].mask.shape, dtype=np.float32)
     veil[:, : veil.shape[1] // 2] = 1
     given = views_of(known_object)

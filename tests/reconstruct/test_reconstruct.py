@@ -1,4 +1,4 @@
-"""Captures and splats to asset folders with a verdict and a page, and what is kept of earlier runs."""
+"""Reconstruction of assets from captures and splats: quality verdict, report page, and reuse of earlier runs."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ GOOD = Verdict(
 
 @pytest.fixture(scope="module", autouse=True)
 def quick_pieces() -> Iterator[None]:
-    """The convex decomposition takes longer than all else, and has tests of its own."""
+    """Replace the convex decomposition, which takes longer than all other stages and has its own tests."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("mitsplat.reconstruct.reconstruct.convex_pieces", lambda mesh: (mesh.convex_hull,))
         yield
@@ -168,7 +168,7 @@ def test_the_record_of_a_fit_must_have_its_numbers(tmp_path: Path, psnr: str) ->
 
 
 def test_a_drawing_determines_the_scale_of_a_capture(known_object: KnownObject) -> None:
-    """The capture is in no unit, the drawing in millimetres: the asset has the size of the drawing."""
+    """The capture has no unit and the CAD drawing is in millimetres: the asset has the size of the drawing."""
     tenth = np.diag([0.1, 0.1, 0.1, 1.0])
     capture = replace(known_object.capture.transformed(tenth), units="unknown")
     drawing = known_object.mesh.copy()
@@ -186,7 +186,7 @@ def test_a_drawing_determines_the_scale_of_a_capture(known_object: KnownObject) 
 
 @pytest.mark.parametrize(("height", "lowest"), [(0.049, 0.0), (0.0, -0.05)])
 def test_an_object_is_cut_at_the_table_below_it(known_object: KnownObject, height: float, lowest: float) -> None:
-    """What is 1 mm below the table is cut off; a plane through the middle of an object is none that it stands on."""
+    """Gaussians 1 mm below the table are removed; a plane through the middle of an object is not its support."""
     lifted = np.eye(4)
     lifted[2, 3] = height
     capture = replace(known_object.capture.transformed(lifted), table=True)
@@ -235,7 +235,7 @@ def test_a_size_is_refused_for_a_capture_in_metres(known_object: KnownObject) ->
 
 
 def test_a_given_size_is_the_longest_edge_in_any_orientation(known_object: KnownObject) -> None:
-    """The capture's axes have nothing to do with the edges of the smallest upright box around the solid."""
+    """The capture's axes are unrelated to the edges of the smallest upright box around the solid."""
     turn = trimesh.transformations.rotation_matrix(0.6, (0, 0, 1)) @ np.diag([3.0, 3.0, 3.0, 1.0])
     capture = replace(known_object.capture.transformed(turn), units="unknown")
     vertices = np.asarray(known_object.mesh.vertices)
@@ -245,7 +245,7 @@ def test_a_given_size_is_the_longest_edge_in_any_orientation(known_object: Known
     assert found.asset.mesh is not None
     assert found.asset.mesh.extents.max() == pytest.approx(settings.size, rel=1e-12)
     assert found.asset.units == "metre"
-    # A share of a cell of the grid is left.
+    # The remaining error is a fraction of a grid cell.
     asset_from_truth = found.asset_from_capture @ turn
     np.testing.assert_allclose(np.cbrt(np.linalg.det(asset_from_truth[:3, :3])), 1, rtol=0.01)
     np.testing.assert_allclose(np.sort(found.asset.mesh.extents[:2]), np.sort(edges), rtol=0.01)
@@ -257,7 +257,7 @@ def test_a_given_size_is_the_longest_edge_in_any_orientation(known_object: Known
 def test_photos_become_an_asset_through_all_stages(
     known_object: KnownObject, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """A fit of other inputs is replaced, see test_fit_interrupted.py, so that there is nothing to be asked for."""
+    """A fit of other inputs is replaced without a prompt, see test_fit_interrupted.py."""
     overwritten = []
 
     def fit_capture(capture: object, out: Path, settings: FitSettings, *, overwrite: bool, progress: object) -> None:

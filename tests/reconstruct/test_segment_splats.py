@@ -1,4 +1,4 @@
-"""Isolation: weights against the twin, and what is removed of planted rubbish."""
+"""Isolation of the object: weights against the slow twin, and removal of planted floaters."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tests.renderer.test_render import CAMERA
 
 
 def test_weights_equal_those_of_the_slow_twin() -> None:
-    """Blended weight T a of every Gaussian, ray by ray in float64."""
+    """Blended weight T a of every Gaussian, computed ray by ray in float64."""
     splats = separated(12, 1)
     mask = np.random.default_rng(0).random((CAMERA.height, CAMERA.width)).astype(np.float32)
     expected = np.zeros((12, 2))
@@ -27,7 +27,7 @@ def test_weights_equal_those_of_the_slow_twin() -> None:
         expected[order] += (behind * opacity[order])[:, None] * (share, 1 - share)
     found = VisibleWeights(splats)(MaskedView(CAMERA, mask))
     assert expected.max() > 3
-    # What is cut where the opacity falls below 0.002 is missing.
+    # Contributions after the cut-off at an opacity of 0.002 are missing.
     np.testing.assert_allclose(found, expected, rtol=0.02, atol=0.05)
 
 
@@ -50,14 +50,14 @@ def rubbish(means: np.ndarray, scale: object, opacity: float = 0.9) -> Splats:
 def test_surroundings_floaters_and_needles_are_removed(known_object: KnownObject) -> None:
     x, y = np.meshgrid(np.linspace(-0.2, 0.2, 40), np.linspace(-0.2, 0.2, 40))
     table = rubbish(np.stack([x.ravel(), y.ravel(), np.full(x.size, -0.06)], axis=1), (0.006, 0.006, 0.001))
-    speck = rubbish(np.array([[-0.01, 0.0, 0.035], [-0.009, 0.0, 0.035]]), 5e-4)  # hovers inside the pocket
+    speck = rubbish(np.array([[-0.01, 0.0, 0.035], [-0.009, 0.0, 0.035]]), 5e-4)  # floats inside the pocket
     needle = rubbish(np.array([[0.045, 0.01, 0.02]]), (0.0005, 0.02, 0.0005))
     buried = rubbish(np.array([[0.0, 0.0, -0.01]]), 0.001)
     parts = [known_object.splats, table, speck, needle, buried]
     views = [
         MaskedView(camera, mask)
         for camera, _, mask, _ in (photo.fitted(160) for photo in known_object.capture.photos)
-        if mask is not None and camera.centre[2] > 0  # nobody looks through the table
+        if mask is not None and camera.centre[2] > 0  # no camera is below the table
     ]
     found = isolate_object(Splats.concatenate(parts), views)
     ends = np.cumsum([len(part) for part in parts])
@@ -76,7 +76,7 @@ def test_surroundings_floaters_and_needles_are_removed(known_object: KnownObject
 
 
 def test_lost_alpha_is_the_share_that_masks_omit(known_object: KnownObject) -> None:
-    """Where splats are missing in the middle of the masks, as much alpha is lost as pixels are bare."""
+    """Where splats are missing in the middle of the masks, the lost alpha equals the share of uncovered pixels."""
     views = [
         MaskedView(camera, mask if number % 2 else np.zeros_like(mask))
         for number, (camera, _, mask, _) in enumerate(photo.fitted(160) for photo in known_object.capture.photos)
@@ -97,7 +97,7 @@ def test_masks_that_do_not_fit_the_splats_are_refused(known_object: KnownObject)
 
 
 def test_separate_dense_clusters_are_not_floaters() -> None:
-    """A row of sixty places that touch, twenty Gaussians in each, and one such place apart."""
+    """A row of sixty touching clusters of twenty Gaussians each, and one separate cluster."""
     places = np.append(np.arange(60) * 0.01, 1.0)
     means = np.zeros((61 * 20, 3))
     means[:, 0] = np.repeat(places, 20) + np.random.default_rng(6).uniform(-1e-4, 1e-4, 61 * 20)

@@ -1,4 +1,4 @@
-"""Refining a mesh by masks brings it to the solid that cast them, and leaves it alone where that does not help."""
+"""Mesh refinement by masks: convergence to the true solid, and rejection without improvement."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ DETAIL = replace(QUICK, rate=1e-2, smoothness=1.0)
 
 
 def bumpy(bumps: float = 0.1, scale: float = 1.0) -> trimesh.Trimesh:
-    """A dented ellipsoid of 1280 faces, 0.11 m long."""
+    """Return a dented ellipsoid of 1280 faces, 0.11 m long."""
     ball = trimesh.creation.icosphere(3)
     x, y, z = ball.vertices.T
     radius = 1 + bumps * np.sin(4 * x + 1) * np.sin(5 * y) * np.cos(3 * z)
@@ -38,7 +38,7 @@ def bumpy(bumps: float = 0.1, scale: float = 1.0) -> trimesh.Trimesh:
 
 
 def overlap(mesh: trimesh.Trimesh, truth: trimesh.Trimesh) -> float:
-    """Mean IoU of the silhouettes from places between those of the photos."""
+    """Return the mean IoU of the silhouettes from positions between those of the photos."""
     cameras = orbit(11, width=SIZE, height=SIZE)
     pairs = zip(masked(mesh, cameras, 1), masked(truth, cameras, 1), strict=True)
     return float(np.mean([iou(one.mask > 0, other.mask > 0) for one, other in pairs]))
@@ -88,7 +88,7 @@ def test_refining_a_true_mesh_keeps_its_shape(truth: trimesh.Trimesh, views: lis
 def test_a_refinement_that_held_out_photos_contradict_is_rejected(
     truth: trimesh.Trimesh, views: list[MaskedView]
 ) -> None:
-    """All masks but those that judge are of a solid 6 % larger."""
+    """All masks but the held-out ones are of a solid 6 % larger."""
     larger = masked(bumpy(scale=1.06), [view.camera for view in views])
     conflicting = [views[number] if number % 6 == 3 else view for number, view in enumerate(larger)]
     found = refine_mesh(truth, conflicting, replace(QUICK, steps=20))
@@ -99,7 +99,7 @@ def test_a_refinement_that_held_out_photos_contradict_is_rejected(
 
 
 def test_refinement_keeps_the_base_on_the_table() -> None:
-    """A box that is too large on all sides but the one that it stands on."""
+    """The box is too large on all sides but its base."""
     box = trimesh.creation.box((0.06, 0.05, 0.04)).subdivide().subdivide().subdivide()
     box.apply_translation((0, 0, 0.02))
     above = [camera for camera in orbit(40, width=SIZE, height=SIZE) if camera.centre[2] > 0.1]
@@ -115,7 +115,7 @@ def test_refinement_keeps_the_base_on_the_table() -> None:
 
 
 def test_motion_that_breaks_a_mesh_is_limited() -> None:
-    """One vertex goes through the other side, and the rest outwards by a tenth."""
+    """One vertex moves through the opposite side, and the others outwards by a tenth."""
     ball = trimesh.creation.icosphere(3)
     wanted = 1.1 * ball.vertices
     wanted[7] = -2 * ball.vertices[7]
@@ -135,7 +135,7 @@ def test_motion_without_finite_vertices_is_refused() -> None:
 
 
 def test_the_gradient_of_a_silhouette_area_equals_its_closed_form() -> None:
-    r"""A ball of radius r at distance d is seen as a disc of area A = pi f^2 r^2 / (d^2 - r^2), in pixels."""
+    """A ball of radius r at distance d covers a disc of area A = pi f^2 r^2 / (d^2 - r^2), in pixels."""
     ball = trimesh.creation.icosphere(4)
     camera = Camera.look_at((4, 0, 0), (0, 0, 0), width=96, height=96, fov_x=40)
     outline = Outline(masked(ball, [camera])[0], np.zeros(3), 1.0, 96)
@@ -157,7 +157,7 @@ def test_the_gradient_of_a_silhouette_area_equals_its_closed_form() -> None:
 def test_masks_of_a_distorted_lens_are_undistorted(
     truth: trimesh.Trimesh, distortion: tuple[float, ...], lens: str
 ) -> None:
-    """Seen aside, where the lens bends most: taken for those of a pinhole they would be ten times as wrong."""
+    """The object is off-axis, where distortion is largest: a pinhole model would make the error ten times as large."""
     aside = Camera.look_at((0.3, 0, 0.1), (0, 0.05, 0), width=480, height=480, fov_x=50)
     cameras = [aside, replace(aside, distortion=distortion, lens=lens)]
     pinhole, bent = (Outline(view, np.zeros(3), 0.07, SIZE) for view in masked(truth, cameras, 2))

@@ -1,4 +1,4 @@
-"""Surfaces of splats against the solid that they were put on."""
+"""Surfaces extracted from splats on a known solid."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def test_depth_carves_a_pocket_that_no_silhouette_shows(known_object: KnownObjec
 
 
 def test_the_surface_ends_at_the_table(known_object: KnownObject) -> None:
-    """Photos from above alone: the hull hangs through the table that the ball stands on, z = -0.05."""
+    """All photos are from above: the visual hull extends below the table that the ball stands on, z = -0.05."""
     cameras, masks = views_of(known_object)
     above = [number for number, camera in enumerate(cameras) if camera.centre[2] > 0.05]
     views = [cameras[number] for number in above], [masks[number] for number in above]
@@ -68,7 +68,7 @@ def test_the_surface_of_surroundings_needs_no_masks(known_object: KnownObject) -
 
 
 def test_simplified_surfaces_stay_watertight() -> None:
-    """Two balls joined by a thin neck, which plain quadric decimation may pinch."""
+    """Two balls are joined by a thin neck, which plain quadric decimation may pinch."""
     solid = trimesh.boolean.union(
         [
             trimesh.creation.icosphere(4, 1.0),
@@ -84,7 +84,7 @@ def test_simplified_surfaces_stay_watertight() -> None:
 
 @pytest.mark.parametrize("seed", [0, 2])
 def test_simplified_surfaces_are_watertight_after_reloading(tmp_path: Path, seed: int) -> None:
-    """A sponge, whose simplification touches itself at vertices and edges, is one closed solid from its file too."""
+    """A simplified sponge touches itself at vertices and edges; it is one closed solid also after reloading."""
     noise = np.pad(gaussian_filter(np.random.default_rng(seed).normal(size=(14, 14, 14)), 1.2), 1, constant_values=-1)
     vertices, faces, _, _ = marching_cubes(noise.astype(np.float32), 0.0, gradient_direction="ascent")
     sponge = max(trimesh.Trimesh(vertices, faces).split(only_watertight=True), key=lambda part: float(part.volume))
@@ -118,7 +118,7 @@ def similarity(scale: float, seed: int) -> np.ndarray:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_a_drawing_is_registered_with_its_scale(known_object: KnownObject, seed: int) -> None:
-    """In another frame and 1000 times as large, with a third of the surface unseen, it lands where it belongs."""
+    """The drawing is in another frame, 1000 times as large, with a third of the surface unseen."""
     points = surface_points(known_object.splats, [photo.camera for photo in known_object.capture.training])
     points = points[points[:, 2] > -0.02]
     drawing = known_object.mesh.copy()
@@ -133,7 +133,9 @@ def test_a_drawing_is_registered_with_its_scale(known_object: KnownObject, seed:
 
 @pytest.mark.parametrize("seed", [1, 4, 6])
 def test_a_nearly_round_drawing_is_rotated_by_its_edges(known_object: KnownObject, seed: int) -> None:
-    """Nine of ten points of a ball lie on it however it is turned: what is left of a box and a pocket decides."""
+    """Nine of ten points are on a ball and do not depend on its rotation: the rest of a box and a pocket
+    determines it.
+    """
     points = np.asarray(trimesh.sample.sample_surface(known_object.mesh, 1000, seed=seed)[0])
     points += np.random.default_rng(seed).normal(0, 1e-4, points.shape)
     drawing = known_object.mesh.copy()
@@ -173,7 +175,7 @@ def test_files_without_a_similarity_are_refused(tmp_path: Path, text: str, rule:
 
 
 def test_narrow_passages_are_closed_and_hollows_are_kept() -> None:
-    """A block with a void that a thin channel joins with the outside, and a pocket."""
+    """A block has a pocket, and a void that a thin channel connects to the outside."""
     solid = np.zeros((40, 40, 40), dtype=bool)
     solid[4:36, 4:36, 4:36] = True
     solid[10:20, 10:20, 10:20] = False

@@ -1,4 +1,4 @@
-"""The report page: complete, alone, and usable by keyboard and screen reader; charts count right."""
+"""Report page: completeness, no external resources, keyboard and screen reader access, and correct counts in charts."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from tests.cli.typed import run
 
 
 class Page(HTMLParser):
-    """Elements with their attributes, and the text of each."""
+    """Parser of a page: elements with their attributes, and the text of each."""
 
     def __init__(self, text: str) -> None:
         super().__init__()
@@ -54,8 +54,8 @@ def page(clean: Path, tmp_path: Path) -> Page:
 def test_the_report_states_contents_and_settings_of_the_dataset(page: Page) -> None:
     for text in ("small", "4 train, 2 val", "64 x 48 px", "No violations in", "Seed", "Device", "hidden", "yolo-pose"):
         assert text in page.text
-    assert "2.0e-05 of the range on average, 0.0040 at most" in page.text  # of frames that all state their error
-    assert Path(sys.argv[0]).name in page.text  # the command that made it
+    assert "2.0e-05 of the range on average, 0.0040 at most" in page.text  # all frames record their error
+    assert Path(sys.argv[0]).name in page.text  # the command that wrote the page
     assert len(page.all("img")) == min(SAMPLES, 6)
     captions = (
         "Instances by class",

@@ -1,4 +1,4 @@
-"""What the report says of draws, viewpoints, occlusion and light, against counts by hand."""
+"""Statistics of draws, viewpoints, occlusion and light in the report, against manual counts."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ CONTENT = {"classes": ["bolt", "nut"], "assets": ["long bolt", "nut"]}
 
 
 def label(asset: int, *, box: tuple[int, int, int, int] = (0, 0, 4, 4), pose: Any = None, **stated: Any) -> Any:
-    """An instance that is seen whole in a box of an image of 20x10."""
+    """Return an unoccluded instance in a box of an image of 20x10."""
     mask = np.zeros((10, 20), dtype=np.uint8, order="F")
     mask[box[1] : box[3], box[0] : box[2]] = 1
     code = coco_mask.encode(mask)["counts"].decode()
@@ -52,7 +52,7 @@ def counted(*records: dict[str, Any]) -> Variety:
 
 
 def numbers(page: str, caption: str) -> dict[str, str]:
-    """The table below a chart."""
+    """Return the table below a chart."""
     figure = next(part for part in page.split("<figure>") if f"<figcaption>{caption}<" in part)
     return dict(re.findall(r'<th scope="row">([^<]+)</th><td>([^<]+)</td>', figure.split("</figure>")[0]))
 
@@ -66,7 +66,7 @@ def test_cells_have_equal_areas() -> None:
 
 
 def test_view_directions_are_counted_in_object_coordinates() -> None:
-    """Whatever turns object and camera together changes nothing."""
+    """A rotation of object and camera together changes nothing."""
     rng = np.random.default_rng(1)
     for turn in (np.eye(3), Rotation.random(rng=rng).as_matrix()):
         pose = np.eye(4)
@@ -82,7 +82,7 @@ def test_view_directions_are_counted_in_object_coordinates() -> None:
 
 
 def test_occlusion_counts_agree_with_masks(clean: Path) -> None:
-    """By masks of drawn frames, decoded and compared pixel by pixel."""
+    """Compares with masks of drawn frames, decoded and counted pixel by pixel."""
     expected = Counter[str]()
     for one in records_of(clean):
         labels = one["labels"]["instances"]
@@ -177,7 +177,7 @@ class TestWarnings:
         ]
 
     def test_lights_are_weighted_by_their_irradiance(self) -> None:
-        """A panel at 1 m beside a lamp ten times as strong at 10 m, which gives a tenth of its light."""
+        """A panel at 1 m is compared with a lamp at 10 m that is ten times as strong and gives a tenth of its light."""
         lamps = [
             {"position": [1, 0, 0], "radiance": 4.0, "size": [0.5, 0.5]},
             {"position": [-10, 0, 0], "intensity": 10.0},
@@ -194,7 +194,7 @@ class TestWarnings:
 def test_the_report_command_prints_the_warnings(dataset: Path, capsys: pytest.CaptureFixture[str]) -> None:
     records = records_of(dataset)
     for one in records:
-        one["draws"]["odd"] = {"nested": [float("inf"), None, "<b>"]}  # nobody checks what draws are
+        one["draws"]["odd"] = {"nested": [float("inf"), None, "<b>"]}  # draws are not validated
     store(dataset, records)
     assert run("report", dataset) == 0
     said = capsys.readouterr().out.splitlines()
@@ -203,7 +203,7 @@ def test_the_report_command_prints_the_warnings(dataset: Path, capsys: pytest.Ca
 
 
 def test_discs_show_cells_at_their_directions() -> None:
-    """The cell around +x and above lies right of the middle and above it."""
+    """The cell around +x and above is drawn to the right of the middle and above it."""
     cells = np.zeros((2, 4), dtype=np.int64)
     cells[1, 0] = 3
     text = discs("c", {"nut": cells})

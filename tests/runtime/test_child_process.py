@@ -1,4 +1,4 @@
-"""Python child processes: no module of the current folder, bounded memory and time, and their errors."""
+"""Python child processes: isolation from the current folder, memory and time limits, and errors."""
 
 import os
 import sys

@@ -1,4 +1,4 @@
-"""Devices by their names: what is refused, what ``auto`` chooses, and which GPU a process takes."""
+"""Device names: validation, the choice of ``auto``, and the GPU of a process."""
 
 import os
 import subprocess
@@ -16,7 +16,7 @@ from mitsplat.runtime.device import CPU, Device, current_device, find_device, gp
 
 
 class FakeDriver:
-    """As much of libcuda as tells of GPUs, given by (name, memory in GiB, bus)."""
+    """The queries of libcuda about GPUs, given by (name, memory in GiB, bus)."""
 
     def __init__(self, *gpus, status=0):
         self.gpus, self.status = gpus, status
@@ -45,7 +45,7 @@ class FakeDriver:
 
 
 class FakeManagement:
-    """As much of NVML as tells of unused memory, given in GiB; it counts in the order of buses."""
+    """The queries of NVML about free memory, given in GiB, in bus order."""
 
     def __init__(self, *unused, models=None):
         self.unused, self.users = unused, 0
@@ -84,7 +84,7 @@ def id_of(ordinal):
 
 @pytest.fixture
 def machine(monkeypatch):
-    """Gives this machine a driver, with or without OptiX."""
+    """Install a fake driver, with or without OptiX."""
     monkeypatch.delenv(gpu_memory.VISIBLE_GPUS, raising=False)
     monkeypatch.delenv(gpu_memory.GPU_ORDER, raising=False)
     monkeypatch.delenv(devices.GPU_NUMBER, raising=False)
@@ -106,7 +106,7 @@ def machine(monkeypatch):
 
 ONE = ("One", 24, "0000:3B:00.0")
 TWO = ("Two", 80, "0000:1A:00.0")
-"""CUDA counts the faster first, `nvidia-smi` this one."""
+"""CUDA lists the faster GPU first, `nvidia-smi` the other."""
 
 
 @pytest.mark.parametrize("text", ["gpu", "cuda:", "cuda:-1", "cuda:one", "cuda:0,1", "CPU", "", "cuda: 1", "cuda\n"])
@@ -131,7 +131,7 @@ def test_invalid_device_names_are_refused(text):
     ],
 )
 def test_a_missing_gpu_is_reported_and_auto_selects_the_cpu(machine, parts, words):
-    """A GPU that was asked for is missed in one sentence; ``auto`` takes the CPU and says why."""
+    """A missing GPU that was requested is an error of one sentence; ``auto`` selects the CPU and states why."""
     machine(*parts.get("gpus", ()), **{key: value for key, value in parts.items() if key != "gpus"})
     for text in ("cuda", "cuda:1", "cuda:all"):
         with pytest.raises(
@@ -160,7 +160,7 @@ def test_a_missing_gpu_is_reported_and_auto_selects_the_cpu(machine, parts, word
     ],
 )
 def test_a_full_gpu_is_hidden(machine, monkeypatch, visible, unused, left):
-    """Dr.Jit, which starts CUDA on all that it sees, would end the process there."""
+    """Dr.Jit starts CUDA on all visible GPUs and would end the process on a full one."""
     machine(unused=unused)
     if visible is not None:
         monkeypatch.setenv(gpu_memory.VISIBLE_GPUS, visible)
@@ -173,7 +173,7 @@ def test_a_full_gpu_is_hidden(machine, monkeypatch, visible, unused, left):
 
 @pytest.mark.parametrize(("order", "left"), [(None, "0,1"), ("FASTEST_FIRST", "0,1"), ("PCI_BUS_ID", "1")])
 def test_numbers_of_different_gpus_are_read_in_the_order_of_cuda(machine, monkeypatch, order, left):
-    """The first GPU on the bus is full; without PCI order its number is unknown, and none is hidden."""
+    """The first GPU on the bus is full; without PCI order its number is unknown, and no GPU is hidden."""
     machine(unused=(0.5, 20), models=["Two", "One"])
     monkeypatch.setenv(gpu_memory.VISIBLE_GPUS, "0,1")
     if order is not None:
@@ -190,7 +190,7 @@ def test_the_memory_of_gpus_excludes_that_of_other_processes(machine):
 def test_devices_select_gpus_by_number_and_all(machine):
     machine(ONE, TWO)
     assert find_device("auto") == Device("cuda", find_device("cuda").gpus, "NVIDIA's driver and OptiX are complete")
-    assert str(find_device("cuda")) == "cuda (One)"  # the first that CUDA counts, which is what Dr.Jit takes
+    assert str(find_device("cuda")) == "cuda (One)"  # first in CUDA order, which Dr.Jit uses
     assert str(find_device("cuda:all")) == "cuda (Two, One)"
     assert [find_device(f"cuda:{i}").gpus[0].name for i in range(2)] == ["Two", "One"]
     assert [gpu.memory / 2**30 for gpu in find_device("cuda:all").gpus] == [80, 24]
@@ -218,9 +218,9 @@ def test_a_process_uses_the_first_visible_gpu(machine, monkeypatch):
     assert taken == ["cuda_ad_rgb"] * 2
     for name, value in late.value.environment.items():
         monkeypatch.setenv(name, value)
-    machine(TWO)  # as that process sees it
+    machine(TWO)  # the driver in the new process
     assert use_device("cuda:0").gpus[0].name == "Two"
-    assert gpu_environment(find_device("cuda").gpus[0]) == {}  # it is alone there
+    assert gpu_environment(find_device("cuda").gpus[0]) == {}  # the only visible GPU
     machine(TWO)
     with pytest.raises(InputError, match=r"^device must be one of the visible GPUs, cuda:0 \(got cuda:1\)$"):
         find_device("cuda:1")

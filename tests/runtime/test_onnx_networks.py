@@ -1,4 +1,4 @@
-"""Networks read no weights from outside of their folder."""
+"""ONNX networks read no weights from outside their folder."""
 
 from __future__ import annotations
 

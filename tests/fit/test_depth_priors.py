@@ -1,4 +1,4 @@
-"""Depth maps of photos: read, brought to the points of a capture, and what a fit makes of them."""
+"""Depth maps of photos: reading, alignment with the points of a capture, and use in a fit."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ CAMERA = Camera.look_at((0, -2, 1), (0, 0, 0), width=WIDTH, height=HEIGHT, fov_x
 
 
 def floor_depth(camera: Camera, width: int, height: int) -> np.ndarray:
-    """Depths of the plane z = 0 at the middles of pixels, (H, W)."""
+    """Return the depths of the plane z = 0 at the pixel centres, (H, W)."""
     rows, columns = np.mgrid[:height, :width] + 0.5
     slopes = camera.ray_slopes(np.stack([columns * camera.width / width, rows * camera.height / height], axis=-1))
     rays = np.column_stack([slopes, np.ones(len(slopes))]) @ camera.world_from_camera[:3, :3].T
@@ -40,7 +40,7 @@ def floor_depth(camera: Camera, width: int, height: int) -> np.ndarray:
 
 
 def seeing(count: int = 60) -> tuple[Photo, np.ndarray]:
-    """A photo, and points of the floor, of which it sees so many."""
+    """Return a photo, and 100 points of the floor of which the photo sees the first ``count``."""
     points = np.column_stack([np.random.default_rng(0).uniform(-0.4, 0.4, (100, 2)), np.zeros(100)])
     return Photo("a/floor.jpg", Path("floor.jpg"), CAMERA, seen=np.arange(count, dtype=np.int32)), points
 
@@ -53,7 +53,7 @@ def test_a_line_is_fitted_with_a_third_of_outliers(shift: bool) -> None:
     wanted[:30] += rng.uniform(0.5, 5, 30)
     scale, offset = fit_line(values, wanted, shift=shift)
     assert scale == pytest.approx(0.4, abs=2e-3) and offset == pytest.approx(0.2 * shift, abs=4e-3)
-    # Least squares alone would be misled.
+    # An ordinary least-squares fit is biased by the outliers.
     assert abs(np.polyfit(values, wanted, 1)[1] - 0.2 * shift) > 0.1
 
 
@@ -66,7 +66,7 @@ def test_a_line_is_fitted_to_exact_values_and_is_flat_for_equal_ones() -> None:
 @pytest.mark.parametrize("kind", ["inverse", "metric"])
 @pytest.mark.parametrize("size", [(WIDTH, HEIGHT), (256, 192), (32, 24)])
 def test_maps_are_aligned_with_the_depths_of_points(kind: DepthKind, size: tuple[int, int]) -> None:
-    """Of a map of any size, scale and, if it is inverse, shift."""
+    """The map may have any size and scale, and an inverse map any shift."""
     photo, points = seeing()
     truth = floor_depth(CAMERA, *size)
     values = (7 / truth - 2 if kind == "inverse" else 1000 * truth).astype(np.float32)
@@ -93,12 +93,12 @@ def test_maps_without_information_are_omitted_by_name() -> None:
     for count in (0, 9):
         few, _ = seeing(count)
         assert align_map(few, points, 1 / truth, "inverse") == "fewer than 10 of the capture's points are in them"
-    for values in (truth, np.ones_like(truth)):  # depth for inverse depth, and nothing at all
+    for values in (truth, np.ones_like(truth)):  # depth instead of inverse depth, and a constant map
         assert align_map(photo, points, values, "inverse") == (
             "their values as inverse depths do not agree with the points in them"
         )
     noise = np.random.default_rng(0).uniform(1, 2, truth.shape).astype(np.float32)
-    for values in (1 / truth, noise):  # inverse depth for depth
+    for values in (1 / truth, noise):  # inverse depth instead of depth
         assert align_map(photo, points, values, "metric") == (
             "their values as metric depths do not agree with the points in them"
         )
@@ -200,7 +200,7 @@ def test_resized_maps_ignore_unknown_pixels() -> None:
 
 
 class Session:
-    """A network that finds the red channel, as onnxruntime would run it."""
+    """Mock of an onnxruntime session with a network that returns the red channel."""
 
     def __init__(self, shape: list[Any], output: Any = None, kind: str = "tensor(float)") -> None:
         self.shape, self.output, self.kind = shape, output, kind
@@ -215,7 +215,7 @@ class Session:
 
 
 def ramp(height: int, width: int) -> np.ndarray:
-    """A picture whose red grows to the right."""
+    """Return an image whose red value grows to the right."""
     picture = np.full((height, width, 3), 0.25, np.float32)
     picture[..., 0] = (np.arange(width) + 0.5) / width
     return picture
@@ -232,7 +232,7 @@ def ramp(height: int, width: int) -> np.ndarray:
 def test_the_network_gets_a_normalised_picture_of_its_size(
     shape: list[Any], kind: str, seen: tuple[int, int], kept: tuple[int, int]
 ) -> None:
-    """Normalised as ImageNet, edges multiples of 14; the map comes back in the photo's aspect."""
+    """Values are normalised as in ImageNet, edges are multiples of 14, and the map has the photo's aspect ratio."""
     session = Session(shape, kind=kind)
     found = DepthNetwork(session, Path("any.onnx")).depths(ramp(300, 400))
     (given,) = session.given
@@ -278,12 +278,12 @@ def test_maps_are_reused_until_photo_or_network_change(
     model.write_bytes(b"other weights")
     assert model_maps([photo], model, tmp_path / "maps") != first and len(session.given) == 2
     Image.fromarray(np.zeros((HEIGHT, WIDTH, 3), np.uint8)).save(photo.file)
-    model_maps([replace(photo)], model, tmp_path / "maps")  # a value of the next run, which hashes the file again
+    model_maps([replace(photo)], model, tmp_path / "maps")  # a new object, as in the next run, hashes the file again
     assert len(session.given) == 3
 
 
 def test_a_network_file_is_run_by_onnxruntime(photo: Photo, tmp_path: Path) -> None:
-    """A convolution that is the red channel, run by onnxruntime."""
+    """The network is a convolution that returns the red channel."""
     pytest.importorskip("onnxruntime")
     onnx = pytest.importorskip("onnx")
     helper, floats = onnx.helper, onnx.TensorProto.FLOAT

@@ -1,4 +1,4 @@
-"""Fits to captures whose truth is known."""
+"""Fits to captures with known ground truth."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ SMALL = FitSettings(gaussians=800, iterations=60, sh_degree=1, refine_every=10, 
 
 
 def ball() -> Splats:
-    """A coloured ball of flat Gaussians."""
+    """Build a coloured ball of flat Gaussians."""
     rng = np.random.default_rng(3)
     index = np.arange(500) + 0.5
     z, azimuth = 1 - index / 250, index * np.pi * (1 + np.sqrt(5))
@@ -59,7 +59,7 @@ def look(direction: np.ndarray) -> Camera:
 
 
 def photograph(folder: Path, *, gains: np.ndarray | None = None) -> Capture:
-    """Pictures of the ball from all around, in front of a busy wall, with masks."""
+    """Render photos of the ball from all sides, in front of a background of noise, with masks."""
     rng, truth = np.random.default_rng(5), ball()
     photos = []
     for number in range(VIEWS):
@@ -73,7 +73,7 @@ def photograph(folder: Path, *, gains: np.ndarray | None = None) -> Capture:
         for file, values in zip(files, (colour, layers.alpha), strict=True):
             Image.fromarray(np.rint(255 * np.clip(values, 0, 1)).astype(np.uint8)).save(file)
         photos.append(Photo(files[0].name, files[0], camera, files[1]))
-    # Points on the ball, and some on the wall, that a fit of the ball alone must do without.
+    # Points on the ball, and some on the background that a fit of the ball alone must ignore.
     row = np.arange(600) % 500
     points = np.concatenate([truth.means[row] + rng.normal(0, 0.005, (600, 3)), rng.normal((0, 0, 9), 1, (100, 3))])
     shades = np.concatenate([255 * (0.5 + SH_C0 * truth.sh[row, 0]), np.full((100, 3), 128)])
@@ -100,7 +100,7 @@ def test_a_fit_has_24_db_on_photos_that_were_held_out(capture: Capture, tmp_path
     assert [photo.name for photo in result.held_out] == ["00.png", "08.png", "16.png"]
     assert 500 < states[0].gaussians < 700 and states[-1].gaussians == len(result.splats) == 900
     assert states[-1].fraction == 1 and states[-1].psnr > states[0].psnr + 3
-    # Masks supervise alpha: nothing is left of the wall, and the ball is opaque from a new side.
+    # Masks supervise alpha: no Gaussians of the background remain, and the ball is opaque from a new direction.
     layers = render_splats(result.splats, look(np.array([0.3, 1, 0.2])))
     truth = render_splats(ball(), look(np.array([0.3, 1, 0.2])))
     inside, outside = truth.alpha > 0.99, ~binary_dilation(truth.alpha > 0.01, iterations=2)
@@ -130,8 +130,8 @@ def test_a_finished_fit_is_reused(fitted: Path, capture: Capture) -> None:
 def test_an_interrupted_fit_resumes_to_the_same_bytes(
     capture: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, strategy: type[Classic] | None
 ) -> None:
-    """A given densification takes part with its state."""
-    monkeypatch.setattr(strategy_classic, "_RESET_STEPS", 20)  # one before the checkpoint, none soon after
+    """The state of a given densification strategy is restored too."""
+    monkeypatch.setattr(strategy_classic, "_RESET_STEPS", 20)  # one reset before the checkpoint, none soon after
     capture = seeing(capture)
 
     def fitted(out: Path, progress: Callable[[FitProgress], None] | None = None) -> FitResult:
@@ -152,14 +152,14 @@ def test_an_interrupted_fit_resumes_to_the_same_bytes(
     with pytest.raises(KeyboardInterrupt):
         fitted(out, interrupt)
     fitted(out, lambda state: steps.append(state.step))
-    assert steps == [25, 50, 50, 60]  # the first checkpoint is behind the first report
+    assert steps == [25, 50, 50, 60]  # the first checkpoint comes after the first report
     assert (out / "splats.ply").read_bytes() == (tmp_path / "whole" / "splats.ply").read_bytes()
 
 
 def test_an_interrupted_fit_ends_at_its_target_at_the_same_step(
     capture: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It looks every 10 steps, also after an interruption in between."""
+    """The target is checked every 10 steps, also after an interruption in between."""
     monkeypatch.setattr(fit, "_REPORT_STEPS", 2)
     monkeypatch.setattr(fit, "_CHECKPOINT_SECONDS", 0.0)
     settings = replace(SMALL, iterations=200, gaussians=300, coarse=0.0, target_psnr=99.0)
@@ -209,7 +209,7 @@ def test_the_folder_of_another_fit_is_refused_without_overwrite(fitted: Path, ca
 
 
 def test_more_gaussians_compile_no_new_kernels(capture: Capture, tmp_path: Path) -> None:
-    """Nor do depths, whatever number of Gaussians or points a photo shows."""
+    """Depths do not compile new kernels either, for any number of Gaussians or of points in a photo."""
     seen: list[set[int]] = []
     counts: list[int] = []
 
@@ -228,7 +228,7 @@ def test_more_gaussians_compile_no_new_kernels(capture: Capture, tmp_path: Path)
 
 
 def test_a_fit_ends_within_its_time_limit(capture: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """On a clock that goes on by 10 ms whenever it is read."""
+    """The mock clock advances by 10 ms at every call."""
     now = itertools.count()
     monkeypatch.setattr(fit.time, "monotonic", lambda: 0.01 * next(now))
     short = fit_capture(capture, tmp_path, replace(SMALL, iterations=10**6, budget=2.0))
@@ -237,7 +237,7 @@ def test_a_fit_ends_within_its_time_limit(capture: Capture, tmp_path: Path, monk
 
 
 def test_the_target_is_measured_on_photos_other_than_those_held_out(capture: Capture, tmp_path: Path) -> None:
-    """What is held out may be replaced by noise: it moves what is reported, and neither splats nor end."""
+    """Noise in place of the held-out photos changes the reported values, but neither the splats nor the last step."""
     settings = replace(SMALL, iterations=400, target_psnr=12.0)
     early = fit_capture(capture, tmp_path / "early", settings)
     assert early.iterations < 200 and early.validation_psnr is not None and early.validation_psnr >= 12
@@ -255,7 +255,7 @@ def test_the_target_is_measured_on_photos_other_than_those_held_out(capture: Cap
 
 
 def test_masks_are_not_read_if_they_are_off(capture: Capture, tmp_path: Path) -> None:
-    """The wall is another one in every photo: its mean is the best that a fit of all pixels can show."""
+    """The background differs in every photo. Its mean is the best result of a fit to all pixels."""
     settings = replace(SMALL, masks="off", iterations=30, coarse=0.0)
     result = fit_capture(capture, tmp_path, settings)
     truth = np.asarray(Image.open(tmp_path / "held_out" / "00.png"))[:, :WIDTH]
@@ -266,7 +266,7 @@ def test_masks_are_not_read_if_they_are_off(capture: Capture, tmp_path: Path) ->
 
 
 def seeing(capture: Capture) -> Capture:
-    """The capture whose photos see the points on their side of the ball."""
+    """Return the capture with each photo's visible points: those on its side of the ball."""
     facing = [
         np.flatnonzero(((photo.camera.centre - capture.points[:600]) * capture.points[:600]).sum(axis=1) > 0.1)
         for photo in capture.photos
@@ -276,7 +276,7 @@ def seeing(capture: Capture) -> Capture:
 
 
 def test_pixels_that_may_be_hidden_do_not_change_the_fit(capture: Capture, tmp_path: Path) -> None:
-    """Splats are the same whatever stands before the object, and nothing is missing behind it."""
+    """The splats do not depend on the colour of the occluder, and the surface behind it is complete."""
     veil = np.zeros((HEIGHT, WIDTH), dtype=bool)
     veil[:, 24:34] = True
 
@@ -314,7 +314,7 @@ def test_depths_of_points_move_the_surface(capture: Capture, tmp_path: Path) -> 
 
 
 def test_the_nearest_of_several_points_in_a_pixel_counts(capture: Capture) -> None:
-    """Gradients of several would be added in any order, and no two fits would be the same."""
+    """Gradients of several points would be added in any order, so that two fits would differ."""
     ensure_variant()
     camera = look(np.array([1.0, 0, 0]))
     depths = np.array([3.0, 1.0, 2.0, 1.0])
@@ -329,7 +329,7 @@ def test_the_nearest_of_several_points_in_a_pixel_counts(capture: Capture) -> No
 
 
 def depth_maps(capture: Capture, folder: Path) -> DepthMaps:
-    """Inverse depths of the ball's photos as a network would give them: each with a scale and a shift of its own."""
+    """Write inverse depth maps of the photos like those of a network, each with a scale and a shift of its own."""
     files = {}
     for number, photo in enumerate(capture.photos):
         layers = render_splats(ball(), photo.camera, quality=fit.QUALITY)
@@ -340,7 +340,7 @@ def depth_maps(capture: Capture, folder: Path) -> DepthMaps:
 
 
 def test_depth_maps_replace_points(capture: Capture, tmp_path: Path) -> None:
-    """A map knows every pixel of the object, the points only theirs."""
+    """A map has a depth for every pixel of the object, the points only for their own pixels."""
     photo = seeing(capture).training[0]
     maps = depth_maps(capture, tmp_path)
     inverse, warnings = align_maps([photo], capture.points, maps, 64)
@@ -394,7 +394,7 @@ def test_depth_error_is_the_difference_of_known_inverse_depths() -> None:
     known = fit._depth_image(camera, mi.UInt32([0, 1, 2]), mi.Float([0.4, 0.35, 0.9]))
     assert np.isnan(np.array(known)).tolist() == [False, False, False, True]
     found = fit._depth_error(alpha, moment, known)
-    assert found[0] == pytest.approx(0.1 + 0.1 + 0.0, abs=1e-6)  # what is hardly covered says nothing
+    assert found[0] == pytest.approx(0.1 + 0.1 + 0.0, abs=1e-6)  # pixels with little coverage are ignored
 
 
 def test_too_few_photos_are_refused(capture: Capture, tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Fits that replace others and are interrupted: what is left is of one fit, and the next run ends in the new one."""
+"""Interrupted replacement of a fit: the folder never mixes two fits, and the next run completes the new one."""
 
 from __future__ import annotations
 
@@ -41,15 +41,15 @@ with Places({place}, signal.{how}).watched():
 
 
 class Interrupted(BaseException):
-    """An exception that no code catches."""
+    """Exception that no code catches."""
 
 
 @dataclass
 class Places:
-    """Something happens at the n-th of the places that change the folder of a fit, and of the steps between them.
+    """Interruption at the n-th step of a fit or change of its folder.
 
     Attributes:
-        left: Places until then.
+        left: Steps and changes until the interruption.
         how: Signal that the process sends itself; None raises :class:`Interrupted`.
     """
 
@@ -88,7 +88,7 @@ class Places:
 
 @dataclass(frozen=True)
 class Fits:
-    """A capture, and the folders of two fits to it."""
+    """Capture, and the folders of two fits to it."""
 
     capture: Capture
     old: Path
@@ -125,7 +125,7 @@ def fits(tmp_path_factory: pytest.TempPathFactory) -> Fits:
 
 
 def interrupted(fits: Fits, out: Path, place: int) -> bool:
-    """Replace the old fit, but be interrupted; whether that came to pass."""
+    """Replace the old fit with an interruption at a place, and return True if the interruption happened."""
     shutil.copytree(fits.old, out)
     try:
         with Places(place).watched():
@@ -136,13 +136,16 @@ def interrupted(fits: Fits, out: Path, place: int) -> bool:
 
 
 def test_a_replacing_fit_interrupted_anywhere_ends_in_the_same_bytes(fits: Fits, tmp_path: Path) -> None:
-    """After each step and each change of the folder; whichever way it is run again, it ends in the same bytes."""
+    """The fit is interrupted after each step and each change of the folder.
+
+    The next run gives the same bytes with and without overwriting.
+    """
     left, place = [], 1
     while interrupted(fits, out := tmp_path / str(place), place):
         left.append(sorted(path.name for path in out.iterdir() if path.name[0] != "."))
         fits.is_whole(out)
         overwrite = place % 2 == 0
-        if place % 3 == 0:  # and once more, soon after
+        if place % 3 == 0:  # a second interruption soon after
             with Places(4).watched(), suppress(Interrupted):
                 fit_capture(fits.capture, out, NEW, overwrite=True)
         fit_capture(fits.capture, out, NEW, overwrite=overwrite)
@@ -157,7 +160,7 @@ def test_a_replacing_fit_interrupted_anywhere_ends_in_the_same_bytes(fits: Fits,
 def test_an_asset_with_an_interrupted_fit_resumes_to_the_same_bytes(
     fits: Fits, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, place: int
 ) -> None:
-    """`asset` has no --overwrite to be told of: settings that changed, an interruption, the same command again."""
+    """Settings change, the run is interrupted, and the same command runs again. `asset` has no --overwrite."""
     captured = CaptureResult(fits.capture, 20, "a board", 0.5, doubtful={})
     monkeypatch.setattr(
         "mitsplat.reconstruct.pipeline.asset_pipeline.capture_photos", lambda photos, out, settings, progress: captured
@@ -185,11 +188,11 @@ def test_an_asset_with_an_interrupted_fit_resumes_to_the_same_bytes(
 def test_a_fit_process_that_is_killed_resumes_to_the_same_bytes(
     fits: Fits, tmp_path: Path, place: int, how: str
 ) -> None:
-    """As by Ctrl-C, or by the kernel when memory runs out; what they leave is what any process can go on with."""
+    """SIGINT stands for Ctrl-C, SIGKILL for the kernel's out-of-memory killer. Any process can resume the fit."""
     out = Path(shutil.copytree(fits.old, tmp_path / "out"))
     names = {"tests": str(Path(__file__).parents[2]), "capture": str(fits.old.parent / "capture"), "out": str(out)}
     code = CHILD.format(**names, place=place, how=how)
-    # Who starts the tests in the background has them, and what they start, ignore Ctrl-C.
+    # Children of a background shell job ignore Ctrl-C without the default handler.
     ended = subprocess.run(
         [sys.executable, "-c", code],
         capture_output=True,

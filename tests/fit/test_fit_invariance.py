@@ -1,10 +1,18 @@
-"""A capture that is moved, turned and made larger gives the splats that are.
+"""Invariance of a fit: a moved, rotated and scaled capture gives splats that are transformed alike.
 
-What can be exact is: lengths by a power of two change no digit. Other lengths and a translation round the means anew,
-and where a gradient vanishes rounding decides its sign, by which Adam moves a parameter by its rate whatever the
-gradient's size. A rotation is no symmetry of a fit: Adam scales every coordinate by its own gradients, and Gaussians
-begin along the axes of the world and become long along these. There the splats only look the same, as those of another
-seed do.
+===================================  =============================================
+Transformation                       Result
+===================================  =============================================
+Scaling by a power of two            Exactly equal, because no digit changes.
+Other scaling, and translation       Equal within an optimiser step.
+Rotation                             Differences as between fits with two seeds.
+===================================  =============================================
+
+Other scaling and a translation round the means differently. Where a gradient vanishes, rounding decides its sign. Adam
+then moves a parameter by its rate for any size of the gradient.
+
+A rotation is no symmetry of a fit. Adam scales every coordinate by its own gradients. Gaussians start aligned with the
+axes of the world and are stretched along these axes.
 """
 
 from __future__ import annotations
@@ -28,7 +36,7 @@ from tests.fit.test_fit import SMALL, photograph, seeing
 
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
-    """Pictures of the ball whose points they see, so that depths take part."""
+    """Return photos of the ball with their visible points, so that depths contribute to the loss."""
     return seeing(photograph(tmp_path_factory.mktemp("photos")))
 
 
@@ -40,7 +48,7 @@ def similarity(scale: float, translation: tuple[float, float, float], rotation: 
 
 
 def fitted(capture: Capture, folder: Path, matrix: np.ndarray, settings: FitSettings) -> tuple[FitResult, FitResult]:
-    """The fit of the capture, and that of the moved capture."""
+    """Fit the capture and the transformed capture, and return both results."""
     moved = fit_capture(capture.transformed(matrix), folder / "moved", settings)
     return fit_capture(capture, folder / "still", settings), moved
 
@@ -67,7 +75,7 @@ def test_moving_and_scaling_changes_a_fit_by_less_than_an_optimiser_step(capture
         (SMALL.rate_opacities, *logits),
         (SMALL.rate_sh, splats.sh, expected.sh),
     ):
-        # Where rounding decides the sign of a gradient, a first step goes one way here and the other way there.
+        # Rounding may reverse the sign of a gradient, so that a first step goes in the opposite direction.
         steps = np.abs(one - other) / rate
         assert steps.max() < 2 and (steps > 1 + 1e-6).mean() < 0.002
 

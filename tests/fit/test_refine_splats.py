@@ -1,4 +1,4 @@
-"""Refining recovers what it is shown."""
+"""Refinement of splats towards given images."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Clones, splits, removals and resets, and the gradients in the image that decide them."""
+"""Classic densification: clones, splits, removals and resets, and the image gradients that control them."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ UNIT = 0.7
 
 
 def tracked(splats: Splats) -> GaussianModel:
-    """A model with the gradients of the loss of :func:`loss_of_twin`."""
+    """Return a model with the gradients of the loss of :func:`loss_of_twin`."""
     ensure_variant()
     from mitsplat.renderer.differentiation.backward import render_differentiable
     from mitsplat.renderer.rays.sensors import view_of
@@ -40,7 +40,10 @@ def tracked(splats: Splats) -> GaussianModel:
 
 
 def test_gradient_in_the_image_is_the_change_of_the_loss_by_the_change_of_place() -> None:
-    """Against differences of the float64 twin's loss and of projected centres, image 2 wide and 2 high."""
+    """The gradient equals finite differences of the float64 reference loss over those of the projected centres.
+
+    Image coordinates span 2 in width and 2 in height.
+    """
     splats = separated(8, 1)
     pull, seen = image_gradient(tracked(splats), CAMERA)
     assert np.array(seen).all()
@@ -65,7 +68,7 @@ def test_what_the_photo_does_not_show_is_not_counted() -> None:
     slope = 0.5 * size / (CAMERA.fx, CAMERA.fy)
     places = np.array([[0, 0, 2], [0, 0, -2], [2.2 * slope[0], 0, 2], [2.2 * slope[0], 0, 2], [0, -2.2 * slope[1], 2]])
     scales = np.full((5, 3), 0.01)
-    scales[3, 1] = 0.2 * slope[0]  # three of these reach back into the image
+    scales[3, 1] = 0.2 * slope[0]  # the extents of three of these reach back into the image
     splats = seed_splats(places @ inverse[:3, :3].T + inverse[:3, 3], np.full((5, 3), 0.5), 0)
     own = GaussianModel(replace(splats, scales=scales), UNIT)
     own.track()
@@ -73,7 +76,7 @@ def test_what_the_photo_does_not_show_is_not_counted() -> None:
 
 
 def model() -> GaussianModel:
-    """Six Gaussians in a row, in the model's unit: two small, two large, one faint, one very large."""
+    """Build six Gaussians in a row, in the model's unit: two small, two large, one faint, one very large."""
     ensure_variant()
     splats = seed_splats(np.arange(18.0).reshape(6, 3), np.full((6, 3), 0.5), 0, opacity=0.8)
     size = np.array([0.002, 0.002, 0.05, 0.05, 0.002, 0.5])
@@ -91,7 +94,7 @@ def test_small_ones_are_cloned_large_ones_split_and_faint_ones_removed() -> None
     before = own.splats()
     control_density(own, HOT, 100, np.random.default_rng(0), remove_large=False)
     after = own.splats()
-    assert len(after) == 7  # without the faint one, with a clone and another part
+    assert len(after) == 7  # minus the faint one, plus a clone and a second part
     rows = np.array([0, 1, 2, 3, 5, 2, 0])
     part = rows == 2
     np.testing.assert_allclose(after.scales, before.scales[rows] / np.where(part, 1.6, 1)[:, None], rtol=1e-5)
@@ -111,7 +114,7 @@ def test_very_large_ones_go_once_opacities_were_reset() -> None:
 
 @pytest.mark.parametrize(("most", "count", "largest"), [(3, 5, 0.05), (5, 5, 0.05), (6, 6, 0.05 / 1.6)])
 def test_the_budget_goes_to_the_largest_gradients(most: int, count: int, largest: float) -> None:
-    """Room for one more of the two that are wanted goes to the large one."""
+    """Two Gaussians qualify for densification. A budget for one more goes to the large one."""
     own = model()
     control_density(own, HOT, most, np.random.default_rng(0), remove_large=False)
     assert own.count == count
@@ -157,7 +160,7 @@ def test_gradients_are_averaged_over_the_photos_that_show_a_gaussian() -> None:
     again = Classic(100, 10)
     again.restore(classic.state())
     np.testing.assert_allclose(again.state()["pull"] / again.state()["photos"], once, rtol=1e-6)
-    # After a change, which forgets them, as before it.
+    # A change resets the sums. The means are then as before.
     classic.refine(own, 10, 0.2, 1e-3, np.random.default_rng(0))
     changed = tracked(own.splats())
     expected = np.array(image_gradient(changed, CAMERA)[0])

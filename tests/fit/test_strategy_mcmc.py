@@ -1,4 +1,4 @@
-"""Moves and additions of Gaussians leave the picture as it is."""
+"""MCMC densification: moved and added Gaussians do not change the image."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from tests.renderer.test_render import CAMERA, make_splats
 @pytest.mark.parametrize("copies", [1, 2, 3, 7, 20])
 @pytest.mark.parametrize("opacity", [0.05, 0.5, 0.97])
 def test_copies_absorb_as_much_light_along_a_line_as_one_gaussian(copies: int, opacity: float) -> None:
-    """Integral over x of 1 - (1 - o' exp(-x^2 / 2 s^2))^n equals that of o exp(-x^2 / 2)."""
+    """The integral over x of 1 - (1 - o' exp(-x^2 / 2 s^2))^n equals that of o exp(-x^2 / 2)."""
     (own,), (factor,) = split_opacity(np.array([opacity]), np.array([copies]))
     x = np.linspace(-12, 12, 20001)
     several = 1 - (1 - own * np.exp(-0.5 * (x / factor) ** 2)) ** copies
@@ -53,7 +53,7 @@ def test_dead_gaussians_are_moved_onto_live_ones() -> None:
     living = {tuple(mean) for mean in before.means[10:]}
     assert all(tuple(mean) in living for mean in after.means)
     assert np.sqrt(np.mean((render_splats(after, CAMERA).rgb - picture) ** 2)) < 0.02
-    # Those that moved, and those that share their place now, start without moments.
+    # The moments of moved Gaussians, and of those at the same positions, are reset.
     moments = np.array(own.second["means"]).reshape(40, 3)
     assert (moments[:10] == 0).all() and 0 < (moments[10:, 0] == 0).sum() < 30
 
@@ -92,7 +92,7 @@ def test_gradients_and_rates_move_parameters_as_adam_does() -> None:
     before = np.array(dr.detach(own.values["means"]))
     dr.backward(dr.sum(own.values["means"] * weight))
     own.update(dict.fromkeys(own.values, 0.001))
-    # The first step of Adam has the size of the rate, whatever the gradient's.
+    # Adam's first step has the size of the rate for any size of the gradient.
     np.testing.assert_allclose(np.array(own.values["means"]), before - 1e-3 * np.sign(weight), atol=1e-6)
 
 
@@ -109,6 +109,6 @@ def test_gaussians_at_the_camera_stay_finite_and_do_not_move() -> None:
     rgb, alpha = render_differentiable(own.cloud(), view_of(make_sensor(CAMERA)), QUALITY)
     dr.backward(dr.sum(rgb[0] + alpha))
     own.update(dict.fromkeys(own.values, 1e-3))
-    after = own.splats()  # refuses what is not finite
+    after = own.splats()  # raises an exception for values that are not finite
     np.testing.assert_array_equal(after.means[:2], means[:2])
     assert (after.means[2:] != means[2:]).any()

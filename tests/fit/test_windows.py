@@ -1,4 +1,4 @@
-"""Photos around the object alone."""
+"""Crops of photos around the object."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ BOXES = {"left": (0, 20, 30, 50), "middle": (70, 40, 110, 60), "large": (60, 10,
 
 @pytest.fixture
 def photos(tmp_path: Path) -> list[Photo]:
-    """Of 200x100 px, with boxes x0, y0, x1, y1 as masks, and one with an empty mask."""
+    """Write photos of 200x100 px with boxes x0, y0, x1, y1 as masks, and one with an empty mask."""
     rng, made = np.random.default_rng(2), []
     camera = Camera.look_at((2, 0, 1), (0, 0, 0), width=200, height=100, fov_x=50)
     camera = replace(camera, distortion=(0.05, -0.01, 0.001, 0.0))
@@ -40,10 +40,10 @@ def test_windows_contain_the_object_and_have_the_same_size(photos: list[Photo]) 
     for window, (x0, y0, x1, y1) in zip(windows, BOXES.values(), strict=False):
         assert window is not None
         left, top, width, height = window
-        assert (width, height) == (72, 77)  # the largest, and a tenth of it on each side
+        assert (width, height) == (72, 77)  # the largest box and a tenth of its size on each side
         assert 0 <= left <= x0 and x1 <= left + width <= 200 and 0 <= top <= y0 and y1 <= top + height <= 100
     Image.fromarray(np.full((100, 200), 255, np.uint8)).save(photos[0].mask or "")
-    assert object_windows(photos) == [None] * 4  # one needs all of it, and so do others of its size
+    assert object_windows(photos) == [None] * 4  # one object fills its photo, and all windows have the same size
 
 
 def test_a_window_has_the_pixels_of_the_photo(photos: list[Photo]) -> None:
@@ -66,7 +66,7 @@ def test_a_window_is_scaled_to_the_size_of_the_fit(photos: list[Photo]) -> None:
     assert (view.camera.width, view.camera.height, view.half.camera.width) == (80, 48, 40)
     assert view.camera.fx == pytest.approx(0.8 * photos[1].camera.fx)
     assert view.inverse_depth is not None and view.inverse_depth.shape == (48, 80)
-    small = depth[::2, ::2]  # half as fine as the photo
+    small = depth[::2, ::2]  # half the resolution of the photo
     np.testing.assert_array_equal(crop_map(small, photos[1].camera, (50, 20, 100, 60))[::2, ::2], small[10:40, 25:75])
     whole = _training_view(photos[1], FitSettings(size=80))
     assert (whole.camera.width, whole.camera.height) == (80, 40)

@@ -1,4 +1,4 @@
-"""Captures on disk, and from photographs to cameras."""
+"""Captures on disk: saving, loading and transforming."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from mitsplat.geometry.camera import Camera
 
 @pytest.fixture
 def capture(tmp_path: Path) -> Capture:
-    """Ten noise photos of 40x30, every other one with a mask."""
+    """Build ten noise photos of 40x30 px, every other one with a mask."""
     rng = np.random.default_rng(3)
     folder = tmp_path / "given"
     folder.mkdir()
@@ -53,7 +53,7 @@ def test_a_saved_capture_is_loaded_unchanged(capture: Capture, tmp_path: Path) -
     capture.save(tmp_path / "a")
     loaded = Capture.load(tmp_path / "a")
     assert loaded.photos[0].file == tmp_path / "a/images/view 0.png"
-    loaded.save(tmp_path / "a")  # in place: no file is lost
+    loaded.save(tmp_path / "a")  # saved in place: no file is lost
     loaded = Capture.load(tmp_path / "a")
     np.testing.assert_array_equal(loaded.points, capture.points)
     np.testing.assert_array_equal(loaded.colours, capture.colours)
@@ -74,7 +74,7 @@ def test_a_saved_capture_is_loaded_unchanged(capture: Capture, tmp_path: Path) -
 def test_an_interrupted_save_leaves_the_earlier_or_the_new_capture(
     capture: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, place: int
 ) -> None:
-    """Pictures of the one are never read with the cameras of the other: 10 photos, 5 masks, points, capture.json."""
+    """Images of one capture are never read with cameras of the other: 10 photos, 5 masks, points, capture.json."""
     out = tmp_path / "out"
     capture.save(out)
     other = capture.transformed(np.diag([2.0, 2.0, 2.0, 1.0]))

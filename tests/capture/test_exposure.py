@@ -1,4 +1,4 @@
-"""Exposures of photos against each other, where they are known."""
+"""Relative exposures of photos, compared with known values."""
 
 from __future__ import annotations
 
@@ -18,7 +18,9 @@ COUNT, POINTS = 9, 120
 
 
 def drawn(folder: Path, gains: np.ndarray) -> Capture:
-    """Photos of coloured points, each seen by a third of the photos in a row, a tenth of them in any colour."""
+    """Draw photos of coloured points. A third of the photos in sequence sees each point, a tenth of these in a random
+    colour.
+    """
     rng = np.random.default_rng(4)
     points, colours = rng.uniform(-1, 1, (POINTS, 3)), rng.uniform(0.05, 0.4, (POINTS, 3))
     photos = []

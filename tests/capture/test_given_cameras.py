@@ -1,4 +1,4 @@
-"""Cameras and masks that others found: COLMAP models, NeRF transforms, folders of masks."""
+"""Cameras and masks from other programs: COLMAP models, NeRF transforms, folders of masks."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from tests import rendered
 
 
 def write_colmap_text(folder: Path, capture: Capture) -> None:
-    """The capture as COLMAP's text files, with points."""
+    """Write the capture as COLMAP text files, with points."""
     from scipy.spatial.transform import Rotation
 
     folder.mkdir()
@@ -113,7 +113,7 @@ def test_given_masks_replace_computed_masks(
         mask = Image.new("L", rendered.SIZE)
         mask.paste(255, (100, 80, 300, 250))
         kind = int(photo.name[5:7]) % 3
-        # In any case, and with a transparency that says nothing.
+        # The suffix may be in upper case, and the alpha channel may be constant.
         shown = mask.convert("RGB").convert("RGBA") if kind == 1 else mask
         shown.save(tmp_path / "masks" / f"{Path(photo.name).stem}{'.PNG' if kind == 2 else '.png'}")
     Image.new("L", rendered.SIZE).save(tmp_path / "masks/photo03.png")
@@ -126,7 +126,9 @@ def test_given_masks_replace_computed_masks(
     assert alpha.sum() == alpha[80:250, 100:300].sum() == 170 * 200
     with monkeypatch.context() as elsewhere:
         elsewhere.chdir(tmp_path / "masks")
-        elsewhere.setattr("mitsplat.capture.pipeline.capture_pipeline.prepare_photos", None)  # would be made anew
+        elsewhere.setattr(
+            "mitsplat.capture.pipeline.capture_pipeline.prepare_photos", None
+        )  # copies are not written again
         there = replace(settings, poses=Path("../model"), masks=Path())
         assert len(capture_photos(given, Path("../out"), there).capture.photos) == 15
     (tmp_path / "masks/photo05.PNG").unlink()
@@ -147,7 +149,7 @@ def test_lenses_of_other_models_are_refused() -> None:
 
 
 def test_fisheye_cameras_are_read_from_colmap_and_transforms_json(tmp_path: Path) -> None:
-    """From a COLMAP model and from a transforms.json: the angle to the axis grows as OpenCV's polynomial says."""
+    """The angle to the axis follows OpenCV's polynomial for a COLMAP model and for a transforms.json."""
     values = 300.0, 301.0, 160.0, 120.0, 0.02, -0.01, 0.003, 0.001
     angle = 0.4
     shown = angle * (1 + 0.02 * angle**2 - 0.01 * angle**4 + 0.003 * angle**6 + 0.001 * angle**8)
@@ -169,7 +171,7 @@ def test_fisheye_cameras_are_read_from_colmap_and_transforms_json(tmp_path: Path
 
 
 def small_model(folder: Path) -> tuple[Path, list[Prepared]]:
-    """A COLMAP model of two photos and a point, and the photos."""
+    """Write a COLMAP model of two photos and a point, and return its folder and the photos."""
     model = folder / "model"
     model.mkdir()
     (model / "cameras.txt").write_text("1 PINHOLE 32 24 40 40 16 12\n")

@@ -1,4 +1,4 @@
-"""Scale and gravity: boards and tags that are drawn, models whose truth is known."""
+"""Scale and vertical of a capture: drawn boards and tags, and models with known ground truth."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ BOARD = Board(6, 4, 0.03)
 LOST = np.eye(4)
 LOST[:3, :3] = 3.7 * Rotation.from_rotvec([0.4, -1.2, 2.0]).as_matrix()
 LOST[:3, 3] = (5, -3, 8)
-"""Takes metres to the arbitrary frame of a reconstruction."""
+"""Transform from metres to the arbitrary frame of a reconstruction."""
 
 
 def ring(count: int = 10, *, rolled: bool = False, width: int = 640) -> list[Camera]:
-    """Cameras around the origin, z up [m]; every third may be held on its side."""
+    """Place cameras around the origin, z up [m]; every third may be rolled by 90 degrees."""
     made = []
     for number, angle in enumerate(np.linspace(0, 2 * np.pi, count, endpoint=False)):
         eye = (0.3 * np.cos(angle), 0.3 * np.sin(angle), 0.2 + 0.1 * (number % 2))
@@ -47,7 +47,7 @@ def ring(count: int = 10, *, rolled: bool = False, width: int = 640) -> list[Cam
 
 
 def lost(camera: Camera) -> Camera:
-    """The camera in the frame of the reconstruction."""
+    """Transform a camera to the frame of the reconstruction."""
     pose = LOST @ camera.world_from_camera
     pose[:3, :3] /= 3.7
     return replace(camera, world_from_camera=pose)
@@ -65,7 +65,7 @@ def model_of(cameras: list[Camera], points: np.ndarray) -> SparseModel:
 
 
 def table_and_thing(seed: int = 0) -> np.ndarray:
-    """Points on a table, a thing standing on it and a few strays."""
+    """Sample points on a table, on an object standing on the table, and a few outliers."""
     rng = np.random.default_rng(seed)
     table = np.column_stack([rng.uniform(-0.25, 0.25, (150, 2)), rng.normal(0, 2e-4, 150)])
     thing = rng.uniform((-0.03, -0.02, 0), (0.03, 0.02, 0.08), (900, 3))
@@ -73,13 +73,13 @@ def table_and_thing(seed: int = 0) -> np.ndarray:
 
 
 def draw(flat: np.ndarray, per_metre: float, camera: Camera, folder: Path, name: str) -> Path:
-    """Draw the image of a picture that lies on z = 0 about the origin; four samples a pixel's edge."""
+    """Draw an image of a picture on the plane z = 0, centred on the origin, with 4x4 samples per pixel."""
     fine = camera.resized(4 * camera.width, 4 * camera.height)
     height, width = flat.shape
     corners = np.array([[0, 0], [width, 0], [width, height], [0, height]], dtype=np.float64)
     places = np.column_stack([(corners - (width / 2, height / 2)) * (1, -1) / per_metre, np.zeros(4)])
     pixels, _ = fine.project(places)
-    # Pixel centres at +0.5 here, at whole numbers in OpenCV.
+    # Pixel centres are at +0.5 here, and at whole numbers in OpenCV.
     homography = cv2.getPerspectiveTransform(np.float32(corners - 0.5), np.float32(pixels - 0.5))
     drawn = cv2.warpPerspective(flat, homography, (fine.width, fine.height), borderValue=150)
     Image.fromarray(cv2.resize(drawn, (camera.width, camera.height), interpolation=cv2.INTER_AREA)).save(folder / name)
@@ -87,14 +87,14 @@ def draw(flat: np.ndarray, per_metre: float, camera: Camera, folder: Path, name:
 
 
 def photos_of_the_board(cameras: list[Camera], folder: Path) -> dict[str, Path]:
-    """Drawn photos of the board alone, by the names of :func:`model_of`."""
+    """Draw photos of the board alone, with the names of :func:`model_of`."""
     names = [f"{k:02}.png" for k in range(len(cameras))]
     flat = BOARD.draw(200)
     return {n: draw(flat, 200 / BOARD.square, c, folder, n) for n, c in zip(names, cameras, strict=True)}
 
 
 def errors(matrix: np.ndarray) -> tuple[float, float, float]:
-    """Relative error of scale, tilt [degrees] and height of the table [m] of a placement of the lost frame."""
+    """Compute the error of a metric frame: relative scale, tilt [degrees] and height of the table [m]."""
     whole = matrix @ LOST
     scale = float(np.cbrt(np.linalg.det(whole[:3, :3])))
     return scale - 1, float(np.degrees(np.arccos(min(1.0, whole[2, 2] / scale)))), float(whole[2, 3])
@@ -114,9 +114,9 @@ def test_a_board_determines_scale_and_vertical(tmp_path: Path) -> None:
     assert anchor.PRINT_ERROR / BOARD.square <= found.scale_error < 1.2 * anchor.PRINT_ERROR / BOARD.square
     middle = find_metric_frame(model, images, board=BOARD, centred=False).matrix @ LOST
     np.testing.assert_allclose(middle[:3, 3], 0, atol=1e-4)
-    np.testing.assert_allclose(middle[:3, :3], np.eye(3), atol=1e-3)  # the board's own axes
+    np.testing.assert_allclose(middle[:3, :3], np.eye(3), atol=1e-3)  # axes of the board
 
-    # A camera that is off by a tenth of its distance is told by the board, and does not spoil the scale.
+    # The board detects a camera that is off by a tenth of its distance. The camera does not bias the scale.
     astray = model.cameras["03.png"]
     pose = astray.world_from_camera.copy()
     pose[:3, 3] += 3.7 * np.array([0.03, 0, 0])
@@ -132,7 +132,7 @@ def test_the_metric_frame_knows_the_pose_of_the_board(tmp_path: Path) -> None:
     images = photos_of_the_board(cameras, tmp_path)
     found = find_metric_frame(model_of(cameras, table_and_thing()), images, board=BOARD)
     assert found.board is not None
-    truth = found.matrix @ LOST  # the board lies where the world's origin is
+    truth = found.matrix @ LOST  # the board lies at the world's origin
     scale = np.cbrt(np.linalg.det(truth[:3, :3]))
     np.testing.assert_allclose(found.board[:3, :3], truth[:3, :3] / scale, atol=1e-3)
     np.testing.assert_allclose(found.board[:3, 3], truth[:3, 3], atol=1e-4)
@@ -143,7 +143,7 @@ def test_the_metric_frame_knows_the_pose_of_the_board(tmp_path: Path) -> None:
     [(0.0004, 0.004, True), (0.002, 0.004, False), (0.004, 0.012, True), (0.0004, np.inf, True)],
 )
 def test_a_camera_is_rejected_if_its_error_stands_out(usual: float, off: float, wrong: bool) -> None:
-    """Errors are shares of the width: a quarter of a per cent condemns a camera that stands out, one per cent any."""
+    """Errors are fractions of the image width. The limit is 0.25 % for an outlier and 1 % for any camera."""
     cameras, rng = ring(), np.random.default_rng(4)
     views: Any = {index: {} for index in range(len(BOARD.corners))}
     for k, camera in enumerate(cameras):
@@ -158,7 +158,10 @@ def test_a_camera_is_rejected_if_its_error_stands_out(usual: float, off: float, 
 
 
 def test_a_bent_board_rejects_no_camera() -> None:
-    """Cameras near the table see all of a bend that those above do not: 2 mm, as the print's own corners have it."""
+    """Cameras near the table see all of a 2 mm bend that cameras above do not see.
+
+    The triangulated corners have the bend as well.
+    """
     bent = BOARD.corners - (0, 0, 0.002) * (np.abs(BOARD.corners[:, :1]) / 0.06) ** 2
     high = ring(30, width=1200)
     low = [Camera.look_at((0.3, y, 0.04), (0, 0, 0), width=1200, height=900, fov_x=45) for y in (-0.1, 0, 0.1)]
@@ -171,7 +174,7 @@ def test_a_bent_board_rejects_no_camera() -> None:
 
 
 def test_the_stated_scale_error_covers_drifting_cameras() -> None:
-    """In 20 models whose cameras drift, the scale is off by as much as it is said to be, not by several times that."""
+    """In 20 models with drifting cameras, the scale error is about as large as stated, within a factor of 2."""
     cameras, rng = ring(), np.random.default_rng(0)
     names = [f"{k:02}.png" for k in range(len(cameras))]
     pixels = [camera.project(BOARD.corners)[0] for camera in cameras]
@@ -194,7 +197,7 @@ def test_the_stated_scale_error_covers_drifting_cameras() -> None:
 
 
 def drift(rng: np.random.Generator) -> np.ndarray:
-    """A small motion of a camera."""
+    """Draw a small random motion of a camera."""
     pose = np.eye(4)
     pose[:3, 3] = rng.normal(0, 3e-4, 3)
     return pose
@@ -208,7 +211,7 @@ def test_tags_determine_scale_and_vertical(tmp_path: Path) -> None:
     cameras = ring()
     images = {f"{k:02}.png": draw(sheet, 8000.0, camera, tmp_path, f"{k:02}.png") for k, camera in enumerate(cameras)}
     assert set(find_tags(np.asarray(Image.open(images["00.png"])))) == {0, 1, 2}
-    model = model_of(cameras, np.random.default_rng(0).normal(0, 0.02, (200, 3)))  # no table among the points
+    model = model_of(cameras, np.random.default_rng(0).normal(0, 0.02, (200, 3)))  # no table in the points
     found = find_metric_frame(model, images, tag=0.04)
     scale, tilt, height = errors(found.matrix)
     assert (found.units, found.up, found.source) == ("metre", "z", "3 AprilTags")
@@ -236,7 +239,7 @@ def test_a_distance_determines_scale_and_the_table_the_vertical(blank: dict[str,
     assert abs(scale) < 1e-9
     assert tilt < 0.1
     assert abs(height) < 2e-4
-    # The same by two points seen at pixels.
+    # Two points given by pixels determine the same scale.
     spots = [f"00.png:{x:.2f},{y:.2f}" for x, y in cameras[0].project(points[[0, 1]])[0]]
     found = find_metric_frame(model, blank, scale_from=(*spots, float(np.linalg.norm(points[0] - points[1]))))
     assert abs(errors(found.matrix)[0]) < 0.02
@@ -266,7 +269,7 @@ def test_without_board_and_distance_scale_and_vertical_are_unknown(blank: dict[s
     assert (found.units, found.up, found.table, found.source) == ("unknown", "unknown", False, "the cameras' attitude")
     centres = np.array([(found.matrix @ np.append(c.centre, 1))[:3] for c in model.cameras.values()])
     assert np.median(np.linalg.norm(centres, axis=1)) == pytest.approx(1, abs=0.01)
-    assert errors(found.matrix)[1] < 1.0  # the cameras are held level
+    assert errors(found.matrix)[1] < 1.0  # cameras are held level
 
 
 def test_a_wall_or_ceiling_is_not_taken_for_the_table() -> None:
@@ -340,8 +343,8 @@ def test_the_printed_board_has_its_stated_size(tmp_path: Path) -> None:
     assert box is not None
     width, height = (float(value) / 72 * 0.0254 for value in box.groups())
     assert (width, height) == pytest.approx((0.297, 0.210), abs=1e-6)
-    assert b"CCITTFaxDecode" in data  # stored without loss
-    # The drawing puts every inner corner where it is said to be, at 20 dots a millimetre.
+    assert b"CCITTFaxDecode" in data  # lossless compression
+    # The drawing has every inner corner at its stated position, at 20 dots per millimetre.
     dots = round(20_000 * board.square)
     sheet = cv2.copyMakeBorder(board.draw(dots), *(dots,) * 4, cv2.BORDER_CONSTANT, value=255)
     small = cv2.resize(sheet, None, fx=0.1, fy=0.1, interpolation=cv2.INTER_AREA)

@@ -1,4 +1,4 @@
-"""Which pixels of photos show the object: found, and set right by those of other photos."""
+"""Object masks of photos: detection, and correction by the masks of other photos."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from tests import rendered
 
 
 def overlap(mask: np.ndarray, true: Camera) -> float:
-    """IoU of a mask with the rendered box, seen by its true camera."""
+    """Compute the IoU of a mask with the box rendered by its true camera."""
     corners = rendered.BOX * (np.stack(np.meshgrid([-0.5, 0.5], [-0.5, 0.5], [0, 1]), axis=-1).reshape(-1, 3))
     hull = cv2.convexHull(true.project(corners)[0].astype(np.float32))
     outline = np.zeros(rendered.SIZE[::-1], dtype=np.uint8)
@@ -45,7 +45,7 @@ def test_masks_of_a_rendered_object_agree_with_the_truth(
 def test_masks_are_corrected_by_those_of_other_photos(
     photos: tuple[Path, dict[str, Camera]], captured: tuple[Path, Path, CaptureResult], tmp_path: Path
 ) -> None:
-    """A mask that spills over the table and a photo that was refused one are like the others afterwards."""
+    """A mask that extends over the table and a rejected photo without a mask both get a correct mask."""
     capture = captured[2].capture
     spilt = np.zeros(rendered.SIZE[::-1], dtype=np.uint8)
     spilt[60:330, 90:400] = 255
@@ -79,7 +79,7 @@ def test_photos_with_an_occluded_object_are_omitted() -> None:
     found, hidden = _reject_occluded(capture, ChosenObject(ball, ball, (aside,)))
     assert len(found.photos) == 8 and hidden.keys() == {"000.jpg", "045.jpg"}
     pixels, _ = photos[0].camera.project(aside)
-    x, y = pixels[np.linalg.norm(pixels - (160, 120), axis=1) < 40].astype(int).T  # before the object
+    x, y = pixels[np.linalg.norm(pixels - (160, 120), axis=1) < 40].astype(int).T  # in front of the object
     assert len(x) > 20 and hidden["000.jpg"][y, x].all() and hidden["000.jpg"].mean() < 0.2
 
 
@@ -91,7 +91,7 @@ def test_masks_are_transparent_where_the_object_may_be_hidden(
     assert whole is not None and capture.photos[1].read_mask()[1] is None
     veil = np.zeros(whole.shape, dtype=bool)
     column = int(np.median(np.nonzero(whole)[1]))
-    veil[:, column - 5 : column + 15] = True  # across the middle: both sides stay
+    veil[:, column - 5 : column + 15] = True  # across the middle, so that both sides remain
     points = object_points(capture)
     name = capture.photos[1].name
     found = object_masks(capture, points, points[points[:, 2] > 0], tmp_path, hidden={name: veil})
@@ -117,7 +117,7 @@ def test_a_capture_without_an_object_is_refused(captured: tuple[Path, Path, Capt
 
 
 def test_a_point_beside_the_camera_changes_no_mask(captured: tuple[Path, Path, CaptureResult]) -> None:
-    """It is projected to more pixels than an integer holds."""
+    """Its projection exceeds the range of integer pixels."""
     capture = captured[2].capture
     photo, points = capture.photos[1], object_points(capture)
     right, _, forward, centre = photo.camera.world_from_camera[:3].T

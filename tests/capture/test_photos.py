@@ -1,4 +1,4 @@
-"""Photographs as they come: turned, reduced, copied, and named with a reason where they are of no use."""
+"""Preparation of photographs: rotated, reduced, copied, and rejected with a reason."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def test_exif_orientation_is_applied_to_the_pixels(folder: Path, orientation: in
     exif[ExifTags.Base.Model] = "Box"
     Image.fromarray(texture()).save(folder / "turned.png", exif=exif)
     photo = prepare(folder)[0]["turned.png"]
-    # What each value says to do with the stored pixels (EXIF 2.3, 4.6.4).
+    # Transformation of the stored pixels by each orientation value (EXIF 2.3, 4.6.4).
     stored = texture()
     upright = [
         stored, stored[:, ::-1], stored[::-1, ::-1], stored[::-1],
@@ -110,7 +110,7 @@ def test_a_missing_folder_is_refused(tmp_path: Path) -> None:
 
 
 def test_a_photograph_whose_name_is_not_utf_8_is_refused(folder: Path) -> None:
-    """COLMAP accepts no such name."""
+    """COLMAP does not accept such a name."""
     (folder / os.fsdecode(b"caf\xe9.txt")).write_text("")
     assert len(find_photos(folder)) == 3
     (folder / os.fsdecode(b"caf\xe9.png")).write_bytes((folder / "0.png").read_bytes())
@@ -119,7 +119,7 @@ def test_a_photograph_whose_name_is_not_utf_8_is_refused(folder: Path) -> None:
 
 
 def test_undistorted_photos_show_the_same_directions(tmp_path: Path) -> None:
-    """A picture that encodes the direction of every pixel is undistorted: pixels must show their own direction."""
+    """The image encodes the direction of every pixel. After undistortion, each pixel must encode its own direction."""
     camera = Camera(160, 120, 130.0, 128.0, 82.0, 59.0, np.eye(4), distortion=(-0.2, 0.05, 0.001, -0.002))
     y, x = np.mgrid[:120, :160] + 0.5
     slopes = camera.ray_slopes(np.column_stack([x.ravel(), y.ravel()])).reshape(120, 160, 2)
@@ -129,7 +129,7 @@ def test_undistorted_photos_show_the_same_directions(tmp_path: Path) -> None:
     assert photo.camera.distortion == ()
     shown = 255 * photo.read().rgb
     slopes = photo.camera.ray_slopes(np.column_stack([x.ravel(), y.ravel()])).reshape(120, 160, 2)
-    assert np.abs(shown[..., :2] - (128 + 150 * slopes))[2:-2, 2:-2].max() < 1.2  # a pixel is 1.15 of code
+    assert np.abs(shown[..., :2] - (128 + 150 * slopes))[2:-2, 2:-2].max() < 1.2  # a pixel is 1.15 of the code
     assert np.abs((shown[..., :2] - (128 + 150 * slopes))[2:-2, 2:-2].mean()) < 0.05
 
 

@@ -1,4 +1,4 @@
-"""From a ray to a pixel of a photo, and from pixels to the thing that they are on."""
+"""Picking: from a ray to a pixel of a photo, and from pixels to the object at these pixels."""
 
 from __future__ import annotations
 
@@ -41,11 +41,11 @@ def test_the_photo_of_a_pick_has_about_the_direction_of_the_ray(capture: Capture
     cosines = [float(one @ ahead / np.linalg.norm(one) / np.linalg.norm(ahead)) for one in every]
     assert towards @ ahead / np.linalg.norm(towards) / np.linalg.norm(ahead) == pytest.approx(max(cosines), abs=0.02)
     shown = photo.camera.project(top_of(0)[None])[0][0]
-    assert np.linalg.norm(shown - pixel) < 8  # px: half of a degree from the eye and what lies between points
+    assert np.linalg.norm(shown - pixel) < 8  # px: half a degree from the eye, and gaps between points
 
 
 def test_a_ray_picks_the_nearest_of_two_objects(capture: Capture) -> None:
-    """Past the middle of the second ball to the first, level with both."""
+    """The ray passes the second ball on its way to the first one, at the height of both."""
     start = np.array([0.5, 0.02 + 0.02 * 0.34 / 0.16, 0.05])
     middle = np.array([*THINGS[1], 0.045])
     pick = pick_along(capture, start, middle - start)

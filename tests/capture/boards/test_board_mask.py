@@ -1,4 +1,4 @@
-"""Squares of a board that a photo shows bare, on drawn photos."""
+"""Uncovered squares of a board, detected in drawn photos."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tests.capture.test_metric_frame import BOARD, draw, ring
 ALL = BOARD.columns * BOARD.rows
 
 
-PAPER = 20  # dots of white around the board, as printers leave it
+PAPER = 20  # dots of white margin around the board, as on printed boards
 
 
 @pytest.fixture(scope="module", params=[0, 3])
@@ -25,7 +25,7 @@ def photo(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
 
 
 def squares_of(found: np.ndarray, camera: Camera) -> set[tuple[int, int]]:
-    """Row and column of the squares whose middles are marked."""
+    """Return row and column of the squares whose centres are marked."""
     middles = {
         (row, column): (column + 0.5 - BOARD.columns / 2, BOARD.rows / 2 - row - 0.5, 0)
         for row in range(BOARD.rows)
@@ -45,7 +45,7 @@ def test_all_squares_of_a_bare_board_are_found_in_even_and_dim_light(photo: tupl
 
 @pytest.mark.parametrize("grey_of_it", [5, 50, 120, 180, 250])
 def test_a_square_with_a_covered_corner_is_not_bare(photo: tuple[Camera, np.ndarray], grey_of_it: int) -> None:
-    """A thing of any brightness lies over corners of the squares (1, 2) to (2, 3)."""
+    """An occluder of any brightness covers corners of the squares (1, 2) to (2, 3)."""
     camera, grey = photo
     corners = BOARD.square * np.array([[-0.35, -0.3, 0], [0.3, -0.3, 0], [0.3, 0.4, 0], [-0.35, 0.4, 0]])
     covered = grey.copy()

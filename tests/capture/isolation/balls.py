@@ -1,4 +1,4 @@
-"""A place of three balls on uneven ground, as points and the cameras around that see them."""
+"""Synthetic scene of three balls on uneven ground, as points with the cameras around them."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from mitsplat.capture.isolation import PhotoView
 from mitsplat.geometry.camera import Camera
 
 THINGS = ((0.0, 0.0), (0.16, 0.02), (-0.03, 0.18))
-"""Middles of balls of 4 cm radius that lie on the ground."""
+"""Ground positions of balls with a radius of 4 cm."""
 
 
 def ground(places: Float64Array) -> Float64Array:
-    """A wavy, leaning ground: heights at places (N, 2 or more) [m]."""
+    """Return the heights of a wavy, sloped ground at positions (N, 2 or more) [m]."""
     return np.asarray(0.006 * np.sin(40 * places[:, 0]) * np.cos(30 * places[:, 1]) + 0.05 * places[:, 0])
 
 
 def three_balls() -> tuple[Float64Array, Int64Array, list[PhotoView]]:
-    """Points on the ground (label 0) and on the visible part of the balls (1, 2, 3), and cameras around."""
+    """Sample points on the ground (label 0) and on visible parts of the balls (1, 2, 3), and place cameras around."""
     rng = np.random.default_rng(0)
     flat = rng.uniform(-0.4, 0.4, (3000, 3))
     flat[:, 2] = ground(flat)
@@ -48,7 +48,7 @@ def three_balls() -> tuple[Float64Array, Int64Array, list[PhotoView]]:
 
 
 def capture_of_balls(folder: Path) -> Capture:
-    """The same as a capture with grey photos, saved in a folder."""
+    """Save the scene as a capture with grey photos in a folder."""
     points, _, views = three_balls()
     photos = []
     (folder / "grey").mkdir(parents=True)

@@ -1,7 +1,7 @@
-"""An object on five kinds of ground among other things: chosen in space without a hint, cut out of path-traced photos.
+"""Isolation of an object among clutter on five kinds of ground, without a hint, from path-traced photos.
 
-Points are what photos show, told by the scene instead of by matching. The whole, with matching and fits, is
-``benchmarks.assets.clutter --ground KIND``.
+Points come from the scene instead of feature matching. ``benchmarks.assets.clutter --ground KIND`` runs the complete
+pipeline with matching and fits.
 """
 
 from __future__ import annotations
@@ -27,11 +27,14 @@ pytestmark = pytest.mark.slow
 
 WIDTH, VIEWS, POINTS = 320, 15, 900
 NEAR = 0.6
-"""From the middle, where walls are not [m]."""
+"""Distance from the centre below which there are no walls [m]."""
 
 
 def shared_points(scene: dict, photos: list[Photo]) -> Capture:
-    """Places that photos show, each seen by all that nothing hides it from, as exactly as matching would tell."""
+    """Sample surface points of the photos with the accuracy of matched points.
+
+    Each point is seen by the photos in which it is not occluded.
+    """
     loaded, rng, sensors = mi.load_dict(scene), np.random.default_rng(3), Sensors()
     depths = mi.load_dict({"type": "aov", "aovs": "place:position"})
     buffers = [np.array(mi.render(loaded, integrator=depths, sensor=sensors.like(p.camera), spp=1)) for p in photos]
@@ -69,4 +72,4 @@ def test_an_object_in_clutter_is_isolated_without_a_hint(kind: str, thing: Any, 
     assert len(masked.photos) == VIEWS
     truth = [np.array(Image.open(tmp_path / "truth" / photo.name)) > 0 for photo in masked.photos]
     shares = [iou(photo.read_mask()[0] >= 0.5, shown) for photo, shown in zip(masked.photos, truth, strict=True)]
-    assert np.mean(shares) > 0.95 and min(shares) > 0.9  # a pixel all around is 0.04
+    assert np.mean(shares) > 0.95 and min(shares) > 0.9  # an error of one pixel along the outline costs 0.04

@@ -1,4 +1,4 @@
-"""The object among points of a cluttered place: what the cameras look at, or what a hint says, on uneven ground."""
+"""Choice of the object among points of a cluttered scene: by viewing directions or by a hint, on uneven ground."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from tests.capture.isolation.balls import THINGS, ground, three_balls
 
 @pytest.fixture(scope="module")
 def place() -> tuple[Float64Array, Int64Array, list[PhotoView]]:
-    """Points on the ground (label 0) and on the visible part of the balls (1, 2, 3), and cameras around."""
+    """Return points on the ground (label 0) and on the visible part of the balls (1, 2, 3), and cameras around."""
     return three_balls()
 
 
 def ball_of(points: Float64Array, place: tuple[Float64Array, Int64Array, list[PhotoView]]) -> set[int]:
-    """Labels of the points that were chosen."""
+    """Return the labels of the chosen points."""
     every, labels, _ = place
     row = {tuple(point): int(label) for point, label in zip(every.tolist(), labels, strict=True)}
     return {row[tuple(point)] for point in points.tolist()}
 
 
 def pick(place: tuple[Float64Array, Int64Array, list[PhotoView]], thing: int) -> Pick:
-    """A pixel of the first photo on the top of a ball."""
+    """Pick the top of a ball by a pixel of the first photo."""
     view = place[2][0]
     x, y = THINGS[thing - 1]
     top = np.array([[x, y, 0.08 + float(ground(np.array([[x, y]]))[0])]])

@@ -1,4 +1,4 @@
-"""What stands before the object in a photo, against areas of discs that overlap."""
+"""Occlusion of the object in a photo, compared with the overlap area of discs."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from mitsplat.geometry.camera import Camera
 
 
 def ball(middle: tuple[float, float, float], radius: float = 0.04, count: int = 800) -> Float64Array:
-    """Points on a ball [m], shape (N, 3)."""
+    """Sample points on a ball [m], shape (N, 3)."""
     points = np.random.default_rng(count).normal(size=(count, 3))
     return points * radius / np.linalg.norm(points, axis=1, keepdims=True) + middle
 
@@ -23,13 +23,13 @@ def hidden_share(camera: Camera, own: Float64Array, others: list[Float64Array]) 
 
 
 CAMERA = Camera.look_at((0, -5, 0), (0, 0, 0), width=640, height=480, fov_x=3)
-"""From so far that balls are discs."""
+"""Camera at such a distance that balls are projected to discs."""
 
 
 @pytest.mark.parametrize("aside", [0.0, 0.02, 0.04, 0.06, 0.1])
 def test_the_hidden_share_of_a_ball_is_the_overlap_of_two_discs(aside: float) -> None:
     own, before, behind = ball((0, 0, 0)), ball((aside, -0.2, 0)), ball((aside, 0.2, 0))
-    # Two discs of radius r whose middles are d apart share 2 r^2 acos(d / 2r) - d sqrt(r^2 - d^2 / 4).
+    # Two discs of radius r with centres d apart overlap in 2 r^2 acos(d / 2r) - d sqrt(r^2 - d^2 / 4).
     half = min(aside / 0.08, 1.0)
     shared = (2 * np.arccos(half) - 2 * half * np.sqrt(1 - half**2)) / np.pi
     assert hidden_share(CAMERA, own, [before]) == pytest.approx(shared, abs=0.05)
@@ -51,7 +51,7 @@ def test_too_few_points_give_no_hidden_share() -> None:
 
 
 def test_thirty_points_are_enough_to_hide_a_share() -> None:
-    """Thirty points, as plain things have, are sparse: the thing lies between them nevertheless."""
+    """Objects without texture have about 30 sparse points. The surface between them still occludes."""
     assert hidden_share(CAMERA, ball((0, 0, 0)), [ball((0.02, -0.2, 0), 0.03, count=30)]) > 0.2
 
 
@@ -63,12 +63,12 @@ def test_hidden_pixels_are_those_of_the_occluder_and_a_rim() -> None:
     y, x = np.mgrid[0:480, 0:640] + 0.5
     (middle,), _ = CAMERA.project(np.array([[0.05, -0.2, 0]]))
     away = np.hypot(x - middle[0], y - middle[1]) / (0.04 / 4.8 * CAMERA.fx)
-    near = np.abs(x - 320) < 0.04 / 5 * CAMERA.fx  # where the object is
+    near = np.abs(x - 320) < 0.04 / 5 * CAMERA.fx  # pixels of the object
     assert pixels[near & (away < 0.97)].all() and not pixels[near & (away > 1.3)].any()
 
 
 def test_a_can_with_points_on_its_rims_only_may_hide_the_object() -> None:
-    """A can whose points are on its rims alone."""
+    """The can has points only on its rims."""
     turns = np.linspace(0, 2 * np.pi, 60, endpoint=False)
     rims = [np.column_stack([0.04 * np.cos(turns), 0.04 * np.sin(turns) - 0.2, np.full(60, z)]) for z in (-0.04, 0.04)]
     occluded, possibly_occluded, _ = occluded_part(CAMERA, ball((0, 0, 0)), [np.concatenate(rims)])

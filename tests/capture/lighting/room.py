@@ -1,4 +1,4 @@
-"""A room of known lamps, a mirror ball in it, and a camera of known faults: what estimates are compared with."""
+"""Reference scene for light estimates: a room with known lights, a mirror ball, and a camera with a known response."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ from mitsplat.runtime.variant import ensure_variant
 ensure_variant()
 
 CENTRE = np.array([0.0, 0.0, 1.0])
-"""Of the ball [m]."""
+"""Centre of the ball [m]."""
 RADIUS, AWAY = 0.03, 0.5
-"""Of the ball, and from it to the camera [m]."""
+"""Radius of the ball, and distance from its centre to the camera [m]."""
 AZIMUTH, ELEVATION, FOV = 250.0, 20.0, 12.0
 SIZE = (270, 180)
 FOCAL = round(18.0 / np.tan(np.radians(FOV) / 2))
-"""The camera's, were it one of 35 mm film, which has the same shape [mm]."""
+"""Focal length for 35 mm film [mm]. The images have the aspect ratio of the film."""
 
 
 @dataclass(frozen=True)
 class RoomLamp:
-    """A rectangle: where, what it faces, width and height, radiance."""
+    """Rectangular light: position, target, width and height, radiance."""
 
     position: tuple[float, float, float]
     target: tuple[float, float, float]
@@ -44,7 +44,7 @@ class RoomLamp:
 
     @property
     def corners(self) -> Float64Array:
-        """In order around it, from the ball's middle."""
+        """Corners in order around the rectangle, relative to the ball's centre."""
         up = np.array([0.0, 1.0, 0.0] if self.position[:2] == self.target[:2] else [0.0, 0.0, 1.0])
         forward = np.subtract(self.target, self.position) / np.linalg.norm(np.subtract(self.target, self.position))
         across = np.cross(up, forward)
@@ -58,13 +58,14 @@ LAMPS = (
     RoomLamp((0.9, 0.6, 2.55), (0.9, 0.6, 0.0), (0.6, 0.3), (22.0, 20.0, 17.0)),
     RoomLamp((-1.95, -0.8, 1.5), (0.0, -0.8, 1.5), (0.8, 0.9), (4.0, 4.8, 6.0)),
 )
-"""A warm one below the ceiling, and a window."""
+"""A warm light below the ceiling, and a window."""
 
 
 def lambert_irradiance(corners: Float64Array) -> float:
-    """Irradiance of a horizontal plane by a polygon of radiance 1 above the horizon (Lambert 1760).
+    """Compute the irradiance of a horizontal plane by a polygon of radiance 1 above the horizon (Lambert 1760).
 
-    ``1/2 sum of theta_i (n_i . z)``: the angle that each edge subtends, and the normal of the plane through it.
+    ``1/2 sum of theta_i (n_i . z)``, where theta_i is the angle that edge i subtends and n_i is the normal of the plane
+    through edge i and the origin.
     """
     total = 0.0
     for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True):
@@ -75,7 +76,7 @@ def lambert_irradiance(corners: Float64Array) -> float:
 
 
 def room(thing: dict[str, Any] | None) -> dict[str, Any]:
-    """Walls of different colours, a black box and the lamps, with a thing where the ball is."""
+    """Build walls of different colours, a black box and the lights, with an object in place of the ball."""
 
     def rectangle(origin: Any, target: Any, half: tuple[float, float], **more: Any) -> dict[str, Any]:
         up = [0, 1, 0] if tuple(origin[:2]) == tuple(target[:2]) else [0, 0, 1]
@@ -128,7 +129,7 @@ def render(
 
 
 def true_panorama(width: int, samples: int) -> Float32Array:
-    """Radiance that arrives at the ball's middle."""
+    """Render the incident radiance at the ball's centre."""
     sight = np.repeat(directions(width // 2, width).reshape(-1, 3), samples, axis=0)
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(1, len(sight))
@@ -139,12 +140,15 @@ def true_panorama(width: int, samples: int) -> Float32Array:
 
 
 def photographs(folder: Path, radiance: Float32Array, times: list[float], suffix: str = ".png") -> list[Path]:
-    """8-bit photographs with a camera's noise, tone curve and EXIF; in 1 s a radiance of 0.25 becomes white."""
+    """Write 8-bit photographs with a camera's noise, tone curve and EXIF data.
+
+    A radiance of 0.25 becomes white in 1 s.
+    """
     random, files = np.random.default_rng(0), []
     for number, time in enumerate(times):
         electrons = random.poisson(20_000 * np.minimum(4 * time * radiance, 2.0)) + random.normal(0, 4, radiance.shape)
         encoded = encode_srgb(np.clip(electrons / 20_000, 0, 1))
-        curved = 0.5 * encoded + 0.5 * encoded**2 * (3 - 2 * encoded)  # more contrast, as cameras give
+        curved = 0.5 * encoded + 0.5 * encoded**2 * (3 - 2 * encoded)  # higher contrast, as in cameras
         image = Image.fromarray(np.rint(255 * curved).astype(np.uint8))
         exif = image.getexif()
         exif.get_ifd(0x8769).update({0x829A: time, 0xA405: FOCAL})

@@ -1,4 +1,4 @@
-"""Captured light: closed forms, a mirror ball in a sky that is known, and in a path-traced room with known lamps."""
+"""Captured light against closed forms, a mirror ball under a known sky, and a path-traced room with known lights."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ from tests.conftest import WriteScene
 
 HEIGHT, WIDTH = 256, 512
 ASIDE = (0.012, -0.01, 0.006)
-"""Where a camera looks that does not look at the ball [m]."""
+"""Offset from the ball of the point that an off-axis camera looks at [m]."""
 
 
 def run(*args: object) -> int:
@@ -50,12 +50,15 @@ def run(*args: object) -> int:
 
 
 def between(a: Float64Array, b: Float64Array) -> float:
-    """Angle between two unit vectors [degrees]."""
+    """Compute the angle between two unit vectors [degrees]."""
     return float(np.degrees(2 * np.arcsin(min(1.0, 0.5 * float(np.linalg.norm(np.subtract(a, b)))))))
 
 
 def painted(*discs: tuple[float, float, float, Any], rest: Any = 0.2, turn: float = 0.0) -> Float32Array:
-    """A sky of one radiance with discs: azimuth, elevation, angular radius [degrees], radiance; edges cross pixels."""
+    """Draw a sky of one radiance with discs that have antialiased edges.
+
+    A disc has azimuth, elevation and angular radius [degrees], and a radiance.
+    """
     sky = np.broadcast_to(np.float32(rest), (HEIGHT, WIDTH, 3))
     sight = directions(HEIGHT, WIDTH, turn)
     for azimuth, elevation, radius, radiance in discs:
@@ -73,7 +76,7 @@ class TestPanoramas:
     def test_weights_sum_to_the_sphere_and_to_closed_form_irradiance(self) -> None:
         assert solid_angles(16, 32).sum() * 32 == pytest.approx(4 * np.pi)
         assert level_weights(16, 32).sum() * 32 == pytest.approx(np.pi)
-        assert level_weights(15, 30).sum() * 30 == pytest.approx(np.pi)  # the horizon is inside of a row
+        assert level_weights(15, 30).sum() * 30 == pytest.approx(np.pi)  # the horizon lies inside a row
         sky = directions(64, 128)[..., 2:].clip(0).repeat(3, axis=2)  # L = cos(theta): E = 2 pi / 3
         np.testing.assert_allclose(level_irradiance(sky), 2 * np.pi / 3, rtol=1e-3)
 
@@ -87,7 +90,7 @@ class TestPanoramas:
         seen = dr.zeros(mi.SurfaceInteraction3f, len(sight))
         seen.wi = -mi.Vector3f(sight.T)
         mean = np.array(emitter.eval(seen))[0] @ sight
-        assert between(mean / np.linalg.norm(mean), directions(32, 64, turn)[7, 50]) < 2.0  # a pixel is 5.6
+        assert between(mean / np.linalg.norm(mean), directions(32, 64, turn)[7, 50]) < 2.0  # a pixel is 5.6 degrees
 
 
 class TestLamps:
@@ -96,7 +99,7 @@ class TestLamps:
         [
             (30, 40, 6, 0),
             (90, 25, 5, 0),  # across the seam
-            (90 - 77, 25, 5, -77),  # the same of a panorama that is turned
+            (90 - 77, 25, 5, -77),  # the same disc in a rotated panorama
             (0, 90, 8, 0),  # at the pole
             (200, 87, 6, 0),  # around the pole
             (300, 15, 2, 0),
@@ -105,7 +108,7 @@ class TestLamps:
     def test_a_disc_has_the_irradiance_of_its_closed_form(
         self, azimuth: float, elevation: float, radius: float, turn: float
     ) -> None:
-        """Irradiance by a disc of angular radius r and elevation e: pi L sin(r)^2 sin(e)."""
+        """A disc of angular radius r and elevation e has the irradiance pi L sin(r)^2 sin(e)."""
         bright, rest = np.array([30.0, 20.0, 10.0]), np.array([0.2, 0.25, 0.3])
         sky = painted((azimuth, elevation, radius, bright), rest=rest, turn=turn)
         found = estimated(sky, rotate_z=turn)
@@ -122,7 +125,7 @@ class TestLamps:
 
     @pytest.mark.parametrize(("azimuth", "elevation"), [(40, 45), (90, 30), (200, 80)])
     def test_a_rectangle_of_60_degrees_is_found_with_its_size(self, azimuth: float, elevation: float) -> None:
-        """As wide as 60 degrees: what its edges cover is larger in the panorama than in its plane."""
+        """At an extent of 60 degrees, areas near the edges are larger in the panorama than in the plane."""
         direction, extents = unit_vector(azimuth, elevation), np.array([1.15, 0.8])
         sight = directions(HEIGHT, WIDTH)
         plane = np.abs(sight @ rectangle_axes(direction).T / np.maximum(sight @ direction, 1e-3)[..., None])
@@ -136,7 +139,7 @@ class TestLamps:
         discs = ((20, 50, 4, 20.0), (140, 30, 8, 5.0), (250, 60, 6, 20.0), (330, 20, 1, 10.0), (0, -40, 9, 40.0))
         sky = painted(*discs)
         found = estimated(sky)
-        order = [2, 0, 1]  # the fourth sends 1 % of the light, the last one comes from below the horizon
+        order = [2, 0, 1]  # the fourth has 1 % of the light, the last is below the horizon
         for lamp, index in zip(found.lamps, order, strict=True):
             assert between(lamp.direction, unit_vector(*discs[index][:2])) < 0.2
         assert [found.share(lamp.irradiance) for lamp in found.lamps] == sorted(
@@ -163,7 +166,7 @@ class TestLamps:
         overcast = (1 + 2 * height.clip(0)) / 3  # CIE 1955
         assert estimated(overcast).lamps == []
         windows = np.where((height > 0.2) & (height < 0.4), 30.0, 1.0).astype(np.float32)
-        assert estimated(windows).lamps == []  # all around
+        assert estimated(windows).lamps == []  # full circle
 
     def test_lamps_and_ambient_light_keep_the_irradiance(self) -> None:
         random = np.random.default_rng(5)
@@ -195,7 +198,7 @@ class TestLines:
     def test_written_lines_give_a_scene_the_light_of_the_panorama(
         self, tmp_path: Path, write_scene: WriteScene, scene_data: Any, rest: Any
     ) -> None:
-        """Read by the scene file's own reader, they send the panorama's light onto a table."""
+        """Read by the loader of scene files, the lines give a table the irradiance of the panorama."""
         sky = painted((10, 60, 6, (20.0, 15.0, 10.0)), (100, 20, 9, (4.0, 5.0, 6.0)), rest=(0.2, 0.2, 0.25), turn=40)
         around = (0.2, -0.1, 0.3)
         found = estimated(sky, rest=rest, rotate_z=40.0, distance=2.0, around=around)
@@ -249,7 +252,7 @@ class TestBrackets:
         assert np.percentile(ratio[lit], [2, 98]) == pytest.approx([1, 1], abs=0.12)
         assert np.abs(np.median(ratio, axis=(0, 1)) - 1).max() < 0.03  # no tint
         assert not clipped.any()
-        # What only the shortest exposure does not clip is as bright as it is.
+        # Radiance that only the shortest exposure does not clip is correct.
         assert ratio[radiance > 10].mean() == pytest.approx(1, abs=0.06)
 
     def test_pixels_clipped_in_the_shortest_exposure_are_a_lower_bound(self) -> None:
@@ -263,7 +266,7 @@ class TestBrackets:
         image = Image.new("RGB", (300, 200))
         exif = image.getexif()
         exif.get_ifd(0x8769).update({0x829A: 0.02, 0x829D: 4.0, 0x8827: 400, 0xA405: 50})
-        exif[0x0112] = 6  # stored on its side
+        exif[0x0112] = 6  # rotated by 90 degrees
         image.save(tmp_path / "a.jpg", exif=exif)
         found = read_photograph(tmp_path / "a.jpg")
         assert found.pixels.shape == (300, 200, 3)
@@ -272,7 +275,7 @@ class TestBrackets:
 
 
 def seen_ball(width: int) -> tuple[float, float, float]:
-    """The room's ball in a square picture of :data:`ASIDE`."""
+    """Return position and radius of the room's ball in a square image of a camera that looks at :data:`ASIDE`."""
     eye = room.CENTRE + room.AWAY * unit_vector(room.AZIMUTH, room.ELEVATION)
     camera = Camera.look_at(eye, room.CENTRE + ASIDE, width=width, height=width, fov_x=room.FOV)
     x, y = camera.project(room.CENTRE)[0][0].tolist()
@@ -281,7 +284,7 @@ def seen_ball(width: int) -> tuple[float, float, float]:
 
 @pytest.fixture(scope="module")
 def mirrored() -> tuple[Float32Array, Float32Array]:
-    """A smooth sky, and what a camera sees of it in a ball that is beside its axis."""
+    """Return a smooth sky and an image of its reflection in an off-axis ball."""
     sight = directions(128, 256)
     sky = np.stack([1 + np.sin(3 * sight[..., i] + 2 * sight[..., (i + 1) % 3]) for i in range(3)], axis=-1)
     emitter = {"type": "envmap", "bitmap": mi.Bitmap(sky.astype(np.float32)), "to_world": y_up_to_z_up(0)}
@@ -295,7 +298,7 @@ def mirrored() -> tuple[Float32Array, Float32Array]:
 
 
 class TestBall:
-    """Below a sky that is far away, as the geometry has it."""
+    """Mirror ball under a distant sky, as the geometry assumes."""
 
     def test_an_unwrapped_ball_equals_its_panorama(self, mirrored: Any) -> None:
         sky, image = mirrored
@@ -317,11 +320,11 @@ class TestBall:
             return float(np.abs(found.radiance - true)[seen].mean())
 
         assert error(focal, 0) < 0.015
-        assert error(None, 0) > 3 * error(focal, 0)  # parallel rays are a coarser model
-        assert error(focal, 3) > 2 * error(focal, 0)  # so that three degrees would be found out
+        assert error(None, 0) > 3 * error(focal, 0)  # the model of parallel rays is less accurate
+        assert error(focal, 3) > 2 * error(focal, 0)  # an error of 3 degrees is detectable
 
     def test_the_blind_spot_has_the_angle_of_its_closed_form(self, mirrored: Any) -> None:
-        """sin(a) = radius / distance, and the rim of 1.5 px: of 80 px, 11 degrees of parallel rays."""
+        """sin(a) = radius / distance, plus a rim of 1.5 px. For 80 px and parallel rays this is 11 degrees."""
         image = np.zeros((200, 200, 3), np.float32)
         nothing = np.zeros((200, 200), bool)
         found = unwrap_ball(image, (100.0, 100.0, 80.0), None, 0.0, 0.0, nothing)
@@ -338,8 +341,12 @@ class TestBall:
         shown = np.rint(255 * encode_srgb(image / 2).clip(0, 1)).astype(np.uint8)
         picture = np.rint(disc * shown + (1 - disc) * behind).astype(np.uint8)
         found = find_ball(picture)
-        assert found == pytest.approx((x, y, radius), abs=0.02 * radius)  # 2 degrees of what is mirrored half-way out
-        assert find_ball(picture // 64, picture, np.full_like(picture, 255)) == found  # other exposures show it less
+        assert found == pytest.approx(
+            (x, y, radius), abs=0.02 * radius
+        )  # 2 degrees of reflected direction at half the radius
+        assert (
+            find_ball(picture // 64, picture, np.full_like(picture, 255)) == found
+        )  # the ball is less visible in the other exposures
         assert find_ball(behind) is None
         assert find_ball(np.full((240, 240, 3), 90, np.uint8)) is None
 
@@ -352,13 +359,13 @@ def shots(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
 
 @pytest.fixture(scope="module")
 def direct() -> list[Float64Array]:
-    """Irradiance of a table in the ball's place by each lamp, in closed form."""
+    """Compute the irradiance at the ball's position on a horizontal plane by each light, in closed form."""
     return [room.lambert_irradiance(lamp.corners) * np.array(lamp.radiance) for lamp in room.LAMPS]
 
 
 @pytest.fixture(scope="module")
 def whole() -> Float64Array:
-    """The same by everything."""
+    """Compute the irradiance at the ball's position on a horizontal plane by all light."""
     return level_irradiance(room.true_panorama(128, 48))
 
 
@@ -371,10 +378,10 @@ def found(shots: list[Path]) -> LightEstimate:
 
 
 class TestRoom:
-    """A path-traced room, photographed in exposures of 8 bits with noise and a tone curve."""
+    """Path-traced room, photographed in 8-bit exposures with noise and a tone curve."""
 
     def test_lamps_are_found_within_3_degrees(self, found: LightEstimate) -> None:
-        """That light is mirrored 3 cm from the ball's middle is a degree of a lamp in 1.9 m."""
+        """Reflection at 3 cm from the ball's centre shifts a light at 1.9 m by one degree."""
         assert len(found.lamps) == len(room.LAMPS)
         for lamp, true in zip(found.lamps, room.LAMPS, strict=True):
             assert between(lamp.direction, true.direction) < 3.0
@@ -399,11 +406,11 @@ class TestRoom:
     def test_a_matt_ball_under_the_estimated_light_looks_as_in_the_room(
         self, found: LightEstimate, whole: Float64Array, tmp_path: Path
     ) -> None:
-        """A matt ball, lit by the room and by the lines; and by lines that are turned, which show."""
+        """A matt ball is lit by the room and by the written lights. Rotated lights give a visible difference."""
         matt = room.ball(type="diffuse", reflectance={"type": "rgb", "value": 0.5})
 
         def shaded(scene: dict[str, Any]) -> Float32Array:
-            """The middle of the ball, whose radius is 17 px, in 6 x 6 patches."""
+            """Return the middle of the ball, whose radius is 17 px, in 6 x 6 patches."""
             return room.render(scene, (60, 60), 64)[18:42, 18:42].reshape(6, 4, 6, 4, 3).mean(axis=(1, 3))
 
         true = shaded(room.room(matt)) * (np.pi / (whole @ LUMINANCE))
@@ -460,7 +467,7 @@ def load_lights(path: Path) -> list[LightSpec]:
 
 
 def turned(light: LightSpec, degrees: float, around: Float64Array) -> LightSpec:
-    """The light, around a place instead of the origin, turned about the vertical."""
+    """Rotate a light about the vertical, and move it from the origin to a position."""
     if isinstance(light, EnvironmentLight):
         return light.model_copy(update={"rotate_z": light.rotate_z + degrees})
     assert isinstance(light, AreaLight)
@@ -469,7 +476,7 @@ def turned(light: LightSpec, degrees: float, around: Float64Array) -> LightSpec:
 
 
 class TestInput:
-    """Invalid input, which is refused in one sentence."""
+    """Invalid input, refused in one sentence."""
 
     CAMERA = ("--camera", 0, 10)
 
@@ -553,7 +560,8 @@ class TestInput:
         words: Any,
         sentence: str,
     ) -> None:
-        # Its process, which takes seconds, is tested with scenes; here all files but the missing one can be read.
+        # The image check runs in a process that takes seconds and is tested with scenes. Here all files except the
+        # missing one are valid.
         if words[0] != "no.exr":
             monkeypatch.setattr(panorama, "check_images", lambda paths: [None] * len(paths))
         assert run("lights", *words, "-o", "out.yaml") == 2

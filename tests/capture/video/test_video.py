@@ -1,4 +1,4 @@
-"""Frames of videos that are drawn, so that it is known how far each picture has moved, and which are blurred."""
+"""Frame selection from drawn videos with known displacement and blur."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ RATE = 30.0
 
 
 def plane(seed: int = 0, size: tuple[int, int] = (360, 2400)) -> np.ndarray:
-    """A texture of several scales, which fades from strong on the left to weak on the right."""
+    """Draw a texture of several scales, with contrast that falls from left to right."""
     rng, whole = np.random.default_rng(seed), np.zeros(size)
     for scale in (2, 5, 12, 30):
         noise = rng.normal(size=(size[0] // scale + 1, size[1] // scale + 1))
@@ -35,7 +35,7 @@ def plane(seed: int = 0, size: tuple[int, int] = (360, 2400)) -> np.ndarray:
 
 
 def seen(texture: np.ndarray, x: float, y: float = 40.0) -> np.ndarray:
-    """Return the part of a texture whose left upper corner lies at x, y [px], BGR."""
+    """Return the part of a texture whose upper left corner lies at x, y [px], BGR."""
     move = np.float32([[1, 0, -x], [0, 1, -y]])
     return cv2.cvtColor(cv2.warpAffine(texture, move, SIZE), cv2.COLOR_GRAY2BGR)
 
@@ -54,7 +54,7 @@ def write(file: Path, pictures: Sequence[np.ndarray], code: str = "mp4v") -> Pat
 
 
 def places() -> np.ndarray:
-    """Return positions [px] of a camera that starts slowly, stands still for a second, and goes on at triple speed."""
+    """Return positions [px] of a camera that starts slowly, stops for a second, and continues at triple speed."""
     slow, fast = np.arange(120) * 2.0, np.arange(1, 91) * 6.0
     return np.concatenate([slow, np.full(30, slow[-1]), slow[-1] + fast])
 
@@ -63,7 +63,7 @@ BLURRED = {number for start in (20, 62, 101) for number in range(start, start + 
     160,
     171,
     200,
-}  # 2 of them are all of a step
+}  # for 2 of them, all frames of a step
 
 
 @pytest.fixture(scope="module")
@@ -77,12 +77,12 @@ def pan(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def few(pan: Path, tmp_path_factory: pytest.TempPathFactory) -> ChosenFrames:
-    """Eight frames of it, at most."""
+    """Choose at most eight frames of the video."""
     return choose_frames(pan, tmp_path_factory.mktemp("few") / "frames", most=8, least=3)
 
 
 def numbers(chosen: ChosenFrames) -> list[int]:
-    """Of the frames in the video, by their names."""
+    """Return the frame numbers in the video by the names of the chosen frames."""
     times = [int(n[:2]) * 60 + int(n[3:5]) + int(n[6:9]) / 1000 for n in chosen.names]
     return [round(time * RATE) for time in times]
 
@@ -97,15 +97,15 @@ def test_chosen_frames_are_sharp_and_evenly_spaced_in_displacement(pan: Path, tm
     assert len(taken) == 1 + int(chosen.moved / STEP)
     assert not BLURRED & set(taken)
     steps = np.diff(x[taken]) / SIZE[0]
-    # A frame is in the middle half of its step; the fast part has two or three frames in a step.
+    # Each frame is in the middle half of its step. The fast part has two or three frames per step.
     assert steps.min() > 0.4 * STEP and steps.max() < 1.6 * STEP
     assert steps.mean() == pytest.approx(STEP, rel=0.05)
-    assert sum(120 <= number < 149 for number in taken) <= 1  # while it stands still
+    assert sum(120 <= number < 149 for number in taken) <= 1  # while the camera stops
     texture = plane()
     for name, number in zip(chosen.names, taken, strict=True):
         with Image.open(chosen.folder / name) as picture:
             error = np.asarray(picture.convert("L")).astype(float) - seen(texture, x[number])[..., 0]
-        assert np.sqrt(np.mean(error**2)) < 12  # of the video's own compression; the next frame's is 20 and more
+        assert np.sqrt(np.mean(error**2)) < 12  # video compression; the next frame differs by 20 or more
 
 
 def test_a_limit_of_frames_widens_their_spacing(few: ChosenFrames) -> None:
@@ -122,7 +122,7 @@ def test_the_same_video_gives_the_same_frames_and_reuses_them(pan: Path, few: Ch
     before = {path: path.stat().st_mtime_ns for path in one.folder.iterdir()}
     assert choose_frames(pan, tmp_path / "one", most=8, least=3) == one
     assert before == {path: path.stat().st_mtime_ns for path in one.folder.iterdir()}
-    (one.folder / one.names[3]).unlink()  # as if it had been interrupted
+    (one.folder / one.names[3]).unlink()  # as after an interruption
     assert choose_frames(pan, tmp_path / "one", most=8, least=3) == one
     assert (one.folder / one.names[3]).read_bytes() == data[one.names[3]]
     other = choose_frames(pan, tmp_path / "one", most=6, least=3)
@@ -164,7 +164,7 @@ def test_noise_and_shake_give_no_displacement() -> None:
 
 
 def test_frames_without_texture_are_neither_a_shot_nor_chosen(tmp_path: Path) -> None:
-    """A video that fades in from black: what shows nothing is neither a shot nor a frame to take."""
+    """The video fades in from black. Frames without content start no new shot and are not chosen."""
     texture = plane(5)
     pictures = [np.zeros((SIZE[1], SIZE[0], 3), np.uint8)] * 20 + [seen(texture, 2.0 * k) for k in range(60)]
     chosen = choose_frames(write(tmp_path / "fade.mp4", pictures), tmp_path / "frames", most=150, least=3)
@@ -173,7 +173,7 @@ def test_frames_without_texture_are_neither_a_shot_nor_chosen(tmp_path: Path) ->
 
 
 def test_sharpness_does_not_depend_on_texture() -> None:
-    """A step of which every other frame is blurred, while texture grows tenfold from its begin to its end."""
+    """Every other frame of a step is blurred, while texture contrast grows tenfold from its start to its end."""
     measures = [
         FrameMeasure(k, k / 30, MotionPosition(0, 0.005 * k, tracked=True), (0.2 if k % 2 else 1.0) * 10 ** (k / 100))
         for k in range(101)
@@ -194,10 +194,10 @@ def test_the_sharp_frame_at_the_border_of_a_step_is_chosen() -> None:
 
 
 def turned_by(file: Path, degrees: int) -> Path:
-    """A copy of an MP4 with the matrix that phones write for a camera held on its side (ISO 14496-12, tkhd)."""
+    """Copy an MP4 with the rotation matrix that phones write for a rolled camera (ISO 14496-12, tkhd)."""
     data = bytearray(file.read_bytes())
     start = data.index(b"tkhd") + 4
-    assert data[start] == 0  # version 0: the matrix is 40 bytes behind version and flags
+    assert data[start] == 0  # version 0: the matrix is 40 bytes after version and flags
     a, b, c, d = {90: (0, 1, -1, 0), 180: (-1, 0, 0, -1), 270: (0, -1, 1, 0)}[degrees]
     one = 1 << 16
     struct.pack_into(">9i", data, start + 40, a * one, b * one, 0, c * one, d * one, 0, 0, 0, 1 << 30)
@@ -237,7 +237,7 @@ def text(file: Path) -> Path:
 
 
 def headless(file: Path) -> Path:
-    """MP4 keeps its table of frames at its end."""
+    """Write half of an MP4, which lacks the table of frames at the file's end."""
     data = write(file, [seen(plane(), 2.0 * k) for k in range(60)]).read_bytes()
     file.write_bytes(data[: len(data) // 2])
     return file

@@ -143,9 +143,9 @@ def ggx(to_camera: Array, to_light: Array, roughness: float, specular: float) ->
 
 
 def tent(cosine: float, roughness: float, specular: float) -> float:
-    """Return the mirrored share of even light (fit of Karis 2014, "Physically Based Shading on Mobile").
+    """Return the mirrored share of uniform light (fit of Karis 2014, "Physically Based Shading on Mobile").
 
-    Of stronger mirrors, only a part of 8 % is replaced.
+    At most 8 % of the captured colour is replaced.
     """
     specular = min(specular, 0.08)
     scale, bias = np.array([-1, -0.0275, -0.572, 0.022]) * roughness + np.array([1, 0.0425, 1.04, -0.04]), 1.04

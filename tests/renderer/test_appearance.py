@@ -1,4 +1,4 @@
-"""Appearances against a slow twin in NumPy, and what a renderer shows of them."""
+"""Appearance changes against a slow twin in NumPy, and their rendering."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def value_noise(point: np.ndarray, seed: int) -> float:
 
 
 def twin(encoded: np.ndarray, points: np.ndarray, matrix: np.ndarray, wear: float, seed: int, size: float) -> Any:
-    """Changed colours (N, 3) of Gaussians at points (N, 3)."""
+    """Return the changed colours (N, 3) of Gaussians at points (N, 3)."""
     result = []
     for colour, point in zip(encoded, points, strict=True):
         p = point * 3 / size
@@ -75,7 +75,7 @@ def test_colours_and_dirt_equal_those_of_the_slow_twin() -> None:
         np.testing.assert_allclose(np.stack(seen, axis=1), expected, atol=2e-4)
         if wear == 1:
             dirty = (expected < twin(encoded, points, matrix, 0, seed, size) - 1e-3).all(axis=1).mean()
-            assert 0.3 < dirty < 0.9  # patches, neither everywhere nor nowhere
+            assert 0.3 < dirty < 0.9  # dirt in patches
     colours = [mi.Float(c.astype(np.float32)) for c in encoded.T]
     same = apply_appearance(colours, [mi.Float(0)] * 13, mi.Vector3f(*points.T.astype(np.float32)))
     assert all((np.array(a) == np.array(b)).all() for a, b in zip(same, colours, strict=True))
@@ -95,12 +95,12 @@ def test_dirt_patches_scale_with_the_object_and_depend_on_the_seed() -> None:
     here = at(0)
     assert 0.2 < here.mean() < 0.45 and here.min() == 0 and here.max() == 1
     near, far, other = (np.corrcoef(here, values)[0, 1] for values in (at(0.05), at(3.0), at(0, 6)))
-    # 20,000 independent pairs have a correlation of 0 +- 0.007.
+    # The correlation of 20,000 independent pairs is 0 +- 0.007.
     assert near > 0.9 and abs(far) < 0.04 and abs(other) < 0.04
 
 
 def ball(**properties: Any) -> tuple[Splats, Any]:
-    """Opaque Gaussians on a sphere, of colours that vary with the direction, and their shape."""
+    """Return opaque Gaussians on a sphere, with colours that vary with direction, and their shape."""
     rng = np.random.default_rng(3)
     mesh = trimesh.creation.icosphere(3, 0.05)
     count = len(mesh.vertices)
@@ -136,7 +136,7 @@ def test_appearance_renders_as_splats_with_changed_colours() -> None:
 
 
 def test_dirt_rotates_with_its_object() -> None:
-    """A part and the camera turned alike: the picture is the same."""
+    """Rotating object and camera together does not change the image."""
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = Rotation.from_rotvec([0.3, 0.7, 1.0]).as_matrix(), (0.4, -0.2, 0.1)
     splats, shape = ball(wear=1.0, wear_seed=4)
@@ -145,12 +145,12 @@ def test_dirt_rotates_with_its_object() -> None:
     turned = make_splats_shape(splats, pose, instance=1, wear=1.0, wear_seed=4)
     integrator = make_integrator(shadow="none", quality="exact")
     there = render_layers(integrator, mi.load_dict({"type": "scene", "ball": turned}), moved)
-    # Gaussians on the border of a pixel's reach come and go by rounding.
+    # Rounding adds or drops Gaussians at the border of a pixel's footprint.
     assert np.abs(here.rgb - there.rgb).mean() < 1e-4
 
 
 def test_mirrors_show_appearances() -> None:
-    """A mirror shows what its rays meet: a ball of a quarter of the reflectance is darker there too."""
+    """A ball with a quarter of the reflectance is also darker in the mirror."""
     ensure_variant()
     _, plain = ball(capture_light="scene")
     _, dark = ball(capture_light="scene", colours=" ".join(map(str, (0.25 * np.eye(3)).ravel())))
@@ -167,7 +167,7 @@ def test_mirrors_show_appearances() -> None:
         integrator = make_integrator(shadow="none", quality="fast", mesh_samples=16)
         scene = mi.load_dict({"type": "scene", "ball": shape, "mirror": mirror})
         pictures.append(render_layers(integrator, scene, camera))
-    # Beside the ball itself, whose rim the mirror is seen through.
+    # Excludes the ball itself; the mirror shows through its rim.
     beside = ~cv2.dilate(np.uint8(pictures[0].instance == 1), np.ones((5, 5))).astype(bool)
     before, after = (layers.rgb[beside].sum() for layers in pictures)
     assert before > 20 and after == pytest.approx(0.25 * before, rel=0.05)

@@ -24,7 +24,7 @@ FIELDS = ("means", "quats", "scales", "opacities", "sh")
 
 
 def separated(count: int, bands: int) -> Splats:
-    """Gaussians whose order along every ray is that of their centres: the twin and the tiles then agree."""
+    """Return Gaussians whose order along every ray equals the order of their centres, so that twin and tiles agree."""
     splats = make_splats(count, 31, bands=bands, scales=(0.05, 0.15))
     means = splats.means.copy()
     means[:, 2] = np.linspace(-1.0, 4.0, count)
@@ -77,7 +77,7 @@ def test_gradients_equal_finite_differences_of_the_twin(bands: int) -> None:
             moved.append((loss_of_twin(replace(splats, **{name: values})), values))
         expected = (moved[0][0] - moved[1][0]) / (2 * step)
         got = float((found[name] * direction).sum())
-        if name == "quats":  # the loss is that of normalised quaternions on both sides
+        if name == "quats":  # both losses use normalised quaternions
             assert got == pytest.approx(expected, rel=2e-2, abs=2e-2)
         else:
             assert got == pytest.approx(expected, rel=1e-2, abs=1e-2), name
@@ -88,7 +88,7 @@ def test_gradients_equal_finite_differences_of_the_twin(bands: int) -> None:
 def test_gradients_computed_in_parts_equal_those_of_the_whole(
     at_once: int, distortion: tuple[float, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As a view's are whose pairs do not fit in the memory: tile by tile, or in parts of many tiles."""
+    """Views whose pairs exceed the memory are processed tile by tile, or in parts of many tiles."""
     splats, camera = make_splats(300, 36, bands=4), replace(CAMERA, distortion=distortion)
     whole = gradients(splats, camera)
     parts: list[int] = []
@@ -99,13 +99,13 @@ def test_gradients_computed_in_parts_equal_those_of_the_whole(
     for module in (backward, record_gradients):
         monkeypatch.setattr(module, "PAIRS_AT_ONCE", at_once)
     found = gradients(splats, camera)
-    assert len(parts) > 1 and max(parts) <= max(at_once, len(splats))  # a tile has no more than all
+    assert len(parts) > 1 and max(parts) <= max(at_once, len(splats))  # a tile has at most all Gaussians
     for name, values in whole.items():
         np.testing.assert_allclose(found[name], values, rtol=1e-4, atol=1e-5 * np.abs(values).max())
 
 
 def test_needles_thinner_than_rounding_have_finite_gradients() -> None:
-    """Else one of them makes numbers of a whole fit undefined."""
+    """A single needle would otherwise make the gradients of a whole fit NaN."""
     rng = np.random.default_rng(3)
     splats = make_splats(200, 34)
     scales = 10 ** np.column_stack([rng.uniform(-10, -8, (200, 2)), rng.uniform(-10, -0.5, 200)])
@@ -139,7 +139,7 @@ def test_corrected_colours_are_refused_for_gradients(switch: str) -> None:
 
 
 def test_depth_of_an_opaque_gaussian_has_unit_gradient() -> None:
-    """Moving the camera's only Gaussian away by dz moves depth by dz, whatever its alpha."""
+    """Moving the camera's only Gaussian away by dz changes depth by dz, for any alpha."""
     ensure_variant()
     from mitsplat.renderer.rays.sensors import view_of
 

@@ -1,4 +1,4 @@
-"""Light that surroundings and visible meshes reflect onto things, against closed forms, and its noise."""
+"""Light reflected by surroundings and visible meshes onto objects: closed forms and noise."""
 
 from __future__ import annotations
 
@@ -40,9 +40,9 @@ def visible_wall() -> Any:
 
 @pytest.mark.parametrize("wall", [captured_wall, visible_wall])
 def test_a_red_wall_reflects_half_of_its_colour(wall: Any) -> None:
-    """A sky of which a red wall hides half: E_bounce over that of white is half the wall's colour.
+    """A red wall hides half of a uniform sky: E_bounce over the white irradiance is half the wall's colour.
 
-    A captured wall shines so by itself, a mesh because of the other half of the sky, which is all that it sees.
+    A captured wall emits its captured colour; a mesh reflects the other half of the sky.
     """
     make_integrator()
     shapes = {
@@ -58,7 +58,7 @@ def test_a_red_wall_reflects_half_of_its_colour(wall: Any) -> None:
 
 
 def test_a_bright_spot_leaves_no_patches_on_a_mesh() -> None:
-    """Few rays from a table meet the spot that a lamp makes on the ceiling."""
+    """Few rays from a table hit the bright spot of a lamp on the ceiling."""
     make_integrator()
     grey = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.5}}
     table = mi.ScalarTransform4f().scale(2)

@@ -1,4 +1,4 @@
-"""Rays that a GPU would leave out: seen in the kernels' code on any machine, and an error where Dr.Jit says so."""
+"""Rays dropped by a GPU: detection in the kernels' code on any machine, and errors on Dr.Jit's warning."""
 
 import ctypes
 import os
@@ -24,14 +24,14 @@ TEXTS = [
     "Please split your kernel into smaller parts (e.g. using `dr::eval()`). Disabling this ray tracing operation to "
     "avoid potential undefined behavior.",
 ]
-"""As the library of Dr.Jit 1.5 has them."""
+"""Messages of the library of Dr.Jit 1.5."""
 
 LIBRARY = Path(dr.__file__).with_name("libdrjit-core.so")
 
 
 @pytest.fixture(params=[ctypes.CDLL, ctypes.PyDLL])
 def log(request):
-    """Dr.Jit's own log, without and with Python's lock, and the callback in place while the test runs."""
+    """Yield Dr.Jit's own log function, without and with Python's lock, while the callback is installed."""
     function = request.param(str(LIBRARY))["_Z7jit_log8LogLevelPKcz"]
     function.argtypes, function.restype = (ctypes.c_uint32, ctypes.c_char_p), None
     level = dr.log_level()
@@ -57,7 +57,7 @@ def test_other_messages_are_printed(log, capfd):
 
 
 def test_the_library_has_the_message_of_dropped_rays():
-    """Another release may word it differently, and nothing else would tell."""
+    """Detects a release of Dr.Jit with another message, which would otherwise go unnoticed."""
     library = LIBRARY.read_bytes()
     for text in TEXTS:
         assert DROPPED_RAYS in text.encode()
@@ -75,7 +75,7 @@ def test_a_process_ends_with_the_callback_in_place():
 class TestKernels:
     @pytest.mark.parametrize("case", CASES)
     def test_every_kernel_traces_one_scene(self, monkeypatch, case):
-        """As they are split on CUDA."""
+        """Kernels are split as on CUDA."""
         build = Proxies.__init__
 
         def apart(self, *args):

@@ -1,4 +1,4 @@
-"""Antialiased silhouettes, against pictures of twice the size and brute force."""
+"""Antialiased silhouettes against images of twice the size and brute force."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ LENSES = {
 
 
 def scene_of(**meshes: Any) -> Any:
-    """Two objects before a background that does not fill the picture, and what else there is."""
+    """Return a scene of two objects before a background that does not fill the image, and further shapes."""
     pose = np.diag([0.4, 0.4, 0.4, 1.0])
     shapes: dict[str, Any] = {"background": make_splats_shape(make_splats(60, 1, scales=(0.05, 0.2)))}
     for number in (1, 2):
@@ -42,7 +42,7 @@ def plate(pose: Any) -> dict[str, Any]:
 
 
 CUTTING = plate(mi.ScalarTransform4f().translate([0, 0.6, 0]).rotate([1, 0, 0], 20).scale(0.4))
-"""A mesh that cuts through all splats."""
+"""Mesh that intersects all splats."""
 
 
 def layers_of(scene: Any, camera: Camera, quality: Quality, **properties: Any) -> Layers:
@@ -64,7 +64,7 @@ def test_edge_pixels_are_means_of_an_image_twice_as_large(preset: str, lens: str
     camera, scene = replace(CAMERA, **LENSES[lens]), scene_of(plate=CUTTING)
     quality = replace(PRESETS[preset], kernel="mip")
     smooth, plain = (layers_of(scene, camera, replace(quality, samples=samples)) for samples in ("edges", 1))
-    order = quality.tolerance if preset == "fast" else 0.0  # what is looked at again is in the order of each ray
+    order = quality.tolerance if preset == "fast" else 0.0  # resampled edges are sorted along each ray
     large = layers_of(scene, camera.resized(2 * camera.width, 2 * camera.height), replace(quality, tolerance=order))
     changed = changed_by(smooth, plain)
     assert 0.05 < changed.mean() < 0.6
@@ -144,7 +144,7 @@ def test_a_box_of_tiles_equals_the_same_tiles_selected_singly() -> None:
 
 
 def test_antialiasing_keeps_the_dilation_of_splats() -> None:
-    """Their dilation is in pixels of the picture, as in four rays of every pixel."""
+    """The dilation is in pixels of the image, as with four rays in every pixel."""
     quality, scene = replace(PRESETS["exact"], kernel="3dgs"), scene_of()
     smooth, plain, everywhere = (layers_of(scene, CAMERA, replace(quality, samples=s)) for s in ("edges", 1, 2))
     changed = changed_by(smooth, plain)
@@ -152,7 +152,7 @@ def test_antialiasing_keeps_the_dilation_of_splats() -> None:
 
 
 def test_both_sides_of_a_border_have_their_own_light() -> None:
-    """An object that is lit ten times as much as the plate behind it, at an edge between pixels' centres."""
+    """An object has ten times the light of the plate behind it; its edge lies between pixel centres."""
     grid = np.stack(np.meshgrid(*[np.linspace(-0.3, 0.3, 40)] * 2), axis=-1).reshape(-1, 2)
     count = len(grid)
     square = Splats(

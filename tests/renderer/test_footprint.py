@@ -1,4 +1,4 @@
-"""Light of pixels across which surfaces bend, against that of its points, and what is known of the noise there."""
+"""Light averaged over the footprint of a pixel on curved surfaces, and its noise estimate."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SIZE, FINER = 24, 4
 
 
 def ridges(period: float, slope: float, extent: float = 0.5) -> trimesh.Trimesh:
-    """A roof of many ridges along y, whose tops lie at z = 0."""
+    """Return a roof of many ridges along y, whose tops are at z = 0."""
     count = int(2 * extent / period)
     x = np.linspace(-extent, extent, 2 * count + 1)
     z = np.where(np.arange(len(x)) % 2, 0.0, -slope * period / 2)
@@ -56,7 +56,7 @@ def test_ridges_finer_than_a_pixel_have_the_mean_light_of_its_points(monkeypatch
     monkeypatch.setattr(footprint, "_bends", lambda here, *_: here.instance < 0)
     middles = render(shapes, down_camera(size=SIZE), samples=4)
     large = render(shapes, down_camera(size=SIZE * FINER), samples=4)
-    inner = slice(2, -2)  # the picture's border has no neighbours beyond it
+    inner = slice(2, -2)  # border pixels lack neighbours
     for name in ("light", "highlight"):
         fine = getattr(large, name).reshape(SIZE, FINER, SIZE, FINER, 3)
         at = [tuple(int(FINER * (0.5 + v)) for v in offset) for offset in OFFSETS]
@@ -93,7 +93,7 @@ def test_pixels_without_similar_neighbours_get_the_saved_rays() -> None:
 
 
 def test_the_number_of_rays_follows_perceived_brightness() -> None:
-    """In equal steps of the display: fewest where it is bright, and where a dark picture is exposed for, more."""
+    """The rays follow equal display steps: fewest in bright light, more with a dark picture's exposure."""
     make_integrator()
     camera = down_camera(size=9)
     view = CameraView(9, 9, camera.fx, camera.fy, camera.cx, camera.cy, camera.world_from_camera)
@@ -111,14 +111,14 @@ def test_the_number_of_rays_follows_perceived_brightness() -> None:
         return float(np.array(light_filter.rays_for(estimate, 0.03, mi.Float(unshadowed), **options))[40])
 
     at_half = wanted(1.0)
-    # The slope of v^(1/2.2) at v is that at a half times (v / 0.5)^(1/2.2 - 1).
+    # The slope of v^(1/2.2) at v is the slope at 0.5 times (v / 0.5)^(1/2.2 - 1).
     for light in (0.06, 0.2, 0.5):
         steps = (light / 0.5) * (light / 0.5) ** (1 / 2.2 - 1)
         assert wanted(2 * light) / at_half == pytest.approx(steps**2, rel=1e-4)
     assert wanted(0.02) / at_half == pytest.approx((0.02 * (0.05 / 0.5) ** (1 / 2.2 - 1)) ** 2, rel=1e-4)
-    for light in (0.03, 0.3, 3.0):  # as bright as any other, however much light there is
+    for light in (0.03, 0.3, 3.0):  # auto-exposure removes the light level
         assert wanted(light, metered=count) == pytest.approx(at_half, rel=2e-3)
-    # Nine in ten pixels of a picture are lit by 1, as bright as if a half of it arrived.
+    # Nine in ten pixels have light 1, whose brightness equals that of half of the light.
     mean = (9 * 1 + 0.1 ** (1 / 2.2)) / 10
     own = 0.1 * 0.5 * mean**-2.2
     steps = (own / 0.5) ** (1 / 2.2)

@@ -1,4 +1,4 @@
-"""The instance image: every pixel shows the instance with the largest share of its centre's ray."""
+"""Instance image: each pixel has the id of the instance with the largest share of its centre ray."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def gaussians(means: npt.ArrayLike, quats: npt.ArrayLike, scales: npt.ArrayLike,
 
 
 def porous(count: int, seed: int) -> tuple[Splats, npt.NDArray[np.int64]]:
-    """Instances (some of them the environment) of small, half transparent Gaussians, all in one place."""
+    """Return instances (some are the environment) of small, half-transparent Gaussians, all in one place."""
     rng = np.random.default_rng(seed)
     n = 60 * count
     splats = gaussians(
@@ -47,7 +47,7 @@ def porous(count: int, seed: int) -> tuple[Splats, npt.NDArray[np.int64]]:
 
 
 def layered(count: int, seed: int) -> tuple[Splats, npt.NDArray[np.int64]]:
-    """Wide sheets of different instances, one behind the other, whose order is that of their tiles' lists too."""
+    """Return wide sheets of different instances, one behind the other, also in the order of the tile lists."""
     rng = np.random.default_rng(seed)
     n = 24
     splats = gaussians(
@@ -60,7 +60,7 @@ def layered(count: int, seed: int) -> tuple[Splats, npt.NDArray[np.int64]]:
 
 
 def shown(splats: Splats, ids: npt.NDArray[np.int64], quality: Quality, camera: Camera = CAMERA) -> npt.NDArray:
-    """The instance image of Gaussians that belong to instances by row."""
+    """Render the instance image of Gaussians that belong to instances by row."""
     ensure_variant()
     shapes = {f"instance_{i}": make_splats_shape(splats.select(ids == i), instance=int(i)) for i in np.unique(ids)}
     integrator = make_integrator(quality=quality, shadow="none")
@@ -68,7 +68,7 @@ def shown(splats: Splats, ids: npt.NDArray[np.int64], quality: Quality, camera: 
 
 
 def differences(found: npt.NDArray, shares: npt.NDArray) -> tuple[int, int]:
-    """Pixels whose instance has a smaller share than another one, and pixels where that cannot be told."""
+    """Count the pixels whose instance has a smaller share than another one, and the pixels with a tie."""
     mine = np.take_along_axis(shares, found[..., None].astype(int), axis=2)[..., 0]
     first, second = np.sort(shares, axis=2)[..., :-3:-1].transpose(2, 0, 1)
     return np.count_nonzero(mine < first - TIE), np.count_nonzero(first - second < TIE)
@@ -78,14 +78,14 @@ def differences(found: npt.NDArray, shares: npt.NDArray) -> tuple[int, int]:
 def test_porous_instances_in_one_place_have_the_ids_of_the_slow_twin(count: int) -> None:
     splats, ids = porous(count, count)
     shares = reference_shares(splats, ids, CAMERA)
-    assert len(np.unique(shares.argmax(axis=2))) >= count  # all of them are seen somewhere
+    assert len(np.unique(shares.argmax(axis=2))) >= count  # each instance is visible somewhere
     wrong, ties = differences(shown(splats, ids, EXACT), shares)
     assert wrong == 0 and ties < 8
 
 
 @pytest.mark.parametrize("before", range(1, 4))
 def test_shapes_without_gaussians_do_not_shift_other_ids(before: int) -> None:
-    """Proxies have none, and come first in a scene without an environment."""
+    """Proxies have no Gaussians, and come first in a scene without an environment."""
     ensure_variant()
     ball = gaussians([(0, 0, 0)], [(0, 0, 0, 1)], [(0.1, 0.1, 0.1)], [0.9])
     poses = [mi.ScalarTransform4f().translate([x, y, 0]).matrix for x, y in ((-0.4, 0.2), (0, -0.3), (0.4, 0.1))]
@@ -113,7 +113,7 @@ def test_sheets_in_any_order_have_the_ids_of_the_slow_twin(tolerance: float) -> 
 
 @pytest.mark.parametrize("tolerance", [0.0, 1e-3, math.inf])
 def test_the_largest_share_wins_for_a_sheet_met_in_small_pieces(tolerance: float) -> None:
-    """Weights .20, .16 and .636, the last in forty Gaussians of which none outweighs the others."""
+    """Weights .20, .16 and .636: the last consists of forty Gaussians, each below the other weights."""
     last = 1 - (1 - 0.636 / 0.64) ** (1 / 40)
     opacities = np.array([0.2, 0.2, *[last] * 40])
     n = len(opacities)
@@ -125,7 +125,7 @@ def test_the_largest_share_wins_for_a_sheet_met_in_small_pieces(tolerance: float
 
 
 def test_a_hundred_instances_on_one_ray_have_the_id_of_the_largest_share() -> None:
-    """More than one further walk can tell apart; the largest is met last, in pieces that weigh less than all others."""
+    """A second walk cannot separate them all; the largest share comes last, in pieces below all other weights."""
     rng = np.random.default_rng(1)
     ids = np.concatenate([rng.permutation(np.arange(1, 101)), np.resize([101, 50, 101, 7], 600)])
     n = len(ids)
@@ -140,7 +140,7 @@ def test_a_hundred_instances_on_one_ray_have_the_id_of_the_largest_share() -> No
 
 @pytest.mark.cpu(reason="there is nothing else to compare with on a GPU, which is never waited for")
 def test_ids_are_equal_without_waiting_for_the_device(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without the look whether any ray is unsure, as on a GPU, nothing changes."""
+    """Skipping the check for ambiguous rays, as on a GPU, changes no id."""
     from mitsplat.renderer.splatting import march
 
     looked = []

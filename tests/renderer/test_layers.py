@@ -1,4 +1,4 @@
-"""Layers on the device: what comes to the host, when, and as what."""
+"""Transfer of layers from the device to the host: content, time and type."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ IDS = ("instance", "proxy_instance")
 
 
 def channels(shape: tuple[int, int], *, even: bool = False) -> dict[str, Any]:
-    """Device arrays of other values in each place, or with colours and ids of one value for all places."""
+    """Return device arrays with distinct values per pixel, or with uniform colours and ids."""
     ensure_variant()
     count, made = shape[0] * shape[1], {}
     for number, field in enumerate(fields(Layers)):
@@ -56,7 +56,7 @@ def test_layers_are_transferred_when_they_are_read() -> None:
     assert not {field.name for field in fields(Layers)} & vars(layers).keys()
     assert layers.depth is layers.depth
     assert {field.name for field in fields(Layers)} & vars(layers).keys() == {"depth"}
-    layers.rgb[0, 0] = 7  # the host's copy, which is kept
+    layers.rgb[0, 0] = 7  # the cached host copy
     assert (layers.rgb[0, 0] == 7).all()
     assert dr.all(layers.device_array("rgb").y == 0.25)
     with pytest.raises(AttributeError, match="'Layers' object has no attribute 'colour'"):

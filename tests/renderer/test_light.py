@@ -1,4 +1,4 @@
-"""Traced light against closed forms, and the mutual occlusion of splats and visible meshes."""
+"""Traced light against closed forms, and mutual occlusion of splats and visible meshes."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def down_camera(height: float = 1.0, size: int = 32, fov: float = 20.0) -> Camer
 
 
 def floor(extent: float = 1.0, grey: float = 0.5, z: float = 0.0) -> Splats:
-    """An opaque grey plane of Gaussians at height z."""
+    """Return an opaque grey plane of Gaussians at height z."""
     n = 40
     x, y = np.meshgrid(np.linspace(-extent, extent, n), np.linspace(-extent, extent, n))
     spacing = 2 * extent / (n - 1)
@@ -61,7 +61,7 @@ def test_light_without_dynamic_objects_changes_no_bit() -> None:
 
 
 def test_wall_hides_half_of_a_uniform_sky() -> None:
-    """At the foot of a tall wall half of the cosine-weighted hemisphere is dark: the ratio is 1/2."""
+    """At the foot of a tall wall, half of the cosine-weighted hemisphere is dark: the ratio is 1/2."""
     make_integrator()
     wall = trimesh.creation.box(bounds=[[0.0, -500, 0.001], [0.5, 500, 500]])
     shapes = {
@@ -75,7 +75,7 @@ def test_wall_hides_half_of_a_uniform_sky() -> None:
 
 
 def test_an_occluder_hides_the_sky_within_its_reach_only() -> None:
-    """A ceiling at height h hides the directions in which it is within reach r; (h / r)^2 of a sky's light is left."""
+    """A ceiling at height h occludes directions within reach r; a share of (h / r)^2 of the sky's light remains."""
     make_integrator()
     sun = {"type": "directional", "direction": [0, 0, -1], "irradiance": {"type": "rgb", "value": 2.0}}
     for ceiling, bright in ((2.0, (0.0, 1.0)), (0.5, (0.0, 0.25))):
@@ -113,7 +113,7 @@ def test_an_object_before_a_point_light_leaves_no_light() -> None:
 
 @pytest.mark.parametrize("unit", [0.001, 1.0, 100.0])
 def test_uniform_capture_keeps_its_colour_on_an_open_horizontal_surface(unit: float) -> None:
-    """At three scales: no acne, no missing light."""
+    """Tested at three scales: no shadow acne, no missing light."""
     make_integrator()
     lamp = {
         "type": "rectangle",
@@ -198,7 +198,7 @@ def nothing() -> Splats:
 
 
 def test_few_rays_leave_no_speckles_in_a_faint_shadow() -> None:
-    """A strong lamp and a weak sky, four rays a pixel: the edge of a wide penumbra, where few rays meet the object."""
+    """A strong lamp, a weak sky and four rays per pixel: few rays hit the object at the edge of the wide penumbra."""
     make_integrator()
     lamp = {
         "type": "rectangle",
@@ -237,7 +237,7 @@ def test_relit_surface_shows_no_pattern_of_the_sampling() -> None:
 
 
 def test_a_point_beside_its_proxy_gets_the_light_of_its_neighbours() -> None:
-    """A proxy wider than its object by a few pixels: the floor seen there is not under the object."""
+    """The proxy is wider than its object by a few pixels: the floor visible there is not under the object."""
     make_integrator()
     base = trimesh.creation.box(bounds=[[-0.125, -0.125, 0.0], [0.125, 0.125, 0.05]])
     shapes = {
@@ -256,16 +256,16 @@ def noise_free(shapes: dict[str, Any], camera: Camera, **options: Any) -> Layers
 
 
 def area_light(size: float, height: float, radiance: float = 5.0) -> dict[str, Any]:
-    """A square of edge ``size`` at ``height`` above the origin that shines down."""
+    """Return a square light of edge ``size`` at ``height`` above the origin that shines down."""
     pose = mi.ScalarTransform4f().look_at(origin=[0, 0, height], target=[0, 0, 0], up=[0, 1, 0]).scale(0.5 * size)
     emitter = {"type": "area", "radiance": {"type": "rgb", "value": radiance}}
     return {"type": "rectangle", "to_world": pose, "emitter": emitter}
 
 
 def test_penumbra_of_a_square_light_has_the_width_of_similar_triangles() -> None:
-    """A half plane at height h under a square light of edge s at height H: the penumbra is s h / (H - h) wide.
+    """A half plane at height h under a square light of edge s at height H has a penumbra of width s h / (H - h).
 
-    In between the visible share of the light rises linearly, and its middle is under the half plane's edge.
+    Inside, the visible share of the light rises linearly; the middle is under the half plane's edge.
     """
     make_integrator()
     size, top, edge = 0.1, 2.0, 0.5
@@ -286,7 +286,7 @@ def test_penumbra_of_a_square_light_has_the_width_of_similar_triangles() -> None
 
 
 def test_the_default_accuracy_holds_in_the_penumbra() -> None:
-    """Rays are spent until light has the stated error as it looks, and not evenly."""
+    """Rays are added until light has the stated perceptual error; their number varies between pixels."""
     make_integrator()
     blocker = trimesh.creation.box(bounds=[[-0.1, -0.1, 0.15], [0.1, 0.1, 0.2]])
     shapes = {
@@ -304,7 +304,7 @@ def test_the_default_accuracy_holds_in_the_penumbra() -> None:
         layers = render_layers(
             make_integrator(shadow_error=error), mi.load_dict({"type": "scene", **shapes}), camera, seed=3
         )
-        # In equal steps of the display, of which the error states the size where half of the light arrives.
+        # Errors are in equal display steps; the stated error applies at half of the light.
         difference = (layers.light[..., 0] - exact) / (error * (np.maximum(exact, 0.05) / 0.5) ** (1 - 1 / 2.2))
         assert np.sqrt(np.mean(difference[penumbra] ** 2)) < 1
         assert abs(difference[penumbra].mean()) < 0.2
@@ -313,7 +313,7 @@ def test_the_default_accuracy_holds_in_the_penumbra() -> None:
 
 @pytest.mark.parametrize("unit", [0.001, 1.0, 100.0])
 def test_no_acne_beside_an_object_and_no_gap_under_it(unit: float) -> None:
-    """A cube on the floor under a slanting lamp: lit floor is lit to the last bit, the shadow starts at the edge."""
+    """A cube on the floor under a slanting lamp: lit floor is exactly unshadowed, and the shadow starts at the edge."""
     make_integrator()
     cube = trimesh.creation.box(bounds=np.multiply(unit, [[-0.1, -0.1, 0.0], [0.1, 0.1, 0.2]]))
     lamp = {"type": "directional", "direction": [1, 0, -1], "irradiance": {"type": "rgb", "value": 2.0}}
@@ -343,7 +343,7 @@ def test_no_acne_beside_an_object_and_no_gap_under_it(unit: float) -> None:
 
 @pytest.mark.parametrize("subdivisions", [2, 3])
 def test_the_terminator_of_a_coarse_ball_is_that_of_a_smooth_one(subdivisions: int) -> None:
-    """No dark facets at the terminator: irradiance is max(0, n.l) of the round ball, though it has few faces."""
+    """The terminator has no dark facets: irradiance is max(0, n.l) of the smooth ball, despite its few faces."""
     make_integrator()
     ball = trimesh.creation.icosphere(subdivisions, 0.3)
     fine = trimesh.creation.icosphere(5, 0.3)
@@ -361,7 +361,7 @@ def test_the_terminator_of_a_coarse_ball_is_that_of_a_smooth_one(subdivisions: i
     u = (np.arange(96) + 0.5 - 48) / camera.fx * 2 / 0.3
     x, z = np.meshgrid(u, -u)
     inner = x**2 + z**2 < 0.8**2
-    # The camera is near: a little parallax is left in x.
+    # The camera is close, so that a little parallax remains in x.
     expected = np.maximum(x, 0)
     difference = np.abs(layers.light[..., 0] - expected)[inner]
     assert difference.mean() < 0.03
@@ -385,7 +385,7 @@ def test_creases_are_those_of_drawings_and_not_of_rough_scans() -> None:
 
 
 def test_every_kind_of_emitter_gives_the_irradiance_of_its_closed_form() -> None:
-    """Relit white under white = pi: E/pi for every kind of light, with nothing in the way."""
+    """Relit white with white = pi gives E/pi for every kind of light without occluders."""
     make_integrator()
     pose = mi.ScalarTransform4f().look_at(origin=[0, 0, 2], target=[0, 0, 0], up=[0, 1, 0])
     sky = np.zeros((256, 512, 3), np.float32)
@@ -398,7 +398,7 @@ def test_every_kind_of_emitter_gives_the_irradiance_of_its_closed_form() -> None
         "directional": ({"type": "directional", "direction": [1, 0, -1], "irradiance": rgb}, 2 / np.sqrt(2)),
         "point": ({"type": "point", "position": [0, 0, 2], "intensity": rgb}, 2.0 / 4),
         "constant": ({"type": "constant", "radiance": rgb}, 2 * np.pi),
-        # L = cos over the upper half: the integral of cos^2 is 2 pi / 3.
+        # L = cos over the upper hemisphere: the integral of cos^2 is 2 pi / 3.
         "map": ({"type": "envmap", "bitmap": mi.Bitmap(sky), "to_world": up}, 2 * np.pi / 3),
     }
     ground = make_splats_shape(floor(), proxy=slab(), instance=1, capture_light="uniform")
@@ -421,7 +421,7 @@ def test_wall_hides_half_of_a_sky() -> None:
 
 
 def test_highlight_takes_no_more_light_than_arrives() -> None:
-    """Under a uniform sky of radiance 1 a lobe of reflectance 1 shows at most 1 (white furnace)."""
+    """A lobe of reflectance 1 reflects at most 1 under a uniform sky of radiance 1 (white furnace)."""
     make_integrator()
     for roughness in (0.3, 0.5, 1.0):
         shiny = make_splats_shape(
@@ -448,7 +448,7 @@ def test_accuracy_out_of_range_is_refused() -> None:
 
 @pytest.mark.parametrize("roughness", [0.3, 0.6, 1.0])
 def test_an_object_in_the_light_of_its_capture_is_unchanged(roughness: float) -> None:
-    """Even light of radiance 1: the ratio is 1 to 1e-3, and the highlight replaces what the capture held of it."""
+    """Uniform light of radiance 1: the ratio is 1 to 1e-3, and the highlight replaces the captured one."""
     make_integrator()
     ground = make_splats_shape(
         floor(), proxy=slab(), instance=1, capture_light="uniform", specular=0.04, roughness=roughness
@@ -465,8 +465,7 @@ def test_an_object_in_the_light_of_its_capture_is_unchanged(roughness: float) ->
 def test_kernels_that_trace_one_scene_give_the_same_light(
     occluders: str, rays: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As on CUDA, where a kernel cannot trace several: what static and dynamic things stop is kept from one to the
-    next."""
+    """CUDA kernels trace one scene each; occlusion by static and dynamic objects is passed to the next kernel."""
     make_integrator()
     ball = trimesh.creation.icosphere(2, 0.05)
     ball.apply_translation([0, 0, 0.06])
@@ -509,9 +508,11 @@ def test_kernels_that_trace_one_scene_give_the_same_light(
 
 @pytest.mark.parametrize(("stride", "apart"), [(1, 0.18), (BLOCK * BLOCK, 0.24), (len(OFFSETS) * BLOCK * BLOCK, 0.06)])
 def test_sample_points_of_rays_do_not_repeat(stride: int, apart: float) -> None:
-    """Those of neighbours, of a pixel, and of each of a bent pixel's points.
+    """Sample points of neighbours, of one pixel, and of each point of a curved pixel differ.
 
-    The least n d^2 of points n steps apart, which sets that do not repeat keep from 0: Roberts' is 0.245.
+    The minimum of n d^2 over points n steps apart is bounded away from 0 for sequences without repetition; it is 0.245
+    for
+    Roberts' sequence.
     """
     step = np.array(RECURRENCE, dtype=np.int64) * stride % 2**32 / 2**32
     n = np.arange(1, 1025)

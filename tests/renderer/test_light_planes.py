@@ -1,4 +1,4 @@
-"""Light on planes from one of four pixels: which tiles, no seams, and shadows as of all pixels."""
+"""Light on coarse planes, traced at one of four pixels: choice of tiles, no seams, and shadows as with all pixels."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from mitsplat.renderer.rays.camera_rays import CameraView  # noqa: E402
 from mitsplat.renderer.rays.device_arrays import plain_mesh  # noqa: E402
 
 PLAIN = 0x40000001
-"""A code as planes have."""
+"""A surface code of planes."""
 
 
 def view_of(width: int, height: int) -> Any:
@@ -93,7 +93,7 @@ def test_constant_light_stays_constant_and_a_ramp_has_no_step() -> None:
     stood_for = coarse & ((x.astype(int) | y.astype(int)) & 1 > 0)
 
     def filled(image: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
-        known = np.where(stood_for, np.float32(7), image)  # not looked at
+        known = np.where(stood_for, np.float32(7), image)  # ignored values
         colour = mi.Color3f(mi.Float(known.ravel()))
         dr.eval(colour)
         result = between_samples(colour, mi.Bool(coarse.ravel()), view_of(width, height))
@@ -102,12 +102,12 @@ def test_constant_light_stays_constant_and_a_ramp_has_no_step() -> None:
     even = np.full((height, width), 0.3, np.float32)
     np.testing.assert_array_equal(filled(even), even)
     ramp = 0.1 + 0.01 * x - 0.003 * y
-    # Beyond the border of the image there is nothing to go on to.
+    # Interpolation at the border of the image lacks the next sample.
     np.testing.assert_allclose(filled(ramp)[:-1, :-1], ramp[:-1, :-1], atol=1e-6)
 
 
 def test_pixels_beside_a_coarse_tile_see_the_same_in_every_column() -> None:
-    """Light that depends on the row alone: those that stand for others are seen at all four."""
+    """Light depends on the row only: samples are weighted by the four pixels that they represent."""
     make_integrator()
     size = 2 * BLOCK
     camera = Camera.look_at((0, 0, 1), (0, 0, 0), up=(0, 1, 0), width=size, height=size, fov_x=20)
@@ -128,7 +128,7 @@ def test_pixels_beside_a_coarse_tile_see_the_same_in_every_column() -> None:
 
 
 def board(*, size: int = 160, error: float = 0.03, rays: int = 64, seed: int = 0, lamp: float = 0.1) -> Layers:
-    """A plate over a large visible board, under a lamp and a sky."""
+    """Render a plate over a large visible board, under a lamp and a sky."""
     plate = trimesh.creation.box(bounds=[[-0.1, -0.1, 0.1], [0.1, 0.1, 0.11]])
     ground = trimesh.creation.box(bounds=[[-3, -3, -0.1], [3, 3, 0]])
     pose = mi.ScalarTransform4f().look_at(origin=[0.6, 0, 1], target=[0, 0, 0], up=[0, 1, 0])
@@ -165,9 +165,9 @@ def test_shadows_on_planes_equal_those_of_all_pixels(monkeypatch: pytest.MonkeyP
     assert 0.2 < common.mean() < 0.95
     errors = [np.sqrt(np.mean((lights - truth)[:, common] ** 2)) for lights in (runs, whole)]
     assert errors[0] < max(1.15 * errors[1], 0.004)
-    # Their mean error is no other in a shadow: nothing is lost between the pixels that stand for others.
+    # The mean error is the same in a shadow: interpolation between samples loses no shadow.
     assert abs(np.mean((runs - whole)[:, common])) < 2e-3
-    # No seam: steps from tile to tile are no larger than those within tiles.
+    # There are no seams: steps between tiles are no larger than those within tiles.
     steps = np.abs(np.diff(runs - truth, axis=2))
     both = common[:, 1:] & common[:, :-1]
     border = both & (np.arange(1, truth.shape[1]) % BLOCK == 0)

@@ -38,7 +38,7 @@ Pixels = tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]
 
 
 def plane(low: tuple[float, float], high: tuple[float, float], z: float) -> Splats:
-    """An opaque grey rectangle of Gaussians."""
+    """Return an opaque grey rectangle of Gaussians."""
     n = 40
     x, y = np.meshgrid(*(np.linspace(a, b, n) for a, b in zip(low, high, strict=True)))
     spacing = max(high[0] - low[0], high[1] - low[1]) / (n - 1)
@@ -84,7 +84,7 @@ def load_scene() -> mi.Scene:
 
 @pytest.fixture(scope="module")
 def pictures() -> tuple[Array, Array]:
-    """Light and highlight of several seeds, shape (seeds, H, W)."""
+    """Render light and highlight with several seeds, shape (seeds, H, W)."""
     make_integrator()
     scene, integrator = load_scene(), make_integrator(white=WHITE)
     layers = [render_layers(integrator, scene, CAMERA, seed=seed) for seed in range(SEEDS)]
@@ -125,7 +125,7 @@ def assert_close(images: Array, pixels: Pixels, expected: list[float], *, bias: 
 
 
 def test_captured_surface_takes_the_ratio_of_irradiance(pictures: tuple[Array, Array]) -> None:
-    """The RMS error is below the wanted standard error, 0.03, and bias is an order of magnitude lower."""
+    """The RMS error is below the target standard error, 0.03, and the bias is an order of magnitude lower."""
     points, pixels = points_below_pixels((-0.5, -0.5), (-0.04, 0.5), 0.0, 8)
     expected = [SCENE.captured(point).factor for point in points]
     assert min(expected) < 0.3 and max(expected) > 0.99
@@ -133,7 +133,7 @@ def test_captured_surface_takes_the_ratio_of_irradiance(pictures: tuple[Array, A
 
 
 def test_faint_shadow_is_found_by_one_ray_per_pixel(pictures: tuple[Array, Array]) -> None:
-    """Light is interpolated between tiles of 8 pixels; the mean loss of light is known to a twelfth."""
+    """Light is interpolated between tiles of 8 pixels; the error of the mean loss of light is below a twelfth."""
     points, pixels = points_below_pixels((-0.54, -0.5), (-0.41, 0.5), 0.0, 6)
     expected = np.array([SCENE.captured(point).factor for point in points])
     faint = (expected < 0.997) & (expected > 0.97)

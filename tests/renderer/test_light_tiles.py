@@ -1,4 +1,4 @@
-"""What one ray a pixel says of tiles, and highlights without shadows, against slow twins and closed forms."""
+"""Estimates of tiles from one ray per pixel, and unshadowed highlights, against slow twins and closed forms."""
 
 from __future__ import annotations
 
@@ -74,7 +74,9 @@ def test_tiles_equal_those_of_a_slow_loop(width: int, height: int) -> None:
 
 
 def light_below_plate(camera: Camera, edge: float, height: float, **others: dict[str, Any]) -> np.ndarray:
-    """Light of four seeds (4, H, W) on a floor under an even sky, with a small plate in its way and other shapes."""
+    """Render light with four seeds (4, H, W) on a floor under a uniform sky, occluded by a small plate and other
+    shapes.
+    """
     plate = trimesh.creation.box(bounds=[[-edge / 2, -edge / 2, height], [edge / 2, edge / 2, height + 1e-4]])
     shapes = {
         "floor": make_splats_shape(floor(2.0), proxy=slab(2.0)),
@@ -88,7 +90,7 @@ def light_below_plate(camera: Camera, edge: float, height: float, **others: dict
 
 
 def test_a_faint_shadow_equals_its_form_factor() -> None:
-    """A small plate takes of an even sky the share of its form factor, A h^2 / (pi d^4), by one ray a pixel."""
+    """One ray per pixel: a small plate removes its form factor A h^2 / (pi d^4) from the light of a uniform sky."""
     edge, height = 0.12, 0.3
     camera = down_camera(3.0, 192, 24.0)
     light = light_below_plate(camera, edge, height)
@@ -101,11 +103,14 @@ def test_a_faint_shadow_equals_its_form_factor() -> None:
     assert blocks.sum() > 100
     assert abs(off.mean()) < 0.1 * factor[faint].mean()
     assert np.sqrt(np.mean(off**2)) < 0.5 * factor[faint].mean()
-    assert len(np.unique(light[0, faint])) > 100  # no steps
+    assert len(np.unique(light[0, faint])) > 100  # continuous values
 
 
 def test_a_faint_shadow_is_a_share_of_the_light_left_by_static_objects() -> None:
-    """A roof hides a part F of the sky: a plate before the rest takes f / (1 - F), and one before the roof nothing."""
+    """A roof hides the share F of the sky.
+
+    A plate before the rest of the sky removes f / (1 - F) of the light, and a plate before the roof removes nothing.
+    """
     edge, height, top = 0.12, 0.3, 1.0
     roof = trimesh.creation.box(bounds=[[0.5, -1.5, top], [3.5, 1.5, top + 0.01]])
     camera = down_camera(0.9, 192, 80.0)
@@ -132,7 +137,7 @@ def test_a_faint_shadow_is_a_share_of_the_light_left_by_static_objects() -> None
 def test_the_mean_lobe_weight_equals_the_reflectance_integral(roughness: float, cosine: float) -> None:
     """The mean weight of sampled directions is the integral of reflectance times cosine over the hemisphere."""
     n = 1 << 18
-    # Opaque, so that one kernel serves all.
+    # Opaque values, so that all cases share one kernel.
     across, along, alpha = (dr.opaque(mi.Float, x) for x in (float(np.sqrt(1 - cosine**2)), cosine, roughness**2))
     lobe = Lobe(mi.Vector3f(0, 0, 1), mi.Vector3f(across, 0.0, along), alpha, mi.Float(0.4))
     i = dr.arange(mi.UInt32, n)

@@ -1,4 +1,4 @@
-"""Shadow rays through splats: chances against products of transmittance, and what casts a shadow and what does not."""
+"""Shadow rays through splats: occlusion probability against transmittance, and choice of occluders."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ LAMP = {"type": "directional", "direction": [0, 0, -1], "irradiance": {"type": "
 
 
 def transmittance(splats: Splats, origin: np.ndarray, direction: np.ndarray, reach: float) -> float:
-    """Product of 1 - a G over the Gaussians whose peak lies on the way."""
+    """Return the product of 1 - a G over the Gaussians whose peak lies on the ray segment."""
     start = splats.means - origin
     axes = Rotation.from_quat(splats.quats).as_matrix().transpose(0, 2, 1)
     o = -np.einsum("nij,nj->ni", axes, start) / splats.scales
@@ -32,7 +32,7 @@ def transmittance(splats: Splats, origin: np.ndarray, direction: np.ndarray, rea
 
 
 def pane(z: float, opacity: float, *, hole: float = 0.0, width: float = 0.1) -> Splats:
-    """A sheet of flat Gaussians on a lattice, opaque enough together to count as closed, with a round hole."""
+    """Return a sheet of flat Gaussians on a lattice with a round hole, opaque enough to count as closed."""
     x, y = np.meshgrid(np.arange(-width, width + 1e-9, 0.004), np.arange(-width, width + 1e-9, 0.004))
     keep = np.hypot(x, y).ravel() >= hole
     count = int(keep.sum())
@@ -46,7 +46,7 @@ def pane(z: float, opacity: float, *, hole: float = 0.0, width: float = 0.1) -> 
 
 
 def seen(shapes: dict[str, Any], *, height: float = 0.6, **options: Any) -> Layers:
-    """From below what hangs above the floor, straight down."""
+    """Render the floor from below hanging shapes, straight down."""
     camera = Camera.look_at((0, 0, height), (0, 0, 0), up=(0, 1, 0), width=64, height=64, fov_x=20, near=0.001)
     integrator = make_integrator(occluders="splats", **options)
     scene = {"type": "scene", "floor": make_splats_shape(floor(), proxy=slab()), "lamp": LAMP, **shapes}
@@ -83,7 +83,7 @@ def test_chance_to_pass_is_the_product_of_transmittances() -> None:
     placed = splats.transformed(turn)
     exact = np.array([transmittance(placed, *one) for one in zip(origin, direction, reach, strict=True)])
     assert exact.min() < 0.2 and exact.max() > 0.7
-    # Of so many sets, and of solids with corners.
+    # Noise of the number of sets, plus the approximation of solids with corners.
     noise = np.sqrt(exact * (1 - exact) / occluders.solids.sets)
     assert (np.abs(passed - exact) < 4 * noise + 0.02).all()
     assert abs((passed - exact).mean()) < 0.01
@@ -91,7 +91,7 @@ def test_chance_to_pass_is_the_product_of_transmittances() -> None:
 
 @pytest.mark.parametrize("opacities", [(0.1,), (0.1, 0.1), (0.2, 0.05)])
 def test_layers_of_leaves_let_through_the_product(opacities: tuple[float, ...]) -> None:
-    """Mean light under layers of many Gaussians, against the mean over the floor of the product for vertical rays."""
+    """The mean light under layers of many Gaussians equals the floor's mean of the product along vertical rays."""
     layers = [pane(1 + 0.1 * i, opacity) for i, opacity in enumerate(opacities)]
     shapes = {f"layer_{i}": make_splats_shape(layer, instance=1 + i) for i, layer in enumerate(layers)}
     light = seen(shapes, shadow_error=0, shadow_samples=64).light[8:-8, 8:-8, 0]
@@ -110,7 +110,7 @@ def test_light_passes_a_hole_of_the_splats_that_the_mesh_lacks() -> None:
     radius = np.hypot(*np.meshgrid(centres, centres))
     through = seen(shapes).light[..., 0]
     assert through[radius < 0.028].mean() > 0.99
-    assert through[radius < 0.028].min() > 1 - 3 * 0.03  # of the standard error that rays are spent for
+    assert through[radius < 0.028].min() > 1 - 3 * 0.03  # target standard error: 0.03
     assert through[(radius > 0.052) & (radius < 0.09)].mean() < 0.02
     integrator = make_integrator()
     camera = Camera.look_at((0, 0, 0.6), (0, 0, 0), up=(0, 1, 0), width=64, height=64, fov_x=20, near=0.001)
@@ -119,7 +119,7 @@ def test_light_passes_a_hole_of_the_splats_that_the_mesh_lacks() -> None:
 
 
 def test_a_leaf_on_the_floor_casts_a_shadow_up_to_its_edge() -> None:
-    """The floor lies within the ellipsoids of the leaf's Gaussians, and none of its light arrives."""
+    """The floor is inside the ellipsoids of the leaf's Gaussians, but receives no light there."""
     leaf = pane(0.0004, 0.95, width=0.08)
     floor_below = Camera.look_at((0, 0, 0.0002), (0.05, 0, 0), up=(0, 0, 1), width=32, height=32, fov_x=60, near=1e-6)
     scene = {"type": "scene", "floor": make_splats_shape(floor(), proxy=slab()), "lamp": LAMP}
@@ -131,7 +131,7 @@ def test_a_leaf_on_the_floor_casts_a_shadow_up_to_its_edge() -> None:
 
 
 def test_a_surface_is_not_shadowed_by_its_own_gaussians() -> None:
-    """A sheet whose Gaussians scatter by their thickness, in slanting light, is as bright as its flat mesh."""
+    """A sheet with Gaussians scattered by their thickness is as bright in slanting light as its flat mesh."""
     sheet = pane(0.05, 0.9)
     rng = np.random.default_rng(1)
     means = sheet.means + rng.normal(0, 0.0003, sheet.means.shape) * [0, 0, 1]
@@ -147,7 +147,7 @@ def test_a_surface_is_not_shadowed_by_its_own_gaussians() -> None:
     light = layers.light[..., 0][inside & (layers.instance == 1)]
     assert light.size > 1000
     assert light.min() > 0.98 * light.max()
-    # Irradiance is measured against that of the floor, which the lamp meets at the same angle.
+    # Irradiance is relative to that of the floor, which has the same angle to the lamp.
     assert light.mean() == pytest.approx(1.0, abs=0.01)
 
 

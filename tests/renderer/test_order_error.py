@@ -1,4 +1,4 @@
-"""The error of the order of blending: its estimate, and tiles that are walked again where it is too large."""
+"""Errors of the blending order: their estimate, and repeated tiles above the tolerance."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ CROWD = make_splats(600, 51, scales=(0.02, 0.3))
 
 
 def display(layers: Layers) -> np.ndarray:
-    """Display-encoded colour, multiplied by alpha, as it is blended."""
+    """Return display-encoded colour, multiplied by alpha, as blended."""
     return encode_srgb(layers.rgb / np.maximum(layers.alpha, 1e-6)[..., None]) * layers.alpha[..., None]
 
 
 def errors(quality: Quality) -> np.ndarray:
-    """Largest error of each pixel's channels against the order of its ray, (H, W)."""
+    """Return the largest error of each pixel's channels against the order along its ray, (H, W)."""
     exact = display(render_splats(CROWD, WIDE, quality=replace(quality, tolerance=0.0)))
     return np.abs(display(render_splats(CROWD, WIDE, quality=quality)) - exact).max(axis=-1)
 
@@ -80,9 +80,9 @@ VIEWS = {
 @pytest.mark.parametrize("lens", VIEWS)
 @pytest.mark.parametrize("mesh", [False, True])
 def test_tolerance_zero_sorts_along_each_ray(lens: str, samples: int, mesh: bool) -> None:
-    """Whatever is late at all is walked again: colours, depths and ids are those of the exact order.
+    """Tolerance near zero repeats every tile with a late Gaussian: colours, depths and ids equal the exact order.
 
-    But for pixels where two Gaussians are equally far: kernels of a GPU round the same depth in more than one way.
+    Exceptions are pixels with two Gaussians at equal depth: kernels of a GPU round the same depth in several ways.
     """
     ensure_variant()
     camera = replace(WIDE, width=50, height=38, **VIEWS[lens])
@@ -111,7 +111,7 @@ def test_tolerance_zero_sorts_along_each_ray(lens: str, samples: int, mesh: bool
 
 
 def sheets(colour: Any) -> Splats:
-    """Round Gaussians in three wide, tilted layers, opaque together, whose colour is a function of x."""
+    """Return round Gaussians in three wide, tilted layers, opaque together, whose colour is a function of x."""
     rng = np.random.default_rng(7)
     x, y = (grid.ravel() for grid in np.meshgrid(np.linspace(-1.5, 1.5, 60), np.linspace(-1.2, 1.2, 48)))
     layers = []
@@ -132,18 +132,18 @@ def sheets(colour: Any) -> Splats:
 
 @pytest.mark.parametrize("samples", [1, 2])
 def test_tiles_of_different_orders_have_no_seams(monkeypatch: pytest.MonkeyPatch, samples: int) -> None:
-    """A picture of one colour keeps it, and a ramp has no steps, where tiles of all three orders lie side by side."""
+    """Tiles of all three orders lie side by side: a uniform image stays uniform, and a ramp has no steps."""
     from mitsplat.renderer.splatting import march
 
     judged = march._exceeds_tolerance
 
     def judged_or_some(errors: list[Any], inside: list[Any], tolerance: Any) -> Any:
-        """Also the black squares of a chequerboard of 12 x 18 tiles, and of those every other one a second time."""
+        """Add the black squares of a chequerboard of 12 x 18 tiles, and every other one of them a second time."""
         tile = dr.arange(mi.UInt32, dr.width(errors[0])) // (32 // len(errors))
         square = tile + tile // 12 if len(errors) > 1 else tile
         return judged(errors, inside, tolerance) | (square % 2 == 0)
 
-    monkeypatch.setattr(march, "rows_together", lambda order: 4 if order == "tile" else 1)  # also on a GPU
+    monkeypatch.setattr(march, "rows_together", lambda order: 4 if order == "tile" else 1)  # on every device
     monkeypatch.setattr(march, "_exceeds_tolerance", judged_or_some)
     quality = Quality(tolerance=1e-3, alpha_min=1e-4, transmittance_min=1e-5, samples=samples)
     even = render_splats(sheets(lambda x: np.full_like(x, 0.7)), WIDE, quality=quality)
@@ -152,11 +152,11 @@ def test_tiles_of_different_orders_have_no_seams(monkeypatch: pytest.MonkeyPatch
     exact = display(render_splats(sheets(lambda x: 0.8 * x), WIDE, quality=replace(quality, tolerance=0.0)))
     steps = np.abs(np.diff(ramp - exact, axis=1)).max(axis=(0, 2))
     assert np.ptp(ramp) > 0.3
-    assert steps[7::8].max() < 2e-3  # from the last column of a tile to the first of the next
+    assert steps[7::8].max() < 2e-3  # last column of a tile to first of the next
 
 
 def test_the_error_of_one_swapped_pair_is_estimated_exactly() -> None:
-    """Two neighbours that change places change a colour by the product of their opacities times what they differ."""
+    """Swapping two neighbours changes the colour by the product of their opacities times their difference."""
     ensure_variant()
     from mitsplat.renderer.splatting.blending import ERROR, blend, new_state
 
@@ -169,7 +169,7 @@ def test_the_error_of_one_swapped_pair_is_estimated_exactly() -> None:
 
 
 def test_the_colour_of_one_swapped_pair_is_corrected_exactly() -> None:
-    """The colour is that of the right order, and a third one, late behind both, is blended as it comes."""
+    """The colour equals that of the right order; a third Gaussian, late behind both, is blended in list order."""
     ensure_variant()
     from mitsplat.renderer.splatting.blending import BLUE, RED, blend, new_state
 
@@ -202,7 +202,7 @@ def test_corrected_images_of_one_colour_keep_it() -> None:
 
 
 def test_the_remaining_order_error_is_reported_with_the_image() -> None:
-    """The largest within the tolerance, since tiles above it are made again; the mean by any order of its sum."""
+    """The largest error is within the tolerance, because worse tiles are repeated; the mean is approximate."""
     small, large = (render_splats(CROWD, WIDE, quality=replace(RAY, tolerance=t)).order_error for t in (5e-3, 0.1))
     assert small is not None and large is not None
     assert 0 < small["mean"] < small["largest"] <= 5e-3 < large["largest"] <= 0.1
@@ -223,7 +223,7 @@ def test_reported_order_errors_equal_those_of_the_pixels() -> None:
 
 
 def test_balanced_pops_less_than_fast() -> None:
-    """While a camera turns by a tenth of a degree, what the order of blending alone changes from picture to picture."""
+    """Measures frame-to-frame changes by the blending order alone while the camera rotates by a tenth of a degree."""
 
     def popping(preset: PresetName) -> float:
         quality = PRESETS[preset]
@@ -257,7 +257,9 @@ TURNING = [turned(0.02 * step) for step in range(6)]
 
 
 def test_tiles_sort_by_the_depth_at_the_visible_footprint() -> None:
-    """Around the mean of the product of two normal distributions: the footprint's, and that of the tile's pixels."""
+    """The sort depth is at the mean of the product of two normal distributions: the footprint, and the tile's
+    pixels.
+    """
     ensure_variant()
     from mitsplat.renderer.projection.records import GaussianRecord
     from mitsplat.renderer.splatting.tile_depths import depth_where_seen

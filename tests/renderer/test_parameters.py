@@ -1,4 +1,4 @@
-"""What a scene says of a plugin is refused in one sentence where it is of another type, or out of range."""
+"""Plugin parameters of the wrong type or out of range raise an error of one sentence."""
 
 from __future__ import annotations
 

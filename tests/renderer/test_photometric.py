@@ -15,7 +15,7 @@ BORDER = 11
 
 
 def pictures() -> tuple[np.ndarray, np.ndarray]:
-    """Two pictures (3, H, W) that are equal and flat where windows reach beyond the border."""
+    """Return two images (3, H, W) that are equal and flat where windows extend beyond the border."""
     rng = np.random.default_rng(2)
     a = np.zeros((3, HEIGHT, WIDTH))
     inner = np.s_[:, BORDER:-BORDER, BORDER:-BORDER]
@@ -55,7 +55,7 @@ def test_gradient_equals_finite_differences() -> None:
     a, b = rng.random((3, HEIGHT, WIDTH)), rng.random((3, HEIGHT, WIDTH))
     for share in (0.2, 1.0):
         _, gradient = loss(a, b, share)
-        direction = np.where(a > b, 1.0, -1.0) * rng.random(a.shape)  # no pixel changes the sign of its difference
+        direction = np.where(a > b, 1.0, -1.0) * rng.random(a.shape)  # no difference changes its sign
         step = 1e-3
         expected = (loss(a + step * direction, b, share)[0] - loss(a - step * direction, b, share)[0]) / (2 * step)
         np.testing.assert_allclose((gradient * direction).sum(), expected, rtol=5e-3)

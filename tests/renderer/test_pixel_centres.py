@@ -1,4 +1,4 @@
-"""Labels belong to the centres of pixels, whatever the number of rays that colours are averaged over."""
+"""Labels sample the pixel centres, for any number of colour samples per pixel."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ PINHOLE = Camera(96, 72, 300.0, 300.0, 48.3, 36.4, np.eye(4), focus_distance=1.0
 THIN = replace(PINHOLE, aperture_radius=0.02)
 DISTORTED = replace(PINHOLE, distortion=(-0.1, 0.02, 0.0, 0.0, 0.0))
 RADIUS, DEPTH = 0.06, 1.0
-"""Of a disc before the camera [m]; 18 pixels wide."""
+"""Radius and depth of a disc before the camera [m]; its width is 18 pixels."""
 
 
 def disc() -> Any:
-    """A disc of one wide, opaque Gaussian, which half of the light passes at its edge."""
+    """Return a disc of one wide, opaque Gaussian, whose edge transmits half of the light."""
     sigma = RADIUS / np.sqrt(2 * np.log(0.9 / 0.5))
     return make_splats_shape(
         Splats([(0, 0, DEPTH)], [(0, 0, 0, 1)], [(sigma, sigma, 1e-4)], [0.9], np.zeros((1, 1, 3))), instance=1
@@ -33,13 +33,13 @@ def disc() -> Any:
 
 
 def centroid(mask: npt.NDArray[np.bool_], x: int = 0, y: int = 0) -> npt.NDArray[np.float64]:
-    """Middle [px] of the pixels of a mask whose first one is at (x, y)."""
+    """Return the centroid [px] of a mask whose first pixel is at (x, y)."""
     rows, columns = np.nonzero(mask)
     return np.array([columns.mean() + 0.5 + x, rows.mean() + 0.5 + y])
 
 
 def expected(camera: Camera) -> npt.NDArray[np.bool_]:
-    """Pixels whose centre's ray meets the disc."""
+    """Return the pixels whose centre ray hits the disc."""
     x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
     slopes = camera.ray_slopes(np.stack([x.ravel(), y.ravel()], axis=1))
     return (np.linalg.norm(slopes, axis=1) < RADIUS / DEPTH).reshape(camera.height, camera.width)
@@ -65,7 +65,7 @@ def test_discs_cover_the_pixels_whose_centres_see_them(samples: int, camera: Cam
 
 @pytest.mark.parametrize("samples", [1, 2, 3])
 def test_a_mesh_behind_splats_has_the_id_where_pixel_centres_see_it(samples: int) -> None:
-    """Where less than half of the centre's ray is blocked, id and depth are those of the visible mesh behind."""
+    """Where less than half of the centre ray is blocked, id and depth are those of the visible mesh behind."""
     ensure_variant()
     import trimesh
 

@@ -1,4 +1,4 @@
-"""What is replayed equals what is traced."""
+"""Recorded kernels: replays equal traced execution."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from tests.renderer.test_render import CAMERA, make_splats
 
 
 def test_recordings_depend_on_counts_and_sizes_and_not_on_values() -> None:
-    """Dr.Jit's own choice takes some numbers for others, in calls such as these."""
+    """Dr.Jit's automatic choice treats some numbers as equal in such calls."""
     ensure_variant()
     traced: list[tuple[int, int]] = []
 
@@ -51,7 +51,7 @@ def test_recordings_depend_on_counts_and_sizes_and_not_on_values() -> None:
 
 @pytest.mark.parametrize("distortion", [(), (-0.2, 0.05, 0.01, -0.01)])
 def test_recorded_gradients_equal_traced_ones(distortion: tuple[float, ...], monkeypatch: pytest.MonkeyPatch) -> None:
-    """Views differ in how many pairs of a Gaussian and a tile they have, down to none."""
+    """Views differ in their number of pairs of Gaussian and tile, down to none."""
     ensure_variant()
     model = GaussianModel(make_splats(300, 36, bands=4), 1.0)
     pairs: list[int] = []
@@ -77,7 +77,7 @@ def test_recorded_gradients_equal_traced_ones(distortion: tuple[float, ...], mon
     assert 0 in pairs and len(set(pairs)) > 4 and np.abs(traced[0][0]).max() > 0
     for turn, found in enumerate(replayed):
         for one, other in zip(found, traced[turn % len(shifts)], strict=True):
-            # GPUs divide by a number that is known when a kernel is compiled otherwise than by one that is not.
+            # GPUs round divisions by compile-time constants differently from divisions by variables.
             rounding = 0.0 if mi.variant().startswith("llvm") else 1e-5 * np.abs(other).max(initial=0.0)
             np.testing.assert_allclose(one, other, rtol=0, atol=rounding)
     for first, second in zip(replayed[: len(shifts)], replayed[len(shifts) :], strict=True):
@@ -87,7 +87,7 @@ def test_recorded_gradients_equal_traced_ones(distortion: tuple[float, ...], mon
 
 @pytest.mark.cpu(reason="what GPUs round otherwise grows over the steps of a fit")
 def test_a_fit_with_recordings_has_the_bytes_of_a_traced_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """With all that changes its kernels: sizes, degrees, depths and numbers of Gaussians."""
+    """The fit varies everything that changes its kernels: sizes, degrees, depths and numbers of Gaussians."""
     ensure_variant()
     (tmp_path / "photos").mkdir()
     capture = seeing(photograph(tmp_path / "photos"))

@@ -1,4 +1,4 @@
-"""Rectangular lamps by table against Mitsuba's own plugins."""
+"""Tabulated rectangular lamps against Mitsuba's plugins."""
 
 from __future__ import annotations
 

@@ -49,14 +49,14 @@ def make_splats(
 def one(
     scales: tuple[float, float, float], *, mean=(0.0, 0.0, 0.0), quat=(0.0, 0.0, 0.0, 1.0), opacity=1.0, count=1
 ) -> Splats:
-    """Equal Gaussians of display-encoded colour (0.2, 0.5, 0.8)."""
+    """Return identical Gaussians of display-encoded colour (0.2, 0.5, 0.8)."""
     colour = (np.array([0.2, 0.5, 0.8]) - 0.5) / SH_C0
     tile = lambda v: np.tile(np.asarray(v, dtype=np.float64), (count, 1))  # noqa: E731
     return Splats(tile(mean), tile(quat), tile(scales), np.full(count, opacity), tile(colour)[:, None, :])
 
 
 def error(layers: Layers, splats: Splats, camera: Camera, quality: Quality = PRESETS["exact"]) -> float:
-    """Largest difference of colour and alpha from the twin, colour compared linear."""
+    """Return the largest difference of colour and alpha from the twin, with linear colour."""
     twin = render_reference(splats, camera, quality)
     alpha = np.maximum(twin.alpha, 1e-6)[..., None]
     linear = decode_srgb(twin.rgb / alpha) * twin.alpha[..., None]
@@ -120,7 +120,7 @@ def test_kernels_and_responses_follow_the_twin(response: str, kernel: str) -> No
 
 
 def test_small_gaussians_keep_their_light_at_any_position_in_a_pixel() -> None:
-    """Under ``mip`` the opacities of all pixels add up to about 2 pi sigma^2 o. Point samples sparkle.
+    """With ``mip``, the opacities of all pixels add up to about 2 pi sigma^2 o; point samples would flicker.
 
     Poisson's summation formula bounds the sum of a Gaussian's samples: 1 +- 2 exp(-2 pi^2 v) along each axis, with the
     widened variance v.
@@ -156,7 +156,7 @@ def test_kernel_of_a_distorted_lens_has_the_size_of_its_pixels() -> None:
 @pytest.mark.parametrize("count", [20, 200])
 @pytest.mark.parametrize("tolerance", [0.0, 1e-3, math.inf])
 def test_coincident_layers_multiply_their_transmittances(count: int, tolerance: float) -> None:
-    """K layers of opacity a at one place leave (1 - a)^K of the light."""
+    """K layers of opacity a at one place transmit (1 - a)^K of the light."""
     splats = one((50.0, 50.0, 0.001), opacity=0.01, count=count)
     quality = Quality(tolerance=tolerance, alpha_min=1e-6, transmittance_min=0)
     alpha = render_splats(splats, CAMERA, quality=quality).alpha
@@ -165,7 +165,7 @@ def test_coincident_layers_multiply_their_transmittances(count: int, tolerance: 
 
 @pytest.mark.parametrize("tolerance", [0.0, 1e-3, math.inf])
 def test_an_ended_ray_has_the_colour_of_its_gaussians_only(tolerance: float) -> None:
-    """Eleven layers of opacity 0.3 leave less than 0.02 of the light, which goes to nothing, or is of their colour."""
+    """Eleven layers of opacity 0.3 transmit less than 0.02; that rest is lost, or has the layers' colour."""
     quality = Quality(tolerance=tolerance, alpha_min=1e-6, transmittance_min=0.02)
     for count, left in ((5, 0.7**5), (30, 0.7**11)):
         splats = one((50.0, 50.0, 0.001), opacity=0.3, count=count)
@@ -191,7 +191,9 @@ def test_powers_of_two_agree_with_numpy() -> None:
 
 
 def test_equal_depths_keep_their_order_when_others_come_between() -> None:
-    """More coincident layers than one walk can hold, and small Gaussians in front that the walk meets after them."""
+    """There are more coincident layers than one walk can hold, and small Gaussians in front that come later in the
+    list.
+    """
     layers = one((0.5, 0.5, 0.5), opacity=0.2, count=24)
     layers = replace(layers, sh=np.random.default_rng(3).uniform(-1, 1, layers.sh.shape))
     front = [one((0.02, 0.02, 0.02), mean=(0.0, 0.0, -0.1 - 0.02 * i), opacity=0.1) for i in range(5)]
@@ -236,12 +238,12 @@ def test_each_lens_equals_the_slow_twin(lens: str) -> None:
 
 @pytest.mark.parametrize("lens", LENSES)
 def test_an_undistorted_lens_image_equals_the_pinhole_image(lens: str) -> None:
-    """Every pixel of a pinhole is looked up where OpenCV says that the lens shows it."""
+    """Every pixel of the pinhole image is looked up at its position in the lens image according to OpenCV."""
     pinhole = Camera.look_at((0, 0, -2), (0, 0, 0), up=(0, -1, 0), width=48, height=36, fov_x=60)
     focal = {"fx": 8 * 48.0, "fy": 8 * 48.0}
     bent = replace(pinhole.resized(8 * 48, 8 * 36), **LENSES[lens] | focal)
     splats = make_splats(40, 17, scales=(0.1, 0.3), bands=1)
-    splats = replace(splats, sh=np.full_like(splats.sh, 0.7))  # of one colour: where orders change there is no edge
+    splats = replace(splats, sh=np.full_like(splats.sh, 0.7))  # one colour: no edges where orders change
     x, y = np.meshgrid(np.arange(48) + 0.5, np.arange(36) + 0.5)
     rays = np.concatenate([pinhole.ray_slopes(np.stack([x.ravel(), y.ravel()], axis=1)), np.ones((48 * 36, 1))], axis=1)
     if lens == "fisheye":
@@ -261,7 +263,7 @@ def test_an_undistorted_lens_image_equals_the_pinhole_image(lens: str) -> None:
 
 @dataclass(frozen=True, eq=False)
 class ThroughAPoint(Camera):
-    """A thin lens as one of its points sees: rays meet those of the centre in the plane of focus."""
+    """Camera at one point of a thin lens: its rays meet the rays of the centre in the plane of focus."""
 
     point: tuple[float, float] = (0.0, 0.0)
 
@@ -294,9 +296,9 @@ def test_thin_lens_follows_the_twin_through_every_point_of_the_aperture(lens: st
 
 @pytest.mark.parametrize("z", [0.8, 1.5, 4.0])
 def test_thin_lens_blurs_by_its_circle_of_confusion(z: float) -> None:
-    """A uniform disk of radius f a |1/F - 1/z| has the variance radius^2 / 4 along each axis, which is added.
+    """A uniform disk of radius f a |1/F - 1/z| adds the variance radius^2 / 4 along each axis.
 
-    A Gaussian is blurred by its own depth too: in the mean over it, radius^2 is larger by (f a sigma / z^2)^2.
+    A Gaussian is also blurred by its own depth: its mean of radius^2 is larger by (f a sigma / z^2)^2.
     """
     camera = Camera(96, 72, 150.0, 150.0, 48.0, 36.0, np.eye(4), aperture_radius=0.08, focus_distance=1.5)
     dot = one((0.01 * z,) * 3, mean=(0, 0, z), opacity=0.5)
@@ -312,7 +314,7 @@ def test_thin_lens_blurs_by_its_circle_of_confusion(z: float) -> None:
 
 
 def test_other_integrators_render_through_the_thin_lens() -> None:
-    """A far bright disk in Mitsuba's path tracer is blurred to the same size."""
+    """A distant bright disk in Mitsuba's path tracer has the same blur size."""
     camera = Camera(64, 48, 100.0, 100.0, 32.0, 24.0, np.eye(4), aperture_radius=0.1, focus_distance=1.0)
     light = {"type": "area", "radiance": {"type": "rgb", "value": 1.0}}
     pose = mi.ScalarTransform4f().translate([0, 0, 4]).rotate([0, 1, 0], 180).scale(0.04)
@@ -325,7 +327,7 @@ def test_other_integrators_render_through_the_thin_lens() -> None:
 
 
 def test_gaussians_far_from_the_origin_keep_their_pixels() -> None:
-    """10 km from the origin, on coordinates that float32 can hold."""
+    """The Gaussians are 10 km from the origin, on coordinates that float32 can represent."""
     near = make_splats(30, 15)
     shift = np.array([8192.0, -4096.0, 2048.0])
     grid = 2.0**-10
@@ -348,8 +350,12 @@ def test_rotating_object_and_camera_together_does_not_change_the_image() -> None
 
 
 def test_turning_the_camera_changes_no_ray() -> None:
-    """Popping: while the camera turns by 0.1 degrees a step, one line of sight keeps its colour, wherever in the image
-    and in its tile it falls. In the order of tiles it does not, because its neighbours decide."""
+    """No popping: while the camera rotates by 0.1 degrees a step, one line of sight has a constant colour.
+
+    This holds at any position in the image and in its tile. The tile order does not have this property, because it
+    depends
+    on neighbouring pixels.
+    """
     splats = make_splats(150, 31, scales=(0.1, 0.5), bands=1)
     sight = CAMERA.world_from_camera[:3, :3] @ (0.03, -0.02, 1.0)
 
@@ -444,7 +450,7 @@ def test_a_gaussian_reaching_the_camera_from_behind_a_wall_stays_hidden(distorti
     )
     camera = replace(CAMERA, world_from_camera=np.eye(4), distortion=distortion)
     fast, exact = (render_splats(splats, camera, quality=name).rgb for name in ("fast", "exact"))
-    assert exact.min() > 0.66  # the dark Gaussian, whose ellipsoid holds the camera, is hidden
+    assert exact.min() > 0.66  # the dark Gaussian around the camera is hidden
     np.testing.assert_allclose(fast, exact, atol=0.02)
 
 
@@ -483,7 +489,7 @@ def test_denormal_scales_stay_finite() -> None:
 
 @pytest.mark.parametrize("preset", ["fast", "balanced", "exact"])
 def test_needles_thinner_than_rounding_keep_their_brightness(preset: str) -> None:
-    """Axes of 0.1 nm seen from 2 m: rounding made responses of any size of them, and pixels that were no numbers."""
+    """Axes of 0.1 nm seen from 2 m: rounding used to give responses of arbitrary size, and NaN pixels."""
     splats = make_splats(400, 41)
     rng = np.random.default_rng(41)
     for longest in (-8.0, -0.5):
@@ -516,7 +522,9 @@ def test_repeated_runs_and_one_thread_give_the_same_bytes() -> None:
 
 
 def test_a_second_frame_compiles_no_new_kernel() -> None:
-    """The kernels of another camera and other splats are those of the first frame, not merely on disk by chance."""
+    """The kernels of another camera and other splats are those of the first frame, not other kernels from the disk
+    cache.
+    """
 
     def kernels(splats: Splats, camera: Camera) -> set[int]:
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
@@ -524,7 +532,7 @@ def test_a_second_frame_compiles_no_new_kernel() -> None:
             render_splats(splats, camera)
             return {k["hash"] for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT}
 
-    first = kernels(make_splats(400, 27), CAMERA)  # crowded enough that tiles of both are walked again
+    first = kernels(make_splats(400, 27), CAMERA)  # crowded enough that both repeat tiles
     moved = Camera.look_at((0.3, 0.2, -1.9), (0.1, 0, 0), up=(0, -1, 0), width=32, height=24, fov_x=42)
     assert first
     assert kernels(make_splats(500, 28), moved) <= first
@@ -559,7 +567,7 @@ def test_presets_are_close_to_exact_on_captures(name: str) -> None:
     camera = Camera.look_at(eye, centre, up=(0, -1, 0), width=640, height=480, fov_x=50)
 
     def shown(quality: str) -> np.ndarray:
-        """Display-encoded colour over black, as captures are compared."""
+        """Return display-encoded colour over black, the form in which captures are compared."""
         layers = render_splats(splats, camera, quality=quality)
         return encode_srgb(layers.rgb / np.maximum(layers.alpha, 1e-6)[..., None]) * layers.alpha[..., None]
 

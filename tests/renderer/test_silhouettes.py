@@ -1,4 +1,4 @@
-"""Silhouettes: each equals what the integrator shows of the instance with nothing else in the scene."""
+"""Silhouettes equal renderings of the single instance without other objects."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ WIDTH, HEIGHT = 96, 64
 
 
 def ball(seed: int, radius: float = 0.05, count: int = 300) -> tuple[ms.Splats, trimesh.Trimesh]:
-    """Gaussians of mixed opacity on a sphere, and the sphere."""
+    """Return Gaussians of mixed opacity on a sphere, and the sphere."""
     rng = np.random.default_rng(seed)
     normal = rng.normal(size=(count, 3))
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
@@ -37,7 +37,7 @@ def ball(seed: int, radius: float = 0.05, count: int = 300) -> tuple[ms.Splats, 
 
 
 def placed() -> dict[str, Any]:
-    """Overlapping balls: one behind the other, one cut by the border, one outside, one far outside, one not there."""
+    """Return overlapping balls: one behind another, one cut by the border, one outside, one far outside, one absent."""
     positions = {1: (0, 0, 0), 2: (0.03, 0.05, 0.02), 7: (-0.17, 0, 0.1), 9: (0, 0.02, -0.27), 300: (3, 0, 0)}
     shapes: dict[str, Any] = {}
     for number, position in positions.items():
@@ -82,7 +82,7 @@ def test_silhouettes_equal_renderings_of_single_instances(
             shown = moved.image_mask(3 * WIDTH, 3 * HEIGHT)
         else:
             shown = np.zeros_like(expected)
-        if distortion:  # the canvas may be smaller than the one that is compared with
+        if distortion:  # the canvas may be smaller than the reference
             edge = [
                 slice(HEIGHT - HEIGHT // 8, 2 * HEIGHT + HEIGHT // 8),
                 slice(WIDTH - WIDTH // 8, 2 * WIDTH + WIDTH // 8),
@@ -108,8 +108,8 @@ def test_visible_pixels_lie_inside_of_silhouettes() -> None:
     for number in (1, 2, 7):
         seen = layers.instance == number
         assert seen.any()
-        assert np.count_nonzero(seen & ~found[number].image_mask(WIDTH, HEIGHT)) <= 2  # three instances mix there
-    assert 0 < np.count_nonzero(layers.instance == 2) < 0.9 * found[2].area  # hidden in part
+        assert np.count_nonzero(seen & ~found[number].image_mask(WIDTH, HEIGHT)) <= 2  # three instances overlap there
+    assert 0 < np.count_nonzero(layers.instance == 2) < 0.9 * found[2].area  # partly hidden
 
 
 def test_a_scene_without_instances_has_no_silhouettes() -> None:
@@ -140,7 +140,7 @@ def test_crowded_silhouettes_are_rendered_in_parts(monkeypatch: pytest.MonkeyPat
 
 
 def test_more_instances_than_bits_have_their_silhouettes() -> None:
-    """More instances than a word has bits, with ids that are far apart."""
+    """The scene has more instances than a word has bits, with ids far apart."""
     ensure_variant()
     splats, _ = ball(1, radius=0.01, count=40)
     shapes = {}

@@ -12,7 +12,7 @@ from mitsplat.runtime.variant import ensure_variant
 
 
 def sky_with_a_sun() -> dict[str, object]:
-    """Clouds, and a sun of four degrees that sends as much light as they do."""
+    """Return clouds, and a sun of four degrees with as much irradiance as the clouds."""
     rng = np.random.default_rng(3)
     sky = rng.uniform(0.2, 0.8, (96, 192, 3)).astype(np.float32)
     sky[30:32, 50:52] = (900, 800, 600)
@@ -21,7 +21,7 @@ def sky_with_a_sun() -> dict[str, object]:
 
 
 def by_quadrature(emitter: object, normals: np.ndarray) -> np.ndarray:
-    """Irradiance (N, 3) on unit normals (N, 3), by the midpoint rule over the sphere."""
+    """Return irradiance (N, 3) on unit normals (N, 3), by the midpoint rule over the sphere."""
     rows, columns = 384, 768
     theta = (np.arange(rows) + 0.5) / rows * np.pi
     phi = (np.arange(columns) + 0.5) / columns * 2 * np.pi
@@ -35,7 +35,9 @@ def by_quadrature(emitter: object, normals: np.ndarray) -> np.ndarray:
 
 
 def test_the_irradiance_table_agrees_with_a_quadrature() -> None:
-    """Within 1 % of the sky's largest where the sun sets, and 0.25 % in the mean of all normals."""
+    """Errors are within 1 % of the sky's largest irradiance where the sun sets, and 0.25 % in the mean of all
+    normals.
+    """
     ensure_variant()
     scene = mi.load_dict({"type": "scene", "sky": sky_with_a_sun()})
     rng = np.random.default_rng(0)
@@ -50,7 +52,7 @@ def test_the_irradiance_table_agrees_with_a_quadrature() -> None:
 
 
 def test_the_octahedral_map_is_bijective() -> None:
-    """Directions come back, those on the fold and on the axes too."""
+    """The round trip is exact to rounding, also for directions on the fold and on the axes."""
     ensure_variant()
     rng = np.random.default_rng(1)
     vectors = np.concatenate([rng.normal(size=(1000, 3)), np.eye(3), -np.eye(3), [[1, 1, 0], [-1, 0, -1], [0, -1, -1]]])

@@ -1,4 +1,4 @@
-"""Patterns of materials: they repeat without a seam, in their colours, and lie on surfaces in their size."""
+"""Material patterns: seamless repetition, colours, and physical size on surfaces."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def test_patterns_are_between_their_colours_without_seams(kind: str) -> None:
 
 
 def test_a_pattern_has_its_size_on_every_face() -> None:
-    """Lengths on a face are lengths in its image: the projection is along the faces of a turned box."""
+    """Lengths on a face equal lengths in its image: the projection follows the faces of a rotated box."""
     shape = Shape(name="a", box=Box(size=(0.4, 0.3, 0.2), rotate=(20, 30, 40)), visible=True)
     assert shape.box is not None
     pose = pose_matrix(shape.box)
@@ -61,14 +61,14 @@ def test_a_pattern_has_its_size_on_every_face() -> None:
     for corners, at in zip(np.asarray(mesh.triangles), uv, strict=True):
         lengths = np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=1)
         np.testing.assert_allclose(np.linalg.norm(at - np.roll(at, 1, axis=0), axis=1) * repeat_width(wood), lengths)
-        # Rows of an image go down: from outside, corners that run counterclockwise do the reverse in (u, v).
+        # Image rows go down: corners that are counterclockwise from outside are clockwise in (u, v).
         (a, b), (c, d) = at[1] - at[0], at[2] - at[0]
         assert a * d - b * c < 0
 
 
 @pytest.mark.parametrize("distance", [0.5, 4.0])
 def test_a_pixel_is_the_mean_of_its_footprint(tmp_path: Path, distance: float) -> None:
-    """Held against the mean of many rays through each pixel, near and far from a picture of fine squares."""
+    """Compares with the mean of many rays through each pixel, near and far from an image of fine squares."""
     ensure_variant()
     cells = np.indices((64, 64)).sum(axis=0) % 2
     cv2.imwrite(str(tmp_path / "a.png"), (np.stack([cells] * 3, axis=2) * 200 + 20).astype(np.uint8))

@@ -1,4 +1,4 @@
-"""Lists of Gaussians per tile: what is in them, and in which order."""
+"""Tile lists: their Gaussians and order."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -42,7 +42,7 @@ def test_entries_ascend_by_depth_and_number_and_have_a_place_by_record(lens: dic
 
 
 def test_sorts_agree_with_numpy() -> None:
-    """In several threads as in one; and the stable radix sort of keys of 64 bits, by which a GPU sorts."""
+    """Several threads agree with one; the stable radix sort of 64-bit keys is the GPU's sort."""
     ensure_variant()
     from mitsplat.renderer.splatting.sorting import sort_in_threads, stable_order
 
@@ -92,7 +92,9 @@ def test_both_sorts_give_the_same_lists(monkeypatch: pytest.MonkeyPatch) -> None
 def test_projection_and_walk_of_both_devices_give_the_same_images(
     preset: PresetName, lens: dict[str, tuple[float, ...]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """All Gaussians at once and a ray a lane, as on a GPU, or what is seen and four: also near the camera's plane."""
+    """Compares all Gaussians with one ray per lane, as on a GPU, to visible ones with four; also near the camera
+    plane.
+    """
     from mitsplat.renderer.splatting import march, tiles
     from mitsplat.renderer.splatting.lanes import rows_together
 
@@ -104,7 +106,7 @@ def test_projection_and_walk_of_both_devices_give_the_same_images(
         monkeypatch.setattr(tiles, "_skips_culling", lambda _, at_once=at_once: at_once)
         monkeypatch.setattr(march, "rows_together", lambda order, rows=rows: rows if order == "tile" else 1)
         found.append([render_splats(make_splats(700, 8), camera, quality=quality) for camera in cameras])
-    rounding = 5e-6 if mi.variant() == "cuda_ad_rgb" else 0.0  # there a branch rounds by how many rays are in it
+    rounding = 5e-6 if mi.variant() == "cuda_ad_rgb" else 0.0  # a GPU branch rounds by its number of rays
     for seen, again in zip(*found, strict=True):
         for name in ("rgb", "alpha", "depth", "instance"):
             np.testing.assert_allclose(getattr(seen, name), getattr(again, name), rtol=rounding, atol=0, err_msg=name)

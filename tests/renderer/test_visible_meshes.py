@@ -1,4 +1,4 @@
-"""Visible meshes beside splats: Mitsuba's materials, what mirrors and glass show, emitters that the camera sees."""
+"""Visible meshes beside splats: Mitsuba materials, mirror and glass images, and visible emitters."""
 
 from __future__ import annotations
 
@@ -62,12 +62,12 @@ def scene_of(material: str, light: str, *, ground: bool = False) -> Any:
 
 @lru_cache
 def physical(samples: int) -> Any:
-    """An integrator whose picture is radiance."""
+    """Return an integrator whose image is radiance."""
     return make_integrator(white=float(np.pi), mesh_samples=samples, max_depth=6, shadow_error=0, shadow_samples=256)
 
 
 def pictures(scene: Any, integrator: Any, seeds: int, **options: Any) -> np.ndarray:
-    """Linear pictures (seeds, H, W, 3)."""
+    """Render linear images (seeds, H, W, 3)."""
     sensor = scene.sensors()[0]
     return np.array(
         [np.array(integrator.render(scene, sensor, seed=seed, **options))[..., :3] for seed in range(seeds)]
@@ -75,7 +75,7 @@ def pictures(scene: Any, integrator: Any, seeds: int, **options: Any) -> np.ndar
 
 
 def ball_pixels() -> np.ndarray:
-    """Pixels (H, W) that show nothing but the ball."""
+    """Return the pixels (H, W) that show only the ball."""
     scene = scene_of("diffuse", "constant")
     depth = np.array(physical(1).render(scene, scene.sensors()[0]))[..., 7]
     ball = depth > 0
@@ -83,7 +83,7 @@ def ball_pixels() -> np.ndarray:
 
 
 def compare(scene: Any, depth: int) -> tuple[float, float, float, float]:
-    """Means over the ball of the pictures and of Mitsuba's path tracer, RMSE between them, and RMSE by noise alone."""
+    """Return means over the ball of our and Mitsuba's path-traced images, their RMSE, and the RMSE of noise alone."""
     inside = ball_pixels()
     path = mi.load_dict({"type": "path", "max_depth": depth, "rr_depth": 100})
     ours = pictures(scene, physical(SAMPLES), SEEDS)[:, inside]
@@ -96,11 +96,11 @@ def compare(scene: Any, depth: int) -> tuple[float, float, float, float]:
 @pytest.mark.parametrize("light", ["constant", "point", "area", "envmap"])
 @pytest.mark.parametrize("material", ["diffuse", "roughconductor", "plastic", "principled"])
 def test_materials_equal_those_traced_by_mitsuba(material: str, light: str) -> None:
-    """The difference of two unbiased pictures has the variance of both: 256 paths a pixel each."""
+    """The variance of the difference of two unbiased images is the sum of both: 256 paths per pixel each."""
     ours, theirs, rmse, noise = compare(scene_of(material, light), 2 if material == "diffuse" else 6)
     assert theirs > 0.03
     assert ours == pytest.approx(theirs, rel=0.01)
-    # A tenth more than noise explains; the floor is for colours that change within a pixel or the light filter.
+    # 10 % above the noise; the constant covers colours that change within a pixel, and the light filter.
     assert rmse < 1.1 * noise + 0.003
 
 
@@ -120,7 +120,7 @@ def test_without_light_metal_is_black_and_diffuse_meshes_have_their_own_colour()
 
 
 def mirror(z: float = 0.0) -> dict[str, Any]:
-    """A perfect mirror that faces up."""
+    """Return a perfect mirror that faces up."""
     return {
         "type": "rectangle",
         "to_world": mi.ScalarTransform4f().translate([0, 0, z]).scale(0.5),
@@ -129,7 +129,7 @@ def mirror(z: float = 0.0) -> dict[str, Any]:
 
 
 def stripes(z: float) -> Splats:
-    """A plane of Gaussians at height z, bright where x > 0.15 and dark elsewhere."""
+    """Return a plane of Gaussians at height z, bright where x > 0.15 and dark elsewhere."""
     plane = floor(1.0, 0.0, z)
     grey = np.where(plane.means[:, 0] > 0.15, 0.8, 0.3)
     return Splats(
@@ -148,13 +148,13 @@ def test_a_mirror_reflects_the_splats_above_it() -> None:
     seen = render_layers(make_integrator(mesh_samples=32), scene, down_camera())
     low, high = ((0.3 + 0.055) / 1.055) ** 2.4, ((0.8 + 0.055) / 1.055) ** 2.4
     assert seen.rgb[4:28, 2:14].mean() == pytest.approx(low, rel=0.05)
-    # Mirrored, the edge lies at 0.15 / 2.5 of the distance to the ceiling's image: pixel 16 + 0.06 / 0.011 = 21.4.
+    # The mirrored edge is at 0.15 / 2.5 of the distance to the ceiling's image: pixel 16 + 0.06 / 0.011 = 21.4.
     assert seen.rgb[4:28, 26:30].mean() == pytest.approx(high, rel=0.05)
     assert np.abs(seen.rgb[16, 18] - low).max() < 0.1 and np.abs(seen.rgb[16, 25] - high).max() < 0.1
 
 
 def test_uniform_splats_are_relit_in_a_mirror() -> None:
-    """Lit by a sky that shines along the plane's own normal only by half: a wall beside hides the other half."""
+    """Splats captured in uniform light are relit by the scene's lights when seen in a mirror."""
     ensure_variant()
     below, above = (make_splats_shape(floor(1.0, 0.6, 1.5), instance=i, proxy=None) for i in (0, 1))
     lamp = {"type": "point", "position": [0, 0, -1.0], "intensity": 4.0}
@@ -163,7 +163,7 @@ def test_uniform_splats_are_relit_in_a_mirror() -> None:
         scene = mi.load_dict({"type": "scene", "mirror": mirror(0.0), "splats": splats, "lamp": lamp})
         seen = render_layers(make_integrator(mesh_samples=16, white=2.0), scene, down_camera())
         got[name] = float(seen.rgb[12:20, 12:20].mean())
-    # The mirror hides the lamp from what lies above it.
+    # The mirror occludes the lamp for splats above it.
     assert got["scene"] == pytest.approx(((0.6 + 0.055) / 1.055) ** 2.4, rel=0.02)
     assert got["uniform"] == 0
     lamp = {"type": "point", "position": [0, 0, 0.5], "intensity": 4.0}
@@ -193,7 +193,7 @@ def test_the_camera_sees_emitters_unless_they_are_hidden() -> None:
     assert (shown.alpha == 1).all() and shown.depth[0, 0] == 0
     assert shown.depth[16, 16] == pytest.approx(0.5)
     assert (hidden.rgb[0, 0] == 0).all() and hidden.alpha[0, 0] == 0
-    # The cube is seen through the hidden lamp, and unchanged elsewhere.
+    # The cube is visible through the hidden lamp, and unchanged elsewhere.
     assert hidden.depth[16, 16] == pytest.approx(0.99) and hidden.alpha[16, 16] == 1
     np.testing.assert_array_equal(hidden.rgb[12, 20], shown.rgb[12, 20])
 
@@ -212,7 +212,7 @@ def test_meshes_cast_shadows_on_captured_splats(material: str, dark: bool) -> No
 
 
 def test_light_is_the_same_in_any_order_of_shapes() -> None:
-    """A proxy without splats says nothing of the light under which an environment was captured."""
+    """A proxy without splats does not determine the capture light of an environment."""
     ensure_variant()
     sky = {"type": "constant", "radiance": {"type": "rgb", "value": 0.25}}
     ground = make_splats_shape(floor(), proxy=slab(), capture_light="uniform")
@@ -260,7 +260,7 @@ def test_mitsubas_thin_lens_equals_the_camera_plugin() -> None:
     }
     ground = {"floor": make_splats_shape(stripes(0.0)), "sky": WHITE_SKY}
     scene = mi.load_dict({"type": "scene", **ground})
-    # The crop begins inside a tile: only the order of each ray knows of no tiles.
+    # The crop begins inside a tile: only the order along each ray is independent of tiles.
     integrator = make_integrator(quality="exact", lens_rings=1, shadow="none")
     ours = integrator.render(scene, make_sensor(replace(camera, aperture_radius=0.05, focus_distance=0.5)))
     theirs = integrator.render(scene, mi.load_dict(lens))

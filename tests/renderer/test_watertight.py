@@ -1,4 +1,4 @@
-"""No ray passes between triangles that share an edge: solids from symmetric places, silhouettes, light under plates."""
+"""Watertight ray tracing across shared edges: symmetric views of solids, silhouettes, and light under plates."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ SOLIDS = {
     "ball": trimesh.creation.icosphere(2, 0.2),
     "drum": trimesh.creation.cylinder(0.2, 0.1, sections=64),
 }
-"""Convex solids with edges where rays of symmetric cameras pass."""
+"""Convex solids with edges on the rays of symmetric cameras."""
 
 PLATE = trimesh.Trimesh(
     [(-0.2, -0.2, 0), (0.2, -0.2, 0), (0.2, 0.2, 0), (-0.2, 0.2, 0)], [(2, 0, 1), (0, 2, 3)], process=False
 )
-"""Two triangles that name the ends of their common edge in different order: thousands of rays used to pass there."""
+"""Two triangles that list their common edge in opposite order: thousands of rays used to pass there."""
 
 
 def cameras(top: float) -> list[Camera]:
-    """Straight above the middle and another place on a diagonal, and aslant over a corner."""
+    """Return cameras straight above the middle, above a point on a diagonal, and oblique over a corner."""
     views = [((0, 0, 0.5), (0, 1, 0), 60.0), ((0.125, 0.125, 0.25), (1, 0, 0), 50.0), ((0, 0, 1), (1, 1, 0), 53.0)]
     above = [
         Camera.look_at(np.add(eye, (0, 0, top)), (*eye[:2], top), up=up, width=width, height=height, fov_x=fov)
@@ -43,9 +43,10 @@ def cameras(top: float) -> list[Camera]:
 
 
 def true_depth(mesh: trimesh.Trimesh, camera: Camera) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.bool_]]:
-    """Depth at which each ray enters a convex solid (H, W), 0 where it misses; and where float32 can tell.
+    """Return the depth at which each ray enters a convex solid (H, W), 0 for a miss, and the pixels decidable in
+    float32.
 
-    It enters at the last of the planes that it meets from outside, if it has not left through another one before.
+    A ray enters at the last plane that it crosses from outside, unless it left through another plane before.
     """
     x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
     slopes = camera.ray_slopes(np.stack([x.ravel(), y.ravel()], axis=1))
@@ -78,7 +79,7 @@ def test_cameras_see_the_front_of_solids_in_every_pixel(name: str) -> None:
 
 @pytest.mark.parametrize("up", [(0, 1, 0), (1, 0, 0)])
 def test_every_pixel_of_a_table_seen_from_above_is_lit(up: tuple[float, float, float]) -> None:
-    """The pose of bin picking: rays between its two triangles used to meet the underside, where it is dark."""
+    """Typical pose of bin picking: rays between the two triangles used to hit the dark underside."""
     ensure_variant()
     camera = Camera.look_at((0, 0, 0.52), (0, 0, 0.02), up=up, width=320, height=240, fov_x=50)
     layers = render(camera, {"table": plain_mesh(SOLIDS["table"]), "sky": SKY}, shadow_error=0.3)
@@ -88,7 +89,7 @@ def test_every_pixel_of_a_table_seen_from_above_is_lit(up: tuple[float, float, f
 
 @pytest.mark.parametrize("kind", ["visible", "static", "dynamic"])
 def test_no_light_passes_through_a_plate(kind: str) -> None:
-    """Rays from the floor to a lamp meet the plate's edges where pixels lie on its diagonals."""
+    """Pixels lie on the plate's diagonals: rays from the floor to a lamp hit the plate's edges."""
     ensure_variant()
     mesh = PLATE.copy().apply_translation((0, 0, 0.5))
     instance = 1 if kind == "dynamic" else 0

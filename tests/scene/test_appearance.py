@@ -1,4 +1,4 @@
-"""Appearances that are drawn: their ranges, what decides them, and what is refused."""
+"""Drawn appearances: ranges, seeds, and validation."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ RANGES = {
 
 @pytest.fixture
 def varied(scene_data: dict[str, Any], write_scene: WriteScene) -> Any:
-    """Makes a scene whose nuts vary in appearance, and whose bolts do not."""
+    """Return a function that makes a scene with varied appearances of nuts, but not of bolts."""
 
     def make(ranges: Any = RANGES) -> Scene:
         scene_data["objects"] = [{"asset": "assets/nut", "count": 3, "appearance": ranges}, {"asset": "assets/bolt"}]
@@ -40,7 +40,7 @@ def varied(scene_data: dict[str, Any], write_scene: WriteScene) -> Any:
 
 
 def layout(index: int, nuts: int = 3) -> Layout:
-    """Nuts, and a bolt behind them."""
+    """Return a layout of nuts, with a bolt behind them."""
     instances = [Instance(number + 1, int(number == nuts), 0, np.eye(4)) for number in range(nuts + 1)]
     return Layout(index, tuple(instances), NO_PHYSICS)
 
@@ -53,12 +53,12 @@ def test_appearances_are_drawn_within_their_ranges(varied: Any) -> None:
     for name, (low, high) in RANGES.items():
         values = np.array([getattr(one, name) for one in drawn]).reshape(300, -1)
         assert low <= values.min() < low + 0.05 * (high - low) and high - 0.05 * (high - low) < values.max() <= high
-        # Uniform: five standard errors of the mean, of which gains have three times as many.
+        # Uniform: five standard errors of the mean; gains have three times as many values.
         assert abs(values.mean() - (low + high) / 2) < 5 * (high - low) / np.sqrt(12 * 300)
         assert len(np.unique(values)) == values.size
     assert len({one.wear_seed for one in drawn}) == 300
     columns = np.array([[one.hue, one.value, *one.gain, one.wear, one.roughness] for one in drawn])
-    # Independent values have a correlation of 0 +- 0.06 over 300 objects.
+    # The correlation of independent values is 0 +- 0.06 over 300 objects.
     assert np.abs(np.corrcoef(columns.T) - np.eye(7)).max() < 0.25
 
 
@@ -93,7 +93,7 @@ def test_drawn_properties_are_those_of_the_shape() -> None:
 
 
 def test_appearances_do_not_change_layouts(varied: Any, scene_data: Any, write_scene: WriteScene) -> None:
-    """And the keys of the layouts that were settled before appearances were known stay theirs."""
+    """Keys of layouts settled before appearances were introduced are unchanged as well."""
     dull, worn = varied({"wear": [0, 1]}), varied()
     del scene_data["objects"][0]["appearance"]
     plain = load_scene(write_scene(scene_data))

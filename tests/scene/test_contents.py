@@ -1,4 +1,4 @@
-"""What a layout holds: draws from pools, classes dealt out in turn, and layouts without anything that is labelled."""
+"""Contents of a layout: draws from pools, balanced classes, and layouts without labelled objects."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ SceneData = dict[str, Any]
 
 @pytest.fixture
 def pool_of_four(scene_data: SceneData, write_scene: WriteScene, tmp_path: Path) -> SceneData:
-    """Four assets of three classes: two are nuts."""
+    """Return a pool of four assets in three classes: two are nuts."""
     box_asset("other_nut", class_name="nut").save(tmp_path / "assets/other_nut")
     box_asset("pin").save(tmp_path / "assets/pin")
     names = [f"assets/{name}" for name in ("nut", "other_nut", "bolt", "pin")]
@@ -51,7 +51,7 @@ def test_each_object_of_a_pool_is_drawn_independently(pool_of_four: SceneData, w
 
 @pytest.mark.parametrize("layouts", [7, 50, 200])
 def test_balance_draws_classes_in_turn(pool_of_four: SceneData, write_scene: WriteScene, layouts: int) -> None:
-    """However many layouts there are, and in each split: no class is ahead by two."""
+    """For any number of layouts and in each split, no class is ahead by two."""
     pool_of_four["objects"][0]["balance"] = True
     scene = load_scene(write_scene(pool_of_four | {"empty": 0.1}))
     for split in ("train", "val"):
@@ -90,7 +90,7 @@ def test_each_split_has_its_share_of_empty_layouts(
         for index in layouts:
             labelled = [a for a in draw_objects(scene, index)[0] if scene.class_index(a) is not None]
             assert bool(labelled) == (index not in empty)
-            assert scene.pools[1][0] in draw_objects(scene, index)[0]  # distractors lie in all of them
+            assert scene.pools[1][0] in draw_objects(scene, index)[0]  # distractors are in all layouts
 
 
 def test_classes_are_those_of_labelled_objects(scene_data: SceneData, write_scene: WriteScene) -> None:
@@ -101,7 +101,7 @@ def test_classes_are_those_of_labelled_objects(scene_data: SceneData, write_scen
 
 
 def test_a_pattern_is_replaced_by_its_matches(scene_data: SceneData, write_scene: WriteScene, tmp_path: Path) -> None:
-    """By name, objects alone, and written into the scene, so that a dataset knows what it was made of."""
+    """Matches are sorted by name, restricted to objects, and written into the scene for the dataset's record."""
     path = write_scene(scene_data | {"objects": [{"pool": "assets/*", "count": 2}]})
     box_asset("around").save(tmp_path / "assets/around")
     folder = tmp_path / "assets/around/asset.yaml"
@@ -115,7 +115,7 @@ def test_a_pattern_is_replaced_by_its_matches(scene_data: SceneData, write_scene
 
 
 def test_a_range_of_scales_gives_assets_of_several_sizes(scene_data: SceneData, write_scene: WriteScene) -> None:
-    """Each is a whole asset, with mesh, splats, pieces and mass in its size: poses stay rigid."""
+    """Each size is a complete asset, with scaled mesh, splats, pieces and mass: poses stay rigid."""
     scene_data["objects"] = [{"pool": ["assets/nut", "assets/bolt"], "scale": [0.5, 2], "count": 3}]
     scene = load_scene(write_scene(scene_data))
     assert scene.pools == (range(10),)
@@ -131,7 +131,7 @@ def test_a_range_of_scales_gives_assets_of_several_sizes(scene_data: SceneData, 
 
 @pytest.mark.parametrize(("validation", "test"), [(0.2, 0.1), (0.25, 0.25), (0.0, 0.3), (0.7, 0.3), (0.1, 0.6)])
 def test_three_splits_have_their_shares(validation: float, test: float) -> None:
-    """However many layouts there are: never off by more than one for each of the two partings."""
+    """For any number of layouts, the error is at most one for each of the two divisions."""
     splits = [split_of(layout, validation, test) for layout in range(500)]
     assert splits[1 if test <= 0.5 else 0] == "test"
     for count in (10, 37, 500):
@@ -159,7 +159,10 @@ def test_each_of_three_splits_is_balanced_and_has_its_empty_layouts(
 def test_held_out_assets_are_in_the_test_split_only(
     pool_of_four: SceneData, write_scene: WriteScene, balance: bool
 ) -> None:
-    """Members of pools, and entries of their own, which then have nothing to draw; the number of others stays."""
+    """Members of pools and separate entries are held out.
+
+    A separate entry has no objects in other splits; the number of other objects does not change.
+    """
     pool_of_four["objects"] = [pool_of_four["objects"][0] | {"balance": balance}, {"asset": "assets/pin", "count": 2}]
     pool_of_four["output"] |= {"test": 0.25}
     plain = load_scene(write_scene(pool_of_four))

@@ -1,4 +1,4 @@
-"""Belts: what they carry, at which moments, and what is refused."""
+"""Conveyor belts: carried objects, times, and validation."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ SETTLED = replace(NO_PHYSICS, attempts=1)
 
 @pytest.fixture
 def belt_data(scene_data: SceneData) -> SceneData:
-    """A belt of 1.2 m that is turned by 30 degrees, below a region of 0.4 m."""
+    """Return a scene of a belt of 1.2 m, rotated by 30 degrees, below a region of 0.4 m."""
     box = {"size": [1.2, 0.6, 0.1], "position": [0, 0, -0.05], "rotate": [0, 0, 30]}
     scene_data["shapes"] = [{"name": "belt", "box": box, "visible": True}]
     return scene_data | {"conveyor": {"belt": "belt", "speed": 0.2, "interval": 0.1}}
 
 
 def lying(*places: tuple[float, float, float]) -> Layout:
-    """A settled layout with an object at each of some places [m]."""
+    """Return a settled layout with an object at each of the given positions [m]."""
     instances = []
     for number, place in enumerate(places, start=1):
         pose = np.eye(4)

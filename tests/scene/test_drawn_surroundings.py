@@ -1,4 +1,4 @@
-"""Places: environments, materials and backgrounds that layouts draw, and what is refused of them."""
+"""Drawn surroundings of a layout: environments, materials, backgrounds, and their validation."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ KINDS = ("colour", "noise", "wood", "checker", "stripes")
 
 @pytest.fixture
 def cells(tmp_path: Path) -> None:
-    """Two environments, and an object that a pattern must pass over."""
+    """Return a scene of two environments, and an object that a pattern must not match."""
     for name, size in (("cell_a", (1.0, 1.0, 0.1)), ("cell_b", (2.0, 1.0, 0.1))):
         replace(box_asset(name, size), kind="environment").save(tmp_path / "assets" / name)
     box_asset("cell_tool").save(tmp_path / "assets/cell_tool")
@@ -93,7 +93,7 @@ def test_a_further_material_shifts_no_other_draw(scene_data: SceneData, write_sc
     scene_data["shapes"][0]["materials"] = [{"kind": "noise"}, {"kind": "wood"}]
     alone = finishes()
     assert {finish.kind for finish in alone} == {"noise", "wood"}
-    assert alone == [finish for finish in alone[::4] for _ in range(4)]  # views of a layout have the same
+    assert alone == [finish for finish in alone[::4] for _ in range(4)]  # views of a layout have equal materials
     box = {"size": [0.1, 0.1, 0.1]}
     scene_data["shapes"].insert(0, {"name": "box", "box": box, "visible": True, "materials": [{"kind": "noise"}]})
     scene_data |= {"background": {"images": "photos"}}
@@ -183,7 +183,7 @@ def test_the_first_unreadable_image_of_many_is_named(
 
 
 def test_a_backdrop_is_a_room_around_its_interior(scene_data: SceneData, write_scene: WriteScene) -> None:
-    """Walls leave the inside free, overlap nowhere, and share one material."""
+    """Walls leave the interior free, do not overlap, and share one material."""
     room = {"size": [3, 2, 2.5], "position": [0.2, 0, -0.7], "ceiling": True}
     scene_data |= {"backdrop": room, "enclosure": {}}
     scene = load_scene(write_scene(scene_data))

@@ -1,4 +1,4 @@
-"""Patterns of files: the same matches as the standard library's, within a bound."""
+"""File patterns: matches equal those of the standard library, in bounded time."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ PATTERNS = [
 
 @pytest.fixture
 def tree(tmp_path: Path) -> Path:
-    """Folders within folders, with links that lead up, and a broken one."""
+    """Create nested folders with links to parents and a broken link."""
     for folder in ("a/b/a/b", "b/c", ".hidden/a"):
         (tmp_path / "in" / folder).mkdir(parents=True)
         (tmp_path / "in" / folder / "c.png").write_text("")
@@ -39,7 +39,7 @@ def test_matches_equal_those_of_pathlib_in_order(tree: Path, pattern: str) -> No
 
 @pytest.mark.parametrize("pattern", ["**/" * 9 + "no", "**/*/" * 9 + "no", "*a" * 20 + "*b"])
 def test_repeated_wildcards_take_linear_time(tmp_path: Path, pattern: str) -> None:
-    """pathlib takes a power of the depth for this."""
+    """The time of pathlib is exponential in the depth."""
     (tmp_path / "/".join("a" * 30)).mkdir(parents=True)
     for number in range(300):
         (tmp_path / f"{number}{'a' * 200}").write_text("")

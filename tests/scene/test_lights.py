@@ -1,4 +1,4 @@
-"""Lights that are drawn: their ranges, how often they are drawn, and what is refused."""
+"""Drawn lights: ranges, frequency of draws, and validation."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ SKY = {"kind": "environment", "draw": {"radiance": [0.5, 2], "rotate_z": [0, 360
 
 @pytest.fixture
 def lit(scene_data: dict[str, Any], write_scene: WriteScene) -> Any:
-    """Makes a scene of 150 layouts of two views under some lights."""
+    """Return a function that makes a scene of 150 layouts of two views under the given lights."""
 
     def make(*lights: dict[str, Any], **keys: Any) -> Scene:
         scene_data["output"] |= {"layouts": 150, "views": 2}
@@ -50,7 +50,7 @@ def lights_of(scene: Scene, frames: range | None = None) -> list[list[Any]]:
 
 
 def spread(values: Any, low: float, high: float) -> None:
-    """Holds values against the mean of a uniform distribution, five standard errors wide, and its ends."""
+    """Assert that values have a uniform distribution's mean within five standard errors, and its ends."""
     values = np.asarray(values)
     assert low <= values.min() < low + 0.1 * (high - low) and high - 0.1 * (high - low) < values.max() <= high
     assert abs(values.mean() - (low + high) / 2) < 5 * (high - low) / np.sqrt(12 * len(values))
@@ -60,7 +60,7 @@ def test_drawn_lights_come_from_all_sides_within_their_ranges(lit: Any) -> None:
     drawn = lights_of(lit(SIDES, SKY))
     assert {len(lights) for lights in drawn} == {1, 2, 3, 4}
     areas = [light for lights in drawn[::2] for light in lights if isinstance(light, AreaLight)]
-    assert len({light.position for light in areas}) == len(areas)  # each copy is drawn for itself
+    assert len({light.position for light in areas}) == len(areas)  # each copy has its own draw
     arms = np.array([light.position for light in areas]) - SIDES["target"]
     away = np.linalg.norm(arms, axis=1)
     spread(away, 0.5, 2.0)
@@ -87,7 +87,7 @@ def test_lights_drawn_in_a_box_fill_each_component(lit: Any) -> None:
     spread([light.position[1] for light in drawn], 2, 2.5)
     assert {light.position[2] for light in drawn} == {0.5}
     along = np.corrcoef([light.position[0] for light in drawn], [light.position[1] for light in drawn])[0, 1]
-    assert abs(along) < 0.4  # of 150 independent pairs it has a standard deviation of 0.08
+    assert abs(along) < 0.4  # standard deviation for 150 independent pairs: 0.08
 
 
 def test_lights_vary_by_layout_or_by_frame(lit: Any) -> None:
@@ -142,9 +142,9 @@ def test_skies_are_drawn_from_a_folder(lit: Any, tmp_path: Any) -> None:
     assert {f"lights[0].pool[{i}]" for i in range(3)} <= set(describe_inputs(scene))
     drawn = [sky for (sky,) in lights_of(scene)]
     images = [sky.image for sky in drawn]
-    assert images[::2] == images[1::2]  # read once for a layout, whatever else varies
+    assert images[::2] == images[1::2]  # one image per layout
     assert len({sky.rotate_z for sky in drawn}) == 300
-    # Of 150 draws 50 are expected of each, with a standard deviation of 6.
+    # Of 150 draws, 50 are expected for each, with a standard deviation of 6.
     assert abs(images[::2].count("skies/b.png") - 50) < 25 and set(images) == set(scene.images)
     assert "pool" not in drawn[0].model_dump(mode="json")
 

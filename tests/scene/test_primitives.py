@@ -1,4 +1,4 @@
-"""Primitives: solids that physics can drop, of splats that cover them, the same for a seed."""
+"""Primitives: closed solids for physics, covered by splats, and determined by the seed."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def test_primitives_are_solids_that_their_splats_cover() -> None:
 
 
 def test_the_seed_determines_primitives() -> None:
-    """One of each kind."""
+    """Tests one primitive of each kind."""
     first, again, other = (
         make_primitives(random_stream(seed, "primitive", number) for number in range(5)) for seed in (3, 3, 4)
     )

@@ -1,4 +1,4 @@
-"""Scene files: the rules between keys, and frames that seed and index alone decide."""
+"""Scene files: rules between keys, and frames determined by seed and index."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def refusal(path: Path) -> str:
 
 
 def planned(scene: Scene, index: int) -> tuple[Any, ...]:
-    """A plan as plain values that compare."""
+    """Return a plan as plain comparable values."""
     plan: FramePlan = plan_frame(scene, index)
     return (plan.camera.world_from_camera.tolist(), plan.lights, plan.draws, plan.seed, plan.split)
 
@@ -69,7 +69,9 @@ def test_entries_of_one_asset_share_its_data(scene_data: SceneData, write_scene:
 def test_every_file_is_read_once_before_errors_are_reported(
     scene_data: SceneData, write_scene: WriteScene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The first object does not fit into the region, the asset of the last one is absent: the latter is told."""
+    """The first object does not fit into the region and the asset of the last one is missing: the latter is
+    reported.
+    """
     nut, read, load = scene_data["objects"][0]["asset"], [], Asset.load
     monkeypatch.setattr(Asset, "load", lambda folder: (read.append(Path(folder).name), load(folder))[1])
     scene_data["objects"] = [{"asset": nut}, {"asset": nut, "scale": 2.0}]
@@ -102,7 +104,7 @@ def test_values_beyond_any_visible_effect_are_refused(
 def test_box_is_turned_about_fixed_axes_in_order_x_y_z(scene_data: SceneData, write_scene: WriteScene) -> None:
     scene_data["shapes"][0]["box"] = {"size": [1, 2, 4], "rotate": [90, 90, 0], "position": [0, 0, 3]}
     mesh = load_scene(write_scene(scene_data)).shape_meshes[0]
-    # About x: (1, 4, 2); then about y: (2, 4, 1).
+    # Rotation about x: (1, 4, 2); then about y: (2, 4, 1).
     np.testing.assert_allclose(mesh.extents, (2, 4, 1), atol=1e-12)
     np.testing.assert_allclose(mesh.centroid, (0, 0, 3), atol=1e-12)
 
@@ -130,7 +132,7 @@ def test_enclosure_leaves_exactly_the_region_free(scene_data: SceneData, write_s
     low, high = np.array([-0.3, -0.3, -0.05]), np.array([0.3, 0.3, 0.2])
     inside = rng.uniform(low, high, (500, 3))
     assert not in_walls(inside).any()
-    # Every way out, sideways or up, ends in a wall.
+    # Every direction, sideways or up, ends at a wall.
     for axis, side in [(0, -1), (0, 1), (1, -1), (1, 1), (2, 1)]:
         leaving = inside.copy()
         leaving[:, axis] = (high if side > 0 else low)[axis] + side * 0.02
@@ -148,7 +150,7 @@ def test_an_enclosure_leaves_room_for_the_largest_object_if_there_is_something_t
     inner = [bounds["enclosure -x"][1, 0], bounds["enclosure +x"][0, 0]]
     inner += [bounds["enclosure -y"][1, 1], bounds["enclosure +y"][0, 1]]
     np.testing.assert_allclose(inner, [-0.22, 0.22, -0.25, 0.25])
-    scene_data["shapes"][0]["box"]["size"] = [0.3, 1, 0.1]  # narrower than the region, which the walls never cut
+    scene_data["shapes"][0]["box"]["size"] = [0.3, 1, 0.1]  # narrower than the region, which walls never cut
     scene = load_scene(write_scene(scene_data))
     assert scene.shape_meshes[2].bounds[0, 0] == pytest.approx(0.2)
 
@@ -157,7 +159,9 @@ def test_an_enclosure_leaves_room_for_the_largest_object_if_there_is_something_t
 
 
 def changed(data: SceneData, **changes: Any) -> SceneData:
-    """A copy of the data with values replaced by dotted key, ``__`` for the dot and digits for list positions."""
+    """Return a copy of the data with values replaced by dotted key, ``__`` for the dot and digits for list
+    positions.
+    """
     data = copy.deepcopy(data)
     for path, value in changes.items():
         *outer, last = path.split("__")
@@ -453,7 +457,7 @@ def test_roll_turns_the_image_about_its_middle(scene_data: SceneData, write_scen
         "roll": [90, 90],
     }  # fmt: skip
     camera = plan_frame(load_scene(write_scene(scene_data)), 0).camera
-    # The camera's x axis, right, is turned onto its former y axis, down.
+    # The camera's x axis, right, is rotated onto its former y axis, down.
     np.testing.assert_allclose(camera.world_from_camera[:3, 0], (0, 0, -1), atol=1e-12)
     np.testing.assert_allclose(camera.project([[0, 0, 0]])[0], [[32, 24]], atol=1e-9)
 
@@ -521,7 +525,7 @@ def test_schema_describes_every_key() -> None:
 
 
 def test_a_fisheye_with_a_field_beyond_85_degrees_is_refused(scene_data: SceneData, write_scene: WriteScene) -> None:
-    """Its corner lies 1000 / 500 = 2 focal lengths from the middle; without distortion 85 degrees lie at 1.48."""
+    """The corner is 1000 / 500 = 2 focal lengths from the centre; without distortion, 85 degrees are at 1.48."""
     lens = {"fx": 500, "size": [1600, 1200], "lens": "fisheye", "distortion": [0, 0, 0, 0]}
     scene_data["output"] = {"width": 160, "height": 120}
     scene_data["camera"]["intrinsics"] = lens

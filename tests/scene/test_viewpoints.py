@@ -1,4 +1,4 @@
-"""Views that are drawn, accepted and chosen by what lies in a layout, against brute force over triangles and pixels."""
+"""View selection: drawn, accepted and chosen views, against brute force over triangles and pixels."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def layouts(scene: Scene) -> list[Layout]:
 
 
 def views(scene: Scene) -> Iterator[tuple[Any, Layout]]:
-    """Plans of all frames with their layouts."""
+    """Return the plans of all frames with their layouts."""
     there = layouts(scene)
     for index in range(scene.num_frames):
         layout = there[layout_of(scene, index)]
@@ -63,7 +63,7 @@ def placed(scene: Scene, layout: Layout) -> list[trimesh.Trimesh]:
 
 
 def hit_depths(camera: Camera, mesh: trimesh.Trimesh) -> np.ndarray:
-    """Depth [m] at which each pixel's ray first meets a mesh, infinite where it does not; triangle by triangle."""
+    """Return the depth [m] of each pixel ray's first hit on a mesh, infinite for a miss, triangle by triangle."""
     x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
     slopes = camera.ray_slopes(np.stack([x.ravel(), y.ravel()], axis=1))
     rays = np.concatenate([slopes, np.ones((len(slopes), 1))], axis=1) @ camera.world_from_camera[:3, :3].T
@@ -80,7 +80,7 @@ def hit_depths(camera: Camera, mesh: trimesh.Trimesh) -> np.ndarray:
 
 
 def twin(camera: Camera, meshes: list[trimesh.Trimesh], shapes: list[trimesh.Trimesh]) -> tuple[np.ndarray, np.ndarray]:
-    """Visible fraction of each mesh, and its share beyond the border, counted ray by ray."""
+    """Return the visible fraction of each mesh, and its share beyond the border, counted ray by ray."""
     wide = replace(
         camera, width=3 * camera.width, height=3 * camera.height, cx=camera.cx + camera.width,
         cy=camera.cy + camera.height,
@@ -121,11 +121,11 @@ def test_views_look_at_existing_objects(scene: Scene, coverage: str) -> None:
     looked_at = set()
     for plan, layout in views(drawn):
         one = next(one for one in layout.instances if one.id == plan.viewpoint["object"])
-        pixel, depth = plan.camera.project(one.world_from_object[:3, 3])  # the middle of a box
+        pixel, depth = plan.camera.project(one.world_from_object[:3, 3])  # the centre of a box
         np.testing.assert_allclose(pixel, [[plan.camera.cx, plan.camera.cy]], atol=1e-9)
         assert 0.5 <= depth[0] <= 1.0
         looked_at.add((layout.index, one.id))
-    assert len(looked_at) > 8  # of 3 layouts of 4 objects, in 24 views
+    assert len(looked_at) > 8  # 3 layouts of 4 objects, in 24 views
 
 
 def test_layouts_without_labelled_objects_are_seen_at_the_target(scene: Scene) -> None:
@@ -151,7 +151,7 @@ def test_frames_are_planned_in_any_order(scene: Scene) -> None:
 
 
 def test_the_first_try_is_the_view_without_selection(scene: Scene) -> None:
-    """So that a view which is accepted at once is the same with and without the rule."""
+    """A view that is accepted at once is therefore the same with and without the rule."""
     plain, chosen = seen_by(scene), seen_by(scene, accept={"in_view": 0.0})
     for index, (plan, _) in enumerate(views(chosen)):
         assert plan.viewpoint["attempt"] == 0
@@ -217,7 +217,7 @@ def test_accepted_views_satisfy_their_rules(scene: Scene) -> None:
             inside = (depth > camera.near) & ((pixel >= 0) & (pixel < (camera.width, camera.height))).all(axis=1)
             whole += inside.mean() > 0.49
         assert whole >= 3
-    assert len(set(attempts)) > 1  # some were refused
+    assert len(set(attempts)) > 1  # some views were rejected
 
 
 def test_views_from_inside_of_an_object_are_rejected(scene: Scene) -> None:
@@ -234,7 +234,7 @@ def test_rules_that_no_view_satisfies_are_refused_with_the_best_view(scene: Scen
     )
     with pytest.raises(InputError, match=sentence):
         plan_frame(far, 2, layouts(far)[0])
-    assert plan_frame(far, 2).camera.width == 64  # before there is a layout nothing is known to be refused
+    assert plan_frame(far, 2).camera.width == 64  # without a layout, no view is rejected
 
 
 # Shares

@@ -1,4 +1,4 @@
-"""Caches that cannot be used cost time only, and are reported once."""
+"""Unusable caches only cost time, and are reported once."""
 
 import errno
 import logging
@@ -34,12 +34,12 @@ with quiet_warp():
 for name in "ab":
     write_cache_file(cache_folder() / "layouts" / name, lambda file: file.write(bytes(1 << 20)))
 """
-"""Starts Warp, writes as it does when it compiles, and keeps two files."""
+"""Starts Warp, writes a kernel as its compiler does, and writes two cache files."""
 
 
 @pytest.fixture
 def fresh(monkeypatch):
-    """Nothing has been prepared or reported in this process."""
+    """Reset the caches that this process has prepared and reported."""
     prepare_caches.cache_clear()
     monkeypatch.setattr(cache, "_reported", set())
     monkeypatch.setenv("WARP_CACHE_PATH", "")
@@ -64,7 +64,7 @@ def test_an_unwritable_cache_gives_one_warning(environment):
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="needs the right to be another user")
 def test_users_without_a_home_folder_work_without_a_cache(tmp_path):
-    """The root folder as home cannot be written by others; the environment is read by one privilege that is left."""
+    """The root folder as home is not writable for others; one remaining privilege allows reading the environment."""
     kept = "-all,+dac_read_search"
     nobody = ["setpriv", "--reuid=54321", "--regid=54321", "--clear-groups"]
     nobody += [f"--inh-caps={kept}", f"--ambient-caps={kept}", f"--bounding-set={kept}"]
@@ -87,7 +87,7 @@ def test_a_full_or_read_only_cache_disk_gives_one_warning(tmp_path, options):
 
 
 def test_kernels_of_a_read_only_cache_are_read(fresh, tmp_path, monkeypatch):
-    """A cache that came with a read-only image is not compiled again."""
+    """Kernels cached in a read-only image are not compiled again."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     (tmp_path / "warp" / "1.0").mkdir(parents=True)
     (tmp_path / "warp" / "1.0" / "kernel.o").write_bytes(b"code")
@@ -118,7 +118,7 @@ def test_cache_files_without_room_are_removed_and_reported_once(fresh, tmp_path,
 
 
 def test_a_cache_that_fills_up_while_compiling_is_named(fresh):
-    """The caller would otherwise name the folder that it writes into."""
+    """Otherwise the caller would name its own output folder."""
     import warp as wp
 
     with pytest.raises(OSError) as raised, quiet_warp():

@@ -1,4 +1,4 @@
-"""Hashes of content against SHA-256 of the bytes that they are said to be of."""
+"""Content hashes equal SHA-256 of the stated bytes."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def test_arrays_of_equal_bytes_differ_by_type_and_shape() -> None:
 
 
 def test_one_module_computes_hashes() -> None:
-    """But for the audit, which keeps names as small numbers."""
+    """The audit is an exception: it stores names as small numbers."""
     found = {
         path.relative_to(PACKAGE).as_posix()
         for path in PACKAGE.rglob("*.py")

@@ -1,4 +1,4 @@
-"""Files state the version of their format, those that state none are of version 1, and newer ones are refused."""
+"""Format versions of files: files without a version are of version 1, and newer versions are refused."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ NO_VERSIONS = ["two", True, 1.5, 0, None]
 
 
 def state(file: Path, version: Any) -> None:
-    """Let a JSON file state this version, or none."""
+    """Write this version, or none, into a JSON file."""
     stored = json.loads(file.read_text())
     assert stored.pop(FORMAT_VERSION) == 1
     file.write_text(json.dumps(stored if version is ... else {FORMAT_VERSION: version, "future": 3, **stored}))

@@ -1,4 +1,4 @@
-"""JSON written and read element by element: the same bytes, the same values, whatever the blocks that are read."""
+"""JSON streams: the same bytes and values, for any size of the blocks read."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def test_streamed_lists_equal_those_of_json(
 ) -> None:
     after = {f"z{key}": value for key, value in rest.items()}
     file = ListsFile(tmp_path / "a.json", ("one", "other"), before={"first": 1}, after=after)
-    for i in range(max(len(one), len(other))):  # in turns
+    for i in range(max(len(one), len(other))):  # alternating lists
         for name, values in (("one", one), ("other", other)):
             if i < len(values):
                 file.append(name, values[i])
@@ -114,9 +114,9 @@ def record(index: int) -> dict[str, Any]:
 
 
 def test_memory_does_not_grow_with_the_number_of_frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Opening, describing in every format and sorting a manifest whose frames came in the wrong order.
+    """Opens, exports to every format and sorts a manifest with frames in the wrong order.
 
-    Held whole, a frame took 5 kB and more.
+    Frames in memory took 5 kB each and more.
     """
 
     def memory(count: int) -> int:
@@ -133,7 +133,7 @@ def test_memory_does_not_grow_with_the_number_of_frames(tmp_path: Path, monkeypa
             def hear(found: dict[str, Any]) -> None:
                 collection.add(found)
                 if found["index"] == count - 1:
-                    # The paths' interpreter-wide table of names grows by leaps, wherever those fall.
+                    # The interpreter-wide table of path names grows in steps at arbitrary times.
                     paths = tracemalloc.Filter(inclusive=False, filename_pattern=pathlib.__file__)
                     kept = tracemalloc.take_snapshot().filter_traces([paths]).statistics("filename")
                     held.append(sum(entry.size for entry in kept))
@@ -142,7 +142,7 @@ def test_memory_does_not_grow_with_the_number_of_frames(tmp_path: Path, monkeypa
             with CollectionWriter(folder, catalogue, formats) as collection:
                 manifest.sort(hear)
                 collection.commit()
-        finally:  # what is counted from now on would be other tests'
+        finally:  # exclude allocations of other tests
             tracemalloc.stop()
         assert [found["index"] for found in Manifest(folder / "manifest.jsonl")] == list(range(count))
         return held[0]

@@ -1,4 +1,4 @@
-"""Wrong YAML is refused in one sentence that names file, line, key path, rule and value."""
+"""Invalid YAML is refused in one sentence with file, line, key path, rule and value."""
 
 from __future__ import annotations
 

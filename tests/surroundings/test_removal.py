@@ -1,4 +1,4 @@
-"""Things that are taken out of a place: what goes, what stays, and what is put where nobody could see."""
+"""Removal of objects from surroundings: removed and remaining splats, and the fill of unobserved areas."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ from tests.surroundings.test_surroundings import (
 )
 
 CUBE = 0.1
-"""Edge of a second box [m], which stands at the place of :data:`BESIDE`."""
+"""Edge of a second box [m] at the position :data:`BESIDE`."""
 BESIDE = (-0.2, 0.1)
 DEPTH = 0.9
 
@@ -56,7 +56,7 @@ def cube() -> Splats:
 
 
 def shaded(splats: Splats) -> Splats:
-    """The splats with a colour that changes evenly with x and y."""
+    """Return the splats with a colour that changes linearly with x and y."""
     colour = np.stack(
         [0.5 + 0.3 * splats.means[:, 0], 0.5 + 0.4 * splats.means[:, 1], np.full(len(splats), 0.5)], axis=1
     )
@@ -64,7 +64,7 @@ def shaded(splats: Splats) -> Splats:
 
 
 def table_and_box() -> tuple[Splats, Splats]:
-    """Table and floor in even slopes of colour, and the box in the corner."""
+    """Return table and floor in linear colour gradients, and the box in the corner."""
     whole = place()
     low = whole.means[:, 2] < HEIGHT + 1e-3
     return shaded(whole.select(low)), whole.select(~low)
@@ -109,7 +109,7 @@ def test_a_picked_object_is_removed_and_another_kept(captured: Capture) -> None:
 
 
 def test_all_picked_objects_are_removed(captured: Capture) -> None:
-    """From a table of an even slope, whose colour goes on below them."""
+    """The colour gradient of the table continues below the removed objects."""
     bare, box = table_and_box()
     on_box = (TABLE[0] / 2 - 0.7 * BOX[0], TABLE[1] / 2 - BOX[1], HEIGHT + BOX[2] / 2)
     left = removed(
@@ -124,7 +124,9 @@ def test_all_picked_objects_are_removed(captured: Capture) -> None:
 
 
 def wall(y: float) -> tuple[Splats, Splats]:
-    """A wall across the table at ``y``, in even slopes of colour, and without what the cube before it hides."""
+    """Return a wall across the table at ``y`` in linear colour gradients, without the part hidden by the cube
+    before it.
+    """
     whole = placed(sheet((0.6, 1.2), 0.02, 31), (0, y, HEIGHT + 0.3), 1)
     colour = np.column_stack([0.5 + 0.3 * whole.means[:, 0], 0.3 + 0.4 * whole.means[:, 2], np.full(len(whole), 0.6)])
     whole = replace(whole, sh=((colour - 0.5) / SH_C0)[:, None].astype(np.float32))
@@ -134,7 +136,7 @@ def wall(y: float) -> tuple[Splats, Splats]:
 
 @pytest.mark.parametrize("gap", [0.0, 0.03])
 def test_a_wall_close_behind_an_object_is_filled(gap: float, tmp_path: Path) -> None:
-    """The thing may touch it; the wall stays, and what was not seen of it is filled."""
+    """The object may touch the wall; the wall stays, and its hidden part is filled."""
     bare, _ = table_and_box()
     y = BESIDE[1] + CUBE / 2 + gap
     true, seen = wall(y)
@@ -162,7 +164,7 @@ def test_sides_of_objects_are_not_taken_for_walls(captured: Capture) -> None:
 def test_picks_without_an_object_on_a_surface_are_refused(captured: Capture) -> None:
     splats = Splats.concatenate([place(), cube()])
     on_table, on_floor = (pick(5, spot) for spot in ((0.1, -0.1, HEIGHT), (0.0, -1.2, HEIGHT - 0.8)))
-    for spot in (on_table, on_floor, "photo05.png:3,1", "photo05.png:-50,900"):  # and where nothing is
+    for spot in (on_table, on_floor, "photo05.png:3,1", "photo05.png:-50,900"):  # and pixels without splats
         with pytest.raises(
             InputError, match=r"photo05\.png:.*: a thing to remove must stand on one of the detected level surfaces"
         ):
@@ -194,7 +196,7 @@ def test_an_environment_records_removed_objects(
     assert "was hidden by removed things" in (tmp_path / "cell" / "report.html").read_text()
     (record,) = json.loads((tmp_path / "cell" / "verdict.json").read_text())["removed_things"]
     assert record["pick"] == what and CUBE**2 < record["filled"] < 3 * CUBE**2 and record["copied"] == 1
-    assert done.verdict.psnr is not None and done.verdict.psnr > 35  # photos show the thing: that is left out
+    assert done.verdict.psnr is not None and done.verdict.psnr > 35  # without pixels of the removed object
     asset = Asset.load(tmp_path / "cell")
     assert asset.mesh is not None
     near = np.linalg.norm(asset.mesh.vertices[:, :2] - BESIDE, axis=1) < 0.08
@@ -203,7 +205,7 @@ def test_an_environment_records_removed_objects(
     monkeypatch.setattr(asset_pipeline, "reconstruct_environment", None)
     again = asset_pipeline.make_asset(capture, tmp_path / "fit", tmp_path / "cell", job)
     assert again.kept
-    with pytest.raises(TypeError, match="not callable"):  # without what was removed it is made anew
+    with pytest.raises(TypeError, match="not callable"):  # other removals require a new asset
         asset_pipeline.make_asset(capture, tmp_path / "fit", tmp_path / "cell", replace(job, remove=()))
 
 
@@ -218,13 +220,13 @@ def test_the_mesh_command_removes_picked_objects(captured: Capture, tmp_path: Pa
     )
     assert done.returncode in (0, 4), done.stderr
     assert "removed things: 0.1" in done.stdout and what in done.stdout
-    left = Asset.load(tmp_path / "cell").splats.means  # the table's middle is the origin
+    left = Asset.load(tmp_path / "cell").splats.means  # the origin is the table's centre
     over = (np.abs(left[:, :2] - BESIDE) < 0.7 * CUBE).all(axis=1) & (left[:, 2] > 0.3 * CUBE)
     assert not over.any()
 
 
 class TestFill:
-    """Textures of 60 x 50 cells with a hole of 14 x 12."""
+    """Filling of textures of 60 x 50 cells with a hole of 14 x 12."""
 
     @staticmethod
     def hole() -> BoolArray:
@@ -261,7 +263,7 @@ class TestFill:
         np.testing.assert_allclose(result, texture, atol=0.02)
 
     def test_a_hole_without_large_surroundings_is_filled_smoothly(self) -> None:
-        """A frame of three cells around the hole is all that is known."""
+        """Only a frame of three cells around the hole is known."""
         hole = self.hole()
         known = np.zeros_like(hole)
         known[21:41, 17:35] = True

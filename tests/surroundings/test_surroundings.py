@@ -1,4 +1,4 @@
-"""A place whose table, things and gaps are known, from its splats to an environment and a scene file."""
+"""Surroundings with known table, objects and gaps, from splats to an environment and a scene file."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ from mitsplat.surroundings.floaters import find_unsupported, remove_floaters
 from mitsplat.surroundings.supports import find_supports, fit_plane
 
 TABLE, HEIGHT = (1.2, 0.7), 0.11
-"""Of the table [m], whose middle is above the origin; the floor is 0.8 m below it."""
+"""Size and height of the table [m]; its centre is above the origin, and the floor is 0.8 m below it."""
 BOX = (0.3, 0.2, 0.2)
-"""Stands in the table's corner at +x, +y [m]."""
+"""Size of the box [m] in the table's corner at +x, +y."""
 UP = np.array([0.0, 0.0, 1.0])
 SMALL = ReconstructSettings(surface=SurfaceSettings(voxels=64, faces=3000), view_size=160, verdict_size=160)
 
 
 def sheet(size: tuple[float, float], step: float, seed: int) -> Splats:
-    """Flat Gaussians over a rectangle in z = 0, of mottled colours."""
+    """Return flat Gaussians over a rectangle in z = 0, with mottled colours."""
     rng = np.random.default_rng(seed)
     x, y = (np.arange(-edge / 2 + step / 2, edge / 2, step) for edge in size)
     means = np.stack(np.meshgrid(x, y, [0.0], indexing="ij"), axis=-1).reshape(-1, 3)
@@ -58,7 +58,7 @@ def placed(splats: Splats, middle: tuple[float, float, float], axis: int = 2) ->
 
 
 def place() -> Splats:
-    """Table, a box on it, and the floor."""
+    """Return the table, a box on it, and the floor."""
     corner = (TABLE[0] / 2 - BOX[0] / 2, TABLE[1] / 2 - BOX[1] / 2)
     sides = [
         placed(sheet((BOX[1], BOX[2]), 0.02, 3), (corner[0] - BOX[0] / 2, corner[1], HEIGHT + BOX[2] / 2), 0),
@@ -70,7 +70,7 @@ def place() -> Splats:
 
 
 def cameras() -> list[Camera]:
-    """From the side of -y, none of which looks at what lies to the right beyond x = 0.45."""
+    """Return cameras on the side of -y; none observes the area on the right beyond x = 0.45."""
     found = []
     for number in range(24):
         turn, height = np.radians(-150 + 5 * number), np.radians((30, 50, 70)[number % 3])
@@ -211,7 +211,7 @@ def test_the_table_of_the_asset_lies_at_height_0(made: tuple[Path, AssetResult])
     assert asset.mesh is not None and asset.kind == "environment" and asset.capture_light == "scene"
     middle = np.abs(asset.mesh.vertices[:, :2]).max(axis=1) < 0.2
     assert np.abs(asset.mesh.vertices[middle & (asset.mesh.vertices[:, 2] > -0.1), 2]).max() < 1e-6
-    assert done.verdict.psnr is not None and done.verdict.psnr > 35  # its own pictures, not what the fit reported
+    assert done.verdict.psnr is not None and done.verdict.psnr > 35  # its own renderings, not the fit's report
     assert "Removed things" not in done.verdict.rows
     assert "Support" in done.verdict.rows and "Support" in (folder / "cell" / "report.html").read_text()
 

@@ -1,4 +1,4 @@
-"""The page of a scene in headless Chromium: it loads, shows splats, and does what its controls say."""
+"""Scene page in headless Chromium: loading, splats, and controls."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ from tests.conftest import box_asset, small_scene
 
 pytestmark = pytest.mark.slow
 
-LONG = 90.0  # seconds, for what takes one on an idle machine
+LONG = 90.0  # seconds; an idle machine needs one
 OPTIONS = (
     *("--headless=new", "--no-sandbox", "--disable-gpu", "--use-gl=angle", "--use-angle=swiftshader"),
     *("--enable-unsafe-swiftshader", "--disable-quic", "--no-first-run", "--disable-background-networking"),
     *("--disable-component-update", "--disable-sync", "--window-size=1100,560"),
 )
 BEGIN = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); from mitsplat.cli import main; main()"
-"""The command, which Ctrl-C ends even where whoever runs the tests lets it be ignored."""
+"""Runs the command with Ctrl-C enabled, also where the test runner ignores it."""
 
 
 @pytest.fixture(scope="module")
@@ -60,7 +60,7 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
 
 @pytest.fixture(scope="module")
 def scene_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A scene of one red box."""
+    """Write a scene of one red box."""
     folder = tmp_path_factory.mktemp("scene")
     box = box_asset("nut", (0.09, 0.09, 0.09))
     sh = np.tile(np.float32([1.7, -1.7, -1.7]), (12, 1, 1))
@@ -76,7 +76,7 @@ def scene_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def until(what: Callable[[], Any]) -> Any:
-    """The first true answer."""
+    """Return the first true answer."""
     end = time.monotonic() + LONG
     while time.monotonic() < end:
         if answer := what():
@@ -86,7 +86,7 @@ def until(what: Callable[[], Any]) -> Any:
 
 
 def screen(browser: Any) -> np.ndarray:
-    """Return the screen, (H, W, 3): the render on the left, splats in the middle, controls on the right."""
+    """Return the screenshot (H, W, 3): the render on the left, splats in the middle, controls on the right."""
     image = Image.open(io.BytesIO(browser.get_screenshot_as_png())).convert("RGB")
     return np.asarray(image).astype(int)
 
@@ -96,13 +96,13 @@ def render(browser: Any) -> np.ndarray:
 
 
 def redness(pixels: np.ndarray) -> float:
-    """Share of pixels that are about red."""
+    """Return the share of pixels that are roughly red."""
     return float(((pixels[..., 0] > 90) & (pixels[..., 1:] < 70).all(axis=-1)).mean())
 
 
 @contextmanager
 def served(browser: Any, path: Path) -> Iterator[None]:
-    """A path's page in the browser, from a command that ends well by Ctrl-C."""
+    """Open the page of a path in the browser; the command must exit with status 0 on Ctrl-C."""
     command = [sys.executable, "-c", BEGIN, "view", str(path), "--port", "0"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as serving:
         try:
@@ -122,13 +122,13 @@ def test_the_page_of_a_scene_works_in_chromium(browser, scene_file):
 
 
 def faults(browser: Any) -> list[str]:
-    """Return errors of the browser since the last call."""
+    """Return the browser's errors since the last call."""
     return [entry["message"] for entry in browser.get_log("browser") if entry["level"] == "SEVERE"]
 
 
 @contextmanager
 def foreign_site(page_body: str) -> Iterator[tuple[str, str, list[str]]]:
-    """A page of another port with this body, its websocket, which is {own} there, and requests that reach that one."""
+    """Serve a page on another port with this body, its websocket as {own}, and record requests to it."""
     from websockets.sync.server import serve
 
     class Site(http.server.BaseHTTPRequestHandler):
@@ -183,7 +183,7 @@ def test_another_site_cannot_frame_or_redirect_the_page(browser):
             browser.get(address)
             until(lambda: any("frame-ancestors" in fault for fault in faults(browser)))
             assert not page._server.get_clients()
-            browser.find_elements("css selector", "a")[0].click()  # but a link with the token is followed
+            browser.find_elements("css selector", "a")[0].click()  # a link with the token works
             until(page._server.get_clients)
             browser.refresh()
             until(lambda: page._server.get_clients() and "websocket=" in browser.current_url)
@@ -196,7 +196,7 @@ def test_another_site_cannot_frame_or_redirect_the_page(browser):
 
 
 def test_a_page_works_through_a_forwarded_port(browser):
-    """As by ``ssh -L 9090:localhost:8080``."""
+    """The port is forwarded as by ``ssh -L 9090:localhost:8080``."""
     page = Page("test", Address(port=0), gaussians=10)
     try:
         with forwarded(page.port) as port:
@@ -211,7 +211,7 @@ def test_a_page_works_through_a_forwarded_port(browser):
 
 @contextmanager
 def forwarded(target: int) -> Iterator[int]:
-    """A port of this machine that leads to another one."""
+    """Forward a port of this machine to another one."""
 
     class Pipe(socketserver.BaseRequestHandler):
         def handle(self) -> None:
@@ -242,7 +242,7 @@ def test_a_click_on_a_capture_picks_the_object(browser, tmp_path):
         return float(((pixels[..., :2] > 160).all(axis=-1) & (pixels[..., 2] < 60)).mean())
 
     def choice(says: str) -> Any:
-        """The box of choices while it says so; None otherwise."""
+        """Return the selection box while it has this value, otherwise None."""
         boxes = "[...document.querySelectorAll('input')]"
         return browser.execute_script(
             f"return {boxes}.find(box => box.value == arguments[0] && box.offsetParent)", says
@@ -278,11 +278,11 @@ def use_page(browser: Any, scene_file: Path) -> None:
         return "exact" in text() and bool(np.abs(render(browser) - before).mean() > 1)
 
     until(lambda: "exact" in text() and "blending-order error" in text())
-    until(lambda: redness(screen(browser)[:, 490:770]) > 0.005)  # of the splats
+    until(lambda: redness(screen(browser)[:, 490:770]) > 0.005)  # the red splats
     first = render(browser)
     assert redness(first) > 0.005
     written = [area.get_attribute("value") for area in browser.find_elements(By.TAG_NAME, "textarea")]
-    assert not [text for text in written if "camera:" in text]  # nobody has moved it yet
+    assert not [text for text in written if "camera:" in text]  # the camera was not moved
 
     browser.find_element(By.CSS_SELECTOR, "[role=slider]").send_keys(Keys.ARROW_RIGHT)  # the next frame
     until(lambda: changed(first))
@@ -297,6 +297,6 @@ def use_page(browser: Any, scene_file: Path) -> None:
     data["region"]["max"][2] = -1
     YAML(typ="safe", pure=True).dump(data, scene_file)
     until(lambda: "must be above min along z (got -1, min is 0.02)" in text())
-    assert redness(screen(browser)[:, 490:770]) > 0.005  # the last good scene stays
+    assert redness(screen(browser)[:, 490:770]) > 0.005  # the last valid scene remains
     scene_file.write_text(good)
     until(lambda: "must be above" not in text())

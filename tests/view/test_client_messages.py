@@ -1,4 +1,4 @@
-"""Messages of browsers that a viewer takes, and those that it drops."""
+"""Browser messages that a viewer accepts, and those that it drops."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def control(**updates: Any) -> dict[str, Any]:
 )
 def test_messages_of_the_page_are_accepted(message):
     assert is_expected(packed(message))
-    viser._messages.Message.deserialize(packed(message))  # viser has not renamed it
+    viser._messages.Message.deserialize(packed(message))  # fails if viser renames it
 
 
 @pytest.mark.parametrize(
@@ -121,7 +121,7 @@ def page() -> Iterator[Page]:
 
 
 def joined(page: Page) -> ClientConnection:
-    """A browser's connection, that has sent its camera."""
+    """Connect a browser that has sent its camera."""
     address = page.url.replace("http://", "ws://")
     browser = connect(address, subprotocols=[f"viser-v{viser.__version__}"], max_size=None)
     browser.send(packed(CAMERA))
@@ -129,7 +129,7 @@ def joined(page: Page) -> ClientConnection:
 
 
 def until(what: Callable[[], Any]) -> Any:
-    """The first true answer."""
+    """Return the first true answer."""
     end = time.monotonic() + 20
     while time.monotonic() < end:
         if answer := what():
@@ -167,7 +167,7 @@ def test_a_large_message_closes_its_own_connection_only(page):
 
 
 def test_messages_are_read_no_faster_than_they_are_handled(page):
-    """Jobs that wait for a thread stay few, however many messages a browser sends."""
+    """The number of jobs that wait for a thread is bounded, however many messages a browser sends."""
     held: Future[None] = Future()
     page.on_move(lambda camera: held.result())
     start = page._server.initial_camera
@@ -177,7 +177,7 @@ def test_messages_are_read_no_faster_than_they_are_handled(page):
         until(page._server.get_clients)
         for _ in range(100):
             browser.send(packed(CAMERA))
-        until(lambda: threads._work_queue.qsize() > 0)  # all threads are held
+        until(lambda: threads._work_queue.qsize() > 0)  # all threads are busy
         time.sleep(0.5)
         waiting = threads._work_queue.qsize()
         held.set_result(None)

@@ -1,4 +1,4 @@
-"""Who may open the page."""
+"""Access control of the page."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ PAGE = f"/{TOKEN}"
     [
         ("localhost:8080", None, False),
         ("localhost", "http://localhost", False),
-        ("localhost:9090", "http://localhost:9090", False),  # a tunnel from another port
+        ("localhost:9090", "http://localhost:9090", False),  # tunnel from another port
         ("127.0.0.1:8080", "http://127.0.0.1:8080", False),
         ("[::1]:8080", None, False),
-        ("evil.example:8080", "http://evil.example:8080", True),  # a name that was made to lead here
+        ("evil.example:8080", "http://evil.example:8080", True),  # DNS rebinding
         ("localhost:8080", "http://evil.example", True),
         ("localhost:8080", "http://localhost:3000", True),
         ("localhost:8080", "null", True),
@@ -67,7 +67,7 @@ def test_a_page_on_the_network_accepts_any_host_name(host, origin, refused):
     [
         (PAGE, False),
         (f"{PAGE}/", False),
-        (f"{PAGE}?websocket=ws://localhost:1{PAGE}", False),  # what viser's script writes there
+        (f"{PAGE}?websocket=ws://localhost:1{PAGE}", False),  # query written by viser's script
         ("/", True),
         (f"/?token={TOKEN}", True),
         (f"{PAGE}x", True),
@@ -100,7 +100,7 @@ def page(request) -> Iterator[Page]:
 
 
 def place(page: Page) -> str:
-    """Path of the page's address."""
+    """Return the path of the page's address."""
     return "/" + page.url.rpartition("/")[2]
 
 
@@ -113,7 +113,7 @@ def answer(page: Page, path: str, **headers: str) -> http.client.HTTPResponse:
 
 
 def status(page: Page, *lines: bytes) -> int:
-    """Status that is answered to a request as it is written."""
+    """Return the response status of a raw request."""
     with closing(socket.create_connection(("127.0.0.1", page.port), timeout=20)) as connection:
         connection.sendall(b"\r\n".join((*lines, b"", b"")))
         return int(connection.recv(100).split()[1])
@@ -149,7 +149,7 @@ def test_the_content_policy_allows_the_own_server_and_no_frame(page):
 
 
 def test_pages_of_two_servers_work_at_the_same_time(page):
-    """Cookies are those of a host and not of a port, so neither page may need one."""
+    """Cookies belong to a host and not to a port, so that no page may depend on one."""
     other = Page("other", Address("0.0.0.0", 0), gaussians=10)
     try:
         assert [answer(one, place(one)).status for one in (page, other, page)] == [200] * 3

@@ -1,4 +1,4 @@
-"""What is shown of a scene, and what of it is sent again when something changes."""
+"""Shown parts of a scene, and the parts sent again after a change."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def test_a_scene_shows_everything_once(scene):
     assert box.min(axis=(0, 1)) == pytest.approx(scene.spec.region.min)
     assert box.max(axis=(0, 1)) == pytest.approx(scene.spec.region.max)
     assert len(np.unique(np.sort(box.reshape(12, 6)), axis=0)) > 1
-    assert np.count_nonzero(box[:, 1] - box[:, 0], axis=1).tolist() == [1] * 12  # every edge is along one axis
+    assert np.count_nonzero(box[:, 1] - box[:, 0], axis=1).tolist() == [1] * 12  # each edge is along one axis
 
 
 def test_a_scene_without_a_layout_shows_no_objects(scene):
@@ -129,7 +129,7 @@ def test_a_thinned_cloud_keeps_its_coverage():
     )
     kept = ShownSplats(splats).thinned(25)
     assert len(kept) == 25
-    assert np.diff(kept.means[:, 0] / 3) == pytest.approx(np.full(24, 4), abs=1.01)  # evenly
+    assert np.diff(kept.means[:, 0] / 3) == pytest.approx(np.full(24, 4), abs=1.01)  # evenly spaced
     area, whole = (float(np.prod(some.scales[:, :2], axis=1).sum()) for some in (kept, splats))
     assert area == pytest.approx(whole)
     assert ShownSplats(splats).thinned(count) is splats

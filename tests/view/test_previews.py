@@ -1,4 +1,4 @@
-"""The thread that works on the newest request alone."""
+"""Worker thread that processes only the newest request."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ import pytest
 from mitsplat.errors import InputError
 from mitsplat.view.previews import LatestRequestWorker, presets_up_to
 
-LONG = 20  # seconds, for what should take none
+LONG = 20  # seconds; normally instant
 
 
 class Steps:
-    """Work in three steps, each of which waits to be let on."""
+    """Work in three steps, each of which waits for a signal."""
 
     def __init__(self) -> None:
         self.begun, self.told, self.refused = Queue[str](), Queue[str](), Queue[str]()

@@ -1,4 +1,4 @@
-"""The page of a scene without a browser: its controls are set as a browser would set them."""
+"""Scene page without a browser: the test sets the controls like a browser."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ LONG = 60
 
 @dataclass
 class Told:
-    """Records the parts that the page shows."""
+    """Records pictures and alerts of the page."""
 
     pictures: list[tuple[ByteImage, str]] = field(default_factory=list)
     alerts: list[str | None] = field(default_factory=list)
@@ -43,7 +43,7 @@ class Shown:
     path: Path
 
     def wait(self, what: Callable[[], Any]) -> Any:
-        """The first true answer, in good time."""
+        """Return the first true answer, within a time limit."""
         for _ in range(20 * LONG):
             self.scene_page.check()
             if answer := what():
@@ -52,7 +52,7 @@ class Shown:
         raise TimeoutError(what, self.told.alerts, self.page._caption.content)
 
     def picture(self) -> ByteImage:
-        """The picture of what is looked at now."""
+        """Return the picture of the current view."""
         self.scene_page._request_render()
         asked = self.scene_page._last_request
         self.wait(lambda: self.scene_page._preview and self.scene_page._preview[0] is asked)
@@ -114,10 +114,10 @@ def test_a_frame_is_shown_until_the_camera_moves(shown):
     assert np.abs(second.astype(int) - first).mean() > 2
     own = view_of(shown.scene_page._scene, 1, shown.scene_page._layout).camera.world_from_camera
     shown.scene_page._moved(look(own))
-    assert shown.scene_page._pose is None  # it was moved there by the page
+    assert shown.scene_page._pose is None  # the page moved the camera there
     shown.scene_page._moved(look(look_at_pose((0, 0.3, 0.3), (0, 0, 0))))
     shown.scene_page._moved(look(own))
-    assert shown.scene_page._pose is None  # and is there again
+    assert shown.scene_page._pose is None  # back at the frame's pose
     shown.scene_page._moved(look(look_at_pose((0, 0.2, 0.9), (0, 0, 0))))
     assert shown.scene_page._pose is not None
     above = shown.picture()
@@ -177,7 +177,7 @@ def test_an_invalid_light_is_not_applied(shown, changed):
         CAMERA | {"up_direction": [0, 0, 0]},
         CAMERA | {"wxyz": [0, 0, 0, 0]},
         CAMERA | {"position": [1e300, 0, 0]},
-        CAMERA | {"position": [1e6, -1e6, 1e6], "look_at": [1e6, -1e6, 1e6 - 0.01]},  # taken, and far away
+        CAMERA | {"position": [1e6, -1e6, 1e6], "look_at": [1e6, -1e6, 1e6 - 0.01]},  # accepted, and far away
     ],
     ids=str,
 )
@@ -233,7 +233,7 @@ def test_the_file_is_reloaded_and_an_invalid_one_keeps_the_last_scene(shown):
     data["shapes"].append(post)
     write(shown.path, data)
     shown.wait(lambda: "/shapes/post" in shown.page._shown)
-    assert shown.scene_page._plain.visible  # which of them the browser does not show
+    assert shown.scene_page._plain.visible  # a notice: the browser shows no appearances
     assert shown.told.alerts[-1] is None
     assert "/shapes/table" in kept
     shown.picture()

@@ -1,4 +1,4 @@
-"""The pages of assets, captures, datasets and files of splats, and what of a dataset a filter finds."""
+"""Pages of assets, captures, datasets and splat files, and the filter of dataset images."""
 
 from __future__ import annotations
 
@@ -103,7 +103,7 @@ def test_the_page_of_a_dataset_steps_through_filtered_images(page, clean):
     shown._visible.value = (0, 0)
     assert shown.found == ()
     assert page._caption.content == "no image passes the filter"
-    shown._class.value = "../../etc/passwd"  # as a browser might answer
+    shown._class.value = "../../etc/passwd"  # possible browser input
     assert shown.found == ()
 
 
@@ -122,11 +122,11 @@ def test_the_page_of_a_capture_shows_photos_with_their_masks(page, known_object:
     assert sum(part.group == "cameras" for part in page._shown.values()) == len(capture.photos)
     view, frustum = page._server.initial_camera, page._handles["/cameras/0"]
     ahead = (view.look_at - view.position) / np.linalg.norm(view.look_at - view.position)
-    for photo in capture.photos:  # all are in the first view
+    for photo in capture.photos:  # the first view contains all cameras
         offset = photo.camera.centre - view.position
         assert np.degrees(np.arccos(offset @ ahead / np.linalg.norm(offset))) < 35
     half = np.tan(frustum.fov / 2)
-    depth = frustum.scale / np.cbrt(half * half * frustum.aspect / 3)  # as viser's client draws it
+    depth = frustum.scale / np.cbrt(half * half * frustum.aspect / 3)  # formula of viser's client
     assert depth == pytest.approx(page._shown["/cameras/0"].drawable.depth, rel=1e-5)
     shown._clicked(3)
     assert page._caption.content.startswith("03\\.png")
@@ -147,14 +147,14 @@ def test_clicks_on_a_capture_pick_objects(page, tmp_path):
         shown._pointed(eye, np.array([x, y, 0.07]) - eye)
 
     click(0, "nothing")
-    click(0, "as no option says")  # as a browser might answer
+    click(0, "as no option says")  # possible browser input
     assert shown._summary.content == ""
     assert "/cameras/0" in page._shown
     click(1, "marks the object")
-    assert "/cameras/0" not in page._shown  # a click on it would pick what is behind
+    assert "/cameras/0" not in page._shown  # a click on a frustum would pick the point behind
     (pick,) = (text for _, text in shown._picks)
     assert shown._summary.content == f"```\n--pick {pick}\n```"
-    assert page._caption.content.startswith(pick.partition(".")[0])  # its photo is shown, with a cross
+    assert page._caption.content.startswith(pick.partition(".")[0])  # its photo is shown with a cross
     assert (page._picture.image != 90).any()
     points = page._shown["/chosen/object"].drawable.points
     assert np.linalg.norm(points[:, :2] - THINGS[1], axis=1).max() < 0.05
@@ -171,7 +171,7 @@ def test_clicks_on_a_capture_pick_objects(page, tmp_path):
     assert "there is no point of the capture at this position" in page._alert.content
     shown._forget(all_of_them=True)
     assert shown._summary.content == "" and not [name for name in page._shown if name.startswith("/chosen")]
-    shown._forget(all_of_them=False)  # of none
+    shown._forget(all_of_them=False)  # no picks exist
 
 
 def test_the_page_of_a_splat_file_shows_its_gaussians(page, tmp_path):
@@ -179,7 +179,7 @@ def test_the_page_of_a_splat_file_shows_its_gaussians(page, tmp_path):
     SplatsPage(page, tmp_path / "nut.ply")
     assert list(page._shown) == ["/splats/file"]
     camera = page._server.initial_camera
-    assert camera.up[1] < -0.5 and camera.position[1] < 0  # -y is up in most files, and it is seen from above
+    assert camera.up[1] < -0.5 and camera.position[1] < 0  # most files have -y up; view from above
     page.look_around("z")
     assert camera.up[2] > 0.5 and camera.position[2] > 0
 

@@ -1,4 +1,4 @@
-"""Lines to be copied into a scene file: it says the same with them as the view showed."""
+"""YAML lines for a scene file reproduce the view's settings."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def test_the_view_is_written_as_a_camera_of_a_scene_file(scene_data, write_scene
     path = write_scene(scene_data)
     path.write_text(path.read_text() + camera_lines(pose, (0.02, 0.01, 0.1), Intrinsics(fov_x=50)))
     camera = plan_frame(load_scene(path), 0).camera
-    assert camera.world_from_camera == pytest.approx(pose, abs=3e-4)  # of places to 0.1 mm
+    assert camera.world_from_camera == pytest.approx(pose, abs=3e-4)  # positions are rounded to 0.1 mm
     assert np.degrees(2 * np.arctan(0.5 * camera.width / camera.fx)) == pytest.approx(50)
 
 

@@ -126,9 +126,8 @@ def test_given_masks_replace_computed_masks(
     assert alpha.sum() == alpha[80:250, 100:300].sum() == 170 * 200
     with monkeypatch.context() as elsewhere:
         elsewhere.chdir(tmp_path / "masks")
-        elsewhere.setattr(
-            "mitsplat.capture.pipeline.capture_pipeline.prepare_photos", None
-        )  # copies are not written again
+        # Copies are not written again.
+        elsewhere.setattr("mitsplat.capture.pipeline.capture_pipeline.prepare_photos", None)
         there = replace(settings, poses=Path("../model"), masks=Path())
         assert len(capture_photos(given, Path("../out"), there).capture.photos) == 15
     (tmp_path / "masks/photo05.PNG").unlink()

@@ -1,4 +1,4 @@
-"""What tests of physics share: poses, and where meshes end."""
+"""Helpers of physics tests: poses, and extents of placed meshes."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ STEPPERS = ("warp", "mujoco")
 
 
 def pose_at(position: ArrayLike, rotation: Rotation | None = None) -> NDArray[np.float64]:
-    """A rigid transform, shape (4, 4)."""
+    """Build a rigid transform, shape (4, 4)."""
     pose = np.eye(4)
     pose[:3, 3] = position
     if rotation is not None:
@@ -20,5 +20,5 @@ def pose_at(position: ArrayLike, rotation: Rotation | None = None) -> NDArray[np
 
 
 def lowest(mesh: trimesh.Trimesh, pose: NDArray[np.float64]) -> float:
-    """Height of a placed mesh's lowest vertex [m]."""
+    """Return the height of a placed mesh's lowest vertex [m]."""
     return float((mesh.vertices @ pose[:3, :3].T + pose[:3, 3])[:, 2].min())

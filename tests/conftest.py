@@ -1,4 +1,4 @@
-"""Small assets and scene files that several tests need."""
+"""Shared fixtures: small assets, scene files, datasets and captures."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 WriteScene = Callable[..., Path]
 
-# The same examples in every run, however slow: new ones are for benchmarks/scale/fuzz.py.
+# Every run uses the same examples without a deadline. benchmarks/scale/fuzz.py tries new ones.
 hypothesis.settings.register_profile("suite", derandomize=True, deadline=None, database=None)
 hypothesis.settings.load_profile("suite")
 
@@ -54,7 +54,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Files with slow tests come first, so that no process begins one when there is nothing left for the others."""
+    """Run files with slow tests first, so that no process starts a slow test when the others have finished."""
     slow = {item.path for item in items if item.get_closest_marker("slow")}
     items.sort(key=lambda item: item.path not in slow)
 
@@ -67,21 +67,21 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 
 @pytest.fixture(autouse=True)
 def no_dropped_rays() -> Iterator[None]:
-    """Fails a test that drops rays on a GPU, even if it reads the result late."""
+    """Fail a test that drops rays on a GPU, even if the test reads the result late."""
     yield
     check_dropped_rays()
 
 
 @pytest.fixture(scope="session")
 def gpu() -> None:
-    """Skips what needs a GPU where there is none."""
+    """Skip tests that need a GPU if there is none."""
     gpus = visible_gpus()
     if isinstance(gpus, MissingPrerequisite):
         pytest.skip(gpus.what)
 
 
 def box_asset(name: str, size: tuple[float, float, float] = (0.02, 0.03, 0.01), class_name: str | None = None) -> Asset:
-    """A box with a flat grey Gaussian on each face."""
+    """Build a box with a flat grey Gaussian on each face."""
     mesh = trimesh.creation.box(extents=size)
     splats = Splats(
         means=mesh.triangles_center.astype(np.float32),
@@ -95,7 +95,10 @@ def box_asset(name: str, size: tuple[float, float, float] = (0.02, 0.03, 0.01), 
 
 @pytest.fixture(scope="session", autouse=True)
 def caches(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """Layouts and pieces are kept for the session alone; Warp's kernels, slow to compile, stay where they are."""
+    """Cache layouts and convex pieces for the session only.
+
+    The cache of Warp's kernels is not replaced, because they compile slowly.
+    """
     with pytest.MonkeyPatch.context() as patch:
         if "WARP_CACHE_PATH" not in os.environ:
             patch.setenv("WARP_CACHE_PATH", str(cache_folder().parent / "warp"))
@@ -105,7 +108,7 @@ def caches(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
 @pytest.fixture(scope="session", autouse=True)
 def no_fsync() -> Iterator[None]:
-    """Files of this process are left to the operating system: no test pulls the plug, and many would wait for disks."""
+    """Disable fsync in this process. No test simulates a power failure, and many tests would wait for the disk."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(os, "fsync", lambda file: None)
         yield
@@ -116,7 +119,7 @@ _tried_meshes: dict[tuple[str, bytes], str] = {}
 
 @pytest.fixture(scope="module")
 def meshes_tried_once() -> Iterator[None]:
-    """Tries each mesh in a child process once, wherever its copies lie: an audit tries each model of BOP."""
+    """Check each distinct mesh in a child process only once, because an audit checks each model of BOP."""
     try_mesh = untrusted_meshes._try_mesh
 
     def try_once(path: Path, modified: int, size: int) -> str:
@@ -132,14 +135,14 @@ def meshes_tried_once() -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def physics() -> Iterator[None]:
-    """Every world of a module is made under the settings that layouts are settled with."""
+    """Create the physics worlds of a module under the Warp settings used to settle layouts."""
     with warp_settings():
         yield
 
 
 @pytest.fixture
 def scene_data() -> dict[str, Any]:
-    """A valid scene file's content; tests change what they are about."""
+    """Return the content of a valid scene file, for tests to modify."""
     return {
         "name": "small",
         "shapes": [{"name": "table", "box": {"size": [1, 1, 0.1], "position": [0, 0, -0.05]}, "visible": True}],
@@ -154,7 +157,7 @@ def scene_data() -> dict[str, Any]:
 
 @pytest.fixture
 def write_scene(tmp_path: Path) -> WriteScene:
-    """Writes a scene file next to the assets ``nut`` and ``bolt``, and returns its path."""
+    """Write a scene file next to the assets ``nut`` and ``bolt``, and return its path."""
 
     def write(data: dict[str, Any], name: str = "scene.yaml") -> Path:
         for asset in (box_asset("nut"), box_asset("bolt", (0.01, 0.01, 0.05))):
@@ -173,7 +176,7 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 
 def small_scene(folder: Path, assets: Sequence[Asset], objects: list[dict[str, Any]], **output: Any) -> Scene:
-    """A scene in ``folder`` of assets that fall before an orbiting camera, in images of 64x48."""
+    """Write and load a scene whose assets fall in front of an orbiting camera, with images of 64x48 px."""
     for asset in assets:
         asset.save(folder / "assets" / asset.name)
     data = {
@@ -190,18 +193,21 @@ def small_scene(folder: Path, assets: Sequence[Asset], objects: list[dict[str, A
 
 
 def nut_and_bolt() -> list[Asset]:
-    """Two assets with a named point each."""
+    """Build two assets with one keypoint each."""
     boxes = box_asset("nut"), box_asset("bolt", (0.01, 0.01, 0.05))
     return [replace(box, keypoints={"top": (0, 0, 0.005)}) for box in boxes]
 
 
 BOTH = [{"asset": "assets/nut"}, {"asset": "assets/bolt"}]
-"""The objects of these."""
+"""Scene entries of the two assets."""
 
 
 @pytest.fixture(scope="session")
 def clean(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A small dataset of drawn frames in every format but COLMAP's, which takes a process to read; left as it is."""
+    """Write a small dataset of drawn frames in every format except COLMAP, which takes a process to read.
+
+    Tests must not change this dataset.
+    """
     from tests.drawn import large_boxes, render_boxes, scatter_boxes
 
     folder = tmp_path_factory.mktemp("clean")
@@ -213,12 +219,12 @@ def clean(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def dataset(clean: Path, tmp_path: Path) -> Path:
-    """A copy of the clean dataset, to be damaged."""
+    """Copy the clean dataset, for tests to damage."""
     return Path(shutil.copytree(clean, tmp_path / "out"))
 
 
 def made_once(tmp_path_factory: pytest.TempPathFactory, name: str, make: Callable[[Path], object]) -> Path:
-    """A folder that one of the session's processes makes, and all read: it takes too long to be made by each."""
+    """Return a folder that one process of the session makes and all processes read, because making it is slow."""
     root = tmp_path_factory.getbasetemp()
     if "PYTEST_XDIST_WORKER" in os.environ:
         root = root.parent
@@ -235,7 +241,7 @@ def made_once(tmp_path_factory: pytest.TempPathFactory, name: str, make: Callabl
 
 @pytest.fixture(scope="session")
 def photos(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Camera]]:
-    """Rendered photos, and their true cameras."""
+    """Render photos, and return their folder and true cameras."""
     from tests import rendered
 
     folder = made_once(tmp_path_factory, "rendered", rendered.render_capture)
@@ -247,7 +253,7 @@ def photos(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Ca
 def captured(
     photos: tuple[Path, dict[str, Camera]], tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[Path, Path, CaptureResult]:
-    """Their capture, with one torn photo among them: photos, folder, result."""
+    """Capture the rendered photos with one truncated photo among them, and return photos, folder and result."""
     from mitsplat.capture.pipeline.capture_pipeline import CaptureSettings, capture_photos
     from tests import rendered
 
@@ -265,7 +271,7 @@ def captured(
 
 @dataclass(frozen=True, eq=False)
 class KnownObject:
-    """A solid with a step and a pocket, Gaussians on its surface, and photos of these with the solid's masks."""
+    """Solid with a step and a pocket, Gaussians on its surface, and photos of these with the solid's masks."""
 
     mesh: trimesh.Trimesh
     splats: Splats
@@ -273,7 +279,7 @@ class KnownObject:
 
 
 def orbit(count: int, *, radius: float = 0.35, width: int = 160, height: int = 120) -> list[Camera]:
-    """Cameras evenly all around the origin."""
+    """Place cameras evenly on a sphere around the origin."""
     z = 1 - 2 * (np.arange(count) + 0.5) / count
     azimuth = np.pi * (3 - np.sqrt(5)) * np.arange(count)
     ring = np.sqrt(1 - z**2)
@@ -283,7 +289,7 @@ def orbit(count: int, *, radius: float = 0.35, width: int = 160, height: int = 1
 
 @pytest.fixture(scope="session")
 def known_object(tmp_path_factory: pytest.TempPathFactory) -> KnownObject:
-    """The object in 32 photos of 160 x 120 px; to be left as it is."""
+    """Render the object in 32 photos of 160 x 120 px. Tests must not change the files."""
     import mitsuba as mi
     from PIL import Image
 

@@ -1,4 +1,4 @@
-"""Frames drawn without a renderer, whose masks, depths, poses and cameras nevertheless belong together: boxes."""
+"""Frames of boxes drawn without a renderer, with consistent masks, depths, poses and cameras."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ from tests.conftest import box_asset
 from tests.synthetic import CERTIFICATE, frame_around
 
 MARGIN = 80
-"""Pixels that silhouettes are drawn beyond the image."""
+"""Margin of silhouettes beyond the image [px]."""
 
 
 def large_boxes() -> list[Asset]:
-    """Two assets of a dozen pixels and more, with a named point each."""
+    """Build two assets with a size of at least a dozen pixels and one keypoint each."""
     boxes = box_asset("nut", (0.12, 0.16, 0.08)), box_asset("bolt", (0.06, 0.07, 0.25))
     return [replace(box, keypoints={"top": (0, 0, 0.04)}) for box in boxes]
 
 
 def scatter_boxes(scene: Any, index: int, *, progress: Any) -> Layout:
-    """Four objects at random poses; no physics."""
+    """Place four objects at random poses, without physics."""
     rng = random_stream(scene.spec.seed, "drawn layout", index)
     instances = []
     for i in range(4):
@@ -41,7 +41,10 @@ def scatter_boxes(scene: Any, index: int, *, progress: Any) -> Layout:
 
 
 def render_boxes(scene: Any, index: int, *, layout: Layout) -> Any:
-    """Every box is the hull of its corners' pixels, at the depth of its middle; nearer ones hide others."""
+    """Draw each box as the convex hull of its projected corners, at the depth of its centre.
+
+    Nearer boxes occlude others.
+    """
     plan = plan_frame(scene, index, layout)
     camera = plan.camera
     shape = camera.height, camera.width

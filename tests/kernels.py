@@ -1,4 +1,7 @@
-"""What Dr.Jit's kernels trace, read from the code that it generates: no GPU is needed to see what one would refuse."""
+"""Ray-tracing scenes in Dr.Jit kernels, read from generated code.
+
+Without a GPU, this finds kernels that CUDA does not support.
+"""
 
 from __future__ import annotations
 
@@ -9,14 +12,14 @@ from contextlib import contextmanager
 import drjit as dr
 
 TRACE = re.compile(r"call void %rd\d+\(ptr %u\d+_in_0_\w+, ptr (%rd\d+), ptr %u\d+_in_ctx")
-"""A call of Embree in LLVM's language: context, the register that holds the scene, rays."""
+"""Call of Embree in LLVM IR: context, the register that holds the scene, rays."""
 
 
 @contextmanager
 def traced_scenes() -> Iterator[list[int]]:
-    """Count the ray-tracing scenes of each kernel that is launched in the block; of the variant llvm_ad_rgb.
+    """Count the ray-tracing scenes of each kernel launched in the block, for the variant llvm_ad_rgb.
 
-    On CUDA, rays of a second one are left out.
+    CUDA omits the rays of a second scene in a kernel.
     """
     numbers: list[int] = []
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):

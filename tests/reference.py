@@ -1,4 +1,4 @@
-"""The slow, readable twin of the renderer: float64 NumPy, every Gaussian on every ray, exact order, no cut-off."""
+"""Slow reference renderer: float64 NumPy, every Gaussian on every ray, exact order, no cut-off."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Array = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Reference:
-    """Display-encoded colour times alpha (H, W, 3), alpha (H, W), and mean depth of what was blended (H, W) [m]."""
+    """Reference image: display-encoded colour times alpha (H, W, 3), alpha (H, W), mean blended depth (H, W) [m]."""
 
     rgb: Array
     alpha: Array
@@ -49,9 +49,10 @@ def render_reference(splats: Splats, camera: Camera, quality: Quality = PRESETS[
 
 
 def reference_shares(splats: Splats, instances: npt.NDArray[np.integer], camera: Camera) -> Array:
-    """Share (H, W, max id + 1) that the Gaussians of each instance, whose ids are given by row, have of each ray.
+    """Compute the share of each instance in each ray, shape (H, W, max id + 1). ``instances`` has the id of each
+    Gaussian.
 
-    What is left of a ray belongs to the environment, id 0.
+    The remaining transmittance of a ray belongs to the environment, id 0.
     """
     x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
     shares = np.zeros((camera.height * camera.width, int(instances.max()) + 1))
@@ -65,27 +66,31 @@ def reference_shares(splats: Splats, instances: npt.NDArray[np.integer], camera:
 
 
 def responses(splats: Splats, camera: Camera, u: float, v: float) -> tuple[Array, Array]:
-    """Opacity along the ray of slopes (u, v), and depth of the peak, of every Gaussian (N,); 0 if it is not ahead."""
+    """Compute opacity along the ray of slopes (u, v) and peak depth of every Gaussian (N,).
+
+    The opacity is 0 if the peak is not in front of the near plane.
+    """
     pose = camera.camera_from_world
     means = splats.means.astype(np.float64) @ pose[:3, :3].T + pose[:3, 3]
     axes = pose[:3, :3] @ Rotation.from_quat(splats.quats.astype(np.float64)).as_matrix()
     scales = splats.scales.astype(np.float64)
-    scales = np.maximum(scales, 1e-6 * scales.max(axis=1, keepdims=True))  # as the renderer states
+    scales = np.maximum(scales, 1e-6 * scales.max(axis=1, keepdims=True))  # same lower bound as in the renderer
     direction = np.array([u, v, 1.0])
     whitened_mean = np.einsum("nij,ni->nj", axes, means) / scales
     whitened_ray = np.einsum("nij,i->nj", axes, direction) / scales
     length2 = (whitened_ray**2).sum(axis=1)
     z = (whitened_mean * whitened_ray).sum(axis=1) / length2
-    # |m x d|^2 / |d|^2 rather than a difference of two large numbers.
+    # |m x d|^2 / |d|^2 avoids the difference of two large numbers.
     distance2 = (np.cross(whitened_mean, whitened_ray) ** 2).sum(axis=1) / length2
     opacity = splats.opacities * np.exp(-0.5 * distance2)
     return np.where(z > camera.near, opacity, 0.0), z
 
 
 def widened_responses(splats: Splats, camera: Camera, slopes: Array, quality: Quality) -> tuple[Array, Array]:
-    """The same, (M, N), along rays (M, 2), under a kernel or as if parallel, by EWA (Zwicker et al. 2002).
+    """Compute opacity and depth, (M, N), along rays (M, 2), with a kernel or parallel rays, by EWA (Zwicker et al.
+    2002).
 
-    Depth and length of the ray are those of a joint Gaussian whose position on the image is known less well by K.
+    Depth and ray length are those of a joint Gaussian whose image position has the additional covariance K.
     """
     kernel = KERNELS[quality.kernel]
     pose = camera.camera_from_world
@@ -114,8 +119,8 @@ def widened_responses(splats: Splats, camera: Camera, slopes: Array, quality: Qu
 
 
 def reference_colours(splats: Splats, camera: Camera) -> Array:
-    """Display-encoded colours (N, 3) as seen from the camera's centre."""
+    """Compute display-encoded colours (N, 3) as seen from the camera's centre."""
     directions = splats.means.astype(np.float64) - camera.centre
-    # A Gaussian centred on the camera is seen along no direction: only its constant band counts.
+    # A Gaussian centred on the camera has no view direction. Only its constant band contributes.
     directions /= np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1e-30)
     return evaluate_sh(splats.sh, directions)

@@ -1,4 +1,4 @@
-"""A small capture whose truth is known: a textured box on a ChArUco board, rendered with sensor noise."""
+"""Small rendered capture with known ground truth: a textured box on a ChArUco board, with sensor noise."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from mitsplat.geometry.camera import Camera
 
 BOARD = Board(7, 5, 0.035)
 BOX = np.array([0.07, 0.05, 0.07])
-"""Edges of the box [m]; it stands in the middle of the board, z = 0 the board."""
+"""Edge lengths of the box [m]. The box stands in the middle of the board, which lies at z = 0."""
 
 SIZE = (480, 360)
-"""Of photos [px]."""
+"""Size of photos [px]."""
 FILM_SIZE = (320, 240)
-"""Of a video [px]."""
+"""Size of a video [px]."""
 
 
 def cameras(count: int) -> list[Camera]:
-    """Cameras around the box, close enough that its sides are matched."""
+    """Place cameras around the box, close enough to match its sides."""
     angles = np.linspace(0, 2 * np.pi, count, endpoint=False)
     heights, radii = np.resize([0.17, 0.22], count), np.resize([0.24, 0.21], count)
     places = np.column_stack([radii * np.cos(angles), radii * np.sin(angles), heights])
@@ -34,23 +34,26 @@ def cameras(count: int) -> list[Camera]:
 
 
 def capture_cameras() -> list[Camera]:
-    """Cameras of a capture, 15 degrees apart, as far around as shows all sides: each pair of its photos is matched."""
+    """Return the cameras of a capture, 15 degrees apart, over an arc that shows all sides.
+
+    The arc is not longer, because each pair of photos is matched.
+    """
     return cameras(24)[:16]
 
 
 def render_capture(folder: Path, *, samples: int = 8) -> dict[str, Camera]:
-    """Render photos into a folder; returns their cameras by name, in the board's frame [m]."""
+    """Render photos into a folder, and return their cameras by name, in the board's frame [m]."""
     return photograph(box_scene(5), capture_cameras(), folder, samples=samples)
 
 
 def box_scene(seed: int) -> dict[str, Any]:
-    """The box on its board; another seed paints box and table differently."""
+    """Build the box on its board. Another seed changes the textures of box and table."""
     rng = np.random.default_rng(seed)
     return table_scene(BOARD, rng) | {f"side{number}": side for number, side in enumerate(_sides(rng))}
 
 
 def _sides(rng: np.random.Generator) -> list[dict[str, Any]]:
-    """The box's visible sides, each painted differently: equal ones would be matched with each other."""
+    """Build the visible sides of the box with different textures. Equal sides would be matched with each other."""
     sides = []
     for axis, sign in ((0, 1), (0, -1), (1, 1), (1, -1), (2, 1)):
         normal = sign * np.eye(3)[axis]
@@ -65,7 +68,7 @@ def _sides(rng: np.random.Generator) -> list[dict[str, Any]]:
 
 
 def walk(count: int) -> list[Camera]:
-    """Cameras of a hand that goes around the box, up and down a little, 96 of them in a turn."""
+    """Return the cameras of a hand-held walk around the box, with small vertical motion and 96 cameras per turn."""
     angles = 2 * np.pi / 96 * np.arange(count)
     heights, radii = 0.19 + 0.03 * np.sin(3 * angles), 0.23 + 0.015 * np.cos(3 * angles)
     places = np.column_stack([radii * np.cos(angles), radii * np.sin(angles), heights])
@@ -73,9 +76,9 @@ def walk(count: int) -> list[Camera]:
 
 
 def render_video(file: Path, count: int = 68, *, samples: int = 4) -> dict[int, Camera]:
-    """Render a video of 30 frames a second, of which every tenth is blurred; returns its cameras by frame.
+    """Render a video at 30 frames per second with every tenth frame blurred, and return its cameras by frame.
 
-    As many as show all sides.
+    The default number of frames shows all sides.
     """
     with TemporaryDirectory() as folder:
         found = photograph(box_scene(5), walk(count), Path(folder), samples=samples)

@@ -1,4 +1,4 @@
-"""What no physics and no renderer made: a certificate, and frames around maps."""
+"""Synthetic data without physics and renderer: a certificate, and frames from given maps."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ CERTIFICATE = replace(NO_PHYSICS, time_to_rest=1.5, collider_penetration=1e-5, a
 
 
 def frame_around(plan: Any, layout: Any, labels: Labels, *, image: Any, ids: Any, depth: Any, normal: Any) -> Frame:
-    """A frame of these maps, whose splats and proxies agree, lit as captured."""
+    """Build a frame from given maps, with equal maps of splats and proxies and the captured light."""
     colour, ids, depth = image.astype(np.float32) / 255, ids.astype(np.uint16), depth.astype(np.float32)
     layers = Layers(
         rgb=colour,

@@ -1,4 +1,4 @@
-"""Asset folders: units, axes and masses; there and back; and everything that may be wrong with one."""
+"""Asset folders: units, axes and masses, round trips, and refused input."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -48,7 +48,7 @@ def write(folder: Path, text: str, **files: bytes) -> Path:
 
 
 def test_an_interrupted_save_leaves_the_earlier_or_the_new_asset(asset, tmp_path, monkeypatch):
-    """Splats of the one are never read with the mesh of the other."""
+    """Splats of one asset are never read with the mesh of the other."""
     asset.save(tmp_path)
 
     def stop(*args, **kwargs):
@@ -114,7 +114,7 @@ class TestUnitsAndAxes:
             (loaded.mesh.vertices, asset.mesh.vertices),
         ):
             assert np.allclose(turned[:, 2], original @ AXES[up], atol=1e-7)
-        # Two rotations differ from a mirror image by the sign of any triple product.
+        # Rotations preserve the sign of a triple product. A mirror image would change the sign.
         triple = np.linalg.det(asset.splats.means[8:11]), np.linalg.det(loaded.splats.means[8:11])
         assert triple[0] == pytest.approx(triple[1], rel=1e-3)
 
@@ -263,7 +263,7 @@ class TestBadInput:
         changes=st.lists(st.tuples(st.floats(0, 1, exclude_max=True), st.integers(0, 255)), max_size=4),
     )
     def test_random_damage_of_meshes_is_refused_or_gives_valid_assets(self, tmp_path, form, keep, changes, monkeypatch):
-        """By the reader itself, without the trial in a process that comes before it."""
+        """The test covers the reader itself, without the preceding check in a child process."""
         monkeypatch.setattr("mitsplat.asset.check_mesh", lambda path: None)
         whole = trimesh.creation.box().export(file_type=form)
         data = bytearray(whole.encode() if isinstance(whole, str) else whole)

@@ -1,4 +1,4 @@
-"""The documentation's machinery: what it shows exists, loads, and is all there; building the site is ``make docs``."""
+"""Documentation checks: examples exist, load, and are complete. ``make docs`` builds the site."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def test_every_referenced_picture_exists_and_no_other() -> None:
 
 
 def test_every_fragment_below_a_picture_is_valid() -> None:
-    """By the models alone: rendering all of them is ``python docs/pictures.py``."""
+    """The pydantic models check the fragments. ``python docs/pictures.py`` renders all of them."""
     from pictures import read_pictures
 
     for picture in read_pictures():
@@ -56,7 +56,7 @@ def test_every_fragment_below_a_picture_is_valid() -> None:
 
 @pytest.mark.slow
 def test_scenes_of_the_gallery_get_no_warning(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The scenes share their parts; each is dropped alone once for each arrangement and stands for its other drops."""
+    """The scenes share their parts. Each part is dropped alone once per arrangement, instead of once per drop."""
     from pictures import GALLERY, SCENES
 
     from mitsplat.physics.drop import Drop
@@ -93,7 +93,7 @@ def test_scenes_of_the_gallery_get_no_warning(monkeypatch: pytest.MonkeyPatch) -
         ("[a](https://example.org/b#c)", None),
         ("[a](http://example.org)", "must be https and name a host"),
         ("[a](https:/example.org)", "must be https and name a host"),
-        ("    [a](missing.md)", None),  # code
+        ("    [a](missing.md)", None),  # code block
     ],
 )
 def test_links_to_missing_files_and_places_are_reported(
@@ -110,7 +110,7 @@ def test_links_to_missing_files_and_places_are_reported(
 
 
 def test_every_command_is_documented() -> None:
-    """Typer's reference, which the site shows, has every command."""
+    """Typer's reference on the site has every command."""
     from mitsplat.cli import app
 
     command = [sys.executable, "-m", "typer", "mitsplat.cli", "utils", "docs", "--name", "mitsplat"]

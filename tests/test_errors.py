@@ -1,4 +1,4 @@
-"""What the command line makes of errors that are no bugs of mitsplat."""
+"""Error messages and exit statuses of the command line for errors that are not bugs of mitsplat."""
 
 import cv2
 import numpy as np

@@ -1,4 +1,4 @@
-"""Every notebook and script in ``examples`` runs from top to bottom; each ends in its own checks."""
+"""Notebooks and scripts in ``examples``: complete runs, each with its own checks at the end."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def test_a_notebook_is_stored_without_outputs_and_ends_in_checks(path: Path) -> 
 @pytest.mark.slow
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_each_notebook_runs(path: Path) -> None:
-    """In a process of its own, since its code chooses Mitsuba's variant and imports as a user would."""
+    """Each notebook runs in a new process, because it chooses Mitsuba's variant and imports as a user would."""
     done = subprocess.run(
         [sys.executable, "-c", "\n\n".join(code_of(path))], cwd=EXAMPLES, capture_output=True, text=True, timeout=600
     )

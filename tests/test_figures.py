@@ -1,4 +1,4 @@
-"""Figures of the documentation: recorded by benchmarks, filled into pages, and checked."""
+"""Figures of the documentation: recorded by benchmarks, inserted into pages, and checked."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def test_detectors_are_compared_over_the_same_draws_of_scenes() -> None:
     def run(strict: float, samples: list[float]) -> dict[str, Any]:
         return {"figures": {"map50_95": [strict, ""], "map50": [2 * strict, ""], "samples": [samples, ""]}}
 
-    draws = np.random.default_rng(1).uniform(0.2, 0.6, 200)  # hard and easy scenes: far apart, alike for every arm
+    draws = np.random.default_rng(1).uniform(0.2, 0.6, 200)  # wide spread of scenes, equal for every arm
     results = {
         "detector.experiment-real-0": run(0.25, list(draws - 0.15)),
         "detector.experiment-synthetic-0": run(0.40, list(draws)),
@@ -75,8 +75,8 @@ def test_detectors_are_compared_over_the_same_draws_of_scenes() -> None:
     interval = f"{low - 0.15:.3f} to {high - 0.15:.3f}"
     assert real == f"| `real` | 1 | 0.250 | {interval} | 0.500 | `synthetic` | 0.150 to 0.170 |"
     assert synthetic.startswith("| `synthetic` | 2 | 0.410 | ") and synthetic.endswith("| 0.820 | – | – |")
-    assert shadow.endswith("| `traced_shadow` | 0.100 to 0.100 |")  # of the same views
-    assert earlier.endswith("| – | – |")  # beside none
+    assert shadow.endswith("| `traced_shadow` | 0.100 to 0.100 |")  # same views
+    assert earlier.endswith("| – | – |")  # no arm to compare with
     results["detector.experiment-no_shadow-0"]["figures"]["scenes"] = ["of later ones", ""]
     results["detector.experiment-real-0"]["figures"]["scenes"] = ["", ""]
     *_, shadow, real, _, _ = experiment_table(results).splitlines()
@@ -85,7 +85,7 @@ def test_detectors_are_compared_over_the_same_draws_of_scenes() -> None:
     for seed in range(2):
         results[f"detector.experiment-synthetic-{seed}"]["figures"]["scenes"] = ["of later ones", ""]
     *_, before, _, _, _, _, _ = experiment_table(results).splitlines()
-    assert before.endswith("| `synthetic` | 0.020 to 0.040 |")  # although of other scenes
+    assert before.endswith("| `synthetic` | 0.020 to 0.040 |")  # compared although of other scenes
     *_, shadow, traced = experiment_table(results, "workshop").splitlines()
     assert shadow.endswith("| `traced_shadow` | 0.100 to 0.100 |")
     assert traced.startswith("| `traced_shadow` | 1 | 0.300 | ")
@@ -157,7 +157,7 @@ def test_a_configuration_has_the_arguments_that_change_figures(words: tuple[str,
 
 @pytest.fixture
 def clean(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A checkout without uncommitted changes, whatever the state of the one under test."""
+    """Mock a checkout without uncommitted changes, for any state of the tested one."""
     monkeypatch.setattr(record, "refusal", lambda: None)
     monkeypatch.setattr(record, "RECORDS", True)
 
@@ -223,7 +223,7 @@ def test_a_run_from_a_dirty_checkout_is_refused_after_it_has_printed(
     git("add", ".")
     git("commit", "--quiet", "-m", "first")
     (tmp_path / "README.md").write_text("Faster.\n")
-    assert refusal(tmp_path) is None  # no figure depends on it
+    assert refusal(tmp_path) is None  # no figure depends on README
     (tmp_path / "mitsplat/quality.py").write_text("FAST = 2\n")
     (tmp_path / "mitsplat/new.py").touch()
     monkeypatch.setattr(record, "RECORDS", True)
@@ -280,13 +280,13 @@ def test_captions_mark_old_dirty_and_transcribed_results() -> None:
 def test_every_benchmark_records_its_figures() -> None:
     scripts = [path for path in record.ROOT.glob("benchmarks/*/*.py") if "__main__" in path.read_text()]
     assert len(scripts) > 25
-    # Data sets for detectors, scripts that start others, and a chart.
+    # Scripts for detector datasets, scripts that start others, and a chart.
     others = {"arranged.py", "meshes.py", "__main__.py", "chart.py"}
     assert {path.name for path in scripts if "with recording(" not in path.read_text()} == others
 
 
 def test_every_benchmark_can_be_imported() -> None:
-    """What they take of the package is there, under that name; a process of its own, as some change the environment."""
+    """Every imported name exists in the package. The imports run in a new process, as some change the environment."""
     modules = [path for path in record.ROOT.glob("benchmarks/*/*.py") if path.name != "__main__.py"]
     names = sorted(".".join(path.relative_to(record.ROOT).with_suffix("").parts) for path in modules)
     script = "import importlib, sys\nfor name in sys.argv[1:]:\n    importlib.import_module(name)"

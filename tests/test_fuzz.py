@@ -1,7 +1,7 @@
-"""Damaged files are read, or refused in one sentence that names them; nothing else may come of them.
+"""Damaged files: each is read, or refused in one sentence with its name.
 
-A few inputs of each reader; ``python -m benchmarks.scale.fuzz`` tries as many as time allows, each in a process of its
-own.
+The tests use a few inputs per reader. ``python -m benchmarks.scale.fuzz`` tries as many as time allows, each in a
+process of its own.
 """
 
 import random
@@ -35,7 +35,7 @@ def test_undamaged_samples_are_read(samples, name):
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("name", READERS)
 def test_damaged_files_are_read_or_refused_in_one_sentence(samples, name):
-    """Slow readers, which start a process, get three inputs; the others 40."""
+    """Slow readers, which start a process, get 3 inputs; the others get 40."""
     reader = READERS[name]
     path = samples / reader.file
     sample = path.read_bytes()

@@ -1,4 +1,4 @@
-"""Child processes in a folder that holds Python files: none of these is run."""
+"""Child processes started in a folder with Python files, none of which is run."""
 
 from __future__ import annotations
 
@@ -126,7 +126,7 @@ KINDS = {
 
 @pytest.fixture
 def start(tmp_path, monkeypatch):
-    """Runs a part of the parent in a folder with hostile modules; what it says, and which of these were run."""
+    """Run a part of the parent script in a folder with hostile modules, and return its output and the modules run."""
     folder, run = tmp_path / "downloaded", tmp_path / "run"
     folder.mkdir(), run.mkdir()
     for name in NAMES.split():

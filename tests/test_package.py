@@ -1,4 +1,4 @@
-"""What is exported, what importing costs, and what a wheel ships."""
+"""Exports, import cost, and contents of the wheel."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ def test_wheel_ships_package_and_plugins(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("first", ["mitsplat", "mitsuba"])
 def test_plugins_are_registered_in_any_order_of_imports(first: str) -> None:
-    """``import mitsplat`` waits for Mitsuba, whose variant may be chosen before and after."""
+    """``import mitsplat`` registers plugins after Mitsuba's import. The variant may be chosen before or after."""
     chosen = "import mitsuba as mi; mi.set_variant('llvm_ad_rgb')"
     lines = {"mitsplat": f"import mitsplat\n{chosen}", "mitsuba": f"{chosen}\nimport mitsplat"}[first]
     code = f"{lines}\nprint(type(mi.load_dict({{'type': 'splat_proxy'}})))"

@@ -38,18 +38,18 @@ LAYERS = (
 )
 """Packages, and modules directly in ``mitsplat``, from top to bottom. Each imports only from layers below its own.
 
-A package is one folder; a subpackage has a layer of its own.
+A package is one folder. A subpackage has a layer of its own.
 """
 
 MAX_LINES = 3000
-"""Most lines of one package, without its subpackages."""
+"""Maximum number of lines of a package, without its subpackages."""
 
 MAX_TOP_MODULES = 10
 MAX_PLUGIN_FILES = 8
 
 
 def find_modules() -> dict[str, Path]:
-    """Every module by its name; the folder ``plugins`` is installed as ``mitsplat.plugins``."""
+    """Return every module by its name. The folder ``plugins`` is installed as ``mitsplat.plugins``."""
     found = {}
     for path in [*(ROOT / "mitsplat").rglob("*.py"), *(ROOT / "plugins").glob("*.py")]:
         parts = path.relative_to(ROOT).with_suffix("").parts
@@ -62,14 +62,17 @@ MODULES = find_modules()
 
 
 def unit_of(module: str) -> str:
-    """Package of a module without the prefix ``mitsplat.``; a module directly in ``mitsplat`` stands for itself."""
+    """Return the package of a module without the prefix ``mitsplat.``.
+
+    A module directly in ``mitsplat`` is returned itself.
+    """
     if MODULES[module].name == "__init__.py" or module.count(".") == 1:
         return module.removeprefix("mitsplat.")
     return module.rpartition(".")[0].removeprefix("mitsplat.")
 
 
 def imports(module: str, *, for_types: bool) -> Iterator[tuple[str, int]]:
-    """Modules of the package that a module imports anywhere in it, and the lines."""
+    """Return the package's modules that a module imports at any place, with the lines."""
     tree = ast.parse(MODULES[module].read_text())
     unread = {
         inner
@@ -153,10 +156,11 @@ def test_the_design_page_names_every_module() -> None:
 
 
 def imports_inside(path: Path) -> Iterator[tuple[int, bool]]:
-    """Lines of imports inside of functions, and whether each states why it is not at the top of the file.
+    """Return the lines of imports inside functions, and True for each import with a stated reason.
 
-    The reason is a comment on the import, above it or above those right before it; or the module's docstring says that
-    its functions import what they need.
+    The reason is a comment on the import, above the import, or above the imports right before. Alternatively the
+    module's
+    docstring states that its functions import what they need.
     """
     lines, tree = path.read_text().splitlines(), ast.parse(path.read_text())
     for_all = re.search(r"\binside (of )?(the |their |its )?functions?\b", ast.get_docstring(tree) or "") is not None
@@ -178,7 +182,7 @@ def imports_inside(path: Path) -> Iterator[tuple[int, bool]]:
 
 
 def test_one_module_builds_command_lines_of_python() -> None:
-    """A child started elsewhere could lack safe-path mode, and run Python files of the current folder."""
+    """A child started by other code could lack safe-path mode, and run Python files of the current folder."""
     starts = ("sys.executable", "sys._base_executable", "ProcessPoolExecutor", "set_executable", "forkserver")
     found = {f"{module}: {start}" for module, path in MODULES.items() for start in starts if start in path.read_text()}
     assert found == {"mitsplat.runtime.child_process: sys.executable"}
@@ -214,7 +218,7 @@ def test_imports_inside_of_functions_have_a_reason() -> None:
 
 
 def test_no_public_name_hides_a_module() -> None:
-    """``from package import name`` must not give a function where a module has the same name."""
+    """``from package import name`` must not return a function if a module has the same name."""
     for module, path in MODULES.items():
         if path.name == "__init__.py" and module != "mitsplat":
             exports = (node for node in ast.parse(path.read_text()).body if isinstance(node, ast.Assign))

@@ -1,4 +1,4 @@
-"""Plain technical English in docstrings: the first line states what a thing is or does."""
+"""Style of docstrings: the first line states the function of an object and does not begin with a question word."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Documented = ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef
 
 
 def public_docstrings(path: Path) -> Iterator[tuple[int, str]]:
-    """Line and docstring of a module and of its public classes, methods and functions."""
+    """Yield line and docstring of a module and of its public classes, methods and functions."""
 
     def visit(node: Documented, line: int) -> Iterator[tuple[int, str]]:
         if text := ast.get_docstring(node):

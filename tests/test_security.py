@@ -1,4 +1,4 @@
-"""Hostile scenes and archives: nothing outside is read, nothing swells, no code is run."""
+"""Hostile scenes and archives: no file outside is read, memory is bounded, and no code is run."""
 
 import gzip
 import json
@@ -66,7 +66,7 @@ class TestScenes:
 
     @pytest.mark.parametrize("opening", ["[", "{", "[ ", "- "])
     def test_deep_nesting_is_refused_in_bounded_time(self, tmp_path, opening):
-        """It would take ruamel.yaml a time with the square of the depth, 6 s for 2,000 brackets."""
+        """ruamel.yaml would take time quadratic in the depth, 6 s for 2,000 brackets."""
         path = tmp_path / "scene.yaml"
         path.write_text(opening * 2000)
         begun = time.process_time()
@@ -76,7 +76,7 @@ class TestScenes:
 
     @pytest.mark.parametrize("key", ["asset", "pool"])
     def test_long_names_are_refused_in_bounded_time(self, scene_data, write_scene, key):
-        """Resolving them would take a time with the square of the length."""
+        """Resolving long names would take time quadratic in the length."""
         scene_data["objects"] = [{key: "*/" * 200_000}]
         path = write_scene(scene_data)
         begun = time.process_time()
@@ -85,7 +85,7 @@ class TestScenes:
         assert time.process_time() - begun < 5 and len(str(raised.value)) < 1000
 
     def test_aliases_that_multiply_are_refused(self, tmp_path):
-        """The billion laughs: ten levels of ten aliases each."""
+        """The attack is "billion laughs": ten levels of ten aliases each."""
         levels = ["a0: &a0 [x]\n"] + [f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 10)}]\n" for i in range(1, 10)]
         (tmp_path / "scene.yaml").write_text("".join(levels))
         with pytest.raises(InputError, match=r"scene\.yaml: must not hold more than 200000 values"):
@@ -102,7 +102,7 @@ class TestScenes:
         assert not (tmp_path / "pwned").exists()
 
     def test_a_named_pipe_is_refused(self, tmp_path):
-        """Opening it would wait for ever."""
+        """Opening a named pipe would block for ever."""
         for name in ("scene.yaml", "a.ply", "a.xml"):
             os.mkfifo(tmp_path / name)
         for read in (lambda: load_scene(tmp_path / "scene.yaml"), lambda: Splats.load(tmp_path / "a.ply"),
@@ -247,7 +247,7 @@ class TestXml:
             check_xml(scene)
 
     def test_mitsuba_gets_absolute_paths_without_links(self, scene):
-        """So that a link that is changed after the check does not change what is read."""
+        """A link that changes after the check does not change the files that are read."""
         (scene.parent / "sub").mkdir()
         (scene.parent / "sub/good.ply").write_text("")
         (scene.parent / "ok.ply").symlink_to("sub/good.ply")
@@ -263,7 +263,7 @@ class TestXml:
             xml_scene.render_xml(scene, scene.parent / "out.png")
 
     def test_a_crash_of_mitsuba_is_reported_in_one_sentence(self, scene, capsys, monkeypatch):
-        """A native reader that crashes, in its stead a process that is killed."""
+        """A killed process stands in for a crash of a native reader."""
         monkeypatch.setattr(xml_scene, "_RenderOne", Dies)
         assert run("render", scene) == 2
         assert "scene.xml: Mitsuba's process ended at a file that the scene names" in capsys.readouterr().err
@@ -278,7 +278,7 @@ class Dies:
 
 
 class TestImages:
-    """Images of environment lights are read by Mitsuba, in a process of its own first."""
+    """Images of environment lights, which Mitsuba first reads in a process of its own."""
 
     @pytest.fixture
     def scene(self, scene_data, write_scene, tmp_path):
@@ -306,7 +306,7 @@ class TestImages:
         assert "\n" not in str(caught.value)
 
     def test_an_image_header_that_states_too_many_pixels_is_refused(self, scene, tmp_path):
-        """An EXR whose window is 2^30 pixels wide and 2^20 high."""
+        """The EXR has a data window of 2^30 pixels in width and 2^20 in height."""
         path = tmp_path / "sky.exr"
         data = path.read_bytes()
         window = struct.pack("<iiii", 0, 0, 15, 7)
@@ -317,7 +317,7 @@ class TestImages:
 
 
 class TestArchives:
-    """Compressed files that swell; the peak of this process says that nothing was allocated for them."""
+    """Compressed files that expand on reading. This process's peak memory shows that nothing was allocated."""
 
     @pytest.fixture(autouse=True)
     def peak(self):
@@ -377,7 +377,7 @@ def samples(tmp_path_factory):
 
 
 class TestAttacks:
-    """A few attacks of ``python -m benchmarks.scale.attack``, and that its verdicts find what goes wrong."""
+    """A few attacks of ``python -m benchmarks.scale.attack``, and the detection of successful attacks."""
 
     @pytest.fixture
     def place(self, samples, tmp_path):
@@ -429,7 +429,7 @@ class TestAttacks:
 
 
 class TestMeshes:
-    """Meshes that swell when they are read; the peak of this process says that they were not read here."""
+    """Meshes that expand on reading. This process's peak memory shows that they were not read here."""
 
     @pytest.fixture(autouse=True)
     def peak(self):
@@ -450,7 +450,7 @@ class TestMeshes:
 
     @pytest.mark.parametrize("read", [read_mesh, read_parts])
     def test_a_count_of_vertices_without_data_is_refused(self, tmp_path, read):
-        """Positions of 10^10 vertices in no buffer, which are zeros by the rules of glTF."""
+        """The file states positions of 10^10 vertices without a buffer. By the glTF specification these are zeros."""
         accessor = {"componentType": 5126, "count": 10**10, "type": "VEC3"}
         mesh = {"primitives": [{"attributes": {"POSITION": 0}}]}
         said = {"asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0}]}

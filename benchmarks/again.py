@@ -1,11 +1,11 @@
-"""Records figures again: runs the commands of results, one after the other.
+"""Repeats recorded benchmarks: runs the commands of results, one after the other.
 
-    python -m benchmarks.again NAME...      # those whose names begin like this: render.frame
-    python -m benchmarks.again --idle       # those by the clock, on a machine that does nothing else
+    python -m benchmarks.again NAME...      # results whose names start with NAME: render.frame
+    python -m benchmarks.again --idle       # timings, on an otherwise idle machine
     python -m benchmarks.again --all        # all that run on this machine from a checkout alone
-    python -m benchmarks.again ... --list   # says what would run, and how long it took
+    python -m benchmarks.again ... --list   # lists the commands and their recorded durations
 
-What names CAPTURE, PHOTOS, DATASET or another thing that a checkout lacks, or a GPU, is run by hand, and so is
+Commands that name CAPTURE, PHOTOS, DATASET or other input that a checkout lacks, or a GPU, are run by hand. So is
 ``python -m scenes.build --out FOLDER``, which without a folder replaces the shipped assets.
 """
 
@@ -29,13 +29,13 @@ IDLE = (
     "physics.settle-rate-count_6",
     "physics.settle-share",
 )
-"""Figures by the clock, or that other programs swell most."""
+"""Wall-clock timings, or figures that other programs affect most."""
 ELSEWHERE = re.compile(r"\b[A-Z]{3,}\b|\.splat\b|cuda|\.\./shared")
-"""What a checkout lacks."""
+"""Input that a checkout lacks."""
 
 
 def command_of(result: Mapping[str, Any]) -> list[str]:
-    """What records a result; the command line's own chart does not, its benchmark does."""
+    """Return the command that records a result; the command line's own chart does not, its benchmark does."""
     words = shlex.split(result["command"])
     if words[:2] == ["mitsplat", "chart"]:
         words = [
@@ -48,14 +48,14 @@ def command_of(result: Mapping[str, Any]) -> list[str]:
 
 
 def recordable(result: Mapping[str, Any]) -> bool:
-    """Whether a checkout on this machine is enough."""
+    """Return True if a checkout on this machine is enough."""
     command = result["command"]
     own = command.startswith(("python -m benchmarks.", "mitsplat chart"))
     return own and not ELSEWHERE.search(command) and not result["machine"]["gpu"]
 
 
 def main() -> None:
-    """Run, and go on when one fails."""
+    """Run the commands; continue after a failure."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("names", nargs="*")
     parser.add_argument("--idle", action="store_true")

@@ -1,19 +1,19 @@
-"""Writes the documentation's figures from what benchmarks recorded, so that none is typed by hand.
+"""Writes the documentation's figures from recorded benchmark results, so that none is typed by hand.
 
     python -m benchmarks.figures            # writes docs/figures.md and docs/reliability.md
-    python -m benchmarks.figures --check    # says what is not as the results are, with status 1
-    python -m benchmarks.figures --age      # how much has changed since each result
+    python -m benchmarks.figures --check    # prints differences from the results, with status 1
+    python -m benchmarks.figures --age      # prints the number of commits since each result
 
-Pages are made of templates in ``benchmarks/templates``, where ``{{ ... }}`` stands for
+Pages are made from templates in ``benchmarks/templates``, where ``{{ ... }}`` stands for
 
-* ``RESULT FIGURE FORMAT``: one figure, as Python formats it; ``*1000:.1f`` multiplies it before;
-* ``cells RESULT FIGURE KEY:FORMAT ...``: cells of a table, of the figures ``FIGURE.KEY``;
+* ``RESULT FIGURE FORMAT``: one figure in a Python format; ``*1000:.1f`` multiplies it first;
+* ``cells RESULT FIGURE KEY:FORMAT ...``: table cells of the figures ``FIGURE.KEY``;
 * ``caption RESULT ...``: command, machine, load and revision of results;
 * ``runs RESULT ...``: the same as a table; ``runs`` alone, of all results;
-* ``detectors PLAN ARM ...``: a table of what arms of ``benchmarks.detector`` came to; ``detectors PLAN``, of all;
+* ``detectors PLAN ARM ...``: a table of results of arms of ``benchmarks.detector``; ``detectors PLAN``, of all;
 * ``detector PLAN ARM``: the mean precision of an arm.
 
-What is not there is an error. ``said.md`` lists sentences of pages that are written by hand: each must stand there.
+Missing figures are errors. ``said.md`` lists sentences of hand-written pages; each must occur in its page.
 """
 
 from __future__ import annotations
@@ -35,26 +35,26 @@ TEMPLATES = ROOT / "benchmarks" / "templates"
 PAGES = {"figures.md": "docs/figures.md", "reliability.md": "docs/reliability.md"}
 SAID = "said.md"
 VIEWS, BYTES = 8, 2.5e5
-"""Frames of a layout, and bytes of a frame, in the projection: those of the default scene."""
+"""Frames per layout and bytes per frame in the projection: those of the default scene."""
 LATE = 50
-"""Commits by which a revision is older than the newest one when a caption says so."""
+"""Number of commits behind the newest revision from which a caption states the age."""
 
 Results = Mapping[str, Mapping[str, Any]]
 
 
 class FigureError(Exception):
-    """A template names what no result has."""
+    """A template names a figure that no result has."""
 
 
 def read_results(folder: Path = RESULTS) -> dict[str, dict[str, Any]]:
-    """Read all results, by name, and add the projection that is computed from them."""
+    """Read all results by name, and add the projection computed from them."""
     results = read_recorded(folder)
     results["projection"] = {"figures": projected(results)}
     return results
 
 
 def projected(results: Results) -> dict[str, list[Any]]:
-    """What a million images cost, from the recorded times of a frame, its files and a layout."""
+    """Compute the cost of a million images from the recorded times of a frame, its files and a layout."""
     frame = value_of(results, "render.frame", "whole_frame")
     rendering = max(frame) if isinstance(frame, list) else frame
     writing = value_of(results, "labels.cost", "yolo_coco.write")
@@ -79,7 +79,7 @@ def projected(results: Results) -> dict[str, list[Any]]:
 
 
 def value_of(results: Results, result: str, name: str) -> Any:
-    """A figure without its unit."""
+    """Return a figure without its unit."""
     if result not in results:
         raise FigureError(f"no result {result}")
     figures = results[result]["figures"]
@@ -89,7 +89,7 @@ def value_of(results: Results, result: str, name: str) -> Any:
 
 
 def formatted(value: Any, spec: str) -> str:
-    """A number, a pair of the least and the most, or text; what is unknown is a dash."""
+    """Format a number, a (minimum, maximum) pair, or text; unknown values become a dash."""
     factor, _, form = spec.rpartition(":")
     if value is None:
         return "–"
@@ -106,7 +106,7 @@ def formatted(value: Any, spec: str) -> str:
 
 
 def caption(result: Mapping[str, Any], newest: int = 0) -> str:
-    """Where figures are from: command, machine, load and revision, and how much older it is than the newest one."""
+    """Return the source of figures: command, machine, load, revision, and commits behind the newest revision."""
     load, day = load_of(result), f"{result['revision']} of {result['date']}"
     late = newest - (result.get("commits") or newest)
     day += f", {late} commits before the newest figure" if late >= LATE else ""
@@ -120,7 +120,7 @@ def caption(result: Mapping[str, Any], newest: int = 0) -> str:
 
 
 def machine_of(result: Mapping[str, Any]) -> str:
-    """Processor, memory and GPU, as far as they are known."""
+    """Return processor, memory and GPU, where known."""
     machine = result["machine"]
     known = f"{machine['cores']} cores" if machine["cores"] else ""
     known += (" of " if known else "") + machine["processor"] if machine["processor"] else ""
@@ -129,13 +129,13 @@ def machine_of(result: Mapping[str, Any]) -> str:
 
 
 def load_of(result: Mapping[str, Any]) -> str:
-    """Load average at the start and the end, or what notes say of it."""
+    """Return the load average at start and end, or the load given in notes."""
     load = result["load"]
     return f"load {load['start']} to {load['end']}" if load["start"] is not None else load.get("said") or ""
 
 
 def runs(results: Iterable[Mapping[str, Any]], newest: int) -> str:
-    """A table of results, with the commits between their revision and the newest one."""
+    """Return a table of results, with the commits between their revision and the newest one."""
     lines = [
         "| command | machine | load | revision | commits since | recorded |",
         "| --- | --- | --- | --- | ---: | --- |",
@@ -153,7 +153,7 @@ def runs(results: Iterable[Mapping[str, Any]], newest: int) -> str:
 
 
 def filled(text: str, results: Results) -> str:
-    """A template with its figures."""
+    """Fill a template with its figures."""
     newest = max((result.get("commits") or 0 for result in results.values()), default=0)
 
     def fill(match: re.Match[str]) -> str:
@@ -189,7 +189,7 @@ def filled(text: str, results: Results) -> str:
 
 
 def wrapped(text: str, width: int = 120) -> str:
-    """Paragraphs of plain text in lines of a width; a sign that begins a list stays behind what it follows."""
+    """Wrap paragraphs of plain text to a width; list markers stay at the end of a line, not at the start."""
     blocks = text.split("\n\n")
     for place, block in enumerate(blocks):
         if block[:1].isalnum() or (block.startswith(("`", "[", "(")) and not block.startswith("```")):
@@ -200,7 +200,7 @@ def wrapped(text: str, width: int = 120) -> str:
 
 
 def pages(results: Results) -> dict[Path, str]:
-    """What every generated page must be."""
+    """Return the expected text of every generated page."""
     found = {}
     for name, page in PAGES.items():
         text = wrapped(filled((TEMPLATES / name).read_text(encoding="utf-8"), results))
@@ -211,7 +211,7 @@ def pages(results: Results) -> dict[Path, str]:
 
 
 def unsaid(results: Results) -> Iterable[str]:
-    """Sentences that pages written by hand lack, or have with other figures; pages that are not there lack none."""
+    """Return the sentences that hand-written pages lack, or have with other figures; absent pages are ignored."""
     file = ""
     for line in filled((TEMPLATES / SAID).read_text(encoding="utf-8"), results).splitlines():
         if line.startswith("# "):
@@ -224,7 +224,7 @@ def unsaid(results: Results) -> Iterable[str]:
 
 
 def differences(results: Results) -> list[str]:
-    """What of the documentation is not as the results are."""
+    """Return the differences between the documentation and the results."""
     found = [
         f"{path.relative_to(ROOT)} is not what the results give; run python -m benchmarks.figures"
         for path, text in pages(results).items()
@@ -234,7 +234,7 @@ def differences(results: Results) -> list[str]:
 
 
 def print_ages(results: Results) -> None:
-    """Commits since each result that changed something figures depend on."""
+    """Print, for each result, the number of later commits that affect figures."""
     for name, result in results.items():
         if "command" in result:
             command = ["git", "-C", str(ROOT), "rev-list", "--count", f"{result['revision']}..HEAD", "--", *MEASURED]
@@ -244,7 +244,7 @@ def print_ages(results: Results) -> None:
 
 
 def main() -> None:
-    """Write, check, or tell ages."""
+    """Write or check the pages, or print ages."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--check", action="store_true")
     parser.add_argument("--age", action="store_true")

@@ -51,9 +51,9 @@ def figure(value: Any, unit: str, *path: object) -> None:
     """Add a figure to the benchmark that is being recorded, if there is one.
 
     Args:
-        value: A number, some text, or a pair of the least and the most.
+        value: A number, some text, or a (minimum, maximum) pair.
         unit: Such as ``s``, ``dB`` or ``MiB``; empty for counts, ratios and shares.
-        path: Words of its name, from the general to the particular.
+        path: Words of its name, from general to specific.
     """
     if _open:
         _open[-1][".".join(map(slug, path))] = [_plain(value), unit]
@@ -76,7 +76,7 @@ def _plain(value: Any) -> Any:
 def configuration_of(parser: argparse.ArgumentParser, options: argparse.Namespace, ignore: Sequence[str] = ()) -> str:
     """Return the positional arguments and the options that differ from their defaults, as one word.
 
-    Only the name of a path counts. Options in ``ignore`` do not count.
+    A path is represented by its name only. Options in ``ignore`` are omitted.
     """
     parts = []
     for action in parser._actions:
@@ -105,12 +105,12 @@ def recording(
     """Record the figures of a run that ends without an exception, in place of those of the same configuration.
 
     Args:
-        benchmark: Its module below ``benchmarks``.
-        parser: Parser of the arguments, which has their defaults.
+        benchmark: Module below ``benchmarks``.
+        parser: Argument parser with the defaults.
         options: Parsed arguments.
         ignore: Options that change no figure, such as the folder for pictures.
         gpu: True if the benchmark uses a GPU.
-        command: Words that start the benchmark, if they are not ``python -m benchmarks.`` and the module.
+        command: Command of the benchmark, if it is not ``python -m benchmarks.`` and the module.
         folder: Folder of the results.
 
     Raises:

@@ -1,1 +1,1 @@
-"""Benchmarks of the wing: assets."""
+"""Benchmarks of assets."""

@@ -1,12 +1,12 @@
-"""What a bake costs, how close it comes to its mesh, and how closely its convex pieces follow it.
+"""Cost of a bake, its accuracy relative to the mesh, and the accuracy of its convex pieces.
 
     python -m benchmarks.assets.bake MESH... [--gaussians 20000] [--subdivide 0]
     python -m benchmarks.assets.bake relay_box --device cuda --ready-pieces --runs 2
 
-MESH is a mesh file, whose triangles are each divided into four as often as is said, or the name of a part of the
-shipped scene. Pieces are found anew, not taken from the cache, unless they are to be ready. In CPU seconds of this
-process, so that other programs on the machine hardly count, and beside them, for a GPU, in seconds that passed. Of
-several runs the last one counts: the first one compiles kernels.
+MESH is a mesh file, or the name of a part of the shipped scene. ``--subdivide`` divides each triangle of a file into
+four, as many times as given. Pieces are computed without the cache, except with ``--ready-pieces``. Times are CPU
+seconds of this process, which other programs hardly affect, and for a GPU wall-clock seconds as well. Of several runs
+the last one counts, because the first one compiles kernels.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import time
 from pathlib import Path
 
 # isort: off
-import mitsplat  # which must come before Dr.Jit
+import mitsplat  # which must be imported before Dr.Jit
 
 import drjit as dr
 import trimesh
@@ -38,7 +38,7 @@ def cpu_seconds() -> float:
 
 
 def divided(path: Path, times: int, folder: Path) -> Path:
-    """A file of the same mesh and texture in smaller triangles."""
+    """Return a file of the same mesh and texture with smaller triangles."""
     mesh = trimesh.load(path, force="mesh")
     for _ in range(times):
         mesh = mesh.subdivide()

@@ -1,7 +1,7 @@
-"""Compare a capture's cameras with published ones: ``python -m benchmarks.assets.cameras CAPTURE POSES``.
+"""Comparison of a capture's cameras with published ones: ``python -m benchmarks.assets.cameras CAPTURE POSES``.
 
-POSES holds a 3x4 projection matrix per photo, ``<name of the photo>.txt``, in any frame and at any scale. These come
-from other people's reconstructions: agreement, not truth.
+POSES holds a 3x4 projection matrix per photo, ``<name of the photo>.txt``, in any frame and at any scale. The published
+cameras are reconstructions too: the result is agreement, not an error relative to the truth.
 """
 
 from __future__ import annotations

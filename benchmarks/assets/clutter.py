@@ -1,12 +1,12 @@
-"""A known solid that is photographed as most people do it, to an asset, against the truth.
+"""Reconstruction of a known solid from casual photographs without a board, against the truth.
 
     python -m benchmarks.assets.clutter OUT [--views 60] [--width 640] [--iterations 3000] [--ground cushion] [--beside]
         [--known-poses]
 
-There is no board: the solid of ``benchmarks.assets.known`` stands on a crumpled cloth among other things in a room, and
-is photographed by hand with an exposure that drifts. ``mitsplat asset --size`` makes an asset of the path-traced
-pictures without a hint; with ``--beside`` another thing stands where the cameras look, and the solid has one click. The
-exit status is 1 if a figure misses what is wanted. OUT keeps the photos and the stages of the asset for another run.
+The solid of ``benchmarks.assets.known`` stands on a crumpled cloth among other objects in a room. The photographs are
+hand-held, with a drifting exposure. ``mitsplat asset --size`` makes an asset of the path-traced images without a hint.
+With ``--beside``, another object is at the point that the cameras look at, and the solid is picked by one click. The
+exit status is 1 if a figure misses its threshold. OUT stores the photos and the stages of the asset for later runs.
 """
 
 from __future__ import annotations
@@ -54,14 +54,14 @@ LEAST = {
     "mean IoU of the masks with the truth",
     "PSNR of the object in held-out photos, dB",
 }
-"""Of these more is better."""
+"""Figures with a minimum; for all others, less is better."""
 
 CLOTH = 1.1
 """Edge of the cloth [m]."""
 
 
 def walk(count: int, width: int, seed: int = 11) -> list[Camera]:
-    """Photos by hand: three rounds at rising heights, neither level nor quite aimed, 4:3."""
+    """Return the cameras of hand-held photos, 4:3: three rounds at rising heights, with errors in roll and aim."""
     rng = np.random.default_rng(seed)
     cameras = []
     for number in range(count):
@@ -79,7 +79,7 @@ def walk(count: int, width: int, seed: int = 11) -> list[Camera]:
 
 
 def ground(kind: str = "cloth", seed: int = 4) -> trimesh.Trimesh:
-    """What the solid stands on, flat under it [m]: one of :data:`GROUNDS`."""
+    """Return the ground [m], one of :data:`GROUNDS`, flattened below the solid."""
     rng = np.random.default_rng(seed)
     cells = 441
     axis = np.linspace(-CLOTH / 2, CLOTH / 2, cells)
@@ -99,7 +99,7 @@ def ground(kind: str = "cloth", seed: int = 4) -> trimesh.Trimesh:
 
 
 def _cloth(x: np.ndarray, y: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Folds of up to a centimetre."""
+    """Return the heights of folds of up to a centimetre."""
     bumps = sum(
         weight * gaussian_filter(rng.normal(size=x.shape), sigma, mode="wrap") * sigma
         for sigma, weight in ((4, 0.25), (9, 0.7), (22, 1.0))
@@ -109,19 +109,19 @@ def _cloth(x: np.ndarray, y: np.ndarray, rng: np.random.Generator) -> np.ndarray
 
 
 def _cushion(x: np.ndarray, y: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """A dome that falls by 8 cm, with a bulge around what lies on it."""
+    """Return the heights of a dome that falls by 8 cm, with a bulge around the solid."""
     away = np.hypot(x, y)
     return np.asarray(0.08 * (np.exp(-((away / 0.4) ** 2)) - 1) + 0.012 * np.exp(-(((away - 0.12) / 0.04) ** 2)))
 
 
 def _gravel(x: np.ndarray, y: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Stones of a centimetre and two."""
+    """Return the heights of stones of one and two centimetres."""
     stones = gaussian_filter(rng.normal(size=x.shape), 2.5, mode="wrap")
     return np.asarray(0.005 * stones / np.abs(stones).max() * 2)
 
 
 def _ledge(x: np.ndarray, y: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """A table that ends 15 cm away, and the bench 8 cm below it."""
+    """Return the heights of a table that ends 15 cm away, and of the bench 8 cm below."""
     return np.asarray(np.where(x + 0.3 * y > 0.15, -0.08, 0.0))
 
 
@@ -132,11 +132,11 @@ GROUNDS: Mapping[str, Callable[[np.ndarray, np.ndarray, np.random.Generator], np
     "gravel": _gravel,
     "ledge": _ledge,
 }
-"""Heights of what the solid may stand on, at x and y [m]."""
+"""Height functions of the grounds at x and y [m]."""
 
 
 def coloured(mesh: trimesh.Trimesh, colours: np.ndarray) -> Any:
-    """A matt mesh with a colour on each vertex (N, 3)."""
+    """Return a matt mesh with a colour on each vertex (N, 3)."""
     from mitsplat.renderer.rays.device_arrays import plain_mesh
 
     properties = mi.Properties()
@@ -148,7 +148,7 @@ def coloured(mesh: trimesh.Trimesh, colours: np.ndarray) -> Any:
 
 
 def woven(mesh: trimesh.Trimesh, seed: int = 8) -> np.ndarray:
-    """A faded print with a weave: colours (N, 3) of the cloth's vertices."""
+    """Return the colours (N, 3) of the cloth's vertices: a faded print with a weave."""
     rng = np.random.default_rng(seed)
     places = (mesh.vertices[:, :2] + CLOTH / 2) / CLOTH
     shade = np.zeros((len(places), 3))
@@ -159,7 +159,7 @@ def woven(mesh: trimesh.Trimesh, seed: int = 8) -> np.ndarray:
 
 
 def mottled(mesh: trimesh.Trimesh, colour: tuple[float, float, float], seed: int) -> Any:
-    """A thing with paint that is worn off in places."""
+    """Return a mesh with paint that is worn off in places."""
     fine = mesh.subdivide_to_size(0.004)
     rng = np.random.default_rng(seed)
     places = (fine.vertices - fine.bounds[0]) / 0.012
@@ -169,7 +169,7 @@ def mottled(mesh: trimesh.Trimesh, colour: tuple[float, float, float], seed: int
 
 
 def things(cloth: trimesh.Trimesh, beside: bool) -> dict[str, Any]:
-    """What else lies on the cloth, from 0.17 m away; ``beside``: one of them where the cameras look."""
+    """Return the other objects on the cloth, from 0.17 m away; with ``beside``, one in the cameras' focus."""
     box, ball, can = trimesh.creation.box, trimesh.creation.icosphere, trimesh.creation.cylinder
     made = [
         (box((0.10, 0.07, 0.04)), (0.20, 0.05), 0.6, (0.7, 0.2, 0.15)),
@@ -194,9 +194,9 @@ def things(cloth: trimesh.Trimesh, beside: bool) -> dict[str, Any]:
 
 
 def room(beside: bool = False, kind: str = "cloth") -> dict[str, Any]:
-    """A cloth on a bed in a papered room with a window, and things on it; the solid is not in it yet.
+    """Return a room with a cloth on a bed, wallpaper, a window and objects on the cloth, without the solid.
 
-    In place of the cloth may be any of :data:`GROUNDS`.
+    Any of :data:`GROUNDS` can replace the cloth.
     """
     ensure_variant()
     rng = np.random.default_rng(5)
@@ -237,29 +237,31 @@ def room(beside: bool = False, kind: str = "cloth") -> dict[str, Any]:
 
 
 def exposures(count: int, seed: int = 2) -> np.ndarray:
-    """Gains of a camera that sets its exposure and white balance anew for every photo, (count, 3)."""
+    """Return gains (count, 3) of automatic exposure and white balance that change with every photo."""
     rng = np.random.default_rng(seed)
     drift = 0.12 * np.sin(np.linspace(0, 5, count)) + rng.normal(0, 0.03, count)
     return np.exp(drift[:, None] + np.outer(0.03 * np.sin(np.linspace(1, 7, count)), [1, 0, -1]))
 
 
 def linear(path: Path) -> np.ndarray:
-    """The light that a photo shows, (H, W, 3)."""
+    """Return the linear light of a photo, (H, W, 3)."""
     return np.asarray((np.array(Image.open(path).convert("RGB")) / 255) ** 2.2)
 
 
 def overlap(photo: Photo, truth: np.ndarray) -> float:
-    """IoU of a photo's mask with the truth, where it does not say that another thing may hide the solid."""
+    """Return the IoU of a photo's mask with the truth, outside of pixels where another object may hide the solid."""
     known = known_where(photo.read_mask()[1], photo.camera)
     return iou((photo.read_mask()[0] >= 0.5) & known, truth & known)
 
 
 def compare(asset: Path, truth: Mapping[str, Camera], mesh: trimesh.Trimesh, out: Path) -> dict[str, float]:
-    """What an asset and its capture are off, the asset put where the cameras' similarity says.
+    """Compute the errors of an asset and its capture, aligned by the cameras' similarity transform.
 
-    Splats are compared with photos that were held out, where the true solid is seen: before the room without it, which
-    ``out/behind`` holds, because a pixel of its outline shows both. The photos' true exposures are taken back, and each
-    channel of the splats has one gain for all photos.
+    Splats are compared with held-out photos where the true solid is visible. They are composed over the room without
+    the
+    solid, stored in ``out/behind``, because pixels of the outline show both. The photos' true exposures are inverted,
+    and
+    each channel of the splats has one gain for all photos.
     """
     made = Asset.load(asset)
     moved, truth_from_asset, residuals = on_truth(asset, truth)
@@ -312,7 +314,7 @@ def main() -> None:
 
 
 def measure(args: argparse.Namespace) -> int:
-    """Print and keep the figures; how many of them miss what is wanted."""
+    """Print and record the figures; return the number of missed thresholds."""
     views, photos, mesh = walk(args.views, args.width), args.out / "photos", solid()
     made, marker = (
         json.dumps([args.views, args.width, args.samples, args.beside, args.ground]),
@@ -356,7 +358,7 @@ def measure(args: argparse.Namespace) -> int:
 
 
 def transforms(views: Mapping[str, Camera]) -> dict[str, Any]:
-    """Cameras as a ``transforms.json`` has them."""
+    """Return cameras in the format of ``transforms.json``."""
     one = next(iter(views.values()))
     frames = [
         {"file_path": name, "transform_matrix": (camera.world_from_camera @ np.diag([1.0, -1.0, -1.0, 1.0])).tolist()}

@@ -1,12 +1,12 @@
-"""Fit a capture here and with gsplat: held-out PSNR and SSIM, and time, in one table.
+"""Fit of a capture by mitsplat and by gsplat: held-out PSNR and SSIM, and time, in one table.
 
     python -m benchmarks.assets.fit CAPTURE --device cuda --gsplat
     python -m benchmarks.assets.fit --synthetic spur_gear --device cuda --iterations 3000
 
-The second fits photos of an asset's splats, which it makes itself, with all that a fit does by default, and says what a
-step waits for: its kernels, in a few steps that are timed one kernel at a time, and the rest.
+The second command renders photos of an asset's splats and fits them with all default settings of a fit. It also prints
+the time of kernels in a step, measured kernel by kernel in a few steps, and the rest.
 
-gsplat's side follows its ``examples/simple_trainer.py mcmc``: same photos, split, seeds, losses, rates and budget; its
+gsplat follows its ``examples/simple_trainer.py mcmc``: same photos, split, seeds, losses, rates and budget; its
 D-SSIM is computed by PyTorch's convolutions. gsplat takes pinhole cameras only: undistort a capture's photos first.
 """
 
@@ -21,7 +21,7 @@ from dataclasses import replace
 from pathlib import Path
 
 # isort: off
-from mitsplat.runtime.device import use_device  # which must come before Dr.Jit
+from mitsplat.runtime.device import use_device  # which must be imported before Dr.Jit
 
 import drjit as dr
 import numpy as np
@@ -63,7 +63,7 @@ def main() -> None:
             settings = replace(
                 settings, masks="off", background="black", coarse=0.0, opacity_weight=0.01, depth_weight=0.0
             )
-        if args.classic:  # it removes large Gaussians itself
+        if args.classic:  # the strategy removes large Gaussians itself
             settings = replace(settings, scale_weight=0.0)
         compare(args, capture, settings)
 
@@ -87,7 +87,7 @@ def compare(args: argparse.Namespace, capture: Capture, settings: FitSettings) -
 
 
 class Watch:
-    """Times the steps between a fit's reports, and in one span its kernels.
+    """Timer of the steps between a fit's reports, and of the kernels in one interval.
 
     Args:
         iterations: Steps of the fit.
@@ -100,7 +100,7 @@ class Watch:
         self.kernels, self.launches, self.compiled = 0.0, 0.0, 0
 
     def __call__(self, now: FitProgress) -> None:
-        """Note what the fit reports."""
+        """Record a report of the fit."""
         at = time.perf_counter()
         counting = dr.flag(dr.JitFlag.KernelHistory)
         if self.last is not None and now.step > self.before:
@@ -118,7 +118,7 @@ class Watch:
         self.last = now.step, time.perf_counter()
 
     def say(self) -> None:
-        """Print and keep what a step takes after 70 % of the fit, where the number of Gaussians stays."""
+        """Print and record the time of a step after 70 % of the fit, where the number of Gaussians is constant."""
         dr.set_flag(dr.JitFlag.KernelHistory, False)
         if not (self.spans and self.launches):
             return
@@ -145,7 +145,7 @@ def keep(name: str, seconds: float, psnr: float, ssim: float, count: int) -> Non
 
 
 def fit_with_gsplat(capture: Capture, settings: FitSettings) -> tuple[float, float, float, int]:
-    """Seconds, held-out PSNR [dB] and SSIM, and number of Gaussians."""
+    """Fit with gsplat; return seconds, held-out PSNR [dB] and SSIM, and the number of Gaussians."""
     import torch
     from gsplat import rasterization
     from gsplat.strategy import MCMCStrategy

@@ -1,9 +1,9 @@
-"""Splat files made elsewhere through the documented lines: import, check, render, audit, each in a fresh process.
+"""Import of splat files from other programs: import, check, render and audit, each in a new process.
 
     python -m benchmarks.assets.imports ../shared/data/splats [--only hammer_100k] [--jobs 4] [--keep FOLDER]
 
-FOLDER holds the `.splat` files that FILES names. Every one must come out of the size that was asked for, be left
-standing upright by physics, and be labelled in all images.
+FOLDER holds the `.splat` files named in FILES. Each import must have the requested size, stay upright in physics, and
+be labelled in all images. The commands are those of the documentation.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ UPRIGHT = 12.0
 
 
 def run(*words: object, folder: Path) -> tuple[int, str, float]:
-    """Exit status, output and CPU seconds of the command mitsplat."""
+    """Run the command mitsplat; return its exit status, output and CPU seconds."""
     command = [str(Path(sys.executable).with_name("mitsplat")), *map(str, words)]
     with tempfile.TemporaryFile("w+") as said:
         process = subprocess.Popen(command, cwd=folder, stdout=said, stderr=subprocess.STDOUT)
@@ -70,7 +70,7 @@ def main() -> None:
 
 
 def one(name: str, file: Path, work: Path) -> str:
-    """Import, check, render and audit one file, and say how it went; what is wrong, or nothing."""
+    """Import, check, render and audit one file and print the result; return the error, or an empty text."""
     size, options = FILES[name]
     scene, out = f"{name}.yaml", f"out/{name}"
     (work / scene).unlink(missing_ok=True)

@@ -1,4 +1,4 @@
-"""What was made of photographs, against what is wanted and against the cameras that took them."""
+"""Comparison of reconstructed assets with thresholds and with the true cameras."""
 
 from __future__ import annotations
 
@@ -17,11 +17,14 @@ from mitsplat.reconstruct.asset_evaluation import VERDICT_FILE
 
 
 def on_truth(asset: Path, truth: Mapping[str, Camera]) -> tuple[Capture, Float64Array, Float64Array]:
-    """The capture in its asset's frame, the similarity (4, 4) that lays its cameras on the true ones, and what is left.
+    """Align an asset's capture with the truth.
+
+    Returns the capture in the asset's frame, the similarity transform (4, 4) of its cameras to the true ones, and the
+    residuals.
 
     Args:
-        asset: Folder that ``mitsplat asset`` wrote.
-        truth: Cameras by the names of their photos.
+        asset: Folder written by ``mitsplat asset``.
+        truth: True cameras by the names of their photos.
     """
     verdict = json.loads((asset / VERDICT_FILE).read_text())
     moved = Capture.load(asset / "capture").transformed(verdict["asset_from_capture"])
@@ -31,7 +34,7 @@ def on_truth(asset: Path, truth: Mapping[str, Camera]) -> tuple[Capture, Float64
 
 
 def tell_wanted(found: Mapping[str, float], wanted: Mapping[str, float], least: Container[str]) -> int:
-    """Print and keep figures beside what is wanted of them, ``least`` or most; how many miss it, absent ones too."""
+    """Print and record figures with their thresholds, minima in ``least``; return the number missed or absent."""
     missed = 0
     for name, limit in wanted.items():
         value = found.get(name, float("nan"))

@@ -1,10 +1,10 @@
-"""Photographs of a solid whose shape, colours, board and cameras are known, to an asset, against the truth.
+"""Reconstruction of a solid with known shape, colours, board and cameras from photographs, against the truth.
 
     python -m benchmarks.assets.known OUT [--views 60] [--width 1200] [--iterations 3000]
 
-The solid, a ball and a box with a pocket, stands on a ChArUco board and is path-traced with sensor noise; ``mitsplat
-asset`` makes an asset of the pictures, which is dropped into a scene and rendered. The exit status is 1 if a figure
-misses what is wanted. OUT keeps the stages of the asset for another run.
+The solid, a ball and a box with a pocket, stands on a ChArUco board and is path-traced with sensor noise. ``mitsplat
+asset`` makes an asset of the images, which is dropped into a scene and rendered. The exit status is 1 if a figure
+misses its threshold. OUT stores the stages of the asset for later runs.
 """
 
 from __future__ import annotations
@@ -62,11 +62,11 @@ LEAST = {
     "held-out PSNR, dB",
     "instances in the rendered frame",
 }
-"""Of these more is better."""
+"""Figures with a minimum; for all others, less is better."""
 
 
 def solid() -> trimesh.Trimesh:
-    """A ball and a box with a pocket in the ball, standing on z = 0 [m]."""
+    """Return a ball and a box, with a pocket in the ball, standing on z = 0 [m]."""
     ball = trimesh.creation.icosphere(4, 0.045)
     box = trimesh.creation.box((0.06, 0.04, 0.07), trimesh.transformations.translation_matrix((0.035, 0.0, 0.0)))
     pocket = trimesh.creation.cylinder(
@@ -80,7 +80,7 @@ def solid() -> trimesh.Trimesh:
 
 
 def cameras(count: int, width: int) -> list[Camera]:
-    """Three rings around the solid by turns, 4:3, with a field of view that holds it and most of the board."""
+    """Return cameras on three rings around the solid, in alternation, 4:3, that see the solid and most of the board."""
     turns = np.linspace(0, 2 * np.pi, count, endpoint=False)
     heights, radii = np.resize([0.10, 0.20, 0.30], count), np.resize([0.34, 0.29, 0.20], count)
     places = np.column_stack([radii * np.cos(turns), radii * np.sin(turns), heights])
@@ -88,7 +88,7 @@ def cameras(count: int, width: int) -> list[Camera]:
 
 
 def table_scene(board: Board, rng: np.random.Generator) -> dict[str, Any]:
-    """A board, z = 0 and its middle the origin, on a speckled table under a lamp and an even sky."""
+    """Return a scene of a board at z = 0, centred on the origin, on a speckled table under a lamp and a uniform sky."""
     ensure_variant()
     drawn = board.draw(60).astype(np.float32) / 255
     sheet = np.array([board.columns, board.rows]) * board.square / 2
@@ -116,7 +116,7 @@ def table_scene(board: Board, rng: np.random.Generator) -> dict[str, Any]:
 
 
 def speckled(mesh: trimesh.Trimesh, *, contrast: float = 1.6, finish: Mapping[str, Any] | None = None) -> Any:
-    """The solid with speckles of 3 and 10 mm on its vertices, matt or with the ``finish`` of a principled BSDF."""
+    """Return the solid with speckles of 3 and 10 mm on its vertices, matt or with a principled BSDF's ``finish``."""
     from mitsplat.renderer.rays.device_arrays import plain_mesh
 
     fine = mesh.subdivide_to_size(0.0012)
@@ -140,7 +140,7 @@ def speckled(mesh: trimesh.Trimesh, *, contrast: float = 1.6, finish: Mapping[st
 
 
 def compare(asset: Path, truth: Mapping[str, Camera], mesh: trimesh.Trimesh) -> dict[str, float]:
-    """What an asset and its capture are off."""
+    """Compute the errors of an asset and its capture."""
     capture = Capture.load(asset / "capture")
     found = np.array([photo.camera.centre for photo in capture.photos])
     true = np.array([truth[photo.name].centre for photo in capture.photos])
@@ -168,14 +168,14 @@ def compare(asset: Path, truth: Mapping[str, Camera], mesh: trimesh.Trimesh) -> 
 
 
 def chamfer(one: trimesh.Trimesh, truth: trimesh.Trimesh, samples: int = 20_000) -> float:
-    """Mean distance between two surfaces, both ways, as a share of the diagonal of the true one."""
+    """Return the symmetric mean distance between two surfaces, as a share of the true diagonal."""
     there = np.abs(DistanceSurface(truth).signed_distances(np.asarray(one.sample(samples, seed=1)))).mean()
     back = np.abs(DistanceSurface(one).signed_distances(np.asarray(truth.sample(samples, seed=2)))).mean()
     return float(there + back) / 2 / float(truth.scale)
 
 
 def mask_overlaps(capture: Capture, truth: Mapping[str, Camera], mesh: trimesh.Trimesh) -> list[float]:
-    """IoU of each photo's mask with the true silhouette."""
+    """Return the IoU of each photo's mask with the true silhouette."""
     from mitsplat.renderer.rays.device_arrays import plain_mesh, ray_scene
 
     solid = ray_scene({"solid": plain_mesh(mesh, mi.Properties())})
@@ -189,7 +189,7 @@ def mask_overlaps(capture: Capture, truth: Mapping[str, Camera], mesh: trimesh.T
 
 
 def drop(asset: Path, out: Path) -> int:
-    """Instances in a frame of a scene that the asset was dropped into."""
+    """Return the number of instances in a frame of a scene with the dropped asset."""
     scene = {
         "name": "known",
         "objects": [{"asset": str(asset.resolve())}],
@@ -223,7 +223,7 @@ def main() -> None:
 
 
 def measure(args: argparse.Namespace) -> int:
-    """Print and keep the figures; how many of them miss what is wanted."""
+    """Print and record the figures; return the number of missed thresholds."""
     mesh, views, photos = solid(), cameras(args.views, args.width), args.out / "photos"
     ensure_variant()
     scene = table_scene(BOARD, np.random.default_rng(5)) | {"solid": speckled(mesh)}

@@ -1,6 +1,6 @@
-"""A capture without a camera: an asset's splats, photographed from all around, and points such as photos give.
+"""Synthetic captures: renderings of an asset's splats from all around, and noisy surface points.
 
-It takes no path tracing and no photographs, so a fit can be timed wherever the package runs.
+They need no path tracing and no photographs, so that a fit can be timed wherever the package runs.
 """
 
 from __future__ import annotations
@@ -19,18 +19,18 @@ from mitsplat.renderer.layers import render_splats
 
 VIEWS, POINTS = 72, 6000
 _NOISE = 0.002
-"""Standard deviation of points in units of the asset's size; thrice as deep behind a photo, they are hidden."""
+"""Standard deviation of points relative to the asset's size; points deeper than three of these are hidden."""
 _BUSY = 0.3
 
 
 def photograph_asset(folder: Path, out: Path, edge: int, *, seed: int = 0) -> Capture:
-    """Photos of an asset before noise, with masks, and noisy points on it.
+    """Render noise-free photos of an asset with masks, and sample noisy points on it.
 
     Args:
         folder: The asset.
         out: Folder for the photos.
         edge: Width and height of the photos [px].
-        seed: Decides the noise.
+        seed: Seed of the noise.
     """
     rng, splats = np.random.default_rng(seed), Asset.load(folder).splats
     centre = np.median(splats.means, axis=0)
@@ -59,7 +59,7 @@ def photograph_asset(folder: Path, out: Path, edge: int, *, seed: int = 0) -> Ca
 
 
 def _directions(count: int) -> np.ndarray:
-    """Unit vectors spread evenly over the sphere but for its poles, above which cameras have no sides."""
+    """Return unit vectors evenly spread over the sphere without its poles, where a camera's x axis is undefined."""
     index = np.arange(count) + 0.5
     z, azimuth = 0.95 * (1 - 2 * index / count), index * np.pi * (1 + np.sqrt(5))
     return np.stack([np.sqrt(1 - z**2) * np.cos(azimuth), np.sqrt(1 - z**2) * np.sin(azimuth), z], axis=1)

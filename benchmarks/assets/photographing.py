@@ -1,4 +1,4 @@
-"""Photographs of known scenes: path-traced, with noise and an exposure per photo, and where things are in them."""
+"""Path-traced photographs of known scenes, with noise, exposures, and masks of objects."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ from mitsplat.runtime.variant import ensure_variant
 
 
 class Sensors:
-    """Mitsuba's own cameras: x left and y up, half a pixel as here. One that only moves needs no new kernels."""
+    """Mitsuba cameras: x left and y up, with the same pixel centres as here. Moving one needs no new kernels."""
 
     def __init__(self) -> None:
         self._made: dict[tuple[int, int, float], Any] = {}
 
     def like(self, camera: Camera) -> Any:
-        """The sensor of a camera, until the next call."""
+        """Return the sensor of a camera, valid until the next call."""
         key = camera.width, camera.height, camera.fx
         if key not in self._made:
             film = {"type": "hdrfilm", "width": camera.width, "height": camera.height, "rfilter": {"type": "box"}}
             angle = float(np.degrees(2 * np.arctan(camera.width / 2 / camera.fx)))
-            # Stratified: of as many paths, less noise that no camera would have.
+            # Stratified samples: less noise with the same number of paths.
             self._made[key] = mi.load_dict(
                 {"type": "perspective", "fov": angle, "film": film, "sampler": {"type": "multijitter"}}
             )
@@ -40,7 +40,7 @@ class Sensors:
 
 
 def by_name(views: Sequence[Camera], suffix: str = ".png") -> dict[str, Camera]:
-    """Cameras by the names of their photos."""
+    """Return cameras by the names of their photos."""
     return {f"photo{number:02}{suffix}": camera for number, camera in enumerate(views)}
 
 
@@ -54,16 +54,16 @@ def photograph(
     gains: np.ndarray | None = None,
     suffix: str = ".png",
 ) -> dict[str, Camera]:
-    """Path-trace photos of a Mitsuba scene, with normal noise; returns their cameras by the names of the files.
+    """Path-trace photos of a Mitsuba scene with normal noise; return their cameras by file name.
 
     Args:
-        scene: As a dictionary.
-        views: From where.
-        folder: Where photos are written.
+        scene: Scene dictionary.
+        views: Cameras.
+        folder: Output folder.
         samples: Paths per pixel.
         noise: Standard deviation in display-encoded values.
-        gains: Of each photo and channel, shape (N, 3), that its light is multiplied by.
-        suffix: Of the files.
+        gains: Exposure gain of each photo and channel, shape (N, 3).
+        suffix: Suffix of the files.
     """
     from mitsplat.renderer.rays.device_arrays import ray_scene
 
@@ -73,7 +73,7 @@ def photograph(
     rng = np.random.default_rng(0)
     found = by_name(views, suffix)
     sensors = Sensors()
-    # Large ones take longer to encode than a GPU does to trace them; as many wait as there are cores.
+    # Encoding a large photo takes longer than tracing it on a GPU; the queue holds one photo per core.
     writing: deque[Future[None]] = deque(maxlen=usable_cores())
     with ThreadPoolExecutor(usable_cores()) as threads:
         for number, (name, camera) in enumerate(found.items()):
@@ -88,14 +88,14 @@ def photograph(
 
 
 def develop(file: Path, radiance: np.ndarray, gain: np.ndarray, noise: np.ndarray) -> None:
-    """Write a photo of light (H, W, 3), times a gain for each channel, with noise in display-encoded values."""
-    # A path that grazes an edge may end in no number.
+    """Write a photo of light (H, W, 3), multiplied by a gain per channel, with noise in display-encoded values."""
+    # A path that grazes an edge may return NaN.
     noisy = np.nan_to_num(np.clip(radiance * gain, 0, 1)) ** (1 / 2.2) + noise
     Image.fromarray(np.rint(255 * noisy.clip(0, 1)).astype(np.uint8)).save(file, quality=95)
 
 
 def show_where(scene: Mapping[str, Any], thing: str, views: Sequence[Camera], folder: Path, finer: int = 3) -> None:
-    """Write masks of where a thing of a scene is seen: in most of ``finer`` squared points of a pixel."""
+    """Write masks of a scene's object: pixels where most of ``finer`` squared samples hit it."""
     from mitsplat.renderer.rays.device_arrays import ray_scene
 
     ensure_variant()
@@ -115,12 +115,12 @@ def show_where(scene: Mapping[str, Any], thing: str, views: Sequence[Camera], fo
 
 
 def speckle(rng: np.random.Generator, size: int, colour: tuple[float, float, float]) -> np.ndarray:
-    """A texture of random brightness, (size, size, 3)."""
+    """Return a texture of random brightness, (size, size, 3)."""
     return np.clip(np.array(colour) * rng.uniform(0.1, 1.3, (size, size, 1)), 0, 1).astype(np.float32)
 
 
 def paint(texture: np.ndarray) -> dict[str, Any]:
-    """A matt surface with this texture, its first row above."""
+    """Return a matt material with this texture, first row at the top."""
     bitmap = mi.Bitmap(np.ascontiguousarray(texture[::-1], dtype=np.float32))
     colour = {"type": "bitmap", "bitmap": bitmap, "raw": True, "filter_type": "nearest"}
     return {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": colour}}

@@ -1,14 +1,14 @@
-"""What ``mitsplat asset`` takes from photographs to an asset, stage by stage, and what its verdict says.
+"""Time of ``mitsplat asset`` from photographs to an asset, stage by stage, and its verdict.
 
     python -m benchmarks.assets.photos PHOTOS OUT [--size METRES] [--refine] [--device cuda]
     python -m benchmarks.assets.photos clutter OUT --device cuda    # which also leaves the photographs in OUT
     taskset -c 0,1 python -m benchmarks.assets.photos clutter OUT
 
-PHOTOS is a folder. ``clutter`` are 97 of 12 megapixels, of the scene of ``benchmarks.assets.clutter``: path-traced on
-the device where OUT does not hold them, which takes a GPU. The command runs in a process of its own that starts anew,
-and stages are told by its log; the processor's seconds of COLMAP count when it ends, with its last stage. With
-``--refine`` ``mitsplat mesh --refine`` runs afterwards, which is not in the time. The exit status is 1 if more time is
-taken than is wanted of ``clutter``: of the processor, or by the clock with a GPU.
+PHOTOS is a folder, or ``clutter``: 97 photographs of 12 megapixels of the scene of ``benchmarks.assets.clutter``. These
+are path-traced on a GPU if OUT lacks them. The command runs in a new process, and its log gives the stages. CPU seconds
+of COLMAP are counted with its last stage, when it ends. With ``--refine``, ``mitsplat mesh --refine`` runs afterwards
+and is not part of the time. The exit status is 1 if ``clutter`` takes more time than its threshold: CPU time, or
+wall-clock time with a GPU.
 """
 
 from __future__ import annotations
@@ -41,11 +41,11 @@ from mitsplat.runtime.device import use_device
 
 WANTED = {"cpu": {"CPU minutes": 30.0}, "cuda": {"minutes": 4.0}}
 JUDGED = "photos", "psnr", "psnr_object", "splat_iou", "mesh_iou", "gaussians", "faces"
-"""What of the verdict is kept."""
+"""Recorded figures of the verdict."""
 
 
 def take_photos(args: argparse.Namespace) -> tuple[Path, float]:
-    """Folder of the clutter's photographs, taken if they are not there, and the solid's longest edge [m]."""
+    """Return the folder of the clutter's photographs, taken if absent, and the solid's longest edge [m]."""
     photos, marker, mesh = args.out / "photos", args.out / "photos.json", solid()
     made = json.dumps([args.views, args.width, args.samples])
     if not (marker.exists() and marker.read_text() == made):
@@ -55,22 +55,22 @@ def take_photos(args: argparse.Namespace) -> tuple[Path, float]:
         gains = exposures(len(views))
         photograph(scene, views, photos, samples=args.samples, noise=0.008, gains=gains, suffix=".jpg")
         print(f"photographs: {time.monotonic() - began:.1f} s", flush=True)
-        dr.flush_malloc_cache()  # the command is to find the GPU empty
+        dr.flush_malloc_cache()  # frees the GPU for the command
         marker.write_text(made)
     return photos, float(mesh.extents.max())
 
 
 def processor_seconds(process: int) -> float:
-    """Of a process that runs, and of its children that have ended [s]."""
+    """Return the CPU seconds of a running process and of its ended children."""
     fields = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
     return sum(map(int, fields[11:15])) / os.sysconf("SC_CLK_TCK")
 
 
 def run(log: Path, words: Sequence[str | Path]) -> dict[str, tuple[float, float]]:
-    """Stages of a command of ``mitsplat``: seconds by the clock, and of the processor.
+    """Run a command of ``mitsplat``; return its stages with wall-clock and CPU seconds.
 
     Raises:
-        RuntimeError: If it fails; that a threshold is missed is no failure.
+        RuntimeError: If it fails; a missed threshold is no failure.
     """
     began, used = time.monotonic(), cpu_seconds()
     times: list[tuple[str, float, float]] = [("starting", 0.0, 0.0)]
@@ -112,7 +112,7 @@ def main() -> None:
 
 
 def measure(args: argparse.Namespace, kind: str) -> int:
-    """Print and keep the figures; how many of them miss what is wanted."""
+    """Print and record the figures; return the number of missed thresholds."""
     ours = args.photos == "clutter"
     photos, size = take_photos(args) if ours else (Path(args.photos), args.size)
     asset = args.out / f"asset-{kind}"

@@ -1,9 +1,9 @@
-"""How many convex pieces meshes come apart into, how far these stand off them, and what that costs.
+"""Number of convex pieces of meshes, their standoff, and the cost of the decomposition.
 
     python -m benchmarks.assets.pieces FOLDER [--proxy-faces 10000]
 
-FOLDER holds mesh files in metres. Pieces are those of the proxy mesh that `mitsplat bake` makes, found anew and not
-taken from the cache. In CPU seconds of this process; a first decomposition, which compiles kernels, is not counted.
+FOLDER holds mesh files in metres. Pieces are those of the proxy mesh of `mitsplat bake`, computed without the cache.
+Times are CPU seconds of this process, without a first decomposition, which compiles kernels.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def main() -> None:
         for path in (names[0], *names):
             os.environ["XDG_CACHE_HOME"] = f"{cache}/{len(rows)}"
             mesh = make_proxy(read_parts(path, metres_per_unit=1.0, up="z", finish=None), arguments.proxy_faces)
-            mesh.vertices += 1e-9 * (not rows)  # not yet in memory when it is measured
+            mesh.vertices += 1e-9 * (not rows)  # a mesh other than the measured ones
             start = cpu_seconds()
             pieces = convex_pieces(mesh)
             seconds = cpu_seconds() - start

@@ -1,9 +1,9 @@
-"""What ``mitsplat mesh --refine`` adds to the mesh of a known solid, from true masks and from wrong ones.
+"""Accuracy gain of ``mitsplat mesh --refine`` on the mesh of a known solid, with true and with wrong masks.
 
     python -m benchmarks.assets.refine_mesh [--wrong 1.5] [--views 48] [--width 480] [--steps 200] [--smoothness 5]
 
-Gaussians lie on the solid of ``benchmarks.assets.known``; the outlines of its masks waver by a standard deviation of
-``--wrong`` pixels, in every view differently. Every eighth view is held out, with its true mask.
+Gaussians lie on the solid of ``benchmarks.assets.known``. The outlines of its masks are displaced by a standard
+deviation of ``--wrong`` pixels, independently in every view. Every eighth view is held out, with its true mask.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ from mitsplat.renderer.rays.device_arrays import plain_mesh, ray_scene
 from mitsplat.runtime.variant import ensure_variant
 
 WAVE = 8.0
-"""Length over which an outline wavers [px]."""
+"""Correlation length of the displacement of outlines [px]."""
 
 
 def cameras(count: int, width: int, middle: np.ndarray) -> list[Camera]:
-    """Evenly all around the solid, 4:3."""
+    """Return cameras evenly all around the solid, 4:3."""
     z = 1 - 2 * (np.arange(count) + 0.5) / count
     turn = np.pi * (3 - np.sqrt(5)) * np.arange(count)
     around = np.column_stack([np.sqrt(1 - z**2) * np.cos(turn), np.sqrt(1 - z**2) * np.sin(turn), z])
@@ -42,7 +42,7 @@ def cameras(count: int, width: int, middle: np.ndarray) -> list[Camera]:
 
 
 def masked(mesh: trimesh.Trimesh, cameras: list[Camera], finer: int = 4) -> list[MaskedView]:
-    """What the cameras see of it, traced through ``finer`` squared points of every pixel."""
+    """Return the masks of the cameras, traced with ``finer`` squared samples per pixel."""
     ensure_variant()
     scene = ray_scene({"mesh": plain_mesh(mesh)})
     views = []
@@ -58,7 +58,7 @@ def masked(mesh: trimesh.Trimesh, cameras: list[Camera], finer: int = 4) -> list
 
 
 def wavered(view: MaskedView, pixels: float, rng: np.random.Generator) -> MaskedView:
-    """The mask with an outline that is wrong by a standard deviation of ``pixels``."""
+    """Displace the outline of a mask by a standard deviation of ``pixels``."""
     inside = (view.mask > 0).astype(np.uint8)
     depth = cv2.distanceTransform(inside, cv2.DIST_L2, 5) - cv2.distanceTransform(1 - inside, cv2.DIST_L2, 5)
     noise = gaussian_filter(rng.normal(size=depth.shape), WAVE)

@@ -1,12 +1,12 @@
-"""The things on the table of a photographed room taken away, against photos of the room without them.
+"""Removal of objects from a table in a photographed room, against photos of the room without them.
 
     python -m benchmarks.assets.removal OUT [--samples 96]
 
-OUT is that of ``python -m benchmarks.assets.room OUT``, whose photos, cameras and fit are taken. Held-out photos are
-traced again without the things; where they differ by more than noise, they are compared with the environment before
-and after the removal. What no photo shows of the table cannot be known, prints on it least of all: the figures say how
-much nearer to the truth the environment comes, and have no threshold. ``OUT/removed`` keeps pictures: the room with the
-things, without them, and the environment without them.
+OUT is the folder of ``python -m benchmarks.assets.room OUT``, with its photos, cameras and fit. Held-out photos are
+traced again without the objects. Where they differ by more than noise, they are compared with the environment before
+and after the removal. Parts of the table that no photo shows are unknown, above all printed patterns. The figures state
+the reduction of the error and have no threshold. ``OUT/removed`` stores pictures: the room with the objects, without
+them, and the environment without them.
 """
 
 from __future__ import annotations
@@ -38,13 +38,13 @@ from mitsplat.storage.files import write_text
 
 WANTED = {"things removed": len(things())}
 _DIFFERENT = 0.08
-"""Difference of two traced photos that shows a thing or its shadow, well above their noise."""
+"""Difference of two traced photos at an object or its shadow, well above their noise."""
 _CLEAR = 0.25
-"""Elevation from which a thing is picked, as a sine: nothing stands before it."""
+"""Elevation from which an object is picked, as a sine: nothing stands before it."""
 
 
 def picks(capture: Capture, truth: dict[str, Camera]) -> list[str]:
-    """A pixel on each thing, in the photo that shows it best."""
+    """Return a pixel on each object, in the photo that shows the most of it."""
     found = []
     for mesh, (x, y), _, _ in things():
         top, best = np.array([x, y, float(mesh.extents[2])]), (np.inf, "")
@@ -70,7 +70,7 @@ def main() -> None:
 
 
 def measure(args: argparse.Namespace) -> int:
-    """Print and keep the figures; how many of them miss what is wanted."""
+    """Print and record the figures; return the number of missed thresholds."""
     capture = Capture.load(args.out / "cell" / "capture")
     views = walk(*json.loads((args.out / "photos.json").read_text())[:2])
     truth = by_name(views)
@@ -91,7 +91,7 @@ def measure(args: argparse.Namespace) -> int:
     write_text(traced, json.dumps([args.samples, numbers]))
     spots = picks(capture, truth)
     job = AssetJob(name="room", kind="environment", remove=tuple(spots))
-    (args.out / "cleared" / VERDICT_FILE).unlink(missing_ok=True)  # made anew, by what the code is now
+    (args.out / "cleared" / VERDICT_FILE).unlink(missing_ok=True)  # run again with the current code
     done = make_asset(capture, args.out / "cell" / "fit", args.out / "cleared", job)
     for what, text in done.verdict.rows.items():
         print(f"  {what}: {text}", file=sys.stderr)

@@ -1,11 +1,11 @@
-"""A furnished room that is photographed by hand, to an environment with its table, against the truth.
+"""Reconstruction of a furnished room from hand-held photographs, with its table, against the truth.
 
     python -m benchmarks.assets.room OUT [--views 150] [--width 480] [--gaussians 60000] [--iterations 3000]
 
-A table with things on it stands at a wall of a papered room with a cabinet; a ChArUco board lies on the table, and the
-exposure drifts. ``mitsplat asset --kind environment`` makes an environment and a scene of the path-traced pictures, in
-which parts are then dropped on the table that was found. The exit status is 1 if a figure misses what is wanted. OUT
-keeps the photos and the stages of the asset for another run.
+A table with objects stands at a wall of a room with wallpaper and a cabinet. A ChArUco board lies on the table, and the
+exposure drifts. ``mitsplat asset --kind environment`` makes an environment and a scene of the path-traced images, and
+parts are dropped on the detected table. The exit status is 1 if a figure misses its threshold. OUT stores the photos
+and the stages of the asset for later runs.
 """
 
 from __future__ import annotations
@@ -52,19 +52,19 @@ WANTED = {
     "instances on the table": 1,
 }
 LEAST = {"photos registered, %", "held-out PSNR, dB", "instances on the table"}
-"""Of these more is better."""
+"""Figures with a minimum; for all others, less is better."""
 
 TABLE = (1.3, 0.75)
-"""Width and depth of the table, whose top is z = 0, its middle the origin [m]."""
+"""Width and depth of the table [m], whose top is z = 0 and centred on the origin."""
 FLOOR = -0.72
 ROOM = (3.4, 3.0, 2.3)
-"""Width, depth and height [m]; the table stands at the wall in +y."""
+"""Width, depth and height of the room [m]; the table stands at the wall in +y."""
 LAMP = [-0.5, -0.45, FLOOR + ROOM[2] - 0.02]
-"""Where its only lamp is [m]."""
+"""Position of the only lamp [m]."""
 
 
 def walk(count: int, width: int, seed: int = 17) -> list[Camera]:
-    """Photos by hand, 4:3, from the side of the table that is free: close, in reach, and back from it."""
+    """Return hand-held cameras, 4:3, on the free side of the table: close, at arm's length, and further back."""
     rng = np.random.default_rng(seed)
     cameras = []
     for number in range(count):
@@ -79,7 +79,7 @@ def walk(count: int, width: int, seed: int = 17) -> list[Camera]:
         place = target * (0.8, 0.5, 1) + away * np.array(
             [np.cos(turn) * np.cos(height), np.sin(turn) * np.cos(height), np.sin(height)]
         )
-        if share >= 0.67 and number % 3 == 0:  # a look around
+        if share >= 0.67 and number % 3 == 0:  # photos around the room
             target = place + (np.array([np.sin(2 * np.pi * sweep), 1.0, -0.1]) * (1.0, 0.8, 1))
         place = place.clip((-1.5, -1.35, 0.12), (1.5, 0.55, 1.4))
         up = np.array([0, 0, 1]) + rng.normal(0, 0.03, 3)
@@ -88,7 +88,7 @@ def walk(count: int, width: int, seed: int = 17) -> list[Camera]:
 
 
 def papered(rng: np.random.Generator, colour: tuple[float, float, float], size: int = 512) -> Any:
-    """A matt surface with a faded print of several scales, and pictures that hang on it."""
+    """Return a matt material with a faded print of several scales, and pictures on the wall."""
     shade = np.zeros((size, size, 1))
     for sigma, weight in ((1.5, 0.30), (4, 0.45), (14, 0.35)):
         noise = gaussian_filter(rng.normal(size=(size, size)), sigma, mode="wrap")[..., None]
@@ -104,7 +104,7 @@ def papered(rng: np.random.Generator, colour: tuple[float, float, float], size: 
 
 
 def things() -> list[tuple[trimesh.Trimesh, tuple[float, float], float, tuple[float, float, float]]]:
-    """What stands on the table: mesh, place, turn and colour, most of it at the back and the sides."""
+    """Return the objects on the table: mesh, position, rotation and colour, mostly at the back and the sides."""
     box, ball, can = trimesh.creation.box, trimesh.creation.icosphere, trimesh.creation.cylinder
     return [
         (box((0.30, 0.14, 0.22)), (-0.40, 0.25), 0.1, (0.55, 0.25, 0.18)),
@@ -117,7 +117,7 @@ def things() -> list[tuple[trimesh.Trimesh, tuple[float, float], float, tuple[fl
 
 
 def room() -> dict[str, Any]:
-    """The room as a Mitsuba scene, the board on the table's left."""
+    """Return the room as a Mitsuba scene, with the board on the left of the table."""
     ensure_variant()
     rng = np.random.default_rng(6)
     place = mi.ScalarTransform4f()
@@ -182,7 +182,7 @@ def room() -> dict[str, Any]:
 
 
 def compare(asset: Path, truth: Mapping[str, Camera]) -> dict[str, float]:
-    """What an environment is off: its cameras are laid on the true ones, and its support goes where they take it."""
+    """Compute the errors of an environment whose support is aligned by its cameras."""
     verdict = json.loads((asset / VERDICT_FILE).read_text())
     moved, matrix, residuals = on_truth(asset, truth)
     scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
@@ -207,7 +207,7 @@ def compare(asset: Path, truth: Mapping[str, Camera]) -> dict[str, float]:
 
 
 def drop(scene: Path, out: Path, parts: Path) -> int:
-    """Instances in images of the scene with real parts in the place of its solids, which are left in ``out``."""
+    """Return the number of instances in images of the scene with real parts; the scene is stored in ``out``."""
     text = scene.read_text().replace("pool: primitives", f"pool: {parts.resolve()}/*")
     path = scene.with_name("room_with_parts.yaml")
     path.write_text(text)
@@ -241,7 +241,7 @@ def measure(args: argparse.Namespace) -> int:
     began = cpu_seconds()
 
     def stage(name: str) -> None:
-        """Note its time; one that an earlier run left keeps the time that it took then."""
+        """Record the time of a stage; reused stages keep their earlier time."""
         nonlocal began
         spent[name], began = max(cpu_seconds() - began, spent.get(name, 0.0)), cpu_seconds()
         times.write_text(json.dumps(spent))

@@ -1,7 +1,7 @@
-"""Whether structure from motion gives the same bytes in each run: ``python -m benchmarks.assets.sfm PHOTOS --runs 30``.
+"""Reproducibility of structure from motion: ``python -m benchmarks.assets.sfm PHOTOS --runs 30``.
 
-Every run starts without the database of the one before. Load the machine meanwhile, or leave it alone: the SHA-256 of
-what COLMAP found, and the processor's time, are printed for each run. Status 1 if two differ.
+Every run starts without the previous database. Results are valid with and without load on the machine. Each run prints
+the SHA-256 of COLMAP's result and its CPU time. The exit status is 1 if two results differ.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ PHOTOS = Path(__file__).resolve().parents[3] / "shared" / "data" / "photos" / "b
 
 
 def main() -> None:
-    """Run, print, compare."""
+    """Run, print and compare."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("photos", type=Path, nargs="?", default=PHOTOS)
     parser.add_argument("--count", type=int, default=20, help="first photos to take")
@@ -35,7 +35,7 @@ def main() -> None:
 
 
 def results(options: argparse.Namespace) -> int:
-    """How many different ones there are."""
+    """Return the number of different results."""
     found = set()
     with TemporaryDirectory() as temporary:
         folder = Path(temporary)

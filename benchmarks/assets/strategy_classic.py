@@ -38,7 +38,7 @@ _MAX_SCALE = 0.1
 """Scale above which a Gaussian is removed after the first opacity reset, in the model's unit."""
 _SHRINK = 1.6
 _RADIUS_SIGMAS = 3.0
-"""Radius of a Gaussian in the test if it is in an image [standard deviations], as published."""
+"""Radius of a Gaussian in the visibility test [standard deviations], as published."""
 
 
 class Classic:

@@ -1,13 +1,13 @@
-"""Whether the verdict on an asset of photographs tells how good it is: captures of known solids, each with a fault.
+"""Correlation of an asset's verdict with its true errors, on captures of known solids with one fault each.
 
     python -m benchmarks.assets.verdicts OUT [--only NAME ...] [--judge]
 
-Solids on a board or on a cloth among other things are path-traced in a few small photographs: too few, from one side,
-blurred, noisy, without texture, glossy, with drifting exposure, and so on. An asset is made of each; the cameras are
-given, in unknown units, because photographs as small as these hardly suffice to find them. The figures of its verdict
-are compared with its true errors, seen from all around in views of which there is no photo: by rank (Spearman), and by
-whether the verdict passes what is good. OUT keeps every capture that is done for another run; ``--judge`` makes
-verdicts anew, of the same fits, and ``--done`` measures only what an earlier run has done.
+Solids on a board, or on a cloth among other objects, are path-traced in a few small photographs. Faults are too few
+photos, photos from one side, blur, noise, no texture, gloss, drifting exposure, and others. The cameras are given, in
+unknown units, because structure from motion rarely works with photographs as small as these. The figures of an asset's
+verdict are compared with its true errors in views from all around without photos: by rank correlation (Spearman), and
+by agreement between a passed verdict and a good asset. OUT stores finished captures for later runs. ``--judge`` repeats
+the verdicts of the same fits, and ``--done`` only evaluates results of an earlier run.
 """
 
 from __future__ import annotations
@@ -45,13 +45,13 @@ from mitsplat.runtime.variant import ensure_variant
 
 WIDTH, SAMPLES = 320, 12
 AROUND, CLOSE, FINE = 8, 26.0, 24
-"""Views of the comparison, their field of view [degrees] and samples per pixel."""
+"""Number of views of the comparison, their field of view [degrees], and samples per pixel."""
 FIT = FitSettings(gaussians=4000, iterations=500, size=WIDTH)
 SURFACE = SurfaceSettings(voxels=96, faces=4000)
 GOOD = {"psnr": 24.0, "splat_iou": 0.95, "mesh_iou": 0.94, "chamfer": 1.0, "scale": 1.0}
-"""What a good asset comes to in truth: thresholds of the verdict, 1 % of the diagonal, and 1 % of the scale."""
+"""True errors of a good asset: thresholds of the verdict, 1 % of the diagonal, and 1 % of the scale."""
 MOST = {"chamfer", "scale", "cut"}
-"""Of these truths less is better, and of these figures of a verdict:"""
+"""Truths, and figures of a verdict, of which less is better."""
 MOST_OF_VERDICT = {"offset", "spread", "lost", "scale_error"}
 STANDS_FOR = (
     ("psnr", "psnr"),
@@ -64,28 +64,28 @@ STANDS_FOR = (
     ("lost", "cut"),
     ("scale_error", "scale"),
 )
-"""A figure of the verdict, and the truth that it stands for."""
+"""True error that each figure of the verdict estimates."""
 RESAMPLES = 2000
 
 
 @dataclass(frozen=True)
 class Case:
-    """A capture and what is wrong with it.
+    """A capture and its fault.
 
     Attributes:
-        name: Of the capture.
-        shape: Of ``SHAPES``.
-        cloth: Whether the solid is on a cloth in a cluttered room and its size is given, or on a board.
-        photos: How many.
-        arc: Share of the circle that they are from.
-        heights: Share of the rounds, which rise, that they are from.
-        blur: Longest motion blur [px]; every photo has a length and a direction of its own.
+        name: Name of the capture.
+        shape: Key of ``SHAPES``.
+        cloth: True for a cloth in a cluttered room with a given size, False for a board.
+        photos: Number of photos.
+        arc: Share of the circle covered by photos.
+        heights: Share of the rising rounds covered by photos.
+        blur: Longest motion blur [px]; every photo has its own length and direction.
         noise: Standard deviation in display-encoded values.
-        contrast: Of the speckles.
-        finish: Of a principled BSDF: (metallic, roughness), or matt.
+        contrast: Contrast of the speckles.
+        finish: (metallic, roughness) of a principled BSDF, or matt.
         drift: Standard deviation of the logarithm of the exposure.
-        beside: Whether another thing stands where the cameras look.
-        sunk: How far the solid is in its support [m].
+        beside: True if another object is at the point that the cameras look at.
+        sunk: Depth of the solid in its support [m].
         zoom: Focal length relative to the usual one.
     """
 
@@ -145,7 +145,7 @@ CASES = (
 
 
 def bowl() -> trimesh.Trimesh:
-    """Its inside is in no silhouette."""
+    """Return a bowl, whose inside is in no silhouette."""
     outer = trimesh.creation.cylinder(0.045, 0.05, sections=64)
     inner = trimesh.creation.cylinder(0.039, 0.05, sections=64)
     inner.apply_translation((0, 0, 0.007))
@@ -153,14 +153,14 @@ def bowl() -> trimesh.Trimesh:
 
 
 def bracket() -> trimesh.Trimesh:
-    """Two plates at a right angle."""
+    """Return two plates at a right angle."""
     flat, up = trimesh.creation.box((0.09, 0.05, 0.012)), trimesh.creation.box((0.012, 0.05, 0.06))
     up.apply_translation((-0.039, 0, 0.024))
     return trimesh.boolean.union([flat, up], engine="manifold")
 
 
 def plate() -> trimesh.Trimesh:
-    """A slab of 8 mm."""
+    """Return a slab of 8 mm."""
     return trimesh.creation.box((0.1, 0.07, 0.008))
 
 
@@ -168,14 +168,14 @@ SHAPES = {"solid": solid, "bowl": bowl, "bracket": bracket, "plate": plate}
 
 
 def standing(case: Case) -> trimesh.Trimesh:
-    """A case's solid where it is [m]."""
+    """Return a case's solid in its pose [m]."""
     mesh = SHAPES[case.shape]()
     mesh.apply_translation((0, 0, -mesh.bounds[0, 2] - case.sunk))
     return mesh
 
 
 def cameras(case: Case) -> list[Camera]:
-    """By hand: as many as there are to be of a longer walk that goes round the chosen share of it."""
+    """Return hand-held cameras: samples of a longer walk around the given share of the circle."""
     whole = walk(round(case.photos / (case.arc * case.heights)), WIDTH)
     low = whole[: round(case.heights * len(whole))]
     turns = [np.arctan2(camera.centre[1], camera.centre[0]) % (2 * np.pi) / (2 * np.pi) for camera in low]
@@ -184,7 +184,7 @@ def cameras(case: Case) -> list[Camera]:
 
 
 def views_around(mesh: trimesh.Trimesh, width: int = WIDTH, lowest: float = 10.0) -> list[Camera]:
-    """From all around a solid above its support, of which there are no photos."""
+    """Return views of a solid from all around above its support, for which there are no photos."""
     sines = np.sin(np.radians(np.linspace(lowest, 65, AROUND)))
     middle = mesh.bounds.mean(axis=0)
     return [
@@ -194,7 +194,7 @@ def views_around(mesh: trimesh.Trimesh, width: int = WIDTH, lowest: float = 10.0
 
 
 def spoil(clean: Path, photos: Path, case: Case) -> None:
-    """Write the photos that a camera with the case's faults would have taken."""
+    """Write photos with the case's faults."""
     rng = np.random.default_rng(6)
     photos.mkdir(parents=True, exist_ok=True)
     for path in sorted(clean.glob("*.png")):
@@ -208,7 +208,7 @@ def spoil(clean: Path, photos: Path, case: Case) -> None:
 
 
 def take(case: Case, mesh: trimesh.Trimesh, folder: Path) -> None:
-    """Path-trace a case's photos and the views that its asset is compared in, with where the solid is in these."""
+    """Path-trace a case's photos and comparison views, with masks of the solid in these."""
     finish = None if case.finish is None else dict(zip(("metallic", "roughness"), case.finish, strict=True))
     shape = speckled(mesh, contrast=case.contrast, finish=finish)
     around = room(case.beside) if case.cloth else table_scene(BOARD, np.random.default_rng(5))
@@ -222,7 +222,7 @@ def take(case: Case, mesh: trimesh.Trimesh, folder: Path) -> None:
 
 
 def truth_of(case: Case, mesh: trimesh.Trimesh, folder: Path) -> dict[str, float]:
-    """What an asset is off, put where the similarity of its cameras says: a share, dB or %."""
+    """Compute the true errors of an asset, aligned by its cameras: shares, dB or %."""
     _, matrix, _ = on_truth(folder / "asset", by_name(cameras(case)))
     made = Asset.load(folder / "asset").transformed(matrix)
     views, colours, overlaps = views_around(mesh), [], []
@@ -247,12 +247,12 @@ def truth_of(case: Case, mesh: trimesh.Trimesh, folder: Path) -> dict[str, float
 
 
 def is_good(truth: Mapping[str, float]) -> bool:
-    """Whether an asset is what the verdict promises."""
+    """Return True if an asset satisfies the thresholds of a good one."""
     return all(truth[name] <= limit if name in MOST else truth[name] >= limit for name, limit in GOOD.items())
 
 
 def measure(case: Case, folder: Path, judge: bool) -> dict[str, Any]:
-    """Verdict and truth of a case; kept if an earlier run made them of the same case."""
+    """Return verdict and truth of a case, from an earlier run if it was made of the same case."""
     mesh, marker, done = standing(case), folder / "photos.json", folder / "done.json"
     made = json.dumps([asdict(case), WIDTH, SAMPLES, AROUND, CLOSE, FINE])
     if not (marker.exists() and marker.read_text() == made):
@@ -288,7 +288,7 @@ def measure(case: Case, folder: Path, judge: bool) -> dict[str, Any]:
 
 
 def rank(results: Sequence[Mapping[str, Any]], figure_name: str, truth: str) -> tuple[float, float, float, int]:
-    """Spearman's correlation of how good a figure says and how good it is, its 95 % interval, and of how many."""
+    """Return Spearman's correlation of estimated and true quality, its 95 % interval, and the number of cases."""
     pairs = [
         (found["verdict"][figure_name], found["truth"][truth])
         for found in results
@@ -328,7 +328,7 @@ def main() -> None:
 
 
 def _tell(name: str, found: Mapping[str, Any]) -> None:
-    """Print and keep the figures of a case."""
+    """Print and record the figures of a case."""
     if found["truth"] is None:
         print(f"{name:26} refused: {found['refused']}", flush=True)
         figure("refused", "", "case", name, "verdict")
@@ -347,7 +347,7 @@ def _tell(name: str, found: Mapping[str, Any]) -> None:
 
 
 def summarise(results: Mapping[str, Mapping[str, Any]]) -> None:
-    """Print and keep rank correlations, and where verdict and truth agree on the assets that were made."""
+    """Print and record rank correlations, and the agreement of verdict and truth on the finished assets."""
     for name, truth in STANDS_FOR:
         value, low, high, count = rank(list(results.values()), name, truth)
         print(f"{name:12} for {truth:10} {value:6.2f}  [{low:.2f}, {high:.2f}] of {count}")

@@ -370,10 +370,10 @@ def _convert(data: bytes, source: str, target: str) -> bytes:
 
 
 def _decompress_gzip(data: bytes) -> bytes:
-    """Return the decompressed content of a gzip file. A truncated file gives the content up to its end.
+    """Return the decompressed content of a gzip file.
 
     Raises:
-        InputError: If the file is invalid, or if its content is larger than splats can be.
+        InputError: If the file is invalid or truncated, or if its content is larger than splats can be.
     """
     limit, raw, rest = _max_decompressed_size(len(data)), bytearray(), data
     decoder = zlib.decompressobj(wbits=31)
@@ -387,6 +387,8 @@ def _decompress_gzip(data: bytes) -> bytes:
                 )
     except zlib.error as error:
         raise InputError(f"not a valid spz file ({error})") from None
+    if not decoder.eof:
+        raise InputError(f"not a complete spz file: its gzip stream has no end within {len(data)} bytes")
     return bytes(raw)
 
 

@@ -328,6 +328,14 @@ class TestFiles:
         np.testing.assert_allclose(loaded.quats, quats, atol=0.01)
         np.testing.assert_allclose(loaded.scales, np.exp(-4), rtol=1e-6)
 
+    @pytest.mark.parametrize("missing", [1, 9, 200])
+    def test_truncated_spz_files_are_refused(self, tmp_path, missing):
+        """Without its last nine bytes, the gzip stream still decodes to all Gaussians, but has no checksum."""
+        random_splats(50).save(tmp_path / "a.spz")
+        (tmp_path / "a.spz").write_bytes((tmp_path / "a.spz").read_bytes()[:-missing])
+        with pytest.raises(InputError, match=r"a\.spz: not a complete spz file"):
+            Splats.load(tmp_path / "a.spz")
+
     def test_spz_files_keep_opacities_zero_and_one(self, tmp_path):
         replace(random_splats(2), opacities=[0.0, 1.0]).save(tmp_path / "a.spz")
         assert Splats.load(tmp_path / "a.spz").opacities.tolist() == [0.0, 1.0]

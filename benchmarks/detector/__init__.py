@@ -1,1 +1,1 @@
-"""Which parts of the generator a detector needs: the published experiment, on real photographs."""
+"""Ablation of the generator for a detector: the published experiment, on real photographs."""

@@ -1,13 +1,14 @@
-"""All arms and seeds of the experiment on detectors, side by side, as far as time allows.
+"""Runs all arms and seeds of the detector experiment in parallel, within a time limit.
 
     python -m benchmarks.detector WORK [--arms real synthetic] [--seeds 0 1 2] [--devices cuda:0 cuda:1] [--jobs 4]
         [--render-devices cpu] [--renders 2] [--minutes 20] [--plan workshop.yaml] [--hope ../shared/data/hope]
 
-Whole datasets are rendered first, on all devices that render; then a changed scene after the one that shows the same
-layouts unchanged, beside what trains. On the processor they take only what is left by the processes that prepare images
-for trainings. Arms are trained when what they learn from is there, in the order in which they are named, all of the
-first seed before the second, and folds of one side by side. What was recorded is not done again; what was interrupted
-goes on.
+Whole datasets are rendered first, on all rendering devices. A changed scene is rendered after the unchanged one with
+the
+same layouts, in parallel with trainings; on the CPU, renderings only use the time left by data loaders of trainings.
+An arm is trained once its datasets are complete. Arms are trained in the order of their names on the command line, all
+of the first seed before the second, and the folds of one arm in parallel. Recorded results are not repeated, and
+interrupted runs are resumed.
 """
 
 from __future__ import annotations
@@ -27,11 +28,11 @@ from benchmarks.detector.experiment import PLAN, VIEWS, folds_of, read_arms, res
 from benchmarks.record import read_recorded, refusal
 
 IMAGES = 32
-"""For which it pays to start a process: reading the assets takes it as long as rendering some of them."""
+"""Least number of images per process: reading the assets takes as long as rendering some of them."""
 
 
 def main() -> None:
-    """Render, train, judge."""
+    """Render, train and evaluate."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("work", type=Path)
     parser.add_argument("--plan", type=Path, default=PLAN)
@@ -63,13 +64,13 @@ class Job:
     """A command.
 
     Attributes:
-        name: Of its log.
-        kind: Of which so many run on each device at once.
-        words: The command, but for the device.
-        after: Names of jobs that must have ended well.
+        name: Name of its log.
+        kind: Kind of job, with a limit on the number per device.
+        words: The command without the device.
+        after: Names of jobs that must have succeeded.
         behind: Names of jobs that must have ended.
-        hides: Whether it sees no other GPU than its own, rather than being told the number.
-        everywhere: Whether it takes all GPUs.
+        hides: True if all other GPUs are hidden from it, instead of an argument with the GPU's number.
+        everywhere: True if it uses all GPUs.
     """
 
     name: str
@@ -82,14 +83,14 @@ class Job:
 
 
 def all_jobs(todo: Sequence[tuple[str, int]], plan: Mapping[str, Any], options: argparse.Namespace) -> list[Job]:
-    """Renders and trainings, in order, of which all others wait for those on all GPUs."""
+    """Return renderings and trainings in order; all wait for the jobs that use all GPUs."""
     jobs = [*renders(todo, plan, options), *trainings(todo, plan, options)]
     whole = [job.name for job in jobs if job.everywhere]
     return [job if job.everywhere else replace(job, behind=whole) for job in jobs]
 
 
 def renders(todo: Sequence[tuple[str, int]], plan: Mapping[str, Any], options: argparse.Namespace) -> Iterator[Job]:
-    """Datasets that some arms learn from, unchanged scenes first; whole ones on all GPUs."""
+    """Return the datasets of the arms, unchanged scenes first; whole ones use all GPUs."""
     wanted: dict[str, list[Mapping[str, Any]]] = {}
     for arm, _ in todo:
         for scene in scenes_of(plan["arms"][arm]):
@@ -115,7 +116,7 @@ def renders(todo: Sequence[tuple[str, int]], plan: Mapping[str, Any], options: a
 
 
 def trainings(todo: Sequence[tuple[str, int]], plan: Mapping[str, Any], options: argparse.Namespace) -> Iterator[Job]:
-    """Trainings of arms for each of their folds, and what judges all of them."""
+    """Return the trainings of arms for each of their folds, and the evaluation of all folds."""
     for arm, seed in todo:
         words = [sys.executable, "-m", "benchmarks.detector.experiment", str(options.work), arm, str(seed)]
         words += ["--plan", str(options.plan), "--workers", str(options.workers)]
@@ -130,7 +131,7 @@ def trainings(todo: Sequence[tuple[str, int]], plan: Mapping[str, Any], options:
 
 
 def run_jobs(jobs: Sequence[Job], free: Mapping[str, list[str]], options: argparse.Namespace) -> None:
-    """Run what may run, in order, on devices that are free for its kind, until all is done or time is up."""
+    """Run the jobs that are ready, in order, on devices free for their kind, until all have ended or time is up."""
     begun = time.monotonic()
     ends = begun + 60 * options.minutes
     logs = options.work / "logs"

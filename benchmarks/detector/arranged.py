@@ -1,12 +1,13 @@
-"""The same objects where no physics put them: standing anywhere, or floating.
+"""Rendering of the same objects without physics: upright at random positions, or floating.
 
     python -m benchmarks.detector.arranged WORK SCENE [--frames 128] [--plan arms.yaml] [--device cuda]
 
-SCENE is one of a plan with the change ``scattered`` or ``floating``. Objects, looks, lights and surroundings of every
-layout are those that the scene draws. ``scattered`` ones stand as their files have them, at random places on what is
-below their region, turned about the vertical, and do not overlap. ``floating`` ones are anywhere above it, turned at
-random, apart by their bounding spheres. On a table there is more room than they would drop into; what finds none in
-500 tries is left out. WORK/data/SCENE gets the images and their labels.
+SCENE is one of a plan with the change ``scattered`` or ``floating``. Objects, appearances, lights and surroundings of
+every layout are those that the scene draws. ``scattered`` objects have the orientation of their files, a random
+rotation about the vertical, and random positions on the surface below their region; they do not overlap.
+``floating`` objects have random poses above it; their bounding spheres do not overlap. On a table, the area is larger
+than the drop region. Objects without a free position in 500 tries are omitted. WORK/data/SCENE gets the images and
+their labels.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 # isort: off
-import mitsplat as ms  # which must come before Dr.Jit
+import mitsplat as ms  # which must be imported before Dr.Jit
 
 import numpy as np
 import trimesh
@@ -33,9 +34,9 @@ from mitsplat.scene.scene import Scene
 
 TRIES = 500
 WIDER = 1.5
-"""Than the region that objects drop into, where no walls are around."""
+"""Size relative to the drop region, in scenes without walls around it."""
 HIGH = 0.6
-"""Up to which objects float [m]."""
+"""Maximum height of floating objects [m]."""
 
 
 def main() -> None:
@@ -55,7 +56,7 @@ def main() -> None:
 
 
 def frames(scene: Scene, count: int, *, floating: bool) -> Iterator[ms.Frame]:
-    """The first frames of a scene without physics."""
+    """Yield the first frames of a scene without physics."""
     with ms.Renderer(scene) as renderer:
         layout = None
         for index in range(count):
@@ -65,7 +66,7 @@ def frames(scene: Scene, count: int, *, floating: bool) -> Iterator[ms.Frame]:
 
 
 def arranged(scene: Scene, index: int, *, floating: bool) -> Layout:
-    """What a layout holds, where it may be without falling."""
+    """Return a layout of the drawn objects in poses without physics."""
     rng = np.random.default_rng([scene.spec.seed, index, floating])
     assets, _ = draw_objects(scene, index)
     regions = draw_regions(scene.spec, index)
@@ -80,7 +81,7 @@ def arranged(scene: Scene, index: int, *, floating: bool) -> Layout:
 
 
 def _room(scene: Scene, region: int) -> tuple[np.ndarray, np.ndarray]:
-    """Corners (2,) of where objects of a region may be [m], on a floor that is at 0 in all scenes."""
+    """Return the corners (2,) of the area for the objects of a region [m]; the floor is at 0 in all scenes."""
     box, _ = scene.spec.all_regions[region]
     low, high = np.array(box.min)[:2], np.array(box.max)[:2]
     half = (high - low) / 2 * (1 if any(shape.bin for shape in scene.spec.shapes) else WIDER)
@@ -90,7 +91,7 @@ def _room(scene: Scene, region: int) -> tuple[np.ndarray, np.ndarray]:
 def _stand(
     scene: Scene, mesh: trimesh.Trimesh, region: int, taken: list[BaseGeometry], rng: np.random.Generator
 ) -> np.ndarray | None:
-    """A pose (4, 4) on the floor beside what stands there, or None."""
+    """Return a pose (4, 4) on the floor beside the standing objects, or None."""
     low, high = _room(scene, region)
     outline = MultiPoint(mesh.vertices[:, :2]).convex_hull
     for _ in range(TRIES):
@@ -114,7 +115,7 @@ def _float(
     taken: list[tuple[np.ndarray, float]],
     rng: np.random.Generator,
 ) -> np.ndarray | None:
-    """A pose (4, 4) above the floor apart from what floats there, or None."""
+    """Return a pose (4, 4) above the floor apart from the floating objects, or None."""
     low, high = _room(scene, region)
     middle = mesh.bounds.mean(axis=0)
     radius = float(np.linalg.norm(mesh.vertices - middle, axis=1).max())

@@ -1,8 +1,9 @@
-"""What an image costs, and what a detector learns from as many of them, as a chart of the documentation.
+"""Cost of an image against the precision of a detector trained on as many images, as a chart of the documentation.
 
     python -m benchmarks.detector.chart [--picture docs/chart_detectors.png]
 
-Seconds are those of ``benchmarks.detector.cost``; bars are of 95 %, over the scenes of photographs and over seeds.
+Seconds are those of ``benchmarks.detector.cost``; bars are 95 % intervals over the scenes of photographs and over
+seeds.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ NAMES = {
     "no_shadow": "fast, no shadow",
     "meshes": "path-traced meshes",
 }
-"""Of arms."""
+"""Names of arms in the chart."""
 
 
 def main() -> None:
@@ -42,7 +43,7 @@ def main() -> None:
     axes = chart.add_subplot()
     for arm, name in NAMES.items():
         seconds, mean = value_of(results, "detector.cost", arm), mean_precision(results, "arms", arm)
-        # Scenes differ far more than arms do, and in all arms alike: what is drawn is the interval of the difference.
+        # Scenes differ far more than arms, and equally in all arms: the chart shows the interval of the difference.
         less = np.percentile(draws[arm] - draws["traced_shadow"], [2.5, 97.5]) if arm != "traced_shadow" else [0.0, 0.0]
         low, high = mean_precision(results, "arms", "traced_shadow") + np.array(less)
         axes.errorbar(seconds, mean, [[max(mean - low, 0)], [max(high - mean, 0)]], fmt="o", capsize=3, label=name)

@@ -1,10 +1,10 @@
-"""What an image of the experiment's scenes costs, as its arms render it.
+"""Cost of an image of the experiment's scenes, as rendered for its arms.
 
     python -m benchmarks.detector.cost WORK [--scene stood] [--layout 1] [--views 4] [--hope ../shared/data/hope]
 
-WORK is what ``benchmarks.detector.material`` made. Views of one layout are rendered one after the other on the CPU:
-processor seconds of all threads from a placed layout to a labelled picture, medians without the first view, in which
-kernels are compiled. ``meshes`` is what ``benchmarks.detector.meshes`` takes for its pictures.
+WORK is the output of ``benchmarks.detector.material``. Views of one layout are rendered one after the other on the CPU.
+Times are CPU seconds of all threads from a placed layout to a labelled image: medians without the first view, which
+compiles kernels. ``meshes`` is the time of the images of ``benchmarks.detector.meshes``.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def main() -> None:
 
 
 def rendered(scene: ms.Scene, views: range) -> Iterator[float]:
-    """Seconds of each view by the splat renderer."""
+    """Return the seconds of each view with the splat renderer."""
     layout = ms.settle_layout(scene, views[0] // VIEWS)
     with ms.Renderer(scene) as renderer:
         for view in views:
@@ -54,7 +54,7 @@ def rendered(scene: ms.Scene, views: range) -> Iterator[float]:
 
 
 def traced(scene: ms.Scene, views: range, options: argparse.Namespace) -> Iterator[float]:
-    """Seconds of each path-traced picture, labels not counted."""
+    """Return the seconds of each path-traced image, without labels."""
     for frame in frames(scene, textured(options.hope, options.work), views, samples=64):
         yield frame.seconds["path"]
 

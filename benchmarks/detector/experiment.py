@@ -1,14 +1,14 @@
-"""One arm of the experiment on detectors, with one seed: rendered, trained, and judged on photographs.
+"""One arm of the detector experiment with one seed: rendering, training, and evaluation on photographs.
 
     python -m benchmarks.detector.experiment WORK ARM SEED [--plan workshop.yaml] [--device cuda:0] [--weights FILE.pt]
         [--fold 0]
-    python -m benchmarks.detector WORK                  # all arms and seeds, side by side
+    python -m benchmarks.detector WORK                  # all arms and seeds, in parallel
 
-WORK is what ``benchmarks.detector.material`` made, and arms stand in ``arms.yaml``; or, with ``--plan workshop.yaml``,
-what ``benchmarks.detector.workshop`` made, and arms stand there. Photographs are those of a few scenes
-under several lights: an arm that learns from photographs is trained once for each fold of scenes, on the other scenes,
-and judged on the fold; detections of all folds are judged together. Precision is also that of samples of scenes,
-drawn with replacement, the same ones for every arm, from which intervals of an arm and of differences follow.
+WORK is the output of ``benchmarks.detector.material``, with arms in ``arms.yaml``; with ``--plan workshop.yaml``, it is
+that of ``benchmarks.detector.workshop``, with arms in the plan. Photographs show a few scenes under several lights. An
+arm that is trained on photographs is trained once for each fold of scenes, on the other scenes, and evaluated on the
+fold; detections of all folds are evaluated together. Precision is also computed for samples of scenes, drawn with
+replacement and equal for every arm, which give intervals of an arm and of differences.
 """
 
 from __future__ import annotations
@@ -37,28 +37,28 @@ from mitsplat.storage.files import write_text
 HERE = Path(__file__).parent
 PLAN = Path("arms.yaml")
 VIEWS = 8
-"""Of each layout, as ``groceries.yaml`` and the shipped scenes say it."""
+"""Views per layout, as in ``groceries.yaml`` and the shipped scenes."""
 SAMPLES = 200
-"""Draws of scenes with replacement."""
+"""Number of draws of scenes with replacement."""
 
 
 def read_arms(plan: Path = PLAN) -> dict[str, Any]:
-    """What ``arms.yaml``, or another plan beside it, says."""
+    """Read ``arms.yaml``, or another plan beside it."""
     return dict(YAML(typ="safe").load((HERE / plan).read_text()))
 
 
 def scenes_of(arm: Mapping[str, Any]) -> list[str]:
-    """The scenes that an arm learns from, by name: their changes, joined by ``+``."""
+    """Return the training scenes of an arm by name: their changes, joined by ``+``."""
     return ["+".join([scene, *([arm["change"]] if "change" in arm else [])]) for scene in arm.get("scenes", [])]
 
 
 def result_of(arm: str, seed: int, plan: Path = PLAN) -> str:
-    """The name of what is recorded of an arm and a seed."""
+    """Return the name of the recorded result of an arm and a seed."""
     return f"detector.experiment-{arm}-{seed}" + ("" if plan == PLAN else f"-plan_{plan.stem}")
 
 
 def state_of_scenes(plan: Mapping[str, Any], arm: str) -> str:
-    """A hash of the scenes that an arm learns from, but for its own change: arms of others are not compared.
+    """Return a hash of an arm's training scenes without its own change; only arms of equal scenes are compared.
 
     Empty if there are none.
     """
@@ -70,11 +70,11 @@ def state_of_scenes(plan: Mapping[str, Any], arm: str) -> str:
 
 
 def write_scene(work: Path, name: str, plan: Path = PLAN) -> Path:
-    """The scene of a name: that of the plan with its changes, by dotted key; null takes away at the end."""
+    """Write the plan's scene with the changes in a name, by dotted key; null values are removed at the end."""
     said = read_arms(plan)
     scene = YAML(typ="safe").load((HERE / said["scene"]).read_text())
     rows = [row for change in name.split("+") for row in said["changes"][change].items()]
-    # What is later in a list goes first, so that places in it stay those of groceries.yaml.
+    # Later list entries are processed first, so that indices remain those of groceries.yaml.
     gone = sorted({row for row in rows if row[1] is None}, reverse=True)
     for key, value in [row for row in rows if row[1] is not None] + gone:
         *way, last = [int(part) if part.isdigit() else part for part in key.split(".")]
@@ -95,13 +95,13 @@ def write_scene(work: Path, name: str, plan: Path = PLAN) -> Path:
 
 
 def folds_of(plan: Mapping[str, Any], arm: str) -> list[set[int]]:
-    """Scenes of photographs that each training of an arm is judged on: all, if it learns from none."""
+    """Return the evaluation scenes of each training of an arm: all at once, if it is not trained on photographs."""
     folds = [set(fold) for fold in plan["folds"]]
     return folds if plan["arms"][arm].get("real") else [set().union(*folds)]
 
 
 def scene_of(image: str) -> int:
-    """The scene that a photograph shows, by its name."""
+    """Return the scene of a photograph, from its name."""
     found = re.search(r"scene_(\d+)_", image)
     if found is None:
         raise SystemExit(f"{image} is not named scene_NNNN_LLLL")
@@ -109,7 +109,7 @@ def scene_of(image: str) -> int:
 
 
 def photographs(work: Path, scenes: set[int], name: str) -> Path:
-    """A COCO folder of the photographs of some scenes."""
+    """Write a COCO folder of the photographs of some scenes."""
     folder = work / name
     with (work / "photos" / "labels.json").open() as file:
         labels = json.load(file)
@@ -129,17 +129,18 @@ def photographs(work: Path, scenes: set[int], name: str) -> Path:
 def listed(
     rendered: list[Path], folder: Path, *, images: int | None = None, first: int | None = None, views: int = VIEWS
 ) -> Path:
-    """A YOLO folder that lists some of the images of rendered ones.
+    """Write a YOLO folder that lists some of the rendered images.
 
     Args:
         rendered: Datasets.
-        folder: Where the list goes.
-        images: How many, of an order which is the same for any number; all if None.
-        first: The first so many images of each dataset, to compare what shows the same; all if None.
-        views: Of each layout, the first so many of :data:`VIEWS`; the more layouts are there among the first images.
+        folder: Folder of the list.
+        images: Number of images, in an order that does not depend on the number; None for all.
+        first: Number of first images of each dataset, to compare equal contents; None for all.
+        views: Number of first views of each layout, of :data:`VIEWS`; with fewer views, the first images have more
+            layouts.
 
     Raises:
-        SystemExit: If there are not so many.
+        SystemExit: If there are too few images.
     """
     some = []
     for one in rendered:
@@ -164,7 +165,7 @@ def listed(
 
 
 def main() -> None:
-    """Train and judge."""
+    """Train and evaluate."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("work", type=Path)
     parser.add_argument("arm")
@@ -185,7 +186,7 @@ def main() -> None:
 
 
 def train_fold(options: argparse.Namespace, plan: Mapping[str, Any], number: int) -> Run:
-    """Train an arm on what it renders, and on photographs of other folds."""
+    """Train an arm on its rendered images, and on photographs of other folds."""
     arm = dict(plan["arms"][options.arm])
     work: Path = options.work
     rendered = [work / "data" / scene for scene in scenes_of(arm)]
@@ -198,12 +199,12 @@ def train_fold(options: argparse.Namespace, plan: Mapping[str, Any], number: int
         folds = folds_of(plan, options.arm)
         real = photographs(work, set().union(*folds) - folds[number], f"without_fold_{number}")
     run = work / "runs" / f"{options.arm}-{options.seed}-{number}"
-    # Without rendered images photographs are what is learnt, not what is mixed in.
+    # Without rendered images, photographs are the training set, and not an addition.
     return train_detector(rendered or [real], run, settings, real=real if rendered else None)
 
 
 def measure(options: argparse.Namespace) -> None:
-    """Train what the arm says for all folds, and judge it."""
+    """Train an arm for all folds, and evaluate it."""
     plan, work = read_arms(options.plan), options.work
     folds = folds_of(plan, options.arm)
     everything = photographs(work, set().union(*folds), "all_photos")

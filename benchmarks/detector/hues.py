@@ -1,9 +1,9 @@
-"""By how much photographs show the hues of each class turned, with and without a camera that turns colours.
+"""Hue rotation of each class on photographs, compared with rendered images with and without hue errors of the camera.
 
     python -m benchmarks.detector.hues WORK
 
-WORK is what ``benchmarks.detector.material`` made, with the datasets that the arms ``synthetic`` and ``no_hue`` learn
-from in ``data/``, of which the second shows the first layouts and views of the first.
+WORK is the output of ``benchmarks.detector.material``, with the datasets of the arms ``synthetic`` and ``no_hue`` in
+``data/``. The second dataset shows the first layouts and views of the first one.
 """
 
 from __future__ import annotations

@@ -1,11 +1,11 @@
-"""Material of the experiment on detectors: assets of scanned objects, packages that no class is, labelled photographs.
+"""Material of the detector experiment: assets of scanned objects, packages without a class, and labelled photographs.
 
     python -m benchmarks.detector.material HOPE WORK [--gaussians 50000] [--packages 120] [--bags 12] [--device cuda]
         [--jobs 8]
 
 HOPE holds ``meshes/*.glb`` (textured scans [m], y up), ``photos/*.jpg`` named ``scene_NNNN_LLLL``, and ``labels.json``
-(COCO). WORK gets ``groceries/``, ``packages/``, ``bags/`` and ``brands/`` (the scans as other brands print them),
-folders of assets, and ``photos/``, a COCO folder. What is there already is kept, so that it goes on where it stopped.
+(COCO). WORK gets ``groceries/``, ``packages/``, ``bags/`` and ``brands/`` (the scans with prints of other brands),
+folders of assets, and ``photos/``, a COCO folder. Existing files are not made again, so that interrupted runs resume.
 """
 
 from __future__ import annotations
@@ -36,47 +36,48 @@ from mitsplat.runtime.device import use_device
 PACKAGE = BakeSettings(
     gaussians=30000, sh_degree=1, directions=8, samples=8, fit_views=12, fit_steps=50, verify_views=2
 )
-"""Packages are many and diffuse: a third of the time of a scan, 2 dB less."""
+"""Bake settings of packages, which are many and diffuse: a third of the time of a scan, 2 dB less."""
 
 UP: dict[str, Literal["y", "z"]] = {"bbq_sauce": "z"}
-"""Axes of scans that stand along another than y: this one lies on its label."""
+"""Up axes of scans other than y: this one lies on its label."""
 
 BRANDS = {"box": 4, "bottle": 10, "can": 8}
-"""How many other brands of each scan there are, by its shape: most goods in cans and bottles come in these.
+"""Number of other brands per scan, by its shape: most cans and bottles are shapes of several brands.
 
-Every second one has the scan's colours: on photographs what shares a class's colours was taken for it, whatever was
-printed on it."""
+Every second one has the scan's colours. Otherwise, on photographs, a detector took objects with a class's colours for
+that class, whatever their print.
+"""
 PRINTED = 5
-"""Bottles of each scan that are printed all around; others have a label and a cap of any colour."""
+"""Number of bottles per scan with print all around; others have a label and a cap of any colour."""
 
 PACKAGES = 120
-"""Of which 90 are boxes, cans and bottles, and the rest what was taken for a class beside them."""
+"""Number of packages: 90 boxes, cans and bottles; the others are kinds that were confused with a class."""
 
 BAGS = 12
 
 DENSITY = 600.0
-"""Of packed food with air around it [kg/m^3]."""
+"""Density of packed food including air [kg/m^3]."""
 
 
 def share_cores(processes: int) -> None:
-    """Leave Dr.Jit, which has a thread for every core, those of one of so many processes."""
+    """Limit Dr.Jit, which starts a thread per core, to the share of cores of one of several processes."""
     dr.set_thread_count(max(1, usable_cores() // processes))
 
 
 def parts_hull(mesh: Path | trimesh.Trimesh, up: Literal["y", "z"]) -> trimesh.Trimesh:
-    """The convex hull of all parts of a mesh [m], z up."""
+    """Return the convex hull of all parts of a mesh [m], z up."""
     parts = read_parts(mesh, metres_per_unit=1.0, up=up, finish=None)
     return trimesh.util.concatenate([part.mesh for part in parts]).convex_hull
 
 
 def hulls_of(mesh: trimesh.Trimesh, count: int = 12) -> list[trimesh.Trimesh]:
-    """Convex hulls [m] of so many patches of a mesh, which is too ragged to be taken apart in a reasonable time."""
+    """Return convex hulls [m] of a number of patches of a mesh that is too ragged for a convex decomposition."""
     _, patch = kmeans2(mesh.triangles_center, count, seed=0, minit="++")
     return [trimesh.convex.convex_hull(mesh.triangles[patch == one].reshape(-1, 3)) for one in np.unique(patch)]
 
 
 def main() -> None:
-    """Read what is asked for."""
+    """Parse the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("hope", type=Path)
     parser.add_argument("work", type=Path)
@@ -92,7 +93,7 @@ def main() -> None:
 
 @dataclass(frozen=True)
 class Wanted:
-    """An asset: a scan, a scan as another brand prints it, or, without a scan, a package or a bag of a seed."""
+    """An asset to make: a scan, a scan with another brand's print, or, without a scan, a package or bag of a seed."""
 
     kind: Literal["groceries", "brands", "packages", "bags"]
     name: str
@@ -100,11 +101,11 @@ class Wanted:
     seed: int = 0
 
     def out(self, work: Path) -> Path:
-        """Its folder."""
+        """Return its folder."""
         return work / self.kind / self.name
 
     def mesh(self) -> tuple[Path | trimesh.Trimesh, Literal["y", "z"]]:
-        """Textured, and which of its axes points up."""
+        """Return the textured mesh, and its up axis."""
         if self.kind == "packages":
             return make_package(self.seed), "z"
         if self.kind == "bags":
@@ -117,7 +118,10 @@ class Wanted:
         return relabel(scan, self.seed, "xyz".index(up), own_colours=own, plain=plain), up
 
     def bake(self, work: Path, gaussians: int, device: str) -> float:
-        """An asset of small files, whose PSNR [dB] this is; its body is its hull, which all but a bag all but fill."""
+        """Bake an asset with small files; return its PSNR [dB].
+
+        Its collision shape is the hull, which is close to the shape of all but bags.
+        """
         use_device(device)
         mesh, up = self.mesh()
         settings = BakeSettings(gaussians=gaussians) if self.kind == "groceries" else PACKAGE
@@ -139,7 +143,7 @@ class Wanted:
 
 
 def wanted_assets(hope: Path, packages: int = PACKAGES, bags: int = BAGS) -> list[Wanted]:
-    """All of the experiment's."""
+    """Return all assets of the experiment."""
     wanted = []
     for number, path in enumerate(sorted((hope / "meshes").glob("*.glb"))):
         wanted.append(Wanted("groceries", path.stem, path))
@@ -150,14 +154,14 @@ def wanted_assets(hope: Path, packages: int = PACKAGES, bags: int = BAGS) -> lis
 
 
 def make(options: argparse.Namespace) -> None:
-    """Bake and copy what is not there."""
+    """Bake and copy what is missing."""
     photos = options.work / "photos"
     if not photos.exists():
         shutil.copytree(options.hope / "photos", photos)
         shutil.copy(options.hope / "labels.json", photos / "labels.json")
     wanted = wanted_assets(options.hope, options.packages, options.bags)
     wanted = [one for one in wanted if not (one.out(options.work) / "asset.yaml").exists()]
-    # Not an executor of concurrent.futures: with processes of so many tasks it waits for ever once all have ended.
+    # concurrent.futures is not used: with processes limited to a number of tasks, its executor never returns.
     with get_context("spawn").Pool(options.jobs, share_cores, (options.jobs,), maxtasksperchild=8) as pool:
         baked = [pool.apply_async(one.bake, (options.work, options.gaussians, options.device)) for one in wanted]
         for one, psnr in zip(wanted, baked, strict=True):

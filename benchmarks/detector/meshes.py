@@ -1,12 +1,12 @@
-"""The same frames path-traced from the textured meshes that the splats were baked of: the dear way, as the ceiling.
+"""Path-traced images of the same frames from the textured meshes behind the splats: the expensive upper bound.
 
     python -m benchmarks.detector.meshes WORK SCENE [--hope ../shared/data/hope] [--frames 128] [--samples 64]
         [--device cuda]
 
-SCENE is one of ``arms.yaml`` with the change ``meshes``. Layouts, looks, lamps, cameras and their response are those of
-the scene, and labels are those of its splats. Objects and what they lie on are path-traced; the walls behind them are
-as the splat renderer shows them, as both take their light for a constant sky. A picture is as bright and as balanced as
-that one where no object is. WORK/data/SCENE gets the images and their labels.
+SCENE is one of ``arms.yaml`` with the change ``meshes``. Layouts, appearances, lamps, cameras and their response are
+those of the scene, and labels are those of its splats. Objects and their support are path-traced. The walls behind them
+are from the splat renderer, because both use a constant sky as their light. Brightness and white balance of an image
+match the splat image where no object is. WORK/data/SCENE gets the images and their labels.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 # isort: off
-import mitsplat as ms  # which must come before Dr.Jit
+import mitsplat as ms  # which must be imported before Dr.Jit
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -43,7 +43,7 @@ from mitsplat.scene.scene import Scene
 from mitsplat.scene.spec.scene_spec import BACKDROP
 
 LEAST = 500
-"""Pixels where no object is by which a picture's brightness is told."""
+"""Least number of object-free pixels to match an image's brightness."""
 
 
 def main() -> None:
@@ -63,13 +63,13 @@ def main() -> None:
 
 
 def textured(hope: Path) -> dict[str, tuple[MeshPart, ...]]:
-    """What all assets were baked of, by their names."""
+    """Return the source meshes of all assets, by name."""
     meshes = {one.name: one.mesh() for one in wanted_assets(hope)}
     return {name: read_parts(mesh, up=up) for name, (mesh, up) in meshes.items()}
 
 
 def frames(scene: Scene, parts: Mapping[str, tuple[MeshPart, ...]], indices: range, samples: int) -> Iterator[Frame]:
-    """Frames of a scene with path-traced pictures, which take processor seconds ``seconds["path"]`` each."""
+    """Yield frames of a scene with path-traced images, each with CPU seconds in ``seconds["path"]``."""
     with ms.Renderer(scene) as renderer:
         layout, objects = None, dict[str, Any]()
         for index in indices:
@@ -88,7 +88,7 @@ def frames(scene: Scene, parts: Mapping[str, tuple[MeshPart, ...]], indices: ran
 
 
 def developed(frame: Frame, radiance: np.ndarray, cover: np.ndarray, scene: Scene) -> np.ndarray:
-    """The picture of a frame's camera."""
+    """Develop an image by a frame's camera."""
     empty = (frame.instance == 0) & (cover == 1)
     if empty.sum() < LEAST:
         empty = cover == 1
@@ -98,7 +98,7 @@ def developed(frame: Frame, radiance: np.ndarray, cover: np.ndarray, scene: Scen
 
 
 def _stands(scene: Scene, name: str) -> bool:
-    """Whether a shape of Mitsuba's description is what objects lie on."""
+    """Return True if a Mitsuba shape supports objects."""
     if not name.startswith("shape_"):
         return False
     shape = scene.spec.shapes[int(name.removeprefix("shape_"))]
@@ -106,7 +106,7 @@ def _stands(scene: Scene, name: str) -> bool:
 
 
 def object_shapes(scene: Scene, layout: Layout, parts: Mapping[str, tuple[MeshPart, ...]]) -> dict[str, Any]:
-    """Mitsuba's shapes of all objects of a layout, as they look there."""
+    """Return Mitsuba shapes of all objects of a layout in their appearances."""
     looks = draw_appearances(scene, layout)
     shapes = {}
     for one in layout.instances:
@@ -117,7 +117,7 @@ def object_shapes(scene: Scene, layout: Layout, parts: Mapping[str, tuple[MeshPa
 
 
 def primitive(asset: Asset) -> MeshPart:
-    """A solid that no file holds, in the colour of the nearest of its splats."""
+    """Return a primitive that no file holds, coloured by the nearest of its splats."""
     mesh = asset.mesh.subdivide_to_size(0.004)
     _, nearest = KDTree(asset.splats.means).query(mesh.vertices)
     colours = decode_srgb(np.clip(asset.splats.sh[nearest, 0] * SH_C0 + 0.5, 0, 1))

@@ -1,8 +1,9 @@
-"""Packages that no class is: boxes, cans, bottles, tubs, and carrier bags, as textured meshes to be baked.
+"""Packages without a class: boxes, cans, bottles, tubs, and carrier bags, as textured meshes to bake.
 
-A detector that has never seen another box with words on it takes every box with words for one that it knows. These are
-drawn from a seed: proportions of groceries, colours, bands, ellipses, stripes and words in the fonts of matplotlib. Nor
-is a shape a class where brands share bottles and cans: scans are printed anew, each as another brand's.
+A detector that was never trained with other printed boxes takes every printed box for one of its classes. Packages are
+drawn from a seed: proportions of groceries, colours, bands, ellipses, stripes and words in the fonts of matplotlib.
+Shape does not determine a class either, because brands share bottles and cans. Scans therefore also get prints of other
+brands.
 """
 
 from __future__ import annotations
@@ -28,12 +29,12 @@ WORDS = re.split(
 FONTS = sorted(Path(matplotlib.get_data_path(), "fonts/ttf").glob("DejaVu*Bold*.ttf"))
 Colours: TypeAlias = list[tuple[int, int, int]]
 FIRST_KINDS = 90
-"""Packages that are boxes, cans and bottles; what photographs showed to be taken for classes beside them follows."""
+"""Boxes, cans and bottles; the other kinds were added because photographs showed confusions with classes."""
 _PIXELS_PER_METRE = 3000.0
 
 
 def make_package(seed: int) -> trimesh.Trimesh:
-    """A closed mesh [m], z up, with a texture."""
+    """Return a closed mesh [m], z up, with a texture."""
     rng = np.random.default_rng(seed)
     kinds: Sequence[Callable[[np.random.Generator], trimesh.Trimesh]] = (_box, _can, _bottle)
     if seed >= FIRST_KINDS:
@@ -42,9 +43,11 @@ def make_package(seed: int) -> trimesh.Trimesh:
 
 
 def make_bag(seed: int) -> trimesh.Trimesh:
-    """A crumpled carrier bag, brown, white or grey, darker in its folds: a closed mesh [m], z up, with a texture.
+    """Return a crumpled carrier bag, a closed mesh [m], z up, with a texture.
 
-    A ball of which thin layers are moved to and fro, coarse ones first, so that it is folded along their edges.
+    The bag is brown, white or grey, darker in its folds.
+
+    A ball whose thin layers are displaced back and forth, coarse layers first, so that it folds along their edges.
     """
     rng = np.random.default_rng([seed, 1])
     ball = trimesh.creation.icosphere(subdivisions=4)
@@ -67,7 +70,7 @@ def make_bag(seed: int) -> trimesh.Trimesh:
 
 
 def shape_of(scan: trimesh.Trimesh) -> Literal["box", "bottle", "can"]:
-    """What a package is, by how much of its bounding box it fills, and how slender it is."""
+    """Classify a package by its share of its bounding box, and its aspect ratio."""
     extents = np.sort(scan.extents)
     if scan.convex_hull.volume > 0.8 * extents.prod():
         return "box"
@@ -77,23 +80,23 @@ def shape_of(scan: trimesh.Trimesh) -> Literal["box", "bottle", "can"]:
 def relabel(
     scan: trimesh.Trimesh, seed: int, up: int, *, own_colours: bool = False, plain: bool = False
 ) -> trimesh.Trimesh:
-    """A scan with another brand's print on it: all sides of a box, all around a bottle below its cap, or a can.
+    """Return a scan with another brand's print: all sides of a box, a bottle all around below its cap, or a can.
 
     Args:
-        scan: With a texture, of which ends of cans stay.
-        seed: Decides all that is printed.
-        up: Axis along which print stands upright.
-        own_colours: Whether it is printed in colours of the scan, so that they do not tell one from the other.
-        plain: Whether it is, if a bottle, of one colour but for its cap, of any, and a label on its front and back.
+        scan: Textured scan; the ends of cans keep their texture.
+        seed: Seed of the print.
+        up: Vertical axis of the print.
+        own_colours: True to print in the scan's colours, so that colours do not distinguish the two.
+        plain: True for a bottle of one colour with a cap of any colour, and a label on its front and back.
     """
     rng = np.random.default_rng(seed)
     shape = shape_of(scan)
     corners = scan.triangles - scan.bounds.mean(axis=0)
-    across, along = (up + 1) % 3, (up + 2) % 3  # from which the upright axis is the third of a right-handed frame
+    across, along = (up + 1) % 3, (up + 2) % 3  # the up axis is the third of a right-handed frame
     scanned = scan.visual.material.baseColorTexture.convert("RGB")
     size, colours = scan.extents, _colours_of(scan, up, rng) if own_colours else _colours(rng)
     uv, sheets = scan.visual.uv[scan.faces], [scanned]
-    side = np.zeros(len(corners), dtype=int)  # the sheet that is on a triangle
+    side = np.zeros(len(corners), dtype=int)  # sheet of each triangle
 
     def put(sheet: Image.Image, faces: np.ndarray, u: np.ndarray, v: np.ndarray) -> None:
         """Print on some of the triangles, at coordinates within [0, 1]."""
@@ -120,7 +123,7 @@ def relabel(
         plain = plain and shape == "bottle"
         front = (_plain_label if plain else _label)(around / 2, size[up], rng, colours)
         sheet = Image.new("RGB", (round(2.1 * front.width), front.height))
-        for place in range(3):  # front and back, and the beginning again where triangles reach over the seam
+        for place in range(3):  # front and back, and the start again for triangles across the seam
             sheet.paste(front, (place * front.width, 0))
         if shape == "bottle":
             cap = (0, 0, sheet.width, round(rng.uniform(0.1, 0.25) * sheet.height))
@@ -145,7 +148,7 @@ def relabel(
 
 
 def _colours(rng: np.random.Generator) -> Colours:
-    """Background, second colour, and ink, which differ in value."""
+    """Return background, second colour and ink, with different values."""
     hues = (rng.random() + np.array([0, rng.uniform(0.1, 0.6), rng.random()])) % 1
     values = np.clip([rng.uniform(0.2, 1), rng.uniform(0.2, 1), rng.choice([0.05, 0.98])], 0, 1)
     if abs(values[2] - values[0]) < 0.35:
@@ -156,9 +159,12 @@ def _colours(rng: np.random.Generator) -> Colours:
 
 
 def _colours_of(scan: trimesh.Trimesh, up: int, rng: np.random.Generator) -> Colours:
-    """Background, second colour, and ink: of the eight that the scan's sides have most of, ink unlike the first."""
+    """Return background, second colour and ink of the eight most frequent colours of the scan's sides.
+
+    Ink is unlike the background.
+    """
     simple = scan.copy()
-    simple.visual.material = scan.visual.material.to_simple()  # of others no colours are sampled
+    simple.visual.material = scan.visual.material.to_simple()  # other triangles have no colour samples
     _, faces, sampled = trimesh.sample.sample_surface(simple, 20_000, sample_color=True, seed=rng)
     sides = sampled[np.abs(scan.face_normals[faces, up]) < 0.7, :3].astype(np.uint8)
     few = Image.fromarray(sides[None]).quantize(8, kmeans=8)
@@ -170,7 +176,7 @@ def _colours_of(scan: trimesh.Trimesh, up: int, rng: np.random.Generator) -> Col
 
 
 def _label(width: float, height: float, rng: np.random.Generator, colours: Colours) -> Image.Image:
-    """A printed side of so many metres: fields of colour, a picture of what is in it, a title, a badge, small print."""
+    """Return a printed side of a size in metres: colour fields, a picture of the contents, a title, a badge, text."""
     size = max(round(width * _PIXELS_PER_METRE), 8), max(round(height * _PIXELS_PER_METRE), 8)
     image = Image.new("RGB", size, colours[0])
     draw = ImageDraw.Draw(image)
@@ -204,7 +210,7 @@ def _label(width: float, height: float, rng: np.random.Generator, colours: Colou
 
 
 def _plain_label(width: float, height: float, rng: np.random.Generator, colours: Colours) -> Image.Image:
-    """A side of one colour, half of them white, with a label in its middle: an ellipse, or a rounded rectangle."""
+    """Return a side of one colour, half of them white, with a label in its middle: an ellipse or rounded rectangle."""
     size = max(round(width * _PIXELS_PER_METRE), 8), max(round(height * _PIXELS_PER_METRE), 8)
     image = Image.new("RGB", size, _white(rng) if rng.random() < 0.5 else colours[0])
     share = rng.uniform([0.5, 0.35], [0.8, 0.65])
@@ -220,7 +226,7 @@ def _plain_label(width: float, height: float, rng: np.random.Generator, colours:
 
 
 def _white(rng: np.random.Generator) -> tuple[int, ...]:
-    """A white of paper or plastic."""
+    """Return a white of paper or plastic."""
     return tuple(round(value) for value in rng.uniform(225, 255) - rng.uniform(0, [4, 8, 30]))
 
 
@@ -230,7 +236,7 @@ def _any_colour(rng: np.random.Generator) -> tuple[int, ...]:
 
 
 def _field(draw: ImageDraw.ImageDraw, size: tuple[int, int], rng: np.random.Generator, colour: tuple[int, ...]) -> None:
-    """A band, an ellipse, a wedge, or stripes."""
+    """Draw a band, an ellipse, a wedge, or stripes."""
     x, y = rng.uniform(0, 1, 2) * size
     w, h = rng.uniform(0.15, 0.8, 2) * size
     shape = rng.integers(4)
@@ -247,7 +253,7 @@ def _field(draw: ImageDraw.ImageDraw, size: tuple[int, int], rng: np.random.Gene
 
 
 def _heap(draw: ImageDraw.ImageDraw, size: tuple[int, int], rng: np.random.Generator) -> None:
-    """A heap of what is in it, cherries or peas: rounds of one hue, each with a light and a dark side."""
+    """Draw a heap of contents such as cherries or peas: discs of one hue, each with a light and a dark side."""
     hue, saturation, value = rng.uniform(-0.03, 0.4) % 1, rng.uniform(0.4, 1), rng.uniform(0.5, 1)
     radius, stretch = rng.uniform(0.04, 0.2) * min(size), rng.uniform(1, 2.2)
     middle, spread = rng.uniform(0.3, 0.7, 2) * size, rng.uniform(0.1, 0.35, 2) * size
@@ -270,7 +276,7 @@ def _write(
     ink: tuple[int, ...],
     outline: tuple[int, ...] | None,
 ) -> float:
-    """Write in letters of so many pixels, no wider than so many, about a point; how high they are."""
+    """Write letters of a size in pixels, up to a maximum width, around a point; return their height."""
     letter = max(min(letter, 1.5 * most / len(text)), 6)
     font = ImageFont.truetype(str(FONTS[rng.integers(len(FONTS)) if rng else 0]), int(letter))
     stroke = 0 if outline is None else max(round(0.08 * letter), 1)
@@ -290,13 +296,13 @@ def _box(rng: np.random.Generator) -> trimesh.Trimesh:
 
 
 def _long_box(rng: np.random.Generator) -> trimesh.Trimesh:
-    """As of spaghetti."""
+    """Return a long box, as for spaghetti."""
     return _boxed(rng.uniform([0.02, 0.045, 0.2], [0.04, 0.08, 0.28]), rng)
 
 
 def _boxed(extents: np.ndarray, rng: np.random.Generator) -> trimesh.Trimesh:
     colours = _colours(rng)
-    # Six sides in a column of the atlas: the large ones printed alike, front and back.
+    # The six sides form a column of the atlas; the large ones, front and back, have equal prints.
     sides = [(0, 1, 2), (0, 1, 2), (2, 0, 1), (2, 0, 1), (1, 2, 0), (1, 2, 0)]
     images = [_label(extents[a], extents[b], rng, colours) for _, a, b in sides]
     width, height = max(im.width for im in images), sum(im.height for im in images)
@@ -323,7 +329,7 @@ def _boxed(extents: np.ndarray, rng: np.random.Generator) -> trimesh.Trimesh:
 
 
 def _turned(profile: np.ndarray, image: Image.Image, gloss: float, sections: int = 64) -> trimesh.Trimesh:
-    """A solid of revolution about z of (radius, height) points, whose texture's v runs along the profile."""
+    """Return a solid of revolution about z of (radius, height) points; the texture's v runs along the profile."""
     length = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(profile, axis=0), axis=1))])
     length /= length[-1]
     angle = np.linspace(0, 2 * np.pi, sections + 1)
@@ -348,7 +354,10 @@ def _round_label(
     painted: Sequence[tuple[int, int, tuple[int, ...]]] = (),
     label: Callable[[float, float, np.random.Generator, Colours], Image.Image] = _label,
 ) -> Image.Image:
-    """The texture of a turned solid: a label between two points of the profile, plain elsewhere, or painted."""
+    """Return the texture of a solid of revolution.
+
+    A label is between two points of the profile; the rest is plain or painted.
+    """
     length = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(profile, axis=0), axis=1))])
     around = 2 * np.pi * profile[:, 0].max()
     colours = _colours(rng)
@@ -393,7 +402,7 @@ def _bottle(rng: np.random.Generator) -> trimesh.Trimesh:
 
 
 def _tub(rng: np.random.Generator) -> trimesh.Trimesh:
-    """A cup that widens, as of yogurt, with a lid that stands out."""
+    """Return a widening cup with a protruding lid, as for yogurt."""
     foot, height = rng.uniform(0.025, 0.042), rng.uniform(0.05, 0.11)
     top = foot * rng.uniform(1.1, 1.4)
     lid, sunk = 1.04 * top, 0.92 * top
@@ -406,7 +415,7 @@ def _tub(rng: np.random.Generator) -> trimesh.Trimesh:
 
 
 def _squeezed(rng: np.random.Generator) -> trimesh.Trimesh:
-    """A flat bottle of one colour with a label in front, and a cap or a nozzle, as of mustard."""
+    """Return a flat bottle of one colour with a label in front, and a cap or a nozzle, as for mustard."""
     radius, height = rng.uniform(0.026, 0.038), rng.uniform(0.11, 0.18)
     waist, neck = rng.uniform(0.75, 1) * radius, rng.uniform(0.5, 0.8) * radius
     tip = neck * (0.9 if rng.random() < 0.6 else 0.2)

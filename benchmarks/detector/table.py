@@ -1,4 +1,4 @@
-"""What arms of the experiment on detectors came to, as a table of the documentation."""
+"""Results of the arms of the detector experiment, as a table of the documentation."""
 
 from __future__ import annotations
 
@@ -13,16 +13,19 @@ import numpy as np
 from benchmarks.detector.experiment import read_arms
 
 REFERENCE = "synthetic"
-"""The arm that others are compared with."""
+"""Arm that others are compared with."""
 REDRAWS = 50
 """Draws of seeds for each draw of scenes."""
 
 
 def experiment_table(results: Mapping[str, Mapping[str, Any]], plan: str = "arms", *arms: str) -> str:
-    """Precision of the arms of a plan that were recorded, or of some of them in their order, with intervals of 95 %.
+    """Return the precision of all recorded arms of a plan, or of some arms in their order, with 95 % intervals.
 
-    Intervals are percentiles of a bootstrap over scenes of photographs, the same draws in every arm, and over seeds,
-    drawn apart for each arm. An arm of one seed has only that of scenes. What arms stand beside, their plan says.
+    Intervals are percentiles of a bootstrap over scenes of photographs, with equal draws in every arm, and over seeds,
+    with
+    separate draws for each arm. An arm of one seed has only the variation of scenes. The plan names the arm that each
+    arm is
+    compared with.
     """
     seeds, draws = _by_arm(results, plan, *arms), precision_draws(results, plan)
     said = read_arms(Path(f"{plan}.yaml"))["arms"]
@@ -43,9 +46,9 @@ def experiment_table(results: Mapping[str, Mapping[str, Any]], plan: str = "arms
 
 
 def precision_draws(results: Mapping[str, Mapping[str, Any]], plan: str = "arms") -> dict[str, np.ndarray]:
-    """Precision of each arm of a plan over draws of its seeds and of scenes: shape (REDRAWS, draws).
+    """Return the precision of each arm of a plan over draws of seeds and of scenes: shape (REDRAWS, draws).
 
-    Each arm draws its own seeds, so that none changes with what else was recorded.
+    Each arm draws its own seeds, so that its values do not depend on other recorded arms.
     """
     return {
         arm: _redrawn(np.array([one["samples"][0] for one in found]), np.random.default_rng(list(arm.encode())))
@@ -54,7 +57,7 @@ def precision_draws(results: Mapping[str, Mapping[str, Any]], plan: str = "arms"
 
 
 def mean_precision(results: Mapping[str, Mapping[str, Any]], plan: str, arm: str) -> float:
-    """Mean over the seeds of an arm.
+    """Return the mean over the seeds of an arm.
 
     Raises:
         KeyError: If there is none.
@@ -67,7 +70,7 @@ def _mean(seeds: Sequence[Mapping[str, Any]], key: str) -> float:
 
 
 def _by_arm(results: Mapping[str, Mapping[str, Any]], plan: str, *wanted: str) -> dict[str, list[Mapping[str, Any]]]:
-    """Figures of every seed of the arms of a plan, among which must be those that are wanted."""
+    """Return the figures of every seed of the arms of a plan; the given arms must be among them."""
     seeds: dict[str, list[Mapping[str, Any]]] = defaultdict(list)
     for name in sorted(results):
         if found := re.fullmatch(rf"detector\.experiment-(\w+)-\d+{'' if plan == 'arms' else f'-plan_{plan}'}", name):
@@ -78,13 +81,13 @@ def _by_arm(results: Mapping[str, Mapping[str, Any]], plan: str, *wanted: str) -
 
 
 def _of_same_scenes(*arms: Sequence[Mapping[str, Any]]) -> bool:
-    """Whether arms learnt from scenes of one description, or from none."""
+    """Return True if arms were trained on scenes of one description, or on none."""
     stated = {tuple(one.get("scenes", [None])) for arm in arms for one in arm}
     return len(stated - {("", "")}) <= 1
 
 
 def _redrawn(samples: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Means over seeds drawn with replacement, of samples (seeds, draws of scenes): shape (REDRAWS, draws)."""
+    """Return means over seeds drawn with replacement, of samples (seeds, draws of scenes): shape (REDRAWS, draws)."""
     drawn = rng.integers(len(samples), size=(REDRAWS, len(samples)))
     means: np.ndarray = samples[drawn].mean(axis=1)
     return means

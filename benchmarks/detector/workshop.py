@@ -1,11 +1,13 @@
-"""Photographs of the machine parts that no photograph is of: path-traced, elsewhere, by another camera.
+"""Simulated photographs of the machine parts, path-traced in other scenes with another camera.
+
+There are no real photographs of these parts.
 
     python -m benchmarks.detector.workshop WORK [--scenes 10] [--views 5] [--width 960] [--samples 64] [--device cuda]
 
-Parts of the shipped scenes lie as they were dropped or poured, in their true materials, on benches of other workshops,
-under other lamps, and Mitsuba's path tracer takes their pictures. The camera is none of mitsplat's: its exposure,
-noise, tone curve, sharpening and JPEG are written here. WORK gets ``photos/``, a COCO folder with the masks of what is
-seen of each part, and ``assets/``, which ``workshop.yaml`` renders. Photographs that are there are kept.
+Parts of the shipped scenes are dropped or poured, with their original materials, on benches of other workshops under
+other lamps, and rendered by Mitsuba's path tracer. The camera is not mitsplat's: its exposure, noise, tone curve,
+sharpening and JPEG are implemented here. WORK gets ``photos/``, a COCO folder with the visible masks of each part, and
+``assets/``, which ``workshop.yaml`` renders. Existing photographs are not made again.
 """
 
 from __future__ import annotations
@@ -18,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 # isort: off
-from mitsplat.runtime.device import use_device  # imports mitsplat, which must come before Dr.Jit
+from mitsplat.runtime.device import use_device  # imports mitsplat, which must be imported before Dr.Jit
 
 import cv2
 import mitsuba as mi
@@ -41,11 +43,11 @@ from mitsplat.scene.spec.light_spec import AreaLight, EnvironmentLight
 from scenes.build import materials as m
 
 LEAST_SEEN = 0.15
-"""Share of a part that must be seen for it to be labelled, as of what is rendered."""
+"""Least visible share of a labelled part, as for rendered images."""
 
 
 def main() -> None:
-    """Read what is asked for."""
+    """Parse the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("work", type=Path)
     parser.add_argument("--scenes", type=int, default=10)
@@ -60,7 +62,7 @@ def main() -> None:
 
 
 def photograph_workshops(options: argparse.Namespace) -> None:
-    """Take the photographs of all scenes that are not there, and write the labels of all."""
+    """Render the photographs of all scenes that are missing, and write the labels of all."""
     photos, assets = options.work / "photos", options.work / "assets"
     photos.mkdir(parents=True, exist_ok=True)
     if not assets.exists():
@@ -87,7 +89,7 @@ def photograph_workshops(options: argparse.Namespace) -> None:
 
 
 def photograph_workshop(number: int, names: Sequence[str], options: argparse.Namespace) -> list[dict[str, Any]]:
-    """Photographs of one layout in one workshop, and what is labelled in each."""
+    """Render the photographs of one layout in one workshop; return the labels of each."""
     rng = np.random.default_rng([7, number])
     poured = bool(number % 2)
     lying = settled(options.work, number, poured=poured)
@@ -113,7 +115,7 @@ def photograph_workshop(number: int, names: Sequence[str], options: argparse.Nam
 
 
 def settled(work: Path, number: int, *, poured: bool) -> list[tuple[str, np.ndarray]]:
-    """Names of parts and where they lie, poses of shape (4, 4) [m]: dropped on a bench, or poured into a tray."""
+    """Return names of parts and their poses, shape (4, 4) [m]: dropped on a bench, or poured into a tray."""
     half = 0.12 if poured else 0.2
     shapes: list[dict[str, Any]] = [
         {"name": "bench", "friction": 0.6, "box": {"size": [1.2, 0.9, 0.05], "position": [0, 0, -0.025]}}
@@ -140,7 +142,7 @@ def settled(work: Path, number: int, *, poured: bool) -> list[tuple[str, np.ndar
 
 
 def workshop(rng: np.random.Generator, *, poured: bool) -> tuple[MeshPart, ...]:
-    """A bench with a wall behind it and things that are none of the parts on it; the tray, where parts are poured."""
+    """Return a bench with a wall behind it and other objects on it, and the tray for poured parts."""
     colours = [tuple(int(value) for value in rng.uniform(40, 225, 3)) for _ in range(12)]
     scratched = m.scratched(m.cast(colours[1], rng), rng, count=80, length=(10, 120), gain=0.3)
     tops = (m.concrete(rng, 512), m.beech(rng, 768, 512, 64), m.cast(colours[0], rng), scratched)
@@ -174,7 +176,7 @@ def _worn(mesh: trimesh.Trimesh, image: m.Pixels, rng: np.random.Generator) -> t
 
 
 def lamps(rng: np.random.Generator) -> dict[str, Any]:
-    """One to three lamps and what light is around."""
+    """Return one to three lamps and ambient light."""
     lights: list[Any] = [EnvironmentLight(kind="environment", radiance=float(rng.uniform(0.1, 0.5)))]
     for _ in range(int(rng.integers(1, 4))):
         place = rng.uniform(0.8, 1.6) * unit_vector(rng.uniform(-180, 0), rng.uniform(30, 75))
@@ -194,7 +196,7 @@ def lamps(rng: np.random.Generator) -> dict[str, Any]:
 
 
 def hand_held(rng: np.random.Generator, width: int) -> Camera:
-    """4:3, of a wider angle than the shipped scenes', from the free side of the bench."""
+    """Return hand-held cameras, 4:3, with a wider angle than the shipped scenes', from the free side of the bench."""
     target = np.array([*rng.uniform(-0.06, 0.06, 2), 0.01])
     place = target + rng.uniform(0.38, 0.7) * unit_vector(rng.uniform(-160, -20), rng.uniform(20, 75))
     up = np.array([0, 0, 1]) + rng.normal(0, 0.04, 3)
@@ -202,10 +204,10 @@ def hand_held(rng: np.random.Generator, width: int) -> Camera:
 
 
 def develop(radiance: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """What the camera makes of light (H, W, 3): uint8.
+    """Develop light (H, W, 3) to uint8.
 
-    Metered by its middle tones, balanced a little wrong, with shot and read noise that neighbours share after
-    demosaicing, a filmic curve (Hable 2010), and sharpened.
+    Exposure is metered by middle tones, white balance is slightly wrong, shot and read noise is correlated between
+    neighbours by demosaicing; a filmic curve (Hable 2010) and sharpening follow.
     """
     height, width = radiance.shape[:2]
     light = radiance * 0.3 * 2 ** rng.uniform(-0.6, 0.6) / max(float(np.quantile(radiance.mean(axis=2), 0.5)), 1e-6)
@@ -232,7 +234,7 @@ def labelled(
     things: Sequence[Sequence[MeshPart]],
     names: Sequence[str],
 ) -> list[dict[str, Any]]:
-    """COCO annotations of the parts of which enough is seen, by what the middle of each pixel shows."""
+    """Return COCO annotations of the parts that are sufficiently visible, sampled at pixel centres."""
     seen = nearest_object(camera, room, things)
     objects = []
     for number, ((name, _), parts) in enumerate(zip(lying, things, strict=True), 1):

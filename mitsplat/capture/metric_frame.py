@@ -1,4 +1,7 @@
-"""Scale and gravity of a reconstruction, from targets, a known distance, the table plane or camera attitudes."""
+"""Scale and vertical direction of a reconstruction.
+
+Targets give both. A known distance gives the scale alone, the table plane or camera attitudes the vertical alone.
+"""
 
 from __future__ import annotations
 

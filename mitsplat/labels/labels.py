@@ -6,7 +6,8 @@ rules, in this order, select the labels. All omissions and marks are counted:
 1. a connected part (8-connectivity) of fewer than ``min_fragment`` pixels is removed from its instance;
 2. an instance left with fewer than ``min_pixels`` pixels is dropped;
 3. an instance with a visible fraction below ``min_visible`` is ``occluded``. An instance whose splats and proxy agree
-   by less than ``min_agreement`` is ``disagreeing``. Both are dropped or only marked, depending on ``below_threshold``.
+   by less than ``min_agreement`` is ``disagreeing``. Occluded and disagreeing instances are dropped or only marked,
+   depending on ``below_threshold``.
 
 The *silhouette* of an instance is its mask when rendered alone, by the same rule for a pixel and after rule 1. The
 visible fraction is exact and uses no depth tolerance: visible pixels over the silhouette's pixels in the image. The

@@ -1,4 +1,4 @@
-"""Gradients of the splat renderer: a second march over the same lists that scatters per-Gaussian derivatives."""
+"""Differentiable rendering of splats: a Dr.Jit operation whose backward pass is in module `record_gradients`."""
 
 from __future__ import annotations
 

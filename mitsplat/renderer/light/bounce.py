@@ -195,7 +195,9 @@ class Reflectors:
 
 
 def trace_bounce(tracer: ShadowTracer, reflectors: Reflectors) -> tuple[mi.Color3f, mi.Float]:
-    """Return the reflected irradiance (Color3f) over that of display white, and a flag (Float) where it is known.
+    """Return the reflected irradiance (Color3f) over that of display white, and a mask (Float).
+
+    The mask is 1 at points where the irradiance was computed, and 0 elsewhere.
 
     Relit points of objects use a few rays each, so that their neighbours must be averaged. On visible meshes, one
     pixel in each cell of 2 x 2 is traced, and the result is already a mean over many cells. This mean is necessary,

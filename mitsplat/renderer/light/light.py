@@ -1,12 +1,12 @@
 """Traced light on splats: irradiance with and without dynamic occluders, and a highlight.
 
 A splat stores the radiance that the camera saw, shadows included. Rendering it among new objects therefore needs no
-full light transport, but one factor per visible point x with normal n:
+full light transport, but one light factor per visible point x with normal n:
 
-    captured under the scene's light:   ratio = E(x, n | static and dynamic occluders) / E(x, n | static occluders)
-    captured under uniform light:       ratio = (E(x, n | static and dynamic occluders) + E_bounce) / E_ref
+    captured under the scene's light:   factor = E(x, n | static and dynamic occluders) / E(x, n | static occluders)
+    captured under uniform light:       factor = (E(x, n | static and dynamic occluders) + E_bounce) / E_ref
 
-with irradiance E = integral of V(x, w) L(w) max(0, n.w) dw over all emitters. The first ratio is exactly 1 where no
+with irradiance E = integral of V(x, w) L(w) max(0, n.w) dw over all emitters. The first factor is exactly 1 where no
 dynamic object takes light away, so that captured shadows are not applied twice. E_ref is the irradiance for which the
 colours of the surroundings are exposed. An object captured in a light tent keeps its colours under E_ref, and is darker
 where less light arrives. E_bounce is the light that the surroundings reflect, see

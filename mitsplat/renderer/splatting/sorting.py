@@ -1,4 +1,4 @@
-"""Sorting on the device and on the host."""
+"""Sorting of 64-bit keys on the device and on the host. Module `tiles` sorts the Gaussians of tiles with it."""
 
 from __future__ import annotations
 

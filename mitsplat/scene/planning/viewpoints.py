@@ -1,4 +1,4 @@
-"""Viewpoints of frames.
+"""Selection of the viewpoint of each frame.
 
 The seed and the index of the frame determine the viewpoint. If the scene file points cameras at objects or selects
 views by the visible objects, the viewpoint also depends on the layout. Without a layout, such a camera gets a possible

@@ -47,7 +47,7 @@ def make_bag(seed: int) -> trimesh.Trimesh:
 
     The bag is brown, white or grey, darker in its folds.
 
-    A ball whose thin layers are displaced back and forth, coarse layers first, so that it folds along their edges.
+    It is a ball whose thin layers are displaced back and forth, coarse ones first, so that it folds along their edges.
     """
     rng = np.random.default_rng([seed, 1])
     ball = trimesh.creation.icosphere(subdivisions=4)

@@ -1,1 +1,1 @@
-"""Benchmarks of the wing: labels."""
+"""Benchmarks of labels."""

@@ -1,9 +1,9 @@
-"""Random frames in every format, and an audit of them: it must find nothing.
+"""Audit of random frames in every format, which must find no violation.
 
     python -m benchmarks.labels.audit [--frames 1000] [--size 128x96] [--out FOLDER]
 
-The workcell's parts float at random poses and scales about the mat, without physics: they overlap, intersect, hide each
-other, leave the image and come close to the camera, as no settled layout does.
+The workcell's parts float at random poses and scales about the mat, without physics. Unlike in settled layouts, they
+intersect, occlude each other, leave the image and come close to the camera.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ SKIPPED = ("yolo-pose", "exr")
 
 
 def scatter(scene: ms.Scene, index: int, *, progress: Any = None) -> Layout:
-    """Up to :data:`MOST` parts anywhere."""
+    """Return a layout of up to :data:`MOST` parts in random poses."""
     rng = random_stream(scene.spec.seed, "scattered layout", index)
     instances = []
     for i in range(int(rng.integers(0, MOST, endpoint=True))):
@@ -41,13 +41,13 @@ def scatter(scene: ms.Scene, index: int, *, progress: Any = None) -> Layout:
         pose[:3, :3] = Rotation.random(rng=rng).as_matrix()
         pose[:3, 3] = rng.normal((0, -0.08, 0.02), (0.07, 0.07, 0.03))
         kind = scene.class_names.index(scene.assets[asset].class_name)
-        # Some ids need sixteen bits.
+        # Some ids exceed eight bits.
         instances.append(Instance(i + 1 if index % 2 else 300 * (i + 1), asset, kind, pose))
     return Layout(index, tuple(instances), NO_PHYSICS)
 
 
 def main() -> None:
-    """Print what was labelled and the violations."""
+    """Print the label counts and the violations."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--frames", type=int, default=1000)
     parser.add_argument("--size", default="128x96")
@@ -58,7 +58,7 @@ def main() -> None:
 
 
 def measure(options: argparse.Namespace) -> None:
-    """Make the frames and audit them."""
+    """Render the frames and audit them."""
     width, height = map(int, options.size.split("x"))
     overrides = {
         "environment": None,

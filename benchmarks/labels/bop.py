@@ -1,11 +1,11 @@
-"""A dataset's BOP scenes read by the BOP toolkit, and its own visibility beside the exact one.
+"""A dataset's BOP scenes in the BOP toolkit, and the toolkit's visibility compared with the exact one.
 
     PYTHONPATH=../bop_toolkit python -m benchmarks.labels.bop DATASET [--delta 15]
 
-Needs the BOP toolkit (its readers, ``misc`` and ``visibility``) with imageio and pypng. Models are cast in their stated
-poses as ``scripts/calc_gt_info.py`` renders them, on a canvas of nine images. With ``labels: {source: proxies}`` the
-silhouettes must be the same; visible fractions differ where something lies less than the toolkit's tolerance [mm] in
-front of an instance.
+Requires the BOP toolkit (its readers, ``misc`` and ``visibility``) with imageio and pypng. Models are ray cast in their
+recorded poses on a canvas of nine images, like ``scripts/calc_gt_info.py`` renders them. With ``labels: {source:
+proxies}`` the silhouettes must be equal. Visible fractions differ where an occluder is closer to an instance than the
+toolkit's tolerance [mm].
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from mitsplat.runtime.variant import ensure_variant
 
 
 def cast(mesh: Any, rotation: Any, shift: Any, matrix: Any, width: int, height: int) -> np.ndarray:
-    """Depth [mm] of a mesh in a pose, 0 where it is not, shape (height, width)."""
+    """Return the depth [mm] of a mesh in a pose, 0 for a miss, shape (height, width)."""
     import mitsuba as mi
 
     y, x = np.mgrid[:height, :width]
@@ -32,7 +32,7 @@ def cast(mesh: Any, rotation: Any, shift: Any, matrix: Any, width: int, height: 
         mi.Point3f(*map(float, origin)), mi.Vector3f(*(mi.Float(row.astype(np.float32)) for row in directions))
     )
     hit = mesh.ray_intersect_preliminary(ray)
-    depth = np.where(np.array(hit.is_valid()), np.array(hit.t), 0)  # directions have a z of 1, so t is the depth
+    depth = np.where(np.array(hit.is_valid()), np.array(hit.t), 0)  # directions have z = 1, so t is the depth
     return depth.reshape(height, width).astype(np.float32)
 
 
@@ -47,7 +47,7 @@ def main() -> None:
 
 
 def compare(options: argparse.Namespace) -> None:
-    """Cast every model of every image."""
+    """Ray cast every model of every image."""
     from bop_toolkit_lib import inout, misc, visibility
 
     ensure_variant()

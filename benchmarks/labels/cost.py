@@ -1,10 +1,10 @@
-"""Seconds that truth, labels and files of a 1280x720 frame with 15 instances cost, on one core.
+"""Time of ground truth, labels and files of a 1280x720 frame with 15 instances, on one core [s].
 
     python -m benchmarks.labels.cost [--frames 7] [--size 1280x720]
 
-The parts lie in a grid on the workcell's mat, seen by its own cameras; nothing is simulated. Medians of the process's
-own seconds, which other work on the machine does not lengthen, with the wall's in brackets; the load is printed too.
-Silhouettes are rendering (each instance alone, on a canvas of nine images): labelling and writing are what remains.
+The parts lie in a grid on the workcell's mat, seen by its own cameras, without simulation. Times are medians of CPU
+seconds, which other programs hardly affect, with wall-clock seconds in brackets; the load is printed too. Silhouettes
+are part of rendering (each instance alone, on a canvas of nine images); the remaining stages are labels and files.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ SETS = {
 
 
 def grid(scene: ms.Scene) -> Layout:
-    """Fifteen parts in three rows, each turned and resting on its lowest point."""
+    """Return fifteen parts in three rows, each rotated and resting on its lowest point."""
     instances = []
     for i in range(INSTANCES):
         asset = i % len(scene.assets)
@@ -54,13 +54,13 @@ def grid(scene: ms.Scene) -> Layout:
 
 
 def truth_of(frame: ms.Frame) -> Truth:
-    """The maps of a frame, with the silhouettes of its labels."""
+    """Return the maps of a frame, with the silhouettes of its labels."""
     alone = {label.id: label.amodal for label in frame.labels.instances}
     return Truth(frame.instance, frame.layers.proxy_instance, alone, frame.depth)
 
 
 def clocks() -> np.ndarray:
-    """Seconds of this process, and of the wall."""
+    """Return CPU seconds of this process, and wall-clock seconds."""
     return np.array([time.process_time(), time.perf_counter()])
 
 
@@ -75,7 +75,7 @@ def main() -> None:
 
 
 def measure(options: argparse.Namespace) -> None:
-    """Render, label and write."""
+    """Render, label and write frames."""
     width, height = map(int, options.size.split("x"))
     os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
     cv2.setNumThreads(1)

@@ -19,14 +19,14 @@ from typing import Any
 import numpy as np
 from pycocotools import mask as coco_mask
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # the package itself needs mitsplat
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # the package itself requires mitsplat
 from record import figure, recording
 
 Instances = dict[str, list[Any]]
 
 
 class Truth:
-    """The manifest's instances by split and name of the image; what was compared with them."""
+    """Instances of the manifest by split and image name, and counts of comparisons."""
 
     def __init__(self, root: Path) -> None:
         self.splits: dict[str, Instances] = {"train": {}, "val": {}}
@@ -44,7 +44,7 @@ class Truth:
         self.boxes += 1
 
     def check_mask(self, label: Any, mask: Any) -> None:
-        """Compare a mask, of the whole image or of its box."""
+        """Compare a mask of the whole image or of its box."""
         x0, y0, x1, y1 = label["box"]
         whole = coco_mask.decode({"size": [self.height, self.width], "counts": label["rle"]}).astype(bool)
         expected = whole if mask.shape == whole.shape else whole[y0:y1, x0:x1]
@@ -54,10 +54,10 @@ class Truth:
 
 
 def by_datumaro(root: Path, truth: Truth) -> None:
-    """Read COCO by Datumaro."""
+    """Import COCO with Datumaro."""
     import datumaro
 
-    logging.getLogger().setLevel(logging.ERROR)  # it names every JSON file of another format
+    logging.getLogger().setLevel(logging.ERROR)  # Datumaro reports every JSON file of another format
     read = datumaro.Dataset.import_from(str(root), "coco_instances")
     names = [label.name for label in read.categories()[datumaro.AnnotationType.label]]
     for split, items in read.subsets().items():
@@ -75,7 +75,7 @@ def by_datumaro(root: Path, truth: Truth) -> None:
 
 
 def by_fiftyone(root: Path, truth: Truth) -> None:
-    """Read COCO by FiftyOne."""
+    """Import COCO with FiftyOne."""
     from fiftyone.utils.coco import COCODetectionDatasetImporter
 
     for split, instances in truth.splits.items():
@@ -95,7 +95,7 @@ def by_fiftyone(root: Path, truth: Truth) -> None:
 
 
 def main() -> None:
-    """Print what was compared."""
+    """Print the counts of comparisons."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("tool", choices=("datumaro", "fiftyone"))
     parser.add_argument("dataset", type=Path)
@@ -106,7 +106,7 @@ def main() -> None:
 
 
 def compare(options: argparse.Namespace) -> None:
-    """Import everything."""
+    """Import and compare all files."""
     truth = Truth(options.dataset)
     held = [instances for split in truth.splits.values() for instances in split.values()]
     figure(len(held), "", "images")

@@ -1,10 +1,11 @@
-"""A dataset read by Ultralytics as it is, compared with the manifest, and one epoch trained on it.
+"""A dataset read by Ultralytics, compared with the manifest, and one epoch of training on it.
 
     pip install '.[train]'
     python -m benchmarks.labels.train DATASET [--size 320] [--batch 6]
 
-The masks are those that its loader hands to the loss, at the images' own size, so what is measured is the whole way:
-text, resampling, letterbox and filling. The network starts without weights, on the CPU, and nothing is downloaded.
+The masks are those of the loss, from Ultralytics' loader at the images' own size. The comparison therefore includes
+text, resampling, letterbox and filling. The network starts without pretrained weights, on the CPU, and nothing is
+downloaded.
 """
 
 from __future__ import annotations
@@ -27,7 +28,10 @@ os.environ["YOLO_OFFLINE"] = "true"
 
 
 def compare(root: Path, data: dict[str, Any], split: str) -> tuple[int, list[float], list[float], float]:
-    """Images, IoU of instances over 200 px in one part and of all others, and how far boxes are off [px]."""
+    """Compare a split; return the number of images, IoUs, and the box error [px].
+
+    IoUs are those of instances over 200 px in one part, and of all others.
+    """
     import cv2
     from ultralytics.cfg import get_cfg
     from ultralytics.data.dataset import YOLODataset
@@ -46,7 +50,7 @@ def compare(root: Path, data: dict[str, Any], split: str) -> tuple[int, list[flo
         kinds = item["cls"].ravel().int().tolist()
         if kinds != [label.class_index for label in truth.instances]:
             raise SystemExit(f"{item['im_file']}: classes {kinds} are not the manifest's")
-        left, top = (side - truth.width) // 2, (side - truth.height) // 2  # what the letterbox adds
+        left, top = (side - truth.width) // 2, (side - truth.height) // 2  # padding of the letterbox
         boxes = item["bboxes"].numpy().reshape(-1, 4) * side
         for label, box, mask in zip(truth.instances, boxes, item["masks"].numpy(), strict=True):
             canvas = np.zeros((side, side), dtype=bool)
@@ -62,7 +66,7 @@ def compare(root: Path, data: dict[str, Any], split: str) -> tuple[int, list[flo
 
 
 def main() -> None:
-    """Print what was read, and train."""
+    """Print the comparison, and train."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("dataset", type=Path)
     parser.add_argument("--size", type=int, default=320)

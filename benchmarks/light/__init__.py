@@ -1,1 +1,1 @@
-"""Benchmarks of the wing: light."""
+"""Benchmarks of light."""

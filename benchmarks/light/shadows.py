@@ -1,23 +1,23 @@
-"""Shadows against truth: baked splats under our light, beside photographs of the same meshes by Mitsuba's path tracer.
+"""Shadows of relit splats against path-traced images of the same meshes by Mitsuba.
 
     python -m benchmarks.light.shadows [--out FOLDER] [--scenes table bin ...] [--lights lamp sky ...]
 
-A scene's surroundings are baked under its lights without the objects, and every object alone under even light. The
-composite of both under ``shadow: none``, ``image`` and ``traced`` is compared with a path-traced photograph of
-surroundings and objects together. PSNR [dB] and FLIP (Andersson et al. 2020, where ``flip_evaluator`` is installed) are
-those of display-encoded pictures:
+A scene's surroundings are baked under its lights without the objects, and every object alone under uniform light. The
+composite of both under ``shadow: none``, ``image`` and ``traced`` is compared with a path-traced image of surroundings
+and objects together. PSNR [dB] and FLIP (Andersson et al. 2020, if ``flip_evaluator`` is installed) are those of
+display-encoded images:
 
-* shadow: the surroundings where the objects take at least 3 % of the light, and 3 pixels around;
+* shadow: the surroundings where the objects remove at least 3 % of the light, and 3 pixels around;
 * object: the pixels of the objects;
 * whole: all pixels.
 
-``capture`` replaces the splats by path-traced pictures of the surroundings and of each object alone, so that what
-remains is the error of the light. ``direct`` is that with the exact ratio of direct light: the best that shadow rays
-can do, without light that bounces off the objects. ``no bounce`` is ``capture traced`` without the light that objects
-get from their surroundings. Penumbrae are measured in the light ratio itself, against direct light that is path-traced
-on white meshes: the distance [px] between 20 and 80 % of every edge.
+``capture`` replaces the splats by path-traced images of the surroundings and of each object alone, so that only the
+error of the light remains. ``direct`` is ``capture`` with the exact ratio of direct light: the optimum of shadow rays
+without light reflected by the objects. ``no bounce`` is ``capture traced`` without the light that surroundings reflect
+onto objects. Penumbrae are measured in the light ratio itself, against direct light that is path-traced on white
+meshes: the distance [px] between 20 and 80 % of every edge.
 
-What takes time (photographs and bakes) is kept in FOLDER and reused.
+Path-traced images and bakes take long; FOLDER stores them for later runs.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from typing import Any
 from mitsplat.arrays import BoolArray, Float64Array
 
 # isort: off
-from mitsplat.asset import Asset  # imports mitsplat, which must come before Dr.Jit
+from mitsplat.asset import Asset  # imports mitsplat, which must be imported before Dr.Jit
 
 import mitsuba as mi
 import numpy as np
@@ -80,7 +80,7 @@ LIGHTS: dict[str, tuple[LightSpec, ...]] = {
 
 @dataclass(frozen=True, eq=False)
 class Thing:
-    """An object: its true mesh in materials, its asset, and where it lies."""
+    """An object: its true mesh with materials, its asset, and its pose."""
 
     name: str
     mesh: trimesh.Scene
@@ -90,7 +90,7 @@ class Thing:
 
 @dataclass(frozen=True, eq=False)
 class Setup:
-    """Surroundings and objects on them, seen by a camera."""
+    """Surroundings, objects on them, and a camera."""
 
     room: trimesh.Scene
     things: Sequence[Thing]
@@ -99,7 +99,7 @@ class Setup:
 
 
 def pose(x: float, y: float, z: float, turn: float = 0.0, tilt: float = 0.0) -> Float64Array:
-    """Where a thing lies [m], turned about z after it was tilted about x [degrees]."""
+    """Return a pose [m], rotated about z after a tilt about x [degrees]."""
     matrix = trimesh.transformations.euler_matrix(np.radians(tilt), 0, np.radians(turn))
     matrix[:3, 3] = x, y, z
     return np.asarray(matrix)
@@ -116,7 +116,7 @@ def block(low: Sequence[float], high: Sequence[float]) -> trimesh.Trimesh:
 
 
 def simple(name: str, mesh: trimesh.Trimesh, where: Float64Array) -> Thing:
-    """A thing of one matt or glossy material, baked small."""
+    """Return an object of one matt or glossy material, baked at a small size."""
     scene = trimesh.Scene({name: mesh})
 
     def bake(folder: Path) -> Asset:
@@ -126,12 +126,12 @@ def simple(name: str, mesh: trimesh.Trimesh, where: Float64Array) -> Thing:
 
 
 def shipped(name: str, where: Float64Array) -> Thing:
-    """A part of the shipped scene, with the asset that was baked from it."""
+    """Return a part of the shipped scene with its asset."""
     return Thing(name, build_part(name, 0)[0], where, lambda _: Asset.load(ROOT / "scenes/assets" / name))
 
 
 def table_setup() -> Setup:
-    """A table with a block whose shadow is captured, and coloured solids in and beside that shadow."""
+    """Return a table with a block whose shadow is captured, and coloured solids in and beside that shadow."""
     rng = np.random.default_rng(1)
     room = {
         "top": worn(block((-0.5, -0.4, -0.04), (0.5, 0.4, 0)), m.concrete(rng, 256)),
@@ -147,7 +147,7 @@ def table_setup() -> Setup:
 
 
 def corner_setup() -> Setup:
-    """Two walls, one of them red, that light what stands near them, and a shelf above."""
+    """Return two walls, one of them red, that reflect light onto nearby objects, and a shelf above."""
     rng = np.random.default_rng(2)
     room = {
         "floor": worn(block((-0.2, -0.4, -0.04), (0.5, 0.2, 0)), m.cast((205, 200, 190), rng)),
@@ -165,7 +165,7 @@ def corner_setup() -> Setup:
 
 
 def bin_setup() -> Setup:
-    """A box with walls that shade its inside, and solids that lean on each other in it."""
+    """Return a box with walls that shade its inside, and solids that lean on each other in it."""
     rng = np.random.default_rng(3)
     outer, inner = block((-0.15, -0.11, 0), (0.15, 0.11, 0.09)), block((-0.14, -0.10, 0.01), (0.14, 0.10, 0.2))
     room = {
@@ -182,7 +182,7 @@ def bin_setup() -> Setup:
 
 
 def parts_setup() -> Setup:
-    """The shipped metal and plastic parts on a grey mat."""
+    """Return the shipped metal and plastic parts on a grey mat."""
     rng = np.random.default_rng(4)
     room = {"mat": worn(block((-0.4, -0.3, -0.03), (0.4, 0.3, 0)), m.cast((120, 122, 120), rng, size=256))}
     lying = {
@@ -224,20 +224,20 @@ def baked(
     kind: Any,
     density: Mapping[str, float] | None = None,
 ) -> Asset:
-    """The asset in ``folder``, baked if it is not there yet."""
+    """Return the asset in ``folder``, baked if absent."""
     if not (folder / "asset.yaml").exists():
         settings = BakeSettings(
             gaussians=gaussians, sh_degree=1, directions=16, fit_steps=0, verify_views=0, density=density
         )
         mesh = trimesh.util.concatenate([part.mesh for part in read_parts(scene)])
-        pieces = [trimesh.Trimesh(mesh.vertices, mesh.faces).convex_hull]  # for physics, which is not used here
+        pieces = [trimesh.Trimesh(mesh.vertices, mesh.faces).convex_hull]  # for physics, unused here
         result = bake_asset(scene, name=folder.name, kind=kind, light=light, settings=settings, pieces=pieces)
         result.asset.save(folder)
     return Asset.load(folder)
 
 
 class Photographer:
-    """Path-traced linear pictures, kept in a folder."""
+    """Path-traced linear images, cached in a folder."""
 
     def __init__(self, camera: Camera, folder: Path, samples: int) -> None:
         self.camera, self.folder, self.samples = camera, folder, samples
@@ -246,7 +246,7 @@ class Photographer:
     def take(
         self, name: str, parts: Sequence[MeshPart], lights: dict[str, Any], *, bounces: int = 6, clay: bool = False
     ) -> tuple[Float64Array, Float64Array]:
-        """Radiance (H, W, 3) averaged over each pixel, and coverage (H, W)."""
+        """Return radiance (H, W, 3) averaged over each pixel, and coverage (H, W)."""
         file = self.folder / f"{name}_{self.samples}.npz"
         if not file.exists():
             scene = mitsuba_scene(parts, lights, clay=clay)
@@ -276,7 +276,7 @@ def placed(thing: Thing) -> tuple[MeshPart, ...]:
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """What is path-traced of one setup under one light, all at H x W."""
+    """Path-traced images of one setup under one light, all H x W."""
 
     photo: Float64Array
     empty: Float64Array
@@ -305,7 +305,7 @@ def take_truth(setup: Setup, name: str, light: str, out: Path, samples: int) -> 
     surroundings = cover == 0
     objects = (cover > 0.999) & (seen > 0)
     darker = surroundings & (photo @ LUMINANCE < 0.97 * (empty @ LUMINANCE)) & (bare @ LUMINANCE > 1e-3)
-    # Speckles of noise are no shadow.
+    # Excludes speckles of noise.
     darker = gaussian_filter(darker.astype(float), 1.5) > 0.5
     shadow = binary_dilation(darker, iterations=3) & surroundings
     return Truth(photo, empty, alone, ratio, objects, shadow, ~binary_dilation(~surroundings, iterations=1))
@@ -314,7 +314,7 @@ def take_truth(setup: Setup, name: str, light: str, out: Path, samples: int) -> 
 def nearest_object(
     camera: Camera, room: Sequence[MeshPart], things: Sequence[Sequence[MeshPart]]
 ) -> npt.NDArray[np.uint32]:
-    """Number of the object that the middle of each pixel shows (H, W), 0 for the surroundings."""
+    """Return the number of the object at each pixel centre (H, W), 0 for the surroundings."""
     occluders = [Occluder(part.mesh, 0, dynamic=False) for part in room]
     occluders += [Occluder(part.mesh, i, dynamic=True) for i, parts in enumerate(things, 1) for part in parts]
     hit, _ = Proxies(occluders).nearest(make_sensor(camera).view().rays())
@@ -322,9 +322,9 @@ def nearest_object(
 
 
 def composites(layers: Layers, unbounced: Layers, relative: Layers, truth: Truth) -> dict[str, Float64Array]:
-    """Linear pictures to compare with the photograph, by name.
+    """Return linear images to compare with the path-traced one, by name.
 
-    ``relative`` are layers whose light is 1 at an open place, which is what the image-space chain works on.
+    ``relative`` are layers with light relative to an open place, the input of the image-space method.
     """
     captured = np.where(truth.objects[..., None], truth.alone, truth.empty).astype(np.float32)
     opaque = {"captured": captured, "alpha": np.ones_like(layers.alpha)}
@@ -341,7 +341,7 @@ def composites(layers: Layers, unbounced: Layers, relative: Layers, truth: Truth
 
 
 def lit(layers: Layers) -> Float64Array:
-    """The linear picture of opaque layers that were changed after they were rendered."""
+    """Return the linear image of opaque layers that were changed after rendering."""
     return np.maximum(layers.captured * layers.light + layers.highlight, 0)
 
 
@@ -351,7 +351,7 @@ def psnr(picture: Float64Array, photo: Float64Array, region: BoolArray) -> float
 
 
 def flip(picture: Float64Array, photo: Float64Array, region: BoolArray) -> float:
-    """Mean FLIP difference in a region; NaN where its library is not installed."""
+    """Return the mean FLIP difference in a region; NaN if its library is not installed."""
     try:
         from flip_evaluator import evaluate
     except ImportError:
@@ -362,7 +362,7 @@ def flip(picture: Float64Array, photo: Float64Array, region: BoolArray) -> float
 
 
 def penumbra_widths(ratios: Sequence[Float64Array], on_room: BoolArray, *, reach: int = 14) -> Float64Array:
-    """Distances [px] between 20 and 80 % of the edges of the first ratio, in all of them (edges, ratios)."""
+    """Return distances [px] between 20 and 80 % of the edges of the first ratio, in all ratios (edges, ratios)."""
     truth = gaussian_filter(ratios[0], 1.0)
     low, high = minimum_filter(truth, 2 * reach + 1), maximum_filter(truth, 2 * reach + 1)
     slope = np.stack(np.gradient(gaussian_filter(ratios[0], 2.0)), axis=-1)
@@ -390,7 +390,7 @@ def _rise(profile: Float64Array, steps: Float64Array) -> float:
 
 
 def save_sheet(path: Path, pictures: Sequence[Float64Array], scale: int = 2) -> None:
-    """Pictures side by side, three to a row, magnified."""
+    """Save images side by side, three to a row, magnified."""
     rows = [np.concatenate(pictures[i : i + 3], axis=1) for i in range(0, len(pictures), 3)]
     rows = [np.pad(row, ((0, 0), (0, rows[0].shape[1] - row.shape[1]), (0, 0))) for row in rows]
     sheet = np.rint(255 * np.clip(encode_srgb(np.concatenate(rows)), 0, 1)).astype(np.uint8)
@@ -398,7 +398,7 @@ def save_sheet(path: Path, pictures: Sequence[Float64Array], scale: int = 2) -> 
 
 
 def compare(name: str, light: str, out: Path, samples: int) -> dict[str, Any]:
-    """Figures of one setup under one light, and the pictures side by side in ``out``."""
+    """Return the figures of one setup under one light, and write the images side by side to ``out``."""
     setup = SETUPS[name]()
     truth = take_truth(setup, name, light, out, samples)
     room = baked(setup.room, out / name / light, LIGHTS[light], 20000, kind="environment", density=setup.density)

@@ -1,14 +1,13 @@
-"""Time against error of traced light: rays where they are needed and a filter, beside as many rays everywhere.
+"""Time and error of traced light: adaptive rays with a filter, compared with equal numbers of rays per pixel.
 
     python -m benchmarks.light.traced [--scene scenes/workcell.yaml] [--frames 4] [--truth 2048]
 
 The truth is the ratio of ``--truth`` rays per pixel without a filter, and reflected light of many rays. Errors are the
-standard deviation of the light factor (mean of RGB) from it, where it matters: at objects that are lit anew, and where
-a shadow takes 1 % or more of the light; but not at pixels beside which another instance begins, where a ray may meet
-the proxy of what the pixel does not show, and no number of rays without a filter is a truth. The PSNR [dB] is that of
-pictures, except for those pixels, as each frame's camera develops them, noise and all, to those of the truth: what
-highlights miss counts as well.
-Processor seconds of all threads are medians over frames, less those of the same frames without light.
+standard deviation of the light factor (mean of RGB) from it, on relit objects and where a shadow removes 1 % or more
+of the light. Pixels next to another instance are excluded: their rays may hit the proxy of the other instance, so that
+no number of rays without a filter is a truth. The PSNR [dB] compares developed images, including camera noise, outside
+of those pixels with images of the truth; it includes errors of highlights.
+CPU seconds of all threads are medians over frames, minus those of the same frames without light.
 """
 
 from __future__ import annotations
@@ -49,7 +48,7 @@ REFLECTED = 96
 
 
 def means(light_filter: LightFilter, estimate: Estimate, bounced: tuple[Any, Any] | None = None) -> LightMeans:
-    """What a filter of one pixel would give; bounced light is that of a few rays, and always averaged."""
+    """Return the values of a filter of one pixel; reflected light has few rays and is always averaged."""
     count = dr.rcp(dr.maximum(estimate.rays, 1))
     return LightMeans(
         estimate.lit * count,
@@ -62,7 +61,7 @@ def means(light_filter: LightFilter, estimate: Estimate, bounced: tuple[Any, Any
 
 @contextmanager
 def filtered(by_neighbours: bool) -> Iterator[None]:
-    """Light as it is filtered, or as every pixel has it alone."""
+    """Return filtered light, or unfiltered light of every pixel."""
     if by_neighbours:
         yield
         return
@@ -72,14 +71,14 @@ def filtered(by_neighbours: bool) -> Iterator[None]:
 
 @contextmanager
 def reflected() -> Iterator[None]:
-    """Reflected light of many rays, which on meshes is no mean over cells."""
+    """Return reflected light of many rays, without the mean over cells on meshes."""
     rays = patch.multiple(bounce, BOUNCE_RAYS=REFLECTED, MESH_RAYS=REFLECTED)
     with rays, patch.object(LightFilter, "average", lambda _, values: values):
         yield
 
 
 class Pictures:
-    """The frames of a scene's first layout, under integrators of the same splats."""
+    """Frames of a scene's first layout, with integrators of the same splats."""
 
     def __init__(self, path: Path, frames: int) -> None:
         self.scene = ms.load_scene(path)
@@ -95,18 +94,18 @@ class Pictures:
             self.plans.append(plan)
 
     def integrator(self, **properties: Any) -> Any:
-        """The scene's own, with some properties changed."""
+        """Return the scene's integrator with some changed properties."""
         return make_integrator(quality=resolve_quality("fast"), **{**light_properties(self.scene), **properties})
 
     def developed(self, number: int, layers: Layers) -> Float32Array:
-        """The picture of a frame, 0 to 255."""
+        """Return the developed image of a frame, 0 to 255."""
         plan, composite = self.plans[number], self.scene.spec.composite
         linear = light_image(layers, composite)
         image = develop(linear, plan.draws, composite, seed=plan.seed)
         return image.astype(np.float32)
 
     def render(self, number: int, integrator: Any, seed: int) -> tuple[Layers, float]:
-        """Layers and processor seconds of a frame."""
+        """Return layers and CPU seconds of a frame."""
         start = time.process_time()
         layers = render_layers(integrator, *self.frames[number], seed=seed)
         dr.sync_thread()
@@ -114,7 +113,7 @@ class Pictures:
 
 
 class Row:
-    """One way to trace light: what it costs and how far off it is, frame by frame."""
+    """One method to trace light: its cost and error, frame by frame."""
 
     def __init__(self, name: str, by_neighbours: bool, integrator: Any) -> None:
         self.name, self.by_neighbours, self.integrator = name, by_neighbours, integrator
@@ -122,12 +121,12 @@ class Row:
         self.errors: dict[str, list[float]] = {"objects": [], "shadows": [], "picture": []}
 
     def render(self, pictures: Pictures, number: int) -> tuple[Layers, float]:
-        """Layers and processor seconds of a frame."""
+        """Return layers and CPU seconds of a frame."""
         with filtered(self.by_neighbours):
             return pictures.render(number, self.integrator, 1)
 
     def compare(self, pictures: Pictures, number: int, truth: Layers, without: float) -> None:
-        """Add a frame, which takes so many seconds without light."""
+        """Add a frame with its time without light [s]."""
         layers, seconds = self.render(pictures, number)
         self.seconds.append(seconds - without)
         apart = pictures.developed(number, layers) - pictures.developed(number, truth)
@@ -143,7 +142,7 @@ class Row:
             self.errors[where].append(float(np.mean(squares)))
 
     def tell(self) -> None:
-        """Print and keep it."""
+        """Print and record the row."""
         cost = float(np.median(self.seconds))
         rms = {where: float(np.sqrt(np.mean(values))) for where, values in self.errors.items()}
         psnr = 20 * np.log10(255 / rms.pop("picture"))
@@ -166,7 +165,7 @@ def main() -> None:
 
 
 def measure(args: argparse.Namespace) -> None:
-    """Print and keep the rows, whose times are taken in turns: other work on the machine delays all of them alike."""
+    """Print and record the rows; their times alternate, so that other load affects all of them equally."""
     pictures = Pictures(args.scene, args.frames)
     rows = [Row(f"{n} rays everywhere", False, _everywhere(pictures, n)) for n in (1, 4, 16, 64)]
     rows += [Row(f"{n} rays everywhere, filtered", True, _everywhere(pictures, n)) for n in (4, 16)]
@@ -174,7 +173,7 @@ def measure(args: argparse.Namespace) -> None:
     rows += [Row("no reflected light", True, pictures.integrator(bounce=False))]
     dark, exact = pictures.integrator(shadow="none"), _everywhere(pictures, args.truth)
     for row in rows:
-        row.render(pictures, 0)  # compiles
+        row.render(pictures, 0)  # compiles kernels
     pictures.render(0, dark, 1)
     for number in range(args.frames):
         with filtered(False), reflected():

@@ -1,1 +1,1 @@
-"""Benchmarks of the wing: physics."""
+"""Benchmarks of physics."""

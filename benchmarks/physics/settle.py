@@ -1,15 +1,15 @@
 """Settling: ``python -m benchmarks.physics.settle rate | faces | thin | bin | rest | worlds | share [--count N]``.
 
 rate     layouts per minute of ten and of thirty objects, with both steppers, in one process and in two
-faces    faces that a box of 1 : 1 : 0.3 comes to rest on, with both steppers, compared by a chi-squared test
+faces    resting faces of a box of 1 : 1 : 0.3, with both steppers, compared by a chi-squared test
 thin     random drops of a screw, a torus, a mug and a concave bracket, certified
 bin      forty objects poured into a bin
-rest     ten objects, seed after seed: time to rest, and what moves in the five seconds after
-worlds   time of several layouts in one simulation, per layout, on ``--device cpu`` or ``cuda:0``
-share    what settling adds to the images of the shipped workcell at 1280x720 with ten views of each layout
+rest     ten objects for each seed: time to rest, and motion in the next five seconds
+worlds   time per layout of several layouts in one simulation, on ``--device cpu`` or ``cuda:0``
+share    time of settling added to the images of the shipped workcell at 1280x720 with ten views of each layout
 
-Parts are nuts, bolts, washers, brackets and plates of 10 to 150 mm, in a box of 0.5 x 0.4 m unless said otherwise.
-What is made once (convex pieces, compiled kernels) is made before the clock starts.
+Parts are nuts, bolts, washers, brackets and plates of 10 to 150 mm, in a box of 0.5 x 0.4 m unless stated otherwise.
+Convex pieces and compiled kernels are prepared before the measurement.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ def thin_parts() -> dict[str, trimesh.Trimesh]:
 
 
 def make_scene(meshes: Mapping[str, trimesh.Trimesh], count: int, stepper: str, **changes: Any) -> Scene:
-    """A scene of ``count`` of each mesh on a table."""
+    """Return a scene of ``count`` of each mesh on a table."""
     with tempfile.TemporaryDirectory() as name:
         return load_scene(write_scene(Path(name), meshes, count, stepper, **changes))
 
@@ -146,7 +146,7 @@ def show(name: str, layouts: list[Layout], given_up: int, seconds: float) -> Non
 
 
 def settle_all(name: str, scene: Scene, count: int) -> list[Layout]:
-    settle_layout(scene, count, cached=False)  # pieces, kernels
+    settle_layout(scene, count, cached=False)  # prepares pieces and kernels
     start, wall = time.process_time(), time.perf_counter()
     layouts = [try_settle(scene, index) for index in range(count)]
     seconds, wall = time.process_time() - start, time.perf_counter() - wall
@@ -164,14 +164,14 @@ def measure_rate(count: int) -> None:
             settle_all(f"{objects} objects, {stepper}", scene, count)
             layouts = settle_layouts(scene, range(count + 2), workers=2, cached=False)
             finished = [time.perf_counter() for _ in layouts]
-            # Each process makes its simulation for the first layout that it settles.
+            # Each process sets up its simulation with its first layout.
             rate = 60 * count / (finished[-1] - finished[1])
             figure(rate, "1/min", f"{objects} objects, {stepper}", "two processes")
             print(f"  {rate:.1f} layouts a minute of wall time in two processes", flush=True)
 
 
 def measure_faces(count: int) -> None:
-    """Resting faces: how often a box lies on each pair of faces; solid angles are what an overdamped box would do."""
+    """Count the resting faces of a box; solid angles predict those of an overdamped box."""
     sides = np.array([0.03, 0.03, 0.009])
     rows = []
     for stepper in STEPPERS:
@@ -220,7 +220,7 @@ def measure_bin(count: int) -> None:
 
 
 def measure_rest(count: int) -> None:
-    """Drop ten objects with each of some seeds once, without a second draw; then wait for five seconds more."""
+    """Drop ten objects once for each of some seeds, without a second draw; then simulate five more seconds."""
     from mitsplat.physics.drop import drop_of
     from mitsplat.physics.rest import _surface_motion, run_to_rest
 
@@ -258,7 +258,7 @@ def measure_rest(count: int) -> None:
 
 
 def measure_worlds(count: int, device: str) -> None:
-    """Layouts of ten objects in one simulation of 1, 8, 64 and 256 worlds, ``count`` at most, on any Warp device."""
+    """Time layouts of ten objects in simulations of 1, 8, 64 and 256 worlds, ``count`` at most, on any Warp device."""
     from benchmarks.physics.worlds import time_worlds
     from mitsplat.physics.drop import TIMESTEP, drop_of
 
@@ -278,7 +278,7 @@ def measure_worlds(count: int, device: str) -> None:
 
 
 def measure_share(count: int) -> None:
-    """CPU seconds of settling and of rendering, layout by layout, so that other work on the machine slows both."""
+    """Measure CPU seconds of settling and of rendering, layout by layout, so that other load slows both."""
     from mitsplat.frames.frame import render_frame
 
     scenes = {
@@ -295,12 +295,12 @@ def measure_share(count: int) -> None:
         spent[name].append(time.process_time() - start)
         return result
 
-    # Stepper by stepper, because what the layouts of a scene share is kept for one scene.
+    # One stepper after the other, because data shared by layouts is cached for one scene.
     for stepper, scene in scenes.items():
         for index in range(count + 1):
             layout = timed(stepper, partial(settle_layout, scene, index, cached=False))
             timed("rendering", partial(render_frame, scene, 10 * index, layout=layout))
-    # The first one makes what all share: parts and compiled kernels.
+    # The first one prepares shared data: parts and compiled kernels.
     image = np.mean(spent["rendering"][1:])
     figure(image, "s", "rendering cpu")
     for stepper in STEPPERS:

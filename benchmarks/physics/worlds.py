@@ -1,4 +1,4 @@
-"""Several layouts in one simulation (Newton's worlds), timed, for ``python -m benchmarks.physics.settle worlds``."""
+"""Timing of several layouts in one simulation (Newton's worlds), for ``python -m benchmarks.physics.settle worlds``."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from mitsplat.physics.rest import run_to_rest
 from mitsplat.physics.worlds import Body, Collider, World
 
 WORLDS = 1, 8, 64, 256
-DURATION = 2.5  # simulated, for coming to rest and the second after that [s]
+DURATION = 2.5  # simulated time to rest and one second after [s]
 
 
 def time_worlds(
@@ -30,7 +30,7 @@ def time_worlds(
     timestep: float,
     device: str,
 ) -> None:
-    """Print what 1, 8, 64 and 256 worlds cost on a Warp device, as many as there are poses to start from."""
+    """Print the time of 1, 8, 64 and 256 worlds on a Warp device, limited by the number of initial poses."""
     for worlds in [worlds for worlds in WORLDS if worlds < len(starts)] + [len(starts)]:
         batch = Batch(bodies, colliders, starts[:worlds], timestep=timestep, device=device)
         wall, cpu = time.perf_counter(), time.process_time()
@@ -49,7 +49,7 @@ def time_worlds(
 
 
 class Batch:
-    """The steps of :class:`mitsplat.physics.worlds.WarpWorld` in several worlds at once, roll friction kept."""
+    """Steps of :class:`mitsplat.physics.worlds.WarpWorld` in several worlds at once, including roll friction."""
 
     def __init__(
         self,
@@ -61,7 +61,7 @@ class Batch:
         device: str,
     ) -> None:
         one = physics._build_scene(bodies, colliders, physics._IMPEDANCE_WARP)
-        contacts = 2 * physics.max_contacts(len(bodies), one.shape_count)  # nothing is drawn again here
+        contacts = 2 * physics.max_contacts(len(bodies), one.shape_count)  # no second draw
         builder = newton.ModelBuilder(gravity=physics._GRAVITY)
         SolverMuJoCo.register_custom_attributes(builder)
         builder.replicate(one, len(starts))
@@ -99,7 +99,7 @@ class Batch:
             here, there = there, here
 
     def run(self) -> Float64Array:
-        """Positions and xyzw quaternions after each launch of the graph, shape (frames, worlds, bodies, 7)."""
+        """Return positions and xyzw quaternions after each launch of the graph, shape (frames, worlds, bodies, 7)."""
         frames = []
         for _ in range(round(DURATION / self.interval)):
             wp.capture_launch(self._graph)
@@ -112,10 +112,10 @@ class Batch:
 def has_rested(
     bodies: Sequence[Body], frames: Float64Array, interval: float, bounds: tuple[Float64Array, Float64Array]
 ) -> bool:
-    """Whether the bodies of one world were at rest for a second, by the rule of :func:`physics.run_to_rest`."""
+    """Return True if the bodies of one world were at rest for a second, by the rule of :func:`physics.run_to_rest`."""
 
     class Recorded(World):
-        """What was simulated before, frame by frame."""
+        """A recorded simulation, frame by frame."""
 
         def __init__(self) -> None:
             super().__init__(bodies, timestep=interval / physics._STEPS)

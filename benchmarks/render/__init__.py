@@ -1,1 +1,1 @@
-"""Benchmarks of the wing: render."""
+"""Benchmarks of rendering."""

@@ -1,4 +1,4 @@
-"""Scenes for the benchmarks: the real captures side by side, and a synthetic cloud where they are absent."""
+"""Scenes of the benchmarks: the real captures side by side, or a synthetic cloud if they are absent."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ CAPTURES = Path(__file__).resolve().parents[3] / "shared" / "data" / "splats"
 
 
 def crowd(folder: Path = CAPTURES, count: int = 887_026) -> tuple[Splats, str]:
-    """About 0.9 M Gaussians and what they are: eleven captures side by side, or as many on random spheres."""
+    """Return about 0.9 M Gaussians and their description: eleven captures side by side, or random spheres."""
     files = sorted(folder.glob("*.splat"))
     if not files:
         return synthetic(count), f"{count} synthetic Gaussians"
@@ -29,7 +29,7 @@ def crowd(folder: Path = CAPTURES, count: int = 887_026) -> tuple[Splats, str]:
 
 
 def synthetic(count: int, seed: int = 0) -> Splats:
-    """Flat Gaussians on random spheres, as captures of solid objects have them."""
+    """Return flat Gaussians on random spheres, similar to captures of solid objects."""
     rng = np.random.default_rng(seed)
     normals = rng.normal(size=(count, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)

@@ -1,4 +1,4 @@
-"""Speed against accuracy, as ``mitsplat chart`` measures it, kept for the documentation.
+"""Speed against accuracy, as measured by ``mitsplat chart``, recorded for the documentation.
 
     python -m benchmarks.render.chart FILE [--frames 2] [--size 1280x720] [--at 0.03 ...] [--picture chart.png]
 

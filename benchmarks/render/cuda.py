@@ -1,9 +1,9 @@
-"""The renderer on a GPU, stage by stage, beside gsplat and Mitsuba's own splat path on the same splats.
+"""Time of the renderer on a GPU, stage by stage, compared with gsplat and Mitsuba's splat renderer on the same splats.
 
     python -m benchmarks.render.cuda [--captures FOLDER] [--no-volprim] [--frames 30]
 
-gsplat and PyTorch are used when they are installed. Times are medians of synchronised repeats. Stages of whole frames
-are those of one process and one layout of the default scene; ``--frames 0`` leaves them out, and the settling.
+gsplat and PyTorch are used if installed. Times are medians of synchronised repeats. Stages of whole frames are those of
+one process and one layout of the default scene; ``--frames 0`` omits them, and the settling.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 # isort: off
-from benchmarks.render.captures import CAMERA, CAPTURES, crowd  # imports mitsplat, which must come before Dr.Jit
+from benchmarks.render.captures import CAMERA, CAPTURES, crowd  # imports mitsplat, which must be imported before Dr.Jit
 
 import drjit as dr
 import mitsuba as mi
@@ -32,7 +32,7 @@ from mitsplat.renderer.layers import make_sensor, render_splats
 
 
 def median_ms(run: Callable[[], object], sync: Callable[[], None], repeats: int = 30) -> float:
-    """Median time of a synchronised call [ms], after three calls that warm up."""
+    """Return the median time of a synchronised call [ms], after three calls to warm up."""
     times = []
     for i in range(repeats + 3):
         sync()
@@ -92,7 +92,7 @@ def time_ours(splats: Splats) -> None:
 
 
 def time_gsplat(splats: Splats) -> np.ndarray:
-    """Print the time of gsplat's forward pass; returns its display-encoded image."""
+    """Print the time of gsplat's forward pass; return its display-encoded image."""
     import torch
     from gsplat import rasterization
 
@@ -130,7 +130,7 @@ def main() -> None:
 
 
 def measure(options: argparse.Namespace) -> None:
-    """Print and keep every time."""
+    """Print and record every time."""
     splats, name = crowd(options.captures)
     figure(len(splats), "", "gaussians")
     print(f"{name}, {CAMERA.width}x{CAMERA.height}")

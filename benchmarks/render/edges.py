@@ -1,9 +1,9 @@
-"""What antialiased silhouettes cost and leave wrong: frames of a scene at several `rendering.samples`.
+"""Cost and remaining error of antialiased silhouettes: frames of a scene at several `rendering.samples`.
 
     python -m benchmarks.render.edges [--scene scenes/workcell.yaml] [--size 640x360] [--frames 2] [--repeats 3]
 
-The error is that of display-encoded colours at the pixels that `samples: edges` changes, against pictures four times as
-wide and high, averaged in linear light. The cost is CPU seconds of all threads, frames of all settings in turns.
+The error is that of display-encoded colours at the pixels that `samples: edges` changes, against images four times as
+wide and high, averaged in linear light. The cost is CPU seconds of all threads; the settings alternate frame by frame.
 """
 
 from __future__ import annotations
@@ -25,18 +25,18 @@ from mitsplat.scene.planning.frame_plan import layout_of
 
 ROOT = Path(__file__).resolve().parents[2]
 TRUTH = 4
-"""How many times wider and higher the pictures are that others are compared with."""
+"""Size of the reference images relative to the compared ones, in width and height."""
 SETTINGS = (1, "edges", 2, 4)
 
 
 def renderer(path: Path, width: int, height: int, samples: Any) -> ms.Renderer:
-    """A renderer of the scene without the sensor's noise."""
+    """Return a renderer of the scene without sensor noise."""
     size = {"output.width": width, "output.height": height, "rendering.samples": samples, "randomise.iso": None}
     return ms.Renderer(ms.load_scene(path, overrides=size))
 
 
 def shown(frame: ms.Frame, fold: int = 1) -> Float32Array:
-    """Display-encoded colours of a frame, of which ``fold`` x ``fold`` pixels are averaged in linear light."""
+    """Return display-encoded colours of a frame, averaged over ``fold`` x ``fold`` pixels in linear light."""
     height, width = frame.rgb.shape[:2]
     linear = frame.rgb.reshape(height // fold, fold, width // fold, fold, 3).mean(axis=(1, 3))
     return np.asarray(encode_srgb(np.clip(linear, 0, 1)), dtype=np.float32)

@@ -1,8 +1,9 @@
-"""Seconds per stage of a frame of the default scene, peak memory, and the renderer against Mitsuba's own splat path.
+"""Seconds per stage of a frame of the default scene, peak memory, and time relative to Mitsuba's splat renderer.
 
     python -m benchmarks.render.frame [--scene scenes/workcell.yaml] [--frames 8] [--ten] [--no-volprim]
 
-Timings are medians of frames after the first (which compiles); quote the ratios, and the load, which is printed too.
+Timings are medians of frames after the first, which compiles kernels. Quote the ratios, and the load, which is printed
+too.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 def ten_objects(path: Path) -> dict[str, Any]:
-    """What makes a scene one of ten objects of its first entry, under its first light and its environment."""
+    """Return changes for a scene of ten objects of its first entry, under its first light and its environment."""
     scene = YAML(typ="safe").load(path)
     objects = [{**scene["objects"][0], "count": 10}]
     lights = [scene["lights"][0], *(light for light in scene["lights"][1:] if light["kind"] == "environment")]
@@ -59,7 +60,7 @@ def time_frames(path: Path, frames: int, overrides: dict[str, Any]) -> None:
 
 
 def time_light(path: Path, overrides: dict[str, Any], repeats: int = 8) -> None:
-    """Print what shadows and highlights cost: the same frames with and without, in turns."""
+    """Print the cost of shadows and highlights: the same frames with and without, in alternation."""
     scenes = [ms.load_scene(path, overrides={**overrides, "composite.shadow": kind}) for kind in ("none", "traced")]
     layout = ms.settle_layout(scenes[0], layout_of(scenes[0], 0))
     wall, processor = [], []

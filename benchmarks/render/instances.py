@@ -1,8 +1,8 @@
-"""The instance image: pixels that differ from the float64 twin, and what it costs to tell instances apart.
+"""Instance image: pixels that differ from the float64 twin, and the cost of separate instances.
 
     python -m benchmarks.render.instances [--scenes 50] [--scene scenes/workcell.yaml]
 
-Seconds are processor seconds of all threads, the least of several; quote the ratios.
+Seconds are CPU seconds of all threads, the minimum of several; quote the ratios.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 def print_differences(scenes: int) -> None:
-    """Random scenes of 3 to 8 porous instances in one place, against the twin."""
+    """Compare random scenes of 3 to 8 porous instances in one place with the twin."""
     sys.path.insert(0, str(ROOT / "tests"))
     from reference import reference_shares
 
@@ -53,7 +53,7 @@ def print_differences(scenes: int) -> None:
 
 
 def crowd(count: int = 8, each: int = 4000) -> dict[str, Any]:
-    """Instances that fill the same ball with half transparent Gaussians: nearly every ray meets all of them."""
+    """Return instances of half-transparent Gaussians in the same ball: nearly every ray meets all of them."""
     rng, shapes = np.random.default_rng(0), {}
     for number in range(1, count + 1):
         quats = rng.normal(size=(each, 4))
@@ -69,7 +69,7 @@ def crowd(count: int = 8, each: int = 4000) -> dict[str, Any]:
 
 
 def print_costs(name: str, integrator: Any, scene: Any, camera: ms.Camera, repeats: int = 7) -> None:
-    """Time of the march with all instances told apart, with the first walk alone, and with all taken for one."""
+    """Print the time of the march with all instances, with the first walk alone, and with a single instance."""
     from mitsplat.renderer.rays.sensors import view_of
     from mitsplat.renderer.splatting import march
     from mitsplat.renderer.splatting.tiles import bin_gaussians
@@ -119,7 +119,7 @@ def main() -> None:
 
 
 def measure(path: Path, scenes: int) -> None:
-    """Print and keep both."""
+    """Print and record both."""
     scene = ms.load_scene(path)
     layout, plan = ms.settle_layout(scene, layout_of(scene, 0)), plan_frame(scene, 3)
     renderer = Renderer(scene, quality=PRESETS["fast"])

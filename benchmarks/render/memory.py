@@ -1,8 +1,8 @@
-"""Peak memory of what grows with a scene, each in a process of its own.
+"""Peak memory of stages that grow with a scene, each in its own process.
 
     python -m benchmarks.render.memory [--gaussians 5000000] [--objects 200] [--variant llvm_ad_rgb]
 
-Images are 1280x720. Memory is that of the process [GiB]: once everything is loaded that the case needs, and its peak.
+Images are 1280x720. Memory is that of the process [GiB]: after loading the case's data, and its peak.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from dataclasses import replace
 from typing import Any
 
 # isort: off
-from benchmarks.render.captures import CAMERA, synthetic  # imports mitsplat, which must come before Dr.Jit
+from benchmarks.render.captures import CAMERA, synthetic  # imports mitsplat, which must be imported before Dr.Jit
 
 import drjit as dr
 import mitsuba as mi
@@ -30,12 +30,12 @@ from mitsplat.runtime.variant import ensure_variant
 
 
 def peak() -> float:
-    """Peak memory of this process so far [GiB]."""
+    """Return the peak memory of this process so far [GiB]."""
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
 
 
 def report(name: str, run: Callable[[], object]) -> None:
-    """Run a case, and print what it adds to the memory."""
+    """Run a case, and print its additional memory."""
     before = peak()
     run()
     dr.sync_thread()
@@ -46,14 +46,14 @@ def report(name: str, run: Callable[[], object]) -> None:
 
 
 def forward(count: int) -> None:
-    """An image of many Gaussians."""
+    """Render an image of many Gaussians."""
     scene = mi.load_dict({"type": "scene", "splats": make_splats_shape(synthetic(count), instance=1)})
     integrator = make_integrator(quality="fast", shadow="none")
     report(f"render {count} Gaussians", lambda: render_layers(integrator, scene, CAMERA))
 
 
 def backward(count: int) -> None:
-    """Gradients of an image of many Gaussians."""
+    """Compute the gradients of an image of many Gaussians."""
     from mitsplat.renderer.differentiation.backward import pack_cloud, render_differentiable
     from mitsplat.renderer.layers import make_sensor
     from mitsplat.renderer.rays.sensors import view_of
@@ -73,7 +73,7 @@ def backward(count: int) -> None:
 
 
 def silhouettes(objects: int) -> None:
-    """Silhouettes of many objects of 2000 Gaussians each."""
+    """Render silhouettes of many objects of 2000 Gaussians each."""
     rng, splats = np.random.default_rng(0), synthetic(2000)
     splats = replace(splats, means=0.04 * splats.means, scales=0.04 * splats.scales)
     shapes: dict[str, Any] = {}
@@ -91,7 +91,7 @@ CASES = {"forward": forward, "backward": backward, "silhouettes": silhouettes}
 
 
 def main() -> None:
-    """Parse the command line, and run each case in a process of its own."""
+    """Parse the command line, and run each case in its own process."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--gaussians", type=int, default=5_000_000)
     parser.add_argument("--objects", type=int, default=200)

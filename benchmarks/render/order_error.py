@@ -1,12 +1,15 @@
-"""The error that the order of blending makes: how well a march knows it, and what the presets cost and miss with it.
+"""Error of the blending order: accuracy of its estimate, and cost and error of the presets.
 
     python -m benchmarks.render.order_error [--captures FOLDER] [--size 1280x720] [--names plant boot_100k ...]
 
-For every capture, and for the splats of a layout of the default scene: the rank correlation of the estimate with the
-true error, over pixels where there is one; of the pixels whose error exceeds a tolerance, the share that lies in tiles
-which the estimate names, and how many it misses; and the largest and the root mean square error that repair leaves.
-Then processor seconds of all threads and errors of the presets, against ``exact``; ``before`` is ``balanced`` as it was
-when all its rays were walked in their own order. All steps take turns; quote medians and ratios.
+For every capture, and for the splats of a layout of the default scene:
+
+* the rank correlation of the estimate with the true error, over pixels with an error;
+* of the pixels whose error exceeds a tolerance, the share in tiles selected by the estimate, and the number missed;
+* the largest and the root mean square error after repair.
+
+CPU seconds of all threads and errors of the presets against ``exact`` follow; ``before`` is the former ``balanced``,
+which sorted along every ray. All steps alternate; quote medians and ratios.
 """
 
 from __future__ import annotations
@@ -49,7 +52,7 @@ REPEATS = 5
 
 
 def subjects(captures: Path, names: list[str], width: int, height: int) -> Iterator[tuple[str, Splats, Camera]]:
-    """Name, splats and camera of everything to look at."""
+    """Yield name, splats and camera of every test case."""
     for file in sorted(captures.glob("*.splat")):
         if not names or file.stem in names:
             splats = Splats.load(file)
@@ -66,7 +69,7 @@ def subjects(captures: Path, names: list[str], width: int, height: int) -> Itera
 
 
 class Picture:
-    """Splats on the device, as one camera sees them."""
+    """Splats on the device, seen by one camera."""
 
     def __init__(self, splats: Splats, camera: Camera) -> None:
         from mitsplat.renderer.projection.clouds import Placement, merge_clouds, upload_cloud
@@ -77,7 +80,7 @@ class Picture:
         self.view = view_of(make_sensor(camera))
 
     def show(self, quality: Quality) -> npt.NDArray[np.float32]:
-        """Display-encoded colours, (pixels, 3)."""
+        """Return display-encoded colours, (pixels, 3)."""
         from mitsplat.renderer.splatting.march import trace
 
         image = trace(self.clouds, self.placements, self.view, quality)
@@ -85,7 +88,7 @@ class Picture:
         return np.stack([channel.numpy() for channel in image.rgb], axis=-1)
 
     def estimate(self, quality: Quality) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
-        """Colours before any tile is walked again, and the estimate of their errors, (pixels,)."""
+        """Return colours before any tile is repeated, and the estimate of their errors, (pixels,)."""
         from mitsplat.renderer.splatting.blending import ERROR, blend, new_state
         from mitsplat.renderer.splatting.lanes import Lanes
         from mitsplat.renderer.splatting.tiles import bin_gaussians
@@ -102,10 +105,10 @@ class Picture:
 
 
 def print_estimate(name: str, picture: Picture) -> None:
-    """How far the estimate agrees with the truth, for the cut-offs of ``balanced``."""
+    """Print the agreement of estimate and truth, for the cut-offs of ``balanced``."""
     from mitsplat.renderer.rays.camera_rays import TILE_HEIGHT, TILE_WIDTH
 
-    quality = replace(PRESETS["balanced"], normalise_ended_rays=False)  # as the walk that estimates leaves a ray's end
+    quality = replace(PRESETS["balanced"], normalise_ended_rays=False)  # cut-off of the estimating walk
     exact = picture.show(replace(quality, tolerance=0.0))
     rgb, estimate = picture.estimate(quality)
     error = np.abs(rgb - exact).max(axis=-1)
@@ -139,19 +142,19 @@ def print_estimate(name: str, picture: Picture) -> None:
 
 
 def tiles_of(pixels: npt.NDArray[np.bool_], width: int) -> npt.NDArray[np.bool_]:
-    """Which tiles hold one of some pixels of an image whose edges tiles divide."""
+    """Return the tiles with at least one of the given pixels, of an image whose edges tiles divide."""
     from mitsplat.renderer.rays.camera_rays import TILE_HEIGHT, TILE_WIDTH
 
     return pixels.reshape(-1, TILE_HEIGHT, width // TILE_WIDTH, TILE_WIDTH).any(axis=(1, 3))
 
 
 def rms(difference: npt.NDArray[np.float32]) -> float:
-    """Root mean square."""
+    """Return the root mean square."""
     return float(np.sqrt(np.mean(difference.astype(np.float64) ** 2)))
 
 
 def print_presets(name: str, picture: Picture) -> None:
-    """Seconds and errors of the presets, which take turns."""
+    """Print seconds and errors of the presets, measured in alternation."""
     exact = picture.show(STEPS["exact"])
     shown = {step: picture.show(quality) - exact for step, quality in STEPS.items()}
     times: dict[str, list[float]] = {step: [] for step in STEPS}

@@ -1,10 +1,10 @@
-"""How the time of the splat renderer grows, how far its march is from the machine's peak, and Mitsuba's own path.
+"""Growth of the splat renderer's time, its march relative to the machine's peak, and Mitsuba's splat renderer.
 
     python -m benchmarks.render.splats [--volprim] [--captures FOLDER] [--names plant boot_100k ...]
 
-Seconds are processor seconds of all threads, which other load on the machine changes little; the fastest of two, or,
-for single captures, the median of five, and of one for what takes seconds. The peak is that of fused multiply-adds in a
-loop without memory, which the same compiler made.
+Times are CPU seconds of all threads, which other load hardly affects. They are the faster of two runs, for single
+captures the median of five, and one run for calls that take seconds. The peak is that of fused multiply-adds in a loop
+without memory access, compiled by the same compiler.
 """
 
 from __future__ import annotations
@@ -37,20 +37,20 @@ from mitsplat.renderer.layers import make_sensor, render_splats
 from mitsplat.runtime.variant import ensure_variant
 
 FMA_PER_EVALUATION = 20
-"""Fused multiply-adds, or operations that cost as much, of one Gaussian on one ray: response, blending, ids."""
+"""Fused multiply-adds, or operations of equal cost, of one Gaussian on one ray: response, blending, ids."""
 
 
 VIEWS = 3
-"""Of every capture, evenly around it."""
+"""Views per capture, evenly around it."""
 
 
 def fastest(run: Callable[[], object], repeats: int = 2) -> float:
-    """Processor seconds of the fastest of ``repeats`` calls, after one that warms up."""
+    """Return the CPU seconds of the fastest of ``repeats`` calls, after one to warm up."""
     return min([timed(run) for _ in range(repeats + 1)][1:])
 
 
 def timed(run: Callable[[], object]) -> float:
-    """Processor seconds of a call."""
+    """Return the CPU seconds of a call."""
     start = time.process_time()
     run()
     dr.sync_thread()
@@ -58,7 +58,7 @@ def timed(run: Callable[[], object]) -> float:
 
 
 def stages(splats: Splats, camera: Camera, quality: Quality) -> tuple[float, float, int]:
-    """Seconds of projecting, binning and sorting, seconds of the march, and pairs of a Gaussian and a tile."""
+    """Return seconds of projecting, binning and sorting, seconds of the march, and pairs of Gaussian and tile."""
     from mitsplat.renderer.projection.clouds import Placement, merge_clouds, upload_cloud
     from mitsplat.renderer.rays.sensors import view_of
     from mitsplat.renderer.splatting.march import march
@@ -77,7 +77,7 @@ def stages(splats: Splats, camera: Camera, quality: Quality) -> tuple[float, flo
 
 
 def fma_peak() -> float:
-    """Fused multiply-adds per processor second."""
+    """Return fused multiply-adds per CPU second."""
     lanes, steps, chains = 1 << 16, 4096, 12
 
     def run() -> None:
@@ -94,7 +94,7 @@ def fma_peak() -> float:
 
 
 def print_growth() -> None:
-    """One line per number of Gaussians, per image size and per overlap."""
+    """Print a line per number of Gaussians, per image size and per overlap."""
     print(f"{'':44s}{'bin':>8s}{'march':>8s}{'pairs':>8s}")
 
     def show(label: str, splats: Splats, camera: Camera, quality: Quality) -> None:
@@ -118,7 +118,7 @@ def print_growth() -> None:
 
 
 def print_peak() -> None:
-    """Evaluations per second of a march that no ray leaves early, against the peak of fused multiply-adds."""
+    """Print evaluations per second of a march without early ray termination, relative to the FMA peak."""
     from mitsplat.renderer.rays.camera_rays import TILE_HEIGHT, TILE_WIDTH
 
     splats = synthetic(200_000)
@@ -137,7 +137,7 @@ def print_peak() -> None:
 
 
 def print_volprim(captures: Path) -> None:
-    """Whole images of the captures, beside Mitsuba's ellipsoids + volprim_rf_basic."""
+    """Time whole images of the captures, compared with Mitsuba's ellipsoids + volprim_rf_basic."""
     splats, name = crowd(captures)
     scene = volprim_scene(splats, CAMERA)
     theirs = fastest(lambda: render_volprim(scene), repeats=1)
@@ -152,7 +152,7 @@ def print_volprim(captures: Path) -> None:
 
 
 def print_captures(captures: Path, names: list[str]) -> None:
-    """Every view of every capture: times as fast as Mitsuba's own path, and errors against ``exact``."""
+    """Print the speed of every view of every capture relative to Mitsuba's renderer, and errors against ``exact``."""
     for file in sorted(captures.glob("*.splat")):
         if names and file.stem not in names:
             continue

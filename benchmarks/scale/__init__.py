@@ -1,1 +1,1 @@
-"""Benchmarks of the wing: scale."""
+"""Benchmarks of scale and robustness."""

@@ -1,11 +1,11 @@
-"""A Ray cluster of machines that share nothing, one of which is killed and one joins late: the same bytes, none lost.
+"""Ray cluster of machines without shared files, one killed and one added during the run: same bytes, no lost frame.
 
     python -m benchmarks.scale.cluster [--frames 40] [--views 5]
 
-Every machine is a set of namespaces on this one (``unshare``, which takes root) with its own processes, home, cache and
-Ray folder, and an empty ``/tmp`` of its own, so that none can open the scene, the dataset or the caller's caches, which
-are there. Two are there from the start. A quarter into the run one is killed whole (SIGKILL to the first process of its
-namespace); at half of it a third joins. What is written is compared with a run of this process alone, byte by byte.
+Every machine is a set of namespaces on this one (``unshare``, which needs root) with its own processes, home, cache and
+Ray folder, and an empty ``/tmp``, so that it cannot open the scene, the dataset or the caller's caches in ``/tmp``. Two
+machines exist from the start. After a quarter of the run one is killed (SIGKILL to the first process of its namespace);
+after half of it a third joins. The result is compared with a run of this process alone, byte by byte.
 """
 
 from __future__ import annotations
@@ -46,11 +46,11 @@ unset WARP_CACHE_PATH
 exec {ray} start --address {address} --num-cpus 1 --resources '{{"machine": 1}}' --block --disable-usage-stats \
     --object-store-memory 200000000 --dashboard-agent-listen-port 0 --min-worker-port 0 --max-worker-port 0
 """
-"""Ray in namespaces of its own. Compiled kernels are copied, as on a machine that has rendered before."""
+"""Starts Ray in its own namespaces. Compiled kernels are copied, as on a machine that has rendered before."""
 
 
 def free_port() -> int:
-    """A port that nobody listens to."""
+    """Return a free port."""
     with socket.socket() as opened:
         opened.bind(("127.0.0.1", 0))
         return int(opened.getsockname()[1])
@@ -64,7 +64,7 @@ class Machines:
         self.started: list[subprocess.Popen[bytes]] = []
 
     def start(self) -> None:
-        """Start one more."""
+        """Start another machine."""
         name = f"machine{len(self.started) + 1}"
         ray = Path(sys.executable).parent / "ray"
         script = MACHINE.format(home=f"/tmp/home_{name}", name=name, hidden=self.folder, ray=ray, address=self.address)
@@ -73,18 +73,18 @@ class Machines:
             self.started.append(subprocess.Popen(command, stdout=log, stderr=log))
 
     def kill(self, number: int) -> None:
-        """End a machine's processes, all at once."""
+        """End all processes of a machine at once."""
         self.started[number].send_signal(signal.SIGKILL)
         self.started[number].wait()
 
     def close(self) -> None:
-        """End all of them."""
+        """End all machines."""
         for number in range(len(self.started)):
             self.kill(number)
 
 
 def write_scene(folder: Path, views: int, frames: int) -> Path:
-    """The scene of ``benchmarks.scale.faults`` with all that it needs in one folder, and an image for a light."""
+    """Write the scene of ``benchmarks.scale.faults`` with all its files in one folder, and an image for a light."""
     shutil.copytree(ROOT / "scenes/assets/hex_nut_m16", folder / "nut")
     rng = np.random.default_rng(0)
     cv2.imwrite(str(folder / "sky.png"), rng.integers(0, 256, (32, 64, 3), dtype=np.uint8))
@@ -97,7 +97,7 @@ def write_scene(folder: Path, views: int, frames: int) -> Path:
 
 
 def main() -> None:
-    """Run both, and print how they differ."""
+    """Run both, and print the differences."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--frames", type=int, default=40)
     parser.add_argument("--views", type=int, default=5)
@@ -110,11 +110,11 @@ def main() -> None:
 
 
 def measure(options: argparse.Namespace) -> bool:
-    """Whether nothing is missing and nothing differs."""
+    """Return True if nothing is missing and nothing differs."""
     folder = Path(tempfile.mkdtemp(prefix="mitsplat-cluster-", dir="/tmp"))
     os.environ["XDG_CACHE_HOME"] = str(folder / "cache")
     os.environ.setdefault("WARP_CACHE_PATH", str(Path.home() / ".cache/warp"))
-    # A token of this cluster's own: the machines have no home to find one in.
+    # The cluster has its own token, because the machines have no home with one.
     os.environ |= {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32)}
     port = free_port()
     ray, head = str(Path(sys.executable).parent / "ray"), None
@@ -129,15 +129,15 @@ def measure(options: argparse.Namespace) -> bool:
     finally:
         machines.close()
         if head is not None:
-            head.terminate()  # with --block it ends what it started
+            head.terminate()  # with --block, its children end too
             head.wait()
         shutil.rmtree(folder, ignore_errors=True)
 
 
 def compare(path: Path, frames: int, machines: Machines) -> bool:
-    """The dataset of one process and that of the cluster."""
+    """Compare the datasets of one process and of the cluster."""
     import ray
-    from ray._private.state import actors  # what is public of it takes a dashboard
+    from ray._private.state import actors  # the public API needs a dashboard
 
     from mitsplat.dataset.write import write_dataset
     from mitsplat.engine.ray import Cluster

@@ -1,11 +1,11 @@
-"""The process that writes lines, over many frames: time and memory of every record, and of the end of a run.
+"""Process that writes records, over many frames: time and memory of every record, and of the end of a run.
 
     python -m benchmarks.scale.driver [--frames 100000] [--begun 0] [--formats yolo coco bop] [--folder FOLDER]
 
-A whole run of :func:`mitsplat.dataset.write.write_dataset`, and then another that finds everything done, but for the
-images: frames are given to it as fast as it takes them, in pairs in the wrong order, as from two workers, with pictures
-that are further names of a few. ``--begun`` frames are there before, as an earlier run left them: put there at once,
-not appended one by one, so that what a record costs after a million can be seen in minutes.
+Runs :func:`mitsplat.dataset.write.write_dataset` completely, and then again with everything finished, but without
+rendering. Frames are supplied at full speed, in pairs in the wrong order, as from two workers; their images are hard
+links to a few files. ``--begun`` frames exist before, as after an earlier run. They are written at once, not appended
+one by one, so that the time of a record after a million can be measured in minutes.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from mitsplat.dataset.manifest import encode_line
 from mitsplat.scene.loading.scene_loading import load_scene
 
 LINKS = 60_000
-"""Names of one file: ext4 allows 65,000."""
+"""Hard links per file: ext4 allows 65,000."""
 VIEWS = 10
 POSE = [
     [0.36, 0.48, -0.8, 0.0123456789],
@@ -42,15 +42,15 @@ SIZE = 64, 48
 
 
 def split_of(index: int) -> str:
-    """Every fifth layout is for validation."""
+    """Return the split of a layout: every fifth one is for validation."""
     return "val" if index // VIEWS % 5 == 1 else "train"
 
 
 class Frames:
-    """Stands for :class:`mitsplat.dataset.frame_job.FrameJob`: frames whose files workers have put in the folder."""
+    """Replacement of :class:`mitsplat.dataset.frame_job.FrameJob` for frames with existing files."""
 
     seconds, cpu = 0.0, 0.0
-    """Time that workers would have spent, in all."""
+    """Total time that workers would have spent."""
     instances = 3
 
     def __init__(self, scene: Any, catalogue: Any, out: Path, *functions: Any) -> None:
@@ -71,7 +71,7 @@ class Frames:
         self._areas = [int(area) for area in coco_mask.area(codes)]
 
     def file(self, index: int, split: str) -> str:
-        """The frame's picture, made."""
+        """Create the frame's image file; return its path."""
         file = f"images/{split}/{index:06d}.png"
         if index % LINKS < 2 or self._source is None:
             self._source = self._out / file
@@ -81,7 +81,7 @@ class Frames:
         return file
 
     def __call__(self, index: int, note: Any, /) -> tuple[dict[str, Any], dict[str, float]]:
-        """Frame ``index``'s neighbour."""
+        """Return the record of frame ``index``'s neighbour."""
         start, begun = time.perf_counter(), time.process_time()
         index ^= 1
         split = split_of(index)
@@ -120,7 +120,7 @@ class Frames:
 
 
 def begin(scene: Any, out: Path, frames: int) -> None:
-    """Put the first frames into a dataset, in the same order and bytes as a run would."""
+    """Write the first frames into a dataset, in the order and bytes of a run."""
     dataset.write_dataset(scene, out, frames=2)
     make = Frames(scene, None, out)
     like = encode_line(make(3, None)[0]).decode()
@@ -137,13 +137,13 @@ def begin(scene: Any, out: Path, frames: int) -> None:
 
 
 class Syncs:
-    """Counts and times fsync; only one of ``every`` is done."""
+    """Counter and timer of fsync; only one of ``every`` calls is executed."""
 
     def __init__(self, every: int) -> None:
         self.calls, self.done, self.seconds, self._every, self._real = 0, 0, 0.0, every, os.fsync
 
     def __call__(self, file: int) -> None:
-        """As :func:`os.fsync`."""
+        """Replace :func:`os.fsync`."""
         self.calls += 1
         if self.calls % self._every == 0:
             start = time.perf_counter()
@@ -152,18 +152,18 @@ class Syncs:
             self.done += 1
 
     def told(self) -> str:
-        """What they take."""
+        """Return the number and the time of the calls."""
         each = 1e3 * self.seconds / max(1, self.done)
         return f"fsync: {self.calls} calls, of which {self.done} were done, {each:.2f} ms each"
 
 
 def resident() -> float:
-    """Memory of this process now [MiB]."""
+    """Return the current memory of this process [MiB]."""
     return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 2**20
 
 
 def run(scene: Any, out: Path, frames: int, syncs: Syncs, name: str) -> None:
-    """One call, with what it took by tenths of the frames."""
+    """Run one call, and measure each tenth of the frames."""
     walls: list[float] = []
     cpus: list[float] = []
     sizes: list[float] = []
@@ -210,7 +210,7 @@ def run(scene: Any, out: Path, frames: int, syncs: Syncs, name: str) -> None:
 
 
 def main() -> None:
-    """Print what both runs take."""
+    """Print time and memory of both runs."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--frames", type=int, default=100_000)
     parser.add_argument("--begun", type=int, default=0)
@@ -226,7 +226,7 @@ def main() -> None:
 
 
 def measure(options: argparse.Namespace) -> None:
-    """Both runs."""
+    """Measure both runs."""
     Frames.instances = options.instances
     dataset.FrameJob = Frames  # type: ignore[misc, assignment]
     os.fsync = syncs = Syncs(options.sync_every)  # type: ignore[assignment]

@@ -1,12 +1,12 @@
-"""Everything that varies, at once: audited, compared byte by byte between numbers of workers and shards, and its cost.
+"""All variations at once: audit, bytewise comparison between numbers of workers and shards, and cost.
 
     python -m benchmarks.scale.everything [--frames 1000] [--compare 64] [--workers 1 2 7] [--cost 24] [--device cuda]
 
 The scene is ``everything.yaml`` beside this file. Objects are those that the scene draws, at random poses about the
-mat, without physics: they intersect, hide each other and leave the image, as no settled layout does. Those that are
-audited are seen through 7 points of a lens, because labels are its centre's. Cost is that of
-an image with its files, from layout to layout, beside the same scene with nothing varied; a thin lens, which takes 7
-to 37 images, and metal, which is path traced, are counted apart.
+mat, without physics. Unlike in settled layouts, they intersect, occlude each other and leave the image. Audited frames
+use 7 points of a lens, because labels are those of its centre. Cost is that of an image with its files, averaged over
+layouts, beside the same scene without variations. A thin lens, which takes 7 to 37 images, and metal, which is path
+traced, are counted separately.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ ROOT = Path(__file__).resolve().parents[2]
 SKIPPED = ("yolo-pose", "exr")
 """Formats that need keypoints, or that hold nothing that an audit reads."""
 UNLIKE = ("runs.jsonl", "timings.jsonl", ".lock")
-"""Files of a dataset that say when and where it was made."""
+"""Files of a dataset that state when and where it was made."""
 PLAIN: dict[str, Any] = {
     "environment": "assets/workcell",
     "backdrop": None,
@@ -54,11 +54,11 @@ PLAIN: dict[str, Any] = {
     ],
     "randomise": {},
 }
-"""The scene with nothing varied but what lies where, which has as many objects and lights on average."""
+"""Changes that disable all variations but poses, with the same mean number of objects and lights."""
 
 
 def make_folder(folder: Path) -> Path:
-    """The scene file with what it names: images of noise, skies of one sun each, and the workcell in other colours."""
+    """Write the scene file with images of noise, skies of one sun each, and the workcell in other colours."""
     rng = np.random.default_rng(0)
     (folder / "assets").symlink_to(ROOT / "scenes/assets")
     for name in ("textures", "photos", "skies"):
@@ -81,7 +81,7 @@ def make_folder(folder: Path) -> Path:
 
 
 def scatter(scene: ms.Scene, index: int, *, progress: Any = None) -> Layout:
-    """The objects that a layout draws, anywhere about the mat."""
+    """Return a layout of the drawn objects at random poses about the mat."""
     rng = random_stream(scene.spec.seed, "scattered layout", index)
     assets, _ = draw_objects(scene, index)
     instances = []
@@ -94,7 +94,7 @@ def scatter(scene: ms.Scene, index: int, *, progress: Any = None) -> Layout:
 
 
 def differing(one: Path, other: Path) -> list[str]:
-    """Files of two datasets that are not the same."""
+    """Return the files that differ between two datasets."""
     found = [
         {path.relative_to(root).as_posix(): path for path in root.rglob("*") if path.is_file()} for root in (one, other)
     ]
@@ -107,7 +107,7 @@ def differing(one: Path, other: Path) -> list[str]:
 
 
 def audited(scene: ms.Scene, out: Path, options: argparse.Namespace) -> None:
-    """Make frames, and audit them."""
+    """Render frames, and audit them."""
     start = time.perf_counter()
     summary = ms.write_dataset(scene, out, frames=options.frames, settle=scatter, workers=None, device=options.device)
     found = audit_dataset(out)
@@ -122,7 +122,7 @@ def audited(scene: ms.Scene, out: Path, options: argparse.Namespace) -> None:
 
 
 def compared(scene: ms.Scene, folder: Path, options: argparse.Namespace) -> None:
-    """The same frames by several numbers of workers, and in two shards."""
+    """Compare the same frames from several numbers of workers, and from two shards."""
     given: dict[str, Any] = {"frames": options.compare, "settle": scatter, "device": options.device}
     made = []
     for workers in options.workers:
@@ -140,7 +140,10 @@ def compared(scene: ms.Scene, folder: Path, options: argparse.Namespace) -> None
 
 
 def cost_of(path: Path, overrides: dict[str, Any], frames: int, folder: Path) -> float:
-    """Seconds of an image and its files: of the processor, or of the clock on a GPU; the first layouts are left out."""
+    """Return the seconds of an image and its files: CPU time, or wall-clock time on a GPU.
+
+    The first layouts are excluded.
+    """
     scene = ms.load_scene(path, overrides={**overrides, "output.width": 1280, "output.height": 720}, allow_outside=True)
     catalogue, clock = Catalogue.of(scene), time.process_time if current_device().kind == "cpu" else time.perf_counter
     taken = []
@@ -155,7 +158,7 @@ def cost_of(path: Path, overrides: dict[str, Any], frames: int, folder: Path) ->
 
 
 def cost(path: Path, spec: Any, frames: int, folder: Path) -> None:
-    """What an image costs with nothing varied, and with all."""
+    """Measure the cost of an image without and with all variations."""
     table, tray = (shape.model_dump(mode="json") for shape in spec.shapes[:2])
     camera = spec.camera.model_dump(mode="json")
     plain = {key: camera[key] for key in ("kind", "target", "radius", "elevation", "azimuth", "intrinsics")}
@@ -174,7 +177,7 @@ def cost(path: Path, spec: Any, frames: int, folder: Path) -> None:
 
 
 def main() -> None:
-    """Print what was found."""
+    """Print the results."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--frames", type=int, default=1000, help="audited; 0 for none")
     parser.add_argument("--compare", type=int, default=64, help="frames that all numbers of workers make; 0 for none")

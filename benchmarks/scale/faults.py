@@ -1,9 +1,9 @@
-"""Kill real renderings at random moments, resume them, and compare every byte with an undisturbed run.
+"""Kill real renderings at random times, resume them, and compare every byte with an undisturbed run.
 
     python -m benchmarks.scale.faults [--kills 50] [--seed 0] [--frames 12] [--synthetic]
 
 Each run has 1 or 2 worker processes, at random. Of three kills (SIGKILL), two hit the whole run and one a worker, whose
-frame the run must make again. A moment is drawn anew each time: mostly while frames are written, sometimes before.
+frame the run must repeat. Each kill has a new random time, mostly while frames are written, sometimes before.
 ``--synthetic`` draws frames instead of rendering them (those of ``tests/engine/test_faults.py``): they start and follow
 each other faster, so that more kills hit the writing of files.
 """
@@ -39,13 +39,13 @@ lights:
 randomise: {{iso: [100, 800]}}
 output: {{width: 64, height: 48, layouts: 3, views: 5, formats: [yolo, coco, exr]}}
 """
-"""Small, so that most of the time is spent at what kills are to hit: starting, settling, writing."""
+"""A small scene, so that most time is spent in the stages to be hit by kills: start, settling, writing."""
 FREE = ("timings.jsonl", "runs.jsonl", ".lock")
-"""What may differ: times, commands, and who held the lock."""
+"""Fields that may differ: times, commands, and the lock's owner."""
 
 
 def hashes(folder: Path) -> dict[str, str]:
-    """SHA-256 of every file, partial ones included."""
+    """Return the SHA-256 of every file, including partial ones."""
     files = (path for path in sorted(folder.rglob("*")) if path.is_file() and path.name not in FREE)
     return {str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
 
@@ -57,7 +57,7 @@ def start(script: list[str], scene: Path, out: Path, frames: int, workers: int) 
 
 
 def workers_of(process: int) -> list[int]:
-    """Worker processes of a run: its children that have multiprocessing's mark."""
+    """Return the worker processes of a run: its children with multiprocessing's mark."""
     found = []
     for text in Path(f"/proc/{process}/task/{process}/children").read_text().split():
         try:
@@ -75,7 +75,7 @@ def lines(out: Path) -> int:
 
 
 def await_moment(process: subprocess.Popen[bytes], out: Path, rng: random.Random) -> bool:
-    """Wait for the moment to kill; false if the run was finished before."""
+    """Wait for the time of the kill; return False if the run finished before."""
     if rng.random() < 0.2:
         end = time.monotonic() + rng.uniform(0, 6)
     else:
@@ -101,7 +101,7 @@ def main() -> None:
 
 
 def measure(options: argparse.Namespace) -> None:
-    """Kill until there were enough."""
+    """Kill until the requested number is reached."""
     rng = random.Random(options.seed)
     counts: Counter[str] = Counter()
     differing: set[str] = set()

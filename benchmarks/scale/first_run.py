@@ -1,9 +1,9 @@
-"""What the first run on a new machine takes: everything is compiled, and kept for the runs after it.
+"""Cost of the first run on a new machine, which compiles and caches everything.
 
     python -m benchmarks.scale.first_run [--frames 4] [--size 640x360]
 
-The default scene is rendered twice by ``mitsplat render`` with an empty home and empty caches; the second run finds all
-that the first one left. Processor seconds are those of all threads.
+``mitsplat render`` renders the default scene twice, with an empty home and empty caches; the second run uses the caches
+of the first one. CPU seconds are those of all threads.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from benchmarks.record import ROOT, figure, recording
 
 
 def main() -> None:
-    """Print what both runs take, and what lies on the disk."""
+    """Print the time of both runs, and the files on the disk."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--frames", type=int, default=4)
     parser.add_argument("--size", default="640x360")

@@ -1,9 +1,9 @@
-"""Damage valid files at random and read them: every reader must return, or refuse in one sentence that names the file.
+"""Damage valid files at random and read them: every reader must return, or fail with one sentence that names the file.
 
     python -m benchmarks.scale.fuzz [--minutes 10] [--seed 0] [--only NAME ...]
 
-Each input is read in a child process with bounded memory and time, so that a crash, a hang or a flood of memory is
-found. ``tests/test_fuzz.py`` does the same for a few inputs of each reader.
+Each input is read in a child process with bounded memory and time, which detects crashes, hangs and excessive memory.
+``tests/test_fuzz.py`` does the same for a few inputs of each reader.
 """
 
 from __future__ import annotations
@@ -47,9 +47,9 @@ from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.scene.loading.scene_loading import load_scene
 
 MEMORY = 12 << 30
-"""Address space of a child [bytes]; libraries that it loads reserve some of it without using it."""
+"""Address space of a child [bytes]; libraries reserve some of it without using it."""
 SECONDS = 90
-"""Longest that one input may take; the decoders of other formats are given 60 s."""
+"""Time limit of one input [s]; the decoders of other formats have 60 s."""
 
 _WORDS = (
     b"nan",
@@ -69,12 +69,12 @@ _NUMBERS = (0, 1, -1, 0x7F, 0x7FFFFFFF, -0x80000000, 1 << 20, 1 << 28)
 
 @dataclass(frozen=True)
 class Reader:
-    """A reader to try.
+    """A reader under test.
 
     Attributes:
-        file: The file that is damaged, below the folder of samples.
-        read: Reads it, given the folder that it is in.
-        slow: Whether it starts a process.
+        file: The file to damage, below the folder of samples.
+        read: Reads it, given its folder.
+        slow: True if it starts a process.
     """
 
     file: str
@@ -83,11 +83,11 @@ class Reader:
 
 
 def mutate(data: bytes, rng: random.Random) -> bytes:
-    """A damaged copy: bits, bytes, whole numbers, digits, blocks and the end of the file are changed."""
+    """Return a damaged copy with changed bits, bytes, integers, digits, blocks or end."""
     found = bytearray(data)
     for _ in range(rng.choice((1, 1, 2, 4, 16))):
         place = rng.randrange(len(found) + 1)
-        # Headers decide most, and are short.
+        # Headers determine most of the behaviour, and are short.
         if rng.random() < 0.5:
             place = min(place, rng.randrange(400))
         match rng.randrange(8):
@@ -114,7 +114,7 @@ def mutate(data: bytes, rng: random.Random) -> bytes:
 
 
 def attempt(reader: Reader, folder: Path) -> str:
-    """Read a damaged file: "read", "refused", or what is wrong with the reader."""
+    """Read a damaged file; return "read", "refused", or the reader's fault."""
     try:
         reader.read(folder)
     except InputError as error:
@@ -128,7 +128,7 @@ def attempt(reader: Reader, folder: Path) -> str:
 
 
 def make_samples(folder: Path) -> None:
-    """Valid files of every kind."""
+    """Create valid files of every kind."""
     rng = np.random.default_rng(0)
     count = 40
     splats = Splats(
@@ -184,7 +184,7 @@ def make_samples(folder: Path) -> None:
 
 
 def _labelled(folder: Path, rng: np.random.Generator) -> None:
-    """A YOLO and a COCO folder."""
+    """Create a YOLO and a COCO folder."""
     for name in ("yolo/images", "yolo/labels", "coco"):
         (folder / name).mkdir(parents=True)
     for name in ("yolo/images/a.png", "coco/a.png"):
@@ -203,7 +203,7 @@ def _labelled(folder: Path, rng: np.random.Generator) -> None:
 
 
 def _read_labelled(folder: Path) -> None:
-    """Read a set and all that is made of it."""
+    """Read a labelled set and all values derived from it."""
     coco_truth(read_set(folder, "train"), masks=True)
     write_data([read_set(folder, "train")], folder.parent / "data")
 
@@ -258,7 +258,7 @@ READERS: Mapping[str, Reader] = {
 
 
 def _child(name: str, folder: Path, seed: int, deadline: float, pipe: Any) -> None:
-    """Try inputs until the time is over; each is announced first."""
+    """Read inputs until the time limit; report each one first."""
     resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
     reader = READERS[name]
     sample = (folder / reader.file).read_bytes()
@@ -278,7 +278,7 @@ def _child(name: str, folder: Path, seed: int, deadline: float, pipe: Any) -> No
 
 
 def fuzz(name: str, folder: Path, seed: int, seconds: float) -> Counter[str]:
-    """Outcomes of random inputs to one reader; faults are printed with the number of their input."""
+    """Return counts of results of random inputs to one reader; print faults with the number of their input."""
     counts: Counter[str] = Counter()
     deadline, number = time.monotonic() + seconds, seed
     sample = (folder / READERS[name].file).read_bytes()
@@ -304,7 +304,7 @@ def fuzz(name: str, folder: Path, seed: int, seconds: float) -> Counter[str]:
 
 
 def main() -> None:
-    """Share the time among the readers, and print what came of their inputs."""
+    """Divide the time among the readers, and print the results."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--minutes", type=float, default=10)
     parser.add_argument("--seed", type=int, default=0)
@@ -315,7 +315,7 @@ def main() -> None:
 
 
 def measure(options: argparse.Namespace) -> None:
-    """One reader after the other."""
+    """Test one reader after the other."""
     total: Counter[str] = Counter()
     with tempfile.TemporaryDirectory() as folder:
         make_samples(Path(folder))

@@ -1,13 +1,13 @@
-"""Labelled images a second that a GPU makes, files on the disk, and whether they are the CPU's.
+"""Labelled images per second of a GPU, including files on the disk, and their equality with the CPU's.
 
     python -m benchmarks.scale.gpu [--device cuda:all] [--frames 600] [--workers 14] [--size 1280x720]
                                    [--compare 12] [--unsettled] [--turns] [--out FOLDER]
 
-Layouts are settled first, on all cores, unless they are part of what is measured (``--unsettled``); what an earlier
-settling left in mitsplat's cache is used. Then ``mitsplat render`` writes the default scene in YOLO and COCO. The rate
-is that of the middle half of the frames, between starting and running dry, as the median of eight equal parts of it.
-``--turns`` does without NVIDIA's Multi-Process Service. The shares in which GPUs are busy are those of ``nvidia-smi``
-meanwhile. At last the dataset is audited, and some frames are rendered on both processors as PNG with their ids.
+Layouts are settled first, on all cores, unless ``--unsettled`` includes them in the measurement; layouts in mitsplat's
+cache are used. Then ``mitsplat render`` writes the default scene in YOLO and COCO. The rate excludes start and end: it
+is the median of eight equal parts of the middle half of the frames. ``--turns`` disables NVIDIA's Multi-Process
+Service. GPU utilisation is measured by ``nvidia-smi``. Finally the dataset is audited, and some frames are rendered on
+both devices as PNG with their ids.
 """
 
 from __future__ import annotations
@@ -39,11 +39,11 @@ from mitsplat.scene.loading.scene_loading import load_scene
 
 WORKCELL = ROOT / "scenes/workcell.yaml"
 PARTS = 8
-"""Of the middle half of the frames, whose median rate is the figure."""
+"""Number of parts of the middle half of the frames, whose median rate is recorded."""
 
 
 def write_scene(folder: Path, frames: int, size: str, **output: object) -> Path:
-    """The default scene with as many layouts as the frames need."""
+    """Write the default scene with as many layouts as the frames need."""
     data = YAML(typ="safe", pure=True).load(WORKCELL)
     width, height = map(int, size.split("x"))
     layouts = -(-frames // data["output"]["views"])
@@ -69,7 +69,7 @@ def settle(scene: Path) -> None:
 def render(
     scene: Path, out: Path, frames: int, device: str, workers: int | None, turns: bool = False
 ) -> list[tuple[float, int]]:
-    """Run ``mitsplat render``; returns numbers of finished frames with the time at which they were seen [s]."""
+    """Run ``mitsplat render``; return numbers of finished frames with their times [s]."""
     start_up = "import mitsplat.engine.mps as mps; mps.CONTROL = 'nothing'; " if turns else ""
     command = [sys.executable, "-c", f"{start_up}from mitsplat.cli import main; main()", "render", str(scene)]
     command += ["-o", str(out), "-n", str(frames), "--device", device, "--allow-outside"]
@@ -96,7 +96,7 @@ def render(
 
 
 def rates(seen: Sequence[tuple[float, int]], frames: int) -> tuple[list[float], float, float]:
-    """Images per second in each part of the middle half of the frames, and when that begins and ends [s]."""
+    """Return images per second in each part of the middle half of the frames, and its start and end [s]."""
     counts, first = np.unique([count for _, count in seen], return_index=True)
     marks = np.linspace(0.25, 0.75, PARTS + 1) * frames
     at = np.interp(marks, counts, np.array([moment for moment, _ in seen])[first])
@@ -105,7 +105,7 @@ def rates(seen: Sequence[tuple[float, int]], frames: int) -> tuple[list[float], 
 
 @contextmanager
 def watched_gpus() -> Iterator[list[tuple[float, int, float, float]]]:
-    """Time [s], number of the GPU, share of time that it is busy [%] and its memory in use [MiB], as they are said."""
+    """Yield time [s], number of the GPU, its utilisation [%] and its memory in use [MiB], as they are reported."""
     samples: list[tuple[float, int, float, float]] = []
     program = shutil.which("nvidia-smi")
     if program is None:
@@ -132,7 +132,7 @@ def watched_gpus() -> Iterator[list[tuple[float, int, float, float]]]:
 
 
 def measure(options: argparse.Namespace, folder: Path) -> None:
-    """Print and keep everything."""
+    """Print and record all figures."""
     scene = write_scene(folder / "measured", options.frames, options.size, formats=["yolo", "coco"])
     if not options.unsettled:
         settle(scene)
@@ -170,7 +170,7 @@ def measure(options: argparse.Namespace, folder: Path) -> None:
 
 
 def tell_stages(out: Path) -> None:
-    """Medians of the stages over the middle half of the frames, by which workers are warm."""
+    """Print medians of the stages over the middle half of the frames, where workers are warm."""
     rows = [json.loads(line) for line in (out / "timings.jsonl").read_text().splitlines()]
     stages: dict[str, list[float]] = defaultdict(list)
     for row in rows[len(rows) // 4 : 3 * len(rows) // 4]:
@@ -184,7 +184,7 @@ def tell_stages(out: Path) -> None:
 
 
 def compare(options: argparse.Namespace, folder: Path) -> None:
-    """PSNR of pictures and pixels of other ids, on the measured device against the CPU."""
+    """Return the PSNR of images and the pixels with different ids, on the measured device against the CPU."""
     made = {}
     for name, device in (("gpu", options.device), ("cpu", "cpu")):
         scene = write_scene(folder / name, options.compare, options.size, formats=["yolo", "instances"], image="png")

@@ -1,12 +1,12 @@
-"""Images per second against workers and size of the scene, memory over many frames, and what 10^6 images cost.
+"""Images per second by workers and size of the scene, memory over many frames, and the cost of 10^6 images.
 
     python -m benchmarks.scale.growth workers [--scene FILE] [--workers 1 2 3] [--frames 12] [--size 320x180]
     python -m benchmarks.scale.growth scene [--frames 6] [--size 320x180]
     python -m benchmarks.scale.growth memory [--frames 2000] [--views 50]
     python -m benchmarks.scale.growth project [--seconds 0.6] [--bytes 2.5e5] [--settle 3] [--views 12]
 
-``workers`` also compares the manifests' SHA-256. ``project`` prints the table of ``docs/reliability.md``, which has its
-model, from recorded results or from the figures given.
+``workers`` also compares the manifests' SHA-256. ``project`` prints the table of ``docs/reliability.md``, which
+describes its model, from recorded results or from the given figures.
 """
 
 from __future__ import annotations
@@ -46,26 +46,26 @@ def manifest_hash(folder: Path) -> str:
 
 
 class Clock:
-    """Hears of finished frames, and gives the speed after every worker's first."""
+    """Progress callback that measures the speed after every worker's first frame."""
 
     def __init__(self, workers: int) -> None:
         self.workers = workers
         self.times: list[float] = []
 
     def __call__(self, done: int, total: int, text: str) -> None:
-        """Hear of progress."""
+        """Record the time of a finished frame."""
         if text.startswith("frame "):
             self.times.append(time.monotonic())
 
     @property
     def speed(self) -> float:
-        """Images per second, nan where there are too few."""
+        """Return images per second, NaN for too few frames."""
         kept = self.times[2 * self.workers - 1 :]
         return (len(kept) - 1) / (kept[-1] - kept[0]) if len(kept) > 1 else float("nan")
 
 
 def measure_workers(path: Path, counts: list[int], frames: int, size: str) -> None:
-    """Local workers, Ray and shards: speed, and whether the bytes are the same."""
+    """Measure local workers, Ray and shards: speed, and equality of bytes."""
     changes = overrides(size, **{"output.formats": ["yolo", "coco"]})
     scene = load_scene(path, overrides=changes, allow_outside=True)
     print(f"{len(scene.assets)} assets, {size}, {frames} frames; load before: {os.getloadavg()[0]:.1f}")
@@ -101,7 +101,7 @@ def measure_workers(path: Path, counts: list[int], frames: int, size: str) -> No
 
 
 def measure_scene(frames: int, size: str) -> None:
-    """One process, with more and more objects."""
+    """Measure one process with growing numbers of objects."""
     print("objects  Gaussians  images/s (median)")
     for count in (1, 4, 8, 16):
         text = SCENE.replace("count: [2, 3]", f"count: [{count}, {count}]").replace(
@@ -119,7 +119,10 @@ def measure_scene(frames: int, size: str) -> None:
 
 
 def measure_memory(frames: int, views: int) -> None:
-    """Resident memory of one process over many small frames, and its slope by least squares after a quarter of them."""
+    """Measure resident memory of one process over many small frames.
+
+    The slope is a least-squares fit without the first quarter of them.
+    """
     layouts = -(-frames // views)
     text = SCENE.replace("layouts: 3, views: 5", f"layouts: {layouts}, views: {views}").replace(
         "yolo, coco, exr", "yolo"
@@ -152,7 +155,7 @@ def measure_memory(frames: int, views: int) -> None:
 
 
 def project(seconds: float, size: float, settle: float, views: int) -> None:
-    """The cost of 10^6 images by number of workers, and where more of them no longer help."""
+    """Print the cost of 10^6 images by number of workers, and the number at which more workers no longer help."""
     found = projection.project(seconds, size, settle, views)
     settling = f"{settle:g} s of settling over {views} views"
     print(f"a frame takes a worker {found.each:.2f} s ({settling}) and {size / 1e6:.2f} MB")
@@ -190,7 +193,7 @@ def main() -> None:
 
 
 def measure(options: argparse.Namespace) -> None:
-    """What takes time."""
+    """Run the measurements that take time."""
     if options.what == "workers":
         measure_workers(options.scene, options.workers, options.frames or 12, options.size)
     elif options.what == "scene":

@@ -1,4 +1,4 @@
-"""What a million images cost, from what one costs. Takes only the standard library."""
+"""Cost of a million images, extrapolated from one. Uses only the standard library."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 IMAGES = 1e6
 WORKERS = 1, 2, 10, 100, 300, 1000, 3000
 FSYNCED = 2e-3
-"""Assumed time in which one process appends and fsyncs the two lines of a frame [s]."""
+"""Assumed time to append and fsync the two lines of a frame in one process [s]."""
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Projection:
-    """Rows, the time that a frame takes a worker [s], the speed of one writer [1/s], and the workers that reach it."""
+    """Rows, time of a frame in a worker [s], speed of one writer [1/s], and workers that saturate it."""
 
     rows: tuple[Row, ...]
     each: float
@@ -33,13 +33,13 @@ class Projection:
 
 
 def project(seconds: float, size: float, settle: float, views: int) -> Projection:
-    """Workers make images until the one process that writes lines has no time left.
+    """Project the cost of images for numbers of workers, until the one process that writes records is saturated.
 
     Args:
-        seconds: Of a frame, with labels and files [s].
-        size: Of a frame on the disk [bytes].
-        settle: Time in which a layout is settled [s].
-        views: Frames of a layout.
+        seconds: Time of a frame, with labels and files [s].
+        size: Size of a frame on the disk [bytes].
+        settle: Time to settle a layout [s].
+        views: Frames per layout.
     """
     each, limit = seconds + settle / views, 1 / FSYNCED
     rows = []

@@ -1,9 +1,10 @@
-"""A viewer under load: many browsers that read nothing, messages of 49 MB, requests without a token, browsers that die.
+"""Viewer under load: many browsers that never read, messages of 49 MB, requests without a token, and killed browsers.
 
     python -m benchmarks.scale.viewer [--scene scenes/workcell.yaml] [--browsers 150] [--megabytes 49] [--killed 100]
 
-The viewer is a process of ``mitsplat view``, whose memory and threads are read from the system. Meanwhile its page is
-asked for five times a second. At the end a browser connects and reads all that is shown, and Ctrl-C ends the viewer.
+The viewer is a process of ``mitsplat view``, whose memory and threads are read from the system. Its page is requested
+five times per second during the test. Finally a browser connects and reads everything shown, and Ctrl-C ends the
+viewer.
 """
 
 from __future__ import annotations
@@ -41,12 +42,12 @@ CAMERA = {
 
 
 class Probe:
-    """Asks for the page until it is stopped, and watches the memory of the process.
+    """Requests the page until stopped, and monitors the memory of the process.
 
     Attributes:
         longest: Longest time to an answer [s].
-        answers: How many there were of each status.
-        peak: Most resident memory [MiB].
+        answers: Number of answers by status.
+        peak: Largest resident memory [MiB].
     """
 
     def __init__(self, url: str, pid: int) -> None:
@@ -73,7 +74,7 @@ class Probe:
 
 
 def status(url: str) -> int:
-    """Status of the answer to a request; 0 where there is none."""
+    """Return the status of the answer to a request; 0 without an answer."""
     try:
         with urllib.request.urlopen(url, timeout=30) as answer:
             answer.read()
@@ -85,7 +86,7 @@ def status(url: str) -> int:
 
 
 def process_values(pid: int) -> tuple[float, int, int]:
-    """Resident memory [MiB], threads and open files of a process."""
+    """Return resident memory [MiB], threads and open files of a process."""
     lines = Path(f"/proc/{pid}/status").read_text().splitlines()
     values = {key: value.split() for key, _, value in (line.partition(":") for line in lines)}
     files = len(list(Path(f"/proc/{pid}/fd").iterdir()))
@@ -93,7 +94,7 @@ def process_values(pid: int) -> tuple[float, int, int]:
 
 
 async def joined(url: str) -> ClientConnection:
-    """Connect as a browser, and tell its camera."""
+    """Connect as a browser, and send its camera."""
     address = url.replace("http://", "ws://")
     options: dict[str, Any] = {"max_size": None, "compression": None, "open_timeout": 60}
     browser = await connect(address, subprotocols=[f"viser-v{viser.__version__}"], **options)  # type: ignore[list-item]
@@ -102,7 +103,7 @@ async def joined(url: str) -> ClientConnection:
 
 
 async def crowd(url: str, count: int, size: int) -> Counter[str]:
-    """Connect so many browsers that read nothing, let each send a large message, and count what became of them."""
+    """Connect browsers that never read, let each send a large message, and count the outcomes."""
     ends: Counter[str] = Counter()
     opened: list[ClientConnection] = []
     for result in await asyncio.gather(*(joined(url) for _ in range(count)), return_exceptions=True):
@@ -122,7 +123,7 @@ async def crowd(url: str, count: int, size: int) -> Counter[str]:
 
 
 async def shown_camera(browser: ClientConnection) -> dict[str, Any]:
-    """The camera that the page tells a new browser, as that would answer."""
+    """Return the camera that the page sends to a new browser, in the form of a browser's message."""
     places: dict[str, Any] = {}
     while len(places) < 2:
         data = bytes(await browser.recv())
@@ -134,7 +135,7 @@ async def shown_camera(browser: ClientConnection) -> dict[str, Any]:
 
 
 async def kill_browsers(url: str, count: int) -> None:
-    """Connect one browser after another, move its camera, and break its connection off while that is rendered."""
+    """Connect one browser after another, move its camera, and break the connection during the rendering."""
     for number in range(count):
         browser = await joined(url)
         start = await shown_camera(browser)
@@ -146,7 +147,7 @@ async def kill_browsers(url: str, count: int) -> None:
 
 
 async def read_all(url: str) -> float:
-    """Connect and read until nothing comes for a second; what was read [MiB]."""
+    """Connect and read until nothing arrives for a second; return the size of the data read [MiB]."""
     browser, size = await joined(url), 0
     with contextlib.suppress(TimeoutError):
         while True:
@@ -157,7 +158,7 @@ async def read_all(url: str) -> float:
 
 @contextlib.contextmanager
 def served(scene: Path) -> Iterator[tuple[str, int, Callable[[], int]]]:
-    """Address and process of a viewer, and how to end it as by Ctrl-C, which gives its status."""
+    """Yield address and process of a viewer, and a function that ends it as by Ctrl-C and returns its status."""
     command = [sys.executable, "-P", "-c", BEGIN, "view", str(scene), "--port", "0"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as viewer:
 
@@ -172,7 +173,7 @@ def served(scene: Path) -> Iterator[tuple[str, int, Callable[[], int]]]:
 
 
 def main() -> None:
-    """Measure, and print a line a phase."""
+    """Measure, and print a line per phase."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--scene", type=Path, default=ROOT / "scenes" / "workcell.yaml")
     parser.add_argument("--browsers", type=int, default=150)
@@ -182,7 +183,7 @@ def main() -> None:
     with recording("scale.viewer", parser, options), served(options.scene) as (url, pid, end):
         shown = asyncio.run(read_all(url))
         figure(shown, "MiB", "sent to a browser")
-        time.sleep(20)  # the first pictures are rendered
+        time.sleep(20)  # wait for the first images
         begin = process_values(pid)
         phases: dict[str, Callable[[], object]] = {
             "crowd": lambda: asyncio.run(crowd(url, options.browsers, options.megabytes << 20)),

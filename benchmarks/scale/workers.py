@@ -1,11 +1,11 @@
-"""What worker processes take of memory, and whether the budget that their number follows from is enough.
+"""Memory of worker processes, compared with the budget that determines their number.
 
     python -m benchmarks.scale.workers workers [--gaussians 2e6] [--size 160x120] [--workers 1 2 3]
     python -m benchmarks.scale.workers budget
 
-``workers`` adds up the proportional set size (PSS, ``/proc/PID/smaps_rollup``), in which memory that several processes
-share is divided among them, of all workers while they render. ``budget`` renders scenes that differ in one thing at a
-time, each in a process of its own, and sets the peak beside what :func:`mitsplat.frames.budget.worker_memory` says.
+``workers`` adds up the proportional set size (PSS, ``/proc/PID/smaps_rollup``) of all workers while they render; PSS
+divides shared memory among the processes. ``budget`` renders scenes that differ in one property at a time, each in its
+own process, and compares the peak with :func:`mitsplat.frames.budget.worker_memory`.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ CASES = {
 def write_room(
     folder: Path, gaussians: float = 1e4, size: str = "160x120", *, objects: int = 2, samples: int = 1, sh: int = 16
 ) -> Path:
-    """A scene file: nuts on a floor of Gaussians that just cover it, ``sh`` coefficients each."""
+    """Write a scene file of nuts on a floor of Gaussians that just cover it, with ``sh`` coefficients each."""
     rng, count = np.random.default_rng(0), int(gaussians)
     splats = Splats(
         means=rng.uniform((-1, -1, -0.05), (1, 1, 0), (count, 3)),
@@ -73,13 +73,13 @@ def write_room(
 
 
 def of_process(process: int | str, file: str, key: str) -> int:
-    """A size in a file of ``/proc`` [bytes]."""
+    """Return a size from a file of ``/proc`` [bytes]."""
     lines = Path(f"/proc/{process}/{file}").read_text().splitlines()
     return next(int(line.split()[1]) for line in lines if line.startswith(f"{key}:")) * 1024
 
 
 def measure_workers(counts: list[int], **options: float | str) -> None:
-    """PSS of all workers together, and what each one more adds to it."""
+    """Measure the PSS of all workers together, and the increase per worker."""
     print(f"{options}: workers, PSS of all of them [MiB], of the driver [MiB]")
     with tempfile.TemporaryDirectory() as folder:
         scene = load_scene(write_room(Path(folder), **options), allow_outside=True)  # type: ignore[arg-type]
@@ -102,7 +102,7 @@ def measure_workers(counts: list[int], **options: float | str) -> None:
 
 
 def measure_budget() -> None:
-    """Peak of a process that makes frames, and the budget."""
+    """Compare the peak memory of a process that renders frames with the budget."""
     print("peak [MiB]  budget [MiB]")
     for name, options in CASES.items():
         with tempfile.TemporaryDirectory() as folder:
@@ -116,7 +116,7 @@ def measure_budget() -> None:
 
 
 def make_frames(path: Path) -> None:
-    """Make a few frames in this process; its peak and its budget."""
+    """Render a few frames in this process; print its peak and its budget."""
     scene = load_scene(path, allow_outside=True)
     with tempfile.TemporaryDirectory() as folder:
         write_dataset(scene, Path(folder) / "out", frames=3)

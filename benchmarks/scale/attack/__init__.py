@@ -1,4 +1,6 @@
-"""Hostile input for every command that reads files of others: each attack must fail in one sentence, or do nothing.
+"""Hostile input for every command that reads files of others.
 
-One module for each kind of input; :mod:`benchmarks.scale.attack.attack` runs an attack and judges it.
+Each attack must fail with one sentence, or have no effect.
+
+Each kind of input has a module; :mod:`benchmarks.scale.attack.attack` runs an attack and evaluates it.
 """

@@ -1,10 +1,10 @@
-"""Attack mitsplat with hostile files and machines, and print what came of each attack.
+"""Attack mitsplat with hostile files and machines, and print the verdict on each attack.
 
     python -m benchmarks.scale.attack [--list] [--only PATTERN] [--quick] [--jobs N] [--slowdown FACTOR]
 
-An attack is held off if its commands end with a status and a sentence of theirs, within bounds of time and memory, and
-neither change nor show anything outside of their folder. The exit status is 1 if one was not held off. The commands are
-those of ``mitsplat`` in the environment of this Python. It needs Linux.
+An attack is repelled if its commands end with a status and an error sentence, within bounds of time and memory, and
+neither change nor disclose anything outside of their folder. The exit status is 1 if an attack was not repelled. The
+commands are those of ``mitsplat`` in the environment of this Python. Linux is required.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ _OWN = ("__main__", "attack", "samples")
 
 
 def all_attacks() -> list[Attack]:
-    """Attacks of every module, in the order of the modules' names."""
+    """Return the attacks of every module, in the order of the modules' names."""
     names = sorted(module.name for module in pkgutil.iter_modules(package.__path__) if module.name not in _OWN)
     modules = [importlib.import_module(f"{package.__name__}.{name}") for name in names]
     return [attack for module in modules for attack in module.ATTACKS]
 
 
 def verdicts(attacks: Sequence[Attack], jobs: int, slowdown: float) -> Iterator[tuple[Attack, Verdict]]:
-    """Attacks and what came of them, each in a folder of its own, which is removed."""
+    """Yield attacks and their verdicts, each run in a folder of its own, which is removed."""
     with tempfile.TemporaryDirectory(prefix="mitsplat-attack-") as folder, ThreadPoolExecutor(jobs) as pool:
         valid = Samples(Path(folder) / "samples")
         if not all(attack.quick for attack in attacks):
@@ -53,7 +53,7 @@ def verdicts(attacks: Sequence[Attack], jobs: int, slowdown: float) -> Iterator[
 
 
 def main() -> None:
-    """Choose the attacks, run them and print a table."""
+    """Select the attacks, run them and print a table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", metavar="PATTERN", help="attacks whose name contains or matches it, such as 'xml*'")
     parser.add_argument("--quick", action="store_true", help="only attacks that render nothing")
@@ -73,7 +73,7 @@ def main() -> None:
         for attack in wanted:
             print(f"{attack.name}: tries to {attack.tries}")
         return
-    # A part that was chosen by name is no result.
+    # A selection by name is not recorded.
     with (
         nullcontext()
         if options.only
@@ -84,7 +84,7 @@ def main() -> None:
 
 
 def measure(wanted: Sequence[Attack], jobs: int, slowdown: float) -> int:
-    """Run attacks, print a line for each, record the counts; returns how many were not held off."""
+    """Run attacks, print a line for each, and record the counts; return the number of attacks not repelled."""
     begun = time.monotonic()
     absent = [attack for attack in wanted if attack.missing]
     done: list[tuple[Attack, Verdict]] = []

@@ -1,4 +1,4 @@
-"""Runs one attack as commands in a folder of its own, measures their processes, and judges what came of them."""
+"""Execution of one attack: runs commands in a folder of its own, measures their processes, and evaluates the result."""
 
 from __future__ import annotations
 
@@ -21,43 +21,43 @@ import numpy as np
 from benchmarks.scale.attack.samples import Place
 
 ANY = frozenset({0, 1, 2, 3, 4})
-"""Exit statuses of `mitsplat` that are no fault of it: done, found something wrong, bad input, missing, partial."""
+"""Exit statuses of `mitsplat` without a crash: success, findings, invalid input, missing dependency, partial result."""
 REFUSED = frozenset({2, 3})
 FINE = frozenset({0})
 
 SECRET_COLOUR = (255, 0, 255)
-"""Colour of every pixel of the picture that no command may read."""
+"""Colour of every pixel of the image that no command may read."""
 SECRET_WORD = "WITNESS-OF-READING"
 """Word of the text files that no command may read."""
 
 _LINGER = 3.0
-"""Time that child processes have to end after their parent [s]."""
+"""Time limit for child processes to end after their parent [s]."""
 _PAGE = os.sysconf("SC_PAGE_SIZE")
 _PICTURES = (".png", ".jpg", ".jpeg")
 _EMBEDDED = re.compile(rb"data:image/(?:png|jpeg);base64,([A-Za-z0-9+/=]+)")
 _SENTENCE = 2000
-"""Most characters of an error's sentence."""
+"""Maximum length of an error sentence [characters]."""
 
 
 @dataclass(frozen=True)
 class Attack:
-    """One hostile input and the verdict on what commands make of it.
+    """A hostile input, and the rules that its commands must obey.
 
     Attributes:
         name: Kind and variant, such as ``xml: link in a subfolder``.
-        tries: Harm that the input tries to do, a clause.
+        tries: Harm that the input attempts, a clause.
         build: Makes the input below ``place.inside``.
         commands: Run one after the other in ``place.inside``; ``mitsplat`` is the first word of most, and ``{inside}``,
             ``{outside}`` and ``{samples}`` are filled in.
-        status: Exit statuses that the last command may have. The others must exit with 0.
+        status: Permitted exit statuses of the last command. The others must exit with 0.
         seconds: Bound on the time of each command.
         mebibytes: Bound on the resident memory of a command and all its children.
-        quick: Whether it needs no rendering and takes a few seconds.
+        quick: True if it needs no rendering and takes a few seconds.
         environment: Variables of the commands, None to remove one.
         keep: Files below ``place.inside`` that must not change.
-        needs: Packages without which it is not run.
-        check: Returns faults beyond the ones that every attack is judged by.
-        during: Called with the place while the last command runs, which is ended afterwards; returns faults.
+        needs: Packages without which it is skipped.
+        check: Returns violations beyond the common rules.
+        during: Called with the place while the last command runs, which is ended afterwards; returns violations.
     """
 
     name: str
@@ -76,7 +76,7 @@ class Attack:
 
     @property
     def missing(self) -> str | None:
-        """Why it cannot be run here, or None."""
+        """Return the reason why it cannot run here, or None."""
         absent = [name for name in self.needs if importlib.util.find_spec(name) is None]
         return f"{', '.join(absent)} is not installed" if absent else None
 
@@ -86,7 +86,7 @@ class Verdict:
     """Result of an attack.
 
     Attributes:
-        faults: Rules that were broken, none if the attack was held off.
+        faults: Violated rules, none if the attack was repelled.
         seconds: Time of all commands.
         mebibytes: Largest resident memory of a command and its children.
         said: Last line of standard error.
@@ -100,7 +100,7 @@ class Verdict:
 
 @dataclass
 class Ended:
-    """A command that has ended or was stopped: status None says that it was stopped, for ``reason``."""
+    """A command that has ended, or was stopped for ``reason``, with status None."""
 
     status: int | None
     seconds: float
@@ -140,7 +140,7 @@ def judge(attack: Attack, place: Place) -> Verdict:
 
 
 def filled(words: Sequence[str], place: Place) -> list[str]:
-    """Words of a command with the folders of a place in them."""
+    """Fill a place's folders into the words of a command."""
     program = str(Path(sys.executable).with_name("mitsplat"))
     names = {"{inside}": place.inside, "{outside}": place.outside, "{samples}": place.samples, "{mitsplat}": program}
     found = [program if word == "mitsplat" and index == 0 else word for index, word in enumerate(words)]
@@ -157,7 +157,7 @@ def run(
     during: Callable[[Place], Iterable[str]] | None = None,
     faults: list[str] | None = None,
 ) -> Ended:
-    """Run a command within the bounds of an attack; all its processes are ended when it exceeds one."""
+    """Run a command within the bounds of an attack; end all its processes when it exceeds one."""
     environment = {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "PYTHONSAFEPATH")}
     for name, value in attack.environment.items():
         environment.pop(name, None)
@@ -206,7 +206,7 @@ def run(
 
 
 def family(process: int, known: Iterable[int] = ()) -> Iterator[int]:
-    """A process and its descendants, and those of processes that were known before."""
+    """Return a process and its descendants, and those of known processes."""
     waiting, seen = [process, *known], set[int]()
     while waiting:
         one = waiting.pop()
@@ -222,7 +222,7 @@ def family(process: int, known: Iterable[int] = ()) -> Iterator[int]:
 
 
 def resident(process: int) -> int:
-    """Resident memory of a process [bytes], without what is only mapped from files; 0 if it has ended."""
+    """Return the resident memory of a process [bytes], without memory-mapped files; 0 if it has ended."""
     try:
         _, pages, shared, *_ = Path(f"/proc/{process}/statm").read_text().split()
     except (OSError, ValueError):
@@ -231,7 +231,7 @@ def resident(process: int) -> int:
 
 
 def _shared_memory(process: int) -> int:
-    """Resident memory that is shared without a file [bytes], such as arrays for workers."""
+    """Return the resident memory that is shared without a file [bytes], such as arrays for workers."""
     try:
         status = Path(f"/proc/{process}/status").read_text()
     except OSError:
@@ -241,7 +241,7 @@ def _shared_memory(process: int) -> int:
 
 
 def end(processes: Iterable[int]) -> None:
-    """Kill processes that were started here."""
+    """Kill processes started here."""
     for process in processes:
         try:
             os.kill(process, signal.SIGKILL)
@@ -250,7 +250,7 @@ def end(processes: Iterable[int]) -> None:
 
 
 def _lingering(known: set[int], session: int) -> list[int]:
-    """Processes that are there some time after the one that started them has ended, which led their session."""
+    """Return processes that still run some time after the end of their session's leader."""
     until = time.monotonic() + _LINGER
     while left := [one for one in known | set(_in_session(session)) if resident(one)]:
         if time.monotonic() > until:
@@ -261,7 +261,7 @@ def _lingering(known: set[int], session: int) -> list[int]:
 
 
 def _in_session(session: int) -> Iterator[int]:
-    """Processes of a session."""
+    """Return the processes of a session."""
     for path in Path("/proc").glob("[0-9]*/stat"):
         try:
             fields = path.read_text().rpartition(")")[2].split()
@@ -272,7 +272,7 @@ def _in_session(session: int) -> Iterator[int]:
 
 
 def _offences(ended: Ended, allowed: frozenset[int], *, stopped: bool) -> Iterator[str]:
-    """Rules that hold for every command."""
+    """Return violations of the rules for every command."""
     text = ended.errors + ended.output
     if ended.reason:
         yield ended.reason
@@ -297,13 +297,13 @@ def _offences(ended: Ended, allowed: frozenset[int], *, stopped: bool) -> Iterat
 
 
 def _tree(folder: Path) -> Iterator[tuple[str, str]]:
-    """Every entry below a folder, links not followed, and what it is."""
+    """Return every entry below a folder, without following links, with its fingerprint."""
     for path in sorted(folder.rglob("*")):
         yield str(path.relative_to(folder)), _fingerprint(path)
 
 
 def _fingerprint(path: Path) -> str:
-    """Kind and content of a file, a link or a folder."""
+    """Return kind and content of a file, a link or a folder."""
     try:
         if path.is_symlink():
             return f"link to {path.readlink()}"
@@ -315,7 +315,10 @@ def _fingerprint(path: Path) -> str:
 
 
 def _unnamed(attack: Attack, place: Place, inputs: set[str]) -> Iterator[str]:
-    """New files and folders beside the input whose names do not begin with a name in the attack or with ``out``."""
+    """Return new files and folders beside the input with unexpected names.
+
+    Expected names start with a name in the attack, or with ``out``.
+    """
     words = " ".join(
         [*(word for command in attack.commands for word in command), *map(str, attack.environment.values())]
     )
@@ -330,7 +333,7 @@ def _differing(before: Sequence[tuple[str, str]], after: Sequence[tuple[str, str
 
 
 def _leaks(folder: Path, inputs: set[str]) -> Iterator[str]:
-    """New files below a folder that show the secret picture or hold the secret word."""
+    """Return new files below a folder that contain the secret image or the secret word."""
     for name, _ in list(_tree(folder)):
         path = folder / name
         if name in inputs or path.is_symlink() or not path.is_file() or path.stat().st_size > 1 << 26:
@@ -343,7 +346,7 @@ def _leaks(folder: Path, inputs: set[str]) -> Iterator[str]:
 
 
 def _shows_secret(data: bytes) -> bool:
-    """Whether a quarter of a picture has the hue of the secret picture, which noise has less often."""
+    """Return True if a quarter of an image has the hue of the secret image, which is improbable for noise."""
     image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
     if image is None:
         return False

@@ -1,4 +1,4 @@
-"""Python files beside the input, in the current folder of the command: none of them may be executed."""
+"""Python files beside the input, in the current folder of the command, which must not be executed."""
 
 from __future__ import annotations
 
@@ -33,7 +33,10 @@ _STARTUP = ("sitecustomize", "usercustomize")
 
 
 def hostile_modules(place: Place) -> None:
-    """Modules named as those of the standard library, of libraries and of Python's start; each leaves a file."""
+    """Write modules that each write a file on import.
+
+    Their names are those of the standard library, of libraries and of Python's start.
+    """
     text = _HOSTILE.format(witness=f"{place.outside}/executed-")
     for name in (*sys.stdlib_module_names, *_LIBRARIES, *_STARTUP):
         place.write(f"{name}.py", text)
@@ -101,7 +104,7 @@ def _dataset(place: Place) -> None:
 
 
 def _configuration(place: Place) -> None:
-    """Files that libraries read from the current folder."""
+    """Write configuration files that libraries read from the current folder."""
     place.write("matplotlibrc", "backend: module://hostile\n")
     place.write("hostile.py", _HOSTILE.format(witness=f"{place.outside}/executed-"))
     for name in (".env", "pyvenv.cfg", "setup.cfg", "pyproject.toml", "python311._pth"):

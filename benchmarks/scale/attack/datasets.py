@@ -1,4 +1,4 @@
-"""Hostile datasets: links that lead outside, damaged records, and files that are none."""
+"""Hostile datasets: links to the outside, damaged records, and replaced files."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ REPLACE = (*RESUME, "--overwrite")
 
 
 def _linked(name: str) -> Build:
-    """A file or folder of a dataset is moved outside, and a link to it left."""
+    """Move a file or folder of a dataset outside, and leave a link to it."""
 
     def build(place: Place) -> None:
         path = place.take_dataset() / name
@@ -40,7 +40,7 @@ def _linked(name: str) -> Build:
 
 
 def _hostile_link(name: str) -> Build:
-    """A file of a dataset is a link to a text that has nothing to do with it."""
+    """Replace a file of a dataset by a link to an unrelated text."""
 
     def build(place: Place) -> None:
         path = place.take_dataset() / name
@@ -119,7 +119,7 @@ def _notes(place: Place) -> None:
 
 
 def _records(change: Callable[[dict[str, Any]], object]) -> Build:
-    """A dataset whose first line in the manifest is another."""
+    """Change the first record of a dataset's manifest."""
 
     def build(place: Place) -> None:
         path = place.take_dataset() / "manifest.jsonl"
@@ -141,7 +141,7 @@ def _replaced(name: str, content: Callable[[], bytes]) -> Build:
 
 
 def _large(name: str, head: bytes = b"") -> Build:
-    """A file of a dataset of 3 GB that takes no room."""
+    """Replace a file of a dataset by a sparse file of 3 GB."""
 
     def build(place: Place) -> None:
         path = place.take_dataset() / name
@@ -281,7 +281,7 @@ def _no_script(place: Place, output: str) -> Iterable[str]:
 
 
 def _linked_shards(place: Place) -> None:
-    """Two shards, one of which is a link to a folder outside."""
+    """Create two shards, one of which is a link to a folder outside."""
     dataset = place.take_dataset()
     shutil.move(dataset, place.outside / "shard")
     Path(place.inside / "dataset").symlink_to(place.outside / "shard")

@@ -1,4 +1,4 @@
-"""Hostile pictures: OpenEXR, photographs, masks, depth maps and the images of lights."""
+"""Hostile images: OpenEXR, photographs, masks, depth maps and images of lights."""
 
 from __future__ import annotations
 
@@ -25,35 +25,35 @@ CAPTURE = ("mitsplat", "capture", "photos", "-o", "made")
 
 
 def png(width: int, height: int, rows: bytes, kind: int = 2, bits: int = 8, extra: bytes = b"") -> bytes:
-    """A PNG of a stated size whose compressed rows are given, whatever they are."""
+    """Return a PNG of a stated size with arbitrary compressed rows."""
     head = struct.pack(">IIBBBBB", width, height, bits, kind, 0, 0, 0)
     return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + extra + chunk(b"IDAT", rows) + chunk(b"IEND", b"")
 
 
 def chunk(name: bytes, data: bytes) -> bytes:
-    """A chunk of a PNG file."""
+    """Return a chunk of a PNG file."""
     return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
 
 
 def zeros(count: int) -> bytes:
-    """So many zeros, compressed, without having them in memory."""
+    """Return compressed zeros without holding them in memory."""
     packer, block = zlib.compressobj(9), bytes(1 << 20)
     parts = [packer.compress(block) for _ in range(count >> 20)]
     return b"".join([*parts, packer.compress(bytes(count & 0xFFFFF)), packer.flush()])
 
 
 def png_sky(path: Path) -> None:
-    """A valid panorama."""
+    """Return a valid panorama."""
     Image.fromarray(np.full((8, 16, 3), 128, np.uint8)).save(path)
 
 
 def bomb(edge: int) -> bytes:
-    """A valid PNG of one bit a pixel that is black, a thousand times smaller than its pixels."""
+    """Return a valid black PNG of one bit per pixel, a thousand times smaller than its pixels."""
     return png(edge, edge, zeros(edge * (edge // 8 + 1)), kind=0, bits=1)
 
 
 def exr(attributes: Mapping[str, tuple[str, bytes]], flags: int = 0, rest: bytes = b"") -> bytes:
-    """An OpenEXR file of one part with these attributes beside the required ones."""
+    """Return an OpenEXR file of one part with these attributes in addition to the required ones."""
     channel = b"".join(name + b"\0" + struct.pack("<iBxxxii", 2, 0, 1, 1) for name in (b"B", b"G", b"R")) + b"\0"
     window = struct.pack("<iiii", 0, 0, 15, 7)
     known = {
@@ -79,7 +79,7 @@ def _window(left: int, top: int, right: int, bottom: int) -> dict[str, tuple[str
 
 
 def _valid(channels: str = "RGB", value: float = 1.0) -> bytes:
-    """A valid OpenEXR file of a small panorama."""
+    """Return a valid OpenEXR file of a small panorama."""
     import OpenEXR
 
     pixels = {name: np.full((8, 16), value, np.float32) for name in channels}
@@ -132,7 +132,7 @@ EXRS: Mapping[str, Callable[[], bytes]] = {
 
 
 _EVERYWHERE = ("window of 2^50 pixels", "damaged pixels", "deep", "empty")
-"""Variants that lights of scenes are tried with, too; their reader is that of panoramas."""
+"""Variants that are also tried with lights of scenes, which use the reader of panoramas."""
 _DEPTHS = (
     *_EVERYWHERE,
     "cut in half",
@@ -141,7 +141,7 @@ _DEPTHS = (
     "200,000 channels",
     "attribute of 2 GB",
 )
-"""Variants that depth maps are tried with, which another reader reads."""
+"""Variants that are also tried with depth maps, which use another reader."""
 
 
 def _exr_attacks() -> Iterator[Attack]:
@@ -166,7 +166,7 @@ def _exr_attacks() -> Iterator[Attack]:
 
 
 def jpeg(exif: bytes = b"", icc: bytes = b"") -> bytes:
-    """A valid photograph of noise."""
+    """Return a valid photograph of noise."""
     file = io.BytesIO()
     pixels = np.random.default_rng(0).integers(0, 255, (48, 64, 3), dtype=np.uint8)
     Image.fromarray(pixels).save(file, "JPEG", exif=exif, icc_profile=icc or None)
@@ -174,7 +174,7 @@ def jpeg(exif: bytes = b"", icc: bytes = b"") -> bytes:
 
 
 def _exif(entries: list[tuple[int, int, int, bytes]], tail: bytes = b"") -> bytes:
-    """An EXIF block with entries of tag, type, count and value; the directory is followed by ``tail``."""
+    """Return an EXIF block with entries of tag, type, count and value; ``tail`` follows the directory."""
     rows = b"".join(struct.pack("<HHI", *entry[:3]) + entry[3].ljust(4, b"\0")[:4] for entry in entries)
     return b"Exif\0\0II*\0\x08\0\0\0" + struct.pack("<H", len(entries)) + rows + struct.pack("<I", 8) + tail
 
@@ -255,7 +255,7 @@ PHOTOS: Mapping[str, tuple[str, Callable[[], bytes]]] = {
 
 
 def noise_photos(place: Place, folder: str = "photos", count: int = 4) -> None:
-    """Valid photographs that share nothing."""
+    """Write valid photographs without common features."""
     for index in range(count):
         pixels = np.random.default_rng(index).integers(0, 255, (48, 64, 3), dtype=np.uint8)
         path = place.inside / folder / f"{index}.png"

@@ -1,4 +1,4 @@
-"""Hostile surroundings: names that are no text, folders without room or rights, few resources, other clocks."""
+"""Hostile machines: names with invalid encodings, full or read-only folders, few resources, and wrong clocks."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from benchmarks.scale.attack.samples import ROOT, Place
 RENDER = ("mitsplat", "render", "scene.yaml", "-o", "made", "--workers", "1")
 TWO = ("mitsplat", "render", "scene.yaml", "-o", "made", "--workers", "2")
 _ODD = os.fsdecode(b"caf\xe9\xff")
-"""A name that is no UTF-8."""
+"""A name that is not valid UTF-8."""
 _MESH = "[{name: table, box: {size: [1, 1, 0.1], position: [0, 0, -0.05]}}, {name: a, mesh: mesh.stl}]"
 _SKY = "[{kind: environment, image: sky.png}]"
 _LONG = ("--seed", f"{'7':>120000}")
-"""Arguments of 120 kB, more than a pipe holds."""
+"""Arguments of 120 kB, more than a pipe buffers."""
 _JUMPING_CLOCK = """
 #define _GNU_SOURCE
 #include <dlfcn.h>
@@ -60,7 +60,7 @@ time_t time(time_t *now) {
     return found.tv_sec;
 }
 """
-"""Library in C whose clock of the date jumps by days and decades at every call."""
+"""C library whose clock of the date jumps by days and decades at every call."""
 
 
 def _scene(place: Place) -> None:
@@ -68,7 +68,7 @@ def _scene(place: Place) -> None:
 
 
 def _odd_folder(what: str) -> Callable[[Place], object]:
-    """Valid input whose name, or whose folder's name, is no UTF-8."""
+    """Create valid input in a file or folder whose name is not valid UTF-8."""
 
     def build(place: Place) -> None:
         if what == "dataset":
@@ -88,7 +88,7 @@ def _odd_folder(what: str) -> Callable[[Place], object]:
 
 
 def _odd_link(name: str, **changes: str) -> Callable[[Place], object]:
-    """A valid scene or capture that reads a file or folder through a link to a name that is no UTF-8."""
+    """Create a valid scene or capture that reads a file or folder through a link to a name that is not valid UTF-8."""
 
     def build(place: Place) -> None:
         path = place.inside / name
@@ -103,7 +103,7 @@ def _odd_link(name: str, **changes: str) -> Callable[[Place], object]:
 
 
 def _odd_home(place: Place) -> None:
-    """A scene in a folder that is reached by a link."""
+    """Create a scene in a folder behind a link."""
     home = place.inside / _ODD
     home.mkdir()
     place.scene().rename(home / "scene.yaml")
@@ -112,7 +112,7 @@ def _odd_home(place: Place) -> None:
 
 
 def _odd_match(place: Place) -> None:
-    """A pool of assets of which one has a name that is no UTF-8."""
+    """Create a pool of assets, one of which has a name that is not valid UTF-8."""
     place.scene(objects="[{pool: 'parts/*', count: 1}]")
     shutil.copytree(place.inside / "nut", place.inside / "parts" / _ODD)
 
@@ -124,7 +124,7 @@ def _odd_image(place: Place) -> None:
 
 
 def _odd_entry(place: Place) -> None:
-    """An image of a dataset whose name is no UTF-8, in its manifest too."""
+    """Rename an image of a dataset to a name that is not valid UTF-8, also in its manifest."""
     dataset = place.take_dataset()
     manifest = dataset / "manifest.jsonl"
     manifest.write_text(manifest.read_text().replace("train/000000.png", "train/caf\\udce9.png"))
@@ -188,12 +188,12 @@ def _name_attacks() -> Iterator[Attack]:
 
 
 def _shell(text: str, *words: str) -> tuple[str, ...]:
-    """A command that is run by a shell after something else."""
+    """Return a command that a shell runs after another one."""
     return ("sh", "-c", f'{text} exec "$0" "$@"', "{mitsplat}", *words)
 
 
 def _mounted(folder: str, size: str, *words: str) -> tuple[str, ...]:
-    """A command that sees a small file system at a folder; needs user namespaces."""
+    """Return a command with a small file system mounted at a folder; needs user namespaces."""
     return ("unshare", "-rm", *_shell(f"mkdir -p {folder} && mount -t tmpfs -o size={size} none {folder} &&", *words))
 
 
@@ -202,7 +202,7 @@ def _read_only(folder: str, *words: str) -> tuple[str, ...]:
 
 
 def _installed_read_only(*words: str) -> tuple[str, ...]:
-    """A command that can write neither to mitsplat's folder nor to those of Python; needs user namespaces."""
+    """Return a command with read-only folders of mitsplat and of Python; needs user namespaces."""
     folders = " ".join(shlex.quote(str(folder)) for folder in (ROOT, Path(sys.prefix), Path(sys.base_prefix)))
     mount = f"for f in {folders}; do mount --bind $f $f && mount -o remount,bind,ro $f || exit 99; done;"
     return ("unshare", "-rm", *_shell(mount, *words))
@@ -220,7 +220,7 @@ _DEAD_START = (
 
 
 def _start(text: str) -> Callable[[Place], object]:
-    """Worker processes end or hang as soon as they start."""
+    """Create a scene whose worker processes end or hang at their start."""
 
     def build(place: Place) -> None:
         place.scene()
@@ -230,7 +230,7 @@ def _start(text: str) -> Callable[[Place], object]:
 
 
 def _times(seconds: float) -> Callable[[Place], object]:
-    """Every input was last changed at another time."""
+    """Set the modification time of every input."""
 
     def build(place: Place) -> None:
         place.take_dataset()
@@ -247,7 +247,7 @@ def _jumping_clock(place: Place) -> None:
 
 
 def _earlier_runs(place: Place) -> None:
-    """Records of runs of the future, as where the clock was set back."""
+    """Write records of runs in the future, as after the clock was set back."""
     dataset = place.take_dataset()
     for name in ("runs.jsonl", "timings.jsonl"):
         path = dataset / name
@@ -280,7 +280,7 @@ def _open_to_all(place: Place) -> None:
 
 
 def _readable_install() -> bool:
-    """Whether other users can read this Python."""
+    """Return True if other users can read this Python."""
     folders = [Path(sys.executable), *Path(sys.executable).parents, *Path(os.path.realpath(sys.executable)).parents]
     return all(folder.stat().st_mode & 0o005 for folder in folders)
 

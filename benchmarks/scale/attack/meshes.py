@@ -1,4 +1,4 @@
-"""Hostile meshes, as objects of scenes and as what is baked."""
+"""Hostile meshes, as objects of scenes and as input of bakes."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from benchmarks.scale.attack.samples import Build, Place, file_of
 
 
 def _zipped(outer: str, inner: str, size: int) -> Build:
-    """An archive of one file of zeros."""
+    """Return an archive of one file of zeros."""
 
     def build(place: Place) -> str:
         with (
@@ -29,7 +29,7 @@ def _zipped(outer: str, inner: str, size: int) -> Build:
 
 
 def _sparse(name: str, head: bytes, size: int) -> Build:
-    """A file of zeros that takes no room on disk."""
+    """Write a sparse file of zeros."""
 
     def build(place: Place) -> str:
         path = place.write(name, head)
@@ -47,7 +47,7 @@ def _glb(content: dict[str, object]) -> bytes:
 
 
 def _gltf(uri: str, count: int = 3) -> str:
-    """A mesh in glTF whose numbers are in another file."""
+    """Write a glTF mesh with its numbers in another file."""
     return json.dumps(
         {
             "asset": {"version": "2.0"},
@@ -70,7 +70,7 @@ def _ply(vertices: int, faces: int, kind: str = "binary_little_endian") -> str:
 
 
 def _textured(uri: str) -> Build:
-    """An OBJ mesh whose material names a texture."""
+    """Write an OBJ mesh whose material names a texture."""
 
     def build(place: Place) -> str:
         place.write("m.mtl", f"newmtl a\nmap_Kd {uri.replace('{outside}', str(place.outside))}\n")
@@ -170,11 +170,11 @@ MESHES: Mapping[str, tuple[str, Build]] = {
 
 
 _READ = ("OBJ of infinite size", "OBJ of 3 million faces in a line")
-"""Meshes that are read, and that the check has something to say of."""
+"""Meshes that are readable, with findings of the check."""
 
 
 def _in_scene(build: Build) -> Callable[[Place], object]:
-    """A scene with the mesh as a shape."""
+    """Write a scene with the mesh as a shape."""
 
     def made(place: Place) -> None:
         name = build(place)

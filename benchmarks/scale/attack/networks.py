@@ -1,4 +1,4 @@
-"""Hostile networks in ONNX, as models of depth and of masks, and pickled weights."""
+"""Hostile ONNX networks, as models of depth and of masks, and pickled weights."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def _varint(value: int) -> bytes:
 
 
 def field(number: int, value: int | bytes | str) -> bytes:
-    """One field of a message of Protocol Buffers."""
+    """Encode one field of a message of Protocol Buffers."""
     if isinstance(value, int):
         return _varint(number << 3) + _varint(value)
     data = value.encode() if isinstance(value, str) else value
@@ -46,7 +46,7 @@ def field(number: int, value: int | bytes | str) -> bytes:
 
 
 def tensor(name: str, shape: tuple[int, ...], raw: bytes | None, external: Mapping[str, str] | None = None) -> bytes:
-    """A tensor of floats, whose numbers are given or in another file."""
+    """Encode a tensor of floats, with its numbers inline or in another file."""
     data = b"".join(field(1, edge) for edge in shape) + field(2, 1) + field(8, name)
     if external is not None:
         entries = b"".join(field(13, field(1, key) + field(2, value)) for key, value in external.items())
@@ -60,12 +60,12 @@ def _value(name: str, shape: tuple[int | str, ...], kind: int = 1) -> bytes:
 
 
 def node(kind: str, inputs: tuple[str, ...], output: str, attributes: bytes = b"") -> bytes:
-    """An operation of a network."""
+    """Encode an operation of a network."""
     return b"".join(field(1, name) for name in inputs) + field(2, output) + field(4, kind) + attributes
 
 
 def network(nodes: list[bytes], initializers: list[bytes] | None = None, edge: int | str = 28) -> bytes:
-    """A network of one picture ``image`` to ``depth``."""
+    """Encode a network from an image ``image`` to ``depth``."""
     graph = b"".join(field(1, one) for one in nodes) + field(2, "graph")
     graph += b"".join(field(5, one) for one in initializers or [])
     graph += field(11, _value("image", (1, 3, edge, edge))) + field(12, _value("depth", (1, 1, edge, edge)))
@@ -73,13 +73,13 @@ def network(nodes: list[bytes], initializers: list[bytes] | None = None, edge: i
 
 
 def _added(initializer: bytes) -> bytes:
-    """A network of the mean of the colours and of weights."""
+    """Encode a network that adds weights to the mean of the colours."""
     channels = field(5, field(1, "axes") + field(8, 1) + field(20, 7))
     return network([node("Add", ("image", "w"), "sum"), node("ReduceMean", ("sum",), "depth", channels)], [initializer])
 
 
 def external_weights(location: str, length: int = 4) -> Callable[[Place], bytes]:
-    """Maker of a network whose weights are in a file."""
+    """Return a function that writes a network with its weights in a file."""
     return lambda place: _added(
         tensor(
             "w",

@@ -27,7 +27,7 @@ def _photos(folder: Path) -> None:
 
 
 def colmap_capture(place: Place) -> Path:
-    """Four photographs and a valid COLMAP model of them in text; returns the model's folder."""
+    """Write four photographs and a valid COLMAP model of them in text; return the model's folder."""
     _photos(place.inside / "photos")
     points = range(1, 60)
     images = [
@@ -43,7 +43,7 @@ def colmap_capture(place: Place) -> Path:
 
 
 def capture_folder(place: Place) -> Path:
-    """A valid capture of four photographs, beside a COLMAP model of them; returns its folder."""
+    """Write a valid capture of four photographs, beside a COLMAP model of them; return its folder."""
     from mitsplat.capture.capture import Capture, Photo
     from mitsplat.geometry.camera import Camera
 
@@ -71,7 +71,7 @@ def _replaced(file: str, change: Callable[[str], str]) -> Callable[[Place], obje
 
 
 def _binary(file: str, data: bytes) -> Callable[[Place], object]:
-    """A model in binary of which one file is given."""
+    """Write a binary model with one given file."""
 
     def build(place: Place) -> None:
         model = colmap_capture(place)
@@ -159,7 +159,7 @@ def _model_attacks() -> Iterator[Attack]:
 
 
 def transforms(place: Place, **changes: Any) -> None:
-    """Four photographs and their ``transforms.json``, with keys of the first frame or of all replaced."""
+    """Write four photographs and their ``transforms.json``, with replaced keys of the first frame or of all."""
     _photos(place.inside / "photos")
     frames = [
         {"file_path": f"photos/{index}.png", "transform_matrix": np.eye(4).tolist(), **(changes if not index else {})}
@@ -187,7 +187,7 @@ TRANSFORM_FILES: Mapping[str, Callable[[Place], object]] = {
 
 
 def _spec(change: Callable[[dict[str, Any]], object]) -> Callable[[Place], object]:
-    """A capture with a change of its ``capture.json``."""
+    """Write a capture with a changed ``capture.json``."""
 
     def build(place: Place) -> None:
         path = capture_folder(place) / "capture.json"
@@ -199,7 +199,7 @@ def _spec(change: Callable[[dict[str, Any]], object]) -> Callable[[Place], objec
 
 
 def _array(name: str, values: np.ndarray[Any, Any]) -> Callable[[Place], object]:
-    """A capture with an array of its points replaced."""
+    """Write a capture with one replaced array of its points."""
 
     def build(place: Place) -> None:
         folder = capture_folder(place)

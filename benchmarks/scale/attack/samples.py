@@ -1,4 +1,4 @@
-"""Folder in which an attack takes place, and valid files that attacks are made of."""
+"""Folder of an attack, and valid files as the basis of attacks."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ lights:
 output: {width: 64, height: 48, layouts: 1, views: 2, formats: [yolo, coco]}
 seed: 7
 """
-"""Small, and rendered in seconds."""
+"""A small scene, rendered in seconds."""
 
 
 class Samples:
-    """Valid files of every kind below a folder; a dataset only where it is asked for.
+    """Valid files of every kind below a folder; the dataset is rendered on demand.
 
     Args:
-        folder: Where they are made.
+        folder: Their folder.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -46,7 +46,7 @@ class Samples:
 
     @property
     def finished(self) -> Path:
-        """Folder of the valid scene and its dataset of two frames."""
+        """Return the folder of the valid scene and its dataset of two frames."""
         return self.folder / "finished"
 
     def render_dataset(self) -> None:
@@ -67,10 +67,10 @@ class Place:
     """Folders of one attack.
 
     Attributes:
-        root: Holds the others.
-        inside: Current folder of the commands, which holds what they are given.
+        root: Parent of the others.
+        inside: Current folder of the commands, with their input.
         outside: Files that no command may read, change or add to.
-        valid: Where valid files are.
+        valid: Folder of valid files.
     """
 
     root: Path
@@ -80,7 +80,7 @@ class Place:
 
     @classmethod
     def make(cls, root: Path, valid: Samples, colour: tuple[int, int, int], word: str) -> Place:
-        """New folders, with a picture of one colour and texts with a word outside."""
+        """Create the folders, with an image of one colour and texts with a word outside."""
         place = cls(root, root / "inside", root / "outside", valid)
         for folder in (place.inside, place.outside, place.outside / "folder"):
             folder.mkdir(parents=True)
@@ -93,11 +93,11 @@ class Place:
 
     @property
     def samples(self) -> Path:
-        """Folder of the valid files."""
+        """Return the folder of the valid files."""
         return self.valid.folder
 
     def take(self, *names: str, into: str = "") -> Path:
-        """Copy valid files or folders here; returns the last of them."""
+        """Copy valid files or folders here; return the last of them."""
         target = self.inside / into
         target.mkdir(parents=True, exist_ok=True)
         for name in names:
@@ -109,19 +109,19 @@ class Place:
         return target / Path(names[-1]).name
 
     def take_dataset(self) -> Path:
-        """A copy of the finished dataset and its scene; returns the dataset's folder."""
+        """Copy the finished dataset and its scene; return the dataset's folder."""
         shutil.copytree(self.valid.finished, self.inside, dirs_exist_ok=True)
         return self.inside / "dataset"
 
     def write(self, name: str, content: str | bytes) -> Path:
-        """A new file below ``inside``."""
+        """Write a new file below ``inside``."""
         path = self.inside / name
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(content if isinstance(content, bytes) else content.encode())
         return path
 
     def scene(self, **changes: str) -> Path:
-        """The valid scene and its asset, with lines that begin with a key replaced or added."""
+        """Write the valid scene and its asset, with lines of given keys replaced or added."""
         if not (self.inside / "nut").exists():
             self.take("nut")
         lines = SCENE.splitlines()

@@ -26,7 +26,7 @@ def _keys(**changes: str) -> Build:
 
 
 def _tree(place: Place) -> None:
-    """Folders ``deep``, three in each down to seven levels: 3,280 in all."""
+    """Create the folders ``deep``, three in each down to seven levels: 3,280 in all."""
     level = [place.inside / "deep"]
     for _ in range(7):
         level = [folder / name for folder in level for name in "abc"]
@@ -52,7 +52,7 @@ def _pattern(key: str) -> Build:
 
 
 def _looped(place: Place) -> None:
-    """A folder that holds links to itself, and a pattern through them."""
+    """Write a folder with links to itself, and a pattern through them."""
     (place.inside / "deep").mkdir()
     for name in "abcd":
         (place.inside / "deep" / name).symlink_to(place.inside / "deep")
@@ -168,7 +168,7 @@ VALUES: Mapping[str, tuple[str, Build]] = {
 }
 
 _WRONG = ("read outside", "break files of labels", "break a terminal")
-"""Harm for which a scene must be refused; of others, the check may also say what is questionable."""
+"""Harm for which a scene must be refused; for others, the check may also print warnings."""
 _MAY_BE_GOOD = "class that turns"
 
 

@@ -1,4 +1,4 @@
-"""Hostile files of splats, as what is imported."""
+"""Hostile splat files, as input of imports."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from benchmarks.scale.attack.samples import Build, Place, file_of
 
 
 def _changed(name: str, change: Callable[[bytes], bytes]) -> Build:
-    """A valid file with other bytes."""
+    """Write a changed valid file."""
 
     def build(place: Place) -> str:
         place.write(name, change((place.samples / name).read_bytes()))
@@ -26,7 +26,7 @@ def _changed(name: str, change: Callable[[bytes], bytes]) -> Build:
 
 
 def _sog(files: Mapping[str, bytes | int]) -> Build:
-    """An archive; a number stands for so many zeros."""
+    """Write an archive; a number stands for as many zeros."""
 
     def build(place: Place) -> str:
         with zipfile.ZipFile(place.inside / "a.sog", "w", zipfile.ZIP_DEFLATED) as archive:

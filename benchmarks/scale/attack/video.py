@@ -12,7 +12,7 @@ from benchmarks.scale.attack.samples import Place
 
 Build = Callable[[Place], object]
 CAPTURE = ("mitsplat", "capture", "a.mp4", "-o", "made", "--frames", "3")
-"""Few frames: of those of a video that can be decoded, cameras are looked for."""
+"""Settings with few frames: if a video can be decoded, structure from motion runs on them."""
 
 
 def _file(make: Callable[[Place], str | bytes]) -> Build:
@@ -20,7 +20,7 @@ def _file(make: Callable[[Place], str | bytes]) -> Build:
 
 
 def _walk(change: Callable[[bytes], bytes]) -> Build:
-    """The valid video with other bytes; its kind is found by what it holds."""
+    """Write the changed valid video; its format is detected from its content."""
     return lambda place: place.write("a.mp4", change((place.samples / "walk.avi").read_bytes()))
 
 
@@ -68,7 +68,7 @@ VIDEOS: Mapping[str, Build] = {
 }
 
 DECODED = ("1 GB of zeros at its end", "frames of 60,000 x 60,000", "index of rubbish", "chunk of 4 GB")
-"""Videos whose frames FFmpeg finds all the same."""
+"""Videos whose frames FFmpeg finds in spite of the damage."""
 
 ATTACKS = tuple(
     Attack(

@@ -1,4 +1,4 @@
-"""Hostile visitors of the viewer: pages of other sites, foreign names, many clients and messages of no sense."""
+"""Hostile clients of the viewer: pages of other sites, foreign host names, many clients and invalid messages."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from benchmarks.scale.attack.attack import FINE, SECRET_WORD, Attack
 from benchmarks.scale.attack.samples import Place
 
 _WAIT = 90.0
-"""Time in which the viewer must be ready [s]."""
+"""Time limit for the start of the viewer [s]."""
 _CAMERA = {
     "type": "ViewerCameraMessage",
     "wxyz": [1.0, 0.0, 0.0, 0.0],
@@ -30,11 +30,11 @@ _CAMERA = {
 }
 _CLIENTS = 150
 _MESSAGE = 49 << 20
-"""Size of the largest message that is sent [bytes]."""
+"""Size of the largest message sent [bytes]."""
 
 
 def address(place: Place) -> str:
-    """Address that the viewer printed, once it answers there."""
+    """Return the address that the viewer printed, once it answers there."""
     until = time.monotonic() + _WAIT
     while time.monotonic() < until:
         found = re.search(r"http://\S+", (place.root / "output.txt").read_text(errors="replace"))
@@ -56,7 +56,7 @@ def _host(url: str) -> tuple[str, int]:
 
 
 def ask(url: str, path: str | None = None, **headers: str) -> tuple[int, dict[str, str], bytes]:
-    """Status, headers and body of the page, or of another path of its server; ``host_`` is the header Host."""
+    """Return status, headers and body of the page or another path of its server; ``host_`` is the header Host."""
     parts = urlsplit(url)
     connection = http.client.HTTPConnection(*_host(url), timeout=30)
     connection.putrequest(
@@ -82,7 +82,7 @@ def _alive(url: str) -> Iterator[str]:
 
 
 def _visits(place: Place) -> Iterator[str]:
-    """Requests of pages of other sites, and of names that lead here."""
+    """Send requests from pages of other sites, and for names that resolve to this machine."""
     url = address(place)
     status, headers, _ = ask(url)
     if status != 200:
@@ -128,7 +128,7 @@ def _connect(url: str, stack: ExitStack) -> Any:
 
 
 def _sent(*messages: object) -> Callable[[Place], Iterator[str]]:
-    """Messages of a client, each over a connection of its own; bytes are sent as they are."""
+    """Send messages of a client, each over its own connection; bytes are sent unchanged."""
 
     def during(place: Place) -> Iterator[str]:
         import msgspec
@@ -144,7 +144,7 @@ def _sent(*messages: object) -> Callable[[Place], Iterator[str]]:
                     connection.send(msgspec.msgpack.encode(message) if not isinstance(message, bytes) else data)
                     time.sleep(1)
             except (OSError, WebSocketException):
-                continue  # refused, which is well
+                continue  # refused, as required
         time.sleep(1)
         yield from _alive(url)
 
@@ -152,7 +152,7 @@ def _sent(*messages: object) -> Callable[[Place], Iterator[str]]:
 
 
 def _crowd(place: Place) -> Iterator[str]:
-    """Many clients that read nothing of what they are sent."""
+    """Connect many clients that never read."""
     from websockets.exceptions import WebSocketException
 
     url = address(place)
@@ -168,7 +168,7 @@ def _crowd(place: Place) -> Iterator[str]:
 
 
 def _half_open(place: Place) -> Iterator[str]:
-    """Connections on which no request is ever completed."""
+    """Open connections that never complete a request."""
     url = address(place)
     with ExitStack() as stack:
         for _ in range(_CLIENTS):

@@ -18,17 +18,17 @@ FILM = (
 
 
 def picture(value: str, name: str = "filename") -> str:
-    """A sky that shows a picture in every direction."""
+    """Return a sky that shows an image in every direction."""
     return f'<emitter type="envmap"><string name="{name}" value="{value}"/></emitter>'
 
 
 def scene(body: str, head: str = "") -> str:
-    """A Mitsuba scene of 16x12 pixels."""
+    """Return a Mitsuba scene of 16x12 pixels."""
     return f'{head}<scene version="3.9.0">{FILM}{body}</scene>'
 
 
 def _files(**texts: str) -> Callable[[Place], object]:
-    """Files below ``scene/``, with ``/`` written as ``__``, and the folder ``scene/sub/deep``."""
+    """Write files below ``scene/``, with ``/`` written as ``__``, and the folder ``scene/sub/deep``."""
 
     def build(place: Place) -> None:
         (place.inside / "scene/sub/deep").mkdir(parents=True)
@@ -39,7 +39,7 @@ def _files(**texts: str) -> Callable[[Place], object]:
 
 
 def _link(name: str, target: str, body: str) -> Callable[[Place], object]:
-    """A scene beside a link to a file or a folder outside."""
+    """Write a scene beside a link to a file or a folder outside."""
 
     def build(place: Place) -> None:
         (place.inside / "scene/sub/deep").mkdir(parents=True)
@@ -74,7 +74,7 @@ _SECRET = '<string name="filename" value="../../outside/secret.txt"/>'
 
 
 def _decoys(**texts: str) -> Callable[[Place], object]:
-    """Files as of :func:`_files`, and harmless ones where a reader of the text alone would look for them."""
+    """Write files as :func:`_files` does, and harmless ones where a text-based reader would look for them."""
 
     def build(place: Place) -> None:
         _files(**texts)(place)

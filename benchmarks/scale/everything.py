@@ -4,9 +4,9 @@
 
 The scene is ``everything.yaml`` beside this file. Objects are those that the scene draws, at random poses about the
 mat, without physics. Unlike in settled layouts, they intersect, occlude each other and leave the image. Audited frames
-use 7 points of a lens, because labels are those of its centre. Cost is that of an image with its files, averaged over
-layouts, beside the same scene without variations. A thin lens, which takes 7 to 37 images, and metal, which is path
-traced, are counted separately.
+use 7 points of a lens, because labels are those of its centre. Cost is the mean time of an image with its files,
+without the first third of the frames, beside the same scene without variations. A thin lens, which takes 7 to 37
+images, and metal, which is path traced, are counted separately.
 """
 
 from __future__ import annotations

@@ -122,9 +122,7 @@ def test_moving_surfaces_are_swept_by_the_exposure(belt_data: SceneData) -> None
 
 
 def test_a_dataset_with_a_belt_has_no_violations(belt_data: SceneData, write_scene: WriteScene, tmp_path: Path) -> None:
-    """Labels follow the carried objects, the audit accepts their poses, and a frame remade from the dataset is
-    identical.
-    """
+    """Labels follow the carried objects, the audit accepts their poses, and a remade frame is identical."""
     belt_data["labels"] = {"min_pixels": 1, "min_fragment": 1}
     belt_data["camera"]["motion"] = {"exposure": [0.01, 0.02]}
     belt_data["output"]["formats"] = ["yolo", "coco", "poses", "bop", "flow", "depth", "colmap"]

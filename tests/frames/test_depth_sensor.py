@@ -129,8 +129,9 @@ class TestTimeOfFlight:
         assert turned.std() / facing.std() == pytest.approx(np.sqrt(2), rel=0.1)
 
     def test_pixels_at_an_edge_mix_both_depths(self) -> None:
-        """The phasors of both surfaces add up, weighted by the Gaussian's share of each; pixels away from the edge do
-        not change.
+        """The phasors of both surfaces add up, weighted by the Gaussian's share of each.
+
+        Pixels away from the edge do not change.
         """
         depth = np.full((96, 128), 1.0)
         depth[:, 64:] = 1.5

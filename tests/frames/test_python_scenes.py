@@ -211,8 +211,9 @@ def test_flow_of_a_removed_object_is_unknown(scene: ms.Scene, above: ms.Camera) 
 
 
 def test_a_sequence_has_the_flow_of_its_objects_and_cameras(scene: ms.Scene, above: ms.Camera) -> None:
-    """A nut slides by 5 mm per frame below the camera: flow f 0.005 / depth px, depth 0.19 m at its top; the table is
-    static.
+    """A nut slides by 5 mm per frame below the camera: flow f 0.005 / depth px, depth 0.19 m at its top.
+
+    The table is static.
     """
     steps = [{"nut": [moved(0.005 * n - 0.005, 0, 0.005)], "bolt": [moved(0.03, 0.02, 0.025)]} for n in range(3)]
     layouts = (ms.Layout.from_poses(scene, poses, index=n) for n, poses in enumerate(steps))  # like a simulator

@@ -38,8 +38,9 @@ def test_a_target_equals_the_labels(scene: Scene) -> None:
 
 
 def test_workers_share_the_layouts_of_an_endless_scene(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Sets the worker information of a DataLoader in this process; two worker processes would only compile kernels
-    again.
+    """Sets the worker information of a DataLoader in this process.
+
+    Two worker processes would only compile kernels again.
     """
     from torch.utils.data._utils.worker import WorkerInfo
 

@@ -32,9 +32,7 @@ class Seen:
 
 CLASSES = ("bolt", "nut")
 ROUNDED = 4
-"""Number of pixels that may differ if a resampled point lies on a pixel's corner, in the middle of a diagonal
-step.
-"""
+"""Pixels that may differ if a resampled point lies on a corner, in the middle of a diagonal step."""
 
 
 def truth_of(instance_map, second=None, alone=None):
@@ -195,8 +193,9 @@ class TestRules:
         assert [entry.id for entry in kept.instances] == [1, 2, 3]
 
     def test_agreement_of_shifted_masks_equals_its_closed_form(self):
-        """Two 20 x 20 squares, one 3 px to the right of the other: IoU 17/23; only the parallel edges are within 2
-        px.
+        """Two 20 x 20 squares, one 3 px to the right of the other, have an IoU of 17/23.
+
+        Only the parallel edges are within 2 px.
         """
         ids = np.zeros((40, 60), dtype=np.uint16)
         ids[10:30, 10:30] = 1

@@ -41,8 +41,9 @@ BIN = {"name": "bin", "bin": {"size": [0.12, 0.09, 0.05], "position": [0, 0, 0.0
 
 
 def test_a_bin_has_five_walls_around_its_interior(scene_data, write_scene):
-    """The volume of the walls is outer minus inner; the inside is empty, and the middle of its floor is where
-    stated.
+    """The volume of the walls is outer minus inner.
+
+    The inside is empty, and the middle of its floor is where stated.
     """
     from mitsplat.geometry.mesh_distance import DistanceSurface
 
@@ -129,10 +130,10 @@ def test_upright_objects_keep_their_vertical(scene_data, write_scene):
 
 
 def test_packed_objects_stand_in_rows(scene_data, write_scene):
-    """Bolts of 10 x 10 mm, rotated by quarter turns up to 3 degrees off, take at most 11 mm by 11 mm; gaps are 2 to 5
-    mm.
+    """Bolts of 10 x 10 mm, rotated by quarter turns up to 3 degrees off, take at most 11 mm by 11 mm.
 
-    At most five stand in a row of 60 mm. The number of rows is minimal, and no row is far from the next.
+    Gaps are 2 to 5 mm. At most five stand in a row of 60 mm. The number of rows is minimal, and no row is far from the
+    next.
     """
     scene_data["objects"] = [{"asset": "assets/bolt", "count": 9}]
     scene_data["region"] = {"min": [-0.03, -0.03, 0.0], "max": [0.03, 0.03, 0.08]}

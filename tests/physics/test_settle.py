@@ -348,8 +348,9 @@ def test_objects_rest_on_the_drawn_environment(scene_data, write_scene):
 
 
 def test_standoff_of_a_hull_equals_its_closed_form():
-    """Pieces equal to the mesh have no standoff; the hull of an L has half a leg, where its long face spans the
-    notch.
+    """Pieces equal to the mesh have no standoff.
+
+    The hull of an L has half a leg, where its long face spans the notch.
     """
     from mitsplat.geometry.mesh_distance import DistanceSurface, standoff
 

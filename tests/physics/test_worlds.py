@@ -75,8 +75,9 @@ def test_free_fall_equals_its_closed_form(stepper):
 
 @pytest.mark.parametrize("stepper", STEPPERS)
 def test_poses_are_those_of_the_mesh_frame(stepper):
-    """A body spinning in free fall rotates about its centre of mass, which follows the parabola; its origin does
-    not.
+    """A body spinning in free fall rotates about its centre of mass, which follows the parabola.
+
+    Its origin does not.
     """
     box = trimesh.creation.box((0.02, 0.04, 0.06)).apply_translation((0.3, -0.2, 0.1))
     start = pose_at((0, 0, 2), Rotation.from_rotvec((0.4, -1.0, 0.3)))
@@ -245,8 +246,9 @@ def test_worlds_in_one_simulation_do_not_interact():
 
 
 def test_mean_speeds_equal_displacement_by_time():
-    """A rotation of t about an axis through the centre of mass and a displacement of w in s seconds: t / s and w /
-    s.
+    """A rotation of t about an axis through the centre of mass in s seconds has the speed t / s.
+
+    A displacement of w has the speed w / s.
     """
     from mitsplat.physics.rest import _mean_speeds
 
@@ -425,11 +427,10 @@ def test_a_ball_rests_inside_a_cup(stepper):
 
 @pytest.mark.parametrize("stepper", STEPPERS)
 def test_thrown_bodies_follow_their_closed_form(stepper):
-    """The position after t is r + v t - g t (t + h) / 2 with semi-implicit steps of h; spin w about a principal axis
-    is constant.
+    """The position after t is r + v t - g t (t + h) / 2 with semi-implicit steps of h.
 
-    MuJoCo integrates the frame's origin: at a distance a from it, the centre of mass is off by the centripetal
-    h w^2 a t / 2.
+    Spin w about a principal axis is constant. MuJoCo integrates the frame's origin: at a distance a from it, the centre
+    of mass is off by the centripetal h w^2 a t / 2.
     """
     box = trimesh.creation.box((0.02, 0.04, 0.06)).apply_translation((0.1, 0, 0))
     start = pose_at((0, 0, 1.0), Rotation.from_euler("z", 30, degrees=True))

@@ -67,8 +67,9 @@ def test_the_hull_of_splats_ends_at_the_floor(known_object: KnownObject) -> None
 
 
 def test_masks_do_not_cut_parts_that_may_be_hidden(known_object: KnownObject) -> None:
-    """A third of each image is occluded: as background, it would cut the object, and so would the hull of masks
-    alone.
+    """A third of each image is occluded.
+
+    As background, it would cut the object, and so would the hull of masks alone.
     """
     veil = np.zeros(views_of(known_object)[0].mask.shape, dtype=np.float32)
     veil[:, : veil.shape[1] // 2] = 1

@@ -76,7 +76,7 @@ def test_surroundings_floaters_and_needles_are_removed(known_object: KnownObject
 
 
 def test_lost_alpha_is_the_share_that_masks_omit(known_object: KnownObject) -> None:
-    """Where splats are missing in the middle of the masks, the lost alpha equals the share of uncovered pixels."""
+    """The lost alpha equals the share of uncovered pixels if splats are missing in the middle of the masks."""
     views = [
         MaskedView(camera, mask if number % 2 else np.zeros_like(mask))
         for number, (camera, _, mask, _) in enumerate(photo.fitted(160) for photo in known_object.capture.photos)

@@ -133,8 +133,9 @@ def test_a_drawing_is_registered_with_its_scale(known_object: KnownObject, seed:
 
 @pytest.mark.parametrize("seed", [1, 4, 6])
 def test_a_nearly_round_drawing_is_rotated_by_its_edges(known_object: KnownObject, seed: int) -> None:
-    """Nine of ten points are on a ball and do not depend on its rotation: the rest of a box and a pocket
-    determines it.
+    """Nine of ten points are on a ball and do not depend on its rotation.
+
+    The rest of a box and a pocket determines the rotation.
     """
     points = np.asarray(trimesh.sample.sample_surface(known_object.mesh, 1000, seed=seed)[0])
     points += np.random.default_rng(seed).normal(0, 1e-4, points.shape)

@@ -160,7 +160,7 @@ def test_relit_object_takes_direct_light_reflected_light_and_a_highlight(picture
 
 
 def test_number_of_rays_is_doubled_until_it_is_the_wanted_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where a pixel has several sample points, the number is rounded down for each of them."""
+    """The number is rounded down for each of several sample points of a pixel."""
     ensure_variant()
     from mitsplat.renderer.light.light import Accuracy
     from mitsplat.renderer.light.light_filter import LightFilter

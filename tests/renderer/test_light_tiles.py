@@ -74,8 +74,9 @@ def test_tiles_equal_those_of_a_slow_loop(width: int, height: int) -> None:
 
 
 def light_below_plate(camera: Camera, edge: float, height: float, **others: dict[str, Any]) -> np.ndarray:
-    """Render light with four seeds (4, H, W) on a floor under a uniform sky, occluded by a small plate and other
-    shapes.
+    """Render light with four seeds (4, H, W) on a floor under a uniform sky.
+
+    A small plate and other shapes occlude it.
     """
     plate = trimesh.creation.box(bounds=[[-edge / 2, -edge / 2, height], [edge / 2, edge / 2, height + 1e-4]])
     shapes = {

@@ -257,8 +257,9 @@ TURNING = [turned(0.02 * step) for step in range(6)]
 
 
 def test_tiles_sort_by_the_depth_at_the_visible_footprint() -> None:
-    """The sort depth is at the mean of the product of two normal distributions: the footprint, and the tile's
-    pixels.
+    """The sort depth is at the mean of the product of two normal distributions.
+
+    These are the footprint, and the distribution of the tile's pixels.
     """
     ensure_variant()
     from mitsplat.renderer.projection.records import GaussianRecord

@@ -65,7 +65,7 @@ def test_discs_cover_the_pixels_whose_centres_see_them(samples: int, camera: Cam
 
 @pytest.mark.parametrize("samples", [1, 2, 3])
 def test_a_mesh_behind_splats_has_the_id_where_pixel_centres_see_it(samples: int) -> None:
-    """Where less than half of the centre ray is blocked, id and depth are those of the visible mesh behind."""
+    """Id and depth are those of the visible mesh behind if less than half of the centre ray is blocked."""
     ensure_variant()
     import trimesh
 

@@ -191,9 +191,7 @@ def test_powers_of_two_agree_with_numpy() -> None:
 
 
 def test_equal_depths_keep_their_order_when_others_come_between() -> None:
-    """There are more coincident layers than one walk can hold, and small Gaussians in front that come later in the
-    list.
-    """
+    """More coincident layers than one walk can hold, and small Gaussians in front that come later in the list."""
     layers = one((0.5, 0.5, 0.5), opacity=0.2, count=24)
     layers = replace(layers, sh=np.random.default_rng(3).uniform(-1, 1, layers.sh.shape))
     front = [one((0.02, 0.02, 0.02), mean=(0.0, 0.0, -0.1 - 0.02 * i), opacity=0.1) for i in range(5)]
@@ -522,9 +520,7 @@ def test_repeated_runs_and_one_thread_give_the_same_bytes() -> None:
 
 
 def test_a_second_frame_compiles_no_new_kernel() -> None:
-    """The kernels of another camera and other splats are those of the first frame, not other kernels from the disk
-    cache.
-    """
+    """Another camera and other splats use the kernels of the first frame, not others from the disk cache."""
 
     def kernels(splats: Splats, camera: Camera) -> set[int]:
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):

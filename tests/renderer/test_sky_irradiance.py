@@ -35,8 +35,9 @@ def by_quadrature(emitter: object, normals: np.ndarray) -> np.ndarray:
 
 
 def test_the_irradiance_table_agrees_with_a_quadrature() -> None:
-    """Errors are within 1 % of the sky's largest irradiance where the sun sets, and 0.25 % in the mean of all
-    normals.
+    """Errors are within 1 % of the sky's largest irradiance where the sun sets.
+
+    They are within 0.25 % in the mean of all normals.
     """
     ensure_variant()
     scene = mi.load_dict({"type": "scene", "sky": sky_with_a_sun()})

@@ -92,8 +92,9 @@ def test_both_sorts_give_the_same_lists(monkeypatch: pytest.MonkeyPatch) -> None
 def test_projection_and_walk_of_both_devices_give_the_same_images(
     preset: PresetName, lens: dict[str, tuple[float, ...]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Compares all Gaussians with one ray per lane, as on a GPU, to visible ones with four; also near the camera
-    plane.
+    """Compares all Gaussians with one ray per lane, as on a GPU, to visible ones with four.
+
+    Includes a camera among the Gaussians, with some near its plane.
     """
     from mitsplat.renderer.splatting import march, tiles
     from mitsplat.renderer.splatting.lanes import rows_together

@@ -43,10 +43,10 @@ def cameras(top: float) -> list[Camera]:
 
 
 def true_depth(mesh: trimesh.Trimesh, camera: Camera) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.bool_]]:
-    """Return the depth at which each ray enters a convex solid (H, W), 0 for a miss, and the pixels decidable in
-    float32.
+    """Return the depth at which each ray enters a convex solid (H, W), and the pixels decidable in float32.
 
-    A ray enters at the last plane that it crosses from outside, unless it left through another plane before.
+    The depth is 0 for a miss. A ray enters at the last plane that it crosses from outside, unless it left through
+    another plane before.
     """
     x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
     slopes = camera.ray_slopes(np.stack([x.ravel(), y.ravel()], axis=1))

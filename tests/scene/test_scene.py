@@ -69,8 +69,9 @@ def test_entries_of_one_asset_share_its_data(scene_data: SceneData, write_scene:
 def test_every_file_is_read_once_before_errors_are_reported(
     scene_data: SceneData, write_scene: WriteScene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The first object does not fit into the region and the asset of the last one is missing: the latter is
-    reported.
+    """The first object does not fit into the region and the asset of the last one is missing.
+
+    The latter is reported.
     """
     nut, read, load = scene_data["objects"][0]["asset"], [], Asset.load
     monkeypatch.setattr(Asset, "load", lambda folder: (read.append(Path(folder).name), load(folder))[1])
@@ -159,8 +160,9 @@ def test_an_enclosure_leaves_room_for_the_largest_object_if_there_is_something_t
 
 
 def changed(data: SceneData, **changes: Any) -> SceneData:
-    """Return a copy of the data with values replaced by dotted key, ``__`` for the dot and digits for list
-    positions.
+    """Return a copy of the data with values replaced by dotted key.
+
+    ``__`` stands for the dot, and digits for list positions.
     """
     data = copy.deepcopy(data)
     for path, value in changes.items():

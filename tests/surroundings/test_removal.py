@@ -124,8 +124,9 @@ def test_all_picked_objects_are_removed(captured: Capture) -> None:
 
 
 def wall(y: float) -> tuple[Splats, Splats]:
-    """Return a wall across the table at ``y`` in linear colour gradients, without the part hidden by the cube
-    before it.
+    """Return a wall across the table at ``y`` in linear colour gradients.
+
+    The part hidden by the cube before it is missing.
     """
     whole = placed(sheet((0.6, 1.2), 0.02, 31), (0, y, HEIGHT + 0.3), 1)
     colour = np.column_stack([0.5 + 0.3 * whole.means[:, 0], 0.3 + 0.4 * whole.means[:, 2], np.full(len(whole), 0.6)])

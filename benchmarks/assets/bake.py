@@ -52,7 +52,7 @@ def main() -> None:
     parser.add_argument("--gaussians", type=int, default=20000)
     parser.add_argument("--subdivide", type=int, default=0)
     parser.add_argument("--device", default="cpu")
-    parser.add_argument("--ready-pieces", action="store_true", help="a part's own, or the hull of a file")
+    parser.add_argument("--ready-pieces", action="store_true", help="use a part's own pieces, or a file's hull")
     parser.add_argument("--runs", type=int, default=1)
     arguments = parser.parse_args()
     device = use_device(arguments.device)

@@ -304,8 +304,8 @@ def main() -> None:
     parser.add_argument("--gaussians", type=int, default=30_000)
     parser.add_argument("--iterations", type=int, default=3000)
     parser.add_argument("--edge", type=int, default=800)
-    parser.add_argument("--ground", choices=list(GROUNDS), default="cloth", help="what the solid stands on")
-    parser.add_argument("--beside", action="store_true", help="another thing where the cameras look, and one click")
+    parser.add_argument("--ground", choices=list(GROUNDS), default="cloth", help="ground below the solid")
+    parser.add_argument("--beside", action="store_true", help="another object in the cameras' focus, and one click")
     parser.add_argument("--known-poses", action="store_true", help="give the true cameras, in unknown units")
     args = parser.parse_args()
     with recording("assets.clutter", parser, args, ignore=("out",)):

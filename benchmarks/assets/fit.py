@@ -41,13 +41,13 @@ from mitsplat.runtime import recorded_kernels as recorded
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("capture", type=Path, nargs="?")
-    parser.add_argument("--synthetic", metavar="ASSET", help="of scenes/assets, in place of a capture")
+    parser.add_argument("--synthetic", metavar="ASSET", help="asset of scenes/assets, instead of a capture")
     parser.add_argument("--iterations", type=int, default=7000)
     parser.add_argument("--gaussians", type=int, default=30_000)
     parser.add_argument("--edge", type=int, default=800)
     parser.add_argument("--device", default="cpu")
-    parser.add_argument("--replay", choices=("on", "off"), default="on", help="recordings of kernels")
-    parser.add_argument("--classic", action="store_true", help="classic densification of 3DGS in place of MCMC")
+    parser.add_argument("--replay", choices=("on", "off"), default="on", help="record and replay kernels")
+    parser.add_argument("--classic", action="store_true", help="classic densification of 3DGS instead of MCMC")
     parser.add_argument("--gsplat", action="store_true")
     args = parser.parse_args()
     if (args.capture is None) == (args.synthetic is None):
@@ -125,7 +125,7 @@ class Watch:
         step = statistics.median(self.spans)
         print(
             f"    {step:.2f} ms a step, {self.kernels:.2f} of them in kernels, {self.launches:.0f} launches, "
-            f"{self.compiled} kernels compiled in the steps that were watched"
+            f"{self.compiled} kernels compiled in the timed steps"
         )
         for value, unit, name in (
             (step, "ms", "step"),

@@ -54,8 +54,8 @@ def run(*words: object, folder: Path) -> tuple[int, str, float]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
-    parser.add_argument("--only", choices=FILES, help="this file alone")
-    parser.add_argument("--jobs", type=int, default=1, help="files at a time")
+    parser.add_argument("--only", choices=FILES, help="only this file")
+    parser.add_argument("--jobs", type=int, default=1, help="number of parallel imports")
     parser.add_argument("--keep", type=Path, help="folder for assets, scenes and datasets")
     arguments = parser.parse_args()
     ignore = ("folder", "keep", "jobs")

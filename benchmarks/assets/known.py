@@ -214,7 +214,7 @@ def main() -> None:
     parser.add_argument("--gaussians", type=int, default=30_000)
     parser.add_argument("--iterations", type=int, default=3000)
     parser.add_argument("--edge", type=int, default=800)
-    parser.add_argument("--variant", default="llvm_ad_rgb", help="Mitsuba's, such as cuda_ad_rgb")
+    parser.add_argument("--variant", default="llvm_ad_rgb", help="Mitsuba variant, such as cuda_ad_rgb")
     args = parser.parse_args()
     mi.set_variant(args.variant)
     with recording("assets.known", parser, args, ignore=("out",), gpu=args.variant.startswith("cuda")):

@@ -95,12 +95,12 @@ def run(log: Path, words: Sequence[str | Path]) -> dict[str, tuple[float, float]
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("photos", help="a folder, or clutter")
+    parser.add_argument("photos", help="folder of photographs, or clutter")
     parser.add_argument("out", type=Path)
-    parser.add_argument("--views", type=int, default=97, help="of the clutter")
+    parser.add_argument("--views", type=int, default=97, help="number of photographs of clutter")
     parser.add_argument("--width", type=int, default=4000)
     parser.add_argument("--samples", type=int, default=16)
-    parser.add_argument("--size", type=float, help="longest edge of the object [m]; known of the clutter")
+    parser.add_argument("--size", type=float, help="longest edge of the object [m]; known for clutter")
     parser.add_argument("--refine", action="store_true", help="refine the mesh as well")
     parser.add_argument("--device", default="cpu")
     args = parser.parse_args()

@@ -26,7 +26,7 @@ def main() -> None:
     """Run, print and compare."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("photos", type=Path, nargs="?", default=PHOTOS)
-    parser.add_argument("--count", type=int, default=20, help="first photos to take")
+    parser.add_argument("--count", type=int, default=20, help="number of first photos")
     parser.add_argument("--runs", type=int, default=30)
     options = parser.parse_args()
     with recording("assets.sfm", parser, options):

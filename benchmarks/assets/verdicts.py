@@ -311,9 +311,9 @@ def rank(results: Sequence[Mapping[str, Any]], figure_name: str, truth: str) -> 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("out", type=Path)
-    parser.add_argument("--only", nargs="+", choices=[case.name for case in CASES], help="these cases")
-    parser.add_argument("--judge", action="store_true", help="make verdicts and compare anew")
-    parser.add_argument("--done", action="store_true", help="those that are done")
+    parser.add_argument("--only", nargs="+", choices=[case.name for case in CASES], help="names of cases to run")
+    parser.add_argument("--judge", action="store_true", help="repeat verdicts and comparisons")
+    parser.add_argument("--done", action="store_true", help="only finished cases")
     args = parser.parse_args()
     ensure_variant()
     with recording("assets.verdicts", parser, args, ignore=("out", "judge", "done")):

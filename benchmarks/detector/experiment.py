@@ -149,11 +149,11 @@ def listed(
         if first is not None:
             wanted = [i for i in range(first * VIEWS // views) if i % VIEWS < views]
             if not found.keys() >= set(wanted):
-                raise SystemExit(f"{one}: its first {first} images are not all there")
+                raise SystemExit(f"{one}: some of its first {first} images are missing")
         some += [found[i] for i in wanted]
     if images is not None:
         if len(some) < images:
-            raise SystemExit(f"there are {len(some)} images, not {images}")
+            raise SystemExit(f"{images} images are required (got {len(some)})")
         some = [some[i] for i in sorted(np.random.default_rng(0).permutation(len(some))[:images])]
     folder.mkdir(parents=True, exist_ok=True)
     write_text(folder / "train.txt", "".join(f"{path}\n" for path in some))
@@ -171,10 +171,10 @@ def main() -> None:
     parser.add_argument("arm")
     parser.add_argument("seed", type=int)
     parser.add_argument("--plan", type=Path, default=PLAN)
-    parser.add_argument("--weights", type=Path, help="to start from; random ones if absent, or if the arm says so")
+    parser.add_argument("--weights", type=Path, help="initial weights; random if absent or if the arm requires it")
     parser.add_argument("--device", default="auto")
     parser.add_argument("--workers", type=int, default=4)
-    parser.add_argument("--fold", type=int, help="only train for this one, so that they can be trained side by side")
+    parser.add_argument("--fold", type=int, help="train only this fold, for parallel trainings")
     options = parser.parse_args()
     if options.fold is not None:
         trained = train_fold(options, read_arms(options.plan), options.fold)

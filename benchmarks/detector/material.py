@@ -81,11 +81,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("hope", type=Path)
     parser.add_argument("work", type=Path)
-    parser.add_argument("--gaussians", type=int, default=50000, help="of each scan")
+    parser.add_argument("--gaussians", type=int, default=50000, help="Gaussians per scan")
     parser.add_argument("--packages", type=int, default=PACKAGES)
     parser.add_argument("--bags", type=int, default=BAGS)
     parser.add_argument("--device", default="cpu")
-    parser.add_argument("--jobs", type=int, default=1, help="assets that are baked at once")
+    parser.add_argument("--jobs", type=int, default=1, help="number of parallel bakes")
     options = parser.parse_args()
     with recording("detector.material", parser, options, ignore=("hope", "work", "jobs"), gpu=options.device != "cpu"):
         make(options)

@@ -100,7 +100,9 @@ def compare(options: argparse.Namespace) -> None:
         ((np.min(shares), np.max(shares)), "", "visible fraction"),
     ):
         figure(value, unit, what)
-    print(f"{frames} images, {len(shares)} instances; models measure what is stated within {max(sizes):.4f} mm")
+    print(
+        f"{frames} images, {len(shares)} instances; model sizes agree with the stated ones within {max(sizes):.4f} mm"
+    )
     print(f"visible pixels of masks and scene_gt_info: at most {max(counts)} apart")
     print(f"pixels of silhouettes that differ: median {np.median(silhouettes):.2%}, worst {np.max(silhouettes):.2%}")
     print(f"boxes of silhouettes: median {np.median(boxes):.0f} px apart, worst {np.max(boxes):.0f} px")

@@ -455,7 +455,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=ROOT / "out" / "shadows")
     parser.add_argument("--scenes", nargs="*", choices=SETUPS, default=list(SETUPS))
     parser.add_argument("--lights", nargs="*", choices=LIGHTS, default=list(LIGHTS))
-    parser.add_argument("--samples", type=int, default=72, help="paths per pixel of a photograph")
+    parser.add_argument("--samples", type=int, default=72, help="paths per pixel of a path-traced image")
     options = parser.parse_args()
     ensure_variant()
     with recording("light.shadows", parser, options, ignore=("out",)):

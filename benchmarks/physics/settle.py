@@ -113,10 +113,10 @@ def try_settle(scene: Scene, index: int) -> Layout | None:
     try:
         layout = settle_layout(scene, index, cached=False)
     except InputError as error:
-        print(f"  given up: {error}")
+        print(f"  not settled: {error}")
         return None
     for one in layout.left_out:
-        print(f"  given up: {scene.assets[one.asset].name} {one.reason}")
+        print(f"  omitted: {scene.assets[one.asset].name} {one.reason}")
     return None if layout.left_out else layout
 
 
@@ -134,7 +134,7 @@ def show(name: str, layouts: list[Layout], given_up: int, seconds: float) -> Non
         figure(value, unit, name, what)
     refused = Counter(reason.split(" by ")[0] for certificate in found for reason in certificate.refused)
     print(
-        f"{name}: {len(found)} layouts, {given_up} given up, {sum(c.attempts for c in found)} draws; "
+        f"{name}: {len(found)} layouts, {given_up} not settled, {sum(c.attempts for c in found)} draws; "
         f"rest {np.median(times):.2f} s (median), {max(times):.2f} (slowest); deepest "
         f"{max(c.collider_penetration for c in found) * 1e3:.2f} mm in colliders, "
         f"{max(c.pair_penetration for c in found) * 1e3:.2f} in objects; "
@@ -332,7 +332,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("measure", choices=[*MEASURES, "worlds"])
     parser.add_argument("--count", type=int)
-    parser.add_argument("--device", default="cpu", help="of worlds: cpu, or cuda:0")
+    parser.add_argument("--device", default="cpu", help="device of worlds: cpu, or cuda:0")
     arguments = parser.parse_args()
     gpu = arguments.measure == "worlds" and arguments.device != "cpu"
     with recording("physics.settle", parser, arguments, gpu=gpu), warp_settings():

@@ -23,9 +23,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("file", type=Path)
     parser.add_argument("--frames", type=int, default=2)
-    parser.add_argument("--size", help="of the pictures, such as 640x480; as the scene says by default")
-    parser.add_argument("--at", nargs="*", type=float, default=[], help="tolerances of the order of blending, as well")
-    parser.add_argument("--picture", type=Path, help="chart to draw")
+    parser.add_argument("--size", help="size of the images, such as 640x480; default: the scene's")
+    parser.add_argument("--at", nargs="*", type=float, default=[], help="additional tolerances of the blending order")
+    parser.add_argument("--picture", type=Path, help="file of the chart")
     options = parser.parse_args()
     overrides: dict[str, Any] = {}
     if options.size:

@@ -102,7 +102,9 @@ def print_costs(name: str, integrator: Any, scene: Any, camera: ms.Camera, repea
         figure(share, "", name, preset, "again")
         for case in ("first walk", "all"):
             figure(least[case] / least["one"], "", name, preset, case)
-        print(f"{name}, {preset}: march of one instance {least['one']:.3f} s, times that: {told}; again: {share:.1%}")
+        print(
+            f"{name}, {preset}: march of one instance {least['one']:.3f} s; relative: {told}; second walk: {share:.1%}"
+        )
         unsure.clear()
 
 
@@ -113,7 +115,7 @@ def main() -> None:
     parser.add_argument("--scene", type=Path, default=ROOT / "scenes/workcell.yaml")
     options = parser.parse_args()
     ensure_variant()
-    print(f"load before the run: {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores; processor seconds")
+    print(f"load before the run: {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores; CPU seconds")
     with recording("render.instances", parser, options):
         measure(options.scene, options.scenes)
 

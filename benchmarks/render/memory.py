@@ -96,7 +96,7 @@ def main() -> None:
     parser.add_argument("--gaussians", type=int, default=5_000_000)
     parser.add_argument("--objects", type=int, default=200)
     parser.add_argument("--variant", default="llvm_ad_rgb")
-    parser.add_argument("--case", choices=CASES, help="run this one here")
+    parser.add_argument("--case", choices=CASES, help="run this case in this process")
     options = parser.parse_args()
     if options.case is None:
         for case in CASES:

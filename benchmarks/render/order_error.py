@@ -136,7 +136,7 @@ def print_estimate(name: str, picture: Picture) -> None:
         for key, value in row.items():
             figure(value, "", name, f"tolerance {tolerance:g}", key)
         print(
-            f"  tolerance {tolerance:g}: {above} pixels above it, {found:.1%} found, {missed} missed; tiles named "
+            f"  tolerance {tolerance:g}: {above} pixels above it, {found:.1%} found, {missed} missed; tiles selected "
             f"{named.mean():.2%}, needed {needed.mean():.2%}; left RMSE {rms(left):.1e}, largest {worst.max():.3f}"
         )
 
@@ -176,7 +176,7 @@ def main() -> None:
     """Parse the command line and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--captures", type=Path, default=CAPTURES)
-    parser.add_argument("--size", default="1280x720", help="of the pictures, a multiple of 8 px")
+    parser.add_argument("--size", default="1280x720", help="size of the images, multiples of 8 px")
     parser.add_argument("--names", nargs="*", default=[], help="captures, or workcell; all by default")
     options = parser.parse_args()
     ensure_variant()

@@ -131,7 +131,7 @@ def print_peak() -> None:
     figure(peak / 1e9, "G/s", "multiply adds")
     figure(rate * FMA_PER_EVALUATION / peak, "", "share of peak")
     print(
-        f"march: {rate / 1e9:.2f} G evaluations per processor second; at {FMA_PER_EVALUATION} multiply-adds each "
+        f"march: {rate / 1e9:.2f} G evaluations per CPU second; at {FMA_PER_EVALUATION} multiply-adds each "
         f"{rate * FMA_PER_EVALUATION / peak:.0%} of the peak of {peak / 1e9:.0f} G"
     )
 
@@ -183,12 +183,12 @@ def print_captures(captures: Path, names: list[str]) -> None:
 def main() -> None:
     """Parse the command line and print the tables."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--volprim", action="store_true", help="only the comparison with Mitsuba's own path")
+    parser.add_argument("--volprim", action="store_true", help="only the comparison with Mitsuba's splat renderer")
     parser.add_argument("--captures", type=Path, default=CAPTURES)
-    parser.add_argument("--names", nargs="*", default=[], help="of single captures to compare; all by default")
+    parser.add_argument("--names", nargs="*", default=[], help="names of single captures; all by default")
     options = parser.parse_args()
     ensure_variant()
-    print(f"load before the run: {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores; processor seconds")
+    print(f"load before the run: {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores; CPU seconds")
     with recording("render.splats", parser, options, ignore=("captures",)):
         if options.volprim:
             print_volprim(options.captures)

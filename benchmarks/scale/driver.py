@@ -216,8 +216,8 @@ def main() -> None:
     parser.add_argument("--begun", type=int, default=0)
     parser.add_argument("--formats", nargs="+", default=["yolo", "coco", "bop"])
     parser.add_argument("--instances", type=int, default=3)
-    parser.add_argument("--sync-every", type=int, default=1, help="do only so many of the fsyncs, to time the rest")
-    parser.add_argument("--folder", type=Path, help="where to make a temporary folder")
+    parser.add_argument("--sync-every", type=int, default=1, help="execute only every Nth fsync, to time the rest")
+    parser.add_argument("--folder", type=Path, help="parent of the temporary folder")
     options = parser.parse_args()
     if options.frames % (2 * VIEWS):
         parser.error(f"--frames must be a multiple of {2 * VIEWS}")

@@ -179,10 +179,10 @@ def cost(path: Path, spec: Any, frames: int, folder: Path) -> None:
 def main() -> None:
     """Print the results."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--frames", type=int, default=1000, help="audited; 0 for none")
-    parser.add_argument("--compare", type=int, default=64, help="frames that all numbers of workers make; 0 for none")
+    parser.add_argument("--frames", type=int, default=1000, help="number of audited frames; 0 for none")
+    parser.add_argument("--compare", type=int, default=64, help="number of compared frames; 0 for none")
     parser.add_argument("--workers", type=int, nargs="+", default=[1, 2, 7])
-    parser.add_argument("--cost", type=int, default=24, help="images that the cost is the mean of; 0 for none")
+    parser.add_argument("--cost", type=int, default=24, help="number of frames for the cost; 0 for none")
     parser.add_argument("--device", default="cpu")
     options = parser.parse_args()
     ms.use_device(options.device)

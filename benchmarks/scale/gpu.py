@@ -217,10 +217,10 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=600)
     parser.add_argument("--workers", type=int)
     parser.add_argument("--size", default="1280x720")
-    parser.add_argument("--compare", type=int, default=12, help="frames that are also rendered on the CPU")
-    parser.add_argument("--unsettled", action="store_true", help="settle layouts within the run that is measured")
+    parser.add_argument("--compare", type=int, default=12, help="number of frames also rendered on the CPU")
+    parser.add_argument("--unsettled", action="store_true", help="settle layouts within the measured run")
     parser.add_argument("--turns", action="store_true", help="without NVIDIA's Multi-Process Service")
-    parser.add_argument("--out", type=Path, help="where datasets are left; removed if absent")
+    parser.add_argument("--out", type=Path, help="folder of the datasets; default: temporary")
     options = parser.parse_args()
     with recording("scale.gpu", parser, options, ignore=("out", "compare"), gpu=True):
         if options.out:

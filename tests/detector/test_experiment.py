@@ -159,7 +159,7 @@ def test_jobs_run_in_order_on_free_devices_after_their_dependencies(tmp_path, ca
         "shy: cuda 1",
         "wrong: status 1: no such thing",
         "patient: cuda:1 None",
-        "not done, as time is up or what they need is not there: lost",
+        "not run because of the time limit or missing inputs: lost",
     ]
     assert free["train"] == ["cuda:1"]
 
@@ -238,5 +238,5 @@ def test_listed_images_have_the_stated_number_of_views_per_layout(tmp_path):
     (folder / "images/train/000017.jpg").unlink()
     assert len(numbers(first=8, views=4)) == 8
     for some in ({"first": 10, "views": 2}, {"first": 48}, {"images": 50}):
-        with pytest.raises(SystemExit, match=r"not all there|not 50"):
+        with pytest.raises(SystemExit, match=r"are missing|50 images are required"):
             numbers(**some)

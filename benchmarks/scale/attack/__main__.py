@@ -58,8 +58,8 @@ def main() -> None:
     parser.add_argument("--only", metavar="PATTERN", help="attacks whose name contains or matches it, such as 'xml*'")
     parser.add_argument("--quick", action="store_true", help="only attacks that render nothing")
     parser.add_argument("--list", action="store_true", help="print the attacks and run none")
-    parser.add_argument("--jobs", type=int, default=2, help="attacks at a time")
-    parser.add_argument("--slowdown", type=float, default=1.0, help="factor of all bounds of time, on a busy machine")
+    parser.add_argument("--jobs", type=int, default=2, help="number of parallel attacks")
+    parser.add_argument("--slowdown", type=float, default=1.0, help="factor of all time limits, on a busy machine")
     options = parser.parse_args()
     wanted = [
         attack

@@ -25,7 +25,7 @@ from tests.renderer.test_render import CAMERA, make_splats
 
 
 def test_recordings_depend_on_counts_and_sizes_and_not_on_values() -> None:
-    """Dr.Jit's automatic choice treats some numbers as equal in such calls."""
+    """Dr.Jit's own selection of recordings confuses some numbers in such calls."""
     ensure_variant()
     traced: list[tuple[int, int]] = []
 

@@ -115,7 +115,7 @@ def caption(result: Mapping[str, Any], newest: int = 0) -> str:
         text += f"; taken over from the notes of revision {day}, not recorded anew since"
     else:
         text += f"; recorded at revision {day}{' with changes' if result.get('dirty') else ''}"
-        text += f" in {result['seconds']:.0f} s"
+        text += f"; the run took {result['seconds']:.0f} s"
     return text + (f". {result['note']}" if result.get("note") else ".")
 
 

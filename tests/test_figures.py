@@ -271,7 +271,7 @@ def test_commands_that_need_only_a_checkout_are_run_again() -> None:
 
 def test_captions_mark_old_dirty_and_transcribed_results() -> None:
     result = {**RESULTS["labels.cost"], "dirty": True, "note": "So."}
-    assert " with changes in " in caption(result) and caption(result).endswith("So.")
+    assert " with changes; the run took " in caption(result) and caption(result).endswith("So.")
     assert "not recorded anew since" in caption({**result, "recorded": "transcribed"})
     assert "commits before" not in caption(result, result["commits"] + 49)
     assert "50 commits before the newest figure" in caption(result, result["commits"] + 50)

@@ -195,7 +195,7 @@ class Reflectors:
 
 
 def trace_bounce(tracer: ShadowTracer, reflectors: Reflectors) -> tuple[mi.Color3f, mi.Float]:
-    """Return the reflected irradiance (Color3f) over that of display white, and a mask (Float).
+    """Return the reflected irradiance (Color3f), divided by that of display white, and a mask (Float).
 
     The mask is 1 at points where the irradiance was computed, and 0 elsewhere.
 

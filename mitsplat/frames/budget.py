@@ -18,6 +18,7 @@ from mitsplat.engine.resources import WorkerMemory
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.camera import Camera
 from mitsplat.quality import KERNELS, Quality, resolve_quality
+from mitsplat.renderer.instances.silhouettes import canvas_margin
 from mitsplat.renderer.rays.camera_rays import TILE_HEIGHT, TILE_WIDTH
 from mitsplat.renderer.splatting.pairs import PAIRS_MAX
 from mitsplat.scene.planning.frame_plan import plan_frame
@@ -75,13 +76,13 @@ def worker_memory(scene: Scene) -> WorkerMemory:
     pixels = spec.output.width * spec.output.height
     cameras = [plan_frame(scene, int(index)).camera for index in np.linspace(0, scene.num_frames - 1, _CAMERAS)]
 
-    def placed_pairs(camera: Camera) -> float:
-        return sum(count * _pairs(splats, camera, quality, position=middle) for splats, count in placed)
+    def placed_pairs(camera: Camera, margin: float) -> float:
+        return sum(count * _pairs(splats, camera, quality, position=middle, margin=margin) for splats, count in placed)
 
     pairs = max(
         max(
-            sum(_pairs(splats, camera, quality) for splats in static) + placed_pairs(camera),
-            placed_pairs(_silhouette_canvas(camera)),
+            sum(_pairs(splats, camera, quality) for splats in static) + placed_pairs(camera, 0),
+            placed_pairs(camera, canvas_margin(camera)),
         )
         for camera in cameras
     )
@@ -96,16 +97,13 @@ def worker_memory(scene: Scene) -> WorkerMemory:
     return WorkerMemory(own, shared=stored, gpu=max(own, WorkerMemory.gpu))
 
 
-def _silhouette_canvas(camera: Camera) -> Camera:
-    """Return the camera of the canvas of silhouettes, which extends by one image size beyond each border."""
-    width, height = camera.width, camera.height
-    return replace(camera, width=3 * width, height=3 * height, cx=camera.cx + width, cy=camera.cy + height)
-
-
-def _pairs(splats: Splats, camera: Camera, quality: Quality, *, position: npt.ArrayLike = (0.0, 0.0, 0.0)) -> float:
+def _pairs(
+    splats: Splats, camera: Camera, quality: Quality, *, position: npt.ArrayLike = (0.0, 0.0, 0.0), margin: float = 0
+) -> float:
     """Estimate an upper bound of the (Gaussian, tile) pairs of an asset at a position [m]; a tile has 8 x 4 pixels.
 
     The footprint of a Gaussian ends where its opacity falls below the quality's cut. The kernel's variance widens it.
+    The canvas extends by ``margin`` image sizes beyond each border of the image, as that of silhouettes.
     """
     step = 1 + len(splats) // _MAX_SAMPLES
     means = splats.means[::step] + np.asarray(position, dtype=np.float32)
@@ -117,5 +115,6 @@ def _pairs(splats: Splats, camera: Camera, quality: Quality, *, position: npt.Ar
     radii = np.sqrt(2 * np.log(excess[visible]))[:, None] * np.sqrt(axes**2 + KERNELS[quality.kernel].variance)  # [px]
     tiles = np.prod(2 * radii / _TILE + 1, axis=1)
     size, largest = np.array([camera.width, camera.height]), radii[:, 1:]
-    inside = ((pixel[visible] > -largest) & (pixel[visible] < size + largest)).all(axis=1)
-    return step * float(np.minimum(tiles, np.prod(size / _TILE + 1))[inside].sum())
+    beyond = largest + margin * size
+    inside = ((pixel[visible] > -beyond) & (pixel[visible] < size + beyond)).all(axis=1)
+    return step * float(np.minimum(tiles, np.prod((1 + 2 * margin) * size / _TILE + 1))[inside].sum())

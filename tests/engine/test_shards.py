@@ -317,7 +317,7 @@ def test_the_device_determines_the_reserved_resources(resources, device, kind, r
         ({"CPU": 4.0}, "cuda", r"must include a GPU, such as GPU=0\.125, for the device cuda \(got CPU=4\)"),
         ({"CPU": 4, "GPU": 1}, "cpu", r"must not include a GPU for the device cpu \(got CPU=4,GPU=1\)"),
         (None, "cuda:1", r"device must be cpu or cuda on a cluster, because Ray assigns the GPUs \(got cuda:1\)"),
-        (None, "auto", r"must be cpu or cuda \(got auto\)"),
+        (None, "auto", r"device must be cpu or cuda on a cluster, because Ray assigns the GPUs \(got auto\)"),
     ],
 )
 def test_devices_that_a_cluster_lacks_are_refused(scene, tmp_path, capsys, resources, device, words):

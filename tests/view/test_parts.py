@@ -113,7 +113,8 @@ def test_lights_are_shown_at_their_positions(scene):
 
 
 def test_the_path_of_a_light_is_shown_as_a_line(scene_data, write_scene):
-    scene_data["lights"][0]["path"] = [{"position": [0, 0, 1]}, {"intensity": 3}, {"position": [0, 1, 1]}]
+    scene_data["lights"][0]["temperature"] = 3000
+    scene_data["lights"][0]["path"] = [{"position": [0, 0, 1]}, {"temperature": 3000}, {"position": [0, 1, 1]}]
     found = named(scene_parts(load_scene(write_scene(scene_data)), 0))
     assert found["/lights/path-0"].drawable.segments.tolist() == [[[0, 0, 1], [0.5, 0, 1]], [[0.5, 0, 1], [0, 1, 1]]]
 

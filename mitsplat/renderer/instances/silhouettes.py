@@ -110,10 +110,15 @@ def proxy_silhouettes(
 
 def _canvas(view: CameraView) -> tuple[CameraView, int, int]:
     """Return the view on a larger canvas, and the position of the image on it (left, top)."""
-    share = _margin(view.width, view.height, view.fx, view.fy, view.cx, view.cy, view.distortion, view.lens)
+    share = canvas_margin(view)
     left, top = int(share * view.width), int(share * view.height)
     width, height = view.width + 2 * left, view.height + 2 * top
     return replace(view, width=width, height=height, cx=view.cx + left, cy=view.cy + top), left, top
+
+
+def canvas_margin(view: CameraView | Camera) -> float:
+    """Return the margin of the canvas of silhouettes on each side of the image, in image sizes."""
+    return _margin(view.width, view.height, view.fx, view.fy, view.cx, view.cy, view.distortion, view.lens)
 
 
 @lru_cache(maxsize=8)

@@ -70,7 +70,7 @@ def view_of(scene: Scene, index: int, layout: Layout | None = None) -> Viewpoint
     if isinstance(camera, CameraOrbit):
         pose = _orbit_pose(camera, view, views)
     else:
-        keys = [look_at_pose(key.eye, key.target) for key in camera.keys]
+        keys = [look_at_pose(key.eye, key.target, key.up) for key in camera.keys]
         pose = interpolate_poses(keys, view / max(1, views - 1))[0]
     pose[:3, 3] += camera.jitter * random_stream(spec.seed, "camera jitter", index).standard_normal(3)
     return Viewpoint(*_camera_of_frame(spec, index, pose))

@@ -79,9 +79,12 @@ class PoseKey(StrictModel):
 
     eye: Vec3 = Field(description="Centre of projection [m].")
     target: Vec3 = Field(description="Point in the centre of the image [m].")
+    up: Vec3 = Field((0, 0, 1), description="Direction that appears upwards in the image.")
 
     @model_validator(mode="after")
     def _check(self) -> PoseKey:
+        if not any(self.up):
+            raise FieldError("up", "must not be zero (got [0, 0, 0])")
         if self.eye == self.target:
             raise FieldError("target", f"must differ from eye (got {list(self.target)})")
         return self

@@ -126,12 +126,20 @@ def test_the_estimated_pairs_bound_the_true_number(preset, rendering):
     assert budget._pairs(discs, camera, quality, position=(0, 0, -3)) == 0
 
 
-def test_the_canvas_of_silhouettes_extends_by_one_image_size_beyond_each_border():
+def test_a_margin_of_one_counts_the_pairs_of_an_image_three_times_as_wide():
     camera = Camera.look_at((0, 0, -2), (0, 0, 0), up=(0, -1, 0), width=256, height=192, fov_x=50)
-    canvas = budget._silhouette_canvas(camera)
-    assert (canvas.width, canvas.height) == (3 * 256, 3 * 192)
-    points = np.random.default_rng(0).uniform(-1, 1, (20, 3))
-    np.testing.assert_allclose(canvas.project(points)[0], camera.project(points)[0] + (256, 192))
+    canvas = replace(camera, width=3 * 256, height=3 * 192, cx=camera.cx + 256, cy=camera.cy + 192)
+    count, rng = 500, np.random.default_rng(0)
+    means, turns = rng.uniform(-3, 3, (count, 3)), np.tile([0, 0, 0, 1], (count, 1))
+    splats = Splats(means, turns, np.full((count, 3), 0.02), [0.9] * count, np.zeros((count, 1, 3)))
+    quality = PRESETS["fast"]
+    found = budget._pairs(splats, camera, quality, margin=1)
+    assert found == budget._pairs(splats, canvas, quality) > budget._pairs(splats, camera, quality) > 0
+
+
+def test_the_memory_of_a_scene_with_a_fisheye_lens_is_estimated():
+    """A corner of the canvas of silhouettes is beyond the largest angle of the lens."""
+    assert worker_memory(load_scene(Path(__file__).parents[2] / "scenes/fisheye.yaml")).own > budget.BASE
 
 
 @pytest.mark.parametrize(("own", "shared", "expected"), [(1, 0, 8), (2, 0, 5), (2, 5, 2), (20, 0, 1)])

@@ -60,7 +60,7 @@ def test_cameras_of_rendered_photos_are_recovered(
         assert ((pixels > -5) & (pixels < np.array(rendered.SIZE) + 5)).all()
 
 
-def test_a_camera_turned_in_the_model_explains_few_of_its_matches(captured: tuple[Path, Path, CaptureResult]) -> None:
+def test_a_camera_moved_in_the_model_explains_few_of_its_matches(captured: tuple[Path, Path, CaptureResult]) -> None:
     """One camera of the model is moved. Only this camera may explain few of its matches."""
     code = """
 import sys, json

@@ -424,6 +424,7 @@ def test_images_of_lights_are_sent_with_the_job(scene_data, write_scene, tmp_pat
     assert copy.read_bytes() == image and tmp_path not in copy.parents
     renderer = Renderer(there.job.scene, quality="fast")
     emitter = renderer.scene_builder._emitter(plan_frame(there.job.scene, 0).lights[0], False)
+    assert renderer.scene_builder._latest["environment map"][0] == str(copy)
     assert copy.name in str(emitter)
     scene = there.job.scene
     there.make(1, there.settle(0))

@@ -14,7 +14,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -27,6 +27,7 @@ from mitsplat.arrays import BoolArray, Float32Array, Float64Array
 from mitsplat.errors import InputError
 from mitsplat.gaussians.spherical_harmonics import sh_rotation
 from mitsplat.gaussians.splat_files import SplatArrays, read_splats, write_splats
+from mitsplat.gaussians.splat_materials import SplatMaterials
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,6 +43,7 @@ class Splats:
         opacities: Peak opacity in [0, 1], shape (N,).
         sh: Spherical-harmonic coefficients of the display-encoded colour in 3DGS order, shape (N, K, 3) with K = 1, 4,
             9 or 16: colour = max(0, 0.5 + sum_k sh[k] Y_k(direction)), direction from camera to Gaussian.
+        materials: Material parameters; ``sh`` then holds the base colour. None if ``sh`` holds captured radiance.
 
     Raises:
         ValueError: If an array has a wrong shape or an invalid value. The message names field, rule, value and row.
@@ -52,16 +54,19 @@ class Splats:
     scales: Float32Array
     opacities: Float32Array
     sh: Float32Array
+    materials: SplatMaterials | None = None
 
     def __post_init__(self) -> None:
         with np.errstate(over="ignore"):  # values beyond float32 become inf, which is refused below
-            arrays = {f.name: np.array(getattr(self, f.name), dtype=np.float32, order="C") for f in fields(self)}
+            arrays = {name: np.array(getattr(self, name), dtype=np.float32, order="C") for name in SplatArrays._fields}
         count = len(arrays["means"]) if arrays["means"].ndim else 0
         for name, row in (("means", (3,)), ("quats", (4,)), ("scales", (3,)), ("opacities", ())):
             if arrays[name].shape != (count, *row):
                 raise InputError(f"{name} must have shape {(count, *row)} (got {arrays[name].shape})")
         if arrays["sh"].shape not in [(count, k, 3) for k in (1, 4, 9, 16)]:
             raise InputError(f"sh must have shape ({count}, 1, 4, 9 or 16, 3) (got {arrays['sh'].shape})")
+        if self.materials is not None and len(self.materials) != count:
+            raise InputError(f"materials must have {count} rows, one per Gaussian (got {len(self.materials)})")
         quats, scales, opacities = arrays["quats"], arrays["scales"], arrays["opacities"]
         for name in ("means", "quats", "sh"):
             _require(np.isfinite(arrays[name]), name, "finite", arrays[name])
@@ -125,7 +130,8 @@ class Splats:
     def select(self, index: slice | npt.ArrayLike) -> Splats:
         """Return the Gaussians selected by a Boolean mask (N,), an integer array or a slice, in its order."""
         rows = index if isinstance(index, slice) else np.atleast_1d(np.asarray(index))
-        return Splats(**{f.name: getattr(self, f.name)[rows] for f in fields(self)})
+        arrays = {name: getattr(self, name)[rows] for name in SplatArrays._fields}
+        return Splats(**arrays, materials=None if self.materials is None else self.materials.select(rows))
 
     def transformed(self, matrix: npt.ArrayLike) -> Splats:
         """Return the splats after a similarity transform. Their view-dependent colours rotate with them.
@@ -145,11 +151,14 @@ class Splats:
             scales=(self.scales.astype(np.float64) * scale).astype(np.float32),
             opacities=self.opacities,
             sh=sh_rotation(rotation, self.sh_degree).astype(np.float32) @ self.sh,
+            materials=None if self.materials is None else self.materials.rotated(rotation),
         )
 
     @staticmethod
     def concatenate(parts: Sequence[Splats]) -> Splats:
-        """Return all Gaussians of ``parts`` in order. Lower SH degrees are padded with zeros to the highest.
+        """Return all Gaussians of ``parts`` in order, without materials.
+
+        Lower SH degrees are padded with zeros to the highest.
 
         Raises:
             ValueError: If ``parts`` is empty.
@@ -158,7 +167,8 @@ class Splats:
             raise ValueError("concatenate needs at least one Splats (got none)")
         width = max(part.sh.shape[1] for part in parts)
         padded = [np.pad(part.sh, ((0, 0), (0, width - part.sh.shape[1]), (0, 0))) for part in parts]
-        joined = {f.name: np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Splats) if f.name != "sh"}
+        names = [name for name in SplatArrays._fields if name != "sh"]
+        joined = {name: np.concatenate([getattr(p, name) for p in parts]) for name in names}
         return Splats(**joined, sh=np.concatenate(padded))
 
 

@@ -1,0 +1,108 @@
+"""Specular lobe of Mitsuba's BSDF ``principled``: GGX microfacets with the Fresnel terms of metals and dielectrics.
+
+Reflected light is linear in the base colour c. With the density D of microfacets, masking G, the half vector h and the
+camera's direction v,
+
+    f cos = D G / (4 n.v) F,   F = c metallic (1 - S) + metallic S + (1 - metallic) F_dielectric,   S = (1 - v.h)^5
+
+so that it is a tinted part, which c multiplies, and a colourless part. Both parts are sampled and filtered without the
+texture of the surface (Burley 2012, "Physically Based Shading at Disney"; Walter et al. 2007, "Microfacet Models for
+Refraction").
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+MIN_ALPHA = 0.001
+"""Smallest GGX parameter alpha, as in ``principled``."""
+
+MIN_COSINE = 1e-3
+"""Smallest cosine between normal and camera: interpolated normals may point away from the camera."""
+
+MAX_SPECULAR = 0.08
+"""Reflectance of a dielectric at normal incidence with ``specular`` 1."""
+
+
+@dataclass(frozen=True, eq=False)
+class Fresnel:
+    """Fresnel terms: reflectance = ``tint`` * base colour + ``white``."""
+
+    tint: mi.Float
+    white: mi.Float
+
+
+@dataclass(frozen=True, eq=False)
+class SpecularLobe:
+    """Specular lobes of visible points towards the camera.
+
+    Attributes:
+        frame: Shading frame.
+        view: Unit vector towards the camera in the shading frame.
+        alpha: GGX parameter.
+        metallic: Metalness.
+        specular: Reflectance of the dielectric at normal incidence over 0.08.
+    """
+
+    frame: mi.Frame3f
+    view: mi.Vector3f
+    alpha: mi.Float
+    metallic: mi.Float
+    specular: mi.Float
+
+    @classmethod
+    def of(
+        cls,
+        normal: mi.Vector3f,
+        to_camera: mi.Vector3f,
+        roughness: mi.Float,
+        metallic: mi.Float,
+        specular: mi.Float,
+    ) -> SpecularLobe:
+        """Return the lobes of points with unit ``normal`` and unit vector ``to_camera``."""
+        frame = mi.Frame3f(mi.Normal3f(normal))
+        view = frame.to_local(to_camera)
+        view.z = dr.maximum(view.z, MIN_COSINE)
+        return cls(frame, dr.normalize(view), dr.maximum(dr.square(roughness), MIN_ALPHA), metallic, specular)
+
+    def evaluate(self, direction: mi.Vector3f) -> tuple[mi.Float, mi.Float, mi.Float]:
+        """Return D G / (4 n.v), its sampling density, and v.h for unit vectors towards the light."""
+        light = self.frame.to_local(direction)
+        half = dr.normalize(light + self.view)
+        cos_half = dr.dot(half, self.view)
+        above = (light.z > 0) & (cos_half > 0)
+        scaled = (dr.square(half.x) + dr.square(half.y)) / dr.square(self.alpha) + dr.square(half.z)
+        distribution = 1 / (dr.pi * dr.square(self.alpha) * dr.square(scaled))
+        density = dr.select(above, distribution * self._unmasked(self.view) / (4 * self.view.z), 0)
+        return density * self._unmasked(light), density, cos_half
+
+    def sample(self, point: mi.Point2f) -> tuple[mi.Vector3f, mi.Float, mi.Float]:
+        """Sample a direction by the visible normals from a point of the unit square.
+
+        See Heitz 2018, "Sampling the GGX Distribution of Visible Normals".
+
+        Returns:
+            Unit vector towards the light, D G / (4 n.v) over its density, and v.h.
+        """
+        half = mi.Vector3f(
+            mi.MicrofacetDistribution(mi.MicrofacetType.GGX, self.alpha, True).sample(self.view, point)[0]
+        )
+        cos_half = dr.dot(self.view, half)
+        light = 2 * cos_half * half - self.view
+        return self.frame.to_world(light), dr.select(light.z > 0, self._unmasked(light), 0), cos_half
+
+    def fresnel(self, cos_half: mi.Float) -> Fresnel:
+        """Return the Fresnel terms for v.h."""
+        grazing = dr.power(dr.clip(1 - cos_half, 0, 1), 5)
+        root = dr.sqrt(MAX_SPECULAR * self.specular)
+        dielectric = dr.select(self.specular > 0, mi.fresnel(cos_half, (1 + root) / (1 - root))[0], 0)
+        return Fresnel(self.metallic * (1 - grazing), dr.lerp(dielectric, grazing, self.metallic))
+
+    def _unmasked(self, direction: mi.Vector3f) -> mi.Float:
+        """Return Smith's share of microfacets that ``direction`` (in the frame) reaches."""
+        cosine2 = dr.square(direction.z)
+        tangent2 = dr.maximum(1 - cosine2, 0) / dr.maximum(cosine2, 1e-12)
+        return dr.select(direction.z > 0, 2 / (1 + dr.sqrt(dr.fma(dr.square(self.alpha), tangent2, 1))), 0)

@@ -56,9 +56,7 @@ class ContentsReader:
         placements = tuple(
             Placement(number[id(c.splats)], c.world_from_splats, c.instance, c.appearance) for c in carriers
         )
-        occluders = [
-            Occluder(c.proxy, c.instance, c.dynamic, c.world_from_splats) for c in carriers if c.proxy is not None
-        ]
+        occluders = [_occluder(c) for c in carriers if c.proxy is not None]
         casters = None
         if splat_shadows:
             casters = [Caster(c.splats, c.instance, c.world_from_splats) for c in carriers if c.dynamic]
@@ -96,6 +94,12 @@ class ContentsReader:
         ]
         clouds = [cloud for _, cloud in self._uploaded]
         return merge_clouds(clouds) if sum(c.count for c in clouds) else None
+
+
+def _occluder(shape: mi.Shape) -> Occluder:
+    """Return the proxy of a ``splats`` shape; captured surroundings take no material, see :class:`RadianceGrid`."""
+    splats = shape.splats if shape.dynamic or shape.splats.materials is not None else None
+    return Occluder(shape.proxy, shape.instance, shape.dynamic, shape.world_from_splats, splats, shape.appearance)
 
 
 def same_shapes(some: Sequence[mi.Shape], others: Sequence[mi.Shape]) -> bool:

@@ -79,6 +79,9 @@ class MeshHits:
             dr.select(closer, self.normal, other.normal),
             dr.select(closer, 0, other.lift),
             dr.select(closer, 0, other.instance),
+            dr.select(closer, 0, other.metallic),
+            dr.select(closer, 1, other.roughness),
+            dr.select(closer, 0, other.specular),
         )
 
 

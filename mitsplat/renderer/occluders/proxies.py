@@ -12,8 +12,11 @@ import mitsuba as mi
 import numpy as np
 import trimesh
 
+from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.mesh_normals import CREASE_ANGLE, corner_normals
+from mitsplat.renderer.occluders.proxy_materials import CornerMaterials, SurfaceMaterial
 from mitsplat.renderer.occluders.splat_occlusion import Caster, SplatOccluders
+from mitsplat.renderer.projection.splat_appearance import SplatAppearance
 from mitsplat.renderer.rays.device_arrays import ray_scene, wrapped
 
 NOISE_CREASE = 10.0
@@ -34,12 +37,16 @@ class Occluder:
         instance: Instance id, 0 for the environment.
         dynamic: True if the captured colours do not contain its shadow.
         world_from_mesh: Pose, a similarity transform, shape (4, 4).
+        splats: Gaussians in the frame of the mesh that give it its material; None for a black surface.
+        appearance: Change of the colours of the splats.
     """
 
     mesh: trimesh.Trimesh
     instance: int
     dynamic: bool
     world_from_mesh: np.ndarray = field(default_factory=lambda: np.eye(4))
+    splats: Splats | None = None
+    appearance: SplatAppearance | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,6 +59,7 @@ class Hit:
         normal: Unit normal of the smooth surface that the triangles approximate, towards the ray's origin.
         lift: Displacement from the triangle to that surface [m] where it is convex, otherwise zero.
         instance: Instance id, 0 for a miss.
+        metallic, roughness, specular: Parameters of ``principled``, of a matt surface for a miss.
     """
 
     distance: mi.Float
@@ -59,11 +67,15 @@ class Hit:
     normal: mi.Normal3f
     lift: mi.Vector3f
     instance: mi.UInt32
+    metallic: mi.Float
+    roughness: mi.Float
+    specular: mi.Float
 
     @classmethod
     def miss(cls) -> Hit:
         """Return a miss."""
-        return cls(mi.Float(dr.inf), mi.Normal3f(0), mi.Normal3f(0), mi.Vector3f(0), mi.UInt32(0))
+        matt = mi.Float(0), mi.Float(1), mi.Float(0)
+        return cls(mi.Float(dr.inf), mi.Normal3f(0), mi.Normal3f(0), mi.Vector3f(0), mi.UInt32(0), *matt)
 
 
 class OccluderScene(Protocol):
@@ -123,6 +135,7 @@ class _TraceScene:
     instances: mi.UInt32
     corners: mi.Float
     normals: mi.Float
+    materials: CornerMaterials | None
 
     def nearest(self: _TraceScene | None, ray: mi.Ray3f, other: Hit) -> Hit:
         """Return the nearer of ``other`` and the hits in this scene."""
@@ -135,13 +148,28 @@ class _TraceScene:
         flip = dr.select(dr.dot(si.n, ray.d) > 0, -1.0, 1.0)
         normal, lift = self._smooth(si, flip, proxy)
         face = si.n * flip
+        gloss = other.metallic, other.roughness, other.specular
+        if self.materials is not None and self.materials.glossy:
+            own = self.materials.at(si.prim_index, si.uv, proxy)
+            values = (own.metallic, 0.0), (own.roughness, 1.0), (own.specular, 0.0)
+            gloss = tuple(
+                dr.select(closer, dr.select(proxy, value, matt), rest)
+                for (value, matt), rest in zip(values, gloss, strict=True)
+            )
         return Hit(
             dr.select(closer, si.t, other.distance),
             dr.select(closer, face, other.face),
             dr.select(closer, dr.select(proxy, normal, face), other.normal),
             dr.select(closer, dr.select(proxy, lift, 0), other.lift),
             dr.select(closer, number, other.instance),
+            *gloss,
         )
+
+    def surface_at(self, triangle: mi.UInt32, uv: mi.Point2f, active: mi.Bool) -> SurfaceMaterial:
+        """Return the materials at barycentric coordinates of proxy triangles."""
+        if self.materials is None:
+            return SurfaceMaterial(mi.Color3f(0), mi.Float(0), mi.Float(1), mi.Float(0))
+        return self.materials.at(triangle, uv, active)
 
     def is_visible(self, hit: mi.PreliminaryIntersection3f) -> mi.Bool:
         """Return True for hits on visible shapes."""
@@ -175,13 +203,16 @@ class _TraceScene:
             if not others:
                 return None
             nothing = mi.Float([0.0] * 9)
-            return cls(ray_scene(others), None, mi.UInt32([0]), nothing, nothing)
-        parts = tuple((o.mesh, o.instance, np.asarray(o.world_from_mesh, np.float64).tobytes()) for o in occluders)
+            return cls(ray_scene(others), None, mi.UInt32([0]), nothing, nothing, None)
+        parts = tuple(
+            (o.mesh, o.instance, np.asarray(o.world_from_mesh, np.float64).tobytes(), o.splats, o.appearance)
+            for o in occluders
+        )
         return _merged_scene(parts, others) if others else _cached_scene(parts, str(mi.variant()))
 
 
-_Parts = tuple[tuple[trimesh.Trimesh, int, bytes], ...]
-"""Meshes with their instance ids and poses (bytes of 16 floats)."""
+_Parts = tuple[tuple[trimesh.Trimesh, int, bytes, Splats | None, SplatAppearance | None], ...]
+"""Meshes with their instance ids, poses (bytes of 16 floats), and the Gaussians and appearances of their materials."""
 
 
 @lru_cache(maxsize=2)
@@ -192,7 +223,7 @@ def _cached_scene(parts: _Parts, _variant: str) -> _TraceScene:
 
 def _merged_scene(parts: _Parts, others: Mapping[str, mi.Shape]) -> _TraceScene:
     corners, normals = [], []
-    for part, _, pose in parts:
+    for part, _, pose, _, _ in parts:
         world_from_mesh = np.frombuffer(pose).reshape(4, 4)
         turn, shift = world_from_mesh[:3, :3], world_from_mesh[:3, 3]
         corners.append(part.triangles.reshape(-1, 3) @ turn.T + shift)
@@ -205,13 +236,14 @@ def _merged_scene(parts: _Parts, others: Mapping[str, mi.Shape]) -> _TraceScene:
     params["vertex_positions"] = positions
     params["faces"] = dr.arange(mi.UInt32, count)
     params.update()
-    instances = np.repeat([instance for _, instance, _ in parts], [len(part.faces) for part, _, _ in parts])
+    instances = np.repeat([instance for _, instance, *_ in parts], [len(part.faces) for part, *_ in parts])
     return _TraceScene(
         ray_scene({"mesh": mesh, **others}),
         dr.opaque(mi.ShapePtr, mesh),  # a literal shape number would enter the kernels and change with every layout
         wrapped(mi.UInt32, instances.astype(np.uint32)),
         positions,
         wrapped(mi.Float, np.concatenate(normals).astype(np.float32)),
+        CornerMaterials.of([(part, splats, appearance) for part, _, _, splats, appearance in parts]),
     )
 
 

@@ -1,0 +1,93 @@
+"""Materials of proxy surfaces at ray hits."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+import numpy as np
+import trimesh
+
+from mitsplat.gaussians.spherical_harmonics import SH_C0
+from mitsplat.gaussians.splat_cloud import Splats
+from mitsplat.gaussians.splat_materials import SplatMaterials
+from mitsplat.images.colour import encode_srgb
+from mitsplat.renderer.layers import make_integrator
+from mitsplat.renderer.occluders.proxies import Occluder, Proxies
+from mitsplat.renderer.occluders.proxy_materials import corner_materials
+from mitsplat.renderer.projection.splat_appearance import SplatAppearance
+
+BOX = trimesh.creation.box(extents=(1, 1, 1))
+RAY_ENDS = np.array([[0.3, 0.2, 3.0], [3.0, 0.2, 0.3], [0.2, -3.0, -0.3], [5.0, 5.0, 5.0]])
+"""Origins of rays onto the top, the right and the front of the box, and of a ray that misses it."""
+
+
+def six_sides(metal: bool) -> Splats:
+    """Return Gaussians on a box whose colour, metallic, roughness and specular depend on the side."""
+    points, scales, colours, parameters = [], [], [], []
+    u, v = (part.ravel() for part in np.meshgrid(*[np.linspace(-0.49, 0.49, 20)] * 2))
+    for side in range(6):
+        axis, end = side // 2, side % 2 - 0.5
+        points.append(np.insert(np.stack([u, v], axis=1), axis, end, axis=1))
+        scales.append(np.full((len(u), 3), np.where(np.arange(3) == axis, 0.001, 0.03)))
+        colours.append(np.full((len(u), 3), [0.1 * side, 0.5, 1.0 - 0.1 * side]))
+        parameters.append(np.full((len(u), 3), [side / 5, 0.2 + 0.1 * side, 1 - side / 5]))
+    count, encoded = 6 * len(u), encode_srgb(np.concatenate(colours))
+    return Splats(
+        np.concatenate(points),
+        np.tile([0, 0, 0, 1.0], (count, 1)),
+        np.concatenate(scales),
+        np.full(count, 0.99),
+        ((encoded - 0.5) / SH_C0)[:, None],
+        materials=SplatMaterials(*np.concatenate(parameters).T) if metal else None,
+    )
+
+
+def rays() -> mi.Ray3f:
+    ends = np.array([[0.3, 0.2, 0.5], [0.5, 0.2, 0.3], [0.2, -0.5, -0.3], [5.0, 5.0, 6.0]])
+    way = ends - RAY_ENDS
+    return mi.Ray3f(mi.Point3f(RAY_ENDS.T), mi.Vector3f((way / np.linalg.norm(way, axis=1)[:, None]).T))
+
+
+def test_hits_have_the_material_of_their_side_of_an_edge() -> None:
+    make_integrator()
+    proxies = Proxies([Occluder(BOX, 1, dynamic=True, splats=six_sides(metal=True))])
+    hit, static = proxies.nearest(rays())
+    sides = np.array([5, 1, 2])
+    np.testing.assert_allclose(hit.metallic, [*sides / 5, 0], atol=1e-6)
+    np.testing.assert_allclose(hit.roughness, [*(0.2 + 0.1 * sides), 1], atol=1e-6)
+    np.testing.assert_allclose(hit.specular, [*(1 - sides / 5), 0], atol=1e-6)
+    assert np.array(static.metallic) == 0
+    assert proxies.dynamic is not None
+    si = proxies.dynamic.scene.ray_intersect_preliminary(rays())
+    colour = np.array(proxies.dynamic.surface_at(si.prim_index, si.prim_uv, si.is_valid()).colour)[:, :3]
+    np.testing.assert_allclose(colour, [0.1 * sides, np.full(3, 0.5), 1 - 0.1 * sides], atol=1e-5)
+
+
+def test_captured_splats_are_diffuse_with_the_colours_of_their_placement() -> None:
+    make_integrator()
+    swap = SplatAppearance((0, 0, 1, 0, 1, 0, 1, 0, 0), wear=0, seed=0, size=1)
+    proxies = Proxies([Occluder(BOX, 1, dynamic=True, splats=six_sides(metal=False), appearance=swap)])
+    hit, _ = proxies.nearest(rays())
+    assert (np.array(hit.metallic), np.array(hit.roughness), np.array(hit.specular)) == (0, 1, 0)
+    assert proxies.dynamic is not None
+    si = proxies.dynamic.scene.ray_intersect_preliminary(rays())
+    colour = np.array(proxies.dynamic.surface_at(si.prim_index, si.prim_uv, si.is_valid()).colour)[:, 0]
+    np.testing.assert_allclose(colour, [0.5, 0.5, 0.5], atol=1e-5)
+
+
+def test_corners_of_a_coarse_mesh_have_the_mean_colour_of_many_gaussians() -> None:
+    """Each corner of a box of 12 triangles takes the mean of a chequered pattern, not the colour of one square."""
+    chequered = six_sides(metal=False)
+    number = np.arange(len(chequered))
+    colours = encode_srgb(np.where((number + number // 20) % 2, 0.8, 0.2))
+    sh = np.repeat((colours - 0.5)[:, None, None] / SH_C0, 3, axis=2)
+    chequered = Splats(chequered.means, chequered.quats, chequered.scales, chequered.opacities, sh)
+    assert np.abs(corner_materials(BOX, chequered)[:, :3] - 0.5).max() < 0.06
+
+
+def test_surfaces_without_splats_reflect_nothing() -> None:
+    make_integrator()
+    proxies = Proxies([Occluder(BOX, 1, dynamic=True)])
+    assert proxies.dynamic is not None
+    si = proxies.dynamic.scene.ray_intersect_preliminary(rays())
+    surface = proxies.dynamic.surface_at(si.prim_index, si.prim_uv, si.is_valid())
+    assert np.array(surface.colour).max() == 0

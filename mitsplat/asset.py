@@ -29,6 +29,7 @@ from scipy.spatial import QhullError
 
 from mitsplat.arrays import Float32Array, Float64Array
 from mitsplat.errors import InputError
+from mitsplat.gaussians.material_files import read_materials, write_materials
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.mesh import check_faces
 from mitsplat.geometry.untrusted_meshes import check_mesh
@@ -73,6 +74,9 @@ class AssetSpec(BaseModel):
     class_name: Name | None = Field(None, alias="class", description="Class to learn; else the name.")
     kind: Literal["object", "environment"] = "object"
     splats: str = Field(description="Splat file.")
+    materials: str | None = Field(
+        None, description="PLY file with the material of each Gaussian; the colours of the splats are base colours."
+    )
     mesh: str | None = Field(None, description="Mesh file, or 'hull': the convex hull of the opaque splats.")
     pieces: str | None = Field(None, description="Mesh file whose connected parts are convex pieces of the mesh.")
     units: Length | Literal["unknown"] | None = Field(
@@ -157,6 +161,8 @@ class Asset:
         folder = Path(folder)
         spec = read_spec(folder)
         splats = Splats.load(_named_file(folder, "splats", spec.splats))
+        if spec.materials is not None:
+            splats = _with_materials(splats, _named_file(folder, "materials", spec.materials))
         if spec.mesh is None:
             mesh = None
         elif spec.mesh == "hull":
@@ -186,7 +192,9 @@ class Asset:
         return asset if np.array_equal(metres_from_file, np.eye(4)) else asset.transformed(metres_from_file)
 
     def save(self, folder: str | PathLike[str], *, splats: str = "splats.ply") -> None:
-        """Write the asset as a folder: ``asset.yaml``, splats, ``mesh.ply`` and ``pieces.ply`` (shapes only, float32).
+        """Write the asset as a folder: ``asset.yaml``, splats, ``materials.ply``, ``mesh.ply`` and ``pieces.ply``.
+
+        Meshes are written as shapes only, in float32.
 
         Args:
             folder: Target folder. It is created if it is missing; files of these names in it are replaced.
@@ -206,6 +214,7 @@ class Asset:
                 class_name=self.class_name,
                 kind=self.kind,
                 splats=splats,
+                materials=None if self.splats.materials is None else "materials.ply",
                 mesh=None if self.mesh is None else "mesh.ply",
                 pieces="pieces.ply" if self.pieces else None,
                 units=units if self.units == "metre" else "unknown",
@@ -229,6 +238,8 @@ class Asset:
             with TemporaryDirectory(prefix=".asset-", dir=folder) as apart:
                 new = Path(apart)
                 stored.splats.save(new / splats)
+                if stored.splats.materials is not None:
+                    write_materials(stored.splats.materials, new / "materials.ply")
                 if stored.mesh is not None:
                     _concatenated([stored.mesh]).export(new / "mesh.ply")
                 if stored.pieces:
@@ -368,6 +379,13 @@ def _named_file(folder: Path, key: str, name: str) -> Path:
         return resolve_inside(folder, name)
     except InputError as error:
         raise InputError(f"{key_place(folder / ASSET_FILE, (key,))}: {error}") from error
+
+
+def _with_materials(splats: Splats, path: Path) -> Splats:
+    materials = read_materials(path, len(splats))
+    if splats.sh_degree:
+        raise InputError(f"{path}: splats with materials must have SH degree 0 (got {splats.sh_degree})")
+    return replace(splats, materials=materials)
 
 
 def _metres_per_unit(spec: AssetSpec, asset: Asset) -> float:

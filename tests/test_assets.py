@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from mitsplat.asset import Asset, read_mesh
 from mitsplat.errors import InputError
 from mitsplat.gaussians.splat_cloud import Splats
+from mitsplat.gaussians.splat_materials import SplatMaterials
 
 DATA = Path(__file__).parents[2] / "shared/data/splats"
 SIZE = (0.06, 0.04, 0.02)
@@ -28,6 +29,16 @@ def surface_splats(mesh: trimesh.Trimesh, count: int = 400, opacity: float = 0.9
         opacities=np.full(count, opacity),
         sh=rng.uniform(-0.5, 0.5, (count, 4, 3)),
     )
+
+
+def with_materials(asset: Asset, *, normals: bool = False) -> Asset:
+    """Return the asset with a base colour and a material per Gaussian; rows of materials are multiples of 1/255."""
+    count, rng = len(asset.splats), np.random.default_rng(1)
+    directions = rng.normal(size=(count, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    values = (np.float32(rng.integers(0, 256, count)) / 255 for _ in range(3))
+    materials = SplatMaterials(*values, directions if normals else None)
+    return replace(asset, splats=replace(asset.splats, sh=asset.splats.sh[:, :1], materials=materials))
 
 
 @pytest.fixture(scope="module")
@@ -74,6 +85,27 @@ class TestRoundTrip:
         assert len(loaded.pieces) == 2
         for piece, original in zip(sorted(loaded.pieces, key=lambda p: p.bounds[0, 0]), asset.pieces, strict=True):
             assert np.allclose(piece.bounds, original.bounds, atol=1e-8) and piece.is_watertight
+
+    @pytest.mark.parametrize("splats", ["splats.ply", "splats.spz", "a.splat"])
+    def test_saved_assets_keep_the_material_of_each_gaussian(self, asset, tmp_path, splats):
+        given_asset = with_materials(asset, normals=True)
+        given_asset.save(tmp_path, splats=splats)
+        loaded = Asset.load(tmp_path).splats
+        assert np.abs(loaded.means - asset.splats.means).max() < 1e-8  # the Gaussians keep their order
+        for name in ("metallic", "roughness", "specular"):
+            np.testing.assert_array_equal(getattr(loaded.materials, name), getattr(given_asset.splats.materials, name))
+        np.testing.assert_allclose(loaded.materials.normals, given_asset.splats.materials.normals, atol=1e-6)
+        assert loaded.materials.select([3]).metallic == given_asset.splats.materials.metallic[3]
+
+    def test_scaled_and_turned_assets_keep_their_materials(self, asset, tmp_path):
+        given_asset = replace(with_materials(asset, normals=True), units="unknown")
+        given_asset.save(tmp_path)
+        write(tmp_path, (tmp_path / "asset.yaml").read_text().replace("up: z", "up: y"))
+        for changed in (Asset.load(tmp_path), Asset.load(tmp_path).resized(0.3), Asset.load(tmp_path).scaled(2.0)):
+            found, expected = changed.splats.materials, given_asset.splats.materials
+            np.testing.assert_array_equal(found.roughness, expected.roughness)
+            x, y, z = expected.normals.T
+            np.testing.assert_allclose(found.normals, np.stack([x, -z, y], axis=1), atol=1e-6)
 
     def test_saved_assets_keep_their_properties(self, asset, tmp_path):
         for given_asset in (asset, replace(asset, kind="environment", mesh=None, pieces=()), replace(asset, mass=0.3)):
@@ -246,6 +278,46 @@ class TestBadInput:
         with pytest.raises(InputError, match=sentence) as error:
             Asset.load(tmp_path)
         assert "\n" not in str(error.value)
+
+    @pytest.mark.parametrize(
+        ("before", "after", "sentence"),
+        [
+            (b"uchar metallic", b"uchar metal___", "must have the uchar vertex properties metallic$"),
+            (b"uchar roughness", b"char roughness ", "must have the uchar vertex properties roughness$"),
+            (b"float ny", b"float xy", "must have the float vertex properties ny$"),
+            (b"float nz", b"float nx", "nx"),
+            (b"vertex 400", b"vertex 399", r"must have one vertex per Gaussian, 400 \(got 399\)"),
+            (b"binary_little_endian", b"ascii", r"must be binary \(got ascii\)"),
+            (
+                b"end_header\n",
+                b"end_header\n" + bytes(1 << 17),
+                r"materials of 400 Gaussians must have at most \d+ bytes",
+            ),
+            (b"end_header\n", b"end_header\n\0\0\0" + bytes(12), r"normals must have length 1 \(got 0 at row 0\)"),
+            (b"ply\n", b"pl\n", "a PLY file must have a header"),
+        ],
+    )
+    def test_materials_that_break_a_rule_are_refused(self, asset, tmp_path, before, after, sentence):
+        with_materials(asset, normals=True).save(tmp_path)
+        stored = (tmp_path / "materials.ply").read_bytes()
+        (tmp_path / "materials.ply").write_bytes(stored.replace(before, after, 1))
+        with pytest.raises(InputError, match=f"materials.ply: .*{sentence}") as error:
+            Asset.load(tmp_path)
+        assert "\n" not in str(error.value)
+
+    def test_materials_without_a_row_per_gaussian_or_with_higher_bands_are_refused(self, asset, tmp_path):
+        with_materials(asset).save(tmp_path)
+        stored = (tmp_path / "materials.ply").read_bytes()
+        (tmp_path / "materials.ply").write_bytes(stored[:-1])
+        with pytest.raises(InputError, match=r"states 400 Gaussians in at least 1200 bytes \(got 1199 bytes\)"):
+            Asset.load(tmp_path)
+        (tmp_path / "materials.ply").write_bytes(stored)
+        asset.splats.save(tmp_path / "splats.ply")
+        with pytest.raises(InputError, match=r"splats with materials must have SH degree 0 \(got 1\)"):
+            Asset.load(tmp_path)
+        (tmp_path / "materials.ply").unlink()
+        with pytest.raises(InputError, match=r"asset.yaml:\d+: materials: no such file \(got materials.ply\)"):
+            Asset.load(tmp_path)
 
     def test_a_missing_asset_folder_is_refused(self, tmp_path):
         with pytest.raises(InputError, match=r"none/asset.yaml: no such file"):

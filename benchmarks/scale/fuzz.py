@@ -22,7 +22,7 @@ import time
 import traceback
 from collections import Counter
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -44,6 +44,7 @@ from mitsplat.detector.training import write_data
 from mitsplat.errors import InputError
 from mitsplat.frames.untrusted_xml import check_xml
 from mitsplat.gaussians.splat_cloud import Splats
+from mitsplat.gaussians.splat_materials import SplatMaterials
 from mitsplat.scene.loading.scene_loading import load_scene
 
 MEMORY = 12 << 30
@@ -139,7 +140,8 @@ def make_samples(folder: Path) -> None:
         sh=rng.normal(0, 0.3, (count, 4, 3)),
     )
     box = trimesh.creation.box((0.02, 0.03, 0.01))
-    asset = Asset("nut", "nut", splats, box, (box,))
+    coloured = replace(splats, sh=splats.sh[:, :1], materials=SplatMaterials.uniform(count))
+    asset = Asset("nut", "nut", coloured, box, (box,))
     asset.save(folder / "nut")
     for suffix in ("splat", "spz"):
         splats.save(folder / f"a.{suffix}")
@@ -238,6 +240,7 @@ READERS: Mapping[str, Reader] = {
     "splats .sog": Reader("a.sog", lambda folder: Splats.load(folder / "a.sog"), slow=True),
     "splats .ksplat": Reader("a.ksplat", lambda folder: Splats.load(folder / "a.ksplat"), slow=True),
     "asset.yaml": Reader("nut/asset.yaml", lambda folder: Asset.load(folder / "nut")),
+    "materials.ply": Reader("nut/materials.ply", lambda folder: Asset.load(folder / "nut")),
     "scene .yaml": Reader("scene.yaml", lambda folder: load_scene(folder / "scene.yaml")),
     "scene .xml": Reader("scene.xml", lambda folder: check_xml(folder / "scene.xml")),
     "mesh .ply": Reader("mesh.ply", lambda folder: read_mesh(folder / "mesh.ply"), slow=True),

@@ -17,6 +17,7 @@ import trimesh
 
 from mitsplat.arrays import Float64Array
 from mitsplat.gaussians.splat_cloud import Splats
+from mitsplat.gaussians.splat_files import SplatArrays
 from mitsplat.geometry.camera import Camera
 from mitsplat.renderer.layers import Layers, make_integrator, make_splats_shape, render_layers
 from mitsplat.runtime.device import use_device
@@ -101,7 +102,7 @@ def _splats(means: Float64Array, scales: tuple[float, float, float], sh: float) 
     count = len(means)
     quats, sizes = np.tile([0.0, 0.0, 0.0, 1.0], (count, 1)), np.tile(scales, (count, 1))
     parts = means, quats, sizes, np.full(count, 0.95), np.full((count, 1, 3), sh)
-    return Splats(*(part.astype(np.float32) for part in parts))
+    return Splats(*SplatArrays(*(part.astype(np.float32) for part in parts)))
 
 
 def trial_means(layers: Layers) -> dict[str, Float64Array]:

@@ -229,5 +229,5 @@ def _check_folder(out: Path, source: Path, name: str | None, *, overwrite: bool)
         raise InputError(f"{out / there[0]}: already exists: choose another folder, or use --overwrite to replace it")
 
 
-_ASSET_FILES = ("asset.yaml", "splats.ply", "mesh.ply", "pieces.ply", "report.html")
+_ASSET_FILES = ("asset.yaml", "splats.ply", "materials.ply", "mesh.ply", "pieces.ply", "report.html")
 """Files of an asset folder."""

@@ -6,13 +6,16 @@ size, scale or class in each entry.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import fields
 from typing import TYPE_CHECKING
 
+import numpy as np
+import numpy.typing as npt
 import trimesh
 
 from mitsplat.gaussians.splat_cloud import Splats
+from mitsplat.gaussians.splat_materials import SplatMaterials
 from mitsplat.scene.spec.light_spec import EnvironmentLight
 from mitsplat.scene.spec.named_files import image_lists
 from mitsplat.storage.content_hash import ContentHash, file_hash
@@ -71,10 +74,9 @@ class _InputHashes:
         """Convert a field to JSON."""
         if isinstance(value, Splats | trimesh.Trimesh):
             if id(value) not in self._known:
-                names = [field.name for field in fields(value)] if isinstance(value, Splats) else ["vertices", "faces"]
                 digest = ContentHash()
-                for name in names:
-                    digest.add_array(getattr(value, name))
+                for array in _arrays_of(value):
+                    digest.add_array(array)
                 self._known[id(value)] = value, digest.hexdigest()  # holding the value keeps its id unique
             return self._known[id(value)][1]
         if isinstance(value, Mapping):
@@ -82,3 +84,16 @@ class _InputHashes:
         if isinstance(value, tuple):
             return [self.describe_value(entry) for entry in value]
         return value
+
+
+def _arrays_of(value: Splats | SplatMaterials | trimesh.Trimesh) -> Iterator[npt.NDArray[np.generic]]:
+    """Yield all arrays of splats, materials or a mesh."""
+    if isinstance(value, trimesh.Trimesh):
+        yield from (value.vertices, value.faces)
+        return
+    for field in fields(value):
+        part = getattr(value, field.name)
+        if isinstance(part, SplatMaterials):
+            yield from _arrays_of(part)
+        elif part is not None:
+            yield part

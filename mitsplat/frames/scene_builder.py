@@ -21,6 +21,7 @@ from mitsplat.asset import Asset
 from mitsplat.frames.background import background_picture
 from mitsplat.frames.camera_response import BACKGROUND
 from mitsplat.gaussians.splat_cloud import Splats
+from mitsplat.gaussians.splat_files import SplatArrays
 from mitsplat.geometry.camera import Camera
 from mitsplat.renderer.layers import device_array, make_splats_shape
 from mitsplat.renderer.scene_emitters import emitter_dict, movable
@@ -36,7 +37,7 @@ from mitsplat.scene.spec.shape_spec import Shape
 
 Value = TypeVar("Value")
 
-NO_SPLATS = Splats(*(np.empty(shape, np.float32) for shape in ((0, 3), (0, 4), (0, 3), 0, (0, 1, 3))))
+NO_SPLATS = Splats(*SplatArrays(*(np.empty(shape, np.float32) for shape in ((0, 3), (0, 4), (0, 3), 0, (0, 1, 3)))))
 """Empty splats of a proxy that only receives and casts shadows."""
 
 

@@ -168,7 +168,7 @@ class Splats:
         width = max(part.sh.shape[1] for part in parts)
         padded = [np.pad(part.sh, ((0, 0), (0, width - part.sh.shape[1]), (0, 0))) for part in parts]
         names = [name for name in SplatArrays._fields if name != "sh"]
-        joined = {name: np.concatenate([getattr(p, name) for p in parts]) for name in names}
+        joined: dict[str, Any] = {name: np.concatenate([getattr(p, name) for p in parts]) for name in names}
         return Splats(**joined, sh=np.concatenate(padded))
 
 

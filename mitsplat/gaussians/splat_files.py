@@ -49,7 +49,7 @@ _PLY_TYPES = {
     **{"double": "f8", "float64": "f8"},
 }
 _PLY_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}
-_MAX_HEADER = 1 << 16
+MAX_PLY_HEADER = 1 << 16
 _MEANS, _QUATS, _SCALES = ("x", "y", "z"), ("rot_1", "rot_2", "rot_3", "rot_0"), ("scale_0", "scale_1", "scale_2")
 _COLOUR = ("f_dc_0", "f_dc_1", "f_dc_2")
 _MAX_COMPRESSION_RATIO = 100
@@ -133,7 +133,7 @@ def write_splats(splats: SplatArrays, path: Path) -> None:
 
 
 def _decode_ply(data: bytes) -> SplatArrays:
-    form, elements, start = _parse_ply_header(data)
+    form, elements, start = parse_ply_header(data)
     if "vertex" not in elements:
         raise InputError("a PLY file of splats must have a vertex element")
     names = elements["vertex"][1].names or ()
@@ -146,19 +146,19 @@ def _decode_ply(data: bytes) -> SplatArrays:
     rest_names = [f"f_rest_{i}" for i in range(rest)]
     if rest not in (0, 9, 24, 45) or not set(rest_names) <= set(names):
         raise InputError(f"f_rest must be numbered from 0 and have 0, 9, 24 or 45 properties (got {rest})")
-    rows = _vertex_rows(data, form, elements, start)
+    rows = vertex_rows(data, form, elements, start)
     # SH coefficients are channel-major: all of red, then green, then blue.
-    higher = _columns(rows, rest_names).reshape(len(rows), 3, rest // 3).transpose(0, 2, 1)
+    higher = columns_of(rows, rest_names).reshape(len(rows), 3, rest // 3).transpose(0, 2, 1)
     return SplatArrays(
-        means=_columns(rows, _MEANS),
-        quats=_columns(rows, _QUATS),
-        scales=_exp(_columns(rows, _SCALES)),
+        means=columns_of(rows, _MEANS),
+        quats=columns_of(rows, _QUATS),
+        scales=_exp(columns_of(rows, _SCALES)),
         opacities=_sigmoid(rows["opacity"]),
-        sh=np.concatenate([_columns(rows, _COLOUR)[:, None], higher], axis=1),
+        sh=np.concatenate([columns_of(rows, _COLOUR)[:, None], higher], axis=1),
     )
 
 
-def _parse_ply_header(data: bytes) -> tuple[str, dict[str, tuple[int, np.dtype[Any]]], int]:
+def parse_ply_header(data: bytes) -> tuple[str, dict[str, tuple[int, np.dtype[Any]]], int]:
     """Parse the header of a PLY file (Turk 1994).
 
     Returns:
@@ -167,9 +167,9 @@ def _parse_ply_header(data: bytes) -> tuple[str, dict[str, tuple[int, np.dtype[A
     Raises:
         InputError: If the header contains an invalid line.
     """
-    end = re.search(rb"\nend_header[ \t]*\r?\n", data[:_MAX_HEADER])
+    end = re.search(rb"\nend_header[ \t]*\r?\n", data[:MAX_PLY_HEADER])
     if not re.match(rb"ply[ \t]*\r?\n", data) or end is None:
-        raise InputError(f"a PLY file must have a header from 'ply' to 'end_header' within {_MAX_HEADER} bytes")
+        raise InputError(f"a PLY file must have a header from 'ply' to 'end_header' within {MAX_PLY_HEADER} bytes")
     lines = data[: end.start()].decode("ascii", "replace").splitlines()
     form = ""
     counts: dict[str, int] = {}
@@ -191,7 +191,7 @@ def _parse_ply_header(data: bytes) -> tuple[str, dict[str, tuple[int, np.dtype[A
     return form, {name: (counts[name], np.dtype(types[name])) for name in counts}, end.end()
 
 
-def _vertex_rows(
+def vertex_rows(
     data: bytes, form: str, elements: dict[str, tuple[int, np.dtype[Any]]], start: int
 ) -> npt.NDArray[np.void]:
     """Return the vertices as a structured array.
@@ -227,7 +227,7 @@ def _sigmoid(logits: npt.ArrayLike) -> Float32Array:
     return np.asarray(expit(np.asarray(logits, dtype=np.float64)), dtype=np.float32)
 
 
-def _columns(rows: npt.NDArray[np.void], names: tuple[str, ...] | list[str]) -> Float32Array:
+def columns_of(rows: npt.NDArray[np.void], names: tuple[str, ...] | list[str]) -> Float32Array:
     """Return the named properties as columns, shape (N, len(names))."""
     table = np.empty((len(rows), len(names)), np.float32)
     with np.errstate(over="ignore"):

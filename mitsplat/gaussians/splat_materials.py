@@ -6,7 +6,7 @@ the direction. The other parameters are those of ``principled``; its parameters 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
@@ -70,8 +70,8 @@ class SplatMaterials:
 
     def select(self, rows: slice | npt.NDArray[np.bool_] | npt.NDArray[np.integer]) -> SplatMaterials:
         """Return the materials of the selected Gaussians."""
-        values = {f.name: getattr(self, f.name) for f in fields(self)}
-        return SplatMaterials(**{name: None if v is None else v[rows] for name, v in values.items()})
+        normals = None if self.normals is None else self.normals[rows]
+        return SplatMaterials(self.metallic[rows], self.roughness[rows], self.specular[rows], normals)
 
     def rotated(self, rotation: npt.ArrayLike) -> SplatMaterials:
         """Return the materials with their normals rotated by ``rotation``, shape (3, 3)."""

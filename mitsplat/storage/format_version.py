@@ -16,7 +16,7 @@ from mitsplat.version import __version__
 FORMAT_VERSION = "format_version"
 """Key of the version."""
 
-FORMAT_VERSIONS = {"asset.yaml": 1, "capture.json": 1, "dataset.json": 1, "fit.json": 1}
+FORMAT_VERSIONS = {"asset.yaml": 2, "capture.json": 1, "dataset.json": 1, "fit.json": 1}
 """Newest version by file, which is the version written. That of ``dataset.json`` covers the whole dataset."""
 
 

@@ -16,6 +16,7 @@ from mitsplat.dataset.inputs import describe_inputs
 from mitsplat.errors import InputError
 from mitsplat.frames.mitsuba_xml import export_xml
 from mitsplat.gaussians.splat_cloud import Splats
+from mitsplat.gaussians.splat_materials import SplatMaterials
 from mitsplat.scene.layout import NO_PHYSICS, Instance, Layout
 from mitsplat.scene.loading.scene_loading import load_scene
 from tests.conftest import box_asset
@@ -48,7 +49,10 @@ def made(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("inputs")
     points = {"top": (0.0, 0.0, 0.005), "tip": (0.01, 0.0, 0.0)}
     for name, size in (("nut", 0.02), ("other_nut", 0.03)):
-        replace(box_asset("nut", (size, 0.03, 0.01)), keypoints=points).save(folder / "assets" / name)
+        nut = replace(box_asset("nut", (size, 0.03, 0.01)), keypoints=points)
+        if name == "other_nut":
+            nut = replace(nut, splats=replace(nut.splats, materials=SplatMaterials.uniform(12)))
+        nut.save(folder / "assets" / name)
     replace(box_asset("loose"), class_name="nut", units="unknown", keypoints=points).save(folder / "assets/loose")
     replace(box_asset("nut", (1.0, 1.0, 0.5)), kind="environment", white=3.0).save(folder / "assets/room")
     trimesh.creation.box((1, 1, 0.1)).export(folder / "table.ply")
@@ -70,6 +74,11 @@ def colour(path: Path) -> None:
     sh = splats.sh.copy()
     sh[3, 0, 0] += 0.25
     replace(splats, sh=sh).save(path)
+
+
+def polish(path: Path) -> None:
+    """Change the last parameter of the last Gaussian in a file of materials."""
+    path.write_bytes(path.read_bytes()[:-1] + b"\0")
 
 
 def bend(path: Path) -> None:
@@ -103,6 +112,7 @@ EDITS = [
         (f"assets/{name}/asset.yaml", say("friction: 0.5", "friction: 0.7"), f"objects[{at[0]}].friction")
         for name, at in OBJECTS.items()
     ),
+    ("assets/other_nut/materials.ply", polish, "objects[1].splats"),
     ("assets/other_nut/asset.yaml", say("name: nut\n", "name: nut2\n"), "assets"),
     ("assets/other_nut/asset.yaml", say("class: nut", "class: large"), "objects[1].class_name"),
     ("assets/other_nut/asset.yaml", say("density: 1000.0", "mass: 0.5"), "objects[1].mass"),

@@ -56,19 +56,20 @@ def test_versions_up_to_the_newest_are_accepted() -> None:
 class TestAssets:
     def test_an_asset_file_starts_with_its_version(self, tmp_path: Path) -> None:
         box_asset("nut").save(tmp_path)
-        assert (tmp_path / "asset.yaml").read_text().startswith("format_version: 1\nname: nut\n")
+        assert (tmp_path / "asset.yaml").read_text().startswith("format_version: 2\nname: nut\n")
 
     def test_an_asset_without_a_version_counts_as_version_1(self, tmp_path: Path) -> None:
         box_asset("nut").save(tmp_path)
         manual = tmp_path / "asset.yaml"
-        manual.write_text(manual.read_text().replace("format_version: 1\n", ""))
+        manual.write_text(manual.read_text().replace("format_version: 2\n", ""))
         assert Asset.load(tmp_path).name == "nut"
 
     def test_a_newer_asset_is_refused_before_its_unknown_keys(self, tmp_path: Path) -> None:
         box_asset("nut").save(tmp_path)
         manual = tmp_path / "asset.yaml"
-        manual.write_text("hardness: 3\n" + manual.read_text().replace("version: 1", "version: 2"))
-        with pytest.raises(InputError, match=rf"asset\.yaml:2: {NEWER}$"):
+        manual.write_text("hardness: 3\n" + manual.read_text().replace("version: 2", "version: 3"))
+        newer = NEWER.replace("most 1", "most 2").replace("got 2", "got 3")
+        with pytest.raises(InputError, match=rf"asset\.yaml:2: {newer}$"):
             Asset.load(tmp_path)
 
     def test_an_invalid_asset_version_is_refused_with_its_line(self, tmp_path: Path) -> None:

@@ -174,7 +174,7 @@ def refuse_to_replace(out: Path, splats: Path) -> None:
         InputError: If a file would be replaced; the message names it.
     """
     known = any((out / name).exists() for name in (ASSET_FILE, REPORT_FILE))
-    for name in ("splats.ply", "mesh.ply", "pieces.ply"):
+    for name in ("splats.ply", "materials.ply", "mesh.ply", "pieces.ply"):
         if (out / name).resolve() == splats.resolve() or ((out / name).exists() and not known):
             raise InputError(f"{out / name}: would be replaced: choose another output folder")
 
@@ -232,7 +232,9 @@ def _existing_asset(out: Path, inputs: str) -> AssetResult | None:
         return None
     try:
         spec = read_spec(out)
-        if not all((out / file).is_file() for file in (spec.splats, spec.mesh, spec.pieces) if file is not None):
+        if not all(
+            (out / file).is_file() for file in (spec.splats, spec.materials, spec.mesh, spec.pieces) if file is not None
+        ):
             return None
         record = json.loads((out / VERDICT_FILE).read_text())
         if record.pop("inputs") != inputs:

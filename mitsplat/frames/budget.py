@@ -9,13 +9,14 @@ machine's memory.
 from __future__ import annotations
 
 import itertools
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
 
 from mitsplat.engine.resources import WorkerMemory
 from mitsplat.gaussians.splat_cloud import Splats
+from mitsplat.gaussians.splat_files import SplatArrays
 from mitsplat.geometry.camera import Camera
 from mitsplat.quality import KERNELS, Quality, resolve_quality
 from mitsplat.renderer.instances.silhouettes import canvas_margin
@@ -70,7 +71,7 @@ def worker_memory(scene: Scene) -> WorkerMemory:
     environments = [environment.splats for environment in scene.environments]
     static = [max(environments, key=len)] if environments else []
     all_splats = {id(splats): splats for splats in itertools.chain(environments, *pools)}.values()
-    stored = sum(getattr(splats, field.name).nbytes for splats in all_splats for field in fields(splats))
+    stored = sum(getattr(splats, name).nbytes for splats in all_splats for name in SplatArrays._fields)
     num_gaussians = sum(map(len, static)) + sum(count * len(splats) for splats, count in placed)
     quality = replace(resolve_quality(spec.quality), **spec.rendering.model_dump())
     pixels = spec.output.width * spec.output.height

@@ -53,8 +53,6 @@ def means(light_filter: LightFilter, estimate: Estimate, bounced: tuple[Any, Any
     return LightMeans(
         estimate.lit * count,
         estimate.base * count,
-        estimate.specular_lit * count,
-        estimate.specular_base * count,
         SMOOTH(light_filter, estimate, bounced).bounced,
     )
 

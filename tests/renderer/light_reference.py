@@ -79,13 +79,33 @@ class BoxScene:
         """Return the ratio of irradiance with all boxes to that with static boxes, at a horizontal surface."""
         return Light(self._irradiance(point, self.boxes) / self._irradiance(point, self._static), 0.0)
 
-    def relit(self, point: Array, to_camera: Array, roughness: float = 0.4, specular: float = 0.0) -> Light:
-        """Return the light of a uniformly captured horizontal surface."""
-        direct = self._irradiance(point, self.boxes) / self.white
-        towards, light = self._arriving(point, self.boxes)
-        mirrored = float(light @ ggx(to_camera, towards, roughness, specular))
-        highlight = np.pi / self.white * mirrored - direct * tent(to_camera[2], roughness, specular)
-        return Light(direct + self._bounce(point), highlight if specular else 0.0)
+    def relit(
+        self, point: Array, to_camera: Array, roughness: float = 1.0, metallic: float = 0.0, specular: float = 0.0
+    ) -> Light:
+        """Return the light of a horizontal surface of a material.
+
+        The factor is that of the base colour. The highlight is the reflected light without it.
+        """
+        diffuse = self._irradiance(point, self.boxes) / self.white + self._bounce(point)
+        if metallic or specular:
+            diffuse *= (1 - metallic) * diffuse_albedo(to_camera, roughness)
+        emitted, reflected = self._arriving(point, self.boxes), self._reflecting(point)
+        towards = np.concatenate([emitted[0], reflected[0]])
+        light = np.concatenate([emitted[1] * np.pi / self.white, reflected[1]])
+        lobe, cos_half = specular_lobe(to_camera, towards, roughness)
+        schlick = (1 - cos_half) ** 5
+        dielectric = fresnel(cos_half, 0.08 * specular) if specular else 0.0
+        tinted = light @ (lobe * metallic * (1 - schlick))
+        colourless = light @ (lobe * (metallic * schlick + (1 - metallic) * dielectric))
+        return Light(diffuse + float(tinted), float(colourless))
+
+    def _reflecting(self, point: Array) -> tuple[Array, Array]:
+        """Return unit vectors (N, 3) towards captured boxes, and pi times their light (N,) per cosine-weighted area."""
+        towards = hemisphere(128)
+        static = np.min([box.entry(point, towards) for box in self._static], axis=0)
+        dynamic = np.min([box.entry(point, towards) for box in self.boxes if box.dynamic], axis=0)
+        seen = (static < np.inf) & (dynamic > static)
+        return towards, np.where(seen, self.grey * np.pi / len(towards), 0.0)
 
     @property
     def _static(self) -> list[Box]:
@@ -100,7 +120,7 @@ class BoxScene:
         places, normal, area = self.lamp.samples()
         way = places - point
         distance = np.linalg.norm(way, axis=1)
-        to_lamp, to_sky = way / distance[:, None], hemisphere()
+        to_lamp, to_sky = way / distance[:, None], hemisphere(128)
         light = self.lamp.radiance * area * np.maximum(-to_lamp @ normal, 0) * np.maximum(to_lamp @ UP, 0) / distance**2
         sky = np.full(len(to_sky), self.sky * np.pi / len(to_sky))
         visible = free(point, to_lamp, distance, boxes), free(point, to_sky, np.full(len(to_sky), np.inf), boxes)
@@ -126,28 +146,34 @@ def hemisphere(rings: int = 32) -> Array:
     return np.stack([radius * np.cos(angle), radius * np.sin(angle), np.sqrt(1 - radius**2)], axis=1)
 
 
-def ggx(to_camera: Array, to_light: Array, roughness: float, specular: float) -> Array:
-    """Return the GGX BRDF D F G / (4 cos cos) of a horizontal surface for directions (N, 3) to light.
+def specular_lobe(to_camera: Array, to_light: Array, roughness: float) -> tuple[Array, Array]:
+    """Return D G / (4 cos cos) of GGX on a horizontal surface, and the cosine of the half vector (Walter et al. 2007).
 
-    The masking is height-correlated (Walter et al. 2007, Heitz 2014).
+    The masking is the product of both sides, as in Mitsuba's ``principled``. Directions ``to_light`` are (N, 3).
     """
-    alpha2 = max(roughness, 0.15) ** 4
+    alpha2 = roughness**4
     half = to_light + to_camera
     half /= np.linalg.norm(half, axis=1, keepdims=True)
-    cos_camera, cos_light, cos_half = to_camera @ UP, to_light @ UP, half @ UP
+    cos_camera, cos_light, cos_half = to_camera @ UP, np.maximum(to_light @ UP, 1e-9), half @ UP
     distribution = alpha2 / (np.pi * (cos_half**2 * (alpha2 - 1) + 1) ** 2)
-    fresnel = specular + (1 - specular) * (1 - (half * to_light).sum(axis=1)) ** 5
-    smith_camera, smith_light = (np.sqrt(alpha2 + (1 - alpha2) * cosine**2) for cosine in (cos_camera, cos_light))
-    masking = 2 * cos_light * cos_camera / (cos_light * smith_camera + cos_camera * smith_light)
-    return np.asarray(distribution * fresnel * masking / (4 * cos_light * cos_camera))
+    masks = [2 / (1 + np.sqrt(1 + alpha2 * (1 / cosine**2 - 1))) for cosine in (cos_camera, cos_light)]
+    return distribution * masks[0] * masks[1] / (4 * cos_camera * cos_light), (half * to_camera).sum(axis=1)
 
 
-def tent(cosine: float, roughness: float, specular: float) -> float:
-    """Return the mirrored share of uniform light (fit of Karis 2014, "Physically Based Shading on Mobile").
+def diffuse_albedo(to_camera: Array, roughness: float) -> float:
+    """Return the albedo of the diffuse lobe of Burley 2012 on a horizontal white surface under uniform light."""
+    towards = hemisphere()
+    schlick_camera, schlick_light = (1 - to_camera @ UP) ** 5, (1 - towards @ UP) ** 5
+    retro = roughness * (1 + towards @ to_camera)
+    base = (1 - schlick_camera / 2) * (1 - schlick_light / 2)
+    both = schlick_camera + schlick_light + schlick_camera * schlick_light * (retro - 1)
+    return float(np.mean(base + retro * both))
 
-    At most 8 % of the captured colour is replaced.
-    """
-    specular = min(specular, 0.08)
-    scale, bias = np.array([-1, -0.0275, -0.572, 0.022]) * roughness + np.array([1, 0.0425, 1.04, -0.04]), 1.04
-    bend = min(scale[0] ** 2, 2 ** (-9.28 * max(cosine, 0.5))) * scale[0] + scale[1]
-    return float(specular * (scale[2] - bias * bend) + scale[3] + bias * bend)
+
+def fresnel(cosine: Array, normal_reflectance: float) -> Array:
+    """Return the reflectance of a dielectric for unpolarised light (Fresnel's equations)."""
+    root = np.sqrt(normal_reflectance)
+    eta = (1 + root) / (1 - root)
+    inside = np.sqrt(1 - (1 - cosine**2) / eta**2)
+    s, p = (cosine - eta * inside) / (cosine + eta * inside), (eta * cosine - inside) / (eta * cosine + inside)
+    return np.asarray(0.5 * (s**2 + p**2))

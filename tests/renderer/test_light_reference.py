@@ -5,6 +5,7 @@ Each stage of :func:`mitsplat.renderer.light.light.light_factor` contributes to 
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import mitsuba as mi
@@ -15,6 +16,7 @@ import trimesh
 
 from mitsplat.gaussians.spherical_harmonics import SH_C0
 from mitsplat.gaussians.splat_cloud import Splats
+from mitsplat.gaussians.splat_materials import SplatMaterials
 from mitsplat.geometry.camera import Camera
 from mitsplat.images.colour import decode_srgb
 from mitsplat.renderer.layers import make_integrator, make_splats_shape, render_layers
@@ -28,7 +30,7 @@ NEAR_OBJECT = Box((-0.4, -0.2, 0.0), (0.0, 0.2, 0.1))
 OCCLUDER = Box((-0.1, 0.5, 0.3), (0.3, 0.7, 0.4), dynamic=True)
 LAMP = Lamp((0.2, 1.6, 1.4), (0.0, 0.0, 0.0), 0.4, 60.0)
 SKY, GREY, WHITE = 0.3, 0.8, float(np.pi)
-ROUGHNESS, SPECULAR = 0.6, 0.3
+ROUGHNESS, METALLIC, SPECULAR = 0.6, 0.4, 0.5
 CAMERA = Camera.look_at((0, 0, 1.47), (0, 0, 0), up=(0, 1, 0), width=128, height=128, fov_x=40)
 EYE = CAMERA.world_from_camera[:3, 3]
 SEEDS = 4
@@ -51,6 +53,11 @@ def plane(low: tuple[float, float], high: tuple[float, float], z: float) -> Spla
     )
 
 
+def with_material(splats: Splats) -> Splats:
+    materials = SplatMaterials.uniform(len(splats), metallic=METALLIC, roughness=ROUGHNESS, specular=SPECULAR)
+    return replace(splats, materials=materials)
+
+
 def mesh_of(*boxes: Box) -> trimesh.Trimesh:
     return trimesh.util.concatenate([trimesh.creation.box(bounds=[box.low, box.high]) for box in boxes])
 
@@ -60,11 +67,7 @@ def load_scene() -> mi.Scene:
     shapes = {
         "floor": make_splats_shape(plane((-1, -1), (0, 1), 0.0), proxy=mesh_of(FLOOR, WALL)),
         "object": make_splats_shape(
-            plane(OBJECT.low[:2], OBJECT.high[:2], OBJECT.high[2]),
-            proxy=mesh_of(OBJECT),
-            instance=1,
-            roughness=ROUGHNESS,
-            specular=SPECULAR,
+            with_material(plane(OBJECT.low[:2], OBJECT.high[:2], OBJECT.high[2])), proxy=mesh_of(OBJECT), instance=1
         ),
         "occluder": make_splats_shape(nothing(), proxy=mesh_of(OCCLUDER), instance=2),
         "table": {
@@ -149,14 +152,13 @@ def test_visible_mesh_takes_direct_and_reflected_light(pictures: tuple[Array, Ar
     assert_close(pictures[0], pixels, expected, bias=0.008, error=0.03)
 
 
-def test_relit_object_takes_direct_light_reflected_light_and_a_highlight(pictures: tuple[Array, Array]) -> None:
-    """The highlight is integrated over a few fixed directions, whose error is below a twentieth."""
+def test_material_takes_direct_light_reflected_light_and_mirrored_light(pictures: tuple[Array, Array]) -> None:
     points, pixels = points_below_pixels((-0.33, -0.13), (-0.07, 0.13), OBJECT.high[2], 6)
-    expected = [SCENE.relit(point, to_camera(point), ROUGHNESS, SPECULAR) for point in points]
-    assert_close(pictures[0], pixels, [light.factor for light in expected], bias=0.003, error=0.015)
+    expected = [SCENE.relit(point, to_camera(point), ROUGHNESS, METALLIC, SPECULAR) for point in points]
+    assert_close(pictures[0], pixels, [light.factor for light in expected], bias=0.004, error=0.02)
     highlights = [light.highlight for light in expected]
     error = float(np.mean(highlights)) / 20
-    assert_close(pictures[1], pixels, highlights, bias=error, error=error)
+    assert_close(pictures[1], pixels, highlights, bias=error, error=2 * error)
 
 
 def test_number_of_rays_is_doubled_until_it_is_the_wanted_one(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from types import SimpleNamespace
 from typing import Any
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -17,7 +16,6 @@ from mitsplat.runtime.variant import ensure_variant
 from tests.renderer.test_light import WHITE_SKY, down_camera, floor, nothing, slab
 
 ensure_variant()
-from mitsplat.renderer.light.highlight import Lobe  # noqa: E402
 from mitsplat.renderer.light.light_tiles import BLOCK, MIN_SHADOW_HITS, ShadowTiles, block_order  # noqa: E402
 
 
@@ -131,19 +129,3 @@ def test_a_faint_shadow_is_a_share_of_the_light_left_by_static_objects() -> None
     assert hidden[before_sky].mean() > 0.2
     assert abs((1 - light - share)[:, before_sky].mean()) < 0.1 * share[before_sky].mean()
     assert abs((1 - light)[:, before_roof].mean()) < 0.1 * share[before_roof].mean()
-
-
-@pytest.mark.parametrize("roughness", [0.2, 0.5, 1.0])
-@pytest.mark.parametrize("cosine", [1.0, 0.6, 0.15])
-def test_the_mean_lobe_weight_equals_the_reflectance_integral(roughness: float, cosine: float) -> None:
-    """The mean weight of sampled directions is the integral of reflectance times cosine over the hemisphere."""
-    n = 1 << 18
-    # Opaque values, so that all cases share one kernel.
-    across, along, alpha = (dr.opaque(mi.Float, x) for x in (float(np.sqrt(1 - cosine**2)), cosine, roughness**2))
-    lobe = Lobe(mi.Vector3f(0, 0, 1), mi.Vector3f(across, 0.0, along), alpha, mi.Float(0.4))
-    i = dr.arange(mi.UInt32, n)
-    u = mi.Point2f((mi.Float(i % 512) + 0.5) / 512, (mi.Float(i // 512) + 0.5) / 512)
-    summed = np.pi * np.array(lobe.reflectance(mi.warp.square_to_cosine_hemisphere(u)), np.float64).mean()
-    direction, weight = lobe.sample(u)
-    assert np.array(weight, np.float64).mean() == pytest.approx(summed, rel=0.01)
-    assert np.array(dr.norm(direction)) == pytest.approx(1, abs=1e-4)

@@ -12,8 +12,7 @@ import pytest
 from mitsplat.runtime.variant import ensure_variant
 
 ensure_variant()
-from mitsplat.renderer.light.emitter_sampling import Emitters, receiver  # noqa: E402
-from mitsplat.renderer.light.highlight import Lobe  # noqa: E402
+from mitsplat.renderer.light.emitter_sampling import receiver  # noqa: E402
 from mitsplat.renderer.light.rectangle_lights import Rectangles  # noqa: E402
 
 
@@ -42,7 +41,7 @@ def test_sampled_directions_and_light_equal_those_of_mitsuba() -> None:
     index = mi.UInt32(rng.choice([i for i in range(4) if i != sky], count).astype(np.uint32))
     point = mi.Point2f(rng.random((2, count)).astype(np.float32))
     si = receiver(mi.Point3f(rng.uniform(-2, 2, (3, count)).astype(np.float32)), mi.Vector3f(0, 0, 1))
-    direction, distance, light = table.towards(si.p, index, point)
+    direction, distance, light, _ = table.towards(si.p, index, point)
     sample, radiance = dr.gather(mi.EmitterPtr, pointers, index).sample_direction(si, point, True)
     np.testing.assert_allclose(np.array(direction), np.array(sample.d), atol=1e-5)
     np.testing.assert_allclose(np.array(distance), np.array(sample.dist), rtol=1e-5)
@@ -65,19 +64,3 @@ def test_sampled_directions_and_light_equal_those_of_mitsuba() -> None:
 def test_other_lamps_are_sampled_by_mitsuba(other: dict[str, Any]) -> None:
     scene = mi.load_dict({"type": "scene", "lamp": LAMPS["plain"], "other": other})
     assert Rectangles.of(scene.emitters(), None) is None
-
-
-def test_light_without_a_lobe_has_no_highlight() -> None:
-    scene = mi.load_dict({"type": "scene", **LAMPS})
-    emitters = Emitters(scene, (0.0, 0.0, 0.0))
-    count = 100
-    rng = np.random.default_rng(2)
-    place = mi.Point3f(rng.uniform(-0.3, 0.3, (3, count)).astype(np.float32))
-    normal = mi.Vector3f(*[v + dr.zeros(mi.Float, count) for v in (0, 0, 1)])
-    lobe = Lobe(normal, normal, dr.full(mi.Float, 0.2, count), dr.full(mi.Float, 0.5, count))
-    si, active = receiver(place, normal), dr.full(mi.Bool, True, count)
-    matt, nothing = emitters.open_light(si, None, active)
-    light, mirrored = emitters.open_light(si, lobe, active)
-    np.testing.assert_array_equal(np.array(matt), np.array(light))
-    assert not np.array(nothing).any()
-    assert np.array(mirrored).min() > 0

@@ -1,5 +1,5 @@
-"""Traced light on splats: emitter sampling, shadow rays, one bounce, highlights, filtering.
+"""Traced light on splats: emitter sampling, shadow rays, one bounce, reflections, filtering.
 
-In: visible surface points, proxy meshes and emitters. Out: irradiance with and without occluders, and a highlight per
-pixel.
+In: visible surface points, proxy meshes and emitters. Out: irradiance with and without occluders, and reflected light
+per pixel.
 """

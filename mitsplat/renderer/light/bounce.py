@@ -145,6 +145,16 @@ class Reflectors:
             dr.eval(total)
         return total / rays
 
+    def outgoing(self, ray: mi.Ray3f, key: mi.UInt32, light: mi.Point2f) -> tuple[mi.Color3f, mi.Float]:
+        """Return the light (Color3f) that surfaces send against rays, in units of white, and their distances [m]."""
+        ray.maxt = dr.inf
+        colour = self._colour(ray, key, light)
+        distance = mi.Float(ray.maxt)
+        if self.proxies.dynamic is not None:
+            hit = self.proxies.dynamic.scene.ray_intersect_preliminary(ray)
+            distance = dr.minimum(distance, hit.t)
+        return colour, distance
+
     def _colour(self, ray: mi.Ray3f, key: mi.UInt32, light: mi.Point2f) -> mi.Color3f:
         """Return the colour (Color3f) at the hits of rays.
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import drjit as dr
@@ -10,14 +10,13 @@ import mitsuba as mi
 import numpy as np
 
 from mitsplat.arrays import Float64Array
-from mitsplat.renderer.light.highlight import Lobe
+from mitsplat.renderer.light.principled import lattice_point
 from mitsplat.renderer.light.rectangle_lights import Rectangles
 from mitsplat.renderer.light.sky_irradiance import SkyIrradiance
 from mitsplat.renderer.rays.device_arrays import wrapped
 
 SURVEY_LATTICE = (233, 144)
 OPEN_LATTICE = (34, 21)
-LOBE_LATTICE = (21, 13)
 SPHERE_LATTICE = (4181, 2584)
 """Number of points and generator of Fibonacci lattices. Consecutive Fibonacci numbers give the best two-dimensional
 lattices (Niederreiter 1992, section 5.3).
@@ -39,12 +38,6 @@ def receiver(position: mi.Point3f, normal: mi.Vector3f) -> mi.SurfaceInteraction
     return si
 
 
-def lattice_point(i: mi.UInt32, lattice: tuple[int, int]) -> mi.Point2f:
-    """Return point ``i`` of a centred rank-1 lattice in the unit square."""
-    count, generator = lattice
-    return mi.Point2f((mi.Float(i) + 0.5) / count, (mi.Float(i * generator % count) + 0.5) / count)
-
-
 @dataclass(frozen=True, eq=False)
 class Beam:
     """Sampled direction towards light.
@@ -53,11 +46,13 @@ class Beam:
         direction: Unit vector towards the light.
         reach: Largest distance of an occluder [m]: the distance to the emitter, or the sky reach.
         irradiance: Unoccluded irradiance estimate (Color3f) of this single sample.
+        density: Sampling density of the direction [1/sr], infinite for point-shaped and parallel light.
     """
 
     direction: mi.Vector3f
     reach: mi.Float
     irradiance: mi.Color3f
+    density: mi.Float
 
 
 class Emitters:
@@ -98,6 +93,10 @@ class Emitters:
             self.sky_colour = self._sky_radiance(receiver(point, mi.Normal3f(0, 0, 1)), mi.Vector3f(0, 0, 1), pointer)
             dr.make_opaque(self.sky_colour)
         dr.make_opaque(self.infinite)
+        numbers = np.array(dr.reinterpret_array(mi.UInt32, self.pointers))
+        index_of = np.zeros(int(numbers.max()) + 1, np.uint32)
+        index_of[numbers] = np.arange(len(emitters))
+        self._index_of = wrapped(mi.UInt32, index_of)
 
     def _survey(self, count: int, point: mi.Point3f) -> Float64Array:
         """Return the mean radiance (count,) of each emitter around a point."""
@@ -115,34 +114,67 @@ class Emitters:
         by_cosine = is_sky if self.even_sky else is_sky & (x < 0.5)
         if self.sky is not None and not self.even_sky:
             x = dr.select(is_sky, dr.select(by_cosine, 2 * x, 2 * x - 1), x)
-        direction, distance, radiance = self._towards(si, index, mi.Point2f(x, point.y), active & ~by_cosine)
+        direction, distance, radiance, density = self._towards(si, index, mi.Point2f(x, point.y), active & ~by_cosine)
         cosine = dr.maximum(dr.dot(si.sh_frame.n, direction), 0)
         irradiance = radiance * cosine
         if self.sky is not None:
             upward = si.sh_frame.to_world(mi.warp.square_to_cosine_hemisphere(mi.Point2f(x, point.y)))
             direction = dr.select(by_cosine, upward, direction)
             cosine = dr.maximum(dr.dot(si.sh_frame.n, direction), 0)
-            if self.even_sky:
-                sky, density = self.sky_colour, cosine * dr.inv_pi
-            else:
-                sky, density = self._sky_radiance(si, direction, emitter, is_sky & active), cosine * dr.inv_pi
-                towards = dr.zeros(mi.DirectionSample3f, dr.width(direction))
-                towards.d = direction
-                density = 0.5 * (density + emitter.pdf_direction(si, towards, is_sky & active))
-            irradiance = dr.select(is_sky, dr.select(density > 0, sky * (cosine / density), 0), irradiance)
+            sky, sky_density = self._sky_towards(si, direction, emitter, is_sky & active)
+            irradiance = dr.select(is_sky, dr.select(sky_density > 0, sky * (cosine / sky_density), 0), irradiance)
+            density = dr.select(is_sky, sky_density, density)
         # Mitsuba derives the distance of infinite lights from the extent of visible meshes, which excludes proxies.
         infinite = dr.gather(mi.UInt32, self.infinite, index, active) > 0
         reach = dr.select(is_sky, self.sky_reach, dr.select(infinite, dr.inf, distance))
-        return Beam(direction, reach, irradiance / chance)
+        return Beam(direction, reach, irradiance / chance, density * chance)
+
+    def emission(
+        self, scene: mi.Scene, si: mi.SurfaceInteraction3f, ray: mi.Ray3f, active: mi.Bool
+    ) -> tuple[mi.Color3f, mi.Float]:
+        """Return the radiance (Color3f) of emitters along rays from ``si``, and the density of :meth:`sample` there.
+
+        Lamps are visible up to the rays' ``maxt``, and the sky behind them. Point-shaped and parallel lights are not.
+        """
+        hit = scene.ray_intersect_preliminary(ray, active=active)
+        lamp = active & hit.is_valid() & hit.shape.is_emitter()
+        at = hit.compute_surface_interaction(ray, mi.RayFlags.Minimal, lamp)
+        emitter = at.shape.emitter()
+        towards = mi.DirectionSample3f(scene, at, si)
+        number = dr.gather(mi.UInt32, self._index_of, dr.reinterpret_array(mi.UInt32, emitter), lamp)
+        radiance = dr.select(lamp, emitter.eval(at, lamp), 0)
+        density = emitter.pdf_direction(si, towards, lamp) * dr.gather(mi.Float, self.choice.chances, number, lamp)
+        density = dr.select(lamp, density, 0)
+        if self.sky is not None:
+            pointer = dr.gather(mi.EmitterPtr, self.pointers, self.sky)
+            open_sky = active & ~hit.is_valid() & (ray.maxt == dr.inf)
+            sky, sky_density = self._sky_towards(si, ray.d, pointer, open_sky)
+            radiance = dr.select(open_sky, sky, radiance)
+            chance = dr.gather(mi.Float, self.choice.chances, self.sky)
+            density = dr.select(open_sky, sky_density * chance, density)
+        return radiance, density
+
+    def _sky_towards(
+        self, si: mi.SurfaceInteraction3f, direction: mi.Vector3f, emitter: mi.EmitterPtr, active: mi.Bool
+    ) -> tuple[mi.Color3f, mi.Float]:
+        """Return radiance (Color3f) and sampling density of the sky in unit directions."""
+        density = dr.maximum(dr.dot(si.sh_frame.n, direction), 0) * dr.inv_pi
+        if self.even_sky:
+            return self.sky_colour, density
+        towards = dr.zeros(mi.DirectionSample3f, dr.width(direction))
+        towards.d = direction
+        density = 0.5 * (density + emitter.pdf_direction(si, towards, active))
+        return self._sky_radiance(si, direction, emitter, active), density
 
     def _towards(
         self, si: mi.SurfaceInteraction3f, index: mi.UInt32, point: mi.Point2f, active: mi.Bool
-    ) -> tuple[mi.Vector3f, mi.Float, mi.Color3f]:
-        """Return unit vector and distance [m] from ``si`` to points of emitters, and radiance over sampling density."""
+    ) -> tuple[mi.Vector3f, mi.Float, mi.Color3f, mi.Float]:
+        """Return unit vector and distance [m] to points of emitters, radiance over density, and the density [1/sr]."""
         if self.rectangles is None or not (self.sky is None or self.even_sky):
             emitter = dr.gather(mi.EmitterPtr, self.pointers, index, active)
             sample, radiance = emitter.sample_direction(si, point, active)
-            return mi.Vector3f(sample.d), sample.dist, dr.select(sample.pdf > 0, radiance, 0)
+            density = dr.select(sample.delta, dr.inf, sample.pdf)
+            return mi.Vector3f(sample.d), sample.dist, dr.select(sample.pdf > 0, radiance, 0), density
         return self.rectangles.towards(si.p, index, point)
 
     @staticmethod
@@ -154,55 +186,26 @@ class Emitters:
         outside.wi = -direction
         return mi.Color3f(emitter.eval(outside, active))
 
-    def open_light(
-        self, si: mi.SurfaceInteraction3f, lobe: Lobe | None, active: mi.Bool
-    ) -> tuple[mi.Color3f, mi.Color3f]:
-        """Compute unoccluded irradiance and mirrored radiance (Color3f) from one fixed set of directions.
-
-        ``lobe`` is None where nothing is mirrored, which takes less time.
-        """
-        total, specular_lit = mi.Color3f(0), mi.Color3f(0)
+    def unoccluded_irradiance(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Color3f:
+        """Compute the unoccluded irradiance (Color3f) from one fixed set of directions."""
+        total = mi.Color3f(0)
         if self.local_choice is not None:
-            choice = self.local_choice
+            choice, rounds = self.local_choice, dr.opaque(mi.UInt32, OPEN_LATTICE[0])
 
-            def local(point: mi.Point2f) -> tuple[mi.Color3f, mi.Color3f]:
+            def add(i: mi.UInt32, total: mi.Color3f) -> tuple[mi.UInt32, mi.Color3f]:
+                point = lattice_point(i, OPEN_LATTICE)
                 index, x, chance = choice.sample(point.x)
-                direction, _, radiance = self._towards(si, index, mi.Point2f(x, point.y), active)
-                light = dr.select(active, radiance * dr.maximum(dr.dot(si.sh_frame.n, direction), 0), 0)
-                return light / chance, 0 if lobe is None else light * (lobe.reflectance(direction) / chance)
+                direction, _, radiance, _ = self._towards(si, index, mi.Point2f(x, point.y), active)
+                cosine = dr.maximum(dr.dot(si.sh_frame.n, direction), 0)
+                return i + 1, total + dr.select(active, radiance * (cosine / chance), 0)
 
-            total, specular_lit = self._integrate(si, active, OPEN_LATTICE, local)
+            state = dr.zeros(mi.UInt32, dr.width(si.p)), dr.zeros(mi.Color3f, dr.width(si.p))
+            _, total = dr.while_loop(state, lambda i, _: active & (i < rounds), add, label="open light")
+            total /= OPEN_LATTICE[0]
         if self.sky is not None:
             emitter = dr.gather(mi.EmitterPtr, self.pointers, self.sky)
             total += dr.pi * self.sky_colour if self.even_sky else sky_irradiance(emitter).at(si.n, active)
-            if lobe is not None:
-                sample_lobe = lobe.sample
-
-                def mirrored(point: mi.Point2f) -> tuple[mi.Color3f, mi.Color3f]:
-                    direction, weight = sample_lobe(point)
-                    radiance = self.sky_colour if self.even_sky else self._sky_radiance(si, direction, emitter, active)
-                    return mi.Color3f(0), dr.select(weight > 0, radiance * weight, 0)
-
-                specular_lit += self._integrate(si, active, LOBE_LATTICE, mirrored)[1]
-        return total, specular_lit
-
-    @staticmethod
-    def _integrate(
-        si: mi.SurfaceInteraction3f,
-        active: mi.Bool,
-        lattice: tuple[int, int],
-        light: Callable[[mi.Point2f], tuple[mi.Color3f, mi.Color3f]],
-    ) -> tuple[mi.Color3f, mi.Color3f]:
-        rounds = dr.opaque(mi.UInt32, lattice[0])
-
-        def body(i: mi.UInt32, total: mi.Color3f, specular_lit: mi.Color3f) -> tuple[mi.UInt32, mi.Color3f, mi.Color3f]:
-            arriving, mirrored = light(lattice_point(i, lattice))
-            return i + 1, total + arriving, specular_lit + mirrored
-
-        nothing = dr.zeros(mi.Color3f, dr.width(si.p))
-        state = dr.zeros(mi.UInt32, dr.width(si.p)), nothing, mi.Color3f(nothing)
-        _, *sums = dr.while_loop(state, lambda i, *_: active & (i < rounds), body, label="open light")
-        return sums[0] / lattice[0], sums[1] / lattice[0]
+        return total
 
 
 class _DiscreteDistribution:

@@ -1,4 +1,4 @@
-"""Traced light on splats: irradiance with and without dynamic occluders, and a highlight.
+"""Traced light on splats: irradiance with and without dynamic occluders, and reflections.
 
 A splat stores the radiance that the camera saw, shadows included. Rendering it among new objects therefore needs no
 full light transport, but one light factor per visible point x with normal n:
@@ -10,8 +10,10 @@ with irradiance E = integral of V(x, w) L(w) max(0, n.w) dw over all emitters. T
 dynamic object takes light away, so that captured shadows are not applied twice. E_ref is the irradiance for which the
 colours of the surroundings are exposed. An object captured in a light tent keeps its colours under E_ref, and is darker
 where less light arrives. E_bounce is the light that the surroundings reflect, see
-:mod:`mitsplat.renderer.light.bounce`. The highlight is the mirrored light of the emitters minus the tent light mirrored
-in the captured colour; under even light it adds nothing.
+:mod:`mitsplat.renderer.light.bounce`. A material of metalness m has the factor (1 - m) (E + E_bounce) / E_ref. Its
+specular lobe adds a tinted part to the factor and a colourless part to the highlight, see
+:mod:`mitsplat.renderer.light.principled`. On captured colours, the highlight is reduced by the mirror image of the
+uniform light, which these colours contain; under even light it adds nothing.
 
 Rays are spent adaptively. Captured surfaces get one ray per pixel where objects occlude less light than the wanted
 error, see :mod:`mitsplat.renderer.light.light_tiles`. All other points get the number of rays that most points need for
@@ -34,6 +36,8 @@ from mitsplat.renderer.light.light_planes import MIN_ROWS, CoarseLight, Planes, 
 from mitsplat.renderer.light.light_points import LightPoints
 from mitsplat.renderer.light.light_tiles import block_order
 from mitsplat.renderer.light.lit_surface import LitSurface, VisibleSurfaces
+from mitsplat.renderer.light.principled import diffuse_albedo, mirrored_uniform
+from mitsplat.renderer.light.reflections import Reflections, ReflectionTracer
 from mitsplat.renderer.light.shadow_rays import ShadowTracer
 from mitsplat.renderer.light.unoccluded_light import UnoccludedLight
 from mitsplat.renderer.occluders.proxies import Proxies
@@ -54,6 +58,9 @@ PLANE_FACTOR = 2
 """Factor of the number of rays at a point that represents four pixels of a plane. With factor 1, its error would be a
 quarter larger than with rays at each pixel. With this factor the error is the same.
 """
+
+FIRST_REFLECTIONS = 4
+"""Reflection rays per glossy pixel before the first error estimate."""
 
 LEVEL_BITS = 4
 """Bits of the number of doublings; 2^15 times the first rays exceeds every setting."""
@@ -97,6 +104,8 @@ class Lighting:
         accuracy: Target error and limits of shadow rays.
         seed: Offset into the low-discrepancy sequence.
         white: Irradiance (Color3f) at which a uniformly captured object keeps its colours.
+        scene: Mitsuba scene with the emitters.
+        reflectors: Surfaces that reflect light onto others.
     """
 
     emitters: Emitters
@@ -105,6 +114,8 @@ class Lighting:
     accuracy: Accuracy
     seed: int
     white: mi.Color3f
+    scene: mi.Scene
+    reflectors: Reflectors
 
     @property
     def view(self) -> CameraView:
@@ -133,7 +144,7 @@ def light_factor(
     """Compute light factor and highlight (Color3f) of every visible point, see the module docstring.
 
     The stages are: search for shadows, coarse light on planes, first rays, unoccluded light, bounce, further rays,
-    filter, and combination. ``tests/renderer/light_reference.py`` computes the same quantities by loops.
+    filter, combination, and reflections. ``tests/renderer/light_reference.py`` computes the same quantities by loops.
 
     Args:
         scene: Mitsuba scene with the emitters.
@@ -148,7 +159,8 @@ def light_factor(
         bounce: True if objects receive the light that surroundings and visible meshes reflect.
     """
     emitters = Emitters(scene, reference, sky_reach)
-    lighting = Lighting(emitters, proxies, visible, accuracy, seed, white)
+    reflectors = Reflectors(grid, proxies, emitters, white)
+    lighting = Lighting(emitters, proxies, visible, accuracy, seed, white, scene, reflectors)
     needed, light, codes = search_shadows(lighting)
     coarse = trace_planes(lighting, needed, codes)
     if coarse is not None:
@@ -160,12 +172,14 @@ def light_factor(
     pixels = TracedPixels.of(lighting, index, coarse)
     estimate = pixels.trace_first_rays()
     unoccluded = UnoccludedLight.integrate(emitters, pixels.points, pixels.here, white)
-    reflectors, bounced = Reflectors(grid, proxies, emitters, white), None
+    bounced = None
     if bounce and reflectors.any and dr.width(unoccluded.place):
         bounced = trace_bounce(pixels.centre_tracer(), reflectors)
     estimate = pixels.trace_further_rays(estimate, unoccluded.level)
-    means = pixels.light_filter.smooth(pixels.points.sum_estimate(estimate), bounced)
-    light, highlight = pixels.combine(light, unoccluded, means)
+    estimate = pixels.points.sums_by_pixel(estimate)
+    means = pixels.light_filter.smooth(estimate, bounced)
+    light = pixels.combine(light, unoccluded, means)
+    light, highlight = pixels.add_reflections(light, estimate)
     if coarse is not None:
         dr.eval(light)
         light = between_samples(light, coarse.coarse, lighting.view)
@@ -186,7 +200,7 @@ def search_shadows(lighting: Lighting) -> tuple[mi.Bool, mi.Color3f, mi.UInt32 |
     everything = visible.at(pixel)
     needed, light, codes = everything.valid, mi.Color3f(1), None
     if error > 0:
-        captured = everything.valid & ~(everything.relit | (everything.specular > 0))
+        captured = everything.valid & ~(everything.relit | everything.glossy)
         plane_code = plane_codes(everything, visible.eye)
         some_captured, some_planes = dr.any(captured), dr.any(plane_code != 0)
         dr.eval(everything.valid, captured, plane_code)
@@ -283,7 +297,7 @@ class TracedPixels:
         if first >= accuracy.most:
             return estimate
         metered = self.lighting.pixels if accuracy.metered else 0
-        wanted = self.light_filter.rays_for(points.sum_estimate(estimate), accuracy.error, level, metered)
+        wanted = self.light_filter.rays_for(points.sums_by_pixel(estimate), accuracy.error, level, metered)
         spent = dr.full(mi.UInt32, first, dr.width(self.index))
         if self.coarse is not None:
             on_lattice = dr.gather(mi.Bool, self.coarse.lattice, self.index)
@@ -300,16 +314,15 @@ class TracedPixels:
         rows, extra = (dr.gather(mi.UInt32, values, lane) for values in (rows, points.ray_count(extra, rows)))
         return self._point_tracer.trace(rows, estimate, extra, accuracy.most - first, points.steps(rows))
 
-    def combine(
-        self, light: mi.Color3f, unoccluded: UnoccludedLight, means: LightMeans
-    ) -> tuple[mi.Color3f, mi.Color3f]:
-        """Combine filtered sums into light factor and highlight of all pixels.
+    def combine(self, light: mi.Color3f, unoccluded: UnoccludedLight, means: LightMeans) -> mi.Color3f:
+        """Return the light factor of all pixels from filtered sums, without reflections.
 
-        With the arriving share s = lit / base, unoccluded irradiance E and mirrored radiance R:
+        With the arriving share s = lit / base, unoccluded irradiance E and metalness m:
 
             captured:    factor = s
-            relit:       factor = s E / white + bounce
-            highlight = s_R R pi / white - (s E / white) tent of relit points, s_R = specular_lit / specular_base
+            relit:       factor = (1 - m) d (s E / white + bounce)
+
+        d is :func:`mitsplat.renderer.light.principled.diffuse_albedo` of glossy materials, otherwise 1.
 
         Sums over rays are averaged over neighbours before the division, so that points with little light do not turn
         black by chance. Sources: module docstring, and Heitz et al. 2018 as above.
@@ -322,31 +335,93 @@ class TracedPixels:
         lit, base = means.lit, means.base
         share = dr.select((base > 0) & (lit != base), lit / base, 1)  # a GPU divides a number by itself to almost 1
         light = mi.Color3f(*[channel + dr.zeros(mi.Float, self.lighting.pixels) for channel in light])
-        dr.eval(light, share, means.specular_lit, means.specular_base)
+        dr.eval(light, share)
         dr.scatter(light, share, self.index)
-        place, white = unoccluded.place, self.lighting.white
-        if not dr.width(place):
+        place = unoccluded.place
+        if dr.width(place):
+            relit = dr.gather(mi.Color3f, share, place) * unoccluded.irradiance / self.lighting.white
+            if means.bounced is not None:
+                relit += dr.gather(mi.Color3f, means.bounced, place)
+            relit *= self._diffuse_share(gathered(self.here, place))
+            dr.eval(light, relit)
+            dr.scatter(light, relit, dr.gather(mi.UInt32, self.index, place))
+        return light
+
+    @staticmethod
+    def _diffuse_share(surface: LitSurface) -> mi.Float:
+        """Return the factor of diffuse light: that of ``principled`` for glossy materials, otherwise 1."""
+        albedo = diffuse_albedo(dr.dot(surface.normal, surface.to_camera), surface.roughness)
+        return dr.select(surface.glossy & ~surface.captured, (1 - surface.metallic) * albedo, 1)
+
+    def add_reflections(self, light: mi.Color3f, estimate: Estimate) -> tuple[mi.Color3f, mi.Color3f]:
+        """Add the specular lobes to the light factor of all pixels, and return it with the highlight (Color3f).
+
+        Args:
+            light: Light factor without reflections (Color3f).
+            estimate: Sums over shadow rays, whose light in the lobe is added to that of the reflection rays.
+        """
+        lighting, here = self.lighting, self.here
+        glossy = dr.compress(here.glossy & here.valid)
+        if not dr.width(glossy):
             return light, mi.Color3f(0)
-        own, pixels = gathered(self.here, place), dr.gather(mi.UInt32, self.index, place)
-        part, specular_lit, specular_base = (
-            dr.gather(type(v), v, place) for v in (share, means.specular_lit, means.specular_base)
+        tracer = ReflectionTracer(
+            lighting.scene,
+            self._point_tracer,
+            lighting.reflectors,
+            self.points.steps(dr.arange(mi.UInt32, dr.width(self.points.owner))),
         )
-        dr.eval(own, part, specular_lit, specular_base)
-        # If no ray came from the directions of the lobe, the arriving share of all light applies. (dr.mean would write
-        # the width of the array into the kernel.)
-        specular_share = dr.select(specular_base > 0, specular_lit / specular_base, dr.sum(part) / 3)
-        mirrored = unoccluded.mirrored * (specular_share * (dr.pi / white))
-        relit = part * unoccluded.irradiance / white
-        mirrored -= dr.select(own.relit, relit * unoccluded.tent, 0)
-        dr.eval(relit, mirrored)
-        if means.bounced is not None:
-            # Added after the exchange of mirror images: the tent's mirror image also represents that of the
-            # surroundings.
-            relit += dr.gather(mi.Color3f, means.bounced, place)
-        dr.scatter(light, relit, pixels, own.relit)
-        highlight = mi.Color3f(dr.zeros(mi.Float, self.lighting.pixels))
-        dr.scatter(highlight, mirrored, pixels)
+        sums = self._trace_reflections(tracer, glossy)
+        scale, weight = dr.pi / lighting.white, dr.rcp(dr.maximum(estimate.rays, 1))
+        per_ray = dr.rcp(dr.maximum(sums.rays, 1))
+        tinted = estimate.tinted * weight * scale + sums.tinted * per_ray
+        colourless = estimate.colourless * weight * scale + sums.colourless * per_ray
+        rays = dr.maximum(sums.rays, 1)
+        means, _ = self.light_filter.mirror([*tinted, *colourless], rays, self.points.is_bent)
+        tinted, colourless = mi.Color3f(*means[:3]), mi.Color3f(*means[3:])
+        before = dr.gather(mi.Color3f, light, self.index)
+        # Captured colours contain the mirror image of the uniform light.
+        tent = dr.select(here.captured & here.relit, mirrored_uniform(here.lobe), 0)
+        colourless -= before * tent
+        dr.eval(before, tinted, colourless)
+        dr.scatter(light, before + tinted, self.index)
+        highlight = mi.Color3f(dr.zeros(mi.Float, lighting.pixels))
+        dr.scatter(highlight, colourless, self.index)
+        dr.eval(light, highlight)
         return light, highlight
+
+    def _trace_reflections(self, tracer: ReflectionTracer, glossy: mi.UInt32) -> Reflections:
+        """Trace reflection rays at the pixels ``glossy`` and return their sums by pixel.
+
+        A pixel gets more rays if its first rays have not reached the wanted error.
+        """
+        accuracy, points = self.lighting.accuracy, self.points
+        total = Reflections.empty(dr.width(points.owner))
+        first = min(FIRST_REFLECTIONS, accuracy.most) if accuracy.error > 0 else accuracy.most
+
+        def trace(rows: mi.UInt32, rays: int) -> None:
+            total.add(rows, tracer.trace(rows, dr.gather(mi.Float, total.rays, rows), rays))
+
+        for rows, rays in points.parts(glossy, first):
+            trace(rows, rays)
+        if first >= accuracy.most:
+            return points.sums_by_pixel(total)
+        sums = points.sums_by_pixel(total)
+        wanted = self.light_filter.reflections_for(
+            sums.brightness, sums.squares, sums.rays, points.is_bent, accuracy.error
+        )
+        wanted = dr.gather(mi.Float, wanted, glossy)
+        done = first
+        while done < accuracy.most:
+            more = dr.compress(wanted > done)
+            glossy, wanted = dr.gather(mi.UInt32, glossy, more), dr.gather(mi.Float, wanted, more)
+            dr.eval(glossy, wanted)
+            if not dr.width(glossy):
+                break
+            step = min(done, accuracy.most - done)
+            for rows, rays in points.parts(glossy, step):
+                trace(rows, rays)
+            done += step
+        return points.sums_by_pixel(total)
 
 
 def _doublings(wanted: mi.Float, rays: int, most: int) -> tuple[mi.UInt32, mi.UInt32]:

@@ -13,6 +13,9 @@ from mitsplat.renderer.rays.camera_rays import CameraView
 RADIUS = 4
 """Radius of the filter [px]."""
 
+LOBE_SHARE = 0.5
+"""Largest angle between the mirrored directions of two neighbours whose reflections are averaged, over GGX's alpha."""
+
 NOISE_LIMIT = 4.0
 """Largest squared difference between the light shares of two neighbours that are averaged, in variances."""
 
@@ -50,7 +53,9 @@ class _Traits:
     """Columns of the packed data of a pixel by which the filter compares neighbours."""
 
     POSITION, NORMAL = slice(0, 3), slice(3, 6)
-    TRAIT, KNOWN, RAYS, SHARE, VARIANCE = range(6, 11)
+    TRAIT, KNOWN, RAYS = range(6, 9)
+    SHARE, VARIANCE = range(9, 11)
+    MIRRORED = slice(9, 12)
     WIDTH = 12
 
 
@@ -60,28 +65,29 @@ class Estimate:
 
     Attributes:
         lit, base: Arriving light and reference light (Color3f).
-        specular_lit, specular_base: Arriving and unoccluded light mirrored to the camera, summed over channels.
+        tinted, colourless: Arriving light in the specular lobe (Color3f): the part that the base colour multiplies, and
+            the rest.
         squares: Sum of the squares of the terms of ``base``.
         rays: Number of rays.
     """
 
     lit: mi.Color3f
     base: mi.Color3f
-    specular_lit: mi.Float
-    specular_base: mi.Float
+    tinted: mi.Color3f
+    colourless: mi.Color3f
     squares: mi.Float
     rays: mi.Float
 
     @classmethod
     def empty(cls, count: int) -> Estimate:
         """Return an estimate without rays at ``count`` points."""
-        colours, numbers = ([dr.zeros(kind, count) for _ in range(n)] for kind, n in ((mi.Color3f, 2), (mi.Float, 4)))
+        colours, numbers = ([dr.zeros(kind, count) for _ in range(n)] for kind, n in ((mi.Color3f, 4), (mi.Float, 2)))
         return cls(*colours, *numbers)
 
     @property
-    def sums(self) -> tuple[mi.Color3f, mi.Color3f, mi.Float, mi.Float, mi.Float]:
+    def sums(self) -> tuple[mi.Color3f, mi.Color3f, mi.Color3f, mi.Color3f, mi.Float]:
         """All fields except the number of rays."""
-        return self.lit, self.base, self.specular_lit, self.specular_base, self.squares
+        return self.lit, self.base, self.tinted, self.colourless, self.squares
 
     def scattered(self, places: mi.UInt32, count: int) -> Estimate:
         """Return this estimate at ``places`` of ``count`` points, without rays at the others."""
@@ -102,14 +108,11 @@ class LightMeans:
 
     Attributes:
         lit, base: Arriving light and reference light (Color3f).
-        specular_lit, specular_base: Arriving and unoccluded light mirrored to the camera.
         bounced: Reflected light (Color3f) over the irradiance of white, or None.
     """
 
     lit: mi.Color3f
     base: mi.Color3f
-    specular_lit: mi.Float
-    specular_base: mi.Float
     bounced: mi.Color3f | None
 
 
@@ -188,15 +191,50 @@ class LightFilter:
         no neighbour knows it.
         """
         weight = dr.rcp(dr.maximum(estimate.rays, 1))
-        values = [c * weight for c in (*estimate.lit, *estimate.base, estimate.specular_lit, estimate.specular_base)]
+        values = [c * weight for c in (*estimate.lit, *estimate.base)]
         if bounced is not None:
             values += [*bounced[0], bounced[1]]
         values, _ = self._average(values, estimate.rays, RADIUS, self._share(estimate)[:2])
         mean_bounced = None
         if bounced is not None:
-            *colour, share = values[8:]
+            *colour, share = values[6:]
             mean_bounced = dr.select(share > 1e-6, mi.Color3f(*colour) / share, 0)
-        return LightMeans(mi.Color3f(*values[:3]), mi.Color3f(*values[3:6]), values[6], values[7], mean_bounced)
+        return LightMeans(mi.Color3f(*values[:3]), mi.Color3f(*values[3:6]), mean_bounced)
+
+    def mirror(
+        self, values: list[mi.Float], rays: mi.Float, bent: mi.Bool, radius: int = RADIUS
+    ) -> tuple[list[mi.Float], mi.Float]:
+        """Average reflected light per ray over neighbours that mirror similar directions.
+
+        Pixels that are ``bent`` (Bool) mirror many directions, so that they are not averaged.
+
+        Returns:
+            The averages, and the effective number of pixels with the same number of rays.
+        """
+        here = self.here
+        mirrored = 2 * dr.dot(here.normal, here.to_camera) * here.normal - here.to_camera
+        mirrored = dr.select(bent, 0, mirrored)
+        closeness = dr.cos(dr.maximum(LOBE_SHARE * dr.square(here.roughness), 1e-3))
+        dr.eval(mirrored, closeness)
+        return self._average(values, rays, radius, lobe=(mirrored, closeness))
+
+    def reflections_for(
+        self, brightness: mi.Float, squares: mi.Float, rays: mi.Float, bent: mi.Bool, error: float
+    ) -> mi.Float:
+        """Compute the number of reflection rays per pixel of ``index`` at which they reach the wanted error.
+
+        Args:
+            brightness: Sum of the brightness of the rays so far, in units of white.
+            squares: Sum of its squares.
+            rays: Number of these rays.
+            bent: True for pixels that mirror many directions.
+            error: Target standard error of mid-grey light.
+        """
+        rays = dr.maximum(rays, 1)
+        (mean, square), shared = self.mirror([brightness / rays, squares / rays], rays, bent, 1)
+        gain = dr.fma(GAIN - 1, dr.square((shared - 1) / (SMALL_FILTER_PIXELS - 1)), 1)
+        allowed = error * dr.power(dr.clip(mean, MIN_LIGHT, 1) / MID_GREY, 1 - DISPLAY)
+        return dr.maximum(square - dr.square(mean), 0) / (dr.square(allowed) * gain)
 
     def _share(self, estimate: Estimate) -> tuple[mi.Float, mi.Float, mi.Float]:
         """Return the light share over 3 x 3 pixels, its variance, and the number of pixels that contribute."""
@@ -215,19 +253,27 @@ class LightFilter:
         return self._average(values, dr.full(mi.Float, 1, dr.width(self.index)), RADIUS)[0]
 
     def _average(
-        self, values: list[mi.Float], rays: mi.Float, radius: int, share: tuple[mi.Float, mi.Float] | None = None
+        self,
+        values: list[mi.Float],
+        rays: mi.Float,
+        radius: int,
+        share: tuple[mi.Float, mi.Float] | None = None,
+        lobe: tuple[mi.Vector3f, mi.Float] | None = None,
     ) -> tuple[list[mi.Float], mi.Float]:
         """Return averages, and the effective number of equally weighted pixels with the same number of rays.
 
         If ``share`` (light share and variance) is given, only neighbours whose share differs by no more than noise
-        count.
+        count. If ``lobe`` (mirrored direction and smallest cosine) is given, only neighbours that mirror similar
+        directions count.
         """
         here = self.here
         known = dr.select(here.known, mi.Float(1), 0)
-        traits = packed([*here.position, *here.normal, here.trait, known, rays, *(share or (0, 0))])  # see _Traits
+        guide = (0, 0, 0) if lobe is None else lobe[0]
+        guide = guide if share is None else (*share, 0)
+        traits = packed([*here.position, *here.normal, here.trait, known, rays, *guide])  # see _Traits
         alike = mi.Float(1)
         for direction in ((1, 0), (0, 1)):
-            values, along = self._average_along(values, traits, direction, radius, share)
+            values, along = self._average_along(values, traits, direction, radius, share, lobe)
             alike *= along
             dr.eval(values, alike)
         return values, alike
@@ -239,6 +285,7 @@ class LightFilter:
         direction: tuple[int, int],
         radius: int,
         share: tuple[mi.Float, mi.Float] | None,
+        lobe: tuple[mi.Vector3f, mi.Float] | None,
     ) -> tuple[list[mi.Float], mi.Float]:
         """Average over pixels up to ``radius`` away along a direction (x, y); the outermost pixels have half weight.
 
@@ -271,6 +318,8 @@ class LightFilter:
             if share is not None:
                 difference, variance = other[_Traits.SHARE] - share[0], share[1] + other[_Traits.VARIANCE]
                 near &= dr.square(difference) <= NOISE_LIMIT * variance
+            if lobe is not None:
+                near &= dr.dot(mi.Vector3f(*other[_Traits.MIRRORED]), lobe[0]) > lobe[1]
             same &= (near & (known == here.known)) | (known & ~here.known)
             # With half weights at the ends, the filter spans exactly one period of the dither.
             weight = dr.select(known, 1.0, GUESS_WEIGHT) * dr.select(distance == last, mi.Float(0.5), 1.0)

@@ -59,7 +59,7 @@ def plane_codes(surface: LitSurface, eye: mi.Point3f) -> mi.UInt32:
     for part, prime in zip(parts, _PRIMES, strict=True):
         code = (code ^ part) * prime
         code ^= code >> 15
-    plain = surface.valid & surface.known & surface.relit & (surface.instance == 0) & (surface.specular == 0)
+    plain = surface.valid & surface.known & surface.relit & (surface.instance == 0) & ~surface.glossy
     return dr.select(plain, code & (_PLAIN - 1) | _PLAIN, 0)
 
 

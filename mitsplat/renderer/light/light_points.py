@@ -9,6 +9,7 @@ so that only their unoccluded light costs extra time.
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from typing import TypeVar
 
 import drjit as dr
 import mitsuba as mi
@@ -16,11 +17,14 @@ import numpy as np
 
 from mitsplat.renderer.light.light_filter import UNTRACED, Estimate
 from mitsplat.renderer.light.lit_surface import LitSurface, VisibleSurfaces
+from mitsplat.renderer.light.reflections import Reflections
 from mitsplat.renderer.rays.camera_rays import CameraView
 from mitsplat.renderer.rays.device_arrays import concatenated, gathered, wrapped
 
 OFFSETS = ((-0.125, -0.375), (0.375, -0.125), (-0.375, 0.125), (0.125, 0.375))
 """Offsets of the points from the pixel centre [px]: a rotated grid without shared rows or columns."""
+
+Sums = TypeVar("Sums", Estimate, Reflections)
 
 EVEN = 0.95
 """Cosine between the normals of neighbours above which light is sampled at the pixel centre only."""
@@ -87,6 +91,11 @@ class LightPoints:
         dr.eval(surface, owner, slot)
         return cls(surface, owner, slot, count, bent)
 
+    @property
+    def is_bent(self) -> mi.Bool:
+        """True for bent pixels."""
+        return self.slot != UNTRACED
+
     def rows(self, places: mi.UInt32) -> mi.UInt32:
         """Return the rows of the points of some pixels (possibly none)."""
         if not dr.width(places):
@@ -103,6 +112,15 @@ class LightPoints:
         """Return the number of rays (at least 1) of the points ``rows``, given the ``rays`` (UInt32) of pixels."""
         return dr.select(rows < dr.opaque(mi.UInt32, self.count), rays, dr.maximum(rays // len(OFFSETS), 1))
 
+    def parts(self, places: mi.UInt32, rays: int) -> list[tuple[mi.UInt32, int]]:
+        """Return the rows of the points of some pixels in parts with equal numbers of rays, which share ``rays``."""
+        rows = self.rows(places)
+        middle = rows < dr.opaque(mi.UInt32, self.count)
+        parts = ((middle, rays), (~middle, max(rays // len(OFFSETS), 1)))
+        found = [(dr.gather(mi.UInt32, rows, dr.compress(which)), number) for which, number in parts]
+        dr.eval(found)
+        return [(part, number) for part, number in found if dr.width(part)]
+
     def steps(self, rows: mi.UInt32) -> tuple[mi.UInt32, mi.UInt32]:
         """Return the first ray number of each point in the sequence of its pixel, and the step to its next ray."""
         count = dr.opaque(mi.UInt32, self.count)
@@ -118,11 +136,25 @@ class LightPoints:
             total += dr.gather(type(values), values, slot + start, several)
         return dr.select(several, total, dr.gather(type(values), values, dr.arange(mi.UInt32, self.count)))
 
-    def sum_estimate(self, estimate: Estimate) -> Estimate:
-        """Sum an estimate by row into an estimate by pixel."""
+    def mean_by_pixel(
+        self, values: mi.Float | mi.Color3f, rows: mi.UInt32, valid: mi.Bool, places: mi.UInt32
+    ) -> mi.Float | mi.Color3f:
+        """Return means over the valid points of the pixels ``places``, whose rows are ``rows``."""
+        sums = []
+        for column in (values, mi.Float(1)):
+            by_row = dr.zeros(type(column), dr.width(self.owner))
+            dr.scatter(by_row, dr.select(valid, column, 0), rows)
+            dr.eval(by_row)
+            sums.append(dr.gather(type(column), self.sum_by_pixel(by_row), places))
+        mean = sums[0] / dr.maximum(sums[1], 1)
+        dr.eval(mean)
+        return mean
+
+    def sums_by_pixel(self, sums: Sums) -> Sums:
+        """Sum a dataclass of values by row into values by pixel."""
         if not self.bent:
-            return estimate
-        result = Estimate(*[self.sum_by_pixel(getattr(estimate, f.name)) for f in fields(Estimate)])
+            return sums
+        result = type(sums)(*[self.sum_by_pixel(getattr(sums, f.name)) for f in fields(sums)])
         dr.eval(result)
         return result
 

@@ -10,6 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mitsplat.renderer.light.principled import MAX_SPECULAR
 from mitsplat.renderer.projection.clouds import Placement
 from mitsplat.renderer.rays.device_arrays import wrapped
 
@@ -22,8 +23,9 @@ class Traits:
     most splats. The other shapes have additional rows at the end of the table.
 
     Attributes:
-        relit: True if the colours were captured under uniform light, by row.
-        roughness, specular: Parameters of the highlight, by row.
+        relit: True if the colours are base colours or were captured under uniform light, by row.
+        roughness, metallic, specular: Parameters of :class:`mitsplat.renderer.light.principled.SpecularLobe`, by row.
+        captured: True if the colours were captured, by row.
         owner: Instance id, by row.
         placements: Placements of the scene with row numbers instead of instance ids; None if every instance has one
             row.
@@ -31,7 +33,9 @@ class Traits:
 
     relit: mi.Bool
     roughness: mi.Float
+    metallic: mi.Float
     specular: mi.Float
+    captured: mi.Bool
     owner: mi.UInt32
     placements: tuple[Placement, ...] | None
 
@@ -39,14 +43,14 @@ class Traits:
     def of(cls, shapes: Sequence[mi.Shape], placements: Sequence[Placement]) -> Traits:
         """Build the table from ``splats`` shapes and their placements."""
         count = 1 + max([0, *(s.instance for s in shapes)])
-        plain = False, 0.4, 0.0
+        plain = False, 0.4, 0.0, 0.0, True
         rows: dict[tuple[int, Any], int] = {}
         values, owners, placed = [plain] * count, list(range(count)), [p.instance for p in placements]
         # A pixel never shows a shape without splats.
         order = [i for i in range(len(shapes)) if len(shapes[i].splats)]
         for i in sorted(order, key=lambda i: -len(shapes[i].splats)):
             shape = shapes[i]
-            own = shape.capture_light == "uniform", shape.roughness, shape.specular
+            own = _parameters(shape)
             key = shape.instance, own
             if key not in rows:
                 first = not any(instance == shape.instance for instance, _ in rows)
@@ -54,12 +58,14 @@ class Traits:
                 values[rows[key] : rows[key] + 1] = [own]
                 owners[rows[key] : rows[key] + 1] = [shape.instance]
             placed[i] = rows[key]
-        relit, roughness, specular = zip(*values, strict=True)
+        relit, roughness, metallic, specular, captured = zip(*values, strict=True)
         several = len(values) > count
         return cls(
             wrapped(mi.Bool, np.array(relit, bool)),
             wrapped(mi.Float, np.array(roughness, np.float32)),
+            wrapped(mi.Float, np.array(metallic, np.float32)),
             wrapped(mi.Float, np.array(specular, np.float32)),
+            wrapped(mi.Bool, np.array(captured, bool)),
             wrapped(mi.UInt32, np.array(owners, np.uint32)),
             tuple(replace(p, instance=row) for p, row in zip(placements, placed, strict=True)) if several else None,
         )
@@ -69,3 +75,15 @@ class Traits:
         if row is None:
             return instance
         return dr.select(dr.gather(mi.UInt32, self.owner, row) == instance, row, instance)
+
+
+def _parameters(shape: mi.Shape) -> tuple[bool, float, float, float, bool]:
+    """Return relit, roughness, metallic, specular and captured of a ``splats`` shape."""
+    materials = shape.splats.materials
+    if materials is None:
+        specular = min(shape.specular / MAX_SPECULAR, 1.0)
+        return shape.capture_light == "uniform", shape.roughness, 0.0, specular, True
+    roughness, metallic, specular = (
+        float(values.mean()) for values in (materials.roughness, materials.metallic, materials.specular)
+    )
+    return True, roughness, metallic, specular, False

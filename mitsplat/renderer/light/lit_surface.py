@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mitsplat.renderer.light.light_traits import Traits
+from mitsplat.renderer.light.principled import SpecularLobe
 from mitsplat.renderer.occluders.proxies import Hit, Proxies
 from mitsplat.renderer.rays.camera_rays import CameraView
 from mitsplat.renderer.rays.device_arrays import gathered
@@ -29,7 +30,8 @@ class LitSurface:
         instance: Instance id (Float).
         trait: Row of the shape in :class:`Traits` (Float). Light is not averaged across rows.
         relit: True if the point is relit (uniform capture), False if it is only shadowed.
-        roughness, specular: GGX roughness and reflectance at normal incidence.
+        roughness, metallic, specular: Parameters of :class:`mitsplat.renderer.light.principled.SpecularLobe`.
+        captured: True if the colour contains the mirror image of the light of the capture.
         known: True if the point comes from the proxy of the visible instance; otherwise position and normal are a
             guess.
         valid: True if there is a point.
@@ -45,9 +47,21 @@ class LitSurface:
     trait: mi.Float
     relit: mi.Bool
     roughness: mi.Float
+    metallic: mi.Float
     specular: mi.Float
+    captured: mi.Bool
     known: mi.Bool
     valid: mi.Bool
+
+    @property
+    def glossy(self) -> mi.Bool:
+        """True if the surface mirrors light."""
+        return (self.specular > 0) | (self.metallic > 0)
+
+    @property
+    def lobe(self) -> SpecularLobe:
+        """Specular lobes towards the camera."""
+        return SpecularLobe.of(self.normal, self.to_camera, self.roughness, self.metallic, self.specular)
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,6 +143,16 @@ class VisibleSurfaces:
         z = dr.select(on_proxy, proxy_depth, depth)
         position = ray(z / cosine)
         valid = (seen.alpha > 1 / 255) & (z > 0)
+        traits, trait = self.traits, seen.trait
+        captured = dr.gather(mi.Bool, traits.captured, trait)
+        roughness, metallic, specular = (
+            dr.select(
+                same & ~captured,
+                dr.select(behind, getattr(static, name), getattr(hit, name)),
+                dr.gather(mi.Float, getattr(traits, name), trait),
+            )
+            for name in ("roughness", "metallic", "specular")
+        )
         reach = dr.max(dr.abs(position))
         return LitSurface(
             position=position,
@@ -138,10 +162,12 @@ class VisibleSurfaces:
             to_camera=-ray.d,
             offset=dr.fma(z, 0.25 / self.view.fx, reach * 4e-6),
             instance=mi.Float(instance),
-            trait=mi.Float(seen.trait),
-            relit=dr.gather(mi.Bool, self.traits.relit, seen.trait) | seen.mesh,
-            roughness=dr.gather(mi.Float, self.traits.roughness, seen.trait),
-            specular=dr.select(seen.mesh, 0, dr.gather(mi.Float, self.traits.specular, seen.trait)),
+            trait=mi.Float(trait),
+            relit=dr.gather(mi.Bool, traits.relit, trait) | seen.mesh,
+            roughness=roughness,
+            metallic=dr.select(seen.mesh, 0, metallic),
+            specular=dr.select(seen.mesh, 0, specular),
+            captured=captured,
             known=known,
             valid=valid,
         )

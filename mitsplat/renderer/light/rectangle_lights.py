@@ -57,8 +57,8 @@ class Rectangles:
 
     def towards(
         self, place: mi.Point3f, index: mi.UInt32, point: mi.Point2f
-    ) -> tuple[mi.Vector3f, mi.Float, mi.Color3f]:
-        """Return unit vectors and distances [m] to points of rectangles, and radiance over sampling density."""
+    ) -> tuple[mi.Vector3f, mi.Float, mi.Color3f, mi.Float]:
+        """Return unit vectors and distances [m] to points of rectangles, radiance over density, and density [1/sr]."""
         row = dr.gather(mi.ArrayXf, self.rows, index, shape=(_Columns.WIDTH, dr.width(index)))
         columns = _Columns.CORNER, _Columns.ACROSS, _Columns.UP, _Columns.NORMAL
         corner, across, up, normal = (mi.Vector3f(*row[column]) for column in columns)
@@ -66,4 +66,9 @@ class Rectangles:
         inverse = dr.rsqrt(dr.squared_norm(way))
         direction = way * inverse
         seen = dr.maximum(-dr.dot(direction, normal), 0) * dr.square(inverse)
-        return direction, dr.rcp(inverse), mi.Color3f(*row[_Columns.RADIANCE]) * seen
+        return (
+            direction,
+            dr.rcp(inverse),
+            mi.Color3f(*row[_Columns.RADIANCE]) * seen,
+            dr.select(seen > 0, dr.rcp(seen), 0),
+        )

@@ -9,10 +9,10 @@ import drjit as dr
 import mitsuba as mi
 
 from mitsplat.renderer.light.emitter_sampling import Beam, Emitters, receiver
-from mitsplat.renderer.light.highlight import Lobe
 from mitsplat.renderer.light.light_filter import Estimate, packed
 from mitsplat.renderer.light.light_tiles import BLOCK, STRIDE, ShadowTiles, block_order, parity
 from mitsplat.renderer.light.lit_surface import LitSurface
+from mitsplat.renderer.light.principled import power_weight
 from mitsplat.renderer.occluders.proxies import OccluderScene, Proxies
 from mitsplat.renderer.rays.camera_rays import CameraView
 from mitsplat.renderer.rays.device_arrays import gathered
@@ -104,7 +104,7 @@ class ShadowTracer:
             rays: Number of additional rays per point.
             most: Upper limit of ``rays``.
             steps: First number in the sequence of the pixel, and the step to the next number, by point.
-            matt: True if no point mirrors light, so that the highlight sums are skipped.
+            matt: True if no point mirrors light, so that the sums of the specular lobe are skipped.
         """
         separate_kernels = self.proxies.separate_kernels
         if separate_kernels and most > WORD_BITS:
@@ -196,18 +196,19 @@ class _RayBatch:
         With the unoccluded estimate e = L(w) max(0, n.w) / p(w) of a ray (Veach 1997, section 2.4.2), visibility V
         past all occluders and V_0 past static occluders, a point adds V e to ``lit`` and V_0 e to ``base`` if its
         captured colours contain shadows, or e if it is relit. ``known`` holds the occlusion of the first scenes as
-        bits; the other scenes are traced here.
+        bits; the other scenes are traced here. Light in the specular lobe is weighted by the power heuristic against
+        the reflection rays of :mod:`mitsplat.renderer.light.reflections`.
         """
-        proxies, surface, lobe = self.tracer.proxies, self.surface, Lobe.of(self.surface)
+        proxies, surface, lobe = self.tracer.proxies, self.surface, self.surface.lobe
 
         def add(
             i: mi.UInt32,
             lit: mi.Color3f,
             base: mi.Color3f,
-            specular_lit: mi.Float,
-            specular_base: mi.Float,
+            tinted: mi.Color3f,
+            colourless: mi.Color3f,
             squares: mi.Float,
-        ) -> tuple[mi.UInt32, mi.Color3f, mi.Color3f, mi.Float, mi.Float, mi.Float]:
+        ) -> tuple[mi.UInt32, mi.Color3f, mi.Color3f, mi.Color3f, mi.Color3f, mi.Float]:
             beam, number, active = self.sample(i)
             occluded = _bits(known, i)
             static_light = free = active
@@ -223,11 +224,14 @@ class _RayBatch:
             lit += light
             base += compared
             if not matt:
-                reflectance = lobe.reflectance(beam.direction)
-                specular_lit += dr.sum(light) * reflectance
-                specular_base += dr.select(active, dr.sum(beam.irradiance) * reflectance, 0)
+                value, density, cos_half = lobe.evaluate(beam.direction)
+                cosine = dr.dot(surface.normal, beam.direction)
+                mirrored = light * (value * power_weight(beam.density, density) / dr.maximum(cosine, 1e-6))
+                fresnel = lobe.fresnel(cos_half)
+                tinted += mirrored * fresnel.tint
+                colourless += mirrored * fresnel.white
             squares += dr.square(dr.sum(compared))
-            return i + 1, lit, base, specular_lit, specular_base, squares
+            return i + 1, lit, base, tinted, colourless, squares
 
         state = dr.zeros(mi.UInt32, dr.width(self.pixel)), *sums
         _, *sums = dr.while_loop(state, lambda i, *_: i < rays, add, label="light")

@@ -8,14 +8,18 @@ and objects together. PSNR [dB] and FLIP (Andersson et al. 2020, if ``flip_evalu
 display-encoded images:
 
 * shadow: the surroundings where the objects remove at least 3 % of the light, and 3 pixels around;
-* object: the pixels of the objects;
+* object: the pixels that objects cover completely;
+* silhouette: the pixels that objects cover in part, and 1 pixel around;
 * whole: all pixels.
+
+A table of objects shows the PSNR of ``traced`` and its mean luminance relative to the path-traced image.
 
 ``capture`` replaces the splats by path-traced images of the surroundings and of each object alone, so that only the
 error of the light remains. ``direct`` is ``capture`` with the exact ratio of direct light: the optimum of shadow rays
 without light reflected by the objects. ``no bounce`` is ``capture traced`` without the light that surroundings reflect
-onto objects. Penumbrae are measured in the light ratio itself, against direct light that is path-traced on white
-meshes: the distance [px] between 20 and 80 % of every edge.
+onto objects. Objects with materials keep their splats in these columns, because their picture under one light does not
+determine that under another; the columns then state errors of shadows only. Penumbrae are measured in the light ratio
+itself, against direct light that is path-traced on white meshes: the distance [px] between 20 and 80 % of every edge.
 
 Path-traced images and bakes take long; FOLDER stores them for later runs.
 """
@@ -29,7 +33,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from mitsplat.arrays import BoolArray, Float64Array
+from mitsplat.arrays import BoolArray, Float32Array, Float64Array
 
 # isort: off
 from mitsplat.asset import Asset  # imports mitsplat, which must be imported before Dr.Jit
@@ -47,7 +51,7 @@ from mitsplat.bake.bake import BakeSettings, bake_asset
 from mitsplat.bake.mesh_parts import MeshPart, bake_lights, mitsuba_scene, read_parts
 from mitsplat.frames.camera_response import light_image
 from mitsplat.geometry.camera import Camera
-from mitsplat.images.colour import LUMINANCE, encode_srgb
+from mitsplat.images.colour import LUMINANCE, decode_srgb, encode_srgb
 from mitsplat.renderer.layers import Layers, make_integrator, make_sensor, make_splats_shape, render_layers
 from mitsplat.renderer.occluders.proxies import Occluder, Proxies
 from mitsplat.renderer.path_tracing import trace_radiance
@@ -75,7 +79,54 @@ LIGHTS: dict[str, tuple[LightSpec, ...]] = {
         EnvironmentLight(radiance=0.15, colour=SKY),
     ),
     "sky": (EnvironmentLight(radiance=0.9, colour=SKY),),
+    "interior": (),  # an image, see lights_of
 }
+
+
+ROOM = np.array([(-3.0, -2.5, -0.75), (3.0, 3.5, 1.95)])
+"""Opposite corners of the room of the light ``interior``; the setup is on a table at the origin [m]."""
+WALL, CEILING, FLOOR = (0.30, 0.28, 0.25), (0.42, 0.41, 0.39), (0.12, 0.09, 0.07)
+WINDOW = (14.0, 15.5, 17.0)
+WINDOWS = ((1, 3.5, -2.0, -0.4), (1, 3.5, 0.4, 2.0), (0, -3.0, -1.0, 0.6))
+"""Axis and position of the wall, and the horizontal interval of each window [m]."""
+SILL, LINTEL, BAR = 0.2, 1.6, 0.03
+"""Heights above the table of the lower and upper edge of the windows, and half the width of their bars [m]."""
+
+
+def interior(height: int = 256, fine: int = 4) -> Float32Array:
+    """Return an equirectangular map (H, 2 H, 3), y up: a room with dim walls and three windows.
+
+    Radiance is that of :data:`WALL`, :data:`CEILING`, :data:`FLOOR` and :data:`WINDOW`. A vertical bar divides each
+    window into two. Every pixel is the mean of ``fine`` x ``fine`` directions.
+    """
+    polar = (np.arange(fine * height) + 0.5) / (fine * height) * np.pi
+    azimuth = (np.arange(2 * fine * height) + 0.5) / (fine * height) * np.pi
+    across = np.sin(polar)[:, None]
+    towards = np.broadcast_arrays(across * np.sin(azimuth), across * np.cos(azimuth), np.cos(polar)[:, None])
+    direction = np.stack(towards, axis=-1)
+    reach = np.where(direction > 0, ROOM[1], ROOM[0]) / direction
+    axis = reach.argmin(axis=-1)
+    point = direction * reach.min(axis=-1, keepdims=True)
+    level = np.where(direction[..., 2] > 0, 1, 0)
+    radiance = np.where((axis == 2)[..., None], np.array([FLOOR, CEILING])[level], np.array(WALL))
+    for wall, position, low, high in WINDOWS:
+        along = point[..., 1 - wall]
+        bright = (axis == wall) & (np.abs(point[..., wall] - position) < 1e-6) & (low < along) & (along < high)
+        bright &= (point[..., 2] > SILL) & (point[..., 2] < LINTEL) & (np.abs(along - 0.5 * (low + high)) > BAR)
+        radiance = np.where(bright[..., None], WINDOW, radiance)
+    return radiance.reshape(height, fine, 2 * height, fine, 3).mean(axis=(1, 3)).astype(np.float32)
+
+
+def lights_of(name: str, folder: Path) -> tuple[LightSpec, ...]:
+    """Return the lights of a name; the image of ``interior`` is written to ``folder`` if absent."""
+    lights = LIGHTS[name]
+    if name != "interior":
+        return lights
+    file = folder.resolve() / "interior.exr"
+    if not file.exists():
+        folder.mkdir(parents=True, exist_ok=True)
+        mi.Bitmap(interior()).write(str(file))
+    return (EnvironmentLight(image=str(file)),)
 
 
 @dataclass(frozen=True, eq=False)
@@ -276,20 +327,29 @@ def placed(thing: Thing) -> tuple[MeshPart, ...]:
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """Path-traced images of one setup under one light, all H x W."""
+    """Path-traced images of one setup under one light, all H x W, and regions in them.
+
+    ``thing`` is the number of the object that covers a pixel completely, or 0.
+    """
 
     photo: Float64Array
     empty: Float64Array
     alone: Float64Array
     ratio: Float64Array
-    objects: BoolArray
+    thing: npt.NDArray[np.uint32]
     shadow: BoolArray
+    silhouette: BoolArray
     edges: BoolArray
+
+    @property
+    def objects(self) -> BoolArray:
+        """Pixels that any object covers completely."""
+        return self.thing > 0
 
 
 def take_truth(setup: Setup, name: str, light: str, out: Path, samples: int) -> Truth:
     shots = Photographer(setup.camera, out / name, samples)
-    lights = bake_lights(LIGHTS[light])
+    lights = bake_lights(lights_of(light, out))
     room, things = read_parts(setup.room), [placed(thing) for thing in setup.things]
     everything = [*room, *(part for parts in things for part in parts)]
     photo, _ = shots.take(f"{light}_photo", everything, lights)
@@ -303,12 +363,14 @@ def take_truth(setup: Setup, name: str, light: str, out: Path, samples: int) -> 
     bare, _ = shots.take(f"{light}_bare", room, lights, bounces=1, clay=True)
     ratio = np.where(bare > 1e-4, direct / np.maximum(bare, 1e-4), 1.0)
     surroundings = cover == 0
-    objects = (cover > 0.999) & (seen > 0)
+    thing = np.where(cover > 0.999, seen, 0)
+    silhouette = binary_dilation((cover > 0) & (cover < 0.999), iterations=1)
     darker = surroundings & (photo @ LUMINANCE < 0.97 * (empty @ LUMINANCE)) & (bare @ LUMINANCE > 1e-3)
     # Excludes speckles of noise.
     darker = gaussian_filter(darker.astype(float), 1.5) > 0.5
     shadow = binary_dilation(darker, iterations=3) & surroundings
-    return Truth(photo, empty, alone, ratio, objects, shadow, ~binary_dilation(~surroundings, iterations=1))
+    edges = ~binary_dilation(~surroundings, iterations=1)
+    return Truth(photo, empty, alone, ratio, thing, shadow, silhouette, edges)
 
 
 def nearest_object(
@@ -321,12 +383,16 @@ def nearest_object(
     return np.array(hit.instance).reshape(camera.height, camera.width)
 
 
-def composites(layers: Layers, unbounced: Layers, relative: Layers, truth: Truth) -> dict[str, Float64Array]:
+def composites(
+    layers: Layers, unbounced: Layers, relative: Layers, truth: Truth, *, materials: bool
+) -> dict[str, Float64Array]:
     """Return linear images to compare with the path-traced one, by name.
 
-    ``relative`` are layers with light relative to an open place, the input of the image-space method.
+    ``relative`` are layers with light relative to an open place, the input of the image-space method. ``materials``
+    states that the objects have materials.
     """
-    captured = np.where(truth.objects[..., None], truth.alone, truth.empty).astype(np.float32)
+    on_objects = layers.captured if materials else truth.alone
+    captured = np.where(truth.objects[..., None], on_objects, truth.empty).astype(np.float32)
     opaque = {"captured": captured, "alpha": np.ones_like(layers.alpha)}
     exact = replace(layers, **opaque)
     ratio = np.where(truth.objects[..., None], layers.light, truth.ratio).astype(np.float32)
@@ -348,6 +414,17 @@ def lit(layers: Layers) -> Float64Array:
 def psnr(picture: Float64Array, photo: Float64Array, region: BoolArray) -> float:
     error = np.clip(encode_srgb(picture), 0, 1) - np.clip(encode_srgb(photo), 0, 1)
     return float(-10 * np.log10(np.mean(error[region] ** 2)))
+
+
+def brightness(picture: Float64Array, photo: Float64Array, region: BoolArray) -> float:
+    """Return the mean luminance in a region relative to the path-traced image."""
+    return float(np.mean(picture[region] @ LUMINANCE) / np.mean(photo[region] @ LUMINANCE))
+
+
+def difference(picture: Float64Array, photo: Float64Array) -> Float64Array:
+    """Return four times the difference of display-encoded images around middle grey, as a linear image."""
+    error = np.clip(encode_srgb(picture), 0, 1) - np.clip(encode_srgb(photo), 0, 1)
+    return decode_srgb(np.clip(0.5 + 4 * error, 0, 1))
 
 
 def flip(picture: Float64Array, photo: Float64Array, region: BoolArray) -> float:
@@ -401,36 +478,49 @@ def compare(name: str, light: str, out: Path, samples: int) -> dict[str, Any]:
     """Return the figures of one setup under one light, and write the images side by side to ``out``."""
     setup = SETUPS[name]()
     truth = take_truth(setup, name, light, out, samples)
-    room = baked(setup.room, out / name / light, LIGHTS[light], 20000, kind="environment", density=setup.density)
-    shapes = {"room": shape_of(room, np.eye(4), 0)}
-    for number, thing in enumerate(setup.things, 1):
-        shapes[f"thing_{number}"] = shape_of(thing.asset(out / name), thing.pose, number)
-    scene = mi.load_dict({"type": "scene", **shapes, **bake_lights(LIGHTS[light])})
+    lights = lights_of(light, out)
+    room = baked(setup.room, out / name / light, lights, 20000, kind="environment", density=setup.density)
+    assets = [thing.asset(out / name) for thing in setup.things]
+    shapes = {
+        f"shape_{i}": shape_of(asset, where, i)
+        for i, (asset, where) in enumerate(
+            zip([room, *assets], [np.eye(4), *(thing.pose for thing in setup.things)], strict=True)
+        )
+    }
+    scene = mi.load_dict({"type": "scene", **shapes, **bake_lights(lights)})
     layers, unbounced, relative = (
         render_layers(make_integrator(**how), scene, setup.camera)
         for how in ({"white": room.white}, {"white": room.white, "bounce": False}, {"bounce": False})
     )
-    pictures = composites(layers, unbounced, relative, truth)
+    materials = any(asset.splats.materials is not None for asset in assets)
+    pictures = composites(layers, unbounced, relative, truth, materials=materials)
+    traced = pictures["traced"]
     ratios = [truth.ratio @ LUMINANCE, layers.light @ LUMINANCE]
     ratios.append(pictures["capture image"] @ LUMINANCE / np.maximum(truth.empty @ LUMINANCE, 1e-6))
     widths = penumbra_widths(ratios, truth.edges)
-    regions = {"shadow": truth.shadow, "object": truth.objects, "whole": np.ones_like(truth.shadow)}
+    regions = {"shadow": truth.shadow, "object": truth.objects, "silhouette": truth.silhouette}
+    regions["whole"] = np.ones_like(truth.shadow)
     result: dict[str, Any] = {
         f"{region} {key}": psnr(picture, truth.photo, mask)
         for key, picture in pictures.items()
         for region, mask in regions.items()
+        if region == "shadow" or not materials or key in ("none", "image", "traced")
     }
     result |= {f"flip {key}": flip(picture, truth.photo, truth.shadow) for key, picture in pictures.items()}
-    bright = [np.mean(p[truth.objects] @ LUMINANCE) for p in (pictures["capture traced"], truth.photo)]
-    result["object brightness"] = bright[0] / bright[1]
+    result["things"] = {
+        thing.name: (psnr(traced, truth.photo, mask), brightness(traced, truth.photo, mask))
+        for i, thing in enumerate(setup.things, 1)
+        if (mask := truth.thing == i).any()
+    }
     error = (layers.light - truth.ratio)[truth.edges & truth.shadow]
     result["ratio rms"] = float(np.sqrt(np.mean(error**2)))
     result["edges"], result["width"] = len(widths), float(np.median(widths[:, 0])) if len(widths) else np.nan
     for column, key in ((1, "traced"), (2, "image")):
         error = np.abs(widths[:, column] - widths[:, 0]) / np.maximum(widths[:, 0], 0.5)
         result[f"width error {key}"] = float(np.nanmedian(error)) if len(widths) else np.nan
-    shown = [truth.photo, pictures["none"], pictures["image"], pictures["traced"]]
+    shown = [truth.photo, pictures["none"], pictures["image"], traced]
     save_sheet(out / f"{name}_{light}.png", [*shown, pictures["capture traced"], layers.light.astype(np.float64)])
+    save_sheet(out / f"{name}_{light}_traced.png", [traced, truth.photo, difference(traced, truth.photo)])
     return result
 
 
@@ -470,21 +560,38 @@ def measure(options: argparse.Namespace) -> None:
             start = time.perf_counter()
             results[name, light] = compare(name, light, options.out, options.samples)
             print(f"{name} {light}: {time.perf_counter() - start:.0f} s", flush=True)
-    for quantity in ("shadow", "flip", "object", "whole"):
-        print(f"\n{quantity:16s}" + "".join(f"{column:>16s}" for column in COLUMNS))
-        rows = {key: [result[f"{quantity} {column}"] for column in COLUMNS] for key, result in results.items()}
+    for quantity in ("shadow", "flip", "object", "silhouette", "whole"):
+        columns = [c for c in COLUMNS if all(f"{quantity} {c}" in result for result in results.values())]
+        print(f"\n{quantity:16s}" + "".join(f"{column:>16s}" for column in columns))
+        rows = {key: [result[f"{quantity} {column}"] for column in columns] for key, result in results.items()}
         rows["mean", ""] = np.mean(list(rows.values()), axis=0)
-        for column, mean in zip(COLUMNS, rows["mean", ""], strict=True):
+        for column, mean in zip(columns, rows["mean", ""], strict=True):
             figure(mean, "" if quantity == "flip" else "dB", quantity, column)
         for key, row in rows.items():
             print(f"{' '.join(key):16s}" + "".join(f"{v:16.3f}" if quantity == "flip" else f"{v:16.1f}" for v in row))
     figure(len(results), "", "photographs")
     gains = [r["shadow traced"] - max(r["shadow none"], r["shadow image"]) for r in results.values()]
     figure(min(gains), "dB", "least gain of traced")
-    others = ("ratio rms", "object brightness", "edges", "width", "width error traced", "width error image")
+    print_things({(*key, thing): found for key, result in results.items() for thing, found in result["things"].items()})
+    others = ("ratio rms", "edges", "width", "width error traced", "width error image")
     print("\n" + " " * 16 + "".join(f"{column:>20s}" for column in others))
     for key, result in results.items():
         print(f"{' '.join(key):16s}" + "".join(f"{result[column]:20.3f}" for column in others))
+
+
+def print_things(things: Mapping[tuple[str, str, str], tuple[float, float]]) -> None:
+    """Print PSNR and brightness of every object in every image."""
+    print(f"\n{'object, traced':40s}{'PSNR [dB]':>12s}{'brightness':>12s}")
+    for key, (error, bright) in things.items():
+        print(f"{' '.join(key):40s}{error:12.1f}{bright:12.2f}")
+        figure(error, "dB", "things", *key, "psnr")
+        figure(bright, "", "things", *key, "brightness")
+    errors, bright = np.array(list(things.values())).T
+    print(f"{'mean':40s}{errors.mean():12.1f}{bright.mean():12.2f}")
+    print(f"{'worst':40s}{errors.min():12.1f}{bright.min():12.2f} to {bright.max():.2f}")
+    figure(errors.mean(), "dB", "things", "mean psnr")
+    figure(errors.min(), "dB", "things", "least psnr")
+    figure((bright.min(), bright.max()), "", "things", "brightness")
 
 
 if __name__ == "__main__":

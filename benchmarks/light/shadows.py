@@ -63,6 +63,8 @@ from scenes.build.parts import build_part
 
 ROOT = Path(__file__).resolve().parents[2]
 SKY = (0.97, 0.99, 1.0)
+PHOTO_PATHS = 16
+"""Paths of the reference relative to other path-traced images, because its noise on metal counts as error."""
 
 LIGHTS: dict[str, tuple[LightSpec, ...]] = {
     "softbox": (
@@ -288,27 +290,38 @@ def baked(
 
 
 class Photographer:
-    """Path-traced linear images, cached in a folder."""
+    """Path-traced linear images, cached in a folder.
+
+    The number of paths per pixel is rounded to that of a square grid in each part of a pixel.
+    """
 
     def __init__(self, camera: Camera, folder: Path, samples: int) -> None:
         self.camera, self.folder, self.samples = camera, folder, samples
         folder.mkdir(parents=True, exist_ok=True)
 
     def take(
-        self, name: str, parts: Sequence[MeshPart], lights: dict[str, Any], *, bounces: int = 6, clay: bool = False
+        self,
+        name: str,
+        parts: Sequence[MeshPart],
+        lights: dict[str, Any],
+        *,
+        bounces: int = 6,
+        clay: bool = False,
+        paths: int = 1,
     ) -> tuple[Float64Array, Float64Array]:
-        """Return radiance (H, W, 3) averaged over each pixel, and coverage (H, W)."""
-        file = self.folder / f"{name}_{self.samples}.npz"
+        """Return radiance (H, W, 3) averaged over each pixel, and coverage (H, W); ``paths`` multiplies the samples."""
+        side, camera = 3, self.camera
+        samples = max(1, round((paths * self.samples) ** 0.5 / side)) ** 2
+        file = self.folder / f"{name}_{side * side * samples}.npz"
         if not file.exists():
             scene = mitsuba_scene(parts, lights, clay=clay)
-            side, camera = 3, self.camera
             fine = camera.resized(camera.width * side, camera.height * side)
             x, y = np.meshgrid(np.arange(fine.width) + 0.5, np.arange(fine.height) + 0.5)
             slopes = fine.ray_slopes(np.stack([x.ravel(), y.ravel()], axis=1))
             rays = np.concatenate([slopes, np.ones((len(slopes), 1))], axis=1) @ camera.world_from_camera[:3, :3].T
             rays /= np.linalg.norm(rays, axis=1, keepdims=True)
             origins = np.broadcast_to(camera.centre, rays.shape)
-            radiance, hit = trace_radiance(scene, origins, rays, samples=self.samples // 9, bounces=bounces, seed=1)
+            radiance, hit = trace_radiance(scene, origins, rays, samples=samples, bounces=bounces, seed=1)
             by_pixel = (camera.height, side, camera.width, side)
             np.savez(
                 file,
@@ -352,7 +365,7 @@ def take_truth(setup: Setup, name: str, light: str, out: Path, samples: int) -> 
     lights = bake_lights(lights_of(light, out))
     room, things = read_parts(setup.room), [placed(thing) for thing in setup.things]
     everything = [*room, *(part for parts in things for part in parts)]
-    photo, _ = shots.take(f"{light}_photo", everything, lights)
+    photo, _ = shots.take(f"{light}_photo", everything, lights, paths=PHOTO_PATHS)
     empty, _ = shots.take(f"{light}_empty", room, lights)
     alone, cover, seen = np.zeros_like(photo), np.zeros(photo.shape[:2]), nearest_object(setup.camera, room, things)
     for number, (thing, parts) in enumerate(zip(setup.things, things, strict=True), 1):
@@ -545,7 +558,12 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=ROOT / "out" / "shadows")
     parser.add_argument("--scenes", nargs="*", choices=SETUPS, default=list(SETUPS))
     parser.add_argument("--lights", nargs="*", choices=LIGHTS, default=list(LIGHTS))
-    parser.add_argument("--samples", type=int, default=72, help="paths per pixel of a path-traced image")
+    parser.add_argument(
+        "--samples",
+        type=int,
+        default=72,
+        help=f"paths per pixel of path-traced images; references have {PHOTO_PATHS} times as many",
+    )
     options = parser.parse_args()
     ensure_variant()
     with recording("light.shadows", parser, options, ignore=("out",)):

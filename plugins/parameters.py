@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import mitsuba as mi
+import numpy as np
 
 from mitsplat.errors import InputError
 
@@ -51,6 +52,14 @@ class Parameters:
         if not value > 0:
             self.refuse(name, "be > 0", value)
         return value
+
+    def colour(self, name: str, default: float) -> tuple[float, float, float]:
+        """Return three finite numbers above 0, from a number for all channels or from an RGB value."""
+        value = self._typed(name, default, (int, float, mi.ScalarColor3d), "a number or an RGB value")
+        red, green, blue = (float(v) for v in np.broadcast_to(np.ravel(value), 3))
+        if not (min(red, green, blue) > 0 and max(red, green, blue) < np.inf):
+            self.refuse(name, "be > 0", value)
+        return red, green, blue
 
     def integer(self, name: str, default: int, least: int, most: int) -> int:
         """Return an integer from ``least`` to ``most``."""

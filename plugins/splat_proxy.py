@@ -97,10 +97,9 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
        - True if surfaces show highlights of lights, by the roughness and specular of the splats. (Default: true)
 
      * - white
-       - |float|
-       - Irradiance under which uniformly captured colours are shown unchanged [W/m^2]. Use pi if radiance 1 is the
-         white of the surroundings, as in baked ones. (Default: 0, the irradiance of an unoccluded horizontal surface at
-         ``reference``)
+       - |float| or |rgb|
+       - Irradiance at which a white surface has the value 1 in the image [W/m^2]. Splats that were captured under
+         uniform light keep their colours under it. (Default: pi, so that the image holds radiance)
 
      * - sky_reach
        - |float|
@@ -129,7 +128,8 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
     All other materials of Mitsuba are path traced: metal reflects, and glass shows, splats, meshes and emitters. In
     reflections, splats that were captured under the scene's light do not show the shadows of added objects.
 
-    The irradiance ``white`` is the white of the picture: radiance is multiplied by pi over it. With a sky, alpha is 1.
+    Radiance is multiplied by pi over ``white``. Splats that were captured under the light of the scene keep their
+    colours; state the irradiance of a white surface in their capture as ``white``. With a sky, alpha is 1.
     The image holds linear R, G, B, A and the channels of ``aov_names``. ``shadow: traced`` needs at least one emitter;
     without emitters, colours stay as captured. Sensors are :monosp:`opencv_camera`, :monosp:`perspective` and
     :monosp:`thinlens`; the filter of their film and their sampler are not used.
@@ -154,12 +154,11 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
             "lens_rings": props.get("lens_rings", 2),
         }
         shadow_error = given.number("shadow_error", 0.03)
-        white, sky_reach = given.number("white", 0.0), given.number("sky_reach", 0.0)
+        sky_reach = given.number("sky_reach", 0.0)
         if not 0 <= shadow_error < 1:
             given.refuse("shadow_error", "be in [0, 1)", shadow_error)
-        for name, value in (("white", white), ("sky_reach", sky_reach)):
-            if not 0 <= value < np.inf:
-                given.refuse(name, "be >= 0", value)
+        if not 0 <= sky_reach < np.inf:
+            given.refuse("sky_reach", "be >= 0", sky_reach)
         self.renderer = LayerRenderer(
             quality=replace(resolve_quality(given.string("quality", "balanced")), **refined),
             shadow=given.choice("shadow", "traced", "none"),
@@ -172,7 +171,7 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
             hide_emitters=given.boolean("hide_emitters", False),
             mesh_samples=given.integer("mesh_samples", 64, 1, 65536),
             max_depth=given.integer("max_depth", 8, 2, 64),
-            white=white,
+            white=given.colour("white", np.pi),
             sky_reach=sky_reach,
             reference=tuple(float(v) for v in np.array(props.get("reference", mi.ScalarPoint3f(0))).ravel()),
         )

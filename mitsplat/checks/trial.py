@@ -28,6 +28,9 @@ BLOCK = 8
 TOLERANCE = 0.02
 """Maximum difference of a mean; 1 is white or unshadowed. One pixel at an edge changes a mean by 0.016."""
 
+WHITE = 1.437
+"""Irradiance of lamp and sky on the middle of the floor [W/m^2], at which the ball keeps its colours."""
+
 # fmt: off
 KNOWN_MEANS = {
     "picture": [
@@ -75,7 +78,7 @@ def render_trial(**options: Any) -> Layers:
 
     The wall occludes light in the captured floor, and the ball is an added object that occludes light.
     """
-    integrator = make_integrator(quality="fast", **options)
+    integrator = make_integrator(quality="fast", white=WHITE, **options)
     import mitsuba as mi  # after the variant was set
 
     x, y = (values.ravel() for values in np.meshgrid(*2 * [np.linspace(-0.5, 0.5, 30)]))

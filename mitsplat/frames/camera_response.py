@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Literal, TypeAlias
@@ -29,13 +30,14 @@ from mitsplat.images.colour import (
     chroma_matrix,
     encode_srgb,
     hue_matrix,
+    neutral_matrix,
     saturation_matrix,
     white_balance_matrix,
 )
 from mitsplat.renderer.layers import Layers, device_array, host_array
 from mitsplat.renderer.rays.device_arrays import wrapped
 from mitsplat.runtime.variant import one_at_a_time
-from mitsplat.scene.spec.image_spec import Composite, ImageShadow
+from mitsplat.scene.spec.image_spec import DAYLIGHT, CameraExposure, Composite, ImageShadow
 
 Tone: TypeAlias = Literal["neutral", "filmic"]
 
@@ -52,8 +54,21 @@ GREY = 118.0
 """Mean byte value (of 255) of a metered picture: middle grey of the standard output sensitivity (ISO 12232)."""
 
 _METERED_PIXELS = 1 << 14
-_MAX_METERING = 6.0
+_MAX_METERING = 12.0
 """Maximum correction by metering, in both directions [stops]."""
+
+WHITE = (math.pi,) * 3
+"""Irradiance at which a white surface has radiance 1, by channel [W/m^2]."""
+
+LUMINOUS_EFFICACY = 179.0
+"""Luminance of radiance 1 [lm/W]: that of equal-energy white light in the visible range (Ward 1994, "The RADIANCE
+lighting simulation and rendering system").
+"""
+
+SATURATION_LUMINANCE = 78.0 / (0.65 * 100.0)
+"""Luminance of picture value 1 at EV 0 and ISO 100 [cd/m^2]: saturation-based speed 78 / H of ISO 12232, with the
+exposure H = 0.65 L shutter / f-number^2 behind a typical lens.
+"""
 
 CURVE_WHITE = 16.0
 """Linear input at the end of the table."""
@@ -103,6 +118,8 @@ def develop(
     *,
     seed: int = 0,
     exposure_flow: PixelFlow | None = None,
+    white: Sequence[float] = WHITE,
+    light: Sequence[float] = WHITE,
 ) -> ByteImage:
     """Convert a linear picture (H, W, 3) to display-encoded bytes with a camera model.
 
@@ -113,15 +130,24 @@ def develop(
             ``white_balance`` [K], ``chroma_stretch`` along ``chroma_angle`` [degrees], ``hue`` [degrees],
             ``saturation``, ``sharpening`` [factor of the difference to a blur of 1 px], ``jpeg`` [quality]. A missing
             entry has no effect.
-        composite: Tone curve, and automatic exposure, to which ``exposure`` is added. By default, that of a scene file
-            without `composite`.
+        composite: Tone curve, exposure, to which the draw ``exposure`` is added, and white balance. By default, the
+            picture is neither exposed nor balanced.
         seed: Seed of the noise, below 2^64. The noise is a function of seed, row-major index and channel of a pixel.
         exposure_flow: Motion of every pixel during the exposure; None for no motion.
+        white: Irradiance at which a white surface has the value 1, by channel [W/m^2]. Exposures of cameras use it.
+        light: Irradiance that an automatic white balance makes neutral, by channel [W/m^2].
     """
     height, width = linear.shape[:2]
-    composite, uploaded = composite or Composite(), device_array(linear)
+    composite, uploaded = composite or Composite(exposure="fixed"), device_array(linear)
     return start_development(
-        uploaded, (height, width), draws, composite, seed=seed, exposure_flow=exposure_flow
+        uploaded,
+        (height, width),
+        draws,
+        composite,
+        seed=seed,
+        exposure_flow=exposure_flow,
+        white=white,
+        light=light,
     ).image()
 
 
@@ -133,11 +159,17 @@ def start_development(
     *,
     seed: int,
     exposure_flow: PixelFlow | None,
+    white: Sequence[float],
+    light: Sequence[float],
 ) -> Development:
     """Start to :func:`develop` a picture on the device, flat and row-major over ``shape``."""
-    if composite.exposure == "auto":
-        metering = metered_exposure(linear, shape[0] * shape[1], composite.tone)
-        draws = {**draws, "exposure": draws.get("exposure", 0.0) + metering}
+    if composite.exposure != "fixed":
+        stops = (
+            metered_exposure(linear, shape[0] * shape[1], composite.tone)
+            if composite.exposure == "auto"
+            else camera_exposure(composite.exposure, white)
+        )
+        draws = {**draws, "exposure": draws.get("exposure", 0.0) + stops}
     linear = _apply_lens(linear, shape, draws)
     if exposure_flow is not None:
         linear = blur_along_flow(linear, shape, exposure_flow)
@@ -145,7 +177,7 @@ def start_development(
         linear = correlate(linear, shape, motion_kernel(draws["motion_blur"], draws.get("motion_angle", 0.0)))
     if "iso" in draws:
         linear = add_noise(linear, shape, draws["iso"], seed)
-    matrix = colour_matrix(draws)
+    matrix = colour_matrix(draws) @ _white_point_matrix(composite, np.divide(light, white))
     if not np.array_equal(matrix, np.eye(3)):
         linear = mi.Color3f(*[sum(opaque_float(m) * c for m, c in zip(row, linear, strict=True)) for row in matrix])
     jpeg = round(draws["jpeg"]) if "jpeg" in draws else None
@@ -211,6 +243,19 @@ def metered_exposure(linear: mi.Color3f, num_pixels: int, tone: Tone) -> float:
     return (low + high) / 2
 
 
+def camera_exposure(exposure: CameraExposure, white: Sequence[float] = WHITE) -> float:
+    """Compute the exposure [stops] of a camera for pictures of irradiance ``white`` by channel [W/m^2] at value 1."""
+    luminance = LUMINOUS_EFFICACY * float(LUMINANCE @ np.asarray(white)) / math.pi
+    return math.log2(luminance / SATURATION_LUMINANCE) - exposure.value
+
+
+def _white_point_matrix(composite: Composite, light: Float64Array) -> Float64Array:
+    """Return the 3x3 matrix on linear sRGB of the white balance; ``light`` is the colour of a white surface."""
+    if composite.white_balance == "auto":
+        return neutral_matrix(light)
+    return np.eye(3) if composite.white_balance == DAYLIGHT else white_balance_matrix(composite.white_balance)
+
+
 def _apply_lens(linear: mi.Color3f, shape: tuple[int, int], draws: Mapping[str, float]) -> mi.Color3f:
     """Apply chromatic aberration, exposure and vignetting."""
     if draws.get("chromatic_aberration", 0.0):
@@ -249,12 +294,12 @@ def _jpeg_compressed(image: ByteImage, quality: int) -> ByteImage:
 def colour_matrix(draws: Mapping[str, float]) -> Float64Array:
     """Compute a 3x3 matrix on linear sRGB for white balance, chroma, hue and saturation, in this order.
 
-    White balance is a Bradford adaptation from daylight of the given temperature to sRGB's white. Chroma is a factor
-    and an angle of :func:`mitsplat.images.colour.chroma_matrix`. Hue rotates colours about the grey axis. Saturation
-    scales their distance from the grey of the same luminance.
+    White balance is a Bradford adaptation from light of the given temperature to sRGB's white. Chroma is a factor
+    and an angle of :func:`mitsplat.images.colour.chroma_matrix`. Hue rotates colours about the grey axis and keeps
+    their luminance. Saturation scales their distance from the grey of the same luminance.
     """
     matrix = np.eye(3)
-    if draws.get("white_balance", 6504.0) != 6504.0:
+    if draws.get("white_balance", DAYLIGHT) != DAYLIGHT:
         matrix = white_balance_matrix(float(draws["white_balance"]))
     if draws.get("chroma_stretch", 1.0) != 1.0:
         matrix = chroma_matrix(draws["chroma_stretch"], draws.get("chroma_angle", 0.0)) @ matrix

@@ -17,7 +17,7 @@ from mitsplat.arrays import Float32Array
 from mitsplat.errors import InputError
 from mitsplat.frames.camera_response import Development, light_layers, start_development
 from mitsplat.frames.flow import exposure_flow, instance_motions, optical_flow
-from mitsplat.frames.light_properties import light_properties, white_irradiance
+from mitsplat.frames.light_properties import irradiance_of, light_properties, white_irradiance
 from mitsplat.frames.scene_builder import SceneBuilder
 from mitsplat.geometry.camera import Camera
 from mitsplat.images.masks import Silhouette
@@ -194,6 +194,7 @@ class Renderer:
         self._variant = mi.variant()
         self.integrator = make_integrator(quality=quality, **light_properties(scene))
         self._settled_layout = lru_cache(maxsize=MAX_CACHED_LAYOUTS)(partial(settle_layout, scene))
+        self._white_irradiance = lru_cache(maxsize=MAX_CACHED_LAYOUTS)(partial(white_irradiance, scene))
 
     def __enter__(self) -> Renderer:
         return self
@@ -247,7 +248,7 @@ class Renderer:
         with _timed(seconds, "composite"):
             background = self.scene_builder.background(index, layout.index, plan.camera)
             linear = light_layers(layers, self.scene.spec.composite, background)
-            development = self._start_development(linear, layers, layout, plan)
+            development = self._start_development(linear, layers, layout, plan, mitsuba_scene)
         with _timed(seconds, "silhouettes"):
             silhouettes = render_silhouettes(
                 self.integrator, mitsuba_scene, plan.camera, source=self.scene.spec.labels.source
@@ -279,19 +280,31 @@ class Renderer:
 
     def _build_scene(self, layout: Layout, plan: FramePlan, *, replaced_lights: bool) -> mi.Scene:
         """Load the Mitsuba scene of a frame, and set the integrator's white to that of the layout's environment."""
-        self.integrator.renderer.white = white_irradiance(self.scene, layout.index)
+        self.integrator.renderer.white = self._white_irradiance(layout.index)
         description = self.scene_builder.describe(layout, plan.lights, replaced_lights=replaced_lights, belt=plan.belt)
         # A scene has few parts, so that loading them serially is faster than waking threads.
         return mi.load_dict(description, parallel=False)
 
-    def _start_development(self, linear: mi.Color3f, layers: Layers, layout: Layout, plan: FramePlan) -> Development:
+    def _start_development(
+        self, linear: mi.Color3f, layers: Layers, layout: Layout, plan: FramePlan, mitsuba_scene: mi.Scene
+    ) -> Development:
         """Start the camera response on the device, with blur by the motion of a belt."""
         motion, belt, flow = plan.viewpoint.get("motion"), plan.belt, None
         if motion is not None and belt is not None:
             carried = np.isin(layers.instance, list(carried_instances(layout, belt.box)))
             flow = exposure_flow(layers.depth, plan.camera, motion["exposure"], belt, carried)
-        composite = self.scene.spec.composite
-        return start_development(linear, layers.shape, plan.draws, composite, seed=plan.seed, exposure_flow=flow)
+        composite, white = self.scene.spec.composite, self._white_irradiance(layout.index)
+        is_balanced = composite.white_balance == "auto" and mitsuba_scene.emitters()
+        return start_development(
+            linear,
+            layers.shape,
+            plan.draws,
+            composite,
+            seed=plan.seed,
+            exposure_flow=flow,
+            white=white,
+            light=irradiance_of(self.scene, mitsuba_scene) if is_balanced else white,
+        )
 
     def _label(self, layers: Layers, silhouettes: Mapping[int, Silhouette], layout: Layout, camera: Camera) -> Labels:
         """Label the instances by the ids of splats or proxies. The depth that is not used stays on the device."""

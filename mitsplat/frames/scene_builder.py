@@ -72,13 +72,16 @@ class SceneBuilder:
                 move without recompilation of kernels.
             belt: Conveyor belt at the moment of the frame; its travel shifts its pattern.
         """
-        movable_lights = replaced_lights or self._has_moving_lights
         return {
             "type": "scene",
             **self._surroundings(layout.index, belt),
             **self._reuse("objects", layout, lambda: _object_shapes(self._scene, layout)),
-            **{f"light_{number}": self._emitter(light, movable_lights) for number, light in enumerate(lights)},
+            **self.emitters(lights, movable=replaced_lights or self._has_moving_lights),
         }
+
+    def emitters(self, lights: tuple[LightSpec, ...], *, movable: bool) -> dict[str, Any]:
+        """Return the emitters of lights by name; movable ones can move without recompilation of kernels."""
+        return {f"light_{number}": self._emitter(light, movable) for number, light in enumerate(lights)}
 
     def background(self, index: int, layout: int, camera: Camera) -> mi.Color3f | float:
         """Return the linear background picture of a frame on the device; a grey if the scene has no background."""

@@ -29,11 +29,12 @@ def decode_srgb(encoded: npt.ArrayLike) -> Float64Array:
 
 
 def hue_matrix(degrees: float) -> Float64Array:
-    """Return the rotation of linear sRGB about the grey axis, shape (3, 3)."""
+    """Return the matrix (3, 3) that rotates linear sRGB about the grey axis, and adds grey to keep the luminance."""
     angle = np.radians(degrees)
     axis = np.full((3, 3), 1 / 3)
     k = np.array([[0, -1, 1], [1, 0, -1], [-1, 1, 0]]) / np.sqrt(3)
-    matrix: Float64Array = np.cos(angle) * np.eye(3) + (1 - np.cos(angle)) * axis + np.sin(angle) * k
+    rotation = np.cos(angle) * np.eye(3) + (1 - np.cos(angle)) * axis + np.sin(angle) * k
+    matrix: Float64Array = rotation + (LUMINANCE - LUMINANCE @ rotation)
     return matrix
 
 
@@ -59,31 +60,59 @@ def chroma_matrix(factor: float, degrees: float) -> Float64Array:
 
 
 @lru_cache(maxsize=256)
-def black_body_colour(kelvin: float) -> tuple[float, float, float]:
-    """Return the linear sRGB colour of a black body (Kang et al. 2002), with luminance 1.
+def temperature_colour(kelvin: float) -> tuple[float, float, float]:
+    """Return the linear sRGB colour of light of a colour temperature, with luminance 1.
 
-    Negative components become 0.
+    Negative components, of light below 1900 K, become 0.
     """
-    colour = _colour_science()
-    white = colour.xy_to_XYZ(colour.temperature.CCT_to_xy(kelvin, method="Kang 2002"))
-    rgb = np.maximum(np.linalg.inv(colour.RGB_COLOURSPACES["sRGB"].matrix_RGB_to_XYZ) @ white, 0.0)
+    rgb = np.maximum(np.linalg.inv(_xyz_from_srgb()) @ _temperature_xyz(kelvin), 0.0)
     red, green, blue = (rgb / (LUMINANCE @ rgb)).tolist()
     return red, green, blue
 
 
 @lru_cache(maxsize=64)
 def white_balance_matrix(kelvin: float) -> Float64Array:
-    """Return the matrix (3, 3) on linear sRGB that maps daylight of a temperature (CIE 15) to white of luminance 1.
+    """Return the matrix (3, 3) on linear sRGB that maps light of a colour temperature to white."""
+    return _adaptation_matrix(_temperature_xyz(kelvin))
+
+
+def neutral_matrix(light: npt.ArrayLike) -> Float64Array:
+    """Return the matrix (3, 3) on linear sRGB that maps the colour of a light to white."""
+    return _adaptation_matrix(_xyz_from_srgb() @ np.asarray(light, dtype=np.float64))
+
+
+def _temperature_xyz(kelvin: float) -> Float64Array:
+    """Return the XYZ of the reference illuminant of a colour temperature (ANSI/IES TM-30), with Y = 1.
+
+    It is a black body up to 4000 K (Kang et al. 2002), daylight from 5000 K (CIE 15), and mixed linearly in between.
+    """
+    colour = _colour_science()
+    share = np.clip((kelvin - 4000.0) / 1000.0, 0.0, 1.0)
+    parts = [(1 - share, "Kang 2002"), (share, "CIE Illuminant D Series")]
+    xyz: Float64Array = sum(
+        weight * colour.xy_to_XYZ(colour.temperature.CCT_to_xy(kelvin, method=method))
+        for weight, method in parts
+        if weight
+    )
+    return xyz
+
+
+def _adaptation_matrix(xyz: Float64Array) -> Float64Array:
+    """Return the matrix (3, 3) on linear sRGB that maps a colour to white; sRGB's white keeps its luminance.
 
     It is a von Kries adaptation in Bradford's cone space (Lam 1985).
     """
-    colour = _colour_science()
-    space = colour.RGB_COLOURSPACES["sRGB"]
-    seen = colour.xy_to_XYZ(colour.temperature.CCT_to_xy(kelvin, method="CIE Illuminant D Series"))
-    shown = colour.xy_to_XYZ(space.whitepoint)
-    adapt = colour.adaptation.matrix_chromatic_adaptation_VonKries(seen, shown, transform="Bradford")
-    matrix = np.linalg.inv(space.matrix_RGB_to_XYZ) @ adapt @ space.matrix_RGB_to_XYZ
+    colour, space = _colour_science(), _xyz_from_srgb()
+    adapt = colour.adaptation.matrix_chromatic_adaptation_VonKries(
+        xyz / xyz[1], space.sum(axis=1), transform="Bradford"
+    )
+    matrix = np.linalg.inv(space) @ adapt @ space
     return np.asarray(matrix / (LUMINANCE @ matrix @ np.ones(3)), dtype=np.float64)
+
+
+def _xyz_from_srgb() -> Float64Array:
+    """Return the matrix (3, 3) from linear sRGB to XYZ."""
+    return np.asarray(_colour_science().RGB_COLOURSPACES["sRGB"].matrix_RGB_to_XYZ, dtype=np.float64)
 
 
 def _colour_science() -> Any:

@@ -184,6 +184,7 @@ camera:
   intrinsics: {{fov_x: 50}}
 lights:
   - {{kind: room, size: {room}}}
+composite: {{white_balance: auto}}
 randomise: {{exposure: [-0.3, 0.3], iso: [100, 400]}}
 output: {{width: 960, height: 540, layouts: 4, views: 3, image: jpg}}
 """
@@ -211,5 +212,6 @@ camera:
 lights:
   - {{kind: area, position: [0.5, -0.4, 1.6], target: [0, 0, 0], size: [0.6, 0.6], radiance: 10}}
   - {{kind: environment, radiance: 0.4}}
+composite: {{exposure: fixed}}  # that of the splats
 output: {{width: 960, height: 540, layouts: 4, views: 3, image: jpg}}
 """

@@ -10,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitsplat.arrays import Float64Array
-from mitsplat.images.colour import black_body_colour
+from mitsplat.images.colour import temperature_colour
 from mitsplat.runtime.variant import ensure_variant
 from mitsplat.scene.spec.light_spec import LightSpec
 
@@ -20,7 +20,7 @@ def emitter_dict(light: LightSpec, folder: Path | None = None) -> dict[str, Any]
     ensure_variant()
     colour = np.asarray(light.colour)
     if light.kind != "environment" and light.temperature is not None:
-        colour = colour * black_body_colour(light.temperature)
+        colour = colour * temperature_colour(light.temperature)
     if light.kind == "environment":
         if light.image is None:
             return {"type": "constant", "radiance": _rgb(light.radiance * colour)}

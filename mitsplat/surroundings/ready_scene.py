@@ -143,5 +143,6 @@ camera:  # similar to the cameras of the photos
 lights:  # a generic room; `mitsplat lights` measures yours
   - {{kind: area, position: [0.5, -0.4, 1.6], target: [0, 0, 0], size: [0.6, 0.6], radiance: 10}}
   - {{kind: environment, radiance: 0.4}}
+composite: {{exposure: fixed}}  # that of the photos
 output: {{width: 960, height: 540, layouts: 4, views: 3, image: jpg}}
 """

@@ -18,6 +18,7 @@ from mitsplat.frames.camera_response import (
     GREY,
     READ_NOISE,
     add_noise,
+    camera_exposure,
     colour_matrix,
     develop,
     light_image,
@@ -25,9 +26,16 @@ from mitsplat.frames.camera_response import (
     tone_curve,
 )
 from mitsplat.frames.image_filters import correlate, motion_kernel
-from mitsplat.images.colour import LUMINANCE, black_body_colour, decode_srgb, encode_srgb, white_balance_matrix
+from mitsplat.images.colour import (
+    LUMINANCE,
+    decode_srgb,
+    encode_srgb,
+    neutral_matrix,
+    temperature_colour,
+    white_balance_matrix,
+)
 from mitsplat.renderer.layers import Layers, device_array, host_array
-from mitsplat.scene.spec.image_spec import Composite, ImageShadow
+from mitsplat.scene.spec.image_spec import CameraExposure, Composite, ImageShadow
 
 
 def encode(linear: np.ndarray) -> np.ndarray:
@@ -46,19 +54,26 @@ def test_one_stop_doubles_linear_light() -> None:
     np.testing.assert_allclose(develop(linear, {"exposure": 1.0}) / 255, encode(np.full((2, 2, 3), 0.2)), atol=0.003)
 
 
-def test_hue_rotates_colours_and_keeps_grey() -> None:
-    matrix = colour_matrix({"hue": 120.0})
-    np.testing.assert_allclose(matrix @ [1, 0, 0], [0, 1, 0], atol=1e-12)
+def test_hue_rotates_chroma_and_keeps_grey_and_luminance() -> None:
+    """A rotation by 120 degrees permutes the chroma, the difference from the mean of the channels."""
+    matrix, colour = colour_matrix({"hue": 120.0}), np.array([0.7, 0.2, 0.1])
+    turned = matrix @ colour
+    np.testing.assert_allclose(turned - turned.mean(), np.roll(colour - colour.mean(), 1), atol=1e-12)
     np.testing.assert_allclose(matrix @ [1, 1, 1], [1, 1, 1], atol=1e-12)
+    for angle in (-170.0, -6.0, 45.0, 120.0):
+        assert LUMINANCE @ (colour_matrix({"hue": angle}) @ colour) == pytest.approx(LUMINANCE @ colour, rel=1e-6)
+        back = colour_matrix({"hue": -angle}) @ colour_matrix({"hue": angle})
+        np.testing.assert_allclose(back, np.eye(3), atol=1e-12)
 
 
 @pytest.mark.parametrize("angle", [0.0, 50.0, 120.0])
 def test_chroma_is_stretched_along_a_hue_and_its_opposite(angle: float) -> None:
     """Hues are angles about the grey axis; 120 degrees from red is green."""
     turned, across = colour_matrix({"hue": angle}) @ [1, 0, 0], colour_matrix({"hue": angle + 90}) @ [1, 0, 0]
-    matrix, grey = colour_matrix({"chroma_stretch": 1.5, "chroma_angle": angle}), np.full(3, 1 / 3)
-    np.testing.assert_allclose(matrix @ (turned - grey), 1.5 * (turned - grey), atol=1e-12)
-    np.testing.assert_allclose(matrix @ (across - grey), (across - grey) / 1.5, atol=1e-12)
+    along, beside = turned - turned.mean(), across - across.mean()
+    matrix = colour_matrix({"chroma_stretch": 1.5, "chroma_angle": angle})
+    np.testing.assert_allclose(matrix @ along, 1.5 * along, atol=1e-12)
+    np.testing.assert_allclose(matrix @ beside, beside / 1.5, atol=1e-12)
     np.testing.assert_allclose(matrix @ [1, 1, 1], [1, 1, 1], atol=1e-12)
 
 
@@ -261,12 +276,41 @@ def test_jpeg_of_low_quality_loses_detail_and_keeps_the_channels() -> None:
     assert np.abs(fine - plain).mean() < 3 < 0.4 * np.abs(coarse - plain).mean()
 
 
-def test_black_bodies_are_warm_below_daylight_and_of_luminance_one() -> None:
-    warm, cool = np.array(black_body_colour(2700.0)), np.array(black_body_colour(9000.0))
+@pytest.mark.parametrize("kelvin", [2000.0, 2700.0, 3999.0, 4001.0, 4500.0, 6504.0, 12000.0])
+def test_a_lamp_is_neutral_under_white_balance_for_its_temperature(kelvin: float) -> None:
+    lamp = np.array(temperature_colour(kelvin))
+    for balanced in (white_balance_matrix(kelvin) @ lamp, neutral_matrix(3 * lamp) @ lamp):
+        assert np.ptp(balanced) < 0.005 * balanced.mean()
+    picture = np.full((4, 4, 3), 0.2 * lamp, np.float32)
+    for composite in (Composite(exposure="fixed", white_balance=kelvin), Composite(white_balance="auto")):
+        image = develop(picture, {}, composite, light=lamp.tolist()).astype(int)
+        assert np.ptp(image, axis=-1).max() <= 1
+
+
+@pytest.mark.parametrize("kelvin", [1700.0, 2700.0, 4000.0])
+def test_warm_lamps_have_the_colour_of_a_black_body(kelvin: float) -> None:
+    """Chromaticity of Planck's spectrum with the CIE 1931 observer; the fit of Kang et al. is within 0.0015."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        import colour
+
+        expected = colour.XYZ_to_xy(colour.sd_to_XYZ(colour.sd_blackbody(kelvin)))
+    seen = np.linalg.inv(white_balance_matrix(kelvin)) @ [1, 1, 1]
+    xyz = colour.RGB_COLOURSPACES["sRGB"].matrix_RGB_to_XYZ @ seen
+    np.testing.assert_allclose(xyz[:2] / xyz.sum(), expected, atol=1.5e-3)
+
+
+def test_the_locus_of_colour_temperatures_is_continuous() -> None:
+    for kelvin in (4000.0, 5000.0):
+        np.testing.assert_allclose(temperature_colour(kelvin - 0.1), temperature_colour(kelvin + 0.1), atol=1e-3)
+
+
+def test_temperature_colours_are_warm_below_daylight_and_of_luminance_one() -> None:
+    warm, cool = np.array(temperature_colour(2700.0)), np.array(temperature_colour(9000.0))
     for colour in (warm, cool):
         assert colour @ [0.2126, 0.7152, 0.0722] == pytest.approx(1, rel=1e-6)
     assert warm[0] > warm[1] > warm[2] and cool[2] > cool[1] > cool[0]
-    np.testing.assert_allclose(black_body_colour(6504.0), 1, atol=0.06)
+    np.testing.assert_allclose(temperature_colour(6504.0), 1, atol=0.06)
 
 
 def test_the_published_matrix_adapts_white() -> None:
@@ -320,6 +364,20 @@ def test_metered_pictures_are_grey_on_average_in_any_light(light: float, tone: A
     metered = Composite(tone=tone, exposure="auto")
     assert develop(grey, {}, metered).mean() == pytest.approx(GREY, abs=1)
     assert develop(grey, {"exposure": -1.0}, metered).mean() < GREY - 20
+
+
+def test_the_exposure_of_a_camera_saturates_at_the_luminance_of_iso_12232() -> None:
+    """Value 1 needs H = 78 / S [lx s], and H = 0.65 L t / N^2 with L = 179 lm/W times radiance E / pi."""
+    aperture, shutter, iso, irradiance = 4.0, 0.01, 200.0, 50.0
+    exposure = CameraExposure(aperture=aperture, shutter=shutter, iso=iso)
+    luminance = 179.0 * irradiance / np.pi
+    stops = np.log2(0.65 * luminance * shutter / aperture**2 / (78.0 / iso))
+    assert camera_exposure(exposure, (irradiance,) * 3) == pytest.approx(stops, abs=1e-6)
+    ev = np.log2(aperture**2 / shutter * 100 / iso)
+    assert camera_exposure(CameraExposure(ev=ev)) == pytest.approx(camera_exposure(exposure))
+    picture = np.full((2, 2, 3), 0.2, np.float32)
+    shown = develop(picture, {"exposure": 0.5}, Composite(exposure=exposure), white=(irradiance,) * 3)
+    np.testing.assert_allclose(shown / 255, encode(np.full((2, 2, 3), 0.2 * 2 ** (stops + 0.5))), atol=0.003)
 
 
 def test_metering_counts_a_lamp_as_white_at_most() -> None:

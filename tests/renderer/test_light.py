@@ -115,8 +115,12 @@ def test_an_object_before_a_point_light_leaves_no_light() -> None:
 
 
 @pytest.mark.parametrize("unit", [0.001, 1.0, 100.0])
-def test_uniform_capture_keeps_its_colour_on_an_open_horizontal_surface(unit: float) -> None:
-    """Tested at three scales: no shadow acne, no missing light."""
+def test_uniform_capture_keeps_its_colour_under_the_irradiance_of_white(unit: float) -> None:
+    """Tested at three scales: no shadow acne, no missing light.
+
+    The sky gives pi. A square of half side a at height 5 a gives 12 times the configuration factor pi F of a quarter
+    seen from below its corner, with pi F = s atan(s) and s = 1 / sqrt(1 + 5^2).
+    """
     make_integrator()
     lamp = {
         "type": "rectangle",
@@ -129,7 +133,8 @@ def test_uniform_capture_keeps_its_colour_on_an_open_horizontal_surface(unit: fl
         "sky": WHITE_SKY,
         "lamp": lamp,
     }
-    light = render(shapes, camera, samples=256).light
+    s = 1 / np.sqrt(1 + 5**2)
+    light = render(shapes, camera, samples=256, white=np.pi + 12 * s * np.arctan(s)).light
     np.testing.assert_allclose(light, 1.0, atol=0.03)
     assert light.mean() == pytest.approx(1.0, abs=5e-3)
 

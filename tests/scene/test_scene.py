@@ -208,6 +208,22 @@ def changed(data: SceneData, **changes: Any) -> SceneData:
         ({"lights": [{"kind": "environment", "image": "sky.exr"}]}, "sky.exr: no such file"),
         ({"randomise": {"vignetting": [-1, 0]}}, "randomise.vignetting[0]: must be >= 0 (got -1)"),
         ({"randomise": {"jpeg": [0, 90]}}, "randomise.jpeg[0]: must be >= 1 (got 0)"),
+        ({"composite": {"exposure": "dark"}}, "composite.exposure: must be auto, fixed, or a mapping with ev, or with"),
+        ({"composite": {"exposure": 9}}, "composite.exposure: must be auto, fixed, or a mapping with ev, or with"),
+        ({"composite": {"exposure": {"ev": "9"}}}, "composite.exposure.ev: must be a number"),
+        ({"composite": {"exposure": {"f": 4}}}, "composite.exposure.f: "),
+        ({"composite": {"exposure": {"aperture": 4}}}, "composite.exposure.shutter: is required if ev is absent"),
+        ({"composite": {"exposure": {"ev": 9, "iso": 100}}}, "composite.exposure.iso: must not be given together with"),
+        (
+            {"composite": {"exposure": {"aperture": 0, "shutter": 1}}},
+            "composite.exposure.aperture: must be > 0 (got 0)",
+        ),
+        ({"composite": {"white_balance": 900}}, "composite.white_balance: must be >= 1667 (got 900)"),
+        ({"composite": {"white_balance": "warm"}}, "composite.white_balance: must be "),
+        (
+            {"composite": {"white_balance": 3000}, "randomise": {"white_balance": [2900, 3100]}},
+            "composite.white_balance: must not be given together with randomise.white_balance (got 3000 and [2900.0,",
+        ),
         ({"randomise": {"exposure": [1, 0]}}, "randomise.exposure: must be [low, high] with low <= high"),
         (
             {"output__formats": ["yolo", "zip"]},

@@ -18,7 +18,6 @@ from mitsplat.renderer.composition.scene_contents import ContentsReader, SceneCo
 from mitsplat.renderer.instances.antialiasing import Edges
 from mitsplat.renderer.instances.primary_visibility import PrimaryVisibility
 from mitsplat.renderer.instances.silhouettes import proxy_silhouettes, splat_silhouettes
-from mitsplat.renderer.light.emitter_sampling import reference_irradiance
 from mitsplat.renderer.light.light import Accuracy, light_factor
 from mitsplat.renderer.light.lit_surface import VisiblePixels, VisibleSurfaces
 from mitsplat.renderer.meshes.mesh_radiance import PathTracer
@@ -51,7 +50,7 @@ class LayerRenderer:
     hide_emitters: bool
     mesh_samples: int
     max_depth: int
-    white: float
+    white: tuple[float, float, float]
     sky_reach: float
     reference: tuple[float, ...]
     _contents: ContentsReader = field(default_factory=ContentsReader, init=False, repr=False)
@@ -98,7 +97,7 @@ class LayerRenderer:
         proxy_depth = dr.select(hit.distance < dr.inf, hit.distance * view.cosine(rays), 0)
         dr.eval(splat, proxy_depth, hit, static)
 
-        white = self._white(scene) if scene.emitters() else mi.Color3f(dr.opaque(mi.Float, float(np.pi)))
+        white = self._white()
         shown = PrimaryVisibility.of(splat, behind, emitters, z_max, dr.pi / white)
         radiance = self._radiance(contents, scene, view, rays, behind, shown, white, paths, seed)
         light, highlight = mi.Color3f(1), mi.Color3f(0)
@@ -254,11 +253,9 @@ class LayerRenderer:
                 proxies.setdefault(shape.instance, []).append((shape.proxy, shape.world_from_splats))
         return proxy_silhouettes(proxies, view)
 
-    def _white(self, scene: mi.Scene) -> mi.Color3f:
-        """Return the irradiance (Color3f) at which uniformly captured objects keep their colours."""
-        return (
-            mi.Color3f(dr.opaque(mi.Float, self.white)) if self.white else reference_irradiance(scene, self.reference)
-        )
+    def _white(self) -> mi.Color3f:
+        """Return the irradiance (Color3f) at which a white surface has the picture value 1."""
+        return mi.Color3f(*[dr.opaque(mi.Float, value) for value in self.white])
 
     def _shape_votes(self, contents: SceneContents, view: CameraView, z_max: mi.Float | None) -> mi.UInt32 | None:
         """Return the shape of an instance that each pixel shows, or None if all its shapes are lit alike.

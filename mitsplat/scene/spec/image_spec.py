@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Literal
 
-from pydantic import AfterValidator, Field, NonNegativeFloat
+from pydantic import AfterValidator, BeforeValidator, Field, NonNegativeFloat, model_validator
 
 from mitsplat.quality import KernelName, ResponseName
 from mitsplat.storage.field_types import (
@@ -15,11 +16,17 @@ from mitsplat.storage.field_types import (
     Positive,
     PositiveRange,
     Range,
+    Stops,
     StopsRange,
     StrictModel,
     Unit,
     check_order,
+    optional_field,
 )
+from mitsplat.storage.yaml_input import FieldError
+
+DAYLIGHT = 6504.0
+"""Colour temperature of sRGB's white [K]."""
 
 
 class Randomise(StrictModel):
@@ -45,10 +52,15 @@ class Randomise(StrictModel):
         "towards cyan and orange towards red.",
     )
     white_balance: Annotated[tuple[Kelvin, Kelvin], AfterValidator(check_order)] = Field(
-        (6504.0, 6504.0), description="Correlated colour temperature that appears white [K]."
+        (DAYLIGHT, DAYLIGHT),
+        description="Colour temperature that appears white [K]. With ``composite.white_balance: auto`` it is the error "
+        "of the automatic white balance: light that would be neutral has the colour that light of 6504 K has under "
+        "this white balance.",
     )
     iso: PositiveRange | None = Field(
-        None, description="ISO sensitivity of the sensor, which determines its noise. No noise if absent."
+        None,
+        description="ISO sensitivity of the sensor, which determines its noise but not its exposure. No noise if "
+        "absent.",
     )
     vignetting: NonNegativeRange = Field((0.0, 0.0), description="Loss of light in the corners of the image [stops].")
     chromatic_aberration: Range = Field(
@@ -132,6 +144,42 @@ class ImageShadow(StrictModel):
     highlight_gain: NonNegativeFloat = Field(0.06, description="Maximum linear value that the highlight adds.")
 
 
+def _check_exposure(exposure: object) -> object:
+    """Refuse other words and numbers; otherwise pydantic would report one member of the union."""
+    if isinstance(exposure, dict | CameraExposure) or exposure in ("auto", "fixed"):
+        return exposure
+    raise ValueError(f"must be auto, fixed, or a mapping with ev, or with aperture and shutter (got {exposure!r})")
+
+
+class CameraExposure(StrictModel):
+    """Exposure of a camera: ``ev``, or ``aperture``, ``shutter`` and ``iso``.
+
+    A surface of luminance 1.2 * 2^EV [cd/m^2] has the picture value 1. This is the saturation-based speed of ISO 12232
+    with a lens that transmits 65 % of the light. Radiance 1 W/(m^2 sr) has the luminance 179 cd/m^2.
+    """
+
+    ev: Stops | None = optional_field("Exposure value at ISO 100: log2(f-number^2 / shutter * 100 / ISO).")
+    aperture: Positive | None = optional_field("f-number. It does not change the depth of field.")
+    shutter: Positive | None = optional_field("Exposure time [s]. It does not blur moving objects.")
+    iso: Positive = Field(100.0, description="ISO sensitivity. It adds no noise.")
+
+    @model_validator(mode="after")
+    def _check(self) -> CameraExposure:
+        stated = self.model_fields_set & {"aperture", "shutter", "iso"}
+        if self.ev is not None and stated:
+            raise FieldError(min(stated), "must not be given together with ev")
+        if self.ev is None and (self.aperture is None or self.shutter is None):
+            raise FieldError("aperture" if self.aperture is None else "shutter", "is required if ev is absent")
+        return self
+
+    @property
+    def value(self) -> float:
+        """Exposure value at ISO 100."""
+        if self.aperture is None or self.shutter is None:
+            return self.ev or 0.0
+        return math.log2(self.aperture**2 / self.shutter * 100.0 / self.iso)
+
+
 class Composite(StrictModel):
     """Composition of the layers into an image."""
 
@@ -157,10 +205,19 @@ class Composite(StrictModel):
     bounce: bool = Field(
         True, description="Adds the light that the environment and visible shapes reflect onto objects."
     )
-    exposure: Literal["fixed", "auto"] = Field(
-        "fixed",
-        description="``fixed`` uses the given light intensities. ``auto`` models auto-exposure: every picture has "
-        "the same mean brightness. ``randomise.exposure`` is added in both cases.",
+    exposure: Annotated[
+        Literal["auto", "fixed"] | CameraExposure,
+        BeforeValidator(_check_exposure, json_schema_input_type=Literal["auto", "fixed"] | CameraExposure),
+    ] = Field(
+        "auto",
+        description="``auto`` meters the picture: its mean luminance is middle grey. ``fixed`` shows a white surface "
+        "of radiance 1 W/(m^2 sr) as white, or that of the stated ``white`` of a captured environment. A "
+        "mapping is the exposure of a camera. ``randomise.exposure`` is added in all cases.",
+    )
+    white_balance: Kelvin | Literal["auto"] = Field(
+        DAYLIGHT,
+        description="Colour temperature that appears white [K]. ``auto`` makes a white surface neutral at the bottom "
+        "centre of ``region``, facing up without occlusion.",
     )
     tone: Literal["neutral", "filmic"] = Field(
         "neutral",

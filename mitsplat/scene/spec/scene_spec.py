@@ -12,7 +12,7 @@ from pydantic import Field, model_validator
 from mitsplat.geometry.camera import MAX_IMAGE_SIDE
 from mitsplat.quality import PresetName
 from mitsplat.scene.spec.camera_spec import CameraSpec
-from mitsplat.scene.spec.image_spec import Composite, DepthSensor, Randomise, Rendering, StereoSensor
+from mitsplat.scene.spec.image_spec import DAYLIGHT, Composite, DepthSensor, Randomise, Rendering, StereoSensor
 from mitsplat.scene.spec.light_spec import EnvironmentLight, LightEntry, RoomLight
 from mitsplat.scene.spec.material_spec import Background
 from mitsplat.scene.spec.object_spec import MAIN_REGION, Arrangement, ObjectSpec, Settle
@@ -210,6 +210,10 @@ class SceneSpec(StrictModel):
         distorted = lens.lens == "fisheye" or any(lens.distortion)
         if isinstance(self.depth_sensor, StereoSensor) and distorted:
             raise FieldError("depth_sensor", "stereo needs a camera without lens distortion")
+        drawn, stated = self.randomise.white_balance, self.composite.white_balance
+        if stated not in ("auto", DAYLIGHT) and drawn != (DAYLIGHT, DAYLIGHT):
+            text = f"must not be given together with randomise.white_balance (got {stated:g} and {list(drawn)})"
+            raise FieldError(("composite", "white_balance"), text)
         if self.hold_out != HoldOut() and not self.output.test:
             raise FieldError("hold_out", "needs a test split: set output.test > 0")
         self._check_regions()

@@ -13,6 +13,7 @@ from scipy.spatial import QhullError
 
 from mitsplat.arrays import Float64Array
 from mitsplat.asset import Asset, opaque_core
+from mitsplat.checks.exposure_check import check_exposure
 from mitsplat.dataset.preflight import run_faults, scene_warnings
 from mitsplat.errors import InputError
 from mitsplat.findings import Finding
@@ -200,6 +201,8 @@ def check_scene(scene: Scene) -> Iterator[Finding]:
     yield Finding(
         "light", lit, f"{len(spec.lights)} lights", "add one to lights, or set capture_light: scene in assets"
     )
+    if lit and not faults:
+        yield check_exposure(scene)
 
 
 def _assets_by_folder(scene: Scene) -> Iterator[list[Asset]]:

@@ -85,6 +85,8 @@ def test_each_planted_fault_of_an_asset_is_found_with_its_remedy(name):
         ("support", lambda data: data.update(shapes=[], enclosure={"floor": -0.1})),
         ("visibility", lambda data: data["camera"].update(target=[0, 0, 5], height=0.1, radius=0.2)),
         ("light", lambda data: data.update(lights=[])),
+        ("exposure", lambda data: data.update(composite={"exposure": {"ev": 18}})),
+        ("exposure", lambda data: data.update(composite={"exposure": {"ev": -8}})),
     ],
 )
 def test_each_planted_fault_of_a_scene_is_found_with_its_remedy(scene_data, write_scene, name, change):

@@ -59,8 +59,8 @@ PLANE_FACTOR = 2
 quarter larger than with rays at each pixel. With this factor the error is the same.
 """
 
-FIRST_REFLECTIONS = 4
-"""Reflection rays per glossy pixel before the first error estimate."""
+FIRST_REFLECTIONS = 4, 16
+"""Reflection rays per pixel of a dielectric and of a metal before the error estimate."""
 
 LEVEL_BITS = 4
 """Bits of the number of doublings; 2^15 times the first rays exceeds every setting."""
@@ -392,35 +392,30 @@ class TracedPixels:
     def _trace_reflections(self, tracer: ReflectionTracer, glossy: mi.UInt32) -> Reflections:
         """Trace reflection rays at the pixels ``glossy`` and return their sums by pixel.
 
-        A pixel gets more rays if its first rays have not reached the wanted error.
+        A pixel gets more rays if its first rays have not reached the wanted error: a power of two, so that pixels with
+        equal numbers are traced together.
         """
-        accuracy, points = self.lighting.accuracy, self.points
+        error, most, points = self.lighting.accuracy.error, self.lighting.accuracy.most, self.points
         total = Reflections.empty(dr.width(points.owner))
-        first = min(FIRST_REFLECTIONS, accuracy.most) if accuracy.error > 0 else accuracy.most
 
-        def trace(rows: mi.UInt32, rays: int) -> None:
-            total.add(rows, tracer.trace(rows, dr.gather(mi.Float, total.rays, rows), rays))
+        def trace(which: mi.Bool, rays: int) -> None:
+            for rows, number in points.parts(dr.gather(mi.UInt32, glossy, dr.compress(which)), rays):
+                total.add(rows, tracer.trace(rows, dr.gather(mi.Float, total.rays, rows), number))
 
-        for rows, rays in points.parts(glossy, first):
-            trace(rows, rays)
-        if first >= accuracy.most:
+        if error == 0:
+            trace(glossy == glossy, most)
             return points.sums_by_pixel(total)
+        metal = dr.gather(mi.Float, self.here.metallic, glossy) > 0
+        for which, first in zip((~metal, metal), FIRST_REFLECTIONS, strict=True):
+            trace(which, min(first, most))
         sums = points.sums_by_pixel(total)
-        wanted = self.light_filter.reflections_for(
-            sums.brightness, sums.squares, sums.rays, points.is_bent, accuracy.error
-        )
-        wanted = dr.gather(mi.Float, wanted, glossy)
-        done = first
-        while done < accuracy.most:
-            more = dr.compress(wanted > done)
-            glossy, wanted = dr.gather(mi.UInt32, glossy, more), dr.gather(mi.Float, wanted, more)
-            dr.eval(glossy, wanted)
-            if not dr.width(glossy):
-                break
-            step = min(done, accuracy.most - done)
-            for rows, rays in points.parts(glossy, step):
-                trace(rows, rays)
-            done += step
+        wanted = self.light_filter.reflections_for(sums.brightness, sums.squares, sums.rays, points.is_bent, error)
+        missing = dr.gather(mi.Float, dr.minimum(wanted, most) - sums.rays, glossy)
+        dr.eval(missing)
+        rays, below = min(FIRST_REFLECTIONS), 0
+        while below < most:
+            trace((missing > below) & (missing <= rays), rays)
+            rays, below = 2 * rays, rays
         return points.sums_by_pixel(total)
 
 

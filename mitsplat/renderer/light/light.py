@@ -399,7 +399,10 @@ class TracedPixels:
         total = Reflections.empty(dr.width(points.owner))
 
         def trace(which: mi.Bool, rays: int) -> None:
-            for rows, number in points.parts(dr.gather(mi.UInt32, glossy, dr.compress(which)), rays):
+            places = dr.compress(which)
+            if not dr.width(places):
+                return
+            for rows, number in points.parts(dr.gather(mi.UInt32, glossy, places), rays):
                 total.add(rows, tracer.trace(rows, dr.gather(mi.Float, total.rays, rows), number))
 
         if error == 0:

@@ -1,0 +1,89 @@
+"""Reflections in mirrors, whose images are known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+import numpy.typing as npt
+import trimesh
+
+from mitsplat.gaussians.splat_cloud import Splats
+from mitsplat.gaussians.splat_materials import SplatMaterials
+from mitsplat.geometry.camera import Camera
+from mitsplat.renderer.layers import make_integrator, make_splats_shape, render_layers
+from tests.renderer.test_light import WHITE_SKY, floor, slab
+
+CAMERA = Camera.look_at((0, -0.6, 0.5), (0, 0, 0), width=120, height=90, fov_x=50)
+LAMP_CENTRE, LAMP_HALF = np.array([0.05, 0.35, 0.4]), 0.08
+
+
+def mirror(roughness: float) -> mi.Shape:
+    """Return a metal floor of base colour 1 as instance 1."""
+    materials = SplatMaterials.uniform(len(floor()), metallic=1.0, roughness=roughness)
+    return make_splats_shape(replace(floor(), materials=materials), proxy=slab(), instance=1)
+
+
+def lamp(radiance: list[float]) -> dict[str, Any]:
+    """Return a horizontal square lamp that shines downwards."""
+    pose = mi.ScalarTransform4f().translate(LAMP_CENTRE.tolist()).rotate([1, 0, 0], 180).scale(LAMP_HALF)
+    return {
+        "type": "rectangle",
+        "to_world": pose,
+        "emitter": {"type": "area", "radiance": {"type": "rgb", "value": radiance}},
+    }
+
+
+def mirrored_lamp() -> npt.NDArray[np.bool_]:
+    """Return the pixels (H, W) whose centres show the image of the lamp in the plane z = 0."""
+    y, x = np.mgrid[: CAMERA.height, : CAMERA.width] + 0.5
+    slopes = CAMERA.ray_slopes(np.stack([x.ravel(), y.ravel()], axis=1))
+    rays = np.column_stack([slopes, np.ones(len(slopes))]) @ CAMERA.world_from_camera[:3, :3].T
+    image = LAMP_CENTRE * (1, 1, -1)
+    at = CAMERA.centre + rays * ((image[2] - CAMERA.centre[2]) / rays[:, 2])[:, None]
+    inside = (np.abs(at - image)[:, :2] < LAMP_HALF).all(axis=1) & (rays[:, 2] < 0)
+    return np.asarray(inside.reshape(CAMERA.height, CAMERA.width))
+
+
+def test_mirror_shows_the_lamp_at_the_place_and_with_the_size_of_its_image() -> None:
+    make_integrator()
+    scene = mi.load_dict({"type": "scene", "floor": mirror(0.02), "lamp": lamp([2.0, 1.0, 0.5])})
+    light = render_layers(make_integrator(white=np.pi, hide_emitters=True), scene, CAMERA).light
+    expected = mirrored_lamp()
+    assert expected.sum() > 150
+    seen = light[..., 0] > 1.0
+    assert (seen & expected).sum() / (seen | expected).sum() > 0.9
+    np.testing.assert_allclose(light[expected].mean(axis=0), [2.0, 1.0, 0.5], rtol=0.03)
+
+
+def test_mirror_shows_an_object_at_its_image() -> None:
+    """A grey box on the mirror, upside down: the mirror image lies below the box, where the sky is white elsewhere."""
+    make_integrator()
+    box = trimesh.creation.box(bounds=[[-0.05, 0.1, 0.02], [0.05, 0.2, 0.12]])
+    points = trimesh.sample.sample_surface(box, 3000, seed=1)[0]
+    grey = Splats(
+        points,
+        np.tile([0, 0, 0, 1.0], (len(points), 1)),
+        np.full((len(points), 3), 2e-3),
+        np.full(len(points), 0.99),
+        np.zeros((len(points), 1, 3)),
+    )
+    thing = make_splats_shape(grey, proxy=box, instance=2)
+    scene = mi.load_dict({"type": "scene", "floor": mirror(0.02), "thing": thing, "sky": WHITE_SKY})
+    light = render_layers(make_integrator(white=np.pi, hide_emitters=True), scene, CAMERA)
+    image = box.copy()
+    image.vertices[:, 2] *= -1
+    y, x = np.mgrid[: CAMERA.height, : CAMERA.width] + 0.5
+    slopes = CAMERA.ray_slopes(np.stack([x.ravel(), y.ravel()], axis=1))
+    rays = np.column_stack([slopes, np.ones(len(slopes))]) @ CAMERA.world_from_camera[:3, :3].T
+    low, high = image.bounds
+    with np.errstate(divide="ignore"):
+        first, second = (low - CAMERA.centre) / rays, (high - CAMERA.centre) / rays
+    met = np.minimum(first, second).max(axis=1) < np.maximum(first, second).min(axis=1)
+    floor_seen = light.instance == 1
+    expected = met.reshape(CAMERA.height, CAMERA.width) & floor_seen
+    seen = (light.light[..., 0] < 0.75) & floor_seen
+    assert expected.sum() > 100
+    assert (seen & expected).sum() / (seen | expected).sum() > 0.85

@@ -47,7 +47,7 @@ def shape_of(geom):
     return mesh.apply_transform(pose)
 
 
-few = BakeSettings(gaussians=1500, sh_degree=0, directions=8, samples=4, fit_steps=0, verify_views=0)
+few = BakeSettings(gaussians=1500, verify_views=0)
 for name in links:
     geoms = [
         shape_of(model.geom(n)) for n in range(model.ngeom) if model.body(model.geom(n).bodyid.item()).name == name

@@ -81,7 +81,6 @@ def measure(arguments: argparse.Namespace) -> None:
             result = bake_asset(
                 mesh,
                 name=Path(name).stem,
-                light="studio" if name in PARTS else "uniform",
                 settings=BakeSettings(gaussians=arguments.gaussians),
                 pieces=pieces if arguments.ready_pieces else (),
                 progress=note,

@@ -33,10 +33,8 @@ from mitsplat.bake.mesh_parts import read_parts
 from mitsplat.runtime.cores import usable_cores
 from mitsplat.runtime.device import use_device
 
-PACKAGE = BakeSettings(
-    gaussians=30000, sh_degree=1, directions=8, samples=8, fit_views=12, fit_steps=50, verify_views=2
-)
-"""Bake settings of packages, which are many and diffuse: a third of the time of a scan, 2 dB less."""
+PACKAGE = BakeSettings(gaussians=30000, verify_views=2)
+"""Bake settings of packages, which are many."""
 
 UP: dict[str, Literal["y", "z"]] = {"bbq_sauce": "z"}
 """Up axes of scans other than y: this one lies on its label."""

@@ -49,7 +49,7 @@ from scipy.ndimage import binary_dilation, gaussian_filter, map_coordinates, max
 # isort: on
 from benchmarks.record import figure, recording
 from mitsplat.bake.bake import BakeSettings, bake_asset
-from mitsplat.bake.mesh_parts import MeshPart, bake_lights, mitsuba_scene, read_parts
+from mitsplat.bake.mesh_parts import UNIFORM_LIGHT, MeshPart, bake_lights, mitsuba_scene, read_parts
 from mitsplat.frames.camera_response import light_image
 from mitsplat.geometry.camera import Camera
 from mitsplat.images.colour import LUMINANCE, decode_srgb, encode_srgb
@@ -172,7 +172,7 @@ def simple(name: str, mesh: trimesh.Trimesh, where: Float64Array) -> Thing:
     scene = trimesh.Scene({name: mesh})
 
     def bake(folder: Path) -> Asset:
-        return baked(scene, folder / name, "uniform", 5000, kind="object")
+        return baked(scene, folder / name, None, 5000, kind="object")
 
     return Thing(name, scene, where, bake)
 
@@ -270,7 +270,7 @@ def view(eye: Sequence[float], target: Sequence[float] = (0, 0, 0.01), *, fov_x:
 def baked(
     scene: trimesh.Scene,
     folder: Path,
-    light: str | Sequence[LightSpec],
+    lights: Sequence[LightSpec] | None,
     gaussians: int,
     *,
     kind: Any,
@@ -278,12 +278,10 @@ def baked(
 ) -> Asset:
     """Return the asset in ``folder``, baked if absent."""
     if not (folder / "asset.yaml").exists():
-        settings = BakeSettings(
-            gaussians=gaussians, sh_degree=1, directions=16, fit_steps=0, verify_views=0, density=density
-        )
+        settings = BakeSettings(gaussians=gaussians, fit_steps=0, verify_views=0, density=density)
         mesh = trimesh.util.concatenate([part.mesh for part in read_parts(scene)])
         pieces = [trimesh.Trimesh(mesh.vertices, mesh.faces).convex_hull]  # for physics, unused here
-        result = bake_asset(scene, name=folder.name, kind=kind, light=light, settings=settings, pieces=pieces)
+        result = bake_asset(scene, name=folder.name, kind=kind, lights=lights, settings=settings, pieces=pieces)
         result.asset.save(folder)
     return Asset.load(folder)
 
@@ -368,7 +366,7 @@ def take_truth(setup: Setup, name: str, light: str, out: Path, samples: int) -> 
     empty, _ = shots.take(f"{light}_empty", room, lights)
     alone, cover, seen = np.zeros_like(photo), np.zeros(photo.shape[:2]), nearest_object(setup.camera, room, things)
     for number, (thing, parts) in enumerate(zip(setup.things, things, strict=True), 1):
-        captured, own = few.take(f"alone_{thing.name}", parts, bake_lights("uniform"))
+        captured, own = few.take(f"alone_{thing.name}", parts, UNIFORM_LIGHT)
         alone = np.where((seen == number)[..., None], captured / np.maximum(own, 1e-6)[..., None], alone)
         cover = np.maximum(own, cover)
     direct, _ = few.take(f"{light}_direct", everything, lights, bounces=1, clay=True)

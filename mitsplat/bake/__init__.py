@@ -1,8 +1,7 @@
 """Baking of CAD meshes and scans into assets.
 
-In: a mesh with its materials. Out: an :class:`~mitsplat.asset.Asset` of flat Gaussians on the surface of the mesh,
-whose colours come from the path tracer, with a proxy mesh and convex pieces, and a report that compares mesh and
-splats.
+In: a mesh with its materials. Out: an :class:`~mitsplat.asset.Asset` of flat Gaussians on the surface of the mesh with
+these materials, a proxy mesh and convex pieces, and a report that compares mesh and splats.
 """
 
 from __future__ import annotations

@@ -55,7 +55,7 @@ def _figures(result: BakeResult) -> str:
 
 def _views(result: BakeResult) -> str:
     note = (
-        "Views that were not used for the fit: the path-traced mesh and its splats. "
+        "Views that were not used for the fit: the mesh and its splats, in base colours if they have materials. "
         f"White in the difference is an error of {_WHITE_DIFFERENCE:g} of the range."
     )
     figures = "".join(_view(number + 1, view) for number, view in enumerate(result.views))

@@ -15,7 +15,7 @@ import trimesh
 from trimesh.visual import ColorVisuals
 from trimesh.visual.color import to_rgba
 
-from mitsplat.arrays import Float32Array, Float64Array
+from mitsplat.arrays import Float64Array, Int64Array
 from mitsplat.bake.surface_materials import (
     DIELECTRIC_SPECULAR,
     LEAST_ROUGHNESS,
@@ -33,7 +33,7 @@ from mitsplat.geometry.mesh_normals import corner_normals
 from mitsplat.geometry.untrusted_meshes import check_mesh
 from mitsplat.images.colour import decode_srgb, encode_srgb
 from mitsplat.renderer.rays.device_arrays import ray_scene
-from mitsplat.renderer.scene_emitters import emitter_dict, y_up_to_z_up
+from mitsplat.renderer.scene_emitters import emitter_dict
 from mitsplat.runtime.variant import ensure_variant
 from mitsplat.scene.spec.light_spec import LightSpec
 from mitsplat.storage.file_kinds import refuse_other_kinds
@@ -43,6 +43,10 @@ _SUFFIXES = (".stl", ".obj", ".glb", ".gltf", ".off", ".3mf", ".dae", ".ply")
 _READER_PACKAGES = {".3mf": ("lxml", "lxml"), ".dae": ("collada", "pycollada")}
 """Modules that trimesh needs for some file types, and the packages that contain them."""
 _WHITE = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 1.0}}
+UNIFORM_LIGHT: dict[str, Any] = {"light": {"type": "constant", "radiance": {"type": "rgb", "value": 1.0}}}
+"""Emitter of radiance 1 from all directions."""
+_LINEAR = decode_srgb(np.arange(256) / 255.0)
+"""Linear values of 8-bit display-encoded values."""
 _DETAIL_SAMPLES = 12
 _DETAIL_CONTRAST = 0.12
 """Standard deviation of the encoded colour inside a face at which the density of Gaussians is largest."""
@@ -58,11 +62,13 @@ class MeshPart:
         colours: Linear base colour of every face corner, shape (F, 3, 3), or None if there is a ``texture``.
         texture: Display-encoded base colour, shape (H, W, 3) uint8, or None.
         uv: Texture coordinates of every face corner, v up, shape (F, 3, 2), or None.
-        metallic: Metalness, 0 for dielectrics to 1 for metals.
-        roughness: Roughness of the glTF material model, in (0, 1].
+        metallic: Metalness, 0 for dielectrics to 1 for metals; the mean if there is a texture of it.
+        roughness: Roughness of the glTF material model, in (0, 1]; the mean if there is a texture of it.
         shiny: True if the material reflects a highlight.
         reflectance: Reflectance at normal incidence of the non-metallic part of the material.
         warnings: Ignored properties of the file's material, a sentence each.
+        metallic_roughness: Texture of metalness and roughness times 255, shape (H, W, 2), or None.
+        normal_map: Tangent-space normals of glTF, shape (H, W, 3) uint8, or None.
     """
 
     name: str
@@ -75,36 +81,73 @@ class MeshPart:
     shiny: bool
     reflectance: float = DIELECTRIC_SPECULAR
     warnings: tuple[str, ...] = ()
-
-    @property
-    def gloss(self) -> float:
-        """Reflectance at normal incidence of the colourless coat on top of the base colour."""
-        return self.reflectance * (1.0 - self.metallic) if self.shiny else 0.0
+    metallic_roughness: npt.NDArray[np.uint8] | None = None
+    normal_map: npt.NDArray[np.uint8] | None = None
 
     @property
     def specular(self) -> float:
         """Reflectance at normal incidence, averaged to grey."""
         if not self.shiny:
             return 0.0
-        base = float(self._face_colours(np.full((1, 3), 1.0 / 3.0)).mean())
-        return self.gloss + base * self.metallic
+        faces = np.arange(len(self.mesh.faces))
+        base = float(self.colours_at(faces, np.full((len(faces), 3), 1.0 / 3.0)).mean())
+        return self.reflectance * (1.0 - self.metallic) + base * self.metallic
 
-    def _face_colours(self, barycentric: Float64Array) -> Float64Array:
-        """Return linear colours (F, S, 3) at ``barycentric`` (S, 3) of every face, from the nearest texel."""
+    def colours_at(self, faces: Int64Array, barycentric: Float64Array) -> Float64Array:
+        """Return linear base colours (N, 3) at barycentric coordinates (N, 3) of faces (N,)."""
         if self.colours is not None:
-            return np.asarray(np.einsum("sk,fkc->fsc", barycentric, self.colours))
-        if self.uv is None or self.texture is None:
+            return np.asarray(np.einsum("nk,nkc->nc", barycentric, self.colours[faces]))
+        if self.texture is None:
             raise InputError(f"part {self.name} has neither colours nor a texture")
-        height, width = self.texture.shape[:2]
-        uv = np.einsum("sk,fkc->fsc", barycentric, self.uv) % 1.0
-        column = np.minimum((uv[..., 0] * width).astype(int), width - 1)
-        row = np.minimum(((1.0 - uv[..., 1]) * height).astype(int), height - 1)
-        return decode_srgb(self.texture[row, column] / 255.0)
+        return np.asarray(_LINEAR[self._texels(self.texture, faces, barycentric)])
+
+    def materials_at(self, faces: Int64Array, barycentric: Float64Array) -> Float64Array:
+        """Return metallic, roughness and specular of ``principled``, shape (N, 3); 0, 1 and 0 for matt parts."""
+        if not self.shiny:
+            return np.tile([0.0, 1.0, 0.0], (len(faces), 1))
+        values = np.tile([self.metallic, self.roughness, self.reflectance / MOST_SPECULAR], (len(faces), 1))
+        if self.metallic_roughness is not None:
+            values[:, :2] = self._texels(self.metallic_roughness, faces, barycentric) / 255.0
+        return values
+
+    def normals_at(self, faces: Int64Array, barycentric: Float64Array) -> Float64Array:
+        """Return unit shading normals (N, 3): smooth normals of the mesh, changed by the normal map.
+
+        The tangents follow from the texture coordinates of each face (glTF 2.0, 3.7.2.1).
+        """
+        smooth = np.asarray(np.einsum("nk,nkd->nd", barycentric, corner_normals(self.mesh)[faces]))
+        smooth /= np.linalg.norm(smooth, axis=1, keepdims=True)
+        if self.normal_map is None or self.uv is None:
+            return smooth
+        corners, uv = self.mesh.triangles[faces], self.uv[faces]
+        edges, (du, dv) = corners[:, 1:] - corners[:, :1], np.moveaxis(uv[:, 1:] - uv[:, :1], 2, 0)
+        mirrored = np.sign(du[:, 0] * dv[:, 1] - du[:, 1] * dv[:, 0])[:, None]
+        tangent = mirrored * (dv[:, 1:] * edges[:, 0] - dv[:, :1] * edges[:, 1])
+        tangent -= np.einsum("nd,nd->n", tangent, smooth)[:, None] * smooth
+        length = np.linalg.norm(tangent, axis=1, keepdims=True)
+        x, y, z = (self._texels(self.normal_map, faces, barycentric) / 127.5 - 1.0).T[..., None]
+        tangent /= np.maximum(length, 1e-30)
+        normal = x * tangent + y * mirrored * np.cross(smooth, tangent) + np.maximum(z, 1e-3) * smooth
+        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+        return np.asarray(np.where(length > 0, normal, smooth))
+
+    def _texels(
+        self, texture: npt.NDArray[np.uint8], faces: Int64Array, barycentric: Float64Array
+    ) -> npt.NDArray[np.uint8]:
+        """Return the nearest texels, shape (N, channels)."""
+        if self.uv is None:
+            raise InputError(f"part {self.name} has a texture without coordinates")
+        height, width = texture.shape[:2]
+        uv = np.einsum("nk,nkc->nc", barycentric, self.uv[faces]) % 1.0
+        column = np.minimum((uv[:, 0] * width).astype(int), width - 1)
+        row = np.minimum(((1.0 - uv[:, 1]) * height).astype(int), height - 1)
+        return np.asarray(texture[row, column])
 
     def detail_density(self, gain: float, rng: np.random.Generator) -> Float64Array:
         """Return the relative density (F,) of Gaussians: 1 for uniform texture, ``1 + gain`` where it changes most."""
-        barycentric = rng.dirichlet(np.ones(3), _DETAIL_SAMPLES)
-        deviation = (self._face_colours(barycentric) ** (1 / 2.2)).std(axis=1).max(axis=1)
+        barycentric = np.tile(rng.dirichlet(np.ones(3), _DETAIL_SAMPLES), (len(self.mesh.faces), 1))
+        colours = self.colours_at(np.repeat(np.arange(len(self.mesh.faces)), _DETAIL_SAMPLES), barycentric)
+        deviation = (colours.reshape(-1, _DETAIL_SAMPLES, 3) ** (1 / 2.2)).std(axis=1).max(axis=1)
         return np.asarray(1.0 + gain * np.clip(deviation / _DETAIL_CONTRAST, 0.0, 1.0))
 
 
@@ -208,17 +251,23 @@ def _read_part(
     if finish.colour is not None:
         warnings, per_corner = [], None
     gloss = (material.metallic, material.roughness, material.shiny, material.specular)
-    if material.texture is not None and visual.uv is not None:
+    maps: tuple[npt.NDArray[np.uint8] | None, npt.NDArray[np.uint8] | None] = (None, None)
+    uv = None
+    if not isinstance(visual, ColorVisuals) and visual.uv is not None:
+        maps = (material.metallic_roughness, material.normal_map)
+        if any(texture is not None for texture in (material.texture, *maps)):
+            uv = np.asarray(visual.uv)[faces]
+    if material.texture is not None and uv is not None:
         if per_corner is not None and (per_corner[..., :3] < 255).any():
             warnings.append(f"part {name!r} has a texture and vertex colours: the vertex colours are ignored")
         texture = material.texture
         if not (material.factor == 1.0).all():
             texture = (255.0 * encode_srgb(decode_srgb(texture / 255.0) * material.factor)).round().astype(np.uint8)
-        return MeshPart(name, geometry, None, texture, np.asarray(visual.uv)[faces], *gloss, tuple(warnings))
+        return MeshPart(name, geometry, None, texture, uv, *gloss, tuple(warnings), *maps)
     colours = np.ones((*faces.shape, 3))
     if per_corner is not None:
         colours = per_corner[..., :3] / 255.0 if linear else decode_srgb(per_corner[..., :3] / 255.0)
-    return MeshPart(name, geometry, colours * material.factor, None, None, *gloss, tuple(warnings))
+    return MeshPart(name, geometry, colours * material.factor, None, uv, *gloss, tuple(warnings), *maps)
 
 
 def _apply_finish(material: Material, finish: SurfaceFinish) -> Material:
@@ -234,8 +283,15 @@ def _apply_finish(material: Material, finish: SurfaceFinish) -> Material:
     if not material.shiny:
         material = replace(material, roughness=ROUGHNESS, specular=DIELECTRIC_SPECULAR)
     material = replace(material, **given)
+    texture = material.metallic_roughness
+    if texture is not None:
+        texture = texture.copy()
+        for channel, name in enumerate(("metallic", "roughness")):
+            if name in given:
+                texture[..., channel] = round(255 * given[name])
     return replace(
         material,
+        metallic_roughness=texture,
         roughness=max(material.roughness, LEAST_ROUGHNESS),
         shiny=material.specular > 0 or material.metallic > 0,
     )
@@ -266,10 +322,18 @@ def _bsdf(part: MeshPart) -> dict[str, Any]:
     return {
         "type": "principled",
         "base_color": colour,
-        "metallic": part.metallic,
-        "roughness": part.roughness,
+        "metallic": _channel(part, 0, part.metallic),
+        "roughness": _channel(part, 1, part.roughness),
         "specular": part.reflectance / MOST_SPECULAR,
     }
+
+
+def _channel(part: MeshPart, number: int, uniform: float) -> Any:
+    """Return a channel of the texture of metalness and roughness, or the uniform value if there is none."""
+    if part.metallic_roughness is None:
+        return uniform
+    pixels = np.ascontiguousarray(part.metallic_roughness[..., number, None])
+    return {"type": "bitmap", "bitmap": mi.Bitmap(pixels), "raw": True}
 
 
 def _mitsuba_mesh(part: MeshPart, bsdf: dict[str, Any]) -> mi.Mesh:
@@ -291,38 +355,13 @@ def _mitsuba_mesh(part: MeshPart, bsdf: dict[str, Any]) -> mi.Mesh:
     return mesh
 
 
-def bake_lights(light: str | Sequence[LightSpec]) -> dict[str, Any]:
-    """Return Mitsuba emitters, by name, of a named light (``uniform``, ``studio``) or of a scene's lights.
+def bake_lights(lights: Sequence[LightSpec]) -> dict[str, Any]:
+    """Return the Mitsuba emitters of a scene's lights, by name.
 
     Raises:
-        InputError: If the name is unknown, or there is no light at all.
+        InputError: If there is no light at all.
     """
     ensure_variant()
-    if light == "uniform":
-        return {"light": {"type": "constant", "radiance": {"type": "rgb", "value": 1.0}}}
-    if light == "studio":
-        return {"light": {"type": "envmap", "bitmap": mi.Bitmap(_studio()), "to_world": y_up_to_z_up(0.0)}}
-    if isinstance(light, str):
-        raise InputError(f"light must be uniform, studio or a scene's lights (got {light!r})")
-    if not light:
+    if not lights:
         raise InputError("a scene whose lights are baked needs at least one light (got none)")
-    return {f"light_{k}": emitter_dict(spec) for k, spec in enumerate(light)}
-
-
-def _studio() -> Float32Array:
-    """Return a latitude-longitude map (H, W, 3) of mean radiance 1, with a soft box towards each corner of a cube."""
-    height, width = 64, 128
-    polar = (np.arange(height) + 0.5) / height * np.pi
-    azimuth = (np.arange(width) + 0.5) / width * 2.0 * np.pi
-    direction = np.stack(
-        [
-            np.sin(polar)[:, None] * np.cos(azimuth),
-            np.sin(polar)[:, None] * np.sin(azimuth),
-            np.broadcast_to(np.cos(polar)[:, None], (height, width)),
-        ],
-        axis=-1,
-    )
-    boxes = np.stack(np.meshgrid(*[(-1.0, 1.0)] * 3), axis=-1).reshape(-1, 3) / np.sqrt(3.0)
-    radiance = 0.35 + np.exp(7.0 * (direction @ boxes.T - 1.0)).sum(axis=-1)
-    radiance /= (radiance * np.sin(polar)[:, None]).sum() / (np.sin(polar).sum() * width)
-    return np.repeat(radiance[..., None], 3, axis=2).astype(np.float32)
+    return {f"light_{k}": emitter_dict(spec) for k, spec in enumerate(lights)}

@@ -81,16 +81,18 @@ class SurfaceFinish:
 
 @dataclass(frozen=True, eq=False)
 class Material:
-    """One material, uniform except for its texture.
+    """One material, uniform except for its textures.
 
     Attributes:
         factor: Linear colour, or factor of the texture, shape (3,).
         texture: Display-encoded base colour, shape (H, W, 3) uint8, or None.
-        metallic: Metalness, 0 to 1.
-        roughness: Roughness of glTF's material model, > 0.
+        metallic: Metalness, 0 to 1; the mean if there is a texture of it.
+        roughness: Roughness of glTF's material model, > 0; the mean if there is a texture of it.
         specular: Reflectance at normal incidence of the non-metallic part.
         shiny: True if the material reflects a highlight.
         warnings: Ignored properties of the file's material, a sentence each.
+        metallic_roughness: Texture of metalness and roughness times 255, shape (H, W, 2), or None.
+        normal_map: Tangent-space normals of glTF, shape (H, W, 3) uint8, or None.
     """
 
     factor: Float64Array
@@ -100,6 +102,8 @@ class Material:
     specular: float = DIELECTRIC_SPECULAR
     shiny: bool = True
     warnings: tuple[str, ...] = ()
+    metallic_roughness: npt.NDArray[np.uint8] | None = None
+    normal_map: npt.NDArray[np.uint8] | None = None
 
 
 def read_material(material: Any) -> Material:
@@ -121,18 +125,20 @@ def _read_gltf(source: PBRMaterial) -> Material:
         warnings.append("it emits light, which is not baked")
     metallic = 0.0 if source.metallicFactor is None else float(source.metallicFactor)
     roughness = ROUGHNESS if source.roughnessFactor is None else float(source.roughnessFactor)
-    if source.metallicRoughnessTexture is not None:
+    texture = _pixels(source.metallicRoughnessTexture)
+    if texture is not None:
         # If this texture exists, absent factors are 1; green is roughness, blue is metalness.
-        means = np.asarray(source.metallicRoughnessTexture.convert("RGB")).reshape(-1, 3).mean(axis=0) / 255.0
-        metallic = means[2] * (1.0 if source.metallicFactor is None else metallic)
-        roughness = means[1] * (1.0 if source.roughnessFactor is None else roughness)
-        warnings.append("metalness and roughness are baked as the means of their texture")
+        factors = (1.0 if given is None else float(given) for given in (source.metallicFactor, source.roughnessFactor))
+        values = np.clip(texture[..., [2, 1]] / 255.0 * (*factors,), (0.0, LEAST_ROUGHNESS), 1.0)
+        texture, (metallic, roughness) = np.rint(255 * values).astype(np.uint8), values.mean(axis=(0, 1))
     return Material(
         factor[:3],
         _pixels(source.baseColorTexture, warnings),
         float(np.clip(metallic, 0.0, 1.0)),
         float(np.clip(roughness, LEAST_ROUGHNESS, 1.0)),
         warnings=tuple(warnings),
+        metallic_roughness=texture,
+        normal_map=_pixels(source.normalTexture),
     )
 
 
@@ -193,11 +199,12 @@ def _numbers(keys: Mapping[str, Any], name: str) -> Float64Array | None:
     return found if len(found) and np.isfinite(found).all() else None
 
 
-def _pixels(image: Image.Image | None, warnings: list[str]) -> npt.NDArray[np.uint8] | None:
+def _pixels(image: Image.Image | None, warnings: list[str] | None = None) -> npt.NDArray[np.uint8] | None:
+    """Return the pixels (H, W, 3) of a texture; ``warnings`` gets a sentence about transparent texels."""
     if image is None:
         return None
     try:
-        if "A" in image.getbands() and np.asarray(image.getchannel("A")).min() < 250:
+        if warnings is not None and "A" in image.getbands() and np.asarray(image.getchannel("A")).min() < 250:
             warnings.append("its texture has transparent texels, which are baked as opaque")
         return np.array(eight_bit(image))
     except IMAGE_ERRORS as error:

@@ -1,12 +1,11 @@
-"""Verification of a bake: its splats compared with the path-traced mesh and with the textures of its file."""
+"""Verification of a bake: its splats compared with pictures of the mesh and with the textures of its file."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import mitsuba as mi
 import numpy as np
 import trimesh
 from scipy.spatial import KDTree
@@ -16,14 +15,16 @@ from trimesh.visual.color import uv_to_color
 
 from mitsplat.arrays import Float64Array
 from mitsplat.fit.image_metrics import psnr_of
-from mitsplat.gaussians.spherical_harmonics import evaluate_sh
+from mitsplat.gaussians.spherical_harmonics import SH_C0
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.camera import Camera
 from mitsplat.images.colour import decode_srgb, encode_srgb
 from mitsplat.progress import Progress
 from mitsplat.renderer.layers import render_splats
-from mitsplat.renderer.path_tracing import render_mesh
 
+PictureFunction = Callable[[Camera, int, int], tuple[Float64Array, Float64Array]]
+"""Function of a camera, the rays per pixel and a seed that returns a linear picture (H, W, 3) and coverage (H, W)."""
+_PICTURE_SAMPLES = 16
 _SAMPLES_PER_PART = 4000
 _MAX_SIGMAS = 3.0
 """Distance to the next Gaussian, in its standard deviations, beyond which a point of the mesh counts as hidden."""
@@ -34,7 +35,7 @@ class BakedView:
     """One view of the mesh and of its splats.
 
     Attributes:
-        mesh: Path-traced picture of the mesh, display-encoded, with black background, shape (H, W, 3).
+        mesh: Picture of the mesh, display-encoded, with black background, shape (H, W, 3).
         splats: Picture of the splats in the same encoding, shape (H, W, 3).
         cover: Fraction of each pixel that the mesh covers, shape (H, W).
         psnr: PSNR of the whole picture [dB].
@@ -47,15 +48,20 @@ class BakedView:
 
 
 def compare_views(
-    scene: mi.Scene,
+    picture: PictureFunction,
     splats: Splats,
     cameras: Sequence[Camera],
-    *,
-    bounces: int,
     seed: int,
     progress: Progress,
 ) -> tuple[tuple[BakedView, ...], float, float]:
     """Compare the mesh and the splats in several views.
+
+    Args:
+        picture: Function that renders the mesh.
+        splats: Splats of the mesh.
+        cameras: The views.
+        seed: Seed of the pictures.
+        progress: Progress callback.
 
     Returns:
         The views, the PSNR of whole images [dB], and the PSNR of the mesh's pixels alone [dB].
@@ -63,7 +69,7 @@ def compare_views(
     views, errors, on_object = [], [], []
     for number, camera in enumerate(cameras):
         progress(number, len(cameras), "comparing with the mesh")
-        truth, cover = render_mesh(scene, camera, samples=36, bounces=bounces, seed=seed + number)
+        truth, cover = picture(camera, _PICTURE_SAMPLES, seed + number)
         mesh, shown = (np.clip(encode_srgb(rgb), 0, 1) for rgb in (truth, render_splats(splats, camera).rgb))
         error = (shown - mesh) ** 2
         errors.append(error.mean())
@@ -76,19 +82,15 @@ def compare_with_textures(
     mesh: trimesh.Trimesh | trimesh.Scene | str | Path,
     splats: Splats,
     world_from_file: Float64Array,
-    gloss: Mapping[str, float],
 ) -> float | None:
     """Return the brightness of the splats relative to the textures of a mesh at points of its surface.
 
-    Trimesh reads the texture from the file's own image, independently of the colours used for baking. Under light of
-    radiance 1 from all directions, a convex surface has the brightness of its texture plus that of its gloss. For a
-    dark surface, the gloss is the larger part.
+    Trimesh reads the texture from the file's own image, independently of the colours used for baking.
 
     Args:
         mesh: Mesh or its file.
-        splats: Splats baked from the mesh under such light.
+        splats: Splats with the base colours of the mesh.
         world_from_file: Transform (4, 4) to metres, z up.
-        gloss: Reflectance on top of the texture by the name of a part; 0 for other parts.
 
     Returns:
         The ratio, or None without textures.
@@ -112,7 +114,7 @@ def compare_with_textures(
         pose = world_from_file @ transform
         points.append(trimesh.transform_points(at, pose))
         normals.append(geometry.face_normals[face] @ pose[:3, :3].T)
-        colours.append(decode_srgb(uv_to_color(uv, image)[:, :3] / 255.0) + gloss.get(str(name), 0.0))
+        colours.append(decode_srgb(uv_to_color(uv, image)[:, :3] / 255.0))
     if not points:
         return None
     place, normal, texture = (np.concatenate(values) for values in (points, normals, colours))
@@ -122,6 +124,6 @@ def compare_with_textures(
     seen = (distance < _MAX_SIGMAS * splats.scales[nearest].max(axis=1)) & (
         np.einsum("nd,nd->n", outward, normal) > 0.7
     )
-    baked = evaluate_sh(splats.sh[nearest], -outward)
+    baked = 0.5 + SH_C0 * splats.sh[nearest, 0]
     expected = texture[seen].mean() if seen.any() else 0.0
     return float(decode_srgb(baked)[seen].mean() / expected) if expected > 0 else None

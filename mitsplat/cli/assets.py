@@ -19,7 +19,6 @@ from mitsplat.cli.options import (
     Kind,
     Name,
     Seed,
-    ShDegree,
     select_device,
     stage_bar,
 )
@@ -40,11 +39,7 @@ def bake(
     name: Name = None,
     class_name: ClassName = None,
     kind: Kind = "object",
-    light: Annotated[
-        Literal["uniform", "studio"], typer.Option(help="Light whose radiance is baked into the Gaussians.")
-    ] = "uniform",
     gaussians: Annotated[int, typer.Option(help="Target number of Gaussians.")] = 20000,
-    sh_degree: ShDegree = 2,
     units: Annotated[float, typer.Option(help="Metres per unit of the mesh; 0.001 for millimetres.")] = 1.0,
     up: Annotated[Literal["y", "z"], typer.Option(help="Axis of the mesh that points up.")] = "z",
     density: Annotated[float, typer.Option(help="Mass density [kg/m^3].")] = 1000.0,
@@ -73,8 +68,8 @@ def bake(
 ) -> None:
     """Make an asset from MESH.
 
-    The asset has Gaussians with baked radiance, a proxy mesh and convex collision pieces. The page report.html compares
-    the mesh with the splats.
+    The asset has Gaussians with the materials of MESH, a proxy mesh and convex collision pieces. The page report.html
+    compares the mesh with the splats.
     """
     from mitsplat.bake.bake import BakeSettings, bake_asset
     from mitsplat.bake.bake_report import write_bake_report
@@ -85,7 +80,7 @@ def bake(
         raise InputError(f"--units must be finite and > 0 (got {units})")
     if not 0 <= seed < 2**32:
         raise InputError(f"--seed must be 0 to {2**32 - 1} (got {seed})")
-    settings = BakeSettings(gaussians=gaussians, sh_degree=sh_degree, seed=seed)
+    settings = BakeSettings(gaussians=gaussians, seed=seed)
     finish = SurfaceFinish(colour=colour, roughness=roughness, metallic=metallic, specular=specular)
     select_device(device)
     with stage_bar() as progress:
@@ -94,7 +89,6 @@ def bake(
             name=name or out.resolve().name,
             class_name=class_name,
             kind=kind,
-            light=light,
             settings=settings,
             metres_per_unit=units,
             up=up,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import lru_cache
 
 import drjit as dr
@@ -94,9 +95,30 @@ def render_mesh(
 ) -> tuple[Float64Array, Float64Array]:
     """Render path-traced radiance (H, W, 3) of a pinhole ``camera`` and coverage (H, W) in [0, 1].
 
-    The radiance is black for background. ``samples`` is rounded to a square, because the rays of a pixel form a regular
-    grid. Radiance is averaged before it is encoded, because the mean of encoded noise is too dark. Only the background
-    is blended with encoded values, as splats are.
+    The radiance is black for background, and ``samples`` is rounded to a square, see :func:`antialiased_picture`.
+    """
+
+    def trace(rays: mi.Ray3f, samples: int, launch: int) -> tuple[Float64Array, Float64Array]:
+        return _mean_radiance(scene, rays.o, rays.d, samples=samples, bounces=bounces, seed=seed + launch)
+
+    return antialiased_picture(camera, samples, trace)
+
+
+def antialiased_picture(
+    camera: Camera,
+    samples: int,
+    trace: Callable[[mi.Ray3f, int, int], tuple[Float64Array, Float64Array]],
+) -> tuple[Float64Array, Float64Array]:
+    """Return mean radiance (H, W, 3), black for background, and coverage (H, W) of a pinhole ``camera``.
+
+    Radiance is averaged before it is encoded, because the mean of encoded noise is too dark. Only the background is
+    blended with encoded values, as splats are.
+
+    Args:
+        camera: The camera.
+        samples: Rays per pixel, rounded to a square, because they form a regular grid.
+        trace: Function of rays, their number per pixel and the number of the call. It returns the mean radiance (N, 3)
+            and the share of hits (N,) of every pixel; the rays of one pixel are consecutive.
     """
     view, side = view_of(make_sensor(camera)), max(1, round(samples**0.5))
     samples, pixels = side * side, camera.width * camera.height
@@ -111,8 +133,6 @@ def render_mesh(
         x = mi.Float(pixel % width) + (mi.Float(within % across) + 0.5) / mi.Float(across)
         y = mi.Float(pixel // width) + (mi.Float(within // across) + 0.5) / mi.Float(across)
         rays, chunk = view.rays_through(x, y), slice(start, start + count)
-        mean[chunk], cover[chunk] = _mean_radiance(
-            scene, rays.o, rays.d, samples=samples, bounces=bounces, seed=seed + launch
-        )
+        mean[chunk], cover[chunk] = trace(rays, samples, launch)
     blended = decode_srgb(encode_srgb(mean / np.maximum(cover, 1e-9)[:, None]) * cover[:, None])
     return blended.reshape(camera.height, camera.width, 3), cover.reshape(camera.height, camera.width)

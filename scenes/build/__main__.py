@@ -24,16 +24,15 @@ ENVIRONMENT = "workcell"
 
 
 def bake_part(name: str, seed: int) -> BakeResult:
-    """Bake one object under the soft boxes of a studio, so that metal looks like metal."""
+    """Bake one object with its materials."""
     part, pieces = build_part(name, seed)
     return bake_asset(
         part,
         name=name,
-        light="studio",
         density=PARTS[name][1],
         friction=0.35,
         pieces=pieces,
-        settings=BakeSettings(gaussians=16000, sh_degree=2, fit_views=48, fit_steps=600, seed=seed),
+        settings=BakeSettings(gaussians=16000, seed=seed),
     )
 
 
@@ -50,13 +49,9 @@ def bake_environment(seed: int) -> BakeResult:
         scene,
         name=ENVIRONMENT,
         kind="environment",
-        light=lights,
+        lights=lights,
         settings=BakeSettings(
             gaussians=270000,
-            sh_degree=1,
-            directions=20,
-            samples=16,
-            bounces=4,
             density=densities(scene),
             fit_steps=320,
             seed=seed,

@@ -80,7 +80,8 @@ CALLS = {
 
 FURTHER = {
     **{f"bake {kind}": f"assert len(bake('part.{kind}').asset.splats)" for kind in ("obj", "glb", "ply")},
-    "bake studio": "assert len(bake('part.stl', light='studio').asset.splats)",
+    "bake lights": "from mitsplat.scene.spec.light_spec import EnvironmentLight; "
+    "bake('part.stl', lights=[EnvironmentLight()])",
     "modules": "import importlib; [importlib.import_module(name) for name in modules]",
 }
 
@@ -94,9 +95,7 @@ modules = [f"mitsplat.{m.name}" for m in pkgutil.iter_modules(ms.__path__) if m.
 
 def bake(file, **options):
     from mitsplat.bake.bake import BakeSettings
-    few = BakeSettings(
-        gaussians=30, sh_degree=0, directions=4, samples=1, bounces=1, fit_steps=0, verify_views=0, sharpening=0
-    )
+    few = BakeSettings(gaussians=30, fit_steps=0, verify_views=0)
     return ms.bake_asset(file, name="part", kind="environment", settings=few, **options)
 
 from pathlib import Path

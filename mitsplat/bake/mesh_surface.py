@@ -1,0 +1,113 @@
+"""Surface of a mesh with all its parts: hits of rays, base colours and materials at its points."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import trimesh
+
+from mitsplat.arrays import Float32Array, Float64Array, Int64Array
+from mitsplat.bake.mesh_parts import MeshPart
+from mitsplat.gaussians.splat_materials import SplatMaterials
+from mitsplat.gaussians.surfels import Surfels
+from mitsplat.geometry.camera import Camera
+from mitsplat.images.colour import encode_srgb
+from mitsplat.renderer.path_tracing import antialiased_picture
+from mitsplat.renderer.rays.device_arrays import plain_mesh, ray_scene, wrapped
+
+_FOOTPRINT_SAMPLES = 16
+"""Surface points whose mean is the material of a surfel."""
+_ALIKE = 0.8
+"""Minimum cosine between the normal of a surfel and those of the points that it averages."""
+
+
+class MeshSurface:
+    """Parts of a mesh as one surface.
+
+    Attributes:
+        mesh: Geometry of all parts [m].
+    """
+
+    def __init__(self, parts: Sequence[MeshPart]) -> None:
+        self.mesh: trimesh.Trimesh = trimesh.util.concatenate([part.mesh for part in parts])
+        self._parts = parts
+        self._first = np.cumsum([0, *(len(part.mesh.faces) for part in parts)])
+        self._scene = ray_scene(
+            {"surface": plain_mesh(trimesh.Trimesh(self.mesh.vertices, self.mesh.faces, process=False))}
+        )
+
+    def trace(self, rays: mi.Ray3f) -> tuple[Int64Array, Float64Array, Float64Array]:
+        """Return faces (N,), barycentric coordinates (N, 3) and distances (N,) [m] of first hits; face -1 is a miss."""
+        hit = self._scene.ray_intersect_preliminary(rays)
+        dr.eval(hit.t, hit.prim_index, hit.prim_uv)
+        distance, index = np.asarray(hit.t, dtype=np.float64), np.asarray(hit.prim_index).astype(np.int64)
+        u, v = np.asarray(hit.prim_uv, dtype=np.float64)
+        is_hit = np.isfinite(distance)
+        return np.where(is_hit, index, -1), np.where(is_hit, (1 - u - v, u, v), 0.0).T, distance
+
+    def base_colours(self, faces: Int64Array, barycentric: Float64Array) -> Float64Array:
+        """Return linear base colours (N, 3) at points of faces."""
+        return self._gather(lambda part, *at: part.colours_at(*at), 3, faces, barycentric)
+
+    def materials(self, faces: Int64Array, barycentric: Float64Array) -> Float64Array:
+        """Return metallic, roughness and specular, shape (N, 3)."""
+        return self._gather(lambda part, *at: part.materials_at(*at), 3, faces, barycentric)
+
+    def normals(self, faces: Int64Array, barycentric: Float64Array) -> Float64Array:
+        """Return shading normals (N, 3), with the normal maps applied."""
+        return self._gather(lambda part, *at: part.normals_at(*at), 3, faces, barycentric)
+
+    def _gather(
+        self,
+        values: Callable[[MeshPart, Int64Array, Float64Array], Float64Array],
+        width: int,
+        faces: Int64Array,
+        barycentric: Float64Array,
+    ) -> Float64Array:
+        found = np.zeros((len(faces), width))
+        for part, first, end in zip(self._parts, self._first, self._first[1:], strict=False):
+            own = np.flatnonzero((faces >= first) & (faces < end))
+            if len(own):
+                found[own] = values(part, faces[own] - first, barycentric[own])
+        return found
+
+    def sample_surfels(self, surfels: Surfels, rng: np.random.Generator) -> tuple[Float64Array, SplatMaterials]:
+        """Return display-encoded base colours (N, 3) and materials of surfels, averaged over their footprints."""
+        count, lift = len(surfels), 0.3 * surfels.scales[:, None, :1]
+        offset = np.clip(rng.normal(size=(count, _FOOTPRINT_SAMPLES, 2)), -1.5, 1.5) * 0.5 * surfels.scales[:, None, :2]
+        outward = np.broadcast_to(surfels.normals[:, None], (count, _FOOTPRINT_SAMPLES, 3))
+        origins = surfels.points[:, None] + np.einsum("nij,nmj->nmi", surfels.frames[:, :, :2], offset) + lift * outward
+        rays = mi.Ray3f(
+            mi.Point3f(*(wrapped(mi.Float, axis.astype(np.float32)) for axis in origins.reshape(-1, 3).T)),
+            mi.Vector3f(*(wrapped(mi.Float, axis.astype(np.float32)) for axis in -outward.reshape(-1, 3).T)),
+        )
+        faces, barycentric, distance = self.trace(rays)
+        own = np.repeat(np.arange(count), _FOOTPRINT_SAMPLES)
+        near = (faces >= 0) & (distance < 1.2 * surfels.scales[own, 0])
+        near &= np.einsum("nd,nd->n", self.mesh.face_normals[faces], surfels.normals[own]) > _ALIKE
+        faces = np.where(near, faces, surfels.faces[own])
+        barycentric = np.where(near[:, None], barycentric, surfels.barycentric[own])
+
+        def mean(values: Float64Array) -> Float64Array:
+            return np.asarray(values.reshape(count, _FOOTPRINT_SAMPLES, -1).mean(axis=1))
+
+        metallic, roughness, specular = mean(self.materials(faces, barycentric)).T.clip(0, 1).astype(np.float32)
+        normals: Float32Array | None = None
+        if any(part.normal_map is not None for part in self._parts):
+            shading = mean(self.normals(faces, barycentric))
+            normals = (shading / np.linalg.norm(shading, axis=1, keepdims=True)).astype(np.float32)
+        colours = mean(encode_srgb(self.base_colours(faces, barycentric)))
+        return colours, SplatMaterials(metallic, roughness, specular, normals)
+
+    def picture(self, camera: Camera, samples: int, _seed: int = 0) -> tuple[Float64Array, Float64Array]:
+        """Return antialiased linear base colours (H, W, 3), black for background, and coverage (H, W)."""
+
+        def mean_colours(rays: mi.Ray3f, samples: int, _launch: int) -> tuple[Float64Array, Float64Array]:
+            faces, barycentric, _ = self.trace(rays)
+            colours = self.base_colours(faces, barycentric).reshape(-1, samples, 3)
+            return colours.mean(axis=1), (faces >= 0).reshape(-1, samples).mean(axis=1)
+
+        return antialiased_picture(camera, samples, mean_colours)

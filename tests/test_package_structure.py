@@ -28,7 +28,7 @@ LAYERS = (
     ("renderer.differentiation", "renderer.light", "scene.loading"),
     ("capture.pipeline",),
     ("capture", "renderer.occluders", "renderer.splatting", "scene.planning"),
-    ("scene",),
+    ("renderer.materials", "scene"),
     ("asset", "renderer.projection"),
     ("capture.boards", "capture.isolation", "capture.lighting", "gaussians", "pages", "renderer.rays", "scene.spec"),
     ("capture.video", "engine", "geometry", "images"),

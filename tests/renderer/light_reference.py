@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 import numpy.typing as npt
@@ -15,6 +16,9 @@ import numpy.typing as npt
 Array = npt.NDArray[np.float64]
 
 UP = np.array([0.0, 0.0, 1.0])
+
+CELL = 0.05
+"""Edge of the cells [m] in which the shadow on captured walls is constant."""
 
 
 @dataclass(frozen=True)
@@ -87,8 +91,9 @@ class BoxScene:
         The factor is that of the base colour. The highlight is the reflected light without it.
         """
         diffuse = self._irradiance(point, self.boxes) / self.white + self._bounce(point)
-        if metallic or specular:
-            diffuse *= (1 - metallic) * diffuse_albedo(to_camera, roughness)
+        if not (metallic or specular):
+            return Light(diffuse, 0.0)
+        diffuse *= (1 - metallic) * diffuse_albedo(to_camera, roughness)
         emitted, reflected = self._arriving(point, self.boxes), self._reflecting(point)
         towards = np.concatenate([emitted[0], reflected[0]])
         light = np.concatenate([emitted[1] * np.pi / self.white, reflected[1]])
@@ -102,10 +107,42 @@ class BoxScene:
     def _reflecting(self, point: Array) -> tuple[Array, Array]:
         """Return unit vectors (N, 3) towards captured boxes, and pi times their light (N,) per cosine-weighted area."""
         towards = hemisphere(128)
+        return towards, self._captured_colours(point, towards) * np.pi / len(towards)
+
+    def _captured_colours(self, point: Array, towards: Array) -> Array:
+        """Return the colours (N,) of captured boxes along rays with the shadows of dynamic boxes, 0 for other rays."""
+        static, dynamic = self._entries(point, towards)
+        colours, seen = np.zeros(len(towards)), (static < np.inf) & (dynamic > static)
+        # Shadows on captured boxes are evaluated in cells, because they change slowly.
+        cells, cell = np.unique(np.round((point + towards * static[:, None])[seen] / CELL), axis=0, return_inverse=True)
+        shares = [self._share_of_cell(tuple(place * CELL)) for place in cells]
+        colours[seen] = self.grey * np.array(shares)[cell.ravel()] if len(cells) else 0.0
+        return colours
+
+    @cache  # noqa: B019 - one scene per module
+    def _share_of_cell(self, place: tuple[float, ...]) -> float:
+        """Return the share of light that dynamic boxes leave at a wall that faces +x.
+
+        Lamps behind captured boxes do not count. Of the sky, dynamic boxes also block the light that captured boxes
+        behind them reflect.
+        """
+        point, normal = np.array(place) + 1e-4 * np.array([1.0, 0.0, 0.0]), np.array([1.0, 0.0, 0.0])
+        places, facing, area = self.lamp.samples()
+        way = places - point
+        distance = np.linalg.norm(way, axis=1)
+        to_lamp, to_sky = way / distance[:, None], hemisphere()[:, [2, 0, 1]]
+        lamp = self.lamp.radiance * area * np.maximum(-to_lamp @ facing, 0) * np.maximum(to_lamp @ normal, 0)
+        lamp /= distance**2
+        sky = np.full(len(to_sky), self.sky * np.pi / len(to_sky))
+        static, dynamic = self._entries(point, to_lamp)
+        lost = lamp[(dynamic < distance) & (static >= distance)].sum()
+        static, dynamic = self._entries(point, to_sky)
+        return float(1 - (lost + sky[dynamic < static].sum()) / (lamp.sum() + sky.sum()))
+
+    def _entries(self, point: Array, towards: Array) -> tuple[Array, Array]:
+        """Return the distances (N,) at which rays enter static and dynamic boxes."""
         static = np.min([box.entry(point, towards) for box in self._static], axis=0)
-        dynamic = np.min([box.entry(point, towards) for box in self.boxes if box.dynamic], axis=0)
-        seen = (static < np.inf) & (dynamic > static)
-        return towards, np.where(seen, self.grey * np.pi / len(towards), 0.0)
+        return static, np.min([box.entry(point, towards) for box in self.boxes if box.dynamic], axis=0)
 
     @property
     def _static(self) -> list[Box]:
@@ -127,11 +164,8 @@ class BoxScene:
         return np.concatenate([to_lamp, to_sky]), np.concatenate([light * visible[0], sky * visible[1]])
 
     def _bounce(self, point: Array) -> float:
-        """Return the captured colour that a cosine-weighted hemisphere of rays hits, 0 behind dynamic boxes."""
-        towards = hemisphere()
-        static = np.min([box.entry(point, towards) for box in self._static], axis=0)
-        dynamic = np.min([box.entry(point, towards) for box in self.boxes if box.dynamic], axis=0)
-        return self.grey * float(np.mean((static < np.inf) & (dynamic > static)))
+        """Return the mean captured colour that a cosine-weighted hemisphere of rays hits."""
+        return float(np.mean(self._captured_colours(point, hemisphere())))
 
 
 def free(point: Array, towards: Array, distance: Array, boxes: Sequence[Box]) -> npt.NDArray[np.bool_]:

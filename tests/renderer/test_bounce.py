@@ -8,16 +8,20 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import trimesh
+from scipy.ndimage import gaussian_filter
+from scipy.spatial.transform import Rotation
 
 from mitsplat.gaussians.spherical_harmonics import SH_C0
 from mitsplat.gaussians.splat_cloud import Splats
+from mitsplat.geometry.camera import Camera
+from mitsplat.images.colour import encode_srgb
 from mitsplat.renderer.layers import make_integrator, make_splats_shape, render_layers
 from tests.renderer.test_light import WHITE_SKY, down_camera, floor, noise_free, nothing, slab
 
 RED = np.array([0.8, 0.2, 0.1])
 
 
-def captured_wall() -> Any:
+def captured_wall(**options: Any) -> Any:
     wall = trimesh.creation.box(bounds=[[0.3, -500, -500], [0.4, 500, 500]])
     encoded = 1.055 * RED ** (1 / 2.4) - 0.055
     sheet = floor(2.0)
@@ -27,7 +31,7 @@ def captured_wall() -> Any:
     painted = Splats(
         sheet.means, sheet.quats, sheet.scales, sheet.opacities, np.tile((encoded - 0.5) / SH_C0, (1600, 1, 1))
     ).transformed(turn)
-    return make_splats_shape(painted, proxy=wall)
+    return make_splats_shape(painted, proxy=wall, **options)
 
 
 def visible_wall() -> Any:
@@ -55,6 +59,116 @@ def test_a_red_wall_reflects_half_of_its_colour(wall: Any) -> None:
     added = (with_bounce - without).mean(axis=(0, 1))
     np.testing.assert_allclose(added / RED, 0.5, atol=0.03)
     np.testing.assert_allclose(without, 0.5, atol=0.03)
+
+
+@pytest.mark.parametrize("receiver", ["captured", "object"])
+def test_an_object_reflects_half_of_its_colour(receiver: str) -> None:
+    """The red wall is an object. It hides half of a uniform sky, and reflects the other half.
+
+    The factor of a captured floor and the light of an object are then 1/2 + colour / 2.
+    """
+    make_integrator()
+    own: dict[str, Any] = {} if receiver == "captured" else {"instance": 2, "capture_light": "uniform"}
+    shapes = {
+        "wall": captured_wall(instance=1, capture_light="uniform"),
+        "floor": make_splats_shape(floor(0.02), proxy=slab(0.02), **own),
+        "sky": WHITE_SKY,
+    }
+    light = noise_free(shapes, down_camera(0.2, 32, 6.0), white=np.pi, bounce=True).light
+    np.testing.assert_allclose(light.mean(axis=(0, 1)), 0.5 + RED / 2, atol=0.03)
+
+
+def object_box(
+    low: tuple[float, float, float], high: tuple[float, float, float], instance: int, encoded: float = 1.0
+) -> Any:
+    """Return an object of Gaussians of one colour on the faces of a box."""
+    mesh = trimesh.creation.box(bounds=[low, high])
+    points, faces = trimesh.sample.sample_surface_even(mesh, 3000, seed=1)
+    turns = [trimesh.geometry.align_vectors([0, 0, 1], normal)[:3, :3] for normal in mesh.face_normals]
+    size = float(np.sqrt(mesh.area / len(points)))
+    splats = Splats(
+        points,
+        Rotation.from_matrix(np.array(turns)[faces]).as_quat(),
+        np.tile([size, size, 0.01 * size], (len(points), 1)),
+        np.full(len(points), 0.999),
+        np.full((len(points), 1, 3), (encoded - 0.5) / SH_C0),
+    )
+    return make_splats_shape(splats, proxy=mesh, instance=instance, capture_light="uniform")
+
+
+def test_white_objects_in_uniform_light_stay_below_its_radiance() -> None:
+    """A white furnace: with all bounces, white objects are as bright as the uniform light, and never brighter."""
+    make_integrator()
+    shapes = {
+        "plate": object_box((-0.2, -0.2, -0.02), (0.2, 0.2, 0.0), 1),
+        "cube": object_box((0.0, -0.05, 0.001), (0.1, 0.05, 0.1), 2),
+        "sky": WHITE_SKY,
+    }
+    camera = Camera.look_at((-0.25, -0.02, 0.25), (0.0, 0.0, 0.02), width=64, height=48, fov_x=30)
+    without, light = (noise_free(shapes, camera, white=np.pi, bounce=b) for b in (False, True))
+    shown = light.alpha > 0.999
+    dark = shown & (without.light[..., 0] < 0.75)
+    assert dark.sum() > 500
+    assert without.light[dark].mean() < 0.7
+    assert 0.9 < light.light[dark].mean() < 1
+    assert light.light[shown].mean() < 1
+
+
+def test_umbra_of_a_lamp_is_that_of_a_path_tracer() -> None:
+    """In the shadow of a box, the table receives the light that the box reflects from the lit table."""
+    make_integrator()
+    radiance, distance, edge, grey = 40.0, 2.0, 0.1, 0.6
+    white = radiance * edge**2 / distance**2
+    place = [distance * 0.6, 0.0, distance * 0.8]
+    pose = mi.ScalarTransform4f().look_at(origin=place, target=[0, 0, 0], up=[0, 1, 0]).scale(edge / 2)
+    lamp = {
+        "type": "rectangle",
+        "to_world": pose,
+        "emitter": {"type": "area", "radiance": {"type": "rgb", "value": radiance}},
+    }
+    camera = Camera.look_at((-0.25, -0.2, 0.3), (-0.06, 0.0, 0.0), width=64, height=48, fov_x=35)
+    low, high = (-0.05, -0.05, 0.0), (0.05, 0.05, 0.1)
+    encoded = float(encode_srgb(grey * 0.8))  # the table is lit at a cosine of 0.8
+    shapes = {
+        "table": make_splats_shape(floor(0.5, encoded), proxy=slab(0.5)),
+        "box": object_box(low, high, 1, float(encode_srgb(grey))),
+        "lamp": lamp,
+    }
+    light = noise_free(shapes, camera, white=white, bounce=True).light[..., 0]
+    diffuse = {"type": "diffuse", "reflectance": {"type": "rgb", "value": grey}}
+    table = {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale(0.5), "bsdf": diffuse}
+    middle, half = np.add(low, high) / 2, np.subtract(high, low) / 2
+    box = {
+        "type": "cube",
+        "to_world": mi.ScalarTransform4f().translate(middle.tolist()).scale(half.tolist()),
+        "bsdf": diffuse,
+    }
+    photos = []
+    for objects in ({"box": box}, {}):
+        scene = mi.load_dict({"type": "scene", "table": table, "lamp": lamp, **objects})
+        integrator = mi.load_dict({"type": "path", "max_depth": 8})
+        photo = np.array(mi.render(scene, sensor=mitsuba_camera(camera), integrator=integrator, spp=256))
+        photos.append(photo[..., 0])
+    ratio = photos[0] / np.maximum(photos[1], 1e-6)
+    instance = render_layers(make_integrator(), mi.load_dict({"type": "scene", **shapes}), camera).instance
+    inside = gaussian_filter((instance == 0).astype(float), 1) > 0.99
+    umbra = inside & (photos[1] > 0) & (ratio < 0.3)
+    assert umbra.sum() > 100
+    assert ratio[umbra].mean() > 0.02
+    assert light[umbra].mean() == pytest.approx(ratio[umbra].mean(), rel=0.1)
+
+
+def mitsuba_camera(camera: Camera) -> Any:
+    """Return Mitsuba's perspective sensor for a pinhole camera with its principal point in the middle."""
+    pose = camera.world_from_camera @ np.diag([-1.0, -1.0, 1.0, 1.0])
+    return mi.load_dict(
+        {
+            "type": "perspective",
+            "fov": float(np.degrees(2 * np.arctan(camera.width / 2 / camera.fx))),
+            "to_world": mi.ScalarTransform4f(pose),
+            "film": {"type": "hdrfilm", "width": camera.width, "height": camera.height, "rfilter": {"type": "box"}},
+        }
+    )
 
 
 def test_a_bright_spot_leaves_no_patches_on_a_mesh() -> None:

@@ -10,7 +10,7 @@ import pytest
 from mitsplat.runtime.variant import ensure_variant
 
 ensure_variant()
-from mitsplat.renderer.light.principled import SpecularLobe, mirrored_uniform  # noqa: E402
+from mitsplat.renderer.materials.principled import SpecularLobe, mirrored_uniform  # noqa: E402
 
 COUNT = 4096
 BASE = (0.8, 0.4, 0.2)

@@ -11,8 +11,8 @@ from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.gaussians.splat_materials import SplatMaterials
 from mitsplat.images.colour import encode_srgb
 from mitsplat.renderer.layers import make_integrator
+from mitsplat.renderer.materials.proxy_materials import corner_materials
 from mitsplat.renderer.occluders.proxies import Occluder, Proxies
-from mitsplat.renderer.occluders.proxy_materials import corner_materials
 from mitsplat.renderer.projection.splat_appearance import SplatAppearance
 
 BOX = trimesh.creation.box(extents=(1, 1, 1))

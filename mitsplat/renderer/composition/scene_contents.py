@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import mitsuba as mi
 
 from mitsplat.gaussians.splat_cloud import Splats
-from mitsplat.renderer.light.bounce import RadianceGrid
 from mitsplat.renderer.light.light_traits import Traits
+from mitsplat.renderer.materials.radiance_grid import RadianceGrid
 from mitsplat.renderer.meshes.mirrored_splats import SplatMirror
 from mitsplat.renderer.meshes.visible_meshes import VisibleMeshes, is_transmissive
 from mitsplat.renderer.occluders.proxies import Occluder, Proxies

@@ -10,9 +10,9 @@ import mitsuba as mi
 import numpy as np
 
 from mitsplat.arrays import Float64Array
-from mitsplat.renderer.light.principled import lattice_point
 from mitsplat.renderer.light.rectangle_lights import Rectangles
 from mitsplat.renderer.light.sky_irradiance import SkyIrradiance
+from mitsplat.renderer.materials.principled import lattice_point
 from mitsplat.renderer.rays.device_arrays import wrapped
 
 SURVEY_LATTICE = (233, 144)
@@ -47,12 +47,14 @@ class Beam:
         reach: Largest distance of an occluder [m]: the distance to the emitter, or the sky reach.
         irradiance: Unoccluded irradiance estimate (Color3f) of this single sample.
         density: Sampling density of the direction [1/sr], infinite for point-shaped and parallel light.
+        sky: True if the light is that of the sky.
     """
 
     direction: mi.Vector3f
     reach: mi.Float
     irradiance: mi.Color3f
     density: mi.Float
+    sky: mi.Bool
 
 
 class Emitters:
@@ -127,7 +129,7 @@ class Emitters:
         # Mitsuba derives the distance of infinite lights from the extent of visible meshes, which excludes proxies.
         infinite = dr.gather(mi.UInt32, self.infinite, index, active) > 0
         reach = dr.select(is_sky, self.sky_reach, dr.select(infinite, dr.inf, distance))
-        return Beam(direction, reach, irradiance / chance, density * chance)
+        return Beam(direction, reach, irradiance / chance, density * chance, is_sky)
 
     def emission(
         self, scene: mi.Scene, si: mi.SurfaceInteraction3f, ray: mi.Ray3f, active: mi.Bool

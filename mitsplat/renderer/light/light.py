@@ -12,7 +12,7 @@ colours of the surroundings are exposed. An object captured in a light tent keep
 where less light arrives. E_bounce is the light that the surroundings reflect, see
 :mod:`mitsplat.renderer.light.bounce`. A material of metalness m has the factor (1 - m) (E + E_bounce) / E_ref. Its
 specular lobe adds a tinted part to the factor and a colourless part to the highlight, see
-:mod:`mitsplat.renderer.light.principled`. On captured colours, the highlight is reduced by the mirror image of the
+:mod:`mitsplat.renderer.materials.principled`. On captured colours, the highlight is reduced by the mirror image of the
 uniform light, which these colours contain; under even light it adds nothing.
 
 Rays are spent adaptively. Captured surfaces get one ray per pixel where objects occlude less light than the wanted
@@ -29,17 +29,19 @@ from functools import cached_property
 import drjit as dr
 import mitsuba as mi
 
-from mitsplat.renderer.light.bounce import RadianceGrid, Reflectors, trace_bounce
+from mitsplat.renderer.light.bounce import Bounce, object_cover, trace_bounce
 from mitsplat.renderer.light.emitter_sampling import Emitters
 from mitsplat.renderer.light.light_filter import UNTRACED, Estimate, LightFilter, LightMeans
 from mitsplat.renderer.light.light_planes import MIN_ROWS, CoarseLight, Planes, between_samples, plane_codes
 from mitsplat.renderer.light.light_points import LightPoints
 from mitsplat.renderer.light.light_tiles import block_order
 from mitsplat.renderer.light.lit_surface import LitSurface, VisibleSurfaces
-from mitsplat.renderer.light.principled import diffuse_albedo, mirrored_uniform
 from mitsplat.renderer.light.reflections import Reflections, ReflectionTracer
+from mitsplat.renderer.light.reflectors import Reflectors
 from mitsplat.renderer.light.shadow_rays import ShadowTracer
 from mitsplat.renderer.light.unoccluded_light import UnoccludedLight
+from mitsplat.renderer.materials.principled import diffuse_albedo, mirrored_uniform
+from mitsplat.renderer.materials.radiance_grid import RadianceGrid
 from mitsplat.renderer.occluders.proxies import Proxies
 from mitsplat.renderer.rays.camera_rays import CameraView
 from mitsplat.renderer.rays.device_arrays import gathered
@@ -61,6 +63,9 @@ quarter larger than with rays at each pixel. With this factor the error is the s
 
 FIRST_REFLECTIONS = 4, 16
 """Reflection rays per pixel of a dielectric and of a metal before the error estimate."""
+
+MIN_COVER = 0.2
+"""Share of the hemisphere that objects cover from which the light of captured points is traced in any case."""
 
 LEVEL_BITS = 4
 """Bits of the number of doublings; 2^15 times the first rays exceeds every setting."""
@@ -156,12 +161,14 @@ def light_factor(
         white: Irradiance (Color3f) at which a uniformly captured object keeps its colours.
         sky_reach: Distance beyond which nothing occludes the sky [m].
         grid: Captured colours of the surroundings; None if there are none.
-        bounce: True if objects receive the light that surroundings and visible meshes reflect.
+        bounce: True if points receive the light that surroundings, objects and visible meshes reflect.
     """
     emitters = Emitters(scene, reference, sky_reach)
-    reflectors = Reflectors(grid, proxies, emitters, white)
+    reflectors = Reflectors(scene, grid, proxies, emitters, white)
     lighting = Lighting(emitters, proxies, visible, accuracy, seed, white, scene, reflectors)
-    needed, light, codes = search_shadows(lighting)
+    bounce &= reflectors.any
+    cover = object_cover(visible) if bounce else None
+    needed, light, codes = search_shadows(lighting, cover)
     coarse = trace_planes(lighting, needed, codes)
     if coarse is not None:
         needed &= ~coarse.coarse | coarse.lattice
@@ -173,12 +180,12 @@ def light_factor(
     estimate = pixels.trace_first_rays()
     unoccluded = UnoccludedLight.integrate(emitters, pixels.points, pixels.here, white)
     bounced = None
-    if bounce and reflectors.any and dr.width(unoccluded.place):
-        bounced = trace_bounce(pixels.centre_tracer(), reflectors)
+    if bounce:
+        bounced = trace_bounce(pixels.centre_tracer(), reflectors, pixels.points.sums_by_pixel(estimate), cover)
     estimate = pixels.trace_further_rays(estimate, unoccluded.level)
     estimate = pixels.points.sums_by_pixel(estimate)
-    means = pixels.light_filter.smooth(estimate, bounced)
-    light = pixels.combine(light, unoccluded, means)
+    means = pixels.light_filter.smooth(estimate, None if bounced is None else bounced.relit)
+    light = pixels.combine(light, unoccluded, means, bounced)
     light, highlight = pixels.add_reflections(light, estimate)
     if coarse is not None:
         dr.eval(light)
@@ -186,10 +193,11 @@ def light_factor(
     return light, highlight
 
 
-def search_shadows(lighting: Lighting) -> tuple[mi.Bool, mi.Color3f, mi.UInt32 | None]:
+def search_shadows(lighting: Lighting, cover: mi.Float | None) -> tuple[mi.Bool, mi.Color3f, mi.UInt32 | None]:
     """Find the pixels whose light must be traced, by one ray per captured pixel.
 
     Captured points in tiles where dynamic objects occlude a share f below the wanted error take the factor 1 - f.
+    Points next to objects, where ``cover`` of :func:`object_cover` is large, are traced in any case.
 
     Returns:
         True (Bool) for pixels that need traced light, the light factor (Color3f) of the others, and the codes of
@@ -208,6 +216,8 @@ def search_shadows(lighting: Lighting) -> tuple[mi.Bool, mi.Color3f, mi.UInt32 |
             tracer = ShadowTracer(lighting.emitters, lighting.proxies, everything, pixel, lighting.view, lighting.seed)
             tiles = tracer.search(captured)
             needed = everything.valid & (~captured | tiles.differs(error))
+            if cover is not None:
+                needed |= captured & (cover > MIN_COVER)
             light = dr.select(everything.valid, tiles.light(), 1)
         codes = plane_code if some_planes else None
     dr.eval(needed, light)
@@ -314,15 +324,17 @@ class TracedPixels:
         rows, extra = (dr.gather(mi.UInt32, values, lane) for values in (rows, points.ray_count(extra, rows)))
         return self._point_tracer.trace(rows, estimate, extra, accuracy.most - first, points.steps(rows))
 
-    def combine(self, light: mi.Color3f, unoccluded: UnoccludedLight, means: LightMeans) -> mi.Color3f:
+    def combine(
+        self, light: mi.Color3f, unoccluded: UnoccludedLight, means: LightMeans, bounced: Bounce | None
+    ) -> mi.Color3f:
         """Return the light factor of all pixels from filtered sums, without reflections.
 
         With the arriving share s = lit / base, unoccluded irradiance E and metalness m:
 
-            captured:    factor = s
+            captured:    factor = s, or (lit + E_with) / (base + E_without) near objects, see `Bounce`
             relit:       factor = (1 - m) d (s E / white + bounce)
 
-        d is :func:`mitsplat.renderer.light.principled.diffuse_albedo` of glossy materials, otherwise 1.
+        d is :func:`mitsplat.renderer.materials.principled.diffuse_albedo` of glossy materials, otherwise 1.
 
         Sums over rays are averaged over neighbours before the division, so that points with little light do not turn
         black by chance. Sources: module docstring, and Heitz et al. 2018 as above.
@@ -331,15 +343,18 @@ class TracedPixels:
             light: Light factor (Color3f) of untraced pixels.
             unoccluded: Unoccluded light.
             means: Filtered light.
+            bounced: Reflected light; None if it is not traced.
         """
-        lit, base = means.lit, means.base
+        lit, base, white = means.lit, means.base, self.lighting.white
+        if bounced is not None:
+            lit, base = lit + bounced.captured[0] * white, base + bounced.captured[1] * white
         share = dr.select((base > 0) & (lit != base), lit / base, 1)  # a GPU divides a number by itself to almost 1
         light = mi.Color3f(*[channel + dr.zeros(mi.Float, self.lighting.pixels) for channel in light])
         dr.eval(light, share)
         dr.scatter(light, share, self.index)
         place = unoccluded.place
         if dr.width(place):
-            relit = dr.gather(mi.Color3f, share, place) * unoccluded.irradiance / self.lighting.white
+            relit = dr.gather(mi.Color3f, share, place) * unoccluded.irradiance / white
             if means.bounced is not None:
                 relit += dr.gather(mi.Color3f, means.bounced, place)
             relit *= self._diffuse_share(gathered(self.here, place))

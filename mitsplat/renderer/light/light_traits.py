@@ -10,7 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsplat.renderer.light.principled import MAX_SPECULAR
+from mitsplat.renderer.materials.principled import MAX_SPECULAR
 from mitsplat.renderer.projection.clouds import Placement
 from mitsplat.renderer.rays.device_arrays import wrapped
 
@@ -24,7 +24,8 @@ class Traits:
 
     Attributes:
         relit: True if the colours are base colours or were captured under uniform light, by row.
-        roughness, metallic, specular: Parameters of :class:`mitsplat.renderer.light.principled.SpecularLobe`, by row.
+        roughness, metallic, specular: Parameters of :class:`mitsplat.renderer.materials.principled.SpecularLobe`, by
+            row.
         captured: True if the colours were captured, by row.
         owner: Instance id, by row.
         placements: Placements of the scene with row numbers instead of instance ids; None if every instance has one

@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mitsplat.renderer.light.light_traits import Traits
-from mitsplat.renderer.light.principled import SpecularLobe
+from mitsplat.renderer.materials.principled import SpecularLobe
 from mitsplat.renderer.occluders.proxies import Hit, Proxies
 from mitsplat.renderer.rays.camera_rays import CameraView
 from mitsplat.renderer.rays.device_arrays import gathered
@@ -30,7 +30,7 @@ class LitSurface:
         instance: Instance id (Float).
         trait: Row of the shape in :class:`Traits` (Float). Light is not averaged across rows.
         relit: True if the point is relit (uniform capture), False if it is only shadowed.
-        roughness, metallic, specular: Parameters of :class:`mitsplat.renderer.light.principled.SpecularLobe`.
+        roughness, metallic, specular: Parameters of :class:`mitsplat.renderer.materials.principled.SpecularLobe`.
         captured: True if the colour contains the mirror image of the light of the capture.
         known: True if the point comes from the proxy of the visible instance; otherwise position and normal are a
             guess.

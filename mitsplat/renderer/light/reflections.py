@@ -1,9 +1,9 @@
 """Reflection rays: light that surfaces, lamps and the sky send into the specular lobe of visible points.
 
-Each ray samples the visible microfacet normals of the point. It ends at the nearest surface, whose outgoing light is
-that of :class:`mitsplat.renderer.light.bounce.Reflectors`, or at an emitter. Light of emitters is weighted by the power
-heuristic against the shadow rays, which sample the emitters (Veach 1997, section 9.2.4). The number of rays follows the
-variance of the first rays, as for shadow rays.
+Each ray samples the visible microfacet normals of the point. It ends at an emitter or at the nearest surface, whose
+outgoing light is that of :class:`mitsplat.renderer.light.reflectors.Reflectors`. Light of emitters is weighted by the
+power heuristic against the shadow rays, which sample the emitters (Veach 1997, section 9.2.4). The number of rays
+follows the variance of the first rays, as for shadow rays.
 """
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ from dataclasses import dataclass, fields
 import drjit as dr
 import mitsuba as mi
 
-from mitsplat.renderer.light.bounce import LANES, Reflectors
 from mitsplat.renderer.light.emitter_sampling import receiver
 from mitsplat.renderer.light.light_tiles import STRIDE
-from mitsplat.renderer.light.principled import power_weight
+from mitsplat.renderer.light.reflectors import LANES, Reflectors
 from mitsplat.renderer.light.shadow_rays import ROBERTS, ShadowTracer, ray_origin, sequence_point
+from mitsplat.renderer.materials.principled import power_weight
 from mitsplat.renderer.rays.device_arrays import gathered
 
 TYPICAL_COLOUR = 0.6

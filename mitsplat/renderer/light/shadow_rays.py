@@ -12,7 +12,7 @@ from mitsplat.renderer.light.emitter_sampling import Beam, Emitters, receiver
 from mitsplat.renderer.light.light_filter import Estimate, packed
 from mitsplat.renderer.light.light_tiles import BLOCK, STRIDE, ShadowTiles, block_order, parity
 from mitsplat.renderer.light.lit_surface import LitSurface
-from mitsplat.renderer.light.principled import power_weight
+from mitsplat.renderer.materials.principled import power_weight
 from mitsplat.renderer.occluders.proxies import OccluderScene, Proxies
 from mitsplat.renderer.rays.camera_rays import CameraView
 from mitsplat.renderer.rays.device_arrays import gathered

@@ -14,7 +14,7 @@ import trimesh
 
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.mesh_normals import CREASE_ANGLE, corner_normals
-from mitsplat.renderer.occluders.proxy_materials import CornerMaterials, SurfaceMaterial
+from mitsplat.renderer.materials.proxy_materials import CornerMaterials, SurfaceMaterial
 from mitsplat.renderer.occluders.splat_occlusion import Caster, SplatOccluders
 from mitsplat.renderer.projection.splat_appearance import SplatAppearance
 from mitsplat.renderer.rays.device_arrays import ray_scene, wrapped
@@ -78,6 +78,57 @@ class Hit:
         return cls(mi.Float(dr.inf), mi.Normal3f(0), mi.Normal3f(0), mi.Vector3f(0), mi.UInt32(0), *matt)
 
 
+@dataclass(frozen=True, eq=False)
+class Boxes:
+    """Axis-aligned boxes around proxies.
+
+    Attributes:
+        rows: Centre [m], half extents [m], instance id and zero of each box, packed.
+        count: Number of boxes.
+    """
+
+    rows: mi.Float
+    count: int
+
+    @classmethod
+    def of(cls, occluders: Sequence[Occluder], visible: Sequence[mi.Shape]) -> Boxes | None:
+        """Return the boxes of proxies and visible shapes."""
+        rows = []
+        for o in occluders:
+            if len(o.mesh.faces):
+                world = trimesh.transform_points(trimesh.bounds.corners(o.mesh.bounds), o.world_from_mesh)
+                low, high = world.min(axis=0), world.max(axis=0)
+                rows.append([*(low + high) / 2, *(high - low) / 2, o.instance, 0])
+        for shape in visible:
+            box = shape.bbox()
+            rows.append([*np.array(box.center()), *np.array(box.extents()) / 2, 0, 0])
+        return cls(wrapped(mi.Float, np.array(rows, np.float32)), len(rows)) if rows else None
+
+    def form_factor(self, point: mi.Point3f, normal: mi.Vector3f) -> mi.Float:
+        """Estimate the largest share of the cosine-weighted hemisphere of points that one box covers.
+
+        A box at distance d has the solid angle A / d^2 of its projected area A. Its mean cosine is half of that of its
+        upper edge.
+        """
+
+        def add(i: mi.UInt32, most: mi.Float) -> tuple[mi.UInt32, mi.Float]:
+            row = dr.gather(mi.ArrayXf, self.rows, i, shape=(8, dr.width(i)))
+            way, half = mi.Vector3f(*row[:3]) - point, mi.Vector3f(*row[3:6])
+            gap = dr.norm(dr.maximum(dr.abs(way) - half, 0))
+            distance = dr.norm(way)
+            towards = dr.abs(way) / dr.maximum(distance, 1e-12)
+            area = 4 * dr.dot(towards, mi.Vector3f(half.y * half.z, half.x * half.z, half.x * half.y))
+            top = dr.dot(normal, way) + dr.dot(dr.abs(normal), half)
+            solid = dr.minimum(area / dr.maximum(dr.pi * gap * distance, 1e-12), 1)
+            top = dr.maximum(top, 0)
+            share = 0.5 * solid * top * dr.rsqrt(dr.maximum(gap * gap + top * top, 1e-24))
+            return i + 1, dr.maximum(most, share)
+
+        rounds = dr.opaque(mi.UInt32, self.count)
+        state = dr.zeros(mi.UInt32, dr.width(point)), dr.zeros(mi.Float, dr.width(point))
+        return dr.while_loop(state, lambda i, _: i < rounds, add, label="boxes")[1]
+
+
 class OccluderScene(Protocol):
     """Ray-traceable scene of occluders."""
 
@@ -91,6 +142,7 @@ class Proxies:
     Attributes:
         static, dynamic: These scenes, for hits.
         shadow_casters: Scenes that cast the shadows of dynamic objects: none, one or two.
+        boxes: Boxes around the dynamic proxies, see :class:`Boxes`; None if there are none.
         shows_meshes: True if the dynamic proxies include visible meshes.
         separate_kernels: True if a kernel may trace only one scene. On CUDA, Dr.Jit drops all but the first.
     """
@@ -103,14 +155,15 @@ class Proxies:
         Visible shapes are dynamic, because no capture contains their shadows. Shadows of dynamic proxies are cast by
         ``casters``, or by the proxy meshes if ``casters`` is None.
         """
-        self.static = _TraceScene.build([o for o in occluders if not o.dynamic])
-        self.dynamic = _TraceScene.build([o for o in occluders if o.dynamic], visible)
+        self.static = TraceScene.build([o for o in occluders if not o.dynamic])
+        self.dynamic = TraceScene.build([o for o in occluders if o.dynamic], visible)
         shadow_casters = (
-            [self.dynamic] if casters is None else [_TraceScene.build([], visible), SplatOccluders.build(casters)]
+            [self.dynamic] if casters is None else [TraceScene.build([], visible), SplatOccluders.build(casters)]
         )
         self.shadow_casters: tuple[OccluderScene, ...] = tuple(
             occluder_scene for occluder_scene in shadow_casters if occluder_scene is not None
         )
+        self.boxes = Boxes.of([o for o in occluders if o.dynamic], visible)
         self.shows_meshes = bool(visible)
         self.separate_kernels = dr.backend_v(mi.Float) == dr.JitBackend.CUDA
 
@@ -121,13 +174,13 @@ class Proxies:
 
     def nearest(self, ray: mi.Ray3f) -> tuple[Hit, Hit]:
         """Return the first hits of rays, and the first hits without the dynamic proxies."""
-        static = _TraceScene.nearest(self.static, ray, Hit.miss())
+        static = TraceScene.nearest(self.static, ray, Hit.miss())
         dr.eval(static)  # a separate kernel, see `separate_kernels`
-        return _TraceScene.nearest(self.dynamic, ray, static), static
+        return TraceScene.nearest(self.dynamic, ray, static), static
 
 
 @dataclass(frozen=True, eq=False)
-class _TraceScene:
+class TraceScene:
     """All meshes merged into one (or None), with the instance id of every triangle, and visible shapes."""
 
     scene: mi.Scene
@@ -137,7 +190,7 @@ class _TraceScene:
     normals: mi.Float
     materials: CornerMaterials | None
 
-    def nearest(self: _TraceScene | None, ray: mi.Ray3f, other: Hit) -> Hit:
+    def nearest(self: TraceScene | None, ray: mi.Ray3f, other: Hit) -> Hit:
         """Return the nearer of ``other`` and the hits in this scene."""
         if self is None:
             return other
@@ -171,6 +224,11 @@ class _TraceScene:
             return SurfaceMaterial(mi.Color3f(0), mi.Float(0), mi.Float(1), mi.Float(0))
         return self.materials.at(triangle, uv, active)
 
+    def normal_at(self, triangle: mi.UInt32, active: mi.Bool) -> mi.Normal3f:
+        """Return the unit normals of proxy triangles."""
+        a, b, c = (dr.gather(mi.Point3f, self.corners, triangle * 3 + corner, active) for corner in range(3))
+        return mi.Normal3f(dr.normalize(dr.cross(b - a, c - a)))
+
     def is_visible(self, hit: mi.PreliminaryIntersection3f) -> mi.Bool:
         """Return True for hits on visible shapes."""
         return mi.Bool(True) if self.mesh is None else hit.shape != self.mesh
@@ -196,7 +254,8 @@ class _TraceScene:
         return mi.Normal3f(dr.normalize(normal)), lift
 
     @classmethod
-    def build(cls, occluders: Sequence[Occluder], visible: Sequence[mi.Shape] = ()) -> _TraceScene | None:
+    def build(cls, occluders: Sequence[Occluder], visible: Sequence[mi.Shape] = ()) -> TraceScene | None:
+        """Merge occluders and visible shapes; return None if there are none."""
         others = {f"visible_{i}": shape for i, shape in enumerate(visible)}
         occluders = [o for o in occluders if len(o.mesh.faces)]
         if not occluders:
@@ -216,12 +275,12 @@ _Parts = tuple[tuple[trimesh.Trimesh, int, bytes, Splats | None, SplatAppearance
 
 
 @lru_cache(maxsize=2)
-def _cached_scene(parts: _Parts, _variant: str) -> _TraceScene:
+def _cached_scene(parts: _Parts, _variant: str) -> TraceScene:
     """Return the merged meshes, cached for the static meshes of all layouts and the last dynamic ones."""
     return _merged_scene(parts, {})
 
 
-def _merged_scene(parts: _Parts, others: Mapping[str, mi.Shape]) -> _TraceScene:
+def _merged_scene(parts: _Parts, others: Mapping[str, mi.Shape]) -> TraceScene:
     corners, normals = [], []
     for part, _, pose, _, _ in parts:
         world_from_mesh = np.frombuffer(pose).reshape(4, 4)
@@ -237,7 +296,7 @@ def _merged_scene(parts: _Parts, others: Mapping[str, mi.Shape]) -> _TraceScene:
     params["faces"] = dr.arange(mi.UInt32, count)
     params.update()
     instances = np.repeat([instance for _, instance, *_ in parts], [len(part.faces) for part, *_ in parts])
-    return _TraceScene(
+    return TraceScene(
         ray_scene({"mesh": mesh, **others}),
         dr.opaque(mi.ShapePtr, mesh),  # a literal shape number would enter the kernels and change with every layout
         wrapped(mi.UInt32, instances.astype(np.uint32)),

@@ -1,0 +1,310 @@
+"""Light that surfaces reflect along rays: captured surroundings, objects and visible meshes.
+
+Captured surroundings have the colour captured there, which contains all earlier bounces, and the shadows of dynamic
+objects. Objects and visible meshes reflect the emitters' light according to their material. An object also reflects the
+light of one further ray, which ends at the next surface.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from mitsplat.renderer.light.emitter_sampling import Beam, Emitters, receiver
+from mitsplat.renderer.light.light_tiles import STRIDE
+from mitsplat.renderer.materials.principled import SpecularLobe, power_weight
+from mitsplat.renderer.materials.proxy_materials import SurfaceMaterial
+from mitsplat.renderer.materials.radiance_grid import RadianceGrid
+from mitsplat.renderer.occluders.proxies import OccluderScene, Proxies, TraceScene
+
+LANES = 1 << 20
+"""Number of rays that are traced at once."""
+
+BOUNCES = 2
+"""Number of objects along a path. The last one is diffuse: a metal then reflects the mean of the light around it."""
+
+CANDIDATES = 4
+"""Sampled emitters of which one is tested for the shadow of dynamic objects on captured surroundings."""
+
+MIN_LAMP_ROUGHNESS = 0.3
+"""Roughness above which the emitters that plastics mirror are added. On smoother surfaces they are rare and bright."""
+
+MAX_REFLECTION = 4.0
+"""Largest reflection of one sampled emitter, in units of display white."""
+
+
+@dataclass(frozen=True, eq=False)
+class Reflectors:
+    """Surfaces that reflect light.
+
+    Attributes:
+        scene: Mitsuba scene with the emitters.
+        grid: Captured colours of the static proxies; None if there are none.
+        proxies: Surfaces that rays hit, and their occluders.
+        emitters: Light on objects and visible meshes.
+        white: Irradiance (Color3f) of display white.
+    """
+
+    scene: mi.Scene
+    grid: RadianceGrid | None
+    proxies: Proxies
+    emitters: Emitters
+    white: mi.Color3f
+
+    @property
+    def any(self) -> bool:
+        """True if any surface reflects light."""
+        dynamic = self.proxies.dynamic
+        objects = dynamic is not None and (self.proxies.shows_meshes or dynamic.materials is not None)
+        return objects or (self.grid is not None and self.proxies.static is not None)
+
+    def irradiance(
+        self,
+        origin: mi.Point3f,
+        normal: mi.Vector3f,
+        start: mi.UInt32,
+        rays: int,
+        sequence: Callable[[mi.UInt32], tuple[mi.Point2f, mi.Point2f]],
+    ) -> tuple[mi.Color3f, mi.Color3f]:
+        """Compute the reflected irradiance at points (Color3f) over the irradiance of display white.
+
+        Args:
+            origin: Ray origins [m].
+            normal: Unit normal of the surface.
+            start: Sequence number of the first ray of every point.
+            rays: Number of rays per point.
+            sequence: Function that maps ray numbers to two points of the unit square.
+
+        Returns:
+            Irradiance from all surfaces, and from the captured surroundings as if there were no dynamic objects.
+        """
+        count = dr.width(origin)
+        together = max(1, min(rays, LANES // count))
+        totals = [mi.Color3f(dr.zeros(mi.Float, count)) for _ in range(2)]
+        for first in range(0, rays, together):
+            some = min(together, rays - first)
+            lane = dr.arange(mi.UInt32, count * some)
+            row = lane // dr.opaque(mi.UInt32, some)
+            number = dr.gather(mi.UInt32, start, row) + (lane - row * some + dr.opaque(mi.UInt32, first)) * STRIDE
+            upward, light = sequence(number)
+            frame = mi.Frame3f(dr.gather(mi.Vector3f, normal, row))
+            towards = frame.to_world(mi.warp.square_to_cosine_hemisphere(upward))
+            ray = mi.Ray3f(dr.gather(mi.Point3f, origin, row), towards)
+            dr.eval(ray, number, light)
+            colour, captured, _ = self._trace(ray, number, light, BOUNCES)
+            for total, colours in zip(totals, (colour, captured), strict=True):
+                total += mi.Color3f(*[dr.block_sum(c, some) for c in colours])
+            dr.eval(totals)
+        return totals[0] / rays, totals[1] / rays
+
+    def outgoing(self, ray: mi.Ray3f, key: mi.UInt32, light: mi.Point2f) -> tuple[mi.Color3f, mi.Float]:
+        """Compute the radiance of the surfaces that rays hit, times pi over the irradiance of display white.
+
+        Args:
+            ray: Rays.
+            key: Integer per ray, from which random numbers derive.
+            light: Point of the unit square per ray that selects an emitter.
+
+        Returns:
+            Radiance (Color3f), 0 for a miss, and distances of the hits [m], infinite for a miss.
+        """
+        colour, _, distance = self._trace(mi.Ray3f(ray), key, light, BOUNCES)
+        return colour, distance
+
+    def _trace(
+        self, ray: mi.Ray3f, key: mi.UInt32, light: mi.Point2f, bounces: int
+    ) -> tuple[mi.Color3f, mi.Color3f, mi.Float]:
+        """Return the colours (Color3f) at the hits of rays, the colours without dynamic objects, and the distances.
+
+        Each scene is traced by a kernel of its own, see ``Proxies.separate_kernels``.
+        """
+        static, dynamic = self.proxies.static, self.proxies.dynamic
+        captured, distance = mi.Color3f(dr.zeros(mi.Float, dr.width(key))), mi.Float(dr.inf)
+        ray.maxt = dr.inf
+        if static is not None:
+            ground = static.scene.ray_intersect_preliminary(ray)
+            hit = ground.is_valid()
+            if self.grid is not None:
+                captured = dr.select(hit, self.grid.at(ray(dr.select(hit, ground.t, 0)), hit), 0)
+            ray.maxt = distance = ground.t
+            dr.eval(ray, ground)
+        dr.eval(captured)
+        if dynamic is None:
+            return captured, captured, distance
+        near = dynamic.scene.ray_intersect_preliminary(ray)
+        colour = dr.select(near.is_valid(), 0, captured)
+        thing = near.is_valid()
+        if self.emitters.sky is not None:  # indoors, the sky represents the light that walls reflect
+            thing &= near.t < self.emitters.sky_reach
+        distance = dr.select(near.is_valid(), dr.select(thing, near.t, dr.inf), distance)
+        dr.eval(near, colour, thing, distance)
+        lane = dr.compress(dr.max(colour) > 0)
+        if static is not None and dr.width(lane):
+            some = (dr.gather(type(v), v, lane) for v in (ray, ground.prim_index, key, light))
+            free = self._unshadowed(static, *some)
+            dr.scatter(colour, dr.select(free, dr.gather(mi.Color3f, colour, lane), 0), lane)
+        lane = dr.compress(thing)
+        if dr.width(lane):
+            some = (dr.gather(type(v), v, lane) for v in (ray, near, key, light))
+            dr.scatter(colour, self._reflected(bounces, *some), lane)
+        dr.eval(colour)
+        return colour, captured, distance
+
+    def _unshadowed(
+        self, static: TraceScene, ray: mi.Ray3f, triangle: mi.UInt32, key: mi.UInt32, light: mi.Point2f
+    ) -> mi.Bool:
+        """Return False for captured surfaces that dynamic objects shade from one sampled emitter.
+
+        The expected value is the share of the light that arrives, because one of several samples is chosen in
+        proportion to its irradiance (Talbot et al. 2005, "Importance Resampling for Global Illumination").
+        """
+        normal = _towards(static.normal_at(triangle, mi.Bool(True)), ray)
+        origin = _lifted(ray(ray.maxt), normal)
+        place = receiver(origin, normal)
+
+        def choose(
+            i: mi.UInt32, total: mi.Float, direction: mi.Vector3f, reach: mi.Float, sky: mi.Bool
+        ) -> tuple[mi.UInt32, mi.Float, mi.Vector3f, mi.Float, mi.Bool]:
+            x = light.x + mi.Float(i) / CANDIDATES
+            beam = self.emitters.sample(place, mi.Point2f(x - dr.floor(x), light.y), mi.Bool(True))
+            weight = dr.sum(beam.irradiance)
+            total += weight
+            chosen = mi.sample_tea_float32(key, i + CANDIDATES, 4) * total < weight
+            return (
+                i + 1,
+                total,
+                dr.select(chosen, beam.direction, direction),
+                dr.select(chosen, beam.reach, reach),
+                dr.select(chosen, beam.sky, sky),
+            )
+
+        count, last = dr.width(key), dr.opaque(mi.UInt32, CANDIDATES)
+        state = (dr.zeros(kind, count) for kind in (mi.UInt32, mi.Float, mi.Vector3f, mi.Float, mi.Bool))
+        state = dr.while_loop(tuple(state), lambda i, *_: i < last, choose, label="candidates")
+        _, total, direction, reach, sky = state
+        shadow, shaded = _shadow_ray(origin, direction, reach), total > 0
+        dr.eval(shadow, key, shaded, sky)
+        shaded &= self._occluded(shadow, mi.UInt32(0), key, shaded, self.proxies.shadow_casters)
+        wall = static.scene.ray_intersect_preliminary(shadow, active=shaded)
+        blocked = shaded & wall.is_valid()
+        shadow.maxt = dr.select(blocked, wall.t, shadow.maxt)
+        dr.eval(shadow, blocked, shaded)
+        # From the directions of the sky, objects also block the light that captured walls behind them reflect.
+        behind = self._occluded(shadow, mi.UInt32(0), key, blocked & sky, self.proxies.shadow_casters)
+        shaded &= ~blocked | behind
+        dr.eval(shaded)
+        return ~shaded
+
+    def _reflected(
+        self, bounces: int, ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, key: mi.UInt32, light: mi.Point2f
+    ) -> mi.Color3f:
+        """Return the colour (Color3f) of objects and visible meshes: reflected light of one emitter and one ray."""
+        dynamic, last = self.proxies.dynamic, bounces == 1
+        if dynamic is None:
+            return mi.Color3f(0)
+        visible, normal = dynamic.is_visible(hit), dynamic.normal_at(hit.prim_index, ~dynamic.is_visible(hit))
+        surface = dynamic.surface_at(hit.prim_index, hit.prim_uv, ~visible)
+        colour, instance = surface.colour, dr.gather(mi.UInt32, dynamic.instances, hit.prim_index, ~visible)
+        if self.proxies.shows_meshes:
+            si = hit.compute_surface_interaction(ray)
+            normal = dr.select(visible, si.n, normal)
+            diffuse = (si.bsdf().flags() & int(mi.BSDFFlags.DiffuseReflection)) != 0
+            colour = dr.select(visible, si.bsdf().eval_diffuse_reflectance(si, diffuse & visible), colour)
+        glossy = dynamic.materials is not None and dynamic.materials.glossy and not last
+        albedo = colour * (1 - surface.metallic) if glossy else colour
+        normal = _towards(normal, ray)
+        origin = _lifted(ray(hit.t), normal)
+        beam = self.emitters.sample(receiver(origin, normal), light, mi.Bool(True))
+        lit, shadow = albedo * beam.irradiance / self.white, _shadow_ray(origin, beam.direction, beam.reach)
+        if glossy:
+            metal = surface.metallic > 0.5
+            lobe = SpecularLobe.of(mi.Vector3f(normal), -ray.d, surface.roughness, surface.metallic, surface.specular)
+            lit += self._mirrored_emitter(lobe, surface, beam, dr.dot(normal, beam.direction), metal)
+        free = dr.max(lit) > 0
+        dr.eval(lit, shadow, key, free, instance)
+        free &= ~self._occluded(shadow, instance, key, free, self.proxies.occluder_scenes)
+        lit = dr.select(free, lit, 0)
+        if last or dynamic.materials is None:
+            return lit
+        point, other = _random_points(key)
+        direction = mi.Frame3f(normal).to_world(mi.warp.square_to_cosine_hemisphere(point))
+        throughput, density = dr.select(visible, 0, albedo), mi.Float(0)
+        if glossy:
+            mirrored, weight, cos_half = lobe.sample(point)
+            direction, fresnel = dr.select(metal, mirrored, direction), lobe.fresnel(cos_half)
+            throughput = dr.select(metal, (surface.colour * fresnel.tint + fresnel.white) * weight, throughput)
+            density = dr.select(metal, lobe.evaluate(direction)[1], 0)
+        onward = mi.Ray3f(origin, direction)
+        throughput = dr.select(dr.dot(normal, direction) > 0, throughput, 0)
+        dr.eval(lit, onward, throughput, normal, density, other)
+        lane = dr.compress(dr.max(throughput) > 0)
+        if dr.width(lane):
+            some = (dr.gather(type(v), v, lane) for v in (onward, key, other, normal, density))
+            onward, key, other, normal, density = some
+            key = key * 0x9E3779B1 + 0x85EBCA77  # other random numbers
+            dr.eval(onward, key, other, normal, density)
+            colour, _, onward.maxt = self._trace(onward, key, other, bounces - 1)
+            if glossy:
+                colour += self._mirrored_emission(onward, normal, density)
+            total = dr.gather(mi.Color3f, lit, lane) + dr.gather(mi.Color3f, throughput, lane) * colour
+            dr.eval(total)
+            dr.scatter(lit, total, lane)
+        return lit
+
+    def _mirrored_emission(self, ray: mi.Ray3f, normal: mi.Normal3f, density: mi.Float) -> mi.Color3f:
+        """Return the light (Color3f) of emitters along mirrored rays; ``density`` is 0 for other rays."""
+        mirrored = density > 0
+        radiance, other = self.emitters.emission(self.scene, receiver(ray.o, normal), ray, mirrored)
+        return dr.select(mirrored, radiance * (power_weight(density, other) * dr.pi / self.white), 0)
+
+    def _mirrored_emitter(
+        self, lobe: SpecularLobe, surface: SurfaceMaterial, beam: Beam, cosine: mi.Float, metal: mi.Bool
+    ) -> mi.Color3f:
+        """Return the specular reflection (Color3f) of sampled emitters. Mirrored rays of metals find them too."""
+        value, density, cos_half = lobe.evaluate(beam.direction)
+        fresnel = lobe.fresnel(cos_half)
+        reflectance = (surface.colour * fresnel.tint + fresnel.white) * (dr.pi * value / dr.maximum(cosine, 1e-3))
+        weight = dr.select(metal, power_weight(beam.density, density), 1)
+        used = (cosine > 0) & (metal | (surface.roughness >= MIN_LAMP_ROUGHNESS))
+        light = reflectance * beam.irradiance * (weight / self.white)
+        return dr.select(used, dr.minimum(light, MAX_REFLECTION), 0)
+
+    def _occluded(
+        self,
+        ray: mi.Ray3f,
+        instance: mi.UInt32,
+        key: mi.UInt32,
+        active: mi.Bool,
+        occluder_scenes: tuple[OccluderScene, ...],
+    ) -> mi.Bool:
+        """Return True for rays that any of some scenes occludes."""
+        free = active
+        for occluder_scene in occluder_scenes:
+            free = free & ~occluder_scene.occluded(ray, instance, key, free)
+            dr.eval(free)
+        return active & ~free
+
+
+def _towards(normal: mi.Normal3f, ray: mi.Ray3f) -> mi.Normal3f:
+    """Return normals towards the origin of rays."""
+    return dr.select(dr.dot(normal, ray.d) > 0, -normal, normal)
+
+
+def _lifted(point: mi.Point3f, normal: mi.Normal3f) -> mi.Point3f:
+    """Return points [m] off a surface by Mitsuba's distance for spawned rays."""
+    return point + normal * ((1 + dr.max(dr.abs(point))) * mi.math.RayEpsilon)
+
+
+def _shadow_ray(origin: mi.Point3f, direction: mi.Vector3f, reach: mi.Float) -> mi.Ray3f:
+    ray = mi.Ray3f(origin, direction)
+    ray.maxt = reach * (1 - 1e-3)
+    return ray
+
+
+def _random_points(key: mi.UInt32) -> tuple[mi.Point2f, mi.Point2f]:
+    """Return two points of the unit square per key."""
+    numbers = [mi.sample_tea_float32(key, mi.UInt32(i), 4) for i in range(4)]
+    return mi.Point2f(*numbers[:2]), mi.Point2f(*numbers[2:])

@@ -54,8 +54,8 @@ _SHIFT_LIMIT = 8.0
 _TRAITS: dict[str, tuple[str, str, str]] = {
     BRIGHTNESS: (
         "of 255",
-        "lower randomise.exposure, or use less light",
-        "raise randomise.exposure, use more light, or darken the surroundings of objects",
+        "lower randomise.exposure, or brighten the surroundings of objects",
+        "raise randomise.exposure, or darken the surroundings of objects",
     ),
     "saturation of objects": ("%", "lower randomise.saturation", "raise randomise.saturation, or reduce gloss"),
     SIZE: ("px", "move cameras farther away", "move cameras nearer"),

@@ -29,7 +29,7 @@ from scipy.spatial import QhullError
 
 from mitsplat.arrays import Float32Array, Float64Array
 from mitsplat.errors import InputError
-from mitsplat.gaussians.material_files import read_materials, write_materials
+from mitsplat.gaussians.material_files import write_materials
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.mesh import check_faces
 from mitsplat.geometry.untrusted_meshes import check_mesh
@@ -160,9 +160,8 @@ class Asset:
         """
         folder = Path(folder)
         spec = read_spec(folder)
-        splats = Splats.load(_named_file(folder, "splats", spec.splats))
-        if spec.materials is not None:
-            splats = _with_materials(splats, _named_file(folder, "materials", spec.materials))
+        materials = None if spec.materials is None else _named_file(folder, "materials", spec.materials)
+        splats = Splats.load(_named_file(folder, "splats", spec.splats), materials=materials)
         if spec.mesh is None:
             mesh = None
         elif spec.mesh == "hull":
@@ -379,13 +378,6 @@ def _named_file(folder: Path, key: str, name: str) -> Path:
         return resolve_inside(folder, name)
     except InputError as error:
         raise InputError(f"{key_place(folder / ASSET_FILE, (key,))}: {error}") from error
-
-
-def _with_materials(splats: Splats, path: Path) -> Splats:
-    materials = read_materials(path, len(splats))
-    if splats.sh_degree:
-        raise InputError(f"{path}: splats with materials must have SH degree 0 (got {splats.sh_degree})")
-    return replace(splats, materials=materials)
 
 
 def _metres_per_unit(spec: AssetSpec, asset: Asset) -> float:

@@ -13,6 +13,7 @@ from mitsplat.asset import ASSET_FILE, Asset, read_mesh, read_spec
 from mitsplat.errors import InputError
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.plugins.parameters import Parameters
+from mitsplat.renderer.light.principled import MAX_SPECULAR
 from mitsplat.renderer.projection.splat_appearance import SplatAppearance
 
 
@@ -30,6 +31,16 @@ class SplatsShape(mi.Mesh):
        - |string|
        - Splat file, required without ``asset``: 3DGS ``.ply``, ``.compressed.ply``, ``.splat``, ``.ksplat``, ``.spz``
          or ``.sog``.
+
+     * - materials
+       - |string|
+       - File of the materials of the Gaussians in ``filename``, whose colours are then base colours; see *Materials* in
+         the conventions. (Default: those of the asset, or none)
+
+     * - metallic
+       - |float|
+       - Metalness from 0 to 1. It makes the colours of ``filename`` base colours of one material with ``roughness`` and
+         ``specular``, without view dependence. (Default: none)
 
      * - proxy
        - |string|
@@ -61,11 +72,12 @@ class SplatsShape(mi.Mesh):
 
      * - roughness
        - |float|
-       - GGX roughness of the highlight, in (0, 1]. (Default: 0.4)
+       - GGX roughness of splats without ``materials``, in (0, 1]. (Default: 0.4)
 
      * - specular
        - |float|
-       - Specular reflectance at normal incidence of the highlight, in [0, 1]. (Default: 0)
+       - Specular reflectance at normal incidence of splats without ``materials``, in [0, 1]. (Default: 0, or 0.04 with
+         ``metallic``)
 
      * - colours
        - |string|
@@ -105,28 +117,21 @@ class SplatsShape(mi.Mesh):
 
         given = Parameters(props, "shape 'splats'")
         folder, filename, proxy_file = (given.string(name, "") for name in ("asset", "filename", "proxy"))
+        materials_file, is_uniform = given.string("materials", ""), "metallic" in props
         units = given.number("units", 0.0)
         if "units" in props and not 0 < units < np.inf:
             raise InputError(f"shape 'splats': 'units' must be finite and > 0 (got {units})")
         asset = None
         if folder:
-            if filename or proxy_file or units:
-                raise InputError("shape 'splats': 'asset' takes the place of 'filename', 'proxy' and 'units'")
+            if filename or materials_file or proxy_file or units:
+                raise InputError(
+                    "shape 'splats': 'asset' takes the place of 'filename', 'materials', 'proxy' and 'units'"
+                )
             path, _ = _stamp(folder, ASSET_FILE)
             asset = _load_asset(path, max(file.stat().st_mtime_ns for file in path.parent.iterdir()))
             splats, proxy = asset.splats, asset.mesh
-        if splats is None:
-            if not filename:
-                raise InputError("shape 'splats': 'asset' or 'filename' is missing")
-            path, modified = _stamp(filename)
-            if not units:
-                _refuse_other_units(path)
-            splats = _load_splats(path, modified)
-        if proxy is None and proxy_file:
-            proxy = _load_mesh(*_stamp(proxy_file))
-        self.splats = splats
-        self.proxy = proxy
-        self.world_from_splats = _matrix(props) @ np.diag([units, units, units, 1.0]) if units else _matrix(props)
+        if is_uniform and (splats is not None or materials_file):
+            raise InputError("shape 'splats': 'metallic' needs 'filename', and no 'materials'")
         self.instance = given.integer("instance", 0, 0, 65535)
         self.dynamic = given.boolean("dynamic", self.instance > 0)
         light = asset.capture_light if asset else "uniform" if self.instance else "scene"
@@ -134,9 +139,29 @@ class SplatsShape(mi.Mesh):
         self.roughness = given.number("roughness", float(asset.roughness) if asset else 0.4)
         if not 0 < self.roughness <= 1:
             raise InputError(f"shape 'splats': 'roughness' must be in (0, 1] (got {self.roughness})")
-        self.specular = given.number("specular", float(asset.specular) if asset and self.instance else 0.0)
+        default = float(asset.specular) if asset and self.instance else 0.04 if is_uniform else 0.0
+        self.specular = given.number("specular", default)
         if not 0 <= self.specular <= 1:
             raise InputError(f"shape 'splats': 'specular' must be in [0, 1] (got {self.specular})")
+        if splats is None:
+            if not filename:
+                raise InputError("shape 'splats': 'asset' or 'filename' is missing")
+            path, modified = _stamp(filename)
+            if not units:
+                _refuse_other_units(path)
+            if is_uniform:
+                metallic = given.number("metallic", 0.0)
+                if not 0 <= metallic <= 1:
+                    given.refuse("metallic", "be in [0, 1]", metallic)
+                specular = min(self.specular / MAX_SPECULAR, 1.0)
+                splats = _load_uniform_splats(path, modified, metallic, self.roughness, specular)
+            else:
+                splats = _load_splats(path, modified, *(_stamp(materials_file) if materials_file else (None, 0)))
+        if proxy is None and proxy_file:
+            proxy = _load_mesh(*_stamp(proxy_file))
+        self.splats = splats
+        self.proxy = proxy
+        self.world_from_splats = _matrix(props) @ np.diag([units, units, units, 1.0]) if units else _matrix(props)
 
         self.appearance = self._read_appearance(given)
 
@@ -208,8 +233,14 @@ def _load_asset(path: Path, _modified: int) -> Asset:
 
 
 @lru_cache(maxsize=64)
-def _load_splats(path: Path, _modified: int) -> Splats:
-    return Splats.load(path)
+def _load_splats(path: Path, _modified: int, materials: Path | None, _materials_modified: int) -> Splats:
+    return Splats.load(path, materials=materials)
+
+
+@lru_cache(maxsize=64)
+def _load_uniform_splats(path: Path, modified: int, metallic: float, roughness: float, specular: float) -> Splats:
+    captured = _load_splats(path, modified, None, 0)
+    return captured.with_material(metallic=metallic, roughness=roughness, specular=specular)
 
 
 @lru_cache(maxsize=64)

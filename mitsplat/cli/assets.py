@@ -17,10 +17,13 @@ from mitsplat.cli.options import (
     DeviceName,
     Faces,
     Kind,
+    Metallic,
     Name,
+    Roughness,
     Seed,
     select_device,
     stage_bar,
+    uniform_material,
 )
 from mitsplat.errors import InputError
 
@@ -146,6 +149,8 @@ def import_(
             "scene: scenes only add shadows (default for environments)."
         ),
     ] = None,
+    metallic: Metallic = None,
+    roughness: Roughness = None,
     faces: Faces = 10000,
     voxels: Annotated[int, typer.Option(help="Grid cells along the longest extent for the mesh reconstruction.")] = 192,
     scene: Annotated[
@@ -173,6 +178,7 @@ def import_(
         without_table=without_table,
         flat_base=flat_base,
         surface=SurfaceSettings(voxels=voxels, faces=faces, blur=1.0),
+        material=uniform_material(metallic, roughness),
     )
     if scene is not None:
         check_scene_path(scene, out, known=size is not None or units is not None)

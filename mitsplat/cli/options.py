@@ -34,6 +34,14 @@ Kind = Annotated[
 ]
 AssetFolder = Annotated[Path, typer.Option("--out", "-o", help="Asset folder to write.")]
 ShDegree = Annotated[int, typer.Option(help="Degree of the spherical harmonics, 0 to 3.")]
+Metallic = Annotated[
+    float | None,
+    typer.Option(help="Metalness, 0 to 1 (metal): the object gets one material, and its colours become base colours."),
+]
+Roughness = Annotated[
+    float | None,
+    typer.Option(help="Roughness, 0 (mirror) to 1: the object gets one material, and its colours become base colours."),
+]
 Faces = Annotated[int, typer.Option(help="Maximum number of mesh faces.")]
 
 Seed = Annotated[int, typer.Option(help="Seed of all random numbers.")]
@@ -189,3 +197,16 @@ def stage_bar(unit: str = "%/s") -> Iterator[Progress]:
         typer.echo(f"{100 * done // total:3d} %: {doing}{left}", err=True)
 
     yield emit
+
+
+def uniform_material(metallic: float | None, roughness: float | None) -> dict[str, float] | None:
+    """Return the given parameters of a material, or None if there are none.
+
+    Raises:
+        InputError: If a value is outside of [0, 1].
+    """
+    given = {name: value for name, value in (("metallic", metallic), ("roughness", roughness)) if value is not None}
+    for name, value in given.items():
+        if not 0 <= value <= 1:
+            raise InputError(f"--{name} must be from 0 to 1 (got {value:g})")
+    return given or None

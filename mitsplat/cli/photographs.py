@@ -18,13 +18,16 @@ from mitsplat.cli.options import (
     DeviceName,
     Faces,
     Kind,
+    Metallic,
     Name,
+    Roughness,
     Seed,
     ShDegree,
     check_new,
     progress_bar,
     select_device,
     stage_bar,
+    uniform_material,
 )
 from mitsplat.errors import InputError, PartialResultError
 
@@ -350,6 +353,8 @@ def asset(
     box: Box = None,
     budget: Budget = None,
     remove: Remove = None,
+    metallic: Metallic = None,
+    roughness: Roughness = None,
     device: DeviceName = "cpu",
 ) -> None:
     """Make an asset from PHOTOS.
@@ -369,6 +374,7 @@ def asset(
         kind=kind,
         settings=ReconstructSettings(size=size),
         remove=tuple(remove or ()),
+        material=uniform_material(metallic, roughness),
     )
     capture = _capture_settings(kind, frames, scale_from, poses, masks, mask_model, pick, pick_not, box)
     fit = replace(default_fit(kind), budget=None if budget is None else _parse_duration(budget))

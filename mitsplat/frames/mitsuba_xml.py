@@ -22,6 +22,7 @@ from mitsplat.frames.camera_response import develop
 from mitsplat.frames.light_properties import light_properties
 from mitsplat.frames.scene_builder import asset_properties
 from mitsplat.frames.untrusted_xml import check_xml
+from mitsplat.gaussians.material_files import write_materials
 from mitsplat.physics.settle import settle_layout
 from mitsplat.progress import Note
 from mitsplat.renderer.layers import describe_sensor
@@ -100,9 +101,12 @@ def _export_assets(scene: Scene, layout: Layout, folder: Path) -> dict[str, Any]
 
 
 def _write_asset(asset: Asset, folder: Path, name: str) -> dict[str, str]:
-    """Write splats and mesh of an asset; return their file properties for the shape plugin ``splats``."""
+    """Write splats, materials and mesh of an asset; return their file properties for the shape plugin ``splats``."""
     asset.splats.save(folder / f"{name}.ply")
     files, mesh = {"filename": f"{folder.name}/{name}.ply"}, asset.mesh
+    if asset.splats.materials is not None:
+        write_materials(asset.splats.materials, folder / f"{name}_materials.ply")
+        files["materials"] = f"{folder.name}/{name}_materials.ply"
     if mesh is not None:
         write_file(folder / f"{name}_proxy.ply", lambda part: mesh.export(part, file_type="ply"))
         files["proxy"] = f"{folder.name}/{name}_proxy.ply"

@@ -25,7 +25,7 @@ MAX_TEXT = 1 << 20
 """Maximum characters of an attribute after parameters are substituted."""
 
 _MAX_LEVELS = 15  # of includes: Mitsuba's own limit
-_FILE_PROPERTIES = ("filename", "asset", "proxy")
+_FILE_PROPERTIES = ("filename", "asset", "materials", "proxy")
 """Names of string properties in which plugins of Mitsuba and of mitsplat expect files."""
 _RESOLVED = {"default": (("name", "value"), ()), "path": (("value",), ()), "include": (("filename",), ("name",))}
 """Elements that this module resolves, with their required and their optional attributes."""

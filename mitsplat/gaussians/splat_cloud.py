@@ -14,7 +14,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -25,6 +25,7 @@ from scipy.spatial.transform import Rotation
 
 from mitsplat.arrays import BoolArray, Float32Array, Float64Array
 from mitsplat.errors import InputError
+from mitsplat.gaussians.material_files import read_materials
 from mitsplat.gaussians.spherical_harmonics import sh_rotation
 from mitsplat.gaussians.splat_files import SplatArrays, read_splats, write_splats
 from mitsplat.gaussians.splat_materials import SplatMaterials
@@ -101,21 +102,29 @@ class Splats:
         return np.stack([self.means.min(axis=0), self.means.max(axis=0)])
 
     @classmethod
-    def load(cls, path: str | PathLike[str], *, units: float = 1.0) -> Splats:
+    def load(
+        cls, path: str | PathLike[str], *, units: float = 1.0, materials: str | PathLike[str] | None = None
+    ) -> Splats:
         """Read a splat file. :mod:`mitsplat.gaussians.splat_files` lists the formats and their precision.
 
         Args:
             path: A ``.ply``, ``.compressed.ply``, ``.splat``, ``.ksplat``, ``.spz`` or ``.sog`` file.
             units: Metres per unit of the file.
+            materials: File of the materials of the Gaussians (:mod:`mitsplat.gaussians.material_files`), if any.
 
         Raises:
-            InputError: If the file is missing, of another kind, or damaged, or if it holds an invalid value.
+            InputError: If a file is missing, of another kind, or damaged, or if it holds an invalid value; or if splats
+                with materials have view-dependent colours.
         """
         arrays = read_splats(Path(path))
         try:
             splats = cls(**arrays._asdict())
         except ValueError as error:
             raise InputError(f"{path}: {error}") from error
+        if materials is not None:
+            splats = replace(splats, materials=read_materials(Path(materials), len(splats)))
+            if splats.sh_degree:
+                raise InputError(f"{path}: splats with materials must have SH degree 0 (got {splats.sh_degree})")
         return splats if units == 1.0 else splats.transformed(np.diag([units, units, units, 1.0]))
 
     def save(self, path: str | PathLike[str]) -> None:
@@ -153,6 +162,15 @@ class Splats:
             sh=sh_rotation(rotation, self.sh_degree).astype(np.float32) @ self.sh,
             materials=None if self.materials is None else self.materials.rotated(rotation),
         )
+
+    def with_material(self, *, metallic: float = 0.0, roughness: float = 0.5, specular: float = 0.5) -> Splats:
+        """Return the splats with one material; their colours without view dependence become base colours.
+
+        Raises:
+            InputError: If a parameter is outside of [0, 1].
+        """
+        materials = SplatMaterials.uniform(len(self), metallic=metallic, roughness=roughness, specular=specular)
+        return replace(self, sh=self.sh[:, :1], materials=materials)
 
     @staticmethod
     def concatenate(parts: Sequence[Splats]) -> Splats:

@@ -7,7 +7,7 @@ up axis is estimated; the user must give the unit or the size.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
@@ -68,6 +68,8 @@ class ImportSettings:
         views: Number of pictures for the surface reconstruction.
         view_size: Edge length of these pictures [px].
         surface: Settings of the surface reconstruction.
+        material: Parameters of the one material that the asset gets, see :meth:`mitsplat.Splats.with_material`; None
+            keeps the captured colours.
     """
 
     up: Axis | None = None
@@ -79,6 +81,7 @@ class ImportSettings:
     views: int = 48
     view_size: int = 480
     surface: SurfaceSettings = field(default_factory=lambda: SurfaceSettings(blur=1.0))
+    material: Mapping[str, float] | None = None
 
     def __post_init__(self) -> None:
         for name in ("units", "size"):
@@ -255,7 +258,7 @@ def import_splats(
     asset = Asset(
         name=name,
         class_name=class_name or name,
-        splats=splats,
+        splats=splats if settings.material is None else splats.with_material(**settings.material),
         mesh=mesh,
         kind=kind,
         density=1000.0 if density is None else density,

@@ -81,6 +81,8 @@ class AssetJob:
         settings: Settings of the reconstruction.
         imported: Mesh that replaces the reconstructed one.
         remove: Things to remove from an environment, PHOTO:X,Y in pixels of the capture's photos.
+        material: Parameters of the one material that the asset gets, see :meth:`mitsplat.Splats.with_material`; None
+            keeps the captured colours.
 
     Raises:
         InputError: If refinement is requested for a mesh that is not reconstructed from masks, or ``remove`` is used
@@ -93,6 +95,7 @@ class AssetJob:
     settings: ReconstructSettings = field(default_factory=ReconstructSettings)
     imported: ImportedMesh | None = None
     remove: tuple[str, ...] = ()
+    material: Mapping[str, float] | None = None
 
     def __post_init__(self) -> None:
         if self.settings.refine is not None and (self.kind != "object" or self.imported is not None):

@@ -166,11 +166,14 @@ def test_asset_passes_every_option_on(
     status = run(
         "asset", "photos", "-o", tmp_path / "mug", "--class", "cup", "--kind", kind, "--size", 0.1,
         "--scale-from", "a.jpg", "b.jpg", 0.5, "--poses", "model", "--masks", "masks", "--budget", "1.5min",
+        "--metallic", 1, "--roughness", 0.3,
     )  # fmt: skip
     assert status == 0
     photos, out, job = calls.args
     assert (photos, out, job.name, job.class_name) == (Path("photos"), tmp_path / "mug", "mug", "cup")
     assert (job.kind, job.settings) == (kind, ReconstructSettings(size=0.1))
+    assert job.material == {"metallic": 1.0, "roughness": 0.3}
+    assert run("asset", "photos", "-o", tmp_path / "mug", "--roughness", 2) == 2
     assert calls.kwargs["capture"] == CaptureSettings(
         kind=kind, scale_from=("a.jpg", "b.jpg", 0.5), poses=Path("model"), masks=Path("masks")
     )

@@ -6,6 +6,7 @@ import re
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import mitsuba as mi
@@ -17,8 +18,9 @@ from typer.testing import CliRunner
 from mitsplat.asset import Asset
 from mitsplat.cli import app
 from mitsplat.errors import InputError
-from mitsplat.frames.mitsuba_xml import describe_error, render_xml
+from mitsplat.frames.mitsuba_xml import _write_asset, describe_error, render_xml
 from mitsplat.frames.untrusted_xml import check_xml
+from mitsplat.gaussians.splat_materials import SplatMaterials
 from mitsplat.runtime.variant import ensure_variant
 from tests.conftest import box_asset
 
@@ -153,6 +155,27 @@ def test_an_asset_shape_has_metres_mesh_and_material(small: Path) -> None:
         np.testing.assert_allclose(shape.proxy.bounds @ at[:3, :3].T, nut.mesh.bounds, atol=1e-5)
     assert [s.capture_light for s in shapes] == ["uniform", "uniform", "uniform", "scene"]
     assert [s.specular for s in shapes] == pytest.approx([0, 0.04, 0.04, 0])
+
+
+def test_splats_have_the_materials_of_a_file_or_one_material(small: Path) -> None:
+    ensure_variant()
+    nut = replace(Asset.load(small / "nut"), name="shiny")
+    varied = SplatMaterials.uniform(len(nut.splats), metallic=1.0, roughness=0.2)
+    (small / "files").mkdir()
+    files = _write_asset(replace(nut, splats=replace(nut.splats, materials=varied)), small / "files", "shiny")
+    shape = '<shape type="splats"> {} </shape>'
+    strings = "".join(f'<string name="{name}" value="{value}"/>' for name, value in files.items())
+    file = f'<string name="filename" value="{files["filename"]}"/>'
+    uniform = f'{file} <float name="metallic" value="0.6"/> <float name="roughness" value="0.3"/>'
+    path = write(
+        small, SCENE.format(shape.format(strings + '<integer name="instance" value="1"/>') + shape.format(uniform))
+    )
+    one, other = sorted((s.splats.materials for s in mi.load_file(str(path)).shapes()), key=lambda m: m.metallic[0])
+    np.testing.assert_allclose(np.stack([one.metallic, one.roughness, one.specular]).T, [[0.6, 0.3, 0.5]] * len(one))
+    np.testing.assert_allclose(np.stack([other.metallic, other.roughness]).T, [[1, 0.2]] * len(other))
+    for wrong in (strings + '<float name="metallic" value="1"/>', uniform.replace("0.6", "1.6")):
+        with pytest.raises(RuntimeError, match=r"'metallic' (needs 'filename', and no|must be in)"):
+            mi.load_file(str(write(small, SCENE.format(shape.format(wrong)))))
 
 
 def test_an_asset_outside_of_the_scenes_folder_is_refused(small: Path) -> None:

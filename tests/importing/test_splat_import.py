@@ -233,8 +233,14 @@ def test_other_formats_import_as_ply_files_do(
 
 
 def test_surroundings_without_a_plane_are_imported_with_a_warning(tmp_path: Path) -> None:
-    splats_on(trimesh.creation.icosphere(3, 0.5), 100).save(tmp_path / "ball.ply")
-    found = import_splats(tmp_path / "ball.ply", name="ball", kind="environment", settings=SMALL)
+    ball = splats_on(trimesh.creation.icosphere(3, 0.5), 100)
+    ball.save(tmp_path / "ball.ply")
+    settings = replace(SMALL, material={"metallic": 1.0})
+    found = import_splats(tmp_path / "ball.ply", name="ball", kind="environment", settings=settings)
+    splats = found.asset.splats
+    assert splats.materials is not None
+    assert (splats.sh_degree, splats.materials.metallic.min(), splats.materials.roughness[0]) == (0, 1, 0.5)
+    np.testing.assert_allclose(splats.sh[:, 0].mean(axis=0), ball.sh[:, 0].mean(axis=0), atol=0.05)
     assert found.support is None
     assert any(miss.startswith("no horizontal surface was found") for miss in found.misses)
 

@@ -137,6 +137,10 @@ def make_asset(
         (out / VERDICT_FILE).unlink(missing_ok=True)
         if edited is not None:
             (out / ASSET_FILE).replace(edited)
+        if job.material is not None:
+            result = replace(
+                result, asset=replace(result.asset, splats=result.asset.splats.with_material(**job.material))
+            )
         result.asset.save(out)
         write_asset_report(out, capture, result)
         # Written last, so that an interrupted run does not look finished.
@@ -221,7 +225,9 @@ def _input_hash(capture: Capture, splats: Path, job: AssetJob) -> str:
             job.imported.metres_per_unit,
         ]
     digest = ContentHash(capture.content_hash)
-    digest.add_json([__version__, job.name, job.class_name, job.kind, asdict(job.settings), imported, job.remove])
+    digest.add_json(
+        [__version__, job.name, job.class_name, job.kind, asdict(job.settings), imported, job.remove, job.material]
+    )
     digest.add_file(splats)
     return digest.hexdigest()
 

@@ -13,7 +13,7 @@ from mitsplat.asset import ASSET_FILE, Asset, read_mesh, read_spec
 from mitsplat.errors import InputError
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.plugins.parameters import Parameters
-from mitsplat.renderer.light.principled import MAX_SPECULAR
+from mitsplat.renderer.materials.principled import MAX_SPECULAR
 from mitsplat.renderer.projection.splat_appearance import SplatAppearance
 
 

@@ -47,7 +47,7 @@ SMALLER = {
     "preview": ["--size", "64x36"],
     "settle": ["-n", "1", "--size", "32x18"],
     "chart": ["-n", "1", "--size", "32x18"],
-    "bake": ["--gaussians", "60", "--sh-degree", "0"],
+    "bake": ["--gaussians", "60"],
     "capture": ["--frames", "17"],
     "asset": ["--budget", "10s"],
     "fit": ["--gaussians", "200", "--iterations", "20", "--edge", "64"],

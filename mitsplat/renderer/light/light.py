@@ -386,10 +386,11 @@ class TracedPixels:
             self.points.steps(dr.arange(mi.UInt32, dr.width(self.points.owner))),
         )
         sums = self._trace_reflections(tracer, glossy)
-        scale, weight = dr.pi / lighting.white, dr.rcp(dr.maximum(estimate.rays, 1))
-        per_ray = dr.rcp(dr.maximum(sums.rays, 1))
-        tinted = estimate.tinted * weight * scale + sums.tinted * per_ray
-        colourless = estimate.colourless * weight * scale + sums.colourless * per_ray
+        per_point = dr.rcp(dr.maximum(self.points.valid_share, 1e-3))
+        weight = per_point / dr.maximum(estimate.rays, 1) * (dr.pi / lighting.white)
+        per_ray = per_point / dr.maximum(sums.rays, 1)
+        tinted = estimate.tinted * weight + sums.tinted * per_ray
+        colourless = estimate.colourless * weight + sums.colourless * per_ray
         rays = dr.maximum(sums.rays, 1)
         means, _ = self.light_filter.mirror([*tinted, *colourless], rays, self.points.is_bent)
         tinted, colourless = mi.Color3f(*means[:3]), mi.Color3f(*means[3:])

@@ -16,6 +16,9 @@ RADIUS = 4
 LOBE_SHARE = 0.5
 """Largest angle between the mirrored directions of two neighbours whose reflections are averaged, over GGX's alpha."""
 
+SAME_GLOSS = 0.1
+"""Largest difference of roughness plus twice the metalness between neighbours whose reflections are averaged."""
+
 NOISE_LIMIT = 4.0
 """Largest squared difference between the light shares of two neighbours that are averaged, in variances."""
 
@@ -55,8 +58,8 @@ class _Traits:
     POSITION, NORMAL = slice(0, 3), slice(3, 6)
     TRAIT, KNOWN, RAYS = range(6, 9)
     SHARE, VARIANCE = range(9, 11)
-    MIRRORED = slice(9, 12)
-    WIDTH = 12
+    MIRRORED, GLOSS = slice(9, 12), 12
+    WIDTH = 16
 
 
 @dataclass(frozen=True, eq=False)
@@ -214,9 +217,10 @@ class LightFilter:
         here = self.here
         mirrored = 2 * dr.dot(here.normal, here.to_camera) * here.normal - here.to_camera
         mirrored = dr.select(bent, 0, mirrored)
+        gloss = here.roughness + 2 * here.metallic
         closeness = dr.cos(dr.maximum(LOBE_SHARE * dr.square(here.roughness), 1e-3))
-        dr.eval(mirrored, closeness)
-        return self._average(values, rays, radius, lobe=(mirrored, closeness))
+        dr.eval(mirrored, closeness, gloss)
+        return self._average(values, rays, radius, lobe=(mirrored, closeness, gloss))
 
     def reflections_for(
         self, brightness: mi.Float, squares: mi.Float, rays: mi.Float, bent: mi.Bool, error: float
@@ -258,18 +262,18 @@ class LightFilter:
         rays: mi.Float,
         radius: int,
         share: tuple[mi.Float, mi.Float] | None = None,
-        lobe: tuple[mi.Vector3f, mi.Float] | None = None,
+        lobe: tuple[mi.Vector3f, mi.Float, mi.Float] | None = None,
     ) -> tuple[list[mi.Float], mi.Float]:
         """Return averages, and the effective number of equally weighted pixels with the same number of rays.
 
         If ``share`` (light share and variance) is given, only neighbours whose share differs by no more than noise
-        count. If ``lobe`` (mirrored direction and smallest cosine) is given, only neighbours that mirror similar
-        directions count.
+        count. If ``lobe`` (mirrored direction, smallest cosine, gloss) is given, only neighbours of the same gloss that
+        mirror similar directions count.
         """
         here = self.here
         known = dr.select(here.known, mi.Float(1), 0)
-        guide = (0, 0, 0) if lobe is None else lobe[0]
-        guide = guide if share is None else (*share, 0)
+        guide = (0, 0, 0, 0) if lobe is None else (*lobe[0], lobe[2])
+        guide = guide if share is None else (*share, 0, 0)
         traits = packed([*here.position, *here.normal, here.trait, known, rays, *guide])  # see _Traits
         alike = mi.Float(1)
         for direction in ((1, 0), (0, 1)):
@@ -285,7 +289,7 @@ class LightFilter:
         direction: tuple[int, int],
         radius: int,
         share: tuple[mi.Float, mi.Float] | None,
-        lobe: tuple[mi.Vector3f, mi.Float] | None,
+        lobe: tuple[mi.Vector3f, mi.Float, mi.Float] | None,
     ) -> tuple[list[mi.Float], mi.Float]:
         """Average over pixels up to ``radius`` away along a direction (x, y); the outermost pixels have half weight.
 
@@ -320,6 +324,7 @@ class LightFilter:
                 near &= dr.square(difference) <= NOISE_LIMIT * variance
             if lobe is not None:
                 near &= dr.dot(mi.Vector3f(*other[_Traits.MIRRORED]), lobe[0]) > lobe[1]
+                near &= dr.abs(other[_Traits.GLOSS] - lobe[2]) < SAME_GLOSS
             same &= (near & (known == here.known)) | (known & ~here.known)
             # With half weights at the ends, the filter spans exactly one period of the dither.
             weight = dr.select(known, 1.0, GUESS_WEIGHT) * dr.select(distance == last, mi.Float(0.5), 1.0)

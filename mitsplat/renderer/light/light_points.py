@@ -96,6 +96,13 @@ class LightPoints:
         """True for bent pixels."""
         return self.slot != UNTRACED
 
+    @property
+    def valid_share(self) -> mi.Float:
+        """Share of the points of every pixel that lie on a surface."""
+        valid = dr.select(self.surface.valid, mi.Float(1), 0)
+        dr.eval(valid)
+        return self.sum_by_pixel(valid) / dr.select(self.is_bent, mi.Float(len(OFFSETS)), 1)
+
     def rows(self, places: mi.UInt32) -> mi.UInt32:
         """Return the rows of the points of some pixels (possibly none)."""
         if not dr.width(places):

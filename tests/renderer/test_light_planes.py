@@ -77,7 +77,9 @@ def test_tiles_beside_a_shadow_or_another_instance_are_not_coarse() -> None:
     tile = np.tile(np.array(planes.number), SAMPLES)
     lit = np.where(tile % 10 >= 6, 4.0, 8.0).astype(np.float32)
     ones = dr.full(mi.Float, 1, len(tile))
-    estimate = Estimate(mi.Color3f(mi.Float(lit / 3)), mi.Color3f(8 * ones / 3), 0 * ones, 0 * ones, 8 * ones, 8 * ones)
+    estimate = Estimate(
+        mi.Color3f(mi.Float(lit / 3)), mi.Color3f(8 * ones / 3), 0 * ones, 0 * ones, 8 * ones, 0 * ones, 8 * ones
+    )
     coarse = np.array(planes.coarse(estimate)).reshape(height, width)
     expected = np.ones((6, 10), bool)
     expected[:2, :2] = False

@@ -40,7 +40,7 @@ from mitsplat.renderer.light.reflections import Reflections, ReflectionTracer
 from mitsplat.renderer.light.reflectors import Reflectors
 from mitsplat.renderer.light.shadow_rays import ShadowTracer
 from mitsplat.renderer.light.unoccluded_light import UnoccludedLight
-from mitsplat.renderer.materials.principled import diffuse_albedo, mirrored_uniform
+from mitsplat.renderer.materials.principled import diffuse_albedo, mirrored_uniform, typical_brightness
 from mitsplat.renderer.materials.radiance_grid import RadianceGrid
 from mitsplat.renderer.occluders.proxies import Proxies
 from mitsplat.renderer.rays.camera_rays import CameraView
@@ -300,14 +300,22 @@ class TracedPixels:
         """Trace more rays from pixels whose light has not reached the wanted error.
 
         The number of rays is doubled until it suffices for the variance of the first rays, see
-        :meth:`LightFilter.rays_for`. Pixels with equal numbers are traced together, so that no lane idles.
+        :meth:`LightFilter.rays_for` and :meth:`LightFilter.reflections_for`. Pixels with equal numbers are traced
+        together, so that no lane idles.
         """
         accuracy, points, order = self.lighting.accuracy, self.points, self.order
         first = accuracy.first
         if first >= accuracy.most:
             return estimate
         metered = self.lighting.pixels if accuracy.metered else 0
-        wanted = self.light_filter.rays_for(points.sums_by_pixel(estimate), accuracy.error, level, metered)
+        sums = points.sums_by_pixel(estimate)
+        wanted = self.light_filter.rays_for(sums, accuracy.error, level, metered)
+        if dr.any(self.here.glossy):
+            scale = dr.pi / dr.mean(self.lighting.white)
+            brightness = typical_brightness(sums.tinted, sums.colourless) * scale
+            squares = sums.mirrored_squares * dr.square(scale)
+            for_lobe = self.light_filter.reflections_for(brightness, squares, sums.rays, points.is_bent, accuracy.error)
+            wanted = dr.maximum(wanted, for_lobe)
         spent = dr.full(mi.UInt32, first, dr.width(self.index))
         if self.coarse is not None:
             on_lattice = dr.gather(mi.Bool, self.coarse.lattice, self.index)

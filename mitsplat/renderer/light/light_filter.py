@@ -71,6 +71,7 @@ class Estimate:
         tinted, colourless: Arriving light in the specular lobe (Color3f): the part that the base colour multiplies, and
             the rest.
         squares: Sum of the squares of the terms of ``base``.
+        mirrored_squares: Sum of the squares of the brightness of light in the specular lobe.
         rays: Number of rays.
     """
 
@@ -79,18 +80,19 @@ class Estimate:
     tinted: mi.Color3f
     colourless: mi.Color3f
     squares: mi.Float
+    mirrored_squares: mi.Float
     rays: mi.Float
 
     @classmethod
     def empty(cls, count: int) -> Estimate:
         """Return an estimate without rays at ``count`` points."""
-        colours, numbers = ([dr.zeros(kind, count) for _ in range(n)] for kind, n in ((mi.Color3f, 4), (mi.Float, 2)))
+        colours, numbers = ([dr.zeros(kind, count) for _ in range(n)] for kind, n in ((mi.Color3f, 4), (mi.Float, 3)))
         return cls(*colours, *numbers)
 
     @property
-    def sums(self) -> tuple[mi.Color3f, mi.Color3f, mi.Color3f, mi.Color3f, mi.Float]:
+    def sums(self) -> tuple[mi.Color3f, mi.Color3f, mi.Color3f, mi.Color3f, mi.Float, mi.Float]:
         """All fields except the number of rays."""
-        return self.lit, self.base, self.tinted, self.colourless, self.squares
+        return self.lit, self.base, self.tinted, self.colourless, self.squares, self.mirrored_squares
 
     def scattered(self, places: mi.UInt32, count: int) -> Estimate:
         """Return this estimate at ``places`` of ``count`` points, without rays at the others."""

@@ -17,11 +17,8 @@ from mitsplat.renderer.light.emitter_sampling import receiver
 from mitsplat.renderer.light.light_tiles import STRIDE
 from mitsplat.renderer.light.reflectors import LANES, Reflectors
 from mitsplat.renderer.light.shadow_rays import ROBERTS, ShadowTracer, ray_origin, sequence_point
-from mitsplat.renderer.materials.principled import power_weight
+from mitsplat.renderer.materials.principled import power_weight, typical_brightness
 from mitsplat.renderer.rays.device_arrays import gathered
-
-TYPICAL_COLOUR = 0.6
-"""Base colour for which the error of reflected light is estimated."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,7 +28,7 @@ class Reflections:
     Attributes:
         tinted: Light that the base colour multiplies (Color3f).
         colourless: Other light (Color3f).
-        brightness: Sum of the brightness of all rays for :data:`TYPICAL_COLOUR`.
+        brightness: Sum of :func:`mitsplat.renderer.light.principled.typical_brightness` of all rays.
         squares: Sum of the squares of this brightness.
         rays: Number of rays.
     """
@@ -91,7 +88,7 @@ class ReflectionTracer:
             number = dr.gather(mi.UInt32, start, row)
             number += (lane - row * some + dr.opaque(mi.UInt32, first)) * dr.gather(mi.UInt32, step, row)
             tinted, colourless = self._light(dr.gather(mi.UInt32, places, row), number)
-            brightness = dr.sum(tinted * TYPICAL_COLOUR + colourless) / 3
+            brightness = typical_brightness(tinted, colourless)
             more = Reflections(
                 mi.Color3f(*[dr.block_sum(c, some) for c in tinted]),
                 mi.Color3f(*[dr.block_sum(c, some) for c in colourless]),

@@ -12,7 +12,7 @@ from mitsplat.renderer.light.emitter_sampling import Beam, Emitters, receiver
 from mitsplat.renderer.light.light_filter import Estimate, packed
 from mitsplat.renderer.light.light_tiles import BLOCK, STRIDE, ShadowTiles, block_order, parity
 from mitsplat.renderer.light.lit_surface import LitSurface
-from mitsplat.renderer.materials.principled import power_weight
+from mitsplat.renderer.materials.principled import power_weight, typical_brightness
 from mitsplat.renderer.occluders.proxies import OccluderScene, Proxies
 from mitsplat.renderer.rays.camera_rays import CameraView
 from mitsplat.renderer.rays.device_arrays import gathered
@@ -208,7 +208,8 @@ class _RayBatch:
             tinted: mi.Color3f,
             colourless: mi.Color3f,
             squares: mi.Float,
-        ) -> tuple[mi.UInt32, mi.Color3f, mi.Color3f, mi.Color3f, mi.Color3f, mi.Float]:
+            mirrored_squares: mi.Float,
+        ) -> tuple[mi.UInt32, mi.Color3f, mi.Color3f, mi.Color3f, mi.Color3f, mi.Float, mi.Float]:
             beam, number, active = self.sample(i)
             occluded = _bits(known, i)
             static_light = free = active
@@ -230,8 +231,9 @@ class _RayBatch:
                 fresnel = lobe.fresnel(cos_half)
                 tinted += mirrored * fresnel.tint
                 colourless += mirrored * fresnel.white
+                mirrored_squares += dr.square(typical_brightness(mirrored * fresnel.tint, mirrored * fresnel.white))
             squares += dr.square(dr.sum(compared))
-            return i + 1, lit, base, tinted, colourless, squares
+            return i + 1, lit, base, tinted, colourless, squares, mirrored_squares
 
         state = dr.zeros(mi.UInt32, dr.width(self.pixel)), *sums
         _, *sums = dr.while_loop(state, lambda i, *_: i < rays, add, label="light")

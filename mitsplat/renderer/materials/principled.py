@@ -26,6 +26,9 @@ MIN_COSINE = 1e-3
 LOBE_LATTICE = (21, 13)
 """Number of points and generator of the lattice that integrates a lobe."""
 
+TYPICAL_COLOUR = 0.6
+"""Base colour for which the error of reflected light is estimated."""
+
 MAX_SPECULAR = 0.08
 """Reflectance of a dielectric at normal incidence with ``specular`` 1."""
 
@@ -119,6 +122,11 @@ class SpecularLobe:
         cosine2 = dr.square(direction.z)
         tangent2 = dr.maximum(1 - cosine2, 0) / dr.maximum(cosine2, 1e-12)
         return dr.select(direction.z > 0, 2 / (1 + dr.sqrt(dr.fma(dr.square(self.alpha), tangent2, 1))), 0)
+
+
+def typical_brightness(tinted: mi.Color3f, colourless: mi.Color3f) -> mi.Float:
+    """Return the mean over channels of reflected light for :data:`TYPICAL_COLOUR`."""
+    return dr.sum(tinted * TYPICAL_COLOUR + colourless) / 3
 
 
 def power_weight(own: mi.Float, other: mi.Float) -> mi.Float:

@@ -14,11 +14,12 @@ from functools import lru_cache
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+import numpy.typing as npt
 import trimesh
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-from mitsplat.arrays import Float32Array
+from mitsplat.arrays import Float32Array, Float64Array
 from mitsplat.gaussians.spherical_harmonics import SH_C0
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.images.colour import decode_srgb
@@ -35,6 +36,12 @@ NEIGHBOURS = 4, 64
 
 FACING = 8
 """Exponent of the cosine between a Gaussian's shortest axis and the normal of the triangle in the Gaussian's weight."""
+
+KINDS = 4
+"""Steps of the material parameters in which Gaussians count as different materials."""
+
+SHORTEST = 3
+"""Edge length of triangles that are not divided further, in standard deviations of the Gaussians."""
 
 MIN_OPACITY = 0.5
 """Opacity above which Gaussians form the surface."""
@@ -104,10 +111,70 @@ class CornerMaterials:
         )
 
 
+@dataclass(frozen=True, eq=False)
+class Triangles:
+    """Parts of the triangles of a mesh.
+
+    Attributes:
+        face: Index of the mesh's triangle, shape (T,).
+        barycentric: Barycentric coordinates of the corners in that triangle, shape (T, 3, 3).
+    """
+
+    face: npt.NDArray[np.intp]
+    barycentric: Float64Array
+
+    def interpolate(self, values: Float64Array) -> Float64Array:
+        """Return values at the corners, shape (T, 3, C), given those at the corners of the mesh, shape (F, 3, C)."""
+        return np.asarray(np.einsum("tij,tjc->tic", self.barycentric, values[self.face]))
+
+
+@lru_cache(maxsize=64)
+def material_triangles(mesh: trimesh.Trimesh, splats: Splats | None) -> Triangles | None:
+    """Divide the triangles near which Gaussians have different materials; return None if no triangle is divided.
+
+    A large triangle may lie below several materials, such as a printed disc on a bolt head. Such triangles are divided
+    into four until their edges are about as short as the distance between Gaussians.
+    """
+    if splats is None or splats.materials is None:
+        return None
+    opaque = splats.opacities > MIN_OPACITY
+    parameters = splats.materials.metallic, splats.materials.roughness, splats.materials.specular
+    kinds, kind = np.unique(np.round(np.stack(parameters)[:, opaque] * KINDS), axis=1, return_inverse=True)
+    if kinds.shape[1] < 2:
+        return None
+    means = splats.means[opaque]
+    trees = [KDTree(means[kind.ravel() == k]) for k in range(kinds.shape[1])]
+    shortest = SHORTEST * float(np.median(splats.scales[opaque].max(axis=1)))
+    divided = np.array([[0, 3, 5], [3, 1, 4], [5, 4, 2], [3, 4, 5]])  # corners 0 to 2, middles of 01, 12 and 20
+    done: list[tuple[npt.NDArray[np.intp], Float64Array]] = []
+    face, barycentric = np.arange(len(mesh.faces)), np.broadcast_to(np.eye(3), (len(mesh.faces), 3, 3))
+    while len(face):
+        corners = np.einsum("tij,tjc->tic", barycentric, mesh.triangles[face])
+        edge = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
+        centre = corners.mean(axis=1)
+        reach = np.linalg.norm(corners - centre[:, None], axis=2).max(axis=1)
+        near = sum((tree.query(centre)[0] <= reach).astype(int) for tree in trees)
+        mixed = (near > 1) & (edge > shortest)
+        done.append((face[~mixed], barycentric[~mixed]))
+        own = barycentric[mixed]
+        points = np.concatenate([own, (own + np.roll(own, -1, axis=1)) / 2], axis=1)
+        face, barycentric = np.repeat(face[mixed], 4), points[:, divided].reshape(-1, 3, 3)
+    if len(done) == 1:
+        return None
+    return Triangles(np.concatenate([f for f, _ in done]), np.concatenate([b for _, b in done]))
+
+
 @lru_cache(maxsize=64)
 def corner_materials(mesh: trimesh.Trimesh, splats: Splats | None) -> Float32Array:
-    """Return the packed materials of all corners of a mesh in the frame of the splats, shape (3 F, 8); cached."""
-    count = 3 * len(mesh.faces)
+    """Return the packed materials of all corners in the frame of the splats, shape (3 T, 8); cached.
+
+    The corners are those of :func:`material_triangles`, or of the T faces of the mesh.
+    """
+    triangles = material_triangles(mesh, splats)
+    corners, facing = mesh.triangles, mesh.face_normals
+    if triangles is not None:
+        corners, facing = triangles.interpolate(corners), facing[triangles.face]
+    count = 3 * len(corners)
     opaque = np.flatnonzero(splats.opacities > MIN_OPACITY) if splats is not None else np.zeros(0, int)
     if splats is None or not len(opaque):
         return np.repeat(_BLACK, count, axis=0)
@@ -117,13 +184,12 @@ def corner_materials(mesh: trimesh.Trimesh, splats: Splats | None) -> Float32Arr
         rows[:, _Columns.METALLIC] = splats.materials.metallic[opaque]
         rows[:, _Columns.ROUGHNESS] = splats.materials.roughness[opaque]
         rows[:, _Columns.SPECULAR] = splats.materials.specular[opaque]
-    corners = mesh.triangles
     places = corners + INSIDE * (corners.mean(axis=1, keepdims=True) - corners)
     neighbours = min(int(np.clip(len(opaque) // count, *NEIGHBOURS)), len(opaque))
     _, nearest = KDTree(splats.means[opaque]).query(places.reshape(-1, 3), range(1, neighbours + 1))
     axes = Rotation.from_quat(splats.quats[opaque]).as_matrix()
     normals = np.take_along_axis(axes, splats.scales[opaque].argmin(axis=1)[:, None, None], axis=2)[..., 0]
-    agreement = np.einsum("nki,ni->nk", normals[nearest], np.repeat(mesh.face_normals, 3, axis=0))
+    agreement = np.einsum("nki,ni->nk", normals[nearest], np.repeat(facing, 3, axis=0))
     weights = agreement**FACING + 1e-9
     return np.einsum("nk,nkc->nc", weights / weights.sum(axis=1, keepdims=True), rows[nearest]).astype(np.float32)
 

@@ -14,7 +14,7 @@ import trimesh
 
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.mesh_normals import CREASE_ANGLE, corner_normals
-from mitsplat.renderer.materials.proxy_materials import CornerMaterials, SurfaceMaterial
+from mitsplat.renderer.materials.proxy_materials import CornerMaterials, SurfaceMaterial, material_triangles
 from mitsplat.renderer.occluders.splat_occlusion import Caster, SplatOccluders
 from mitsplat.renderer.projection.splat_appearance import SplatAppearance
 from mitsplat.renderer.rays.device_arrays import ray_scene, wrapped
@@ -281,13 +281,18 @@ def _cached_scene(parts: _Parts, _variant: str) -> TraceScene:
 
 
 def _merged_scene(parts: _Parts, others: Mapping[str, mi.Shape]) -> TraceScene:
-    corners, normals = [], []
-    for part, _, pose, _, _ in parts:
+    corners, normals, numbers = [], [], []
+    for part, instance, pose, splats, _ in parts:
         world_from_mesh = np.frombuffer(pose).reshape(4, 4)
         turn, shift = world_from_mesh[:3, :3], world_from_mesh[:3, 3]
-        corners.append(part.triangles.reshape(-1, 3) @ turn.T + shift)
-        turn = turn / np.cbrt(np.linalg.det(turn))
-        normals.append(smooth_normals(part).reshape(-1, 3) @ turn.T)
+        own = [part.triangles, smooth_normals(part).reshape(-1, 3, 3)]
+        divided = material_triangles(part, splats)
+        if divided is not None:
+            own = [divided.interpolate(values) for values in own]
+            own[1] /= np.linalg.norm(own[1], axis=2, keepdims=True)
+        corners.append(own[0].reshape(-1, 3) @ turn.T + shift)
+        normals.append(own[1].reshape(-1, 3) @ (turn / np.cbrt(np.linalg.det(turn))).T)
+        numbers.append(np.full(len(own[0]), instance, np.uint32))
     positions = wrapped(mi.Float, np.concatenate(corners).astype(np.float32))
     count = sum(len(c) for c in corners)
     mesh = mi.Mesh("proxies", count, count // 3)
@@ -295,11 +300,10 @@ def _merged_scene(parts: _Parts, others: Mapping[str, mi.Shape]) -> TraceScene:
     params["vertex_positions"] = positions
     params["faces"] = dr.arange(mi.UInt32, count)
     params.update()
-    instances = np.repeat([instance for _, instance, *_ in parts], [len(part.faces) for part, *_ in parts])
     return TraceScene(
         ray_scene({"mesh": mesh, **others}),
         dr.opaque(mi.ShapePtr, mesh),  # a literal shape number would enter the kernels and change with every layout
-        wrapped(mi.UInt32, instances.astype(np.uint32)),
+        wrapped(mi.UInt32, np.concatenate(numbers)),
         positions,
         wrapped(mi.Float, np.concatenate(normals).astype(np.float32)),
         CornerMaterials.of([(part, splats, appearance) for part, _, _, splats, appearance in parts]),

@@ -191,6 +191,7 @@ def test_number_of_rays_is_doubled_until_it_is_the_wanted_one(monkeypatch: pytes
 
     monkeypatch.setattr(LightFilter, "rays_for", spy_rays_for)
     monkeypatch.setattr(LightFilter, "smooth", spy_smooth)
+    monkeypatch.setattr(LightFilter, "reflections_for", lambda _, brightness, *__: 0 * brightness)
     error, most = 0.01, 200
     render_layers(make_integrator(shadow_error=error, shadow_samples=most), load_scene(), CAMERA.resized(64, 64))
     expected = []

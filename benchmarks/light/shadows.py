@@ -53,7 +53,9 @@ from mitsplat.bake.mesh_parts import UNIFORM_LIGHT, MeshPart, bake_lights, mitsu
 from mitsplat.frames.camera_response import light_image
 from mitsplat.geometry.camera import Camera
 from mitsplat.images.colour import LUMINANCE, decode_srgb, encode_srgb
+from mitsplat.quality import resolve_quality
 from mitsplat.renderer.layers import Layers, make_integrator, make_sensor, make_splats_shape, render_layers
+from mitsplat.renderer.light.emitter_sampling import reference_irradiance
 from mitsplat.renderer.occluders.proxies import Occluder, Proxies
 from mitsplat.renderer.path_tracing import trace_radiance
 from mitsplat.runtime.variant import ensure_variant
@@ -510,8 +512,9 @@ class SplatScene:
         return cls(scene, setup.camera, room.white, materials)
 
     def render(self, **properties: Any) -> Layers:
-        """Render the layers with properties of the integrator."""
-        return render_layers(make_integrator(**properties), self.scene, self.camera)
+        """Render the layers with properties of the integrator, and the defaults of scene files otherwise."""
+        quality = replace(resolve_quality("fast"), samples="edges")
+        return render_layers(make_integrator(quality=quality, **properties), self.scene, self.camera)
 
 
 def compare(name: str, light: str, out: Path, samples: int) -> dict[str, Any]:
@@ -521,7 +524,8 @@ def compare(name: str, light: str, out: Path, samples: int) -> dict[str, Any]:
     splats = SplatScene.of(setup, name, light, out)
     materials, white = splats.materials, splats.white
     layers, unbounced = splats.render(white=white), splats.render(white=white, bounce=False)
-    relative = splats.render(bounce=False)
+    open_place = np.ravel(reference_irradiance(splats.scene, (0, 0, 0))).tolist()
+    relative = splats.render(white={"type": "rgb", "value": open_place}, bounce=False)
     pictures = composites(layers, unbounced, relative, truth, materials=materials)
     traced = pictures["traced"]
     ratios = [truth.ratio @ LUMINANCE, layers.light @ LUMINANCE]

@@ -27,6 +27,7 @@ from mitsplat.arrays import Float64Array  # imports mitsplat, which must be impo
 
 import mitsuba as mi
 import numpy as np
+import numpy.typing as npt
 import trimesh
 
 # isort: on
@@ -36,8 +37,8 @@ from benchmarks.light.shadows import (
     SKY,
     Photographer,
     block,
+    coverage,
     difference,
-    nearest_object,
     pose,
     psnr,
     save_sheet,
@@ -131,31 +132,38 @@ def white_solids() -> dict[str, Solid]:
 
 @dataclass(frozen=True, eq=False)
 class Pair:
-    """Linear images (H, W, 3) of both renderers, and the number of the object that covers a pixel completely."""
+    """Linear images (H, W, 3) of both renderers, the object that covers a pixel completely, and the coverage by all."""
 
     ours: Float64Array
     path: Float64Array
-    thing: Any
+    thing: npt.NDArray[np.uint32]
+    cover: Float64Array
 
 
 def render_pair(
-    name: str, solids: Mapping[str, Solid], mat: MeshPart, lights: Sequence[LightSpec], options: argparse.Namespace
+    name: str,
+    solids: Mapping[str, Solid],
+    mat: MeshPart,
+    lights: Sequence[LightSpec],
+    options: argparse.Namespace,
+    *,
+    width: int = 400,
 ) -> Pair:
-    """Render objects on a mat with both renderers, and write the images side by side."""
-    camera = Camera.look_at((0, -0.36, 0.36), (0, -0.01, 0.01), width=400, height=300, fov_x=46.0)
-    shots = Photographer(camera, options.out / "metals", options.samples)
+    """Render objects on a mat with both renderers, and write the images side by side.
+
+    A smaller ``width`` has more paths per pixel: the reference has the same number in all.
+    """
+    camera = Camera.look_at((0, -0.36, 0.36), (0, -0.01, 0.01), width=width, height=width * 3 // 4, fov_x=46.0)
+    shots = Photographer(camera, options.out / "metals", options.samples * (400 // width) ** 2)
     parts, emitters = [solid.placed() for solid in solids.values()], bake_lights(lights)
     path, _ = shots.take(name, [mat, *parts], emitters)
-    near = nearest_object(camera, [mat], [[part] for part in parts])
-    # Excludes pixels at silhouettes: those with another object next to them.
-    sides = [np.roll(near, shift, axis) for axis in (0, 1) for shift in (-1, 1)]
-    thing = np.where(np.all([side == near for side in sides], axis=0), near, 0)
+    thing, cover = coverage(camera, [mat], [[part] for part in parts])
     shapes = {f"thing_{i}": solid.shape(i) for i, solid in enumerate(solids.values(), 1)}
     scene = mi.load_dict({"type": "scene", "mat": part_shape(mat), **shapes, **emitters})
     layers = render_layers(make_integrator(white=float(np.pi), hide_emitters=True), scene, camera)
     ours = layers.rgb.astype(np.float64)
     save_sheet(options.out / f"metals_{name}.png", [ours, path, difference(ours, path)])
-    return Pair(ours, path, thing)
+    return Pair(ours, path, thing, cover)
 
 
 def compare_metals(name: str, solids: Mapping[str, Solid], options: argparse.Namespace) -> None:
@@ -181,9 +189,9 @@ def compare_metals(name: str, solids: Mapping[str, Solid], options: argparse.Nam
 def compare_lamps(options: argparse.Namespace) -> None:
     """Print and record the error of white solids on a white table under two coloured lamps."""
     table = plain("table", block((-0.4, -0.4, -0.03), (0.4, 0.4, 0)), (0.8, 0.8, 0.8))
-    pair = render_pair("lamps", white_solids(), table, LAMPS, options)
+    pair = render_pair("lamps", white_solids(), table, LAMPS, options, width=200)
     error = np.clip(encode_srgb(pair.ours), 0, 1) - np.clip(encode_srgb(pair.path), 0, 1)
-    for what, mask in (("table", pair.thing == 0), ("solids", pair.thing > 0)):
+    for what, mask in (("table", pair.cover == 0), ("solids", pair.thing > 0)):
         rms = float(np.sqrt(np.mean(error[mask] ** 2)))
         print(f"two coloured lamps, {what}: display RMS {rms:.4f}")
         figure(rms, "", "lamps", what, "rms")

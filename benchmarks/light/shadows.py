@@ -14,11 +14,9 @@ display-encoded images:
 
 A table of objects shows the PSNR of ``traced`` and its mean luminance relative to the path-traced image.
 
-``capture`` replaces the splats by path-traced images of the surroundings and of each object alone, so that only the
-error of the light remains. ``direct`` is ``capture`` with the exact ratio of direct light: the optimum of shadow rays
-without light reflected by the objects. ``no bounce`` is ``capture traced`` without the light that surroundings reflect
-onto objects. Objects with materials keep their splats in these columns, because their picture under one light does not
-determine that under another; the columns then state errors of shadows only. Penumbrae are measured in the light ratio
+``capture`` replaces the splats of the surroundings by their path-traced image, so that only the error of the light
+remains. ``direct`` is ``capture`` with the exact ratio of direct light: the optimum of shadow rays without light
+reflected by the objects. Penumbrae are measured in the light ratio
 itself, against direct light that is path-traced on white meshes: the distance [px] between 20 and 80 % of every edge.
 
 Path-traced images and bakes take long; FOLDER stores them for later runs. With 48 paths per pixel, two path-traced
@@ -49,7 +47,7 @@ from scipy.ndimage import binary_dilation, gaussian_filter, map_coordinates, max
 # isort: on
 from benchmarks.record import figure, recording
 from mitsplat.bake.bake import BakeSettings, bake_asset
-from mitsplat.bake.mesh_parts import UNIFORM_LIGHT, MeshPart, bake_lights, mitsuba_scene, read_parts
+from mitsplat.bake.mesh_parts import MeshPart, bake_lights, mitsuba_scene, read_parts
 from mitsplat.frames.camera_response import light_image
 from mitsplat.geometry.camera import Camera
 from mitsplat.images.colour import LUMINANCE, decode_srgb, encode_srgb
@@ -345,7 +343,6 @@ class Truth:
 
     photo: Float64Array
     empty: Float64Array
-    alone: Float64Array
     ratio: Float64Array
     thing: npt.NDArray[np.uint32]
     shadow: BoolArray
@@ -360,29 +357,24 @@ class Truth:
 
 def take_truth(setup: Setup, name: str, light: str, out: Path, samples: int) -> Truth:
     shots = Photographer(setup.camera, out / name, samples)
-    few = Photographer(setup.camera, out / name, samples // 16)  # for even and direct light, which have less noise
+    few = Photographer(setup.camera, out / name, samples // 16)  # for direct light, which has less noise
     lights = bake_lights(lights_of(light, out))
     room, things = read_parts(setup.room), [placed(thing) for thing in setup.things]
     everything = [*room, *(part for parts in things for part in parts)]
     photo, _ = shots.take(f"{light}_photo", everything, lights)
     empty, _ = shots.take(f"{light}_empty", room, lights)
-    alone, cover, seen = np.zeros_like(photo), np.zeros(photo.shape[:2]), nearest_object(setup.camera, room, things)
-    for number, (thing, parts) in enumerate(zip(setup.things, things, strict=True), 1):
-        captured, own = few.take(f"alone_{thing.name}", parts, UNIFORM_LIGHT)
-        alone = np.where((seen == number)[..., None], captured / np.maximum(own, 1e-6)[..., None], alone)
-        cover = np.maximum(own, cover)
     direct, _ = few.take(f"{light}_direct", everything, lights, bounces=1, clay=True)
     bare, _ = few.take(f"{light}_bare", room, lights, bounces=1, clay=True)
     ratio = np.where(bare > 1e-4, direct / np.maximum(bare, 1e-4), 1.0)
+    thing, cover = coverage(setup.camera, room, things)
     surroundings = cover == 0
-    thing = np.where(cover > 0.999, seen, 0)
-    silhouette = binary_dilation((cover > 0) & (cover < 0.999), iterations=1)
+    silhouette = binary_dilation((cover > 0) & (cover < 1), iterations=1)
     darker = surroundings & (photo @ LUMINANCE < 0.97 * (empty @ LUMINANCE)) & (bare @ LUMINANCE > 1e-3)
     # Excludes speckles of noise.
     darker = gaussian_filter(darker.astype(float), 1.5) > 0.5
     shadow = binary_dilation(darker, iterations=3) & surroundings
     edges = ~binary_dilation(~surroundings, iterations=1)
-    return Truth(photo, empty, alone, ratio, thing, shadow, silhouette, edges)
+    return Truth(photo, empty, ratio, thing, shadow, silhouette, edges)
 
 
 def nearest_object(
@@ -395,16 +387,22 @@ def nearest_object(
     return np.array(hit.instance).reshape(camera.height, camera.width)
 
 
-def composites(
-    layers: Layers, unbounced: Layers, relative: Layers, truth: Truth, *, materials: bool
-) -> dict[str, Float64Array]:
+def coverage(
+    camera: Camera, room: Sequence[MeshPart], things: Sequence[Sequence[MeshPart]], *, side: int = 3
+) -> tuple[npt.NDArray[np.uint32], Float64Array]:
+    """Return the number of the object that covers a pixel completely, or 0, and the coverage by all objects (H, W)."""
+    fine = nearest_object(camera.resized(camera.width * side, camera.height * side), room, things)
+    by_pixel = fine.reshape(camera.height, side, camera.width, side)
+    least, most = by_pixel.min(axis=(1, 3)), by_pixel.max(axis=(1, 3))
+    return np.where(least == most, most, 0), (by_pixel > 0).mean(axis=(1, 3))
+
+
+def composites(layers: Layers, relative: Layers, truth: Truth) -> dict[str, Float64Array]:
     """Return linear images to compare with the path-traced one, by name.
 
-    ``relative`` are layers with light relative to an open place, the input of the image-space method. ``materials``
-    states that the objects have materials.
+    ``relative`` are layers with light relative to an open place, the input of the image-space method.
     """
-    on_objects = layers.captured if materials else truth.alone
-    captured = np.where(truth.objects[..., None], on_objects, truth.empty).astype(np.float32)
+    captured = np.where(truth.objects[..., None], layers.captured, truth.empty).astype(np.float32)
     opaque = {"captured": captured, "alpha": np.ones_like(layers.alpha)}
     exact = replace(layers, **opaque)
     ratio = np.where(truth.objects[..., None], layers.light, truth.ratio).astype(np.float32)
@@ -412,7 +410,6 @@ def composites(
     pictures |= {"image": light_image(relative, Composite(shadow="image"))}
     pictures |= {"traced": light_image(layers, Composite())}
     pictures |= {"capture image": light_image(replace(relative, **opaque), Composite(shadow="image"))}
-    pictures |= {"no bounce": lit(replace(unbounced, **opaque))}
     pictures |= {"capture traced": lit(exact)}
     pictures["direct"] = lit(replace(exact, light=ratio))
     return {name: np.asarray(picture, dtype=np.float64) for name, picture in pictures.items()}
@@ -490,26 +487,23 @@ def save_sheet(path: Path, pictures: Sequence[Float64Array], scale: int = 2) -> 
 class SplatScene:
     """A setup as baked splats under one light.
 
-    ``white`` is the irradiance that the surroundings show as white. ``materials`` states that objects have materials.
+    ``white`` is the irradiance that the surroundings show as white.
     """
 
     scene: mi.Scene
     camera: Camera
     white: float
-    materials: bool
 
     @classmethod
     def of(cls, setup: Setup, name: str, light: str, out: Path) -> SplatScene:
         """Return the scene of a setup; its bakes are stored in ``out``."""
         lights = lights_of(light, out)
         room = baked(setup.room, out / name / light, lights, 20000, kind="environment", density=setup.density)
-        assets = [thing.asset(out / name) for thing in setup.things]
         shapes = {"room": shape_of(room, np.eye(4), 0)}
-        for number, (thing, asset) in enumerate(zip(setup.things, assets, strict=True), 1):
-            shapes[f"thing_{number}"] = shape_of(asset, thing.pose, number)
+        for number, thing in enumerate(setup.things, 1):
+            shapes[f"thing_{number}"] = shape_of(thing.asset(out / name), thing.pose, number)
         scene = mi.load_dict({"type": "scene", **shapes, **bake_lights(lights)})
-        materials = any(asset.splats.materials is not None for asset in assets)
-        return cls(scene, setup.camera, room.white, materials)
+        return cls(scene, setup.camera, room.white)
 
     def render(self, **properties: Any) -> Layers:
         """Render the layers with properties of the integrator, and the defaults of scene files otherwise."""
@@ -522,11 +516,10 @@ def compare(name: str, light: str, out: Path, samples: int) -> dict[str, Any]:
     setup = SETUPS[name]()
     truth = take_truth(setup, name, light, out, samples)
     splats = SplatScene.of(setup, name, light, out)
-    materials, white = splats.materials, splats.white
-    layers, unbounced = splats.render(white=white), splats.render(white=white, bounce=False)
+    layers = splats.render(white=splats.white)
     open_place = np.ravel(reference_irradiance(splats.scene, (0, 0, 0))).tolist()
     relative = splats.render(white={"type": "rgb", "value": open_place}, bounce=False)
-    pictures = composites(layers, unbounced, relative, truth, materials=materials)
+    pictures = composites(layers, relative, truth)
     traced = pictures["traced"]
     ratios = [truth.ratio @ LUMINANCE, layers.light @ LUMINANCE]
     ratios.append(pictures["capture image"] @ LUMINANCE / np.maximum(truth.empty @ LUMINANCE, 1e-6))
@@ -537,7 +530,7 @@ def compare(name: str, light: str, out: Path, samples: int) -> dict[str, Any]:
         f"{region} {key}": psnr(picture, truth.photo, mask)
         for key, picture in pictures.items()
         for region, mask in regions.items()
-        if region == "shadow" or not materials or key in ("none", "image", "traced")
+        if region == "shadow" or key in ("none", "image", "traced")
     }
     result |= {f"flip {key}": flip(picture, truth.photo, truth.shadow) for key, picture in pictures.items()}
     result["things"] = {
@@ -569,7 +562,7 @@ def shape_of(asset: Asset, where: Float64Array, instance: int) -> Any:
     )
 
 
-COLUMNS = ("none", "image", "traced", "capture image", "no bounce", "capture traced", "direct")
+COLUMNS = ("none", "image", "traced", "capture image", "capture traced", "direct")
 
 
 def main() -> None:
@@ -620,16 +613,16 @@ def measure(options: argparse.Namespace) -> None:
 def print_things(things: Mapping[tuple[str, str, str], tuple[float, float]]) -> None:
     """Print PSNR and brightness of every object in every image."""
     print(f"\n{'object, traced':40s}{'PSNR [dB]':>12s}{'brightness':>12s}")
-    for key, (error, bright) in things.items():
-        print(f"{' '.join(key):40s}{error:12.1f}{bright:12.2f}")
-        figure(error, "dB", "things", *key, "psnr")
-        figure(bright, "", "things", *key, "brightness")
+    for (name, light, thing), (error, bright) in things.items():
+        print(f"{f'{name} {light} {thing}':40s}{error:12.1f}{bright:12.2f}")
+        figure(error, "dB", "things", name, thing, light, "psnr")
+        figure(bright, "", "things", name, thing, light, "brightness")
     errors, bright = np.array(list(things.values())).T
     print(f"{'mean':40s}{errors.mean():12.1f}{bright.mean():12.2f}")
     print(f"{'worst':40s}{errors.min():12.1f}{bright.min():12.2f} to {bright.max():.2f}")
     figure(errors.mean(), "dB", "things", "mean psnr")
     figure(errors.min(), "dB", "things", "least psnr")
-    figure((bright.min(), bright.max()), "", "things", "brightness")
+    figure((bright.min(), bright.max()), "", "things", "range of brightness")
 
 
 if __name__ == "__main__":

@@ -5,8 +5,8 @@
     python -m benchmarks.again --all        # all that run on this machine from a checkout alone
     python -m benchmarks.again ... --list   # lists the commands and their recorded durations
 
-Commands that name CAPTURE, PHOTOS, DATASET or other input that a checkout lacks, or a GPU, are run by hand. So is
-``python -m scenes.build --out FOLDER``, which without a folder replaces the shipped assets.
+Commands that name CAPTURE, PHOTOS, DATASET, Blender or other input that a checkout lacks, or a GPU, are run by hand. So
+is ``python -m scenes.build --out FOLDER``, which without a folder replaces the shipped assets.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ IDLE = (
     "physics.settle-share",
 )
 """Wall-clock timings, or figures that other programs affect most."""
-ELSEWHERE = re.compile(r"\b[A-Z]{3,}\b|\.splat\b|cuda|\.\./shared")
+ELSEWHERE = re.compile(r"\b[A-Z]{3,}\b|\.splat\b|cuda|\.\./shared|--blender")
 """Input that a checkout lacks."""
 
 

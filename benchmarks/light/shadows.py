@@ -621,7 +621,7 @@ def print_things(things: Mapping[tuple[str, str, str], tuple[float, float]]) -> 
     print(f"{'mean':40s}{errors.mean():12.1f}{bright.mean():12.2f}")
     print(f"{'worst':40s}{errors.min():12.1f}{bright.min():12.2f} to {bright.max():.2f}")
     figure(errors.mean(), "dB", "things", "mean psnr")
-    figure(errors.min(), "dB", "things", "least psnr")
+    figure((errors.min(), errors.max()), "dB", "things", "range of psnr")
     figure((bright.min(), bright.max()), "", "things", "range of brightness")
 
 

@@ -71,7 +71,7 @@ def test_a_background_is_seen_in_empty_pixels_and_changes_no_label(
     scene_data: dict[str, Any], write_scene: WriteScene, tmp_path: Path
 ) -> None:
     scene_data["shapes"][0]["box"]["size"] = [0.4, 0.4, 0.1]
-    scene_data["objects"] = []
+    scene_data |= {"objects": [], "composite": {"exposure": "fixed"}}
     layout = Layout(0, (), NO_PHYSICS)
     plain = ms.render_frame(ms.load_scene(write_scene(scene_data)), 0, layout=layout)
     cv2.imwrite(str(tmp_path / "red.png"), np.full((30, 40, 3), (0, 0, 200), dtype=np.uint8))

@@ -7,6 +7,7 @@ import shutil
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,12 +18,19 @@ from mitsplat.capture.capture import Capture, Photo
 from mitsplat.capture.pipeline.capture_pipeline import CaptureResult, CaptureSettings
 from mitsplat.errors import InputError
 from mitsplat.fit.trainer import FitSettings
+from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.camera import Camera
 from mitsplat.geometry.mesh_distance import DistanceSurface
 from mitsplat.reconstruct.asset_evaluation import Verdict
 from mitsplat.reconstruct.asset_report import _directions
 from mitsplat.reconstruct.pipeline.asset_pipeline import AssetResult, asset_from_photos, make_asset, read_fit
-from mitsplat.reconstruct.reconstruct import AssetJob, ImportedMesh, ReconstructSettings, reconstruct_asset
+from mitsplat.reconstruct.reconstruct import (
+    AssetJob,
+    ImportedMesh,
+    Reconstruction,
+    ReconstructSettings,
+    reconstruct_asset,
+)
 from mitsplat.reconstruct.surface import SurfaceSettings
 from mitsplat.scene.loading.scene_loading import load_scene
 from tests.conftest import KnownObject
@@ -138,6 +146,14 @@ def test_edited_files_are_kept_and_missing_ones_made_again(
     folder, _ = made
     given, out = (Capture.load(folder / "capture"), folder / "fit"), tmp_path / "asset"
     job = AssetJob(name="part", class_name="bracket", settings=SETTINGS)
+    found: list[Reconstruction] = []
+
+    def reconstruct_once(capture: Capture, splats: Splats, job: AssetJob, **options: Any) -> Reconstruction:
+        if not found:
+            found.append(reconstruct_asset(capture, splats, job, **options))
+        return replace(found[0], asset=replace(found[0].asset, name=job.name))
+
+    monkeypatch.setattr("mitsplat.reconstruct.pipeline.asset_pipeline.reconstruct_asset", reconstruct_once)
     shutil.copytree(folder / "asset", out)
     described = out / "asset.yaml"
     described.write_text(described.read_text().replace("friction: 0.5", "friction: 0.31"))

@@ -22,7 +22,7 @@ from mitsplat.geometry.camera import Camera
 from mitsplat.reconstruct.asset_evaluation import show_asset
 from mitsplat.reconstruct.pipeline import asset_pipeline
 from mitsplat.reconstruct.reconstruct import AssetJob, ImportedMesh
-from mitsplat.surroundings.depth_views import depth_views, surface_points
+from mitsplat.surroundings.depth_views import SurfacePoints, depth_views, surface_points
 from mitsplat.surroundings.removal import remove_things
 from mitsplat.surroundings.supports import find_supports, find_walls
 from mitsplat.surroundings.texture_fill import fill_texture
@@ -80,8 +80,18 @@ def captured(tmp_path_factory: pytest.TempPathFactory) -> Capture:
     return photographed(Splats.concatenate([place(), cube()]), tmp_path_factory.mktemp("photos"))
 
 
-def removed(splats: Splats, capture: Capture, *what: str) -> Splats:
-    points = surface_points(depth_views(splats, [photo.camera for photo in capture.training]))
+@pytest.fixture(scope="module")
+def points(captured: Capture) -> SurfacePoints:
+    """Return points on the surfaces of the place and the cube."""
+    return seen_points(Splats.concatenate([place(), cube()]), captured)
+
+
+def seen_points(splats: Splats, capture: Capture) -> SurfacePoints:
+    return surface_points(depth_views(splats, [photo.camera for photo in capture.training]))
+
+
+def removed(splats: Splats, capture: Capture, *what: str, points: SurfacePoints | None = None) -> Splats:
+    points = seen_points(splats, capture) if points is None else points
     return remove_things(splats, what, capture, find_supports(points, UP, DEPTH, within=5), points, DEPTH)[0]
 
 
@@ -143,7 +153,7 @@ def test_a_wall_close_behind_an_object_is_filled(gap: float, tmp_path: Path) -> 
     true, seen = wall(y)
     capture = photographed(Splats.concatenate([bare, true, cube()]), tmp_path)
     fitted = Splats.concatenate([bare, seen, cube()])
-    points = surface_points(depth_views(fitted, [photo.camera for photo in capture.training]))
+    points = seen_points(fitted, capture)
     supports, what = find_supports(points, UP, DEPTH, within=5), pick(12, (*BESIDE, HEIGHT + CUBE))
     left, (thing,) = remove_things(fitted, (what,), capture, supports, points, DEPTH)
     assert 0.5 * CUBE**2 < thing.behind < 2 * CUBE**2 and thing.copied == 1
@@ -156,24 +166,22 @@ def test_a_wall_close_behind_an_object_is_filled(gap: float, tmp_path: Path) -> 
         assert np.abs(shown.alpha - whole.alpha).max() < 0.05
 
 
-def test_sides_of_objects_are_not_taken_for_walls(captured: Capture) -> None:
-    splats = Splats.concatenate([place(), cube()])
-    points = surface_points(depth_views(splats, [photo.camera for photo in captured.training]))
+def test_sides_of_objects_are_not_taken_for_walls(points: SurfacePoints) -> None:
     assert find_walls(points, DEPTH) == []
 
 
-def test_picks_without_an_object_on_a_surface_are_refused(captured: Capture) -> None:
+def test_picks_without_an_object_on_a_surface_are_refused(captured: Capture, points: SurfacePoints) -> None:
     splats = Splats.concatenate([place(), cube()])
     on_table, on_floor = (pick(5, spot) for spot in ((0.1, -0.1, HEIGHT), (0.0, -1.2, HEIGHT - 0.8)))
     for spot in (on_table, on_floor, "photo05.png:3,1", "photo05.png:-50,900"):  # and pixels without splats
         with pytest.raises(
             InputError, match=r"photo05\.png:.*: a thing to remove must stand on one of the detected level surfaces"
         ):
-            removed(splats, captured, spot)
+            removed(splats, captured, spot, points=points)
     with pytest.raises(InputError, match=r"none\.png:3,4: a pick must be PHOTO:X,Y with a registered photo"):
-        removed(splats, captured, "none.png:3,4")
+        removed(splats, captured, "none.png:3,4", points=points)
     with pytest.raises(InputError, match=r"a pixel must be given as X,Y \(got 3\)"):
-        removed(splats, captured, "photo05.png:3")
+        removed(splats, captured, "photo05.png:3", points=points)
     with pytest.raises(InputError, match="removed only from an environment"):
         AssetJob(name="mug", remove=("photo05.png:3,4",))
     mesh = ImportedMesh(trimesh.creation.box((1, 1, 1)))

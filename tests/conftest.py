@@ -30,11 +30,16 @@ from mitsplat.scene.loading.scene_loading import load_scene
 from mitsplat.scene.scene import Scene
 from mitsplat.scene.spec.scene_spec import FORMATS
 from mitsplat.storage.cache import cache_folder
+from tests.forks import Forks
 
 if TYPE_CHECKING:
     from mitsplat.capture.pipeline.capture_pipeline import CaptureResult
 
 WriteScene = Callable[..., Path]
+
+# Child processes load bytecode. Threads of BLAS would wait for each other, because several processes share the cores.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+os.environ |= {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
 
 # Every run uses the same examples without a deadline. benchmarks/scale/fuzz.py tries new ones.
 hypothesis.settings.register_profile("suite", derandomize=True, deadline=None, database=None)
@@ -112,6 +117,14 @@ def no_fsync() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(os, "fsync", lambda file: None)
         yield
+
+
+@pytest.fixture(scope="session")
+def forks() -> Iterator[Forks]:
+    """Return the process of this session that forks."""
+    made = Forks()
+    yield made
+    made.close()
 
 
 _tried_meshes: dict[tuple[str, bytes], str] = {}

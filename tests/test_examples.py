@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+
+from tests.forks import Forks
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 NOTEBOOKS = sorted(EXAMPLES.glob("*.ipynb"))
@@ -33,19 +33,18 @@ def test_a_notebook_is_stored_without_outputs_and_ends_in_checks(path: Path) -> 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
-def test_each_notebook_runs(path: Path) -> None:
-    """Each notebook runs in a new process, because it chooses Mitsuba's variant and imports as a user would."""
-    done = subprocess.run(
-        [sys.executable, "-c", "\n\n".join(code_of(path))], cwd=EXAMPLES, capture_output=True, text=True, timeout=600
-    )
+def test_each_notebook_runs(forks: Forks, path: Path) -> None:
+    """Each notebook runs in a process of its own, because it chooses Mitsuba's variant and imports as a user would."""
+    done = forks.run("\n\n".join(code_of(path)), folder=EXAMPLES)
     assert done.returncode == 0, done.stderr[-3000:]
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("path", SCRIPTS, ids=lambda path: path.stem)
-def test_each_example_script_runs(path: Path, tmp_path: Path) -> None:
+def test_each_example_script_runs(forks: Forks, path: Path, tmp_path: Path) -> None:
     assert "\nassert " in path.read_text()
     given = [] if path.stem == "read_labels" else [tmp_path]
-    done = subprocess.run([sys.executable, path, *given], cwd=tmp_path, capture_output=True, text=True, timeout=600)
+    code = "import runpy, sys\nrunpy.run_path(sys.argv.pop(1), run_name='__main__')"
+    done = forks.run(code, path, *given, folder=tmp_path)
     assert done.returncode == 0, done.stderr[-3000:]
     assert any(tmp_path.iterdir()) == bool(given)

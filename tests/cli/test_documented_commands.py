@@ -1,7 +1,7 @@
 """Commands in README and docs, each run in a process of its own on real input without mocks.
 
 Other tests call the same code in a process where earlier tests have set up imports, Mitsuba's variant and caches. Here
-nothing is set up.
+nothing is set up: the first command runs in a new process, the others in forks of :mod:`tests.forks`.
 """
 
 from __future__ import annotations
@@ -33,6 +33,7 @@ from tests import rendered
 from tests.capture.lighting import room
 from tests.cli.typed import run as type_in
 from tests.conftest import box_asset
+from tests.forks import MITSPLAT, Forks
 
 if TYPE_CHECKING:
     from mitsplat.capture.pipeline.capture_pipeline import CaptureResult
@@ -40,8 +41,6 @@ if TYPE_CHECKING:
 ROOT = Path(__file__).parents[2]
 PAGES = (ROOT / "README.md", *sorted(path for path in (ROOT / "docs").rglob("*.md") if "_build" not in path.parts))
 """Pages with documented commands. README comes first, because it creates most files that the others name."""
-MITSPLAT = Path(sys.executable).with_name("mitsplat")
-
 SMALLER = {
     "render": ["-n", "2", "--size", "64x36"],
     "preview": ["--size", "64x36"],
@@ -49,7 +48,6 @@ SMALLER = {
     "chart": ["-n", "1", "--size", "32x18"],
     "bake": ["--gaussians", "60"],
     "capture": ["--frames", "17"],
-    "asset": ["--budget", "10s"],
     "fit": ["--gaussians", "200", "--iterations", "20", "--edge", "64"],
     "mesh": ["--faces", "300", "--voxels", "48"],
     "import": ["--faces", "300", "--voxels", "48"],
@@ -61,18 +59,22 @@ SMALLER = {
 """Options that replace or extend those of documented commands to make them fast."""
 
 
-def run(command: list[str] | str, folder: Path, **variables: str) -> subprocess.CompletedProcess[str]:
-    """Run a command as a user's shell would, with the caches of this session."""
-    environment = {**os.environ, "PATH": f"{MITSPLAT.parent}{os.pathsep}{os.environ['PATH']}", **variables}
-    return subprocess.run(
-        command,
-        cwd=folder,
-        env=environment,
-        shell=isinstance(command, str),
-        capture_output=True,
-        text=True,
-        timeout=400,
-    )
+SMALLER_SETTINGS = {
+    "asset": """
+from mitsplat.reconstruct.pipeline import asset_pipeline as module
+from mitsplat.reconstruct.surface import SurfaceSettings
+
+full = module.asset_from_photos
+
+def small(*arguments, fit, **options):
+    photos, out, job = arguments
+    job = replace(job, settings=replace(job.settings, surface=SurfaceSettings(voxels=48, faces=300)))
+    return full(photos, out, job, fit=replace(fit, gaussians=200, iterations=20, size=64), **options)
+
+module.asset_from_photos = small
+""",
+}
+"""Code that makes commands fast by settings for which they have no options."""
 
 
 def blocks(page: Path, language: str) -> list[str]:
@@ -164,13 +166,29 @@ FILMED = [words for words in SHOWN if words[1] in PHOTOGRAPHS and any(word.endsw
 """Commands that begin with a video."""
 
 
-def obey(words: list[str], desk: Path, *, good: tuple[int, ...] = (0,)) -> None:
+def expand(words: list[str], folder: Path) -> list[str]:
+    """Replace patterns of file names as a shell does."""
+    found = [sorted(folder.glob(word)) if "*" in word else [word] for word in words]
+    return [str(name) for names in found for name in names]
+
+
+def obey(words: list[str], desk: Path, forks: Forks, *, good: tuple[int, ...] = (0,)) -> None:
     """Run a fast version of a command and check that it ends without an error or developer messages."""
-    typed = re.sub(r"'([^' ]*[>*][^' ]*)'", r"\1", shlex.join(smaller(words)))  # quotes for the shell
-    done = run(typed, desk)
-    told = f"{typed}: status {done.returncode}\n{done.stdout[-800:]}\n{done.stderr[-2000:]}"
+    typed = expand(smaller(words)[1:], desk)
+    file = None
+    if ">" in typed:
+        *typed, _, file = typed
+    if words == SHOWN[0]:
+        command = [Path(sys.executable).with_name("mitsplat"), *typed]
+        done = subprocess.run(command, cwd=desk, capture_output=True, text=True, timeout=400)
+    else:
+        changes = SMALLER_SETTINGS.get(typed[0], "")
+        done = forks.run(f"from dataclasses import replace\n{changes}\n{MITSPLAT}", *typed, folder=desk)
+    told = f"{shlex.join(words)}: status {done.returncode}\n{done.stdout[-800:]}\n{done.stderr[-2000:]}"
     assert done.returncode in good, told
     assert "Traceback" not in done.stderr and "CUDA driver" not in done.stderr, told
+    if file is not None:
+        (desk / file).write_text(done.stdout)
 
 
 def test_every_command_is_shown_in_the_documentation() -> None:
@@ -182,13 +200,13 @@ def test_every_command_is_shown_in_the_documentation() -> None:
 
 
 @pytest.mark.slow
-def test_every_documented_command_runs_in_its_own_process(desk: Path) -> None:
+def test_every_documented_command_runs_in_its_own_process(desk: Path, forks: Forks) -> None:
     for words in SHOWN:
         if words[1] in ("view", "compare", *DETECTORS):  # view is tested in tests/view; the others run below
             continue
         if words[1] not in PHOTOGRAPHS and "assets/mug" not in words:
             # Status 1 means findings, which a box of 60 Gaussians and small machines may give.
-            obey(words, desk, good=(0, 1) if words[1] in ("check", "doctor") else (0,))
+            obey(words, desk, forks, good=(0, 1) if words[1] in ("check", "doctor") else (0,))
     made = ("out/cell/report.html", "frame.png", "drop.gif", "assets/gear/asset.yaml", "board.pdf", "frame.xml")
     assert [
         name for name in (*made, "frame_again.png", "out/whole/contact_sheet.jpg") if not (desk / name).stat().st_size
@@ -206,15 +224,15 @@ def lay_photographs(desk: Path) -> None:
 
 
 @pytest.mark.slow
-def test_the_documented_compare_commands_run(desk: Path) -> None:
+def test_the_documented_compare_commands_run(desk: Path, forks: Forks) -> None:
     lay_photographs(desk)
     for words in SHOWN:
         if words[1] == "compare":
-            obey(words, desk)
+            obey(words, desk, forks)
 
 
 @pytest.mark.slow
-def test_the_documented_detector_commands_run(desk: Path) -> None:
+def test_the_documented_detector_commands_run(desk: Path, forks: Forks) -> None:
     """Runs after the commands above, which have written the dataset."""
     if not all(map(find_spec, ("torch", "torchvision", "ultralytics"))):
         pytest.skip("Ultralytics and PyTorch are not installed")
@@ -223,20 +241,20 @@ def test_the_documented_detector_commands_run(desk: Path) -> None:
     lay_photographs(desk)
     for words in SHOWN:
         if words[1] in DETECTORS:
-            obey(words, desk)
+            obey(words, desk, forks)
     assert (desk / "runs/mixed/evaluation/photographs-all/report.html").stat().st_size
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("page", [page for page in PAGES if blocks(page, "python")], ids=lambda page: page.stem)
-def test_the_documented_python_examples_run(desk: Path, page: Path) -> None:
+def test_the_documented_python_examples_run(desk: Path, forks: Forks, page: Path) -> None:
     """Each page runs in one process, after the commands above, which have written the datasets of some pages."""
     # tests/frames/test_torch_dataset.py tests the loop over endless frames with a detector of the reader's.
     known = [text for text in blocks(page, "python") if "import torch" not in text and "from torch" not in text]
     if not (desk / "runs").is_dir():
         known = [text for text in known if "runs/" not in text]
     code = "\n".join(known)
-    done = subprocess.run([sys.executable, "-c", code], cwd=desk, capture_output=True, text=True, check=False)
+    done = forks.run(code, folder=desk)
     assert (done.returncode, done.stderr) == (0, "")
 
 
@@ -252,7 +270,9 @@ def test_the_scene_of_the_guide_is_valid(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_the_documented_photo_commands_make_an_asset(desk: Path, captured: tuple[Path, Path, CaptureResult]) -> None:
+def test_the_documented_photo_commands_make_an_asset(
+    desk: Path, forks: Forks, captured: tuple[Path, Path, CaptureResult]
+) -> None:
     """The cameras exist already, as if a first run had ended after structure from motion, which takes a minute.
 
     Status 4 comes from a tiny fit, which misses the quality thresholds of an asset.
@@ -266,17 +286,17 @@ def test_the_documented_photo_commands_make_an_asset(desk: Path, captured: tuple
         if "--remove" in words:  # needs a detected table; runs in tests/surroundings/test_removal.py
             continue
         if words not in FILMED and (words[1] in PHOTOGRAPHS or "assets/mug" in words):
-            obey(words, desk, good={"asset": (0, 4), "mesh": (0, 4), "check": (0, 1)}.get(words[1], (0,)))
+            obey(words, desk, forks, good={"asset": (0, 4), "mesh": (0, 4), "check": (0, 1)}.get(words[1], (0,)))
     made = ("captures/mug/capture.png", "assets/mug/report.html", "assets/mug_by_stages/report.html")
     assert [name for name in made if not (desk / name).stat().st_size] == []
 
 
 @pytest.mark.slow
-def test_the_documented_video_commands_make_a_capture(tmp_path: Path) -> None:
+def test_the_documented_video_commands_make_a_capture(forks: Forks, tmp_path: Path) -> None:
     (tmp_path / "videos").mkdir()
     rendered.render_video(tmp_path / "videos/mug.mp4")
     for words in FILMED:
-        obey(words, tmp_path)
+        obey(words, tmp_path, forks)
         made = tmp_path / words[words.index("-o") + 1]
         assert (made / "capture.png").stat().st_size
         assert len(list((made / "images").iterdir())) >= 0.75 * len(list((made / "frames").glob("*.jpg"))) > 12

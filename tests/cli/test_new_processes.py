@@ -15,6 +15,7 @@ import mitsplat
 from mitsplat.errors import InputError
 from mitsplat.scene.loading.scene_loading import load_scene
 from tests.conftest import WriteScene, box_asset
+from tests.forks import PACKAGES
 
 ROOT = Path(__file__).parents[2]
 
@@ -87,6 +88,7 @@ FURTHER = {
 
 FORKS = (
     BEGIN
+    + PACKAGES
     + """
 import json, os, traceback
 import mitsuba, pkgutil

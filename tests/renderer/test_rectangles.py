@@ -64,3 +64,23 @@ def test_sampled_directions_and_light_equal_those_of_mitsuba() -> None:
 def test_other_lamps_are_sampled_by_mitsuba(other: dict[str, Any]) -> None:
     scene = mi.load_dict({"type": "scene", "lamp": LAMPS["plain"], "other": other})
     assert Rectangles.of(scene.emitters(), None) is None
+
+
+def test_rays_towards_sample_points_hit_the_rectangle_with_the_same_radiance_and_density() -> None:
+    scene = mi.load_dict({"type": "scene", **{name: LAMPS[name] for name in ("plain", "mirrored", "flipped")}})
+    table = Rectangles.of(scene.emitters(), None)
+    assert table is not None
+    rng, count = np.random.default_rng(3), 500
+    place = mi.Point3f(rng.uniform(-0.3, 0.3, (3, count)).astype(np.float32))
+    index = mi.UInt32(rng.integers(0, len(scene.emitters()), count).astype(np.uint32))
+    point = mi.Point2f(rng.uniform(0.01, 0.99, (2, count)).astype(np.float32))
+    direction, _, light, density = table.towards(place, index, point)
+    number, distance, radiance, same = (np.array(v, np.float64) for v in table.along(mi.Ray3f(place, direction)))
+    hit = scene.ray_intersect(mi.Ray3f(place, direction))
+    front = (np.array(light).sum(axis=0) > 0) & (number == np.array(index))
+    assert front.sum() > 100
+    np.testing.assert_allclose(distance[front], np.array(hit.t)[front], rtol=1e-4)
+    np.testing.assert_allclose(same[front], np.array(density)[front], rtol=1e-3)
+    np.testing.assert_allclose(radiance[:, front] / same[front], np.array(light)[:, front], rtol=1e-3)
+    backwards = table.along(mi.Ray3f(place, -direction))[1]
+    assert np.isinf(np.array(backwards)).mean() > 0.9

@@ -138,23 +138,36 @@ class Emitters:
 
         Lamps are visible up to the rays' ``maxt``, and the sky behind them. Point-shaped and parallel lights are not.
         """
+        lamp, number, radiance, density = self._lamps_along(scene, si, ray, active)
+        radiance = dr.select(lamp, radiance, 0)
+        density = dr.select(lamp, density * dr.gather(mi.Float, self.choice.chances, number, lamp), 0)
+        if self.sky is not None:
+            pointer = dr.gather(mi.EmitterPtr, self.pointers, self.sky)
+            open_sky = active & ~lamp & (ray.maxt == dr.inf)
+            sky, sky_density = self._sky_towards(si, ray.d, pointer, open_sky)
+            radiance = dr.select(open_sky, sky, radiance)
+            chance = dr.gather(mi.Float, self.choice.chances, self.sky)
+            density = dr.select(open_sky, sky_density * chance, density)
+        return radiance, density
+
+    def _lamps_along(
+        self, scene: mi.Scene, si: mi.SurfaceInteraction3f, ray: mi.Ray3f, active: mi.Bool
+    ) -> tuple[mi.Bool, mi.UInt32, mi.Color3f, mi.Float]:
+        """Return True where rays hit a lamp before ``maxt``, its index, its radiance, and the density of its samples.
+
+        The back of a lamp lets rays pass.
+        """
+        if self.rectangles is not None:
+            number, distance, radiance, density = self.rectangles.along(ray)
+            return active & (distance < ray.maxt), number, radiance, density
         hit = scene.ray_intersect_preliminary(ray, active=active)
         lamp = active & hit.is_valid() & hit.shape.is_emitter()
         at = hit.compute_surface_interaction(ray, mi.RayFlags.Minimal, lamp)
         emitter = at.shape.emitter()
         towards = mi.DirectionSample3f(scene, at, si)
         number = dr.gather(mi.UInt32, self._index_of, dr.reinterpret_array(mi.UInt32, emitter), lamp)
-        radiance = dr.select(lamp, emitter.eval(at, lamp), 0)
-        density = emitter.pdf_direction(si, towards, lamp) * dr.gather(mi.Float, self.choice.chances, number, lamp)
-        density = dr.select(lamp, density, 0)
-        if self.sky is not None:
-            pointer = dr.gather(mi.EmitterPtr, self.pointers, self.sky)
-            open_sky = active & ~hit.is_valid() & (ray.maxt == dr.inf)
-            sky, sky_density = self._sky_towards(si, ray.d, pointer, open_sky)
-            radiance = dr.select(open_sky, sky, radiance)
-            chance = dr.gather(mi.Float, self.choice.chances, self.sky)
-            density = dr.select(open_sky, sky_density * chance, density)
-        return radiance, density
+        radiance = emitter.eval(at, lamp)
+        return lamp & (dr.max(radiance) > 0), number, radiance, emitter.pdf_direction(si, towards, lamp)
 
     def _sky_towards(
         self, si: mi.SurfaceInteraction3f, direction: mi.Vector3f, emitter: mi.EmitterPtr, active: mi.Bool

@@ -61,7 +61,7 @@ PLANE_FACTOR = 2
 quarter larger than with rays at each pixel. With this factor the error is the same.
 """
 
-FIRST_REFLECTIONS = 4, 16
+FIRST_REFLECTIONS = 4, 8
 """Reflection rays per pixel of a dielectric and of a metal before the error estimate."""
 
 MIN_COVER = 0.2
@@ -416,34 +416,28 @@ class TracedPixels:
     def _trace_reflections(self, tracer: ReflectionTracer, glossy: mi.UInt32) -> Reflections:
         """Trace reflection rays at the pixels ``glossy`` and return their sums by pixel.
 
-        A pixel gets more rays if its first rays have not reached the wanted error: a power of two, so that pixels with
-        equal numbers are traced together.
+        A pixel gets more rays if its first rays have not reached the wanted error.
         """
         error, most, points = self.lighting.accuracy.error, self.lighting.accuracy.most, self.points
         total = Reflections.empty(dr.width(points.owner))
 
-        def trace(which: mi.Bool, rays: int) -> None:
-            places = dr.compress(which)
-            if not dr.width(places):
-                return
-            for rows, number in points.parts(dr.gather(mi.UInt32, glossy, places), rays):
-                total.add(rows, tracer.trace(rows, dr.gather(mi.Float, total.rays, rows), number))
+        def trace(places: mi.UInt32, by_pixel: mi.UInt32) -> None:
+            rows = points.rows(places)
+            rays = points.ray_count(dr.gather(mi.UInt32, by_pixel, dr.gather(mi.UInt32, points.owner, rows)), rows)
+            total.add(rows, tracer.trace(rows, dr.gather(mi.Float, total.rays, rows), rays))
 
-        if error == 0:
-            trace(glossy == glossy, most)
-            return points.sums_by_pixel(total)
-        metal = dr.gather(mi.Float, self.here.metallic, glossy) > 0
-        for which, first in zip((~metal, metal), FIRST_REFLECTIONS, strict=True):
-            trace(which, min(first, most))
+        for_dielectric, for_metal = (min(first, most) if error > 0 else most for first in FIRST_REFLECTIONS)
+        trace(glossy, dr.select(self.here.metallic > 0, dr.opaque(mi.UInt32, for_metal), for_dielectric))
         sums = points.sums_by_pixel(total)
-        wanted = self.light_filter.reflections_for(sums.brightness, sums.squares, sums.rays, points.is_bent, error)
-        missing = dr.gather(mi.Float, dr.minimum(wanted, most) - sums.rays, glossy)
-        dr.eval(missing)
-        rays, below = min(FIRST_REFLECTIONS), 0
-        while below < most:
-            trace((missing > below) & (missing <= rays), rays)
-            rays, below = 2 * rays, rays
-        return points.sums_by_pixel(total)
+        if error > 0:
+            wanted = self.light_filter.reflections_for(sums.brightness, sums.squares, sums.rays, points.is_bent, error)
+            more = mi.UInt32(dr.ceil(dr.clip(wanted - sums.rays, 0, most)))
+            dr.eval(more)
+            places = dr.gather(mi.UInt32, glossy, dr.compress(dr.gather(mi.UInt32, more, glossy) > 0))
+            if dr.width(places):
+                trace(places, more)
+                sums = points.sums_by_pixel(total)
+        return sums
 
 
 def _doublings(wanted: mi.Float, rays: int, most: int) -> tuple[mi.UInt32, mi.UInt32]:

@@ -119,15 +119,6 @@ class LightPoints:
         """Return the number of rays (at least 1) of the points ``rows``, given the ``rays`` (UInt32) of pixels."""
         return dr.select(rows < dr.opaque(mi.UInt32, self.count), rays, dr.maximum(rays // len(OFFSETS), 1))
 
-    def parts(self, places: mi.UInt32, rays: int) -> list[tuple[mi.UInt32, int]]:
-        """Return the rows of the points of some pixels in parts with equal numbers of rays, which share ``rays``."""
-        rows = self.rows(places)
-        middle = rows < dr.opaque(mi.UInt32, self.count)
-        parts = ((middle, rays), (~middle, max(rays // len(OFFSETS), 1)))
-        found = [(dr.gather(mi.UInt32, rows, dr.compress(which)), number) for which, number in parts]
-        dr.eval(found)
-        return [(part, number) for part, number in found if dr.width(part)]
-
     def steps(self, rows: mi.UInt32) -> tuple[mi.UInt32, mi.UInt32]:
         """Return the first ray number of each point in the sequence of its pixel, and the step to its next ray."""
         count = dr.opaque(mi.UInt32, self.count)

@@ -72,3 +72,38 @@ class Rectangles:
             mi.Color3f(*row[_Columns.RADIANCE]) * seen,
             dr.select(seen > 0, dr.rcp(seen), 0),
         )
+
+    def along(self, ray: mi.Ray3f) -> tuple[mi.UInt32, mi.Float, mi.Color3f, mi.Float]:
+        """Intersect rays with the luminous sides of all rectangles.
+
+        Returns:
+            Index of the nearest rectangle, its distance [m] (infinite for a miss), its radiance, and the density [1/sr]
+            of :meth:`towards` in the direction of the ray.
+        """
+        count, lanes = dr.opaque(mi.UInt32, dr.width(self.rows) // _Columns.WIDTH), dr.width(ray.d)
+        origin, direction = mi.Vector3f(ray.o), mi.Vector3f(ray.d)
+
+        def nearest(
+            i: mi.UInt32, number: mi.UInt32, distance: mi.Float, radiance: mi.Color3f, density: mi.Float
+        ) -> tuple[mi.UInt32, mi.UInt32, mi.Float, mi.Color3f, mi.Float]:
+            row = dr.gather(mi.ArrayXf, self.rows, i, shape=(_Columns.WIDTH, lanes))
+            columns = _Columns.CORNER, _Columns.ACROSS, _Columns.UP, _Columns.NORMAL
+            corner, across, up, normal = (mi.Vector3f(*row[column]) for column in columns)
+            facing = -dr.dot(direction, normal)
+            reach = dr.dot(origin - corner, normal) / facing
+            point = origin + direction * reach - corner
+            x, y = (dr.dot(point, edge) / dr.squared_norm(edge) for edge in (across, up))
+            inside = (facing > 0) & (reach > 0) & (x >= 0) & (x <= 1) & (y >= 0) & (y <= 1) & (reach < distance)
+            return (
+                i + 1,
+                dr.select(inside, i, number),
+                dr.select(inside, reach, distance),
+                dr.select(inside, mi.Color3f(*row[_Columns.RADIANCE]), radiance),
+                dr.select(inside, dr.square(reach) / facing, density),
+            )
+
+        nothing = [dr.zeros(kind, lanes) for kind in (mi.UInt32, mi.UInt32, mi.Color3f, mi.Float)]
+        state = nothing[0], nothing[1], dr.full(mi.Float, dr.inf, lanes), nothing[2], nothing[3]
+        _, *found = dr.while_loop(state, lambda i, *_: i < count, nearest, label="rectangles along rays")
+        number, distance, radiance, density = found
+        return number, distance, radiance, density

@@ -14,11 +14,12 @@ import drjit as dr
 import mitsuba as mi
 
 from mitsplat.renderer.light.emitter_sampling import receiver
+from mitsplat.renderer.light.light_filter import packed
 from mitsplat.renderer.light.light_tiles import STRIDE
 from mitsplat.renderer.light.reflectors import LANES, Reflectors
 from mitsplat.renderer.light.shadow_rays import ROBERTS, ShadowTracer, ray_origin, sequence_point
 from mitsplat.renderer.materials.principled import power_weight, typical_brightness
-from mitsplat.renderer.rays.device_arrays import gathered
+from mitsplat.renderer.rays.device_arrays import concatenated, gathered
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,33 +72,39 @@ class ReflectionTracer:
     reflectors: Reflectors
     steps: tuple[mi.UInt32, mi.UInt32]
 
-    def trace(self, places: mi.UInt32, done: mi.Float, rays: int) -> Reflections:
-        """Trace ``rays`` rays from each of the points ``places``, which had ``done`` rays before."""
+    def trace(self, places: mi.UInt32, done: mi.Float, rays: mi.UInt32) -> Reflections:
+        """Trace ``rays`` (at least one) from each of the points ``places``, which had ``done`` rays before."""
         count = dr.width(places)
+        first = dr.prefix_sum(rays)
+        dr.eval(first, rays)
+        lanes = first[count - 1] + rays[count - 1]
+        if lanes > LANES and count > 1:
+            halves = dr.arange(mi.UInt32, count // 2), dr.arange(mi.UInt32, count - count // 2) + count // 2
+            parts = [self.trace(*(dr.gather(type(v), v, half) for v in (places, done, rays))) for half in halves]
+            return Reflections(*[concatenated([getattr(p, f.name) for p in parts]) for f in fields(Reflections)])
+        # The lanes of a point are adjacent: marks at the first lanes, summed up, are the numbers of the points.
+        marks = dr.zeros(mi.UInt32, lanes)
+        dr.scatter(marks, mi.UInt32(1), first, first > 0)
+        row = dr.cumsum(marks)
         begin, step = (dr.gather(mi.UInt32, values, places) for values in self.steps)
-        pixel = dr.gather(mi.UInt32, self.tracer.pixel, places)
-        start = self.tracer.sequence_start(pixel) + (begin + mi.UInt32(done) * step) * STRIDE
-        step *= STRIDE
-        dr.eval(start, step)
-        total = Reflections.empty(count)
-        together = max(1, min(rays, LANES // count))
-        for first in range(0, rays, together):
-            some = min(together, rays - first)
-            lane = dr.arange(mi.UInt32, count * some)
-            row = lane // dr.opaque(mi.UInt32, some)
-            number = dr.gather(mi.UInt32, start, row)
-            number += (lane - row * some + dr.opaque(mi.UInt32, first)) * dr.gather(mi.UInt32, step, row)
-            tinted, colourless = self._light(dr.gather(mi.UInt32, places, row), number)
-            brightness = typical_brightness(tinted, colourless)
-            more = Reflections(
-                mi.Color3f(*[dr.block_sum(c, some) for c in tinted]),
-                mi.Color3f(*[dr.block_sum(c, some) for c in colourless]),
-                dr.block_sum(brightness, some),
-                dr.block_sum(dr.square(brightness), some),
-                dr.full(mi.Float, some, count),
-            )
-            total.add(dr.arange(mi.UInt32, count), more)
-        return total
+        start = self.tracer.sequence_start(dr.gather(mi.UInt32, self.tracer.pixel, places))
+        dr.eval(row, begin, step, start)
+        number = dr.arange(mi.UInt32, lanes) - dr.gather(mi.UInt32, first, row)
+        number += mi.UInt32(dr.gather(mi.Float, done, row))
+        number = dr.gather(mi.UInt32, begin, row) + number * dr.gather(mi.UInt32, step, row)
+        number = dr.gather(mi.UInt32, start, row) + number * STRIDE
+        tinted, colourless = self._light(dr.gather(mi.UInt32, places, row), number)
+        light = packed([*tinted, *colourless, typical_brightness(tinted, colourless)])
+
+        def add(i: mi.UInt32, total: mi.ArrayXf, squares: mi.Float) -> tuple[mi.UInt32, mi.ArrayXf, mi.Float]:
+            own = dr.gather(mi.ArrayXf, light, first + i, shape=(8, count))
+            return i + 1, total + own, dr.fma(own[6], own[6], squares)
+
+        state = dr.zeros(mi.UInt32, count), dr.zeros(mi.ArrayXf, (8, count)), dr.zeros(mi.Float, count)
+        _, total, squares = dr.while_loop(state, lambda i, *_: i < rays, add, label="sum of reflections")
+        sums = mi.Color3f(*total[0:3]), mi.Color3f(*total[3:6]), total[6], squares, mi.Float(rays)
+        dr.eval(sums)
+        return Reflections(*sums)
 
     def _light(self, places: mi.UInt32, number: mi.UInt32) -> tuple[mi.Color3f, mi.Color3f]:
         """Return the tinted and the colourless light of one ray per lane; each scene has a kernel of its own."""

@@ -27,7 +27,7 @@ LAYERS = (
     ("labels", "physics", "renderer.meshes"),
     ("renderer.differentiation", "renderer.light", "scene.loading"),
     ("capture.pipeline",),
-    ("capture", "renderer.occluders", "renderer.splatting", "scene.planning"),
+    ("capture", "renderer.emitters", "renderer.occluders", "renderer.splatting", "scene.planning"),
     ("renderer.materials", "scene"),
     ("asset", "renderer.projection"),
     ("capture.boards", "capture.isolation", "capture.lighting", "gaussians", "pages", "renderer.rays", "scene.spec"),

@@ -52,8 +52,8 @@ from mitsplat.frames.camera_response import light_image
 from mitsplat.geometry.camera import Camera
 from mitsplat.images.colour import LUMINANCE, decode_srgb, encode_srgb
 from mitsplat.quality import resolve_quality
+from mitsplat.renderer.emitters.emitter_sampling import reference_irradiance
 from mitsplat.renderer.layers import Layers, make_integrator, make_sensor, make_splats_shape, render_layers
-from mitsplat.renderer.light.emitter_sampling import reference_irradiance
 from mitsplat.renderer.occluders.proxies import Occluder, Proxies
 from mitsplat.renderer.path_tracing import trace_radiance
 from mitsplat.runtime.variant import ensure_variant

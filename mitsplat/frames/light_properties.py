@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitsplat.frames.scene_builder import SceneBuilder
-from mitsplat.renderer.light.emitter_sampling import reference_irradiance
+from mitsplat.renderer.emitters.emitter_sampling import reference_irradiance
 from mitsplat.scene.planning.frame_lights import expand_rooms, lights_at
 from mitsplat.scene.scene import Scene
 from mitsplat.scene.spec.light_spec import EnvironmentLight

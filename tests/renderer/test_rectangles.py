@@ -12,8 +12,8 @@ import pytest
 from mitsplat.runtime.variant import ensure_variant
 
 ensure_variant()
-from mitsplat.renderer.light.emitter_sampling import receiver  # noqa: E402
-from mitsplat.renderer.light.rectangle_lights import Rectangles  # noqa: E402
+from mitsplat.renderer.emitters.emitter_sampling import receiver  # noqa: E402
+from mitsplat.renderer.emitters.rectangle_lights import Rectangles  # noqa: E402
 
 
 def lamp(place: tuple[float, float, float], scale: tuple[float, float, float], **more: Any) -> dict[str, Any]:

@@ -6,8 +6,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsplat.renderer.light.emitter_sampling import sky_irradiance
-from mitsplat.renderer.light.sky_irradiance import _folded, _unfolded
+from mitsplat.renderer.emitters.emitter_sampling import sky_irradiance
+from mitsplat.renderer.emitters.sky_irradiance import _folded, _unfolded
 from mitsplat.runtime.variant import ensure_variant
 
 

@@ -29,8 +29,8 @@ from functools import cached_property
 import drjit as dr
 import mitsuba as mi
 
+from mitsplat.renderer.emitters.emitter_sampling import Emitters
 from mitsplat.renderer.light.bounce import Bounce, object_cover, trace_bounce
-from mitsplat.renderer.light.emitter_sampling import Emitters
 from mitsplat.renderer.light.light_filter import UNTRACED, Estimate, LightFilter, LightMeans
 from mitsplat.renderer.light.light_planes import MIN_ROWS, CoarseLight, Planes, between_samples, plane_codes
 from mitsplat.renderer.light.light_points import LightPoints

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from mitsplat.renderer.light.emitter_sampling import Emitters
+from mitsplat.renderer.emitters.emitter_sampling import Emitters
 from mitsplat.renderer.light.light_filter import Estimate
 from mitsplat.renderer.light.light_tiles import BLOCK
 from mitsplat.renderer.light.lit_surface import LitSurface, VisibleSurfaces

@@ -13,7 +13,7 @@ from dataclasses import dataclass, fields
 import drjit as dr
 import mitsuba as mi
 
-from mitsplat.renderer.light.emitter_sampling import receiver
+from mitsplat.renderer.emitters.emitter_sampling import receiver
 from mitsplat.renderer.light.light_filter import packed
 from mitsplat.renderer.light.light_tiles import STRIDE
 from mitsplat.renderer.light.reflectors import LANES, Reflectors

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from mitsplat.renderer.light.emitter_sampling import Beam, Emitters, receiver
+from mitsplat.renderer.emitters.emitter_sampling import Beam, Emitters, receiver
 from mitsplat.renderer.light.light_tiles import STRIDE
 from mitsplat.renderer.materials.principled import SpecularLobe, power_weight
 from mitsplat.renderer.materials.proxy_materials import SurfaceMaterial

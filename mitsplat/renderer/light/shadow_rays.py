@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from mitsplat.renderer.light.emitter_sampling import Beam, Emitters, receiver
+from mitsplat.renderer.emitters.emitter_sampling import Beam, Emitters, receiver
 from mitsplat.renderer.light.light_filter import Estimate, packed
 from mitsplat.renderer.light.light_tiles import BLOCK, STRIDE, ShadowTiles, block_order, parity
 from mitsplat.renderer.light.lit_surface import LitSurface

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from mitsplat.renderer.light.emitter_sampling import Emitters, receiver
+from mitsplat.renderer.emitters.emitter_sampling import Emitters, receiver
 from mitsplat.renderer.light.light_points import LightPoints
 from mitsplat.renderer.light.lit_surface import LitSurface
 from mitsplat.renderer.rays.device_arrays import gathered

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from mitsplat.renderer.light.emitter_sampling import receiver
+from mitsplat.renderer.emitters.emitter_sampling import receiver
 from mitsplat.renderer.meshes.mirrored_splats import SplatHits, SplatMirror
 from mitsplat.renderer.meshes.visible_meshes import VisibleMeshes, has_bsdf_flag
 from mitsplat.renderer.occluders.proxies import Proxies

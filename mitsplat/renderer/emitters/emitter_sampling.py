@@ -10,8 +10,8 @@ import mitsuba as mi
 import numpy as np
 
 from mitsplat.arrays import Float64Array
-from mitsplat.renderer.light.rectangle_lights import Rectangles
-from mitsplat.renderer.light.sky_irradiance import SkyIrradiance
+from mitsplat.renderer.emitters.rectangle_lights import Rectangles
+from mitsplat.renderer.emitters.sky_irradiance import SkyIrradiance
 from mitsplat.renderer.materials.principled import lattice_point
 from mitsplat.renderer.rays.device_arrays import wrapped
 

@@ -50,8 +50,8 @@ _MIN_OBJECT_SIZE, _MAX_OBJECT_SIZE = 0.001, 5.0
 _MIN_SIZE, _MAX_SIZE = 1e-5, 1e5
 """Size range of any mesh [m]; 32-bit floats are too coarse outside of it."""
 _FIT_VIEWS = 12
-_BASE_COLOUR_SAMPLES, _RADIANCE_SAMPLES = 4, 16
-"""Rays per pixel of the pictures for the fit."""
+_BASE_COLOUR_SAMPLES, _RADIANCE_SAMPLES = (4, 9), (16, 36)
+"""Rays per pixel of the pictures for the fit and for the comparison."""
 _STAGES = {
     "placing Gaussians": 40,
     "tracing their radiance": 16,
@@ -206,7 +206,7 @@ def bake_asset(
         picture, samples = partial(_trace_picture, scene), _RADIANCE_SAMPLES
     if settings.fit_steps:
         fit_cameras = fit_cameras or _orbit(surface.mesh, _FIT_VIEWS, turn=0.0)
-        splats = _fit_splats(splats, picture, fit_cameras, samples, settings, stages)
+        splats = _fit_splats(splats, picture, fit_cameras, samples[0], settings, stages)
     splats = replace(splats, materials=materials)
     stages("finding convex pieces")
     proxy = make_proxy(parts, settings.proxy_faces)
@@ -230,7 +230,7 @@ def bake_asset(
         stages.end()
         return BakeResult(asset, float("nan"), float("nan"), surface=surface.mesh, warnings=tuple(warnings))
     cameras = cameras or _orbit(surface.mesh, settings.verify_views)
-    views, psnr, psnr_object = compare_views(picture, splats, cameras, settings.seed, stages.step)
+    views, psnr, psnr_object = compare_views(picture, splats, cameras, samples[1], settings.seed, stages.step)
     brightness = None
     if lights is None and (finish is None or finish.colour is None):
         brightness = compare_with_textures(mesh, splats, world_from_file(metres_per_unit, up))

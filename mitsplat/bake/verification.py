@@ -24,7 +24,6 @@ from mitsplat.renderer.layers import render_splats
 
 PictureFunction = Callable[[Camera, int, int], tuple[Float64Array, Float64Array]]
 """Function of a camera, the rays per pixel and a seed that returns a linear picture (H, W, 3) and coverage (H, W)."""
-_PICTURE_SAMPLES = 16
 _SAMPLES_PER_PART = 4000
 _MAX_SIGMAS = 3.0
 """Distance to the next Gaussian, in its standard deviations, beyond which a point of the mesh counts as hidden."""
@@ -51,6 +50,7 @@ def compare_views(
     picture: PictureFunction,
     splats: Splats,
     cameras: Sequence[Camera],
+    samples: int,
     seed: int,
     progress: Progress,
 ) -> tuple[tuple[BakedView, ...], float, float]:
@@ -60,6 +60,7 @@ def compare_views(
         picture: Function that renders the mesh.
         splats: Splats of the mesh.
         cameras: The views.
+        samples: Rays per pixel of the pictures.
         seed: Seed of the pictures.
         progress: Progress callback.
 
@@ -69,7 +70,7 @@ def compare_views(
     views, errors, on_object = [], [], []
     for number, camera in enumerate(cameras):
         progress(number, len(cameras), "comparing with the mesh")
-        truth, cover = picture(camera, _PICTURE_SAMPLES, seed + number)
+        truth, cover = picture(camera, samples, seed + number)
         mesh, shown = (np.clip(encode_srgb(rgb), 0, 1) for rgb in (truth, render_splats(splats, camera).rgb))
         error = (shown - mesh) ** 2
         errors.append(error.mean())

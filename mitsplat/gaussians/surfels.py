@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from mitsplat.arrays import BoolArray, Float64Array, Int64Array
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.mesh_normals import CREASE_ANGLE
+from mitsplat.runtime.cores import usable_cores
 
 _OPACITY = 0.98
 _PACKING = 0.62
@@ -288,9 +289,9 @@ def _independent_set(count: int, pairs: Int64Array, rng: np.random.Generator) ->
 def _query(tree: KDTree, points: npt.ArrayLike, **options: Any) -> tuple[Float64Array, Int64Array]:
     """Return distances and indices of nearest neighbours.
 
-    All processors are used; the result does not depend on their number.
+    All cores of the process are used; the result does not depend on their number.
     """
-    found: tuple[Float64Array, Int64Array] = tree.query(points, workers=-1, **options)
+    found: tuple[Float64Array, Int64Array] = tree.query(points, workers=usable_cores(), **options)
     return found
 
 

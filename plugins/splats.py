@@ -14,6 +14,7 @@ from mitsplat.errors import InputError
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.plugins.parameters import Parameters
 from mitsplat.renderer.materials.principled import MAX_SPECULAR
+from mitsplat.renderer.materials.proxy_materials import GlossChange
 from mitsplat.renderer.projection.splat_appearance import SplatAppearance
 
 
@@ -72,7 +73,7 @@ class SplatsShape(mi.Mesh):
 
      * - roughness
        - |float|
-       - GGX roughness of splats without ``materials``, in (0, 1]. (Default: 0.4)
+       - GGX roughness in (0, 1]. It replaces that of all materials. (Default: that of the materials; else 0.4)
 
      * - specular
        - |float|
@@ -161,9 +162,17 @@ class SplatsShape(mi.Mesh):
             proxy = _load_mesh(*_stamp(proxy_file))
         self.splats = splats
         self.proxy = proxy
+        self.gloss = self._read_gloss(props, is_uniform)
         self.world_from_splats = _matrix(props) @ np.diag([units, units, units, 1.0]) if units else _matrix(props)
 
         self.appearance = self._read_appearance(given)
+
+    def _read_gloss(self, props: mi.Properties, is_uniform: bool) -> GlossChange:
+        """Return the roughness and specular that replace those of all materials of the splats."""
+        if self.splats.materials is None or is_uniform:
+            return GlossChange()
+        specular = min(self.specular / MAX_SPECULAR, 1.0)
+        return GlossChange(self.roughness if "roughness" in props else None, specular if "specular" in props else None)
 
     def _read_appearance(self, given: Parameters) -> SplatAppearance | None:
         """Read the appearance; return None if the scene sets neither colours nor wear."""

@@ -156,10 +156,9 @@ def make_asset_shape(
 
 def asset_properties(asset: Asset, instance: int, appearance: ObjectAppearance | None = None) -> dict[str, Any]:
     """Return the properties of the shape plugin ``splats`` for an asset; instance 0 is the environment."""
-    return {
-        "instance": instance,
-        "capture_light": asset.capture_light,
-        "roughness": float(asset.roughness),
-        "specular": float(asset.specular) if instance else 0.0,
-        **(appearance.properties() if appearance else {}),
-    }
+    gloss = {"roughness": float(asset.roughness), "specular": float(asset.specular) if instance else 0.0}
+    drawn = appearance.properties() if appearance else {}
+    if asset.splats.materials is not None:  # drawn values replace those of all materials
+        drawn = {name: value for name, value in drawn.items() if gloss.get(name) != value}
+        gloss = {}
+    return {"instance": instance, "capture_light": asset.capture_light, **gloss, **drawn}

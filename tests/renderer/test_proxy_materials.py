@@ -10,7 +10,8 @@ from mitsplat.gaussians.spherical_harmonics import SH_C0
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.gaussians.splat_materials import SplatMaterials
 from mitsplat.images.colour import encode_srgb
-from mitsplat.renderer.layers import make_integrator
+from mitsplat.renderer.composition.scene_contents import ContentsReader
+from mitsplat.renderer.layers import make_integrator, make_splats_shape
 from mitsplat.renderer.materials.proxy_materials import corner_materials
 from mitsplat.renderer.occluders.proxies import Occluder, Proxies
 from mitsplat.renderer.projection.splat_appearance import SplatAppearance
@@ -60,6 +61,17 @@ def test_hits_have_the_material_of_their_side_of_an_edge() -> None:
     si = proxies.dynamic.scene.ray_intersect_preliminary(rays())
     colour = np.array(proxies.dynamic.surface_at(si.prim_index, si.prim_uv, si.is_valid()).colour)[:, :3]
     np.testing.assert_allclose(colour, [0.1 * sides, np.full(3, 0.5), 1 - 0.1 * sides], atol=1e-5)
+
+
+def test_roughness_of_a_placement_replaces_that_of_all_its_materials() -> None:
+    make_integrator()
+    own = 0.2 + 0.1 * np.array([5, 1, 2])
+    for changed, expected in (({}, own), ({"roughness": 0.45}, 0.45)):
+        shape = make_splats_shape(six_sides(metal=True), proxy=BOX, instance=1, **changed)
+        scene = mi.load_dict({"type": "scene", "box": shape})
+        hit, _ = ContentsReader().read(scene, splat_shadows=False).proxies.nearest(rays())
+        np.testing.assert_allclose(np.array(hit.roughness)[:3], expected, atol=1e-6)
+        np.testing.assert_allclose(np.array(hit.metallic)[:3], np.array([5, 1, 2]) / 5, atol=1e-6)
 
 
 def test_captured_splats_are_diffuse_with_the_colours_of_their_placement() -> None:

@@ -99,7 +99,9 @@ class ContentsReader:
 def _occluder(shape: mi.Shape) -> Occluder:
     """Return the proxy of a ``splats`` shape; captured surroundings take no material, see :class:`RadianceGrid`."""
     splats = shape.splats if shape.dynamic or shape.splats.materials is not None else None
-    return Occluder(shape.proxy, shape.instance, shape.dynamic, shape.world_from_splats, splats, shape.appearance)
+    return Occluder(
+        shape.proxy, shape.instance, shape.dynamic, shape.world_from_splats, splats, shape.appearance, shape.gloss
+    )
 
 
 def same_shapes(some: Sequence[mi.Shape], others: Sequence[mi.Shape]) -> bool:

@@ -87,4 +87,6 @@ def _parameters(shape: mi.Shape) -> tuple[bool, float, float, float, bool]:
     roughness, metallic, specular = (
         float(values.mean()) for values in (materials.roughness, materials.metallic, materials.specular)
     )
+    roughness = roughness if shape.gloss.roughness is None else shape.gloss.roughness
+    specular = specular if shape.gloss.specular is None else shape.gloss.specular
     return True, roughness, metallic, specular, False

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -59,6 +60,16 @@ _BLACK = np.array([[0, 0, 0, 0, 1, 0, 0, 0]], np.float32)
 """Material of surfaces without Gaussians."""
 
 
+class GlossChange(NamedTuple):
+    """Roughness and specular that replace those of all materials of a placement; None keeps them."""
+
+    roughness: float | None = None
+    specular: float | None = None
+
+
+UNCHANGED_GLOSS = GlossChange()
+
+
 @dataclass(frozen=True, eq=False)
 class SurfaceMaterial:
     """Materials at points.
@@ -74,6 +85,26 @@ class SurfaceMaterial:
     specular: mi.Float
 
 
+class ProxyPart(NamedTuple):
+    """Mesh of a placement with what determines its materials.
+
+    Attributes:
+        mesh: Surface in its own frame [m].
+        instance: Instance id.
+        pose: Bytes of the 16 floats of the pose.
+        splats: Gaussians of the materials; None for a black surface.
+        appearance: Change of the colours.
+        gloss: Change of roughness and specular.
+    """
+
+    mesh: trimesh.Trimesh
+    instance: int
+    pose: bytes
+    splats: Splats | None
+    appearance: SplatAppearance | None
+    gloss: GlossChange
+
+
 @dataclass(frozen=True, eq=False)
 class CornerMaterials:
     """Materials of the corners of triangles.
@@ -87,12 +118,12 @@ class CornerMaterials:
     glossy: bool
 
     @classmethod
-    def of(cls, parts: list[tuple[trimesh.Trimesh, Splats | None, SplatAppearance | None]]) -> CornerMaterials | None:
+    def of(cls, parts: list[ProxyPart]) -> CornerMaterials | None:
         """Build the table of merged meshes; return None if no mesh has Gaussians."""
-        if all(splats is None for _, splats, _ in parts):
+        if all(part.splats is None for part in parts):
             return None
         values = np.concatenate(
-            [_recoloured(corner_materials(mesh, splats), appearance) for mesh, splats, appearance in parts]
+            [_changed(corner_materials(part.mesh, part.splats), part.appearance, part.gloss) for part in parts]
         )
         glossy = bool((values[:, [_Columns.METALLIC, _Columns.SPECULAR]] > 0).any())
         return cls(wrapped(mi.Float, values), glossy)
@@ -194,11 +225,15 @@ def corner_materials(mesh: trimesh.Trimesh, splats: Splats | None) -> Float32Arr
     return np.einsum("nk,nkc->nc", weights / weights.sum(axis=1, keepdims=True), rows[nearest]).astype(np.float32)
 
 
-def _recoloured(corners: Float32Array, appearance: SplatAppearance | None) -> Float32Array:
-    """Return the corners of a placement with the colour matrix of its appearance; dirt is ignored."""
-    if appearance is None:
+def _changed(corners: Float32Array, appearance: SplatAppearance | None, gloss: GlossChange) -> Float32Array:
+    """Return the corners of a placement with the changes of its appearance and gloss; dirt is ignored."""
+    if appearance is None and gloss == UNCHANGED_GLOSS:
         return corners
     result = corners.copy()
-    matrix = np.reshape(appearance.matrix, (3, 3))
-    result[:, _Columns.COLOUR] = np.clip(corners[:, _Columns.COLOUR] @ matrix.T, 0, 1)
+    if appearance is not None:
+        matrix = np.reshape(appearance.matrix, (3, 3))
+        result[:, _Columns.COLOUR] = np.clip(corners[:, _Columns.COLOUR] @ matrix.T, 0, 1)
+    for column, value in ((_Columns.ROUGHNESS, gloss.roughness), (_Columns.SPECULAR, gloss.specular)):
+        if value is not None:
+            result[:, column] = value
     return result

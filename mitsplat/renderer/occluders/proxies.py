@@ -14,7 +14,14 @@ import trimesh
 
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.mesh_normals import CREASE_ANGLE, corner_normals
-from mitsplat.renderer.materials.proxy_materials import CornerMaterials, SurfaceMaterial, material_triangles
+from mitsplat.renderer.materials.proxy_materials import (
+    UNCHANGED_GLOSS,
+    CornerMaterials,
+    GlossChange,
+    ProxyPart,
+    SurfaceMaterial,
+    material_triangles,
+)
 from mitsplat.renderer.occluders.splat_occlusion import Caster, SplatOccluders
 from mitsplat.renderer.projection.splat_appearance import SplatAppearance
 from mitsplat.renderer.rays.device_arrays import ray_scene, wrapped
@@ -39,6 +46,7 @@ class Occluder:
         world_from_mesh: Pose, a similarity transform, shape (4, 4).
         splats: Gaussians in the frame of the mesh that give it its material; None for a black surface.
         appearance: Change of the colours of the splats.
+        gloss: Change of their roughness and specular.
     """
 
     mesh: trimesh.Trimesh
@@ -47,6 +55,7 @@ class Occluder:
     world_from_mesh: np.ndarray = field(default_factory=lambda: np.eye(4))
     splats: Splats | None = None
     appearance: SplatAppearance | None = None
+    gloss: GlossChange = UNCHANGED_GLOSS
 
 
 @dataclass(frozen=True, eq=False)
@@ -264,35 +273,33 @@ class TraceScene:
             nothing = mi.Float([0.0] * 9)
             return cls(ray_scene(others), None, mi.UInt32([0]), nothing, nothing, None)
         parts = tuple(
-            (o.mesh, o.instance, np.asarray(o.world_from_mesh, np.float64).tobytes(), o.splats, o.appearance)
+            ProxyPart(
+                o.mesh, o.instance, np.asarray(o.world_from_mesh, np.float64).tobytes(), o.splats, o.appearance, o.gloss
+            )
             for o in occluders
         )
         return _merged_scene(parts, others) if others else _cached_scene(parts, str(mi.variant()))
 
 
-_Parts = tuple[tuple[trimesh.Trimesh, int, bytes, Splats | None, SplatAppearance | None], ...]
-"""Meshes with their instance ids, poses (bytes of 16 floats), and the Gaussians and appearances of their materials."""
-
-
 @lru_cache(maxsize=2)
-def _cached_scene(parts: _Parts, _variant: str) -> TraceScene:
+def _cached_scene(parts: tuple[ProxyPart, ...], _variant: str) -> TraceScene:
     """Return the merged meshes, cached for the static meshes of all layouts and the last dynamic ones."""
     return _merged_scene(parts, {})
 
 
-def _merged_scene(parts: _Parts, others: Mapping[str, mi.Shape]) -> TraceScene:
+def _merged_scene(parts: tuple[ProxyPart, ...], others: Mapping[str, mi.Shape]) -> TraceScene:
     corners, normals, numbers = [], [], []
-    for part, instance, pose, splats, _ in parts:
-        world_from_mesh = np.frombuffer(pose).reshape(4, 4)
+    for part in parts:
+        world_from_mesh = np.frombuffer(part.pose).reshape(4, 4)
         turn, shift = world_from_mesh[:3, :3], world_from_mesh[:3, 3]
-        own = [part.triangles, smooth_normals(part).reshape(-1, 3, 3)]
-        divided = material_triangles(part, splats)
+        own = [part.mesh.triangles, smooth_normals(part.mesh).reshape(-1, 3, 3)]
+        divided = material_triangles(part.mesh, part.splats)
         if divided is not None:
             own = [divided.interpolate(values) for values in own]
             own[1] /= np.linalg.norm(own[1], axis=2, keepdims=True)
         corners.append(own[0].reshape(-1, 3) @ turn.T + shift)
         normals.append(own[1].reshape(-1, 3) @ (turn / np.cbrt(np.linalg.det(turn))).T)
-        numbers.append(np.full(len(own[0]), instance, np.uint32))
+        numbers.append(np.full(len(own[0]), part.instance, np.uint32))
     positions = wrapped(mi.Float, np.concatenate(corners).astype(np.float32))
     count = sum(len(c) for c in corners)
     mesh = mi.Mesh("proxies", count, count // 3)
@@ -306,7 +313,7 @@ def _merged_scene(parts: _Parts, others: Mapping[str, mi.Shape]) -> TraceScene:
         wrapped(mi.UInt32, np.concatenate(numbers)),
         positions,
         wrapped(mi.Float, np.concatenate(normals).astype(np.float32)),
-        CornerMaterials.of([(part, splats, appearance) for part, _, _, splats, appearance in parts]),
+        CornerMaterials.of(list(parts)),
     )
 
 

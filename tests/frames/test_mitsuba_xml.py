@@ -66,7 +66,7 @@ def write(folder: Path, text: str) -> Path:
     [
         (
             SCENE.format(NUT.format('<float name="size" value="1"/>')),
-            r":7: shape 'splats' takes no 'size'; it takes asset, filename, proxy, units, to_world, instance, dynamic, "
+            r":7: shape 'splats' takes no 'size'; it takes asset, filename, materials, metallic, proxy, units, to_world, instance, dynamic, "
             "capture_light, roughness, specular, colours, wear, wear_seed$",
         ),
         (
@@ -110,7 +110,7 @@ def write(folder: Path, text: str) -> Path:
         ),
         (
             SCENE.format(NUT.format('<float name="units" value="1"/>')),
-            ":7: shape 'splats': 'asset' takes the place of 'filename', 'proxy' and 'units'$",
+            ":7: shape 'splats': 'asset' takes the place of 'filename', 'materials', 'proxy' and 'units'$",
         ),
         (SCENE.format('<shape type="splatz"/>'), ':7: .*Plugin "splatz" not found'),
         (SCENE.format('<shape type="ply"> <string name="filename" value="no.ply"/> </shape>'), ":7: .*file not found"),

@@ -94,7 +94,7 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
 
      * - highlight
        - |bool|
-       - True if surfaces show highlights of lights, by the roughness and specular of the splats. (Default: true)
+       - True if reflections without the base colour are added. (Default: true)
 
      * - white
        - |float| or |rgb|

@@ -45,9 +45,9 @@ class Layers(LazyValue):
         proxy_depth: Depth of the proxy meshes along the optical axis [m], (H, W) float32.
         proxy_instance: Id of the nearest proxy mesh, (H, W) uint16.
         normal: World-space unit normal of the nearest proxy, zero for a miss, (H, W, 3) float32.
-        light: Factor of light and shadow on the linear colour, (H, W, 3) float32.
-        highlight: Linear colour added to lit colours, minus the mirrored capture light in the captured colours, (H, W,
-            3) float32.
+        light: Factor of light, shadow and tinted reflections on the linear colour, (H, W, 3) float32.
+        highlight: Reflections without the base colour, added to lit colours. On captured colours, the mirrored light of
+            the capture is subtracted. (H, W, 3) float32.
     """
 
     rgb: Float32Array

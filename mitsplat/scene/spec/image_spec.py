@@ -196,7 +196,11 @@ class Composite(StrictModel):
         "number of shadow rays. Elsewhere the target is perceptually equal.",
     )
     image_shadow: ImageShadow = Field(ImageShadow(), description="Parameters of ``shadow: image``.")
-    highlight: bool = Field(True, description="Adds specular highlights of the lights of the scene.")
+    highlight: bool = Field(
+        True,
+        description="Adds reflections that do not have the colour of the surface: all of "
+        "plastics, and those at grazing angles of metals.",
+    )
     occluders: Literal["proxies", "splats"] = Field(
         "proxies",
         description="Occluders in traced shadows of objects: ``proxies`` for the meshes, ``splats`` for the splats "

@@ -77,10 +77,10 @@ class AppearanceRanges(StrictModel):
         "capture.",
     )
     roughness: RoughnessRange | None = Field(
-        None, description="GGX roughness of the highlight. The value of the asset if absent."
+        None, description="GGX roughness of all materials. That of the asset if absent."
     )
     specular: UnitRange | None = Field(
-        None, description="Specular reflectance at normal incidence. The value of the asset if absent."
+        None, description="Specular reflectance at normal incidence of all materials. That of the asset if absent."
     )
     wear: UnitRange = Field(
         (0.0, 0.0),

@@ -66,8 +66,8 @@ def write(folder: Path, text: str) -> Path:
     [
         (
             SCENE.format(NUT.format('<float name="size" value="1"/>')),
-            r":7: shape 'splats' takes no 'size'; it takes asset, filename, materials, metallic, proxy, units, to_world, instance, dynamic, "
-            "capture_light, roughness, specular, colours, wear, wear_seed$",
+            r":7: shape 'splats' takes no 'size'; it takes asset, filename, materials, metallic, proxy, units, "
+            "to_world, instance, dynamic, capture_light, roughness, specular, colours, wear, wear_seed$",
         ),
         (
             SCENE.format('<shape type="sphere"> <string name="proxy" value="a"/> <float name="b" value="1"/> </shape>'),

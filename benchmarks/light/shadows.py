@@ -49,11 +49,12 @@ from benchmarks.record import figure, recording
 from mitsplat.bake.bake import BakeSettings, bake_asset
 from mitsplat.bake.mesh_parts import MeshPart, bake_lights, mitsuba_scene, read_parts
 from mitsplat.frames.camera_response import light_image
+from mitsplat.frames.scene_builder import make_asset_shape
 from mitsplat.geometry.camera import Camera
 from mitsplat.images.colour import LUMINANCE, decode_srgb, encode_srgb
 from mitsplat.quality import resolve_quality
 from mitsplat.renderer.emitters.emitter_sampling import reference_irradiance
-from mitsplat.renderer.layers import Layers, make_integrator, make_sensor, make_splats_shape, render_layers
+from mitsplat.renderer.layers import Layers, make_integrator, make_sensor, render_layers
 from mitsplat.renderer.occluders.proxies import Occluder, Proxies
 from mitsplat.renderer.path_tracing import trace_radiance
 from mitsplat.runtime.variant import ensure_variant
@@ -499,9 +500,9 @@ class SplatScene:
         """Return the scene of a setup; its bakes are stored in ``out``."""
         lights = lights_of(light, out)
         room = baked(setup.room, out / name / light, lights, 20000, kind="environment", density=setup.density)
-        shapes = {"room": shape_of(room, np.eye(4), 0)}
+        shapes = {"room": make_asset_shape(room, np.eye(4), 0)}
         for number, thing in enumerate(setup.things, 1):
-            shapes[f"thing_{number}"] = shape_of(thing.asset(out / name), thing.pose, number)
+            shapes[f"thing_{number}"] = make_asset_shape(thing.asset(out / name), thing.pose, number)
         scene = mi.load_dict({"type": "scene", **shapes, **bake_lights(lights)})
         return cls(scene, setup.camera, room.white)
 
@@ -548,18 +549,6 @@ def compare(name: str, light: str, out: Path, samples: int) -> dict[str, Any]:
     save_sheet(out / f"{name}_{light}.png", [*shown, pictures["capture traced"], layers.light.astype(np.float64)])
     save_sheet(out / f"{name}_{light}_traced.png", [traced, truth.photo, difference(traced, truth.photo)])
     return result
-
-
-def shape_of(asset: Asset, where: Float64Array, instance: int) -> Any:
-    return make_splats_shape(
-        asset.splats,
-        where,
-        asset.mesh,
-        instance=instance,
-        capture_light=asset.capture_light,
-        roughness=float(asset.roughness),
-        specular=float(asset.specular) if instance else 0.0,
-    )
 
 
 COLUMNS = ("none", "image", "traced", "capture image", "capture traced", "direct")

@@ -1,7 +1,7 @@
 """Built-in distractor objects: convex solids of random proportions with random materials, as splats.
 
-A material has one colour, or two colours in stripes, checks or spots in the object's own coordinates. It also has a
-roughness and a specular reflectance. No light is traced: under uniform light, a convex object shows its own colours.
+A material has one base colour, or two in stripes, checks or spots in the object's own coordinates. It is plastic or
+metal of any roughness.
 """
 
 from __future__ import annotations
@@ -39,16 +39,17 @@ def _make(number: int, rng: np.random.Generator) -> Asset:
     surfels = _add_inner_layer(place_surfels(mesh, 1.0, _SURFELS, rng))
     colours = [colorsys.hsv_to_rgb(rng.random(), rng.random(), rng.uniform(0.25, 0.95)) for _ in range(2)]
     second = _pattern(surfels.points / mesh.extents.max(), rng)
-    polished = rng.random() < 0.3
+    is_metal = rng.random() < 0.3
+    friction, roughness = float(rng.uniform(0.3, 0.7)), float(rng.uniform(0.1, 0.8))
+    splats = surfels.splats((np.array(colours)[second.astype(int)][:, None] - 0.5) / SH_C0)
     return Asset(
         name=f"{kind}_{number}",
         class_name=kind,
-        splats=surfels.splats((np.array(colours)[second.astype(int)][:, None] - 0.5) / SH_C0),
+        splats=splats.with_material(metallic=float(is_metal), roughness=roughness, specular=0.5),
         mesh=mesh,
         pieces=(mesh,),
-        friction=float(rng.uniform(0.3, 0.7)),
-        roughness=float(rng.uniform(0.1, 0.8)),
-        specular=float(rng.uniform(0.2, 0.5)) if polished else 0.04,
+        friction=friction,
+        roughness=roughness,
     )
 
 

@@ -41,7 +41,7 @@ FACING = 8
 KINDS = 4
 """Steps of the material parameters in which Gaussians count as different materials."""
 
-SHORTEST = 3
+SHORTEST = 5
 """Edge length of triangles that are not divided further, in standard deviations of the Gaussians."""
 
 MIN_OPACITY = 0.5

@@ -292,14 +292,10 @@ def _merged_scene(parts: tuple[ProxyPart, ...], others: Mapping[str, mi.Shape]) 
     for part in parts:
         world_from_mesh = np.frombuffer(part.pose).reshape(4, 4)
         turn, shift = world_from_mesh[:3, :3], world_from_mesh[:3, 3]
-        own = [part.mesh.triangles, smooth_normals(part.mesh).reshape(-1, 3, 3)]
-        divided = material_triangles(part.mesh, part.splats)
-        if divided is not None:
-            own = [divided.interpolate(values) for values in own]
-            own[1] /= np.linalg.norm(own[1], axis=2, keepdims=True)
-        corners.append(own[0].reshape(-1, 3) @ turn.T + shift)
-        normals.append(own[1].reshape(-1, 3) @ (turn / np.cbrt(np.linalg.det(turn))).T)
-        numbers.append(np.full(len(own[0]), part.instance, np.uint32))
+        own_corners, own_normals = _own_corners(part.mesh, part.splats)
+        corners.append(own_corners @ turn.T + shift)
+        normals.append(own_normals @ (turn / np.cbrt(np.linalg.det(turn))).T)
+        numbers.append(np.full(len(own_corners) // 3, part.instance, np.uint32))
     positions = wrapped(mi.Float, np.concatenate(corners).astype(np.float32))
     count = sum(len(c) for c in corners)
     mesh = mi.Mesh("proxies", count, count // 3)
@@ -315,6 +311,17 @@ def _merged_scene(parts: tuple[ProxyPart, ...], others: Mapping[str, mi.Shape]) 
         wrapped(mi.Float, np.concatenate(normals).astype(np.float32)),
         CornerMaterials.of(list(parts)),
     )
+
+
+@lru_cache(maxsize=64)
+def _own_corners(mesh: trimesh.Trimesh, splats: Splats | None) -> tuple[np.ndarray, np.ndarray]:
+    """Return corners and normals (3 T, 3) of the triangles in the frame of the mesh, cached across layouts."""
+    own = [mesh.triangles, smooth_normals(mesh).reshape(-1, 3, 3)]
+    divided = material_triangles(mesh, splats)
+    if divided is not None:
+        own = [divided.interpolate(values) for values in own]
+        own[1] /= np.linalg.norm(own[1], axis=2, keepdims=True)
+    return own[0].reshape(-1, 3), own[1].reshape(-1, 3)
 
 
 @lru_cache(maxsize=64)

@@ -3,7 +3,7 @@
 import itertools
 import subprocess
 import sys
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -118,7 +118,7 @@ def test_the_estimated_pairs_bound_the_true_number(preset, rendering):
     for radius, opacity in itertools.product((0.001, 0.01, 0.05), (0.05, 0.99)):
         scales = np.tile([radius, radius, 1e-4], (count, 1))
         discs = Splats(means, np.tile([0, 0, 0, 1], (count, 1)), scales, [opacity] * count, np.zeros((count, 1, 3)))
-        clouds = merge_clouds([upload_cloud(*(getattr(discs, field.name) for field in fields(discs)))])
+        clouds = merge_clouds([upload_cloud(discs.means, discs.quats, discs.scales, discs.opacities, discs.sh)])
         real = bin_gaussians(clouds, [Placement(0, np.eye(4), 1)], view, quality).pairs
         need = budget._pairs(discs, camera, quality)
         assert real <= need

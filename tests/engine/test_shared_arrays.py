@@ -15,6 +15,7 @@ from mitsplat.asset import Asset
 from mitsplat.engine import shared_arrays
 from mitsplat.engine.pool import run_frames
 from mitsplat.gaussians.splat_cloud import Splats
+from mitsplat.gaussians.splat_files import SplatArrays
 from mitsplat.storage.cache import cache_folder
 from tests.conftest import box_asset
 
@@ -55,15 +56,19 @@ def splats_of(count: int) -> Splats:
     )
 
 
+def arrays_of(splats: Splats) -> list[np.ndarray]:
+    return [getattr(splats, name) for name in SplatArrays._fields]
+
+
 def total_of(splats: Splats) -> float:
-    return float(sum(array.sum(dtype=np.float64) for array in vars(splats).values()))
+    return float(sum(array.sum(dtype=np.float64) for array in arrays_of(splats)))
 
 
 def test_workers_map_one_copy_of_the_arrays_and_leave_no_file(tmp_path, monkeypatch):
     """No file is left, not even by a killed worker."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     splats = splats_of(50_000)
-    size = sum(array.nbytes for array in vars(splats).values()) / MIB
+    size = sum(array.nbytes for array in arrays_of(splats)) / MIB
     make = Describe(splats, box_asset("nut"))
     with closing(run_frames(make, {i: [i] for i in range(4)}, workers=2, note=print)) as results:
         found = list(islice(results, 2))

@@ -354,7 +354,8 @@ def _metered(light: mi.Float, area: mi.Int32, pixels: int) -> mi.Float:
 
     Each value of ``light`` represents ``area`` pixels. All other pixels count as 1.
     """
-    area = mi.UInt64(area + dr.zeros(mi.Int32, dr.width(light)))  # the sum of a scalar would be the scalar itself
+    # Opaque, because the sum of a literal would enter the kernel.
+    area = mi.UInt64(area + dr.opaque(mi.Int32, 0, dr.width(light)))
     looks = dr.minimum(dr.power(dr.maximum(light, 0), DISPLAY), 4) * _STEPS
     looks = dr.sum(mi.UInt64(looks + 0.5) * area) - dr.sum(area) * _STEPS
     looks += dr.opaque(mi.UInt64, pixels * _STEPS)

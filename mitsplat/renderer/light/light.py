@@ -265,6 +265,23 @@ class TracedPixels:
         points = LightPoints.of(visible, here, index, light_filter.place, order)
         return cls(lighting, index, here, light_filter, points, order, coarse)
 
+    @cached_property
+    def glossy(self) -> mi.UInt32:
+        """Places of the pixels that mirror light."""
+        return dr.compress(self.here.glossy & self.here.valid)
+
+    @cached_property
+    def mirror_filter(self) -> LightFilter:
+        """Filter over the glossy pixels."""
+        own = gathered(self.here, self.glossy)
+        dr.eval(own)
+        return LightFilter(own, self.lighting.view, dr.gather(mi.UInt32, self.index, self.glossy))
+
+    def _rays_for_reflections(self, brightness: mi.Float, squares: mi.Float, rays: mi.Float) -> mi.Float:
+        """Return the wanted number of rays of the glossy pixels, given sums over the rays of all pixels."""
+        columns = (dr.gather(type(v), v, self.glossy) for v in (brightness, squares, rays, self.points.is_bent))
+        return self.mirror_filter.reflections_for(*columns, self.lighting.accuracy.error)
+
     def _tracer(self, surface: LitSurface, pixel: mi.UInt32) -> ShadowTracer:
         lighting, lattice = self.lighting, self.coarse and self.coarse.lattice
         return ShadowTracer(lighting.emitters, lighting.proxies, surface, pixel, lighting.view, lighting.seed, lattice)
@@ -285,7 +302,7 @@ class TracedPixels:
         :meth:`ShadowTracer.trace`.
         """
         points, first = self.points, self.lighting.accuracy.first
-        tracer, estimate, rest = self._point_tracer, Estimate.empty(dr.width(points.owner)), self.order
+        estimate, rest = Estimate.empty(dr.width(points.owner)), self.order
         if self.coarse is not None:
             places = dr.gather(mi.UInt32, self.light_filter.place, self.coarse.pixel)
             estimate = self.coarse.estimate.scattered(places, dr.width(points.owner))
@@ -293,7 +310,7 @@ class TracedPixels:
         rows = points.rows(rest)
         if dr.width(rows):
             rays = points.ray_count(dr.opaque(mi.UInt32, first), rows)
-            estimate = tracer.trace(rows, estimate, rays, first, points.steps(rows))
+            estimate = self._point_tracer.trace(rows, estimate, rays, first, points.steps(rows))
         return estimate
 
     def trace_further_rays(self, estimate: Estimate, level: mi.Float) -> Estimate:
@@ -310,12 +327,14 @@ class TracedPixels:
         metered = self.lighting.pixels if accuracy.metered else 0
         sums = points.sums_by_pixel(estimate)
         wanted = self.light_filter.rays_for(sums, accuracy.error, level, metered)
-        if dr.any(self.here.glossy):
+        if dr.width(self.glossy):
             scale = dr.pi / dr.mean(self.lighting.white)
             brightness = typical_brightness(sums.tinted, sums.colourless) * scale
             squares = sums.mirrored_squares * dr.square(scale)
-            for_lobe = self.light_filter.reflections_for(brightness, squares, sums.rays, points.is_bent, accuracy.error)
-            wanted = dr.maximum(wanted, for_lobe)
+            for_lobe = self._rays_for_reflections(brightness, squares, sums.rays)
+            for_lobe = dr.maximum(for_lobe, dr.gather(mi.Float, wanted, self.glossy))
+            dr.eval(wanted, for_lobe)
+            dr.scatter(wanted, for_lobe, self.glossy)
         spent = dr.full(mi.UInt32, first, dr.width(self.index))
         if self.coarse is not None:
             on_lattice = dr.gather(mi.Bool, self.coarse.lattice, self.index)
@@ -383,43 +402,42 @@ class TracedPixels:
             light: Light factor without reflections (Color3f).
             estimate: Sums over shadow rays, whose light in the lobe is added to that of the reflection rays.
         """
-        lighting, here = self.lighting, self.here
-        glossy = dr.compress(here.glossy & here.valid)
+        lighting, glossy, points = self.lighting, self.glossy, self.points
         if not dr.width(glossy):
             return light, mi.Color3f(0)
         tracer = ReflectionTracer(
             lighting.scene,
             self._point_tracer,
             lighting.reflectors,
-            self.points.steps(dr.arange(mi.UInt32, dr.width(self.points.owner))),
+            points.steps(dr.arange(mi.UInt32, dr.width(points.owner))),
         )
-        sums = self._trace_reflections(tracer, glossy)
-        per_point = dr.rcp(dr.maximum(self.points.valid_share, 1e-3))
+        sums, estimate = gathered(self._trace_reflections(tracer), glossy), gathered(estimate, glossy)
+        per_point = dr.rcp(dr.maximum(dr.gather(mi.Float, points.valid_share, glossy), 1e-3))
         weight = per_point / dr.maximum(estimate.rays, 1) * (dr.pi / lighting.white)
-        per_ray = per_point / dr.maximum(sums.rays, 1)
-        tinted = estimate.tinted * weight + sums.tinted * per_ray
-        colourless = estimate.colourless * weight + sums.colourless * per_ray
         rays = dr.maximum(sums.rays, 1)
-        means, _ = self.light_filter.mirror([*tinted, *colourless], rays, self.points.is_bent)
+        tinted = estimate.tinted * weight + sums.tinted * (per_point / rays)
+        colourless = estimate.colourless * weight + sums.colourless * (per_point / rays)
+        bent = dr.gather(mi.Bool, points.is_bent, glossy)
+        means, _ = self.mirror_filter.mirror([*tinted, *colourless], rays, bent)
         tinted, colourless = mi.Color3f(*means[:3]), mi.Color3f(*means[3:])
-        before = dr.gather(mi.Color3f, light, self.index)
+        own, pixels = self.mirror_filter.here, self.mirror_filter.index
+        before = dr.gather(mi.Color3f, light, pixels)
         # Captured colours contain the mirror image of the uniform light.
-        tent = dr.select(here.captured & here.relit, mirrored_uniform(here.lobe), 0)
-        colourless -= before * tent
+        colourless -= before * dr.select(own.captured & own.relit, mirrored_uniform(own.lobe), 0)
         dr.eval(before, tinted, colourless)
-        dr.scatter(light, before + tinted, self.index)
+        dr.scatter(light, before + tinted, pixels)
         highlight = mi.Color3f(dr.zeros(mi.Float, lighting.pixels))
-        dr.scatter(highlight, colourless, self.index)
+        dr.scatter(highlight, colourless, pixels)
         dr.eval(light, highlight)
         return light, highlight
 
-    def _trace_reflections(self, tracer: ReflectionTracer, glossy: mi.UInt32) -> Reflections:
-        """Trace reflection rays at the pixels ``glossy`` and return their sums by pixel.
+    def _trace_reflections(self, tracer: ReflectionTracer) -> Reflections:
+        """Trace reflection rays at the glossy pixels and return their sums by pixel.
 
         A pixel gets more rays if its first rays have not reached the wanted error.
         """
         error, most, points = self.lighting.accuracy.error, self.lighting.accuracy.most, self.points
-        total = Reflections.empty(dr.width(points.owner))
+        total, glossy = Reflections.empty(dr.width(points.owner)), self.glossy
 
         def trace(places: mi.UInt32, by_pixel: mi.UInt32) -> None:
             rows = points.rows(places)
@@ -430,10 +448,12 @@ class TracedPixels:
         trace(glossy, dr.select(self.here.metallic > 0, dr.opaque(mi.UInt32, for_metal), for_dielectric))
         sums = points.sums_by_pixel(total)
         if error > 0:
-            wanted = self.light_filter.reflections_for(sums.brightness, sums.squares, sums.rays, points.is_bent, error)
-            more = mi.UInt32(dr.ceil(dr.clip(wanted - sums.rays, 0, most)))
-            dr.eval(more)
-            places = dr.gather(mi.UInt32, glossy, dr.compress(dr.gather(mi.UInt32, more, glossy) > 0))
+            wanted = self._rays_for_reflections(sums.brightness, sums.squares, sums.rays)
+            missing = mi.UInt32(dr.ceil(dr.clip(wanted - dr.gather(mi.Float, sums.rays, glossy), 0, most)))
+            more = dr.zeros(mi.UInt32, points.count)
+            dr.eval(missing)
+            dr.scatter(more, missing, glossy)
+            places = dr.gather(mi.UInt32, glossy, dr.compress(missing > 0))
             if dr.width(places):
                 trace(places, more)
                 sums = points.sums_by_pixel(total)

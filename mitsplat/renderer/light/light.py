@@ -279,8 +279,9 @@ class TracedPixels:
 
     def _rays_for_reflections(self, brightness: mi.Float, squares: mi.Float, rays: mi.Float) -> mi.Float:
         """Return the wanted number of rays of the glossy pixels, given sums over the rays of all pixels."""
-        columns = (dr.gather(type(v), v, self.glossy) for v in (brightness, squares, rays, self.points.is_bent))
-        return self.mirror_filter.reflections_for(*columns, self.lighting.accuracy.error)
+        glossy, bent = self.glossy, dr.gather(mi.Bool, self.points.is_bent, self.glossy)
+        brightness, squares, rays = (dr.gather(mi.Float, v, glossy) for v in (brightness, squares, rays))
+        return self.mirror_filter.reflections_for(brightness, squares, rays, bent, self.lighting.accuracy.error)
 
     def _tracer(self, surface: LitSurface, pixel: mi.UInt32) -> ShadowTracer:
         lighting, lattice = self.lighting, self.coarse and self.coarse.lattice

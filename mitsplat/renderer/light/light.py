@@ -109,7 +109,6 @@ class Lighting:
         accuracy: Target error and limits of shadow rays.
         seed: Offset into the low-discrepancy sequence.
         white: Irradiance (Color3f) at which a uniformly captured object keeps its colours.
-        scene: Mitsuba scene with the emitters.
         reflectors: Surfaces that reflect light onto others.
     """
 
@@ -119,7 +118,6 @@ class Lighting:
     accuracy: Accuracy
     seed: int
     white: mi.Color3f
-    scene: mi.Scene
     reflectors: Reflectors
 
     @property
@@ -165,7 +163,7 @@ def light_factor(
     """
     emitters = Emitters(scene, reference, sky_reach)
     reflectors = Reflectors(scene, grid, proxies, emitters, white)
-    lighting = Lighting(emitters, proxies, visible, accuracy, seed, white, scene, reflectors)
+    lighting = Lighting(emitters, proxies, visible, accuracy, seed, white, reflectors)
     bounce &= reflectors.any
     cover = object_cover(visible) if bounce else None
     needed, light, codes = search_shadows(lighting, cover)
@@ -407,7 +405,6 @@ class TracedPixels:
         if not dr.width(glossy):
             return light, mi.Color3f(0)
         tracer = ReflectionTracer(
-            lighting.scene,
             self._point_tracer,
             lighting.reflectors,
             points.steps(dr.arange(mi.UInt32, dr.width(points.owner))),
@@ -449,7 +446,8 @@ class TracedPixels:
         trace(glossy, dr.select(self.here.metallic > 0, dr.opaque(mi.UInt32, for_metal), for_dielectric))
         sums = points.sums_by_pixel(total)
         if error > 0:
-            wanted = self._rays_for_reflections(sums.brightness, sums.squares, sums.rays)
+            brightness = typical_brightness(sums.tinted, sums.colourless)
+            wanted = self._rays_for_reflections(brightness, sums.squares, sums.rays)
             missing = mi.UInt32(dr.ceil(dr.clip(wanted - dr.gather(mi.Float, sums.rays, glossy), 0, most)))
             more = dr.zeros(mi.UInt32, points.count)
             dr.eval(missing)

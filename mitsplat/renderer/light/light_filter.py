@@ -179,15 +179,11 @@ class LightFilter:
                 ``MID_GREY``. Pixels without traced light count as lit by 1. The value 0 means exposure for white.
         """
         share, variance, shared = self._share(estimate)
-        # If few of the 3 x 3 pixels are similar, almost none of the more distant pixels are.
-        gain = dr.fma(GAIN - 1, dr.square((shared - 1) / (SMALL_FILTER_PIXELS - 1)), 1)
         light = unshadowed * share
         if metered:
             exposure = _metered(light, self.stride * self.stride, metered)
             light, unshadowed = light * exposure, unshadowed * exposure
-        # The tolerated error follows the slope of the display curve, relative to ``MID_GREY``.
-        allowed = error * dr.power(dr.clip(light, MIN_LIGHT, 1) / MID_GREY, 1 - DISPLAY)
-        return estimate.rays * variance * dr.square(unshadowed / allowed) / gain
+        return estimate.rays * variance * dr.square(unshadowed / _allowed_error(error, light)) / _gain(shared)
 
     def smooth(self, estimate: Estimate, bounced: tuple[mi.Color3f, mi.Float] | None = None) -> LightMeans:
         """Average the light of the estimate per ray over neighbours of the pixels of ``index``.
@@ -238,9 +234,7 @@ class LightFilter:
         """
         rays = dr.maximum(rays, 1)
         (mean, square), shared = self.mirror([brightness / rays, squares / rays], rays, bent, 1)
-        gain = dr.fma(GAIN - 1, dr.square((shared - 1) / (SMALL_FILTER_PIXELS - 1)), 1)
-        allowed = error * dr.power(dr.clip(mean, MIN_LIGHT, 1) / MID_GREY, 1 - DISPLAY)
-        return dr.maximum(square - dr.square(mean), 0) / (dr.square(allowed) * gain)
+        return dr.maximum(square - dr.square(mean), 0) / (dr.square(_allowed_error(error, mean)) * _gain(shared))
 
     def _share(self, estimate: Estimate) -> tuple[mi.Float, mi.Float, mi.Float]:
         """Return the light share over 3 x 3 pixels, its variance, and the number of pixels that contribute."""
@@ -347,6 +341,22 @@ class LightFilter:
         _, weights, squares, *sums = dr.while_loop(state, lambda step, *_: step < 2 * last, add, label="light filter")
         averages = [own + total / weights for own, total in zip(values, sums, strict=True)]
         return averages, weights * weights / (squares * own_rays)
+
+
+def _gain(shared: mi.Float) -> mi.Float:
+    """Return the factor by which the full filter reduces variance, given the similar pixels among 3 x 3.
+
+    If few of these are similar, almost none of the more distant pixels are.
+    """
+    return dr.fma(GAIN - 1, dr.square((shared - 1) / (SMALL_FILTER_PIXELS - 1)), 1)
+
+
+def _allowed_error(error: float, light: mi.Float) -> mi.Float:
+    """Return the tolerated standard error at a light level, given that at ``MID_GREY``.
+
+    It follows the slope of the display curve.
+    """
+    return error * dr.power(dr.clip(light, MIN_LIGHT, 1) / MID_GREY, 1 - DISPLAY)
 
 
 def _metered(light: mi.Float, area: mi.Int32, pixels: int) -> mi.Float:

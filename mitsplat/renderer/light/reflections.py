@@ -29,22 +29,19 @@ class Reflections:
     Attributes:
         tinted: Light that the base colour multiplies (Color3f).
         colourless: Other light (Color3f).
-        brightness: Sum of :func:`mitsplat.renderer.light.principled.typical_brightness` of all rays.
-        squares: Sum of the squares of this brightness.
+        squares: Sum of the squares of :func:`mitsplat.renderer.materials.principled.typical_brightness` of all rays.
         rays: Number of rays.
     """
 
     tinted: mi.Color3f
     colourless: mi.Color3f
-    brightness: mi.Float
     squares: mi.Float
     rays: mi.Float
 
     @classmethod
     def empty(cls, count: int) -> Reflections:
         """Return sums without rays at ``count`` points."""
-        colours, numbers = ([dr.zeros(kind, count) for _ in range(n)] for kind, n in ((mi.Color3f, 2), (mi.Float, 3)))
-        return cls(*colours, *numbers)
+        return cls(*[dr.zeros(kind, count) for kind in (mi.Color3f, mi.Color3f, mi.Float, mi.Float)])
 
     def add(self, places: mi.UInt32, more: Reflections) -> None:
         """Add the sums ``more`` of distinct ``places`` in place."""
@@ -53,7 +50,7 @@ class Reflections:
             value = dr.gather(type(total), total, places) + getattr(more, field.name)
             dr.eval(value)
             dr.scatter(total, value, places)
-        dr.eval(self.tinted, self.colourless, self.brightness, self.squares, self.rays)
+        dr.eval(self.tinted, self.colourless, self.squares, self.rays)
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,13 +58,11 @@ class ReflectionTracer:
     """Reflection rays from visible points.
 
     Attributes:
-        scene: Mitsuba scene with the emitters.
         tracer: The points, and the emitters.
         reflectors: Surfaces that the rays hit.
         steps: First number in the sequence of the pixel, and the step to the next number, by point.
     """
 
-    scene: mi.Scene
     tracer: ShadowTracer
     reflectors: Reflectors
     steps: tuple[mi.UInt32, mi.UInt32]
@@ -102,7 +97,7 @@ class ReflectionTracer:
 
         state = dr.zeros(mi.UInt32, count), dr.zeros(mi.ArrayXf, (8, count)), dr.zeros(mi.Float, count)
         _, total, squares = dr.while_loop(state, lambda i, *_: i < rays, add, label="sum of reflections")
-        sums = mi.Color3f(*total[0:3]), mi.Color3f(*total[3:6]), total[6], squares, mi.Float(rays)
+        sums = mi.Color3f(*total[0:3]), mi.Color3f(*total[3:6]), squares, mi.Float(rays)
         dr.eval(sums)
         return Reflections(*sums)
 
@@ -122,7 +117,7 @@ class ReflectionTracer:
         dr.eval(ray, si, tint, white, density, active, number)
         light, ray.maxt = self.reflectors.outgoing(ray, number, sequence_point(number))
         dr.eval(light, ray)
-        radiance, other = self.tracer.emitters.emission(self.scene, si, ray, active)
+        radiance, other = self.tracer.emitters.emission(self.reflectors.scene, si, ray, active)
         light += radiance * (power_weight(density, other) * dr.pi / self.reflectors.white)
         tinted, colourless = light * tint, light * white
         dr.eval(tinted, colourless)

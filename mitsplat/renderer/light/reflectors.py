@@ -205,7 +205,8 @@ class Reflectors:
         dynamic, last = self.proxies.dynamic, bounces == 1
         if dynamic is None:
             return mi.Color3f(0)
-        visible, normal = dynamic.is_visible(hit), dynamic.normal_at(hit.prim_index, ~dynamic.is_visible(hit))
+        visible = dynamic.is_visible(hit)
+        normal = dynamic.normal_at(hit.prim_index, ~visible)
         surface = dynamic.surface_at(hit.prim_index, hit.prim_uv, ~visible)
         colour, instance = surface.colour, dr.gather(mi.UInt32, dynamic.instances, hit.prim_index, ~visible)
         if self.proxies.shows_meshes:

@@ -13,6 +13,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mitsplat.renderer.emitters.emitter_sampling import receiver
+from mitsplat.renderer.materials.principled import power_weight
 from mitsplat.renderer.meshes.mirrored_splats import SplatHits, SplatMirror
 from mitsplat.renderer.meshes.visible_meshes import VisibleMeshes, has_bsdf_flag
 from mitsplat.renderer.occluders.proxies import Proxies
@@ -200,7 +201,7 @@ class PathTracer:
         towards, light = self.scene.sample_emitter_direction(si, point, False, rough)
         out = si.to_local(towards.d)
         value, density = bsdf.eval_pdf(context, si, out, rough & (towards.pdf > 0))
-        weight = dr.select(towards.delta, 1, _power(towards.pdf, density))
+        weight = dr.select(towards.delta, 1, power_weight(towards.pdf, density))
         arrives = path.throughput * value * light * self.exposure * weight
         arrives = dr.select(rough & (towards.pdf > 0), arrives, 0)
         ray = si.spawn_ray_to(si.p + towards.d * towards.dist)
@@ -268,7 +269,7 @@ class PathTracer:
         emitter = si.emitter(self.scene)
         towards = mi.DirectionSample3f(self.scene, si, reference)
         chance = self.scene.pdf_emitter_direction(reference, towards, active & ~delta)
-        weight = dr.select(delta, 1, _power(density, chance))
+        weight = dr.select(delta, 1, power_weight(density, chance))
         light = path.throughput * emitter.eval(si, active) * self.exposure * weight
         _add(result, path.lane, dr.select(active & (emitter != None), light, 0))  # noqa: E711 - of every element
 
@@ -300,10 +301,6 @@ class _RandomNumbers:
 
 def _has_emitter_flag(emitter: mi.EmitterPtr, flag: mi.EmitterFlags) -> mi.Bool:
     return (emitter.flags() & int(flag)) != 0
-
-
-def _power(own: mi.Float, other: mi.Float) -> mi.Float:
-    return dr.select(own > 0, dr.rcp(1 + dr.square(other / own)), 0)
 
 
 def _add(total: mi.Color3f, lane: mi.UInt32, light: mi.Color3f) -> None:

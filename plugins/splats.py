@@ -12,8 +12,8 @@ import trimesh
 from mitsplat.asset import ASSET_FILE, Asset, read_mesh, read_spec
 from mitsplat.errors import InputError
 from mitsplat.gaussians.splat_cloud import Splats
+from mitsplat.gaussians.splat_materials import specular_of
 from mitsplat.plugins.parameters import Parameters
-from mitsplat.renderer.materials.principled import MAX_SPECULAR
 from mitsplat.renderer.materials.proxy_materials import GlossChange
 from mitsplat.renderer.projection.splat_appearance import SplatAppearance
 
@@ -154,7 +154,7 @@ class SplatsShape(mi.Mesh):
                 metallic = given.number("metallic", 0.0)
                 if not 0 <= metallic <= 1:
                     given.refuse("metallic", "be in [0, 1]", metallic)
-                specular = min(self.specular / MAX_SPECULAR, 1.0)
+                specular = specular_of(self.specular)
                 splats = _load_uniform_splats(path, modified, metallic, self.roughness, specular)
             else:
                 splats = _load_splats(path, modified, *(_stamp(materials_file) if materials_file else (None, 0)))
@@ -171,7 +171,7 @@ class SplatsShape(mi.Mesh):
         """Return the roughness and specular that replace those of all materials of the splats."""
         if self.splats.materials is None or is_uniform:
             return GlossChange()
-        specular = min(self.specular / MAX_SPECULAR, 1.0)
+        specular = specular_of(self.specular)
         return GlossChange(self.roughness if "roughness" in props else None, specular if "specular" in props else None)
 
     def _read_appearance(self, given: Parameters) -> SplatAppearance | None:

@@ -19,7 +19,6 @@ from mitsplat.arrays import Float64Array, Int64Array
 from mitsplat.bake.surface_materials import (
     DIELECTRIC_SPECULAR,
     LEAST_ROUGHNESS,
-    MOST_SPECULAR,
     ROUGHNESS,
     UNKNOWN_COLOUR,
     Material,
@@ -28,6 +27,7 @@ from mitsplat.bake.surface_materials import (
     read_material,
 )
 from mitsplat.errors import InputError, MissingResourceError
+from mitsplat.gaussians.splat_materials import MAX_SPECULAR
 from mitsplat.geometry.mesh import check_faces
 from mitsplat.geometry.mesh_normals import corner_normals
 from mitsplat.geometry.untrusted_meshes import check_mesh
@@ -105,7 +105,7 @@ class MeshPart:
         """Return metallic, roughness and specular of ``principled``, shape (N, 3); 0, 1 and 0 for matt parts."""
         if not self.shiny:
             return np.tile([0.0, 1.0, 0.0], (len(faces), 1))
-        values = np.tile([self.metallic, self.roughness, self.reflectance / MOST_SPECULAR], (len(faces), 1))
+        values = np.tile([self.metallic, self.roughness, self.reflectance / MAX_SPECULAR], (len(faces), 1))
         if self.metallic_roughness is not None:
             values[:, :2] = self._texels(self.metallic_roughness, faces, barycentric) / 255.0
         return values
@@ -324,7 +324,7 @@ def _bsdf(part: MeshPart) -> dict[str, Any]:
         "base_color": colour,
         "metallic": _channel(part, 0, part.metallic),
         "roughness": _channel(part, 1, part.roughness),
-        "specular": part.reflectance / MOST_SPECULAR,
+        "specular": part.reflectance / MAX_SPECULAR,
     }
 
 

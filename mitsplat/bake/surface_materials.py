@@ -22,12 +22,12 @@ from trimesh.visual.material import PBRMaterial, SimpleMaterial
 
 from mitsplat.arrays import Float64Array
 from mitsplat.errors import InputError
+from mitsplat.gaussians.splat_materials import MAX_SPECULAR
 from mitsplat.images.colour import decode_srgb, eight_bit
 from mitsplat.storage.files import IMAGE_ERRORS, is_inside
 
 DIELECTRIC_SPECULAR = 0.04
 """Reflectance at normal incidence of common plastics, lacquers and glass."""
-MOST_SPECULAR = 0.08
 UNKNOWN_COLOUR = 0.5
 """Linear grey of parts without a colour."""
 ROUGHNESS = 0.6
@@ -56,7 +56,7 @@ class SurfaceFinish:
     specular: float | None = None
 
     def __post_init__(self) -> None:
-        for name, most in (("roughness", 1.0), ("metallic", 1.0), ("specular", MOST_SPECULAR)):
+        for name, most in (("roughness", 1.0), ("metallic", 1.0), ("specular", MAX_SPECULAR)):
             value = getattr(self, name)
             if value is not None and not 0 <= value <= most:
                 cause = " (for a metal, give metallic 1)" if name == "specular" and value > most else ""
@@ -166,7 +166,7 @@ def _read_mtl(source: SimpleMaterial) -> Material:
     given_roughness, metallic = _numbers(keys, "pr"), _numbers(keys, "pm")
     highlight, illumination = _numbers(keys, "ks"), _numbers(keys, "illum")
     physical = given_roughness is not None or metallic is not None
-    specular = 0.0 if highlight is None else min(MOST_SPECULAR, MOST_SPECULAR * float(highlight.mean()))
+    specular = 0.0 if highlight is None else min(MAX_SPECULAR, MAX_SPECULAR * float(highlight.mean()))
     if illumination is not None and illumination[0] < 2 and not physical:
         specular = 0.0
     if physical and highlight is None:

@@ -15,6 +15,9 @@ import numpy.typing as npt
 from mitsplat.arrays import Float32Array
 from mitsplat.errors import InputError
 
+MAX_SPECULAR = 0.08
+"""Reflectance of a dielectric at normal incidence with ``specular`` 1."""
+
 
 @dataclass(frozen=True, eq=False)
 class SplatMaterials:
@@ -79,3 +82,8 @@ class SplatMaterials:
             return self
         turned = self.normals.astype(np.float64) @ np.asarray(rotation, dtype=np.float64).T
         return SplatMaterials(self.metallic, self.roughness, self.specular, turned.astype(np.float32))
+
+
+def specular_of(reflectance: float) -> float:
+    """Return the parameter ``specular``, at most 1, of a reflectance at normal incidence."""
+    return min(reflectance / MAX_SPECULAR, 1.0)

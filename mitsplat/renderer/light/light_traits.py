@@ -10,7 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsplat.renderer.materials.principled import MAX_SPECULAR
+from mitsplat.gaussians.splat_materials import specular_of
 from mitsplat.renderer.projection.clouds import Placement
 from mitsplat.renderer.rays.device_arrays import wrapped
 
@@ -82,8 +82,7 @@ def _parameters(shape: mi.Shape) -> tuple[bool, float, float, float, bool]:
     """Return relit, roughness, metallic, specular and captured of a ``splats`` shape."""
     materials = shape.splats.materials
     if materials is None:
-        specular = min(shape.specular / MAX_SPECULAR, 1.0)
-        return shape.capture_light == "uniform", shape.roughness, 0.0, specular, True
+        return shape.capture_light == "uniform", shape.roughness, 0.0, specular_of(shape.specular), True
     roughness, metallic, specular = (
         float(values.mean()) for values in (materials.roughness, materials.metallic, materials.specular)
     )

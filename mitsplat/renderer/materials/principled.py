@@ -17,6 +17,8 @@ from dataclasses import dataclass, replace
 import drjit as dr
 import mitsuba as mi
 
+from mitsplat.gaussians.splat_materials import MAX_SPECULAR
+
 MIN_ALPHA = 0.001
 """Smallest GGX parameter alpha, as in ``principled``."""
 
@@ -28,9 +30,6 @@ LOBE_LATTICE = (21, 13)
 
 TYPICAL_COLOUR = 0.6
 """Base colour for which the error of reflected light is estimated."""
-
-MAX_SPECULAR = 0.08
-"""Reflectance of a dielectric at normal incidence with ``specular`` 1."""
 
 
 def lattice_point(i: mi.UInt32, lattice: tuple[int, int]) -> mi.Point2f:

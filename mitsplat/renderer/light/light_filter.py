@@ -59,7 +59,6 @@ class _Traits:
     TRAIT, KNOWN, RAYS = range(6, 9)
     SHARE, VARIANCE = range(9, 11)
     MIRRORED, GLOSS = slice(9, 12), 12
-    WIDTH = 16
 
 
 @dataclass(frozen=True, eq=False)
@@ -268,8 +267,7 @@ class LightFilter:
         """
         here = self.here
         known = dr.select(here.known, mi.Float(1), 0)
-        guide = (0, 0, 0, 0) if lobe is None else (*lobe[0], lobe[2])
-        guide = guide if share is None else (*share, 0, 0)
+        guide = (share or (0, 0)) if lobe is None else (*lobe[0], lobe[2])
         traits = packed([*here.position, *here.normal, here.trait, known, rays, *guide])  # see _Traits
         alike = mi.Float(1)
         for direction in ((1, 0), (0, 1)):
@@ -294,10 +292,8 @@ class LightFilter:
         here, view, width = self.here, self.view, dr.width(self.index)
         x, y = mi.Int32(self.index % view.width), mi.Int32(self.index // view.width)
         along_x, along_y = (dr.opaque(mi.Int32, step) * self.stride for step in direction)
-        images = packed(values)
-        own_rays = dr.gather(mi.ArrayXf, traits, dr.arange(mi.UInt32, width), shape=(_Traits.WIDTH, width))[
-            _Traits.RAYS
-        ]
+        images, columns = packed(values), dr.width(traits) // width
+        own_rays = dr.gather(mi.ArrayXf, traits, dr.arange(mi.UInt32, width), shape=(columns, width))[_Traits.RAYS]
         last = dr.opaque(mi.UInt32, radius)
 
         def add(
@@ -309,7 +305,7 @@ class LightFilter:
             inside = (nx >= 0) & (nx < view.width) & (ny >= 0) & (ny < view.height)
             place = dr.gather(mi.UInt32, self.shown, mi.UInt32(ny * view.width + nx), inside)
             same = inside & (place != UNTRACED)
-            other = dr.gather(mi.ArrayXf, traits, place, same, shape=(_Traits.WIDTH, width))
+            other = dr.gather(mi.ArrayXf, traits, place, same, shape=(columns, width))
             position, normal = mi.Point3f(*other[_Traits.POSITION]), mi.Vector3f(*other[_Traits.NORMAL])
             trait, known, rays = other[_Traits.TRAIT], other[_Traits.KNOWN] > 0, other[_Traits.RAYS]
             same &= trait == here.trait

@@ -6,10 +6,13 @@ import argparse
 import time
 from pathlib import Path
 
+# isort: off
+import mitsplat  # which must be imported before Dr.Jit
+
 import mitsuba as mi
 import numpy as np
 
-import mitsplat
+# isort: on
 from benchmarks.record import figure, recording
 from mitsplat.bake.bake import BakeResult, BakeSettings, bake_asset
 from mitsplat.geometry.camera import Camera

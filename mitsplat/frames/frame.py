@@ -17,7 +17,7 @@ from mitsplat.arrays import Float32Array
 from mitsplat.errors import InputError
 from mitsplat.frames.camera_response import Development, light_layers, start_development
 from mitsplat.frames.flow import exposure_flow, instance_motions, optical_flow
-from mitsplat.frames.light_properties import irradiance_of, light_properties, white_irradiance
+from mitsplat.frames.light_properties import background_light, irradiance_of, light_properties, white_irradiance
 from mitsplat.frames.scene_builder import SceneBuilder
 from mitsplat.geometry.camera import Camera
 from mitsplat.images.masks import Silhouette
@@ -246,7 +246,8 @@ class Renderer:
         with _timed(seconds, "render"):
             layers = render_layers(self.integrator, mitsuba_scene, plan.camera, seed=plan.seed)
         with _timed(seconds, "composite"):
-            background = self.scene_builder.background(index, layout.index, plan.camera)
+            lit = background_light(self.scene, layout.index, mitsuba_scene)
+            background = lit * self.scene_builder.background(index, layout.index, plan.camera)
             linear = light_layers(layers, self.scene.spec.composite, background)
             development = self._start_development(linear, layers, layout, plan, mitsuba_scene)
         with _timed(seconds, "silhouettes"):

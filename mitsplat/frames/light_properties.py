@@ -5,9 +5,11 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mitsplat.asset import Asset
 from mitsplat.frames.scene_builder import SceneBuilder
 from mitsplat.renderer.emitters.emitter_sampling import reference_irradiance
 from mitsplat.scene.planning.frame_lights import expand_rooms, lights_at
@@ -51,10 +53,28 @@ def white_irradiance(scene: Scene, layout: int) -> Irradiance:
     environment = scene.environment_of(layout)
     if environment is not None and environment.white is not None:
         return (environment.white,) * 3
-    is_captured = (
-        environment is not None and environment.capture_light == "scene" and environment.splats.materials is None
-    )
-    return capture_irradiance(scene) if is_captured and scene.spec.lights else (math.pi,) * 3
+    return capture_irradiance(scene) if _has_captured_light(environment) and scene.spec.lights else (math.pi,) * 3
+
+
+def background_light(scene: Scene, layout: int, lit: mi.Scene) -> mi.Color3f:
+    """Return the factor (Color3f) that lights the background picture of a frame, whose Mitsuba scene is ``lit``.
+
+    The background shows surfaces that are lit like the reference point: its value 1 is a white surface there. Behind
+    captured surroundings, and where light has no effect, it keeps its values as they do.
+    """
+    factor = np.ones(3)
+    if (
+        scene.spec.composite.shadow == "traced"
+        and lit.emitters()
+        and not _has_captured_light(scene.environment_of(layout))
+    ):
+        factor = np.divide(irradiance_of(scene, lit), white_irradiance(scene, layout))
+    return mi.Color3f(*[dr.opaque(mi.Float, float(channel)) for channel in factor])
+
+
+def _has_captured_light(environment: Asset | None) -> bool:
+    """Return True if the colours of an environment contain the light of its capture."""
+    return environment is not None and environment.capture_light == "scene" and environment.splats.materials is None
 
 
 def capture_irradiance(scene: Scene) -> Irradiance:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from mitsplat.frames.background import crop_background
 from mitsplat.images.colour import decode_srgb
 from mitsplat.scene.layout import NO_PHYSICS, Layout
 from mitsplat.scene.planning.layout_surroundings import BackgroundDraw, draw_surroundings
-from tests.conftest import WriteScene
+from tests.conftest import WriteScene, box_asset
 
 
 def backing(**values: Any) -> BackgroundDraw:
@@ -71,7 +72,7 @@ def test_a_background_is_seen_in_empty_pixels_and_changes_no_label(
     scene_data: dict[str, Any], write_scene: WriteScene, tmp_path: Path
 ) -> None:
     scene_data["shapes"][0]["box"]["size"] = [0.4, 0.4, 0.1]
-    scene_data |= {"objects": [], "composite": {"exposure": "fixed"}}
+    scene_data |= {"objects": [], "composite": {"exposure": "fixed"}, "lights": [{"kind": "environment"}]}
     layout = Layout(0, (), NO_PHYSICS)
     plain = ms.render_frame(ms.load_scene(write_scene(scene_data)), 0, layout=layout)
     cv2.imwrite(str(tmp_path / "red.png"), np.full((30, 40, 3), (0, 0, 200), dtype=np.uint8))
@@ -93,6 +94,61 @@ def test_a_background_is_seen_in_empty_pixels_and_changes_no_label(
     np.testing.assert_allclose(frame.rgb[border], frame.layers.rgb[border] + through * red, atol=1e-6)
     for name in ("rgb", "alpha", "depth", "instance", "normal", "proxy_depth"):
         np.testing.assert_array_equal(getattr(frame.layers, name), getattr(plain.layers, name))
+
+
+ORANGE = [1.0, 0.6, 0.2]
+GREY = {"images": "grey.png"}
+
+
+def picture_with_background(
+    data: dict[str, Any], write_scene: WriteScene, radiance: float, composite: dict[str, Any]
+) -> tuple[np.ndarray, ms.Frame]:
+    """Render a small table before a grey photograph under an orange sky, and return the factor of the photograph."""
+    data["shapes"][0]["box"]["size"] = [0.4, 0.4, 0.1]
+    data["lights"] = [{"kind": "environment", "radiance": radiance, "colour": ORANGE}] if radiance else []
+    data |= {"objects": [], "background": GREY, "composite": composite}
+    path = write_scene(data)
+    cv2.imwrite(str(path.parent / "grey.png"), np.full((48, 64, 3), 150, dtype=np.uint8))
+    scene = ms.load_scene(path)
+    drawn = draw_surroundings(scene.spec, 0).background
+    assert drawn is not None
+    frame = ms.render_frame(scene, 0, layout=Layout(0, (), NO_PHYSICS))
+    empty = frame.layers.alpha == 0
+    assert 0.1 < empty.mean() < 0.9
+    return frame.rgb[empty] / (drawn.gain * decode_srgb(150 / 255)), frame
+
+
+@pytest.mark.parametrize("radiance", [0.15, 60.0])
+def test_a_background_is_lit_as_a_surface_at_the_reference_point(
+    scene_data: dict[str, Any], write_scene: WriteScene, radiance: float
+) -> None:
+    """A white surface under a sky of radiance L has radiance L."""
+    factor, _ = picture_with_background(scene_data, write_scene, radiance, {"exposure": "fixed"})
+    np.testing.assert_allclose(factor, np.broadcast_to(radiance * np.array(ORANGE), factor.shape), rtol=1e-3)
+
+
+def test_exposure_and_white_balance_treat_the_background_as_the_surfaces_before_it(
+    scene_data: dict[str, Any], write_scene: WriteScene
+) -> None:
+    composite = {"white_balance": "auto"}
+    images = [picture_with_background(scene_data, write_scene, value, composite)[1] for value in (0.02, 200.0)]
+    assert np.abs(images[0].image.astype(int) - images[1].image).max() <= 1
+    empty = images[0].image[images[0].layers.alpha == 0].astype(int)
+    assert np.ptp(empty, axis=1).max() <= 1 and 90 < empty.mean() < 160
+
+
+@pytest.mark.parametrize("case", ["captured surroundings", "no light", "no traced light"])
+def test_a_background_keeps_its_values_where_surfaces_keep_theirs(
+    scene_data: dict[str, Any], write_scene: WriteScene, case: str
+) -> None:
+    composite = {"exposure": "fixed", "shadow": "none" if case == "no traced light" else "traced"}
+    if case == "captured surroundings":
+        scene_data["environment"] = "assets/room"
+        room = replace(box_asset("room", (0.1, 0.1, 0.1)), kind="environment", capture_light="scene")
+        room.save(write_scene(scene_data).parent / "assets/room")
+    radiance = 0.0 if case == "no light" else 8.0
+    factor, _ = picture_with_background(scene_data, write_scene, radiance, composite)
+    np.testing.assert_allclose(factor, 1, rtol=1e-5)
 
 
 def test_background_has_the_size_of_each_camera(

@@ -54,7 +54,7 @@ GREY = 118.0
 """Mean byte value (of 255) of a metered picture: middle grey of the standard output sensitivity (ISO 12232)."""
 
 _METERED_PIXELS = 1 << 14
-_MAX_METERING = 12.0
+_MAX_METERING = 30.0
 """Maximum correction by metering, in both directions [stops]."""
 
 WHITE = (math.pi,) * 3
@@ -222,7 +222,7 @@ class Development:
 
 
 def metered_exposure(linear: mi.Color3f, num_pixels: int, tone: Tone) -> float:
-    """Compute the exposure [stops], within 6 stops, at which the encoded luminance has the mean :data:`GREY`.
+    """Compute the exposure [stops], within 30 stops, at which the encoded luminance has the mean :data:`GREY`.
 
     The mean is taken after encoding, so that clipped lamps weigh no more than white paper. It is estimated from evenly
     spaced pixels.
@@ -237,7 +237,7 @@ def metered_exposure(linear: mi.Color3f, num_pixels: int, tone: Tone) -> float:
         return float(curve[np.rint(step).astype(int)].mean())
 
     low, high = -_MAX_METERING, _MAX_METERING
-    for _ in range(16):
+    for _ in range(18):
         middle = (low + high) / 2
         low, high = (middle, high) if mean(middle) < GREY else (low, middle)
     return (low + high) / 2

@@ -49,7 +49,7 @@ def test_metering_removes_the_brightness_of_a_lamp_and_white_balance_its_colour(
     table_data: dict[str, Any], write_scene: WriteScene, composite: dict[str, Any], neutral: bool
 ) -> None:
     images = []
-    for radiance in (0.05, 50.0):
+    for radiance in (1e-5, 1e5):
         lights = [{"kind": "environment", "radiance": radiance, "colour": ORANGE}]
         scene = ms.load_scene(write_scene(table_data | {"lights": lights, "composite": composite}))
         images.append(ms.render_frame(scene, 0).image.astype(int))
@@ -60,6 +60,48 @@ def test_metering_removes_the_brightness_of_a_lamp_and_white_balance_its_colour(
         assert np.ptp([red, green, blue]) <= 1
     else:
         assert red > 1.2 * green > 1.4 * blue
+
+
+def test_pictures_and_rays_under_automatic_exposure_do_not_depend_on_the_light_level(
+    table_data: dict[str, Any], write_scene: WriteScene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The wanted numbers of shadow and reflection rays of two metal boxes are those of other lamps."""
+    make_integrator()
+    from mitsplat.renderer.light.light_filter import LightFilter
+
+    wanted: list[Any] = []
+    rays_for, reflections_for = LightFilter.rays_for, LightFilter.reflections_for
+
+    def spy_rays_for(self: LightFilter, *args: Any) -> Any:
+        rays, exposure = rays_for(self, *args)
+        wanted.append(np.array(rays))
+        return rays, exposure
+
+    def spy_reflections_for(self: LightFilter, *args: Any) -> Any:
+        rays = reflections_for(self, *args)
+        wanted.append(np.array(rays))
+        return rays
+
+    monkeypatch.setattr(LightFilter, "rays_for", spy_rays_for)
+    monkeypatch.setattr(LightFilter, "reflections_for", spy_reflections_for)
+    camera = {"kind": "orbit", "target": [0, 0, 0.015], "radius": 0.3, "height": 0.25, "intrinsics": {"fov_x": 15}}
+    table_data |= {"objects": [{"asset": "assets/metal"}], "composite": {}, "camera": camera}
+    metal, images, numbers = box_asset("metal", (0.03, 0.03, 0.03)), [], []
+    splats = metal.splats.with_material(metallic=1.0, roughness=0.4, specular=0.5)
+    poses = np.tile(np.eye(4), (2, 1, 1))
+    poses[:, :3, 3] = [[-0.017, 0, 0.016], [0.017, 0, 0.016]]
+    for radiance in (1e-4, 1e5):
+        table_data["lights"] = [{"kind": "area", "position": [0.4, 0, 0.5], "radiance": radiance}]
+        path = write_scene(table_data)
+        replace(metal, splats=splats).save(path.parent / "assets/metal")
+        scene = ms.load_scene(path)
+        images.append(ms.render_frame(scene, 0, layout=ms.Layout.from_poses(scene, {0: list(poses)})).image.astype(int))
+        numbers.append(wanted.copy())
+        wanted.clear()
+    assert len(numbers[0]) == 3 and all(rays.max() > 1 for rays in numbers[0])
+    for some, others in zip(*numbers, strict=True):
+        np.testing.assert_allclose(some, others, rtol=0.02, atol=0.02)
+    assert np.abs(images[1] - images[0]).max() <= 2
 
 
 @pytest.mark.parametrize("shadow", ["traced", "image", "none"])

@@ -181,9 +181,9 @@ def test_number_of_rays_is_doubled_until_it_is_the_wanted_one(monkeypatch: pytes
     rays_for, smooth = LightFilter.rays_for, LightFilter.smooth
 
     def spy_rays_for(self: LightFilter, *args: Any) -> Any:
-        wanted = rays_for(self, *args)
+        wanted, exposure = rays_for(self, *args)
         seen["wanted"] = np.array(wanted, np.float64)
-        return wanted
+        return wanted, exposure
 
     def spy_smooth(self: LightFilter, estimate: Any, bounced: Any) -> Any:
         seen["rays"] = np.array(estimate.rays, np.float64)

@@ -62,6 +62,8 @@ class Emitters:
 
     A sky of one colour is sampled by the cosine to the normal, so that only occlusion causes noise. An environment map
     is sampled half by the cosine and half by its radiance, with the balance heuristic (Veach 1997, section 9.2.2).
+
+    The attribute ``fluence`` is the light of all directions at the reference point, mean over channels [W/m^2].
     """
 
     def __init__(self, scene: mi.Scene, reference: Sequence[float], sky_reach: float = np.inf) -> None:
@@ -82,6 +84,7 @@ class Emitters:
         self.sky = None if sky is None else mi.UInt32(0) if len(emitters) == 1 else dr.opaque(mi.UInt32, sky)
         point = mi.Point3f(*[dr.opaque(mi.Float, float(v)) for v in reference])
         fluence = self._survey(len(emitters), point)
+        self.fluence = dr.opaque(mi.Float, fluence.sum() / 3)
         share = UNIFORM_SHARE / len(emitters) + (1 - UNIFORM_SHARE) * fluence / max(fluence.sum(), 1e-30)
         self.choice = _DiscreteDistribution(share)
         local = np.where(np.arange(len(emitters)) == sky, 0, share)
@@ -101,7 +104,7 @@ class Emitters:
         self._index_of = wrapped(mi.UInt32, index_of)
 
     def _survey(self, count: int, point: mi.Point3f) -> Float64Array:
-        """Return the mean radiance (count,) of each emitter around a point."""
+        """Return the fluence (count,) of each emitter at a point, sum over channels [W/m^2]."""
         i = dr.arange(mi.UInt32, count * SURVEY_LATTICE[0])
         emitter = dr.gather(mi.EmitterPtr, self.pointers, i // SURVEY_LATTICE[0])
         sample = lattice_point(i % SURVEY_LATTICE[0], SURVEY_LATTICE)

@@ -166,7 +166,7 @@ def light_factor(
     lighting = Lighting(emitters, proxies, visible, accuracy, seed, white, reflectors)
     bounce &= reflectors.any
     cover = object_cover(visible) if bounce else None
-    needed, light, codes = search_shadows(lighting, cover)
+    needed, others, light, codes = search_shadows(lighting, cover)
     coarse = trace_planes(lighting, needed, codes)
     if coarse is not None:
         needed &= ~coarse.coarse | coarse.lattice
@@ -180,26 +180,29 @@ def light_factor(
     bounced = None
     if bounce:
         bounced = trace_bounce(pixels.centre_tracer(), reflectors, pixels.points.sums_by_pixel(estimate), cover)
-    estimate = pixels.trace_further_rays(estimate, unoccluded.level)
+    estimate, exposure = pixels.trace_further_rays(estimate, unoccluded.level, others)
     estimate = pixels.points.sums_by_pixel(estimate)
     means = pixels.light_filter.smooth(estimate, None if bounced is None else bounced.relit)
     light = pixels.combine(light, unoccluded, means, bounced)
-    light, highlight = pixels.add_reflections(light, estimate)
+    light, highlight = pixels.add_reflections(light, estimate, exposure)
     if coarse is not None:
         dr.eval(light)
         light = between_samples(light, coarse.coarse, lighting.view)
     return light, highlight
 
 
-def search_shadows(lighting: Lighting, cover: mi.Float | None) -> tuple[mi.Bool, mi.Color3f, mi.UInt32 | None]:
+def search_shadows(
+    lighting: Lighting, cover: mi.Float | None
+) -> tuple[mi.Bool, mi.UInt32, mi.Color3f, mi.UInt32 | None]:
     """Find the pixels whose light must be traced, by one ray per captured pixel.
 
     Captured points in tiles where dynamic objects occlude a share f below the wanted error take the factor 1 - f.
     Points next to objects, where ``cover`` of :func:`object_cover` is large, are traced in any case.
 
     Returns:
-        True (Bool) for pixels that need traced light, the light factor (Color3f) of the others, and the codes of
-        :func:`mitsplat.renderer.light.light_planes.plane_codes`, None if no plane is visible.
+        True (Bool) for pixels that need traced light, the number of others that show a surface, the light factor
+        (Color3f) of these, and the codes of :func:`mitsplat.renderer.light.light_planes.plane_codes`, None if no plane
+        is visible.
     """
     visible, error = lighting.visible, lighting.accuracy.error
     pixel = dr.arange(mi.UInt32, lighting.pixels)
@@ -218,8 +221,9 @@ def search_shadows(lighting: Lighting, cover: mi.Float | None) -> tuple[mi.Bool,
                 needed |= captured & (cover > MIN_COVER)
             light = dr.select(everything.valid, tiles.light(), 1)
         codes = plane_code if some_planes else None
-    dr.eval(needed, light)
-    return needed, light, codes
+    others = dr.count(everything.valid & ~needed)
+    dr.eval(needed, others, light)
+    return needed, others, light, codes
 
 
 def trace_planes(lighting: Lighting, needed: mi.Bool, codes: mi.UInt32 | None) -> CoarseLight | None:
@@ -275,11 +279,15 @@ class TracedPixels:
         dr.eval(own)
         return LightFilter(own, self.lighting.view, dr.gather(mi.UInt32, self.index, self.glossy))
 
-    def _rays_for_reflections(self, brightness: mi.Float, squares: mi.Float, rays: mi.Float) -> mi.Float:
+    def _rays_for_reflections(
+        self, brightness: mi.Float, squares: mi.Float, rays: mi.Float, exposure: mi.Float
+    ) -> mi.Float:
         """Return the wanted number of rays of the glossy pixels, given sums over the rays of all pixels."""
         glossy, bent = self.glossy, dr.gather(mi.Bool, self.points.is_bent, self.glossy)
         brightness, squares, rays = (dr.gather(mi.Float, v, glossy) for v in (brightness, squares, rays))
-        return self.mirror_filter.reflections_for(brightness, squares, rays, bent, self.lighting.accuracy.error)
+        return self.mirror_filter.reflections_for(
+            brightness, squares, rays, bent, self.lighting.accuracy.error, exposure
+        )
 
     def _tracer(self, surface: LitSurface, pixel: mi.UInt32) -> ShadowTracer:
         lighting, lattice = self.lighting, self.coarse and self.coarse.lattice
@@ -312,25 +320,34 @@ class TracedPixels:
             estimate = self._point_tracer.trace(rows, estimate, rays, first, points.steps(rows))
         return estimate
 
-    def trace_further_rays(self, estimate: Estimate, level: mi.Float) -> Estimate:
+    def trace_further_rays(self, estimate: Estimate, level: mi.Float, others: mi.UInt32) -> tuple[Estimate, mi.Float]:
         """Trace more rays from pixels whose light has not reached the wanted error.
 
         The number of rays is doubled until it suffices for the variance of the first rays, see
         :meth:`LightFilter.rays_for` and :meth:`LightFilter.reflections_for`. Pixels with equal numbers are traced
         together, so that no lane idles.
+
+        Args:
+            estimate: Estimate from the rays so far.
+            level: Unoccluded light over white, by pixel.
+            others: Number of pixels without traced light that show a surface.
+
+        Returns:
+            The estimate, and the factor of the exposure that :meth:`LightFilter.rays_for` assumes.
         """
         accuracy, points, order = self.lighting.accuracy, self.points, self.order
+        if accuracy.error == 0:
+            return estimate, mi.Float(1)
         first = accuracy.first
-        if first >= accuracy.most:
-            return estimate
-        metered = self.lighting.pixels if accuracy.metered else 0
         sums = points.sums_by_pixel(estimate)
-        wanted = self.light_filter.rays_for(sums, accuracy.error, level, metered)
+        wanted, exposure = self.light_filter.rays_for(sums, accuracy.error, level, others if accuracy.metered else None)
+        if first >= accuracy.most:
+            return estimate, exposure
         if dr.width(self.glossy):
             scale = dr.pi / dr.mean(self.lighting.white)
             brightness = typical_brightness(sums.tinted, sums.colourless) * scale
             squares = sums.mirrored_squares * dr.square(scale)
-            for_lobe = self._rays_for_reflections(brightness, squares, sums.rays)
+            for_lobe = self._rays_for_reflections(brightness, squares, sums.rays, exposure)
             for_lobe = dr.maximum(for_lobe, dr.gather(mi.Float, wanted, self.glossy))
             dr.eval(wanted, for_lobe)
             dr.scatter(wanted, for_lobe, self.glossy)
@@ -342,13 +359,14 @@ class TracedPixels:
         more = dr.gather(mi.Float, wanted, order) > mi.Float(dr.gather(mi.UInt32, spent, order))
         rows = points.rows(dr.gather(mi.UInt32, order, dr.compress(more)))
         if not dr.width(rows):
-            return estimate
+            return estimate, exposure
         owner = dr.gather(mi.UInt32, points.owner, rows)
         doublings, extra = _doublings(dr.gather(mi.Float, wanted, owner), first, accuracy.most)
         extra += dr.opaque(mi.UInt32, first) - dr.gather(mi.UInt32, spent, owner)
         lane = stable_order(doublings, LEVEL_BITS)
         rows, extra = (dr.gather(mi.UInt32, values, lane) for values in (rows, points.ray_count(extra, rows)))
-        return self._point_tracer.trace(rows, estimate, extra, accuracy.most - first, points.steps(rows))
+        estimate = self._point_tracer.trace(rows, estimate, extra, accuracy.most - first, points.steps(rows))
+        return estimate, exposure
 
     def combine(
         self, light: mi.Color3f, unoccluded: UnoccludedLight, means: LightMeans, bounced: Bounce | None
@@ -394,12 +412,15 @@ class TracedPixels:
         albedo = diffuse_albedo(dr.dot(surface.normal, surface.to_camera), surface.roughness)
         return dr.select(surface.glossy & ~surface.captured, (1 - surface.metallic) * albedo, 1)
 
-    def add_reflections(self, light: mi.Color3f, estimate: Estimate) -> tuple[mi.Color3f, mi.Color3f]:
+    def add_reflections(
+        self, light: mi.Color3f, estimate: Estimate, exposure: mi.Float
+    ) -> tuple[mi.Color3f, mi.Color3f]:
         """Add the specular lobes to the light factor of all pixels, and return it with the highlight (Color3f).
 
         Args:
             light: Light factor without reflections (Color3f).
             estimate: Sums over shadow rays, whose light in the lobe is added to that of the reflection rays.
+            exposure: Factor of the exposure.
         """
         lighting, glossy, points = self.lighting, self.glossy, self.points
         if not dr.width(glossy):
@@ -409,7 +430,7 @@ class TracedPixels:
             lighting.reflectors,
             points.steps(dr.arange(mi.UInt32, dr.width(points.owner))),
         )
-        sums, estimate = gathered(self._trace_reflections(tracer), glossy), gathered(estimate, glossy)
+        sums, estimate = gathered(self._trace_reflections(tracer, exposure), glossy), gathered(estimate, glossy)
         per_point = dr.rcp(dr.maximum(dr.gather(mi.Float, points.valid_share, glossy), 1e-3))
         weight = per_point / dr.maximum(estimate.rays, 1) * (dr.pi / lighting.white)
         rays = dr.maximum(sums.rays, 1)
@@ -429,7 +450,7 @@ class TracedPixels:
         dr.eval(light, highlight)
         return light, highlight
 
-    def _trace_reflections(self, tracer: ReflectionTracer) -> Reflections:
+    def _trace_reflections(self, tracer: ReflectionTracer, exposure: mi.Float) -> Reflections:
         """Trace reflection rays at the glossy pixels and return their sums by pixel.
 
         A pixel gets more rays if its first rays have not reached the wanted error.
@@ -447,7 +468,7 @@ class TracedPixels:
         sums = points.sums_by_pixel(total)
         if error > 0:
             brightness = typical_brightness(sums.tinted, sums.colourless)
-            wanted = self._rays_for_reflections(brightness, sums.squares, sums.rays)
+            wanted = self._rays_for_reflections(brightness, sums.squares, sums.rays, exposure)
             missing = mi.UInt32(dr.ceil(dr.clip(wanted - dr.gather(mi.Float, sums.rays, glossy), 0, most)))
             more = dr.zeros(mi.UInt32, points.count)
             dr.eval(missing)

@@ -42,11 +42,10 @@ MIN_LIGHT = 0.05
 DISPLAY = 1 / 2.2
 """Exponent of displayed light. Displayed values are perceptually even, and files store them in even steps."""
 
-BRIGHTEST, DIMMEST = 64.0, 1 / 64
-"""Largest and smallest factor of automatic exposure."""
-
-_STEPS = 4096
-"""Number of integer steps of displayed light; integer sums do not depend on the number of threads."""
+_STEPS = 1 << 20
+"""Integer steps of displayed light 1, fine enough for light of 1e-8; integer sums do not depend on the number of
+threads.
+"""
 
 UNTRACED = 0xFFFFFFFF
 """Place of a pixel without traced light."""
@@ -164,7 +163,9 @@ class LightFilter:
             self.shown = dr.select(coarse, dr.gather(mi.UInt32, self.place, stands, coarse), self.place)
             dr.eval(self.shown)
 
-    def rays_for(self, estimate: Estimate, error: float, unshadowed: mi.Float, metered: int = 0) -> mi.Float:
+    def rays_for(
+        self, estimate: Estimate, error: float, unshadowed: mi.Float, others: mi.UInt32 | None = None
+    ) -> tuple[mi.Float, mi.Float]:
         """Compute the number of rays per pixel of ``index`` at which light reaches the wanted error.
 
         The wanted error applies at ``MID_GREY``. At other levels the same perceptual error is tolerated: a smaller
@@ -174,15 +175,18 @@ class LightFilter:
             estimate: Estimate from the rays so far.
             error: Target standard error of mid-grey light.
             unshadowed: Light without occluders at each pixel; 1 is white. Rays estimate the share of it that arrives.
-            metered: Number of pixels of the picture under automatic exposure, which makes the mean look like
-                ``MID_GREY``. Pixels without traced light count as lit by 1. The value 0 means exposure for white.
+            others: Number of other pixels that show a surface, under automatic exposure, which makes the mean look like
+                ``MID_GREY``. They count as lit by 1. None means exposure for white.
+
+        Returns:
+            Number of rays, and the factor of the exposure.
         """
         share, variance, shared = self._share(estimate)
-        light = unshadowed * share
-        if metered:
-            exposure = _metered(light, self.stride * self.stride, metered)
-            light, unshadowed = light * exposure, unshadowed * exposure
-        return estimate.rays * variance * dr.square(unshadowed / _allowed_error(error, light)) / _gain(shared)
+        light, exposure = unshadowed * share, mi.Float(1)
+        if others is not None:
+            exposure = _metered(light, self.stride * self.stride, others)
+        error = _allowed_error(error, light * exposure)
+        return estimate.rays * variance * dr.square(unshadowed * exposure / error) / _gain(shared), exposure
 
     def smooth(self, estimate: Estimate, bounced: tuple[mi.Color3f, mi.Float] | None = None) -> LightMeans:
         """Average the light of the estimate per ray over neighbours of the pixels of ``index``.
@@ -220,7 +224,7 @@ class LightFilter:
         return self._average(values, rays, radius, lobe=(mirrored, closeness, gloss))
 
     def reflections_for(
-        self, brightness: mi.Float, squares: mi.Float, rays: mi.Float, bent: mi.Bool, error: float
+        self, brightness: mi.Float, squares: mi.Float, rays: mi.Float, bent: mi.Bool, error: float, exposure: mi.Float
     ) -> mi.Float:
         """Compute the number of reflection rays per pixel of ``index`` at which they reach the wanted error.
 
@@ -230,9 +234,11 @@ class LightFilter:
             rays: Number of these rays.
             bent: True for pixels that mirror many directions.
             error: Target standard error of mid-grey light.
+            exposure: Factor of the exposure, that of :meth:`rays_for`.
         """
         rays = dr.maximum(rays, 1)
-        (mean, square), shared = self.mirror([brightness / rays, squares / rays], rays, bent, 1)
+        means = [brightness * exposure / rays, squares * dr.square(exposure) / rays]
+        (mean, square), shared = self.mirror(means, rays, bent, 1)
         return dr.maximum(square - dr.square(mean), 0) / (dr.square(_allowed_error(error, mean)) * _gain(shared))
 
     def _share(self, estimate: Estimate) -> tuple[mi.Float, mi.Float, mi.Float]:
@@ -355,19 +361,16 @@ def _allowed_error(error: float, light: mi.Float) -> mi.Float:
     return error * dr.power(dr.clip(light, MIN_LIGHT, 1) / MID_GREY, 1 - DISPLAY)
 
 
-def _metered(light: mi.Float, area: mi.Int32, pixels: int) -> mi.Float:
+def _metered(light: mi.Float, area: mi.Int32, others: mi.UInt32) -> mi.Float:
     """Return the exposure factor that makes the mean of a picture look like ``MID_GREY``.
 
-    Each value of ``light`` represents ``area`` pixels. All other pixels count as 1.
+    Each value of ``light`` represents ``area`` pixels. The ``others`` count as 1.
     """
     # Opaque, because the sum of a literal would enter the kernel.
     area = mi.UInt64(area + dr.opaque(mi.Int32, 0, dr.width(light)))
-    looks = dr.minimum(dr.power(dr.maximum(light, 0), DISPLAY), 4) * _STEPS
-    looks = dr.sum(mi.UInt64(looks + 0.5) * area) - dr.sum(area) * _STEPS
-    looks += dr.opaque(mi.UInt64, pixels * _STEPS)
-    mean = mi.Float(looks) / dr.opaque(mi.Float, pixels * _STEPS)
-    exposure = MID_GREY * dr.power(dr.maximum(mean, 1e-6), -1 / DISPLAY)
-    return dr.clip(exposure, DIMMEST, BRIGHTEST)
+    looks = mi.UInt64(dr.power(dr.maximum(light, 0), DISPLAY) * _STEPS + 0.5)
+    mean = mi.Float(dr.sum(looks * area) + mi.UInt64(others) * _STEPS) / mi.Float(dr.sum(area) + others)
+    return MID_GREY * dr.power(dr.maximum(mean / _STEPS, 1e-6), -1 / DISPLAY)
 
 
 def _padded(count: int) -> int:

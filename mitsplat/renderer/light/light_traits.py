@@ -44,7 +44,8 @@ class Traits:
     def of(cls, shapes: Sequence[mi.Shape], placements: Sequence[Placement]) -> Traits:
         """Build the table from ``splats`` shapes and their placements."""
         count = 1 + max([0, *(s.instance for s in shapes)])
-        plain = False, 0.4, 0.0, 0.0, True
+        # Without captured surroundings, pixels of instance 0 show sparse splats of objects, which are relit.
+        plain = True, 0.4, 0.0, 0.0, True
         rows: dict[tuple[int, Any], int] = {}
         values, owners, placed = [plain] * count, list(range(count)), [p.instance for p in placements]
         # A pixel never shows a shape without splats.

@@ -33,7 +33,7 @@ MIN_LAMP_ROUGHNESS = 0.3
 """Roughness above which the emitters that plastics mirror are added. On smoother surfaces they are rare and bright."""
 
 MAX_REFLECTION = 4.0
-"""Largest reflection of one sampled emitter, in units of display white."""
+"""Largest reflection of one sampled emitter, in units of the fluence at the reference point."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -271,7 +271,7 @@ class Reflectors:
         weight = dr.select(metal, power_weight(beam.density, density), 1)
         used = (cosine > 0) & (metal | (surface.roughness >= MIN_LAMP_ROUGHNESS))
         light = reflectance * beam.irradiance * (weight / self.white)
-        return dr.select(used, dr.minimum(light, MAX_REFLECTION), 0)
+        return dr.select(used, dr.minimum(light, MAX_REFLECTION * self.emitters.fluence / self.white), 0)
 
     def _occluded(
         self,

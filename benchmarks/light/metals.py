@@ -10,8 +10,10 @@ white solids on a white table; its error is the root mean square of display-enco
 Gaussians lie on the true meshes, which are also the proxies, so that the error is that of the shading. FOLDER stores
 path-traced images for later runs.
 
-Base colours are the linear reflectances at normal incidence of Akenine-Möller et al., *Real-Time Rendering*, 4th
-edition, table 9.2. The red metal is dyed aluminium: no measured value.
+Base colours are linear reflectances at normal incidence under D65. Those of copper and gold follow from the optical
+constants that Mitsuba ships (``Cu``, ``Au``); the red of gold, 1.022, is limited to 1. Brass is from Akenine-Möller et
+al., *Real-Time Rendering*, 4th edition, table 9.2, which agrees with both. The red metal is dyed aluminium: no measured
+value.
 """
 
 from __future__ import annotations

@@ -13,9 +13,10 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.record import figure, recording
-from mitsplat.frames.speed_accuracy import draw_chart, measure_steps
+from mitsplat.frames.accuracy_chart import draw_chart
+from mitsplat.frames.speed_accuracy import measure_steps
 
-UNITS = {"seconds": "s", "psnr": "dB", "memory": "GiB"}
+UNITS = {"seconds": "s", "psnr": "dB", "objects": "dB", "memory": "GiB"}
 
 
 def main() -> None:

@@ -298,13 +298,15 @@ def chart(
 ) -> None:
     """Measure speed and accuracy of the rendering presets on SCENE.
 
-    All presets and several cheaper light models are compared with the preset exact. Times are valid for this machine
-    only. Memory is main memory, not GPU memory.
+    All presets and several cheaper light models are compared with the preset exact. Objects that all have materials
+    are compared with their path-traced meshes, beside captured objects and meshes with fewer paths. Times are valid for
+    this machine only. Memory is main memory, not GPU memory.
     """
     from rich.console import Console
     from rich.table import Table
 
-    from mitsplat.frames.speed_accuracy import cheapest, check_tolerance, draw_chart, measure_steps, write_csv
+    from mitsplat.frames.accuracy_chart import draw_chart, write_csv
+    from mitsplat.frames.speed_accuracy import cheapest, check_tolerance, measure_steps
     from mitsplat.runtime.device import find_device
 
     check_output_file(out, ".png")
@@ -322,14 +324,15 @@ def chart(
             device=chosen,
         )
     best = cheapest(rows, tolerance)
-    table = Table("step", "s/image", "RMSE", "PSNR [dB]", "largest", "estimate", "SSIM", "mask IoU", "peak [GiB]")
+    names = "RMSE", "PSNR [dB]", "largest", "estimate", "objects [dB]", "SSIM", "mask IoU", "peak [GiB]"
+    table = Table("step", "s/image", *names)
     for row in rows:
         name = f"{row.name} *" if row == best else row.name
-        errors = f"{row.rmse:.5f}", f"{row.psnr:.1f}", f"{row.largest:.3f}", f"{row.estimate:.4f}"
+        errors = f"{row.rmse:.5f}", f"{row.psnr:.1f}", f"{row.largest:.3f}", f"{row.estimate:.4f}", f"{row.objects:.1f}"
         table.add_row(
             name, f"{row.seconds:.2f}", *errors, f"{row.ssim:.4f}", f"{row.mask_iou:.4f}", f"{row.memory:.2f}"
         )
-    Console(width=110).print(table)
+    Console(width=120).print(table)
     typer.echo(f"* fastest preset with an error of at most {tolerance:g}")
     write_csv(rows, out.with_suffix(".csv"))
     draw_chart(rows, out, title=f"{scene.name}: {frames} images", tolerance=tolerance)

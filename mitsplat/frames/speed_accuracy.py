@@ -1,13 +1,12 @@
-"""Benchmark of speed and accuracy: presets and cheaper light models against the exact renderer.
+"""Benchmark of speed and accuracy: presets, cheaper light models and other kinds of objects against references.
 
 Every step runs in a separate process, so that its time and memory are measured alone. Pictures are compared
-display-encoded, before the camera's development, because sensor noise would mask the differences.
+display-encoded, before the camera's development, because sensor noise would mask the differences. The reference of
+whole pictures is the preset ``exact``, and that of objects their meshes, path-traced with many paths per pixel.
 """
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 import resource
 import statistics
@@ -15,17 +14,20 @@ import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
+from itertools import count
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from scipy.ndimage import maximum_filter, minimum_filter
 
-from mitsplat.arrays import Float32Array
+from mitsplat.arrays import BoolArray, Float32Array, Float64Array
 from mitsplat.engine.pool import LostWorkersError, run_in_process
 from mitsplat.errors import InputError, MissingResourceError
-from mitsplat.frames.frame import render_frame
+from mitsplat.frames.frame import Renderer
+from mitsplat.frames.object_steps import MeshSceneBuilder, without_materials
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.camera import Camera
 from mitsplat.images.colour import encode_srgb
@@ -34,7 +36,6 @@ from mitsplat.quality import PRESETS, Quality
 from mitsplat.renderer.layers import Layers, render_splats
 from mitsplat.runtime.device import Device, current_device
 from mitsplat.scene.loading.scene_loading import load_scene
-from mitsplat.storage.files import storage_errors, write_file, write_text
 
 INSTANCE_MIN = 50
 """Minimum size of an instance for the mask IoU [px]."""
@@ -42,26 +43,44 @@ INSTANCE_MIN = 50
 
 @dataclass(frozen=True)
 class Step:
-    """One configuration: the splat renderer's quality, and changes to the scene file by key."""
+    """One configuration.
+
+    Attributes:
+        name: Name in the table.
+        quality: Quality of the splat renderer.
+        overrides: Changes to the scene file by key.
+        captured: True if the objects are captured assets: their base colours times the light ratio.
+        mesh_paths: Paths per pixel of objects that are path-traced meshes; 0 for splats.
+    """
 
     name: str
     quality: Quality
     overrides: Mapping[str, Any] = field(default_factory=dict)
+    captured: bool = False
+    mesh_paths: int = 0
 
 
 _FAST = PRESETS["fast"]
+TOLERANCE_PREFIX, BUDGET_PREFIX, MESH_PREFIX = "balanced at ", "fast, shadow error ", "meshes, "
+"""Prefixes of the names of steps with other tolerances, with other ray budgets, and with path-traced meshes."""
+
 STEPS = (
     *(Step(name, quality) for name, quality in PRESETS.items()),
     Step("fast, EWA response", replace(_FAST, response="ewa")),
     Step("fast, cut at 1/255, SH 1", replace(_FAST, alpha_min=1 / 255, sh_degree=1)),
 )
 LIGHT_STEPS = (
-    Step("fast, shadow error 0.1", _FAST, {"composite.shadow_error": 0.1}),
+    *(Step(f"{BUDGET_PREFIX}{error}", _FAST, {"composite.shadow_error": error}) for error in (0.1, 0.015)),
     Step("fast, shadows of splats", _FAST, {"composite.occluders": "splats"}),
     Step("fast, no bounce", _FAST, {"composite.bounce": False}),
     Step("fast, image shadow", _FAST, {"composite.shadow": "image"}),
     Step("fast, no shadow", _FAST, {"composite.shadow": "none"}),
 )
+MATERIAL_STEPS = (
+    Step("fast, captured objects", _FAST, captured=True),
+    *(Step(f"{MESH_PREFIX}{paths} paths", _FAST, mesh_paths=paths) for paths in (4, 16, 64, 256)),
+)
+"""Steps for scenes whose objects all have materials. The last one is the reference of objects."""
 
 
 def tolerance_steps(tolerances: Sequence[float]) -> tuple[Step, ...]:
@@ -71,11 +90,7 @@ def tolerance_steps(tolerances: Sequence[float]) -> tuple[Step, ...]:
         InputError: If a tolerance is negative or not a number.
     """
     balanced = PRESETS["balanced"]
-    return tuple(Step(f"{_TOLERANCE_PREFIX}{t:g}", replace(balanced, tolerance=t)) for t in tolerances)
-
-
-_TOLERANCE_PREFIX = "balanced at "
-"""Prefix of the step names of :func:`tolerance_steps`, before the tolerance."""
+    return tuple(Step(f"{TOLERANCE_PREFIX}{t:g}", replace(balanced, tolerance=t)) for t in tolerances)
 
 
 @dataclass(frozen=True)
@@ -92,6 +107,8 @@ class Row:
         mask_iou: Mean IoU of the instances' pixels; NaN without instances.
         memory: Peak memory of the process [GiB].
         estimate: Largest error due to the blending order by the step's own estimate; NaN without an estimate.
+        objects: PSNR inside of objects [dB]: against their path-traced meshes if all objects have materials, otherwise
+            against ``exact``. Infinite for the reference, NaN without objects.
     """
 
     name: str
@@ -103,6 +120,7 @@ class Row:
     mask_iou: float
     memory: float
     estimate: float
+    objects: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,7 +145,7 @@ def measure_steps(
     progress: Progress | None = None,
     device: Device | None = None,
 ) -> list[Row]:
-    """Measure steps against the preset ``exact``.
+    """Measure steps against the preset ``exact``, and objects against path-traced meshes if these are among the steps.
 
     Args:
         path: Scene file, or a file of splats, which is rendered from a circle of cameras.
@@ -147,20 +165,33 @@ def measure_steps(
     if frames < 1:
         raise InputError(f"frames must be at least 1 (got {frames})")
     if steps is None:
-        steps = STEPS if _is_splats(path) else STEPS + LIGHT_STEPS
+        steps = _steps_of(path, overrides, allow_outside)
     steps = (*steps, *tolerance_steps(tolerances))
     exact = Step("exact", PRESETS["exact"])
-    plan = [exact, *(step for step in steps if step != exact)]
-    rows: dict[str, Row] = {}
-    reference: _StepResult | None = None
-    for number, step in enumerate(plan):
+    traced = max(steps, key=lambda step: step.mesh_paths, default=exact)
+    references = [exact, traced] if traced.mesh_paths else [exact]
+    plan = [*references, *(step for step in steps if step not in references)]
+    done = count()
+
+    def run(step: Step) -> _StepResult:
         if progress is not None:
-            progress(number, len(plan), step.name)
+            progress(next(done), len(plan), step.name)
         job = _RenderJob(path, step, frames, {**(overrides or {}), **step.overrides}, allow_outside)
-        result = _run_job(job, device or current_device())
-        reference = reference or result
-        rows[step.name] = _compare(step.name, result, reference)
+        return _run_job(job, device or current_device())
+
+    known = {step.name: run(step) for step in references}
+    whole, objects = known[exact.name], known[references[-1].name]
+    rows = {step.name: _compare(step, known.get(step.name) or run(step), whole, objects) for step in plan}
     return [rows[step.name] for step in steps]
+
+
+def _steps_of(path: Path, overrides: Mapping[str, Any] | None, allow_outside: bool) -> tuple[Step, ...]:
+    """Return all steps that apply to a file."""
+    if _is_splats(path):
+        return STEPS
+    assets = load_scene(path, overrides=dict(overrides or {}), allow_outside=allow_outside).assets
+    has_materials = bool(assets) and all(asset.splats.materials is not None for asset in assets)
+    return STEPS + LIGHT_STEPS + (MATERIAL_STEPS if has_materials else ())
 
 
 def cheapest(rows: Sequence[Row], tolerance: float) -> Row:
@@ -250,15 +281,27 @@ def _scene_renderer(job: _RenderJob) -> Callable[[int], View]:
     options = scene.spec.rendering.model_dump()
     if job.step.quality.response == "ewa":  # the step itself sets the response
         del options["response"]
-    quality = replace(job.step.quality, **options)
+    if job.step.captured:
+        scene = without_materials(scene)
+    renderer = Renderer(scene, quality=replace(job.step.quality, **options))
     indices = np.linspace(0, scene.num_frames - 1, job.frames).round().astype(int)
 
     def render(number: int) -> View:
-        frame = render_frame(scene, int(indices[number]), quality=quality)
+        frame = renderer.render(int(indices[number]))
         seconds = sum(value for stage, value in frame.seconds.items() if stage != "settle")
         picture = encode_srgb(np.clip(frame.rgb, 0, 1)).astype(np.float32)
         return picture, frame.instance, seconds, _largest_error(frame.order_error)
 
+    def render_meshes(number: int) -> View:
+        # The first picture of a layout prepares the splats that meshes mirror, which takes longer than the paths.
+        renderer.integrator.renderer.mesh_samples = 1
+        render(number)
+        renderer.integrator.renderer.mesh_samples = job.step.mesh_paths
+        return render(number)
+
+    if job.step.mesh_paths:
+        renderer.scene_builder = MeshSceneBuilder(scene)
+        return render_meshes
     return render
 
 
@@ -296,27 +339,45 @@ def look_around(splats: Splats, index: int, count: int, *, width: int, height: i
     return Camera.look_at(eye, centre, up=(0, -1, 0), width=width, height=height, fov_x=50)
 
 
-def _compare(name: str, result: _StepResult, reference: _StepResult) -> Row:
+def _compare(step: Step, result: _StepResult, whole: _StepResult, objects: _StepResult) -> Row:
+    """Compare pictures with the reference of whole pictures, and inside of objects with that of objects."""
     # Imported here, because it would add to the peak memory of the measuring processes.
     from skimage.metrics import structural_similarity
 
-    difference = result.pictures.astype(np.float64) - reference.pictures
-    rmse = float(np.sqrt(np.mean(difference**2)))
+    difference = result.pictures.astype(np.float64) - whole.pictures
     ssim = [
         structural_similarity(picture, exact, channel_axis=-1, data_range=1.0)  # type: ignore[no-untyped-call]
-        for picture, exact in zip(result.pictures, reference.pictures, strict=True)
+        for picture, exact in zip(result.pictures, whole.pictures, strict=True)
     ]
+    inside = _inside_objects(whole.instances)
     return Row(
-        name,
+        step.name,
         result.seconds,
-        rmse,
-        psnr=-20 * math.log10(rmse) if rmse > 0 else math.inf,
+        rmse=_rms(difference),
+        psnr=_psnr(difference),
         largest=float(np.abs(difference).max()),
         ssim=float(np.mean(ssim)),
-        mask_iou=_mask_iou(result.instances, reference.instances),
+        mask_iou=math.nan if step.mesh_paths else _mask_iou(result.instances, whole.instances),
         memory=result.memory,
         estimate=result.estimate,
+        objects=_psnr((result.pictures.astype(np.float64) - objects.pictures)[inside]) if inside.any() else math.nan,
     )
+
+
+def _rms(difference: Float64Array) -> float:
+    return float(np.sqrt(np.mean(difference**2)))
+
+
+def _psnr(difference: Float64Array) -> float:
+    """Return the PSNR [dB] of values in [0, 1]; infinite without a difference."""
+    rms = _rms(difference)
+    return -20 * math.log10(rms) if rms > 0 else math.inf
+
+
+def _inside_objects(instances: npt.NDArray[np.uint16]) -> BoolArray:
+    """Return True for pixels whose neighbours all show the same instance, which excludes silhouettes."""
+    least, most = (find(instances, size=(1, 3, 3)) for find in (minimum_filter, maximum_filter))
+    return np.asarray((least == most) & (least > 0))
 
 
 def _mask_iou(instances: npt.NDArray[np.uint16], true_instances: npt.NDArray[np.uint16]) -> float:
@@ -328,51 +389,3 @@ def _mask_iou(instances: npt.NDArray[np.uint16], true_instances: npt.NDArray[np.
             mask, true_mask = ids == instance, true_ids == instance
             ious.append(np.count_nonzero(mask & true_mask) / np.count_nonzero(mask | true_mask))
     return float(np.mean(ious)) if ious else math.nan
-
-
-def write_csv(rows: Sequence[Row], file: Path) -> None:
-    """Write a CSV file with a header and one line per row."""
-    stream = io.StringIO(newline="")
-    writer = csv.DictWriter(stream, list(asdict(rows[0])))
-    writer.writeheader()
-    writer.writerows(asdict(row) for row in rows)
-    with storage_errors(file):
-        write_text(file, stream.getvalue())
-
-
-def draw_chart(rows: Sequence[Row], file: Path, *, title: str, tolerance: float) -> None:
-    """Plot the time of an image against its error, both logarithmic.
-
-    Steps connect the Pareto-optimal configurations; a curve connects those of ``balanced`` over its tolerance.
-    """
-    from matplotlib.figure import Figure  # takes half a second, which only a chart needs
-
-    figure = Figure(figsize=(8, 5), layout="constrained")
-    axes = figure.add_subplot()
-    least = min((row.rmse for row in rows if row.rmse > 0), default=1e-3) / 4
-    errors = [max(row.rmse, least) for row in rows]
-    points = [(row.seconds, error) for row, error in zip(rows, errors, strict=True)]
-    front = sorted(p for p in points if not any(q != p and q[0] <= p[0] and q[1] <= p[1] for q in points))
-    axes.step(*zip(*front, strict=True), where="post", color="0.7", zorder=1)
-    axes.plot(*zip(*curve_of(rows, least), strict=True), color="C0", linewidth=1, zorder=1)
-    chosen = cheapest(rows, tolerance)
-    for row, error in zip(rows, errors, strict=True):
-        axes.scatter(row.seconds, error, s=50, color="C3" if row == chosen else "C0", zorder=2)
-        label = f"{row.name} (no error)" if row.rmse == 0 else row.name
-        placed: dict[str, Any] = {"xytext": (6, 4)}
-        if row.name.startswith(_TOLERANCE_PREFIX):  # below the points, which are dense at the curve's end
-            label, placed = row.name.removeprefix(_TOLERANCE_PREFIX), {"xytext": (0, -6), "rotation": -45, "va": "top"}
-        axes.annotate(label, (row.seconds, error), textcoords="offset points", fontsize=8, **placed)
-    axes.axhline(tolerance, color="C3", linewidth=0.8, linestyle="--")
-    axes.set(xscale="log", yscale="log", xlabel="seconds per image", ylabel="RMSE against exact", title=title)
-    axes.margins(x=0.2, y=0.1)
-    with storage_errors(file):
-        write_file(file, lambda part: figure.savefig(part, dpi=110, format=file.suffix[1:]))
-
-
-def curve_of(rows: Sequence[Row], least: float = 0.0) -> list[tuple[float, float]]:
-    """Return (seconds, error >= ``least``) of ``balanced`` at all its tolerances, in descending order."""
-    preset = f"{_TOLERANCE_PREFIX}{PRESETS['balanced'].tolerance:g}"
-    named = {preset if row.name == "balanced" else row.name: row for row in rows}
-    curve = {name.removeprefix(_TOLERANCE_PREFIX): named[name] for name in named if name.startswith(_TOLERANCE_PREFIX)}
-    return [(curve[key].seconds, max(curve[key].rmse, least)) for key in sorted(curve, key=float, reverse=True)]

@@ -115,7 +115,7 @@ def test_presets_are_measured_on_a_scene_with_files_outside_only_if_allowed(
 def test_render_chooses_the_preset_within_a_tolerance(
     scene_path: Path, write_dataset: Calls, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    chosen = Calls(chart.Row("fast", 0.5, 0.01, 40.0, 0.1, 0.9, 0.9, 1.0, 0.0))
+    chosen = Calls(chart.Row("fast", 0.5, 0.01, 40.0, 0.1, 0.9, 0.9, 1.0, 0.0, 40.0))
     monkeypatch.setattr(chart, "choose_preset", chosen)
     assert run("render", scene_path, "--tolerance", "0.02", "--seed", 3) == 0
     assert chosen.args == (scene_path, 0.02)

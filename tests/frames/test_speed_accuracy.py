@@ -9,12 +9,20 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from PIL import Image
+from ruamel.yaml import YAML
 from typer.testing import CliRunner
 
+from mitsplat.asset import Asset
 from mitsplat.cli import app
 from mitsplat.errors import InputError
-from mitsplat.frames.speed_accuracy import Row, Step, cheapest, curve_of, draw_chart, measure_steps, tolerance_steps
+from mitsplat.frames import speed_accuracy
+from mitsplat.frames.accuracy_chart import curve_of, draw_chart
+from mitsplat.frames.speed_accuracy import Row, Step, cheapest, measure_steps, tolerance_steps
+from mitsplat.gaussians.spherical_harmonics import SH_C0
+from mitsplat.gaussians.surfels import place_surfels
+from mitsplat.images.colour import encode_srgb
 from mitsplat.quality import PRESETS
 from tests.renderer.test_render import make_splats
 
@@ -28,10 +36,52 @@ def splat_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def row(name: str, seconds: float, rmse: float) -> Row:
     psnr = -20 * math.log10(rmse) if rmse else math.inf
-    return Row(name, seconds, rmse, psnr, largest=rmse, ssim=1.0, mask_iou=1.0, memory=0.5, estimate=0.0)
+    return Row(
+        name, seconds, rmse, psnr, largest=rmse, ssim=1.0, mask_iou=1.0, memory=0.5, estimate=0.0, objects=math.nan
+    )
 
 
 ROWS = [row("fast", 1.0, 0.01), row("balanced", 2.0, 0.001), row("exact", 9.0, 0.0), row("fast, no shadow", 0.5, 0.0)]
+
+
+def metal_ball(folder: Path) -> Path:
+    """Write a scene of a metal ball on a table under a lamp and a sky."""
+    mesh = trimesh.creation.icosphere(3, 0.03)
+    surfels = place_surfels(mesh, 1.0, 2000, np.random.default_rng(0))
+    gold = encode_srgb(np.array([1.0, 0.782, 0.344]))
+    splats = surfels.splats(np.tile((gold - 0.5) / SH_C0, (len(surfels), 1, 1))).with_material(
+        metallic=1, roughness=0.3
+    )
+    Asset(name="ball", class_name="ball", splats=splats, mesh=mesh, pieces=(mesh,)).save(folder / "ball")
+    box = {"size": [1, 1, 0.1], "position": [0, 0, -0.05]}
+    scene = {
+        "name": "metal",
+        "shapes": [{"name": "table", "box": box, "visible": True}],
+        "objects": [{"asset": "ball"}],
+        "region": {"min": [-0.05, -0.05, 0.0], "max": [0.05, 0.05, 0.1]},
+        "settle": {"arrangement": "upright"},
+        "camera": {"kind": "orbit", "target": [0, 0, 0.02], "radius": 0.2, "height": 0.15},
+        "lights": [{"kind": "area", "position": [0.3, 0.2, 0.6], "size": [0.2, 0.2]}, {"kind": "environment"}],
+        "output": {"width": 64, "height": 48, "layouts": 1, "views": 1},
+    }
+    YAML(typ="safe", pure=True).dump(scene, folder / "scene.yaml")
+    return folder / "scene.yaml"
+
+
+def test_objects_are_compared_with_their_path_traced_meshes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Splats with materials show the reflections of the meshes; the same splats as captured colours do not."""
+    monkeypatch.setattr(speed_accuracy, "_run_job", lambda job, _: job(0, lambda _: None))  # in this process
+    fast = PRESETS["fast"]
+    monkeypatch.setitem(PRESETS, "exact", fast)  # whose kernels are compiled anyway
+    meshes = (Step(f"meshes, {paths} paths", fast, mesh_paths=paths) for paths in (4, 64))
+    rows = measure_steps(
+        metal_ball(tmp_path), [Step("fast", fast), Step("captured", fast, captured=True), *meshes], frames=1
+    )
+    splats, captured, few_paths, many_paths = (row.objects for row in rows)
+    assert captured < 20 and splats > 28 and few_paths < many_paths == math.inf
+    assert rows[0].mask_iou > 0.99 and math.isnan(rows[2].mask_iou)
+    draw_chart([*ROWS, *rows[1:]], tmp_path / "chart.png", title="", tolerance=0.002)
+    assert np.asarray(Image.open(tmp_path / "chart.png")).shape[1] > 1500  # both panels
 
 
 @pytest.mark.parametrize(("tolerance", "name"), [(0.02, "fast"), (0.002, "balanced"), (0.0, "exact")])

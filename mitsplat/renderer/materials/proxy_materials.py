@@ -48,7 +48,7 @@ MIN_OPACITY = 0.5
 """Opacity above which Gaussians form the surface."""
 
 
-class _Columns:
+class MaterialColumns:
     """Columns of the packed material of a corner."""
 
     COLOUR = slice(0, 3)
@@ -110,7 +110,7 @@ class CornerMaterials:
     """Materials of the corners of triangles.
 
     Attributes:
-        values: Packed values, see :class:`_Columns`.
+        values: Packed values, see :class:`MaterialColumns`.
         glossy: True if any surface has a specular reflection.
     """
 
@@ -122,23 +122,21 @@ class CornerMaterials:
         """Build the table of merged meshes; return None if no mesh has Gaussians."""
         if all(part.splats is None for part in parts):
             return None
-        values = np.concatenate(
-            [_changed(corner_materials(part.mesh, part.splats), part.appearance, part.gloss) for part in parts]
-        )
-        glossy = bool((values[:, [_Columns.METALLIC, _Columns.SPECULAR]] > 0).any())
+        values = np.concatenate([part_materials(part) for part in parts])
+        glossy = bool((values[:, [MaterialColumns.METALLIC, MaterialColumns.SPECULAR]] > 0).any())
         return cls(wrapped(mi.Float, values), glossy)
 
     def at(self, triangle: mi.UInt32, uv: mi.Point2f, active: mi.Bool) -> SurfaceMaterial:
         """Return the materials at barycentric coordinates ``uv`` of triangles."""
-        shape = (_Columns.WIDTH, dr.width(triangle))
+        shape = (MaterialColumns.WIDTH, dr.width(triangle))
         total = mi.ArrayXf(dr.zeros(mi.ArrayXf, shape))
         for corner, weight in enumerate((1 - uv.x - uv.y, uv.x, uv.y)):
             total += dr.gather(mi.ArrayXf, self.values, triangle * 3 + corner, active, shape=shape) * weight
         return SurfaceMaterial(
-            mi.Color3f(*total[_Columns.COLOUR]),
-            total[_Columns.METALLIC],
-            total[_Columns.ROUGHNESS],
-            total[_Columns.SPECULAR],
+            mi.Color3f(*total[MaterialColumns.COLOUR]),
+            total[MaterialColumns.METALLIC],
+            total[MaterialColumns.ROUGHNESS],
+            total[MaterialColumns.SPECULAR],
         )
 
 
@@ -210,11 +208,11 @@ def corner_materials(mesh: trimesh.Trimesh, splats: Splats | None) -> Float32Arr
     if splats is None or not len(opaque):
         return np.repeat(_BLACK, count, axis=0)
     rows = np.repeat(_BLACK, len(opaque), axis=0)
-    rows[:, _Columns.COLOUR] = np.clip(decode_srgb(0.5 + SH_C0 * splats.sh[opaque, 0]), 0, 1)
+    rows[:, MaterialColumns.COLOUR] = np.clip(decode_srgb(0.5 + SH_C0 * splats.sh[opaque, 0]), 0, 1)
     if splats.materials is not None:
-        rows[:, _Columns.METALLIC] = splats.materials.metallic[opaque]
-        rows[:, _Columns.ROUGHNESS] = splats.materials.roughness[opaque]
-        rows[:, _Columns.SPECULAR] = splats.materials.specular[opaque]
+        rows[:, MaterialColumns.METALLIC] = splats.materials.metallic[opaque]
+        rows[:, MaterialColumns.ROUGHNESS] = splats.materials.roughness[opaque]
+        rows[:, MaterialColumns.SPECULAR] = splats.materials.specular[opaque]
     places = corners + INSIDE * (corners.mean(axis=1, keepdims=True) - corners)
     neighbours = min(int(np.clip(len(opaque) // count, *NEIGHBOURS)), len(opaque))
     _, nearest = KDTree(splats.means[opaque]).query(places.reshape(-1, 3), range(1, neighbours + 1))
@@ -225,15 +223,16 @@ def corner_materials(mesh: trimesh.Trimesh, splats: Splats | None) -> Float32Arr
     return np.einsum("nk,nkc->nc", weights / weights.sum(axis=1, keepdims=True), rows[nearest]).astype(np.float32)
 
 
-def _changed(corners: Float32Array, appearance: SplatAppearance | None, gloss: GlossChange) -> Float32Array:
-    """Return the corners of a placement with the changes of its appearance and gloss; dirt is ignored."""
+def part_materials(part: ProxyPart) -> Float32Array:
+    """Return the packed materials of all corners of a placement, shape (3 T, 8); dirt is ignored."""
+    corners, appearance, gloss = corner_materials(part.mesh, part.splats), part.appearance, part.gloss
     if appearance is None and gloss == UNCHANGED_GLOSS:
         return corners
     result = corners.copy()
     if appearance is not None:
         matrix = np.reshape(appearance.matrix, (3, 3))
-        result[:, _Columns.COLOUR] = np.clip(corners[:, _Columns.COLOUR] @ matrix.T, 0, 1)
-    for column, value in ((_Columns.ROUGHNESS, gloss.roughness), (_Columns.SPECULAR, gloss.specular)):
+        result[:, MaterialColumns.COLOUR] = np.clip(corners[:, MaterialColumns.COLOUR] @ matrix.T, 0, 1)
+    for column, value in ((MaterialColumns.ROUGHNESS, gloss.roughness), (MaterialColumns.SPECULAR, gloss.specular)):
         if value is not None:
             result[:, column] = value
     return result

@@ -57,6 +57,12 @@ class Occluder:
     appearance: SplatAppearance | None = None
     gloss: GlossChange = UNCHANGED_GLOSS
 
+    @property
+    def part(self) -> ProxyPart:
+        """The mesh with what determines its materials."""
+        pose = np.asarray(self.world_from_mesh, np.float64).tobytes()
+        return ProxyPart(self.mesh, self.instance, pose, self.splats, self.appearance, self.gloss)
+
 
 @dataclass(frozen=True, eq=False)
 class Hit:
@@ -272,12 +278,7 @@ class TraceScene:
                 return None
             nothing = mi.Float([0.0] * 9)
             return cls(ray_scene(others), None, mi.UInt32([0]), nothing, nothing, None)
-        parts = tuple(
-            ProxyPart(
-                o.mesh, o.instance, np.asarray(o.world_from_mesh, np.float64).tobytes(), o.splats, o.appearance, o.gloss
-            )
-            for o in occluders
-        )
+        parts = tuple(o.part for o in occluders)
         return _merged_scene(parts, others) if others else _cached_scene(parts, str(mi.variant()))
 
 
@@ -290,11 +291,9 @@ def _cached_scene(parts: tuple[ProxyPart, ...], _variant: str) -> TraceScene:
 def _merged_scene(parts: tuple[ProxyPart, ...], others: Mapping[str, mi.Shape]) -> TraceScene:
     corners, normals, numbers = [], [], []
     for part in parts:
-        world_from_mesh = np.frombuffer(part.pose).reshape(4, 4)
-        turn, shift = world_from_mesh[:3, :3], world_from_mesh[:3, 3]
-        own_corners, own_normals = _own_corners(part.mesh, part.splats)
-        corners.append(own_corners @ turn.T + shift)
-        normals.append(own_normals @ (turn / np.cbrt(np.linalg.det(turn))).T)
+        own_corners, own_normals = world_corners(part)
+        corners.append(own_corners)
+        normals.append(own_normals)
         numbers.append(np.full(len(own_corners) // 3, part.instance, np.uint32))
     positions = wrapped(mi.Float, np.concatenate(corners).astype(np.float32))
     count = sum(len(c) for c in corners)
@@ -311,6 +310,14 @@ def _merged_scene(parts: tuple[ProxyPart, ...], others: Mapping[str, mi.Shape]) 
         wrapped(mi.Float, np.concatenate(normals).astype(np.float32)),
         CornerMaterials.of(list(parts)),
     )
+
+
+def world_corners(part: ProxyPart) -> tuple[np.ndarray, np.ndarray]:
+    """Return corners [m] and unit normals (3 T, 3) of the triangles of a placement in world space."""
+    world_from_mesh = np.frombuffer(part.pose).reshape(4, 4)
+    turn, shift = world_from_mesh[:3, :3], world_from_mesh[:3, 3]
+    corners, normals = _own_corners(part.mesh, part.splats)
+    return corners @ turn.T + shift, normals @ (turn / np.cbrt(np.linalg.det(turn))).T
 
 
 @lru_cache(maxsize=64)

@@ -8,8 +8,8 @@ import shutil
 import tempfile
 import time
 import weakref
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -86,13 +86,27 @@ class FrameJob:
         """
         if self._cached_layout is not None and self._cached_layout.index == index:
             return self._cached_layout
-        path = self.out / f"layouts/{index:04d}.json"
+        path = self._layout_path(index)
         with storage_errors(self.out), open_in_place(path.parent / LOCK, "ab") as lock:
             fcntl.lockf(lock, fcntl.LOCK_EX, 1, index)  # one byte per layout; released with the file or the process
             if not path.exists():
                 write_text(path, self.settle_to_json(index, note))
             with layout_errors(path), open_regular(path) as file:
                 return self.load_layout(file.read())
+
+    def settle_ahead(self, layouts: Sequence[int]) -> None:
+        """Settle the layouts that have no file, except those that another process settles at that moment."""
+        for index in layouts:
+            path = self._layout_path(index)
+            if path.exists():
+                continue
+            with suppress(BlockingIOError), open_in_place(path.parent / LOCK, "ab") as lock:
+                fcntl.lockf(lock, fcntl.LOCK_EX | fcntl.LOCK_NB, 1, index)
+                if not path.exists():
+                    write_text(path, self.settle_to_json(index, lambda text: None))
+
+    def _layout_path(self, index: int) -> Path:
+        return self.out / f"layouts/{index:04d}.json"
 
     def load_layout(self, text: str | bytes) -> Layout:
         """Parse a layout from JSON and cache it; return the cached object if the index is the same.

@@ -200,7 +200,10 @@ def _results(
     """Yield the record and the seconds of the stages of each frame, after its files were written to the folder."""
     if cluster is None:
         memory = TYPICAL_MEMORY if workers is not None else worker_memory(job.scene)
-        with closing(run_frames(job, layouts, workers=workers, note=note, memory=memory, device=device)) as results:
+        prepare = job.settle_ahead
+        with closing(
+            run_frames(job, layouts, workers=workers, note=note, memory=memory, device=device, prepare=prepare)
+        ) as results:
             yield from results
         return
     with closing(run_on_ray(RemoteFrameJob(job), layouts, cluster, workers=workers, note=note)) as frames:

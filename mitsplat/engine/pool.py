@@ -3,6 +3,9 @@
 A frame depends only on (seed, frame index), so the scheduler may choose any order. Each worker gets all frames of one
 layout in turn. Different layouts thus settle in parallel, and a worker can cache the data of its layout. A frame whose
 worker is lost is made again by another worker.
+
+Helper processes of low priority prepare later layouts on cores that the workers leave idle. Their results only save
+time: a worker that needs an unprepared layout prepares it.
 """
 
 from __future__ import annotations
@@ -15,14 +18,15 @@ import threading
 import time
 import traceback
 from collections import Counter, deque
-from collections.abc import Generator, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, nullcontext, suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from heapq import heapify, heappop, heappush, heapreplace
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
-from typing import Generic, Protocol, TypeVar
+from typing import Any, Generic, Protocol, TypeVar
 
 from mitsplat.engine.mps import MAX_CLIENTS, SharedGpu
 from mitsplat.engine.resources import TYPICAL_MEMORY, WorkerMemory, unused_memory
@@ -52,6 +56,13 @@ MIN_SPEED_UP = 1.1
 
 _SPEED_WINDOW = 6
 """Frames per worker over which speed is measured."""
+
+_HELPER_MEMORY = 2**30
+"""Maximum memory of a helper process [bytes]."""
+
+_HELPER_NICENESS = 5
+"""Lower priority of helper processes. The lowest one could delay a worker that waits for a layout on a busy machine."""
+
 _MAX_SERIAL_FRAMES = 16
 """Number of frames up to which worker processes are not worth their start-up time."""
 
@@ -75,6 +86,13 @@ class MakeFrame(Protocol[MadeFrame]):
 
     def __call__(self, index: int, note: Note, /) -> MadeFrame:
         """Make frame ``index``."""
+
+
+Prepare = Callable[[Sequence[int]], object]
+"""Function that prepares layouts in the given order and skips those in preparation elsewhere; must be picklable."""
+
+_Jobs = tuple[MakeFrame[Any], Callable[[], object] | None]
+"""Functions of workers and helpers, which share the arrays of the scene."""
 
 
 class FrameError(RuntimeError):
@@ -186,6 +204,7 @@ def run_frames(
     note: Note,
     memory: WorkerMemory = TYPICAL_MEMORY,
     device: Device | None = None,
+    prepare: Prepare | None = None,
 ) -> Generator[Result]:
     """Call ``make`` for every frame and yield the results in order of completion.
 
@@ -200,6 +219,8 @@ def run_frames(
         memory: Memory of a worker, which limits an automatic number of workers.
         device: Device for the frames; each worker selects it first, and several GPUs are assigned in turn. None for
             work without a device.
+        prepare: Function that helper processes call with the layouts that the first workers do not begin with. Its
+            failures are ignored, because ``make`` prepares what is missing.
 
     Raises:
         InputError: If the input of a frame is invalid.
@@ -233,10 +254,16 @@ def run_frames(
     with closing(SharedGpu()) if shares else nullcontext() as shared:
         if shared is not None and shared.problem:
             note(f"workers take turns on the GPU, because {shared.problem}")
+        environment = {} if shared is None else shared.environment
+        later = list(layouts)[1 if grow else max_workers :]  # the first workers begin with the others
+        worthwhile = prepare is not None and total > _MAX_SERIAL_FRAMES
+        helpers = min(len(later), _affordable_helpers(max_workers, memory)) if worthwhile else 0
         with (
-            closing(_Processes(make, device, {} if shared is None else shared.environment)) as pool,
+            closing(_Processes(make, device, environment, partial(prepare, later) if prepare else None)) as pool,
             closing(run_pool(pool, layouts, max_workers, note, grow=grow)) as found,
         ):
+            for _ in range(helpers):
+                pool.start_helper()
             yield from found
 
 
@@ -257,6 +284,12 @@ def affordable_workers(memory: WorkerMemory, device: Device | None = None) -> in
         fitting = int(min(gpu.memory for gpu in device.gpus) / memory.gpu)
         max_workers = min(max_workers, len(device.gpus) * min(fitting, MAX_CLIENTS))
     return max(1, max_workers)
+
+
+def _affordable_helpers(workers: int, memory: WorkerMemory) -> int:
+    """Return the number of helpers for which cores and unused memory suffice beside the workers."""
+    room = (unused_memory() * 2**30 - memory.shared - workers * memory.own) / _HELPER_MEMORY
+    return min(max(1, usable_cores() - workers), max(0, int(room)))
 
 
 def run_pool(
@@ -481,26 +514,44 @@ class _Processes(Generic[Result]):
     """
 
     def __init__(
-        self, make: MakeFrame[Result], device: Device | None, environment: Mapping[str, str] | None = None
+        self,
+        make: MakeFrame[Result],
+        device: Device | None,
+        environment: Mapping[str, str] | None = None,
+        prepare: Callable[[], object] | None = None,
     ) -> None:
         prepare_caches()  # workers inherit the folders
-        self._make = SharedArrays(make)
+        self._jobs = SharedArrays((make, prepare))
         self._environment = environment or {}
         self._kind = None if device is None else device.kind
         self._gpus = () if device is None else device.gpus
         self._taken: dict[int, Gpu] = {}
         self._spawn = multiprocessing.get_context("spawn")
         self._workers: dict[int, tuple[BaseProcess, Connection]] = {}
+        self._helpers: list[BaseProcess] = []
         self._starting: dict[int, float] = {}
         self._count = 0
 
     def start(self) -> int:
         pipe, far_end = self._spawn.Pipe()
         worker, self._count = self._count, self._count + 1
-        arguments = far_end, self._kind, self._make
-        process = self._spawn.Process(target=_work, args=arguments, name=f"mitsplat-{worker}", daemon=True)
         load = Counter(self._taken.values())
         gpu = min(self._gpus, key=load.__getitem__, default=None)
+        process = self._start_process(f"mitsplat-{worker}", _work, (far_end, self._kind, self._jobs), gpu)
+        far_end.close()  # so that the worker's death closes the pipe
+        self._workers[worker] = process, pipe
+        self._starting[worker] = _START_TIMEOUT
+        if gpu is not None:
+            self._taken[worker] = gpu
+        return worker
+
+    def start_helper(self) -> None:
+        """Start a process that runs ``prepare`` once. It needs no attention and may die."""
+        name = f"mitsplat-helper-{len(self._helpers)}"
+        self._helpers.append(self._start_process(name, _help, (self._jobs,), None))
+
+    def _start_process(self, name: str, target: Callable[..., None], arguments: Any, gpu: Gpu | None) -> BaseProcess:
+        process = self._spawn.Process(target=target, args=arguments, name=name, daemon=True)
         with safe_path_children(), children_on_gpu(gpu, **self._environment), _short_arguments():
             resource_tracker.ensure_running()  # its start together with the first worker would unblock SIGINT
             # Ctrl-C reaches all processes of a terminal, but only this one must handle it: workers inherit the blocked
@@ -510,12 +561,7 @@ class _Processes(Generic[Result]):
                 process.start()
             finally:
                 signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
-        far_end.close()  # so that the worker's death closes the pipe
-        self._workers[worker] = process, pipe
-        self._starting[worker] = _START_TIMEOUT
-        if gpu is not None:
-            self._taken[worker] = gpu
-        return worker
+        return process
 
     def stop(self, worker: int) -> None:
         process, pipe = self._workers.pop(worker)
@@ -558,11 +604,13 @@ class _Processes(Generic[Result]):
         return 0
 
     def close(self) -> None:
-        for process, _ in self._workers.values():
+        for process in (*self._helpers, *(process for process, _ in self._workers.values())):
             process.kill()
+        for helper in self._helpers:
+            helper.join()
         for worker in list(self._workers):
             self.stop(worker)
-        self._make.close()
+        self._jobs.close()
 
 
 @contextmanager
@@ -586,8 +634,19 @@ def _describe_end(process: BaseProcess) -> str:
     return f"was killed by {signal.Signals(-code).name}" if code < 0 else f"ended with status {code}"
 
 
-def _work(pipe: Connection, device: Kind | None, make: MakeFrame[Result]) -> None:
+def _help(jobs: _Jobs) -> None:
+    """Run a helper. Its failures are ignored, because the workers find them again."""
+    _, prepare = jobs
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    os.nice(_HELPER_NICENESS)
+    if prepare is not None:
+        with suppress(Exception):
+            prepare()
+
+
+def _work(pipe: Connection, device: Kind | None, jobs: _Jobs) -> None:
     """Run a worker: receive frame indices, send notes and results, until the process is stopped."""
+    make, _ = jobs
     threading.Thread(target=_end_with_parent, daemon=True).start()
     with suppress(EOFError, BrokenPipeError):
         pipe.send(Started())

@@ -1,5 +1,6 @@
 """Dataset folders: content, resumption, interruption and refusals, with a synthetic renderer."""
 
+import fcntl
 import hashlib
 import json
 import os
@@ -18,12 +19,14 @@ from ruamel.yaml import YAML
 
 from mitsplat.dataset import dataset_folder as folder
 from mitsplat.dataset import manifest
+from mitsplat.dataset.frame_job import FrameJob
 from mitsplat.dataset.manifest import Manifest
 from mitsplat.dataset.schema import read_content
 from mitsplat.dataset.write import write_dataset
 from mitsplat.engine import pool
 from mitsplat.engine.pool import FrameError
 from mitsplat.errors import InputError, MissingResourceError
+from mitsplat.formats.format import Catalogue
 from mitsplat.formats.yolo import data_yaml
 from mitsplat.frames.layer_sheet import layer_sheet
 from mitsplat.images.masks import Silhouette
@@ -303,6 +306,23 @@ class TestSameBytes:
 
         write(scene, tmp_path / "out", frames=3)
         write(scene, tmp_path / "out", frames=4, settle=never)
+
+    def test_settling_ahead_skips_layouts_that_exist_or_are_being_settled(self, scene, tmp_path, monkeypatch):
+        """Layout 1 exists, and another process settles layout 2."""
+
+        def lock(file, operation, length, layout):
+            assert (operation, length) == (fcntl.LOCK_EX | fcntl.LOCK_NB, 1)
+            if layout == 2:
+                raise BlockingIOError
+
+        layouts = tmp_path / "layouts"
+        layouts.mkdir()
+        (layouts / "0001.json").touch()
+        monkeypatch.setattr(fcntl, "lockf", lock)
+        job = FrameJob(scene, Catalogue((), (), (), ()), tmp_path, render, settle)
+        job.settle_ahead([0, 1, 2])
+        assert sorted(path.name for path in layouts.glob("*.json")) == ["0000.json", "0001.json"]
+        assert job.load_layout((layouts / "0000.json").read_bytes()).index == 0
 
 
 def never_render(scene, index, *, layout):

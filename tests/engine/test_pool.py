@@ -20,6 +20,7 @@ from mitsplat.engine.pool import Failure, Finished, FrameError, LostWorkersError
 from mitsplat.engine.resources import TYPICAL_MEMORY
 from mitsplat.errors import InputError, MissingResourceError
 from mitsplat.runtime.device import CPU, Device, Gpu, MissingPrerequisite, visible_gpus
+from mitsplat.storage.files import write_text
 
 LAYOUTS = {0: [0, 1, 2], 1: [3, 4, 5], 2: [6, 7, 8]}
 
@@ -109,6 +110,47 @@ def test_frames_of_lost_workers_are_made_by_others(tmp_path, workers):
     assert sorted(made) == list(range(9))
     told = [note for note in notes if "repeated" in note]
     assert sorted(told) == [f"the worker of frame {i} was killed by SIGKILL: the frame is repeated" for i in (1, 7)]
+
+
+@dataclass(frozen=True)
+class Prepare:
+    """Function of a helper process that records its layouts and fails."""
+
+    folder: Path
+
+    def __call__(self, layouts):
+        write_text(self.folder / str(os.getpid()), str(layouts))
+        raise RuntimeError("ignored")
+
+
+@dataclass(frozen=True)
+class WaitForHelper:
+    """Job that waits until a helper process has prepared layouts."""
+
+    folder: Path
+
+    def __call__(self, index, note, /):
+        wait_for(lambda: list(self.folder.iterdir()))
+        return index
+
+
+def test_a_helper_prepares_the_layouts_that_no_worker_begins_with(tmp_path):
+    layouts = {4: range(8), 5: range(8, 16), 7: [16], 9: [17]}
+    with closing(
+        run_frames(WaitForHelper(tmp_path), layouts, workers=2, note=print, prepare=Prepare(tmp_path))
+    ) as results:
+        assert sorted(results) == list(range(18))
+    for path in tmp_path.iterdir():
+        assert path.read_text() == "[7, 9]"
+        assert ended(path.name)
+
+
+@pytest.mark.parametrize(("cores", "gigabytes", "helpers"), [(2, 9, 1), (6, 64, 4), (6, 10.5, 2), (2, 8, 0)])
+def test_the_number_of_helpers_is_bounded_by_cores_and_memory(monkeypatch, cores, gigabytes, helpers):
+    """Two workers take 4 GiB each. A helper takes 1 GiB, and uses a core that has no worker, if there is one."""
+    monkeypatch.setattr(engine, "unused_memory", lambda: float(gigabytes))
+    monkeypatch.setattr(engine, "usable_cores", lambda: cores)
+    assert engine._affordable_helpers(2, TYPICAL_MEMORY) == helpers
 
 
 @pytest.fixture
@@ -336,7 +378,7 @@ def test_a_gpu_that_does_not_start_loses_its_worker(monkeypatch, kind, exhausted
 
     monkeypatch.setattr(engine, "use_shared_device", fail)
     monkeypatch.setattr(engine, "_end_with_parent", lambda: None)
-    engine._work(SimpleNamespace(recv=receive, send=said.append), kind, Variant())
+    engine._work(SimpleNamespace(recv=receive, send=said.append), kind, (Variant(), None))
     assert isinstance(said.pop(0), engine.Started)
     assert [(answer.exhausted, answer.message) for answer in said] == [(exhausted, "cuInit() failed")] * 2
 

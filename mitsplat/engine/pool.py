@@ -10,6 +10,7 @@ time: a worker that needs an unprepared layout prepares it.
 
 from __future__ import annotations
 
+import math
 import multiprocessing
 import os
 import signal
@@ -26,6 +27,7 @@ from heapq import heapify, heappop, heappush, heapreplace
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
+from statistics import median
 from typing import Any, Generic, Protocol, TypeVar
 
 from mitsplat.engine.mps import MAX_CLIENTS, SharedGpu
@@ -54,7 +56,7 @@ MAX_LOSSES = 3
 MIN_SPEED_UP = 1.1
 """Minimum speed-up for keeping another worker, if the engine chooses the number of workers."""
 
-_SPEED_WINDOW = 6
+_SPEED_WINDOW = 8
 """Frames per worker over which speed is measured."""
 
 _HELPER_MEMORY = 2**30
@@ -316,14 +318,14 @@ def run_pool(
     max_workers = min(max_workers, plan.left)
     growth = _Growth(max_workers)
     losses: Counter[int] = Counter()
-    at_work: dict[int, int] = {}
+    at_work: dict[int, tuple[int, float]] = {}  # frame, and the time when it was assigned
     gone = 0
     live_workers: dict[int, int] = {}  # value: number of lost workers when it got its frame
 
     def assign(worker: int) -> None:
         live_workers[worker] = gone
         if (task := plan.take(worker)) is not None:
-            at_work[worker] = task[1]
+            at_work[worker] = task[1], time.monotonic()
             pool.send_frame(worker, task[1], task[0])
 
     for _ in range(min(1, max_workers) if grow else max_workers):
@@ -336,7 +338,7 @@ def run_pool(
             if worker not in at_work:
                 live_workers.pop(worker, None)  # died while idle
                 continue
-            frame = at_work.pop(worker)
+            frame, begin = at_work.pop(worker)
             if isinstance(answer, Failure) and not answer.exhausted:
                 raise answer.error(frame)
             if isinstance(answer, Failure):
@@ -370,7 +372,7 @@ def run_pool(
                     assign(pool.start())
                 continue
             if grow:
-                match growth.judge(worker, len(at_work) + 1, time.monotonic()):
+                match growth.judge(worker, len(at_work) + 1, begin, time.monotonic()):
                     case "start" if plan.left:
                         assign(pool.start())
                     case "stop":
@@ -473,32 +475,39 @@ class _Plan:
 
 
 class _Growth:
-    """Decision about another worker, from the frame rates with n and with n - 1 workers."""
+    """Decision about another worker, from the speeds with n and with n - 1 workers.
+
+    The speed is the number of workers over the median time of a frame. The median ignores frames that take longer
+    because they are the first of a layout or compile kernels.
+    """
 
     def __init__(self, max_workers: int) -> None:
         self._max_workers = max_workers
         self._speed = 0.0
         self._count = 0
         self._warm: set[int] = set()
-        self._finished = 0
         self._since = 0.0
+        self._seconds: list[float] = []
 
-    def judge(self, worker: int, count: int, now: float) -> str:
-        """Evaluate a frame finished by one of ``count`` workers; return "start", "stop", "stay" or "" (undecided).
+    def judge(self, worker: int, count: int, begin: float, now: float) -> str:
+        """Evaluate a frame that one of ``count`` workers began at ``begin`` and has finished.
 
-        The first frame of each worker is ignored, because it includes imports, compilation and settling of a layout.
+        Frames that began before every worker had finished its first one are ignored.
+
+        Returns:
+            "start", "stop", "stay" or "" (undecided).
         """
         if count != self._count:
-            self._count, self._finished = count, -1
+            self._count, self._since, self._seconds = count, math.inf, []
         self._warm.add(worker)
         if len(self._warm) < count:
             return ""
-        self._finished += 1
-        if self._finished == 0:
-            self._since = now
-        if self._finished < _SPEED_WINDOW * count:
+        self._since = min(self._since, now)
+        if begin >= self._since:
+            self._seconds.append(now - begin)
+        if len(self._seconds) < _SPEED_WINDOW * count:
             return ""
-        speed = self._finished / (now - self._since)
+        speed = count / median(self._seconds)
         if speed < MIN_SPEED_UP * self._speed:
             return "stop"
         self._speed = speed

@@ -489,8 +489,8 @@ class Linger:
 class Scripted:
     """Pool whose workers take given times on a simulated clock, one after the other, to test the number of workers."""
 
-    def __init__(self, seconds, joining=()):
-        self.seconds, self.joining, self.clock, self.most = seconds, list(joining), 0.0, 0
+    def __init__(self, seconds, joining=(), settle=0.0):
+        self.seconds, self.joining, self.settle, self.clock, self.most = seconds, list(joining), settle, 0.0, 0
         self.due: dict[int, tuple[float, int]] = {}
         self.alive: set[int] = set()
         self.hired = 0
@@ -505,7 +505,8 @@ class Scripted:
         self.alive.remove(worker)
 
     def send_frame(self, worker, frame, layout):
-        self.due[worker] = self.clock + self.seconds(len(self.alive)), frame
+        settle = self.settle * (frame % 8 == 0)
+        self.due[worker] = self.clock + settle + self.seconds(len(self.alive)), frame
 
     def wait(self):
         worker = min(self.due, key=self.due.__getitem__)
@@ -533,6 +534,15 @@ def test_workers_are_added_while_they_increase_the_speed(monkeypatch, seconds, s
     made = list(run_pool(pool, {0: range(400)}, 4, print, grow=True))
     assert sorted(made) == list(range(400))
     assert (len(pool.alive), pool.most) == (settled_at, most)
+
+
+def test_the_time_of_settling_does_not_affect_the_number_of_workers(monkeypatch):
+    """Every eighth frame settles a layout for ten times as long as the others render."""
+    pool = Scripted(lambda count: 1.0, settle=10.0)
+    monkeypatch.setattr(engine.time, "monotonic", lambda: pool.clock)
+    made = list(run_pool(pool, {k: range(8 * k, 8 * k + 8) for k in range(40)}, 4, print, grow=True))
+    assert sorted(made) == list(range(320))
+    assert (len(pool.alive), pool.most) == (4, 4)
 
 
 def test_workers_start_on_machines_that_join():

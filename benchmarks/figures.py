@@ -9,6 +9,7 @@ Pages are made from templates in ``benchmarks/templates``, where ``{{ ... }}`` s
 * ``RESULT FIGURE FORMAT``: one figure in a Python format; ``*1000:.1f`` multiplies it first;
 * ``cells RESULT FIGURE KEY:FORMAT ...``: table cells of the figures ``FIGURE.KEY``;
 * ``caption RESULT ...``: command, machine, load and revision of results;
+* ``revision RESULT``: the revision and its date;
 * ``runs RESULT ...``: the same as a table; ``runs`` alone, of all results;
 * ``detectors PLAN ARM ...``: a table of results of arms of ``benchmarks.detector``; ``detectors PLAN``, of all;
 * ``detector PLAN ARM``: the mean precision of an arm.
@@ -107,7 +108,7 @@ def formatted(value: Any, spec: str) -> str:
 
 def caption(result: Mapping[str, Any], newest: int = 0) -> str:
     """Return the source of figures: command, machine, load, revision, and commits behind the newest revision."""
-    load, day = load_of(result), f"{result['revision']} of {result['date']}"
+    load, day = load_of(result), revision_of(result)
     late = newest - (result.get("commits") or newest)
     day += f", {late} commits before the newest figure" if late >= LATE else ""
     text = f"`{result['command']}` on {machine_of(result)}" + (f", {load}" if load else "")
@@ -117,6 +118,11 @@ def caption(result: Mapping[str, Any], newest: int = 0) -> str:
         text += f"; recorded at revision {day}{' with changes' if result.get('dirty') else ''}"
         text += f"; the run took {result['seconds']:.0f} s"
     return text + (f". {result['note']}" if result.get("note") else ".")
+
+
+def revision_of(result: Mapping[str, Any]) -> str:
+    """Return the revision and its date."""
+    return f"{result['revision']} of {result['date']}"
 
 
 def machine_of(result: Mapping[str, Any]) -> str:
@@ -172,6 +178,8 @@ def filled(text: str, results: Results) -> str:
                     if what == "runs":
                         return runs((results[name] for name in names), newest)
                     return "  \n".join(f"*{caption(results[name], newest)}*" for name in names)
+                case ["revision", result]:
+                    return revision_of(results[result])
                 case ["cells", result, prefix, *cells] if cells:
                     pairs = [cell.partition(":") for cell in cells]
                     return " | ".join(

@@ -193,7 +193,7 @@ class Composite(StrictModel):
         gt=0,
         lt=1,
         description="Target standard error of the traced light where half of the light arrives. It determines the "
-        "number of shadow rays. Elsewhere the target is perceptually equal.",
+        "numbers of shadow rays and reflection rays. Elsewhere the target is perceptually equal.",
     )
     image_shadow: ImageShadow = Field(ImageShadow(), description="Parameters of ``shadow: image``.")
     highlight: bool = Field(
@@ -207,7 +207,8 @@ class Composite(StrictModel):
         "of thin, porous objects.",
     )
     bounce: bool = Field(
-        True, description="Adds the light that the environment and visible shapes reflect onto objects."
+        True,
+        description="Adds the light that surroundings and objects reflect onto objects, and objects onto surfaces.",
     )
     exposure: Annotated[
         Literal["auto", "fixed"] | CameraExposure,

@@ -6,8 +6,7 @@ every ray is tested against every box.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
@@ -18,16 +17,22 @@ Array = npt.NDArray[np.float64]
 UP = np.array([0.0, 0.0, 1.0])
 
 CELL = 0.05
-"""Edge of the cells [m] in which the shadow on captured walls is constant."""
+"""Edge of the cells [m] in which the light that a surface reflects is constant."""
 
 
 @dataclass(frozen=True)
 class Box:
-    """Axis-aligned box; ``dynamic`` boxes are absent from captured colours."""
+    """Axis-aligned box.
+
+    A ``dynamic`` box is absent from captured colours. It reflects the share ``albedo`` of the light of emitters, and if
+    it is not a ``mesh`` also that of other boxes.
+    """
 
     low: tuple[float, float, float]
     high: tuple[float, float, float]
     dynamic: bool = False
+    albedo: float = 0.0
+    mesh: bool = False
 
     def entry(self, origin: Array, directions: Array) -> Array:
         """Return the distance (N,) at which rays enter the box, infinite for a miss (slab method)."""
@@ -35,6 +40,11 @@ class Box:
             first, second = ((np.array(side) - origin) / directions for side in (self.low, self.high))
         near, far = np.minimum(first, second).max(axis=1), np.maximum(first, second).min(axis=1)
         return np.where((far > np.maximum(near, 1e-6)) & (near > -1e-9), np.maximum(near, 0.0), np.inf)
+
+    def normals(self, points: Array) -> Array:
+        """Return the outward unit normals (N, 3) of points on the box."""
+        distance = np.abs(np.concatenate([points - self.low, points - self.high], axis=1))
+        return np.concatenate([-np.eye(3), np.eye(3)])[distance.argmin(axis=1)]
 
 
 @dataclass(frozen=True)
@@ -73,15 +83,27 @@ class BoxScene:
     ``grey`` is the linear colour of the captured boxes, and ``white`` the irradiance of display white.
     """
 
-    boxes: Sequence[Box]
+    boxes: tuple[Box, ...]
     lamp: Lamp
     sky: float
     grey: float
     white: float
 
-    def captured(self, point: Array) -> Light:
+    @property
+    def before(self) -> BoxScene:
+        """The scene without dynamic boxes."""
+        return replace(self, boxes=tuple(box for box in self.boxes if not box.dynamic))
+
+    def shadowed(self, point: Array) -> float:
         """Return the ratio of irradiance with all boxes to that with static boxes, at a horizontal surface."""
-        return Light(self._irradiance(point, self.boxes) / self._irradiance(point, self._static), 0.0)
+        return self._irradiance(point) / self.before._irradiance(point)
+
+    def captured(self, point: Array) -> float:
+        """Return the ratio of direct and reflected irradiance with all boxes to that with static boxes."""
+        with_objects, without = (
+            scene._irradiance(point) + self.white * scene._bounce(point) for scene in (self, self.before)
+        )
+        return with_objects / without
 
     def relit(
         self, point: Array, to_camera: Array, roughness: float = 1.0, metallic: float = 0.0, specular: float = 0.0
@@ -90,11 +112,11 @@ class BoxScene:
 
         The factor is that of the base colour. The highlight is the reflected light without it.
         """
-        diffuse = self._irradiance(point, self.boxes) / self.white + self._bounce(point)
+        diffuse = self._irradiance(point) / self.white + self._bounce(point)
         if not (metallic or specular):
             return Light(diffuse, 0.0)
         diffuse *= (1 - metallic) * diffuse_albedo(to_camera, roughness)
-        emitted, reflected = self._arriving(point, self.boxes), self._reflecting(point)
+        emitted, reflected = self._arriving(point), self._reflecting(point)
         towards = np.concatenate([emitted[0], reflected[0]])
         light = np.concatenate([emitted[1] * np.pi / self.white, reflected[1]])
         lobe, cos_half = specular_lobe(to_camera, towards, roughness)
@@ -105,32 +127,49 @@ class BoxScene:
         return Light(diffuse + float(tinted), float(colourless))
 
     def _reflecting(self, point: Array) -> tuple[Array, Array]:
-        """Return unit vectors (N, 3) towards captured boxes, and pi times their light (N,) per cosine-weighted area."""
+        """Return unit vectors (N, 3) towards boxes, and pi times their light (N,) per cosine-weighted area."""
         towards = hemisphere(128)
-        return towards, self._captured_colours(point, towards) * np.pi / len(towards)
+        return towards, self._colours(point, towards) * np.pi / len(towards)
 
-    def _captured_colours(self, point: Array, towards: Array) -> Array:
-        """Return the colours (N,) of captured boxes along rays with the shadows of dynamic boxes, 0 for other rays."""
-        static, dynamic = self._entries(point, towards)
-        colours, seen = np.zeros(len(towards)), (static < np.inf) & (dynamic > static)
-        # Shadows on captured boxes are evaluated in cells, because they change slowly.
-        cells, cell = np.unique(np.round((point + towards * static[:, None])[seen] / CELL), axis=0, return_inverse=True)
-        shares = [self._share_of_cell(tuple(place * CELL)) for place in cells]
-        colours[seen] = self.grey * np.array(shares)[cell.ravel()] if len(cells) else 0.0
+    def _colours(self, point: Array, towards: Array, bounces: int = 2) -> Array:
+        """Return the colours (N,) of boxes along rays, 0 for other rays, on paths of ``bounces`` dynamic boxes."""
+        entries = np.array([box.entry(point, towards) for box in self.boxes])
+        colours, nearest = np.zeros(len(towards)), entries.argmin(axis=0)
+        for number, box in enumerate(self.boxes):
+            hit = (nearest == number) & (entries[number] < np.inf)
+            if not hit.any() or (box.dynamic and not box.albedo):
+                continue
+            places = point + towards[hit] * entries[number][hit, None]
+            normals = box.normals(places)
+            centres = (np.floor(places / CELL + 1e-6) + 0.5) * CELL
+            places = np.where(np.abs(normals) > 0.5, places.round(6), centres)
+            cells, cell = np.unique(np.concatenate([places, normals], axis=1), axis=0, return_inverse=True)
+            values = [self._colour_of_cell(box, tuple(row), bounces) for row in cells.tolist()]
+            colours[hit] = np.array(values)[cell.ravel()]
         return colours
 
-    @cache  # noqa: B019 - one scene per module
-    def _share_of_cell(self, place: tuple[float, ...]) -> float:
-        """Return the share of light that dynamic boxes leave at a wall that faces +x.
+    @cache  # noqa: B019 - few scenes per module
+    def _colour_of_cell(self, box: Box, cell: tuple[float, ...], bounces: int) -> float:
+        """Return the colour of a box at a cell, given the position and the normal of the cell."""
+        normal, few = np.array(cell[3:]), replace(self, lamp=replace(self.lamp, count=6))
+        point = np.array(cell[:3]) + 1e-4 * normal
+        if not box.dynamic:
+            return self.grey * few._share_left(point, normal)
+        light = few._irradiance(point, normal, rings=16) / self.white
+        if bounces > 1 and not box.mesh:
+            light += float(np.mean(self._colours(point, turned(hemisphere(12), normal), bounces - 1)))
+        return box.albedo * light
+
+    def _share_left(self, point: Array, normal: Array) -> float:
+        """Return the share of light that dynamic boxes leave at a point of a captured box.
 
         Lamps behind captured boxes do not count. Of the sky, dynamic boxes also block the light that captured boxes
         behind them reflect.
         """
-        point, normal = np.array(place) + 1e-4 * np.array([1.0, 0.0, 0.0]), np.array([1.0, 0.0, 0.0])
         places, facing, area = self.lamp.samples()
         way = places - point
         distance = np.linalg.norm(way, axis=1)
-        to_lamp, to_sky = way / distance[:, None], hemisphere()[:, [2, 0, 1]]
+        to_lamp, to_sky = way / distance[:, None], turned(hemisphere(16), normal)
         lamp = self.lamp.radiance * area * np.maximum(-to_lamp @ facing, 0) * np.maximum(to_lamp @ normal, 0)
         lamp /= distance**2
         sky = np.full(len(to_sky), self.sky * np.pi / len(to_sky))
@@ -141,34 +180,34 @@ class BoxScene:
 
     def _entries(self, point: Array, towards: Array) -> tuple[Array, Array]:
         """Return the distances (N,) at which rays enter static and dynamic boxes."""
-        static = np.min([box.entry(point, towards) for box in self._static], axis=0)
-        return static, np.min([box.entry(point, towards) for box in self.boxes if box.dynamic], axis=0)
+        entries = {box: box.entry(point, towards) for box in self.boxes}
+        kinds = ([entry for box, entry in entries.items() if box.dynamic is kind] for kind in (False, True))
+        static, dynamic = (np.min([np.full(len(towards), np.inf), *kind], axis=0) for kind in kinds)
+        return static, dynamic
 
-    @property
-    def _static(self) -> list[Box]:
-        return [box for box in self.boxes if not box.dynamic]
-
-    def _irradiance(self, point: Array, boxes: Sequence[Box]) -> float:
+    def _irradiance(self, point: Array, normal: Array = UP, rings: int = 64) -> float:
         """Return E = integral of V(w) L(w) max(0, n.w) dw."""
-        return float(self._arriving(point, boxes)[1].sum())
+        return float(self._arriving(point, normal, rings)[1].sum())
 
-    def _arriving(self, point: Array, boxes: Sequence[Box]) -> tuple[Array, Array]:
+    def _arriving(self, point: Array, normal: Array = UP, rings: int = 128) -> tuple[Array, Array]:
         """Return unit vectors (N, 3) towards light, and the irradiance (N,) that arrives from each."""
-        places, normal, area = self.lamp.samples()
+        places, facing, area = self.lamp.samples()
         way = places - point
         distance = np.linalg.norm(way, axis=1)
-        to_lamp, to_sky = way / distance[:, None], hemisphere(128)
-        light = self.lamp.radiance * area * np.maximum(-to_lamp @ normal, 0) * np.maximum(to_lamp @ UP, 0) / distance**2
+        to_lamp, to_sky = way / distance[:, None], turned(hemisphere(rings), normal)
+        light = self.lamp.radiance * area * np.maximum(-to_lamp @ facing, 0) * np.maximum(to_lamp @ normal, 0)
+        light /= distance**2
         sky = np.full(len(to_sky), self.sky * np.pi / len(to_sky))
-        visible = free(point, to_lamp, distance, boxes), free(point, to_sky, np.full(len(to_sky), np.inf), boxes)
+        far = np.full(len(to_sky), np.inf)
+        visible = free(point, to_lamp, distance, self.boxes), free(point, to_sky, far, self.boxes)
         return np.concatenate([to_lamp, to_sky]), np.concatenate([light * visible[0], sky * visible[1]])
 
     def _bounce(self, point: Array) -> float:
-        """Return the mean captured colour that a cosine-weighted hemisphere of rays hits."""
-        return float(np.mean(self._captured_colours(point, hemisphere())))
+        """Return the mean colour that a cosine-weighted hemisphere of rays hits."""
+        return float(np.mean(self._colours(point, hemisphere())))
 
 
-def free(point: Array, towards: Array, distance: Array, boxes: Sequence[Box]) -> npt.NDArray[np.bool_]:
+def free(point: Array, towards: Array, distance: Array, boxes: tuple[Box, ...]) -> npt.NDArray[np.bool_]:
     """Return True for rays that no box occludes before ``distance``."""
     return np.all([box.entry(point, towards) >= distance for box in boxes], axis=0)
 
@@ -178,6 +217,12 @@ def hemisphere(rings: int = 32) -> Array:
     ring, sector = (part.ravel() for part in np.meshgrid(np.arange(rings), np.arange(2 * rings)))
     radius, angle = np.sqrt((ring + 0.5) / rings), np.pi * (sector + 0.5) / rings
     return np.stack([radius * np.cos(angle), radius * np.sin(angle), np.sqrt(1 - radius**2)], axis=1)
+
+
+def turned(directions: Array, normal: Array) -> Array:
+    """Return directions (N, 3) about +z as directions about a unit vector along an axis."""
+    side = np.roll(np.abs(normal), 1)
+    return directions @ np.stack([side, np.cross(normal, side), normal])
 
 
 def specular_lobe(to_camera: Array, to_light: Array, roughness: float) -> tuple[Array, Array]:

@@ -27,6 +27,7 @@ from tests.renderer.test_light import nothing
 FLOOR, WALL = Box((-1.0, -1.0, -0.1), (0.0, 1.0, 0.0)), Box((-1.1, -1.0, -0.1), (-0.9, 1.0, 1.0))
 OBJECT = Box((-0.35, -0.15, 0.0), (-0.05, 0.15, 0.1), dynamic=True)
 NEAR_OBJECT = Box((-0.4, -0.2, 0.0), (0.0, 0.2, 0.1))
+TABLE = Box((0.0, -1.0, -0.1), (1.0, 1.0, 0.0), dynamic=True, albedo=0.5, mesh=True)
 OCCLUDER = Box((-0.1, 0.5, 0.3), (0.3, 0.7, 0.4), dynamic=True)
 LAMP = Lamp((0.2, 1.6, 1.4), (0.0, 0.0, 0.0), 0.4, 60.0)
 SKY, GREY, WHITE = 0.3, 0.8, float(np.pi)
@@ -62,13 +63,14 @@ def mesh_of(*boxes: Box) -> trimesh.Trimesh:
     return trimesh.util.concatenate([trimesh.creation.box(bounds=[box.low, box.high]) for box in boxes])
 
 
-def load_scene() -> mi.Scene:
+def load_scene(*, matt: bool = False) -> mi.Scene:
+    """Load the scene. The object is of a glossy material, or ``matt``."""
+    make_integrator()
     lamp_pose = mi.ScalarTransform4f().look_at(origin=list(LAMP.position), target=list(LAMP.target), up=[0, 0, 1])
+    top = plane(OBJECT.low[:2], OBJECT.high[:2], OBJECT.high[2])
     shapes = {
         "floor": make_splats_shape(plane((-1, -1), (0, 1), 0.0), proxy=mesh_of(FLOOR, WALL)),
-        "object": make_splats_shape(
-            with_material(plane(OBJECT.low[:2], OBJECT.high[:2], OBJECT.high[2])), proxy=mesh_of(OBJECT), instance=1
-        ),
+        "object": make_splats_shape(top if matt else with_material(top), proxy=mesh_of(OBJECT), instance=1),
         "occluder": make_splats_shape(nothing(), proxy=mesh_of(OCCLUDER), instance=2),
         "table": {
             "type": "rectangle",
@@ -88,24 +90,33 @@ def load_scene() -> mi.Scene:
 @pytest.fixture(scope="module")
 def pictures() -> tuple[Array, Array]:
     """Render light and highlight with several seeds, shape (seeds, H, W)."""
-    return rendered(bounce=True)
+    return rendered(load_scene())
+
+
+@pytest.fixture(scope="module")
+def beside_matt_object() -> Array:
+    """Render the light with a matt object and several seeds, shape (seeds, H, W)."""
+    return rendered(load_scene(matt=True))[0]
 
 
 @pytest.fixture(scope="module")
 def direct() -> Array:
     """Render the light of the emitters with several seeds, shape (seeds, H, W)."""
-    return rendered(bounce=False)[0]
+    return rendered(load_scene(), bounce=False)[0]
 
 
-def rendered(*, bounce: bool) -> tuple[Array, Array]:
-    make_integrator()
-    scene, integrator = load_scene(), make_integrator(white=WHITE, bounce=bounce)
+def rendered(scene: mi.Scene, *, bounce: bool = True) -> tuple[Array, Array]:
+    integrator = make_integrator(white=WHITE, bounce=bounce)
     layers = [render_layers(integrator, scene, CAMERA, seed=seed) for seed in range(SEEDS)]
     light, highlight = (np.stack([getattr(one, name)[..., 0] for one in layers]) for name in ("light", "highlight"))
     return light.astype(np.float64), highlight.astype(np.float64)
 
 
-SCENE = BoxScene((FLOOR, WALL, OBJECT, OCCLUDER), LAMP, SKY, float(decode_srgb(np.array(GREY))), WHITE)
+COLOUR = float(decode_srgb(np.array(GREY)))
+SCENE, MATT_SCENE = (
+    BoxScene((FLOOR, WALL, TABLE, replace(OBJECT, albedo=albedo), OCCLUDER), LAMP, SKY, COLOUR, WHITE)
+    for albedo in ((1 - METALLIC) * COLOUR, COLOUR)
+)
 
 
 def points_below_pixels(
@@ -137,18 +148,19 @@ def assert_close(images: Array, pixels: Pixels, expected: list[float], *, bias: 
     assert np.sqrt(np.mean(difference**2)) < error
 
 
-def test_captured_surface_takes_the_ratio_of_irradiance(direct: Array) -> None:
+def test_captured_surface_takes_the_ratio_of_direct_and_reflected_light(beside_matt_object: Array) -> None:
     """The RMS error is below the target standard error, 0.03, and the bias is an order of magnitude lower."""
-    points, pixels = points_below_pixels((-0.5, -0.5), (-0.04, 0.5), 0.0, 8)
-    expected = [SCENE.captured(point).factor for point in points]
-    assert min(expected) < 0.3 and max(expected) > 0.99
-    assert_close(direct, pixels, expected, bias=0.003, error=0.03)
+    points, pixels = points_below_pixels((-0.5, -0.5), (-0.04, 0.5), 0.0, 10)
+    expected = [MATT_SCENE.captured(point) for point in points]
+    assert min(expected) < 0.4 and max(expected) > 0.99
+    assert max(light - MATT_SCENE.shadowed(point) for point, light in zip(points, expected, strict=True)) > 0.05
+    assert_close(beside_matt_object, pixels, expected, bias=0.003, error=0.03)
 
 
 def test_faint_shadow_is_found_by_one_ray_per_pixel(direct: Array) -> None:
     """Light is interpolated between tiles of 8 pixels; the error of the mean loss of light is below a twelfth."""
     points, pixels = points_below_pixels((-0.54, -0.5), (-0.41, 0.5), 0.0, 6)
-    expected = np.array([SCENE.captured(point).factor for point in points])
+    expected = np.array([SCENE.shadowed(point) for point in points])
     faint = (expected < 0.997) & (expected > 0.97)
     assert faint.sum() > 10
     some = pixels[0][faint], pixels[1][faint]
@@ -157,7 +169,7 @@ def test_faint_shadow_is_found_by_one_ray_per_pixel(direct: Array) -> None:
 
 def test_visible_mesh_takes_direct_and_reflected_light(pictures: tuple[Array, Array]) -> None:
     """Light on coarse planes is interpolated, and a wall reflects light."""
-    points, pixels = points_below_pixels((0.05, -0.5), (0.5, 0.5), 0.0, 8)
+    points, pixels = points_below_pixels((0.05, -0.5), (0.5, 0.5), 0.0, 10)
     expected = [SCENE.relit(point, to_camera(point)).factor for point in points]
     assert_close(pictures[0], pixels, expected, bias=0.008, error=0.03)
 

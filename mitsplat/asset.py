@@ -87,8 +87,13 @@ class AssetSpec(BaseModel):
     density: Positive | None = Field(None, description="[kg/m^3]; 1000 if neither this nor mass is given.")
     mass: Positive | None = Field(None, description="[kg], instead of density.")
     friction: float = Field(0.5, ge=0, description="Coulomb friction coefficient.")
-    roughness: float = Field(0.4, gt=0, le=1, description="GGX roughness of the highlight.")
-    specular: float = Field(0.04, ge=0, le=1, description="Specular reflectance at normal incidence.")
+    roughness: float = Field(0.4, gt=0, le=1, description="GGX roughness of captured splats; not used with materials.")
+    specular: float = Field(
+        0.04,
+        ge=0,
+        le=1,
+        description="Specular reflectance of captured splats at normal incidence; not used with materials.",
+    )
     capture_light: Literal["uniform", "scene"] = "uniform"
     keypoints: dict[Name, tuple[float, float, float]] | None = Field(
         None, description="Named points in the units and axes of the files, for pose labels."
@@ -122,8 +127,8 @@ class Asset:
         density: Mass density [kg/m^3]; ignored if ``mass`` is given.
         mass: Mass [kg] or None.
         friction: Coulomb friction coefficient.
-        roughness: GGX roughness of the highlight in (0, 1].
-        specular: Specular reflectance at normal incidence in [0, 1]; 0 disables the highlight.
+        roughness: GGX roughness of captured splats in (0, 1]; not used with materials.
+        specular: Specular reflectance of captured splats at normal incidence in [0, 1]; not used with materials.
         capture_light: Light under which the colours were captured. ``uniform`` (light tent, turntable in the shade):
             the scene's lights relight the asset. ``scene`` (already lit as displayed): the scene's lights only add
             shadows.
@@ -244,7 +249,8 @@ class Asset:
                 if stored.pieces:
                     _concatenated(stored.pieces).export(new / "pieces.ply")
                 described = new / ASSET_FILE
-                YAML(pure=True).dump(spec.model_dump(by_alias=True, exclude_none=True), described)
+                unused = set() if self.splats.materials is None else {"roughness", "specular"}
+                YAML(pure=True).dump(spec.model_dump(by_alias=True, exclude_none=True, exclude=unused), described)
                 (folder / ASSET_FILE).unlink(missing_ok=True)
                 for file in sorted(new.iterdir(), key=lambda file: file == described):
                     file.replace(folder / file.name)

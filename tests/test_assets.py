@@ -96,6 +96,7 @@ class TestRoundTrip:
             np.testing.assert_array_equal(getattr(loaded.materials, name), getattr(given_asset.splats.materials, name))
         np.testing.assert_allclose(loaded.materials.normals, given_asset.splats.materials.normals, atol=1e-6)
         assert loaded.materials.select([3]).metallic == given_asset.splats.materials.metallic[3]
+        assert "roughness" not in (tmp_path / "asset.yaml").read_text()  # it would have no effect
 
     def test_scaled_and_turned_assets_keep_their_materials(self, asset, tmp_path):
         given_asset = replace(with_materials(asset, normals=True), units="unknown")

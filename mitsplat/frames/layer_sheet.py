@@ -41,7 +41,7 @@ def draw_layer(frame: Frame, name: LayerName) -> tuple[str, ByteImage]:
     if name == "ids":
         return "ids by splats", _id_colours(frame.instance)
     if name == "light":
-        return "light: black 0, grey 1 (as captured), white 2", _grey(frame.layers.light / 2)
+        return "light: black 0, grey 1 (colour unchanged), white 2", _grey(frame.layers.light / 2)
     if name == "highlight":
         return "highlight: white 1, square root", _grey(np.sqrt(np.maximum(frame.layers.highlight, 0)))
     known = frame.depth[frame.depth > 0]

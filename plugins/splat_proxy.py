@@ -65,7 +65,7 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
 
      * - shadow
        - |string|
-       - ``traced``: light from the scene's emitters, shadowed by the proxies. ``none``: colours as captured. (Default:
+       - ``traced``: light from the scene's emitters, shadowed by the proxies. ``none``: colours as stored. (Default:
          ``traced``)
 
      * - shadow_error
@@ -80,7 +80,7 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
 
      * - shadow_samples
        - |int|
-       - Largest number of shadow rays per pixel. (Default: 64)
+       - Largest number of shadow rays, and of reflection rays, per pixel. (Default: 64)
 
      * - occluders
        - |string|
@@ -89,8 +89,8 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
 
      * - bounce
        - |bool|
-       - True if uniformly captured objects and diffuse meshes also receive the light that surroundings and visible
-         meshes reflect. (Default: true)
+       - True if objects and diffuse meshes also receive the light that surroundings and other objects reflect, and
+         surroundings near objects that of the objects. (Default: true)
 
      * - highlight
        - |bool|
@@ -131,7 +131,7 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
     Radiance is multiplied by pi over ``white``. Splats that were captured under the light of the scene keep their
     colours; state the irradiance of a white surface in their capture as ``white``. With a sky, alpha is 1.
     The image holds linear R, G, B, A and the channels of ``aov_names``. ``shadow: traced`` needs at least one emitter;
-    without emitters, colours stay as captured. Sensors are :monosp:`opencv_camera`, :monosp:`perspective` and
+    without emitters, colours stay as stored. Sensors are :monosp:`opencv_camera`, :monosp:`perspective` and
     :monosp:`thinlens`; the filter of their film and their sampler are not used.
 
     .. tabs::

@@ -65,6 +65,10 @@ _HELPER_MEMORY = 2**30
 _HELPER_NICENESS = 5
 """Lower priority of helper processes. The lowest one could delay a worker that waits for a layout on a busy machine."""
 
+
+CORES_PER_WORKER = 2
+"""Cores that the threads of a worker on a CPU keep busy; two workers on two cores take a quarter more CPU time."""
+
 _MAX_SERIAL_FRAMES = 16
 """Number of frames up to which worker processes are not worth their start-up time."""
 
@@ -234,7 +238,12 @@ def run_frames(
     check_workers(workers)
     total = sum(map(len, layouts.values()))
     max_workers = affordable_workers(memory, device) if workers is None else workers
-    serial = min(max_workers, total) <= 1 or (workers is None and total <= _MAX_SERIAL_FRAMES)
+    # On a GPU, starting workers one by one would take longer than most runs.
+    grow = workers is None and (device is None or not device.gpus)
+    later = list(layouts)[1 if grow else max_workers :]  # the first workers begin with the others
+    worthwhile = prepare is not None and total > _MAX_SERIAL_FRAMES and workers != 1
+    helpers = min(len(later), _affordable_helpers(max_workers, memory)) if worthwhile else 0
+    serial = total <= 1 or max_workers + helpers <= 1 or (workers is None and total <= _MAX_SERIAL_FRAMES)
     if serial and (device is None or device.is_usable_here):
         if device is not None and device != current_device():
             use_device(device)
@@ -250,16 +259,11 @@ def run_frames(
         return
     if serial:
         max_workers = 1
-    # On a GPU, starting workers one by one would take longer than most runs.
-    grow = workers is None and (device is None or not device.gpus)
     shares = device is not None and 0 < len(device.gpus) < min(max_workers, total)
     with closing(SharedGpu()) if shares else nullcontext() as shared:
         if shared is not None and shared.problem:
             note(f"workers take turns on the GPU, because {shared.problem}")
         environment = {} if shared is None else shared.environment
-        later = list(layouts)[1 if grow else max_workers :]  # the first workers begin with the others
-        worthwhile = prepare is not None and total > _MAX_SERIAL_FRAMES
-        helpers = min(len(later), _affordable_helpers(max_workers, memory)) if worthwhile else 0
         with (
             closing(_Processes(make, device, environment, partial(prepare, later) if prepare else None)) as pool,
             closing(run_pool(pool, layouts, max_workers, note, grow=grow)) as found,
@@ -281,7 +285,9 @@ def run_in_process(make: MakeFrame[Result], device: Device | None = None) -> Gen
 
 def affordable_workers(memory: WorkerMemory, device: Device | None = None) -> int:
     """Return the number of workers for which cores, unused memory and GPU memory suffice, at least 1."""
-    max_workers = min(usable_cores(), int((unused_memory() * 2**30 - memory.shared) / memory.own))
+    on_cpu = device is not None and not device.gpus
+    cores = usable_cores() // (CORES_PER_WORKER if on_cpu else 1)
+    max_workers = min(cores, int((unused_memory() * 2**30 - memory.shared) / memory.own))
     if device is not None and device.gpus:
         fitting = int(min(gpu.memory for gpu in device.gpus) / memory.gpu)
         max_workers = min(max_workers, len(device.gpus) * min(fitting, MAX_CLIENTS))

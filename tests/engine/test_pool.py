@@ -153,6 +153,18 @@ def test_the_number_of_helpers_is_bounded_by_cores_and_memory(monkeypatch, cores
     assert engine._affordable_helpers(2, TYPICAL_MEMORY) == helpers
 
 
+def test_a_worker_on_the_cpu_has_two_cores(monkeypatch):
+    """On two cores, one worker renders beside a helper. Without layouts to prepare, no process is started."""
+    monkeypatch.setattr(engine, "unused_memory", lambda: 64.0)
+    monkeypatch.setattr(engine, "usable_cores", lambda: 2)
+    began = []
+    monkeypatch.setattr(engine, "run_pool", lambda *args, **how: began.append((args[2], how)) or (i for i in ()))
+    monkeypatch.setattr(engine._Processes, "start_helper", lambda pool: began.append("helper"))
+    for layouts in ({0: range(20)}, {0: range(10), 1: range(10)}):
+        list(run_frames(Variant(), layouts, workers=None, note=print, device=CPU, prepare=Prepare(Path())))
+    assert began == [(1, {"grow": True}), "helper"]
+
+
 @pytest.fixture
 def interpreter(tmp_path, monkeypatch):
     """Replace Python by a shell script in worker processes."""

@@ -367,14 +367,19 @@ def look_at_pose(eye: npt.ArrayLike, target: npt.ArrayLike, up: npt.ArrayLike = 
     if not distance > 0:
         raise ValueError(f"a camera must look at a point other than its own position (got {eye.tolist()} twice)")
     forward = forward / distance
-    right = np.cross(forward, up)
+    right = _cross(forward, up)
     if np.linalg.norm(right) < 1e-6 * max(1.0, float(np.linalg.norm(up))):
-        right = np.cross(forward, (0.0, 1.0, 0.0))
+        right = _cross(forward, np.array([0.0, 1.0, 0.0]))
     right /= np.linalg.norm(right)
     pose = np.eye(4)
-    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward], axis=1)
+    pose[:3, :3] = np.stack([right, _cross(forward, right), forward], axis=1)
     pose[:3, 3] = eye
     return pose
+
+
+def _cross(a: Float64Array, b: Float64Array) -> Float64Array:
+    """Return the cross product of two vectors (3,); ``np.cross`` takes ten times as long."""
+    return np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
 
 
 def interpolate_poses(key_poses: Sequence[npt.ArrayLike], times: npt.ArrayLike) -> Float64Array:

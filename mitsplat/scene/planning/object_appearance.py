@@ -7,6 +7,7 @@ own.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -63,8 +64,9 @@ class ObjectAppearance:
         return found
 
 
+@lru_cache(maxsize=2)
 def draw_appearances(scene: Scene, layout: Layout) -> dict[int, ObjectAppearance]:
-    """Draw the appearances of the objects of a layout whose entries define ranges.
+    """Draw the appearances of the objects of a layout whose entries define ranges; cached for its next frame.
 
     Returns:
         Appearances by instance id.

@@ -8,7 +8,7 @@ viewpoint instead.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
@@ -129,6 +129,7 @@ def _hemisphere_view(scene: Scene, index: int, camera: CameraHemisphere, layout:
     The search ends at the first accepted candidate that meets the targets exactly.
     """
     spec = scene.spec
+    lens, drawn_motion = _camera_of_frame(spec, index, np.eye(4))
     predictor = (
         None
         if layout is None or (camera.look_at == "target" and not camera.selects_views)
@@ -137,10 +138,8 @@ def _hemisphere_view(scene: Scene, index: int, camera: CameraHemisphere, layout:
     if predictor is None or not camera.selects_views:
         target, seen = _target(camera, spec.seed, index, 0, predictor)
         pose, target = _hemisphere_pose(camera, spec.seed, index, 0, target)
-        view_camera, drawn = _camera_of_frame(spec, index, pose)
-        return Viewpoint(
-            view_camera, drawn if camera.look_at == "target" else {**drawn, "target": target.tolist(), "object": seen}
-        )
+        aim = {} if camera.look_at == "target" else {"target": target.tolist(), "object": seen}
+        return Viewpoint(replace(lens, world_from_camera=pose), {**drawn_motion, **aim})
     shares = (camera.occlusion, camera.truncation)
     rounding = random_stream(spec.seed, "camera shares", index).uniform(size=2)
     best: tuple[float, Viewpoint] | None = None
@@ -150,8 +149,8 @@ def _hemisphere_view(scene: Scene, index: int, camera: CameraHemisphere, layout:
         pose, target = _hemisphere_pose(camera, spec.seed, index, number, target)
         if camera.truncation is not None and number % 2:
             rng = _stream(spec.seed, "camera border", index, number)
-            pose, target = _rotate_target_to_border(_camera_of_frame(spec, index, pose)[0], pose, target, rng)
-        view_camera, motion_draws = _camera_of_frame(spec, index, pose)
+            pose, target = _rotate_target_to_border(lens, pose, target, rng)
+        view_camera = replace(lens, world_from_camera=pose)
         projected = predictor.project(view_camera)
         if camera.accept is not None and (violations := predictor.find_violations(projected, camera.accept)):
             refused.append((sum(miss for miss, _ in violations), " and ".join(text for _, text in violations)))
@@ -162,7 +161,7 @@ def _hemisphere_view(scene: Scene, index: int, camera: CameraHemisphere, layout:
             "object": seen,
             "attempt": number,
             "predicted": prediction.to_json(),
-        } | motion_draws
+        } | drawn_motion
         cost = _cost(prediction, [0.0 if share is None else share.share for share in shares], rounding)
         if best is None or cost < best[0]:
             best = cost, Viewpoint(view_camera, drawn)

@@ -300,6 +300,28 @@ def test_warm_lamps_have_the_colour_of_a_black_body(kelvin: float) -> None:
     np.testing.assert_allclose(xyz[:2] / xyz.sum(), expected, atol=1.5e-3)
 
 
+def test_colours_of_light_agree_with_colour_science() -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # colour warns on import if Matplotlib is missing
+        import colour
+    space = colour.RGB_COLOURSPACES["sRGB"].matrix_RGB_to_XYZ
+    white = space.sum(axis=1)
+    for kelvin in (1700.0, 2222.0, 2223.0, 4000.0, 4500.0, 5000.0, 7000.0, 7001.0, 25000.0):
+        share = np.clip((kelvin - 4000) / 1000, 0, 1)
+        black, day = (
+            colour.xy_to_XYZ(colour.temperature.CCT_to_xy(min(max(kelvin, low), 25000), method=method))
+            for low, method in ((0, "Kang 2002"), (4000, "CIE Illuminant D Series"))
+        )
+        light = (1 - share) * black + share * day
+        adapt = colour.adaptation.matrix_chromatic_adaptation_VonKries(light, white, transform="Bradford")
+        expected = np.linalg.inv(space) @ adapt @ space
+        expected /= LUMINANCE @ expected @ np.ones(3)
+        np.testing.assert_allclose(white_balance_matrix(kelvin), expected, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(neutral_matrix(np.linalg.inv(space) @ light), expected, rtol=0, atol=1e-12)
+        linear = np.maximum(np.linalg.inv(space) @ light, 0)
+        np.testing.assert_allclose(temperature_colour(kelvin), linear / (LUMINANCE @ linear), rtol=1e-12)
+
+
 def test_the_locus_of_colour_temperatures_is_continuous() -> None:
     for kelvin in (4000.0, 5000.0):
         np.testing.assert_allclose(temperature_colour(kelvin - 0.1), temperature_colour(kelvin + 0.1), atol=1e-3)

@@ -14,18 +14,17 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 PACKAGES = """
-import mitsplat, warnings
+import mitsplat
 import cv2, mujoco, newton, numpy, PIL.Image, pydantic, ruamel.yaml, scipy.ndimage, scipy.optimize
 import scipy.spatial, skimage.measure, trimesh, typer
-with warnings.catch_warnings():
-    warnings.simplefilter("ignore")
-    import colour
 """
 """Imports of a process that forks. Mitsuba starts a thread, so that its import before a fork hangs its end."""
 
 SERVER = f"""
-import json, os, signal, sys
+import gc, json, os, signal, sys
 {PACKAGES}
+import mitsplat.cli, mitsplat.labels.labels, mitsplat.scene.planning.frame_plan
+gc.freeze()
 for line in sys.stdin:
     code, arguments, folder, variables, files = json.loads(line)
     child = os.fork()

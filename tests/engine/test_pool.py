@@ -6,7 +6,6 @@ import subprocess
 import sys
 import time
 from contextlib import closing, suppress
-from dataclasses import dataclass
 from multiprocessing import resource_tracker, spawn
 from pathlib import Path
 from types import SimpleNamespace
@@ -20,35 +19,20 @@ from mitsplat.engine.pool import Failure, Finished, FrameError, LostWorkersError
 from mitsplat.engine.resources import TYPICAL_MEMORY
 from mitsplat.errors import InputError, MissingResourceError
 from mitsplat.runtime.device import CPU, Device, Gpu, MissingPrerequisite, visible_gpus
-from mitsplat.storage.files import write_text
+from tests.engine.jobs import (
+    CommandLine,
+    Greedy,
+    KillOnce,
+    Linger,
+    Make,
+    Prepare,
+    Variant,
+    WaitForHelper,
+    ended,
+    wait_for,
+)
 
 LAYOUTS = {0: [0, 1, 2], 1: [3, 4, 5], 2: [6, 7, 8]}
-
-
-@dataclass(frozen=True)
-class Make:
-    """Job that returns (index, process id), and fails in a chosen way at one frame."""
-
-    fail_at: int = -1
-    how: str = ""
-    folder: Path = Path()
-
-    def __call__(self, index, note, /):
-        note(f"working on {index}")
-        if index == self.fail_at:
-            if self.how == "killed":
-                os.kill(os.getpid(), signal.SIGKILL)
-            if self.how == "exits":
-                os._exit(3)
-            raise {"input": InputError, "bug": Unpicklable}[self.how](f"no {index}")
-        if self.how == "slow":
-            time.sleep(60)
-        return index, os.getpid()
-
-
-class Unpicklable(RuntimeError):
-    def __reduce__(self):
-        raise TypeError("not this one")
 
 
 def run(make, workers=1, layouts=LAYOUTS, note=lambda text: None):
@@ -110,28 +94,6 @@ def test_frames_of_lost_workers_are_made_by_others(tmp_path, workers):
     assert sorted(made) == list(range(9))
     told = [note for note in notes if "repeated" in note]
     assert sorted(told) == [f"the worker of frame {i} was killed by SIGKILL: the frame is repeated" for i in (1, 7)]
-
-
-@dataclass(frozen=True)
-class Prepare:
-    """Function of a helper process that records its layouts and fails."""
-
-    folder: Path
-
-    def __call__(self, layouts):
-        write_text(self.folder / str(os.getpid()), str(layouts))
-        raise RuntimeError("ignored")
-
-
-@dataclass(frozen=True)
-class WaitForHelper:
-    """Job that waits until a helper process has prepared layouts."""
-
-    folder: Path
-
-    def __call__(self, index, note, /):
-        wait_for(lambda: list(self.folder.iterdir()))
-        return index
 
 
 def test_a_helper_prepares_the_layouts_that_no_worker_begins_with(tmp_path):
@@ -208,14 +170,6 @@ def test_workers_receive_a_command_line_only_if_it_is_short(monkeypatch, argumen
     assert sys.argv == ["run", *arguments]
 
 
-@dataclass(frozen=True)
-class CommandLine:
-    """Job that returns the command line of its process."""
-
-    def __call__(self, index, note, /):
-        return tuple(sys.argv)
-
-
 def test_frames_of_a_worker_that_does_not_start_are_made_by_others(monkeypatch, tmp_path, interpreter):
     monkeypatch.setattr(engine, "_START_TIMEOUT", 15.0)
     mark = tmp_path / "first"
@@ -238,37 +192,6 @@ def test_suspended_workers_are_killed(tmp_path):
         begun = time.monotonic()
     assert time.monotonic() - begun < 10
     assert all(ended(path.name) for path in (tmp_path / "pids").iterdir())
-
-
-@dataclass(frozen=True)
-class KillOnce:
-    """Job that kills its process once at each of the given frames."""
-
-    folder: Path
-    frames: tuple[int, ...]
-
-    def __call__(self, index, note, /):
-        mark = self.folder / str(index)
-        if index in self.frames and not mark.exists():
-            mark.touch()
-            os.kill(os.getpid(), signal.SIGKILL)
-        return index
-
-
-@dataclass(frozen=True)
-class Greedy:
-    """Job that raises Dr.Jit's out-of-memory error if more than ``room`` processes live, and always at one frame."""
-
-    folder: Path
-    room: int
-    too_large: int = -1
-
-    def __call__(self, index, note, /):
-        (self.folder / str(os.getpid())).touch()
-        if index == self.too_large or sum(not ended(path.name) for path in self.folder.iterdir()) > self.room:
-            raise RuntimeError("jit_malloc(): out of memory! Could not allocate 4 GiB of device memory.\n(and more)")
-        time.sleep(0.1)  # the other workers are busy meanwhile
-        return index, os.getpid()
 
 
 def test_a_worker_without_memory_is_not_replaced(tmp_path):
@@ -409,16 +332,6 @@ def test_workers_get_the_environment_of_the_gpu_service(monkeypatch, own, seen):
     assert os.environ["CUDA_VISIBLE_DEVICES"] == "1"
 
 
-@dataclass(frozen=True)
-class Variant:
-    """Job that returns Mitsuba's variant and the visible GPU."""
-
-    def __call__(self, index, note, /):
-        import mitsuba as mi
-
-        return index, mi.variant(), os.environ.get("CUDA_VISIBLE_DEVICES")
-
-
 @pytest.mark.parametrize(("gigabytes", "count"), [((80, 80), 8), ((80, 7), 4), ((7,), 2), ((1,), 1)])
 def test_the_number_of_workers_is_bounded_by_gpu_memory(monkeypatch, gigabytes, count):
     """All workers start at once. A GPU of 7 GiB gets two workers of 3 GiB."""
@@ -457,7 +370,7 @@ def test_workers_end_with_their_parent(tmp_path):
         "import sys; sys.path.insert(0, sys.argv[1])\n"
         "from pathlib import Path\n"
         "from mitsplat.engine.pool import run_frames\n"
-        "from tests.engine.test_pool import Linger\n"
+        "from tests.engine.jobs import Linger\n"
         "if __name__ == '__main__':\n"
         "    list(run_frames(Linger(Path(sys.argv[2])), {0: [0, 1]}, workers=2, note=print))\n"
     )
@@ -470,32 +383,6 @@ def test_workers_end_with_their_parent(tmp_path):
     parent.wait()
     for path in folder.iterdir():
         wait_for(lambda path=path: ended(path.name))
-
-
-def ended(process):
-    """Return True if a process has ended or is a zombie; it may end during the call."""
-    try:
-        return "Z" in Path("/proc", process, "stat").read_text().rpartition(")")[2].split()[0]
-    except (FileNotFoundError, ProcessLookupError):
-        return True
-
-
-def wait_for(condition, seconds=300):
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.05)
-
-
-@dataclass(frozen=True)
-class Linger:
-    """Job that records its process id and blocks."""
-
-    folder: Path
-
-    def __call__(self, index, note, /):
-        (self.folder / str(os.getpid())).touch()
-        time.sleep(300)
 
 
 class Scripted:

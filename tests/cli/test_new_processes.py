@@ -174,8 +174,8 @@ def test_the_first_renders_of_a_process_may_run_in_several_threads(desk: Path) -
     code = """
 import threading
 scene = ms.load_scene("scene.yaml")
-jobs = [lambda k=k: ms.render_splats(ball(k), camera).alpha for k in range(3)]
-jobs += [lambda k=k: ms.render_frame(scene, k).instance for k in range(3)]
+jobs = [lambda k=k: ms.render_splats(ball(k), camera).alpha for k in range(2)]
+jobs += [lambda k=k: ms.render_frame(scene, k).instance for k in range(2)]
 found, start = {}, threading.Barrier(len(jobs))
 
 def work(k):

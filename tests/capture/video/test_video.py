@@ -70,17 +70,24 @@ BLURRED = {number for start in (20, 62, 101) for number in range(start, start + 
 
 @pytest.fixture(scope="module")
 def pan(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    texture, folder = plane(), tmp_path_factory.mktemp("pan")
-    pictures = [
-        smeared(seen(texture, x)) if number in BLURRED else seen(texture, x) for number, x in enumerate(places())
-    ]
-    return write(folder / "pan.mp4", pictures)
+    return write(tmp_path_factory.mktemp("pan") / "pan.mp4", pictures(places()))
+
+
+def pictures(way: np.ndarray) -> list[np.ndarray]:
+    texture = plane()
+    return [smeared(seen(texture, x)) if number in BLURRED else seen(texture, x) for number, x in enumerate(way)]
 
 
 @pytest.fixture(scope="module")
-def few(pan: Path, tmp_path_factory: pytest.TempPathFactory) -> ChosenFrames:
-    """Choose at most eight frames of the video."""
-    return choose_frames(pan, tmp_path_factory.mktemp("few") / "frames", most=8, least=3)
+def start(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Write the first three seconds of the video, for tests that do not depend on its length."""
+    return write(tmp_path_factory.mktemp("start") / "start.mp4", pictures(places()[:90]))
+
+
+@pytest.fixture(scope="module")
+def few(start: Path, tmp_path_factory: pytest.TempPathFactory) -> ChosenFrames:
+    """Choose at most eight frames of the first three seconds."""
+    return choose_frames(start, tmp_path_factory.mktemp("few") / "frames", most=8, least=3)
 
 
 def numbers(chosen: ChosenFrames) -> list[int]:
@@ -110,24 +117,25 @@ def test_chosen_frames_are_sharp_and_evenly_spaced_in_displacement(pan: Path, tm
         assert np.sqrt(np.mean(error**2)) < 12  # video compression; the next frame differs by 20 or more
 
 
-def test_a_limit_of_frames_widens_their_spacing(few: ChosenFrames) -> None:
+def test_a_limit_of_frames_widens_their_spacing(pan: Path, tmp_path: Path) -> None:
+    few = choose_frames(pan, tmp_path / "frames", most=8, least=3)
     assert 7 <= len(few.names) <= 8
     steps = np.diff(places()[numbers(few)])
     assert steps.max() < 3.5 * steps.min()
     assert not BLURRED & set(numbers(few))
 
 
-def test_the_same_video_gives_the_same_frames_and_reuses_them(pan: Path, few: ChosenFrames, tmp_path: Path) -> None:
-    one = choose_frames(pan, tmp_path / "one", most=8, least=3)
+def test_the_same_video_gives_the_same_frames_and_reuses_them(start: Path, few: ChosenFrames, tmp_path: Path) -> None:
+    one = choose_frames(start, tmp_path / "one", most=8, least=3)
     data = {name: (one.folder / name).read_bytes() for name in one.names}
     assert data == {name: (few.folder / name).read_bytes() for name in few.names}
     before = {path: path.stat().st_mtime_ns for path in one.folder.iterdir()}
-    assert choose_frames(pan, tmp_path / "one", most=8, least=3) == one
+    assert choose_frames(start, tmp_path / "one", most=8, least=3) == one
     assert before == {path: path.stat().st_mtime_ns for path in one.folder.iterdir()}
     (one.folder / one.names[3]).unlink()  # as after an interruption
-    assert choose_frames(pan, tmp_path / "one", most=8, least=3) == one
+    assert choose_frames(start, tmp_path / "one", most=8, least=3) == one
     assert (one.folder / one.names[3]).read_bytes() == data[one.names[3]]
-    other = choose_frames(pan, tmp_path / "one", most=6, least=3)
+    other = choose_frames(start, tmp_path / "one", most=6, least=3)
     assert {path.name for path in one.folder.glob("*.jpg")} == set(other.names) != set(one.names)
 
 
@@ -209,8 +217,10 @@ def turned_by(file: Path, degrees: int) -> Path:
 
 
 @pytest.mark.parametrize("degrees", [90, 180, 270])
-def test_the_rotation_stated_by_a_video_is_applied(pan: Path, few: ChosenFrames, tmp_path: Path, degrees: int) -> None:
-    turned = choose_frames(turned_by(pan, degrees), tmp_path / "turned", most=8, least=3)
+def test_the_rotation_stated_by_a_video_is_applied(
+    start: Path, few: ChosenFrames, tmp_path: Path, degrees: int
+) -> None:
+    turned = choose_frames(turned_by(start, degrees), tmp_path / "turned", most=8, least=3)
     with Image.open(turned.folder / turned.names[0]) as picture:
         shown = np.asarray(picture).astype(float)
     frame = seen(plane(), places()[numbers(turned)[0]])

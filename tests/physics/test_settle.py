@@ -7,10 +7,7 @@ import gc
 import hashlib
 import json
 import shutil
-import subprocess
-import sys
 from dataclasses import replace
-from pathlib import Path
 from weakref import ref
 
 import numpy as np
@@ -201,7 +198,7 @@ def test_several_processes_settle_the_same_layouts_as_one(scene_data, write_scen
 
 
 @pytest.mark.parametrize("stepper", STEPPERS)
-def test_seed_and_index_determine_every_byte(stepper, scene_data, write_scene):
+def test_seed_and_index_determine_every_byte(stepper, scene_data, write_scene, forks):
     """A process that settles only layout 2 and one that settled another layout first agree."""
     scene_data["settle"] = {"stepper": stepper}
     path = write_scene(scene_data)
@@ -212,13 +209,9 @@ def test_seed_and_index_determine_every_byte(stepper, scene_data, write_scene):
         "import json, sys; from mitsplat import load_scene, settle_layout;"
         "sys.stdout.write(json.dumps(settle_layout(load_scene(sys.argv[1]), 2, cached=False).to_json()))"
     )
-    there = subprocess.run(
-        [sys.executable, "-c", program, str(path)],
-        capture_output=True,
-        text=True,
-        check=True,
-        cwd=Path(__file__).parents[2],
-    ).stdout
+    done = forks.run(program, path, folder=path.parent)
+    assert done.returncode == 0, done.stderr
+    there = done.stdout
     assert hashlib.sha256(there.encode()).hexdigest() == hashlib.sha256(here.encode()).hexdigest()
     assert json.dumps(settle_layout(scene, 1, cached=False).to_json()["instances"]) != json.dumps(
         json.loads(here)["instances"]

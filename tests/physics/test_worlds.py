@@ -7,7 +7,6 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from mitsplat.geometry.decomposition import convex_pieces
 from mitsplat.geometry.mesh import mass_properties
 from tests.bodies import STEPPERS, lowest, pose_at
 
@@ -414,12 +413,12 @@ def test_a_ball_rests_inside_a_cup(stepper):
     from mitsplat.physics.rest import run_to_rest
     from mitsplat.physics.worlds import Collider
 
-    profile = [[0, 0], [0.03, 0], [0.03, 0.03], [0.025, 0.03], [0.025, 0.006], [0, 0.006]]
-    cup = trimesh.creation.revolve(profile, sections=8)
+    wall = [(0.0275, (0.005, 0.06)), (-0.0275, (0.005, 0.06))]
+    cup = [trimesh.creation.box((0.06, 0.06, 0.006)).apply_translation((0, 0, 0.003))]
+    cup += [trimesh.creation.box((*size, 0.024)).apply_translation((x, 0, 0.018)) for x, size in wall]
+    cup += [trimesh.creation.box((*size[::-1], 0.024)).apply_translation((0, y, 0.018)) for y, size in wall]
     ball = trimesh.creation.icosphere(3, 0.012)
-    world = world_of(
-        stepper, [body_of(ball)], [Collider(0.5, pieces=convex_pieces(cup)), table()], [pose_at((0.005, 0, 0.06))]
-    )
+    world = world_of(stepper, [body_of(ball)], [Collider(0.5, pieces=tuple(cup)), table()], [pose_at((0.005, 0, 0.06))])
     outcome = run_to_rest(world, max_time=6.0, bounds=EVERYWHERE)
     assert outcome.rejection == ""
     assert lowest(ball, outcome.poses[0]) == pytest.approx(0.006, abs=5e-4)

@@ -237,9 +237,15 @@ class LightFilter:
             exposure: Factor of the exposure, that of :meth:`rays_for`.
         """
         rays = dr.maximum(rays, 1)
-        means = [brightness * exposure / rays, squares * dr.square(exposure) / rays]
-        (mean, square), shared = self.mirror(means, rays, bent, 1)
-        return dr.maximum(square - dr.square(mean), 0) / (dr.square(_allowed_error(error, mean)) * _gain(shared))
+        mean = brightness * exposure / rays
+        variance = (
+            dr.maximum(squares * dr.square(exposure) / rays - dr.square(mean), 0) * rays / dr.maximum(rays - 1, 1)
+        )
+        dr.eval(mean, variance)
+        # Own samples would stop at small variance and large values by chance, so that the picture would be too bright.
+        (variance,), _ = self._average([variance], rays, 1)
+        (mean,), shared = self.mirror([mean], rays, bent, 1)
+        return variance / (dr.square(_allowed_error(error, mean)) * _gain(shared))
 
     def _share(self, estimate: Estimate) -> tuple[mi.Float, mi.Float, mi.Float]:
         """Return the light share over 3 x 3 pixels, its variance, and the number of pixels that contribute."""

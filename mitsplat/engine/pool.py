@@ -265,7 +265,15 @@ def run_frames(
             note(f"workers take turns on the GPU, because {shared.problem}")
         environment = {} if shared is None else shared.environment
         with (
-            closing(_Processes(make, device, environment, partial(prepare, later) if prepare else None)) as pool,
+            closing(
+                _Processes(
+                    make,
+                    device,
+                    environment,
+                    partial(prepare, later) if prepare else None,
+                    None if workers is None else max(1, usable_cores() // workers),
+                )
+            ) as pool,
             closing(run_pool(pool, layouts, max_workers, note, grow=grow)) as found,
         ):
             for _ in range(helpers):
@@ -534,11 +542,13 @@ class _Processes(Generic[Result]):
         device: Device | None,
         environment: Mapping[str, str] | None = None,
         prepare: Callable[[], object] | None = None,
+        threads: int | None = None,
     ) -> None:
         prepare_caches()  # workers inherit the folders
         self._jobs = SharedArrays((make, prepare))
         self._environment = environment or {}
         self._kind = None if device is None else device.kind
+        self._threads = threads
         self._gpus = () if device is None else device.gpus
         self._taken: dict[int, Gpu] = {}
         self._spawn = multiprocessing.get_context("spawn")
@@ -552,7 +562,9 @@ class _Processes(Generic[Result]):
         worker, self._count = self._count, self._count + 1
         load = Counter(self._taken.values())
         gpu = min(self._gpus, key=load.__getitem__, default=None)
-        process = self._start_process(f"mitsplat-{worker}", _work, (far_end, self._kind, self._jobs), gpu)
+        arguments = far_end, self._kind, self._threads, self._jobs
+        with children_on_gpu(gpu, **self._environment):
+            process = self._start_process(f"mitsplat-{worker}", _work, arguments)
         far_end.close()  # so that the worker's death closes the pipe
         self._workers[worker] = process, pipe
         self._starting[worker] = _START_TIMEOUT
@@ -563,11 +575,11 @@ class _Processes(Generic[Result]):
     def start_helper(self) -> None:
         """Start a process that runs ``prepare`` once. It needs no attention and may die."""
         name = f"mitsplat-helper-{len(self._helpers)}"
-        self._helpers.append(self._start_process(name, _help, (self._jobs,), None))
+        self._helpers.append(self._start_process(name, _help, (self._jobs,)))
 
-    def _start_process(self, name: str, target: Callable[..., None], arguments: Any, gpu: Gpu | None) -> BaseProcess:
+    def _start_process(self, name: str, target: Callable[..., None], arguments: Any) -> BaseProcess:
         process = self._spawn.Process(target=target, args=arguments, name=name, daemon=True)
-        with safe_path_children(), children_on_gpu(gpu, **self._environment), _short_arguments():
+        with safe_path_children(), _short_arguments():
             resource_tracker.ensure_running()  # its start together with the first worker would unblock SIGINT
             # Ctrl-C reaches all processes of a terminal, but only this one must handle it: workers inherit the blocked
             # signal.
@@ -659,7 +671,7 @@ def _help(jobs: _Jobs) -> None:
             prepare()
 
 
-def _work(pipe: Connection, device: Kind | None, jobs: _Jobs) -> None:
+def _work(pipe: Connection, device: Kind | None, threads: int | None, jobs: _Jobs) -> None:
     """Run a worker: receive frame indices, send notes and results, until the process is stopped."""
     make, _ = jobs
     threading.Thread(target=_end_with_parent, daemon=True).start()
@@ -670,7 +682,7 @@ def _work(pipe: Connection, device: Kind | None, jobs: _Jobs) -> None:
             try:
                 if device is not None:
                     try:
-                        use_shared_device(device)
+                        use_shared_device(device, threads)
                     except (ImportError, RuntimeError, MissingResourceError) as error:
                         if device == "cpu":
                             raise

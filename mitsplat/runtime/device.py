@@ -108,14 +108,20 @@ def use_device(device: str | Device) -> Device:
     return found
 
 
-def use_shared_device(kind: Kind) -> None:
+def use_shared_device(kind: Kind, threads: int | None = None) -> None:
     """Select a device like :func:`use_device`, in one of several processes that share its cores.
 
     On a GPU, Dr.Jit's threads only build scenes. One thread does this in a tenth of the time of sixteen threads.
+
+    Args:
+        kind: Kind of the device.
+        threads: Number of threads on a CPU; None for one per core.
     """
     use_device(kind)
     if kind == "cuda":
-        dr.set_thread_count(1)
+        threads = 1
+    if threads is not None:
+        dr.set_thread_count(threads)
 
 
 def current_device() -> Device:

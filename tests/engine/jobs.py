@@ -97,6 +97,16 @@ class Variant:
 
 
 @dataclass(frozen=True)
+class Threads:
+    """Job that returns the number of Dr.Jit's threads."""
+
+    def __call__(self, index, note, /):
+        import drjit as dr
+
+        return dr.thread_count()
+
+
+@dataclass(frozen=True)
 class Linger:
     """Job that records its process id and blocks."""
 

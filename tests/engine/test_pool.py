@@ -26,6 +26,7 @@ from tests.engine.jobs import (
     Linger,
     Make,
     Prepare,
+    Threads,
     Variant,
     WaitForHelper,
     ended,
@@ -283,6 +284,13 @@ def test_workers_select_the_device_first(monkeypatch):
     assert "CUDA_VISIBLE_DEVICES" not in os.environ
 
 
+@pytest.mark.parametrize(("workers", "threads"), [(2, 2), (4, 1)])
+def test_workers_share_the_cores(monkeypatch, workers, threads):
+    monkeypatch.setattr(engine, "usable_cores", lambda: 5)
+    with closing(run_frames(Threads(), {0: range(2)}, workers=workers, note=print, device=CPU)) as results:
+        assert list(results) == [threads, threads]
+
+
 def test_a_missing_gpu_is_reported_in_one_sentence():
     """An error of device selection in a worker is reported as the error of its frame."""
     lost = Device("cuda", (Gpu("gone", 2**40, 1, "", ""),))
@@ -301,7 +309,7 @@ def test_a_gpu_that_does_not_start_loses_its_worker(monkeypatch, kind, exhausted
     A CPU that fails would fail again.
     """
 
-    def fail(device):
+    def fail(device, threads):
         raise ImportError("cuInit() failed")
 
     frames, said = iter([7, 8]), []
@@ -313,7 +321,7 @@ def test_a_gpu_that_does_not_start_loses_its_worker(monkeypatch, kind, exhausted
 
     monkeypatch.setattr(engine, "use_shared_device", fail)
     monkeypatch.setattr(engine, "_end_with_parent", lambda: None)
-    engine._work(SimpleNamespace(recv=receive, send=said.append), kind, (Variant(), None))
+    engine._work(SimpleNamespace(recv=receive, send=said.append), kind, None, (Variant(), None))
     assert isinstance(said.pop(0), engine.Started)
     assert [(answer.exhausted, answer.message) for answer in said] == [(exhausted, "cuInit() failed")] * 2
 

@@ -45,6 +45,7 @@ from mitsplat.progress import Note
 from mitsplat.runtime.child_process import safe_path_children
 from mitsplat.runtime.cores import usable_cores
 from mitsplat.runtime.device import Device, Gpu, Kind, children_on_gpu, current_device, use_device, use_shared_device
+from mitsplat.runtime.gpu_memory import VISIBLE_GPUS
 from mitsplat.storage.cache import prepare_caches
 
 MadeFrame = TypeVar("MadeFrame", covariant=True)
@@ -573,9 +574,10 @@ class _Processes(Generic[Result]):
         return worker
 
     def start_helper(self) -> None:
-        """Start a process that runs ``prepare`` once. It needs no attention and may die."""
+        """Start a process without a GPU that runs ``prepare`` once. It needs no attention and may die."""
         name = f"mitsplat-helper-{len(self._helpers)}"
-        self._helpers.append(self._start_process(name, _help, (self._jobs,)))
+        with children_on_gpu(None, **{VISIBLE_GPUS: ""}):
+            self._helpers.append(self._start_process(name, _help, (self._jobs,)))
 
     def _start_process(self, name: str, target: Callable[..., None], arguments: Any) -> BaseProcess:
         process = self._spawn.Process(target=target, args=arguments, name=name, daemon=True)

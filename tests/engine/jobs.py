@@ -127,12 +127,12 @@ def ended(process):
 
 @dataclass(frozen=True)
 class Prepare:
-    """Function of a helper process that records its layouts and fails."""
+    """Function of a helper process that records its layouts and visible GPUs, and fails."""
 
     folder: Path
 
     def __call__(self, layouts):
-        write_text(self.folder / str(os.getpid()), str(layouts))
+        write_text(self.folder / str(os.getpid()), f"{layouts} {os.environ.get('CUDA_VISIBLE_DEVICES')!r}")
         raise RuntimeError("ignored")
 
 

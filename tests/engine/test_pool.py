@@ -104,7 +104,7 @@ def test_a_helper_prepares_the_layouts_that_no_worker_begins_with(tmp_path):
     ) as results:
         assert sorted(results) == list(range(18))
     for path in tmp_path.iterdir():
-        assert path.read_text() == "[7, 9]"
+        assert path.read_text() == "[7, 9] ''"
         assert ended(path.name)
 
 

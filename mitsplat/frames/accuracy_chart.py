@@ -10,7 +10,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from mitsplat.frames.speed_accuracy import BUDGET_PREFIX, MESH_PREFIX, TOLERANCE_PREFIX, Row, cheapest
+from mitsplat.frames.speed_accuracy import BUDGET_PREFIX, CAPTURED, MESH_PREFIX, TOLERANCE_PREFIX, Row, cheapest
 from mitsplat.quality import PRESETS
 from mitsplat.storage.files import storage_errors, write_file, write_text
 
@@ -65,15 +65,18 @@ def _draw_errors(axes: Any, rows: Sequence[Row], tolerance: float) -> None:
 
 
 def _draw_objects(axes: Any, rows: Sequence[Row]) -> None:
-    """Plot the time against the PSNR of objects; lines connect ray budgets of splats, and of path-traced meshes."""
+    """Plot the time against the PSNR of objects, without models of light that are cheaper than reflections.
+
+    Lines connect ray budgets of splats and of path-traced meshes.
+    """
     meshes = [row for row in rows if row.name.startswith(MESH_PREFIX)]
     budgets = [row for row in rows if row.name == "fast" or row.name.startswith(BUDGET_PREFIX)]
-    for series, colour in ((budgets, "C0"), (meshes, "C1")):
-        line = sorted((row.seconds, row.objects) for row in series)
-        axes.plot(*zip(*line, strict=True), color=colour, linewidth=1, zorder=1) if line else None
-    for row in rows:
-        axes.scatter(row.seconds, row.objects, s=50, color="C1" if row in meshes else "C0", zorder=2)
-        axes.annotate(row.name, (row.seconds, row.objects), xytext=(6, 4), textcoords="offset points", fontsize=8)
+    others = [row for row in rows if row.name in (*PRESETS, CAPTURED) and row not in budgets]
+    for series, colour, line in ((budgets, "C0", "-"), (meshes, "C1", "-"), (others, "C2", "")):
+        points = sorted((row.objects, row.seconds) for row in series)
+        axes.plot([p[1] for p in points], [p[0] for p in points], f"o{line}", color=colour)
+        for row in series:
+            axes.annotate(row.name, (row.seconds, row.objects), xytext=(6, 4), textcoords="offset points", fontsize=8)
     reference = "path-traced meshes" if meshes else "exact"
     axes.set(xscale="log", xlabel="seconds per image", ylabel=f"PSNR of objects against {reference} [dB]")
     axes.margins(x=0.2, y=0.1)

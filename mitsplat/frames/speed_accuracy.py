@@ -64,6 +64,9 @@ _FAST = PRESETS["fast"]
 TOLERANCE_PREFIX, BUDGET_PREFIX, MESH_PREFIX = "balanced at ", "fast, shadow error ", "meshes, "
 """Prefixes of the names of steps with other tolerances, with other ray budgets, and with path-traced meshes."""
 
+CAPTURED = "fast, captured objects"
+"""Name of the step without materials."""
+
 STEPS = (
     *(Step(name, quality) for name, quality in PRESETS.items()),
     Step("fast, EWA response", replace(_FAST, response="ewa")),
@@ -77,7 +80,7 @@ LIGHT_STEPS = (
     Step("fast, no shadow", _FAST, {"composite.shadow": "none"}),
 )
 MATERIAL_STEPS = (
-    Step("fast, captured objects", _FAST, captured=True),
+    Step(CAPTURED, _FAST, captured=True),
     *(Step(f"{MESH_PREFIX}{paths} paths", _FAST, mesh_paths=paths) for paths in (4, 16, 64, 256)),
 )
 """Steps for scenes whose objects all have materials. The last one is the reference of objects."""

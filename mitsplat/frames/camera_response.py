@@ -163,9 +163,10 @@ def start_development(
     light: Sequence[float],
 ) -> Development:
     """Start to :func:`develop` a picture on the device, flat and row-major over ``shape``."""
+    balance = _white_point_matrix(composite, np.divide(light, white))
     if composite.exposure != "fixed":
         stops = (
-            metered_exposure(linear, shape[0] * shape[1], composite.tone)
+            metered_exposure(linear, shape[0] * shape[1], composite.tone, LUMINANCE @ balance)
             if composite.exposure == "auto"
             else camera_exposure(composite.exposure, white)
         )
@@ -177,7 +178,7 @@ def start_development(
         linear = correlate(linear, shape, motion_kernel(draws["motion_blur"], draws.get("motion_angle", 0.0)))
     if "iso" in draws:
         linear = add_noise(linear, shape, draws["iso"], seed)
-    matrix = colour_matrix(draws) @ _white_point_matrix(composite, np.divide(light, white))
+    matrix = colour_matrix(draws) @ balance
     if not np.array_equal(matrix, np.eye(3)):
         linear = mi.Color3f(*[sum(opaque_float(m) * c for m, c in zip(row, linear, strict=True)) for row in matrix])
     jpeg = round(draws["jpeg"]) if "jpeg" in draws else None
@@ -221,15 +222,15 @@ class Development:
         return image if self.jpeg is None else _jpeg_compressed(image, self.jpeg)
 
 
-def metered_exposure(linear: mi.Color3f, num_pixels: int, tone: Tone) -> float:
+def metered_exposure(linear: mi.Color3f, num_pixels: int, tone: Tone, weights: Float64Array) -> float:
     """Compute the exposure [stops], within 30 stops, at which the encoded luminance has the mean :data:`GREY`.
 
-    The mean is taken after encoding, so that clipped lamps weigh no more than white paper. It is estimated from evenly
-    spaced pixels.
+    The luminance is that after white balance: ``weights`` (3,) times linear sRGB before it. The mean is taken after
+    encoding, so that clipped lamps weigh no more than white paper. It is estimated from evenly spaced pixels.
     """
     sampled_pixels = dr.arange(mi.UInt32, 0, num_pixels, max(1, num_pixels // _METERED_PIXELS))
     dr.eval(linear)
-    luminance = np.maximum(LUMINANCE @ dr.gather(mi.Color3f, linear, sampled_pixels).numpy(), 0.0)
+    luminance = np.maximum(np.float32(weights) @ dr.gather(mi.Color3f, linear, sampled_pixels).numpy(), 0.0)
     curve = 255.0 * np.clip(tone_curve(tone), 0.0, 1.0)
 
     def mean(stops: float) -> float:

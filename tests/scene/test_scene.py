@@ -209,6 +209,7 @@ def changed(data: SceneData, **changes: Any) -> SceneData:
         ({"randomise": {"vignetting": [-1, 0]}}, "randomise.vignetting[0]: must be >= 0 (got -1)"),
         ({"randomise": {"jpeg": [0, 90]}}, "randomise.jpeg[0]: must be >= 1 (got 0)"),
         ({"composite": {"exposure": "dark"}}, "composite.exposure: must be auto, fixed, or a mapping with ev, or with"),
+        ({"composite": {"white_balance": "daylight"}}, "composite.white_balance: must be auto or a colour temperature"),
         ({"composite": {"exposure": 9}}, "composite.exposure: must be auto, fixed, or a mapping with ev, or with"),
         ({"composite": {"exposure": {"ev": "9"}}}, "composite.exposure.ev: must be a number"),
         ({"composite": {"exposure": {"f": 4}}}, "composite.exposure.f: "),

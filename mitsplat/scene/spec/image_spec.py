@@ -151,6 +151,13 @@ def _check_exposure(exposure: object) -> object:
     raise ValueError(f"must be auto, fixed, or a mapping with ev, or with aperture and shutter (got {exposure!r})")
 
 
+def _check_white_balance(balance: object) -> object:
+    """Refuse other words; otherwise pydantic would report one member of the union."""
+    if balance == "auto" or (isinstance(balance, int | float) and not isinstance(balance, bool)):
+        return balance
+    raise ValueError(f"must be auto or a colour temperature in K (got {balance!r})")
+
+
 class CameraExposure(StrictModel):
     """Exposure of a camera: ``ev``, or ``aperture``, ``shutter`` and ``iso``.
 
@@ -219,7 +226,10 @@ class Composite(StrictModel):
         "of radiance 1 W/(m^2 sr) as white, or that of the stated ``white`` of a captured environment. A "
         "mapping is the exposure of a camera. ``randomise.exposure`` is added in all cases.",
     )
-    white_balance: Kelvin | Literal["auto"] = Field(
+    white_balance: Annotated[
+        Kelvin | Literal["auto"],
+        BeforeValidator(_check_white_balance, json_schema_input_type=Kelvin | Literal["auto"]),
+    ] = Field(
         DAYLIGHT,
         description="Colour temperature that appears white [K]. ``auto`` makes a white surface neutral at the bottom "
         "centre of ``region``, facing up without occlusion.",

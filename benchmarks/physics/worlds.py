@@ -60,7 +60,7 @@ class Batch:
         timestep: float,
         device: str,
     ) -> None:
-        one = physics._build_scene(bodies, colliders, physics._IMPEDANCE_WARP)
+        one = physics._build_scene(bodies, colliders, physics._IMPEDANCE_WARP, True)
         contacts = 2 * physics.max_contacts(len(bodies), one.shape_count)  # no second draw
         builder = newton.ModelBuilder(gravity=physics._GRAVITY)
         SolverMuJoCo.register_custom_attributes(builder)

@@ -202,7 +202,7 @@ class WarpWorld(World):
     ) -> None:
         super().__init__(bodies, timestep=timestep)
         self._timestep = timestep
-        model = _build_model(bodies, colliders, _IMPEDANCE_WARP)
+        model = _build_model(bodies, colliders, _IMPEDANCE_WARP, True)
         contacts = max(8, int(capacity * max_contacts(len(bodies), model.shape_count)))
         self._solver = PairFrictionSolver(
             model, nconmax=contacts, njmax=6 * contacts, use_mujoco_contacts=False, **_SOLVER_OPTIONS
@@ -263,7 +263,9 @@ class MujocoWorld(World):
     def __init__(self, bodies: Sequence[Body], colliders: Sequence[Collider], *, timestep: float) -> None:
         super().__init__(bodies, timestep=timestep)
         solver = PairFrictionSolver(
-            _build_model(bodies, colliders, _IMPEDANCE_MUJOCO), use_mujoco_cpu=True, **_SOLVER_OPTIONS
+            _build_model(bodies, colliders, _IMPEDANCE_MUJOCO, False),
+            use_mujoco_cpu=True,
+            **_SOLVER_OPTIONS,
         )
         self._model, self._data = solver.mj_model, solver.mj_data
         self._model.opt.timestep = timestep
@@ -352,17 +354,25 @@ def max_contacts(bodies: int, shapes: int) -> int:
     return 24 * bodies + shapes
 
 
-def _build_model(bodies: Sequence[Body], colliders: Sequence[Collider], impedance: tuple[float, float]) -> newton.Model:
-    return _build_scene(bodies, colliders, impedance).finalize(device="cpu")
+def _build_model(
+    bodies: Sequence[Body], colliders: Sequence[Collider], impedance: tuple[float, float], newton_contacts: bool
+) -> newton.Model:
+    return _build_scene(bodies, colliders, impedance, newton_contacts).finalize(device="cpu")
 
 
 def _build_scene(
-    bodies: Sequence[Body], colliders: Sequence[Collider], impedance: tuple[float, float]
+    bodies: Sequence[Body], colliders: Sequence[Collider], impedance: tuple[float, float], newton_contacts: bool
 ) -> newton.ModelBuilder:
+    """Build a scene for Newton's contacts, or else for those of MuJoCo.
+
+    Newton analyses convex hulls for its contacts, which takes as long as all other steps. MuJoCo makes the hulls of
+    meshes itself.
+    """
     contact = {"mujoco:condim": _WITH_ROLL, "mujoco:geom_solimp": (*impedance, 1e-3, 0.5, 2.0)}
     builder = newton.ModelBuilder(gravity=_GRAVITY)
     builder.validate_inertia_detailed = True  # in Python: the alternative compiles a kernel for 4 s
     SolverMuJoCo.register_custom_attributes(builder)
+    add_hull = builder.add_shape_convex_hull if newton_contacts else builder.add_shape_mesh
     for collider in colliders:
         # With size 0, the bodies determine the lengths of spin and rolling friction.
         config = _shape_config(collider.friction, size=0.0)
@@ -371,7 +381,8 @@ def _build_scene(
             hx, hy, hz = np.divide(size, 2).tolist()
             xform = wp.transform(wp.vec3(*pose[:3, 3]), wp.quat(*Rotation.from_matrix(pose[:3, :3]).as_quat()))
             builder.add_shape_box(-1, xform=xform, hx=hx, hy=hy, hz=hz, cfg=config, custom_attributes=contact)
-        _add_hulls(builder, -1, [newton_hull(piece) for piece in collider.pieces], config, contact)
+        for piece in collider.pieces:
+            add_hull(-1, mesh=newton_hull(piece), cfg=config, custom_attributes=contact)
     for i, place in enumerate(_initial_coordinates(bodies)):
         body = bodies[i] if i < len(bodies) else None
         mass = bodies[0].mass if body is None else body.mass
@@ -383,19 +394,10 @@ def _build_scene(
             lock_inertia=True,
         )
         if body is not None:
-            _add_hulls(builder, link, body.hulls, _shape_config(body.friction, size=body.size), contact)
+            config = _shape_config(body.friction, size=body.size)
+            for hull in body.hulls:
+                add_hull(link, mesh=hull, cfg=config, custom_attributes=contact)
     return builder
-
-
-def _add_hulls(
-    builder: newton.ModelBuilder,
-    link: int,
-    hulls: Sequence[newton.Mesh],
-    config: newton.ModelBuilder.ShapeConfig,
-    contact: dict[str, Any],
-) -> None:
-    for hull in hulls:
-        builder.add_shape_convex_hull(link, mesh=hull, cfg=config, custom_attributes=contact)
 
 
 def _shape_config(friction: float, *, size: float) -> newton.ModelBuilder.ShapeConfig:

@@ -40,6 +40,25 @@ def world_of(stepper, bodies, colliders, poses, *, timestep=0.002, capacity=1.0)
     return world
 
 
+def test_mujoco_makes_the_hulls_that_newton_analyses(monkeypatch):
+    """The pieces of bodies and colliders give the same bytes of MuJoCo's model, as meshes and as convex hulls."""
+    import mujoco
+
+    from mitsplat.physics import worlds
+
+    def model_bytes():
+        model = worlds.MujocoWorld([body], [ground], timestep=0.002)._model
+        found = np.zeros(mujoco.mj_sizeModel(model), np.uint8)
+        mujoco.mj_saveModel(model, None, found)
+        return found.tobytes()
+
+    body = body_of(trimesh.creation.icosphere(1, 0.02), trimesh.creation.box((0.05, 0.01, 0.01)))
+    ground, build = worlds.Collider(0.5, (trimesh.creation.box((1.0, 1.0, 0.1)),)), worlds._build_model
+    as_meshes = model_bytes()
+    monkeypatch.setattr(worlds, "_build_model", lambda *args: build(*args[:3], True))
+    assert model_bytes() == as_meshes
+
+
 def run_until(world, time):
     while world.time < time - 1e-9:
         world.advance()

@@ -29,46 +29,15 @@ from mitsplat.errors import InputError, MissingResourceError
 from mitsplat.formats.format import Catalogue
 from mitsplat.formats.yolo import data_yaml
 from mitsplat.frames.layer_sheet import layer_sheet
-from mitsplat.images.masks import Silhouette
-from mitsplat.labels.labels import LabelRules, Labels, Truth, label_instances
+from mitsplat.labels.labels import Labels
 from mitsplat.labels.overlay import class_colour, draw_labels
 from mitsplat.runtime import device as devices
 from mitsplat.runtime.device import Device, Gpu
-from mitsplat.scene.layout import Instance, Layout
 from mitsplat.scene.loading.scene_loading import load_scene
-from mitsplat.scene.planning.frame_plan import plan_frame
-from mitsplat.scene.streams import random_stream
 from mitsplat.storage.files import SPLITS
-from tests.synthetic import CERTIFICATE, frame_around
+from tests.synthetic import render, settle
 
 PARSE_LINE = manifest.parse_line
-
-
-def settle(scene, index, *, progress):
-    """Place three objects at random positions, without physics."""
-    rng = random_stream(scene.spec.seed, "synthetic layout", index)
-    instances = []
-    for i in range(3):
-        pose = np.eye(4)
-        pose[:3, 3] = rng.uniform(-1, 1, 3)
-        instances.append(Instance(i + 1, i % len(scene.assets), i % len(scene.class_names), pose))
-    return Layout(index, tuple(instances), CERTIFICATE)
-
-
-def render(scene, index, *, layout):
-    """Draw a disc per object on noise."""
-    plan = plan_frame(scene, index, layout)
-    camera = plan.camera
-    rng = np.random.default_rng(plan.seed)
-    ids = np.zeros((camera.height, camera.width), dtype=np.int32)
-    for instance in layout.instances:
-        x, y = (instance.world_from_object[:2, 3] * 0.4 + 0.5) * (camera.width, camera.height)
-        cv2.circle(ids, (int(x), int(y)), 7, instance.id, cv2.FILLED)
-    image = rng.integers(0, 256, (camera.height, camera.width, 3), dtype=np.uint8)
-    silhouettes = {int(i): Silhouette.cropped(ids == i, 0, 0) for i in np.unique(ids[ids > 0])}
-    labels = label_instances(Truth(ids, ids, silhouettes, ids), layout.instances, scene.class_names, LabelRules())
-    normal = np.stack(np.meshgrid(range(camera.width), range(camera.height), [0.5]), -1)[:, :, 0].astype(np.float32)
-    return frame_around(plan, layout, labels, image=image, ids=ids, depth=ids, normal=normal)
 
 
 @dataclass(frozen=True)

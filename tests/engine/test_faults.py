@@ -21,6 +21,7 @@ from mitsplat.dataset.manifest import Manifest
 from mitsplat.errors import InputError, MissingResourceError, PartialResultError
 from tests.conftest import box_asset, small_scene
 from tests.dataset.test_write import contents, render, settle, write
+from tests.engine.faults import KilledOnce, TooLarge, lines, slow
 
 CHILD = """
 import sys
@@ -28,26 +29,14 @@ sys.path.insert(0, {tests!r})
 from functools import partial
 from mitsplat.dataset import write as dataset
 from mitsplat.cli import main
-from tests.dataset.test_write import settle
-from tests.engine.test_faults import slow
+from tests.engine.faults import slow
+from tests.synthetic import settle
 
 if __name__ == "__main__":
     dataset.render_frame = partial(slow, {seconds}, {stop})
     dataset.settle_layout = settle
     main(sys.argv[1:])
 """
-
-
-def slow(seconds, stop, scene, index, *, layout):
-    """Draw a frame after a delay.
-
-    Block once the folder in ``stop`` holds the given number of frames, because the process that sends the signal may be
-    late.
-    """
-    if stop is not None and lines(Path(stop[0])) >= stop[1]:
-        time.sleep(3600)
-    time.sleep(seconds)
-    return render(scene, index, layout=layout)
 
 
 @pytest.fixture(scope="module")
@@ -82,11 +71,6 @@ def start(tmp_path, scene, out, *options, frames):
             # Children of a background shell job ignore Ctrl-C, and so would this process without the default handler.
             preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
         )
-
-
-def lines(out):
-    path = out / "manifest.jsonl"
-    return path.read_bytes().count(b"\n") if path.exists() else 0
 
 
 def wait_for_frames(process, out, count):
@@ -129,21 +113,6 @@ def test_an_interrupted_run_ends_with_130_and_resumes_to_the_same_bytes(scene, t
     assert contents(out) == undisturbed
 
 
-@dataclass(frozen=True)
-class KilledOnce:
-    """Renderer whose process is killed at one frame, as by the kernel when memory runs out."""
-
-    folder: Path
-    index: int
-
-    def __call__(self, scene, index, *, layout):
-        mark = self.folder / "killed"
-        if index == self.index and not mark.exists():
-            mark.touch()
-            os.kill(os.getpid(), signal.SIGKILL)
-        return render(scene, index, layout=layout)
-
-
 def test_a_killed_worker_loses_no_frame(scene, tmp_path, undisturbed):
     told = []
     summary = write(
@@ -156,18 +125,6 @@ def test_a_killed_worker_loses_no_frame(scene, tmp_path, undisturbed):
     assert summary.rendered == 20
     assert "the worker of frame 7 was killed by SIGKILL: the frame is repeated" in told
     assert contents(tmp_path / "out") == undisturbed
-
-
-@dataclass(frozen=True)
-class TooLarge:
-    """Renderer that runs out of memory at one frame."""
-
-    index: int
-
-    def __call__(self, scene, index, *, layout):
-        if index == self.index:
-            raise RuntimeError("jit_malloc(): out of memory! Could not allocate 9 GiB of device memory.")
-        return render(scene, index, layout=layout)
 
 
 @pytest.mark.parametrize("workers", [1, 3])

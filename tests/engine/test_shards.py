@@ -34,7 +34,7 @@ from mitsplat.scene.spec.scene_spec import FORMATS
 from tests.cli.typed import run
 from tests.conftest import BOTH, nut_and_bolt, small_scene
 from tests.dataset.test_write import contents, render, settle, write
-from tests.engine.test_faults import KilledOnce
+from tests.engine.faults import KilledOnce
 
 
 @pytest.fixture(scope="module")

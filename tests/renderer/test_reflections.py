@@ -103,6 +103,44 @@ def test_mirror_shows_the_lamp_at_the_place_and_with_the_size_of_its_image() -> 
     np.testing.assert_allclose(light[expected].mean(axis=0), [2.0, 1.0, 0.5], rtol=0.03)
 
 
+@pytest.mark.parametrize("shift", [0.0, 0.3, 0.5])
+def test_small_mirroring_ball_reflects_all_light_of_a_lamp(shift: float) -> None:
+    """The image of the lamp is smaller than a pixel; its light does not depend on its place in the pixel.
+
+    A convex mirror of radius r has the focal length f = r / 2. A lamp of area A at the distance p has an image of area
+    A f^2 / (p + f)^2 at the distance p f / (p + f) behind the mirror.
+    """
+    make_integrator()
+    radius, size, radiance = 0.02, 0.06, 1000.0
+    camera = Camera.look_at((0, 0, 1), (0, 0, 0), width=40, height=40, fov_x=5.7, up=(0, 1, 0))
+    x = shift / camera.fx
+    ball = trimesh.creation.icosphere(4, radius).apply_translation((x, x, 0))
+    points = ball.triangles_center
+    materials = SplatMaterials.uniform(len(points), metallic=1.0, roughness=0.1)
+    splats = Splats(
+        points,
+        np.tile([0, 0, 0, 1.0], (len(points), 1)),
+        np.full((len(points), 3), 5e-4),
+        np.full(len(points), 0.99),
+        np.zeros((len(points), 1, 3)),
+        materials=materials,
+    )
+    place = mi.ScalarPoint3f(0.15, 0, 1)
+    pose = mi.ScalarTransform4f().look_at(place, mi.ScalarPoint3f(0), mi.ScalarVector3f(0, 1, 0)).scale(size / 2)
+    emitter = {"type": "area", "radiance": {"type": "rgb", "value": radiance}}
+    rectangle = {"type": "rectangle", "to_world": pose, "emitter": emitter}
+    scene = mi.load_dict(
+        {"type": "scene", "ball": make_splats_shape(splats, proxy=ball, instance=1), "lamp": rectangle}
+    )
+    layers = render_layers(make_integrator(white=np.pi, hide_emitters=True), scene, camera)
+    light = (layers.light + layers.highlight)[..., 0]
+    seen = light[layers.instance == 1].sum() / camera.fx**2
+    focal, away = radius / 2, float(np.linalg.norm(place)) - radius
+    image = away * focal / (away + focal)
+    expected = radiance * size**2 * (focal / (away + focal)) ** 2 / (1 - radius + image) ** 2
+    assert seen == pytest.approx(expected, rel=0.07)
+
+
 def test_mirror_shows_an_object_at_its_image() -> None:
     """A grey box on the mirror, upside down: the mirror image lies below the box, where the sky is white elsewhere."""
     make_integrator()

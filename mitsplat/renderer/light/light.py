@@ -23,7 +23,7 @@ traced, see :mod:`mitsplat.renderer.light.light_planes`.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import drjit as dr
@@ -33,7 +33,7 @@ from mitsplat.renderer.emitters.emitter_sampling import Emitters
 from mitsplat.renderer.light.bounce import Bounce, object_cover, trace_bounce
 from mitsplat.renderer.light.light_filter import UNTRACED, Estimate, LightFilter, LightMeans
 from mitsplat.renderer.light.light_planes import MIN_ROWS, CoarseLight, Planes, between_samples, plane_codes
-from mitsplat.renderer.light.light_points import LightPoints
+from mitsplat.renderer.light.light_points import LightPoints, filtered_roughness
 from mitsplat.renderer.light.light_tiles import block_order
 from mitsplat.renderer.light.lit_surface import LitSurface, VisibleSurfaces
 from mitsplat.renderer.light.reflections import Reflections, ReflectionTracer
@@ -263,6 +263,8 @@ class TracedPixels:
         here = visible.at(index)
         dr.eval(here)
         light_filter = LightFilter(here, view, index, coarse and coarse.coarse)
+        here = replace(here, roughness=filtered_roughness(here, index, light_filter.place, view))
+        dr.eval(here)
         order = _in_blocks(light_filter.place, view)
         points = LightPoints.of(visible, here, index, light_filter.place, order)
         return cls(lighting, index, here, light_filter, points, order, coarse)

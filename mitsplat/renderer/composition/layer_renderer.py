@@ -16,7 +16,7 @@ from mitsplat.images.masks import Silhouette
 from mitsplat.quality import Quality
 from mitsplat.renderer.composition.scene_contents import ContentsReader, SceneContents, same_shapes
 from mitsplat.renderer.instances.antialiasing import Edges
-from mitsplat.renderer.instances.primary_visibility import PrimaryVisibility
+from mitsplat.renderer.instances.primary_visibility import NO_SPLAT, PrimaryVisibility
 from mitsplat.renderer.instances.silhouettes import proxy_silhouettes, splat_silhouettes
 from mitsplat.renderer.light.light import Accuracy, light_factor
 from mitsplat.renderer.light.lit_surface import VisiblePixels, VisibleSurfaces
@@ -163,18 +163,25 @@ class LayerRenderer:
             return {}
         rays = edges.rays()
         behind, emitters, z_max = self._trace_background(contents, scene, edges.fine, rays, edges.positions())
-        splat = Image.empty(dr.width(rays.d))
+        splat, own = Image.empty(dr.width(rays.d)), [dr.zeros(mi.Float, dr.width(rays.d))] * 4
+        pixel = edges.pixels()
+        key_at_pixel = dr.gather(mi.UInt32, key, pixel)
         if contents.clouds is not None:
-            splat = edges.trace(contents.clouds, contents.placements, self.quality, z_max)
+            splat, own = edges.trace(contents.clouds, contents.placements, self.quality, key_at_pixel, z_max)
         shown = PrimaryVisibility.of(splat, behind, emitters, z_max, dr.pi / white)
-        pixel = edges.nearest_same(key, shown.key)
+        other = edges.nearest_other(key, shown.key)
+        shares = shown.shares(splat, own, key_at_pixel >= NO_SPLAT)
 
-        def near(values: mi.Color3f) -> mi.Color3f:
-            """Return the values of the nearest pixel with the same key."""
-            return values if dr.width(values) == 1 else dr.gather(type(values), values, pixel)
+        def mixed(values: mi.Color3f, share: mi.Color3f | mi.Float) -> mi.Color3f:
+            """Return the mean of the values at the ray's pixel, with weight ``share``, and at the other pixel."""
+            if dr.width(values) == 1:
+                return values
+            return dr.lerp(dr.gather(mi.Color3f, values, other), dr.gather(mi.Color3f, values, pixel), share)
 
-        lights = near(layers["light"]), near(layers["highlight"])
-        rgb, captured = shown.lit(*lights, None if radiance is None else near(radiance))
+        light, highlight = mixed(layers["light"], shares[0]), mixed(layers["highlight"], shares[1])
+        if radiance is not None:
+            radiance = dr.gather(mi.Color3f, radiance, dr.select(shown.key == key_at_pixel, pixel, other))
+        rgb, captured = shown.lit(light, highlight, radiance)
         fine = {"rgb": rgb, "alpha": shown.alpha, "captured": captured}
         dr.eval(fine)
         smooth = {name: edges.averaged(layers[name], values) for name, values in fine.items()}

@@ -4,10 +4,10 @@ One ray through a pixel's centre sees only one side of a silhouette, so that its
 neighbour of another instance or another visible mesh are therefore rendered again, in a view with one pixel per ray.
 Only the tiles of this view that contain such pixels have lists. The average is taken over linear, lit colours.
 
-Light is not traced again. A ray takes the light of the nearest pixel, its own or an adjacent one, that shows the same
-surface. Both sides of a silhouette are therefore lit like the surface beside them (compare Salvi and Vidimce 2012,
-"Surface based anti-aliasing", which shades once per surface). Ids, depths and all other label data stay those of the
-pixel's centre.
+Light is not traced again. The surface that the pixel shows takes its light. What else a ray sees takes the light of the
+nearest pixel that shows another surface. Both sides of a silhouette are therefore lit like the surface beside them
+(compare Salvi and Vidimce 2012, "Surface based anti-aliasing", which shades once per surface), also along a ray that
+sees both of them. Ids, depths and all other label data stay those of the pixel's centre.
 """
 
 from __future__ import annotations
@@ -79,9 +79,14 @@ class Edges:
         return mi.Float(x) + 0.5, mi.Float(y) + 0.5
 
     def trace(
-        self, clouds: CloudSet, placements: Sequence[Placement], quality: Quality, z_max: mi.Float | None
-    ) -> Image:
-        """Render splats along those rays; arguments as in :func:`mitsplat.renderer.splatting.march.trace`.
+        self,
+        clouds: CloudSet,
+        placements: Sequence[Placement],
+        quality: Quality,
+        own: mi.UInt32,
+        z_max: mi.Float | None,
+    ) -> tuple[Image, list[mi.Float]]:
+        """Render splats along those rays; arguments and result as in `march_tiles`.
 
         The rays are few, so that the order per ray replaces every order with a finite tolerance.
 
@@ -89,10 +94,17 @@ class Edges:
             CrowdedError: If one tile alone has too many pairs.
         """
         exact = quality if quality.order == "tile" else replace(quality, tolerance=0.0)
-        return _trace(clouds, placements, self.fine, self.subset, exact, z_max)
+        return _trace(clouds, placements, self.fine, self.subset, exact, mi.Float(own), z_max)
 
-    def nearest_same(self, keys: mi.UInt32, own: mi.UInt32) -> mi.UInt32:
-        """Return for each ray the nearest pixel with the same key; the ray's own pixel if there is none.
+    def pixels(self) -> mi.UInt32:
+        """Return the pixel of the picture that contains each ray."""
+        x, y = self._places()
+        return _pixel(mi.Int32(x // ZOOM), mi.Int32(y // ZOOM), self.view)
+
+    def nearest_other(self, keys: mi.UInt32, own: mi.UInt32) -> mi.UInt32:
+        """Return for each ray the nearest pixel with another key than its own pixel; that pixel if there is none.
+
+        If the key of the ray itself is not that of its pixel, only pixels with the key of the ray count.
 
         Args:
             keys: Keys of the picture's pixels.
@@ -102,11 +114,13 @@ class Edges:
         px, py = mi.Int32(x // ZOOM), mi.Int32(y // ZOOM)
         # Direction of the nearer neighbour along each axis.
         right, down = (dr.select(place % ZOOM * 2 >= ZOOM, mi.Int32(1), -1) for place in (x, y))
-        found, pixel = mi.Bool(False), _pixel(px, py, self.view)
-        for dx, dy in ((0, 0), (1, 0), (0, 1), (1, 1), (-1, 0), (0, -1), (-1, 1), (1, -1), (-1, -1)):
+        pixel = _pixel(px, py, self.view)
+        here, found = dr.gather(mi.UInt32, keys, pixel), mi.Bool(False)
+        for dx, dy in ((1, 0), (0, 1), (1, 1), (-1, 0), (0, -1), (-1, 1), (1, -1), (-1, -1)):
             other = _pixel(px + dx * right, py + dy * down, self.view)
-            same = ~found & (dr.gather(mi.UInt32, keys, other) == own)
-            pixel, found = dr.select(same, other, pixel), found | same
+            key = dr.gather(mi.UInt32, keys, other)
+            wanted = ~found & (key != here) & ((key == own) | (own == here))
+            pixel, found = dr.select(wanted, other, pixel), found | wanted
         return pixel
 
     def averaged(self, values: mi.Float | mi.Color3f, fine: mi.Float | mi.Color3f) -> mi.Float | mi.Color3f:
@@ -147,10 +161,11 @@ def _trace(
     view: CameraView,
     subset: TileSubset,
     quality: Quality,
+    own: mi.Float,
     z_max: mi.Float | None,
-) -> Image:
+) -> tuple[Image, list[mi.Float]]:
     try:
-        return march_tiles(bin_gaussians(clouds, placements, view, quality, subset=subset), view, quality, z_max)
+        return march_tiles(bin_gaussians(clouds, placements, view, quality, subset=subset), view, quality, own, z_max)
     except CrowdedError:
         if subset.count == 1:
             raise
@@ -158,6 +173,7 @@ def _trace(
     for half in subset.halves(view):
         pixels = dr.arange(mi.UInt32, half.count * TILE_PIXELS) + start
         part_z = None if z_max is None else dr.gather(mi.Float, z_max, pixels)
-        parts.append(_trace(clouds, placements, view, half, quality, part_z))
+        parts.append(_trace(clouds, placements, view, half, quality, dr.gather(mi.Float, own, pixels), part_z))
         start += half.count * TILE_PIXELS
-    return Image.joined(parts)
+    images, shares = zip(*parts, strict=True)
+    return Image.joined(images), [dr.concat(list(values)) for values in zip(*shares, strict=True)]

@@ -55,8 +55,7 @@ class PrimaryVisibility:
         ``z_max`` is the depth along z [m] of the nearest mesh or emitter, behind which nothing is visible. ``scale`` is
         the factor from radiance to the picture's scale (Color3f).
         """
-        covered = dr.maximum(splat.alpha, 1e-6)
-        colour = mi.Color3f(*[srgb_to_linear(c / covered) * splat.alpha for c in splat.rgb])
+        colour = _linear(splat.rgb, splat.alpha)
         alpha, key = splat.alpha, mi.UInt32(splat.instance)
         solid, diffuse, front, emission = mi.Bool(False), mi.Bool(False), mi.Bool(False), mi.Color3f(0)
         shape = mi.UInt32(0)
@@ -75,6 +74,22 @@ class PrimaryVisibility:
         cover = dr.select(diffuse, 1, splat.alpha)
         return cls(colour, alpha, splat.alpha, cover, solid, diffuse, front, emission, key)
 
+    def shares(self, splat: Image, own: list[mi.Float], on_mesh: mi.Bool) -> tuple[mi.Color3f, mi.Float]:
+        """Return the shares of ``colour`` (Color3f) and of ``cover`` (Float) that one surface has.
+
+        Args:
+            splat: Splats along the rays.
+            own: Opacity, red, green and blue of the splats of an instance, as parts of those of ``splat``.
+            on_mesh: True if the surface is the diffuse mesh; otherwise it is that instance.
+        """
+        opacity, *encoded = own
+        others = [dr.maximum(a - b, 0) for a, b in zip(splat.rgb, encoded, strict=True)]
+        here, beside = _linear(encoded, opacity), _linear(others, splat.alpha - opacity)
+        mesh = self.colour - _linear(splat.rgb, splat.alpha)
+        total, here = here + beside + mesh, dr.select(on_mesh, mesh, here)
+        cover = dr.select(on_mesh, self.cover - splat.alpha, opacity)
+        return mi.Color3f(*[_share(h, t) for h, t in zip(here, total, strict=True)]), _share(cover, self.cover)
+
     def lit(
         self, light: mi.Color3f, highlight: mi.Color3f, radiance: mi.Color3f | None
     ) -> tuple[mi.Color3f, mi.Color3f]:
@@ -86,3 +101,14 @@ class PrimaryVisibility:
         if radiance is not None:
             emission = dr.select(self.solid & ~self.diffuse, radiance * (1 - self.splat_alpha), emission)
         return dr.maximum(self.colour * light + highlight * self.cover, 0) + emission, self.colour + emission
+
+
+def _linear(encoded: list[mi.Float], opacity: mi.Float) -> mi.Color3f:
+    """Return linear colours (Color3f) multiplied by ``opacity``, given display-encoded ones multiplied by it."""
+    covered = dr.maximum(opacity, 1e-6)
+    return mi.Color3f(*[srgb_to_linear(c / covered) * opacity for c in encoded])
+
+
+def _share(part: mi.Float, total: mi.Float) -> mi.Float:
+    """Return a part over the total, from 0 to 1."""
+    return dr.select(total > 0, dr.clip(part / total, 0, 1), 1)

@@ -125,18 +125,48 @@ def _corrected(
     pixel: Pixel, alpha: mi.Float, weight: mi.Float, colour: list[mi.Float], z: mi.Float
 ) -> tuple[list[mi.Float], list[mi.Float]]:
     """Return the colour correction for a late Gaussian, and the state of late peaks after it."""
-    total, _, *colours = pixel[SUMS]
-    deepest, met = pixel[DEEPEST], weight > 0
-    late = met & (z < deepest)
+    change, sums = _late_change(pixel, alpha, weight, z, [1.0, z, *colour], pixel[SUMS])
+    return change[2:], [dr.select(weight > 0, dr.maximum(z, pixel[DEEPEST]), pixel[DEEPEST]), *sums]
+
+
+def _late_change(
+    pixel: Pixel,
+    alpha: mi.Float,
+    weight: mi.Float,
+    z: mi.Float,
+    values: list[mi.Float | float],
+    sums: list[mi.Float],
+) -> tuple[list[mi.Float], list[mi.Float]]:
+    """Return the corrections of blended ``values`` for a late Gaussian, and their decaying ``sums`` after it."""
+    met, total = weight > 0, pixel[SUMS][0]
+    late = met & (z < pixel[DEEPEST])
     behind, kept = _shares(pixel, weight, late, z, _DECAY)
     taken = dr.select(late, alpha * behind, 0.0)
-    change = [taken * dr.fma(total, c, -sum_c) for c, sum_c in zip(colour, colours, strict=True)]
-    keep = dr.select(met & ~late, kept, 1.0 - taken)
-    own = dr.fma(taken, total, weight)
-    return change, [
-        dr.select(met, dr.maximum(z, deepest), deepest),
-        *(dr.fma(keep, old, own * f) for old, f in zip(pixel[SUMS], [1.0, z, *colour], strict=True)),
-    ]
+    keep, own = dr.select(met & ~late, kept, 1.0 - taken), dr.fma(taken, total, weight)
+    return (
+        [taken * dr.fma(total, value, -old) for value, old in zip(values, sums, strict=True)],
+        [dr.fma(keep, old, own * value) for value, old in zip(values, sums, strict=True)],
+    )
+
+
+SHARE = 9
+"""Numbers that follow the state of a ray in :func:`blend_share`: an instance id; weight, red, green and blue of this
+instance; and their decaying sums.
+"""
+
+
+def blend_share(
+    pixel: Pixel, alpha: mi.Float, record: GaussianRecord | FieldsOnAccess, z: mi.Float, several: bool, late: OutOfOrder
+) -> Pixel:
+    """Return the state of a ray after one more Gaussian, and the share that one instance has of it."""
+    state, own, share, decaying = pixel[:-SHARE], pixel[-SHARE], pixel[1 - SHARE : -4], pixel[-4:]
+    weight, counts = state[TRANSMITTANCE] * alpha, record.instance == own
+    values = [dr.select(counts, value, 0.0) for value in (1.0, *record.colour)]
+    share = [dr.fma(weight, value, total) for value, total in zip(values, share, strict=True)]
+    if late == "corrected":
+        change, decaying = _late_change(state, alpha, weight, z, values, decaying)
+        share = [a + b for a, b in zip(share, change, strict=True)]
+    return [*blend(state, alpha, record, z, several, late), own, *share, *decaying]
 
 
 def out_of_order(quality: Quality) -> OutOfOrder:

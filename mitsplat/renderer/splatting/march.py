@@ -25,10 +25,12 @@ from mitsplat.renderer.splatting.blending import (
     ERROR,
     HALF_Z,
     RED,
+    SHARE,
     SUM_Z,
     TALLY,
     OutOfOrder,
     blend,
+    blend_share,
     new_state,
     out_of_order,
     without_late_state,
@@ -257,13 +259,19 @@ def _tiles_of(flags: mi.Bool, lanes: Lanes) -> mi.UInt32:
     return dr.compress(reduce(or_, [dr.gather(mi.Bool, flags, lane + k) for k in range(per_tile)]))
 
 
-def march_tiles(lists: TileLists, view: CameraView, quality: Quality, z_max: mi.Float | None = None) -> Image:
+def march_tiles(
+    lists: TileLists, view: CameraView, quality: Quality, own: mi.Float, z_max: mi.Float | None = None
+) -> tuple[Image, list[mi.Float]]:
     """Render the pixels of some tiles, tile after tile, with one ray through each pixel's centre.
 
     Arguments are those of :func:`march`. Nothing is repaired: the order is per tile or per ray.
+
+    Returns:
+        The image; and for one instance ``own`` per ray (its id), opacity, red, green and blue of its Gaussians, as
+        parts of those of the image.
     """
     lanes = Lanes(lists, view, rows_together(quality.order), by_tile=True)
-    places = zip(lanes.pixel, lanes.inside, strict=True)
+    places = list(zip(lanes.pixel, lanes.inside, strict=True))
     far = [mi.Float(dr.inf) if z_max is None else dr.gather(mi.Float, z_max, pixel, inside) for pixel, inside in places]
     if quality.order == "ray":
         dr.eval(lists.nearest)
@@ -271,15 +279,23 @@ def march_tiles(lists: TileLists, view: CameraView, quality: Quality, z_max: mi.
     state: dict[str, Any] = {"several": lists.instance is None, "late": late}
     where = lanes.slopes(dr.opaque(mi.Float, 0.5), dr.opaque(mi.Float, 0.5))
     rays = Rays.through(lists, view, quality, where, far, lanes.start, lanes.stop)
-    found = walk(rays, quality.order, partial(new_state, **state), partial(blend, **state))
-    image, _ = _collect(without_late_state(found, late), lanes, lists.instance, quality)
-    dr.eval(image)
-    return image
+    nothing = [mi.Float(0.0) for _ in range(SHARE - 1)]
+    fresh = iter([[*new_state(**state), dr.gather(mi.Float, own, *place), *nothing] for place in places])
+    found = walk(rays, quality.order, partial(next, fresh), partial(blend_share, **state))
+    pixels = without_late_state([pixel[:-SHARE] for pixel in found], late)
+    image, _ = _collect(pixels, lanes, lists.instance, quality)
+    share = _images([pixel[1 - SHARE : -4] for pixel in found], pixels, lanes, quality)
+    dr.eval(image, share)
+    return image, share
 
 
 def _picture(pixels: list[Pixel], lanes: Lanes, quality: Quality) -> list[mi.Float]:
     """Return red, green, blue and opacity of the lanes' pixels as row-major arrays."""
-    shown = [[*pixel[RED : BLUE + 1], 1.0 - pixel[TRANSMITTANCE]] for pixel in pixels]
+    return _images([[*pixel[RED : BLUE + 1], 1.0 - pixel[TRANSMITTANCE]] for pixel in pixels], pixels, lanes, quality)
+
+
+def _images(shown: list[list[mi.Float]], pixels: list[Pixel], lanes: Lanes, quality: Quality) -> list[mi.Float]:
+    """Return blended values of the lanes' pixels as row-major arrays; the values of ended rays are normalised."""
     if quality.normalise_ended_rays:
         end = dr.opaque(mi.Float, quality.transmittance_min)
         whole = [dr.select(pixel[TRANSMITTANCE] <= end, dr.rcp(1.0 - pixel[TRANSMITTANCE]), 1.0) for pixel in pixels]

@@ -281,14 +281,21 @@ class TracedPixels:
         dr.eval(own)
         return LightFilter(own, self.lighting.view, dr.gather(mi.UInt32, self.index, self.glossy))
 
+    @cached_property
+    def mirrored(self) -> mi.Vector3f:
+        """Mean over the sample points of the directions that the glossy pixels mirror."""
+        surface = self.points.surface
+        mirrored = 2 * dr.dot(surface.normal, surface.to_camera) * surface.normal - surface.to_camera
+        rows = dr.arange(mi.UInt32, dr.width(self.points.owner))
+        return self.points.mean_by_pixel(mirrored, rows, surface.valid, self.glossy)
+
     def _rays_for_reflections(
         self, brightness: mi.Float, squares: mi.Float, rays: mi.Float, exposure: mi.Float
     ) -> mi.Float:
         """Return the wanted number of rays of the glossy pixels, given sums over the rays of all pixels."""
-        glossy, bent = self.glossy, dr.gather(mi.Bool, self.points.is_bent, self.glossy)
-        brightness, squares, rays = (dr.gather(mi.Float, v, glossy) for v in (brightness, squares, rays))
+        brightness, squares, rays = (dr.gather(mi.Float, v, self.glossy) for v in (brightness, squares, rays))
         return self.mirror_filter.reflections_for(
-            brightness, squares, rays, bent, self.lighting.accuracy.error, exposure
+            brightness, squares, rays, self.mirrored, self.lighting.accuracy.error, exposure
         )
 
     def _tracer(self, surface: LitSurface, pixel: mi.UInt32) -> ShadowTracer:
@@ -438,8 +445,7 @@ class TracedPixels:
         rays = dr.maximum(sums.rays, 1)
         tinted = estimate.tinted * weight + sums.tinted * (per_point / rays)
         colourless = estimate.colourless * weight + sums.colourless * (per_point / rays)
-        bent = dr.gather(mi.Bool, points.is_bent, glossy)
-        means, _ = self.mirror_filter.mirror([*tinted, *colourless], rays, bent)
+        means, _ = self.mirror_filter.mirror([*tinted, *colourless], rays, self.mirrored)
         tinted, colourless = mi.Color3f(*means[:3]), mi.Color3f(*means[3:])
         own, pixels = self.mirror_filter.here, self.mirror_filter.index
         before = dr.gather(mi.Color3f, light, pixels)

@@ -206,25 +206,30 @@ class LightFilter:
         return LightMeans(mi.Color3f(*values[:3]), mi.Color3f(*values[3:6]), mean_bounced)
 
     def mirror(
-        self, values: list[mi.Float], rays: mi.Float, bent: mi.Bool, radius: int = RADIUS
+        self, values: list[mi.Float], rays: mi.Float, mirrored: mi.Vector3f, radius: int = RADIUS
     ) -> tuple[list[mi.Float], mi.Float]:
         """Average reflected light per ray over neighbours that mirror similar directions.
 
-        Pixels that are ``bent`` (Bool) mirror many directions, so that they are not averaged.
+        ``mirrored`` is the mean of the directions that a pixel mirrors. It is short where they differ, and such pixels
+        are not averaged.
 
         Returns:
             The averages, and the effective number of pixels with the same number of rays.
         """
         here = self.here
-        mirrored = 2 * dr.dot(here.normal, here.to_camera) * here.normal - here.to_camera
-        mirrored = dr.select(bent, 0, mirrored)
         gloss = here.roughness + 2 * here.metallic
         closeness = dr.cos(dr.maximum(LOBE_SHARE * dr.square(here.roughness), 1e-3))
-        dr.eval(mirrored, closeness, gloss)
+        dr.eval(closeness, gloss)
         return self._average(values, rays, radius, lobe=(mirrored, closeness, gloss))
 
     def reflections_for(
-        self, brightness: mi.Float, squares: mi.Float, rays: mi.Float, bent: mi.Bool, error: float, exposure: mi.Float
+        self,
+        brightness: mi.Float,
+        squares: mi.Float,
+        rays: mi.Float,
+        mirrored: mi.Vector3f,
+        error: float,
+        exposure: mi.Float,
     ) -> mi.Float:
         """Compute the number of reflection rays per pixel of ``index`` at which they reach the wanted error.
 
@@ -232,7 +237,7 @@ class LightFilter:
             brightness: Sum of the brightness of the rays so far, in units of white.
             squares: Sum of its squares.
             rays: Number of these rays.
-            bent: True for pixels that mirror many directions.
+            mirrored: Mean of the directions that a pixel mirrors.
             error: Target standard error of mid-grey light.
             exposure: Factor of the exposure, that of :meth:`rays_for`.
         """
@@ -244,7 +249,7 @@ class LightFilter:
         dr.eval(mean, variance)
         # Own samples would stop at small variance and large values by chance, so that the picture would be too bright.
         (variance,), _ = self._average([variance], rays, 1)
-        (mean,), shared = self.mirror([mean], rays, bent, 1)
+        (mean,), shared = self.mirror([mean], rays, mirrored, 1)
         return variance / (dr.square(_allowed_error(error, mean)) * _gain(shared))
 
     def _share(self, estimate: Estimate) -> tuple[mi.Float, mi.Float, mi.Float]:

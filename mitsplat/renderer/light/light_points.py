@@ -26,6 +26,8 @@ OFFSETS = ((-0.125, -0.375), (0.375, -0.125), (-0.375, 0.125), (0.125, 0.375))
 
 Sums = TypeVar("Sums", Estimate, Reflections)
 
+Values = TypeVar("Values", "mi.Float", "mi.Color3f", "mi.Vector3f")
+
 EVEN = 0.95
 """Cosine between the normals of neighbours above which light is sampled at the pixel centre only."""
 
@@ -134,9 +136,7 @@ class LightPoints:
             total += dr.gather(type(values), values, slot + start, several)
         return dr.select(several, total, dr.gather(type(values), values, dr.arange(mi.UInt32, self.count)))
 
-    def mean_by_pixel(
-        self, values: mi.Float | mi.Color3f, rows: mi.UInt32, valid: mi.Bool, places: mi.UInt32
-    ) -> mi.Float | mi.Color3f:
+    def mean_by_pixel(self, values: Values, rows: mi.UInt32, valid: mi.Bool, places: mi.UInt32) -> Values:
         """Return means over the valid points of the pixels ``places``, whose rows are ``rows``."""
         sums = []
         for column in (values, mi.Float(1)):

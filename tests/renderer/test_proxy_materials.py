@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import trimesh
@@ -103,3 +104,19 @@ def test_surfaces_without_splats_reflect_nothing() -> None:
     si = proxies.dynamic.scene.ray_intersect_preliminary(rays())
     surface = proxies.dynamic.surface_at(si.prim_index, si.prim_uv, si.is_valid())
     assert np.array(surface.colour).max() == 0
+
+
+def test_many_rays_hit_the_same_triangles_as_few() -> None:
+    """Reflected light is traced in a second scene if there are many rays, with the same hits inside of triangles."""
+    make_integrator()
+    sphere = trimesh.creation.icosphere(2)
+    surface = Proxies([Occluder(sphere, 1, dynamic=True)]).dynamic
+    assert surface is not None
+    count = 4 * len(sphere.faces)
+    towards = np.random.default_rng(0).normal(size=(3, count)).astype(np.float32)
+    ray = mi.Ray3f(mi.Point3f(0), dr.normalize(mi.Vector3f(towards)))
+    dr.eval(ray)
+    many, few = surface.intersect(ray), surface.scene.ray_intersect_preliminary(ray)
+    assert "_open_edged" in vars(surface)
+    assert np.array_equal(np.array(many.prim_index), np.array(few.prim_index))
+    assert np.allclose(np.array(many.t), np.array(few.t), rtol=1e-5)

@@ -125,7 +125,7 @@ class Reflectors:
         captured, distance = mi.Color3f(dr.zeros(mi.Float, dr.width(key))), mi.Float(dr.inf)
         ray.maxt = dr.inf
         if static is not None:
-            ground = static.scene.ray_intersect_preliminary(ray)
+            ground = static.intersect(ray)
             hit = ground.is_valid()
             if self.grid is not None:
                 captured = dr.select(hit, self.grid.at(ray(dr.select(hit, ground.t, 0)), hit), 0)
@@ -134,7 +134,7 @@ class Reflectors:
         dr.eval(captured)
         if dynamic is None:
             return captured, captured, distance
-        near = dynamic.scene.ray_intersect_preliminary(ray)
+        near = dynamic.intersect(ray)
         colour = dr.select(near.is_valid(), 0, captured)
         thing = near.is_valid()
         if self.emitters.sky is not None:  # indoors, the sky represents the light that walls reflect
@@ -188,7 +188,7 @@ class Reflectors:
         shadow, shaded = _shadow_ray(origin, direction, reach), total > 0
         dr.eval(shadow, key, shaded, sky)
         shaded &= self._occluded(shadow, mi.UInt32(0), key, shaded, self.proxies.shadow_casters)
-        wall = static.scene.ray_intersect_preliminary(shadow, active=shaded)
+        wall = static.intersect(shadow, shaded)
         blocked = shaded & wall.is_valid()
         shadow.maxt = dr.select(blocked, wall.t, shadow.maxt)
         dr.eval(shadow, blocked, shaded)

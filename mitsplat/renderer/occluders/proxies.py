@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Protocol
 
 import drjit as dr
@@ -29,6 +29,12 @@ from mitsplat.renderer.rays.device_arrays import ray_scene, wrapped
 NOISE_CREASE = 10.0
 """Dihedral angle of a crease over the lower quartile of a mesh's dihedral angles. The quartile is zero for CAD meshes,
 whose flat faces have interior edges, and 2 to 8 degrees for reconstructed smooth surfaces.
+"""
+
+OPEN_EDGED_RAYS = 2
+"""Rays per triangle above which reflected light is traced in a second scene without watertight edges.
+
+Embree prepares this scene in the time that about 30 rays per triangle save. It serves all frames of a layout.
 """
 
 SHARPEST = np.radians(80.0)
@@ -238,6 +244,25 @@ class TraceScene:
         if self.materials is None:
             return SurfaceMaterial(mi.Color3f(0), mi.Float(0), mi.Float(1), mi.Float(0))
         return self.materials.at(triangle, uv, active)
+
+    def intersect(self, ray: mi.Ray3f, active: mi.Bool = True) -> mi.PreliminaryIntersection3f:
+        """Return the first hits of rays that collect reflected light; single rays may pass between two triangles."""
+        many = dr.width(ray.d) > OPEN_EDGED_RAYS * self._primitives
+        return (self._open_edged if many else self.scene).ray_intersect_preliminary(ray, active=active)
+
+    @cached_property
+    def _primitives(self) -> int:
+        return sum(shape.primitive_count() for shape in self.scene.shapes())
+
+    @cached_property
+    def _open_edged(self) -> mi.Scene:
+        """The same shapes without watertight edges, which Embree intersects in three quarters of the time.
+
+        OptiX is always watertight.
+        """
+        if dr.backend_v(mi.Float) == dr.JitBackend.CUDA:
+            return self.scene
+        return ray_scene({f"shape_{i}": shape for i, shape in enumerate(self.scene.shapes())}, watertight=False)
 
     def normal_at(self, triangle: mi.UInt32, active: mi.Bool) -> mi.Normal3f:
         """Return the unit normals of proxy triangles."""

@@ -59,12 +59,12 @@ def gathered(columns: Columns, index: mi.UInt32) -> Columns:
     return type(columns)(*[v if dr.width(v) == 1 else dr.gather(type(v), v, index) for v in values])
 
 
-def ray_scene(contents: Mapping[str, mi.Shape]) -> mi.Scene:
+def ray_scene(contents: Mapping[str, mi.Shape], *, watertight: bool = True) -> mi.Scene:
     """Load a Mitsuba scene of ``contents`` (shapes, lights and others) with watertight triangle edges.
 
     By default Embree misses rays on an edge that two triangles share; OptiX does not.
     """
-    return mi.load_dict({"type": "scene", "embree_use_robust_intersections": True, **contents}, parallel=False)
+    return mi.load_dict({"type": "scene", "embree_use_robust_intersections": watertight, **contents}, parallel=False)
 
 
 def plain_mesh(mesh: trimesh.Trimesh, properties: mi.Properties | None = None) -> mi.Mesh:

@@ -19,7 +19,7 @@ LAYERS = (
     ("audit", "checks", "surroundings", "view"),
     ("dataset", "importing"),
     ("bake", "formats", "reconstruct"),
-    ("fit", "frames"),
+    ("fit", "frames", "reconstruct.materials"),
     ("renderer",),
     ("plugins",),
     ("renderer.composition",),

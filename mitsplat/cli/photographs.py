@@ -355,6 +355,13 @@ def asset(
     remove: Remove = None,
     metallic: Metallic = None,
     roughness: Roughness = None,
+    lights: Annotated[
+        Path | None,
+        typer.Option(
+            help="Lights of the photos in the frame of the capture, a file by `mitsplat lights`: the materials of the "
+            "object are estimated."
+        ),
+    ] = None,
     device: DeviceName = "cpu",
 ) -> None:
     """Make an asset from PHOTOS.
@@ -365,6 +372,7 @@ def asset(
     asset folder then drops objects on the surface at which the photos are directed. The exit status is 4 if a quality
     threshold is missed.
     """
+    from mitsplat.reconstruct.materials.estimation import CaptureLight
     from mitsplat.reconstruct.pipeline.asset_pipeline import asset_from_photos, default_fit
     from mitsplat.reconstruct.reconstruct import AssetJob, ReconstructSettings
 
@@ -373,6 +381,7 @@ def asset(
         class_name=class_name,
         kind=kind,
         settings=ReconstructSettings(size=size),
+        light=None if lights is None else CaptureLight.load(lights),
         remove=tuple(remove or ()),
         material=uniform_material(metallic, roughness),
     )

@@ -20,6 +20,7 @@ from mitsplat.progress import Progress
 from mitsplat.reconstruct.asset_evaluation import HeldOutView, Verdict, compute_verdict, show_held_out
 from mitsplat.reconstruct.causes import find_causes
 from mitsplat.reconstruct.fallback_proxy import find_proxy_surface
+from mitsplat.reconstruct.materials.estimation import CaptureLight
 from mitsplat.reconstruct.registration import Alignment, register_mesh, surface_points
 from mitsplat.reconstruct.segment_splats import Isolation, MaskedView, isolate_object
 from mitsplat.reconstruct.silhouette_refinement import MeshRefineSettings, RefinedMesh, refine_mesh
@@ -83,10 +84,11 @@ class AssetJob:
         remove: Things to remove from an environment, PHOTO:X,Y in pixels of the capture's photos.
         material: Parameters of the one material that the asset gets, see :meth:`mitsplat.Splats.with_material`; None
             keeps the captured colours.
+        light: Light of the photographs, from which the materials of an object are estimated; None if it is unknown.
 
     Raises:
-        InputError: If refinement is requested for a mesh that is not reconstructed from masks, or ``remove`` is used
-            with an object or an imported mesh.
+        InputError: If refinement is requested for a mesh that is not reconstructed from masks, ``remove`` is used
+            with an object or an imported mesh, or ``light`` with an environment, a material or a size.
     """
 
     name: str
@@ -96,6 +98,7 @@ class AssetJob:
     imported: ImportedMesh | None = None
     remove: tuple[str, ...] = ()
     material: Mapping[str, float] | None = None
+    light: CaptureLight | None = None
 
     def __post_init__(self) -> None:
         if self.settings.refine is not None and (self.kind != "object" or self.imported is not None):
@@ -104,6 +107,13 @@ class AssetJob:
             raise InputError("things can be removed only from an environment: use --kind environment, or omit --remove")
         if self.remove and self.imported is not None:
             raise InputError("things cannot be removed from an imported mesh: omit one of the two")
+        if self.light is not None:
+            if self.kind != "object":
+                raise InputError(f"materials are estimated for objects only: omit the lights (got kind {self.kind})")
+            if self.material is not None:
+                raise InputError("lights and a given material both define the materials: omit one of the two")
+            if self.settings.size is not None:
+                raise InputError("lights need a capture in metres: omit the lights, or give the scale by a board")
 
 
 @dataclass(frozen=True, eq=False)

@@ -173,11 +173,24 @@ def test_asset_passes_every_option_on(
     assert (photos, out, job.name, job.class_name) == (Path("photos"), tmp_path / "mug", "mug", "cup")
     assert (job.kind, job.settings) == (kind, ReconstructSettings(size=0.1))
     assert job.material == {"metallic": 1.0, "roughness": 0.3}
+    assert job.light is None
     assert run("asset", "photos", "-o", tmp_path / "mug", "--roughness", 2) == 2
     assert calls.kwargs["capture"] == CaptureSettings(
         kind=kind, scale_from=("a.jpg", "b.jpg", 0.5), poses=Path("model"), masks=Path("masks")
     )
     assert calls.kwargs["fit"] == FitSettings(gaussians=gaussians, budget=90.0)
+
+
+def test_asset_reads_the_lights_of_the_photos(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    calls, lights = Calls(finished(tmp_path)), tmp_path / "lamps.yaml"
+    monkeypatch.setattr(pipeline, "asset_from_photos", calls)
+    lights.write_text("lights: [{kind: environment, radiance: 2}]")
+    assert run("asset", "photos", "-o", tmp_path / "mug", "--lights", lights) == 0
+    assert [light.radiance for light in calls.args[2].light.lights] == [2]
+    assert run("asset", "photos", "-o", tmp_path / "mug", "--lights", lights, "--metallic", 1) == 2
+    assert "lights and a given material both define the materials: omit one of the two" in capsys.readouterr().err
 
 
 def test_a_log_has_stages_and_the_remaining_time(

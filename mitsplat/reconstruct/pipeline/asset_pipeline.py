@@ -25,6 +25,12 @@ from mitsplat.pages.html import REPORT_FILE
 from mitsplat.progress import Progress
 from mitsplat.reconstruct.asset_evaluation import VERDICT_FILE, Verdict
 from mitsplat.reconstruct.asset_report import write_asset_report
+from mitsplat.reconstruct.materials.estimation import (
+    MIN_CONFIDENCE,
+    CaptureLight,
+    estimate_materials,
+    require_light_frame,
+)
 from mitsplat.reconstruct.reconstruct import AssetJob, Reconstruction, reconstruct_asset
 from mitsplat.storage.content_hash import ContentHash, file_hash
 from mitsplat.storage.files import write_text
@@ -82,6 +88,8 @@ def asset_from_photos(
     """
     fit = fit or default_fit(job.kind)
     taken = capture_photos(photos, out / "capture", capture or CaptureSettings(kind=job.kind), progress=progress)
+    if job.light is not None:
+        require_light_frame(taken.capture)
 
     def fitting(now: FitProgress) -> None:
         if progress is not None:
@@ -120,8 +128,11 @@ def make_asset(
         progress: Progress callback.
 
     Raises:
-        InputError: If a file is missing or damaged, or an object has no masks.
+        InputError: If a file is missing or damaged, an object has no masks, or lights are given for a capture without a
+            metric frame.
     """
+    if job.light is not None:
+        require_light_frame(capture)
     splat_file, psnr = read_fit(fit)
     inputs = _input_hash(capture, splat_file, job)
     earlier_scene = recorded_scene(out)
@@ -132,6 +143,8 @@ def make_asset(
         splats = Splats.load(splat_file)
         if job.kind == "object":
             result = reconstruct_asset(capture, splats, job, psnr=psnr, progress=progress)
+            if job.light is not None:
+                result = _with_estimated_materials(result, capture, job.light, progress)
         else:
             result = reconstruct_environment(capture, splats, job, psnr=psnr, source=source, progress=progress)
         (out / VERDICT_FILE).unlink(missing_ok=True)
@@ -149,6 +162,27 @@ def make_asset(
         done = AssetResult(out, result.verdict, kept=False, warnings=warnings)
     scene, warning = write_scene(out, earlier_scene)
     return replace(done, scene=scene, warnings=done.warnings if warning is None else (*done.warnings, warning))
+
+
+def _with_estimated_materials(
+    result: Reconstruction, capture: Capture, light: CaptureLight, progress: Progress | None
+) -> Reconstruction:
+    """Return the asset with the materials that its photographs show, or unchanged if their confidence is low."""
+    if progress is not None:
+        progress(0, 1, "estimating materials")
+    asset = result.asset
+    if asset.mesh is None:
+        return result
+    found = estimate_materials(capture, asset.mesh, light)
+    rows = {f"Material {number}": str(region) for number, region in enumerate(found.regions, start=1)}
+    if found.confidence >= MIN_CONFIDENCE:
+        result = replace(result, asset=replace(asset, splats=found.apply(asset.splats)))
+    else:
+        rows["Materials"] = (
+            f"not used, and the captured colours are kept: the confidence is {found.confidence:.2f} (at least "
+            f"{MIN_CONFIDENCE:g} is required); check whether the lights are those of the photos"
+        )
+    return replace(result, verdict=replace(result.verdict, rows={**result.verdict.rows, **rows}))
 
 
 def read_fit(path: Path) -> tuple[Path, float | None]:
@@ -228,6 +262,8 @@ def _input_hash(capture: Capture, splats: Path, job: AssetJob) -> str:
     digest.add_json(
         [__version__, job.name, job.class_name, job.kind, asdict(job.settings), imported, job.remove, job.material]
     )
+    if job.light is not None:
+        digest.add_json(job.light.content())
     digest.add_file(splats)
     return digest.hexdigest()
 

@@ -1,0 +1,505 @@
+"""Estimation of the materials of a photographed object whose light is known.
+
+The radiance of a surface is linear in its base colour (:mod:`mitsplat.renderer.materials.principled`). For each pair of
+metalness and roughness, the base colour of every surface point follows from the photographs that show the point. Points
+of similar colour form regions, and each region takes the pair whose radiance fits its photographs best.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, NamedTuple
+
+import cv2
+import mitsuba as mi
+import numpy as np
+import trimesh
+from pydantic import Field
+from scipy.cluster.vq import kmeans2
+from scipy.ndimage import binary_dilation, binary_erosion
+from scipy.optimize import minimize
+from scipy.spatial import KDTree
+
+from mitsplat.arrays import BoolArray, Float32Array, Float64Array, Int64Array
+from mitsplat.capture.capture import Capture, Photo, known_where
+from mitsplat.errors import InputError
+from mitsplat.gaussians.spherical_harmonics import SH_C0
+from mitsplat.gaussians.splat_cloud import Splats
+from mitsplat.gaussians.splat_materials import SplatMaterials
+from mitsplat.geometry.camera import Camera
+from mitsplat.geometry.mesh_normals import corner_normals
+from mitsplat.images.colour import decode_srgb, encode_srgb
+from mitsplat.reconstruct.materials.surface_light import LitMesh, Reflectance
+from mitsplat.renderer.scene_emitters import emitter_dict
+from mitsplat.runtime.variant import ensure_variant
+from mitsplat.scene.spec.light_spec import LightSpec
+from mitsplat.storage.content_hash import file_hash
+from mitsplat.storage.field_types import StrictModel
+from mitsplat.storage.files import resolve_inside
+from mitsplat.storage.yaml_input import load_yaml
+
+MIN_CONFIDENCE = 0.1
+"""Least confidence at which an asset gets estimated materials."""
+
+_METALLIC = np.linspace(0, 1, 5)
+_ROUGHNESS = np.array([0.15, 0.25, 0.3, 0.35, 0.4, 0.5, 0.6, 0.8])
+"""Grid of the search, which a local search refines."""
+_POINTS, _FIT_POINTS = 4000, 1000
+"""Number of surface points with a base colour, and of those that determine metalness and roughness."""
+_CLUSTERS = 6
+_MERGE_LOSS = 0.1
+"""Relative increase of the errors of two clusters up to which they become one region."""
+_MIN_SHARE = 0.03
+"""Share of the points below which a cluster is merged with another."""
+_MIN_VIEWS = 4
+_MIN_COSINE = 0.2
+"""Least cosine between normal and camera of an observation."""
+_CLIPPED = 0.97
+"""Linear radiance from which a pixel may be clipped."""
+_MIN_OPENNESS, _MIN_FLATNESS = 0.9, 0.97
+"""Limits of clear points: share of the hemisphere without the object, and mean cosine of the normals in two pixels."""
+_NOISE = 0.1, 0.01
+"""Standard error of radiance: relative, and absolute."""
+_GRID, _REACH = 41, 2.0
+"""Vertices along the edge of the support, and half of this edge in diagonals of the object."""
+
+
+class _LightFile(StrictModel):
+    """Lights of a file by ``mitsplat lights``."""
+
+    lights: tuple[Annotated[LightSpec, Field(discriminator="kind")], ...] = Field(min_length=1)
+
+
+@dataclass(frozen=True)
+class CaptureLight:
+    """Lights of photographs, in the frame of their capture. White in the photographs is the radiance 1.
+
+    Attributes:
+        lights: The lights.
+        folder: Folder of the images that they name.
+
+    Raises:
+        InputError: If a light is random or moves, or an image is missing.
+    """
+
+    lights: tuple[LightSpec, ...]
+    folder: Path = Path()
+
+    def __post_init__(self) -> None:
+        for light in self.lights:
+            if any(getattr(light, name, None) for name in ("draw", "path", "pool")):
+                raise InputError("the lights of photographs must be fixed: remove draw, path and pool")
+            image = getattr(light, "image", None)
+            if image is not None and not (self.folder / image).is_file():
+                raise InputError(f"{self.folder / image}: no such image")
+
+    @classmethod
+    def load(cls, path: Path) -> CaptureLight:
+        """Read the key ``lights`` of a file, as ``mitsplat lights`` writes it.
+
+        Raises:
+            InputError: If the file cannot be read or breaks a rule.
+        """
+        lights = load_yaml(path, _LightFile).lights
+        try:
+            for light in lights:
+                if image := getattr(light, "image", None):
+                    resolve_inside(path.parent, image)
+            return cls(lights, path.parent)
+        except InputError as error:
+            raise InputError(f"{path}: {error}") from None
+
+    def scene(self) -> mi.Scene:
+        """Return a Mitsuba scene of the lights."""
+        emitters = {f"light_{number}": emitter_dict(light, self.folder) for number, light in enumerate(self.lights)}
+        return mi.load_dict({"type": "scene", **emitters})
+
+    def content(self) -> list[object]:
+        """Return the values and the hashes of the images, for the hash of the inputs."""
+        images = [image for light in self.lights if (image := getattr(light, "image", None))]
+        hashes = [file_hash(self.folder / image) for image in images]
+        return [*(light.model_dump(mode="json") for light in self.lights), *hashes]
+
+
+@dataclass(frozen=True)
+class Region:
+    """Surface of one material.
+
+    Attributes:
+        colour: Mean base colour, linear RGB.
+        metallic, roughness: Parameters of ``principled``.
+        confidence: Relative difference between the errors of the best metal and of the best dielectric, 0 to 1.
+        share: Share of the observed surface points.
+    """
+
+    colour: tuple[float, float, float]
+    metallic: float
+    roughness: float
+    confidence: float
+    share: float
+
+    def __str__(self) -> str:
+        colour = "".join(f"{round(255 * value):02x}" for value in encode_srgb(np.clip(self.colour, 0, 1)))
+        return (
+            f"base colour #{colour}, metallic {self.metallic:.2f}, roughness {self.roughness:.2f}, "
+            f"confidence {self.confidence:.2f}, {self.share:.0%} of the surface"
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class MaterialEstimate:
+    """Estimated materials of an object.
+
+    Attributes:
+        regions: Regions by decreasing share.
+        points: Surface points, shape (N, 3).
+        colours: Linear base colours of the points, (N, 3).
+        region: Index of the region of each point, (N,).
+    """
+
+    regions: tuple[Region, ...]
+    points: Float64Array
+    colours: Float64Array
+    region: Int64Array
+
+    @property
+    def confidence(self) -> float:
+        """Mean confidence of the surface."""
+        return sum(region.share * region.confidence for region in self.regions)
+
+    def apply(self, splats: Splats) -> Splats:
+        """Return the splats with these materials; each Gaussian gets the base colour of the nearest points."""
+        distance, nearest = KDTree(self.points).query(splats.means, k=min(3, len(self.points)))
+        distance, nearest = distance.reshape(len(splats), -1), nearest.reshape(len(splats), -1)
+        same = self.region[nearest] == self.region[nearest[:, :1]]
+        weight = same / np.maximum(distance, 1e-12)
+        weight /= weight.sum(axis=1, keepdims=True)
+        colours = encode_srgb(np.einsum("nk,nkc->nc", weight, self.colours[nearest]))
+        table = np.array([(region.metallic, region.roughness) for region in self.regions])
+        metallic, roughness = table[self.region[nearest[:, 0]]].T.astype(np.float32)
+        materials = SplatMaterials(metallic, roughness, np.full(len(splats), 0.5, dtype=np.float32))
+        return replace(splats, sh=((colours[:, None] - 0.5) / SH_C0).astype(np.float32), materials=materials)
+
+
+class _View(NamedTuple):
+    """Linear radiance of a photo, and its pixels that show only the object, or only other things."""
+
+    camera: Camera
+    radiance: Float32Array
+    object: BoolArray
+    surroundings: BoolArray
+
+    @classmethod
+    def of(cls, photo: Photo, size: int) -> _View:
+        camera, rgb, mask, hidden = photo.fitted(size)
+        known = known_where(hidden, camera)
+        inside = np.zeros(known.shape, dtype=bool) if mask is None else mask > 0.5
+        outside = known & ~binary_dilation(inside, iterations=2)
+        return cls(camera, decode_srgb(rgb).astype(np.float32), known & binary_erosion(inside), outside)
+
+
+class _Observations(NamedTuple):
+    """Observations of points, sorted by point.
+
+    Attributes:
+        point: Index of the point, (R,).
+        radiance: Linear radiance, at least 1 if a pixel may be clipped, (R, 3).
+        to_camera: Unit vectors towards the camera, (R, 3).
+    """
+
+    point: Int64Array
+    radiance: Float64Array
+    to_camera: Float64Array
+
+    def select(self, points: Int64Array) -> tuple[_Observations, BoolArray]:
+        """Return the observations of sorted ``points``, renumbered, and the mask (R,) of these observations."""
+        rows = np.isin(self.point, points)
+        return _Observations(np.searchsorted(points, self.point[rows]), self.radiance[rows], self.to_camera[rows]), rows
+
+
+class _Fit(NamedTuple):
+    """Base colours (P, 3), robust mean errors (P,), and the weights (P,) of the base colours in the data."""
+
+    colours: Float64Array
+    errors: Float64Array
+    weights: Float64Array
+
+
+def require_light_frame(capture: Capture) -> None:
+    """Raise InputError if lights have no place in the frame of a capture."""
+    if capture.units != "metre" or capture.up != "z":
+        raise InputError(
+            "lights need a capture in metres with z up, such as one with a board or tags "
+            f"(got units {capture.units}, up {capture.up})"
+        )
+
+
+def estimate_materials(
+    capture: Capture, mesh: trimesh.Trimesh, light: CaptureLight, *, size: int = 640, seed: int = 0
+) -> MaterialEstimate:
+    """Estimate the materials of an object from its photographs.
+
+    Args:
+        capture: Photos with masks, in metres, z up.
+        mesh: Surface of the object in the frame of the capture.
+        light: Light of the photographs.
+        size: Longest edge of the photos [px].
+        seed: Seed of the surface points and the rays.
+
+    Raises:
+        InputError: If the capture has no metric frame, or too few photos show the object.
+    """
+    ensure_variant()
+    require_light_frame(capture)
+    views = [_View.of(photo, size) for photo in capture.photos if photo.mask is not None]
+    surfaces = _lit_surfaces(mesh, views, light, floor=0.0 if capture.table else float(mesh.bounds[0, 2]))
+    rng = np.random.default_rng(seed)
+    points, normals = _sample_surface(mesh, _POINTS, seed)
+    seen = _observe(surfaces, points, normals, views, "object")
+    counts = np.bincount(seen.point, minlength=len(points))
+    usable = np.flatnonzero(counts >= _MIN_VIEWS)
+    if len(usable) < _CLUSTERS:
+        raise InputError(
+            f"materials need surface points that {_MIN_VIEWS} photos show (got {len(usable)}): check masks and light"
+        )
+    clear = _clear_points(mesh, surfaces, points, normals, views, seed)
+    fitted = np.sort(rng.permutation(usable)[:_FIT_POINTS])
+    observed, _ = seen.select(fitted)
+    traced = _trace(surfaces, points[fitted], normals[fitted], observed, _ROUGHNESS, seed)
+    fits = [[_fit_colours(observed, _mix(traced, m, k)) for k in range(len(_ROUGHNESS))] for m in _METALLIC]
+    errors = np.stack([np.stack([fit.errors for fit in row], axis=1) for row in fits], axis=1)
+
+    def fit_points(own: Int64Array, metallic: float, roughness: float) -> _Fit:
+        observed, _ = seen.select(own)
+        traced = _trace(surfaces, points[own], normals[own], observed, np.array([roughness]), seed)
+        return _fit_colours(observed, _mix(traced, metallic, 0))
+
+    best = np.unravel_index(errors.mean(axis=0).argmin(), errors.shape[1:])
+    colours = encode_srgb(fit_points(usable, float(_METALLIC[best[0]]), float(_ROUGHNESS[best[1]])).colours)
+    near = KDTree(points[usable]).query(points[usable], k=min(8, len(usable)))[1]
+    _, cluster = kmeans2(np.median(colours[near], axis=1), _CLUSTERS, minit="++", seed=0)
+    merged = _merge(cluster[np.searchsorted(usable, fitted)], errors, clear[fitted])
+    cluster = merged[cluster]
+    share = np.bincount(cluster, minlength=int(merged.max()) + 1) / len(cluster)
+    cluster = np.argsort(np.argsort(-share, kind="stable"))[cluster]
+    region = cluster[KDTree(points[usable]).query(points)[1]]
+    regions, colours = [], np.empty((len(points), 3))
+    for number, part in enumerate(np.sort(share)[::-1]):
+        members = _members(region[fitted], number, clear[fitted])
+        regions.append(_region(members, errors, observed, traced, float(part)))
+        found = regions[-1]
+        colours[region == number] = found.colour
+        own = usable[cluster == number]
+        fit = fit_points(own, found.metallic, found.roughness)
+        # Points that few or unsuitable photos show get the colour of their region.
+        prior = np.median(fit.weights, axis=0) * np.where(clear[own], 0.1, 1.0)[:, None]
+        colours[own] = (fit.weights * fit.colours + prior * found.colour) / (fit.weights + prior)
+    return MaterialEstimate(tuple(regions), points, colours, region)
+
+
+def _sample_surface(mesh: trimesh.Trimesh, count: int, seed: int) -> tuple[Float64Array, Float64Array]:
+    """Return random points (N, 3) on a mesh and their smooth unit normals (N, 3)."""
+    points, faces = trimesh.sample.sample_surface(mesh, count, seed=seed)
+    points = np.asarray(points)
+    barycentric = np.nan_to_num(trimesh.triangles.points_to_barycentric(mesh.triangles[faces], points), nan=1 / 3)
+    normals = np.einsum("nk,nkd->nd", barycentric, corner_normals(mesh)[faces])
+    return points, normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+
+
+def _lit_surfaces(mesh: trimesh.Trimesh, views: Sequence[_View], light: CaptureLight, floor: float) -> LitMesh:
+    """Return the object and its support, a plane at height ``floor``, with their mean radiance in the photos."""
+    fine = trimesh.Trimesh(mesh.vertices, mesh.faces).subdivide_to_size(float(mesh.scale) / 25, max_iter=20)
+    centre, line = mesh.bounds.mean(axis=0), np.linspace(-_REACH, _REACH, _GRID) * float(mesh.scale)
+    x, y = np.meshgrid(line + centre[0], line + centre[1])
+    plane = np.stack([x.ravel(), y.ravel(), np.full(x.size, floor)], axis=1)
+    corner = np.arange(_GRID * (_GRID - 1)).reshape(-1, _GRID)[:, :-1].ravel()
+    faces = np.concatenate(
+        [
+            np.stack([corner, corner + 1, corner + _GRID + 1], axis=1),
+            np.stack([corner, corner + _GRID + 1, corner + _GRID], axis=1),
+        ]
+    )
+    whole = trimesh.Trimesh(
+        np.concatenate([fine.vertices, plane]), np.concatenate([fine.faces, faces + len(fine.vertices)]), process=False
+    )
+    surfaces = LitMesh(whole, len(fine.faces), light.scene(), centre.tolist())
+    upward = np.tile([0.0, 0.0, 1.0], (len(plane), 1))
+    normals = np.asarray(fine.vertex_normals)
+    radiance = [
+        _mean_radiance(points, _observe(surfaces, points, towards, views, shown))
+        for points, towards, shown in ((fine.vertices, normals, "object"), (plane, upward, "surroundings"))
+    ]
+    surfaces.set_radiance(np.concatenate(radiance))
+    return surfaces
+
+
+def _mean_radiance(points: Float64Array, seen: _Observations) -> Float64Array:
+    """Return the mean observed radiance of points (N, 3); that of the nearest observed point if there is none."""
+    counts = np.bincount(seen.point, minlength=len(points))
+    sums = np.stack([np.bincount(seen.point, seen.radiance[:, c], len(points)) for c in range(3)], axis=1)
+    known = counts > 0
+    if not known.any():
+        return np.zeros((len(points), 3))
+    means = sums[known] / counts[known, None]
+    return np.asarray(means[KDTree(points[known]).query(points)[1]])
+
+
+def _observe(
+    surfaces: LitMesh, points: Float64Array, normals: Float64Array, views: Sequence[_View], shown: str
+) -> _Observations:
+    """Return the observations of points (N, 3) in the pixels that show ``object`` or ``surroundings``."""
+    found = []
+    for view in views:
+        to_camera = view.camera.centre - points
+        to_camera /= np.linalg.norm(to_camera, axis=1, keepdims=True)
+        pixels, _ = view.camera.project(points)
+        inside = ((pixels >= 1) & (pixels <= (view.camera.width - 1, view.camera.height - 1))).all(axis=1)
+        rows = np.flatnonzero(inside & (np.einsum("nd,nd->n", normals, to_camera) > _MIN_COSINE))
+        whole = cv2.erode(getattr(view, shown).astype(np.uint8), np.ones((2, 2), np.uint8), anchor=(0, 0))
+        column, line = np.floor(pixels[rows] - 0.5).astype(int).T
+        rows = rows[whole[line, column] > 0]
+        rows = rows[surfaces.unoccluded(points[rows], normals[rows], view.camera.centre)] if len(rows) else rows
+        if not len(rows):
+            continue
+        x, y = (pixels[rows].T[..., None] - 0.5).astype(np.float32)
+        radiance = np.asarray(cv2.remap(view.radiance, x, y, cv2.INTER_LINEAR))[:, 0]
+        bright = cv2.dilate((view.radiance >= _CLIPPED).astype(np.float32), np.ones((3, 3)))
+        clipped = np.asarray(cv2.remap(np.asarray(bright), x, y, cv2.INTER_NEAREST))[:, 0] > 0
+        found.append((rows, np.where(clipped, np.maximum(radiance, 1), radiance), to_camera[rows]))
+    if not found:
+        return _Observations(np.zeros(0, dtype=np.int64), np.zeros((0, 3)), np.zeros((0, 3)))
+    point, radiance, to_camera = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    order = np.argsort(point, kind="stable")
+    return _Observations(point[order], radiance[order].astype(np.float64), to_camera[order])
+
+
+def _clear_points(
+    mesh: trimesh.Trimesh,
+    surfaces: LitMesh,
+    points: Float64Array,
+    normals: Float64Array,
+    views: Sequence[_View],
+    seed: int,
+) -> BoolArray:
+    """Return True for points (N,) that mirror little of the object itself, and that are flat within two pixels."""
+    camera = views[0].camera
+    pixel = float(np.linalg.norm(camera.centre - mesh.bounds.mean(axis=0))) / camera.fx
+    others, their_normals = _sample_surface(mesh, 10 * len(points), seed + 1)
+    near = KDTree(others).query_ball_point(points, 2 * pixel)
+    flatness = np.array([normals[i] @ their_normals[rows].mean(axis=0) if rows else 1 for i, rows in enumerate(near)])
+    clear = (flatness > _MIN_FLATNESS) & (surfaces.openness(points, normals) > _MIN_OPENNESS)
+    return np.asarray(clear)
+
+
+def _trace(
+    surfaces: LitMesh,
+    points: Float64Array,
+    normals: Float64Array,
+    seen: _Observations,
+    roughness: Float64Array,
+    seed: int,
+) -> Reflectance:
+    light = surfaces.light(points, normals)
+    return surfaces.reflectance(light, seen.point, seen.to_camera, roughness.tolist(), seed)
+
+
+def _mix(traced: Reflectance, metallic: float, place: float) -> tuple[Float64Array, Float64Array]:
+    """Return tint and white part (R, 3) of a material; ``place`` is that of its roughness in the grid."""
+    low = min(int(place), traced.tint.shape[1] - 1)
+    high, share = min(low + 1, traced.tint.shape[1] - 1), place - low
+
+    def at(values: Float32Array) -> Float64Array:
+        return np.asarray((1 - share) * values[:, low].astype(np.float64) + share * values[:, high])
+
+    tint = (1 - metallic) * at(traced.diffuse) + metallic * at(traced.tint)
+    return tint, metallic * at(traced.metal) + (1 - metallic) * at(traced.dielectric)
+
+
+def _fit_colours(seen: _Observations, material: tuple[Float64Array, Float64Array], rounds: int = 4) -> _Fit:
+    """Fit the base colour of every point by iteratively reweighted least squares with Cauchy's loss."""
+    tint, white = material
+    starts = np.flatnonzero(np.diff(seen.point, prepend=-1))
+    counts = np.diff(starts, append=len(seen.point))
+    clipped = seen.radiance >= _CLIPPED
+    precision = 1 / (_NOISE[0] * seen.radiance + _NOISE[1]) ** 2
+    weight = precision * ~clipped
+    for _ in range(rounds):
+        sums = np.add.reduceat(weight * tint**2, starts)
+        colours = np.clip(np.add.reduceat(weight * tint * (seen.radiance - white), starts) / (sums + 1e-9), 0, 1)
+        excess = np.repeat(colours, counts, axis=0) * tint + white - seen.radiance
+        # A clipped pixel limits the radiance from below only.
+        square = np.where(clipped & (excess > 0), 0, excess**2 * precision)
+        weight = precision * ~(clipped & (excess > 0)) / (1 + square)
+    errors = np.add.reduceat(np.log1p(square).mean(axis=1), starts) / counts
+    return _Fit(colours, errors, sums)
+
+
+def _members(cluster: Int64Array, number: int, clear: BoolArray) -> Int64Array:
+    """Return the clear points of a cluster, or all if there are few."""
+    own = np.flatnonzero(cluster == number)
+    suitable = own[clear[own]]
+    return suitable if len(suitable) >= max(8, 0.1 * len(own)) else own
+
+
+def _merge(cluster: Int64Array, errors: Float64Array, clear: BoolArray) -> Int64Array:
+    """Return the region of each cluster.
+
+    Clusters that one material explains almost as well are merged, and so are small ones. Clusters without points are in
+    region 0.
+    """
+    names, own = np.unique(cluster, return_inverse=True)
+    region = np.arange(len(names))
+    while (count := int(region.max()) + 1) > 1:
+        members = [_members(region[own], number, clear) for number in range(count)]
+        sizes, means = np.bincount(region[own]), np.array([errors[rows].mean(axis=0) for rows in members])
+        increase = means / np.maximum(means.min(axis=(1, 2), keepdims=True), 1e-3) - 1
+        pairs = [(i, j) for i in range(count) for j in range(i)]
+        loss = [float(np.maximum(increase[i], increase[j]).min()) for i, j in pairs]
+        small = set(np.flatnonzero(sizes < _MIN_SHARE * len(own)).tolist())
+        choices = [k for k, pair in enumerate(pairs) if not small or small.intersection(pair)]
+        chosen = min(choices, key=lambda k: loss[k])
+        if loss[chosen] > _MERGE_LOSS and not small:
+            break
+        i, j = pairs[chosen]
+        region = np.where(region == i, j, region)
+        region = np.where(region > i, region - 1, region)
+    found = np.zeros(_CLUSTERS, dtype=np.int64)
+    found[names] = region
+    return found
+
+
+def _region(rows: Int64Array, errors: Float64Array, seen: _Observations, traced: Reflectance, share: float) -> Region:
+    """Return the material of the points ``rows``."""
+    table = errors[rows].mean(axis=0)
+    start = np.unravel_index(table.argmin(), table.shape)
+    observed, mask = seen.select(rows)
+    own = Reflectance(*[getattr(traced, name)[mask] for name in ("diffuse", "tint", "metal", "dielectric")])
+
+    def error(values: Float64Array) -> float:
+        return float(_fit_colours(observed, _mix(own, values[0], values[1])).errors.mean())
+
+    limits = [(0.0, 1.0), (0.0, len(_ROUGHNESS) - 1.0)]
+    initial = np.array([_METALLIC[start[0]], start[1]], dtype=np.float64)
+    simplex = np.clip(initial + np.array([(0, 0), (0.1, 0), (0, 0.6)]), 0, [1, len(_ROUGHNESS) - 1])
+    simplex[1, 0] = initial[0] - 0.1 if initial[0] >= 0.95 else simplex[1, 0]
+    simplex[2, 1] = initial[1] - 0.6 if initial[1] > limits[1][1] - 0.6 else simplex[2, 1]
+    found = minimize(
+        error,
+        initial,
+        method="Nelder-Mead",
+        bounds=limits,
+        options={"initial_simplex": simplex, "xatol": 0.02, "fatol": 1e-5, "maxfev": 40},
+    )
+    metallic, place = found.x
+    fit = _fit_colours(observed, _mix(own, metallic, place))
+    metal = _METALLIC >= 0.5
+    other = table[~metal if metallic >= 0.5 else metal].min()
+    return Region(
+        colour=tuple(np.median(fit.colours, axis=0).tolist()),
+        metallic=float(metallic),
+        roughness=float(np.interp(place, np.arange(len(_ROUGHNESS)), _ROUGHNESS)),
+        confidence=float(np.clip(1 - found.fun / max(other, 1e-9), 0, 1)),
+        share=share,
+    )

@@ -165,7 +165,9 @@ def test_lights_of_a_file_are_fixed_and_their_images_lie_beside_it(tmp_path: Pat
     file = tmp_path / "lamps.yaml"
     file.write_text("lights:\n  - {kind: area, position: [0, 0, 1], target: [0, 0, 0], radiance: 5}\n")
     assert [light.kind for light in CaptureLight.load(file).lights] == ["area"]
+    (tmp_path / "broken.exr").write_bytes(b"no image")
     for lines, message in (
+        ("lights: [{kind: environment, image: broken.exr}]", "lamps.yaml: .*broken.exr: not a readable image"),
         ("lights: []", "at least 1 item"),
         ("lights: [{kind: environment, image: sky.exr}]", "lamps.yaml: .*sky.exr"),
         ("lights: [{kind: environment, image: ../sky.exr}]", "lamps.yaml: must be a file inside"),

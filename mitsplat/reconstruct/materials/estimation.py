@@ -31,6 +31,7 @@ from mitsplat.gaussians.splat_materials import SplatMaterials
 from mitsplat.geometry.camera import Camera
 from mitsplat.geometry.mesh_normals import corner_normals
 from mitsplat.images.colour import decode_srgb, encode_srgb
+from mitsplat.images.untrusted_images import check_images
 from mitsplat.reconstruct.materials.surface_light import LitMesh, Reflectance
 from mitsplat.renderer.scene_emitters import emitter_dict
 from mitsplat.runtime.variant import ensure_variant
@@ -104,9 +105,9 @@ class CaptureLight:
         """
         lights = load_yaml(path, _LightFile).lights
         try:
-            for light in lights:
-                if image := getattr(light, "image", None):
-                    resolve_inside(path.parent, image)
+            images = [resolve_inside(path.parent, image) for one in lights if (image := getattr(one, "image", None))]
+            if reason := next(filter(None, check_images(images)), None):
+                raise InputError(reason)
             return cls(lights, path.parent)
         except InputError as error:
             raise InputError(f"{path}: {error}") from None

@@ -63,7 +63,10 @@ def _read_images(output: BinaryIO, _: bytes, *arguments: str) -> None:
     """Read images, each within the memory limit that follows its path, and write one line per image."""
     import mitsuba as mi  # imported only in the child process
 
+    from mitsplat.runtime.threads import ensure_threads  # imports Dr.Jit
+
     mi.set_variant("scalar_rgb")
+    ensure_threads()
     for path, limit in zip(arguments[::2], arguments[1::2], strict=True):
         limit_memory(int(limit))
         check_exr_header(Path(path))

@@ -20,11 +20,11 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
-import drjit as dr
 import mitsuba as mi
 
 from mitsplat.errors import InputError, LateDeviceError, MissingResourceError
 from mitsplat.runtime.gpu_memory import MIN_UNUSED_MEMORY, VISIBLE_GPUS, unused_gpu_memory
+from mitsplat.runtime.threads import MIN_THREADS, ensure_threads
 from mitsplat.runtime.variant import VARIANTS, choose_variant
 
 Kind = Literal["cpu", "cuda"]
@@ -111,17 +111,14 @@ def use_device(device: str | Device) -> Device:
 def use_shared_device(kind: Kind, threads: int | None = None) -> None:
     """Select a device like :func:`use_device`, in one of several processes that share its cores.
 
-    On a GPU, Dr.Jit's threads only build scenes. One thread does this in a tenth of the time of sixteen threads.
+    On a GPU, Dr.Jit's threads only build scenes. Few threads do this in a tenth of the time of sixteen threads.
 
     Args:
         kind: Kind of the device.
-        threads: Number of threads on a CPU; None for one per core.
+        threads: Number of threads on a CPU, at least MIN_THREADS; None for one per core.
     """
     use_device(kind)
-    if kind == "cuda":
-        threads = 1
-    if threads is not None:
-        dr.set_thread_count(threads)
+    ensure_threads(MIN_THREADS if kind == "cuda" else threads)
 
 
 def current_device() -> Device:

@@ -18,6 +18,7 @@ from mitsplat.errors import InputError
 from mitsplat.runtime.dropped_rays import record_dropped_rays
 from mitsplat.runtime.llvm import check_llvm
 from mitsplat.runtime.plugin_registration import register_plugins
+from mitsplat.runtime.threads import ensure_threads
 
 VARIANTS = ("llvm_ad_rgb", "cuda_ad_rgb")
 """Variants in which the plugins run; the first is the default."""
@@ -29,7 +30,7 @@ Result = TypeVar("Result")
 
 
 def ensure_variant() -> None:
-    """Set ``llvm_ad_rgb`` if no variant is set, and register the plugins for the variant.
+    """Set ``llvm_ad_rgb`` if no variant is set, register the plugins for the variant, and set the minimum of threads.
 
     Raises:
         InputError: If the current variant cannot run the plugins.
@@ -46,6 +47,7 @@ def ensure_variant() -> None:
             check_llvm()
         if variant is None:
             mi.set_variant(VARIANTS[0])
+        ensure_threads()
         # Mitsuba changes the variant before it calls its callbacks, and another thread may be between both steps.
         register_plugins(mi.variant())
         if mi.variant() == "cuda_ad_rgb":

@@ -284,9 +284,9 @@ def test_workers_select_the_device_first(monkeypatch):
     assert "CUDA_VISIBLE_DEVICES" not in os.environ
 
 
-@pytest.mark.parametrize(("workers", "threads"), [(2, 2), (4, 1)])
+@pytest.mark.parametrize(("workers", "threads"), [(2, 3), (4, 2)])
 def test_workers_share_the_cores(monkeypatch, workers, threads):
-    monkeypatch.setattr(engine, "usable_cores", lambda: 5)
+    monkeypatch.setattr(engine, "usable_cores", lambda: 6)
     with closing(run_frames(Threads(), {0: range(2)}, workers=workers, note=print, device=CPU)) as results:
         assert list(results) == [threads, threads]
 

@@ -513,7 +513,7 @@ def test_repeated_runs_and_any_number_of_threads_give_the_same_bytes() -> None:
     assert render_splats(splats, CAMERA).rgb.tobytes() == first
     threads = dr.thread_count()
     try:
-        for count in (1, 4):
+        for count in (2, 5):
             dr.set_thread_count(count)
             assert render_splats(splats, CAMERA).rgb.tobytes() == first
     finally:

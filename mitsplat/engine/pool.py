@@ -68,7 +68,7 @@ _HELPER_NICENESS = 5
 
 
 CORES_PER_WORKER = 2
-"""Cores that the threads of a worker on a CPU keep busy; two workers on two cores take a quarter more CPU time."""
+"""Cores that the threads of a worker on a CPU keep busy. On two cores, two workers were not faster than one."""
 
 _MAX_SERIAL_FRAMES = 16
 """Number of frames up to which worker processes are not worth their start-up time."""

@@ -280,10 +280,11 @@ def test_the_documented_photo_commands_make_an_asset(
     Status 4 comes from a tiny fit, which misses the quality thresholds of an asset.
     """
     given, out, _ = captured
-    for name in ("mug", "cell"):
+    for name in ("mug", "cell", "nut"):
         shutil.copytree(given, desk / "photos" / name)
-    for place in ("captures/mug", "assets/mug/capture", "assets/cell/capture"):
+    for place in ("captures/mug", "assets/mug/capture", "assets/cell/capture", "assets/nut/capture"):
         shutil.copytree(out, desk / place)
+    (desk / "assets/lamps.yaml").write_text("lights:\n- {kind: environment, radiance: 1.0}\n")
     for words in SHOWN:
         if "--remove" in words:  # needs a detected table; runs in tests/surroundings/test_removal.py
             continue

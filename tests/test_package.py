@@ -43,7 +43,7 @@ def test_the_compatibility_page_names_every_layer() -> None:
 
 
 def test_importing_the_package_loads_no_heavy_library() -> None:
-    heavy = ["mitsuba", "drjit", "warp", "newton", "mujoco", "pycolmap", "torch", "cv2", "skimage", "coacd"]
+    heavy = ["mitsuba", "drjit", "warp", "newton", "mujoco", "pycolmap", "torch", "cv2", "skimage", "colour", "coacd"]
     code = f"import mitsplat, mitsplat.cli, sys; print([name for name in {heavy} if name in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import warnings
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -12,11 +14,6 @@ from mitsplat.arrays import Float64Array
 
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)
 """Rec. 709 luminance weights of linear sRGB."""
-
-_XYZ_FROM_SRGB = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
-"""Linear sRGB to CIE 1931 XYZ (IEC 61966-2-1)."""
-_BRADFORD = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]])
-"""CIE 1931 XYZ to Bradford's cone space (Lam 1985)."""
 
 
 def encode_srgb(linear: npt.ArrayLike) -> Float64Array:
@@ -68,7 +65,7 @@ def temperature_colour(kelvin: float) -> tuple[float, float, float]:
 
     Negative components, of light below 1900 K, become 0.
     """
-    rgb = np.maximum(np.linalg.inv(_XYZ_FROM_SRGB) @ _temperature_xyz(kelvin), 0.0)
+    rgb = np.maximum(np.linalg.inv(_xyz_from_srgb()) @ _temperature_xyz(kelvin), 0.0)
     red, green, blue = (rgb / (LUMINANCE @ rgb)).tolist()
     return red, green, blue
 
@@ -81,45 +78,23 @@ def white_balance_matrix(kelvin: float) -> Float64Array:
 
 def neutral_matrix(light: npt.ArrayLike) -> Float64Array:
     """Return the matrix (3, 3) on linear sRGB that maps the colour of a light to white."""
-    return _adaptation_matrix(_XYZ_FROM_SRGB @ np.asarray(light, dtype=np.float64))
+    return _adaptation_matrix(_xyz_from_srgb() @ np.asarray(light, dtype=np.float64))
 
 
 def _temperature_xyz(kelvin: float) -> Float64Array:
     """Return the XYZ of the reference illuminant of a colour temperature (ANSI/IES TM-30), with Y = 1.
 
-    It is a black body up to 4000 K, daylight from 5000 K, and mixed linearly in between.
+    It is a black body up to 4000 K (Kang et al. 2002), daylight from 5000 K (CIE 15), and mixed linearly in between.
     """
+    colour = _colour_science()
     share = np.clip((kelvin - 4000.0) / 1000.0, 0.0, 1.0)
-    mixed = np.zeros(3)
-    for weight, chromaticity in ((1 - share, _black_body_xy), (share, _daylight_xy)):
-        if weight:
-            x, y = chromaticity(kelvin)
-            mixed += weight * np.array([x / y, 1.0, (1 - x - y) / y])
-    return mixed
-
-
-def _black_body_xy(kelvin: float) -> tuple[float, float]:
-    """Return the CIE 1931 chromaticity of a black body (Kang et al. 2002)."""
-    if kelvin <= 4000:
-        x = np.polyval([-0.2661239e9, -0.2343589e6, 0.8776956e3, 0.179910], 1 / kelvin)
-    else:
-        x = np.polyval([-3.0258469e9, 2.1070379e6, 0.2226347e3, 0.24039], 1 / kelvin)
-    if kelvin <= 2222:
-        y = np.polyval([-1.1063814, -1.34811020, 2.18555832, -0.20219683], x)
-    elif kelvin <= 4000:
-        y = np.polyval([-0.9549476, -1.37418593, 2.09137015, -0.16748867], x)
-    else:
-        y = np.polyval([3.0817580, -5.8733867, 3.75112997, -0.37001483], x)
-    return float(x), float(y)
-
-
-def _daylight_xy(kelvin: float) -> tuple[float, float]:
-    """Return the CIE 1931 chromaticity of daylight from 4000 K (CIE 15)."""
-    if kelvin <= 7000:
-        x = np.polyval([-4.6070e9, 2.9678e6, 0.09911e3, 0.244063], 1 / kelvin)
-    else:
-        x = np.polyval([-2.0064e9, 1.9018e6, 0.24748e3, 0.237040], 1 / kelvin)
-    return float(x), float(np.polyval([-3.0, 2.87, -0.275], x))
+    parts = [(1 - share, "Kang 2002"), (share, "CIE Illuminant D Series")]
+    xyz: Float64Array = sum(
+        weight * colour.xy_to_XYZ(colour.temperature.CCT_to_xy(kelvin, method=method))
+        for weight, method in parts
+        if weight
+    )
+    return xyz
 
 
 def _adaptation_matrix(xyz: Float64Array) -> Float64Array:
@@ -127,10 +102,25 @@ def _adaptation_matrix(xyz: Float64Array) -> Float64Array:
 
     It is a von Kries adaptation in Bradford's cone space (Lam 1985).
     """
-    cones = _BRADFORD @ _XYZ_FROM_SRGB
-    adapt = np.diag(cones.sum(axis=1) / (_BRADFORD @ (xyz / xyz[1])))
-    matrix = np.linalg.inv(cones) @ adapt @ cones
+    colour, space = _colour_science(), _xyz_from_srgb()
+    adapt = colour.adaptation.matrix_chromatic_adaptation_VonKries(
+        xyz / xyz[1], space.sum(axis=1), transform="Bradford"
+    )
+    matrix = np.linalg.inv(space) @ adapt @ space
     return np.asarray(matrix / (LUMINANCE @ matrix @ np.ones(3)), dtype=np.float64)
+
+
+def _xyz_from_srgb() -> Float64Array:
+    """Return the matrix (3, 3) from linear sRGB to XYZ."""
+    return np.asarray(_colour_science().RGB_COLOURSPACES["sRGB"].matrix_RGB_to_XYZ, dtype=np.float64)
+
+
+def _colour_science() -> Any:
+    """Import colour-science without its warning that plots need Matplotlib."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        import colour  # the import takes a second and warns
+    return colour
 
 
 def eight_bit(image: Image.Image) -> Image.Image:

@@ -94,16 +94,11 @@ class LightPoints:
         return cls(surface, owner, slot, count, bent)
 
     @property
-    def is_bent(self) -> mi.Bool:
-        """True for bent pixels."""
-        return self.slot != UNTRACED
-
-    @property
     def valid_share(self) -> mi.Float:
         """Share of the points of every pixel that lie on a surface."""
         valid = dr.select(self.surface.valid, mi.Float(1), 0)
         dr.eval(valid)
-        return self.sum_by_pixel(valid) / dr.select(self.is_bent, mi.Float(len(OFFSETS)), 1)
+        return self.sum_by_pixel(valid) / dr.select(self.slot != UNTRACED, mi.Float(len(OFFSETS)), 1)
 
     def rows(self, places: mi.UInt32) -> mi.UInt32:
         """Return the rows of the points of some pixels (possibly none)."""
@@ -168,14 +163,10 @@ def filtered_roughness(here: LitSurface, index: mi.UInt32, place: mi.UInt32, vie
     count: bent pixels have several points. The change decreases with the squared cosine to the camera, because a wide
     lobe at a silhouette would lose light below the surface.
     """
-    x, y = mi.Int32(index % view.width), mi.Int32(index // view.width)
     total, count = mi.Float(0), mi.Float(0)
-    for dx, dy in ((1, 0), (-1, 0), (0, 1), (0, -1)):
-        nx, ny = x + dx, y + dy
-        inside = (nx >= 0) & (nx < view.width) & (ny >= 0) & (ny < view.height)
-        other = dr.gather(mi.UInt32, place, mi.UInt32(ny * view.width + nx), inside)
-        near = inside & (other != UNTRACED)
-        near &= dr.gather(mi.Float, here.trait, other, near) == here.trait
+    for step in ((1, 0), (-1, 0), (0, 1), (0, -1)):
+        _, other, lit = _neighbour(index, place, view, step)
+        near = lit & (dr.gather(mi.Float, here.trait, other, lit) == here.trait)
         normal = dr.gather(mi.Vector3f, here.normal, other, near)
         near &= dr.dot(normal, here.normal) > EVEN
         total += dr.select(near, dr.squared_norm(normal - here.normal), 0)
@@ -186,13 +177,9 @@ def filtered_roughness(here: LitSurface, index: mi.UInt32, place: mi.UInt32, vie
 
 def _bends(here: LitSurface, index: mi.UInt32, place: mi.UInt32, view: CameraView) -> mi.Bool:
     """Return for each pixel (Bool) if it borders on another shape or, on an instance, on another surface direction."""
-    x, y = mi.Int32(index % view.width), mi.Int32(index // view.width)
     thing, bends = here.instance > 0, mi.Bool(False)
     for dx, dy in np.ndindex(3, 3):
-        nx, ny = x + (dx - 1), y + (dy - 1)
-        inside = (nx >= 0) & (nx < view.width) & (ny >= 0) & (ny < view.height)
-        other = dr.gather(mi.UInt32, place, mi.UInt32(ny * view.width + nx), inside)
-        lit = inside & (other != UNTRACED)
+        inside, other, lit = _neighbour(index, place, view, (dx - 1, dy - 1))
         same = dr.gather(mi.Float, here.trait, other, lit) == here.trait
         even = dr.dot(dr.gather(mi.Vector3f, here.normal, other, lit), here.normal) > EVEN
         bends |= (lit & ~same) | (inside & thing & ~(lit & even))
@@ -200,3 +187,13 @@ def _bends(here: LitSurface, index: mi.UInt32, place: mi.UInt32, view: CameraVie
     bends &= here.known & here.valid & (thing | ~here.relit)
     dr.eval(bends)
     return bends
+
+
+def _neighbour(
+    index: mi.UInt32, place: mi.UInt32, view: CameraView, step: tuple[int, int]
+) -> tuple[mi.Bool, mi.UInt32, mi.Bool]:
+    """Return if the pixels at an offset ``step`` lie inside the picture, their places, and if their light is traced."""
+    x, y = mi.Int32(index % view.width) + step[0], mi.Int32(index // view.width) + step[1]
+    inside = (x >= 0) & (x < view.width) & (y >= 0) & (y < view.height)
+    other = dr.gather(mi.UInt32, place, mi.UInt32(y * view.width + x), inside)
+    return inside, other, inside & (other != UNTRACED)

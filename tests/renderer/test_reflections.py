@@ -24,6 +24,19 @@ CAMERA = Camera.look_at((0, -0.6, 0.5), (0, 0, 0), width=120, height=90, fov_x=5
 LAMP_CENTRE, LAMP_HALF = np.array([0.05, 0.35, 0.4]), 0.08
 
 
+def round_splats(points: npt.NDArray[np.float64], size: float, materials: SplatMaterials | None = None) -> Splats:
+    """Return grey, almost opaque Gaussians of one standard deviation [m]."""
+    count = len(points)
+    return Splats(
+        points,
+        np.tile([0, 0, 0, 1.0], (count, 1)),
+        np.full((count, 3), size),
+        np.full(count, 0.99),
+        np.zeros((count, 1, 3)),
+        materials=materials,
+    )
+
+
 def mirror(roughness: float) -> mi.Shape:
     """Return a metal floor of base colour 1 as instance 1."""
     materials = SplatMaterials.uniform(len(floor()), metallic=1.0, roughness=roughness)
@@ -117,14 +130,7 @@ def test_small_mirroring_ball_reflects_all_light_of_a_lamp(shift: float) -> None
     ball = trimesh.creation.icosphere(4, radius).apply_translation((x, x, 0))
     points = ball.triangles_center
     materials = SplatMaterials.uniform(len(points), metallic=1.0, roughness=0.1)
-    splats = Splats(
-        points,
-        np.tile([0, 0, 0, 1.0], (len(points), 1)),
-        np.full((len(points), 3), 5e-4),
-        np.full(len(points), 0.99),
-        np.zeros((len(points), 1, 3)),
-        materials=materials,
-    )
+    splats = round_splats(points, 5e-4, materials)
     place = mi.ScalarPoint3f(0.15, 0, 1)
     pose = mi.ScalarTransform4f().look_at(place, mi.ScalarPoint3f(0), mi.ScalarVector3f(0, 1, 0)).scale(size / 2)
     emitter = {"type": "area", "radiance": {"type": "rgb", "value": radiance}}
@@ -146,13 +152,7 @@ def test_mirror_shows_an_object_at_its_image() -> None:
     make_integrator()
     box = trimesh.creation.box(bounds=[[-0.05, 0.1, 0.02], [0.05, 0.2, 0.12]])
     points = trimesh.sample.sample_surface(box, 3000, seed=1)[0]
-    grey = Splats(
-        points,
-        np.tile([0, 0, 0, 1.0], (len(points), 1)),
-        np.full((len(points), 3), 2e-3),
-        np.full(len(points), 0.99),
-        np.zeros((len(points), 1, 3)),
-    )
+    grey = round_splats(points, 2e-3)
     thing = make_splats_shape(grey, proxy=box, instance=2)
     scene = mi.load_dict({"type": "scene", "floor": mirror(0.02), "thing": thing, "sky": WHITE_SKY})
     light = render_layers(make_integrator(white=np.pi, hide_emitters=True), scene, CAMERA)

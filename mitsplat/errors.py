@@ -35,6 +35,18 @@ class PartialResultError(RuntimeError):
     """Written result that misses a threshold; the message names the threshold and a remedy. Exit status 4."""
 
 
+def check_type(value: object, kind: type, place: str, remedy: str) -> None:
+    """Check that an argument of the Python API has a type.
+
+    Raises:
+        InputError: If it has another type.
+    """
+    if not isinstance(value, kind):
+        text = repr(value)
+        shown = type(value).__name__ if len(text) > 60 or "\n" in text else f"{type(value).__name__} {text}"
+        raise InputError(f"{place} must be a {kind.__name__} (got {shown}): {remedy}")
+
+
 def is_out_of_memory(error: BaseException) -> bool:
     """Return True if an error means that host or GPU memory is exhausted.
 

@@ -6,21 +6,18 @@ import json
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from mitsplat.dataset.dataset_files import TIMINGS
 from mitsplat.dataset.dataset_folder import append_run, content_of, finish_folder, open_folder
 from mitsplat.dataset.manifest import append_line
 from mitsplat.dataset.write import DatasetSummary, FrameCounts
-from mitsplat.errors import InputError
+from mitsplat.errors import InputError, check_type
 from mitsplat.formats.registry import Catalogue, write_frame
+from mitsplat.frames.frame import Frame
 from mitsplat.runtime.device import current_device
 from mitsplat.scene.scene import Scene
 from mitsplat.scene.splits import split_of
 from mitsplat.storage.files import storage_errors, write_text
-
-if TYPE_CHECKING:
-    from mitsplat.frames.frame import Frame
 
 
 def write_frames(scene: Scene, out: str | Path, frames: Iterable[Frame], *, overwrite: bool = False) -> DatasetSummary:
@@ -44,6 +41,9 @@ def write_frames(scene: Scene, out: str | Path, frames: Iterable[Frame], *, over
         InputError: If there are no frames, a frame does not have the scene's image size, or the folder holds other
             files. Also if flow is among the formats, because flow relates views of one layout.
     """
+    Scene.check(scene)
+    if not isinstance(frames, Iterable):
+        raise InputError(f"frames must be a list or an iterator of frames (got {type(frames).__name__})")
     out, output = Path(out), scene.spec.output
     if "flow" in output.formats:
         raise InputError(
@@ -59,6 +59,7 @@ def write_frames(scene: Scene, out: str | Path, frames: Iterable[Frame], *, over
     with open_folder(out, content, scene.path, None, resume=False, overwrite=overwrite) as manifest:
         append_run(out, 1, device)
         for index, frame in enumerate(frames):
+            check_type(frame, Frame, f"frame {index}", "render it by mitsplat.render_frame or mitsplat.render_frames")
             if frame.image.shape[:2] != (output.height, output.width):
                 height, width = frame.image.shape[:2]
                 raise InputError(

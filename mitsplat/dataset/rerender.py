@@ -78,6 +78,7 @@ def rerender_frame(
         InputError: If there is no such frame, a preflight check fails, or the folder holds other files.
         MissingResourceError: If the device is not available, or memory does not suffice for one frame.
     """
+    Scene.check(scene)
     out, index = Path(out), to_index(index, "frame")
     layout = layout_of(scene, index)
     catalogue = Catalogue.of(scene)

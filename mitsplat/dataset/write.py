@@ -131,6 +131,7 @@ def write_dataset(
         PartialResultError: If workers were lost, or finished files were removed, faster than frames could be made
             again.
     """
+    Scene.check(scene)
     out = Path(out)
     count = scene.num_frames if frames is None else frames
     if not 1 <= count <= scene.num_frames:

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsplat.arrays import Float32Array
-from mitsplat.errors import InputError
+from mitsplat.errors import InputError, check_type
 from mitsplat.frames.camera_response import Development, light_layers, start_development
 from mitsplat.frames.flow import exposure_flow, instance_motions, optical_flow
 from mitsplat.frames.light_properties import background_light, irradiance_of, light_properties, white_irradiance
@@ -137,8 +137,10 @@ def render_frame(
             given and objects move.
 
     Raises:
-        InputError: If the index is out of range, the layout cannot be settled, or the lights break a rule.
+        InputError: If the index is out of range, an argument has another type, the layout cannot be settled, or the
+            lights break a rule.
     """
+    Scene.check(scene)
     layout_of(scene, index)  # check the index before costly work
     ensure_variant()
     return _cached_renderer(scene, quality, str(mi.variant())).render(
@@ -185,6 +187,7 @@ class Renderer:
     """
 
     def __init__(self, scene: Scene, *, quality: str | Quality | None = None) -> None:
+        Scene.check(scene)
         if not isinstance(quality, Quality):
             quality = replace(resolve_quality(quality or scene.spec.quality), **scene.spec.rendering.model_dump())
         ensure_variant()
@@ -226,6 +229,12 @@ class Renderer:
             raise InputError(
                 f"Mitsuba's variant must stay {self._variant}, in which the renderer was created (got {mi.variant()})"
             )
+        for place, shown in (("layout", layout), ("next_layout", next_layout)):
+            if shown is not None:
+                check_type(shown, Layout, place, "create it by mitsplat.Layout.from_poses(scene, poses)")
+        for place, seen in (("camera", camera), ("next_camera", next_camera)):
+            if seen is not None:
+                check_type(seen, Camera, place, "create it by mitsplat.Camera or mitsplat.Camera.look_at")
         seconds: dict[str, float] = {}
         if layout is None:
             with _timed(seconds, "settle"):

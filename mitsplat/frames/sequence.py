@@ -55,8 +55,10 @@ def render_frames(
         scene: The scene.
         frames: Number of frames, or their indices. By default, the frames of the scene; with given layouts or cameras,
             the shorter of these. Indices may be endless, such as ``itertools.count()``.
-        layouts: One layout per frame, or one for all frames; by default, the scene's settled layouts.
-        cameras: One camera per frame, or one for all frames; by default, those of the scene.
+        layouts: One layout per frame, or one for all frames; by default, the scene's settled layouts. A list must not
+            be shorter than ``frames``.
+        cameras: One camera per frame, or one for all frames; by default, those of the scene. A list must not be shorter
+            than ``frames``.
         lights: As in :func:`mitsplat.render_frame`, for all frames.
         quality: As in :func:`mitsplat.render_frame`.
         progress: Show a progress bar in a terminal, or in a notebook with ipywidgets.
@@ -64,6 +66,7 @@ def render_frames(
     Raises:
         InputError: As in :func:`mitsplat.render_frame`.
     """
+    Scene.check(scene)
     if frames is None:
         is_film = isinstance(layouts, Iterable) or isinstance(cameras, Iterable)
         indices: Iterable[int] = itertools.count() if is_film else range(scene.num_frames)
@@ -73,6 +76,11 @@ def render_frames(
         if (count := to_index(frames, "frames")) < 0:
             raise InputError(f"frames must be 0 or more (got {count})")
         indices = range(count)
+    if isinstance(frames, Sized) or not isinstance(frames, Iterable | None):
+        wanted = len(indices)  # type: ignore[arg-type]
+        for name, given in (("layouts", layouts), ("cameras", cameras)):
+            if isinstance(given, Sized) and len(given) < wanted:
+                raise InputError(f"{name} must have one item for each of the {wanted} frames (got {len(given)})")
     parts: tuple[object, ...] = (indices, layouts, cameras)
     total = min((len(part) for part in parts if isinstance(part, Sized)), default=None)
     scene = with_unlimited_layouts(scene)

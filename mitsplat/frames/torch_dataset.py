@@ -50,10 +50,14 @@ class FrameStream(IterableDataset[Sample]):
     Args:
         scene: The scene; its number of layouts is ignored.
         quality: As in :func:`mitsplat.render_frame`.
+
+    Raises:
+        InputError: If ``scene`` is not a scene, such as the path of a scene file.
     """
 
     def __init__(self, scene: Scene, *, quality: str | Quality | None = None) -> None:
         super().__init__()
+        Scene.check(scene)
         self.scene, self.quality = scene, quality
 
     def __iter__(self) -> Iterator[Sample]:

@@ -65,6 +65,7 @@ def settle_layout(scene: Scene, index: int, *, progress: Note | None = None, cac
         InputError: If there is no layout of this index, the region is too small for the objects, or none of them comes
             to rest within the limits.
     """
+    Scene.check(scene)
     index = to_index(index, "layout")
     if index < 0:
         raise InputError(f"layout must be at least 0 (got {index})")

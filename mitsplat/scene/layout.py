@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -12,9 +12,7 @@ import numpy.typing as npt
 from mitsplat.arrays import Float64Array
 from mitsplat.errors import InputError
 from mitsplat.scene.given_poses import asset_index, rigid_pose
-
-if TYPE_CHECKING:
-    from mitsplat.scene.scene import Scene
+from mitsplat.scene.scene import Scene
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,8 +140,15 @@ class Layout:
                 all frames of a video.
 
         Raises:
-            InputError: If a name does not match exactly one asset, or if a matrix is not a rotation and a translation.
+            InputError: If a name does not match exactly one asset, a matrix is not a rotation and a translation, or an
+                entry of the scene file has fewer matrices than its smallest ``count``.
         """
+        Scene.check(scene)
+        if not isinstance(poses, Mapping):
+            raise InputError(
+                f"poses must map names of assets to lists of matrices, as in {{'bolt': [pose]}} (got a "
+                f"{type(poses).__name__})"
+            )
         paths = [path for entry in scene.spec.objects for path in entry.names for _ in entry.scales]
         names = [(asset.name, path) for asset, path in zip(scene.assets, paths, strict=True)]
         lists: dict[int, Sequence[npt.ArrayLike | None]] = {}
@@ -151,10 +156,20 @@ class Layout:
             asset = asset_index(name, names)
             if asset in lists:
                 raise InputError(f"poses[{name!r}]: must not name an asset that already has poses (asset {asset})")
+            if not isinstance(given, Iterable) or isinstance(given, str):
+                raise InputError(f"poses[{name!r}]: must be a list of matrices (got {type(given).__name__})")
             lists[asset] = [
                 None if pose is None else rigid_pose(pose, f"poses[{name!r}][{number}]")
                 for number, pose in enumerate(given)
             ]
+        for number, (entry, pool) in enumerate(zip(scene.spec.objects, scene.pools, strict=True)):
+            counts = [len(lists[asset]) for asset in pool if asset in lists]
+            if counts and sum(counts) < (least := len(entry.poses) or entry.count[0]):
+                raise InputError(
+                    f"poses: must have at least objects[{number}].count = {least} matrices of "
+                    f"{' and '.join(sorted({scene.assets[asset].name for asset in pool}))} (got {sum(counts)}); None "
+                    "stands for an absent object"
+                )
         listed = [(asset, pose) for asset in sorted(lists) for pose in lists[asset]]
         instances = tuple(
             Instance(number, asset, scene.class_index(asset), np.asarray(pose))

@@ -11,6 +11,7 @@ from pathlib import Path
 import trimesh
 
 from mitsplat.asset import Asset
+from mitsplat.errors import check_type
 from mitsplat.scene.spec.object_spec import ObjectSpec
 from mitsplat.scene.spec.scene_spec import SceneSpec
 from mitsplat.scene.splits import draw_environment
@@ -38,6 +39,15 @@ class Scene:
     shape_meshes: tuple[trimesh.Trimesh, ...]
     class_names: tuple[str, ...]
     images: Mapping[str, Path] = field(default_factory=dict)
+
+    @classmethod
+    def check(cls, value: object) -> None:
+        """Check that an argument is a scene.
+
+        Raises:
+            InputError: If it is not, such as the path of a scene file.
+        """
+        check_type(value, cls, "scene", "read a file with mitsplat.load_scene(path)")
 
     def environment_of(self, layout: int) -> Asset | None:
         """Return the environment of a layout; None if the scene has none."""

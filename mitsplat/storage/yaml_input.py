@@ -144,7 +144,8 @@ def key_place(path: str | Path, keys: KeyPath) -> str:
 def _to_file_values(value: Any) -> Any:
     """Convert a value to mappings, lists and scalars as in a file."""
     if isinstance(value, BaseModel):
-        return _to_file_values(dict(value))
+        # dict(value) would call a field named ``keys``.
+        return {name: _to_file_values(getattr(value, name)) for name in type(value).model_fields}
     if isinstance(value, Mapping):
         return {str(key): _to_file_values(inner) for key, inner in value.items()}
     if isinstance(value, list | tuple):

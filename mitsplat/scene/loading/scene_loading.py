@@ -11,7 +11,7 @@ import numpy as np
 import trimesh
 
 from mitsplat.asset import Asset
-from mitsplat.errors import InputError
+from mitsplat.errors import InputError, check_type
 from mitsplat.scene.loading.references import LoadedFiles, errors_at_key, expand_patterns, load_files, shape_mesh
 from mitsplat.scene.planning.conveyor import check_belt
 from mitsplat.scene.planning.frame_lights import expand_rooms
@@ -58,6 +58,9 @@ def make_scene(spec: SceneSpec, folder: str | Path = ".") -> Scene:
     Raises:
         InputError: If a named file is missing or invalid.
     """
+    check_type(
+        spec, SceneSpec, "spec", "create it by mitsplat.SceneSpec(name=..., ...), or use mitsplat.load_scene(path)"
+    )
     return _build_scene(spec, Path(folder) / _PYTHON_SCENE_NAME, allow_outside=True)
 
 

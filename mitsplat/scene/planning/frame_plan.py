@@ -118,6 +118,8 @@ def plan_frame(
     index = to_index(index, "frame")
     spec, number = scene.spec, layout_of(scene, index)
     if lights is not None:
+        if not isinstance(lights, Sequence) or isinstance(lights, str):
+            raise InputError(f"lights must be a list of lights (got a {type(lights).__name__}): put one light in [ ]")
         spec = SceneSpec(**{**dict(spec), "lights": tuple(lights)})  # validates the lights
         if unknown := {name for _, name in light_images(spec)} - set(scene.images):
             raise InputError(f"images of lights must be images that the scene file names (got {min(unknown)!r})")

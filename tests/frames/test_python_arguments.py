@@ -1,0 +1,104 @@
+"""Arguments of the wrong type or number in the Python API are refused in one sentence."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import mitsplat as ms
+from mitsplat.scene.planning.frame_plan import plan_frame
+from tests.conftest import WriteScene
+
+PATH = {"kind": "path", "keys": [{"eye": [0, -0.4, 0.3], "target": [0, 0, 0]}]}
+
+
+@pytest.fixture
+def scene(write_scene: WriteScene, scene_data: dict[str, Any]) -> ms.Scene:
+    """Return a scene whose camera has a field named like a method of mappings."""
+    scene_data["objects"][0]["count"] = 3
+    return ms.load_scene(write_scene(scene_data | {"camera": PATH}))
+
+
+def film(scene: Any, **arguments: Any) -> list[ms.Frame]:
+    return list(ms.render_frames(scene, progress=False, **arguments))
+
+
+@pytest.mark.parametrize(
+    ("lights", "sentence"),
+    [
+        ([{"kind": "area", "position": [0, 0, 1], "powr": 3}], "SceneSpec: lights[0].powr: is not a known key"),
+        ([{"kind": "area"}], "SceneSpec: lights[0].position: is required"),
+        (["area"], "SceneSpec: lights[0]: must be"),
+        ({"kind": "area", "position": [0, 0, 1]}, "lights must be a list of lights (got a dict)"),
+        ("area", "lights must be a list of lights (got a str)"),
+    ],
+)
+def test_invalid_lights_are_refused_beside_a_camera_on_a_path(scene: ms.Scene, lights: Any, sentence: str) -> None:
+    with pytest.raises(ms.InputError) as caught:
+        plan_frame(scene, 0, lights=lights)
+    assert str(caught.value).startswith(sentence) and "\n" not in str(caught.value)
+
+
+def test_an_invalid_part_of_a_specification_with_a_path_is_named(scene_data: dict[str, Any]) -> None:
+    from mitsplat.scene.spec.camera_spec import CameraPath
+
+    camera = CameraPath(**PATH)
+    with pytest.raises(ms.InputError, match=r"^SceneSpec: seed: must be >= 0 \(got -1\)$"):
+        ms.SceneSpec(**scene_data | {"camera": camera, "seed": -1})
+
+
+POSE = np.eye(4)
+CALLS: list[tuple[Callable[[ms.Scene, Path], object], str]] = [
+    (lambda scene, out: ms.render_frame(scene, 0, layout={"nut": [POSE]}), "layout must be a Layout (got dict"),
+    (lambda scene, out: film(scene, layouts={"nut": [POSE]}), "layout must be a Layout (got str 'nut')"),
+    (lambda scene, out: ms.render_frame(scene, 0, camera=POSE), "camera must be a Camera (got ndarray)"),
+    (lambda scene, out: ms.render_frame("scene.yaml", 0), "scene must be a Scene (got str 'scene.yaml')"),
+    (lambda scene, out: film("scene.yaml"), "scene must be a Scene"),
+    (lambda scene, out: ms.Renderer(Path("scene.yaml")), "scene must be a Scene"),
+    (lambda scene, out: ms.settle_layout("scene.yaml", 0), "scene must be a Scene"),
+    (lambda scene, out: ms.write_dataset("scene.yaml", out), "scene must be a Scene"),
+    (lambda scene, out: ms.rerender_frame("scene.yaml", 0, out), "scene must be a Scene"),
+    (lambda scene, out: ms.write_frames("scene.yaml", out, []), "scene must be a Scene"),
+    (lambda scene, out: ms.write_frames(scene, out, 3), "frames must be a list or an iterator of frames (got int)"),
+    (lambda scene, out: ms.write_frames(scene, out, [POSE]), "frame 0 must be a Frame (got ndarray)"),
+    (lambda scene, out: ms.make_scene({"name": "x"}), "spec must be a SceneSpec (got dict {'name': 'x'})"),
+    (lambda scene, out: ms.Layout.from_poses("scene.yaml", {}), "scene must be a Scene"),
+    (lambda scene, out: ms.Layout.from_poses(scene, [POSE]), "poses must map names of assets to lists of matrices"),
+    (lambda scene, out: ms.Layout.from_poses(scene, {"nut": None}), "poses['nut']: must be a list of matrices"),
+    (lambda scene, out: ms.Layout.from_poses(scene, {"nut": 5}), "poses['nut']: must be a list of matrices"),
+    (
+        lambda scene, out: ms.Layout.from_poses(scene, {"nut": [POSE, POSE]}),
+        "poses: must have at least objects[0].count = 3 matrices of nut (got 2)",
+    ),
+    (
+        lambda scene, out: film(scene, frames=3, layouts=[ms.Layout.from_poses(scene, {"bolt": [POSE]})] * 2),
+        "layouts must have one item for each of the 3 frames (got 2)",
+    ),
+    (lambda scene, out: film(scene, frames=[0, 1], cameras=[]), "cameras must have one item for each of the 2 frames"),
+]
+
+
+@pytest.mark.parametrize(("call", "sentence"), CALLS, ids=[sentence for _, sentence in CALLS])
+def test_arguments_of_another_type_are_refused(
+    scene: ms.Scene, tmp_path: Path, call: Callable[[ms.Scene, Path], object], sentence: str
+) -> None:
+    with pytest.raises(ms.InputError) as caught:
+        call(scene, tmp_path / "out")
+    assert str(caught.value).startswith(sentence) and "\n" not in str(caught.value)
+
+
+def test_a_stream_of_a_scene_file_is_refused() -> None:
+    pytest.importorskip("torch")
+    from mitsplat.frames.torch_dataset import FrameStream
+
+    with pytest.raises(ms.InputError, match=r"^scene must be a Scene \(got str 'scene.yaml'\): read a file with"):
+        FrameStream("scene.yaml")  # type: ignore[arg-type]
+
+
+def test_absent_objects_count_as_given_poses(scene: ms.Scene) -> None:
+    layout = ms.Layout.from_poses(scene, {"nut": [POSE, None, POSE]})
+    assert [one.id for one in layout.instances] == [1, 3]

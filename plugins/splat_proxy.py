@@ -9,6 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mitsplat.gaussians.splat_training import trained_kernel
 from mitsplat.plugins.parameters import Parameters
 from mitsplat.quality import resolve_quality
 from mitsplat.renderer.composition.layer_renderer import LayerRenderer
@@ -52,7 +53,7 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
      * - kernel
        - |string|
        - Footprint of a Gaussian: ``exact``, ``mip`` (widened by a pixel), or dilated as by the trainers ``3dgs`` and
-         ``gsplat``. (Default: ``exact``)
+         ``gsplat``. (Default: ``mip`` if a splat file states that it was trained with antialiasing, else ``exact``)
 
      * - samples
        - |int|
@@ -159,6 +160,7 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
             given.refuse("shadow_error", "be in [0, 1)", shadow_error)
         if not 0 <= sky_reach < np.inf:
             given.refuse("sky_reach", "be >= 0", sky_reach)
+        self._is_kernel_stated = "kernel" in props
         self.renderer = LayerRenderer(
             quality=replace(resolve_quality(given.string("quality", "balanced")), **refined),
             shadow=given.choice("shadow", "traced", "none"),
@@ -192,6 +194,9 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
         """Render an image tensor (H, W, 4 + AOVs), linear RGBA first."""
         if not isinstance(sensor, mi.Sensor):
             sensor = scene.sensors()[sensor]
+        if not self._is_kernel_stated and self.renderer.quality.kernel == "exact":
+            kernel = trained_kernel(shape.splats.kernel for shape in scene.shapes() if hasattr(shape, "splats"))
+            self.renderer.quality = replace(self.renderer.quality, kernel=kernel)
         layers = self.renderer.render_layers(scene, sensor, seed=int(seed))
         view = view_of(sensor)
         channels = [*layers["rgb"], layers["alpha"], *layers["captured"], layers["depth"], mi.Float(layers["instance"])]

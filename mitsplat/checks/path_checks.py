@@ -196,6 +196,7 @@ def check_scene(scene: Scene) -> Iterator[Finding]:
     if support and not faults:
         yield from _check_rest(scene)
     yield _check_view(scene)
+    yield from _check_kernel(scene)
     drawn = (*scene.environments, *scene.assets)
     lit = bool(spec.lights) or all(asset.capture_light == "scene" for asset in drawn)
     yield Finding(
@@ -233,6 +234,19 @@ def _check_rest(scene: Scene) -> Iterator[Finding]:
         yield Finding("rest", False, str(error), "change what objects rest on, or their region")
     if rested:
         yield Finding("rest", True, f"{len(rested)} objects come to rest, each tried alone")
+
+
+def _check_kernel(scene: Scene) -> Iterator[Finding]:
+    """Compare the kernel of the scene with those that its splat files state."""
+    drawn, kernel = (*scene.environments, *scene.assets), scene.splat_options["kernel"]
+    stated = {asset.name: asset.splats.kernel for asset in drawn if asset.splats.kernel}
+    if stated:
+        text = ", ".join(f"{name}: {trained}" for name, trained in stated.items())
+        yield Finding(
+            "kernel", kernel == "mip" or "mip" not in stated.values(),
+            f"rendering.kernel is {kernel}; kernels of the training: {text}",
+            "set rendering.kernel to mip, or leave it out: such splats look dotted or too dense with other kernels",
+        )  # fmt: skip
 
 
 def _check_view(scene: Scene) -> Finding:

@@ -201,6 +201,8 @@ def import_(
     report = write_import_report(out, result)
     typer.echo(f"up: {result.upright.reason}")
     typer.echo(f"Gaussians: {result.removed_of_all}")
+    if result.training is not None:
+        typer.echo(f"trained: {result.training}")
     if made.mesh is not None:
         extents = " x ".join(f"{extent:.4g}" for extent in made.mesh.extents)
         pieces = f", {len(made.pieces)} convex pieces" if made.pieces else ""

@@ -73,7 +73,7 @@ def worker_memory(scene: Scene) -> WorkerMemory:
     all_splats = {id(splats): splats for splats in itertools.chain(environments, *pools)}.values()
     stored = sum(getattr(splats, name).nbytes for splats in all_splats for name in SplatArrays._fields)
     num_gaussians = sum(map(len, static)) + sum(count * len(splats) for splats, count in placed)
-    quality = replace(resolve_quality(spec.quality), **spec.rendering.model_dump())
+    quality = replace(resolve_quality(spec.quality), **scene.splat_options)
     pixels = spec.output.width * spec.output.height
     cameras = [plan_frame(scene, int(index)).camera for index in np.linspace(0, scene.num_frames - 1, _CAMERAS)]
 

@@ -189,7 +189,7 @@ class Renderer:
     def __init__(self, scene: Scene, *, quality: str | Quality | None = None) -> None:
         Scene.check(scene)
         if not isinstance(quality, Quality):
-            quality = replace(resolve_quality(quality or scene.spec.quality), **scene.spec.rendering.model_dump())
+            quality = replace(resolve_quality(quality or scene.spec.quality), **scene.splat_options)
         ensure_variant()
         self.scene = scene
         self.quality = quality

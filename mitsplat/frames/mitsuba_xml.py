@@ -65,7 +65,7 @@ def export_xml(scene: Scene, index: int, path: str | Path) -> None:
         "integrator": {
             "type": "splat_proxy",
             "quality": scene.spec.quality,
-            **scene.spec.rendering.model_dump(),
+            **scene.splat_options,
             **light_properties(scene, number),
         },
         "sensor": describe_sensor(plan.camera),

@@ -281,7 +281,7 @@ View = tuple[Float32Array, npt.NDArray[np.uint16], float, float]
 def _scene_renderer(job: _RenderJob) -> Callable[[int], View]:
     """Return a function that renders one of the pictures of a scene."""
     scene = load_scene(job.path, overrides=dict(job.overrides), allow_outside=job.allow_outside)
-    options = scene.spec.rendering.model_dump()
+    options = dict(scene.splat_options)
     if job.step.quality.response == "ewa":  # the step itself sets the response
         del options["response"]
     if job.step.captured:

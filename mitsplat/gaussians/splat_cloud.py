@@ -29,6 +29,7 @@ from mitsplat.gaussians.material_files import read_materials
 from mitsplat.gaussians.spherical_harmonics import sh_rotation
 from mitsplat.gaussians.splat_files import SplatArrays, read_splats, write_splats
 from mitsplat.gaussians.splat_materials import SplatMaterials
+from mitsplat.quality import KernelName
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,6 +46,7 @@ class Splats:
         sh: Spherical-harmonic coefficients of the display-encoded colour in 3DGS order, shape (N, K, 3) with K = 1, 4,
             9 or 16: colour = max(0, 0.5 + sum_k sh[k] Y_k(direction)), direction from camera to Gaussian.
         materials: Material parameters; ``sh`` then holds the base colour. None if ``sh`` holds captured radiance.
+        kernel: Kernel with which the splats were trained (:class:`mitsplat.Quality`), if their file states it.
 
     Raises:
         ValueError: If an array has a wrong shape or an invalid value. The message names field, rule, value and row.
@@ -56,6 +58,7 @@ class Splats:
     opacities: Float32Array
     sh: Float32Array
     materials: SplatMaterials | None = None
+    kernel: KernelName | None = None
 
     def __post_init__(self) -> None:
         with np.errstate(over="ignore"):  # values beyond float32 become inf, which is refused below
@@ -116,9 +119,9 @@ class Splats:
             InputError: If a file is missing, of another kind, or damaged, or if it holds an invalid value; or if splats
                 with materials have view-dependent colours.
         """
-        arrays = read_splats(Path(path))
+        arrays, kernel = read_splats(Path(path))
         try:
-            splats = cls(**arrays._asdict())
+            splats = cls(**arrays._asdict(), kernel=kernel)
         except ValueError as error:
             raise InputError(f"{path}: {error}") from error
         if materials is not None:
@@ -134,13 +137,15 @@ class Splats:
             InputError: If the suffix is unknown, the format cannot hold these splats, or the file cannot be written. No
                 partial file remains.
         """
-        write_splats(SplatArrays(self.means, self.quats, self.scales, self.opacities, self.sh), Path(path))
+        arrays = SplatArrays(self.means, self.quats, self.scales, self.opacities, self.sh)
+        write_splats(arrays, Path(path), self.kernel)
 
     def select(self, index: slice | npt.ArrayLike) -> Splats:
         """Return the Gaussians selected by a Boolean mask (N,), an integer array or a slice, in its order."""
         rows = index if isinstance(index, slice) else np.atleast_1d(np.asarray(index))
         arrays = {name: getattr(self, name)[rows] for name in SplatArrays._fields}
-        return Splats(**arrays, materials=None if self.materials is None else self.materials.select(rows))
+        materials = None if self.materials is None else self.materials.select(rows)
+        return Splats(**arrays, materials=materials, kernel=self.kernel)
 
     def transformed(self, matrix: npt.ArrayLike) -> Splats:
         """Return the splats after a similarity transform. Their view-dependent colours rotate with them.
@@ -161,6 +166,7 @@ class Splats:
             opacities=self.opacities,
             sh=sh_rotation(rotation, self.sh_degree).astype(np.float32) @ self.sh,
             materials=None if self.materials is None else self.materials.rotated(rotation),
+            kernel=self.kernel,
         )
 
     def with_material(self, *, metallic: float = 0.0, roughness: float = 0.5, specular: float = 0.5) -> Splats:
@@ -176,7 +182,7 @@ class Splats:
     def concatenate(parts: Sequence[Splats]) -> Splats:
         """Return all Gaussians of ``parts`` in order, without materials.
 
-        Lower SH degrees are padded with zeros to the highest.
+        Lower SH degrees are padded with zeros to the highest. The kernel is that of all parts, or None if they differ.
 
         Raises:
             ValueError: If ``parts`` is empty.
@@ -187,7 +193,8 @@ class Splats:
         padded = [np.pad(part.sh, ((0, 0), (0, width - part.sh.shape[1]), (0, 0))) for part in parts]
         names = [name for name in SplatArrays._fields if name != "sh"]
         joined: dict[str, Any] = {name: np.concatenate([getattr(p, name) for p in parts]) for name in names}
-        return Splats(**joined, sh=np.concatenate(padded))
+        kernels = {part.kernel for part in parts}
+        return Splats(**joined, sh=np.concatenate(padded), kernel=kernels.pop() if len(kernels) == 1 else None)
 
 
 def split_similarity(matrix: npt.ArrayLike) -> tuple[Float64Array, float, Float64Array]:

@@ -22,10 +22,12 @@ from __future__ import annotations
 
 import gzip
 import io
+import logging
 import re
 import struct
 import zipfile
 import zlib
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -37,6 +39,16 @@ from mitsplat.arrays import Float32Array
 from mitsplat.errors import InputError
 from mitsplat.gaussians.spherical_harmonics import SH_C0
 from mitsplat.gaussians.splat_converter import convert_splats
+from mitsplat.gaussians.splat_training import (
+    SPZ_ANTIALIASED,
+    SPZ_FLAGS_OFFSET,
+    merge_filter,
+    ply_comment,
+    ply_kernel,
+    sog_kernel,
+    spz_kernel,
+)
+from mitsplat.quality import KernelName
 from mitsplat.runtime.child_process import run_bounded
 from mitsplat.storage.files import storage_errors, write_file
 
@@ -52,6 +64,12 @@ _PLY_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "
 MAX_PLY_HEADER = 1 << 16
 _MEANS, _QUATS, _SCALES = ("x", "y", "z"), ("rot_1", "rot_2", "rot_3", "rot_0"), ("scale_0", "scale_1", "scale_2")
 _COLOUR = ("f_dc_0", "f_dc_1", "f_dc_2")
+_FLAT_THICKNESS = np.float32(0.01)
+"""Third scale of flat Gaussians that have none, relative to the smaller of the others."""
+_FILTER = "filter_3D"
+_USED = re.compile(rf"[xyz]|f_dc_[012]|f_rest_\d+|opacity|scale_[012]|rot_[0123]|{_FILTER}")
+_REDUNDANT = ("nx", "ny", "nz", "red", "green", "blue")
+"""Columns without further information: empty normals, and colours that repeat the SH coefficients of degree 0."""
 _MAX_COMPRESSION_RATIO = 100
 """Maximum ratio of decompressed to compressed size. Real files have ratios of 1.1 to 3."""
 _MAX_ENTRIES = 64
@@ -65,6 +83,8 @@ _SPZ_HEADER = struct.Struct("<4s2I4B")
 _SPZ_FRACTIONAL_BITS = 12
 _SPZ_FRACTIONAL_BITS_OFFSET = 13
 _SPZ_POSITION_BITS = 23
+
+_logger = logging.getLogger(__name__)
 
 
 class SplatArrays(NamedTuple):
@@ -82,8 +102,12 @@ def default_up_axis(path: Path) -> Axis:
     return "y" if path.suffix.lower() == ".spz" else "-y"
 
 
-def read_splats(path: Path) -> SplatArrays:
-    """Read a splat file in its own units and axes.
+def read_splats(path: Path) -> tuple[SplatArrays, KernelName | None]:
+    """Read a splat file in its own units and axes; a warning names columns that are not used.
+
+    Returns:
+        The arrays, and the kernel with which the splats were trained; None if the file does not state it, see
+        :mod:`mitsplat.gaussians.splat_training`.
 
     Raises:
         InputError: If the file is missing, of an unknown suffix, or damaged, or if it holds an invalid value.
@@ -103,23 +127,41 @@ def read_splats(path: Path) -> SplatArrays:
         if not data:
             raise InputError("the file is empty")
         if suffix == ".splat":
-            return _decode_splat(data)
+            return _decode_splat(data), None
         if suffix == ".spz":
             return _decode_spz(data)
-        return _decode_ply(data if suffix == ".ply" else _convert(data, suffix[1:], "ply"))
+        if suffix == ".sog":
+            return _decode_ply(_convert(data, "sog", "ply")), sog_kernel(data)
+        if suffix == ".ksplat":
+            return _decode_ply(_convert(data, "ksplat", "ply")), None
+        arrays, names = _decode_ply(data), _vertex_names(data)
     except ValueError as error:
         raise InputError(f"{path}: {error}") from error
+    if unused := [name for name in names if name not in _REDUNDANT and not _USED.fullmatch(name)]:
+        _logger.warning("%s: the columns %s are not used", path, ", ".join(unused))
+    stated = ply_kernel(data[:MAX_PLY_HEADER].partition(b"end_header")[0])
+    implied: KernelName | None = "mip" if _FILTER in names else "exact" if names and _SCALES[2] not in names else None
+    return arrays, stated or implied
 
 
-def write_splats(splats: SplatArrays, path: Path) -> None:
+def write_splats(splats: SplatArrays, path: Path, kernel: KernelName | None = None) -> None:
     """Write ``splats`` in the format of the suffix of ``path``. The file is replaced atomically.
+
+    Args:
+        splats: Splats to write.
+        path: The file.
+        kernel: Kernel with which the splats were trained. ``.ply`` states it, and ``.spz`` states ``mip``.
 
     Raises:
         InputError: If the suffix is not ``.ply``, ``.splat`` or ``.spz``, the format cannot hold the splats, or the
             file cannot be written.
         MissingResourceError: If the disk is full.
     """
-    encoders = {".ply": _encode_ply, ".splat": _encode_splat, ".spz": _encode_spz}
+    encoders: dict[str, Callable[[SplatArrays, KernelName | None], bytes]] = {
+        ".ply": _encode_ply,
+        ".splat": _encode_splat,
+        ".spz": _encode_spz,
+    }
     suffix = path.suffix.lower()
     if suffix not in encoders or path.name.lower().endswith(".compressed.ply"):
         raise InputError(f"{path}: splats can be written as .ply, .splat or .spz (got {path.name!r})")
@@ -127,7 +169,7 @@ def write_splats(splats: SplatArrays, path: Path) -> None:
         raise InputError(f"{path}: a {suffix} file must hold at least one Gaussian (got 0)")
     if not path.parent.is_dir():
         raise InputError(f"{path}: cannot be written (the folder does not exist)")
-    data = encoders[suffix](splats)
+    data = encoders[suffix](splats, kernel)
     with storage_errors(path):
         write_file(path, lambda partial: partial.write_bytes(data))
 
@@ -139,7 +181,8 @@ def _decode_ply(data: bytes) -> SplatArrays:
     names = elements["vertex"][1].names or ()
     if "packed_position" in names:
         return _decode_ply(_convert(data, "compressed.ply", "ply"))
-    missing = [n for n in (*_MEANS, *_COLOUR, "opacity", *_SCALES, *_QUATS) if n not in names]
+    scale_names = _SCALES if _SCALES[2] in names else _SCALES[:2]  # 2DGS has two
+    missing = [n for n in (*_MEANS, *_COLOUR, "opacity", *scale_names, *_QUATS) if n not in names]
     if missing:
         raise InputError(f"a PLY file of splats must have the vertex properties {', '.join(missing)} (missing)")
     rest = sum(name.startswith("f_rest_") for name in names)
@@ -147,15 +190,26 @@ def _decode_ply(data: bytes) -> SplatArrays:
     if rest not in (0, 9, 24, 45) or not set(rest_names) <= set(names):
         raise InputError(f"f_rest must be numbered from 0 and have 0, 9, 24 or 45 properties (got {rest})")
     rows = vertex_rows(data, form, elements, start)
+    scales, opacities = _exp(columns_of(rows, scale_names)), _sigmoid(rows["opacity"])
+    if len(scale_names) == 2:
+        scales = np.hstack([scales, _FLAT_THICKNESS * scales.min(axis=1, keepdims=True)])
+    if _FILTER in names:
+        scales, opacities = merge_filter(scales, opacities, rows[_FILTER])
     # SH coefficients are channel-major: all of red, then green, then blue.
     higher = columns_of(rows, rest_names).reshape(len(rows), 3, rest // 3).transpose(0, 2, 1)
     return SplatArrays(
         means=columns_of(rows, _MEANS),
         quats=columns_of(rows, _QUATS),
-        scales=_exp(columns_of(rows, _SCALES)),
-        opacities=_sigmoid(rows["opacity"]),
+        scales=scales,
+        opacities=opacities,
         sh=np.concatenate([columns_of(rows, _COLOUR)[:, None], higher], axis=1),
     )
+
+
+def _vertex_names(data: bytes) -> tuple[str, ...]:
+    """Return the names of the columns of a PLY file of splats; none if they are packed."""
+    names = parse_ply_header(data)[1]["vertex"][1].names or ()
+    return () if "packed_position" in names else names
 
 
 def parse_ply_header(data: bytes) -> tuple[str, dict[str, tuple[int, np.dtype[Any]]], int]:
@@ -236,7 +290,7 @@ def columns_of(rows: npt.NDArray[np.void], names: tuple[str, ...] | list[str]) -
     return table
 
 
-def _encode_ply(splats: SplatArrays) -> bytes:
+def _encode_ply(splats: SplatArrays, kernel: KernelName | None = None) -> bytes:
     """Encode in the layout of the original 3DGS files. It includes empty normals, which some loaders require."""
     with np.errstate(divide="ignore"):
         opacity = np.clip(logit(splats.opacities.astype(np.float64)), -_LOGIT_LIMIT, _LOGIT_LIMIT)
@@ -256,7 +310,8 @@ def _encode_ply(splats: SplatArrays) -> bytes:
         ]
     ).astype("<f4")
     properties = "".join(f"property float {name}\n" for name in names)
-    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {count}\n{properties}end_header\n"
+    form = f"format binary_little_endian 1.0\n{ply_comment(kernel)}"
+    header = f"ply\n{form}element vertex {count}\n{properties}end_header\n"
     return header.encode() + rows.tobytes()
 
 
@@ -278,7 +333,7 @@ def _decode_splat(data: bytes) -> SplatArrays:
     )
 
 
-def _encode_splat(splats: SplatArrays) -> bytes:
+def _encode_splat(splats: SplatArrays, _kernel: KernelName | None) -> bytes:
     rows = np.empty(len(splats.means), _SPLAT_ROW)
     rgba = np.column_stack([0.5 + SH_C0 * splats.sh[:, 0], splats.opacities])
     rows["mean"], rows["scale"] = splats.means, splats.scales
@@ -287,18 +342,21 @@ def _encode_splat(splats: SplatArrays) -> bytes:
     return rows.tobytes()
 
 
-def _decode_spz(data: bytes) -> SplatArrays:
+def _decode_spz(data: bytes) -> tuple[SplatArrays, KernelName | None]:
     """Decode SPZ version 3 (Niantic's ``load-spz.cc``): consecutive arrays of small integers in gzip.
 
     The result is bit-identical to that of gaussforge, without a separate process. gaussforge decodes or refuses other
     versions and files whose length does not match their header.
     """
+    if data[:4] == b"NGSP":  # not in gzip since version 4
+        version = int.from_bytes(data[4:8], "little")
+        raise InputError(f"SPZ files of version {version} are not supported: convert them to version 3, or to .ply")
     raw = _decompress_gzip(data)
     magic, version, count, degree, bits, _, _ = _SPZ_HEADER.unpack(raw[: _SPZ_HEADER.size].ljust(_SPZ_HEADER.size))
     widths = (9, 1, 3, 3, 4, 3 * (degree + 1) ** 2 - 3)
     known = (magic, version) == (b"NGSP", 3) and count > 0 and degree <= 3 and bits <= _SPZ_POSITION_BITS
     if not known or len(raw) != _SPZ_HEADER.size + count * sum(widths):
-        return _decode_ply(_convert(data, "spz", "ply"))
+        return _decode_ply(_convert(data, "spz", "ply")), spz_kernel(raw)
     ends = _SPZ_HEADER.size + count * np.cumsum(widths)
     arrays = np.split(np.frombuffer(raw, np.uint8, ends[-1]), [_SPZ_HEADER.size, *ends[:-1]])[1:]
     positions, alphas, colours, scales, turns, rest = (a.reshape(count, -1).astype(np.int32) for a in arrays)
@@ -306,13 +364,14 @@ def _decode_spz(data: bytes) -> SplatArrays:
     alpha, base = alphas[:, 0].astype(np.float32) / 255, (colours.astype(np.float32) / 255 - 0.5) / np.float32(0.15)
     with np.errstate(divide="ignore"):
         logits = np.log((alpha / (1 - alpha)).astype(np.float64)).astype(np.float32)
-    return SplatArrays(
+    decoded = SplatArrays(
         means=((high << 24 | middle << 16 | low << 8) >> 8).astype(np.float32) / np.float32(1 << bits),
         quats=_smallest_three(turns.astype(np.uint8).view("<u4")[:, 0].copy()),
         scales=_exp(scales / 16 - 10),
         opacities=_sigmoid(logits),
         sh=np.concatenate([base[:, None], rest.reshape(count, -1, 3).astype(np.float32) / 128 - 1], axis=1),
     )
+    return decoded, spz_kernel(raw)
 
 
 def _smallest_three(packed: npt.NDArray[np.uint32]) -> Float32Array:
@@ -332,7 +391,7 @@ def _smallest_three(packed: npt.NDArray[np.uint32]) -> Float32Array:
     return quats
 
 
-def _encode_spz(splats: SplatArrays) -> bytes:
+def _encode_spz(splats: SplatArrays, kernel: KernelName | None) -> bytes:
     """Encode SPZ version 3 with the maximum number of fractional position bits that the extent of the splats permits.
 
     The encoder itself uses 12 bits, which are steps of 0.24 mm. Here, positions are multiplied by a power of two before
@@ -344,6 +403,7 @@ def _encode_spz(splats: SplatArrays) -> bytes:
     scaled = SplatArrays(means, splats.quats, splats.scales, splats.opacities, splats.sh)
     packed = bytearray(gzip.decompress(_convert(_encode_ply(scaled), "ply", "spz")))
     packed[_SPZ_FRACTIONAL_BITS_OFFSET] = bits
+    packed[SPZ_FLAGS_OFFSET] |= SPZ_ANTIALIASED if kernel == "mip" else 0
     return gzip.compress(bytes(packed), compresslevel=6, mtime=0)
 
 

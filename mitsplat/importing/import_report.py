@@ -41,6 +41,7 @@ def _verdict(imported: Imported) -> str:
     rows: dict[str, str | None] = {
         "Up": imported.upright.reason,
         "Gaussians": imported.removed_of_all,
+        "Trained": imported.training,
         "IoU of mesh and splats": figure_of(imported.mesh_iou, "{:.3f}"),
         "Shift between mesh and splats": figure_of(imported.offset, "{:.3%} of the diagonal"),
         "Captured light": asset.capture_light,

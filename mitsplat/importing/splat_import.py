@@ -148,6 +148,18 @@ class Imported:
         return f"{len(self.asset.splats)} of {self.found}; removed: {removed}"
 
     @property
+    def training(self) -> str | None:
+        """Training that the file states, with the kernel that renders it, as text; None if it states none."""
+        kernel = self.asset.splats.kernel
+        if kernel == "mip":
+            return (
+                "with antialiasing; scenes render it with `rendering: {kernel: mip}` unless they state another kernel"
+            )
+        if kernel in ("3dgs", "gsplat"):
+            return f"without antialiasing; `rendering: {{kernel: {kernel}}}` in a scene renders it as it was trained"
+        return None
+
+    @property
     def misses(self) -> tuple[str, ...]:
         """Problems of the asset with their remedies, a sentence each."""
         asset, found, thresholds = self.asset, [], Thresholds()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TypeVar
 
 import mitsuba as mi
@@ -15,8 +15,10 @@ from mitsplat.arrays import BoolArray, Float32Array
 from mitsplat.capture.capture import Capture, Photo, known_where
 from mitsplat.fit.image_metrics import psnr_of
 from mitsplat.gaussians.splat_cloud import Splats
+from mitsplat.gaussians.splat_training import trained_kernel
 from mitsplat.geometry.camera import Camera
 from mitsplat.images.colour import encode_srgb
+from mitsplat.quality import resolve_quality
 from mitsplat.reconstruct.registration import measure_offset, surface_points
 from mitsplat.reconstruct.segment_splats import Isolation
 from mitsplat.reconstruct.silhouette_refinement import RefinedMesh
@@ -219,7 +221,8 @@ def show_held_out(
 
 def show_asset(splats: Splats, mesh: trimesh.Trimesh | None, cameras: Sequence[Camera]) -> list[AssetView]:
     """Render splats and mesh from cameras."""
-    integrator = make_integrator(shadow="none")
+    quality = replace(resolve_quality("balanced"), kernel=trained_kernel([splats.kernel]))
+    integrator = make_integrator(quality=quality, shadow="none")
     scene = mi.load_dict({"type": "scene", "splats": make_splats_shape(splats, instance=1, proxy=mesh)})
     views = []
     for camera in cameras:

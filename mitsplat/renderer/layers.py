@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from typing import Any
 
@@ -16,6 +16,7 @@ import trimesh
 
 from mitsplat.arrays import Float32Array
 from mitsplat.gaussians.splat_cloud import Splats
+from mitsplat.gaussians.splat_training import trained_kernel
 from mitsplat.geometry.camera import Camera
 from mitsplat.images.masks import Silhouette
 from mitsplat.quality import Quality, resolve_quality
@@ -166,14 +167,17 @@ def render_splats(splats: Splats, camera: Camera, *, quality: str | Quality = "b
     Args:
         splats: Splats to render, as instance 1.
         camera: Camera.
-        quality: Name of a preset, or a :class:`mitsplat.quality.Quality`.
+        quality: Name of a preset, which gets the kernel ``mip`` if the splats were trained with antialiasing, or a
+            :class:`mitsplat.quality.Quality`.
 
     Raises:
         InputError: If there is no such preset.
     """
+    if not isinstance(quality, Quality):
+        quality = replace(resolve_quality(quality), kernel=trained_kernel([splats.kernel]))
     ensure_variant()
     integrator, scene = _single_shape_scene(splats, str(mi.variant()))
-    integrator.renderer.quality = resolve_quality(quality)
+    integrator.renderer.quality = quality
     layers = render_layers(integrator, scene, camera)
     dr.sync_thread()
     return layers

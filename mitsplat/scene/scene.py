@@ -7,11 +7,13 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import accumulate, pairwise
 from pathlib import Path
+from typing import Any
 
 import trimesh
 
 from mitsplat.asset import Asset
 from mitsplat.errors import check_type
+from mitsplat.gaussians.splat_training import trained_kernel
 from mitsplat.scene.spec.object_spec import ObjectSpec
 from mitsplat.scene.spec.scene_spec import SceneSpec
 from mitsplat.scene.splits import draw_environment
@@ -57,6 +59,13 @@ class Scene:
     def num_frames(self) -> int:
         """Number of frames: layouts times views. Frames of one layout have consecutive indices."""
         return self.spec.output.layouts * self.spec.output.views
+
+    @cached_property
+    def splat_options(self) -> dict[str, Any]:
+        """Values of ``spec.rendering`` that refine a preset, with the kernel of the splats if it is not stated."""
+        options = self.spec.rendering.model_dump()
+        drawn = (*self.environments, *self.assets)
+        return options | {"kernel": options["kernel"] or trained_kernel(asset.splats.kernel for asset in drawn)}
 
     @cached_property
     def pools(self) -> tuple[range, ...]:

@@ -313,7 +313,7 @@ class TestFiles:
         data[turns] = kept
         (tmp_path / "a.spz").write_bytes(gzip.compress(bytes(data)))
         converted = splat_files._decode_ply(splat_files._convert((tmp_path / "a.spz").read_bytes(), "spz", "ply"))
-        for name, array in splat_files.read_splats(tmp_path / "a.spz")._asdict().items():
+        for name, array in splat_files.read_splats(tmp_path / "a.spz")[0]._asdict().items():
             np.testing.assert_array_equal(array, getattr(converted, name), err_msg=name, strict=True)
 
     def test_spz_files_of_version_2_are_read(self, tmp_path):

@@ -248,10 +248,11 @@ class Rendering(StrictModel):
         description="``perspective`` evaluates Gaussians along exact perspective rays. ``ewa`` uses parallel rays "
         "within the footprint of each Gaussian, as trainers do.",
     )
-    kernel: KernelName = Field(
-        "exact",
+    kernel: KernelName | None = Field(
+        None,
         description="Footprint of a Gaussian: ``exact`` for the Gaussian itself, ``mip`` for one widened by a pixel "
-        "against aliasing, ``3dgs`` and ``gsplat`` for the dilation of those trainers.",
+        "against aliasing, ``3dgs`` and ``gsplat`` for the dilation of those trainers. By default, ``mip`` if a splat "
+        "file of the scene states that it was trained with antialiasing, else ``exact``.",
     )
     samples: Annotated[int, Field(ge=1, le=8)] | Literal["edges"] = Field(
         "edges",

@@ -21,11 +21,12 @@ from mitsplat.frames.light_properties import background_light, irradiance_of, li
 from mitsplat.frames.scene_builder import SceneBuilder
 from mitsplat.geometry.camera import Camera
 from mitsplat.images.masks import Silhouette
+from mitsplat.labels.keypoint_visibility import find_blocked_keypoints
 from mitsplat.labels.labels import Labels, Truth, label_instances
 from mitsplat.labels.overlay import draw_labels
 from mitsplat.physics.settle import settle_layout
 from mitsplat.quality import Quality, resolve_quality
-from mitsplat.renderer.layers import Layers, host_array, make_integrator, render_layers, render_silhouettes
+from mitsplat.renderer.layers import Layers, find_hits, host_array, make_integrator, render_layers, render_silhouettes
 from mitsplat.renderer.lazy_value import LazyValue
 from mitsplat.runtime.variant import ensure_variant, one_at_a_time
 from mitsplat.scene.layout import Layout
@@ -264,7 +265,7 @@ class Renderer:
                 self.integrator, mitsuba_scene, plan.camera, source=self.scene.spec.labels.source
             )
         with _timed(seconds, "label"):
-            labels = self._label(layers, silhouettes, layout, plan.camera)
+            labels = self._label(layers, silhouettes, layout, plan.camera, mitsuba_scene)
         with _timed(seconds, "composite"):
             image = development.image()
         return Frame.later(
@@ -316,12 +317,17 @@ class Renderer:
             light=irradiance_of(self.scene, mitsuba_scene) if is_balanced else white,
         )
 
-    def _label(self, layers: Layers, silhouettes: Mapping[int, Silhouette], layout: Layout, camera: Camera) -> Labels:
+    def _label(
+        self, layers: Layers, silhouettes: Mapping[int, Silhouette], layout: Layout, camera: Camera, shown: mi.Scene
+    ) -> Labels:
         """Label the instances by the ids of splats or proxies. The depth that is not used stays on the device."""
-        scene, rules = self.scene, self.scene.spec.labels
+        scene, rules, hits = self.scene, self.scene.spec.labels, partial(find_hits, self.integrator, shown)
         if rules.source == "splats":
             truth = Truth(layers.instance, layers.proxy_instance, silhouettes, layers.depth)
         else:
             truth = Truth(layers.proxy_instance, layers.instance, silhouettes, layers.proxy_depth)
         keypoints = {number: asset.keypoint_array for number, asset in enumerate(scene.assets) if asset.keypoints}
-        return label_instances(truth, layout.instances, scene.class_names, rules, camera=camera, keypoints=keypoints)
+        blocked = find_blocked_keypoints(scene.assets, layout.instances, camera, hits)
+        return label_instances(
+            *(truth, layout.instances, scene.class_names, rules), camera=camera, keypoints=keypoints, blocked=blocked
+        )

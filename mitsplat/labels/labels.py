@@ -47,7 +47,7 @@ if TYPE_CHECKING:
 
 
 KEYPOINT_TOLERANCE = 0.005
-"""Maximum distance of a visible keypoint behind the visible surface, as a share of its depth."""
+"""Maximum distance of a visible keypoint behind surroundings without a mesh, as a share of its depth."""
 
 UNLABELLED, HIDDEN, VISIBLE = 0, 1, 2
 """Visibility of a keypoint, as in COCO: outside the image, occluded, visible."""
@@ -64,7 +64,7 @@ class Truth:
         instance: Ids from which labels derive, (H, W) integers.
         second: Ids from the other source (proxies if labels derive from splats), (H, W) integers.
         silhouettes: Silhouette of every instance by id, from the labels' source; instances without pixels are absent.
-        depth: Depth of the visible surface along the optical axis [m], (H, W), for the visibility of keypoints.
+        depth: Depth of the visible surface along the optical axis [m], (H, W).
     """
 
     instance: npt.NDArray[np.integer]
@@ -225,6 +225,7 @@ def label_instances(
     *,
     camera: Camera | None = None,
     keypoints: Mapping[int, Float64Array] | None = None,
+    blocked: Mapping[int, BoolArray] | None = None,
 ) -> Labels:
     """Label the visible ``instances`` of a frame.
 
@@ -235,6 +236,8 @@ def label_instances(
         rules: Thresholds for dropping and marking.
         camera: Camera; required for keypoints.
         keypoints: Keypoints by asset index, in the asset's coordinates [m], shape (K, 3) each.
+        blocked: True for the keypoints that a mesh hides, by instance id, shape (K,) each; by default, none is hidden
+            by a mesh. See :mod:`mitsplat.labels.keypoint_visibility`.
 
     Raises:
         ValueError: If a map is not a 2-D integer array, the maps differ in shape, or a map contains an unknown id.
@@ -295,7 +298,7 @@ def label_instances(
                 world_from_object=instance.world_from_object,
                 keypoints=np.zeros((0, 3))
                 if points is None or camera is None
-                else _project_keypoints(points, instance, camera, truth),
+                else _project_keypoints(points, instance, camera, truth, (blocked or {}).get(instance.id)),
                 marks=marks,
             )
         )
@@ -346,18 +349,27 @@ def _agreement(
     return float(np.count_nonzero(one & other) / np.count_nonzero(one | other)), boundary_f1(one, other)
 
 
-def _project_keypoints(points: Float64Array, instance: Instance, camera: Camera, truth: Truth) -> Float64Array:
-    """Compute pixels and visibilities of an asset's keypoints, shape (K, 3)."""
+def _project_keypoints(
+    points: Float64Array, instance: Instance, camera: Camera, truth: Truth, blocked: BoolArray | None
+) -> Float64Array:
+    """Compute pixels and visibilities of an asset's keypoints, shape (K, 3).
+
+    A keypoint is hidden if a mesh blocks its ray, or if all four pixels around it show surroundings in front of it,
+    which may have no mesh.
+    """
     pose = instance.world_from_object
     points = points @ pose[:3, :3].T + pose[:3, 3]
     pixels, depth = camera.project(points)
+    hidden = np.zeros(len(points), dtype=bool) if blocked is None else blocked
     keypoints = np.zeros((len(points), 3))
-    for row, (x, y), z in zip(keypoints, pixels, depth, strict=True):
+    for row, (x, y), z, is_hidden in zip(keypoints, pixels, depth, hidden, strict=True):
         if not (z > camera.near and 0 <= x < camera.width and 0 <= y < camera.height):
             continue
-        pixel = int(y), int(x)
-        is_visible = truth.instance[pixel] == instance.id and z <= truth.depth[pixel] * (1 + KEYPOINT_TOLERANCE)
-        row[:] = x, y, VISIBLE if is_visible else HIDDEN
+        left, top = max(int(x - 0.5), 0), max(int(y - 0.5), 0)
+        around = slice(top, top + 2), slice(left, left + 2)
+        front, is_surroundings = truth.depth[around], truth.instance[around] == 0
+        is_hidden |= bool((is_surroundings & (front > 0) & (front < z * (1 - KEYPOINT_TOLERANCE))).all())
+        row[:] = x, y, HIDDEN if is_hidden else VISIBLE
     return keypoints
 
 

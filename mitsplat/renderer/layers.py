@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 import trimesh
 
-from mitsplat.arrays import Float32Array
+from mitsplat.arrays import BoolArray, Float32Array, Float64Array
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.gaussians.splat_training import trained_kernel
 from mitsplat.geometry.camera import Camera
@@ -236,3 +236,10 @@ def render_silhouettes(
     silhouettes = dict(integrator.renderer.silhouettes(scene, _sensor_of(camera, str(mi.variant())), source=source))
     check_dropped_rays()
     return silhouettes
+
+
+def find_hits(integrator: mi.Integrator, scene: mi.Scene, starts: Float64Array, ends: Float64Array) -> BoolArray:
+    """Return True for the segments between points (N, 3) [m] that a proxy or a visible mesh intersects."""
+    blocked: BoolArray = integrator.renderer.blocked(scene, starts, ends)
+    check_dropped_rays()
+    return blocked

@@ -275,18 +275,31 @@ class TestYolo:
         assert data["kpt_shape"] == [2, 3]
         assert data["kpt_names"] == {0: ["head", "tip"], 1: ["middle", "unused_1"]}
 
-    def test_a_keypoint_is_visible_on_the_surface_and_hidden_behind_it(self) -> None:
+    def test_a_keypoint_is_hidden_by_meshes_and_by_surroundings_in_front_of_it(self) -> None:
         ids = np.full((HEIGHT, WIDTH), 1, dtype=np.uint16)
-        depth = np.full((HEIGHT, WIDTH), 0.9)
         silhouettes = {1: Silhouette.cropped(ids == 1, 0, 0)}
         pose = np.eye(4)
         pose[2, 3] = 0.1  # 0.9 m in front of the camera
-        instances = [Seen(1, 0, pose), Seen(2, 0, np.eye(4))]
-        covered = ids.copy()
-        covered[HEIGHT // 2 - 5 : HEIGHT // 2 + 5, WIDTH // 2 - 5 : WIDTH // 2 + 5] = 2  # covers both points
-        for shown, expected in ((ids, [VISIBLE, HIDDEN]), (covered, [HIDDEN, HIDDEN])):
-            truth = Truth(shown, shown, silhouettes, depth)
-            labels = label_instances(truth, instances, CLASSES, LabelRules(), camera=CAMERA, keypoints=POINTS)
+        middle = slice(HEIGHT // 2 - 5, HEIGHT // 2 + 5), slice(WIDTH // 2 - 5, WIDTH // 2 + 5)
+        covered, half_covered = ids.copy(), ids.copy()
+        covered[middle] = 0
+        half_covered[middle[0], WIDTH // 2 :] = 0
+        for shown, nearest, blocked, expected in (
+            (ids, 0.9, [False, False], [VISIBLE, VISIBLE]),
+            (ids, 0.5, [False, False], [VISIBLE, VISIBLE]),  # other objects have meshes
+            (ids, 0.9, [False, True], [VISIBLE, HIDDEN]),
+            (covered, 0.5, [False, False], [HIDDEN, HIDDEN]),
+            (covered, 2.0, [False, False], [VISIBLE, VISIBLE]),
+            (covered, 0.0, [False, False], [VISIBLE, VISIBLE]),
+            (half_covered, 0.5, [False, False], [VISIBLE, VISIBLE]),
+        ):
+            truth = Truth(shown, shown, silhouettes, np.full((HEIGHT, WIDTH), nearest))
+            labels = label_instances(
+                *(truth, [Seen(1, 0, pose)], CLASSES, LabelRules()),
+                camera=CAMERA,
+                keypoints=POINTS,
+                blocked={1: np.array(blocked)},
+            )
             assert labels.instances[0].keypoints[:, 2].tolist() == expected
 
     @pytest.mark.parametrize("task", ["yolo-detect", "yolo-obb", "yolo-pose"])

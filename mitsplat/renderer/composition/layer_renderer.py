@@ -12,6 +12,7 @@ import mitsuba as mi
 import numpy as np
 import trimesh
 
+from mitsplat.arrays import BoolArray, Float64Array
 from mitsplat.images.masks import Silhouette
 from mitsplat.quality import Quality
 from mitsplat.renderer.composition.scene_contents import ContentsReader, SceneContents, same_shapes
@@ -23,6 +24,7 @@ from mitsplat.renderer.light.lit_surface import VisiblePixels, VisibleSurfaces
 from mitsplat.renderer.meshes.mesh_radiance import PathTracer
 from mitsplat.renderer.meshes.visible_meshes import MeshHits, VisibleEmitters
 from mitsplat.renderer.rays.camera_rays import CameraView
+from mitsplat.renderer.rays.device_arrays import wrapped
 from mitsplat.renderer.rays.sensors import view_of
 from mitsplat.renderer.splatting.march import Image, largest_and_mean, trace
 from mitsplat.renderer.splatting.pairs import CrowdedError
@@ -259,6 +261,20 @@ class LayerRenderer:
             if getattr(shape, "instance", 0) and shape.proxy is not None:
                 proxies.setdefault(shape.instance, []).append((shape.proxy, shape.world_from_splats))
         return proxy_silhouettes(proxies, view)
+
+    def blocked(self, scene: mi.Scene, starts: Float64Array, ends: Float64Array) -> BoolArray:
+        """Return True for the segments between points (N, 3) [m] that a proxy or a visible mesh intersects."""
+        contents = self._contents.read(scene, self.occluders == "splats")
+        way = ends - starts
+        length = np.linalg.norm(way, axis=1)
+        ray = dr.zeros(mi.Ray3f, len(way))
+        ray.o, ray.d = (
+            type(vector)(*(wrapped(mi.Float, column.astype(np.float32)) for column in values.T))
+            for vector, values in ((ray.o, starts), (ray.d, way / np.maximum(length, 1e-12)[:, None]))
+        )
+        ray.maxt = wrapped(mi.Float, length.astype(np.float32))
+        found = np.array(contents.proxies.blocked(ray), dtype=bool)
+        return np.broadcast_to(found, len(way))
 
     def _white(self) -> mi.Color3f:
         """Return the irradiance (Color3f) at which a white surface has the picture value 1."""

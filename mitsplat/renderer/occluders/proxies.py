@@ -199,6 +199,15 @@ class Proxies:
         dr.eval(static)  # a separate kernel, see `separate_kernels`
         return TraceScene.nearest(self.dynamic, ray, static), static
 
+    def blocked(self, ray: mi.Ray3f) -> mi.Bool:
+        """Return True for rays that hit a proxy before their end."""
+        found = mi.Bool(False)
+        for proxies in (self.static, self.dynamic):
+            if proxies is not None:
+                found |= proxies.scene.ray_test(ray)
+                dr.eval(found)  # a separate kernel, see `separate_kernels`
+        return found
+
 
 @dataclass(frozen=True, eq=False)
 class TraceScene:

@@ -16,11 +16,11 @@ import numpy.typing as npt
 from mitsplat.arrays import Float32Array
 from mitsplat.errors import InputError, check_type
 from mitsplat.frames.camera_response import Development, light_layers, start_development
-from mitsplat.frames.flow import exposure_flow, instance_motions, optical_flow
 from mitsplat.frames.light_properties import background_light, irradiance_of, light_properties, white_irradiance
 from mitsplat.frames.scene_builder import SceneBuilder
 from mitsplat.geometry.camera import Camera
 from mitsplat.images.masks import Silhouette
+from mitsplat.labels.flow import exposure_flow, instance_motions, optical_flow
 from mitsplat.labels.keypoint_visibility import find_blocked_keypoints
 from mitsplat.labels.labels import Labels, Truth, label_instances
 from mitsplat.labels.overlay import draw_labels
@@ -95,7 +95,7 @@ class Frame(LazyValue):
     def flow(self) -> Float32Array | None:
         """Motion of every pixel to the next image [px], (H, W, 2); None without a next image.
 
-        Both components are 1e10 where the flow is unknown, see :func:`mitsplat.frames.flow.optical_flow`.
+        Both components are 1e10 where the flow is unknown, see :func:`mitsplat.labels.flow.optical_flow`.
         """
         if self.plan.next_camera is None:
             return None

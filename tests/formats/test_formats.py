@@ -23,9 +23,9 @@ from mitsplat.errors import InputError
 from mitsplat.formats import coco, maps
 from mitsplat.formats.registry import Catalogue, CollectionWriter, write_frame
 from mitsplat.formats.yolo import rotated_box
-from mitsplat.frames.flow import optical_flow
 from mitsplat.geometry.camera import Camera
 from mitsplat.images.masks import Silhouette
+from mitsplat.labels.flow import optical_flow
 from mitsplat.labels.labels import HIDDEN, VISIBLE, LabelRules, Truth, label_instances
 from mitsplat.labels.polygons import fill_polygon
 from mitsplat.scene.layout import Layout

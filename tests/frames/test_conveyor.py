@@ -15,8 +15,8 @@ import mitsplat as ms
 from mitsplat.audit.audit import audit_dataset
 from mitsplat.dataset.rerender import rerender_frame
 from mitsplat.dataset.write import write_dataset
-from mitsplat.frames.flow import UNKNOWN_FLOW, exposure_flow
 from mitsplat.geometry.camera import Camera
+from mitsplat.labels.flow import UNKNOWN_FLOW, exposure_flow
 from mitsplat.scene.layout import NO_PHYSICS, Instance, Layout
 from mitsplat.scene.planning.conveyor import Belt
 from mitsplat.scene.spec.shape_spec import Box

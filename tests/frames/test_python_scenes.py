@@ -16,8 +16,8 @@ from scipy.spatial.transform import Rotation
 
 import mitsplat as ms
 from mitsplat.dataset.write import write_dataset
-from mitsplat.frames.flow import UNKNOWN_FLOW, instance_motions, optical_flow
 from mitsplat.gaussians.splat_cloud import Splats
+from mitsplat.labels.flow import UNKNOWN_FLOW, instance_motions, optical_flow
 from mitsplat.scene.loading.scene_loading import load_scene
 from mitsplat.scene.planning.frame_plan import plan_frame
 from mitsplat.scene.spec.camera_spec import CameraOrbit

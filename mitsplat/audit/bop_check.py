@@ -92,12 +92,17 @@ class BopCheck(DatasetCheck):
         return []
 
     def _count_fit(self, frame: DecodedFrame, label: DecodedInstance, camera: object, pose: JsonObject) -> None:
-        """Project the model by the camera and pose in the files, and count the IoU with the silhouette's box."""
+        """Project the model by the camera and pose in the files, and count the IoU with the silhouette's box.
+
+        Boxes that reach the end of the range in which silhouettes are counted are left out, because they are cut there.
+        """
         number = label.entry["asset"] + 1
         corners = self._corners.get(number)
         matrix = _read_numbers(camera, "cam_K", 9)
         rotation, shift = _read_numbers(pose, "cam_R_m2c", 9), _read_numbers(pose, "cam_t_m2c", 3)
         if corners is None or matrix is None or rotation is None or shift is None or label.silhouette_area < _MIN_AREA:
+            return
+        if label.reaches_range:
             return
         projected = (corners @ rotation.reshape(3, 3).T + shift) @ matrix.reshape(3, 3).T
         if projected[:, 2].max() > 0 >= projected[:, 2].min():

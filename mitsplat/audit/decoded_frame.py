@@ -16,6 +16,10 @@ from mitsplat.arrays import BoolArray, Float64Array, Int64Array
 from mitsplat.images.masks import Box, decode_rle
 from mitsplat.storage.files import JsonObject, Record
 
+_RANGE, _DISTORTED_RANGES = (1.0,), (1.0, 0.5, 0.25, 0.125, 0.0)
+"""Ranges around the image in which silhouettes are counted, in image sizes; that of a distorted lens is one of several.
+"""
+
 
 class DecodedInstance:
     """Instance of a frame with its masks, which are not empty.
@@ -30,10 +34,12 @@ class DecodedInstance:
         area, amodal_area: Numbers of pixels of both masks.
         silhouette_area: Number of pixels of the silhouette, also beyond the image's border, as stated in the manifest.
         visible_fraction: Visible pixels over the pixels of the silhouette in the image.
-        truncation: Fraction of the silhouette beyond the image's border.
+        reaches_range: True if the silhouette reaches the end of the range in which its pixels are counted.
+        truncation: Fraction of the silhouette beyond the image's border. For a silhouette that reaches the end of its
+            range, this is the fraction in the manifest, unless it is too small.
     """
 
-    def __init__(self, entry: JsonObject, width: int, height: int) -> None:
+    def __init__(self, entry: JsonObject, width: int, height: int, *, is_distorted: bool = False) -> None:
         self.entry = entry
         self.id, self.class_index = int(entry["id"]), int(entry["class_index"])
         self.name = f"instance {self.id}"
@@ -44,6 +50,12 @@ class DecodedInstance:
         self.silhouette_area = int(entry["silhouette_area"])
         self.visible_fraction = self.area / self.amodal_area
         self.truncation = 1 - self.amodal_area / self.silhouette_area
+        x0, y0, x1, y1 = entry["silhouette_box"]
+        outside = (-x0, width), (-y0, height), (x1 - width, width), (y1 - height, height)
+        ranges = _DISTORTED_RANGES if is_distorted else _RANGE
+        self.reaches_range = any(part == int(share * side) for part, side in outside for share in ranges)
+        if self.reaches_range:
+            self.truncation = max(self.truncation, float(entry["truncation"]))
 
 
 class DecodedFrame:
@@ -79,7 +91,10 @@ class DecodedFrame:
         self.world_from_camera: Float64Array = np.array(camera["world_from_camera"], dtype=np.float64)
         self.intrinsics: Float64Array = np.array(camera["intrinsics"], dtype=np.float64)
         self.distortion: Float64Array = np.array(camera["distortion"], dtype=np.float64)
-        self.instances = tuple(DecodedInstance(entry, *self.size) for entry in labels["instances"])
+        self.instances = tuple(
+            DecodedInstance(entry, *self.size, is_distorted=bool(self.distortion.any()))
+            for entry in labels["instances"]
+        )
 
     def full_mask(self, instance: DecodedInstance, *, amodal: bool = False) -> BoolArray:
         """Return the visible pixels of an instance, or its silhouette, in the whole image (H, W)."""

@@ -38,10 +38,12 @@ class Silhouette:
     Attributes:
         box: Bounds of the mask.
         mask: Covered pixels inside the box, shape (y1 - y0, x1 - x0).
+        beyond: Number of further covered pixels, outside of the range in which masks are computed.
     """
 
     box: Box
     mask: BoolArray
+    beyond: float = 0.0
 
     @classmethod
     def cropped(cls, mask: BoolArray, x: int, y: int) -> Silhouette:

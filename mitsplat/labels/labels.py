@@ -11,7 +11,7 @@ rules, in this order, select the labels. All omissions and marks are counted:
 
 The *silhouette* of an instance is its mask when rendered alone, by the same rule for a pixel and after rule 1. The
 visible fraction is exact and uses no depth tolerance: visible pixels over the silhouette's pixels in the image. The
-truncation is the share of the silhouette beyond the image's border.
+truncation is the share of the complete silhouette beyond the image's border.
 
 Positions are in pixels with the image's corner at (0, 0), so pixel centres are at +0.5 and a box is half-open.
 """
@@ -52,7 +52,16 @@ KEYPOINT_TOLERANCE = 0.005
 UNLABELLED, HIDDEN, VISIBLE = 0, 1, 2
 """Visibility of a keypoint, as in COCO: outside the image, occluded, visible."""
 
-_STORED_FIELDS = ("id", "asset", "class_index", "silhouette_area", "depth_area", "agreement", "boundary_f1")
+_STORED_FIELDS = (
+    "id",
+    "asset",
+    "class_index",
+    "silhouette_area",
+    "depth_area",
+    "agreement",
+    "boundary_f1",
+    "truncation",
+)
 """Fields of a label that have the same name and value in the manifest."""
 
 
@@ -85,11 +94,13 @@ class InstanceLabel:
         box: Bounds of the mask [px].
         mask: Visible pixels inside the box, shape (y1 - y0, x1 - x0).
         amodal: The silhouette's part in the image, including hidden pixels.
-        silhouette_box: Bounds of the silhouette, also beyond the image's border [px].
-        silhouette_area: Pixels of the silhouette.
+        silhouette_box: Bounds of the silhouette, also beyond the image's border [px], at most one image size on each
+            side.
+        silhouette_area: Pixels of the silhouette in that range.
         depth_area: Pixels of ``amodal`` at which the image has a depth.
         agreement: IoU of the instance's masks by splats and by proxies.
         boundary_f1: F1 score of their boundaries, see :func:`mitsplat.images.masks.boundary_f1`.
+        truncation: Share of the complete silhouette beyond the image's border.
         world_from_object: Rigid transform from the asset's coordinates to the world's [m], shape (4, 4).
         keypoints: Position [px] and visibility of the asset's named points, shape (K, 3): :data:`VISIBLE`,
             :data:`HIDDEN`, or :data:`UNLABELLED` at (0, 0).
@@ -108,6 +119,7 @@ class InstanceLabel:
     depth_area: int
     agreement: float
     boundary_f1: float
+    truncation: float
     world_from_object: Float64Array
     keypoints: Float64Array = field(default_factory=lambda: np.zeros((0, 3)))
     marks: tuple[str, ...] = ()
@@ -121,11 +133,6 @@ class InstanceLabel:
     def visible_fraction(self) -> float:
         """Visible pixels over the silhouette's pixels in the image."""
         return self.area / self.amodal.area
-
-    @property
-    def truncation(self) -> float:
-        """Share of the silhouette beyond the image's border."""
-        return 1 - self.amodal.area / self.silhouette_area
 
     @cached_property
     def polygon(self) -> Float64Array:
@@ -295,6 +302,7 @@ def label_instances(
                 depth_area=_with_depth(amodal, truth),
                 agreement=agreement,
                 boundary_f1=boundary,
+                truncation=1 - amodal.area / (area + (0.0 if silhouette is None else silhouette.beyond)),
                 world_from_object=instance.world_from_object,
                 keypoints=np.zeros((0, 3))
                 if points is None or camera is None

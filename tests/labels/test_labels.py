@@ -410,3 +410,13 @@ def test_a_distractor_occludes_and_has_no_label():
     (found,) = labels.instances
     assert (found.id, found.visible_fraction, found.marks) == (1, 0.5, ())
     assert not any(labels.dropped.values())
+
+
+def test_the_truncation_counts_pixels_beyond_the_range_of_masks():
+    everything = np.ones((12, 30), dtype=bool)
+    ids = np.ones((4, 10), dtype=np.uint16)
+    truth = Truth(ids, ids, {1: Silhouette((-10, -4, 20, 8), everything, beyond=640.0)}, ids)
+    (found,) = label_instances(truth, [Seen(1, 0, np.eye(4))], CLASSES, LabelRules()).instances
+    assert (found.silhouette_area, found.truncation) == (360, 1 - 40 / 1000)
+    labels = Labels(10, 4, (found,), {})
+    assert Labels.from_json(labels.to_json()).instances[0].truncation == found.truncation

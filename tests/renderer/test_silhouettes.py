@@ -154,3 +154,37 @@ def test_more_instances_than_bits_have_their_silhouettes() -> None:
         pixel, _ = camera().project([(0.04 * (number % 10 - 4.5), 0, 0.04 * (number // 10 - 3))])
         x0, y0, x1, y1 = found[900 * number + 1].box
         assert np.abs(pixel[0] - ((x0 + x1) / 2, (y0 + y1) / 2)).max() < 1.5
+
+
+@pytest.mark.parametrize("source", ["splats", "proxies"])
+@pytest.mark.parametrize("shift", [0.0, 0.4])
+def test_an_object_close_to_the_camera_has_its_complete_area(source: str, shift: float) -> None:
+    """A plate of side s at distance d has f s / d pixels on each side, here 13 images of 96 px."""
+    ensure_variant()
+    side, distance = 1.0, 0.1
+    plate = trimesh.creation.box((side, 0.001, side))
+    across = (np.arange(60) + 0.5) / 60 * side - side / 2
+    means = np.stack([*np.meshgrid(across, [0.0], across)], axis=-1).reshape(-1, 3).astype(np.float32)
+    splats = ms.Splats(
+        means=means,
+        quats=np.tile(np.float32([0, 0, 0, 1]), (len(means), 1)),
+        scales=np.tile(np.float32([0.012, 0.0005, 0.012]), (len(means), 1)),
+        opacities=np.full(len(means), 0.95, dtype=np.float32),
+        sh=np.zeros((len(means), 1, 3), dtype=np.float32),
+    )
+    scene = mi.load_dict({"type": "scene", "plate": make_splats_shape(splats, np.eye(4), plate, instance=1)})
+    eye = shift, -distance - 0.0005, 0
+    view = ms.Camera.look_at(eye, (shift, 0, 0), width=WIDTH, height=HEIGHT, fov_x=40)
+    found = render_silhouettes(make_integrator(shadow="none"), scene, view, source=source)[1]
+    inside = found.clipped(WIDTH, HEIGHT)
+    assert inside is not None and inside.area == WIDTH * HEIGHT
+    assert found.area + found.beyond == pytest.approx((view.fx * side / distance) ** 2, rel=0.01)
+
+
+def test_an_object_that_reaches_behind_the_camera_has_a_large_finite_area() -> None:
+    ensure_variant()
+    floor = trimesh.creation.box((4, 4, 0.01))
+    scene = mi.load_dict({"type": "scene", "floor": make_splats_shape(ball(1)[0], np.eye(4), floor, instance=1)})
+    view = ms.Camera.look_at((0, 0, 0.1), (0, 1, 0.1), width=WIDTH, height=HEIGHT, fov_x=40)
+    found = render_silhouettes(make_integrator(shadow="none"), scene, view, source="proxies")[1]
+    assert 10 * found.area < found.beyond < np.inf

@@ -18,7 +18,7 @@ from mitsplat.quality import Quality
 from mitsplat.renderer.composition.scene_contents import ContentsReader, SceneContents, same_shapes
 from mitsplat.renderer.instances.antialiasing import Edges
 from mitsplat.renderer.instances.primary_visibility import NO_SPLAT, PrimaryVisibility
-from mitsplat.renderer.instances.silhouettes import proxy_silhouettes, splat_silhouettes
+from mitsplat.renderer.instances.silhouettes import proxy_silhouettes, splat_silhouettes, with_area_beyond
 from mitsplat.renderer.light.light import Accuracy, light_factor
 from mitsplat.renderer.light.lit_surface import VisiblePixels, VisibleSurfaces
 from mitsplat.renderer.meshes.mesh_radiance import PathTracer
@@ -252,15 +252,17 @@ class LayerRenderer:
         """
         contents = self._contents.read(scene, self.occluders == "splats")
         view = view_of(sensor)
-        if source == "splats":
-            if contents.clouds is None:
-                return {}
-            return splat_silhouettes(contents.clouds, contents.placements, view, self.quality)
         proxies: dict[int, list[tuple[trimesh.Trimesh, np.ndarray]]] = {}
         for shape in contents.shapes:
             if getattr(shape, "instance", 0) and shape.proxy is not None:
                 proxies.setdefault(shape.instance, []).append((shape.proxy, shape.world_from_splats))
-        return proxy_silhouettes(proxies, view)
+        if source != "splats":
+            found = proxy_silhouettes(proxies, view)
+        elif contents.clouds is None:
+            return {}
+        else:
+            found = splat_silhouettes(contents.clouds, contents.placements, view, self.quality)
+        return with_area_beyond(found, proxies, view)
 
     def blocked(self, scene: mi.Scene, starts: Float64Array, ends: Float64Array) -> BoolArray:
         """Return True for the segments between points (N, 3) [m] that a proxy or a visible mesh intersects."""

@@ -18,7 +18,7 @@ import mitsuba as mi
 import numpy as np
 import trimesh
 
-from mitsplat.geometry.camera import Camera, Lens
+from mitsplat.geometry.camera import FISHEYE_MAX, Camera, Lens
 from mitsplat.images.masks import Silhouette
 from mitsplat.quality import Quality
 from mitsplat.renderer.projection.clouds import CloudSet, Placement
@@ -37,6 +37,10 @@ distortion cannot be inverted that far out, the largest margin with an inverse i
 
 _ROWS_OF_COLUMN = (np.arange(1 << TILE_HEIGHT)[:, None] >> np.arange(TILE_HEIGHT) & 1).astype(bool)
 """Pixels of a tile column, from the top, that the bits of a number cover."""
+
+_MAX_SLOPE = math.tan(FISHEYE_MAX)
+_SAMPLES_BEYOND = 512
+"""Range of slopes in which silhouettes beyond the canvas are sampled, and number of samples along each axis."""
 
 _INVERTED = 0.01
 """Largest round-trip error of a pixel through the inverted distortion [px]."""
@@ -106,6 +110,49 @@ def proxy_silhouettes(
         if hit.any():
             found[instance] = Silhouette.cropped(hit, x0 - left, y0 - top)
     return found
+
+
+def with_area_beyond(
+    found: Mapping[int, Silhouette],
+    proxies: Mapping[int, Sequence[tuple[trimesh.Trimesh, np.ndarray]]],
+    view: CameraView,
+) -> dict[int, Silhouette]:
+    """Return silhouettes with the area of their proxies beyond the canvas, where they reach it and the image."""
+    canvas, left, top = _canvas(view)
+    result = dict(found)
+    for instance, silhouette in found.items():
+        x0, y0, x1, y1 = silhouette.box
+        reaches = x0 == -left or y0 == -top or x1 == canvas.width - left or y1 == canvas.height - top
+        if reaches and instance in proxies and silhouette.clipped(view.width, view.height) is not None:
+            result[instance] = replace(silhouette, beyond=_area_beyond(canvas, proxies[instance]))
+    return result
+
+
+def _area_beyond(canvas: CameraView, parts: Sequence[tuple[trimesh.Trimesh, np.ndarray]]) -> float:
+    """Return the area that meshes cover outside of a canvas [px], up to 85 degrees beside the optical axis.
+
+    The area is sampled in the plane of slopes, in which pixels have their size at the centre of the lens.
+    """
+    camera_from_world = canvas.camera.camera_from_world
+    points = np.concatenate([trimesh.transform_points(mesh.vertices, camera_from_world @ pose) for mesh, pose in parts])
+    low, high = np.full(2, -_MAX_SLOPE), np.full(2, _MAX_SLOPE)
+    if (points[:, 2] > canvas.near).all():
+        slopes = points[:, :2] / points[:, 2:]
+        low, high = np.maximum(slopes.min(axis=0), low), np.minimum(slopes.max(axis=0), high)
+    step = (high - low) / _SAMPLES_BEYOND
+    if not (step > 0).all():
+        return 0.0
+    count = _SAMPLES_BEYOND
+    (fx, fy), (cx, cy) = 1 / step, -low / step
+    wide = CameraView(count, count, float(fx), float(fy), float(cx), float(cy), canvas.world_from_camera)
+    window, hit = (0, 0, count, count), np.zeros(count**2, dtype=bool)
+    for mesh, pose in parts:
+        hit |= np.array(_trace_alone(wide, window, mesh, pose))
+    row, column = np.divmod(np.flatnonzero(hit), count)
+    rays = np.column_stack([low + (np.column_stack([column, row]) + 0.5) * step, np.ones(len(row))])
+    pixels, _ = replace(canvas.camera, world_from_camera=np.eye(4)).project(rays)
+    inside = ((pixels >= 0) & (pixels < (canvas.width, canvas.height))).all(axis=1)
+    return float(np.count_nonzero(~inside) * step.prod() * canvas.fx * canvas.fy)
 
 
 def _canvas(view: CameraView) -> tuple[CameraView, int, int]:

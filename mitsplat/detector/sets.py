@@ -4,9 +4,14 @@
 kind     content of the folder
 ======== ===============================================================================================================
 mitsplat ``dataset.json``, and files of the format ``yolo``
-yolo     ``data.yaml`` with folders or lists of images; labels lie at the paths that Ultralytics expects
-coco     JSON files of ``images``, ``annotations`` and ``categories``, images beside them or anywhere in the folder
+yolo     ``data.yaml`` with folders or lists of images, or ``classes.txt`` beside the folders ``images`` and ``labels``;
+         labels lie at the paths that Ultralytics expects
+coco     JSON files of ``images``, ``annotations`` and ``categories``, in the folder, in ``annotations`` or in folders
+         of splits; images beside them or anywhere in the folder
 ======== ===============================================================================================================
+
+Exact duplicates of a label count once, as in Ultralytics. A COCO category without labels that is only the supercategory
+of others is no class; Roboflow writes one.
 
 All images and labels are read and checked first. A truncated image or label is therefore an error, and later readers
 cannot skip it silently.
@@ -40,8 +45,14 @@ Split = Literal["train", "val", "test", "all"]
 STRIDE = 32
 """Divisor of the image sides in Ultralytics' networks [px]."""
 
+CLASSES_FILE = "classes.txt"
+"""Class names in YOLO exports of Label Studio, one a line; all their images belong to every split."""
+
 _MAX_COCO_BYTES = 1 << 32
 """Largest COCO file that is read [bytes]; the file of COCO's 118,287 training images has 0.45e9 bytes."""
+_SPLIT_FOLDERS = {"train": "train", "val": "val", "valid": "val", "validation": "val", "test": "test"}
+"""Folders of splits in COCO exports, and the split of each."""
+
 _OUTSIDE_TOLERANCE = 0.01
 """Largest distance of a position from the image, as a share of its sides; such positions are clipped."""
 
@@ -178,6 +189,9 @@ def read_set(path: str | Path, split: Split, progress: Progress | None = None) -
             for name, given in entries.items()
         }
         return _read_yolo(root, "yolo", split, _class_names(content, root / "data.yaml"), listed, progress)
+    if (root / CLASSES_FILE).is_file() and (root / "images").is_dir():
+        names = _class_names({"names": _read_lines(root / CLASSES_FILE)}, root / CLASSES_FILE)
+        return _read_yolo(root, "yolo", split, names, {name: ["images"] for name in SPLITS}, progress)
     return _read_coco(root, split, progress)
 
 
@@ -190,8 +204,13 @@ def reorder_classes(found: LabelledSet, class_names: Sequence[str], owner: str) 
     own, wanted = set(found.class_names), set(class_names)
     if own != wanted:
         more, less = sorted(own - wanted), sorted(wanted - own)
-        differences = [f"it also has {', '.join(more)}"] * bool(more) + [f"it lacks {', '.join(less)}"] * bool(less)
-        raise InputError(f"{found.root}: its classes must be those of {owner}: {' and '.join(differences)}")
+        counts = found.to_record()["instances"]
+        differences = [f"it also has {', '.join(f'{name} ({counts[name]} labels)' for name in more)}"] * bool(more)
+        differences += [f"it lacks {', '.join(less)}"] * bool(less)
+        raise InputError(
+            f"{found.root}: its classes must be those of {owner}: {' and '.join(differences)}; rename its classes, or "
+            "remove those without labels"
+        )
     if tuple(class_names) == found.class_names:
         return found
     place = [list(class_names).index(name) for name in found.class_names]
@@ -305,11 +324,21 @@ def _listed_images(root: Path, entry: str) -> list[Path]:
         return images_below(place)
     if not place.is_file():
         return []
+    images = [place.parent / line for line in _read_lines(place)]
+    # CVAT lists `data/images/...`, but its archives begin with `images`.
+    shorter = [place.parent / line.removeprefix("data/") for line in _read_lines(place)]
+    return [
+        other if not image.exists() and other.exists() else image for image, other in zip(images, shorter, strict=True)
+    ]
+
+
+def _read_lines(path: Path) -> list[str]:
+    """Return the lines of a text file without blank ones."""
     try:
-        lines = place.read_text(encoding="utf-8-sig").split("\n")
+        lines = path.read_text(encoding="utf-8-sig").split("\n")
     except UnicodeDecodeError as error:
-        raise InputError(f"{place}: must be a folder of images, or a list of them in UTF-8 ({error.reason})") from error
-    return [place.parent / line.strip() for line in lines if line.strip()]
+        raise InputError(f"{path}: must be lines of text in UTF-8 ({error.reason})") from error
+    return [line.strip() for line in lines if line.strip()]
 
 
 def _label_file(image: Path) -> Path:
@@ -319,6 +348,7 @@ def _label_file(image: Path) -> Path:
 
 
 def _yolo_instances(text: str, path: Path, num_classes: int, size: tuple[int, int]) -> Iterator[LabelledObject]:
+    seen: set[bytes] = set()
     for number, line in enumerate(text.splitlines(), start=1):
         words = line.split()
         if not words:
@@ -334,6 +364,9 @@ def _yolo_instances(text: str, path: Path, num_classes: int, size: tuple[int, in
             )
         if values[0] not in range(num_classes):
             raise InputError(f"{place}: the class must be 0 to {num_classes - 1} (got {words[0]})")
+        if (key := values.astype(np.float32).tobytes()) in seen:  # Ultralytics compares numbers of this precision
+            continue
+        seen.add(key)
         points = values[1:].reshape(-1, 2)
         if len(values) == 5:
             (x, y), (w, h) = points
@@ -376,7 +409,11 @@ def _read_coco(root: Path, split: Split, progress: Progress | None) -> LabelledS
 def _coco_part(root: Path, split: Split, path: Path, content: dict[str, Any], progress: Progress | None) -> LabelledSet:
     """Return the labelled images of one COCO file."""
     try:
-        categories = sorted(content["categories"], key=lambda category: category["id"])
+        used = {annotation["category_id"] for annotation in content["annotations"]}
+        above = {c["name"]: c.get("supercategory") for c in content["categories"]}
+        parents = {parent for name, parent in above.items() if parent != name and above.get(parent) != parent}
+        categories = [c for c in content["categories"] if c["id"] in used or c["name"] not in parents]
+        categories.sort(key=lambda category: category["id"])
         names = tuple(str(category["name"]) for category in categories)
         index = {category["id"]: i for i, category in enumerate(categories)}
         by_image: dict[Any, list[dict[str, Any]]] = {image["id"]: [] for image in content["images"]}
@@ -398,15 +435,18 @@ def _coco_part(root: Path, split: Split, path: Path, content: dict[str, Any], pr
     def read(image: dict[str, Any]) -> Sample:
         file = find(str(image.get("file_name")))
         width, height, shown = check_image(file)
-        if (image.get("width"), image.get("height")) != (width, height):
+        if (image.get("width", width), image.get("height", height)) != (width, height):
             raise InputError(
                 f"{file}: must have the size in {path.name}, {image.get('width')} x {image.get('height')} px, "
                 f"after EXIF orientation (got {width} x {height})"
             )
         found = by_image[image["id"]]
-        instances = tuple(_coco_instance(a, index[a["category_id"]], (width, height), path) for a in found)
+        instances = {
+            (one.class_index, one.box, one.rle and one.rle["counts"], one.crowd): one
+            for one in (_coco_instance(a, index[a["category_id"]], (width, height), path) for a in found)
+        }
         shown.add_json([names, found])
-        return Sample(file, _relative_name(root, file), width, height, instances, shown.hexdigest())
+        return Sample(file, _relative_name(root, file), width, height, tuple(instances.values()), shown.hexdigest())
 
     images = sorted(content["images"], key=lambda image: str(image.get("file_name")))
     return LabelledSet(root, "coco", split, names, _read_samples(read, images, root, progress))
@@ -414,7 +454,8 @@ def _coco_part(root: Path, split: Split, path: Path, content: dict[str, Any], pr
 
 def _coco_files(root: Path, split: Split) -> dict[Path, dict[str, Any]]:
     """Return the COCO files of a split and their contents: one file, or all files for the split ``all``."""
-    paths = [path for folder in (root, root / "annotations") for path in sorted(folder.glob("*.json"))]
+    folders = (root, *(root / name for name in ("annotations", *_SPLIT_FOLDERS)))
+    paths = [path for folder in folders for path in sorted(folder.glob("*.json"))]
     files = {path: _read_json(path) for path in paths}
     files = {
         path: content
@@ -422,7 +463,7 @@ def _coco_files(root: Path, split: Split) -> dict[Path, dict[str, Any]]:
         if isinstance(content, dict) and {"images", "annotations", "categories"} <= content.keys()
     }
     if len(files) > 1:
-        named = {path: content for path, content in files.items() if split in re.findall("[a-z]+", path.stem.lower())}
+        named = {path: content for path, content in files.items() if split in _split_words(path.relative_to(root))}
         files = named or files
     if len(files) == 1 or (files and split == "all"):
         return files
@@ -432,6 +473,11 @@ def _coco_files(root: Path, split: Split) -> dict[Path, dict[str, Any]]:
         f"{root}: must be a dataset of mitsplat (dataset.json), a YOLO folder (data.yaml) or a COCO folder (a JSON "
         "file with images, annotations and categories)"
     )
+
+
+def _split_words(path: Path) -> list[str]:
+    """Return the words of a path, those of other tools' splits translated."""
+    return [_SPLIT_FOLDERS.get(word, word) for word in re.findall("[a-z]+", str(path.with_suffix("")).lower())]
 
 
 def _file_names(files: Iterable[Path]) -> str:
@@ -452,6 +498,7 @@ def _image_finder(root: Path, listing: Path) -> Callable[[str], Path]:
         below.setdefault(path.name, []).append(path)
 
     def find(name: str) -> Path:
+        name = name.replace("\\", "/")  # as Label Studio writes it on Windows
         if not is_inside(root, name):
             raise InputError(f"{listing}: file_name must be of an image in {root} (got {name})")
         for folder in (listing.parent, root):

@@ -231,7 +231,10 @@ def read_sets(
         found.append(read_set(real, "train", progress))
     for one in found:
         if all(instance.crowd for sample in one.samples for instance in sample.instances):
-            raise InputError(f"{one.root}: all labels are crowds, which cannot be used for training")
+            raise InputError(
+                f"{one.root}: all labels are crowds, which cannot be used for training; set iscrowd to 0 if each is "
+                "one object, because CVAT exports masks as crowds"
+            )
     found = [reorder_classes(one, found[0].class_names, str(found[0].root)) for one in found]
     if masks:
         for one in found:

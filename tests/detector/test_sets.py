@@ -89,7 +89,7 @@ def test_classes_are_matched_by_name(tmp_path: Path) -> None:
     assert turned.class_names == CLASSES
     for sample, seed in zip(turned.samples, range(3), strict=True):
         assert [CLASSES[i.class_index] for i in sample.instances] == [name for name, _ in paint(seed)[1]]
-    with pytest.raises(InputError, match="it also has box and it lacks gear, nut"):
+    with pytest.raises(InputError, match=r"it also has box \(2 labels\) and it lacks gear, nut"):
         reorder_classes(found, ("disc", "nut", "gear"), "out/cell")
 
 
@@ -199,7 +199,7 @@ YOLO_FAULTS: dict[str, tuple[Callable[[Path], object], str]] = {
             (root / "data.yaml").write_text("train: some.txt\nnames: [disc, box]\n"),
             (root / "some.txt").write_bytes("./images/train/caf\u00e9.png\n".encode("latin-1")),
         ),
-        r"some.txt: must be a folder of images, or a list of them in UTF-8",
+        r"some.txt: must be lines of text in UTF-8",
     ),
     "nowhere": (
         lambda root: (root / "data.yaml").write_text("train: pictures\nnames: [disc, box]\n"),
@@ -368,3 +368,129 @@ def test_the_digest_changes_with_images_and_labels(tmp_path: Path) -> None:
         label.read_text().replace("0 ", "1 ", 1) if label.read_text()[0] == "0" else "0" + label.read_text()[1:]
     )
     assert read_set(root, "train").to_record()["digest"] != first["digest"]
+
+
+def test_exact_duplicates_of_a_label_line_count_once(tmp_path: Path) -> None:
+    """As in Ultralytics, which compares class and positions in single precision."""
+    root = write_yolo(tmp_path, {"train": 1})
+    box, polygon = "0 0.5 0.5 0.2 0.2\n", "1 0.1 0.1 0.3 0.1 0.3 0.3\n"
+    same_box = "1 0.1 0.1 0.3 0.1 0.3 0.3 0.1 0.3\n"
+    other_class, rounded, moved = "1 0.5 0.5 0.2 0.2\n", "0 0.50 0.500000001 0.2 0.2\n", "0 0.5 0.50001 0.2 0.2\n"
+    text = box + polygon + box + same_box + polygon + other_class + rounded + moved
+    (root / "labels/train/000000.txt").write_text(text)
+    (sample,) = read_set(root, "train").samples
+    assert [one.class_index for one in sample.instances] == [0, 1, 1, 1, 0]
+    assert [one.polygon is None for one in sample.instances] == [True, False, False, True, True]
+
+
+def edit_coco(root: Path, edit: Callable[[dict], object]) -> Path:  # type: ignore[type-arg]
+    content = json.loads((root / "labels.json").read_text())
+    edit(content)
+    (root / "labels.json").write_text(json.dumps(content))
+    return root
+
+
+def test_exact_duplicates_of_a_coco_annotation_count_once(tmp_path: Path) -> None:
+    root = write_coco(tmp_path, 2)
+    once = read_set(root, "train").to_record()["instances"]
+
+    def repeat(content: dict) -> None:  # type: ignore[type-arg]
+        content["annotations"] += [one | {"id": one["id"] + 100} for one in content["annotations"]]
+
+    assert read_set(edit_coco(root, repeat), "train").to_record()["instances"] == once
+
+
+def parent(name: str, above: str, number: int = 0) -> dict[str, object]:
+    return {"id": number, "name": name, "supercategory": above}
+
+
+def test_an_unlabelled_supercategory_is_no_class(tmp_path: Path) -> None:
+    """Roboflow writes the project as category 0, above all classes."""
+    root = write_coco(tmp_path, 2)
+    edit_coco(root, lambda c: [one.update(supercategory="parts") for one in c["categories"]])
+    edit_coco(root, lambda c: c["categories"].append(parent("parts", "none")))
+    found = read_set(root, "train")
+    assert found.class_names == ("box", "disc") and found.samples[0].instances
+    reorder_classes(found, CLASSES, "the dataset")
+
+
+def test_a_labelled_supercategory_stays_a_class_and_has_a_remedy(tmp_path: Path) -> None:
+    root = write_coco(tmp_path, 2)
+    edit_coco(root, lambda c: [one.update(supercategory="parts") for one in c["categories"]])
+    edit_coco(root, lambda c: c["categories"].append(parent("parts", "none")))
+    edit_coco(root, lambda c: c["annotations"][0].update(category_id=0))
+    found = read_set(root, "train")
+    assert found.class_names == ("parts", "box", "disc")
+    with pytest.raises(
+        InputError, match=r"also has parts \(1 labels\); rename its classes, or remove those without lab"
+    ):
+        reorder_classes(found, CLASSES, "the dataset")
+
+
+def test_an_unlabelled_class_above_itself_stays_a_class(tmp_path: Path) -> None:
+    root = edit_coco(write_coco(tmp_path, 2), lambda c: c["categories"].append(parent("person", "person", 9)))
+    edit_coco(root, lambda c: c["categories"].append(parent("child", "person", 12)))
+    assert read_set(root, "train").class_names == ("box", "disc", "person", "child")
+
+
+def test_a_coco_export_with_folders_of_splits_is_read(tmp_path: Path) -> None:
+    """Roboflow: train/_annotations.coco.json, valid/_annotations.coco.json, beside the images."""
+    for number, split in enumerate(("train", "valid")):
+        other = write_coco(tmp_path / f"made {split}", 2 + number, first=10 * number)
+        (tmp_path / "export" / split).mkdir(parents=True)
+        for image in (other / "photos").iterdir():
+            image.rename(tmp_path / "export" / split / f"{split}_{image.name}")
+        edit_coco(other, lambda c, split=split: [i.update(file_name=f"{split}_{i['file_name']}") for i in c["images"]])
+        (other / "labels.json").rename(tmp_path / "export" / split / "_annotations.coco.json")
+    assert [len(read_set(tmp_path / "export", split).samples) for split in ("train", "val", "all")] == [2, 3, 5]
+
+
+def test_a_coco_export_without_sizes_and_with_backslashes_is_read(tmp_path: Path) -> None:
+    root = write_coco(tmp_path, 2)
+
+    def edit(content: dict) -> None:  # type: ignore[type-arg]
+        for image in content["images"]:
+            image["file_name"] = "photos\\" + image["file_name"]
+            del image["width"], image["height"]
+
+    assert [sample.name for sample in read_set(edit_coco(root, edit), "train").samples] == [
+        "photos/p0.png",
+        "photos/p1.png",
+    ]
+
+
+def test_images_without_labels_are_read_as_empty(tmp_path: Path) -> None:
+    coco = write_coco(tmp_path / "coco", 3)
+    edit_coco(coco, lambda c: c.update(annotations=[a for a in c["annotations"] if a["image_id"] == 10]))
+    assert [bool(sample.instances) for sample in read_set(coco, "train").samples] == [False, True, False]
+    yolo = write_yolo(tmp_path / "yolo", {"train": 3})
+    (yolo / "labels/train/000000.txt").unlink()
+    (yolo / "labels/train/000002.txt").write_text("\n")
+    assert [bool(sample.instances) for sample in read_set(yolo, "train").samples] == [False, True, False]
+
+
+def test_polygons_mixed_with_boxes_are_read_line_by_line(tmp_path: Path) -> None:
+    root = write_yolo(tmp_path, {"train": 1})
+    (root / "labels/train/000000.txt").write_text("0 0.5 0.5 0.2 0.4\n1 0.1 0.1 0.3 0.1 0.3 0.3\n")
+    (sample,) = read_set(root, "train").samples
+    np.testing.assert_allclose(sample.instances[0].box, (0.4 * WIDTH, 0.3 * HEIGHT, 0.6 * WIDTH, 0.7 * HEIGHT))
+    assert [one.has_mask for one in sample.instances] == [False, True]
+
+
+def test_a_yolo_export_of_label_studio_is_read(tmp_path: Path) -> None:
+    made = write_yolo(tmp_path / "made", {"train": 3})
+    root = tmp_path / "export"
+    root.mkdir()
+    for folder in ("images", "labels"):
+        (made / folder / "train").rename(root / folder)
+    (root / "classes.txt").write_text("disc\nbox\n")
+    for split in ("train", "val", "all"):
+        found = read_set(root, split)  # type: ignore[arg-type]
+        assert found.class_names == ("disc", "box") and len(found.samples) == 3
+
+
+def test_a_list_of_cvat_is_followed(tmp_path: Path) -> None:
+    root = write_yolo(tmp_path, {"train": 2})
+    (root / "train.txt").write_text("data/images/train/000000.png\ndata/images/train/000001.png\n")
+    (root / "data.yaml").write_text("path: .\ntrain: train.txt\nnames:\n  0: disc\n  1: box\n")
+    assert len(read_set(root, "train").samples) == 2

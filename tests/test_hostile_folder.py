@@ -76,7 +76,7 @@ def service():
 
 
 def presets():
-    from mitsplat.frames.speed_accuracy import measure_steps
+    from mitsplat.frames.accuracy.speed_accuracy import measure_steps
     measure_steps(Path("missing.ply"), [])
 
 

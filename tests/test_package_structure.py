@@ -18,7 +18,7 @@ LAYERS = (
     ("reconstruct.pipeline", "report"),
     ("audit", "checks", "surroundings", "view"),
     ("dataset", "importing"),
-    ("bake", "formats", "reconstruct"),
+    ("bake", "formats", "frames.accuracy", "reconstruct"),
     ("fit", "frames", "reconstruct.materials"),
     ("renderer",),
     ("plugins",),

@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.record import figure, recording
-from mitsplat.frames.accuracy_chart import draw_chart
-from mitsplat.frames.speed_accuracy import measure_steps
+from mitsplat.frames.accuracy.accuracy_chart import draw_chart
+from mitsplat.frames.accuracy.speed_accuracy import measure_steps
 
 UNITS = {"seconds": "s", "psnr": "dB", "objects": "dB", "memory": "GiB"}
 

@@ -35,8 +35,8 @@ from scipy.stats import spearmanr
 # isort: on
 from benchmarks.record import figure, recording
 from benchmarks.render.captures import CAPTURES
+from mitsplat.frames.accuracy.speed_accuracy import look_around
 from mitsplat.frames.frame import Renderer
-from mitsplat.frames.speed_accuracy import look_around
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.camera import Camera
 from mitsplat.quality import PRESETS, Quality

@@ -29,7 +29,7 @@ import numpy as np
 # isort: on
 from benchmarks.record import figure, recording
 from benchmarks.render.volprim import render_volprim, volprim_scene
-from mitsplat.frames.speed_accuracy import look_around, picture_of
+from mitsplat.frames.accuracy.speed_accuracy import look_around, picture_of
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.camera import Camera
 from mitsplat.quality import PRESETS, Quality

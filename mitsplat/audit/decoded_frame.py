@@ -134,6 +134,24 @@ class DecodedFrame:
             pixels, _ = cv2.projectPoints(points, zero, zero, self.intrinsics, self.distortion)
         return np.asarray(pixels, dtype=np.float64).reshape(-1, 2)
 
+    def has_no_pixel(self, points: Float64Array) -> BoolArray:
+        """Return True for points in the camera's frame (N, 3) beyond the rays of the lens.
+
+        The distance from the principal point does not grow all the way from the axis to their ray, or a fisheye would
+        show more than 85 degrees.
+        """
+        slopes = points[:, :2] / points[:, 2:]
+        beyond = np.zeros(len(points), dtype=bool)
+        if self.record["camera"]["lens"] == "fisheye":
+            beyond |= np.linalg.norm(slopes, axis=1) > np.tan(np.radians(85.0))
+        last = np.zeros(len(points))
+        for step in np.linspace(0, 1, 33)[1:] if self.distortion.any() else ():
+            shown = self.project(np.column_stack([step * slopes, np.ones(len(slopes))]))
+            away = np.linalg.norm(shown - self.intrinsics[:2, 2], axis=1)
+            beyond |= away < last
+            last = away
+        return beyond
+
     def ray_slopes(self, pixels: Float64Array) -> Float64Array:
         """Return the ray slopes (x / z, y / z) of pixels; both have shape (N, 2)."""
         pixels = np.ascontiguousarray(pixels, dtype=np.float64).reshape(-1, 1, 2)

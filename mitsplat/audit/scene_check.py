@@ -7,6 +7,7 @@ from itertools import chain
 
 import numpy as np
 
+from mitsplat.arrays import Float64Array
 from mitsplat.audit.dataset_check import DatasetCheck, Violations
 from mitsplat.audit.decoded_frame import DecodedFrame
 from mitsplat.storage.files import JsonObject
@@ -70,13 +71,17 @@ class SceneCheck(DatasetCheck):
         expected = scale @ [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]
         if np.abs(frame.intrinsics - expected).max() > 1e-9 * max(fx, fy, width, height):
             yield f"its intrinsics are not the scene's, {expected[0, 0]:.6g}, {expected[1, 1]:.6g} px"
-        if list(frame.distortion) != list(lens["distortion"]) or frame.record["camera"]["lens"] != lens["lens"]:
+        distortion = ([], "opencv") if self._output.get("rectify") else (list(lens["distortion"]), lens["lens"])
+        if (list(frame.distortion), frame.record["camera"]["lens"]) != distortion:
             yield "its lens distortion is not the scene's"
 
     def _check_camera_pose(self, frame: DecodedFrame) -> Iterator[str]:
         """Check the camera's position and direction: distance and direction to the target, or the ends of a path."""
         camera, pose = self._camera, np.array(frame.world_from_camera, dtype=np.float64)
         eye, axis = pose[:3, 3], pose[:3, 2]
+        if camera["kind"] == "fixed":
+            yield from _check_fixed_pose(camera, pose)
+            return
         if camera["kind"] == "path":
             views = self._output["views"]
             ends = {0: camera["keys"][0], views - 1: camera["keys"][-1]}
@@ -105,6 +110,30 @@ class SceneCheck(DatasetCheck):
         distance = float(np.linalg.norm(np.cross(axis, offset)))
         if distance > tolerance or (axis @ offset > 0 and high > tolerance):
             yield f"its camera looks past the scene's target by {distance:.3g} m"
+
+
+def _check_fixed_pose(camera: JsonObject, pose: Float64Array) -> Iterator[str]:
+    """Compare a pose with that of a fixed camera, or with its eye, target and upper direction."""
+    if (stated := camera["world_from_camera"]) is not None:
+        expected = np.array(stated, dtype=np.float64)
+        eye, axes = expected[:3, 3], expected[:3, :3]
+    else:
+        eye, ahead = np.array(camera["eye"]), np.subtract(camera["target"], camera["eye"])
+        ahead /= np.linalg.norm(ahead)
+        ups = np.array([camera["up"], (0, 1, 0), (0, 0, 1)], dtype=np.float64)
+        right = next(
+            side for side in np.cross(ahead, ups / np.linalg.norm(ups, axis=1)[:, None]) if side @ side > 1e-12
+        )
+        right /= np.linalg.norm(right)
+        axes = np.stack([right, np.cross(ahead, right), ahead], axis=1)
+    away = float(np.linalg.norm(pose[:3, 3] - eye))
+    if away > _SIGMAS * camera["jitter"] + _POSITION_TOLERANCE:
+        yield f"its camera is {away:.3g} m from the scene's fixed camera"
+    # The Frobenius norm of the difference of two rotations is sqrt(8) sin(angle / 2).
+    sine = float(np.linalg.norm(pose[:3, :3] - axes)) / np.sqrt(8)
+    angle = float(2 * np.degrees(np.arcsin(min(1.0, sine))))
+    if angle > _SIGMAS * camera["rotation_jitter"] + np.degrees(_POSITION_TOLERANCE):
+        yield f"its camera is turned by {angle:.3g} degrees from the scene's fixed camera"
 
 
 def _viewpoint(frame: DecodedFrame) -> JsonObject:

@@ -25,7 +25,8 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from mitsplat.arrays import BoolArray, Float32Array, Float64Array, Int32Array
 from mitsplat.errors import InputError
-from mitsplat.geometry.camera import Camera, Lens
+from mitsplat.geometry.camera import Camera
+from mitsplat.geometry.lens import Lens
 from mitsplat.images.colour import decode_srgb, encode_srgb
 from mitsplat.storage.content_hash import ContentHash
 from mitsplat.storage.files import IMAGE_ERRORS, copy_file, resolve_inside, write_file, write_text

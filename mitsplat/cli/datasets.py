@@ -168,7 +168,7 @@ def render(
             if quality is not None:
                 raise InputError("--quality and --tolerance both select the preset: give only one")
             from mitsplat.dataset.preflight import refuse, run_faults
-            from mitsplat.frames.speed_accuracy import choose_preset
+            from mitsplat.frames.accuracy.speed_accuracy import choose_preset
 
             refuse(loaded, run_faults(loaded))
             with progress_bars() as progress:
@@ -305,8 +305,8 @@ def chart(
     from rich.console import Console
     from rich.table import Table
 
-    from mitsplat.frames.accuracy_chart import draw_chart, write_csv
-    from mitsplat.frames.speed_accuracy import cheapest, check_tolerance, measure_steps
+    from mitsplat.frames.accuracy.accuracy_chart import draw_chart, write_csv
+    from mitsplat.frames.accuracy.speed_accuracy import cheapest, check_tolerance, measure_steps
     from mitsplat.runtime.device import find_device
 
     check_output_file(out, ".png")

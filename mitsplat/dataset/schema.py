@@ -19,7 +19,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from mitsplat.dataset.manifest import LONGEST_LINE, parse_line, read_lines
 from mitsplat.errors import InputError
-from mitsplat.geometry.camera import Camera, Lens
+from mitsplat.geometry.camera import Camera
+from mitsplat.geometry.lens import Lens
 from mitsplat.images.masks import decode_rle
 from mitsplat.scene.spec.camera_spec import CameraSpec
 from mitsplat.scene.spec.scene_spec import LabelRules, Output

@@ -23,6 +23,7 @@ import trimesh
 from scipy.spatial import ConvexHull
 from scipy.spatial.distance import pdist
 
+from mitsplat.errors import InputError
 from mitsplat.formats.format import AnnotationWriter, Catalogue, FrameFiles
 from mitsplat.formats.maps import encode_mask_png
 from mitsplat.geometry.camera import Camera
@@ -41,7 +42,16 @@ def scene_folder(record: Record) -> str:
 
 
 def write(files: FrameFiles) -> None:
-    """Write a frame's depth picture and masks, and add its image under a second name."""
+    """Write a frame's depth picture and masks, and add its image under a second name.
+
+    Raises:
+        InputError: If the camera of a frame made in Python has lens distortion.
+    """
+    if not files.frame.camera.is_pinhole:
+        raise InputError(
+            f"frame {files.frame.index}: bop must have a camera without lens distortion (got "
+            f"{list(files.frame.camera.distortion)})"
+        )
     scene = scene_folder(files.record)
     files.add_image(f"{scene}/rgb/{files.image_name}")
     files.add_depth(f"{scene}/depth/{files.number}.png")

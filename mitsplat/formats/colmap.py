@@ -10,6 +10,7 @@ from pathlib import Path
 
 from scipy.spatial.transform import Rotation
 
+from mitsplat.errors import InputError
 from mitsplat.formats.coco import image_file
 from mitsplat.formats.format import AnnotationWriter, Catalogue
 from mitsplat.geometry.camera import Camera
@@ -43,7 +44,14 @@ def camera_model(camera: Camera) -> str:
     """Return the line of a camera: model, size and parameters.
 
     Models are PINHOLE, OPENCV (k1 k2 p1 p2), FULL_OPENCV (and k3 k4 k5 k6) and OPENCV_FISHEYE.
+
+    Raises:
+        InputError: If the lens has thin-prism distortion.
     """
+    if len(camera.distortion) > 8:
+        raise InputError(
+            f"colmap must have a lens without thin-prism distortion (got s1 to s4 = {list(camera.distortion[8:])})"
+        )
     values = [camera.fx, camera.fy, camera.cx, camera.cy]
     if not camera.distortion:
         model = "PINHOLE"

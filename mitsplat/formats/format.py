@@ -76,11 +76,19 @@ class Catalogue:
         formats = scene.spec.output.formats
         if "yolo-pose" in formats and not any(keypoint_names):
             raise InputError(f"{scene.path}: output.formats: yolo-pose needs an asset with keypoints (got none)")
-        distortion = scene.spec.camera.intrinsics.distortion
-        if "bop" in formats and any(distortion):
-            raise InputError(
-                f"{scene.path}: output.formats: bop must have a camera without lens distortion (got {list(distortion)})"
-            )
+        lens = scene.spec.camera.intrinsics
+        shown = f"{'fisheye ' if lens.lens == 'fisheye' else ''}{list(lens.distortion)}"
+        if not (scene.spec.output.rectify or lens.is_pinhole):
+            if "bop" in formats:
+                raise InputError(
+                    f"{scene.path}: output.formats: bop must have a camera without lens distortion (got {shown}): set "
+                    "output.rectify: true for images of the pinhole camera"
+                )
+            if "colmap" in formats and len(lens.distortion) > 8:
+                raise InputError(
+                    f"{scene.path}: output.formats: colmap must have a lens without thin-prism distortion (got "
+                    f"{shown}): set output.rectify: true for images of the pinhole camera"
+                )
         return cls(
             scene.class_names,
             keypoint_names,

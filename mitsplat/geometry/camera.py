@@ -8,26 +8,24 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
-from typing import Any, Literal
+from typing import Any
 
 import cv2
 import numpy as np
 import numpy.typing as npt
-from numpy.polynomial import Polynomial
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
 from mitsplat.arrays import Float64Array, Int64Array
-
-Lens = Literal["opencv", "fisheye"]
-"""OpenCV camera models: rational with tangential distortion, or fisheye."""
-
-FISHEYE_MAX = float(np.radians(85.0))
-"""Maximum angle between a fisheye ray and the optical axis [rad]. Rays are stored as slopes, which diverge at 90
-degrees.
-"""
-
+from mitsplat.geometry.lens import (
+    Lens,
+    distortion_coefficients,
+    fisheye_radius,
+    largest_slope,
+    lens_fault,
+    undistort,
+)
+from mitsplat.geometry.rigid import rigid_matrix
 
 MAX_IMAGE_SIDE = 16384
 """Maximum side length of an image [px]."""
@@ -45,17 +43,19 @@ class Camera:
         fx, fy: Focal lengths [px].
         cx, cy: Principal point [px], pixel centres at +0.5 (the centre of an image is ``width / 2``).
         world_from_camera: Rigid transform of camera coordinates to world coordinates [m], shape (4, 4).
-        distortion: OpenCV coefficients ``k1, k2, p1, p2[, k3[, k4, k5, k6]]``, or empty for a pinhole camera; ``k1, k2,
-            k3, k4`` for a fisheye lens.
+        distortion: OpenCV coefficients ``k1, k2, p1, p2[, k3[, k4, k5, k6[, s1, s2, s3, s4]]]``, or empty for a pinhole
+            camera; ``k1, k2, k3, k4`` for a fisheye lens. Also the array of `cv2.calibrateCamera` or
+            `cv2.fisheye.calibrate`, such as (1, 5).
         near: Near clipping depth [m].
         lens: ``opencv``, or ``fisheye`` for OpenCV's fisheye model (Kannala and Brandt 2006).
         aperture_radius: Aperture radius of a thin lens [m]; 0 for a pinhole camera, which has no defocus blur.
         focus_distance: Focus depth of a thin lens along z [m].
 
     Raises:
-        ValueError: If a size is below 1, a focal length is not positive, or the pose is not rigid; if the number of
-            distortion coefficients is not 0, 4, 5 or 8 (4 for a fisheye lens); if a fisheye lens shows more than 85
-            degrees to any side of its axis; or if the aperture is negative or the focus is not beyond ``near``.
+        ValueError: If a size is below 1, a focal length is not positive, or the pose is not rigid; if the distortion
+            has another number of coefficients; if the image needs rays that the lens model does not have, because its
+            distortion folds inside the image or a fisheye lens shows more than 85 degrees to any side of its axis; or
+            if the aperture is negative or the focus is not beyond ``near``.
     """
 
     width: int
@@ -85,31 +85,27 @@ class Camera:
             raise ValueError(f"aperture_radius must be finite and >= 0 (got {self.aperture_radius})")
         if self.aperture_radius > 0 and not self.near < self.focus_distance < np.inf:
             raise ValueError(f"focus_distance must be finite and > near, {self.near} (got {self.focus_distance})")
-        if self.lens == "fisheye":
-            self._check_fisheye()
-        elif len(self.distortion) not in (0, 4, 5, 8):
-            raise ValueError(f"distortion must have 0, 4, 5 or 8 coefficients (got {len(self.distortion)})")
-        pose = np.array(self.world_from_camera, dtype=np.float64)
-        if pose.shape != (4, 4) or not np.isfinite(pose).all():
-            raise ValueError("world_from_camera must be a finite 4x4 matrix")
-        rotation = pose[:3, :3]
-        if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-5 or np.linalg.det(rotation) < 0:
-            raise ValueError("world_from_camera must be a rotation and a translation, without scale or mirror")
+        if self.lens not in ("opencv", "fisheye"):
+            raise ValueError(f"lens must be opencv or fisheye (got {self.lens!r})")
+        try:
+            object.__setattr__(self, "distortion", distortion_coefficients(self.distortion, self.lens))
+        except ValueError as error:
+            raise ValueError(f"distortion {error}") from None
+        if fault := lens_fault(
+            (self.width, self.height), (self.fx, self.fy), (self.cx, self.cy), self.distortion, self.lens
+        ):
+            raise ValueError(fault)
+        try:
+            pose = rigid_matrix(self.world_from_camera, "world_from_camera")
+        except ValueError as error:
+            raise ValueError(f"world_from_camera {error}") from None
         pose.flags.writeable = False
         object.__setattr__(self, "world_from_camera", pose)
 
-    def _check_fisheye(self) -> None:
-        if len(self.distortion) != 4:
-            raise ValueError(f"the distortion of a fisheye lens must have 4 coefficients (got {len(self.distortion)})")
-        x, y = np.meshgrid([0, self.width], [0, self.height])
-        farthest = float(np.hypot((x - self.cx) / self.fx, (y - self.cy) / self.fy).max())
-        angle = np.linspace(0, FISHEYE_MAX, 200)
-        shown = fisheye_radius(angle, self.distortion)
-        if np.any(np.diff(shown) <= 0) or farthest > shown[-1]:
-            raise ValueError(
-                f"a fisheye must show at most 85 degrees to each side, in growing distance from the principal point "
-                f"(got a corner at {farthest:.3g} focal lengths, where 85 degrees are at {shown[-1]:.3g})"
-            )
+    @property
+    def is_pinhole(self) -> bool:
+        """True if the lens does not distort."""
+        return self.lens == "opencv" and not any(self.distortion)
 
     @classmethod
     def look_at(
@@ -121,7 +117,7 @@ class Camera:
         width: int,
         height: int,
         fov_x: float,
-        distortion: Sequence[float] = (),
+        distortion: npt.ArrayLike = (),
         near: float = NEAR,
     ) -> Camera:
         """Create a camera at ``eye`` [m] that faces ``target`` [m].
@@ -142,7 +138,39 @@ class Camera:
             cx=0.5 * width,
             cy=0.5 * height,
             world_from_camera=look_at_pose(eye, target, up),
-            distortion=tuple(float(c) for c in distortion),
+            distortion=distortion,  # type: ignore[arg-type]  # converted by __post_init__
+            near=near,
+        )
+
+    @classmethod
+    def from_opengl(
+        cls,
+        world_from_camera: npt.ArrayLike,
+        *,
+        width: int,
+        height: int,
+        fx: float,
+        fy: float,
+        cx: float,
+        cy: float,
+        distortion: npt.ArrayLike = (),
+        near: float = NEAR,
+    ) -> Camera:
+        """Create a camera from a pose in OpenGL's axes (x right, y up, z backwards), as in Blender and NeRF datasets.
+
+        The intrinsics are those of :class:`Camera`: in pixels, with y downwards.
+
+        Raises:
+            ValueError: As for :class:`Camera`. A matrix in OpenGL's column-major order must be transposed first.
+        """
+        try:
+            pose = rigid_matrix(world_from_camera, "world_from_camera")
+        except ValueError as error:
+            raise ValueError(f"world_from_camera {error}") from None
+        return cls(
+            *(width, height, fx, fy, cx, cy),
+            world_from_camera=pose @ np.diag([1.0, -1.0, -1.0, 1.0]),
+            distortion=distortion,  # type: ignore[arg-type]  # converted by __post_init__
             near=near,
         )
 
@@ -225,7 +253,8 @@ class Camera:
         """Project world points (N, 3): return distorted pixel positions (N, 2) and depths along z [m] (N,).
 
         A point at or behind the camera plane has pixel position NaN. A point beyond the angle at which the distortion
-        turns back also has NaN, because its polynomial would place the point inside the image, where no ray shows it.
+        stops growing (or 85 degrees, for a fisheye lens) also has NaN, because its polynomial may place the point
+        inside the image, where no ray shows it.
         """
         pose = self.camera_from_world
         local = np.atleast_2d(np.asarray(points, dtype=np.float64)) @ pose[:3, :3].T + pose[:3, 3]
@@ -235,18 +264,17 @@ class Camera:
             depths = np.where(front, depth, np.nan)
             return local[:, :2] / depths[:, None] * (self.fx, self.fy) + (self.cx, self.cy), depth
         pixels = np.full((len(local), 2), np.nan)
+        slopes = local[front, :2] / depth[front, None]
+        slope = np.linalg.norm(slopes, axis=1)
         if self.lens == "fisheye":
-            slopes = local[front, :2] / depth[front, None]
-            slope = np.maximum(np.linalg.norm(slopes, axis=1, keepdims=True), 1e-12)
-            shown = slopes * fisheye_radius(np.arctan(slope), self.distortion) / slope
+            shown = slopes * (fisheye_radius(np.arctan(slope), self.distortion) / np.maximum(slope, 1e-12))[:, None]
             pixels[front] = shown * (self.fx, self.fy) + (self.cx, self.cy)
         elif front.any():
             projected, _ = cv2.projectPoints(
                 local[front], np.zeros(3), np.zeros(3), self.intrinsics, np.array(self.distortion)
             )
             pixels[front] = projected.reshape(-1, 2)
-            slopes = local[front, :2] / depth[front, None]
-            pixels[np.flatnonzero(front)[np.linalg.norm(slopes, axis=1) >= turning_slope(self.distortion)]] = np.nan
+        pixels[np.flatnonzero(front)[slope >= largest_slope(self.distortion, self.lens)]] = np.nan
         return pixels, depth
 
     def visible_pixels(self, points: npt.ArrayLike) -> tuple[Int64Array, Int64Array, Int64Array]:
@@ -271,62 +299,34 @@ class Camera:
         Args:
             image: Shape (H, W, C).
         """
-        half = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])  # OpenCV has pixel centres at whole numbers
-        lens, size = (self.intrinsics - half, np.array(self.distortion)), (self.width, self.height)
-        pinhole = np.asarray(cv2.getOptimalNewCameraMatrix(*lens, size, 0)[0])
-        x, y = cv2.initUndistortRectifyMap(*lens, np.eye(3), pinhole, size, cv2.CV_32FC1)
+        side = np.linspace(0, 1, 65)
+        left, right, top, bottom = (
+            self.ray_slopes(np.stack([x * self.width, y * self.height], axis=1))
+            for x, y in ((0 * side, side), (0 * side + 1, side), (side, 0 * side), (side, 0 * side + 1))
+        )
+        low = np.array([left[:, 0].max(), top[:, 1].max()])
+        fx, fy = (self.width, self.height) / (np.array([right[:, 0].min(), bottom[:, 1].min()]) - low)
+        cx, cy = (-low * (fx, fy)).tolist()
+        pinhole = replace(self, fx=float(fx), fy=float(fy), cx=cx, cy=cy, distortion=(), lens="opencv")
+        columns, rows = np.meshgrid(np.arange(self.width) + 0.5, np.arange(self.height) + 0.5)
+        slopes = pinhole.ray_slopes(np.stack([columns.ravel(), rows.ravel()], axis=1))
+        at_origin = replace(self, world_from_camera=np.eye(4))
+        at, _ = at_origin.project(np.column_stack([slopes, np.ones(len(slopes))]))
+        # OpenCV has pixel centres at whole numbers.
+        x, y = (at - 0.5).astype(np.float32).T.reshape(2, self.height, self.width)
         pixels = cv2.remap(image, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-        (fx, _, cx), (_, fy, cy), _ = (pinhole + half).tolist()
-        return np.asarray(pixels, dtype=np.uint8), replace(self, fx=fx, fy=fy, cx=cx, cy=cy, distortion=())
+        return np.asarray(pixels, dtype=np.uint8), pinhole
 
     def ray_slopes(self, pixels: npt.ArrayLike) -> Float64Array:
-        """Return undistorted ray slopes ``(x / z, y / z)`` in camera space, shape (N, 2), of pixel positions (N, 2)."""
+        """Return undistorted ray slopes ``(x / z, y / z)`` in camera space, shape (N, 2), of pixel positions (N, 2).
+
+        Positions outside the image for which the lens has no ray are NaN.
+        """
         pixels = np.asarray(pixels, dtype=np.float64).reshape(-1, 2)
         slopes = (pixels - (self.cx, self.cy)) / (self.fx, self.fy)
         if not self.distortion or not len(slopes):
             return slopes
-        if self.lens == "fisheye":
-            radius = np.maximum(np.linalg.norm(slopes, axis=1, keepdims=True), 1e-12)
-            angle = radius.copy()
-            for _ in range(20):
-                angle -= (fisheye_radius(angle, self.distortion) - radius) / fisheye_rate(angle, self.distortion)
-            return np.asarray(slopes * np.tan(np.clip(angle, 0, FISHEYE_MAX)) / radius, dtype=np.float64)
-        criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-12)
-        undistorted = cv2.undistortPoints(
-            slopes.reshape(-1, 1, 2), np.eye(3), np.array(self.distortion), None, np.eye(3), np.eye(3), criteria
-        )
-        return np.asarray(undistorted, dtype=np.float64).reshape(-1, 2)
-
-
-@lru_cache(maxsize=64)
-def turning_slope(distortion: tuple[float, ...]) -> float:
-    """Return the ray slope at which OpenCV's radial distortion stops growing; infinity if it always grows.
-
-    The distorted radius is ``r N(s) / D(s)`` with ``s = r^2``, ``N = 1 + k1 s + k2 s^2 + k3 s^3`` and ``D = 1 + k4 s +
-    k5 s^2 + k6 s^3``. Its derivative has the sign of ``N D + 2 s (N' D - N D')``. Poles (``D = 0``) end the valid range
-    too. Tangential distortion is small and is left out.
-    """
-    k1, k2, _, _, k3, k4, k5, k6 = (*distortion, *(0.0,) * (8 - len(distortion)))
-    top, bottom, s = Polynomial([1, k1, k2, k3]), Polynomial([1, k4, k5, k6]), Polynomial([0, 1])
-    rate = top * bottom + 2 * s * (top.deriv() * bottom - top * bottom.deriv())
-    roots = np.concatenate([rate.trim().roots(), bottom.trim().roots()])
-    real = roots[np.isreal(roots)].real
-    return float(np.sqrt(min(real[real > 0], default=np.inf)))
-
-
-def fisheye_radius(angle: Any, k: Sequence[Any]) -> Any:
-    """Return the distance from the principal point [focal lengths] of rays at an angle to the axis [rad].
-
-    The function works with host and device arrays.
-    """
-    square = angle * angle
-    return angle * (1 + square * (k[0] + square * (k[1] + square * (k[2] + square * k[3]))))
-
-
-def fisheye_rate(angle: Any, k: Sequence[Any]) -> Any:
-    """Return the derivative of :func:`fisheye_radius`."""
-    square = angle * angle
-    return 1 + square * (3 * k[0] + square * (5 * k[1] + square * (7 * k[2] + square * 9 * k[3])))
+        return undistort(slopes, self.distortion, self.lens)
 
 
 def direction(azimuth: float, sine: float) -> Float64Array:
@@ -352,7 +352,8 @@ def spiral(sines: Float64Array, turn: float = 0.0) -> Float64Array:
 def look_at_pose(eye: npt.ArrayLike, target: npt.ArrayLike, up: npt.ArrayLike = (0.0, 0.0, 1.0)) -> Float64Array:
     """Return ``world_from_camera`` (4, 4) of an OpenCV camera at ``eye`` [m] that faces ``target`` [m].
 
-    If the view is parallel to ``up``, the upper edge of the image points along +y of the world.
+    If the view is parallel to ``up``, the upper edge of the image points along +y of the world, or +z if the view is
+    parallel to y.
 
     Raises:
         ValueError: If a point is not finite, or if both points are equal.
@@ -369,7 +370,7 @@ def look_at_pose(eye: npt.ArrayLike, target: npt.ArrayLike, up: npt.ArrayLike = 
     forward = forward / distance
     right = _cross(forward, up)
     if np.linalg.norm(right) < 1e-6 * max(1.0, float(np.linalg.norm(up))):
-        right = _cross(forward, np.array([0.0, 1.0, 0.0]))
+        right = _cross(forward, np.eye(3)[1 if abs(forward[1]) < 0.9 else 2])
     right /= np.linalg.norm(right)
     pose = np.eye(4)
     pose[:3, :3] = np.stack([right, _cross(forward, right), forward], axis=1)

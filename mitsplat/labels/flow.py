@@ -81,7 +81,7 @@ def exposure_flow(
     """
     height, width = depth.shape
     columns, rows = np.arange(width) + 0.5, np.arange(height) + 0.5
-    distorted = camera.lens == "fisheye" or any(camera.distortion)
+    distorted = not camera.is_pinhole
     if distorted:
         pixels = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
         x, y = camera.ray_slopes(pixels).astype(np.float32).T.reshape(2, height, width)

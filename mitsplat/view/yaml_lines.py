@@ -27,9 +27,9 @@ def camera_lines(pose: Float64Array, look_at: npt.ArrayLike, intrinsics: Intrins
     """
     eye = pose[:3, 3]
     depth = max(float((np.asarray(look_at) - eye) @ pose[:3, 2]), 0.01)
-    key = {"eye": rounded(eye), "target": rounded(eye + depth * pose[:3, 2]), "up": rounded(-pose[:3, 1])}
-    lens = intrinsics.model_dump(exclude_defaults=True)
-    return f"camera:\n  kind: path\n  keys:\n    - {_flow(key)}\n  intrinsics: {_flow(lens)}\n"
+    stated = {"eye": eye, "target": eye + depth * pose[:3, 2], "up": -pose[:3, 1]}
+    lines = "".join(f"  {key}: {list(rounded(vector))}\n" for key, vector in stated.items())
+    return f"camera:\n  kind: fixed\n{lines}  intrinsics: {_flow(intrinsics.model_dump(exclude_defaults=True))}\n"
 
 
 def seed_line(seed: int) -> str:

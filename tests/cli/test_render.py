@@ -15,7 +15,7 @@ from mitsplat.dataset import write as dataset
 from mitsplat.dataset.write import DatasetSummary
 from mitsplat.errors import InputError
 from mitsplat.frames import mitsuba_xml as xml_scene
-from mitsplat.frames import speed_accuracy as chart
+from mitsplat.frames.accuracy import speed_accuracy as chart
 from mitsplat.runtime.device import CPU, Device
 from mitsplat.scene.scene import Scene
 from tests.cli.typed import Calls, run

@@ -15,7 +15,7 @@ from mitsplat.dataset import write as dataset
 from mitsplat.dataset.preflight import disk_faults, image_faults, refuse, run_faults, scene_warnings, sees
 from mitsplat.dataset.write import write_dataset
 from mitsplat.errors import InputError, MissingResourceError
-from mitsplat.frames import speed_accuracy as chart
+from mitsplat.frames.accuracy import speed_accuracy as chart
 from mitsplat.geometry.camera import Camera
 from mitsplat.geometry.mesh_points import points_inside
 from mitsplat.scene.layout import NO_PHYSICS, Layout

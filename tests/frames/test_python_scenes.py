@@ -81,7 +81,10 @@ def test_a_scene_made_in_python_equals_that_of_the_file(
     [
         ({"regoin": 1}, "SceneSpec: regoin: is not a known key (did you mean 'region'?)"),
         ({"seed": -1}, "SceneSpec: seed: must be >= 0 (got -1)"),
-        ({"camera": {"kind": "drone"}}, "SceneSpec: camera.kind: must be one of 'path', 'orbit', 'hemisphere'"),
+        (
+            {"camera": {"kind": "drone"}},
+            "SceneSpec: camera.kind: must be one of 'fixed', 'path', 'orbit', 'hemisphere'",
+        ),
         ({"objects": [{"asset": "assets/nut", "count": [3, 2]}]}, "SceneSpec: objects[0].count: must be [low, high]"),
         (
             {"shapes": (Shape(name="a", mesh="a.ply"), {"name": "b", "bxo": 1})},

@@ -17,9 +17,9 @@ from typer.testing import CliRunner
 from mitsplat.asset import Asset
 from mitsplat.cli import app
 from mitsplat.errors import InputError
-from mitsplat.frames import speed_accuracy
-from mitsplat.frames.accuracy_chart import curve_of, draw_chart
-from mitsplat.frames.speed_accuracy import Row, Step, cheapest, measure_steps, tolerance_steps
+from mitsplat.frames.accuracy import speed_accuracy
+from mitsplat.frames.accuracy.accuracy_chart import curve_of, draw_chart
+from mitsplat.frames.accuracy.speed_accuracy import Row, Step, cheapest, measure_steps, tolerance_steps
 from mitsplat.gaussians.spherical_harmonics import SH_C0
 from mitsplat.gaussians.surfels import place_surfels
 from mitsplat.images.colour import encode_srgb

@@ -12,7 +12,8 @@ import pytest
 
 from mitsplat.errors import InputError
 from mitsplat.formats.colmap import camera_model
-from mitsplat.geometry.camera import Camera, look_at_pose, turning_slope
+from mitsplat.geometry.camera import Camera, look_at_pose
+from mitsplat.geometry.lens import turning_slope
 from mitsplat.renderer.layers import describe_sensor
 from mitsplat.runtime.variant import ensure_variant
 
@@ -48,7 +49,7 @@ def test_rays_of_a_fisheye_project_to_their_pixels(distortion: tuple[float, ...]
     [
         ({"distortion": (0.1, 0.0)}, "must have 4 coefficients"),
         ({"fx": 200.0}, "at most 85 degrees"),
-        ({"distortion": (-0.5, 0.0, 0.0, 0.0)}, "in growing distance"),
+        ({"distortion": (-0.5, 0.0, 0.0, 0.0)}, "its distortion stops growing"),
     ],
 )
 def test_an_invalid_fisheye_is_refused(changes: dict[str, object], sentence: str) -> None:
@@ -107,7 +108,7 @@ THIN = replace(PINHOLE, aperture_radius=0.002, focus_distance=0.008, near=0.004)
 """A lens focused nearer than the default minimum depth of cameras."""
 
 
-@pytest.mark.parametrize("camera", [PINHOLE, FISHEYE, THIN, replace(PINHOLE, fy=1 / 3, cx=-7.1, distortion=BENT)])
+@pytest.mark.parametrize("camera", [PINHOLE, FISHEYE, THIN, replace(PINHOLE, fy=1000 / 3, cx=317.1, distortion=BENT)])
 def test_json_keeps_every_field_of_a_camera(camera: Camera) -> None:
     back = Camera.from_json(json.loads(json.dumps(camera.to_json())))
     for field in fields(Camera):
@@ -129,11 +130,11 @@ def test_the_turning_slope_is_the_root_of_the_derivative(distortion: tuple[float
 
 
 def test_points_beyond_the_turn_of_a_barrel_distortion_are_not_in_the_image() -> None:
-    camera = Camera(640, 480, 300.0, 300.0, 320.0, 240.0, np.eye(4), (-0.3, 0.0, 0.0, 0.0))
+    camera = Camera(640, 480, 700.0, 700.0, 320.0, 240.0, np.eye(4), (-0.3, 0.0, 0.0, 0.0))
     slopes = np.array([0.0, 0.5, 1.0, 1.05, 1.7, 3.0])
     pixels, depth = camera.project(np.column_stack([slopes, np.zeros(6), np.ones(6)]))
     assert np.isnan(pixels[4:]).all()
     assert (depth == 1.0).all()
-    np.testing.assert_allclose(pixels[:4, 0], 320 + 300 * (slopes[:4] - 0.3 * slopes[:4] ** 3), rtol=1e-9)
+    np.testing.assert_allclose(pixels[:4, 0], 320 + 700 * (slopes[:4] - 0.3 * slopes[:4] ** 3), rtol=1e-9)
     points = np.array([[3.0, 0.0, 1.0], [0.1, 0.0, -1.0], [0.5, 0.0, 1.0]])
     assert np.isnan(camera.project(points)[0]).all(axis=1).tolist() == [True, True, False]

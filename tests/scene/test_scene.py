@@ -198,7 +198,7 @@ def changed(data: SceneData, **changes: Any) -> SceneData:
         ({"camera__intrinsics": {"fov_x": 60, "cx": 3}}, "camera.intrinsics.cx: needs fx"),
         (
             {"camera__intrinsics": {"fx": 60, "distortion": [0.1]}},
-            "camera.intrinsics.distortion: must have 0, 4, 5 or 8 coefficients (got 1)",
+            "camera.intrinsics.distortion: must have 0, 4, 5, 8, 12 or 14 coefficients (got 1)",
         ),
         ({"lights__0": {"kind": "spot", "position": [0, 0, 1], "cone": 90}}, "lights[0].cone: must be < 90 (got 90)"),
         ({"lights__0__target": [0.5, 0, 1]}, "lights[0].target: must differ from the light's positions"),
@@ -549,6 +549,6 @@ def test_a_fisheye_with_a_field_beyond_85_degrees_is_refused(scene_data: SceneDa
     scene_data["output"] = {"width": 160, "height": 120}
     scene_data["camera"]["intrinsics"] = lens
     found = refusal(write_scene(scene_data))
-    assert found.startswith("camera.intrinsics: ")
+    assert found.startswith("camera.intrinsics.distortion: ")
     assert "85 degrees" in found
     load_scene(write_scene(scene_data | {"camera": scene_data["camera"] | {"intrinsics": lens | {"fx": 700}}}))

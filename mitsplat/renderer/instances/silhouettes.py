@@ -18,7 +18,8 @@ import mitsuba as mi
 import numpy as np
 import trimesh
 
-from mitsplat.geometry.camera import FISHEYE_MAX, Camera, Lens
+from mitsplat.geometry.camera import Camera
+from mitsplat.geometry.lens import FISHEYE_MAX, Lens, lens_fault
 from mitsplat.images.masks import Silhouette
 from mitsplat.quality import Quality
 from mitsplat.renderer.projection.clouds import CloudSet, Placement
@@ -41,9 +42,6 @@ _ROWS_OF_COLUMN = (np.arange(1 << TILE_HEIGHT)[:, None] >> np.arange(TILE_HEIGHT
 _MAX_SLOPE = math.tan(FISHEYE_MAX)
 _SAMPLES_BEYOND = 512
 """Range of slopes in which silhouettes beyond the canvas are sampled, and number of samples along each axis."""
-
-_INVERTED = 0.01
-"""Largest round-trip error of a pixel through the inverted distortion [px]."""
 
 
 def splat_silhouettes(
@@ -181,21 +179,10 @@ def _margin(
 ) -> float:
     if not distortion:
         return MARGINS[0]
-    camera = Camera(width, height, fx, fy, cx, cy, np.eye(4), distortion, lens=lens)
     for share in MARGINS[:-1]:
-        x, y = np.meshgrid(
-            np.linspace(-share * width, (1 + share) * width, 33), np.linspace(-share * height, (1 + share) * height, 33)
-        )
-        pixels = np.stack([x.ravel(), y.ravel()], axis=1)
-        slopes = camera.ray_slopes(pixels)
-        back, _ = camera.project(np.column_stack([slopes, np.ones(len(slopes))]))
-        # The radius must increase outwards: beyond a fold, the distortion is inverted to the wrong side.
-        radius = np.linalg.norm(slopes, axis=1).reshape(x.shape)
-        grows = all(
-            (np.diff(line, axis=1) > 0).all()
-            for line in (radius[:, 17:], radius[:, 16::-1], radius[17:].T, radius[16::-1].T)
-        )
-        if grows and np.abs(back - pixels).max() < _INVERTED:
+        left, top = int(share * width), int(share * height)
+        size, centre = (width + 2 * left, height + 2 * top), (cx + left, cy + top)
+        if not lens_fault(size, (fx, fy), centre, distortion, lens):
             return share
     return MARGINS[-1]
 

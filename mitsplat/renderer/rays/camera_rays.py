@@ -10,7 +10,16 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsplat.geometry.camera import FISHEYE_MAX, Camera, Lens, fisheye_radius, fisheye_rate
+from mitsplat.geometry.camera import Camera
+from mitsplat.geometry.lens import (
+    FISHEYE_MAX,
+    NEWTON_STEPS,
+    Lens,
+    fisheye_radius,
+    fisheye_rate,
+    opencv_distort,
+    padded,
+)
 
 TILE_WIDTH, TILE_HEIGHT = 8, 4
 """Size of a tile [px]. Smaller tiles create more pairs to sort. Larger tiles leave more lanes idle, deviate more from
@@ -34,7 +43,8 @@ class CameraView:
     Attributes:
         width, height: Image size [px].
         fx, fy, cx, cy: Intrinsics [px].
-        distortion: OpenCV coefficients k1, k2, p1, p2, k3, k4, k5, k6, or empty; k1, k2, k3, k4 of a fisheye lens.
+        distortion: OpenCV coefficients k1, k2, p1, p2, k3, k4, k5, k6[, s1, s2, s3, s4], or empty; k1, k2, k3, k4 of a
+            fisheye lens.
         near: Smallest visible depth [m].
         world_from_camera: Pose, OpenCV axes, shape (4, 4).
         samples: Rays per pixel along each axis.
@@ -63,8 +73,7 @@ class CameraView:
 
     def __post_init__(self) -> None:
         if self.lens == "opencv":
-            padded = (*self.distortion, *(0.0,) * (8 - len(self.distortion)))
-            object.__setattr__(self, "distortion", padded if any(padded) else ())
+            object.__setattr__(self, "distortion", padded(self.distortion) if any(self.distortion) else ())
         # Opaque values let a new camera reuse the compiled kernels.
         for name in ("fx", "fy", "cx", "cy", "near"):
             self._opaque[name] = dr.opaque(mi.Float, getattr(self, name))
@@ -210,7 +219,7 @@ class CameraView:
             return u - o["du"], v - o["dv"]
         u, v = xd, yd
         # Newton's method on the 2-D distortion map with its analytic Jacobian converges in 3 to 5 steps.
-        for _ in range(8):
+        for _ in range(NEWTON_STEPS):
             pu, pv, j = self.distort(u, v)
             ru, rv = xd - pu, yd - pv
             det = j[0] * j[3] - j[1] * j[2]
@@ -220,7 +229,7 @@ class CameraView:
     def _fisheye_slopes(self, x: mi.Float, y: mi.Float) -> tuple[mi.Float, mi.Float]:
         radius = dr.maximum(dr.sqrt(x * x + y * y), 1e-9)
         angle = mi.Float(radius)
-        for _ in range(8):
+        for _ in range(NEWTON_STEPS):
             angle -= (fisheye_radius(angle, self._k) - radius) / fisheye_rate(angle, self._k)
         scale = dr.tan(dr.clip(angle, 0, FISHEYE_MAX)) / radius
         return x * scale, y * scale
@@ -243,31 +252,15 @@ class CameraView:
     def distort(
         self, u: mi.Float, v: mi.Float
     ) -> tuple[mi.Float, mi.Float, tuple[mi.Float, mi.Float, mi.Float, mi.Float]]:
-        """Apply OpenCV's distortion to slopes; return them with the Jacobian (du'/du, du'/dv, dv'/du, dv'/dv).
+        """Apply the lens distortion to slopes; return them with the Jacobian (du'/du, du'/dv, dv'/du, dv'/dv).
 
-        Source: OpenCV documentation, "Camera Calibration and 3D Reconstruction", rational model, and "Fisheye camera
-        model" (Kannala and Brandt 2006).
+        Source: OpenCV documentation, "Fisheye camera model" (Kannala and Brandt 2006), and :func:`opencv_distort`.
         """
         if self.lens == "fisheye":
             return self._fisheye_distort(u, v)
-        k1, k2, p1, p2, k3, k4, k5, k6 = self._k
-        r2 = u * u + v * v
-        top, bottom = 1 + r2 * (k1 + r2 * (k2 + r2 * k3)), 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
-        radial = top / bottom
-        slope = (k1 + r2 * (2 * k2 + 3 * r2 * k3) - radial * (k4 + r2 * (2 * k5 + 3 * r2 * k6))) / bottom
-        pu = u * radial + 2 * p1 * u * v + p2 * (r2 + 2 * u * u)
-        pv = v * radial + p1 * (r2 + 2 * v * v) + 2 * p2 * u * v
-        cross = 2 * u * v * slope + 2 * p1 * u + 2 * p2 * v
-        return (
-            pu,
-            pv,
-            (
-                radial + 2 * u * u * slope + 2 * p1 * v + 6 * p2 * u,
-                cross,
-                cross,
-                radial + 2 * v * v * slope + 6 * p1 * v + 2 * p2 * u,
-            ),
-        )
+        distorted: tuple[mi.Float, mi.Float, tuple[mi.Float, mi.Float, mi.Float, mi.Float]]
+        distorted = opencv_distort(u, v, self._k)
+        return distorted
 
     def pixel_covariance(self, u: mi.Float, v: mi.Float, variance: float) -> tuple[mi.Float, mi.Float, mi.Float]:
         """Return the covariance (uu, uv, vv) in slopes at (u, v) of an isotropic ``variance`` [px^2]."""
@@ -365,8 +358,10 @@ class CameraView:
         hi_u = hi_v = mi.Float(-dr.inf)
         edge = {(i, dy) for i in range(TILE_WIDTH + 1) for dy in (0, TILE_HEIGHT)}
         edge |= {(dx, i) for dx in (0, TILE_WIDTH) for i in range(TILE_HEIGHT + 1)}
+        # Pixels beyond the image are not rendered. The lens may have no rays there.
+        width, height = dr.opaque(mi.Float, self.width), dr.opaque(mi.Float, self.height)
         for dx, dy in sorted(edge):
-            u, v = self.slopes(x + dx, y + dy)
+            u, v = self.slopes(dr.minimum(x + dx, width), dr.minimum(y + dy, height))
             lo_u, hi_u = dr.minimum(lo_u, u), dr.maximum(hi_u, u)
             lo_v, hi_v = dr.minimum(lo_v, v), dr.maximum(hi_v, v)
         table = dr.empty(mi.Float, 4 * tiles)

@@ -140,8 +140,8 @@ def _expand_enclosures(
 
 
 def _check_lens(spec: SceneSpec, path: Path) -> None:
-    """Check that the intrinsics are valid for the image size; a fisheye lens must not see backwards, for example."""
-    with errors_at_key(path, "camera", "intrinsics"):
+    """Check that the intrinsics are valid for the image size: the distortion must not fold inside the image."""
+    with errors_at_key(path, "camera", "intrinsics", *(["distortion"] if spec.camera.intrinsics.distortion else [])):
         try:
             camera_at(np.eye(4), spec.camera.intrinsics, spec.output)
         except ValueError as error:

@@ -19,7 +19,7 @@ from mitsplat.arrays import Float64Array
 from mitsplat.errors import InputError
 from mitsplat.geometry.camera import Camera, direction, interpolate_poses, look_at_pose
 from mitsplat.scene.planning.visibility_prediction import PredictedView, VisibilityPredictor
-from mitsplat.scene.spec.camera_spec import CameraHemisphere, CameraOrbit, Intrinsics
+from mitsplat.scene.spec.camera_spec import CameraFixed, CameraHemisphere, CameraOrbit, Intrinsics
 from mitsplat.scene.spec.scene_spec import Output, SceneSpec
 from mitsplat.scene.streams import random_stream
 
@@ -67,7 +67,11 @@ def view_of(scene: Scene, index: int, layout: Layout | None = None) -> Viewpoint
     if isinstance(camera, CameraHemisphere):
         return _hemisphere_view(scene, index, camera, layout)
     view, views = index % spec.output.views, spec.output.views
-    if isinstance(camera, CameraOrbit):
+    if isinstance(camera, CameraFixed):
+        pose = camera.pose
+        turn = camera.rotation_jitter * random_stream(spec.seed, "camera rotation jitter", index).standard_normal(3)
+        pose[:3, :3] = pose[:3, :3] @ Rotation.from_rotvec(turn, degrees=True).as_matrix()
+    elif isinstance(camera, CameraOrbit):
         pose = _orbit_pose(camera, view, views)
     else:
         keys = [look_at_pose(key.eye, key.target, key.up) for key in camera.keys]
@@ -87,6 +91,8 @@ def _camera_of_frame(spec: SceneSpec, index: int, pose: Float64Array) -> tuple[C
 
 def camera_at(pose: Float64Array, intrinsics: Intrinsics, output: Output) -> Camera:
     """Return a camera of the scene file at a pose, for images of the output's size.
+
+    A rectified camera is the pinhole camera with the same intrinsic matrix.
 
     Raises:
         ValueError: If the intrinsics are invalid, such as those of a fisheye lens that sees backwards.
@@ -109,7 +115,8 @@ def camera_at(pose: Float64Array, intrinsics: Intrinsics, output: Output) -> Cam
         aperture_radius=intrinsics.aperture,
         focus_distance=intrinsics.focus,
     )
-    return camera.resized(output.width, output.height)
+    camera = camera.resized(output.width, output.height)
+    return replace(camera, distortion=(), lens="opencv") if output.rectify else camera
 
 
 def _orbit_pose(camera: CameraOrbit, view: int, views: int) -> Float64Array:

@@ -4,9 +4,13 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import Field, NonNegativeFloat, model_validator
+import numpy as np
+from pydantic import AfterValidator, BeforeValidator, Field, NonNegativeFloat, model_validator
 
-from mitsplat.geometry.camera import NEAR, Lens
+from mitsplat.arrays import Float64Array
+from mitsplat.geometry.camera import NEAR, look_at_pose
+from mitsplat.geometry.lens import Lens, distortion_coefficients, shortened
+from mitsplat.geometry.rigid import ROUNDED, nearest_rigid, rigid_matrix
 from mitsplat.storage.field_types import (
     ElevationRange,
     Positive,
@@ -18,6 +22,19 @@ from mitsplat.storage.field_types import (
     optional_field,
 )
 from mitsplat.storage.yaml_input import FieldError
+
+
+def _flat_coefficients(values: object) -> object:
+    """Convert a list or an array of OpenCV, such as (1, 5), to a tuple, which strict mode requires."""
+    if isinstance(values, np.ndarray):
+        values = values.tolist()
+    if isinstance(values, list | tuple) and any(isinstance(value, list | tuple) for value in values):
+        rows = [value if isinstance(value, list | tuple) else [value] for value in values]
+        if len(rows) == 1 or all(len(row) == 1 for row in rows):
+            values = [value for row in rows for value in row]
+    if isinstance(values, list | tuple) and all(isinstance(value, int | float) for value in values):
+        return shortened(values)
+    return tuple(values) if isinstance(values, list) else values
 
 
 class Intrinsics(StrictModel):
@@ -33,10 +50,13 @@ class Intrinsics(StrictModel):
         description="Image width and height to which ``fx``, ``fy``, ``cx`` and ``cy`` refer [px]. The size of the "
         "output if absent.",
     )
-    distortion: tuple[float, ...] = Field(
+    distortion: Annotated[
+        tuple[float, ...], BeforeValidator(_flat_coefficients, json_schema_input_type=tuple[float, ...])
+    ] = Field(
         (),
-        description="OpenCV distortion coefficients k1, k2, p1, p2[, k3[, k4, k5, k6]]; k1, k2, k3, k4 for a fisheye "
-        "lens. Empty for a pinhole camera.",
+        description="OpenCV distortion coefficients k1, k2, p1, p2[, k3[, k4, k5, k6[, s1, s2, s3, s4]]], as "
+        "``cv2.calibrateCamera`` returns them; k1, k2, k3, k4 of ``cv2.fisheye`` for a fisheye lens. Empty for a "
+        "pinhole camera. The image must not extend beyond the angle at which the distortion stops growing.",
     )
     lens: Lens = Field("opencv", description="OpenCV camera model.")
     aperture: NonNegativeFloat = Field(0.0, description="Aperture radius of a thin lens [m]. 0 for a pinhole camera.")
@@ -51,12 +71,18 @@ class Intrinsics(StrictModel):
                 raise FieldError(key, "needs fx")
         if self.aperture > 0 and self.focus <= NEAR:
             raise FieldError("focus", f"must be beyond the near clipping depth, {NEAR} m (got {self.focus})")
-        if self.lens == "fisheye":
-            if self.fx is None or len(self.distortion) != 4:
-                raise FieldError("lens", "fisheye needs fx and 4 distortion coefficients")
-        elif len(self.distortion) not in (0, 4, 5, 8):
-            raise FieldError("distortion", f"must have 0, 4, 5 or 8 coefficients (got {len(self.distortion)})")
+        if self.lens == "fisheye" and (self.fx is None or len(self.distortion) != 4):
+            raise FieldError("lens", "fisheye needs fx and 4 distortion coefficients")
+        try:
+            distortion_coefficients(self.distortion, self.lens)
+        except ValueError as error:
+            raise FieldError("distortion", str(error)) from None
         return self
+
+    @property
+    def is_pinhole(self) -> bool:
+        """True if the lens does not distort."""
+        return self.lens == "opencv" and not any(self.distortion)
 
 
 class Motion(StrictModel):
@@ -96,6 +122,78 @@ class CameraPath(Viewpoint):
     kind: Literal["path"] = Field("path", description="Path through key poses.")
     keys: tuple[PoseKey, ...] = Field(min_length=1, description="Key poses, evenly spaced in time.")
     jitter: NonNegativeFloat = Field(0.0, description="Random displacement of the eye, 1 sigma [m].")
+
+
+Row = tuple[float, float, float, float]
+
+
+def _rows(matrix: object) -> object:
+    """Convert lists and arrays to tuples, which strict mode requires."""
+    if isinstance(matrix, np.ndarray):
+        matrix = matrix.tolist()
+    return tuple(map(_rows, matrix)) if isinstance(matrix, list | tuple) else matrix
+
+
+def _rigid(matrix: tuple[Row, Row, Row, Row]) -> tuple[Row, Row, Row, Row]:
+    """Refuse a matrix that is no rigid transform, and correct rounded entries of its rotation."""
+    rows: tuple[Row, Row, Row, Row]
+    rows = _rows(nearest_rigid(rigid_matrix(matrix, "world_from_camera", tolerance=ROUNDED)))  # type: ignore[assignment]
+    return rows
+
+
+class CameraFixed(Viewpoint):
+    """Camera that stands still, such as one on a robot cell: the same view in every image, except for jitter."""
+
+    kind: Literal["fixed"] = Field("fixed", description="Camera that stands still.")
+    world_from_camera: Annotated[
+        tuple[Row, Row, Row, Row] | None,
+        AfterValidator(lambda matrix: matrix if matrix is None else _rigid(matrix)),
+        BeforeValidator(_rows, json_schema_input_type=tuple[Row, Row, Row, Row] | None),
+    ] = Field(
+        None,
+        description="Pose of the camera as the rows of a rigid 4x4 matrix [m]. Its columns are the camera's x axis "
+        "(right in the image), y axis (down), z axis (into the scene), and its centre, in world coordinates. Either "
+        "this key, or ``eye`` and ``target``.",
+    )
+    eye: Vec3 | None = Field(None, description="Centre of projection [m].")
+    target: Vec3 | None = Field(None, description="Point in the centre of the image [m].")
+    up: Vec3 = Field(
+        (0, 0, 1),
+        description="Direction that appears upwards in the image. If the view is parallel to it, such as straight "
+        "down, +y of the world appears upwards (+z, if that is parallel too).",
+    )
+    jitter: NonNegativeFloat = Field(
+        0.0, description="Random displacement of the eye, 1 sigma along each axis [m]. It is drawn for every image."
+    )
+    rotation_jitter: NonNegativeFloat = Field(
+        0.0,
+        le=30,
+        description="Random rotation of the camera, 1 sigma about each of its axes [degrees]. It is drawn for every "
+        "image.",
+    )
+
+    @model_validator(mode="after")
+    def _check(self) -> CameraFixed:
+        if self.world_from_camera is not None:
+            for key, absent in (("eye", None), ("target", None), ("up", (0, 0, 1))):
+                if getattr(self, key) != absent:  # stored scenes state all keys
+                    raise FieldError(key, "must not be given together with world_from_camera")
+            return self
+        for key in ("eye", "target"):
+            if getattr(self, key) is None:
+                raise FieldError((), "must have either world_from_camera, or eye and target")
+        if not any(self.up):
+            raise FieldError("up", "must not be zero (got [0, 0, 0])")
+        if self.eye == self.target:
+            raise FieldError("target", f"must differ from eye (got {list(self.eye or ())})")
+        return self
+
+    @property
+    def pose(self) -> Float64Array:
+        """``world_from_camera`` without jitter, shape (4, 4)."""
+        if self.eye is not None and self.target is not None:
+            return look_at_pose(self.eye, self.target, self.up)
+        return np.array(self.world_from_camera, dtype=np.float64)
 
 
 class CameraOrbit(Viewpoint):
@@ -191,4 +289,4 @@ class CameraHemisphere(Viewpoint):
         return self
 
 
-CameraSpec = Annotated[CameraPath | CameraOrbit | CameraHemisphere, Field(discriminator="kind")]
+CameraSpec = Annotated[CameraFixed | CameraPath | CameraOrbit | CameraHemisphere, Field(discriminator="kind")]

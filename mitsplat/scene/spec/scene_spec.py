@@ -61,6 +61,13 @@ class Output(StrictModel):
     formats: tuple[FormatName, ...] = Field(
         ("yolo",), min_length=1, description="Formats of the labels. ``exr`` writes all layers of an image."
     )
+    rectify: bool = Field(
+        False,
+        exclude_if=lambda rectify: not rectify,
+        description="Images of the pinhole camera with the same intrinsic matrix, without the lens distortion, as "
+        "``cv2.undistort(image, K, distortion)`` makes them of photographs. All labels belong to these images. BOP "
+        "needs it for a camera with distortion.",
+    )
     image: Literal["png", "jpg"] = Field("png", description="Image file format.")
     validation: Unit = Field(
         0.2,
@@ -206,10 +213,9 @@ class SceneSpec(StrictModel):
             )
         if "depth-sensor" in self.output.formats and self.depth_sensor is None:
             raise FieldError(("output", "formats"), "depth-sensor needs the key depth_sensor")
-        lens = self.camera.intrinsics
-        distorted = lens.lens == "fisheye" or any(lens.distortion)
+        distorted = not (self.output.rectify or self.camera.intrinsics.is_pinhole)
         if isinstance(self.depth_sensor, StereoSensor) and distorted:
-            raise FieldError("depth_sensor", "stereo needs a camera without lens distortion")
+            raise FieldError("depth_sensor", "stereo needs a camera without lens distortion, or output.rectify: true")
         drawn, stated = self.randomise.white_balance, self.composite.white_balance
         if stated not in ("auto", DAYLIGHT) and drawn != (DAYLIGHT, DAYLIGHT):
             text = f"must not be given together with randomise.white_balance (got {stated:g} and {list(drawn)})"

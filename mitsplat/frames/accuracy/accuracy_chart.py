@@ -10,7 +10,14 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from mitsplat.frames.speed_accuracy import BUDGET_PREFIX, CAPTURED, MESH_PREFIX, TOLERANCE_PREFIX, Row, cheapest
+from mitsplat.frames.accuracy.speed_accuracy import (
+    BUDGET_PREFIX,
+    CAPTURED,
+    MESH_PREFIX,
+    TOLERANCE_PREFIX,
+    Row,
+    cheapest,
+)
 from mitsplat.quality import PRESETS
 from mitsplat.storage.files import storage_errors, write_file, write_text
 

@@ -26,8 +26,8 @@ from scipy.ndimage import maximum_filter, minimum_filter
 from mitsplat.arrays import BoolArray, Float32Array, Float64Array
 from mitsplat.engine.pool import LostWorkersError, run_in_process
 from mitsplat.errors import InputError, MissingResourceError
+from mitsplat.frames.accuracy.object_steps import MeshSceneBuilder, without_materials
 from mitsplat.frames.frame import Renderer
-from mitsplat.frames.object_steps import MeshSceneBuilder, without_materials
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.camera import Camera
 from mitsplat.images.colour import encode_srgb

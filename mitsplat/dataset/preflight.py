@@ -24,6 +24,8 @@ from mitsplat.geometry.camera import Camera
 from mitsplat.geometry.mesh import check_size
 from mitsplat.geometry.mesh_points import points_inside
 from mitsplat.scene.planning.frame_plan import FramePlan, plan_frame
+from mitsplat.scene.planning.lens_warnings import lens_warnings
+from mitsplat.scene.planning.view_diagnosis import FAR, distance_to_box, pose_cause, sees
 from mitsplat.scene.planning.visibility_prediction import enclosing_shape
 from mitsplat.scene.scene import Scene
 from mitsplat.scene.spec.light_spec import LocalLight
@@ -235,9 +237,14 @@ def label_faults(scene: Scene, frames: Sequence[int]) -> Iterator[Finding]:
         yield _fault("visibility", text, "move camera out of it")
         return
     low, high = _reachable_box(scene)
+    nearest = min(cameras, key=lambda camera: distance_to_box(camera.centre, low, high))
+    away = distance_to_box(nearest.centre, low, high)
     if not any(sees(camera, low, high) for camera in cameras):
-        text = f"camera: no view shows any place that objects can reach ({len(cameras)} views tested)"
-        remedy = "turn camera to region: `mitsplat preview` shows where it looks"
+        text = (
+            f"camera: no view shows any place that objects can reach ({len(cameras)} views tested; the nearest such "
+            f"place is {away:.3g} m from the camera)"
+        )
+        remedy = pose_cause(nearest, low, high) or "turn camera to region: `mitsplat preview` shows where it looks"
         yield _fault("visibility", text, remedy)
         return
     depths = [_depth_range(camera, low, high) for camera in cameras]
@@ -251,7 +258,11 @@ def label_faults(scene: Scene, frames: Sequence[int]) -> Iterator[Finding]:
     shown = max(_max_pixels(c, largest, near) for c, (near, _) in zip(cameras, depths, strict=True))
     if shown < least:
         text = f"camera: no object covers more than {shown:.2g} px in any view (labels.min_pixels is {least})"
-        yield _fault("labels", text, "move camera nearer, or make fx or the image larger")
+        remedy = "move camera nearer, or make fx or the image larger"
+        if away > FAR:
+            text += f"; the nearest place of objects is {away:.3g} m away"
+            remedy = "is its position in millimetres? Otherwise move camera nearer, or make fx larger"
+        yield _fault("labels", text, remedy)
 
 
 def scene_warnings(scene: Scene) -> Iterator[Finding]:
@@ -271,6 +282,7 @@ def scene_warnings(scene: Scene) -> Iterator[Finding]:
         f"of {len(cameras)} views {len(inside)} are from inside of a shape, {blind} see no place where objects can be",
         "move camera, its keys or its ranges: such images have no labels",
     )
+    yield from lens_warnings(spec)
     yield from _cost_warnings(scene)
     yield from _backdrop_warnings(scene, plans)
     for number, light in enumerate(spec.lights):
@@ -333,27 +345,6 @@ def _backdrop_warnings(scene: Scene, plans: Sequence[FramePlan]) -> Iterator[Fin
     if hidden := sum(behind(light.position) for light in lights):
         text = f"{hidden} of {len(lights)} lights are behind a wall of the backdrop"
         yield _fault("backdrop", text, "move lights into the room")
-
-
-def sees(camera: Camera, low: Float64Array, high: Float64Array) -> bool:
-    """Return True if a camera sees any part of a box; occluders are ignored.
-
-    A grid of points in the box detects boxes that are small in the image. A grid of camera rays detects large ones.
-    """
-    grid = np.stack(np.meshgrid(*([np.linspace(0, 1, 9)] * 3), indexing="ij"), axis=-1).reshape(-1, 3)
-    pixels, depth = camera.project(low + grid * (high - low))
-    with np.errstate(invalid="ignore"):
-        shown = ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(axis=1) & (depth > camera.near)
-    if shown.any():
-        return True
-    across = np.stack(np.meshgrid(np.linspace(0, camera.width, 17), np.linspace(0, camera.height, 17)), axis=-1)
-    slopes = camera.ray_slopes(across.reshape(-1, 2))
-    # The directions have depth 1, so the ray parameter is the depth.
-    rays = np.concatenate([slopes, np.ones((len(slopes), 1))], axis=1) @ camera.world_from_camera[:3, :3].T
-    with np.errstate(divide="ignore", invalid="ignore"):
-        ends = np.stack([(low - camera.centre) / rays, (high - camera.centre) / rays])
-    first, last = np.nanmax(ends.min(axis=0), axis=1), np.nanmin(ends.max(axis=0), axis=1)
-    return bool((np.maximum(first, camera.near) < last).any())
 
 
 def _plans(scene: Scene, frames: Sequence[int]) -> list[FramePlan]:

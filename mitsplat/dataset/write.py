@@ -43,6 +43,7 @@ from mitsplat.progress import Note, Progress
 from mitsplat.runtime.device import Device, current_device, find_device
 from mitsplat.scene.layout import Layout
 from mitsplat.scene.planning.frame_plan import layout_of
+from mitsplat.scene.planning.lens_warnings import lens_warnings
 from mitsplat.scene.scene import Scene
 from mitsplat.storage.files import SPLITS, Record, read_json, storage_errors
 
@@ -144,6 +145,8 @@ def write_dataset(
     check_workers(workers)
     catalogue = Catalogue.of(scene)
     indices = range(count) if shard is None else shard.frames(count, scene.spec.output.views)
+    for warning in lens_warnings(scene.spec):
+        _logger.warning("%s: %s: %s", scene.path, warning.text, warning.remedy)
     if render is None and settle is None:
         refuse(scene, run_faults(scene, indices, out=out, workers=workers, elsewhere=cluster is not None))
     if cluster is not None:

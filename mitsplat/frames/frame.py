@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -12,6 +13,7 @@ import cv2
 import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
+import trimesh
 
 from mitsplat.arrays import Float32Array
 from mitsplat.errors import InputError, check_type
@@ -33,6 +35,7 @@ from mitsplat.scene.layout import Layout
 from mitsplat.scene.planning.conveyor import carried_instances, layout_at_view
 from mitsplat.scene.planning.frame_plan import FramePlan, layout_of, plan_frame
 from mitsplat.scene.planning.object_appearance import ObjectAppearance, draw_appearances
+from mitsplat.scene.planning.view_diagnosis import distance_to_box, pose_cause, sees
 from mitsplat.scene.scene import Scene
 from mitsplat.scene.spec.light_spec import LightEntry
 
@@ -195,7 +198,7 @@ class Renderer:
         self.scene = scene
         self.quality = quality
         self.scene_builder = SceneBuilder(scene)
-        self._variant = mi.variant()
+        self._variant, self._warned = mi.variant(), False
         self.integrator = make_integrator(quality=quality, **light_properties(scene))
         self._settled_layout = lru_cache(maxsize=MAX_CACHED_LAYOUTS)(partial(settle_layout, scene))
         self._white_irradiance = lru_cache(maxsize=MAX_CACHED_LAYOUTS)(partial(white_irradiance, scene))
@@ -266,6 +269,8 @@ class Renderer:
             )
         with _timed(seconds, "label"):
             labels = self._label(layers, silhouettes, layout, plan.camera, mitsuba_scene)
+        if camera is not None and not labels.instances and not self._warned:
+            self._warn_of_empty_view(layout, plan)
         with _timed(seconds, "composite"):
             image = development.image()
         return Frame.later(
@@ -280,6 +285,23 @@ class Renderer:
             appearances=draw_appearances(self.scene, layout),
             next_layout=next_layout,
         )
+
+    def _warn_of_empty_view(self, layout: Layout, plan: FramePlan) -> None:
+        """Warn once if a given camera sees no object, with the likely cause."""
+        boxes = []
+        for one in layout.instances:
+            mesh, pose = self.scene.assets[one.asset].mesh, one.world_from_object
+            if mesh is not None:
+                corners = trimesh.bounds.corners(mesh.bounds) @ pose[:3, :3].T + pose[:3, 3]
+                boxes.append((corners.min(axis=0), corners.max(axis=0)))
+        if not boxes or any(sees(plan.camera, low, high) for low, high in boxes):
+            return
+        self._warned = True
+        low, high = np.min([low for low, _ in boxes], axis=0), np.max([high for _, high in boxes], axis=0)
+        away = min(distance_to_box(plan.camera.centre, *box) for box in boxes)
+        cause = pose_cause(plan.camera, low, high) or "turn the camera to the objects"
+        text = f"frame {plan.index}: nothing is in view; the nearest object is {away:.3g} m from the camera: {cause}"
+        warnings.warn(text, stacklevel=4)
 
     def _layouts_at_views(self, layout: Layout, index: int) -> tuple[Layout, Layout | None]:
         """Return the layout at the moments of a frame and of the next view; None for the latter if nothing moves."""

@@ -143,7 +143,9 @@ def test_given_masks_replace_computed_masks(
 def test_lenses_of_other_models_are_refused() -> None:
     with pytest.raises(InputError, match="lens model FOV is not supported: use one of SIMPLE_PINHOLE, "):
         sfm.opencv_camera("FOV", 4, 3, [1] * 5, np.eye(4)[:3])
-    with pytest.raises(InputError, match="a camera of lens model OPENCV_FISHEYE cannot be used: a fisheye lens must show"):
+    with pytest.raises(
+        InputError, match="a camera of lens model OPENCV_FISHEYE cannot be used: a fisheye lens must show"
+    ):
         sfm.opencv_camera("OPENCV_FISHEYE", 4000, 3000, [300, 300, 2000, 1500, 0, 0, 0, 0], np.eye(4)[:3])
 
 

@@ -37,12 +37,22 @@ def _flat_coefficients(values: object) -> object:
     return tuple(values) if isinstance(values, list) else values
 
 
+def _check_sign(focal: object) -> object:
+    """Refuse negative focal lengths."""
+    if isinstance(focal, int | float) and focal < 0:
+        raise ValueError(f"must be > 0 (got {focal:g}): is it of OpenGL or of an image with y upwards? Omit the sign")
+    return focal
+
+
+Focal = Annotated[Positive, BeforeValidator(_check_sign, json_schema_input_type=Positive)]
+
+
 class Intrinsics(StrictModel):
     """OpenCV intrinsics with pixel centres at +0.5: either ``fov_x``, or ``fx`` with the other calibrated values."""
 
     fov_x: float | None = Field(None, gt=0, lt=180, description="Horizontal field of view [degrees].")
-    fx: Positive | None = Field(None, description="Focal length along x [px].")
-    fy: Positive | None = Field(None, description="Focal length along y [px]. Equal to ``fx`` if absent.")
+    fx: Focal | None = Field(None, description="Focal length along x [px].")
+    fy: Focal | None = Field(None, description="Focal length along y [px]. Equal to ``fx`` if absent.")
     cx: float | None = Field(None, description="Principal point along x [px]. The centre of the image if absent.")
     cy: float | None = Field(None, description="Principal point along y [px]. The centre of the image if absent.")
     size: tuple[Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]] | None = Field(

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from typing import Literal, get_args
 
+import numpy as np
 from pydantic import Field, model_validator
 
 from mitsplat.geometry.camera import MAX_IMAGE_SIDE
@@ -49,6 +50,10 @@ FormatName = Literal[
     "exr",
 ]
 FORMATS: tuple[str, ...] = get_args(FormatName)
+
+
+MIN_FOCAL = 0.1
+"""Minimum focal length of a rectilinear lens, as a fraction of the image's side; a field of view of 157 degrees."""
 
 
 class Output(StrictModel):
@@ -216,6 +221,7 @@ class SceneSpec(StrictModel):
         distorted = not (self.output.rectify or self.camera.intrinsics.is_pinhole)
         if isinstance(self.depth_sensor, StereoSensor) and distorted:
             raise FieldError("depth_sensor", "stereo needs a camera without lens distortion, or output.rectify: true")
+        self._check_focal_length()
         drawn, stated = self.randomise.white_balance, self.composite.white_balance
         if stated not in ("auto", DAYLIGHT) and drawn != (DAYLIGHT, DAYLIGHT):
             text = f"must not be given together with randomise.white_balance (got {stated:g} and {list(drawn)})"
@@ -224,6 +230,25 @@ class SceneSpec(StrictModel):
             raise FieldError("hold_out", "needs a test split: set output.test > 0")
         self._check_regions()
         return self
+
+    def _check_focal_length(self) -> None:
+        """Refuse focal lengths that are not in pixels."""
+        lens = self.camera.intrinsics
+        for key, focal, side, index in (("fx", lens.fx, "width", 0), ("fy", lens.fy, "height", 1)):
+            pixels = (lens.size or (self.output.width, self.output.height))[index]
+            if lens.lens == "opencv" and focal is not None and focal < (least := pixels * MIN_FOCAL):
+                if focal < 3:
+                    cause = f"is it a fraction of the {side}, or in metres?"
+                else:
+                    cause = (
+                        f"is it in millimetres? Multiply it by {pixels} px and divide by the {side} of the sensor [mm]"
+                    )
+                fov = 2 * np.degrees(np.arctan(pixels / (2 * focal)))
+                text = (
+                    f"must be in pixels, at least {least:g} for a {side} of {pixels} px (got {focal:g}, a field of "
+                    f"view of {fov:.4g} degrees): {cause}"
+                )
+                raise FieldError(("camera", "intrinsics", key), text)
 
     def _check_regions(self) -> None:
         """Check enclosure heights, names of regions, references to regions, and keys that need upright arrangements."""

@@ -38,11 +38,12 @@ def check_exposure(scene: Scene) -> Finding:
 
 def _placed_objects(scene: Scene) -> Layout:
     """Return a layout with one object of each entry, side by side at the bottom of its first region."""
-    poses: dict[str | int, list[np.ndarray]] = {}
+    poses: dict[str | int, list[np.ndarray | None]] = {}
     for number, (entry, pool) in enumerate(zip(scene.spec.objects, scene.pools, strict=True)):
         region, _ = scene.spec.all_regions[scene.spec.regions_of(entry)[0]]
         share = (number + 0.5) / len(scene.pools)
         pose = np.eye(4)
         pose[:3, 3] = [*np.add(region.min[:2], share * np.subtract(region.max[:2], region.min[:2])), region.min[2]]
-        poses.setdefault(pool[0], []).append(pose)
+        absent = (len(entry.poses) or entry.count[0]) - 1
+        poses.setdefault(pool[0], []).extend([pose, *[None] * absent])
     return Layout.from_poses(scene, poses)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,7 @@ from mitsplat.dataset.preflight import run_faults, scene_warnings
 from mitsplat.errors import InputError
 from mitsplat.findings import Finding
 from mitsplat.formats.registry import Catalogue
+from mitsplat.geometry.coplanar import coplanar_place
 from mitsplat.geometry.mesh import closed_solid, mass_properties
 from mitsplat.physics.settle import try_alone, warp_settings
 from mitsplat.reconstruct.registration import measure_offset
@@ -26,6 +28,7 @@ from mitsplat.scene.loading.scene_loading import load_scene
 from mitsplat.scene.planning.frame_plan import plan_frame
 from mitsplat.scene.scene import Scene
 from mitsplat.scene.spec.named_files import environments, object_assets
+from mitsplat.scene.spec.scene_spec import BACKDROP
 
 SIZE_LIMITS = {"object": (0.002, 2.0), "environment": (0.2, 100.0)}
 """Expected range of the longest extent by kind of asset [m]."""
@@ -196,6 +199,7 @@ def check_scene(scene: Scene) -> Iterator[Finding]:
     if support and not faults:
         yield from _check_rest(scene)
     yield _check_view(scene)
+    yield from _check_surfaces(scene)
     yield from _check_kernel(scene)
     drawn = (*scene.environments, *scene.assets)
     lit = bool(spec.lights) or all(asset.capture_light == "scene" for asset in drawn)
@@ -236,6 +240,20 @@ def _check_rest(scene: Scene) -> Iterator[Finding]:
         yield Finding("rest", True, f"{len(rested)} objects come to rest, each tried alone")
 
 
+def _check_surfaces(scene: Scene) -> Iterator[Finding]:
+    """Name the pairs of visible shapes of different looks that share a plane, so that it is random which one shows."""
+    eyes = [plan_frame(scene, index).camera.centre for index in _sampled_views(scene)]
+    shown = [pair for pair in zip(scene.spec.shapes, scene.shape_meshes, strict=True) if pair[0].visible]
+    for (one, mesh), (other, beside) in combinations(shown, 2):
+        of_backdrop = all(shape.name.startswith(BACKDROP) for shape in (one, other))
+        if of_backdrop or (one.colour == other.colour and not one.materials and not other.materials):
+            continue
+        if (place := coplanar_place(mesh, beside, eyes)) is not None:
+            at = ", ".join(f"{value:.4g}" for value in place)
+            text = f"shapes {one.name!r} and {other.name!r} have faces in one plane, for example at [{at}]"
+            yield Finding("surfaces", False, text, "move one of them by 0.1 mm or more: both show in random spots")
+
+
 def _check_kernel(scene: Scene) -> Iterator[Finding]:
     """Compare the kernel of the scene with those that its splat files state."""
     drawn, kernel = (*scene.environments, *scene.assets), scene.splat_options["kernel"]
@@ -249,11 +267,15 @@ def _check_kernel(scene: Scene) -> Iterator[Finding]:
         )  # fmt: skip
 
 
+def _sampled_views(scene: Scene) -> range:
+    return range(0, scene.num_frames, max(1, scene.num_frames // 24))
+
+
 def _check_view(scene: Scene) -> Finding:
     """Check that most views show the place where objects are dropped: the centre of a region, at its bottom."""
     corners = np.array([(region.min, region.max) for region, _ in scene.spec.all_regions])
     middles = np.column_stack([corners.mean(axis=1)[:, :2], corners[:, 0, 2]])
-    views = range(0, scene.num_frames, max(1, scene.num_frames // 24))
+    views = _sampled_views(scene)
     blind = []
     for index in views:
         camera = plan_frame(scene, index).camera

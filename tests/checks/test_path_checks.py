@@ -1,5 +1,6 @@
 """Preflight checks: a valid asset and scene pass; each inserted fault is found and comes with a remedy."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -155,3 +156,31 @@ def test_an_unreadable_asset_is_refused_in_one_sentence(tmp_path, capsys):
     splats.write_bytes(splats.read_bytes()[:-4] + np.float32(np.nan).tobytes())
     assert run("check", tmp_path / "nut") == 2
     assert "quats must be finite (got nan at row 11)" in capsys.readouterr().err
+
+
+MAT = {"name": "mat", "box": {"size": [0.3, 0.2, 0.02], "position": [0.1, 0, -0.01]}, "visible": True}
+
+
+@pytest.mark.parametrize(
+    ("change", "is_found"),
+    [
+        ({"colour": [0.9, 0.1, 0.1]}, True),
+        ({"materials": [{"kind": "noise"}]}, True),
+        ({}, False),  # of the colour of the table
+        ({"colour": [0.9, 0.1, 0.1], "visible": False}, False),
+        ({"colour": [0.9, 0.1, 0.1], "box": {"size": [0.3, 0.2, 0.02], "position": [0.1, 0, -0.009]}}, False),
+    ],
+)
+def test_visible_shapes_in_one_plane_are_named(scene_data, write_scene, change, is_found):
+    scene_data["shapes"].append(MAT | change)
+    found = [one.text for one in check_scene(load_scene(write_scene(scene_data))) if one.name == "surfaces"]
+    assert bool(found) == is_found
+    if is_found:
+        assert found[0].startswith("shapes 'table' and 'mat' have faces in one plane, for example at [")
+        x, y, z = json.loads(found[0].partition(" at ")[2])
+        assert -0.05 <= x <= 0.25 and -0.1 <= y <= 0.1 and abs(z) < 1e-5
+
+
+def test_walls_of_a_backdrop_share_planes_without_a_warning(scene_data, write_scene):
+    scene_data["backdrop"] = {"size": [3, 3, 2], "position": [0, 0, -0.1]}
+    assert not [one for one in check_scene(load_scene(write_scene(scene_data))) if one.name == "surfaces"]

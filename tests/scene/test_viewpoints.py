@@ -283,3 +283,53 @@ def test_unused_view_rules_are_not_stored(scene: Scene) -> None:
     stored = seen_by(scene).spec.camera.model_dump(mode="json")
     assert isinstance(scene.spec.camera, StrictModel)
     assert not stored.keys() & {"look_at", "coverage", "accept", "occlusion", "truncation", "tries"}
+
+
+def surrounding(scene: Scene, eye: Any) -> Layout:
+    """Place the box of 12 x 16 x 8 cm around a point."""
+    pose = np.eye(4)
+    pose[:3, 3] = eye
+    return Layout.from_poses(scene, {"nut": [pose], "bolt": [None]})
+
+
+@pytest.mark.parametrize("kind", ["orbit", "path", "given"])
+def test_a_given_camera_inside_of_an_object_is_refused(scene: Scene, kind: str) -> None:
+    if kind == "path":
+        keys = [{"eye": [0.5, 0, 0.4], "target": [0, 0, 0]}]
+        scene = load_scene(scene.path, overrides={"camera": {"kind": "path", "keys": keys}})
+    eye = plan_frame(scene, 0).camera.centre
+    given = {"camera": plan_frame(scene, 0).camera} if kind == "given" else {}
+    with pytest.raises(InputError, match=r"frame 0 must not be in a solid \(it is in object 1 \(nut\)\)"):
+        plan_frame(scene, 0, surrounding(scene, eye), **given)
+    beside = surrounding(scene, np.add(eye, (0.07, 0, 0)))
+    np.testing.assert_array_equal(plan_frame(scene, 0, beside, **given).camera.centre, eye)
+
+
+def test_a_given_camera_in_a_visible_shape_is_refused(scene: Scene) -> None:
+    shape = {"name": "block", "box": {"size": [0.1, 0.1, 0.1], "position": [0.5, 0, 0.4]}, "visible": True}
+    scene = load_scene(scene.path, overrides={"shapes": [shape]})
+    with pytest.raises(InputError, match=r"frame 0 must not be in a solid \(it is in shape 'block'\)"):
+        plan_frame(scene, 0, surrounding(scene, (0, 0, 0)))
+    assert plan_frame(scene, 1, surrounding(scene, (0, 0, 0)))
+
+
+@pytest.mark.parametrize(
+    "camera",
+    [
+        {"kind": "orbit", "target": [0, 0, 0], "radius": 0.5, "height": 0.4, "jitter": 0.06},
+        HEMISPHERE,
+        HEMISPHERE | {"look_at": "objects"},
+        HEMISPHERE | {"occlusion": {"share": 0.3}},
+    ],
+    ids=["jitter", "hemisphere", "objects", "selected"],
+)
+def test_a_drawn_camera_inside_of_an_object_is_drawn_again(scene: Scene, camera: dict[str, Any]) -> None:
+    scene = load_scene(scene.path, overrides={"camera": camera})
+    first = plan_frame(scene, 0, surrounding(scene, (0, 0, -1))).camera.centre
+    around = surrounding(scene, np.add(first, (0.05, 0.05, 0.03)))
+    seen = plan_frame(scene, 0, around).camera
+    again = plan_frame(scene, 0, around).camera
+    np.testing.assert_array_equal(seen.centre, again.centre)
+    box = placed(scene, around)[0].bounds
+    assert not ((seen.centre > box[0]) & (seen.centre < box[1])).all()
+    assert np.linalg.norm(seen.centre - first) > 0

@@ -16,7 +16,7 @@ from mitsplat.geometry.camera import Camera
 from mitsplat.scene.layout import Layout
 from mitsplat.scene.planning.conveyor import Belt, belt_of
 from mitsplat.scene.planning.frame_lights import lights_at
-from mitsplat.scene.planning.viewpoints import Viewpoint, view_of
+from mitsplat.scene.planning.viewpoints import Viewpoint, check_eye, view_of
 from mitsplat.scene.scene import Scene
 from mitsplat.scene.spec.image_spec import Randomise
 from mitsplat.scene.spec.light_spec import EnvironmentLight, LightEntry, LightSpec
@@ -112,8 +112,8 @@ def plan_frame(
             way.
 
     Raises:
-        InputError: If there is no such frame, if no candidate view fulfils the conditions of the scene file, or if the
-            lights are invalid.
+        InputError: If there is no such frame, if no candidate view fulfils the conditions of the scene file, if the
+            camera is inside an object or a visible shape, or if the lights are invalid.
     """
     index = to_index(index, "frame")
     spec, number = scene.spec, layout_of(scene, index)
@@ -132,6 +132,8 @@ def plan_frame(
     time = view / max(1, spec.output.views - 1)
     ranges = spec.randomise
     viewpoint = view_of(scene, index, layout) if camera is None else Viewpoint(camera)
+    if camera is not None and layout is not None:
+        check_eye(scene, index, layout, camera)
     if next_camera is None and camera is not None:
         next_camera = None if next_layout is None else camera
     elif next_camera is None and view + 1 < spec.output.views:

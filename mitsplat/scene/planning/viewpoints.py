@@ -18,8 +18,15 @@ from scipy.spatial.transform import Rotation
 from mitsplat.arrays import Float64Array
 from mitsplat.errors import InputError
 from mitsplat.geometry.camera import Camera, direction, interpolate_poses, look_at_pose
-from mitsplat.scene.planning.visibility_prediction import PredictedView, VisibilityPredictor
-from mitsplat.scene.spec.camera_spec import CameraFixed, CameraHemisphere, CameraOrbit, Intrinsics
+from mitsplat.scene.planning.visibility_prediction import PredictedView, VisibilityPredictor, containing_solid
+from mitsplat.scene.spec.camera_spec import (
+    TRIES,
+    Acceptance,
+    CameraFixed,
+    CameraHemisphere,
+    CameraOrbit,
+    Intrinsics,
+)
 from mitsplat.scene.spec.scene_spec import Output, SceneSpec
 from mitsplat.scene.streams import random_stream
 
@@ -76,8 +83,23 @@ def view_of(scene: Scene, index: int, layout: Layout | None = None) -> Viewpoint
     else:
         keys = [look_at_pose(key.eye, key.target, key.up) for key in camera.keys]
         pose = interpolate_poses(keys, view / max(1, views - 1))[0]
-    pose[:3, 3] += camera.jitter * random_stream(spec.seed, "camera jitter", index).standard_normal(3)
-    return Viewpoint(*_camera_of_frame(spec, index, pose))
+    stated = pose[:3, 3].copy()
+    for number in range(TRIES if camera.jitter else 1):
+        pose[:3, 3] = stated + camera.jitter * _stream(spec.seed, "camera jitter", index, number).standard_normal(3)
+        solid = "" if layout is None else containing_solid(scene, layout, pose[:3, 3])
+        if not solid:
+            return Viewpoint(*_camera_of_frame(spec, index, pose))
+    raise InputError(f"{scene.path}: camera: the eye of frame {index} must not be in a solid (it is in {solid})")
+
+
+def check_eye(scene: Scene, index: int, layout: Layout, camera: Camera) -> None:
+    """Check that a given camera is not inside an object or a visible shape, which would hide everything.
+
+    Raises:
+        InputError: If it is.
+    """
+    if solid := containing_solid(scene, layout, camera.centre):
+        raise InputError(f"{scene.path}: the camera of frame {index} must not be in a solid (it is in {solid})")
 
 
 def _camera_of_frame(spec: SceneSpec, index: int, pose: Float64Array) -> tuple[Camera, dict[str, Any]]:
@@ -143,10 +165,17 @@ def _hemisphere_view(scene: Scene, index: int, camera: CameraHemisphere, layout:
         else VisibilityPredictor.of(scene, layout)
     )
     if predictor is None or not camera.selects_views:
-        target, seen = _target(camera, spec.seed, index, 0, predictor)
-        pose, target = _hemisphere_pose(camera, spec.seed, index, 0, target)
-        aim = {} if camera.look_at == "target" else {"target": target.tolist(), "object": seen}
-        return Viewpoint(replace(lens, world_from_camera=pose), {**drawn_motion, **aim})
+        for number in range(camera.tries):
+            target, seen = _target(camera, spec.seed, index, number, predictor)
+            pose, target = _hemisphere_pose(camera, spec.seed, index, number, target)
+            solid = "" if layout is None else containing_solid(scene, layout, pose[:3, 3])
+            if not solid:
+                aim = {} if camera.look_at == "target" else {"target": target.tolist(), "object": seen}
+                return Viewpoint(replace(lens, world_from_camera=pose), {**drawn_motion, **aim})
+        raise InputError(
+            f"{scene.path}: camera: all {camera.tries} eyes drawn for frame {index} are in a solid (the last in "
+            f"{solid}); widen the camera's ranges"
+        )
     shares = (camera.occlusion, camera.truncation)
     rounding = random_stream(spec.seed, "camera shares", index).uniform(size=2)
     best: tuple[float, Viewpoint] | None = None
@@ -159,7 +188,7 @@ def _hemisphere_view(scene: Scene, index: int, camera: CameraHemisphere, layout:
             pose, target = _rotate_target_to_border(lens, pose, target, rng)
         view_camera = replace(lens, world_from_camera=pose)
         projected = predictor.project(view_camera)
-        if camera.accept is not None and (violations := predictor.find_violations(projected, camera.accept)):
+        if violations := predictor.find_violations(projected, camera.accept or Acceptance()):
             refused.append((sum(miss for miss, _ in violations), " and ".join(text for _, text in violations)))
             continue
         prediction = predictor.predict(projected, camera.occlusion, camera.truncation, spec.labels.min_pixels)

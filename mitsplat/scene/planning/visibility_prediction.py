@@ -195,22 +195,12 @@ class VisibilityPredictor:
             text = f"shows {share:.3g} of the labelled objects, but in_view is {rules.in_view:g}"
             found.append((1 - share / rules.in_view, text))
         away = self._clearance(eye, rules.clearance)
-        if name := self._containing_solid(eye):
+        if name := containing_solid(self._scene, self._layout, eye):
             found.append((1.0, f"is inside {name}"))
         elif away < rules.clearance:
             text = f"is {away:.3g} m from the nearest surface, but clearance is {rules.clearance:g}"
             found.append((1 - away / rules.clearance, text))
         return found
-
-    def _containing_solid(self, eye: Float64Array) -> str:
-        """Return the description of the shape or object that contains a point; empty if none does."""
-        if name := enclosing_shape(self._scene, eye):
-            return f"shape {name!r}"
-        for one in self._near(eye, 0.0):
-            mesh = _mesh(self._scene, one.asset)
-            if points_inside(mesh, _local(eye, one.world_from_object)[None])[0]:
-                return f"object {one.id}"
-        return ""
 
     def _clearance(self, eye: Float64Array, reach: float) -> float:
         """Return the distance from a point to the nearest surface [m], at most ``reach``."""
@@ -224,6 +214,17 @@ class VisibilityPredictor:
         """Return the instances whose bounding spheres come within ``reach`` [m] of a point."""
         near = np.linalg.norm(self.centres - eye, axis=1) < self._radii + reach
         return [one for one, is_near in zip(self._layout.instances, near, strict=True) if is_near]
+
+
+def containing_solid(scene: Scene, layout: Layout, point: Float64Array) -> str:
+    """Return the description of the visible shape or the object that contains a point [m]; empty if none does."""
+    if name := enclosing_shape(scene, point):
+        return f"shape {name!r}"
+    for one in layout.instances:
+        mesh = _mesh(scene, one.asset)
+        if points_inside(mesh, _local(point, one.world_from_object)[None])[0]:
+            return f"object {one.id} ({scene.assets[one.asset].name})"
+    return ""
 
 
 def enclosing_shape(scene: Scene, point: Float64Array) -> str:

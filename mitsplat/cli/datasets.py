@@ -418,7 +418,7 @@ def view(
     port: Annotated[int, typer.Option(help="TCP port to listen on.")] = 8080,
     gaussians: Annotated[
         int,
-        typer.Option(help="Maximum number of Gaussians per cloud in the browser; larger clouds are subsampled evenly."),
+        typer.Option(help="Maximum number of Gaussians in the browser; of more, all clouds show the same share."),
     ] = 300_000,
     device: DeviceName = "cpu",
     allow_outside: AllowOutside = False,

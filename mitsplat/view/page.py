@@ -29,6 +29,7 @@ from mitsplat.view.scene_parts import (
     base_colours,
     bounds_of,
     changes,
+    share_gaussians,
 )
 
 _HALF_MAX = 200.0
@@ -56,7 +57,7 @@ class Page:
     Args:
         title: Title above the controls.
         address: Network address of the page.
-        gaussians: Maximum number of Gaussians per cloud; larger clouds are subsampled.
+        gaussians: Maximum number of Gaussians of all clouds together; more are subsampled.
 
     Attributes:
         gui: viser's controls.
@@ -93,6 +94,8 @@ class Page:
         self._alerted: str | None = None
         self._alert = self.gui.add_html("", visible=False)
         self._groups = self.gui.add_folder("Show", order=1000, visible=False)
+        with self._groups:
+            self._thinned = self.gui.add_markdown("", visible=False)
         self._boxes: dict[str, Any] = {}
 
     def close(self) -> None:
@@ -141,7 +144,8 @@ class Page:
 
     def show(self, parts: Iterable[ShownPart]) -> None:
         """Show exactly these parts; only changes are sent."""
-        wanted = {part.name: part for part in parts}
+        shared, count = share_gaussians(parts, self._gaussians)
+        wanted = {part.name: part for part in shared}
         removed, added, moved = changes(self._shown, wanted)
         with self._server.atomic():
             for name in removed:
@@ -153,6 +157,11 @@ class Page:
                 handle = self._handles[part.name]
                 handle.position, handle.wxyz = part.pose[:3, 3], _wxyz(part.pose)
         self._shown = wanted
+        drawn = sum(part.drawable.count for part in shared if isinstance(part.drawable, ShownSplats))
+        self._thinned.visible = drawn < count
+        self._thinned.content = (
+            f"{drawn:,} of {count:,} Gaussians are shown, enlarged. `mitsplat view --gaussians {count}` shows all."
+        )
 
     def show_picture(self, image: ByteImage, caption: str) -> None:
         """Show a picture beside the parts, with a caption in Markdown."""
@@ -225,7 +234,7 @@ class Page:
         scene, drawable = self._server.scene, part.drawable
         place = {"position": part.pose[:3, 3], "wxyz": _wxyz(part.pose)}
         if isinstance(drawable, ShownSplats):
-            return scene.add_gaussian_splats(part.name, **splat_arrays(drawable.thinned(self._gaussians)), **place)
+            return scene.add_gaussian_splats(part.name, **splat_arrays(drawable.thinned()), **place)
         if isinstance(drawable, ShownMesh):
             opacity = None if drawable.opacity == 1.0 else drawable.opacity
             vertices, faces = np.asarray(drawable.mesh.vertices, dtype=np.float32), np.asarray(drawable.mesh.faces)

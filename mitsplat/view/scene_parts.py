@@ -53,20 +53,26 @@ _EDGES = np.array([[0, 1], [2, 3], [4, 5], [6, 7], [0, 2], [1, 3], [4, 6], [5, 7
 
 @dataclass(frozen=True, eq=False)
 class ShownSplats:
-    """Gaussians, drawn with their direction-independent colours."""
+    """Gaussians, drawn with their direction-independent colours; ``share`` is the part of them that is drawn."""
 
     splats: Splats
+    share: float = 1.0
 
-    def thinned(self, max_count: int) -> Splats:
-        """Return at most ``max_count`` Gaussians.
+    @property
+    def count(self) -> int:
+        """Number of drawn Gaussians, at least one."""
+        return max(1, int(self.share * len(self.splats)))
+
+    def thinned(self) -> Splats:
+        """Return the drawn Gaussians.
 
         Every n-th Gaussian is taken and enlarged by the square root of n, so that surfaces stay covered.
         """
         count = len(self.splats)
-        if count <= max_count:
+        if self.share == 1.0:
             return self.splats
-        sample = self.splats.select(np.linspace(0, count - 1, max_count).astype(int))
-        return replace(sample, scales=sample.scales * np.float32(np.sqrt(count / max_count)))
+        sample = self.splats.select(np.linspace(0, count - 1, self.count).astype(int))
+        return replace(sample, scales=sample.scales * np.float32(np.sqrt(count / self.count)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,6 +139,23 @@ class ShownPart:
     def group(self) -> str:
         """Group with which the part is shown or hidden."""
         return self.name.split("/")[1]
+
+
+def share_gaussians(parts: Iterable[ShownPart], most: int) -> tuple[list[ShownPart], int]:
+    """Return parts that draw at most ``most`` Gaussians together, and the number of all their Gaussians.
+
+    All clouds draw the same share, because a browser sorts and draws the Gaussians of all clouds together. Shares are
+    powers of the root of one half, so that one object more or less seldom changes all clouds.
+    """
+    parts = list(parts)
+    count = sum(len(part.drawable.splats) for part in parts if isinstance(part.drawable, ShownSplats))
+    if count <= most:
+        return parts, count
+    share = float(0.5 ** (np.ceil(2 * np.log2(count / most)) / 2))
+    return [
+        replace(part, drawable=replace(part.drawable, share=share)) if isinstance(part.drawable, ShownSplats) else part
+        for part in parts
+    ], count
 
 
 def look_same(one: Any, other: Any) -> bool:

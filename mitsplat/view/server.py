@@ -38,7 +38,7 @@ def serve(
     Args:
         path: Scene file, splat file, or folder of an asset, a capture or a dataset.
         address: Network address of the page.
-        gaussians: Maximum number of Gaussians per cloud in the browser.
+        gaussians: Maximum number of Gaussians of all clouds together in the browser.
         allow_outside: Allow a scene to reference files outside its folder.
         ready: Callback with the address of the page, called when it is available.
 

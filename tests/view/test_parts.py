@@ -28,6 +28,7 @@ from mitsplat.view.scene_parts import (
     changes,
     light_parts,
     scene_parts,
+    share_gaussians,
 )
 from tests.bodies import pose_at
 from tests.conftest import box_asset
@@ -128,12 +129,25 @@ def test_a_thinned_cloud_keeps_its_coverage():
         opacities=np.full(count, 0.5),
         sh=np.zeros((count, 1, 3)),
     )
-    kept = ShownSplats(splats).thinned(25)
+    kept = ShownSplats(splats, 0.25).thinned()
     assert len(kept) == 25
     assert np.diff(kept.means[:, 0] / 3) == pytest.approx(np.full(24, 4), abs=1.01)  # evenly spaced
     area, whole = (float(np.prod(some.scales[:, :2], axis=1).sum()) for some in (kept, splats))
     assert area == pytest.approx(whole)
-    assert ShownSplats(splats).thinned(count) is splats
+    assert ShownSplats(splats).thinned() is splats
+
+
+def test_the_gaussians_of_all_clouds_are_limited_together():
+    splats = [box_asset("nut").splats for _ in range(5)]
+    parts = [ShownPart(f"/splats/{i}", ShownSplats(one)) for i, one in enumerate(splats)]
+    for most in (60, 59, 30, 20, 7):
+        shared, count = share_gaussians(parts, most)
+        drawn = [len(part.drawable.thinned()) for part in shared]
+        assert count == 60 and sum(drawn) <= max(most, 5) and len(set(drawn)) == 1
+        assert min(drawn) >= max(1, int(most / 60 / 2**0.5 * 12))
+    assert share_gaussians(parts, 60)[0] == parts
+    fewer, more = (share_gaussians(parts[:n], 22)[0] for n in (4, 5))
+    assert changes({p.name: p for p in fewer}, {p.name: p for p in more[:4]}) == ([], [], [])
 
 
 def test_shown_colours_are_averages_over_directions():

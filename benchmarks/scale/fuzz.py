@@ -211,24 +211,25 @@ def _read_labelled(folder: Path) -> None:
 
 
 def _transforms(folder: Path) -> None:
-    photos = [Prepared(f"photos/{name}.png", folder / f"photos/{name}.png", (32, 24), 1, ()) for name in "ab"]
     from mitsplat.capture import known_poses as poses
 
-    poses._read_transforms(folder / "transforms.json", {photo.name: photo for photo in photos})
+    path = folder / "transforms.json"
+    content = poses._parse_transforms(path)
+    poses._read_transforms(path, content, {frame.file_path: (32, 24) for frame in content.frames})
 
 
 def _colmap(folder: Path) -> None:
     photos = [Prepared(f"{name}.png", folder / f"photos/{name}.png", (32, 24), 1, ()) for name in "ab"]
-    read_poses(folder / "model", photos, folder / "work")
+    read_poses(folder / "model", photos, folder / "work", base=folder)
 
 
 def _masks(folder: Path) -> None:
     photo = Prepared("a.png", folder / "photos/a.png", (32, 24), 1, ())
-    make = given_masks(folder / "masks", {"a.png": photo})
     from mitsplat.capture.capture import Photo
     from mitsplat.geometry.camera import Camera
 
     camera = Camera.look_at((0, 0, -1), (0, 0, 0), up=(0, -1, 0), width=32, height=24, fov_x=40)
+    make = given_masks(folder / "masks", {"a.png": photo}, {"a.png": camera})
     make(Photo("a.png", photo.file, camera))
 
 

@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+import os
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from typing import Annotated
 
 import numpy as np
+from PIL import Image, ImageOps
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from mitsplat.capture.photos import Prepared
+from mitsplat.capture.name_matching import match_names
+from mitsplat.capture.photos import Prepared, shapes_differ, turn_upright, with_orientation
 from mitsplat.capture.structure_from_motion import SparseModel, find_points, read_model
 from mitsplat.errors import InputError
 from mitsplat.geometry.camera import Camera
+from mitsplat.images.colour import LUMINANCE, eight_bit
 from mitsplat.progress import Progress
 
 _Row = tuple[float, float, float, float]
@@ -25,6 +29,14 @@ _MAX_COORDINATE = 1e9
 """Largest accepted coordinate of a camera or a point, in units of the model; geocentric coordinates in metres reach
 6e6.
 """
+_FIRST_TURNED = 5
+"""First EXIF orientation that exchanges width and height."""
+_MIN_COLOURS = 20
+"""Minimum number of observed points for a decision by their colours."""
+_MIN_CORRELATION = 0.5
+"""Minimum correlation of the luminances of points and photo."""
+_MAX_UNEXPLAINED = 0.6
+"""Maximum ratio of the unexplained variances of the luminances, right orientation against wrong."""
 
 
 class _Lens(BaseModel):
@@ -57,36 +69,139 @@ class _Transforms(_Lens):
     frames: list[_Frame] = Field(min_length=1)
 
 
-def read_poses(source: Path, photos: Sequence[Prepared], folder: Path, progress: Progress | None = None) -> SparseModel:
+def read_poses(
+    source: Path,
+    photos: Sequence[Prepared],
+    folder: Path,
+    progress: Progress | None = None,
+    *,
+    base: Path,
+    unusable: Sequence[str] = (),
+) -> tuple[SparseModel, list[Prepared]]:
     """Read the cameras of photographs from a file, keyed by the file names of the copies.
 
     If the model has no points, points are triangulated from the photographs with fixed cameras.
 
     Args:
         source: Folder of a COLMAP model (``.bin`` or ``.txt``), or a ``transforms.json`` (OpenGL axes).
-        photos: Copies of the photographs without EXIF rotation, because such files ignore it.
+        photos: Copies of the photographs without EXIF rotation, because COLMAP ignores it.
         folder: Folder for intermediate files.
         progress: Callback with the present activity.
+        base: Folder of the photographs.
+        unusable: Names of photographs without copies, which the model may name too.
+
+    Returns:
+        The model, and the photos. Photos whose cameras hold for the upright image have upright copies.
 
     Raises:
-        InputError: If the file is damaged or contains none of the photos.
+        InputError: If the file is damaged or contains none of the photos, if names are ambiguous, or if the file does
+            not tell whether its cameras hold for a photo before or after its EXIF rotation.
         MissingResourceError: If COLMAP aborts its process.
     """
+    by_name = {photo.name: photo for photo in photos}
+    everything = [*by_name, *unusable]
     if source.is_dir():
         model = read_model(source, folder / "given")
+        paths = {name: PurePosixPath(name.replace("\\", "/")) for name in model.cameras}
+        names = match_names(source, paths, base, everything)
+        sized = set(model.cameras)
     elif source.suffix == ".json":
-        model = _read_transforms(source, {photo.name: photo for photo in photos})
+        content = _parse_transforms(source)
+        # The paths are relative to the file.
+        paths = {frame.file_path: _below(source.resolve().parent, frame.file_path) for frame in content.frames}
+        names = match_names(source, paths, base, everything)
+        sizes = {name: by_name[photo].size for name, photo in names.items() if photo in by_name}
+        model, sized = _read_transforms(source, content, sizes)
     else:
         raise InputError(f"{source}: poses must be the folder of a COLMAP model or a transforms.json")
-    names = _match(model.cameras, photos)
-    if len(names) < 2:
-        raise InputError(f"{source}: must name the photos (got {next(iter(model.cameras))} which matches no photo)")
+    matched = {name: by_name[photo] for name, photo in names.items() if photo in by_name and name in model.cameras}
+    if len(matched) < 2:
+        first = next(iter(paths))
+        raise InputError(f"{source}: must name at least two of the photos (got {len(matched)}; it names {first})")
     _check_coordinates(source, model)
-    sizes = {photo.file.name: photo.size for photo in photos}
-    cameras = {file: _resized_camera(source, name, model.cameras[name], sizes[file]) for name, file in names.items()}
+    upright = _upright_photos(source, model, matched, sized)
+    matched |= {name: turn_upright(photo) for name, photo in matched.items() if photo.name in upright}
+    cameras = {
+        photo.file.name: _resized_camera(source, name, model.cameras[name], photo.size)
+        for name, photo in matched.items()
+    }
+    turned = {photo.name: photo for photo in matched.values()}
+    photos = [turned.get(photo.name, photo) for photo in photos]
     if not len(model.points):
-        return find_points([photo for photo in photos if photo.file.name in cameras], cameras, folder, progress)
-    return replace(model, cameras=cameras, seen={file: model.seen[name] for name, file in names.items()})
+        return find_points([p for p in photos if p.file.name in cameras], cameras, folder, progress), photos
+    seen = {photo.file.name: model.seen[name] for name, photo in matched.items()}
+    return replace(model, cameras=cameras, seen=seen), photos
+
+
+def _below(folder: Path, name: str) -> PurePosixPath:
+    """Return the path of a file relative to a folder, which may have backslashes and parts ``..``."""
+    return PurePosixPath(os.path.normpath(folder / name.replace("\\", "/")))
+
+
+def _upright_photos(
+    source: Path, model: SparseModel, matched: Mapping[str, Prepared], sized: Collection[str]
+) -> set[str]:
+    """Return the names of the photos with EXIF rotation whose cameras hold for the upright image.
+
+    The size of the model's image decides. Half turns, mirror images and square images have the same size: there, the
+    colours of the model's points decide, and else the other photos.
+
+    Args:
+        source: Model, for messages.
+        model: Cameras and points, by names of the model.
+        matched: Photos by names of the model.
+        sized: Names for which the model states the size of the image.
+
+    Raises:
+        InputError: If nothing decides.
+    """
+    upright, undecided = {}, []
+    for name, photo in matched.items():
+        if photo.pending == 1:
+            continue
+        stored = photo.size
+        shown = stored[::-1] if photo.pending >= _FIRST_TURNED else stored
+        fits = [name in sized and not shapes_differ(_size(model.cameras[name]), size) for size in (stored, shown)]
+        decision = fits[1] if any(fits) and not all(fits) else None
+        if decision is None and name in sized:
+            decision = _coloured_upright(model, name, photo)
+        if decision is None:
+            undecided.append(photo)
+        else:
+            upright[photo.name] = decision
+    decisions = set(upright.values())
+    if undecided and len(decisions) != 1:
+        raise InputError(
+            f"{source}: does not tell whether its camera of {undecided[0].name} holds before or after the rotation in "
+            f"the EXIF data of the photo (orientation {undecided[0].pending}): rotate the pixels or remove the entry"
+        )
+    return {name for name, decision in upright.items() if decision} | {
+        photo.name for photo in undecided if True in decisions
+    }
+
+
+def _coloured_upright(model: SparseModel, name: str, photo: Prepared) -> bool | None:
+    """Return True if the upright photo shows the colours of the model's points, False if the stored one does.
+
+    Returns:
+        None if the photo observes few points, or if the colours fit none or both.
+    """
+    seen = model.seen[name]
+    camera, colours = model.cameras[name], model.colours[seen] @ LUMINANCE.astype(np.float64)
+    with Image.open(photo.file) as image:
+        stored = eight_bit(image)
+    fits = []
+    for turned in (stored, ImageOps.exif_transpose(with_orientation(stored, photo.pending))):
+        grey = np.asarray(turned.convert("L"), dtype=np.float64)
+        sight = camera.resized(turned.width, turned.height)
+        inside, x, y = sight.visible_pixels(model.points[seen])
+        if len(inside) < _MIN_COLOURS or not (np.ptp(colours[inside]) and np.ptp(grey[y, x])):
+            return None
+        fits.append(float(np.corrcoef(colours[inside], grey[y, x])[0, 1]))
+    right, wrong = max(fits), min(fits)
+    if right < _MIN_CORRELATION or 1 - right**2 > _MAX_UNEXPLAINED * (1 - max(wrong, 0) ** 2):
+        return None
+    return fits[1] == right
 
 
 def _check_coordinates(source: Path, model: SparseModel) -> None:
@@ -98,10 +213,10 @@ def _check_coordinates(source: Path, model: SparseModel) -> None:
             raise InputError(f"{source}: {name} must lie within {_MAX_COORDINATE:g} of the origin (got {farthest:g})")
 
 
-def _read_transforms(path: Path, photos: Mapping[str, Prepared]) -> SparseModel:
-    """Read the cameras of a ``transforms.json``, keyed by its file paths."""
+def _parse_transforms(path: Path) -> _Transforms:
+    """Read a ``transforms.json``."""
     try:
-        content = _Transforms.model_validate_json(path.read_bytes())
+        return _Transforms.model_validate_json(path.read_bytes())
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None
     except OSError as error:
@@ -112,8 +227,17 @@ def _read_transforms(path: Path, photos: Mapping[str, Prepared]) -> SparseModel:
         raise InputError(
             f"{path}: {place}: {first['msg']} (got {json.dumps(first['input'], default=str):.60})"
         ) from None
-    sizes = {name: photos[file].size for name, file in _match_names(content, photos).items()}
-    cameras = {}
+
+
+def _read_transforms(
+    path: Path, content: _Transforms, sizes: Mapping[str, tuple[int, int]]
+) -> tuple[SparseModel, set[str]]:
+    """Return the cameras of a ``transforms.json`` by its file paths, and the paths for which it states the size.
+
+    Frames without a size have that of their photo in ``sizes``, and are left out if they have none.
+    """
+    cameras: dict[str, Camera] = {}
+    sized = set()
     for number, frame in enumerate(content.frames):
         lens = _Lens.model_validate(content.model_dump(exclude_unset=True) | frame.model_dump(exclude_unset=True))
         width, height = lens.w, lens.h
@@ -121,19 +245,18 @@ def _read_transforms(path: Path, photos: Mapping[str, Prepared]) -> SparseModel:
             if frame.file_path not in sizes:
                 continue  # not among the photos; its size is unknown and not needed
             width, height = sizes[frame.file_path]
+        else:
+            sized.add(frame.file_path)
         try:
-            cameras[frame.file_path] = _camera(lens, round(width), round(height), np.array(frame.transform_matrix))
+            camera = _camera(lens, round(width), round(height), np.array(frame.transform_matrix))
         except ValueError as error:
             raise InputError(f"{path}: frames[{number}]: {error}") from error
+        other = cameras.setdefault(frame.file_path, camera)
+        if not np.array_equal(other.world_from_camera, camera.world_from_camera):
+            raise InputError(f"{path}: frames[{number}]: an image must have one pose (got two of {frame.file_path})")
     empty = np.zeros((0, 3))
     nothing = {name: np.zeros(0, dtype=np.int32) for name in cameras}
-    return SparseModel(cameras, empty, empty.astype(np.uint8), nothing)
-
-
-def _match_names(content: _Transforms, photos: Mapping[str, Prepared]) -> dict[str, str]:
-    files = _match([frame.file_path for frame in content.frames], list(photos.values()))
-    names = {photo.file.name: name for name, photo in photos.items()}
-    return {path: names[file] for path, file in files.items()}
+    return SparseModel(cameras, empty, empty.astype(np.uint8), nothing), sized
 
 
 def _camera(lens: _Lens, width: int, height: int, pose: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> Camera:
@@ -168,29 +291,13 @@ def _camera(lens: _Lens, width: int, height: int, pose: np.ndarray[tuple[int, ..
     )
 
 
-def _match(names: Iterable[str], photos: Sequence[Prepared]) -> dict[str, str]:
-    """Match names of a model to file names of the photo copies.
-
-    A name matches by its path, or by its last part if only one photo has it.
-    """
-    keys: dict[str, set[str]] = {}
-    for photo in photos:
-        path = PurePosixPath(photo.name)
-        for key in {str(path), str(path.with_suffix("")), path.name, path.stem}:
-            keys.setdefault(key, set()).add(photo.file.name)
-    matched: dict[str, str] = {}
-    for name in names:
-        path = PurePosixPath(name.replace("\\", "/"))
-        for key in (str(path), path.name, path.stem):
-            if len(keys.get(key, ())) == 1:
-                matched[name] = next(iter(keys[key]))
-                break
-    return matched
+def _size(camera: Camera) -> tuple[int, int]:
+    return camera.width, camera.height
 
 
 def _resized_camera(source: Path, name: str, camera: Camera, size: tuple[int, int]) -> Camera:
     """Return the camera resized to the pixels of a reduced copy."""
-    if abs(camera.width * size[1] - camera.height * size[0]) > max(camera.width, camera.height, *size):
+    if shapes_differ(_size(camera), size):
         raise InputError(
             f"{source}: {name} must have the aspect ratio of its photo, {size[0]}x{size[1]} px (got {camera.width}x"
             f"{camera.height})"

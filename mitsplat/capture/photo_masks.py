@@ -1,8 +1,8 @@
-"""Object masks of photographs: given by the user, from a segmentation network, or from geometry."""
+"""Object masks of photographs: given by the user, by transparency, from a segmentation network, or from geometry."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
@@ -12,20 +12,27 @@ from typing import Any
 import cv2
 import numpy as np
 import numpy.typing as npt
-from PIL import ExifTags, Image, ImageOps
+from PIL import Image, ImageOps
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from mitsplat.arrays import BoolArray, Float64Array
 from mitsplat.capture.capture import Capture, Photo, mask_name
-from mitsplat.capture.photos import Prepared
+from mitsplat.capture.photos import (
+    Prepared,
+    alpha_channel,
+    mask_files,
+    plain_background,
+    read_mask,
+    with_orientation,
+)
 from mitsplat.errors import InputError
 from mitsplat.geometry.camera import Camera
 from mitsplat.progress import Progress
 from mitsplat.runtime.cores import usable_cores
 from mitsplat.runtime.onnx_networks import load_library
-from mitsplat.storage.files import IMAGE_ERRORS, write_file
+from mitsplat.storage.files import write_file
 
 ByteImage = npt.NDArray[np.uint8]
 MaskMaker = Callable[[Photo], BoolArray]
@@ -153,49 +160,83 @@ def object_masks(
     return add(agreed_masks(masked, points, bare, hidden))
 
 
-def given_masks(folder: Path, prepared: Mapping[str, Prepared]) -> MaskMaker:
-    """Return a function that reads masks of the user.
-
-    A mask file is ``<photo>.png``, with or without the photo's own suffix, in any case. It has the size of the photo.
-    White marks the object; in a picture with transparency, opaque pixels do. A mask is oriented as viewers show the
-    photo. A mask in the orientation of the sensor is rotated by the EXIF orientation of the photo.
+def given_masks(folder: Path, prepared: Mapping[str, Prepared], lenses: Mapping[str, Camera]) -> MaskMaker:
+    """Return a function that reads masks of the user, see :func:`read_mask`.
 
     Args:
         folder: Folder of the masks.
         prepared: Photo copies by the name of the photo.
+        lenses: Cameras of the copies, before distortion was removed.
 
     Raises:
         InputError: Raised by the returned function if a mask is missing or has another aspect ratio.
     """
-    below = sorted(path for path in folder.rglob("*") if path.is_file())
-    by_name = {path.relative_to(folder).as_posix().lower(): path for path in below}
+    files = mask_files(folder)
 
     def make(photo: Photo) -> BoolArray:
-        name = Path(photo.name)
-        candidates = [f"{photo.name}.png", name.with_suffix(".png").as_posix(), photo.name]
-        path = next((by_name[file.lower()] for file in candidates if file.lower() in by_name), None)
-        if path is None:
-            raise InputError(f"{folder}: every photo must have a mask (missing: {candidates[1]})")
-        try:
-            with Image.open(path) as image:
-                upright = ImageOps.exif_transpose(image)
-                mask = upright.getchannel("A") if "A" in upright.getbands() else upright.convert("L")
-                if mask.getextrema() == (255, 255):  # a fully opaque alpha channel has no information
-                    mask = upright.convert("L")
-        except IMAGE_ERRORS as error:
-            raise InputError(f"{path}: not a readable image ({error})") from error
-        size = (photo.camera.width, photo.camera.height)
-        if shapes_differ(mask.size, size) and not shapes_differ(mask.size[::-1], size):
-            mask.getexif()[ExifTags.Base.Orientation] = prepared[photo.name].orientation
-            mask = ImageOps.exif_transpose(mask)
-        if shapes_differ(mask.size, size):
+        mask = read_mask(files, prepared[photo.name])
+        if mask is None:
             raise InputError(
-                f"{path}: must have the aspect ratio of its photo, {size[0]}x{size[1]} px "
-                f"(got {mask.width}x{mask.height})"
+                f"{folder}: every photo must have a mask (missing: {Path(photo.name).with_suffix('.png').as_posix()})"
             )
-        return np.asarray(mask.resize(size, Image.Resampling.BOX)) >= 128
+        return _seen_by(photo.camera, mask, lenses[photo.name])
 
     return make
+
+
+def cutout_masks(
+    folder: Path, prepared: Mapping[str, Prepared], lenses: Mapping[str, Camera], names: Collection[str]
+) -> MaskMaker | None:
+    """Return a function that takes the masks of photos whose background was removed from their transparency.
+
+    Args:
+        folder: Folder of the photos.
+        prepared: Photo copies by the name of the photo.
+        lenses: Cameras of the copies, before distortion was removed.
+        names: Names of the photos.
+
+    Returns:
+        None if a photo has no alpha channel, or if no photo has a transparent pixel.
+    """
+    opaque = [prepared[name].opaque for name in names]
+    if None in opaque or min(share for share in opaque if share is not None) == 1:
+        return None
+
+    def make(photo: Photo) -> BoolArray:
+        copy = prepared[photo.name]
+        with Image.open(folder / photo.name) as image:
+            alpha = alpha_channel(image)
+        if alpha is None:  # replaced since it was prepared
+            raise InputError(f"{folder / photo.name}: must have transparent pixels, as when it was read")
+        alpha = ImageOps.exif_transpose(with_orientation(alpha, copy.orientation))
+        mask = np.asarray(alpha.resize(copy.size, Image.Resampling.BOX)) >= 128
+        return _seen_by(photo.camera, mask, lenses[photo.name])
+
+    return make
+
+
+def plain_masks(photos: Sequence[Photo]) -> MaskMaker | None:
+    """Return a function that masks what is not the plain background of rendered photos; None if a photo has none."""
+
+    def background(photo: Photo) -> BoolArray | None:
+        return plain_background(np.rint(255 * replace(photo, gain=None).read().rgb).astype(np.uint8))
+
+    if any(background(photo) is None for photo in photos):
+        return None
+
+    def make(photo: Photo) -> BoolArray:
+        plain = background(photo)
+        return np.zeros((photo.camera.height, photo.camera.width), bool) if plain is None else ~plain
+
+    return make
+
+
+def _seen_by(camera: Camera, mask: BoolArray, lens: Camera) -> BoolArray:
+    """Return a mask of a photo as its camera without distortion sees it; the mask itself if the lens is unchanged."""
+    if not lens.distortion or camera.distortion:
+        return mask
+    pixels, _ = lens.undistorted(np.uint8(255) * mask.astype(np.uint8)[..., None])
+    return np.asarray(pixels.reshape(camera.height, camera.width) >= 128)
 
 
 def model_masks(model: Path) -> MaskMaker:
@@ -461,11 +502,6 @@ def _dilate(mask: npt.NDArray[np.generic], radius: float) -> BoolArray:
     """Dilate a mask by a disc with a radius of at least one pixel."""
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * max(1, round(radius)) + 1,) * 2)
     return np.asarray(cv2.dilate(mask.astype(np.uint8), disc) > 0)
-
-
-def shapes_differ(one: tuple[int, int], other: tuple[int, int]) -> bool:
-    """Return True if two image sizes have different aspect ratios, beyond the rounding of a reduced copy."""
-    return abs(one[0] * other[1] - one[1] * other[0]) > max(*one, *other)
 
 
 def _largest_part(mask: BoolArray) -> BoolArray:

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import shutil
 import struct
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from PIL import ExifTags, Image, ImageOps
 
+from mitsplat.arrays import BoolArray, ByteImage
 from mitsplat.capture.capture import Photo, stored_name
 from mitsplat.capture.video.sharpness import sharpness
 from mitsplat.errors import InputError
@@ -37,6 +40,12 @@ _MAX_CLIPPED = 0.9
 """Fraction of black or white pixels above which a photo is unusable; a white backdrop covers less."""
 
 
+_PLAIN = 3
+"""Largest difference of a plain background from black or white [of 255]; JPEG changes it that much."""
+_PLAIN_BORDER = 0.5
+"""Minimum fraction of the border of a photo that a plain background takes."""
+
+
 @dataclass(frozen=True)
 class Prepared:
     """Upright copy of a photo.
@@ -47,6 +56,8 @@ class Prepared:
         size: Width and height [px].
         orientation: EXIF orientation that was applied, 1 to 8 (1: none).
         lens: Camera make and model, focal length and size; photos with equal values can share intrinsics.
+        pending: EXIF orientation that was not applied, 1 to 8 (1: none).
+        opaque: Fraction of opaque pixels; None without an alpha channel.
     """
 
     name: str
@@ -54,6 +65,8 @@ class Prepared:
     size: tuple[int, int]
     orientation: int
     lens: tuple[str, ...]
+    pending: int = 1
+    opaque: float | None = None
 
 
 @dataclass(frozen=True)
@@ -95,6 +108,7 @@ def prepare_photos(
     but: Path | None = None,
     max_size: int,
     upright: bool = True,
+    masks: Path | None = None,
     progress: Progress | None = None,
 ) -> tuple[list[Prepared], dict[str, str]]:
     """Make upright copies of the usable photographs below ``folder``.
@@ -107,7 +121,9 @@ def prepare_photos(
         but: Folder whose pictures are excluded.
         out: Folder of the copies; existing copies are reused.
         max_size: Longest edge of the copies [px].
-        upright: Apply the EXIF orientation. Known cameras ignore it.
+        upright: Apply the EXIF orientation. Without it, cameras are known, and photos may be rendered: a plain
+            background is not judged then.
+        masks: Folder of masks of the object. A photo is too dark or too bright only if the object is too.
         progress: Callback with the number of finished photos.
 
     Returns:
@@ -120,8 +136,10 @@ def prepare_photos(
     out.mkdir(parents=True, exist_ok=True)
     measured: list[_MeasuredPhoto] = []
     rejected: dict[str, str] = {}
+    files_of_masks = {} if masks is None else mask_files(masks)
+    prepare = partial(_prepare, folder=folder, out=out, max_size=max_size, upright=upright, masks=files_of_masks)
     with ThreadPoolExecutor(usable_cores()) as pool:
-        results = pool.map(partial(_prepare, folder=folder, out=out, max_size=max_size, upright=upright), files)
+        results = pool.map(prepare, files)
         for done, (file, result) in enumerate(zip(files, results, strict=True), start=1):
             if isinstance(result, str):
                 rejected[file.relative_to(folder).as_posix()] = result
@@ -140,7 +158,9 @@ def prepare_photos(
     return good, rejected
 
 
-def _prepare(path: Path, *, folder: Path, out: Path, max_size: int, upright: bool) -> _MeasuredPhoto | str:
+def _prepare(
+    path: Path, *, folder: Path, out: Path, max_size: int, upright: bool, masks: Mapping[str, Path]
+) -> _MeasuredPhoto | str:
     """Make the upright copy of a photo, or return the reason why it cannot be read."""
     if path.suffix.lower() in _UNSUPPORTED:
         return f"{path.suffix[1:].upper()} files are not supported; export it as JPEG or PNG"
@@ -150,12 +170,14 @@ def _prepare(path: Path, *, folder: Path, out: Path, max_size: int, upright: boo
             image.load()
             exif = image.getexif()
             details = {**exif, **exif.get_ifd(ExifTags.IFD.Exif)}
-            orientation = int(exif.get(ExifTags.Base.Orientation, 1)) if upright else 1
+            stated = exif.get(ExifTags.Base.Orientation, 1)
+            stated = int(stated) if stated in range(1, 9) else 1
+            orientation, pending = (stated, 1) if upright else (1, stated)
             turned = ImageOps.exif_transpose(image) if upright else image
             lossy, kept = image.format in _LOSSY, image.format in ("JPEG", "PNG") and image.mode in ("RGB", "L")
     except IMAGE_ERRORS as error:
         return f"it cannot be read ({error})"
-    kept &= max(turned.size) <= max_size and orientation == 1
+    kept &= max(turned.size) <= max_size and orientation == pending == 1
     suffix = path.suffix if kept else ".jpg" if lossy else ".png"
     file = out / stored_name(name, suffix)
     rgb = eight_bit(turned)
@@ -165,7 +187,8 @@ def _prepare(path: Path, *, folder: Path, out: Path, max_size: int, upright: boo
         if kept:
             write_file(file, partial(shutil.copyfile, path))
         else:
-            # EXIF is copied for the focal length, the initial value of COLMAP; the orientation is removed.
+            # EXIF is copied for the focal length, the initial value of COLMAP; the orientation is removed, because some
+            # readers apply it.
             exif = turned.getexif()
             exif.pop(ExifTags.Base.Orientation, None)
             try:
@@ -178,8 +201,110 @@ def _prepare(path: Path, *, folder: Path, out: Path, max_size: int, upright: boo
     focal = details.get(ExifTags.Base.FocalLength), details.get(ExifTags.Base.FocalLengthIn35mmFilm)
     lens = (details.get(ExifTags.Base.Make), details.get(ExifTags.Base.Model), *focal, *rgb.size)
     grey = np.asarray(rgb.convert("L"))
-    clipped = (float(np.mean(grey <= 4)), float(np.mean(grey >= 251)))
-    return _MeasuredPhoto(Prepared(name, file, rgb.size, orientation, tuple(map(str, lens))), sharpness(grey), clipped)
+    alpha, shown, opaque = alpha_channel(turned), np.ones(grey.shape, bool), None
+    if alpha is not None:
+        shown = np.asarray(alpha.resize(rgb.size, Image.Resampling.BOX)) >= 128
+        opaque = float(shown.mean())
+        if not opaque:
+            return "it is transparent"
+    prepared = Prepared(name, file, rgb.size, orientation, tuple(map(str, lens)), pending, opaque)
+    regions = [shown]
+    if not upright and (plain := plain_background(np.asarray(rgb))) is not None:
+        regions.append(shown & ~plain)
+    if (mask := read_mask(masks, prepared)) is not None:
+        regions.append(shown & mask)
+    clipped = [(float(np.mean(grey[r] <= 4)), float(np.mean(grey[r] >= 251))) for r in regions if r.any()]
+    return _MeasuredPhoto(prepared, sharpness(grey), min(clipped, key=max))
+
+
+def alpha_channel(image: Image.Image) -> Image.Image | None:
+    """Return the alpha channel of an image; None if it has none."""
+    if "transparency" in image.info:  # a colour, or the alpha of the colours of a palette
+        image = image.convert("RGBA")
+    return image.getchannel("A") if "A" in image.getbands() else None
+
+
+def plain_background(rgb: ByteImage) -> BoolArray | None:
+    """Return the background of a rendered photo (H, W, 3): black or white pixels that are connected to its border.
+
+    Returns:
+        Shape (H, W); None unless at least half of the border has one colour, black or white.
+    """
+    border = np.concatenate([rgb[0], rgb[-1], rgb[:, 0], rgb[:, -1]]).astype(np.int16)
+    for colour in (0, 255):
+        if np.mean((np.abs(border - colour) <= _PLAIN).all(axis=1)) < _PLAIN_BORDER:
+            continue
+        alike = np.asarray((np.abs(rgb.astype(np.int16) - colour) <= _PLAIN).all(axis=2), dtype=np.uint8)
+        parts = cv2.connectedComponents(alike, connectivity=4)[1]
+        outer = np.unique(np.concatenate([parts[0], parts[-1], parts[:, 0], parts[:, -1]]))
+        return np.asarray(np.isin(parts, outer[outer > 0]))
+    return None
+
+
+def mask_files(folder: Path) -> dict[str, Path]:
+    """Return the files of a folder of masks by their lower-case path relative to it."""
+    below = sorted(path for path in folder.rglob("*") if path.is_file())
+    return {path.relative_to(folder).as_posix().lower(): path for path in below}
+
+
+def read_mask(files: Mapping[str, Path], photo: Prepared) -> BoolArray | None:
+    """Read the mask of a photo in the size of its copy; None if there is none.
+
+    A mask file is ``<photo>.png``, with or without the photo's own suffix, in any case. White marks the object; in a
+    picture with transparency, opaque pixels do. A mask has the orientation of the copy: as viewers show the photo, or,
+    with known cameras, as the model has it. A mask in the orientation of the sensor is rotated by the EXIF orientation.
+
+    Raises:
+        InputError: If it cannot be read or has another aspect ratio.
+    """
+    name = Path(photo.name)
+    candidates = [f"{photo.name}.png", name.with_suffix(".png").as_posix(), photo.name]
+    path = next((files[file.lower()] for file in candidates if file.lower() in files), None)
+    if path is None:
+        return None
+    try:
+        with Image.open(path) as image:
+            turned = ImageOps.exif_transpose(image)
+            mask = alpha_channel(turned)
+            if mask is None or mask.getextrema() == (255, 255):  # a fully opaque alpha channel has no information
+                mask = turned.convert("L")
+    except IMAGE_ERRORS as error:
+        raise InputError(f"{path}: not a readable image ({error})") from error
+    size = photo.size
+    if shapes_differ(mask.size, size) and not shapes_differ(mask.size[::-1], size):
+        mask = ImageOps.exif_transpose(with_orientation(mask, photo.orientation))
+    if shapes_differ(mask.size, size):
+        raise InputError(
+            f"{path}: must have the aspect ratio of its photo, {size[0]}x{size[1]} px (got {mask.width}x{mask.height})"
+        )
+    return np.asarray(mask.resize(size, Image.Resampling.BOX)) >= 128
+
+
+def shapes_differ(one: tuple[int, int], other: tuple[int, int]) -> bool:
+    """Return True if two image sizes have different aspect ratios, beyond the rounding of a reduced copy."""
+    return abs(one[0] * other[1] - one[1] * other[0]) > max(*one, *other)
+
+
+def with_orientation(image: Image.Image, orientation: int) -> Image.Image:
+    """Return a copy of an image with an EXIF orientation, which is not applied."""
+    copy = image.copy()
+    copy.getexif()[ExifTags.Base.Orientation] = orientation
+    return copy
+
+
+def turn_upright(photo: Prepared) -> Prepared:
+    """Return the photo with its pending EXIF orientation applied, in a new copy; an existing copy is reused."""
+    if photo.pending == 1:
+        return photo
+    file = photo.file.with_name(f"{photo.file.stem}.upright.png")
+    try:
+        with Image.open(photo.file) as image:
+            turned = ImageOps.exif_transpose(with_orientation(eight_bit(image), photo.pending))
+    except IMAGE_ERRORS as error:
+        raise InputError(f"{photo.file}: not a readable image ({error})") from error
+    if not file.exists():
+        write_file(file, lambda part: turned.save(part, "PNG", exif=b""))
+    return replace(photo, file=file, size=turned.size, orientation=photo.pending, pending=1)
 
 
 def _photo_fault(photo: _MeasuredPhoto, median_sharpness: float) -> str | None:

@@ -124,8 +124,9 @@ def assign_ids(job: dict[str, Any], images: Path, database: Path) -> None:
 
 def extract(job: dict[str, Any], images: Path, database: Path, folder: Path) -> None:
     """Compute SIFT features of the photos that have none yet."""
-    write_status(folder, "finding features")
     assign_ids(job, images, database)
+    # Later than the creation of the database, which fails while the parent reads it.
+    write_status(folder, "finding features")
     options = pycolmap.FeatureExtractionOptions()
     options.num_threads = usable_cores()  # COLMAP would use all cores; each needs memory for a photo
     options.sift.max_num_features = job["features"]

@@ -21,7 +21,7 @@ from scipy.ndimage import map_coordinates
 
 from mitsplat.arrays import Float32Array, Float64Array
 from mitsplat.capture.capture import Photo, Window
-from mitsplat.capture.photo_masks import shapes_differ
+from mitsplat.capture.photos import shapes_differ
 from mitsplat.errors import InputError
 from mitsplat.geometry.camera import Camera
 from mitsplat.images.exr_header import check_exr_header

@@ -127,4 +127,6 @@ def eight_bit(image: Image.Image) -> Image.Image:
     """Convert to RGB with 8 bits per channel. Transparent pixels keep their colour, 16-bit grey its upper byte."""
     if image.mode.startswith("I"):
         return Image.fromarray((np.asarray(image).astype(np.int64) // 256).clip(0, 255).astype(np.uint8)).convert("RGB")
+    if "transparency" in image.info:  # Pillow asks for this intermediate mode
+        image = image.convert("RGBA")
     return image.convert("RGB")

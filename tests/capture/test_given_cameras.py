@@ -11,13 +11,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import ExifTags, Image, ImageOps
 
 from mitsplat.capture import known_poses as poses
 from mitsplat.capture import structure_from_motion as sfm
 from mitsplat.capture.capture import Capture
 from mitsplat.capture.known_poses import read_poses
-from mitsplat.capture.photos import Prepared, prepare_photos
+from mitsplat.capture.photos import Prepared, prepare_photos, with_orientation
 from mitsplat.capture.pipeline.capture_pipeline import CaptureResult, CaptureSettings, capture_photos
 from mitsplat.errors import InputError
 from mitsplat.geometry.camera import Camera
@@ -88,7 +88,7 @@ def test_transforms_json_is_read_and_points_are_triangulated(
     content = {"camera_angle_x": 2 * np.arctan(camera.width / 2 / camera.fx), "frames": frames}
     (tmp_path / "transforms.json").write_text(json.dumps(content))
     prepared, _ = prepare_photos(folder, tmp_path / "copies", max_size=480)
-    model = read_poses(tmp_path / "transforms.json", prepared, tmp_path / "work")
+    model, _ = read_poses(tmp_path / "transforms.json", prepared, tmp_path / "work", base=folder)
     for name, true in truth.items():
         np.testing.assert_allclose(model.cameras[name].world_from_camera, true.world_from_camera, atol=1e-12)
         assert model.cameras[name].fx == pytest.approx(true.fx)
@@ -97,10 +97,10 @@ def test_transforms_json_is_read_and_points_are_triangulated(
     content["frames"][1]["transform_matrix"][0][0] = 7
     (tmp_path / "transforms.json").write_text(json.dumps(content))
     with pytest.raises(InputError, match=r"transforms\.json: frames\[1\]: world_from_camera must be a rotation"):
-        read_poses(tmp_path / "transforms.json", prepared, tmp_path / "work")
+        read_poses(tmp_path / "transforms.json", prepared, tmp_path / "work", base=folder)
     (tmp_path / "transforms.json").write_text('{"frames": []}')
     with pytest.raises(InputError, match=r"transforms\.json: frames: "):
-        read_poses(tmp_path / "transforms.json", prepared, tmp_path / "work")
+        read_poses(tmp_path / "transforms.json", prepared, tmp_path / "work", base=folder)
 
 
 def test_given_masks_replace_computed_masks(
@@ -165,7 +165,8 @@ def test_fisheye_cameras_are_read_from_colmap_and_transforms_json(tmp_path: Path
     frame = {"file_path": "a.png", "transform_matrix": np.diag([1.0, -1.0, -1.0, 1.0]).tolist()}
     lens = dict(zip(names, values, strict=True)) | {"w": 320, "h": 240, "camera_model": "OPENCV_FISHEYE"}
     (tmp_path / "transforms.json").write_text(json.dumps(lens | {"frames": [frame]}))
-    nerf = poses._read_transforms(tmp_path / "transforms.json", {}).cameras["a.png"]
+    path = tmp_path / "transforms.json"
+    nerf = poses._read_transforms(path, poses._parse_transforms(path), {})[0].cameras["a.png"]
     for camera in (colmap, nerf):
         assert camera.lens == "fisheye"
         np.testing.assert_allclose(camera.project([[np.tan(angle), 0, 1]])[0], pixel, atol=1e-9)
@@ -196,7 +197,7 @@ def test_models_with_positions_that_are_not_finite_are_refused(
     path = model / f"{file}.txt"
     path.write_text(path.read_text().replace(old, new))
     with pytest.raises(InputError) as raised:
-        read_poses(model, photos, tmp_path / "work")
+        read_poses(model, photos, tmp_path / "work", base=tmp_path)
     assert sentence in str(raised.value) and str(model) in str(raised.value)
 
 
@@ -212,14 +213,14 @@ def test_counts_beyond_the_size_of_a_model_take_no_memory(
     (model / "points3D.bin").write_bytes(data)
     monkeypatch.setattr(sfm, "_READ_MEMORY", 200 << 20)
     with pytest.raises(InputError, match="model: not a readable COLMAP model"):
-        read_poses(model, photos, tmp_path / "work")
+        read_poses(model, photos, tmp_path / "work", base=tmp_path)
 
 
 def test_reading_a_model_beyond_the_time_limit_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     model, photos = small_model(tmp_path)
     monkeypatch.setattr(sfm, "_READ_SECONDS", 0.0)
     with pytest.raises(InputError, match="COLMAP did not end within 0 s"):
-        read_poses(model, photos, tmp_path / "work")
+        read_poses(model, photos, tmp_path / "work", base=tmp_path)
 
 
 def test_a_named_pipe_in_a_model_is_refused(tmp_path: Path) -> None:
@@ -227,4 +228,106 @@ def test_a_named_pipe_in_a_model_is_refused(tmp_path: Path) -> None:
     (model / "points3D.txt").unlink()
     os.mkfifo(model / "points3D.txt")
     with pytest.raises(InputError, match=r"points3D\.txt: must be a file"):
-        read_poses(model, photos, tmp_path / "work")
+        read_poses(model, photos, tmp_path / "work", base=tmp_path)
+
+
+def test_photos_of_one_camera_of_a_rig_get_its_cameras(tmp_path: Path) -> None:
+    """Both cameras of the model have photos of the same names; unusable photos count as matched."""
+    model, _ = small_model(tmp_path)
+    images = "".join(
+        f"{number} 1 0 0 0 {0.1 * number} 0 1 1 {side}/{name}.png\n5 6 1\n"
+        for number, (side, name) in enumerate(((side, name) for side in ("left", "right") for name in "abc"), start=1)
+    )
+    (model / "images.txt").write_text(images)
+    (model / "points3D.txt").write_text("1 0 0 1 9 9 9 0.1 1 0 2 0 3 0 4 0 5 0 6 0\n")
+    photos = [Prepared(f"{name}.png", tmp_path / f"{name}.png", (32, 24), 1, ()) for name in "ab"]
+    found, _ = read_poses(model, photos, tmp_path / "work", base=tmp_path / "right", unusable=["c.png"])
+    assert {name: round(-float(c.centre[0]), 3) for name, c in found.cameras.items()} == {"a.png": 0.4, "b.png": 0.5}
+    with pytest.raises(InputError, match=r"the photo a\.png must match one of the names \(got left/a\.png and right/"):
+        read_poses(model, photos, tmp_path / "work", base=tmp_path / "elsewhere")
+
+
+def test_paths_of_a_transforms_json_are_relative_to_it(tmp_path: Path) -> None:
+    folder = tmp_path / "rig/right"
+    folder.mkdir(parents=True)
+    frames = [{"file_path": f".\\{name}.png", "transform_matrix": np.eye(4).tolist()} for name in "ab"]
+    frames[1]["transform_matrix"] = np.diag([-1.0, -1, 1, 1]).tolist()
+    content = {"fl_x": 40, "w": 32, "h": 24, "frames": frames}
+    path = folder / "transforms.json"
+    path.write_text(json.dumps(content))
+    parsed = poses._parse_transforms(path)
+    names = {frame.file_path: poses._below(path.parent, frame.file_path) for frame in parsed.frames}
+    given = [f"{side}/{name}.png" for side in ("left", "right") for name in "ab"]
+    assert poses.match_names(path, names, tmp_path / "rig", given) == {
+        ".\\a.png": "right/a.png",
+        ".\\b.png": "right/b.png",
+    }
+    frames[1]["file_path"] = ".\\a.png"
+    path.write_text(json.dumps(content))
+    with pytest.raises(InputError, match=r"frames\[1\]: an image must have one pose \(got two of \.\\a\.png\)"):
+        poses._read_transforms(path, poses._parse_transforms(path), {})
+
+
+def turned_photos(folder: Path, orientation: int, size: tuple[int, int]) -> tuple[np.ndarray, list[Prepared]]:
+    """Return the upright pixels of a photo, and three photos that are stored for an EXIF orientation."""
+    coarse = np.random.default_rng(0).integers(0, 256, (size[1] // 4, size[0] // 4, 3), dtype=np.uint8)
+    upright = coarse.repeat(4, axis=0).repeat(4, axis=1)
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = orientation
+    undo = {6: 8, 8: 6}.get(orientation, orientation)  # all other orientations are their own inverse
+    stored = ImageOps.exif_transpose(with_orientation(Image.fromarray(upright), undo))
+    (folder / "photos").mkdir()
+    for name in "abc":
+        stored.save(folder / "photos" / f"{name}.png", exif=exif)
+    prepared, rejected = prepare_photos(folder / "photos", folder / "copies", max_size=1000, upright=False)
+    assert not rejected
+    return upright, prepared
+
+
+def model_of(picture: np.ndarray, *, points: bool = True) -> sfm.SparseModel:
+    """Return a model of three cameras that see coloured points on a picture (H, W, 3), one metre in front of them."""
+    height, width = picture.shape[:2]
+    pixels = np.random.default_rng(1).uniform((2, 2), (width - 2, height - 2), (60 if points else 0, 2))
+    places = np.column_stack([(pixels - (width / 2, height / 2)) / 50, np.ones(len(pixels))])
+    columns, rows = pixels.astype(int).T
+    camera = Camera(width, height, 50.0, 50.0, width / 2, height / 2, np.eye(4))
+    names = [f"{name}.png" for name in "abc"]
+    seen = dict.fromkeys(names, np.arange(len(pixels), dtype=np.int32))
+    return sfm.SparseModel(dict.fromkeys(names, camera), places, picture[rows, columns], seen)
+
+
+@pytest.mark.parametrize("orientation", range(2, 9))
+@pytest.mark.parametrize("of", ["stored", "upright"])
+@pytest.mark.parametrize("size", [(80, 60), (64, 64)])
+def test_the_model_decides_whether_its_cameras_hold_for_upright_photos(
+    tmp_path: Path, orientation: int, of: str, size: tuple[int, int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The size of the model's images decides; where it cannot, the colours of the model's points."""
+    upright, prepared = turned_photos(tmp_path, orientation, size)
+    with Image.open(prepared[0].file) as copy:
+        stored = np.asarray(copy)
+    wanted = upright if of == "upright" else stored
+    monkeypatch.setattr(poses, "read_model", lambda *_: model_of(wanted))
+    found, photos = read_poses(tmp_path, prepared, tmp_path / "work", base=tmp_path / "photos")
+    assert len(found.cameras) == 3
+    for photo in photos:
+        assert photo.file.name in found.cameras
+        camera = found.cameras[photo.file.name]
+        assert (camera.width, camera.height) == photo.size == wanted.shape[1::-1]
+        with Image.open(photo.file) as copy:
+            np.testing.assert_array_equal(np.asarray(copy), wanted)
+            assert copy.getexif().get(ExifTags.Base.Orientation, 1) == 1
+
+
+@pytest.mark.parametrize("points", [True, False])
+def test_an_undecided_half_turn_is_refused_with_a_remedy(
+    tmp_path: Path, points: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The points have other colours than the photos, or there are no points."""
+    upright, prepared = turned_photos(tmp_path, 3, (80, 60))
+    other = np.random.default_rng(9).integers(0, 256, upright.shape, dtype=np.uint8)
+    monkeypatch.setattr(poses, "read_model", lambda *_: model_of(other, points=points))
+    with pytest.raises(InputError) as raised:
+        read_poses(tmp_path, prepared, tmp_path / "work", base=tmp_path / "photos")
+    assert "camera of a.png holds before or after the rotation in the EXIF data" in str(raised.value)
+    assert "(orientation 3): rotate the pixels or remove the entry" in str(raised.value)

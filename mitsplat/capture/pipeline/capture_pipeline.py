@@ -20,13 +20,22 @@ from mitsplat.capture.exposure import even_exposure
 from mitsplat.capture.isolation import ChosenObject, occluded_part
 from mitsplat.capture.known_poses import read_poses
 from mitsplat.capture.metric_frame import DEFAULT_BOARD, MetricFrame, find_metric_frame
-from mitsplat.capture.photo_masks import add_masks, given_masks, model_masks, object_masks, object_points
+from mitsplat.capture.photo_masks import (
+    add_masks,
+    cutout_masks,
+    given_masks,
+    model_masks,
+    object_masks,
+    object_points,
+    plain_masks,
+)
 from mitsplat.capture.photos import SUFFIXES, Prepared, find_photos, prepare_photos, undistort
 from mitsplat.capture.pipeline.overview import capture_sheet
 from mitsplat.capture.pipeline.picking import chosen_object
 from mitsplat.capture.structure_from_motion import MIN_AGREEMENT, MIN_POINTS, SURE_AGREEMENT, SparseModel, find_cameras
 from mitsplat.capture.video import ChosenFrames, choose_frames
 from mitsplat.errors import InputError
+from mitsplat.geometry.camera import Camera
 from mitsplat.progress import Progress
 from mitsplat.storage.content_hash import file_hash
 from mitsplat.storage.files import write_file, write_text
@@ -224,13 +233,17 @@ def _capture(photos: Path, out: Path, settings: CaptureSettings, progress: Progr
         but=settings.masks,
         max_size=settings.max_size,
         upright=settings.poses is None,
+        masks=settings.masks,
         progress=progress,
     )
     if len(prepared) < MIN_PHOTOS:
         reasons = "; ".join(f"{name}: {reason}" for name, reason in sorted(rejected.items())[:3])
         raise InputError(f"{photos}: needs at least {MIN_PHOTOS} usable photographs (got {len(prepared)}; {reasons})")
+    given = None
+    if settings.poses is not None:
+        given, prepared = read_poses(settings.poses, prepared, work, progress, base=photos, unusable=list(rejected))
     by_file = {photo.file.name: photo for photo in prepared}
-    model, frame, faults = _find_model(photos, by_file, settings, work, progress)
+    model, frame, faults = _find_model(photos, by_file, given, settings, work, progress)
     rejected |= {by_file[file].name: fault for file, fault in faults.items()}
     capture = Capture(
         photos=tuple(
@@ -247,11 +260,13 @@ def _capture(photos: Path, out: Path, settings: CaptureSettings, progress: Progr
     # The near distance depends on the units, and poses do not define one.
     near = tuple(replace(photo, camera=replace(photo.camera, near=0.01)) for photo in capture.photos)
     capture = replace(capture, photos=near, table=frame.table)
+    lenses = {photo.name: photo.camera for photo in capture.photos}
     if settings.undistorted:
         capture = replace(capture, photos=tuple(undistort(photo) for photo in capture.photos))
     capture = even_exposure(capture)
     if settings.kind == "object":
-        capture = _with_masks(capture, frame, settings, prepared, out, progress)
+        made = {photo.name: photo for photo in prepared}
+        capture = _with_masks(capture, frame, settings, photos, made, lenses, out, progress)
         if len(capture.photos) < MIN_PHOTOS:
             name, reason = sorted(set(capture.rejected.items()) - set(rejected.items()))[0]
             raise InputError(
@@ -334,7 +349,12 @@ def _delete_outdated(out: Path, inputs: dict[str, object], settings: CaptureSett
 
 
 def _find_model(
-    photos: Path, by_file: dict[str, Prepared], settings: CaptureSettings, work: Path, progress: Progress | None
+    photos: Path,
+    by_file: dict[str, Prepared],
+    given: SparseModel | None,
+    settings: CaptureSettings,
+    work: Path,
+    progress: Progress | None,
 ) -> tuple[SparseModel, MetricFrame, dict[str, str]]:
     """Find consistent cameras and their metric frame.
 
@@ -343,8 +363,8 @@ def _find_model(
         reason for each file without a camera.
     """
     faults: dict[str, str] = {}
-    if settings.poses is not None:
-        model = read_poses(settings.poses, list(by_file.values()), work, progress)
+    if given is not None:
+        model = given
     else:
         model, faults = _remove_faulty_cameras(find_cameras(list(by_file.values()), work, progress))
     _check_camera_count(photos, model, by_file, faults)
@@ -424,16 +444,23 @@ def _with_masks(
     capture: Capture,
     frame: MetricFrame,
     settings: CaptureSettings,
-    prepared: Sequence[Prepared],
+    source: Path,
+    prepared: Mapping[str, Prepared],
+    lenses: Mapping[str, Camera],
     out: Path,
     progress: Progress | None,
 ) -> Capture:
     mask_folder = out / "masks"
     if settings.masks is not None:
-        made = {photo.name: photo for photo in prepared}
-        return add_masks(capture, given_masks(settings.masks, made), mask_folder, progress=progress)
+        return add_masks(capture, given_masks(settings.masks, prepared, lenses), mask_folder, progress=progress)
     if settings.mask_model is not None:
         return add_masks(capture, model_masks(settings.mask_model), mask_folder, progress=progress)
+    if not settings.has_hints:
+        cut = cutout_masks(source, prepared, lenses, list(lenses))
+        if cut is None and settings.poses is not None and frame.board is None:
+            cut = plain_masks(capture.photos)
+        if cut is not None:
+            return add_masks(capture, cut, mask_folder, progress=progress)
     if not frame.table and not settings.has_hints:
         raise InputError(
             "no table was found below the object to segment it: pick it (--pick), give masks (--masks or "

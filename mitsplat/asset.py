@@ -13,6 +13,7 @@ A folder holds ``asset.yaml`` (:class:`AssetSpec` lists its keys) and the files 
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from os import PathLike
@@ -34,6 +35,7 @@ from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.mesh import check_faces
 from mitsplat.geometry.untrusted_meshes import check_mesh
 from mitsplat.storage.field_types import Name
+from mitsplat.storage.file_kinds import no_folder_with
 from mitsplat.storage.files import MESH_ERRORS, resolve_inside, storage_errors
 from mitsplat.storage.format_version import FORMAT_VERSIONS
 from mitsplat.storage.yaml_input import FieldError, key_place, load_yaml
@@ -348,7 +350,10 @@ def read_spec(folder: str | PathLike[str]) -> AssetSpec:
     Raises:
         InputError: If the file is missing, has a newer format version or breaks a rule.
     """
-    return load_yaml(Path(folder) / ASSET_FILE, AssetSpec, newest=FORMAT_VERSIONS[ASSET_FILE])
+    path = Path(folder) / ASSET_FILE
+    if not os.path.lexists(path):
+        raise no_folder_with(Path(folder), ASSET_FILE, "an asset folder")
+    return load_yaml(path, AssetSpec, newest=FORMAT_VERSIONS[ASSET_FILE])
 
 
 def read_mesh(path: Path, *, merge: bool = True) -> trimesh.Trimesh:

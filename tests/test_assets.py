@@ -321,7 +321,7 @@ class TestBadInput:
             Asset.load(tmp_path)
 
     def test_a_missing_asset_folder_is_refused(self, tmp_path):
-        with pytest.raises(InputError, match=r"none/asset.yaml: no such file"):
+        with pytest.raises(InputError, match=r"none: no such folder"):
             Asset.load(tmp_path / "none")
 
     def test_mesh_vertices_that_are_not_finite_are_refused(self, tmp_path):

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
@@ -13,7 +14,7 @@ import trimesh
 from scipy.spatial import QhullError
 
 from mitsplat.arrays import Float64Array
-from mitsplat.asset import Asset, opaque_core
+from mitsplat.asset import ASSET_FILE, Asset, opaque_core
 from mitsplat.checks.exposure_check import check_exposure
 from mitsplat.dataset.preflight import run_faults, scene_warnings
 from mitsplat.errors import InputError
@@ -28,7 +29,8 @@ from mitsplat.scene.loading.scene_loading import load_scene
 from mitsplat.scene.planning.frame_plan import plan_frame
 from mitsplat.scene.scene import Scene
 from mitsplat.scene.spec.named_files import environments, object_assets
-from mitsplat.scene.spec.scene_spec import BACKDROP
+from mitsplat.scene.spec.scene_spec import BACKDROP, SceneSpec
+from mitsplat.storage.yaml_input import KeyPath, key_place
 
 SIZE_LIMITS = {"object": (0.002, 2.0), "environment": (0.2, 100.0)}
 """Expected range of the longest extent by kind of asset [m]."""
@@ -47,6 +49,31 @@ MIN_SPREAD_DIFFERENCE = 0.5
 """Relative difference of spreads above which an environment that is thinner along x or y seems to lie on its side."""
 
 
+_ASSET_KEYS: Mapping[str, KeyPath] = {
+    "units": ("units",),
+    "up axis": ("up",),
+    **dict.fromkeys(("splats", "needles", "floaters", "opacity", "spherical harmonics"), ("splats",)),
+    **dict.fromkeys(("mesh", "overlap", "offset", "watertightness"), ("mesh",)),
+    "mass": ("mass",),
+    "colliders": ("pieces",),
+}
+"""Keys of ``asset.yaml`` by the names of findings."""
+_SCENE_KEYS: Mapping[str, KeyPath] = {
+    "formats": ("output", "formats"),
+    **dict.fromkeys(("count", "rest", "settling"), ("objects",)),
+    **dict.fromkeys(("frames", "memory", "disk"), ("output",)),
+    **dict.fromkeys(("visibility", "views", "labels"), ("camera",)),
+    **dict.fromkeys(("shape", "bin", "support"), ("shapes",)),
+    **dict.fromkeys(("light", "lights", "exposure"), ("lights",)),
+    **dict.fromkeys(("room", "region"), ("region",)),
+    "time": ("settle",),
+    "lens": ("camera", "intrinsics"),
+    "backdrop": ("backdrop",),
+    "kernel": ("rendering",),
+}
+"""Keys of scene files by the names of findings."""
+
+
 def check_path(path: Path, *, allow_outside: bool = False) -> Iterator[Finding]:
     """Yield the findings for an asset folder, or for a scene file with all files that it names.
 
@@ -56,11 +83,29 @@ def check_path(path: Path, *, allow_outside: bool = False) -> Iterator[Finding]:
     if path.is_dir():
         yield from check_asset(Asset.load(path))
         return
-    yield from check_scene(load_scene(path, allow_outside=allow_outside))
+    for finding in check_scene(load_scene(path, allow_outside=allow_outside)):
+        yield _located(finding, path, _SCENE_KEYS)
+
+
+def _located(finding: Finding, file: Path, keys: Mapping[str, KeyPath]) -> Finding:
+    """Return a problem with the line of the key to change: the one that its text begins with, or that of its name."""
+    if finding.ok or finding.place:
+        return finding
+    begin = re.match(r"([a-z_]+)(?:\[(\d+)\])?((?:\.[a-z_]+)*)(?=[: ])", finding.text)
+    key = keys.get(finding.name, ())
+    if begin and begin[1] in SceneSpec.model_fields and file.name != ASSET_FILE:
+        number = () if begin[2] is None else (int(begin[2]),)
+        key = (begin[1], *number, *begin[3].split(".")[1:])
+    return replace(finding, place=key_place(file, key)) if key else finding
 
 
 def check_asset(asset: Asset) -> Iterator[Finding]:
     """Yield one finding for each property of an asset that is checked."""
+    for finding in _asset_findings(asset):
+        yield finding if asset.folder is None else _located(finding, asset.folder / ASSET_FILE, _ASSET_KEYS)
+
+
+def _asset_findings(asset: Asset) -> Iterator[Finding]:
     splats = asset.splats
     core = opaque_core(splats).astype(np.float64)
     if not len(core):

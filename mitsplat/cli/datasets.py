@@ -5,6 +5,7 @@ Each command imports its dependencies inside its function, so that all other com
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Iterable, Mapping
 from itertools import chain
 from pathlib import Path
@@ -555,6 +556,8 @@ def _print_findings(findings: Iterable[Finding], mark: str) -> NoReturn:
         typer.echo(f"{'ok  ' if finding.ok else mark}  {finding.name}: {finding.text}")
         if not finding.ok:
             typer.echo(f"      to do: {finding.remedy}")
+            if finding.place:
+                typer.echo(f"      in {finding.place}")
     raise typer.Exit(0 if good else 1)
 
 
@@ -579,6 +582,8 @@ def _overrides(
     if formats is not None:
         names = [name.strip() for name in formats.split(",")]
         if unknown := [name for name in names if name not in FORMATS]:
-            raise InputError(f"--format must be one or more of {', '.join(FORMATS)} (got {unknown[0]})")
+            close = difflib.get_close_matches(unknown[0].lower(), FORMATS, n=1)
+            hint = f"; did you mean {close[0]}?" if close else ""
+            raise InputError(f"--format must be one or more of {', '.join(FORMATS)} (got {unknown[0]}{hint})")
         overrides["output.formats"] = names
     return {key: value for key, value in overrides.items() if value is not None}

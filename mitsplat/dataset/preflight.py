@@ -48,6 +48,8 @@ MIN_PIXEL_BYTES, MIN_PROCESS_GIB = 500, 0.5
 Measured with the workcell scene: 1.0 GiB at 640x360, 2.6 GiB at 2000x2000, 8.4 GiB at 4000x4000. Other scenes need
 more, up to the estimate of :func:`mitsplat.frames.budget.worker_memory`.
 """
+MIN_SHARE_IN_BIN = 0.5
+"""Share of the region above a bin below which objects probably fall beside it by mistake."""
 SLOW_OBJECTS = 40
 """Number of objects per layout above which settling takes minutes on two cores; 25 took 27 s, 50 took 212 s."""
 MIN_FRAME_BYTES = 8192
@@ -299,6 +301,7 @@ def scene_warnings(scene: Scene) -> Iterator[Finding]:
         if names:
             text = f"{len(names)} of {len(lights)} drawn lights are inside of a shape, such as {names[0]!r}"
             yield _fault("lights", text, "narrow lights[].draw: they light nothing")
+    yield from _bin_warnings(scene)
     for shape in spec.shapes:
         if shape.bin is None:
             continue
@@ -307,6 +310,28 @@ def scene_warnings(scene: Scene) -> Iterator[Finding]:
             if asset.mesh is not None and (np.sort(asset.mesh.extents)[:2] > opening).any():
                 text = f"{asset.name!r} does not fit into {shape.name!r}"
                 yield _fault("bin", text, "make the bin larger, or the object smaller by scale")
+
+
+def _bin_warnings(scene: Scene) -> Iterator[Finding]:
+    """Warn of bins into which no object falls, because every region lies beside them."""
+    regions = scene.spec.all_regions
+    for number, shape in enumerate(scene.spec.shapes):
+        if shape.bin is None or not shape.collider or all(entry.poses for entry in scene.spec.objects):
+            continue
+        centre, half = np.array(shape.bin.position[:2]), np.array(shape.bin.size[:2]) / 2
+        shares = []
+        for region, _ in regions:
+            low, high = np.array(region.min[:2]), np.array(region.max[:2])
+            common = np.minimum(high, centre + half) - np.maximum(low, centre - half)
+            share = float(np.prod(np.maximum(common, 0)) / np.prod(high - low))
+            shares.append(share if region.max[2] > shape.bin.position[2] else 0.0)
+        where = "the region is" if len(regions) == 1 else "all regions are"
+        if max(shares) == 0:
+            text = f"shapes[{number}]: {where} beside the bin {shape.name!r}, so no object falls into it"
+            yield _fault("bin", text, "move region above it, or the bin below it (metres?)")
+        elif len(regions) == 1 and shares[0] < MIN_SHARE_IN_BIN:
+            text = f"region: only {shares[0]:.0%} of it is above the bin {shape.name!r}"
+            yield _fault("bin", text, "make region smaller than the bin, or objects fall beside it")
 
 
 def _cost_warnings(scene: Scene) -> Iterator[Finding]:

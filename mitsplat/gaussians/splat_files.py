@@ -50,6 +50,7 @@ from mitsplat.gaussians.splat_training import (
 )
 from mitsplat.quality import KernelName
 from mitsplat.runtime.child_process import run_bounded
+from mitsplat.storage.file_kinds import kind_of_file
 from mitsplat.storage.files import storage_errors, write_file
 
 Axis = Literal["x", "-x", "y", "-y", "z", "-z"]
@@ -114,8 +115,10 @@ def read_splats(path: Path) -> tuple[SplatArrays, KernelName | None]:
     """
     suffix = path.suffix.lower()
     if suffix not in (".ply", ".splat", *_CONVERTED):
+        kind = kind_of_file(path)
         raise InputError(
-            f"{path}: splats must be .ply, .compressed.ply, .splat, .ksplat, .spz or .sog (got suffix {suffix!r})"
+            f"{path}: splats must be .ply, .compressed.ply, .splat, .ksplat, .spz or .sog (got suffix {suffix!r}"
+            f"{f', {kind}' if kind else ''})"
         )
     try:
         if path.exists() and not path.is_file():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import json
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import count
 from pathlib import Path
@@ -256,7 +257,7 @@ def _finding(
     elif kind != "missing":
         if kind == "tuple_type" and "prefixItems" in (form := _schema_at(model, location)):
             rule += f" of {len(form['prefixItems'])}"
-        rule = f"{rule.replace('Input should', 'must')} (got {_format_value(value)})"
+        rule = f"{rule.replace('Input should', 'must')} (got {_format_value(value)}{_hint(kind, context, value)})"
     overlaps = [min(len(keys), len(override)) for override in overridden]
     from_file = not any(n and keys[:n] == override[:n] for n, override in zip(overlaps, overridden, strict=True))
     line = _line(tree, keys) if tree is not None and from_file else None
@@ -324,6 +325,18 @@ def _schema_at(model: type[BaseModel], location: KeyPath) -> dict[str, Any]:
             schema = schema.get("properties", {}).get(part, {})
         schema = resolved(schema)
     return schema
+
+
+def _hint(kind: str, context: Mapping[str, Any], value: object) -> str:
+    """Return the value that was probably meant, as the end of a message: a similar word, or a percentage as a share."""
+    if kind in ("literal_error", "union_tag_invalid") and isinstance(value, str):
+        expected = re.findall(r"'([^']*)'", str(context.get("expected", context.get("expected_tags", ""))))
+        close = difflib.get_close_matches(value.lower(), expected, n=1)
+        return f"; did you mean '{close[0]}'?" if close else ""
+    limit = context.get("le", context.get("lt"))
+    if isinstance(value, bool) or not isinstance(value, int | float) or not isinstance(limit, int | float):
+        return ""
+    return f"; a share of {value:g} % is {value / 100:g}" if limit <= 1 and 5 <= value <= 100 * limit else ""
 
 
 def _unknown_key(key: str, known: list[str]) -> str:

@@ -9,7 +9,9 @@ import trimesh
 from ruamel.yaml import YAML
 
 from mitsplat.asset import Asset
-from mitsplat.checks.path_checks import SIZE_LIMITS, check_asset, check_scene
+from mitsplat.checks.path_checks import _SCENE_KEYS, SIZE_LIMITS, _located, check_asset, check_scene
+from mitsplat.dataset.preflight import scene_warnings
+from mitsplat.findings import Finding
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.scene.loading.scene_loading import load_scene
 from tests.cli.typed import run
@@ -138,6 +140,26 @@ def test_the_check_command_prints_findings_and_sets_its_status(tmp_path, capsys)
     assert run("check", tmp_path / "open") == 1
     lines = capsys.readouterr().out.splitlines()
     assert "      to do: close it" in lines[lines.index("look  watertightness: open") + 1]
+
+
+def test_problems_have_the_file_and_line_of_the_key_to_change(scene_data, write_scene, capsys):
+    scene_data["shapes"].append({"name": "tray", "bin": {"size": [0.2, 0.2, 0.05], "position": [3, 0, 0]}})
+    path = write_scene(scene_data)
+
+    def place_of(file, text, key):
+        line = next(i for i, line in enumerate(file.read_text().splitlines(), 1) if text in line)
+        return f"{file}:{line}: {key}"
+
+    (found,) = (_located(finding, path, _SCENE_KEYS) for finding in scene_warnings(load_scene(path)) if not finding.ok)
+    assert found.place == place_of(path, "bin:", "shapes[1]")
+    by_name = _located(Finding("exposure", False, "surfaces are black", "more light"), path, _SCENE_KEYS)
+    assert by_name.place == place_of(path, "lights:", "lights")
+    asset = path.parent / "assets/nut/asset.yaml"
+    asset.write_text(asset.read_text().replace("density: 1000.0", "mass: 900"))
+    assert run("check", asset.parent) == 1
+    out = capsys.readouterr().out.splitlines()
+    wrong = next(i for i, line in enumerate(out) if line.startswith("look  mass"))
+    assert out[wrong + 2] == f"      in {place_of(asset, 'mass: 900', 'mass')}"
 
 
 def test_an_open_mesh_has_the_mass_of_its_pieces():

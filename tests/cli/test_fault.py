@@ -17,7 +17,7 @@ from tests.conftest import box_asset
     [
         (
             "bake plant.splat -o a",
-            "plant.splat: must be a mesh (.glb, .obj, .stl, .ply) (got a splat file: enter it in an asset",
+            "plant.splat: must be a mesh (.glb, .obj, .stl, .ply) (got a splat file; import it first: `mitsplat import",
         ),
         (
             "bake nut.step -o a",
@@ -25,14 +25,17 @@ from tests.conftest import box_asset
         ),
         ("bake folder -o a", "folder: must be a mesh (.glb, .obj, .stl, .ply) (got a folder)"),
         ("bake part.stl -o part.stl", "--out must be a folder (got the file part.stl)"),
-        ("check plant.splat", "plant.splat: must be a scene file (.yaml) (got a splat file: enter it in an asset"),
+        (
+            "check plant.splat",
+            "plant.splat: must be a scene file (.yaml) (got a splat file; import it first: `mitsplat import",
+        ),
         (
             "render plant.splat",
-            "plant.splat: must be a scene file (.yaml) (got a splat file: enter it in an asset",
+            "plant.splat: must be a scene file (.yaml) (got a splat file; import it first: `mitsplat import",
         ),
         (
             "render part.stl",
-            "part.stl: must be a scene file (.yaml) (got a mesh: `mitsplat bake` makes an asset from it)",
+            "part.stl: must be a scene file (.yaml) (got a mesh; bake it first: `mitsplat bake part.stl -o part`)",
         ),
         ("render nut", "nut: must be a scene file (.yaml) (got the folder of an asset: enter it in a scene"),
         ("preview scene.xml", "scene.xml: must be a scene file (.yaml) (got a Mitsuba scene: `mitsplat render`"),

@@ -144,6 +144,26 @@ def test_each_doubtful_scene_gets_its_warning(change, found, scene_data, write_s
     assert re.match(found, finding.text)
 
 
+@pytest.mark.parametrize(
+    ("position", "region", "text"),
+    [
+        ([0, 0, 0], None, None),
+        ([2, 0, 0], None, "shapes[2]: the region is beside the bin 'bin', so no object falls into it"),
+        ([0, 0, 5], None, "shapes[2]: the region is beside the bin 'bin', so no object falls into it"),
+        ([0, 0, 0], {"min": [-1, -1, 0.1], "max": [1, 1, 0.3]}, "region: only 4% of it is above the bin 'bin'"),
+    ],
+)
+def test_a_region_outside_of_the_bin_is_reported(position, region, text, scene_data, write_scene):
+    scene_data["shapes"] = [
+        *scene_data["shapes"], *[{"name": f"pad {i}", "box": {"size": [9, 9, 0.1], "position": [0, 0, -1]}}
+                                 for i in range(2 - len(scene_data["shapes"]))],
+        {"name": "bin", "bin": {"size": [0.4, 0.4, 0.1], "position": position}},
+    ]  # fmt: skip
+    scene = scene_with(scene_data, write_scene, {} if region is None else {"region": region})
+    found = [finding.text for finding in scene_warnings(scene) if finding.name == "bin"]
+    assert found == ([] if text is None else [text])
+
+
 def test_check_warns_of_slow_settling_and_of_large_images(scene_data, write_scene, monkeypatch):
     scene_data["objects"][0]["count"] = [100, 200]
     scene_data["output"] |= {"width": 3000, "height": 3000}

@@ -1,0 +1,116 @@
+"""Hints at probable mistakes in scene files: files that are no assets, misspelt names, and percentages."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+import trimesh
+
+from mitsplat.asset import Asset
+from mitsplat.errors import InputError
+from mitsplat.gaussians.splat_cloud import Splats
+from mitsplat.scene.loading.scene_loading import load_scene
+from tests.cli.typed import run
+
+
+def error_of(path: Path) -> str:
+    with pytest.raises(InputError) as raised:
+        load_scene(path)
+    assert "\n" not in str(raised.value)
+    return str(raised.value)
+
+
+@pytest.mark.parametrize("key", ["asset", "pool", "environment"])
+@pytest.mark.parametrize(
+    ("name", "hint"),
+    [
+        ("part.stl", "(got a mesh; bake it first: `mitsplat bake {folder}/part.stl -o {folder}/part`)"),
+        ("part.GLB", "a mesh; bake it first"),
+        ("part.splat", "(got a splat file; import it first: `mitsplat import {folder}/part.splat -o {folder}/part`)"),
+        ("part.ply", "(got splats or a mesh; import or bake it first: "),
+        ("part.step", "(got a CAD file; export it as a mesh"),
+        ("part.txt", "must be an asset folder (got another file)"),
+    ],
+)
+def test_a_file_instead_of_an_asset_is_refused_with_the_command_to_use(
+    scene_data, write_scene, key: str, name: str, hint: str
+) -> None:
+    if key == "environment":
+        scene_data["environment"] = name
+    else:
+        scene_data["objects"][0] = {"asset": name} if key == "asset" else {"pool": [name]}
+    path = write_scene(scene_data)
+    (path.parent / name).write_bytes(b"solid")
+    said = error_of(path)
+    assert hint.format(folder=path.parent) in said
+    assert said.startswith(f"{path}:") and f"{path.parent / name}: must be an asset folder" in said
+
+
+def test_folders_that_are_no_assets_are_refused_with_a_hint(scene_data, write_scene) -> None:
+    scene_data["objects"][0] = {"asset": "assets/new"}
+    path = write_scene(scene_data)
+    folder = path.parent / "assets/new"
+    folder.mkdir(parents=True)
+    assert "must be an asset folder (got a folder without asset.yaml)" in error_of(path)
+    (folder / "gear.stl").write_bytes(b"solid")
+    assert "(got a folder without asset.yaml; gear.stl is a mesh; bake it first" in error_of(path)
+    (folder / "dataset.json").write_text("{}")
+    assert "(got the folder of a dataset" in error_of(path)
+    scene_data["objects"][0] = {"asset": "assets/nut/asset.yaml"}
+    assert f"(got its asset.yaml: give {path.parent}/assets/nut)" in error_of(write_scene(scene_data))
+
+
+@pytest.mark.parametrize("name", ["assets/nutt", "asets/nut", "Assets/Nut", "nut", "parts/nut"])
+def test_a_misspelt_asset_folder_is_refused_with_the_similar_one(scene_data, write_scene, name: str) -> None:
+    scene_data["objects"][0] = {"asset": name}
+    path = write_scene(scene_data)
+    assert f"{path.parent / name}: no such folder; did you mean {path.parent / 'assets/nut'}?" in error_of(path)
+
+
+def test_other_names_get_no_hint(scene_data, write_scene) -> None:
+    scene_data["objects"][0] = {"asset": "zzzzzz"}
+    path = write_scene(scene_data)
+    assert error_of(path).endswith(f"{path.parent / 'zzzzzz'}: no such folder")
+
+
+@pytest.mark.parametrize(
+    ("change", "hint"),
+    [
+        ({"formats": ["yolo", "cocoo"]}, """output.formats[1]: must be 'yolo', """),
+        ({"formats": ["yolo", "cocoo"]}, """(got "cocoo"; did you mean 'coco'?)"""),
+        ({"formats": ["COCO"]}, """(got "COCO"; did you mean 'coco'?)"""),
+        ({"image": "jpeg"}, """(got "jpeg"; did you mean 'jpg'?)"""),
+        ({"validation": 20}, "output.validation: must be <= 1 (got 20; a share of 20 % is 0.2)"),
+        ({"test": 10}, "output.test: must be < 1 (got 10; a share of 10 % is 0.1)"),
+        ({"validation": 2000}, "output.validation: must be <= 1 (got 2000)"),
+        ({"viws": 3}, "output.viws: is not a known key (did you mean 'views'?)"),
+    ],
+)
+def test_misspelt_words_and_percentages_are_refused_with_the_probable_value(
+    scene_data, write_scene, change: dict[str, object], hint: str
+) -> None:
+    scene_data["output"] |= change
+    assert hint in error_of(write_scene(scene_data))
+
+
+def test_a_misspelt_kind_is_refused_with_the_similar_one(scene_data, write_scene) -> None:
+    scene_data["camera"] |= {"kind": "hemisfere"}
+    assert """(got "hemisfere"; did you mean 'hemisphere'?)""" in error_of(write_scene(scene_data))
+
+
+def test_commands_refuse_misspelt_formats_and_other_files_with_a_hint(
+    scene_data, write_scene, capsys, tmp_path
+) -> None:
+    path = write_scene(scene_data)
+    assert run("render", path, "-o", tmp_path / "out", "--format", "yolo,cocoo") == 2
+    assert "(got cocoo; did you mean coco?)" in capsys.readouterr().err
+    trimesh.creation.box().export(tmp_path / "part.stl")
+    assert run("check", tmp_path / "part.stl") == 2
+    assert f"bake it first: `mitsplat bake {tmp_path}/part.stl" in capsys.readouterr().err
+    with pytest.raises(InputError, match=r"got suffix '\.stl', a mesh; bake it first"):
+        Splats.load(tmp_path / "part.stl")
+    with pytest.raises(InputError, match="a mesh; bake it first"):
+        Asset.load(tmp_path / "part.stl")
+    shutil.rmtree(tmp_path / "out", ignore_errors=True)

@@ -63,7 +63,7 @@ _SCENE_KEYS: Mapping[str, KeyPath] = {
     **dict.fromkeys(("count", "rest", "settling"), ("objects",)),
     **dict.fromkeys(("frames", "memory", "disk"), ("output",)),
     **dict.fromkeys(("visibility", "views", "labels"), ("camera",)),
-    **dict.fromkeys(("shape", "bin", "support"), ("shapes",)),
+    **dict.fromkeys(("shape", "bin", "support", "surfaces"), ("shapes",)),
     **dict.fromkeys(("light", "lights", "exposure"), ("lights",)),
     **dict.fromkeys(("room", "region"), ("region",)),
     "time": ("settle",),

@@ -302,21 +302,24 @@ def scene_warnings(scene: Scene) -> Iterator[Finding]:
             text = f"{len(names)} of {len(lights)} drawn lights are inside of a shape, such as {names[0]!r}"
             yield _fault("lights", text, "narrow lights[].draw: they light nothing")
     yield from _bin_warnings(scene)
-    for shape in spec.shapes:
-        if shape.bin is None:
-            continue
-        opening = np.sort(shape.bin.size[:2])
-        for asset in {asset.name: asset for asset in scene.assets}.values():
-            if asset.mesh is not None and (np.sort(asset.mesh.extents)[:2] > opening).any():
-                text = f"{asset.name!r} does not fit into {shape.name!r}"
-                yield _fault("bin", text, "make the bin larger, or the object smaller by scale")
 
 
 def _bin_warnings(scene: Scene) -> Iterator[Finding]:
-    """Warn of bins into which no object falls, because every region lies beside them."""
+    """Warn of bins that are too small for an object, and of bins beside which objects fall."""
     regions = scene.spec.all_regions
     for number, shape in enumerate(scene.spec.shapes):
-        if shape.bin is None or not shape.collider or all(entry.poses for entry in scene.spec.objects):
+        if shape.bin is None:
+            continue
+        opening = np.sort(shape.bin.size[:2])
+        too_large = [
+            asset.name
+            for asset in {asset.name: asset for asset in scene.assets}.values()
+            if asset.mesh is not None and (np.sort(asset.mesh.extents)[:2] > opening).any()
+        ]
+        for name in too_large:
+            text = f"shapes[{number}]: {name!r} does not fit into {shape.name!r}"
+            yield _fault("bin", text, "make the bin larger, or the object smaller by scale")
+        if too_large or not shape.collider or all(entry.poses for entry in scene.spec.objects):
             continue
         centre, half = np.array(shape.bin.position[:2]), np.array(shape.bin.size[:2]) / 2
         shares = []

@@ -133,7 +133,10 @@ TOLD = "views", "lights", "bin"
     [
         ({"camera": path_of(ABOVE, ABOVE, INSIDE, INSIDE)}, "of 12 views [2-6] are from inside"),
         ({"lights": [{"kind": "point", "position": [0, 0, -0.05]}]}, r"lights\[0\] is inside of shape 'table'"),
-        ({"shapes": [{"name": "table", "box": TABLE, "visible": True}, NARROW]}, "'nut' does not fit into 'bin'"),
+        (
+            {"shapes": [{"name": "table", "box": TABLE, "visible": True}, NARROW]},
+            r"shapes\[1\]: 'nut' does not fit into 'bin'",
+        ),
     ],
 )
 def test_each_doubtful_scene_gets_its_warning(change, found, scene_data, write_scene, machine):

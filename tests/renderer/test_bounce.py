@@ -96,11 +96,14 @@ def object_box(
     return make_splats_shape(splats, proxy=mesh, instance=instance, capture_light="uniform")
 
 
-def test_white_objects_in_uniform_light_stay_below_its_radiance() -> None:
+@pytest.mark.parametrize("kind", ["object", "mesh"])
+def test_white_objects_in_uniform_light_stay_below_its_radiance(kind: str) -> None:
     """A white furnace: with all bounces, white objects are as bright as the uniform light, and never brighter."""
     make_integrator()
+    white = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 1.0}}
+    mesh = {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale(0.2), "bsdf": white}
     shapes = {
-        "plate": object_box((-0.2, -0.2, -0.02), (0.2, 0.2, 0.0), 1),
+        "plate": object_box((-0.2, -0.2, -0.02), (0.2, 0.2, 0.0), 1) if kind == "object" else mesh,
         "cube": object_box((0.0, -0.05, 0.001), (0.1, 0.05, 0.1), 2),
         "sky": WHITE_SKY,
     }
@@ -111,7 +114,31 @@ def test_white_objects_in_uniform_light_stay_below_its_radiance() -> None:
     assert dark.sum() > 500
     assert without.light[dark].mean() < 0.7
     assert 0.9 < light.light[dark].mean() < 1
+    assert 0.96 < light.light[dark & (light.instance == 2)].mean() < 1
     assert light.light[shown].mean() < 1
+
+
+def test_light_of_an_object_keeps_its_place_on_a_mesh() -> None:
+    """A white wall of width 2 b and height c, lit by a horizontal sun, lights the table at the distance x.
+
+    The form factor of a perpendicular rectangle is F = (atan(b / x) - x / r atan(b / r)) / pi, with r^2 = x^2 + c^2
+    (Howell, "A Catalog of Radiation Heat Transfer Configuration Factors", B-3).
+    """
+    make_integrator()
+    b, c = 0.2, 0.1
+    shapes = {
+        "table": {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale(0.5)},
+        "wall": object_box((-0.05, -b, 0.0), (0.0, b, c), 1),
+        "sun": {"type": "directional", "direction": [-1, 0, 0], "irradiance": {"type": "rgb", "value": 1.0}},
+    }
+    camera = down_camera(0.5, 96, 45.0)
+    scene, integrator = mi.load_dict({"type": "scene", **shapes}), make_integrator(white=1.0)
+    light = np.mean([render_layers(integrator, scene, camera, seed=seed).light for seed in range(4)], axis=0)
+    x = (np.arange(96) + 0.5 - 48) / camera.fx * 0.5
+    beside = (x > 0.035) & (x < 0.1)  # not in the reach of the small filter of the wall's edge
+    r = np.hypot(x, c)
+    expected = (np.arctan(b / x) - x / r * np.arctan(b / r)) / np.pi
+    np.testing.assert_allclose(light[40:56].mean(axis=(0, 2))[beside], expected[beside], rtol=0.1)
 
 
 def test_umbra_of_a_lamp_is_that_of_a_path_tracer() -> None:

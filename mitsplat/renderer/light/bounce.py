@@ -41,6 +41,9 @@ MESH_RAYS = 2
 """Rays per pixel on visible meshes such as a table, at one pixel of four; averages over even surfaces reduce the noise.
 """
 
+SPREAD = 64
+"""Mean distance between a point and its neighbours in the wide average over meshes, over the offset of ray origins."""
+
 
 @dataclass(frozen=True, eq=False)
 class Bounce:
@@ -88,7 +91,9 @@ def trace_bounce(tracer: ShadowTracer, reflectors: Reflectors, estimate: Estimat
 
     Points of objects use a few rays each, so that their neighbours must be averaged. On visible meshes, one pixel in
     each cell of 2 x 2 is traced, and the result is already a mean over many cells. This mean is necessary, because few
-    rays hit small bright regions such as a wall near a lamp.
+    rays hit small bright regions such as a wall near a lamp. Light of near surfaces changes over short distances, so
+    that less of this mean counts there (Ward et al. 1988, "A Ray Tracing Solution for Diffuse
+    Interreflection").
     """
     surface, view, pixel = tracer.surface, tracer.view, tracer.pixel
     cells = replace(view, width=-(-view.width // 2), height=-(-view.height // 2))
@@ -117,11 +122,14 @@ def trace_bounce(tracer: ShadowTracer, reflectors: Reflectors, estimate: Estimat
         start = tracer.sequence_start(number)
         origin, normal = mi.Point3f(ray_origin(own)), mi.Vector3f(own.normal)
         dr.eval(own, start, origin, normal)
-        found, without = reflectors.irradiance(origin, normal, start, rays, _two_points)
+        found, without, nearness = reflectors.irradiance(origin, normal, start, rays, _two_points)
         if mesh:
             cell = dr.gather(mi.UInt32, row * cells.width + column, places)
-            for stride in (1, RADIUS):
-                found = mi.Color3f(*LightFilter(own, cells, cell, stride=stride).average([*found]))
+            *means, near = LightFilter(own, cells, cell).average([*found, dr.sum(found) * nearness])
+            wide = mi.Color3f(*LightFilter(own, cells, cell, stride=RADIUS).average(means))
+            found = mi.Color3f(*means)
+            share = dr.clip(SPREAD * own.offset * near / dr.maximum(dr.sum(found), 1e-20), 0, 1)
+            found = dr.lerp(wide, found, share)
         dr.scatter(relit, found, places)
         dr.scatter(static, without, places)
         dr.scatter(known, mi.Float(1), places)

@@ -196,12 +196,10 @@ class LightFilter:
         """
         weight = dr.rcp(dr.maximum(estimate.rays, 1))
         values = [c * weight for c in (*estimate.lit, *estimate.base)]
-        if bounced is not None:
-            values += [*bounced[0], bounced[1]]
         values, _ = self._average(values, estimate.rays, RADIUS, self._share(estimate)[:2])
         mean_bounced = None
-        if bounced is not None:
-            *colour, share = values[6:]
+        if bounced is not None:  # shadows of lamps do not limit its average
+            *colour, share = self.average([*bounced[0], bounced[1]])
             mean_bounced = dr.select(share > 1e-6, mi.Color3f(*colour) / share, 0)
         return LightMeans(mi.Color3f(*values[:3]), mi.Color3f(*values[3:6]), mean_bounced)
 

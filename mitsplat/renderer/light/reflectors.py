@@ -1,8 +1,8 @@
 """Light that surfaces reflect along rays: captured surroundings, objects and visible meshes.
 
 Captured surroundings have the colour captured there, which contains all earlier bounces, and the shadows of dynamic
-objects. Objects and visible meshes reflect the emitters' light according to their material. An object also reflects the
-light of one further ray, which ends at the next surface.
+objects. Objects and visible meshes reflect the emitters' light according to their material, and the light of one
+further ray, which ends at the next surface.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ class Reflectors:
         start: mi.UInt32,
         rays: int,
         sequence: Callable[[mi.UInt32], tuple[mi.Point2f, mi.Point2f]],
-    ) -> tuple[mi.Color3f, mi.Color3f]:
+    ) -> tuple[mi.Color3f, mi.Color3f, mi.Float]:
         """Compute the reflected irradiance at points (Color3f) over the irradiance of display white.
 
         Args:
@@ -79,11 +79,13 @@ class Reflectors:
             sequence: Function that maps ray numbers to two points of the unit square.
 
         Returns:
-            Irradiance from all surfaces, and from the captured surroundings as if there were no dynamic objects.
+            Irradiance from all surfaces, irradiance from the captured surroundings as if there were no dynamic objects,
+            and inverse distance [1/m] of the surfaces, a mean that is weighted by their light.
         """
         count = dr.width(origin)
         together = max(1, min(rays, LANES // count))
         totals = [mi.Color3f(dr.zeros(mi.Float, count)) for _ in range(2)]
+        nearness = dr.zeros(mi.Float, count)
         for first in range(0, rays, together):
             some = min(together, rays - first)
             lane = dr.arange(mi.UInt32, count * some)
@@ -94,11 +96,12 @@ class Reflectors:
             towards = frame.to_world(mi.warp.square_to_cosine_hemisphere(upward))
             ray = mi.Ray3f(dr.gather(mi.Point3f, origin, row), towards)
             dr.eval(ray, number, light)
-            colour, captured, _ = self._trace(ray, number, light, BOUNCES)
+            colour, captured, distance = self._trace(ray, number, light, BOUNCES)
             for total, colours in zip(totals, (colour, captured), strict=True):
                 total += mi.Color3f(*[dr.block_sum(c, some) for c in colours])
-            dr.eval(totals)
-        return totals[0] / rays, totals[1] / rays
+            nearness += dr.block_sum(dr.sum(colour) / dr.maximum(distance, 1e-6), some)
+            dr.eval(totals, nearness)
+        return totals[0] / rays, totals[1] / rays, nearness / dr.maximum(dr.sum(totals[0]), 1e-20)
 
     def outgoing(self, ray: mi.Ray3f, key: mi.UInt32, light: mi.Point2f) -> tuple[mi.Color3f, mi.Float]:
         """Compute the radiance of the surfaces that rays hit, times pi over the irradiance of display white.
@@ -232,7 +235,7 @@ class Reflectors:
             return lit
         point, other = _random_points(key)
         direction = mi.Frame3f(normal).to_world(mi.warp.square_to_cosine_hemisphere(point))
-        throughput, density = dr.select(visible, 0, albedo), mi.Float(0)
+        throughput, density = mi.Color3f(albedo), mi.Float(0)
         if glossy:
             mirrored, weight, cos_half = lobe.sample(point)
             direction, fresnel = dr.select(metal, mirrored, direction), lobe.fresnel(cos_half)

@@ -23,7 +23,8 @@ class OpenCVCamera(mi.Sensor):
 
      * - cx, cy
        - |float|
-       - Principal point [px], pixel centres at +0.5. (Default: centre of the film)
+       - Principal point [px], pixel centres at +0.5: add 0.5 to the values of ``cv2.calibrateCamera``. (Default: centre
+         of the film)
 
      * - distortion
        - |string|

@@ -41,7 +41,8 @@ class Camera:
     Attributes:
         width, height: Image size [px].
         fx, fy: Focal lengths [px].
-        cx, cy: Principal point [px], pixel centres at +0.5 (the centre of an image is ``width / 2``).
+        cx, cy: Principal point [px], pixel centres at +0.5 (the centre of an image is ``width / 2``). Add 0.5 to the
+            values of ``cv2.calibrateCamera``.
         world_from_camera: Rigid transform of camera coordinates to world coordinates [m], shape (4, 4).
         distortion: OpenCV coefficients ``k1, k2, p1, p2[, k3[, k4, k5, k6[, s1, s2, s3, s4]]]``, or empty for a pinhole
             camera; ``k1, k2, k3, k4`` for a fisheye lens. Also the array of `cv2.calibrateCamera` or

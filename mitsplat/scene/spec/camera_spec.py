@@ -53,8 +53,16 @@ class Intrinsics(StrictModel):
     fov_x: float | None = Field(None, gt=0, lt=180, description="Horizontal field of view [degrees].")
     fx: Focal | None = Field(None, description="Focal length along x [px].")
     fy: Focal | None = Field(None, description="Focal length along y [px]. Equal to ``fx`` if absent.")
-    cx: float | None = Field(None, description="Principal point along x [px]. The centre of the image if absent.")
-    cy: float | None = Field(None, description="Principal point along y [px]. The centre of the image if absent.")
+    cx: float | None = Field(
+        None,
+        description="Principal point along x [px], with the centre of the first pixel at 0.5: add 0.5 to the value of "
+        "``cv2.calibrateCamera``. The centre of the image if absent.",
+    )
+    cy: float | None = Field(
+        None,
+        description="Principal point along y [px], with the centre of the first pixel at 0.5: add 0.5 to the value of "
+        "``cv2.calibrateCamera``. The centre of the image if absent.",
+    )
     size: tuple[Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]] | None = Field(
         None,
         description="Image width and height to which ``fx``, ``fy``, ``cx`` and ``cy`` refer [px]. The size of the "

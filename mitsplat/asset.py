@@ -34,6 +34,7 @@ from mitsplat.gaussians.material_files import write_materials
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.mesh import check_faces
 from mitsplat.geometry.untrusted_meshes import check_mesh
+from mitsplat.mesh_files.mesh_reading import SCENE_SUFFIXES, read_surface
 from mitsplat.storage.field_types import Name
 from mitsplat.storage.file_kinds import no_folder_with
 from mitsplat.storage.files import MESH_ERRORS, resolve_inside, storage_errors
@@ -357,7 +358,7 @@ def read_spec(folder: str | PathLike[str]) -> AssetSpec:
 
 
 def read_mesh(path: Path, *, merge: bool = True) -> trimesh.Trimesh:
-    """Read a mesh file of any format that trimesh supports; several parts become one mesh.
+    """Read a mesh file of any format; several parts become one mesh, in the units and axes of the file.
 
     Args:
         path: The file.
@@ -366,14 +367,10 @@ def read_mesh(path: Path, *, merge: bool = True) -> trimesh.Trimesh:
     Raises:
         InputError: If the file is missing or damaged, has no triangles, or has a vertex that is not finite.
     """
-    check_mesh(path)
-    try:
-        with np.errstate(all="ignore"):
-            mesh = trimesh.load_mesh(path, process=merge)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
-    except MESH_ERRORS as error:
-        raise InputError(f"{path}: not a valid mesh file ({type(error).__name__}: {error})") from error
+    if path.suffix.lower() in SCENE_SUFFIXES:
+        mesh = read_surface(path, merge=merge)
+    else:
+        mesh = _read_with_trimesh(path, merge=merge)
     if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
         raise InputError(f"{path}: a mesh must have triangles (got none)")
     check_faces(mesh, path)
@@ -381,6 +378,17 @@ def read_mesh(path: Path, *, merge: bool = True) -> trimesh.Trimesh:
         row = int(np.argmin(np.isfinite(mesh.vertices).all(axis=1)))
         raise InputError(f"{path}: vertices must be finite (got {mesh.vertices[row].tolist()} at vertex {row})")
     return mesh
+
+
+def _read_with_trimesh(path: Path, *, merge: bool) -> trimesh.Trimesh:
+    check_mesh(path)
+    try:
+        with np.errstate(all="ignore"):
+            return trimesh.load_mesh(path, process=merge)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
+    except MESH_ERRORS as error:
+        raise InputError(f"{path}: not a valid mesh file ({type(error).__name__}: {error})") from error
 
 
 def _named_file(folder: Path, key: str, name: str) -> Path:

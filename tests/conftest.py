@@ -127,7 +127,7 @@ def forks() -> Iterator[Forks]:
     made.close()
 
 
-_tried_meshes: dict[tuple[str, bytes], str] = {}
+_tried_meshes: dict[tuple[str, bytes, untrusted_meshes.TrialReader], str] = {}
 
 
 @pytest.fixture(scope="module")
@@ -135,10 +135,10 @@ def meshes_tried_once() -> Iterator[None]:
     """Check each distinct mesh in a child process only once, because an audit checks each model of BOP."""
     try_mesh = untrusted_meshes._try_mesh
 
-    def try_once(path: Path, modified: int, size: int) -> str:
-        key = path.suffix, path.read_bytes()
+    def try_once(path: Path, modified: int, size: int, read: untrusted_meshes.TrialReader) -> str:
+        key = path.suffix, path.read_bytes(), read
         if key not in _tried_meshes:
-            _tried_meshes[key] = try_mesh(path, modified, size)
+            _tried_meshes[key] = try_mesh(path, modified, size, read)
         return _tried_meshes[key]
 
     with pytest.MonkeyPatch.context() as patch:

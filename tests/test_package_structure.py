@@ -30,7 +30,10 @@ LAYERS = (
     ("capture", "renderer.emitters", "renderer.occluders", "renderer.splatting", "scene.planning"),
     ("renderer.materials", "scene"),
     ("asset", "renderer.projection"),
-    ("capture.boards", "capture.isolation", "capture.lighting", "gaussians", "pages", "renderer.rays", "scene.spec"),
+    (
+        *("capture.boards", "capture.isolation", "capture.lighting", "gaussians", "mesh_files", "pages"),
+        *("renderer.rays", "scene.spec"),
+    ),
     ("capture.video", "engine", "geometry", "images"),
     ("quality", "runtime"),
     ("storage",),

@@ -457,14 +457,13 @@ class TestMeshes:
             read(path)
 
     def test_a_3mf_bomb_is_refused(self, tmp_path):
-        pytest.importorskip("lxml")
         path = tmp_path / "a.3mf"
-        with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive, archive.open("3D/a.model", "w") as file:
+        with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive, archive.open("3D/3dmodel.model", "w") as file:
             file.write(b"<model><resources><object id='1'><mesh><vertices>")
             for _ in range(100):
                 file.write(b"<vertex x='0' y='0' z='0'/>" * 40000)
             file.write(b"</vertices></mesh></object></resources></model>")
-        with pytest.raises(InputError, match=r"a\.3mf: not a mesh file that can be read \("):
+        with pytest.raises(InputError, match=r"a\.3mf: not a mesh that can be read \(.* a factor of more than 100"):
             read_mesh(path)
 
     def test_a_gltf_buffer_outside_of_the_folder_is_not_read(self, tmp_path):
@@ -482,7 +481,7 @@ class TestMeshes:
             for name in buffers:
                 changed = changed.replace(name, uri + name)
             (tmp_path / "in/a.gltf").write_text(changed)
-            with pytest.raises(InputError, match="escapes resolver root"):
+            with pytest.raises(InputError, match="is outside of its folder"):
                 read_mesh(tmp_path / "in/a.gltf")
 
     @pytest.mark.parametrize("name", ["a.stl", "a.obj", "a.glb"])

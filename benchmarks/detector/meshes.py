@@ -121,7 +121,7 @@ def primitive(asset: Asset) -> MeshPart:
     mesh = asset.mesh.subdivide_to_size(0.004)
     _, nearest = KDTree(asset.splats.means).query(mesh.vertices)
     colours = decode_srgb(np.clip(asset.splats.sh[nearest, 0] * SH_C0 + 0.5, 0, 1))
-    return MeshPart(asset.name, mesh, colours[mesh.faces], None, None, 0.0, asset.roughness, True, asset.specular)
+    return MeshPart(asset.name, mesh, colours[mesh.faces], None, 0.0, asset.roughness, True, asset.specular)
 
 
 def _placed(part: MeshPart, instance: Instance, look: ObjectAppearance | None) -> MeshPart:
@@ -133,8 +133,9 @@ def _placed(part: MeshPart, instance: Instance, look: ObjectAppearance | None) -
     part = replace(part, mesh=mesh, roughness=look.roughness, reflectance=look.specular, shiny=look.specular > 0)
     if part.texture is None:
         return replace(part, colours=np.clip(part.colours @ matrix.T, 0, 1))
-    texture = encode_srgb(np.clip(decode_srgb(part.texture / 255.0) @ matrix.T, 0, 1))
-    return replace(part, texture=np.rint(255 * texture).astype(np.uint8))
+    colours = encode_srgb(np.clip((decode_srgb(part.texture.pixels / 255.0) * part.factor) @ matrix.T, 0, 1))
+    texture = replace(part.texture, pixels=np.rint(255 * colours).astype(np.uint8))
+    return replace(part, texture=texture, factor=1.0)
 
 
 if __name__ == "__main__":

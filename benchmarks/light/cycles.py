@@ -47,6 +47,7 @@ from PIL import Image
 from benchmarks.record import figure, recording
 from mitsplat.bake.mesh_parts import MeshPart, read_parts
 from mitsplat.geometry.mesh_normals import corner_normals
+from mitsplat.images.colour import decode_srgb, encode_srgb
 from mitsplat.renderer.scene_emitters import emitter_dict
 from mitsplat.runtime.variant import ensure_variant
 from mitsplat.scene.spec.light_spec import LightSpec
@@ -82,8 +83,9 @@ def export_part(part: MeshPart, folder: Path, number: int) -> dict[str, Any]:
     texture = None
     if part.texture is not None:
         texture = f"texture_{number}.png"
-        Image.fromarray(part.texture).save(folder / texture)
-        arrays["uv"] = part.uv
+        pixels = encode_srgb(decode_srgb(part.texture.pixels / 255.0) * part.factor)
+        Image.fromarray(np.rint(255 * pixels).astype(np.uint8)).save(folder / texture)
+        arrays["uv"] = part.texture.uv
     else:
         arrays["colours"] = part.colours
     np.savez(folder / f"part_{number}.npz", **arrays)

@@ -106,7 +106,7 @@ def plain(
 ) -> MeshPart:
     """Return a mesh of one material; a dielectric is diffuse."""
     colours = np.broadcast_to(np.asarray(colour, dtype=np.float64), (len(mesh.faces), 3, 3))
-    return MeshPart(name, mesh, colours, None, None, metallic, roughness, shiny=metallic > 0)
+    return MeshPart(name, mesh, colours, None, metallic, roughness, shiny=metallic > 0)
 
 
 def metal_grid(meshes: Sequence[trimesh.Trimesh], turn: float = 0.0) -> dict[str, Solid]:

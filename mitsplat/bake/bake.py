@@ -19,7 +19,7 @@ import trimesh
 
 from mitsplat.arrays import BoolArray, Float64Array
 from mitsplat.asset import Asset
-from mitsplat.bake.mesh_parts import UNIFORM_LIGHT, bake_lights, mitsuba_scene, read_parts, world_from_file
+from mitsplat.bake.mesh_parts import UNIFORM_LIGHT, MeshModel, bake_lights, mitsuba_scene, read_model
 from mitsplat.bake.mesh_surface import MeshSurface
 from mitsplat.bake.proxy_mesh import make_proxy
 from mitsplat.bake.radiance import BOUNCES, bake_radiance, hemisphere, ray_offset, rotate_directions
@@ -29,7 +29,7 @@ from mitsplat.errors import InputError
 from mitsplat.fit.refine_splats import Picture, RefineSettings, refine_splats
 from mitsplat.gaussians.spherical_harmonics import SH_C0
 from mitsplat.gaussians.splat_cloud import Splats
-from mitsplat.gaussians.surfels import Surfels, place_surfels
+from mitsplat.gaussians.surfels import Surfels
 from mitsplat.geometry.camera import Camera, spiral
 from mitsplat.geometry.decomposition import convex_pieces
 from mitsplat.images.colour import encode_srgb
@@ -49,6 +49,8 @@ _MIN_OBJECT_SIZE, _MAX_OBJECT_SIZE = 0.001, 5.0
 """Size range of objects [m]; sizes outside of it indicate wrong units."""
 _MIN_SIZE, _MAX_SIZE = 1e-5, 1e5
 """Size range of any mesh [m]; 32-bit floats are too coarse outside of it."""
+_FLAT = 1e-6
+"""Thickness relative to the size below which a mesh encloses no volume."""
 _FIT_VIEWS = 12
 _BASE_COLOUR_SAMPLES, _RADIANCE_SAMPLES = (4, 9), (16, 36)
 """Rays per pixel of the pictures for the fit and for the comparison."""
@@ -61,8 +63,8 @@ _STAGES = {
     "comparing with the mesh": 8,
 }
 """Stages of a bake, with their relative durations."""
-_MIN_BRIGHTNESS, _MAX_BRIGHTNESS = 0.6, 1.4
-"""Range of brightness relative to the textures that shaded corners and highlights can explain."""
+_MIN_BRIGHTNESS, _MAX_BRIGHTNESS = 0.8, 1.25
+"""Range of brightness relative to the textures that the size of the Gaussians can explain."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,6 +80,7 @@ class BakeResult:
         brightness: Mean brightness of the splats relative to the textures of the file, which are read from the file
             independently. None without textures or under a scene's lights.
         warnings: Warnings for the user, a sentence each.
+        units: Unit and up axis of the mesh, and which of them its file states.
     """
 
     asset: Asset
@@ -87,6 +90,7 @@ class BakeResult:
     surface: trimesh.Trimesh | None = None
     brightness: float | None = None
     warnings: tuple[str, ...] = ()
+    units: str = ""
 
 
 @dataclass(frozen=True)
@@ -126,8 +130,8 @@ def bake_asset(
     kind: Literal["object", "environment"] = "object",
     lights: Sequence[LightSpec] | None = None,
     settings: BakeSettings | None = None,
-    metres_per_unit: float = 1.0,
-    up: Literal["y", "z"] = "z",
+    metres_per_unit: float | None = None,
+    up: Literal["y", "z"] | None = None,
     density: float = 1000.0,
     friction: float = 0.5,
     pieces: Sequence[trimesh.Trimesh] = (),
@@ -140,15 +144,16 @@ def bake_asset(
     """Bake a textured or coloured mesh into an asset of Gaussians.
 
     Args:
-        mesh: Mesh, scene of several parts, or file that trimesh reads.
+        mesh: Mesh, scene of several parts, or mesh file.
         name: Name of the asset.
         class_name: Class label for detectors; ``name`` if None.
         kind: ``object`` or ``environment``. Objects get convex pieces for physics.
         lights: Lights of a scene whose radiance is baked into an asset with ``capture_light: scene``. By default the
             asset has materials, and scenes light it.
         settings: Resolution.
-        metres_per_unit: Length of the mesh's unit [m].
-        up: Axis that points up in the mesh (glTF: y).
+        metres_per_unit: Length of the mesh's unit [m]; by default that which the file states (glTF, 3MF, COLLADA), or
+            1 m.
+        up: Axis that points up in the mesh; by default that which the file states (glTF: y), or z.
         density: Mass density [kg/m^3].
         friction: Coulomb friction coefficient.
         pieces: Convex pieces of an object for physics [m], z up; by default the proxy mesh is decomposed.
@@ -164,20 +169,26 @@ def bake_asset(
     """
     ensure_variant()
     settings = settings or BakeSettings()
-    for key, value, allowed in (("kind", kind, ("object", "environment")), ("up", up, ("y", "z"))):
-        if value not in allowed:
-            raise InputError(f"{key} must be {' or '.join(allowed)} (got {value!r})")
+    if kind not in ("object", "environment"):
+        raise InputError(f"kind must be object or environment (got {kind!r})")
+    if up not in (None, "y", "z"):
+        raise InputError(f"up must be y or z (got {up!r})")
     if not (density > 0 and np.isfinite(density)):
         raise InputError(f"density must be a number > 0 in kg/m^3 (got {density:g})")
     if not (friction >= 0 and np.isfinite(friction)):
         raise InputError(f"friction must be a number of at least 0 (got {friction:g})")
     stages = _Stages(progress)
     emitters = {} if lights is None else bake_lights(lights)
-    parts = read_parts(mesh, metres_per_unit=metres_per_unit, up=up, finish=finish)
+    model = read_model(mesh, metres_per_unit=metres_per_unit, up=up, finish=finish)
+    parts = model.parts
     surface = MeshSurface(parts)
     source, size = str(mesh) if isinstance(mesh, str | Path) else name, float(surface.mesh.extents.max())
     if kind == "object" and not any_size:
-        _check_size(source, size, metres_per_unit)
+        _check_size(source, size, model.units)
+    if kind == "object" and not pieces and _is_flat(surface.mesh):
+        raise InputError(
+            f"{source}: an object must have a volume (got a flat mesh): give it a thickness, or bake an environment"
+        )
     if not _MIN_SIZE <= size <= _MAX_SIZE:
         raise InputError(f"{source}: a mesh must be {_MIN_SIZE:g} to {_MAX_SIZE:g} m across (got {size:.3g} m)")
     stages("placing Gaussians")
@@ -188,9 +199,9 @@ def bake_asset(
     )
     clay = mitsuba_scene(parts, UNIFORM_LIGHT, clay=True)
     # The visible fraction of a few trial surfels determines how many surfels are placed.
-    trial = place_surfels(surface.mesh, face_density, min(_TRIAL_GAUSSIANS, settings.gaussians), rng)
+    trial = surface.place_surfels(face_density, min(_TRIAL_GAUSSIANS, settings.gaussians), rng)
     share = float(_visible_surfels(clay, trial, rng).mean()) if len(trial) else 1.0
-    surfels = place_surfels(surface.mesh, face_density, round(settings.gaussians / max(share, 0.2)), rng)
+    surfels = surface.place_surfels(face_density, round(settings.gaussians / max(share, 0.2)), rng)
     surfels = surfels.subset(_visible_surfels(clay, surfels, rng))
     if not len(surfels):
         raise InputError(
@@ -225,22 +236,23 @@ def bake_asset(
         capture_light="uniform" if lights is None else "scene",
         white=None if lights is None else float(np.pi),
     )
-    warnings = [warning for part in parts for warning in part.warnings]
+    warnings = [*model.warnings, *(warning for part in parts for warning in part.warnings)]
+    units = _describe_units(model)
     if not settings.verify_views:
         stages.end()
-        return BakeResult(asset, float("nan"), float("nan"), surface=surface.mesh, warnings=tuple(warnings))
+        return BakeResult(
+            asset, float("nan"), float("nan"), surface=surface.mesh, warnings=tuple(warnings), units=units
+        )
     cameras = cameras or _orbit(surface.mesh, settings.verify_views)
     views, psnr, psnr_object = compare_views(picture, splats, cameras, samples[1], settings.seed, stages.step)
-    brightness = None
-    if lights is None and (finish is None or finish.colour is None):
-        brightness = compare_with_textures(mesh, splats, world_from_file(metres_per_unit, up))
+    brightness = compare_with_textures(parts, splats) if lights is None else None
     if brightness is not None and not _MIN_BRIGHTNESS < brightness < _MAX_BRIGHTNESS:
         warnings.append(
             f"the splats are {brightness:.2g} times as bright as the textures of the file: "
             "check the factors of its materials"
         )
     stages.end()
-    return BakeResult(asset, psnr, psnr_object, views, surface.mesh, brightness, tuple(warnings))
+    return BakeResult(asset, psnr, psnr_object, views, surface.mesh, brightness, tuple(warnings), units)
 
 
 class _Stages:
@@ -265,6 +277,15 @@ class _Stages:
             self._progress(100, 100, "done")
 
 
+def _describe_units(model: MeshModel) -> str:
+    """Return a description such as "0.0254 m, z up (stated by the file)"."""
+    text = f"{model.units:g} m, {model.up} up"
+    if not model.stated:
+        return text
+    part = "" if len(model.stated) == 2 else f"{model.stated[0]} "
+    return f"{text} ({part}stated by the file)"
+
+
 def _check_size(source: str, size: float, metres_per_unit: float) -> None:
     """Refuse objects whose size [m] indicates wrong units."""
     if _MIN_OBJECT_SIZE <= size <= _MAX_OBJECT_SIZE:
@@ -277,6 +298,14 @@ def _check_size(source: str, size: float, metres_per_unit: float) -> None:
         f"{source}: an object must be {_MIN_OBJECT_SIZE:g} to {_MAX_OBJECT_SIZE:g} m across (got {size:.3g} m at "
         f"{metres_per_unit:g} metres per unit: {likely}--any-size accepts the size)"
     )
+
+
+def _is_flat(mesh: trimesh.Trimesh) -> bool:
+    """Return True if all vertices lie in one plane, within a millionth of the size."""
+    offsets = mesh.vertices - mesh.vertices.mean(axis=0)
+    _, axes = np.linalg.eigh(offsets.T @ offsets)
+    extents = np.ptp(offsets @ axes, axis=0)
+    return bool(extents.min() < _FLAT * extents.max())
 
 
 def _visible_surfels(clay: mi.Scene, surfels: Surfels, rng: np.random.Generator) -> BoolArray:

@@ -32,6 +32,7 @@ def _figures(result: BakeResult) -> str:
     asset, warnings = result.asset, list(result.warnings)
     rows: dict[str, str | None] = {
         "Gaussians": f"{len(asset.splats)}",
+        "Units": result.units or None,
         "PSNR on unseen views": figure_of(_finite_or_none(result.psnr), "{:.2f} dB"),
         "PSNR of the mesh's pixels": figure_of(_finite_or_none(result.psnr_object), "{:.2f} dB"),
         "Brightness relative to the file's textures": figure_of(result.brightness, "{:.2f}"),

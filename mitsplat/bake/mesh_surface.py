@@ -12,7 +12,7 @@ import trimesh
 from mitsplat.arrays import Float32Array, Float64Array, Int64Array
 from mitsplat.bake.mesh_parts import MeshPart
 from mitsplat.gaussians.splat_materials import SplatMaterials
-from mitsplat.gaussians.surfels import Surfels
+from mitsplat.gaussians.surfels import Surfels, place_surfels
 from mitsplat.geometry.camera import Camera
 from mitsplat.images.colour import encode_srgb
 from mitsplat.renderer.path_tracing import antialiased_picture
@@ -20,6 +20,8 @@ from mitsplat.renderer.rays.device_arrays import plain_mesh, ray_scene, wrapped
 
 _FOOTPRINT_SAMPLES = 16
 """Surface points whose mean is the material of a surfel."""
+_SHEET_LIFT = 3.0
+"""Height of surfels above a sheet without thickness, in their standard deviations along the normal."""
 _ALIKE = 0.8
 """Minimum cosine between the normal of a surfel and those of the points that it averages."""
 
@@ -35,6 +37,7 @@ class MeshSurface:
         self.mesh: trimesh.Trimesh = trimesh.util.concatenate([part.mesh for part in parts])
         self._parts = parts
         self._first = np.cumsum([0, *(len(part.mesh.faces) for part in parts)])
+        self._double_sided = np.repeat([part.double_sided for part in parts], np.diff(self._first))
         self._scene = ray_scene(
             {"surface": plain_mesh(trimesh.Trimesh(self.mesh.vertices, self.mesh.faces, process=False))}
         )
@@ -47,6 +50,23 @@ class MeshSurface:
         u, v = np.asarray(hit.prim_uv, dtype=np.float64)
         is_hit = np.isfinite(distance)
         return np.where(is_hit, index, -1), np.where(is_hit, (1 - u - v, u, v), 0.0).T, distance
+
+    def place_surfels(self, density: Float64Array, count: int, rng: np.random.Generator) -> Surfels:
+        """Place about ``count`` surfels with a relative ``density`` (F,), on both sides of double-sided faces."""
+        if not self._double_sided.any():
+            return place_surfels(self.mesh, density, count, rng)
+        behind = np.flatnonzero(self._double_sided)
+        backs = trimesh.Trimesh(self.mesh.vertices, self.mesh.faces[behind][:, ::-1], process=False)
+        sides = trimesh.util.concatenate([trimesh.Trimesh(self.mesh.vertices, self.mesh.faces, process=False), backs])
+        own = np.concatenate([np.arange(len(self.mesh.faces)), behind])
+        surfels = place_surfels(sides, density[own], count, rng)
+        is_back = surfels.faces >= len(self.mesh.faces)
+        barycentric = np.where(is_back[:, None], surfels.barycentric[:, ::-1], surfels.barycentric)
+        faces = own[surfels.faces]
+        # A sheet has no thickness: its Gaussians lie on their own side of it, so that they cover those of the other.
+        lift = np.where(self._double_sided[faces], _SHEET_LIFT * surfels.scales[:, 2], 0.0)
+        points = surfels.points + lift[:, None] * surfels.normals
+        return Surfels(points, surfels.frames, surfels.scales, faces, barycentric)
 
     def base_colours(self, faces: Int64Array, barycentric: Float64Array) -> Float64Array:
         """Return linear base colours (N, 3) at points of faces."""
@@ -87,7 +107,8 @@ class MeshSurface:
         faces, barycentric, distance = self.trace(rays)
         own = np.repeat(np.arange(count), _FOOTPRINT_SAMPLES)
         near = (faces >= 0) & (distance < 1.2 * surfels.scales[own, 0])
-        near &= np.einsum("nd,nd->n", self.mesh.face_normals[faces], surfels.normals[own]) > _ALIKE
+        cosine = np.einsum("nd,nd->n", self.mesh.face_normals[faces], surfels.normals[own])
+        near &= np.where(self._double_sided[faces], np.abs(cosine), cosine) > _ALIKE
         faces = np.where(near, faces, surfels.faces[own])
         barycentric = np.where(near[:, None], barycentric, surfels.barycentric[own])
 
@@ -98,6 +119,7 @@ class MeshSurface:
         normals: Float32Array | None = None
         if any(part.normal_map is not None for part in self._parts):
             shading = mean(self.normals(faces, barycentric))
+            shading *= np.where(np.einsum("nd,nd->n", shading, surfels.normals) < 0, -1.0, 1.0)[:, None]
             normals = (shading / np.linalg.norm(shading, axis=1, keepdims=True)).astype(np.float32)
         colours = mean(encode_srgb(self.base_colours(faces, barycentric)))
         return colours, SplatMaterials(metallic, roughness, specular, normals)

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import trimesh
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
-from trimesh.visual import TextureVisuals
-from trimesh.visual.color import uv_to_color
 
 from mitsplat.arrays import Float64Array
+from mitsplat.bake.mesh_parts import MeshPart
 from mitsplat.fit.image_metrics import psnr_of
 from mitsplat.gaussians.spherical_harmonics import SH_C0
 from mitsplat.gaussians.splat_cloud import Splats
@@ -79,47 +77,30 @@ def compare_views(
     return tuple(views), psnr_of(float(np.mean(errors))), psnr_of(float(np.nanmean(on_object)))
 
 
-def compare_with_textures(
-    mesh: trimesh.Trimesh | trimesh.Scene | str | Path,
-    splats: Splats,
-    world_from_file: Float64Array,
-) -> float | None:
+def compare_with_textures(parts: Sequence[MeshPart], splats: Splats) -> float | None:
     """Return the brightness of the splats relative to the textures of a mesh at points of its surface.
 
-    Trimesh reads the texture from the file's own image, independently of the colours used for baking.
+    The textures are used without the factors of the materials.
 
     Args:
-        mesh: Mesh or its file.
+        parts: Parts of the mesh.
         splats: Splats with the base colours of the mesh.
-        world_from_file: Transform (4, 4) to metres, z up.
 
     Returns:
         The ratio, or None without textures.
     """
-    if isinstance(mesh, str | Path):
-        mesh = trimesh.load_scene(mesh)
-    scene = mesh if isinstance(mesh, trimesh.Scene) else trimesh.Scene({"mesh": mesh})
     points, normals, colours = [], [], []
-    for node in scene.graph.nodes_geometry:
-        transform, name = scene.graph[node]
-        geometry = scene.geometry[name]
-        visual = geometry.visual
-        if not isinstance(visual, TextureVisuals) or visual.uv is None:
+    for part in parts:
+        if part.texture is None or not part.mesh.area > 0:
             continue
-        image = getattr(visual.material, "baseColorTexture", None) or getattr(visual.material, "image", None)
-        if image is None:
-            continue
-        at, face = trimesh.sample.sample_surface(geometry, _SAMPLES_PER_PART, seed=0)
-        share = trimesh.triangles.points_to_barycentric(geometry.triangles[face], at)
-        uv = np.einsum("nk,nkd->nd", share, np.asarray(visual.uv)[geometry.faces[face]])
-        pose = world_from_file @ transform
-        points.append(trimesh.transform_points(at, pose))
-        normals.append(geometry.face_normals[face] @ pose[:3, :3].T)
-        colours.append(decode_srgb(uv_to_color(uv, image)[:, :3] / 255.0))
+        at, face = trimesh.sample.sample_surface(part.mesh, _SAMPLES_PER_PART, seed=0)
+        barycentric = trimesh.triangles.points_to_barycentric(part.mesh.triangles[face], at)
+        points.append(at)
+        normals.append(part.mesh.face_normals[face])
+        colours.append(decode_srgb(part.texture.at(face, barycentric) / 255.0))
     if not points:
         return None
     place, normal, texture = (np.concatenate(values) for values in (points, normals, colours))
-    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     distance, nearest = KDTree(splats.means).query(place)
     outward = Rotation.from_quat(splats.quats[nearest]).as_matrix()[:, :, 2]
     seen = (distance < _MAX_SIGMAS * splats.scales[nearest].max(axis=1)) & (

@@ -36,15 +36,25 @@ Overwrite = Annotated[
 def bake(
     mesh: Annotated[
         Path,
-        typer.Argument(metavar="MESH", help="Mesh with textures or vertex colours, in a format that trimesh reads."),
+        typer.Argument(
+            metavar="MESH", help="Mesh with its materials (.glb, .gltf, .3mf, .obj, .ply, .stl, .off or .dae)."
+        ),
     ],
     out: AssetFolder,
     name: Name = None,
     class_name: ClassName = None,
     kind: Kind = "object",
     gaussians: Annotated[int, typer.Option(help="Target number of Gaussians.")] = 20000,
-    units: Annotated[float, typer.Option(help="Metres per unit of the mesh; 0.001 for millimetres.")] = 1.0,
-    up: Annotated[Literal["y", "z"], typer.Option(help="Axis of the mesh that points up.")] = "z",
+    units: Annotated[
+        float | None,
+        typer.Option(
+            help="Metres per unit of the mesh, 0.001 for millimetres; by default stated by MESH (glTF, 3MF, DAE) or 1."
+        ),
+    ] = None,
+    up: Annotated[
+        Literal["y", "z"] | None,
+        typer.Option(help="Axis of the mesh that points up; by default stated by MESH (glTF, 3MF, DAE) or z."),
+    ] = None,
     density: Annotated[float, typer.Option(help="Mass density [kg/m^3].")] = 1000.0,
     friction: Annotated[float, typer.Option(help="Coulomb friction coefficient.")] = 0.5,
     colour: Annotated[
@@ -79,7 +89,7 @@ def bake(
     from mitsplat.bake.surface_materials import SurfaceFinish
 
     _check_folder(out, mesh, name, overwrite=overwrite)
-    if not 0 < units < math.inf:
+    if units is not None and not 0 < units < math.inf:
         raise InputError(f"--units must be finite and > 0 (got {units})")
     if not 0 <= seed < 2**32:
         raise InputError(f"--seed must be 0 to {2**32 - 1} (got {seed})")
@@ -105,6 +115,7 @@ def bake(
     report = write_bake_report(out, result)
     for warning in result.warnings:
         typer.echo(f"warning: {warning}")
+    typer.echo(f"units of the mesh: {result.units}")
     typer.echo(f"report: {report}")
     typer.echo(f"asset: {out} ({len(result.asset.splats)} Gaussians, {result.psnr:.1f} dB on unseen views)")
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import struct
+from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
 from typing import BinaryIO
@@ -17,6 +18,9 @@ from mitsplat.storage.files import MESH_ERRORS
 
 ARCHIVES = (".zip", ".bz2", ".gz", ".tar")
 """Suffixes of archives, which are refused so that the user unpacks and inspects them."""
+
+TrialReader = Callable[[BinaryIO, bytes, str], None]
+"""Function of a child process that reads a mesh file: its output, its data (none), and the path of the file."""
 
 _SECONDS = 120
 _MEMORY = 1 << 30
@@ -33,11 +37,15 @@ _PLAIN_PLY = re.compile(
 _WIDTHS = {b"float": 4, b"float32": 4, b"double": 8, b"float64": 8, b"uchar": 1, b"uint8": 1}
 
 
-def check_mesh(path: Path) -> None:
+def check_mesh(path: Path, *, read: TrialReader | None = None) -> None:
     """Refuse a mesh file whose reader crashes or takes more memory or time than its size justifies.
 
     Files of binary triangles (.stl, .ply) whose size matches their header are not tested, because their reader takes
     only a few times their size. Other errors are left to the actual reader.
+
+    Args:
+        path: The file.
+        read: Function at a module's top level that reads the file in a child process; by default trimesh does.
 
     Raises:
         InputError: If the trial read fails, or for an archive, or if the file is missing or too large.
@@ -53,7 +61,7 @@ def check_mesh(path: Path) -> None:
         is_plain = _is_plain_binary(path, status.st_size)
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from error
-    if not is_plain and (reason := _try_mesh(path.resolve(), status.st_mtime_ns, status.st_size)):
+    if not is_plain and (reason := _try_mesh(path.resolve(), status.st_mtime_ns, status.st_size, read or _read_mesh)):
         raise InputError(f"{path}: not a mesh file that can be read ({reason})")
 
 
@@ -70,13 +78,13 @@ def _is_plain_binary(path: Path, size: int) -> bool:
 
 
 @lru_cache(maxsize=256)
-def _try_mesh(path: Path, _modified: int, size: int) -> str:
+def _try_mesh(path: Path, _modified: int, size: int, read: TrialReader) -> str:
     """Return the reason why a file cannot be read within its limits.
 
     The reason is empty if the file can be read, or if its reader reports an ordinary error.
     """
     memory = _MEMORY + _MEMORY_PER_BYTE * size
-    process = run_bounded(_read_mesh, path, imports=["trimesh"], memory=memory, seconds=_SECONDS)
+    process = run_bounded(read, path, imports=["trimesh"], memory=memory, seconds=_SECONDS)
     if process.status == 0:
         return ""
     return process.reason if (process.status or 0) > 0 else f"its reader {process.reason}"

@@ -195,7 +195,7 @@ def test_texture_is_placed_by_its_coordinates(tmp_path: Path) -> None:
     sheet.visual = TextureVisuals(uv=0.9 * corners[:, :2] / 0.04 + 0.5, material=material)
     sheet.export(tmp_path / "sheet.glb")
     for source in (sheet, tmp_path / "sheet.glb"):
-        splats = bake_asset(source, name="sheet", settings=quick(gaussians=400)).asset.splats
+        splats = bake_asset(source, name="sheet", up="z", settings=quick(gaussians=400)).asset.splats
         colours, y = outward_colours(splats), splats.means[:, 1]
         assert (colours[y < -0.004][:, 0] > colours[y < -0.004][:, 2]).all()
         assert (colours[y > 0.004][:, 2] > colours[y > 0.004][:, 0]).all()
@@ -269,6 +269,7 @@ def not_finite() -> trimesh.Trimesh:
             {"mesh": trimesh.creation.box((0.04, 0.01, 0.01)), "metres_per_unit": 0.001},
             r"got 4e-05 m at 0.001 metres per unit: --units 1 reads it in metres, and --any-size accepts the size",
         ),
+        ({"mesh": trimesh.Trimesh(np.eye(3), [[0, 1, 2]])}, "an object must have a volume .got a flat mesh."),
         ({"density": 0.0}, "density must be a number > 0 .* .got 0."),
         ({"density": float("nan")}, "density must be a number > 0 .* .got nan."),
         ({"friction": -0.5}, "friction must be a number of at least 0 .got -0.5."),

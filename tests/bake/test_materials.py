@@ -16,10 +16,11 @@ from trimesh.visual.material import PBRMaterial, SimpleMaterial
 from mitsplat.bake.bake import BakeResult, BakeSettings, bake_asset
 from mitsplat.bake.bake_report import write_bake_report
 from mitsplat.bake.mesh_parts import MeshPart, read_parts
-from mitsplat.bake.surface_materials import SurfaceFinish, read_material
+from mitsplat.bake.surface_materials import SurfaceFinish
 from mitsplat.errors import InputError, MissingResourceError
 from mitsplat.fit.image_metrics import psnr_of
 from mitsplat.images.colour import decode_srgb
+from mitsplat.mesh_files.trimesh_files import read_material
 
 pytestmark = pytest.mark.usefixtures("meshes_tried_once")
 
@@ -53,7 +54,7 @@ def colour_of(part: MeshPart) -> np.ndarray:
     """Return the mean linear colour of a mesh part."""
     if part.colours is not None:
         return np.asarray(part.colours.mean(axis=(0, 1)))
-    return np.asarray(decode_srgb(part.texture / 255.0).mean(axis=(0, 1)))
+    return np.asarray(decode_srgb(part.texture.pixels / 255.0).mean(axis=(0, 1)) * part.factor)
 
 
 @pytest.fixture(scope="module")
@@ -75,7 +76,7 @@ def bakes(tmp_path_factory: pytest.TempPathFactory) -> dict[str, BakeResult]:
         "stl": SurfaceFinish(colour="#c87828"),
     }
     return {
-        kind: bake_asset(folder / f"box.{kind}", name="box", settings=QUICK, finish=finish)
+        kind: bake_asset(folder / f"box.{kind}", name="box", up="z", settings=QUICK, finish=finish)
         for kind, finish in finishes.items()
     }
 

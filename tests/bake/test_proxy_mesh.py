@@ -17,7 +17,7 @@ def test_the_proxy_of_a_scan_with_many_faces_is_watertight() -> None:
     scan = trimesh.Trimesh(ball.vertices * factors, ball.faces, process=False)
     assert scan.is_volume and not scan.simplify_quadric_decimation(face_count=4000).is_volume
     proxy = make_proxy(
-        [MeshPart("scan", scan, np.full((len(scan.faces), 3, 3), 0.5), None, None, 0.0, None, True, 0.04, ())], 4000
+        [MeshPart("scan", scan, np.full((len(scan.faces), 3, 3), 0.5), None, 0.0, None, True, 0.04, ())], 4000
     )
     assert proxy.is_volume
     assert 1000 < len(proxy.faces) <= 4000

@@ -12,6 +12,7 @@ import trimesh
 from benchmarks.detector import arranged, meshes
 from mitsplat.bake.mesh_parts import MeshPart
 from mitsplat.images.colour import encode_srgb
+from mitsplat.mesh_files.mesh_file import Texture
 from mitsplat.scene.layout import Instance
 from mitsplat.scene.planning.object_appearance import ObjectAppearance
 
@@ -56,12 +57,12 @@ def test_a_mesh_gets_the_appearance_of_its_instance() -> None:
     white.
     """
     texture = np.rint(255 * encode_srgb(np.array([[[0.4, 0.3, 0.8]]]))).astype(np.uint8)
-    part = MeshPart("box", BOX, None, texture, np.zeros((12, 3, 2)), 0.0, 0.9, True)
+    part = MeshPart("box", BOX, None, Texture(texture, np.zeros((12, 3, 2))), 0.0, 0.9, True)
     look = ObjectAppearance(1, 0, 0.0, 1.0, 2.0, (0.5, 1.0, 1.0), 0.3, 0.02, 0.0, 0)
     pose = np.eye(4)
     pose[2, 3] = 1.0
     found = meshes._placed(part, Instance(1, 0, 0, pose), look)
     assert found.texture is not None
-    assert found.texture[0, 0] == pytest.approx(255 * encode_srgb(np.array([0.4, 0.6, 1.0])), abs=1.5)
+    assert found.texture.pixels[0, 0] == pytest.approx(255 * encode_srgb(np.array([0.4, 0.6, 1.0])), abs=1.5)
     assert (found.roughness, found.reflectance) == (0.3, 0.02)
     assert found.mesh.bounds[:, 2] == pytest.approx([0.94, 1.06]) and BOX.bounds[1, 2] == pytest.approx(0.06)

@@ -1,0 +1,320 @@
+"""Reader of glTF 2.0 files: nodes, primitives and materials (Khronos, *glTF 2.0*).
+
+The unit is the metre and y points up. Skins and morph targets have the pose that the nodes of the file define.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import cache, cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import Rotation
+
+from mitsplat.arrays import Float64Array, Int64Array
+from mitsplat.errors import InputError
+from mitsplat.mesh_files.gltf_data import GltfData, normalised
+from mitsplat.mesh_files.mesh_file import (
+    DIELECTRIC_SPECULAR,
+    LEAST_ROUGHNESS,
+    OPAQUE,
+    PAINTED_MATERIAL,
+    TRANSPARENT_TEXELS,
+    UNKNOWN_MATERIAL,
+    FilePart,
+    Material,
+    MeshFile,
+    Texture,
+    Wrap,
+    gloss_texture,
+    is_transparent,
+    means_of,
+    pixels_of,
+)
+from mitsplat.storage.files import JsonObject
+
+_READ_EXTENSIONS = {
+    "EXT_mesh_gpu_instancing",
+    "EXT_texture_avif",
+    "EXT_texture_webp",
+    "KHR_draco_mesh_compression",
+    "KHR_materials_ior",
+    "KHR_materials_pbrSpecularGlossiness",
+    "KHR_materials_specular",
+    "KHR_materials_unlit",
+    "KHR_mesh_quantization",
+    "KHR_node_visibility",
+    "KHR_texture_transform",
+    "KHR_xmp_json_ld",
+}
+_COMPRESSIONS = {"EXT_meshopt_compression", "KHR_meshopt_compression", "KHR_texture_basisu"}
+"""Extensions that are refused where their data are needed, with a remedy."""
+_WITHOUT_EFFECT = {"KHR_materials_variants", "KHR_materials_emissive_strength", "KHR_xmp_json_ld", "KHR_xmp"}
+"""Extensions of materials that change nothing in what is baked."""
+_WRAPS: dict[int, Wrap] = {10497: "repeat", 33071: "clamp", 33648: "mirror"}
+_TRIANGLES, _STRIP, _FAN = 4, 5, 6
+_METAL_SPECULAR = 0.25
+"""Specular colour of the specular-glossiness model above which a material is a metal."""
+
+
+def read_gltf(path: Path, *, textures: bool = True) -> MeshFile:
+    """Read a ``.gltf`` or ``.glb`` file.
+
+    Damaged files raise the errors of :data:`mitsplat.storage.files.MESH_ERRORS`.
+
+    Args:
+        path: The file.
+        textures: False to ignore all textures, which need not exist.
+
+    Raises:
+        InputError: If the file requires an extension that is not supported, or if a texture cannot be read.
+        MissingResourceError: If the package that decompresses its geometry is not installed.
+    """
+    data = GltfData(path)
+    unknown = sorted(set(data.document.get("extensionsRequired", [])) - _READ_EXTENSIONS - _COMPRESSIONS)
+    if unknown:
+        raise InputError(
+            f"it requires extensions of glTF that are not supported: export it without {', '.join(unknown)}"
+        )
+    return _GltfReader(data, textures).read()
+
+
+class _GltfReader:
+    """Reader of the scene of one file."""
+
+    def __init__(self, data: GltfData, textures: bool) -> None:
+        self._data, self._textures = data, textures
+        self._names: dict[str, int] = {}
+        self._warnings: list[str] = []
+        self._read_part = cache(self._read_primitive)
+        self._pixels = cache(lambda texture: pixels_of(data.texture_image(texture)))
+
+    def read(self) -> MeshFile:
+        """Read all parts of the scene."""
+        parts = tuple(part for node, pose in self._world_poses.items() for part in self._read_node(node, pose))
+        return MeshFile(parts, 1.0, "y", tuple(dict.fromkeys(self._warnings)), in_single=True)
+
+    @cached_property
+    def _world_poses(self) -> dict[int, Float64Array]:
+        """Poses (4, 4) of all nodes of the scene, in depth-first order."""
+        document, poses = self._data.document, {}
+        nodes = document.get("nodes", [])
+        if "scenes" in document:
+            roots = self._data.entry("scenes", document.get("scene", 0)).get("nodes", [])
+        else:
+            inner = {child for node in nodes for child in node.get("children", [])}
+            roots = [index for index in range(len(nodes)) if index not in inner]
+        pending = [(root, np.eye(4)) for root in reversed(roots)]
+        while pending:
+            index, parent = pending.pop()
+            node = self._data.entry("nodes", index)
+            if index in poses:
+                raise ValueError(f"node {index} has two parents")
+            if not node.get("extensions", {}).get("KHR_node_visibility", {}).get("visible", True):
+                continue
+            poses[index] = parent @ _local_pose(node)
+            pending += [(child, poses[index]) for child in reversed(node.get("children", []))]
+        return poses
+
+    def _read_node(self, index: int, pose: Float64Array) -> Iterator[FilePart]:
+        """Read the mesh of a node, once per instance."""
+        node = self._data.entry("nodes", index)
+        if "mesh" not in node:
+            return
+        mesh = self._data.entry("meshes", node["mesh"])
+        poses = [pose @ one for one in self._instances(node)]
+        weights = tuple(node.get("weights") or mesh.get("weights") or ())
+        for number, primitive in enumerate(mesh["primitives"]):
+            if primitive.get("mode", _TRIANGLES) not in (_TRIANGLES, _STRIP, _FAN):
+                self._warnings.append("its points and lines are left out")
+                continue
+            part = self._read_part(node["mesh"], number, weights)
+            if "skin" in node:
+                vertices = self._skinned(self._data.entry("skins", node["skin"]), primitive, part.vertices)
+                yield _moved(part, vertices, np.eye(4))
+                continue
+            yield from (_moved(part, part.vertices, one) for one in poses)
+
+    def _instances(self, node: JsonObject) -> list[Float64Array]:
+        """Return the poses of the instances of a node, relative to it (``EXT_mesh_gpu_instancing``)."""
+        stored = node.get("extensions", {}).get("EXT_mesh_gpu_instancing")
+        if stored is None:
+            return [np.eye(4)]
+        given = {name.lower(): self._data.accessor(index) for name, index in stored["attributes"].items()}
+        count = min(map(len, given.values()))
+        return [_local_pose({name: values[k] for name, values in given.items()}) for k in range(count)]
+
+    def _skinned(self, skin: JsonObject, primitive: JsonObject, vertices: Float64Array) -> Float64Array:
+        """Return vertices (V, 3) in the pose of the joints of a skin."""
+        poses = np.array([self._world_poses[joint] for joint in skin["joints"]])
+        if "inverseBindMatrices" in skin:
+            inverse = self._data.accessor(skin["inverseBindMatrices"]).reshape(-1, 4, 4).transpose(0, 2, 1)
+            poses = poses @ inverse[: len(poses)]
+        joints, weights = (self._attribute(primitive, name) for name in ("JOINTS_0", "WEIGHTS_0"))
+        at = np.pad(vertices, ((0, 0), (0, 1)), constant_values=1.0)
+        total = np.maximum(weights.sum(axis=1, keepdims=True), 1e-12)
+        return np.asarray(np.einsum("vj,vjab,vb->va", weights / total, poses[joints.astype(int)], at)[:, :3])
+
+    def _attribute(self, primitive: JsonObject, name: str) -> npt.NDArray[Any]:
+        return self._data.accessor(primitive["attributes"][name])
+
+    def _read_primitive(self, mesh: int, number: int, weights: tuple[float, ...]) -> FilePart:
+        """Read a primitive of a mesh whose morph targets have ``weights``."""
+        stored_mesh = self._data.entry("meshes", mesh)
+        primitive = stored_mesh["primitives"][number]
+        attributes, indices = self._read_arrays(primitive)
+        vertices = attributes["POSITION"].astype(np.float64)
+        for target, weight in zip(primitive.get("targets", []), weights, strict=False):
+            if weight and "POSITION" in target:
+                vertices = vertices + weight * self._data.accessor(target["POSITION"])
+        faces = _triangles(indices, primitive.get("mode", _TRIANGLES))
+        if len(faces) and not 0 <= faces.min() <= faces.max() < len(vertices):
+            raise ValueError(f"a face has vertices {faces.min()} to {faces.max()} of {len(vertices)}")
+        name = str(stored_mesh.get("name", f"mesh_{mesh}"))
+        self._names[name] = self._names.get(name, -1) + 1
+        name = f"{name}_{self._names[name]}" if self._names[name] else name
+        colours = None
+        if "COLOR_0" in attributes:
+            colours = np.clip(normalised(attributes["COLOR_0"])[:, :3].astype(np.float64), 0.0, 1.0)[faces]
+        if "material" not in primitive:
+            material = UNKNOWN_MATERIAL if colours is None else PAINTED_MATERIAL
+            return FilePart(name, vertices, faces, np.eye(4), material, colours)
+        stored = self._data.entry("materials", primitive["material"])
+        uv = {int(key[9:]): values[faces] for key, values in attributes.items() if key.startswith("TEXCOORD_")}
+        material = self._read_material(stored, uv)
+        return FilePart(name, vertices, faces, np.eye(4), material, colours, bool(stored.get("doubleSided")))
+
+    def _read_arrays(self, primitive: JsonObject) -> tuple[dict[str, npt.NDArray[Any]], Int64Array]:
+        """Return the positions, colours and texture coordinates of a primitive, and its indices."""
+        decoded: dict[str, npt.NDArray[Any]] = {}
+        indices = None
+        if (compressed := primitive.get("extensions", {}).get("KHR_draco_mesh_compression")) is not None:
+            decoded, indices = self._data.draco(compressed)
+        attributes = {}
+        for name, index in primitive["attributes"].items():
+            if name not in ("POSITION", "COLOR_0") and not name.startswith("TEXCOORD_"):
+                continue
+            if name not in decoded:
+                attributes[name] = self._data.accessor(index)
+            elif self._data.entry("accessors", index).get("normalized"):
+                attributes[name] = normalised(decoded[name])
+            else:
+                attributes[name] = decoded[name]
+        if indices is None and "indices" in primitive:
+            indices = self._data.accessor(primitive["indices"])
+        if indices is None:
+            indices = np.arange(len(attributes["POSITION"]))
+        return attributes, np.ravel(indices).astype(np.int64)
+
+    def _read_material(self, stored: JsonObject, uv: dict[int, Float64Array]) -> Material:
+        """Convert a material for faces with coordinates ``uv`` (F, 3, 2) by their set."""
+        warnings: list[str] = []
+        values, extensions = stored.get("pbrMetallicRoughness", {}), stored.get("extensions", {})
+        metallic, roughness = float(values.get("metallicFactor", 1.0)), float(values.get("roughnessFactor", 1.0))
+        factor, base = values.get("baseColorFactor", (1, 1, 1, 1)), values.get("baseColorTexture")
+        specular, left_out = DIELECTRIC_SPECULAR, set(extensions) - _READ_EXTENSIONS - _WITHOUT_EFFECT
+        if "KHR_materials_ior" in extensions:
+            index = float(extensions["KHR_materials_ior"].get("ior", 1.5))
+            specular = ((index - 1.0) / (index + 1.0)) ** 2
+        if (given := extensions.get("KHR_materials_specular")) is not None:
+            colour = np.mean(given.get("specularColorFactor", (1, 1, 1)))
+            specular *= float(given.get("specularFactor", 1.0) * colour)
+            left_out |= {name for name in ("specularTexture", "specularColorTexture") if name in given}
+        if (given := extensions.get("KHR_materials_pbrSpecularGlossiness")) is not None:
+            factor, base = given.get("diffuseFactor", (1, 1, 1, 1)), given.get("diffuseTexture")
+            metallic, roughness = 0.0, 1.0 - float(given.get("glossinessFactor", 1.0))
+            reflected = np.asarray(given.get("specularFactor", (1, 1, 1)), dtype=np.float64)
+            if "specularGlossinessTexture" in given:
+                left_out.add("specularGlossinessTexture")
+                roughness, specular = max(roughness, 0.5), DIELECTRIC_SPECULAR
+            elif reflected.max() > _METAL_SPECULAR:
+                factor, base, metallic = (*reflected, 1.0), None, 1.0
+            else:
+                specular = float(reflected.mean())
+            values = {}
+        if stored.get("alphaMode", "OPAQUE") == "BLEND" and factor[3] < OPAQUE:
+            warnings.append("it is transparent, but is baked as opaque")
+        if "emissiveTexture" in stored or any(stored.get("emissiveFactor", ())):
+            warnings.append("it emits light, which is not baked")
+        if left_out:
+            names = ", ".join(sorted(left_out))
+            warnings.append(f"its {names} {'is' if len(left_out) == 1 else 'are'} left out")
+        texture, is_opaque = self._read_texture(base, uv, warnings), stored.get("alphaMode", "OPAQUE") == "OPAQUE"
+        if not (texture is None or is_opaque) and is_transparent(self._data.texture_image(base["index"])):
+            warnings.append(TRANSPARENT_TEXELS)
+        gloss = self._read_texture(values.get("metallicRoughnessTexture"), uv, warnings)
+        if gloss is not None:
+            gloss = gloss_texture(gloss, metallic, roughness)
+            metallic, roughness = means_of(gloss)
+        normal = self._read_texture(stored.get("normalTexture"), uv, warnings)
+        if normal is not None and (scale := stored["normalTexture"].get("scale", 1.0)) != 1.0:
+            slopes = 127.5 + scale * (normal.pixels[..., :2] - 127.5)
+            pixels = np.concatenate([slopes.clip(0, 255).astype(np.uint8), normal.pixels[..., 2:]], axis=2)
+            normal = Texture(pixels, normal.uv, normal.wrap)
+        return Material(
+            np.clip(np.asarray(factor[:3], dtype=np.float64), 0.0, 1.0),
+            texture,
+            float(np.clip(metallic, 0.0, 1.0)),
+            float(np.clip(roughness, LEAST_ROUGHNESS, 1.0)),
+            specular,
+            "KHR_materials_unlit" not in extensions,
+            tuple(warnings),
+            gloss,
+            normal,
+        )
+
+    def _read_texture(
+        self, given: JsonObject | None, uv: dict[int, Float64Array], warnings: list[str]
+    ) -> Texture | None:
+        """Read a texture with its own coordinates."""
+        if given is None or not self._textures:
+            return None
+        pixels, transform = self._pixels(given["index"]), given.get("extensions", {}).get("KHR_texture_transform", {})
+        number = transform.get("texCoord", given.get("texCoord", 0))
+        if number not in uv:
+            warnings.append(f"its texture uses coordinates TEXCOORD_{number}, which are missing, and is left out")
+            return None
+        coordinates = _transformed(uv[number].astype(np.float64), transform) * (1.0, -1.0) + (0.0, 1.0)
+        sampler = self._data.entry("textures", given["index"]).get("sampler")
+        stored = {} if sampler is None else self._data.entry("samplers", sampler)
+        wrap_u, wrap_v = (_WRAPS[stored.get(name, 10497)] for name in ("wrapS", "wrapT"))
+        return Texture(pixels, coordinates, (wrap_u, wrap_v))
+
+
+def _local_pose(node: JsonObject) -> Float64Array:
+    """Return the pose (4, 4) of a node relative to its parent."""
+    if "matrix" in node:
+        return np.asarray(node["matrix"], dtype=np.float64).reshape(4, 4).T
+    pose = np.eye(4)
+    turn = Rotation.from_quat(np.asarray(node.get("rotation", (0, 0, 0, 1)), dtype=np.float64)).as_matrix()
+    pose[:3, :3] = turn * np.asarray(node.get("scale", (1, 1, 1)), dtype=np.float64)
+    pose[:3, 3] = node.get("translation", (0, 0, 0))
+    return pose
+
+
+def _moved(part: FilePart, vertices: Float64Array, pose: Float64Array) -> FilePart:
+    return FilePart(part.name, vertices, part.faces, pose, part.material, part.colours, part.double_sided)
+
+
+def _triangles(indices: Int64Array, mode: int) -> Int64Array:
+    """Return the faces (F, 3) of a list, strip or fan of triangles."""
+    if mode == _TRIANGLES:
+        return indices.reshape(-1, 3)
+    first = np.arange(max(0, len(indices) - 2))
+    if mode == _FAN:
+        return np.stack([indices[first + 1], indices[first + 2], np.full(len(first), indices[:1])], axis=1)
+    odd = first % 2
+    return np.stack([indices[first], indices[first + 1 + odd], indices[first + 2 - odd]], axis=1)
+
+
+def _transformed(uv: Float64Array, transform: JsonObject) -> Float64Array:
+    """Return coordinates (F, 3, 2), v down, after ``KHR_texture_transform``: scale, rotation, offset.
+
+    The rotation is counter-clockwise in the image, whose v axis points down.
+    """
+    angle = float(transform.get("rotation", 0.0))
+    turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+    return np.asarray((uv * transform.get("scale", (1, 1))) @ turn.T + transform.get("offset", (0, 0)))

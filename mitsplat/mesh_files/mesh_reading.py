@@ -1,0 +1,83 @@
+"""Reading of mesh files from untrusted sources."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+import trimesh
+
+from mitsplat.errors import InputError, MissingResourceError
+from mitsplat.geometry.untrusted_meshes import check_mesh
+from mitsplat.mesh_files.gltf import read_gltf
+from mitsplat.mesh_files.mesh_file import MeshFile
+from mitsplat.mesh_files.threemf import read_3mf
+from mitsplat.mesh_files.trimesh_files import read_with_trimesh
+from mitsplat.storage.file_kinds import refuse_other_kinds
+from mitsplat.storage.files import MESH_ERRORS
+
+SUFFIXES = (".stl", ".obj", ".glb", ".gltf", ".off", ".3mf", ".dae", ".ply")
+SCENE_SUFFIXES = (".glb", ".gltf", ".3mf")
+"""Suffixes of files of nodes and components that this package reads without trimesh."""
+_READERS = {".glb": read_gltf, ".gltf": read_gltf, ".3mf": read_3mf}
+
+
+def read_surface(path: Path, *, merge: bool = True) -> trimesh.Trimesh:
+    """Read the geometry of a mesh file as one mesh, in the units and axes of the file.
+
+    Args:
+        path: The file.
+        merge: Merge vertices at the same position.
+
+    Raises:
+        InputError, MissingResourceError: As :func:`read_mesh_file`.
+    """
+    meshes = []
+    for part in read_mesh_file(path, textures=False).parts:
+        mesh = trimesh.Trimesh(part.vertices, part.faces, process=False)
+        meshes.append(mesh.apply_transform(part.transform))  # which reverses the faces of mirrored parts
+    joined = trimesh.util.concatenate(meshes) if meshes else trimesh.Trimesh()
+    return trimesh.Trimesh(joined.vertices, joined.faces, process=merge)
+
+
+def read_mesh_file(path: Path, *, textures: bool = True) -> MeshFile:
+    """Read a mesh file, after a trial read in a process with bounded memory and time.
+
+    Args:
+        path: The file.
+        textures: False to ignore all textures, which need not exist.
+
+    Raises:
+        InputError: If the file cannot be read, requires what is not supported, or lacks a texture.
+        MissingResourceError: If the package that reads such files is not installed.
+    """
+    refuse_other_kinds(path, "a mesh (.glb, .obj, .stl, .ply)", *SUFFIXES)
+    if not path.is_file():
+        raise InputError(f"{path}: no such mesh file")
+    check_mesh(path, read=_try_mesh_file)
+    try:
+        return _read(path, textures=textures)
+    except InputError as error:
+        named = str(error).startswith(f"{path.parent}/") or str(error).startswith(str(path))
+        raise error if named else InputError(f"{path}: {error}") from error
+    except MissingResourceError:
+        raise
+    except (OSError, *MESH_ERRORS) as error:
+        raise InputError(f"{path}: not a mesh that can be read ({error})") from error
+
+
+def _read(path: Path, *, textures: bool) -> MeshFile:
+    with np.errstate(all="ignore"):
+        return _READERS.get(path.suffix.lower(), read_with_trimesh)(path, textures=textures)
+
+
+def _try_mesh_file(output: BinaryIO, _: bytes, path: str) -> None:
+    """Read a file and discard it. Errors except lack of memory are ignored, since the actual reader reports them."""
+    try:
+        _read(Path(path), textures=True)
+    except MemoryError:
+        raise InputError("reading it takes more memory than its file size justifies") from None
+    except (InputError, MissingResourceError, OSError, *MESH_ERRORS):
+        pass
+    output.write(b"\n")

@@ -1,0 +1,281 @@
+"""Reader of 3MF files: objects, components and colours (3MF Consortium, *Core* 1.3 and *Materials and Properties* 1.2).
+
+The positions have the unit that the file states, by default the millimetre, and z points up. Colours are
+display-encoded and matt.
+"""
+
+from __future__ import annotations
+
+import io
+import posixpath
+import zipfile
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import IO
+from xml.etree import ElementTree
+
+import numpy as np
+from PIL import Image, ImageColor
+
+from mitsplat.arrays import Float64Array, Int64Array
+from mitsplat.errors import InputError
+from mitsplat.images.colour import decode_srgb
+from mitsplat.mesh_files.mesh_file import (
+    PAINTED_MATERIAL,
+    UNKNOWN_COLOUR,
+    FilePart,
+    MeshFile,
+    Texture,
+    Wrap,
+    pixels_of,
+)
+from mitsplat.storage.files import IMAGE_ERRORS
+
+_MODEL = "3D/3dmodel.model"
+_RELATIONSHIPS = "_rels/.rels"
+_MODEL_TYPE = "http://schemas.microsoft.com/3dmanufacturing/2013/01/3dmodel"
+_UNITS = {"micron": 1e-6, "millimeter": 1e-3, "centimeter": 1e-2, "inch": 0.0254, "foot": 0.3048, "meter": 1.0}
+_WRAPS: dict[str, Wrap] = {"wrap": "repeat", "mirror": "mirror", "clamp": "clamp", "none": "clamp"}
+_MAX_EXPANSION = 100
+"""Maximum size of a file in the archive relative to that of the archive."""
+_MAX_INSTANCES = 100_000
+"""Maximum number of instances that components may multiply to."""
+_Key = tuple[str, str]
+"""Model file in the archive, and identifier in it."""
+
+
+@dataclass
+class _Object:
+    """Object of a model: a mesh, or components of other objects.
+
+    Attributes:
+        name: Its name.
+        vertices: Positions, shape (V, 3).
+        faces: Vertices of each triangle, shape (F, 3).
+        groups: Property group of each triangle, or None, F entries.
+        indices: Entry of the group at each corner, shape (F, 3).
+        components: Objects and their transforms (4, 4).
+    """
+
+    name: str
+    vertices: Float64Array
+    faces: Int64Array
+    groups: list[str | None]
+    indices: Int64Array
+    components: list[tuple[_Key, Float64Array]] = field(default_factory=list)
+
+
+@dataclass
+class _Group:
+    """Group of colours, linear, shape (N, 3), or of texture coordinates, shape (N, 2), with the texture's id."""
+
+    values: Float64Array
+    texture: str | None = None
+
+
+def read_3mf(path: Path, *, textures: bool = True) -> MeshFile:
+    """Read a ``.3mf`` file.
+
+    Damaged files raise the errors of :data:`mitsplat.storage.files.MESH_ERRORS`.
+
+    Args:
+        path: The file.
+        textures: False to ignore all textures.
+
+    Raises:
+        InputError: If a texture cannot be read, or if the file requires an extension that is not supported.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return _Package(archive, textures, _MAX_EXPANSION * path.stat().st_size).read()
+    except (zipfile.BadZipFile, ElementTree.ParseError, NotImplementedError) as error:
+        raise ValueError(str(error)) from error
+
+
+class _Package:
+    """Archive of a 3MF file."""
+
+    def __init__(self, archive: zipfile.ZipFile, textures: bool, max_size: int) -> None:
+        self._archive, self._textures, self._max_size = archive, textures, max_size
+        self._files = {name.lstrip("/").lower(): name for name in archive.namelist()}
+        self._objects: dict[_Key, _Object] = {}
+        self._groups: dict[_Key, _Group] = {}
+        self._images: dict[_Key, tuple[str, tuple[Wrap, Wrap]]] = {}
+        self._models: set[str] = set()
+        self._left_out: set[str] = set()
+        self._unit = _UNITS["millimeter"]
+
+    def read(self) -> MeshFile:
+        """Read all objects that the build section names."""
+        start = self._start()
+        items = list(self._read_model(start))
+        parts: list[FilePart] = []
+        pending: list[tuple[_Key, Float64Array, tuple[_Key, ...]]] = [(key, pose, ()) for key, pose in reversed(items)]
+        for _ in range(_MAX_INSTANCES):
+            if not pending:
+                break
+            key, pose, parents = pending.pop()
+            if key in parents:
+                raise ValueError(f"object {key[1]} contains itself")
+            if key not in self._objects and key[0] not in self._models:
+                list(self._read_model(key[0]))
+            one = self._objects.get(key)
+            if one is None:
+                raise ValueError(f"object {key[1]} is missing")
+            pending += [(child, pose @ own, (*parents, key)) for child, own in reversed(one.components)]
+            parts += self._parts(key[0], one, pose)
+        if pending:
+            raise ValueError(f"components make more than {_MAX_INSTANCES} objects")
+        warnings = [f"its {', '.join(sorted(self._left_out))} are left out"] if self._left_out else []
+        return MeshFile(tuple(parts), self._unit, "z", tuple(warnings))
+
+    def _open(self, name: str) -> IO[bytes]:
+        """Open a file of the archive; names differ in letter case alone if at all."""
+        found = self._files.get(name.lstrip("/").lower())
+        if found is None:
+            raise ValueError(f"{name} is missing in the archive")
+        if self._archive.getinfo(found).file_size > self._max_size:
+            raise ValueError(f"{name} expands by a factor of more than {_MAX_EXPANSION}")
+        return self._archive.open(found)
+
+    def _start(self) -> str:
+        """Return the name of the root model."""
+        if _RELATIONSHIPS in self._files:
+            with self._open(_RELATIONSHIPS) as file:
+                for element in ElementTree.parse(file).iter():
+                    if element.get("Type") == _MODEL_TYPE:
+                        return element.get("Target", _MODEL).lstrip("/")
+        return _MODEL
+
+    def _read_model(self, model: str) -> Iterator[tuple[_Key, Float64Array]]:
+        """Read the resources of a model file; return the objects of its build section with their transforms."""
+        self._models.add(model)
+        with self._open(model) as file:
+            root: ElementTree.Element | None = None
+            for event, element in ElementTree.iterparse(file, events=("start", "end")):
+                kind = _local(element)
+                if root is None:
+                    root = element
+                    self._check_root(model, element)
+                if event == "start":
+                    continue
+                number = element.get("id", "")
+                if kind == "object":
+                    self._objects[model, number] = self._object(model, element)
+                    element.clear()
+                elif kind in ("basematerials", "colorgroup"):
+                    name = "displaycolor" if kind == "basematerials" else "color"
+                    self._groups[model, number] = _Group(_linear([child.get(name) for child in element]))
+                elif kind == "texture2dgroup":
+                    uv = [(float(child.get("u", 0)), float(child.get("v", 0))) for child in element]
+                    self._groups[model, number] = _Group(np.reshape(uv, (-1, 2)), element.get("texid"))
+                elif kind == "texture2d":
+                    wrap = tuple(_WRAPS[element.get(f"tilestyle{axis}", "wrap")] for axis in "uv")
+                    self._images[model, number] = element.get("path", ""), (wrap[0], wrap[1])
+                elif kind in ("compositematerials", "multiproperties"):
+                    self._groups[model, number] = _Group(np.full((len(element), 3), UNKNOWN_COLOUR))
+                    self._left_out.add(f"{kind} of colours")
+                elif kind == "item":
+                    yield self._reference(model, element), _matrix(element.get("transform"))
+
+    def _check_root(self, model: str, root: ElementTree.Element) -> None:
+        if _local(root) != "model":
+            raise ValueError(f"{model} is no 3MF model")
+        unit = root.get("unit", "millimeter")
+        if unit not in _UNITS:
+            raise ValueError(f"unit must be one of {', '.join(_UNITS)} (got {unit})")
+        if len(self._models) == 1:
+            self._unit = _UNITS[unit]
+        elif self._unit != _UNITS[unit]:
+            raise ValueError(f"all models of a file must have one unit (got {unit} in {model})")
+
+    def _reference(self, model: str, element: ElementTree.Element) -> _Key:
+        """Return the object that an item or a component names; other model files are named by ``p:path``."""
+        path = next((value for key, value in element.attrib.items() if key.endswith("}path")), model)
+        return path.lstrip("/"), element.attrib["objectid"]
+
+    def _object(self, model: str, element: ElementTree.Element) -> _Object:
+        vertices, triangles, components = [], [], []
+        for child in element.iter():
+            kind = _local(child)
+            if kind == "vertex":
+                vertices.append((float(child.attrib["x"]), float(child.attrib["y"]), float(child.attrib["z"])))
+            elif kind == "triangle":
+                triangles.append(child.attrib)
+            elif kind == "component":
+                components.append((self._reference(model, child), _matrix(child.get("transform"))))
+        faces = [(int(one["v1"]), int(one["v2"]), int(one["v3"])) for one in triangles]
+        group, entry = element.get("pid"), element.get("pindex", "0")
+        indices = []
+        for one in triangles:
+            first = one.get("p1", entry)
+            indices.append((int(first), int(one.get("p2", first)), int(one.get("p3", first))))
+        return _Object(
+            element.get("name") or f"object_{element.get('id')}",
+            np.reshape(vertices, (-1, 3)).astype(np.float64),
+            np.reshape(faces, (-1, 3)).astype(np.int64),
+            [one.get("pid", group) for one in triangles],
+            np.reshape(indices, (-1, 3)).astype(np.int64),
+            components,
+        )
+
+    def _parts(self, model: str, one: _Object, pose: Float64Array) -> Iterator[FilePart]:
+        """Yield an object as one part of its colours and one part of each texture."""
+        if not len(one.faces):
+            return
+        if not 0 <= one.faces.min() <= one.faces.max() < len(one.vertices):
+            raise ValueError(f"a face has vertices {one.faces.min()} to {one.faces.max()} of {len(one.vertices)}")
+        groups = np.array([name or "" for name in one.groups])
+        colours, textured = np.full((*one.faces.shape, 3), UNKNOWN_COLOUR), np.zeros(len(groups), dtype=bool)
+        for name in np.unique(groups):
+            if not name:
+                continue
+            if (model, str(name)) not in self._groups:
+                raise ValueError(f"property group {name} is missing")
+            group, rows = self._groups[model, str(name)], groups == name
+            indices = one.indices[rows]
+            if not 0 <= indices.min() <= indices.max() < len(group.values):
+                raise ValueError(f"property group {name} has {len(group.values)} entries (got {indices.max()})")
+            if group.texture is None:
+                colours[rows] = group.values[indices]
+            elif self._textures:
+                textured |= rows
+                texture = self._texture(model, group.texture, group.values[indices])
+                material = replace(PAINTED_MATERIAL, texture=texture)
+                yield FilePart(f"{one.name}_{name}", one.vertices, one.faces[rows], pose, material)
+        if not textured.all():
+            rest = ~textured
+            yield FilePart(one.name, one.vertices, one.faces[rest], pose, PAINTED_MATERIAL, colours[rest])
+
+    def _texture(self, model: str, number: str, uv: Float64Array) -> Texture:
+        if (model, number) not in self._images:
+            raise InputError(f"its texture {number} is missing; give a colour")
+        path, wrap = self._images[model, number]
+        path = path if path.startswith("/") else posixpath.join(posixpath.dirname(model), path)
+        try:
+            with self._open(path) as file, Image.open(io.BytesIO(file.read())) as image:
+                return Texture(pixels_of(image), uv, wrap)
+        except IMAGE_ERRORS as error:
+            raise InputError(f"its texture {path} cannot be read ({error}); give a colour") from None
+
+
+def _local(element: ElementTree.Element) -> str:
+    """Return the name of an element without its namespace."""
+    return element.tag.rpartition("}")[2]
+
+
+def _linear(colours: list[str | None]) -> Float64Array:
+    """Return linear colours (N, 3) of ``#RRGGBB`` and ``#RRGGBBAA``; grey where none is stated."""
+    grey = np.full(3, UNKNOWN_COLOUR)
+    return np.reshape(
+        [grey if c is None else decode_srgb(np.array(ImageColor.getrgb(c)[:3]) / 255.0) for c in colours], (-1, 3)
+    )
+
+
+def _matrix(text: str | None) -> Float64Array:
+    """Return a transform (4, 4) of 12 numbers, which are the rows of a matrix that row vectors are multiplied by."""
+    pose = np.eye(4)
+    if text is not None:
+        pose[:3] = np.array([float(number) for number in text.split()]).reshape(4, 3).T
+    return pose

@@ -1,0 +1,164 @@
+"""3MF: units, colours and placement that the file states."""
+
+from __future__ import annotations
+
+import io
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from mitsplat.bake.mesh_parts import MeshPart, read_model
+from mitsplat.errors import InputError
+from mitsplat.images.colour import decode_srgb
+
+CORE = "http://schemas.microsoft.com/3dmanufacturing/core/2015/02"
+MATERIAL = "http://schemas.microsoft.com/3dmanufacturing/material/2015/02"
+PRODUCTION = "http://schemas.microsoft.com/3dmanufacturing/production/2015/06"
+VERTICES = "".join(f'<vertex x="{x}" y="{y}" z="{z}"/>' for x, y, z in ((0, 0, 0), (8, 0, 0), (0, 8, 0), (0, 0, 8)))
+FACES = ((0, 2, 1), (0, 1, 3), (1, 2, 3), (0, 3, 2))
+RED, GREEN, BLUE = np.eye(3)
+IDENTITY = "1 0 0 0 1 0 0 0 1"
+
+
+@pytest.fixture(autouse=True)
+def _without_trial(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("mitsplat.mesh_files.mesh_reading.check_mesh", lambda path, read: None)
+
+
+def tetrahedron(number: int, *, more: str = "", triangles: tuple[str, ...] = ("",) * 4) -> str:
+    """Build an object: the corner of a cube with a side of 8 units."""
+    rows = "".join(
+        f'<triangle v1="{a}" v2="{b}" v3="{c}" {extra}/>' for (a, b, c), extra in zip(FACES, triangles, strict=True)
+    )
+    mesh = f"<mesh><vertices>{VERTICES}</vertices><triangles>{rows}</triangles></mesh>"
+    return f'<object id="{number}" type="model" {more}>{mesh}</object>'
+
+
+def write(path: Path, resources: str, build: str = '<item objectid="1"/>', unit: str = "", **files: bytes) -> Path:
+    """Write a 3MF file."""
+    model = (
+        f'<model {unit} xmlns="{CORE}" xmlns:m="{MATERIAL}" xmlns:p="{PRODUCTION}">'
+        f"<resources>{resources}</resources><build>{build}</build></model>"
+    )
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("3D/3dmodel.model", model)
+        for name, data in files.items():
+            archive.writestr(name, data)
+    return path
+
+
+def corners_of(part: MeshPart) -> np.ndarray:
+    assert part.colours is not None
+    return part.colours
+
+
+@pytest.mark.parametrize(
+    ("unit", "metres"),
+    [
+        ("", 1e-3),
+        *((f'unit="{u}"', m) for u, m in (("inch", 0.0254), ("foot", 0.3048), ("micron", 1e-6), ("meter", 1))),
+    ],
+)
+def test_the_unit_of_the_file_is_used_unless_one_is_given(tmp_path: Path, unit: str, metres: float) -> None:
+    path = write(tmp_path / "a.3mf", tetrahedron(1), unit=unit)
+    model = read_model(path)
+    assert (model.units, model.up, model.stated) == (metres, "z", ("units", "up"))
+    np.testing.assert_allclose(model.parts[0].mesh.extents, 8 * metres)
+    given = read_model(path, metres_per_unit=0.01, up="y")
+    assert (given.units, given.up, given.stated) == (0.01, "y", ())
+    np.testing.assert_allclose(given.parts[0].mesh.bounds, [(0, -0.08, 0), (0.08, 0, 0.08)], atol=1e-9)
+
+
+def test_colours_of_objects_triangles_and_corners_are_read(tmp_path: Path) -> None:
+    bases = '<basematerials id="5"><base name="a" displaycolor="#804020"/><base name="b" displaycolor="#00FF00FF"/>'
+    colours = '<m:colorgroup id="6"><m:color color="#FF0000"/><m:color color="#0000FF"/></m:colorgroup>'
+    triangles = ("", 'p1="1"', 'pid="6" p1="0" p2="1" p3="1"', 'pid="6" p1="1"')
+    resources = bases + "</basematerials>" + colours + tetrahedron(1, more='pid="5" pindex="0"', triangles=triangles)
+    (part,) = read_model(write(tmp_path / "a.3mf", resources)).parts
+    found = corners_of(part)
+    np.testing.assert_allclose(found[0], [decode_srgb(np.array([0x80, 0x40, 0x20]) / 255)] * 3)
+    np.testing.assert_allclose(found[1], [GREEN] * 3)
+    np.testing.assert_allclose(found[2], [RED, BLUE, BLUE])
+    np.testing.assert_allclose(found[3], [BLUE] * 3)
+    assert not part.shiny
+
+
+def test_components_are_placed_by_their_transforms(tmp_path: Path) -> None:
+    """The second component is mirrored; the build item moves both. A matrix lists its rows for row vectors."""
+    components = (
+        f'<object id="2"><components><component objectid="1" transform="{IDENTITY} 100 0 0"/>'
+        '<component objectid="1" transform="-1 0 0 0 1 0 0 0 1 0 0 0"/></components></object>'
+    )
+    colours = '<m:colorgroup id="6"><m:color color="#FF0000"/><m:color color="#0000FF"/></m:colorgroup>'
+    triangles = ('pid="6" p1="0" p2="1" p3="1"',) * 4
+    build = '<item objectid="2" transform="0 1 0 -1 0 0 0 0 1 0 0 50"/>'
+    resources = colours + tetrahedron(1, triangles=triangles) + components
+    first, second = read_model(write(tmp_path / "a.3mf", resources, build)).parts
+    # (x, y, z) becomes (-y, x, z + 50).
+    np.testing.assert_allclose(first.mesh.bounds, np.array([(-8, 100, 50), (0, 108, 58)]) * 1e-3, atol=1e-9)
+    np.testing.assert_allclose(second.mesh.bounds, np.array([(-8, -8, 50), (0, 0, 58)]) * 1e-3, atol=1e-9)
+    for part in (first, second):
+        assert part.mesh.volume == pytest.approx(8**3 / 6 * 1e-9)
+        red = corners_of(part)[..., 0] > 0.5
+        tip = np.linalg.norm(part.mesh.triangles - [0, part.mesh.bounds[0, 1], 0.05], axis=2)
+        assert red.sum() == 4
+        assert (red.sum(axis=1) == 1).all()
+        if part is second:
+            tip = np.linalg.norm(part.mesh.triangles - [0, 0, 0.05], axis=2)
+        assert (red == (tip < 1e-9))[[0, 1, 3]].all()
+
+
+def test_textures_of_the_archive_are_read(tmp_path: Path) -> None:
+    """The image is red on its left half; u grows from 0 to 1 along the first edge of a triangle."""
+    image, buffer = Image.new("RGB", (8, 8), (0, 0, 255)), io.BytesIO()
+    image.paste((255, 0, 0), (0, 0, 4, 8))
+    image.save(buffer, "PNG")
+    texture = '<m:texture2d id="7" path="/3D/Textures/a.png" contenttype="image/png" tilestyleu="clamp"/>'
+    group = '<m:texture2dgroup id="8" texid="7">' + "".join(
+        f'<m:tex2coord u="{u}" v="{v}"/>' for u, v in ((0, 0), (1, 0), (0, 1))
+    )
+    triangles = ('pid="8" p1="0" p2="1" p3="2"', "", "", "")
+    resources = texture + group + "</m:texture2dgroup>" + tetrahedron(1, triangles=triangles)
+    path = write(tmp_path / "a.3mf", resources, **{"3D/Textures/a.png": buffer.getvalue()})
+    textured, plain = read_model(path).parts
+    assert (len(textured.mesh.faces), len(plain.mesh.faces)) == (1, 3)
+    weights = np.array([[0.8, 0.1, 0.1], [0.1, 0.8, 0.1]])
+    np.testing.assert_allclose(textured.colours_at(np.zeros(2, int), weights), [RED, BLUE])
+    with pytest.raises(InputError, match=r"a\.3mf: its texture /3D/Textures/a\.png cannot be read .* is missing"):
+        read_model(write(tmp_path / "a.3mf", resources))
+
+
+def test_objects_of_other_model_files_are_read(tmp_path: Path) -> None:
+    other = f'<model xmlns="{CORE}"><resources>{tetrahedron(4)}</resources></model>'.encode()
+    component = '<object id="1"><components><component objectid="4" p:path="/3D/other.model"/></components></object>'
+    (part,) = read_model(write(tmp_path / "a.3mf", component, **{"3D/other.model": other})).parts
+    assert part.mesh.extents[0] == pytest.approx(8e-3)
+
+
+@pytest.mark.parametrize(
+    ("resources", "fault"),
+    [
+        ('<object id="1"><components><component objectid="1"/></components></object>', "object 1 contains itself"),
+        ("", "object 1 is missing"),
+        (tetrahedron(1, more='pid="9" pindex="0"'), "property group 9 is missing"),
+        ('<basematerials id="9"/>' + tetrahedron(1, more='pid="9" pindex="0"'), "group 9 has 0 entries"),
+        (tetrahedron(1).replace('v1="0"', 'v1="17"'), "vertices 1 to 17 of 4"),
+        ("<object", "not well-formed"),
+    ],
+)
+def test_damaged_files_are_refused_in_one_sentence(tmp_path: Path, resources: str, fault: str) -> None:
+    with pytest.raises(InputError, match=rf"a\.3mf: not a mesh that can be read \(.*{fault}"):
+        read_model(write(tmp_path / "a.3mf", resources))
+
+
+def test_components_that_multiply_without_end_are_refused(tmp_path: Path) -> None:
+    """Each of 20 objects has ten components: 10^20 parts."""
+    chain = "".join(
+        f'<object id="{number}"><components>' + f'<component objectid="{number + 1}"/>' * 10 + "</components></object>"
+        for number in range(1, 21)
+    )
+    with pytest.raises(InputError, match="components make more than 100000 objects"):
+        read_model(write(tmp_path / "a.3mf", chain + tetrahedron(21)))

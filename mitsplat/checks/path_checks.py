@@ -198,12 +198,15 @@ def _mesh(asset: Asset, core: Float64Array) -> Iterator[Finding]:
 def _mass(asset: Asset, mesh: trimesh.Trimesh) -> Iterator[Finding]:
     try:
         pieces = asset.pieces or (mesh.convex_hull,)
+        solid = closed_solid(mesh, pieces)
+        volume = abs(float(solid.volume))
     except QhullError:
+        volume = 0.0
+    if not 0 < volume < np.inf:
         yield Finding("mass", False, "its mesh spans no volume", "give it another mesh, or another size")
         return
-    solid = closed_solid(mesh, pieces)
     mass = mass_properties(mesh, pieces, density=asset.density, mass=asset.mass).mass
-    density = mass / abs(float(solid.volume)) if solid.volume else float("inf")
+    density = mass / volume
     has_solid = solid is mesh or bool(asset.pieces)
     hull = "" if has_solid else " if it fills its convex hull; its convex pieces are not computed yet"
     yield Finding(

@@ -145,7 +145,7 @@ class DecodedFrame:
         if self.record["camera"]["lens"] == "fisheye":
             beyond |= np.linalg.norm(slopes, axis=1) > np.tan(np.radians(85.0))
         last = np.zeros(len(points))
-        for step in np.linspace(0, 1, 33)[1:] if self.distortion.any() else ():
+        for step in np.linspace(0, 1, 33)[1:] if len(points) and self.distortion.any() else ():
             shown = self.project(np.column_stack([step * slopes, np.ones(len(slopes))]))
             away = np.linalg.norm(shown - self.intrinsics[:2, 2], axis=1)
             beyond |= away < last

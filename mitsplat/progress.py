@@ -9,3 +9,6 @@ Progress = Callable[[int, int, str], None]
 
 Note = Callable[[str], None]
 """Callback that receives a short description of a slow operation."""
+
+TIME_NOTE = "time: "
+"""Beginning of the note that estimates the time of a run. It stays visible."""

@@ -6,7 +6,8 @@ Each command imports its dependencies inside its function, so that all other com
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn
@@ -540,12 +541,26 @@ def check(
     """Check an asset or a scene for likely mistakes.
 
     The command checks units, up axis, needle-shaped Gaussians, floaters, agreement of mesh and splats, mass,
-    colliders, free space, visibility and light, and suggests a remedy for each problem. The exit status is 1 if there
-    is any problem.
+    colliders, free space, visibility and light, and suggests a remedy for each problem. For a scene, it also settles
+    one layout and renders two images, and states the time that the dataset takes on this machine. The exit status is 1
+    if there is any problem.
     """
     from mitsplat.checks.path_checks import check_path
 
-    _print_findings(check_path(path, allow_outside=allow_outside), "look")
+    findings = check_path(path, allow_outside=allow_outside)
+    _print_findings(findings if path.is_dir() else chain(findings, _time(path, allow_outside=allow_outside)), "look")
+
+
+def _time(path: Path, *, allow_outside: bool) -> Iterator[Finding]:
+    """Yield the time that the dataset of a scene takes, unless the scene is refused."""
+    from mitsplat.checks.time_check import measure_time
+    from mitsplat.dataset.preflight import run_faults
+    from mitsplat.scene.loading.scene_loading import load_scene
+
+    scene = load_scene(path, allow_outside=allow_outside)
+    if not any(run_faults(scene)):
+        with suppress(InputError):  # reported by the checks before
+            yield measure_time(scene)
 
 
 def _print_findings(findings: Iterable[Finding], mark: str) -> NoReturn:

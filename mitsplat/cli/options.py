@@ -14,7 +14,7 @@ import typer
 
 from mitsplat.cli import fault
 from mitsplat.errors import InputError, exit_status, sentence_of
-from mitsplat.progress import Progress
+from mitsplat.progress import TIME_NOTE, Progress
 
 if TYPE_CHECKING:
     from mitsplat.runtime.device import Device
@@ -166,7 +166,10 @@ def progress_bar(unit: str = "images/s") -> Iterator[Progress]:
             # Frames of an earlier run and steps of an earlier stage must not count for the present speed.
             if bar.tasks[0].total != total or done < bar.tasks[0].completed:
                 bar.reset(task, total=total, completed=done)
-            bar.update(task, completed=done, description=doing)
+            if doing.startswith(TIME_NOTE):
+                bar.console.print(doing, highlight=False)
+            else:
+                bar.update(task, completed=done, description=doing)
 
         yield update
 

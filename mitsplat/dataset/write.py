@@ -38,8 +38,9 @@ from mitsplat.errors import InputError
 from mitsplat.formats.registry import FORMATS, Catalogue
 from mitsplat.frames.budget import worker_memory
 from mitsplat.frames.frame import render_frame
+from mitsplat.frames.time_estimate import TIMED_FRAMES, describe_time
 from mitsplat.physics.settle import settle_layout
-from mitsplat.progress import Note, Progress
+from mitsplat.progress import TIME_NOTE, Note, Progress
 from mitsplat.runtime.device import Device, current_device, find_device
 from mitsplat.scene.layout import Layout
 from mitsplat.scene.planning.frame_plan import layout_of
@@ -183,10 +184,18 @@ def write_dataset(
             incomplete.read(out / f"layouts/{layout:04d}.json")
         job = FrameJob(scene, catalogue, out, render or render_frame, settle or settle_layout)
         with closing(_results(job, layouts, workers, cluster, used_device, note)) as results:
+            first: list[dict[str, float]] = []
             for record, seconds in results:
                 append_line(out / TIMINGS, {"index": record["index"], **seconds})
                 manifest.append(record)
                 note(f"frame {record['index']}")
+                if len(first) < TIMED_FRAMES:
+                    first.append(seconds)
+                    if len(first) == TIMED_FRAMES:
+                        settled = max(stages.get("settle", 0.0) for stages in first)
+                        image = min(sum(stages.values()) - stages.get("settle", 0.0) for stages in first)
+                        images = sum(map(len, layouts.values()))
+                        note(f"{TIME_NOTE}{describe_time(len(layouts), settled, images, image)}")
                 incomplete.add(record["layout"], [(one["name"], one["reason"]) for one in record.get("left_out", ())])
         counts = FrameCounts()
         finish_folder(out, manifest, content, catalogue, counts.add)

@@ -69,7 +69,7 @@ def settle_layout(scene: Scene, index: int, *, progress: Note | None = None, cac
     index = to_index(index, "layout")
     if index < 0:
         raise InputError(f"layout must be at least 0 (got {index})")
-    path = cache_folder() / "layouts" / f"{_scene_hash(scene)[:32]}-{index:04d}.json"
+    path = _cached_path(scene, index)
     if cached:
         with suppress(OSError, ValueError, KeyError, TypeError):  # a damaged or missing file is replaced
             return Layout.from_json(json.loads(path.read_bytes()))
@@ -80,6 +80,15 @@ def settle_layout(scene: Scene, index: int, *, progress: Note | None = None, cac
     if cached:
         write_cache_file(path, lambda file: file.write(json.dumps(layout.to_json()).encode()))
     return layout
+
+
+def is_cached(scene: Scene, index: int) -> bool:
+    """Return True if the result of :func:`settle_layout` is in the cache."""
+    return _cached_path(scene, index).exists()
+
+
+def _cached_path(scene: Scene, index: int) -> Path:
+    return cache_folder() / "layouts" / f"{_scene_hash(scene)[:32]}-{index:04d}.json"
 
 
 @dataclass(frozen=True)

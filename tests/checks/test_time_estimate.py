@@ -1,0 +1,68 @@
+"""The time of a dataset, estimated from its first layout and images."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from mitsplat.checks import time_check
+from mitsplat.dataset.write import write_dataset
+from mitsplat.frames import time_estimate
+from mitsplat.scene.scene import Scene
+from tests.conftest import BOTH, small_scene
+from tests.drawn import large_boxes, render_boxes, scatter_boxes
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"), [(0.4, "0 s"), (99, "99 s"), (100, "2 min"), (5999, "100 min"), (7200, "2.0 h")]
+)
+def test_durations_have_a_readable_unit(seconds: float, text: str) -> None:
+    assert time_estimate.format_time(seconds) == text
+
+
+def test_the_time_is_that_of_all_layouts_and_images() -> None:
+    assert time_estimate.describe_time(10, 8.0, 200, 1.4) == (
+        "about 6 min in one process: 200 images of 1.4 s, and 10 layouts that settle in 8 s"
+    )
+    assert time_estimate.describe_time(0, 8.0, 20, 1.4).startswith("about 28 s in one process: 20 images")
+
+
+def test_a_check_measures_one_layout_and_the_second_image(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The first image takes longer, because it compiles kernels."""
+    scene = small_scene(tmp_path, large_boxes(), BOTH, layouts=4, views=3)
+    rendered: list[int] = []
+
+    def settle(scene: Scene, index: int) -> Any:
+        time.sleep(0.3)
+        return scatter_boxes(scene, index, progress=None)
+
+    def render(scene: Scene, index: int, *, layout: Any) -> Any:
+        time.sleep(0.1 if rendered else 2.0)
+        rendered.append(index)
+        return render_boxes(scene, index, layout=layout)
+
+    monkeypatch.setattr(time_check, "settle_layout", settle)
+    monkeypatch.setattr(time_check, "render_frame", render)
+    monkeypatch.setattr(time_check, "is_cached", lambda scene, index: index == 0)
+    found = time_check.measure_time(scene)
+    assert found.ok and found.name == "time" and rendered == [3, 4]
+    assert "12 images of" in found.text and "and 3 layouts that settle in 0.3" in found.text
+    assert 2 < float(found.text.split()[1]) < 12
+
+
+def test_a_run_states_its_time_after_the_first_images(tmp_path: Path) -> None:
+    scene = small_scene(tmp_path, large_boxes(), BOTH, layouts=3, views=2)
+    notes: list[str] = []
+    write_dataset(
+        scene,
+        tmp_path / "out",
+        render=render_boxes,
+        settle=scatter_boxes,
+        progress=lambda done, total, text: notes.append(text),
+    )
+    (stated,) = (note for note in notes if note.startswith("time: about "))
+    assert "6 images of" in stated and "3 layouts" in stated
+    assert notes.index(stated) == notes.index("frame 2") + 1

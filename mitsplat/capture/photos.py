@@ -73,6 +73,7 @@ class Prepared:
 class _MeasuredPhoto:
     prepared: Prepared
     sharpness: float
+    is_cutout: bool
     clipped: tuple[float, float]
 
 
@@ -147,10 +148,12 @@ def prepare_photos(
                 measured.append(result)
             if progress is not None:
                 progress(done, len(files), "reading photos")
-    median = float(np.median([photo.sharpness for photo in measured])) if measured else 0.0
+    # The sharpness of an object alone is comparable only to that of other photos without background.
+    kinds = {photo.is_cutout for photo in measured}
+    medians = {kind: float(np.median([p.sharpness for p in measured if p.is_cutout == kind])) for kind in kinds}
     good = []
     for photo in measured:
-        reason = _photo_fault(photo, median)
+        reason = _photo_fault(photo, medians[photo.is_cutout])
         if reason is None:
             good.append(photo.prepared)
         else:
@@ -211,10 +214,12 @@ def _prepare(
     regions = [shown]
     if not upright and (plain := plain_background(np.asarray(rgb))) is not None:
         regions.append(shown & ~plain)
+    is_cutout = not regions[-1].all()
+    sharp = sharpness(grey, regions[-1] if is_cutout else None)
     if (mask := read_mask(masks, prepared)) is not None:
         regions.append(shown & mask)
     clipped = [(float(np.mean(grey[r] <= 4)), float(np.mean(grey[r] >= 251))) for r in regions if r.any()]
-    return _MeasuredPhoto(prepared, sharpness(grey), min(clipped, key=max))
+    return _MeasuredPhoto(prepared, sharp, is_cutout, min(clipped, key=max))
 
 
 def alpha_channel(image: Image.Image) -> Image.Image | None:

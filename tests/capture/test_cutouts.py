@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import ExifTags, Image
+from PIL import ExifTags, Image, ImageFilter
 
 from mitsplat.capture import known_poses as poses
 from mitsplat.capture.capture import Photo
@@ -80,6 +80,30 @@ def test_transparent_pixels_do_not_count_as_dark(tmp_path: Path, mode: str, upri
     assert len(good) == 4, bad
     for number, photo in enumerate(good.values()):
         assert photo.opaque == pytest.approx(mask_of(number).mean(), abs=0.02)
+
+
+def test_a_small_object_is_not_blurred_and_a_blurred_one_is(tmp_path: Path) -> None:
+    """Sharpness is that of the object without its outline, so neither its size nor its mask counts."""
+
+    def make(size: int, blur: float = 0.0) -> Image.Image:
+        texture = np.random.default_rng(0).integers(0, 256, (200, 200), dtype=np.uint8)
+        pixels = np.zeros((200, 200, 4), np.uint8)
+        pixels[..., :3] = np.asarray(Image.fromarray(texture).filter(ImageFilter.GaussianBlur(blur)))[..., None]
+        pixels[..., 3] = 255
+        mask = np.zeros((200, 200), bool)
+        mask[20 : 20 + size, 20 : 20 + size] = True
+        pixels[~mask] = 0
+        return Image.fromarray(pixels, "RGBA")
+
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    for number in range(3):
+        make(150).save(folder / f"{number}.png")
+    make(20).save(folder / "far.png")
+    make(150, 3.0).save(folder / "shaken.png")
+    good, bad = prepare(folder)
+    assert set(good) == {"0.png", "1.png", "2.png", "far.png"}
+    assert bad["shaken.png"].startswith("it is blurred")
 
 
 def test_dark_and_transparent_photos_stay_rejected(tmp_path: Path) -> None:

@@ -5,15 +5,25 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from mitsplat.arrays import ByteImage
+from mitsplat.arrays import BoolArray, ByteImage
 
 _JUDGED_EDGE = 800
 """Longer edge at which sharpness is measured [px], so that picture size and noise have little effect."""
 
 
-def sharpness(grey: ByteImage) -> float:
-    """Return the variance of the Laplacian (Pech-Pacheco et al. 2000) of a reduced grey picture, shape (H, W)."""
-    return float(cv2.Laplacian(shrink(grey, _JUDGED_EDGE), cv2.CV_32F).var())
+def sharpness(grey: ByteImage, region: BoolArray | None = None) -> float:
+    """Return the variance of the Laplacian (Pech-Pacheco et al. 2000) of a reduced grey picture.
+
+    Args:
+        grey: Picture, shape (H, W).
+        region: Pixels to judge without those at the border of the region, shape (H, W); all pixels if None.
+    """
+    edges = cv2.Laplacian(shrink(grey, _JUDGED_EDGE), cv2.CV_32F)
+    if region is not None:
+        whole = shrink(np.uint8(255) * region.astype(np.uint8), _JUDGED_EDGE)
+        inside = cv2.erode(whole, np.ones((5, 5), np.uint8)) == 255
+        edges = edges[inside] if np.any(inside) else edges
+    return float(edges.var())
 
 
 def shrink(grey: ByteImage, edge: int) -> ByteImage:

@@ -20,6 +20,7 @@ from mitsplat.gaussians.surfels import place_surfels
 from mitsplat.importing.import_report import write_import_report, write_scene
 from mitsplat.importing.splat_import import Imported, ImportSettings, _cut_base, _topples, import_splats
 from mitsplat.importing.upright import axis_vector, cut_support, find_up, rotation_to_z
+from mitsplat.quality import KernelName
 from mitsplat.reconstruct.surface import SurfaceSettings
 from mitsplat.scene.loading.scene_loading import load_scene
 
@@ -243,6 +244,27 @@ def test_surroundings_without_a_plane_are_imported_with_a_warning(tmp_path: Path
     np.testing.assert_allclose(splats.sh[:, 0].mean(axis=0), ball.sh[:, 0].mean(axis=0), atol=0.05)
     assert found.support is None
     assert any(miss.startswith("no horizontal surface was found") for miss in found.misses)
+
+
+@pytest.mark.parametrize(
+    ("kernel", "text"),
+    [
+        ("mip", "with antialiasing; scenes render it with `rendering: {kernel: mip}`"),
+        ("gsplat", "{kernel: gsplat}"),
+        (None, None),
+    ],
+)
+def test_the_kernel_of_the_training_is_reported(
+    imported: Imported, tmp_path: Path, kernel: KernelName | None, text: str | None
+) -> None:
+    asset = replace(imported.asset, splats=replace(imported.asset.splats, kernel=kernel))
+    found = replace(imported, asset=asset, views=[])
+    assert (found.training is None) == (text is None)
+    page = write_import_report(tmp_path, found).read_text()
+    assert ("Trained" in page) == (text is not None)
+    assert text is None or text in (found.training or "")
+    asset.save(tmp_path)
+    assert Asset.load(tmp_path).splats.kernel == kernel
 
 
 @pytest.mark.parametrize("form", ["spz", "sog", "ksplat", "compressed.ply"])

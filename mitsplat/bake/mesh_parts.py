@@ -25,6 +25,8 @@ from mitsplat.renderer.scene_emitters import emitter_dict
 from mitsplat.runtime.variant import ensure_variant
 from mitsplat.scene.spec.light_spec import LightSpec
 
+_MAX_POSITION = 1e10
+"""Largest coordinate [units of the file] at which vertices can be merged by their positions."""
 _SINGLE_STEP = 2.0**-23
 """Step of 32-bit numbers relative to their value."""
 _MAX_STEP = 1e-3
@@ -201,6 +203,8 @@ def read_model(
             row = int(np.flatnonzero(~np.isfinite(part.vertices).all(axis=1))[0])
             place = np.asarray(part.vertices[row]).tolist()
             raise InputError(f"{source}: vertex positions must be finite (got {place} at vertex {row})")
+        if len(part.vertices) and (most := float(np.abs(part.vertices).max())) > _MAX_POSITION:
+            raise InputError(f"{source}: vertex positions must be at most {_MAX_POSITION:g} units (got {most:g})")
         parts.append(_place(part, to_world @ part.transform, finish))
     parts = [part for part in parts if len(part.mesh.faces)]
     if not file.parts:

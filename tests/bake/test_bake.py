@@ -260,6 +260,7 @@ def not_finite() -> trimesh.Trimesh:
         ({"lights": []}, "at least one light"),
         ({"metres_per_unit": 0.0}, "metres_per_unit must be > 0 .got 0.0."),
         ({"mesh": trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [2, 0, 0]], [[0, 1, 2]])}, "faces that have an area"),
+        ({"mesh": trimesh.creation.box(bounds=[[0, 0, 0], [1, 1, 1e12]])}, "at most 1e.10 units .got 1e.12."),
         ({"mesh": not_finite()}, r"vertex positions must be finite .got \[nan, .* at vertex 0."),
         (
             {"mesh": trimesh.creation.box((31, 9, 4))},

@@ -199,7 +199,7 @@ def _mass(asset: Asset, mesh: trimesh.Trimesh) -> Iterator[Finding]:
     try:
         pieces = asset.pieces or (mesh.convex_hull,)
         solid = closed_solid(mesh, pieces)
-        volume = abs(float(solid.volume))
+        volume = abs(float(np.linalg.det(solid.triangles).sum())) / 6
     except QhullError:
         volume = 0.0
     if not 0 < volume < np.inf:

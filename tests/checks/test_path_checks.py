@@ -9,7 +9,7 @@ import trimesh
 from ruamel.yaml import YAML
 
 from mitsplat.asset import Asset
-from mitsplat.checks.path_checks import _SCENE_KEYS, SIZE_LIMITS, _located, check_asset, check_scene
+from mitsplat.checks.path_checks import _SCENE_KEYS, SIZE_LIMITS, _located, _mass, check_asset, check_scene
 from mitsplat.dataset.preflight import scene_warnings
 from mitsplat.findings import Finding
 from mitsplat.gaussians.splat_cloud import Splats
@@ -79,6 +79,14 @@ def test_each_planted_fault_of_an_asset_is_found_with_its_remedy(name):
     found = wrong(check_asset(asset))
     assert remedy in found[name.strip()].remedy
     assert set(found) <= {name.strip(), "offset", "overlap", "colliders"}  # a displaced mesh causes all three
+
+
+def test_a_mesh_without_a_volume_has_no_mass() -> None:
+    """The density of a mesh whose vertices have collapsed to one point would be infinite."""
+    mesh = trimesh.Trimesh(np.tile(GOOD.mesh.vertices[:1], (8, 1)), trimesh.creation.box().faces, process=False)
+    (finding,) = _mass(replace(GOOD, mesh=mesh, pieces=(mesh,)), mesh)
+    assert not finding.ok
+    assert finding.text == "its mesh spans no volume"
 
 
 @pytest.mark.parametrize(

@@ -392,7 +392,7 @@ def preview(
     check_output_file(out, ".png", ".jpg", ".jpeg")
     from PIL import Image
 
-    from mitsplat.dataset.preflight import count_faults, image_faults, layout_faults, refuse
+    from mitsplat.dataset.preflight import count_faults, image_faults, label_faults, layout_faults, refuse
     from mitsplat.frames.frame import render_frame
     from mitsplat.frames.layer_sheet import layer_sheet
     from mitsplat.scene.loading.scene_loading import load_scene
@@ -405,6 +405,8 @@ def preview(
     picture = Image.fromarray(layer_sheet(rendered))
     write_file(out, lambda part: picture.save(part, "PNG" if out.suffix.lower() == ".png" else "JPEG"))
     typer.echo(f"picture: {out}")
+    for fault in label_faults(loaded, [frame]):
+        typer.echo(f"look  {fault.text}; {fault.remedy}")
 
 
 def view(

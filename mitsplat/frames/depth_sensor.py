@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 
 from mitsplat.arrays import BoolArray, ByteImage, Float32Array, Float64Array
+from mitsplat.errors import InputError
 from mitsplat.frames.frame import Frame
 from mitsplat.geometry.camera import Camera
 from mitsplat.images.colour import LUMINANCE
@@ -24,10 +25,19 @@ MIN_REFLECTANCE = 0.02
 
 
 def measure_depth(frame: Frame, sensor: DepthSensor) -> Float32Array:
-    """Simulate the measured depth of a frame along the optical axis [m], 0 for no measurement, (H, W)."""
+    """Simulate the measured depth of a frame along the optical axis [m], 0 for no measurement, (H, W).
+
+    Raises:
+        InputError: If a stereo sensor has a camera with lens distortion, which a frame made in Python may have.
+    """
     rng = random_stream(frame.plan.seed, "depth sensor")
     depth = frame.depth.astype(np.float64)
     if isinstance(sensor, StereoSensor):
+        if not frame.camera.is_pinhole:
+            raise InputError(
+                f"frame {frame.index}: a stereo depth_sensor must have a camera without lens distortion (got "
+                f"{list(frame.camera.distortion)})"
+            )
         return simulate_stereo(depth, frame.camera.fx, sensor, rng, frame.image)
     reflectance = np.clip(frame.layers.captured @ LUMINANCE, MIN_REFLECTANCE, 1.0)
     return simulate_time_of_flight(depth, frame.camera, sensor, rng, reflectance, frame.layers.normal)

@@ -6,6 +6,7 @@ import json
 import re
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,9 +14,11 @@ from PIL import Image, ImageSequence
 
 from mitsplat.frames import frame, layer_sheet
 from mitsplat.frames import mitsuba_xml as xml_scene
+from mitsplat.geometry.camera import look_at_pose
 from mitsplat.physics import settle
 from mitsplat.scene.layout import Layout
 from tests.cli.typed import Calls, run
+from tests.conftest import WriteScene
 
 
 def test_preview_writes_the_image_of_the_frame(
@@ -30,6 +33,23 @@ def test_preview_writes_the_image_of_the_frame(
     scene, index = calls.args
     assert (scene.spec.output.width, index) == (6, 5)
     np.testing.assert_array_equal(np.asarray(Image.open(tmp_path / "a.png")), image)
+
+
+def test_preview_states_why_nothing_is_in_view(
+    scene_data: dict[str, Any],
+    write_scene: WriteScene,
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """The matrix is that of a camera in the axes of OpenGL, which looks along -z."""
+    matrix = look_at_pose((0.8, -0.6, 0.9), (0, 0.1, 0)) @ np.diag([1.0, -1.0, -1.0, 1.0])
+    scene_data["camera"] = {"kind": "fixed", "world_from_camera": matrix.tolist(), "intrinsics": {"fov_x": 30}}
+    monkeypatch.setattr(frame, "render_frame", Calls(SimpleNamespace(image=np.zeros((4, 6, 3), dtype=np.uint8))))
+    monkeypatch.setattr(layer_sheet, "layer_sheet", lambda rendered: rendered.image)
+    assert run("preview", write_scene(scene_data), "-o", tmp_path / "a.png") == 0
+    assert "look  camera: no view shows any place" in (printed := capsys.readouterr().out)
+    assert "in the axes of OpenGL" in printed
 
 
 @pytest.mark.parametrize("name", ["a.gif", "no/such/folder/a.png"])

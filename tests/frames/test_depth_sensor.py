@@ -215,3 +215,10 @@ def test_invalid_sensors_are_refused(
 ) -> None:
     with pytest.raises(InputError, match=sentence):
         load_scene(write_scene(scene_data | change))
+
+
+def test_a_stereo_sensor_refuses_a_distorted_camera_of_a_frame_made_in_python() -> None:
+    camera = Camera(128, 96, FOCAL, FOCAL, 64.0, 48.0, np.eye(4), distortion=(-0.1, 0.0, 0.0, 0.0))
+    frame = SimpleNamespace(index=3, camera=camera, plan=SimpleNamespace(seed=0), depth=np.ones((96, 128)), image=PLAIN)
+    with pytest.raises(InputError, match=r"^frame 3: a stereo depth_sensor must have a camera without lens distortion"):
+        measure_depth(frame, StereoSensor())  # type: ignore[arg-type]

@@ -130,7 +130,10 @@ def _type_of(root: Schema, key: Schema, path: str) -> str:
         return _listed(f"`{choice}`" for choice in key.get("enum", [key.get("const")]))
     if "prefixItems" in key:
         each = {_type_of(root, item, path) for item in key["prefixItems"]}
-        return f"{len(key['prefixItems'])} {_plural(each.pop())}" if len(each) == 1 else f"[{', '.join(sorted(each))}]"
+        if len(each) > 1:
+            return f"[{', '.join(sorted(each))}]"
+        (item,) = each
+        return f"{len(key['prefixItems'])} {f'lists of {item}' if item[0].isdigit() else _plural(item)}"
     if key.get("type") == "array":
         return f"list of {_plural(_type_of(root, key['items'], path))}"
     names = {"string": "text", "boolean": "`true` or `false`", "integer": "whole number"}

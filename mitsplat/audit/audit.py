@@ -130,6 +130,7 @@ def _create_checks(root: Path, content: JsonObject) -> list[DatasetCheck]:
     splits = splits_of(output)
     by_format: dict[str, Callable[[], list[DatasetCheck]]] = {
         "coco": lambda: [InstancesCheck(root, content, "instances", split) for split in splits],
+        "coco-polygons": lambda: [InstancesCheck(root, content, "polygons", split) for split in splits],
         "amodal": lambda: [InstancesCheck(root, content, "amodal", split) for split in splits],
         "panoptic": lambda: [PanopticCheck(root, content, split) for split in splits],
         "poses": lambda: [PosesCheck(root, content, split) for split in splits],

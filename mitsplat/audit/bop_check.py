@@ -52,7 +52,7 @@ class BopCheck(DatasetCheck):
 
     def __init__(self, root: Path, content: JsonObject) -> None:
         self._root, self._content = root, content
-        self._folder = ""
+        self._folder, self._is_first = "", True
         self._cursors: dict[str, EntryCursor[object]] = {}
         self._corners: dict[int, Float64Array] = {}
         self._fits: dict[int, list[int]] = {}
@@ -60,6 +60,9 @@ class BopCheck(DatasetCheck):
 
     def check(self, frame: DecodedFrame) -> Violations:
         """Compare the entries of a frame with its masks, depth picture, camera and poses."""
+        if self._is_first:
+            self._is_first = False
+            yield from self._check_camera_file(frame)
         if frame.bop_folder != self._folder:
             yield from self._finish_scene()
             self._folder = frame.bop_folder
@@ -129,6 +132,25 @@ class BopCheck(DatasetCheck):
                     f"does not fit its silhouettes in the poses of scene_gt.json: half of {sum(counts)} boxes have an "
                     f"IoU below {middle + 1 / _BINS:.2f}",
                 )
+
+    def _check_camera_file(self, frame: DecodedFrame) -> Violations:
+        """Check that ``camera.json`` has the intrinsics of the first frame."""
+        file = "bop/camera.json"
+        (fx, _, cx), (_, fy, cy), _ = frame.intrinsics
+        expected = {"fx": fx, "fy": fy, "cx": cx - 0.5, "cy": cy - 0.5, "depth_scale": frame.record["depth_scale"]}
+        expected |= dict(zip(("width", "height"), frame.size, strict=True))
+        try:
+            found: object = read_json(self._root / file)
+        except FileNotFoundError:
+            yield file, "is missing"
+            return
+        except (OSError, ValueError) as error:
+            yield file, f"cannot be read ({error})"
+            return
+        for key, value in expected.items():
+            if not isinstance(found, dict) or not is_close(found.get(key), value):
+                yield file, f"{key} is not that of the first frame, {value:g}"
+                return
 
     def _check_models(self) -> Violations:
         """Check that the model files exist and have the stated measures."""

@@ -93,10 +93,11 @@ class AnnotationFile:
 
 
 class InstancesCheck(DatasetCheck):
-    """Check of ``instances_<split>.json`` or ``amodal_<split>.json``."""
+    """Check of ``instances_<split>.json``, ``polygons_<split>.json`` or ``amodal_<split>.json``."""
 
     def __init__(self, root: Path, content: JsonObject, name: str, split: str) -> None:
         self._split, self._content, self._amodal = split, content, name == "amodal"
+        self._polygons = name == "polygons"
         self._annotations = AnnotationFile(root, f"annotations/{name}_{split}.json")
         self._path, self._last_id = root / self._annotations.file, 0
 
@@ -119,7 +120,13 @@ class InstancesCheck(DatasetCheck):
             yield f"id {number} is not above those before it"
         else:
             self._last_id = number
-        yield from _check_segmentation(frame, label, entry.get("segmentation"), amodal=self._amodal)
+        code = entry.get("segmentation")
+        if self._polygons:
+            code = _decode_polygons(frame, code)
+        if code is None:
+            yield "segmentation is no mask that pycocotools reads"
+        else:
+            yield from _check_segmentation(frame, label, code, amodal=self._amodal)
         if self._amodal:
             yield from _check_segmentation(frame, label, entry.get("visible_segmentation"), amodal=False)
         expected = {
@@ -152,6 +159,7 @@ class InstancesCheck(DatasetCheck):
         try:
             with contextlib.redirect_stdout(io.StringIO()):
                 coco = COCO(self._path)
+                coco.info()
             counts = {"images": len(coco.imgs), "annotations": len(coco.anns)}
         except Exception as error:  # noqa: BLE001 - users of the file get the same error
             yield self._annotations.file, f"cannot be read by pycocotools ({type(error).__name__}: {error})"
@@ -260,6 +268,18 @@ class PosesCheck(DatasetCheck):
         yield from self._frames.finish()
         if not self._frames.broken and self._classes != self._content["classes"]:
             yield self._frames.file, f"classes are {self._classes[:20]}, not {self._content['classes'][:20]}"
+
+
+def _decode_polygons(frame: DecodedFrame, polygons: object) -> object:
+    """Return the run-length code of a union of polygons, as pycocotools fills them; None if they are invalid."""
+    width, height = frame.size
+    if not isinstance(polygons, list) or not polygons or not all(isinstance(one, list) for one in polygons):
+        return None
+    try:
+        code = coco_mask.merge(coco_mask.frPyObjects(polygons, height, width))
+    except Exception:  # noqa: BLE001 - pycocotools raises various types
+        return None
+    return {"size": code["size"], "counts": code["counts"].decode("ascii")}
 
 
 def _check_segmentation(frame: DecodedFrame, label: DecodedInstance, code: object, *, amodal: bool) -> Iterator[str]:

@@ -17,7 +17,10 @@ from mitsplat.storage.files import JsonObject, Record, splits_of
 YOLO_FOLDERS = {"yolo": "", "yolo-detect": "yolo-detect/", "yolo-obb": "yolo-obb/", "yolo-pose": "yolo-pose/"}
 """Folders of Ultralytics' tasks, in which labels lie beside their images."""
 _YOLO = {name: folder for name, folder in YOLO_FOLDERS.items() if folder}
-_ANNOTATIONS = {"coco": "instances", "amodal": "amodal", "panoptic": "panoptic", "poses": "poses"}
+_ANNOTATIONS = {
+    **{"coco": "instances", "coco-polygons": "polygons", "amodal": "amodal"},
+    **{"panoptic": "panoptic", "poses": "poses"},
+}
 _MAPS = ("depth", "depth-sensor", "normals", "instances", "semantic", "panoptic")
 _FOLDERS = (
     *("images", "labels", "layers", "annotations", "layouts", *_YOLO, *_MAPS),
@@ -113,7 +116,7 @@ def _annotation_files(content: JsonObject) -> Iterator[str]:
             yield from (f"annotations/{prefix}_{split}.json" for split in splits_of(output))
     yield from (f"{folder}data.yaml" for name, folder in _YOLO.items() if name in formats)
     if "bop" in formats:
-        yield "bop/models/models_info.json"
+        yield from ("bop/camera.json", "bop/models/models_info.json")
         yield from (f"bop/models/obj_{position + 1:06d}.ply" for position in labelled_assets(content))
     if "colmap" in formats:
         yield from (f"colmap/{name}.txt" for name in ("cameras", "images", "points3D"))

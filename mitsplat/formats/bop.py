@@ -2,6 +2,7 @@
 
 ::
 
+    bop/camera.json                                  intrinsics, image size and depth scale of the first frame
     bop/models/obj_000001.ply, models_info.json      proxy meshes [mm]; object ids are positions among the assets + 1
     bop/<split>/000000/scene_camera.json, scene_gt.json, scene_gt_info.json
     bop/<split>/000000/rgb/000003.png, depth/000003.png, mask/000003_000000.png, mask_visib/000003_000000.png
@@ -80,6 +81,7 @@ class ScenesWriter(AnnotationWriter):
         meshes = enumerate(catalogue.meshes)
         self._meshes = {position + 1: mesh for position, mesh in meshes if position not in catalogue.distractors}
         self._folder, self._layout = "", -1
+        self._camera: JsonObject | None = None
         self._scene_files: dict[str, EntriesFile] = {}
         self._completed: list[GrowingFile] = []
 
@@ -99,6 +101,8 @@ class ScenesWriter(AnnotationWriter):
                 part: EntriesFile(self._root / folder / f"scene_{part}.json") for part in ("camera", "gt", "gt_info")
             }
         index, camera = str(record["index"]), Camera.from_json(record["camera"])
+        if self._camera is None:
+            self._camera = dataset_camera(record, camera)
         self._scene_files["camera"].append(index, camera_entry(record, camera))
         self._scene_files["gt"].append(index, pose_entries(record, camera))
         self._scene_files["gt_info"].append(index, info_entries(record))
@@ -119,6 +123,8 @@ class ScenesWriter(AnnotationWriter):
         self._end_scene()
         self._finish_batch()
         write_models(self._root, self._meshes)
+        if self._camera is not None:
+            write_text(self._root / "bop/camera.json", json.dumps(self._camera, indent=1))
 
     def discard(self) -> None:
         """Remove the files that do not have their final name yet."""
@@ -142,6 +148,14 @@ def write_models(root: Path, meshes: Mapping[int, trimesh.Trimesh]) -> None:
         data = trimesh.exchange.ply.export_ply(scaled, encoding="ascii", vertex_normal=True)
         write_file(root / f"bop/models/obj_{number:06d}.ply", lambda path, data=data: path.write_bytes(data))  # type: ignore[misc]
     write_text(root / "bop/models/models_info.json", json.dumps(info, indent=1))
+
+
+def dataset_camera(record: Record, camera: Camera) -> JsonObject:
+    """Return the content of ``camera.json``, which describes the camera of a dataset by that of one frame."""
+    return {
+        **{"cx": camera.cx - 0.5, "cy": camera.cy - 0.5, "fx": camera.fx, "fy": camera.fy},
+        **{"width": camera.width, "height": camera.height, "depth_scale": record["depth_scale"]},
+    }
 
 
 def camera_entry(record: Record, camera: Camera) -> JsonObject:

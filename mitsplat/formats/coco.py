@@ -2,6 +2,9 @@
 
 ``annotations/instances_<split>.json``
     Boxes, areas and run-length masks of the visible pixels, with the keypoints of assets that define some.
+``annotations/polygons_<split>.json``
+    The same with polygons along the edges of pixels (:func:`mitsplat.labels.polygons.pixel_polygons`) instead of
+    run lengths, for tools that read only polygons.
 ``annotations/amodal_<split>.json``
     The same instances with their full silhouettes, hidden pixels included. ``visible_segmentation`` is the visible
     part.
@@ -24,7 +27,9 @@ import numpy.typing as npt
 
 from mitsplat.formats.format import AnnotationWriter, Catalogue, FrameFiles
 from mitsplat.geometry.camera import Camera
+from mitsplat.images.masks import decode_rle
 from mitsplat.labels.labels import UNLABELLED, Labels
+from mitsplat.labels.polygons import pixel_polygons
 from mitsplat.storage.files import JsonObject, Record
 from mitsplat.storage.json_stream import ListsFile
 
@@ -32,10 +37,20 @@ ENVIRONMENT = "environment"
 """Name of the panoptic category of pixels without an instance."""
 
 
+INFO: JsonObject = {"description": "Rendered by mitsplat", "version": "1.0", "contributor": "mitsplat", "url": ""}
+"""COCO's ``info``, without dates, so that equal datasets have equal bytes."""
+
+_HEAD: JsonObject = {"info": INFO, "licenses": []}
+"""Entries of all COCO files; ``COCO.info()`` of pycocotools and other readers need them."""
+
+
 def annotations_of(
-    record: Record, keypoint_names: Sequence[Sequence[str]], *, first: int, amodal: bool
+    record: Record, keypoint_names: Sequence[Sequence[str]], *, first: int, amodal: bool, polygons: bool = False
 ) -> Iterator[JsonObject]:
-    """Yield the visible or amodal annotations of a frame's instances, with ids from ``first`` on."""
+    """Yield the visible or amodal annotations of a frame's instances, with ids from ``first`` on.
+
+    With ``polygons``, the segmentations of visible pixels are polygons.
+    """
     width, height = record["labels"]["size"]
     for number, label in enumerate(record["labels"]["instances"], start=first):
         visible = {"size": [height, width], "counts": label["rle"]}
@@ -54,6 +69,9 @@ def annotations_of(
         }
         if amodal:
             annotation["visible_segmentation"] = visible
+        if polygons:
+            outlines = pixel_polygons(decode_rle(visible)[y0:y1, x0:x1].astype(bool))
+            annotation["segmentation"] = [np.add(outline, (x0, y0)).ravel().tolist() for outline in outlines]
         if keypoint_names[label["class_index"]]:
             annotation["keypoints"] = [value for point in label["keypoints"] for value in point]
             annotation["num_keypoints"] = sum(point[2] > UNLABELLED for point in label["keypoints"])
@@ -102,9 +120,9 @@ def pose_entry(record: Record, assets: Sequence[str]) -> JsonObject:
 
 
 def create_instances_file(path: Path, class_names: Sequence[str], keypoint_names: Sequence[Sequence[str]]) -> ListsFile:
-    """Create ``instances_<split>.json`` or ``amodal_<split>.json`` without frames."""
+    """Create ``instances_<split>.json``, ``polygons_<split>.json`` or ``amodal_<split>.json`` without frames."""
     categories = _categories(class_names, keypoint_names)
-    return ListsFile(path, ("images", "annotations"), after={"categories": categories})
+    return ListsFile(path, ("images", "annotations"), before=_HEAD, after={"categories": categories})
 
 
 def append_instances(
@@ -113,6 +131,7 @@ def append_instances(
     keypoint_names: Sequence[Sequence[str]],
     *,
     amodal: bool = False,
+    polygons: bool = False,
     folders: bool = False,
 ) -> None:
     """Append a frame to a file of :func:`create_instances_file`.
@@ -123,7 +142,7 @@ def append_instances(
     name = {"file_name": image_file(record).removeprefix("images/")} if folders else {}
     file.append("images", _image(record) | name)
     first = file.count("annotations") + 1
-    for annotation in annotations_of(record, keypoint_names, first=first, amodal=amodal):
+    for annotation in annotations_of(record, keypoint_names, first=first, amodal=amodal, polygons=polygons):
         file.append("annotations", annotation)
 
 
@@ -155,15 +174,15 @@ class SplitsWriter(AnnotationWriter):
         self._append(self._by_split[record["split"]], record)
 
 
-def instances_writer(root: Path, catalogue: Catalogue, *, amodal: bool = False) -> SplitsWriter:
-    """Create the writer of ``instances_<split>.json`` or ``amodal_<split>.json``."""
+def instances_writer(root: Path, catalogue: Catalogue, *, amodal: bool = False, polygons: bool = False) -> SplitsWriter:
+    """Create the writer of ``instances_<split>.json``, ``amodal_<split>.json`` or ``polygons_<split>.json``."""
     classes, keypoints = catalogue.class_names, catalogue.keypoint_names
     return SplitsWriter(
         root,
-        "amodal" if amodal else "instances",
+        "amodal" if amodal else "polygons" if polygons else "instances",
         catalogue.splits,
         partial(create_instances_file, class_names=classes, keypoint_names=keypoints),
-        partial(append_instances, keypoint_names=keypoints, amodal=amodal),
+        partial(append_instances, keypoint_names=keypoints, amodal=amodal, polygons=polygons),
     )
 
 
@@ -177,7 +196,7 @@ def panoptic_writer(root: Path, catalogue: Catalogue) -> SplitsWriter:
         file.append("images", _image(record))
         file.append("annotations", panoptic_annotation(record, count))
 
-    create = partial(ListsFile, lists=("images", "annotations"), after={"categories": categories})
+    create = partial(ListsFile, lists=("images", "annotations"), before=_HEAD, after={"categories": categories})
     return SplitsWriter(root, "panoptic", catalogue.splits, create, append)
 
 

@@ -5,7 +5,7 @@ the manifest. Names of formats in a scene file's ``output.formats``:
 
 ``yolo``, ``yolo-detect``, ``yolo-obb``, ``yolo-pose``
     See :mod:`mitsplat.formats.yolo`.
-``coco``, ``amodal``, ``panoptic``, ``poses``
+``coco``, ``coco-polygons``, ``amodal``, ``panoptic``, ``poses``
     See :mod:`mitsplat.formats.coco`.
 ``bop``
     See :mod:`mitsplat.formats.bop`; for cameras without lens distortion.
@@ -46,6 +46,7 @@ TABLE = {
     **{task: yolo.format_of(task) for task in yolo.TASKS},
     "instances": Format(("instances",), map_files.write_instances),
     "coco": Format(("annotations",), create_writer=coco.instances_writer),
+    "coco-polygons": Format(("annotations",), create_writer=partial(coco.instances_writer, polygons=True)),
     "amodal": Format(("annotations",), create_writer=partial(coco.instances_writer, amodal=True)),
     "panoptic": Format(("panoptic", "annotations"), coco.write_panoptic, coco.panoptic_writer),
     "poses": Format(("annotations",), create_writer=coco.poses_writer),

@@ -12,6 +12,14 @@ from scipy.sparse import coo_array, csgraph
 
 from mitsplat.arrays import BoolArray, Float64Array, Int64Array
 
+_PIXEL_EDGES = (
+    ((-1, 0), (0, 0), (1, 0)),
+    ((0, 1), (1, 0), (0, 1)),
+    ((1, 0), (1, 1), (-1, 0)),
+    ((0, -1), (0, 1), (0, -1)),
+)
+"""Clockwise edges of a pixel: the pixel beside it (row, column), start and step (x, y)."""
+
 _EDGE_DISTANCE = 0.02
 """Distance of the outermost vertices from a pixel's edge [px], so that they truncate to that pixel."""
 
@@ -52,6 +60,56 @@ def fill_polygon(polygon: npt.ArrayLike, width: int, height: int) -> BoolArray:
     canvas = np.zeros((height, width), dtype=np.uint8)
     cv2.fillPoly(canvas, [np.asarray(polygon, dtype=np.float32).astype(np.int32)], 1)
     return canvas.astype(bool)
+
+
+def pixel_polygons(mask: BoolArray) -> list[Int64Array]:
+    """Return a closed polygon (M, 2) [px] along the pixel edges of every part of a mask, for COCO.
+
+    Parts are connected by edges, so that pixels that touch at a corner are separate parts. COCO has no holes: a
+    vertical edge that is traversed in both directions joins each hole to the polygon around it. pycocotools restores
+    the mask exactly from the union of the polygons.
+    """
+    count, parts = cv2.connectedComponents(mask.astype(np.uint8), connectivity=4)
+    polygons = []
+    for number in range(1, count):
+        part = np.pad(parts == number, 1)
+        outer, *holes = sorted(_edge_rings(part), key=lambda ring: min(ring, key=lambda corner: corner[::-1])[::-1])
+        for hole in holes:  # from the top, so that each hole is joined to one before it or to the outer ring
+            first = min(range(len(hole)), key=lambda i: hole[i][::-1])
+            x, y = hole[first]
+            top = y
+            while part[top - 1, x]:
+                top -= 1
+            at = outer.index((x, top))
+            outer = [*outer[: at + 1], *hole[first:], *hole[:first], hole[first], *outer[at:]]
+        polygons.append(_corners(np.array(outer, dtype=np.int64)) - 1)
+    return polygons
+
+
+def _edge_rings(part: BoolArray) -> list[list[tuple[int, int]]]:
+    """Return the closed walks (x, y) along the pixel edges of a part, which is on their right hand."""
+    ahead: dict[tuple[int, int], list[tuple[int, int]]] = {}
+    for beside, start, step in _PIXEL_EDGES:
+        ys, xs = np.nonzero(part & ~np.roll(part, (-beside[0], -beside[1]), axis=(0, 1)))
+        for x, y in zip((xs + start[0]).tolist(), (ys + start[1]).tolist(), strict=True):
+            ahead.setdefault((x, y), []).append(step)
+    rings = []
+    while ahead:
+        corner = begin = next(iter(ahead))
+        step, ring = ahead[corner][0], []
+        while True:
+            ring.append(corner)
+            steps = ahead[corner]
+            # Where two pixels of the part touch at a corner, the walk turns right and stays at its pixel.
+            step = steps[0] if len(steps) == 1 else max(steps, key=lambda one: step[0] * one[1] - step[1] * one[0])
+            steps.remove(step)
+            if not steps:
+                del ahead[corner]
+            corner = corner[0] + step[0], corner[1] + step[1]
+            if corner == begin:
+                break
+        rings.append(ring)
+    return rings
 
 
 def _joined_rings(rings: list[Int64Array], shape: tuple[int, int]) -> Int64Array:

@@ -311,11 +311,15 @@ def test_files_of_no_frame_are_violations(dataset: Path) -> None:
 
 
 WHOLE = (
-    *(f"annotations/{n}_{s}.json" for n in ("instances", "amodal", "panoptic", "poses") for s in ("train", "val")),
+    *(
+        f"annotations/{n}_{s}.json"
+        for n in ("instances", "polygons", "amodal", "panoptic", "poses")
+        for s in ("train", "val")
+    ),
     *("data.yaml", "yolo-detect/data.yaml", "yolo-obb/data.yaml", "yolo-pose/data.yaml"),
     *("layouts/0000.json", "layouts/0002.json"),
     *(f"bop/train/000000/scene_{part}.json" for part in ("camera", "gt", "gt_info")),
-    *("bop/models/models_info.json", "bop/models/obj_000001.ply", "contact_sheet.jpg"),
+    *("bop/camera.json", "bop/models/models_info.json", "bop/models/obj_000001.ply", "contact_sheet.jpg"),
 )
 
 

@@ -170,6 +170,7 @@ def farther(it: camera.Camera) -> camera.Camera:
 
 
 COCO, AMODAL = "annotations/instances_train.json", "annotations/amodal_train.json"
+POLYGONS = "annotations/polygons_train.json"
 PANOPTIC, POSES = "annotations/panoptic_train.json", "annotations/poses_train.json"
 GT, INFO, BOP_CAMERA = (f"bop/train/000000/scene_{part}.json" for part in ("gt", "gt_info", "camera"))
 OTHER = {1: 2, 2: 1, 3: 3}
@@ -208,6 +209,36 @@ FAULTS: dict[str, tuple[str, Patch, str, str]] = {
         each_annotation(lambda e: e.update(area=e["bbox"][2] * e["bbox"][3])),
         COCO,
         "area is",
+    ),
+    "coco-polygons: shifted": (
+        "coco-polygons",
+        each_annotation(lambda e: add_to(e["segmentation"][0], 0, 3)),
+        POLYGONS,
+        "differs from its mask",
+    ),
+    "coco-polygons: one part only": (
+        "coco-polygons",
+        each_annotation(lambda e: e.update(segmentation=[])),
+        POLYGONS,
+        "is no mask that pycocotools reads",
+    ),
+    "coco-polygons: run lengths": (
+        "coco-polygons",
+        each_annotation(lambda e: e.update(segmentation={"size": [48, 64], "counts": ""})),
+        POLYGONS,
+        "is no mask that pycocotools reads",
+    ),
+    "bop: camera.json with OpenGL's pixel centres": (
+        "bop",
+        entry(bop, "dataset_camera", lambda e: e.update(cx=e["cx"] + 0.5)),
+        "bop/camera.json",
+        "cx is not that of the first frame",
+    ),
+    "coco: no info": (
+        "coco",
+        lambda patch: patch.setattr(coco, "_HEAD", {}),
+        COCO,
+        "cannot be read by pycocotools (KeyError: 'info')",
     ),
     "amodal: seen for covered": (
         "amodal",

@@ -45,7 +45,7 @@ def test_three_splits_have_no_violations_in_every_format(made: Path) -> None:
     records = records_of(made)
     assert Counter(record["split"] for record in records) == {"train": 8, "val": 4, "test": 4}
     assert audit_dataset(made).violations == ()
-    for name in ("instances", "amodal", "panoptic", "poses"):
+    for name in ("instances", "polygons", "amodal", "panoptic", "poses"):
         assert (made / f"annotations/{name}_test.json").is_file()
     assert len(COCO(made / "annotations/instances_test.json").imgs) == 4
     assert YAML(typ="safe").load(made / "data.yaml")["test"] == "images/test"

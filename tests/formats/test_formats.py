@@ -317,10 +317,12 @@ class TestYolo:
 
 
 class TestCoco:
-    @pytest.mark.parametrize("name", ["instances", "amodal"])
+    @pytest.mark.parametrize("name", ["instances", "polygons", "amodal"])
     def test_pycocotools_reads_the_masks_of_the_labels(self, written: Written, name: str) -> None:
         for split in ("train", "val"):
             read = COCO(written.root / f"annotations/{name}_{split}.json")
+            read.info()
+            assert read.dataset["licenses"] == []
             for frame, record in written.pairs:
                 if record["split"] != split:
                     continue
@@ -328,7 +330,8 @@ class TestCoco:
                     visible = whole(label, (HEIGHT, WIDTH))
                     expected = label.amodal.image_mask(WIDTH, HEIGHT) if name == "amodal" else visible
                     np.testing.assert_array_equal(read.annToMask(entry), expected)
-                    np.testing.assert_array_equal(coco_mask.toBbox(entry["segmentation"]), entry["bbox"])
+                    assert isinstance(entry["segmentation"], list) == (name == "polygons")
+                    np.testing.assert_array_equal(coco_mask.toBbox(read.annToRLE(entry)), entry["bbox"])
                     assert (entry["area"], entry["category_id"]) == (expected.sum(), label.class_index + 1)
                     assert len(entry["keypoints"]) == 3 * len(KEYPOINTS[label.class_index])
                     if name == "amodal":
@@ -410,6 +413,16 @@ class TestBop:
         """Compute a bounding box by the rule of misc.calc_2d_bbox."""
         ys, xs = mask.nonzero()
         return [int(xs.min()), int(ys.min()), int(xs.max() - xs.min()), int(ys.max() - ys.min())]
+
+    def test_the_camera_of_the_dataset_is_that_of_the_first_frame(self, written: Written) -> None:
+        """Its keys are those that bop_toolkit_lib.inout.load_cam_params reads."""
+        camera = json.loads((written.root / "bop/camera.json").read_text())
+        assert camera.keys() == {"cx", "cy", "depth_scale", "fx", "fy", "height", "width"}
+        assert (camera["width"], camera["height"]) == (WIDTH, HEIGHT)
+        scene = json.loads((written.root / "bop/train/000000/scene_camera.json").read_text())["0"]
+        (fx, _, cx), (_, fy, cy), _ = np.reshape(scene["cam_K"], (3, 3))
+        assert (camera["fx"], camera["fy"], camera["cx"], camera["cy"]) == (fx, fy, cx, cy)
+        assert camera["depth_scale"] == scene["depth_scale"]
 
     def test_models_are_in_millimetres_with_their_extents(self, written: Written) -> None:
         info = json.loads((written.root / "bop/models/models_info.json").read_text())

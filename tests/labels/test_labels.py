@@ -17,7 +17,7 @@ from mitsplat.formats.maps import encode_mask_png
 from mitsplat.formats.yolo import yolo_lines
 from mitsplat.images.masks import Silhouette, bounds_of_ids, encode_mask, without_fragments
 from mitsplat.labels.labels import LabelRules, Labels, Truth, label_instances
-from mitsplat.labels.polygons import fill_polygon, outline
+from mitsplat.labels.polygons import fill_polygon, outline, pixel_polygons
 
 
 @dataclass(frozen=True)
@@ -410,6 +410,27 @@ def test_a_distractor_occludes_and_has_no_label():
     (found,) = labels.instances
     assert (found.id, found.visible_fraction, found.marks) == (1, 0.5, ())
     assert not any(labels.dropped.values())
+
+
+@settings(max_examples=300)
+@given(st.integers(1, 14), st.integers(1, 14), st.integers(0, 2**32 - 1), st.sampled_from([0.3, 0.5, 0.8]))
+def test_pycocotools_restores_masks_from_polygons_of_pixel_edges(height, width, seed, share):
+    mask = np.random.default_rng(seed).random((height, width)) < share
+    polygons = pixel_polygons(mask)
+    assert len(polygons) == ndimage.label(mask)[1]  # parts are connected by edges
+    if polygons:
+        code = coco_mask.merge(coco_mask.frPyObjects([p.ravel().tolist() for p in polygons], height, width))
+        np.testing.assert_array_equal(coco_mask.decode(code) > 0, mask)
+
+
+def test_a_ring_with_a_core_is_two_polygons_with_the_area_of_the_mask():
+    mask = np.zeros((60, 80), dtype=np.uint8)
+    for radius, value in ((25, 1), (15, 0), (6, 1)):
+        cv2.circle(mask, (40, 30), radius, value, -1)
+    polygons = pixel_polygons(mask > 0)
+    x, y = zip(*(polygon.T for polygon in polygons), strict=True)
+    areas = [abs(np.dot(u, np.roll(v, 1)) - np.dot(v, np.roll(u, 1))) / 2 for u, v in zip(x, y, strict=True)]
+    assert len(polygons) == 2 and sum(areas) == mask.sum()
 
 
 def test_the_truncation_counts_pixels_beyond_the_range_of_masks():

@@ -36,6 +36,7 @@ FormatName = Literal[
     "yolo-obb",
     "yolo-pose",
     "coco",
+    "coco-polygons",
     "amodal",
     "panoptic",
     "poses",

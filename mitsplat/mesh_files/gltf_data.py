@@ -171,7 +171,8 @@ class GltfData:
         if "KHR_texture_basisu" in extensions:
             raise InputError(
                 f"its texture {index} is compressed as KTX2 (KHR_texture_basisu), which is not supported: "
-                "`npx @gltf-transform/cli ktxdecompress in.glb out.glb` decompresses it; or give a colour"
+                "`npx @gltf-transform/cli ktxdecompress in.glb out.glb` decompresses it with KTX-Software; "
+                "or give a colour"
             )
         raise InputError(f"a material's texture {index} has no image; give a colour")
 

@@ -167,7 +167,7 @@ def progress_bar(unit: str = "images/s") -> Iterator[Progress]:
             if bar.tasks[0].total != total or done < bar.tasks[0].completed:
                 bar.reset(task, total=total, completed=done)
             if doing.startswith(TIME_NOTE):
-                bar.console.print(doing, highlight=False)
+                bar.console.print(doing, highlight=False, soft_wrap=True)
             else:
                 bar.update(task, completed=done, description=doing)
 

@@ -6,10 +6,18 @@ TIMED_FRAMES = 3
 """Number of frames of a run after which its time is estimated; the first ones also compile kernels."""
 
 
-def describe_time(layouts: int, settle: float, images: int, image: float) -> str:
-    """Return a sentence on the time of layouts and images that take ``settle`` and ``image`` [s] each."""
-    text = f"about {format_time(layouts * settle + images * image)} in one process: {images} images of {image:.2g} s"
-    return f"{text}, and {layouts} layouts that settle in {settle:.2g} s" if layouts else f"{text}; no layout to settle"
+def describe_time(layouts: int, settle: float | None, images: int, image: float) -> str:
+    """Return a sentence on the time of layouts and images that take ``settle`` and ``image`` [s] each.
+
+    ``settle`` is None if no layout was timed, because the first one was in the cache.
+    """
+    total = format_time(layouts * (settle or 0.0) + images * image)
+    text = f"about {total} in one process: {images} images of {image:.2g} s"
+    if not layouts:
+        return f"{text}; no layout to settle"
+    if settle is None:
+        return f"{text}, without settling {layouts} layouts"
+    return f"{text}, and {layouts} layouts that settle in {settle:.2g} s"
 
 
 def format_time(seconds: float) -> str:

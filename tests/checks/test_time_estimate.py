@@ -28,6 +28,7 @@ def test_the_time_is_that_of_all_layouts_and_images() -> None:
         "about 6 min in one process: 200 images of 1.4 s, and 10 layouts that settle in 8 s"
     )
     assert time_estimate.describe_time(0, 8.0, 20, 1.4).startswith("about 28 s in one process: 20 images")
+    assert time_estimate.describe_time(3, None, 20, 1.4).endswith("20 images of 1.4 s, without settling 3 layouts")
 
 
 def test_a_check_measures_one_layout_and_the_second_image(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -115,17 +115,29 @@ def test_metal_and_plastic_are_recovered_with_their_parameters(photographed: Cap
         assert np.linalg.norm(np.median(colours[own], axis=0) - true) < 0.1 * np.linalg.norm(true)
 
 
-def estimate(confidence: float) -> MaterialEstimate:
-    """Return an estimate of one region with this confidence."""
+@pytest.mark.usefixtures("few_points")
+def test_wrong_lights_explain_the_photos_worse_than_captured_colours(photographed: Capture) -> None:
+    mesh = trimesh.util.concatenate(list(balls().values()))
+    below = CaptureLight((AreaLight(position=(-0.5, 0.3, 0.2), target=(0, 0, 0), size=(0.3, 0.3), radiance=20.0),))
+    assert estimate_materials(photographed, mesh, LIGHT).shortcoming() is None
+    reason = estimate_materials(photographed, mesh, below).shortcoming()
+    assert reason is not None and "reduce the error of captured colours" in reason
+
+
+def estimate(confidence: float, explained: float = 0.5) -> MaterialEstimate:
+    """Return an estimate of one region with these figures."""
     region = Region((0.5, 0.4, 0.2), 1.0, 0.3, confidence, 1.0)
-    return MaterialEstimate((region,), np.zeros((1, 3)), np.array([region.colour]), np.zeros(1, dtype=np.int64))
+    place = np.zeros(1, dtype=np.int64)
+    return MaterialEstimate((region,), np.zeros((1, 3)), np.array([region.colour]), place, explained)
 
 
-@pytest.mark.parametrize(("confidence", "used"), [(0.05, False), (0.5, True)])
-def test_captured_colours_are_kept_if_the_confidence_is_low(
-    monkeypatch: pytest.MonkeyPatch, photographed: Capture, confidence: float, used: bool
+@pytest.mark.parametrize(
+    ("confidence", "explained", "used"), [(0.05, 0.5, False), (0.5, 0.2, False), (0.5, -0.3, False), (0.5, 0.5, True)]
+)
+def test_captured_colours_are_kept_if_the_light_does_not_fit(
+    monkeypatch: pytest.MonkeyPatch, photographed: Capture, confidence: float, explained: float, used: bool
 ) -> None:
-    monkeypatch.setattr(pipeline, "estimate_materials", lambda *_: estimate(confidence))
+    monkeypatch.setattr(pipeline, "estimate_materials", lambda *_: estimate(confidence, explained))
     mesh = balls()["metal"]
     surfels = place_surfels(mesh, 1.0, 100, np.random.default_rng(0))
     asset = Asset("ball", "ball", surfels.splats(np.zeros((len(surfels), 4, 3))), mesh)

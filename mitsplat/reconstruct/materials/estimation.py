@@ -41,19 +41,23 @@ from mitsplat.storage.field_types import StrictModel
 from mitsplat.storage.files import resolve_inside
 from mitsplat.storage.yaml_input import load_yaml
 
-MIN_CONFIDENCE = 0.1
-"""Least confidence at which an asset gets estimated materials."""
+MIN_CONFIDENCE, MIN_EXPLAINED = 0.1, 0.25
+"""Least values of :class:`MaterialEstimate` at which an asset gets estimated materials."""
 
 _METALLIC = np.linspace(0, 1, 5)
 _ROUGHNESS = np.array([0.15, 0.25, 0.3, 0.35, 0.4, 0.5, 0.6, 0.8])
 """Grid of the search, which a local search refines."""
-_POINTS, _FIT_POINTS = 4000, 1000
+_POINTS, _FIT_POINTS = 12_000, 1000
 """Number of surface points with a base colour, and of those that determine metalness and roughness."""
 _CLUSTERS = 6
 _MERGE_LOSS = 0.1
 """Relative increase of the errors of two clusters up to which they become one region."""
 _MIN_SHARE = 0.03
 """Share of the points below which a cluster is merged with another."""
+_NEIGHBOURS = 12
+"""Number of points over which colours and errors are averaged."""
+_ROUNDS = 4
+"""Rounds of a robust fit."""
 _MIN_VIEWS = 4
 _MIN_COSINE = 0.2
 """Least cosine between normal and camera of an observation."""
@@ -63,8 +67,10 @@ _MIN_OPENNESS, _MIN_FLATNESS = 0.9, 0.97
 """Limits of clear points: share of the hemisphere without the object, and mean cosine of the normals in two pixels."""
 _NOISE = 0.1, 0.01
 """Standard error of radiance: relative, and absolute."""
-_GRID, _REACH = 41, 2.0
+_GRID, _REACH = 41, 10.0
 """Vertices along the edge of the support, and half of this edge in diagonals of the object."""
+_SLOPE_WEIGHT = 0.3
+"""Weight, in observations, of a radiance that is equal in all directions."""
 
 
 class _LightFile(StrictModel):
@@ -158,17 +164,31 @@ class MaterialEstimate:
         points: Surface points, shape (N, 3).
         colours: Linear base colours of the points, (N, 3).
         region: Index of the region of each point, (N,).
+        explained: Relative decrease of the error of the photos if clusters of points have a common base colour under
+            the light instead of a common radiance. It is small or negative if the light is wrong.
     """
 
     regions: tuple[Region, ...]
     points: Float64Array
     colours: Float64Array
     region: Int64Array
+    explained: float
 
     @property
     def confidence(self) -> float:
         """Mean confidence of the surface."""
         return sum(region.share * region.confidence for region in self.regions)
+
+    def shortcoming(self) -> str | None:
+        """Return why the materials must not be used, a clause, or None."""
+        if self.explained < MIN_EXPLAINED:
+            return (
+                "under the light, base colours reduce the error of captured colours in the photos by "
+                f"{self.explained:.0%} (at least {MIN_EXPLAINED:.0%} is required)"
+            )
+        if self.confidence < MIN_CONFIDENCE:
+            return f"the confidence is {self.confidence:.2f} (at least {MIN_CONFIDENCE:g} is required)"
+        return None
 
     def apply(self, splats: Splats) -> Splats:
         """Return the splats with these materials; each Gaussian gets the base colour of the nearest points."""
@@ -265,39 +285,61 @@ def estimate_materials(
         raise InputError(
             f"materials need surface points that {_MIN_VIEWS} photos show (got {len(usable)}): check masks and light"
         )
+    points, normals, (seen, _) = points[usable], normals[usable], seen.select(usable)
     clear = _clear_points(mesh, surfaces, points, normals, views, seed)
-    fitted = np.sort(rng.permutation(usable)[:_FIT_POINTS])
+    fitted = np.sort(rng.permutation(len(points))[:_FIT_POINTS])
     observed, _ = seen.select(fitted)
     traced = _trace(surfaces, points[fitted], normals[fitted], observed, _ROUGHNESS, seed)
     fits = [[_fit_colours(observed, _mix(traced, m, k)) for k in range(len(_ROUGHNESS))] for m in _METALLIC]
     errors = np.stack([np.stack([fit.errors for fit in row], axis=1) for row in fits], axis=1)
 
-    def fit_points(own: Int64Array, metallic: float, roughness: float) -> _Fit:
-        observed, _ = seen.select(own)
-        traced = _trace(surfaces, points[own], normals[own], observed, np.array([roughness]), seed)
-        return _fit_colours(observed, _mix(traced, metallic, 0))
+    def reflected(metallic: float, roughness: float) -> tuple[Float64Array, Float64Array]:
+        return _mix(_trace(surfaces, points, normals, seen, np.array([roughness]), seed), metallic, 0)
 
     best = np.unravel_index(errors.mean(axis=0).argmin(), errors.shape[1:])
-    colours = encode_srgb(fit_points(usable, float(_METALLIC[best[0]]), float(_ROUGHNESS[best[1]])).colours)
-    near = KDTree(points[usable]).query(points[usable], k=min(8, len(usable)))[1]
-    _, cluster = kmeans2(np.median(colours[near], axis=1), _CLUSTERS, minit="++", seed=0)
-    merged = _merge(cluster[np.searchsorted(usable, fitted)], errors, clear[fitted])
-    cluster = merged[cluster]
-    share = np.bincount(cluster, minlength=int(merged.max()) + 1) / len(cluster)
-    cluster = np.argsort(np.argsort(-share, kind="stable"))[cluster]
-    region = cluster[KDTree(points[usable]).query(points)[1]]
-    regions, colours = [], np.empty((len(points), 3))
-    for number, part in enumerate(np.sort(share)[::-1]):
-        members = _members(region[fitted], number, clear[fitted])
-        regions.append(_region(members, errors, observed, traced, float(part)))
-        found = regions[-1]
-        colours[region == number] = found.colour
-        own = usable[cluster == number]
-        fit = fit_points(own, found.metallic, found.roughness)
-        # Points that few or unsuitable photos show get the colour of their region.
-        prior = np.median(fit.weights, axis=0) * np.where(clear[own], 0.1, 1.0)[:, None]
-        colours[own] = (fit.weights * fit.colours + prior * found.colour) / (fit.weights + prior)
-    return MaterialEstimate(tuple(regions), points, colours, region)
+    fit = _fit_colours(seen, reflected(float(_METALLIC[best[0]]), float(_ROUGHNESS[best[1]])))
+    near = KDTree(points).query(points, k=min(_NEIGHBOURS, len(points)))[1]
+    cluster = _clusters(fit.colours, near)
+    merged = _merge(cluster[fitted], errors, clear[fitted])
+    region = merged[cluster]
+    regions = [
+        _region(_members(region[fitted], number, clear[fitted]), errors, observed, traced)
+        for number in range(int(merged.max()) + 1)
+    ]
+    materials = [reflected(found.metallic, found.roughness) for found in regions]
+    fitted_colours = [_fit_colours(seen, material) for material in materials]
+    # Points change to the cluster whose colour explains the photos of their neighbourhood best.
+    names = np.unique(cluster)
+    means = [np.median(fitted_colours[merged[name]].colours[cluster == name], axis=0) for name in names]
+    loss = [_fit_colours(seen, materials[merged[name]], one).errors for name, one in zip(names, means, strict=True)]
+    smooth = np.stack(loss, axis=1)[near].mean(axis=1)
+    region = merged[names[smooth.argmin(axis=1)]]
+    colours = np.empty_like(points)
+    for number, (found, fit) in enumerate(zip(regions, fitted_colours, strict=True)):
+        own = region == number
+        # Points that few photos show, and those of metal that mirrors itself, get the colour of their region.
+        prior = np.median(fit.weights, axis=0) * np.where(clear, 0.1, 0.1 + 0.9 * found.metallic)[:, None]
+        colours[own] = ((fit.weights * fit.colours + prior * found.colour) / (fit.weights + prior))[own]
+    share = np.bincount(region, minlength=len(regions)) / len(region)
+    order = np.argsort(-share, kind="stable")
+    regions = [replace(regions[number], share=float(share[number])) for number in order if share[number] > 0]
+    explained = 1 - float(smooth.min(axis=1).mean()) / max(_captured_loss(seen, near), 1e-9)
+    return MaterialEstimate(tuple(regions), points, colours, np.argsort(order)[region], explained)
+
+
+def _clusters(colours: Float64Array, near: Int64Array) -> Int64Array:
+    """Return the cluster of each point by its linear colour (N, 3); ``near`` (N, K) are its neighbours."""
+    return np.asarray(kmeans2(np.median(encode_srgb(colours)[near], axis=1), _CLUSTERS, minit="++", seed=0)[1])
+
+
+def _captured_loss(seen: _Observations, near: Int64Array) -> float:
+    """Return the mean error of radiances that are equal in all directions, one for each cluster of points."""
+    constant = np.ones_like(seen.radiance), np.zeros_like(seen.radiance)
+    radiance = _fit_colours(seen, constant).colours
+    cluster = _clusters(radiance, near)
+    means = [np.median(radiance[cluster == name], axis=0) for name in np.unique(cluster)]
+    loss = np.stack([_fit_colours(seen, constant, one).errors for one in means], axis=1)
+    return float(loss[near].mean(axis=1).min(axis=1).mean())
 
 
 def _sample_surface(mesh: trimesh.Trimesh, count: int, seed: int) -> tuple[Float64Array, Float64Array]:
@@ -310,9 +352,11 @@ def _sample_surface(mesh: trimesh.Trimesh, count: int, seed: int) -> tuple[Float
 
 
 def _lit_surfaces(mesh: trimesh.Trimesh, views: Sequence[_View], light: CaptureLight, floor: float) -> LitMesh:
-    """Return the object and its support, a plane at height ``floor``, with their mean radiance in the photos."""
+    """Return the object and its support, a plane at height ``floor``, with their radiance in the photos."""
     fine = trimesh.Trimesh(mesh.vertices, mesh.faces).subdivide_to_size(float(mesh.scale) / 25, max_iter=20)
-    centre, line = mesh.bounds.mean(axis=0), np.linspace(-_REACH, _REACH, _GRID) * float(mesh.scale)
+    # The grid is finer below the object, where its shadow ends.
+    centre, line = mesh.bounds.mean(axis=0), np.linspace(-1, 1, _GRID)
+    line = (0.1 * line + 0.9 * line**3) * _REACH * float(mesh.scale)
     x, y = np.meshgrid(line + centre[0], line + centre[1])
     plane = np.stack([x.ravel(), y.ravel(), np.full(x.size, floor)], axis=1)
     corner = np.arange(_GRID * (_GRID - 1)).reshape(-1, _GRID)[:, :-1].ravel()
@@ -329,22 +373,25 @@ def _lit_surfaces(mesh: trimesh.Trimesh, views: Sequence[_View], light: CaptureL
     upward = np.tile([0.0, 0.0, 1.0], (len(plane), 1))
     normals = np.asarray(fine.vertex_normals)
     radiance = [
-        _mean_radiance(points, _observe(surfaces, points, towards, views, shown))
+        _linear_radiance(points, _observe(surfaces, points, towards, views, shown))
         for points, towards, shown in ((fine.vertices, normals, "object"), (plane, upward, "surroundings"))
     ]
     surfaces.set_radiance(np.concatenate(radiance))
     return surfaces
 
 
-def _mean_radiance(points: Float64Array, seen: _Observations) -> Float64Array:
-    """Return the mean observed radiance of points (N, 3); that of the nearest observed point if there is none."""
-    counts = np.bincount(seen.point, minlength=len(points))
-    sums = np.stack([np.bincount(seen.point, seen.radiance[:, c], len(points)) for c in range(3)], axis=1)
-    known = counts > 0
-    if not known.any():
-        return np.zeros((len(points), 3))
-    means = sums[known] / counts[known, None]
-    return np.asarray(means[KDTree(points[known]).query(points)[1]])
+def _linear_radiance(points: Float64Array, seen: _Observations) -> Float64Array:
+    """Fit the radiance of points (N, 3) towards a unit vector d, as coefficients (N, 4, 3) of 1 and d.
+
+    Points without observations get the coefficients of the nearest observed point.
+    """
+    known, starts = np.unique(seen.point, return_index=True)
+    if not len(known):
+        return np.zeros((len(points), 4, 3))
+    basis = np.insert(seen.to_camera, 0, 1.0, axis=1)[:, :, None]
+    left = np.add.reduceat(basis * basis.swapaxes(1, 2), starts) + np.diag([0, *[_SLOPE_WEIGHT] * 3])
+    found = np.linalg.solve(left, np.add.reduceat(basis * seen.radiance[:, None], starts))
+    return np.asarray(found[KDTree(points[known]).query(points)[1]])
 
 
 def _observe(
@@ -418,17 +465,24 @@ def _mix(traced: Reflectance, metallic: float, place: float) -> tuple[Float64Arr
     return tint, metallic * at(traced.metal) + (1 - metallic) * at(traced.dielectric)
 
 
-def _fit_colours(seen: _Observations, material: tuple[Float64Array, Float64Array], rounds: int = 4) -> _Fit:
-    """Fit the base colour of every point by iteratively reweighted least squares with Cauchy's loss."""
+def _fit_colours(
+    seen: _Observations, material: tuple[Float64Array, Float64Array], colour: Float64Array | None = None
+) -> _Fit:
+    """Fit the base colour of every point by iteratively reweighted least squares with Cauchy's loss.
+
+    If ``colour`` (3,) is given, it is the base colour of all points.
+    """
     tint, white = material
     starts = np.flatnonzero(np.diff(seen.point, prepend=-1))
     counts = np.diff(starts, append=len(seen.point))
     clipped = seen.radiance >= _CLIPPED
     precision = 1 / (_NOISE[0] * seen.radiance + _NOISE[1]) ** 2
     weight = precision * ~clipped
-    for _ in range(rounds):
+    for _ in range(_ROUNDS if colour is None else 1):
         sums = np.add.reduceat(weight * tint**2, starts)
         colours = np.clip(np.add.reduceat(weight * tint * (seen.radiance - white), starts) / (sums + 1e-9), 0, 1)
+        if colour is not None:
+            colours = np.broadcast_to(colour, colours.shape)
         excess = np.repeat(colours, counts, axis=0) * tint + white - seen.radiance
         # A clipped pixel limits the radiance from below only.
         square = np.where(clipped & (excess > 0), 0, excess**2 * precision)
@@ -471,7 +525,7 @@ def _merge(cluster: Int64Array, errors: Float64Array, clear: BoolArray) -> Int64
     return found
 
 
-def _region(rows: Int64Array, errors: Float64Array, seen: _Observations, traced: Reflectance, share: float) -> Region:
+def _region(rows: Int64Array, errors: Float64Array, seen: _Observations, traced: Reflectance) -> Region:
     """Return the material of the points ``rows``."""
     table = errors[rows].mean(axis=0)
     start = np.unravel_index(table.argmin(), table.shape)
@@ -502,5 +556,5 @@ def _region(rows: Int64Array, errors: Float64Array, seen: _Observations, traced:
         metallic=float(metallic),
         roughness=float(np.interp(place, np.arange(len(_ROUGHNESS)), _ROUGHNESS)),
         confidence=float(np.clip(1 - found.fun / max(other, 1e-9), 0, 1)),
-        share=share,
+        share=0.0,
     )

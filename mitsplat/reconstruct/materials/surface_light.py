@@ -19,7 +19,7 @@ from mitsplat.renderer.emitters.emitter_sampling import Emitters, receiver
 from mitsplat.renderer.materials.principled import SpecularLobe, diffuse_albedo, lattice_point, power_weight
 from mitsplat.renderer.rays.device_arrays import plain_mesh, ray_scene, wrapped
 
-_LOBE_LATTICE, _LIGHT_LATTICE, _OPEN_LATTICE = (55, 34), (987, 610), (89, 55)
+_LOBE_LATTICE, _LIGHT_LATTICE, _OPEN_LATTICE = (55, 34), (377, 233), (89, 55)
 """Number and generator of the rays of a specular lobe, of the samples of the emitters at a point, and of openness."""
 
 
@@ -77,11 +77,11 @@ class LitMesh:
         self._faces = wrapped(mi.UInt32, np.asarray(mesh.faces, dtype=np.uint32))
         self._object_faces = dr.opaque(mi.UInt32, faces)
         self._offset = dr.opaque(mi.Float, 1e-4 * float(mesh.scale))
-        self._radiance = dr.zeros(mi.Float, 3 * len(mesh.vertices))
+        self._radiance = [dr.zeros(mi.Float, 3 * len(mesh.vertices))] * 4
 
     def set_radiance(self, radiance: Float64Array) -> None:
-        """Set the radiance of the vertices, shape (V, 3)."""
-        self._radiance = wrapped(mi.Float, radiance.astype(np.float32))
+        """Set the radiance of the vertices towards a unit vector d, as coefficients (V, 4, 3) of 1 and d."""
+        self._radiance = [wrapped(mi.Float, one.astype(np.float32)) for one in radiance.swapaxes(0, 1)]
 
     def unoccluded(self, points: Float64Array, normals: Float64Array, target: Float64Array) -> BoolArray:
         """Return True for points (N, 3) with unit normals (N, 3) that see a ``target`` (3,)."""
@@ -193,9 +193,10 @@ class LitMesh:
         valid, (u, v) = hit.is_valid(), hit.prim_uv
         vertex, colour = dr.gather(mi.Vector3u, self._faces, hit.prim_index, valid), mi.Color3f(0)
         for index, share in zip(vertex, (1 - u - v, u, v), strict=True):
-            colour += dr.gather(mi.Color3f, self._radiance, index, valid) * share
+            for values, factor in zip(self._radiance, (1, *-ray.d), strict=True):
+                colour += dr.gather(mi.Color3f, values, index, valid) * (share * factor)
         ray.maxt = dr.select(valid, hit.t, dr.inf)
-        return dr.select(valid & dr.isfinite(u + v), colour, 0)  # slivers yield NaN
+        return dr.select(valid & dr.isfinite(u + v), dr.maximum(colour, 0), 0)  # slivers yield NaN
 
 
 def _vector(values: Float64Array) -> mi.Vector3f:

@@ -26,7 +26,6 @@ from mitsplat.progress import Progress
 from mitsplat.reconstruct.asset_evaluation import VERDICT_FILE, Verdict
 from mitsplat.reconstruct.asset_report import write_asset_report
 from mitsplat.reconstruct.materials.estimation import (
-    MIN_CONFIDENCE,
     CaptureLight,
     estimate_materials,
     require_light_frame,
@@ -167,7 +166,7 @@ def make_asset(
 def _with_estimated_materials(
     result: Reconstruction, capture: Capture, light: CaptureLight, progress: Progress | None
 ) -> Reconstruction:
-    """Return the asset with the materials that its photographs show, or unchanged if their confidence is low."""
+    """Return the asset with the materials that its photographs show, or unchanged if the light does not fit them."""
     if progress is not None:
         progress(0, 1, "estimating materials")
     asset = result.asset
@@ -175,12 +174,11 @@ def _with_estimated_materials(
         return result
     found = estimate_materials(capture, asset.mesh, light)
     rows = {f"Material {number}": str(region) for number, region in enumerate(found.regions, start=1)}
-    if found.confidence >= MIN_CONFIDENCE:
+    if (reason := found.shortcoming()) is None:
         result = replace(result, asset=replace(asset, splats=found.apply(asset.splats)))
     else:
         rows["Materials"] = (
-            f"not used, and the captured colours are kept: the confidence is {found.confidence:.2f} (at least "
-            f"{MIN_CONFIDENCE:g} is required); check whether the lights are those of the photos"
+            f"not used, and the captured colours are kept: {reason}; check whether the lights are those of the photos"
         )
     return replace(result, verdict=replace(result.verdict, rows={**result.verdict.rows, **rows}))
 

@@ -46,7 +46,8 @@ from mitsplat.gaussians.splat_materials import SplatMaterials
 from mitsplat.gaussians.surfels import Surfels, place_surfels
 from mitsplat.geometry.camera import Camera
 from mitsplat.images.colour import LUMINANCE, encode_srgb
-from mitsplat.reconstruct.materials.estimation import CaptureLight, MaterialEstimate, estimate_materials
+from mitsplat.reconstruct.materials.capture_light import CaptureLight
+from mitsplat.reconstruct.materials.estimation import MaterialEstimate, estimate_materials
 from mitsplat.renderer.emitters.emitter_sampling import reference_irradiance
 from mitsplat.renderer.layers import make_integrator, make_splats_shape, render_layers
 from mitsplat.renderer.path_tracing import render_mesh

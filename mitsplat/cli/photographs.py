@@ -372,7 +372,7 @@ def asset(
     asset folder then drops objects on the surface at which the photos are directed. The exit status is 4 if a quality
     threshold is missed.
     """
-    from mitsplat.reconstruct.materials.estimation import CaptureLight
+    from mitsplat.reconstruct.materials.capture_light import CaptureLight
     from mitsplat.reconstruct.pipeline.asset_pipeline import asset_from_photos, default_fit
     from mitsplat.reconstruct.reconstruct import AssetJob, ReconstructSettings
 

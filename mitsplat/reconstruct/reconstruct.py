@@ -20,7 +20,7 @@ from mitsplat.progress import Progress
 from mitsplat.reconstruct.asset_evaluation import HeldOutView, Verdict, compute_verdict, show_held_out
 from mitsplat.reconstruct.causes import find_causes
 from mitsplat.reconstruct.fallback_proxy import find_proxy_surface
-from mitsplat.reconstruct.materials.estimation import CaptureLight
+from mitsplat.reconstruct.materials.capture_light import CaptureLight
 from mitsplat.reconstruct.registration import Alignment, register_mesh, surface_points
 from mitsplat.reconstruct.segment_splats import Isolation, MaskedView, isolate_object
 from mitsplat.reconstruct.silhouette_refinement import MeshRefineSettings, RefinedMesh, refine_mesh

@@ -19,13 +19,8 @@ from mitsplat.gaussians.surfels import place_surfels
 from mitsplat.geometry.camera import Camera
 from mitsplat.images.colour import encode_srgb
 from mitsplat.reconstruct.asset_evaluation import Verdict
-from mitsplat.reconstruct.materials.estimation import (
-    CaptureLight,
-    MaterialEstimate,
-    Region,
-    estimate_materials,
-    require_light_frame,
-)
+from mitsplat.reconstruct.materials.capture_light import CaptureLight, require_light_frame
+from mitsplat.reconstruct.materials.estimation import MaterialEstimate, Region, estimate_materials
 from mitsplat.reconstruct.pipeline import asset_pipeline as pipeline
 from mitsplat.reconstruct.reconstruct import AssetJob, Reconstruction, ReconstructSettings
 from mitsplat.scene.spec.light_spec import AreaLight, EnvironmentLight, LightDraw

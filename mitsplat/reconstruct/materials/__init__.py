@@ -6,6 +6,7 @@ Output: base colour, metalness and roughness of the surface, with a confidence.
 
 from __future__ import annotations
 
-from mitsplat.reconstruct.materials.estimation import CaptureLight, MaterialEstimate, estimate_materials
+from mitsplat.reconstruct.materials.capture_light import CaptureLight
+from mitsplat.reconstruct.materials.estimation import MaterialEstimate, estimate_materials
 
 __all__ = ["CaptureLight", "MaterialEstimate", "estimate_materials"]

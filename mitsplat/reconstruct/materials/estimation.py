@@ -2,44 +2,40 @@
 
 The radiance of a surface is linear in its base colour (:mod:`mitsplat.renderer.materials.principled`). For each pair of
 metalness and roughness, the base colour of every surface point follows from the photographs that show the point. Points
-of similar colour form regions, and each region takes the pair whose radiance fits its photographs best.
+of similar colour form regions, and each region takes the pair whose radiance fits its photographs best. Points then
+move to the region that explains their photographs best.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Annotated, NamedTuple
+from typing import NamedTuple
 
-import cv2
-import mitsuba as mi
 import numpy as np
 import trimesh
-from pydantic import Field
 from scipy.cluster.vq import kmeans2
-from scipy.ndimage import binary_dilation, binary_erosion
 from scipy.optimize import minimize
 from scipy.spatial import KDTree
 
 from mitsplat.arrays import BoolArray, Float32Array, Float64Array, Int64Array
-from mitsplat.capture.capture import Capture, Photo, known_where
+from mitsplat.capture.capture import Capture
 from mitsplat.errors import InputError
 from mitsplat.gaussians.spherical_harmonics import SH_C0
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.gaussians.splat_materials import SplatMaterials
-from mitsplat.geometry.camera import Camera
-from mitsplat.geometry.mesh_normals import corner_normals
-from mitsplat.images.colour import decode_srgb, encode_srgb
-from mitsplat.images.untrusted_images import check_images
+from mitsplat.images.colour import encode_srgb
+from mitsplat.reconstruct.materials.capture_light import CaptureLight, require_light_frame
+from mitsplat.reconstruct.materials.observations import (
+    CLIPPED,
+    Observations,
+    View,
+    clear_points,
+    lit_surfaces,
+    observe,
+    sample_surface,
+)
 from mitsplat.reconstruct.materials.surface_light import LitMesh, Reflectance
-from mitsplat.renderer.scene_emitters import emitter_dict
 from mitsplat.runtime.variant import ensure_variant
-from mitsplat.scene.spec.light_spec import LightSpec
-from mitsplat.storage.content_hash import file_hash
-from mitsplat.storage.field_types import StrictModel
-from mitsplat.storage.files import resolve_inside
-from mitsplat.storage.yaml_input import load_yaml
 
 MIN_CONFIDENCE, MIN_EXPLAINED = 0.1, 0.25
 """Least values of :class:`MaterialEstimate` at which an asset gets estimated materials."""
@@ -59,75 +55,8 @@ _NEIGHBOURS = 12
 _ROUNDS = 4
 """Rounds of a robust fit."""
 _MIN_VIEWS = 4
-_MIN_COSINE = 0.2
-"""Least cosine between normal and camera of an observation."""
-_CLIPPED = 0.97
-"""Linear radiance from which a pixel may be clipped."""
-_MIN_OPENNESS, _MIN_FLATNESS = 0.9, 0.97
-"""Limits of clear points: share of the hemisphere without the object, and mean cosine of the normals in two pixels."""
 _NOISE = 0.1, 0.01
 """Standard error of radiance: relative, and absolute."""
-_GRID, _REACH = 41, 10.0
-"""Vertices along the edge of the support, and half of this edge in diagonals of the object."""
-_SLOPE_WEIGHT = 0.3
-"""Weight, in observations, of a radiance that is equal in all directions."""
-
-
-class _LightFile(StrictModel):
-    """Lights of a file by ``mitsplat lights``."""
-
-    lights: tuple[Annotated[LightSpec, Field(discriminator="kind")], ...] = Field(min_length=1)
-
-
-@dataclass(frozen=True)
-class CaptureLight:
-    """Lights of photographs, in the frame of their capture. White in the photographs is the radiance 1.
-
-    Attributes:
-        lights: The lights.
-        folder: Folder of the images that they name.
-
-    Raises:
-        InputError: If a light is random or moves, or an image is missing.
-    """
-
-    lights: tuple[LightSpec, ...]
-    folder: Path = Path()
-
-    def __post_init__(self) -> None:
-        for light in self.lights:
-            if any(getattr(light, name, None) for name in ("draw", "path", "pool")):
-                raise InputError("the lights of photographs must be fixed: remove draw, path and pool")
-            image = getattr(light, "image", None)
-            if image is not None and not (self.folder / image).is_file():
-                raise InputError(f"{self.folder / image}: no such image")
-
-    @classmethod
-    def load(cls, path: Path) -> CaptureLight:
-        """Read the key ``lights`` of a file, as ``mitsplat lights`` writes it.
-
-        Raises:
-            InputError: If the file cannot be read or breaks a rule.
-        """
-        lights = load_yaml(path, _LightFile).lights
-        try:
-            images = [resolve_inside(path.parent, image) for one in lights if (image := getattr(one, "image", None))]
-            if reason := next(filter(None, check_images(images)), None):
-                raise InputError(reason)
-            return cls(lights, path.parent)
-        except InputError as error:
-            raise InputError(f"{path}: {error}") from None
-
-    def scene(self) -> mi.Scene:
-        """Return a Mitsuba scene of the lights."""
-        emitters = {f"light_{number}": emitter_dict(light, self.folder) for number, light in enumerate(self.lights)}
-        return mi.load_dict({"type": "scene", **emitters})
-
-    def content(self) -> list[object]:
-        """Return the values and the hashes of the images, for the hash of the inputs."""
-        images = [image for light in self.lights if (image := getattr(light, "image", None))]
-        hashes = [file_hash(self.folder / image) for image in images]
-        return [*(light.model_dump(mode="json") for light in self.lights), *hashes]
 
 
 @dataclass(frozen=True)
@@ -204,57 +133,12 @@ class MaterialEstimate:
         return replace(splats, sh=((colours[:, None] - 0.5) / SH_C0).astype(np.float32), materials=materials)
 
 
-class _View(NamedTuple):
-    """Linear radiance of a photo, and its pixels that show only the object, or only other things."""
-
-    camera: Camera
-    radiance: Float32Array
-    object: BoolArray
-    surroundings: BoolArray
-
-    @classmethod
-    def of(cls, photo: Photo, size: int) -> _View:
-        camera, rgb, mask, hidden = photo.fitted(size)
-        known = known_where(hidden, camera)
-        inside = np.zeros(known.shape, dtype=bool) if mask is None else mask > 0.5
-        outside = known & ~binary_dilation(inside, iterations=2)
-        return cls(camera, decode_srgb(rgb).astype(np.float32), known & binary_erosion(inside), outside)
-
-
-class _Observations(NamedTuple):
-    """Observations of points, sorted by point.
-
-    Attributes:
-        point: Index of the point, (R,).
-        radiance: Linear radiance, at least 1 if a pixel may be clipped, (R, 3).
-        to_camera: Unit vectors towards the camera, (R, 3).
-    """
-
-    point: Int64Array
-    radiance: Float64Array
-    to_camera: Float64Array
-
-    def select(self, points: Int64Array) -> tuple[_Observations, BoolArray]:
-        """Return the observations of sorted ``points``, renumbered, and the mask (R,) of these observations."""
-        rows = np.isin(self.point, points)
-        return _Observations(np.searchsorted(points, self.point[rows]), self.radiance[rows], self.to_camera[rows]), rows
-
-
 class _Fit(NamedTuple):
     """Base colours (P, 3), robust mean errors (P,), and the weights (P,) of the base colours in the data."""
 
     colours: Float64Array
     errors: Float64Array
     weights: Float64Array
-
-
-def require_light_frame(capture: Capture) -> None:
-    """Raise InputError if lights have no place in the frame of a capture."""
-    if capture.units != "metre" or capture.up != "z":
-        raise InputError(
-            "lights need a capture in metres with z up, such as one with a board or tags "
-            f"(got units {capture.units}, up {capture.up})"
-        )
 
 
 def estimate_materials(
@@ -274,11 +158,11 @@ def estimate_materials(
     """
     ensure_variant()
     require_light_frame(capture)
-    views = [_View.of(photo, size) for photo in capture.photos if photo.mask is not None]
-    surfaces = _lit_surfaces(mesh, views, light, floor=0.0 if capture.table else float(mesh.bounds[0, 2]))
+    views = [View.of(photo, size) for photo in capture.photos if photo.mask is not None]
+    surfaces = lit_surfaces(mesh, views, light, floor=0.0 if capture.table else float(mesh.bounds[0, 2]))
     rng = np.random.default_rng(seed)
-    points, normals = _sample_surface(mesh, _POINTS, seed)
-    seen = _observe(surfaces, points, normals, views, "object")
+    points, normals = sample_surface(mesh, _POINTS, seed)
+    seen = observe(surfaces, points, normals, views, "object")
     counts = np.bincount(seen.point, minlength=len(points))
     usable = np.flatnonzero(counts >= _MIN_VIEWS)
     if len(usable) < _CLUSTERS:
@@ -286,7 +170,7 @@ def estimate_materials(
             f"materials need surface points that {_MIN_VIEWS} photos show (got {len(usable)}): check masks and light"
         )
     points, normals, (seen, _) = points[usable], normals[usable], seen.select(usable)
-    clear = _clear_points(mesh, surfaces, points, normals, views, seed)
+    clear = clear_points(mesh, surfaces, points, normals, views, seed)
     fitted = np.sort(rng.permutation(len(points))[:_FIT_POINTS])
     observed, _ = seen.select(fitted)
     traced = _trace(surfaces, points[fitted], normals[fitted], observed, _ROUGHNESS, seed)
@@ -332,7 +216,7 @@ def _clusters(colours: Float64Array, near: Int64Array) -> Int64Array:
     return np.asarray(kmeans2(np.median(encode_srgb(colours)[near], axis=1), _CLUSTERS, minit="++", seed=0)[1])
 
 
-def _captured_loss(seen: _Observations, near: Int64Array) -> float:
+def _captured_loss(seen: Observations, near: Int64Array) -> float:
     """Return the mean error of radiances that are equal in all directions, one for each cluster of points."""
     constant = np.ones_like(seen.radiance), np.zeros_like(seen.radiance)
     radiance = _fit_colours(seen, constant).colours
@@ -342,110 +226,11 @@ def _captured_loss(seen: _Observations, near: Int64Array) -> float:
     return float(loss[near].mean(axis=1).min(axis=1).mean())
 
 
-def _sample_surface(mesh: trimesh.Trimesh, count: int, seed: int) -> tuple[Float64Array, Float64Array]:
-    """Return random points (N, 3) on a mesh and their smooth unit normals (N, 3)."""
-    points, faces = trimesh.sample.sample_surface(mesh, count, seed=seed)
-    points = np.asarray(points)
-    barycentric = np.nan_to_num(trimesh.triangles.points_to_barycentric(mesh.triangles[faces], points), nan=1 / 3)
-    normals = np.einsum("nk,nkd->nd", barycentric, corner_normals(mesh)[faces])
-    return points, normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-
-
-def _lit_surfaces(mesh: trimesh.Trimesh, views: Sequence[_View], light: CaptureLight, floor: float) -> LitMesh:
-    """Return the object and its support, a plane at height ``floor``, with their radiance in the photos."""
-    fine = trimesh.Trimesh(mesh.vertices, mesh.faces).subdivide_to_size(float(mesh.scale) / 25, max_iter=20)
-    # The grid is finer below the object, where its shadow ends.
-    centre, line = mesh.bounds.mean(axis=0), np.linspace(-1, 1, _GRID)
-    line = (0.1 * line + 0.9 * line**3) * _REACH * float(mesh.scale)
-    x, y = np.meshgrid(line + centre[0], line + centre[1])
-    plane = np.stack([x.ravel(), y.ravel(), np.full(x.size, floor)], axis=1)
-    corner = np.arange(_GRID * (_GRID - 1)).reshape(-1, _GRID)[:, :-1].ravel()
-    faces = np.concatenate(
-        [
-            np.stack([corner, corner + 1, corner + _GRID + 1], axis=1),
-            np.stack([corner, corner + _GRID + 1, corner + _GRID], axis=1),
-        ]
-    )
-    whole = trimesh.Trimesh(
-        np.concatenate([fine.vertices, plane]), np.concatenate([fine.faces, faces + len(fine.vertices)]), process=False
-    )
-    surfaces = LitMesh(whole, len(fine.faces), light.scene(), centre.tolist())
-    upward = np.tile([0.0, 0.0, 1.0], (len(plane), 1))
-    normals = np.asarray(fine.vertex_normals)
-    radiance = [
-        _linear_radiance(points, _observe(surfaces, points, towards, views, shown))
-        for points, towards, shown in ((fine.vertices, normals, "object"), (plane, upward, "surroundings"))
-    ]
-    surfaces.set_radiance(np.concatenate(radiance))
-    return surfaces
-
-
-def _linear_radiance(points: Float64Array, seen: _Observations) -> Float64Array:
-    """Fit the radiance of points (N, 3) towards a unit vector d, as coefficients (N, 4, 3) of 1 and d.
-
-    Points without observations get the coefficients of the nearest observed point.
-    """
-    known, starts = np.unique(seen.point, return_index=True)
-    if not len(known):
-        return np.zeros((len(points), 4, 3))
-    basis = np.insert(seen.to_camera, 0, 1.0, axis=1)[:, :, None]
-    left = np.add.reduceat(basis * basis.swapaxes(1, 2), starts) + np.diag([0, *[_SLOPE_WEIGHT] * 3])
-    found = np.linalg.solve(left, np.add.reduceat(basis * seen.radiance[:, None], starts))
-    return np.asarray(found[KDTree(points[known]).query(points)[1]])
-
-
-def _observe(
-    surfaces: LitMesh, points: Float64Array, normals: Float64Array, views: Sequence[_View], shown: str
-) -> _Observations:
-    """Return the observations of points (N, 3) in the pixels that show ``object`` or ``surroundings``."""
-    found = []
-    for view in views:
-        to_camera = view.camera.centre - points
-        to_camera /= np.linalg.norm(to_camera, axis=1, keepdims=True)
-        pixels, _ = view.camera.project(points)
-        inside = ((pixels >= 1) & (pixels <= (view.camera.width - 1, view.camera.height - 1))).all(axis=1)
-        rows = np.flatnonzero(inside & (np.einsum("nd,nd->n", normals, to_camera) > _MIN_COSINE))
-        whole = cv2.erode(getattr(view, shown).astype(np.uint8), np.ones((2, 2), np.uint8), anchor=(0, 0))
-        column, line = np.floor(pixels[rows] - 0.5).astype(int).T
-        rows = rows[whole[line, column] > 0]
-        rows = rows[surfaces.unoccluded(points[rows], normals[rows], view.camera.centre)] if len(rows) else rows
-        if not len(rows):
-            continue
-        x, y = (pixels[rows].T[..., None] - 0.5).astype(np.float32)
-        radiance = np.asarray(cv2.remap(view.radiance, x, y, cv2.INTER_LINEAR))[:, 0]
-        bright = cv2.dilate((view.radiance >= _CLIPPED).astype(np.float32), np.ones((3, 3)))
-        clipped = np.asarray(cv2.remap(np.asarray(bright), x, y, cv2.INTER_NEAREST))[:, 0] > 0
-        found.append((rows, np.where(clipped, np.maximum(radiance, 1), radiance), to_camera[rows]))
-    if not found:
-        return _Observations(np.zeros(0, dtype=np.int64), np.zeros((0, 3)), np.zeros((0, 3)))
-    point, radiance, to_camera = (np.concatenate(parts) for parts in zip(*found, strict=True))
-    order = np.argsort(point, kind="stable")
-    return _Observations(point[order], radiance[order].astype(np.float64), to_camera[order])
-
-
-def _clear_points(
-    mesh: trimesh.Trimesh,
-    surfaces: LitMesh,
-    points: Float64Array,
-    normals: Float64Array,
-    views: Sequence[_View],
-    seed: int,
-) -> BoolArray:
-    """Return True for points (N,) that mirror little of the object itself, and that are flat within two pixels."""
-    camera = views[0].camera
-    pixel = float(np.linalg.norm(camera.centre - mesh.bounds.mean(axis=0))) / camera.fx
-    others, their_normals = _sample_surface(mesh, 10 * len(points), seed + 1)
-    near = KDTree(others).query_ball_point(points, 2 * pixel)
-    flatness = np.array([normals[i] @ their_normals[rows].mean(axis=0) if rows else 1 for i, rows in enumerate(near)])
-    clear = (flatness > _MIN_FLATNESS) & (surfaces.openness(points, normals) > _MIN_OPENNESS)
-    return np.asarray(clear)
-
-
 def _trace(
     surfaces: LitMesh,
     points: Float64Array,
     normals: Float64Array,
-    seen: _Observations,
+    seen: Observations,
     roughness: Float64Array,
     seed: int,
 ) -> Reflectance:
@@ -466,7 +251,7 @@ def _mix(traced: Reflectance, metallic: float, place: float) -> tuple[Float64Arr
 
 
 def _fit_colours(
-    seen: _Observations, material: tuple[Float64Array, Float64Array], colour: Float64Array | None = None
+    seen: Observations, material: tuple[Float64Array, Float64Array], colour: Float64Array | None = None
 ) -> _Fit:
     """Fit the base colour of every point by iteratively reweighted least squares with Cauchy's loss.
 
@@ -475,7 +260,7 @@ def _fit_colours(
     tint, white = material
     starts = np.flatnonzero(np.diff(seen.point, prepend=-1))
     counts = np.diff(starts, append=len(seen.point))
-    clipped = seen.radiance >= _CLIPPED
+    clipped = seen.radiance >= CLIPPED
     precision = 1 / (_NOISE[0] * seen.radiance + _NOISE[1]) ** 2
     weight = precision * ~clipped
     for _ in range(_ROUNDS if colour is None else 1):
@@ -525,7 +310,7 @@ def _merge(cluster: Int64Array, errors: Float64Array, clear: BoolArray) -> Int64
     return found
 
 
-def _region(rows: Int64Array, errors: Float64Array, seen: _Observations, traced: Reflectance) -> Region:
+def _region(rows: Int64Array, errors: Float64Array, seen: Observations, traced: Reflectance) -> Region:
     """Return the material of the points ``rows``."""
     table = errors[rows].mean(axis=0)
     start = np.unravel_index(table.argmin(), table.shape)

@@ -25,11 +25,8 @@ from mitsplat.pages.html import REPORT_FILE
 from mitsplat.progress import Progress
 from mitsplat.reconstruct.asset_evaluation import VERDICT_FILE, Verdict
 from mitsplat.reconstruct.asset_report import write_asset_report
-from mitsplat.reconstruct.materials.estimation import (
-    CaptureLight,
-    estimate_materials,
-    require_light_frame,
-)
+from mitsplat.reconstruct.materials.capture_light import CaptureLight, require_light_frame
+from mitsplat.reconstruct.materials.estimation import estimate_materials
 from mitsplat.reconstruct.reconstruct import AssetJob, Reconstruction, reconstruct_asset
 from mitsplat.storage.content_hash import ContentHash, file_hash
 from mitsplat.storage.files import write_text

@@ -85,6 +85,13 @@ Size = Annotated[
         help="Longest edge of the smallest upright box around the object [m]; only for captures without a scale."
     ),
 ]
+Lights = Annotated[
+    Path | None,
+    typer.Option(
+        help="Lights of the photos in the frame of the capture, a file by `mitsplat lights`: the materials of the "
+        "object are estimated."
+    ),
+]
 Budget = Annotated[
     str | None,
     typer.Option(
@@ -299,6 +306,7 @@ def mesh(
         ),
     ] = False,
     remove: Remove = None,
+    lights: Lights = None,
     device: DeviceName = "cpu",
 ) -> None:
     """Make an asset from SPLATS that were fitted to CAPTURE.
@@ -309,6 +317,7 @@ def mesh(
     """
     from mitsplat.asset import read_mesh
     from mitsplat.capture.capture import Capture
+    from mitsplat.reconstruct.materials.capture_light import CaptureLight
     from mitsplat.reconstruct.pipeline.asset_pipeline import make_asset
     from mitsplat.reconstruct.reconstruct import AssetJob, ImportedMesh, ReconstructSettings
     from mitsplat.reconstruct.registration import invert_transform
@@ -329,6 +338,7 @@ def mesh(
         settings=ReconstructSettings(surface=surface, size=size, refine=MeshRefineSettings() if refine else None),
         imported=imported,
         remove=tuple(remove or ()),
+        light=None if lights is None else CaptureLight.load(lights),
     )
     select_device(device)
     with stage_bar("steps/s") as progress:
@@ -355,13 +365,7 @@ def asset(
     remove: Remove = None,
     metallic: Metallic = None,
     roughness: Roughness = None,
-    lights: Annotated[
-        Path | None,
-        typer.Option(
-            help="Lights of the photos in the frame of the capture, a file by `mitsplat lights`: the materials of the "
-            "object are estimated."
-        ),
-    ] = None,
+    lights: Lights = None,
     device: DeviceName = "cpu",
 ) -> None:
     """Make an asset from PHOTOS.

@@ -181,12 +181,16 @@ def test_asset_passes_every_option_on(
     assert calls.kwargs["fit"] == FitSettings(gaussians=gaussians, budget=90.0)
 
 
-def test_asset_reads_the_lights_of_the_photos(
+def test_asset_and_mesh_read_the_lights_of_the_photos(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     calls, lights = Calls(finished(tmp_path)), tmp_path / "lamps.yaml"
     monkeypatch.setattr(pipeline, "asset_from_photos", calls)
+    monkeypatch.setattr(pipeline, "make_asset", calls)
+    monkeypatch.setattr(Capture, "load", lambda folder: folder)
     lights.write_text("lights: [{kind: environment, radiance: 2}]")
+    assert run("mesh", "capture", "fit", "-o", tmp_path / "mug", "--lights", lights) == 0
+    assert [light.radiance for light in calls.args[3].light.lights] == [2]
     assert run("asset", "photos", "-o", tmp_path / "mug", "--lights", lights) == 0
     assert [light.radiance for light in calls.args[2].light.lights] == [2]
     assert run("asset", "photos", "-o", tmp_path / "mug", "--lights", lights, "--metallic", 1) == 2

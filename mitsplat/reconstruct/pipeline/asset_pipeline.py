@@ -175,7 +175,8 @@ def _with_estimated_materials(
         result = replace(result, asset=replace(asset, splats=found.apply(asset.splats)))
     else:
         rows["Materials"] = (
-            f"not used, and the captured colours are kept: {reason}; check whether the lights are those of the photos"
+            f"not used, and the captured colours are kept: {reason}; check whether the lights are those of the photos "
+            "and the mesh is smooth, or import a CAD mesh"
         )
     return replace(result, verdict=replace(result.verdict, rows={**result.verdict.rows, **rows}))
 

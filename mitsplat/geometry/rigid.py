@@ -38,13 +38,13 @@ def rigid_matrix(pose: npt.ArrayLike, frames: str, *, tolerance: float = RIGID) 
     if np.abs(rotation @ rotation.T - np.eye(3)).max() <= tolerance and not mirrored:
         return matrix
     got = f"axes{' of a left-handed frame' if mirrored else ''} of lengths {', '.join(f'{n:.6g}' for n in lengths)}"
+    cosines = np.abs((rotation.T @ rotation / np.maximum(np.outer(lengths, lengths), 1e-12))[np.triu_indices(3, 1)])
     if mirrored:
         cause = "is one axis inverted, or are two exchanged?"
-    elif np.ptp(lengths) < RIGID * lengths.max() and abs(lengths[0] - 1) > tolerance:
+    elif cosines.max() <= tolerance:
         cause = "is a scale, such as metres per millimetre, part of the matrix?"
     else:
-        cosines = np.abs((rotation.T @ rotation / np.outer(lengths, lengths))[np.triu_indices(3, 1)])
-        got += f" with angles of {np.degrees(np.arccos(np.clip(cosines.max(), 0, 1))):.4g} degrees between them"
+        got += f" with an angle of {np.degrees(np.arccos(min(1.0, cosines.max()))):.4g} degrees between two of them"
         cause = "are its entries rounded, or rows and columns mixed up?"
     raise ValueError(f"must be a rotation and a translation, without scale or mirror (got {got}); {cause}")
 

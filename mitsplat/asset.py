@@ -90,6 +90,15 @@ class AssetSpec(BaseModel):
     density: Positive | None = Field(None, description="[kg/m^3]; 1000 if neither this nor mass is given.")
     mass: Positive | None = Field(None, description="[kg], instead of density.")
     friction: float = Field(0.5, ge=0, description="Coulomb friction coefficient.")
+    restitution: float = Field(
+        0.0, ge=0, le=1, exclude_if=lambda share: share == 0, description="Coefficient of restitution."
+    )
+    rolling_friction: float | None = Field(
+        None, ge=0, description="Length of rolling friction [m]; 0.0005, at most 1 % of the size, if absent."
+    )
+    torsional_friction: float | None = Field(
+        None, ge=0, description="Contact radius of spin friction [m]; 0.01, at most a fifth of the size, if absent."
+    )
     roughness: float = Field(0.4, gt=0, le=1, description="GGX roughness of captured splats; not used with materials.")
     specular: float = Field(
         0.04,
@@ -130,6 +139,9 @@ class Asset:
         density: Mass density [kg/m^3]; ignored if ``mass`` is given.
         mass: Mass [kg] or None.
         friction: Coulomb friction coefficient.
+        restitution: Coefficient of restitution in [0, 1].
+        rolling_friction: Length of rolling friction [m], or None: derived from the size.
+        torsional_friction: Contact radius of spin friction [m], or None: derived from the size.
         roughness: GGX roughness of captured splats in (0, 1]; not used with materials.
         specular: Specular reflectance of captured splats at normal incidence in [0, 1]; not used with materials.
         capture_light: Light under which the colours were captured. ``uniform`` (light tent, turntable in the shade):
@@ -151,6 +163,9 @@ class Asset:
     density: float = 1000.0
     mass: float | None = None
     friction: float = 0.5
+    restitution: float = 0.0
+    rolling_friction: float | None = None
+    torsional_friction: float | None = None
     roughness: float = 0.4
     specular: float = 0.04
     capture_light: Literal["uniform", "scene"] = "uniform"
@@ -186,6 +201,9 @@ class Asset:
             density=1000.0 if spec.density is None else spec.density,
             mass=spec.mass,
             friction=spec.friction,
+            restitution=spec.restitution,
+            rolling_friction=spec.rolling_friction,
+            torsional_friction=spec.torsional_friction,
             roughness=spec.roughness,
             specular=spec.specular,
             capture_light=spec.capture_light,
@@ -228,6 +246,9 @@ class Asset:
                 density=self.density if self.mass is None else None,
                 mass=self.mass,
                 friction=self.friction,
+                restitution=self.restitution,
+                rolling_friction=self.rolling_friction,
+                torsional_friction=self.torsional_friction,
                 roughness=self.roughness,
                 specular=self.specular,
                 capture_light=self.capture_light,

@@ -109,10 +109,13 @@ class TestRoundTrip:
             np.testing.assert_allclose(found.normals, np.stack([x, -z, y], axis=1), atol=1e-6)
 
     def test_saved_assets_keep_their_properties(self, asset, tmp_path):
-        for given_asset in (asset, replace(asset, kind="environment", mesh=None, pieces=()), replace(asset, mass=0.3)):
+        contact = {"restitution": 0.6, "rolling_friction": 1e-5, "torsional_friction": 0.0}
+        environment = replace(asset, kind="environment", mesh=None, pieces=())
+        for given_asset in (asset, environment, replace(asset, mass=0.3), replace(asset, **contact)):
             given_asset.save(tmp_path / "a")
             loaded = Asset.load(tmp_path / "a")
-            for name in ("name", "class_name", "kind", "mass", "friction", "roughness", "specular", "capture_light"):
+            properties = ("name", "class_name", "kind", "mass", "friction", "roughness", "specular", "capture_light")
+            for name in (*properties, *contact):
                 assert getattr(loaded, name) == getattr(given_asset, name)
             assert loaded.mass is not None or loaded.density == given_asset.density
             assert loaded.folder == tmp_path / "a"

@@ -13,7 +13,7 @@ from newton.solvers import SolverMuJoCo
 from benchmarks.record import figure
 from mitsplat.arrays import Float64Array
 from mitsplat.physics import worlds as physics
-from mitsplat.physics.friction import PairFrictionSolver
+from mitsplat.physics.friction import PairContactSolver
 from mitsplat.physics.rest import run_to_rest
 from mitsplat.physics.worlds import Body, Collider, World
 
@@ -66,7 +66,7 @@ class Batch:
         SolverMuJoCo.register_custom_attributes(builder)
         builder.replicate(one, len(starts))
         model = builder.finalize(device=device)
-        self._solver = PairFrictionSolver(
+        self._solver = PairContactSolver(
             model, nconmax=contacts, njmax=6 * contacts, use_mujoco_contacts=False, **physics._SOLVER_OPTIONS
         )
         self._solver.mjw_model.opt.warn_overflow = 0
@@ -130,7 +130,7 @@ def has_rested(
             raise NotImplementedError
 
         def _set_velocities(self, velocities: Float64Array) -> None:
-            raise NotImplementedError
+            pass
 
         def _advance(self) -> None:
             self._frame = next(self._frames)

@@ -19,6 +19,7 @@ from mitsplat.geometry.decomposition import MAX_PIECES, convex_pieces, max_gap
 from mitsplat.geometry.mesh import mass_properties, prepare_mesh
 from mitsplat.geometry.mesh_distance import Clearance, DistanceSurface, PlacedSurface, all_clearances, standoff
 from mitsplat.physics.contacts import ContactFinder
+from mitsplat.physics.friction import ContactMaterial
 from mitsplat.physics.placement import Item, draw_poses
 from mitsplat.physics.rest import CONTACT_OVERFLOW, RestOutcome, run_to_rest
 from mitsplat.physics.worlds import Body, Collider, MujocoWorld, WarpWorld, World, all_pieces
@@ -26,6 +27,7 @@ from mitsplat.progress import Note
 from mitsplat.scene.layout import NO_PHYSICS, Instance, Layout, LeftOut, RestCertificate, UnsettledLayoutError
 from mitsplat.scene.planning.contents import draw_objects, draw_regions
 from mitsplat.scene.scene import Scene
+from mitsplat.scene.spec.shape_spec import Shape
 from mitsplat.scene.splits import draw_environment
 from mitsplat.scene.streams import random_stream
 from mitsplat.scene.walls import ENCLOSURE, PILE_HEIGHT, bin_walls, enclosed_bounds, pose_matrix, walls_beside
@@ -330,7 +332,7 @@ class Drop:
                     if standoff_distance <= limit:
                         break
             mass = mass_properties(mesh, pieces, density=asset.density, mass=asset.mass)
-            self._parts[id(asset.mesh)] = _Part(Body(pieces, mass, asset.friction), surface, standoff_distance)
+            self._parts[id(asset.mesh)] = _Part(Body(pieces, mass, _material(asset)), surface, standoff_distance)
         return self._parts[id(asset.mesh)]
 
     def _make_ground(self, surroundings: Asset | None, progress: Note) -> _Ground:
@@ -345,17 +347,17 @@ class Drop:
                 walls.append(len(colliders))
             mesh = prepare_mesh(shape_mesh, f"shape {shape.name!r}")
             if shape.bin is not None:
-                collider = Collider(shape.friction, pieces=bin_walls(shape.bin))
+                collider = Collider(_material(shape), pieces=bin_walls(shape.bin))
             elif shape.box is None:
-                collider = Collider(shape.friction, pieces=_pieces(mesh, shape.name, progress))
+                collider = Collider(_material(shape), pieces=_pieces(mesh, shape.name, progress))
             else:
-                collider = Collider(shape.friction, box=(shape.box.size, pose_matrix(shape.box)))
+                collider = Collider(_material(shape), box=(shape.box.size, pose_matrix(shape.box)))
             colliders.append(collider)
             obstacles.append(PlacedSurface(shape.name, DistanceSurface(mesh)))
         if surroundings is not None and surroundings.mesh is not None:
             mesh = prepare_mesh(surroundings.mesh, f"asset {surroundings.name!r}", solid=False)
             pieces = surroundings.pieces or _pieces(mesh, surroundings.name, progress)
-            colliders.append(Collider(surroundings.friction, pieces=pieces))
+            colliders.append(Collider(_material(surroundings), pieces=pieces))
             obstacles.append(PlacedSurface(surroundings.name, DistanceSurface(mesh)))
         if not colliders:
             raise InputError(f"{scene.path}: at least one shape must be a collider, on which objects rest (got none)")
@@ -483,6 +485,10 @@ class Drop:
             Instance(one.id, one.asset, self.scene.class_index(one.asset), pose)
             for one, pose in zip(drawn, poses, strict=True)
         )
+
+
+def _material(surface: Asset | Shape) -> ContactMaterial:
+    return ContactMaterial(surface.friction, surface.restitution, surface.rolling_friction, surface.torsional_friction)
 
 
 def _support_gaps(resting: Sequence[PlacedSurface], clearances: Sequence[Clearance]) -> dict[PlacedSurface, float]:

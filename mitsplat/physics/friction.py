@@ -1,4 +1,4 @@
-"""Friction of a pair of surfaces from the friction of each, for MuJoCo on Warp and in C.
+"""Contact materials, and the friction of a pair of surfaces from that of each, for MuJoCo on Warp and in C.
 
 Sliding
     The geometric mean of the two coefficients, as in Box2D (``b2MixFriction``) and Jolt (``DefaultCombineFriction``).
@@ -9,12 +9,15 @@ Spin, about the contact's normal
 Rolling
     A length [m], the larger of the two. It does not depend on sliding friction, because deformation causes it.
 
+:mod:`mitsplat.physics.restitution` states the rule of rebounds.
+
 MuJoCo's ``geom_friction`` holds these values of each geom: coefficient, contact radius, rolling length.
 """
 
 from __future__ import annotations
 
 import warnings
+from dataclasses import dataclass
 from typing import Any, no_type_check
 
 import newton
@@ -23,11 +26,58 @@ import warp as wp
 from newton.solvers import SolverMuJoCo
 
 from mitsplat.arrays import Float64Array
+from mitsplat.physics.restitution import MIN_IMPACT_SPEED, SIMULTANEOUS, rebound_speed_on_warp
 
+GRAVITY = 9.81
+"""[m/s^2]"""
 MIN_FRICTION = 2e-5
 """Minimum friction. MuJoCo divides by the friction, and smaller values are unstable."""
 
+IMPACT_IMPEDANCE = 0.9999
+"""Impedance of impacts: the largest of MuJoCo, so that a contact reaches its reference acceleration."""
+# Contact radius and rolling-friction length of materials that state none [m], limited to these shares of the size, so
+# that round parts stop and thin parts do not stand on their rim.
+_CONTACT_RADIUS, _ROLLING = (0.01, 0.2), (5e-4, 0.01)
+
 _vec5 = wp.types.vector(length=5, dtype=wp.float32)
+
+
+@dataclass(frozen=True)
+class ContactMaterial:
+    """Contact properties of a surface.
+
+    Attributes:
+        friction: Coulomb friction coefficient.
+        restitution: Coefficient of restitution.
+        rolling_friction: Length of rolling friction [m], or None: 0.5 mm, at most 1 % of a body's size.
+        torsional_friction: Contact radius of spin friction [m], or None: 10 mm, at most a fifth of a body's size.
+    """
+
+    friction: float = 0.5
+    restitution: float = 0.0
+    rolling_friction: float | None = None
+    torsional_friction: float | None = None
+
+    def shape_config(self, stiffness: float, damping: float, *, size: float) -> newton.ModelBuilder.ShapeConfig:
+        """Return Newton's description of a shape.
+
+        Args:
+            stiffness: Stiffness of contacts per unit of mass [1/s^2].
+            damping: Damping of contacts per unit of mass [1/s].
+            size: Size of the body [m]; 0 for static shapes, so that bodies determine lengths that are None.
+        """
+        rolling, radius = self.rolling_friction, self.torsional_friction
+        return newton.ModelBuilder.ShapeConfig(
+            density=0.0,
+            ke=stiffness,
+            kd=damping,
+            mu=self.friction,
+            mu_torsional=min(_CONTACT_RADIUS[0], _CONTACT_RADIUS[1] * size) if radius is None else radius,
+            mu_rolling=min(_ROLLING[0], _ROLLING[1] * size) if rolling is None else rolling,
+            restitution=self.restitution,
+            margin=0.0,
+            gap=0.0,
+        )
 
 
 def pair_friction(first: Float64Array, second: Float64Array) -> Float64Array:
@@ -37,22 +87,54 @@ def pair_friction(first: Float64Array, second: Float64Array) -> Float64Array:
     return np.asarray(np.maximum(np.stack([slide, slide, slide * spin, roll, roll], axis=1), MIN_FRICTION))
 
 
-class PairFrictionSolver(SolverMuJoCo):
-    """MuJoCo solver on Warp with Newton's contacts and the friction of :func:`pair_friction`."""
+class PairContactSolver(SolverMuJoCo):
+    """MuJoCo solver on Warp with Newton's contacts, :func:`pair_friction` and restitution."""
 
     def __init__(self, model: newton.Model, **options: Any) -> None:
         with warnings.catch_warnings():
             # The friction of a geom is one factor of a pair's friction, which is at least MIN_FRICTION.
             warnings.filterwarnings("ignore", message=r"geom \d+: friction.* < MJ_MINMU")
             super().__init__(model, **options)
+        self._rebounds = bool(self.geom_restitution().any()) and not self.use_mujoco_cpu
+        if self._rebounds:
+            nbody = self.mjw_model.nbody
+            self._longest: Any = wp.zeros((self.mjw_data.nworld, nbody * nbody), dtype=wp.float32, device=model.device)
+            self._approach = wp.zeros(self.mjw_data.naconmax, dtype=wp.float32, device=model.device)
+
+    def geom_restitution(self) -> Float64Array:
+        """Return the coefficients of restitution of MuJoCo's geoms in one world."""
+        shapes: Any = self.mjc_geom_to_newton_shape  # every finished model has these arrays
+        restitution: Any = self.model.shape_material_restitution
+        return np.asarray(restitution.numpy()[shapes.numpy()[0]], dtype=np.float64)
 
     def _convert_contacts_to_mjwarp(self, model: newton.Model, state_in: newton.State, contacts: Any) -> None:
         super()._convert_contacts_to_mjwarp(model, state_in, contacts)
         found = self.mjw_data.contact
+        geoms = [self.mjw_data.nacon, found.geom, found.worldid]
         wp.launch(
             _mix_friction,
             dim=self.mjw_data.naconmax,
-            inputs=[self.mjw_data.nacon, found.geom, found.worldid, self.mjw_model.geom_friction, found.friction],
+            inputs=[*geoms, self.mjw_model.geom_friction, found.friction],
+            device=model.device,
+        )
+        if not self._rebounds:
+            return
+        model_bodies = [self.mjw_model.geom_bodyid, self.mjw_model.nbody]
+        bodies = [model.shape_body, state_in.body_q, state_in.body_qd, model.body_com]
+        shapes = [self.mjc_geom_to_newton_shape, model.shape_material_restitution]
+        impacts = [self._approach, self._longest]
+        self._longest.fill_(0.0)
+        wp.launch(
+            _find_impacts,
+            dim=self.mjw_data.naconmax,
+            inputs=[*geoms, *model_bodies, *shapes, *bodies, found.pos, found.frame, found.dist, *impacts],
+            device=model.device,
+        )
+        contact = [found.frame, found.dist, found.solref, found.solreffriction, found.solimp]
+        wp.launch(
+            _rebound,
+            dim=self.mjw_data.naconmax,
+            inputs=[*geoms, *model_bodies, *shapes, *impacts, self.mjw_model.opt.timestep, *contact],
             device=model.device,
         )
 
@@ -77,3 +159,103 @@ def _mix_friction(
     roll = wp.max(MIN_FRICTION, wp.max(first[2], second[2]))
     slide = wp.max(MIN_FRICTION, slide)
     friction[contact] = _vec5(slide, slide, spin, roll, roll)
+
+
+@wp.kernel(enable_backward=False, module="unique")
+@no_type_check
+def _find_impacts(
+    count: wp.array[wp.int32],
+    geoms: wp.array[wp.vec2i],
+    worlds: wp.array[wp.int32],
+    geom_body: wp.array[wp.int32],
+    nbody: int,
+    geom_shape: wp.array2d[wp.int32],
+    restitution: wp.array[wp.float32],
+    shape_body: wp.array[wp.int32],
+    body_q: wp.array[wp.transform],
+    body_qd: wp.array[wp.spatial_vector],
+    body_com: wp.array[wp.vec3],
+    pos: wp.array[wp.vec3],
+    frame: wp.array[wp.mat33],
+    dist: wp.array[wp.float32],
+    approach: wp.array[wp.float32],
+    longest: wp.array2d[wp.float32],
+):
+    """Compute the approach speed of each impact, else 0, and the longest time of each pair below the surface."""
+    contact = wp.tid()
+    if contact >= count[0]:
+        return
+    pair, world = geoms[contact], worlds[contact]
+    first, second = geom_shape[world, pair[0]], geom_shape[world, pair[1]]
+    speed = wp.dot(
+        frame[contact][0],
+        _point_velocity(shape_body[first], pos[contact], body_q, body_qd, body_com)
+        - _point_velocity(shape_body[second], pos[contact], body_q, body_qd, body_com),
+    )
+    approach[contact] = 0.0
+    if restitution[first] * restitution[second] > 0.0 and speed > MIN_IMPACT_SPEED:
+        approach[contact] = speed
+        place = _pair_index(geom_body[pair[0]], geom_body[pair[1]], nbody)
+        wp.atomic_max(longest, world, place, wp.max(0.0, -dist[contact]) / speed)
+
+
+@wp.kernel(enable_backward=False, module="unique")
+@no_type_check
+def _rebound(
+    count: wp.array[wp.int32],
+    geoms: wp.array[wp.vec2i],
+    worlds: wp.array[wp.int32],
+    geom_body: wp.array[wp.int32],
+    nbody: int,
+    geom_shape: wp.array2d[wp.int32],
+    restitution: wp.array[wp.float32],
+    approach: wp.array[wp.float32],
+    longest: wp.array2d[wp.float32],
+    timestep: wp.array[wp.float32],
+    frame: wp.array[wp.mat33],
+    dist: wp.array[wp.float32],
+    solref: wp.array[wp.vec2],
+    solreffriction: wp.array[wp.vec2],
+    solimp: wp.array[_vec5],
+):
+    """Give impacts the reference acceleration of :func:`mitsplat.physics.restitution.rebound_speed`, as damping."""
+    contact = wp.tid()
+    if contact >= count[0]:
+        return
+    speed = approach[contact]
+    if speed == 0.0:
+        return
+    pair, world = geoms[contact], worlds[contact]
+    depth = wp.max(0.0, -dist[contact])
+    place = _pair_index(geom_body[pair[0]], geom_body[pair[1]], nbody)
+    if depth / speed < longest[world, place] - SIMULTANEOUS:
+        dist[contact] = 1.0  # no force in this step
+        return
+    e = wp.sqrt(restitution[geom_shape[world, pair[0]]] * restitution[geom_shape[world, pair[1]]])
+    rebound = rebound_speed_on_warp(e, speed, depth, GRAVITY * wp.abs(frame[contact][0][2]), timestep[0])
+    solreffriction[contact] = solref[contact]  # sliding does not rebound
+    solref[contact] = wp.vec2(0.0, -(speed + rebound) / (speed * timestep[0]))
+    solimp[contact] = _vec5(IMPACT_IMPEDANCE, IMPACT_IMPEDANCE, 1.0e-3, 0.5, 2.0)
+
+
+@wp.func
+@no_type_check
+def _pair_index(first: int, second: int, nbody: int):
+    """Return the index of an unordered pair of bodies."""
+    return wp.min(first, second) * nbody + wp.max(first, second)
+
+
+@wp.func
+@no_type_check
+def _point_velocity(
+    body: int,
+    point: wp.vec3,
+    body_q: wp.array[wp.transform],
+    body_qd: wp.array[wp.spatial_vector],
+    body_com: wp.array[wp.vec3],
+):
+    """Return the velocity of a point of a body; Newton stores that of its centre of mass, then its spin."""
+    if body < 0:
+        return wp.vec3(0.0)
+    arm = point - wp.transform_point(body_q[body], body_com[body])
+    return wp.spatial_top(body_qd[body]) + wp.cross(wp.spatial_bottom(body_qd[body]), arm)

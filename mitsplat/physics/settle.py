@@ -29,7 +29,7 @@ from mitsplat.storage.content_hash import ContentHash
 
 PACKAGE = Path(__file__).parents[1]
 
-_PHYSICS_MODULES = ("contacts", "drop", "friction", "placement", "rest", "worlds")
+_PHYSICS_MODULES = ("contacts", "drop", "friction", "placement", "rest", "restitution", "worlds")
 MODULES = (
     "geometry.decomposition",
     "geometry.mesh",
@@ -196,7 +196,8 @@ def _scene_hash(scene: Scene) -> str:
     if spec.regions:
         add(spec.regions)
     for asset in (*scene.assets, *surroundings):
-        add(asset.name, asset.class_name, asset.density, asset.mass, asset.friction)
+        add(asset.name, asset.class_name, asset.density, asset.mass)
+        add(asset.friction, asset.restitution, asset.rolling_friction, asset.torsional_friction)
         for mesh in (asset.mesh, *asset.pieces):
             add_mesh(mesh)
     return digest.hexdigest()

@@ -22,16 +22,21 @@ from scipy.spatial.transform import Rotation
 from mitsplat.arrays import Float64Array
 from mitsplat.geometry.mesh import MassProperties, join_meshes
 from mitsplat.physics.contacts import ContactFinder, newton_hull
-from mitsplat.physics.friction import PairFrictionSolver, pair_friction
+from mitsplat.physics.friction import (
+    GRAVITY,
+    IMPACT_IMPEDANCE,
+    ContactMaterial,
+    PairContactSolver,
+    pair_friction,
+)
+from mitsplat.physics.restitution import MIN_IMPACT_SPEED, SIMULTANEOUS, rebound_speed
 
-_GRAVITY = (0.0, 0.0, -9.81)
-# Contact of damping 2/t and stiffness 1/(t z)^2, as in MuJoCo. At a damping ratio z of 1, a body rebounds from a drop
-# of 0.3 m by 5 mm, because contact cannot pull. From 1.5 on it does not leave the table. At 2 it penetrates deeper
-# without benefit.
+_GRAVITY = (0.0, 0.0, -GRAVITY)
+# Contact of damping 2/t and stiffness 1/(t z)^2, as in MuJoCo, for all contacts that are no impacts (see
+# :mod:`mitsplat.physics.restitution`). At a damping ratio z of 1, a body would rebound from a drop of 0.3 m by 5 mm,
+# because contact cannot pull. From 1.5 on it does not leave the table. At 2 it penetrates deeper without benefit.
 _CONTACT_TIME, _DAMPING_RATIO = 0.004, 1.5
-# Contact radius and rolling-friction length [m], limited to these shares of the size, so that round parts stop and thin
-# parts do not stand on their rim. See :mod:`mitsplat.physics.friction`.
-_CONTACT_RADIUS, _ROLLING = (0.01, 0.2), (5e-4, 0.01)
+_DAMPED = 1 / (_CONTACT_TIME * _DAMPING_RATIO) ** 2, 2 / _CONTACT_TIME
 _WITH_ROLL, _WITHOUT_ROLL = 6, 4  # contact dimensions: normal, two sliding, spin, and two rolling
 # Impedance of contacts at the surface and 1 mm deep: at MuJoCo's default of 0.9, a nut under a plate of a hundred times
 # its mass sinks by 1 mm. MuJoCo's own contacts flicker, and come to rest less often when stiffer.
@@ -71,7 +76,7 @@ class Body:
 
     pieces: tuple[trimesh.Trimesh, ...]
     mass: MassProperties
-    friction: float
+    material: ContactMaterial
 
     @cached_property
     def outline(self) -> Float64Array:
@@ -93,7 +98,7 @@ class Body:
 class Collider:
     """Static collider: convex pieces in world space, or a box by its full ``size`` [m] and pose (4, 4)."""
 
-    friction: float
+    material: ContactMaterial
     pieces: tuple[trimesh.Trimesh, ...] = ()
     box: tuple[tuple[float, float, float], Float64Array] | None = None
 
@@ -204,7 +209,7 @@ class WarpWorld(World):
         self._timestep = timestep
         model = _build_model(bodies, colliders, _IMPEDANCE_WARP, True)
         contacts = max(8, int(capacity * max_contacts(len(bodies), model.shape_count)))
-        self._solver = PairFrictionSolver(
+        self._solver = PairContactSolver(
             model, nconmax=contacts, njmax=6 * contacts, use_mujoco_contacts=False, **_SOLVER_OPTIONS
         )
         # Overflow is read from flags, because the kernels would print it at every step.
@@ -262,13 +267,14 @@ class MujocoWorld(World):
 
     def __init__(self, bodies: Sequence[Body], colliders: Sequence[Collider], *, timestep: float) -> None:
         super().__init__(bodies, timestep=timestep)
-        solver = PairFrictionSolver(
+        solver = PairContactSolver(
             _build_model(bodies, colliders, _IMPEDANCE_MUJOCO, False),
             use_mujoco_cpu=True,
             **_SOLVER_OPTIONS,
         )
         self._model, self._data = solver.mj_model, solver.mj_data
         self._model.opt.timestep = timestep
+        self._restitution = solver.geom_restitution()
         self._centres = np.array([body.mass.centre for body in bodies])
 
     @property
@@ -299,7 +305,9 @@ class MujocoWorld(World):
             raise ContactOverflow
 
     def _step(self) -> None:
-        """Run ``mj_step`` for this integrator with the friction of :mod:`mitsplat.physics.friction`.
+        """Run ``mj_step`` for this integrator with friction and restitution of pairs.
+
+        See :mod:`mitsplat.physics.friction` and :mod:`mitsplat.physics.restitution`.
 
         MuJoCo has no callback between contact detection and constraint assembly, so that its stages are called
         separately.
@@ -309,8 +317,32 @@ class MujocoWorld(World):
             stage(model, data)
         pairs, friction = data.contact.geom, model.geom_friction
         data.contact.friction[:] = pair_friction(friction[pairs[:, 0]], friction[pairs[:, 1]])
+        if self._restitution.any() and len(pairs):
+            self._rebound()
         for stage in _AFTER_CONTACTS:
             stage(model, data)
+
+    def _rebound(self) -> None:
+        """Give impacts the reference acceleration of :mod:`mitsplat.physics.restitution`, as damping."""
+        model, data, contact, timestep = self._model, self._data, self._data.contact, self._model.opt.timestep
+        velocity, spin = np.zeros((2, model.nbody, 3))
+        velocity[1:], local = np.array(data.qvel).reshape(-1, 2, 3).swapaxes(0, 1)
+        spin[1:] = np.einsum("nij,nj->ni", data.xmat[1:].reshape(-1, 3, 3), local)
+        bodies = model.geom_bodyid[contact.geom]
+        moving = velocity[bodies] + np.cross(spin[bodies], contact.pos[:, None] - data.xpos[bodies])
+        speeds = np.einsum("ni,ni->n", contact.frame[:, :3], moving[:, 0] - moving[:, 1])
+        restitution = np.sqrt(self._restitution[contact.geom].prod(axis=1))
+        fast = np.flatnonzero((speeds > MIN_IMPACT_SPEED) & (restitution > 0))
+        approach, depth = speeds[fast], np.maximum(0, -contact.dist[fast])
+        _, pair = np.unique(np.sort(bodies[fast]) @ [model.nbody, 1], return_inverse=True)
+        longest = np.zeros(len(fast))
+        np.maximum.at(longest, pair, depth / approach)
+        contact.exclude[fast] = depth / approach < longest[pair] - SIMULTANEOUS  # no force in this step
+        gravity = GRAVITY * np.abs(contact.frame[fast, 2])
+        rebound = rebound_speed(restitution[fast], approach, depth, gravity, timestep)
+        contact.solreffriction[fast] = contact.solref[fast]  # sliding does not rebound
+        contact.solref[fast] = np.stack([np.zeros(len(fast)), -(approach + rebound) / (approach * timestep)], axis=1)
+        contact.solimp[fast, :2] = IMPACT_IMPEDANCE
 
     def _allow_rolling(self, allowed: bool) -> None:
         self._model.geom_condim[:] = _WITHOUT_ROLL if allowed else _WITH_ROLL
@@ -374,8 +406,7 @@ def _build_scene(
     SolverMuJoCo.register_custom_attributes(builder)
     add_hull = builder.add_shape_convex_hull if newton_contacts else builder.add_shape_mesh
     for collider in colliders:
-        # With size 0, the bodies determine the lengths of spin and rolling friction.
-        config = _shape_config(collider.friction, size=0.0)
+        config = collider.material.shape_config(*_DAMPED, size=0.0)
         if collider.box is not None:
             size, pose = collider.box
             hx, hy, hz = np.divide(size, 2).tolist()
@@ -394,20 +425,7 @@ def _build_scene(
             lock_inertia=True,
         )
         if body is not None:
-            config = _shape_config(body.friction, size=body.size)
+            config = body.material.shape_config(*_DAMPED, size=body.size)
             for hull in body.hulls:
                 add_hull(link, mesh=hull, cfg=config, custom_attributes=contact)
     return builder
-
-
-def _shape_config(friction: float, *, size: float) -> newton.ModelBuilder.ShapeConfig:
-    return newton.ModelBuilder.ShapeConfig(
-        density=0.0,
-        ke=1 / (_CONTACT_TIME * _DAMPING_RATIO) ** 2,
-        kd=2 / _CONTACT_TIME,
-        mu=friction,
-        mu_torsional=min(_CONTACT_RADIUS[0], _CONTACT_RADIUS[1] * size),
-        mu_rolling=min(_ROLLING[0], _ROLLING[1] * size),
-        margin=0.0,
-        gap=0.0,
-    )

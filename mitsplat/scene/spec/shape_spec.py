@@ -53,6 +53,23 @@ class Shape(StrictModel):
         0.6,
         description="Coulomb friction coefficient. A contact has the geometric mean of the coefficients of both sides.",
     )
+    restitution: Unit = Field(
+        0.0,
+        exclude_if=lambda restitution: restitution == 0,
+        description="Coefficient of restitution. A contact has the geometric mean of the coefficients of both sides.",
+    )
+    rolling_friction: NonNegativeFloat | None = Field(
+        None,
+        exclude_if=lambda length: length is None,
+        description="Length of rolling friction [m]. A contact has the larger one of both sides. If absent, objects "
+        "determine it.",
+    )
+    torsional_friction: NonNegativeFloat | None = Field(
+        None,
+        exclude_if=lambda radius: radius is None,
+        description="Contact radius of spin friction [m]. A contact has the larger one of both sides. If absent, "
+        "objects determine it.",
+    )
 
     @model_validator(mode="after")
     def _check(self) -> Shape:

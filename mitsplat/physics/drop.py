@@ -47,6 +47,9 @@ CROWDED = "no room for all"
 _LEFT_OUT_PER_ROUND = 0.1  # share of the objects that is left out per round if they find no room,
 _MAX_LEFT_OUT = 0.5  # and maximum share in total: beyond it, the region is too small
 _POUR_SPEED = 1.0  # speed limit of poured objects [m/s]: at higher speed, heavy objects eject light ones
+# Simulated time for the draws of a layout [s], thirty times that of a typical draw. After it, each rejected draw leaves
+# objects out.
+_MAX_SIMULATED = 60.0
 _CONCAVITIES = (0.02, 0.01, 0.005)  # concavity of convex pieces, from coarse to fine
 
 
@@ -90,11 +93,19 @@ _Defect = tuple[str, set[PlacedSurface]]
 
 @dataclass(frozen=True)
 class _Rejection:
-    """Rejection of a draw: its reason, the positions of the objects that cause it, and an optional error message."""
+    """Rejection of a draw.
+
+    Attributes:
+        reason: Reason.
+        causes: Positions of the objects that cause it.
+        sentence: Error message, or empty.
+        simulated: Simulated time of the draw [s].
+    """
 
     reason: str
     causes: Sequence[int]
     sentence: str = ""
+    simulated: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -141,8 +152,9 @@ class Drop:
         """Draw poses until a layout passes all checks.
 
         After ``settle.attempts`` rejected draws, the objects that caused every rejection are left out. If there are
-        none, the object that caused most rejections is left out. The remaining objects are drawn again. If objects find
-        no room beside one another, the last of them are left out.
+        none, the object that caused most rejections is left out. The remaining objects are drawn again. Once the draws
+        of a layout have simulated 60 s, every rejected draw leaves out objects. If objects find no room beside one
+        another, the last of them are left out.
 
         Raises:
             InputError: If more than half of the objects find no room, although each of them fits alone.
@@ -155,7 +167,7 @@ class Drop:
         refused: list[str] = []
         left_out: list[LeftOut] = []
         sentence = crowded = ""
-        total = len(drawn)
+        total, simulated = len(drawn), 0.0
         while drawn:
             faults: dict[int, list[str]] = {one.id: [] for one in drawn}
             before = len(refused)
@@ -168,6 +180,9 @@ class Drop:
                 crowded = crowded or (sentence if found.reason == CROWDED else "")
                 for position in found.causes:
                     faults[drawn[position].id].append(found.reason)
+                simulated += found.simulated
+                if simulated > _MAX_SIMULATED:
+                    break
             draws = len(refused) - before
             removed = [one for one in drawn if len(faults[one.id]) == draws]
             if CROWDED in refused[before:]:
@@ -207,7 +222,7 @@ class Drop:
         world.reset(start)
         outcome = self._run(world, number, regions, given)
         if outcome.rejection:
-            return _Rejection(outcome.rejection, outcome.causes)
+            return _Rejection(outcome.rejection, outcome.causes, simulated=world.time)
         resting = [self._placed(asset, pose) for asset, pose in zip(assets, outcome.poses, strict=True)]
         clearances = all_clearances(resting, obstacles, reach=_MAX_MEASURED_GAP)
         gaps = _support_gaps(resting, clearances)
@@ -216,7 +231,8 @@ class Drop:
         )
         if defect is not None:
             reason, causes = defect
-            return _Rejection(reason, [position for position, item in enumerate(resting) if item in causes])
+            positions = [position for position, item in enumerate(resting) if item in causes]
+            return _Rejection(reason, positions, simulated=world.time)
         certificate = RestCertificate(
             rested=True,
             inside=True,

@@ -49,6 +49,17 @@ def test_an_object_that_falls_over_is_omitted_and_others_keep_their_ids(needle_s
     assert np.abs(start - resting).max() < 2e-3  # they were placed at rest
 
 
+def test_the_simulated_time_of_a_layout_is_bounded(needle_scene, scene_data, monkeypatch):
+    """After the limit of simulated time, one rejected draw leaves an object out, whatever settle.attempts says."""
+    from mitsplat.physics import drop
+
+    scene_data["settle"]["attempts"] = 50
+    monkeypatch.setattr(drop, "_MAX_SIMULATED", 0.0)
+    layout = settle_layout(load_scene(needle_scene(scene_data)), 0, cached=False)
+    assert [(one.id, one.reason) for one in layout.left_out] == [(1, "fell over in 1 of 1 draws")]
+    assert layout.certificate.attempts == 2
+
+
 def test_a_layout_without_resting_objects_is_an_error_with_the_empty_layout(needle_scene, scene_data):
     scene_data["objects"] = [{"asset": "assets/needle", "count": 2}]
     scene = load_scene(needle_scene(scene_data))

@@ -16,6 +16,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 from scipy.stats import kstest
 
+from mitsplat.asset import Asset
 from mitsplat.errors import InputError
 from mitsplat.physics.settle import replay_layout, settle_layout, settle_layouts
 from mitsplat.scene.layout import Layout
@@ -89,6 +90,19 @@ def test_a_layout_satisfies_its_certificate(scene_data, write_scene):
     assert certificate.support_gap < 1e-3
     assert certificate.standoff < 1e-6  # a box is its own convex piece
     assert certificate.attempts == len(certificate.refused) + 1
+
+
+def test_objects_that_rebound_rest_as_still_as_others(scene_data, write_scene, tmp_path):
+    """With a restitution of 0.6, motion, penetration and gaps at rest are within the limits of objects without."""
+    scene_data["shapes"][0]["restitution"] = 0.6
+    path = write_scene(scene_data)
+    for name in ("nut", "bolt"):
+        folder = tmp_path / "assets" / name
+        replace(Asset.load(folder), restitution=0.6).save(folder)
+    certificate = settle_layout(load_scene(path), 0, cached=False).certificate
+    assert certificate.surface_motion < 5e-4
+    assert certificate.collider_penetration < 3e-4
+    assert certificate.support_gap < 1e-3
 
 
 @pytest.mark.parametrize("stepper", STEPPERS)

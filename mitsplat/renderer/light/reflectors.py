@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -120,10 +121,7 @@ class Reflectors:
     def _trace(
         self, ray: mi.Ray3f, key: mi.UInt32, light: mi.Point2f, bounces: int
     ) -> tuple[mi.Color3f, mi.Color3f, mi.Float]:
-        """Return the colours (Color3f) at the hits of rays, the colours without dynamic objects, and the distances.
-
-        Each scene is traced by a kernel of its own, see ``Proxies.separate_kernels``.
-        """
+        """Return the colours (Color3f) at the hits of rays, the colours without dynamic objects, and the distances."""
         static, dynamic = self.proxies.static, self.proxies.dynamic
         captured, distance = mi.Color3f(dr.zeros(mi.Float, dr.width(key))), mi.Float(dr.inf)
         ray.maxt = dr.inf
@@ -133,8 +131,8 @@ class Reflectors:
             if self.grid is not None:
                 captured = dr.select(hit, self.grid.at(ray(dr.select(hit, ground.t, 0)), hit), 0)
             ray.maxt = distance = ground.t
-            dr.eval(ray, ground)
-        dr.eval(captured)
+            triangle = ground.prim_index
+            dr.eval(triangle, ray, captured)
         if dynamic is None:
             return captured, captured, distance
         near = dynamic.intersect(ray)
@@ -143,10 +141,11 @@ class Reflectors:
         if self.emitters.sky is not None:  # indoors, the sky represents the light that walls reflect
             thing &= near.t < self.emitters.sky_reach
         distance = dr.select(near.is_valid(), dr.select(thing, near.t, dr.inf), distance)
-        dr.eval(near, colour, thing, distance)
-        lane = dr.compress(dr.max(colour) > 0)
+        lit = dr.max(colour) > 0
+        dr.eval(near, colour, captured, thing, distance, lit)
+        lane = dr.compress(lit)
         if static is not None and dr.width(lane):
-            some = (dr.gather(type(v), v, lane) for v in (ray, ground.prim_index, key, light))
+            some = (dr.gather(type(v), v, lane) for v in (ray, triangle, key, light))
             free = self._unshadowed(static, *some)
             dr.scatter(colour, dr.select(free, dr.gather(mi.Color3f, colour, lane), 0), lane)
         lane = dr.compress(thing)
@@ -189,12 +188,12 @@ class Reflectors:
         state = dr.while_loop(tuple(state), lambda i, *_: i < last, choose, label="candidates")
         _, total, direction, reach, sky = state
         shadow, shaded = _shadow_ray(origin, direction, reach), total > 0
-        dr.eval(shadow, key, shaded, sky)
+        self._end_kernel(shadow, key, shaded, sky)
         shaded &= self._occluded(shadow, mi.UInt32(0), key, shaded, self.proxies.shadow_casters)
         wall = static.intersect(shadow, shaded)
         blocked = shaded & wall.is_valid()
         shadow.maxt = dr.select(blocked, wall.t, shadow.maxt)
-        dr.eval(shadow, blocked, shaded)
+        self._end_kernel(shadow, blocked, shaded)
         # From the directions of the sky, objects also block the light that captured walls behind them reflect.
         behind = self._occluded(shadow, mi.UInt32(0), key, blocked & sky, self.proxies.shadow_casters)
         shaded &= ~blocked | behind
@@ -228,7 +227,7 @@ class Reflectors:
             lobe = SpecularLobe.of(mi.Vector3f(normal), -ray.d, surface.roughness, surface.metallic, surface.specular)
             lit += self._mirrored_emitter(lobe, surface, beam, dr.dot(normal, beam.direction), metal)
         free = dr.max(lit) > 0
-        dr.eval(lit, shadow, key, free, instance)
+        self._end_kernel(lit, shadow, key, free, instance)
         free &= ~self._occluded(shadow, instance, key, free, self.proxies.occluder_scenes)
         lit = dr.select(free, lit, 0)
         if last or dynamic.materials is None:
@@ -288,8 +287,13 @@ class Reflectors:
         free = active
         for occluder_scene in occluder_scenes:
             free = free & ~occluder_scene.occluded(ray, instance, key, free)
-            dr.eval(free)
+            self._end_kernel(free)
         return active & ~free
+
+    def _end_kernel(self, *values: Any) -> None:
+        """Evaluate values before the next scene is traced, if a kernel may trace only one scene."""
+        if self.proxies.separate_kernels:
+            dr.eval(values)
 
 
 def _towards(normal: mi.Normal3f, ray: mi.Ray3f) -> mi.Normal3f:

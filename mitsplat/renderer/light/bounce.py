@@ -26,9 +26,6 @@ from mitsplat.renderer.rays.device_arrays import gathered
 BOUNCE_RAYS = 7
 """Rays per pixel of objects, and of captured surroundings near objects, before neighbours are averaged."""
 
-MAX_METALLIC = 0.99
-"""Metalness above which diffuse light is not traced."""
-
 CELL = 4
 """Edge [px] of the cells in which :func:`object_cover` is constant."""
 
@@ -112,7 +109,7 @@ def trace_bounce(tracer: ShadowTracer, reflectors: Reflectors, estimate: Estimat
     if cover is not None:
         shaded = dr.sum(estimate.lit) < MAX_SHARE * dr.sum(estimate.base)
         captured = _captured(surface) & (shaded | (dr.gather(mi.Float, cover, pixel) > MIN_COVER))
-    diffuse = surface.relit & thing & (surface.metallic < MAX_METALLIC)
+    diffuse = surface.relit & thing & surface.diffuse
     few = captured & selected
     for mesh, which, rays in ((False, diffuse | few, BOUNCE_RAYS), (True, on_mesh, MESH_RAYS)):
         places = dr.compress(which)

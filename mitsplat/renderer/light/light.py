@@ -404,7 +404,7 @@ class TracedPixels:
         share = dr.select((base > 0) & (lit != base), lit / base, 1)  # a GPU divides a number by itself to almost 1
         light = mi.Color3f(*[channel + dr.zeros(mi.Float, self.lighting.pixels) for channel in light])
         dr.eval(light, share)
-        dr.scatter(light, share, self.index)
+        dr.scatter(light, dr.select(self.here.relit, 0, share), self.index)
         place = unoccluded.place
         if dr.width(place):
             relit = dr.gather(mi.Color3f, share, place) * unoccluded.irradiance / white

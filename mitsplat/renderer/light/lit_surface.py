@@ -17,6 +17,10 @@ AGREEMENT = 0.02
 """Largest distance of a splat in front of its proxy, as a share of the depth, at which the proxy's surface is used."""
 
 
+MAX_METALLIC = 0.99
+"""Metalness above which diffuse light is not traced."""
+
+
 @dataclass(eq=False)
 class LitSurface:
     """Visible surface points.
@@ -57,6 +61,11 @@ class LitSurface:
     def glossy(self) -> mi.Bool:
         """True if the surface mirrors light."""
         return (self.specular > 0) | (self.metallic > 0)
+
+    @property
+    def diffuse(self) -> mi.Bool:
+        """True if the surface reflects diffuse light."""
+        return self.metallic < MAX_METALLIC
 
     @property
     def lobe(self) -> SpecularLobe:

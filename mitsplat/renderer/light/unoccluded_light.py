@@ -19,12 +19,13 @@ from mitsplat.renderer.rays.device_arrays import gathered
 
 @dataclass(frozen=True, eq=False)
 class UnoccludedLight:
-    """Light without occluders at relit points.
+    """Light without occluders at relit points that reflect diffuse light.
 
     Attributes:
         place: Places of these points among the traced pixels.
         irradiance: Irradiance (Color3f); None if there are none.
-        level: Mean over channels of irradiance over white for relit points, otherwise 1, by traced pixel.
+        level: Mean over channels of irradiance over white for these points, its mean over orientations at the
+            reference point for other relit points, and otherwise 1, by traced pixel.
     """
 
     place: mi.UInt32
@@ -33,12 +34,15 @@ class UnoccludedLight:
 
     @classmethod
     def integrate(cls, emitters: Emitters, points: LightPoints, here: LitSurface, white: mi.Color3f) -> UnoccludedLight:
-        """Integrate the light at those of the pixels ``here`` that are relit.
+        """Integrate the light at those of the pixels ``here`` that are relit and no pure metals.
 
         E = integral of L(w) max(0, n.w) dw over all emitters, a mean over the sample ``points`` of a pixel.
         """
-        place = dr.compress(here.relit)
-        level = dr.full(mi.Float, 1, dr.width(here.relit))
+        place = dr.compress(here.relit & here.diffuse)
+        # Of pure metals, the light matters only for the metering and for the number of rays.
+        usual = emitters.fluence / (4 * dr.mean(white))
+        level = dr.select(here.relit, usual, mi.Float(1))
+        dr.eval(level)
         if not dr.width(place):
             return cls(place, None, level)
         rows = points.rows(place)

@@ -16,7 +16,7 @@ from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.camera import Camera
 from mitsplat.images.colour import encode_srgb
 from mitsplat.renderer.layers import make_integrator, make_splats_shape, render_layers
-from tests.renderer.test_light import WHITE_SKY, down_camera, floor, noise_free, nothing, slab
+from tests.renderer.test_light import WHITE_SKY, area_light, down_camera, floor, noise_free, nothing, slab
 
 RED = np.array([0.8, 0.2, 0.1])
 
@@ -139,6 +139,20 @@ def test_light_of_an_object_keeps_its_place_on_a_mesh() -> None:
     r = np.hypot(x, c)
     expected = (np.arctan(b / x) - x / r * np.arctan(b / r)) / np.pi
     np.testing.assert_allclose(light[40:56].mean(axis=(0, 2))[beside], expected[beside], rtol=0.1)
+
+
+def test_light_of_an_object_leaves_no_squares_on_a_captured_floor() -> None:
+    """Few rays from a pixel hit the lit object, and the mean of its neighbours has no step at the edge of a square."""
+    make_integrator()
+    shapes = {
+        "floor": make_splats_shape(floor(0.5), proxy=slab(0.5)),
+        "wall": object_box((-0.05, -0.2, 0.0), (0.0, 0.2, 0.1), 1),
+        "lamp": area_light(0.2, 1.0),
+    }
+    layers = noise_free(shapes, down_camera(0.5, 96, 45.0), white=0.2, bounce=True)
+    beside = layers.light[20:76, 54:90].mean(axis=-1)
+    assert beside.mean() > 1.01
+    assert np.abs(np.diff(beside, axis=0)).max() < 0.001  # along the wall, where the light is even
 
 
 def test_umbra_of_a_lamp_is_that_of_a_path_tracer() -> None:

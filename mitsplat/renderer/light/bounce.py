@@ -86,11 +86,11 @@ def trace_bounce(tracer: ShadowTracer, reflectors: Reflectors, estimate: Estimat
 
     ``cover`` is that of :func:`object_cover`.
 
-    Points of objects use a few rays each, so that their neighbours must be averaged. On visible meshes, one pixel in
-    each cell of 2 x 2 is traced, and the result is already a mean over many cells. This mean is necessary, because few
-    rays hit small bright regions such as a wall near a lamp. Light of near surfaces changes over short distances, so
-    that less of this mean counts there (Ward et al. 1988, "A Ray Tracing Solution for Diffuse
-    Interreflection").
+    Points of objects use a few rays each, so that their neighbours must be averaged, at captured points twice. On
+    visible meshes, one pixel in each cell of 2 x 2 is traced, and the result is already a mean over many cells. This
+    mean is necessary, because few rays hit small bright regions such as a wall near a lamp. Light of near surfaces
+    changes over short distances, so that less of this mean counts there (Ward et al. 1988, "A Ray Tracing Solution for
+    Diffuse Interreflection").
     """
     surface, view, pixel = tracer.surface, tracer.view, tracer.pixel
     cells = replace(view, width=-(-view.width // 2), height=-(-view.height // 2))
@@ -137,7 +137,10 @@ def trace_bounce(tracer: ShadowTracer, reflectors: Reflectors, estimate: Estimat
         own = gathered(surface, places)
         columns = [dr.gather(mi.Float, c, places) for c in (*relit, *static, known)]
         dr.eval(own, columns)
-        *columns, share = LightFilter(own, view, dr.gather(mi.UInt32, pixel, places)).average(columns)
+        light_filter = LightFilter(own, view, dr.gather(mi.UInt32, pixel, places))
+        for _ in range(2):  # a single box would show rare bright rays as squares
+            columns = light_filter.average(columns)
+        *columns, share = columns
         both = dr.zeros(mi.Color3f, count), dr.zeros(mi.Color3f, count)
         for total, colours in zip(both, (columns[:3], columns[3:]), strict=True):
             dr.scatter(total, dr.select(share > 1e-6, mi.Color3f(*colours) / share, 0), places)

@@ -64,12 +64,6 @@ quarter larger than with rays at each pixel. With this factor the error is the s
 FIRST_REFLECTIONS = 4, 8
 """Reflection rays per pixel of a dielectric and of a metal before the error estimate."""
 
-FURTHER_REFLECTIONS = 1.2
-"""Largest number of reflection rays per pixel after the error estimate, times the wanted error.
-
-Few pixels mirror rare bright light, and their error decreases slowly: more rays take much time for little effect.
-"""
-
 MIN_COVER = 0.2
 """Share of the hemisphere that objects cover from which the light of captured points is traced in any case."""
 
@@ -97,11 +91,6 @@ class Accuracy:
         """Rays per point before the first error estimate."""
         wanted = max(MIN_FIRST_RAYS, round(FIRST_RAYS / self.error)) if self.error > 0 else self.most
         return min(wanted, self.most)
-
-    @property
-    def further_reflections(self) -> int:
-        """Largest number of reflection rays per pixel after the error estimate."""
-        return min(round(FURTHER_REFLECTIONS / self.error), self.most)
 
     @property
     def dense(self) -> int:
@@ -474,7 +463,7 @@ class TracedPixels:
 
         A pixel gets more rays if its first rays have not reached the wanted error.
         """
-        accuracy, points = self.lighting.accuracy, self.points
+        error, most, points = self.lighting.accuracy.error, self.lighting.accuracy.most, self.points
         total, glossy = Reflections.empty(dr.width(points.owner)), self.glossy
 
         def trace(places: mi.UInt32, by_pixel: mi.UInt32) -> None:
@@ -482,16 +471,13 @@ class TracedPixels:
             rays = points.ray_count(dr.gather(mi.UInt32, by_pixel, dr.gather(mi.UInt32, points.owner, rows)), rows)
             total.add(rows, tracer.trace(rows, dr.gather(mi.Float, total.rays, rows), rays))
 
-        for_dielectric, for_metal = (
-            min(first, accuracy.most) if accuracy.error > 0 else accuracy.most for first in FIRST_REFLECTIONS
-        )
+        for_dielectric, for_metal = (min(first, most) if error > 0 else most for first in FIRST_REFLECTIONS)
         trace(glossy, dr.select(self.here.metallic > 0, dr.opaque(mi.UInt32, for_metal), for_dielectric))
         sums = points.sums_by_pixel(total)
-        if accuracy.error > 0:
+        if error > 0:
             brightness = typical_brightness(sums.tinted, sums.colourless)
             wanted = self._rays_for_reflections(brightness, sums.squares, sums.rays, exposure)
-            missing = wanted - dr.gather(mi.Float, sums.rays, glossy)
-            missing = mi.UInt32(dr.ceil(dr.clip(missing, 0, dr.opaque(mi.Float, accuracy.further_reflections))))
+            missing = mi.UInt32(dr.ceil(dr.clip(wanted - dr.gather(mi.Float, sums.rays, glossy), 0, most)))
             more = dr.zeros(mi.UInt32, points.count)
             dr.eval(missing)
             dr.scatter(more, missing, glossy)

@@ -122,7 +122,7 @@ def test_a_frame_is_shown_until_the_camera_moves(shown):
     assert shown.scene_page._pose is not None
     above = shown.picture()
     assert np.abs(above.astype(int) - second).mean() > 2
-    assert YAML(typ="safe").load(shown.scene_page._camera_yaml.value)["camera"]["keys"][0]["eye"] == [0.0, 0.2, 0.9]
+    assert YAML(typ="safe").load(shown.scene_page._camera_yaml.value)["camera"]["eye"] == [0.0, 0.2, 0.9]
     shown.scene_page._look_at_frame(0)
     assert np.abs(shown.picture().astype(int) - first).mean() < 1
 

@@ -41,7 +41,8 @@ _TARGET_FACES, _MAX_ERROR = 5000, 0.003
 # A surface is noisy if sharp valleys have more than this share of the length of all edges. It is the result of a bad
 # fit and would be split into more pieces than it has faces. Parts and scans have 0.15 at most.
 _NOISY, _NOISY_THRESHOLD = 0.25, 0.1
-# CoACD search iterations per cut. A scan has more cuts than concavities, so any of them is sufficient.
+# CoACD search iterations per cut. A scan has more cuts than concavities, so any of them is sufficient. CoACD converts
+# an open surface to a thin shell of many faces: with all iterations, a cup of 96 faces takes minutes.
 _ITERATIONS, _SCAN_ITERATIONS = 150, 20
 # Number of cut planes that are tested along each direction.
 _CUTS_PER_AXIS = 15
@@ -84,7 +85,7 @@ def convex_pieces(
 
 @lru_cache(maxsize=256)
 def _cached_pieces(vertices: bytes, faces: bytes, threshold: float, max_pieces: int) -> tuple[trimesh.Trimesh, ...]:
-    digest = ContentHash("pieces 4", f"{version('coacd')} {threshold!r} {max_pieces}", vertices, faces)
+    digest = ContentHash("pieces 5", f"{version('coacd')} {threshold!r} {max_pieces}", vertices, faces)
     path = cache_folder() / "pieces" / f"{digest.hexdigest()}.npz"
     pieces = _read_pieces(path)
     if pieces is None:
@@ -126,7 +127,7 @@ def _split(part: trimesh.Trimesh, threshold: float, max_pieces: int) -> list[tri
     found = coacd.run_coacd(
         coacd.Mesh(part.vertices, part.faces),
         threshold=threshold,
-        mcts_iterations=_SCAN_ITERATIONS if scan or noisy else _ITERATIONS,
+        mcts_iterations=_SCAN_ITERATIONS if scan or noisy or not part.is_watertight else _ITERATIONS,
         seed=0,
     )
     pieces = [trimesh.Trimesh(vertices, faces, process=False).convex_hull for vertices, faces in found]

@@ -194,10 +194,14 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
         """Render an image tensor (H, W, 4 + AOVs), linear RGBA first."""
         if not isinstance(sensor, mi.Sensor):
             sensor = scene.sensors()[sensor]
-        if not self._is_kernel_stated and self.renderer.quality.kernel == "exact":
+        quality = self.renderer.quality
+        if not self._is_kernel_stated and quality.kernel == "exact":
             kernel = trained_kernel(shape.splats.kernel for shape in scene.shapes() if hasattr(shape, "splats"))
-            self.renderer.quality = replace(self.renderer.quality, kernel=kernel)
-        layers = self.renderer.render_layers(scene, sensor, seed=int(seed))
+            self.renderer.quality = replace(quality, kernel=kernel)
+        try:
+            layers = self.renderer.render_layers(scene, sensor, seed=int(seed))
+        finally:
+            self.renderer.quality = quality  # the next scene may state another kernel
         view = view_of(sensor)
         channels = [*layers["rgb"], layers["alpha"], *layers["captured"], layers["depth"], mi.Float(layers["instance"])]
         channels += [layers["proxy_depth"], mi.Float(layers["proxy_instance"]), *layers["normal"]]

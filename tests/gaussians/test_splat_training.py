@@ -21,6 +21,7 @@ from mitsplat.gaussians.splat_training import SPZ_FLAGS_OFFSET, merge_filter
 from mitsplat.geometry.camera import Camera
 from mitsplat.quality import PRESETS
 from mitsplat.renderer.layers import render_splats
+from mitsplat.runtime.variant import ensure_variant
 from mitsplat.scene.loading.scene_loading import load_scene
 from tests.gaussians.test_splats import encoded, random_splats, trained_ply
 
@@ -181,11 +182,15 @@ def test_presets_render_antialiased_splats_with_the_mip_filter() -> None:
 
 
 def test_an_xml_scene_uses_the_kernel_that_its_splats_state(tmp_path: Path) -> None:
+    ensure_variant()
     for name, kernel in (("a", "mip"), ("b", None)):
         thin_splats(kernel).save(tmp_path / f"{name}.ply")
 
-    def picture(name: str, **properties: str) -> np.ndarray:
-        integrator = mi.load_dict({"type": "splat_proxy", "shadow": "none", **properties})
+    def make(**properties: str) -> mi.Integrator:
+        return mi.load_dict({"type": "splat_proxy", "shadow": "none", **properties})
+
+    def picture(name: str, integrator: mi.Integrator | None = None, **properties: str) -> np.ndarray:
+        integrator = integrator or make(**properties)
         shape = {"type": "splats", "filename": str(tmp_path / f"{name}.ply")}
         sensor = {"type": "perspective", "fov": 40.0, "film": {"type": "hdrfilm", "width": 32, "height": 24}}
         sensor["to_world"] = mi.ScalarTransform4f().look_at([0, 0, -3], [0, 0, 0], [0, -1, 0])
@@ -196,6 +201,9 @@ def test_an_xml_scene_uses_the_kernel_that_its_splats_state(tmp_path: Path) -> N
     np.testing.assert_array_equal(picture("a"), filtered)
     assert not np.array_equal(picture("b"), filtered)
     np.testing.assert_array_equal(picture("a", kernel="exact"), picture("b"))
+    shared = make()
+    np.testing.assert_array_equal(picture("a", shared), filtered)
+    np.testing.assert_array_equal(picture("b", shared), picture("b"))
 
 
 @pytest.mark.parametrize("where", ["environment", "object"])

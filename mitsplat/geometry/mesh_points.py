@@ -21,9 +21,11 @@ def points_inside(mesh: trimesh.Trimesh, points: Float64Array) -> BoolArray:
     """
     low, high = mesh.bounds
     inside = ((points > low) & (points < high)).all(axis=1)
-    triangles = np.asarray(mesh.triangles, dtype=np.float64)
     nearby = np.flatnonzero(inside)
-    for chunk in np.array_split(nearby, math.ceil(len(nearby) * len(triangles) / _PAIRS) or 1):
+    if not len(nearby):  # the usual case of a camera and an object
+        return np.asarray(inside)
+    triangles = np.asarray(mesh.triangles, dtype=np.float64)
+    for chunk in np.array_split(nearby, math.ceil(len(nearby) * len(triangles) / _PAIRS)):
         corners = triangles[None] - points[chunk][:, None, None]
         a, b, c = corners[:, :, 0], corners[:, :, 1], corners[:, :, 2]
         la, lb, lc = (np.linalg.norm(side, axis=-1) for side in (a, b, c))

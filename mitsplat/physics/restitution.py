@@ -43,12 +43,6 @@ SIMULTANEOUS = 1e-5
 """Time between impacts of one pair of bodies that count as one [s]."""
 
 
-def damped_restitution(ratio: float) -> float:
-    """Compute the restitution of a contact that cannot pull, from its damping ratio in (0, 1)."""
-    phase = np.arcsin(ratio)
-    return float(np.exp(-np.tan(phase) * (np.pi - 2 * phase)))
-
-
 def rebound_speed(
     restitution: Float64Array, approach: Float64Array, depth: Float64Array, gravity: Float64Array, timestep: float
 ) -> Float64Array:

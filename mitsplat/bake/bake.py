@@ -77,8 +77,8 @@ class BakeResult:
         psnr_object: PSNR over the mesh's pixels alone [dB]; NaN without verification.
         views: Pictures of that comparison.
         surface: Baked mesh with all its parts [m], z up, or None.
-        brightness: Mean brightness of the splats relative to the textures of the file, which are read from the file
-            independently. None without textures or under a scene's lights.
+        brightness: Mean brightness of the splats relative to the textures of the file, without the factors of its
+            materials. None without textures or under a scene's lights.
         warnings: Warnings for the user, a sentence each.
         units: Unit and up axis of the mesh, and which of them its file states.
     """

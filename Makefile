@@ -6,19 +6,24 @@ PIP_INSTALL := $(VENV)/bin/python -m pip install --quiet --disable-pip-version-c
 INPUTS := pyproject.toml constraints.txt
 SPHINX := --builder html --fresh-env --fail-on-warning --keep-going --nitpicky --quiet
 
-.PHONY: render test test-gpu lint browser docs clean
+.PHONY: render test test-extended test-gpu lint browser docs clean
 
 render: $(STAMPS)/package
 	$(VENV)/bin/mitsplat render scenes/workcell.yaml -o out/workcell --resume
 
 # In the order of the files: left to itself, the plugin ends with those of few tests, of which some take minutes.
+TWO_PROCESSES := --numprocesses 2 --dist loadfile --no-loadscope-reorder
 test: $(STAMPS)/tools
-	$(VENV)/bin/python -m pytest --numprocesses 2 --dist loadfile --no-loadscope-reorder
+	$(VENV)/bin/python -m pytest $(TWO_PROCESSES)
+
+# The tests marked `extended`, which pytest leaves out otherwise.
+test-extended: $(STAMPS)/tools
+	$(VENV)/bin/python -m pytest $(TWO_PROCESSES) -m extended
 
 # What renders, on the GPU; tests/gpu also compares it with the CPU. The tests share the GPU.
 GPU_TESTS := tests/gpu tests/renderer tests/frames tests/fit tests/bake
 test-gpu: $(STAMPS)/tools
-	$(VENV)/bin/python -m pytest --device cuda --numprocesses 6 --dist loadfile $(GPU_TESTS)
+	$(VENV)/bin/python -m pytest -m '' --device cuda --numprocesses 6 --dist loadfile $(GPU_TESTS)
 
 lint: $(STAMPS)/tools
 	$(VENV)/bin/ruff check

@@ -38,7 +38,7 @@ from mitsplat.errors import InputError
 from mitsplat.formats.registry import FORMATS, Catalogue
 from mitsplat.frames.budget import worker_memory
 from mitsplat.frames.frame import render_frame
-from mitsplat.frames.time_estimate import TIMED_FRAMES, describe_time
+from mitsplat.frames.time_estimate import RunTime
 from mitsplat.physics.settle import is_cached, settle_layout
 from mitsplat.progress import TIME_NOTE, Note, Progress
 from mitsplat.runtime.device import Device, current_device, find_device
@@ -183,22 +183,17 @@ def write_dataset(
         for layout in sorted({layout_of(scene, index) for index in indices}):
             incomplete.read(out / f"layouts/{layout:04d}.json")
         job = FrameJob(scene, catalogue, out, render or render_frame, settle or settle_layout)
+        unsettled = [layout for layout in layouts if settle is not None or not is_cached(scene, layout)]
+        run_time = RunTime(
+            len(unsettled), sum(map(len, layouts.values())), settles_first=min(layouts, default=0) in unsettled
+        )
         with closing(_results(job, layouts, workers, cluster, used_device, note)) as results:
-            first: list[dict[str, float]] = []
-            unsettled = [index for index in layouts if settle is not None or not is_cached(scene, index)]
             for record, seconds in results:
                 append_line(out / TIMINGS, {"index": record["index"], **seconds})
                 manifest.append(record)
                 note(f"frame {record['index']}")
-                if len(first) < TIMED_FRAMES:
-                    first.append(seconds)
-                    if len(first) == TIMED_FRAMES:
-                        settled = max(stages.get("settle", 0.0) for stages in first)
-                        was_timed = min(layouts) in unsettled
-                        image = min(sum(stages.values()) - stages.get("settle", 0.0) for stages in first)
-                        images = sum(map(len, layouts.values()))
-                        text = describe_time(len(unsettled), settled if was_timed else None, images, image)
-                        note(f"{TIME_NOTE}{text}")
+                if estimate := run_time.add(seconds):
+                    note(f"{TIME_NOTE}{estimate}")
                 incomplete.add(record["layout"], [(one["name"], one["reason"]) for one in record.get("left_out", ())])
         counts = FrameCounts()
         finish_folder(out, manifest, content, catalogue, counts.add)

@@ -2,8 +2,41 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 TIMED_FRAMES = 3
-"""Number of frames of a run after which its time is estimated; the first ones also compile kernels."""
+"""Number of frames of a run after which the first estimate of its time is corrected."""
+
+
+class RunTime:
+    """Estimate of the time of a run from its first images.
+
+    Args:
+        layouts: Number of layouts that are not settled yet.
+        images: Number of images of the run.
+        settles_first: True if the first image needs one of these layouts.
+    """
+
+    def __init__(self, layouts: int, images: int, *, settles_first: bool) -> None:
+        self._layouts, self._images, self._settles_first = layouts, images, settles_first
+        self._settle = self._image = 0.0
+        self._timed = 0
+
+    def add(self, seconds: Mapping[str, float]) -> str:
+        """Add the seconds of the stages of an image.
+
+        Returns:
+            The estimate after the first image, and after ``TIMED_FRAMES`` images; otherwise an empty string.
+        """
+        settle = seconds.get("settle", 0.0)
+        image = sum(seconds.values()) - settle
+        self._settle = max(self._settle, settle)
+        self._image = min(self._image, image) if self._timed else image
+        self._timed += 1
+        if self._images == 1 or self._timed not in (1, TIMED_FRAMES):
+            return ""
+        text = describe_time(self._layouts, self._settle if self._settles_first else None, self._images, self._image)
+        return f"{text} (the first image also compiles kernels)" if self._timed == 1 else text
 
 
 def describe_time(layouts: int, settle: float | None, images: int, image: float) -> str:

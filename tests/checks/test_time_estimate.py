@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -54,16 +55,28 @@ def test_a_check_measures_one_layout_and_the_second_image(tmp_path: Path, monkey
     assert 1 < float(found.text.split()[1]) < 12
 
 
-def test_a_run_states_its_time_after_the_first_images(tmp_path: Path) -> None:
+def test_a_run_states_its_time_after_the_first_image_and_corrects_it(tmp_path: Path) -> None:
+    """The first image takes longer, because it compiles kernels."""
     scene = small_scene(tmp_path, large_boxes(), BOTH, layouts=3, views=2)
     notes: list[str] = []
+
+    def render(scene: Scene, index: int, *, layout: Any) -> Any:
+        frame = render_boxes(scene, index, layout=layout)
+        return replace(frame, seconds={"trace": 50.0 if index == 0 else 2.0})
+
     write_dataset(
         scene,
         tmp_path / "out",
-        render=render_boxes,
+        render=render,
         settle=scatter_boxes,
         progress=lambda done, total, text: notes.append(text),
     )
-    (stated,) = (note for note in notes if note.startswith("time: about "))
-    assert "6 images of" in stated and "3 layouts" in stated
-    assert notes.index(stated) == notes.index("frame 2") + 1
+    first, corrected = (note for note in notes if note.startswith("time: about "))
+    assert "about 5 min in one process: 6 images of 50 s, and 3 layouts" in first
+    assert first.endswith("(the first image also compiles kernels)")
+    assert "about 12 s in one process: 6 images of 2 s, and 3 layouts" in corrected
+    assert notes.index(first) == notes.index("frame 0") + 1 and notes.index(corrected) == notes.index("frame 2") + 1
+
+
+def test_a_run_of_one_image_states_no_time() -> None:
+    assert not time_estimate.RunTime(1, 1, settles_first=True).add({"settle": 3.0, "trace": 1.0})

@@ -21,6 +21,7 @@ from mitsplat.geometry.lens import (
     Lens,
     distortion_coefficients,
     fisheye_radius,
+    is_pinhole,
     largest_slope,
     lens_fault,
     undistort,
@@ -106,7 +107,7 @@ class Camera:
     @property
     def is_pinhole(self) -> bool:
         """True if the lens does not distort."""
-        return self.lens == "opencv" and not any(self.distortion)
+        return is_pinhole(self.distortion, self.lens)
 
     @classmethod
     def look_at(

@@ -36,23 +36,19 @@ _LARGE, _LARGE_TANGENTIAL = 5.0, 0.05
 
 
 def distortion_coefficients(values: npt.ArrayLike, lens: Lens) -> tuple[float, ...]:
-    """Return distortion coefficients in OpenCV's order, from a list or an array of OpenCV such as (1, 5) or (14, 1).
-
-    Coefficients after the eighth that are zero are left out.
+    """Return distortion coefficients in OpenCV's order, see :func:`flat_coefficients`.
 
     Raises:
         ValueError: If there is another number of coefficients, one is not finite, or the sensor is tilted. The message
             is a rule that begins with "must".
     """
+    flat = flat_coefficients(values)
     try:
-        array = np.array(values, dtype=np.float64)
+        found = tuple(map(float, flat))
     except (TypeError, ValueError):
         raise ValueError(f"must be a list of numbers (got {values!r})") from None
-    if not np.isfinite(array).all():
-        raise ValueError(f"must have finite coefficients (got {array.ravel().tolist()})")
-    if max(array.shape, default=1) != array.size:
-        raise ValueError(f"must be a list of coefficients (got an array of shape {array.shape})")
-    found = shortened(array.ravel().tolist())
+    if not np.isfinite(found).all():
+        raise ValueError(f"must have finite coefficients (got {list(found)})")
     if len(found) == 14:
         raise ValueError(
             f"must have no tilt of the sensor, tau_x and tau_y (got {list(found[12:])}): calibrate without "
@@ -65,11 +61,27 @@ def distortion_coefficients(values: npt.ArrayLike, lens: Lens) -> tuple[float, .
     return found
 
 
-def shortened(coefficients: Sequence[float]) -> tuple[float, ...]:
-    """Return the coefficients without the thin-prism and tilt coefficients that OpenCV adds as zeros."""
-    if len(coefficients) in (12, 14) and not any(coefficients[8:]):
-        return tuple(coefficients[:8])
-    return tuple(coefficients[:12] if len(coefficients) == 14 and not any(coefficients[12:]) else coefficients)
+def flat_coefficients(values: Any) -> tuple[Any, ...]:
+    """Return the coefficients of a list or an array of OpenCV, such as (1, 5) or (14, 1).
+
+    Coefficients after the eighth (thin prism and tilt) that are zero are left out, because OpenCV adds them. The types
+    of the values are not checked.
+
+    Raises:
+        ValueError: If they are not in one row or column. The message is a rule that begins with "must".
+    """
+    array = np.array(values, dtype=object)
+    if max(array.shape, default=1) != array.size:
+        raise ValueError(f"must be a list of coefficients (got an array of shape {array.shape})")
+    flat = tuple(array.ravel().tolist())
+    if len(flat) in (12, 14) and not any(flat[8:]):
+        return flat[:8]
+    return flat[:12] if len(flat) == 14 and not any(flat[12:]) else flat
+
+
+def is_pinhole(distortion: Sequence[float], lens: Lens) -> bool:
+    """Return True if a lens does not distort."""
+    return lens == "opencv" and not any(distortion)
 
 
 def opencv_distort(u: Any, v: Any, k: Sequence[Any]) -> tuple[Any, Any, tuple[Any, Any, Any, Any]]:

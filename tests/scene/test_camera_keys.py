@@ -163,7 +163,7 @@ def test_the_audit_accepts_a_fixed_camera_and_finds_a_moved_one(tmp_path: Path, 
         ),
         ({"fx": 300, "size": [640, 480], "distortion": [-0.4, 0, 0, 0], "lens": "fisheye"}, "stops growing at"),
         ({"fov_x": 60, "distortion": [0] * 12 + [0.01, 0]}, "must have no tilt of the sensor"),
-        ({"fov_x": 60, "distortion": [[0.1, 0], [0, 0]]}, "must be a number"),
+        ({"fov_x": 60, "distortion": [[0.1, 0], [0, 0]]}, "must be a list of coefficients (got an array of"),
     ],
 )
 @pytest.mark.parametrize("rectify", [False, True])

@@ -9,7 +9,7 @@ from pydantic import AfterValidator, BeforeValidator, Field, NonNegativeFloat, m
 
 from mitsplat.arrays import Float64Array
 from mitsplat.geometry.camera import NEAR, look_at_pose
-from mitsplat.geometry.lens import Lens, distortion_coefficients, shortened
+from mitsplat.geometry.lens import Lens, distortion_coefficients, flat_coefficients, is_pinhole
 from mitsplat.geometry.rigid import ROUNDED, nearest_rigid, rigid_matrix
 from mitsplat.storage.field_types import (
     ElevationRange,
@@ -26,15 +26,7 @@ from mitsplat.storage.yaml_input import FieldError
 
 def _flat_coefficients(values: object) -> object:
     """Convert a list or an array of OpenCV, such as (1, 5), to a tuple, which strict mode requires."""
-    if isinstance(values, np.ndarray):
-        values = values.tolist()
-    if isinstance(values, list | tuple) and any(isinstance(value, list | tuple) for value in values):
-        rows = [value if isinstance(value, list | tuple) else [value] for value in values]
-        if len(rows) == 1 or all(len(row) == 1 for row in rows):
-            values = [value for row in rows for value in row]
-    if isinstance(values, list | tuple) and all(isinstance(value, int | float) for value in values):
-        return shortened(values)
-    return tuple(values) if isinstance(values, list) else values
+    return flat_coefficients(values) if isinstance(values, list | tuple | np.ndarray) else values
 
 
 def _check_sign(focal: object) -> object:
@@ -100,7 +92,7 @@ class Intrinsics(StrictModel):
     @property
     def is_pinhole(self) -> bool:
         """True if the lens does not distort."""
-        return self.lens == "opencv" and not any(self.distortion)
+        return is_pinhole(self.distortion, self.lens)
 
 
 class Motion(StrictModel):

@@ -19,7 +19,7 @@ import hashlib
 import json
 import re
 import shutil
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from io import StringIO
 from pathlib import Path
@@ -30,7 +30,9 @@ from ruamel.yaml import YAML
 
 from benchmarks.record import figure, recording
 from mitsplat.detector import DetectionMatches, TrainSettings, evaluate_detector, train_detector
+from mitsplat.detector.detector_evaluation import NMS_IOU
 from mitsplat.detector.losses import error_gains
+from mitsplat.detector.scores import Detection, overlaps
 from mitsplat.detector.training import Run
 from mitsplat.storage.files import write_text
 
@@ -164,6 +166,46 @@ def listed(
     return folder
 
 
+def scores_of_merged(
+    truth: Mapping[str, Any], detections: Sequence[Detection], merged: Mapping[str, Sequence[str]]
+) -> dict[str, tuple[float, float]]:
+    """Return mAP50-95 and mAP50 of ``all`` classes and of each merged class, if classes are merged.
+
+    As within any class, of two detections of a merged class that overlap by more than :data:`NMS_IOU`, only the one
+    with the higher score counts.
+
+    Args:
+        truth: Labels, a COCO dataset.
+        detections: Detections, in COCO's results format.
+        merged: Names of classes by name of the merged class.
+    """
+    if not merged:
+        return {}
+    number = {category["name"]: category["id"] for category in truth["categories"]}
+    new = {number[name]: number[names[0]] for names in merged.values() for name in names}
+    called = {number[names[0]]: name for name, names in merged.items()}
+    labels = [one | {"category_id": new.get(one["category_id"], one["category_id"])} for one in truth["annotations"]]
+    categories = [
+        one | {"name": called.get(one["id"], one["name"])}
+        for one in truth["categories"]
+        if new.get(one["id"], one["id"]) == one["id"]
+    ]
+    found: list[Detection] = []
+    kept: dict[tuple[int, int], list[Detection]] = {}
+    for one in sorted(detections, key=lambda detection: -detection["score"]):
+        if one["category_id"] in new:
+            one = one | {"category_id": new[one["category_id"]]}
+            others = kept.setdefault((one["image_id"], one["category_id"]), [])
+            if others and overlaps([one["bbox"]], [other["bbox"] for other in others]).max() > NMS_IOU:
+                continue
+            others.append(one)
+        found.append(one)
+    whole = DetectionMatches({**truth, "annotations": labels, "categories": categories}, found).average_precision()
+    return {"all": (whole.map50_95, whole.map50)} | {
+        name: whole.classes[name] for name in merged if name in whole.classes
+    }
+
+
 def main() -> None:
     """Train and evaluate."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -222,6 +264,9 @@ def measure(options: argparse.Namespace) -> None:
     out = work / "found" / f"{options.arm}-{options.seed}.json"
     out.parent.mkdir(exist_ok=True)
     out.write_text(json.dumps([one for one in detections if one["score"] >= 0.01]))
+    for name, (strict, loose) in scores_of_merged(truth, detections, plan.get("merged", {})).items():
+        figure(strict, "", "merged", name, "map50_95")
+        figure(loose, "", "merged", name, "map50")
     matches = DetectionMatches(truth, detections)
     whole = matches.average_precision()
     figure(whole.map50_95, "", "map50_95")

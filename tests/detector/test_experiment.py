@@ -111,6 +111,27 @@ def test_photographs_are_judged_by_detectors_that_were_not_trained_on_them(work,
     assert len(figures["samples"]) == experiment.SAMPLES
 
 
+def test_detections_of_merged_classes_are_one_class():
+    """Of three nuts, one is found as the other size, one as both sizes, and one is missed."""
+    boxes = [[0, 0, 10, 10], [20, 0, 10, 10], [40, 0, 10, 10]]
+    truth = {
+        "images": [{"id": 1, "width": 64, "height": 64}],
+        "categories": [{"id": 1, "name": "m16"}, {"id": 2, "name": "m20"}],
+        "annotations": [
+            {"id": k + 1, "image_id": 1, "category_id": c, "bbox": box, "area": 100, "iscrowd": 0}
+            for k, (c, box) in enumerate(zip([1, 2, 2], boxes, strict=True))
+        ],
+    }
+    found = [
+        {"image_id": 1, "category_id": c, "bbox": boxes[k], "score": score}
+        for c, k, score in [(2, 0, 0.9), (1, 1, 0.8), (2, 1, 0.7)]
+    ]
+    scores = experiment.scores_of_merged(truth, found, {"nut": ["m16", "m20"]})
+    assert scores == {"all": scores["nut"], "nut": (pytest.approx(67 / 101), pytest.approx(67 / 101))}  # recall 2/3
+    assert experiment.DetectionMatches(truth, found).average_precision().map50 < 0.3
+    assert experiment.scores_of_merged(truth, found, {}) == {}
+
+
 @pytest.mark.parametrize(("arm", "starts"), [("real", "coco.pt"), ("scratch", None)])
 def test_an_arm_starts_from_its_stated_weights(work, monkeypatch, arm, starts):
     given: list[Path | None] = []

@@ -106,7 +106,8 @@ def renders(todo: Sequence[tuple[str, int]], plan: Mapping[str, Any], options: a
             words += ["--hope", str(options.hope)] if module == "meshes" else []
         else:
             workers = options.render_workers if frames is None else max(1, frames // IMAGES)
-            words = ["mitsplat", "render", str(write_scene(options.work, scene, options.plan)), "--resume"]
+            words = [sys.executable, "-c", "from mitsplat.cli import main; main()", "render", "--resume"]
+            words += [str(write_scene(options.work, scene, options.plan))]
             words += ["-o", str(options.work / "data" / scene)]
             words += ["--workers", str(min(options.render_workers, workers))]
             words += [] if frames is None else ["--frames", str(frames)]

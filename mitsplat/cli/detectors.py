@@ -192,9 +192,11 @@ def compare(
         )
         if found.hue_advice:
             typer.echo(f"  {found.hue_advice}")
-    if found.same_size is not None:
+    if found.same_size is not None and found.same_sizes is not None:
+        least, most = found.same_sizes
         typer.echo(
-            f"objects in photographs of {found.same_size} px are as large as in rendered images of {size} px: "
+            f"objects in photographs of {found.same_size} px are as large as in rendered images of {size} px "
+            f"({least} to {most} px by class): "
             f"`mitsplat evaluate --size {found.same_size}`"
             + (f", `mitsplat train --size {size} --real-size {found.same_size}`" if found.same_size > size else "")
         )

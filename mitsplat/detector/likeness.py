@@ -110,6 +110,7 @@ class Likeness:
         same_size: Longer side of photographs [px], a multiple of 32, at which their objects have the size of rendered
             ones. This is the median over classes of the ratio of upper quartiles, of objects that no border cuts; upper
             quartiles, because partly hidden objects look smaller. None if no class is frequent enough on both sides.
+        same_sizes: Smallest and largest of these sizes over classes [px], which show how uncertain ``same_size`` is.
         traits: Traits over all classes.
         classes: Brightness and saturation of each class that is frequent enough on both sides.
         hues: Hue shift of the photographs from red towards green [degrees], for each of these classes where it can be
@@ -119,6 +120,7 @@ class Likeness:
     images: int
     photographs: int
     same_size: int | None
+    same_sizes: tuple[int, int] | None
     traits: tuple[Trait, ...]
     classes: dict[str, tuple[Trait, ...]]
     hues: dict[str, float]
@@ -188,9 +190,13 @@ def compare_with_photographs(
         for index, name in enumerate(real.class_names)
         if name in classes and (turn := _hue_shift(hues[0][index], hues[1][index])) is not None
     }
-    ratio = _size_ratio(sides, len(real.class_names))
-    same_size = None if ratio is None else max(round(size * ratio / STRIDE), 1) * STRIDE
-    return Likeness(len(ours), len(theirs), same_size, traits_of(None), classes, turned)
+    same_size, same_sizes = None, None
+    if ratios := _size_ratios(sides, len(real.class_names)):
+        least, same_size, most = (
+            max(round(size * ratio / STRIDE), 1) * STRIDE for ratio in np.quantile(ratios, [0, 0.5, 1])
+        )
+        same_sizes = least, most
+    return Likeness(len(ours), len(theirs), same_size, same_sizes, traits_of(None), classes, turned)
 
 
 def _zero_hue_sums() -> Float64Array:
@@ -223,15 +229,15 @@ def _hue_shift(ours: Float64Array, theirs: Float64Array) -> float | None:
     return None if abs(best) == _MAX_HUE_SHIFT else 360 / _HUE_BINS * best
 
 
-def _size_ratio(sides: tuple[_Values, _Values], classes: int) -> float | None:
-    """Return the size ratio of rendered to photographed objects, or None if no class is frequent enough in both."""
+def _size_ratios(sides: tuple[_Values, _Values], classes: int) -> list[float]:
+    """Return the size ratio of rendered to photographed objects, for each class that is frequent enough in both."""
     ratios = []
     for index in range(classes):
         ours, theirs = (side.get((_UNCUT_SIZE, index), []) for side in sides)
         if len(ours) >= MIN_RENDERED_OBJECTS and len(theirs) >= MIN_REAL_OBJECTS:
             upper = [np.quantile([value for _, value in values], 0.75) for values in (ours, theirs)]
-            ratios.append(upper[0] / upper[1])
-    return float(np.median(ratios)) if ratios else None
+            ratios.append(float(upper[0] / upper[1]))
+    return ratios
 
 
 def _sample_evenly(samples: list[Sample], max_images: int) -> list[Sample]:

@@ -12,7 +12,8 @@ Pages are made from templates in ``benchmarks/templates``, where ``{{ ... }}`` s
 * ``revision RESULT``: the revision and its date;
 * ``runs RESULT ...``: the same as a table; ``runs`` alone, of all results;
 * ``detectors PLAN ARM ...``: a table of results of arms of ``benchmarks.detector``; ``detectors PLAN``, of all;
-* ``detector PLAN ARM``: the mean precision of an arm.
+* ``detector PLAN ARM``: the mean precision of an arm;
+* ``gain PLAN ARM BASELINE``: table cells of its gain over another arm, and the 95 % interval.
 
 Missing figures are errors. ``said.md`` lists sentences of hand-written pages; each must occur in its page.
 """
@@ -28,7 +29,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from benchmarks.detector.table import experiment_table, mean_precision
+from benchmarks.detector.table import experiment_table, gain_cells, mean_precision
 from benchmarks.record import MEASURED, RESULTS, ROOT, read_recorded
 from benchmarks.scale.projection import project
 
@@ -172,6 +173,8 @@ def filled(text: str, results: Results) -> str:
                     return experiment_table(results, *plan_and_arms)
                 case ["detector", plan, arm]:
                     return f"{mean_precision(results, plan, arm):.3f}"
+                case ["gain", plan, arm, baseline]:
+                    return gain_cells(results, plan, arm, baseline)
                 case ["caption" | "runs" as what, *names] if names:
                     if missing := [name for name in names if "command" not in results.get(name, {})]:
                         raise FigureError(f"no result {missing[0]}")

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from benchmarks import again, figures, record
-from benchmarks.detector.table import experiment_table
+from benchmarks.detector.table import experiment_table, gain_cells
 from benchmarks.figures import FigureError, caption, differences, filled, formatted, read_results, unsaid
 from benchmarks.record import configuration_of, figure, read_recorded, recording, refusal, revision
 from mitsplat.checks import doctor
@@ -77,6 +77,8 @@ def test_detectors_are_compared_over_the_same_draws_of_scenes() -> None:
     assert synthetic.startswith("| `synthetic` | 2 | 0.410 | ") and synthetic.endswith("| 0.820 | – | – |")
     assert shadow.endswith("| `traced_shadow` | 0.100 to 0.100 |")  # same views
     assert earlier.endswith("| – | – |")  # no arm to compare with
+    assert gain_cells(results, "arms", "no_shadow", "traced_shadow") == "−0.100 | −0.100 to −0.100"
+    assert gain_cells(results, "arms", "synthetic", "real") == "+0.160 | +0.150 to +0.170"
     results["detector.experiment-no_shadow-0"]["figures"]["scenes"] = ["of later ones", ""]
     results["detector.experiment-real-0"]["figures"]["scenes"] = ["", ""]
     *_, shadow, real, _, _ = experiment_table(results).splitlines()

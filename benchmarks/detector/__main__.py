@@ -1,14 +1,14 @@
 """Runs all arms and seeds of the detector experiment in parallel, within a time limit.
 
-    python -m benchmarks.detector WORK [--arms real synthetic] [--seeds 0 1 2] [--devices cuda:0 cuda:1] [--jobs 4]
-        [--render-devices cpu] [--renders 2] [--minutes 20] [--plan workshop.yaml] [--hope ../shared/data/hope]
+    python -m benchmarks.detector WORK --weights coco.pt [--plan workshop.yaml] [--arms real synthetic] [--seeds 0 1 2]
+        [--devices cuda:0 cuda:1] [--jobs 4] [--render-devices cpu] [--renders 2] [--minutes 20]
+        [--hope ../shared/data/hope]
 
 Whole datasets are rendered first, on all rendering devices. A changed scene is rendered after the unchanged one with
-the
-same layouts, in parallel with trainings; on the CPU, renderings only use the time left by data loaders of trainings.
-An arm is trained once its datasets are complete. Arms are trained in the order of their names on the command line, all
-of the first seed before the second, and the folds of one arm in parallel. Recorded results are not repeated, and
-interrupted runs are resumed.
+the same layouts, in parallel with trainings; on the CPU, renderings only use the time left by data loaders of
+trainings. An arm is trained once its datasets are complete. Arms are trained in the order of their names on the command
+line, all of the first seed before the second, and the folds of one arm in parallel. Recorded results are not repeated,
+and interrupted runs are resumed.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from typing import Any
 
 from benchmarks.detector.experiment import PLAN, VIEWS, folds_of, read_arms, result_of, scenes_of, write_scene
 from benchmarks.record import read_recorded, refusal
+from mitsplat.runtime.cores import usable_cores
 
 IMAGES = 32
 """Least number of images per process: reading the assets takes as long as rendering some of them."""
@@ -41,14 +42,16 @@ def main() -> None:
     parser.add_argument("--devices", nargs="+", default=["cuda:0"])
     parser.add_argument("--render-devices", nargs="+", help="rendering devices, such as cpu; default: --devices")
     parser.add_argument("--jobs", type=int, default=4, help="parallel trainings per device")
-    parser.add_argument("--workers", type=int, default=4, help="data loaders per training")
+    parser.add_argument("--workers", type=int, help="data loaders per training; default: all cores are shared")
     parser.add_argument("--renders", type=int, default=1, help="parallel renderings per device")
-    parser.add_argument("--render-workers", type=int, default=8, help="maximum number of processes per rendering")
+    parser.add_argument("--render-workers", type=int, help="maximum number of processes per rendering; default: cores")
     parser.add_argument("--minutes", type=float, default=1e9, help="time limit, after which all jobs are stopped")
-    parser.add_argument("--weights", type=Path)
+    parser.add_argument("--weights", type=Path, required=True, help="initial weights of arms without random weights")
     parser.add_argument("--hope", type=Path, default=Path("../shared/data/hope"), help="folder of the scans")
     options = parser.parse_args()
     options.render_devices = options.render_devices or options.devices
+    options.workers = options.workers or max(1, usable_cores() // (options.jobs * len(options.devices)))
+    options.render_workers = options.render_workers or usable_cores()
     plan = read_arms(options.plan)
     arms = options.arms or list(plan["arms"])
     if refused := refusal():
@@ -121,7 +124,7 @@ def trainings(todo: Sequence[tuple[str, int]], plan: Mapping[str, Any], options:
     for arm, seed in todo:
         words = [sys.executable, "-m", "benchmarks.detector.experiment", str(options.work), arm, str(seed)]
         words += ["--plan", str(options.plan), "--workers", str(options.workers)]
-        words += ["--weights", str(options.weights)] if options.weights else []
+        words += ["--weights", str(options.weights)]
         after = [f"render-{scene}" for scene in scenes_of(plan["arms"][arm])]
         folds = [
             Job(f"{arm}-{seed}-{fold}", "train", [*words, "--fold", str(fold)], after)

@@ -2,7 +2,7 @@
 
     python -m benchmarks.detector.experiment WORK ARM SEED [--plan workshop.yaml] [--device cuda:0] [--weights FILE.pt]
         [--fold 0]
-    python -m benchmarks.detector WORK                  # all arms and seeds, in parallel
+    python -m benchmarks.detector WORK --weights FILE.pt         # all arms and seeds, in parallel
 
 WORK is the output of ``benchmarks.detector.material``, with arms in ``arms.yaml``; with ``--plan workshop.yaml``, it is
 that of ``benchmarks.detector.workshop``, with arms in the plan. Photographs show a few scenes under several lights. An

@@ -45,14 +45,15 @@ def experiment_table(results: Mapping[str, Mapping[str, Any]], plan: str = "arms
     return "\n".join(lines)
 
 
-def precision_draws(results: Mapping[str, Mapping[str, Any]], plan: str = "arms") -> dict[str, np.ndarray]:
-    """Return the precision of each arm of a plan over draws of seeds and of scenes: shape (REDRAWS, draws).
+def precision_draws(results: Mapping[str, Mapping[str, Any]], plan: str = "arms", *arms: str) -> dict[str, np.ndarray]:
+    """Return the precision of all or some arms over draws of seeds and of scenes: shape (REDRAWS, draws).
 
     Each arm draws its own seeds, so that its values do not depend on other recorded arms.
     """
     return {
         arm: _redrawn(np.array([one["samples"][0] for one in found]), np.random.default_rng(list(arm.encode())))
-        for arm, found in _by_arm(results, plan).items()
+        for arm, found in _by_arm(results, plan, *arms).items()
+        if not arms or arm in arms
     }
 
 
@@ -63,6 +64,18 @@ def mean_precision(results: Mapping[str, Mapping[str, Any]], plan: str, arm: str
         KeyError: If there is none.
     """
     return _mean(_by_arm(results, plan, arm)[arm], "map50_95")
+
+
+def gain_cells(results: Mapping[str, Mapping[str, Any]], plan: str, arm: str, baseline: str) -> str:
+    """Return the gain of an arm over a baseline and its 95 % interval, as two cells of a table.
+
+    Raises:
+        KeyError: If one of them has no result.
+    """
+    gain = mean_precision(results, plan, arm) - mean_precision(results, plan, baseline)
+    draws = precision_draws(results, plan, arm, baseline)
+    low, high = np.percentile(draws[arm] - draws[baseline], [2.5, 97.5])
+    return f"{gain:+.3f} | {low:+.3f} to {high:+.3f}".replace("-", "−")
 
 
 def _mean(seeds: Sequence[Mapping[str, Any]], key: str) -> float:

@@ -143,7 +143,8 @@ def test_an_arm_starts_from_its_stated_weights(work, monkeypatch, arm, starts):
 
 def test_folds_are_trained_in_parallel_and_judged_after_all_of_them(work, tmp_path):
     plan = experiment.read_arms()
-    options = argparse.Namespace(work=work, plan=experiment.PLAN, workers=2, weights=None, hope=tmp_path)
+    weights = tmp_path / "coco.pt"
+    options = argparse.Namespace(work=work, plan=experiment.PLAN, workers=2, weights=weights, hope=tmp_path)
     options.render_devices, options.render_workers = ["cuda:0", "cuda:1"], 8
     todo = [("hybrid_more", 0), ("no_shadow", 0)]
     renders = {job.name: job for job in side_by_side.renders(todo, plan, options)}

@@ -1,7 +1,8 @@
 """Commands in README and docs, each run in a process of its own on real input without mocks.
 
 Other tests call the same code in a process where earlier tests have set up imports, Mitsuba's variant and caches. Here
-nothing is set up: the first command runs in a new process, the others in forks of :mod:`tests.forks`.
+nothing is set up: the first command runs in a new process, the others in forks of :mod:`tests.forks`. ``make test``
+runs :data:`QUICK` commands, and ``make test-extended`` all.
 """
 
 from __future__ import annotations
@@ -29,6 +30,7 @@ from mitsplat.cli import app
 from mitsplat.gaussians.surfels import place_surfels
 from mitsplat.physics.settle import settle_layout
 from mitsplat.scene.loading.scene_loading import load_scene
+from mitsplat.scene.spec import SceneSpec
 from tests import rendered
 from tests.capture.lighting import room
 from tests.cli.typed import run as type_in
@@ -121,10 +123,9 @@ def smaller(words: list[str]) -> list[str]:
 
 @pytest.fixture(scope="session")
 def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Create the files that documented commands name: a scene with two kinds of parts, a mesh in mm, splats, light.
+    """Create the files that quick commands and Python examples name: a scene with two kinds of parts, and splats.
 
-    The first commands settle layouts from an empty cache. The layouts of later commands are settled here with the same
-    code.
+    The first commands settle layouts from an empty cache.
     """
     folder = tmp_path_factory.mktemp("desk")
     shipped = YAML(typ="safe", pure=True).load(ROOT / "scenes/workcell.yaml")
@@ -135,13 +136,28 @@ def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
     shipped["output"] |= {"width": 128, "height": 72, "layouts": 12, "views": 1}
     for name in ("workcell", "tray"):
         YAML(typ="safe", pure=True).dump(shipped, folder / f"scenes/{name}.yaml")
-    scene = load_scene(folder / "scenes/workcell.yaml")
-    for index in (3, 7):
-        settle_layout(scene, index)
+    settle_layout(load_scene(folder / "scenes/workcell.yaml"), 3)
+    box_asset("plant").splats.save(folder / "plant.splat")
+    return folder
+
+
+@pytest.fixture(scope="session")
+def dataset_desk(desk: Path, forks: Forks) -> Path:
+    """Run the quick commands in their order, and return their folder."""
+    for words in QUICK:
+        obey(words, desk, forks, good=(0, 1) if words[1] == "doctor" else (0,))  # status 1: the machine is small
+    return desk
+
+
+def lay_inputs(folder: Path) -> None:
+    """Add the files that the other commands name: a mesh in mm, splats of an object and a room, photos of light.
+
+    The layout of a later command is settled here with the same code.
+    """
+    settle_layout(load_scene(folder / "scenes/workcell.yaml"), 7)
     gear = trimesh.creation.box((30, 20, 10))
     gear.visual.vertex_colors = [200, 60, 40, 255]
     gear.export(folder / "gear.glb")
-    box_asset("plant").splats.save(folder / "plant.splat")
     bottle, floor = trimesh.creation.cylinder(0.03, 0.2), trimesh.creation.box((1.2, 0.8, 0.02))
     for name, mesh in (("bottle", bottle), ("room", floor)):
         surfels = place_surfels(mesh, 1.0, 2500, np.random.default_rng(0))
@@ -151,7 +167,6 @@ def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (folder / name).mkdir(parents=True)
         room.photographs(folder / name, mirrored, [0.01, 0.05, 0.25, 1.2], ".jpg")
     write_exr(folder / "hall.exr", room.true_panorama(128, 8))
-    return folder
 
 
 PHOTOGRAPHS = ("capture", "asset", "fit", "mesh")
@@ -168,6 +183,11 @@ own.
 """
 SHOWN.sort(key=DOCUMENTED.index)  # a command comes after those whose output it needs
 
+QUICK = [
+    next(words for words in SHOWN if words[1] == name)
+    for name in ("render", "audit", "report", "board", "export", "schema", "doctor", "split")
+]
+"""One command of each kind that is quick, in an order in which they can run."""
 
 FILMED = [words for words in SHOWN if words[1] in PHOTOGRAPHS and any(word.endswith(".mp4") for word in words)]
 """Commands that begin with a video."""
@@ -207,22 +227,39 @@ def test_every_command_is_shown_in_the_documentation() -> None:
 
 
 @pytest.mark.slow
-def test_every_documented_command_runs_in_its_own_process(desk: Path, forks: Forks) -> None:
-    for words in SHOWN:
-        if words[1] in ("view", "compare", *DETECTORS):  # view is tested in tests/view; the others run below
-            continue
-        if words[1] not in PHOTOGRAPHS and "assets/mug" not in words:
-            # Status 1 means findings, which a box of 60 Gaussians and small machines may give.
-            obey(words, desk, forks, good=(0, 1) if words[1] in ("check", "doctor") else (0,))
-    made = ("out/cell/report.html", "frame.png", "drop.gif", "assets/gear/asset.yaml", "board.pdf", "frame.xml")
-    assert [
-        name for name in (*made, "frame_again.png", "out/whole/contact_sheet.jpg") if not (desk / name).stat().st_size
-    ] == []
+def test_quick_documented_commands_run_in_their_own_process(dataset_desk: Path) -> None:
+    desk = dataset_desk
+    made = ("out/cell/report.html", "board.pdf", "frame.xml")
+    assert [name for name in made if not (desk / name).stat().st_size] == []
     assert json.loads((desk / "scene.schema.json").read_text())["properties"]["camera"]
     assert len(list((desk / "out/cell/images").rglob("*.jpg"))) == 2
 
 
-@pytest.mark.slow
+@pytest.mark.extended
+def test_every_documented_command_runs_in_its_own_process(dataset_desk: Path, forks: Forks) -> None:
+    desk = dataset_desk
+    lay_inputs(desk)
+    for words in SHOWN:
+        # view is tested in tests/view; compare and the detectors run below.
+        if words in QUICK or words[1] in ("view", "compare", *DETECTORS):
+            continue
+        if words[1] not in PHOTOGRAPHS and "assets/mug" not in words:
+            # Status 1 means findings, which a box of 60 Gaussians may give.
+            obey(words, desk, forks, good=(0, 1) if words[1] == "check" else (0,))
+    made = ("frame.png", "drop.gif", "assets/gear/asset.yaml", "frame_again.png", "out/whole/contact_sheet.jpg")
+    assert [name for name in made if not (desk / name).stat().st_size] == []
+
+
+def test_the_files_of_the_tutorial_of_a_bin_are_valid(forks: Forks, tmp_path: Path) -> None:
+    (code,), (scene,) = blocks(TUTORIAL, "python"), blocks(TUTORIAL, "yaml")
+    done = forks.run(code, folder=tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert trimesh.load_mesh(tmp_path / "bracket.stl").is_watertight
+    assert len(list((tmp_path / "textures").iterdir())) == 4
+    SceneSpec.model_validate(YAML(typ="safe", pure=True).load(scene))
+
+
+@pytest.mark.extended
 def test_the_tutorial_of_a_bin_makes_a_bop_dataset(forks: Forks, tmp_path: Path) -> None:
     """All commands run in their order, on the files that the page makes. The audit finds no violation."""
     (code,), (scene,) = blocks(TUTORIAL, "python"), blocks(TUTORIAL, "yaml")
@@ -246,17 +283,16 @@ def lay_photographs(desk: Path) -> None:
         shutil.copyfile(desk / "out/cell/data.yaml", desk / "photographs/data.yaml")
 
 
-@pytest.mark.slow
-def test_the_documented_compare_commands_run(desk: Path, forks: Forks) -> None:
-    lay_photographs(desk)
+def test_the_documented_compare_commands_run(dataset_desk: Path, forks: Forks) -> None:
+    lay_photographs(dataset_desk)
     for words in SHOWN:
         if words[1] == "compare":
-            obey(words, desk, forks)
+            obey(words, dataset_desk, forks)
 
 
-@pytest.mark.slow
-def test_the_documented_detector_commands_run(desk: Path, forks: Forks) -> None:
-    """Runs after the commands above, which have written the dataset."""
+@pytest.mark.extended
+def test_the_documented_detector_commands_run(dataset_desk: Path, forks: Forks) -> None:
+    desk = dataset_desk
     if not all(map(find_spec, ("torch", "torchvision", "ultralytics"))):
         pytest.skip("Ultralytics and PyTorch are not installed")
     if subprocess.run([sys.executable, "-c", "import torchvision"], capture_output=True, check=False).returncode:
@@ -268,8 +304,18 @@ def test_the_documented_detector_commands_run(desk: Path, forks: Forks) -> None:
     assert (desk / "runs/mixed/evaluation/photographs-all/report.html").stat().st_size
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("page", [page for page in PAGES if blocks(page, "python")], ids=lambda page: page.stem)
+LONG_EXAMPLES = ("label_formats", "scaling_out", "train_detector")
+"""Pages whose Python examples need datasets of commands that are not quick, or repeat the example of another page."""
+
+
+@pytest.mark.parametrize(
+    "page",
+    [
+        pytest.param(page, id=page.stem, marks=[pytest.mark.extended] if page.stem in LONG_EXAMPLES else [])
+        for page in PAGES
+        if blocks(page, "python")
+    ],
+)
 def test_the_documented_python_examples_run(desk: Path, forks: Forks, page: Path) -> None:
     """Each page runs in one process, after the commands above, which have written the datasets of some pages."""
     # tests/frames/test_torch_dataset.py tests the loop over endless frames with a detector of the reader's.
@@ -292,7 +338,7 @@ def test_the_scene_of_the_guide_is_valid(tmp_path: Path) -> None:
     assert [finding.text for finding in check_scene(scene) if not finding.ok] == []
 
 
-@pytest.mark.slow
+@pytest.mark.extended
 def test_the_documented_photo_commands_make_an_asset(
     desk: Path, forks: Forks, captured: tuple[Path, Path, CaptureResult]
 ) -> None:
@@ -315,7 +361,7 @@ def test_the_documented_photo_commands_make_an_asset(
     assert [name for name in made if not (desk / name).stat().st_size] == []
 
 
-@pytest.mark.slow
+@pytest.mark.extended
 def test_the_documented_video_commands_make_a_capture(forks: Forks, tmp_path: Path) -> None:
     (tmp_path / "videos").mkdir()
     rendered.render_video(tmp_path / "videos/mug.mp4")

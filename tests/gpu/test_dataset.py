@@ -17,7 +17,7 @@ COMMAND = "from mitsplat.cli import main; main()"
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("device", ["cpu", "cuda"])
+@pytest.mark.parametrize("device", [pytest.param("cpu", marks=pytest.mark.extended), "cuda"])
 def test_processes_sharing_a_gpu_make_the_same_bytes(
     device: str, tmp_path: Path, request: pytest.FixtureRequest
 ) -> None:

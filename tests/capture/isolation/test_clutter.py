@@ -1,4 +1,4 @@
-"""Isolation of an object among clutter on five kinds of ground, without a hint, from path-traced photos.
+"""Isolation of an object among clutter on several kinds of ground, without a hint, from path-traced photos.
 
 Points come from the scene instead of feature matching. ``benchmarks.assets.clutter --ground KIND`` runs the complete
 pipeline with matching and fits.
@@ -60,7 +60,9 @@ def thing() -> Any:
     return speckled(solid())
 
 
-@pytest.mark.parametrize("kind", GROUNDS)
+@pytest.mark.parametrize(
+    "kind", [pytest.param(kind, marks=[] if kind == "cloth" else [pytest.mark.extended]) for kind in GROUNDS]
+)
 def test_an_object_in_clutter_is_isolated_without_a_hint(kind: str, thing: Any, tmp_path: Path) -> None:
     scene, views = room(kind=kind) | {"solid": thing}, walk(VIEWS, WIDTH)
     photograph(scene, views, tmp_path / "photos", samples=4, noise=0.008, gains=exposures(VIEWS))

@@ -332,23 +332,8 @@ class Drop:
 
     def _part(self, asset: Asset, progress: Note) -> _Part:
         """Build the physics data of an asset, once for all entries that share its mesh."""
-        if asset.mesh is None:
-            raise InputError(f"asset {asset.name!r} must have a mesh for physics (got none)")
         if id(asset.mesh) not in self._parts:
-            mesh = prepare_mesh(asset.mesh, f"asset {asset.name!r}")
-            surface = DistanceSurface(mesh)
-            pieces, standoff_distance = asset.pieces, 0.0
-            if pieces:
-                standoff_distance = standoff(surface, pieces)
-            else:
-                limit = max_gap(float(mesh.extents.max()))
-                for threshold in _CONCAVITIES:
-                    pieces = _pieces(mesh, asset.name, progress, threshold=threshold)
-                    standoff_distance = standoff(surface, pieces)
-                    if standoff_distance <= limit:
-                        break
-            mass = mass_properties(mesh, pieces, density=asset.density, mass=asset.mass)
-            self._parts[id(asset.mesh)] = _Part(Body(pieces, mass, _material(asset)), surface, standoff_distance)
+            self._parts[id(asset.mesh)] = _make_part(asset, progress)
         return self._parts[id(asset.mesh)]
 
     def _make_ground(self, surroundings: Asset | None, progress: Note) -> _Ground:
@@ -362,18 +347,12 @@ class Drop:
             if not (shape.visible or shape.proxy):
                 walls.append(len(colliders))
             mesh = prepare_mesh(shape_mesh, f"shape {shape.name!r}")
-            if shape.bin is not None:
-                collider = Collider(_material(shape), pieces=bin_walls(shape.bin))
-            elif shape.box is None:
-                collider = Collider(_material(shape), pieces=_pieces(mesh, shape.name, progress))
-            else:
-                collider = Collider(_material(shape), box=(shape.box.size, pose_matrix(shape.box)))
+            collider = make_collider(shape, mesh, progress)
             colliders.append(collider)
             obstacles.append(PlacedSurface(shape.name, DistanceSurface(mesh)))
         if surroundings is not None and surroundings.mesh is not None:
             mesh = prepare_mesh(surroundings.mesh, f"asset {surroundings.name!r}", solid=False)
-            pieces = surroundings.pieces or _pieces(mesh, surroundings.name, progress)
-            colliders.append(Collider(_material(surroundings), pieces=pieces))
+            colliders.append(make_collider(surroundings, mesh, progress))
             obstacles.append(PlacedSurface(surroundings.name, DistanceSurface(mesh)))
         if not colliders:
             raise InputError(f"{scene.path}: at least one shape must be a collider, on which objects rest (got none)")
@@ -501,6 +480,52 @@ class Drop:
             Instance(one.id, one.asset, self.scene.class_index(one.asset), pose)
             for one, pose in zip(drawn, poses, strict=True)
         )
+
+
+def make_body(asset: Asset, progress: Note) -> Body:
+    """Return the rigid body of an asset: its convex pieces, computed if it has none, its mass and its material.
+
+    Raises:
+        InputError: If the asset has no mesh, or its mesh has no volume.
+    """
+    return _make_part(asset, progress).body
+
+
+def make_collider(surface: Asset | Shape, mesh: trimesh.Trimesh, progress: Note) -> Collider:
+    """Return the static collider of a shape, or of an environment.
+
+    Args:
+        surface: The shape or environment.
+        mesh: Its mesh in world space [m], prepared by :func:`mitsplat.geometry.mesh.prepare_mesh`.
+        progress: Callback for slow operations.
+    """
+    if isinstance(surface, Asset):
+        return Collider(_material(surface), pieces=surface.pieces or _pieces(mesh, surface.name, progress))
+    if surface.bin is not None:
+        return Collider(_material(surface), pieces=bin_walls(surface.bin))
+    if surface.box is None:
+        return Collider(_material(surface), pieces=_pieces(mesh, surface.name, progress))
+    return Collider(_material(surface), box=(surface.box.size, pose_matrix(surface.box)))
+
+
+def _make_part(asset: Asset, progress: Note) -> _Part:
+    """Build the physics data of an asset."""
+    if asset.mesh is None:
+        raise InputError(f"asset {asset.name!r} must have a mesh for physics (got none)")
+    mesh = prepare_mesh(asset.mesh, f"asset {asset.name!r}")
+    surface = DistanceSurface(mesh)
+    pieces, standoff_distance = asset.pieces, 0.0
+    if pieces:
+        standoff_distance = standoff(surface, pieces)
+    else:
+        limit = max_gap(float(mesh.extents.max()))
+        for threshold in _CONCAVITIES:
+            pieces = _pieces(mesh, asset.name, progress, threshold=threshold)
+            standoff_distance = standoff(surface, pieces)
+            if standoff_distance <= limit:
+                break
+    mass = mass_properties(mesh, pieces, density=asset.density, mass=asset.mass)
+    return _Part(Body(pieces, mass, _material(asset)), surface, standoff_distance)
 
 
 def _material(surface: Asset | Shape) -> ContactMaterial:

@@ -35,12 +35,12 @@ _GRAVITY = (0.0, 0.0, -GRAVITY)
 # Contact of damping 2/t and stiffness 1/(t z)^2, as in MuJoCo, for all contacts that are no impacts (see
 # :mod:`mitsplat.physics.restitution`). At a damping ratio z of 1, a body would rebound from a drop of 0.3 m by 5 mm,
 # because contact cannot pull. From 1.5 on it does not leave the table. At 2 it penetrates deeper without benefit.
-_CONTACT_TIME, _DAMPING_RATIO = 0.004, 1.5
-_DAMPED = 1 / (_CONTACT_TIME * _DAMPING_RATIO) ** 2, 2 / _CONTACT_TIME
-_WITH_ROLL, _WITHOUT_ROLL = 6, 4  # contact dimensions: normal, two sliding, spin, and two rolling
+CONTACT_TIME, DAMPING_RATIO = 0.004, 1.5
+CONTACT_STIFFNESS, CONTACT_DAMPING = 1 / (CONTACT_TIME * DAMPING_RATIO) ** 2, 2 / CONTACT_TIME
+WITH_ROLL, _WITHOUT_ROLL = 6, 4  # contact dimensions: normal, two sliding, spin, and two rolling
 # Impedance of contacts at the surface and 1 mm deep: at MuJoCo's default of 0.9, a nut under a plate of a hundred times
 # its mass sinks by 1 mm. MuJoCo's own contacts flicker, and come to rest less often when stiffer.
-_IMPEDANCE_WARP, _IMPEDANCE_MUJOCO = (0.996, 0.9999), (0.99, 0.999)
+_IMPEDANCE_WARP, IMPEDANCE_MUJOCO = (0.996, 0.9999), (0.99, 0.999)
 _STEPS = 4  # per captured graph; even, so that the two states return to their roles
 _SOLVER_OPTIONS: dict[str, Any] = {
     "integrator": "implicitfast",
@@ -256,7 +256,7 @@ class WarpWorld(World):
             raise ContactOverflow
 
     def _allow_rolling(self, allowed: bool) -> None:
-        self._solver.mjw_model.geom_condim.fill_(_WITHOUT_ROLL if allowed else _WITH_ROLL)
+        self._solver.mjw_model.geom_condim.fill_(_WITHOUT_ROLL if allowed else WITH_ROLL)
 
     def _coordinates(self) -> Float64Array:
         return _array(self._states[0].body_q)
@@ -268,7 +268,7 @@ class MujocoWorld(World):
     def __init__(self, bodies: Sequence[Body], colliders: Sequence[Collider], *, timestep: float) -> None:
         super().__init__(bodies, timestep=timestep)
         solver = PairContactSolver(
-            _build_model(bodies, colliders, _IMPEDANCE_MUJOCO, False),
+            _build_model(bodies, colliders, IMPEDANCE_MUJOCO, False),
             use_mujoco_cpu=True,
             **_SOLVER_OPTIONS,
         )
@@ -345,7 +345,7 @@ class MujocoWorld(World):
         contact.solimp[fast, :2] = IMPACT_IMPEDANCE
 
     def _allow_rolling(self, allowed: bool) -> None:
-        self._model.geom_condim[:] = _WITHOUT_ROLL if allowed else _WITH_ROLL
+        self._model.geom_condim[:] = _WITHOUT_ROLL if allowed else WITH_ROLL
 
     def _coordinates(self) -> Float64Array:
         return np.array(self._data.qpos).reshape(-1, 7)[:, [0, 1, 2, 4, 5, 6, 3]]
@@ -400,13 +400,13 @@ def _build_scene(
     Newton analyses convex hulls for its contacts, which takes as long as all other steps. MuJoCo makes the hulls of
     meshes itself.
     """
-    contact = {"mujoco:condim": _WITH_ROLL, "mujoco:geom_solimp": (*impedance, 1e-3, 0.5, 2.0)}
+    contact = {"mujoco:condim": WITH_ROLL, "mujoco:geom_solimp": (*impedance, 1e-3, 0.5, 2.0)}
     builder = newton.ModelBuilder(gravity=_GRAVITY)
     builder.validate_inertia_detailed = True  # in Python: the alternative compiles a kernel for 4 s
     SolverMuJoCo.register_custom_attributes(builder)
     add_hull = builder.add_shape_convex_hull if newton_contacts else builder.add_shape_mesh
     for collider in colliders:
-        config = collider.material.shape_config(*_DAMPED, size=0.0)
+        config = collider.material.shape_config(CONTACT_STIFFNESS, CONTACT_DAMPING, size=0.0)
         if collider.box is not None:
             size, pose = collider.box
             hx, hy, hz = np.divide(size, 2).tolist()
@@ -425,7 +425,7 @@ def _build_scene(
             lock_inertia=True,
         )
         if body is not None:
-            config = body.material.shape_config(*_DAMPED, size=body.size)
+            config = body.material.shape_config(CONTACT_STIFFNESS, CONTACT_DAMPING, size=body.size)
             for hull in body.hulls:
                 add_hull(link, mesh=hull, cfg=config, custom_attributes=contact)
     return builder

@@ -18,7 +18,7 @@ LAYERS = (
     ("reconstruct.pipeline", "report"),
     ("audit", "checks", "surroundings", "view"),
     ("dataset", "importing"),
-    ("bake", "formats", "frames.accuracy", "reconstruct"),
+    ("bake", "formats", "frames.accuracy", "reconstruct", "usd"),
     ("fit", "frames", "reconstruct.materials"),
     ("renderer",),
     ("plugins",),

@@ -122,7 +122,12 @@ def bake(
 
 def import_(
     file: Annotated[
-        Path, typer.Argument(metavar="FILE", help="Splat file (.ply, .compressed.ply, .splat, .ksplat, .spz or .sog).")
+        Path,
+        typer.Argument(
+            metavar="FILE",
+            help="Splat file (.ply, .compressed.ply, .splat, .ksplat, .spz or .sog), or OpenUSD stage (.usd, .usda, "
+            ".usdc or .usdz).",
+        ),
     ],
     out: AssetFolder,
     name: Name = None,
@@ -152,7 +157,9 @@ def import_(
     ] = False,
     mass: Annotated[float | None, typer.Option(help="Mass [kg]; alternative to --density.")] = None,
     density: Annotated[float | None, typer.Option(help="Mass density [kg/m^3]; 1000 by default.")] = None,
-    friction: Annotated[float, typer.Option(help="Coulomb friction coefficient.")] = 0.5,
+    friction: Annotated[
+        float | None, typer.Option(help="Coulomb friction coefficient; 0.5 if FILE states none.")
+    ] = None,
     light: Annotated[
         Literal["uniform", "scene"] | None,
         typer.Option(
@@ -175,12 +182,26 @@ def import_(
     Invisible, oversized and isolated Gaussians are removed, and the up axis is estimated. An object gets a mesh and
     convex collision pieces. The page report.html shows the result. Warnings are printed; `mitsplat check` runs more
     checks.
+
+    A USD stage states its unit and up axis. If it also has colliders, the asset gets its splats unchanged, and its
+    colliders, mass, friction and class. Everything else in the stage is listed.
     """
+    from mitsplat.usd.usd_layers import is_usd
+
+    _check_folder(out, file, name, overwrite=overwrite)
+    if is_usd(file):
+        fixed: dict[str, object] = {"--up": up != "auto", "--size": size, "--units": units, "--crop": crop}
+        fixed |= {"--without-table": without_table, "--flat-base": flat_base, "--scene": scene}
+        fixed |= {"--metallic": metallic, "--roughness": roughness}
+        given = [option for option, value in fixed.items() if value]
+        if _import_stage(
+            file, out, name, class_name, mass=mass, density=density, friction=friction, light=light, given=given
+        ):
+            return
     from mitsplat.importing.import_report import check_scene_path, write_import_report, write_scene
     from mitsplat.importing.splat_import import ImportSettings, import_splats
     from mitsplat.reconstruct.surface import SurfaceSettings
 
-    _check_folder(out, file, name, overwrite=overwrite)
     settings = ImportSettings(
         up=None if up == "auto" else up,
         units=units,
@@ -203,7 +224,7 @@ def import_(
             settings=settings,
             density=density,
             mass=mass,
-            friction=friction,
+            friction=0.5 if friction is None else friction,
             capture_light=light,
             progress=progress,
         )
@@ -227,6 +248,33 @@ def import_(
     if scene is not None:
         write_scene(scene, out, result)
         typer.echo(f"scene: {scene}")
+
+
+def _import_stage(
+    file: Path,
+    out: Path,
+    name: str | None,
+    class_name: str | None,
+    *,
+    mass: float | None,
+    density: float | None,
+    friction: float | None,
+    light: Literal["uniform", "scene"] | None,
+    given: list[str],
+) -> bool:
+    """Save the asset of a USD stage and return True; return False if the stage has no geometry beside its splats."""
+    from mitsplat.usd.stage_assets import read_stage_asset, with_values
+
+    found = read_stage_asset(file).asset
+    if found is None:
+        return False
+    if given:
+        raise InputError(f"{given[0]} does not apply to {file}, whose colliders state its geometry")
+    asset = with_values(found, name, class_name, mass=mass, density=density, friction=friction, light=light)
+    asset.save(out)
+    typer.echo(f"Gaussians: {len(asset.splats)}; {len(asset.pieces)} convex pieces")
+    typer.echo(f"asset: {out}")
+    return True
 
 
 def _check_folder(out: Path, source: Path, name: str | None, *, overwrite: bool) -> None:

@@ -493,27 +493,62 @@ def settle(
 
 
 def export(
-    scene: SceneFile,
+    source: Annotated[Path, typer.Argument(metavar="ASSET|SCENE", help="Asset folder or scene file (.yaml).")],
     frame: FrameIndex = 0,
-    out: Annotated[Path, typer.Option("--out", "-o", help="Mitsuba scene to write (.xml).")] = Path("scene.xml"),
+    out: Annotated[
+        Path,
+        typer.Option(
+            "--out",
+            "-o",
+            help="Mitsuba scene (.xml), OpenUSD stage (.usd, .usda, .usdc, .usdz), or MJCF.",
+        ),
+    ] = Path("scene.xml"),
+    mjcf: Annotated[
+        bool, typer.Option("--mjcf", help="Write the .xml file as an MJCF model for MuJoCo instead of a Mitsuba scene.")
+    ] = False,
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Replace an existing file, including manual changes.")
     ] = False,
     allow_outside: AllowOutside = False,
 ) -> None:
-    """Export one frame of SCENE as a Mitsuba scene.
+    """Export one frame of SCENE, or ASSET, to other programs.
 
-    The XML file can be edited and rendered with `mitsplat render`.
+    A Mitsuba scene can be edited and rendered with `mitsplat render`. A USD stage has splats, colliders, masses,
+    friction, poses at rest, camera, lights and semantic labels. An MJCF model has the bodies and shapes for MuJoCo.
+    Whatever a format cannot hold is listed.
     """
-    check_new(out, ".xml", overwrite=overwrite)
+    from mitsplat.usd.usd_layers import USD_SUFFIXES
+
+    check_new(out, ".xml", *(() if mjcf else USD_SUFFIXES), overwrite=overwrite)
     files = out.with_name(f"{out.stem}_files")
     if files.exists() and not overwrite and not (files.is_dir() and not any(files.iterdir())):
         raise InputError(f"--out {out}: the folder {files} must not exist yet; --overwrite replaces its files")
-    from mitsplat.frames.mitsuba_xml import export_xml
-    from mitsplat.scene.loading.scene_loading import load_scene
+    is_asset, to_mitsuba = source.is_dir(), out.suffix.lower() == ".xml" and not mjcf
+    losses: tuple[str, ...] = ()
+    if is_asset and to_mitsuba:
+        raise InputError(f"--out of an asset must be a USD stage, or MJCF with --mjcf (got {out})")
+    if is_asset:
+        from mitsplat.asset import Asset
+        from mitsplat.usd.mjcf import export_asset_mjcf
+        from mitsplat.usd.usd_export import export_asset_usd
 
-    export_xml(load_scene(scene, allow_outside=allow_outside), frame, out)
-    typer.echo(f"scene: {out}")
+        losses = (export_asset_mjcf if mjcf else export_asset_usd)(Asset.load(source), out)
+    else:
+        from mitsplat.scene.loading.scene_loading import load_scene
+
+        scene = load_scene(source, allow_outside=allow_outside)
+        if to_mitsuba:
+            from mitsplat.frames.mitsuba_xml import export_xml
+
+            export_xml(scene, frame, out)
+        else:
+            from mitsplat.usd.mjcf import export_scene_mjcf
+            from mitsplat.usd.usd_export import export_scene_usd
+
+            losses = (export_scene_mjcf if mjcf else export_scene_usd)(scene, frame, out)
+    for loss in losses:
+        typer.echo(f"not exported: {loss}")
+    typer.echo(f"{'asset' if is_asset else 'scene'}: {out}")
 
 
 def schema() -> None:

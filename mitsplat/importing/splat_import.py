@@ -31,6 +31,8 @@ from mitsplat.reconstruct.segment_splats import find_floaters, long_needles, vis
 from mitsplat.reconstruct.surface import SurfaceSettings, reconstruct_surface
 from mitsplat.renderer.layers import render_splats
 from mitsplat.runtime.variant import one_at_a_time
+from mitsplat.usd.stage_assets import read_stage_asset
+from mitsplat.usd.usd_layers import is_usd
 
 MIN_OPACITY = 1 / 255
 """Opacity below which a Gaussian is invisible in every picture."""
@@ -204,7 +206,7 @@ def import_splats(
     """Convert a splat file to an asset.
 
     Args:
-        path: Any file that :meth:`mitsplat.Splats.load` reads.
+        path: Any file that :meth:`mitsplat.Splats.load` reads, or a USD stage.
         name: Name of the asset.
         class_name: Class label for detectors; ``name`` if None.
         kind: ``object`` or ``environment``. Objects can be dropped, so they get a closed mesh and convex pieces.
@@ -234,7 +236,12 @@ def import_splats(
             progress(next(stages), _STAGES, stage_name)
 
     report("reading the file")
-    loaded = Splats.load(path)
+    if is_usd(path):  # a stage states its unit and axis, and its splats are in metres with z up
+        loaded = read_stage_asset(path).splats
+        units = settings.units if settings.units or settings.size else 1.0
+        settings = replace(settings, up=settings.up or "z", units=units)
+    else:
+        loaded = Splats.load(path)
     if not len(loaded):
         raise InputError(f"{path}: must hold at least one Gaussian (got 0)")
     cleaner = _Cleaner(path, loaded)

@@ -1,0 +1,419 @@
+"""Content of a USD stage as records, which a child process reads from an untrusted file.
+
+Poses are in metres with z up: every matrix maps the coordinates of a prim to the world of mitsplat. Conventions of
+particle fields are those of the OpenUSD user guide, pages of ``UsdVol``: scales are linear standard deviations and
+opacities lie in [0, 1]; SH coefficients are grouped by particle, band by band; attributes of single precision are
+preferred to those of half precision; arrays that are too long are cut, and arrays that are too short are ignored.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+from collections import defaultdict
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, BinaryIO, cast
+
+import numpy as np
+import numpy.typing as npt
+
+from mitsplat.arrays import Float32Array, Float64Array
+from mitsplat.errors import InputError
+from mitsplat.runtime.child_process import run_bounded
+from mitsplat.usd.usd_layers import open_confined, require_usd
+
+if TYPE_CHECKING:
+    from pxr import Usd, UsdGeom
+
+Record = dict[str, Any]
+
+METADATA = "mitsplat"
+"""Key of ``customData``, and namespace of attributes, for values that no schema of USD has."""
+MAX_DEGREE = 3
+_MEMORY = 2 << 30
+_MEMORY_PER_BYTE = 60
+"""Permitted memory of the reader per byte of the stage's folder; text is longer than the arrays that it states."""
+_SECONDS = 600
+_MAX_SIZE = 8 << 30
+_Z_UP_FROM_Y_UP = np.array([[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]], dtype=np.float64)
+_ROUND_SEGMENTS = 64
+
+
+def read_records(path: Path) -> Record:
+    """Read the content of a stage in a child process with bounded memory and time.
+
+    Returns:
+        Lists of records: ``fields``, ``bodies``, ``colliders``, ``meshes``, ``cameras`` and ``lights``; and ``notes``,
+        one sentence for everything that is not read.
+
+    Raises:
+        InputError: If a file is missing or damaged, lies outside of the stage's folder, or breaks a rule.
+        MissingResourceError: If OpenUSD is not installed.
+    """
+    require_usd()
+    if not path.is_file():
+        raise InputError(f"{path}: no such file")
+    size = path.stat().st_size
+    if size > _MAX_SIZE:
+        raise InputError(f"{path}: must be a stage of at most {_MAX_SIZE} bytes (got {size})")
+    size = min(_MAX_SIZE, size + sum(file.stat().st_size for file in path.parent.glob("**/*.usd*") if file.is_file()))
+    memory = _MEMORY + _MEMORY_PER_BYTE * size
+    result = run_bounded(write_records, path, memory=memory, seconds=_SECONDS)
+    if result.status:
+        reason = result.reason if result.status > 0 else f"its reader {result.reason}"
+        raise InputError(reason if reason.startswith(str(path)) else f"{path}: {reason}")
+    if result.status is None:
+        raise InputError(f"{path}: its reader {result.reason}")
+    with np.load(io.BytesIO(result.output), allow_pickle=False) as stored:
+        arrays = {name: stored[name] for name in stored.files}
+    return cast(Record, _with_arrays(json.loads(arrays.pop("records").tobytes()), arrays))
+
+
+def write_records(output: BinaryIO, _: bytes, path: str) -> None:
+    """Read a stage and write its records, as the child's part of :func:`read_records`."""
+    arrays: dict[str, npt.NDArray[Any]] = {}
+    text = json.dumps(_without_arrays(_StageReader(open_confined(Path(path))).read(), arrays))
+    arrays["records"] = np.frombuffer(text.encode(), dtype=np.uint8)
+    np.savez(output, allow_pickle=False, **arrays)
+
+
+def _without_arrays(value: Any, arrays: dict[str, npt.NDArray[Any]]) -> Any:
+    """Return a record whose arrays are replaced by their names in ``arrays``."""
+    if isinstance(value, np.ndarray):
+        arrays[f"a{len(arrays)}"] = value
+        return {"array": f"a{len(arrays) - 1}"}
+    if isinstance(value, dict):
+        return {key: _without_arrays(one, arrays) for key, one in value.items()}
+    return [_without_arrays(one, arrays) for one in value] if isinstance(value, list) else value
+
+
+def _with_arrays(value: Any, arrays: dict[str, npt.NDArray[Any]]) -> Any:
+    if isinstance(value, dict):
+        if value.keys() == {"array"}:
+            return arrays[value["array"]]
+        return {key: _with_arrays(one, arrays) for key, one in value.items()}
+    return [_with_arrays(one, arrays) for one in value] if isinstance(value, list) else value
+
+
+class _StageReader:
+    """Reader of one stage at its first time."""
+
+    def __init__(self, stage: Usd.Stage) -> None:
+        from pxr import Usd, UsdGeom, UsdPhysics  # optional, and slow to import
+
+        self._stage, self._time = stage, Usd.TimeCode.EarliestTime()
+        units = UsdGeom.GetStageMetersPerUnit(stage)
+        if not 0 < units < np.inf:
+            raise InputError(f"metersPerUnit must be finite and > 0 (got {units:g})")
+        up = _Z_UP_FROM_Y_UP if UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.y else np.eye(4)
+        self._world_from_stage = np.diag([units, units, units, 1.0]) @ up
+        self._units, self._kilograms = units, UsdPhysics.GetStageKilogramsPerUnit(stage)
+        self._cache = UsdGeom.XformCache(self._time)
+        self._ignored: dict[str, list[str]] = defaultdict(list)
+
+    def read(self) -> Record:
+        """Return the records of all prims."""
+        from pxr import Usd, UsdGeom, UsdLux, UsdPhysics, UsdVol  # optional
+
+        found: Record = {key: [] for key in ("fields", "bodies", "colliders", "meshes", "cameras", "lights")}
+        for prim in self._stage.Traverse(Usd.TraverseInstanceProxies()):
+            imageable = UsdGeom.Imageable(prim)
+            if imageable and imageable.ComputeVisibility(self._time) == UsdGeom.Tokens.invisible:
+                if prim.IsA(UsdGeom.Boundable):
+                    self._ignored["invisible prims"].append(str(prim.GetPath()))
+                continue
+            if prim.HasAPI(UsdPhysics.RigidBodyAPI):
+                found["bodies"].append(self._body(prim))
+            if prim.IsA(UsdVol.ParticleField):
+                if self._is_gaussian(prim):
+                    found["fields"].append(self._field(prim))
+                else:
+                    self._ignored["particle fields without Gaussian ellipsoids and SH"].append(str(prim.GetPath()))
+            elif prim.IsA(UsdGeom.Camera):
+                found["cameras"].append(self._camera(prim))
+            elif prim.HasAPI(UsdLux.LightAPI):
+                found["lights"].append(self._light(prim))
+            elif prim.IsA(UsdGeom.Gprim):
+                self._gprim(prim, found)
+            elif prim.IsA(UsdGeom.Boundable) or prim.IsA(UsdPhysics.Joint):
+                self._ignored[f"prims of type {prim.GetTypeName()}"].append(str(prim.GetPath()))
+        found["notes"] = [
+            *self._assumptions(),
+            *(f"not imported: {error}" for error in self._stage.GetCompositionErrors()),
+        ]
+        for what, paths in self._ignored.items():
+            found["notes"].append(f"not imported: {len(paths)} {what} ({paths[0]}{', ...' if paths[1:] else ''})")
+        found["default"] = str(self._stage.GetDefaultPrim().GetPath()) if self._stage.GetDefaultPrim() else ""
+        return found
+
+    def _assumptions(self) -> Iterator[str]:
+        """Yield a note for each unit or axis that the stage does not state."""
+        from pxr import UsdGeom  # optional
+
+        if not UsdGeom.StageHasAuthoredMetersPerUnit(self._stage):
+            yield f"metersPerUnit is not stated, so that USD's default of {self._units:g} applies"
+        if not self._stage.HasAuthoredMetadata("upAxis"):
+            yield f"upAxis is not stated, so that USD's default of {UsdGeom.GetStageUpAxis(self._stage)} applies"
+
+    def _world_from(self, prim: Usd.Prim) -> Float64Array:
+        """Return the matrix from the prim's coordinates to the world in metres with z up, shape (4, 4)."""
+        matrix = np.array(self._cache.GetLocalToWorldTransform(prim)).T  # USD multiplies row vectors
+        return np.asarray(self._world_from_stage @ matrix, dtype=np.float64)
+
+    def _base(self, prim: Usd.Prim) -> Record:
+        """Return the values that records of all kinds have."""
+        from pxr import UsdPhysics  # optional
+
+        body = prim
+        while body and not body.HasAPI(UsdPhysics.RigidBodyAPI):
+            body = body.GetParent()
+        owner = prim
+        while owner and METADATA not in owner.GetCustomData():
+            owner = owner.GetParent()
+        return {
+            "path": str(prim.GetPath()),
+            "matrix": self._world_from(prim),
+            "body": str(body.GetPath()) if body else None,
+            "owner": str(owner.GetPath()) if owner else None,
+            "metadata": _plain(owner.GetCustomData()[METADATA]) if owner else {},
+            "label": self._label(prim),
+        }
+
+    def _label(self, prim: Usd.Prim) -> str | None:
+        """Return the semantic class of a prim or of its nearest ancestor with one."""
+        from pxr import UsdSemantics  # optional
+
+        while prim and prim.GetPath().IsPrimPath():
+            taxonomies = UsdSemantics.LabelsAPI.GetDirectTaxonomies(prim)
+            for taxonomy in sorted(taxonomies, key=lambda name: name != "class"):
+                if labels := UsdSemantics.LabelsAPI(prim, taxonomy).GetLabelsAttr().Get(self._time):
+                    return str(labels[0])
+            # Isaac Sim before 5.0: SemanticsAPI:NAME with pairs of type and data.
+            for attribute in prim.GetAttributes():
+                name = attribute.GetName()
+                if (
+                    name.startswith("semantic:")
+                    and name.endswith(":params:semanticType")
+                    and attribute.Get() == "class"
+                ):
+                    return str(prim.GetAttribute(name.removesuffix("Type") + "Data").Get())
+            prim = prim.GetParent()
+        return None
+
+    def _value(self, prim: Usd.Prim, name: str) -> Any:
+        attribute = prim.GetAttribute(name)
+        return attribute.Get(self._time) if attribute else None
+
+    def _array(self, prim: Usd.Prim, name: str, count: int, default: npt.ArrayLike, group: int = 1) -> Float32Array:
+        """Return an attribute per particle: single precision, else half precision, else the default."""
+        row = np.shape(default)
+        for key in (name, f"{name}h"):
+            values = self._value(prim, key)
+            if values is None or not len(values):
+                continue
+            if len(values) >= count * group:
+                if len(values) > count * group:
+                    self._ignored[f"surplus values of {key}"].append(str(prim.GetPath()))
+                return np.array(values, dtype=np.float32)[: count * group].reshape(count * group, *row)
+            self._ignored[f"values of {key} that are too few"].append(str(prim.GetPath()))
+        return np.broadcast_to(np.asarray(default, dtype=np.float32), (count * group, *row)).copy()
+
+    @staticmethod
+    def _is_gaussian(prim: Usd.Prim) -> bool:
+        from pxr import UsdVol  # optional
+
+        needed = UsdVol.ParticleFieldKernelGaussianEllipsoidAPI, UsdVol.ParticleFieldSphericalHarmonicsAttributeAPI
+        return all(prim.HasAPI(schema) for schema in (*needed, UsdVol.ParticleFieldPositionAttributeAPI))
+
+    def _field(self, prim: Usd.Prim) -> Record:
+        """Return the record of a particle field."""
+        values = (self._value(prim, key) for key in ("positions", "positionsh"))
+        positions = next((found for found in values if found is not None and len(found)), ())
+        count, degree = len(positions), int(self._value(prim, "radiance:sphericalHarmonicsDegree"))
+        if not 0 <= degree <= 32:
+            raise InputError(f"{prim.GetPath()}: the degree of spherical harmonics must be 0 to 32 (got {degree})")
+        terms, name = (degree + 1) ** 2, "radiance:sphericalHarmonicsCoefficients"
+        sh = self._array(prim, name, count, (0.0, 0.0, 0.0), terms).reshape(count, terms, 3)
+        if degree > MAX_DEGREE:
+            self._ignored[f"bands of spherical harmonics above degree {MAX_DEGREE}"].append(str(prim.GetPath()))
+            sh = sh[:, : (MAX_DEGREE + 1) ** 2]
+        record = self._base(prim) | {
+            "means": np.array(positions, dtype=np.float32).reshape(count, 3),
+            "quats": self._array(prim, "orientations", count, (0.0, 0.0, 0.0, 1.0)),  # GfQuat stores xyzw
+            "scales": self._array(prim, "scales", count, (1.0, 1.0, 1.0)),
+            "opacities": self._array(prim, "opacities", count, 1.0),
+            "sh": sh,
+            "colour_space": self._colour_space(prim, name),
+        }
+        for key in ("metallic", "roughness", "specular", "normals"):
+            if (values := self._value(prim, f"{METADATA}:{key}")) is not None:
+                record[key] = np.array(values, dtype=np.float32)
+        return record
+
+    @staticmethod
+    def _colour_space(prim: Usd.Prim, name: str) -> str:
+        """Return the colour space that the file states for an attribute, or an empty text."""
+        from pxr import Usd  # optional
+
+        for key in (f"{name}", f"{name}h"):
+            if prim.GetAttribute(key).HasColorSpace():
+                return str(prim.GetAttribute(key).GetColorSpace())
+        while prim:
+            if prim.HasAPI(Usd.ColorSpaceAPI) and (space := Usd.ColorSpaceAPI(prim).GetColorSpaceNameAttr().Get()):
+                return str(space)
+            prim = prim.GetParent()
+        return ""
+
+    def _body(self, prim: Usd.Prim) -> Record:
+        """Return the record of a rigid body; mass, centre and inertia are None where the stage does not state them."""
+        from pxr import UsdPhysics  # optional
+
+        mass = UsdPhysics.MassAPI(prim) if prim.HasAPI(UsdPhysics.MassAPI) else None
+
+        def stated(attribute: Any, valid: Any) -> Any:
+            value = attribute.Get(self._time) if attribute else None
+            return value if value is not None and valid(value) else None
+
+        record: Record = dict.fromkeys(("mass", "density", "centre", "inertia", "axes"))
+        if mass is not None:
+            record["mass"] = stated(mass.GetMassAttr(), lambda value: value > 0)
+            record["density"] = stated(mass.GetDensityAttr(), lambda value: value > 0)
+            centre = stated(mass.GetCenterOfMassAttr(), lambda value: np.isfinite(value).all())
+            inertia = stated(mass.GetDiagonalInertiaAttr(), lambda value: any(value))
+            axes = stated(mass.GetPrincipalAxesAttr(), lambda value: value.GetLength() > 0)
+            if record["mass"] is not None:
+                record["mass"] *= self._kilograms
+            if record["density"] is not None:
+                record["density"] *= self._kilograms / self._units**3
+            record["centre"] = None if centre is None else list(centre)
+            record["inertia"] = (
+                None if inertia is None else [value * self._kilograms * self._units**2 for value in inertia]
+            )
+            record["axes"] = None if axes is None else [*axes.GetImaginary(), axes.GetReal()]
+        return self._base(prim) | record
+
+    def _gprim(self, prim: Usd.Prim, found: Record) -> None:
+        """Add the record of a geometric prim: a collider, and a mesh if it is rendered."""
+        from pxr import UsdGeom, UsdPhysics  # optional
+
+        triangles = self._triangles(prim)
+        if triangles is None:
+            self._ignored[f"prims of type {prim.GetTypeName()}"].append(str(prim.GetPath()))
+            return
+        points, faces = triangles
+        record = self._base(prim) | {"points": points, "faces": faces, "type": str(prim.GetTypeName())}
+        purpose = UsdGeom.Imageable(prim).ComputePurpose()
+        colour = UsdGeom.Gprim(prim).GetDisplayColorAttr().Get(self._time)
+        record["colour"] = list(colour[0]) if colour else None
+        record["visible"] = purpose in (UsdGeom.Tokens.default_, UsdGeom.Tokens.render)
+        if prim.HasAPI(UsdPhysics.CollisionAPI) and UsdPhysics.CollisionAPI(prim).GetCollisionEnabledAttr().Get():
+            approximation = "convexHull"
+            if prim.IsA(UsdGeom.Mesh):
+                approximation = UsdPhysics.MeshCollisionAPI(prim).GetApproximationAttr().Get() or "none"
+            found["colliders"].append({**record, "approximation": approximation, **self._contact(prim)})
+        if record["visible"] or prim.GetAttribute(f"{METADATA}:proxy"):
+            found["meshes"].append(record)
+
+    def _contact(self, prim: Usd.Prim) -> Record:
+        """Return friction and restitution of the physics material that is bound to a collider."""
+        from pxr import UsdPhysics, UsdShade  # optional
+
+        bound = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial("physics")[0]
+        if not bound or not bound.GetPrim().HasAPI(UsdPhysics.MaterialAPI):
+            return {"friction": None, "restitution": None}
+        material = UsdPhysics.MaterialAPI(bound)
+        return {
+            "friction": material.GetDynamicFrictionAttr().Get(self._time),
+            "restitution": material.GetRestitutionAttr().Get(self._time),
+        }
+
+    def _triangles(self, prim: Usd.Prim) -> tuple[Float64Array, npt.NDArray[np.int64]] | None:
+        """Return vertices and triangles of a prim in its own coordinates; None for an unsupported type."""
+        import trimesh  # the child alone needs it
+        from pxr import UsdGeom  # optional
+
+        solids = trimesh.creation
+        if prim.IsA(UsdGeom.Mesh):
+            return _mesh_triangles(UsdGeom.Mesh(prim), self._time)
+        if prim.IsA(UsdGeom.Cube):
+            mesh = solids.box([UsdGeom.Cube(prim).GetSizeAttr().Get(self._time)] * 3)
+        elif prim.IsA(UsdGeom.Sphere):
+            mesh = solids.icosphere(3, UsdGeom.Sphere(prim).GetRadiusAttr().Get(self._time))
+        elif prim.IsA(UsdGeom.Cylinder) or prim.IsA(UsdGeom.Capsule) or prim.IsA(UsdGeom.Cone):
+            height, radius = self._value(prim, "height"), self._value(prim, "radius")
+            if prim.IsA(UsdGeom.Cylinder):
+                mesh = solids.cylinder(radius, height, sections=_ROUND_SEGMENTS)
+            elif prim.IsA(UsdGeom.Capsule):
+                mesh = solids.capsule(height, radius)
+            else:
+                mesh = solids.cone(radius, height, sections=_ROUND_SEGMENTS)
+            mesh.apply_translation([0, 0, -mesh.bounds.mean(axis=0)[2]])
+            mesh.vertices = np.roll(mesh.vertices, {"X": 1, "Y": 2, "Z": 0}[self._value(prim, "axis")], axis=1)
+        else:
+            return None
+        return np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces, dtype=np.int64)
+
+    def _camera(self, prim: Usd.Prim) -> Record:
+        """Return the record of a camera: GfCamera, apertures and focal length in tenths of a unit."""
+        from pxr import UsdGeom  # optional
+
+        camera = UsdGeom.Camera(prim)
+        names = [f"{axis}Aperture{end}" for axis in ("Horizontal", "Vertical") for end in ("", "Offset")]
+        names += ["FocalLength", "FStop", "FocusDistance"]
+        values = {name: float(getattr(camera, f"Get{name}Attr")().Get(self._time)) for name in names}
+        if camera.GetProjectionAttr().Get(self._time) != UsdGeom.Tokens.perspective:
+            self._ignored["orthographic projections"].append(str(prim.GetPath()))
+        return self._base(prim) | values | {"units": self._units}
+
+    def _light(self, prim: Usd.Prim) -> Record:
+        """Return the record of a light with the inputs that UsdLux defines for its type."""
+        inputs = {
+            attribute.GetName().removeprefix("inputs:"): _plain(attribute.Get(self._time))
+            for attribute in prim.GetAttributes()
+            if attribute.GetName().startswith("inputs:")
+        }
+        treated = bool(self._value(prim, "treatAsPoint"))
+        return self._base(prim) | {"type": str(prim.GetTypeName()), "inputs": inputs, "point": treated}
+
+
+def _mesh_triangles(mesh: UsdGeom.Mesh, time: Usd.TimeCode) -> tuple[Float64Array, npt.NDArray[np.int64]] | None:
+    """Return vertices and triangles of a polygon mesh; polygons are split into fans."""
+    points, counts, corners = (
+        np.array(attribute.Get(time) if attribute.Get(time) is not None else ())
+        for attribute in (mesh.GetPointsAttr(), mesh.GetFaceVertexCountsAttr(), mesh.GetFaceVertexIndicesAttr())
+    )
+    path = mesh.GetPrim().GetPath()
+    if not len(counts):
+        return None
+    if counts.min() < 3 or counts.sum() != len(corners):
+        raise InputError(f"{path}: faceVertexCounts must be at least 3 and match faceVertexIndices ({len(corners)})")
+    if corners.min() < 0 or corners.max() >= len(points):
+        raise InputError(f"{path}: faceVertexIndices must be 0 to {len(points) - 1} (got {corners.max()})")
+    faces = np.concatenate(list(_fans(counts.astype(np.int64), corners.astype(np.int64))))
+    if mesh.GetOrientationAttr().Get() == "leftHanded":
+        faces = faces[:, ::-1]
+    return points.astype(np.float64), np.ascontiguousarray(faces)
+
+
+def _fans(counts: npt.NDArray[np.int64], corners: npt.NDArray[np.int64]) -> Iterator[npt.NDArray[np.int64]]:
+    """Yield the triangles (N, 3) of all polygons with equal numbers of corners."""
+    starts = np.cumsum(counts) - counts
+    for size in np.unique(counts):
+        first = starts[counts == size]
+        for corner in range(1, size - 1):
+            yield corners[np.stack([first, first + corner, first + corner + 1], axis=1)]
+
+
+def _plain(value: Any) -> Any:
+    """Return a value of USD as a JSON value."""
+    if isinstance(value, dict):
+        return {str(key): _plain(one) for key, one in value.items()}
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
+    if hasattr(value, "path"):  # SdfAssetPath
+        return str(value.path)
+    try:
+        return [_plain(one) for one in value]
+    except TypeError:
+        return str(value)

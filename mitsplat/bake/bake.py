@@ -33,6 +33,7 @@ from mitsplat.gaussians.surfels import Surfels
 from mitsplat.geometry.camera import Camera, spiral
 from mitsplat.geometry.decomposition import convex_pieces
 from mitsplat.images.colour import encode_srgb
+from mitsplat.mesh_files.mesh_file import MeshFile
 from mitsplat.progress import Progress
 from mitsplat.renderer.path_tracing import render_mesh, trace_radiance
 from mitsplat.runtime.variant import ensure_variant, one_at_a_time
@@ -123,7 +124,7 @@ class BakeSettings:
 
 @one_at_a_time
 def bake_asset(
-    mesh: trimesh.Trimesh | trimesh.Scene | str | Path,
+    mesh: trimesh.Trimesh | trimesh.Scene | MeshFile | str | Path,
     *,
     name: str,
     class_name: str | None = None,
@@ -144,15 +145,15 @@ def bake_asset(
     """Bake a textured or coloured mesh into an asset of Gaussians.
 
     Args:
-        mesh: Mesh, scene of several parts, or mesh file.
+        mesh: Mesh, scene of several parts, mesh file, or the content of one.
         name: Name of the asset.
         class_name: Class label for detectors; ``name`` if None.
         kind: ``object`` or ``environment``. Objects get convex pieces for physics.
         lights: Lights of a scene whose radiance is baked into an asset with ``capture_light: scene``. By default the
             asset has materials, and scenes light it.
         settings: Resolution.
-        metres_per_unit: Length of the mesh's unit [m]; by default that which the file states (glTF, 3MF, COLLADA), or
-            1 m.
+        metres_per_unit: Length of the mesh's unit [m]; by default that which the file states (STEP, glTF, 3MF,
+            COLLADA), or 1 m.
         up: Axis that points up in the mesh; by default that which the file states (glTF: y), or z.
         density: Mass density [kg/m^3].
         friction: Coulomb friction coefficient.

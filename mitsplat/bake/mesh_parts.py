@@ -152,7 +152,7 @@ class MeshModel:
 
 
 def read_parts(
-    mesh: trimesh.Trimesh | trimesh.Scene | str | Path,
+    mesh: trimesh.Trimesh | trimesh.Scene | MeshFile | str | Path,
     *,
     metres_per_unit: float | None = None,
     up: Literal["y", "z"] | None = None,
@@ -163,7 +163,7 @@ def read_parts(
 
 
 def read_model(
-    mesh: trimesh.Trimesh | trimesh.Scene | str | Path,
+    mesh: trimesh.Trimesh | trimesh.Scene | MeshFile | str | Path,
     *,
     metres_per_unit: float | None = None,
     up: Literal["y", "z"] | None = None,
@@ -172,7 +172,7 @@ def read_model(
     """Read a mesh or a mesh file [m], z up.
 
     Args:
-        mesh: The mesh, or its file.
+        mesh: The mesh, or its file, or the content of a file.
         metres_per_unit: Length of the unit of the mesh [m]; by default that which the file states, or 1 m.
         up: Axis that points up in the mesh; by default that which the file states, or z.
         finish: Values that replace those of the materials.
@@ -188,6 +188,8 @@ def read_model(
         raise InputError(f"{source}: metres_per_unit must be > 0 (got {metres_per_unit})")
     if isinstance(mesh, str | Path):
         source, file = str(mesh), read_mesh_file(Path(mesh), textures=finish.colour is None)
+    elif isinstance(mesh, MeshFile):
+        source, file = "mesh", mesh
     else:
         source, file = "mesh", MeshFile(scene_parts(mesh, "mesh"))
     stated = [

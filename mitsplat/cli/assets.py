@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -27,6 +27,9 @@ from mitsplat.cli.options import (
 )
 from mitsplat.errors import InputError
 
+if TYPE_CHECKING:
+    from mitsplat.mesh_files.mesh_file import MeshFile
+
 Overwrite = Annotated[
     bool,
     typer.Option("--overwrite", help="Replace an existing asset in the folder, including manual changes to its files."),
@@ -37,7 +40,8 @@ def bake(
     mesh: Annotated[
         Path,
         typer.Argument(
-            metavar="MESH", help="Mesh with its materials (.glb, .gltf, .3mf, .obj, .ply, .stl, .off or .dae)."
+            metavar="MESH",
+            help="STEP file, or mesh with its materials (.glb, .gltf, .3mf, .obj, .ply, .stl, .off or .dae).",
         ),
     ],
     out: AssetFolder,
@@ -48,7 +52,8 @@ def bake(
     units: Annotated[
         float | None,
         typer.Option(
-            help="Metres per unit of the mesh, 0.001 for millimetres; by default stated by MESH (glTF, 3MF, DAE) or 1."
+            help="Metres per unit of the mesh, 0.001 for millimetres; by default stated by MESH (STEP, glTF, 3MF, DAE) "
+            "or 1."
         ),
     ] = None,
     up: Annotated[
@@ -72,6 +77,16 @@ def bake(
         float | None,
         typer.Option(help="Reflectance of dielectric parts that replaces the file's values, 0 (matt) to 0.08."),
     ] = None,
+    tolerance: Annotated[
+        float | None,
+        typer.Option(
+            help="Maximum distance of facets from the surfaces of a STEP file [mm]; by default 1/2000 of the longest "
+            "extent, which is half a pixel of a view that is 1000 pixels wide."
+        ),
+    ] = None,
+    split: Annotated[
+        bool, typer.Option("--split", help="Make one asset per part of a STEP file; equal parts are made once.")
+    ] = False,
     any_size: Annotated[
         bool, typer.Option("--any-size", help="Also accept an object smaller than 1 mm or larger than 5 m.")
     ] = False,
@@ -87,37 +102,55 @@ def bake(
     from mitsplat.bake.bake import BakeSettings, bake_asset
     from mitsplat.bake.bake_report import write_bake_report
     from mitsplat.bake.surface_materials import SurfaceFinish
+    from mitsplat.mesh_files.step import STEP_SUFFIXES, read_step, separate_parts
 
     _check_folder(out, mesh, name, overwrite=overwrite)
     if units is not None and not 0 < units < math.inf:
         raise InputError(f"--units must be finite and > 0 (got {units})")
     if not 0 <= seed < 2**32:
         raise InputError(f"--seed must be 0 to {2**32 - 1} (got {seed})")
+    if split and name is not None:
+        raise InputError(f"--name applies to one asset, but --split names each by its part (got {name})")
     settings = BakeSettings(gaussians=gaussians, seed=seed)
     finish = SurfaceFinish(colour=colour, roughness=roughness, metallic=metallic, specular=specular)
+    sources: dict[Path, MeshFile | Path] = {out: mesh}
+    if mesh.suffix.lower() in STEP_SUFFIXES:
+        file = read_step(mesh, tolerance=tolerance, separate=split)
+        typer.echo(f"facets: within {file.tolerance:.3g} mm of the surfaces")
+        sources = {out: file}
+        if split:
+            parts = separate_parts(file)
+            sources = {out / part: content for part, (content, _) in parts.items()}
+            for part, (_, count) in parts.items():
+                typer.echo(f"part: {part} ({count} of {len(file.parts)} parts)")
+    elif tolerance is not None or split:
+        raise InputError(f"--{'split' if split else 'tolerance'} applies to STEP files (got {mesh})")
+    for folder in sources:
+        _check_folder(folder, mesh, name, overwrite=overwrite)
     select_device(device)
-    with stage_bar() as progress:
-        result = bake_asset(
-            mesh,
-            name=name or out.resolve().name,
-            class_name=class_name,
-            kind=kind,
-            settings=settings,
-            metres_per_unit=units,
-            up=up,
-            density=density,
-            friction=friction,
-            finish=finish,
-            any_size=any_size,
-            progress=progress,
-        )
-    result.asset.save(out)
-    report = write_bake_report(out, result)
-    for warning in result.warnings:
-        typer.echo(f"warning: {warning}")
-    typer.echo(f"units of the mesh: {result.units}")
-    typer.echo(f"report: {report}")
-    typer.echo(f"asset: {out} ({len(result.asset.splats)} Gaussians, {result.psnr:.1f} dB on unseen views)")
+    for folder, source in sources.items():
+        with stage_bar() as progress:
+            result = bake_asset(
+                source,
+                name=name or folder.resolve().name,
+                class_name=class_name,
+                kind=kind,
+                settings=settings,
+                metres_per_unit=units,
+                up=up,
+                density=density,
+                friction=friction,
+                finish=finish,
+                any_size=any_size,
+                progress=progress,
+            )
+        result.asset.save(folder)
+        report = write_bake_report(folder, result)
+        for warning in result.warnings:
+            typer.echo(f"warning: {warning}")
+        typer.echo(f"units of the mesh: {result.units}")
+        typer.echo(f"report: {report}")
+        typer.echo(f"asset: {folder} ({len(result.asset.splats)} Gaussians, {result.psnr:.1f} dB on unseen views)")
 
 
 def import_(

@@ -60,7 +60,7 @@ _METAL_SPECULAR = 0.25
 """Specular colour of the specular-glossiness model above which a material is a metal."""
 
 
-def read_gltf(path: Path, *, textures: bool = True) -> MeshFile:
+def read_gltf(path: Path, *, textures: bool = True, content: bytes | None = None) -> MeshFile:
     """Read a ``.gltf`` or ``.glb`` file.
 
     Damaged files raise the errors of :data:`mitsplat.storage.files.MESH_ERRORS`.
@@ -68,12 +68,13 @@ def read_gltf(path: Path, *, textures: bool = True) -> MeshFile:
     Args:
         path: The file.
         textures: False to ignore all textures, which need not exist.
+        content: Content of the file; by default it is read.
 
     Raises:
         InputError: If the file requires an extension that is not supported, or if a texture cannot be read.
         MissingResourceError: If the package that decompresses its geometry is not installed.
     """
-    data = GltfData(path)
+    data = GltfData(path, content)
     unknown = sorted(set(data.document.get("extensionsRequired", [])) - _READ_EXTENSIONS - _COMPRESSIONS)
     if unknown:
         raise InputError(

@@ -33,15 +33,19 @@ class GltfData:
 
     Damaged data raise the errors of :data:`mitsplat.storage.files.MESH_ERRORS`.
 
+    Args:
+        path: The file, whose folder has the files that it names.
+        content: Its content; by default it is read.
+
     Attributes:
         path: The file.
         document: The JSON document.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, content: bytes | None = None) -> None:
         self.path = path
         self._binary = b""
-        content = path.read_bytes()
+        content = path.read_bytes() if content is None else content
         if content[:4] == _MAGIC:
             content = self._read_chunks(content)
         self.document: JsonObject = json.loads(content.decode("utf-8-sig"))

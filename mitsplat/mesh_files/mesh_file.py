@@ -129,6 +129,7 @@ class MeshFile:
         up: Axis that points up, or None if the file does not state it.
         warnings: Parts of the file that were left out, a sentence each.
         in_single: True if the positions are stored as 32-bit numbers.
+        tolerance: Maximum distance of the facets from the surfaces of the file [mm], or None for a file of facets.
     """
 
     parts: tuple[FilePart, ...]
@@ -136,6 +137,7 @@ class MeshFile:
     up: Axis | None = None
     warnings: tuple[str, ...] = ()
     in_single: bool = False
+    tolerance: float | None = None
 
 
 def pixels_of(image: Image.Image) -> npt.NDArray[np.uint8]:

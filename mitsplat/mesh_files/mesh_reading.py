@@ -12,13 +12,14 @@ from mitsplat.errors import InputError, MissingResourceError
 from mitsplat.geometry.untrusted_meshes import check_mesh
 from mitsplat.mesh_files.gltf import read_gltf
 from mitsplat.mesh_files.mesh_file import MeshFile
+from mitsplat.mesh_files.step import STEP_SUFFIXES, read_step
 from mitsplat.mesh_files.threemf import read_3mf
 from mitsplat.mesh_files.trimesh_files import read_with_trimesh
 from mitsplat.storage.file_kinds import refuse_other_kinds
 from mitsplat.storage.files import MESH_ERRORS
 
-SUFFIXES = (".stl", ".obj", ".glb", ".gltf", ".off", ".3mf", ".dae", ".ply")
-SCENE_SUFFIXES = (".glb", ".gltf", ".3mf")
+SUFFIXES = (".stl", ".obj", ".glb", ".gltf", ".off", ".3mf", ".dae", ".ply", *STEP_SUFFIXES)
+SCENE_SUFFIXES = (".glb", ".gltf", ".3mf", *STEP_SUFFIXES)
 """Suffixes of files of nodes and components that this package reads without trimesh."""
 _READERS = {".glb": read_gltf, ".gltf": read_gltf, ".3mf": read_3mf}
 
@@ -52,9 +53,11 @@ def read_mesh_file(path: Path, *, textures: bool = True) -> MeshFile:
         InputError: If the file cannot be read, requires what is not supported, or lacks a texture.
         MissingResourceError: If the package that reads such files is not installed.
     """
-    refuse_other_kinds(path, "a mesh (.glb, .obj, .stl, .ply)", *SUFFIXES)
+    refuse_other_kinds(path, "a mesh (.glb, .step, .obj, .stl, .ply)", *SUFFIXES)
     if not path.is_file():
         raise InputError(f"{path}: no such mesh file")
+    if path.suffix.lower() in STEP_SUFFIXES:
+        return read_step(path)
     check_mesh(path, read=_try_mesh_file)
     try:
         return _read(path, textures=textures)

@@ -11,13 +11,15 @@ from mitsplat.errors import InputError
 
 _SPLATS = "a splat file; import it first: `mitsplat import FILE -o FOLDER`"
 _MESH = "a mesh; bake it first: `mitsplat bake FILE -o FOLDER`"
+_STEP = "a STEP file; bake it first: `mitsplat bake FILE -o FOLDER`"
 _PICTURE = "an image"
-_DRAWING = "a CAD file; export it as a mesh, .glb with colours or .stl"
+_DRAWING = "a CAD file; export it as .step, or as a mesh: .glb with colours or .stl"
 _BY_SUFFIX = {
     **dict.fromkeys((".splat", ".ksplat", ".spz", ".sog"), _SPLATS),
     **dict.fromkeys((".stl", ".obj", ".glb", ".gltf", ".off", ".3mf", ".dae"), _MESH),
     **dict.fromkeys((".png", ".jpg", ".jpeg", ".exr", ".hdr", ".tif", ".tiff"), _PICTURE),
-    **dict.fromkeys((".step", ".stp", ".iges", ".igs", ".brep", ".sldprt", ".ipt", ".fcstd"), _DRAWING),
+    **dict.fromkeys((".step", ".stp"), _STEP),
+    **dict.fromkeys((".iges", ".igs", ".brep", ".sldprt", ".ipt", ".fcstd"), _DRAWING),
     ".ply": "splats or a mesh; import or bake it first: `mitsplat import FILE -o FOLDER`, or `mitsplat bake`",
     ".xml": "a Mitsuba scene: `mitsplat render` renders it",
     ".yaml": "a scene or an asset.yaml",
@@ -77,7 +79,9 @@ def no_folder_with(folder: Path, file: str, wanted: str) -> InputError:
         if found := next((text for name, text in _BY_CONTENT.items() if (folder / name).is_file()), None):
             return InputError(f"{folder}: must be {wanted} (got {found})")
         inside = sorted(path for path in folder.iterdir() if path.suffix.lower() in _BY_SUFFIX)
-        kinds = [kind for path in inside if (kind := kind_of_file(path)) and kind.startswith(("a mesh", "a splat"))]
+        kinds = [
+            kind for path in inside if (kind := kind_of_file(path)) and kind.startswith(("a mesh", "a splat", "a STEP"))
+        ]
         has = f"; {inside[0].name} is {kinds[0]}" if kinds else ""
         return InputError(f"{folder}: must be {wanted} (got a folder without {file}{has})")
     close = _similar_folder(folder, file)

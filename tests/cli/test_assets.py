@@ -13,6 +13,7 @@ from mitsplat.asset import Asset
 from mitsplat.bake.bake import BakeSettings
 from tests.cli.typed import run
 from tests.conftest import box_asset
+from tests.mesh_files.test_step import assembly
 
 
 def test_bake_applies_every_option(
@@ -43,9 +44,27 @@ def test_bake_applies_every_option(
     assert re.search(r"Gaussians, \d+\.\d dB", capsys.readouterr().out)
 
 
+def test_bake_splits_a_step_file_into_its_parts(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("mitsplat.bake.bake.BakeSettings", partial(BakeSettings, fit_steps=0, verify_views=0))
+    step = assembly(tmp_path / "frame.step")
+    assert run("bake", step, "-o", tmp_path / "parts", "--split", "--tolerance", 0.5, "--gaussians", 60) == 0
+    said = capsys.readouterr().out
+    assert "facets: within 0.5 mm" in said and "part: block (1 of 3 parts)\npart: pin_no._1 (2 of 3 parts)\n" in said
+    assert "0.001 m, z up (units stated by the file)" in said
+    block, pin = (Asset.load(tmp_path / "parts" / name) for name in ("block", "pin_no._1"))
+    assert (block.name, pin.class_name) == ("block", "pin_no._1")
+    np.testing.assert_allclose(block.mesh.extents, (0.01, 0.02, 0.03), atol=1e-7)
+    assert pin.mesh.extents[2] == pytest.approx(0.04)
+
+
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [
+        (["--split"], "--split applies to STEP files (got {mesh})"),
+        (["--tolerance", "0.1"], "--tolerance applies to STEP files (got {mesh})"),
+        (["--split", "--name", "a"], "--name applies to one asset, but --split names each by its part (got a)"),
         (["--units", "0"], "--units must be finite and > 0 (got 0.0)"),
         (["--units", "1e-6", "--any-size"], "{mesh}: a mesh must be 1e-05 to 100000 m across (got 3e-08 m)"),
         (["--units", "1e30", "--any-size"], "{mesh}: a mesh must be 1e-05 to 100000 m across (got 3e+28 m)"),

@@ -17,13 +17,13 @@ from tests.conftest import box_asset
     [
         (
             "bake plant.splat -o a",
-            "plant.splat: must be a mesh (.glb, .obj, .stl, .ply) (got a splat file; import it first: `mitsplat import",
+            "plant.splat: must be a mesh (.glb, .step, .obj, .stl, .ply) (got a splat file; import it first: `mits",
         ),
         (
-            "bake nut.step -o a",
-            "nut.step: must be a mesh (.glb, .obj, .stl, .ply) (got a CAD file",
+            "bake nut.iges -o a",
+            "nut.iges: must be a mesh (.glb, .step, .obj, .stl, .ply) (got a CAD file",
         ),
-        ("bake folder -o a", "folder: must be a mesh (.glb, .obj, .stl, .ply) (got a folder)"),
+        ("bake folder -o a", "folder: must be a mesh (.glb, .step, .obj, .stl, .ply) (got a folder)"),
         ("bake part.stl -o part.stl", "--out must be a folder (got the file part.stl)"),
         (
             "check plant.splat",
@@ -53,7 +53,7 @@ def test_a_file_of_the_wrong_kind_is_refused_with_its_kind(
     box_asset("nut").mesh.export("part.stl")
     Path("folder").mkdir()
     Path("scene.xml").write_text('<scene version="3.9.0"/>')
-    Path("nut.step").touch()
+    Path("nut.iges").touch()
     assert run(*words.split()) == 2
     told = capsys.readouterr().err
     assert told.startswith(f"mitsplat: {sentence}") and told.count("\n") == 1

@@ -30,7 +30,8 @@ def error_of(path: Path) -> str:
         ("part.GLB", "a mesh; bake it first"),
         ("part.splat", "(got a splat file; import it first: `mitsplat import {folder}/part.splat -o {folder}/part`)"),
         ("part.ply", "(got splats or a mesh; import or bake it first: "),
-        ("part.step", "(got a CAD file; export it as a mesh"),
+        ("part.step", "(got a STEP file; bake it first: `mitsplat bake {folder}/part.step -o {folder}/part`)"),
+        ("part.iges", "(got a CAD file; export it as .step"),
         ("part.txt", "must be an asset folder (got another file)"),
     ],
 )

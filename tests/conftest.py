@@ -127,22 +127,25 @@ def forks() -> Iterator[Forks]:
     made.close()
 
 
-_tried_meshes: dict[tuple[str, bytes, untrusted_meshes.TrialReader], str] = {}
+_try_mesh = untrusted_meshes._try_mesh
+
+
+@pytest.fixture(scope="session", autouse=True)
+def meshes_not_tried() -> Iterator[None]:
+    """Omit the trial read of mesh files in a child process, which takes half a second each.
+
+    The trial refuses only files that take too much memory or time: see ``meshes_tried``.
+    """
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(untrusted_meshes, "_try_mesh", lambda path, modified, size, read: "")
+        yield
 
 
 @pytest.fixture(scope="module")
-def meshes_tried_once() -> Iterator[None]:
-    """Check each distinct mesh in a child process only once, because an audit checks each model of BOP."""
-    try_mesh = untrusted_meshes._try_mesh
-
-    def try_once(path: Path, modified: int, size: int, read: untrusted_meshes.TrialReader) -> str:
-        key = path.suffix, path.read_bytes(), read
-        if key not in _tried_meshes:
-            _tried_meshes[key] = try_mesh(path, modified, size, read)
-        return _tried_meshes[key]
-
+def meshes_tried() -> Iterator[None]:
+    """Read mesh files on trial, as outside of tests."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(untrusted_meshes, "_try_mesh", try_once)
+        patch.setattr(untrusted_meshes, "_try_mesh", _try_mesh)
         yield
 
 

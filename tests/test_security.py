@@ -28,6 +28,8 @@ from tests.cli.typed import run
 from tests.conftest import box_asset
 from tests.engine.jobs import Dies
 
+pytestmark = pytest.mark.usefixtures("meshes_tried")
+
 
 class TestScenes:
     @pytest.mark.parametrize(

@@ -20,8 +20,6 @@ from mitsplat.errors import InputError
 from mitsplat.storage.files import Record
 from tests.cli.typed import run
 
-pytestmark = pytest.mark.usefixtures("meshes_tried_once")
-
 
 def records_of(root: Path) -> list[Record]:
     return [json.loads(line) for line in (root / "manifest.jsonl").read_bytes().splitlines()]

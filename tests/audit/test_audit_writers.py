@@ -33,8 +33,6 @@ from mitsplat.scene.spec.scene_spec import FORMATS
 from tests.conftest import BOTH, small_scene
 from tests.drawn import large_boxes, render_boxes, scatter_boxes
 
-pytestmark = pytest.mark.usefixtures("meshes_tried_once")
-
 Patch = Callable[[pytest.MonkeyPatch], None]
 
 
@@ -443,7 +441,13 @@ def rows_of(code: str, size: tuple[int, int]) -> str:
     return str(by_rows({"size": [size[1], size[0]], "counts": code})["counts"])
 
 
-@pytest.mark.parametrize("fault", FAULTS)
+SLOW = ("colmap: principal point at 0", "colmap: world for camera")
+"""Faults of COLMAP beside the quick one: each audit starts a process that imports pycolmap."""
+
+
+@pytest.mark.parametrize(
+    "fault", [pytest.param(fault, marks=pytest.mark.extended if fault in SLOW else ()) for fault in FAULTS]
+)
 def test_the_fault_of_each_wrong_writer_is_a_violation(
     scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fault: str
 ) -> None:
@@ -490,7 +494,10 @@ def test_the_audit_imports_no_writer() -> None:
     "lens",
     [
         {"lens": "fisheye", "fx": 40.0, "fy": 41.0, "cx": 31.0, "cy": 25.0, "distortion": (0.02, -0.01, 0.003, 0.001)},
-        {"fov_x": 70.0, "distortion": (0.05, -0.02, 0.002, -0.001, 0.01, 0.003, 0.002, 0.001)},
+        pytest.param(
+            {"fov_x": 70.0, "distortion": (0.05, -0.02, 0.002, -0.001, 0.01, 0.003, 0.002, 0.001)},
+            marks=pytest.mark.extended,
+        ),
     ],
     ids=["fisheye", "distorted"],
 )

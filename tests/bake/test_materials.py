@@ -22,8 +22,6 @@ from mitsplat.fit.image_metrics import psnr_of
 from mitsplat.images.colour import decode_srgb
 from mitsplat.mesh_files.trimesh_files import read_material
 
-pytestmark = pytest.mark.usefixtures("meshes_tried_once")
-
 COLOUR = (200, 120, 40)
 QUICK = BakeSettings(gaussians=300, fit_steps=0, verify_views=1)
 

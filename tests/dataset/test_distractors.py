@@ -28,8 +28,6 @@ from tests.conftest import box_asset, small_scene
 from tests.drawn import large_boxes, render_boxes
 from tests.synthetic import CERTIFICATE
 
-pytestmark = pytest.mark.usefixtures("meshes_tried_once")
-
 OBJECTS = [
     {"pool": ["assets/nut", "assets/bolt"], "count": [2, 4], "balance": True, "scale": [0.7, 1.2]},
     {"asset": "assets/crate", "count": 2, "label": False},
@@ -136,7 +134,7 @@ def test_distractors_are_in_no_label_file(made: Path) -> None:
     assert seen > 16
 
 
-@pytest.mark.parametrize("part", ["workers", "shards"])
+@pytest.mark.parametrize("part", [pytest.param("workers", marks=pytest.mark.extended), "shards"])
 def test_workers_and_merged_shards_make_the_same_bytes(made: Path, scene: Scene, tmp_path: Path, part: str) -> None:
     if part == "workers":
         out = write(scene, tmp_path / "out", workers=3)

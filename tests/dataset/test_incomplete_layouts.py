@@ -23,8 +23,6 @@ from mitsplat.scene.scene import Scene
 from tests.conftest import BOTH, small_scene
 from tests.drawn import large_boxes, render_boxes, scatter_boxes
 
-pytestmark = pytest.mark.usefixtures("meshes_tried_once")
-
 WORDS = "fell over in 5 of 5 draws"
 
 
@@ -89,6 +87,7 @@ def test_the_report_counts_omitted_objects(whole: DatasetSummary, tmp_path: Path
     )
 
 
+@pytest.mark.extended
 def test_workers_make_the_same_bytes(scene: Scene, whole: DatasetSummary, tmp_path: Path) -> None:
     """The number of workers does not divide the number of layouts."""
     assert files_of(write(scene, tmp_path / "out", workers=3).path) == files_of(whole.path)

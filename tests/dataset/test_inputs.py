@@ -22,8 +22,6 @@ from mitsplat.scene.loading.scene_loading import load_scene
 from tests.conftest import box_asset
 from tests.dataset.test_write import never_render, write
 
-pytestmark = pytest.mark.usefixtures("meshes_tried_once")
-
 SCENE = {
     "name": "all inputs",
     "environment": "assets/room",

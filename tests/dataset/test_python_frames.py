@@ -21,8 +21,6 @@ from mitsplat.scene.spec.scene_spec import FORMATS
 from tests.conftest import BOTH, small_scene
 from tests.drawn import large_boxes
 
-pytestmark = pytest.mark.usefixtures("meshes_tried_once")
-
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:

@@ -25,8 +25,6 @@ from tests.conftest import box_asset, small_scene
 from tests.dataset.test_distractors import scatter_drawn
 from tests.drawn import large_boxes, render_boxes
 
-pytestmark = pytest.mark.usefixtures("meshes_tried_once")
-
 FORMATS_HERE = [name for name in FORMATS if name != "colmap"]
 
 

@@ -23,8 +23,6 @@ from mitsplat.scene.spec.shape_spec import Box
 from tests.audit.test_audit import records_of, store
 from tests.conftest import WriteScene
 
-pytestmark = pytest.mark.usefixtures("meshes_tried_once")
-
 SceneData = dict[str, Any]
 STEP = 0.02
 """Travel of the belt between views [m]: 4 pixels at a distance of 0.5 m and a focal length of 100 px."""

@@ -23,8 +23,6 @@ from mitsplat.scene.planning.layout_surroundings import draw_surroundings
 from mitsplat.scene.spec.scene_spec import FORMATS
 from tests.conftest import WriteScene, box_asset
 
-pytestmark = pytest.mark.usefixtures("meshes_tried_once")
-
 SceneData = dict[str, Any]
 
 

@@ -26,8 +26,6 @@ from mitsplat.storage.field_types import StrictModel
 from tests.conftest import BOTH, small_scene
 from tests.drawn import large_boxes, render_boxes, scatter_boxes
 
-pytestmark = pytest.mark.usefixtures("meshes_tried_once")
-
 HEMISPHERE = {
     "kind": "hemisphere",
     "target": [0, 0, 0],

@@ -24,8 +24,6 @@ from mitsplat.version import __version__
 from tests.conftest import BOTH, box_asset, small_scene
 from tests.drawn import large_boxes, render_boxes, scatter_boxes
 
-pytestmark = pytest.mark.usefixtures("meshes_tried_once")
-
 NEWER = (
     rf"format_version must be at most 1, the newest that mitsplat {__version__} reads \(got 2\): "
     r"update mitsplat, or create the file again with this version"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -12,6 +13,14 @@ from tests.forks import Forks
 EXAMPLES = Path(__file__).parents[1] / "examples"
 NOTEBOOKS = sorted(EXAMPLES.glob("*.ipynb"))
 SCRIPTS = sorted(EXAMPLES.glob("*.py"))
+QUICK = ("robot_poses", "speed_and_accuracy", "xml_authoring")
+
+
+def runs(paths: list[Path]) -> list[Any]:
+    """Return the parameters of tests that run examples, of which most take long."""
+    return [
+        pytest.param(path, id=path.stem, marks=() if path.stem in QUICK else pytest.mark.extended) for path in paths
+    ]
 
 
 def code_of(path: Path) -> list[str]:
@@ -32,7 +41,7 @@ def test_a_notebook_is_stored_without_outputs_and_ends_in_checks(path: Path) -> 
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", runs(NOTEBOOKS))
 def test_each_notebook_runs(forks: Forks, path: Path) -> None:
     """Each notebook runs in a process of its own, because it chooses Mitsuba's variant and imports as a user would."""
     done = forks.run("\n\n".join(code_of(path)), folder=EXAMPLES)
@@ -40,7 +49,7 @@ def test_each_notebook_runs(forks: Forks, path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("path", SCRIPTS, ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", runs(SCRIPTS))
 def test_each_example_script_runs(forks: Forks, path: Path, tmp_path: Path) -> None:
     assert "\nassert " in path.read_text()
     given = [] if path.stem == "read_labels" else [tmp_path]

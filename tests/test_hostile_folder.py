@@ -146,7 +146,13 @@ def test_a_child_without_safe_path_mode_runs_files_of_the_folder(start, tmp_path
     assert "random" in start(sys.executable, tmp_path / "script/parent.py", "nothing")[1]
 
 
-@pytest.mark.parametrize("kind", KINDS)
+QUICK = ("worker", "image", "splats", "service", "cluster")
+"""Children that need few imports."""
+
+
+@pytest.mark.parametrize(
+    "kind", [pytest.param(kind, marks=() if kind in QUICK else pytest.mark.extended) for kind in KINDS]
+)
 def test_no_child_runs_python_files_of_the_current_folder(start, tmp_path, kind):
     if kind == "cluster":
         pytest.importorskip("ray", reason="Ray is not installed: pip install 'mitsplat[cluster]'")

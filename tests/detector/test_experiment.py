@@ -194,6 +194,7 @@ def test_rendering_on_the_cpu_has_a_lower_priority_than_training(tmp_path, capsy
     assert said == {"render": "19", "train": str(os.nice(0))}
 
 
+@pytest.mark.extended
 def test_labels_of_workshop_photographs_are_the_visible_pixels(tmp_path, physics, monkeypatch):
     monkeypatch.setattr(record, "_open", [{}])
     options = argparse.Namespace(work=tmp_path, scenes=2, views=1, width=160, samples=4)

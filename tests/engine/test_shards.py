@@ -58,6 +58,7 @@ def write_shards(scene, folder, count, **options):
 
 
 class TestSameBytes:
+    @pytest.mark.extended
     def test_more_workers_than_layouts_make_the_same_bytes(self, scene, tmp_path, whole):
         write(scene, tmp_path / "out", workers=4)
         assert contents(tmp_path / "out") == whole

@@ -184,7 +184,7 @@ def test_an_asset_with_an_interrupted_fit_resumes_to_the_same_bytes(
 
 
 @pytest.mark.cpu(reason="the processes that are ended fit on the CPU, and their fit goes on in this one")
-@pytest.mark.parametrize(("place", "how"), [(1, "SIGINT"), (10, "SIGKILL")])
+@pytest.mark.parametrize(("place", "how"), [pytest.param(1, "SIGINT", marks=pytest.mark.extended), (10, "SIGKILL")])
 def test_a_fit_process_that_is_killed_resumes_to_the_same_bytes(
     fits: Fits, tmp_path: Path, place: int, how: str
 ) -> None:

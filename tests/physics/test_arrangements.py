@@ -77,6 +77,7 @@ def test_a_pile_fills_a_bin(scene_data, write_scene):
     assert layout.certificate.pair_penetration < 5e-4
 
 
+@pytest.mark.extended
 def test_a_pile_without_room_is_refused(scene_data, write_scene):
     with pytest.raises(InputError, match=r"region must be large enough .* settle\.arrangement pile"):
         drop_layout(

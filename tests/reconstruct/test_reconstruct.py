@@ -200,7 +200,7 @@ def test_a_drawing_determines_the_scale_of_a_capture(known_object: KnownObject) 
     assert found.verdict.offset < 0.003
 
 
-@pytest.mark.parametrize(("height", "lowest"), [(0.049, 0.0), (0.0, -0.05)])
+@pytest.mark.parametrize(("height", "lowest"), [(0.049, 0.0), pytest.param(0.0, -0.05, marks=pytest.mark.extended)])
 def test_an_object_is_cut_at_the_table_below_it(known_object: KnownObject, height: float, lowest: float) -> None:
     """Gaussians 1 mm below the table are removed; a plane through the middle of an object is not its support."""
     lifted = np.eye(4)

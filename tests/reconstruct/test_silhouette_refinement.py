@@ -55,7 +55,11 @@ def views(truth: trimesh.Trimesh) -> list[MaskedView]:
 
 
 @pytest.mark.parametrize(
-    "bumps, scale, settings, factor", [(0.1, 1.03, QUICK, 5.0), (0.05, 1.0, DETAIL, 1.8)], ids=["swollen", "smoothed"]
+    "bumps, scale, settings, factor",
+    [
+        pytest.param(0.1, 1.03, QUICK, 5.0, id="swollen"),
+        pytest.param(0.05, 1.0, DETAIL, 1.8, id="smoothed", marks=pytest.mark.extended),
+    ],
 )
 def test_a_disturbed_mesh_is_refined_to_the_solid(
     truth: trimesh.Trimesh,
@@ -78,6 +82,7 @@ def test_a_disturbed_mesh_is_refined_to_the_solid(
     assert not len(edges_through_faces(found.mesh, found.mesh.vertices))
 
 
+@pytest.mark.extended
 def test_refining_a_true_mesh_keeps_its_shape(truth: trimesh.Trimesh, views: list[MaskedView]) -> None:
     found = refine_mesh(truth, views, QUICK)
     assert found.kept == (found.mesh is not truth)
@@ -152,7 +157,11 @@ def test_the_gradient_of_a_silhouette_area_equals_its_closed_form() -> None:
 
 
 @pytest.mark.parametrize(
-    "distortion, lens", [((-0.35, 0.12, 0.004, -0.006), "opencv"), ((0.05, -0.01, 0.0, 0.0), "fisheye")]
+    "distortion, lens",
+    [
+        pytest.param((-0.35, 0.12, 0.004, -0.006), "opencv", marks=pytest.mark.extended),
+        ((0.05, -0.01, 0.0, 0.0), "fisheye"),
+    ],
 )
 def test_masks_of_a_distorted_lens_are_undistorted(
     truth: trimesh.Trimesh, distortion: tuple[float, ...], lens: str

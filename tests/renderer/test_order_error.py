@@ -76,9 +76,15 @@ VIEWS = {
 }
 
 
-@pytest.mark.parametrize("samples", [1, 2])
-@pytest.mark.parametrize("lens", VIEWS)
-@pytest.mark.parametrize("mesh", [False, True])
+@pytest.mark.parametrize(
+    ("mesh", "lens", "samples"),
+    [
+        pytest.param(mesh, lens, samples, marks=() if mesh == (samples == 2) else pytest.mark.extended)
+        for mesh in (False, True)
+        for lens in VIEWS
+        for samples in (1, 2)
+    ],
+)
 def test_tolerance_zero_sorts_along_each_ray(lens: str, samples: int, mesh: bool) -> None:
     """Tolerance near zero repeats every tile with a late Gaussian: colours, depths and ids equal the exact order.
 

@@ -552,7 +552,7 @@ def test_unknown_quality_is_refused() -> None:
     assert tone_curve("neutral")[0] == 0
 
 
-@pytest.mark.parametrize("name", ["plant", "academic_tarot_cards"])
+@pytest.mark.parametrize("name", [pytest.param("plant", marks=pytest.mark.extended), "academic_tarot_cards"])
 def test_presets_are_close_to_exact_on_captures(name: str) -> None:
     file = CAPTURES / f"{name}.splat"
     if not file.exists():

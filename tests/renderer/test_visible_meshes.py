@@ -93,8 +93,18 @@ def compare(scene: Any, depth: int) -> tuple[float, float, float, float]:
     return float(ours.mean()), float(theirs.mean()), float(np.sqrt(error)), float(np.sqrt(noise))
 
 
-@pytest.mark.parametrize("light", ["constant", "point", "area", "envmap"])
-@pytest.mark.parametrize("material", ["diffuse", "roughconductor", "plastic", "principled"])
+QUICK = {"diffuse": "area", "roughconductor": "envmap", "plastic": "constant", "principled": "point"}
+"""The light under which the quick tests compare each material."""
+
+
+@pytest.mark.parametrize(
+    ("material", "light"),
+    [
+        pytest.param(material, light, marks=() if light == quick else pytest.mark.extended)
+        for material, quick in QUICK.items()
+        for light in ("constant", "point", "area", "envmap")
+    ],
+)
 def test_materials_equal_those_traced_by_mitsuba(material: str, light: str) -> None:
     """The variance of the difference of two unbiased images is the sum of both: 256 paths per pixel each."""
     ours, theirs, rmse, noise = compare(scene_of(material, light), 2 if material == "diffuse" else 6)
@@ -104,7 +114,10 @@ def test_materials_equal_those_traced_by_mitsuba(material: str, light: str) -> N
     assert rmse < 1.1 * noise + 0.003
 
 
-@pytest.mark.parametrize("material", ["conductor", "dielectric", "plastic"])
+@pytest.mark.parametrize(
+    "material",
+    ["dielectric", *(pytest.param(name, marks=pytest.mark.extended) for name in ("conductor", "plastic"))],
+)
 def test_paths_between_meshes_are_followed(material: str) -> None:
     ours, theirs, rmse, noise = compare(scene_of(material, "envmap", ground=True), 6)
     assert ours == pytest.approx(theirs, rel=0.01)

@@ -134,8 +134,14 @@ def dataset(folder: Path, camera: dict[str, Any], formats: list[str], **output: 
 NATIVE = ["yolo", "coco", "bop", "poses", "depth", "flow"]
 
 
-@pytest.mark.parametrize("stated", ["eye", "matrix"])
-@pytest.mark.parametrize("jitter", [0.0, 0.004])
+@pytest.mark.parametrize(
+    ("stated", "jitter"),
+    [
+        ("eye", 0.004),
+        ("matrix", 0.0),
+        *(pytest.param(*other, marks=pytest.mark.extended) for other in (("eye", 0.0), ("matrix", 0.004))),
+    ],
+)
 def test_the_audit_accepts_a_fixed_camera_and_finds_a_moved_one(tmp_path: Path, stated: str, jitter: float) -> None:
     camera = FIXED if stated == "eye" else {"kind": "fixed", "world_from_camera": POSE.tolist()}
     scene, out = dataset(tmp_path, camera | {"jitter": jitter, "rotation_jitter": 250 * jitter}, NATIVE)
@@ -196,7 +202,9 @@ LENSES = {
 }
 
 
-@pytest.mark.parametrize("name", LENSES)
+@pytest.mark.parametrize(
+    "name", ["opencv", *(pytest.param(name, marks=pytest.mark.extended) for name in ("prism", "fisheye"))]
+)
 def test_rectified_images_are_written_as_bop_and_pass_the_audit(tmp_path: Path, name: str) -> None:
     _, out = dataset(tmp_path, FIXED | {"intrinsics": LENSES[name]}, [*NATIVE, "colmap"], rectify=True)
     assert audit_dataset(out).violations == ()

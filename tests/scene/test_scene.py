@@ -263,7 +263,11 @@ def changed(data: SceneData, **changes: Any) -> SceneData:
             {"objects__0": {"pool": "primitives", "size": 0.1}},
             "objects[0].size: must not be given for primitives (use scale)",
         ),
-        ({"objects__0": {"pool": "primitives", "scale": 30}}, "objects[0].pool[0]: asset 'box_0' must fit into"),
+        pytest.param(
+            {"objects__0": {"pool": "primitives", "scale": 30}},
+            "objects[0].pool[0]: asset 'box_0' must fit into",
+            marks=pytest.mark.extended,
+        ),
         ({"empty": 1.5}, "empty: must be <= 1 (got 1.5)"),
         ({"environment": "assets/gone"}, "environment: "),
         ({"shapes__0": {"name": "a", "mesh": "gone.ply"}}, "gone.ply: no such file"),

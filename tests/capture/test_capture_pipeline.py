@@ -218,7 +218,7 @@ def test_cameras_with_few_matches_are_named_unless_a_board_confirms_them(
         )
 
 
-@pytest.mark.parametrize("undistorted", [False, True])
+@pytest.mark.parametrize("undistorted", [False, pytest.param(True, marks=pytest.mark.extended)])
 def test_a_camera_that_the_board_contradicts_is_left_out(
     captured: tuple[Path, Path, CaptureResult], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, undistorted: bool
 ) -> None:
@@ -247,7 +247,7 @@ def test_a_run_without_undistort_starts_from_the_photos_again(
 ) -> None:
     """A run without --undistort, in the folder of a run with it, reads the photographs again."""
     given, _, result = captured
-    model = model_of(result.capture)
+    model = model_of(result.capture, 4)
     cameras = {name: replace(camera, distortion=(-0.2, 0.0, 0.0, 0.0)) for name, camera in model.cameras.items()}
     monkeypatch.setattr(take, "find_cameras", lambda *args: replace(model, cameras=cameras))
     for undistorted in (True, False):
@@ -317,7 +317,7 @@ def test_mixed_and_damaged_photos_give_accurate_cameras(
     assert off.max() < 0.02
 
 
-@pytest.mark.slow
+@pytest.mark.extended
 def test_one_core_and_an_interruption_give_the_same_bytes(photos: tuple[Path, object], tmp_path: Path) -> None:
     """The capture runs on all cores, or on one core in a process that is killed while it matches and then resumed."""
     given = tmp_path / "given"
@@ -386,7 +386,7 @@ sfm_child.main(sfm_child.Path({str(tmp_path / "job.json")!r}))
     child.stdout.close()
 
 
-@pytest.mark.slow
+@pytest.mark.extended
 def test_photos_of_another_scene_are_rejected(
     photos: tuple[Path, dict[str, Camera]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

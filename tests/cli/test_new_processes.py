@@ -159,9 +159,10 @@ def desk(scene_data: dict[str, object], write_scene: WriteScene, tmp_path: Path)
     return tmp_path
 
 
-def test_every_public_name_works_in_a_new_process(desk: Path) -> None:
+@pytest.mark.parametrize("calls", [CALLS, pytest.param(FURTHER, marks=pytest.mark.extended)], ids=["names", "further"])
+def test_every_public_name_works_in_a_new_process(desk: Path, calls: dict[str, str]) -> None:
     assert sorted(CALLS) == mitsplat.__all__
-    done = fresh(FORKS, json.dumps(CALLS | FURTHER), folder=desk)
+    done = fresh(FORKS, json.dumps(calls), folder=desk)
     assert done.returncode == 0, done.stderr[-2000:]
     assert json.loads(done.stdout.splitlines()[-1]) == {}
 

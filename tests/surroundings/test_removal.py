@@ -145,7 +145,7 @@ def wall(y: float) -> tuple[Splats, Splats]:
     return whole, whole.select(~hidden)
 
 
-@pytest.mark.parametrize("gap", [0.0, 0.03])
+@pytest.mark.parametrize("gap", [0.0, pytest.param(0.03, marks=pytest.mark.extended)])
 def test_a_wall_close_behind_an_object_is_filled(gap: float, tmp_path: Path) -> None:
     """The object may touch the wall; the wall stays, and its hidden part is filled."""
     bare, _ = table_and_box()
@@ -218,7 +218,7 @@ def test_an_environment_records_removed_objects(
         asset_pipeline.make_asset(capture, tmp_path / "fit", tmp_path / "cell", replace(job, remove=()))
 
 
-@pytest.mark.slow
+@pytest.mark.extended
 def test_the_mesh_command_removes_picked_objects(captured: Capture, tmp_path: Path) -> None:
     captured.save(tmp_path / "capture")
     Splats.concatenate([place(), cube()]).save(tmp_path / "splats.ply")

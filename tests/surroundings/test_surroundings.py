@@ -236,7 +236,7 @@ def test_the_scene_of_surroundings_drops_objects_beside_the_box(made: tuple[Path
     assert (np.array(scene.spec.region.max[:2]) < corner).any()
 
 
-@pytest.mark.slow
+@pytest.mark.extended
 def test_the_scene_of_surroundings_gets_no_warning(made: tuple[Path, AssetResult]) -> None:
     assert [finding for finding in check_scene(load_scene(made[0] / "cell.yaml")) if not finding.ok] == []
 

@@ -10,13 +10,14 @@ import sys
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 from PIL import Image
 
-from mitsplat.capture.video import ChosenFrames, choose_frames
+from mitsplat.capture.video import ChosenFrames, choose_frames, extraction, video_worker
 from mitsplat.capture.video.frame_selection import STEP, FrameMeasure, choose
 from mitsplat.capture.video.motion import MotionClock, MotionPosition
 from mitsplat.errors import InputError
@@ -90,6 +91,22 @@ def few(start: Path, tmp_path_factory: pytest.TempPathFactory) -> ChosenFrames:
     return choose_frames(start, tmp_path_factory.mktemp("few") / "frames", most=8, least=3)
 
 
+@pytest.fixture
+def in_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Choose frames in this process, because the start of a child process takes longer than a short video."""
+
+    def run_worker(video: Path, folder: Path, most: int, least: int, progress: object) -> dict[str, Any]:
+        messages: list[dict[str, Any]] = []
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(video_worker, "_send", lambda **message: messages.append(message))
+            video_worker.main(video, folder, most, least)
+        if "error" in messages[-1]:
+            raise InputError(messages[-1]["error"])
+        return dict(json.loads(json.dumps(messages[-1]["found"])))
+
+    monkeypatch.setattr(extraction, "_run_worker", run_worker)
+
+
 def numbers(chosen: ChosenFrames) -> list[int]:
     """Return the frame numbers in the video by the names of the chosen frames."""
     times = [int(n[:2]) * 60 + int(n[3:5]) + int(n[6:9]) / 1000 for n in chosen.names]
@@ -117,6 +134,7 @@ def test_chosen_frames_are_sharp_and_evenly_spaced_in_displacement(pan: Path, tm
         assert np.sqrt(np.mean(error**2)) < 12  # video compression; the next frame differs by 20 or more
 
 
+@pytest.mark.usefixtures("in_process")
 def test_a_limit_of_frames_widens_their_spacing(pan: Path, tmp_path: Path) -> None:
     few = choose_frames(pan, tmp_path / "frames", most=8, least=3)
     assert 7 <= len(few.names) <= 8
@@ -125,6 +143,7 @@ def test_a_limit_of_frames_widens_their_spacing(pan: Path, tmp_path: Path) -> No
     assert not BLURRED & set(numbers(few))
 
 
+@pytest.mark.usefixtures("in_process")
 def test_the_same_video_gives_the_same_frames_and_reuses_them(start: Path, few: ChosenFrames, tmp_path: Path) -> None:
     one = choose_frames(start, tmp_path / "one", most=8, least=3)
     data = {name: (one.folder / name).read_bytes() for name in one.names}
@@ -139,6 +158,7 @@ def test_the_same_video_gives_the_same_frames_and_reuses_them(start: Path, few: 
     assert {path.name for path in one.folder.glob("*.jpg")} == set(other.names) != set(one.names)
 
 
+@pytest.mark.usefixtures("in_process")
 def test_cuts_are_detected_and_each_shot_has_frames(tmp_path: Path) -> None:
     first, second = plane(1), plane(2)
     pictures = [seen(first, 2.0 * k) for k in range(60)] + [seen(second, 600 - 2.0 * k) for k in range(60)]
@@ -151,6 +171,7 @@ def test_cuts_are_detected_and_each_shot_has_frames(tmp_path: Path) -> None:
     assert len(shots[0]) >= 7 and len(shots[1]) >= 6
 
 
+@pytest.mark.usefixtures("in_process")
 def test_a_blurred_frame_is_not_a_cut(tmp_path: Path) -> None:
     texture = plane(3)
     pictures = [
@@ -173,6 +194,7 @@ def test_noise_and_shake_give_no_displacement() -> None:
     assert moved.path < 0.01
 
 
+@pytest.mark.usefixtures("in_process")
 def test_frames_without_texture_are_neither_a_shot_nor_chosen(tmp_path: Path) -> None:
     """The video fades in from black. Frames without content start no new shot and are not chosen."""
     texture = plane(5)
@@ -216,6 +238,7 @@ def turned_by(file: Path, degrees: int) -> Path:
     return turned
 
 
+@pytest.mark.usefixtures("in_process")
 @pytest.mark.parametrize("degrees", [90, 180, 270])
 def test_the_rotation_stated_by_a_video_is_applied(
     start: Path, few: ChosenFrames, tmp_path: Path, degrees: int
@@ -284,7 +307,11 @@ def jumpy(file: Path) -> Path:
     ],
     ids=lambda value: getattr(value, "__name__", ""),
 )
-def test_unusable_videos_are_refused_in_one_sentence(make, sentence: str, tmp_path: Path) -> None:
+def test_unusable_videos_are_refused_in_one_sentence(
+    make, sentence: str, tmp_path: Path, request: pytest.FixtureRequest
+) -> None:
+    if make in (still, plain, short, jumpy):  # FFmpeg decodes the others in a process of their own
+        request.getfixturevalue("in_process")
     file = make(tmp_path / "clip.mp4")
     with pytest.raises(InputError, match=rf"clip\.mp4: {sentence}") as refused:
         choose_frames(file, tmp_path / "frames", most=6, least=3)

@@ -303,6 +303,8 @@ class _StageWriter:
         UsdPhysics.CollisionAPI.Apply(prim)
         UsdShade.MaterialBindingAPI.Apply(prim).Bind(material, materialPurpose="physics")
         prim.CreateAttribute("mjc:condim", Sdf.ValueTypeNames.Int, custom=True).Set(WITH_ROLL)
+        for name in ("contactMargin", "contactGap"):  # the gap of Newton's default moves objects at rest
+            prim.CreateAttribute(f"newton:{name}", Sdf.ValueTypeNames.Float, custom=True).Set(0.0)
         impedance = Vt.DoubleArray([*IMPEDANCE_MUJOCO, 1e-3, 0.5, 2.0])
         prim.CreateAttribute("mjc:solimp", Sdf.ValueTypeNames.DoubleArray, custom=True).Set(impedance)
 

@@ -190,6 +190,7 @@ def test_objects_stay_at_rest_in_newton(folder: Path, scene: Scene) -> None:
             solver.step(states[0], states[1], control, None, 0.002)
             states.reverse()
         assert_still(first, states[0].body_q.numpy().astype(np.float64))
+    assert not (solver.mj_model.geom_margin.any() or solver.mj_model.geom_gap.any())  # would lift objects at rest
     frictions = set(np.round(np.array(builder.shape_material_mu)[np.array(builder.shape_flags) == 6], 6).tolist())
     assert frictions == {0.4, 0.5, 0.6}
 

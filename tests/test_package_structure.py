@@ -18,7 +18,7 @@ LAYERS = (
     ("reconstruct.pipeline", "report"),
     ("audit", "checks", "surroundings", "view"),
     ("dataset", "importing"),
-    ("bake", "formats", "frames.accuracy", "reconstruct", "usd"),
+    ("bake", "formats", "frames.accuracy", "gltf_splats", "reconstruct", "usd"),
     ("fit", "frames", "reconstruct.materials"),
     ("renderer",),
     ("plugins",),

@@ -158,8 +158,8 @@ def import_(
         Path,
         typer.Argument(
             metavar="FILE",
-            help="Splat file (.ply, .compressed.ply, .splat, .ksplat, .spz or .sog), or OpenUSD stage (.usd, .usda, "
-            ".usdc or .usdz).",
+            help="Splat file (.ply, .compressed.ply, .splat, .ksplat, .spz or .sog), glTF file with splats (.glb or "
+            ".gltf), or OpenUSD stage (.usd, .usda, .usdc or .usdz).",
         ),
     ],
     out: AssetFolder,
@@ -216,8 +216,8 @@ def import_(
     convex collision pieces. The page report.html shows the result. Warnings are printed; `mitsplat check` runs more
     checks.
 
-    A USD stage states its unit and up axis. If it also has colliders, the asset gets its splats unchanged, and its
-    colliders, mass, friction and class. Everything else in the stage is listed.
+    USD and glTF files state their unit and up axis. If a USD stage also has colliders, the asset gets its splats
+    unchanged, and its colliders, mass, friction and class. Everything else in the stage is listed.
     """
     from mitsplat.usd.usd_layers import is_usd
 

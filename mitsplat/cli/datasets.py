@@ -500,11 +500,15 @@ def export(
         typer.Option(
             "--out",
             "-o",
-            help="Mitsuba scene (.xml), OpenUSD stage (.usd, .usda, .usdc, .usdz), or MJCF.",
+            help="Mitsuba scene (.xml), OpenUSD stage (.usd, .usda, .usdc, .usdz), MJCF, or the splats of ASSET as "
+            "glTF (.glb).",
         ),
     ] = Path("scene.xml"),
     mjcf: Annotated[
         bool, typer.Option("--mjcf", help="Write the .xml file as an MJCF model for MuJoCo instead of a Mitsuba scene.")
+    ] = False,
+    spz: Annotated[
+        bool, typer.Option("--spz", help="Compress the splats of a .glb file, which quantises them.")
     ] = False,
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Replace an existing file, including manual changes.")
@@ -515,24 +519,34 @@ def export(
 
     A Mitsuba scene can be edited and rendered with `mitsplat render`. A USD stage has splats, colliders, masses,
     friction, poses at rest, camera, lights and semantic labels. An MJCF model has the bodies and shapes for MuJoCo.
-    Whatever a format cannot hold is listed.
+    A glTF file has the splats of ASSET alone. Whatever a format cannot hold is listed.
     """
     from mitsplat.usd.usd_layers import USD_SUFFIXES
 
-    check_new(out, ".xml", *(() if mjcf else USD_SUFFIXES), overwrite=overwrite)
+    check_new(out, ".xml", *(() if mjcf else (*USD_SUFFIXES, ".glb")), overwrite=overwrite)
+    to_gltf = out.suffix.lower() == ".glb"
+    if spz and not to_gltf:
+        raise InputError(f"--spz applies to .glb files (got {out})")
+    if to_gltf and not source.is_dir():
+        raise InputError(f"a .glb file holds the splats of an asset folder (got {source}): export a USD stage")
     files = out.with_name(f"{out.stem}_files")
     if files.exists() and not overwrite and not (files.is_dir() and not any(files.iterdir())):
         raise InputError(f"--out {out}: the folder {files} must not exist yet; --overwrite replaces its files")
     is_asset, to_mitsuba = source.is_dir(), out.suffix.lower() == ".xml" and not mjcf
     losses: tuple[str, ...] = ()
     if is_asset and to_mitsuba:
-        raise InputError(f"--out of an asset must be a USD stage, or MJCF with --mjcf (got {out})")
+        raise InputError(f"--out of an asset must be a USD stage, .glb, or MJCF with --mjcf (got {out})")
     if is_asset:
         from mitsplat.asset import Asset
+        from mitsplat.gltf_splats.splat_writing import export_asset_gltf
         from mitsplat.usd.mjcf import export_asset_mjcf
         from mitsplat.usd.usd_export import export_asset_usd
 
-        losses = (export_asset_mjcf if mjcf else export_asset_usd)(Asset.load(source), out)
+        asset = Asset.load(source)
+        if to_gltf:
+            losses = export_asset_gltf(asset, out, spz=spz)
+        else:
+            losses = (export_asset_mjcf if mjcf else export_asset_usd)(asset, out)
     else:
         from mitsplat.scene.loading.scene_loading import load_scene
 

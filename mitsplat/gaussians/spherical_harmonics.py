@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from mitsplat.arrays import Float64Array
+from mitsplat.arrays import Float32Array, Float64Array
+from mitsplat.images.colour import encode_srgb
 
 SH_C0 = 0.28209479177387814
 """Value of the constant spherical harmonic, 1 / (2 sqrt(pi))."""
@@ -101,3 +102,16 @@ def sh_rotation(rotation: npt.ArrayLike, degree: int) -> Float64Array:
     turned = sh_basis(directions @ np.asarray(rotation, dtype=np.float64), degree)
     solution = np.linalg.pinv(sh_basis(directions, degree)) @ turned
     return np.asarray(solution, dtype=np.float64)
+
+
+def encode_sh(sh: Float32Array) -> Float32Array:
+    """Return coefficients of display-encoded colours from those of linear colours.
+
+    The constant band is exact. The others are multiplied by the slope of the encoding at the mean colour.
+    """
+    mean, step = np.maximum(0.5 + SH_C0 * sh[:, :1].astype(np.float64), 0.0), 1e-4
+    slope = (encode_srgb(mean + step) - encode_srgb(np.maximum(mean - step, 0))) / (
+        mean + step - np.maximum(mean - step, 0)
+    )
+    constant = (encode_srgb(mean) - 0.5) / SH_C0
+    return np.concatenate([constant, slope * sh[:, 1:]], axis=1).astype(np.float32)

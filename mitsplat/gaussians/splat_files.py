@@ -132,7 +132,7 @@ def read_splats(path: Path) -> tuple[SplatArrays, KernelName | None]:
         if suffix == ".splat":
             return _decode_splat(data), None
         if suffix == ".spz":
-            return _decode_spz(data)
+            return decode_spz(data)
         if suffix == ".sog":
             return _decode_ply(_convert(data, "sog", "ply")), sog_kernel(data)
         if suffix == ".ksplat":
@@ -163,7 +163,7 @@ def write_splats(splats: SplatArrays, path: Path, kernel: KernelName | None = No
     encoders: dict[str, Callable[[SplatArrays, KernelName | None], bytes]] = {
         ".ply": _encode_ply,
         ".splat": _encode_splat,
-        ".spz": _encode_spz,
+        ".spz": encode_spz,
     }
     suffix = path.suffix.lower()
     if suffix not in encoders or path.name.lower().endswith(".compressed.ply"):
@@ -345,7 +345,7 @@ def _encode_splat(splats: SplatArrays, _kernel: KernelName | None) -> bytes:
     return rows.tobytes()
 
 
-def _decode_spz(data: bytes) -> tuple[SplatArrays, KernelName | None]:
+def decode_spz(data: bytes) -> tuple[SplatArrays, KernelName | None]:
     """Decode SPZ version 3 (Niantic's ``load-spz.cc``): consecutive arrays of small integers in gzip.
 
     The result is bit-identical to that of gaussforge, without a separate process. gaussforge decodes or refuses other
@@ -394,7 +394,7 @@ def _smallest_three(packed: npt.NDArray[np.uint32]) -> Float32Array:
     return quats
 
 
-def _encode_spz(splats: SplatArrays, kernel: KernelName | None) -> bytes:
+def encode_spz(splats: SplatArrays, kernel: KernelName | None) -> bytes:
     """Encode SPZ version 3 with the maximum number of fractional position bits that the extent of the splats permits.
 
     The encoder itself uses 12 bits, which are steps of 0.24 mm. Here, positions are multiplied by a power of two before

@@ -23,6 +23,7 @@ from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.gaussians.splat_files import Axis, default_up_axis
 from mitsplat.geometry.camera import Camera, spiral
 from mitsplat.geometry.decomposition import convex_pieces
+from mitsplat.gltf_splats.splat_reading import is_gltf, read_gltf_splats
 from mitsplat.importing.upright import Plane, Upright, cut_support, find_up
 from mitsplat.progress import Progress
 from mitsplat.reconstruct.asset_evaluation import AssetView, Thresholds, iou, is_closed, show_asset
@@ -206,7 +207,7 @@ def import_splats(
     """Convert a splat file to an asset.
 
     Args:
-        path: Any file that :meth:`mitsplat.Splats.load` reads, or a USD stage.
+        path: Any file that :meth:`mitsplat.Splats.load` reads, a glTF file, or a USD stage.
         name: Name of the asset.
         class_name: Class label for detectors; ``name`` if None.
         kind: ``object`` or ``environment``. Objects can be dropped, so they get a closed mesh and convex pieces.
@@ -236,8 +237,8 @@ def import_splats(
             progress(next(stages), _STAGES, stage_name)
 
     report("reading the file")
-    if is_usd(path):  # a stage states its unit and axis, and its splats are in metres with z up
-        loaded = read_stage_asset(path).splats
+    if is_usd(path) or is_gltf(path):  # such files state unit and axis, and their splats are in metres with z up
+        loaded = read_stage_asset(path).splats if is_usd(path) else read_gltf_splats(path)
         units = settings.units if settings.units or settings.size else 1.0
         settings = replace(settings, up=settings.up or "z", units=units)
     else:

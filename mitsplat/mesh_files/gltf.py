@@ -76,6 +76,8 @@ def read_gltf(path: Path, *, textures: bool = True, content: bytes | None = None
     """
     data = GltfData(path, content)
     unknown = sorted(set(data.document.get("extensionsRequired", [])) - _READ_EXTENSIONS - _COMPRESSIONS)
+    if "KHR_gaussian_splatting" in unknown:
+        raise InputError("it has Gaussian splats, which `mitsplat import` reads")
     if unknown:
         raise InputError(
             f"it requires extensions of glTF that are not supported: export it without {', '.join(unknown)}"
@@ -100,25 +102,7 @@ class _GltfReader:
 
     @cached_property
     def _world_poses(self) -> dict[int, Float64Array]:
-        """Poses (4, 4) of all nodes of the scene, in depth-first order."""
-        document, poses = self._data.document, {}
-        nodes = document.get("nodes", [])
-        if "scenes" in document:
-            roots = self._data.entry("scenes", document.get("scene", 0)).get("nodes", [])
-        else:
-            inner = {child for node in nodes for child in node.get("children", [])}
-            roots = [index for index in range(len(nodes)) if index not in inner]
-        pending = [(root, np.eye(4)) for root in reversed(roots)]
-        while pending:
-            index, parent = pending.pop()
-            node = self._data.entry("nodes", index)
-            if index in poses:
-                raise ValueError(f"node {index} has two parents")
-            if not node.get("extensions", {}).get("KHR_node_visibility", {}).get("visible", True):
-                continue
-            poses[index] = parent @ _local_pose(node)
-            pending += [(child, poses[index]) for child in reversed(node.get("children", []))]
-        return poses
+        return world_poses(self._data)
 
     def _read_node(self, index: int, pose: Float64Array) -> Iterator[FilePart]:
         """Read the mesh of a node, once per instance."""
@@ -126,7 +110,7 @@ class _GltfReader:
         if "mesh" not in node:
             return
         mesh = self._data.entry("meshes", node["mesh"])
-        poses = [pose @ one for one in self._instances(node)]
+        poses = [pose @ one for one in instance_poses(self._data, node)]
         weights = tuple(node.get("weights") or mesh.get("weights") or ())
         for number, primitive in enumerate(mesh["primitives"]):
             if primitive.get("mode", _TRIANGLES) not in (_TRIANGLES, _STRIP, _FAN):
@@ -138,15 +122,6 @@ class _GltfReader:
                 yield _moved(part, vertices, np.eye(4))
                 continue
             yield from (_moved(part, part.vertices, one) for one in poses)
-
-    def _instances(self, node: JsonObject) -> list[Float64Array]:
-        """Return the poses of the instances of a node, relative to it (``EXT_mesh_gpu_instancing``)."""
-        stored = node.get("extensions", {}).get("EXT_mesh_gpu_instancing")
-        if stored is None:
-            return [np.eye(4)]
-        given = {name.lower(): self._data.accessor(index) for name, index in stored["attributes"].items()}
-        count = min(map(len, given.values()))
-        return [_local_pose({name: values[k] for name, values in given.items()}) for k in range(count)]
 
     def _skinned(self, skin: JsonObject, primitive: JsonObject, vertices: Float64Array) -> Float64Array:
         """Return vertices (V, 3) in the pose of the joints of a skin."""
@@ -283,6 +258,43 @@ class _GltfReader:
         stored = {} if sampler is None else self._data.entry("samplers", sampler)
         wrap_u, wrap_v = (_WRAPS[stored.get(name, 10497)] for name in ("wrapS", "wrapT"))
         return Texture(pixels, coordinates, (wrap_u, wrap_v))
+
+
+def world_poses(data: GltfData) -> dict[int, Float64Array]:
+    """Return the poses (4, 4) of all visible nodes of the scene, in depth-first order.
+
+    Raises:
+        ValueError: If a node has two parents.
+    """
+    document = data.document
+    poses: dict[int, Float64Array] = {}
+    nodes = document.get("nodes", [])
+    if "scenes" in document:
+        roots = data.entry("scenes", document.get("scene", 0)).get("nodes", [])
+    else:
+        inner = {child for node in nodes for child in node.get("children", [])}
+        roots = [index for index in range(len(nodes)) if index not in inner]
+    pending = [(root, np.eye(4)) for root in reversed(roots)]
+    while pending:
+        index, parent = pending.pop()
+        node = data.entry("nodes", index)
+        if index in poses:
+            raise ValueError(f"node {index} has two parents")
+        if not node.get("extensions", {}).get("KHR_node_visibility", {}).get("visible", True):
+            continue
+        poses[index] = parent @ _local_pose(node)
+        pending += [(child, poses[index]) for child in reversed(node.get("children", []))]
+    return poses
+
+
+def instance_poses(data: GltfData, node: JsonObject) -> list[Float64Array]:
+    """Return the poses of the instances of a node, relative to it (``EXT_mesh_gpu_instancing``)."""
+    stored = node.get("extensions", {}).get("EXT_mesh_gpu_instancing")
+    if stored is None:
+        return [np.eye(4)]
+    given = {name.lower(): data.accessor(index) for name, index in stored["attributes"].items()}
+    count = min(map(len, given.values()))
+    return [_local_pose({name: values[k] for name, values in given.items()}) for k in range(count)]
 
 
 def _local_pose(node: JsonObject) -> Float64Array:

@@ -16,12 +16,11 @@ from scipy.spatial import QhullError
 from mitsplat.arrays import Float32Array, Float64Array
 from mitsplat.asset import Asset, AssetSpec
 from mitsplat.errors import InputError
-from mitsplat.gaussians.spherical_harmonics import SH_C0
+from mitsplat.gaussians.spherical_harmonics import encode_sh
 from mitsplat.gaussians.splat_cloud import Splats, split_similarity
 from mitsplat.gaussians.splat_materials import SplatMaterials
 from mitsplat.geometry.decomposition import convex_pieces
 from mitsplat.geometry.mesh import mass_properties, prepare_mesh
-from mitsplat.images.colour import encode_srgb
 from mitsplat.usd.stage_records import Record, read_records
 
 _ENCODED = ("", "srgb_rec709_scene", "srgb_rec709_display", "srgb_texture", "sRGB", "auto", "raw")
@@ -119,7 +118,7 @@ def _splats(field: Record, notes: list[str]) -> Splats:
         scales = np.where(flat, _FLAT * thinnest, scales)
     space, sh = field["colour_space"], field["sh"]
     if space in _LINEAR:
-        sh = _encoded_sh(sh)
+        sh = encode_sh(sh)
         if sh.shape[1] > 1:
             notes.append(f"not imported: colours beyond first order: the linear ones of {field['path']} were encoded")
     elif space not in _ENCODED:
@@ -130,19 +129,6 @@ def _splats(field: Record, notes: list[str]) -> Splats:
     return Splats(
         field["means"], field["quats"], scales, field["opacities"], sh, materials, field["metadata"].get("kernel")
     )
-
-
-def _encoded_sh(sh: Float32Array) -> Float32Array:
-    """Return coefficients of display-encoded colours from those of linear colours.
-
-    The constant band is exact. The others are multiplied by the slope of the encoding at the mean colour.
-    """
-    mean, step = np.maximum(0.5 + SH_C0 * sh[:, :1].astype(np.float64), 0.0), 1e-4
-    slope = (encode_srgb(mean + step) - encode_srgb(np.maximum(mean - step, 0))) / (
-        mean + step - np.maximum(mean - step, 0)
-    )
-    constant = (encode_srgb(mean) - 0.5) / SH_C0
-    return np.concatenate([constant, slope * sh[:, 1:]], axis=1).astype(np.float32)
 
 
 def make_asset(path: Path, records: Record, body: str | None, splats: Splats, notes: list[str]) -> Asset | None:

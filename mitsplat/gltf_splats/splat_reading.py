@@ -1,0 +1,156 @@
+"""Reader of Gaussian splats in glTF (Khronos, ``KHR_gaussian_splatting`` and ``..._compression_spz_2``).
+
+Scales and opacities are activated values, quaternions are xyzw, and coefficients of spherical harmonics have the order
+and signs of 3DGS. SPZ data have axes right, up, back, and are converted to those of glTF: left, up, front.
+"""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+
+from mitsplat.arrays import Float32Array
+from mitsplat.errors import InputError, MissingResourceError
+from mitsplat.gaussians.spherical_harmonics import encode_sh
+from mitsplat.gaussians.splat_cloud import Splats
+from mitsplat.gaussians.splat_files import decode_spz
+from mitsplat.geometry.untrusted_meshes import check_mesh
+from mitsplat.mesh_files.gltf import instance_poses, world_poses
+from mitsplat.mesh_files.gltf_data import GltfData
+from mitsplat.storage.files import MESH_ERRORS, JsonObject
+
+GLTF_SUFFIXES = (".glb", ".gltf")
+EXTENSION = "KHR_gaussian_splatting"
+COMPRESSION = f"{EXTENSION}_compression_spz_2"
+ENCODED, LINEAR = "srgb_rec709_display", "lin_rec709_display"
+Z_UP_FROM_GLTF = np.array([(1.0, 0, 0, 0), (0, 0, -1, 0), (0, 1, 0, 0), (0, 0, 0, 1)])
+"""Transform from the axes of glTF, y up, to those of mitsplat, z up."""
+GLTF_FROM_SPZ = np.diag([-1.0, 1.0, -1.0, 1.0])
+_READ_EXTENSIONS = {
+    EXTENSION,
+    COMPRESSION,
+    "EXT_mesh_gpu_instancing",
+    "KHR_mesh_quantization",
+    "KHR_node_visibility",
+    "KHR_xmp_json_ld",
+}
+_THINNEST = 1e-6
+"""Least scale of a Gaussian relative to its largest one. The standard permits 0."""
+
+_logger = logging.getLogger(__name__)
+
+
+def is_gltf(path: Path) -> bool:
+    """Return True if a file has a suffix of glTF."""
+    return path.suffix.lower() in GLTF_SUFFIXES
+
+
+def read_gltf_splats(path: Path) -> Splats:
+    """Read all Gaussian splats of the scene of a glTF file, in metres with z up.
+
+    Meshes, cameras and lights are not read. A warning names properties of splats that are not used.
+
+    Raises:
+        InputError: If the file cannot be read, has no splats, requires an extension that is not supported, or mirrors,
+            shears or scales splats non-uniformly.
+    """
+    check_mesh(path, read=_try_splats)
+    try:
+        return _read(path, warn=True)
+    except InputError as error:
+        raise error if str(error).startswith(str(path)) else InputError(f"{path}: {error}") from error
+    except (OSError, *MESH_ERRORS) as error:
+        raise InputError(f"{path}: not a glTF file that can be read ({error})") from error
+
+
+def _try_splats(output: BinaryIO, _: bytes, path: str) -> None:
+    """Read a file and discard it. Errors except lack of memory are ignored, since the actual reader reports them."""
+    try:
+        _read(Path(path), warn=False)
+    except MemoryError:
+        raise InputError("reading it takes more memory than its file size justifies") from None
+    except (InputError, MissingResourceError, OSError, *MESH_ERRORS):
+        pass
+    output.write(b"\n")
+
+
+def _read(path: Path, *, warn: bool) -> Splats:
+    data = GltfData(path)
+    if unknown := sorted(set(data.document.get("extensionsRequired", [])) - _READ_EXTENSIONS):
+        raise InputError(f"it requires extensions that are not supported: export it without {', '.join(unknown)}")
+    parts, cache, left_out = [], {}, set()
+    for index, pose in world_poses(data).items():
+        node = data.entry("nodes", index)
+        if "mesh" not in node:
+            continue
+        for number, primitive in enumerate(data.entry("meshes", node["mesh"])["primitives"]):
+            if EXTENSION not in primitive.get("extensions", {}):
+                left_out.add("meshes, which `mitsplat bake` reads")
+                continue
+            key = node["mesh"], number
+            if key not in cache:
+                cache[key] = _read_primitive(data, primitive, left_out)
+            for instance in instance_poses(data, node):
+                try:
+                    parts.append(cache[key].transformed(Z_UP_FROM_GLTF @ pose @ instance))
+                except ValueError as error:
+                    raise InputError(f"node {node.get('name', index)}: {error}") from error
+    if not parts:
+        raise InputError(f"it has no Gaussian splats ({EXTENSION}); `mitsplat bake` reads meshes")
+    if warn and left_out:
+        _logger.warning("%s: not read: %s", path, "; ".join(sorted(left_out)))
+    return Splats.concatenate(parts)
+
+
+def _read_primitive(data: GltfData, primitive: JsonObject, left_out: set[str]) -> Splats:
+    """Read a primitive in the axes of its node."""
+    stored = primitive["extensions"][EXTENSION]
+    space = stored.get("colorSpace", ENCODED)
+    for name, known in (("kernel", "ellipse"), ("projection", "perspective"), ("sortingMethod", "cameraDistance")):
+        if stored.get(name, known) != known:
+            left_out.add(f"the {name} {stored[name]}, for which {known} is used")
+    compressed = stored.get("extensions", {}).get(COMPRESSION)
+    if compressed is not None:
+        arrays, kernel = decode_spz(bytes(data.view(compressed["bufferView"])))
+        splats = Splats(**arrays._asdict(), kernel=kernel).transformed(GLTF_FROM_SPZ)
+        means, quats, scales = splats.means, splats.quats, splats.scales
+        opacities, sh = splats.opacities, splats.sh
+    else:
+        kernel = None
+        means = _attribute(data, primitive, "POSITION", 3)
+        quats = _attribute(data, primitive, f"{EXTENSION}:ROTATION", 4)
+        scales = _attribute(data, primitive, f"{EXTENSION}:SCALE", 3)
+        opacities = _attribute(data, primitive, f"{EXTENSION}:OPACITY", 1)[:, 0]
+        sh = _spherical_harmonics(data, primitive)
+    if space == LINEAR:
+        sh = encode_sh(sh)
+        if sh.shape[1] > 1:
+            left_out.add("linear colours beyond first order, which are encoded")
+    elif space != ENCODED:
+        left_out.add(f"the colour space {space}, for which {ENCODED} is used")
+    visible = scales.max(axis=1, initial=0.0) > 0
+    scales = np.maximum(scales, _THINNEST * scales.max(axis=1, keepdims=True, initial=0.0))
+    return Splats(means[visible], quats[visible], scales[visible], opacities[visible], sh[visible], kernel=kernel)
+
+
+def _spherical_harmonics(data: GltfData, primitive: JsonObject) -> Float32Array:
+    """Return the coefficients (N, K, 3) of all degrees that a primitive has completely."""
+    bands = []
+    for degree in range(4):
+        names = [f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{n}" for n in range(2 * degree + 1)]
+        if degree and names[0] not in primitive["attributes"]:
+            break
+        bands += [_attribute(data, primitive, name, 3) for name in names]
+    return np.stack(bands, axis=1)
+
+
+def _attribute(data: GltfData, primitive: JsonObject, name: str, width: int) -> Float32Array:
+    if name not in primitive["attributes"]:
+        raise InputError(f"its splats must have the attribute {name} (missing)")
+    values = data.accessor(primitive["attributes"][name])
+    if values.shape[1] != width:
+        raise InputError(f"its attribute {name} must have {width} components (got {values.shape[1]})")
+    return values.astype(np.float32)

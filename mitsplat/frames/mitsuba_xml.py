@@ -36,6 +36,7 @@ from mitsplat.scene.planning.conveyor import layout_at_view
 from mitsplat.scene.planning.frame_plan import FramePlan, layout_of, plan_frame
 from mitsplat.scene.planning.layout_surroundings import MaterialDraw, draw_surroundings
 from mitsplat.scene.planning.object_appearance import draw_appearances
+from mitsplat.scene.planning.shape_poses import shape_motion
 from mitsplat.scene.scene import Scene
 from mitsplat.storage.files import library_errors, storage_errors, write_file
 
@@ -121,7 +122,8 @@ def _export_visible_shapes(scene: Scene, plan: FramePlan, folder: Path) -> dict[
             drawn, belt = surroundings.material_of(shape), plan.belt
             image = texture_image(drawn, scene.images)
             travel = belt.travel if belt is not None and shape.box == belt.box else 0.0
-            made = finished_mesh(mesh, shape, drawn, image, travel=travel)
+            motion = shape_motion(shape, mesh, scene.spec.seed, plan.layout)
+            made = finished_mesh(mesh, shape, drawn, image, travel=travel, motion=motion)
             shapes[f"shape_{number}"] = _write_shape(made, drawn, image, folder, f"shape_{number}")
     return shapes
 

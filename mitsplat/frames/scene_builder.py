@@ -31,6 +31,7 @@ from mitsplat.scene.planning.conveyor import Belt
 from mitsplat.scene.planning.frame_lights import expand_rooms
 from mitsplat.scene.planning.layout_surroundings import MaterialDraw, draw_surroundings
 from mitsplat.scene.planning.object_appearance import ObjectAppearance, draw_appearances
+from mitsplat.scene.planning.shape_poses import placed_shapes
 from mitsplat.scene.scene import Scene
 from mitsplat.scene.spec.light_spec import EnvironmentLight, LightSpec
 from mitsplat.scene.spec.shape_spec import Shape
@@ -100,21 +101,29 @@ class SceneBuilder:
             shapes["environment"] = self._reuse(
                 "environment", environment, lambda: make_asset_shape(environment, np.eye(4), 0)
             )
-        for number, (shape, mesh) in enumerate(zip(spec.shapes, scene.shape_meshes, strict=True)):
-            name = f"shape_{number}"
+        for number, (shape, placed, motion) in enumerate(placed_shapes(scene, layout)):
+            name, mesh = f"shape_{number}", scene.shape_meshes[number]
             if shape.visible:
-                shapes[name] = self._visible_shape(name, shape, mesh, surroundings.material_of(shape), belt)
+                material = surroundings.material_of(shape)
+                shapes[name] = self._visible_shape(name, shape, mesh, material, belt, motion)
             elif shape.proxy:
-                shapes[name] = self._reuse(name, None, partial(make_splats_shape, NO_SPLATS, proxy=mesh))
+                shapes[name] = self._reuse(name, motion.tobytes(), partial(make_splats_shape, NO_SPLATS, proxy=placed))
         return shapes
 
     def _visible_shape(
-        self, name: str, shape: Shape, mesh: trimesh.Trimesh, finish: MaterialDraw, belt: Belt | None
+        self,
+        name: str,
+        shape: Shape,
+        mesh: trimesh.Trimesh,
+        finish: MaterialDraw,
+        belt: Belt | None,
+        motion: Float64Array,
     ) -> mi.Shape:
         """Return a shape with its material; the pattern of a belt is shifted by the belt's travel."""
         image, bsdf = self._reuse(f"material of {name}", finish, lambda: _load_material(finish, self._scene.images))
         travel = belt.travel if belt is not None and shape.box == belt.box and image is not None else 0.0
-        return self._reuse(name, (finish, travel), lambda: finished_mesh(mesh, shape, finish, image, bsdf, travel))
+        key = finish, travel, motion.tobytes()
+        return self._reuse(name, key, lambda: finished_mesh(mesh, shape, finish, image, bsdf, travel, motion))
 
     def _emitter(self, light: LightSpec, is_movable: bool) -> mi.Emitter | mi.Shape | dict[str, Any]:
         """Return the emitter of a light, or its Mitsuba dictionary."""

@@ -26,6 +26,7 @@ from mitsplat.physics.worlds import Body, Collider, MujocoWorld, WarpWorld, Worl
 from mitsplat.progress import Note
 from mitsplat.scene.layout import NO_PHYSICS, Instance, Layout, LeftOut, RestCertificate, UnsettledLayoutError
 from mitsplat.scene.planning.contents import draw_objects, draw_regions
+from mitsplat.scene.planning.shape_poses import shape_motion
 from mitsplat.scene.scene import Scene
 from mitsplat.scene.spec.shape_spec import Shape
 from mitsplat.scene.splits import draw_environment
@@ -143,9 +144,11 @@ class Drop:
         self._world_count = 0
         self._objects = [self._part(asset, progress) for asset in scene.assets]
         self._arrangements = tuple(arrangement for _, arrangement in scene.spec.all_regions)
-        surroundings = scene.environments if scene.spec.environment_collides else ()
-        self._grounds = tuple(self._make_ground(around, progress) for around in surroundings or (None,))
-        for ground in self._grounds:
+        self._surroundings = (scene.environments if scene.spec.environment_collides else ()) or (None,)
+        self._grounds = {
+            number: self._make_ground(around, progress) for number, around in enumerate(self._surroundings)
+        }
+        for ground in self._grounds.values():
             self._check_given_poses(ground)
 
     def settle(self, index: int) -> Layout:
@@ -287,8 +290,17 @@ class Drop:
         yield from moments
 
     def _ground_of(self, layout: int) -> int:
-        """Return the index of a layout's ground; environments without collision share one ground."""
-        return draw_environment(self.scene.spec, layout) if len(self._grounds) > 1 else 0
+        """Return the key of a layout's ground; environments without collision share one ground.
+
+        If a collider is jittered, each layout has a ground of its own, and the last one is cached.
+        """
+        number = draw_environment(self.scene.spec, layout) if len(self._surroundings) > 1 else 0
+        if not any(shape.collider and shape.is_jittered for shape in self.scene.spec.shapes):
+            return number
+        key = len(self._surroundings) + layout
+        if key not in self._grounds:
+            self._grounds = {key: self._make_ground(self._surroundings[number], lambda text: None, layout)}
+        return key
 
     def _run(
         self,
@@ -336,8 +348,11 @@ class Drop:
             self._parts[id(asset.mesh)] = _make_part(asset, progress)
         return self._parts[id(asset.mesh)]
 
-    def _make_ground(self, surroundings: Asset | None, progress: Note) -> _Ground:
-        """Build the static scene from colliding shapes and, optionally, surroundings."""
+    def _make_ground(self, surroundings: Asset | None, progress: Note, layout: int | None = None) -> _Ground:
+        """Build the static scene from colliding shapes and, optionally, surroundings.
+
+        Jittered shapes have their places of a layout, or those of the scene file.
+        """
         scene, walls = self.scene, []  # positions of the invisible enclosure walls
         colliders: list[Collider] = []
         obstacles: list[PlacedSurface] = []
@@ -347,9 +362,12 @@ class Drop:
             if not (shape.visible or shape.proxy):
                 walls.append(len(colliders))
             mesh = prepare_mesh(shape_mesh, f"shape {shape.name!r}")
+            motion = np.eye(4) if layout is None else shape_motion(shape, shape_mesh, scene.spec.seed, layout)
             collider = make_collider(shape, mesh, progress)
+            if shape.is_jittered:
+                collider = collider.moved(motion)
             colliders.append(collider)
-            obstacles.append(PlacedSurface(shape.name, DistanceSurface(mesh)))
+            obstacles.append(PlacedSurface(shape.name, DistanceSurface(mesh), motion))
         if surroundings is not None and surroundings.mesh is not None:
             mesh = prepare_mesh(surroundings.mesh, f"asset {surroundings.name!r}", solid=False)
             colliders.append(make_collider(surroundings, mesh, progress))

@@ -36,6 +36,7 @@ MODULES = (
     "geometry.mesh_distance",
     *(f"physics.{name}" for name in _PHYSICS_MODULES),
     "scene.planning.contents",
+    "scene.planning.shape_poses",
     "scene.splits",
     "scene.streams",
     "scene.walls",

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -101,6 +101,11 @@ class Collider:
     material: ContactMaterial
     pieces: tuple[trimesh.Trimesh, ...] = ()
     box: tuple[tuple[float, float, float], Float64Array] | None = None
+
+    def moved(self, motion: Float64Array) -> Collider:
+        """Return the collider after a rigid transform (4, 4)."""
+        pieces = tuple(piece.copy().apply_transform(motion) for piece in self.pieces)
+        return replace(self, pieces=pieces, box=None if self.box is None else (self.box[0], motion @ self.box[1]))
 
 
 def all_pieces(bodies: Iterable[Body], colliders: Iterable[Collider]) -> Iterator[trimesh.Trimesh]:

@@ -76,23 +76,26 @@ def finished_mesh(
     image: ByteImage | None,
     bsdf: mi.BSDF | None = None,
     travel: float = 0.0,
+    motion: Float64Array | None = None,
 ) -> mi.Mesh:
     """Create Mitsuba's shape of a mesh with texture coordinates.
 
     Args:
-        mesh: Mesh of ``shape`` in world space [m].
+        mesh: Mesh of ``shape`` at its place in the scene file [m].
         shape: Shape of the scene file.
         finish: Finish of the shape.
         image: Image of the finish.
         bsdf: Loaded Mitsuba material; None for Mitsuba's default.
         travel: Distance that the surface has moved along the shape's own x axis [m], for example of a belt.
+        motion: Transform (4, 4) of the mesh together with its texture, see :mod:`mitsplat.scene.planning.shape_poses`.
     """
     props = mi.Properties()
     if bsdf is not None:
         props["bsdf"] = bsdf
+    placed = mesh if motion is None else mesh.copy().apply_transform(motion)
     if image is None:
-        return plain_mesh(mesh, props)
-    corners = np.asarray(mesh.triangles).reshape(-1, 3)
+        return plain_mesh(placed, props)
+    corners = np.asarray(placed.triangles).reshape(-1, 3)
     split = trimesh.Trimesh(corners, np.arange(len(corners)).reshape(-1, 3), process=False)
     uv = box_projection(mesh, pattern_axes(shape), finish, image.shape[0] / image.shape[1], travel)
     made = mi.Mesh("mesh", len(corners), len(split.faces), has_vertex_texcoords=True, props=props)

@@ -23,6 +23,7 @@ from mitsplat.scene.planning.conveyor import layout_at_view
 from mitsplat.scene.planning.frame_plan import FramePlan, layout_of, plan_frame
 from mitsplat.scene.planning.layout_surroundings import LayoutSurroundings, draw_surroundings
 from mitsplat.scene.planning.object_appearance import draw_appearances
+from mitsplat.scene.planning.shape_poses import placed_shapes
 from mitsplat.scene.scene import Scene
 from mitsplat.scene.spec.light_spec import LightSpec
 from mitsplat.scene.spec.shape_spec import Shape
@@ -131,12 +132,14 @@ def frame_content(scene: Scene, index: int, progress: Note = lambda text: None) 
 def _static_shapes(scene: Scene, plan: FramePlan, progress: Note) -> list[StaticShape]:
     """Return the shapes of the scene file without the walls of enclosures, at which no object rests."""
     surroundings, found = draw_surroundings(scene.spec, plan.index), []
-    for shape, mesh in zip(scene.spec.shapes, scene.shape_meshes, strict=True):
+    for (shape, mesh, motion), stated in zip(placed_shapes(scene, plan.layout), scene.shape_meshes, strict=True):
         if shape.name.startswith(ENCLOSURE):
             continue
         collider = None
         if shape.collider:
-            collider = make_collider(shape, prepare_mesh(mesh, f"shape {shape.name!r}"), progress)
+            collider = make_collider(shape, prepare_mesh(stated, f"shape {shape.name!r}"), progress)
+            if shape.is_jittered:
+                collider = collider.moved(motion)
         colour = _mean_colour(scene, shape, surroundings) if shape.visible else None
         found.append(StaticShape(shape.name, mesh, collider, colour, shape.proxy))
     return found

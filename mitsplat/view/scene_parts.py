@@ -24,6 +24,7 @@ from mitsplat.geometry.camera import Camera, look_at_pose
 from mitsplat.labels.overlay import class_colour
 from mitsplat.scene.layout import Layout
 from mitsplat.scene.planning.conveyor import layout_at_view
+from mitsplat.scene.planning.shape_poses import placed_shapes
 from mitsplat.scene.planning.viewpoints import view_of
 from mitsplat.scene.scene import Scene
 from mitsplat.scene.spec.light_spec import AreaLight, EnvironmentLight, LightSpec, RoomLight, SpotLight
@@ -197,7 +198,7 @@ def scene_parts(
             yield ShownPart("/meshes/environment", ShownMesh(environment.mesh, _GREY, 0.6))
     if layout is not None:
         yield from _object_parts(scene, layout)
-    for shape, mesh in zip(scene.spec.shapes, scene.shape_meshes, strict=True):
+    for shape, mesh, _ in placed_shapes(scene, number):
         if shape.visible:
             red, green, blue = (round(255 * value) for value in shape.colour)
             yield ShownPart(f"/shapes/{shape.name}", ShownMesh(mesh, (red, green, blue)))

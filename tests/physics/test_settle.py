@@ -22,6 +22,7 @@ from mitsplat.physics.settle import replay_layout, settle_layout, settle_layouts
 from mitsplat.scene.layout import Layout
 from mitsplat.scene.loading.scene_loading import load_scene
 from mitsplat.scene.planning.layout_surroundings import draw_surroundings
+from mitsplat.scene.planning.shape_poses import placed_shapes
 from tests.bodies import STEPPERS, lowest, pose_at
 
 pytestmark = pytest.mark.usefixtures("physics")
@@ -353,6 +354,22 @@ def test_objects_rest_on_the_drawn_environment(scene_data, write_scene):
             assert lowest(mesh, instance.world_from_object) == pytest.approx(tops[number], abs=5e-4)
     alone = settle_layout(replace(scene), index, cached=False)
     assert alone.to_json() == layout.to_json()
+
+
+def test_objects_rest_on_the_jittered_shape(scene_data, write_scene):
+    """In the scene file, a step of 4 cm is beside the place where objects fall; in some layout it is below."""
+    step = {"size": [0.3, 0.3, 0.04], "position": [0.25, 0, 0.02]}
+    scene_data["shapes"].append({"name": "step", "box": step, "jitter": 0.15})
+    scene_data["objects"] = [{"asset": "assets/nut"}]
+    scene_data["region"] = {"min": [-0.03, -0.03, 0.05], "max": [0.03, 0.03, 0.12]}
+    scene_data["settle"] = {"stepper": "mujoco"}
+    scene_data["output"]["layouts"] = 100
+    scene = load_scene(write_scene(scene_data))
+    bounds = ([mesh.bounds[:, :2] for _, mesh, _ in placed_shapes(scene, layout)][1] for layout in range(100))
+    below = next(layout for layout, (low, high) in enumerate(bounds) if (low < -0.08).all() and (high > 0.08).all())
+    (one,) = settle_layout(scene, below, cached=False).instances
+    heights = scene.assets[one.asset].mesh.vertices @ one.world_from_object[2, :3] + one.world_from_object[2, 3]
+    assert heights.min() == pytest.approx(0.04, abs=5e-4)
 
 
 def test_standoff_of_a_hull_equals_its_closed_form():

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from mitsplat.scene.planning.shape_poses import draw_shift
 from mitsplat.scene.spec.material_spec import Background, ColourMaterial, ImageMaterial, Material
 from mitsplat.scene.spec.scene_spec import SceneSpec
 from mitsplat.scene.spec.shape_spec import Shape
@@ -82,11 +83,13 @@ class LayoutSurroundings:
     Attributes:
         environment: Index among the environments of the scene; 0 if there are none.
         materials: Drawn materials, by the names of visible shapes. All walls of a backdrop share one entry.
+        shifts: Displacement along x and y [m] and rotation [degrees] of jittered shapes, by their names.
         background: Background image, if the scene has one.
     """
 
     environment: int = 0
     materials: Mapping[str, MaterialDraw] = field(default_factory=dict)
+    shifts: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
     background: BackgroundDraw | None = None
 
     def material_of(self, shape: Shape) -> MaterialDraw:
@@ -100,6 +103,8 @@ class LayoutSurroundings:
             values["environment"] = {"number": self.environment, "name": spec.environment[self.environment]}
         if self.materials:
             values["materials"] = {name: drawn.to_json() for name, drawn in self.materials.items()}
+        if self.shifts:
+            values["shifts"] = {name: list(shift) for name, shift in self.shifts.items()}
         if self.background is not None:
             values["background"] = self.background.to_json()
         return values
@@ -110,8 +115,9 @@ def draw_surroundings(spec: SceneSpec, index: int, layout: int | None = None) ->
     layout = index // spec.output.views if layout is None else layout
     choices = {material_name(shape.name): shape.materials for shape in spec.shapes if shape.materials}
     materials = {name: draw_material(among, spec.seed, name, layout) for name, among in choices.items()}
+    shifts = {shape.name: draw_shift(shape, spec.seed, layout) for shape in spec.shapes if shape.is_jittered}
     background = None if spec.background is None else draw_background(spec.background, spec.seed, index)
-    return LayoutSurroundings(draw_environment(spec, layout), materials, background)
+    return LayoutSurroundings(draw_environment(spec, layout), materials, shifts, background)
 
 
 def draw_material(materials: Sequence[Material], seed: int, name: str, layout: int) -> MaterialDraw:

@@ -19,6 +19,7 @@ import trimesh
 from mitsplat.arrays import BoolArray, Float64Array, Int64Array
 from mitsplat.geometry.camera import Camera
 from mitsplat.geometry.mesh_points import points_inside
+from mitsplat.scene.planning.shape_poses import placed_shapes
 
 if TYPE_CHECKING:
     from mitsplat.scene.layout import Instance, Layout
@@ -115,7 +116,7 @@ class VisibilityPredictor:
         self._owner = np.repeat(np.arange(len(instances)), self._counts)
         self._spacing = _spacing(scene) * float(np.sqrt(step))
         self._radii = np.array([np.linalg.norm(mesh.extents) / 2 for mesh in meshes])
-        shapes = [m for shape, m in zip(scene.spec.shapes, scene.shape_meshes, strict=True) if shape.visible]
+        shapes = [mesh for shape, mesh, _ in placed_shapes(scene, layout.index) if shape.visible]
         self._triangles = np.concatenate([np.zeros((0, 3, 3)), *(mesh.triangles for mesh in shapes)])
         here = scene.environment_of(layout.index)
         around = [] if here is None or here.mesh is None else [here.mesh]
@@ -218,7 +219,7 @@ class VisibilityPredictor:
 
 def containing_solid(scene: Scene, layout: Layout, point: Float64Array) -> str:
     """Return the description of the visible shape or the object that contains a point [m]; empty if none does."""
-    if name := enclosing_shape(scene, point):
+    if name := enclosing_shape(scene, point, layout.index):
         return f"shape {name!r}"
     for one in layout.instances:
         mesh = _mesh(scene, one.asset)
@@ -227,10 +228,10 @@ def containing_solid(scene: Scene, layout: Layout, point: Float64Array) -> str:
     return ""
 
 
-def enclosing_shape(scene: Scene, point: Float64Array) -> str:
+def enclosing_shape(scene: Scene, point: Float64Array, layout: int = 0) -> str:
     """Return the name of a visible shape that contains a point [m] and not the centre of the region, or empty."""
     middle = (np.array(scene.spec.region.min) + scene.spec.region.max) / 2
-    for shape, mesh in zip(scene.spec.shapes, scene.shape_meshes, strict=True):
+    for shape, mesh, _ in placed_shapes(scene, layout):
         if shape.visible and points_inside(mesh, np.stack([point, middle])).tolist() == [True, False]:
             return shape.name
     return ""

@@ -203,6 +203,9 @@ class SceneSpec(StrictModel):
         if self.conveyor is not None and self.conveyor.belt not in boxes:
             named, got = ", ".join(boxes) or "none", self.conveyor.belt
             raise FieldError(("conveyor", "belt"), f"must be the name of a box among the shapes, {named} (got {got})")
+        for number, shape in enumerate(self.shapes):
+            if self.conveyor is not None and shape.name == self.conveyor.belt and shape.is_jittered:
+                raise FieldError(("shapes", number, "jitter"), "must not be given for the belt of a conveyor")
         environment_lights = [
             i for i, light in enumerate(self.lights) if isinstance(light, EnvironmentLight | RoomLight)
         ]

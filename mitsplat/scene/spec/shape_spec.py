@@ -49,6 +49,18 @@ class Shape(StrictModel):
         description="Materials of a visible shape, in place of ``colour``. Each layout draws one of them and a value "
         "from each of its ranges.",
     )
+    jitter: NonNegativeFloat = Field(
+        0.0,
+        exclude_if=lambda distance: distance == 0,
+        description="Random displacement along x and y, 1 sigma [m]. It is drawn for every layout.",
+    )
+    rotation_jitter: NonNegativeFloat = Field(
+        0.0,
+        le=30,
+        exclude_if=lambda angle: angle == 0,
+        description="Random rotation about the vertical through the centre of the shape, 1 sigma [degrees]. It is "
+        "drawn for every layout.",
+    )
     friction: NonNegativeFloat = Field(
         0.6,
         description="Coulomb friction coefficient. A contact has the geometric mean of the coefficients of both sides.",
@@ -80,6 +92,11 @@ class Shape(StrictModel):
         if self.materials and not self.visible:
             raise FieldError("materials", f"must not be given for shape {self.name!r}, which is not visible")
         return self
+
+    @property
+    def is_jittered(self) -> bool:
+        """True if the shape stands at another place in every layout."""
+        return bool(self.jitter or self.rotation_jitter)
 
 
 class Conveyor(StrictModel):

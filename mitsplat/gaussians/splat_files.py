@@ -173,6 +173,9 @@ def write_splats(splats: SplatArrays, path: Path, kernel: KernelName | None = No
     if not path.parent.is_dir():
         raise InputError(f"{path}: cannot be written (the folder does not exist)")
     data = encoders[suffix](splats, kernel)
+    if suffix == ".splat" and kernel == "mip":
+        rule = "%s: .splat files cannot state that splats were trained with antialiasing: use .ply or .spz"
+        _logger.warning(rule, path)
     with storage_errors(path):
         write_file(path, lambda partial: partial.write_bytes(data))
 

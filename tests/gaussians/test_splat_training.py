@@ -72,6 +72,14 @@ def test_stored_splats_keep_their_kernel(tmp_path: Path, form: str, kernel: str)
     assert Splats.concatenate([splats, random_splats(3)]).kernel is None
 
 
+def test_a_file_that_cannot_state_antialiasing_is_reported(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    splats = replace(random_splats(3), kernel="mip")
+    for name in ("a.ply", "a.spz", "a.splat"):
+        splats.save(tmp_path / name)
+    (message,) = caplog.messages
+    assert message.startswith(f"{tmp_path / 'a.splat'}: .splat files cannot state that splats were trained with anti")
+
+
 @pytest.mark.parametrize("version", [2, 3])
 def test_the_flag_of_spz_files_states_antialiasing(tmp_path: Path, version: int) -> None:
     """Version 2 is decoded by another program than version 3; its rotations take a byte less."""

@@ -15,6 +15,8 @@ from mitsplat.arrays import Float64Array, Int64Array
 from mitsplat.bake.surface_materials import SurfaceFinish
 from mitsplat.errors import InputError
 from mitsplat.gaussians.splat_materials import MAX_SPECULAR
+from mitsplat.geometry.camera import spiral
+from mitsplat.geometry.coplanar import coplanar_place
 from mitsplat.geometry.mesh_normals import corner_normals
 from mitsplat.images.colour import decode_srgb, encode_srgb
 from mitsplat.mesh_files.mesh_file import DIELECTRIC_SPECULAR, OPAQUE, Axis, FilePart, MeshFile, Texture
@@ -216,6 +218,7 @@ def read_model(
     warnings = [*file.warnings]
     warnings += _recentre(parts, file, source)
     warnings += _inverted_bodies(parts)
+    warnings += _coincident_parts(parts)
     return MeshModel(tuple(parts), units, axis, tuple(stated), tuple(warnings))
 
 
@@ -299,6 +302,31 @@ def _recentre(parts: Sequence[MeshPart], file: MeshFile, source: str) -> Iterato
         part.mesh.apply_translation(-centre)
     place = ", ".join(f"{value:.10g}" for value in centre)
     yield f"the mesh is {distance:.4g} m from the origin of its file: its centre ({place}) m becomes the origin"
+
+
+def _coincident_parts(parts: Sequence[MeshPart]) -> Iterator[str]:
+    """Yield a warning about each pair of parts of different looks that have faces in one plane, such as decals."""
+    bounds = np.array([part.mesh.bounds for part in parts])
+    low, high = bounds[:, 0].min(axis=0), bounds[:, 1].max(axis=0)
+    eyes = (low + high) / 2 + 10 * np.linalg.norm(high - low) * spiral(np.linspace(-0.95, 0.95, 32), 0.0)
+    for one, part in enumerate(parts):
+        meets = ((bounds[:, 0] <= bounds[one, 1]) & (bounds[:, 1] >= bounds[one, 0])).all(axis=1)
+        for other in (parts[index] for index in np.flatnonzero(meets).tolist() if index > one):
+            if _look_alike(part, other):
+                continue
+            if (place := coplanar_place(part.mesh, other.mesh, eyes, one_sided=True)) is not None:
+                at = ", ".join(f"{value:.4g}" for value in place)
+                yield (
+                    f"parts {part.name!r} and {other.name!r} have faces in one plane, for example at [{at}] m: both "
+                    "show in random spots; move one of them by 0.1 mm or more"
+                )
+
+
+def _look_alike(one: MeshPart, other: MeshPart) -> bool:
+    """Return True if two parts have the same colour everywhere."""
+    if one.colours is None or other.colours is None:
+        return False
+    return all(bool((part.colours == one.colours[0, 0]).all()) for part in (one, other))
 
 
 def _inverted_bodies(parts: Sequence[MeshPart]) -> Iterator[str]:

@@ -21,17 +21,20 @@ _MIN_EXTENT = 1e-3
 """Minimum extent of an overlap [m]."""
 
 
-def coplanar_place(one: trimesh.Trimesh, other: trimesh.Trimesh, eyes: npt.ArrayLike) -> Float64Array | None:
+def coplanar_place(
+    one: trimesh.Trimesh, other: trimesh.Trimesh, eyes: npt.ArrayLike, *, one_sided: bool = False
+) -> Float64Array | None:
     """Return a point [m] at which a face of each of two meshes lies in the same plane and faces the same side, or None.
 
-    Planes that face none of the viewpoints ``eyes`` (N, 3) [m] are ignored.
+    Planes that face none of the viewpoints ``eyes`` (N, 3) [m] are ignored. Open meshes show both sides, unless
+    ``one_sided`` is set.
     """
     low = np.maximum(one.bounds[0], other.bounds[0]) - DISTANCE
     high = np.minimum(one.bounds[1], other.bounds[1]) + DISTANCE
     if (low > high).any():
         return None
     middle = (low + high) / 2
-    triangles, planes = zip(*(_planes(mesh, low, high, middle) for mesh in (one, other)), strict=True)
+    triangles, planes = zip(*(_planes(mesh, low, high, middle, one_sided) for mesh in (one, other)), strict=True)
     if not all(map(len, planes)):
         return None
     tolerance = np.array([_ANGLE, _ANGLE, _ANGLE, DISTANCE])
@@ -50,7 +53,7 @@ def coplanar_place(one: trimesh.Trimesh, other: trimesh.Trimesh, eyes: npt.Array
 
 
 def _planes(
-    mesh: trimesh.Trimesh, low: Float64Array, high: Float64Array, middle: Float64Array
+    mesh: trimesh.Trimesh, low: Float64Array, high: Float64Array, middle: Float64Array, one_sided: bool
 ) -> tuple[Float64Array, Float64Array]:
     """Return the triangles of a mesh that reach a box, (T, 3, 3) relative to ``middle``, and their planes (T, 4)."""
     triangles = np.asarray(mesh.triangles, dtype=np.float64)
@@ -60,7 +63,7 @@ def _planes(
     lengths = np.linalg.norm(normals, axis=1)
     triangles, normals = triangles[lengths > 0], normals[lengths > 0] / lengths[lengths > 0, None]
     planes = np.column_stack([normals, (normals * triangles[:, 0]).sum(axis=1)])
-    if mesh.is_watertight:
+    if one_sided or mesh.is_watertight:
         return triangles, planes
     return np.concatenate([triangles, triangles]), np.concatenate([planes, -planes])  # open meshes show both sides
 

@@ -6,6 +6,7 @@ The unit is the metre and y points up. Skins and morph targets have the pose tha
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from mitsplat.arrays import Float64Array, Int64Array
 from mitsplat.errors import InputError
+from mitsplat.mesh_files.cut_outs import cut_out
 from mitsplat.mesh_files.gltf_data import GltfData, normalised
 from mitsplat.mesh_files.mesh_file import (
     DIELECTRIC_SPECULAR,
@@ -29,6 +31,7 @@ from mitsplat.mesh_files.mesh_file import (
     MeshFile,
     Texture,
     Wrap,
+    alpha_of,
     gloss_texture,
     is_transparent,
     means_of,
@@ -161,7 +164,20 @@ class _GltfReader:
         stored = self._data.entry("materials", primitive["material"])
         uv = {int(key[9:]): values[faces] for key, values in attributes.items() if key.startswith("TEXCOORD_")}
         material = self._read_material(stored, uv)
-        return FilePart(name, vertices, faces, np.eye(4), material, colours, bool(stored.get("doubleSided")))
+        part = FilePart(name, vertices, faces, np.eye(4), material, colours, bool(stored.get("doubleSided")))
+        return self._cut_out(part, stored, uv) if stored.get("alphaMode") == "MASK" else part
+
+    def _cut_out(self, part: FilePart, stored: JsonObject, uv: dict[int, Float64Array]) -> FilePart:
+        """Remove the places of a part that its material, of ``alphaMode`` MASK, makes invisible."""
+        values = stored.get("pbrMetallicRoughness", {})
+        factor, base = values.get("baseColorFactor", (1, 1, 1, 1)), values.get("baseColorTexture")
+        if (given := stored.get("extensions", {}).get("KHR_materials_pbrSpecularGlossiness")) is not None:
+            factor, base = given.get("diffuseFactor", (1, 1, 1, 1)), given.get("diffuseTexture")
+        cutoff = float(stored.get("alphaCutoff", 0.5))
+        alpha = self._read_texture(base, uv, [], alpha=True)
+        if alpha is not None and factor[3] > 0:
+            return cut_out(part, alpha, 255.0 * cutoff / factor[3])
+        return part if factor[3] >= cutoff else replace(part, faces=part.faces[:0])
 
     def _read_arrays(self, primitive: JsonObject) -> tuple[dict[str, npt.NDArray[Any]], Int64Array]:
         """Return the positions, colours and texture coordinates of a primitive, and its indices."""
@@ -218,8 +234,8 @@ class _GltfReader:
         if left_out:
             names = ", ".join(sorted(left_out))
             warnings.append(f"its {names} {'is' if len(left_out) == 1 else 'are'} left out")
-        texture, is_opaque = self._read_texture(base, uv, warnings), stored.get("alphaMode", "OPAQUE") == "OPAQUE"
-        if not (texture is None or is_opaque) and is_transparent(self._data.texture_image(base["index"])):
+        texture, is_blended = self._read_texture(base, uv, warnings), stored.get("alphaMode", "OPAQUE") == "BLEND"
+        if texture is not None and is_blended and is_transparent(self._data.texture_image(base["index"])):
             warnings.append(TRANSPARENT_TEXELS)
         gloss = self._read_texture(values.get("metallicRoughnessTexture"), uv, warnings)
         if gloss is not None:
@@ -243,12 +259,13 @@ class _GltfReader:
         )
 
     def _read_texture(
-        self, given: JsonObject | None, uv: dict[int, Float64Array], warnings: list[str]
+        self, given: JsonObject | None, uv: dict[int, Float64Array], warnings: list[str], *, alpha: bool = False
     ) -> Texture | None:
-        """Read a texture with its own coordinates."""
-        if given is None or not self._textures:
+        """Read a texture, or only its channel ``alpha``, with its own coordinates."""
+        if given is None or not (self._textures or alpha):
             return None
-        pixels, transform = self._pixels(given["index"]), given.get("extensions", {}).get("KHR_texture_transform", {})
+        pixels = alpha_of(self._data.texture_image(given["index"])) if alpha else self._pixels(given["index"])
+        transform = given.get("extensions", {}).get("KHR_texture_transform", {})
         number = transform.get("texCoord", given.get("texCoord", 0))
         if number not in uv:
             warnings.append(f"its texture uses coordinates TEXCOORD_{number}, which are missing, and is left out")

@@ -152,6 +152,18 @@ def pixels_of(image: Image.Image) -> npt.NDArray[np.uint8]:
         raise InputError(f"its texture cannot be read ({error})") from error
 
 
+def alpha_of(image: Image.Image) -> npt.NDArray[np.uint8]:
+    """Return the opacity (H, W, 1) of a texture times 255.
+
+    Raises:
+        InputError: If the image is damaged.
+    """
+    try:
+        return np.asarray(image.convert("RGBA").getchannel("A"))[..., None]
+    except IMAGE_ERRORS as error:
+        raise InputError(f"its texture cannot be read ({error})") from error
+
+
 def is_transparent(image: Image.Image) -> bool:
     """Return True if an image has transparent pixels."""
     try:

@@ -15,7 +15,7 @@ from mitsplat.asset import read_mesh
 from mitsplat.bake.mesh_parts import MeshPart, read_model, read_parts
 from mitsplat.errors import InputError, MissingResourceError
 from mitsplat.images.colour import encode_srgb
-from tests.mesh_files.glb import CORNER_UV, CORNERS, QUAD, SIZE, Glb, cube_mesh, matt, sheet
+from tests.mesh_files.glb import CORNER_UV, CORNERS, QUAD, SIZE, Glb, coordinate_image, cube_mesh, matt, sheet
 
 
 @pytest.fixture(autouse=True)
@@ -281,6 +281,29 @@ def test_ignored_properties_of_a_material_are_reported(tmp_path: Path, changes: 
         patch.setattr(Glb, "save", with_texture(Glb.save))
         (warning,) = material_of(tmp_path, **changes).warnings
     assert __import__("re").search(sentence, warning)
+
+
+@pytest.mark.parametrize(("cutoff", "alpha"), [(None, 1.0), (0.25, 1.0), (0.25, 0.5), (1.5, 1.0)])
+def test_masked_texels_are_cut_out(tmp_path: Path, cutoff: float | None, alpha: float) -> None:
+    """Opacity grows from left to right, so that the right part of the sheet remains, with its texture."""
+    image = coordinate_image()
+    image.putalpha(Image.fromarray(np.tile(np.arange(64, dtype=np.uint8) * 4, (64, 1))))
+    glb = Glb()
+    attributes = {"POSITION": glb.accessor(CORNERS), "TEXCOORD_0": glb.accessor(CORNER_UV)}
+    material = matt(glb.texture(image)) | {"alphaMode": "MASK"} | ({} if cutoff is None else {"alphaCutoff": cutoff})
+    material["pbrMetallicRoughness"]["baseColorFactor"] = [1, 1, 1, alpha]
+    glb.mesh(attributes, glb.accessor(QUAD), material)
+    path = glb.save(tmp_path / "a.glb")
+    if cutoff == 1.5:
+        with pytest.raises(InputError, match="faces that have an area"):
+            read(path)
+        return
+    (part,) = read(path)
+    edge = (cutoff or 0.5) / alpha
+    assert part.mesh.area == pytest.approx((1 - edge) * SIZE**2, rel=0.02) and part.warnings == ()
+    assert part.mesh.bounds[0, 0] == pytest.approx(edge * SIZE, abs=1.5 * SIZE / 64)
+    points, texels = samples(part)
+    np.testing.assert_allclose(texels, np.stack([points[:, 0] / SIZE, 1.0 - points[:, 1] / SIZE], axis=1), atol=0.01)
 
 
 def with_texture(save: Any) -> Any:

@@ -255,6 +255,8 @@ def _class_names(content: dict[str, Any], path: Path) -> tuple[str, ...]:
         names = [names[i] for i in range(len(names))]
     if not isinstance(names, list) or not names or len(set(map(str, names))) < len(names):
         raise InputError(f"{path}: names must be distinct classes, numbered from 0 (got {str(names)[:80]})")
+    if content.get("nc", len(names)) != len(names):
+        raise InputError(f"{path}: nc must be the number of names, {len(names)} (got {content['nc']})")
     return tuple(map(str, names))
 
 
@@ -370,6 +372,8 @@ def _yolo_instances(text: str, path: Path, num_classes: int, size: tuple[int, in
         points = values[1:].reshape(-1, 2)
         if len(values) == 5:
             (x, y), (w, h) = points
+            if w < 0 or h < 0:
+                raise InputError(f"{place}: must have a width and a height of at least 0 (got {line[:60]!r})")
             points = np.array([[x - w / 2, y - h / 2], [x + w / 2, y + h / 2]])
         polygon = _clip_points(points * size, size, place)
         (x0, y0), (x1, y1) = polygon.min(axis=0), polygon.max(axis=0)
@@ -430,6 +434,9 @@ def _coco_part(root: Path, split: Split, path: Path, content: dict[str, Any], pr
         raise InputError(f"{path}: ids of images, and ids and names of categories, must differ")
     if not by_image:
         raise InputError(f"{root}: there are no images for {split}")
+    boxes = [annotation.get("bbox") for annotation in content["annotations"]]
+    if boxes and all(map(_is_fraction, boxes)):
+        raise InputError(f"{path}: bbox must be in pixels (got at most 1 in every annotation: are they fractions?)")
     find = _image_finder(root, path)
 
     def read(image: dict[str, Any]) -> Sample:
@@ -545,6 +552,12 @@ def _coco_instance(annotation: dict[str, Any], class_index: int, size: tuple[int
                 rle = coco_mask.frPyObjects({"size": [height, width], "counts": lengths}, height, width)
             if not decode_rle(rle).any():
                 raise InputError(f"{place}: segmentation must cover a pixel")
+            x, y, w, h = coco_mask.toBbox(rle).tolist()
+            if min(x1, x + w) < max(x0, x) - 1 or min(y1, y + h) < max(y0, y) - 1:  # masks have whole pixels
+                raise InputError(
+                    f"{place}: bbox must enclose its segmentation, which spans [{x:g}, {y:g}, {w:g}, {h:g}] (got "
+                    f"{annotation['bbox']})"
+                )
         except InputError:
             raise
         except (KeyError, TypeError, ValueError, IndexError, ArithmeticError) as error:
@@ -553,6 +566,11 @@ def _coco_instance(annotation: dict[str, Any], class_index: int, size: tuple[int
     if crowd not in (0, 1):
         raise InputError(f"{place}: iscrowd must be 0 or 1 (got {crowd!r})")
     return LabelledObject(class_index, (x0, y0, x1, y1), None, None if rle is None else _rle_text(rle), bool(crowd))
+
+
+def _is_fraction(box: object) -> bool:
+    """Return True if a box has no value above 1."""
+    return isinstance(box, list) and all(isinstance(value, int | float) and value <= 1 for value in box)
 
 
 def _run_lengths(code: str) -> list[int]:

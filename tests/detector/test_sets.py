@@ -148,6 +148,11 @@ YOLO_FAULTS: dict[str, tuple[Callable[[Path], object], str]] = {
     "nan": (_line("0 0.1 0.1 0.2 nan 0.2 0.2\n"), r"must lie in the image, .* \(got nan\)"),
     "torn": (_line("0 0.1 0.1 0.2 0.1 0.2\n"), r"000001.txt:1: must be a class and a box .* \(got 6\)"),
     "word": (_line("0 0.1 0.1 o.2 0.1 0.2 0.2\n"), r"000001.txt:1: must be numbers"),
+    "negative": (_line("0 0.5 0.5 -0.1 0.2\n"), r"000001.txt:1: must have a width and a height of at least 0"),
+    "count": (
+        lambda root: (root / "data.yaml").write_text("train: images/train\nnc: 3\nnames: [disc, box]\n"),
+        r"data.yaml: nc must be the number of names, 2 \(got 3\)",
+    ),
     "flat": (_line("0 0.1 0.1 0.2 0.1 0.3 0.1\n"), r"must have a width and a height"),
     "image": (
         lambda root: (root / "images/train/000001.png").write_bytes(
@@ -254,6 +259,14 @@ COCO_FAULTS: dict[str, tuple[Callable[[dict], object], str]] = {  # type: ignore
     "beyond": (lambda c: c["annotations"][0].update(bbox=[0, 0, 200, 10]), r"bbox: positions must lie in the image"),
     "bbox": (lambda c: c["annotations"][0].update(bbox=[0, 0, 10]), r"bbox must be x, y, width, height"),
     "empty": (lambda c: c["annotations"][0].update(bbox=[0, 0, 0, 10]), r"bbox must have a width and a height"),
+    "fractions": (
+        lambda c: [one.update(bbox=[0.1, 0.1, 0.2, 0.3], segmentation=[]) for one in c["annotations"]],
+        r"labels.json: bbox must be in pixels \(got at most 1 in every annotation",
+    ),
+    "elsewhere": (
+        lambda c: c["annotations"][0].update(bbox=[2, 2, 10, 10], segmentation=[[60, 40, 80, 40, 80, 50]]),
+        r"bbox must enclose its segmentation, which spans \[61, 40, 19, 10\]",
+    ),
     "polygon": (
         lambda c: c["annotations"][0].update(segmentation=[[1, 2]]),
         "segmentation must be polygons of 3 points",

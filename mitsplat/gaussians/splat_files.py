@@ -85,6 +85,8 @@ _SPZ_FRACTIONAL_BITS = 12
 _SPZ_FRACTIONAL_BITS_OFFSET = 13
 _SPZ_POSITION_BITS = 23
 
+_MIN_JUDGED = 100
+"""Number of Gaussians from which their values show how they are encoded."""
 _logger = logging.getLogger(__name__)
 
 
@@ -196,6 +198,7 @@ def _decode_ply(data: bytes) -> SplatArrays:
     if rest not in (0, 9, 24, 45) or not set(rest_names) <= set(names):
         raise InputError(f"f_rest must be numbered from 0 and have 0, 9, 24 or 45 properties (got {rest})")
     rows = vertex_rows(data, form, elements, start)
+    _check_encoding(columns_of(rows, scale_names), rows["opacity"])
     scales, opacities = _exp(columns_of(rows, scale_names)), _sigmoid(rows["opacity"])
     if len(scale_names) == 2:
         scales = np.hstack([scales, _FLAT_THICKNESS * scales.min(axis=1, keepdims=True)])
@@ -210,6 +213,19 @@ def _decode_ply(data: bytes) -> SplatArrays:
         opacities=opacities,
         sh=np.concatenate([columns_of(rows, _COLOUR)[:, None], higher], axis=1),
     )
+
+
+def _check_encoding(scales: npt.NDArray[Any], opacities: npt.NDArray[Any]) -> None:
+    """Refuse sizes and opacities in place of the logarithms and logits of a PLY file.
+
+    No trained splats have only logits from 0 to 1 and Gaussians above one unit.
+    """
+    if len(scales) >= _MIN_JUDGED and scales.min() > 0 and opacities.min() >= 0 and opacities.max() <= 1:
+        raise InputError(
+            "scale_0 to scale_2 and opacity of a PLY file must be logarithms and logits (got "
+            f"{scales.min():.3g} to {scales.max():.3g}, and {opacities.min():.3g} to {opacities.max():.3g}): apply log "
+            "to the scales and log(o / (1 - o)) to the opacities"
+        )
 
 
 def _vertex_names(data: bytes) -> tuple[str, ...]:

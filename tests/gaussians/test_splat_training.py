@@ -4,6 +4,7 @@ import gzip
 import io
 import json
 import logging
+import re
 import struct
 import zipfile
 from dataclasses import replace
@@ -232,3 +233,17 @@ def test_a_scene_uses_the_kernel_that_its_splats_state(scene_data, write_scene, 
     assert found.ok == (stated is None)
     assert f"{tagged.name}: mip" in found.text
     assert "rendering.kernel to mip" in found.remedy
+
+
+def test_sizes_in_place_of_logarithms_are_refused(tmp_path: Path) -> None:
+    """Such a file is that of a program that wrote what it renders."""
+    splats = random_splats(200)
+    splats.save(tmp_path / "a.ply")
+    head, _, rows = (tmp_path / "a.ply").read_bytes().partition(b"end_header\n")
+    names = re.findall(rb"property float (\w+)", head)
+    values = np.frombuffer(rows, "<f4").reshape(200, -1).copy()
+    for number, column in enumerate((*splats.scales.T, splats.opacities)):
+        values[:, names.index([b"scale_0", b"scale_1", b"scale_2", b"opacity"][number])] = column
+    (tmp_path / "a.ply").write_bytes(head + b"end_header\n" + values.tobytes())
+    with pytest.raises(InputError, match=r"a\.ply: scale_0 to scale_2 and opacity .* must be logarithms and logits"):
+        Splats.load(tmp_path / "a.ply")

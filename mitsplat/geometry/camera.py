@@ -79,7 +79,9 @@ class Camera:
             raise ValueError(
                 f"camera size must be whole numbers of 1 to {MAX_IMAGE_SIDE} px (got {sides[0]}x{sides[1]})"
             )
-        if not (self.fx > 0 and self.fy > 0 and np.isfinite([self.fx, self.fy, self.cx, self.cy]).all()):
+        if not np.isfinite([self.cx, self.cy]).all():
+            raise ValueError(f"the principal point must be finite (got cx={self.cx}, cy={self.cy})")
+        if not (self.fx > 0 and self.fy > 0 and np.isfinite([self.fx, self.fy]).all()):
             raise ValueError(f"focal lengths must be finite and > 0 (got fx={self.fx}, fy={self.fy})")
         if not self.near > 0:
             raise ValueError(f"near must be > 0 (got {self.near})")

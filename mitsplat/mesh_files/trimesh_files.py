@@ -78,7 +78,10 @@ def read_with_trimesh(path: Path, *, textures: bool = True) -> MeshFile:
     scene = trimesh.load_scene(path, resolver=_Resolver(path))
     parts = scene_parts(scene, path)
     units, up = _read_collada_asset(path) if kind == ".dae" else (None, None)
-    return MeshFile(parts, units, up, in_single=kind in (".stl", ".ply"))
+    warnings = []
+    if kind == ".stl" and any(np.any(one.face_attributes.get("stl", 0)) for one in scene.geometry.values()):
+        warnings.append("the colours of its faces are not read, because STL files store them in several ways")
+    return MeshFile(parts, units, up, tuple(warnings), in_single=kind in (".stl", ".ply"))
 
 
 def scene_parts(mesh: trimesh.Trimesh | trimesh.Scene, source: object) -> tuple[FilePart, ...]:

@@ -151,3 +151,13 @@ def test_units_and_up_axis_of_collada_are_used(
     np.testing.assert_allclose(model.parts[0].mesh.extents, units * np.array(extents))
     assert model.parts[0].mesh.volume == pytest.approx(units**3)
     assert read_model(tmp_path / "a.dae", metres_per_unit=0.5, up="z").units == 0.5
+
+
+@pytest.mark.parametrize("is_coloured", [False, True])
+def test_colours_of_stl_files_are_reported(tmp_path: Path, is_coloured: bool) -> None:
+    """The two bytes after each face hold its colour in different ways (VisCAM, Magics)."""
+    stored = bytearray(trimesh.exchange.stl.export_stl(trimesh.creation.box((1, 2, 3))))
+    stored[84 + 48 : 84 + 50] = b"\xff\x7f" if is_coloured else b"\0\0"
+    (tmp_path / "box.stl").write_bytes(stored)
+    warnings = read_model(tmp_path / "box.stl").warnings
+    assert [warning.partition(" are not read")[0] for warning in warnings] == is_coloured * ["the colours of its faces"]

@@ -60,6 +60,10 @@ class _Lens(BaseModel):
     camera_model: str = "OPENCV"
 
 
+_MIN_CENTRE = 0.25
+"""Minimum distance of a principal point from the border, relative to the image, if its image size is not stated."""
+
+
 class _Frame(_Lens):
     file_path: str
     transform_matrix: tuple[_Row, _Row, _Row, _Row]
@@ -251,6 +255,12 @@ def _read_transforms(
             camera = _camera(lens, round(width), round(height), np.array(frame.transform_matrix))
         except ValueError as error:
             raise InputError(f"{path}: frames[{number}]: {error}") from error
+        across = camera.cx / width, camera.cy / height
+        if frame.file_path not in sized and not all(_MIN_CENTRE < share < 1 - _MIN_CENTRE for share in across):
+            raise InputError(
+                f"{path}: frames[{number}]: cx, cy = {camera.cx:g}, {camera.cy:g} must be near the middle of the photo "
+                f"of {width} x {height} px: state w and h, the size for which fl_x and cx hold"
+            )
         other = cameras.setdefault(frame.file_path, camera)
         if not np.array_equal(other.world_from_camera, camera.world_from_camera):
             raise InputError(f"{path}: frames[{number}]: an image must have one pose (got two of {frame.file_path})")
@@ -269,6 +279,8 @@ def _camera(lens: _Lens, width: int, height: int, pose: np.ndarray[tuple[int, ..
     if focal is None:
         if lens.camera_angle_x is None:
             raise ValueError("needs fl_x or camera_angle_x")
+        if not 0 < lens.camera_angle_x < np.pi:
+            raise ValueError(f"camera_angle_x must be 0 to pi radians (got {lens.camera_angle_x:g}: is it in degrees?)")
         focal = 0.5 * width / np.tan(0.5 * lens.camera_angle_x)
     fisheye = lens.camera_model == "OPENCV_FISHEYE"
     if lens.k4 and not fisheye:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import struct
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -170,6 +172,26 @@ def test_fisheye_cameras_are_read_from_colmap_and_transforms_json(tmp_path: Path
     for camera in (colmap, nerf):
         assert camera.lens == "fisheye"
         np.testing.assert_allclose(camera.project([[np.tan(angle), 0, 1]])[0], pixel, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("lens", "sentence"),
+    [
+        ({"camera_angle_x": 50.0}, "camera_angle_x must be 0 to pi radians (got 50: is it in degrees?)"),
+        ({"fl_x": 900, "cx": 640, "cy": 480}, "cx, cy = 640, 480 must be near the middle of the photo of 640 x 480 px"),
+        ({"fl_x": 900, "cx": 640, "cy": 480, "w": 1280, "h": 960}, ""),
+        ({"fl_x": 450, "cx": 300, "cy": 250}, ""),
+    ],
+)
+def test_intrinsics_of_another_image_size_or_unit_are_refused(
+    tmp_path: Path, lens: dict[str, float], sentence: str
+) -> None:
+    """Photos of 640 x 480 px may have cameras that hold for 1280 x 960 px, if the file states it."""
+    frame = {"file_path": "a.png", "transform_matrix": np.diag([1.0, -1.0, -1.0, 1.0]).tolist()}
+    path = tmp_path / "transforms.json"
+    path.write_text(json.dumps(lens | {"frames": [frame]}))
+    with pytest.raises(InputError, match=re.escape(sentence)) if sentence else nullcontext():
+        poses._read_transforms(path, poses._parse_transforms(path), {"a.png": (640, 480)})
 
 
 def small_model(folder: Path) -> tuple[Path, list[Prepared]]:

@@ -288,6 +288,7 @@ def test_every_benchmark_records_its_figures() -> None:
     assert {path.name for path in scripts if "with recording(" not in path.read_text()} == others
 
 
+@pytest.mark.extended
 def test_every_benchmark_can_be_imported() -> None:
     """Every imported name exists in the package. The imports run in a new process, as some change the environment.
 

@@ -161,7 +161,7 @@ def test_no_child_runs_python_files_of_the_current_folder(start, tmp_path, kind)
     assert KINDS[kind] in said
 
 
-@pytest.mark.parametrize("command", [["doctor"], ["check", "scene.yaml"]])
+@pytest.mark.parametrize("command", [pytest.param(["doctor"], marks=pytest.mark.extended), ["check", "scene.yaml"]])
 def test_no_command_runs_python_files_of_the_current_folder(start, command):
     program = Path(sys.executable).with_name("mitsplat")
     if not program.exists():

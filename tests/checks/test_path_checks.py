@@ -97,7 +97,11 @@ def test_a_mesh_without_a_volume_has_no_mass() -> None:
         ("visibility", lambda data: data["camera"].update(target=[0, 0, 5], height=0.1, radius=0.2)),
         ("light", lambda data: data.update(lights=[])),
         ("exposure", lambda data: data.update(composite={"exposure": {"ev": 18}})),
-        ("exposure", lambda data: data.update(composite={"exposure": {"ev": -8}})),
+        pytest.param(
+            "exposure",
+            lambda data: data.update(composite={"exposure": {"ev": -8}}),
+            marks=pytest.mark.extended,
+        ),
     ],
 )
 def test_each_planted_fault_of_a_scene_is_found_with_its_remedy(scene_data, write_scene, name, change):

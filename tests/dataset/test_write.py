@@ -195,6 +195,7 @@ class TestSameBytes:
         assert write(scene, out).rendered == 7
         assert contents(out) == undisturbed
 
+    @pytest.mark.extended
     def test_a_failed_worker_keeps_finished_frames(self, scene, tmp_path, undisturbed):
         out = tmp_path / "out"
         with pytest.raises(FrameError, match="frame 5 failed"):
@@ -452,6 +453,7 @@ class TestDevice:
         with pytest.raises(InputError, match=r"must be a dataset of this version of mitsplat \(dataset.json: device: "):
             read_content(tmp_path / "out")
 
+    @pytest.mark.extended
     def test_workers_use_the_device_of_their_caller(self, scene, tmp_path):
         """Each worker records its device. Earlier versions fell back to LLVM for any device of the caller."""
         write(scene, tmp_path / "out", render=Told(tmp_path), workers=2, device="cpu")

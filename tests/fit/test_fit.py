@@ -126,7 +126,7 @@ def test_a_finished_fit_is_reused(fitted: Path, capture: Capture) -> None:
     assert again.iterations == 60 and again.psnr == json.loads((fitted / "fit.json").read_text())["psnr"]
 
 
-@pytest.mark.parametrize("strategy", [None, Classic])
+@pytest.mark.parametrize("strategy", [Classic, pytest.param(None, marks=pytest.mark.extended)])
 def test_an_interrupted_fit_resumes_to_the_same_bytes(
     capture: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, strategy: type[Classic] | None
 ) -> None:

@@ -135,6 +135,7 @@ def interrupted(fits: Fits, out: Path, place: int) -> bool:
     return False
 
 
+@pytest.mark.extended
 def test_a_replacing_fit_interrupted_anywhere_ends_in_the_same_bytes(fits: Fits, tmp_path: Path) -> None:
     """The fit is interrupted after each step and each change of the folder.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import pickle
 from dataclasses import fields, replace
@@ -240,9 +241,16 @@ def test_frame_out_of_range_is_refused(scene: ms.Scene) -> None:
         ms.render_frame(scene, 12)
 
 
-@pytest.mark.parametrize("samples", [1, 2, "edges"])
-@pytest.mark.parametrize("quality", ["fast", "balanced"])
-@pytest.mark.parametrize("close", [False, True])
+QUICK = (("fast", 1, False), ("balanced", 2, True), ("fast", "edges", True))
+
+
+@pytest.mark.parametrize(
+    ("quality", "samples", "close"),
+    [
+        pytest.param(*case, marks=() if case in QUICK else pytest.mark.extended)
+        for case in itertools.product(("fast", "balanced"), (1, 2, "edges"), (False, True))
+    ],
+)
 def test_a_still_camera_renders_the_same_bytes_as_a_new_renderer(quality: str, samples: Any, close: bool) -> None:
     """From the third image on, only tiles with objects are rendered, also where static splats occlude them."""
     ms.render_splats(make_splats(1), Camera.look_at((0, 0, -2), (0, 0, 0), width=8, height=8, fov_x=50))

@@ -255,7 +255,7 @@ def test_an_error_in_an_included_file_names_its_line(small: Path) -> None:
         render_xml(scene, small / "out.png")
 
 
-@pytest.mark.parametrize("place", ["scene", "here"])
+@pytest.mark.parametrize("place", ["scene", pytest.param("here", marks=pytest.mark.extended)])
 def test_native_plugins_in_the_scene_folder_are_not_loaded(small: Path, place: str) -> None:
     """Mitsuba searches the current folder and the scene's folder for plugins before its own."""
     compiler = shutil.which("cc")
@@ -277,6 +277,7 @@ def test_native_plugins_in_the_scene_folder_are_not_loaded(small: Path, place: s
     assert not (small / "ran").exists()
 
 
+@pytest.mark.extended
 def test_the_documented_scene_renders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The image is 8 times smaller than documented, so that the test is fast."""
     (text,) = re.findall(r"```xml\n(.*?)```", (ROOT / "docs/xml_and_plugins.md").read_text(), re.DOTALL)

@@ -371,7 +371,7 @@ def test_a_box_does_not_balance_on_its_edge(stepper):
     np.testing.assert_allclose(np.abs(outcome.poses[:, 2, 2]), [0, 1], atol=1e-3)
 
 
-@pytest.mark.parametrize("stepper", STEPPERS)
+@pytest.mark.parametrize("stepper", ["mujoco", pytest.param("warp", marks=pytest.mark.extended)])
 def test_a_stack_of_five_drifts_by_less_than_a_tenth_of_a_millimetre(stepper):
     """Drift below 0.1 mm in 5 s."""
     box = trimesh.creation.box((0.04, 0.04, 0.02))
@@ -432,7 +432,7 @@ def test_the_rebound_height_equals_its_closed_form(stepper, timestep):
         assert heights[apex][i] == pytest.approx(one * 0.4 * height, rel=0.05, abs=missed)
 
 
-@pytest.mark.parametrize("stepper", STEPPERS)
+@pytest.mark.parametrize("stepper", ["mujoco", pytest.param("warp", marks=pytest.mark.extended)])
 def test_few_discs_that_land_near_their_rim_stop_on_it(stepper):
     """Discs of 40 x 3 mm fall 0.1 m at tilts of 0.5 to 4.25 degrees from upright.
 
@@ -465,7 +465,7 @@ def test_the_restitution_of_an_underdamped_contact_equals_its_closed_form():
 
 
 @pytest.mark.parametrize("stepper", STEPPERS)
-@pytest.mark.parametrize("speed", [3.0, 6.0])
+@pytest.mark.parametrize("speed", [pytest.param(3.0, marks=pytest.mark.extended), 6.0])
 def test_a_thin_plate_does_not_tunnel(stepper, speed):
     """A plate of 2 mm moves 12 mm per step at 6 m/s, thrown flat, on edge and on a corner at table and wall."""
     from mitsplat.physics.worlds import Collider, ContactMaterial

@@ -51,7 +51,15 @@ def quick_pieces() -> Iterator[None]:
 
 
 @pytest.fixture(scope="module")
-def made(known_object: KnownObject, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, AssetResult]:
+def reconstructions() -> list[Reconstruction]:
+    """Return the list of what ``made`` reconstructs."""
+    return []
+
+
+@pytest.fixture(scope="module")
+def made(
+    known_object: KnownObject, tmp_path_factory: pytest.TempPathFactory, reconstructions: list[Reconstruction]
+) -> tuple[Path, AssetResult]:
     folder = tmp_path_factory.mktemp("made")
     (folder / "fit").mkdir()
     known_object.splats.save(folder / "fit" / "splats.ply")
@@ -59,7 +67,14 @@ def made(known_object: KnownObject, tmp_path_factory: pytest.TempPathFactory) ->
     capture = replace(known_object.capture, units="unknown", rejected={"blurred.jpg": "it is <blurred>"})
     capture.save(folder / "capture")
     job = AssetJob(name="part", class_name="bracket", settings=SETTINGS)
-    return folder, make_asset(Capture.load(folder / "capture"), folder / "fit", folder / "asset", job)
+
+    def reconstruct(*given: Any, **options: Any) -> Reconstruction:
+        reconstructions.append(reconstruct_asset(*given, **options))
+        return reconstructions[0]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("mitsplat.reconstruct.pipeline.asset_pipeline.reconstruct_asset", reconstruct)
+        return folder, make_asset(Capture.load(folder / "capture"), folder / "fit", folder / "asset", job)
 
 
 def test_mesh_and_splats_have_the_frame_of_the_truth(known_object: KnownObject, made: tuple[Path, AssetResult]) -> None:
@@ -141,17 +156,17 @@ def test_an_asset_is_reused_for_the_same_inputs_only(
 
 
 def test_edited_files_are_kept_and_missing_ones_made_again(
-    made: tuple[Path, AssetResult], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    made: tuple[Path, AssetResult],
+    reconstructions: list[Reconstruction],
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
 ) -> None:
     folder, _ = made
     given, out = (Capture.load(folder / "capture"), folder / "fit"), tmp_path / "asset"
     job = AssetJob(name="part", class_name="bracket", settings=SETTINGS)
-    found: list[Reconstruction] = []
 
     def reconstruct_once(capture: Capture, splats: Splats, job: AssetJob, **options: Any) -> Reconstruction:
-        if not found:
-            found.append(reconstruct_asset(capture, splats, job, **options))
-        return replace(found[0], asset=replace(found[0].asset, name=job.name))
+        return replace(reconstructions[0], asset=replace(reconstructions[0].asset, name=job.name))
 
     monkeypatch.setattr("mitsplat.reconstruct.pipeline.asset_pipeline.reconstruct_asset", reconstruct_once)
     shutil.copytree(folder / "asset", out)

@@ -538,14 +538,16 @@ def export(
         raise InputError(f"--out of an asset must be a USD stage, .glb, or MJCF with --mjcf (got {out})")
     if is_asset:
         from mitsplat.asset import Asset
-        from mitsplat.gltf_splats.splat_writing import export_asset_gltf
-        from mitsplat.usd.mjcf import export_asset_mjcf
-        from mitsplat.usd.usd_export import export_asset_usd
 
         asset = Asset.load(source)
         if to_gltf:
+            from mitsplat.gltf_splats.splat_writing import export_asset_gltf
+
             losses = export_asset_gltf(asset, out, spz=spz)
         else:
+            from mitsplat.usd.mjcf import export_asset_mjcf
+            from mitsplat.usd.usd_export import export_asset_usd
+
             losses = (export_asset_mjcf if mjcf else export_asset_usd)(asset, out)
     else:
         from mitsplat.scene.loading.scene_loading import load_scene

@@ -79,13 +79,17 @@ def read_gltf(path: Path, *, textures: bool = True, content: bytes | None = None
     """
     data = GltfData(path, content)
     unknown = sorted(set(data.document.get("extensionsRequired", [])) - _READ_EXTENSIONS - _COMPRESSIONS)
+    splats = InputError("it has Gaussian splats, which `mitsplat import` reads")
     if "KHR_gaussian_splatting" in unknown:
-        raise InputError("it has Gaussian splats, which `mitsplat import` reads")
+        raise splats
     if unknown:
         raise InputError(
             f"it requires extensions of glTF that are not supported: export it without {', '.join(unknown)}"
         )
-    return _GltfReader(data, textures).read()
+    file = _GltfReader(data, textures).read()
+    if not file.parts and "KHR_gaussian_splatting" in data.document.get("extensionsUsed", []):
+        raise splats
+    return file
 
 
 class _GltfReader:

@@ -18,6 +18,7 @@ from mitsplat.geometry.camera import Camera
 from mitsplat.gltf_splats.splat_reading import read_gltf_splats
 from mitsplat.gltf_splats.splat_writing import write_gltf_splats
 from mitsplat.images.colour import encode_srgb
+from mitsplat.mesh_files.mesh_reading import read_mesh_file
 from mitsplat.renderer.layers import render_splats
 from tests.cli.typed import run
 from tests.conftest import box_asset
@@ -123,6 +124,9 @@ def test_files_that_cannot_be_read_are_refused_in_one_sentence(tmp_path: Path, m
 
     good, flat, partial, mirrored = Glb(), Glb(), Glb(), [{"mesh": 0, "scale": [-1, 1, 1]}]
     one_splat(good, colour)
+    for listed in ("extensionsRequired", "extensionsUsed"):
+        with pytest.raises(InputError, match="it has Gaussian splats, which `mitsplat import` reads"):
+            read_mesh_file(good.save(path, **{**scene, listed: [EXTENSION]}))
     assert "requires extensions that are not supported: export it without X" in error_of(good, extensionsRequired=["X"])
     assert "node 0: a transform must neither mirror nor flatten" in error_of(good, nodes=mirrored)
     flat.mesh({"POSITION": flat.accessor(np.zeros((3, 3), np.float32))})

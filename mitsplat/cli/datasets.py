@@ -53,7 +53,9 @@ Preset = Annotated[PresetName | None, typer.Option(help="Rendering preset; repla
 
 
 def render(
-    scene: Annotated[Path, typer.Argument(metavar="SCENE", help="Scene file (.yaml) or Mitsuba scene (.xml).")],
+    scene: Annotated[
+        Path, typer.Argument(metavar="SCENE", help="Scene file (.yaml), OpenUSD stage, or Mitsuba scene (.xml).")
+    ],
     out: Annotated[
         Path | None,
         typer.Option(
@@ -130,8 +132,9 @@ def render(
     """Render the labelled dataset of SCENE.
 
     Options override values of the scene file. A Mitsuba scene (.xml) is rendered to one picture without labels.
+    For an OpenUSD stage (.usd, .usda, .usdc, .usdz), each of its cameras gives a labelled image.
     """
-    from mitsplat.runtime.device import find_device
+    from mitsplat.runtime.device import find_device, use_device
 
     if only is not None and any((frames is not None, shard, engine == "ray", workers is not None, overwrite)):
         raise InputError(
@@ -152,6 +155,17 @@ def render(
             from mitsplat.frames.mitsuba_xml import render_apart
 
             typer.echo(f"picture: {render_apart(scene, out, allow_outside=allow_outside, device=chosen)}")
+            return
+        from mitsplat.usd.usd_layers import is_usd
+
+        if is_usd(scene):
+            ignored = engine != "local", any_device, workers is not None, seed is not None
+            if any(ignored) or any(given is not None for given in (frames, only, tolerance, shard)):
+                raise InputError(
+                    f"{scene}: only --out, --size, --format, --quality, --device and --overwrite apply to a USD stage"
+                )
+            use_device(device or "cpu")
+            _render_stage(scene, out, overrides, overwrite=overwrite)
             return
         from mitsplat.dataset.dataset_folder import Shard
         from mitsplat.dataset.write import write_dataset
@@ -627,6 +641,25 @@ def _print_findings(findings: Iterable[Finding], mark: str) -> NoReturn:
             if finding.place:
                 typer.echo(f"      in {finding.place}")
     raise typer.Exit(0 if good else 1)
+
+
+def _render_stage(stage: Path, out: Path, overrides: Mapping[str, Any], *, overwrite: bool) -> None:
+    """Render the cameras of a USD stage to a labelled dataset."""
+    from tempfile import TemporaryDirectory
+
+    from mitsplat.dataset.python_frames import write_frames
+    from mitsplat.frames.sequence import render_frames
+    from mitsplat.scene.layout import Layout
+    from mitsplat.usd.stage_scene import read_stage_scene
+
+    with TemporaryDirectory() as folder:
+        found = read_stage_scene(stage, Path(folder), overrides)
+        for note in found.notes:
+            typer.echo(note)
+        layout = Layout.from_poses(found.scene, found.poses)
+        frames = render_frames(found.scene, layouts=[layout] * len(found.cameras), cameras=found.cameras)
+        summary = write_frames(found.scene, out, frames, overwrite=overwrite)
+        typer.echo(f"dataset: {out} ({summary.rendered} images)")
 
 
 def _format_counts(counts: Mapping[str, int]) -> str:

@@ -114,7 +114,7 @@ class _StageReader:
 
     def read(self) -> Record:
         """Return the records of all prims."""
-        from pxr import Usd, UsdGeom, UsdLux, UsdPhysics, UsdVol  # optional
+        from pxr import Usd, UsdGeom, UsdLux, UsdPhysics, UsdRender, UsdVol  # optional
 
         found: Record = {key: [] for key in ("fields", "bodies", "colliders", "meshes", "cameras", "lights")}
         for prim in self._stage.Traverse(Usd.TraverseInstanceProxies()):
@@ -144,17 +144,23 @@ class _StageReader:
         ]
         for what, paths in self._ignored.items():
             found["notes"].append(f"not imported: {len(paths)} {what} ({paths[0]}{', ...' if paths[1:] else ''})")
+        settings = UsdRender.Settings.GetStageRenderSettings(self._stage)
+        found["resolution"] = list(settings.GetResolutionAttr().Get()) if settings else None
+        policy = settings.GetAspectRatioConformPolicyAttr().Get() if settings else None
+        found["stretched"] = policy == "adjustPixelAspectRatio"
         found["default"] = str(self._stage.GetDefaultPrim().GetPath()) if self._stage.GetDefaultPrim() else ""
         return found
 
     def _assumptions(self) -> Iterator[str]:
-        """Yield a note for each unit or axis that the stage does not state."""
+        """Yield a note for each unit or axis that the stage does not state, and for motion."""
         from pxr import UsdGeom  # optional
 
         if not UsdGeom.StageHasAuthoredMetersPerUnit(self._stage):
             yield f"metersPerUnit is not stated, so that USD's default of {self._units:g} applies"
         if not self._stage.HasAuthoredMetadata("upAxis"):
             yield f"upAxis is not stated, so that USD's default of {UsdGeom.GetStageUpAxis(self._stage)} applies"
+        if self._stage.GetEndTimeCode() > self._stage.GetStartTimeCode():
+            yield "not imported: motion; the stage is read at its first time"
 
     def _world_from(self, prim: Usd.Prim) -> Float64Array:
         """Return the matrix from the prim's coordinates to the world in metres with z up, shape (4, 4)."""
@@ -185,6 +191,8 @@ class _StageReader:
         from pxr import UsdSemantics  # optional
 
         while prim and prim.GetPath().IsPrimPath():
+            if self._value(prim, f"{METADATA}:unlabelled"):
+                return None
             taxonomies = UsdSemantics.LabelsAPI.GetDirectTaxonomies(prim)
             for taxonomy in sorted(taxonomies, key=lambda name: name != "class"):
                 if labels := UsdSemantics.LabelsAPI(prim, taxonomy).GetLabelsAttr().Get(self._time):

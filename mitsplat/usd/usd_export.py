@@ -327,6 +327,7 @@ class _StageWriter:
             prim.CreateFocusDistanceAttr(camera.focus_distance)
         settings = UsdRender.Settings.Define(self.stage, "/Render/settings")
         settings.CreateResolutionAttr(Gf.Vec2i(camera.width, camera.height))
+        settings.CreateAspectRatioConformPolicyAttr("adjustPixelAspectRatio")  # the focal lengths may differ
         settings.CreateCameraRel().SetTargets([prim.GetPath()])
         self.stage.SetMetadata("renderSettingsPrimPath", "/Render/settings")
 

@@ -1,0 +1,249 @@
+"""Scenes from untrusted USD stages: assets and a scene file in a folder, and the frames that the stage shows.
+
+Rigid bodies with splats are objects, and so are particle fields with a semantic class that belong to no body. Other
+particle fields are the environment. Meshes that belong to no body are visible shapes.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+from scipy.spatial import QhullError
+
+from mitsplat.arrays import Float64Array
+from mitsplat.asset import Asset, opaque_core
+from mitsplat.errors import InputError
+from mitsplat.gaussians.splat_cloud import Splats, split_similarity
+from mitsplat.geometry.camera import Camera
+from mitsplat.images.colour import encode_srgb, temperature_colour
+from mitsplat.scene.loading.scene_loading import load_scene
+from mitsplat.scene.scene import Scene
+from mitsplat.storage.files import storage_errors, write_text
+from mitsplat.usd.stage_assets import body_frames, make_asset, merge_fields, placed_mesh
+from mitsplat.usd.stage_records import Record, read_records
+
+_WIDTH = 1280
+"""Image width of a stage without render settings [px]."""
+_DISTANCE = 100.0
+"""Distance at which a distant light is placed [m]."""
+
+
+@dataclass(frozen=True, eq=False)
+class StageScene:
+    """Scene of a stage.
+
+    Attributes:
+        scene: The scene; its files are in a folder.
+        poses: Poses ``world_from_object`` of each asset, by its index.
+        cameras: Cameras of the stage.
+        notes: What was not read, one sentence each.
+    """
+
+    scene: Scene
+    poses: dict[str | int, list[Float64Array]]
+    cameras: tuple[Camera, ...]
+    notes: tuple[str, ...]
+
+
+def read_stage_scene(path: Path, folder: Path, overrides: Mapping[str, Any] | None = None) -> StageScene:
+    """Read a stage, and write its assets and a scene file into a folder.
+
+    Args:
+        path: The stage.
+        folder: Empty folder.
+        overrides: Values that replace those of the scene, by dotted key. The default size of the images is that of the
+            stage's render settings.
+
+    Raises:
+        InputError: If the stage is damaged, or has no camera or no labelled object.
+        MissingResourceError: If OpenUSD is not installed, or the disk is full.
+    """
+    records, overrides = read_records(path), dict(overrides or {})
+    size = (overrides["output.width"], overrides["output.height"]) if "output.width" in overrides else None
+    notes: list[str] = list(records["notes"])
+    if not records["cameras"]:
+        raise InputError(f"{path}: must have a camera to be rendered (got none)")
+    frames = body_frames(records["bodies"])
+    groups: dict[str, list[Record]] = {}
+    for field in records["fields"]:
+        groups.setdefault(field["body"] or (field["path"] if field["label"] else ""), []).append(field)
+    surroundings = groups.pop("", [])
+    if not any(fields[0]["label"] for fields in groups.values()):
+        raise InputError(f"{path}: must have particle fields with a semantic class, UsdSemantics.LabelsAPI (got none)")
+    with storage_errors(folder):
+        keys, poses, entries = dict[str, int](), dict[str | int, list[Float64Array]](), list[dict[str, Any]]()
+        for group, fields in groups.items():
+            asset, pose = _object(path, records, group, fields, frames, notes)
+            label = fields[0]["label"]
+            key = hashlib.sha256(repr((asset.class_name, label)).encode() + asset.splats.means.tobytes()).hexdigest()
+            if key not in keys:
+                keys[key] = len(keys)
+                name = f"{re.sub(r'[^A-Za-z0-9_]', '_', asset.name)}_{keys[key]}"
+                asset.save(folder / "assets" / name)
+                entries.append({"asset": f"assets/{name}", "label": label is not None, "count": 0})
+            entries[keys[key]]["count"] += 1
+            poses.setdefault(keys[key], []).append(pose)
+        data: dict[str, Any] = {"name": path.stem, "objects": entries, "shapes": _shapes(records, folder)}
+        if surroundings:
+            _environment(path, records, surroundings, notes).save(folder / "assets" / "environment")
+            data["environment"] = "assets/environment"
+        data["lights"] = [light for record in records["lights"] for light in _lights(record, notes)]
+        cameras = tuple(
+            _camera(record, size or records["resolution"], stretched=records["stretched"])
+            for record in records["cameras"]
+        )
+        first = cameras[0]
+        cameras = tuple(camera for camera in cameras if (camera.width, camera.height) == (first.width, first.height))
+        if len(cameras) < len(records["cameras"]):
+            notes.append("not imported: cameras whose images have another size than those of the first one")
+        reach = 10.0
+        data |= {
+            "region": {"min": [-reach, -reach, 0.0], "max": [reach, reach, reach]},
+            "camera": {
+                "kind": "fixed",
+                "world_from_camera": first.world_from_camera.tolist(),
+                "intrinsics": {"fx": first.fx, "fy": first.fy, "cx": first.cx, "cy": first.cy},
+            },
+            "output": {"width": first.width, "height": first.height, "layouts": len(cameras), "views": 1},
+        }
+        write_text(folder / "scene.yaml", json.dumps(data, indent=1))  # YAML includes JSON
+    return StageScene(load_scene(folder / "scene.yaml", overrides=overrides), poses, cameras, tuple(notes))
+
+
+def _object(
+    path: Path,
+    records: Record,
+    group: str,
+    fields: Sequence[Record],
+    frames: dict[str | None, Float64Array],
+    notes: list[str],
+) -> tuple[Asset, Float64Array]:
+    """Return the asset and the pose of a body, or of a labelled particle field without one."""
+    body = fields[0]["body"]
+    if body is None:
+        rotation, _, translation = split_similarity(fields[0]["matrix"])
+        frame = np.eye(4)
+        frame[:3, :3], frame[:3, 3] = rotation, translation
+    else:
+        frame = frames[body]
+    splats, found = merge_fields(path, fields, np.asarray(np.linalg.inv(frame), dtype=np.float64))
+    notes.extend(found)
+    asset = None if body is None else make_asset(path, records, body, splats, notes)
+    if asset is None:
+        name = group.rpartition("/")[2]
+        asset = Asset(name, fields[0]["label"] or name, splats, mesh=_hull(path, group, splats))
+        notes.append(f"{group} has no colliders; the convex hull of its splats casts its shadows")
+    if any(field["label"] != fields[0]["label"] for field in fields):
+        notes.append(f"not imported: the classes of {group} except {fields[0]['label']}")
+    return replace(asset, class_name=fields[0]["label"] or asset.class_name), frame
+
+
+def _hull(path: Path, name: str, splats: Splats) -> trimesh.Trimesh:
+    try:
+        return trimesh.convex.convex_hull(opaque_core(splats))
+    except (QhullError, ValueError):
+        raise InputError(f"{path}: {name}: the opaque Gaussians of an object must span a volume") from None
+
+
+def _environment(path: Path, records: Record, fields: Sequence[Record], notes: list[str]) -> Asset:
+    """Return the environment: splats that belong to no object, with the proxy meshes that belong to no body."""
+    splats, found = merge_fields(path, fields, np.eye(4))
+    notes.extend(found)
+    known = {**records, "fields": list(fields), "colliders": []}
+    asset = make_asset(path, known, None, splats, notes)
+    asset = asset or Asset("environment", "environment", splats, kind="environment", capture_light="scene")
+    return replace(asset, name="environment", kind="environment", mass=None)
+
+
+def _shapes(records: Record, folder: Path) -> list[dict[str, Any]]:
+    """Write the visible meshes that belong to no body; return their entries in the scene file."""
+    found = []
+    for number, record in enumerate(one for one in records["meshes"] if one["visible"] and one["body"] is None):
+        file = f"shape_{number}.ply"
+        placed_mesh(record, np.eye(4)).export(folder / file)
+        colour = np.clip(encode_srgb(record["colour"] or (0.3, 0.3, 0.3)), 0, 1).tolist()
+        found.append({"name": record["path"], "mesh": file, "visible": True, "collider": False, "colour": colour})
+    return found
+
+
+def _camera(record: Record, size: Sequence[int] | None, *, stretched: bool) -> Camera:
+    """Return a camera of UsdGeom; lengths are in tenths of a unit of the stage.
+
+    Args:
+        record: Record of the camera.
+        size: Width and height of the image [px], or None.
+        stretched: True if the aperture fills the image even if this stretches the image.
+    """
+    across, up = record["HorizontalAperture"], record["VerticalAperture"]
+    width, height = size or (_WIDTH, max(1, round(_WIDTH * up / across)))
+    rotation, scale, translation = split_similarity(record["matrix"])
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation @ np.diag([1.0, -1.0, -1.0]), translation
+    fx, fy = width * record["FocalLength"] / across, height * record["FocalLength"] / up
+    if (
+        not stretched and abs(fx / fy - 1) > 1e-3
+    ):  # an aperture of another aspect ratio is extended, as UsdRender defines by default
+        fx = fy = min(fx, fy)
+    sensor = 0.1 * scale
+    return Camera(
+        width=width,
+        height=height,
+        fx=fx,
+        fy=fy,
+        cx=0.5 * width - fx * record["HorizontalApertureOffset"] / record["FocalLength"],
+        cy=0.5 * height + fy * record["VerticalApertureOffset"] / record["FocalLength"],
+        world_from_camera=pose,
+        aperture_radius=sensor * record["FocalLength"] / (2 * record["FStop"]) if record["FStop"] > 0 else 0.0,
+        focus_distance=scale * record["FocusDistance"] if record["FStop"] > 0 else 1.0,
+    )
+
+
+def _lights(record: Record, notes: list[str]) -> list[dict[str, Any]]:
+    """Return the entry of a light in the scene file; none, with a note, for lights that it does not have."""
+    inputs, kind = record["inputs"], record["type"]
+    rotation, scale, position = split_similarity(record["matrix"])
+    strength = inputs.get("intensity", 1.0) * 2.0 ** inputs.get("exposure", 0.0)
+    colour = np.array(inputs.get("color", (1.0, 1.0, 1.0)), dtype=np.float64)
+    if inputs.get("enableColorTemperature"):
+        colour = colour * temperature_colour(inputs.get("colorTemperature", 6500.0))
+    peak = float(colour.max())
+    if strength * peak <= 0:
+        return []
+    entry: dict[str, Any] = {"colour": (colour / peak).tolist()}
+    strength *= peak
+    normal, is_normalised = -rotation[:, 2], bool(inputs.get("normalize"))
+    place = {"position": position.tolist(), "target": (position + normal).tolist()}
+    if kind.startswith("DomeLight"):
+        if inputs.get("texture:file"):
+            notes.append(f"not imported: the image of {record['path']}, which gives uniform light")
+        return [{"kind": "environment", "radiance": strength, **entry}]
+    if kind in ("RectLight", "DiskLight"):
+        sides = np.array([inputs.get("width", 1.0), inputs.get("height", 1.0)])
+        if kind == "DiskLight":
+            sides = np.full(2, np.sqrt(np.pi) * inputs.get("radius", 0.5))
+        sides = sides * scale
+        radiance = strength / sides.prod() if is_normalised else strength
+        return [{"kind": "area", "size": sides.tolist(), "radiance": radiance, **place, **entry}]
+    if kind == "SphereLight":
+        radius = scale * inputs.get("radius", 0.5)
+        intensity = strength / 4 if is_normalised else strength * np.pi * radius**2
+        cone = inputs.get("shaping:cone:angle", 90.0)
+        if cone < 90.0:
+            return [{"kind": "spot", "cone": cone, "intensity": intensity, **place, **entry}]
+        return [{"kind": "point", "position": place["position"], "intensity": intensity, **entry}]
+    if kind == "DistantLight":
+        half = np.radians(max(inputs.get("angle", 0.53), 0.1) / 2)
+        radiance = strength / (np.pi * np.sin(half) ** 2) if is_normalised else strength
+        away, side = -_DISTANCE * normal, np.sqrt(np.pi) * _DISTANCE * np.tan(half)
+        sun = {"position": away.tolist(), "target": [0.0, 0.0, 0.0], "size": [side, side], "radiance": radiance}
+        return [{"kind": "area", **sun, **entry}]
+    notes.append(f"not imported: the light {record['path']} of type {kind}")
+    return []

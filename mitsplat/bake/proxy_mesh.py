@@ -70,11 +70,16 @@ def _retriangulate_flat(sheet: trimesh.Trimesh) -> trimesh.Trimesh:
         return sheet
     to_plane = trimesh.geometry.plane_transform(sheet.vertices[0], normal)
     corners = trimesh.transform_points(sheet.vertices, to_plane)[sheet.faces, :2]
-    outline = shapely.coverage_union_all(shapely.polygons(corners)).simplify(1e-6 * sheet.scale)
+    faces = shapely.polygons(corners)
+    try:
+        outline = shapely.coverage_union_all(faces)
+    except shapely.GEOSException:  # a corner lies on the edge of another face, as in cut-outs
+        outline = shapely.union_all(faces, grid_size=1e-7 * sheet.scale)
+    outline = outline.simplify(1e-6 * sheet.scale)
     flat = [trimesh.creation.triangulate_polygon(polygon, engine="earcut") for polygon in shapely.get_parts(outline)]
-    vertices, faces = trimesh.util.append_faces([v for v, _ in flat], [f for _, f in flat])
+    vertices, triangles = trimesh.util.append_faces([v for v, _ in flat], [f for _, f in flat])
     vertices = np.pad(vertices, ((0, 0), (0, 1)))
-    return trimesh.Trimesh(trimesh.transform_points(vertices, np.linalg.inv(to_plane)), faces)
+    return trimesh.Trimesh(trimesh.transform_points(vertices, np.linalg.inv(to_plane)), triangles)
 
 
 def _lies_on(sheet: trimesh.Trimesh, solid: trimesh.Trimesh) -> bool:

@@ -13,6 +13,7 @@ from PIL import Image
 
 from mitsplat.asset import read_mesh
 from mitsplat.bake.mesh_parts import MeshPart, read_model, read_parts
+from mitsplat.bake.proxy_mesh import make_proxy
 from mitsplat.errors import InputError, MissingResourceError
 from mitsplat.images.colour import encode_srgb
 from tests.mesh_files.glb import CORNER_UV, CORNERS, QUAD, SIZE, Glb, coordinate_image, cube_mesh, matt, sheet
@@ -304,6 +305,18 @@ def test_masked_texels_are_cut_out(tmp_path: Path, cutoff: float | None, alpha: 
     assert part.mesh.bounds[0, 0] == pytest.approx(edge * SIZE, abs=1.5 * SIZE / 64)
     points, texels = samples(part)
     np.testing.assert_allclose(texels, np.stack([points[:, 0] / SIZE, 1.0 - points[:, 1] / SIZE], axis=1), atol=0.01)
+
+
+def test_the_proxy_of_a_cut_out_has_its_outline(tmp_path: Path) -> None:
+    image = coordinate_image()
+    row, column = np.mgrid[:64, :64] - 31.5
+    image.putalpha(Image.fromarray(np.where(np.hypot(row, column) < 25, 255, 0).astype(np.uint8)))
+    glb = Glb()
+    attributes = {"POSITION": glb.accessor(CORNERS), "TEXCOORD_0": glb.accessor(CORNER_UV)}
+    glb.mesh(attributes, glb.accessor(QUAD), matt(glb.texture(image)) | {"alphaMode": "MASK", "doubleSided": True})
+    proxy = make_proxy(read(glb.save(tmp_path / "a.glb")), 1000)
+    assert proxy.area == pytest.approx(np.pi * 25**2 * (SIZE / 64) ** 2, rel=0.02)
+    assert len(proxy.faces) < 1000
 
 
 def with_texture(save: Any) -> Any:

@@ -114,6 +114,7 @@ def test_an_interrupted_run_ends_with_130_and_resumes_to_the_same_bytes(scene, t
     assert contents(out) == undisturbed
 
 
+@pytest.mark.extended
 def test_a_killed_worker_loses_no_frame(scene, tmp_path, undisturbed):
     told = []
     summary = write(

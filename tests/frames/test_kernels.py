@@ -78,6 +78,7 @@ def test_another_layout_compiles_no_new_kernels() -> None:
             assert new == 0, f"frame {index}: {new} of {run} kernels"
 
 
+@pytest.mark.extended
 def test_drawn_lights_compile_no_new_kernels() -> None:
     """Position, size, radiance and number of up to four lights vary; each set of kinds was rendered before."""
     scene = load_scene(WORKCELL)

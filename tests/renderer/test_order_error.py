@@ -74,12 +74,14 @@ VIEWS = {
     "thin": {"aperture_radius": 0.05, "focus_distance": 2.0},
     "inside": {"world_from_camera": look_at_pose((0, 0, -0.2), (0, 0, 1))},
 }
+QUICK = (*((False, lens, 1) for lens in VIEWS), (True, "pinhole", 2), (True, "distorted", 2))
+"""Quick cases with and without a mesh, by lens and samples."""
 
 
 @pytest.mark.parametrize(
     ("mesh", "lens", "samples"),
     [
-        pytest.param(mesh, lens, samples, marks=() if mesh == (samples == 2) else pytest.mark.extended)
+        pytest.param(mesh, lens, samples, marks=() if (mesh, lens, samples) in QUICK else pytest.mark.extended)
         for mesh in (False, True)
         for lens in VIEWS
         for samples in (1, 2)

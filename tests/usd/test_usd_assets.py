@@ -275,4 +275,4 @@ def test_the_commands_export_and_import_an_asset(tmp_path: Path, capsys: pytest.
     assert run("import", tmp_path / "nut.usdz", "-o", tmp_path / "third", "--size", 0.1) == 2
     assert "--size does not apply" in capsys.readouterr().err
     assert run("export", tmp_path / "nut", "-o", tmp_path / "nut.xml") == 2
-    assert "must be a USD stage, or MJCF with --mjcf" in capsys.readouterr().err
+    assert "must be a USD stage, .glb, or MJCF with --mjcf" in capsys.readouterr().err

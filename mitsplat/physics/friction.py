@@ -100,6 +100,7 @@ class PairContactSolver(SolverMuJoCo):
             nbody = self.mjw_model.nbody
             self._longest: Any = wp.zeros((self.mjw_data.nworld, nbody * nbody), dtype=wp.float32, device=model.device)
             self._approach = wp.zeros(self.mjw_data.naconmax, dtype=wp.float32, device=model.device)
+            self._velocities = wp.zeros_like(self.mjw_data.qvel)
 
     def geom_restitution(self) -> Float64Array:
         """Return the coefficients of restitution of MuJoCo's geoms in one world."""
@@ -122,21 +123,34 @@ class PairContactSolver(SolverMuJoCo):
         model_bodies = [self.mjw_model.geom_bodyid, self.mjw_model.nbody]
         bodies = [model.shape_body, state_in.body_q, state_in.body_qd, model.body_com]
         shapes = [self.mjc_geom_to_newton_shape, model.shape_material_restitution]
-        impacts = [self._approach, self._longest]
+        impacts, timestep = [self._approach, self._longest], self.mjw_model.opt.timestep
         self._longest.fill_(0.0)
+        wp.copy(self._velocities, self.mjw_data.qvel)
         wp.launch(
             _find_impacts,
             dim=self.mjw_data.naconmax,
-            inputs=[*geoms, *model_bodies, *shapes, *bodies, found.pos, found.frame, found.dist, *impacts],
+            inputs=[*geoms, *model_bodies, *shapes, *bodies, found.pos, found.frame, found.dist, timestep, *impacts],
             device=model.device,
         )
         contact = [found.frame, found.dist, found.solref, found.solreffriction, found.solimp]
         wp.launch(
             _rebound,
             dim=self.mjw_data.naconmax,
-            inputs=[*geoms, *model_bodies, *shapes, *impacts, self.mjw_model.opt.timestep, *contact],
+            inputs=[*geoms, *model_bodies, *shapes, *impacts, timestep, *contact],
             device=model.device,
         )
+
+    def _update_newton_state(
+        self, model: newton.Model, state: newton.State, mj_data: Any, state_prev: newton.State, observables: Any = None
+    ) -> None:
+        if self._rebounds:  # before the state of the solver is copied to Newton's
+            wp.launch(
+                _move_since_impact,
+                dim=(mj_data.nworld, self.mjw_model.nbody - 1),
+                inputs=[self.mjw_model.nbody, self._longest, self._velocities, mj_data.qvel, mj_data.qpos],
+                device=model.device,
+            )
+        super()._update_newton_state(model, state, mj_data, state_prev, observables)
 
 
 @wp.kernel(enable_backward=False, module="unique")
@@ -178,6 +192,7 @@ def _find_impacts(
     pos: wp.array[wp.vec3],
     frame: wp.array[wp.mat33],
     dist: wp.array[wp.float32],
+    timestep: wp.array[wp.float32],
     approach: wp.array[wp.float32],
     longest: wp.array2d[wp.float32],
 ):
@@ -196,7 +211,7 @@ def _find_impacts(
     if restitution[first] * restitution[second] > 0.0 and speed > MIN_IMPACT_SPEED:
         approach[contact] = speed
         place = _pair_index(geom_body[pair[0]], geom_body[pair[1]], nbody)
-        wp.atomic_max(longest, world, place, wp.max(0.0, -dist[contact]) / speed)
+        wp.atomic_max(longest, world, place, wp.clamp(-dist[contact] / speed, 0.0, timestep[0]))
 
 
 @wp.kernel(enable_backward=False, module="unique")
@@ -226,16 +241,51 @@ def _rebound(
     if speed == 0.0:
         return
     pair, world = geoms[contact], worlds[contact]
-    depth = wp.max(0.0, -dist[contact])
+    since = wp.clamp(-dist[contact] / speed, 0.0, timestep[0])
     place = _pair_index(geom_body[pair[0]], geom_body[pair[1]], nbody)
-    if depth / speed < longest[world, place] - SIMULTANEOUS:
+    if since < longest[world, place] - SIMULTANEOUS:
         dist[contact] = 1.0  # no force in this step
         return
     e = wp.sqrt(restitution[geom_shape[world, pair[0]]] * restitution[geom_shape[world, pair[1]]])
-    rebound = rebound_speed_on_warp(e, speed, depth, GRAVITY * wp.abs(frame[contact][0][2]), timestep[0])
+    rebound = rebound_speed_on_warp(e, speed, since, GRAVITY * wp.abs(frame[contact][0][2]), timestep[0])
     solreffriction[contact] = solref[contact]  # sliding does not rebound
     solref[contact] = wp.vec2(0.0, -(speed + rebound) / (speed * timestep[0]))
     solimp[contact] = _vec5(IMPACT_IMPEDANCE, IMPACT_IMPEDANCE, 1.0e-3, 0.5, 2.0)
+
+
+@wp.kernel(enable_backward=False, module="unique")
+@no_type_check
+def _move_since_impact(
+    nbody: int,
+    longest: wp.array2d[wp.float32],
+    before: wp.array2d[wp.float32],
+    after: wp.array2d[wp.float32],
+    coordinates: wp.array2d[wp.float32],
+):
+    """Apply the change of velocity of each free body to its motion since its first impact, in place."""
+    world, free = wp.tid()
+    body = free + 1
+    late = wp.float32(0.0)
+    for other in range(nbody):
+        late = wp.max(late, longest[world, _pair_index(body, other, nbody)])
+    if late == 0.0:
+        return
+    q, v = 7 * free, 6 * free
+    turn = wp.vec3(0.0)
+    for i in range(3):
+        coordinates[world, q + i] += late * (after[world, v + i] - before[world, v + i])
+        turn[i] = late * (after[world, v + 3 + i] - before[world, v + 3 + i])
+    angle = wp.length(turn)
+    if angle > 0.0:
+        rotation = wp.quat(
+            coordinates[world, q + 4],
+            coordinates[world, q + 5],
+            coordinates[world, q + 6],
+            coordinates[world, q + 3],
+        ) * wp.quat_from_axis_angle(turn / angle, angle)
+        coordinates[world, q + 3] = rotation[3]
+        for i in range(3):
+            coordinates[world, q + 4 + i] = rotation[i]
 
 
 @wp.func

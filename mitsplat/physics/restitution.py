@@ -8,20 +8,23 @@ with
 
 because its force vanishes at the phase ``pi - 2 B`` of the oscillation. The contacts of this package last about two
 steps, so that ``e`` would depend on the phase at which a step meets the surface. A contact that approaches faster than
-:data:`MIN_IMPACT_SPEED` is therefore given an impact within one step ``h``: a reference acceleration that changes its
-speed from ``-v`` to ``w``, where
+:data:`MIN_IMPACT_SPEED` is therefore given an impact at the moment ``t = p / v`` before the step, at which its points
+met; ``p`` is its depth, and at most one step ``h`` has passed since. Its reference acceleration changes its speed
+within the step from ``-v`` to ``w``, where
 
-    w^2 + g h w = e^2 (v^2 + g h v) + 2 g p (1 - e^2).
+    w (w + g (h + 2 t)) = e^2 v (v + g (h - 2 t)).
 
-Without the terms of gravity this is Newton's law, ``w = e v``. ``g h v`` belongs to the energy of semi-implicit steps,
-and ``2 g p`` to the depth ``p`` at which the step meets the surface; ``g`` is the component of gravity along the
-normal. A body that falls from ``h0`` then rises to ``e^2 h0`` at any timestep. Slower contacts are damped and do not
-rebound, so that resting bodies are not disturbed. The limit is a kinetic energy of 5 mJ per kilogram.
+Without the terms of gravity this is Newton's law, ``w = e v``. They belong to the energy of semi-implicit steps; ``g``
+is the component of gravity along the normal. After the step, the change of velocity of both bodies is also applied to
+the time ``t`` of their motion. A body that falls from ``h0`` then rises to ``e^2 h0`` at any timestep. Slower contacts
+are damped and do not rebound, so that resting bodies are not disturbed. The limit is a kinetic energy of 5 mJ per
+kilogram.
 
 A step meets a thin part several millimetres deep, with points in contact that would have touched later or not at all,
 because the first impact turns the part away from them. Only the point of a pair of bodies that has been below the
-surface for the longest time, ``p / v``, is therefore given an impact. Points that follow within :data:`SIMULTANEOUS`
-share it. The other fast points have no force in this step.
+surface for the longest time ``t`` is therefore given an impact. Points that follow within :data:`SIMULTANEOUS` share
+it. The other fast points have no force in this step, and the motion since the first impact is that of a body that they
+did not touch.
 
 The restitution of a contact is the geometric mean of the coefficients of both sides, as for friction: two surfaces of
 one material have that material's coefficient, and nothing rebounds from a surface of coefficient 0.
@@ -44,28 +47,25 @@ SIMULTANEOUS = 1e-5
 
 
 def rebound_speed(
-    restitution: Float64Array, approach: Float64Array, depth: Float64Array, gravity: Float64Array, timestep: float
+    restitution: Float64Array, approach: Float64Array, since: Float64Array, gravity: Float64Array, timestep: float
 ) -> Float64Array:
     """Compute the separation speeds of impacts [m/s], shape (N,); see :mod:`mitsplat.physics.restitution`.
 
     Args:
         restitution: Coefficients of the contacts.
         approach: Approach speeds [m/s].
-        depth: Penetration depths [m].
+        since: Times since the impacts [s].
         gravity: Gravity along the normals [m/s^2].
         timestep: Timestep [s].
     """
-    half = gravity * timestep / 2
-    squared = restitution**2
-    energy = squared * approach * (approach + 2 * half) + 2 * gravity * depth * (1 - squared)
-    return np.sqrt(half**2 + energy) - half
+    half = gravity * (timestep + 2 * since) / 2
+    return np.sqrt(half**2 + restitution**2 * approach * (approach + gravity * (timestep - 2 * since))) - half
 
 
 @wp.func
 @no_type_check
-def rebound_speed_on_warp(restitution: float, approach: float, depth: float, gravity: float, timestep: float):
+def rebound_speed_on_warp(restitution: float, approach: float, since: float, gravity: float, timestep: float):
     """Compute :func:`rebound_speed` in a kernel."""
-    half = 0.5 * gravity * timestep
-    squared = restitution * restitution
-    energy = squared * approach * (approach + 2.0 * half) + 2.0 * gravity * depth * (1.0 - squared)
+    half = 0.5 * gravity * (timestep + 2.0 * since)
+    energy = restitution * restitution * approach * (approach + gravity * (timestep - 2.0 * since))
     return wp.sqrt(half * half + energy) - half

@@ -322,13 +322,19 @@ class MujocoWorld(World):
             stage(model, data)
         pairs, friction = data.contact.geom, model.geom_friction
         data.contact.friction[:] = pair_friction(friction[pairs[:, 0]], friction[pairs[:, 1]])
-        if self._restitution.any() and len(pairs):
-            self._rebound()
+        late = self._rebound() if self._restitution.any() and len(pairs) else None
+        before = np.array(data.qvel)
         for stage in _AFTER_CONTACTS:
             stage(model, data)
+        if late is not None:
+            gained = np.array(data.qvel) - before
+            mujoco.mj_integratePos(model, data.qpos, np.repeat(late[1:], 6) * gained, 1.0)
 
-    def _rebound(self) -> None:
-        """Give impacts the reference acceleration of :mod:`mitsplat.physics.restitution`, as damping."""
+    def _rebound(self) -> Float64Array | None:
+        """Give impacts the reference acceleration of :mod:`mitsplat.physics.restitution`, as damping.
+
+        Return the time of each body since its first impact [s], or None if there is no impact.
+        """
         model, data, contact, timestep = self._model, self._data, self._data.contact, self._model.opt.timestep
         velocity, spin = np.zeros((2, model.nbody, 3))
         velocity[1:], local = np.array(data.qvel).reshape(-1, 2, 3).swapaxes(0, 1)
@@ -338,16 +344,21 @@ class MujocoWorld(World):
         speeds = np.einsum("ni,ni->n", contact.frame[:, :3], moving[:, 0] - moving[:, 1])
         restitution = np.sqrt(self._restitution[contact.geom].prod(axis=1))
         fast = np.flatnonzero((speeds > MIN_IMPACT_SPEED) & (restitution > 0))
-        approach, depth = speeds[fast], np.maximum(0, -contact.dist[fast])
-        _, pair = np.unique(np.sort(bodies[fast]) @ [model.nbody, 1], return_inverse=True)
-        longest = np.zeros(len(fast))
-        np.maximum.at(longest, pair, depth / approach)
-        contact.exclude[fast] = depth / approach < longest[pair] - SIMULTANEOUS  # no force in this step
+        if not len(fast):
+            return None
+        approach, bodies = speeds[fast], bodies[fast]
+        since = np.clip(-contact.dist[fast] / approach, 0.0, timestep)
+        _, pair = np.unique(np.sort(bodies) @ [model.nbody, 1], return_inverse=True)
+        longest, late = np.zeros(len(fast)), np.zeros(model.nbody)
+        np.maximum.at(longest, pair, since)
+        np.maximum.at(late, bodies, since[:, None])
+        contact.exclude[fast] = since < longest[pair] - SIMULTANEOUS  # no force in this step
         gravity = GRAVITY * np.abs(contact.frame[fast, 2])
-        rebound = rebound_speed(restitution[fast], approach, depth, gravity, timestep)
+        rebound = rebound_speed(restitution[fast], approach, since, gravity, timestep)
         contact.solreffriction[fast] = contact.solref[fast]  # sliding does not rebound
         contact.solref[fast] = np.stack([np.zeros(len(fast)), -(approach + rebound) / (approach * timestep)], axis=1)
         contact.solimp[fast, :2] = IMPACT_IMPEDANCE
+        return late
 
     def _allow_rolling(self, allowed: bool) -> None:
         self._model.geom_condim[:] = _WITHOUT_ROLL if allowed else WITH_ROLL

@@ -432,6 +432,29 @@ def test_the_rebound_height_equals_its_closed_form(stepper, timestep):
         assert heights[apex][i] == pytest.approx(one * 0.4 * height, rel=0.05, abs=missed)
 
 
+@pytest.mark.parametrize("stepper", STEPPERS)
+def test_the_spin_after_an_impact_equals_its_closed_form(stepper):
+    """A tilted plate falls on its edge without friction: J = (1 + e) v / (1 / m + x^2 / I), w = J x / I.
+
+    It has turned by w t after the time t since the edge touched the table, at any phase of the steps.
+    """
+    plate, turn = trimesh.creation.box((0.1, 0.02, 0.002)), Rotation.from_euler("y", -30, degrees=True)
+    low = plate.vertices @ turn.as_matrix().T
+    arm, depth = low[low[:, 2].argmin(), [0, 2]]
+    heights, step, end, restitution = np.linspace(0.2, 0.208, 6), 0.002, 0.216, 0.5
+    body = body_of(plate, friction=0.0, restitution=restitution)
+    poses = [pose_at((0, 0.05 * i, height - depth), turn) for i, height in enumerate(heights)]
+    world = world_of(stepper, [body] * 6, [table(friction=0.0, restitution=restitution)], poses)
+    run_until(world, end)
+    found = step * np.ceil((np.sqrt(step**2 / 4 + 2 * heights / GRAVITY) - step / 2) / step)
+    speed = GRAVITY * found
+    since = end - found + (found * (found + step) * GRAVITY / 2 - heights) / speed
+    mass, inertia = body.mass.mass, body.mass.inertia[1, 1]
+    impulse = (1 + restitution) * speed / (1 / mass + arm**2 / inertia)
+    turned = [(turn.inv() * Rotation.from_matrix(pose[:3, :3])).magnitude() for pose in world.poses]
+    np.testing.assert_allclose(turned, impulse * abs(arm) / inertia * since, rtol=0.02)
+
+
 @pytest.mark.parametrize("stepper", ["mujoco", pytest.param("warp", marks=pytest.mark.extended)])
 def test_few_discs_that_land_near_their_rim_stop_on_it(stepper):
     """Discs of 40 x 3 mm fall 0.1 m at tilts of 0.5 to 4.25 degrees from upright.

@@ -381,7 +381,13 @@ class TestAttacks:
         return Place.make(tmp_path / "place", samples, SECRET_COLOUR, SECRET_WORD)
 
     @pytest.mark.parametrize(
-        "name", ["exr: panorama, deep", "splats: SPZ bomb", "xml: absolute path", "yaml: aliases that multiply"]
+        "name",
+        [
+            "splats: SPZ bomb",
+            "yaml: aliases that multiply",
+            pytest.param("exr: panorama, deep", marks=pytest.mark.extended),
+            pytest.param("xml: absolute path", marks=pytest.mark.extended),
+        ],
     )
     def test_a_known_attack_has_no_effect(self, place, name):
         (attack,) = (attack for attack in all_attacks() if attack.name == name)

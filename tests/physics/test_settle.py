@@ -205,9 +205,8 @@ def test_a_changed_rule_invalidates_cached_layouts(change, scene_data, write_sce
     assert settle._scene_hash.__wrapped__(scene) != kept
 
 
-@pytest.mark.parametrize("stepper", ["mujoco", pytest.param("warp", marks=pytest.mark.extended)])
-def test_several_processes_settle_the_same_layouts_as_one(stepper, scene_data, write_scene):
-    scene_data["settle"] = {"stepper": stepper}
+@pytest.mark.extended
+def test_several_processes_settle_the_same_layouts_as_one(scene_data, write_scene):
     scene = load_scene(write_scene(scene_data))
     found = {layout.index: layout.to_json() for layout in settle_layouts(scene, range(3), workers=2, cached=False)}
     assert found == {index: settle_layout(scene, index, cached=False).to_json() for index in range(3)}

@@ -92,6 +92,8 @@ def read_stage_scene(path: Path, folder: Path, overrides: Mapping[str, Any] | No
             entries[keys[key]]["count"] += 1
             poses.setdefault(keys[key], []).append(pose)
         data: dict[str, Any] = {"name": path.stem, "objects": entries, "shapes": _shapes(records, folder)}
+        if hidden := [one["path"] for one in records["meshes"] if one["visible"] and one["body"] is not None]:
+            notes.append(f"not rendered: meshes of rigid bodies; only their splats are: {', '.join(hidden)}")
         if surroundings:
             _environment(path, records, surroundings, notes).save(folder / "assets" / "environment")
             data["environment"] = "assets/environment"

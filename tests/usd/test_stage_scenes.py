@@ -18,7 +18,7 @@ from tests.usd.test_simulated_frames import INDEX, folder  # noqa: F401 - a fixt
 from tests.usd.test_usd_assets import new_stage
 
 pxr = pytest.importorskip("pxr", reason="needs OpenUSD: pip install 'mitsplat[usd]'")
-from pxr import Gf, UsdGeom, UsdLux, UsdRender, UsdSemantics, UsdVol, Vt  # noqa: E402
+from pxr import Gf, UsdGeom, UsdLux, UsdPhysics, UsdRender, UsdSemantics, UsdVol, Vt  # noqa: E402
 
 RADIUS = 0.04
 
@@ -55,6 +55,7 @@ def write_balls(path: Path) -> list[tuple[float, float, float]]:
     light.AddTranslateOp().Set((0, 0, 1.5))
     UsdLux.DomeLight.Define(stage, "/World/dome").CreateIntensityAttr(0.3)
     UsdLux.CylinderLight.Define(stage, "/World/tube")
+    UsdPhysics.RigidBodyAPI.Apply(UsdGeom.Cube.Define(stage, "/World/body").GetPrim())
     settings = UsdRender.Settings.Define(stage, "/Render/settings")
     settings.CreateResolutionAttr(Gf.Vec2i(120, 90))
     stage.SetMetadata("renderSettingsPrimPath", "/Render/settings")
@@ -69,6 +70,7 @@ def test_a_stage_of_usd_core_renders_with_labels_that_pass_the_audit(
     assert run("render", tmp_path / "balls.usda", "-o", tmp_path / "out", "--format", "yolo,bop") == 0
     printed = capsys.readouterr().out
     assert "not imported: the light /World/tube of type CylinderLight" in printed
+    assert "not rendered: meshes of rigid bodies; only their splats are: /World/body" in printed
     assert printed.count("has no colliders; the convex hull of its splats casts its shadows") == 5
     assert run("audit", tmp_path / "out") == 0
     (line,) = (tmp_path / "out/manifest.jsonl").read_text().splitlines()

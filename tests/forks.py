@@ -22,7 +22,9 @@ import scipy.spatial, skimage.measure, trimesh, typer
 
 SERVER = f"""
 import gc, json, os, signal, sys
+sys.modules["pxr"] = None  # newton imports OpenUSD if it is installed, which starts threads
 {PACKAGES}
+del sys.modules["pxr"]
 import mitsplat.cli, mitsplat.labels.labels, mitsplat.scene.planning.frame_plan
 gc.freeze()
 for line in sys.stdin:

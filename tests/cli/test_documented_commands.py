@@ -304,8 +304,8 @@ def test_the_documented_detector_commands_run(dataset_desk: Path, forks: Forks) 
     assert (desk / "runs/mixed/evaluation/photographs-all/report.html").stat().st_size
 
 
-LONG_EXAMPLES = ("label_formats", "scaling_out", "train_detector")
-"""Pages whose Python examples need datasets of commands that are not quick, or repeat the example of another page."""
+LONG_EXAMPLES = ("label_formats", "scaling_out", "simulators", "train_detector")
+"""Pages whose Python examples need files of commands that are not quick, or repeat the example of another page."""
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,6 @@ particle fields are the environment. Meshes that belong to no body are visible s
 
 from __future__ import annotations
 
-import hashlib
 import json
 import re
 from collections.abc import Mapping, Sequence
@@ -26,6 +25,7 @@ from mitsplat.geometry.camera import Camera
 from mitsplat.images.colour import encode_srgb, temperature_colour
 from mitsplat.scene.loading.scene_loading import load_scene
 from mitsplat.scene.scene import Scene
+from mitsplat.storage.content_hash import ContentHash
 from mitsplat.storage.files import storage_errors, write_text
 from mitsplat.usd.stage_assets import body_frames, make_asset, merge_fields, placed_mesh
 from mitsplat.usd.stage_records import Record, read_records
@@ -83,7 +83,9 @@ def read_stage_scene(path: Path, folder: Path, overrides: Mapping[str, Any] | No
         for group, fields in groups.items():
             asset, pose = _object(path, records, group, fields, frames, notes)
             label = fields[0]["label"]
-            key = hashlib.sha256(repr((asset.class_name, label)).encode() + asset.splats.means.tobytes()).hexdigest()
+            content = ContentHash(repr((asset.class_name, label)))
+            content.add_array(asset.splats.means)
+            key = content.hexdigest()
             if key not in keys:
                 keys[key] = len(keys)
                 name = f"{re.sub(r'[^A-Za-z0-9_]', '_', asset.name)}_{keys[key]}"

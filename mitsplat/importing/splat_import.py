@@ -54,6 +54,8 @@ _CONTACT_HEIGHT = 0.01
 """Maximum height of vertices that touch the table, as a fraction of the longest extent."""
 _MAX_BASE_CUT = 0.06
 """Maximum height that is cut off an object for a flat base, as a fraction of its height."""
+FROM_GLTF_AXES: Mapping[Axis, Axis] = {"y": "z", "-y": "-z", "z": "-y", "-z": "y", "x": "x", "-x": "-x"}
+"""Axis of splats with z up for each axis of their glTF file, in which y points up."""
 _STAGES = 6
 
 
@@ -237,10 +239,16 @@ def import_splats(
             progress(next(stages), _STAGES, stage_name)
 
     report("reading the file")
+    reason = ""
     if is_usd(path) or is_gltf(path):  # such files state unit and axis, and their splats are in metres with z up
+        if is_usd(path) and settings.up:
+            raise InputError(
+                f"{path}: states its up axis: correct upAxis of the stage, without --up (got {settings.up})"
+            )
+        reason = f"{settings.up}, as given" if settings.up else "as the file states"
         loaded = read_stage_asset(path).splats if is_usd(path) else read_gltf_splats(path)
         units = settings.units if settings.units or settings.size else 1.0
-        settings = replace(settings, up=settings.up or "z", units=units)
+        settings = replace(settings, up=FROM_GLTF_AXES[settings.up or "y"], units=units)
     else:
         loaded = Splats.load(path)
     if not len(loaded):
@@ -255,6 +263,8 @@ def import_splats(
     cleaner.remove_floaters(kind)
     report("finding up")
     upright = find_up(cleaner.splats, kind, default_up_axis(path), settings.up)
+    if reason:
+        upright = replace(upright, reason=reason)
     turn = np.eye(4)
     turn[:3, :3] = upright.rotation
     if settings.without_table:

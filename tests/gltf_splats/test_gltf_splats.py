@@ -15,9 +15,11 @@ from mitsplat.errors import InputError
 from mitsplat.gaussians.spherical_harmonics import SH_C0, sh_basis
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.camera import Camera
-from mitsplat.gltf_splats.splat_reading import read_gltf_splats
+from mitsplat.gltf_splats.splat_reading import Z_UP_FROM_GLTF, read_gltf_splats
 from mitsplat.gltf_splats.splat_writing import write_gltf_splats
 from mitsplat.images.colour import encode_srgb
+from mitsplat.importing.splat_import import FROM_GLTF_AXES
+from mitsplat.importing.upright import axis_vector
 from mitsplat.mesh_files.mesh_reading import read_mesh_file
 from mitsplat.renderer.layers import render_splats
 from tests.cli.typed import run
@@ -79,6 +81,11 @@ def test_attributes_and_poses_of_nodes_follow_the_standard(tmp_path: Path) -> No
     found = sh_basis(directions, 3) @ splats.sh.astype(np.float64)
     np.testing.assert_allclose(found[1], sh_basis(in_file, 3) @ sh, atol=1e-5)
     np.testing.assert_allclose(found[0], sh_basis(turn.inv().apply(in_file), 3) @ sh, atol=1e-5)
+
+
+def test_a_given_up_axis_is_an_axis_of_the_file() -> None:
+    for axis, read in FROM_GLTF_AXES.items():
+        np.testing.assert_array_equal(Z_UP_FROM_GLTF[:3, :3] @ axis_vector(axis), axis_vector(read))
 
 
 def test_linear_colours_are_encoded(tmp_path: Path) -> None:

@@ -222,14 +222,23 @@ def import_(
     from mitsplat.usd.usd_layers import is_usd
 
     _check_folder(out, file, name, overwrite=overwrite)
+    stage = None
     if is_usd(file):
-        fixed: dict[str, object] = {"--up": up != "auto", "--size": size, "--units": units, "--crop": crop}
-        fixed |= {"--without-table": without_table, "--flat-base": flat_base, "--scene": scene}
-        fixed |= {"--metallic": metallic, "--roughness": roughness}
-        given = [option for option, value in fixed.items() if value]
-        if _import_stage(
-            file, out, name, class_name, mass=mass, density=density, friction=friction, light=light, given=given
-        ):
+        from mitsplat.usd.stage_assets import read_stage_asset, with_values
+
+        stage = read_stage_asset(file)
+        if stage.asset is not None:
+            fixed: dict[str, object] = {"--up": up != "auto", "--size": size, "--units": units, "--crop": crop}
+            fixed |= {"--without-table": without_table, "--flat-base": flat_base, "--scene": scene}
+            fixed |= {"--metallic": metallic, "--roughness": roughness}
+            if given := [option for option, value in fixed.items() if value]:
+                raise InputError(f"{given[0]} does not apply to {file}, whose colliders state its geometry")
+            asset = with_values(
+                stage.asset, name, class_name, mass=mass, density=density, friction=friction, light=light
+            )
+            asset.save(out)
+            typer.echo(f"Gaussians: {len(asset.splats)}; {len(asset.pieces)} convex pieces")
+            typer.echo(f"asset: {out}")
             return
     from mitsplat.importing.import_report import check_scene_path, write_import_report, write_scene
     from mitsplat.importing.splat_import import ImportSettings, import_splats
@@ -259,6 +268,7 @@ def import_(
             mass=mass,
             friction=0.5 if friction is None else friction,
             capture_light=light,
+            stage=stage,
             progress=progress,
         )
     made = result.asset
@@ -281,33 +291,6 @@ def import_(
     if scene is not None:
         write_scene(scene, out, result)
         typer.echo(f"scene: {scene}")
-
-
-def _import_stage(
-    file: Path,
-    out: Path,
-    name: str | None,
-    class_name: str | None,
-    *,
-    mass: float | None,
-    density: float | None,
-    friction: float | None,
-    light: Literal["uniform", "scene"] | None,
-    given: list[str],
-) -> bool:
-    """Save the asset of a USD stage and return True; return False if the stage has no geometry beside its splats."""
-    from mitsplat.usd.stage_assets import read_stage_asset, with_values
-
-    found = read_stage_asset(file).asset
-    if found is None:
-        return False
-    if given:
-        raise InputError(f"{given[0]} does not apply to {file}, whose colliders state its geometry")
-    asset = with_values(found, name, class_name, mass=mass, density=density, friction=friction, light=light)
-    asset.save(out)
-    typer.echo(f"Gaussians: {len(asset.splats)}; {len(asset.pieces)} convex pieces")
-    typer.echo(f"asset: {out}")
-    return True
 
 
 def _check_folder(out: Path, source: Path, name: str | None, *, overwrite: bool) -> None:

@@ -32,7 +32,7 @@ from mitsplat.reconstruct.segment_splats import find_floaters, long_needles, vis
 from mitsplat.reconstruct.surface import SurfaceSettings, reconstruct_surface
 from mitsplat.renderer.layers import render_splats
 from mitsplat.runtime.variant import one_at_a_time
-from mitsplat.usd.stage_assets import read_stage_asset
+from mitsplat.usd.stage_assets import StageAsset, read_stage_asset
 from mitsplat.usd.usd_layers import is_usd
 
 MIN_OPACITY = 1 / 255
@@ -204,6 +204,7 @@ def import_splats(
     mass: float | None = None,
     friction: float = 0.5,
     capture_light: Literal["uniform", "scene"] | None = None,
+    stage: StageAsset | None = None,
     progress: Progress | None = None,
 ) -> Imported:
     """Convert a splat file to an asset.
@@ -219,6 +220,7 @@ def import_splats(
         mass: Mass [kg].
         friction: Coulomb friction coefficient.
         capture_light: As in :class:`mitsplat.Asset`; by default ``uniform`` for objects, ``scene`` for environments.
+        stage: Content of the USD stage at ``path``; by default it is read.
         progress: Callback that gets the current stage.
 
     Raises:
@@ -246,7 +248,7 @@ def import_splats(
                 f"{path}: states its up axis: correct upAxis of the stage, without --up (got {settings.up})"
             )
         reason = f"{settings.up}, as given" if settings.up else "as the file states"
-        loaded = read_stage_asset(path).splats if is_usd(path) else read_gltf_splats(path)
+        loaded = (stage or read_stage_asset(path)).splats if is_usd(path) else read_gltf_splats(path)
         units = settings.units if settings.units or settings.size else 1.0
         settings = replace(settings, up=FROM_GLTF_AXES[settings.up or "y"], units=units)
     else:

@@ -18,6 +18,7 @@ from mitsplat.capture.photos import Prepared, shapes_differ, turn_upright, with_
 from mitsplat.capture.structure_from_motion import SparseModel, find_points, read_model
 from mitsplat.errors import InputError
 from mitsplat.geometry.camera import Camera
+from mitsplat.geometry.rigid import OPENCV_FROM_OPENGL
 from mitsplat.images.colour import LUMINANCE, eight_bit
 from mitsplat.progress import Progress
 
@@ -288,8 +289,7 @@ def _camera(lens: _Lens, width: int, height: int, pose: np.ndarray[tuple[int, ..
     distortion = (lens.k1, lens.k2, lens.p1, lens.p2) + ((lens.k3,) if lens.k3 else ())
     if fisheye:
         distortion = (lens.k1, lens.k2, lens.k3, lens.k4)
-    pose = pose.copy()
-    pose[:3, :3] @= np.diag([1.0, -1.0, -1.0])
+    pose = pose @ OPENCV_FROM_OPENGL
     return Camera(
         width=width,
         height=height,

@@ -26,7 +26,7 @@ from mitsplat.geometry.lens import (
     lens_fault,
     undistort,
 )
-from mitsplat.geometry.rigid import rigid_matrix
+from mitsplat.geometry.rigid import OPENCV_FROM_OPENGL, rigid_matrix
 
 MAX_IMAGE_SIDE = 16384
 """Maximum side length of an image [px]."""
@@ -173,7 +173,7 @@ class Camera:
             raise ValueError(f"world_from_camera {error}") from None
         return cls(
             *(width, height, fx, fy, cx, cy),
-            world_from_camera=pose @ np.diag([1.0, -1.0, -1.0, 1.0]),
+            world_from_camera=pose @ OPENCV_FROM_OPENGL,
             distortion=distortion,  # type: ignore[arg-type]  # converted by __post_init__
             near=near,
         )

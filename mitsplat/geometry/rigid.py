@@ -9,6 +9,10 @@ from mitsplat.arrays import Float64Array
 
 RIGID = 1e-5
 """Maximum absolute entry of R R^T - 1. Rotations in single precision pass; scales do not."""
+Z_UP_FROM_Y_UP = np.array([(1.0, 0.0, 0.0, 0.0), (0.0, 0.0, -1.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)])
+"""Transform (4, 4) from axes with y up, as in glTF, to those with z up."""
+OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+"""Transform (4, 4) between the axes of cameras in OpenGL and OpenCV, which is its own inverse."""
 ROUNDED = 2e-3
 """Maximum absolute entry of R R^T - 1 of a rotation whose entries are rounded to three decimals."""
 

@@ -17,6 +17,7 @@ from mitsplat.errors import InputError, MissingResourceError
 from mitsplat.gaussians.spherical_harmonics import encode_sh
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.gaussians.splat_files import decode_spz
+from mitsplat.geometry.rigid import Z_UP_FROM_Y_UP
 from mitsplat.geometry.untrusted_meshes import check_mesh
 from mitsplat.mesh_files.gltf import instance_poses, world_poses
 from mitsplat.mesh_files.gltf_data import GltfData
@@ -26,8 +27,6 @@ GLTF_SUFFIXES = (".glb", ".gltf")
 EXTENSION = "KHR_gaussian_splatting"
 COMPRESSION = f"{EXTENSION}_compression_spz_2"
 ENCODED, LINEAR = "srgb_rec709_display", "lin_rec709_display"
-Z_UP_FROM_GLTF = np.array([(1.0, 0, 0, 0), (0, 0, -1, 0), (0, 1, 0, 0), (0, 0, 0, 1)])
-"""Transform from the axes of glTF, y up, to those of mitsplat, z up."""
 GLTF_FROM_SPZ = np.diag([-1.0, 1.0, -1.0, 1.0])
 _READ_EXTENSIONS = {
     EXTENSION,
@@ -95,7 +94,7 @@ def _read(path: Path, *, warn: bool) -> Splats:
                 cache[key] = _read_primitive(data, primitive, left_out)
             for instance in instance_poses(data, node):
                 try:
-                    parts.append(cache[key].transformed(Z_UP_FROM_GLTF @ pose @ instance))
+                    parts.append(cache[key].transformed(Z_UP_FROM_Y_UP @ pose @ instance))
                 except ValueError as error:
                     raise InputError(f"node {node.get('name', index)}: {error}") from error
     if not parts:

@@ -14,7 +14,8 @@ from mitsplat.asset import Asset
 from mitsplat.errors import InputError
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.gaussians.splat_files import SplatArrays, encode_spz
-from mitsplat.gltf_splats.splat_reading import COMPRESSION, ENCODED, EXTENSION, GLTF_FROM_SPZ, Z_UP_FROM_GLTF
+from mitsplat.geometry.rigid import Z_UP_FROM_Y_UP
+from mitsplat.gltf_splats.splat_reading import COMPRESSION, ENCODED, EXTENSION, GLTF_FROM_SPZ
 from mitsplat.storage.files import storage_errors, write_file
 from mitsplat.version import __version__
 
@@ -56,7 +57,7 @@ def write_gltf_splats(splats: Splats, path: Path, *, name: str, spz: bool = Fals
     if not len(splats):
         raise InputError(f"{path}: a glTF file must hold at least one Gaussian (got 0)")
     unit = _spz_unit(splats) if spz else 1.0
-    turned = splats.transformed(np.diag([1 / unit, 1 / unit, 1 / unit, 1.0]) @ Z_UP_FROM_GLTF.T)
+    turned = splats.transformed(np.diag([1 / unit, 1 / unit, 1 / unit, 1.0]) @ Z_UP_FROM_Y_UP.T)
     names, properties, extensions = _attributes(turned), {"kernel": "ellipse", "colorSpace": ENCODED}, [EXTENSION]
     accessors: list[dict[str, Any]] = []
     views: list[dict[str, Any]] = []

@@ -24,6 +24,7 @@ from mitsplat.arrays import Float64Array
 from mitsplat.asset import Asset
 from mitsplat.errors import InputError
 from mitsplat.geometry.camera import Camera
+from mitsplat.geometry.rigid import OPENCV_FROM_OPENGL
 from mitsplat.images.colour import encode_srgb
 from mitsplat.physics.drop import TIMESTEP, make_body
 from mitsplat.physics.friction import GRAVITY, MIN_FRICTION, ContactMaterial
@@ -183,7 +184,7 @@ class _ModelWriter:
 
 def _camera(camera: Camera) -> ET.Element:
     """Return MuJoCo's camera, which looks along -z; its principal point is the window's offset, with y up."""
-    frame = camera.world_from_camera @ np.diag([1.0, -1.0, -1.0, 1.0])
+    frame = camera.world_from_camera @ OPENCV_FROM_OPENGL
     offset = (0.5 * camera.width - camera.cx, 0.5 * camera.height - camera.cy)
     values: dict[str, npt.ArrayLike] = {
         "resolution": (camera.width, camera.height),

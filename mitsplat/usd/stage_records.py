@@ -20,6 +20,7 @@ import numpy.typing as npt
 
 from mitsplat.arrays import Float32Array, Float64Array
 from mitsplat.errors import InputError
+from mitsplat.geometry.rigid import Z_UP_FROM_Y_UP
 from mitsplat.runtime.child_process import run_bounded
 from mitsplat.usd.usd_layers import open_confined, require_usd
 
@@ -36,7 +37,6 @@ _MEMORY_PER_BYTE = 60
 """Permitted memory of the reader per byte of the stage's folder; text is longer than the arrays that it states."""
 _SECONDS = 600
 _MAX_SIZE = 8 << 30
-_Z_UP_FROM_Y_UP = np.array([[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]], dtype=np.float64)
 _ROUND_SEGMENTS = 64
 
 
@@ -106,7 +106,7 @@ class _StageReader:
         units = UsdGeom.GetStageMetersPerUnit(stage)
         if not 0 < units < np.inf:
             raise InputError(f"metersPerUnit must be finite and > 0 (got {units:g})")
-        up = _Z_UP_FROM_Y_UP if UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.y else np.eye(4)
+        up = Z_UP_FROM_Y_UP if UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.y else np.eye(4)
         self._world_from_stage = np.diag([units, units, units, 1.0]) @ up
         self._units, self._kilograms = units, UsdPhysics.GetStageKilogramsPerUnit(stage)
         self._cache = UsdGeom.XformCache(self._time)

@@ -25,6 +25,7 @@ from mitsplat.asset import Asset
 from mitsplat.errors import InputError
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.camera import Camera
+from mitsplat.geometry.rigid import OPENCV_FROM_OPENGL
 from mitsplat.images.colour import temperature_colour
 from mitsplat.physics.drop import make_body
 from mitsplat.physics.friction import GRAVITY, MIN_FRICTION, ContactMaterial
@@ -44,8 +45,6 @@ _SENSOR_WIDTH = 0.036
 """Width of the sensor of exported cameras [m]; USD states focal lengths and offsets relative to it."""
 _SPOT_FALLOFF = 0.25
 """Share of a spot's cone in which its light falls off, as in Mitsuba."""
-_USD_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
-"""Cameras and lights of USD look along -z, with y up."""
 
 
 def export_asset_usd(asset: Asset, path: Path) -> tuple[str, ...]:
@@ -313,7 +312,7 @@ class _StageWriter:
         from pxr import Gf, UsdGeom, UsdRender  # optional
 
         prim = UsdGeom.Camera.Define(self.stage, "/World/camera")
-        self._place(prim.GetPrim(), camera.world_from_camera @ _USD_FROM_OPENCV)
+        self._place(prim.GetPrim(), camera.world_from_camera @ OPENCV_FROM_OPENGL)
         width = 10 * _SENSOR_WIDTH
         focal, height = width * camera.fx / camera.width, width * camera.height / camera.width * camera.fx / camera.fy
         prim.CreateFocalLengthAttr(focal)
@@ -370,7 +369,7 @@ class _StageWriter:
             level = np.hypot(*forward[:2]) > 1e-6 * np.linalg.norm(forward)
             up = (0.0, 0.0, 1.0) if level else (0.0, 1.0, 0.0)
             aim = Camera.look_at(light.position, light.target, up=up, width=1, height=1, fov_x=60)
-            pose = aim.world_from_camera @ _USD_FROM_OPENCV
+            pose = aim.world_from_camera @ OPENCV_FROM_OPENGL
         if light.kind == "spot":
             shaping = UsdLux.ShapingAPI.Apply(made.GetPrim())
             shaping.CreateShapingConeAngleAttr(light.cone)

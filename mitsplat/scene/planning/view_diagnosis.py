@@ -9,6 +9,7 @@ import numpy as np
 
 from mitsplat.arrays import Float64Array
 from mitsplat.geometry.camera import Camera
+from mitsplat.geometry.rigid import OPENCV_FROM_OPENGL
 
 FAR = 10.0
 """Distance of a camera from all objects above which its position is probably in millimetres [m]."""
@@ -62,14 +63,16 @@ def _candidates(pose: Float64Array, *, far: bool) -> Iterator[tuple[str, Float64
     """Yield possible mistakes in a pose, and the pose without them. Positions in millimetres must be far away."""
     metric = pose.copy()
     metric[:3, 3] *= 1e-3 if far else 1.0
-    flip = np.diag([1.0, -1.0, -1.0, 1.0])
     exchanged = metric.copy()
     exchanged[:3, :3] = metric[:3, :3].T
     unit = " in millimetres, and" if far else ""
     if far:
         yield "is its position in millimetres?", metric
-    yield f"is its matrix{unit} in the axes of OpenGL (y up, z backwards), for Camera.from_opengl?", metric @ flip
+    yield (
+        f"is its matrix{unit} in the axes of OpenGL (y up, z backwards), for Camera.from_opengl?",
+        metric @ OPENCV_FROM_OPENGL,
+    )
     yield f"is its matrix{unit} the inverse, camera_from_world?", np.asarray(np.linalg.inv(metric), np.float64)
-    both = np.asarray(np.linalg.inv(flip @ metric), np.float64)
+    both = np.asarray(np.linalg.inv(OPENCV_FROM_OPENGL @ metric), np.float64)
     yield f"is its matrix{unit} the inverse, in the axes of OpenGL (y up, z backwards)?", both
     yield f"is its matrix{unit} one whose rotation has rows and columns exchanged?", exchanged

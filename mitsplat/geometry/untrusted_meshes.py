@@ -12,7 +12,7 @@ from typing import BinaryIO
 import numpy as np
 import trimesh
 
-from mitsplat.errors import InputError
+from mitsplat.errors import InputError, MissingResourceError
 from mitsplat.runtime.child_process import run_bounded
 from mitsplat.storage.files import MESH_ERRORS
 
@@ -90,13 +90,21 @@ def _try_mesh(path: Path, _modified: int, size: int, read: TrialReader) -> str:
     return process.reason if (process.status or 0) > 0 else f"its reader {process.reason}"
 
 
-def _read_mesh(output: BinaryIO, _: bytes, path: str) -> None:
-    """Read a file and discard it. Errors except lack of memory are ignored, since the actual reader reports them."""
+def try_read(output: BinaryIO, read: Callable[[], object]) -> None:
+    """Read a file in a :data:`TrialReader` and discard it.
+
+    Errors except lack of memory are ignored, because the actual reader reports them.
+    """
     try:
         with np.errstate(all="ignore"):
-            trimesh.load_scene(path).to_mesh()
+            read()
     except MemoryError:
         raise InputError("reading it takes more memory than its file size justifies") from None
-    except (OSError, *MESH_ERRORS):
+    except (InputError, MissingResourceError, OSError, *MESH_ERRORS):
         pass
     output.write(b"\n")
+
+
+def _read_mesh(output: BinaryIO, _: bytes, path: str) -> None:
+    """Read a file with trimesh and discard it."""
+    try_read(output, lambda: trimesh.load_scene(path).to_mesh())

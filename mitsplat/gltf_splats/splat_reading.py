@@ -13,12 +13,12 @@ from typing import BinaryIO
 import numpy as np
 
 from mitsplat.arrays import Float32Array
-from mitsplat.errors import InputError, MissingResourceError
+from mitsplat.errors import InputError
 from mitsplat.gaussians.spherical_harmonics import encode_sh
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.gaussians.splat_files import decode_spz
 from mitsplat.geometry.rigid import Z_UP_FROM_Y_UP
-from mitsplat.geometry.untrusted_meshes import check_mesh
+from mitsplat.geometry.untrusted_meshes import check_mesh, try_read
 from mitsplat.mesh_files.gltf import instance_poses, world_poses
 from mitsplat.mesh_files.gltf_data import GltfData
 from mitsplat.storage.files import MESH_ERRORS, JsonObject
@@ -66,14 +66,8 @@ def read_gltf_splats(path: Path) -> Splats:
 
 
 def _try_splats(output: BinaryIO, _: bytes, path: str) -> None:
-    """Read a file and discard it. Errors except lack of memory are ignored, since the actual reader reports them."""
-    try:
-        _read(Path(path), warn=False)
-    except MemoryError:
-        raise InputError("reading it takes more memory than its file size justifies") from None
-    except (InputError, MissingResourceError, OSError, *MESH_ERRORS):
-        pass
-    output.write(b"\n")
+    """Read a file and discard it."""
+    try_read(output, lambda: _read(Path(path), warn=False))
 
 
 def _read(path: Path, *, warn: bool) -> Splats:

@@ -9,7 +9,7 @@ import numpy as np
 import trimesh
 
 from mitsplat.errors import InputError, MissingResourceError
-from mitsplat.geometry.untrusted_meshes import check_mesh
+from mitsplat.geometry.untrusted_meshes import check_mesh, try_read
 from mitsplat.mesh_files.gltf import read_gltf
 from mitsplat.mesh_files.mesh_file import MeshFile
 from mitsplat.mesh_files.step import STEP_SUFFIXES, read_step
@@ -76,11 +76,5 @@ def _read(path: Path, *, textures: bool) -> MeshFile:
 
 
 def _try_mesh_file(output: BinaryIO, _: bytes, path: str) -> None:
-    """Read a file and discard it. Errors except lack of memory are ignored, since the actual reader reports them."""
-    try:
-        _read(Path(path), textures=True)
-    except MemoryError:
-        raise InputError("reading it takes more memory than its file size justifies") from None
-    except (InputError, MissingResourceError, OSError, *MESH_ERRORS):
-        pass
-    output.write(b"\n")
+    """Read a file with all its textures and discard it."""
+    try_read(output, lambda: _read(Path(path), textures=True))

@@ -71,7 +71,7 @@ def read_stage_asset(path: Path) -> StageAsset:
         for kind in ("cameras", "lights")
         if records[kind]
     ]
-    frame = body_frames(records["bodies"]).get(bodies.pop(), np.eye(4))
+    frame = body_frames(path, records["bodies"]).get(bodies.pop(), np.eye(4))
     splats, found_notes = merge_fields(path, fields, _inverse(frame))
     asset = make_asset(path, records, fields[0]["body"], splats, notes)
     notes += found_notes
@@ -80,14 +80,26 @@ def read_stage_asset(path: Path) -> StageAsset:
     return StageAsset(splats, asset, tuple(notes))
 
 
-def body_frames(bodies: Sequence[Record]) -> dict[str | None, Float64Array]:
+def body_frames(path: Path, bodies: Sequence[Record]) -> dict[str | None, Float64Array]:
     """Return the rigid frames ``world_from_body`` of rigid bodies, without the scale of their prims."""
     frames: dict[str | None, Float64Array] = {}
     for body in bodies:
-        rotation, _, translation = _similarity(body["path"], body["matrix"])
-        frames[body["path"]] = np.eye(4)
-        frames[body["path"]][:3, :3], frames[body["path"]][:3, 3] = rotation, translation
+        frames[body["path"]], _ = rigid_frame(path, body)
     return frames
+
+
+def rigid_frame(path: Path, record: Record) -> tuple[Float64Array, float]:
+    """Return the rigid transform (4, 4) of a record's matrix, and its uniform scale; ``path`` is that of the stage.
+
+    Raises:
+        InputError: If the matrix mirrors, shears or scales non-uniformly.
+    """
+    frame = np.eye(4)
+    try:
+        frame[:3, :3], scale, frame[:3, 3] = split_similarity(record["matrix"])
+    except ValueError as error:
+        raise InputError(f"{path}: {record['path']}: {error}") from None
+    return frame, scale
 
 
 def merge_fields(path: Path, fields: Sequence[Record], frame_from_world: Float64Array) -> tuple[Splats, list[str]]:
@@ -141,7 +153,7 @@ def make_asset(path: Path, records: Record, body: str | None, splats: Splats, no
         splats: Splats in the frame of the body.
         notes: List to which notes are appended.
     """
-    frames = body_frames(records["bodies"])
+    frames = body_frames(path, records["bodies"])
     frame_from_world = _inverse(frames.get(body, np.eye(4)))
     colliders = [one for one in records["colliders"] if one["body"] == body]
     proxies = [one for one in records["meshes"] if one["body"] == body and not one["visible"]]
@@ -191,7 +203,7 @@ def make_asset(path: Path, records: Record, body: str | None, splats: Splats, no
         ),
     )
     if kind == "object" and dynamics.get("inertia") is not None:
-        notes.extend(_inertia_notes(asset, dynamics))
+        notes.extend(_inertia_notes(path, asset, dynamics))
     return asset
 
 
@@ -212,13 +224,13 @@ def _checked(path: Path, asset: Asset) -> Asset:
     return asset
 
 
-def _inertia_notes(asset: Asset, body: Record) -> list[str]:
+def _inertia_notes(path: Path, asset: Asset, body: Record) -> list[str]:
     """Return a note if the inertia or centre of mass of a stage differs from that of a uniform density."""
     if asset.mesh is None:
         return []
     mass = mass_properties(prepare_mesh(asset.mesh, asset.name), asset.pieces, density=asset.density, mass=asset.mass)
     moments, stated = np.linalg.eigvalsh(mass.inertia), np.sort(body["inertia"])
-    _, scale, _ = split_similarity(body["matrix"])
+    _, scale = rigid_frame(path, body)
     centre = mass.centre if body["centre"] is None else scale * np.array(body["centre"])
     size = float(asset.mesh.extents.max())
     if (
@@ -249,13 +261,6 @@ def _pieces(path: Path, record: Record, frame_from_world: Float64Array) -> Seque
 
 def _inverse(matrix: Float64Array) -> Float64Array:
     return np.asarray(np.linalg.inv(matrix), dtype=np.float64)
-
-
-def _similarity(name: str, matrix: Float64Array) -> tuple[Float64Array, float, Float64Array]:
-    try:
-        return split_similarity(matrix)
-    except ValueError as error:
-        raise InputError(f"{name}: {error}") from None
 
 
 def with_values(

@@ -20,14 +20,15 @@ from scipy.spatial import QhullError
 from mitsplat.arrays import Float64Array
 from mitsplat.asset import Asset, opaque_core
 from mitsplat.errors import InputError
-from mitsplat.gaussians.splat_cloud import Splats, split_similarity
+from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.camera import Camera
+from mitsplat.geometry.rigid import OPENCV_FROM_OPENGL
 from mitsplat.images.colour import encode_srgb, temperature_colour
 from mitsplat.scene.loading.scene_loading import load_scene
 from mitsplat.scene.scene import Scene
 from mitsplat.storage.content_hash import ContentHash
 from mitsplat.storage.files import storage_errors, write_text
-from mitsplat.usd.stage_assets import body_frames, make_asset, merge_fields, placed_mesh
+from mitsplat.usd.stage_assets import body_frames, make_asset, merge_fields, placed_mesh, rigid_frame
 from mitsplat.usd.stage_records import Record, read_records
 
 _WIDTH = 1280
@@ -71,7 +72,7 @@ def read_stage_scene(path: Path, folder: Path, overrides: Mapping[str, Any] | No
     notes: list[str] = list(records["notes"])
     if not records["cameras"]:
         raise InputError(f"{path}: must have a camera to be rendered (got none)")
-    frames = body_frames(records["bodies"])
+    frames = body_frames(path, records["bodies"])
     groups: dict[str, list[Record]] = {}
     for field in records["fields"]:
         groups.setdefault(field["body"] or (field["path"] if field["label"] else ""), []).append(field)
@@ -99,9 +100,9 @@ def read_stage_scene(path: Path, folder: Path, overrides: Mapping[str, Any] | No
         if surroundings:
             _environment(path, records, surroundings, notes).save(folder / "assets" / "environment")
             data["environment"] = "assets/environment"
-        data["lights"] = [light for record in records["lights"] for light in _lights(record, notes)]
+        data["lights"] = [light for record in records["lights"] for light in _lights(path, record, notes)]
         cameras = tuple(
-            _camera(record, size or records["resolution"], stretched=records["stretched"])
+            _camera(path, record, size or records["resolution"], stretched=records["stretched"])
             for record in records["cameras"]
         )
         first = cameras[0]
@@ -132,12 +133,7 @@ def _object(
 ) -> tuple[Asset, Float64Array]:
     """Return the asset and the pose of a body, or of a labelled particle field without one."""
     body = fields[0]["body"]
-    if body is None:
-        rotation, _, translation = split_similarity(fields[0]["matrix"])
-        frame = np.eye(4)
-        frame[:3, :3], frame[:3, 3] = rotation, translation
-    else:
-        frame = frames[body]
+    frame = rigid_frame(path, fields[0])[0] if body is None else frames[body]
     splats, found = merge_fields(path, fields, np.asarray(np.linalg.inv(frame), dtype=np.float64))
     notes.extend(found)
     asset = None if body is None else make_asset(path, records, body, splats, notes)
@@ -178,19 +174,18 @@ def _shapes(records: Record, folder: Path) -> list[dict[str, Any]]:
     return found
 
 
-def _camera(record: Record, size: Sequence[int] | None, *, stretched: bool) -> Camera:
+def _camera(path: Path, record: Record, size: Sequence[int] | None, *, stretched: bool) -> Camera:
     """Return a camera of UsdGeom; lengths are in tenths of a unit of the stage.
 
     Args:
+        path: The stage, for messages.
         record: Record of the camera.
         size: Width and height of the image [px], or None.
         stretched: True if the aperture fills the image even if this stretches the image.
     """
     across, up = record["HorizontalAperture"], record["VerticalAperture"]
     width, height = size or (_WIDTH, max(1, round(_WIDTH * up / across)))
-    rotation, scale, translation = split_similarity(record["matrix"])
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = rotation @ np.diag([1.0, -1.0, -1.0]), translation
+    pose, scale = rigid_frame(path, record)
     fx, fy = width * record["FocalLength"] / across, height * record["FocalLength"] / up
     if (
         not stretched and abs(fx / fy - 1) > 1e-3
@@ -204,16 +199,17 @@ def _camera(record: Record, size: Sequence[int] | None, *, stretched: bool) -> C
         fy=fy,
         cx=0.5 * width - fx * record["HorizontalApertureOffset"] / record["FocalLength"],
         cy=0.5 * height + fy * record["VerticalApertureOffset"] / record["FocalLength"],
-        world_from_camera=pose,
+        world_from_camera=pose @ OPENCV_FROM_OPENGL,
         aperture_radius=sensor * record["FocalLength"] / (2 * record["FStop"]) if record["FStop"] > 0 else 0.0,
         focus_distance=scale * record["FocusDistance"] if record["FStop"] > 0 else 1.0,
     )
 
 
-def _lights(record: Record, notes: list[str]) -> list[dict[str, Any]]:
+def _lights(path: Path, record: Record, notes: list[str]) -> list[dict[str, Any]]:
     """Return the entry of a light in the scene file; none, with a note, for lights that it does not have."""
     inputs, kind = record["inputs"], record["type"]
-    rotation, scale, position = split_similarity(record["matrix"])
+    frame, scale = rigid_frame(path, record)
+    position, normal = frame[:3, 3], -frame[:3, 2]
     strength = inputs.get("intensity", 1.0) * 2.0 ** inputs.get("exposure", 0.0)
     colour = np.array(inputs.get("color", (1.0, 1.0, 1.0)), dtype=np.float64)
     if inputs.get("enableColorTemperature"):
@@ -223,7 +219,7 @@ def _lights(record: Record, notes: list[str]) -> list[dict[str, Any]]:
         return []
     entry: dict[str, Any] = {"colour": (colour / peak).tolist()}
     strength *= peak
-    normal, is_normalised = -rotation[:, 2], bool(inputs.get("normalize"))
+    is_normalised = bool(inputs.get("normalize"))
     place = {"position": position.tolist(), "target": (position + normal).tolist()}
     if kind.startswith("DomeLight"):
         if inputs.get("texture:file"):

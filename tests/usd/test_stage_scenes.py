@@ -18,7 +18,7 @@ from tests.usd.test_simulated_frames import INDEX, folder  # noqa: F401 - a fixt
 from tests.usd.test_usd_assets import new_stage
 
 pxr = pytest.importorskip("pxr", reason="needs OpenUSD: pip install 'mitsplat[usd]'")
-from pxr import Gf, UsdGeom, UsdLux, UsdPhysics, UsdRender, UsdSemantics, UsdVol, Vt  # noqa: E402
+from pxr import Gf, Usd, UsdGeom, UsdLux, UsdPhysics, UsdRender, UsdSemantics, UsdVol, Vt  # noqa: E402
 
 RADIUS = 0.04
 
@@ -104,6 +104,15 @@ def test_an_exported_frame_is_read_as_the_same_scene(folder: Path, tmp_path: Pat
         if before.kind != "area":  # its colour temperature is part of its colour
             assert getattr(light, strength) == pytest.approx(getattr(before, strength) * scale, rel=1e-5)
     assert [shape.name for shape in found.scene.spec.shapes] == ["/World/shapes/table_0/mesh"]
+
+
+def test_a_sheared_camera_is_refused_in_one_sentence(tmp_path: Path) -> None:
+    write_balls(tmp_path / "balls.usda")
+    stage = Usd.Stage.Open(str(tmp_path / "balls.usda"))
+    UsdGeom.Xformable(stage.GetPrimAtPath("/World/camera")).AddScaleOp().Set((1, 2, 1))
+    stage.Save()
+    with pytest.raises(InputError, match=r"balls\.usda: /World/camera: a transform must scale uniformly"):
+        read_stage_scene(tmp_path / "balls.usda", tmp_path / "scene")
 
 
 def test_a_stage_without_classes_or_cameras_is_refused(tmp_path: Path) -> None:

@@ -132,7 +132,7 @@ def render(
     """Render the labelled dataset of SCENE.
 
     Options override values of the scene file. A Mitsuba scene (.xml) is rendered to one picture without labels.
-    For an OpenUSD stage (.usd, .usda, .usdc, .usdz), each of its cameras gives a labelled image.
+    For an OpenUSD stage (.usd, .usda, .usdc, .usdz), each of its cameras gives a labelled image per time code.
     """
     from mitsplat.runtime.device import find_device, use_device
 
@@ -160,12 +160,15 @@ def render(
 
         if is_usd(scene):
             ignored = engine != "local", any_device, workers is not None, seed is not None
-            if any(ignored) or any(given is not None for given in (frames, only, tolerance, shard)):
+            if any(ignored) or any(given is not None for given in (only, tolerance, shard)):
                 raise InputError(
-                    f"{scene}: only --out, --size, --format, --quality, --device and --overwrite apply to a USD stage"
+                    f"{scene}: only --out, --frames, --size, --format, --quality, --device and --overwrite apply to a "
+                    "USD stage"
                 )
+            if frames is not None and frames < 1:
+                raise InputError(f"--frames must be 1 or more (got {frames})")
             use_device(device or "cpu")
-            _render_stage(scene, out, overrides, overwrite=overwrite)
+            _render_stage(scene, out, frames, overrides, overwrite=overwrite)
             return
         from mitsplat.dataset.dataset_folder import Shard
         from mitsplat.dataset.write import write_dataset
@@ -643,8 +646,8 @@ def _print_findings(findings: Iterable[Finding], mark: str) -> NoReturn:
     raise typer.Exit(0 if good else 1)
 
 
-def _render_stage(stage: Path, out: Path, overrides: Mapping[str, Any], *, overwrite: bool) -> None:
-    """Render the cameras of a USD stage to a labelled dataset."""
+def _render_stage(stage: Path, out: Path, times: int | None, overrides: Mapping[str, Any], *, overwrite: bool) -> None:
+    """Render the cameras of a USD stage at its time codes, at most ``times``, to a labelled dataset."""
     from tempfile import TemporaryDirectory
 
     from mitsplat.dataset.python_frames import write_frames
@@ -653,13 +656,14 @@ def _render_stage(stage: Path, out: Path, overrides: Mapping[str, Any], *, overw
     from mitsplat.usd.stage_scene import read_stage_scene
 
     with TemporaryDirectory() as folder:
-        found = read_stage_scene(stage, Path(folder), overrides)
+        found = read_stage_scene(stage, Path(folder), overrides, images=times)
         for note in found.notes:
             typer.echo(note)
-        layout = Layout.from_poses(found.scene, found.poses)
-        frames = render_frames(found.scene, layouts=[layout] * len(found.cameras), cameras=found.cameras)
+        layouts = [Layout.from_poses(found.scene, poses) for poses in found.poses]
+        cameras = [camera for track in found.cameras for camera in track]
+        frames = render_frames(found.scene, layouts=layouts * len(found.cameras), cameras=cameras)
         summary = write_frames(found.scene, out, frames, overwrite=overwrite)
-        typer.echo(f"dataset: {out} ({summary.rendered} images)")
+        typer.echo(f"dataset: {out} ({summary.rendered} images of {len(layouts)} time codes)")
 
 
 def _format_counts(counts: Mapping[str, int]) -> str:

@@ -71,6 +71,8 @@ def read_stage_asset(path: Path) -> StageAsset:
         for kind in ("cameras", "lights")
         if records[kind]
     ]
+    if any("motion" in record for record in (*fields, *records["bodies"])):
+        notes.append("not imported: the motion of prims, which are read at the first time code")
     frame = body_frames(path, records["bodies"]).get(bodies.pop(), np.eye(4))
     splats, found_notes = merge_fields(path, fields, _inverse(frame))
     asset = make_asset(path, records, fields[0]["body"], splats, notes)

@@ -22,6 +22,7 @@ from mitsplat.arrays import Float32Array, Float64Array
 from mitsplat.errors import InputError
 from mitsplat.geometry.rigid import Z_UP_FROM_Y_UP
 from mitsplat.runtime.child_process import run_bounded
+from mitsplat.usd.stage_motion import is_moving, sampled_attributes, time_codes
 from mitsplat.usd.usd_layers import open_confined, require_usd
 
 if TYPE_CHECKING:
@@ -40,12 +41,17 @@ _MAX_SIZE = 8 << 30
 _ROUND_SEGMENTS = 64
 
 
-def read_records(path: Path) -> Record:
+def read_records(path: Path, images: int | None = 1) -> Record:
     """Read the content of a stage in a child process with bounded memory and time.
 
+    Args:
+        path: The stage.
+        images: Maximum number of time codes at which moving prims are read; None for all.
+
     Returns:
-        Lists of records: ``fields``, ``bodies``, ``colliders``, ``meshes``, ``cameras`` and ``lights``; and ``notes``,
-        one sentence for everything that is not read.
+        Lists of records: ``fields``, ``bodies``, ``colliders``, ``meshes``, ``cameras`` and ``lights``; ``times``, the
+        time codes; and ``notes``, one sentence for everything that is not read. A record is that of the first time
+        code. Those of moving prims also have ``motion``, their matrices at all time codes, shape (T, 4, 4).
 
     Raises:
         InputError: If a file is missing or damaged, lies outside of the stage's folder, or breaks a rule.
@@ -59,7 +65,7 @@ def read_records(path: Path) -> Record:
         raise InputError(f"{path}: must be a stage of at most {_MAX_SIZE} bytes (got {size})")
     size = min(_MAX_SIZE, size + sum(file.stat().st_size for file in path.parent.glob("**/*.usd*") if file.is_file()))
     memory = _MEMORY + _MEMORY_PER_BYTE * size
-    result = run_bounded(write_records, path, memory=memory, seconds=_SECONDS)
+    result = run_bounded(write_records, path, str(images or 0), memory=memory, seconds=_SECONDS)
     if result.status:
         reason = result.reason if result.status > 0 else f"its reader {result.reason}"
         raise InputError(reason if reason.startswith(str(path)) else f"{path}: {reason}")
@@ -70,10 +76,11 @@ def read_records(path: Path) -> Record:
     return cast(Record, _with_arrays(json.loads(arrays.pop("records").tobytes()), arrays))
 
 
-def write_records(output: BinaryIO, _: bytes, path: str) -> None:
+def write_records(output: BinaryIO, _: bytes, path: str, images: str) -> None:
     """Read a stage and write its records, as the child's part of :func:`read_records`."""
     arrays: dict[str, npt.NDArray[Any]] = {}
-    text = json.dumps(_without_arrays(_StageReader(open_confined(Path(path))).read(), arrays))
+    reader = _StageReader(open_confined(Path(path)), int(images) or None)
+    text = json.dumps(_without_arrays(reader.read(), arrays))
     arrays["records"] = np.frombuffer(text.encode(), dtype=np.uint8)
     np.savez(output, allow_pickle=False, **arrays)
 
@@ -97,12 +104,13 @@ def _with_arrays(value: Any, arrays: dict[str, npt.NDArray[Any]]) -> Any:
 
 
 class _StageReader:
-    """Reader of one stage at its first time."""
+    """Reader of one stage at its first time code; poses are read at all of its time codes."""
 
-    def __init__(self, stage: Usd.Stage) -> None:
+    def __init__(self, stage: Usd.Stage, images: int | None) -> None:
         from pxr import Usd, UsdGeom, UsdPhysics  # optional, and slow to import
 
-        self._stage, self._time = stage, Usd.TimeCode.EarliestTime()
+        self._stage, self._times = stage, time_codes(stage, images)
+        self._time = Usd.TimeCode(self._times[0])
         units = UsdGeom.GetStageMetersPerUnit(stage)
         if not 0 < units < np.inf:
             raise InputError(f"metersPerUnit must be finite and > 0 (got {units:g})")
@@ -118,6 +126,8 @@ class _StageReader:
 
         found: Record = {key: [] for key in ("fields", "bodies", "colliders", "meshes", "cameras", "lights")}
         for prim in self._stage.Traverse(Usd.TraverseInstanceProxies()):
+            for name in sampled_attributes(prim):
+                self._ignored[f"sets of time samples of {name}"].append(str(prim.GetPath()))
             imageable = UsdGeom.Imageable(prim)
             if imageable and imageable.ComputeVisibility(self._time) == UsdGeom.Tokens.invisible:
                 if prim.IsA(UsdGeom.Boundable):
@@ -138,6 +148,8 @@ class _StageReader:
                 self._gprim(prim, found)
             elif prim.IsA(UsdGeom.Boundable) or prim.IsA(UsdPhysics.Joint):
                 self._ignored[f"prims of type {prim.GetTypeName()}"].append(str(prim.GetPath()))
+        self._add_motion([record for records in found.values() for record in records])
+        found["times"] = self._times
         found["notes"] = [
             *self._assumptions(),
             *(f"not imported: {error}" for error in self._stage.GetCompositionErrors()),
@@ -152,15 +164,24 @@ class _StageReader:
         return found
 
     def _assumptions(self) -> Iterator[str]:
-        """Yield a note for each unit or axis that the stage does not state, and for motion."""
+        """Yield a note for each unit or axis that the stage does not state."""
         from pxr import UsdGeom  # optional
 
         if not UsdGeom.StageHasAuthoredMetersPerUnit(self._stage):
             yield f"metersPerUnit is not stated, so that USD's default of {self._units:g} applies"
         if not self._stage.HasAuthoredMetadata("upAxis"):
             yield f"upAxis is not stated, so that USD's default of {UsdGeom.GetStageUpAxis(self._stage)} applies"
-        if self._stage.GetEndTimeCode() > self._stage.GetStartTimeCode():
-            yield "not imported: motion; the stage is read at its first time"
+
+    def _add_motion(self, records: list[Record]) -> None:
+        """Add the matrices of moving prims at all time codes to their records."""
+        prims = [self._stage.GetPrimAtPath(record["path"]) for record in records]
+        moving = [(record, prim) for record, prim in zip(records, prims, strict=True) if is_moving(prim)]
+        for record, _ in moving:
+            record["motion"] = np.empty((len(self._times), 4, 4))
+        for number, time in enumerate(self._times):
+            self._cache.SetTime(time)
+            for record, prim in moving:
+                record["motion"][number] = self._world_from(prim)
 
     def _world_from(self, prim: Usd.Prim) -> Float64Array:
         """Return the matrix from the prim's coordinates to the world in metres with z up, shape (4, 4)."""

@@ -1,14 +1,15 @@
 """Scenes from untrusted USD stages: assets and a scene file in a folder, and the frames that the stage shows.
 
 Rigid bodies with splats are objects, and so are particle fields with a semantic class that belong to no body. Other
-particle fields are the environment. Meshes that belong to no body are visible shapes.
+particle fields are the environment. Meshes that belong to no body are visible shapes. Objects and cameras have the
+poses of each time code.
 """
 
 from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -35,6 +36,8 @@ _WIDTH = 1280
 """Image width of a stage without render settings [px]."""
 _DISTANCE = 100.0
 """Distance at which a distant light is placed [m]."""
+_STILL = 1e-6
+"""Tolerated change of scales and of matrices of prims that do not move."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,18 +46,20 @@ class StageScene:
 
     Attributes:
         scene: The scene; its files are in a folder.
-        poses: Poses ``world_from_object`` of each asset, by its index.
-        cameras: Cameras of the stage.
+        poses: For each time code, the poses ``world_from_object`` of each asset, by its index.
+        cameras: For each camera of the stage, that camera at each time code.
         notes: What was not read, one sentence each.
     """
 
     scene: Scene
-    poses: dict[str | int, list[Float64Array]]
-    cameras: tuple[Camera, ...]
+    poses: tuple[dict[str | int, list[Float64Array]], ...]
+    cameras: tuple[tuple[Camera, ...], ...]
     notes: tuple[str, ...]
 
 
-def read_stage_scene(path: Path, folder: Path, overrides: Mapping[str, Any] | None = None) -> StageScene:
+def read_stage_scene(
+    path: Path, folder: Path, overrides: Mapping[str, Any] | None = None, *, images: int | None = None
+) -> StageScene:
     """Read a stage, and write its assets and a scene file into a folder.
 
     Args:
@@ -62,12 +67,13 @@ def read_stage_scene(path: Path, folder: Path, overrides: Mapping[str, Any] | No
         folder: Empty folder.
         overrides: Values that replace those of the scene, by dotted key. The default size of the images is that of the
             stage's render settings.
+        images: Maximum number of time codes.
 
     Raises:
         InputError: If the stage is damaged, or has no camera or no labelled object.
         MissingResourceError: If OpenUSD is not installed, or the disk is full.
     """
-    records, overrides = read_records(path), dict(overrides or {})
+    records, overrides = read_records(path, images), dict(overrides or {})
     size = (overrides["output.width"], overrides["output.height"]) if "output.width" in overrides else None
     notes: list[str] = list(records["notes"])
     if not records["cameras"]:
@@ -80,9 +86,11 @@ def read_stage_scene(path: Path, folder: Path, overrides: Mapping[str, Any] | No
     if not any(fields[0]["label"] for fields in groups.values()):
         raise InputError(f"{path}: must have particle fields with a semantic class, UsdSemantics.LabelsAPI (got none)")
     with storage_errors(folder):
-        keys, poses, entries = dict[str, int](), dict[str | int, list[Float64Array]](), list[dict[str, Any]]()
+        keys, entries = dict[str, int](), list[dict[str, Any]]()
+        poses: list[dict[str | int, list[Float64Array]]] = [{} for _ in records["times"]]
+        owners = {record["path"]: record for record in (*records["fields"], *records["bodies"])}
         for group, fields in groups.items():
-            asset, pose = _object(path, records, group, fields, frames, notes)
+            asset = _object(path, records, group, fields, frames, notes)
             label = fields[0]["label"]
             content = ContentHash(repr((asset.class_name, label)))
             content.add_array(asset.splats.means)
@@ -93,7 +101,8 @@ def read_stage_scene(path: Path, folder: Path, overrides: Mapping[str, Any] | No
                 asset.save(folder / "assets" / name)
                 entries.append({"asset": f"assets/{name}", "label": label is not None, "count": 0})
             entries[keys[key]]["count"] += 1
-            poses.setdefault(keys[key], []).append(pose)
+            for known, pose in zip(poses, _motion(path, owners[group], records["times"], notes), strict=True):
+                known.setdefault(keys[key], []).append(pose)
         data: dict[str, Any] = {"name": path.stem, "objects": entries, "shapes": _shapes(records, folder)}
         if hidden := [one["path"] for one in records["meshes"] if one["visible"] and one["body"] is not None]:
             notes.append(f"not rendered: meshes of rigid bodies; only their splats are: {', '.join(hidden)}")
@@ -101,14 +110,18 @@ def read_stage_scene(path: Path, folder: Path, overrides: Mapping[str, Any] | No
             _environment(path, records, surroundings, notes).save(folder / "assets" / "environment")
             data["environment"] = "assets/environment"
         data["lights"] = [light for record in records["lights"] for light in _lights(path, record, notes)]
-        cameras = tuple(
-            _camera(path, record, size or records["resolution"], stretched=records["stretched"])
-            for record in records["cameras"]
-        )
-        first = cameras[0]
-        cameras = tuple(camera for camera in cameras if (camera.width, camera.height) == (first.width, first.height))
+        cameras = list[tuple[Camera, ...]]()
+        for record in records["cameras"]:
+            camera = _camera(path, record, size or records["resolution"], stretched=records["stretched"])
+            frames_of_camera = _motion(path, record, records["times"], notes)
+            cameras.append(
+                tuple(replace(camera, world_from_camera=frame @ OPENCV_FROM_OPENGL) for frame in frames_of_camera)
+            )
+        first = cameras[0][0]
+        cameras = [track for track in cameras if (track[0].width, track[0].height) == (first.width, first.height)]
         if len(cameras) < len(records["cameras"]):
             notes.append("not imported: cameras whose images have another size than those of the first one")
+        notes.extend(_unread_motion(records))
         reach = 10.0
         data |= {
             "region": {"min": [-reach, -reach, 0.0], "max": [reach, reach, reach]},
@@ -117,10 +130,12 @@ def read_stage_scene(path: Path, folder: Path, overrides: Mapping[str, Any] | No
                 "world_from_camera": first.world_from_camera.tolist(),
                 "intrinsics": {"fx": first.fx, "fy": first.fy, "cx": first.cx, "cy": first.cy},
             },
-            "output": {"width": first.width, "height": first.height, "layouts": len(cameras), "views": 1},
+            "output": {"width": first.width, "height": first.height, "layouts": len(cameras) * len(poses), "views": 1},
         }
         write_text(folder / "scene.yaml", json.dumps(data, indent=1))  # YAML includes JSON
-    return StageScene(load_scene(folder / "scene.yaml", overrides=overrides), poses, cameras, tuple(notes))
+    return StageScene(
+        load_scene(folder / "scene.yaml", overrides=overrides), tuple(poses), tuple(cameras), tuple(notes)
+    )
 
 
 def _object(
@@ -130,8 +145,8 @@ def _object(
     fields: Sequence[Record],
     frames: dict[str | None, Float64Array],
     notes: list[str],
-) -> tuple[Asset, Float64Array]:
-    """Return the asset and the pose of a body, or of a labelled particle field without one."""
+) -> Asset:
+    """Return the asset of a body, or of a labelled particle field without one."""
     body = fields[0]["body"]
     frame = rigid_frame(path, fields[0])[0] if body is None else frames[body]
     splats, found = merge_fields(path, fields, np.asarray(np.linalg.inv(frame), dtype=np.float64))
@@ -143,7 +158,38 @@ def _object(
         notes.append(f"{group} has no colliders; the convex hull of its splats casts its shadows")
     if any(field["label"] != fields[0]["label"] for field in fields):
         notes.append(f"not imported: the classes of {group} except {fields[0]['label']}")
-    return replace(asset, class_name=fields[0]["label"] or asset.class_name), frame
+    return replace(asset, class_name=fields[0]["label"] or asset.class_name)
+
+
+def _motion(path: Path, record: Record, times: Sequence[float], notes: list[str]) -> list[Float64Array]:
+    """Return the rigid frame of a record at each time code."""
+    if "motion" not in record:
+        return [rigid_frame(path, record)[0]] * len(times)
+    frames, scales = list[Float64Array](), list[float]()
+    for time, matrix in zip(times, record["motion"], strict=True):
+        frame, scale = rigid_frame(path, {"path": f"{record['path']} at time code {time:g}", "matrix": matrix})
+        frames.append(frame)
+        scales.append(scale)
+    if not np.allclose(scales, scales[0], rtol=_STILL, atol=0):
+        notes.append(f"not imported: the change of the scale of {record['path']}; it has that of the first time code")
+    return frames
+
+
+def _unread_motion(records: Record) -> Iterator[str]:
+    """Yield a note for each prim that moves in the world or relative to its body, and that this module keeps in place.
+
+    Labelled particle fields without a body are objects. Meshes of bodies are not rendered.
+    """
+    bodies = {body["path"]: body for body in records["bodies"]}
+    for kind in ("fields", "meshes", "lights"):
+        for record in records[kind]:
+            if "motion" not in record or (kind == "fields" and record["body"] is None and record["label"]):
+                continue
+            body = bodies.get(record["body"], {}) if kind != "lights" else {}
+            relative = np.linalg.inv(body.get("motion", body.get("matrix", np.eye(4)))) @ record["motion"]
+            if not np.allclose(relative, relative[0], rtol=0, atol=_STILL):
+                place = "" if not body else f" relative to {record['body']}"
+                yield f"not imported: the motion of {record['path']}{place}; it stays as at the first time code"
 
 
 def _hull(path: Path, name: str, splats: Splats) -> trimesh.Trimesh:

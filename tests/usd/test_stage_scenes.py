@@ -23,6 +23,34 @@ from pxr import Gf, Usd, UsdGeom, UsdLux, UsdPhysics, UsdRender, UsdSemantics, U
 RADIUS = 0.04
 
 
+def add_ball(stage: Usd.Stage, path: str, label: str, rng: np.random.Generator) -> UsdVol.ParticleField3DGaussianSplat:
+    """Add a ball of splats with a class."""
+    points = rng.normal(size=(400, 3))
+    points *= RADIUS / np.linalg.norm(points, axis=1, keepdims=True)
+    field = UsdVol.ParticleField3DGaussianSplat.Define(stage, path)
+    field.CreatePositionsAttr(Vt.Vec3fArray(points.tolist()))
+    field.CreateScalesAttr([(0.004, 0.004, 0.004)] * 400)
+    field.CreateOpacitiesAttr([0.95] * 400)
+    field.CreateRadianceSphericalHarmonicsDegreeAttr(0)
+    field.CreateRadianceSphericalHarmonicsCoefficientsAttr([tuple(rng.normal(0, 1, 3).tolist())] * 400)
+    UsdSemantics.LabelsAPI.Apply(field.GetPrim(), "class").CreateLabelsAttr([label])
+    return field
+
+
+def add_camera(stage: Usd.Stage) -> UsdGeom.Camera:
+    """Add a camera whose focal length is the width of its image."""
+    camera = UsdGeom.Camera.Define(stage, "/World/camera")
+    camera.CreateFocalLengthAttr(24.0)
+    camera.CreateHorizontalApertureAttr(24.0)
+    camera.CreateVerticalApertureAttr(18.0)
+    return camera
+
+
+def looking_down(x: float) -> Gf.Matrix4d:
+    """Return the pose of a camera that looks down from (x, 0, 0.8), with y up in the image."""
+    return Gf.Matrix4d().SetLookAt(Gf.Vec3d(x, 0, 0.8), Gf.Vec3d(x, 0, 0), Gf.Vec3d(0, 1, 0)).GetInverse()
+
+
 def write_balls(path: Path) -> list[tuple[float, float, float]]:
     """Write five balls of splats on a table, with usd-core alone; return their centres."""
     stage, rng = new_stage(path), np.random.default_rng(0)
@@ -33,23 +61,10 @@ def write_balls(path: Path) -> list[tuple[float, float, float]]:
     table.CreateDisplayColorAttr([(0.3, 0.2, 0.1)])
     centres = [(0.15 * np.cos(turn), 0.15 * np.sin(turn), RADIUS) for turn in np.arange(5) * 0.4 * np.pi]
     for number, centre in enumerate(centres):
-        points = rng.normal(size=(400, 3))
-        points *= RADIUS / np.linalg.norm(points, axis=1, keepdims=True)
-        field = UsdVol.ParticleField3DGaussianSplat.Define(stage, f"/World/ball_{number}")
-        field.CreatePositionsAttr(Vt.Vec3fArray(points.tolist()))
-        field.CreateScalesAttr([(0.004, 0.004, 0.004)] * 400)
-        field.CreateOpacitiesAttr([0.95] * 400)
-        field.CreateRadianceSphericalHarmonicsDegreeAttr(0)
-        field.CreateRadianceSphericalHarmonicsCoefficientsAttr([tuple(rng.normal(0, 1, 3).tolist())] * 400)
+        field = add_ball(stage, f"/World/ball_{number}", "even" if number % 2 == 0 else "odd", rng)
         UsdGeom.Xformable(field).AddTranslateOp().Set(centre)
-        labels = UsdSemantics.LabelsAPI.Apply(field.GetPrim(), "class")
-        labels.CreateLabelsAttr(["even" if number % 2 == 0 else "odd"])
-    camera = UsdGeom.Camera.Define(stage, "/World/camera")
-    view = Gf.Matrix4d().SetLookAt(Gf.Vec3d(0, 0, 0.8), Gf.Vec3d(0, 0, 0), Gf.Vec3d(0, 1, 0))
-    camera.AddTransformOp().Set(view.GetInverse())
-    camera.CreateFocalLengthAttr(24.0)
-    camera.CreateHorizontalApertureAttr(24.0)
-    camera.CreateVerticalApertureAttr(18.0)
+    camera = add_camera(stage)
+    camera.AddTransformOp().Set(looking_down(0.0))
     light = UsdLux.RectLight.Define(stage, "/World/light")
     light.CreateIntensityAttr(20.0)
     light.AddTranslateOp().Set((0, 0, 1.5))
@@ -84,16 +99,83 @@ def test_a_stage_of_usd_core_renders_with_labels_that_pass_the_audit(
     np.testing.assert_allclose(middles, expected, atol=1.5)
 
 
+def write_moving_balls(path: Path) -> None:
+    """Write two balls, of which one moves under a moving camera, and time samples that are not read."""
+    stage, rng = new_stage(path), np.random.default_rng(0)
+    for name in ("still", "moving"):
+        UsdPhysics.RigidBodyAPI.Apply(UsdGeom.Xform.Define(stage, f"/World/{name}").GetPrim())
+        add_ball(stage, f"/World/{name}/splats", name, rng)
+    UsdGeom.Xformable(stage.GetPrimAtPath("/World/still")).AddTranslateOp().Set((0.0, 0.15, RADIUS))
+    moving = UsdGeom.Xformable(stage.GetPrimAtPath("/World/moving"))
+    place, turn, size = moving.AddTranslateOp(), moving.AddRotateZOp(), moving.AddScaleOp()
+    camera = add_camera(stage)
+    view = camera.AddTransformOp()
+    light = UsdLux.RectLight.Define(stage, "/World/light")
+    height = light.AddTranslateOp()
+    for time, x in ((2.0, -0.1), (6.0, 0.1)):
+        place.Set((x, 0.0, RADIUS), time)
+        turn.Set(450 * x, time)
+        size.Set((1 + 0.01 * time,) * 3, time)
+        view.Set(looking_down(x / 2), time)
+        light.CreateIntensityAttr().Set(time, time)
+        height.Set((0, 0, time), time)
+        UsdGeom.Imageable(stage.GetPrimAtPath("/World/still")).CreateVisibilityAttr().Set("inherited", time)
+    stage.SetStartTimeCode(2)
+    stage.SetEndTimeCode(6)
+    stage.SetTimeCodesPerSecond(48)
+    stage.SetFramesPerSecond(24)
+    stage.Save()
+
+
+def test_time_samples_of_poses_become_a_sequence_with_stable_ids(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_moving_balls(tmp_path / "balls.usda")
+    assert run("render", tmp_path / "balls.usda", "-o", tmp_path / "out", "--size", "80x60", "--format", "bop") == 0
+    printed = capsys.readouterr().out
+    assert "not imported: 1 sets of time samples of visibility (/World/still)" in printed
+    assert "not imported: 1 sets of time samples of inputs:intensity (/World/light)" in printed
+    assert "not imported: the motion of /World/light; it stays as at the first time code" in printed
+    assert "not imported: the change of the scale of /World/moving" in printed
+    assert "(3 images of 3 time codes)" in printed
+    assert run("audit", tmp_path / "out") == 0
+    records = [json.loads(line) for line in (tmp_path / "out/manifest.jsonl").read_text().splitlines()]
+    # Time codes 2, 4 and 6; a focal length of 80 px, and centres of balls 0.76 m below the camera.
+    for record, x in zip(records, (-0.1, 0.0, 0.1), strict=True):
+        found = {one["class"]: one for one in record["labels"]["instances"]}
+        assert {name: one["id"] for name, one in found.items()} == {"still": 1, "moving": 2}
+        for name, place in (("still", (0.0, 0.15)), ("moving", (x, 0.0))):
+            box = np.array(found[name]["box"])
+            expected = 40 + 80 * (place[0] - x / 2) / 0.76, 30 - 80 * place[1] / 0.76
+            np.testing.assert_allclose(0.5 * (box[:2] + box[2:]), expected, atol=1.0)
+        pose = np.array(found["moving"]["world_from_object"])
+        turned = np.radians(450 * x)
+        np.testing.assert_allclose(pose[:3, 3], (x, 0, RADIUS), atol=1e-6)
+        np.testing.assert_allclose(pose[:2, 0], (np.cos(turned), np.sin(turned)), atol=1e-6)
+
+
+def test_frames_limits_the_time_codes_of_a_stage(tmp_path: Path) -> None:
+    write_moving_balls(tmp_path / "balls.usda")
+    found = read_stage_scene(tmp_path / "balls.usda", tmp_path / "scene", images=2)
+    assert (len(found.poses), len(found.cameras), len(found.cameras[0])) == (2, 1, 2)
+    stage = Usd.Stage.Open(str(tmp_path / "balls.usda"))
+    stage.SetEndTimeCode(1e6)
+    stage.Save()
+    with pytest.raises(InputError, match=r"at most 10000 time codes \(got 500000\): limit them with --frames"):
+        read_stage_scene(tmp_path / "balls.usda", tmp_path / "again")
+
+
 def test_an_exported_frame_is_read_as_the_same_scene(folder: Path, tmp_path: Path) -> None:  # noqa: F811
     scene = load_scene(folder / "scene.yaml")
     layout = settle_layout(scene, 1)
     plan = plan_frame(scene, INDEX, layout)
     found = read_stage_scene(folder / "frame.usda", tmp_path)
     assert found.scene.class_names == ("bolt",)
-    poses = [pose for number in sorted(found.poses, key=int) for pose in found.poses[number]]
+    (at_rest,) = found.poses
+    poses = [pose for number in sorted(at_rest, key=int) for pose in at_rest[number]]
     for pose, one in zip(poses, layout.instances, strict=True):
         np.testing.assert_allclose(pose, one.world_from_object, atol=1e-6)
-    (camera,) = found.cameras
+    ((camera,),) = found.cameras
     for name in ("fx", "fy", "cx", "cy", "width", "height"):
         assert getattr(camera, name) == pytest.approx(getattr(plan.camera, name), rel=1e-5)
     np.testing.assert_allclose(camera.world_from_camera, plan.camera.world_from_camera, atol=1e-6)

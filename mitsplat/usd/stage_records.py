@@ -38,6 +38,7 @@ _MEMORY_PER_BYTE = 60
 """Permitted memory of the reader per byte of the stage's folder; text is longer than the arrays that it states."""
 _SECONDS = 600
 _MAX_SIZE = 8 << 30
+_MAX_IMAGE_SIZE = 1 << 28
 _ROUND_SEGMENTS = 64
 
 
@@ -110,6 +111,7 @@ class _StageReader:
         from pxr import Usd, UsdGeom, UsdPhysics  # optional, and slow to import
 
         self._stage, self._times = stage, time_codes(stage, images)
+        self._folder = Path(stage.GetRootLayer().realPath).parent
         self._time = Usd.TimeCode(self._times[0])
         units = UsdGeom.GetStageMetersPerUnit(stage)
         if not 0 < units < np.inf:
@@ -396,14 +398,38 @@ class _StageReader:
         return self._base(prim) | values | {"units": self._units}
 
     def _light(self, prim: Usd.Prim) -> Record:
-        """Return the record of a light with the inputs that UsdLux defines for its type."""
+        """Return the record of a light with the inputs that UsdLux defines for its type, and the bytes of its image."""
+        from pxr import UsdGeom  # optional
+
         inputs = {
             attribute.GetName().removeprefix("inputs:"): _plain(attribute.Get(self._time))
             for attribute in prim.GetAttributes()
             if attribute.GetName().startswith("inputs:")
         }
-        treated = bool(self._value(prim, "treatAsPoint"))
-        return self._base(prim) | {"type": str(prim.GetTypeName()), "inputs": inputs, "point": treated}
+        record = self._base(prim) | {"type": str(prim.GetTypeName()), "inputs": inputs}
+        record["point"] = bool(self._value(prim, "treatAsPoint"))
+        if inputs.get("texture:file"):
+            record["image"] = self._file(prim, "inputs:texture:file")
+            pole = self._value(prim, "poleAxis") or "Y"
+            record["pole"] = UsdGeom.GetStageUpAxis(self._stage) if pole == "scene" else pole
+        return record
+
+    def _file(self, prim: Usd.Prim, name: str) -> npt.NDArray[np.uint8] | None:
+        """Return the content of a file that an attribute names, in the folder of the stage or in its package."""
+        from pxr import Ar  # optional
+
+        found = self._value(prim, name).resolvedPath
+        file = Path(Ar.SplitPackageRelativePathOuter(found)[0])
+        if not found or not file.resolve().is_relative_to(self._folder.resolve()):
+            self._ignored["images that are missing or outside of the stage's folder"].append(str(prim.GetPath()))
+            return None
+        content = Ar.GetResolver().OpenAsset(Ar.ResolvedPath(found))
+        if not content or content.GetSize() > _MAX_IMAGE_SIZE:
+            self._ignored[f"images that cannot be opened or have more than {_MAX_IMAGE_SIZE} bytes"].append(
+                str(prim.GetPath())
+            )
+            return None
+        return np.frombuffer(bytes(content.GetBuffer()), dtype=np.uint8)
 
 
 def _mesh_triangles(mesh: UsdGeom.Mesh, time: Usd.TimeCode) -> tuple[Float64Array, npt.NDArray[np.int64]] | None:

@@ -18,13 +18,15 @@ import numpy as np
 import trimesh
 from scipy.spatial import QhullError
 
-from mitsplat.arrays import Float64Array
+from mitsplat.arrays import Float32Array, Float64Array
 from mitsplat.asset import Asset, opaque_core
+from mitsplat.capture.lighting.panorama import HDR_SUFFIXES, read_radiance, rotated, write_exr
 from mitsplat.errors import InputError
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.camera import Camera
-from mitsplat.geometry.rigid import OPENCV_FROM_OPENGL
-from mitsplat.images.colour import encode_srgb, temperature_colour
+from mitsplat.geometry.rigid import OPENCV_FROM_OPENGL, Z_UP_FROM_Y_UP
+from mitsplat.images.colour import decode_srgb, encode_srgb, temperature_colour
+from mitsplat.images.picture_files import read_picture
 from mitsplat.scene.loading.scene_loading import load_scene
 from mitsplat.scene.scene import Scene
 from mitsplat.storage.content_hash import ContentHash
@@ -36,6 +38,8 @@ _WIDTH = 1280
 """Image width of a stage without render settings [px]."""
 _DISTANCE = 100.0
 """Distance at which a distant light is placed [m]."""
+_PICTURES = (".png", ".jpg", ".jpeg", ".bmp")
+"""Suffixes of images of the sky whose values are encoded for display."""
 _STILL = 1e-6
 """Tolerated change of scales and of matrices of prims that do not move."""
 
@@ -109,7 +113,13 @@ def read_stage_scene(
         if surroundings:
             _environment(path, records, surroundings, notes).save(folder / "assets" / "environment")
             data["environment"] = "assets/environment"
-        data["lights"] = [light for record in records["lights"] for light in _lights(path, record, notes)]
+        data["lights"] = []
+        for record in records["lights"]:
+            for light in _lights(path, record, folder, notes):
+                if light["kind"] == "environment" and any(one["kind"] == "environment" for one in data["lights"]):
+                    notes.append(f"not imported: the light {record['path']}, because a scene has one light of the sky")
+                else:
+                    data["lights"].append(light)
         cameras = list[tuple[Camera, ...]]()
         for record in records["cameras"]:
             camera = _camera(path, record, size or records["resolution"], stretched=records["stretched"])
@@ -251,8 +261,11 @@ def _camera(path: Path, record: Record, size: Sequence[int] | None, *, stretched
     )
 
 
-def _lights(path: Path, record: Record, notes: list[str]) -> list[dict[str, Any]]:
-    """Return the entry of a light in the scene file; none, with a note, for lights that it does not have."""
+def _lights(path: Path, record: Record, folder: Path, notes: list[str]) -> list[dict[str, Any]]:
+    """Return the entry of a light in the scene file; none, with a note, for lights that it does not have.
+
+    The image of a light is written into the folder.
+    """
     inputs, kind = record["inputs"], record["type"]
     frame, scale = rigid_frame(path, record)
     position, normal = frame[:3, 3], -frame[:3, 2]
@@ -268,9 +281,13 @@ def _lights(path: Path, record: Record, notes: list[str]) -> list[dict[str, Any]
     is_normalised = bool(inputs.get("normalize"))
     place = {"position": position.tolist(), "target": (position + normal).tolist()}
     if kind.startswith("DomeLight"):
-        if inputs.get("texture:file"):
-            notes.append(f"not imported: the image of {record['path']}, which gives uniform light")
-        return [{"kind": "environment", "radiance": strength, **entry}]
+        image = _sky(path, record, folder, notes) if inputs.get("texture:file") else None
+        if image is None:
+            return [{"kind": "environment", "radiance": strength, **entry}]
+        radiance, turn = image
+        file = f"sky{len(list(folder.glob('sky*.exr')))}.exr"
+        write_exr(folder / file, radiance * np.asarray(entry["colour"], dtype=np.float32))
+        return [{"kind": "environment", "radiance": strength, "image": file, "rotate_z": turn}]
     if kind in ("RectLight", "DiskLight"):
         sides = np.array([inputs.get("width", 1.0), inputs.get("height", 1.0)])
         if kind == "DiskLight":
@@ -293,3 +310,37 @@ def _lights(path: Path, record: Record, notes: list[str]) -> list[dict[str, Any]
         return [{"kind": "area", **sun, **entry}]
     notes.append(f"not imported: the light {record['path']} of type {kind}")
     return []
+
+
+def _sky(path: Path, record: Record, folder: Path, notes: list[str]) -> tuple[Float32Array, float] | None:
+    """Return the image of a dome light with its zenith up, and its rotation about the vertical [degrees].
+
+    The upper border of the image is the pole, +y or +z of the prim. With the pole +y, the middle of the image is +z and
+    +x is left of it, as OpenEXR defines. The pole +z adds a rotation by 90 degrees about x.
+    """
+    name, format = record["inputs"]["texture:file"], record["inputs"].get("texture:format", "automatic")
+    suffix, place = Path(name).suffix.lower(), f"the image {name} of {record['path']}"
+    if record["image"] is None or format not in ("automatic", "latlong") or suffix not in (*HDR_SUFFIXES, *_PICTURES):
+        notes.append(f"not imported: {place} (format {format}); the light is uniform")
+        return None
+    file = folder / f"image{suffix}"
+    file.write_bytes(record["image"].tobytes())
+    try:
+        radiance = read_radiance(file) if suffix in HDR_SUFFIXES else _read_display_encoded(file)
+    except InputError as error:
+        raise InputError(f"{path}: {place}: {error}") from None
+    if format == "automatic" and radiance.shape[1] != 2 * radiance.shape[0]:
+        notes.append(f"not imported: {place}, which is not twice as wide as high; the light is uniform")
+        return None
+    pose, _ = rigid_frame(path, record)
+    turn = pose[:3, :3] @ (np.eye(3) if record["pole"] == "Z" else Z_UP_FROM_Y_UP[:3, :3].T)
+    if turn[2, 2] > 1 - 1e-9:
+        return radiance, float(np.degrees(np.arctan2(turn[1, 0], turn[0, 0])))
+    return rotated(radiance, turn), 0.0
+
+
+def _read_display_encoded(file: Path) -> Float32Array:
+    picture = read_picture(file)
+    if picture is None:
+        raise InputError(f"{file}: not a readable image")
+    return decode_srgb(picture[..., ::-1] / 255).astype(np.float32)

@@ -5,11 +5,19 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
+from PIL import Image
+from scipy.spatial.transform import Rotation
 
+from mitsplat.capture.lighting.panorama import write_exr
 from mitsplat.errors import InputError
+from mitsplat.geometry.rigid import Z_UP_FROM_Y_UP
 from mitsplat.physics.settle import settle_layout
+from mitsplat.renderer.scene_emitters import emitter_dict
+from mitsplat.runtime.variant import ensure_variant
 from mitsplat.scene.loading.scene_loading import load_scene
 from mitsplat.scene.planning.frame_plan import plan_frame
 from mitsplat.usd.stage_scene import read_stage_scene
@@ -163,6 +171,78 @@ def test_frames_limits_the_time_codes_of_a_stage(tmp_path: Path) -> None:
     stage.Save()
     with pytest.raises(InputError, match=r"at most 10000 time codes \(got 500000\): limit them with --frames"):
         read_stage_scene(tmp_path / "balls.usda", tmp_path / "again")
+
+
+@pytest.mark.parametrize(
+    ("up", "pole", "suffix", "turns"),
+    [
+        ("Y", "", ".exr", (20.0, -50.0, 70.0)),
+        ("Z", "", ".exr", (0.0, 0.0, 0.0)),
+        ("Z", "", ".exr", (90.0, 0.0, 70.0)),
+        ("Z", "scene", ".png", (0.0, 0.0, 70.0)),
+        ("Y", "Z", ".png", (20.0, -50.0, 70.0)),
+    ],
+)
+def test_an_image_of_the_sky_has_the_orientation_that_usdlux_defines(
+    tmp_path: Path, up: str, pole: str, suffix: str, turns: tuple[float, float, float]
+) -> None:
+    ensure_variant()
+    path = tmp_path / "balls.usda"
+    write_balls(path)
+    image = np.zeros((32, 64, 3), dtype=np.float32)
+    image[:16, :32] = 1.0  # directions with y > 0 (the pole) and x > 0 (left of the middle, +z)
+    if suffix == ".exr":
+        write_exr(tmp_path / "sky.exr", image)
+    else:
+        Image.fromarray((255 * image).astype(np.uint8)).save(tmp_path / "sky.png")
+    stage = Usd.Stage.Open(str(path))
+    UsdGeom.SetStageUpAxis(stage, up)
+    stage.RemovePrim("/World/dome")
+    dome = (UsdLux.DomeLight_1 if pole else UsdLux.DomeLight).Define(stage, "/World/dome")
+    dome.CreateTextureFileAttr(f"./sky{suffix}")
+    dome.CreateColorAttr((1.0, 0.5, 0.0))
+    dome.CreateIntensityAttr(3.0)
+    UsdGeom.Xformable(dome).AddRotateXYZOp().Set(turns)
+    if pole:
+        dome.CreatePoleAxisAttr(pole)
+    stage.Save()
+    found = read_stage_scene(path, tmp_path / "scene")
+    assert not [note for note in found.notes if "image" in note]
+    (light,) = (light for light in found.scene.spec.lights if light.kind == "environment")
+    emitter = mi.load_dict(emitter_dict(light, tmp_path / "scene"))
+    towards = np.random.default_rng(0).normal(size=(3, 2000))
+    towards /= np.linalg.norm(towards, axis=0)
+    ray = dr.zeros(mi.SurfaceInteraction3f, 2000)
+    ray.wi = -mi.Vector3f(towards)
+    radiance = np.array(emitter.eval(ray))
+    world_from_stage = Z_UP_FROM_Y_UP[:3, :3] if up == "Y" else np.eye(3)
+    rotation = world_from_stage @ Rotation.from_euler("xyz", turns, degrees=True).as_matrix()
+    is_up = pole == "Z" or (pole == "scene" and up == "Z")
+    x, y, _ = (rotation @ (Z_UP_FROM_Y_UP[:3, :3] if is_up else np.eye(3))).T @ towards
+    clear = (np.abs(x) > 0.2) & (np.abs(y) > 0.2)  # farther than a pixel from a border
+    expected = np.outer((3.0, 1.5, 0.0), (x > 0) & (y > 0))
+    np.testing.assert_allclose(radiance[:, clear], expected[:, clear], atol=1e-3)
+
+
+def test_images_of_the_sky_that_are_not_read_are_named(tmp_path: Path) -> None:
+    write_balls(tmp_path / "in/balls.usda")
+    (tmp_path / "sky.exr").write_bytes(b"outside")
+    (tmp_path / "in/broken.exr").write_bytes(b"broken")
+    stage = Usd.Stage.Open(str(tmp_path / "in/balls.usda"))
+    dome = UsdLux.DomeLight.Get(stage, "/World/dome")
+    for name, note in (
+        ("../sky.exr", "not imported: 1 images that are missing or outside of the stage's folder (/World/dome)"),
+        ("./none.exr", "not imported: 1 images that are missing or outside of the stage's folder (/World/dome)"),
+    ):
+        dome.CreateTextureFileAttr(name)
+        stage.Save()
+        notes = read_stage_scene(tmp_path / "in/balls.usda", tmp_path / "scene").notes
+        assert note in notes
+        assert f"not imported: the image {name} of /World/dome (format automatic); the light is uniform" in notes
+    dome.CreateTextureFileAttr("./broken.exr")
+    stage.Save()
+    with pytest.raises(InputError, match=r"balls\.usda: the image \./broken\.exr of /World/dome: .* not a readable"):
+        read_stage_scene(tmp_path / "in/balls.usda", tmp_path / "scene")
 
 
 def test_an_exported_frame_is_read_as_the_same_scene(folder: Path, tmp_path: Path) -> None:  # noqa: F811

@@ -59,6 +59,17 @@ def resized(radiance: Float32Array, height: int, width: int) -> Float32Array:
     return np.asarray(cv2.resize(radiance, (width, height), interpolation=cv2.INTER_AREA), dtype=np.float32)
 
 
+def rotated(panorama: Float32Array, rotation: Float64Array) -> Float32Array:
+    """Return a panorama whose directions are turned by a rotation (3, 3), with bilinear interpolation."""
+    height, width = panorama.shape[:2]
+    x, y, z = np.moveaxis(directions(height, width) @ rotation, -1, 0)  # directions before the rotation
+    column = (np.pi / 2 - np.arctan2(y, x)) % (2 * np.pi) * (width / (2 * np.pi)) - 0.5
+    row = np.arctan2(np.hypot(x, y), z) * (height / np.pi) - 0.5
+    wide = np.concatenate([panorama[:, -1:], panorama, panorama[:, :1]], axis=1)
+    places = (column + 1).astype(np.float32), row.astype(np.float32)
+    return np.asarray(cv2.remap(wide, *places, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), dtype=np.float32)
+
+
 def unit_vector(azimuth: float, elevation: float) -> Float64Array:
     """Return the direction of an azimuth and an elevation [degrees]."""
     turn, rise = np.radians([azimuth, elevation])

@@ -8,6 +8,7 @@ import pytest
 import shapely
 import trimesh
 
+from mitsplat.asset import Asset
 from mitsplat.geometry import decomposition
 from mitsplat.geometry.decomposition import convex_pieces, denoise_solid, max_gap
 from mitsplat.geometry.mesh import simplify_solid
@@ -122,6 +123,17 @@ def test_a_ragged_mesh_is_split_into_few_pieces(caplog):
 @pytest.mark.parametrize("name", ["hex_bolt", "proximity_sensor", "spur_gear"])
 def test_shipped_parts_do_not_count_as_ragged(name):
     assert decomposition._concave_edge_share(trimesh.load_mesh(PARTS / name / "mesh.ply")) < 0.15
+
+
+@pytest.mark.parametrize("name", ["bearing_6204", "bearing_6206", "washer"])
+def test_round_shipped_parts_rest_on_edge_as_their_mesh_does(name):
+    """The pieces are as wide as the mesh within 0.02 mm in every direction of the plane of the ring."""
+    asset = Asset.load(PARTS / name)
+    angle = np.radians(np.arange(0, 360, 0.5))
+    directions = np.stack([np.cos(angle), np.sin(angle), 0 * angle])
+    pieces = np.concatenate([piece.vertices for piece in asset.pieces])
+    deviation = (pieces @ directions).max(axis=0) - (asset.mesh.vertices @ directions).max(axis=0)
+    assert np.abs(deviation).max() < 2e-5
 
 
 def scanned_can(noise: float = 2e-5) -> trimesh.Trimesh:

@@ -319,7 +319,8 @@ def _bin_warnings(scene: Scene) -> Iterator[Finding]:
         for name in too_large:
             text = f"shapes[{number}]: {name!r} does not fit into {shape.name!r}"
             yield _fault("bin", text, "make the bin larger, or the object smaller by scale")
-        if too_large or not shape.collider or all(entry.poses for entry in scene.spec.objects):
+        # Beside a bin that some layouts lack, objects are meant to fall.
+        if too_large or not shape.collider or shape.share < 1 or all(entry.poses for entry in scene.spec.objects):
             continue
         centre, half = np.array(shape.bin.position[:2]), np.array(shape.bin.size[:2]) / 2
         shares = []

@@ -36,7 +36,7 @@ from mitsplat.scene.planning.conveyor import layout_at_view
 from mitsplat.scene.planning.frame_plan import FramePlan, layout_of, plan_frame
 from mitsplat.scene.planning.layout_surroundings import MaterialDraw, draw_surroundings
 from mitsplat.scene.planning.object_appearance import draw_appearances
-from mitsplat.scene.planning.shape_poses import shape_motion
+from mitsplat.scene.planning.shape_poses import placed_shapes
 from mitsplat.scene.scene import Scene
 from mitsplat.storage.files import library_errors, storage_errors, write_file
 
@@ -117,14 +117,14 @@ def _write_asset(asset: Asset, folder: Path, name: str) -> dict[str, str]:
 def _export_visible_shapes(scene: Scene, plan: FramePlan, folder: Path) -> dict[str, Any]:
     """Write the meshes and patterns of visible shapes; return their Mitsuba dictionaries."""
     surroundings, shapes = draw_surroundings(scene.spec, plan.index), {}
-    for number, (shape, mesh) in enumerate(zip(scene.spec.shapes, scene.shape_meshes, strict=True)):
-        if shape.visible:
+    for placed in placed_shapes(scene, plan.layout):
+        if (shape := placed.shape).visible:
+            name = f"shape_{placed.number}"
             drawn, belt = surroundings.material_of(shape), plan.belt
             image = texture_image(drawn, scene.images)
             travel = belt.travel if belt is not None and shape.box == belt.box else 0.0
-            motion = shape_motion(shape, mesh, scene.spec.seed, plan.layout)
-            made = finished_mesh(mesh, shape, drawn, image, travel=travel, motion=motion)
-            shapes[f"shape_{number}"] = _write_shape(made, drawn, image, folder, f"shape_{number}")
+            made = finished_mesh(placed.stated, shape, drawn, image, travel=travel, motion=placed.motion)
+            shapes[name] = _write_shape(made, drawn, image, folder, name)
     return shapes
 
 

@@ -101,13 +101,14 @@ class SceneBuilder:
             shapes["environment"] = self._reuse(
                 "environment", environment, lambda: make_asset_shape(environment, np.eye(4), 0)
             )
-        for number, (shape, placed, motion) in enumerate(placed_shapes(scene, layout)):
-            name, mesh = f"shape_{number}", scene.shape_meshes[number]
+        for placed in placed_shapes(scene, layout):
+            name, shape = f"shape_{placed.number}", placed.shape
             if shape.visible:
                 material = surroundings.material_of(shape)
-                shapes[name] = self._visible_shape(name, shape, mesh, material, belt, motion)
+                shapes[name] = self._visible_shape(name, shape, placed.stated, material, belt, placed.motion)
             elif shape.proxy:
-                shapes[name] = self._reuse(name, motion.tobytes(), partial(make_splats_shape, NO_SPLATS, proxy=placed))
+                make = partial(make_splats_shape, NO_SPLATS, proxy=placed.mesh)
+                shapes[name] = self._reuse(name, placed.motion.tobytes(), make)
         return shapes
 
     def _visible_shape(

@@ -26,7 +26,7 @@ from mitsplat.physics.worlds import Body, Collider, MujocoWorld, WarpWorld, Worl
 from mitsplat.progress import Note
 from mitsplat.scene.layout import NO_PHYSICS, Instance, Layout, LeftOut, RestCertificate, UnsettledLayoutError
 from mitsplat.scene.planning.contents import draw_objects, draw_regions
-from mitsplat.scene.planning.shape_poses import shape_motion
+from mitsplat.scene.planning.shape_poses import is_present, shape_motion
 from mitsplat.scene.scene import Scene
 from mitsplat.scene.spec.shape_spec import Shape
 from mitsplat.scene.splits import draw_environment
@@ -292,10 +292,10 @@ class Drop:
     def _ground_of(self, layout: int) -> int:
         """Return the key of a layout's ground; environments without collision share one ground.
 
-        If a collider is jittered, each layout has a ground of its own, and the last one is cached.
+        If colliders are drawn per layout, each layout has a ground of its own, and the last one is cached.
         """
         number = draw_environment(self.scene.spec, layout) if len(self._surroundings) > 1 else 0
-        if not any(shape.collider and shape.is_jittered for shape in self.scene.spec.shapes):
+        if not any(shape.collider and shape.is_drawn for shape in self.scene.spec.shapes):
             return number
         key = len(self._surroundings) + layout
         if key not in self._grounds:
@@ -351,13 +351,13 @@ class Drop:
     def _make_ground(self, surroundings: Asset | None, progress: Note, layout: int | None = None) -> _Ground:
         """Build the static scene from colliding shapes and, optionally, surroundings.
 
-        Jittered shapes have their places of a layout, or those of the scene file.
+        The shapes and their places are those of a layout, or all those of the scene file.
         """
         scene, walls = self.scene, []  # positions of the invisible enclosure walls
         colliders: list[Collider] = []
         obstacles: list[PlacedSurface] = []
         for shape, shape_mesh in zip(scene.spec.shapes, scene.shape_meshes, strict=True):
-            if not shape.collider:
+            if not shape.collider or (layout is not None and not is_present(shape, scene.spec.seed, layout)):
                 continue
             if not (shape.visible or shape.proxy):
                 walls.append(len(colliders))

@@ -132,16 +132,17 @@ def frame_content(scene: Scene, index: int, progress: Note = lambda text: None) 
 def _static_shapes(scene: Scene, plan: FramePlan, progress: Note) -> list[StaticShape]:
     """Return the shapes of the scene file without the walls of enclosures, at which no object rests."""
     surroundings, found = draw_surroundings(scene.spec, plan.index), []
-    for (shape, mesh, motion), stated in zip(placed_shapes(scene, plan.layout), scene.shape_meshes, strict=True):
+    for placed in placed_shapes(scene, plan.layout):
+        shape = placed.shape
         if shape.name.startswith(ENCLOSURE):
             continue
         collider = None
         if shape.collider:
-            collider = make_collider(shape, prepare_mesh(stated, f"shape {shape.name!r}"), progress)
+            collider = make_collider(shape, prepare_mesh(placed.stated, f"shape {shape.name!r}"), progress)
             if shape.is_jittered:
-                collider = collider.moved(motion)
+                collider = collider.moved(placed.motion)
         colour = _mean_colour(scene, shape, surroundings) if shape.visible else None
-        found.append(StaticShape(shape.name, mesh, collider, colour, shape.proxy))
+        found.append(StaticShape(shape.name, placed.mesh, collider, colour, shape.proxy))
     return found
 
 

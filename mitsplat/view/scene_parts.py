@@ -198,7 +198,8 @@ def scene_parts(
             yield ShownPart("/meshes/environment", ShownMesh(environment.mesh, _GREY, 0.6))
     if layout is not None:
         yield from _object_parts(scene, layout)
-    for shape, mesh, _ in placed_shapes(scene, number):
+    for placed in placed_shapes(scene, number):
+        shape, mesh = placed.shape, placed.mesh
         if shape.visible:
             red, green, blue = (round(255 * value) for value in shape.colour)
             yield ShownPart(f"/shapes/{shape.name}", ShownMesh(mesh, (red, green, blue)))

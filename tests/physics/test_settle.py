@@ -364,11 +364,26 @@ def test_objects_rest_on_the_jittered_shape(scene_data, write_scene):
     scene_data["settle"] = {"stepper": "mujoco"}
     scene_data["output"]["layouts"] = 100
     scene = load_scene(write_scene(scene_data))
-    bounds = ([mesh.bounds[:, :2] for _, mesh, _ in placed_shapes(scene, layout)][1] for layout in range(100))
+    bounds = ([placed.mesh.bounds[:, :2] for placed in placed_shapes(scene, layout)][1] for layout in range(100))
     below = next(layout for layout, (low, high) in enumerate(bounds) if (low < -0.08).all() and (high > 0.08).all())
     (one,) = settle_layout(scene, below, cached=False).instances
     heights = scene.assets[one.asset].mesh.vertices @ one.world_from_object[2, :3] + one.world_from_object[2, 3]
     assert heights.min() == pytest.approx(0.04, abs=5e-4)
+
+
+def test_objects_rest_on_a_shape_only_in_layouts_that_have_it(scene_data, write_scene):
+    step = {"size": [0.3, 0.3, 0.04], "position": [0, 0, 0.02]}
+    scene_data["shapes"].append({"name": "step", "box": step, "share": 0.5})
+    scene_data["objects"] = [{"asset": "assets/nut"}]
+    scene_data["region"] = {"min": [-0.03, -0.03, 0.06], "max": [0.03, 0.03, 0.13]}
+    scene_data["settle"] = {"stepper": "mujoco"}
+    scene_data["output"]["layouts"] = 20
+    scene = load_scene(write_scene(scene_data))
+    counts = [len(list(placed_shapes(scene, layout))) for layout in range(20)]
+    for layout, height in ((counts.index(1), 0.0), (counts.index(2), 0.04)):
+        (one,) = settle_layout(scene, layout, cached=False).instances
+        heights = scene.assets[one.asset].mesh.vertices @ one.world_from_object[2, :3] + one.world_from_object[2, 3]
+        assert heights.min() == pytest.approx(height, abs=5e-4)
 
 
 def test_standoff_of_a_hull_equals_its_closed_form():

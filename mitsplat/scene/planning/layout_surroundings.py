@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from mitsplat.scene.planning.shape_poses import draw_shift
+from mitsplat.scene.planning.shape_poses import draw_shift, is_present
 from mitsplat.scene.spec.material_spec import Background, ColourMaterial, ImageMaterial, Material
 from mitsplat.scene.spec.scene_spec import SceneSpec
 from mitsplat.scene.spec.shape_spec import Shape
@@ -84,6 +84,7 @@ class LayoutSurroundings:
         environment: Index among the environments of the scene; 0 if there are none.
         materials: Drawn materials, by the names of visible shapes. All walls of a backdrop share one entry.
         shifts: Displacement along x and y [m] and rotation [degrees] of jittered shapes, by their names.
+        absent: Names of the shapes that the layout does not have.
         background: Background image, if the scene has one.
     """
 
@@ -91,6 +92,7 @@ class LayoutSurroundings:
     materials: Mapping[str, MaterialDraw] = field(default_factory=dict)
     shifts: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
     background: BackgroundDraw | None = None
+    absent: tuple[str, ...] = ()
 
     def material_of(self, shape: Shape) -> MaterialDraw:
         """Return the drawn material of a shape, or its fixed colour."""
@@ -105,6 +107,8 @@ class LayoutSurroundings:
             values["materials"] = {name: drawn.to_json() for name, drawn in self.materials.items()}
         if self.shifts:
             values["shifts"] = {name: list(shift) for name, shift in self.shifts.items()}
+        if self.absent:
+            values["absent"] = list(self.absent)
         if self.background is not None:
             values["background"] = self.background.to_json()
         return values
@@ -113,11 +117,14 @@ class LayoutSurroundings:
 def draw_surroundings(spec: SceneSpec, index: int, layout: int | None = None) -> LayoutSurroundings:
     """Draw the surroundings of frame ``index``, or of the layout whose number is given."""
     layout = index // spec.output.views if layout is None else layout
-    choices = {material_name(shape.name): shape.materials for shape in spec.shapes if shape.materials}
+    present = [shape for shape in spec.shapes if is_present(shape, spec.seed, layout)]
+    names = {shape.name for shape in present}
+    absent = tuple(shape.name for shape in spec.shapes if shape.name not in names)
+    choices = {material_name(shape.name): shape.materials for shape in present if shape.materials}
     materials = {name: draw_material(among, spec.seed, name, layout) for name, among in choices.items()}
-    shifts = {shape.name: draw_shift(shape, spec.seed, layout) for shape in spec.shapes if shape.is_jittered}
+    shifts = {shape.name: draw_shift(shape, spec.seed, layout) for shape in present if shape.is_jittered}
     background = None if spec.background is None else draw_background(spec.background, spec.seed, index)
-    return LayoutSurroundings(draw_environment(spec, layout), materials, shifts, background)
+    return LayoutSurroundings(draw_environment(spec, layout), materials, shifts, background, absent)
 
 
 def draw_material(materials: Sequence[Material], seed: int, name: str, layout: int) -> MaterialDraw:

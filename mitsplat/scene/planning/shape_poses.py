@@ -1,8 +1,9 @@
-"""Places of jittered shapes, which the seed and the index of a layout determine."""
+"""Presence and places of shapes, which the seed and the index of a layout determine."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 import trimesh
@@ -12,6 +13,30 @@ from mitsplat.arrays import Float64Array
 from mitsplat.scene.scene import Scene
 from mitsplat.scene.spec.shape_spec import Shape
 from mitsplat.scene.streams import random_stream
+
+
+@dataclass(frozen=True, eq=False)
+class PlacedShape:
+    """Shape of a layout.
+
+    Attributes:
+        number: Position in the ``shapes`` of the scene file.
+        shape: The shape.
+        stated: Mesh at the place of the scene file, in world space [m].
+        mesh: Mesh at the place of the layout, in world space [m].
+        motion: Transform (4, 4) from the first place to the second.
+    """
+
+    number: int
+    shape: Shape
+    stated: trimesh.Trimesh
+    mesh: trimesh.Trimesh
+    motion: Float64Array
+
+
+def is_present(shape: Shape, seed: int, layout: int) -> bool:
+    """Return True if a layout has the shape."""
+    return shape.share == 1 or bool(random_stream(seed, f"share of shape {shape.name}", layout).random() < shape.share)
 
 
 def draw_shift(shape: Shape, seed: int, layout: int) -> tuple[float, float, float]:
@@ -31,12 +56,10 @@ def shape_motion(shape: Shape, mesh: trimesh.Trimesh, seed: int, layout: int) ->
     return motion
 
 
-def placed_shapes(scene: Scene, layout: int) -> Iterator[tuple[Shape, trimesh.Trimesh, Float64Array]]:
-    """Iterate over the shapes of a layout with their meshes in world space [m].
-
-    Yields:
-        Shape, its mesh, and the transform (4, 4) of :func:`shape_motion`.
-    """
-    for shape, mesh in zip(scene.spec.shapes, scene.shape_meshes, strict=True):
-        motion = shape_motion(shape, mesh, scene.spec.seed, layout)
-        yield shape, mesh.copy().apply_transform(motion) if shape.is_jittered else mesh, motion
+def placed_shapes(scene: Scene, layout: int) -> Iterator[PlacedShape]:
+    """Iterate over the shapes that a layout has."""
+    for number, (shape, stated) in enumerate(zip(scene.spec.shapes, scene.shape_meshes, strict=True)):
+        if is_present(shape, scene.spec.seed, layout):
+            motion = shape_motion(shape, stated, scene.spec.seed, layout)
+            mesh = stated.copy().apply_transform(motion) if shape.is_jittered else stated
+            yield PlacedShape(number, shape, stated, mesh, motion)

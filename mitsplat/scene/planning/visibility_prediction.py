@@ -116,7 +116,7 @@ class VisibilityPredictor:
         self._owner = np.repeat(np.arange(len(instances)), self._counts)
         self._spacing = _spacing(scene) * float(np.sqrt(step))
         self._radii = np.array([np.linalg.norm(mesh.extents) / 2 for mesh in meshes])
-        shapes = [mesh for shape, mesh, _ in placed_shapes(scene, layout.index) if shape.visible]
+        shapes = [placed.mesh for placed in placed_shapes(scene, layout.index) if placed.shape.visible]
         self._triangles = np.concatenate([np.zeros((0, 3, 3)), *(mesh.triangles for mesh in shapes)])
         here = scene.environment_of(layout.index)
         around = [] if here is None or here.mesh is None else [here.mesh]
@@ -231,9 +231,9 @@ def containing_solid(scene: Scene, layout: Layout, point: Float64Array) -> str:
 def enclosing_shape(scene: Scene, point: Float64Array, layout: int = 0) -> str:
     """Return the name of a visible shape that contains a point [m] and not the centre of the region, or empty."""
     middle = (np.array(scene.spec.region.min) + scene.spec.region.max) / 2
-    for shape, mesh, _ in placed_shapes(scene, layout):
-        if shape.visible and points_inside(mesh, np.stack([point, middle])).tolist() == [True, False]:
-            return shape.name
+    for placed in placed_shapes(scene, layout):
+        if placed.shape.visible and points_inside(placed.mesh, np.stack([point, middle])).tolist() == [True, False]:
+            return placed.shape.name
     return ""
 
 

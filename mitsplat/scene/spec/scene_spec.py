@@ -204,8 +204,9 @@ class SceneSpec(StrictModel):
             named, got = ", ".join(boxes) or "none", self.conveyor.belt
             raise FieldError(("conveyor", "belt"), f"must be the name of a box among the shapes, {named} (got {got})")
         for number, shape in enumerate(self.shapes):
-            if self.conveyor is not None and shape.name == self.conveyor.belt and shape.is_jittered:
-                raise FieldError(("shapes", number, "jitter"), "must not be given for the belt of a conveyor")
+            if self.conveyor is not None and shape.name == self.conveyor.belt and shape.is_drawn:
+                key = "jitter" if shape.is_jittered else "share"
+                raise FieldError(("shapes", number, key), "must not be given for the belt of a conveyor")
         environment_lights = [
             i for i, light in enumerate(self.lights) if isinstance(light, EnvironmentLight | RoomLight)
         ]

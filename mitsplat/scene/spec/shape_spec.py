@@ -49,6 +49,11 @@ class Shape(StrictModel):
         description="Materials of a visible shape, in place of ``colour``. Each layout draws one of them and a value "
         "from each of its ranges.",
     )
+    share: Unit = Field(
+        1.0,
+        exclude_if=lambda share: share == 1,
+        description="Probability that a layout has the shape. It is drawn for every layout and every shape.",
+    )
     jitter: NonNegativeFloat = Field(
         0.0,
         exclude_if=lambda distance: distance == 0,
@@ -97,6 +102,11 @@ class Shape(StrictModel):
     def is_jittered(self) -> bool:
         """True if the shape stands at another place in every layout."""
         return bool(self.jitter or self.rotation_jitter)
+
+    @property
+    def is_drawn(self) -> bool:
+        """True if layouts differ in the place or the presence of the shape."""
+        return self.is_jittered or self.share < 1
 
 
 class Conveyor(StrictModel):

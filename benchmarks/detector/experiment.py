@@ -59,6 +59,11 @@ def result_of(arm: str, seed: int, plan: Path = PLAN) -> str:
     return f"detector.experiment-{arm}-{seed}" + ("" if plan == PLAN else f"-plan_{plan.stem}")
 
 
+def base_of(plan: Mapping[str, Any], scene: str) -> Path:
+    """Return the scene file that a scene changes: ``scene`` of its first change, or that of the plan."""
+    return HERE / str(plan["changes"][scene.partition("+")[0]].get("scene", plan["scene"]))
+
+
 def state_of_scenes(plan: Mapping[str, Any], arm: str) -> str:
     """Return a hash of an arm's training scenes without its own change; only arms of equal scenes are compared.
 
@@ -67,15 +72,16 @@ def state_of_scenes(plan: Mapping[str, Any], arm: str) -> str:
     unchanged = [scene.partition("+")[0] for scene in scenes_of(plan["arms"][arm])]
     if not unchanged:
         return ""
+    bases = "".join(path.read_text() for path in dict.fromkeys(base_of(plan, scene) for scene in unchanged))
     said = [plan["changes"][scene] for scene in unchanged]
-    return hashlib.sha256(((HERE / plan["scene"]).read_text() + json.dumps(said)).encode()).hexdigest()[:16]
+    return hashlib.sha256((bases + json.dumps(said)).encode()).hexdigest()[:16]
 
 
 def write_scene(work: Path, name: str, plan: Path = PLAN) -> Path:
-    """Write the plan's scene with the changes in a name, by dotted key; null values are removed at the end."""
+    """Write a scene with the changes in its name, by dotted key; null values are removed at the end."""
     said = read_arms(plan)
-    scene = YAML(typ="safe").load((HERE / said["scene"]).read_text())
-    rows = [row for change in name.split("+") for row in said["changes"][change].items()]
+    scene = YAML(typ="safe").load(base_of(said, name).read_text())
+    rows = [row for change in name.split("+") for row in said["changes"][change].items() if row[0] != "scene"]
     # Later list entries are processed first, so that indices remain those of groceries.yaml.
     gone = sorted({row for row in rows if row[1] is None}, reverse=True)
     for key, value in [row for row in rows if row[1] is not None] + gone:

@@ -23,11 +23,11 @@ SIZE = (320, 200)
 
 GALLERY = (
     *("workcell.yaml", "bin_picking.yaml", "shelf.yaml", "conveyor.yaml", "stacks.yaml", "fisheye.yaml"),
-    *("close_up.yaml", "moving_light.yaml"),
+    *("close_up.yaml", "moving_light.yaml", "benches.yaml"),
 )
 """Scenes of the gallery, in its order; ``real.yaml``, whose assets are made first, and ``mirror_ball.xml`` follow."""
 
-SHEETS = ("workcell.yaml", "bin_picking.yaml", "shelf.yaml", "conveyor.yaml", "real.yaml")
+SHEETS = ("workcell.yaml", "benches.yaml", "bin_picking.yaml", "shelf.yaml", "conveyor.yaml", "real.yaml")
 """Scenes of which the gallery also shows up to twelve frames, or a sequence of them."""
 
 

@@ -27,7 +27,7 @@ GALLERY = (
 )
 """Scenes of the gallery, in its order; ``real.yaml``, whose assets are made first, and ``mirror_ball.xml`` follow."""
 
-SHEETS = ("workcell.yaml", "benches.yaml", "bin_picking.yaml", "shelf.yaml", "conveyor.yaml", "real.yaml")
+SHEETS = ("workcell.yaml", "benches.yaml", "bin_picking.yaml", "conveyor.yaml", "real.yaml")
 """Scenes of which the gallery also shows up to twelve frames, or a sequence of them."""
 
 

@@ -1,7 +1,8 @@
 """Reader of Gaussian splats in glTF (Khronos, ``KHR_gaussian_splatting`` and ``..._compression_spz_2``).
 
 Scales and opacities are activated values, quaternions are xyzw, and coefficients of spherical harmonics have the order
-and signs of 3DGS. SPZ data have axes right, up, back, and are converted to those of glTF: left, up, front.
+and signs of 3DGS. SPZ data have axes right, up, back, and are converted to those of glTF: left, up, front. Files of
+programs that omit this conversion are recognised by the bounds of their positions.
 """
 
 from __future__ import annotations
@@ -36,6 +37,10 @@ _READ_EXTENSIONS = {
     "KHR_node_visibility",
     "KHR_xmp_json_ld",
 }
+_SPZ_STEP = 2.0**-11
+"""Tolerance of the bounds of positions in SPZ data, two steps of positions with 12 fractional bits."""
+_MATERIALS = "KHR_materials_"
+"""Prefix of extensions of materials, which splats do not have; other programs require the one of unlit materials."""
 _THINNEST = 1e-6
 """Least scale of a Gaussian relative to its largest one. The standard permits 0."""
 
@@ -72,7 +77,8 @@ def _try_splats(output: BinaryIO, _: bytes, path: str) -> None:
 
 def _read(path: Path, *, warn: bool) -> Splats:
     data = GltfData(path)
-    if unknown := sorted(set(data.document.get("extensionsRequired", [])) - _READ_EXTENSIONS):
+    required = {name for name in data.document.get("extensionsRequired", []) if not name.startswith(_MATERIALS)}
+    if unknown := sorted(required - _READ_EXTENSIONS):
         raise InputError(f"it requires extensions that are not supported: export it without {', '.join(unknown)}")
     parts, cache, left_out = [], {}, set()
     for index, pose in world_poses(data).items():
@@ -108,7 +114,11 @@ def _read_primitive(data: GltfData, primitive: JsonObject, left_out: set[str]) -
     compressed = stored.get("extensions", {}).get(COMPRESSION)
     if compressed is not None:
         arrays, kernel = decode_spz(bytes(data.view(compressed["bufferView"])))
-        splats = Splats(**arrays._asdict(), kernel=kernel).transformed(GLTF_FROM_SPZ)
+        splats = Splats(**arrays._asdict(), kernel=kernel)
+        if _has_axes_of_gltf(data, primitive, splats.means):
+            left_out.add("the axes of SPZ, because the bounds of positions are those without a conversion")
+        else:
+            splats = splats.transformed(GLTF_FROM_SPZ)
         means, quats, scales = splats.means, splats.quats, splats.scales
         opacities, sh = splats.opacities, splats.sh
     else:
@@ -127,6 +137,22 @@ def _read_primitive(data: GltfData, primitive: JsonObject, left_out: set[str]) -
     visible = scales.max(axis=1, initial=0.0) > 0
     scales = np.maximum(scales, _THINNEST * scales.max(axis=1, keepdims=True, initial=0.0))
     return Splats(means[visible], quats[visible], scales[visible], opacities[visible], sh[visible], kernel=kernel)
+
+
+def _has_axes_of_gltf(data: GltfData, primitive: JsonObject, means: Float32Array) -> bool:
+    """Return True if the bounds of ``POSITION`` are those of SPZ data without a conversion, and only those."""
+    if "POSITION" not in primitive.get("attributes", {}) or not len(means):
+        return False
+    accessor = data.entry("accessors", primitive["attributes"]["POSITION"])
+    if "min" not in accessor or "max" not in accessor:
+        return False
+    stated = np.array([accessor["min"], accessor["max"]], dtype=np.float64)
+    tolerance = _SPZ_STEP + 1e-3 * np.abs(stated).max()
+
+    def fits(positions: Float32Array) -> bool:
+        return bool(np.abs([positions.min(axis=0), positions.max(axis=0)] - stated).max() <= tolerance)
+
+    return fits(means) and not fits(means @ GLTF_FROM_SPZ[:3, :3].astype(np.float32))
 
 
 def _spherical_harmonics(data: GltfData, primitive: JsonObject) -> Float32Array:

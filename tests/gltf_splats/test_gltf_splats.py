@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import struct
 from pathlib import Path
 from typing import Any
 
@@ -118,6 +119,32 @@ def test_a_compressed_file_is_read_within_the_steps_of_spz(tmp_path: Path) -> No
     # SPZ data have x right and z back; those of glTF are x left and z front.
     write_gltf_splats(splats, tmp_path / "b.glb", name="a")
     assert (tmp_path / "a.glb").stat().st_size < (tmp_path / "b.glb").stat().st_size / 2
+
+
+def test_axes_of_compressed_splats_follow_the_bounds_of_their_positions(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Some programs store the axes of glTF in SPZ data, and require an extension of materials."""
+    splats = random_splats()
+    write_gltf_splats(splats, tmp_path / "a.glb", name="a", spz=True)
+    content = (tmp_path / "a.glb").read_bytes()
+    (length,) = struct.unpack("<I", content[12:16])
+    document = json.loads(content[20 : 20 + length])
+    accessor = document["accessors"][0]
+    low, high = np.array(accessor["min"]), np.array(accessor["max"])
+    bounds = np.sort([low * (-1, 1, -1), high * (-1, 1, -1)], axis=0)  # without a turn by 180 degrees
+    accessor["min"], accessor["max"] = bounds.tolist()
+    document["extensionsRequired"].append("KHR_materials_unlit")
+    text = json.dumps(document).encode()
+    text += b" " * (-len(text) % 4)
+    rest = content[20 + length :]
+    header = struct.pack("<4sIIII", b"glTF", 2, 20 + len(text) + len(rest), len(text), 0x4E4F534A)
+    (tmp_path / "b.glb").write_bytes(header + text + rest)
+    found, turned = read_gltf_splats(tmp_path / "a.glb"), read_gltf_splats(tmp_path / "b.glb")
+    np.testing.assert_allclose(turned.means, found.means * (-1, -1, 1), atol=1e-7)
+    np.testing.assert_allclose(covariances(turned), covariances(found) * np.outer((-1, -1, 1), (-1, -1, 1)), atol=1e-7)
+    assert "b.glb: not read: the axes of SPZ" in caplog.text
+    assert "a.glb" not in caplog.text
 
 
 def test_files_that_cannot_be_read_are_refused_in_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,7 +1,8 @@
 """Time samples of a USD stage: its time codes, moving prims, and attributes that change.
 
 The images of a stage are one per time code from ``startTimeCode`` to ``endTimeCode``; if the stage states
-``framesPerSecond``, there are as many per second instead. A stage without these time codes has those of its samples.
+``framesPerSecond``, there are as many per second instead. They end at the last sample of a pose. A stage without these
+time codes has those of its samples.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ def time_codes(stage: Usd.Stage, limit: int | None = None) -> list[float]:
             found.update(UsdGeom.Xformable(prim).GetTimeSamples())
     first, last = min(found, default=0.0), max(found, default=0.0)
     if stage.HasAuthoredTimeCodeRange():
-        first, last = stage.GetStartTimeCode(), stage.GetEndTimeCode()
+        first, last = stage.GetStartTimeCode(), min(last, stage.GetEndTimeCode())
     step = 1.0
     if stage.HasAuthoredMetadata("framesPerSecond"):
         step = stage.GetTimeCodesPerSecond() / stage.GetFramesPerSecond()

@@ -11,7 +11,7 @@ from __future__ import annotations
 import io
 import json
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, cast
 
@@ -23,6 +23,7 @@ from mitsplat.errors import InputError
 from mitsplat.geometry.rigid import Z_UP_FROM_Y_UP
 from mitsplat.runtime.child_process import run_bounded
 from mitsplat.usd.stage_motion import is_moving, sampled_attributes, time_codes
+from mitsplat.usd.stage_physics import body_dynamics, contact_of, mass_of_colliders
 from mitsplat.usd.usd_layers import open_confined, require_usd
 
 if TYPE_CHECKING:
@@ -156,7 +157,8 @@ class _StageReader:
             *self._assumptions(),
             *(f"not imported: {error}" for error in self._stage.GetCompositionErrors()),
         ]
-        for what, paths in self._ignored.items():
+        for what, found_paths in self._ignored.items():
+            paths = list(dict.fromkeys(found_paths))
             found["notes"].append(f"not imported: {len(paths)} {what} ({paths[0]}{', ...' if paths[1:] else ''})")
         settings = UsdRender.Settings.GetStageRenderSettings(self._stage)
         found["resolution"] = list(settings.GetResolutionAttr().Get()) if settings else None
@@ -219,18 +221,22 @@ class _StageReader:
             taxonomies = UsdSemantics.LabelsAPI.GetDirectTaxonomies(prim)
             for taxonomy in sorted(taxonomies, key=lambda name: name != "class"):
                 if labels := UsdSemantics.LabelsAPI(prim, taxonomy).GetLabelsAttr().Get(self._time):
-                    return str(labels[0])
+                    return self._first_class(prim, map(str, labels))
             # Isaac Sim before 5.0: SemanticsAPI:NAME with pairs of type and data.
-            for attribute in prim.GetAttributes():
-                name = attribute.GetName()
-                if (
-                    name.startswith("semantic:")
-                    and name.endswith(":params:semanticType")
-                    and attribute.Get() == "class"
-                ):
-                    return str(prim.GetAttribute(name.removesuffix("Type") + "Data").Get())
+            names = [one.GetName() for one in prim.GetAttributes() if one.GetName().startswith("semantic:")]
+            kinds = [one for one in names if one.endswith(":params:semanticType") and self._value(prim, one) == "class"]
+            if kinds:
+                data = (self._value(prim, one.removesuffix("Type") + "Data") for one in kinds)
+                return self._first_class(prim, map(str, data))
             prim = prim.GetParent()
         return None
+
+    def _first_class(self, prim: Usd.Prim, classes: Iterable[str]) -> str:
+        """Return the first of the classes of a prim."""
+        first, *others = classes
+        if others:
+            self._ignored[f"sets of classes besides {first}"].append(str(prim.GetPath()))
+        return first
 
     def _value(self, prim: Usd.Prim, name: str) -> Any:
         attribute = prim.GetAttribute(name)
@@ -298,30 +304,13 @@ class _StageReader:
 
     def _body(self, prim: Usd.Prim) -> Record:
         """Return the record of a rigid body; mass, centre and inertia are None where the stage does not state them."""
-        from pxr import UsdPhysics  # optional
+        from pxr import Usd, UsdPhysics  # optional
 
-        mass = UsdPhysics.MassAPI(prim) if prim.HasAPI(UsdPhysics.MassAPI) else None
-
-        def stated(attribute: Any, valid: Any) -> Any:
-            value = attribute.Get(self._time) if attribute else None
-            return value if value is not None and valid(value) else None
-
-        record: Record = dict.fromkeys(("mass", "density", "centre", "inertia", "axes"))
-        if mass is not None:
-            record["mass"] = stated(mass.GetMassAttr(), lambda value: value > 0)
-            record["density"] = stated(mass.GetDensityAttr(), lambda value: value > 0)
-            centre = stated(mass.GetCenterOfMassAttr(), lambda value: np.isfinite(value).all())
-            inertia = stated(mass.GetDiagonalInertiaAttr(), lambda value: any(value))
-            axes = stated(mass.GetPrincipalAxesAttr(), lambda value: value.GetLength() > 0)
-            if record["mass"] is not None:
-                record["mass"] *= self._kilograms
-            if record["density"] is not None:
-                record["density"] *= self._kilograms / self._units**3
-            record["centre"] = None if centre is None else list(centre)
-            record["inertia"] = (
-                None if inertia is None else [value * self._kilograms * self._units**2 for value in inertia]
-            )
-            record["axes"] = None if axes is None else [*axes.GetImaginary(), axes.GetReal()]
+        record = body_dynamics(prim, self._time, self._units, self._kilograms)
+        if record["mass"] is None and (mass := mass_of_colliders(prim, self._volume)) is not None:
+            record["mass"] = mass * self._kilograms
+            if sum(one.HasAPI(UsdPhysics.CollisionAPI) for one in Usd.PrimRange(prim)) > 1:
+                self._ignored["distributions of a mass over colliders"].append(str(prim.GetPath()))
         return self._base(prim) | record
 
     def _gprim(self, prim: Usd.Prim, found: Record) -> None:
@@ -342,22 +331,21 @@ class _StageReader:
             approximation = "convexHull"
             if prim.IsA(UsdGeom.Mesh):
                 approximation = UsdPhysics.MeshCollisionAPI(prim).GetApproximationAttr().Get() or "none"
-            found["colliders"].append({**record, "approximation": approximation, **self._contact(prim)})
+            found["colliders"].append({**record, "approximation": approximation, **contact_of(prim, self._time)})
         if record["visible"] or prim.GetAttribute(f"{METADATA}:proxy"):
             found["meshes"].append(record)
 
-    def _contact(self, prim: Usd.Prim) -> Record:
-        """Return friction and restitution of the physics material that is bound to a collider."""
-        from pxr import UsdPhysics, UsdShade  # optional
+    def _volume(self, prim: Usd.Prim) -> float:
+        """Return the volume of a collider in units of the stage: that of its mesh, or else of its convex hull."""
+        import trimesh  # the child alone needs it
 
-        bound = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial("physics")[0]
-        if not bound or not bound.GetPrim().HasAPI(UsdPhysics.MaterialAPI):
-            return {"friction": None, "restitution": None}
-        material = UsdPhysics.MaterialAPI(bound)
-        return {
-            "friction": material.GetDynamicFrictionAttr().Get(self._time),
-            "restitution": material.GetRestitutionAttr().Get(self._time),
-        }
+        triangles = self._triangles(prim)
+        if triangles is None:
+            return 0.0
+        mesh = trimesh.Trimesh(*triangles).apply_transform(self._world_from(prim))
+        if self._value(prim, "physics:approximation") == "convexHull" or not mesh.is_watertight:
+            mesh = mesh.convex_hull
+        return float(abs(mesh.volume) / self._units**3)
 
     def _triangles(self, prim: Usd.Prim) -> tuple[Float64Array, npt.NDArray[np.int64]] | None:
         """Return vertices and triangles of a prim in its own coordinates; None for an unsupported type."""

@@ -26,7 +26,7 @@ from tests.usd.test_simulated_frames import INDEX, folder  # noqa: F401 - a fixt
 from tests.usd.test_usd_assets import new_stage
 
 pxr = pytest.importorskip("pxr", reason="needs OpenUSD: pip install 'mitsplat[usd]'")
-from pxr import Gf, Usd, UsdGeom, UsdLux, UsdPhysics, UsdRender, UsdSemantics, UsdVol, Vt  # noqa: E402
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdPhysics, UsdRender, UsdSemantics, UsdVol, Vt  # noqa: E402
 
 RADIUS = 0.04
 
@@ -162,14 +162,34 @@ def test_time_samples_of_poses_become_a_sequence_with_stable_ids(
         np.testing.assert_allclose(pose[:2, 0], (np.cos(turned), np.sin(turned)), atol=1e-6)
 
 
+def test_the_first_of_several_classes_counts_and_the_others_are_named(tmp_path: Path) -> None:
+    write_balls(tmp_path / "balls.usda")
+    stage = Usd.Stage.Open(str(tmp_path / "balls.usda"))
+    labels = UsdSemantics.LabelsAPI(stage.GetPrimAtPath("/World/ball_1"), "class").GetLabelsAttr()
+    labels.Set(["odd", "ball"])
+    old = stage.GetPrimAtPath("/World/ball_2")
+    old.RemoveAPI(UsdSemantics.LabelsAPI, "class")
+    for number, (kind, data) in enumerate((("shape", "round"), ("class", "even"), ("class", "thing"))):
+        old.CreateAttribute(f"semantic:s{number}:params:semanticType", Sdf.ValueTypeNames.String).Set(kind)
+        old.CreateAttribute(f"semantic:s{number}:params:semanticData", Sdf.ValueTypeNames.String).Set(data)
+    stage.Save()
+    found = read_stage_scene(tmp_path / "balls.usda", tmp_path / "scene")
+    assert found.scene.class_names == ("even", "odd")
+    assert "not imported: 1 sets of classes besides odd (/World/ball_1)" in found.notes
+    assert "not imported: 1 sets of classes besides even (/World/ball_2)" in found.notes
+
+
 def test_frames_limits_the_time_codes_of_a_stage(tmp_path: Path) -> None:
     write_moving_balls(tmp_path / "balls.usda")
     found = read_stage_scene(tmp_path / "balls.usda", tmp_path / "scene", images=2)
     assert (len(found.poses), len(found.cameras), len(found.cameras[0])) == (2, 1, 2)
     stage = Usd.Stage.Open(str(tmp_path / "balls.usda"))
-    stage.SetEndTimeCode(1e6)
+    stage.SetEndTimeCode(1e6)  # nothing moves after the last sample, at 6
     stage.Save()
-    with pytest.raises(InputError, match=r"at most 10000 time codes \(got 500000\): limit them with --frames"):
+    assert len(read_stage_scene(tmp_path / "balls.usda", tmp_path / "longer").poses) == 3
+    stage.SetFramesPerSecond(1e6)
+    stage.Save()
+    with pytest.raises(InputError, match=r"at most 10000 time codes \(got 83334\): limit them with --frames"):
         read_stage_scene(tmp_path / "balls.usda", tmp_path / "again")
 
 

@@ -25,7 +25,7 @@ from tests.cli.typed import run
 from tests.conftest import box_asset
 
 pxr = pytest.importorskip("pxr", reason="needs OpenUSD: pip install 'mitsplat[usd]'")
-from pxr import Gf, Usd, UsdGeom, UsdPhysics, UsdValidation, UsdVol, Vt  # noqa: E402
+from pxr import Gf, Usd, UsdGeom, UsdPhysics, UsdShade, UsdValidation, UsdVol, Vt  # noqa: E402
 
 ARRAYS = ("means", "quats", "scales", "opacities", "sh")
 
@@ -215,6 +215,39 @@ def test_a_stage_with_colliders_of_another_program_becomes_an_asset(tmp_path: Pa
     assert asset.mass == pytest.approx(0.25)
     np.testing.assert_allclose(asset.mesh.bounds, [[-0.01, -0.01, -0.01], [0.01, 0.01, 0.017]], atol=1e-6)
     np.testing.assert_allclose(asset.splats.means, 0.001 * splats.means, atol=1e-7)
+
+
+@pytest.mark.parametrize("place", ["mass", "density", "material"])
+def test_masses_of_colliders_and_materials_are_those_of_the_body(
+    tmp_path: Path, place: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A cube of 1 litre states a mass or density, in units of centimetres and grams; a second cube has 1 g/cm^3."""
+    stage = new_stage(tmp_path / "part.usda")
+    UsdGeom.SetStageMetersPerUnit(stage, 0.01)
+    UsdPhysics.SetStageKilogramsPerUnit(stage, 0.001)
+    body = UsdGeom.Xform.Define(stage, "/part").GetPrim()
+    UsdPhysics.RigidBodyAPI.Apply(body)
+    UsdPhysics.MassAPI.Apply(body)
+    write_field(stage, "/part/splats", random_splats(30, 0).transformed(np.diag([100, 100, 100, 1.0])))
+    for number, name in enumerate(("first", "second")):
+        cube = UsdGeom.Cube.Define(stage, f"/part/{name}")
+        cube.CreateSizeAttr(1.0)
+        cube.AddTranslateOp().Set((20.0 * number, 0, 0))
+        cube.AddScaleOp().Set((10.0, 10.0, 10.0))
+        UsdPhysics.CollisionAPI.Apply(cube.GetPrim())
+        if place == "material" and not number:
+            material = UsdShade.Material.Define(stage, "/part/metal")
+            UsdPhysics.MaterialAPI.Apply(material.GetPrim()).CreateDensityAttr(7.8)
+            UsdShade.MaterialBindingAPI.Apply(cube.GetPrim()).Bind(material, materialPurpose="physics")
+        elif not number:
+            mass = UsdPhysics.MassAPI.Apply(cube.GetPrim())
+            (mass.CreateMassAttr if place == "mass" else mass.CreateDensityAttr)(7800.0 if place == "mass" else 7.8)
+        else:
+            UsdPhysics.MassAPI.Apply(cube.GetPrim()).CreateDensityAttr(1.0)
+    stage.Save()
+    asset = read_stage_asset(tmp_path / "part.usda").asset
+    assert asset is not None and asset.mass == pytest.approx(8.8, rel=1e-6)
+    assert "not imported: 1 distributions of a mass over colliders (/part)" in caplog.text
 
 
 @pytest.mark.parametrize(

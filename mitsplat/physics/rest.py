@@ -20,6 +20,8 @@ CONTACT_OVERFLOW = "contact buffer overflow"
 # the velocities of resting bodies.
 _REST_MOTION, _REST_TIME = 5e-4, 1.0
 _QUIET_MOTION, _QUIET_TIME = 1e-4, 0.25
+# Time without rolling friction [s], longer than rebounds last. Rolling friction would slow tumbling parts on their rim.
+_FREE_TIME = 1.5
 _SPEED_WINDOW = 0.05  # averaging time of the reported speeds [s]
 
 
@@ -56,7 +58,8 @@ def run_to_rest(
     """Advance a world until its bodies have been at rest for a second, or until rest is ruled out.
 
     At rest, no surface point moves by 0.5 mm within one second, and by 0.1 mm within its first quarter. After that
-    quarter, rolling friction is disabled, because it would let a box balance on its edge.
+    quarter, rolling friction is disabled, because it would let a box balance on its edge. It is also disabled in the
+    first 1.5 s, because discs that tumble on their rim would stop on it.
 
     Args:
         world: Simulation; changed in place.
@@ -94,7 +97,7 @@ def _run_to_rest(
     since, rest = 0.0, world.poses
     motion = np.zeros(len(world.bodies))
     while world.time - since < _REST_TIME:
-        world.allow_rolling(world.time - since >= _QUIET_TIME)
+        world.allow_rolling(world.time < _FREE_TIME or world.time - since >= _QUIET_TIME)
         poses = _advance_within(world, bounds, fastest)
         past.append(poses)
         observe(world.time, poses)

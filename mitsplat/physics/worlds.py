@@ -37,7 +37,7 @@ _GRAVITY = (0.0, 0.0, -GRAVITY)
 # because contact cannot pull. From 1.5 on it does not leave the table. At 2 it penetrates deeper without benefit.
 CONTACT_TIME, DAMPING_RATIO = 0.004, 1.5
 CONTACT_STIFFNESS, CONTACT_DAMPING = 1 / (CONTACT_TIME * DAMPING_RATIO) ** 2, 2 / CONTACT_TIME
-WITH_ROLL, _WITHOUT_ROLL = 6, 4  # contact dimensions: normal, two sliding, spin, and two rolling
+WITH_ROLL = 6  # contact dimensions: normal, two sliding, spin, and two rolling
 # Impedance of contacts at the surface and 1 mm deep: at MuJoCo's default of 0.9, a nut under a plate of a hundred times
 # its mass sinks by 1 mm. MuJoCo's own contacts flicker, and come to rest less often when stiffer.
 _IMPEDANCE_WARP, IMPEDANCE_MUJOCO = (0.996, 0.9999), (0.99, 0.999)
@@ -217,6 +217,7 @@ class WarpWorld(World):
         self._solver = PairContactSolver(
             model, nconmax=contacts, njmax=6 * contacts, use_mujoco_contacts=False, **_SOLVER_OPTIONS
         )
+        self._friction = _array(self._solver.mjw_model.geom_friction)
         # Overflow is read from flags, because the kernels would print it at every step.
         self._solver.mjw_model.opt.warn_overflow = 0
         # The pipeline has room for one contact more than the solver, because it stops counting when it is full and sets
@@ -261,7 +262,7 @@ class WarpWorld(World):
             raise ContactOverflow
 
     def _allow_rolling(self, allowed: bool) -> None:
-        self._solver.mjw_model.geom_condim.fill_(_WITHOUT_ROLL if allowed else WITH_ROLL)
+        _assign(self._solver.mjw_model.geom_friction, self._friction * (1.0, 1.0, 0.0 if allowed else 1.0))
 
     def _coordinates(self) -> Float64Array:
         return _array(self._states[0].body_q)
@@ -280,6 +281,7 @@ class MujocoWorld(World):
         self._model, self._data = solver.mj_model, solver.mj_data
         self._model.opt.timestep = timestep
         self._restitution = solver.geom_restitution()
+        self._friction = np.array(self._model.geom_friction)
         self._centres = np.array([body.mass.centre for body in bodies])
 
     @property
@@ -361,7 +363,7 @@ class MujocoWorld(World):
         return late
 
     def _allow_rolling(self, allowed: bool) -> None:
-        self._model.geom_condim[:] = _WITHOUT_ROLL if allowed else WITH_ROLL
+        self._model.geom_friction[:] = self._friction * (1.0, 1.0, 0.0 if allowed else 1.0)
 
     def _coordinates(self) -> Float64Array:
         return np.array(self._data.qpos).reshape(-1, 7)[:, [0, 1, 2, 4, 5, 6, 3]]

@@ -112,11 +112,11 @@ def test_a_replay_ends_in_the_poses_of_the_layout(stepper, scene_data, write_sce
     scene_data["settle"] = {"stepper": stepper}
     scene = load_scene(write_scene(scene_data))
     layout = settle_layout(scene, 0, cached=False)
-    *moments, last = replay_layout(scene, layout, interval=0.04)
+    *moments, last = replay_layout(scene, layout, interval=0.01)
     assert last is layout
     positions = np.array([[one.world_from_object[:3, 3] for one in moment.instances] for moment in moments])
     resting = np.array([one.world_from_object[:3, 3] for one in layout.instances])
-    assert len(moments) == int(layout.certificate.time_to_rest / 0.04) + 1
+    assert len(moments) == int(layout.certificate.time_to_rest / 0.01) + 1
     assert positions[0, :, 2].min() > resting[:, 2].max()
     np.testing.assert_allclose(positions[-1], resting, atol=2e-3)
 

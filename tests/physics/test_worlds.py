@@ -371,6 +371,24 @@ def test_a_box_does_not_balance_on_its_edge(stepper):
     np.testing.assert_allclose(np.abs(outcome.poses[:, 2, 2]), [0, 1], atol=1e-3)
 
 
+@pytest.mark.parametrize("stepper", STEPPERS)
+def test_rolling_friction_starts_after_one_and_a_half_seconds(stepper):
+    """A rolling cylinder slows down by a = g b / (1.5 r): it would stop within the time v / a and the way v^2 / 2 a."""
+    from mitsplat.physics.rest import run_to_rest
+
+    radius, speed, rolling = 0.01, 0.3, 5e-4
+    cylinder = trimesh.creation.cylinder(radius=radius, height=0.02, sections=256)
+    lying = Rotation.from_euler("x", 90, degrees=True)
+    world = world_of(
+        stepper, [body_of(cylinder, rolling_friction=rolling)], [table()], [pose_at((-0.4, 0, radius), lying)]
+    )
+    world.set_velocities(np.array([[[speed, 0, 0], [0, speed / radius, 0]]]))
+    outcome = run_to_rest(world, max_time=3.0, bounds=EVERYWHERE)
+    slowing = GRAVITY * rolling / (1.5 * radius)
+    assert outcome.poses[0, 0, 3] + 0.4 > 1.5 * speed**2 / (2 * slowing)
+    assert 1.5 < outcome.time < 1.5 + speed / slowing
+
+
 @pytest.mark.parametrize("stepper", ["mujoco", pytest.param("warp", marks=pytest.mark.extended)])
 def test_a_stack_of_five_drifts_by_less_than_a_tenth_of_a_millimetre(stepper):
     """Drift below 0.1 mm in 5 s."""

@@ -3,8 +3,8 @@
     python examples/robot_arm.py [FOLDER] [--frames N] [--size WIDTHxHEIGHT]
 
 Each link of `arm.xml` consists of boxes and cylinders and is baked as an asset of its own. In every frame, the poses of
-the links are those of MuJoCo: 4x4 matrices world_from_body, which the kinematics of a robot also provide. Finally the
-frames are written as a dataset, which the audit checks.
+the links are those of MuJoCo's bodies. Poses from the kinematics of a robot, 4x4 matrices world_from_body, are given by
+`ms.Layout.from_poses`. Finally the frames are written as a dataset, which the audit checks.
 """
 
 import argparse
@@ -76,12 +76,8 @@ def layouts():
     while True:
         data.ctrl[:] = 0.9 * np.sin(3 * data.time + np.arange(model.nu))
         mujoco.mj_step(model, data, nstep=round(0.1 / model.opt.timestep))
-        poses = {}
-        for name in links:
-            pose = np.eye(4)
-            pose[:3, :3], pose[:3, 3] = data.body(name).xmat.reshape(3, 3), data.body(name).xpos
-            poses[name] = [pose]
-        yield ms.Layout.from_poses(scene, poses)
+        mujoco.mj_forward(model, data)  # mj_step leaves the poses before its last step
+        yield ms.layout_from_mujoco(scene, model, data, {name: name for name in links})
 
 
 camera = ms.Camera.look_at((0.35, -0.75, 0.45), (0, 0, 0.15), width=width, height=height, fov_x=45)

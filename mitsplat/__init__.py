@@ -42,9 +42,12 @@ _HOME = {
     "Splats": "gaussians.splat_cloud",
     "asset_from_photos": "reconstruct.pipeline.asset_pipeline",
     "bake_asset": "bake.bake",
+    "camera_from_mujoco": "usd.simulator_poses",
     "capture_photos": "capture.pipeline.capture_pipeline",
     "fit_capture": "fit.trainer",
     "import_splats": "importing.splat_import",
+    "layout_from_mujoco": "usd.simulator_poses",
+    "layout_from_newton": "usd.simulator_poses",
     "load_scene": "scene.loading.scene_loading",
     "make_scene": "scene.loading.scene_loading",
     "render_frame": "frames.frame",
@@ -90,6 +93,9 @@ if TYPE_CHECKING:
     from mitsplat.scene.loading.scene_loading import make_scene as make_scene
     from mitsplat.scene.scene import Scene as Scene
     from mitsplat.scene.spec.scene_spec import SceneSpec as SceneSpec
+    from mitsplat.usd.simulator_poses import camera_from_mujoco as camera_from_mujoco
+    from mitsplat.usd.simulator_poses import layout_from_mujoco as layout_from_mujoco
+    from mitsplat.usd.simulator_poses import layout_from_newton as layout_from_newton
 
 
 def __getattr__(name: str) -> Any:

@@ -11,12 +11,13 @@ from mitsplat.errors import InputError
 from mitsplat.geometry.rigid import rigid_matrix
 
 
-def asset_index(name: str | int, names: Sequence[tuple[str, str]]) -> int:
+def asset_index(name: str | int, names: Sequence[tuple[str, str]], place: str) -> int:
     """Return the index of the asset with a name or number.
 
     Args:
         name: Name, path or index of the asset.
         names: Name and path of each asset.
+        place: Place of the name for messages.
 
     Raises:
         InputError: If no asset or several assets match.
@@ -27,13 +28,13 @@ def asset_index(name: str | int, names: Sequence[tuple[str, str]]) -> int:
             return found[0]
         if found:
             raise InputError(
-                f"poses[{name!r}]: must name one asset (it names {len(found)} of scene.assets: use one of the indices "
+                f"{place}: must name one asset (it names {len(found)} of scene.assets: use one of the indices "
                 f"{', '.join(map(str, found))})"
             )
     elif 0 <= name < len(names):
         return int(name)
     known = ", ".join(sorted({asset for asset, _ in names})) or "none"
-    raise InputError(f"poses[{name!r}]: must be an asset of the scene ({known}) or its index in scene.assets")
+    raise InputError(f"{place}: must be an asset of the scene ({known}) or its index in scene.assets")
 
 
 def rigid_pose(pose: npt.ArrayLike, place: str) -> Float64Array:

@@ -149,11 +149,9 @@ class Layout:
                 f"poses must map names of assets to lists of matrices, as in {{'bolt': [pose]}} (got a "
                 f"{type(poses).__name__})"
             )
-        paths = [path for entry in scene.spec.objects for path in entry.names for _ in entry.scales]
-        names = [(asset.name, path) for asset, path in zip(scene.assets, paths, strict=True)]
         lists: dict[int, Sequence[npt.ArrayLike | None]] = {}
         for name, given in poses.items():
-            asset = asset_index(name, names)
+            asset = asset_index(name, scene.asset_names, f"poses[{name!r}]")
             if asset in lists:
                 raise InputError(f"poses[{name!r}]: must not name an asset that already has poses (asset {asset})")
             if not isinstance(given, Iterable) or isinstance(given, str):

@@ -68,6 +68,12 @@ class Scene:
         return options | {"kernel": options["kernel"] or trained_kernel(asset.splats.kernel for asset in drawn)}
 
     @cached_property
+    def asset_names(self) -> tuple[tuple[str, str], ...]:
+        """For each asset, its name and its path in the scene file."""
+        paths = (path for entry in self.spec.objects for path in entry.names for _ in entry.scales)
+        return tuple((asset.name, path) for asset, path in zip(self.assets, paths, strict=True))
+
+    @cached_property
     def pools(self) -> tuple[range, ...]:
         """For each entry of ``spec.objects``, the indices of its assets."""
         ends = list(accumulate((len(entry.names) * len(entry.scales) for entry in self.spec.objects), initial=0))

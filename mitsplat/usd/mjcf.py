@@ -9,7 +9,6 @@ Friction of a contact: MuJoCo takes the larger coefficient of two geoms with equ
 
 from __future__ import annotations
 
-import re
 import tempfile
 import xml.etree.ElementTree as ET
 from collections.abc import Iterable
@@ -33,6 +32,7 @@ from mitsplat.physics.worlds import CONTACT_TIME, DAMPING_RATIO, IMPEDANCE_MUJOC
 from mitsplat.scene.scene import Scene
 from mitsplat.storage.files import storage_errors, write_file
 from mitsplat.usd.frame_content import FrameContent, PlacedObject, frame_content
+from mitsplat.usd.simulator_poses import identifier
 
 _VISUAL = {"contype": "0", "conaffinity": "0", "group": "2", "mass": "0"}
 _COLLISION_GROUP = "3"
@@ -117,8 +117,8 @@ class _ModelWriter:
         self._shapes(world, content)
         for one in content.objects:
             asset, body = content.assets[one.asset]
-            name = f"{_word(asset.name)}_{one.id}"
-            self._body(world, name, f"{_word(asset.name)}_{one.asset}", asset, body, one.pose)
+            name = f"{identifier(asset.name)}_{one.id}"
+            self._body(world, name, f"{identifier(asset.name)}_{one.asset}", asset, body, one.pose)
             if one.labelled:
                 ET.SubElement(custom, "text", name=f"class_{name}", data=asset.class_name)
         if content.camera is not None:
@@ -134,7 +134,7 @@ class _ModelWriter:
     def _shapes(self, world: ET.Element, content: FrameContent) -> None:
         """Add static shapes: colliders, and visible meshes."""
         for number, shape in enumerate(content.shapes):
-            name = f"{_word(shape.name)}_{number}"
+            name = f"{identifier(shape.name)}_{number}"
             colour = None if shape.colour is None else {"rgba": _text((*encode_srgb(shape.colour), 1.0))}
             if colour is not None:
                 self._geom(world, f"{name}_visual", shape.mesh, _VISUAL | colour)
@@ -211,8 +211,3 @@ def _text(value: npt.ArrayLike) -> str:
     """Return numbers as text that reads back exactly."""
     numbers = np.atleast_1d(np.asarray(value, dtype=np.float64)).tolist()
     return " ".join(str(int(one)) if one == int(one) else repr(one) for one in numbers)
-
-
-def _word(text: str) -> str:
-    """Return a name without characters that file names and MJCF do not have."""
-    return re.sub(r"\W+", "_", text)

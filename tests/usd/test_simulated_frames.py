@@ -22,6 +22,7 @@ from mitsplat.scene.loading.scene_loading import load_scene
 from mitsplat.scene.planning.frame_plan import plan_frame
 from mitsplat.scene.scene import Scene
 from mitsplat.usd.mjcf import export_scene_mjcf
+from mitsplat.usd.simulator_poses import layout_from_newton
 from mitsplat.usd.usd_export import export_scene_usd
 from tests.cli.typed import run
 from tests.conftest import box_asset
@@ -186,6 +187,9 @@ def test_objects_stay_at_rest_in_newton(folder: Path, scene: Scene) -> None:
         first = states[0].body_q.numpy().astype(np.float64)
         for pose, row in zip(poses_at_rest(scene), first, strict=True):
             np.testing.assert_allclose(pose[:3, 3], row[:3], atol=1e-6)
+        live = layout_from_newton(scene, model, states[0]).instances
+        assert [(one.id, scene.assets[one.asset].name) for one in live] == [(1, "nut"), (2, "nut"), (3, "bolt")]
+        np.testing.assert_allclose([one.world_from_object for one in live], poses_at_rest(scene), atol=1e-6)
         for _ in range(1000):
             solver.step(states[0], states[1], control, None, 0.002)
             states.reverse()

@@ -30,7 +30,7 @@ IDLE = (
     "physics.settle-share",
 )
 """Wall-clock timings, or figures that other programs affect most."""
-ELSEWHERE = re.compile(r"\b[A-Z]{3,}\b|\.splat\b|cuda|\.\./shared|--blender")
+ELSEWHERE = re.compile(r"\b[A-Z]{3,}\b|\.splat\b|cuda|\.\./shared|--blender|--gausscam")
 """Input that a checkout lacks."""
 
 

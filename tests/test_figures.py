@@ -282,9 +282,9 @@ def test_captions_mark_old_dirty_and_transcribed_results() -> None:
 def test_every_benchmark_records_its_figures() -> None:
     scripts = [path for path in record.ROOT.glob("benchmarks/*/*.py") if "__main__" in path.read_text()]
     assert len(scripts) > 25
-    # Scripts for detector data and sample meshes, of Blender and of clients, scripts that start others, and a chart.
+    # Scripts for detector data and sample meshes, of Blender, clients and gausscam, scripts that start others, a chart.
     others = {"arranged.py", "meshes.py", "sample_meshes.py", "blender_scene.py", "client_readers.py"}
-    others |= {"__main__.py", "chart.py"}
+    others |= {"__main__.py", "chart.py", "live_gausscam.py"}
     assert {path.name for path in scripts if "with recording(" not in path.read_text()} == others
 
 
@@ -292,9 +292,9 @@ def test_every_benchmark_records_its_figures() -> None:
 def test_every_benchmark_can_be_imported() -> None:
     """Every imported name exists in the package. The imports run in a new process, as some change the environment.
 
-    ``blender_scene.py`` runs in the environment of Blender.
+    ``blender_scene.py`` runs in the environment of Blender, ``live_gausscam.py`` in that of gausscam.
     """
-    excluded = ("__main__.py", "blender_scene.py")
+    excluded = ("__main__.py", "blender_scene.py", "live_gausscam.py")
     modules = [path for path in record.ROOT.glob("benchmarks/*/*.py") if path.name not in excluded]
     names = sorted(".".join(path.relative_to(record.ROOT).with_suffix("").parts) for path in modules)
     script = "import importlib, sys\nfor name in sys.argv[1:]:\n    importlib.import_module(name)"

@@ -9,7 +9,7 @@ from __future__ import annotations
 import io
 import posixpath
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import IO
@@ -35,6 +35,14 @@ from mitsplat.storage.files import IMAGE_ERRORS
 _MODEL = "3D/3dmodel.model"
 _RELATIONSHIPS = "_rels/.rels"
 _MODEL_TYPE = "http://schemas.microsoft.com/3dmanufacturing/2013/01/3dmodel"
+_READ_EXTENSIONS = {
+    "http://schemas.microsoft.com/3dmanufacturing/core/2015/02",
+    "http://schemas.microsoft.com/3dmanufacturing/material/2015/02",
+    "http://schemas.microsoft.com/3dmanufacturing/production/2015/06",
+    "http://schemas.microsoft.com/3dmanufacturing/trianglesets/2021/07",
+}
+_PAINT = ("mmu_segmentation", "paint_color")
+"""Attributes of triangles with colours that slicers paint."""
 _UNITS = {"micron": 1e-6, "millimeter": 1e-3, "centimeter": 1e-2, "inch": 0.0254, "foot": 0.3048, "meter": 1.0}
 _WRAPS: dict[str, Wrap] = {"wrap": "repeat", "mirror": "mirror", "clamp": "clamp", "none": "clamp"}
 _MAX_EXPANSION = 100
@@ -55,6 +63,7 @@ class _Object:
         faces: Vertices of each triangle, shape (F, 3).
         groups: Property group of each triangle, or None, F entries.
         indices: Entry of the group at each corner, shape (F, 3).
+        is_support: True if it supports others while they are printed.
         components: Objects and their transforms (4, 4).
     """
 
@@ -63,6 +72,7 @@ class _Object:
     faces: Int64Array
     groups: list[str | None]
     indices: Int64Array
+    is_support: bool
     components: list[tuple[_Key, Float64Array]] = field(default_factory=list)
 
 
@@ -123,11 +133,14 @@ class _Package:
             one = self._objects.get(key)
             if one is None:
                 raise ValueError(f"object {key[1]} is missing")
+            if one.is_support:
+                self._left_out.add("supports")
+                continue
             pending += [(child, pose @ own, (*parents, key)) for child, own in reversed(one.components)]
             parts += self._parts(key[0], one, pose)
         if pending:
             raise ValueError(f"components make more than {_MAX_INSTANCES} objects")
-        warnings = [f"its {', '.join(sorted(self._left_out))} are left out"] if self._left_out else []
+        warnings = [f"its {' and '.join(sorted(self._left_out))} are left out"] if self._left_out else []
         return MeshFile(tuple(parts), self._unit, "z", tuple(warnings))
 
     def _open(self, name: str) -> IO[bytes]:
@@ -153,11 +166,15 @@ class _Package:
         self._models.add(model)
         with self._open(model) as file:
             root: ElementTree.Element | None = None
-            for event, element in ElementTree.iterparse(file, events=("start", "end")):
+            namespaces: dict[str, str] = {}
+            for event, element in ElementTree.iterparse(file, events=("start", "end", "start-ns")):
+                if event == "start-ns":
+                    namespaces[element[0]] = element[1]
+                    continue
                 kind = _local(element)
                 if root is None:
                     root = element
-                    self._check_root(model, element)
+                    self._check_root(model, element, namespaces)
                 if event == "start":
                     continue
                 number = element.get("id", "")
@@ -179,9 +196,14 @@ class _Package:
                 elif kind == "item":
                     yield self._reference(model, element), _matrix(element.get("transform"))
 
-    def _check_root(self, model: str, root: ElementTree.Element) -> None:
+    def _check_root(self, model: str, root: ElementTree.Element, namespaces: Mapping[str, str]) -> None:
         if _local(root) != "model":
             raise ValueError(f"{model} is no 3MF model")
+        required = {namespaces.get(prefix, prefix) for prefix in root.get("requiredextensions", "").split()}
+        if unknown := sorted(required - _READ_EXTENSIONS):
+            raise InputError(
+                f"it requires extensions of 3MF that are not supported: export it without {', '.join(unknown)}"
+            )
         unit = root.get("unit", "millimeter")
         if unit not in _UNITS:
             raise ValueError(f"unit must be one of {', '.join(_UNITS)} (got {unit})")
@@ -203,6 +225,8 @@ class _Package:
                 vertices.append((float(child.attrib["x"]), float(child.attrib["y"]), float(child.attrib["z"])))
             elif kind == "triangle":
                 triangles.append(child.attrib)
+                if any(name.endswith(_PAINT) for name in child.attrib):
+                    self._left_out.add("painted colours of a slicer")
             elif kind == "component":
                 components.append((self._reference(model, child), _matrix(child.get("transform"))))
         faces = [(int(one["v1"]), int(one["v2"]), int(one["v3"])) for one in triangles]
@@ -217,6 +241,7 @@ class _Package:
             np.reshape(faces, (-1, 3)).astype(np.int64),
             [one.get("pid", group) for one in triangles],
             np.reshape(indices, (-1, 3)).astype(np.int64),
+            element.get("type") in ("support", "solidsupport"),
             components,
         )
 

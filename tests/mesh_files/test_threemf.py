@@ -162,3 +162,30 @@ def test_components_that_multiply_without_end_are_refused(tmp_path: Path) -> Non
     )
     with pytest.raises(InputError, match="components make more than 100000 objects"):
         read_model(write(tmp_path / "a.3mf", chain + tetrahedron(21)))
+
+
+@pytest.mark.parametrize(
+    ("namespace", "is_read"),
+    [
+        (PRODUCTION, True),
+        (MATERIAL, True),
+        ("http://schemas.microsoft.com/3dmanufacturing/beamlattice/2017/02", False),
+        ("http://example.com/cells", False),
+    ],
+)
+def test_required_extensions_that_are_not_supported_are_named(tmp_path: Path, namespace: str, is_read: bool) -> None:
+    path = write(tmp_path / "a.3mf", tetrahedron(1), unit=f'xmlns:x="{namespace}" requiredextensions="x"')
+    if is_read:
+        assert len(read_model(path).parts) == 1
+        return
+    with pytest.raises(InputError, match=f"extensions of 3MF that are not supported: export it without {namespace}"):
+        read_model(path)
+
+
+def test_supports_and_painted_colours_are_left_out_with_a_warning(tmp_path: Path) -> None:
+    support = tetrahedron(2).replace('type="model"', 'type="support"')
+    painted = tetrahedron(1, triangles=('paint_color="4"', "", "", ""))
+    build = '<item objectid="1"/><item objectid="2" transform="1 0 0 0 1 0 0 0 1 50 0 0"/>'
+    model = read_model(write(tmp_path / "a.3mf", painted + support, build))
+    assert model.warnings == ("its painted colours of a slicer and supports are left out",)
+    np.testing.assert_allclose(model.parts[0].mesh.extents, 0.008)

@@ -136,7 +136,11 @@ class _GltfReader:
         if "inverseBindMatrices" in skin:
             inverse = self._data.accessor(skin["inverseBindMatrices"]).reshape(-1, 4, 4).transpose(0, 2, 1)
             poses = poses @ inverse[: len(poses)]
-        joints, weights = (self._attribute(primitive, name) for name in ("JOINTS_0", "WEIGHTS_0"))
+        sets = sum(name.startswith("JOINTS_") for name in primitive["attributes"])
+        joints, weights = (
+            np.hstack([self._attribute(primitive, f"{name}_{k}") for k in range(sets)])
+            for name in ("JOINTS", "WEIGHTS")
+        )
         at = np.pad(vertices, ((0, 0), (0, 1)), constant_values=1.0)
         total = np.maximum(weights.sum(axis=1, keepdims=True), 1e-12)
         return np.asarray(np.einsum("vj,vjab,vb->va", weights / total, poses[joints.astype(int)], at)[:, :3])

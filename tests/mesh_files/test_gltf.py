@@ -377,6 +377,20 @@ def test_skins_and_morph_targets_have_the_pose_of_the_file(tmp_path: Path) -> No
     np.testing.assert_allclose(part.mesh.bounds[:, 2], 0.25)
 
 
+def test_vertices_may_follow_more_than_four_joints(tmp_path: Path) -> None:
+    """The fifth joint has the whole weight."""
+    glb = sheet()
+    first, second = np.tile(np.arange(4, dtype=np.uint8), (4, 1)), np.full((4, 4), 4, np.uint8)
+    weights = np.tile(np.array([1, 0, 0, 0], np.float32), (4, 1))
+    attributes = glb.document["meshes"][0]["primitives"][0]["attributes"]
+    attributes |= {"JOINTS_0": glb.accessor(first), "WEIGHTS_0": glb.accessor(0 * weights)}
+    attributes |= {"JOINTS_1": glb.accessor(second), "WEIGHTS_1": glb.accessor(weights)}
+    nodes = [{"mesh": 0, "skin": 0}, *({"translation": [0, 0, 0.1 * k]} for k in range(5))]
+    scenes, skins = [{"nodes": list(range(6))}], [{"joints": [1, 2, 3, 4, 5]}]
+    (part,) = read(glb.save(tmp_path / "a.glb", nodes=nodes, skins=skins, scenes=scenes))
+    np.testing.assert_allclose(part.mesh.bounds[:, 2], 0.4, atol=1e-6)
+
+
 def test_data_and_files_of_uris_are_read(tmp_path: Path) -> None:
     glb = sheet()
     (tmp_path / "my data.bin").write_bytes(glb.data)

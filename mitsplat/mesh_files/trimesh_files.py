@@ -8,8 +8,9 @@ without ``Ks``, ``Pr`` and ``Pm``, or with ``illum`` 0 or 1, is matt.
 from __future__ import annotations
 
 import importlib.util
+import io
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -26,6 +27,7 @@ from mitsplat.arrays import Float64Array
 from mitsplat.errors import InputError, MissingResourceError
 from mitsplat.geometry.mesh import check_faces
 from mitsplat.images.colour import decode_srgb
+from mitsplat.mesh_files.face_polygons import has_concave, plain_obj
 from mitsplat.mesh_files.file_references import find_reference
 from mitsplat.mesh_files.mesh_file import (
     DIELECTRIC_SPECULAR,
@@ -75,12 +77,19 @@ def read_with_trimesh(path: Path, *, textures: bool = True) -> MeshFile:
     kind = path.suffix.lower()
     if kind == ".dae" and importlib.util.find_spec("collada") is None:
         raise MissingResourceError(f"{path}: reading it needs `pip install pycollada`")
-    scene = trimesh.load_scene(path, resolver=_Resolver(path))
+    file = io.BytesIO(plain_obj(path.read_bytes())) if kind == ".obj" else path
+    scene = trimesh.load_scene(file, file_type=kind[1:], resolver=_Resolver(path))
+    if any(has_concave(np.asarray(positions), polygons) for positions, polygons in _polygons(path, scene)):
+        raise InputError(
+            "it has concave polygons, which are read from OBJ files only: export it with triangles instead of polygons"
+        )
     parts = scene_parts(scene, path)
     units, up = _read_collada_asset(path) if kind == ".dae" else (None, None)
     warnings = []
     if kind == ".stl" and any(np.any(one.face_attributes.get("stl", 0)) for one in scene.geometry.values()):
         warnings.append("the colours of its faces are not read, because STL files store them in several ways")
+    if kind == ".obj" and textures and (names := _values_of(path, "usemtl")) and not _values_of(path, "mtllib"):
+        warnings.append(f"it names no material file (mtllib) of its material {names[0]}, which is left out")
     return MeshFile(parts, units, up, tuple(warnings), in_single=kind in (".stl", ".ply"))
 
 
@@ -247,6 +256,33 @@ class _Resolver(FilePathResolver):  # type: ignore[misc]
         return found.read_bytes()
 
 
+def _polygons(path: Path, scene: trimesh.Scene) -> Iterator[tuple[Any, Any]]:
+    """Yield the positions and the vertices of the polygons of a file, in formats whose polygons trimesh splits."""
+    kind = path.suffix.lower()
+    if kind == ".ply":
+        for mesh in scene.geometry.values():
+            raw = mesh.metadata.get("_ply_raw", {})
+            vertex, face = (raw.get(name, {}).get("data") for name in ("vertex", "face"))
+            names = face if isinstance(face, dict) else getattr(getattr(face, "dtype", None), "names", None) or ()
+            for name in {"vertex_index", "vertex_indices"} & set(names):
+                polygons = face[name] if isinstance(face, dict) else face[name]["f1"]
+                yield np.column_stack([np.ravel(vertex[axis]) for axis in "xyz"]).astype(np.float64), polygons
+    elif kind == ".off":
+        text = re.sub(r"#.*", "", path.read_text(errors="replace")).split(None, 1)[1]
+        rows = [line.split() for line in text.splitlines() if line.strip()]
+        count, number = map(int, rows[0][:2])
+        faces = [row[1 : int(row[0]) + 1] for row in rows[count + 1 : count + number + 1]]
+        yield np.array([row[:3] for row in rows[1 : count + 1]], dtype=np.float64), [[*map(int, f)] for f in faces]
+    elif kind == ".dae":
+        import collada  # optional
+
+        for geometry in collada.Collada(str(path), ignore=[collada.DaeError]).geometries:
+            for one in geometry.primitives:
+                if isinstance(one, collada.polylist.Polylist):  # its subclasses have other polygons
+                    starts, ends = one.polystarts, one.polyends
+                    yield one.vertex, [one.vertex_index[a:b] for a, b in zip(starts, ends, strict=True)]
+
+
 def _read_collada_asset(path: Path) -> tuple[float | None, Axis | None]:
     """Return the unit [m] and the up axis of a COLLADA file; its specification defines 1 m and y if they are absent."""
     units, up = 1.0, "Y_UP"
@@ -283,7 +319,9 @@ def check_textures(mesh: Path) -> None:
 
 
 def _check_obj(mesh: Path) -> None:
-    libraries = _values_of(mesh, "mtllib")
+    libraries = list(dict.fromkeys(_values_of(mesh, "mtllib")))
+    if len(libraries) > 1:
+        raise InputError(f"{mesh}: must have one material file (got {', '.join(libraries)}): join them")
     known: list[str] = []
     for library in libraries:
         words = library.split()

@@ -44,7 +44,7 @@ def expected_files(record: Record, content: JsonObject) -> dict[str, str]:
     for name in _MAPS:
         if name in formats:
             files[f"{name}/{split}/{png}"] = name
-    if "flow" in formats and record["view"] + 1 < output["views"]:
+    if "flow" in formats and ("next" in record or record["view"] + 1 < output["views"]):
         files[f"flow/{split}/{number}.flo"] = "flow"
     if "exr" in formats:
         files[f"layers/{split}/{number}.exr"] = "exr"

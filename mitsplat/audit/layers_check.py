@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import cv2
@@ -71,11 +71,12 @@ class LayersCheck(DatasetCheck):
         self._last = None if depth is None else (frame, depth, step)
 
     def _check_flow(self, frame: DecodedFrame) -> Violations:
-        """Compare the flow of the previous frame with that computed from its depth and both cameras."""
+        """Compare the flow of the previous frame with that computed from its depth, both cameras and the poses."""
         assert self._last is not None  # noqa: S101
         before, depth, step = self._last
         file = f"flow/{before.split}/{before.index:06d}.flo"
-        if (frame.index, frame.record["layout"]) != (before.index + 1, before.record["layout"]):
+        expected = "next" in before.record or frame.record["layout"] == before.record["layout"]
+        if frame.index != before.index + 1 or not expected:
             return
         if file not in before.record["files"] or not (before.root / file).is_file():
             return
@@ -88,50 +89,77 @@ class LayersCheck(DatasetCheck):
         pixels = np.stack([x.ravel(), y.ravel()], axis=1)
         slopes = np.column_stack([before.ray_slopes(pixels), np.ones(len(pixels))])
         known = depth.ravel() > step
-        motion = frame.camera_from_world @ before.world_from_camera
-        found = flow.reshape(-1, 2)[known]
-        stated = (np.abs(found) < _MAX_FLOW).all(axis=1)
+        found = flow.reshape(-1, 2)
+        stated: BoolArray = np.asarray((np.abs(found) < _MAX_FLOW).all(axis=1))
 
-        def wrong_if_carried(by: Float64Array) -> BoolArray:
-            """Return a mask of the pixels with depth whose flow differs from that of points displaced by ``by`` [m]."""
-            run = frame.camera_from_world[:3, :3] @ by
-            ahead, last = np.zeros(len(found)), np.zeros((len(found), 3))
+        def wrong_if_moved(motion: Float64Array, chosen: BoolArray) -> BoolArray:
+            """Return a mask of the chosen pixels whose flow differs from that of points with a motion in the world."""
+            turn = frame.camera_from_world @ motion @ before.world_from_camera
+            start, z = pixels[chosen], depth.ravel()[chosen]
 
             def moved(z: Float64Array) -> Float64Array:
-                points = slopes[known] * z[known, None] @ motion[:3, :3].T + motion[:3, 3] + run
-                ahead[:] = points[:, 2]
-                points[points[:, 2] <= 0] = (0, 0, 1)
-                last[:] = points
-                return frame.project(points)
+                return slopes[chosen] * z[:, None] @ turn[:3, :3].T + turn[:3, 3]
 
-            near, far = moved(depth.ravel() - step / 2), moved(depth.ravel() + step / 2)
-            expected = moved(depth.ravel()) - pixels[known]
+            def project(points: Float64Array) -> Float64Array:
+                return frame.project(np.where(points[:, 2:] <= 0, (0, 0, 1), points))
+
+            end = moved(z)
+            near, far = project(moved(z - step / 2)), project(moved(z + step / 2))
+            expected = project(end) - start
             tolerance = _FLOW_TOLERANCE + np.abs(far - near).max(axis=1) + 1e-5 * np.abs(expected).max(axis=1)
-            in_front = ahead > frame.record["camera"]["near"] + step
-            wrong: BoolArray = in_front & (~stated | (np.abs(found - expected).max(axis=1) > tolerance))
-            unknown = np.flatnonzero(wrong & ~stated)
-            wrong[unknown[frame.has_no_pixel(last[unknown])]] = False
+            in_front = end[:, 2] > frame.record["camera"]["near"] + step
+            is_stated = stated[chosen]
+            differs = np.abs(found[chosen] - expected).max(axis=1) > tolerance
+            wrong: BoolArray = in_front & (~is_stated | differs)
+            unknown = np.flatnonzero(wrong & ~is_stated)
+            wrong[unknown[frame.has_no_pixel(end[unknown])]] = False
             return wrong
 
-        if not known.any():
-            return
-        wrong = wrong_if_carried(np.zeros(3))
-        if (run := self._belt.between(before, frame)).any():
-            # Pixels without a labelled instance may show the belt or static parts, so both motions are accepted.
-            carried = wrong_if_carried(run)
-            runs, stays = (self._pixels_of(before, carries).ravel()[known] for carries in (True, False))
-            wrong = np.where(runs, carried, np.where(stays, wrong, wrong & carried))
+        motions = list(self._motions(before, frame))
+        wrong, rest = np.zeros(len(known), dtype=bool), known.copy()
+        for seen, motion in motions:
+            chosen = known & seen.ravel()
+            rest &= ~chosen
+            if motion is not None and chosen.any():
+                wrong[chosen] = wrong_if_moved(motion, chosen)
+        # Pixels without a labelled instance may show static parts, a belt, or fragments of instances that move.
+        run = np.eye(4)
+        run[:3, 3] = self._belt.between(before, frame)
+        wrong[rest] = not _has_unlabelled_motion(before)
+        for motion in (np.eye(4), run, *(motion for _, motion in motions if motion is not None)):
+            left = wrong & rest
+            if left.any():
+                wrong[left] = wrong_if_moved(motion, left)
         if count := np.count_nonzero(wrong):
             yield file, f"{count} pixels have a flow that contradicts depth and cameras"
 
-    def _pixels_of(self, frame: DecodedFrame, carried: bool) -> BoolArray:
-        """Return the pixels (H, W) of the labelled instances that the belt carries, or of the others."""
-        width, height = frame.size
-        seen = np.zeros((height, width), dtype=bool)
-        for instance in frame.instances:
-            if self._belt.carries(instance.pose) == carried:
-                seen |= frame.full_mask(instance)
-        return seen
+    def _motions(self, before: DecodedFrame, frame: DecodedFrame) -> Iterator[tuple[BoolArray, Float64Array | None]]:
+        """Yield the pixels (H, W) of labelled instances, and their motion in the world until the next frame.
+
+        The motion is None if the instance has no label in the next frame.
+        """
+        width, height = before.size
+        if "next" in before.record:
+            after = {instance.id: instance.pose for instance in frame.instances}
+            for instance in before.instances:
+                is_known = instance.id in after
+                motion = after[instance.id] @ np.linalg.inv(instance.pose) if is_known else None
+                yield before.full_mask(instance), motion
+            return
+        for carried in (True, False):
+            motion, seen = np.eye(4), np.zeros((height, width), dtype=bool)
+            motion[:3, 3] = self._belt.between(before, frame) if carried else 0.0
+            for instance in before.instances:
+                if self._belt.carries(instance.pose) == carried:
+                    seen |= before.full_mask(instance)
+            yield seen, motion
+
+
+def _has_unlabelled_motion(frame: DecodedFrame) -> bool:
+    """Return True if instances without a label may move until the next frame."""
+    dropped = {reason: count for reason, count in frame.record["labels"]["dropped"].items() if reason != "fragments"}
+    unlabelled = any(not drawn["label"] for drawn in frame.record.get("objects") or ())
+    return "next" in frame.record and (any(dropped.values()) or unlabelled)
 
 
 class PlacementCheck(DatasetCheck):

@@ -660,8 +660,11 @@ def _render_stage(stage: Path, out: Path, times: int | None, overrides: Mapping[
         for note in found.notes:
             typer.echo(note)
         layouts = [Layout.from_poses(found.scene, poses) for poses in found.poses]
-        cameras = [camera for track in found.cameras for camera in track]
-        frames = render_frames(found.scene, layouts=layouts * len(found.cameras), cameras=cameras)
+        # One film per camera; a stage without motion is one film over all cameras.
+        films = found.cameras if len(layouts) > 1 else [[camera for (camera,) in found.cameras]]
+        frames = chain.from_iterable(
+            render_frames(found.scene, layouts=layouts * (len(film) // len(layouts)), cameras=film) for film in films
+        )
         summary = write_frames(found.scene, out, frames, overwrite=overwrite)
         typer.echo(f"dataset: {out} ({summary.rendered} images of {len(layouts)} time codes)")
 

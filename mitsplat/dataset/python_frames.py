@@ -14,6 +14,7 @@ from mitsplat.dataset.write import DatasetSummary, FrameCounts
 from mitsplat.errors import InputError, check_type
 from mitsplat.formats.registry import Catalogue, write_frame
 from mitsplat.frames.frame import Frame
+from mitsplat.frames.sequence import with_successor
 from mitsplat.runtime.device import current_device
 from mitsplat.scene.scene import Scene
 from mitsplat.scene.splits import split_of
@@ -29,7 +30,8 @@ def write_frames(scene: Scene, out: str | Path, frames: Iterable[Frame], *, over
 
     Frames are numbered in the order of the iterable. Each frame counts as a layout of its own, which determines its
     split. The audit compares pictures, labels, layouts and cameras of such a dataset with each other, but not cameras
-    with the scene. An interrupted run cannot be resumed.
+    with the scene. An interrupted run cannot be resumed. A frame has a file of its flow if this leads to the next frame
+    of the iterable, as in a film of :func:`mitsplat.render_frames`.
 
     Args:
         scene: Scene of all frames; image size and formats are in ``scene.spec``.
@@ -39,15 +41,15 @@ def write_frames(scene: Scene, out: str | Path, frames: Iterable[Frame], *, over
 
     Raises:
         InputError: If there are no frames, a frame does not have the scene's image size, or the folder holds other
-            files. Also if flow is among the formats, because flow relates views of one layout.
+            files. Also if flow is among the formats and the scene has a conveyor, whose views the flow relates.
     """
     Scene.check(scene)
     if not isinstance(frames, Iterable):
         raise InputError(f"frames must be a list or an iterator of frames (got {type(frames).__name__})")
     out, output = Path(out), scene.spec.output
-    if "flow" in output.formats:
+    if "flow" in output.formats and scene.spec.conveyor is not None:
         raise InputError(
-            "output.formats: flow is not available for frames made in Python, because it "
+            "output.formats: flow is not available for frames made in Python of a scene with a conveyor, because it "
             "relates views of one layout; save frame.flow instead"
         )
     # Each frame is a layout of its own.
@@ -58,7 +60,8 @@ def write_frames(scene: Scene, out: str | Path, frames: Iterable[Frame], *, over
     counts = FrameCounts()
     with open_folder(out, content, scene.path, None, resume=False, overwrite=overwrite) as manifest:
         append_run(out, 1, device)
-        for index, frame in enumerate(frames):
+        pairs = with_successor(frames) if "flow" in output.formats else ((frame, None) for frame in frames)
+        for index, (frame, following) in enumerate(pairs):
             check_type(frame, Frame, f"frame {index}", "render it by mitsplat.render_frame or mitsplat.render_frames")
             if frame.image.shape[:2] != (output.height, output.width):
                 height, width = frame.image.shape[:2]
@@ -68,16 +71,28 @@ def write_frames(scene: Scene, out: str | Path, frames: Iterable[Frame], *, over
             split = split_of(index, output.validation, output.test)
             # The camera's pose and lens contain all drawn values except the motion.
             motion = {name: value for name, value in frame.plan.viewpoint.items() if name == "motion"}
+            is_film = following is not None and _leads_to(frame, following)
+            next_camera = frame.plan.next_camera if is_film else None
             plan = replace(
-                frame.plan, index=index, layout=index, view=0, split=split, next_camera=None, viewpoint=motion
+                frame.plan, index=index, layout=index, view=0, split=split, next_camera=next_camera, viewpoint=motion
             )
             layout = replace(frame.layout, index=index)
             with storage_errors(out):
                 write_text(out / f"layouts/{index:04d}.json", json.dumps(layout.to_json()))
                 record = write_frame(replace(frame, plan=plan), out, scene.spec, catalogue, custom_layout=True)
+                if is_film:
+                    record["next"] = index + 1
             append_line(out / TIMINGS, {"index": index, **{k: round(v, 4) for k, v in frame.seconds.items()}})
             manifest.append(record)
         if not len(manifest):
             raise InputError("frames must have at least one frame (got none)")
         finish_folder(out, manifest, content, catalogue, counts.add)
         return counts.summary(out, rendered=len(manifest))
+
+
+def _leads_to(frame: Frame, following: Frame) -> bool:
+    """Return True if the flow of a frame leads to another frame: to its camera and its poses."""
+    camera, layout = frame.plan.next_camera, frame.next_layout or frame.layout
+    if camera is None or camera.to_json() != following.camera.to_json():
+        return False
+    return bool(layout.to_json()["instances"] == following.layout.to_json()["instances"])

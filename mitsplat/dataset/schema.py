@@ -228,6 +228,7 @@ class _Record(_Stored):
     empty: bool = False
     left_out: list[_LeftOut] = []
     order_error: _OrderError | None = None
+    next: Count | None = None
 
 
 def read_content(root: Path) -> JsonObject:

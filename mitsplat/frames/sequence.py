@@ -90,7 +90,7 @@ def render_frames(
                 yield renderer.render(index, lights=lights)
             return
         shots = zip(indices, _one_per_frame(layouts), _one_per_frame(cameras), strict=False)
-        for shot, following in _with_progress_bar(_with_successor(shots), total, progress):
+        for shot, following in _with_progress_bar(with_successor(shots), total, progress):
             index, layout, camera = shot
             next_layout, next_camera = (None, None) if following is None else _next_view(scene, shot, following)
             frame = renderer.render(
@@ -123,7 +123,7 @@ def _one_per_frame(given: Item | Iterable[Item] | None) -> Iterator[Item | None]
     return iter(given) if isinstance(given, Iterable) else itertools.repeat(given)
 
 
-def _with_successor(items: Iterable[Item]) -> Iterator[tuple[Item, Item | None]]:
+def with_successor(items: Iterable[Item]) -> Iterator[tuple[Item, Item | None]]:
     """Pair every item with its successor; None for the last one."""
     rest = iter(items)
     now = next(rest, None)

@@ -6,6 +6,7 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -18,6 +19,8 @@ from mitsplat.scene.layout import Layout
 from mitsplat.scene.scene import Scene
 from mitsplat.scene.spec.camera_spec import Motion
 from mitsplat.scene.spec.scene_spec import FORMATS
+from mitsplat.scene.spec.shape_spec import Conveyor
+from mitsplat.scene.splits import split_of
 from tests.conftest import BOTH, small_scene
 from tests.drawn import large_boxes
 
@@ -86,6 +89,26 @@ def test_invalid_given_frames_are_refused_in_one_sentence(scene: Scene, frames: 
     with pytest.raises(InputError, match="frame 0: must be of the scene's 64x48 px"):
         write_frames(scene, tmp_path / "wide", film(scene, 1, width=80))
     output = scene.spec.output.model_copy(update={"formats": ("flow",)})
-    flowing = replace(scene, spec=scene.spec.model_copy(update={"output": output}))
-    with pytest.raises(InputError, match="flow is not available for frames made in Python"):
+    belt = Conveyor(belt="belt", speed=0.1, interval=0.1)
+    flowing = replace(scene, spec=scene.spec.model_copy(update={"output": output, "conveyor": belt}))
+    with pytest.raises(InputError, match="flow is not available for frames made in Python of a scene with a conveyor"):
         write_frames(flowing, tmp_path / "flow", frames)
+
+
+def test_the_flow_of_a_film_is_written_and_audited(scene: Scene, frames: list, tmp_path: Path) -> None:
+    """Flow leads to the next frame of the dataset: not from the last one, nor to a frame of another film."""
+    output = scene.spec.output.model_copy(update={"formats": ("flow", "exr")})
+    scene = replace(scene, spec=scene.spec.model_copy(update={"output": output}))
+    aside = Camera.look_at((0.02, -0.05, 0.5), (0, 0, 0), width=64, height=48, fov_x=40)
+    (other,) = render_frames(scene, layouts=[frames[0].layout], cameras=aside, quality="fast", progress=False)
+    out = write_frames(scene, tmp_path / "out", [*frames, other]).path
+    files = [f"flow/{split_of(n, output.validation, output.test)}/{n:06d}.flo" for n in range(4)]
+    assert [(out / file).is_file() for file in files] == [True, True, False, False]
+    assert list(audit_dataset(out).violations) == []
+    records = [json.loads(line) for line in (out / "manifest.jsonl").read_text().splitlines()]
+    assert [record.get("next") for record in records] == [1, 2, None, None]
+    # A flow in which the nut stands still contradicts the poses of the manifest.
+    flow = cv2.readOpticalFlow(str(out / files[0]))
+    assert np.abs(flow[frames[0].instance == frames[0].layout.instances[0].id, 0]).min() > 0.5
+    cv2.writeOpticalFlow(str(out / files[0]), np.where(np.abs(flow) < 1e9, 0, flow).astype(np.float32))
+    assert any("have a flow that contradicts depth and cameras" in text for _, text in audit_dataset(out).violations)

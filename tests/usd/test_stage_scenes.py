@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import cv2
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -139,7 +140,10 @@ def test_time_samples_of_poses_become_a_sequence_with_stable_ids(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     write_moving_balls(tmp_path / "balls.usda")
-    assert run("render", tmp_path / "balls.usda", "-o", tmp_path / "out", "--size", "80x60", "--format", "bop") == 0
+    assert (
+        run("render", tmp_path / "balls.usda", "-o", tmp_path / "out", "--size", "80x60", "--format", "bop,exr,flow")
+        == 0
+    )
     printed = capsys.readouterr().out
     assert "not imported: 1 sets of time samples of visibility (/World/still)" in printed
     assert "not imported: 1 sets of time samples of inputs:intensity (/World/light)" in printed
@@ -148,6 +152,12 @@ def test_time_samples_of_poses_become_a_sequence_with_stable_ids(
     assert "(3 images of 3 time codes)" in printed
     assert run("audit", tmp_path / "out") == 0
     records = [json.loads(line) for line in (tmp_path / "out/manifest.jsonl").read_text().splitlines()]
+    # The ball moves by 0.1 m and the camera by 0.05 m: 80 px 0.05 / depth, in the mean around the axis of its turn,
+    # which is at (34.7, 30).
+    (file,) = (name for name in records[0]["files"] if name.startswith("flow/"))
+    flow = cv2.readOpticalFlow(str(tmp_path / "out" / file))
+    np.testing.assert_allclose(flow[29:31, 34:36].mean(axis=(0, 1)), (80 * 0.05 / 0.72, 0.0), atol=0.4)
+    assert [any(name.startswith("flow/") for name in record["files"]) for record in records] == [True, True, False]
     # Time codes 2, 4 and 6; a focal length of 80 px, and centres of balls 0.76 m below the camera.
     for record, x in zip(records, (-0.1, 0.0, 0.1), strict=True):
         found = {one["class"]: one for one in record["labels"]["instances"]}

@@ -203,6 +203,9 @@ def _decode_ply(data: bytes) -> SplatArrays:
     if len(scale_names) == 2:
         scales = np.hstack([scales, _FLAT_THICKNESS * scales.min(axis=1, keepdims=True)])
     if _FILTER in names:
+        if not (least := float(rows[_FILTER].min(initial=0.0))) >= 0:
+            cause = "; are they logarithms?" if least < 0 else ""
+            raise InputError(f"{_FILTER} must be standard deviations of at least 0 (got {least:.3g}){cause}")
         scales, opacities = merge_filter(scales, opacities, rows[_FILTER])
     # SH coefficients are channel-major: all of red, then green, then blue.
     higher = columns_of(rows, rest_names).reshape(len(rows), 3, rest // 3).transpose(0, 2, 1)

@@ -136,6 +136,14 @@ def test_the_3d_filter_is_convolved_with_the_gaussians(tmp_path: Path) -> None:
     assert again.kernel == "mip"
 
 
+@pytest.mark.parametrize(("value", "got"), [(-4.6, r"-4\.6\); are they logarithms"), (np.nan, r"nan\)$")])
+def test_filters_that_are_no_deviations_are_refused(tmp_path: Path, value: float, got: str) -> None:
+    splats = random_splats(50)
+    (tmp_path / "a.ply").write_bytes(ply_of(splats, columns={"filter_3D": np.full(50, value, dtype=np.float32)}))
+    with pytest.raises(InputError, match=rf"filter_3D must be standard deviations of at least 0 \(got {got}"):
+        Splats.load(tmp_path / "a.ply")
+
+
 def test_a_filter_of_zero_changes_nothing() -> None:
     splats = random_splats(10)
     scales, opacities = merge_filter(splats.scales, splats.opacities, np.zeros(10, np.float32))

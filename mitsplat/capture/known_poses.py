@@ -46,6 +46,7 @@ class _Lens(BaseModel):
     model_config = ConfigDict(allow_inf_nan=False)
 
     camera_angle_x: _Positive | None = None
+    camera_angle_y: _Positive | None = None
     fl_x: _Positive | None = None
     fl_y: _Positive | None = None
     cx: float | None = None
@@ -58,7 +59,11 @@ class _Lens(BaseModel):
     k4: float = 0.0
     p1: float = 0.0
     p2: float = 0.0
+    k5: float = 0.0
+    k6: float = 0.0
+    distortion_params: list[float] = []
     camera_model: str = "OPENCV"
+    is_fisheye: bool = False
 
 
 _MIN_CENTRE = 0.25
@@ -276,14 +281,16 @@ def _camera(lens: _Lens, width: int, height: int, pose: np.ndarray[tuple[int, ..
         raise ValueError(
             f"camera_model must be OPENCV, OPENCV_FISHEYE or PINHOLE (got {lens.camera_model}): undistort the photos"
         )
-    focal = lens.fl_x
+    if lens.k5 or lens.k6 or any(lens.distortion_params):
+        raise ValueError("has distortion in k5, k6 or distortion_params, which are not read: state k1, k2, k3, p1, p2")
+    focal, focal_y = lens.fl_x, lens.fl_y
     if focal is None:
         if lens.camera_angle_x is None:
             raise ValueError("needs fl_x or camera_angle_x")
-        if not 0 < lens.camera_angle_x < np.pi:
-            raise ValueError(f"camera_angle_x must be 0 to pi radians (got {lens.camera_angle_x:g}: is it in degrees?)")
-        focal = 0.5 * width / np.tan(0.5 * lens.camera_angle_x)
-    fisheye = lens.camera_model == "OPENCV_FISHEYE"
+        focal = _focal(width, lens.camera_angle_x, "camera_angle_x")
+        if focal_y is None and lens.camera_angle_y is not None:
+            focal_y = _focal(height, lens.camera_angle_y, "camera_angle_y")
+    fisheye = lens.camera_model == "OPENCV_FISHEYE" or lens.is_fisheye  # as instant-ngp states it
     if lens.k4 and not fisheye:
         raise ValueError(f"k4 belongs to camera_model OPENCV_FISHEYE (got {lens.camera_model})")
     distortion = (lens.k1, lens.k2, lens.p1, lens.p2) + ((lens.k3,) if lens.k3 else ())
@@ -294,13 +301,20 @@ def _camera(lens: _Lens, width: int, height: int, pose: np.ndarray[tuple[int, ..
         width=width,
         height=height,
         fx=float(focal),
-        fy=float(lens.fl_y or focal),
+        fy=float(focal_y or focal),
         cx=0.5 * width if lens.cx is None else lens.cx,
         cy=0.5 * height if lens.cy is None else lens.cy,
         world_from_camera=pose,
         distortion=distortion if fisheye or any(distortion) else (),
         lens="fisheye" if fisheye else "opencv",
     )
+
+
+def _focal(size: float, angle: float, key: str) -> float:
+    """Return the focal length [px] of a field of view [rad] of ``size`` pixels."""
+    if not 0 < angle < np.pi:
+        raise ValueError(f"{key} must be 0 to pi radians (got {angle:g}: is it in degrees?)")
+    return float(0.5 * size / np.tan(0.5 * angle))
 
 
 def _size(camera: Camera) -> tuple[int, int]:

@@ -10,6 +10,7 @@ import struct
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -174,6 +175,21 @@ def test_fisheye_cameras_are_read_from_colmap_and_transforms_json(tmp_path: Path
         np.testing.assert_allclose(camera.project([[np.tan(angle), 0, 1]])[0], pixel, atol=1e-9)
 
 
+def test_lenses_of_instant_ngp_are_read(tmp_path: Path) -> None:
+    """It states a fisheye lens by ``is_fisheye``, and may state both fields of view instead of focal lengths."""
+    frame = {"file_path": "a.png", "transform_matrix": np.eye(4).tolist()}
+    path = tmp_path / "transforms.json"
+
+    def read(lens: dict[str, Any]) -> Camera:
+        path.write_text(json.dumps(lens | {"w": 640, "h": 480, "frames": [frame]}))
+        return poses._read_transforms(path, poses._parse_transforms(path), {})[0].cameras["a.png"]
+
+    fisheye = read({"fl_x": 300, "k1": 0.02, "k2": 0.003, "is_fisheye": True})
+    assert (fisheye.lens, fisheye.distortion) == ("fisheye", (0.02, 0.003, 0.0, 0.0))
+    pinhole = read({"camera_angle_x": 2 * np.arctan(320 / 600), "camera_angle_y": 2 * np.arctan(240 / 500)})
+    assert (pinhole.fx, pinhole.fy) == pytest.approx((600, 500))
+
+
 @pytest.mark.parametrize(
     ("lens", "sentence"),
     [
@@ -181,10 +197,14 @@ def test_fisheye_cameras_are_read_from_colmap_and_transforms_json(tmp_path: Path
         ({"fl_x": 900, "cx": 640, "cy": 480}, "cx, cy = 640, 480 must be near the middle of the photo of 640 x 480 px"),
         ({"fl_x": 900, "cx": 640, "cy": 480, "w": 1280, "h": 960}, ""),
         ({"fl_x": 450, "cx": 300, "cy": 250}, ""),
+        ({"fl_x": 450, "k5": 0.1}, "has distortion in k5, k6 or distortion_params, which are not read"),
+        ({"fl_x": 450, "distortion_params": [0.1, 0, 0, 0, 0, 0]}, "has distortion in k5, k6 or distortion_params"),
+        ({"fl_x": 450, "k5": 0, "distortion_params": [0, 0]}, ""),
+        ({"camera_angle_x": 0.8, "camera_angle_y": 40}, "camera_angle_y must be 0 to pi radians (got 40"),
     ],
 )
 def test_intrinsics_of_another_image_size_or_unit_are_refused(
-    tmp_path: Path, lens: dict[str, float], sentence: str
+    tmp_path: Path, lens: dict[str, Any], sentence: str
 ) -> None:
     """Photos of 640 x 480 px may have cameras that hold for 1280 x 960 px, if the file states it."""
     frame = {"file_path": "a.png", "transform_matrix": np.diag([1.0, -1.0, -1.0, 1.0]).tolist()}

@@ -425,7 +425,8 @@ def _coco_part(root: Path, split: Split, path: Path, content: dict[str, Any], pr
             for key, known in (("image_id", by_image), ("category_id", index)):
                 if annotation[key] not in known:
                     raise InputError(
-                        f"{path}: annotation {annotation.get('id')}: {key} must be in the file (got {annotation[key]})"
+                        f"{path}: annotation {annotation.get('id')}: {key} must be in the file (got "
+                        f"{annotation[key]!r})"
                     )
             by_image[annotation["image_id"]].append(annotation)
     except (KeyError, TypeError) as error:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import warnings
+
 import numpy as np
 
 from mitsplat.findings import Finding
@@ -26,7 +28,9 @@ def check_exposure(scene: Scene) -> Finding:
     """
     camera = plan_frame(scene, 0).camera
     camera = camera.resized(WIDTH, max(1, round(WIDTH * camera.height / camera.width)))
-    frame = render_frame(scene, 0, quality="fast", layout=_placed_objects(scene), camera=camera)
+    with warnings.catch_warnings():  # of a view without objects, which another check reports
+        warnings.simplefilter("ignore")
+        frame = render_frame(scene, 0, quality="fast", layout=_placed_objects(scene), camera=camera)
     surfaces = frame.image[frame.layers.alpha > 0.5]
     if not len(surfaces):
         return Finding("exposure", True, "the first view shows no surface")

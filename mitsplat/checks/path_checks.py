@@ -27,6 +27,7 @@ from mitsplat.reconstruct.registration import measure_offset
 from mitsplat.reconstruct.segment_splats import find_floaters, long_needles, visible_area
 from mitsplat.scene.loading.scene_loading import load_scene
 from mitsplat.scene.planning.frame_plan import plan_frame
+from mitsplat.scene.planning.view_diagnosis import pose_cause
 from mitsplat.scene.scene import Scene
 from mitsplat.scene.spec.named_files import environments, object_assets
 from mitsplat.scene.spec.scene_spec import BACKDROP, SceneSpec
@@ -334,6 +335,9 @@ def _check_view(scene: Scene) -> Finding:
     where = "a region" if len(middles) > 1 else "the region"
     text = f"{len(views) - len(blind)} of {len(views)} views show the middle of {where}"
     remedy = f"turn the camera there: `mitsplat preview --frame {blind[0] if blind else 0}` shows one that does not"
+    if blind and getattr(scene.spec.camera, "world_from_camera", None) is not None:
+        camera = plan_frame(scene, blind[0]).camera
+        remedy = pose_cause(camera, middles.min(axis=0), middles.max(axis=0)) or remedy
     return Finding("visibility", len(blind) * 2 <= len(views), text, remedy)
 
 

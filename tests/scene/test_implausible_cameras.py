@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 
 import mitsplat as ms
+from mitsplat.checks.exposure_check import check_exposure
+from mitsplat.checks.path_checks import _check_view
 from mitsplat.dataset.preflight import label_faults, scene_warnings
 from mitsplat.geometry.camera import look_at_pose
 from mitsplat.scene.planning.lens_warnings import lens_warnings
@@ -173,3 +175,22 @@ def test_a_given_camera_that_sees_nothing_is_reported_once(
                 renderer.render(0, layout=layout, camera=ms.Camera(*lens, POSE @ FLIP))
         assert len(caught) == 1
         renderer.render(0, layout=layout, camera=ms.Camera(*lens, POSE))
+
+
+def test_an_inverted_pose_that_sees_a_corner_of_the_region_is_reported(
+    scene_data: dict[str, Any], write_scene: WriteScene
+) -> None:
+    """The camera with the right pose looks at the middle; the inverse sees part of the region, but no object."""
+    tilt = np.radians(35)
+    right = np.eye(4)
+    right[:3, :3] = [[1, 0, 0], [0, -np.cos(tilt), -np.sin(tilt)], [0, np.sin(tilt), -np.cos(tilt)]]
+    right[:3, 3] = 0, 0.42, 0.6
+    found = {}
+    for name, pose in (("right", right), ("inverse", np.linalg.inv(right))):
+        camera = {"kind": "fixed", "world_from_camera": pose.tolist()}
+        scene = ms.load_scene(write_scene(scene_data | {"camera": camera}, f"{name}.yaml"))
+        assert list(label_faults(scene, [0])) == []
+        found[name] = _check_view(scene)
+    assert (found["right"].ok, found["inverse"].ok) == (True, False)
+    assert found["inverse"].remedy == "is its matrix the inverse, camera_from_world?"
+    check_exposure(scene)  # without a warning of Python, which would be an error here

@@ -13,7 +13,7 @@ from typing import BinaryIO
 
 import numpy as np
 
-from mitsplat.arrays import Float32Array
+from mitsplat.arrays import Float32Array, Float64Array
 from mitsplat.errors import InputError
 from mitsplat.gaussians.spherical_harmonics import encode_sh
 from mitsplat.gaussians.splat_cloud import Splats
@@ -115,10 +115,7 @@ def _read_primitive(data: GltfData, primitive: JsonObject, left_out: set[str]) -
     if compressed is not None:
         arrays, kernel = decode_spz(bytes(data.view(compressed["bufferView"])))
         splats = Splats(**arrays._asdict(), kernel=kernel)
-        if _has_axes_of_gltf(data, primitive, splats.means):
-            left_out.add("the axes of SPZ, because the bounds of positions are those without a conversion")
-        else:
-            splats = splats.transformed(GLTF_FROM_SPZ)
+        splats = splats.transformed(_gltf_from_spz(data, primitive, splats.means, left_out))
         means, quats, scales = splats.means, splats.quats, splats.scales
         opacities, sh = splats.opacities, splats.sh
     else:
@@ -139,20 +136,29 @@ def _read_primitive(data: GltfData, primitive: JsonObject, left_out: set[str]) -
     return Splats(means[visible], quats[visible], scales[visible], opacities[visible], sh[visible], kernel=kernel)
 
 
-def _has_axes_of_gltf(data: GltfData, primitive: JsonObject, means: Float32Array) -> bool:
-    """Return True if the bounds of ``POSITION`` are those of SPZ data without a conversion, and only those."""
-    if "POSITION" not in primitive.get("attributes", {}) or not len(means):
-        return False
-    accessor = data.entry("accessors", primitive["attributes"]["POSITION"])
-    if "min" not in accessor or "max" not in accessor:
-        return False
+def _gltf_from_spz(data: GltfData, primitive: JsonObject, means: Float32Array, left_out: set[str]) -> Float64Array:
+    """Return the transform (4, 4) from the axes of SPZ data to those of glTF, which the bounds of ``POSITION`` confirm.
+
+    CesiumJS and other programs write and read data without this transform; then the bounds are those of the data.
+    """
+    index = primitive.get("attributes", {}).get("POSITION")
+    accessor = {} if index is None else data.entry("accessors", index)
+    if not len(means) or "min" not in accessor or "max" not in accessor:
+        return GLTF_FROM_SPZ
     stated = np.array([accessor["min"], accessor["max"]], dtype=np.float64)
     tolerance = _SPZ_STEP + 1e-3 * np.abs(stated).max()
 
-    def fits(positions: Float32Array) -> bool:
+    def fit(matrix: Float64Array) -> bool:
+        positions = means @ matrix[:3, :3].T
         return bool(np.abs([positions.min(axis=0), positions.max(axis=0)] - stated).max() <= tolerance)
 
-    return fits(means) and not fits(means @ GLTF_FROM_SPZ[:3, :3].astype(np.float32))
+    if fit(GLTF_FROM_SPZ):
+        return GLTF_FROM_SPZ
+    if fit(np.eye(4)):
+        left_out.add("the axes of SPZ, because the bounds of positions are those without a conversion")
+        return np.eye(4)
+    left_out.add("the bounds of positions, which contradict the SPZ data; objects may be turned by 180 degrees")
+    return GLTF_FROM_SPZ
 
 
 def _spherical_harmonics(data: GltfData, primitive: JsonObject) -> Float32Array:

@@ -135,16 +135,23 @@ def test_axes_of_compressed_splats_follow_the_bounds_of_their_positions(
     bounds = np.sort([low * (-1, 1, -1), high * (-1, 1, -1)], axis=0)  # without a turn by 180 degrees
     accessor["min"], accessor["max"] = bounds.tolist()
     document["extensionsRequired"].append("KHR_materials_unlit")
-    text = json.dumps(document).encode()
-    text += b" " * (-len(text) % 4)
-    rest = content[20 + length :]
-    header = struct.pack("<4sIIII", b"glTF", 2, 20 + len(text) + len(rest), len(text), 0x4E4F534A)
-    (tmp_path / "b.glb").write_bytes(header + text + rest)
-    found, turned = read_gltf_splats(tmp_path / "a.glb"), read_gltf_splats(tmp_path / "b.glb")
+
+    def save(path: Path) -> Path:
+        text = json.dumps(document).encode()
+        text += b" " * (-len(text) % 4)
+        rest = content[20 + length :]
+        header = struct.pack("<4sIIII", b"glTF", 2, 20 + len(text) + len(rest), len(text), 0x4E4F534A)
+        path.write_bytes(header + text + rest)
+        return path
+
+    found, turned = read_gltf_splats(tmp_path / "a.glb"), read_gltf_splats(save(tmp_path / "b.glb"))
     np.testing.assert_allclose(turned.means, found.means * (-1, -1, 1), atol=1e-7)
     np.testing.assert_allclose(covariances(turned), covariances(found) * np.outer((-1, -1, 1), (-1, -1, 1)), atol=1e-7)
     assert "b.glb: not read: the axes of SPZ" in caplog.text
     assert "a.glb" not in caplog.text
+    accessor["min"], accessor["max"] = [-1.0] * 3, [1.0] * 3
+    np.testing.assert_array_equal(read_gltf_splats(save(tmp_path / "c.glb")).means, found.means)
+    assert "c.glb: not read: the bounds of positions, which contradict the SPZ data" in caplog.text
 
 
 def test_files_that_cannot_be_read_are_refused_in_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

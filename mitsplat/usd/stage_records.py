@@ -40,6 +40,12 @@ _MEMORY_PER_BYTE = 60
 _SECONDS = 600
 _MAX_SIZE = 8 << 30
 _MAX_IMAGE_SIZE = 1 << 28
+_LIGHT_INPUTS = (
+    *("intensity", "exposure", "color", "enableColorTemperature", "colorTemperature", "normalize"),
+    *("width", "height", "radius", "angle", "shaping:cone:angle"),
+)
+"""Inputs of lights that are read; those of dome lights are others."""
+_DOME_INPUTS = ("texture:file", "texture:format")
 _ROUND_SEGMENTS = 64
 
 
@@ -315,7 +321,7 @@ class _StageReader:
 
     def _gprim(self, prim: Usd.Prim, found: Record) -> None:
         """Add the record of a geometric prim: a collider, and a mesh if it is rendered."""
-        from pxr import UsdGeom, UsdPhysics  # optional
+        from pxr import UsdGeom, UsdPhysics, UsdShade  # optional
 
         triangles = self._triangles(prim)
         if triangles is None:
@@ -327,6 +333,15 @@ class _StageReader:
         colour = UsdGeom.Gprim(prim).GetDisplayColorAttr().Get(self._time)
         record["colour"] = list(colour[0]) if colour else None
         record["visible"] = purpose in (UsdGeom.Tokens.default_, UsdGeom.Tokens.render)
+        if record["visible"]:
+            scheme = prim.GetAttribute("subdivisionScheme")
+            for what, is_found in (
+                ("materials of visible prims", UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()[0]),
+                ("colours after the first of a prim", colour and len(colour) > 1),
+                ("subdivisions", scheme and scheme.HasAuthoredValue() and scheme.Get() != UsdGeom.Tokens.none),
+            ):
+                if is_found:
+                    self._ignored[what].append(str(prim.GetPath()))
         if prim.HasAPI(UsdPhysics.CollisionAPI) and UsdPhysics.CollisionAPI(prim).GetCollisionEnabledAttr().Get():
             approximation = "convexHull"
             if prim.IsA(UsdGeom.Mesh):
@@ -389,14 +404,18 @@ class _StageReader:
         """Return the record of a light with the inputs that UsdLux defines for its type, and the bytes of its image."""
         from pxr import UsdGeom  # optional
 
-        inputs = {
-            attribute.GetName().removeprefix("inputs:"): _plain(attribute.Get(self._time))
-            for attribute in prim.GetAttributes()
-            if attribute.GetName().startswith("inputs:")
-        }
+        inputs, is_dome = {}, str(prim.GetTypeName()).startswith("DomeLight")
+        for attribute in prim.GetAttributes():
+            name, value = attribute.GetName().removeprefix("inputs:"), attribute.Get(self._time)
+            if name == attribute.GetName():
+                continue
+            inputs[name] = _plain(value)
+            is_default = value == prim.GetPrimDefinition().GetAttributeFallbackValue(attribute.GetName())
+            if name not in (*_LIGHT_INPUTS, *(_DOME_INPUTS if is_dome else ())) and not is_default:
+                self._ignored[f"values of {attribute.GetName()}"].append(str(prim.GetPath()))
         record = self._base(prim) | {"type": str(prim.GetTypeName()), "inputs": inputs}
         record["point"] = bool(self._value(prim, "treatAsPoint"))
-        if inputs.get("texture:file"):
+        if is_dome and inputs.get("texture:file"):
             record["image"] = self._file(prim, "inputs:texture:file")
             pole = self._value(prim, "poleAxis") or "Y"
             record["pole"] = UsdGeom.GetStageUpAxis(self._stage) if pole == "scene" else pole

@@ -27,7 +27,7 @@ from tests.usd.test_simulated_frames import INDEX, folder  # noqa: F401 - a fixt
 from tests.usd.test_usd_assets import new_stage
 
 pxr = pytest.importorskip("pxr", reason="needs OpenUSD: pip install 'mitsplat[usd]'")
-from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdPhysics, UsdRender, UsdSemantics, UsdVol, Vt  # noqa: E402
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdPhysics, UsdRender, UsdSemantics, UsdShade, UsdVol, Vt  # noqa: E402
 
 RADIUS = 0.04
 
@@ -170,6 +170,30 @@ def test_time_samples_of_poses_become_a_sequence_with_stable_ids(
         turned = np.radians(450 * x)
         np.testing.assert_allclose(pose[:3, 3], (x, 0, RADIUS), atol=1e-6)
         np.testing.assert_allclose(pose[:2, 0], (np.cos(turned), np.sin(turned)), atol=1e-6)
+
+
+def test_values_of_lights_and_appearances_of_shapes_that_are_not_read_are_named(tmp_path: Path) -> None:
+    write_balls(tmp_path / "balls.usda")
+    stage = Usd.Stage.Open(str(tmp_path / "balls.usda"))
+    before = read_stage_scene(tmp_path / "balls.usda", tmp_path / "before").notes
+    light = UsdLux.LightAPI(stage.GetPrimAtPath("/World/light"))
+    light.CreateDiffuseAttr(0.5)
+    light.CreateSpecularAttr(1.0)  # the default
+    UsdLux.RectLight(light.GetPrim()).CreateTextureFileAttr("./window.png")
+    table = UsdGeom.Mesh.Get(stage, "/World/table")
+    table.CreateDisplayColorAttr([(0.3, 0.2, 0.1), (0.1, 0.2, 0.3)])
+    table.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.catmullClark)
+    material = UsdShade.Material.Define(stage, "/World/wood")
+    UsdShade.MaterialBindingAPI.Apply(table.GetPrim()).Bind(material)
+    stage.Save()
+    added = set(read_stage_scene(tmp_path / "balls.usda", tmp_path / "after").notes) - set(before)
+    assert added == {
+        "not imported: 1 values of inputs:diffuse (/World/light)",
+        "not imported: 1 values of inputs:texture:file (/World/light)",
+        "not imported: 1 colours after the first of a prim (/World/table)",
+        "not imported: 1 subdivisions (/World/table)",
+        "not imported: 1 materials of visible prims (/World/table)",
+    }
 
 
 def test_the_first_of_several_classes_counts_and_the_others_are_named(tmp_path: Path) -> None:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import trimesh
@@ -56,10 +56,13 @@ def shape_motion(shape: Shape, mesh: trimesh.Trimesh, seed: int, layout: int) ->
     return motion
 
 
-def placed_shapes(scene: Scene, layout: int) -> Iterator[PlacedShape]:
-    """Iterate over the shapes that a layout has."""
+@lru_cache(maxsize=2)
+def placed_shapes(scene: Scene, layout: int) -> tuple[PlacedShape, ...]:
+    """Return the shapes that a layout has, the last layouts from a cache."""
+    placed = []
     for number, (shape, stated) in enumerate(zip(scene.spec.shapes, scene.shape_meshes, strict=True)):
         if is_present(shape, scene.spec.seed, layout):
             motion = shape_motion(shape, stated, scene.spec.seed, layout)
             mesh = stated.copy().apply_transform(motion) if shape.is_jittered else stated
-            yield PlacedShape(number, shape, stated, mesh, motion)
+            placed.append(PlacedShape(number, shape, stated, mesh, motion))
+    return tuple(placed)

@@ -212,7 +212,7 @@ def read_model(
         parts.append(_place(part, to_world @ part.transform, finish))
     parts = [part for part in parts if len(part.mesh.faces)]
     if not file.parts:
-        raise InputError(f"{source}: a mesh needs at least one face (got none)")
+        raise InputError(f"{source}: a mesh needs at least one face (got none; is the file complete?)")
     if not sum(float(part.mesh.area) for part in parts) > 0:
         raise InputError(f"{source}: a mesh needs faces that have an area (got none)")
     warnings = [*file.warnings]

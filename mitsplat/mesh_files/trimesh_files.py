@@ -7,6 +7,7 @@ without ``Ks``, ``Pr`` and ``Pm``, or with ``illum`` 0 or 1, is matt.
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
 import io
 import re
@@ -293,13 +294,25 @@ def _read_collada_asset(path: Path) -> tuple[float | None, Axis | None]:
             parents += 1 if event == "start" else -1
             if event == "end" and kind == "asset" and parents == 1:
                 unit, axis = element.find(f"{_NAMESPACE}unit"), element.find(f"{_NAMESPACE}up_axis")
-                units = units if unit is None else float(unit.get("meter", "1"))
+                units = units if unit is None else _length(unit.get("meter", "1"))
                 up = up if axis is None else (axis.text or "").strip()
                 break
     if up not in ("X_UP", "Y_UP", "Z_UP"):
         raise ValueError(f"up_axis must be X_UP, Y_UP or Z_UP (got {up})")
     axes: dict[str, Axis] = {"X_UP": "x", "Y_UP": "y", "Z_UP": "z"}
     return units, axes[up]
+
+
+def _length(text: str) -> float:
+    """Return a length [m].
+
+    Raises:
+        ValueError: If it is not a number above 0.
+    """
+    with contextlib.suppress(ValueError):
+        if 0 < (length := float(text)) < np.inf:
+            return length
+    raise ValueError(f"meter of its unit must be a number above 0 (got {text})")
 
 
 def check_textures(mesh: Path) -> None:

@@ -153,6 +153,21 @@ def test_units_and_up_axis_of_collada_are_used(
     assert read_model(tmp_path / "a.dae", metres_per_unit=0.5, up="z").units == 0.5
 
 
+@pytest.mark.parametrize("meter", ["0", "-1", "nan", "1,5"])
+def test_a_collada_unit_that_is_no_length_is_refused(tmp_path: Path, meter: str) -> None:
+    pytest.importorskip("collada", reason="needs pycollada, which reads COLLADA")
+    (tmp_path / "a.dae").write_text(collada(f'<unit meter="{meter}"/>'))
+    with pytest.raises(InputError, match=rf"meter of its unit must be a number above 0 \(got {meter}\)"):
+        read_model(tmp_path / "a.dae")
+
+
+def test_a_truncated_stl_is_refused_with_its_likely_cause(tmp_path: Path) -> None:
+    content = trimesh.creation.box((0.06, 0.06, 0.06)).export(file_type="stl")
+    (tmp_path / "a.stl").write_bytes(content[:-100])
+    with pytest.raises(InputError, match=r"a\.stl: a mesh needs at least one face \(got none; is the file complete\?"):
+        read_parts(tmp_path / "a.stl")
+
+
 @pytest.mark.parametrize("is_coloured", [False, True])
 def test_colours_of_stl_files_are_reported(tmp_path: Path, is_coloured: bool) -> None:
     """The two bytes after each face hold its colour in different ways (VisCAM, Magics)."""

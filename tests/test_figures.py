@@ -284,7 +284,7 @@ def test_every_benchmark_records_its_figures() -> None:
     assert len(scripts) > 25
     # Scripts for detector data and sample meshes, of Blender, clients and gausscam, scripts that start others, a chart.
     others = {"arranged.py", "meshes.py", "sample_meshes.py", "blender_scene.py", "client_readers.py"}
-    others |= {"__main__.py", "chart.py", "live_gausscam.py"}
+    others |= {"__main__.py", "chart.py", "live_gausscam.py", "blender_photos.py"}
     assert {path.name for path in scripts if "with recording(" not in path.read_text()} == others
 
 

@@ -5,7 +5,8 @@
     python -m benchmarks.detector WORK --weights FILE.pt         # all arms and seeds, in parallel
 
 WORK is the output of ``benchmarks.detector.material``, with arms in ``arms.yaml``; with ``--plan workshop.yaml``, it is
-that of ``benchmarks.detector.workshop``, with arms in the plan. Photographs show a few scenes under several lights. An
+that of ``benchmarks.detector.workshop``, with arms in the plan; ``--plan cycles.yaml`` evaluates the same trainings on
+the photographs of ``benchmarks.detector.cycles_photos``. Photographs show a few scenes under several lights. An
 arm that is trained on photographs is trained once for each fold of scenes, on the other scenes, and evaluated on the
 fold; detections of all folds are evaluated together. Precision is also computed for samples of scenes, drawn with
 replacement and equal for every arm, which give intervals of an arm and of differences.
@@ -45,8 +46,9 @@ SAMPLES = 200
 
 
 def read_arms(plan: Path = PLAN) -> dict[str, Any]:
-    """Read ``arms.yaml``, or another plan beside it."""
-    return dict(YAML(typ="safe").load((HERE / plan).read_text()))
+    """Read ``arms.yaml``, or another plan beside it; its entries replace those of the plan that it is ``like``."""
+    said = dict(YAML(typ="safe").load((HERE / plan).read_text()))
+    return read_arms(Path(said["like"])) | said if "like" in said else said
 
 
 def scenes_of(arm: Mapping[str, Any]) -> list[str]:
@@ -108,6 +110,11 @@ def folds_of(plan: Mapping[str, Any], arm: str) -> list[set[int]]:
     return folds if plan["arms"][arm].get("real") else [set().union(*folds)]
 
 
+def photos_of(plan: Mapping[str, Any]) -> str:
+    """Return the folder of WORK with a plan's photographs."""
+    return str(plan.get("photos", "photos"))
+
+
 def scene_of(image: str) -> int:
     """Return the scene of a photograph, from its name."""
     found = re.search(r"scene_(\d+)_", image)
@@ -116,10 +123,10 @@ def scene_of(image: str) -> int:
     return int(found[1])
 
 
-def photographs(work: Path, scenes: set[int], name: str) -> Path:
-    """Write a COCO folder of the photographs of some scenes."""
-    folder = work / name
-    with (work / "photos" / "labels.json").open() as file:
+def photographs(work: Path, scenes: set[int], name: str, photos: str = "photos") -> Path:
+    """Write a COCO folder of the photographs of some scenes, from another folder of WORK."""
+    folder = work / (name if photos == "photos" else f"{name}_{photos}")
+    with (work / photos / "labels.json").open() as file:
         labels = json.load(file)
     labels["images"] = [image for image in labels["images"] if scene_of(image["file_name"]) in scenes]
     kept = {image["id"] for image in labels["images"]}
@@ -129,7 +136,7 @@ def photographs(work: Path, scenes: set[int], name: str) -> Path:
         fcntl.flock(lock, fcntl.LOCK_EX)
         for image in labels["images"]:
             if not (folder / image["file_name"]).exists():
-                shutil.copy(work / "photos" / image["file_name"], folder)
+                shutil.copy(work / photos / image["file_name"], folder)
         write_text(folder / "labels.json", json.dumps(labels))
     return folder
 
@@ -245,7 +252,7 @@ def train_fold(options: argparse.Namespace, plan: Mapping[str, Any], number: int
     real = None
     if arm.get("real"):
         folds = folds_of(plan, options.arm)
-        real = photographs(work, set().union(*folds) - folds[number], f"without_fold_{number}")
+        real = photographs(work, set().union(*folds) - folds[number], f"without_fold_{number}", photos_of(plan))
     run = work / "runs" / f"{options.arm}-{options.seed}-{number}"
     # Without rendered images, photographs are the training set, and not an addition.
     return train_detector(rendered or [real], run, settings, real=real if rendered else None)
@@ -255,7 +262,7 @@ def measure(options: argparse.Namespace) -> None:
     """Train an arm for all folds, and evaluate it."""
     plan, work = read_arms(options.plan), options.work
     folds = folds_of(plan, options.arm)
-    everything = photographs(work, set().union(*folds), "all_photos")
+    everything = photographs(work, set().union(*folds), "all_photos", photos_of(plan))
     size = plan["arms"][options.arm].get("test_size", plan["test_size"])
     detections, truth = [], {}
     for number, fold in enumerate(folds):
@@ -267,7 +274,8 @@ def measure(options: argparse.Namespace) -> None:
         detections += [
             one for one in json.loads((found.path / "detections.json").read_text()) if one["image_id"] in judged
         ]
-    out = work / "found" / f"{options.arm}-{options.seed}.json"
+    suffix = "" if photos_of(plan) == "photos" else f"-{photos_of(plan)}"
+    out = work / "found" / f"{options.arm}-{options.seed}{suffix}.json"
     out.parent.mkdir(exist_ok=True)
     out.write_text(json.dumps([one for one in detections if one["score"] >= 0.01]))
     for name, (strict, loose) in scores_of_merged(truth, detections, plan.get("merged", {})).items():

@@ -68,18 +68,22 @@ def photograph_workshops(options: argparse.Namespace) -> None:
     if not assets.exists():
         shutil.copytree(ROOT / "scenes/assets", assets)
     names = sorted(path.parent.name for path in assets.glob("*/asset.yaml") if path.parent.name != "workcell")
-    images: list[dict[str, Any]] = []
-    annotations: list[dict[str, Any]] = []
+    shots: list[dict[str, Any]] = []
     for number in range(options.scenes):
         stored = photos / f".scene_{number:04d}.json"
         if not stored.exists():
             stored.write_text(json.dumps(photograph_workshop(number, names, options)))
-        for shot in json.loads(stored.read_text()):
-            image = len(images)
-            images.append({"id": image, **shot["image"]})
-            annotations += [
-                {"id": len(annotations) + k, "image_id": image, **one} for k, one in enumerate(shot["objects"])
-            ]
+        shots += json.loads(stored.read_text())
+    write_labels(photos, names, shots)
+
+
+def write_labels(photos: Path, names: Sequence[str], shots: Sequence[dict[str, Any]]) -> None:
+    """Write the COCO file of photographs, and record their number and that of their labels."""
+    images: list[dict[str, Any]] = []
+    annotations: list[dict[str, Any]] = []
+    for image, shot in enumerate(shots):
+        images.append({"id": image, **shot["image"]})
+        annotations += [{"id": len(annotations) + k, "image_id": image, **one} for k, one in enumerate(shot["objects"])]
     categories = [{"id": k, "name": name} for k, name in enumerate(names, 1)]
     labels = {"images": images, "annotations": annotations, "categories": categories}
     (photos / "labels.json").write_text(json.dumps(labels))
@@ -133,10 +137,15 @@ def settled(work: Path, number: int, *, poured: bool) -> list[tuple[str, np.ndar
         "output": {"width": 64, "height": 48, "layouts": 1, "views": 1},
         "seed": 1000 + number,
     }
+    return settle_parts(work, scene)
+
+
+def settle_parts(work: Path, scene: dict[str, Any]) -> list[tuple[str, np.ndarray]]:
+    """Return names of the parts of a scene's first layout, and their poses, shape (4, 4) [m]."""
     path = work / "layout.yaml"
     with path.open("w") as file:
         YAML(typ="safe").dump(scene, file)
-    loaded = load_scene(path)
+    loaded = load_scene(path, allow_outside=True)
     layout = settle_layout(loaded, 0)
     return [(loaded.assets[one.asset].name, np.array(one.world_from_object)) for one in layout.instances]
 
@@ -236,23 +245,28 @@ def labelled(
 ) -> list[dict[str, Any]]:
     """Return COCO annotations of the parts that are sufficiently visible, sampled at pixel centres."""
     seen = nearest_object(camera, room, things)
-    objects = []
+    objects: list[dict[str, Any]] = []
     for number, ((name, _), parts) in enumerate(zip(lying, things, strict=True), 1):
-        pixels, whole = seen == number, np.count_nonzero(nearest_object(camera, (), [parts]))
-        if whole == 0 or pixels.sum() < max(LEAST_SEEN * whole, 16):
-            continue
-        outline = coco_mask.encode(np.asfortranarray(pixels.astype(np.uint8)))
-        objects.append(
-            {
-                "category_id": names.index(name) + 1,
-                "segmentation": outline | {"counts": outline["counts"].decode()},
-                "bbox": coco_mask.toBbox(outline).tolist(),
-                "area": int(pixels.sum()),
-                "iscrowd": 0,
-                "visible_fraction": round(float(pixels.sum() / whole), 3),
-            }
-        )
+        whole = np.count_nonzero(nearest_object(camera, (), [parts]))
+        objects += annotation(seen == number, whole, names.index(name) + 1)
     return objects
+
+
+def annotation(pixels: np.ndarray, whole: int, category: int) -> list[dict[str, Any]]:
+    """Return the COCO annotation of a part's visible pixels (H, W), or nothing if too few of ``whole`` are visible."""
+    if whole == 0 or pixels.sum() < max(LEAST_SEEN * whole, 16):
+        return []
+    outline = coco_mask.encode(np.asfortranarray(pixels.astype(np.uint8)))
+    return [
+        {
+            "category_id": category,
+            "segmentation": outline | {"counts": outline["counts"].decode()},
+            "bbox": coco_mask.toBbox(outline).tolist(),
+            "area": int(pixels.sum()),
+            "iscrowd": 0,
+            "visible_fraction": round(float(pixels.sum() / whole), 3),
+        }
+    ]
 
 
 if __name__ == "__main__":

@@ -319,7 +319,9 @@ def develop(light: np.ndarray, view: Mapping[str, Any], target: Path) -> None:
     image = bpy.data.images.new("photo", width, height, float_buffer=True)
     image.colorspace_settings.name = "Linear Rec.709"
     image.pixels.foreach_set(pixels[::-1].ravel().astype(np.float32))
-    image.save_render(str(target), scene=scene)
+    unfinished = target.with_suffix(".part.jpg")
+    image.save_render(str(unfinished), scene=scene)
+    unfinished.rename(target)
     bpy.data.images.remove(image)
 
 

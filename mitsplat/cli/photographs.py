@@ -240,10 +240,8 @@ def capture(
         typer.echo(f"rejected: {name}: {reason}")
     for warning in result.warnings:
         typer.echo(f"warning: {warning}")
-    typer.echo(
-        f"capture: {out} ({len(found.photos)} of {result.given} photos, {len(found.points)} points, "
-        f"{result.reprojection_error:.2f} px)"
-    )
+    points = f"{len(found.points)} points" + (f", {result.reprojection_error:.2f} px" if len(found.points) else "")
+    typer.echo(f"capture: {out} ({len(found.photos)} of {result.given} photos, {points})")
     scale = "in metres" if found.units == "metre" else "in unknown units"
     error = "" if found.scale_error is None else f" ± {found.scale_error:.2%}"
     typer.echo(f"frame: {scale}{error}, {'z up' if found.up == 'z' else 'up unknown'}, by {result.source}")

@@ -175,6 +175,24 @@ def test_fisheye_cameras_are_read_from_colmap_and_transforms_json(tmp_path: Path
         np.testing.assert_allclose(camera.project([[np.tan(angle), 0, 1]])[0], pixel, atol=1e-9)
 
 
+def test_cameras_that_no_point_confirms_are_reported(tmp_path: Path) -> None:
+    """Three photos of unrelated noise have no common points."""
+    (tmp_path / "photos").mkdir()
+    frames = []
+    for number in range(3):
+        noise = np.random.default_rng(number).integers(40, 220, (9, 12, 3)).astype(np.uint8)
+        Image.fromarray(noise).resize((96, 72)).save(tmp_path / f"photos/{number}.png")
+        pose = np.eye(4)
+        pose[:3, 3] = 0.1 * number, 0, 1
+        frames.append({"file_path": f"photos/{number}.png", "transform_matrix": pose.tolist()})
+    (tmp_path / "transforms.json").write_text(json.dumps({"camera_angle_x": 0.7, "frames": frames}))
+    settings = CaptureSettings(kind="environment", poses=tmp_path / "transforms.json")
+    result = capture_photos(tmp_path / "photos", tmp_path / "out", settings)
+    assert not len(result.capture.points)
+    (warning,) = result.warnings
+    assert warning.startswith("no point is seen alike by two photos with the cameras given, which may be wrong")
+
+
 def test_lenses_of_instant_ngp_are_read(tmp_path: Path) -> None:
     """It states a fisheye lens by ``is_fisheye``, and may state both fields of view instead of focal lengths."""
     frame = {"file_path": "a.png", "transform_matrix": np.eye(4).tolist()}

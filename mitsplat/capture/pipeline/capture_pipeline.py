@@ -171,7 +171,12 @@ class CaptureResult:
             warnings.append(
                 f"cameras agree with few of their matches and may be wrong; remove these photos or add others: {shares}"
             )
-        if self.weak:
+        if not len(self.capture.points):
+            warnings.append(
+                "no point is seen alike by two photos with the cameras given, which may be wrong: are they of these "
+                "photos, and in the axes of their format (transforms.json: y up, z backwards)?"
+            )
+        elif self.weak:
             warnings.append(f"few matched points; add photos with more overlap: {', '.join(self.weak)}")
         return tuple(warnings)
 

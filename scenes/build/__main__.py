@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import time
+from dataclasses import replace
 from pathlib import Path
 
 # isort: off
@@ -29,7 +30,7 @@ ENVIRONMENT = "workcell"
 def bake_part(name: str, seed: int) -> BakeResult:
     """Bake one object with its materials."""
     part, pieces = build_part(name, seed)
-    return bake_asset(
+    result = bake_asset(
         part,
         name=name,
         density=PARTS[name][1],
@@ -37,6 +38,7 @@ def bake_part(name: str, seed: int) -> BakeResult:
         pieces=pieces,
         settings=BakeSettings(gaussians=16000, seed=seed),
     )
+    return replace(result, asset=replace(result.asset, restitution=0.6))
 
 
 def bake_environment(seed: int) -> BakeResult:

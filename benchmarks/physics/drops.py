@@ -1,4 +1,6 @@
-"""Resting poses of single parts on a table: ``python -m benchmarks.physics.drops [--drops N] [--processes N]``.
+"""Resting poses of single parts on a table: ``python -m benchmarks.physics.drops [--drops N] [--steppers S ...]``.
+
+Warp takes several times as long as the others; ``--steppers mujoco reference`` leaves it out.
 
 A cube, coins of several ratios of height to diameter, and the shipped parts fall 0.05 to 0.25 m from random poses, with
 both steppers and with MuJoCo's own time stepping as a reference. A part rests flat or on edge if the symmetry axis of
@@ -11,7 +13,8 @@ Bouncing Ball"). It does not wait for rest.
 Published values: a coin that does not rebound and falls in a random pose rests on edge with the probability
 h / sqrt(h^2 + d^2) (Yong and Mahadevan, 2011, "Probability, geometry, and dynamics in the toss of a thick coin"). With
 rebounds, thin coins do so more rarely: an American nickel (h/d = 0.09) in one of about 6000 tosses (Murray and Teare,
-1993, "Probability of a tossed coin landing on edge").
+1993, "Probability of a tossed coin landing on edge"), and a coin of h/d = 1 in half of the tosses (Hernández-Navarro
+and Piñero, 2022, "Exact face-landing probabilities for bouncing objects").
 """
 
 from __future__ import annotations
@@ -23,6 +26,7 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import combinations
 from multiprocessing import get_context
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -46,9 +50,10 @@ if TYPE_CHECKING:
 ASSETS = Path(__file__).resolve().parents[2] / "scenes/assets"
 STEPPERS = ("warp", "mujoco", "reference")
 RATIOS = (0.09, 0.2, 0.35, 0.5, 0.75, 1.0)
+PUBLISHED = {0.09: (1 / 6000, "Murray and Teare"), 1.0: (0.5, "Hernández-Navarro and Piñero")}  # with rebounds
 DIAMETER = 0.025
 BATCH = 20
-CHUNK = 10  # batches that a process makes with one simulation
+CHUNK = 5  # batches that a process makes with one simulation
 SPACING = 0.5
 TIMESTEP, MAX_TIME = 0.002, 8.0
 REFERENCE_STEP, REFERENCE_TIME, CONTACT_TIME = 0.0005, 3.0, 0.003
@@ -186,21 +191,21 @@ def drop_reference(batch: Batch) -> tuple[Float64Array, int]:
     return found, int((np.abs(data.qvel.reshape(-1, 6)[:, :3]).max(axis=1) > 0.05).sum())
 
 
-def batches_of(names: Sequence[str], drops: int, restitution: float) -> Iterator[Batch]:
+def batches_of(names: Sequence[str], steppers: Sequence[str], drops: int, restitution: float) -> Iterator[Batch]:
     for part in names:
-        for stepper in STEPPERS:
+        for stepper in steppers:
             for number in range(-(-drops // BATCH)):
                 yield Batch(part, stepper, restitution, number)
 
 
 def show(name: str, up: dict[str, Float64Array], seconds: dict[str, float], moving: dict[str, int]) -> None:
-    """Print and record the shares of one part."""
-    axis, table = make_part(name).axis, []
-    for stepper in STEPPERS:
+    """Print and record the shares of one part with each stepper of ``up``."""
+    axis, table = make_part(name).axis, {}
+    for stepper in up:
         along = np.abs(up[stepper] @ axis)
         flat, edge, count = int((along > 0.9).sum()), int((along < 0.3).sum()), len(along)
         interval = binomtest(edge, count).proportion_ci(method="wilson")
-        table.append([flat, edge, count - flat - edge])
+        table[stepper] = [flat, edge, count - flat - edge]
         each = seconds[stepper] / count
         text = f"{name:18} {stepper:9} flat {flat / count:7.2%}  on edge {edge / count:7.2%}"
         text += f" ({interval.low:.2%} to {interval.high:.2%})  other {1 - (flat + edge) / count:7.2%}"
@@ -219,8 +224,8 @@ def show(name: str, up: dict[str, Float64Array], seconds: dict[str, float], movi
             figure(chisquare(counts).pvalue, "", name, stepper, "p of equal faces")
             text += f"  faces {counts.tolist()}, p = {chisquare(counts).pvalue:.3f}"
         print(f"{text}  moving {moving[stepper]}  {each:.3f} CPU s", flush=True)
-    for first, second in (("warp", "mujoco"), ("mujoco", "reference"), ("warp", "reference")):
-        rows = np.array([table[STEPPERS.index(first)], table[STEPPERS.index(second)]])
+    for first, second in combinations(up, 2):
+        rows = np.array([table[first], table[second]])
         rows = rows[:, rows.any(axis=0)]
         p = chi2_contingency(rows).pvalue if rows.shape[1] > 1 else 1.0
         figure(p, "", name, "p", first, second)
@@ -228,13 +233,18 @@ def show(name: str, up: dict[str, Float64Array], seconds: dict[str, float], movi
         ratio = float(name.split()[1])
         expected = ratio / np.hypot(ratio, 1)
         figure(expected, "", name, "edge without rebound")
-        print(f"{name:18} on edge without rebound {expected:.2%} (Yong and Mahadevan)", flush=True)
+        text = f"{name:18} published on edge: {expected:.2%} without rebound (Yong and Mahadevan)"
+        if ratio in PUBLISHED:
+            share, authors = PUBLISHED[ratio]
+            text += f", {share:.2%} with rebounds ({authors})"
+        print(text, flush=True)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("parts", nargs="*", metavar="PART", help=f"all by default: {', '.join(part_names())}")
     parser.add_argument("--drops", type=int, default=200, help="drops of each part with each stepper")
+    parser.add_argument("--steppers", nargs="+", choices=STEPPERS, default=list(STEPPERS))
     parser.add_argument("--processes", type=int, default=1)
     parser.add_argument("--restitution", type=float, default=0.5, help="of parts and table")
     arguments = parser.parse_args()
@@ -243,9 +253,9 @@ def main() -> None:
     seconds: dict[tuple[str, str], float] = defaultdict(float)
     moving: dict[tuple[str, str], int] = defaultdict(int)
     with recording("physics.drops", parser, arguments, ignore=("processes",)):
-        drop_batch(Batch(names[0], "warp", arguments.restitution, 0))  # compiles the kernels once
+        drop_batch(Batch(names[0], arguments.steppers[0], arguments.restitution, 0))  # compiles the kernels once
         with ProcessPoolExecutor(arguments.processes, mp_context=get_context("spawn")) as pool:
-            batches = batches_of(names, arguments.drops, arguments.restitution)
+            batches = batches_of(names, arguments.steppers, arguments.drops, arguments.restitution)
             for batch, found, spent, moved in pool.map(drop_batch, batches, chunksize=CHUNK):
                 key = batch.part, batch.stepper
                 up[key].append(found)
@@ -254,9 +264,9 @@ def main() -> None:
         for name in names:
             show(
                 name,
-                {stepper: np.concatenate(up[name, stepper]) for stepper in STEPPERS},
-                {stepper: seconds[name, stepper] for stepper in STEPPERS},
-                {stepper: moving[name, stepper] for stepper in STEPPERS},
+                {stepper: np.concatenate(up[name, stepper]) for stepper in arguments.steppers},
+                {stepper: seconds[name, stepper] for stepper in arguments.steppers},
+                {stepper: moving[name, stepper] for stepper in arguments.steppers},
             )
 
 

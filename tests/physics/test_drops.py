@@ -1,0 +1,42 @@
+"""Shares of resting poses of dropped parts, with bounds that a correct share violates with a probability of 1 %."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.stats import binom, chisquare
+
+from benchmarks.physics.drops import BATCH, Batch, drop_batch, make_part
+
+
+def upward(part: str, drops: int, *, restitution: float = 0.5, stepper: str = "mujoco"):
+    """Drop a part and return the upward components of its axes, shape (N, 3)."""
+    batches = [Batch(part, stepper, restitution, number) for number in range(drops // BATCH)]
+    return np.concatenate([drop_batch(batch)[1] for batch in batches])
+
+
+def on_edge(part: str, drops: int, **options):
+    return int((np.abs(upward(part, drops, **options) @ make_part(part).axis) < 0.3).sum())
+
+
+def test_rebounds_keep_coins_off_their_edge():
+    """A coin of h/d = 0.35 that does not rebound rests on edge with h / sqrt(h^2 + d^2), with rebounds more rarely.
+
+    The formula is that of Yong and Mahadevan (2011), "Probability, geometry, and dynamics in the toss of a thick coin".
+    """
+    assert on_edge("coin 0.35", 60) <= binom.ppf(0.01, 60, 0.35 / np.hypot(0.35, 1))
+
+
+@pytest.mark.extended
+@pytest.mark.parametrize(("part", "share"), [("washer", 0.005), ("bearing_6204", 0.05), ("bearing_6206", 0.05)])
+def test_few_round_parts_rest_on_edge(part, share):
+    assert on_edge(part, 400) <= binom.ppf(0.99, 400, share)
+
+
+@pytest.mark.extended
+@pytest.mark.parametrize("stepper", ["mujoco", "warp"])
+def test_cubes_rest_on_each_face_equally_often(stepper):
+    up = upward("cube", 200, stepper=stepper)
+    faces = np.argmax(np.concatenate([up, -up], axis=1), axis=1)
+    assert np.abs(up).max(axis=1).min() > 0.999
+    assert chisquare(np.bincount(faces, minlength=6)).pvalue > 0.01

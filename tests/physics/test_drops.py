@@ -19,8 +19,8 @@ def on_edge(part: str, drops: int, **options):
     return int((np.abs(upward(part, drops, **options) @ make_part(part).axis) < 0.3).sum())
 
 
-def test_rebounds_keep_coins_off_their_edge():
-    """A coin of h/d = 0.35 that does not rebound rests on edge with h / sqrt(h^2 + d^2), with rebounds more rarely.
+def test_coins_that_rebound_rest_on_edge_more_rarely_than_the_formula_without_rebounds():
+    """For coins that do not rebound it is h / sqrt(h^2 + d^2), which is an upper bound here; h/d is 0.35.
 
     The formula is that of Yong and Mahadevan (2011), "Probability, geometry, and dynamics in the toss of a thick coin".
     """

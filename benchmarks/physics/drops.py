@@ -138,11 +138,11 @@ def make_world(part_name: str, stepper: str, restitution: float) -> World:
 
 
 def drop_bodies(batch: Batch) -> tuple[Float64Array, int]:
-    from mitsplat.physics.rest import run_to_rest
+    from mitsplat.physics.rest import FREE_TIME, run_to_rest
 
     world = make_world(batch.part, batch.stepper, batch.restitution)
     world.reset(draw_starts(batch))
-    outcome = run_to_rest(world, max_time=MAX_TIME, bounds=(np.full(3, -50.0), np.full(3, 50.0)))
+    outcome = run_to_rest(world, max_time=MAX_TIME, bounds=(np.full(3, -50.0), np.full(3, 50.0)), free_time=FREE_TIME)
     return outcome.poses[:, :3, :3], len(outcome.causes)
 
 

@@ -222,7 +222,7 @@ def measure_bin(count: int) -> None:
 def measure_rest(count: int) -> None:
     """Drop ten objects once for each of some seeds, without a second draw; then simulate five more seconds."""
     from mitsplat.physics.drop import drop_of
-    from mitsplat.physics.rest import _surface_motion, run_to_rest
+    from mitsplat.physics.rest import FREE_TIME, _surface_motion, run_to_rest
 
     for stepper in STEPPERS:
         drop = drop_of(make_scene(parts(), 2, stepper), lambda text: None)
@@ -231,7 +231,7 @@ def measure_rest(count: int) -> None:
             assets, _ = draw_objects(drop.scene, 0)
             world = drop._world(assets, 1.0)
             world.reset(drop.draw_poses(assets, np.random.default_rng(seed)))
-            outcome = run_to_rest(world, max_time=6.0, bounds=drop._grounds[0].bounds)
+            outcome = run_to_rest(world, max_time=6.0, bounds=drop._grounds[0].bounds, free_time=FREE_TIME)
             if outcome.rejection:
                 print(f"  seed {seed}: {outcome.rejection}")
                 continue

@@ -21,7 +21,7 @@ from mitsplat.geometry.mesh_distance import Clearance, DistanceSurface, PlacedSu
 from mitsplat.physics.contacts import ContactFinder
 from mitsplat.physics.friction import ContactMaterial
 from mitsplat.physics.placement import Item, draw_poses
-from mitsplat.physics.rest import CONTACT_OVERFLOW, RestOutcome, run_to_rest
+from mitsplat.physics.rest import CONTACT_OVERFLOW, FREE_TIME, RestOutcome, run_to_rest
 from mitsplat.physics.worlds import Body, Collider, MujocoWorld, WarpWorld, World, all_pieces
 from mitsplat.progress import Note
 from mitsplat.scene.layout import NO_PHYSICS, Instance, Layout, LeftOut, RestCertificate, UnsettledLayoutError
@@ -47,6 +47,7 @@ _COLLECTION_INTERVAL = 24
 CROWDED = "no room for all"
 _LEFT_OUT_PER_ROUND = 0.1  # share of the objects that is left out per round if they find no room,
 _MAX_LEFT_OUT = 0.5  # and maximum share in total: beyond it, the region is too small
+_FALLING = {"drop", "pile", "scatter"}  # arrangements of random poses
 _POUR_SPEED = 1.0  # speed limit of poured objects [m/s]: at higher speed, heavy objects eject light ones
 # Simulated time for the draws of a layout [s], thirty times that of a typical draw. After it, each rejected draw leaves
 # objects out.
@@ -317,7 +318,16 @@ class Drop:
         free = np.array([pose is None for pose in given])[:, None]
         own = np.asarray(regions)
         bounds = np.where(free, low[own], low.min(axis=0)), np.where(free, high[own], high.max(axis=0))
-        return run_to_rest(world, max_time=settle.max_time, bounds=bounds, fastest=fastest, observe=observe)
+        # Round objects that are put down would roll away without rolling friction.
+        falls = all(self._arrangements[i] in _FALLING for i in regions)
+        return run_to_rest(
+            world,
+            max_time=settle.max_time,
+            bounds=bounds,
+            free_time=FREE_TIME if falls else 0.0,
+            fastest=fastest,
+            observe=observe,
+        )
 
     def _world(self, assets: tuple[int, ...], capacity: float, number: int = 0) -> World:
         """Return the simulation of these assets on a ground; the last one is cached."""

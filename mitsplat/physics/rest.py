@@ -20,8 +20,8 @@ CONTACT_OVERFLOW = "contact buffer overflow"
 # the velocities of resting bodies.
 _REST_MOTION, _REST_TIME = 5e-4, 1.0
 _QUIET_MOTION, _QUIET_TIME = 1e-4, 0.25
-# Time without rolling friction [s], longer than rebounds last. Rolling friction would slow tumbling parts on their rim.
-_FREE_TIME = 1.5
+FREE_TIME = 1.5
+"""Time without rolling friction for bodies that fall in random poses [s], longer than rebounds last."""
 _SPEED_WINDOW = 0.05  # averaging time of the reported speeds [s]
 
 
@@ -52,6 +52,7 @@ def run_to_rest(
     *,
     max_time: float,
     bounds: tuple[Float64Array, Float64Array],
+    free_time: float = 0.0,
     fastest: float = np.inf,
     observe: Callable[[float, Float64Array], None] = lambda time, poses: None,
 ) -> RestOutcome:
@@ -59,17 +60,18 @@ def run_to_rest(
 
     At rest, no surface point moves by 0.5 mm within one second, and by 0.1 mm within its first quarter. After that
     quarter, rolling friction is disabled, because it would let a box balance on its edge. It is also disabled in the
-    first 1.5 s, because discs that tumble on their rim would stop on it.
+    first seconds of bodies that tumble, because discs would stop on their rim.
 
     Args:
         world: Simulation; changed in place.
         max_time: Time limit for coming to rest [s].
         bounds: Corners of the box in which the centres of mass must stay [m], shape (3,) each, or (N, 3) for each body.
+        free_time: Time without rolling friction [s].
         fastest: Speed limit to which faster bodies are slowed down after each advance [m/s].
         observe: Callback that receives the time [s] and the poses (N, 4, 4) after each advance.
     """
     try:
-        return _run_to_rest(world, max_time, bounds, fastest, observe)
+        return _run_to_rest(world, max_time, bounds, free_time, fastest, observe)
     except ContactOverflow:
         refused = _Rejected(CONTACT_OVERFLOW, np.zeros(len(world.bodies), dtype=bool))
     except _Rejected as error:
@@ -89,6 +91,7 @@ def _run_to_rest(
     world: World,
     max_time: float,
     bounds: tuple[Float64Array, Float64Array],
+    free_time: float,
     fastest: float,
     observe: Callable[[float, Float64Array], None],
 ) -> RestOutcome:
@@ -97,7 +100,7 @@ def _run_to_rest(
     since, rest = 0.0, world.poses
     motion = np.zeros(len(world.bodies))
     while world.time - since < _REST_TIME:
-        world.allow_rolling(world.time < _FREE_TIME or world.time - since >= _QUIET_TIME)
+        world.allow_rolling(world.time < free_time or world.time - since >= _QUIET_TIME)
         poses = _advance_within(world, bounds, fastest)
         past.append(poses)
         observe(world.time, poses)

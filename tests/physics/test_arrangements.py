@@ -10,6 +10,7 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
+from mitsplat.asset import Asset
 from mitsplat.dataset.preflight import layout_faults
 from mitsplat.errors import InputError
 from mitsplat.physics.placement import standing_turns
@@ -128,6 +129,19 @@ def test_upright_objects_keep_their_vertical(scene_data, write_scene):
     np.testing.assert_allclose(poses[:, 2, 2], 1.0, atol=1e-4)
     np.testing.assert_allclose(poses[:, 2, 3], 0.025, atol=3e-4)
     assert np.ptp(np.arctan2(poses[:, 1, 0], poses[:, 0, 0])) > 0.5
+
+
+def test_an_upright_ball_does_not_roll_away(scene_data, write_scene, tmp_path):
+    """A ball that is put down has rolling friction from the start."""
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=0.02)
+    Asset(name="ball", class_name="ball", splats=box_asset("ball").splats, mesh=ball, pieces=(ball,)).save(
+        tmp_path / "assets/ball"
+    )
+    scene_data["objects"] = [{"asset": "assets/ball", "count": 2}]
+    _, layout = drop_layout(scene_data, write_scene, settle={"arrangement": "upright", "stepper": "mujoco"})
+    assert len(layout.instances) == 2
+    for one in layout.instances:
+        assert one.world_from_object[2, 2] > np.cos(np.radians(5))
 
 
 def test_packed_objects_stand_in_rows(scene_data, write_scene):

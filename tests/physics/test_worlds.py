@@ -372,9 +372,9 @@ def test_a_box_does_not_balance_on_its_edge(stepper):
 
 
 @pytest.mark.parametrize("stepper", STEPPERS)
-def test_rolling_friction_starts_after_one_and_a_half_seconds(stepper):
+def test_rolling_friction_starts_after_the_free_time(stepper):
     """A rolling cylinder slows down by a = g b / (1.5 r): it would stop within the time v / a and the way v^2 / 2 a."""
-    from mitsplat.physics.rest import run_to_rest
+    from mitsplat.physics.rest import FREE_TIME, run_to_rest
 
     radius, speed, rolling = 0.01, 0.3, 5e-4
     cylinder = trimesh.creation.cylinder(radius=radius, height=0.02, sections=256)
@@ -383,7 +383,7 @@ def test_rolling_friction_starts_after_one_and_a_half_seconds(stepper):
         stepper, [body_of(cylinder, rolling_friction=rolling)], [table()], [pose_at((-0.4, 0, radius), lying)]
     )
     world.set_velocities(np.array([[[speed, 0, 0], [0, speed / radius, 0]]]))
-    outcome = run_to_rest(world, max_time=3.0, bounds=EVERYWHERE)
+    outcome = run_to_rest(world, max_time=3.0, bounds=EVERYWHERE, free_time=FREE_TIME)
     slowing = GRAVITY * rolling / (1.5 * radius)
     assert outcome.poses[0, 0, 3] + 0.4 > 1.5 * speed**2 / (2 * slowing)
     assert 1.5 < outcome.time < 1.5 + speed / slowing

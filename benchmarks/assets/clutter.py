@@ -34,6 +34,7 @@ from mitsplat.capture.capture import Capture, Photo, known_where
 from mitsplat.capture.pipeline.capture_pipeline import CaptureSettings
 from mitsplat.fit.trainer import FitSettings
 from mitsplat.geometry.camera import Camera
+from mitsplat.geometry.rigid import OPENCV_FROM_OPENGL
 from mitsplat.reconstruct.asset_evaluation import iou, show_asset
 from mitsplat.reconstruct.pipeline.asset_pipeline import asset_from_photos
 from mitsplat.reconstruct.reconstruct import AssetJob, ReconstructSettings
@@ -361,7 +362,7 @@ def transforms(views: Mapping[str, Camera]) -> dict[str, Any]:
     """Return cameras in the format of ``transforms.json``."""
     one = next(iter(views.values()))
     frames = [
-        {"file_path": name, "transform_matrix": (camera.world_from_camera @ np.diag([1.0, -1.0, -1.0, 1.0])).tolist()}
+        {"file_path": name, "transform_matrix": (camera.world_from_camera @ OPENCV_FROM_OPENGL).tolist()}
         for name, camera in views.items()
     ]
     return {

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 import mitsplat as ms
-from benchmarks.assets.stages import SCENES, render
+from benchmarks.assets.stages import SCENES, asset_names, render
 from benchmarks.record import figure, recording
 from mitsplat.gltf_splats import export_asset_gltf, read_gltf_splats
 
@@ -27,7 +27,7 @@ def main() -> None:
     parser.add_argument("--only", nargs="+", help="Names of the assets.")
     arguments = parser.parse_args()
     with recording("assets.gltf_splats", parser, arguments), tempfile.TemporaryDirectory() as folder:
-        names = arguments.only or sorted(path.parent.name for path in SCENES.glob("assets/*/asset.yaml"))
+        names = arguments.only or asset_names()
         rows = np.array([errors_of(name, Path(folder) / "splats.glb") for name in names])
         figure(len(names), "", "assets")
         for kind, errors, sizes in (("plain", rows[:, 0], rows[:, 2]), ("spz", rows[:, 1], rows[:, 3])):

@@ -41,7 +41,7 @@ def main() -> None:
     parser.add_argument("--only", nargs="+", help="Names of the assets; without the scene.")
     arguments = parser.parse_args()
     with recording("assets.stages", parser, arguments), tempfile.TemporaryDirectory() as folder:
-        names = arguments.only or sorted(path.parent.name for path in SCENES.glob("assets/*/asset.yaml"))
+        names = arguments.only or asset_names()
         rows = [round_trip(name, Path(folder)) for name in names]
         pictures, masses, inertias, frictions, findings = zip(*rows, strict=True)
         figure(len(names), "", "assets")
@@ -53,6 +53,11 @@ def main() -> None:
             found = simulate_scene(Path(folder))
             findings = (*findings, found)
         figure(sum(findings), "", "validators", "findings")
+
+
+def asset_names() -> list[str]:
+    """Return the names of the shipped assets."""
+    return sorted(path.parent.name for path in SCENES.glob("assets/*/asset.yaml"))
 
 
 def round_trip(name: str, folder: Path) -> tuple[float, float, float, float, int]:

@@ -26,7 +26,7 @@ from mitsplat.physics.worlds import Body, Collider, MujocoWorld, WarpWorld, Worl
 from mitsplat.progress import Note
 from mitsplat.scene.layout import NO_PHYSICS, Instance, Layout, LeftOut, RestCertificate, UnsettledLayoutError
 from mitsplat.scene.planning.contents import draw_objects, draw_regions
-from mitsplat.scene.planning.shape_poses import is_present, shape_motion
+from mitsplat.scene.planning.shape_poses import placed_shapes
 from mitsplat.scene.scene import Scene
 from mitsplat.scene.spec.shape_spec import Shape
 from mitsplat.scene.splits import draw_environment
@@ -366,13 +366,13 @@ class Drop:
         scene, walls = self.scene, []  # positions of the invisible enclosure walls
         colliders: list[Collider] = []
         obstacles: list[PlacedSurface] = []
-        for shape, shape_mesh in zip(scene.spec.shapes, scene.shape_meshes, strict=True):
-            if not shape.collider or (layout is not None and not is_present(shape, scene.spec.seed, layout)):
+        for placed in placed_shapes(scene, layout):
+            shape, motion = placed.shape, placed.motion
+            if not shape.collider:
                 continue
             if not (shape.visible or shape.proxy):
                 walls.append(len(colliders))
-            mesh = prepare_mesh(shape_mesh, f"shape {shape.name!r}")
-            motion = np.eye(4) if layout is None else shape_motion(shape, shape_mesh, scene.spec.seed, layout)
+            mesh = prepare_mesh(placed.stated, f"shape {shape.name!r}")
             collider = make_collider(shape, mesh, progress)
             if shape.is_jittered:
                 collider = collider.moved(motion)

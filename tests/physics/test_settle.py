@@ -367,8 +367,7 @@ def test_objects_rest_on_the_jittered_shape(scene_data, write_scene):
     bounds = ([placed.mesh.bounds[:, :2] for placed in placed_shapes(scene, layout)][1] for layout in range(100))
     below = next(layout for layout, (low, high) in enumerate(bounds) if (low < -0.08).all() and (high > 0.08).all())
     (one,) = settle_layout(scene, below, cached=False).instances
-    heights = scene.assets[one.asset].mesh.vertices @ one.world_from_object[2, :3] + one.world_from_object[2, 3]
-    assert heights.min() == pytest.approx(0.04, abs=5e-4)
+    assert lowest(scene.assets[one.asset].mesh, one.world_from_object) == pytest.approx(0.04, abs=5e-4)
 
 
 def test_objects_rest_on_a_shape_only_in_layouts_that_have_it(scene_data, write_scene):
@@ -382,8 +381,7 @@ def test_objects_rest_on_a_shape_only_in_layouts_that_have_it(scene_data, write_
     counts = [len(list(placed_shapes(scene, layout))) for layout in range(20)]
     for layout, height in ((counts.index(1), 0.0), (counts.index(2), 0.04)):
         (one,) = settle_layout(scene, layout, cached=False).instances
-        heights = scene.assets[one.asset].mesh.vertices @ one.world_from_object[2, :3] + one.world_from_object[2, 3]
-        assert heights.min() == pytest.approx(height, abs=5e-4)
+        assert lowest(scene.assets[one.asset].mesh, one.world_from_object) == pytest.approx(height, abs=5e-4)
 
 
 def test_standoff_of_a_hull_equals_its_closed_form():

@@ -57,8 +57,16 @@ def shape_motion(shape: Shape, mesh: trimesh.Trimesh, seed: int, layout: int) ->
 
 
 @lru_cache(maxsize=2)
-def placed_shapes(scene: Scene, layout: int) -> tuple[PlacedShape, ...]:
-    """Return the shapes that a layout has, the last layouts from a cache."""
+def placed_shapes(scene: Scene, layout: int | None) -> tuple[PlacedShape, ...]:
+    """Return the shapes that a layout has, or all shapes at the places of the scene file; the last ones from a cache.
+
+    Args:
+        scene: The scene.
+        layout: Index of the layout, or None for the scene file.
+    """
+    if layout is None:
+        pairs = enumerate(zip(scene.spec.shapes, scene.shape_meshes, strict=True))
+        return tuple(PlacedShape(number, shape, mesh, mesh, np.eye(4)) for number, (shape, mesh) in pairs)
     placed = []
     for number, (shape, stated) in enumerate(zip(scene.spec.shapes, scene.shape_meshes, strict=True)):
         if is_present(shape, scene.spec.seed, layout):

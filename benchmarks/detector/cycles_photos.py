@@ -41,7 +41,7 @@ from shapely.geometry import MultiPoint
 # isort: on
 from benchmarks.detector.clutter import STEEL, Material, matt, metal
 from benchmarks.detector.interiors import Interior, interior
-from benchmarks.detector.workshop import annotation, settle_parts, write_labels
+from benchmarks.detector.workshop import PLASTIC, WOOD, annotation, settle_parts, write_labels
 from benchmarks.record import ROOT, recording
 from mitsplat.bake.mesh_parts import MeshPart, read_parts
 from mitsplat.capture.lighting.panorama import unit_vector
@@ -183,13 +183,13 @@ def settled(
     """Return names and poses (4, 4) [m] of parts, and the inner size of their bin if they are poured."""
     kind = KINDS[number % 3]
     shapes: list[dict[str, Any]] = [
-        {"name": "bench", "friction": 0.6, "box": {"size": [1.3, 0.76, 0.05], "position": [0, 0, -0.025]}}
+        {"name": "bench", **WOOD, "box": {"size": [1.3, 0.76, 0.05], "position": [0, 0, -0.025]}}
     ]
     bin_size, half = None, np.array([0.2, 0.15])
     if kind == "pile":
         bin_size = tuple(float(value) for value in rng.uniform((0.21, 0.16, 0.045), (0.29, 0.22, 0.07)).round(3))
         half = np.array(bin_size[:2]) / 2 - 0.02
-        shapes.append({"name": "bin", "friction": 0.5, "bin": {"size": list(bin_size), "thickness": 0.004}})
+        shapes.append({"name": "bin", **PLASTIC, "bin": {"size": list(bin_size), "thickness": 0.004}})
     upright = {"arrangement": "upright", "turned_over": 0.4} if number % 2 else {"arrangement": "scatter"}
     scene = {
         "name": "bench",

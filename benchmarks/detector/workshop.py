@@ -45,6 +45,10 @@ from scenes.build import materials as m
 LEAST_SEEN = 0.15
 """Least visible share of a labelled part, as for rendered images."""
 
+WOOD = {"friction": 0.6, "restitution": 0.4}
+PLASTIC = {"friction": 0.5, "restitution": 0.4}
+"""Contact properties of benches and trays."""
+
 
 def main() -> None:
     """Parse the command line."""
@@ -122,10 +126,10 @@ def settled(work: Path, number: int, *, poured: bool) -> list[tuple[str, np.ndar
     """Return names of parts and their poses, shape (4, 4) [m]: dropped on a bench, or poured into a tray."""
     half = 0.12 if poured else 0.2
     shapes: list[dict[str, Any]] = [
-        {"name": "bench", "friction": 0.6, "box": {"size": [1.2, 0.9, 0.05], "position": [0, 0, -0.025]}}
+        {"name": "bench", **WOOD, "box": {"size": [1.2, 0.9, 0.05], "position": [0, 0, -0.025]}}
     ]
     if poured:
-        shapes.append({"name": "tray", "friction": 0.5, "bin": {"size": [0.28, 0.22, 0.05], "thickness": 0.004}})
+        shapes.append({"name": "tray", **PLASTIC, "bin": {"size": [0.28, 0.22, 0.05], "thickness": 0.004}})
     scene = {
         "name": "workshop",
         "shapes": shapes,

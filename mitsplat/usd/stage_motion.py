@@ -1,13 +1,13 @@
-"""Time samples of a USD stage: its time codes, moving prims, and attributes that change.
+"""Time samples of a USD stage: its time codes, moving and hidden prims, and attributes that change.
 
 The images of a stage are one per time code from ``startTimeCode`` to ``endTimeCode``; if the stage states
-``framesPerSecond``, there are as many per second instead. They end at the last sample of a pose. A stage without these
-time codes has those of its samples.
+``framesPerSecond``, there are as many per second instead. They end at the last sample of a pose or visibility. A stage
+without these time codes has those of its samples.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -21,7 +21,7 @@ MAX_TIMES = 10_000
 
 
 def time_codes(stage: Usd.Stage, limit: int | None = None) -> list[float]:
-    """Return the time codes of the images; a stage without moving prims has one.
+    """Return the time codes of the images; a stage without moving prims and changing visibility has one.
 
     Args:
         stage: The stage.
@@ -36,6 +36,8 @@ def time_codes(stage: Usd.Stage, limit: int | None = None) -> list[float]:
     for prim in stage.Traverse(Usd.TraverseInstanceProxies()):
         if prim.IsA(UsdGeom.Xformable) and UsdGeom.Xformable(prim).TransformMightBeTimeVarying():
             found.update(UsdGeom.Xformable(prim).GetTimeSamples())
+        if _is_blinking(prim):
+            found.update(UsdGeom.Imageable(prim).GetVisibilityAttr().GetTimeSamples())
     first, last = min(found, default=0.0), max(found, default=0.0)
     if stage.HasAuthoredTimeCodeRange():
         first, last = stage.GetStartTimeCode(), min(last, stage.GetEndTimeCode())
@@ -63,12 +65,32 @@ def is_moving(prim: Usd.Prim) -> bool:
     return False
 
 
+def visibility(prim: Usd.Prim, times: Sequence[float]) -> list[bool]:
+    """Return the visibility of a prim at time codes: one value if it does not change."""
+    from pxr import UsdGeom  # optional
+
+    def is_visible(time: float) -> bool:
+        return bool(UsdGeom.Imageable(prim).ComputeVisibility(time) != UsdGeom.Tokens.invisible)
+
+    ancestor = prim
+    while ancestor and not _is_blinking(ancestor):
+        ancestor = ancestor.GetParent()
+    return [is_visible(time) for time in (times if ancestor else times[:1])]
+
+
+def _is_blinking(prim: Usd.Prim) -> bool:
+    """Return True if a prim has time samples of its own visibility."""
+    from pxr import UsdGeom  # optional
+
+    return bool(UsdGeom.Imageable(prim) and UsdGeom.Imageable(prim).GetVisibilityAttr().ValueMightBeTimeVarying())
+
+
 def sampled_attributes(prim: Usd.Prim) -> Iterator[str]:
-    """Yield the names of the attributes of a prim that change and are not part of its pose."""
+    """Yield the names of the attributes of a prim that change, except for its pose and visibility."""
     from pxr import UsdGeom  # optional
 
     for attribute in prim.GetAuthoredAttributes():
-        if attribute.ValueMightBeTimeVarying() and not UsdGeom.Xformable.IsTransformationAffectedByAttrNamed(
-            attribute.GetName()
-        ):
-            yield attribute.GetName()
+        name = attribute.GetName()
+        is_read = name == UsdGeom.Tokens.visibility or UsdGeom.Xformable.IsTransformationAffectedByAttrNamed(name)
+        if attribute.ValueMightBeTimeVarying() and not is_read:
+            yield name

@@ -22,7 +22,8 @@ from mitsplat.arrays import Float32Array, Float64Array
 from mitsplat.errors import InputError
 from mitsplat.geometry.rigid import Z_UP_FROM_Y_UP
 from mitsplat.runtime.child_process import run_bounded
-from mitsplat.usd.stage_motion import is_moving, sampled_attributes, time_codes
+from mitsplat.usd.stage_images import image_settings, unread_settings
+from mitsplat.usd.stage_motion import is_moving, sampled_attributes, time_codes, visibility
 from mitsplat.usd.stage_physics import body_dynamics, contact_of, mass_of_colliders
 from mitsplat.usd.usd_layers import open_confined, require_usd
 
@@ -59,7 +60,8 @@ def read_records(path: Path, images: int | None = 1) -> Record:
     Returns:
         Lists of records: ``fields``, ``bodies``, ``colliders``, ``meshes``, ``cameras`` and ``lights``; ``times``, the
         time codes; and ``notes``, one sentence for everything that is not read. A record is that of the first time
-        code. Those of moving prims also have ``motion``, their matrices at all time codes, shape (T, 4, 4).
+        code. Those of moving prims also have ``motion``, their matrices at all time codes, shape (T, 4, 4), and those
+        of objects that appear or disappear have ``shown``, their visibility at all time codes.
 
     Raises:
         InputError: If a file is missing or damaged, lies outside of the stage's folder, or breaks a rule.
@@ -131,32 +133,34 @@ class _StageReader:
 
     def read(self) -> Record:
         """Return the records of all prims."""
-        from pxr import Usd, UsdGeom, UsdLux, UsdPhysics, UsdRender, UsdVol  # optional
+        from pxr import Usd, UsdGeom, UsdLux, UsdPhysics, UsdVol  # optional
 
         found: Record = {key: [] for key in ("fields", "bodies", "colliders", "meshes", "cameras", "lights")}
         for prim in self._stage.Traverse(Usd.TraverseInstanceProxies()):
             for name in sampled_attributes(prim):
                 self._ignored[f"sets of time samples of {name}"].append(str(prim.GetPath()))
-            imageable = UsdGeom.Imageable(prim)
-            if imageable and imageable.ComputeVisibility(self._time) == UsdGeom.Tokens.invisible:
-                if prim.IsA(UsdGeom.Boundable):
-                    self._ignored["invisible prims"].append(str(prim.GetPath()))
-                continue
-            if prim.HasAPI(UsdPhysics.RigidBodyAPI):
+            shown = visibility(prim, self._times) if prim.IsA(UsdGeom.Imageable) else [True]
+            if prim.HasAPI(UsdPhysics.RigidBodyAPI) and any(shown):
                 found["bodies"].append(self._body(prim))
-            if prim.IsA(UsdVol.ParticleField):
+            if prim.IsA(UsdGeom.Camera):  # it takes pictures also if it is invisible itself
+                found["cameras"].append(self._camera(prim))
+            elif not any(shown) and not prim.HasAPI(UsdPhysics.CollisionAPI):
+                if prim.IsA(UsdGeom.Boundable) or prim.HasAPI(UsdLux.LightAPI):
+                    self._ignored["invisible prims"].append(str(prim.GetPath()))
+            elif prim.IsA(UsdVol.ParticleField):
                 if self._is_gaussian(prim):
-                    found["fields"].append(self._field(prim))
+                    self._add_field(prim, shown, found)
                 else:
                     self._ignored["particle fields without Gaussian ellipsoids and SH"].append(str(prim.GetPath()))
-            elif prim.IsA(UsdGeom.Camera):
-                found["cameras"].append(self._camera(prim))
-            elif prim.HasAPI(UsdLux.LightAPI):
-                found["lights"].append(self._light(prim))
             elif prim.IsA(UsdGeom.Gprim):
-                self._gprim(prim, found)
+                self._gprim(prim, found, is_visible=self._is_visible(prim, shown))
+            elif prim.HasAPI(UsdLux.LightAPI):
+                if self._is_visible(prim, shown):
+                    found["lights"].append(self._light(prim))
             elif prim.IsA(UsdGeom.Boundable) or prim.IsA(UsdPhysics.Joint):
                 self._ignored[f"prims of type {prim.GetTypeName()}"].append(str(prim.GetPath()))
+        for what, place in unread_settings(self._stage):
+            self._ignored[what].append(place)
         self._add_motion([record for records in found.values() for record in records])
         found["times"] = self._times
         found["notes"] = [
@@ -166,12 +170,24 @@ class _StageReader:
         for what, found_paths in self._ignored.items():
             paths = list(dict.fromkeys(found_paths))
             found["notes"].append(f"not imported: {len(paths)} {what} ({paths[0]}{', ...' if paths[1:] else ''})")
-        settings = UsdRender.Settings.GetStageRenderSettings(self._stage)
-        found["resolution"] = list(settings.GetResolutionAttr().Get()) if settings else None
-        policy = settings.GetAspectRatioConformPolicyAttr().Get() if settings else None
-        found["stretched"] = policy == "adjustPixelAspectRatio"
         found["default"] = str(self._stage.GetDefaultPrim().GetPath()) if self._stage.GetDefaultPrim() else ""
         return found
+
+    def _is_visible(self, prim: Usd.Prim, shown: list[bool]) -> bool:
+        """Return the visibility of a prim that is no object: that of the first time code."""
+        if any(shown) and not all(shown):
+            self._ignored["changes of the visibility of prims that are no objects"].append(str(prim.GetPath()))
+        return shown[0]
+
+    def _add_field(self, prim: Usd.Prim, shown: list[bool], found: Record) -> None:
+        """Add the record of a particle field, if it is an object or visible at the first time code."""
+        record = self._field(prim)
+        if record["body"] is None and not record["label"]:
+            if not self._is_visible(prim, shown):
+                return
+        elif not all(shown):
+            record["shown"] = shown
+        found["fields"].append(record)
 
     def _assumptions(self) -> Iterator[str]:
         """Yield a note for each unit or axis that the stage does not state."""
@@ -319,8 +335,11 @@ class _StageReader:
                 self._ignored["distributions of a mass over colliders"].append(str(prim.GetPath()))
         return self._base(prim) | record
 
-    def _gprim(self, prim: Usd.Prim, found: Record) -> None:
-        """Add the record of a geometric prim: a collider, and a mesh if it is rendered."""
+    def _gprim(self, prim: Usd.Prim, found: Record, *, is_visible: bool) -> None:
+        """Add the record of a geometric prim: a collider, and a mesh if it is rendered.
+
+        Invisible colliders collide, too.
+        """
         from pxr import UsdGeom, UsdPhysics, UsdShade  # optional
 
         triangles = self._triangles(prim)
@@ -332,7 +351,7 @@ class _StageReader:
         purpose = UsdGeom.Imageable(prim).ComputePurpose()
         colour = UsdGeom.Gprim(prim).GetDisplayColorAttr().Get(self._time)
         record["colour"] = list(colour[0]) if colour else None
-        record["visible"] = purpose in (UsdGeom.Tokens.default_, UsdGeom.Tokens.render)
+        record["visible"] = is_visible and purpose in (UsdGeom.Tokens.default_, UsdGeom.Tokens.render)
         if record["visible"]:
             scheme = prim.GetAttribute("subdivisionScheme")
             for what, is_found in (
@@ -398,7 +417,7 @@ class _StageReader:
         values = {name: float(getattr(camera, f"Get{name}Attr")().Get(self._time)) for name in names}
         if camera.GetProjectionAttr().Get(self._time) != UsdGeom.Tokens.perspective:
             self._ignored["orthographic projections"].append(str(prim.GetPath()))
-        return self._base(prim) | values | {"units": self._units}
+        return self._base(prim) | values | image_settings(self._stage, prim, self._time)
 
     def _light(self, prim: Usd.Prim) -> Record:
         """Return the record of a light with the inputs that UsdLux defines for its type, and the bytes of its image."""

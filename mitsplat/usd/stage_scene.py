@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 import trimesh
-from scipy.spatial import QhullError
+from scipy.spatial.transform import Rotation
 
 from mitsplat.arrays import Float32Array, Float64Array
 from mitsplat.asset import Asset, opaque_core
@@ -32,10 +32,15 @@ from mitsplat.scene.scene import Scene
 from mitsplat.storage.content_hash import ContentHash
 from mitsplat.storage.files import storage_errors, write_text
 from mitsplat.usd.stage_assets import body_frames, make_asset, merge_fields, placed_mesh, rigid_frame
+from mitsplat.usd.stage_images import fit_aperture
 from mitsplat.usd.stage_records import Record, read_records
 
 _WIDTH = 1280
 """Image width of a stage without render settings [px]."""
+_FLATNESS = 1e-3
+"""Thickness of points, relative to their extent, from which they span a volume."""
+_TOLERATED_ASPECT = 1e-3
+"""Difference of the aspect ratios of aperture and image that is not reported, relative to them."""
 _DISTANCE = 100.0
 """Distance at which a distant light is placed [m]."""
 _PICTURES = (".png", ".jpg", ".jpeg", ".bmp")
@@ -50,13 +55,14 @@ class StageScene:
 
     Attributes:
         scene: The scene; its files are in a folder.
-        poses: For each time code, the poses ``world_from_object`` of each asset, by its index.
+        poses: For each time code, the poses ``world_from_object`` of each asset, by its index; None where an object is
+            invisible.
         cameras: For each camera of the stage, that camera at each time code.
         notes: What was not read, one sentence each.
     """
 
     scene: Scene
-    poses: tuple[dict[str | int, list[Float64Array]], ...]
+    poses: tuple[dict[str | int, list[Float64Array | None]], ...]
     cameras: tuple[tuple[Camera, ...], ...]
     notes: tuple[str, ...]
 
@@ -91,7 +97,7 @@ def read_stage_scene(
         raise InputError(f"{path}: must have particle fields with a semantic class, UsdSemantics.LabelsAPI (got none)")
     with storage_errors(folder):
         keys, entries = dict[str, int](), list[dict[str, Any]]()
-        poses: list[dict[str | int, list[Float64Array]]] = [{} for _ in records["times"]]
+        poses: list[dict[str | int, list[Float64Array | None]]] = [{} for _ in records["times"]]
         owners = {record["path"]: record for record in (*records["fields"], *records["bodies"])}
         for group, fields in groups.items():
             asset = _object(path, records, group, fields, frames, notes)
@@ -105,8 +111,11 @@ def read_stage_scene(
                 asset.save(folder / "assets" / name)
                 entries.append({"asset": f"assets/{name}", "label": label is not None, "count": 0})
             entries[keys[key]]["count"] += 1
-            for known, pose in zip(poses, _motion(path, owners[group], records["times"], notes), strict=True):
-                known.setdefault(keys[key], []).append(pose)
+            frames_of_object = _motion(path, owners[group], records["times"], notes)
+            for known, pose, shown in zip(
+                poses, frames_of_object, _shown(group, fields, len(poses), notes), strict=True
+            ):
+                known.setdefault(keys[key], []).append(pose if shown else None)
         data: dict[str, Any] = {"name": path.stem, "objects": entries, "shapes": _shapes(records, folder)}
         if hidden := [one["path"] for one in records["meshes"] if one["visible"] and one["body"] is not None]:
             notes.append(f"not rendered: meshes of rigid bodies; only their splats are: {', '.join(hidden)}")
@@ -122,7 +131,7 @@ def read_stage_scene(
                     data["lights"].append(light)
         cameras = list[tuple[Camera, ...]]()
         for record in records["cameras"]:
-            camera = _camera(path, record, size or records["resolution"], stretched=records["stretched"])
+            camera = _camera(path, record, size or record["resolution"], notes)
             frames_of_camera = _motion(path, record, records["times"], notes)
             cameras.append(
                 tuple(replace(camera, world_from_camera=frame @ OPENCV_FROM_OPENGL) for frame in frames_of_camera)
@@ -185,6 +194,14 @@ def _motion(path: Path, record: Record, times: Sequence[float], notes: list[str]
     return frames
 
 
+def _shown(group: str, fields: Sequence[Record], count: int, notes: list[str]) -> Sequence[bool]:
+    """Return the visibility of an object at each of ``count`` time codes: that of any of its particle fields."""
+    found = {tuple(field.get("shown", [True] * count)) for field in fields}
+    if len(found) > 1:
+        notes.append(f"not imported: the visibility of single particle fields of {group}, which is shown as a whole")
+    return [any(shown) for shown in zip(*found, strict=True)]
+
+
 def _unread_motion(records: Record) -> Iterator[str]:
     """Yield a note for each prim that moves in the world or relative to its body, and that this module keeps in place.
 
@@ -203,10 +220,17 @@ def _unread_motion(records: Record) -> Iterator[str]:
 
 
 def _hull(path: Path, name: str, splats: Splats) -> trimesh.Trimesh:
-    try:
-        return trimesh.convex.convex_hull(opaque_core(splats))
-    except (QhullError, ValueError):
-        raise InputError(f"{path}: {name}: the opaque Gaussians of an object must span a volume") from None
+    """Return the convex hull of the centres of an object's opaque Gaussians.
+
+    If these span no volume, as those of a card, it is that of the ends of the axes of all Gaussians.
+    """
+    axes = splats.scales[:, :, None] * np.swapaxes(Rotation.from_quat(splats.quats).as_matrix(), 1, 2)
+    ends = np.concatenate([(splats.means[:, None] + sign * axes).reshape(-1, 3) for sign in (1, -1)])
+    for points in (opaque_core(splats).astype(np.float64), ends):
+        sizes = np.linalg.svd(points - points.mean(axis=0), compute_uv=False) if len(points) > 3 else np.zeros(3)
+        if sizes[2] > _FLATNESS * sizes[0]:
+            return trimesh.convex.convex_hull(points)
+    raise InputError(f"{path}: {name}: the Gaussians of an object must span a volume")
 
 
 def _environment(path: Path, records: Record, fields: Sequence[Record], notes: list[str]) -> Asset:
@@ -230,23 +254,26 @@ def _shapes(records: Record, folder: Path) -> list[dict[str, Any]]:
     return found
 
 
-def _camera(path: Path, record: Record, size: Sequence[int] | None, *, stretched: bool) -> Camera:
+def _camera(path: Path, record: Record, size: Sequence[int] | None, notes: list[str]) -> Camera:
     """Return a camera of UsdGeom; lengths are in tenths of a unit of the stage.
 
     Args:
         path: The stage, for messages.
         record: Record of the camera.
         size: Width and height of the image [px], or None.
-        stretched: True if the aperture fills the image even if this stretches the image.
+        notes: List to which notes are appended.
     """
-    across, up = record["HorizontalAperture"], record["VerticalAperture"]
-    width, height = size or (_WIDTH, max(1, round(_WIDTH * up / across)))
+    across, up, pixel_aspect = record["HorizontalAperture"], record["VerticalAperture"], record["pixel_aspect"]
+    width, height = size or (_WIDTH, max(1, round(_WIDTH * up * pixel_aspect / across)))
     pose, scale = rigid_frame(path, record)
+    image_aspect = pixel_aspect * width / height
+    if size and abs(image_aspect * up / across - 1) > _TOLERATED_ASPECT:
+        notes.append(
+            f"the aperture of {record['path']} has the aspect ratio {across / up:.3f} and its image "
+            f"{image_aspect:.3f}: fitted by the policy {record['policy']}"
+        )
+    across, up = fit_aperture(across, up, image_aspect, record["policy"])
     fx, fy = width * record["FocalLength"] / across, height * record["FocalLength"] / up
-    if (
-        not stretched and abs(fx / fy - 1) > 1e-3
-    ):  # an aperture of another aspect ratio is extended, as UsdRender defines by default
-        fx = fy = min(fx, fy)
     sensor = 0.1 * scale
     return Camera(
         width=width,

@@ -128,7 +128,7 @@ def write_moving_balls(path: Path) -> None:
         view.Set(looking_down(x / 2), time)
         light.CreateIntensityAttr().Set(time, time)
         height.Set((0, 0, time), time)
-        UsdGeom.Imageable(stage.GetPrimAtPath("/World/still")).CreateVisibilityAttr().Set("inherited", time)
+        light.CreateVisibilityAttr().Set("inherited", time)
     stage.SetStartTimeCode(2)
     stage.SetEndTimeCode(6)
     stage.SetTimeCodesPerSecond(48)
@@ -145,7 +145,6 @@ def test_time_samples_of_poses_become_a_sequence_with_stable_ids(
         == 0
     )
     printed = capsys.readouterr().out
-    assert "not imported: 1 sets of time samples of visibility (/World/still)" in printed
     assert "not imported: 1 sets of time samples of inputs:intensity (/World/light)" in printed
     assert "not imported: the motion of /World/light; it stays as at the first time code" in printed
     assert "not imported: the change of the scale of /World/moving" in printed
@@ -170,6 +169,122 @@ def test_time_samples_of_poses_become_a_sequence_with_stable_ids(
         turned = np.radians(450 * x)
         np.testing.assert_allclose(pose[:3, 3], (x, 0, RADIUS), atol=1e-6)
         np.testing.assert_allclose(pose[:2, 0], (np.cos(turned), np.sin(turned)), atol=1e-6)
+
+
+def test_an_object_leaves_the_images_in_which_the_stage_hides_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_moving_balls(tmp_path / "balls.usda")
+    stage = Usd.Stage.Open(str(tmp_path / "balls.usda"))
+    for path, states in (
+        ("/World/still", ("invisible", "inherited", "inherited")),
+        ("/World/moving/splats", ("inherited", "invisible", "inherited")),
+        ("/World/light", ("inherited", "invisible", "invisible")),
+    ):
+        attribute = UsdGeom.Imageable(stage.GetPrimAtPath(path)).CreateVisibilityAttr()
+        for time, state in zip((2.0, 4.0, 6.0), states, strict=True):
+            attribute.Set(state, time)
+    UsdGeom.Imageable(stage.GetPrimAtPath("/World/camera")).MakeInvisible()  # it takes pictures all the same
+    stage.Save()
+    command = "render", tmp_path / "balls.usda", "-o", tmp_path / "out", "--size", "80x60", "--format", "bop,flow"
+    assert run(*command) == 0
+    assert (
+        "not imported: 1 changes of the visibility of prims that are no objects (/World/light)"
+        in capsys.readouterr().out
+    )
+    assert run("audit", tmp_path / "out") == 0
+    records = [json.loads(line) for line in (tmp_path / "out/manifest.jsonl").read_text().splitlines()]
+    found = [{one["class"]: one["id"] for one in record["labels"]["instances"]} for record in records]
+    assert found == [{"moving": 2}, {"still": 1}, {"still": 1, "moving": 2}]
+
+
+def test_a_stage_in_which_only_the_visibility_changes_is_a_sequence(tmp_path: Path) -> None:
+    write_balls(tmp_path / "balls.usda")
+    stage = Usd.Stage.Open(str(tmp_path / "balls.usda"))
+    attribute = UsdGeom.Imageable(stage.GetPrimAtPath("/World/ball_1")).CreateVisibilityAttr()
+    attribute.Set("inherited", 1.0)
+    attribute.Set("invisible", 2.0)
+    stage.Save()
+    found = read_stage_scene(tmp_path / "balls.usda", tmp_path / "scene")
+    absent = [[pose is None for asset in sorted(poses) for pose in poses[asset]] for poses in found.poses]
+    assert absent == [[False] * 5, [False, True, False, False, False]]
+
+
+def test_invisible_colliders_collide_and_other_invisible_prims_are_named(tmp_path: Path) -> None:
+    stage, rng = new_stage(tmp_path / "ball.usda"), np.random.default_rng(0)
+    UsdPhysics.RigidBodyAPI.Apply(UsdGeom.Xform.Define(stage, "/World/ball").GetPrim())
+    add_ball(stage, "/World/ball/splats", "ball", rng)
+    collider = UsdGeom.Sphere.Define(stage, "/World/ball/collider")
+    collider.CreateRadiusAttr(RADIUS)
+    UsdPhysics.CollisionAPI.Apply(collider.GetPrim())
+    add_camera(stage).AddTransformOp().Set(looking_down(0.0))
+    dome, cover = UsdLux.DomeLight.Define(stage, "/World/dome"), UsdGeom.Cube.Define(stage, "/World/cover")
+    for prim in (collider, dome, cover):
+        prim.MakeInvisible()
+    stage.Save()
+    found = read_stage_scene(tmp_path / "ball.usda", tmp_path / "scene")
+    (asset,) = found.scene.assets
+    assert asset.mesh is not None
+    assert asset.mesh.volume == pytest.approx(4 / 3 * np.pi * RADIUS**3, rel=0.01)
+    assert not any("convex hull" in note for note in found.notes)
+    assert "not imported: 2 invisible prims (/World/dome, ...)" in found.notes
+    assert not found.scene.spec.shapes
+
+
+@pytest.mark.parametrize(
+    ("policy", "expected"),
+    [
+        ("", (90.0, 90.0)),  # expandAperture: the height of 18 fills 90 px, f = 18
+        ("cropAperture", (120.0, 120.0)),  # the width of 18 fills 120 px
+        ("adjustApertureWidth", (90.0, 90.0)),
+        ("adjustApertureHeight", (120.0, 120.0)),
+        ("adjustPixelAspectRatio", (120.0, 90.0)),
+    ],
+)
+def test_a_render_product_states_size_and_fit_of_the_image_of_its_camera(
+    tmp_path: Path, policy: str, expected: tuple[float, float]
+) -> None:
+    write_balls(tmp_path / "balls.usda")
+    stage = Usd.Stage.Open(str(tmp_path / "balls.usda"))
+    camera = UsdGeom.Camera.Get(stage, "/World/camera")
+    for attribute in (camera.GetFocalLengthAttr(), camera.GetHorizontalApertureAttr()):
+        attribute.Set(18.0)
+    stage.GetPrimAtPath("/Render/settings").GetAttribute("resolution").Set(Gf.Vec2i(64, 64))
+    product = UsdRender.Product.Define(stage, "/Render/product")
+    product.CreateCameraRel().SetTargets(["/World/camera"])
+    product.CreateResolutionAttr(Gf.Vec2i(120, 90))
+    product.CreateDataWindowNDCAttr((0, 0, 1, 0.5))
+    if policy:
+        product.CreateAspectRatioConformPolicyAttr(policy)
+    UsdRender.Settings.Define(stage, "/Render/other").CreateResolutionAttr(Gf.Vec2i(8, 8))
+    stage.Save()
+    found = read_stage_scene(tmp_path / "balls.usda", tmp_path / "scene")
+    ((camera_found,),) = found.cameras
+    assert (camera_found.width, camera_found.height) == (120, 90)
+    assert (camera_found.fx, camera_found.fy) == pytest.approx(expected)
+    for note in (
+        "not imported: 1 values of dataWindowNDC (/Render/product)",
+        "not imported: 1 render settings that renderSettingsPrimPath does not name (/Render/other)",
+        "the aperture of /World/camera has the aspect ratio 1.000 and its image 1.333: "
+        f"fitted by the policy {policy or 'expandAperture'}",
+    ):
+        assert note in found.notes
+
+
+def test_the_hull_of_a_single_gaussian_is_that_of_its_axes(tmp_path: Path) -> None:
+    write_balls(tmp_path / "balls.usda")
+    stage = Usd.Stage.Open(str(tmp_path / "balls.usda"))
+    field = UsdVol.ParticleField3DGaussianSplat.Define(stage, "/World/blob")
+    field.CreatePositionsAttr([(0.0, 0.0, 0.2)])
+    field.CreateScalesAttr([(0.03, 0.02, 0.01)])
+    field.CreateOrientationsAttr([Gf.Quatf(0.5**0.5, 0.5**0.5, 0, 0)])  # turns y to z
+    field.CreateRadianceSphericalHarmonicsDegreeAttr(0)
+    UsdSemantics.LabelsAPI.Apply(field.GetPrim(), "class").CreateLabelsAttr(["blob"])
+    stage.Save()
+    found = read_stage_scene(tmp_path / "balls.usda", tmp_path / "scene")
+    (asset,) = (one for one in found.scene.assets if one.class_name == "blob")
+    assert asset.mesh is not None
+    np.testing.assert_allclose(asset.mesh.bounds, [(-0.03, -0.01, 0.18), (0.03, 0.01, 0.22)], atol=1e-6)
 
 
 def test_values_of_lights_and_appearances_of_shapes_that_are_not_read_are_named(tmp_path: Path) -> None:

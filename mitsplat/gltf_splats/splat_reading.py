@@ -1,7 +1,8 @@
 """Reader of Gaussian splats in glTF (Khronos, ``KHR_gaussian_splatting`` and ``..._compression_spz_2``).
 
 Scales and opacities are activated values, quaternions are xyzw, and coefficients of spherical harmonics have the order
-and signs of 3DGS. SPZ data have axes right, up, back, and are converted to those of glTF: left, up, front. Files of
+and signs of 3DGS. Earlier drafts defined logarithms of scales; these are recognised by negative values, which the
+standard forbids. SPZ data have axes right, up, back, and are converted to those of glTF: left, up, front. Files of
 programs that omit this conversion are recognised by the bounds of their positions.
 """
 
@@ -123,6 +124,9 @@ def _read_primitive(data: GltfData, primitive: JsonObject, left_out: set[str]) -
         means = _attribute(data, primitive, "POSITION", 3)
         quats = _attribute(data, primitive, f"{EXTENSION}:ROTATION", 4)
         scales = _attribute(data, primitive, f"{EXTENSION}:SCALE", 3)
+        if scales.min(initial=0.0) < 0:
+            scales = np.exp(scales)
+            left_out.add("negative scales; they are taken for the logarithms of earlier drafts")
         opacities = _attribute(data, primitive, f"{EXTENSION}:OPACITY", 1)[:, 0]
         sh = _spherical_harmonics(data, primitive)
     if space == LINEAR:

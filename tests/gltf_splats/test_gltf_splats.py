@@ -47,12 +47,14 @@ def covariances(splats: Splats) -> np.ndarray:
     return axes @ axes.transpose(0, 2, 1)
 
 
-def one_splat(glb: Glb, sh: np.ndarray, **properties: Any) -> int:
+def one_splat(
+    glb: Glb, sh: np.ndarray, *, scales: tuple[float, float, float] = (0.3, 0.2, 0.1), **properties: Any
+) -> int:
     """Add a mesh with a Gaussian at (1, 2, 3) that is long in x, whose colour has the coefficients (K, 3)."""
     values = {
         "POSITION": (1.0, 2.0, 3.0),
         f"{EXTENSION}:ROTATION": (0.0, 0.0, 0.0, 1.0),
-        f"{EXTENSION}:SCALE": (0.3, 0.2, 0.1),
+        f"{EXTENSION}:SCALE": scales,
         f"{EXTENSION}:OPACITY": (0.75,),
     }
     attributes = {name: glb.accessor(np.array([value], np.float32)) for name, value in values.items()}
@@ -95,6 +97,20 @@ def test_linear_colours_are_encoded(tmp_path: Path) -> None:
     mesh = one_splat(glb, (np.array([[0.2, 0.5, 0.9]]) - 0.5) / SH_C0, colorSpace="lin_rec709_display")
     splats = read_gltf_splats(glb.save(tmp_path / "a.glb", nodes=[{"mesh": mesh}], scenes=[{"nodes": [0]}], scene=0))
     np.testing.assert_allclose(0.5 + SH_C0 * splats.sh[0, 0], encode_srgb(np.array([0.2, 0.5, 0.9])), atol=1e-4)
+
+
+def test_logarithms_of_scales_of_earlier_drafts_are_recognised_by_their_sign(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    for scales, expected in (((0.3, 0.0, 0.1), (0.3, 0.1, 3e-7)), ((-1.0, 0.5, -3.0), np.exp([-1.0, -3.0, 0.5]))):
+        glb = Glb()
+        mesh = one_splat(glb, np.zeros((1, 3)), scales=scales)
+        caplog.clear()
+        found = read_gltf_splats(glb.save(tmp_path / "a.glb", nodes=[{"mesh": mesh}], scenes=[{"nodes": [0]}], scene=0))
+        # In the axes x, y, z of mitsplat, the Gaussian has the scales of x, z, y of the file.
+        np.testing.assert_allclose(np.sqrt(np.diag(covariances(found)[0])), expected, rtol=1e-3)
+        warned = "not read: negative scales; they are taken for the logarithms of earlier drafts" in caplog.text
+        assert warned == (min(scales) < 0)
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])

@@ -27,10 +27,26 @@ _QUARTERS = np.array(
 """Corners of the four parts of a face in its barycentric coordinates."""
 
 
-def cut_out(part: FilePart, alpha: Texture, threshold: float) -> FilePart:
-    """Return a part without the places where a texture of alpha, one channel, is below a threshold.
+_PLAIN = 32
+"""Size of the texture of parts whose colours alone have an opacity [texels]."""
+
+
+def opaque_texture(count: int) -> Texture:
+    """Return an opaque texture of alpha for ``count`` faces, which gives each face a grid of texels."""
+    uv = np.tile([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]], (count, 1, 1))
+    return Texture(np.full((_PLAIN, _PLAIN, 1), 255, dtype=np.uint8), uv)
+
+
+def cut_out(part: FilePart, alpha: Texture, threshold: float, opacity: Float64Array | None = None) -> FilePart:
+    """Return a part without the places where its alpha is below a threshold.
 
     Faces at a border are split until their edges are at most a texel long.
+
+    Args:
+        part: The part.
+        alpha: Texture of alpha times 255, one channel.
+        threshold: Alpha times 255.
+        opacity: Factor of the alpha at the face corners, shape (F, 3), or None for 1.
     """
     owner, corners = np.arange(len(part.faces)), np.tile(np.eye(3), (len(part.faces), 1, 1))
     size = np.array(alpha.pixels.shape[1::-1], dtype=np.float64)
@@ -40,6 +56,8 @@ def cut_out(part: FilePart, alpha: Texture, threshold: float) -> FilePart:
         length = np.linalg.norm((uv - np.roll(uv, 1, axis=1)) * size, axis=2).max(axis=1)
         points = (0.9 * _GRID + 0.1 / 3) @ corners
         values = alpha.at(np.repeat(owner, len(_GRID)), points.reshape(-1, 3)).reshape(len(owner), -1)
+        if opacity is not None:
+            values = values * np.einsum("fgk,fk->fg", points, opacity[owner])
         share = (values >= threshold).mean(axis=1)
         is_last = (length <= _FINE) | (sum(map(len, owners)) + 4 * len(owner) > _MAX_FACES)
         is_last |= (length <= _COARSE) & ((share == 0) | (share == 1))

@@ -17,16 +17,13 @@ import numpy.typing as npt
 from mitsplat.arrays import Float64Array, Int64Array
 
 _KINDS = (b"v", b"vt", b"vn")
-_TO_REWRITE = re.compile(
-    rb"^[ \t]*f[ \t](?:[^\n]*[ \t/])?[-0]|^[ \t]*f(?:[ \t]+[^\s\\]+){4}|^[ \t]*f[^\n]*\\\r?$", re.M
-)
+_TO_REWRITE = re.compile(rb"^f (?:[^\n]*[ /])?[-0]|^f(?: \S+){4}", re.M)
 _FLAT = 1e-6
 """Share of the area of a polygon up to which a reversed triangle of its fan is rounding."""
-_CONTINUATION = re.compile(rb"\\\r?\n")
 
 
 def plain_obj(content: bytes) -> bytes:
-    """Return the content of an OBJ file with absolute indices and triangles in place of polygons.
+    """Return the plain text of an OBJ file with absolute indices and triangles in place of polygons.
 
     Raises:
         ValueError: If a face is damaged or refers to a missing vertex.
@@ -37,8 +34,8 @@ def plain_obj(content: bytes) -> bytes:
     positions: list[list[bytes]] = []
     polygons: list[list[tuple[int, ...]]] = []
     lines: list[bytes | int] = []  # an integer is the number of a polygon
-    for line in _CONTINUATION.sub(b" ", content).splitlines():
-        words = line.partition(b"#")[0].split()
+    for line in content.splitlines():
+        words = line.split()
         if words and words[0] == b"f" and len(words) >= 4:
             lines.append(len(polygons))
             polygons.append([_absolute(word, counts) for word in words[1:]])
@@ -73,9 +70,7 @@ def split_polygons(positions: Float64Array, polygons: Sequence[Any]) -> list[Int
         ValueError: If a polygon has a missing vertex.
     """
     found: list[Int64Array] = [np.zeros((0, 3), dtype=np.int64)] * len(polygons)
-    for numbers, rows in _equal_lengths(polygons):
-        if rows.min() < 0 or rows.max() >= len(positions):
-            raise ValueError(f"a face refers to vertices {rows.min() + 1} to {rows.max() + 1} of {len(positions)}")
+    for numbers, rows in _equal_lengths(polygons, len(positions)):
         second = np.arange(1, rows.shape[1] - 1)
         fan = np.stack([np.zeros_like(second), second, second + 1], axis=1)
         if len(fan) == 2:
@@ -87,16 +82,27 @@ def split_polygons(positions: Float64Array, polygons: Sequence[Any]) -> list[Int
 
 
 def has_concave(positions: Float64Array, polygons: Sequence[Any]) -> bool:
-    """Return True if the fan of a polygon overlaps itself."""
-    return any(_fans(positions, rows)[1].any() for _, rows in _equal_lengths(polygons))
+    """Return True if the fan of a polygon overlaps itself.
+
+    Raises:
+        ValueError: If a polygon has a missing vertex.
+    """
+    return any(_fans(positions, rows)[1].any() for _, rows in _equal_lengths(polygons, len(positions)))
 
 
-def _equal_lengths(polygons: Sequence[Any]) -> Iterator[tuple[Int64Array, Int64Array]]:
-    """Yield the numbers of the polygons of each length, and their vertices (N, length)."""
+def _equal_lengths(polygons: Sequence[Any], count: int) -> Iterator[tuple[Int64Array, Int64Array]]:
+    """Yield the numbers of the polygons of each length, and their vertices (N, length) of ``count``.
+
+    Raises:
+        ValueError: If a polygon has a missing vertex.
+    """
     lengths = np.array([len(one) for one in polygons], dtype=np.int64)
     for length in np.unique(lengths[lengths > 2]):
         numbers = np.nonzero(lengths == length)[0]
-        yield numbers, np.array([polygons[int(number)] for number in numbers], dtype=np.int64)
+        rows = np.array([polygons[int(number)] for number in numbers], dtype=np.int64)
+        if rows.min() < 0 or rows.max() >= count:
+            raise ValueError(f"a face refers to vertices {rows.min() + 1} to {rows.max() + 1} of {count}")
+        yield numbers, rows
 
 
 def _fans(positions: Float64Array, rows: Int64Array) -> tuple[Float64Array, npt.NDArray[np.bool_]]:

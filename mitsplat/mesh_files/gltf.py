@@ -17,13 +17,14 @@ from scipy.spatial.transform import Rotation
 
 from mitsplat.arrays import Float64Array, Int64Array
 from mitsplat.errors import InputError
-from mitsplat.mesh_files.cut_outs import cut_out
+from mitsplat.mesh_files.cut_outs import cut_out, opaque_texture
 from mitsplat.mesh_files.gltf_data import GltfData, normalised
 from mitsplat.mesh_files.mesh_file import (
     DIELECTRIC_SPECULAR,
     LEAST_ROUGHNESS,
     OPAQUE,
     PAINTED_MATERIAL,
+    TRANSPARENT_COLOURS,
     TRANSPARENT_TEXELS,
     UNKNOWN_MATERIAL,
     FilePart,
@@ -104,6 +105,10 @@ class _GltfReader:
 
     def read(self) -> MeshFile:
         """Read all parts of the scene."""
+        scenes = self._data.document.get("scenes", [])
+        if len(scenes) > 1:
+            number = self._data.document.get("scene", 0)
+            self._warnings.append(f"it has {len(scenes)} scenes, of which only scene {number} is read")
         parts = tuple(part for node, pose in self._world_poses.items() for part in self._read_node(node, pose))
         return MeshFile(parts, 1.0, "y", tuple(dict.fromkeys(self._warnings)), in_single=True)
 
@@ -132,6 +137,9 @@ class _GltfReader:
 
     def _skinned(self, skin: JsonObject, primitive: JsonObject, vertices: Float64Array) -> Float64Array:
         """Return vertices (V, 3) in the pose of the joints of a skin."""
+        outside = [joint for joint in skin["joints"] if joint not in self._world_poses]
+        if outside:
+            raise ValueError(f"joint {outside[0]} of a skin is not in the scene")
         poses = np.array([self._world_poses[joint] for joint in skin["joints"]])
         if "inverseBindMatrices" in skin:
             inverse = self._data.accessor(skin["inverseBindMatrices"]).reshape(-1, 4, 4).transpose(0, 2, 1)
@@ -153,19 +161,22 @@ class _GltfReader:
         stored_mesh = self._data.entry("meshes", mesh)
         primitive = stored_mesh["primitives"][number]
         attributes, indices = self._read_arrays(primitive)
-        vertices = attributes["POSITION"].astype(np.float64)
         for target, weight in zip(primitive.get("targets", []), weights, strict=False):
-            if weight and "POSITION" in target:
-                vertices = vertices + weight * self._data.accessor(target["POSITION"])
+            for name in (set(target) & set(attributes)) if weight else ():
+                attributes[name] = normalised(attributes[name]) if name == "COLOR_0" else attributes[name]
+                attributes[name] = attributes[name] + weight * self._data.accessor(target[name]).astype(np.float64)
+        vertices = attributes["POSITION"].astype(np.float64)
         faces = _triangles(indices, primitive.get("mode", _TRIANGLES))
         if len(faces) and not 0 <= faces.min() <= faces.max() < len(vertices):
             raise ValueError(f"a face has vertices {faces.min()} to {faces.max()} of {len(vertices)}")
         name = str(stored_mesh.get("name", f"mesh_{mesh}"))
         self._names[name] = self._names.get(name, -1) + 1
         name = f"{name}_{self._names[name]}" if self._names[name] else name
-        colours = None
+        colours, alpha = None, None
         if "COLOR_0" in attributes:
-            colours = np.clip(normalised(attributes["COLOR_0"])[:, :3].astype(np.float64), 0.0, 1.0)[faces]
+            stored_colours = np.clip(normalised(attributes["COLOR_0"]).astype(np.float64), 0.0, 1.0)[faces]
+            colours = stored_colours[..., :3]
+            alpha = stored_colours[..., 3] if stored_colours.shape[2] == 4 else None
         if "material" not in primitive:
             material = UNKNOWN_MATERIAL if colours is None else PAINTED_MATERIAL
             return FilePart(name, vertices, faces, np.eye(4), material, colours)
@@ -173,18 +184,32 @@ class _GltfReader:
         uv = {int(key[9:]): values[faces] for key, values in attributes.items() if key.startswith("TEXCOORD_")}
         material = self._read_material(stored, uv)
         part = FilePart(name, vertices, faces, np.eye(4), material, colours, bool(stored.get("doubleSided")))
-        return self._cut_out(part, stored, uv) if stored.get("alphaMode") == "MASK" else part
+        if stored.get("alphaMode") == "BLEND" and alpha is not None and (alpha < OPAQUE).any():
+            material = replace(material, warnings=(*material.warnings, TRANSPARENT_COLOURS))
+            return replace(part, material=material)
+        return self._cut_out(part, stored, uv, alpha) if stored.get("alphaMode") == "MASK" else part
 
-    def _cut_out(self, part: FilePart, stored: JsonObject, uv: dict[int, Float64Array]) -> FilePart:
-        """Remove the places of a part that its material, of ``alphaMode`` MASK, makes invisible."""
+    def _cut_out(
+        self, part: FilePart, stored: JsonObject, uv: dict[int, Float64Array], opacity: Float64Array | None
+    ) -> FilePart:
+        """Remove the places of a part that its material, of ``alphaMode`` MASK, makes invisible.
+
+        Args:
+            part: The part.
+            stored: The material.
+            uv: Texture coordinates (F, 3, 2) by their set.
+            opacity: Opacity of the colours of the face corners, shape (F, 3), or None.
+        """
         values = stored.get("pbrMetallicRoughness", {})
         factor, base = values.get("baseColorFactor", (1, 1, 1, 1)), values.get("baseColorTexture")
         if (given := stored.get("extensions", {}).get("KHR_materials_pbrSpecularGlossiness")) is not None:
             factor, base = given.get("diffuseFactor", (1, 1, 1, 1)), given.get("diffuseTexture")
         cutoff = float(stored.get("alphaCutoff", 0.5))
         alpha = self._read_texture(base, uv, [], alpha=True)
+        if alpha is None and opacity is not None:
+            alpha = opaque_texture(len(part.faces))
         if alpha is not None and factor[3] > 0:
-            return cut_out(part, alpha, 255.0 * cutoff / factor[3])
+            return cut_out(part, alpha, 255.0 * cutoff / factor[3], opacity)
         return part if factor[3] >= cutoff else replace(part, faces=part.faces[:0])
 
     def _read_arrays(self, primitive: JsonObject) -> tuple[dict[str, npt.NDArray[Any]], Int64Array]:

@@ -167,11 +167,14 @@ def alpha_of(image: Image.Image) -> npt.NDArray[np.uint8]:
 def is_transparent(image: Image.Image) -> bool:
     """Return True if an image has transparent pixels."""
     try:
-        return "A" in image.getbands() and float(np.asarray(image.getchannel("A")).min()) < 250
+        alpha = image.convert("RGBA").getchannel("A") if image.has_transparency_data else None
+        return alpha is not None and float(np.asarray(alpha).min()) < 250
     except IMAGE_ERRORS as error:
         raise InputError(f"its texture cannot be read ({error})") from error
 
 
+WITHOUT_COORDINATES = "its texture has no coordinates, and is left out"
+TRANSPARENT_COLOURS = "the colours of its vertices are transparent, but are baked as opaque"
 TRANSPARENT_TEXELS = "its texture has transparent texels, which are baked as opaque"
 
 

@@ -41,6 +41,20 @@ _READ_EXTENSIONS = {
     "http://schemas.microsoft.com/3dmanufacturing/production/2015/06",
     "http://schemas.microsoft.com/3dmanufacturing/trianglesets/2021/07",
 }
+_LEFT_OUT_TYPES = {"support": "supports", "solidsupport": "supports", "other": "objects of type other"}
+"""Types of objects that are no parts of the model."""
+_LEFT_OUT_KINDS = {
+    "beamlattice": "beam lattices",
+    "pbmetallicdisplayproperties": "metalness and roughness",
+    "pbspeculardisplayproperties": "gloss",
+    "translucentdisplayproperties": "translucency",
+}
+"""Elements that are not read."""
+_SLICER_VOLUMES = ("metadata/slic3r_pe_model.config", "metadata/slic3r_model.config")
+_SLICER_PARTS = "metadata/model_settings.config"
+"""Files in which slicers state volumes that are no parts: PrusaSlicer and its forks, Bambu Studio and its forks."""
+_NORMAL = ("", "normal_part")
+_MODIFIERS = "modifiers and negative volumes of a slicer"
 _PAINT = ("mmu_segmentation", "paint_color")
 """Attributes of triangles with colours that slicers paint."""
 _UNITS = {"micron": 1e-6, "millimeter": 1e-3, "centimeter": 1e-2, "inch": 0.0254, "foot": 0.3048, "meter": 1.0}
@@ -63,7 +77,7 @@ class _Object:
         faces: Vertices of each triangle, shape (F, 3).
         groups: Property group of each triangle, or None, F entries.
         indices: Entry of the group at each corner, shape (F, 3).
-        is_support: True if it supports others while they are printed.
+        left_out: Name of objects that are no part of the model, such as supports, or None.
         components: Objects and their transforms (4, 4).
     """
 
@@ -72,7 +86,7 @@ class _Object:
     faces: Int64Array
     groups: list[str | None]
     indices: Int64Array
-    is_support: bool
+    left_out: str | None
     components: list[tuple[_Key, Float64Array]] = field(default_factory=list)
 
 
@@ -114,7 +128,9 @@ class _Package:
         self._images: dict[_Key, tuple[str, tuple[Wrap, Wrap]]] = {}
         self._models: set[str] = set()
         self._left_out: set[str] = set()
+        self._is_transparent = False
         self._unit = _UNITS["millimeter"]
+        self._modifier_faces, self._modifier_parts = self._read_modifiers()
 
     def read(self) -> MeshFile:
         """Read all objects that the build section names."""
@@ -133,15 +149,44 @@ class _Package:
             one = self._objects.get(key)
             if one is None:
                 raise ValueError(f"object {key[1]} is missing")
-            if one.is_support:
-                self._left_out.add("supports")
+            if one.left_out is not None:
+                self._left_out.add(one.left_out)
                 continue
-            pending += [(child, pose @ own, (*parents, key)) for child, own in reversed(one.components)]
+            for child, own in reversed(one.components):
+                if (key[1], child[1]) in self._modifier_parts:
+                    self._left_out.add(_MODIFIERS)
+                else:
+                    pending.append((child, pose @ own, (*parents, key)))
             parts += self._parts(key[0], one, pose)
         if pending:
             raise ValueError(f"components make more than {_MAX_INSTANCES} objects")
         warnings = [f"its {' and '.join(sorted(self._left_out))} are left out"] if self._left_out else []
+        if self._is_transparent:
+            warnings.append("some of its colours are transparent, but are baked as opaque")
         return MeshFile(tuple(parts), self._unit, "z", tuple(warnings))
+
+    def _read_modifiers(self) -> tuple[dict[str, list[tuple[int, int]]], set[tuple[str, str]]]:
+        """Return what slicers mark as modifiers: first and last faces by object, and pairs of object and component."""
+        faces: dict[str, list[tuple[int, int]]] = {}
+        for one, volume, metadata in self._slicer_entries(_SLICER_VOLUMES, "volume"):
+            if metadata.get("volume_type", "ModelPart") != "ModelPart" or metadata.get("modifier") == "1":
+                faces.setdefault(one, []).append((int(volume.attrib["firstid"]), int(volume.attrib["lastid"])))
+        entries = self._slicer_entries((_SLICER_PARTS,), "part")
+        parts = {(one, part.get("id", "")) for one, part, _ in entries if part.get("subtype", "") not in _NORMAL}
+        return faces, parts
+
+    def _slicer_entries(
+        self, names: tuple[str, ...], kind: str
+    ) -> Iterator[tuple[str, ElementTree.Element, dict[str, str]]]:
+        """Yield object, element and metadata of each element of a kind in the settings of a slicer."""
+        for name in names:
+            if name not in self._files:
+                continue
+            with self._open(name) as file:
+                for one in ElementTree.parse(file).iter("object"):
+                    for element in one.iter(kind):
+                        metadata = {entry.get("key", ""): entry.get("value", "") for entry in element.iter("metadata")}
+                        yield one.get("id", ""), element, metadata
 
     def _open(self, name: str) -> IO[bytes]:
         """Open a file of the archive; names differ in letter case alone if at all."""
@@ -178,12 +223,16 @@ class _Package:
                 if event == "start":
                     continue
                 number = element.get("id", "")
+                if kind in _LEFT_OUT_KINDS:
+                    self._left_out.add(_LEFT_OUT_KINDS[kind])
                 if kind == "object":
                     self._objects[model, number] = self._object(model, element)
                     element.clear()
                 elif kind in ("basematerials", "colorgroup"):
                     name = "displaycolor" if kind == "basematerials" else "color"
-                    self._groups[model, number] = _Group(_linear([child.get(name) for child in element]))
+                    colours = [child.get(name) for child in element]
+                    self._is_transparent |= any(len(c) == 9 and c[7:].lower() != "ff" for c in colours if c is not None)
+                    self._groups[model, number] = _Group(_linear(colours))
                 elif kind == "texture2dgroup":
                     uv = [(float(child.get("u", 0)), float(child.get("v", 0))) for child in element]
                     self._groups[model, number] = _Group(np.reshape(uv, (-1, 2)), element.get("texid"))
@@ -229,19 +278,22 @@ class _Package:
                     self._left_out.add("painted colours of a slicer")
             elif kind == "component":
                 components.append((self._reference(model, child), _matrix(child.get("transform"))))
+        for first, last in sorted(self._modifier_faces.get(element.get("id", ""), []), reverse=True):
+            self._left_out.add(_MODIFIERS)
+            del triangles[first : last + 1]
         faces = [(int(one["v1"]), int(one["v2"]), int(one["v3"])) for one in triangles]
         group, entry = element.get("pid"), element.get("pindex", "0")
         indices = []
         for one in triangles:
-            first = one.get("p1", entry)
-            indices.append((int(first), int(one.get("p2", first)), int(one.get("p3", first))))
+            corner = one.get("p1", entry)
+            indices.append((int(corner), int(one.get("p2", corner)), int(one.get("p3", corner))))
         return _Object(
             element.get("name") or f"object_{element.get('id')}",
             np.reshape(vertices, (-1, 3)).astype(np.float64),
             np.reshape(faces, (-1, 3)).astype(np.int64),
             [one.get("pid", group) for one in triangles],
             np.reshape(indices, (-1, 3)).astype(np.int64),
-            element.get("type") in ("support", "solidsupport"),
+            _LEFT_OUT_TYPES.get(element.get("type", "model")),
             components,
         )
 

@@ -7,14 +7,13 @@ without ``Ks``, ``Pr`` and ``Pm``, or with ``illum`` 0 or 1, is matt.
 
 from __future__ import annotations
 
-import contextlib
 import importlib.util
 import io
 import re
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
-from xml.etree import ElementTree
 
 import numpy as np
 import trimesh
@@ -28,6 +27,7 @@ from mitsplat.arrays import Float64Array
 from mitsplat.errors import InputError, MissingResourceError
 from mitsplat.geometry.mesh import check_faces
 from mitsplat.images.colour import decode_srgb
+from mitsplat.mesh_files.collada_files import check_collada, collada_warnings, plain_name, read_collada_asset
 from mitsplat.mesh_files.face_polygons import has_concave, plain_obj
 from mitsplat.mesh_files.file_references import find_reference
 from mitsplat.mesh_files.mesh_file import (
@@ -36,10 +36,11 @@ from mitsplat.mesh_files.mesh_file import (
     OPAQUE,
     PAINTED_MATERIAL,
     ROUGHNESS,
+    TRANSPARENT_COLOURS,
     TRANSPARENT_TEXELS,
     UNKNOWN_COLOUR,
     UNKNOWN_MATERIAL,
-    Axis,
+    WITHOUT_COORDINATES,
     FilePart,
     Material,
     MeshFile,
@@ -49,7 +50,7 @@ from mitsplat.mesh_files.mesh_file import (
     means_of,
     pixels_of,
 )
-from mitsplat.storage.files import IMAGE_ERRORS
+from mitsplat.mesh_files.obj_files import check_obj_materials, check_texture, obj_warnings, plain_text, values_of
 
 _FULL_SPECULAR = 0.08
 """Reflectance at normal incidence of ``Ks`` 1."""
@@ -57,7 +58,17 @@ _TRIMESH_DIFFUSE = (102, 102, 102)
 """Value that trimesh inserts for an absent ``Kd``."""
 _MAX_HEADER_BYTES = 1 << 16
 """Maximum size of the header of a PLY file [bytes]."""
-_NAMESPACE = "{*}"
+_STL_HEADER_BYTES = 80
+_UNREAD_MAPS = {f"map_{name}" for name in ("pr", "pm", "ks", "ns", "d", "bump", "refl", "rma", "orm")}
+_UNREAD_KEYS = {"bump", "norm", "disp", "decal", "refl", *_UNREAD_MAPS}
+"""Keys of MTL files that are left out with a warning."""
+_NO_MATERIALS = (UNKNOWN_MATERIAL, PAINTED_MATERIAL)
+_COLOUR_NAMES = (("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"))
+"""Names of colours in PLY files that trimesh does not read."""
+_LENGTH = (
+    "its data do not have the length that its header states: it is incomplete, or its faces have different numbers of "
+    "corners, which is not read from binary PLY files: export it with triangles"
+)
 
 
 def read_with_trimesh(path: Path, *, textures: bool = True) -> MeshFile:
@@ -78,20 +89,107 @@ def read_with_trimesh(path: Path, *, textures: bool = True) -> MeshFile:
     kind = path.suffix.lower()
     if kind == ".dae" and importlib.util.find_spec("collada") is None:
         raise MissingResourceError(f"{path}: reading it needs `pip install pycollada`")
-    file = io.BytesIO(plain_obj(path.read_bytes())) if kind == ".obj" else path
-    scene = trimesh.load_scene(file, file_type=kind[1:], resolver=_Resolver(path))
-    if any(has_concave(np.asarray(positions), polygons) for positions, polygons in _polygons(path, scene)):
+    content = _plain_content(path)
+    file = path if content is None else io.BytesIO(content)
+    try:
+        scene = trimesh.load_scene(file, file_type=kind[1:], resolver=_Resolver(path), process=False)
+    except ValueError as error:
+        if kind == ".ply" and "unexpected length" in str(error):
+            raise InputError(_LENGTH) from error
+        raise
+    document = _collada_document(path) if kind == ".dae" else None
+    if any(has_concave(np.asarray(positions), polygons) for positions, polygons in _polygons(path, scene, document)):
         raise InputError(
             "it has concave polygons, which are read from OBJ files only: export it with triangles instead of polygons"
         )
     parts = scene_parts(scene, path)
-    units, up = _read_collada_asset(path) if kind == ".dae" else (None, None)
-    warnings = []
-    if kind == ".stl" and any(np.any(one.face_attributes.get("stl", 0)) for one in scene.geometry.values()):
-        warnings.append("the colours of its faces are not read, because STL files store them in several ways")
-    if kind == ".obj" and textures and (names := _values_of(path, "usemtl")) and not _values_of(path, "mtllib"):
-        warnings.append(f"it names no material file (mtllib) of its material {names[0]}, which is left out")
-    return MeshFile(parts, units, up, tuple(warnings), in_single=kind in (".stl", ".ply"))
+    if document is None:
+        warnings = tuple(_warnings(path, scene, content, parts, textures))
+        return MeshFile(parts, warnings=warnings, in_single=kind in (".stl", ".ply"))
+    if textures:
+        check_collada(path, document)
+    units, up = read_collada_asset(path)
+    parts = tuple(part if part.material in _NO_MATERIALS else _decoded(part) for part in parts)
+    return MeshFile(parts, units, up, tuple(collada_warnings(document)))
+
+
+def _decoded(part: FilePart) -> FilePart:
+    """Return a part whose display-encoded factor was read as a linear one, as trimesh does, with the linear factor."""
+    return replace(part, material=replace(part.material, factor=decode_srgb(part.material.factor)))
+
+
+def _plain_content(path: Path) -> bytes | None:
+    """Return the content of an OBJ or PLY file in a form that trimesh reads correctly, or None if the file is read."""
+    kind = path.suffix.lower()
+    if kind == ".obj":
+        return plain_obj(plain_text(path.read_bytes()))
+    if kind == ".ply":
+        header = _ply_header(path)
+        for names in _COLOUR_NAMES:
+            if all(re.search(rf"^property \w+ {name}\s*$", header, re.M) for name in names):
+                content = path.read_bytes()
+                head, end, data = content.partition(b"end_header")
+                for name, plain in zip(names, ("red", "green", "blue"), strict=True):
+                    head = re.sub(
+                        rb"^(property \w+ )%b(\s*)$" % name.encode(), rb"\1%b\2" % plain.encode(), head, flags=re.M
+                    )
+                return head + end + data
+    return None
+
+
+def _ply_header(path: Path) -> str:
+    with path.open("rb") as file:
+        return file.read(_MAX_HEADER_BYTES).partition(b"end_header")[0].decode("utf-8", errors="replace")
+
+
+def _collada_document(path: Path) -> Any:
+    import collada  # optional
+
+    return collada.Collada(str(path), ignore=[collada.DaeError])
+
+
+def _warnings(
+    path: Path, scene: trimesh.Scene, content: bytes | None, parts: tuple[FilePart, ...], textures: bool
+) -> Iterator[str]:
+    """Yield a warning about each kind of data of a file that is not read."""
+    kind = path.suffix.lower()
+    if kind == ".obj" and content is not None:
+        names = values_of(path, content, "usemtl")
+        if textures and names and not values_of(path, content, "mtllib"):
+            yield f"it names no material file (mtllib) of its material {names[0]}, which is left out"
+        yield from obj_warnings(content, parts)
+    elif kind == ".stl":
+        with path.open("rb") as file:
+            is_coloured = b"COLOR=" in file.read(_STL_HEADER_BYTES)
+        if is_coloured or any(np.any(one.face_attributes.get("stl", 0)) for one in scene.geometry.values()):
+            yield "the colours of its faces are not read, because STL files store them in several ways"
+    elif kind == ".ply":
+        named = _texture_names(_ply_header(path))
+        if textures and named and all(part.material.texture is None for part in parts):
+            yield f"its texture {named[0]} has no coordinates, and is left out"
+    elif kind == ".off":
+        yield from _off_warnings(path)
+
+
+def _off_warnings(path: Path) -> Iterator[str]:
+    """Yield a warning if an OFF file has colours.
+
+    Raises:
+        InputError: If its positions have four components.
+    """
+    header, rows, count, number = _off_rows(path)
+    if "4" in header or "n" in header:
+        raise InputError(f"OFF files must have positions of three components (got {header})")
+    faces = rows[count + 1 : count + number + 1]
+    if "C" in header or any(len(row) > int(row[0]) + 1 for row in faces):
+        yield "the colours of its vertices and faces are not read, because OFF files store them in several ways"
+
+
+def _off_rows(path: Path) -> tuple[str, list[list[str]], int, int]:
+    """Return the header of an OFF file, the rows of its numbers, and the counts of its vertices and faces."""
+    header, text = re.sub(r"#.*", "", path.read_text(errors="replace")).split(None, 1)
+    rows = [line.split() for line in text.splitlines() if line.strip()]
+    return header, rows, int(rows[0][0]), int(rows[0][1])
 
 
 def scene_parts(mesh: trimesh.Trimesh | trimesh.Scene, source: object) -> tuple[FilePart, ...]:
@@ -136,6 +234,8 @@ def _read_part(name: str, mesh: trimesh.Trimesh, transform: Float64Array) -> Fil
         stored = visual.vertex_attributes.get("color")
         if stored is not None and len(stored) == len(vertices):
             colours = to_rgba(np.asarray(stored))[faces]
+    if colours is not None and colours.shape[-1] == 4 and (colours[..., 3] < 255 * OPAQUE).any():
+        material = replace(material, warnings=(*material.warnings, TRANSPARENT_COLOURS))
     linear = None if colours is None else decode_srgb(colours[..., :3] / 255.0)
     return FilePart(name, vertices, faces, transform, material, linear, double_sided)
 
@@ -158,6 +258,8 @@ def _read_pbr(source: PBRMaterial, uv: Float64Array | None) -> Material:
     metallic = 0.0 if source.metallicFactor is None else float(source.metallicFactor)
     roughness = ROUGHNESS if source.roughnessFactor is None else float(source.roughnessFactor)
     texture = _texture(source.baseColorTexture, uv)
+    if source.baseColorTexture is not None and uv is None:
+        warnings.append(WITHOUT_COORDINATES)
     if texture is not None and is_transparent(source.baseColorTexture):
         warnings.append(TRANSPARENT_TEXELS)
     gloss = _texture(source.metallicRoughnessTexture, uv)
@@ -187,7 +289,7 @@ def _read_mtl(source: SimpleMaterial, uv: Float64Array | None) -> Material:
     warnings: list[str] = []
     texture = _texture(source.image, uv)
     if source.image is not None and uv is None:
-        warnings.append("its texture has no coordinates, and is left out")
+        warnings.append(WITHOUT_COORDINATES)
     elif source.image is not None and is_transparent(source.image):
         warnings.append(TRANSPARENT_TEXELS)
     diffuse = _numbers(keys, "kd")
@@ -203,7 +305,7 @@ def _read_mtl(source: SimpleMaterial, uv: Float64Array | None) -> Material:
     emission = _numbers(keys, "ke")
     if "map_ke" in keys or (emission is not None and emission.any()):
         warnings.append("it emits light, which is not baked")
-    left_out = sorted({"map_pr", "map_pm", "map_ks", "map_ns", "map_d", "map_bump", "bump", "norm"} & set(keys))
+    left_out = sorted((_UNREAD_KEYS | ({"map_ka"} if source.image is None else set())) & set(keys))
     if left_out:
         warnings.append(f"its {', '.join(left_out)} {'is' if len(left_out) == 1 else 'are'} left out")
     given_roughness, metallic = _numbers(keys, "pr"), _numbers(keys, "pm")
@@ -236,7 +338,9 @@ def _read_mtl(source: SimpleMaterial, uv: Float64Array | None) -> Material:
 def _numbers(keys: Mapping[str, Any], name: str) -> Float64Array | None:
     """Return the numbers of an MTL key, or None if it is absent or damaged."""
     try:
-        found = np.atleast_1d(np.asarray(keys[name], dtype=np.float64))
+        given = keys[name]
+        words = [word for word in given if word != "-halo"] if isinstance(given, list) else given
+        found = np.atleast_1d(np.asarray(words, dtype=np.float64))
     except (KeyError, ValueError):
         return None
     return found if len(found) and np.isfinite(found).all() else None
@@ -251,13 +355,15 @@ class _Resolver(FilePathResolver):  # type: ignore[misc]
 
     def get(self, name: str) -> bytes:
         """Return the content of a file."""
+        name = plain_name(name) if self._mesh.suffix.lower() == ".dae" else name
         found = find_reference(self._source, name, "file", folder=self._mesh.parent)
-        if found.suffix.lower() == ".mtl":
-            self._source = found
-        return found.read_bytes()
+        if found.suffix.lower() != ".mtl":
+            return found.read_bytes()
+        self._source = found
+        return plain_text(found.read_bytes())
 
 
-def _polygons(path: Path, scene: trimesh.Scene) -> Iterator[tuple[Any, Any]]:
+def _polygons(path: Path, scene: trimesh.Scene, document: Any) -> Iterator[tuple[Any, Any]]:
     """Yield the positions and the vertices of the polygons of a file, in formats whose polygons trimesh splits."""
     kind = path.suffix.lower()
     if kind == ".ply":
@@ -267,52 +373,21 @@ def _polygons(path: Path, scene: trimesh.Scene) -> Iterator[tuple[Any, Any]]:
             names = face if isinstance(face, dict) else getattr(getattr(face, "dtype", None), "names", None) or ()
             for name in {"vertex_index", "vertex_indices"} & set(names):
                 polygons = face[name] if isinstance(face, dict) else face[name]["f1"]
+                if "red" in names and any(len(one) != 3 for one in polygons):
+                    raise InputError("faces with colours must be triangles: export it with triangles")
                 yield np.column_stack([np.ravel(vertex[axis]) for axis in "xyz"]).astype(np.float64), polygons
     elif kind == ".off":
-        text = re.sub(r"#.*", "", path.read_text(errors="replace")).split(None, 1)[1]
-        rows = [line.split() for line in text.splitlines() if line.strip()]
-        count, number = map(int, rows[0][:2])
+        _, rows, count, number = _off_rows(path)
         faces = [row[1 : int(row[0]) + 1] for row in rows[count + 1 : count + number + 1]]
         yield np.array([row[:3] for row in rows[1 : count + 1]], dtype=np.float64), [[*map(int, f)] for f in faces]
     elif kind == ".dae":
-        import collada  # optional
-
-        for geometry in collada.Collada(str(path), ignore=[collada.DaeError]).geometries:
+        for geometry in document.geometries:
             for one in geometry.primitives:
-                if isinstance(one, collada.polylist.Polylist):  # its subclasses have other polygons
+                if hasattr(one, "polystarts"):
                     starts, ends = one.polystarts, one.polyends
                     yield one.vertex, [one.vertex_index[a:b] for a, b in zip(starts, ends, strict=True)]
-
-
-def _read_collada_asset(path: Path) -> tuple[float | None, Axis | None]:
-    """Return the unit [m] and the up axis of a COLLADA file; its specification defines 1 m and y if they are absent."""
-    units, up = 1.0, "Y_UP"
-    with path.open("rb") as file:
-        parents = 0
-        for event, element in ElementTree.iterparse(file, events=("start", "end")):
-            kind = element.tag.rpartition("}")[2]
-            parents += 1 if event == "start" else -1
-            if event == "end" and kind == "asset" and parents == 1:
-                unit, axis = element.find(f"{_NAMESPACE}unit"), element.find(f"{_NAMESPACE}up_axis")
-                units = units if unit is None else _length(unit.get("meter", "1"))
-                up = up if axis is None else (axis.text or "").strip()
-                break
-    if up not in ("X_UP", "Y_UP", "Z_UP"):
-        raise ValueError(f"up_axis must be X_UP, Y_UP or Z_UP (got {up})")
-    axes: dict[str, Axis] = {"X_UP": "x", "Y_UP": "y", "Z_UP": "z"}
-    return units, axes[up]
-
-
-def _length(text: str) -> float:
-    """Return a length [m].
-
-    Raises:
-        ValueError: If it is not a number above 0.
-    """
-    with contextlib.suppress(ValueError):
-        if 0 < (length := float(text)) < np.inf:
-            return length
-    raise ValueError(f"meter of its unit must be a number above 0 (got {text})")
+                elif np.ndim(one.vertex_index) == 2:
+                    yield one.vertex, one.vertex_index
 
 
 def check_textures(mesh: Path) -> None:
@@ -323,56 +398,12 @@ def check_textures(mesh: Path) -> None:
     """
     kind = mesh.suffix.lower()
     if kind == ".obj":
-        _check_obj(mesh)
+        check_obj_materials(mesh)
     elif kind == ".ply":
-        with mesh.open("rb") as file:
-            header = file.read(_MAX_HEADER_BYTES).partition(b"end_header")[0].decode("utf-8", errors="replace")
-        for texture in re.findall(r"^comment TextureFile (.+?)\s*$", header, re.MULTILINE):
-            _check_texture(mesh, texture, mesh.parent)
+        for texture in _texture_names(_ply_header(mesh)):
+            check_texture(mesh, texture, mesh.parent)
 
 
-def _check_obj(mesh: Path) -> None:
-    libraries = list(dict.fromkeys(_values_of(mesh, "mtllib")))
-    if len(libraries) > 1:
-        raise InputError(f"{mesh}: must have one material file (got {', '.join(libraries)}): join them")
-    known: list[str] = []
-    for library in libraries:
-        words = library.split()
-        if len(words) > 1 and all((mesh.parent / word).is_file() for word in words):
-            raise InputError(f"{mesh}: must have one material file (got {library})")
-        path = find_reference(mesh, library, "material file")
-        known += _values_of(path, "newmtl")
-        for texture in _values_of(path, "map_kd"):
-            if texture.startswith("-"):
-                raise InputError(f"{path}: options of a texture are not supported: remove them (got map_Kd {texture})")
-            _check_texture(path, texture, mesh.parent)
-    missing = sorted(set(_values_of(mesh, "usemtl")) - set(known)) if libraries else []
-    if missing:
-        raise InputError(
-            f"{mesh}: its material {missing[0]} is not in {', '.join(libraries)}: add it, or give a colour"
-        )
-
-
-def _check_texture(path: Path, texture: str, folder: Path) -> None:
-    found = find_reference(path, texture, "texture", folder=folder)
-    try:
-        with Image.open(found) as image:
-            image.load()
-    except IMAGE_ERRORS as error:
-        raise InputError(
-            f"{path}: its texture {texture} cannot be read ({error}); put it there, or give a colour"
-        ) from None
-
-
-def _values_of(path: Path, key: str) -> list[str]:
-    """Return the values of all lines of an OBJ or an MTL that begin with a key."""
-    names = []
-    for line in path.read_bytes().splitlines():
-        words = line.split(maxsplit=1)
-        if len(words) == 2 and words[0].lower() == key.encode():
-            try:
-                names.append(words[1].strip().decode("utf-8"))
-            except UnicodeDecodeError:
-                name = words[1].strip().decode("cp1252", errors="replace")
-                raise InputError(f"{path}: names must be UTF-8: save it so, or rename it (got {key} {name})") from None
-    return names
+def _texture_names(header: str) -> list[str]:
+    """Return the textures that the header of a PLY file names."""
+    return re.findall(r"^comment TextureFile (.+?)\s*$", header, re.MULTILINE)

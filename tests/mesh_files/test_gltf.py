@@ -307,6 +307,70 @@ def test_masked_texels_are_cut_out(tmp_path: Path, cutoff: float | None, alpha: 
     np.testing.assert_allclose(texels, np.stack([points[:, 0] / SIZE, 1.0 - points[:, 1] / SIZE], axis=1), atol=0.01)
 
 
+@pytest.mark.parametrize("has_texture", [False, True])
+def test_opacity_of_vertex_colours_is_cut_out(tmp_path: Path, has_texture: bool) -> None:
+    """It grows from left to right, and multiplies that of a texture, which is 0.8 everywhere."""
+    glb = Glb()
+    colours = np.c_[np.ones((4, 3)), CORNERS[:, 0] / SIZE].astype(np.float32)
+    attributes = {"POSITION": glb.accessor(CORNERS), "COLOR_0": glb.accessor(colours)}
+    material = matt()
+    if has_texture:
+        attributes["TEXCOORD_0"] = glb.accessor(CORNER_UV)
+        material = matt(glb.texture(Image.new("RGBA", (64, 64), (255, 0, 0, 204))))
+    glb.mesh(attributes, glb.accessor(QUAD), material | {"alphaMode": "MASK"})
+    (part,) = read(glb.save(tmp_path / "a.glb"))
+    edge = 0.5 / 0.8 if has_texture else 0.5
+    assert part.mesh.area == pytest.approx((1 - edge) * SIZE**2, rel=0.05)
+    glb.document["materials"][0]["alphaMode"] = "BLEND"
+    (part,) = read(glb.save(tmp_path / "b.glb"))
+    assert any("colours of its vertices are transparent" in warning for warning in part.warnings)
+
+
+def test_transparent_entries_of_a_palette_are_reported(tmp_path: Path) -> None:
+    glb, image = Glb(), Image.new("P", (8, 8))
+    image.putpalette([200, 100, 50])
+    image.info["transparency"] = 0
+    attributes = {"POSITION": glb.accessor(CORNERS), "TEXCOORD_0": glb.accessor(CORNER_UV)}
+    glb.mesh(attributes, glb.accessor(QUAD), matt(glb.texture(image)) | {"alphaMode": "BLEND"})
+    (part,) = read(glb.save(tmp_path / "a.glb"))
+    assert "transparent texels" in part.warnings[0]
+
+
+def test_the_scene_that_is_read_is_named_if_there_are_several(tmp_path: Path) -> None:
+    glb = sheet()
+    glb.document["nodes"].append({"mesh": 0, "scale": [2, 2, 2]})
+    path = glb.save(tmp_path / "a.glb", scene=1, scenes=[{"nodes": [0]}, {"nodes": [1]}])
+    model = read_model(path)
+    assert model.warnings == ("it has 2 scenes, of which only scene 1 is read",)
+    assert model.parts[0].mesh.extents.max() == pytest.approx(2 * SIZE)
+
+
+def test_morph_targets_change_colours_and_texture_coordinates(tmp_path: Path) -> None:
+    glb = Glb()
+    black, red = np.zeros((4, 3), np.float32), np.float32([[1, 0, 0]] * 4)
+    attributes = {"POSITION": glb.accessor(CORNERS), "COLOR_0": glb.accessor(black)}
+    glb.mesh(attributes, glb.accessor(QUAD), matt(), targets=[{"COLOR_0": glb.accessor(red)}])
+    glb.document["meshes"][0]["weights"] = [1.0]
+    (part,) = read(glb.save(tmp_path / "a.glb"))
+    np.testing.assert_allclose(part.colours_at(np.arange(2), np.full((2, 3), 1 / 3)), [(1, 0, 0)] * 2)
+    glb = sheet(uv=np.zeros((4, 2)))
+    glb.document["meshes"][0]["primitives"][0]["targets"] = [{"TEXCOORD_0": glb.accessor(CORNER_UV)}]
+    glb.document["nodes"][0]["weights"] = [1.0]
+    expected, texels = shown_uv(glb.save(tmp_path / "b.glb"))
+    np.testing.assert_allclose(texels, expected, atol=0.01)
+
+
+def test_joints_outside_of_the_scene_are_refused(tmp_path: Path) -> None:
+    glb = Glb()
+    weights = np.float32([[1, 0, 0, 0]] * 4)
+    skin = {"JOINTS_0": glb.accessor(np.zeros((4, 4), np.uint8)), "WEIGHTS_0": glb.accessor(weights)}
+    glb.mesh({"POSITION": glb.accessor(CORNERS), **skin}, glb.accessor(QUAD))
+    glb.document["nodes"] = [{"mesh": 0, "skin": 0}, {}]
+    path = glb.save(tmp_path / "a.glb", skins=[{"joints": [1]}])
+    with pytest.raises(InputError, match="joint 1 of a skin is not in the scene"):
+        read(path)
+
+
 def test_the_proxy_of_a_cut_out_has_its_outline(tmp_path: Path) -> None:
     image = coordinate_image()
     row, column = np.mgrid[:64, :64] - 31.5

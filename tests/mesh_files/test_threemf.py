@@ -189,3 +189,48 @@ def test_supports_and_painted_colours_are_left_out_with_a_warning(tmp_path: Path
     model = read_model(write(tmp_path / "a.3mf", painted + support, build))
     assert model.warnings == ("its painted colours of a slicer and supports are left out",)
     np.testing.assert_allclose(model.parts[0].mesh.extents, 0.008)
+
+
+def test_volumes_of_slicers_that_are_no_parts_are_left_out(tmp_path: Path) -> None:
+    """PrusaSlicer names triangles of one mesh, Bambu Studio components of an object."""
+    double = tetrahedron(1, triangles=("",) * 4)
+    rows = double[double.index("<triangle ") : double.index("</triangles>")]
+    double = double.replace("</triangles>", rows.replace("<triangle ", "<triangle pid='5' p1='0' ") + "</triangles>")
+    colours = '<m:colorgroup id="5"><m:color color="#FF0000"/></m:colorgroup>'
+    volumes = (
+        '<config><object id="1"><volume firstid="0" lastid="3"><metadata key="volume_type" value="ModelPart"/></volume>'
+        '<volume firstid="4" lastid="7"><metadata key="volume_type" value="ParameterModifier"/></volume></object>'
+        "</config>"
+    )
+    files = {"Metadata/Slic3r_PE_model.config": volumes.encode()}
+    (tmp_path / "a").mkdir()
+    prusa = read_model(write(tmp_path / "a/a.3mf", colours + double, **files))
+    group = "<components>" + "".join(f'<component objectid="{number}"/>' for number in (1, 2)) + "</components>"
+    kinds = ((1, "normal_part"), (2, "negative_part"))
+    rows = "".join(f'<part id="{number}" subtype="{kind}"/>' for number, kind in kinds)
+    parts = f'<config><object id="3">{rows}</object></config>'
+    resources = tetrahedron(1) + tetrahedron(2) + f'<object id="3" type="model">{group}</object>'
+    files = {"Metadata/model_settings.config": parts.encode()}
+    bambu = read_model(write(tmp_path / "b.3mf", resources, '<item objectid="3"/>', **files))
+    for model in (prusa, bambu):
+        assert sum(len(part.mesh.faces) for part in model.parts) == 4
+        assert model.warnings == ("its modifiers and negative volumes of a slicer are left out",)
+
+
+@pytest.mark.parametrize(
+    ("resources", "sentence"),
+    [
+        (tetrahedron(1).replace("</mesh>", "<beamlattice/></mesh>"), "its beam lattices are left out"),
+        ('<m:pbmetallicdisplayproperties id="8"/>' + tetrahedron(1), "its metalness and roughness are left out"),
+        (
+            '<m:colorgroup id="5"><m:color color="#FF000040"/></m:colorgroup>' + tetrahedron(1),
+            "colours are transparent",
+        ),
+        (tetrahedron(1) + tetrahedron(2).replace('"model"', '"other"'), "its objects of type other are left out"),
+    ],
+)
+def test_what_is_not_read_is_named(tmp_path: Path, resources: str, sentence: str) -> None:
+    build = '<item objectid="1"/>' + '<item objectid="2"/>' * ('id="2"' in resources)
+    model = read_model(write(tmp_path / "a.3mf", resources, build))
+    (warning,) = model.warnings
+    assert sentence in warning and sum(len(part.mesh.faces) for part in model.parts) == 4

@@ -1,0 +1,157 @@
+"""OBJ files and their material files: text in the form that trimesh reads, their textures, and what is not read."""
+
+from __future__ import annotations
+
+import codecs
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from mitsplat.errors import InputError
+from mitsplat.mesh_files.file_references import find_reference
+from mitsplat.mesh_files.mesh_file import FilePart
+from mitsplat.storage.files import IMAGE_ERRORS
+
+_CONTINUATION = re.compile(rb"\\\r?\n")
+_KEPT = (b"map_", b"mtllib")
+"""Beginnings of the keys whose values are file names."""
+_NAMES = (b"usemtl", b"newmtl", b"g", b"o")
+"""Keys whose values may contain the character that begins a comment."""
+_COLOURED = re.compile(rb"^v(?: \S+){3}((?: \S+){3})$", re.M)
+_MAX_COLOUR = 1.01
+_LEFT_OUT = {
+    rb"^(?:curv|curv2|surf) ": "its free-form curves and surfaces are left out",
+    rb"^[lp] ": "its points and lines are left out",
+    rb"^call ": "the files that it calls are left out",
+}
+
+
+def plain_text(content: bytes) -> bytes:
+    """Return an OBJ or MTL file in UTF-8, with single blanks and line feeds, without comments and continued lines."""
+    if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        content = content.decode("utf-16").encode()
+    lines = _CONTINUATION.sub(b" ", content.removeprefix(codecs.BOM_UTF8)).splitlines()
+    return b"\n".join(map(_plain_line, lines)) + b"\n"
+
+
+def _plain_line(line: bytes) -> bytes:
+    if b"#" in line:
+        key = line.split(maxsplit=1)[0].lower()
+        if key.startswith(b"#") or not (key in _NAMES or key.startswith(_KEPT)):
+            line = line.partition(b"#")[0]
+    words = line.split()
+    if words and words[0].lower().startswith(_KEPT):
+        return b" ".join(line.strip().split(maxsplit=1))
+    return b" ".join(words)
+
+
+def obj_warnings(content: bytes, parts: tuple[FilePart, ...]) -> Iterator[str]:
+    """Yield a warning about each kind of data of an OBJ file that is not read.
+
+    Args:
+        content: Its plain text.
+        parts: What is read.
+
+    Raises:
+        InputError: If colours of vertices are not within 0 to 1.
+    """
+    for pattern, sentence in _LEFT_OUT.items():
+        if re.search(pattern, content, re.M):
+            yield sentence
+    colours = _COLOURED.findall(content)
+    if not colours:
+        return
+    most = np.array(b" ".join(colours).split(), dtype=np.float64).max()
+    if most > 1:
+        raise InputError(f"colours of vertices must be within 0 to 1 (got {most:g}): divide them by 255")
+    if len(colours) < len(re.findall(rb"^v ", content, re.M)):
+        yield "the colours of its vertices are left out, because some vertices have none"
+    elif any(part.colours is None for part in parts):
+        yield "the colours of its vertices are left out, because its faces have materials: remove mtllib to use them"
+
+
+def values_of(path: Path, content: bytes, key: str) -> list[str]:
+    """Return the values of all lines of an OBJ or MTL file that begin with a key.
+
+    Args:
+        path: The file, for messages.
+        content: Its plain text.
+        key: The key, in lower case.
+
+    Raises:
+        InputError: If a value is not UTF-8.
+    """
+    names = []
+    for found in re.finditer(rb"^" + key.encode() + rb" (.*)$", content, re.M | re.I):
+        try:
+            names.append(found[1].decode("utf-8"))
+        except UnicodeDecodeError:
+            name = found[1].decode("cp1252", errors="replace")
+            raise InputError(f"{path}: names must be UTF-8: save it so, or rename it (got {key} {name})") from None
+    return names
+
+
+def check_obj_materials(mesh: Path) -> None:
+    """Refuse an OBJ file whose material file, materials or textures are missing or cannot be read.
+
+    Raises:
+        InputError: If one is missing, outside of the folder, or damaged.
+    """
+    content = plain_text(mesh.read_bytes())
+    libraries = list(dict.fromkeys(values_of(mesh, content, "mtllib")))
+    if len(libraries) > 1:
+        raise InputError(f"{mesh}: must have one material file (got {', '.join(libraries)}): join them")
+    known: list[str] = []
+    for library in libraries:
+        words = library.split()
+        if len(words) > 1 and all((mesh.parent / word).is_file() for word in words):
+            raise InputError(f"{mesh}: must have one material file (got {library})")
+        path = find_reference(mesh, library, "material file")
+        known += _check_library(path, mesh.parent)
+    missing = sorted(set(values_of(mesh, content, "usemtl")) - set(known)) if libraries else []
+    if missing:
+        raise InputError(
+            f"{mesh}: its material {missing[0]} is not in {', '.join(libraries)}: add it, or give a colour"
+        )
+
+
+def _check_library(path: Path, folder: Path) -> list[str]:
+    """Check a material file of a mesh in ``folder``, and return the names of its materials."""
+    content = plain_text(path.read_bytes())
+    for texture in values_of(path, content, "map_kd"):
+        if texture.startswith("-"):
+            raise InputError(f"{path}: options of a texture are not supported: remove them (got map_Kd {texture})")
+        check_texture(path, texture, folder)
+    for key in ("ka", "kd", "ks"):
+        for colour in values_of(path, content, key):
+            _check_colour(path, key, colour)
+    return values_of(path, content, "newmtl")
+
+
+def _check_colour(path: Path, key: str, colour: str) -> None:
+    try:
+        values = np.array(colour.split(), dtype=np.float64)
+    except ValueError:
+        values = np.zeros(0)
+    if len(values) != 3 or (key == "kd" and values.max() > _MAX_COLOUR):
+        name = key.capitalize()
+        raise InputError(f"{path}: {name} must be red, green and blue from 0 to 1 (got {name} {colour})")
+
+
+def check_texture(path: Path, texture: str, folder: Path) -> None:
+    """Refuse a texture that the file ``path`` of a mesh in ``folder`` names if it is missing or damaged.
+
+    Raises:
+        InputError: If it is missing, outside of the folder, or no image.
+    """
+    found = find_reference(path, texture, "texture", folder=folder)
+    try:
+        with Image.open(found) as image:
+            image.load()
+    except IMAGE_ERRORS as error:
+        raise InputError(
+            f"{path}: its texture {texture} cannot be read ({error}); put it there, or give a colour"
+        ) from None

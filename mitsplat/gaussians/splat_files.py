@@ -13,7 +13,7 @@ suffix                  read  write  precision
 ======================  ====  =====  ==========================================================================
 
 No format states its axes or its unit, so ``x, y, z`` are returned as in the file, without rotation or scaling.
-This module decodes ``.ply``, ``.splat`` and version 3 of ``.spz``, in which assets are stored. Its allocations are
+This package decodes ``.ply``, ``.splat``, ``.ksplat`` and version 3 of ``.spz``. Its allocations are
 limited by the size of the file. gaussforge decodes the other formats. It does not validate its input and therefore
 runs in a separate process with bounded memory, which takes 0.1 s to start.
 """
@@ -37,6 +37,7 @@ from scipy.special import expit, logit
 
 from mitsplat.arrays import Float32Array
 from mitsplat.errors import InputError
+from mitsplat.gaussians.ksplat_files import read_ksplat
 from mitsplat.gaussians.spherical_harmonics import SH_C0
 from mitsplat.gaussians.splat_converter import convert_splats
 from mitsplat.gaussians.splat_training import (
@@ -138,7 +139,7 @@ def read_splats(path: Path) -> tuple[SplatArrays, KernelName | None]:
         if suffix == ".sog":
             return _decode_ply(_convert(data, "sog", "ply")), sog_kernel(data)
         if suffix == ".ksplat":
-            return _decode_ply(_convert(data, "ksplat", "ply")), None
+            return _decode_ksplat(data), None
         arrays, names = _decode_ply(data), _vertex_names(data)
     except ValueError as error:
         raise InputError(f"{path}: {error}") from error
@@ -216,6 +217,13 @@ def _decode_ply(data: bytes) -> SplatArrays:
         opacities=opacities,
         sh=np.concatenate([columns_of(rows, _COLOUR)[:, None], higher], axis=1),
     )
+
+
+def _decode_ksplat(data: bytes) -> SplatArrays:
+    means, quats, scales, colours, sh = read_ksplat(data)
+    constant = (colours[:, None, :3] - 0.5) / SH_C0
+    arrays = (means, quats, scales, colours[:, 3], np.concatenate([constant, sh], axis=1))
+    return SplatArrays(*(values.astype(np.float32) for values in arrays))
 
 
 def _check_encoding(scales: npt.NDArray[Any], opacities: npt.NDArray[Any]) -> None:

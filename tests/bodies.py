@@ -1,4 +1,4 @@
-"""Helpers of physics tests: poses, and extents of placed meshes."""
+"""Helpers of physics tests: bodies, their simulation, poses, and extents of placed meshes."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ import numpy as np
 import trimesh
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
+
+from mitsplat.geometry.mesh import mass_properties
 
 STEPPERS = ("warp", "mujoco")
 
@@ -22,3 +24,35 @@ def pose_at(position: ArrayLike, rotation: Rotation | None = None) -> NDArray[np
 def lowest(mesh: trimesh.Trimesh, pose: NDArray[np.float64]) -> float:
     """Return the height of a placed mesh's lowest vertex [m]."""
     return float((mesh.vertices @ pose[:3, :3].T + pose[:3, 3])[:, 2].min())
+
+
+def body_of(*pieces, density=3000.0, **material):
+    """Return a body of convex pieces with a contact material."""
+    from mitsplat.physics.friction import ContactMaterial
+    from mitsplat.physics.worlds import Body
+
+    mass = mass_properties(trimesh.util.concatenate(list(pieces)), pieces, density=density)
+    return Body(pieces, mass, ContactMaterial(**material))
+
+
+def table(pose=None, **material):
+    """Return a box whose top is the plane z = 0 of its pose."""
+    from mitsplat.physics.friction import ContactMaterial
+    from mitsplat.physics.worlds import Collider
+
+    top_from_box = trimesh.transformations.translation_matrix((0, 0, -0.05))
+    return Collider(
+        ContactMaterial(**material), box=((1.0, 1.0, 0.1), (np.eye(4) if pose is None else pose) @ top_from_box)
+    )
+
+
+def world_of(stepper, bodies, colliders, poses, *, timestep=0.002, capacity=1.0):
+    """Return the simulation of bodies at their poses."""
+    from mitsplat.physics.worlds import MujocoWorld, WarpWorld
+
+    if stepper == "mujoco":
+        world = MujocoWorld(bodies, colliders, timestep=timestep)
+    else:
+        world = WarpWorld(bodies, colliders, timestep=timestep, capacity=capacity)
+    world.reset(np.stack(poses))
+    return world

@@ -73,6 +73,7 @@ def test_scenes_of_the_gallery_get_no_warning(monkeypatch: pytest.MonkeyPatch) -
 
     from mitsplat.checks import path_checks
     from mitsplat.physics.drop import Drop
+    from mitsplat.scene.spec.object_spec import Arrangement
 
     checked: dict[tuple[str, bytes], list[Finding]] = {}
     check_asset = path_checks.check_asset
@@ -87,12 +88,12 @@ def test_scenes_of_the_gallery_get_no_warning(monkeypatch: pytest.MonkeyPatch) -
     dropped: set[tuple[str, str]] = set()
     try_alone = Drop.try_alone
 
-    def try_once(drop: Drop, asset: int, region: int, tries: int) -> list[str]:
-        drops = drop.scene.assets[asset].name, drop.scene.spec.all_regions[region][1]
+    def try_once(drop: Drop, asset: int, region: int, arrangement: Arrangement, tries: int) -> list[str]:
+        drops = drop.scene.assets[asset].name, arrangement
         if drops in dropped:
             return []
         dropped.add(drops)
-        return try_alone(drop, asset, region, tries)
+        return try_alone(drop, asset, region, arrangement, tries)
 
     monkeypatch.setattr(Drop, "try_alone", try_once)
     for name in GALLERY:

@@ -128,15 +128,15 @@ def layout_faults(scene: Scene) -> Iterator[Finding]:
             except InputError as error:
                 yield _fault("shape", str(error), "correct the mesh, or set collider: false")
                 return
-    for number, (region, arrangement) in enumerate(scene.spec.all_regions):
+    for number, (region, arrangements) in enumerate(scene.spec.all_regions):
         where = f"regions[{number - 1}]" if number else "region"
         here = [i for i in dropped if scene.spec.regions_of(scene.spec.objects[i]) == (number,)]
         if here or not scene.spec.regions:
-            yield from _region_faults(scene, where, here, region, arrangement)
+            yield from _region_faults(scene, where, here, region, arrangements)
 
 
 def _region_faults(
-    scene: Scene, where: str, dropped: Sequence[int], region: Region, arrangement: Arrangement
+    scene: Scene, where: str, dropped: Sequence[int], region: Region, arrangements: Sequence[Arrangement]
 ) -> Iterator[Finding]:
     """Find reasons why the entries ``dropped``, which use only this region, cannot come to rest in it."""
     low, high = np.array(region.min), np.array(region.max)
@@ -147,7 +147,7 @@ def _region_faults(
         text = f"{where}: no collider is below it, so all objects fall forever"
         yield _fault("support", text, "move region above the table, or the table below it")
         return
-    if arrangement == "pile":
+    if "pile" in arrangements:
         high[2] += PILE_HEIGHT
     yield from _room_faults(scene, where, dropped, low, high)
 
@@ -402,9 +402,9 @@ def _reachable_box(scene: Scene) -> tuple[Float64Array, Float64Array]:
     walls = [position for position, shape in enumerate(shapes) if not (shape.visible or shape.proxy)]
     names = [name for name, _ in colliders]
     lows, highs = [], []
-    for number, (place, arrangement) in enumerate(scene.spec.all_regions):
+    for number, (place, arrangements) in enumerate(scene.spec.all_regions):
         low, high = enclosed_bounds(place, boxes, walls_beside(scene.spec, number, names, walls))
-        high[2] += PILE_HEIGHT if arrangement == "pile" else 0.0
+        high[2] += PILE_HEIGHT if "pile" in arrangements else 0.0
         lows.append(low)
         highs.append(high)
     low, high = np.min(lows, axis=0), np.max(highs, axis=0)

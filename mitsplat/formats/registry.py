@@ -31,7 +31,7 @@ import numpy as np
 from mitsplat.formats import bop, coco, map_files, maps, yolo
 from mitsplat.formats.colmap import ModelWriter
 from mitsplat.formats.format import Catalogue, Format, FrameFiles
-from mitsplat.scene.planning.contents import draw_regions
+from mitsplat.scene.planning.contents import draw_arrangements, draw_regions
 from mitsplat.scene.planning.layout_surroundings import draw_surroundings
 from mitsplat.scene.spec.scene_spec import FORMATS, SceneSpec
 from mitsplat.scene.splits import is_empty
@@ -92,6 +92,8 @@ def write_frame(
             regions = draw_regions(spec, plan.layout)
             for drawn in record["objects"]:
                 drawn["region"] = spec.region_names[regions[drawn["id"] - 1]]
+    if not custom_layout and any(len(arrangements) > 1 for _, arrangements in spec.all_regions):
+        record["arrangement"] = dict(zip(spec.region_names, draw_arrangements(spec, plan.layout), strict=True))
     if frame.layout.left_out:
         record["left_out"] = [
             {"id": one.id, "asset": one.asset, "name": catalogue.assets[one.asset], "reason": one.reason}

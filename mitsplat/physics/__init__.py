@@ -2,8 +2,8 @@
 
 Input: a :class:`~mitsplat.scene.scene.Scene` and the index of a layout. Output: a
 :class:`~mitsplat.scene.layout.Layout` with a certificate of its rest, measured on the original meshes. :mod:`.drop`
-draws, drops and certifies a layout. :func:`.rest.run_to_rest` detects rest. :mod:`.settle` caches layouts by the hash
-of all their inputs.
+draws, drops and certifies a layout. :mod:`.handling` tosses, pushes and shakes objects. :func:`.rest.run_to_rest`
+detects rest. :mod:`.settle` caches layouts by the hash of all their inputs.
 """
 
 from __future__ import annotations

@@ -20,14 +20,16 @@ from mitsplat.geometry.mesh import mass_properties, prepare_mesh
 from mitsplat.geometry.mesh_distance import Clearance, DistanceSurface, PlacedSurface, all_clearances, standoff
 from mitsplat.physics.contacts import ContactFinder
 from mitsplat.physics.friction import ContactMaterial
+from mitsplat.physics.handling import draw_handling
 from mitsplat.physics.placement import Item, draw_poses
 from mitsplat.physics.rest import CONTACT_OVERFLOW, FREE_TIME, RestOutcome, run_to_rest
 from mitsplat.physics.worlds import Body, Collider, MujocoWorld, WarpWorld, World, all_pieces
 from mitsplat.progress import Note
 from mitsplat.scene.layout import NO_PHYSICS, Instance, Layout, LeftOut, RestCertificate, UnsettledLayoutError
-from mitsplat.scene.planning.contents import draw_objects, draw_regions
+from mitsplat.scene.planning.contents import draw_arrangements, draw_objects, draw_regions
 from mitsplat.scene.planning.shape_poses import placed_shapes
 from mitsplat.scene.scene import Scene
+from mitsplat.scene.spec.object_spec import Arrangement
 from mitsplat.scene.spec.shape_spec import Shape
 from mitsplat.scene.splits import draw_environment
 from mitsplat.scene.streams import random_stream
@@ -47,7 +49,7 @@ _COLLECTION_INTERVAL = 24
 CROWDED = "no room for all"
 _LEFT_OUT_PER_ROUND = 0.1  # share of the objects that is left out per round if they find no room,
 _MAX_LEFT_OUT = 0.5  # and maximum share in total: beyond it, the region is too small
-_FALLING = {"drop", "pile", "scatter"}  # arrangements of random poses
+_PUT_DOWN = {"stack", "upright", "tower", "packed"}  # arrangements of other than random poses
 _POUR_SPEED = 1.0  # speed limit of poured objects [m/s]: at higher speed, heavy objects eject light ones
 # Simulated time for the draws of a layout [s], thirty times that of a typical draw. After it, each rejected draw leaves
 # objects out.
@@ -81,12 +83,13 @@ class _Ground:
 
 @dataclass(frozen=True, eq=False)
 class _DrawnObject:
-    """An object drawn for a layout, with its pose from the scene file (if any) and its start region."""
+    """An object drawn for a layout: its pose from the scene file (if any), its start region, and their arrangement."""
 
     id: int
     asset: int
     given: Float64Array | None
     region: int
+    arrangement: Arrangement
 
 
 _Defect = tuple[str, set[PlacedSurface]]
@@ -144,7 +147,6 @@ class Drop:
         self._worlds: dict[tuple[tuple[int, ...], float, int], World] = {}
         self._world_count = 0
         self._objects = [self._part(asset, progress) for asset in scene.assets]
-        self._arrangements = tuple(arrangement for _, arrangement in scene.spec.all_regions)
         self._surroundings = (scene.environments if scene.spec.environment_collides else ()) or (None,)
         self._grounds = {
             number: self._make_ground(around, progress) for number, around in enumerate(self._surroundings)
@@ -206,32 +208,41 @@ class Drop:
     def _draw_contents(self, index: int) -> list[_DrawnObject]:
         """Return the objects that are drawn for a layout."""
         assets, given = draw_objects(self.scene, index)
+        arrangements = draw_arrangements(self.scene.spec, index)
         rows = zip(assets, given, draw_regions(self.scene.spec, index), strict=True)
-        return [_DrawnObject(number, *row) for number, row in enumerate(rows, start=1)]
+        return [_DrawnObject(number, *row, arrangements[row[-1]]) for number, row in enumerate(rows, start=1)]
+
+    def _arrangements(self, drawn: Sequence[_DrawnObject]) -> list[Arrangement]:
+        """Return the arrangement of each region."""
+        arrangements = [possible[0] for _, possible in self.scene.spec.all_regions]
+        for one in drawn:
+            arrangements[one.region] = one.arrangement
+        return arrangements
 
     def _try(self, index: int, drawn: Sequence[_DrawnObject], refused: Sequence[str]) -> Layout | _Rejection:
         """Drop the given objects from the next draw of start poses."""
         number = self._ground_of(index)
         assets, given = tuple(one.asset for one in drawn), [one.given for one in drawn]
         regions, obstacles = [one.region for one in drawn], self._grounds[number].obstacles
+        arrangements = self._arrangements(drawn)
         rng = random_stream(self.scene.spec.seed, "object poses", index, len(refused))
         try:
-            start = self.draw_poses(assets, rng, given, number, regions)
+            start = self.draw_poses(assets, rng, given, number, regions, arrangements)
         except InputError as error:
             # An object that is too large for its region is rejected alone; the others may still fit.
-            alone = [self._place([item], number, rng) is None for item in self._items(assets, given, regions)]
+            items = self._items(assets, given, regions)
+            alone = [self._place([item], number, rng, arrangements) is None for item in items]
             reason = "no room for it" if any(alone) else CROWDED
             return _Rejection(reason, np.flatnonzero(alone).tolist(), str(error))
         world = self._world(assets, 2.0 ** refused.count(CONTACT_OVERFLOW), number)
-        world.reset(start)
-        outcome = self._run(world, number, regions, given)
+        outcome = self._run(world, start, index, len(refused), drawn)
         if outcome.rejection:
             return _Rejection(outcome.rejection, outcome.causes, simulated=world.time)
         resting = [self._placed(asset, pose) for asset, pose in zip(assets, outcome.poses, strict=True)]
         clearances = all_clearances(resting, obstacles, reach=_MAX_MEASURED_GAP)
         gaps = _support_gaps(resting, clearances)
         defect = _rest_defect(clearances, gaps, obstacles) or self._arrangement_defect(
-            resting, clearances, obstacles, start, outcome.poses, given, regions
+            resting, clearances, obstacles, start, outcome.poses, drawn
         )
         if defect is not None:
             reason, causes = defect
@@ -254,15 +265,15 @@ class Drop:
         )
         return Layout(index, self._instances(drawn, outcome.poses), certificate)
 
-    def try_alone(self, asset: int, region: int, tries: int) -> list[str]:
-        """Drop an object alone with a region's arrangement.
+    def try_alone(self, asset: int, region: int, arrangement: Arrangement, tries: int) -> list[str]:
+        """Drop an object alone into a region.
 
         Returns:
             The reason of each failed try, or [] if one try succeeds.
         """
         refused: list[str] = []
         while len(refused) < tries:
-            found = self._try(0, [_DrawnObject(1, asset, None, region)], refused)
+            found = self._try(0, [_DrawnObject(1, asset, None, region, arrangement)], refused)
             if isinstance(found, Layout):
                 return []
             refused.append(found.reason)
@@ -276,18 +287,19 @@ class Drop:
             return
         assets, given = tuple(one.asset for one in drawn), [one.given for one in drawn]
         certificate = layout.certificate
-        rng = random_stream(self.scene.spec.seed, "object poses", layout.index, certificate.attempts - 1)
+        attempt = certificate.attempts - 1
+        rng = random_stream(self.scene.spec.seed, "object poses", layout.index, attempt)
         capacity = 2.0 ** certificate.refused.count(CONTACT_OVERFLOW)
         number, regions = self._ground_of(layout.index), [one.region for one in drawn]
         world = self._world(assets, capacity, number)
-        world.reset(self.draw_poses(assets, rng, given, number, regions))
-        moments = [world.poses]
+        start = self.draw_poses(assets, rng, given, number, regions, self._arrangements(drawn))
+        moments = [start]
 
         def observe(time: float, poses: Float64Array) -> None:
             if len(moments) * interval <= time <= certificate.time_to_rest:
                 moments.append(poses)
 
-        self._run(world, number, regions, given, observe)
+        self._run(world, start, layout.index, attempt, drawn, observe)
         yield from moments
 
     def _ground_of(self, layout: int) -> int:
@@ -306,26 +318,42 @@ class Drop:
     def _run(
         self,
         world: World,
-        ground: int,
-        regions: Sequence[int],
-        given: Sequence[Float64Array | None],
+        start: Float64Array,
+        index: int,
+        attempt: int,
+        drawn: Sequence[_DrawnObject],
         observe: Callable[[float, Float64Array], None] = lambda time, poses: None,
     ) -> RestOutcome:
+        """Simulate a draw of a layout from its start poses (N, 4, 4)."""
         settle = self.scene.spec.settle
-        fastest = _POUR_SPEED if any(self._arrangements[i] == "pile" for i in regions) else np.inf
-        low, high = self._grounds[ground].bounds
+        fastest = _POUR_SPEED if any(one.arrangement == "pile" for one in drawn) else np.inf
+        low, high = self._grounds[self._ground_of(index)].bounds
         # Objects with a pose in the scene file may be in any of the regions.
-        free = np.array([pose is None for pose in given])[:, None]
-        own = np.asarray(regions)
-        bounds = np.where(free, low[own], low.min(axis=0)), np.where(free, high[own], high.max(axis=0))
+        free = np.array([one.given is None for one in drawn])
+        own = np.array([one.region for one in drawn])
+        low, high = (
+            np.where(free[:, None], limit[own], rest) for limit, rest in ((low, low.min(0)), (high, high.max(0)))
+        )
         # Round objects that are put down would roll away without rolling friction.
-        falls = all(self._arrangements[i] in _FALLING for i in regions)
+        falls = _PUT_DOWN.isdisjoint(one.arrangement for one in drawn)
+        regions = [region for region, _ in self.scene.spec.all_regions]
+        handling = draw_handling(
+            world.bodies,
+            start,
+            list(zip(regions, self._arrangements(drawn), strict=True)),
+            [free & (own == number) for number in range(len(regions))],
+            random_stream(self.scene.spec.seed, "object motion", index, attempt),
+            speed=settle.speed,
+            spin=settle.spin,
+        )
+        world.reset(start, handling.velocities)
         return run_to_rest(
             world,
             max_time=settle.max_time,
-            bounds=bounds,
+            bounds=(low, high),
             free_time=FREE_TIME if falls else 0.0,
             fastest=fastest,
+            handling=handling,
             observe=observe,
         )
 
@@ -385,10 +413,10 @@ class Drop:
         if not colliders:
             raise InputError(f"{scene.path}: at least one shape must be a collider, on which objects rest (got none)")
         lows, highs = [], []
-        for number, (region, arrangement) in enumerate(scene.spec.all_regions):
+        for number, (region, arrangements) in enumerate(scene.spec.all_regions):
             beside = walls_beside(scene.spec, number, [item.name for item in obstacles], walls)
             low, high = enclosed_bounds(region, [item.bounds for item in obstacles], beside)
-            high[2] += PILE_HEIGHT if arrangement == "pile" else 0.0
+            high[2] += PILE_HEIGHT if "pile" in arrangements else 0.0
             lows.append(low)
             highs.append(high)
         bounds = np.array(lows), np.array(highs)
@@ -419,15 +447,18 @@ class Drop:
         given: Sequence[Float64Array | None] = (),
         ground: int = 0,
         regions: Sequence[int] | None = None,
+        arrangements: Sequence[Arrangement] | None = None,
     ) -> Float64Array:
         """Draw start poses (N, 4, 4) above a ground, see :func:`mitsplat.physics.placement.draw_poses`.
+
+        ``arrangements`` are those of all regions; the first of the scene file if None.
 
         Raises:
             InputError: If objects find no room.
         """
         items = self._items(assets, given, regions)
-        region, arrangement = self.scene.spec.region, self.scene.spec.settle.arrangement
-        poses = self._place(items, ground, rng)
+        region, arrangements = self.scene.spec.region, arrangements or self._arrangements(())
+        poses = self._place(items, ground, rng, arrangements)
         if poses is not None:
             return poses
         if self.scene.spec.regions:
@@ -440,13 +471,18 @@ class Drop:
         raise InputError(
             f"{self.scene.path}: region must be large enough to hold all objects of a layout without overlap "
             f"(got {len(assets)} objects in {size[0]:.3g} x {size[1]:.3g} x {size[2]:.3g} m"
-            f"{self._describe_obstruction(self._grounds[ground].obstacles)}, settle.arrangement {arrangement})"
+            f"{self._describe_obstruction(self._grounds[ground].obstacles)}, settle.arrangement {arrangements[0]})"
         )
 
-    def _place(self, items: Sequence[Item], ground: int, rng: np.random.Generator) -> Float64Array | None:
-        spec = self.scene.spec
-        settle = spec.settle
-        return draw_poses(items, self._grounds[ground].obstacles, spec.all_regions, rng, settle.yaw, settle.turned_over)
+    def _place(
+        self, items: Sequence[Item], ground: int, rng: np.random.Generator, arrangements: Sequence[Arrangement]
+    ) -> Float64Array | None:
+        settle = self.scene.spec.settle
+        regions = [
+            (region, arrangement)
+            for (region, _), arrangement in zip(self.scene.spec.all_regions, arrangements, strict=True)
+        ]
+        return draw_poses(items, self._grounds[ground].obstacles, regions, rng, settle.yaw, settle.turned_over)
 
     def _items(
         self, assets: Sequence[int], given: Sequence[Float64Array | None], regions: Sequence[int] | None
@@ -476,11 +512,10 @@ class Drop:
         obstacles: Sequence[PlacedSurface],
         start: Float64Array,
         end: Float64Array,
-        given: Sequence[Float64Array | None],
-        regions: Sequence[int],
+        drawn: Sequence[_DrawnObject],
     ) -> _Defect | None:
         """Return how a resting layout violates the requested arrangement, or None."""
-        arrangement_of = {item: self._arrangements[region] for item, region in zip(resting, regions, strict=True)}
+        arrangement_of = {item: one.arrangement for item, one in zip(resting, drawn, strict=True)}
         for pair in clearances:
             if pair.second.name.startswith(ENCLOSURE) and pair.distance < max_gap(0.0):
                 return f"{pair.first.name} rests against the enclosure", {pair.first}
@@ -495,8 +530,8 @@ class Drop:
         tilts = np.degrees(np.arccos(np.clip(np.einsum("nj,nj->n", end[:, 2, :3], start[:, 2, :3]), -1, 1)))
         fallen = [
             item
-            for item, tilt, pose in zip(resting, tilts, given, strict=True)
-            if arrangement_of[item] in ("stack", "upright", "tower", "packed") and pose is None and tilt > _FALLEN_TILT
+            for item, tilt, one in zip(resting, tilts, drawn, strict=True)
+            if one.arrangement in _PUT_DOWN and one.given is None and tilt > _FALLEN_TILT
         ]
         return (f"{fallen[0].name} fell over", set(fallen)) if fallen else None
 

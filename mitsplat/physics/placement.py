@@ -19,6 +19,7 @@ from mitsplat.scene.walls import PILE_HEIGHT
 _MAX_POSITIONS = 200  # positions tried per object before all objects are drawn again
 _MAX_POSITIONS_IN_LAYER = 20  # positions tried per layer of a pile
 _MAX_DRAWS = 20
+_GROWTH = 1.1  # of the box of tipped objects, after a number of positions without room
 _SPACING = 1e-3  # minimum distance of bounding boxes at the start [m]
 _PACK_GAP = (2e-3, 5e-3)  # distance of packed objects [m]
 _MAX_PACK_YAW = 3.0  # maximum rotation of packed objects from quarter turns [degrees]
@@ -153,8 +154,13 @@ class _Draw:
             return self._build_tower(free)
         if arrangement == "packed":
             return self._pack(free)
+        if arrangement == "tipped":
+            return self._gather(free)
         place: dict[str, Callable[[int], bool]] = {
             "drop": self._drop,
+            "tossed": self._drop,
+            "pushed": self._drop,
+            "shaken": self._drop,
             "pile": self._pour,
             "scatter": self._scatter,
             "upright": lambda i: self._stand(i, self._draw_side(i), self._yaw),
@@ -163,6 +169,24 @@ class _Draw:
 
     def _drop(self, i: int) -> bool:
         return self._place_randomly(i, self._low, self._high)
+
+    def _gather(self, members: Sequence[int]) -> bool:
+        """Place all members close together, in a box about a random point that grows until it holds them."""
+        middle = self._rng.uniform(self._low, self._high)
+        half = 0.0
+        for i in members:
+            size = np.ptp(self._items[i].outline, axis=0)
+            half = max(half, float(np.linalg.norm(size)) / 2)
+            while not self._place_randomly(
+                i,
+                np.maximum(self._low, np.minimum(middle, self._high - half) - half),
+                np.minimum(self._high, np.maximum(middle, self._low + half) + half),
+                places=_MAX_POSITIONS_IN_LAYER,
+            ):
+                if (middle - half < self._low).all() and (middle + half > self._high).all():
+                    return self._drop(i)
+                half *= _GROWTH
+        return True
 
     def _pour(self, i: int) -> bool:
         """Place an item in a column above the region's floor; the column rises as it fills."""

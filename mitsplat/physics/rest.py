@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsplat.arrays import Float64Array
+from mitsplat.physics.handling import NO_HANDLING, Handling
 from mitsplat.physics.worlds import Body, ContactOverflow, World
 
 CONTACT_OVERFLOW = "contact buffer overflow"
@@ -54,6 +55,7 @@ def run_to_rest(
     bounds: tuple[Float64Array, Float64Array],
     free_time: float = 0.0,
     fastest: float = np.inf,
+    handling: Handling = NO_HANDLING,
     observe: Callable[[float, Float64Array], None] = lambda time, poses: None,
 ) -> RestOutcome:
     """Advance a world until its bodies have been at rest for a second, or until rest is ruled out.
@@ -64,14 +66,15 @@ def run_to_rest(
 
     Args:
         world: Simulation; changed in place.
-        max_time: Time limit for coming to rest [s].
+        max_time: Time limit for coming to rest, from the end of the handling on [s].
         bounds: Corners of the box in which the centres of mass must stay [m], shape (3,) each, or (N, 3) for each body.
-        free_time: Time without rolling friction [s].
+        free_time: Time without rolling friction, from the end of the handling on [s].
         fastest: Speed limit to which faster bodies are slowed down after each advance [m/s].
+        handling: Actions on the bodies. Before they end, the bodies are not at rest.
         observe: Callback that receives the time [s] and the poses (N, 4, 4) after each advance.
     """
     try:
-        return _run_to_rest(world, max_time, bounds, free_time, fastest, observe)
+        return _run_to_rest(world, max_time, bounds, free_time, fastest, handling, observe)
     except ContactOverflow:
         refused = _Rejected(CONTACT_OVERFLOW, np.zeros(len(world.bodies), dtype=bool))
     except _Rejected as error:
@@ -93,6 +96,7 @@ def _run_to_rest(
     bounds: tuple[Float64Array, Float64Array],
     free_time: float,
     fastest: float,
+    handling: Handling,
     observe: Callable[[float, Float64Array], None],
 ) -> RestOutcome:
     mean_frames = max(1, round(_SPEED_WINDOW / world.interval))
@@ -100,16 +104,17 @@ def _run_to_rest(
     since, rest = 0.0, world.poses
     motion = np.zeros(len(world.bodies))
     while world.time - since < _REST_TIME:
-        world.allow_rolling(world.time < free_time or world.time - since >= _QUIET_TIME)
+        world.allow_rolling(world.time < handling.end + free_time or world.time - since >= _QUIET_TIME)
+        handling.apply(world)
         poses = _advance_within(world, bounds, fastest)
         past.append(poses)
         observe(world.time, poses)
         motion = np.maximum(motion, _surface_motion(world.bodies, rest, poses))
         moving = motion > (_QUIET_MOTION if world.time - since < _QUIET_TIME else _REST_MOTION)
-        if moving.any():
+        if moving.any() or world.time < handling.end:
             since, rest = world.time, poses
             motion = np.zeros(len(world.bodies))
-        if since >= max_time:
+        if since >= handling.end + max_time:
             raise _Rejected(f"not at rest within {max_time:g} s", moving)
     speed, spin = _mean_speeds(world.bodies, past[0], poses, (len(past) - 1) * world.interval)
     return RestOutcome("", since, speed, spin, float(motion.max()), world.poses)

@@ -9,7 +9,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from importlib.metadata import version
-from itertools import compress
+from itertools import compress, product
 from pathlib import Path
 
 import numpy as np
@@ -29,7 +29,7 @@ from mitsplat.storage.content_hash import ContentHash
 
 PACKAGE = Path(__file__).parents[1]
 
-_PHYSICS_MODULES = ("contacts", "drop", "friction", "placement", "rest", "restitution", "worlds")
+_PHYSICS_MODULES = ("contacts", "drop", "friction", "handling", "placement", "rest", "restitution", "worlds")
 MODULES = (
     "geometry.decomposition",
     "geometry.mesh",
@@ -121,7 +121,10 @@ def settle_layouts(
 
 
 def try_alone(scene: Scene, *, tries: int = 3) -> Iterator[tuple[str, Arrangement, list[str]]]:
-    """Drop each object alone; yield its asset, the arrangement, and the reasons of the tries if all of them failed.
+    """Drop each object alone in each arrangement of its regions.
+
+    Yields:
+        Its asset, the arrangement, and the reasons of the tries if all of them failed.
 
     One size of each asset is tried. The stepper is always MuJoCo in C, because it needs no compilation.
 
@@ -137,12 +140,11 @@ def try_alone(scene: Scene, *, tries: int = 3) -> Iterator[tuple[str, Arrangemen
         drop = drop_of(scene, lambda text: None)
         for entry, pool in zip(scene.spec.objects, scene.pools, strict=True):
             for region in () if entry.poses else scene.spec.regions_of(entry):
-                arrangement = scene.spec.all_regions[region][1]
-                for asset in pool:
-                    name = scene.assets[asset].name
-                    if (name, region) not in tried:
-                        tried.add((name, region))
-                        yield name, arrangement, drop.try_alone(asset, region, tries)
+                for asset, arrangement in product(pool, dict.fromkeys(scene.spec.all_regions[region][1])):
+                    one = scene.assets[asset].name, region, arrangement
+                    if one not in tried:
+                        tried.add(one)
+                        yield one[0], arrangement, drop.try_alone(asset, region, arrangement, tries)
 
 
 def replay_layout(scene: Scene, layout: Layout, *, interval: float = 0.04) -> Iterator[Layout]:

@@ -142,10 +142,18 @@ class World(ABC):
         self.allow_rolling(False)
         self._reset(_coordinates(self.bodies, poses))
         self.set_velocities(np.zeros((len(self.bodies), 2, 3)) if velocities is None else velocities)
+        self.set_forces(np.zeros((len(self.bodies), 2, 3)))
 
     def set_velocities(self, velocities: Float64Array) -> None:
         """Set the velocities of the bodies, as in :attr:`velocities`; poses do not change."""
         self._set_velocities(np.pad(velocities, ((0, -len(velocities) % _BATCH), (0, 0), (0, 0))))
+
+    def set_forces(self, forces: Float64Array) -> None:
+        """Set the force [N] and torque [N m] on the centre of mass of each body in world axes, shape (N, 2, 3).
+
+        They act until they are changed, or until :meth:`reset`.
+        """
+        self._set_forces(np.pad(forces, ((0, -len(forces) % _BATCH), (0, 0), (0, 0))))
 
     def advance(self) -> None:
         """Advance the simulation by :attr:`interval`.
@@ -182,6 +190,10 @@ class World(ABC):
     @abstractmethod
     def _set_velocities(self, velocities: Float64Array) -> None:
         """Set the velocities of every body, including those without shape, shape (M, 2, 3)."""
+
+    @abstractmethod
+    def _set_forces(self, forces: Float64Array) -> None:
+        """Set the forces on every body, including those without shape, shape (M, 2, 3)."""
 
     @abstractmethod
     def _advance(self) -> None: ...
@@ -256,6 +268,9 @@ class WarpWorld(World):
         _assign(state.joint_qd, velocities.ravel())
         _assign(state.body_qd, velocities.reshape(-1, 6))
 
+    def _set_forces(self, forces: Float64Array) -> None:
+        _assign(self._control.joint_f, forces.ravel())
+
     def _advance(self) -> None:
         wp.capture_launch(self._graph)
         if any(_array(observed.overflow).any() for observed in self._observables):
@@ -303,6 +318,9 @@ class MujocoWorld(World):
         arms = np.einsum("nij,nj->ni", rotations, self._centres)
         of_origin = np.stack([of_centre - np.cross(spin, arms), np.einsum("nji,nj->ni", rotations, spin)], axis=1)
         self._data.qvel[: of_origin.size] = of_origin.ravel()
+
+    def _set_forces(self, forces: Float64Array) -> None:
+        self._data.xfrc_applied[1:] = forces.reshape(-1, 6)
 
     def _advance(self) -> None:
         for _ in range(_STEPS):

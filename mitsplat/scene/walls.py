@@ -44,7 +44,7 @@ def enclosure_walls(
     The walls reach from the floor of the enclosure to the top of the region, or of the pile. Without a margin in the
     specification, the largest object fits between region and walls; but no wall is farther out than the supports.
     """
-    region, arrangement = spec.all_regions[number]
+    region, arrangements = spec.all_regions[number]
     inner_low, inner_high = np.array(region.min), np.array(region.max)
     if enclosure.margin is not None:
         low, high = inner_low - enclosure.margin, inner_high + enclosure.margin
@@ -54,7 +54,7 @@ def enclosure_walls(
         low = np.minimum(inner_low, np.maximum(inner_low - margin, bounds[:, 0].min(axis=0)))
         high = np.maximum(inner_high, np.minimum(inner_high + margin, bounds[:, 1].max(axis=0)))
     low[2], high[2] = enclosure.floor, inner_high[2]
-    if arrangement == "pile":
+    if "pile" in arrangements:
         high[2] += PILE_HEIGHT
     middle, size, thickness = (low + high) / 2, high - low, _ENCLOSURE_THICKNESS
     walls = []

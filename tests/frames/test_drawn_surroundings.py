@@ -18,7 +18,7 @@ from mitsplat.dataset.write import write_dataset
 from mitsplat.frames.mitsuba_xml import export_xml
 from mitsplat.images.colour import encode_srgb
 from mitsplat.scene.layout import NO_PHYSICS, Instance, Layout
-from mitsplat.scene.planning.contents import draw_regions
+from mitsplat.scene.planning.contents import draw_arrangements, draw_regions
 from mitsplat.scene.planning.layout_surroundings import draw_surroundings
 from mitsplat.scene.spec.scene_spec import FORMATS
 from tests.conftest import WriteScene, box_asset
@@ -135,10 +135,11 @@ def test_exported_xml_renders_the_same_environment(
     assert np.abs(shown - expected).mean() < 0.004
 
 
-def test_the_manifest_records_the_region_of_each_object(
+def test_the_manifest_records_regions_and_arrangements(
     scene_data: SceneData, write_scene: WriteScene, tmp_path: Path
 ) -> None:
     scene_data |= {"regions": [{"name": "shelf", "min": [-0.2, -0.2, 0.3], "max": [0.2, 0.2, 0.5]}]}
+    scene_data["settle"] = {"arrangement": ["drop", "pushed"]}
     scene_data["objects"] = [{"asset": "assets/nut", "scale": 4}]
     scene_data["output"] |= {"layouts": 4, "views": 1}
     scene = ms.load_scene(write_scene(scene_data))
@@ -148,3 +149,6 @@ def test_the_manifest_records_the_region_of_each_object(
     told = [record["objects"][0]["region"] for record in records]
     assert told == [("main", "shelf")[draw_regions(scene.spec, index)[0]] for index in range(4)]
     assert set(told) == {"main", "shelf"}
+    drawn = [tuple(record["arrangement"].values()) for record in records]
+    assert drawn == [draw_arrangements(scene.spec, index) for index in range(4)]
+    assert records[0]["arrangement"].keys() == {"main", "shelf"}

@@ -7,42 +7,11 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from mitsplat.geometry.mesh import mass_properties
-from tests.bodies import STEPPERS, lowest, pose_at
+from tests.bodies import STEPPERS, body_of, lowest, pose_at, table, world_of
 
 GRAVITY = 9.81
 pytestmark = pytest.mark.usefixtures("physics")
 EVERYWHERE = np.full(3, -1e3), np.full(3, 1e3)
-
-
-def body_of(*pieces, density=3000.0, **material):
-    from mitsplat.physics.friction import ContactMaterial
-    from mitsplat.physics.worlds import Body
-
-    mass = mass_properties(trimesh.util.concatenate(list(pieces)), pieces, density=density)
-    return Body(pieces, mass, ContactMaterial(**material))
-
-
-def table(pose=None, **material):
-    """Return a box whose top is the plane z = 0 of its pose."""
-    from mitsplat.physics.friction import ContactMaterial
-    from mitsplat.physics.worlds import Collider
-
-    top_from_box = trimesh.transformations.translation_matrix((0, 0, -0.05))
-    return Collider(
-        ContactMaterial(**material), box=((1.0, 1.0, 0.1), (np.eye(4) if pose is None else pose) @ top_from_box)
-    )
-
-
-def world_of(stepper, bodies, colliders, poses, *, timestep=0.002, capacity=1.0):
-    from mitsplat.physics.worlds import MujocoWorld, WarpWorld
-
-    if stepper == "mujoco":
-        world = MujocoWorld(bodies, colliders, timestep=timestep)
-    else:
-        world = WarpWorld(bodies, colliders, timestep=timestep, capacity=capacity)
-    world.reset(np.stack(poses))
-    return world
 
 
 def test_mujoco_makes_the_hulls_that_newton_analyses(monkeypatch):

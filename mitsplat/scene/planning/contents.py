@@ -1,4 +1,4 @@
-"""Contents of a layout: the drawn objects and the regions in which they start.
+"""Contents of a layout: the drawn objects, the regions in which they start, and their arrangements.
 
 The seed and the index of the layout determine the contents. Any worker can therefore draw any layout in any order.
 """
@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mitsplat.arrays import Float64Array, Int64Array
+from mitsplat.scene.spec.object_spec import Arrangement
 from mitsplat.scene.spec.scene_spec import SceneSpec
 from mitsplat.scene.streams import random_stream, weighted_choice
 from mitsplat.scene.walls import pose_matrix
@@ -43,6 +44,15 @@ def draw_regions(spec: SceneSpec, layout: int) -> tuple[int, ...]:
         rng = random_stream(spec.seed, f"object region {position}", layout)
         found += [candidates[i] for i in weighted_choice(rng, areas[candidates], count)]
     return tuple(found)
+
+
+def draw_arrangements(spec: SceneSpec, layout: int) -> tuple[Arrangement, ...]:
+    """Return the arrangement of each region in a layout."""
+    drawn = []
+    for number, (_, arrangements) in enumerate(spec.all_regions):
+        rng = random_stream(spec.seed, f"arrangement of region {number}", layout)
+        drawn.append(arrangements[int(rng.integers(len(arrangements)))])
+    return tuple(drawn)
 
 
 def _counts(spec: SceneSpec, layout: int) -> list[int]:

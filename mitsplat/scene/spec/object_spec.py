@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from mitsplat.storage.field_types import (
     CountRange,
@@ -35,7 +35,24 @@ RoughnessRange = Annotated[tuple[_Roughness, _Roughness], AfterValidator(check_o
 _Yaw = Annotated[float, Field(ge=-360, le=360)]
 YawRange = Annotated[tuple[_Yaw, _Yaw], AfterValidator(check_order)]
 
-Arrangement = Literal["drop", "pile", "scatter", "stack", "upright", "tower", "packed"]
+_Speed = Annotated[float, Field(gt=0, le=3)]
+SpeedRange = Annotated[tuple[_Speed, _Speed], AfterValidator(check_order)]
+_Spin = Annotated[float, Field(ge=0, le=3600)]
+SpinRange = Annotated[tuple[_Spin, _Spin], AfterValidator(check_order)]
+USUAL_SPEED, USUAL_SPIN = (0.2, 0.6), (0.0, 720.0)
+
+Arrangement = Literal[
+    "drop", "tossed", "tipped", "pushed", "shaken", "pile", "scatter", "stack", "upright", "tower", "packed"
+]
+Arrangements = Annotated[
+    tuple[Arrangement, ...],
+    Field(min_length=1),
+    BeforeValidator(
+        lambda value: (value,) if isinstance(value, str) else tuple(value) if isinstance(value, list) else value,
+        json_schema_input_type=Arrangement | tuple[Arrangement, ...],
+    ),
+]
+"""One arrangement or several; a single name is converted to a tuple."""
 
 
 class ObjectPose(StrictModel):
@@ -185,6 +202,14 @@ class Settle(StrictModel):
     """Initial arrangement of objects and simulation until rest.
 
     * ``drop``: random poses in the region.
+    * ``tossed``: random poses in the region. Each object starts at ``speed``, horizontally in the direction of a random
+      point of the region, and at ``spin`` about a random axis.
+    * ``tipped``: random poses close together, as the contents of a container, which leave it at the same ``speed``, 45
+      degrees downwards in the direction of a random point of the region. The container is not simulated.
+    * ``pushed``: a drop. One second later, a vertical plane without friction sweeps objects together at ``speed``, in
+      a random direction, from the edge of the region to between 20 and 70 % of its length.
+    * ``shaken``: a drop. One second later, the ground moves to and fro three times in 0.96 s, along a random horizontal
+      direction. ``speed`` is its maximum speed.
     * ``pile``: random poses above a bin, in a column as high as necessary, poured in at 1 m/s.
     * ``scatter``: random poses apart from each other, so that no objects touch.
     * ``stack``: the objects of one asset on top of each other, on their largest face.
@@ -193,10 +218,21 @@ class Settle(StrictModel):
     * ``packed``: upright side by side, in rows from a corner of the region, in slightly inexact quarter turns.
     """
 
-    arrangement: Arrangement = Field(
-        "drop",
-        description="Initial arrangement of the objects: random drop, pile, sparse scatter, stacks, upright, a "
-        "tower, or packed side by side.",
+    arrangement: Arrangements = Field(
+        ("drop",),
+        description="Arrangement of the objects: random drop, tossed, tipped out of a container, pushed together, "
+        "shaken, pile, sparse scatter, stacks, upright, a tower, or packed side by side. Of a list, each layout draws "
+        "one, and a name that occurs twice has twice the probability.",
+    )
+    speed: SpeedRange = Field(
+        USUAL_SPEED,
+        exclude_if=lambda speed: speed == USUAL_SPEED,
+        description="Range of speeds for the arrangements ``tossed``, ``tipped``, ``pushed`` and ``shaken`` [m/s].",
+    )
+    spin: SpinRange = Field(
+        USUAL_SPIN,
+        exclude_if=lambda spin: spin == USUAL_SPIN,
+        description="Range of angular speeds for the arrangement ``tossed`` [degrees/s].",
     )
     yaw: YawRange | None = optional_field(
         "Range of rotations about the vertical axis [degrees] for the arrangements ``upright``, "

@@ -16,7 +16,7 @@ from mitsplat.scene.spec.camera_spec import CameraSpec
 from mitsplat.scene.spec.image_spec import DAYLIGHT, Composite, DepthSensor, Randomise, Rendering, StereoSensor
 from mitsplat.scene.spec.light_spec import EnvironmentLight, LightEntry, RoomLight
 from mitsplat.scene.spec.material_spec import Background
-from mitsplat.scene.spec.object_spec import MAIN_REGION, Arrangement, ObjectSpec, Settle
+from mitsplat.scene.spec.object_spec import MAIN_REGION, USUAL_SPEED, USUAL_SPIN, Arrangement, ObjectSpec, Settle
 from mitsplat.scene.spec.shape_spec import Backdrop, Conveyor, Enclosure, NamedRegion, Region, Shape
 from mitsplat.storage.field_types import StrictModel, Unit, optional_field
 from mitsplat.storage.yaml_input import FieldError
@@ -263,10 +263,16 @@ class SceneSpec(StrictModel):
             if walls is not None and walls.floor >= region.max[2]:
                 text = f"must be below the region's top at {region.max[2]:g} m (got {walls.floor:g})"
                 raise FieldError((*keys, "enclosure", "floor"), text)
-        has_upright = {"upright", "tower", "packed"} & {way for _, way in self.all_regions}
-        for key, is_set in (("yaw", self.settle.yaw is not None), ("turned_over", self.settle.turned_over > 0)):
-            if is_set and not has_upright:
-                text = f"needs settle.arrangement upright, tower or packed (got {self.settle.arrangement})"
+        used = {arrangement for _, arrangements in self.all_regions for arrangement in arrangements}
+        for key, is_set, allowed in (
+            ("yaw", self.settle.yaw is not None, ("upright", "tower", "packed")),
+            ("turned_over", self.settle.turned_over > 0, ("upright", "tower", "packed")),
+            ("speed", self.settle.speed != USUAL_SPEED, ("tossed", "tipped", "pushed", "shaken")),
+            ("spin", self.settle.spin != USUAL_SPIN, ("tossed",)),
+        ):
+            if is_set and used.isdisjoint(allowed):
+                usable = " or ".join(filter(None, (", ".join(allowed[:-1]), allowed[-1])))
+                text = f"needs settle.arrangement {usable} (got {', '.join(self.settle.arrangement)})"
                 raise FieldError(("settle", key), text)
         names = self.region_names
         for number, name in enumerate(names[1:]):
@@ -286,8 +292,8 @@ class SceneSpec(StrictModel):
         return (MAIN_REGION, *(region.name for region in self.regions))
 
     @property
-    def all_regions(self) -> tuple[tuple[Region, Arrangement], ...]:
-        """All regions with the arrangement of objects in them."""
+    def all_regions(self) -> tuple[tuple[Region, tuple[Arrangement, ...]], ...]:
+        """All regions with the arrangements of objects in them, of which each layout draws one."""
         usual = self.settle.arrangement
         return ((self.region, usual), *((region, region.arrangement or usual) for region in self.regions))
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pydantic import Field, NonNegativeFloat, model_validator
 
 from mitsplat.scene.spec.material_spec import ColourMaterial, Material, NoiseMaterial
-from mitsplat.scene.spec.object_spec import Arrangement
+from mitsplat.scene.spec.object_spec import Arrangements
 from mitsplat.storage.field_types import Positive, StrictModel, Unit, Vec3
 from mitsplat.storage.yaml_input import FieldError
 
@@ -183,6 +183,8 @@ class NamedRegion(Region):
         description="Invisible walls around the region. Their ``floor`` is the height of the surface on which "
         "objects lie.",
     )
-    arrangement: Arrangement | None = Field(
-        None, description="Arrangement of objects in the region. ``settle.arrangement`` if absent."
+    arrangement: Arrangements | None = Field(
+        None,
+        description="Arrangement of objects in the region, or a list from which each layout draws one. "
+        "``settle.arrangement`` if absent.",
     )

@@ -49,7 +49,7 @@ PAGES = (
 )
 """Pages with documented commands. README comes first, because it creates most files that the others name."""
 SMALLER = {
-    "render": ["-n", "2", "--size", "64x36"],
+    "render": ["-n", "4", "--size", "64x36"],
     "preview": ["--size", "64x36"],
     "settle": ["-n", "1", "--size", "32x18"],
     "chart": ["-n", "1", "--size", "32x18"],
@@ -125,7 +125,7 @@ def smaller(words: list[str]) -> list[str]:
 def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Create the files that quick commands and Python examples name: a scene with two kinds of parts, and splats.
 
-    The first commands settle layouts from an empty cache.
+    The first command settles the two layouts of the quick commands from an empty cache.
     """
     folder = tmp_path_factory.mktemp("desk")
     shipped = YAML(typ="safe", pure=True).load(ROOT / "scenes/workcell.yaml")
@@ -133,10 +133,9 @@ def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name in (*parts, shipped["environment"]):
         shutil.copytree(ROOT / "scenes" / name, folder / "scenes" / name)
     shipped["objects"] = [{"asset": name} for name in parts]
-    shipped["output"] |= {"width": 128, "height": 72, "layouts": 12, "views": 1}
+    shipped["output"] |= {"width": 128, "height": 72, "layouts": 12, "views": 2}
     for name in ("workcell", "tray"):
         YAML(typ="safe", pure=True).dump(shipped, folder / f"scenes/{name}.yaml")
-    settle_layout(load_scene(folder / "scenes/workcell.yaml"), 3)
     box_asset("plant").splats.save(folder / "plant.splat")
     return folder
 
@@ -154,7 +153,7 @@ def lay_inputs(folder: Path) -> None:
 
     The layout of a later command is settled here with the same code.
     """
-    settle_layout(load_scene(folder / "scenes/workcell.yaml"), 7)
+    settle_layout(load_scene(folder / "scenes/workcell.yaml"), 3)
     gear = trimesh.creation.box((30, 20, 10))
     gear.visual.vertex_colors = [200, 60, 40, 255]
     gear.export(folder / "gear.glb")
@@ -232,7 +231,7 @@ def test_quick_documented_commands_run_in_their_own_process(dataset_desk: Path) 
     made = ("out/cell/report.html", "board.pdf", "frame.xml")
     assert [name for name in made if not (desk / name).stat().st_size] == []
     assert json.loads((desk / "scene.schema.json").read_text())["properties"]["camera"]
-    assert len(list((desk / "out/cell/images").rglob("*.jpg"))) == 2
+    assert len(list((desk / "out/cell/images").rglob("*.jpg"))) == 4
 
 
 @pytest.mark.extended

@@ -3,7 +3,6 @@
 import os
 import signal
 from contextlib import closing
-from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
 from types import SimpleNamespace
@@ -11,38 +10,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from mitsplat.asset import Asset
 from mitsplat.engine import shared_arrays
 from mitsplat.engine.pool import run_frames
 from mitsplat.gaussians.splat_cloud import Splats
-from mitsplat.gaussians.splat_files import SplatArrays
-from mitsplat.storage.cache import cache_folder
 from tests.conftest import box_asset
+from tests.engine.array_jobs import Describe, arrays_of, total_of
 
 MIB = 2**20
-
-
-@dataclass(frozen=True)
-class Describe:
-    """Job that describes its arrays from within a worker."""
-
-    splats: Splats
-    asset: Asset
-    empty: np.ndarray = field(default_factory=lambda: np.empty((0, 3)))
-    text: str = "as it was"
-
-    def __call__(self, index, note, /):
-        total = total_of(self.splats)
-        try:
-            self.splats.means.flags.writeable = True
-        except ValueError as error:
-            refusal = str(error)
-        self.asset.mesh.copy().apply_scale(2.0)
-        rows = Path("/proc/self/smaps").read_text().split("\n")
-        starts = [i for i, row in enumerate(rows) if str(cache_folder()) in row]
-        mapped = [rows[i].split()[1] for i in starts]
-        resident = sum(int(row.split()[1]) for i in starts for row in rows[i : i + 5] if row.startswith("Rss:")) / 1024
-        return os.getpid(), total, refusal, mapped, resident, (self.empty.shape, self.text)
 
 
 def splats_of(count: int) -> Splats:
@@ -54,14 +28,6 @@ def splats_of(count: int) -> Splats:
         opacities=rng.uniform(0, 1, count),
         sh=rng.normal(size=(count, 16, 3)),
     )
-
-
-def arrays_of(splats: Splats) -> list[np.ndarray]:
-    return [getattr(splats, name) for name in SplatArrays._fields]
-
-
-def total_of(splats: Splats) -> float:
-    return float(sum(array.sum(dtype=np.float64) for array in arrays_of(splats)))
 
 
 def test_workers_map_one_copy_of_the_arrays_and_leave_no_file(tmp_path, monkeypatch):

@@ -36,9 +36,9 @@ def scene(scene_data: dict[str, Any], write_scene: WriteScene, tmp_path: Path) -
 def test_earlier_frames_of_a_renderer_do_not_change_a_frame(scene: ms.Scene) -> None:
     layouts = [scatter_boxes(scene, layout, progress=None) for layout in range(4)]
     with ms.Renderer(scene, quality="fast") as renderer:
-        frames = [renderer.render(index, layout=layouts[index // 3]) for index in range(8)]
-    assert len({frame.plan.lights[-1].image for frame in frames}) > 1
-    assert len({len(frame.plan.lights) for frame in frames}) > 1
+        frames = {index: renderer.render(index, layout=layouts[index // 3]) for index in (0, 1, 6, 7)}
+    assert len({frame.plan.lights[-1].image for frame in frames.values()}) > 1
+    assert len({len(frame.plan.lights) for frame in frames.values()}) > 1
     for index in (1, 6, 7):
         with ms.Renderer(scene, quality="fast") as renderer:
             alone = renderer.render(index, layout=layouts[index // 3])

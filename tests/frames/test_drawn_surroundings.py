@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -57,13 +58,19 @@ def places(scene_data: SceneData, write_scene: WriteScene, tmp_path: Path) -> Sc
     return scene_data
 
 
+def neighbours(scene: ms.Scene) -> tuple[int, int]:
+    """Return the first two successive layouts with different environments."""
+    numbers = [draw_surroundings(scene.spec, 2 * layout).environment for layout in range(6)]
+    return next(pair for pair in pairwise(range(6)) if numbers[pair[0]] != numbers[pair[1]])
+
+
 def test_a_drawn_environment_renders_as_a_stated_one(places: SceneData, write_scene: WriteScene) -> None:
     del places["shapes"][0]["materials"]
     del places["background"]
     drawn = ms.load_scene(write_scene(places))
     seen = {}
     with ms.Renderer(drawn) as renderer:
-        for layout in range(6):
+        for layout in neighbours(drawn):
             frame = renderer.render(2 * layout, layout=lying(drawn, layout))
             seen[layout] = (draw_surroundings(drawn.spec, frame.index).environment, frame.image)
     assert {number for number, _ in seen.values()} == {0, 1}
@@ -88,12 +95,12 @@ def test_a_material_of_one_colour_renders_as_the_colour_key(places: SceneData, w
 
 def test_the_order_of_frames_does_not_change_them(places: SceneData, write_scene: WriteScene) -> None:
     scene = ms.load_scene(write_scene(places))
-    frames = [*range(6)]
+    frames = [2 * layout + view for layout in neighbours(scene) for view in range(2)]
     with ms.Renderer(scene) as renderer:
         forth = [renderer.render(index, layout=lying(scene, index // 2)).image for index in frames]
     with ms.Renderer(scene) as renderer:
         back = [renderer.render(index, layout=lying(scene, index // 2)).image for index in frames[::-1]][::-1]
-    assert len({image.tobytes() for image in forth}) == 6
+    assert len({image.tobytes() for image in forth}) == 4
     np.testing.assert_array_equal(forth, back)
 
 

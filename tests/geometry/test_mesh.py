@@ -59,15 +59,13 @@ def test_each_repair_is_logged_in_one_sentence(caplog):
     ]
 
 
-@pytest.mark.slow
-def test_a_million_triangles_are_simplified(caplog):
-    """A ball of 1.3 M triangles keeps its volume within 0.1 %."""
-    ball = trimesh.creation.icosphere(8, 0.05)
-    assert len(ball.faces) > 1e6
+def test_a_mesh_of_too_many_triangles_is_simplified(caplog):
+    """A ball of 328,000 triangles keeps its volume within 0.1 %."""
+    ball = trimesh.creation.icosphere(7, 0.05)
     simple = prepare_mesh(ball, "ball")
     assert len(simple.faces) <= 200_000
     assert simple.volume == pytest.approx(4 / 3 * np.pi * 0.05**3, rel=1e-3)
-    assert caplog.records[-1].message == "ball: physics simplifies the mesh of 1310720 to 200000 triangles"
+    assert caplog.records[-1].message == "ball: physics simplifies the mesh of 327680 to 200000 triangles"
 
 
 def test_unwelded_triangles_are_welded():

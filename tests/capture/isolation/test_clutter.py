@@ -25,7 +25,7 @@ from mitsplat.runtime.variant import ensure_variant
 
 pytestmark = pytest.mark.slow
 
-WIDTH, VIEWS, POINTS = 320, 15, 900
+WIDTH, VIEWS, POINTS = 320, 10, 900
 NEAR = 0.6
 """Distance from the centre below which there are no walls [m]."""
 

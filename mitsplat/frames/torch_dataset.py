@@ -21,10 +21,12 @@ import numpy as np
 import torch
 from torch.utils.data import IterableDataset, get_worker_info
 
+from mitsplat.errors import InputError
 from mitsplat.frames.frame import Frame
 from mitsplat.frames.sequence import render_frames
 from mitsplat.quality import Quality
 from mitsplat.scene.scene import Scene
+from mitsplat.scene.splits import split_of
 
 Sample = tuple[torch.Tensor, dict[str, torch.Tensor]]
 """Image and detection target."""
@@ -33,9 +35,11 @@ Sample = tuple[torch.Tensor, dict[str, torch.Tensor]]
 class FrameStream(IterableDataset[Sample]):
     """Endless frames of a scene in the format of torchvision's detection models.
 
-    With N worker processes of a ``DataLoader``, worker k renders the layouts k, k + N, k + 2 N and so on, so that no
-    layout is rendered twice. The scene's seed determines all frames: ``ms.load_scene(path, overrides={"seed": 1})``
-    gives others. Workers must be spawned, because a renderer does not survive a fork.
+    Layouts of the validation and test splits (``output.validation``, ``output.test``) are left out, so that a dataset
+    of the same scene can evaluate the detector. With N worker processes of a ``DataLoader``, worker k renders every
+    Nth of the other layouts, so that no layout is rendered twice. The scene's seed determines all frames:
+    ``ms.load_scene(path, overrides={"seed": 1})`` gives others. Workers must be spawned, because a renderer does not
+    survive a fork.
 
     Each sample is an image, (3, H, W) float32 from 0 to 1, and a target:
 
@@ -52,19 +56,27 @@ class FrameStream(IterableDataset[Sample]):
         quality: As in :func:`mitsplat.render_frame`.
 
     Raises:
-        InputError: If ``scene`` is not a scene, such as the path of a scene file.
+        InputError: If ``scene`` is not a scene, such as the path of a scene file, or if it has no layouts for training.
     """
 
     def __init__(self, scene: Scene, *, quality: str | Quality | None = None) -> None:
         super().__init__()
         Scene.check(scene)
+        output = scene.spec.output
+        if output.validation + output.test >= 1:
+            raise InputError(
+                f"{scene.path}: output.validation and output.test must leave layouts for training (got "
+                f"{output.validation:g} and {output.test:g})"
+            )
         self.scene, self.quality = scene, quality
 
     def __iter__(self) -> Iterator[Sample]:
         worker = get_worker_info()
         first, step = (0, 1) if worker is None else (worker.id, worker.num_workers)
-        views = self.scene.spec.output.views
-        indices = (layout * views + view for layout in itertools.count(first, step) for view in range(views))
+        output = self.scene.spec.output
+        training = (k for k in itertools.count() if split_of(k, output.validation, output.test) == "train")
+        layouts = itertools.islice(training, first, None, step)
+        indices = (layout * output.views + view for layout in layouts for view in range(output.views))
         for frame in render_frames(self.scene, indices, quality=self.quality, progress=False):
             yield sample_of(frame)
 

@@ -74,6 +74,9 @@ class Camera:
     focus_distance: float = 1.0
 
     def __post_init__(self) -> None:
+        for name in ("fx", "fy", "cx", "cy", "near", "aperture_radius", "focus_distance"):
+            if np.ndim(getattr(self, name)) or isinstance(getattr(self, name), str):
+                raise ValueError(f"{name} must be a number (got {getattr(self, name)!r})")
         sides = self.width, self.height
         if not all(isinstance(side, int | np.integer) and 1 <= side <= MAX_IMAGE_SIDE for side in sides):
             raise ValueError(

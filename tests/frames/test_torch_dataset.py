@@ -8,9 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from mitsplat.errors import InputError
 from mitsplat.frames.frame import render_frame
 from mitsplat.scene.loading.scene_loading import load_scene
 from mitsplat.scene.scene import Scene
+from mitsplat.scene.splits import split_of
 from tests.conftest import WriteScene
 
 torch = pytest.importorskip("torch", reason="the extra torch is not installed")
@@ -19,7 +21,7 @@ from mitsplat.frames.torch_dataset import FrameStream, sample_of  # noqa: E402 -
 
 @pytest.fixture
 def scene(scene_data: dict[str, Any], write_scene: WriteScene) -> Scene:
-    scene_data["output"] = {"width": 64, "height": 48, "layouts": 1, "views": 2}
+    scene_data["output"] = {"width": 64, "height": 48, "layouts": 1, "views": 2, "validation": 0}
     scene_data["objects"] = [{"asset": "assets/nut", "scale": 6.0}]
     return load_scene(write_scene(scene_data))
 
@@ -51,6 +53,20 @@ def test_workers_share_the_layouts_of_an_endless_scene(scene: Scene, monkeypatch
         taken = list(itertools.islice(FrameStream(scene, quality="fast"), 3))
         found[number] = [int(target["image_id"]) for _, target in taken]
     assert found == {0: [0, 1, 4], 1: [2, 3, 6]}
+
+
+def test_layouts_of_other_splits_are_left_out(scene_data: dict[str, Any], write_scene: WriteScene) -> None:
+    """Objects that are held out, and images for evaluation, must not be learnt."""
+    scene_data["output"] = {"width": 16, "height": 12, "validation": 0.25, "test": 0.25}
+    scene = load_scene(write_scene(scene_data))
+    views = scene.spec.output.views
+    frames = itertools.islice(FrameStream(scene, quality="fast"), 0, 6 * views, views)
+    layouts = [int(target["image_id"]) // views for _, target in frames]
+    assert layouts == [k for k in range(layouts[-1] + 1) if split_of(k, 0.25, 0.25) == "train"]
+    assert layouts[-1] > 5
+    scene_data["output"]["validation"] = 0.75
+    with pytest.raises(InputError, match=r"must leave layouts for training \(got 0\.75 and 0\.25\)"):
+        FrameStream(load_scene(write_scene(scene_data)))
 
 
 def test_batches_are_lists(scene: Scene) -> None:

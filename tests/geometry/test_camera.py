@@ -63,6 +63,12 @@ def test_an_invalid_image_size_is_refused(width: float) -> None:
         Camera(width, 480, 100.0, 100.0, 5.0, 240.0, np.eye(4))  # type: ignore[arg-type]
 
 
+@pytest.mark.parametrize("changes", [{"fx": np.eye(3)}, {"cy": "240"}])
+def test_intrinsics_that_are_no_numbers_are_refused(changes: dict[str, object]) -> None:
+    with pytest.raises(ValueError, match=r"(fx|cy) must be a number"):
+        replace(PINHOLE, **changes)  # type: ignore[arg-type]
+
+
 def test_positions_that_are_not_finite_are_refused() -> None:
     with pytest.raises(ValueError, match=r"must be finite \(got \[0.0, 0.0, nan\]"):
         look_at_pose((0, 0, np.nan), (0, 0, 0))

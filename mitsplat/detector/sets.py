@@ -56,6 +56,9 @@ _SPLIT_FOLDERS = {"train": "train", "val": "val", "valid": "val", "validation": 
 _OUTSIDE_TOLERANCE = 0.01
 """Largest distance of a position from the image, as a share of its sides; such positions are clipped."""
 
+_BOX_TOLERANCE = 2.0
+"""Largest difference of a box from the bounds of its segmentation at which both are the same [px]."""
+
 
 @dataclass(frozen=True, eq=False)
 class LabelledObject:
@@ -553,7 +556,13 @@ def _coco_instance(annotation: dict[str, Any], class_index: int, size: tuple[int
                 rle = coco_mask.frPyObjects({"size": [height, width], "counts": lengths}, height, width)
             if not decode_rle(rle).any():
                 raise InputError(f"{place}: segmentation must cover a pixel")
+            stated = np.array([x, y, w, h])
             x, y, w, h = coco_mask.toBbox(rle).tolist()
+            if (other := _other_box(stated, x, y, w, h)) is not None:
+                raise InputError(
+                    f"{place}: bbox must be x, y, width, height, not {other} (got {annotation['bbox']} for a "
+                    f"segmentation that spans [{x:g}, {y:g}, {w:g}, {h:g}])"
+                )
             if min(x1, x + w) < max(x0, x) - 1 or min(y1, y + h) < max(y0, y) - 1:  # masks have whole pixels
                 raise InputError(
                     f"{place}: bbox must enclose its segmentation, which spans [{x:g}, {y:g}, {w:g}, {h:g}] (got "
@@ -567,6 +576,17 @@ def _coco_instance(annotation: dict[str, Any], class_index: int, size: tuple[int
     if crowd not in (0, 1):
         raise InputError(f"{place}: iscrowd must be 0 or 1 (got {crowd!r})")
     return LabelledObject(class_index, (x0, y0, x1, y1), None, None if rle is None else _rle_text(rle), bool(crowd))
+
+
+def _other_box(stated: Float64Array, x: float, y: float, w: float, h: float) -> str | None:
+    """Return how a box is stated if it fits a segmentation within 2 pixels in another form than COCO's, or None."""
+    forms = {
+        "its two corners": (x, y, x + w, y + h),
+        "its centre and size": (x + w / 2, y + h / 2, w, h),
+    }
+    if np.abs(stated - (x, y, w, h)).max() <= _BOX_TOLERANCE:
+        return None
+    return next((name for name, box in forms.items() if np.abs(stated - box).max() <= _BOX_TOLERANCE), None)
 
 
 def _is_fraction(box: object) -> bool:

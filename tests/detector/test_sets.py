@@ -267,6 +267,14 @@ COCO_FAULTS: dict[str, tuple[Callable[[dict], object], str]] = {  # type: ignore
         lambda c: c["annotations"][0].update(bbox=[2, 2, 10, 10], segmentation=[[60, 40, 80, 40, 80, 50]]),
         r"bbox must enclose its segmentation, which spans \[61, 40, 19, 10\]",
     ),
+    "corners": (
+        lambda c: c["annotations"][0].update(bbox=[10, 20, 40, 35], segmentation=[[10, 20, 40, 20, 40, 35, 10, 35]]),
+        r"bbox must be x, y, width, height, not its two corners \(got \[10, 20, 40, 35\]",
+    ),
+    "centre": (
+        lambda c: c["annotations"][0].update(bbox=[25, 27.5, 30, 15], segmentation=[[10, 20, 40, 20, 40, 35, 10, 35]]),
+        "not its centre and size",
+    ),
     "polygon": (
         lambda c: c["annotations"][0].update(segmentation=[[1, 2]]),
         "segmentation must be polygons of 3 points",

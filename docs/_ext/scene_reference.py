@@ -119,7 +119,13 @@ def _resolved(root: Schema, key: Schema) -> Schema:
 def _type_of(root: Schema, key: Schema, path: str) -> str:
     """What may be written, with its bounds, in words."""
     if "anyOf" in key:
-        return " or ".join(_type_of(root, choice, path) for choice in key["anyOf"] if choice.get("type") != "null")
+        choices = [choice for choice in key["anyOf"] if choice.get("type") != "null"]
+        return " or ".join(
+            "list of these"
+            if choice.get("items") in choices[:1] and "enum" in choices[0]
+            else _type_of(root, choice, path)
+            for choice in choices
+        )
     if "oneOf" in key:
         kinds = [_resolved(root, kind)["properties"]["kind"]["const"] for kind in key["oneOf"]]
         path = _shown_at(root, key, path)

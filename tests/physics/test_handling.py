@@ -227,7 +227,7 @@ def test_handled_objects_rest_and_replay(scene_data, write_scene, way):
 
 
 def test_each_layout_draws_an_arrangement_of_a_list(scene_data, write_scene):
-    """A name that occurs twice has twice the probability; regions are drawn independently."""
+    """Each round has every entry of the list once, in random order; regions are drawn independently."""
     scene_data["settle"] = {"arrangement": ["drop", "pushed", "tossed", "drop"]}
     scene_data["regions"] = [
         {"name": "a", "min": [0, 0, 0.1], "max": [1, 1, 1], "arrangement": ["drop", "upright"]},
@@ -235,9 +235,9 @@ def test_each_layout_draws_an_arrangement_of_a_list(scene_data, write_scene):
     ]
     spec = load_scene(write_scene(scene_data)).spec
     drawn = np.array([draw_arrangements(spec, index) for index in range(400)])
-    counts = Counter(drawn[:, 0])
-    for name, share in (("drop", 0.5), ("pushed", 0.25), ("tossed", 0.25)):
-        assert abs(counts[name] - 400 * share) < 4 * np.sqrt(400 * share * (1 - share))
+    rounds = drawn[:, 0].reshape(100, 4)
+    assert all(Counter(one) == {"drop": 2, "pushed": 1, "tossed": 1} for one in rounds)
+    assert len({tuple(one) for one in rounds}) == 12
     both = np.mean((drawn[:, 0] == "drop") & (drawn[:, 1] == "upright"))
     assert abs(both - 0.25) < 4 * np.sqrt(0.25 * 0.75 / 400)
     assert set(drawn[:, 2]) == {"scatter"}

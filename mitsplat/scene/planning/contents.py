@@ -47,11 +47,15 @@ def draw_regions(spec: SceneSpec, layout: int) -> tuple[int, ...]:
 
 
 def draw_arrangements(spec: SceneSpec, layout: int) -> tuple[Arrangement, ...]:
-    """Return the arrangement of each region in a layout."""
+    """Return the arrangement of each region in a layout.
+
+    The arrangements of a region are dealt in rounds. Each round is a random permutation of its list.
+    """
     drawn = []
     for number, (_, arrangements) in enumerate(spec.all_regions):
-        rng = random_stream(spec.seed, f"arrangement of region {number}", layout)
-        drawn.append(arrangements[int(rng.integers(len(arrangements)))])
+        turn, place = divmod(layout, len(arrangements))
+        order = random_stream(spec.seed, f"arrangement of region {number}", turn).permutation(len(arrangements))
+        drawn.append(arrangements[order[place]])
     return tuple(drawn)
 
 

@@ -221,8 +221,8 @@ class Settle(StrictModel):
     arrangement: Arrangements = Field(
         ("drop",),
         description="Arrangement of the objects: random drop, tossed, tipped out of a container, pushed together, "
-        "shaken, pile, sparse scatter, stacks, upright, a tower, or packed side by side. Of a list, each layout draws "
-        "one, and a name that occurs twice has twice the probability.",
+        "shaken, pile, sparse scatter, stacks, upright, a tower, or packed side by side. Each layout has one "
+        "arrangement of a list; they are dealt in rounds, so that a name that occurs twice is twice as frequent.",
     )
     speed: SpeedRange = Field(
         USUAL_SPEED,

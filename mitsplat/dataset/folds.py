@@ -67,6 +67,8 @@ def write_folds(root: str | Path, folds: int) -> list[Fold]:
                 layouts[record["layout"]].update(label["class"] for label in record["labels"]["instances"])
                 images[record["layout"]] += 1
         if not 2 <= folds <= len(layouts):
+            if len(layouts) < 2:
+                raise InputError(f"{root}: must have at least 2 layouts to be divided into folds (got {len(layouts)})")
             raise InputError(f"folds must be 2 to {len(layouts)}, the layouts of {root} (got {folds})")
         fold_of = assign_folds(layouts, folds)
         remove_folds(root)

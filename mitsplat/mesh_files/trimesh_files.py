@@ -175,12 +175,14 @@ def _off_warnings(path: Path) -> Iterator[str]:
     """Yield a warning if an OFF file has colours.
 
     Raises:
-        InputError: If its positions have four components.
+        InputError: If its positions have four components, or if it has fewer faces than its header states.
     """
     header, rows, count, number = _off_rows(path)
     if "4" in header or "n" in header:
         raise InputError(f"OFF files must have positions of three components (got {header})")
     faces = rows[count + 1 : count + number + 1]
+    if len(faces) < number:
+        raise InputError(f"its header states {number} faces (got {len(faces)}; is the file complete?)")
     if "C" in header or any(len(row) > int(row[0]) + 1 for row in faces):
         yield "the colours of its vertices and faces are not read, because OFF files store them in several ways"
 
@@ -400,7 +402,10 @@ def check_textures(mesh: Path) -> None:
     if kind == ".obj":
         check_obj_materials(mesh)
     elif kind == ".ply":
-        for texture in _texture_names(_ply_header(mesh)):
+        names = _texture_names(_ply_header(mesh))
+        if len(names) > 1:  # trimesh uses the last one for all faces
+            raise InputError(f"{mesh}: must have one texture (got {', '.join(names)}): merge them")
+        for texture in names:
             check_texture(mesh, texture, mesh.parent)
 
 

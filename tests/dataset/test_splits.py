@@ -99,6 +99,15 @@ def test_folds_list_existing_images_and_labels(made: Path, capsys: pytest.Captur
         write_folds(made, 7)
 
 
+def test_a_dataset_of_one_layout_has_no_folds(tmp_path: Path) -> None:
+    scene = small_scene(
+        tmp_path, large_boxes(), [{"asset": "assets/nut"}, {"asset": "assets/bolt"}], layouts=1, views=1
+    )
+    out = write_dataset(scene, tmp_path / "out", render=render_boxes, settle=scatter_drawn).path
+    with pytest.raises(InputError, match=r"must have at least 2 layouts to be divided into folds \(got 1\)"):
+        write_folds(out, 2)
+
+
 def test_overwriting_removes_folds(tmp_path: Path) -> None:
     scene = small_scene(
         tmp_path, large_boxes(), [{"asset": "assets/nut"}, {"asset": "assets/bolt"}], layouts=2, views=1

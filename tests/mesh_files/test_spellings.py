@@ -166,6 +166,14 @@ def test_transparent_colours_and_textures_without_coordinates_of_ply_are_named(t
     assert read_model(tmp_path / "b.ply").warnings == ("its texture a.png has no coordinates, and is left out",)
 
 
+def test_several_textures_of_ply_are_refused(tmp_path: Path) -> None:
+    for name in "ab":
+        Image.new("RGB", (8, 8)).save(tmp_path / f"{name}.png")
+    (tmp_path / "a.ply").write_text(ply(head="comment TextureFile a.png\ncomment TextureFile b.png\n"))
+    with pytest.raises(InputError, match=r"must have one texture \(got a\.png, b\.png\): merge them"):
+        read_model(tmp_path / "a.ply")
+
+
 @pytest.mark.parametrize(
     ("content", "sentence"),
     [
@@ -200,6 +208,12 @@ def test_colours_of_off_files_are_named(tmp_path: Path, content: str) -> None:
     (tmp_path / "a.off").write_text(content)
     model = read_model(tmp_path / "a.off")
     assert is_complete(model) and "colours of its vertices and faces are not read" in model.warnings[0]
+
+
+def test_a_truncated_off_file_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "a.off").write_text(off().removesuffix("3 0 3 2\n"))
+    with pytest.raises(InputError, match=r"its header states 4 faces \(got 3; is the file complete\?\)"):
+        read_model(tmp_path / "a.off")
 
 
 def test_homogeneous_positions_of_off_are_refused(tmp_path: Path) -> None:

@@ -196,8 +196,9 @@ def _place(
             placed[number] = body, asset_index(match[1], exported, f"body {name!r}")
         elif body in free:
             raise InputError(
-                f"body {name!r}: must be named ASSET_ID, an asset of the scene and a number of 1 to 9999, because it "
-                "has a free joint; otherwise name the bodies that are shown by bodies={BODY: ASSET}"
+                f"body {repr(name) if name else body}: must be named ASSET_ID, an asset of the scene and a number of 1 "
+                "to 9999, because it has a free joint; otherwise state the bodies that are shown, by their names or "
+                "indices: bodies={BODY: ASSET}"
             )
     if not placed:
         raise InputError(

@@ -136,7 +136,10 @@ class _StageReader:
         from pxr import Usd, UsdGeom, UsdLux, UsdPhysics, UsdVol  # optional
 
         found: Record = {key: [] for key in ("fields", "bodies", "colliders", "meshes", "cameras", "lights")}
-        for prim in self._stage.Traverse(Usd.TraverseInstanceProxies()):
+        prims = iter(self._stage.Traverse(Usd.TraverseInstanceProxies()))
+        for prim in prims:
+            if prim.IsA(UsdGeom.PointInstancer):
+                prims.PruneChildren()  # its prototypes are drawn at the points alone
             for name in sampled_attributes(prim):
                 self._ignored[f"sets of time samples of {name}"].append(str(prim.GetPath()))
             shown = visibility(prim, self._times) if prim.IsA(UsdGeom.Imageable) else [True]

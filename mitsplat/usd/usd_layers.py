@@ -75,7 +75,7 @@ def _check_layers(path: Path) -> None:
         if not file.is_absolute():  # USD found no such file beside the layer, and would search the current folder
             raise InputError(f"{path}: no such file: {folder / file}")
         if not file.resolve().is_relative_to(folder):
-            raise InputError(f"{path}: files of a stage must lie in its folder (got {file})")
+            raise InputError(f"{path}: files of a stage must lie in its folder; flatten the stage (got {file})")
         if not file.is_file():
             raise InputError(f"{path}: no such file: {file}")
         if file.suffix.lower() not in USD_SUFFIXES:

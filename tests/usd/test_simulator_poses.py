@@ -193,11 +193,13 @@ def test_wrong_bodies_and_poses_are_refused(
         (("nut_1", "bolt_1"), r"'bolt_1': must have an instance id of its own \(body 'nut_1' has 1, too\)"),
         (("nut_1", "bolt"), r"'bolt': must be named ASSET_ID, .* because it has a free joint"),
         (("nut_1", "mug_2"), r"'mug_2': must be named ASSET_ID"),
+        (("nut_1", ""), r"^body 2: must be named ASSET_ID, .* by their names or indices: bodies="),
         ((), r"the model must have bodies named ASSET_ID, .* \(got world\)"),
     ],
 )
 def test_wrong_names_of_bodies_are_refused(scene: ms.Scene, names: tuple[str, ...], message: str) -> None:
     bodies = "".join(f'<body name="{name}"><freejoint/><geom size="0.1"/></body>' for name in names)
+    bodies = bodies.replace(' name=""', "")
     model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{bodies}</worldbody></mujoco>")
     with pytest.raises(ms.InputError, match=message):
         ms.layout_from_mujoco(scene, model, mujoco.MjData(model))

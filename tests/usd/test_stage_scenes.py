@@ -271,6 +271,20 @@ def test_a_render_product_states_size_and_fit_of_the_image_of_its_camera(
         assert note in found.notes
 
 
+def test_prototypes_of_a_point_instancer_are_not_drawn_by_themselves(tmp_path: Path) -> None:
+    write_balls(tmp_path / "balls.usda")
+    stage = Usd.Stage.Open(str(tmp_path / "balls.usda"))
+    instancer = UsdGeom.PointInstancer.Define(stage, "/World/trees")
+    UsdGeom.Cube.Define(stage, "/World/trees/prototypes/tree")
+    add_ball(stage, "/World/trees/prototypes/ball", "tree", np.random.default_rng(1))
+    instancer.CreatePrototypesRel().SetTargets(["/World/trees/prototypes/tree", "/World/trees/prototypes/ball"])
+    stage.Save()
+    found = read_stage_scene(tmp_path / "balls.usda", tmp_path / "scene")
+    assert "not imported: 1 prims of type PointInstancer (/World/trees)" in found.notes
+    assert found.scene.class_names == ("even", "odd")
+    assert [shape.name for shape in found.scene.spec.shapes] == ["/World/table"]
+
+
 def test_the_hull_of_a_single_gaussian_is_that_of_its_axes(tmp_path: Path) -> None:
     write_balls(tmp_path / "balls.usda")
     stage = Usd.Stage.Open(str(tmp_path / "balls.usda"))

@@ -274,7 +274,8 @@ def test_a_hostile_stage_is_refused_in_a_sentence(tmp_path: Path, text: str, mes
 def test_a_child_process_refuses_hostile_stages(tmp_path: Path) -> None:
     (tmp_path / "bad.usda").write_text('#usda 1.0\ndef "x" (references=@/etc/passwd.usda@</a>) {}\n')
     with pytest.raises(
-        InputError, match=r"bad\.usda: files of a stage must lie in its folder \(got /etc/passwd\.usda\)"
+        InputError,
+        match=r"bad\.usda: files of a stage must lie in its folder; flatten the stage \(got /etc/passwd\.usda\)",
     ):
         read_stage_asset(tmp_path / "bad.usda")
     (tmp_path / "empty.usda").write_text("#usda 1.0\n")

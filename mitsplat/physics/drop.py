@@ -12,7 +12,7 @@ from functools import lru_cache
 import numpy as np
 import trimesh
 
-from mitsplat.arrays import Float64Array
+from mitsplat.arrays import BoolArray, Float64Array
 from mitsplat.asset import Asset
 from mitsplat.errors import InputError
 from mitsplat.geometry.decomposition import MAX_PIECES, convex_pieces, max_gap
@@ -22,7 +22,7 @@ from mitsplat.physics.contacts import ContactFinder
 from mitsplat.physics.friction import ContactMaterial
 from mitsplat.physics.handling import draw_handling
 from mitsplat.physics.placement import Item, draw_poses
-from mitsplat.physics.rest import CONTACT_OVERFLOW, FREE_TIME, RestOutcome, run_to_rest
+from mitsplat.physics.rest import CONTACT_OVERFLOW, FREE_TIME, LATE, LEANING, RestOutcome, run_to_rest
 from mitsplat.physics.worlds import Body, Collider, MujocoWorld, WarpWorld, World, all_pieces
 from mitsplat.progress import Note
 from mitsplat.scene.layout import NO_PHYSICS, Instance, Layout, LeftOut, RestCertificate, UnsettledLayoutError
@@ -33,7 +33,15 @@ from mitsplat.scene.spec.object_spec import Arrangement
 from mitsplat.scene.spec.shape_spec import Shape
 from mitsplat.scene.splits import draw_environment
 from mitsplat.scene.streams import random_stream
-from mitsplat.scene.walls import ENCLOSURE, PILE_HEIGHT, bin_walls, enclosed_bounds, pose_matrix, walls_beside
+from mitsplat.scene.walls import (
+    ENCLOSURE,
+    PILE_HEIGHT,
+    bin_walls,
+    enclosed_bounds,
+    enclosure_box,
+    pose_matrix,
+    walls_beside,
+)
 
 TIMESTEP = 0.002  # of the simulation [s]
 _MAX_MEASURED_GAP = 5e-3  # larger gaps are not measured [m]
@@ -51,9 +59,9 @@ _LEFT_OUT_PER_ROUND = 0.1  # share of the objects that is left out per round if 
 _MAX_LEFT_OUT = 0.5  # and maximum share in total: beyond it, the region is too small
 _PUT_DOWN = {"stack", "upright", "tower", "packed"}  # arrangements of other than random poses
 _POUR_SPEED = 1.0  # speed limit of poured objects [m/s]: at higher speed, heavy objects eject light ones
-# Simulated time for the draws of a layout [s], thirty times that of a typical draw. After it, each rejected draw leaves
+# Simulated time for the draws of a layout [s], ten times that of a typical draw. After it, each rejected draw leaves
 # objects out.
-_MAX_SIMULATED = 60.0
+_MAX_SIMULATED = 40.0
 _CONCAVITIES = (0.02, 0.01, 0.005)  # concavity of convex pieces, from coarse to fine
 
 
@@ -73,12 +81,14 @@ class _Ground:
     Attributes:
         contact_finder: Contact finder for all objects and these colliders.
         bounds: Corners of the box in which the centres of mass must stay [m], per region, shape (R, 3) each.
+        walls: Corners of the box of the enclosure's walls [m], in the same shapes; infinite without a wall.
     """
 
     colliders: tuple[Collider, ...]
     obstacles: tuple[PlacedSurface, ...]
     contact_finder: ContactFinder
     bounds: tuple[Float64Array, Float64Array]
+    walls: tuple[Float64Array, Float64Array]
 
 
 @dataclass(frozen=True, eq=False)
@@ -235,9 +245,12 @@ class Drop:
             reason = "no room for it" if any(alone) else CROWDED
             return _Rejection(reason, np.flatnonzero(alone).tolist(), str(error))
         world = self._world(assets, 2.0 ** refused.count(CONTACT_OVERFLOW), number)
-        outcome = self._run(world, start, index, len(refused), drawn)
+        outcome = self._run(world, start, index, len(refused), drawn, rng)
         if outcome.rejection:
-            return _Rejection(outcome.rejection, outcome.causes, simulated=world.time)
+            reason = outcome.rejection
+            if reason in (LEANING, LATE):
+                reason = f"{self.scene.assets[assets[outcome.causes[0]]].name} {reason}"
+            return _Rejection(reason, outcome.causes, simulated=world.time)
         resting = [self._placed(asset, pose) for asset, pose in zip(assets, outcome.poses, strict=True)]
         clearances = all_clearances(resting, obstacles, reach=_MAX_MEASURED_GAP)
         gaps = _support_gaps(resting, clearances)
@@ -299,7 +312,7 @@ class Drop:
             if len(moments) * interval <= time <= certificate.time_to_rest:
                 moments.append(poses)
 
-        self._run(world, start, layout.index, attempt, drawn, observe)
+        self._run(world, start, layout.index, attempt, drawn, rng, observe)
         yield from moments
 
     def _ground_of(self, layout: int) -> int:
@@ -322,25 +335,36 @@ class Drop:
         index: int,
         attempt: int,
         drawn: Sequence[_DrawnObject],
+        rng: np.random.Generator,
         observe: Callable[[float, Float64Array], None] = lambda time, poses: None,
     ) -> RestOutcome:
-        """Simulate a draw of a layout from its start poses (N, 4, 4)."""
+        """Simulate a draw of a layout from its start poses (N, 4, 4); ``rng`` draws those of objects that fail."""
         settle = self.scene.spec.settle
         fastest = _POUR_SPEED if any(one.arrangement == "pile" for one in drawn) else np.inf
-        low, high = self._grounds[self._ground_of(index)].bounds
-        # Objects with a pose in the scene file may be in any of the regions.
+        number, arrangements = self._ground_of(index), self._arrangements(drawn)
+        ground = self._grounds[number]
         free = np.array([one.given is None for one in drawn])
         own = np.array([one.region for one in drawn])
-        low, high = (
-            np.where(free[:, None], limit[own], rest) for limit, rest in ((low, low.min(0)), (high, high.max(0)))
-        )
+
+        def limits(box: tuple[Float64Array, Float64Array]) -> tuple[Float64Array, Float64Array]:
+            """Return the box of each object. Those with a pose in the scene file may be in any of the regions."""
+            low, high = np.where(free[:, None], np.stack(box)[:, own], [[box[0].min(axis=0)], [box[1].max(axis=0)]])
+            return low, high
+
+        def redraw(poses: Float64Array, failed: BoolArray) -> Float64Array | None:
+            if (failed & ~free).any():
+                return None
+            placed = [None if again else pose for again, pose in zip(failed, poses, strict=True)]
+            items = self._items([one.asset for one in drawn], placed, own.tolist())
+            return self._place(items, number, rng, arrangements)
+
         # Round objects that are put down would roll away without rolling friction.
         falls = _PUT_DOWN.isdisjoint(one.arrangement for one in drawn)
         regions = [region for region, _ in self.scene.spec.all_regions]
         handling = draw_handling(
             world.bodies,
             start,
-            list(zip(regions, self._arrangements(drawn), strict=True)),
+            list(zip(regions, arrangements, strict=True)),
             [free & (own == number) for number in range(len(regions))],
             random_stream(self.scene.spec.seed, "object motion", index, attempt),
             speed=settle.speed,
@@ -350,10 +374,12 @@ class Drop:
         return run_to_rest(
             world,
             max_time=settle.max_time,
-            bounds=(low, high),
+            bounds=limits(ground.bounds),
+            walls=limits(ground.walls),
             free_time=FREE_TIME if falls else 0.0,
             fastest=fastest,
             handling=handling,
+            redraw=redraw if falls else None,
             observe=observe,
         )
 
@@ -412,16 +438,18 @@ class Drop:
             obstacles.append(PlacedSurface(surroundings.name, DistanceSurface(mesh)))
         if not colliders:
             raise InputError(f"{scene.path}: at least one shape must be a collider, on which objects rest (got none)")
-        lows, highs = [], []
+        names, boxes = [item.name for item in obstacles], [item.bounds for item in obstacles]
+        bounds, inner = [], []
         for number, (region, arrangements) in enumerate(scene.spec.all_regions):
-            beside = walls_beside(scene.spec, number, [item.name for item in obstacles], walls)
-            low, high = enclosed_bounds(region, [item.bounds for item in obstacles], beside)
+            beside = walls_beside(scene.spec, number, names, walls)
+            low, high = enclosed_bounds(region, boxes, beside)
             high[2] += PILE_HEIGHT if "pile" in arrangements else 0.0
-            lows.append(low)
-            highs.append(high)
-        bounds = np.array(lows), np.array(highs)
+            bounds.append((low, high))
+            inner.append(enclosure_box({names[wall]: boxes[wall] for wall in beside}))
         finder = ContactFinder(all_pieces((part.body for part in self._objects), colliders))
-        return _Ground(tuple(colliders), tuple(obstacles), finder, bounds)
+        outer_low, outer_high = np.array(bounds).swapaxes(0, 1)
+        inner_low, inner_high = np.array(inner).swapaxes(0, 1)
+        return _Ground(tuple(colliders), tuple(obstacles), finder, (outer_low, outer_high), (inner_low, inner_high))
 
     def _check_given_poses(self, ground: _Ground) -> None:
         """Refuse start poses of the scene file that overlap one another or a collider.
@@ -518,7 +546,7 @@ class Drop:
         arrangement_of = {item: one.arrangement for item, one in zip(resting, drawn, strict=True)}
         for pair in clearances:
             if pair.second.name.startswith(ENCLOSURE) and pair.distance < max_gap(0.0):
-                return f"{pair.first.name} rests against the enclosure", {pair.first}
+                return f"{pair.first.name} {LEANING}", {pair.first}
         for pair in clearances:
             if (
                 arrangement_of[pair.first] == "scatter"

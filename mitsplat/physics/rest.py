@@ -9,12 +9,14 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from mitsplat.arrays import Float64Array
+from mitsplat.arrays import BoolArray, Float64Array
 from mitsplat.physics.handling import NO_HANDLING, Handling
 from mitsplat.physics.worlds import Body, ContactOverflow, World
 
 CONTACT_OVERFLOW = "contact buffer overflow"
 """Reason of :func:`run_to_rest` for rejecting a drop that may succeed with a larger capacity."""
+LEANING, LATE = "rests against the enclosure", "keeps moving"
+"""Reasons that concern the first body that causes the rejection."""
 
 # Rest means that no surface moves farther than a limit [m] within a time [s]. The stricter first stage ends before
 # rolling friction is disabled. Speeds are less reliable: contacts of rounded hulls flicker from step to step, and so do
@@ -24,6 +26,12 @@ _QUIET_MOTION, _QUIET_TIME = 1e-4, 0.25
 FREE_TIME = 1.5
 """Time without rolling friction for bodies that fall in random poses [s], longer than rebounds last."""
 _SPEED_WINDOW = 0.05  # averaging time of the reported speeds [s]
+_DRAG_TIME = 0.2  # time constant of the drag on bodies that still move after FREE_TIME [s]
+# Bodies are late if they roll or rock while the others rest: they move by more than a limit [m] within a time [s]. At
+# least one body may be late, and at most this share of all.
+_LATE_MOTION, _LATE_TIME, _MAX_LATE = 1e-3, 1.0, 0.25
+_WALL_DISTANCE = 1e-3  # distance from a wall below which a body leans against it [m]
+_MAX_REDRAWS = 8  # of bodies, in one drop
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,14 +56,23 @@ class RestOutcome:
     causes: tuple[int, ...] = ()
 
 
+Redraw = Callable[[Float64Array, BoolArray], Float64Array | None]
+"""Function that gets poses (N, 4, 4) and a mask (N,), and returns the poses with new ones for the masked bodies.
+
+It returns None if there is no room.
+"""
+
+
 def run_to_rest(
     world: World,
     *,
     max_time: float,
     bounds: tuple[Float64Array, Float64Array],
+    walls: tuple[Float64Array, Float64Array] | None = None,
     free_time: float = 0.0,
     fastest: float = np.inf,
     handling: Handling = NO_HANDLING,
+    redraw: Redraw | None = None,
     observe: Callable[[float, Float64Array], None] = lambda time, poses: None,
 ) -> RestOutcome:
     """Advance a world until its bodies have been at rest for a second, or until rest is ruled out.
@@ -64,17 +81,26 @@ def run_to_rest(
     quarter, rolling friction is disabled, because it would let a box balance on its edge. It is also disabled in the
     first seconds of bodies that tumble, because discs would stop on their rim.
 
+    Bodies that still move after 1.5 s are slowed by a drag with a time constant of 0.2 s, which ends together with
+    rolling friction. A body fails if it leaves the bounds, leans against a wall, or moves on when three quarters of the
+    bodies have moved by less than 1 mm for a second. With ``redraw``, failed bodies start again from new poses, up to
+    eight times, while the others stay where they are. Otherwise, the drop is rejected.
+
     Args:
         world: Simulation; changed in place.
-        max_time: Time limit for coming to rest, from the end of the handling on [s].
+        max_time: Time limit for coming to rest, from the end of the handling or the last redraw on [s].
         bounds: Corners of the box in which the centres of mass must stay [m], shape (3,) each, or (N, 3) for each body.
-        free_time: Time without rolling friction, from the end of the handling on [s].
+        walls: Corners of the box of walls that no body may lean against [m], in the same shapes; infinite without a
+            wall.
+        free_time: Time without rolling friction, from the end of the handling or the last redraw on [s].
         fastest: Speed limit to which faster bodies are slowed down after each advance [m/s].
         handling: Actions on the bodies. Before they end, the bodies are not at rest.
+        redraw: Function that draws new poses of failed bodies.
         observe: Callback that receives the time [s] and the poses (N, 4, 4) after each advance.
     """
+    failures = _Failures(world, bounds, walls or (np.full(3, -np.inf), np.full(3, np.inf)))
     try:
-        return _run_to_rest(world, max_time, bounds, free_time, fastest, handling, observe)
+        return _run_to_rest(world, max_time, failures, free_time, fastest, handling, redraw, observe)
     except ContactOverflow:
         refused = _Rejected(CONTACT_OVERFLOW, np.zeros(len(world.bodies), dtype=bool))
     except _Rejected as error:
@@ -93,20 +119,22 @@ class _Rejected(Exception):
 def _run_to_rest(
     world: World,
     max_time: float,
-    bounds: tuple[Float64Array, Float64Array],
+    failures: _Failures,
     free_time: float,
     fastest: float,
     handling: Handling,
+    redraw: Redraw | None,
     observe: Callable[[float, Float64Array], None],
 ) -> RestOutcome:
     mean_frames = max(1, round(_SPEED_WINDOW / world.interval))
     past: deque[Float64Array] = deque([world.poses], maxlen=mean_frames + 1)
-    since, rest = 0.0, world.poses
-    motion = np.zeros(len(world.bodies))
+    begin, since, rest = handling.end, 0.0, world.poses
+    motion, redraws = np.zeros(len(world.bodies)), 0
     while world.time - since < _REST_TIME:
-        world.allow_rolling(world.time < handling.end + free_time or world.time - since >= _QUIET_TIME)
+        quiet = world.time - since >= _QUIET_TIME
+        world.allow_rolling(world.time - begin < free_time or quiet)
         handling.apply(world)
-        poses = _advance_within(world, bounds, fastest)
+        poses = _advance(world, fastest, drag=world.time - begin >= FREE_TIME and not quiet)
         past.append(poses)
         observe(world.time, poses)
         motion = np.maximum(motion, _surface_motion(world.bodies, rest, poses))
@@ -114,27 +142,102 @@ def _run_to_rest(
         if moving.any() or world.time < handling.end:
             since, rest = world.time, poses
             motion = np.zeros(len(world.bodies))
-        if since >= handling.end + max_time:
-            raise _Rejected(f"not at rest within {max_time:g} s", moving)
+        reason, failed = failures.find(poses, moving, begin)
+        if not failed.any() and since - begin >= max_time:
+            reason, failed = f"not at rest within {max_time:g} s", moving
+        if failed.any():
+            drawn = redraw(poses, failed) if redraw is not None and redraws < _MAX_REDRAWS else None
+            if drawn is None:
+                raise _Rejected(reason, failed)
+            _restart(world, drawn, failed)
+            begin, since = max(world.time, handling.end), world.time
+            rest, motion, redraws = drawn, np.zeros(len(world.bodies)), redraws + 1
     speed, spin = _mean_speeds(world.bodies, past[0], poses, (len(past) - 1) * world.interval)
     return RestOutcome("", since, speed, spin, float(motion.max()), world.poses)
 
 
-def _advance_within(world: World, bounds: tuple[Float64Array, Float64Array], fastest: float) -> Float64Array:
-    """Advance the world, check the bounds, and return the poses."""
+def _advance(world: World, fastest: float, *, drag: bool) -> Float64Array:
+    """Advance the world, reduce its velocities, and return the poses."""
     world.advance()
     poses, velocities = world.poses, world.velocities
     if not np.isfinite(poses).all() or not np.isfinite(velocities).all():
         raise _Rejected("the simulation diverged", ~np.isfinite(poses).all(axis=(1, 2)))
+    if drag:
+        velocities *= np.exp(-world.interval / _DRAG_TIME)
     speeds = np.linalg.norm(velocities[:, 0], axis=1)
-    if speeds.max() > fastest:
+    too_fast = speeds.max() > fastest
+    if too_fast:
         velocities[:, 0] *= np.minimum(1.0, fastest / np.maximum(speeds, fastest))[:, None]
+    if drag or too_fast:
         world.set_velocities(velocities)
-    centres = _centres(world.bodies, poses)
-    outside = ((centres < bounds[0]) | (centres > bounds[1])).any(axis=1)
-    if outside.any():
-        raise _Rejected(f"{int(outside.sum())} left the enclosure", outside)
     return poses
+
+
+def _restart(world: World, poses: Float64Array, bodies: BoolArray) -> None:
+    """Set new poses (N, 4, 4). The given bodies (N,) start at rest, the others keep their velocities."""
+    time, velocities = world.time, world.velocities
+    velocities[bodies] = 0.0
+    world.reset(poses, velocities)
+    world.time = time
+
+
+class _Failures:
+    """Detection of bodies that will not come to rest where they may.
+
+    Args:
+        world: Simulation.
+        bounds: Corners of the box in which the centres of mass must stay [m].
+        walls: Corners of the box of walls that no body may lean against [m].
+    """
+
+    def __init__(
+        self, world: World, bounds: tuple[Float64Array, Float64Array], walls: tuple[Float64Array, Float64Array]
+    ) -> None:
+        count = len(world.bodies)
+        self._world, self._bounds = world, bounds
+        self._low, self._high = (np.broadcast_to(side, (count, 3)) for side in walls)
+        self._last_motion = np.zeros(count)
+        self._before: tuple[float, Float64Array] | None = None  # time and poses
+        self._reach = np.array([np.linalg.norm(body.outline - body.mass.centre, axis=1).max() for body in world.bodies])
+
+    def find(self, poses: Float64Array, moving: BoolArray, begin: float) -> tuple[str, BoolArray]:
+        """Return the reason of a failure, and a mask (N,) of the bodies that failed.
+
+        Args:
+            poses: World-from-body transforms, shape (N, 4, 4).
+            moving: Mask of the bodies that move, shape (N,).
+            begin: Time at which the handling ended, or bodies were dropped again [s].
+        """
+        time = self._world.time
+        self._last_motion[moving] = time
+        centres = _centres(self._world.bodies, poses)
+        outside = np.any((centres < self._bounds[0]) | (centres > self._bounds[1]), axis=1)
+        if outside.any():
+            return f"{int(outside.sum())} left the enclosure", outside
+        calm = time - self._last_motion >= _QUIET_TIME
+        reach = self._reach[:, None] + _WALL_DISTANCE
+        leaning = calm & ((centres - reach < self._low) | (centres + reach > self._high)).any(axis=1)
+        for i in np.flatnonzero(leaning):
+            points = self._world.bodies[i].outline @ poses[i, :3, :3].T + poses[i, :3, 3]
+            beyond = (points < self._low[i] + _WALL_DISTANCE) | (points > self._high[i] - _WALL_DISTANCE)
+            leaning[i] = beyond.any()
+        if leaning.any():
+            return LEANING, leaning
+        return LATE, self._find_late(poses, calm, begin)
+
+    def _find_late(self, poses: Float64Array, calm: BoolArray, begin: float) -> BoolArray:
+        """Return a mask (N,) of the bodies that move while the others rest."""
+        time, late = self._world.time, np.zeros(len(calm), dtype=bool)
+        if time < begin + FREE_TIME:
+            self._before = None
+        elif self._before is None:
+            self._before = time, poses
+        elif time - self._before[0] >= _LATE_TIME:
+            moved = _surface_motion(self._world.bodies, self._before[1], poses) > _LATE_MOTION
+            if moved.sum() <= max(1, int(_MAX_LATE * len(moved))) < len(moved):
+                late = moved & ~calm
+            self._before = time, poses
+        return late
 
 
 def _centres(bodies: Sequence[Body], poses: Float64Array) -> Float64Array:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -79,6 +79,25 @@ def walls_beside(spec: SceneSpec, number: int, names: Sequence[str], walls: Sequ
     others = [f"{ENCLOSURE}{_of_region(spec, i)}" for i in range(len(spec.all_regions)) if i != number]
     foreign = {f"{other}{side}" for other in others for side in ("-x", "+x", "-y", "+y", "lid")}
     return [position for position in walls if names[position] not in foreign]
+
+
+def enclosure_box(bounds: Mapping[str, Float64Array]) -> tuple[Float64Array, Float64Array]:
+    """Return the corners of the box between the walls of an enclosure [m]; infinite where there is no wall.
+
+    Args:
+        bounds: Bounding box of each wall by name, shape (2, 3) [m]; other names are ignored.
+    """
+    low, high = np.full(3, -np.inf), np.full(3, np.inf)
+    for name, box in bounds.items():
+        side = name.split()[-1]
+        if not name.startswith(ENCLOSURE) or side == "lid":
+            continue
+        axis = "xy".index(side[1])
+        if side[0] == "-":
+            low[axis] = max(low[axis], box[1][axis])
+        else:
+            high[axis] = min(high[axis], box[0][axis])
+    return low, high
 
 
 def backdrop_shapes(room: Backdrop) -> list[Shape]:

@@ -268,12 +268,35 @@ def test_simulations_are_freed(scene_data, write_scene, monkeypatch):
     assert gone == [True, True, True, False]
 
 
-def test_drops_that_fall_off_are_rejected_and_counted(scene_data, write_scene):
-    """On a pedestal narrower than the region, some draws stay and some fall off."""
+@pytest.fixture
+def pedestal_scene(scene_data, write_scene):
+    """Return a scene with a pedestal narrower than the region, from which some objects fall."""
     scene_data["shapes"][0]["box"] = {"size": [0.12, 0.12, 0.1], "position": [0, 0, -0.05]}
     scene_data["region"] = {"min": [-0.1, -0.1, 0.01], "max": [0.1, 0.1, 0.1]}
     scene_data["settle"] = {"attempts": 30}
-    scene = load_scene(write_scene(scene_data))
+    return load_scene(write_scene(scene_data))
+
+
+def test_objects_that_fall_off_are_dropped_again_while_the_others_stay(pedestal_scene):
+    again = 0
+    for index in range(3):
+        layout = settle_layout(pedestal_scene, index, cached=False)
+        assert layout.certificate.refused == ()
+        assert layout.left_out == ()
+        *moments, _ = replay_layout(pedestal_scene, layout, interval=0.008)
+        places = np.array([[one.world_from_object[:3, 3] for one in moment.instances] for moment in moments])
+        assert places[-1, :, 2].min() > 0
+        raised = np.diff(places[..., 2], axis=0) > 0.05  # from below the pedestal to above it
+        assert not raised.all(axis=1).any()
+        again += raised.sum()
+    assert again > 0
+
+
+def test_drops_that_fall_off_are_rejected_and_counted(pedestal_scene, monkeypatch):
+    from mitsplat.physics import rest
+
+    monkeypatch.setattr(rest, "_MAX_REDRAWS", 0)
+    scene = pedestal_scene
     certificates = [settle_layout(scene, index, cached=False).certificate for index in range(3)]
     refused = [reason for certificate in certificates for reason in certificate.refused]
     assert refused

@@ -596,3 +596,60 @@ def test_a_poured_ball_keeps_its_speed_limit(stepper):
     assert max(speeds) == pytest.approx(1.0, rel=1e-3)
     landed = next(time for time, height in heights if height < 0.025)
     assert landed == pytest.approx(0.5 / 1.0 + 1.0 / (2 * GRAVITY), abs=0.04)
+
+
+@pytest.mark.parametrize("stepper", ["mujoco", pytest.param("warp", marks=pytest.mark.extended)])
+def test_the_drag_on_late_bodies_equals_its_closed_form(stepper):
+    """A block without friction slides at v for the time t = 1.5 s; with drag, it stops after another v T, T = 0.2 s."""
+    from mitsplat.physics.rest import run_to_rest
+
+    block, speed = trimesh.creation.box((0.04, 0.04, 0.01)), 0.4
+    world = world_of(stepper, [body_of(block, friction=0.0)], [table(friction=0.0)], [pose_at((-0.4, 0, 0.005))])
+    velocities = np.zeros((1, 2, 3))
+    velocities[0, 0, 0] = speed
+    world.reset(world.poses, velocities)
+    outcome = run_to_rest(world, max_time=4.0, bounds=EVERYWHERE)
+    assert outcome.rejection == ""
+    assert outcome.poses[0, 0, 3] + 0.4 == pytest.approx(speed * (1.5 + 0.2), rel=0.01)
+    # It is slower than 0.1 mm in 0.25 s.
+    assert outcome.time == pytest.approx(1.5 + 0.2 * np.log(speed / 4e-4), abs=0.15)
+
+
+@pytest.mark.parametrize(("leans", "reason"), [(False, "keeps moving"), (True, "rests against the enclosure")])
+def test_a_body_that_fails_starts_again_while_the_others_stay(leans, reason):
+    """Four of five blocks rest. The fifth is pushed, or stands 0.5 mm from a wall."""
+    from mitsplat.physics.rest import run_to_rest
+
+    block = body_of(trimesh.creation.box((0.02, 0.02, 0.01)), friction=0.0)
+    start = np.stack([pose_at((0.1, 0.1 * i - 0.2, 0.005)) for i in range(5)])
+    world = world_of("mujoco", [block] * 5, [table()], start)
+    walls = np.full((5, 3), -np.inf), np.full((5, 3), np.inf)
+    walls[1][4, 0] = 0.1105 if leans else np.inf
+    asked = []
+
+    def observe(time, poses):
+        if not leans and not asked:
+            velocities = world.velocities
+            velocities[4, 0] = (0.01, 0, 0)
+            world.set_velocities(velocities)
+
+    def redraw(poses, failed):
+        asked.append((world.time, failed, poses))
+        drawn = poses.copy()
+        drawn[failed, :3, 3] += (-0.05, 0, 0.02)
+        return drawn
+
+    def run(**options):
+        world.reset(start)
+        return run_to_rest(world, max_time=6.0, bounds=EVERYWHERE, walls=walls, observe=observe, **options)
+
+    refused = run()
+    assert (refused.rejection, refused.causes) == (reason, (4,))
+    outcome = run(redraw=redraw)
+    assert outcome.rejection == ""
+    ((time, failed, before),) = asked
+    assert time == pytest.approx(0.25 if leans else 2.5, abs=0.03)
+    assert failed.tolist() == [False] * 4 + [True]
+    np.testing.assert_allclose(outcome.poses[:4], before[:4], atol=1e-4)
+    assert outcome.poses[4, 0, 3] == pytest.approx(before[4, 0, 3] - 0.05, abs=1e-3)
+    assert outcome.time > time

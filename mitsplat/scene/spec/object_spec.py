@@ -246,7 +246,11 @@ class Settle(StrictModel):
         "another side, if they are stable on it. The side is left, right or top; the front stays in "
         "front.",
     )
-    max_time: Positive = Field(6.0, description="Simulated time within which a layout must come to rest [s].")
+    max_time: Positive = Field(
+        6.0,
+        description="Simulated time within which a layout must come to rest [s]. It starts again if objects are "
+        "dropped again.",
+    )
     attempts: int = Field(
         5,
         ge=1,

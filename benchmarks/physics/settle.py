@@ -1,11 +1,13 @@
-"""Settling: ``python -m benchmarks.physics.settle rate | faces | thin | bin | rest | worlds | share [--count N]``.
+"""Settling of layouts: ``python -m benchmarks.physics.settle MEASURE [--count N]``.
 
 rate     layouts per minute of ten and of thirty objects, with both steppers, in one process and in two
 faces    resting faces of a box of 1 : 1 : 0.3, with both steppers, compared by a chi-squared test
 thin     random drops of a screw, a torus, a mug and a concave bracket, certified
 bin      forty objects poured into a bin
 rest     ten objects for each seed: time to rest, and motion in the next five seconds
-worlds   time per layout of several layouts in one simulation, on ``--device cpu`` or ``cuda:0``
+worlds   layouts per minute of several layouts in one simulation, on ``--device cpu`` or ``cuda:0``, and of MuJoCo in C
+         in as many processes as there are cores
+layouts  time of each of the first layouts of the detector's five scenes, with the scans in ``--hope``
 share    time of settling added to the images of the shipped workcell at 1280x720 with ten views of each layout
 
 Parts are nuts, bolts, washers, brackets and plates of 10 to 150 mm, in a box of 0.5 x 0.4 m unless stated otherwise.
@@ -19,6 +21,7 @@ import tempfile
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping
+from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -29,12 +32,13 @@ from ruamel.yaml import YAML
 from scipy.stats import chi2_contingency
 from trimesh.creation import annulus, box, cylinder, torus
 
+from benchmarks.physics.layouts import POINT, time_layouts
 from benchmarks.record import figure, recording
 from mitsplat.asset import Asset
 from mitsplat.errors import InputError
-from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.decomposition import convex_pieces
 from mitsplat.physics.settle import settle_layout, settle_layouts, warp_settings
+from mitsplat.runtime.cores import usable_cores
 from mitsplat.scene.layout import Layout
 from mitsplat.scene.loading.scene_loading import load_scene
 from mitsplat.scene.planning.contents import draw_objects
@@ -84,15 +88,8 @@ def make_scene(meshes: Mapping[str, trimesh.Trimesh], count: int, stepper: str, 
 
 
 def write_scene(folder: Path, meshes: Mapping[str, trimesh.Trimesh], count: int, stepper: str, **changes: Any) -> Path:
-    point = Splats(
-        means=np.zeros((1, 3), np.float32),
-        quats=np.float32([[0, 0, 0, 1]]),
-        scales=np.full((1, 3), 1e-3, np.float32),
-        opacities=np.ones(1, np.float32),
-        sh=np.zeros((1, 1, 3), np.float32),
-    )
     for name, mesh in meshes.items():
-        Asset(name, name, point, mesh=mesh, pieces=convex_pieces(mesh), density=3000.0).save(folder / name)
+        Asset(name, name, POINT, mesh=mesh, pieces=convex_pieces(mesh), density=3000.0).save(folder / name)
     scene = {
         "name": "settle",
         "shapes": [{"name": "table", "box": {"size": [1, 1, 0.1], "position": [0, 0, -0.05]}, "visible": True}],
@@ -258,7 +255,10 @@ def measure_rest(count: int) -> None:
 
 
 def measure_worlds(count: int, device: str) -> None:
-    """Time layouts of ten objects in simulations of 1, 8, 64 and 256 worlds, ``count`` at most, on any Warp device."""
+    """Time layouts of ten objects in simulations of 1, 8, 64 and 256 worlds, ``count`` at most, on any Warp device.
+
+    MuJoCo in C settles as many layouts in processes.
+    """
     from benchmarks.physics.worlds import time_worlds
     from mitsplat.physics.drop import TIMESTEP, drop_of
 
@@ -275,6 +275,14 @@ def measure_worlds(count: int, device: str) -> None:
         timestep=TIMESTEP,
         device=device,
     )
+    cores = usable_cores()
+    # Each process loads libraries with its first layout.
+    layouts = settle_layouts(make_scene(parts(), 2, "mujoco"), range(count + cores), workers=cores, cached=False)
+    finished = [time.perf_counter() for _ in layouts]
+    rate = 60 * count / (finished[-1] - finished[cores - 1])
+    figure(cores, "", "mujoco", "processes")
+    figure(rate, "1/min", "mujoco", "layouts")
+    print(f"MuJoCo in C in {cores} processes, with certificates: {rate:.1f} layouts a minute", flush=True)
 
 
 def measure_share(count: int) -> None:
@@ -330,14 +338,19 @@ MEASURES: dict[str, tuple[Callable[[int], None], int]] = {
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("measure", choices=[*MEASURES, "worlds"])
+    parser.add_argument("measure", choices=[*MEASURES, "worlds", "layouts"])
     parser.add_argument("--count", type=int)
     parser.add_argument("--device", default="cpu", help="device of worlds: cpu, or cuda:0")
+    parser.add_argument("--hope", type=Path, default=Path("../shared/data/hope"), help="folder of the scans of layouts")
+    parser.add_argument("--work", type=Path, help="folder that keeps the assets of layouts")
     arguments = parser.parse_args()
     gpu = arguments.measure == "worlds" and arguments.device != "cpu"
-    with recording("physics.settle", parser, arguments, gpu=gpu), warp_settings():
+    with recording("physics.settle", parser, arguments, ignore=("hope", "work"), gpu=gpu), warp_settings():
         if arguments.measure == "worlds":
             measure_worlds(arguments.count or (8 if arguments.device == "cpu" else 256), arguments.device)
+        elif arguments.measure == "layouts":
+            with nullcontext(arguments.work) if arguments.work else tempfile.TemporaryDirectory() as work:
+                time_layouts(arguments.hope, Path(work), arguments.count or 80)
         else:
             measure, count = MEASURES[arguments.measure]
             measure(arguments.count or count)

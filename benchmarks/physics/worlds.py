@@ -132,6 +132,9 @@ def has_rested(
         def _set_velocities(self, velocities: Float64Array) -> None:
             pass
 
+        def _set_forces(self, forces: Float64Array) -> None:
+            pass
+
         def _advance(self) -> None:
             self._frame = next(self._frames)
 

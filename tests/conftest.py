@@ -23,6 +23,7 @@ from mitsplat.errors import MissingResourceError
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry import untrusted_meshes
 from mitsplat.geometry.camera import Camera
+from mitsplat.images import untrusted_images
 from mitsplat.physics.settle import warp_settings
 from mitsplat.runtime.device import MissingPrerequisite, use_device, visible_gpus
 from mitsplat.runtime.dropped_rays import check_dropped_rays
@@ -127,25 +128,27 @@ def forks() -> Iterator[Forks]:
     made.close()
 
 
-_try_mesh = untrusted_meshes._try_mesh
+_try_mesh, _try_images = untrusted_meshes._try_mesh, untrusted_images._try_images
 
 
 @pytest.fixture(scope="session", autouse=True)
-def meshes_not_tried() -> Iterator[None]:
-    """Omit the trial read of mesh files in a child process, which takes half a second each.
+def files_not_tried() -> Iterator[None]:
+    """Omit the trial read of mesh files and images in a child process, which takes half a second each.
 
-    The trial refuses only files that take too much memory or time: see ``meshes_tried``.
+    The trial refuses only damaged images, and files that take too much memory or time: see ``files_tried``.
     """
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(untrusted_meshes, "_try_mesh", lambda path, modified, size, read: "")
+        patch.setattr(untrusted_images, "_try_images", lambda files: (len(files), None))
         yield
 
 
 @pytest.fixture(scope="module")
-def meshes_tried() -> Iterator[None]:
-    """Read mesh files on trial, as outside of tests."""
+def files_tried() -> Iterator[None]:
+    """Read mesh files and images on trial, as outside of tests."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(untrusted_meshes, "_try_mesh", _try_mesh)
+        patch.setattr(untrusted_images, "_try_images", _try_images)
         yield
 
 

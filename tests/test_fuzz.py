@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from benchmarks.scale.fuzz import READERS, attempt, make_samples, mutate
 
-pytestmark = pytest.mark.usefixtures("meshes_tried")
+pytestmark = pytest.mark.usefixtures("files_tried")
 SETTINGS = {
     "deadline": None,
     "derandomize": True,

@@ -28,7 +28,7 @@ from tests.cli.typed import run
 from tests.conftest import box_asset
 from tests.engine.jobs import Dies
 
-pytestmark = pytest.mark.usefixtures("meshes_tried")
+pytestmark = pytest.mark.usefixtures("files_tried")
 
 
 class TestScenes:

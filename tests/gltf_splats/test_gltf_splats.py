@@ -196,7 +196,7 @@ def test_files_that_cannot_be_read_are_refused_in_one_sentence(tmp_path: Path, m
         read_gltf_splats(path)
 
 
-def test_a_small_file_of_many_gaussians_is_refused(meshes_tried: None, tmp_path: Path) -> None:
+def test_a_small_file_of_many_gaussians_is_refused(files_tried: None, tmp_path: Path) -> None:
     """Accessors without data are zeros, of which any number can be stated."""
     huge = Glb()
     one_splat(huge, np.zeros((1, 3)))

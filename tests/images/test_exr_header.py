@@ -15,6 +15,8 @@ from mitsplat.fit.depth_priors import read_map
 from mitsplat.images.exr_header import check_exr_header
 from mitsplat.images.untrusted_images import check_images
 
+pytestmark = pytest.mark.usefixtures("files_tried")
+
 
 @pytest.fixture
 def path(tmp_path: Path) -> Path:

@@ -168,6 +168,7 @@ def test_lights_need_a_metric_frame(photographed: Capture) -> None:
             require_light_frame(replace(photographed, **wrong))  # type: ignore[arg-type]
 
 
+@pytest.mark.usefixtures("files_tried")
 def test_lights_of_a_file_are_fixed_and_their_images_lie_beside_it(tmp_path: Path) -> None:
     file = tmp_path / "lamps.yaml"
     file.write_text("lights:\n  - {kind: area, position: [0, 0, 1], target: [0, 0, 0], radiance: 5}\n")

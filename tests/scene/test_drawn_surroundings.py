@@ -156,6 +156,7 @@ def test_each_frame_draws_a_background(scene_data: SceneData, write_scene: Write
         ({"materials": [{"kind": "colour"}], "visible": False}, "shapes[0].materials: must not be given for shape"),
     ],
 )
+@pytest.mark.usefixtures("files_tried")
 def test_invalid_environments_and_backgrounds_are_refused(
     scene_data: SceneData, write_scene: WriteScene, tmp_path: Path, changes: SceneData, sentence: str
 ) -> None:
@@ -171,6 +172,7 @@ def test_invalid_environments_and_backgrounds_are_refused(
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.usefixtures("files_tried")
 def test_the_first_unreadable_image_of_many_is_named(
     scene_data: SceneData, write_scene: WriteScene, tmp_path: Path
 ) -> None:

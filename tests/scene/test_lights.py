@@ -226,6 +226,7 @@ def test_a_second_sky_beside_a_room_is_refused(scene_data: Any, write_scene: Wri
         load_scene(write_scene(scene_data | {"lights": lights}))
 
 
+@pytest.mark.usefixtures("files_tried")
 def test_the_first_unreadable_image_of_a_pool_is_named(scene_data: Any, write_scene: WriteScene, tmp_path: Any) -> None:
     for name in ("a.png", "c.png"):
         cv2.imwrite(str(tmp_path / name), np.full((4, 8, 3), 90, dtype=np.uint8))

@@ -407,6 +407,7 @@ def test_an_image_of_the_sky_has_the_orientation_that_usdlux_defines(
     np.testing.assert_allclose(radiance[:, clear], expected[:, clear], atol=1e-3)
 
 
+@pytest.mark.usefixtures("files_tried")
 def test_images_of_the_sky_that_are_not_read_are_named(tmp_path: Path) -> None:
     write_balls(tmp_path / "in/balls.usda")
     (tmp_path / "sky.exr").write_bytes(b"outside")

@@ -55,9 +55,9 @@ _FALLEN_TILT = 5.0  # tilt from which an upright object has fallen over [degrees
 # which Python would collect only after a quarter of all objects. A collection takes 0.5 s.
 _COLLECTION_INTERVAL = 24
 CROWDED = "no room for all"
+PUT_DOWN = {"stack", "upright", "tower", "packed"}  # arrangements of other than random poses
 _LEFT_OUT_PER_ROUND = 0.1  # share of the objects that is left out per round if they find no room,
 _MAX_LEFT_OUT = 0.5  # and maximum share in total: beyond it, the region is too small
-_PUT_DOWN = {"stack", "upright", "tower", "packed"}  # arrangements of other than random poses
 _POUR_SPEED = 1.0  # speed limit of poured objects [m/s]: at higher speed, heavy objects eject light ones
 # Simulated time for the draws of a layout [s], ten times that of a typical draw. After it, each rejected draw leaves
 # objects out.
@@ -359,7 +359,7 @@ class Drop:
             return self._place(items, number, rng, arrangements)
 
         # Round objects that are put down would roll away without rolling friction.
-        falls = _PUT_DOWN.isdisjoint(one.arrangement for one in drawn)
+        falls = PUT_DOWN.isdisjoint(one.arrangement for one in drawn)
         regions = [region for region, _ in self.scene.spec.all_regions]
         handling = draw_handling(
             world.bodies,
@@ -559,7 +559,7 @@ class Drop:
         fallen = [
             item
             for item, tilt, one in zip(resting, tilts, drawn, strict=True)
-            if one.arrangement in _PUT_DOWN and one.given is None and tilt > _FALLEN_TILT
+            if one.arrangement in PUT_DOWN and one.given is None and tilt > _FALLEN_TILT
         ]
         return (f"{fallen[0].name} fell over", set(fallen)) if fallen else None
 

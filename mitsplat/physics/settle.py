@@ -121,7 +121,7 @@ def settle_layouts(
 
 
 def try_alone(scene: Scene, *, tries: int = 3) -> Iterator[tuple[str, Arrangement, list[str]]]:
-    """Drop each object alone in each arrangement of its regions.
+    """Drop each object alone in each arrangement of its regions, but only in the first one of random poses.
 
     Yields:
         Its asset, the arrangement, and the reasons of the tries if all of them failed.
@@ -135,12 +135,15 @@ def try_alone(scene: Scene, *, tries: int = 3) -> Iterator[tuple[str, Arrangemen
     scene = replace(scene, spec=scene.spec.model_copy(update={"settle": settle}))
     tried = set()
     with warp_settings():
-        from mitsplat.physics.drop import drop_of  # Newton reads these settings when it compiles
+        from mitsplat.physics.drop import PUT_DOWN, drop_of  # Newton reads these settings when it compiles
 
         drop = drop_of(scene, lambda text: None)
         for entry, pool in zip(scene.spec.objects, scene.pools, strict=True):
             for region in () if entry.poses else scene.spec.regions_of(entry):
-                for asset, arrangement in product(pool, dict.fromkeys(scene.spec.all_regions[region][1])):
+                possible = scene.spec.all_regions[region][1]
+                falling = [arrangement for arrangement in possible if arrangement not in PUT_DOWN]
+                put_down = [arrangement for arrangement in possible if arrangement in PUT_DOWN]
+                for asset, arrangement in product(pool, [*falling[:1], *put_down]):
                     one = scene.assets[asset].name, region, arrangement
                     if one not in tried:
                         tried.add(one)

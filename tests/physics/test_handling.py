@@ -10,7 +10,7 @@ import pytest
 import trimesh
 
 from mitsplat.errors import InputError
-from mitsplat.physics.settle import replay_layout, settle_layout
+from mitsplat.physics.settle import replay_layout, settle_layout, try_alone
 from mitsplat.scene.loading.scene_loading import load_scene
 from mitsplat.scene.planning.contents import draw_arrangements
 from mitsplat.scene.spec.shape_spec import Region
@@ -258,3 +258,10 @@ def test_wrong_arrangements_are_refused(scene_data, write_scene, settle, sentenc
     scene_data["settle"] = settle
     with pytest.raises(InputError, match=re.escape(sentence)):
         load_scene(write_scene(scene_data))
+
+
+def test_objects_are_tried_alone_in_one_arrangement_of_random_poses(scene_data, write_scene):
+    scene_data["objects"] = [{"asset": "assets/nut"}]
+    scene_data["settle"] = {"arrangement": ["pushed", "upright", "drop", "upright"]}
+    found = list(try_alone(load_scene(write_scene(scene_data))))
+    assert found == [("nut", "pushed", []), ("nut", "upright", [])]

@@ -194,10 +194,11 @@ def _labelled(folder: Path, rng: np.random.Generator) -> None:
     (folder / "yolo/data.yaml").write_text("train: images\nval: images\nnames:\n  0: nut\n  1: bolt\n")
     (folder / "yolo/labels/a.txt").write_text("0 0.1 0.2 0.5 0.2 0.4 0.6\n1 0.5 0.5 0.9 0.5 0.7 0.9\n")
     runs = {"size": [24, 32], "counts": [100, 5, 19, 5, 639]}
-    given = [[[4, 4, 12, 4, 8, 12]], runs, {"size": [24, 32], "counts": "T35c00\\c0"}]
+    packed = {"size": [24, 32], "counts": "T35c00\\c0"}
+    given = [([4, 4, 8, 8], [[4, 4, 12, 4, 8, 12]]), ([4, 4, 2, 5], runs), ([4, 4, 2, 5], packed)]
     annotations = [
-        {"id": i, "image_id": 5, "category_id": 2, "bbox": [4, 4, 8, 8], "iscrowd": 0, "segmentation": segmentation}
-        for i, segmentation in enumerate(given)
+        {"id": i, "image_id": 5, "category_id": 2, "bbox": box, "iscrowd": 0, "segmentation": segmentation}
+        for i, (box, segmentation) in enumerate(given)
     ]
     images = [{"id": 5, "file_name": "a.png", "width": 32, "height": 24}]
     content = {"images": images, "annotations": annotations, "categories": [{"id": 2, "name": "nut"}]}

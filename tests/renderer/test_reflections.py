@@ -10,14 +10,16 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 import trimesh
+from scipy.ndimage import binary_dilation
 
 from mitsplat.gaussians.spherical_harmonics import SH_C0
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.gaussians.splat_materials import SplatMaterials
 from mitsplat.gaussians.surfels import place_surfels
 from mitsplat.geometry.camera import Camera
-from mitsplat.images.colour import encode_srgb
+from mitsplat.images.colour import decode_srgb, encode_srgb
 from mitsplat.renderer.layers import make_integrator, make_splats_shape, render_layers
+from tests.renderer.test_bounce import mitsuba_camera
 from tests.renderer.test_light import WHITE_SKY, down_camera, floor, nothing, slab
 
 CAMERA = Camera.look_at((0, -0.6, 0.5), (0, 0, 0), width=120, height=90, fov_x=50)
@@ -145,6 +147,53 @@ def test_small_mirroring_ball_reflects_all_light_of_a_lamp(shift: float) -> None
     image = away * focal / (away + focal)
     expected = radiance * size**2 * (focal / (away + focal)) ** 2 / (1 - radius + image) ** 2
     assert seen == pytest.approx(expected, rel=0.07)
+
+
+@pytest.mark.parametrize("roughness", [0.1, 0.3])
+def test_metal_shows_the_highlights_of_another_metal_as_bright_as_a_path_tracer(roughness: float) -> None:
+    """A metal plate mirrors a metal ball that mirrors a small lamp, which is below the plane of the plate.
+
+    The highlight contains the light of the lamp, and pixels with many rays do not brighten their neighbours.
+    """
+    make_integrator()
+    grey, radius, height, extent = 0.5, 0.05, 0.1, 0.2
+    ball = trimesh.creation.icosphere(4, radius).apply_translation((0, 0, height))
+    of_ball = SplatMaterials.uniform(len(ball.faces), metallic=1.0, roughness=0.4)
+    of_plate = SplatMaterials.uniform(len(floor()), metallic=1.0, roughness=roughness)
+    place = mi.ScalarPoint3f(1, 0, -height)
+    pose = mi.ScalarTransform4f().look_at(place, mi.ScalarPoint3f(0, 0, height), mi.ScalarVector3f(0, 0, 1)).scale(0.03)
+    rectangle = {**lamp([10000.0] * 3), "to_world": pose}
+    splats = {
+        "plate": make_splats_shape(replace(floor(extent, grey), materials=of_plate), proxy=slab(extent), instance=1),
+        "ball": make_splats_shape(round_splats(ball.triangles_center, 2e-3, of_ball), proxy=ball, instance=2),
+    }
+    scene = mi.load_dict({"type": "scene", **splats, "lamp": rectangle})
+    many, few = (
+        [render_layers(make_integrator(white=np.pi, **options), scene, CAMERA, seed=seed) for seed in range(2)]
+        for options in ({"shadow_error": 0.0, "shadow_samples": 256}, {})
+    )
+
+    def metal(shape: str, roughness: float, **properties: Any) -> dict[str, Any]:
+        colour = {"type": "rgb", "value": float(decode_srgb(grey))}
+        bsdf = {"type": "principled", "base_color": colour, "metallic": 1.0, "roughness": roughness}
+        return {"type": shape, "bsdf": bsdf, **properties}
+
+    meshes = {
+        "plate": metal("rectangle", roughness, to_world=mi.ScalarTransform4f().scale(extent)),
+        "ball": metal("sphere", 0.4, center=[0, 0, height], radius=radius),
+    }
+    scene = mi.load_dict({"type": "scene", **meshes, "lamp": rectangle})
+    path = mi.load_dict({"type": "path", "max_depth": 8, "hide_emitters": True})
+    photo = np.array(mi.render(scene, sensor=mitsuba_camera(CAMERA), integrator=path, spp=256))[..., :3]
+    y, x = np.mgrid[: CAMERA.height, : CAMERA.width] + 0.5
+    image = CAMERA.project(np.array([[0, 0, -height]]))[0][0]
+    reach = 2 * CAMERA.fx * radius / np.linalg.norm(CAMERA.centre - (0, 0, -height))
+    away = ~binary_dilation(many[0].instance == 2, iterations=2)
+    around = (np.hypot(x - image[0], y - image[1]) < reach) & (many[0].instance == 1) & away
+    assert around.sum() > 500
+    exact, usual = (np.mean([layer.rgb[around].mean() for layer in layers]) for layers in (many, few))
+    assert exact == pytest.approx(photo[around].mean(), rel=0.05)
+    assert usual == pytest.approx(exact, rel=0.1)
 
 
 def test_mirror_shows_an_object_at_its_image() -> None:

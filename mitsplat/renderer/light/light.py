@@ -445,7 +445,7 @@ class TracedPixels:
         rays = dr.maximum(sums.rays, 1)
         tinted = estimate.tinted * weight + sums.tinted * (per_point / rays)
         colourless = estimate.colourless * weight + sums.colourless * (per_point / rays)
-        means, _ = self.mirror_filter.mirror([*tinted, *colourless], rays, self.mirrored)
+        means, _ = self.mirror_filter.mirror([*tinted, *colourless], self.mirrored)
         tinted, colourless = mi.Color3f(*means[:3]), mi.Color3f(*means[3:])
         own, pixels = self.mirror_filter.here, self.mirror_filter.index
         before = dr.gather(mi.Color3f, light, pixels)

@@ -204,21 +204,25 @@ class LightFilter:
         return LightMeans(mi.Color3f(*values[:3]), mi.Color3f(*values[3:6]), mean_bounced)
 
     def mirror(
-        self, values: list[mi.Float], rays: mi.Float, mirrored: mi.Vector3f, radius: int = RADIUS
+        self, values: list[mi.Float], mirrored: mi.Vector3f, radius: int = RADIUS
     ) -> tuple[list[mi.Float], mi.Float]:
         """Average reflected light per ray over neighbours that mirror similar directions.
+
+        All pixels have equal weights, because bright pixels have more rays: weights by rays would add light beside
+        highlights. Numbers of rays in proportion to the variance make all pixels equally accurate.
 
         ``mirrored`` is the mean of the directions that a pixel mirrors. It is short where they differ, and such pixels
         are not averaged.
 
         Returns:
-            The averages, and the effective number of pixels with the same number of rays.
+            The averages, and the effective number of pixels.
         """
         here = self.here
         gloss = here.roughness + 2 * here.metallic
         closeness = dr.cos(dr.maximum(LOBE_SHARE * dr.square(here.roughness), 1e-3))
         dr.eval(closeness, gloss)
-        return self._average(values, rays, radius, lobe=(mirrored, closeness, gloss))
+        even = dr.full(mi.Float, 1, dr.width(self.index))
+        return self._average(values, even, radius, lobe=(mirrored, closeness, gloss))
 
     def reflections_for(
         self,
@@ -247,7 +251,7 @@ class LightFilter:
         dr.eval(mean, variance)
         # Own samples would stop at small variance and large values by chance, so that the picture would be too bright.
         (variance,), _ = self._average([variance], rays, 1)
-        (mean,), shared = self.mirror([mean], rays, mirrored, 1)
+        (mean,), shared = self.mirror([mean], mirrored, 1)
         return variance / (dr.square(_allowed_error(error, mean)) * _gain(shared))
 
     def _share(self, estimate: Estimate) -> tuple[mi.Float, mi.Float, mi.Float]:

@@ -33,8 +33,8 @@ CANDIDATES = 4
 MIN_LAMP_ROUGHNESS = 0.3
 """Roughness above which the emitters that plastics mirror are added. On smoother surfaces they are rare and bright."""
 
-MAX_REFLECTION = 4.0
-"""Largest reflection of one sampled emitter, in units of the fluence at the reference point."""
+DIFFUSE_SPREAD = 0.5
+"""GGX's alpha of a diffuse reflection in :func:`widened`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,29 +97,33 @@ class Reflectors:
             towards = frame.to_world(mi.warp.square_to_cosine_hemisphere(upward))
             ray = mi.Ray3f(dr.gather(mi.Point3f, origin, row), towards)
             dr.eval(ray, number, light)
-            colour, captured, distance = self._trace(ray, number, light, BOUNCES)
+            spread = dr.opaque(mi.Float, DIFFUSE_SPREAD, count * some)
+            colour, captured, distance = self._trace(ray, number, light, spread, BOUNCES)
             for total, colours in zip(totals, (colour, captured), strict=True):
                 total += mi.Color3f(*[dr.block_sum(c, some) for c in colours])
             nearness += dr.block_sum(dr.sum(colour) / dr.maximum(distance, 1e-6), some)
             dr.eval(totals, nearness)
         return totals[0] / rays, totals[1] / rays, nearness / dr.maximum(dr.sum(totals[0]), 1e-20)
 
-    def outgoing(self, ray: mi.Ray3f, key: mi.UInt32, light: mi.Point2f) -> tuple[mi.Color3f, mi.Float]:
+    def outgoing(
+        self, ray: mi.Ray3f, key: mi.UInt32, light: mi.Point2f, spread: mi.Float
+    ) -> tuple[mi.Color3f, mi.Float]:
         """Compute the radiance of the surfaces that rays hit, times pi over the irradiance of display white.
 
         Args:
             ray: Rays.
             key: Integer per ray, from which random numbers derive.
             light: Point of the unit square per ray that selects an emitter.
+            spread: GGX's alpha of the lobe that reflects the light of each ray.
 
         Returns:
             Radiance (Color3f), 0 for a miss, and distances of the hits [m], infinite for a miss.
         """
-        colour, _, distance = self._trace(mi.Ray3f(ray), key, light, BOUNCES)
+        colour, _, distance = self._trace(mi.Ray3f(ray), key, light, spread, BOUNCES)
         return colour, distance
 
     def _trace(
-        self, ray: mi.Ray3f, key: mi.UInt32, light: mi.Point2f, bounces: int
+        self, ray: mi.Ray3f, key: mi.UInt32, light: mi.Point2f, spread: mi.Float, bounces: int
     ) -> tuple[mi.Color3f, mi.Color3f, mi.Float]:
         """Return the colours (Color3f) at the hits of rays, the colours without dynamic objects, and the distances."""
         static, dynamic = self.proxies.static, self.proxies.dynamic
@@ -150,7 +154,7 @@ class Reflectors:
             dr.scatter(colour, dr.select(free, dr.gather(mi.Color3f, colour, lane), 0), lane)
         lane = dr.compress(thing)
         if dr.width(lane):
-            some = (dr.gather(type(v), v, lane) for v in (ray, near, key, light))
+            some = (dr.gather(type(v), v, lane) for v in (ray, near, key, light, spread))
             dr.scatter(colour, self._reflected(bounces, *some), lane)
         dr.eval(colour)
         return colour, captured, distance
@@ -201,7 +205,13 @@ class Reflectors:
         return ~shaded
 
     def _reflected(
-        self, bounces: int, ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, key: mi.UInt32, light: mi.Point2f
+        self,
+        bounces: int,
+        ray: mi.Ray3f,
+        hit: mi.PreliminaryIntersection3f,
+        key: mi.UInt32,
+        light: mi.Point2f,
+        spread: mi.Float,
     ) -> mi.Color3f:
         """Return the colour (Color3f) of objects and visible meshes: reflected light of one emitter and one ray."""
         dynamic, last = self.proxies.dynamic, bounces == 1
@@ -224,7 +234,8 @@ class Reflectors:
         lit, shadow = albedo * beam.irradiance / self.white, _shadow_ray(origin, beam.direction, beam.reach)
         if glossy:
             metal = surface.metallic > 0.5
-            lobe = SpecularLobe.of(mi.Vector3f(normal), -ray.d, surface.roughness, surface.metallic, surface.specular)
+            roughness = widened(surface.roughness, spread)
+            lobe = SpecularLobe.of(mi.Vector3f(normal), -ray.d, roughness, surface.metallic, surface.specular)
             lit += self._mirrored_emitter(lobe, surface, beam, dr.dot(normal, beam.direction), metal)
         free = dr.max(lit) > 0
         self._end_kernel(lit, shadow, key, free, instance)
@@ -235,21 +246,23 @@ class Reflectors:
         point, other = _random_points(key)
         direction = mi.Frame3f(normal).to_world(mi.warp.square_to_cosine_hemisphere(point))
         throughput, density = mi.Color3f(albedo), mi.Float(0)
+        spread = dr.opaque(mi.Float, DIFFUSE_SPREAD, dr.width(key))
         if glossy:
             mirrored, weight, cos_half = lobe.sample(point)
             direction, fresnel = dr.select(metal, mirrored, direction), lobe.fresnel(cos_half)
             throughput = dr.select(metal, (surface.colour * fresnel.tint + fresnel.white) * weight, throughput)
             density = dr.select(metal, lobe.evaluate(direction)[1], 0)
+            spread = dr.select(metal, lobe.alpha, spread)
         onward = mi.Ray3f(origin, direction)
         throughput = dr.select(dr.dot(normal, direction) > 0, throughput, 0)
-        dr.eval(lit, onward, throughput, normal, density, other)
+        dr.eval(lit, onward, throughput, normal, density, other, spread)
         lane = dr.compress(dr.max(throughput) > 0)
         if dr.width(lane):
-            some = (dr.gather(type(v), v, lane) for v in (onward, key, other, normal, density))
-            onward, key, other, normal, density = some
+            some = (dr.gather(type(v), v, lane) for v in (onward, key, other, normal, density, spread))
+            onward, key, other, normal, density, spread = some
             key = key * 0x9E3779B1 + 0x85EBCA77  # other random numbers
-            dr.eval(onward, key, other, normal, density)
-            colour, _, onward.maxt = self._trace(onward, key, other, bounces - 1)
+            dr.eval(onward, key, other, normal, density, spread)
+            colour, _, onward.maxt = self._trace(onward, key, other, spread, bounces - 1)
             if glossy:
                 colour += self._mirrored_emission(onward, normal, density)
             total = dr.gather(mi.Color3f, lit, lane) + dr.gather(mi.Color3f, throughput, lane) * colour
@@ -271,9 +284,8 @@ class Reflectors:
         fresnel = lobe.fresnel(cos_half)
         reflectance = (surface.colour * fresnel.tint + fresnel.white) * (dr.pi * value / dr.maximum(cosine, 1e-3))
         weight = dr.select(metal, power_weight(beam.density, density), 1)
-        used = (cosine > 0) & (metal | (surface.roughness >= MIN_LAMP_ROUGHNESS))
-        light = reflectance * beam.irradiance * (weight / self.white)
-        return dr.select(used, dr.minimum(light, MAX_REFLECTION * self.emitters.fluence / self.white), 0)
+        used = (cosine > 0) & (metal | (lobe.alpha >= MIN_LAMP_ROUGHNESS**2))
+        return dr.select(used, reflectance * beam.irradiance * (weight / self.white), 0)
 
     def _occluded(
         self,
@@ -294,6 +306,16 @@ class Reflectors:
         """Evaluate values before the next scene is traced, if a kernel may trace only one scene."""
         if self.proxies.separate_kernels:
             dr.eval(values)
+
+
+def widened(roughness: mi.Float, spread: mi.Float) -> mi.Float:
+    """Return the roughness of a surface that another lobe of GGX's alpha ``spread`` mirrors.
+
+    The squares of both parameters add up, as the variances of their microfacet slopes. The other lobe blurs
+    the image in any case, and few of its rays would find a narrow highlight. The energy is the same
+    (Kaplanyan and Dachsbacher 2013, "Path Space Regularization for Holistic and Robust Light Transport").
+    """
+    return dr.sqrt(dr.sqrt(dr.power(roughness, 4) + dr.square(spread)))
 
 
 def _towards(normal: mi.Normal3f, ray: mi.Ray3f) -> mi.Normal3f:

@@ -153,7 +153,8 @@ def try_alone(scene: Scene, *, tries: int = 3) -> Iterator[tuple[str, Arrangemen
 def replay_layout(scene: Scene, layout: Layout, *, interval: float = 0.04) -> Iterator[Layout]:
     """Simulate the drop of a layout again.
 
-    On a CPU, the simulation reproduces the original drop exactly.
+    On a CPU, the simulation reproduces the original drop exactly. Objects that were dropped again jump to their new
+    start poses.
 
     Yields:
         The layout every ``interval`` seconds [s], and finally the given layout.

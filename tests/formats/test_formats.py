@@ -161,6 +161,7 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Written:
         output=SimpleNamespace(formats=FORMATS, image="png", views=2),
         labels=SimpleNamespace(source="splats"),
         empty=0.0,
+        all_regions=((None, ("drop",)),),
         environment=None,
         shapes=(),
         objects=(),

@@ -365,7 +365,7 @@ class Drop:
             world.bodies,
             start,
             list(zip(regions, arrangements, strict=True)),
-            [free & (own == number) for number in range(len(regions))],
+            [free & (own == region) for region in range(len(regions))],
             random_stream(self.scene.spec.seed, "object motion", index, attempt),
             speed=settle.speed,
             spin=settle.spin,

@@ -285,6 +285,10 @@ def measure(options: argparse.Namespace) -> None:
     whole = matches.average_precision()
     figure(whole.map50_95, "", "map50_95")
     figure(whole.map50, "", "map50")
+    if trained.has_masks:
+        masks = DetectionMatches(truth, detections, "segm").average_precision()
+        figure(masks.map50_95, "", "masks", "map50_95")
+        figure(masks.map50, "", "masks", "map50")
     for name, (strict, _) in whole.classes.items():
         figure(strict, "", "class", name)
     for name, gain in error_gains(truth, detections, whole).items():

@@ -3,11 +3,13 @@
 There are no real photographs of these parts.
 
     python -m benchmarks.detector.workshop WORK [--scenes 10] [--views 5] [--width 960] [--samples 64] [--device cuda]
+        [--first 10 --photos development]
 
 Parts of the shipped scenes are dropped or poured, with their original materials, on benches of other workshops under
 other lamps, and rendered by Mitsuba's path tracer. The camera is not mitsplat's: its exposure, noise, tone curve,
 sharpening and JPEG are implemented here. WORK gets ``photos/``, a COCO folder with the visible masks of each part, and
 ``assets/``, which ``workshop.yaml`` renders. Existing photographs are not made again.
+Scenes 0 to 9 are the test set. Changes of rendered scenes are tried on scenes 10 to 19, in the folder ``development``.
 """
 
 from __future__ import annotations
@@ -55,6 +57,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("work", type=Path)
     parser.add_argument("--scenes", type=int, default=10)
+    parser.add_argument("--first", type=int, default=0, help="number of the first scene")
+    parser.add_argument("--photos", default="photos", help="folder of WORK for the photographs")
     parser.add_argument("--views", type=int, default=5)
     parser.add_argument("--width", type=int, default=960)
     parser.add_argument("--samples", type=int, default=64)
@@ -67,13 +71,13 @@ def main() -> None:
 
 def photograph_workshops(options: argparse.Namespace) -> None:
     """Render the photographs of all scenes that are missing, and write the labels of all."""
-    photos, assets = options.work / "photos", options.work / "assets"
+    photos, assets = options.work / options.photos, options.work / "assets"
     photos.mkdir(parents=True, exist_ok=True)
     if not assets.exists():
         shutil.copytree(ROOT / "scenes/assets", assets)
     names = sorted(path.parent.name for path in assets.glob("*/asset.yaml") if path.parent.name != "workcell")
     shots: list[dict[str, Any]] = []
-    for number in range(options.scenes):
+    for number in range(options.first, options.first + options.scenes):
         stored = photos / f".scene_{number:04d}.json"
         if not stored.exists():
             stored.write_text(json.dumps(photograph_workshop(number, names, options)))
@@ -112,7 +116,7 @@ def photograph_workshop(number: int, names: Sequence[str], options: argparse.Nam
         name = f"scene_{number:04d}_{view:04d}.jpg"
         picture = develop(np.nan_to_num(np.array(radiance)[..., :3].astype(np.float64)), rng)
         cv2.imwrite(
-            str(options.work / "photos" / name),
+            str(options.work / options.photos / name),
             picture[..., ::-1],
             [cv2.IMWRITE_JPEG_QUALITY, int(rng.integers(80, 95))],
         )

@@ -10,8 +10,6 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-import torch
-
 from mitsplat.detector.libraries import load_libraries, load_weights
 
 
@@ -28,6 +26,7 @@ def main() -> None:
 def write_mask_weights(boxes: Path, masks: Path, network: str) -> None:
     """Write the weights of a network with masks as a file of Ultralytics."""
     load_libraries()
+    import torch  # optional dependencies
     from ultralytics.nn.tasks import SegmentationModel
 
     found = load_weights(boxes)

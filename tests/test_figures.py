@@ -282,7 +282,7 @@ def test_captions_mark_old_dirty_and_transcribed_results() -> None:
 def test_every_benchmark_records_its_figures() -> None:
     scripts = [path for path in record.ROOT.glob("benchmarks/*/*.py") if "__main__" in path.read_text()]
     assert len(scripts) > 25
-    # Scripts for detector data, weights and sample meshes, of Blender, clients and gausscam, scripts that start others, a chart.
+    # Scripts for detector data and weights, sample meshes, Blender, clients and gausscam, starters of others, a chart.
     others = {"arranged.py", "meshes.py", "sample_meshes.py", "blender_scene.py", "client_readers.py"}
     others |= {"__main__.py", "chart.py", "live_gausscam.py", "blender_photos.py", "mask_weights.py"}
     assert {path.name for path in scripts if "with recording(" not in path.read_text()} == others

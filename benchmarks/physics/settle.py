@@ -278,7 +278,11 @@ def measure_worlds(count: int, device: str) -> None:
     cores = usable_cores()
     # Each process loads libraries with its first layout.
     layouts = settle_layouts(make_scene(parts(), 2, "mujoco"), range(count + cores), workers=cores, cached=False)
-    finished = [time.perf_counter() for _ in layouts]
+    finished = []
+    for _ in layouts:
+        finished.append(time.perf_counter())
+        if len(finished) in (cores, count // 2 + cores):
+            print(f"MuJoCo in C: {len(finished)} of {count + cores} layouts have settled", flush=True)
     rate = 60 * count / (finished[-1] - finished[cores - 1])
     figure(cores, "", "mujoco", "processes")
     figure(rate, "1/min", "mujoco", "layouts")

@@ -19,6 +19,7 @@ from mitsplat.physics.worlds import Body, Collider, World
 
 WORLDS = 1, 8, 64, 256
 DURATION = 2.5  # simulated time to rest and one second after [s]
+REPORTED = 64  # launches of the graph between lines of progress
 
 
 def time_worlds(
@@ -32,7 +33,10 @@ def time_worlds(
 ) -> None:
     """Print the time of 1, 8, 64 and 256 worlds on a Warp device, limited by the number of initial poses."""
     for worlds in [worlds for worlds in WORLDS if worlds < len(starts)] + [len(starts)]:
+        print(f"{worlds} worlds on {device}: building the model and compiling kernels", flush=True)
+        wall = time.perf_counter()
         batch = Batch(bodies, colliders, starts[:worlds], timestep=timestep, device=device)
+        print(f"  ready after {time.perf_counter() - wall:.1f} s", flush=True)
         wall, cpu = time.perf_counter(), time.process_time()
         frames = batch.run()
         wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
@@ -100,12 +104,16 @@ class Batch:
 
     def run(self) -> Float64Array:
         """Return positions and xyzw quaternions after each launch of the graph, shape (frames, worlds, bodies, 7)."""
-        frames = []
-        for _ in range(round(DURATION / self.interval)):
+        frames: list[Float64Array] = []
+        count, start = round(DURATION / self.interval), time.perf_counter()
+        for number in range(1, count + 1):
             wp.capture_launch(self._graph)
             frames.append(self._states[0].body_q.numpy().astype(np.float64).reshape(self._shape))
             if any(observed.overflow.numpy().any() for observed in self._observables):
                 raise RuntimeError("contact buffer overflow")
+            if number % REPORTED == 0:
+                simulated, elapsed = number * self.interval, time.perf_counter() - start
+                print(f"  {simulated:.1f} of {DURATION:g} s simulated after {elapsed:.1f} s", flush=True)
         return np.stack(frames)
 
 

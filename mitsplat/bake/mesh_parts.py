@@ -210,10 +210,10 @@ def read_model(
         if len(part.vertices) and (most := float(np.abs(part.vertices).max())) > _MAX_POSITION:
             raise InputError(f"{source}: vertex positions must be at most {_MAX_POSITION:g} units (got {most:g})")
         parts.append(_place(part, to_world @ part.transform, finish))
-    parts = [part for part in parts if len(part.mesh.faces)]
+    parts = [part for part in parts if part.mesh.area > 0]  # a scale of 0 hides a part
     if not file.parts:
         raise InputError(f"{source}: a mesh needs at least one face (got none; is the file complete?)")
-    if not sum(float(part.mesh.area) for part in parts) > 0:
+    if not parts:
         raise InputError(f"{source}: a mesh needs faces that have an area (got none)")
     warnings = [*file.warnings]
     warnings += _recentre(parts, file, source)

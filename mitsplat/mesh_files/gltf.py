@@ -22,6 +22,7 @@ from mitsplat.mesh_files.gltf_data import GltfData, normalised
 from mitsplat.mesh_files.mesh_file import (
     DIELECTRIC_SPECULAR,
     LEAST_ROUGHNESS,
+    MAX_FRACTION,
     OPAQUE,
     PAINTED_MATERIAL,
     TRANSPARENT_COLOURS,
@@ -174,7 +175,13 @@ class _GltfReader:
         name = f"{name}_{self._names[name]}" if self._names[name] else name
         colours, alpha = None, None
         if "COLOR_0" in attributes:
-            stored_colours = np.clip(normalised(attributes["COLOR_0"]).astype(np.float64), 0.0, 1.0)[faces]
+            given = normalised(attributes["COLOR_0"]).astype(np.float64)
+            if "targets" not in primitive and given.max(initial=0.0) > MAX_FRACTION:
+                raise InputError(
+                    f"colours of vertices must be within 0 to 1 (got {given.max():g}): divide them by 255, or export "
+                    "them as integers"
+                )
+            stored_colours = np.clip(given, 0.0, 1.0)[faces]
             colours = stored_colours[..., :3]
             alpha = stored_colours[..., 3] if stored_colours.shape[2] == 4 else None
         if "material" not in primitive:

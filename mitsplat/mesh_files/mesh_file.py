@@ -27,6 +27,8 @@ UNKNOWN_COLOUR = 0.5
 ROUGHNESS = 0.6
 LEAST_ROUGHNESS = 0.05
 OPAQUE = 0.999
+MAX_FRACTION = 1.01
+"""Largest number that counts as a colour from 0 to 1."""
 
 _WRAPPED: dict[Wrap, Callable[[Float64Array], Float64Array]] = {
     "repeat": lambda t: t % 1.0,

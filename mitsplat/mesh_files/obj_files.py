@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import codecs
 import re
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -12,7 +13,7 @@ from PIL import Image
 
 from mitsplat.errors import InputError
 from mitsplat.mesh_files.file_references import find_reference
-from mitsplat.mesh_files.mesh_file import FilePart
+from mitsplat.mesh_files.mesh_file import MAX_FRACTION, FilePart
 from mitsplat.storage.files import IMAGE_ERRORS
 
 _CONTINUATION = re.compile(rb"\\\r?\n")
@@ -21,7 +22,6 @@ _KEPT = (b"map_", b"mtllib")
 _NAMES = (b"usemtl", b"newmtl", b"g", b"o")
 """Keys whose values may contain the character that begins a comment."""
 _COLOURED = re.compile(rb"^v(?: \S+){3}((?: \S+){3})$", re.M)
-_MAX_COLOUR = 1.01
 _LEFT_OUT = {
     rb"^(?:curv|curv2|surf) ": "its free-form curves and surfaces are left out",
     rb"^[lp] ": "its points and lines are left out",
@@ -128,6 +128,11 @@ def _check_library(path: Path, folder: Path) -> list[str]:
     for key in ("ka", "kd", "ks"):
         for colour in values_of(path, content, key):
             _check_colour(path, key, colour)
+    materials = re.split(rb"^newmtl ", content, flags=re.M | re.I)[1:]
+    for name, count in Counter(values_of(path, content, "newmtl")).items():
+        same = {one for one in materials if one.splitlines()[0].decode() == name}
+        if count > 1 and len({one.strip() for one in same}) > 1:
+            raise InputError(f"{path}: materials must have different names (got {count} with the name {name})")
     return values_of(path, content, "newmtl")
 
 
@@ -136,7 +141,7 @@ def _check_colour(path: Path, key: str, colour: str) -> None:
         values = np.array(colour.split(), dtype=np.float64)
     except ValueError:
         values = np.zeros(0)
-    if len(values) != 3 or (key == "kd" and values.max() > _MAX_COLOUR):
+    if len(values) != 3 or (key == "kd" and values.max() > MAX_FRACTION):
         name = key.capitalize()
         raise InputError(f"{path}: {name} must be red, green and blue from 0 to 1 (got {name} {colour})")
 

@@ -50,6 +50,8 @@ _LEFT_OUT_KINDS = {
     "translucentdisplayproperties": "translucency",
 }
 """Elements that are not read."""
+_LEFT_OUT_SHAPES = {"booleanshape", "displacementmesh", "levelset", "alternatives"}
+"""Elements of extensions that define the shape of an object."""
 _SLICER_VOLUMES = ("metadata/slic3r_pe_model.config", "metadata/slic3r_model.config")
 _SLICER_PARTS = "metadata/model_settings.config"
 """Files in which slicers state volumes that are no parts: PrusaSlicer and its forks, Bambu Studio and its forks."""
@@ -160,7 +162,10 @@ class _Package:
             parts += self._parts(key[0], one, pose)
         if pending:
             raise ValueError(f"components make more than {_MAX_INSTANCES} objects")
-        warnings = [f"its {' and '.join(sorted(self._left_out))} are left out"] if self._left_out else []
+        left_out = " and ".join(sorted(self._left_out))
+        if left_out and not parts:
+            raise InputError(f"it has only {left_out}, which are not read: export it with meshes of solids")
+        warnings = [f"its {left_out} are left out"] if self._left_out else []
         if self._is_transparent:
             warnings.append("some of its colours are transparent, but are baked as opaque")
         return MeshFile(tuple(parts), self._unit, "z", tuple(warnings))
@@ -276,6 +281,8 @@ class _Package:
                 triangles.append(child.attrib)
                 if any(name.endswith(_PAINT) for name in child.attrib):
                     self._left_out.add("painted colours of a slicer")
+            elif kind in _LEFT_OUT_SHAPES:
+                self._left_out.add(f"objects of kind {kind}")
             elif kind == "component":
                 components.append((self._reference(model, child), _matrix(child.get("transform"))))
         for first, last in sorted(self._modifier_faces.get(element.get("id", ""), []), reverse=True):

@@ -21,7 +21,7 @@ from PIL import Image
 from trimesh.resolvers import FilePathResolver
 from trimesh.visual import ColorVisuals
 from trimesh.visual.color import to_rgba
-from trimesh.visual.material import PBRMaterial, SimpleMaterial
+from trimesh.visual.material import PBRMaterial, SimpleMaterial, empty_material
 
 from mitsplat.arrays import Float64Array
 from mitsplat.errors import InputError, MissingResourceError
@@ -33,6 +33,7 @@ from mitsplat.mesh_files.file_references import find_reference
 from mitsplat.mesh_files.mesh_file import (
     DIELECTRIC_SPECULAR,
     LEAST_ROUGHNESS,
+    MAX_FRACTION,
     OPAQUE,
     PAINTED_MATERIAL,
     ROUGHNESS,
@@ -59,6 +60,7 @@ _TRIMESH_DIFFUSE = (102, 102, 102)
 _MAX_HEADER_BYTES = 1 << 16
 """Maximum size of the header of a PLY file [bytes]."""
 _STL_HEADER_BYTES = 80
+_STL_FACE_BYTES = 50
 _UNREAD_MAPS = {f"map_{name}" for name in ("pr", "pm", "ks", "ns", "d", "bump", "refl", "rma", "orm")}
 _UNREAD_KEYS = {"bump", "norm", "disp", "decal", "refl", *_UNREAD_MAPS}
 """Keys of MTL files that are left out with a warning."""
@@ -89,6 +91,7 @@ def read_with_trimesh(path: Path, *, textures: bool = True) -> MeshFile:
     kind = path.suffix.lower()
     if kind == ".dae" and importlib.util.find_spec("collada") is None:
         raise MissingResourceError(f"{path}: reading it needs `pip install pycollada`")
+    document = _collada_document(path) if kind == ".dae" else None
     content = _plain_content(path)
     file = path if content is None else io.BytesIO(content)
     try:
@@ -97,7 +100,6 @@ def read_with_trimesh(path: Path, *, textures: bool = True) -> MeshFile:
         if kind == ".ply" and "unexpected length" in str(error):
             raise InputError(_LENGTH) from error
         raise
-    document = _collada_document(path) if kind == ".dae" else None
     if any(has_concave(np.asarray(positions), polygons) for positions, polygons in _polygons(path, scene, document)):
         raise InputError(
             "it has concave polygons, which are read from OBJ files only: export it with triangles instead of polygons"
@@ -119,10 +121,16 @@ def _decoded(part: FilePart) -> FilePart:
 
 
 def _plain_content(path: Path) -> bytes | None:
-    """Return the content of an OBJ or PLY file in a form that trimesh reads correctly, or None if the file is read."""
+    """Return the content of a file in a form that trimesh reads correctly, or None if the file is read."""
     kind = path.suffix.lower()
+    if kind == ".stl":
+        return _plain_stl(path)
     if kind == ".obj":
-        return plain_obj(plain_text(path.read_bytes()))
+        content = plain_obj(plain_text(path.read_bytes()))
+        if re.search(rb"^mtllib ", content, re.M | re.I):
+            return content
+        # trimesh leaves out colours of vertices that have texture coordinates.
+        return re.sub(rb"^f .*$", lambda face: re.sub(rb"/\S*", b"", face[0]), content, flags=re.M)
     if kind == ".ply":
         header = _ply_header(path)
         for names in _COLOUR_NAMES:
@@ -137,6 +145,14 @@ def _plain_content(path: Path) -> bytes | None:
     return None
 
 
+def _plain_stl(path: Path) -> bytes | None:
+    """Return a binary STL file without bytes after its last face, or None if there are none."""
+    content = path.read_bytes()
+    number = int.from_bytes(content[_STL_HEADER_BYTES : _STL_HEADER_BYTES + 4], "little")
+    end = _STL_HEADER_BYTES + 4 + number * _STL_FACE_BYTES
+    return content[:end] if number and end < len(content) and b"facet" not in content[:1024] else None
+
+
 def _ply_header(path: Path) -> str:
     with path.open("rb") as file:
         return file.read(_MAX_HEADER_BYTES).partition(b"end_header")[0].decode("utf-8", errors="replace")
@@ -145,7 +161,10 @@ def _ply_header(path: Path) -> str:
 def _collada_document(path: Path) -> Any:
     import collada  # optional
 
-    return collada.Collada(str(path), ignore=[collada.DaeError])
+    document = collada.Collada(str(path), ignore=[collada.DaeError])
+    if document.scene is None:
+        raise InputError("it has no scene (instance_visual_scene), which places its geometry: export a scene")
+    return document
 
 
 def _warnings(
@@ -164,11 +183,37 @@ def _warnings(
         if is_coloured or any(np.any(one.face_attributes.get("stl", 0)) for one in scene.geometry.values()):
             yield "the colours of its faces are not read, because STL files store them in several ways"
     elif kind == ".ply":
+        yield from _ply_warnings(_ply_header(path), scene)
         named = _texture_names(_ply_header(path))
         if textures and named and all(part.material.texture is None for part in parts):
             yield f"its texture {named[0]} has no coordinates, and is left out"
     elif kind == ".off":
         yield from _off_warnings(path)
+
+
+def _ply_warnings(header: str, scene: trimesh.Scene) -> Iterator[str]:
+    """Yield a warning about each kind of data of a PLY file that is not read, for its header.
+
+    Raises:
+        InputError: If a colour is above the range of its type.
+    """
+    coloured = []
+    for mesh in scene.geometry.values():
+        for name, element in mesh.metadata.get("_ply_raw", {}).items():
+            if name not in ("vertex", "face") or "red" not in element["properties"] or not len(element["data"]):
+                continue
+            coloured.append(name)
+            values = np.asarray(element["data"]["red"])
+            most = max(float(np.max(element["data"][one])) for one in ("red", "green", "blue"))
+            if values.dtype.kind == "f" and most > MAX_FRACTION:
+                raise InputError(
+                    f"colours that are no integers must be within 0 to 1 (got {most:g}): divide them by 255"
+                )
+    if {"vertex", "face"} <= set(coloured):
+        yield "the colours of its faces are left out, because its vertices have colours"
+    left_out = sorted(set(re.findall(r"^element (\S+) [1-9]", header, re.M)) - {"vertex", "face"})
+    if left_out:
+        yield f"its elements {', '.join(left_out)} are left out"
 
 
 def _off_warnings(path: Path) -> Iterator[str]:
@@ -230,16 +275,26 @@ def _read_part(name: str, mesh: trimesh.Trimesh, transform: Float64Array) -> Fil
         else:
             material = UNKNOWN_MATERIAL
     else:
-        uv = None if visual.uv is None else np.asarray(visual.uv, dtype=np.float64)[faces]
-        material = read_material(visual.material, uv)
-        double_sided = bool(getattr(visual.material, "doubleSided", False))
         stored = visual.vertex_attributes.get("color")
         if stored is not None and len(stored) == len(vertices):
             colours = to_rgba(np.asarray(stored))[faces]
+        if _is_empty(visual.material):
+            material = UNKNOWN_MATERIAL if colours is None else PAINTED_MATERIAL
+        else:
+            uv = None if visual.uv is None else np.asarray(visual.uv, dtype=np.float64)[faces]
+            material = read_material(visual.material, uv)
+            double_sided = bool(getattr(visual.material, "doubleSided", False))
     if colours is not None and colours.shape[-1] == 4 and (colours[..., 3] < 255 * OPAQUE).any():
         material = replace(material, warnings=(*material.warnings, TRANSPARENT_COLOURS))
     linear = None if colours is None else decode_srgb(colours[..., :3] / 255.0)
     return FilePart(name, vertices, faces, transform, material, linear, double_sided)
+
+
+def _is_empty(material: Any) -> bool:
+    """Return True for the dark grey image that trimesh uses for texture coordinates without a material."""
+    if not isinstance(material, SimpleMaterial) or material.kwargs or material.image is None:
+        return False
+    return np.array_equal(np.asarray(material.image), np.asarray(empty_material().image))
 
 
 def read_material(material: Any, uv: Float64Array | None = None) -> Material:
@@ -297,6 +352,11 @@ def _read_mtl(source: SimpleMaterial, uv: Float64Array | None) -> Material:
     diffuse = _numbers(keys, "kd")
     if diffuse is None and not np.array_equal(source.diffuse[:3], _TRIMESH_DIFFUSE):
         diffuse = np.asarray(source.diffuse[:3]) / 255.0
+    if texture is not None and diffuse is not None and not diffuse.any():
+        warnings.append("its Kd is black, which is not applied to its texture")
+        diffuse = None
+    if diffuse is None and source.image is None and (ambient := _numbers(keys, "ka")) is not None and ambient.any():
+        warnings.append("it has no Kd, and its Ka is no surface colour: grey is used")
     if diffuse is not None:
         factor = decode_srgb(np.broadcast_to(np.clip(diffuse, 0, 1), 3))
     else:
@@ -411,4 +471,4 @@ def check_textures(mesh: Path) -> None:
 
 def _texture_names(header: str) -> list[str]:
     """Return the textures that the header of a PLY file names."""
-    return re.findall(r"^comment TextureFile (.+?)\s*$", header, re.MULTILINE)
+    return re.findall(r"^comment TextureFile (.+?)\s*$", header, re.M | re.I)

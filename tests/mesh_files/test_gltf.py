@@ -268,6 +268,22 @@ def test_materials_follow_the_specification(tmp_path: Path) -> None:
     np.testing.assert_allclose(part.colours[0, 0], (0.2, 0.4, 0.6))
 
 
+def test_colours_of_vertices_are_fractions(tmp_path: Path) -> None:
+    glb = Glb()
+    colours = glb.accessor(np.full((4, 3), 255.0, dtype=np.float32))
+    glb.mesh({"POSITION": glb.accessor(CORNERS), "COLOR_0": colours}, glb.accessor(QUAD))
+    with pytest.raises(InputError, match=r"colours of vertices must be within 0 to 1 \(got 255\)"):
+        read_model(glb.save(tmp_path / "a.glb"))
+
+
+def test_a_node_of_scale_0_is_hidden(tmp_path: Path) -> None:
+    glb = Glb()
+    glb.mesh({"POSITION": glb.accessor(CORNERS)}, glb.accessor(QUAD))
+    glb.document["nodes"] = [{"mesh": 0, "scale": [0, 0, 0], "translation": [9, 0, 0]}, {"mesh": 0}]
+    glb.document["scenes"] = [{"nodes": [0, 1]}]
+    assert len(read_model(glb.save(tmp_path / "a.glb")).parts) == 1
+
+
 @pytest.mark.parametrize(
     ("changes", "sentence"),
     [

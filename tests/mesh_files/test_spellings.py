@@ -8,7 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from PIL import Image
+from trimesh.visual import TextureVisuals
 
 from mitsplat.bake.mesh_parts import MeshModel, read_model
 from mitsplat.errors import InputError
@@ -98,6 +100,7 @@ def test_colours_of_mtl_that_are_no_rgb_are_refused(tmp_path: Path, colour: str)
         (obj(), RED + "d -halo 0.3\n", "is transparent"),
         (obj(), RED + "map_Ka a.png\n", "map_ka is left out"),
         (obj(), RED + "disp a.png\n", "disp is left out"),
+        (obj(), "newmtl red\nKa 1 0 0\n", "it has no Kd"),
     ],
 )
 def test_what_is_not_read_of_obj_is_named(tmp_path: Path, text: str, library: str, sentence: str) -> None:
@@ -117,6 +120,42 @@ def test_colours_of_vertices_of_obj_are_fractions(tmp_path: Path) -> None:
     (tmp_path / "b.obj").write_text((tmp_path / "a.obj").read_text().replace(" 1 0.5 0", " 255 128 0"))
     with pytest.raises(InputError, match=r"colours of vertices must be within 0 to 1 \(got 255\)"):
         read_model(tmp_path / "b.obj")
+
+
+def test_colours_and_grey_of_obj_without_material_file_survive_texture_coordinates(tmp_path: Path) -> None:
+    """trimesh replaces both by a dark grey texture."""
+    plain = obj(use="vt 0 0\nvt 1 0", face="f {}/1 {}/2 {}/2").replace("mtllib a.mtl\n", "")
+    (tmp_path / "a.obj").write_text(plain)
+    assert shown(read_model(tmp_path / "a.obj")) == [188, 188, 188]
+    (tmp_path / "b.obj").write_text(obj(use="", vertex="v {} {} {} 1 0.5 0").replace("mtllib a.mtl\n", ""))
+    model = read_model(tmp_path / "b.obj")
+    assert shown(model) == [255, 128, 0] and model.warnings == ()
+    sheet = trimesh.Trimesh(POINTS, FACES, process=False, visual=TextureVisuals(uv=np.zeros((4, 2))))
+    assert shown(read_model(sheet)) == [188, 188, 188]
+
+
+def test_a_black_factor_does_not_hide_the_texture_of_obj(tmp_path: Path) -> None:
+    """Some programs write Kd 0 0 0 beside a texture."""
+    (tmp_path / "a.obj").write_text(obj(use="usemtl red\nvt 0.5 0.5", face="f {}/1 {}/1 {}/1"))
+    (tmp_path / "a.mtl").write_text("newmtl red\nKd 0 0 0\nmap_Kd a.png\n")
+    Image.new("RGB", (8, 8), COLOUR).save(tmp_path / "a.png")
+    model = read_model(tmp_path / "a.obj")
+    assert shown(model) == list(COLOUR) and "its Kd is black" in model.parts[0].warnings[0]
+
+
+def test_two_materials_of_one_name_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "a.obj").write_text(obj())
+    (tmp_path / "a.mtl").write_text(RED + RED)
+    assert shown(read_model(tmp_path / "a.obj")) == [255, 0, 0]
+    (tmp_path / "a.mtl").write_text(RED + "newmtl red\nKd 0 1 0\n")
+    with pytest.raises(InputError, match=r"a\.mtl: materials must have different names \(got 2 with the name red\)"):
+        read_model(tmp_path / "a.obj")
+
+
+@pytest.mark.parametrize("header", [b"", b"solid"])
+def test_bytes_after_the_last_face_of_stl_are_ignored(tmp_path: Path, header: bytes) -> None:
+    (tmp_path / "a.stl").write_bytes(stl(header=header) + bytes(100))
+    assert is_complete(read_model(tmp_path / "a.stl"))
 
 
 def stl(points: object = POINTS, header: bytes = b"") -> bytes:
@@ -164,6 +203,20 @@ def test_transparent_colours_and_textures_without_coordinates_of_ply_are_named(t
     assert "colours of its vertices are transparent" in part.warnings[0]
     (tmp_path / "b.ply").write_text(ply(head="comment TextureFile a.png\n"))
     assert read_model(tmp_path / "b.ply").warnings == ("its texture a.png has no coordinates, and is left out",)
+
+
+def test_other_colours_and_elements_of_ply_are_named(tmp_path: Path) -> None:
+    columns = "".join(f"property uchar {name}\n" for name in ("red", "green", "blue"))
+    faces = tuple(f"3 {a} {b} {c} 0 255 0" for a, b, c in FACES)
+    (tmp_path / "a.ply").write_text(ply(columns, "200 100 50", faces, columns))
+    model = read_model(tmp_path / "a.ply")
+    assert shown(model) == list(COLOUR) and "colours of its faces are left out" in model.warnings[0]
+    material = "element material 1\nproperty uchar diffuse_red\nend_header"
+    (tmp_path / "b.ply").write_text(ply().replace("end_header", material) + "255\n")
+    assert read_model(tmp_path / "b.ply").warnings == ("its elements material are left out",)
+    (tmp_path / "c.ply").write_text(ply(columns.replace("uchar", "float"), "255 128 0"))
+    with pytest.raises(InputError, match=r"colours that are no integers must be within 0 to 1 \(got 255\)"):
+        read_model(tmp_path / "c.ply")
 
 
 def test_several_textures_of_ply_are_refused(tmp_path: Path) -> None:

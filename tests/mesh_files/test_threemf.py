@@ -217,6 +217,12 @@ def test_volumes_of_slicers_that_are_no_parts_are_left_out(tmp_path: Path) -> No
         assert model.warnings == ("its modifiers and negative volumes of a slicer are left out",)
 
 
+def test_a_file_of_shapes_of_extensions_alone_is_refused(tmp_path: Path) -> None:
+    shape = '<object id="1"><booleanshape objectid="1"/></object>'
+    with pytest.raises(InputError, match="it has only objects of kind booleanshape, which are not read"):
+        read_model(write(tmp_path / "a.3mf", shape, '<item objectid="1"/>'))
+
+
 @pytest.mark.parametrize(
     ("resources", "sentence"),
     [

@@ -193,8 +193,8 @@ def test_one_module_builds_command_lines_of_python() -> None:
 
 def test_multiprocessing_starts_in_safe_path_mode() -> None:
     starts = [module for module, path in MODULES.items() if "import multiprocessing" in path.read_text()]
-    assert starts == ["mitsplat.engine.pool"]
-    source = MODULES["mitsplat.engine.pool"].read_text()
+    assert starts == ["mitsplat.engine.worker_processes"]
+    source = MODULES["mitsplat.engine.worker_processes"].read_text()
     assert "with safe_path_children(), _short_arguments():" in source
     assert source.count("process.start()") == 1
 

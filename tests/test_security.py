@@ -17,7 +17,7 @@ from benchmarks.scale.attack.attack import SECRET_COLOUR, SECRET_WORD, Attack, j
 from benchmarks.scale.attack.samples import Place, Samples
 from mitsplat.asset import Asset, read_mesh
 from mitsplat.bake.mesh_parts import read_parts
-from mitsplat.engine import pool
+from mitsplat.engine import scheduler
 from mitsplat.errors import InputError
 from mitsplat.frames import mitsuba_xml as xml_scene
 from mitsplat.frames.untrusted_xml import check_xml
@@ -268,7 +268,7 @@ class TestXml:
 
     def test_a_crash_of_mitsuba_is_reported_in_one_sentence(self, scene, capsys, monkeypatch):
         """A killed process stands in for a crash of a native reader. Tests of the engine repeat lost frames."""
-        monkeypatch.setattr(pool, "MAX_LOSSES", 1)
+        monkeypatch.setattr(scheduler, "MAX_LOSSES", 1)
         monkeypatch.setattr(xml_scene, "_RenderOne", Dies)
         assert run("render", scene) == 2
         assert "scene.xml: Mitsuba's process ended at a file that the scene names" in capsys.readouterr().err

@@ -7,9 +7,11 @@ of a scene's arrays. This package does not depend on the type of a frame.
 
 from __future__ import annotations
 
-from mitsplat.engine.pool import FrameError, LostWorkersError, MakeFrame, affordable_workers, run_frames
+from mitsplat.engine.answers import FrameError, LostWorkersError
+from mitsplat.engine.pool import affordable_workers, run_frames
 from mitsplat.engine.ray import Cluster
 from mitsplat.engine.resources import WorkerMemory, unused_memory
+from mitsplat.engine.worker_processes import MakeFrame
 
 __all__ = [
     "Cluster",

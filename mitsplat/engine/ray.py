@@ -18,13 +18,14 @@ from contextlib import closing
 from dataclasses import dataclass, replace
 from typing import Any, Generic, Protocol, TypeVar
 
-from mitsplat.engine.pool import Answer, Failure, Finished, Lost, LostWorkersError, check_workers, run_pool
+from mitsplat.engine.answers import Answer, Failure, Finished, Lost, LostWorkersError, Result
+from mitsplat.engine.pool import check_workers
+from mitsplat.engine.scheduler import run_pool
 from mitsplat.errors import InputError, MissingResourceError
 from mitsplat.progress import Note
 from mitsplat.runtime.child_process import SAFE_PATH, safe_path_children
 from mitsplat.runtime.device import Device, Kind, use_shared_device
 
-Result = TypeVar("Result")
 MadeFrame = TypeVar("MadeFrame", covariant=True)
 
 GPU_SHARE = {"CPU": 1.0, "GPU": 0.125}

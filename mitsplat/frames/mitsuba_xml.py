@@ -16,7 +16,8 @@ import numpy as np
 
 from mitsplat.arrays import ByteImage
 from mitsplat.asset import Asset
-from mitsplat.engine.pool import LostWorkersError, run_in_process
+from mitsplat.engine.answers import LostWorkersError
+from mitsplat.engine.pool import run_in_process
 from mitsplat.errors import InputError
 from mitsplat.frames.camera_response import develop
 from mitsplat.frames.light_properties import light_properties

@@ -24,7 +24,7 @@ from mitsplat.dataset.manifest import Manifest
 from mitsplat.dataset.schema import read_content
 from mitsplat.dataset.write import write_dataset
 from mitsplat.engine import pool
-from mitsplat.engine.pool import FrameError
+from mitsplat.engine.answers import FrameError
 from mitsplat.errors import InputError, MissingResourceError
 from mitsplat.formats.format import Catalogue
 from mitsplat.formats.yolo import data_yaml

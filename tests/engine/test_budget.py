@@ -1,6 +1,7 @@
 """Memory budget of workers: an upper bound of measured peaks that scales with the scene."""
 
 import itertools
+import os
 import subprocess
 import sys
 from dataclasses import replace
@@ -145,5 +146,5 @@ def test_the_memory_of_a_scene_with_a_fisheye_lens_is_estimated():
 @pytest.mark.parametrize(("own", "shared", "expected"), [(1, 0, 8), (2, 0, 5), (2, 5, 2), (20, 0, 1)])
 def test_the_number_of_workers_is_bounded_by_memory(monkeypatch, own, shared, expected):
     monkeypatch.setattr(engine, "unused_memory", lambda: 10.5)
-    monkeypatch.setattr(engine.os, "sched_getaffinity", lambda _: set(range(8)), raising=False)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(8)), raising=False)
     assert engine.affordable_workers(WorkerMemory(own * 2**30, shared * 2**30)) == expected

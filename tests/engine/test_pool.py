@@ -16,8 +16,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mitsplat.engine import pool as engine
-from mitsplat.engine.pool import Failure, Finished, FrameError, LostWorkersError, run_frames, run_pool
+from mitsplat.engine import scheduler, worker_processes
+from mitsplat.engine.answers import Failure, Finished, FrameError, LostWorkersError, Started
+from mitsplat.engine.frame_queue import FrameQueue
+from mitsplat.engine.pool import run_frames
 from mitsplat.engine.resources import TYPICAL_MEMORY
+from mitsplat.engine.scheduler import run_pool
+from mitsplat.engine.worker_processes import WorkerProcesses
 from mitsplat.errors import InputError, MissingResourceError
 from mitsplat.runtime.device import CPU, Device, Gpu, MissingPrerequisite, visible_gpus
 from tests.engine.jobs import (
@@ -123,7 +128,7 @@ def test_a_worker_on_the_cpu_has_two_cores(monkeypatch):
     monkeypatch.setattr(engine, "usable_cores", lambda: 2)
     began = []
     monkeypatch.setattr(engine, "run_pool", lambda *args, **how: began.append((args[2], how)) or (i for i in ()))
-    monkeypatch.setattr(engine._Processes, "start_helper", lambda pool: began.append("helper"))
+    monkeypatch.setattr(WorkerProcesses, "start_helper", lambda pool: began.append("helper"))
     for layouts in ({0: range(20)}, {0: range(10), 1: range(10)}):
         list(run_frames(Variant(), layouts, workers=None, note=print, device=CPU, prepare=Prepare(Path())))
     assert began == [(1, {"grow": True}), "helper"]
@@ -157,7 +162,7 @@ def test_a_worker_that_does_not_start_in_time_is_reported(monkeypatch, interpret
 
     Two workers start in any order, so that either frame may be the first to be lost, or to be lost three times.
     """
-    monkeypatch.setattr(engine, "_START_TIMEOUT", 0.5)
+    monkeypatch.setattr(worker_processes, "_START_TIMEOUT", 0.5)
     monkeypatch.setattr(sys, "argv", ["run", "x" * 200_000])
     interpreter(script)
     begun, notes = time.monotonic(), []
@@ -176,7 +181,7 @@ def test_workers_receive_a_command_line_only_if_it_is_short(monkeypatch, argumen
 
 
 def test_frames_of_a_worker_that_does_not_start_are_made_by_others(monkeypatch, tmp_path, interpreter):
-    monkeypatch.setattr(engine, "_START_TIMEOUT", 15.0)
+    monkeypatch.setattr(worker_processes, "_START_TIMEOUT", 15.0)
     mark = tmp_path / "first"
     interpreter(f'if [ ! -e {mark} ]; then touch {mark}; kill -STOP $$; fi; exec {sys.executable} "$@"')
     notes = []
@@ -188,7 +193,7 @@ def test_frames_of_a_worker_that_does_not_start_are_made_by_others(monkeypatch, 
 def test_suspended_workers_are_killed(tmp_path):
     """SIGTERM would have no effect until the processes continue."""
     (tmp_path / "pids").mkdir()
-    with closing(engine._Processes(Linger(tmp_path / "pids"), None)) as pool:
+    with closing(WorkerProcesses(Linger(tmp_path / "pids"), None)) as pool:
         for index in range(2):
             pool.send_frame(pool.start(), index, 0)
         wait_for(lambda: len(list((tmp_path / "pids").iterdir())) == 2)
@@ -272,8 +277,8 @@ def test_workers_select_the_device_first(monkeypatch):
         assert {variant for _, variant, _ in results} == {"llvm_ad_rgb"}
     monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
     gpus = tuple(Gpu(name, 80 * 2**30, number, "", f"GPU-{name}") for number, name in enumerate("ab"))
-    monkeypatch.setattr(engine, "use_shared_device", print)
-    pool = engine._Processes(Variant(), Device("cuda", gpus))
+    monkeypatch.setattr(worker_processes, "use_shared_device", print)
+    pool = WorkerProcesses(Variant(), Device("cuda", gpus))
     pool._kind = None  # no device is selected
     with closing(pool):
         workers = [pool.start() for _ in range(3)]
@@ -324,10 +329,10 @@ def test_a_gpu_that_does_not_start_loses_its_worker(monkeypatch, kind, exhausted
             return next(frames)
         raise EOFError
 
-    monkeypatch.setattr(engine, "use_shared_device", fail)
-    monkeypatch.setattr(engine, "_end_with_parent", lambda: None)
-    engine._work(SimpleNamespace(recv=receive, send=said.append), kind, None, (Variant(), None))
-    assert isinstance(said.pop(0), engine.Started)
+    monkeypatch.setattr(worker_processes, "use_shared_device", fail)
+    monkeypatch.setattr(worker_processes, "_end_with_parent", lambda: None)
+    worker_processes._work(SimpleNamespace(recv=receive, send=said.append), kind, None, (Variant(), None))
+    assert isinstance(said.pop(0), Started)
     assert [(answer.exhausted, answer.message) for answer in said] == [(exhausted, "cuInit() failed")] * 2
 
 
@@ -336,7 +341,7 @@ def test_workers_get_the_environment_of_the_gpu_service(monkeypatch, own, seen):
     """The service's variables are set in the workers only. One of several GPUs has a name of its own."""
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "1")
     gpu = Gpu("a", 80 * 2**30, 0, "", own)
-    with closing(engine._Processes(Variant(), Device("cuda", (gpu,)), {"CUDA_VISIBLE_DEVICES": "0"})) as pool:
+    with closing(WorkerProcesses(Variant(), Device("cuda", (gpu,)), {"CUDA_VISIBLE_DEVICES": "0"})) as pool:
         pool._kind = None  # no device is selected
         pool.send_frame(pool.start(), 0, 0)
         while not (answers := list(pool.wait())):
@@ -349,7 +354,7 @@ def test_workers_get_the_environment_of_the_gpu_service(monkeypatch, own, seen):
 def test_the_number_of_workers_is_bounded_by_gpu_memory(monkeypatch, gigabytes, count):
     """All workers start at once. A GPU of 7 GiB gets two workers of 3 GiB."""
     monkeypatch.setattr(engine, "unused_memory", lambda: 32.0)
-    monkeypatch.setattr(engine.os, "sched_getaffinity", lambda _: set(range(16)), raising=False)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(16)), raising=False)
     device = Device("cuda", tuple(Gpu("one", size * 2**30, 0, "", "") for size in gigabytes))
     assert engine.affordable_workers(TYPICAL_MEMORY, device) == count
     began = []
@@ -361,7 +366,7 @@ def test_the_number_of_workers_is_bounded_by_gpu_memory(monkeypatch, gigabytes, 
 
 def test_the_number_of_workers_per_gpu_is_bounded(monkeypatch):
     monkeypatch.setattr(engine, "unused_memory", lambda: 4096.0)
-    monkeypatch.setattr(engine.os, "sched_getaffinity", lambda _: set(range(256)), raising=False)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(256)), raising=False)
     gpus = tuple(Gpu("large", 288 * 2**30, number, "", "") for number in range(2))
     assert [engine.affordable_workers(TYPICAL_MEMORY, Device("cuda", gpus[:count])) for count in (1, 2)] == [48, 96]
 
@@ -442,7 +447,7 @@ class Scripted:
 )
 def test_workers_are_added_while_they_increase_the_speed(monkeypatch, seconds, settled_at, most):
     pool = Scripted(seconds)
-    monkeypatch.setattr(engine.time, "monotonic", lambda: pool.clock)
+    monkeypatch.setattr(scheduler.time, "monotonic", lambda: pool.clock)
     made = list(run_pool(pool, {0: range(400)}, 4, print, grow=True))
     assert sorted(made) == list(range(400))
     assert (len(pool.alive), pool.most) == (settled_at, most)
@@ -451,7 +456,7 @@ def test_workers_are_added_while_they_increase_the_speed(monkeypatch, seconds, s
 def test_the_time_of_settling_does_not_affect_the_number_of_workers(monkeypatch):
     """Every eighth frame settles a layout for ten times as long as the others render."""
     pool = Scripted(lambda count: 1.0, settle=10.0)
-    monkeypatch.setattr(engine.time, "monotonic", lambda: pool.clock)
+    monkeypatch.setattr(scheduler.time, "monotonic", lambda: pool.clock)
     made = list(run_pool(pool, {k: range(8 * k, 8 * k + 8) for k in range(40)}, 4, print, grow=True))
     assert sorted(made) == list(range(320))
     assert (len(pool.alive), pool.most) == (4, 4)
@@ -503,7 +508,7 @@ class SlowPlan:
 def test_the_plan_agrees_with_its_slow_twin(sizes, events):
     """Workers take frames, are lost with their frame, and are stopped, in any order."""
     layouts = {7 * number: [100 * number + view for view in range(size)] for number, size in enumerate(sizes)}
-    fast, slow = engine._Plan(layouts), SlowPlan(layouts)
+    fast, slow = FrameQueue(layouts), SlowPlan(layouts)
     at_work = {}
     for worker, event in events:
         if event == "take":
@@ -540,7 +545,7 @@ def test_the_cost_of_a_frame_grows_with_the_logarithm_of_layouts():
     """
     looks = {}
     for count in (100, 3200):
-        plan = engine._Plan({Counted(layout): range(3) for layout in range(count)})
+        plan = FrameQueue({Counted(layout): range(3) for layout in range(count)})
         Counted.looks = 0
         for turn in range(plan.left):
             plan.take(turn % 50)

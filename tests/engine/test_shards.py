@@ -23,7 +23,7 @@ from mitsplat.dataset.frame_job import FrameJob, RemoteFrameJob
 from mitsplat.dataset.manifest import Manifest, encode_line
 from mitsplat.dataset.shards import merge_shards
 from mitsplat.engine import ray as cluster
-from mitsplat.engine.pool import LostWorkersError
+from mitsplat.engine.answers import LostWorkersError
 from mitsplat.engine.ray import Cluster
 from mitsplat.errors import InputError, MissingResourceError
 from mitsplat.formats.registry import Catalogue

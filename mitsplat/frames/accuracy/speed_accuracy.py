@@ -24,7 +24,8 @@ import numpy.typing as npt
 from scipy.ndimage import maximum_filter, minimum_filter
 
 from mitsplat.arrays import BoolArray, Float32Array, Float64Array
-from mitsplat.engine.pool import LostWorkersError, run_in_process
+from mitsplat.engine.answers import LostWorkersError
+from mitsplat.engine.pool import run_in_process
 from mitsplat.errors import InputError, MissingResourceError
 from mitsplat.frames.accuracy.object_steps import MeshSceneBuilder, without_materials
 from mitsplat.frames.frame import Renderer

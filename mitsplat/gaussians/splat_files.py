@@ -12,7 +12,7 @@ suffix                  read  write  precision
 ``.sog``                yes   no     PlayCanvas: 16-bit log positions, 8-bit codebooks; the order changes
 ======================  ====  =====  ==========================================================================
 
-No format states its axes or its unit, so ``x, y, z`` are returned as in the file, without rotation or scaling.
+Few files state their axes and none its unit, so ``x, y, z`` are returned as in the file, without rotation or scaling.
 This package decodes ``.ply``, ``.splat``, ``.ksplat`` and version 3 of ``.spz``. Its allocations are
 limited by the size of the file. gaussforge decodes the other formats. It does not validate its input and therefore
 runs in a separate process with bounded memory, which takes 0.1 s to start.
@@ -51,7 +51,7 @@ from mitsplat.gaussians.splat_training import (
 )
 from mitsplat.quality import KernelName
 from mitsplat.runtime.child_process import run_bounded
-from mitsplat.storage.file_kinds import kind_of_file
+from mitsplat.storage.file_kinds import kind_of_file, refuse_placeholder
 from mitsplat.storage.files import storage_errors, write_file
 
 Axis = Literal["x", "-x", "y", "-y", "z", "-z"]
@@ -88,6 +88,10 @@ _SPZ_POSITION_BITS = 23
 
 _MIN_JUDGED = 100
 """Number of Gaussians from which their values show how they are encoded."""
+_MIN_SPREAD = 0.7
+"""Range of stored opacities from which those from 0 to 1 are no logits."""
+_MAX_COEFFICIENT = 10.0
+"""Median of constant coefficients above which they are no colours: 1.8 is white."""
 _logger = logging.getLogger(__name__)
 
 
@@ -102,8 +106,15 @@ class SplatArrays(NamedTuple):
 
 
 def default_up_axis(path: Path) -> Axis:
-    """Return the usual up axis of a format: y for ``.spz``, -y for the others, as in structure from motion."""
-    return "y" if path.suffix.lower() == ".spz" else "-y"
+    """Return the usual up axis of a file: y for ``.spz``, z if a PLY says so, or -y, as in structure from motion.
+
+    Nerfstudio turns its scenes and writes the comment ``Vertical Axis: z``. With y, programs mean y or -y.
+    """
+    if path.suffix.lower() != ".ply":
+        return "y" if path.suffix.lower() == ".spz" else "-y"
+    with path.open("rb") as file:
+        header = file.read(MAX_PLY_HEADER).partition(b"end_header")[0]
+    return "z" if re.search(rb"^comment vertical axis:[ \t]*z\s*$", header, re.M | re.I) else "-y"
 
 
 def read_splats(path: Path) -> tuple[SplatArrays, KernelName | None]:
@@ -129,6 +140,7 @@ def read_splats(path: Path) -> tuple[SplatArrays, KernelName | None]:
         data = path.read_bytes()
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from error
+    refuse_placeholder(path, data[:MAX_PLY_HEADER])
     try:
         if not data:
             raise InputError("the file is empty")
@@ -199,7 +211,7 @@ def _decode_ply(data: bytes) -> SplatArrays:
     if rest not in (0, 9, 24, 45) or not set(rest_names) <= set(names):
         raise InputError(f"f_rest must be numbered from 0 and have 0, 9, 24 or 45 properties (got {rest})")
     rows = vertex_rows(data, form, elements, start)
-    _check_encoding(columns_of(rows, scale_names), rows["opacity"])
+    _check_encoding(columns_of(rows, scale_names), rows["opacity"], columns_of(rows, _COLOUR))
     scales, opacities = _exp(columns_of(rows, scale_names)), _sigmoid(rows["opacity"])
     if len(scale_names) == 2:
         scales = np.hstack([scales, _FLAT_THICKNESS * scales.min(axis=1, keepdims=True)])
@@ -226,16 +238,24 @@ def _decode_ksplat(data: bytes) -> SplatArrays:
     return SplatArrays(*(values.astype(np.float32) for values in arrays))
 
 
-def _check_encoding(scales: npt.NDArray[Any], opacities: npt.NDArray[Any]) -> None:
-    """Refuse sizes and opacities in place of the logarithms and logits of a PLY file.
+def _check_encoding(scales: npt.NDArray[Any], opacities: npt.NDArray[Any], colours: npt.NDArray[Any]) -> None:
+    """Refuse sizes, opacities and colours in place of the logarithms, logits and coefficients of a PLY file.
 
-    No trained splats have only logits from 0 to 1 and Gaussians above one unit.
+    No trained splats have only logits from 0 to 1 with Gaussians above one unit, or all over this range.
     """
-    if len(scales) >= _MIN_JUDGED and scales.min() > 0 and opacities.min() >= 0 and opacities.max() <= 1:
+    if len(scales) < _MIN_JUDGED:
+        return
+    low, high = float(opacities.min()), float(opacities.max())
+    if 0 <= low <= high <= 1 and (scales.min() > 0 or high - low > _MIN_SPREAD):
         raise InputError(
             "scale_0 to scale_2 and opacity of a PLY file must be logarithms and logits (got "
-            f"{scales.min():.3g} to {scales.max():.3g}, and {opacities.min():.3g} to {opacities.max():.3g}): apply log "
+            f"{scales.min():.3g} to {scales.max():.3g}, and {low:.3g} to {high:.3g}): apply log "
             "to the scales and log(o / (1 - o)) to the opacities"
+        )
+    if (usual := float(np.median(np.abs(colours)))) > _MAX_COEFFICIENT:
+        raise InputError(
+            "f_dc_0 to f_dc_2 of a PLY file must be coefficients of spherical harmonics (got values of "
+            f"{usual:.3g}): convert colours from 0 to 255 by (c / 255 - 0.5) / 0.2821"
         )
 
 

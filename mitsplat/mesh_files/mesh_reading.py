@@ -15,7 +15,7 @@ from mitsplat.mesh_files.mesh_file import MeshFile
 from mitsplat.mesh_files.step import STEP_SUFFIXES, read_step
 from mitsplat.mesh_files.threemf import read_3mf
 from mitsplat.mesh_files.trimesh_files import read_with_trimesh
-from mitsplat.storage.file_kinds import refuse_other_kinds
+from mitsplat.storage.file_kinds import refuse_other_kinds, refuse_placeholder
 from mitsplat.storage.files import MESH_ERRORS
 
 SUFFIXES = (".stl", ".obj", ".glb", ".gltf", ".off", ".3mf", ".dae", ".ply", *STEP_SUFFIXES)
@@ -56,6 +56,11 @@ def read_mesh_file(path: Path, *, textures: bool = True) -> MeshFile:
     refuse_other_kinds(path, "a mesh (.glb, .step, .obj, .stl, .ply)", *SUFFIXES)
     if not path.is_file():
         raise InputError(f"{path}: no such mesh file")
+    try:
+        with path.open("rb") as file:
+            refuse_placeholder(path, file.read(1024))
+    except OSError as error:
+        raise InputError(f"{path}: not a mesh that can be read ({error})") from error
     if path.suffix.lower() in STEP_SUFFIXES:
         return read_step(path)
     check_mesh(path, read=_try_mesh_file)

@@ -55,6 +55,23 @@ def refuse_other_kinds(path: Path, wanted: str, *suffixes: str) -> None:
         raise InputError(f"{path}: must be {wanted} (got {kind_of_file(path)})")
 
 
+def refuse_placeholder(path: Path, start: bytes) -> None:
+    """Refuse a file with the content of another one: a Git LFS pointer, or a web page of a failed download.
+
+    Args:
+        path: The file.
+        start: Its first bytes.
+
+    Raises:
+        InputError: If it is one.
+    """
+    text = start.lstrip()[:40].lower()
+    if text.startswith(b"version https://git-lfs"):
+        raise InputError(f"{path}: is a Git LFS pointer in place of the file: get the file by `git lfs pull`")
+    if text.startswith((b"<!doctype html", b"<html")):
+        raise InputError(f"{path}: is a web page in place of the file: the download failed")
+
+
 def kind_of_file(path: Path) -> str | None:
     """Return the kind of a file by its suffix, with the command to use for it; None if it is unknown."""
     kind = _BY_SUFFIX.get(path.suffix.lower())

@@ -7,6 +7,7 @@ import logging
 import re
 import struct
 import zipfile
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,6 +21,7 @@ from mitsplat.errors import InputError
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.gaussians.splat_training import SPZ_FLAGS_OFFSET, merge_filter
 from mitsplat.geometry.camera import Camera
+from mitsplat.mesh_files.mesh_reading import read_mesh_file
 from mitsplat.quality import PRESETS
 from mitsplat.renderer.layers import render_splats
 from mitsplat.runtime.variant import ensure_variant
@@ -243,15 +245,47 @@ def test_a_scene_uses_the_kernel_that_its_splats_state(scene_data, write_scene, 
     assert "rendering.kernel to mip" in found.remedy
 
 
-def test_sizes_in_place_of_logarithms_are_refused(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("columns", "values", "sentence"),
+    [
+        (
+            ("scale_0", "scale_1", "scale_2", "opacity"),
+            lambda splats: (*splats.scales.T, splats.opacities),
+            "must be logarithms and logits",
+        ),
+        (("opacity",), lambda splats: (splats.opacities,), "must be logarithms and logits"),
+        (
+            ("f_dc_0", "f_dc_1", "f_dc_2"),
+            lambda splats: (255 * splats.opacities,) * 3,
+            "must be coefficients of",
+        ),
+    ],
+)
+def test_rendered_values_in_place_of_stored_ones_are_refused(
+    tmp_path: Path, columns: tuple[str, ...], values: Callable[[Splats], tuple[np.ndarray, ...]], sentence: str
+) -> None:
     """Such a file is that of a program that wrote what it renders."""
     splats = random_splats(200)
     splats.save(tmp_path / "a.ply")
     head, _, rows = (tmp_path / "a.ply").read_bytes().partition(b"end_header\n")
     names = re.findall(rb"property float (\w+)", head)
-    values = np.frombuffer(rows, "<f4").reshape(200, -1).copy()
-    for number, column in enumerate((*splats.scales.T, splats.opacities)):
-        values[:, names.index([b"scale_0", b"scale_1", b"scale_2", b"opacity"][number])] = column
-    (tmp_path / "a.ply").write_bytes(head + b"end_header\n" + values.tobytes())
-    with pytest.raises(InputError, match=r"a\.ply: scale_0 to scale_2 and opacity .* must be logarithms and logits"):
+    table = np.frombuffer(rows, "<f4").reshape(200, -1).copy()
+    for name, column in zip(columns, values(splats), strict=True):
+        table[:, names.index(name.encode())] = column
+    (tmp_path / "a.ply").write_bytes(head + b"end_header\n" + table.tobytes())
+    with pytest.raises(InputError, match=rf"a\.ply: .*{sentence}"):
         Splats.load(tmp_path / "a.ply")
+
+
+@pytest.mark.parametrize(
+    ("content", "sentence"),
+    [
+        (b"version https://git-lfs.github.com/spec/v1\n", "is a Git LFS pointer"),
+        (b"\n<!DOCTYPE html>", "is a web page"),
+    ],
+)
+def test_files_in_place_of_splats_are_named(tmp_path: Path, content: bytes, sentence: str) -> None:
+    (tmp_path / "a.ply").write_bytes(content)
+    for read in (Splats.load, read_mesh_file):
+        with pytest.raises(InputError, match=sentence):
+            read(tmp_path / "a.ply")

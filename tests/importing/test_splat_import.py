@@ -16,6 +16,7 @@ from mitsplat.asset import Asset
 from mitsplat.cli import app
 from mitsplat.errors import InputError
 from mitsplat.gaussians.splat_cloud import Splats
+from mitsplat.gaussians.splat_files import default_up_axis
 from mitsplat.gaussians.surfels import place_surfels
 from mitsplat.importing.import_report import write_import_report, write_scene
 from mitsplat.importing.splat_import import Imported, ImportSettings, _cut_base, _topples, import_splats
@@ -82,6 +83,14 @@ def test_without_a_plane_the_up_direction_is_the_stated_one() -> None:
     assert np.allclose(found.up, (0, 1, 0))
     assert "as is usual" in found.reason
     assert np.allclose(find_up(ball, "object", "y", "-x").up, (-1, 0, 0))
+
+
+@pytest.mark.parametrize(("comment", "up"), [("comment Vertical Axis: z\n", "z"), ("", "-y")])
+def test_the_up_axis_that_nerfstudio_states_is_used(tmp_path: Path, comment: str, up: str) -> None:
+    splats_on(trimesh.creation.icosphere(3, 0.1), 50).save(tmp_path / "a.ply")
+    stored = (tmp_path / "a.ply").read_bytes().replace(b" 1.0\n", b" 1.0\n" + comment.encode(), 1)
+    (tmp_path / "a.ply").write_bytes(stored)
+    assert default_up_axis(tmp_path / "a.ply") == up
 
 
 def test_the_floor_supports_surroundings_with_a_larger_wall() -> None:

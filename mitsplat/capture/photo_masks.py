@@ -53,6 +53,9 @@ MIN_SHARE = 0.02
 MIN_AGREEMENT = 0.7
 """Minimum fraction of the object's points in a photo that its mask must cover."""
 
+_MAX_BORDER = 0.9
+"""Maximum fraction of the border of a photo that a mask may cover."""
+
 _WORK_EDGE = 480
 """Longer edge of the photo in the first GrabCut, and of the object in the last [px]."""
 
@@ -125,6 +128,31 @@ def add_masks(
             if progress is not None:
                 progress(done, len(capture.photos), "cutting out")
     return replace(capture, photos=tuple(photos), rejected=rejected)
+
+
+def check_borders(capture: Capture, source: Path) -> Capture:
+    """Return a capture, unless its masks mark the background in place of the object.
+
+    Args:
+        capture: Capture with masks.
+        source: Folder of the masks or of the transparent photos, for the message.
+
+    Raises:
+        InputError: If most masks are white along the border of the photo.
+    """
+    around = 0
+    for photo in capture.photos:
+        if photo.mask is not None:
+            with Image.open(photo.mask) as image:
+                mask = np.asarray(image.convert("L")) >= 128
+            border = np.concatenate([mask[0], mask[-1], mask[:, 0], mask[:, -1]])
+            around += bool(border.mean() > _MAX_BORDER)
+    if around > len(capture.photos) / 2:
+        raise InputError(
+            f"{source}: masks must be white, or photos opaque, on the object (got {around} of {len(capture.photos)} "
+            "that are so along the whole border of the photo): invert them"
+        )
+    return capture
 
 
 def object_masks(
@@ -219,7 +247,8 @@ def plain_masks(photos: Sequence[Photo]) -> MaskMaker | None:
     """Return a function that masks what is not the plain background of rendered photos; None if a photo has none."""
 
     def background(photo: Photo) -> BoolArray | None:
-        return plain_background(np.rint(255 * replace(photo, gain=None).read().rgb).astype(np.uint8))
+        rgb = np.rint(255 * replace(photo, gain=None).read().rgb).astype(np.uint8)
+        return plain_background(rgb, without_noise=True)
 
     if any(background(photo) is None for photo in photos):
         return None

@@ -42,8 +42,14 @@ _MAX_CLIPPED = 0.9
 
 _PLAIN = 3
 """Largest difference of a plain background from black or white [of 255]; JPEG changes it that much."""
+_NEARLY_PLAIN = 24
+_MAX_NOISE = 0.02
+"""Maximum fraction of the border of a rendered photo that is nearly black or white."""
 _PLAIN_BORDER = 0.5
 """Minimum fraction of the border of a photo that a plain background takes."""
+
+_MAX_LABEL = 50
+"""Largest value of a mask that stores labels in place of white."""
 
 
 @dataclass(frozen=True)
@@ -229,15 +235,20 @@ def alpha_channel(image: Image.Image) -> Image.Image | None:
     return image.getchannel("A") if "A" in image.getbands() else None
 
 
-def plain_background(rgb: ByteImage) -> BoolArray | None:
+def plain_background(rgb: ByteImage, *, without_noise: bool = False) -> BoolArray | None:
     """Return the background of a rendered photo (H, W, 3): black or white pixels that are connected to its border.
+
+    Args:
+        rgb: The photo.
+        without_noise: Accept no background with the noise of a camera, whose single pixels would be no background.
 
     Returns:
         Shape (H, W); None unless at least half of the border has one colour, black or white.
     """
     border = np.concatenate([rgb[0], rgb[-1], rgb[:, 0], rgb[:, -1]]).astype(np.int16)
     for colour in (0, 255):
-        if np.mean((np.abs(border - colour) <= _PLAIN).all(axis=1)) < _PLAIN_BORDER:
+        plain, near = (np.mean((np.abs(border - colour) <= limit).all(axis=1)) for limit in (_PLAIN, _NEARLY_PLAIN))
+        if plain < _PLAIN_BORDER or (without_noise and near - plain > _MAX_NOISE):
             continue
         alike = np.asarray((np.abs(rgb.astype(np.int16) - colour) <= _PLAIN).all(axis=2), dtype=np.uint8)
         parts = cv2.connectedComponents(alike, connectivity=4)[1]
@@ -275,6 +286,9 @@ def read_mask(files: Mapping[str, Path], photo: Prepared) -> BoolArray | None:
                 mask = turned.convert("L")
     except IMAGE_ERRORS as error:
         raise InputError(f"{path}: not a readable image ({error})") from error
+    most = mask.getextrema()[1]
+    if 0 < most <= _MAX_LABEL:
+        raise InputError(f"{path}: white, 255, must mark the object (got at most {most}): multiply labels by 255")
     size = photo.size
     if shapes_differ(mask.size, size) and not shapes_differ(mask.size[::-1], size):
         mask = ImageOps.exif_transpose(with_orientation(mask, photo.orientation))

@@ -12,11 +12,12 @@ import pytest
 from PIL import ExifTags, Image, ImageFilter
 
 from mitsplat.capture import known_poses as poses
-from mitsplat.capture.capture import Photo
-from mitsplat.capture.photo_masks import cutout_masks, given_masks
+from mitsplat.capture.capture import Capture, Photo
+from mitsplat.capture.photo_masks import add_masks, check_borders, cutout_masks, given_masks
 from mitsplat.capture.photos import Prepared, plain_background, prepare_photos
 from mitsplat.capture.pipeline.capture_pipeline import CaptureSettings, capture_photos
 from mitsplat.capture.structure_from_motion import SparseModel
+from mitsplat.errors import InputError
 from mitsplat.geometry.camera import Camera
 
 SIZE = (120, 90)
@@ -139,6 +140,8 @@ def test_a_plain_background_is_connected_to_the_border() -> None:
     background = plain_background(picture)
     assert background is not None
     assert not background[10:30, 10:30].any() and background.sum() == 40 * 50 - 400
+    noisy = np.clip(picture + np.random.default_rng(0).normal(0, 3, picture.shape), 0, 255).astype(np.uint8)
+    assert plain_background(noisy) is not None and plain_background(noisy, without_noise=True) is None
     assert plain_background(np.full((40, 50, 3), 128, np.uint8)) is None
     assert plain_background(np.random.default_rng(0).integers(0, 256, (40, 50, 3), dtype=np.uint8)) is None
 
@@ -217,3 +220,23 @@ def test_a_data_set_of_nerf_becomes_a_capture_with_masks(
         assert mask is not None
         found, wanted = mask >= 0.5, mask_of(number)
         assert (found & wanted).sum() / (found | wanted).sum() > 0.95
+
+
+def test_masks_of_labels_and_of_the_background_are_refused(tmp_path: Path) -> None:
+    folder = write_photos(tmp_path / "photos", cutout)
+    good, _ = prepare(folder)
+    masks = write_masks(tmp_path / "masks")
+    for path in masks.iterdir():
+        with Image.open(path) as image:
+            Image.fromarray(np.asarray(image.convert("L")) // 255).save(path)
+    lens = Camera(*SIZE, 100.0, 100.0, 60.0, 45.0, np.eye(4))
+    photos = tuple(Photo(name, photo.file, lens) for name, photo in good.items())
+    with pytest.raises(InputError, match=r"white, 255, must mark the object \(got at most 1\)"):
+        given_masks(masks, good, dict.fromkeys(good, lens))(photos[0])
+
+    capture = Capture(photos, np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
+    objects = {photo.name: mask_of(number) for number, photo in enumerate(photos)}
+    check_borders(add_masks(capture, lambda photo: objects[photo.name], tmp_path / "objects"), masks)
+    inverted = add_masks(capture, lambda photo: ~objects[photo.name], tmp_path / "inverted")
+    with pytest.raises(InputError, match=r"masks must be white, .* \(got 4 of 4 .*\): invert them"):
+        check_borders(inverted, masks)

@@ -22,6 +22,7 @@ from mitsplat.capture.known_poses import read_poses
 from mitsplat.capture.metric_frame import DEFAULT_BOARD, MetricFrame, find_metric_frame
 from mitsplat.capture.photo_masks import (
     add_masks,
+    check_borders,
     cutout_masks,
     given_masks,
     model_masks,
@@ -457,12 +458,15 @@ def _with_masks(
 ) -> Capture:
     mask_folder = out / "masks"
     if settings.masks is not None:
-        return add_masks(capture, given_masks(settings.masks, prepared, lenses), mask_folder, progress=progress)
+        given = given_masks(settings.masks, prepared, lenses)
+        return check_borders(add_masks(capture, given, mask_folder, progress=progress), settings.masks)
     if settings.mask_model is not None:
         return add_masks(capture, model_masks(settings.mask_model), mask_folder, progress=progress)
     if not settings.has_hints:
         cut = cutout_masks(source, prepared, lenses, list(lenses))
-        if cut is None and settings.poses is not None and frame.board is None:
+        if cut is not None:
+            return check_borders(add_masks(capture, cut, mask_folder, progress=progress), source)
+        if settings.poses is not None and frame.board is None:
             cut = plain_masks(capture.photos)
         if cut is not None:
             return add_masks(capture, cut, mask_folder, progress=progress)

@@ -286,7 +286,7 @@ def read_mask(files: Mapping[str, Path], photo: Prepared) -> BoolArray | None:
                 mask = turned.convert("L")
     except IMAGE_ERRORS as error:
         raise InputError(f"{path}: not a readable image ({error})") from error
-    most = mask.getextrema()[1]
+    most = int(np.asarray(mask).max())
     if 0 < most <= _MAX_LABEL:
         raise InputError(f"{path}: white, 255, must mark the object (got at most {most}): multiply labels by 255")
     size = photo.size

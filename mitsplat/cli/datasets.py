@@ -618,19 +618,21 @@ def check(
     from mitsplat.checks.path_checks import check_path
 
     findings = check_path(path, allow_outside=allow_outside)
-    _print_findings(findings if path.is_dir() else chain(findings, _time(path, allow_outside=allow_outside)), "look")
+    _print_findings(
+        findings if path.is_dir() else chain(findings, _trial_run(path, allow_outside=allow_outside)), "look"
+    )
 
 
-def _time(path: Path, *, allow_outside: bool) -> Iterator[Finding]:
-    """Yield the time that the dataset of a scene takes, unless the scene is refused."""
-    from mitsplat.checks.time_check import measure_time
+def _trial_run(path: Path, *, allow_outside: bool) -> Iterator[Finding]:
+    """Yield the result of a trial run of a scene, unless the scene is refused."""
+    from mitsplat.checks.time_check import measure_run
     from mitsplat.dataset.preflight import run_faults
     from mitsplat.scene.loading.scene_loading import load_scene
 
     scene = load_scene(path, allow_outside=allow_outside)
     if not any(run_faults(scene)):
         with suppress(InputError):  # reported by the checks before
-            yield measure_time(scene)
+            yield from measure_run(scene)
 
 
 def _print_findings(findings: Iterable[Finding], mark: str) -> NoReturn:

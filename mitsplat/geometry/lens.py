@@ -31,7 +31,7 @@ NEWTON_STEPS = 8
 """Number of steps of Newton's method that invert the distortion of a pixel on the device."""
 _GRID = 33
 """Number of tested points along each side of an image."""
-_LARGE, _LARGE_TANGENTIAL = 5.0, 0.05
+_LARGE, _LARGE_TANGENTIAL = 5.0, 0.015
 """Magnitudes of k1 and of p1 and p2 above which coefficients are probably wrong."""
 
 

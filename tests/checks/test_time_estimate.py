@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ import pytest
 from mitsplat.checks import time_check
 from mitsplat.dataset.write import write_dataset
 from mitsplat.frames import time_estimate
+from mitsplat.geometry.camera import Camera
 from mitsplat.scene.scene import Scene
 from tests.conftest import BOTH, small_scene
 from tests.drawn import large_boxes, render_boxes, scatter_boxes
@@ -49,10 +51,31 @@ def test_a_check_measures_one_layout_and_the_second_image(tmp_path: Path, monkey
     monkeypatch.setattr(time_check, "settle_layout", settle)
     monkeypatch.setattr(time_check, "render_frame", render)
     monkeypatch.setattr(time_check, "is_cached", lambda scene, index: index == 0)
-    found = time_check.measure_time(scene)
+    (found,) = time_check.measure_run(scene)
     assert found.ok and found.name == "time" and rendered == [3, 4]
     assert "12 images of" in found.text and "and 3 layouts that settle in 0.3" in found.text
     assert 1 < float(found.text.split()[1]) < 12
+
+
+@pytest.mark.parametrize(
+    ("height", "cause"), [(1.0, "`mitsplat preview` shows"), (-1.0, "below all objects, at z = -1")]
+)
+def test_a_check_reports_images_without_labels(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, height: float, cause: str
+) -> None:
+    """A table may hide all objects from a camera that is directed at them."""
+    scene = small_scene(tmp_path, large_boxes(), BOTH, layouts=1, views=1)
+    camera = Camera.look_at((0.1, 0, height), (0, 0, 9 * height), width=64, height=48, fov_x=40)
+
+    def render(scene: Scene, index: int, *, layout: Any) -> Any:
+        frame = render_boxes(scene, index, layout=layout)
+        labels = replace(frame.labels, instances=(), dropped={"hidden": 2, "small": 0})
+        return replace(frame, labels=labels, plan=replace(frame.plan, camera=camera))
+
+    monkeypatch.setattr(time_check, "settle_layout", partial(scatter_boxes, progress=None))
+    monkeypatch.setattr(time_check, "render_frame", render)
+    found, _ = time_check.measure_run(scene)
+    assert not found.ok and "no label (not labelled: 4 hidden)" in found.text and cause in found.remedy
 
 
 def test_a_run_states_its_time_after_the_first_image_and_corrects_it(tmp_path: Path) -> None:

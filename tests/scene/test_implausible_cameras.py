@@ -76,6 +76,8 @@ def test_focal_lengths_that_are_not_in_pixels_are_refused(
         (GOOD | {"cx": 3.2, "cy": 2.4}, "is far from the middle", "in millimetres"),
         ({"fov_x": 60, "distortion": [112, 0, 0, 0]}, "distortion moves the corners", "k1 = 112 has no unit"),
         ({"fov_x": 60, "distortion": [-0.1, 0.1, -0.12, 0, 0]}, "large tangential", "is the order k1, k2, p1, p2, k3?"),
+        (GOOD | {"distortion": [-0.2, 0.05, -0.02, 0, 0]}, "large tangential", "is the order k1, k2, p1, p2, k3?"),
+        (GOOD | {"lens": "fisheye", "distortion": [-0.3, 0.1, 0, 0]}, "than an orthographic fisheye", "lens: opencv?"),
         ({"fx": 500, "size": [480, 640]}, "size: 480x640 px has another aspect", "are width and height exchanged?"),
         (
             {"fx": 900, "cx": 640, "cy": 360, "size": [1280, 720]},

@@ -21,7 +21,9 @@ FOV = (3.2, 150.0)
 """Range of horizontal fields of view of rectilinear lenses [degrees]. The lower end is more than pi."""
 MAX_STRETCH = 2.0
 """Maximum ratio of the distances of a corner from the principal point with and without distortion."""
-MAX_TANGENTIAL = 0.05
+MIN_SINE = 0.97
+"""Minimum ratio of the distance of a ray from the principal point and that of an orthographic fisheye lens."""
+MAX_TANGENTIAL = 0.015
 """Maximum magnitude of p1 and p2."""
 MAX_APERTURE, MAX_FOCUS = 0.05, 100.0
 """Maximum aperture radius and focus depth [m]."""
@@ -122,6 +124,17 @@ def _distortion_warnings(lens: Intrinsics, full: tuple[int, int]) -> Iterator[tu
     plain = np.maximum(plain, 1e-9)
     stretch = float(np.max(np.maximum(plain / shown, shown / plain)))
     cause = likely_cause(lens.distortion, lens.lens)
+    if lens.lens == "fisheye":
+        # Real lenses lie between the orthographic (sin) and the rectilinear projection (tan).
+        angle = float(np.arctan(slopes.max()))
+        ratio = float(shown[int(np.argmax(slopes))]) / np.sin(angle)
+        if ratio < MIN_SINE:
+            yield (
+                f"distortion places rays at {np.degrees(angle):.3g} degrees nearer to the middle, by {1 - ratio:.0%}, "
+                "than an orthographic fisheye lens does",
+                "are they coefficients of lens: opencv?",
+            )
+            return
     if stretch > MAX_STRETCH:
         yield f"distortion moves the corners of the image by a factor of {stretch:.3g}", cause
     elif lens.lens == "opencv" and max(map(abs, lens.distortion[2:4])) > MAX_TANGENTIAL:

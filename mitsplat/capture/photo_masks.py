@@ -131,22 +131,14 @@ def add_masks(
 
 
 def check_borders(capture: Capture, source: Path) -> Capture:
-    """Return a capture, unless its masks mark the background in place of the object.
-
-    Args:
-        capture: Capture with masks.
-        source: Folder of the masks or of the transparent photos, for the message.
+    """Return a capture with masks from the folder ``source``.
 
     Raises:
-        InputError: If most masks are white along the border of the photo.
+        InputError: If most masks are white along the border of the photo, as inverted masks are.
     """
-    around = 0
-    for photo in capture.photos:
-        if photo.mask is not None:
-            with Image.open(photo.mask) as image:
-                mask = np.asarray(image.convert("L")) >= 128
-            border = np.concatenate([mask[0], mask[-1], mask[:, 0], mask[:, -1]])
-            around += bool(border.mean() > _MAX_BORDER)
+    masks = [photo.read().mask for photo in capture.photos]
+    borders = [np.concatenate([m[0], m[-1], m[:, 0], m[:, -1]]) for m in masks if m is not None]
+    around = sum(bool(border.mean() > _MAX_BORDER) for border in borders)
     if around > len(capture.photos) / 2:
         raise InputError(
             f"{source}: masks must be white, or photos opaque, on the object (got {around} of {len(capture.photos)} "

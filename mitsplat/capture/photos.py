@@ -238,9 +238,7 @@ def alpha_channel(image: Image.Image) -> Image.Image | None:
 def plain_background(rgb: ByteImage, *, without_noise: bool = False) -> BoolArray | None:
     """Return the background of a rendered photo (H, W, 3): black or white pixels that are connected to its border.
 
-    Args:
-        rgb: The photo.
-        without_noise: Accept no background with the noise of a camera, whose single pixels would be no background.
+    With ``without_noise``, there is no background that has the noise of a camera.
 
     Returns:
         Shape (H, W); None unless at least half of the border has one colour, black or white.

@@ -21,7 +21,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from mitsplat.cli import assets, datasets, detectors, fault, lights, photographs
+from mitsplat.cli import assets, datasets, detectors, fault, inspection, lights, machine, photographs
 from mitsplat.errors import LateDeviceError, exit_status, sentence_of
 from mitsplat.runtime.child_process import leave_current_folder, python_command, python_environment
 from mitsplat.storage.file_kinds import check_name
@@ -46,12 +46,12 @@ COMMAND_GROUPS: Mapping[str, Sequence[Callable[..., None]]] = {
         datasets.export,
     ),
     "Inspect": (
-        datasets.view,
-        datasets.preview,
-        datasets.check,
-        datasets.audit,
-        datasets.report,
-        datasets.chart,
+        inspection.view,
+        inspection.preview,
+        inspection.check,
+        inspection.audit,
+        inspection.report,
+        inspection.chart,
     ),
     "Train detectors": (
         detectors.train,
@@ -59,8 +59,8 @@ COMMAND_GROUPS: Mapping[str, Sequence[Callable[..., None]]] = {
         detectors.compare,
     ),
     "Machine": (
-        datasets.doctor,
-        datasets.schema,
+        machine.doctor,
+        machine.schema,
     ),
 }
 """Commands by heading of the help page, in the order of a typical workflow."""

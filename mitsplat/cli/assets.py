@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
+from mitsplat.cli.console import select_device, stage_bar
 from mitsplat.cli.options import (
     AssetFolder,
     ClassName,
@@ -21,8 +22,6 @@ from mitsplat.cli.options import (
     Name,
     Roughness,
     Seed,
-    select_device,
-    stage_bar,
     uniform_material,
 )
 from mitsplat.errors import InputError

@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from mitsplat.cli.options import JsonLog, Seed, check_ending, command_log
+from mitsplat.cli.console import command_log
+from mitsplat.cli.options import JsonLog, Seed, check_ending
 
 if TYPE_CHECKING:
     from mitsplat.detector.likeness import Trait

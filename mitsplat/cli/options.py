@@ -1,24 +1,31 @@
-"""Shared options of commands, checks of output paths, progress bars and machine-readable logs."""
+"""Options that several commands share, and their checks."""
 
 from __future__ import annotations
 
-import json
-import sys
-import time
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+import difflib
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import typer
 
-from mitsplat.cli import fault
-from mitsplat.errors import InputError, exit_status, sentence_of
-from mitsplat.progress import TIME_NOTE, Progress
+from mitsplat.errors import InputError
+from mitsplat.quality import PresetName
 
-if TYPE_CHECKING:
-    from mitsplat.runtime.device import Device
-
+SceneFile = Annotated[Path, typer.Argument(metavar="SCENE", help="Scene file (.yaml).")]
+DatasetFolder = Annotated[Path, typer.Argument(metavar="DATASET", help="Dataset folder.")]
+FrameIndex = Annotated[int, typer.Option("--frame", help="Frame index, from 0.")]
+FrameSize = Annotated[str | None, typer.Option(metavar="WxH", help="Image size [px], such as 1280x720.")]
+SceneSeed = Annotated[int | None, typer.Option(help="Seed of all random numbers; replaces the seed of the scene.")]
+AllowOutside = Annotated[
+    bool, typer.Option("--allow-outside", help="Allow SCENE to reference files outside its folder.")
+]
+OverwriteDataset = Annotated[
+    bool,
+    typer.Option(
+        "--overwrite/--resume", help="Replace the dataset in the folder, or continue it and keep its finished images."
+    ),
+]
+Preset = Annotated[PresetName | None, typer.Option(help="Rendering preset; replaces the preset of the scene.")]
 DeviceName = Annotated[
     str,
     typer.Option(
@@ -43,9 +50,7 @@ Roughness = Annotated[
     typer.Option(help="Roughness, 0 (mirror) to 1: the object gets one material, and its colours become base colours."),
 ]
 Faces = Annotated[int, typer.Option(help="Maximum number of mesh faces.")]
-
 Seed = Annotated[int, typer.Option(help="Seed of all random numbers.")]
-
 JsonLog = Annotated[
     bool,
     typer.Option(
@@ -74,134 +79,6 @@ def check_new(out: Path, *endings: str, overwrite: bool) -> None:
         raise InputError(f"--out must be a new file (got {out}); --overwrite replaces an existing one")
 
 
-def select_device(name: str) -> None:
-    """Select the device for all later computation and print the reason for the choice of ``auto``."""
-    from mitsplat.runtime.device import use_device  # most commands do not need it
-
-    print_device(use_device(name))
-
-
-def print_device(device: Device) -> None:
-    """Print in one line the device that ``auto`` selected, and the reason."""
-    if device.reason:
-        typer.echo(f"device: {device}, because {device.reason}", err=True)
-
-
-@contextmanager
-def command_log(
-    json_log: bool, command: str, unit: str = "images/s"
-) -> Iterator[Callable[[], AbstractContextManager[Progress]]]:
-    """Report the progress of a command, by bars or as a JSON log that also contains its errors.
-
-    The log has the event started, any number of progress events, and then finished or failed. A failed event has the
-    exit status and a sentence.
-
-    Args:
-        json_log: Write the log to stderr instead of bars.
-        command: Name of the command in the log.
-        unit: Unit of the speed that bars show.
-
-    Yields:
-        Function that returns a context manager for one progress callback.
-    """
-    if not json_log:
-        yield lambda: progress_bar(unit)
-        return
-
-    def emit(event: str, **details: Any) -> None:
-        line = json.dumps({"time": round(time.time(), 3), "command": command, "event": event, **details})
-        typer.echo(line, err=True)
-
-    def progress(done: int, total: int, doing: str) -> None:
-        emit("progress", done=done, total=total, doing=doing)
-
-    emit("started")
-    try:
-        yield lambda: nullcontext(progress)
-    except BaseException as error:
-        status = exit_status(error)
-        if isinstance(error, typer.Exit) or (status is None and not isinstance(error, Exception)):
-            raise
-        if status == 130:
-            emit(
-                "failed",
-                status=130,
-                error=type(error).__name__,
-                message="interrupted: run the command again to continue",
-            )
-            raise
-        sentence = fault.report_fault(error) if status is None else sentence_of(error)
-        status = fault.STATUS if status is None else status
-        emit("failed", status=status, error=type(error).__name__, message=sentence)
-        raise typer.Exit(status) from error
-    emit("finished", status=0)
-
-
-@contextmanager
-def progress_bar(unit: str = "images/s") -> Iterator[Progress]:
-    """Show a bar on stderr with the speed and the remaining time."""
-    # Imported here because half of the commands and `--help` show no bar.
-    from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        ProgressColumn,
-        Task,
-        TextColumn,
-        TimeRemainingColumn,
-    )
-    from rich.text import Text
-
-    class RateColumn(ProgressColumn):
-        def render(self, task: Task) -> Text:
-            speed = task.finished_speed or task.speed
-            return Text("" if speed is None else f"{speed:.2f} {unit}")
-
-    columns = (BarColumn(), MofNCompleteColumn(), RateColumn(), TimeRemainingColumn(), TextColumn("{task.description}"))
-    with Progress(*columns, console=Console(stderr=True), speed_estimate_period=300) as bar:
-        task = bar.add_task("", total=None)
-
-        def update(done: int, total: int, doing: str) -> None:
-            # Frames of an earlier run and steps of an earlier stage must not count for the present speed.
-            if bar.tasks[0].total != total or done < bar.tasks[0].completed:
-                bar.reset(task, total=total, completed=done)
-            if doing.startswith(TIME_NOTE):
-                bar.console.print(doing, highlight=False, soft_wrap=True)
-            else:
-                bar.update(task, completed=done, description=doing)
-
-        yield update
-
-
-@contextmanager
-def stage_bar(unit: str = "%/s") -> Iterator[Progress]:
-    """Show progress in stages on stderr: a bar on a terminal, otherwise one line per stage.
-
-    Without a terminal, a stage that takes longer prints one more line per minute, with the remaining time. The text
-    after a colon in the progress message is a detail and does not start a new stage.
-    """
-    if sys.stderr.isatty():
-        with progress_bar(unit) as bar:
-            yield bar
-        return
-    stage, stage_start, last_report, first = "", 0.0, 0.0, 0
-
-    def emit(done: int, total: int, doing: str) -> None:
-        nonlocal stage, stage_start, last_report, first
-        now, left = time.monotonic(), ""
-        if doing.partition(":")[0] != stage:
-            stage, stage_start, first = doing.partition(":")[0], now, done
-        elif now - last_report >= 60 and done > first:
-            left = f", {(now - stage_start) * (total - done) / (done - first):.0f} s left"
-        else:
-            return
-        last_report = now
-        typer.echo(f"{100 * done // total:3d} %: {doing}{left}", err=True)
-
-    yield emit
-
-
 def uniform_material(metallic: float | None, roughness: float | None) -> dict[str, float] | None:
     """Return the given parameters of a material, or None if there are none.
 
@@ -213,3 +90,27 @@ def uniform_material(metallic: float | None, roughness: float | None) -> dict[st
         if not 0 <= value <= 1:
             raise InputError(f"--{name} must be from 0 to 1 (got {value:g})")
     return given or None
+
+
+def scene_overrides(
+    *, size: str | None = None, seed: int | None = None, quality: str | None = None, formats: str | None = None
+) -> dict[str, Any]:
+    """Return the given options as a mapping from scene file keys to values."""
+    from mitsplat.scene.spec.scene_spec import FORMATS  # most commands do not need it
+
+    if seed is not None and seed < 0:
+        raise InputError(f"--seed must be >= 0 (got {seed})")
+    overrides: dict[str, Any] = {"seed": seed, "quality": quality}
+    if size is not None:
+        width, _, height = size.lower().partition("x")
+        if not (width.isdecimal() and height.isdecimal() and int(width) > 0 and int(height) > 0):
+            raise InputError(f"--size must be WIDTHxHEIGHT in pixels, such as 1280x720 (got {size})")
+        overrides |= {"output.width": int(width), "output.height": int(height)}
+    if formats is not None:
+        names = [name.strip() for name in formats.split(",")]
+        if unknown := [name for name in names if name not in FORMATS]:
+            close = difflib.get_close_matches(unknown[0].lower(), FORMATS, n=1)
+            hint = f"; did you mean {close[0]}?" if close else ""
+            raise InputError(f"--format must be one or more of {', '.join(FORMATS)} (got {unknown[0]}{hint})")
+        overrides["output.formats"] = names
+    return {key: value for key, value in overrides.items() if value is not None}

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
+from mitsplat.cli.console import progress_bar, select_device, stage_bar
 from mitsplat.cli.options import (
     AssetFolder,
     ClassName,
@@ -24,9 +25,6 @@ from mitsplat.cli.options import (
     Seed,
     ShDegree,
     check_new,
-    progress_bar,
-    select_device,
-    stage_bar,
     uniform_material,
 )
 from mitsplat.errors import InputError, PartialResultError

@@ -41,7 +41,7 @@ from tests.conftest import box_asset
         ("preview scene.xml", "scene.xml: must be a scene file (.yaml) (got a Mitsuba scene: `mitsplat render`"),
         ("audit folder", "folder must be a dataset of mitsplat (dataset.json: No such file or directory)"),
         ("audit gone", "gone must be a dataset of mitsplat (no such folder)"),
-        ("render gone.yaml --address auto", "--address and --resources apply to a Ray cluster: add --engine ray"),
+        ("render gone.yaml --address auto", "--address does not apply to this machine: add --engine ray"),
     ],
 )
 def test_a_file_of_the_wrong_kind_is_refused_with_its_kind(

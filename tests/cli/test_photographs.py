@@ -14,7 +14,7 @@ import pytest
 from mitsplat.capture.boards.targets import Board
 from mitsplat.capture.capture import Capture
 from mitsplat.capture.pipeline.capture_pipeline import CaptureSettings
-from mitsplat.cli.options import stage_bar
+from mitsplat.cli.console import stage_bar
 from mitsplat.errors import InputError
 from mitsplat.fit import depth_network as depth_model
 from mitsplat.fit import depth_priors as depth_maps
@@ -202,7 +202,7 @@ def test_a_log_has_stages_and_the_remaining_time(
 ) -> None:
     """The log replaces the progress bar if standard error is no terminal."""
     clock = iter([0.0, 5.0, 70.0, 80.0, 90.0])
-    monkeypatch.setattr("mitsplat.cli.options.time.monotonic", lambda: next(clock))
+    monkeypatch.setattr("mitsplat.cli.console.time.monotonic", lambda: next(clock))
     with stage_bar() as progress:
         progress(0, 10, "matching")
         progress(1, 10, "matching")

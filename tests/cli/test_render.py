@@ -149,9 +149,15 @@ def test_render_writes_the_image_of_a_mitsuba_scene(
     assert run("render", "one.xml", "-o", tmp_path) == 0
     assert calls.args == (Path("one.xml"), tmp_path)
     assert str(picture) in capsys.readouterr().out
-    for ignored in (["--seed", 3], ["--workers", 2], ["--overwrite"], ["--any-device"], ["--engine", "ray"]):
-        assert run("render", "one.xml", *ignored) == 2
-        assert "a Mitsuba scene has its own size, seed and quality: only" in capsys.readouterr().err
+    for option, *value in (["--seed", 3], ["--workers", 2], ["--overwrite"], ["--any-device"], ["--engine", "ray"]):
+        assert run("render", "one.xml", option, *value) == 2
+        assert f"{option} does not apply to the Mitsuba scene one.xml" in capsys.readouterr().err
+
+
+def test_options_that_do_not_apply_to_a_usd_stage_are_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    for option, *value in (["--seed", 3], ["--workers", 2], ["--only", 2], ["--tolerance", 0.1], ["--shard", "1/2"]):
+        assert run("render", "one.usda", option, *value) == 2
+        assert f"{option} does not apply to the USD stage one.usda" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -292,9 +292,10 @@ def test_every_benchmark_records_its_figures() -> None:
 def test_every_benchmark_can_be_imported() -> None:
     """Every imported name exists in the package. The imports run in a new process, as some change the environment.
 
-    ``blender_scene.py`` runs in the environment of Blender, ``live_gausscam.py`` in that of gausscam.
+    ``blender_scene.py`` and ``blender_photos.py`` run in the environment of Blender, ``live_gausscam.py`` in that of
+    gausscam.
     """
-    excluded = ("__main__.py", "blender_scene.py", "live_gausscam.py")
+    excluded = ("__main__.py", "blender_scene.py", "blender_photos.py", "live_gausscam.py")
     modules = [path for path in record.ROOT.glob("benchmarks/*/*.py") if path.name not in excluded]
     names = sorted(".".join(path.relative_to(record.ROOT).with_suffix("").parts) for path in modules)
     script = "import importlib, sys\nfor name in sys.argv[1:]:\n    importlib.import_module(name)"

@@ -259,11 +259,8 @@ def _mean_speeds(
 
 def _surface_motion(bodies: Sequence[Body], before: Float64Array, after: Float64Array) -> Float64Array:
     """Compute the largest displacement of a point of each body between two sets of poses [m], shape (N,)."""
-    moved = after - before
-    return np.array(
-        [
-            np.linalg.norm(body.outline @ change[:3, :3].T + change[:3, 3], axis=1).max()
-            for body, change in zip(bodies, moved, strict=True)
-        ],
-        dtype=np.float64,
-    )
+    largest = np.zeros(len(bodies))
+    for i, (body, change) in enumerate(zip(bodies, after - before, strict=True)):
+        moved = body.outline @ change[:3, :3].T + change[:3, 3]
+        largest[i] = np.sqrt(np.einsum("ni,ni->n", moved, moved).max())
+    return largest

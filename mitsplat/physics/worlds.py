@@ -43,8 +43,8 @@ WITH_ROLL, _WITHOUT_ROLL = 6, 4
 # its mass sinks by 1 mm. MuJoCo's own contacts flicker when stiffer: from 0.98 on, piled packages creep at 1 to 10 mm/s
 # and do not come to rest; at 0.97 they rest within 0.1 mm/s.
 _IMPEDANCE_WARP, IMPEDANCE_MUJOCO = (0.996, 0.9999), (0.97, 0.999)
-# Solver tolerance of MuJoCo in double precision. At its default of 1e-8, errors of one step cost iterations in the next:
-# 18 instead of 9 per step in a pile of 29 packages.
+# Solver tolerance of MuJoCo in double precision. At its default of 1e-8, errors of one step cost iterations in the next
+# step: 18 instead of 9 per step in a pile of 29 packages.
 _TOLERANCE = 1e-12
 _STEPS = 4  # per captured graph; even, so that the two states return to their roles
 _SOLVER_OPTIONS: dict[str, Any] = {

@@ -29,7 +29,7 @@ from ruamel.yaml import YAML
 from scipy.spatial import QhullError
 
 from mitsplat.arrays import Float32Array, Float64Array
-from mitsplat.errors import InputError
+from mitsplat.errors import InputError, path_of
 from mitsplat.gaussians.material_files import write_materials
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.mesh import check_faces
@@ -181,7 +181,7 @@ class Asset:
         Raises:
             InputError: If ``asset.yaml`` or a file that it names is missing or breaks a rule.
         """
-        folder = Path(folder)
+        folder = path_of(folder, "folder")
         spec = read_spec(folder)
         materials = None if spec.materials is None else _named_file(folder, "materials", spec.materials)
         splats = Splats.load(_named_file(folder, "splats", spec.splats), materials=materials)
@@ -229,7 +229,7 @@ class Asset:
             InputError: If a value breaks a rule of :class:`AssetSpec` or the folder cannot be written.
             MissingResourceError: If the disk is full.
         """
-        folder = Path(folder)
+        folder = path_of(folder, "folder")
         units = _SPZ_UNITS if splats.lower().endswith(".spz") and self.units == "metre" else 1.0
         stored = self if units == 1.0 else self.transformed(np.diag([1 / units, 1 / units, 1 / units, 1.0]))
         try:

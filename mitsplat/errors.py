@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import errno
+import os
 import re
+from pathlib import Path
 
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 """Error numbers of the operating system that mean that there is no space for a file."""
@@ -42,9 +44,24 @@ def check_type(value: object, kind: type, place: str, remedy: str) -> None:
         InputError: If it has another type.
     """
     if not isinstance(value, kind):
-        text = repr(value)
-        shown = type(value).__name__ if len(text) > 60 or "\n" in text else f"{type(value).__name__} {text}"
-        raise InputError(f"{place} must be a {kind.__name__} (got {shown}): {remedy}")
+        raise InputError(f"{place} must be a {kind.__name__} (got {describe(value)}): {remedy}")
+
+
+def describe(value: object) -> str:
+    """Return the type of a value and the value, if it is short."""
+    text = repr(value)
+    return type(value).__name__ if len(text) > 60 or "\n" in text else f"{type(value).__name__} {text}"
+
+
+def path_of(value: object, place: str) -> Path:
+    """Return an argument of the Python API as a path.
+
+    Raises:
+        InputError: If it is no path.
+    """
+    if not isinstance(value, str | os.PathLike):
+        raise InputError(f"{place} must be a path (got {describe(value)})")
+    return Path(value)
 
 
 def is_out_of_memory(error: BaseException) -> bool:

@@ -11,7 +11,7 @@ from mitsplat.dataset.dataset_files import TIMINGS
 from mitsplat.dataset.dataset_folder import append_run, content_of, finish_folder, open_folder
 from mitsplat.dataset.manifest import append_line
 from mitsplat.dataset.write import DatasetSummary, FrameCounts
-from mitsplat.errors import InputError, check_type
+from mitsplat.errors import InputError, check_type, path_of
 from mitsplat.formats.registry import Catalogue, write_frame
 from mitsplat.frames.frame import Frame
 from mitsplat.frames.sequence import with_successor
@@ -46,7 +46,7 @@ def write_frames(scene: Scene, out: str | Path, frames: Iterable[Frame], *, over
     Scene.check(scene)
     if not isinstance(frames, Iterable):
         raise InputError(f"frames must be a list or an iterator of frames (got {type(frames).__name__})")
-    out, output = Path(out), scene.spec.output
+    out, output = path_of(out, "out"), scene.spec.output
     if "flow" in output.formats and scene.spec.conveyor is not None:
         raise InputError(
             "output.formats: flow is not available for frames made in Python of a scene with a conveyor, because it "

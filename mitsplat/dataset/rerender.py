@@ -21,7 +21,7 @@ from mitsplat.dataset.frame_job import FrameJob, Render, Settle
 from mitsplat.dataset.manifest import parse_line, read_lines
 from mitsplat.dataset.preflight import count_faults, image_faults, layout_faults, refuse
 from mitsplat.dataset.schema import check_record, read_content
-from mitsplat.errors import InputError
+from mitsplat.errors import InputError, path_of
 from mitsplat.formats.registry import Catalogue
 from mitsplat.frames.frame import render_frame
 from mitsplat.physics.settle import settle_layout
@@ -79,7 +79,7 @@ def rerender_frame(
         MissingResourceError: If the device is not available, or memory does not suffice for one frame.
     """
     Scene.check(scene)
-    out, index = Path(out), to_index(index, "frame")
+    out, index = path_of(out, "out"), to_index(index, "frame")
     layout = layout_of(scene, index)
     catalogue = Catalogue.of(scene)
     refuse(scene, chain(count_faults(scene), layout_faults(scene), image_faults(scene, 1)))

@@ -24,7 +24,7 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from mitsplat.arrays import BoolArray, Float32Array, Float64Array
-from mitsplat.errors import InputError
+from mitsplat.errors import InputError, path_of
 from mitsplat.gaussians.material_files import read_materials
 from mitsplat.gaussians.spherical_harmonics import sh_rotation
 from mitsplat.gaussians.splat_files import SplatArrays, read_splats, write_splats
@@ -119,7 +119,7 @@ class Splats:
             InputError: If a file is missing, of another kind, or damaged, or if it holds an invalid value; or if splats
                 with materials have view-dependent colours.
         """
-        arrays, kernel = read_splats(Path(path))
+        arrays, kernel = read_splats(path_of(path, "path"))
         try:
             splats = cls(**arrays._asdict(), kernel=kernel)
         except ValueError as error:
@@ -138,7 +138,7 @@ class Splats:
                 partial file remains.
         """
         arrays = SplatArrays(self.means, self.quats, self.scales, self.opacities, self.sh)
-        write_splats(arrays, Path(path), self.kernel)
+        write_splats(arrays, path_of(path, "path"), self.kernel)
 
     def select(self, index: slice | npt.ArrayLike) -> Splats:
         """Return the Gaussians selected by a Boolean mask (N,), an integer array or a slice, in its order."""

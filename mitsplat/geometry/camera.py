@@ -6,6 +6,7 @@ For conventions see :mod:`mitsplat.gaussians.splat_cloud`: x right, y down, z fo
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -17,6 +18,7 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
 from mitsplat.arrays import Float64Array, Int64Array
+from mitsplat.errors import describe
 from mitsplat.geometry.lens import (
     Lens,
     distortion_coefficients,
@@ -26,7 +28,7 @@ from mitsplat.geometry.lens import (
     lens_fault,
     undistort,
 )
-from mitsplat.geometry.rigid import OPENCV_FROM_OPENGL, rigid_matrix
+from mitsplat.geometry.rigid import OPENCV_FROM_OPENGL, points_of, rigid_matrix
 
 MAX_IMAGE_SIDE = 16384
 """Maximum side length of an image [px]."""
@@ -75,8 +77,8 @@ class Camera:
 
     def __post_init__(self) -> None:
         for name in ("fx", "fy", "cx", "cy", "near", "aperture_radius", "focus_distance"):
-            if np.ndim(getattr(self, name)) or isinstance(getattr(self, name), str):
-                raise ValueError(f"{name} must be a number (got {getattr(self, name)!r})")
+            if not isinstance(getattr(self, name), int | float | np.integer | np.floating):
+                raise ValueError(f"{name} must be a number (got {describe(getattr(self, name))})")
         sides = self.width, self.height
         if not all(isinstance(side, int | np.integer) and 1 <= side <= MAX_IMAGE_SIDE for side in sides):
             raise ValueError(
@@ -136,6 +138,9 @@ class Camera:
         """
         if not 0.0 < fov_x < 180.0:
             raise ValueError(f"fov_x must be between 0 and 180 degrees (got {fov_x})")
+        if fov_x < np.pi:
+            text = f"fov_x is {fov_x:g} degrees: is it in radians? Then it is {np.degrees(fov_x):.3g} degrees"
+            warnings.warn(text, stacklevel=2)
         focal = 0.5 * width / np.tan(0.5 * np.radians(fov_x))
         return cls(
             width=width,
@@ -264,7 +269,7 @@ class Camera:
         inside the image, where no ray shows it.
         """
         pose = self.camera_from_world
-        local = np.atleast_2d(np.asarray(points, dtype=np.float64)) @ pose[:3, :3].T + pose[:3, 3]
+        local = points_of(points, "points") @ pose[:3, :3].T + pose[:3, 3]
         depth = local[:, 2]
         front = depth > 0
         if not self.distortion:
@@ -365,23 +370,23 @@ def look_at_pose(eye: npt.ArrayLike, target: npt.ArrayLike, up: npt.ArrayLike = 
     Raises:
         ValueError: If a point is not finite, or if both points are equal.
     """
-    eye, target, up = (np.asarray(v, dtype=np.float64) for v in (eye, target, up))
-    forward = target - eye
+    start, end, upper = points_of(eye, "eye")[0], points_of(target, "target")[0], points_of(up, "up")[0]
+    forward = end - start
     distance = np.linalg.norm(forward)
     if not np.isfinite(distance):
         raise ValueError(
-            f"the position and target of a camera must be finite (got {eye.tolist()} and {target.tolist()})"
+            f"the position and target of a camera must be finite (got {start.tolist()} and {end.tolist()})"
         )
     if not distance > 0:
-        raise ValueError(f"a camera must look at a point other than its own position (got {eye.tolist()} twice)")
+        raise ValueError(f"a camera must look at a point other than its own position (got {start.tolist()} twice)")
     forward = forward / distance
-    right = _cross(forward, up)
-    if np.linalg.norm(right) < 1e-6 * max(1.0, float(np.linalg.norm(up))):
+    right = _cross(forward, upper)
+    if np.linalg.norm(right) < 1e-6 * max(1.0, float(np.linalg.norm(upper))):
         right = _cross(forward, np.eye(3)[1 if abs(forward[1]) < 0.9 else 2])
     right /= np.linalg.norm(right)
     pose = np.eye(4)
     pose[:3, :3] = np.stack([right, _cross(forward, right), forward], axis=1)
-    pose[:3, 3] = eye
+    pose[:3, 3] = start
     return pose
 
 

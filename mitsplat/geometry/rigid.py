@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import numpy.typing as npt
 
 from mitsplat.arrays import Float64Array
+from mitsplat.errors import InputError, describe
 
 RIGID = 1e-5
 """Maximum absolute entry of R R^T - 1. Rotations in single precision pass; scales do not."""
@@ -64,9 +67,24 @@ def nearest_rigid(matrix: Float64Array) -> Float64Array:
     return nearest
 
 
+def points_of(value: Any, place: str) -> Float64Array:
+    """Return an argument of the Python API as points (N, 3); one point may be (3,).
+
+    Raises:
+        InputError: If it is no array of points.
+    """
+    try:
+        points = np.atleast_2d(np.asarray(value, dtype=np.float64))
+    except (TypeError, ValueError):
+        raise InputError(f"{place} must be numbers of shape (N, 3) (got {describe(value)})") from None
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise InputError(f"{place} must have shape (N, 3) (got {np.shape(value)})")
+    return points
+
+
 def _describe(pose: npt.ArrayLike) -> str:
     """Describe a value that is not a valid matrix, for an error message."""
     if isinstance(pose, np.ndarray) and pose.shape != (4, 4):
         return f"an array of shape {pose.shape}"
-    text = repr(pose)
+    text = " ".join(repr(pose).split())
     return text if len(text) <= 60 else f"{text[:57]}..."

@@ -18,7 +18,7 @@ import trimesh
 
 from mitsplat.arrays import BoolArray, Float64Array
 from mitsplat.asset import Asset
-from mitsplat.errors import InputError
+from mitsplat.errors import InputError, path_of
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.gaussians.splat_files import Axis, default_up_axis
 from mitsplat.geometry.camera import Camera, spiral
@@ -226,7 +226,7 @@ def import_splats(
     Raises:
         InputError: If the file cannot be read, no Gaussian remains, or a value breaks a rule.
     """
-    path = Path(path)
+    path = path_of(path, "path")
     if density is not None and mass is not None:
         raise InputError("density and mass must not both be given")
     for key, value in (("density", density), ("mass", mass)):

@@ -15,6 +15,7 @@ import numpy.typing as npt
 import trimesh
 
 from mitsplat.arrays import BoolArray, Float32Array, Float64Array
+from mitsplat.errors import check_type
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.gaussians.splat_training import trained_kernel
 from mitsplat.geometry.camera import Camera
@@ -173,6 +174,8 @@ def render_splats(splats: Splats, camera: Camera, *, quality: str | Quality = "b
     Raises:
         InputError: If there is no such preset.
     """
+    check_type(splats, Splats, "splats", "read a file with mitsplat.Splats.load(path)")
+    check_type(camera, Camera, "camera", "create it by mitsplat.Camera or mitsplat.Camera.look_at")
     if not isinstance(quality, Quality):
         quality = replace(resolve_quality(quality), kernel=trained_kernel([splats.kernel]))
     ensure_variant()

@@ -172,7 +172,7 @@ def check_name(device: str) -> str:
     Raises:
         InputError: If the name is invalid.
     """
-    if not _DEVICE.fullmatch(device):
+    if not isinstance(device, str) or not _DEVICE.fullmatch(device):
         raise InputError(f"device must be cpu, cuda, cuda:N, cuda:all or auto (got {device})")
     return device
 

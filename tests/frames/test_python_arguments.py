@@ -52,6 +52,8 @@ def test_an_invalid_part_of_a_specification_with_a_path_is_named(scene_data: dic
 
 
 POSE = np.eye(4)
+CAMERA = ms.Camera(64, 48, 60.0, 60.0, 32.0, 24.0, POSE)
+SPLATS = ms.Splats(np.zeros((1, 3)), np.ones((1, 4)), np.ones((1, 3)), np.ones(1), np.zeros((1, 1, 3)))
 CALLS: list[tuple[Callable[[ms.Scene, Path], object], str]] = [
     (lambda scene, out: ms.render_frame(scene, 0, layout={"nut": [POSE]}), "layout must be a Layout (got dict"),
     (lambda scene, out: film(scene, layouts={"nut": [POSE]}), "layout must be a Layout (got str 'nut')"),
@@ -79,6 +81,18 @@ CALLS: list[tuple[Callable[[ms.Scene, Path], object], str]] = [
         "layouts must have one item for each of the 3 frames (got 2)",
     ),
     (lambda scene, out: film(scene, frames=[0, 1], cameras=[]), "cameras must have one item for each of the 2 frames"),
+    (lambda scene, out: film(scene, frames=CAMERA), "frames must be a whole number (got Camera)"),
+    (lambda scene, out: ms.load_scene({"name": "x"}), "path must be a path (got dict {'name': 'x'})"),
+    (lambda scene, out: ms.Asset.load(None), "folder must be a path (got NoneType None)"),
+    (lambda scene, out: ms.Splats.load(5), "path must be a path (got int 5)"),
+    (lambda scene, out: ms.write_frames(scene, [], "out"), "out must be a path (got list [])"),
+    (lambda scene, out: ms.write_dataset(scene, 3), "out must be a path (got int 3)"),
+    (lambda scene, out: ms.capture_photos(5, str(out)), "photos must be a path (got int 5)"),
+    (lambda scene, out: ms.render_splats("a.ply", CAMERA), "splats must be a Splats (got str 'a.ply')"),
+    (lambda scene, out: ms.render_splats(SPLATS, POSE), "camera must be a Camera (got ndarray)"),
+    (lambda scene, out: ms.use_device(None), "device must be cpu, cuda, cuda:N, cuda:all or auto (got None)"),
+    (lambda scene, out: CAMERA.project([[0, 0]]), "points must have shape (N, 3) (got (1, 2))"),
+    (lambda scene, out: CAMERA.project("nut"), "points must be numbers of shape (N, 3) (got str 'nut')"),
 ]
 
 

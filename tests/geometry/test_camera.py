@@ -63,10 +63,15 @@ def test_an_invalid_image_size_is_refused(width: float) -> None:
         Camera(width, 480, 100.0, 100.0, 5.0, 240.0, np.eye(4))  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("changes", [{"fx": np.eye(3)}, {"cy": "240"}])
+@pytest.mark.parametrize("changes", [{"fx": np.eye(3)}, {"cy": "240"}, {"cy": None}])
 def test_intrinsics_that_are_no_numbers_are_refused(changes: dict[str, object]) -> None:
     with pytest.raises(ValueError, match=r"(fx|cy) must be a number"):
         replace(PINHOLE, **changes)  # type: ignore[arg-type]
+
+
+def test_a_field_of_view_in_radians_is_reported() -> None:
+    with pytest.warns(UserWarning, match=r"fov_x is 0\.86 degrees: is it in radians\? Then it is 49\.3 degrees"):
+        Camera.look_at((0, 0, 1), (0, 0, 0), width=64, height=48, fov_x=0.86)
 
 
 def test_positions_that_are_not_finite_are_refused() -> None:

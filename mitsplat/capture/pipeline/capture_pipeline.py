@@ -35,7 +35,7 @@ from mitsplat.capture.pipeline.overview import capture_sheet
 from mitsplat.capture.pipeline.picking import chosen_object
 from mitsplat.capture.structure_from_motion import MIN_AGREEMENT, MIN_POINTS, SURE_AGREEMENT, SparseModel, find_cameras
 from mitsplat.capture.video import ChosenFrames, choose_frames
-from mitsplat.errors import InputError
+from mitsplat.errors import InputError, path_of
 from mitsplat.geometry.camera import Camera
 from mitsplat.progress import Progress
 from mitsplat.storage.content_hash import file_hash
@@ -194,7 +194,11 @@ class CaptureResult:
 
 
 def capture_photos(
-    photos: Path, out: Path, settings: CaptureSettings = CaptureSettings(), *, progress: Progress | None = None
+    photos: str | Path,
+    out: str | Path,
+    settings: CaptureSettings = CaptureSettings(),
+    *,
+    progress: Progress | None = None,
 ) -> CaptureResult:
     """Find cameras, scale, gravity and masks of photographs.
 
@@ -212,6 +216,7 @@ def capture_photos(
             a folder that is overwritten.
         MissingResourceError: If COLMAP or the mask network fails to run.
     """
+    photos, out = path_of(photos, "photos"), path_of(out, "out")
     _check_outputs(out, photos, settings)
     if settings.masks is not None and not settings.masks.is_dir():
         raise InputError(f"{settings.masks}: no such folder of masks")

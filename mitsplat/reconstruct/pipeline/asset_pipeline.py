@@ -17,7 +17,7 @@ from typing import Any, Literal
 from mitsplat.asset import ASSET_FILE, read_spec
 from mitsplat.capture.capture import Capture
 from mitsplat.capture.pipeline.capture_pipeline import CaptureSettings, capture_photos
-from mitsplat.errors import InputError
+from mitsplat.errors import InputError, path_of
 from mitsplat.fit.fit_folder import FIT_FILE, read_record
 from mitsplat.fit.trainer import FitProgress, FitSettings, fit_capture
 from mitsplat.gaussians.splat_cloud import Splats
@@ -60,8 +60,8 @@ class AssetResult:
 
 
 def asset_from_photos(
-    photos: Path,
-    out: Path,
+    photos: str | Path,
+    out: str | Path,
     job: AssetJob,
     *,
     capture: CaptureSettings | None = None,
@@ -82,6 +82,7 @@ def asset_from_photos(
         InputError: If the photographs do not suffice.
         MissingResourceError: If a required program or model is missing.
     """
+    photos, out = path_of(photos, "photos"), path_of(out, "out")
     fit = fit or default_fit(job.kind)
     taken = capture_photos(photos, out / "capture", capture or CaptureSettings(kind=job.kind), progress=progress)
     if job.light is not None:

@@ -11,7 +11,7 @@ import numpy as np
 import trimesh
 
 from mitsplat.asset import Asset
-from mitsplat.errors import InputError, check_type
+from mitsplat.errors import InputError, check_type, path_of
 from mitsplat.scene.loading.references import LoadedFiles, errors_at_key, expand_patterns, load_files, shape_mesh
 from mitsplat.scene.planning.conveyor import check_belt
 from mitsplat.scene.planning.frame_lights import expand_rooms
@@ -42,7 +42,7 @@ def load_scene(path: str | Path, *, overrides: Mapping[str, Any] | None = None, 
     Raises:
         InputError: If the scene file or a file that it names is missing or invalid.
     """
-    path = Path(path)
+    path = path_of(path, "path")
     refuse_other_kinds(path, "a scene file (.yaml)", ".yaml", ".yml")
     return _build_scene(load_yaml(path, SceneSpec, overrides=overrides), path, allow_outside=allow_outside)
 

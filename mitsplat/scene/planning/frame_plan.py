@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, SupportsIndex
 
-from mitsplat.errors import InputError
+from mitsplat.errors import InputError, describe
 from mitsplat.geometry.camera import Camera
 from mitsplat.scene.layout import Layout
 from mitsplat.scene.planning.conveyor import Belt, belt_of
@@ -72,7 +72,7 @@ def to_index(index: SupportsIndex, name: str) -> int:
     try:
         return operator.index(index)
     except TypeError:
-        raise InputError(f"{name} must be a whole number (got {index!r})") from None
+        raise InputError(f"{name} must be a whole number (got {describe(index)})") from None
 
 
 def layout_of(scene: Scene, index: int) -> int:

@@ -37,7 +37,7 @@ from mitsplat.images.colour import (
 from mitsplat.renderer.layers import Layers, device_array, host_array
 from mitsplat.renderer.rays.device_arrays import wrapped
 from mitsplat.runtime.variant import one_at_a_time
-from mitsplat.scene.spec.image_spec import DAYLIGHT, CameraExposure, Composite, ImageShadow
+from mitsplat.scene.spec.image_spec import DAYLIGHT, CameraExposure, Composite
 
 Tone: TypeAlias = Literal["neutral", "filmic"]
 
@@ -73,6 +73,21 @@ exposure H = 0.65 L shutter / f-number^2 behind a typical lens.
 CURVE_WHITE = 16.0
 """Linear input at the end of the table."""
 
+_SHADOW_BLUR = 5.0
+"""Standard deviation of the blur of image-space shadows [px at a width of 1280]."""
+
+_SHADOW_SLOPE = 10.0
+"""Steepness of the sigmoid of image-space shadows, which is one half at half of the brightest light."""
+
+DARKEST_SHADOW = 0.35
+"""Factor of image-space shadows in full shadow."""
+
+_HIGHLIGHT_START = 0.85
+"""Fraction of the brightest light above which image-space shadows add a highlight."""
+
+HIGHLIGHT_GAIN = 0.06
+"""Maximum linear value of this highlight."""
+
 
 @one_at_a_time
 def light_image(layers: Layers, composite: Composite) -> Float32Array:
@@ -87,7 +102,7 @@ def light_layers(layers: Layers, composite: Composite, background: mi.Color3f | 
     if composite.shadow == "image":
         red, green, blue = layers.device_array("light")
         luminance = red * LUMINANCE[0] + green * LUMINANCE[1] + blue * LUMINANCE[2]
-        maps = shadow_from_image(host_array(luminance, layers.shape), composite.image_shadow)
+        maps = shadow_from_image(host_array(luminance, layers.shape))
         factor, highlight = (device_array(values) for values in maps)
         lit = lit * factor
         if composite.highlight:
@@ -95,19 +110,23 @@ def light_layers(layers: Layers, composite: Composite, background: mi.Color3f | 
     return lit + background * (1 - alpha)
 
 
-def shadow_from_image(shadow_map: Float32Array, parameters: ImageShadow) -> tuple[Float32Array, Float32Array]:
-    """Compute the factor and the highlight (H, W) of the published image-space chain from a shadow map (H, W)."""
+def shadow_from_image(shadow_map: Float32Array) -> tuple[Float32Array, Float32Array]:
+    """Compute the factor and the highlight (H, W) of the image-space shadow from a shadow map (H, W).
+
+    The map is normalised, blurred, and mapped by a sigmoid to the factor of the image. Where the map is brightest, a
+    highlight is added (Niżeniec and Iwanowski, section 4.2).
+    """
     brightest = float(np.percentile(shadow_map, 99.0))
     normalised = np.clip(shadow_map / max(brightest, 1e-6), 0.0, 1.0).astype(np.float32)
-    soft = cv2.GaussianBlur(normalised, (0, 0), parameters.blur * shadow_map.shape[1] / 1280)
+    soft = cv2.GaussianBlur(normalised, (0, 0), _SHADOW_BLUR * shadow_map.shape[1] / 1280)
 
     def sigmoid(x: npt.ArrayLike) -> Float32Array:
-        return np.asarray(1 / (1 + np.exp(-parameters.slope * (np.asarray(x) - parameters.midpoint))), dtype=np.float32)
+        return np.asarray(1 / (1 + np.exp(-_SHADOW_SLOPE * (np.asarray(x) - 0.5))), dtype=np.float32)
 
     low, high = sigmoid(0.0), sigmoid(1.0)
-    factor = parameters.darkest + (1 - parameters.darkest) * (sigmoid(soft) - low) / (high - low)
-    above_start = np.clip((soft - parameters.highlight_start) / (1 - parameters.highlight_start), 0, 1)
-    return factor.astype(np.float32), (above_start * parameters.highlight_gain).astype(np.float32)
+    factor = DARKEST_SHADOW + (1 - DARKEST_SHADOW) * (sigmoid(soft) - low) / (high - low)
+    above_start = np.clip((soft - _HIGHLIGHT_START) / (1 - _HIGHLIGHT_START), 0, 1)
+    return factor.astype(np.float32), (above_start * HIGHLIGHT_GAIN).astype(np.float32)
 
 
 @one_at_a_time

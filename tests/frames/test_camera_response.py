@@ -14,8 +14,10 @@ import pytest
 from scipy import stats
 
 from mitsplat.frames.camera_response import (
+    DARKEST_SHADOW,
     FULL_WELL,
     GREY,
+    HIGHLIGHT_GAIN,
     READ_NOISE,
     add_noise,
     camera_exposure,
@@ -35,7 +37,7 @@ from mitsplat.images.colour import (
     white_balance_matrix,
 )
 from mitsplat.renderer.layers import Layers, device_array, host_array
-from mitsplat.scene.spec.image_spec import CameraExposure, Composite, ImageShadow
+from mitsplat.scene.spec.image_spec import CameraExposure, Composite
 
 
 def encode(linear: np.ndarray) -> np.ndarray:
@@ -358,25 +360,22 @@ def test_the_srgb_transfer_agrees_with_colour_science() -> None:
 def test_published_shadow_is_darkest_in_shadow_and_one_in_light() -> None:
     shadow_map = np.ones((64, 128), np.float32)
     shadow_map[:, :40] = 0.0
-    parameters = ImageShadow(blur=20.0, darkest=0.4)
-    factor, highlight = shadow_from_image(shadow_map, parameters)
-    assert factor[32, 2] == pytest.approx(0.4, abs=0.01)
+    factor, highlight = shadow_from_image(shadow_map)
+    assert factor[32, 2] == pytest.approx(DARKEST_SHADOW, abs=0.01)
     assert factor[32, 120] == pytest.approx(1.0, abs=0.01)
     assert (np.diff(factor[32]) >= -1e-6).all()
-    assert highlight[32, 2] == 0 and highlight[32, 120] == pytest.approx(parameters.highlight_gain, rel=0.01)
+    assert highlight[32, 2] == 0 and highlight[32, 120] == pytest.approx(HIGHLIGHT_GAIN, rel=0.01)
 
 
-def test_parameters_of_the_published_shadow_reach_the_picture() -> None:
+def test_the_published_shadow_reaches_the_picture() -> None:
     light = np.ones((64, 128, 3), np.float32)
     light[:, :40] = 0.0
     layers = dict.fromkeys((f.name for f in fields(Layers)), np.zeros((64, 128), np.float32))
     layers |= {"captured": np.full((64, 128, 3), 0.5, np.float32), "alpha": np.ones((64, 128), np.float32)}
     layers = Layers(**{**layers, "light": light})
-    for darkest in (0.2, 0.6):
-        shadow = ImageShadow(darkest=darkest, highlight_gain=0.1)
-        picture = light_image(layers, Composite(shadow="image", image_shadow=shadow))
-        np.testing.assert_allclose(picture[32, 2], 0.5 * darkest, atol=0.005)
-        np.testing.assert_allclose(picture[32, 120], 0.5 + 0.1, atol=0.005)
+    picture = light_image(layers, Composite(shadow="image"))
+    np.testing.assert_allclose(picture[32, 2], 0.5 * DARKEST_SHADOW, atol=0.005)
+    np.testing.assert_allclose(picture[32, 120], 0.5 + HIGHLIGHT_GAIN, atol=0.005)
 
 
 @pytest.mark.parametrize("tone", ["neutral", "filmic"])

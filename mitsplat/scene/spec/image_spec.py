@@ -127,23 +127,6 @@ class TimeOfFlightSensor(StrictModel):
 DepthSensor = Annotated[StereoSensor | TimeOfFlightSensor, Field(discriminator="kind")]
 
 
-class ImageShadow(StrictModel):
-    """Parameters of the published image-space shadow (Niżeniec and Iwanowski, section 4.2).
-
-    The shadow map is normalised, blurred, mapped by a sigmoid and multiplied with the image. Where the map is
-    brightest, a highlight is added.
-    """
-
-    blur: Positive = Field(5.0, description="Standard deviation of the Gaussian blur [px at a width of 1280].")
-    slope: Positive = Field(10.0, description="Steepness of the sigmoid.")
-    midpoint: Unit = Field(0.5, description="Value of the normalised map at which the sigmoid is one half.")
-    darkest: Unit = Field(0.35, description="Factor in full shadow.")
-    highlight_start: float = Field(
-        0.85, ge=0, lt=1, description="Value of the normalised map above which the highlight starts."
-    )
-    highlight_gain: NonNegativeFloat = Field(0.06, description="Maximum linear value that the highlight adds.")
-
-
 def _check_exposure(exposure: object) -> object:
     """Refuse other words and numbers; otherwise pydantic would report one member of the union."""
     if isinstance(exposure, dict | CameraExposure) or exposure in ("auto", "fixed"):
@@ -202,7 +185,6 @@ class Composite(StrictModel):
         description="Target standard error of the traced light where half of the light arrives. It determines the "
         "numbers of shadow rays and reflection rays. Elsewhere the target is perceptually equal.",
     )
-    image_shadow: ImageShadow = Field(ImageShadow(), description="Parameters of ``shadow: image``.")
     highlight: bool = Field(
         True,
         description="Adds reflections that do not have the colour of the surface: all of "

@@ -6,6 +6,10 @@ Functions import modules of the detector experiment, because other measures run 
 from __future__ import annotations
 
 import time
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import suppress
+from functools import lru_cache
+from multiprocessing import get_context
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,10 +22,10 @@ from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.physics.settle import warp_settings
 from mitsplat.scene.layout import UnsettledLayoutError
 from mitsplat.scene.loading.scene_loading import load_scene
-from mitsplat.scene.scene import Scene
 
 if TYPE_CHECKING:
     from benchmarks.detector.material import Wanted
+    from mitsplat.physics.drop import Drop
 
 SCENES = ("table", "seat", "carton", "stood", "packed")
 
@@ -50,7 +54,7 @@ def write_body(wanted: Wanted, work: Path) -> None:
     Asset(wanted.name, name, POINT, mesh=shape, pieces=tuple(pieces), density=DENSITY).save(wanted.out(work))
 
 
-def time_layouts(hope: Path, work: Path, count: int) -> None:
+def time_layouts(hope: Path, work: Path, count: int, processes: int) -> None:
     """Print and record CPU seconds of the first layouts of each scene; missing assets are written to ``work``."""
     from benchmarks.detector.experiment import write_scene
     from benchmarks.detector.material import wanted_assets
@@ -59,22 +63,25 @@ def time_layouts(hope: Path, work: Path, count: int) -> None:
         if not (wanted.out(work) / "asset.yaml").exists():
             write_body(wanted, work)
     everything: list[float] = []
-    for name in SCENES:
-        scene = load_scene(write_scene(work, name), overrides={"output.layouts": count + 1})
-        seconds, draws, left_out = time_scene(scene, count)
-        everything += seconds
-        for value, unit, what in (
-            (np.median(seconds), "s", "median cpu"),
-            (max(seconds), "s", "slowest cpu"),
-            (draws / count, "", "draws per layout"),
-            (left_out, "", "left out"),
-        ):
-            figure(value, unit, name, what)
-        print(
-            f"{name}: {np.median(seconds):.2f} CPU s (median), {max(seconds):.2f} (slowest), "
-            f"{draws / count:.1f} draws per layout, {left_out} objects left out",
-            flush=True,
-        )
+    with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
+        for name in SCENES:
+            jobs = [(write_scene(work, name), index, count) for index in range(count)]
+            rows = list(pool.map(time_layout, jobs))
+            seconds, draws, left_out = (np.array(column) for column in zip(*rows, strict=True))
+            everything += seconds.tolist()
+            for value, unit, what in (
+                (np.median(seconds), "s", "median cpu"),
+                (seconds.max(), "s", "slowest cpu"),
+                (draws.mean(), "", "draws per layout"),
+                (left_out.sum(), "", "left out"),
+            ):
+                figure(value, unit, name, what)
+            print(
+                f"{name}: {np.median(seconds):.2f} CPU s (median), {seconds.max():.2f} (slowest, layout "
+                f"{seconds.argmax()}), {draws.mean():.2f} draws per layout, {left_out.sum()} objects left out",
+                flush=True,
+            )
+    figure(len(everything), "", "all", "layouts")
     figure(np.median(everything), "s", "all", "median cpu")
     figure(max(everything) / np.median(everything), "", "all", "slowest by median")
     print(
@@ -82,21 +89,30 @@ def time_layouts(hope: Path, work: Path, count: int) -> None:
     )
 
 
-def time_scene(scene: Scene, count: int) -> tuple[list[float], int, int]:
-    """Return CPU seconds of each layout after the first one, and the numbers of draws and of objects left out."""
+def time_layout(job: tuple[Path, int, int]) -> tuple[float, int, int]:
+    """Return CPU seconds of a layout, and the numbers of draws and of objects left out.
+
+    Args:
+        job: Scene file, index of the layout, and number of layouts.
+    """
+    path, index, count = job
+    drop = _make_drop(path, count)
+    with warp_settings():
+        start = time.process_time()
+        try:
+            layout = drop.settle(index)
+        except UnsettledLayoutError as error:
+            layout = error.layout
+        return time.process_time() - start, layout.certificate.attempts, len(layout.left_out)
+
+
+@lru_cache(maxsize=1)
+def _make_drop(path: Path, count: int) -> Drop:
+    """Prepare the simulation of a scene; its last layout loads libraries."""
     from mitsplat.physics.drop import drop_of
 
-    seconds, draws, left_out = [], 0, 0
     with warp_settings():
-        drop = drop_of(scene, lambda text: None)
-        for index in (count, *range(count)):  # the first one loads libraries
-            start = time.process_time()
-            try:
-                layout = drop.settle(index)
-            except UnsettledLayoutError as error:
-                layout = error.layout
-            if index < count:
-                seconds.append(time.process_time() - start)
-                draws += layout.certificate.attempts
-                left_out += len(layout.left_out)
-    return seconds, draws, left_out
+        drop = drop_of(load_scene(path, overrides={"output.layouts": count + 1}), lambda text: None)
+        with suppress(UnsettledLayoutError):
+            drop.settle(count)
+    return drop

@@ -347,14 +347,15 @@ def main() -> None:
     parser.add_argument("--device", default="cpu", help="device of worlds: cpu, or cuda:0")
     parser.add_argument("--hope", type=Path, default=Path("../shared/data/hope"), help="folder of the scans of layouts")
     parser.add_argument("--work", type=Path, help="folder that keeps the assets of layouts")
+    parser.add_argument("--processes", type=int, default=1, help="processes of layouts")
     arguments = parser.parse_args()
     gpu = arguments.measure == "worlds" and arguments.device != "cpu"
-    with recording("physics.settle", parser, arguments, ignore=("hope", "work"), gpu=gpu), warp_settings():
+    with recording("physics.settle", parser, arguments, ignore=("hope", "work", "processes"), gpu=gpu), warp_settings():
         if arguments.measure == "worlds":
             measure_worlds(arguments.count or (8 if arguments.device == "cpu" else 256), arguments.device)
         elif arguments.measure == "layouts":
             with nullcontext(arguments.work) if arguments.work else tempfile.TemporaryDirectory() as work:
-                time_layouts(arguments.hope, Path(work), arguments.count or 80)
+                time_layouts(arguments.hope, Path(work), arguments.count or 80, arguments.processes)
         else:
             measure, count = MEASURES[arguments.measure]
             measure(arguments.count or count)

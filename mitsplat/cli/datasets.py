@@ -298,7 +298,7 @@ def settle(
 
 def merge(
     shards: Annotated[
-        list[Path], typer.Argument(metavar="SHARDS...", help="Dataset folders with all shards of one dataset.")
+        list[Path], typer.Argument(metavar="SHARDS", help="Dataset folders with all shards of one dataset.")
     ],
     out: Annotated[Path, typer.Option("--out", "-o", help="Dataset folder to write.")],
     overwrite: OverwriteDataset = False,

@@ -31,7 +31,7 @@ def train(
     datasets: Annotated[
         list[Path],
         typer.Argument(
-            metavar="DATASETS...", help="Dataset folders with YOLO labels; the detector trains on all of them."
+            metavar="DATASETS", help="Dataset folders with YOLO labels; the detector trains on all of them."
         ),
     ],
     out: Annotated[Path, typer.Option("--out", "-o", help="Run folder to write.")],
@@ -150,7 +150,7 @@ def evaluate(
 
 
 def compare(
-    datasets: Annotated[list[Path], typer.Argument(metavar="DATASETS...", help="Folders of rendered datasets.")],
+    datasets: Annotated[list[Path], typer.Argument(metavar="DATASETS", help="Folders of rendered datasets.")],
     photographs: Annotated[
         Path,
         typer.Argument(

@@ -44,7 +44,9 @@ def view(
     port: Annotated[int, typer.Option(help="TCP port to listen on.")] = 8080,
     gaussians: Annotated[
         int,
-        typer.Option(help="Maximum number of Gaussians in the browser; of more, all clouds show the same share."),
+        typer.Option(
+            help="Maximum number of Gaussians in the browser; larger scenes show the same fraction of each cloud."
+        ),
     ] = 300_000,
     device: DeviceName = "cpu",
     allow_outside: AllowOutside = False,
@@ -159,7 +161,8 @@ def report(
     """Write an HTML report of DATASET.
 
     The report is a single file that works offline. It shows sample images with labels, statistics, random draws, the
-    audit and the origin of the data. Properties of the images that a detector cannot learn are also printed.
+    audit and the origin of the data. The command also prints warnings about gaps in the dataset, such as classes with
+    few examples.
     """
     from mitsplat.report.dataset_report import write_report
 
@@ -181,7 +184,9 @@ def chart(
     ] = 0.004,
     at: Annotated[
         list[float] | None,
-        typer.Option(help="Additional blending-order tolerance at which `balanced` is measured; repeatable."),
+        typer.Option(
+            metavar="VALUE", help="Additional blending-order tolerance at which `balanced` is measured; repeatable."
+        ),
     ] = None,
     out: Annotated[
         Path,
@@ -192,9 +197,9 @@ def chart(
 ) -> None:
     """Measure speed and accuracy of the rendering presets on SCENE.
 
-    All presets and several cheaper light models are compared with the preset exact. Objects that all have materials
-    are compared with their path-traced meshes, beside captured objects and meshes with fewer paths. Times are valid for
-    this machine only. Memory is main memory, not GPU memory.
+    The reference for all presets and for several cheaper light models is the preset exact. If all objects have
+    materials, the reference for objects is their path-traced meshes. The chart then also contains captured objects
+    and meshes with fewer paths. Times are valid for this machine only. Memory is main memory, not GPU memory.
     """
     from rich.console import Console
     from rich.table import Table

@@ -192,7 +192,7 @@ def capture(
     out: Annotated[Path, typer.Option("--out", "-o", help="Capture folder to write.")],
     kind: Annotated[
         Literal["object", "environment"],
-        typer.Option(help="object: the subject is segmented by masks; environment: the whole photos are used."),
+        typer.Option(help="object: the subject is segmented by masks; environment: whole photos are used."),
     ] = "object",
     frames: Frames = 150,
     max_size: Annotated[int, typer.Option(help="Longest edge of the photos [px]; larger photos are reduced.")] = 1600,

@@ -1,6 +1,6 @@
 """HTML report of a dataset: labelled samples, draws, missing variety, statistics, audit and provenance.
 
-In: a dataset folder. Out: one HTML file that needs no network, and warnings about gaps that a detector cannot learn.
+In: a dataset folder. Out: one HTML file that needs no network, and warnings about gaps in its variety.
 """
 
 from __future__ import annotations

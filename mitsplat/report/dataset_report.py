@@ -70,7 +70,7 @@ def write_report(root: str | Path, out: str | Path | None = None) -> tuple[Path,
     """Write the report of a dataset, by default to ``report.html`` in its folder.
 
     Returns:
-        Path of the report, the audit in it, and warnings about gaps that a detector cannot learn from the images.
+        Path of the report, the audit in it, and warnings about gaps, see :meth:`.Variety.warnings`.
 
     Raises:
         InputError: If the folder is no dataset of mitsplat.

@@ -1,4 +1,4 @@
-"""Variety of a dataset: drawn values, viewpoints of its objects, and gaps that a detector cannot learn."""
+"""Variety of a dataset: drawn values, viewpoints of its objects, and warnings about gaps."""
 
 from __future__ import annotations
 
@@ -108,7 +108,7 @@ class Variety:
             self._sides["right" if x > 0 else "left"] += 1
 
     def warnings(self) -> list[str]:
-        """Return warnings about gaps that a detector cannot learn from these images, a sentence each."""
+        """Return warnings about gaps, such as classes with few examples or unseen view directions, a sentence each."""
         found = [*self._class_warnings(), *self._instance_warnings()]
         for name, counts in sorted(self._directions.items()):
             cells = np.count_nonzero(counts[:RINGS])

@@ -36,7 +36,7 @@ Compiled kernels of a first run are small in comparison, see ``python -m benchma
 
 
 def examine() -> Iterator[Finding]:
-    """Yield the findings one by one."""
+    """Run all checks of the machine and yield their findings one by one."""
     yield Finding("Python", sys.version_info >= (3, 11), platform.python_version(), "install Python 3.11 or newer")
     for package in ("mitsuba", "drjit", "newton"):
         yield _package(package)

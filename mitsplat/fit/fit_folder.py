@@ -25,6 +25,7 @@ from mitsplat.storage.files import write_file, write_text
 from mitsplat.storage.format_version import FORMAT_VERSION, FORMAT_VERSIONS, check_format_version
 
 FIT_FILE = "fit.json"
+_CHECKPOINT = "checkpoint.npz"
 T = TypeVar("T")
 _RUNNING_MARKER = ".unfinished"
 """Marker file of a running or interrupted fit."""
@@ -110,7 +111,7 @@ class FitFolder:
         """Return the finished fit of these inputs, or None; arguments and errors are as in :meth:`checkpoint`."""
         result = self._existing(FIT_FILE, self._read, overwrite)
         if result is not None:
-            for name in ("checkpoint.npz", _RUNNING_MARKER):  # left by a run that was interrupted after its last step
+            for name in (_CHECKPOINT, _RUNNING_MARKER):  # left by a run that was interrupted after its last step
                 (self.path / name).unlink(missing_ok=True)
         return result
 
@@ -123,7 +124,7 @@ class FitFolder:
         Raises:
             InputError: If the folder contains such a file and ``overwrite`` is False.
         """
-        return self._existing("checkpoint.npz", self._read_checkpoint, overwrite)
+        return self._existing(_CHECKPOINT, self._read_checkpoint, overwrite)
 
     def _existing(self, name: str, read: Callable[[Path], T], overwrite: bool) -> T | None:
         """Return the content of a file if it exists and belongs to this fit."""
@@ -173,7 +174,7 @@ class FitFolder:
         Raises:
             InputError: If there is such a file; the message names it.
         """
-        if any((self.path / name).exists() for name in (FIT_FILE, "checkpoint.npz", _RUNNING_MARKER)):
+        if any((self.path / name).exists() for name in (FIT_FILE, _CHECKPOINT, _RUNNING_MARKER)):
             return
         for there in (self.path / "splats.ply", self.held_out):
             if there.exists():
@@ -185,7 +186,7 @@ class FitFolder:
         (self.path / _RUNNING_MARKER).touch()
         (self.path / FIT_FILE).unlink(missing_ok=True)
         if not resumed:
-            (self.path / "checkpoint.npz").unlink(missing_ok=True)
+            (self.path / _CHECKPOINT).unlink(missing_ok=True)
         (self.path / "splats.ply").unlink(missing_ok=True)
         shutil.rmtree(self.held_out, ignore_errors=True)
         for part in self.path.glob(".*.part"):  # left by a run that was killed during a write
@@ -198,7 +199,7 @@ class FitFolder:
             with temporary.open("wb") as file:
                 np.savez(file, inputs=self.inputs, **state)
 
-        write_file(self.path / "checkpoint.npz", write)
+        write_file(self.path / _CHECKPOINT, write)
 
     def save(self, result: FitResult, known: Mapping[str, Any]) -> None:
         """Write the finished fit; the record contains the result and the entries of ``known``."""
@@ -208,5 +209,5 @@ class FitFolder:
         record |= {"gaussians": len(result.splats)} | dict(known)
         record |= {name: [asdict(p) for p in getattr(result, name)] for name in ("held_out", "validation")}
         write_text(self.path / FIT_FILE, json.dumps(record, indent=1) + "\n")
-        for name in ("checkpoint.npz", _RUNNING_MARKER):
+        for name in (_CHECKPOINT, _RUNNING_MARKER):
             (self.path / name).unlink(missing_ok=True)

@@ -25,23 +25,22 @@ def check_images(paths: Sequence[Path]) -> list[str | None]:
     An image is refused if it cannot be read, or if it needs more memory than its size justifies. All images are tested
     in one process, up to the first that is refused. Later images are not tested and have None.
     """
-    found: list[str | None] = []
+    reason = None
     stamps = []
     for path in paths:
         try:
             status = path.stat()
         except OSError as error:
-            found.append(f"{path}: cannot be read ({error.strerror})")
+            reason = f"{path}: cannot be read ({error.strerror})"
             break
         if not path.is_file():
-            found.append(f"{path}: must be a file")
+            reason = f"{path}: must be a file"
             break
         stamps.append((path.resolve(), status.st_mtime_ns, status.st_size))
-    num_readable, reason = _try_images(tuple(stamps)) if stamps else (0, None)
-    if reason is not None:
-        found = [f"{paths[num_readable]}: not a readable image ({reason})"]
-    known = [*[None] * (num_readable if reason is not None else len(stamps)), *found]
-    return [*known, *[None] * (len(paths) - len(known))]
+    num_readable, fault = _try_images(tuple(stamps)) if stamps else (0, None)
+    if fault is not None:
+        reason = f"{paths[num_readable]}: not a readable image ({fault})"
+    return [reason if index == num_readable else None for index in range(len(paths))]
 
 
 @lru_cache(maxsize=64)
@@ -53,9 +52,9 @@ def _try_images(files: tuple[_Stamp, ...]) -> tuple[int, str | None]:
     process = run_bounded(
         _read_images, *arguments, imports=["mitsuba"], memory=max(limits), seconds=_SECONDS + len(files)
     )
-    num_readable = len(process.output.splitlines())
     if process.status == 0:
-        return num_readable, None
+        return len(files), None
+    num_readable = len(process.output.splitlines())
     return num_readable, process.reason if (process.status or 0) > 0 else f"its reader {process.reason}"
 
 

@@ -41,16 +41,15 @@ class TileSubset:
         tile = y * view.tiles_x + x
         inside = (x < view.tiles_x) & (y < view.tiles_y)
         flag = dr.select(dr.gather(mi.Bool, flags, tile, inside), mi.UInt32(1), 0)
-        # Prefix sums along the rows of corners, then along their columns; the sum at the start of each line is
-        # subtracted.
+        # Prefix sums along the rows of corners, then along the columns, minus the sum at the start of each line.
         running = dr.prefix_sum(flag)
         along = running - dr.gather(mi.UInt32, running, y * columns)
-        across = x * rows + y
-        turned = dr.empty(mi.UInt32, columns * rows)
-        dr.scatter(turned, along, across, mode=dr.ReduceMode.Permute)
-        dr.eval(turned)
-        running = dr.prefix_sum(turned)
-        above = dr.gather(mi.UInt32, running, across) - dr.gather(mi.UInt32, running, x * rows)
+        column_major = x * rows + y
+        transposed = dr.empty(mi.UInt32, columns * rows)
+        dr.scatter(transposed, along, column_major, mode=dr.ReduceMode.Permute)
+        dr.eval(transposed)
+        running = dr.prefix_sum(transposed)
+        above = dr.gather(mi.UInt32, running, column_major) - dr.gather(mi.UInt32, running, x * rows)
         ones = dr.select(flags, mi.UInt32(1), 0)
         before = dr.empty(mi.UInt32, dr.width(flags) + 1)
         order = dr.arange(mi.UInt32, dr.width(flags))

@@ -53,6 +53,11 @@ _MAX_COCO_BYTES = 1 << 32
 _SPLIT_FOLDERS = {"train": "train", "val": "val", "valid": "val", "validation": "val", "test": "test"}
 """Folders of splits in COCO exports, and the split of each."""
 
+_BACKGROUND = {"background", "_background_", "__background__"}
+"""Categories that are no classes if they have no labels."""
+_AREA_TOLERANCE = 0.02
+"""Largest relative difference of a stated area from that of its box."""
+
 _OUTSIDE_TOLERANCE = 0.01
 """Largest distance of a position from the image, as a share of its sides; such positions are clipped."""
 
@@ -419,7 +424,8 @@ def _coco_part(root: Path, split: Split, path: Path, content: dict[str, Any], pr
         used = {annotation["category_id"] for annotation in content["annotations"]}
         above = {c["name"]: c.get("supercategory") for c in content["categories"]}
         parents = {parent for name, parent in above.items() if parent != name and above.get(parent) != parent}
-        categories = [c for c in content["categories"] if c["id"] in used or c["name"] not in parents]
+        unlabelled = parents | _BACKGROUND
+        categories = [c for c in content["categories"] if c["id"] in used or c["name"] not in unlabelled]
         categories.sort(key=lambda category: category["id"])
         names = tuple(str(category["name"]) for category in categories)
         index = {category["id"]: i for i, category in enumerate(categories)}
@@ -572,10 +578,31 @@ def _coco_instance(annotation: dict[str, Any], class_index: int, size: tuple[int
             raise
         except (KeyError, TypeError, ValueError, IndexError, ArithmeticError) as error:
             raise InputError(f"{place}: segmentation must be polygons or run lengths ({error})") from error
+    else:
+        _check_box_alone(annotation, np.array([x, y, w, h]), place)
     crowd = annotation.get("iscrowd") or 0
     if crowd not in (0, 1):
         raise InputError(f"{place}: iscrowd must be 0 or 1 (got {crowd!r})")
     return LabelledObject(class_index, (x0, y0, x1, y1), None, None if rle is None else _rle_text(rle), bool(crowd))
+
+
+def _check_box_alone(annotation: dict[str, Any], box: Float64Array, place: str) -> None:
+    """Check the rotation and the area that an annotation without segmentation states for its box.
+
+    Raises:
+        InputError: If the box is rotated, or if its area is that of its two corners.
+    """
+    attributes, area, (x, y, w, h) = annotation.get("attributes"), annotation.get("area"), box.tolist()
+    if isinstance(attributes, dict) and attributes.get("rotation"):
+        turn = attributes["rotation"]
+        raise InputError(f"{place}: bbox must not be rotated (got rotation {turn}): export masks or polygons")
+    if not isinstance(area, int | float) or not area > 0:
+        return
+    own, corners = (abs(a * b / area - 1) <= _AREA_TOLERANCE for a, b in ((w, h), (w - x, h - y)))
+    if corners and not own:
+        raise InputError(
+            f"{place}: bbox must be x, y, width, height, not its two corners (got {annotation['bbox']}, area {area})"
+        )
 
 
 def _other_box(stated: Float64Array, x: float, y: float, w: float, h: float) -> str | None:

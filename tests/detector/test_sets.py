@@ -275,6 +275,14 @@ COCO_FAULTS: dict[str, tuple[Callable[[dict], object], str]] = {  # type: ignore
         lambda c: c["annotations"][0].update(bbox=[25, 27.5, 30, 15], segmentation=[[10, 20, 40, 20, 40, 35, 10, 35]]),
         "not its centre and size",
     ),
+    "area": (
+        lambda c: c["annotations"][0].update(bbox=[10, 20, 40, 35], area=450, segmentation=[]),
+        r"bbox must be x, y, width, height, not its two corners \(got \[10, 20, 40, 35\], area 450\)",
+    ),
+    "rotation": (
+        lambda c: c["annotations"][0].update(attributes={"rotation": 30.0}, segmentation=[]),
+        r"bbox must not be rotated \(got rotation 30.0\)",
+    ),
     "polygon": (
         lambda c: c["annotations"][0].update(segmentation=[[1, 2]]),
         "segmentation must be polygons of 3 points",
@@ -430,6 +438,7 @@ def test_an_unlabelled_supercategory_is_no_class(tmp_path: Path) -> None:
     root = write_coco(tmp_path, 2)
     edit_coco(root, lambda c: [one.update(supercategory="parts") for one in c["categories"]])
     edit_coco(root, lambda c: c["categories"].append(parent("parts", "none")))
+    edit_coco(root, lambda c: c["categories"].append(parent("__background__", "none") | {"id": 99}))
     found = read_set(root, "train")
     assert found.class_names == ("box", "disc") and found.samples[0].instances
     reorder_classes(found, CLASSES, "the dataset")

@@ -55,8 +55,6 @@ _SPLIT_FOLDERS = {"train": "train", "val": "val", "valid": "val", "validation": 
 
 _BACKGROUND = {"background", "_background_", "__background__"}
 """Categories that are no classes if they have no labels."""
-_AREA_TOLERANCE = 0.02
-"""Largest relative difference of a stated area from that of its box."""
 
 _OUTSIDE_TOLERANCE = 0.01
 """Largest distance of a position from the image, as a share of its sides; such positions are clipped."""
@@ -593,12 +591,9 @@ def _check_box_alone(annotation: dict[str, Any], box: Float64Array, place: str) 
         InputError: If the box is rotated, or if its area is that of its two corners.
     """
     attributes, area, (x, y, w, h) = annotation.get("attributes"), annotation.get("area"), box.tolist()
-    if isinstance(attributes, dict) and attributes.get("rotation"):
-        turn = attributes["rotation"]
+    if isinstance(attributes, dict) and (turn := attributes.get("rotation")):
         raise InputError(f"{place}: bbox must not be rotated (got rotation {turn}): export masks or polygons")
-    if not isinstance(area, int | float) or not area > 0:
-        return
-    own, corners = (abs(a * b / area - 1) <= _AREA_TOLERANCE for a, b in ((w, h), (w - x, h - y)))
+    own, corners = (isinstance(area, int | float) and abs(a - area) <= 0.02 * area for a in (w * h, (w - x) * (h - y)))
     if corners and not own:
         raise InputError(
             f"{place}: bbox must be x, y, width, height, not its two corners (got {annotation['bbox']}, area {area})"

@@ -1,4 +1,4 @@
-"""Help texts of every command and option, and their entries in the guide."""
+"""Help texts of every command and option, and the entries of commands in the guide."""
 
 from __future__ import annotations
 
@@ -29,17 +29,10 @@ def test_version_prints_the_version_of_the_package(capsys: pytest.CaptureFixture
     assert capsys.readouterr().out == f"mitsplat {version('mitsplat')}\n"
 
 
-def test_every_command_and_option_is_documented() -> None:
+def test_the_guide_lists_every_command() -> None:
     page = (Path(__file__).parents[2] / "docs/first_dataset.md").read_text()
-    commands = typer.main.get_command(app).commands
-    assert set(commands) >= {"render", "audit", "report", "preview", "bake", "export", "schema", "doctor"}
-    for name, command in commands.items():
-        line = next((row for row in page.splitlines() if row.startswith(f"| `mitsplat {name}")), None)
-        assert line is not None, name
-        for parameter in command.params:
-            if parameter.param_type_name == "option" and parameter.name != "help":
-                spelt = [form for o in parameter.opts for form in (f"`{o}`", f"/{o}", f"{o}/")]
-                assert any(form in line for form in spelt), parameter.opts
+    rows = [row.split()[2].rstrip("`") for row in page.splitlines() if row.startswith("| `mitsplat ")]
+    assert sorted(rows) == sorted(typer.main.get_command(app).commands)
 
 
 def test_help_lists_every_command_once_under_a_heading(capsys: pytest.CaptureFixture[str]) -> None:

@@ -103,7 +103,10 @@ class Quality:
 
     @property
     def order(self) -> Order:
-        """Blending order of the first walk, before tiles are repeated."""
+        """Order of the colours: of the tile, of a window along each ray, or of each ray.
+
+        With ``window``, only tiles whose estimated error exceeds the tolerance are blended in this order.
+        """
         return "ray" if self.tolerance == 0 else "tile" if math.isinf(self.tolerance) else "window"
 
 

@@ -37,7 +37,7 @@ from mitsplat.renderer.path_tracing import render_mesh
 from mitsplat.renderer.rays.device_arrays import ray_scene
 from mitsplat.renderer.scene_emitters import emitter_dict
 from mitsplat.scene.layout import Instance, Layout
-from mitsplat.scene.planning.frame_plan import layout_of
+from mitsplat.scene.planning.frame_plan import layout_index_of
 from mitsplat.scene.planning.object_appearance import ObjectAppearance, draw_appearances
 from mitsplat.scene.scene import Scene
 from mitsplat.scene.spec.scene_spec import BACKDROP
@@ -73,8 +73,8 @@ def frames(scene: Scene, parts: Mapping[str, tuple[MeshPart, ...]], indices: ran
     with ms.Renderer(scene) as renderer:
         layout, objects = None, dict[str, Any]()
         for index in indices:
-            if layout is None or layout.index != layout_of(scene, index):
-                layout = ms.settle_layout(scene, layout_of(scene, index))
+            if layout is None or layout.index != layout_index_of(scene, index):
+                layout = ms.settle_layout(scene, layout_index_of(scene, index))
                 objects = object_shapes(scene, layout, parts)
             frame, start = renderer.render(index, layout=layout), time.process_time()
             described = renderer.scene_builder.describe(layout, frame.plan.lights)

@@ -32,7 +32,7 @@ from mitsplat.frames.light_properties import light_properties
 from mitsplat.quality import resolve_quality
 from mitsplat.renderer.layers import Layers, make_integrator, render_layers
 from mitsplat.runtime.variant import ensure_variant
-from mitsplat.scene.planning.frame_plan import FramePlan, layout_of, plan_frame
+from mitsplat.scene.planning.frame_plan import FramePlan, layout_index_of, plan_frame
 
 ensure_variant()
 import drjit as dr  # noqa: E402
@@ -82,7 +82,7 @@ class Pictures:
         self.scene = ms.load_scene(path)
         quality = resolve_quality("fast")
         self.renderer = Renderer(self.scene, quality=quality)
-        layout = ms.settle_layout(self.scene, layout_of(self.scene, 0))
+        layout = ms.settle_layout(self.scene, layout_index_of(self.scene, 0))
         print(f"{len(layout.instances)} objects, {len(self.scene.spec.lights)} lights, {frames} frames")
         self.frames: list[tuple[Any, Any]] = []
         self.plans: list[FramePlan] = []

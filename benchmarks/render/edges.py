@@ -21,7 +21,7 @@ import mitsplat as ms
 from benchmarks.record import figure, recording
 from mitsplat.arrays import Float32Array
 from mitsplat.images.colour import encode_srgb
-from mitsplat.scene.planning.frame_plan import layout_of
+from mitsplat.scene.planning.frame_plan import layout_index_of
 
 ROOT = Path(__file__).resolve().parents[2]
 TRUTH = 4
@@ -55,7 +55,7 @@ def main() -> None:
     with recording("render.edges", parser, options):
         renderers = {samples: renderer(options.scene, width, height, samples) for samples in SETTINGS}
         scene = renderers[1].scene
-        layout = ms.settle_layout(scene, layout_of(scene, 0))
+        layout = ms.settle_layout(scene, layout_index_of(scene, 0))
         seconds: dict[Any, list[float]] = {samples: [] for samples in SETTINGS}
         errors: dict[Any, list[Float32Array]] = {samples: [] for samples in SETTINGS}
         with renderer(options.scene, TRUTH * width, TRUTH * height, 1) as large:

@@ -22,7 +22,7 @@ import mitsplat as ms
 from benchmarks.record import figure, recording
 from benchmarks.render.captures import CAMERA, crowd
 from benchmarks.render.volprim import render_volprim, volprim_scene
-from mitsplat.scene.planning.frame_plan import layout_of
+from mitsplat.scene.planning.frame_plan import layout_index_of
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -39,7 +39,7 @@ def time_frames(path: Path, frames: int, overrides: dict[str, Any]) -> None:
     """Print medians per stage over frames of one layout."""
     scene = ms.load_scene(path, overrides=overrides)
     start = time.perf_counter()
-    layout = ms.settle_layout(scene, layout_of(scene, 0))
+    layout = ms.settle_layout(scene, layout_index_of(scene, 0))
     seconds = time.perf_counter() - start
     figure(seconds, "s", "settle first")
     figure(len(layout.instances), "", "objects")
@@ -62,7 +62,7 @@ def time_frames(path: Path, frames: int, overrides: dict[str, Any]) -> None:
 def time_light(path: Path, overrides: dict[str, Any], repeats: int = 8) -> None:
     """Print the cost of shadows and highlights: the same frames with and without, in alternation."""
     scenes = [ms.load_scene(path, overrides={**overrides, "composite.shadow": kind}) for kind in ("none", "traced")]
-    layout = ms.settle_layout(scenes[0], layout_of(scenes[0], 0))
+    layout = ms.settle_layout(scenes[0], layout_index_of(scenes[0], 0))
     wall, processor = [], []
     for index in range(repeats + 1):
         for scene in scenes:

@@ -29,7 +29,7 @@ from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.quality import PRESETS
 from mitsplat.renderer.layers import make_integrator, make_sensor, make_splats_shape
 from mitsplat.runtime.variant import ensure_variant
-from mitsplat.scene.planning.frame_plan import layout_of, plan_frame
+from mitsplat.scene.planning.frame_plan import layout_index_of, plan_frame
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -123,7 +123,7 @@ def main() -> None:
 def measure(path: Path, scenes: int) -> None:
     """Print and record both."""
     scene = ms.load_scene(path)
-    layout, plan = ms.settle_layout(scene, layout_of(scene, 0)), plan_frame(scene, 3)
+    layout, plan = ms.settle_layout(scene, layout_index_of(scene, 0)), plan_frame(scene, 3)
     renderer = Renderer(scene, quality=PRESETS["fast"])
     placed = mi.load_dict(renderer.scene_builder.describe(layout, plan.lights))
     print_costs(path.name, renderer.integrator, placed, plan.camera)

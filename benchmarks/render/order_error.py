@@ -42,7 +42,7 @@ from mitsplat.geometry.camera import Camera
 from mitsplat.quality import PRESETS, Quality
 from mitsplat.renderer.layers import make_sensor
 from mitsplat.runtime.variant import ensure_variant
-from mitsplat.scene.planning.frame_plan import layout_of, plan_frame
+from mitsplat.scene.planning.frame_plan import layout_index_of, plan_frame
 
 ROOT = Path(__file__).resolve().parents[2]
 TOLERANCES = (2e-3, 5e-3, 1e-2)
@@ -61,7 +61,10 @@ def subjects(captures: Path, names: list[str], width: int, height: int) -> Itera
         from mitsplat.plugins.splats import SplatsShape  # derives from a class of the variant
 
         with Renderer(ms.load_scene(ROOT / "scenes/workcell.yaml")) as renderer:
-            layout, plan = ms.settle_layout(renderer.scene, layout_of(renderer.scene, 0)), plan_frame(renderer.scene, 0)
+            layout, plan = (
+                ms.settle_layout(renderer.scene, layout_index_of(renderer.scene, 0)),
+                plan_frame(renderer.scene, 0),
+            )
             shapes = mi.load_dict(renderer.scene_builder.describe(layout, plan.lights)).shapes()
             parts = [shape for shape in shapes if isinstance(shape, SplatsShape)]
             splats = Splats.concatenate([part.splats.transformed(part.world_from_splats) for part in parts])

@@ -20,7 +20,7 @@ from mitsplat.errors import InputError, PartialResultError
 from mitsplat.formats.registry import Catalogue, write_frame
 from mitsplat.progress import Note
 from mitsplat.scene.layout import Layout, UnsettledLayoutError
-from mitsplat.scene.planning.frame_plan import layout_of
+from mitsplat.scene.planning.frame_plan import layout_index_of
 from mitsplat.scene.scene import Scene
 from mitsplat.storage.files import (
     Record,
@@ -56,7 +56,7 @@ class FrameJob:
     def __call__(self, index: int, note: Note, /) -> tuple[Record, dict[str, float]]:
         """Make frame ``index``, and return its record and the seconds of its stages."""
         start = time.perf_counter()
-        layout = self._layout(layout_of(self.scene, index), note)
+        layout = self._layout(layout_index_of(self.scene, index), note)
         settled = time.perf_counter()
         record, seconds = self.write(index, layout)
         return record, {**seconds, "settle": round(settled - start, 4)}

@@ -26,7 +26,7 @@ from mitsplat.formats.registry import Catalogue
 from mitsplat.frames.frame import render_frame
 from mitsplat.physics.settle import settle_layout
 from mitsplat.runtime.device import Device, current_device, use_device
-from mitsplat.scene.planning.frame_plan import layout_of, to_index
+from mitsplat.scene.planning.frame_plan import layout_index_of, to_index
 from mitsplat.scene.scene import Scene
 from mitsplat.storage.files import Record, open_regular, read_json, storage_errors, write_text
 
@@ -80,7 +80,7 @@ def rerender_frame(
     """
     Scene.check(scene)
     out, index = path_of(out, "out"), to_index(index, "frame")
-    layout = layout_of(scene, index)
+    layout = layout_index_of(scene, index)
     catalogue = Catalogue.of(scene)
     refuse(scene, chain(count_faults(scene), layout_faults(scene), image_faults(scene, 1)))
     if out.exists() and not (out / FRAME).is_file() and (not out.is_dir() or any(out.iterdir())):

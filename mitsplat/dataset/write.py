@@ -43,7 +43,7 @@ from mitsplat.physics.settle import is_cached, settle_layout
 from mitsplat.progress import TIME_NOTE, Note, Progress
 from mitsplat.runtime.device import Device, current_device, find_device
 from mitsplat.scene.layout import Layout
-from mitsplat.scene.planning.frame_plan import layout_of
+from mitsplat.scene.planning.frame_plan import layout_index_of
 from mitsplat.scene.planning.lens_warnings import lens_warnings
 from mitsplat.scene.scene import Scene
 from mitsplat.storage.files import SPLITS, Record, read_json, storage_errors
@@ -163,7 +163,7 @@ def write_dataset(
         layouts: dict[int, list[int]] = {}
         for index in indices:
             if index not in manifest:
-                layouts.setdefault(layout_of(scene, index), []).append(index)
+                layouts.setdefault(layout_index_of(scene, index), []).append(index)
 
         def note(text: str) -> None:
             if progress is not None:
@@ -180,7 +180,7 @@ def write_dataset(
                 )
             append_run(out, workers, used_device.kind, [gpu.name for gpu in used_device.gpus])
         incomplete = IncompleteLayouts(scene, -(-count // scene.spec.output.views))
-        for layout in sorted({layout_of(scene, index) for index in indices}):
+        for layout in sorted({layout_index_of(scene, index) for index in indices}):
             incomplete.read(out / f"layouts/{layout:04d}.json")
         job = FrameJob(scene, catalogue, out, render or render_frame, settle or settle_layout)
         unsettled = [layout for layout in layouts if settle is not None or not is_cached(scene, layout)]

@@ -1,8 +1,9 @@
 """Parallel frame generation in worker processes, on this machine or on a Ray cluster.
 
 Input: a function that makes a frame, and the frames of every layout. Output: the function's return values, in order of
-completion. Processes that die are replaced, and their frames are made again. All processes of a machine share one copy
-of a scene's arrays. This package does not depend on the type of a frame.
+completion. The frame of a process that dies is made again. A new process starts only if no other is left, or if a
+machine joins the cluster, because most processes die of exhausted memory. All processes of a machine share one copy of
+a scene's arrays. This package does not depend on the type of a frame.
 """
 
 from __future__ import annotations

@@ -48,11 +48,11 @@ class Failure:
     """Exception of a worker as text, because not every exception can be pickled.
 
     Attributes:
-        sentence: Exception class, if its message is meant for the user.
+        user_error: Exception class, if its message is meant for the user.
         exhausted: True if memory is exhausted.
     """
 
-    sentence: type[Exception] | None
+    user_error: type[Exception] | None
     kind: str
     message: str
     trace: str
@@ -61,15 +61,17 @@ class Failure:
     @classmethod
     def of(cls, error: Exception) -> Failure:
         """Build a failure from the exception that is being handled."""
-        sentence = next((kind for kind in _SENTENCES if isinstance(error, kind)), None)
-        if sentence is None:  # classes with the same exit status of the command line
-            sentence = {2: InputError, 3: MissingResourceError}.get(exit_status(error) or 0)
-        return cls(sentence, type(error).__name__, sentence_of(error), traceback.format_exc(), is_out_of_memory(error))
+        user_error = next((kind for kind in _SENTENCES if isinstance(error, kind)), None)
+        if user_error is None:  # classes with the same exit status of the command line
+            user_error = {2: InputError, 3: MissingResourceError}.get(exit_status(error) or 0)
+        return cls(
+            user_error, type(error).__name__, sentence_of(error), traceback.format_exc(), is_out_of_memory(error)
+        )
 
     def error(self, frame: int) -> Exception:
         """Return the exception to raise in the calling process."""
-        if self.sentence is not None:
-            return self.sentence(self.message)
+        if self.user_error is not None:
+            return self.user_error(self.message)
         error = FrameError(f"frame {frame} failed: {self.kind}: {self.message}")
         error.add_note(self.trace)
         return error

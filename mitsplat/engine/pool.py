@@ -77,8 +77,9 @@ def run_frames(
         InputError: If the input of a frame is invalid.
         MissingResourceError: If the memory does not suffice for a frame in a single worker.
         FrameError: If a frame fails otherwise in a worker.
-        LostWorkersError: If :data:`MAX_LOSSES` workers died while making the same frame. Workers are stopped before an
-            exception is raised, and when the iterator is closed.
+        LostWorkersError: If :data:`mitsplat.engine.scheduler.MAX_LOSSES` workers died while making the same frame.
+
+    Workers are stopped before any exception is raised, and when the iterator is closed.
     """
     check_workers(workers)
     total = sum(map(len, layouts.values()))

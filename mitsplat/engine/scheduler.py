@@ -22,9 +22,9 @@ def run_pool(
     """Distribute all frames over the pool's workers and yield the results in order of completion.
 
     A worker gets its next frame when it has finished one, so that results do not accumulate while the caller is busy. A
-    lost worker is replaced only if it was the last one, because exhausted memory is the most likely cause, or on newly
-    joined machines. A worker that reports exhausted memory is replaced only if another worker has gone since it began
-    the frame.
+    lost worker is replaced only if no other worker has a frame, or if a machine has joined, because exhausted memory is
+    the most likely cause. A worker that reports exhausted memory is replaced only if another worker has gone since it
+    began the frame.
 
     Args:
         pool: Pool that starts the workers and receives their answers.
@@ -42,10 +42,10 @@ def run_pool(
     losses: Counter[int] = Counter()
     at_work: dict[int, tuple[int, float]] = {}  # frame, and the time when it was assigned
     gone = 0
-    live_workers: dict[int, int] = {}  # value: number of lost workers when it got its frame
+    gone_at_start: dict[int, int] = {}  # by live worker: number of workers gone when it got its frame
 
     def assign(worker: int) -> None:
-        live_workers[worker] = gone
+        gone_at_start[worker] = gone
         if (task := queue.take(worker)) is not None:
             at_work[worker] = task[1], time.monotonic()
             pool.send_frame(worker, task[1], task[0])
@@ -58,7 +58,7 @@ def run_pool(
                 note(answer.text)
                 continue
             if worker not in at_work:
-                live_workers.pop(worker, None)  # died while idle
+                gone_at_start.pop(worker, None)  # died while idle
                 continue
             frame, begin = at_work.pop(worker)
             if isinstance(answer, Failure) and not answer.exhausted:
@@ -67,19 +67,19 @@ def run_pool(
                 queue.put_back(worker, frame)
                 pool.stop(worker)
                 grow = False
-                if live_workers.pop(worker) < gone:  # the missing memory may be free now
+                if gone_at_start.pop(worker) < gone:  # the missing memory may be free now
                     assign(pool.start())
                     continue
-                if not live_workers:
+                if not gone_at_start:
                     raise memory_error(frame, answer.message)
                 gone += 1
-                left = f"{len(live_workers)} worker{'s' * (len(live_workers) > 1)}"
+                left = f"{len(gone_at_start)} worker{'s' * (len(gone_at_start) > 1)}"
                 note(f"memory ran out in frame {frame}, which is repeated with {left}")
                 if not at_work:
-                    assign(next(iter(live_workers)))
+                    assign(next(iter(gone_at_start)))
                 continue
             if isinstance(answer, Lost):
-                del live_workers[worker]
+                del gone_at_start[worker]
                 gone += 1
                 losses[frame] += 1
                 if losses[frame] == MAX_LOSSES:
@@ -101,7 +101,7 @@ def run_pool(
                         grow = False
                         queue.leave(worker)
                         pool.stop(worker)
-                        del live_workers[worker]
+                        del gone_at_start[worker]
                         yield answer.result
                         continue
                     case "stay":

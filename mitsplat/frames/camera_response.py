@@ -90,12 +90,12 @@ HIGHLIGHT_GAIN = 0.06
 
 
 @one_at_a_time
-def light_image(layers: Layers, composite: Composite) -> Float32Array:
+def lit_picture(layers: Layers, composite: Composite) -> Float32Array:
     """Compute the linear picture (H, W, 3) with the configured shadows over a grey background."""
-    return host_array(light_layers(layers, composite), layers.shape)
+    return host_array(apply_light(layers, composite), layers.shape)
 
 
-def light_layers(layers: Layers, composite: Composite, background: mi.Color3f | float = BACKGROUND) -> mi.Color3f:
+def apply_light(layers: Layers, composite: Composite, background: mi.Color3f | float = BACKGROUND) -> mi.Color3f:
     """Compute the linear picture over a background on the device, flat and row-major."""
     alpha = layers.device_array("alpha")
     lit = layers.device_array("rgb" if composite.shadow == "traced" else "captured")
@@ -113,7 +113,7 @@ def light_layers(layers: Layers, composite: Composite, background: mi.Color3f | 
 def shadow_from_image(shadow_map: Float32Array) -> tuple[Float32Array, Float32Array]:
     """Compute the factor and the highlight (H, W) of the image-space shadow from a shadow map (H, W).
 
-    The map is normalised, blurred, and mapped by a sigmoid to the factor of the image. Where the map is brightest, a
+    The map is the luminance of the traced light. It is normalised, blurred, and mapped by a sigmoid to the factor of the image. Where the map is brightest, a
     highlight is added (Niżeniec and Iwanowski, section 4.2).
     """
     brightest = float(np.percentile(shadow_map, 99.0))

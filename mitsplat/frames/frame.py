@@ -17,7 +17,7 @@ import trimesh
 
 from mitsplat.arrays import Float32Array
 from mitsplat.errors import InputError, check_type
-from mitsplat.frames.camera_response import Development, light_layers, start_development
+from mitsplat.frames.camera_response import Development, apply_light, start_development
 from mitsplat.frames.light_properties import background_light, irradiance_of, light_properties, white_irradiance
 from mitsplat.frames.scene_builder import SceneBuilder
 from mitsplat.geometry.camera import Camera
@@ -33,7 +33,7 @@ from mitsplat.renderer.lazy_value import LazyValue
 from mitsplat.runtime.variant import ensure_variant, one_at_a_time
 from mitsplat.scene.layout import Layout
 from mitsplat.scene.planning.conveyor import carried_instances, layout_at_view
-from mitsplat.scene.planning.frame_plan import FramePlan, layout_of, plan_frame
+from mitsplat.scene.planning.frame_plan import FramePlan, layout_index_of, plan_frame
 from mitsplat.scene.planning.object_appearance import ObjectAppearance, draw_appearances
 from mitsplat.scene.planning.view_diagnosis import distance_to_box, pose_cause, sees
 from mitsplat.scene.scene import Scene
@@ -145,7 +145,7 @@ def render_frame(
             lights break a rule.
     """
     Scene.check(scene)
-    layout_of(scene, index)  # check the index before costly work
+    layout_index_of(scene, index)  # check the index before costly work
     ensure_variant()
     return _cached_renderer(scene, quality, str(mi.variant())).render(
         index, layout=layout, camera=camera, lights=lights, next_layout=next_layout, next_camera=next_camera
@@ -242,7 +242,7 @@ class Renderer:
         seconds: dict[str, float] = {}
         if layout is None:
             with _timed(seconds, "settle"):
-                layout = self._settled_layout(layout_of(self.scene, index))
+                layout = self._settled_layout(layout_index_of(self.scene, index))
         layout, layout_of_next_view = self._layouts_at_views(layout, index)
         next_layout = next_layout or layout_of_next_view
         with _timed(seconds, "place"):
@@ -261,7 +261,7 @@ class Renderer:
         with _timed(seconds, "composite"):
             lit = background_light(self.scene, layout.index, mitsuba_scene)
             background = lit * self.scene_builder.background(index, layout.index, plan.camera)
-            linear = light_layers(layers, self.scene.spec.composite, background)
+            linear = apply_light(layers, self.scene.spec.composite, background)
             development = self._start_development(linear, layers, layout, plan, mitsuba_scene)
         with _timed(seconds, "silhouettes"):
             silhouettes = render_silhouettes(
@@ -306,7 +306,7 @@ class Renderer:
     def _layouts_at_views(self, layout: Layout, index: int) -> tuple[Layout, Layout | None]:
         """Return the layout at the moments of a frame and of the next view; None for the latter if nothing moves."""
         spec = self.scene.spec
-        view = index - layout_of(self.scene, index) * spec.output.views
+        view = index - layout_index_of(self.scene, index) * spec.output.views
         here = layout_at_view(spec, layout, view)
         after = layout_at_view(spec, layout, min(view + 1, spec.output.views - 1))
         return here, None if after is here else after

@@ -34,7 +34,7 @@ from mitsplat.runtime.device import Device
 from mitsplat.runtime.variant import ensure_variant
 from mitsplat.scene.layout import Layout
 from mitsplat.scene.planning.conveyor import layout_at_view
-from mitsplat.scene.planning.frame_plan import FramePlan, layout_of, plan_frame
+from mitsplat.scene.planning.frame_plan import FramePlan, layout_index_of, plan_frame
 from mitsplat.scene.planning.layout_surroundings import MaterialDraw, draw_surroundings
 from mitsplat.scene.planning.object_appearance import draw_appearances
 from mitsplat.scene.planning.shape_poses import placed_shapes
@@ -54,7 +54,7 @@ def export_xml(scene: Scene, index: int, path: str | Path) -> None:
     ensure_variant()
     path = Path(path)
     files = path.with_name(f"{path.stem}_files")
-    number = layout_of(scene, index)
+    number = layout_index_of(scene, index)
     layout = layout_at_view(scene.spec, settle_layout(scene, number), index - number * scene.spec.output.views)
     plan = plan_frame(scene, index, layout)
     if files.is_symlink():

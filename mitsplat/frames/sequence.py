@@ -17,7 +17,7 @@ from mitsplat.geometry.camera import Camera
 from mitsplat.quality import Quality
 from mitsplat.scene.layout import Layout
 from mitsplat.scene.planning.conveyor import layout_at_view
-from mitsplat.scene.planning.frame_plan import layout_of, to_index
+from mitsplat.scene.planning.frame_plan import layout_index_of, to_index
 from mitsplat.scene.planning.viewpoints import view_of
 from mitsplat.scene.scene import Scene
 from mitsplat.scene.spec.light_spec import LightEntry
@@ -110,10 +110,10 @@ def with_unlimited_layouts(scene: Scene) -> Scene:
 def _next_view(scene: Scene, shot: Shot, following: Shot) -> tuple[Layout | None, Camera | None]:
     """Return the next layout and camera for the flow of a film; (None, None) if the next image has other objects."""
     (index, layout, _), (next_index, next_layout, next_camera) = shot, following
-    if layout is None and layout_of(scene, index) != layout_of(scene, next_index):
+    if layout is None and layout_index_of(scene, index) != layout_index_of(scene, next_index):
         return None, None
     if next_layout is not None:
-        view = next_index - layout_of(scene, next_index) * scene.spec.output.views
+        view = next_index - layout_index_of(scene, next_index) * scene.spec.output.views
         next_layout = layout_at_view(scene.spec, next_layout, view)
     return next_layout, view_of(scene, next_index, next_layout).camera if next_camera is None else next_camera
 

@@ -15,7 +15,7 @@ def random_stream(seed: int, purpose: str, *numbers: int) -> np.random.Generator
     """Return the random generator for one purpose in one frame, layout or attempt. It is independent of all others.
 
     Args:
-        seed: Seed of the scene.
+        seed: Seed of the scene, or of one frame's plan.
         purpose: Name of the value that is drawn.
         numbers: Index of the frame or layout, and of the attempt if values are drawn repeatedly.
     """

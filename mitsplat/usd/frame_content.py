@@ -20,7 +20,7 @@ from mitsplat.progress import Note
 from mitsplat.renderer.textures import texture_image
 from mitsplat.runtime.variant import ensure_variant
 from mitsplat.scene.planning.conveyor import layout_at_view
-from mitsplat.scene.planning.frame_plan import FramePlan, layout_of, plan_frame
+from mitsplat.scene.planning.frame_plan import FramePlan, layout_index_of, plan_frame
 from mitsplat.scene.planning.layout_surroundings import LayoutSurroundings, draw_surroundings
 from mitsplat.scene.planning.object_appearance import draw_appearances
 from mitsplat.scene.planning.shape_poses import placed_shapes
@@ -99,7 +99,7 @@ def frame_content(scene: Scene, index: int, progress: Note = lambda text: None) 
     Raises:
         InputError: If there is no such frame, or its layout does not settle.
     """
-    number = layout_of(scene, index)
+    number = layout_index_of(scene, index)
     layout = layout_at_view(
         scene.spec, settle_layout(scene, number, progress=progress), index % scene.spec.output.views
     )

@@ -23,7 +23,7 @@ from mitsplat.frames.camera_response import (
     camera_exposure,
     colour_matrix,
     develop,
-    light_image,
+    lit_picture,
     shadow_from_image,
     tone_curve,
 )
@@ -373,7 +373,7 @@ def test_the_published_shadow_reaches_the_picture() -> None:
     layers = dict.fromkeys((f.name for f in fields(Layers)), np.zeros((64, 128), np.float32))
     layers |= {"captured": np.full((64, 128, 3), 0.5, np.float32), "alpha": np.ones((64, 128), np.float32)}
     layers = Layers(**{**layers, "light": light})
-    picture = light_image(layers, Composite(shadow="image"))
+    picture = lit_picture(layers, Composite(shadow="image"))
     np.testing.assert_allclose(picture[32, 2], 0.5 * DARKEST_SHADOW, atol=0.005)
     np.testing.assert_allclose(picture[32, 120], 0.5 + HIGHLIGHT_GAIN, atol=0.005)
 

@@ -18,7 +18,7 @@ from pydantic import TypeAdapter
 import mitsplat as ms
 from mitsplat.errors import InputError
 from mitsplat.formats.registry import Catalogue, write_frame
-from mitsplat.frames.camera_response import develop, light_image
+from mitsplat.frames.camera_response import develop, lit_picture
 from mitsplat.frames.mitsuba_xml import export_xml, render_xml
 from mitsplat.frames.scene_builder import NO_SPLATS
 from mitsplat.geometry.camera import Camera
@@ -218,7 +218,7 @@ def test_labels_transfer_only_ids_and_one_depth_to_the_host(
     names = {field.name for field in fields(frame.layers)}
     assert names & vars(frame.layers).keys() == {"instance", "proxy_instance", depth}
     assert "rgb" not in vars(frame)
-    np.testing.assert_array_equal(frame.rgb, light_image(frame.layers, chosen.spec.composite))
+    np.testing.assert_array_equal(frame.rgb, lit_picture(frame.layers, chosen.spec.composite))
     again = develop(frame.rgb, frame.plan.draws, chosen.spec.composite, seed=frame.plan.seed)
     np.testing.assert_array_equal(again, frame.image)
 

@@ -16,7 +16,7 @@ import pytest
 from mitsplat.asset import Asset
 from mitsplat.errors import InputError
 from mitsplat.scene.loading.scene_loading import load_scene, scene_json_schema
-from mitsplat.scene.planning.frame_plan import FramePlan, layout_of, plan_frame
+from mitsplat.scene.planning.frame_plan import FramePlan, layout_index_of, plan_frame
 from mitsplat.scene.scene import Scene
 from mitsplat.scene.spec.scene_spec import SCHEMA_VERSION
 from mitsplat.scene.streams import random_stream
@@ -340,7 +340,7 @@ def test_the_next_camera_is_that_of_the_layouts_next_view(scene_data: SceneData,
 
 def test_frames_belong_to_layouts(scene_data: SceneData, write_scene: WriteScene) -> None:
     scene = load_scene(write_scene(scene_data))
-    assert [layout_of(scene, index) for index in range(12)] == [0] * 4 + [1] * 4 + [2] * 4
+    assert [layout_index_of(scene, index) for index in range(12)] == [0] * 4 + [1] * 4 + [2] * 4
     assert [plan_frame(scene, index).view for index in range(12)] == [0, 1, 2, 3] * 3
     for index in (-1, 12):
         with pytest.raises(InputError, match=f"frame must be in 0 to 11 \\(got {index}\\)"):

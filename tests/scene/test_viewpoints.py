@@ -18,7 +18,7 @@ from mitsplat.errors import InputError
 from mitsplat.geometry.camera import Camera
 from mitsplat.scene.layout import Layout
 from mitsplat.scene.loading.scene_loading import load_scene
-from mitsplat.scene.planning.frame_plan import layout_of, plan_frame
+from mitsplat.scene.planning.frame_plan import layout_index_of, plan_frame
 from mitsplat.scene.planning.visibility_prediction import VisibilityPredictor
 from mitsplat.scene.scene import Scene
 from mitsplat.scene.spec.camera_spec import Occlusion, Truncation
@@ -52,7 +52,7 @@ def views(scene: Scene) -> Iterator[tuple[Any, Layout]]:
     """Return the plans of all frames with their layouts."""
     there = layouts(scene)
     for index in range(scene.num_frames):
-        layout = there[layout_of(scene, index)]
+        layout = there[layout_index_of(scene, index)]
         yield plan_frame(scene, index, layout), layout
 
 
@@ -142,7 +142,7 @@ def test_frames_are_planned_in_any_order(scene: Scene) -> None:
     again = load_scene(scene.path, overrides={"camera": drawn.spec.camera.model_dump(mode="json")})
     there = layouts(again)
     for index in (17, 3, 8, 0):
-        plan = plan_frame(again, index, there[layout_of(again, index)])
+        plan = plan_frame(again, index, there[layout_index_of(again, index)])
         assert plan.camera.world_from_camera.tolist() == forwards[index]
         if plan.next_camera is not None:
             assert plan.next_camera.world_from_camera.tolist() == forwards[index + 1]

@@ -75,7 +75,7 @@ def to_index(index: SupportsIndex, name: str) -> int:
         raise InputError(f"{name} must be a whole number (got {describe(index)})") from None
 
 
-def layout_of(scene: Scene, index: int) -> int:
+def layout_index_of(scene: Scene, index: int) -> int:
     """Return the index of the layout that frame ``index`` shows.
 
     Raises:
@@ -116,7 +116,7 @@ def plan_frame(
             camera is inside an object or a visible shape, or if the lights are invalid.
     """
     index = to_index(index, "frame")
-    spec, number = scene.spec, layout_of(scene, index)
+    spec, number = scene.spec, layout_index_of(scene, index)
     if lights is not None:
         if not isinstance(lights, Sequence) or isinstance(lights, str):
             raise InputError(f"lights must be a list of lights (got a {type(lights).__name__}): put one light in [ ]")

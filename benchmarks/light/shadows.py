@@ -48,7 +48,7 @@ from scipy.ndimage import binary_dilation, gaussian_filter, map_coordinates, max
 from benchmarks.record import figure, recording
 from mitsplat.bake.bake import BakeSettings, bake_asset
 from mitsplat.bake.mesh_parts import MeshPart, bake_lights, mitsuba_scene, read_parts
-from mitsplat.frames.camera_response import light_image
+from mitsplat.frames.camera_response import lit_picture
 from mitsplat.frames.scene_builder import make_asset_shape
 from mitsplat.geometry.camera import Camera
 from mitsplat.images.colour import LUMINANCE, decode_srgb, encode_srgb
@@ -407,10 +407,10 @@ def composites(layers: Layers, relative: Layers, truth: Truth) -> dict[str, Floa
     opaque = {"captured": captured, "alpha": np.ones_like(layers.alpha)}
     exact = replace(layers, **opaque)
     ratio = np.where(truth.objects[..., None], layers.light, truth.ratio).astype(np.float32)
-    pictures = {"none": light_image(layers, Composite(shadow="none"))}
-    pictures |= {"image": light_image(relative, Composite(shadow="image"))}
-    pictures |= {"traced": light_image(layers, Composite())}
-    pictures |= {"capture image": light_image(replace(relative, **opaque), Composite(shadow="image"))}
+    pictures = {"none": lit_picture(layers, Composite(shadow="none"))}
+    pictures |= {"image": lit_picture(relative, Composite(shadow="image"))}
+    pictures |= {"traced": lit_picture(layers, Composite())}
+    pictures |= {"capture image": lit_picture(replace(relative, **opaque), Composite(shadow="image"))}
     pictures |= {"capture traced": lit(exact)}
     pictures["direct"] = lit(replace(exact, light=ratio))
     return {name: np.asarray(picture, dtype=np.float64) for name, picture in pictures.items()}

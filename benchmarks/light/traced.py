@@ -26,7 +26,7 @@ from scipy.ndimage import maximum_filter, minimum_filter
 import mitsplat as ms
 from benchmarks.record import figure, recording
 from mitsplat.arrays import Float32Array
-from mitsplat.frames.camera_response import develop, light_image
+from mitsplat.frames.camera_response import develop, lit_picture
 from mitsplat.frames.frame import Renderer
 from mitsplat.frames.light_properties import light_properties
 from mitsplat.quality import resolve_quality
@@ -98,7 +98,7 @@ class Pictures:
     def developed(self, number: int, layers: Layers) -> Float32Array:
         """Return the developed image of a frame, 0 to 255."""
         plan, composite = self.plans[number], self.scene.spec.composite
-        linear = light_image(layers, composite)
+        linear = lit_picture(layers, composite)
         image = develop(linear, plan.draws, composite, seed=plan.seed)
         return image.astype(np.float32)
 

@@ -113,8 +113,8 @@ def apply_light(layers: Layers, composite: Composite, background: mi.Color3f | f
 def shadow_from_image(shadow_map: Float32Array) -> tuple[Float32Array, Float32Array]:
     """Compute the factor and the highlight (H, W) of the image-space shadow from a shadow map (H, W).
 
-    The map is the luminance of the traced light. It is normalised, blurred, and mapped by a sigmoid to the factor of the
-    image. Where the map is brightest, a highlight is added (Niżeniec and Iwanowski, section 4.2).
+    The map is the luminance of the traced light. It is normalised, blurred, and mapped by a sigmoid to the factor of
+    the image. Where the map is brightest, a highlight is added (Niżeniec and Iwanowski, section 4.2).
     """
     brightest = float(np.percentile(shadow_map, 99.0))
     normalised = np.clip(shadow_map / max(brightest, 1e-6), 0.0, 1.0).astype(np.float32)

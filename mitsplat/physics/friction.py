@@ -32,6 +32,7 @@ GRAVITY = 9.81
 """[m/s^2]"""
 MIN_FRICTION = 2e-5
 """Minimum friction. MuJoCo divides by the friction, and smaller values are unstable."""
+_MIN_SLIDING_WARP = 1e-4  # at 2e-5, blocks with rolling friction diverge in single precision
 
 IMPACT_IMPEDANCE = 0.9999
 """Impedance of impacts: the largest of MuJoCo, so that a contact reaches its reference acceleration."""
@@ -168,10 +169,9 @@ def _mix_friction(
         return
     pair, world = geoms[contact], worlds[contact]
     first, second = geom_friction[world, pair[0]], geom_friction[world, pair[1]]
-    slide = wp.sqrt(first[0] * second[0])
+    slide = wp.max(_MIN_SLIDING_WARP, wp.sqrt(first[0] * second[0]))
     spin = wp.max(MIN_FRICTION, slide * wp.max(first[1], second[1]))
     roll = wp.max(MIN_FRICTION, wp.max(first[2], second[2]))
-    slide = wp.max(MIN_FRICTION, slide)
     friction[contact] = _vec5(slide, slide, spin, roll, roll)
 
 

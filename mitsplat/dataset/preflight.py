@@ -25,6 +25,7 @@ from mitsplat.geometry.mesh import check_size
 from mitsplat.geometry.mesh_points import points_inside
 from mitsplat.scene.planning.frame_plan import FramePlan, plan_frame
 from mitsplat.scene.planning.lens_warnings import lens_warnings
+from mitsplat.scene.planning.unit_warnings import unit_warnings
 from mitsplat.scene.planning.view_diagnosis import FAR, distance_to_box, pose_cause, sees
 from mitsplat.scene.planning.visibility_prediction import enclosing_shape
 from mitsplat.scene.scene import Scene
@@ -285,6 +286,7 @@ def scene_warnings(scene: Scene) -> Iterator[Finding]:
         "move camera, its keys or its ranges: such images have no labels",
     )
     yield from lens_warnings(spec)
+    yield from unit_warnings(spec)
     yield from _cost_warnings(scene)
     yield from _backdrop_warnings(scene, plans)
     for number, light in enumerate(spec.lights):

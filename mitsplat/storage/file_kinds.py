@@ -101,6 +101,8 @@ def no_folder_with(folder: Path, file: str, wanted: str) -> InputError:
         ]
         has = f"; {inside[0].name} is {kinds[0]}" if kinds else ""
         return InputError(f"{folder}: must be {wanted} (got a folder without {file}{has})")
+    if any(letter in str(folder) for letter in "*?["):
+        return InputError(f"{folder}: no such folder; is it a pattern, for the key pool?")
     close = _similar_folder(folder, file)
     return InputError(f"{folder}: no such folder{f'; did you mean {close}?' if close else ''}")
 

@@ -12,6 +12,8 @@ from mitsplat.asset import Asset
 from mitsplat.errors import InputError
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.scene.loading.scene_loading import load_scene
+from mitsplat.scene.planning.unit_warnings import unit_warnings
+from mitsplat.scene.spec.scene_spec import SceneSpec
 from tests.cli.typed import run
 
 
@@ -115,3 +117,35 @@ def test_commands_refuse_misspelt_formats_and_other_files_with_a_hint(
     with pytest.raises(InputError, match="a mesh; bake it first"):
         Asset.load(tmp_path / "part.stl")
     shutil.rmtree(tmp_path / "out", ignore_errors=True)
+
+
+@pytest.mark.parametrize(
+    ("changes", "text", "cause"),
+    [
+        ({"region": {"min": [-100, -100, 50], "max": [100, 100, 250]}}, "region: it is 200 m long", "millimetres?"),
+        (
+            {"lights": [{"kind": "point", "position": [0, 0, 1500], "intensity": 3}]},
+            "lights[0]: it is 1500 m away",
+            "millimetres?",
+        ),
+        (
+            {"lights": [{"kind": "environment", "colour": [255, 240, 230]}]},
+            "lights[0].colour: its factors are up to 255",
+            "from 0 to 255?",
+        ),
+        (
+            {"shapes": [{"name": "a", "box": {"size": [1, 1, 1], "position": [0, 0, -1], "rotate": [0, 0, 1.57]}}]},
+            "shapes[0]: it is rotated by 0, 0, 1.57 degrees",
+            "radians?",
+        ),
+    ],
+)
+def test_values_in_another_unit_are_reported(scene_data, changes: dict[str, object], text: str, cause: str) -> None:
+    assert list(unit_warnings(SceneSpec(**scene_data))) == []
+    (found,) = unit_warnings(SceneSpec(**scene_data | changes))
+    assert found.text == text and cause in found.remedy
+
+
+def test_a_pattern_of_assets_names_the_key_for_it(scene_data, write_scene) -> None:
+    scene_data["objects"][0]["asset"] = "assets/*"
+    assert "assets/*: no such folder; is it a pattern, for the key pool?" in error_of(write_scene(scene_data))

@@ -19,6 +19,8 @@ from mitsplat.gaussians.surfels import place_surfels
 from mitsplat.geometry.camera import Camera
 from mitsplat.images.colour import decode_srgb, encode_srgb
 from mitsplat.renderer.layers import make_integrator, make_splats_shape, render_layers
+from mitsplat.renderer.light.reflections import COLUMN_STEP, RAY_STEP, ROW_STEP
+from mitsplat.renderer.light.shadow_rays import ROBERTS
 from tests.renderer.test_bounce import mitsuba_camera
 from tests.renderer.test_light import WHITE_SKY, down_camera, floor, nothing, slab
 
@@ -55,6 +57,31 @@ def furnace(metallic: float, roughness: float, albedo: float) -> tuple[mi.Scene,
     sphere = make_splats_shape(replace(splats, materials=materials), proxy=ball, instance=1)
     camera = Camera.look_at((0, -0.6, 0.3), (0, 0, 0), width=64, height=48, fov_x=25)
     return mi.load_dict({"type": "scene", "sphere": sphere, "sky": WHITE_SKY}), camera
+
+
+@pytest.mark.parametrize(
+    "steps",
+    [
+        (RAY_STEP,),
+        (COLUMN_STEP,),
+        (ROW_STEP,),
+        (COLUMN_STEP + ROW_STEP,),
+        (COLUMN_STEP - ROW_STEP,),
+        (COLUMN_STEP, ROW_STEP),
+        (COLUMN_STEP, RAY_STEP),
+        (ROW_STEP, RAY_STEP),
+    ],
+)
+def test_rays_of_rows_columns_and_blocks_are_even(steps: tuple[int, ...]) -> None:
+    """The smallest distance of n points on a torus is at least 0.43 of that of a hexagonal lattice.
+
+    That is sqrt(2 / (sqrt(3) n)), the largest distance possible.
+    """
+    numbers = sum(np.arange(8)[(slice(None), *[None] * i)] * step for i, step in enumerate(steps)).ravel()
+    points = np.stack([numbers * factor % 2**32 for factor in ROBERTS], axis=1) / 2**32
+    differences = (points[:, None] - points)[~np.eye(len(points), dtype=bool)]
+    distance = np.linalg.norm(differences - np.rint(differences), axis=1).min()
+    assert distance > 0.43 * np.sqrt(2 / (np.sqrt(3) * len(points)))
 
 
 @pytest.mark.parametrize(("metallic", "albedo"), [(1.0, 1.0), (0.0, 0.6)])

@@ -9,6 +9,7 @@ renders them.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, cast
@@ -196,7 +197,7 @@ class VisibilityPredictor:
             text = f"shows {share:.3g} of the labelled objects, but in_view is {rules.in_view:g}"
             found.append((1 - share / rules.in_view, text))
         away = self._clearance(eye, rules.clearance)
-        if name := containing_solid(self._scene, self._layout, eye):
+        if name := containing_solid(self._scene, self._layout, eye, self._near(eye, 0.0)):
             found.append((1.0, f"is inside {name}"))
         elif away < rules.clearance:
             text = f"is {away:.3g} m from the nearest surface, but clearance is {rules.clearance:g}"
@@ -217,11 +218,16 @@ class VisibilityPredictor:
         return [one for one, is_near in zip(self._layout.instances, near, strict=True) if is_near]
 
 
-def containing_solid(scene: Scene, layout: Layout, point: Float64Array) -> str:
-    """Return the description of the visible shape or the object that contains a point [m]; empty if none does."""
+def containing_solid(
+    scene: Scene, layout: Layout, point: Float64Array, instances: Sequence[Instance] | None = None
+) -> str:
+    """Return the description of the visible shape or the object that contains a point [m]; empty if none does.
+
+    ``instances`` are the objects to test, by default all of the layout.
+    """
     if name := enclosing_shape(scene, point, layout.index):
         return f"shape {name!r}"
-    for one in layout.instances:
+    for one in layout.instances if instances is None else instances:
         mesh = _mesh(scene, one.asset)
         if points_inside(mesh, _local(point, one.world_from_object)[None])[0]:
             return f"object {one.id} ({scene.assets[one.asset].name})"

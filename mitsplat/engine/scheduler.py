@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Generator, Mapping, Sequence
+from typing import Generic
 
 from mitsplat.engine.answers import Failure, Lost, LostWorkersError, Pool, Result, Status
 from mitsplat.engine.frame_queue import FrameQueue
@@ -36,81 +37,109 @@ def run_pool(
     Raises:
         InputError, MissingResourceError, FrameError, LostWorkersError: As :func:`mitsplat.engine.pool.run_frames`.
     """
-    queue = FrameQueue(layouts)
-    max_workers = min(max_workers, queue.left)
-    growth = WorkerGrowth(max_workers)
-    losses: Counter[int] = Counter()
-    at_work: dict[int, tuple[int, float]] = {}  # frame, and the time when it was assigned
-    gone = 0
-    gone_at_start: dict[int, int] = {}  # by live worker: number of workers gone when it got its frame
+    yield from _Scheduler(pool, layouts, max_workers, note, grow=grow).run()
 
-    def assign(worker: int) -> None:
-        gone_at_start[worker] = gone
-        if (task := queue.take(worker)) is not None:
-            at_work[worker] = task[1], time.monotonic()
-            pool.send_frame(worker, task[1], task[0])
 
-    for _ in range(min(1, max_workers) if grow else max_workers):
-        assign(pool.start())
-    while at_work:
-        for worker, answer in pool.wait():
-            if isinstance(answer, Status):
-                note(answer.text)
-                continue
-            if worker not in at_work:
-                gone_at_start.pop(worker, None)  # died while idle
-                continue
-            frame, begin = at_work.pop(worker)
-            if isinstance(answer, Failure) and not answer.exhausted:
-                raise answer.error(frame)
-            if isinstance(answer, Failure):
-                queue.put_back(worker, frame)
-                pool.stop(worker)
-                grow = False
-                if gone_at_start.pop(worker) < gone:  # the missing memory may be free now
-                    assign(pool.start())
-                    continue
-                if not gone_at_start:
-                    raise memory_error(frame, answer.message)
-                gone += 1
-                left = f"{len(gone_at_start)} worker{'s' * (len(gone_at_start) > 1)}"
-                note(f"memory ran out in frame {frame}, which is repeated with {left}")
-                if not at_work:
-                    assign(next(iter(gone_at_start)))
-                continue
-            if isinstance(answer, Lost):
-                del gone_at_start[worker]
-                gone += 1
-                losses[frame] += 1
-                if losses[frame] == MAX_LOSSES:
-                    raise LostWorkersError(
-                        f"the worker of frame {frame} {answer.how}, {MAX_LOSSES} times in a row (out of memory?); "
-                        "finished frames are kept"
-                    )
-                queue.put_back(worker, frame)
-                note(f"the worker of frame {frame} {answer.how}: the frame is repeated")
-                grow = False
-                if not at_work:
-                    assign(pool.start())
-                continue
-            if grow:
-                match growth.decide(worker, len(at_work) + 1, begin, time.monotonic()):
-                    case "start" if queue.left:
-                        assign(pool.start())
-                    case "stop":
-                        grow = False
-                        queue.leave(worker)
-                        pool.stop(worker)
-                        del gone_at_start[worker]
-                        yield answer.result
-                        continue
-                    case "stay":
-                        grow = False
-            assign(worker)
-            yield answer.result
-        for _ in range(pool.free_slots()):
-            if queue.left:
-                assign(pool.start())
+class _Scheduler(Generic[Result]):
+    """State of a run, see :func:`run_pool`."""
+
+    def __init__(
+        self, pool: Pool[Result], layouts: Mapping[int, Sequence[int]], max_workers: int, note: Note, *, grow: bool
+    ) -> None:
+        self._pool, self._note, self._grow = pool, note, grow
+        self._queue = FrameQueue(layouts)
+        self._max_workers = min(max_workers, self._queue.left)
+        self._growth = WorkerGrowth(self._max_workers)
+        self._losses: Counter[int] = Counter()
+        self._at_work: dict[int, tuple[int, float]] = {}  # frame, and the time when it was assigned
+        self._gone = 0
+        self._gone_at_start: dict[int, int] = {}  # by live worker: number of workers gone when it got its frame
+
+    def run(self) -> Generator[Result]:
+        """Yield the results."""
+        for _ in range(min(1, self._max_workers) if self._grow else self._max_workers):
+            self._assign(self._pool.start())
+        while self._at_work:
+            for worker, answer in self._pool.wait():
+                if isinstance(answer, Status):
+                    self._note(answer.text)
+                elif worker not in self._at_work:
+                    self._gone_at_start.pop(worker, None)  # died while idle
+                elif isinstance(answer, Lost):
+                    self._repeat_lost(worker, answer.how)
+                elif isinstance(answer, Failure):
+                    self._handle_failure(worker, answer)
+                else:
+                    self._assign_next(worker)
+                    yield answer.result
+            for _ in range(self._pool.free_slots()):
+                if self._queue.left:
+                    self._assign(self._pool.start())
+
+    def _assign(self, worker: int) -> None:
+        """Send the next frame to an idle worker, if there is one."""
+        self._gone_at_start[worker] = self._gone
+        if (task := self._queue.take(worker)) is not None:
+            layout, frame = task
+            self._at_work[worker] = frame, time.monotonic()
+            self._pool.send_frame(worker, frame, layout)
+
+    def _repeat_lost(self, worker: int, how: str) -> None:
+        """Return the frame of a lost worker to the queue.
+
+        Raises:
+            LostWorkersError: If the frame has terminated :data:`MAX_LOSSES` workers.
+        """
+        frame, _ = self._at_work.pop(worker)
+        del self._gone_at_start[worker]
+        self._gone += 1
+        self._losses[frame] += 1
+        if self._losses[frame] == MAX_LOSSES:
+            raise LostWorkersError(
+                f"the worker of frame {frame} {how}, {MAX_LOSSES} times in a row (out of memory?); finished frames are "
+                "kept"
+            )
+        self._queue.put_back(worker, frame)
+        self._note(f"the worker of frame {frame} {how}: the frame is repeated")
+        self._grow = False
+        if not self._at_work:
+            self._assign(self._pool.start())
+
+    def _handle_failure(self, worker: int, failure: Failure) -> None:
+        """Repeat a frame for which memory did not suffice, with fewer workers; raise any other failure."""
+        frame, _ = self._at_work.pop(worker)
+        if not failure.exhausted:
+            raise failure.error(frame)
+        self._queue.put_back(worker, frame)
+        self._pool.stop(worker)
+        self._grow = False
+        if self._gone_at_start.pop(worker) < self._gone:  # the missing memory may be free now
+            self._assign(self._pool.start())
+            return
+        if not self._gone_at_start:
+            raise memory_error(frame, failure.message)
+        self._gone += 1
+        left = f"{len(self._gone_at_start)} worker{'s' * (len(self._gone_at_start) > 1)}"
+        self._note(f"memory ran out in frame {frame}, which is repeated with {left}")
+        if not self._at_work:
+            self._assign(next(iter(self._gone_at_start)))
+
+    def _assign_next(self, worker: int) -> None:
+        """Send a frame to a worker that has finished one, and adapt the number of workers to their speed."""
+        _, begin = self._at_work.pop(worker)
+        change = ""
+        if self._grow:
+            change = self._growth.decide(worker, len(self._at_work) + 1, begin, time.monotonic())
+        if change == "start" and self._queue.left:
+            self._assign(self._pool.start())
+        if change in ("stop", "stay"):
+            self._grow = False
+        if change == "stop":
+            self._queue.leave(worker)
+            self._pool.stop(worker)
+            del self._gone_at_start[worker]
+        else:
+            self._assign(worker)
 
 
 def memory_error(frame: int, why: str) -> MissingResourceError:

@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.record import figure, recording
+from mitsplat.capture.alignment.target_evidence import fit_similarity
 from mitsplat.capture.capture import Capture
-from mitsplat.capture.metric_frame import fit_similarity
 
 
 def compare(capture: Path, poses: Path) -> None:

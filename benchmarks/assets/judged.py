@@ -10,8 +10,8 @@ import numpy as np
 
 from benchmarks.record import figure
 from mitsplat.arrays import Float64Array
+from mitsplat.capture.alignment.target_evidence import fit_similarity
 from mitsplat.capture.capture import Capture
-from mitsplat.capture.metric_frame import fit_similarity
 from mitsplat.geometry.camera import Camera
 from mitsplat.reconstruct.asset_evaluation import VERDICT_FILE
 

@@ -27,9 +27,9 @@ from benchmarks.assets import photographing
 from benchmarks.assets.judged import tell_wanted
 from benchmarks.assets.photographing import Sensors, by_name, paint, photograph, speckle
 from benchmarks.record import figure, recording
+from mitsplat.capture.alignment.target_evidence import fit_similarity
 from mitsplat.capture.boards.targets import Board
 from mitsplat.capture.capture import Capture
-from mitsplat.capture.metric_frame import fit_similarity
 from mitsplat.capture.pipeline.capture_pipeline import CaptureSettings
 from mitsplat.dataset.write import write_dataset
 from mitsplat.fit.trainer import FitSettings

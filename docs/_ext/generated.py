@@ -38,7 +38,17 @@ PACKAGES = (
         "report",
         "detector",
     ),
-    *("capture", "capture.video", "capture.boards", "capture.lighting", "fit", "reconstruct", "bake", "checks"),
+    *(
+        "capture",
+        "capture.video",
+        "capture.boards",
+        "capture.alignment",
+        "capture.lighting",
+        "fit",
+        "reconstruct",
+        "bake",
+        "checks",
+    ),
 )
 
 

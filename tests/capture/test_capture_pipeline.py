@@ -20,8 +20,9 @@ from PIL import ExifTags, Image, ImageFilter
 
 from benchmarks.assets.photographing import photograph
 from mitsplat.capture import structure_from_motion as sfm
+from mitsplat.capture.alignment.metric_frame import find_metric_frame
+from mitsplat.capture.alignment.target_evidence import fit_similarity
 from mitsplat.capture.capture import Capture
-from mitsplat.capture.metric_frame import find_metric_frame, fit_similarity
 from mitsplat.capture.photos import Prepared
 from mitsplat.capture.pipeline import capture_pipeline as take
 from mitsplat.capture.pipeline.capture_pipeline import CaptureResult, CaptureSettings, capture_photos
@@ -208,7 +209,7 @@ def test_cameras_with_few_matches_are_named_unless_a_board_confirms_them(
     said = capsys.readouterr().out
     assert "rejected: photo03.png: its camera is wrong: it agrees with only 40% of its matches\n" in said
     assert "warning" not in said
-    monkeypatch.setattr("mitsplat.capture.metric_frame._fit_board", lambda *args: None)
+    monkeypatch.setattr("mitsplat.capture.alignment.target_evidence._fit_board", lambda *args: None)
     for _ in range(2):  # first computed, then reused
         assert run("capture", given, "-o", tmp_path / "out", "--kind", "environment") == 0
         said = capsys.readouterr().out
@@ -237,7 +238,7 @@ def test_a_camera_that_the_board_contradicts_is_left_out(
     assert found.capture.table
     assert found.doubtful == {}
     assert len(found.capture.photos) == len(result.capture.photos) - 1
-    monkeypatch.setattr("mitsplat.capture.metric_frame._fit_board", lambda *args: None)
+    monkeypatch.setattr("mitsplat.capture.alignment.target_evidence._fit_board", lambda *args: None)
     again = capture_photos(given, tmp_path / "again", settings)
     assert again.doubtful == {doubted: 0.6}
 

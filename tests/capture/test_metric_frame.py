@@ -12,14 +12,14 @@ import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from mitsplat.capture import metric_frame as anchor
-from mitsplat.capture.boards.targets import Board, find_tags
-from mitsplat.capture.metric_frame import (
+from mitsplat.capture.alignment import target_evidence
+from mitsplat.capture.alignment.metric_frame import (
     find_metric_frame,
     find_table,
-    fit_similarity,
     vertical_from_cameras,
 )
+from mitsplat.capture.alignment.target_evidence import fit_similarity
+from mitsplat.capture.boards.targets import Board, find_tags
 from mitsplat.capture.structure_from_motion import SparseModel
 from mitsplat.errors import InputError
 from mitsplat.geometry.camera import Camera
@@ -111,7 +111,8 @@ def test_a_board_determines_scale_and_vertical(tmp_path: Path) -> None:
     assert tilt < 0.05
     assert abs(height) < 1e-4
     assert found.scale_error is not None
-    assert anchor.PRINT_ERROR / BOARD.square <= found.scale_error < 1.2 * anchor.PRINT_ERROR / BOARD.square
+    least = target_evidence.PRINT_ERROR / BOARD.square
+    assert least <= found.scale_error < 1.2 * least
     middle = find_metric_frame(model, images, board=BOARD, centred=False).matrix @ LOST
     np.testing.assert_allclose(middle[:3, 3], 0, atol=1e-4)
     np.testing.assert_allclose(middle[:3, :3], np.eye(3), atol=1e-3)  # axes of the board
@@ -152,9 +153,9 @@ def test_a_camera_is_rejected_if_its_error_stands_out(usual: float, off: float, 
             angle = rng.uniform(0, 2 * np.pi)
             error = (off if k == 0 else usual) * camera.width
             views[index][f"{k:02}"] = camera, pixel + error * np.array([np.cos(angle), np.sin(angle)])
-    found, confirmed = anchor._check_cameras(views, dict(enumerate(BOARD.corners)))
+    found, confirmed = target_evidence._check_cameras(views, dict(enumerate(BOARD.corners)))
     assert set(found) == ({"00"} if wrong else set())
-    assert confirmed == ({f"{k:02}" for k in range(1, 10)} if usual < anchor.MAX_CONTRADICTION else set())
+    assert confirmed == ({f"{k:02}" for k in range(1, 10)} if usual < target_evidence.MAX_CONTRADICTION else set())
 
 
 def test_a_bent_board_rejects_no_camera() -> None:
@@ -169,8 +170,8 @@ def test_a_bent_board_rejects_no_camera() -> None:
         index: {f"{k:02}": (camera, camera.project(point)[0][0]) for k, camera in enumerate(high + low)}
         for index, point in enumerate(bent)
     }
-    corners = anchor._triangulate_corners(views, {f"{k:02}" for k in range(33)})
-    assert anchor._check_cameras(views, corners) == ({}, frozenset(f"{k:02}" for k in range(33)))
+    corners = target_evidence._triangulate_corners(views, {f"{k:02}" for k in range(33)})
+    assert target_evidence._check_cameras(views, corners) == ({}, frozenset(f"{k:02}" for k in range(33)))
 
 
 def test_the_stated_scale_error_covers_drifting_cameras() -> None:
@@ -187,12 +188,12 @@ def test_the_stated_scale_error_covers_drifting_cameras() -> None:
         }
 
         def measure(chosen: set[str], seen: Any = seen) -> float | None:
-            fitted = anchor._fit_board(anchor._triangulate_corners(seen, chosen), BOARD)
+            fitted = target_evidence._fit_board(target_evidence._triangulate_corners(seen, chosen), BOARD)
             return None if fitted is None else fitted[1]
 
         scale = measure(set(names))
         assert scale is not None
-        ratios.append((scale - 1) / anchor._scale_error(scale, measure, names, 1e9))
+        ratios.append((scale - 1) / target_evidence._scale_error(scale, measure, names, 1e9))
     assert 0.5 < np.sqrt(np.mean(np.square(ratios))) < 2
 
 

@@ -13,13 +13,13 @@ from typing import Literal
 import numpy as np
 
 from mitsplat.arrays import BoolArray
+from mitsplat.capture.alignment.metric_frame import DEFAULT_BOARD, MetricFrame, find_metric_frame
 from mitsplat.capture.boards.board_mask import bare_squares
 from mitsplat.capture.boards.targets import Board
 from mitsplat.capture.capture import CAPTURE_FILE, Capture, Photo
 from mitsplat.capture.exposure import even_exposure
 from mitsplat.capture.isolation import ChosenObject, occluded_part
 from mitsplat.capture.known_poses import read_poses
-from mitsplat.capture.metric_frame import DEFAULT_BOARD, MetricFrame, find_metric_frame
 from mitsplat.capture.photo_masks import (
     add_masks,
     check_borders,
@@ -70,7 +70,7 @@ class CaptureSettings:
         frames: Maximum number of frames taken from a video.
         board: ChArUco board to detect.
         tag: Edge length of printed AprilTags [m]; None if unknown.
-        scale_from: Two points and their distance [m], as in :func:`mitsplat.capture.metric_frame.spot`.
+        scale_from: Two points and their distance [m], as in :func:`mitsplat.capture.alignment.metric_frame.spot`.
         poses: COLMAP model or ``transforms.json`` with given cameras.
         metric: True if ``poses`` are in metres with z up; they are then not transformed.
         masks: Folder of masks.

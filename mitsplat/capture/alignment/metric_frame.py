@@ -5,46 +5,23 @@ Targets give both. A known distance gives the scale alone, the table plane or ca
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-import cv2
 import numpy as np
 import numpy.typing as npt
-from skimage.transform import SimilarityTransform
 
 from mitsplat.arrays import Float64Array
-from mitsplat.capture.boards.targets import Board, find_tags
+from mitsplat.capture.alignment.target_evidence import FrameEvidence, board_evidence, find_targets, tag_evidence
+from mitsplat.capture.boards.targets import Board
 from mitsplat.capture.structure_from_motion import SparseModel
 from mitsplat.errors import InputError
-from mitsplat.geometry.camera import Camera
-from mitsplat.geometry.triangulation import nearest_point_to_lines, triangulate
-from mitsplat.images.picture_files import read_picture
+from mitsplat.geometry.triangulation import nearest_point_to_lines
 
 DEFAULT_BOARD = Board()
 """Default board of `mitsplat board`."""
-
-MAX_CONTRADICTION = 0.0025
-"""Reprojection error of the board up to which a camera is confirmed, as a fraction of the longer image edge."""
-
-_WRONG_LIMIT = 0.01
-"""Reprojection error above which a camera is always wrong, as a fraction of the longer image edge.
-
-Between both limits, a camera is wrong if its error is an outlier.
-"""
-
-_OUTLIER_FACTOR = 3.0
-"""Factor of the median camera error above which an error is an outlier."""
-
-PRINT_ERROR = 1e-4
-"""Standard error of the user's measurement of a printed square or tag edge [m]."""
-
-_GROUPS = 6
-"""Number of image groups of the jackknife for the scale error."""
-
-_Views = dict[int, dict[str, tuple[Camera, Float64Array]]]
 
 _MIN_TILT_COSINE = np.cos(np.radians(30))
 """Cosine of the largest angle between the table normal and the vertical that the cameras suggest."""
@@ -104,47 +81,13 @@ def find_metric_frame(
         InputError: If ``scale_from`` names points that do not exist, or all cameras coincide with the point at which
             they are directed.
     """
-    views, tag_views = _find_targets(model, images, board, tags=tag is not None)
-    corners = _triangulate_corners(views, set(model.cameras))
-    tags = _triangulate_tags(tag_views, set(model.cameras))
-    wrong: dict[str, float] = {}
-    confirmed: frozenset[str] = frozenset()
-    board_pose: Float64Array | None = None
-    scale: tuple[float, float | None] | None = None
-    plane: tuple[Float64Array, Float64Array] | None = None
-    source = ""
-    if fitted := _fit_board(corners, board):
-        pose, factor = fitted
-        board_pose = pose
-        flat = board.corners / factor @ pose[:3, :3].T + pose[:3, 3]
-        wrong, confirmed = _check_cameras(views, {**dict(enumerate(flat)), **corners})
-
-        def board_scale(names: set[str]) -> float | None:
-            fitted = _fit_board(_triangulate_corners(views, names), board)
-            return None if fitted is None else fitted[1]
-
-        error = _scale_error(factor, board_scale, list(model.cameras), board.square)
-        scale, plane = (factor, error), (pose[:3, 2], pose[:3, 3])
-        source = f"a ChArUco board ({len(corners)} corners)"
-    elif tags and tag is not None:
-
-        def tag_scale(names: set[str]) -> float | None:
-            quads = _triangulate_tags(tag_views, names).values()
-            edges = [np.linalg.norm(quad - np.roll(quad, 1, axis=0), axis=1) for quad in quads]
-            return tag / float(np.mean(edges)) if edges else None
-
-        factor = tag_scale(set(model.cameras)) or np.nan
-        scale = factor, _scale_error(factor, tag_scale, list(model.cameras), tag)
-        source = f"{len(tags)} AprilTag{'s' if len(tags) > 1 else ''}"
-        plane = _plane_of_tags(tags)
-    if scale_from is not None and scale is None:
-        one, other, metres = scale_from
-        gap = float(np.linalg.norm(spot(model, one) - spot(model, other)))
-        if not (1e-6 <= metres <= 1e6 and gap > 0):
-            raise InputError(
-                f"the distance of {one} and {other} must be 1e-6 to 1e6 m (got {metres}, {gap:.3g} in the model)"
-            )
-        scale, source = (metres / gap, None), f"the distance of {one} and {other}"
+    views, tag_views = find_targets(model, images, board, tags=tag is not None)
+    evidence = board_evidence(model, views, board)
+    if evidence is None and tag is not None:
+        evidence = tag_evidence(model, tag_views, tag)
+    if evidence is None:
+        evidence = FrameEvidence() if scale_from is None else _distance_evidence(model, scale_from)
+    scale, plane, source, board_pose = evidence.scale, evidence.plane, evidence.source, evidence.board
     if plane is None and (table := find_table(model)) is not None:
         plane = table
         source += f"{', ' if source else ''}the table plane"
@@ -167,7 +110,7 @@ def find_metric_frame(
     distance = float(np.median(np.linalg.norm(centres - target, axis=1)))
     if not distance > 0:
         raise InputError(f"the {len(centres)} cameras must not coincide with the point at which they are directed")
-    factor = scale[0] if scale else 1 / distance
+    factor = 1 / distance if scale is None else scale
     rotation = _upright_rotation(normal, forward[0] if board_pose is None else board_pose[:3, 0])
     matrix = np.eye(4)
     matrix[:3, :3] = factor * rotation
@@ -177,15 +120,30 @@ def find_metric_frame(
         board_pose[:3, :3] /= factor
     return MetricFrame(
         matrix=matrix,
-        units="metre" if scale else "unknown",
+        units="unknown" if scale is None else "metre",
         up="unknown" if plane is None else "z",
         table=plane is not None,
         source=source,
-        scale_error=scale[1] if scale else None,
-        wrong=wrong,
-        confirmed=confirmed,
+        scale_error=evidence.scale_error,
+        wrong=evidence.wrong,
+        confirmed=evidence.confirmed,
         board=board_pose,
     )
+
+
+def _distance_evidence(model: SparseModel, scale_from: tuple[str, str, float]) -> FrameEvidence:
+    """Return the scale by two points and their distance [m].
+
+    Raises:
+        InputError: If a point does not exist, or if the distance is 0 or out of range.
+    """
+    one, other, metres = scale_from
+    gap = float(np.linalg.norm(spot(model, one) - spot(model, other)))
+    if not (1e-6 <= metres <= 1e6 and gap > 0):
+        raise InputError(
+            f"the distance of {one} and {other} must be 1e-6 to 1e6 m (got {metres}, {gap:.3g} in the model)"
+        )
+    return FrameEvidence(scale=metres / gap, source=f"the distance of {one} and {other}")
 
 
 def spot(model: SparseModel, name: str) -> Float64Array:
@@ -221,20 +179,6 @@ def spot(model: SparseModel, name: str) -> Float64Array:
     depth = float(depths[near] @ weights / weights.sum())
     ray = np.append(camera.ray_slopes([(x, y)])[0], 1.0) * depth
     return np.asarray(camera.world_from_camera[:3, :3] @ ray + camera.centre)
-
-
-def fit_similarity(source: Float64Array, target: Float64Array) -> tuple[Float64Array, Float64Array]:
-    """Fit the similarity between two point sets (Umeyama 1991).
-
-    Args:
-        source: Points, shape (N, 3).
-        target: Corresponding points, shape (N, 3).
-
-    Returns:
-        Matrix, shape (4, 4), and the residuals, shape (N, 3).
-    """
-    matrix = np.asarray(SimilarityTransform.from_estimate(source, target).params, dtype=np.float64)
-    return matrix, source @ matrix[:3, :3].T + matrix[:3, 3] - target
 
 
 def find_table(model: SparseModel, *, trials: int = 30000, seed: int = 0) -> tuple[Float64Array, Float64Array] | None:
@@ -336,116 +280,3 @@ def _upright_rotation(normal: Float64Array, heading: Float64Array) -> Float64Arr
         x = x - x @ normal * normal
     x = x / np.linalg.norm(x)
     return np.stack([x, np.cross(normal, x), normal])
-
-
-def _find_targets(model: SparseModel, images: Mapping[str, Path], board: Board, *, tags: bool) -> tuple[_Views, _Views]:
-    """Detect board corners and AprilTags in the images.
-
-    Returns:
-        Pixels (2,) of board corners by index and image, and pixels (4, 2) of tag corners by tag id and image.
-    """
-    corner_views: _Views = {}
-    tag_views: _Views = {}
-    for name, camera in model.cameras.items():
-        grey = read_picture(images[name], cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
-        if grey is None:
-            raise InputError(f"{images[name]}: not a readable image")
-        pixels = np.asarray(grey, dtype=np.uint8)
-        for found, views in ((board.find(pixels), corner_views), (find_tags(pixels) if tags else {}, tag_views)):
-            for index, places in found.items():
-                views.setdefault(index, {})[name] = (camera, places)
-    return corner_views, tag_views
-
-
-def _scale_error(scale: float, measure: Callable[[set[str]], float | None], images: list[str], edge: float) -> float:
-    """Return the relative standard error of a scale, from the print and a jackknife over image groups (Tukey 1958).
-
-    The residuals of corners are too optimistic, because a deformation of the whole model moves all corners together. So
-    the scale is measured with every sixth image left out in turn, which also changes the mix of cameras.
-
-    Args:
-        scale: Scale from all images.
-        measure: Function that returns the scale from a subset of the images, or None if they are not sufficient.
-        images: Names of all images.
-        edge: Edge length measured by the user [m].
-    """
-    found = [measure(set(images) - set(images[first::_GROUPS])) for first in range(_GROUPS)]
-    scales = np.array([value for value in found if value is not None])
-    drawn = float(np.sqrt((len(scales) - 1) * scales.var())) / scale if len(scales) > 1 else 0.0
-    return float(np.hypot(drawn, PRINT_ERROR / edge))
-
-
-def _triangulate_corners(views: _Views, names: set[str]) -> dict[int, Float64Array]:
-    """Triangulate the board corners that enough of the named images show; points (3,) by index."""
-    found = {i: triangulate([view for name, view in seen.items() if name in names]) for i, seen in views.items()}
-    return {index: point for index, point in found.items() if point is not None}
-
-
-def _triangulate_tags(views: _Views, names: set[str]) -> dict[int, Float64Array]:
-    """Triangulate the tags that enough of the named images show; corners (4, 3) in the model by tag id."""
-    tags = {}
-    for number, seen in views.items():
-        shown = [view for name, view in seen.items() if name in names]
-        points = (triangulate([(camera, quad[corner]) for camera, quad in shown]) for corner in range(4))
-        found = [point for point in points if point is not None]
-        if len(found) == 4:
-            tags[number] = np.array(found)
-    return tags
-
-
-def _check_cameras(views: _Views, corners: Mapping[int, Float64Array]) -> tuple[dict[str, float], frozenset[str]]:
-    """Compare the cameras with the board.
-
-    A camera is judged if it observes at least six corners. Cameras with few or repetitive points can be far off at
-    small reprojection errors.
-
-    Args:
-        views: Observations of board corners.
-        corners: Positions (3,) of the corners by index. Triangulated positions are best, because a bent print is not
-            flat.
-
-    Returns:
-        Images that contradict the board, with their error [px], and images that agree with it.
-    """
-    errors: dict[str, list[float]] = {}
-    edges = {}
-    for index, seen in views.items():
-        for name, (camera, pixel) in seen.items():
-            error = np.linalg.norm(camera.project(corners[index])[0][0] - pixel)
-            errors.setdefault(name, []).append(float(np.nan_to_num(error, nan=np.inf)))
-            edges[name] = max(camera.width, camera.height)
-    shares = {name: float(np.median(found)) / edges[name] for name, found in errors.items() if len(found) >= 6}
-    if not shares:
-        return {}, frozenset()
-    outlying = _OUTLIER_FACTOR * float(np.median(list(shares.values())))
-    limit = min(max(MAX_CONTRADICTION, outlying), _WRONG_LIMIT)
-    wrong = {name: share * edges[name] for name, share in shares.items() if share > limit}
-    return wrong, frozenset(name for name, share in shares.items() if share <= MAX_CONTRADICTION)
-
-
-def _fit_board(corners: Mapping[int, Float64Array], board: Board) -> tuple[Float64Array, float] | None:
-    """Return the pose (4, 4) of the board in the model, and the metres per unit of the model.
-
-    The result is None if there are too few corners or their arrangement does not match the board.
-    """
-    if len(corners) < 6:
-        return None
-    ids = sorted(corners)
-    printed = board.corners[ids]
-    matrix, residuals = fit_similarity(printed, np.array([corners[index] for index in ids]))
-    scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
-    rms = float(np.sqrt((residuals**2).sum(axis=1).mean())) / scale
-    spread = float(np.sqrt(((printed - printed.mean(axis=0)) ** 2).sum(axis=1).mean()))
-    if rms > 0.05 * spread:
-        return None
-    pose = matrix.copy()
-    pose[:3, :3] /= scale
-    return pose, 1 / scale
-
-
-def _plane_of_tags(tags: Mapping[int, Float64Array]) -> tuple[Float64Array, Float64Array] | None:
-    """Return the normal and a point of the common plane of the tags, or None if they are not in one plane."""
-    corners = np.concatenate(list(tags.values()))
-    point = corners.mean(axis=0)
-    _, spread, axes = np.linalg.svd(corners - point)
-    return (axes[2], point) if spread[2] < 0.02 * spread[0] else None

@@ -66,8 +66,8 @@ class _Lens(BaseModel):
     is_fisheye: bool = False
 
 
-_MIN_CENTRE = 0.25
-"""Minimum distance of a principal point from the border, relative to the image, if its image size is not stated."""
+_MIN_CENTRE, _MIN_FOCAL = (0.25, 0.1), 0.1
+"""Minimum distance of a principal point from the border without and with a stated size, and focal length [sizes]."""
 
 
 class _Frame(_Lens):
@@ -261,11 +261,11 @@ def _read_transforms(
             camera = _camera(lens, round(width), round(height), np.array(frame.transform_matrix))
         except ValueError as error:
             raise InputError(f"{path}: frames[{number}]: {error}") from error
-        across = camera.cx / width, camera.cy / height
-        if frame.file_path not in sized and not all(_MIN_CENTRE < share < 1 - _MIN_CENTRE for share in across):
+        across, least = (camera.cx / width, camera.cy / height), _MIN_CENTRE[frame.file_path in sized]
+        if camera.fx / width < _MIN_FOCAL or not all(least < share < 1 - least for share in across):
             raise InputError(
-                f"{path}: frames[{number}]: cx, cy = {camera.cx:g}, {camera.cy:g} must be near the middle of the photo "
-                f"of {width} x {height} px: state w and h, the size for which fl_x and cx hold"
+                f"{path}: frames[{number}]: fl_x, cx, cy = {camera.fx:g}, {camera.cx:g}, {camera.cy:g} must be in "
+                f"pixels of a photo of {width:g} x {height:g}: state w and h, the size for which they hold"
             )
         other = cameras.setdefault(frame.file_path, camera)
         if not np.array_equal(other.world_from_camera, camera.world_from_camera):

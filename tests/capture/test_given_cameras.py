@@ -212,7 +212,9 @@ def test_lenses_of_instant_ngp_are_read(tmp_path: Path) -> None:
     ("lens", "sentence"),
     [
         ({"camera_angle_x": 50.0}, "camera_angle_x must be 0 to pi radians (got 50: is it in degrees?)"),
-        ({"fl_x": 900, "cx": 640, "cy": 480}, "cx, cy = 640, 480 must be near the middle of the photo of 640 x 480 px"),
+        ({"fl_x": 900, "cx": 640, "cy": 480}, "fl_x, cx, cy = 900, 640, 480 must be in pixels of a photo of 640 x 480"),
+        ({"fl_x": 8, "cx": 320, "cy": 240, "w": 640, "h": 480}, "fl_x, cx, cy = 8, 320, 240 must be in pixels"),
+        ({"fl_x": 900, "cx": 0.5, "cy": 0.5, "w": 640, "h": 480}, "fl_x, cx, cy = 900, 0.5, 0.5 must be in pixels"),
         ({"fl_x": 900, "cx": 640, "cy": 480, "w": 1280, "h": 960}, ""),
         ({"fl_x": 450, "cx": 300, "cy": 250}, ""),
         ({"fl_x": 450, "k5": 0.1}, "has distortion in k5, k6 or distortion_params, which are not read"),

@@ -10,33 +10,30 @@ from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
 import numpy as np
-import trimesh
 
 from mitsplat.arrays import BoolArray, Float64Array
 from mitsplat.asset import Asset
 from mitsplat.errors import InputError
-from mitsplat.geometry.decomposition import MAX_PIECES, convex_pieces, max_gap
-from mitsplat.geometry.mesh import mass_properties, prepare_mesh
-from mitsplat.geometry.mesh_distance import Clearance, DistanceSurface, PlacedSurface, all_clearances, standoff
+from mitsplat.geometry.decomposition import max_gap
+from mitsplat.geometry.mesh import prepare_mesh
+from mitsplat.geometry.mesh_distance import Clearance, DistanceSurface, PlacedSurface, all_clearances
+from mitsplat.physics.bodies import Part, make_collider, make_part
 from mitsplat.physics.contacts import ContactFinder
-from mitsplat.physics.friction import ContactMaterial
 from mitsplat.physics.handling import draw_handling
 from mitsplat.physics.placement import Item, draw_poses
 from mitsplat.physics.rest import CONTACT_OVERFLOW, FREE_TIME, LATE, LEANING, RestOutcome, run_to_rest
-from mitsplat.physics.worlds import Body, Collider, MujocoWorld, WarpWorld, World, all_pieces
+from mitsplat.physics.worlds import Collider, MujocoWorld, WarpWorld, World, all_pieces
 from mitsplat.progress import Note
 from mitsplat.scene.layout import NO_PHYSICS, Instance, Layout, LeftOut, RestCertificate, UnsettledLayoutError
 from mitsplat.scene.planning.contents import draw_arrangements, draw_objects, draw_regions
 from mitsplat.scene.planning.shape_poses import placed_shapes
 from mitsplat.scene.scene import Scene
 from mitsplat.scene.spec.object_spec import Arrangement
-from mitsplat.scene.spec.shape_spec import Shape
 from mitsplat.scene.splits import draw_environment
 from mitsplat.scene.streams import random_stream
 from mitsplat.scene.walls import (
     ENCLOSURE,
     PILE_HEIGHT,
-    bin_walls,
     enclosed_bounds,
     enclosure_box,
     pose_matrix,
@@ -62,16 +59,6 @@ _POUR_SPEED = 1.0  # speed limit of poured objects [m/s]: at higher speed, heavy
 # Simulated time for the draws of a layout [s], ten times that of a typical draw. After it, each rejected draw leaves
 # objects out.
 _MAX_SIMULATED = 40.0
-_CONCAVITIES = (0.02, 0.01, 0.005)  # concavity of convex pieces, from coarse to fine
-
-
-@dataclass(frozen=True, eq=False)
-class _Part:
-    """Physics data of an asset; ``standoff`` as in :func:`mitsplat.geometry.mesh_distance.standoff`."""
-
-    body: Body
-    surface: DistanceSurface
-    standoff: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,7 +140,7 @@ class Drop:
 
     def __init__(self, scene: Scene, progress: Note) -> None:
         self.scene = scene
-        self._parts: dict[int, _Part] = {}
+        self._parts: dict[int, Part] = {}
         self._worlds: dict[tuple[tuple[int, ...], float, int], World] = {}
         self._world_count = 0
         self._objects = [self._part(asset, progress) for asset in scene.assets]
@@ -406,10 +393,10 @@ class Drop:
             )
         return self._worlds[key]
 
-    def _part(self, asset: Asset, progress: Note) -> _Part:
+    def _part(self, asset: Asset, progress: Note) -> Part:
         """Build the physics data of an asset, once for all entries that share its mesh."""
         if id(asset.mesh) not in self._parts:
-            self._parts[id(asset.mesh)] = _make_part(asset, progress)
+            self._parts[id(asset.mesh)] = make_part(asset, progress)
         return self._parts[id(asset.mesh)]
 
     def _make_ground(self, surroundings: Asset | None, progress: Note, layout: int | None = None) -> _Ground:
@@ -573,56 +560,6 @@ class Drop:
         )
 
 
-def make_body(asset: Asset, progress: Note) -> Body:
-    """Return the rigid body of an asset: its convex pieces, computed if it has none, its mass and its material.
-
-    Raises:
-        InputError: If the asset has no mesh, or its mesh has no volume.
-    """
-    return _make_part(asset, progress).body
-
-
-def make_collider(surface: Asset | Shape, mesh: trimesh.Trimesh, progress: Note) -> Collider:
-    """Return the static collider of a shape, or of an environment.
-
-    Args:
-        surface: The shape or environment.
-        mesh: Its mesh in world space [m], prepared by :func:`mitsplat.geometry.mesh.prepare_mesh`.
-        progress: Callback for slow operations.
-    """
-    if isinstance(surface, Asset):
-        return Collider(_material(surface), pieces=surface.pieces or _pieces(mesh, surface.name, progress))
-    if surface.bin is not None:
-        return Collider(_material(surface), pieces=bin_walls(surface.bin))
-    if surface.box is None:
-        return Collider(_material(surface), pieces=_pieces(mesh, surface.name, progress))
-    return Collider(_material(surface), box=(surface.box.size, pose_matrix(surface.box)))
-
-
-def _make_part(asset: Asset, progress: Note) -> _Part:
-    """Build the physics data of an asset."""
-    if asset.mesh is None:
-        raise InputError(f"asset {asset.name!r} must have a mesh for physics (got none)")
-    mesh = prepare_mesh(asset.mesh, f"asset {asset.name!r}")
-    surface = DistanceSurface(mesh)
-    pieces, standoff_distance = asset.pieces, 0.0
-    if pieces:
-        standoff_distance = standoff(surface, pieces)
-    else:
-        limit = max_gap(float(mesh.extents.max()))
-        for threshold in _CONCAVITIES:
-            pieces = _pieces(mesh, asset.name, progress, threshold=threshold)
-            standoff_distance = standoff(surface, pieces)
-            if standoff_distance <= limit:
-                break
-    mass = mass_properties(mesh, pieces, density=asset.density, mass=asset.mass)
-    return _Part(Body(pieces, mass, _material(asset)), surface, standoff_distance)
-
-
-def _material(surface: Asset | Shape) -> ContactMaterial:
-    return ContactMaterial(surface.friction, surface.restitution, surface.rolling_friction, surface.torsional_friction)
-
-
 def _support_gaps(resting: Sequence[PlacedSurface], clearances: Sequence[Clearance]) -> dict[PlacedSurface, float]:
     """Compute the distance of each object from its nearest neighbour [m]."""
     return {
@@ -651,10 +588,3 @@ def _rest_defect(
 
 def _deepest(pairs: Iterable[Clearance]) -> float:
     return max([0.0, *(-pair.distance for pair in pairs)])
-
-
-def _pieces(
-    mesh: trimesh.Trimesh, name: str, progress: Note, *, threshold: float = _CONCAVITIES[0]
-) -> tuple[trimesh.Trimesh, ...]:
-    progress(f"computing convex pieces of {name}")
-    return convex_pieces(mesh, threshold=threshold, max_pieces=round(MAX_PIECES * _CONCAVITIES[0] / threshold))

@@ -29,7 +29,7 @@ from mitsplat.storage.content_hash import ContentHash
 
 PACKAGE = Path(__file__).parents[1]
 
-_PHYSICS_MODULES = ("contacts", "drop", "friction", "handling", "placement", "rest", "restitution", "worlds")
+_PHYSICS_MODULES = ("bodies", "contacts", "drop", "friction", "handling", "placement", "rest", "restitution", "worlds")
 MODULES = (
     "geometry.decomposition",
     "geometry.mesh",

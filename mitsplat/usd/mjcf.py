@@ -25,7 +25,8 @@ from mitsplat.errors import InputError
 from mitsplat.geometry.camera import Camera
 from mitsplat.geometry.rigid import OPENCV_FROM_OPENGL
 from mitsplat.images.colour import encode_srgb
-from mitsplat.physics.drop import TIMESTEP, make_body
+from mitsplat.physics.bodies import make_body
+from mitsplat.physics.drop import TIMESTEP
 from mitsplat.physics.friction import GRAVITY, MIN_FRICTION, ContactMaterial
 from mitsplat.physics.settle import warp_settings
 from mitsplat.physics.worlds import CONTACT_TIME, DAMPING_RATIO, IMPEDANCE_MUJOCO, WITH_ROLL, Body

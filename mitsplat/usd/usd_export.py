@@ -27,7 +27,7 @@ from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.camera import Camera
 from mitsplat.geometry.rigid import OPENCV_FROM_OPENGL
 from mitsplat.images.colour import temperature_colour
-from mitsplat.physics.drop import make_body
+from mitsplat.physics.bodies import make_body
 from mitsplat.physics.friction import GRAVITY, MIN_FRICTION, ContactMaterial
 from mitsplat.physics.settle import warp_settings
 from mitsplat.physics.worlds import CONTACT_DAMPING, CONTACT_STIFFNESS, IMPEDANCE_MUJOCO, WITH_ROLL, Body, Collider

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from mitsplat.arrays import Float64Array
 from mitsplat.geometry.camera import Camera
-from mitsplat.physics.drop import make_body
+from mitsplat.physics.bodies import make_body
 from mitsplat.physics.settle import settle_layout, warp_settings
 from mitsplat.scene.loading.scene_loading import load_scene
 from mitsplat.scene.planning.frame_plan import plan_frame

@@ -1,0 +1,86 @@
+"""Rigid bodies of assets and static colliders of shapes, with their convex pieces, mass and contact material."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import trimesh
+
+from mitsplat.asset import Asset
+from mitsplat.errors import InputError
+from mitsplat.geometry.decomposition import MAX_PIECES, convex_pieces, max_gap
+from mitsplat.geometry.mesh import mass_properties, prepare_mesh
+from mitsplat.geometry.mesh_distance import DistanceSurface, standoff
+from mitsplat.physics.friction import ContactMaterial
+from mitsplat.physics.worlds import Body, Collider
+from mitsplat.progress import Note
+from mitsplat.scene.spec.shape_spec import Shape
+from mitsplat.scene.walls import bin_walls, pose_matrix
+
+_CONCAVITIES = (0.02, 0.01, 0.005)  # concavity of convex pieces, from coarse to fine
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """Physics data of an asset; ``standoff`` as in :func:`mitsplat.geometry.mesh_distance.standoff`."""
+
+    body: Body
+    surface: DistanceSurface
+    standoff: float
+
+
+def make_body(asset: Asset, progress: Note) -> Body:
+    """Return the rigid body of an asset: its convex pieces, computed if it has none, its mass and its material.
+
+    Raises:
+        InputError: If the asset has no mesh, or its mesh has no volume.
+    """
+    return make_part(asset, progress).body
+
+
+def make_collider(surface: Asset | Shape, mesh: trimesh.Trimesh, progress: Note) -> Collider:
+    """Return the static collider of a shape, or of an environment.
+
+    Args:
+        surface: The shape or environment.
+        mesh: Its mesh in world space [m], prepared by :func:`mitsplat.geometry.mesh.prepare_mesh`.
+        progress: Callback for slow operations.
+    """
+    if isinstance(surface, Asset):
+        return Collider(_material(surface), pieces=surface.pieces or _pieces(mesh, surface.name, progress))
+    if surface.bin is not None:
+        return Collider(_material(surface), pieces=bin_walls(surface.bin))
+    if surface.box is None:
+        return Collider(_material(surface), pieces=_pieces(mesh, surface.name, progress))
+    return Collider(_material(surface), box=(surface.box.size, pose_matrix(surface.box)))
+
+
+def make_part(asset: Asset, progress: Note) -> Part:
+    """Build the physics data of an asset."""
+    if asset.mesh is None:
+        raise InputError(f"asset {asset.name!r} must have a mesh for physics (got none)")
+    mesh = prepare_mesh(asset.mesh, f"asset {asset.name!r}")
+    surface = DistanceSurface(mesh)
+    pieces, standoff_distance = asset.pieces, 0.0
+    if pieces:
+        standoff_distance = standoff(surface, pieces)
+    else:
+        limit = max_gap(float(mesh.extents.max()))
+        for threshold in _CONCAVITIES:
+            pieces = _pieces(mesh, asset.name, progress, threshold=threshold)
+            standoff_distance = standoff(surface, pieces)
+            if standoff_distance <= limit:
+                break
+    mass = mass_properties(mesh, pieces, density=asset.density, mass=asset.mass)
+    return Part(Body(pieces, mass, _material(asset)), surface, standoff_distance)
+
+
+def _material(surface: Asset | Shape) -> ContactMaterial:
+    return ContactMaterial(surface.friction, surface.restitution, surface.rolling_friction, surface.torsional_friction)
+
+
+def _pieces(
+    mesh: trimesh.Trimesh, name: str, progress: Note, *, threshold: float = _CONCAVITIES[0]
+) -> tuple[trimesh.Trimesh, ...]:
+    progress(f"computing convex pieces of {name}")
+    return convex_pieces(mesh, threshold=threshold, max_pieces=round(MAX_PIECES * _CONCAVITIES[0] / threshold))

@@ -32,7 +32,7 @@ from mitsplat.surroundings.coverage import (
     find_holes,
     free_rectangle,
 )
-from mitsplat.surroundings.depth_views import depth_views, surface_points
+from mitsplat.surroundings.depth_views import SurfacePoints, depth_views, surface_points
 from mitsplat.surroundings.floaters import remove_floaters
 from mitsplat.surroundings.ready_scene import Region, scene_text
 from mitsplat.surroundings.removal import RemovedThing, remove_things
@@ -58,6 +58,7 @@ _MAX_UNCHANGED = 1.5 / 255
 """Largest colour difference of a pixel that the removal of things left unchanged."""
 _MIN_REGION = 0.1
 """Least edge of a drop region [m]."""
+_UP = np.array([0.0, 0.0, 1.0])
 
 
 def reconstruct_environment(
@@ -89,17 +90,13 @@ def reconstruct_environment(
     splats, removed = remove_floaters(splats, capture.training, scale)
     views = depth_views(splats, cameras)
     points = surface_points(views)
-    found = find_supports(points, np.array([0.0, 0.0, 1.0]), scale, within=_MAX_SUPPORT_TILT)
-    if not found and capture.up == "unknown":
-        axes = np.concatenate([np.eye(3), -np.eye(3)])
-        candidates = (find_supports(points, axis, scale, within=_MAX_AXIS_ANGLE) for axis in axes)
-        found = max(candidates, key=lambda supports: supports[0].central_share if supports else 0.0)
+    found = _find_supports(points, scale, vertical_known=capture.up != "unknown")
     motion: Float64Array = np.eye(4)
     if found:
         motion = np.asarray(np.linalg.inv(found[0].pose))
         capture, splats = replace(capture.transformed(motion), up="z", table=True), splats.transformed(motion)
         points, views = points.transformed(motion), [view.transformed(motion) for view in views]
-        found = find_supports(points, np.array([0.0, 0.0, 1.0]), scale, within=_MAX_LEVEL_TILT)
+        found = find_supports(points, _UP, scale, within=_MAX_LEVEL_TILT)
     cameras = [photo.camera for photo in capture.training]
     fitted, things = splats, list[RemovedThing]()
     if job.remove:
@@ -112,13 +109,8 @@ def reconstruct_environment(
         mesh = _mesh(splats.select(~background), capture.training, job, found, scale, progress)
         imported = ImportedMesh(mesh, np.eye(4))
     made = reconstruct_asset(capture, splats, replace(job, imported=imported, remove=()), psnr=psnr, progress=progress)
-    # A given size rotates the asset to its mesh. This rotation is undone, because the support is already parallel to
-    # the axes.
-    factor = float(np.cbrt(np.linalg.det(made.asset_from_capture[:3, :3])))
-    back = np.eye(4)
-    back[:3, :3] = made.asset_from_capture[:3, :3].T / factor
-    larger = np.diag([factor, factor, factor, 1.0])
-    made = replace(made, asset=made.asset.transformed(back), asset_from_capture=larger @ motion)
+    made, larger = _without_rotation(made, motion)
+    factor = float(larger[0, 0])
     error = "" if capture.scale_error is None else f" ± {capture.scale_error:.2%}"
     rows = {
         "Frame": f"{'in metres' if made.asset.units == 'metre' else 'in unknown units'}{error}"
@@ -171,6 +163,29 @@ def reconstruct_environment(
         psnr = _mean_psnr(made.held_out, fitted if things else None)
     verdict = replace(made.verdict, psnr=psnr, rows=rows, findings=tuple(findings))
     return replace(made, verdict=verdict, sections=tuple(sections), record=record)
+
+
+def _find_supports(points: SurfacePoints, scale: float, *, vertical_known: bool) -> list[Support]:
+    """Return the level surfaces; if the vertical is unknown and none is near z, those near any other axis."""
+    found = find_supports(points, _UP, scale, within=_MAX_SUPPORT_TILT)
+    if found or vertical_known:
+        return found
+    axes = np.concatenate([np.eye(3), -np.eye(3)])
+    candidates = (find_supports(points, axis, scale, within=_MAX_AXIS_ANGLE) for axis in axes)
+    return max(candidates, key=lambda supports: supports[0].central_share if supports else 0.0)
+
+
+def _without_rotation(made: Reconstruction, motion: Float64Array) -> tuple[Reconstruction, Float64Array]:
+    """Undo the rotation by which a given size turns an asset to its mesh, because the support is already level.
+
+    Returns:
+        The reconstruction, and the scaling (4, 4) from the frame of the support to that of the asset.
+    """
+    factor = float(np.cbrt(np.linalg.det(made.asset_from_capture[:3, :3])))
+    back = np.eye(4)
+    back[:3, :3] = made.asset_from_capture[:3, :3].T / factor
+    larger = np.diag([factor, factor, factor, 1.0])
+    return replace(made, asset=made.asset.transformed(back), asset_from_capture=larger @ motion), larger
 
 
 def _typical_depth(capture: Capture) -> float:

@@ -64,6 +64,8 @@ _STAGES = {
     "comparing with the mesh": 8,
 }
 """Stages of a bake, with their relative durations."""
+_MAX_BACKS = 0.02
+"""Maximum share of visible points of an object that are backs of one-sided faces."""
 _MIN_BRIGHTNESS, _MAX_BRIGHTNESS = 0.8, 1.25
 """Range of brightness relative to the textures that the size of the Gaussians can explain."""
 
@@ -238,6 +240,12 @@ def bake_asset(
         white=None if lights is None else float(np.pi),
     )
     warnings = [*model.warnings, *(warning for part in parts for warning in part.warnings)]
+    backs = surface.share_of_backs(np.random.default_rng(settings.seed)) if kind == "object" else 0.0
+    if backs > _MAX_BACKS and not any("inside out" in warning for warning in warnings):
+        warnings.append(
+            f"{backs:.0%} of the visible points are backs of faces, which stay empty: the surface is open; close it, "
+            "give it a thickness, or state doubleSided in a glTF file"
+        )
     units = _describe_units(model)
     if not settings.verify_views:
         stages.end()

@@ -22,6 +22,8 @@ _FOOTPRINT_SAMPLES = 16
 """Surface points whose mean is the material of a surfel."""
 _SHEET_LIFT = 3.0
 """Height of surfels above a sheet without thickness, in their standard deviations along the normal."""
+_BACK_RAYS = 20_000
+"""Number of chords of a sphere around the mesh that find backs of faces."""
 _ALIKE = 0.8
 """Minimum cosine between the normal of a surfel and those of the points that it averages."""
 
@@ -50,6 +52,19 @@ class MeshSurface:
         u, v = np.asarray(hit.prim_uv, dtype=np.float64)
         is_hit = np.isfinite(distance)
         return np.where(is_hit, index, -1), np.where(is_hit, (1 - u - v, u, v), 0.0).T, distance
+
+    def share_of_backs(self, rng: np.random.Generator) -> float:
+        """Return the share of visible points that are backs of one-sided faces, seen through openings of the mesh."""
+        random = rng.normal(size=(2, _BACK_RAYS, 3))
+        start, end = random / np.linalg.norm(random, axis=2, keepdims=True)
+        middle = self.mesh.bounds.mean(axis=0)
+        radius = 0.5 * float(np.linalg.norm(self.mesh.extents))
+        origins, ways = middle + 1.5 * radius * start, radius * end - 1.5 * radius * start
+        rays = mi.Ray3f(mi.Point3f(origins.T.astype(np.float32)), mi.Vector3f(ways.T.astype(np.float32)))
+        faces, _, _ = self.trace(rays)
+        cosine = np.einsum("nd,nd->n", self.mesh.face_normals[faces], ways)
+        is_back = (cosine > 0.05 * np.linalg.norm(ways, axis=1)) & ~self._double_sided[faces]
+        return float(is_back[faces >= 0].mean()) if (faces >= 0).any() else 0.0
 
     def place_surfels(self, density: Float64Array, count: int, rng: np.random.Generator) -> Surfels:
         """Place about ``count`` surfels with a relative ``density`` (F,), on both sides of double-sided faces."""

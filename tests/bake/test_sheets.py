@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import trimesh
@@ -13,6 +15,7 @@ from mitsplat.asset import Asset
 from mitsplat.bake.bake import BakeSettings, bake_asset
 from mitsplat.gaussians.spherical_harmonics import SH_C0
 from mitsplat.images.colour import encode_srgb
+from mitsplat.mesh_files.mesh_file import UNKNOWN_MATERIAL, FilePart, MeshFile
 
 RADIUS, HEIGHT = 0.03, 0.08
 
@@ -61,3 +64,14 @@ def test_both_sides_have_the_material(cup: Asset) -> None:
 def test_the_back_of_a_single_sided_sheet_gets_none() -> None:
     _, cosine = wall(bake_cup(double_sided=False))
     assert (cosine > 0).all()
+
+
+@pytest.mark.parametrize("double_sided", [False, True])
+def test_backs_that_stay_empty_are_reported(double_sided: bool) -> None:
+    """Rays through the open end of a box without a lid meet the backs of its walls."""
+    box = trimesh.creation.box((2, 1, 1))
+    part = FilePart("box", box.vertices, box.faces[box.face_normals[:, 2] < 0.5], np.eye(4), UNKNOWN_MATERIAL)
+    file = MeshFile((replace(part, double_sided=double_sided),))
+    settings = BakeSettings(gaussians=300, fit_steps=0, verify_views=0)
+    (warning, *_) = (*bake_asset(file, name="box", settings=settings).warnings, "")
+    assert warning.endswith("state doubleSided in a glTF file") is not double_sided

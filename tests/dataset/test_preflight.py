@@ -269,3 +269,11 @@ def test_a_dataset_without_labels_ends_with_status_4(scene_data, write_scene, tm
     assert run("render", path, "-o", tmp_path / "part", "--workers", 1, "--shard", "1/2") == 0
     laid_out = lambda scene, index, **_: Layout(index, (), NO_PHYSICS)  # noqa: E731
     assert run("render", path, "-o", tmp_path / "empty", "--workers", 1) == 0
+
+
+@pytest.mark.parametrize(("changes", "is_repeated"), [({}, True), ({"jitter": 0.001}, False)])
+def test_equal_views_of_a_layout_are_reported(scene_data, write_scene, changes: dict, is_repeated: bool) -> None:
+    camera = {"kind": "fixed", "eye": [0, -0.3, 0.6], "target": [0, 0, 0], **changes}
+    scene_data["output"] |= {"views": 2}
+    found = [one.text for one in scene_warnings(load_scene(write_scene(scene_data | {"camera": camera})))]
+    assert any("differ in noise alone" in text for text in found) is is_repeated

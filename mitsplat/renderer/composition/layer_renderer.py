@@ -93,28 +93,28 @@ class LayerRenderer:
     ) -> dict[str, dr.ArrayBase]:
         """Render the layers through one point of the lens."""
         rays = view.rays()
-        behind, emitters, z_max = self._trace_background(contents, scene, view, rays)
+        meshes, emitters, z_max = self._trace_meshes_and_emitters(contents, scene, view, rays)
         splat = self._trace_splats(contents, scene, view, z_max)
         hit, static = contents.proxies.nearest(rays)
         proxy_depth = dr.select(hit.distance < dr.inf, hit.distance * view.cosine(rays), 0)
         dr.eval(splat, proxy_depth, hit, static)
 
         white = self._white()
-        shown = PrimaryVisibility.of(splat, behind, emitters, z_max, dr.pi / white)
-        radiance = self._radiance(contents, scene, view, rays, behind, shown, white, paths, seed)
+        shown = PrimaryVisibility.of(splat, meshes, emitters, z_max, dr.pi / white)
+        radiance = self._radiance(contents, scene, view, rays, meshes, shown, white, paths, seed)
         light, highlight = mi.Color3f(1), mi.Color3f(0)
         if self.shadow == "traced" and scene.emitters():
             mesh = shown.diffuse & shown.front
             seen = VisiblePixels(
                 rays.d,
                 shown.cover,
-                dr.select(mesh, behind.depth, splat.depth) if behind else splat.depth,
+                dr.select(mesh, meshes.depth, splat.depth) if meshes else splat.depth,
                 dr.select(mesh, 0, splat.instance),
                 contents.traits.seen(self._shape_votes(contents, view, z_max), splat.instance),
                 mesh,
             )
             # Visible meshes receive light like static proxies, also where splats touch them.
-            ground = behind.before(static) if behind else static
+            ground = meshes.before(static) if meshes else static
             dr.eval(seen, ground)
             light, highlight = light_factor(
                 scene,
@@ -164,13 +164,13 @@ class LayerRenderer:
         if edges is None:
             return {}
         rays = edges.rays()
-        behind, emitters, z_max = self._trace_background(contents, scene, edges.fine, rays, edges.positions())
+        meshes, emitters, z_max = self._trace_meshes_and_emitters(contents, scene, edges.fine, rays, edges.positions())
         splat, own = Image.empty(dr.width(rays.d)), [dr.zeros(mi.Float, dr.width(rays.d))] * 4
         pixel = edges.pixels()
         key_at_pixel = dr.gather(mi.UInt32, key, pixel)
         if contents.clouds is not None:
             splat, own = edges.trace(contents.clouds, contents.placements, self.quality, key_at_pixel, z_max)
-        shown = PrimaryVisibility.of(splat, behind, emitters, z_max, dr.pi / white)
+        shown = PrimaryVisibility.of(splat, meshes, emitters, z_max, dr.pi / white)
         other = edges.nearest_other(key, shown.key)
         shares = shown.shares(splat, own, key_at_pixel >= NO_SPLAT)
 
@@ -190,7 +190,7 @@ class LayerRenderer:
         dr.eval(smooth)
         return smooth
 
-    def _trace_background(
+    def _trace_meshes_and_emitters(
         self,
         contents: SceneContents,
         scene: mi.Scene,
@@ -202,12 +202,12 @@ class LayerRenderer:
 
         Rays pass through the positions ``at`` of the view [px], or through the centres of all its pixels.
         """
-        behind = contents.meshes.trace(view, rays, at) if contents.meshes else None
+        meshes = contents.meshes.trace(view, rays, at) if contents.meshes else None
         emitters = None if self.hide_emitters else VisibleEmitters.trace(scene, view, rays)
-        z_max = behind.depth if behind else None
+        z_max = meshes.depth if meshes else None
         if emitters:
             z_max = emitters.depth if z_max is None else dr.minimum(z_max, emitters.depth)
-        return behind, emitters, z_max
+        return meshes, emitters, z_max
 
     def _radiance(
         self,
@@ -215,19 +215,19 @@ class LayerRenderer:
         scene: mi.Scene,
         view: CameraView,
         rays: mi.Ray3f,
-        behind: MeshHits | None,
+        meshes: MeshHits | None,
         shown: PrimaryVisibility,
         white: mi.Color3f,
         paths: int,
         seed: int,
     ) -> mi.Color3f | None:
         """Return the radiance (Color3f) of path-traced meshes along their visible rays, in the picture's scale."""
-        if behind is None or contents.meshes is None or contents.meshes.diffuse is None:
+        if meshes is None or contents.meshes is None or contents.meshes.diffuse is None:
             return None
         pixel = dr.compress(shown.solid & ~shown.diffuse & (shown.splat_alpha < 1 - 1e-3))
         if not dr.width(pixel):
             return None
-        ray, hit = (dr.gather(type(v), v, pixel) for v in (mi.Ray3f(rays), behind.hit))
+        ray, hit = (dr.gather(type(v), v, pixel) for v in (mi.Ray3f(rays), meshes.hit))
         tracer = PathTracer(
             contents.meshes,
             scene,

@@ -3,8 +3,8 @@
 A splat stores the radiance that the camera saw, shadows included. Rendering it among new objects therefore needs no
 full light transport, but one light factor per visible point x with normal n:
 
-    captured under the scene's light:   factor = E(x, n | static and dynamic occluders) / E(x, n | static occluders)
-    captured under uniform light:       factor = (E(x, n | static and dynamic occluders) + E_bounce) / E_ref
+    captured under the scene's light:       factor = E(x, n | static and dynamic occluders) / E(x, n | static occluders)
+    captured under uniform light ("relit"): factor = (E(x, n | static and dynamic occluders) + E_bounce) / E_ref
 
 with irradiance E = integral of V(x, w) L(w) max(0, n.w) dw over all emitters. The first factor is exactly 1 where no
 dynamic object takes light away, so that captured shadows are not applied twice. E_ref is the irradiance for which the
@@ -48,7 +48,7 @@ from mitsplat.renderer.rays.device_arrays import gathered
 from mitsplat.renderer.splatting.sorting import stable_order
 
 FIRST_RAYS = 0.3
-"""Rays per point before the first error estimate, times the wanted error: the number that most points need.
+"""Product of the wanted error and the number of rays per point before the first estimate: what most points need.
 
 With fewer rays the estimates are so rough that rays go to the wrong points, and penumbras count as even light.
 """
@@ -209,16 +209,16 @@ def search_shadows(
     everything = visible.at(pixel)
     needed, light, codes = everything.valid, mi.Color3f(1), None
     if error > 0:
-        captured = everything.valid & ~(everything.relit | everything.glossy)
+        shadow_only = everything.valid & ~(everything.relit | everything.glossy)
         plane_code = plane_codes(everything, visible.eye)
-        some_captured, some_planes = dr.any(captured), dr.any(plane_code != 0)
-        dr.eval(everything.valid, captured, plane_code)
-        if some_captured:
+        some_shadow_only, some_planes = dr.any(shadow_only), dr.any(plane_code != 0)
+        dr.eval(everything.valid, shadow_only, plane_code)
+        if some_shadow_only:
             tracer = ShadowTracer(lighting.emitters, lighting.proxies, everything, pixel, lighting.view, lighting.seed)
-            tiles = tracer.search(captured)
-            needed = everything.valid & (~captured | tiles.differs(error))
+            tiles = tracer.search(shadow_only)
+            needed = everything.valid & (~shadow_only | tiles.differs(error))
             if cover is not None:
-                needed |= captured & (cover > MIN_COVER)
+                needed |= shadow_only & (cover > MIN_COVER)
             light = dr.select(everything.valid, tiles.light(), 1)
         codes = plane_code if some_planes else None
     others = dr.count(everything.valid & ~needed)

@@ -1,8 +1,8 @@
 """Light that surfaces reflect along rays: captured surroundings, objects and visible meshes.
 
-Captured surroundings have the colour captured there, which contains all earlier bounces, and the shadows of dynamic
-objects. Objects and visible meshes reflect the emitters' light according to their material, and the light of one
-further ray, which ends at the next surface.
+Captured surroundings keep their captured colour, which contains all earlier bounces. Dynamic objects cast shadows on
+them. Objects and visible meshes reflect the emitters' light according to their material, and the light of one further
+ray, which ends at the next surface.
 """
 
 from __future__ import annotations
@@ -92,13 +92,13 @@ class Reflectors:
             lane = dr.arange(mi.UInt32, count * some)
             row = lane // dr.opaque(mi.UInt32, some)
             number = dr.gather(mi.UInt32, start, row) + (lane - row * some + dr.opaque(mi.UInt32, first)) * STRIDE
-            upward, light = sequence(number)
+            upward, emitter_sample = sequence(number)
             frame = mi.Frame3f(dr.gather(mi.Vector3f, normal, row))
             towards = frame.to_world(mi.warp.square_to_cosine_hemisphere(upward))
             ray = mi.Ray3f(dr.gather(mi.Point3f, origin, row), towards)
-            dr.eval(ray, number, light)
+            dr.eval(ray, number, emitter_sample)
             spread = dr.opaque(mi.Float, DIFFUSE_SPREAD, count * some)
-            colour, captured, distance = self._trace(ray, number, light, spread, BOUNCES)
+            colour, captured, distance = self._trace(ray, number, emitter_sample, spread, BOUNCES)
             for total, colours in zip(totals, (colour, captured), strict=True):
                 total += mi.Color3f(*[dr.block_sum(c, some) for c in colours])
             nearness += dr.block_sum(dr.sum(colour) / dr.maximum(distance, 1e-6), some)
@@ -106,24 +106,24 @@ class Reflectors:
         return totals[0] / rays, totals[1] / rays, nearness / dr.maximum(dr.sum(totals[0]), 1e-20)
 
     def outgoing(
-        self, ray: mi.Ray3f, key: mi.UInt32, light: mi.Point2f, spread: mi.Float
+        self, ray: mi.Ray3f, key: mi.UInt32, emitter_sample: mi.Point2f, spread: mi.Float
     ) -> tuple[mi.Color3f, mi.Float]:
         """Compute the radiance of the surfaces that rays hit, times pi over the irradiance of display white.
 
         Args:
             ray: Rays.
             key: Integer per ray, from which random numbers derive.
-            light: Point of the unit square per ray that selects an emitter.
+            emitter_sample: Point of the unit square per ray that selects an emitter.
             spread: GGX's alpha of the lobe that reflects the light of each ray.
 
         Returns:
             Radiance (Color3f), 0 for a miss, and distances of the hits [m], infinite for a miss.
         """
-        colour, _, distance = self._trace(mi.Ray3f(ray), key, light, spread, BOUNCES)
+        colour, _, distance = self._trace(mi.Ray3f(ray), key, emitter_sample, spread, BOUNCES)
         return colour, distance
 
     def _trace(
-        self, ray: mi.Ray3f, key: mi.UInt32, light: mi.Point2f, spread: mi.Float, bounces: int
+        self, ray: mi.Ray3f, key: mi.UInt32, emitter_sample: mi.Point2f, spread: mi.Float, bounces: int
     ) -> tuple[mi.Color3f, mi.Color3f, mi.Float]:
         """Return the colours (Color3f) at the hits of rays, the colours without dynamic objects, and the distances."""
         static, dynamic = self.proxies.static, self.proxies.dynamic
@@ -141,26 +141,26 @@ class Reflectors:
             return captured, captured, distance
         near = dynamic.intersect(ray)
         colour = dr.select(near.is_valid(), 0, captured)
-        thing = near.is_valid()
+        hits_object = near.is_valid()
         if self.emitters.sky is not None:  # indoors, the sky represents the light that walls reflect
-            thing &= near.t < self.emitters.sky_reach
-        distance = dr.select(near.is_valid(), dr.select(thing, near.t, dr.inf), distance)
-        lit = dr.max(colour) > 0
-        dr.eval(near, colour, captured, thing, distance, lit)
-        lane = dr.compress(lit)
+            hits_object &= near.t < self.emitters.sky_reach
+        distance = dr.select(near.is_valid(), dr.select(hits_object, near.t, dr.inf), distance)
+        has_colour = dr.max(colour) > 0
+        dr.eval(near, colour, captured, hits_object, distance, has_colour)
+        lane = dr.compress(has_colour)
         if static is not None and dr.width(lane):
-            some = (dr.gather(type(v), v, lane) for v in (ray, triangle, key, light))
+            some = (dr.gather(type(v), v, lane) for v in (ray, triangle, key, emitter_sample))
             free = self._unshadowed(static, *some)
             dr.scatter(colour, dr.select(free, dr.gather(mi.Color3f, colour, lane), 0), lane)
-        lane = dr.compress(thing)
+        lane = dr.compress(hits_object)
         if dr.width(lane):
-            some = (dr.gather(type(v), v, lane) for v in (ray, near, key, light, spread))
+            some = (dr.gather(type(v), v, lane) for v in (ray, near, key, emitter_sample, spread))
             dr.scatter(colour, self._reflected(bounces, *some), lane)
         dr.eval(colour)
         return colour, captured, distance
 
     def _unshadowed(
-        self, static: TraceScene, ray: mi.Ray3f, triangle: mi.UInt32, key: mi.UInt32, light: mi.Point2f
+        self, static: TraceScene, ray: mi.Ray3f, triangle: mi.UInt32, key: mi.UInt32, emitter_sample: mi.Point2f
     ) -> mi.Bool:
         """Return False for captured surfaces that dynamic objects shade from one sampled emitter.
 
@@ -174,8 +174,8 @@ class Reflectors:
         def choose(
             i: mi.UInt32, total: mi.Float, direction: mi.Vector3f, reach: mi.Float, sky: mi.Bool
         ) -> tuple[mi.UInt32, mi.Float, mi.Vector3f, mi.Float, mi.Bool]:
-            x = light.x + mi.Float(i) / CANDIDATES
-            beam = self.emitters.sample(place, mi.Point2f(x - dr.floor(x), light.y), mi.Bool(True))
+            x = emitter_sample.x + mi.Float(i) / CANDIDATES
+            beam = self.emitters.sample(place, mi.Point2f(x - dr.floor(x), emitter_sample.y), mi.Bool(True))
             weight = dr.sum(beam.irradiance)
             total += weight
             chosen = mi.sample_tea_float32(key, i + CANDIDATES, 4) * total < weight
@@ -210,7 +210,7 @@ class Reflectors:
         ray: mi.Ray3f,
         hit: mi.PreliminaryIntersection3f,
         key: mi.UInt32,
-        light: mi.Point2f,
+        emitter_sample: mi.Point2f,
         spread: mi.Float,
     ) -> mi.Color3f:
         """Return the colour (Color3f) of objects and visible meshes: reflected light of one emitter and one ray."""
@@ -230,7 +230,7 @@ class Reflectors:
         albedo = colour * (1 - surface.metallic) if glossy else colour
         normal = _towards(normal, ray)
         origin = _lifted(ray(hit.t), normal)
-        beam = self.emitters.sample(receiver(origin, normal), light, mi.Bool(True))
+        beam = self.emitters.sample(receiver(origin, normal), emitter_sample, mi.Bool(True))
         lit, shadow = albedo * beam.irradiance / self.white, _shadow_ray(origin, beam.direction, beam.reach)
         if glossy:
             metal = surface.metallic > 0.5

@@ -40,8 +40,8 @@ CONTACT_STIFFNESS, CONTACT_DAMPING = 1 / (CONTACT_TIME * DAMPING_RATIO) ** 2, 2 
 # Contact dimensions: normal, two sliding, spin, and two rolling.
 WITH_ROLL, _WITHOUT_ROLL = 6, 4
 # Impedance of contacts at the surface and 1 mm deep: at MuJoCo's default of 0.9, a nut under a plate of a hundred times
-# its mass sinks by 1 mm. MuJoCo's own contacts flicker when stiffer: from 0.98 on, piled packages creep at 1 to 10 mm/s
-# and do not come to rest; at 0.97 they rest within 0.1 mm/s.
+# its mass sinks by 1 mm. MuJoCo's own contacts flicker when stiffer: from 0.98 on, a pile of 29 packages creeps at 1 to
+# 10 mm/s; at 0.97 it rests within 0.1 mm/s. Some other piles still creep at 2 to 4 mm/s.
 _IMPEDANCE_WARP, IMPEDANCE_MUJOCO = (0.996, 0.9999), (0.97, 0.999)
 # Solver tolerance of MuJoCo in double precision. At its default of 1e-8, errors of one step cost iterations in the next
 # step: 18 instead of 9 per step in a pile of 29 packages.

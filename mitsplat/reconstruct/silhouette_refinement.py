@@ -28,7 +28,7 @@ import trimesh
 
 from mitsplat.arrays import Float64Array
 from mitsplat.errors import InputError
-from mitsplat.geometry.camera import Camera
+from mitsplat.geometry.camera import Camera, look_at_pose
 from mitsplat.progress import Progress
 from mitsplat.reconstruct.fold_repair import limit_motion
 from mitsplat.reconstruct.segment_splats import MaskedView
@@ -198,13 +198,12 @@ class Outline:
     def __init__(self, view: MaskedView, middle: Float64Array, radius: float, size: int) -> None:
         given = view.camera
         distance = float(np.linalg.norm(given.centre - middle))
-        fov = 2 * float(np.degrees(np.arcsin(_VIEW_RADIUS * radius / distance)))
-        up = -given.world_from_camera[:3, 1]
-        camera = Camera.look_at(given.centre, middle, up=up, width=size, height=size, fov_x=fov)
-        self.focal = camera.fx
+        half_angle = float(np.arcsin(_VIEW_RADIUS * radius / distance))
+        self.focal = 0.5 * size / float(np.tan(half_angle))
+        pose = look_at_pose(given.centre, middle, -given.world_from_camera[:3, 1])
+        camera = Camera(size, size, self.focal, self.focal, 0.5 * size, 0.5 * size, pose)
         y, x = np.mgrid[:size, :size] + 0.5
         slopes = camera.ray_slopes(np.column_stack([x.ravel(), y.ravel()]))
-        pose = camera.world_from_camera
         ahead = np.column_stack([slopes, np.ones(len(slopes))]) @ pose[:3, :3].T
         # Pixel centres are at +0.5 here, but at integers in OpenCV.
         pixels = np.nan_to_num(given.project(given.centre + distance * ahead)[0], nan=-9.0) - 0.5
@@ -220,7 +219,7 @@ class Outline:
         pose[:3, 3] = (given.centre - middle) / radius
         box = {"type": "box"}
         film = {"type": "hdrfilm", "width": size, "height": size, "pixel_format": "luminance", "rfilter": box}
-        placed = {"to_world": mi.ScalarTransform4f(pose), "fov": fov}
+        placed = {"to_world": mi.ScalarTransform4f(pose), "fov": np.degrees(2 * half_angle)}
         self.sensor = mi.load_dict({"type": "perspective", "film": film, **placed})
 
 

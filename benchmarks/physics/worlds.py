@@ -146,7 +146,7 @@ def has_rested(
         def _advance(self) -> None:
             self._frame = next(self._frames)
 
-        def _allow_rolling(self, rolls: bool) -> None:
+        def _set_rolling_friction(self, enabled: bool) -> None:
             pass
 
         def _coordinates(self) -> Float64Array:

@@ -156,7 +156,7 @@ class Drop:
 
         After ``settle.attempts`` rejected draws, the objects that caused every rejection are left out. If there are
         none, the object that caused most rejections is left out. The remaining objects are drawn again. Once the draws
-        of a layout have simulated 60 s, every rejected draw leaves out objects. If objects find no room beside one
+        of a layout have simulated 40 s, every rejected draw leaves out objects. If objects find no room beside one
         another, the last of them are left out.
 
         Raises:

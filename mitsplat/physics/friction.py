@@ -89,7 +89,10 @@ def pair_friction(first: Float64Array, second: Float64Array) -> Float64Array:
 
 
 class PairContactSolver(SolverMuJoCo):
-    """MuJoCo solver on Warp with Newton's contacts, :func:`pair_friction` and restitution."""
+    """Newton's solver with MuJoCo. On Warp it adds :func:`pair_friction` and restitution to Newton's contacts.
+
+    In C, :class:`~mitsplat.physics.worlds.MujocoWorld` does the same between the stages of a step.
+    """
 
     def __init__(self, model: newton.Model, **options: Any) -> None:
         with warnings.catch_warnings():

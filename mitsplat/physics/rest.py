@@ -29,7 +29,7 @@ _SPEED_WINDOW = 0.05  # averaging time of the reported speeds [s]
 _DRAG_TIME = 0.2  # time constant of the drag on bodies that still move after FREE_TIME [s]
 # Bodies are late if they roll or rock while the others rest: they move by more than a limit [m] within a time [s]. At
 # least one body may be late, and at most this share of all.
-_LATE_MOTION, _LATE_TIME, _MAX_LATE = 1e-3, 1.0, 0.25
+_LATE_MOTION, _LATE_TIME, _MAX_LATE = 1e-3, 1.0, 0.5
 _WALL_DISTANCE = 1e-3  # distance from a wall below which a body leans against it [m]
 _MAX_REDRAWS = 8  # of bodies, in one drop
 
@@ -41,9 +41,9 @@ class RestOutcome:
     Attributes:
         rejection: Reason of a rejection, or empty.
         time: Simulated time from which the bodies were at rest [s].
-        surface_motion: Largest displacement of a surface point in the second after that [m]; infinite if rejected.
-        max_speed, max_spin: Maxima over the bodies at the end of that second [m/s, rad/s].
-        poses: World-from-body transforms at that time, shape (N, 4, 4).
+        max_speed, max_spin: Maxima over the bodies at the end of the second after that [m/s, rad/s].
+        surface_motion: Largest displacement of a surface point in that second [m]; infinite if rejected.
+        poses: World-from-body transforms at the end of that second, shape (N, 4, 4).
         causes: Positions of the bodies that cause the rejection.
     """
 
@@ -82,9 +82,9 @@ def run_to_rest(
     first seconds of bodies that tumble, because discs would stop on their rim.
 
     Bodies that still move after 1.5 s are slowed by a drag with a time constant of 0.2 s, which ends together with
-    rolling friction. A body fails if it leaves the bounds, leans against a wall, or moves on when three quarters of the
-    bodies have moved by less than 1 mm for a second. With ``redraw``, failed bodies start again from new poses, up to
-    eight times, while the others stay where they are. Otherwise, the drop is rejected.
+    rolling friction. A body fails if it leaves the bounds, leans against a wall, or moves on when half of the bodies,
+    or all but one, have moved by less than 1 mm for a second. With ``redraw``, failed bodies start again from new
+    poses, up to eight times, while the others stay where they are. Otherwise, the drop is rejected.
 
     Args:
         world: Simulation; changed in place.
@@ -132,7 +132,7 @@ def _run_to_rest(
     motion, redraws = np.zeros(len(world.bodies)), 0
     while world.time - since < _REST_TIME:
         quiet = world.time - since >= _QUIET_TIME
-        world.allow_rolling(world.time - begin < free_time or quiet)
+        world.set_rolling_friction(not (world.time - begin < free_time or quiet))
         handling.apply(world)
         poses = _advance(world, fastest, drag=world.time - begin >= FREE_TIME and not quiet)
         past.append(poses)

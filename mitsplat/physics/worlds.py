@@ -5,6 +5,7 @@ Import and use this module within :func:`mitsplat.physics.settle.warp_settings`,
 
 from __future__ import annotations
 
+import logging
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -30,6 +31,8 @@ from mitsplat.physics.friction import (
     pair_friction,
 )
 from mitsplat.physics.restitution import MIN_IMPACT_SPEED, SIMULTANEOUS, rebound_speed
+
+_logger = logging.getLogger(__name__)
 
 _GRAVITY = (0.0, 0.0, -GRAVITY)
 # Contact of damping 2/t and stiffness 1/(t z)^2, as in MuJoCo, for all contacts that are no impacts (see
@@ -293,6 +296,8 @@ class MujocoWorld(World):
 
     def __init__(self, bodies: Sequence[Body], colliders: Sequence[Collider], *, timestep: float) -> None:
         super().__init__(bodies, timestep=timestep)
+        if mujoco.get_mju_user_warning() is None:  # else MuJoCo writes MUJOCO_LOG.TXT into the working folder
+            mujoco.set_mju_user_warning(_logger.debug)
         solver = PairContactSolver(
             _build_model(bodies, colliders, IMPEDANCE_MUJOCO, False),
             use_mujoco_cpu=True,

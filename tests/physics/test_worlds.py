@@ -668,3 +668,14 @@ def test_a_body_that_fails_starts_again_while_the_others_stay(leans, reason):
     np.testing.assert_allclose(outcome.poses[:4], before[:4], atol=1e-4)
     assert outcome.poses[4, 0, 3] == pytest.approx(before[4, 0, 3] - 0.05, abs=1e-3)
     assert outcome.time > time
+
+
+def test_warnings_of_mujoco_leave_no_file(tmp_path, monkeypatch):
+    import mujoco
+
+    monkeypatch.chdir(tmp_path)
+    world = world_of("mujoco", [body_of(trimesh.creation.box((0.02, 0.02, 0.02)))], [table()], [pose_at((0, 0, 0.1))])
+    world._data.qvel[:] = np.nan
+    mujoco.mj_step(world._model, world._data)
+    assert world._data.warning[mujoco.mjtWarning.mjWARN_BADQVEL].number == 1
+    assert list(tmp_path.iterdir()) == []

@@ -65,8 +65,8 @@ def time_layouts(hope: Path, work: Path, count: int, processes: int) -> None:
     everything: list[float] = []
     with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
         for name in SCENES:
-            jobs = [(write_scene(work, name), index, count) for index in range(count)]
-            rows = list(pool.map(time_layout, jobs))
+            path = write_scene(work, name)
+            rows = list(pool.map(time_layout, [(path, index, count) for index in range(count)]))
             seconds, draws, left_out = (np.array(column) for column in zip(*rows, strict=True))
             everything += seconds.tolist()
             for value, unit, what in (

@@ -285,7 +285,7 @@ def scene_warnings(scene: Scene) -> Iterator[Finding]:
         f"of {len(cameras)} views {len(inside)} are from inside of a shape, {blind} see no place where objects can be",
         "move camera, its keys or its ranges: such images have no labels",
     )
-    if spec.output.views > 1 and spec.background is None and _is_repeated(scene):
+    if spec.output.views > 1 and spec.background is None and _is_repeated(scene, plans[0]):
         text = "output.views: the images of a layout show the same view in the same light, and differ in noise alone"
         yield _fault("views", text, "set it to 1 with more layouts, or state camera.jitter or randomise")
     yield from lens_warnings(spec)
@@ -309,9 +309,9 @@ def scene_warnings(scene: Scene) -> Iterator[Finding]:
     yield from _bin_warnings(scene)
 
 
-def _is_repeated(scene: Scene) -> bool:
-    """Return True if the first two images have one view, one light and equal random values."""
-    one, other = plan_frame(scene, 0), plan_frame(scene, 1)
+def _is_repeated(scene: Scene, one: FramePlan) -> bool:
+    """Return True if the second image has the view, the light and the random values of the first one."""
+    other = plan_frame(scene, 1)
     values = [{**plan.draws, "motion_angle": 0.0} for plan in (one, other)]
     same_view = np.array_equal(one.camera.world_from_camera, other.camera.world_from_camera)
     return same_view and one.lights == other.lights and one.belt == other.belt and values[0] == values[1]

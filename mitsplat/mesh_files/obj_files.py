@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import codecs
 import re
-from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -128,12 +127,14 @@ def _check_library(path: Path, folder: Path) -> list[str]:
     for key in ("ka", "kd", "ks"):
         for colour in values_of(path, content, key):
             _check_colour(path, key, colour)
-    materials = re.split(rb"^newmtl ", content, flags=re.M | re.I)[1:]
-    for name, count in Counter(values_of(path, content, "newmtl")).items():
-        same = {one for one in materials if one.splitlines()[0].decode() == name}
-        if count > 1 and len({one.strip() for one in same}) > 1:
+    names = values_of(path, content, "newmtl")
+    bodies = [body.strip() for body in re.split(rb"^newmtl .*$", content, flags=re.M | re.I)[1:]]
+    first: dict[str, bytes] = {}
+    for name, body in zip(names, bodies, strict=True):
+        if first.setdefault(name, body) != body:
+            count = names.count(name)
             raise InputError(f"{path}: materials must have different names (got {count} with the name {name})")
-    return values_of(path, content, "newmtl")
+    return names
 
 
 def _check_colour(path: Path, key: str, colour: str) -> None:

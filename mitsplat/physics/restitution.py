@@ -1,8 +1,7 @@
 """Restitution of contacts: Newton's law of impact for MuJoCo's soft contacts, in C and on Warp.
 
 MuJoCo's contact is a spring and damper with a reference acceleration ``a = b v - k r`` for the approach speed ``v`` and
-the distance ``r``. It cannot pull. A contact of damping ratio ``z = sin(B)`` that the timestep resolves rebounds
-with
+the distance ``r``. It cannot pull. A contact of damping ratio ``z = sin(B)`` that the timestep resolves rebounds with
 
     e = exp(-tan(B) (pi - 2 B)),
 
@@ -17,8 +16,8 @@ within the step from ``-v`` to ``w``, where
 Without the terms of gravity this is Newton's law, ``w = e v``. They belong to the energy of semi-implicit steps; ``g``
 is the component of gravity along the normal. After the step, the change of velocity of both bodies is also applied to
 the time ``t`` of their motion. A body that falls from ``h0`` then rises to ``e^2 h0`` at any timestep. Slower contacts
-are damped and do not rebound, so that resting bodies are not disturbed. At the limit,
-``v^2 / 2`` is 5 mJ per kilogram.
+are damped and do not rebound, so that resting bodies are not disturbed. At the limit, ``v^2 / 2``
+is 5 mJ per kilogram.
 
 A step meets a thin part several millimetres deep. Some of its points in contact would have touched later or not at all,
 because the first impact turns the part away from them. Only the point of a pair of bodies that has been below the

@@ -39,7 +39,7 @@ from mitsplat.capture.photo_masks import given_masks
 from mitsplat.capture.photos import Prepared
 from mitsplat.capture.video import choose_frames
 from mitsplat.detector.detector_evaluation import coco_truth
-from mitsplat.detector.sets import read_set
+from mitsplat.detector.labelled_sets.set_reading import read_set
 from mitsplat.detector.training import write_data
 from mitsplat.errors import InputError
 from mitsplat.frames.untrusted_xml import check_xml

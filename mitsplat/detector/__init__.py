@@ -10,9 +10,10 @@ needs no extra.
 from __future__ import annotations
 
 from mitsplat.detector.detector_evaluation import Evaluation, evaluate_detector
+from mitsplat.detector.labelled_sets.labelled_set import LabelledSet
+from mitsplat.detector.labelled_sets.set_reading import read_set
 from mitsplat.detector.likeness import Likeness, compare_with_photographs
 from mitsplat.detector.scores import AveragePrecision, DetectionMatches, average_precision
-from mitsplat.detector.sets import LabelledSet, read_set
 from mitsplat.detector.training import Run, TrainSettings, open_run, train_detector
 
 __all__ = [

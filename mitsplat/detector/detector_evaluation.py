@@ -22,6 +22,9 @@ from typing import Any
 import numpy as np
 
 from mitsplat.detector.detector_report import make_report
+from mitsplat.detector.labelled_sets.labelled_set import LabelledSet, Sample, Split, check_masks, reorder_classes
+from mitsplat.detector.labelled_sets.pictures import read_picture
+from mitsplat.detector.labelled_sets.set_reading import read_set
 from mitsplat.detector.libraries import (
     check_device,
     check_torchvision,
@@ -32,7 +35,6 @@ from mitsplat.detector.libraries import (
     versions,
 )
 from mitsplat.detector.losses import error_gains
-from mitsplat.detector.pictures import read_picture
 from mitsplat.detector.scores import (
     CONFIDENCE,
     IOU,
@@ -42,7 +44,6 @@ from mitsplat.detector.scores import (
     DetectionMatches,
     confuse,
 )
-from mitsplat.detector.sets import LabelledSet, Sample, Split, check_masks, read_set, reorder_classes
 from mitsplat.detector.training import check_folder, open_run
 from mitsplat.errors import InputError
 from mitsplat.images.masks import encode_mask

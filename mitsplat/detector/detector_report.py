@@ -9,10 +9,10 @@ from typing import Any
 import cv2
 import numpy as np
 
+from mitsplat.detector.labelled_sets.labelled_set import LabelledSet, Sample
+from mitsplat.detector.labelled_sets.pictures import read_picture
 from mitsplat.detector.losses import ERROR_KINDS
-from mitsplat.detector.pictures import read_picture
 from mitsplat.detector.scores import CONFIDENCE, IOU, MAX_DETECTIONS, AveragePrecision, Confusion, Detection
-from mitsplat.detector.sets import LabelledSet, Sample
 from mitsplat.images.masks import Silhouette, decode_rle
 from mitsplat.labels.overlay import class_colour
 from mitsplat.pages.html import inline_image, make_page, mask_path

@@ -26,6 +26,9 @@ WEIGHTS_ERRORS = (
 )
 """Exceptions that a damaged weights file can raise."""
 
+STRIDE = 32
+"""Divisor of the image sides in Ultralytics' networks [px]."""
+
 MIN_TORCH = "2.6"
 """First PyTorch release that lists the classes of a file before it loads it; the safe loader needs this."""
 

@@ -21,8 +21,10 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
 from mitsplat.arrays import BoolArray, ByteImage, Float64Array
-from mitsplat.detector.pictures import read_picture
-from mitsplat.detector.sets import STRIDE, LabelledObject, Sample, Split, read_set, reorder_classes
+from mitsplat.detector.labelled_sets.labelled_set import LabelledObject, Sample, Split, reorder_classes
+from mitsplat.detector.labelled_sets.pictures import read_picture
+from mitsplat.detector.labelled_sets.set_reading import read_set
+from mitsplat.detector.libraries import STRIDE
 from mitsplat.errors import InputError
 from mitsplat.labels.polygons import fill_polygon
 from mitsplat.progress import Progress

@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 
 from mitsplat.arrays import BoolArray
-from mitsplat.detector.pictures import MIN_SIDE, read_picture
-from mitsplat.detector.sets import LabelledObject, LabelledSet
+from mitsplat.detector.labelled_sets.labelled_set import LabelledObject, LabelledSet
+from mitsplat.detector.labelled_sets.pictures import MIN_SIDE, read_picture
 from mitsplat.errors import InputError
 from mitsplat.images.masks import Silhouette, decode_rle
 from mitsplat.labels.polygons import outline

@@ -23,7 +23,10 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from mitsplat.detector.labelled_sets.labelled_set import LabelledSet, check_masks, reorder_classes
+from mitsplat.detector.labelled_sets.set_reading import read_set
 from mitsplat.detector.libraries import (
+    STRIDE,
     check_device,
     check_weights,
     load_libraries,
@@ -33,7 +36,6 @@ from mitsplat.detector.libraries import (
 )
 from mitsplat.detector.mix import plan_images
 from mitsplat.detector.photo_tiles import cut_photographs
-from mitsplat.detector.sets import STRIDE, LabelledSet, check_masks, read_set, reorder_classes
 from mitsplat.errors import InputError
 from mitsplat.progress import Progress
 from mitsplat.runtime.cores import usable_cores

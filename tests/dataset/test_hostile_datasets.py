@@ -17,7 +17,7 @@ from mitsplat.dataset.dataset_files import is_written
 from mitsplat.dataset.folds import write_folds
 from mitsplat.dataset.manifest import Manifest, encode_line
 from mitsplat.dataset.shards import merge_shards
-from mitsplat.detector.sets import read_set
+from mitsplat.detector.labelled_sets.set_reading import read_set
 from mitsplat.detector.training import write_data
 from mitsplat.errors import InputError, PartialResultError
 from mitsplat.report.dataset_report import write_report

@@ -12,8 +12,9 @@ import pytest
 
 from mitsplat.detector.detector_evaluation import Evaluation, coco_truth, evaluate_detector, write_evaluation
 from mitsplat.detector.detector_report import worst_images
+from mitsplat.detector.labelled_sets.labelled_set import LabelledSet
+from mitsplat.detector.labelled_sets.set_reading import read_set
 from mitsplat.detector.scores import Confusion, average_precision
-from mitsplat.detector.sets import LabelledSet, read_set
 from mitsplat.errors import InputError
 from tests.conftest import contents
 from tests.detector.painted import write_coco, write_yolo

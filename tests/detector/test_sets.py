@@ -13,8 +13,10 @@ import pytest
 from PIL import Image
 from pycocotools import mask as coco_mask
 
-from mitsplat.detector.pictures import read_picture
-from mitsplat.detector.sets import LabelledSet, _run_lengths, check_masks, read_set, reorder_classes
+from mitsplat.detector.labelled_sets.coco_annotations import _run_lengths
+from mitsplat.detector.labelled_sets.labelled_set import LabelledSet, check_masks, reorder_classes
+from mitsplat.detector.labelled_sets.pictures import read_picture
+from mitsplat.detector.labelled_sets.set_reading import read_set
 from mitsplat.detector.training import read_sets, write_data
 from mitsplat.errors import InputError
 from tests.detector.painted import CLASSES, HEIGHT, WIDTH, paint, write_coco, write_yolo

@@ -8,8 +8,9 @@ import cv2
 import numpy as np
 import pytest
 
+from mitsplat.detector.labelled_sets.labelled_set import LabelledObject, LabelledSet, Sample
+from mitsplat.detector.labelled_sets.set_reading import read_set
 from mitsplat.detector.photo_tiles import cut_photographs
-from mitsplat.detector.sets import LabelledObject, LabelledSet, Sample, read_set
 from mitsplat.errors import InputError
 from mitsplat.labels.polygons import fill_polygon
 from tests.detector.painted import HEIGHT, WIDTH, paint, write_coco, write_yolo

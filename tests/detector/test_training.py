@@ -22,10 +22,10 @@ from typer.testing import CliRunner
 from mitsplat.cli import app
 from mitsplat.detector import libraries
 from mitsplat.detector.detector_evaluation import coco_truth, evaluate_detector
+from mitsplat.detector.labelled_sets.set_reading import read_set
 from mitsplat.detector.libraries import check_weights, load_weights
 from mitsplat.detector.mix import plan_images
 from mitsplat.detector.scores import average_precision
-from mitsplat.detector.sets import read_set
 from mitsplat.detector.training import RUN_FILE, Run, TrainSettings, open_run, train_detector, write_data
 from mitsplat.errors import InputError, MissingResourceError
 from mitsplat.storage.content_hash import file_hash

@@ -15,7 +15,6 @@ import mujoco
 import numpy as np
 
 import mitsplat as ms
-from mitsplat.audit import audit_dataset
 from mitsplat.usd.mjcf import export_scene_mjcf
 
 parser = argparse.ArgumentParser()
@@ -59,4 +58,4 @@ print(out)
 
 assert frames[0].layout.instances[0].world_from_object[2, 3] > frames[-1].layout.instances[0].world_from_object[2, 3]
 assert frames[-1].labels.instances
-assert not audit_dataset(out).violations
+assert not ms.audit_dataset(out).violations

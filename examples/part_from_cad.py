@@ -11,7 +11,6 @@ import cv2
 import trimesh
 
 import mitsplat as ms
-from mitsplat.bake.bake import BakeSettings
 
 folder = Path(sys.argv[1] if len(sys.argv) > 1 else tempfile.mkdtemp())
 
@@ -23,7 +22,7 @@ flange = trimesh.boolean.difference([trimesh.boolean.union([plate, hub]), bore])
 flange.visual.face_colors = (190, 110, 40, 255)
 
 # 1,000 Gaussians bake quickly. Without `settings`, the asset has 20,000.
-result = ms.bake_asset(flange, name="flange", density=7800, settings=BakeSettings(gaussians=1000))
+result = ms.bake_asset(flange, name="flange", density=7800, settings=ms.BakeSettings(gaussians=1000))
 result.asset.save(folder / "flange")
 print(f"baked: {result.psnr:.1f} dB on unseen views")
 

@@ -17,8 +17,6 @@ import numpy as np
 import trimesh
 
 import mitsplat as ms
-from mitsplat.audit import audit_dataset
-from mitsplat.bake.bake import BakeSettings
 
 parser = argparse.ArgumentParser()
 parser.add_argument("folder", type=Path, nargs="?")
@@ -47,7 +45,7 @@ def shape_of(geom):
     return mesh.apply_transform(pose)
 
 
-few = BakeSettings(gaussians=1500, verify_views=0)
+few = ms.BakeSettings(gaussians=1500, verify_views=0)
 for name in links:
     geoms = [
         shape_of(model.geom(n)) for n in range(model.ngeom) if model.body(model.geom(n).bodyid.item()).name == name
@@ -97,4 +95,4 @@ moved = np.abs(flow).max(axis=2) < 1e9
 assert all(len(frame.labels.instances) == len(links) for frame in frames)
 assert np.abs(flow[moved & (frames[0].instance == len(links))]).max() > 0.3  # the forearm moves
 assert np.abs(flow[moved & (frames[0].instance == 0)]).max() < 1e-3  # and nothing of the workcell moves
-assert not audit_dataset(out).violations
+assert not ms.audit_dataset(out).violations

@@ -26,8 +26,14 @@ hide_full_gpus()
 _importing = threading.RLock()
 _HOME = {
     "Asset": "asset",
+    "AssetJob": "reconstruct.reconstruct",
+    "BakeSettings": "bake.bake",
     "Camera": "geometry.camera",
+    "Capture": "capture.capture",
+    "CaptureSettings": "capture.pipeline.capture_pipeline",
+    "FitSettings": "fit.trainer",
     "Frame": "frames.frame",
+    "ImportSettings": "importing.splat_import",
     "InputError": "errors",
     "Labels": "labels.labels",
     "LateDeviceError": "errors",
@@ -41,6 +47,7 @@ _HOME = {
     "SceneSpec": "scene.spec.scene_spec",
     "Splats": "gaussians.splat_cloud",
     "asset_from_photos": "reconstruct.pipeline.asset_pipeline",
+    "audit_dataset": "audit.audit",
     "bake_asset": "bake.bake",
     "camera_from_mujoco": "usd.simulator_poses",
     "capture_photos": "capture.pipeline.capture_pipeline",
@@ -58,13 +65,18 @@ _HOME = {
     "use_device": "runtime.device",
     "write_dataset": "dataset.write",
     "write_frames": "dataset.python_frames",
+    "write_report": "report.dataset_report",
 }
 
 __all__ = sorted(_HOME)
 
 if TYPE_CHECKING:
     from mitsplat.asset import Asset as Asset
+    from mitsplat.audit.audit import audit_dataset as audit_dataset
+    from mitsplat.bake.bake import BakeSettings as BakeSettings
     from mitsplat.bake.bake import bake_asset as bake_asset
+    from mitsplat.capture.capture import Capture as Capture
+    from mitsplat.capture.pipeline.capture_pipeline import CaptureSettings as CaptureSettings
     from mitsplat.capture.pipeline.capture_pipeline import capture_photos as capture_photos
     from mitsplat.dataset.python_frames import write_frames as write_frames
     from mitsplat.dataset.rerender import rerender_frame as rerender_frame
@@ -73,6 +85,7 @@ if TYPE_CHECKING:
     from mitsplat.errors import LateDeviceError as LateDeviceError
     from mitsplat.errors import MissingResourceError as MissingResourceError
     from mitsplat.errors import PartialResultError as PartialResultError
+    from mitsplat.fit.trainer import FitSettings as FitSettings
     from mitsplat.fit.trainer import fit_capture as fit_capture
     from mitsplat.frames.frame import Frame as Frame
     from mitsplat.frames.frame import Renderer as Renderer
@@ -80,13 +93,16 @@ if TYPE_CHECKING:
     from mitsplat.frames.sequence import render_frames as render_frames
     from mitsplat.gaussians.splat_cloud import Splats as Splats
     from mitsplat.geometry.camera import Camera as Camera
+    from mitsplat.importing.splat_import import ImportSettings as ImportSettings
     from mitsplat.importing.splat_import import import_splats as import_splats
     from mitsplat.labels.labels import Labels as Labels
     from mitsplat.physics.settle import settle_layout as settle_layout
     from mitsplat.quality import Quality as Quality
     from mitsplat.reconstruct.pipeline.asset_pipeline import asset_from_photos as asset_from_photos
+    from mitsplat.reconstruct.reconstruct import AssetJob as AssetJob
     from mitsplat.renderer.layers import Layers as Layers
     from mitsplat.renderer.layers import render_splats as render_splats
+    from mitsplat.report.dataset_report import write_report as write_report
     from mitsplat.runtime.device import use_device as use_device
     from mitsplat.scene.layout import Layout as Layout
     from mitsplat.scene.loading.scene_loading import load_scene as load_scene

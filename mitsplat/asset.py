@@ -125,7 +125,7 @@ class AssetSpec(BaseModel):
         return self
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Asset:
     """One object or one environment in metres, z up.
 
@@ -172,7 +172,11 @@ class Asset:
     keypoints: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
     white: float | None = None
     units: Literal["metre", "unknown"] = "metre"
-    folder: Path | None = field(default=None, repr=False)
+    folder: Path | None = None
+
+    def __repr__(self) -> str:
+        faces = 0 if self.mesh is None else len(self.mesh.faces)
+        return f"Asset({self.name!r}: {self.kind}, {len(self.splats)} Gaussians, {faces} faces)"
 
     @classmethod
     def load(cls, folder: str | PathLike[str]) -> Asset:

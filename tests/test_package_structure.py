@@ -6,6 +6,7 @@ import ast
 import re
 from collections import Counter
 from collections.abc import Iterator
+from functools import cache
 from graphlib import TopologicalSorter
 from pathlib import Path
 
@@ -64,6 +65,12 @@ def find_modules() -> dict[str, Path]:
 MODULES = find_modules()
 
 
+@cache
+def tree_of(path: Path) -> ast.Module:
+    """Return the syntax tree of a module."""
+    return ast.parse(path.read_text())
+
+
 def unit_of(module: str) -> str:
     """Return the package of a module without the prefix ``mitsplat.``.
 
@@ -74,15 +81,9 @@ def unit_of(module: str) -> str:
     return module.rpartition(".")[0].removeprefix("mitsplat.")
 
 
-def imports(module: str, *, for_types: bool) -> Iterator[tuple[str, int]]:
+def imports(module: str) -> Iterator[tuple[str, int]]:
     """Return the package's modules that a module imports at any place, with the lines."""
-    tree = ast.parse(MODULES[module].read_text())
-    unread = {
-        inner
-        for node in ast.walk(tree)
-        if isinstance(node, ast.If) and isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING"
-        for inner in ast.walk(node)
-    }
+    tree = tree_of(MODULES[module])
     for node in ast.walk(tree):
         if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "mitsplat":
             names = [f"{node.module}.{alias.name}" for alias in node.names]
@@ -91,8 +92,7 @@ def imports(module: str, *, for_types: bool) -> Iterator[tuple[str, int]]:
             targets = {alias.name for alias in node.names if alias.name in MODULES}
         else:
             continue
-        if for_types or node not in unread:
-            yield from ((target, node.lineno) for target in targets)
+        yield from ((target, node.lineno) for target in targets)
 
 
 def is_own_part(module: str, target: str) -> bool:
@@ -106,14 +106,14 @@ LAYER = {unit: height for height, units in enumerate(reversed(LAYERS)) for unit 
 @pytest.mark.parametrize("module", sorted(set(MODULES) - {"mitsplat"}))
 def test_imports_point_to_lower_layers(module: str) -> None:
     own = unit_of(module)
-    for target, line in imports(module, for_types=True):
+    for target, line in imports(module):
         other = unit_of(target)
         place = f"{MODULES[module].relative_to(ROOT)}:{line}: {own} imports {target}"
         assert own == other or is_own_part(module, target) or LAYER[other] < LAYER[own], place
 
 
 def test_imports_form_no_cycle() -> None:
-    graph = {module: {target for target, _ in imports(module, for_types=True)} - {module} for module in MODULES}
+    graph = {module: {target for target, _ in imports(module)} - {module} for module in MODULES}
     for module, path in MODULES.items():
         if path.name == "__init__.py":  # a package's public names come from its own modules
             graph[module] = {target for target in graph[module] if not is_own_part(module, target)}
@@ -126,7 +126,7 @@ def test_every_package_has_a_layer_and_a_docstring() -> None:
     assert units == set(LAYER)
     for module, path in MODULES.items():
         if path.name == "__init__.py":
-            assert len(ast.get_docstring(ast.parse(path.read_text())) or "") > 100, module
+            assert len(ast.get_docstring(tree_of(path)) or "") > 100, module
 
 
 def test_packages_keep_their_limit_of_lines() -> None:
@@ -165,7 +165,7 @@ def imports_inside(path: Path) -> Iterator[tuple[int, bool]]:
     module's
     docstring states that its functions import what they need.
     """
-    lines, tree = path.read_text().splitlines(), ast.parse(path.read_text())
+    lines, tree = path.read_text().splitlines(), tree_of(path)
     for_all = re.search(r"\binside (of )?(the |their |its )?functions?\b", ast.get_docstring(tree) or "") is not None
     inner = {
         node.lineno: node
@@ -224,7 +224,7 @@ def test_no_public_name_hides_a_module() -> None:
     """``from package import name`` must not return a function if a module has the same name."""
     for module, path in MODULES.items():
         if path.name == "__init__.py" and module != "mitsplat":
-            exports = (node for node in ast.parse(path.read_text()).body if isinstance(node, ast.Assign))
+            exports = (node for node in tree_of(path).body if isinstance(node, ast.Assign))
             names = {
                 name
                 for node in exports

@@ -43,7 +43,7 @@ MAX_CACHED_LAYOUTS = 4
 """Number of settled layouts that a renderer caches for further views."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Frame(LazyValue):
     """A labelled picture of H x W pixels with all its inputs. Notebooks display it as an image.
 
@@ -65,7 +65,7 @@ class Frame(LazyValue):
 
     plan: FramePlan
     layout: Layout
-    layers: Layers = field(repr=False)
+    layers: Layers
     rgb: Float32Array
     image: npt.NDArray[np.uint8]
     labels: Labels
@@ -106,6 +106,10 @@ class Frame(LazyValue):
         belt = self.plan.belt
         ids = self.instance if motions or belt is not None else None
         return optical_flow(self.depth, self.camera, self.plan.next_camera, ids, motions, belt)
+
+    def __repr__(self) -> str:
+        labels = self.labels
+        return f"Frame({self.plan.index}: {labels.width} x {labels.height} px, {len(labels.instances)} labels)"
 
     def _repr_png_(self) -> bytes:
         """Return a PNG of the image beside the image with drawn labels."""

@@ -32,7 +32,7 @@ from mitsplat.gaussians.splat_materials import SplatMaterials
 from mitsplat.quality import KernelName
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Splats:
     """Set of N anisotropic 3D Gaussians with view-dependent colour (Kerbl et al. 2023, 3DGS).
 
@@ -87,6 +87,10 @@ class Splats:
 
     def __len__(self) -> int:
         return len(self.means)
+
+    def __repr__(self) -> str:
+        colours = f"captured colours of degree {self.sh_degree}" if self.materials is None else "materials"
+        return f"Splats({len(self)} Gaussians, {colours})"
 
     @property
     def sh_degree(self) -> int:

@@ -82,7 +82,7 @@ class Truth:
     depth: npt.NDArray[np.floating]
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class InstanceLabel:
     """Label of one visible instance.
 
@@ -123,6 +123,12 @@ class InstanceLabel:
     world_from_object: Float64Array
     keypoints: Float64Array = field(default_factory=lambda: np.zeros((0, 3)))
     marks: tuple[str, ...] = ()
+
+    def __repr__(self) -> str:
+        return (
+            f"InstanceLabel({self.id}: {self.class_name}, box {self.box}, {self.area} px, "
+            f"{self.visible_fraction:.0%} visible)"
+        )
 
     @cached_property
     def area(self) -> int:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import lru_cache, partial
 from typing import Any
 
@@ -27,7 +27,7 @@ from mitsplat.runtime.dropped_rays import check_dropped_rays
 from mitsplat.runtime.variant import ensure_variant, one_at_a_time
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Layers(LazyValue):
     """Output of the integrator for one view, H x W pixels.
 
@@ -62,6 +62,10 @@ class Layers(LazyValue):
     normal: Float32Array
     light: Float32Array
     highlight: Float32Array
+
+    def __repr__(self) -> str:
+        height, width = self.shape
+        return f"Layers({width} x {height} px: {', '.join(field.name for field in fields(self))})"
 
     @classmethod
     def on_device(cls, channels: Mapping[str, dr.ArrayBase], shape: tuple[int, int]) -> Layers:

@@ -5,6 +5,6 @@ In: a dataset folder. Out: one HTML file that needs no network, and warnings abo
 
 from __future__ import annotations
 
-from mitsplat.report.dataset_report import write_report
+from mitsplat.report.dataset_report import DatasetReport, write_report
 
-__all__ = ["write_report"]
+__all__ = ["DatasetReport", "write_report"]

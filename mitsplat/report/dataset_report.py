@@ -10,6 +10,7 @@ from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -66,11 +67,22 @@ class _Statistics:
             histogram.add([label[key] for label in labels["instances"]])
 
 
-def write_report(root: str | Path, out: str | Path | None = None) -> tuple[Path, Audit, list[str]]:
-    """Write the report of a dataset, by default to ``report.html`` in its folder.
+class DatasetReport(NamedTuple):
+    """Result of :func:`write_report`.
 
-    Returns:
-        Path of the report, the audit in it, and warnings about gaps, see :meth:`.Variety.warnings`.
+    Attributes:
+        path: The HTML page.
+        audit: The audit that the page shows.
+        warnings: Warnings about gaps in the variety of the dataset, a sentence each.
+    """
+
+    path: Path
+    audit: Audit
+    warnings: list[str]
+
+
+def write_report(root: str | Path, out: str | Path | None = None) -> DatasetReport:
+    """Write the report of a dataset, by default to ``report.html`` in its folder.
 
     Raises:
         InputError: If the folder is no dataset of mitsplat.
@@ -100,7 +112,7 @@ def write_report(root: str | Path, out: str | Path | None = None) -> tuple[Path,
         _details(content),
     ]
     write_text(out, make_page(f"{name}: dataset report", "\n".join(parts), script=_SCRIPT))
-    return out, audit, variety.warnings()
+    return DatasetReport(out, audit, variety.warnings())
 
 
 def _summary(content: JsonObject, statistics: _Statistics, audit: Audit, root: Path) -> str:

@@ -102,7 +102,7 @@ class LeftOut:
     reason: str
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Layout:
     """Poses of the objects of one layout, and the objects that were left out.
 
@@ -119,6 +119,11 @@ class Layout:
     certificate: RestCertificate
     left_out: tuple[LeftOut, ...] = ()
     settled: Layout | None = None
+
+    def __repr__(self) -> str:
+        left_out = f", {len(self.left_out)} left out" if self.left_out else ""
+        rest = "at rest" if self.certificate.rested else "not at rest"
+        return f"Layout({self.index}: {len(self.instances)} objects{left_out}, {rest})"
 
     @classmethod
     def from_poses(

@@ -19,7 +19,7 @@ from mitsplat.scene.spec.scene_spec import SceneSpec
 from mitsplat.scene.splits import draw_environment
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Scene:
     """Scene specification with all files that it names.
 
@@ -41,6 +41,13 @@ class Scene:
     shape_meshes: tuple[trimesh.Trimesh, ...]
     class_names: tuple[str, ...]
     images: Mapping[str, Path] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        output = self.spec.output
+        return (
+            f"Scene({str(self.path)!r}: {output.layouts} layouts x {output.views} views, {len(self.assets)} assets of "
+            f"{len(self.class_names)} classes)"
+        )
 
     @classmethod
     def check(cls, value: object) -> None:

@@ -7,6 +7,8 @@ runs :data:`QUICK` commands, and ``make test-extended`` all.
 
 from __future__ import annotations
 
+import ast
+import inspect
 import json
 import os
 import re
@@ -24,6 +26,7 @@ import trimesh
 import typer.main
 from ruamel.yaml import YAML
 
+import mitsplat as ms
 from mitsplat.capture.lighting.panorama import write_exr
 from mitsplat.checks.path_checks import check_scene
 from mitsplat.cli import app
@@ -309,6 +312,9 @@ LONG_EXAMPLES = ("label_formats", "scaling_out", "simulators", "train_detector")
 """Pages whose Python examples need files of commands that are not quick, or repeat the example of another page."""
 
 
+ASSET_CALLS = ("ms.bake_asset(", "ms.capture_photos(")
+
+
 @pytest.mark.parametrize(
     "page",
     [
@@ -321,13 +327,31 @@ def test_the_documented_python_examples_run(desk: Path, forks: Forks, page: Path
     """Each page runs in one process, after the commands above, which have written the datasets of some pages."""
     # tests/frames/test_torch_dataset.py tests the loop over endless frames with a detector of the reader's.
     # tests/usd/test_simulated_frames.py runs Newton, which compiles kernels for a minute.
-    foreign = ("import torch", "from torch", "import newton", "newton.Model")
+    # The next test checks the calls that make assets, which take minutes.
+    foreign = ("import torch", "from torch", "import newton", "newton.Model", *ASSET_CALLS)
     known = [text for text in blocks(page, "python") if not any(word in text for word in foreign)]
     if not (desk / "runs").is_dir():
         known = [text for text in known if "runs/" not in text]
     code = "\n".join(known)
     done = forks.run(code, folder=desk)
     assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_the_documented_calls_that_make_assets_have_valid_arguments() -> None:
+    code = "\n".join(
+        text for text in blocks(ROOT / "docs/api.md", "python") if any(call in text for call in ASSET_CALLS)
+    )
+    called = set()
+    for node in ast.walk(ast.parse(code)):
+        if isinstance(node, ast.Call) and ast.unparse(node.func).startswith("ms."):
+            name = ast.unparse(node.func).removeprefix("ms.")
+            function = ms.Capture.load if name == "Capture.load" else getattr(ms, name)
+            inspect.signature(function).bind(*node.args, **{str(word.arg): word.value for word in node.keywords})
+            called.add(name)
+    assert called == {
+        *("AssetJob", "BakeSettings", "FitSettings", "ImportSettings"),
+        *("asset_from_photos", "bake_asset", "capture_photos", "fit_capture", "import_splats"),
+    }
 
 
 def test_the_scene_of_the_guide_is_valid(tmp_path: Path) -> None:

@@ -66,6 +66,17 @@ def test_a_frame_shows_and_labels_its_objects(scene: ms.Scene, settled: dict[str
     assert frame._repr_png_().startswith(b"\x89PNG")
 
 
+def test_values_print_on_one_line_without_arrays(scene: ms.Scene, settled: dict[str, Any]) -> None:
+    layout = layout_of_small_scene(scene, settled)
+    frame = ms.render_frame(scene, 1, layout=layout)
+    asset = scene.assets[0]
+    for value in (scene, layout, frame, frame.labels, frame.layers, asset, asset.splats):
+        assert "\n" not in repr(value) and "array" not in repr(value)
+    assert repr(frame) == f"Frame(1: 192 x 144 px, {len(frame.labels.instances)} labels)"
+    assert f"{len(layout.instances)} objects" in repr(layout) and f"{len(asset.splats)} Gaussians" in repr(asset)
+    assert all(label.class_name in repr(frame.labels) for label in frame.labels.instances)
+
+
 def test_the_same_frame_has_the_same_bytes(scene: ms.Scene, settled: dict[str, Any]) -> None:
     layout = layout_of_small_scene(scene, settled)
     first = ms.render_frame(scene, 2, layout=layout)

@@ -15,6 +15,7 @@ import trimesh
 from mitsplat.arrays import BoolArray, Float64Array
 from mitsplat.images.masks import Silhouette
 from mitsplat.quality import Quality
+from mitsplat.renderer.composition.material_borders import FROM_PROXY
 from mitsplat.renderer.composition.scene_contents import ContentsReader, SceneContents, same_shapes
 from mitsplat.renderer.instances.antialiasing import Edges
 from mitsplat.renderer.instances.primary_visibility import NO_SPLAT, PrimaryVisibility
@@ -23,6 +24,7 @@ from mitsplat.renderer.light.light import Accuracy, light_factor
 from mitsplat.renderer.light.lit_surface import VisiblePixels, VisibleSurfaces
 from mitsplat.renderer.meshes.mesh_radiance import PathTracer
 from mitsplat.renderer.meshes.visible_meshes import MeshHits, VisibleEmitters
+from mitsplat.renderer.occluders.proxies import Hit
 from mitsplat.renderer.rays.camera_rays import CameraView
 from mitsplat.renderer.rays.device_arrays import wrapped
 from mitsplat.renderer.rays.sensors import view_of
@@ -112,6 +114,7 @@ class LayerRenderer:
                 dr.select(mesh, 0, splat.instance),
                 contents.traits.seen(self._shape_votes(contents, view, z_max), splat.instance),
                 mesh,
+                *self._border_materials(contents, view, hit, splat, z_max),
             )
             # Visible meshes receive light like static proxies, also where splats touch them.
             ground = meshes.before(static) if meshes else static
@@ -281,6 +284,14 @@ class LayerRenderer:
     def _white(self) -> mi.Color3f:
         """Return the irradiance (Color3f) at which a white surface has the picture value 1."""
         return mi.Color3f(*[dr.opaque(mi.Float, value) for value in self.white])
+
+    def _border_materials(
+        self, contents: SceneContents, view: CameraView, hit: Hit, splat: Image, z_max: mi.Float | None
+    ) -> tuple[mi.Float, mi.Float]:
+        """Return metalness and roughness of pixels at borders of materials, :data:`FROM_PROXY` elsewhere."""
+        if contents.mixed is None:
+            return mi.Float(FROM_PROXY), mi.Float(FROM_PROXY)
+        return contents.mixed.materials(view, self.quality, hit, splat.instance, z_max)
 
     def _shape_votes(self, contents: SceneContents, view: CameraView, z_max: mi.Float | None) -> mi.UInt32 | None:
         """Return the shape of an instance that each pixel shows, or None if all its shapes are lit alike.

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import mitsuba as mi
 
 from mitsplat.gaussians.splat_cloud import Splats
+from mitsplat.renderer.composition.material_borders import MixedObjects
 from mitsplat.renderer.light.light_traits import Traits
 from mitsplat.renderer.materials.radiance_grid import RadianceGrid
 from mitsplat.renderer.meshes.mirrored_splats import SplatMirror
@@ -29,6 +30,7 @@ class SceneContents:
     mirror: SplatMirror | None
     traits: Traits
     grid: RadianceGrid | None
+    mixed: MixedObjects | None
 
 
 class ContentsReader:
@@ -73,6 +75,7 @@ class ContentsReader:
             mirror,
             Traits.of(carriers, placements),
             self._surroundings(carriers),
+            MixedObjects.of(carriers, placements),
         )
         return self._contents
 

@@ -82,6 +82,7 @@ class VisiblePixels:
         alpha, depth, instance: Opacity, depth and instance id as in the layers.
         trait: Row of the visible shape in :class:`Traits`.
         mesh: True if the pixel shows a visible mesh.
+        metallic, roughness: Parameters that replace those of the proxy where they are not negative.
     """
 
     direction: mi.Vector3f
@@ -90,6 +91,8 @@ class VisiblePixels:
     instance: mi.UInt32
     trait: mi.UInt32
     mesh: mi.Bool
+    metallic: mi.Float
+    roughness: mi.Float
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,6 +165,8 @@ class VisibleSurfaces:
             )
             for name in ("roughness", "metallic", "specular")
         )
+        metallic = dr.select(seen.metallic >= 0, seen.metallic, metallic)
+        roughness = dr.select(seen.roughness >= 0, seen.roughness, roughness)
         reach = dr.max(dr.abs(position))
         return LitSurface(
             position=position,

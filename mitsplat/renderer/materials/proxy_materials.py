@@ -20,7 +20,7 @@ import trimesh
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-from mitsplat.arrays import Float32Array, Float64Array
+from mitsplat.arrays import Float32Array, Float64Array, Int64Array
 from mitsplat.gaussians.spherical_harmonics import SH_C0
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.images.colour import decode_srgb
@@ -40,6 +40,14 @@ FACING = 8
 
 KINDS = 4
 """Steps of the material parameters in which Gaussians count as different materials."""
+
+NEIGHBOURS_OF_MIXED = 16
+"""Smallest number of Gaussians per corner on a mesh of several materials. All of the nearest may lie across a step."""
+
+OFF_TRIANGLE = 0.25
+"""Distance from a triangle at which a Gaussian of a mesh with several materials counts less, by the factor exp(-1/2),
+than on the triangle, as a share of the Gaussian's largest standard deviation.
+"""
 
 SHORTEST = 5
 """Edge length of triangles that are not divided further, in standard deviations of the Gaussians."""
@@ -214,13 +222,29 @@ def corner_materials(mesh: trimesh.Trimesh, splats: Splats | None) -> Float32Arr
         rows[:, MaterialColumns.ROUGHNESS] = splats.materials.roughness[opaque]
         rows[:, MaterialColumns.SPECULAR] = splats.materials.specular[opaque]
     places = corners + INSIDE * (corners.mean(axis=1, keepdims=True) - corners)
-    neighbours = min(int(np.clip(len(opaque) // count, *NEIGHBOURS)), len(opaque))
+    least = NEIGHBOURS[0] if triangles is None else NEIGHBOURS_OF_MIXED
+    neighbours = min(int(np.clip(len(opaque) // count, least, NEIGHBOURS[1])), len(opaque))
     _, nearest = KDTree(splats.means[opaque]).query(places.reshape(-1, 3), range(1, neighbours + 1))
     axes = Rotation.from_quat(splats.quats[opaque]).as_matrix()
     normals = np.take_along_axis(axes, splats.scales[opaque].argmin(axis=1)[:, None, None], axis=2)[..., 0]
     agreement = np.einsum("nki,ni->nk", normals[nearest], np.repeat(facing, 3, axis=0))
     weights = agreement**FACING + 1e-9
+    if triangles is not None:
+        weights *= _on_triangle(corners, splats, opaque[nearest])
     return np.einsum("nk,nkc->nc", weights / weights.sum(axis=1, keepdims=True), rows[nearest]).astype(np.float32)
+
+
+def _on_triangle(corners: Float64Array, splats: Splats, nearest: Int64Array) -> Float64Array:
+    """Return weights (3 T, K) of the Gaussians ``nearest`` (3 T, K) of each corner, 1 for the one nearest its triangle.
+
+    A step or a seam is an edge of the mesh. Gaussians across it are close to the corner, but not to its triangle.
+    """
+    count, neighbours = nearest.shape
+    triangle = np.repeat(corners, 3 * neighbours, axis=0)
+    points = splats.means[nearest.ravel()]
+    away = np.linalg.norm(points - trimesh.triangles.closest_point(triangle, points), axis=1)
+    squares = np.square(away / (OFF_TRIANGLE * splats.scales[nearest.ravel()].max(axis=1))).reshape(count, neighbours)
+    return np.asarray(np.exp(-0.5 * (squares - squares.min(axis=1, keepdims=True))))
 
 
 def part_materials(part: ProxyPart) -> Float32Array:

@@ -15,7 +15,7 @@ Pages are made from templates in ``benchmarks/templates``, where ``{{ ... }}`` s
 * ``detector PLAN ARM``: the mean precision of an arm;
 * ``gain PLAN ARM BASELINE``: table cells of its gain over another arm, and the 95 % interval.
 
-Missing figures are errors. ``said.md`` lists sentences of hand-written pages; each must occur in its page.
+Missing figures are errors. ``sentences.md`` lists sentences of hand-written pages; each must occur in its page.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from benchmarks.scale.projection import project
 
 TEMPLATES = ROOT / "benchmarks" / "templates"
 PAGES = {"figures.md": "docs/figures.md", "reliability.md": "docs/reliability.md"}
-SAID = "said.md"
+SENTENCES = "sentences.md"
 VIEWS, BYTES = 8, 2.5e5
 """Frames per layout and bytes per frame in the projection: those of the default scene."""
 LATE = 50
@@ -224,7 +224,7 @@ def pages(results: Results) -> dict[Path, str]:
 def unsaid(results: Results) -> Iterable[str]:
     """Return the sentences that hand-written pages lack, or have with other figures; absent pages are ignored."""
     file = ""
-    for line in filled((TEMPLATES / SAID).read_text(encoding="utf-8"), results).splitlines():
+    for line in filled((TEMPLATES / SENTENCES).read_text(encoding="utf-8"), results).splitlines():
         if line.startswith("# "):
             file = line[2:].strip()
         elif line.startswith("* "):
@@ -249,8 +249,8 @@ def print_ages(results: Results) -> None:
     for name, result in results.items():
         if "command" in result:
             command = ["git", "-C", str(ROOT), "rev-list", "--count", f"{result['revision']}..HEAD", "--", *MEASURED]
-            said = subprocess.run(command, capture_output=True, text=True, check=False)
-            count = said.stdout.strip() if said.returncode == 0 else "unknown"
+            run = subprocess.run(command, capture_output=True, text=True, check=False)
+            count = run.stdout.strip() if run.returncode == 0 else "unknown"
             print(f"{count:>8s} commits since {result['revision']} ({result['recorded']}): {name}")
 
 

@@ -49,7 +49,7 @@ def test_a_changed_figure_is_reported_for_the_page_that_shows_it() -> None:
 def test_a_sentence_with_another_figure_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(figures, "ROOT", tmp_path)
     monkeypatch.setattr(figures, "TEMPLATES", tmp_path)
-    (tmp_path / "said.md").write_text("# page.md\n\n* It takes {{ one seconds .1f }} s.\n")
+    (tmp_path / "sentences.md").write_text("# page.md\n\n* It takes {{ one seconds .1f }} s.\n")
     (tmp_path / "page.md").write_text("Some words. It takes\n1.3 s. More.\n")
     assert list(unsaid({"one": {"figures": {"seconds": [1.26, "s"]}}})) == []
     assert list(unsaid({"one": {"figures": {"seconds": [1.46, "s"]}}})) == ["page.md should say: It takes 1.5 s."]

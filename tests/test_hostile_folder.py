@@ -156,9 +156,9 @@ QUICK = ("worker", "image", "splats", "service", "cluster")
 def test_no_child_runs_python_files_of_the_current_folder(start, tmp_path, kind):
     if kind == "cluster":
         pytest.importorskip("ray", reason="Ray is not installed: pip install 'mitsplat[cluster]'")
-    said, run = start(sys.executable, tmp_path / "script/parent.py", kind)
+    output, run = start(sys.executable, tmp_path / "script/parent.py", kind)
     assert run == []
-    assert KINDS[kind] in said
+    assert KINDS[kind] in output
 
 
 @pytest.mark.parametrize("command", [pytest.param(["doctor"], marks=pytest.mark.extended), ["check", "scene.yaml"]])
@@ -166,6 +166,6 @@ def test_no_command_runs_python_files_of_the_current_folder(start, command):
     program = Path(sys.executable).with_name("mitsplat")
     if not program.exists():
         pytest.skip("mitsplat is not installed as a command")
-    said, run = start(program, *command)
+    output, run = start(program, *command)
     assert run == []
-    assert "scene.yaml" in said or "LLVM" in said
+    assert "scene.yaml" in output or "LLVM" in output

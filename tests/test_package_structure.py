@@ -179,9 +179,11 @@ def imports_inside(path: Path) -> Iterator[tuple[int, bool]]:
         last = node.end_lineno or first
         text = "\n".join(lines[first - 1 : last])
         above = lines[first - 2].strip()
-        said = for_all or ends.get(first - 1, False) or above.startswith("# ") or "  # " in text.replace("# noqa", "")
-        ends[last] = said
-        yield first, said
+        has_reason = (
+            for_all or ends.get(first - 1, False) or above.startswith("# ") or "  # " in text.replace("# noqa", "")
+        )
+        ends[last] = has_reason
+        yield first, has_reason
 
 
 def test_one_module_builds_command_lines_of_python() -> None:
@@ -214,8 +216,8 @@ def test_imports_inside_of_functions_have_a_reason() -> None:
     silent = [
         f"{path.relative_to(ROOT)}:{line}"
         for path in MODULES.values()
-        for line, said in imports_inside(path)
-        if not said
+        for line, has_reason in imports_inside(path)
+        if not has_reason
     ]
     assert silent == []
 

@@ -456,9 +456,9 @@ class TestMeshes:
         """The file states positions of 10^10 vertices without a buffer. By the glTF specification these are zeros."""
         accessor = {"componentType": 5126, "count": 10**10, "type": "VEC3"}
         mesh = {"primitives": [{"attributes": {"POSITION": 0}}]}
-        said = {"asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0}]}
+        document = {"asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0}]}
         empty, path = {"buffers": [], "bufferViews": []}, tmp_path / "a.gltf"
-        path.write_text(json.dumps({**said, "meshes": [mesh], "accessors": [accessor], **empty}))
+        path.write_text(json.dumps({**document, "meshes": [mesh], "accessors": [accessor], **empty}))
         with pytest.raises(
             InputError, match=r"a\.gltf: not a mesh file that can be read \(reading it takes more memory"
         ):

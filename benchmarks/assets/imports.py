@@ -43,12 +43,12 @@ UPRIGHT = 12.0
 def run(*words: object, folder: Path) -> tuple[int, str, float]:
     """Run the command mitsplat; return its exit status, output and CPU seconds."""
     command = [str(Path(sys.executable).with_name("mitsplat")), *map(str, words)]
-    with tempfile.TemporaryFile("w+") as said:
-        process = subprocess.Popen(command, cwd=folder, stdout=said, stderr=subprocess.STDOUT)
+    with tempfile.TemporaryFile("w+") as output:
+        process = subprocess.Popen(command, cwd=folder, stdout=output, stderr=subprocess.STDOUT)
         _, status, used = os.wait4(process.pid, 0)
         process.returncode = os.waitstatus_to_exitcode(status)
-        said.seek(0)
-        return process.returncode, said.read(), used.ru_utime + used.ru_stime
+        output.seek(0)
+        return process.returncode, output.read(), used.ru_utime + used.ru_stime
 
 
 def main() -> None:
@@ -75,12 +75,12 @@ def one(name: str, file: Path, work: Path) -> str:
     scene, out = f"{name}.yaml", f"out/{name}"
     (work / scene).unlink(missing_ok=True)
     shutil.rmtree(work / out, ignore_errors=True)
-    status, said, seconds = run(
+    status, output, seconds = run(
         "import", file, "-o", f"assets/{name}", "--size", size, "--scene", scene, *options, folder=work
     )
     if status:
-        return f"{name}: import ended with status {status}: {said}"
-    warnings = said.count("warning: ")
+        return f"{name}: import ended with status {status}: {output}"
+    warnings = output.count("warning: ")
     checked, findings, _ = run("check", scene, folder=work)
     rendered, told, rendering = run("render", scene, "-n", 2, "--size", "640x360", "-o", out, folder=work)
     if rendered:
@@ -103,7 +103,7 @@ def one(name: str, file: Path, work: Path) -> str:
         f"{warnings} warnings, check {checked}, tilt {tilt:.1f} degrees, labelled {labelled:.0%}, audit {audited}",
         flush=True,
     )
-    for text in (said, findings, violations):
+    for text in (output, findings, violations):
         for line in text.splitlines():
             if line.startswith(("warning: ", "look", "up: ")):
                 print(f"    {line}", flush=True)

@@ -294,18 +294,18 @@ def rank(results: Sequence[Mapping[str, Any]], figure_name: str, truth: str) -> 
         for found in results
         if found["truth"] is not None and found["verdict"][figure_name] is not None
     ]
-    if len({said for said, _ in pairs}) < 3:
+    if len({predicted for predicted, _ in pairs}) < 3:
         return np.nan, np.nan, np.nan, len(pairs)
-    said, true = np.array(pairs).T
-    said, true = (-said if figure_name in MOST_OF_VERDICT else said), (-true if truth in MOST else true)
+    predicted, true = np.array(pairs).T
+    predicted, true = (-predicted if figure_name in MOST_OF_VERDICT else predicted), (-true if truth in MOST else true)
 
     def statistic(x: np.ndarray, y: np.ndarray) -> float:
         return float(spearmanr(x, y).statistic) if np.ptp(x) and np.ptp(y) else 0.0
 
     span = bootstrap(
-        (said, true), statistic, paired=True, vectorized=False, n_resamples=RESAMPLES, method="percentile", rng=0
+        (predicted, true), statistic, paired=True, vectorized=False, n_resamples=RESAMPLES, method="percentile", rng=0
     ).confidence_interval
-    return statistic(said, true), float(span.low), float(span.high), len(pairs)
+    return statistic(predicted, true), float(span.low), float(span.high), len(pairs)
 
 
 def main() -> None:

@@ -47,8 +47,8 @@ SAMPLES = 200
 
 def read_arms(plan: Path = PLAN) -> dict[str, Any]:
     """Read ``arms.yaml``, or another plan beside it; its entries replace those of the plan that it is ``like``."""
-    said = dict(YAML(typ="safe").load((HERE / plan).read_text()))
-    return read_arms(Path(said["like"])) | said if "like" in said else said
+    content = dict(YAML(typ="safe").load((HERE / plan).read_text()))
+    return read_arms(Path(content["like"])) | content if "like" in content else content
 
 
 def scenes_of(arm: Mapping[str, Any]) -> list[str]:
@@ -75,15 +75,15 @@ def state_of_scenes(plan: Mapping[str, Any], arm: str) -> str:
     if not unchanged:
         return ""
     bases = "".join(path.read_text() for path in dict.fromkeys(base_of(plan, scene) for scene in unchanged))
-    said = [plan["changes"][scene] for scene in unchanged]
-    return hashlib.sha256((bases + json.dumps(said)).encode()).hexdigest()[:16]
+    changes = [plan["changes"][scene] for scene in unchanged]
+    return hashlib.sha256((bases + json.dumps(changes)).encode()).hexdigest()[:16]
 
 
 def write_scene(work: Path, name: str, plan: Path = PLAN) -> Path:
     """Write a scene with the changes in its name, by dotted key; null values are removed at the end."""
-    said = read_arms(plan)
-    scene = YAML(typ="safe").load(base_of(said, name).read_text())
-    rows = [row for change in name.split("+") for row in said["changes"][change].items() if row[0] != "scene"]
+    arms = read_arms(plan)
+    scene = YAML(typ="safe").load(base_of(arms, name).read_text())
+    rows = [row for change in name.split("+") for row in arms["changes"][change].items() if row[0] != "scene"]
     # Later list entries are processed first, so that indices remain those of groceries.yaml.
     gone = sorted({row for row in rows if row[1] is None}, reverse=True)
     for key, value in [row for row in rows if row[1] is not None] + gone:
@@ -247,8 +247,8 @@ def train_fold(options: argparse.Namespace, plan: Mapping[str, Any], number: int
     rendered = [work / "data" / scene for scene in scenes_of(arm)]
     if some := {key: arm[key] for key in ("images", "first", "views") if key in arm}:
         rendered = [listed(rendered, work / "listed" / f"{options.arm}-{options.seed}", **some)]
-    said = {"weights": options.weights} | plan["train"] | arm.get("train", {})
-    settings = TrainSettings(**said, seed=options.seed, device=options.device, workers=options.workers)
+    given = {"weights": options.weights} | plan["train"] | arm.get("train", {})
+    settings = TrainSettings(**given, seed=options.seed, device=options.device, workers=options.workers)
     real = None
     if arm.get("real"):
         folds = folds_of(plan, options.arm)

@@ -28,15 +28,15 @@ def experiment_table(results: Mapping[str, Mapping[str, Any]], plan: str = "arms
     compared with.
     """
     seeds, draws = _by_arm(results, plan, *arms), precision_draws(results, plan)
-    said = read_arms(Path(f"{plan}.yaml"))["arms"]
+    entries = read_arms(Path(f"{plan}.yaml"))["arms"]
     lines = [
         "| learnt from | seeds | mAP50-95 | 95 % | mAP50 | compared with | less by, 95 % |",
         "| --- | ---: | ---: | --- | ---: | --- | --- |",
     ]
     for arm in arms or seeds:
         strict, loose = (_mean(seeds[arm], key) for key in ("map50_95", "map50"))
-        reference, compared = said[arm].get("beside", REFERENCE), "– | –"
-        others = said[arm].get("other_scenes", False)
+        reference, compared = entries[arm].get("beside", REFERENCE), "– | –"
+        others = entries[arm].get("other_scenes", False)
         known = reference in seeds and (others or _of_same_scenes(seeds[arm], seeds[reference]))
         if arm != reference and known:
             compared = f"`{reference}` | {_interval(draws[reference] - draws[arm])}"

@@ -153,8 +153,8 @@ def compare(path: Path, frames: int, machines: Machines) -> bool:
         time.sleep(0.5)
     events: Counter[str] = Counter()
 
-    def hear(done: int, total: int, said: str) -> None:
-        if said.startswith("frame "):
+    def hear(done: int, total: int, text: str) -> None:
+        if text.startswith("frame "):
             events["frames"] += 1
             if events["frames"] == frames // 4:
                 machines.kill(0)
@@ -162,9 +162,9 @@ def compare(path: Path, frames: int, machines: Machines) -> bool:
             if events["frames"] == frames // 2:
                 machines.start()
                 print(f"machine 3 is started after frame {events['frames']}", flush=True)
-        elif "is repeated" in said:
+        elif "is repeated" in text:
             events["lost"] += 1
-            print(said[:100], flush=True)
+            print(text[:100], flush=True)
 
     summary = write_dataset(
         load_scene(path),

@@ -76,9 +76,9 @@ def render(
     if workers is not None:
         command += ["--workers", str(workers)]
     finished, timings, seen = 0, out / "timings.jsonl", []
-    with tempfile.TemporaryFile("w+") as said:
+    with tempfile.TemporaryFile("w+") as output:
         start = time.monotonic()
-        process = subprocess.Popen(command, cwd=ROOT, stdout=said, stderr=subprocess.STDOUT)
+        process = subprocess.Popen(command, cwd=ROOT, stdout=output, stderr=subprocess.STDOUT)
         seen.append((start, 0))
         while True:
             running = process.poll() is None
@@ -90,8 +90,10 @@ def render(
             time.sleep(0.02)
         seen.append((time.monotonic(), finished))
         if process.returncode or finished != frames:
-            said.seek(0)
-            raise SystemExit(f"{finished} of {frames} frames, exit status {process.returncode}: {said.read()[-4000:]}")
+            output.seek(0)
+            raise SystemExit(
+                f"{finished} of {frames} frames, exit status {process.returncode}: {output.read()[-4000:]}"
+            )
     return seen
 
 

@@ -130,8 +130,8 @@ def measure_memory(frames: int, views: int) -> None:
     page = os.sysconf("SC_PAGE_SIZE") / 2**20
     rows: list[tuple[int, float]] = []
 
-    def hear(done: int, total: int, said: str) -> None:
-        if said.startswith("frame ") and done % 10 == 0:
+    def hear(done: int, total: int, text: str) -> None:
+        if text.startswith("frame ") and done % 10 == 0:
             rows.append((done, int(Path("/proc/self/statm").read_text().split()[1]) * page))
 
     with tempfile.TemporaryDirectory() as folder:

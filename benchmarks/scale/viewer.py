@@ -196,9 +196,9 @@ def main() -> None:
                 counts = phase()
             time.sleep(5)
             memory, threads, files = process_values(pid)
-            said = f"page {dict(probe.answers)} in at most {probe.longest:.2f} s; peak {probe.peak:.0f} MiB"
+            load_text = f"page {dict(probe.answers)} in at most {probe.longest:.2f} s; peak {probe.peak:.0f} MiB"
             left = f"after it {memory:.0f} MiB, {threads} threads, {files} files (began with {begin})"
-            print(f"{name}: {dict(counts) if isinstance(counts, Counter) else 'done'}; {said}; {left}", flush=True)
+            print(f"{name}: {dict(counts) if isinstance(counts, Counter) else 'done'}; {load_text}; {left}", flush=True)
             figure(probe.longest, "s", name, "longest answer")
             figure(probe.peak - begin[0], "MiB", name, "peak above begin")
             figure(memory - begin[0], "MiB", name, "left above begin")

@@ -87,9 +87,9 @@ def measure_workers(counts: list[int], **options: float | str) -> None:
         for count in counts:
             sizes: list[tuple[int, int]] = []
 
-            def hear(done: int, total: int, said: str) -> None:
+            def hear(done: int, total: int, text: str) -> None:
                 workers = workers_of(multiprocessing.current_process().pid or 0)
-                if said.startswith("frame ") and done >= total // 2:
+                if text.startswith("frame ") and done >= total // 2:
                     found = [of_process(worker, "smaps_rollup", "Pss") for worker in workers]
                     sizes.append((sum(found), of_process("self", "smaps_rollup", "Pss")))  # noqa: B023
 
@@ -108,11 +108,11 @@ def measure_budget() -> None:
         with tempfile.TemporaryDirectory() as folder:
             path = write_room(Path(folder), **options) if options is not None else WORKCELL  # type: ignore[arg-type]
             command = [sys.executable, "-m", "benchmarks.scale.workers", "frames", "--scene", str(path)]
-            said = subprocess.run(command, capture_output=True, text=True, check=True, cwd=ROOT).stdout
-        peak, budget = map(float, said.split())
+            output = subprocess.run(command, capture_output=True, text=True, check=True, cwd=ROOT).stdout
+        peak, budget = map(float, output.split())
         figure(peak, "MiB", name, "peak")
         figure(budget, "MiB", name, "budget")
-        print(f"{said.strip()}  {name}", flush=True)
+        print(f"{output.strip()}  {name}", flush=True)
 
 
 def make_frames(path: Path) -> None:

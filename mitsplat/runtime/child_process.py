@@ -145,8 +145,8 @@ def run_function() -> None:
         function(output, data, *arguments)
         output.flush()
     except Exception as error:  # noqa: BLE001 - the parent tells of it
-        said = str(error).strip().splitlines() or [type(error).__name__]
-        sys.stderr.write(f"\n{said[-1]}\n")
+        lines = str(error).strip().splitlines() or [type(error).__name__]
+        sys.stderr.write(f"\n{lines[-1]}\n")
         sys.stderr.flush()
         os._exit(REFUSED_STATUS if isinstance(error, InputError) else 1)
     os._exit(0)  # with limited memory, the shutdown of a driver may hang

@@ -397,7 +397,7 @@ def test_an_invalid_manifest_record_is_one_violation(
         place = place[key]
     place[keys[-1]] = value
     store_lines(dataset, records)
-    found = [said for file, said in audit_dataset(dataset).violations if file == "manifest.jsonl"]
+    found = [violation for file, violation in audit_dataset(dataset).violations if file == "manifest.jsonl"]
     assert len(found) == 1 and found[0].startswith("line 1 is not the record of a frame (") and text in found[0]
 
 

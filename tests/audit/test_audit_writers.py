@@ -456,7 +456,7 @@ def test_the_fault_of_each_wrong_writer_is_a_violation(
         patch(patched)
         out = write(scene, tmp_path / "out", formats.split())
     found = audit_dataset(out).violations
-    assert any(where.startswith(file) and text in said for where, said in found), found
+    assert any(where.startswith(file) and text in violation for where, violation in found), found
 
 
 def test_all_formats_of_merged_shards_have_no_violations(scene: Scene, tmp_path: Path) -> None:
@@ -470,9 +470,9 @@ def test_all_formats_of_merged_shards_have_no_violations(scene: Scene, tmp_path:
 def test_poses_that_differ_from_the_layout_are_violations(scene: Scene, tmp_path: Path) -> None:
     out = write(scene, tmp_path / "out", ["yolo"])
     (out / "layouts/0000.json").write_text((out / "layouts/0001.json").read_text())
-    said = [text for _, text in audit_dataset(out).violations]
-    assert any("has another pose than in layouts/0000.json" in text for text in said)
-    assert "is of layout 1" in said
+    texts = [text for _, text in audit_dataset(out).violations]
+    assert any("has another pose than in layouts/0000.json" in text for text in texts)
+    assert "is of layout 1" in texts
 
 
 WRITERS = ("formats", "frames", "labels", "plugins", "renderer")

@@ -313,13 +313,13 @@ def test_textures_and_materials_that_cannot_be_read_are_refused(tmp_path: Path) 
     (tmp_path / "plain.ply").write_text(text.replace("comment", "comment TextureFile absent.png\ncomment", 1))
     refused(tmp_path / "plain.ply", r"its texture absent\.png is missing")
     trimesh.Scene(box(TextureVisuals(np.zeros((36, 2)), material=PBRMaterial()))).export(tmp_path / "model.gltf")
-    said = json.loads((tmp_path / "model.gltf").read_text())
-    said["materials"] = [{"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}]
-    said |= {"textures": [{"source": 0}], "images": [{"uri": "not%20there.png"}]}
-    (tmp_path / "model.gltf").write_text(json.dumps(said))
+    document = json.loads((tmp_path / "model.gltf").read_text())
+    document["materials"] = [{"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}]
+    document |= {"textures": [{"source": 0}], "images": [{"uri": "not%20there.png"}]}
+    (tmp_path / "model.gltf").write_text(json.dumps(document))
     refused(tmp_path / "model.gltf", r"its texture not there\.png is missing")
-    said["materials"][0]["pbrMetallicRoughness"]["baseColorTexture"]["index"] = 7
-    (tmp_path / "model.gltf").write_text(json.dumps(said))
+    document["materials"][0]["pbrMetallicRoughness"]["baseColorTexture"]["index"] = 7
+    (tmp_path / "model.gltf").write_text(json.dumps(document))
     refused(tmp_path / "model.gltf", "a material's texture 7 is missing")
 
 

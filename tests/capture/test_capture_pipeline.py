@@ -206,16 +206,16 @@ def test_cameras_with_few_matches_are_named_unless_a_board_confirms_them(
     model = replace(model, agreement=dict.fromkeys(model.cameras, 0.98) | {"photo03.png": 0.4, seen: 0.6})
     monkeypatch.setattr(take, "find_cameras", lambda *args: model)
     assert run("capture", given, "-o", tmp_path / "sure", "--square", 0.035, "--kind", "environment") == 0
-    said = capsys.readouterr().out
-    assert "rejected: photo03.png: its camera is wrong: it agrees with only 40% of its matches\n" in said
-    assert "warning" not in said
+    output = capsys.readouterr().out
+    assert "rejected: photo03.png: its camera is wrong: it agrees with only 40% of its matches\n" in output
+    assert "warning" not in output
     monkeypatch.setattr("mitsplat.capture.alignment.target_evidence._fit_board", lambda *args: None)
     for _ in range(2):  # first computed, then reused
         assert run("capture", given, "-o", tmp_path / "out", "--kind", "environment") == 0
-        said = capsys.readouterr().out
+        output = capsys.readouterr().out
         assert (
             "warning: cameras agree with few of their matches and may be wrong; remove these photos or add others: "
-            f"{seen} (60%)\n" in said
+            f"{seen} (60%)\n" in output
         )
 
 
@@ -303,10 +303,10 @@ def test_mixed_and_damaged_photos_give_accurate_cameras(
         image.save(given / "short.jpg", quality=95)
     (given / "short.jpg").write_bytes((given / "short.jpg").read_bytes()[:9000])
     assert run("capture", given, "-o", out, "--square", 0.035, "--kind", "environment") == 0
-    said, err = capsys.readouterr()
+    output, err = capsys.readouterr()
     assert "Traceback" not in err
-    assert "rejected: shaken.png: it is blurred (sharpness " in said
-    assert "rejected: short.jpg: it cannot be read (" in said
+    assert "rejected: shaken.png: it is blurred (sharpness " in output
+    assert "rejected: short.jpg: it cannot be read (" in output
     capture = Capture.load(out)
     assert set(capture.rejected) == {"shaken.png", "short.jpg"}
     cameras = {photo.name: photo.camera for photo in capture.photos}
@@ -400,13 +400,13 @@ def test_photos_of_another_scene_are_rejected(
     for number in range(6):
         shutil.copy(photos[0] / f"photo{number:02}.png", given)
     assert run("capture", given, "-o", out, "--square", 0.035, "--kind", "environment") == 4
-    said, err = capsys.readouterr()
+    output, err = capsys.readouterr()
     assert "only 6 of 10 photos (60%) could be used, 75% are required" in err
     assert "Traceback" not in err
     capture = Capture.load(out)
     assert {photo.name for photo in capture.photos} == {f"photo{number:02}.png" for number in range(6)}
     assert set(capture.rejected) == {f"other{number:02}.png" for number in range(4)}
-    assert "rejected: other00.png: it " in said
+    assert "rejected: other00.png: it " in output
 
 
 @pytest.mark.parametrize(

@@ -131,8 +131,8 @@ def test_an_asset_of_several_sizes_is_listed_once(scene_data, write_scene, monke
     """A fault of one size is reported. The asset is then not also listed with "no problems"."""
     monkeypatch.setitem(SIZE_LIMITS, "object", (0.016, 2.0))
     scene_data["objects"] = [{"asset": f"assets/{name}", "scale": [0.5, 1]} for name in ("nut", "bolt")]
-    said = [(finding.name, finding.text) for finding in check_scene(load_scene(write_scene(scene_data)))]
-    assert [(name, text) for name, text in said if name.startswith(("nut", "bolt"))] == [
+    findings = [(finding.name, finding.text) for finding in check_scene(load_scene(write_scene(scene_data)))]
+    assert [(name, text) for name, text in findings if name.startswith(("nut", "bolt"))] == [
         ("nut: units", "the longest extent is 0.015 m"),
         ("bolt", "12 Gaussians, no problems"),
     ]
@@ -176,12 +176,12 @@ def test_problems_have_the_file_and_line_of_the_key_to_change(scene_data, write_
 
 def test_an_open_mesh_has_the_mass_of_its_pieces():
     half = GOOD.mesh.copy().apply_transform(np.diag([0.5, 1, 1, 1]))
-    for pieces, said in (
+    for pieces, text in (
         ((half,), "0.06 kg, of 1000 kg/m^3"),
         ((), "0.12 kg, of 1000 kg/m^3 if it fills its convex hull; its convex pieces are not computed yet"),
     ):
         found = {finding.name: finding for finding in check_asset(replace(GOOD, mesh=OPEN, pieces=pieces))}
-        assert found["mass"].text == said
+        assert found["mass"].text == text
 
 
 def test_an_unreadable_asset_is_refused_in_one_sentence(tmp_path, capsys):

@@ -50,9 +50,10 @@ def test_bake_splits_a_step_file_into_its_parts(
     monkeypatch.setattr("mitsplat.bake.bake.BakeSettings", partial(BakeSettings, fit_steps=0, verify_views=0))
     step = assembly(tmp_path / "frame.step")
     assert run("bake", step, "-o", tmp_path / "parts", "--split", "--tolerance", 0.5, "--gaussians", 60) == 0
-    said = capsys.readouterr().out
-    assert "facets: within 0.5 mm" in said and "part: block (1 of 3 parts)\npart: pin_no._1 (2 of 3 parts)\n" in said
-    assert "0.001 m, z up (units stated by the file)" in said
+    output = capsys.readouterr().out
+    assert "facets: within 0.5 mm" in output
+    assert "part: block (1 of 3 parts)\npart: pin_no._1 (2 of 3 parts)\n" in output
+    assert "0.001 m, z up (units stated by the file)" in output
     block, pin = (Asset.load(tmp_path / "parts" / name) for name in ("block", "pin_no._1"))
     assert (block.name, pin.class_name) == ("block", "pin_no._1")
     np.testing.assert_allclose(block.mesh.extents, (0.01, 0.02, 0.03), atol=1e-7)

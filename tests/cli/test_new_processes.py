@@ -137,10 +137,10 @@ for name, call in json.loads(sys.argv[1]).items():
             status = 1
         os._exit(status)
     os.close(begin)
-    said = os.fdopen(end).read()
+    output = os.fdopen(end).read()
     status = os.waitpid(child, 0)[1]
     if status:
-        failed[name] = f"{status}: {said}"
+        failed[name] = f"{status}: {output}"
 print(json.dumps(failed))
 """
 )

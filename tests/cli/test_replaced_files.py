@@ -91,8 +91,8 @@ def test_a_board_sheet_is_replaced_only_with_overwrite(tmp_path: Path, capsys: p
     sheet = tmp_path / "board.pdf"
     sheet.write_text("an invoice")
     assert run("board", "-o", sheet) == 2 and sheet.read_text() == "an invoice"
-    said = f"mitsplat: --out must be a new file (got {sheet}); --overwrite replaces an existing one\n"
-    assert capsys.readouterr().err == said
+    message = f"mitsplat: --out must be a new file (got {sheet}); --overwrite replaces an existing one\n"
+    assert capsys.readouterr().err == message
     assert run("board", "-o", sheet, "--overwrite") == 0 and sheet.read_bytes().startswith(b"%PDF")
 
 

@@ -89,12 +89,12 @@ def test_finished_images_need_no_disk_space(tmp_path):
 @pytest.mark.usefixtures("machine")
 def test_check_and_render_report_the_same_fault(scene_data, write_scene, tmp_path, capsys):
     path = write_scene({**scene_data, "camera": path_of(INSIDE)})
-    said = "camera: every view is from inside of shape 'table', which hides all objects"
+    message = "camera: every view is from inside of shape 'table', which hides all objects"
     assert run("check", path) == 1
-    assert f"look  visibility: {said}\n      to do: move camera out of it\n" in capsys.readouterr().out
+    assert f"look  visibility: {message}\n      to do: move camera out of it\n" in capsys.readouterr().out
     for command in (("render", path, "-o", tmp_path / "out"), ("render", path, "--tolerance", "0.1")):
         assert run(*command) == 2
-        assert f"{path}: {said}; move camera out of it" in capsys.readouterr().err
+        assert f"{path}: {message}; move camera out of it" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
     buried = write_scene({**scene_data, **HOPELESS["buried"][0]})
     for command in (("preview", buried, "-o", tmp_path / "one.png"), ("settle", buried)):

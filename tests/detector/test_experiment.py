@@ -208,8 +208,8 @@ def test_jobs_run_in_order_on_free_devices_after_their_dependencies(tmp_path, ca
     jobs.insert(0, replace(job("patient", "pass"), behind=["wrong"]))
     free = {"train": ["cuda:1"], "render": []}
     side_by_side.run_jobs(jobs, free, argparse.Namespace(work=tmp_path, minutes=5))
-    said = [line.split("min  ")[-1] for line in capsys.readouterr().out.splitlines()]
-    assert said == [
+    lines = [line.split("min  ")[-1] for line in capsys.readouterr().out.splitlines()]
+    assert lines == [
         "early: cuda:1 None",
         "late: cuda:1 None",
         "shy: cuda 1",
@@ -224,8 +224,8 @@ def test_rendering_on_the_cpu_has_a_lower_priority_than_training(tmp_path, capsy
     nice = [sys.executable, "-c", "import os; print(os.nice(0))"]
     jobs = [side_by_side.Job(kind, kind, nice) for kind in ("render", "train")]
     side_by_side.run_jobs(jobs, {"train": ["cpu"], "render": ["cpu"]}, argparse.Namespace(work=tmp_path, minutes=5))
-    said = dict(line.split("min  ")[-1].split(": ") for line in capsys.readouterr().out.splitlines())
-    assert said == {"render": "19", "train": str(os.nice(0))}
+    lines = dict(line.split("min  ")[-1].split(": ") for line in capsys.readouterr().out.splitlines())
+    assert lines == {"render": "19", "train": str(os.nice(0))}
 
 
 @pytest.mark.extended

@@ -76,8 +76,8 @@ def test_the_budget_covers_the_peak_of_a_rendering_process(room):
     room.environments[0].save(folder / "assets/room")
     text = room.path.read_text()
     (folder / "room.yaml").write_text(f"{text}environment: assets/room\n")
-    said = subprocess.run([sys.executable, "-c", CHILD, folder / "room.yaml"], capture_output=True, check=True).stdout
-    peak, need = map(float, said.split()[-2:])
+    output = subprocess.run([sys.executable, "-c", CHILD, folder / "room.yaml"], capture_output=True, check=True).stdout
+    peak, need = map(float, output.split()[-2:])
     assert peak < need < 4 * peak
 
 

@@ -62,11 +62,11 @@ def command(tmp_path, *args, seconds=0.05, stop=None):
 def start(tmp_path, scene, out, *options, frames):
     """Start the command line on ``frames`` synthetic frames, in a session of its own as from a terminal."""
     stop = str(out), lines(out) + frames
-    with (tmp_path / "said").open("w") as said:
+    with (tmp_path / "log").open("w") as log:
         return subprocess.Popen(
             command(tmp_path, scene.path, "-o", out, *options, stop=stop),
-            stdout=said,
-            stderr=said,
+            stdout=log,
+            stderr=log,
             start_new_session=True,
             # Children of a background shell job ignore Ctrl-C, and so would this process without the default handler.
             preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
@@ -107,7 +107,7 @@ def test_an_interrupted_run_ends_with_130_and_resumes_to_the_same_bytes(scene, t
     wait_for_frames(process, out, 3)
     os.killpg(process.pid, signal.SIGINT)
     assert process.wait(timeout=60) == 130
-    assert "Traceback" not in (tmp_path / "said").read_text()
+    assert "Traceback" not in (tmp_path / "log").read_text()
     assert not list(out.rglob(".*.part"))
     kept = lines(out)
     assert write(scene, out).rendered == 20 - kept

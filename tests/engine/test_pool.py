@@ -322,7 +322,7 @@ def test_a_gpu_that_does_not_start_loses_its_worker(monkeypatch, kind, exhausted
     def fail(device, threads):
         raise ImportError("cuInit() failed")
 
-    frames, said = iter([7, 8]), []
+    frames, answers = iter([7, 8]), []
 
     def receive():
         with suppress(StopIteration):
@@ -331,9 +331,9 @@ def test_a_gpu_that_does_not_start_loses_its_worker(monkeypatch, kind, exhausted
 
     monkeypatch.setattr(worker_processes, "use_shared_device", fail)
     monkeypatch.setattr(worker_processes, "_end_with_parent", lambda: None)
-    worker_processes._work(SimpleNamespace(recv=receive, send=said.append), kind, None, (Variant(), None))
-    assert isinstance(said.pop(0), Started)
-    assert [(answer.exhausted, answer.message) for answer in said] == [(exhausted, "cuInit() failed")] * 2
+    worker_processes._work(SimpleNamespace(recv=receive, send=answers.append), kind, None, (Variant(), None))
+    assert isinstance(answers.pop(0), Started)
+    assert [(answer.exhausted, answer.message) for answer in answers] == [(exhausted, "cuInit() failed")] * 2
 
 
 @pytest.mark.parametrize(("own", "seen"), [("", "0"), ("GPU-a", "GPU-a")])

@@ -161,8 +161,8 @@ def test_shadow_modes_differ_from_traced(
 
 @pytest.fixture
 def refined(write_scene: WriteScene, scene_data: dict[str, Any]) -> ms.Scene:
-    said = {"quality": "balanced", "rendering": {"kernel": "mip", "samples": 2}}
-    return ms.load_scene(write_scene({**scene_data, **said}, "refined.yaml"))
+    changes = {"quality": "balanced", "rendering": {"kernel": "mip", "samples": 2}}
+    return ms.load_scene(write_scene({**scene_data, **changes}, "refined.yaml"))
 
 
 def test_rendering_refines_the_preset(scene: ms.Scene, refined: ms.Scene, settled: dict[str, Any]) -> None:

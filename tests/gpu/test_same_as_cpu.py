@@ -29,8 +29,8 @@ def rendered(tmp_path_factory: pytest.TempPathFactory, gpu: None) -> dict[str, d
         command = [sys.executable, "-m", "tests.gpu.cases", variant, str(folder / f"{variant}.npz")]
         processes[variant] = subprocess.Popen(command, cwd=root, env=os.environ, stderr=subprocess.PIPE, text=True)
     for variant, process in processes.items():
-        _, said = process.communicate()
-        assert process.returncode == 0, said
+        _, errors = process.communicate()
+        assert process.returncode == 0, errors
         found[variant] = dict(np.load(folder / f"{variant}.npz"))
     return found
 
@@ -42,7 +42,7 @@ def test_gpu_and_cpu_arrays_of_a_case_agree(case: str, rendered: dict[str, dict[
         for arrays in rendered.values()
     )
     assert cpu and list(cpu) == list(gpu)
-    faults = [f"{name}: {said}" for name in cpu if (said := fault(name, cpu[name], gpu[name], case))]
+    faults = [f"{name}: {text}" for name in cpu if (text := fault(name, cpu[name], gpu[name], case))]
     assert not faults
 
 

@@ -113,13 +113,13 @@ def test_files_that_cannot_be_read_are_refused_in_one_sentence(
 ) -> None:
     path = assembly(tmp_path / "a.step")
     text = path.read_text()
-    for content, said in (
+    for content, message in (
         (text.replace("#9=", "#9=DOCUMENT_FILE('/etc/passwd','','',#8,'',$);#9999="), "(got /etc/passwd): export the"),
         (text[:400], "its text is damaged, or it has no surfaces"),
         (Step().save(path).read_text(), "its text is damaged, or it has no surfaces"),
     ):
         path.write_text(content)
-        with pytest.raises(InputError, match=re.escape(said)):
+        with pytest.raises(InputError, match=re.escape(message)):
             read_step(path)
     with pytest.raises(InputError, match="the tolerance must be finite and > 0 mm"):
         read_step(path, tolerance=0.0)

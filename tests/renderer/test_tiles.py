@@ -56,7 +56,7 @@ def test_sorts_agree_with_numpy() -> None:
 
 
 @pytest.mark.parametrize(
-    ("said", "slow"),
+    ("processor", "slow"),
     [
         ("vendor_id\t: AuthenticAMD\ncpu family\t: 25\nflags\t: sse avx2 avx512f avx512dq\n", True),
         ("vendor_id\t: AuthenticAMD\ncpu family\t: 25\nflags\t: sse avx2 sha_ni\n", False),  # Zen 3
@@ -66,12 +66,12 @@ def test_sorts_agree_with_numpy() -> None:
     ],
 )
 def test_processors_on_which_numpy_sorts_slowly_are_known(
-    said: str | None, slow: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    processor: str | None, slow: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from mitsplat.renderer.splatting import sorting
 
-    if said is not None:
-        (tmp_path / "cpuinfo").write_text(f"processor\t: 0\n{said}\nprocessor\t: 1\n{said}")
+    if processor is not None:
+        (tmp_path / "cpuinfo").write_text(f"processor\t: 0\n{processor}\nprocessor\t: 1\n{processor}")
     monkeypatch.setattr(sorting, "CPUINFO", tmp_path / "cpuinfo")
     assert sorting.numpy_sorts_slowly.__wrapped__() is slow
 

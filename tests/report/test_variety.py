@@ -197,8 +197,8 @@ def test_the_report_command_prints_the_warnings(dataset: Path, capsys: pytest.Ca
         one["draws"]["odd"] = {"nested": [float("inf"), None, "<b>"]}  # draws are not validated
     store(dataset, records)
     assert run("report", dataset) == 0
-    said = capsys.readouterr().out.splitlines()
-    assert said[-1].startswith("report:") and all(line.startswith("look  ") for line in said[:-1])
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[-1].startswith("report:") and all(line.startswith("look  ") for line in lines[:-1])
     assert "<b>" not in (dataset / "report.html").read_text()
 
 

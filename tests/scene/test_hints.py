@@ -46,9 +46,9 @@ def test_a_file_instead_of_an_asset_is_refused_with_the_command_to_use(
         scene_data["objects"][0] = {"asset": name} if key == "asset" else {"pool": [name]}
     path = write_scene(scene_data)
     (path.parent / name).write_bytes(b"solid")
-    said = error_of(path)
-    assert hint.format(folder=path.parent) in said
-    assert said.startswith(f"{path}:") and f"{path.parent / name}: must be an asset folder" in said
+    message = error_of(path)
+    assert hint.format(folder=path.parent) in message
+    assert message.startswith(f"{path}:") and f"{path.parent / name}: must be an asset folder" in message
 
 
 def test_folders_that_are_no_assets_are_refused_with_a_hint(scene_data, write_scene) -> None:

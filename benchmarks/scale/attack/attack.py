@@ -89,13 +89,13 @@ class Verdict:
         faults: Violated rules, none if the attack was repelled.
         seconds: Time of all commands.
         mebibytes: Largest resident memory of a command and its children.
-        said: Last line of standard error.
+        last_line: Last line of standard error.
     """
 
     faults: tuple[str, ...]
     seconds: float
     mebibytes: float
-    said: str
+    last_line: str
 
 
 @dataclass
@@ -118,12 +118,12 @@ def judge(attack: Attack, place: Place) -> Verdict:
     before, inputs = list(_tree(place.outside)), {path for path, _ in _tree(place.inside)}
     faults: list[str] = []
     seconds = mebibytes = 0.0
-    said = ""
+    last_line = ""
     for number, words in enumerate(attack.commands):
         last = number == len(attack.commands) - 1
         ended = run(filled(words, place), place, attack, during=attack.during if last else None, faults=faults)
         seconds, mebibytes = seconds + ended.seconds, max(mebibytes, ended.mebibytes)
-        said = (ended.errors.strip().splitlines() or [""])[-1]
+        last_line = (ended.errors.strip().splitlines() or [""])[-1]
         faults += _offences(ended, attack.status if last else FINE, stopped=last and attack.during is not None)
         if SECRET_WORD in ended.output + ended.errors:
             faults.append("it prints text of a file outside")
@@ -136,7 +136,7 @@ def judge(attack: Attack, place: Place) -> Verdict:
     faults += [f"{name} was changed" for name, was in kept.items() if _fingerprint(place.inside / name) != was]
     faults += [f"{path} shows what lies outside" for path in _leaks(place.inside, inputs)]
     faults += [f"{path} was made, which no command names" for path in _unnamed(attack, place, inputs)]
-    return Verdict(tuple(faults), seconds, mebibytes, said)
+    return Verdict(tuple(faults), seconds, mebibytes, last_line)
 
 
 def filled(words: Sequence[str], place: Place) -> list[str]:
@@ -281,8 +281,8 @@ def _offences(ended: Ended, allowed: frozenset[int], *, stopped: bool) -> Iterat
             yield "it was stopped"
     elif ended.status not in allowed:
         expected = " or ".join(map(str, sorted(allowed)))
-        said = (text.strip().splitlines() or ["nothing"])[-1]
-        yield f"it exits with status {ended.status}, not {expected}: {said:.300}"
+        last_line = (text.strip().splitlines() or ["nothing"])[-1]
+        yield f"it exits with status {ended.status}, not {expected}: {last_line:.300}"
     if "Traceback (most recent call last)" in text:
         yield "it prints a traceback"
     if "internal error of mitsplat" in text:

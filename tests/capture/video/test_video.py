@@ -355,9 +355,9 @@ def test_the_video_worker_prints_one_json_object_per_line_only(pan: Path, tmp_pa
         "3",
     ]
     done = subprocess.run(command, capture_output=True, text=True, check=True, env=os.environ)
-    said = [json.loads(line) for line in done.stdout.splitlines()]
+    messages = [json.loads(line) for line in done.stdout.splitlines()]
     assert done.stderr == ""
-    assert {key for message in said for key in message} == {"progress", "found"}
-    steps = [message["progress"] for message in said[:-1]]
+    assert {key for message in messages for key in message} == {"progress", "found"}
+    steps = [message["progress"] for message in messages[:-1]]
     assert steps[0] == [1, len(places()), "watching the video"]
     assert steps[len(places()) - 1][:2] == [len(places())] * 2

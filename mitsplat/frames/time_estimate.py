@@ -6,6 +6,9 @@ from collections.abc import Mapping
 
 TIMED_FRAMES = 3
 """Number of frames of a run after which the first estimate of its time is corrected."""
+CORRECTED = 0.5
+"""Later estimates are reported if they are lower than this share of the last one: with several processes, the first
+image of each compiles kernels."""
 
 
 class RunTime:
@@ -21,22 +24,27 @@ class RunTime:
         self._layouts, self._images, self._settles_first = layouts, images, settles_first
         self._settle = self._image = 0.0
         self._timed = 0
+        self._reported = 0.0
 
     def add(self, seconds: Mapping[str, float]) -> str:
         """Add the seconds of the stages of an image.
 
         Returns:
-            The estimate after the first image, and after ``TIMED_FRAMES`` images; otherwise an empty string.
+            The estimate after the first image, after ``TIMED_FRAMES`` images, and after any later one that shows that
+            the run takes much less time; otherwise an empty string.
         """
         settle = seconds.get("settle", 0.0)
         image = sum(seconds.values()) - settle
         self._settle = max(self._settle, settle)
         self._image = min(self._image, image) if self._timed else image
         self._timed += 1
-        if self._images == 1 or self._timed not in (1, TIMED_FRAMES):
+        total = self._layouts * self._settle + self._images * self._image
+        much_less = self._timed > TIMED_FRAMES and total < CORRECTED * self._reported
+        if self._images == 1 or not (self._timed in (1, TIMED_FRAMES) or much_less):
             return ""
+        self._reported = total
         text = describe_time(self._layouts, self._settle if self._settles_first else None, self._images, self._image)
-        return f"{text} (the first image also compiles kernels)" if self._timed == 1 else text
+        return f"{text} (the first image of a process also compiles kernels)" if self._timed == 1 else text
 
 
 def describe_time(layouts: int, settle: float | None, images: int, image: float) -> str:

@@ -97,9 +97,16 @@ def test_a_run_states_its_time_after_the_first_image_and_corrects_it(tmp_path: P
     )
     first, corrected = (note for note in notes if note.startswith("time: about "))
     assert "about 5 min in one process: 6 images of 50 s, and 3 layouts" in first
-    assert first.endswith("(the first image also compiles kernels)")
+    assert first.endswith("(the first image of a process also compiles kernels)")
     assert "about 12 s in one process: 6 images of 2 s, and 3 layouts" in corrected
     assert notes.index(first) == notes.index("frame 0") + 1 and notes.index(corrected) == notes.index("frame 2") + 1
+
+
+def test_an_estimate_from_first_images_of_several_processes_is_corrected_later() -> None:
+    run = time_estimate.RunTime(0, 100, settles_first=False)
+    texts = [run.add({"trace": seconds}) for seconds in (50.0, 52.0, 51.0, 48.0, 2.0, 1.9, 2.0)]
+    assert [bool(text) for text in texts] == [True, False, True, False, True, False, False]
+    assert texts[4].startswith("about 3 min in one process: 100 images of 2 s")
 
 
 def test_a_run_of_one_image_states_no_time() -> None:

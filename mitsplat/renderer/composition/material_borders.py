@@ -24,15 +24,13 @@ from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.gaussians.splat_materials import SplatMaterials
 from mitsplat.images.colour import LUMINANCE, decode_srgb
 from mitsplat.quality import Quality
+from mitsplat.renderer.composition.parameter_pass import ParameterPass, parameter_cloud
 from mitsplat.renderer.materials.proxy_materials import MIN_OPACITY, GlossChange
 from mitsplat.renderer.occluders.proxies import Hit
-from mitsplat.renderer.projection.clouds import Cloud, CloudSet, Placement, merge_clouds, upload_cloud
-from mitsplat.renderer.rays.camera_rays import TILE_HEIGHT, TILE_PIXELS, TILE_WIDTH, CameraView
+from mitsplat.renderer.projection.clouds import Cloud, CloudSet, Placement, merge_clouds
+from mitsplat.renderer.rays.camera_rays import TILE_HEIGHT, TILE_WIDTH, CameraView
 from mitsplat.renderer.rays.device_arrays import wrapped
 from mitsplat.renderer.rays.tile_subset import TileSubset
-from mitsplat.renderer.splatting.march import march_tiles
-from mitsplat.renderer.splatting.pairs import CrowdedError
-from mitsplat.renderer.splatting.tiles import bin_gaussians
 
 DIFFERENT = 0.1
 """Difference of metalness between two materials that have a border."""
@@ -97,22 +95,8 @@ class MixedObjects:
         subset = self._borders(view, hit, instance)
         if subset.count == 0:
             return parameters[0], parameters[1]
-        exact = quality if quality.order == "tile" else replace(quality, tolerance=0.0)
-        own = dr.zeros(mi.Float, subset.count * TILE_PIXELS)
-        lane = dr.arange(mi.UInt32, dr.width(own))
-        number = dr.gather(mi.UInt32, subset.number, lane // TILE_PIXELS)
-        row = number // view.tiles_x
-        x = (number - row * view.tiles_x) * TILE_WIDTH + lane % TILE_WIDTH
-        y = row * TILE_HEIGHT + lane // TILE_WIDTH % TILE_HEIGHT
-        inside = (x < view.width) & (y < view.height)
-        pixel = y * view.width + x
-        far = None if z_max is None else dr.gather(mi.Float, z_max, pixel, inside)
-        dr.eval(own, far, pixel, inside)
-        try:
-            lists = bin_gaussians(self.clouds, self.placements, view, exact, subset=subset)
-        except CrowdedError:
-            return parameters[0], parameters[1]
-        image, _ = march_tiles(lists, view, exact, own, far)
+        found = ParameterPass.of(self.clouds, self.placements, view, quality, subset, z_max)
+        image, pixel, inside = found.image, found.pixel, found.inside
         metal, luminance, rough = image.rgb
         mixed = dr.gather(mi.Bool, self.mixed, dr.gather(mi.UInt32, instance, pixel, inside), inside)
         shown = inside & mixed & (image.alpha > 0.5) & (luminance > 0)
@@ -162,5 +146,4 @@ def _parameter_cloud(splats: Splats, gloss: GlossChange) -> Cloud:
     luminance = np.maximum(base @ LUMINANCE, LEAST_LUMINANCE)
     roughness = materials.roughness if gloss.roughness is None else np.full(len(splats), gloss.roughness)
     values = luminance[:, None] * np.stack([materials.metallic, np.ones(len(splats)), roughness], axis=1)
-    sh = ((values - 0.5) / SH_C0).astype(np.float32)[:, None]
-    return upload_cloud(splats.means, splats.quats, splats.scales, splats.opacities, sh)
+    return parameter_cloud(splats, values)

@@ -9,6 +9,7 @@ import mitsuba as mi
 
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.renderer.composition.material_borders import MixedObjects
+from mitsplat.renderer.composition.shading_normals import NormalMappedShapes
 from mitsplat.renderer.light.light_traits import Traits
 from mitsplat.renderer.materials.radiance_grid import RadianceGrid
 from mitsplat.renderer.meshes.mirrored_splats import SplatMirror
@@ -31,6 +32,7 @@ class SceneContents:
     traits: Traits
     grid: RadianceGrid | None
     mixed: MixedObjects | None
+    normal_mapped: NormalMappedShapes | None
 
 
 class ContentsReader:
@@ -76,6 +78,7 @@ class ContentsReader:
             Traits.of(carriers, placements),
             self._surroundings(carriers),
             MixedObjects.of(carriers, placements),
+            NormalMappedShapes.of(carriers, placements),
         )
         return self._contents
 

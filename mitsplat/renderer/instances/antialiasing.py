@@ -94,7 +94,7 @@ class Edges:
             CrowdedError: If one tile alone has too many pairs.
         """
         exact = quality if quality.order == "tile" else replace(quality, tolerance=0.0)
-        return _trace(clouds, placements, self.fine, self.subset, exact, mi.Float(own), z_max)
+        return trace_tiles(clouds, placements, self.fine, self.subset, exact, mi.Float(own), z_max)
 
     def pixels(self) -> mi.UInt32:
         """Return the pixel of the picture that contains each ray."""
@@ -155,7 +155,7 @@ def _pixel(x: mi.Int32, y: mi.Int32, view: CameraView) -> mi.UInt32:
     return mi.UInt32(dr.clip(y, 0, view.height - 1) * view.width + dr.clip(x, 0, view.width - 1))
 
 
-def _trace(
+def trace_tiles(
     clouds: CloudSet,
     placements: Sequence[Placement],
     view: CameraView,
@@ -164,6 +164,11 @@ def _trace(
     own: mi.Float,
     z_max: mi.Float | None,
 ) -> tuple[Image, list[mi.Float]]:
+    """Render the tiles of ``subset``, in parts if they have too many pairs; see :func:`march_tiles`.
+
+    Raises:
+        CrowdedError: If one tile alone has too many pairs.
+    """
     try:
         return march_tiles(bin_gaussians(clouds, placements, view, quality, subset=subset), view, quality, own, z_max)
     except CrowdedError:
@@ -173,7 +178,7 @@ def _trace(
     for half in subset.halves(view):
         pixels = dr.arange(mi.UInt32, half.count * TILE_PIXELS) + start
         part_z = None if z_max is None else dr.gather(mi.Float, z_max, pixels)
-        parts.append(_trace(clouds, placements, view, half, quality, dr.gather(mi.Float, own, pixels), part_z))
+        parts.append(trace_tiles(clouds, placements, view, half, quality, dr.gather(mi.Float, own, pixels), part_z))
         start += half.count * TILE_PIXELS
     images, shares = zip(*parts, strict=True)
     return Image.joined(images), [dr.concat(list(values)) for values in zip(*shares, strict=True)]

@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mitsplat.renderer.light.light_traits import Traits
-from mitsplat.renderer.materials.principled import SpecularLobe
+from mitsplat.renderer.materials.principled import MIN_COSINE, SpecularLobe
 from mitsplat.renderer.occluders.proxies import Hit, Proxies
 from mitsplat.renderer.rays.camera_rays import CameraView
 from mitsplat.renderer.rays.device_arrays import gathered
@@ -83,6 +83,7 @@ class VisiblePixels:
         trait: Row of the visible shape in :class:`Traits`.
         mesh: True if the pixel shows a visible mesh.
         metallic, roughness: Parameters that replace those of the proxy where they are not negative.
+        normal: Unit shading normal that replaces that of the proxy where it is not zero.
     """
 
     direction: mi.Vector3f
@@ -93,6 +94,7 @@ class VisiblePixels:
     mesh: mi.Bool
     metallic: mi.Float
     roughness: mi.Float
+    normal: mi.Vector3f
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,7 +172,7 @@ class VisibleSurfaces:
         reach = dr.max(dr.abs(position))
         return LitSurface(
             position=position,
-            normal=mi.Vector3f(dr.select(same, shown[0], towards)),
+            normal=self._shading_normal(seen, mi.Vector3f(dr.select(same, shown[0], towards))),
             face=mi.Vector3f(dr.select(same, shown[1], towards)),
             lift=dr.select(on_proxy, shown[2], 0),
             to_camera=-ray.d,
@@ -185,3 +187,14 @@ class VisibleSurfaces:
             known=known,
             valid=valid,
         )
+
+    @staticmethod
+    def _shading_normal(seen: VisiblePixels, smooth: mi.Vector3f) -> mi.Vector3f:
+        """Return the normal of the splats where they have one, otherwise ``smooth``.
+
+        A normal that points away from the camera is turned to the horizon.
+        """
+        normal, towards = seen.normal, -seen.direction
+        cosine = dr.dot(normal, towards)
+        normal = dr.select(cosine < MIN_COSINE, dr.normalize(normal + (MIN_COSINE - cosine) * towards), normal)
+        return dr.select(dr.squared_norm(seen.normal) > 0, normal, smooth)

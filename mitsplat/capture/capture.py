@@ -93,7 +93,7 @@ class PhotoPixels(NamedTuple):
     Attributes:
         rgb: Display-encoded colours in [0, 1], shape (H, W, 3).
         mask: Share of each pixel that the object covers, shape (H, W), or None without a mask.
-        hidden: Possible occlusion of the object by other things, (H, W) in [0, 1], or None without occlusion.
+        hidden: Possible occlusion of the object by other objects, (H, W) in [0, 1], or None without occlusion.
     """
 
     rgb: Float32Array
@@ -118,7 +118,7 @@ class Photo:
         name: File name as given by the user.
         file: Image file, in the orientation of the camera.
         camera: Camera in the frame of the capture.
-        mask: 8-bit image of the same size, 255 = object; transparent where another thing may occlude the object.
+        mask: 8-bit image of the same size, 255 = object; transparent where another object may occlude the object.
         seen: Indices of the capture's points that this photo observes, shape (K,).
         gain: Factors of linear red, green and blue that match the exposure of the other photos; None for no correction.
     """

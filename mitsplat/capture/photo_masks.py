@@ -39,7 +39,7 @@ MaskMaker = Callable[[Photo], BoolArray]
 """Function that computes the mask of a photo, shape (H, W)."""
 
 Hidden = Mapping[str, BoolArray]
-"""Pixels (H, W) in which another thing may occlude the object, by the name of the photo; photos without them are
+"""Pixels (H, W) in which another object may occlude the object, by the name of the photo; photos without them are
 absent.
 """
 _NOTHING: Hidden = {}
@@ -103,7 +103,7 @@ def add_masks(
         folder: Folder for the masks.
         progress: Callback with the number of finished photos.
         points: Points of the object that masks must cover, shape (N, 3).
-        hidden: Pixels in which other things may occlude the object.
+        hidden: Pixels in which other objects may occlude the object.
         threads: Number of masks that are computed at the same time.
     """
     photos, rejected = [], dict(capture.rejected)
@@ -167,7 +167,7 @@ def object_masks(
         above: Points of the object alone, which masks must cover, shape (M, 3).
         folder: Folder for the masks.
         bare: Function that finds pixels that are certainly not the object.
-        hidden: Pixels in which other things may occlude the object; masks are 0 and transparent there.
+        hidden: Pixels in which other objects may occlude the object; masks are 0 and transparent there.
         progress: Callback with the number of finished photos.
     """
     add = partial(
@@ -291,7 +291,7 @@ def geometric_masks(points: Float64Array, bare: Bare | None = None, hidden: Hidd
     Args:
         points: Points of the object in the frame of the capture, shape (N, 3); see :func:`object_points`.
         bare: Function that finds pixels that are certainly not the object.
-        hidden: Pixels in which other things may occlude the object.
+        hidden: Pixels in which other objects may occlude the object.
     """
 
     def make(photo: Photo) -> BoolArray:
@@ -319,7 +319,7 @@ def agreed_masks(
         masked: Capture with initial masks.
         points: Points of the object in the frame of the capture, shape (N, 3); they bound the hull.
         bare: Function that finds pixels that are certainly not the object.
-        hidden: Pixels in which other things may occlude the object.
+        hidden: Pixels in which other objects may occlude the object.
     """
     small = {photo.name: _reduce_photo(photo) for photo in masked.photos}
     shown = [(camera, mask | _resize_occlusion(hidden.get(name), camera)) for name, (camera, _, mask) in small.items()]

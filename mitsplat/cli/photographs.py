@@ -70,7 +70,7 @@ Remove = Annotated[
     typer.Option(
         "--remove",
         metavar="PHOTO:X,Y",
-        help="Remove the thing at this pixel, in CAPTURE/images, from an environment; repeatable.",
+        help="Remove the object at this pixel, in CAPTURE/images, from an environment; repeatable.",
     ),
 ]
 Box = Annotated[

@@ -104,7 +104,7 @@ class HeldOutView(AssetView):
         name: Name of the photo.
         photo: Display-encoded colours, (H, W, 3).
         mask: Share of each pixel that the object covers, (H, W), or None.
-        known: True where no other thing may hide the object, (H, W).
+        known: True where no other object may hide the object, (H, W).
     """
 
     name: str

@@ -81,7 +81,7 @@ class AssetJob:
         kind: Objects are isolated, get convex pieces and can be dropped; environments stay whole and get an open mesh.
         settings: Settings of the reconstruction.
         imported: Mesh that replaces the reconstructed one.
-        remove: Things to remove from an environment, PHOTO:X,Y in pixels of the capture's photos.
+        remove: Objects to remove from an environment, PHOTO:X,Y in pixels of the capture's photos.
         material: Parameters of the one material that the asset gets, see :meth:`mitsplat.Splats.with_material`; None
             keeps the captured colours.
         light: Light of the photographs, from which the materials of an object are estimated; None if it is unknown.
@@ -104,9 +104,11 @@ class AssetJob:
         if self.settings.refine is not None and (self.kind != "object" or self.imported is not None):
             raise InputError("only the mesh of an object that is reconstructed from masks can be refined")
         if self.remove and self.kind != "environment":
-            raise InputError("things can be removed only from an environment: use --kind environment, or omit --remove")
+            raise InputError(
+                "objects can be removed only from an environment: use --kind environment, or omit --remove"
+            )
         if self.remove and self.imported is not None:
-            raise InputError("things cannot be removed from an imported mesh: omit one of the two")
+            raise InputError("objects cannot be removed from an imported mesh: omit one of the two")
         if self.light is not None:
             if self.kind != "object":
                 raise InputError(f"materials are estimated for objects only: omit the lights (got kind {self.kind})")

@@ -63,7 +63,7 @@ class MaskedView:
     Attributes:
         camera: The camera.
         mask: Share of each pixel that the object covers, (H, W) in [0, 1].
-        hidden: Share of each pixel where another thing may hide the object, (H, W) in [0, 1]; None if nowhere.
+        hidden: Share of each pixel where another object may hide the object, (H, W) in [0, 1]; None if nowhere.
 
     Raises:
         ValueError: If the mask does not have the camera's size.

@@ -22,7 +22,7 @@ MIN_PHOTOS = 3
 SUPPORT_TOLERANCE = 0.012
 """Largest height above the support that still counts as the support, as a share of the typical depth."""
 MAX_THING_HEIGHT = 0.6
-"""Largest height of things that stand on a support, as a share of the typical depth."""
+"""Largest height of objects that stand on a support, as a share of the typical depth."""
 _MIN_HOLE_AREA = 0.005
 """Least area of a hole in the report, as a share of the support's area."""
 _MAX_HOLES = 3

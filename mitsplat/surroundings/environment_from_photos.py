@@ -35,7 +35,7 @@ from mitsplat.surroundings.coverage import (
 from mitsplat.surroundings.depth_views import SurfacePoints, depth_views, surface_points
 from mitsplat.surroundings.floaters import remove_floaters
 from mitsplat.surroundings.ready_scene import Region, scene_text
-from mitsplat.surroundings.removal import RemovedThing, remove_things
+from mitsplat.surroundings.removal import RemovedObject, remove_objects
 from mitsplat.surroundings.supports import Support, find_supports, flatten_mesh
 
 _FOREGROUND_DISTANCE = 3.0
@@ -55,7 +55,7 @@ _FLATTEN_RANGE = 0.03
 _MAX_HIDDEN_SHARE = 0.1
 """Largest share of the support that too few photos may show."""
 _MAX_UNCHANGED = 1.5 / 255
-"""Largest colour difference of a pixel that the removal of things left unchanged."""
+"""Largest colour difference of a pixel that the removal of objects left unchanged."""
 _MIN_REGION = 0.1
 """Least edge of a drop region [m]."""
 _UP = np.array([0.0, 0.0, 1.0])
@@ -98,9 +98,9 @@ def reconstruct_environment(
         points, views = points.transformed(motion), [view.transformed(motion) for view in views]
         found = find_supports(points, _UP, scale, within=_MAX_LEVEL_TILT)
     cameras = [photo.camera for photo in capture.training]
-    fitted, things = splats, list[RemovedThing]()
+    fitted, removed_objects = splats, list[RemovedObject]()
     if job.remove:
-        splats, things = remove_things(splats, job.remove, capture, found, points, scale, progress)
+        splats, removed_objects = remove_objects(splats, job.remove, capture, found, points, scale, progress)
         views = depth_views(splats, cameras)
         points = surface_points(views)
     background = _background(splats, cameras)
@@ -124,13 +124,15 @@ def reconstruct_environment(
         named = [(photo.name, photo.camera) for photo in capture.training]
         holes = find_holes(found[0], coverage, splats, named)
         supports = [support.transformed(larger) for support in found]
-        filled = coverage.cells_with(np.concatenate([np.zeros((0, 2)), *(t.filled for t in things if t.support == 0)]))
+        filled = coverage.cells_with(
+            np.concatenate([np.zeros((0, 2)), *(t.filled for t in removed_objects if t.support == 0)])
+        )
         region = _region(coverage, found[0], factor)
         unit = "m" if made.asset.units == "metre" else "units"
         rows |= _rows(supports, coverage, holes, region, factor, unit)
         findings += _findings(coverage, holes, region, factor, unit, metric=made.asset.units == "metre")
-        if things:
-            rows["Removed things"] = "; ".join(_removal_text(thing, factor, unit) for thing in things)
+        if removed_objects:
+            rows["Removed objects"] = "; ".join(_removal_text(one, factor, unit) for one in removed_objects)
             record["removed_things"] = [
                 {
                     "pick": t.pick,
@@ -139,7 +141,7 @@ def reconstruct_environment(
                     "behind": factor**2 * t.behind,
                     "copied": t.copied,
                 }
-                for t in things
+                for t in removed_objects
             ]
         sections.append(_support_map(coverage, filled))
         record["supports"] = [
@@ -150,7 +152,7 @@ def reconstruct_environment(
             record["scene"] = scene_text(job.name, supports, region, seen)
     else:
         findings.append(
-            "no level surface was found for things to stand on (one is required): photograph the table from above as "
+            "no level surface was found for objects to stand on (one is required): photograph the table from above as "
             "well, and put texture on it"
         )
     if made.asset.units != "metre":
@@ -160,7 +162,7 @@ def reconstruct_environment(
         )
     # The PSNR is that of the asset after all changes, not that of the fit.
     if made.held_out:
-        psnr = _mean_psnr(made.held_out, fitted if things else None)
+        psnr = _mean_psnr(made.held_out, fitted if removed_objects else None)
     verdict = replace(made.verdict, psnr=psnr, rows=rows, findings=tuple(findings))
     return replace(made, verdict=verdict, sections=tuple(sections), record=record)
 
@@ -259,22 +261,22 @@ def _hole_text(hole: Hole, factor: float, unit: str) -> str:
     x, y = (factor * value for value in hole.centre)
     place = f"{factor**2 * hole.area:.2g} {unit}² around x {x:.2f}, y {y:.2f}"
     if hole.nearest_photo is None:
-        return f"{place}, hidden from all directions by things: move them"
+        return f"{place}, hidden from all directions by objects: move them"
     return (
         f"{place}: photograph it from near {hole.nearest_photo}, {hole.elevation:.0f} degrees above it "
         f"(shows {hole.visible_share:.0%})"
     )
 
 
-def _removal_text(thing: RemovedThing, factor: float, unit: str) -> str:
-    """Describe a removed thing and the filled area as a clause."""
-    size = " x ".join(f"{factor * edge:.2g}" for edge in thing.high - thing.low)
-    x, y = (factor * 0.5 * (thing.low + thing.high))[:2]
-    copied = "copies of the surroundings" if thing.copied > 0.99 else f"copies of the surroundings ({thing.copied:.0%})"
-    behind = f" and {factor**2 * thing.behind:.2g} {unit}² of a wall behind it" if thing.behind else ""
+def _removal_text(one: RemovedObject, factor: float, unit: str) -> str:
+    """Describe a removed object and the filled area as a clause."""
+    size = " x ".join(f"{factor * edge:.2g}" for edge in one.high - one.low)
+    x, y = (factor * 0.5 * (one.low + one.high))[:2]
+    copied = "copies of the surroundings" if one.copied > 0.99 else f"copies of the surroundings ({one.copied:.0%})"
+    behind = f" and {factor**2 * one.behind:.2g} {unit}² of a wall behind it" if one.behind else ""
     return (
-        f"{size} {unit} around x {x:.2f}, y {y:.2f} of surface {thing.support} ({thing.pick}), {thing.gaussians} "
-        f"Gaussians; {factor**2 * thing.area:.2g} {unit}²{behind} hidden by it are synthesised from {copied}"
+        f"{size} {unit} around x {x:.2f}, y {y:.2f} of surface {one.support} ({one.pick}), {one.gaussians} "
+        f"Gaussians; {factor**2 * one.area:.2g} {unit}²{behind} hidden by it are synthesised from {copied}"
     )
 
 
@@ -316,7 +318,7 @@ def _support_map(coverage: Coverage, filled: BoolArray) -> str:
     tint[coverage.hidden] = (0.85, 0.3, 0.25)
     tint[filled] = (0.9, 0.75, 0.3)
     picture = np.repeat(np.repeat(tint.transpose(1, 0, 2)[::-1], 5, axis=0), 5, axis=1)
-    invented = ", yellow was hidden by removed things and is synthesised" if filled.any() else ""
+    invented = ", yellow was hidden by removed objects and is synthesised" if filled.any() else ""
     note = (
         "The support from above, x to the right and y up: green is free, dark is covered, red is visible "
         f"in fewer than {MIN_PHOTOS} photos{invented}."

@@ -22,7 +22,7 @@ from mitsplat.surroundings.supports import Support
 CELL = 0.004
 """Edge of the cells that fill a support, as a share of the typical depth."""
 _BARE_HEIGHT = 0.25
-"""Largest height of the bare support, as a share of the height that separates it from things."""
+"""Largest height of the bare support, as a share of the height that separates it from objects."""
 _VIEW_SIZE = 400
 """Longest edge of the pictures for the support's colours [px]."""
 _OPAQUE = 0.9
@@ -33,7 +33,7 @@ _SIGMA_ALONG, _SIGMA_ACROSS = 0.7, 0.1
 
 @dataclass(eq=False)
 class Ground:
-    """Texture of a support in the photos; it changes when things are removed.
+    """Texture of a support in the photos; it changes when objects are removed.
 
     Attributes:
         support: The support.
@@ -101,7 +101,7 @@ class Grid:
         return top
 
     def inside(self, points: Float64Array, footprint: BoolArray, depth: float) -> Float64Array:
-        """Return a lattice of positions (M, 3) inside a thing, below its surface points.
+        """Return a lattice of positions (M, 3) inside an object, below its surface points.
 
         The positions are at least ``depth`` from sides, top and ground; ``depth`` is also the step of the lattice.
         """
@@ -118,7 +118,7 @@ class Grid:
         return np.concatenate([np.zeros((0, 3)), *columns])
 
     def outline(self, points: Float64Array) -> BoolArray:
-        """Return the covered cells of one thing, with holes filled."""
+        """Return the covered cells of one object, with holes filled."""
         return np.asarray(binary_fill_holes(self.covered(points)))
 
     def bare_colours(self, splats: Splats, cameras: Sequence[Camera], height: float) -> tuple[Float64Array, BoolArray]:

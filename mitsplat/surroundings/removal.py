@@ -1,8 +1,8 @@
-"""Removal of a thing from a support, and completion of the surfaces behind it.
+"""Removal of an object from a support, and completion of the surfaces behind it.
 
-Points that stand on the support are separated into connected things. Each Gaussian belongs to the thing of its nearest
-point, and so do Gaussians that reach into its volume. No photo shows the support below the thing, or a wall close
-behind it. Both are filled with patches of the same surface (:mod:`.texture_fill`), as sheets of flat Gaussians.
+Points that stand on the support are separated into connected objects. Each Gaussian belongs to the object of its
+nearest point, and so do Gaussians that reach into its volume. No photo shows the support below the object, or a wall
+close behind it. Both are filled with patches of the same surface (:mod:`.texture_fill`), as sheets of flat Gaussians.
 """
 
 from __future__ import annotations
@@ -27,32 +27,32 @@ from mitsplat.surroundings.supports import Support, find_walls
 from mitsplat.surroundings.texture_fill import dilated, fill_texture
 
 _VOXEL = 0.02
-"""Edge of the voxels that separate things, as a share of the typical depth."""
+"""Edge of the voxels that separate objects, as a share of the typical depth."""
 _SPARSE_SHARE = 0.05
 """Number of points in a voxel below which it counts as free, as a share of the median number."""
 _PICK_TOLERANCE = 3
-"""Largest distance between a picked position and a point of the thing [voxels]."""
+"""Largest distance between a picked position and a point of the object [voxels]."""
 _MAX_OVERHANG = 3
-"""Largest overhang of a thing beyond its support [voxels]."""
+"""Largest overhang of an object beyond its support [voxels]."""
 _RADIUS_SIGMAS = 2.0
 """Radius of a Gaussian in standard deviations."""
 _OTHER_DISTANCE = 0.5
-"""Distance from the surface of another thing above which a Gaussian over the footprint does not belong to that thing
+"""Distance from the surface of another object above which a Gaussian over the footprint does not belong to that object
 [voxels].
 """
 _OWNER_MARGIN = 4
-"""Margin around a thing in which the nearest point decides on the owner of a Gaussian [voxels]."""
+"""Margin around an object in which the nearest point decides on the owner of a Gaussian [voxels]."""
 _BLEED_WIDTH = 2
-"""Width of the border around the hidden area whose colours the thing affects, in units of ``SUPPORT_TOLERANCE``."""
+"""Width of the border around the hidden area whose colours the object affects, in units of ``SUPPORT_TOLERANCE``."""
 _FEET_RANGE = 0.4
-"""Half the height range of a thing's feet around half of :data:`SUPPORT_TOLERANCE`, as a share of it."""
+"""Half the height range of an object's feet around half of :data:`SUPPORT_TOLERANCE`, as a share of it."""
 _STRAY_SHARE = 0.02
-"""Share of a thing's points that are ignored for its distance from a wall."""
+"""Share of an object's points that are ignored for its distance from a wall."""
 
 
 @dataclass(frozen=True, eq=False)
-class RemovedThing:
-    """A removed thing, in the support's frame.
+class RemovedObject:
+    """A removed object, in the support's frame.
 
     Attributes:
         pick: The pick as given.
@@ -83,7 +83,7 @@ class RemovedThing:
         return self.area + self.behind
 
 
-def remove_things(
+def remove_objects(
     splats: Splats,
     picks: Sequence[str],
     capture: Capture,
@@ -91,27 +91,27 @@ def remove_things(
     points: SurfacePoints,
     scale: float,
     progress: Progress | None = None,
-) -> tuple[Splats, list[RemovedThing]]:
-    """Remove picked things one after the other, and fill the surfaces that they hid.
+) -> tuple[Splats, list[RemovedObject]]:
+    """Remove picked objects one after the other, and fill the surfaces that they hid.
 
     Args:
         splats: Splats of the scene.
-        picks: PHOTO:X,Y [px] on each thing.
+        picks: PHOTO:X,Y [px] on each object.
         capture: Photos in the splats' frame.
-        supports: Supports of things.
+        supports: Supports of objects.
         points: Surface points of the training photos.
         scale: Typical depth of the photos.
-        progress: Called after each thing.
+        progress: Called after each object.
 
     Returns:
-        The splats, and the removed things.
+        The splats, and the removed objects.
 
     Raises:
         InputError: If there is no such photo, or the pixel shows nothing that stands on a support.
     """
     walls = find_walls(points, scale)
     surfaces = [*supports, *walls]
-    fitted, places, grounds, removed = splats, points.places, dict[int, Ground](), list[RemovedThing]()
+    fitted, places, grounds, removed = splats, points.places, dict[int, Ground](), list[RemovedObject]()
 
     def ground(number: int) -> Ground:
         """Return the texture of a surface, including earlier fills."""
@@ -121,19 +121,19 @@ def remove_things(
 
     for pick in picks:
         number, spot = _find_pick(splats, pick, capture, supports, scale)
-        splats, own, places, thing = _remove_thing(splats, pick, number, spot, ground(number), walls, places, scale)
+        splats, own, places, body = _remove_object(splats, pick, number, spot, ground(number), walls, places, scale)
         for place, wall in enumerate(walls, len(supports)):
             if _is_close_to_wall(own, wall, scale):
                 splats, area, copied = _fill_behind(splats, own, places, ground(place), scale)
-                share = (thing.copied * thing.filled_area + copied * area) / (thing.filled_area + area)
-                thing = replace(thing, behind=thing.behind + area, copied=share)
-        removed.append(thing)
+                share = (body.copied * body.filled_area + copied * area) / (body.filled_area + area)
+                body = replace(body, behind=body.behind + area, copied=share)
+        removed.append(body)
         if progress is not None:
-            progress(len(removed), len(picks), "removing things")
+            progress(len(removed), len(picks), "removing objects")
     return splats, removed
 
 
-def _remove_thing(
+def _remove_object(
     splats: Splats,
     pick: str,
     number: int,
@@ -142,26 +142,26 @@ def _remove_thing(
     walls: Sequence[Support],
     places: Float64Array,
     scale: float,
-) -> tuple[Splats, Float64Array, Float64Array, RemovedThing]:
-    """Return the splats without the thing, its points (M, 3), all other points (N, 3), and its description."""
+) -> tuple[Splats, Float64Array, Float64Array, RemovedObject]:
+    """Return the splats without the object, its points (M, 3), all other points (N, 3), and its description."""
     support, grid = ground.support, ground.grid
     inverse = np.asarray(np.linalg.inv(support.pose))
-    # Points on walls are excluded, so that a thing that touches a wall ends there.
+    # Points on walls are excluded, so that an object that touches a wall ends there.
     loose = ~np.any(
         [np.zeros(len(places), dtype=bool), *(w.contains(places, SUPPORT_TOLERANCE * scale) for w in walls)], axis=0
     )
-    thing, others = _separate_thing(support.local(places), loose, spot, support, scale)
-    if thing is None:
-        raise InputError(f"{pick}: the photos do not show enough of the thing to separate it from its surroundings")
-    standing, footprint, hole = _hidden_cells(ground, thing, others, scale)
-    gone = _thing_gaussians(splats.transformed(inverse), thing, others, grid, footprint, hole, scale)
+    body, others = _separate_object(support.local(places), loose, spot, support, scale)
+    if body is None:
+        raise InputError(f"{pick}: the photos do not show enough of the object to separate it from its surroundings")
+    standing, footprint, hole = _hidden_cells(ground, body, others, scale)
+    gone = _object_gaussians(splats.transformed(inverse), body, others, grid, footprint, hole, scale)
     sheet, copied = _fill_hole(ground, standing, hole)
-    removed = RemovedThing(
+    removed = RemovedObject(
         pick=pick,
         support=number,
         gaussians=int(gone.sum()),
-        low=thing.min(axis=0),
-        high=thing.max(axis=0),
+        low=body.min(axis=0),
+        high=body.max(axis=0),
         filled=grid.middles[hole],
         area=float(hole.sum()) * grid.cell**2,
         behind=0.0,
@@ -174,17 +174,17 @@ def _remove_thing(
         & footprint[tuple(cells.T)]
         & (np.abs(others[:, 2] / (SUPPORT_TOLERANCE * scale) - 0.5) < _FEET_RANGE)
     )
-    parts = np.concatenate([thing, others[feet]]), others[~feet]
+    parts = np.concatenate([body, others[feet]]), others[~feet]
     own, rest = (part @ support.pose[:3, :3].T + support.pose[:3, 3] for part in parts)
     return left, own, rest, removed
 
 
-def _is_close_to_wall(thing: Float64Array, wall: Support, scale: float) -> bool:
-    """Return True if points (N, 3) of a thing are in front of a wall and nearer to it than the thing is wide.
+def _is_close_to_wall(body: Float64Array, wall: Support, scale: float) -> bool:
+    """Return True if points (N, 3) of an object are in front of a wall and nearer to it than the object is wide.
 
-    A thing farther away hides nothing from all cameras, because some of them see past it.
+    An object farther away hides nothing from all cameras, because some of them see past it.
     """
-    local = wall.local(thing)
+    local = wall.local(body)
     before = (np.abs(local[:, :2]) <= np.array(wall.size) / 2).all(axis=1)
     if not before.any() or np.median(local[:, 2]) < SUPPORT_TOLERANCE * scale:
         return False
@@ -194,11 +194,11 @@ def _is_close_to_wall(thing: Float64Array, wall: Support, scale: float) -> bool:
 
 
 def _fill_behind(
-    splats: Splats, thing: Float64Array, others: Float64Array, ground: Ground, scale: float
+    splats: Splats, body: Float64Array, others: Float64Array, ground: Ground, scale: float
 ) -> tuple[Splats, float, float]:
-    """Fill the area of a wall that a removed thing hid; return the splats, the area, and the share that is copied."""
+    """Fill the area of a wall that a removed object hid; return the splats, the area, and the share that is copied."""
     wall = ground.support
-    standing, _, hole = _hidden_cells(ground, wall.local(thing), wall.local(others), scale)
+    standing, _, hole = _hidden_cells(ground, wall.local(body), wall.local(others), scale)
     if not hole.any():
         return splats, 0.0, 1.0
     guessed = _hole_gaussians(splats.transformed(np.linalg.inv(wall.pose)), ground.grid, hole, scale)
@@ -208,15 +208,15 @@ def _fill_behind(
 
 
 def _hidden_cells(
-    ground: Ground, thing: Float64Array, others: Float64Array, scale: float
+    ground: Ground, body: Float64Array, others: Float64Array, scale: float
 ) -> tuple[BoolArray, BoolArray, BoolArray]:
-    """Return cells of a surface that other points stand on, that a thing is above, and that it hid, (X, Y) each.
+    """Return cells of a surface that other points stand on, that an object is above, and that it hid, (X, Y) each.
 
     Points are in the surface's frame, shape (N, 3).
     """
-    height, top, margin = others[:, 2], float(thing[:, 2].max()), round(SUPPORT_TOLERANCE / CELL)
+    height, top, margin = others[:, 2], float(body[:, 2].max()), round(SUPPORT_TOLERANCE / CELL)
     standing = ground.grid.covered(others[(height > SUPPORT_TOLERANCE * scale) & (height < top)])
-    footprint = dilated(ground.grid.outline(thing), margin) & ~standing  # surface points lie away from edges
+    footprint = dilated(ground.grid.outline(body), margin) & ~standing  # surface points lie away from edges
     parts, _ = label(~ground.seen & ~standing)
     hidden = np.isin(parts, np.setdiff1d(parts[footprint], [0]))
     core = binary_fill_holes(hidden & dilated(footprint, 4 * margin))
@@ -228,7 +228,7 @@ def _fill_hole(ground: Ground, standing: BoolArray, hole: BoolArray) -> tuple[Sp
     margin = round(SUPPORT_TOLERANCE / CELL)
     ground.texture, copied = fill_texture(ground.texture, ground.seen & ~hole & ~dilated(standing, margin), hole)
     ground.seen = ground.seen | hole
-    # The sheet also covers the border of the hole, where Gaussians of the thing extended.
+    # The sheet also covers the border of the hole, where Gaussians of the object extended.
     sheet = ground.grid.sheet(ground.texture, ground.seen & dilated(hole, margin))
     return sheet.transformed(ground.support.pose), copied
 
@@ -236,7 +236,7 @@ def _fill_hole(ground: Ground, standing: BoolArray, hole: BoolArray) -> tuple[Sp
 def _find_pick(
     splats: Splats, pick: str, capture: Capture, supports: Sequence[Support], scale: float
 ) -> tuple[int, Float64Array]:
-    """Return the index of the support below the thing at a pixel, and the position (3,) in the support's frame."""
+    """Return the index of the support below the object at a pixel, and the position (3,) in the support's frame."""
     photo, pixel = capture.picked(pick)
     camera = photo.camera
     ray = np.append(camera.ray_slopes([pixel])[0], 1.0)
@@ -251,18 +251,18 @@ def _find_pick(
         if above and (np.abs(local[:2]) <= np.array(support.size) / 2).all():
             found, lowest = number, float(local[2])
     if found < 0:
-        raise InputError(f"{pick}: a thing to remove must stand on one of the detected level surfaces")
+        raise InputError(f"{pick}: an object to remove must stand on one of the detected level surfaces")
     return found, supports[found].local(spot)
 
 
-def _separate_thing(
+def _separate_object(
     points: Float64Array, loose: BoolArray, spot: Float64Array, support: Support, scale: float
 ) -> tuple[Float64Array | None, Float64Array]:
-    """Return the points of the thing at a position, or None, and all other points without stray ones.
+    """Return the points of the object at a position, or None, and all other points without stray ones.
 
     The result is in the support's frame.
 
-    Only ``loose`` points (N,) can belong to a thing. An overhang of a few voxels beyond the support is included.
+    Only ``loose`` points (N,) can belong to an object. An overhang of a few voxels beyond the support is included.
     """
     over = (np.abs(points[:, :2]) <= np.array(support.size) / 2).all(axis=1)
     high = loose & (points[:, 2] > SUPPORT_TOLERANCE * scale) & (points[:, 2] < MAX_THING_HEIGHT * scale)
@@ -282,44 +282,42 @@ def _separate_thing(
         return None, points
     part = parts[tuple(voxel.T)]
     own = part == parts[tuple(near[gaps.argmin()])]
-    thing = points[standing[own]]
+    body = points[standing[own]]
     beside = np.flatnonzero(~over & high)
-    away = KDTree(_subsample(thing, 0.5 * edge)).query(points[beside], distance_upper_bound=_MAX_OVERHANG * edge)[0]
+    away = KDTree(_subsample(body, 0.5 * edge)).query(points[beside], distance_upper_bound=_MAX_OVERHANG * edge)[0]
     beside = beside[np.isfinite(away)]
     gone = np.concatenate([standing[own | (part == 0)], beside])
-    return np.concatenate([thing, points[beside]]), np.delete(points, gone, axis=0)
+    return np.concatenate([body, points[beside]]), np.delete(points, gone, axis=0)
 
 
-def _thing_gaussians(
+def _object_gaussians(
     splats: Splats,
-    thing: Float64Array,
+    body: Float64Array,
     others: Float64Array,
     grid: Grid,
     footprint: BoolArray,
     hole: BoolArray,
     scale: float,
 ) -> BoolArray:
-    """Return True for Gaussians (N,) to remove: on the surface and inside the thing, and in or below the hole."""
+    """Return True for Gaussians (N,) to remove: on the surface and inside the object, and in or below the hole."""
     reach, means = _VOXEL * scale, splats.means.astype(np.float64)
     beside = _OWNER_MARGIN * reach
-    low, high = thing.min(axis=0) - beside, thing.max(axis=0) + beside
+    low, high = body.min(axis=0) - beside, body.max(axis=0) + beside
     low[2] = -MAX_THING_HEIGHT * scale
     rows = np.flatnonzero(((means > low) & (means < high)).all(axis=1))
     around = others[((others > low - beside) & (others < high + beside)).all(axis=1)]
-    surface, around = _subsample(thing, 0.25 * reach), _subsample(around, 0.25 * reach)
+    surface, around = _subsample(body, 0.25 * reach), _subsample(around, 0.25 * reach)
     both = np.concatenate([surface, around])
     away, nearest = KDTree(both).query(means[rows])
     own, bare = nearest < len(surface), both[nearest, 2] < SUPPORT_TOLERANCE * scale
     cells = grid.cells(means[rows, :2])
     height = means[rows, 2]
-    floor, top = SUPPORT_TOLERANCE * scale, float(thing[:, 2].max()) + 0.5 * reach
+    floor, top = SUPPORT_TOLERANCE * scale, float(body[:, 2].max()) + 0.5 * reach
     inside = np.asarray((cells >= 0).all(axis=1))
     cells = np.where(inside[:, None], cells, 0)
     over = inside & footprint[tuple(cells.T)]
     goes = (own | (over & (bare | (away > _OTHER_DISTANCE * reach)) & (height < top))) & (height > floor)
-    gone = _gaussians_reaching(splats, grid.inside(thing, footprint, reach)) | _hole_gaussians(
-        splats, grid, hole, scale
-    )
+    gone = _gaussians_reaching(splats, grid.inside(body, footprint, reach)) | _hole_gaussians(splats, grid, hole, scale)
     gone[rows[goes]] = True
     return gone
 

@@ -1,4 +1,4 @@
-"""Flat, level surfaces of a scene on which things can stand (table, shelf, floor), and walls.
+"""Flat, level surfaces of a scene on which objects can stand (table, shelf, floor), and walls.
 
 Planes are found by RANSAC (Fischler and Bolles 1981) among points on upward surfaces, the largest first. They are
 refined by least squares with Cauchy weights. The points of a plane are split into connected parts, and each part is
@@ -50,7 +50,7 @@ _MIN_AREA = 0.02
 
 @dataclass(frozen=True, eq=False)
 class Support:
-    """A flat rectangle on which things can stand.
+    """A flat rectangle on which objects can stand.
 
     Attributes:
         pose: Frame of the rectangle in the scene, (4, 4): z is its normal, x its longer side, its centre is the origin.
@@ -137,7 +137,7 @@ def find_supports(points: SurfacePoints, up: Float64Array, scale: float, within:
 def find_walls(points: SurfacePoints, scale: float) -> list[Support]:
     """Find upright surfaces with almost no visible points behind them.
 
-    The side of a thing is not a wall: the top of the thing gives points behind its side.
+    The side of an object is not a wall: the top of the object gives points behind its side.
 
     Args:
         points: Surface points of the photos, z up.

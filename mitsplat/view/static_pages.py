@@ -33,8 +33,8 @@ _NOTHING = "nothing"
 _CLICKS = {
     _NOTHING: None,
     "marks the object": _PICK,
-    "excludes a thing from the object": _PICK_NOT,
-    "removes a thing from the environment": _REMOVE,
+    "excludes another object": _PICK_NOT,
+    "removes an object from the environment": _REMOVE,
 }
 """Meanings of a click, and the corresponding command line option."""
 _COLOURS = {_PICK: (255, 210, 0), _PICK_NOT: (60, 120, 255), _REMOVE: (255, 60, 60)}
@@ -87,7 +87,7 @@ class SplatsPage(StaticPage):
 
 
 class CapturePage(StaticPage):
-    """Page of a capture: points, cameras, and the selected photo with its mask; a click picks a thing."""
+    """Page of a capture: points, cameras, and the selected photo with its mask; a click picks an object."""
 
     def __init__(self, page: Page, folder: Path) -> None:
         self._page, self._capture = page, Capture.load(folder)
@@ -96,7 +96,7 @@ class CapturePage(StaticPage):
         if not photos:
             raise InputError(f"{folder}: must have a photo to be shown (got none)")
         page.show(capture_parts(self._capture))
-        with page.gui.add_folder("Pick things by clicks"):
+        with page.gui.add_folder("Pick objects by clicks"):
             self._click = page.gui.add_dropdown("a click", tuple(_CLICKS), initial_value=_NOTHING)
             self._summary = page.gui.add_markdown("")
             back = page.gui.add_button_group("forget", ("the last", "all"))
@@ -137,7 +137,7 @@ class CapturePage(StaticPage):
             self._apply_picks([] if all_of_them else self._picks[:-1])
 
     def _apply_picks(self, picks: list[tuple[str, str]]) -> None:
-        """Show the things that the picks select, and the options for the command line; hide cameras while clicks pick.
+        """Show the objects that the picks select, and the options for the command line; hide cameras while clicks pick.
 
         Raises:
             InputError: If the picks select nothing; the earlier picks remain.
@@ -152,7 +152,7 @@ class CapturePage(StaticPage):
         self._summary.content = f"```\n{words}\n```" if words else ""
 
     def _selected_parts(self, picks: Sequence[tuple[str, str]]) -> list[ShownPart]:
-        """Return the points of the things that the picks select."""
+        """Return the points of the objects that the picks select."""
         on, off, away = ([pick for kind, pick in picks if kind == option] for option in (_PICK, _PICK_NOT, _REMOVE))
         parts = []
         if on or off:

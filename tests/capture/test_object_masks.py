@@ -73,7 +73,7 @@ def test_photos_with_an_occluded_object_are_omitted() -> None:
     assert [photo.name for photo in found.photos] == [f"{turn:03}.jpg" for turn in range(45, 360, 45)]
     assert not hidden and found.rejected.keys() == {"blurred.jpg", "000.jpg"}
     assert re.fullmatch(
-        r"another thing is in front of the object and may occlude \d+% of it", found.rejected["000.jpg"]
+        r"another object is in front of the object and may occlude \d+% of it", found.rejected["000.jpg"]
     )
     aside = 0.75 * ball + np.array([0.12, 0.05, 0.03])
     found, hidden = _reject_occluded(capture, ChosenObject(ball, ball, (aside,)))

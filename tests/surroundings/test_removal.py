@@ -23,7 +23,7 @@ from mitsplat.reconstruct.asset_evaluation import show_asset
 from mitsplat.reconstruct.pipeline import asset_pipeline
 from mitsplat.reconstruct.reconstruct import AssetJob, ImportedMesh
 from mitsplat.surroundings.depth_views import SurfacePoints, depth_views, surface_points
-from mitsplat.surroundings.removal import remove_things
+from mitsplat.surroundings.removal import remove_objects
 from mitsplat.surroundings.supports import find_supports, find_walls
 from mitsplat.surroundings.texture_fill import fill_texture
 from tests.surroundings.test_surroundings import (
@@ -92,7 +92,7 @@ def seen_points(splats: Splats, capture: Capture) -> SurfacePoints:
 
 def removed(splats: Splats, capture: Capture, *what: str, points: SurfacePoints | None = None) -> Splats:
     points = seen_points(splats, capture) if points is None else points
-    return remove_things(splats, what, capture, find_supports(points, UP, DEPTH, within=5), points, DEPTH)[0]
+    return remove_objects(splats, what, capture, find_supports(points, UP, DEPTH, within=5), points, DEPTH)[0]
 
 
 def above(splats: Splats, low: tuple[float, float], high: tuple[float, float]) -> BoolArray:
@@ -155,7 +155,7 @@ def test_a_wall_close_behind_an_object_is_filled(gap: float, tmp_path: Path) -> 
     fitted = Splats.concatenate([bare, seen, cube()])
     points = seen_points(fitted, capture)
     supports, what = find_supports(points, UP, DEPTH, within=5), pick(12, (*BESIDE, HEIGHT + CUBE))
-    left, (thing,) = remove_things(fitted, (what,), capture, supports, points, DEPTH)
+    left, (thing,) = remove_objects(fitted, (what,), capture, supports, points, DEPTH)
     assert 0.5 * CUBE**2 < thing.behind < 2 * CUBE**2 and thing.copied == 1
     assert not above(left, (BESIDE[0] - 0.1, BESIDE[1] - 0.1), (BESIDE[0] + 0.1, y - 0.015)).any()
     from_near = Camera.look_at((-0.2, -0.4, 0.3), (BESIDE[0], y, HEIGHT + 0.05), width=160, height=120, fov_x=40)
@@ -175,7 +175,7 @@ def test_picks_without_an_object_on_a_surface_are_refused(captured: Capture, poi
     on_table, on_floor = (pick(5, spot) for spot in ((0.1, -0.1, HEIGHT), (0.0, -1.2, HEIGHT - 0.8)))
     for spot in (on_table, on_floor, "photo05.png:3,1", "photo05.png:-50,900"):  # and pixels without splats
         with pytest.raises(
-            InputError, match=r"photo05\.png:.*: a thing to remove must stand on one of the detected level surfaces"
+            InputError, match=r"photo05\.png:.*: an object to remove must stand on one of the detected level surfaces"
         ):
             removed(splats, captured, spot, points=points)
     with pytest.raises(InputError, match=r"none\.png:3,4: a pick must be PHOTO:X,Y with a registered photo"):
@@ -199,10 +199,10 @@ def test_an_environment_records_removed_objects(
     what = pick(12, (*BESIDE, HEIGHT + CUBE))
     job = AssetJob(name="cell", kind="environment", settings=SMALL, remove=(what,))
     done = asset_pipeline.make_asset(capture, tmp_path / "fit", tmp_path / "cell", job)
-    size = done.verdict.rows["Removed things"].split(" m around x -0.")[0]
+    size = done.verdict.rows["Removed objects"].split(" m around x -0.")[0]
     assert [float(edge) for edge in size.split(" x ")] == pytest.approx([CUBE, CUBE, CUBE], abs=0.015)
-    assert what in done.verdict.rows["Removed things"] and "are synthesised" in done.verdict.rows["Removed things"]
-    assert "was hidden by removed things" in (tmp_path / "cell" / "report.html").read_text()
+    assert what in done.verdict.rows["Removed objects"] and "are synthesised" in done.verdict.rows["Removed objects"]
+    assert "was hidden by removed objects" in (tmp_path / "cell" / "report.html").read_text()
     (record,) = json.loads((tmp_path / "cell" / "verdict.json").read_text())["removed_things"]
     assert record["pick"] == what and CUBE**2 < record["filled"] < 3 * CUBE**2 and record["copied"] == 1
     assert done.verdict.psnr is not None and done.verdict.psnr > 35  # without pixels of the removed object
@@ -228,7 +228,7 @@ def test_the_mesh_command_removes_picked_objects(captured: Capture, tmp_path: Pa
         [Path(sys.executable).with_name("mitsplat"), *words], cwd=tmp_path, capture_output=True, text=True, check=False
     )
     assert done.returncode in (0, 4), done.stderr
-    assert "removed things: 0.1" in done.stdout and what in done.stdout
+    assert "removed objects: 0.1" in done.stdout and what in done.stdout
     left = Asset.load(tmp_path / "cell").splats.means  # the origin is the table's centre
     over = (np.abs(left[:, :2] - BESIDE) < 0.7 * CUBE).all(axis=1) & (left[:, 2] > 0.3 * CUBE)
     assert not over.any()

@@ -212,7 +212,7 @@ def test_the_table_of_the_asset_lies_at_height_0(made: tuple[Path, AssetResult])
     middle = np.abs(asset.mesh.vertices[:, :2]).max(axis=1) < 0.2
     assert np.abs(asset.mesh.vertices[middle & (asset.mesh.vertices[:, 2] > -0.1), 2]).max() < 1e-6
     assert done.verdict.psnr is not None and done.verdict.psnr > 35  # its own renderings, not the fit's report
-    assert "Removed things" not in done.verdict.rows
+    assert "Removed objects" not in done.verdict.rows
     assert "Support" in done.verdict.rows and "Support" in (folder / "cell" / "report.html").read_text()
 
 

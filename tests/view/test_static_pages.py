@@ -159,11 +159,11 @@ def test_clicks_on_a_capture_pick_objects(page, tmp_path):
     points = page._shown["/chosen/object"].drawable.points
     assert np.linalg.norm(points[:, :2] - THINGS[1], axis=1).max() < 0.05
 
-    click(1, "excludes a thing from the object")
-    assert "a thing is selected by both --pick and --pick-not" in page._alert.content
+    click(1, "excludes another object")
+    assert "an object is selected by both --pick and --pick-not" in page._alert.content
     assert shown._summary.content == f"```\n--pick {pick}\n```" and "/chosen/object" in page._shown
 
-    click(2, "removes a thing from the environment")
+    click(2, "removes an object from the environment")
     assert shown._summary.content.count("--remove") == 1 and not page._alert.visible
     points = page._shown["/chosen/removed"].drawable.points
     assert np.linalg.norm(points[:, :2] - THINGS[2], axis=1).max() < 0.05

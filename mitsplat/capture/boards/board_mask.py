@@ -36,8 +36,8 @@ def bare_squares(
     """Return the pixels of squares that look as printed, shape (H, W).
 
     Each square is rectified and compared with the print, up to the local brightness and contrast. A square is accepted
-    only as a whole, with the edges of its neighbours. So a partly covered square is rejected completely. Things thinner
-    than a tenth of a square, or things that cover a few modules of a marker in a similar grey, can be missed.
+    only as a whole, with the edges of its neighbours. So a partly covered square is rejected completely. Objects
+    thinner than a tenth of a square, or objects that cover a few modules of a marker in a similar grey, can be missed.
 
     Args:
         board: The printed board.

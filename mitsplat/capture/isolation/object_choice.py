@@ -1,8 +1,8 @@
 """Selection of the object among the points of a photographed place.
 
-Points above the support surface (:mod:`.support`) are clustered into separate things. A pick or a box decides if given.
-Otherwise the score of a thing increases with its closeness to the centres of the photos, and with its closeness to the
-point at which the cameras are directed.
+Points above the support surface (:mod:`.support`) are clustered into separate objects. A pick or a box decides if
+given. Otherwise the score of an object increases with its closeness to the centres of the photos, and with its
+closeness to the point at which the cameras are directed.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _MIN_HEIGHT = 3.0
 _MIN_ROUGHNESS = 0.003
 """Minimum roughness, as a fraction of the cameras' distance."""
 _GAP_BOUNDS = (0.02, 0.08)
-"""Bounds of the gap between things, as fractions of the cameras' distance; the gap is four times the point spacing."""
+"""Bounds of the gap between objects, as fractions of the cameras' distance; the gap is four times the point spacing."""
 _MIN_POINTS = 20
 _PICK_RADIUS = 0.1
 """Maximum distance of a point from a picked pixel, as a fraction of the photo's longer edge."""
@@ -74,7 +74,7 @@ class ChosenObject:
     Attributes:
         points: Points on the object, and the projections of the lowest onto the support, shape (N, 3).
         above: Points on the object only, shape (M, 3).
-        others: Points on each other thing on the support, shape (K, 3) each.
+        others: Points on each other object on the support, shape (K, 3) each.
     """
 
     points: Float64Array
@@ -96,11 +96,11 @@ def choose_object(
         points: Points that the photos share, shape (N, 3).
         views: Views of the photos.
         picks: Pixels on the object; several picks can mark separate parts.
-        picks_not: Pixels on things that do not belong to the object.
+        picks_not: Pixels on other objects.
         box: Minimum and maximum x, y and z of a box that contains the object.
 
     Raises:
-        InputError: If there is no thing above the support, or a pick is near no point of a thing.
+        InputError: If there is no object above the support, or a pick is near no point of an object.
     """
     focus, distance = focus_of([view.camera for view in views])
     if box is not None:
@@ -123,24 +123,24 @@ def choose_object(
             f"no object was found above its support in the photos ({np.count_nonzero(stands)} points above it): give "
             "masks, or take photos of one object with texture on and below it"
         )
-    thing, count = _cluster_things(points, stands, distance)
+    cluster, count = _cluster_objects(points, stands, distance)
     if picks:
-        chosen = np.unique([_picked_thing(pick, points, thing) for pick in picks])
+        chosen = np.unique([_picked_cluster(pick, points, cluster) for pick in picks])
     else:
         away = np.linalg.norm(points[stands] - focus, axis=1) / (_FOCUS_SIGMA * distance)
-        scores = np.bincount(thing[stands], central[stands] * np.exp(-0.5 * away**2), count)
+        scores = np.bincount(cluster[stands], central[stands] * np.exp(-0.5 * away**2), count)
         for pick in picks_not:
-            scores[_picked_thing(pick, points, thing)] = -1
+            scores[_picked_cluster(pick, points, cluster)] = -1
         chosen = np.array([int(scores.argmax())])
-    refused = {_picked_thing(pick, points, thing) for pick in picks_not}
+    refused = {_picked_cluster(pick, points, cluster) for pick in picks_not}
     if refused >= set(chosen.tolist()):
         raise InputError(
-            f"a thing is selected by both --pick and --pick-not ({picks_not[0].name}): the picked things touch"
+            f"an object is selected by both --pick and --pick-not ({picks_not[0].name}): the picked objects touch"
         )
-    own = np.isin(thing, [number for number in chosen.tolist() if number not in refused])
+    own = np.isin(cluster, [number for number in chosen.tolist() if number not in refused])
     feet = _project_feet(points[own], height[own], support)
-    large = np.flatnonzero(np.bincount(thing[stands]) >= _MIN_POINTS)
-    others = tuple(points[thing == number] for number in large if not own[thing == number].any())
+    large = np.flatnonzero(np.bincount(cluster[stands]) >= _MIN_POINTS)
+    others = tuple(points[cluster == number] for number in large if not own[cluster == number].any())
     return ChosenObject(np.concatenate([points[own], feet]), points[own], others)
 
 
@@ -162,11 +162,11 @@ def focus_of(cameras: Sequence[Camera]) -> tuple[Float64Array, float]:
     return focus, float(np.median(np.linalg.norm(centres - focus, axis=1)))
 
 
-def _cluster_things(points: Float64Array, stands: BoolArray, distance: float) -> tuple[Int64Array, int]:
-    """Cluster the points into things.
+def _cluster_objects(points: Float64Array, stands: BoolArray, distance: float) -> tuple[Int64Array, int]:
+    """Cluster the points into objects.
 
     Returns:
-        Index of the thing of each point (N,), -1 for none, and the number of things.
+        Index of the object of each point (N,), -1 for none, and the number of objects.
     """
     tree = KDTree(points[stands])
     gap = 4 * float(np.median(tree.query(points[stands], k=6)[0][:, -1]))
@@ -174,20 +174,20 @@ def _cluster_things(points: Float64Array, stands: BoolArray, distance: float) ->
     pairs = tree.query_pairs(gap, output_type="ndarray")
     graph = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(tree.n, tree.n))
     count, label = connected_components(graph, directed=False)
-    thing = np.full(len(points), -1, dtype=np.int64)
-    thing[stands] = label
-    return thing, int(count)
+    cluster = np.full(len(points), -1, dtype=np.int64)
+    cluster[stands] = label
+    return cluster, int(count)
 
 
-def _picked_thing(pick: Pick, points: Float64Array, thing: Int64Array) -> int:
-    """Return the index of the thing nearest to a pixel of a photo."""
+def _picked_cluster(pick: Pick, points: Float64Array, cluster: Int64Array) -> int:
+    """Return the index of the object nearest to a pixel of a photo."""
     camera = pick.view.camera
-    shown = pick.view.seen[thing[pick.view.seen] >= 0]
+    shown = pick.view.seen[cluster[pick.view.seen] >= 0]
     gaps = np.linalg.norm(camera.project(points[shown])[0] - pick.pixel, axis=1)
     limit = _PICK_RADIUS * max(camera.width, camera.height)
     if not len(gaps) or not gaps.min() < limit:
-        raise InputError(f"{pick.name}: the photo observes no point of a thing within {limit:.0f} px of this pixel")
-    return int(thing[shown[int(gaps.argmin())]])
+        raise InputError(f"{pick.name}: the photo observes no point of an object within {limit:.0f} px of this pixel")
+    return int(cluster[shown[int(gaps.argmin())]])
 
 
 def _project_feet(own: Float64Array, height: Float64Array, support: SupportSurface) -> Float64Array:

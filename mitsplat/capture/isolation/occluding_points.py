@@ -1,4 +1,4 @@
-"""Occlusion of the object by other things in a photo."""
+"""Occlusion of the object by other objects in a photo."""
 
 from __future__ import annotations
 
@@ -15,27 +15,27 @@ from mitsplat.geometry.camera import Camera
 _EDGE = 128
 """Longer edge of the object in the picture in which fractions are counted [px]."""
 _GAPS = (12, 40)
-"""Bounds of the gap between points of a thing in that picture [px].
+"""Bounds of the gap between points of an object in that picture [px].
 
 The gap is twice the median distance to the third nearest point.
 """
 
 
 def occluded_part(camera: Camera, own: Float64Array, others: Sequence[Float64Array]) -> tuple[float, float, BoolArray]:
-    """Estimate the part of an object that other things occlude from a camera.
+    """Estimate the part of an object that other objects occlude from a camera.
 
     The outline of the object is the convex hull of its points in the image, even for an object that is not convex. The
-    first reason is that masks are searched in the hull and would include a thing in front of a notch. The second is
+    first reason is that masks are searched in the hull and would include an object in front of a notch. The second is
     that sparse points cannot separate a notch from a plain surface.
 
-    Another thing occludes the image where its points are dense and nearer to the camera than the middle of the object.
-    It may surround the object. Plain surfaces have no points, so the thing may cover the whole hull of its points and
+    Another object occludes the image where its points are dense and nearer to the camera than the middle of the object.
+    It may surround the object. Plain surfaces have no points, so the object may cover the whole hull of its points and
     half a gap beyond.
 
     Args:
         camera: Camera of the photo.
         own: Points on the object, shape (N, 3).
-        others: Points on each other thing, shape (M, 3).
+        others: Points on each other object, shape (M, 3).
 
     Returns:
         The occluded fraction of the outline, the possibly occluded fraction, and the possibly occluded pixels, shape

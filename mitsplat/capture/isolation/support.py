@@ -1,7 +1,7 @@
-"""Support surface of a photographed place: the smooth, possibly uneven surface below the things, such as cloth or lawn.
+"""Support surface of a photographed place: the smooth, possibly uneven surface below the objects, such as cloth.
 
 The surface is a height over a grid, fitted from below, as ground filters do for laser scans (review: Zhang et al.
-2016). The weight of points above it falls with their height; points on it or below have full weight. Where a thing
+2016). The weight of points above it falls with their height; points on it or below have full weight. Where an object
 occludes the surface, it continues with minimal bending (thin plate). The first iterations allow little more than a
 plane; stiffness and tolerance decrease with each iteration.
 """

@@ -65,20 +65,16 @@ class CaptureSettings:
     """Settings of a capture.
 
     Attributes:
-        kind: ``object`` is segmented by masks; ``environment`` is not.
-        max_size: Longest edge of the photos [px]; larger photos are reduced.
-        frames: Maximum number of frames taken from a video.
-        board: ChArUco board to detect.
-        tag: Edge length of printed AprilTags [m]; None if unknown.
-        scale_from: Two points and their distance [m], as in :func:`mitsplat.capture.alignment.metric_frame.spot`.
-        poses: COLMAP model or ``transforms.json`` with given cameras.
-        metric: True if ``poses`` are in metres with z up; they are then not transformed.
-        masks: Folder of masks.
-        mask_model: ONNX file of a segmentation network.
-        undistorted: Resample the photos to pinhole cameras.
-        picks: Pixels on the object, PHOTO:X,Y in pixels of the capture's photos. Without picks, the object is the thing
+        kind: ``object`` is segmented by masks; ``environment`` is not. max_size: Longest edge of the photos [px];
+        larger photos are reduced. frames: Maximum number of frames taken from a video. board: ChArUco board to detect.
+        tag: Edge length of printed AprilTags [m]; None if unknown. scale_from: Two points and their distance [m], as in
+        :func:`mitsplat.capture.alignment.metric_frame.spot`. poses: COLMAP model or ``transforms.json`` with given
+        cameras. metric: True if ``poses`` are in metres with z up; they are then not transformed. masks: Folder of
+        masks. mask_model: ONNX file of a segmentation network. undistorted: Resample the photos to pinhole cameras.
+        picks: Pixels on the object, PHOTO:X,Y in pixels of the capture's photos. Without picks, the object is the
+        object
             at which the photos are directed.
-        picks_not: Pixels on things that do not belong to the object.
+        picks_not: Pixels on other objects.
         box: Minimum and maximum x, y and z of a box that contains the object, in the frame of the capture.
     """
 
@@ -493,7 +489,7 @@ def _with_masks(
 
 
 def _reject_occluded(capture: Capture, chosen: ChosenObject) -> tuple[Capture, dict[str, BoolArray]]:
-    """Reject photos in which other things occlude much of the object, and find the occluded pixels of the others.
+    """Reject photos in which other objects occlude much of the object, and find the occluded pixels of the others.
 
     Returns:
         The capture without the rejected photos, and the possibly occluded pixels, (H, W), by the name of the photo.
@@ -502,7 +498,7 @@ def _reject_occluded(capture: Capture, chosen: ChosenObject) -> tuple[Capture, d
     for photo in capture.photos:
         occluded, possible, pixels = occluded_part(photo.camera, chosen.above, chosen.others)
         if occluded > _HIDDEN and possible > _MAX_HIDDEN:
-            rejected[photo.name] = f"another thing is in front of the object and may occlude {possible:.0%} of it"
+            rejected[photo.name] = f"another object is in front of the object and may occlude {possible:.0%} of it"
             continue
         photos.append(photo)
         if occluded > _HIDDEN:

@@ -28,7 +28,7 @@ def chosen_object(
     Args:
         capture: Capture with z up.
         picks: Pixels on the object, PHOTO:X,Y.
-        picks_not: Pixels on things that do not belong to the object.
+        picks_not: Pixels on other objects.
         box: Minimum and maximum x, y and z of a box that contains the object.
 
     Raises:

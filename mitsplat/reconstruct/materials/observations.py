@@ -32,7 +32,7 @@ _SLOPE_WEIGHT = 0.3
 
 
 class View(NamedTuple):
-    """Linear radiance of a photo, and its pixels that show only the object, or only other things."""
+    """Linear radiance of a photo, and its pixels that show only the object, or only other objects."""
 
     camera: Camera
     radiance: Float32Array

@@ -73,7 +73,7 @@ def test_hints_without_a_matching_object_are_refused(place: tuple[Float64Array, 
     one = pick(place, 1)
     with pytest.raises(InputError, match=r"selected by both --pick and --pick-not \(one.jpg:1,2\)"):
         choose_object(points, views, picks=[one], picks_not=[one])
-    with pytest.raises(InputError, match="no point of a thing within 32 px"):
+    with pytest.raises(InputError, match="no point of an object within 32 px"):
         choose_object(points, views, picks=[Pick("one.jpg:0,0", views[0], (0.0, 0.0))])
     bare = np.flatnonzero(labels == 0)
     place_of = {int(old): new for new, old in enumerate(bare)}

@@ -97,7 +97,10 @@ def _check_box(frame: DecodedFrame, label: DecodedInstance, values: list[float])
 
 
 def _check_rotated(frame: DecodedFrame, label: DecodedInstance, values: list[float]) -> Iterator[str]:
-    """Check that four corners are the smallest rectangle that contains the mask's pixels."""
+    """Check that four corners are the smallest rectangle that contains the mask's pixels.
+
+    A rectangle whose upright bounding box is larger than the image is shortened, or replaced by the mask's box.
+    """
     if len(values) != 8:
         yield "its line is not four corners"
         return
@@ -110,17 +113,33 @@ def _check_rotated(frame: DecodedFrame, label: DecodedInstance, values: list[flo
     ys, xs = np.nonzero(label.mask)
     squares = np.concatenate([np.stack([xs + dx, ys + dy], axis=1) for dx in (0, 1) for dy in (0, 1)])
     hull = squares[ConvexHull(squares).vertices] + np.array(label.box[:2], dtype=np.float64)
-    along = (hull[:, None] - corners) @ (sides / lengths[:, None] ** 2).T  # (points, corners, sides)
-    inside = np.diagonal(along, axis1=1, axis2=2) * lengths
     # The smallest rectangle has a side on the hull (Freeman and Shapira 1975).
     edges = np.roll(hull, -1, axis=0) - hull
     edges /= np.linalg.norm(edges, axis=1, keepdims=True)
-    smallest = min(np.ptp(hull @ edge) * np.ptp(hull @ (-edge[1], edge[0])) for edge in edges)
+    candidates = np.stack([edges, edges[:, ::-1] * (-1, 1)], axis=1)
+    areas = np.array([np.ptp(hull @ axes.T, axis=0).prod() for axes in candidates])
+    leaves_image = (_bounding_size(candidates[np.argmin(areas)], hull) > frame.size).any()
+    bounds = np.concatenate([corners.min(axis=0), corners.max(axis=0)])
     tolerance = 0.05
-    if inside.min() < -tolerance or (inside - lengths).max() > tolerance:
-        yield "its line is not the smallest rectangle around its mask: pixels lie outside"
-    elif lengths[0] * lengths[1] > _MAX_AREA_RATIO * smallest + tolerance * lengths.max():
-        yield f"its line is not the smallest rectangle around its mask: one of {smallest:.1f} px fits"
+    if leaves_image and np.abs(bounds - label.box).max() <= tolerance:
+        return
+    axes = sides[:2] / lengths[:2, None]
+    at, needed = corners @ axes.T, hull @ axes.T
+    missing = np.stack([at.min(axis=0) - needed.min(axis=0), needed.max(axis=0) - at.max(axis=0)])
+    extents = np.ptp(needed, axis=0)
+    if missing.max() > tolerance:
+        fills = np.abs(np.ptp(corners, axis=0) - frame.size).min() < tolerance
+        is_shortened = missing[:, np.argmin(extents)].max() < tolerance and np.ptp(missing, axis=0).max() < tolerance
+        if not (leaves_image and fills and is_shortened):
+            yield "its line is not the smallest rectangle around its mask: pixels lie outside"
+            return
+    if np.maximum(extents, lengths[:2]).prod() > _MAX_AREA_RATIO * areas.min() + tolerance * lengths.max():
+        yield f"its line is not the smallest rectangle around its mask: one of {areas.min():.1f} px fits"
+
+
+def _bounding_size(axes: Float64Array, points: Float64Array) -> Float64Array:
+    """Return width and height of the upright box around the rectangle of points (N, 2) along two unit axes (2, 2)."""
+    return np.asarray(np.abs(axes).T @ np.ptp(points @ axes.T, axis=0))
 
 
 def _check_pose(frame: DecodedFrame, label: DecodedInstance, values: list[float]) -> Iterator[str]:

@@ -5,7 +5,7 @@ format      folder                          numbers of a line after the class in
 =========== =============================== ==================================================================
 yolo        ``labels/``                     x y of the outline of :func:`mitsplat.labels.polygons.outline`
 yolo-detect ``yolo-detect/labels/``         x y of the box's centre, width, height
-yolo-obb    ``yolo-obb/labels/``            x y of the four corners of the smallest rotated rectangle
+yolo-obb    ``yolo-obb/labels/``            x y of the four corners of :func:`rotated_box`
 yolo-pose   ``yolo-pose/labels/``           the box, then x y v of every keypoint: 2 visible, 1 hidden, 0 outside
 =========== =============================== ==================================================================
 
@@ -32,10 +32,15 @@ from mitsplat.storage.files import SPLITS, Record, write_text
 
 @dataclass(frozen=True)
 class Task:
-    """Task of Ultralytics: folder of its dataset, and function that returns the numbers of an instance's line [px]."""
+    """Task of Ultralytics.
+
+    Attributes:
+        folder: Folder of its dataset.
+        numbers: Function of an instance and the image size (2,) that returns the positions of the instance's line [px].
+    """
 
     folder: str
-    numbers: Callable[[InstanceLabel], Float64Array]
+    numbers: Callable[[InstanceLabel, Float64Array], Float64Array]
 
 
 def format_of(task: str) -> Format:
@@ -81,7 +86,7 @@ def yolo_lines(labels: Labels, task: str = "yolo", num_keypoints: int = 0) -> st
     size = np.array((labels.width, labels.height), dtype=np.float64)
     lines = []
     for label in labels.instances:
-        points = (TASKS[task].numbers(label).reshape(-1, 2) / size).ravel().tolist()
+        points = (TASKS[task].numbers(label, size).reshape(-1, 2) / size).ravel().tolist()
         text = [str(label.class_index), " ".join(["%.6f"] * len(points)) % tuple(points)]
         if task == "yolo-pose":
             missing = np.zeros((num_keypoints - len(label.keypoints), 3))
@@ -121,21 +126,43 @@ def names_yaml(class_names: Sequence[str], keypoint_names: Sequence[Sequence[str
     return "\n".join(lines) + "\n"
 
 
-def rotated_box(label: InstanceLabel) -> Float64Array:
-    """Return the corners of the smallest rectangle around the whole pixels of the mask [px], shape (4, 2)."""
+def rotated_box(label: InstanceLabel, size: Float64Array) -> Float64Array:
+    """Return the corners of the smallest rectangle around the whole pixels of the mask [px], shape (4, 2).
+
+    Ultralytics ignores images with a rectangle whose upright bounding box is larger than the image. The long sides of
+    such a rectangle are shortened to fit. If it is too wide for that, the upright box of the mask takes its place.
+
+    Args:
+        label: The instance.
+        size: Width and height of the image [px].
+    """
     x0, y0 = label.box[:2]
     ys, xs = np.nonzero(label.mask)
     pixels = np.concatenate([np.stack([xs + dx, ys + dy], axis=1) for dx in (0, 1) for dy in (0, 1)])
     rectangle = cv2.minAreaRect(cv2.convexHull(pixels.astype(np.int32)).astype(np.float32))
     corners = np.asarray(cv2.boxPoints(rectangle), dtype=np.float64)
+    centre, sides = corners.mean(axis=0), np.diff(corners[:3], axis=0)
+    across, along = sides[np.argsort((sides**2).sum(axis=1), kind="stable")]
+    if (excess := np.abs(across) + np.abs(along) - size).max() > 0:
+        share = 1.0 - float((excess / np.maximum(np.abs(along), 1e-9)).max())
+        along = share * along
+        if share <= 0 or along @ along < across @ across:
+            return _corners(label)
+        signs = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])
+        corners = centre + 0.5 * signs @ np.stack([across, along])
     return np.add(corners, (x0, y0), dtype=np.float64)
 
 
-def _outline(label: InstanceLabel) -> Float64Array:
+def _corners(label: InstanceLabel) -> Float64Array:
+    x0, y0, x1, y1 = label.box
+    return np.array([(x0, y0), (x1, y0), (x1, y1), (x0, y1)], dtype=np.float64)
+
+
+def _outline(label: InstanceLabel, _: Float64Array) -> Float64Array:
     return label.polygon
 
 
-def _centred_box(label: InstanceLabel) -> Float64Array:
+def _centred_box(label: InstanceLabel, _: Float64Array) -> Float64Array:
     x0, y0, x1, y1 = label.box
     return np.array([(x0 + x1) / 2, (y0 + y1) / 2, x1 - x0, y1 - y0], dtype=np.float64)
 

@@ -96,7 +96,7 @@ def entry(owner: Any, name: str, change: Callable[[dict[str, Any]], object]) -> 
 def task(name: str, change: Callable[[Any], Any]) -> Patch:
     """Patch a YOLO task to write changed numbers on every line [px]."""
     real = yolo.TASKS[name]
-    return lambda patch: patch.setitem(yolo.TASKS, name, yolo.Task(real.folder, lambda it: change(real.numbers(it))))
+    return lambda patch: patch.setitem(yolo.TASKS, name, yolo.Task(real.folder, lambda *of: change(real.numbers(*of))))
 
 
 def by_rows(code: dict[str, Any]) -> dict[str, Any]:

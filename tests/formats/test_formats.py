@@ -251,8 +251,32 @@ class TestYolo:
         ids = np.zeros((HEIGHT, WIDTH), dtype=np.uint8)
         cv2.fillPoly(ids, [cv2.boxPoints(((80, 60), (80, 20), 30)).astype(np.int32)], 1)
         frame = frame_of(Drawn({1: (ids > 0, 0, 0)}), 0)
-        _, size, _ = cv2.minAreaRect(rotated_box(frame.labels.instances[0]).astype(np.float32))
+        _, size, _ = cv2.minAreaRect(
+            rotated_box(frame.labels.instances[0], np.array([WIDTH, HEIGHT])).astype(np.float32)
+        )
         np.testing.assert_allclose(sorted(size), (21, 81), atol=1.5)
+
+    def test_rotated_boxes_of_bars_through_the_image_fit_into_it(self) -> None:
+        """Ultralytics drops the whole image if the upright bounds of a rotated box are larger than it."""
+        size = np.array([WIDTH, HEIGHT])
+        for points, thickness, is_upright in (
+            (((-20, -20), (180, 140)), 20, False),
+            (((-30, 150), (190, -30)), 6, False),
+            (((0, 0), (160, 120)), 110, True),
+        ):
+            ids = np.zeros((HEIGHT, WIDTH), dtype=np.uint8)
+            cv2.line(ids, *points, 1, thickness)
+            (label,) = frame_of(Drawn({1: (ids > 0, 0, 0)}), 0).labels.instances
+            corners = rotated_box(label, size)
+            assert (np.ptp(corners, axis=0) <= size + 1e-6).all()
+            if is_upright:
+                np.testing.assert_allclose([*corners.min(axis=0), *corners.max(axis=0)], label.box, atol=1e-6)
+                continue
+            middle, extents, _ = cv2.minAreaRect(corners.astype(np.float32))
+            assert min(extents) == pytest.approx(thickness, abs=3)
+            assert max(extents) > 150
+            np.testing.assert_allclose(middle, size / 2, atol=6)
+            assert (np.ptp(corners, axis=0) / size).max() == pytest.approx(1)
 
     def test_keypoints_have_position_and_visibility(self, written: Written) -> None:
         seen = set()

@@ -66,8 +66,6 @@ _STAGES = {
 """Stages of a bake, with their relative durations."""
 _MAX_BACKS = 0.02
 """Maximum share of visible points of an object that are backs of one-sided faces."""
-_MIN_BRIGHTNESS, _MAX_BRIGHTNESS = 0.8, 1.25
-"""Range of brightness relative to the textures that the size of the Gaussians can explain."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -254,12 +252,14 @@ def bake_asset(
         )
     cameras = cameras or _orbit(surface.mesh, settings.verify_views)
     views, psnr, psnr_object = compare_views(picture, splats, cameras, samples[1], settings.seed, stages.step)
-    brightness = compare_with_textures(parts, splats) if lights is None else None
-    if brightness is not None and not _MIN_BRIGHTNESS < brightness < _MAX_BRIGHTNESS:
-        warnings.append(
-            f"the splats are {brightness:.2g} times as bright as the textures of the file: "
-            "check the factors of its materials"
-        )
+    brightness: float | None = None
+    if lights is None:
+        brightness, different = compare_with_textures(parts, splats, surface.parts_of(surfels.faces))
+        warnings += [
+            f"the splats of part {part!r} are {ratio:.2g} times as bright as its texture in the file: check the factor "
+            "of its material"
+            for part, ratio in different.items()
+        ]
     stages.end()
     return BakeResult(asset, psnr, psnr_object, views, surface.mesh, brightness, tuple(warnings), units)
 

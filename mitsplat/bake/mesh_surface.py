@@ -53,6 +53,10 @@ class MeshSurface:
         is_hit = np.isfinite(distance)
         return np.where(is_hit, index, -1), np.where(is_hit, (1 - u - v, u, v), 0.0).T, distance
 
+    def parts_of(self, faces: Int64Array) -> Int64Array:
+        """Return the positions (N,) of the parts of faces (N,)."""
+        return np.searchsorted(self._first, faces, side="right") - 1
+
     def share_of_backs(self, rng: np.random.Generator) -> float:
         """Return the share of visible points that are backs of one-sided faces, seen through openings of the mesh."""
         random = rng.normal(size=(2, _BACK_RAYS, 3))
@@ -136,7 +140,7 @@ class MeshSurface:
             shading = mean(self.normals(faces, barycentric))
             shading *= np.where(np.einsum("nd,nd->n", shading, surfels.normals) < 0, -1.0, 1.0)[:, None]
             normals = (shading / np.linalg.norm(shading, axis=1, keepdims=True)).astype(np.float32)
-        colours = mean(encode_srgb(self.base_colours(faces, barycentric)))
+        colours = encode_srgb(mean(self.base_colours(faces, barycentric)))
         return colours, SplatMaterials(metallic, roughness, specular, normals)
 
     def picture(self, camera: Camera, samples: int, _seed: int = 0) -> tuple[Float64Array, Float64Array]:

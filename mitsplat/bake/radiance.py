@@ -12,11 +12,11 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from mitsplat.arrays import BoolArray, Float64Array
-from mitsplat.gaussians.spherical_harmonics import sh_basis
+from mitsplat.gaussians.spherical_harmonics import SH_C0, sh_basis
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.gaussians.surfels import Surfels
 from mitsplat.geometry.camera import spiral
-from mitsplat.images.colour import encode_srgb
+from mitsplat.images.colour import decode_srgb, encode_srgb
 from mitsplat.progress import Progress
 from mitsplat.renderer.path_tracing import RAYS_PER_LAUNCH, trace_radiance
 
@@ -110,9 +110,15 @@ def _fit_radiance(scene: mi.Scene, surfels: Surfels, rng: np.random.Generator, p
         basis = sh_basis(-towards.reshape(-1, 3), _SH_DEGREE).reshape(*towards.shape[:2], terms)
         weighted = weights[:, None] * basis
         target = encode_srgb(radiance).reshape(*towards.shape) - 0.5
-        coefficients[chunk] = np.linalg.solve(
+        fitted = np.linalg.solve(
             np.einsum("nmk,nml->nkl", weighted, basis) + penalty, np.einsum("nmk,nmc->nkc", weighted, target)
         )
+        # The mean of encoded values is darker than the mean radiance, which a texture shows from afar.
+        shown, share = decode_srgb(np.clip(basis @ fitted + 0.5, 0.0, None)), weights / weights.sum()
+        means = (np.einsum("m,nmc->nc", share, one) for one in (radiance.reshape(*towards.shape), shown))
+        traced, blended = map(encode_srgb, means)
+        fitted[:, 0] += (traced - blended) / SH_C0
+        coefficients[chunk] = fitted
     return coefficients
 
 

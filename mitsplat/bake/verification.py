@@ -10,7 +10,7 @@ import trimesh
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-from mitsplat.arrays import Float64Array
+from mitsplat.arrays import Float64Array, Int64Array
 from mitsplat.bake.mesh_parts import MeshPart
 from mitsplat.fit.image_metrics import psnr_of
 from mitsplat.gaussians.spherical_harmonics import SH_C0
@@ -25,6 +25,12 @@ PictureFunction = Callable[[Camera, int, int], tuple[Float64Array, Float64Array]
 _SAMPLES_PER_PART = 4000
 _MAX_SIGMAS = 3.0
 """Distance to the next Gaussian, in its standard deviations, beyond which a point of the mesh counts as hidden."""
+_MIN_SEEN = 100
+"""Minimum number of visible samples of a part that is compared with its texture."""
+_DARK = 0.01
+"""Difference of linear colours that is not visible."""
+_MIN_BRIGHTNESS, _MAX_BRIGHTNESS = 0.8, 1.25
+"""Range of brightness relative to the textures that the size of the Gaussians can explain."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,35 +83,38 @@ def compare_views(
     return tuple(views), psnr_of(float(np.mean(errors))), psnr_of(float(np.nanmean(on_object)))
 
 
-def compare_with_textures(parts: Sequence[MeshPart], splats: Splats) -> float | None:
-    """Return the brightness of the splats relative to the textures of a mesh at points of its surface.
+def compare_with_textures(
+    parts: Sequence[MeshPart], splats: Splats, owners: Int64Array
+) -> tuple[float | None, dict[str, float]]:
+    """Compare the brightness of the splats with that of the textures of a mesh at points of its surface.
 
     The textures are used without the factors of the materials.
 
     Args:
         parts: Parts of the mesh.
         splats: Splats with the base colours of the mesh.
+        owners: Position of the part of each splat, shape (N,).
 
     Returns:
-        The ratio, or None without textures.
+        The ratio of all parts, or None without textures; and the ratio of each visible part that differs, by its name.
     """
-    points, normals, colours = [], [], []
-    for part in parts:
+    tree, outward = KDTree(splats.means), Rotation.from_quat(splats.quats).as_matrix()[:, :, 2]
+    reach, shown = _MAX_SIGMAS * splats.scales.max(axis=1), decode_srgb(0.5 + SH_C0 * splats.sh[:, 0])
+    sums, different = np.zeros(2), {}
+    for number, part in enumerate(parts):
         if part.texture is None or not part.mesh.area > 0:
             continue
         at, face = trimesh.sample.sample_surface(part.mesh, _SAMPLES_PER_PART, seed=0)
         barycentric = trimesh.triangles.points_to_barycentric(part.mesh.triangles[face], at)
-        points.append(at)
-        normals.append(part.mesh.face_normals[face])
-        colours.append(decode_srgb(part.texture.at(face, barycentric) / 255.0))
-    if not points:
-        return None
-    place, normal, texture = (np.concatenate(values) for values in (points, normals, colours))
-    distance, nearest = KDTree(splats.means).query(place)
-    outward = Rotation.from_quat(splats.quats[nearest]).as_matrix()[:, :, 2]
-    seen = (distance < _MAX_SIGMAS * splats.scales[nearest].max(axis=1)) & (
-        np.einsum("nd,nd->n", outward, normal) > 0.7
-    )
-    baked = 0.5 + SH_C0 * splats.sh[nearest, 0]
-    expected = texture[seen].mean() if seen.any() else 0.0
-    return float(decode_srgb(baked)[seen].mean() / expected) if expected > 0 else None
+        distance, nearest = tree.query(at)
+        cosine = np.einsum("nd,nd->n", outward[nearest], part.mesh.face_normals[face])
+        seen = (distance < reach[nearest]) & (cosine > 0.7) & (owners[nearest] == number)
+        if np.count_nonzero(seen) < _MIN_SEEN:
+            continue
+        texture = decode_srgb(part.texture.at(face, barycentric) / 255.0)[seen]
+        means = np.array([shown[nearest][seen].mean(), texture.mean()])
+        sums += part.mesh.area * seen.mean() * means
+        ratio = means[0] / max(means[1], _DARK)
+        if np.ptp(means) > _DARK and not _MIN_BRIGHTNESS < ratio < _MAX_BRIGHTNESS:
+            different[part.name] = float(ratio)
+    return (float(sums[0] / sums[1]) if sums[1] > 0 else None), different

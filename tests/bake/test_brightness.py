@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 import trimesh
@@ -9,7 +11,60 @@ from PIL import Image
 from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
-from mitsplat.bake.bake import BakeSettings, bake_asset
+from mitsplat.bake.bake import BakeResult, BakeSettings, bake_asset
+from mitsplat.geometry.camera import Camera
+from mitsplat.images.colour import decode_srgb
+from mitsplat.scene.spec.light_spec import EnvironmentLight
+
+NOISE = np.random.default_rng(0).random((64, 64))
+
+
+def textured_box(pixels: np.ndarray, centre: float = 0.0, *, factor: float = 1.0) -> trimesh.Trimesh:
+    """Build a box of 40 mm with a grey texture (H, W) on each side."""
+    box = trimesh.creation.box((0.04, 0.04, 0.04), trimesh.transformations.translation_matrix((centre, 0, 0)))
+    box.unmerge_vertices()
+    uv = np.tile([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0]], (12, 1))
+    image = Image.fromarray(np.repeat(pixels[..., None], 3, axis=2).astype(np.uint8))
+    colour = [factor, factor, factor, 1.0]
+    material = PBRMaterial(baseColorTexture=image, baseColorFactor=colour, metallicFactor=0.0, roughnessFactor=0.8)
+    box.visual = TextureVisuals(uv=uv, material=material)
+    return box
+
+
+def bake(mesh: trimesh.Trimesh | trimesh.Scene, **options: Any) -> BakeResult:
+    settings = BakeSettings(gaussians=1500, fit_steps=0, verify_views=1, proxy_faces=100)
+    pieces = [trimesh.creation.box((0.04, 0.04, 0.04))]
+    return bake_asset(mesh, name="box", settings=settings, pieces=pieces, **options)
+
+
+@pytest.mark.parametrize("pixels", [255 * (NOISE < 0.1), 255 * (NOISE < 0.5), 250 - 250 * (NOISE < 0.1)])
+def test_patterns_finer_than_gaussians_keep_their_mean_brightness(pixels: np.ndarray) -> None:
+    """Specks of white on black are seen from afar by their mean radiance, not by their mean code value."""
+    result = bake(textured_box(pixels))
+    assert result.brightness == pytest.approx(1.0, abs=0.1)
+    assert result.warnings == ()
+
+
+def test_patterns_under_lights_keep_their_mean_radiance() -> None:
+    camera = Camera.look_at((0.2, 0.26, 0.18), (0, 0, 0), width=64, height=64, fov_x=25)
+    lit = {"kind": "environment", "lights": [EnvironmentLight()]}
+    (view,) = bake(textured_box(255 * (NOISE < 0.1)), cameras=[camera], **lit).views
+    inside = view.cover > 0.999
+    assert decode_srgb(view.splats)[inside].mean() == pytest.approx(decode_srgb(view.mesh)[inside].mean(), rel=0.1)
+
+
+def test_brightness_that_differs_is_reported_for_each_part() -> None:
+    """One dark part among bright ones does not hide in their mean, and nearly black ones are not reported."""
+    grey = np.full((8, 8), 200)
+    bodies = {
+        "body": textured_box(grey),
+        "knob": textured_box(grey, 0.1, factor=0.4),
+        "foot": textured_box(np.full((8, 8), 12), 0.2, factor=0.4),
+        "lid": textured_box(grey, 0.3),
+    }
+    warnings = bake(trimesh.Scene(bodies)).warnings
+    assert len(warnings) == 1
+    assert "the splats of part 'knob' are 0.4 times as bright as its texture in the file" in warnings[0]
 
 
 def test_folds_do_not_darken_the_colours_of_a_crumpled_body() -> None:

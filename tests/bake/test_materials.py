@@ -92,7 +92,7 @@ def test_splats_have_the_brightness_of_the_texture(bakes: dict[str, BakeResult],
     assert bakes["ply"].brightness is None
     dark = bake_asset(write_obj(tmp_path, "Kd 0.4 0.4 0.4\nmap_Kd colour.png"), name="box", settings=QUICK)
     assert dark.brightness == pytest.approx(decode_srgb(0.4), rel=0.1)
-    assert "as bright as the textures of the file" in dark.warnings[0]
+    assert "as bright as its texture in the file" in dark.warnings[0]
 
 
 def test_texels_outside_of_all_faces_do_not_count_for_brightness(tmp_path: Path) -> None:

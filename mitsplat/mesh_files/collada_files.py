@@ -17,6 +17,11 @@ from mitsplat.mesh_files.mesh_file import OPAQUE, Axis
 from mitsplat.mesh_files.obj_files import check_texture
 
 _NAMESPACE = "{*}"
+_LOST_NODE = re.compile(
+    r"(Geometry|Node|Material|Controller) .* not found|Invalid url in (node|geometry)|Incorrect target id in material"
+    r"|.*(translate|rotate|scale|matrix) (transform|node)|(Translate|Rotate|Scale) node"
+)
+"""Errors of pycollada after which it leaves out a node of the scene with its geometry."""
 _NOT_FINITE = re.compile("nan|inf", re.I)
 
 
@@ -79,6 +84,11 @@ def check_collada(path: Path, document: Any) -> None:
     for material in document.materials:
         if (texture := _texture_of(material)) is not None:
             check_texture(path, plain_name(texture), path.parent)
+
+
+def lost_node(document: Any) -> str | None:
+    """Return the reason why a node of the scene of a ``collada.Collada`` was left out, or None if all were read."""
+    return next((str(error.msg) for error in document.errors if _LOST_NODE.match(error.msg)), None)
 
 
 def collada_warnings(document: Any) -> Iterator[str]:

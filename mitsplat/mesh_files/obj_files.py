@@ -29,7 +29,10 @@ _LEFT_OUT = {
 
 
 def plain_text(content: bytes) -> bytes:
-    """Return an OBJ or MTL file in UTF-8, with single blanks and line feeds, without comments and continued lines."""
+    """Return an OBJ or MTL file in UTF-8 in one spelling.
+
+    It has single blanks, line feeds and colours of three values, and no comments or continued lines.
+    """
     if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         content = content.decode("utf-16").encode()
     lines = _CONTINUATION.sub(b" ", content.removeprefix(codecs.BOM_UTF8)).splitlines()
@@ -44,6 +47,8 @@ def _plain_line(line: bytes) -> bytes:
     words = line.split()
     if words and words[0].lower().startswith(_KEPT):
         return b" ".join(line.strip().split(maxsplit=1))
+    if len(words) == 2 and words[0].lower() in (b"ka", b"kd", b"ks"):
+        words += words[1:] * 2  # a single value stands for all three
     return b" ".join(words)
 
 

@@ -27,7 +27,7 @@ from mitsplat.arrays import Float64Array
 from mitsplat.errors import InputError, MissingResourceError
 from mitsplat.geometry.mesh import check_faces
 from mitsplat.images.colour import decode_srgb
-from mitsplat.mesh_files.collada_files import check_collada, collada_warnings, plain_name, read_collada_asset
+from mitsplat.mesh_files.collada_files import check_collada, collada_warnings, lost_node, plain_name, read_collada_asset
 from mitsplat.mesh_files.face_polygons import has_concave, plain_obj
 from mitsplat.mesh_files.file_references import find_reference
 from mitsplat.mesh_files.mesh_file import (
@@ -91,6 +91,8 @@ def read_with_trimesh(path: Path, *, textures: bool = True) -> MeshFile:
     kind = path.suffix.lower()
     if kind == ".dae" and importlib.util.find_spec("collada") is None:
         raise MissingResourceError(f"{path}: reading it needs `pip install pycollada`")
+    if kind == ".ply":
+        _check_elements(_ply_header(path))
     document = _collada_document(path) if kind == ".dae" else None
     content = _plain_content(path)
     file = path if content is None else io.BytesIO(content)
@@ -110,6 +112,8 @@ def read_with_trimesh(path: Path, *, textures: bool = True) -> MeshFile:
         return MeshFile(parts, warnings=warnings, in_single=kind in (".stl", ".ply"))
     if textures:
         check_collada(path, document)
+    if (lost := lost_node(document)) is not None:
+        raise InputError(f"one of its nodes cannot be read ({lost}): export it again with all materials")
     units, up = read_collada_asset(path)
     parts = tuple(part if part.material in _NO_MATERIALS else _decoded(part) for part in parts)
     return MeshFile(parts, units, up, tuple(collada_warnings(document)))
@@ -156,6 +160,21 @@ def _plain_stl(path: Path) -> bytes | None:
 def _ply_header(path: Path) -> str:
     with path.open("rb") as file:
         return file.read(_MAX_HEADER_BYTES).partition(b"end_header")[0].decode("utf-8", errors="replace")
+
+
+def _check_elements(header: str) -> None:
+    """Refuse a PLY file of splats, of strips of triangles or of points, for its header.
+
+    Raises:
+        InputError: If it is one.
+    """
+    if re.search(r"^element face [1-9]", header, re.M) or not re.search(r"^element", header, re.M):
+        return
+    if re.search(r"^element chunk |^property float (f_dc_0|rot_0)\s*$", header, re.M):
+        raise InputError("it has Gaussian splats and no faces: `mitsplat import` makes an asset of it")
+    if re.search(r"^element tristrips [1-9]", header, re.M):
+        raise InputError("its faces are strips of triangles (tristrips), which are not read: export it with triangles")
+    raise InputError("a mesh needs at least one face (got points only): reconstruct a surface, or export it with faces")
 
 
 def _collada_document(path: Path) -> Any:
@@ -471,4 +490,4 @@ def check_textures(mesh: Path) -> None:
 
 def _texture_names(header: str) -> list[str]:
     """Return the textures that the header of a PLY file names."""
-    return re.findall(r"^comment TextureFile (.+?)\s*$", header, re.M | re.I)
+    return re.findall(r"^comment TextureFile +(.+?)\s*$", header, re.M | re.I)

@@ -133,6 +133,44 @@ def collada(asset: str) -> str:
 
 
 @pytest.mark.parametrize(
+    ("instance", "lost"),
+    [
+        ('<instance_geometry url="#other"/>', "Geometry #other not found"),
+        (
+            '<instance_geometry url="#g"><bind_material><technique_common><instance_material symbol="a" '
+            'target="#paint"/></technique_common></bind_material></instance_geometry>',
+            "Material #paint not found",
+        ),
+        ('<instance_camera url="#eye"/>', ""),
+    ],
+)
+def test_collada_nodes_that_are_lost_are_refused(tmp_path: Path, instance: str, lost: str) -> None:
+    """pycollada leaves out a node of a missing geometry or material, and the rest would be baked without it."""
+    pytest.importorskip("collada", reason="needs pycollada, which reads COLLADA")
+    text = collada("").replace("</visual_scene>", f"<node>{instance}</node></visual_scene>")
+    (tmp_path / "a.dae").write_text(text)
+    if not lost:
+        assert len(read_model(tmp_path / "a.dae").parts) == 1
+        return
+    with pytest.raises(InputError, match=f"one of its nodes cannot be read .*{lost}"):
+        read_model(tmp_path / "a.dae")
+
+
+@pytest.mark.parametrize(
+    ("element", "sentence"),
+    [
+        ("element chunk 1\nproperty float min_x\n", "mitsplat import"),
+        ("element tristrips 1\nproperty list int int vertex_indices\n", "strips of triangles"),
+        ("", "points only"),
+    ],
+)
+def test_ply_files_without_faces_are_named(tmp_path: Path, element: str, sentence: str) -> None:
+    (tmp_path / "a.ply").write_text(f"ply\nformat ascii 1.0\n{element}element vertex 1\nend_header\n0\n")
+    with pytest.raises(InputError, match=sentence):
+        read_model(tmp_path / "a.ply")
+
+
+@pytest.mark.parametrize(
     ("asset", "units", "up", "extents"),
     [
         ('<unit meter="0.0254"/><up_axis>Z_UP</up_axis>', 0.0254, "z", (1, 2, 3)),

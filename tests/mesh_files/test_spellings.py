@@ -64,6 +64,7 @@ RED = "newmtl red\nKd 1 0 0\n"
         (obj(), "newmtl red\n\tKd 1 0 0 # paint\n"),
         (obj(use="usemtl  dark   red\t"), "newmtl dark  red\nKd 1 0 0\n"),
         (obj(use="usemtl red#1"), "newmtl red#1\nKd 1 0 0\n"),
+        (obj(), RED + "Ks 0\nKa 0.5\n"),
     ],
 )
 def test_spellings_of_obj_give_the_same_mesh(tmp_path: Path, text: str, library: str) -> None:
@@ -80,7 +81,7 @@ def test_wide_characters_of_obj_are_read(tmp_path: Path) -> None:
     assert is_complete(model) and shown(model) == [255, 0, 0]
 
 
-@pytest.mark.parametrize("colour", ["Kd xyz 0.4 0.2 0.1", "Kd spectral a.rfl", "Kd 0.5", "Kd 255 128 0", "Ks 0.5"])
+@pytest.mark.parametrize("colour", ["Kd xyz 0.4 0.2 0.1", "Kd spectral a.rfl", "Kd 0.5 0.2", "Kd 255 128 0", "Ks 1 a"])
 def test_colours_of_mtl_that_are_no_rgb_are_refused(tmp_path: Path, colour: str) -> None:
     """trimesh drops all materials of a file with one such colour."""
     (tmp_path / "a.obj").write_text(obj())

@@ -211,7 +211,7 @@ def _decode_ply(data: bytes) -> SplatArrays:
     if rest not in (0, 9, 24, 45) or not set(rest_names) <= set(names):
         raise InputError(f"f_rest must be numbered from 0 and have 0, 9, 24 or 45 properties (got {rest})")
     rows = vertex_rows(data, form, elements, start)
-    _check_encoding(columns_of(rows, scale_names), rows["opacity"], columns_of(rows, _COLOUR))
+    _check_encoding(*(columns_of(rows, names) for names in (_MEANS, scale_names, ("opacity",), _COLOUR)))
     scales, opacities = _exp(columns_of(rows, scale_names)), _sigmoid(rows["opacity"])
     if len(scale_names) == 2:
         scales = np.hstack([scales, _FLAT_THICKNESS * scales.min(axis=1, keepdims=True)])
@@ -238,10 +238,11 @@ def _decode_ksplat(data: bytes) -> SplatArrays:
     return SplatArrays(*(values.astype(np.float32) for values in arrays))
 
 
-def _check_encoding(scales: npt.NDArray[Any], opacities: npt.NDArray[Any], colours: npt.NDArray[Any]) -> None:
+def _check_encoding(means: Float32Array, scales: Float32Array, opacities: Float32Array, colours: Float32Array) -> None:
     """Refuse sizes, opacities and colours in place of the logarithms, logits and coefficients of a PLY file.
 
-    No trained splats have only logits from 0 to 1 with Gaussians above one unit, or all over this range.
+    No trained splats have only logits from 0 to 1 with Gaussians above one unit, or all over this range, or only
+    Gaussians above one unit of which most are as large as the cloud.
     """
     if len(scales) < _MIN_JUDGED:
         return
@@ -251,6 +252,12 @@ def _check_encoding(scales: npt.NDArray[Any], opacities: npt.NDArray[Any], colou
             "scale_0 to scale_2 and opacity of a PLY file must be logarithms and logits (got "
             f"{scales.min():.3g} to {scales.max():.3g}, and {low:.3g} to {high:.3g}): apply log "
             "to the scales and log(o / (1 - o)) to the opacities"
+        )
+    extent = float(np.ptp(np.percentile(means, (5, 95), axis=0), axis=0).max())
+    if scales.min() > 0 and (size := float(np.exp(np.median(scales)))) > 0.5 * extent:
+        raise InputError(
+            f"scale_0 to scale_2 of a PLY file must be logarithms (got {scales.min():.3g} to {scales.max():.3g}, which "
+            f"are Gaussians of {size:.3g} units in a cloud of {extent:.3g} units): apply log to the scales"
         )
     if (usual := float(np.median(np.abs(colours)))) > _MAX_COEFFICIENT:
         raise InputError(

@@ -255,6 +255,11 @@ def test_a_scene_uses_the_kernel_that_its_splats_state(scene_data, write_scene, 
         ),
         (("opacity",), lambda splats: (splats.opacities,), "must be logarithms and logits"),
         (
+            ("scale_0", "scale_1", "scale_2"),
+            lambda splats: tuple(splats.scales.T),
+            "scale_2 of a PLY file must be logarithms",
+        ),
+        (
             ("f_dc_0", "f_dc_1", "f_dc_2"),
             lambda splats: (255 * splats.opacities,) * 3,
             "must be coefficients of",

@@ -62,11 +62,10 @@ def _generate(pieces: Sequence[trimesh.Trimesh], max_pairs: int) -> NarrowPhase:
     # If one hull has many vertices, the support search changes for all hulls; the largest hull therefore decides.
     hull = newton_hull(max(pieces, key=lambda piece: len(piece.vertices)))
     builder = newton.ModelBuilder()
-    builder.validate_inertia_detailed = True  # in Python; the alternative compiles a kernel
     builder.add_shape_box(-1)
     builder.add_shape_convex_hull(-1, mesh=hull)
     builder.add_shape_convex_hull(builder.add_body(), mesh=hull)
-    model = builder.finalize(device="cpu")
+    model = builder.finalize(device="cpu", skip_validation_inertia=True)  # it is not simulated
     # Overflow is read from the solver's flags, because the pipeline would print it at every step.
     pipeline = newton.CollisionPipeline(model, broad_phase="sap", shape_pairs_max=max_pairs, verify_buffers=False)
     return pipeline.narrow_phase

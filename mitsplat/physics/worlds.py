@@ -46,6 +46,9 @@ WITH_ROLL, _WITHOUT_ROLL = 6, 4
 # its mass sinks by 1 mm. MuJoCo's own contacts flicker when stiffer: from 0.98 on, a pile of 29 packages creeps at 1 to
 # 10 mm/s, and another one at 2 to 4 mm/s at 0.97. At 0.96 such piles rest sooner, and friction is still exact to 0.3 %.
 _IMPEDANCE_WARP, IMPEDANCE_MUJOCO = (0.996, 0.9999), (0.96, 0.999)
+# Moment of inertia below which Newton corrects it [kg m^2], below that of any part of 0.5 mm. By default, Newton adds
+# 1e-6 kg m^2 to moments below 1e-10, which a steel cube of 2 mm has.
+_MIN_INERTIA = 1e-20
 # Solver tolerance of MuJoCo in double precision. At its default of 1e-8, errors of one step cost iterations in the next
 # step: 18 instead of 9 per step in a pile of 29 packages.
 _TOLERANCE = 1e-12
@@ -451,6 +454,7 @@ def _build_scene(
     contact = {"mujoco:condim": WITH_ROLL, "mujoco:geom_solimp": (*impedance, 1e-3, 0.5, 2.0)}
     builder = newton.ModelBuilder(gravity=_GRAVITY)
     builder.validate_inertia_detailed = True  # in Python: the alternative compiles a kernel for 4 s
+    builder.inertia_absolute_tolerance = builder.inertia_correction = _MIN_INERTIA
     SolverMuJoCo.register_custom_attributes(builder)
     add_hull = builder.add_shape_convex_hull if newton_contacts else builder.add_shape_mesh
     for collider in colliders:

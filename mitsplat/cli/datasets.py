@@ -292,8 +292,10 @@ def settle(
         for one in layout.left_out:
             typer.echo(f"left out of layout {layout.index}: {loaded.assets[one.asset].name} ({one.reason})")
     if preview:
-        pictures = write_preview(loaded, settled[0], out)
+        pictures, again = write_preview(loaded, settled[0], out)
         typer.echo(f"drop: {out} ({pictures} pictures)")
+        if again:
+            typer.echo(f"dropped again, because they did not come to rest where they may: {', '.join(again)}")
 
 
 def merge(

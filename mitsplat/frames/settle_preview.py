@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from PIL import Image
+from PIL import Image, ImageDraw
 from rich.table import Table
 
-from mitsplat.frames.frame import render_frame
+from mitsplat.frames.frame import Frame, render_frame
+from mitsplat.labels.overlay import draw_labels
 from mitsplat.physics.settle import replay_layout
 from mitsplat.scene.layout import Layout
 from mitsplat.scene.scene import Scene
@@ -18,6 +20,7 @@ from mitsplat.storage.files import storage_errors, write_file
 
 _INTERVAL = 0.04  # between pictures of a drop [s]; GIF counts in hundredths
 _PAUSE = 1500  # on the last picture [ms]
+_MARK_TIME = 0.5  # for which an object that was dropped again is marked [s]
 
 
 def certificate_table(layouts: Iterable[Layout]) -> Table:
@@ -41,21 +44,45 @@ def certificate_table(layouts: Iterable[Layout]) -> Table:
     return table
 
 
-def write_preview(scene: Scene, layout: Layout, path: Path) -> int:
-    """Write the drop of a layout as an animated GIF from its first frame's camera; return the number of pictures.
+def write_preview(scene: Scene, layout: Layout, path: Path) -> tuple[int, list[str]]:
+    """Write the drop of a layout as an animated GIF from its first frame's camera.
+
+    Objects that are dropped again jump to new start poses. For half a second from then on, they are coloured and named.
+
+    Returns:
+        The number of pictures, and a description of each object that is dropped again.
 
     Raises:
         InputError: If the file cannot be written.
         MissingResourceError: If the disk is full.
     """
     frame = layout.index * scene.spec.output.views
-    pictures = [
-        Image.fromarray(render_frame(scene, frame, layout=moment, quality="fast").image)
-        for moment in replay_layout(scene, layout, interval=_INTERVAL)
-    ]
+    names = {one.id: scene.assets[one.asset].name for one in layout.instances}
+    marked: dict[int, float] = {}  # time until which an object is marked, by id
+    pictures, again = [], []
+    for moment in replay_layout(scene, layout, interval=_INTERVAL):
+        for number in moment.dropped_again:
+            marked[number] = moment.time + _MARK_TIME
+            again.append(f"{names[number]} (object {number}) after {moment.time:.1f} s")
+        shown = {number: names[number] for number, end in marked.items() if moment.time < end}
+        picture = render_frame(scene, frame, layout=moment.layout, quality="fast")
+        pictures.append(_mark(picture, shown))
     step = round(_INTERVAL * 1000)
     durations = [step] * (len(pictures) - 1) + [_PAUSE]
     film: dict[str, Any] = {"save_all": True, "append_images": pictures[1:], "duration": durations, "loop": 0}
     with storage_errors(path):
         write_file(path, lambda part: pictures[0].save(part, "GIF", **film))
-    return len(pictures)
+    return len(pictures), again
+
+
+def _mark(frame: Frame, names: Mapping[int, str]) -> Image.Image:
+    """Return the picture of a frame, in which objects of these ids are coloured and named as dropped again."""
+    if not names:
+        return Image.fromarray(frame.image)
+    labels = replace(frame.labels, instances=tuple(one for one in frame.labels.instances if one.id in names))
+    picture = Image.fromarray(draw_labels(frame.image, labels))
+    text, size = f"dropped again: {', '.join(names.values())}", max(10, round(frame.image.shape[1] / 36))
+    ImageDraw.Draw(picture).text(
+        (size / 2, size / 2), text, "white", font_size=size, stroke_width=2, stroke_fill="black"
+    )
+    return picture

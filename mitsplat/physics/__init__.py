@@ -8,6 +8,6 @@ shakes objects. :func:`.rest.run_to_rest` detects rest. :mod:`.settle` caches la
 
 from __future__ import annotations
 
-from mitsplat.physics.settle import replay_layout, settle_layout, settle_layouts
+from mitsplat.physics.settle import ReplayMoment, replay_layout, settle_layout, settle_layouts
 
-__all__ = ["replay_layout", "settle_layout", "settle_layouts"]
+__all__ = ["ReplayMoment", "replay_layout", "settle_layout", "settle_layouts"]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import gc
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
@@ -21,7 +21,16 @@ from mitsplat.physics.bodies import Part, make_collider, make_part
 from mitsplat.physics.contacts import ContactFinder
 from mitsplat.physics.handling import draw_handling
 from mitsplat.physics.placement import Item, draw_poses
-from mitsplat.physics.rest import CONTACT_OVERFLOW, FREE_TIME, LATE, LEANING, RestOutcome, run_to_rest
+from mitsplat.physics.rest import (
+    CONTACT_OVERFLOW,
+    FREE_TIME,
+    LATE,
+    LEANING,
+    Observe,
+    RestOutcome,
+    observe_nothing,
+    run_to_rest,
+)
 from mitsplat.physics.worlds import Collider, MujocoWorld, WarpWorld, World, all_pieces
 from mitsplat.progress import Note
 from mitsplat.scene.layout import NO_PHYSICS, Instance, Layout, LeftOut, RestCertificate, UnsettledLayoutError
@@ -279,8 +288,13 @@ class Drop:
             refused.append(found.reason)
         return refused
 
-    def replay(self, layout: Layout, interval: float) -> Iterator[Float64Array]:
-        """Yield poses (N, 4, 4) of a layout's objects every ``interval`` seconds, from the start until they rest."""
+    def replay(self, layout: Layout, interval: float) -> Iterator[tuple[float, Float64Array, BoolArray]]:
+        """Simulate the drop of a layout again, from the start until its objects rest.
+
+        Yields:
+            Every ``interval`` seconds: the time [s], the poses (N, 4, 4), and a mask (N,) of the objects that were
+            dropped again since the moment before.
+        """
         resting_ids = {instance.id for instance in layout.instances}
         drawn = [one for one in self._draw_contents(layout.index) if one.id in resting_ids]
         if not drawn:
@@ -293,11 +307,14 @@ class Drop:
         number, regions = self._ground_of(layout.index), [one.region for one in drawn]
         world = self._world(assets, capacity, number)
         start = self.draw_poses(assets, rng, given, number, regions, self._arrangements(drawn))
-        moments = [start]
+        restarted = np.zeros(len(drawn), dtype=bool)
+        moments = [(0.0, start, restarted.copy())]
 
-        def observe(time: float, poses: Float64Array) -> None:
+        def observe(time: float, poses: Float64Array, again: BoolArray) -> None:
+            np.logical_or(restarted, again, out=restarted)
             if len(moments) * interval <= time <= certificate.time_to_rest:
-                moments.append(poses)
+                moments.append((time, poses, restarted.copy()))
+                restarted[:] = False
 
         self._run(world, start, layout.index, attempt, drawn, rng, observe)
         yield from moments
@@ -323,7 +340,7 @@ class Drop:
         attempt: int,
         drawn: Sequence[_DrawnObject],
         rng: np.random.Generator,
-        observe: Callable[[float, Float64Array], None] = lambda time, poses: None,
+        observe: Observe = observe_nothing,
     ) -> RestOutcome:
         """Simulate a draw of a layout from its start poses (N, 4, 4); ``rng`` draws those of objects that fail."""
         settle = self.scene.spec.settle

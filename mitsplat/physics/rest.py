@@ -62,6 +62,13 @@ Redraw = Callable[[Float64Array, BoolArray], Float64Array | None]
 It returns None if there is no room.
 """
 
+Observe = Callable[[float, Float64Array, BoolArray], None]
+"""Callback that gets the time [s], the poses (N, 4, 4), and a mask (N,) of the bodies that were dropped again."""
+
+
+def observe_nothing(time: float, poses: Float64Array, again: BoolArray) -> None:
+    """Ignore a moment of a drop."""
+
 
 def run_to_rest(
     world: World,
@@ -73,7 +80,7 @@ def run_to_rest(
     fastest: float = np.inf,
     handling: Handling = NO_HANDLING,
     redraw: Redraw | None = None,
-    observe: Callable[[float, Float64Array], None] = lambda time, poses: None,
+    observe: Observe = observe_nothing,
 ) -> RestOutcome:
     """Advance a world until its bodies have been at rest for a second, or until rest is ruled out.
 
@@ -96,7 +103,7 @@ def run_to_rest(
         fastest: Speed limit to which faster bodies are slowed down after each advance [m/s].
         handling: Actions on the bodies. Before they end, the bodies are not at rest.
         redraw: Function that draws new poses of failed bodies.
-        observe: Callback that receives the time [s] and the poses (N, 4, 4) after each advance.
+        observe: Callback after each advance.
     """
     failures = _Failures(world, bounds, walls or (np.full(3, -np.inf), np.full(3, np.inf)))
     try:
@@ -124,7 +131,7 @@ def _run_to_rest(
     fastest: float,
     handling: Handling,
     redraw: Redraw | None,
-    observe: Callable[[float, Float64Array], None],
+    observe: Observe,
 ) -> RestOutcome:
     mean_frames = max(1, round(_SPEED_WINDOW / world.interval))
     past: deque[Float64Array] = deque([world.poses], maxlen=mean_frames + 1)
@@ -136,7 +143,6 @@ def _run_to_rest(
         handling.apply(world)
         poses = _advance(world, fastest, drag=world.time - begin >= FREE_TIME and not quiet)
         past.append(poses)
-        observe(world.time, poses)
         motion = np.maximum(motion, _surface_motion(world.bodies, rest, poses))
         moving = motion > (_QUIET_MOTION if world.time - since < _QUIET_TIME else _REST_MOTION)
         if moving.any() or world.time < handling.end:
@@ -152,6 +158,7 @@ def _run_to_rest(
             _restart(world, drawn, failed)
             begin, since = max(world.time, handling.end), world.time
             rest, motion, redraws = drawn, np.zeros(len(world.bodies)), redraws + 1
+        observe(world.time, rest if failed.any() else poses, failed)
     speed, spin = _mean_speeds(world.bodies, past[0], poses, (len(past) - 1) * world.interval)
     return RestOutcome("", since, speed, spin, float(motion.max()), world.poses)
 

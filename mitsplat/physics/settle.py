@@ -150,25 +150,41 @@ def try_alone(scene: Scene, *, tries: int = 3) -> Iterator[tuple[str, Arrangemen
                         yield one[0], arrangement, drop.try_alone(asset, region, arrangement, tries)
 
 
-def replay_layout(scene: Scene, layout: Layout, *, interval: float = 0.04) -> Iterator[Layout]:
+@dataclass(frozen=True, eq=False)
+class ReplayMoment:
+    """Moment of a replay.
+
+    Attributes:
+        layout: The layout with the poses of this moment.
+        time: Simulated time since the start [s].
+        dropped_again: Ids of the objects that have been dropped again since the moment before. They jump to new start
+            poses.
+    """
+
+    layout: Layout
+    time: float
+    dropped_again: tuple[int, ...] = ()
+
+
+def replay_layout(scene: Scene, layout: Layout, *, interval: float = 0.04) -> Iterator[ReplayMoment]:
     """Simulate the drop of a layout again.
 
-    On a CPU, the simulation reproduces the original drop exactly. Objects that were dropped again jump to their new
-    start poses.
+    On a CPU, the simulation reproduces the original drop exactly.
 
     Yields:
-        The layout every ``interval`` seconds [s], and finally the given layout.
+        A moment every ``interval`` seconds [s], and finally the given layout.
     """
     with warp_settings():
         from mitsplat.physics.drop import drop_of  # Newton reads these settings when it compiles
 
-        for poses in drop_of(scene, lambda text: None).replay(layout, interval):
+        for time, poses, again in drop_of(scene, lambda text: None).replay(layout, interval):
             moving = (
                 replace(instance, world_from_object=pose)
                 for instance, pose in zip(layout.instances, poses, strict=True)
             )
-            yield replace(layout, instances=tuple(moving))
-    yield layout
+            ids = tuple(instance.id for instance in compress(layout.instances, again))
+            yield ReplayMoment(replace(layout, instances=tuple(moving)), time, ids)
+    yield ReplayMoment(layout, layout.certificate.time_to_rest)
 
 
 @lru_cache(maxsize=4)

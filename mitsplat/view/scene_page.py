@@ -296,8 +296,12 @@ class ScenePage:
         view, playing = request
         layout = self._renders.layout(view.scene, view.index)
         if playing:
+            names = {one.id: view.scene.assets[one.asset].name for one in layout.instances}
             for moment in replay_layout(view.scene, layout, interval=_INTERVAL):
-                yield moment
+                if moment.dropped_again:
+                    dropped = ", ".join(names[number] for number in moment.dropped_again)
+                    self._page.caption(f"dropped again after {moment.time:.1f} s: {dropped}")
+                yield moment.layout
                 self._worker.wait(_INTERVAL)
         yield layout
         for preset in presets_up_to(view.finest):

@@ -43,7 +43,7 @@ def test_an_object_that_falls_over_is_omitted_and_others_keep_their_ids(needle_s
     assert layout.certificate.attempts == 3
     assert Layout.from_json(json.loads(json.dumps(layout.to_json()))).left_out == layout.left_out
     *moments, _ = replay_layout(scene, layout, interval=0.04)
-    start = np.array([one.world_from_object[:3, 3] for one in moments[0].instances])
+    start = np.array([one.world_from_object[:3, 3] for one in moments[0].layout.instances])
     resting = np.array([one.world_from_object[:3, 3] for one in layout.instances])
     assert start.shape == (2, 3)
     assert np.abs(start - resting).max() < 2e-3  # they were placed at rest

@@ -113,8 +113,8 @@ def test_a_replay_ends_in_the_poses_of_the_layout(stepper, scene_data, write_sce
     scene = load_scene(write_scene(scene_data))
     layout = settle_layout(scene, 0, cached=False)
     *moments, last = replay_layout(scene, layout, interval=0.01)
-    assert last is layout
-    positions = np.array([[one.world_from_object[:3, 3] for one in moment.instances] for moment in moments])
+    assert last.layout is layout
+    positions = np.array([[one.world_from_object[:3, 3] for one in moment.layout.instances] for moment in moments])
     resting = np.array([one.world_from_object[:3, 3] for one in layout.instances])
     assert len(moments) == int(layout.certificate.time_to_rest / 0.01) + 1
     assert positions[0, :, 2].min() > resting[:, 2].max()
@@ -284,9 +284,13 @@ def test_objects_that_fall_off_are_dropped_again_while_the_others_stay(pedestal_
         assert layout.certificate.refused == ()
         assert layout.left_out == ()
         *moments, _ = replay_layout(pedestal_scene, layout, interval=0.008)
-        places = np.array([[one.world_from_object[:3, 3] for one in moment.instances] for moment in moments])
+        places = np.array([[one.world_from_object[:3, 3] for one in moment.layout.instances] for moment in moments])
         assert places[-1, :, 2].min() > 0
         raised = np.diff(places[..., 2], axis=0) > 0.05  # from below the pedestal to above it
+        ids = [one.id for one in layout.instances]
+        marked = np.array([[number in moment.dropped_again for number in ids] for moment in moments[1:]])
+        jumps = np.linalg.norm(np.diff(places, axis=0), axis=2) > 0.02  # at most 16 mm by falling
+        np.testing.assert_array_equal(jumps, marked)
         assert not raised.all(axis=1).any()
         again += raised.sum()
     assert again > 0

@@ -579,14 +579,14 @@ def test_slow_sliding_is_not_rest(stepper):
     velocities[0, 0, 0] = 3e-4
     world.reset(start, velocities)
 
-    def push(time, poses):
+    def push(time, poses, again):
         world.set_velocities(velocities * (3 if time > 0.3 else 1))
 
     refused = physics.run_to_rest(world, max_time=1.0, bounds=EVERYWHERE, observe=push).rejection
     assert refused == "not at rest within 1 s"
     world.reset(start, velocities)
 
-    def keep(time, poses):
+    def keep(time, poses, again):
         world.set_velocities(velocities)
 
     outcome = physics.run_to_rest(world, max_time=1.0, bounds=EVERYWHERE, observe=keep)
@@ -603,7 +603,7 @@ def test_a_poured_ball_keeps_its_speed_limit(stepper):
     world = world_of(stepper, [body_of(ball)], [table()], [pose_at((0, 0, 0.52))])
     speeds, heights = [], []
 
-    def observe(time, poses):
+    def observe(time, poses, again):
         speeds.append(np.linalg.norm(world.velocities[0, 0]))
         heights.append((time, poses[0, 2, 3]))
 
@@ -642,7 +642,7 @@ def test_a_body_that_fails_starts_again_while_the_others_stay(leans, reason):
     walls[1][4, 0] = 0.1105 if leans else np.inf
     asked = []
 
-    def observe(time, poses):
+    def observe(time, poses, again):
         if not leans and not asked:
             velocities = world.velocities
             velocities[4, 0] = (0.01, 0, 0)

@@ -2,8 +2,9 @@
 
 Input: a :class:`~mitsplat.scene.scene.Scene` and the index of a layout. Output: a
 :class:`~mitsplat.scene.layout.Layout` with a certificate of its rest, measured on the original meshes. :mod:`.bodies`
-makes rigid bodies of assets. :mod:`.drop` draws, drops and certifies a layout. :mod:`.handling` tosses, pushes and
-shakes objects. :func:`.rest.run_to_rest` detects rest. :mod:`.settle` caches layouts by the hash of all their inputs.
+makes rigid bodies of assets, :mod:`.ground` the static scene. :mod:`.drop` draws and drops a layout, and
+:mod:`.certificate` checks it. :mod:`.handling` tosses, pushes and shakes objects. :func:`.rest.run_to_rest` detects
+rest. :mod:`.settle` caches layouts by the hash of all their inputs.
 """
 
 from __future__ import annotations

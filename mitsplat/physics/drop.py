@@ -5,7 +5,7 @@ from __future__ import annotations
 import gc
 import math
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
@@ -14,13 +14,12 @@ import numpy as np
 from mitsplat.arrays import BoolArray, Float64Array
 from mitsplat.asset import Asset
 from mitsplat.errors import InputError
-from mitsplat.geometry.decomposition import max_gap
-from mitsplat.geometry.mesh import prepare_mesh
-from mitsplat.geometry.mesh_distance import Clearance, DistanceSurface, PlacedSurface, all_clearances
-from mitsplat.physics.bodies import Part, make_collider, make_part
-from mitsplat.physics.contacts import ContactFinder
+from mitsplat.geometry.mesh_distance import PlacedSurface, all_clearances
+from mitsplat.physics.bodies import Part, make_part
+from mitsplat.physics.certificate import MAX_MEASURED_GAP, RestingObject, RestingState
+from mitsplat.physics.ground import Ground, make_ground
 from mitsplat.physics.handling import draw_handling
-from mitsplat.physics.placement import Item, draw_poses
+from mitsplat.physics.placement import PUT_DOWN, Item, draw_poses
 from mitsplat.physics.rest import (
     CONTACT_OVERFLOW,
     FREE_TIME,
@@ -31,60 +30,30 @@ from mitsplat.physics.rest import (
     observe_nothing,
     run_to_rest,
 )
-from mitsplat.physics.worlds import Collider, MujocoWorld, WarpWorld, World, all_pieces
+from mitsplat.physics.worlds import MujocoWorld, WarpWorld, World
 from mitsplat.progress import Note
 from mitsplat.scene.layout import NO_PHYSICS, Instance, Layout, LeftOut, RestCertificate, UnsettledLayoutError
 from mitsplat.scene.planning.contents import draw_arrangements, draw_objects, draw_regions
-from mitsplat.scene.planning.shape_poses import placed_shapes
 from mitsplat.scene.scene import Scene
 from mitsplat.scene.spec.object_spec import Arrangement
 from mitsplat.scene.splits import draw_environment
 from mitsplat.scene.streams import random_stream
 from mitsplat.scene.walls import (
-    ENCLOSURE,
-    PILE_HEIGHT,
-    enclosed_bounds,
-    enclosure_box,
     pose_matrix,
-    walls_beside,
 )
 
 TIMESTEP = 0.002  # of the simulation [s]
-_MAX_MEASURED_GAP = 5e-3  # larger gaps are not measured [m]
-# Maximum penetration at rest [m], or as a share of the object's size if that is larger: convex pieces of scans deviate
-# by that much.
-_MAX_DEPTH_IN_COLLIDER, _MAX_DEPTH_IN_OBJECT, _MAX_DEPTH_SHARE = 3e-4, 5e-4, 0.003
 _MAX_START_OVERLAP = 1e-3  # maximum overlap of start poses from the scene file [m]
-_MIN_SCATTER_DISTANCE = 5e-4  # minimum distance of scattered objects at rest [m]
-_FALLEN_TILT = 5.0  # tilt from which an upright object has fallen over [degrees]
 # Number of simulations between garbage collections. Newton leaves each model (1 MiB and more) in reference cycles,
 # which Python would collect only after a quarter of all objects. A collection takes 0.5 s.
 _COLLECTION_INTERVAL = 24
 CROWDED = "no room for all"
-PUT_DOWN = {"stack", "upright", "tower", "packed"}  # arrangements of other than random poses
 _LEFT_OUT_PER_ROUND = 0.1  # share of the objects that is left out per round if they find no room,
 _MAX_LEFT_OUT = 0.5  # and maximum share in total: beyond it, the region is too small
 _POUR_SPEED = 1.0  # speed limit of poured objects [m/s]: at higher speed, heavy objects eject light ones
 # Simulated time for the draws of a layout [s], ten times that of a typical draw. After it, each rejected draw leaves
 # objects out.
 _MAX_SIMULATED = 40.0
-
-
-@dataclass(frozen=True, eq=False)
-class _Ground:
-    """Static scene; colliders and obstacles are parallel.
-
-    Attributes:
-        contact_finder: Contact finder for all objects and these colliders.
-        bounds: Corners of the box in which the centres of mass must stay [m], per region, shape (R, 3) each.
-        walls: Corners of the box of the enclosure's walls [m], in the same shapes; infinite without a wall.
-    """
-
-    colliders: tuple[Collider, ...]
-    obstacles: tuple[PlacedSurface, ...]
-    contact_finder: ContactFinder
-    bounds: tuple[Float64Array, Float64Array]
-    walls: tuple[Float64Array, Float64Array]
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,10 +65,6 @@ class _DrawnObject:
     given: Float64Array | None
     region: int
     arrangement: Arrangement
-
-
-_Defect = tuple[str, set[PlacedSurface]]
-"""Defect of a resting state: its description and the affected objects."""
 
 
 @dataclass(frozen=True)
@@ -154,8 +119,9 @@ class Drop:
         self._world_count = 0
         self._objects = [self._part(asset, progress) for asset in scene.assets]
         self._surroundings = (scene.environments if scene.spec.environment_collides else ()) or (None,)
+        bodies = [part.body for part in self._objects]
         self._grounds = {
-            number: self._make_ground(around, progress) for number, around in enumerate(self._surroundings)
+            number: make_ground(scene, bodies, around, progress) for number, around in enumerate(self._surroundings)
         }
         for ground in self._grounds.values():
             self._check_given_poses(ground)
@@ -247,16 +213,20 @@ class Drop:
             if reason in (LEANING, LATE):
                 reason = f"{self.scene.assets[assets[outcome.causes[0]]].name} {reason}"
             return _Rejection(reason, outcome.causes, simulated=world.time)
-        resting = [self._placed(asset, pose) for asset, pose in zip(assets, outcome.poses, strict=True)]
-        clearances = all_clearances(resting, obstacles, reach=_MAX_MEASURED_GAP)
-        gaps = _support_gaps(resting, clearances)
-        defect = _rest_defect(clearances, gaps, obstacles) or self._arrangement_defect(
-            resting, clearances, obstacles, start, outcome.poses, drawn
-        )
+        # The tilt is the angle between the vertical and the object's start vertical after its rotation.
+        upright = np.einsum("nj,nj->n", outcome.poses[:, 2, :3], start[:, 2, :3])
+        resting = [
+            RestingObject(
+                self._placed(one.asset, pose),
+                one.arrangement,
+                None if one.given is not None else float(np.degrees(np.arccos(np.clip(cosine, -1, 1)))),
+            )
+            for one, pose, cosine in zip(drawn, outcome.poses, upright, strict=True)
+        ]
+        state = RestingState(resting, obstacles)
+        defect = state.find_defect()
         if defect is not None:
-            reason, causes = defect
-            positions = [position for position, item in enumerate(resting) if item in causes]
-            return _Rejection(reason, positions, simulated=world.time)
+            return _Rejection(defect.reason, defect.causes, simulated=world.time)
         certificate = RestCertificate(
             rested=True,
             inside=True,
@@ -265,9 +235,9 @@ class Drop:
             max_speed=outcome.max_speed,
             max_spin=outcome.max_spin,
             surface_motion=outcome.surface_motion,
-            collider_penetration=_deepest(pair for pair in clearances if pair.second in obstacles),
-            pair_penetration=_deepest(pair for pair in clearances if pair.second not in obstacles),
-            support_gap=max(gaps.values()),
+            collider_penetration=state.collider_penetration,
+            pair_penetration=state.pair_penetration,
+            support_gap=max(state.support_gaps),
             standoff=max(self._objects[asset].standoff for asset in assets),
             attempts=len(refused) + 1,
             refused=tuple(refused),
@@ -329,7 +299,8 @@ class Drop:
             return number
         key = len(self._surroundings) + layout
         if key not in self._grounds:
-            self._grounds = {key: self._make_ground(self._surroundings[number], lambda text: None, layout)}
+            bodies, around = [part.body for part in self._objects], self._surroundings[number]
+            self._grounds = {key: make_ground(self.scene, bodies, around, lambda text: None, layout)}
         return key
 
     def _run(
@@ -416,46 +387,7 @@ class Drop:
             self._parts[id(asset.mesh)] = make_part(asset, progress)
         return self._parts[id(asset.mesh)]
 
-    def _make_ground(self, surroundings: Asset | None, progress: Note, layout: int | None = None) -> _Ground:
-        """Build the static scene from colliding shapes and, optionally, surroundings.
-
-        The shapes and their places are those of a layout, or all those of the scene file.
-        """
-        scene, walls = self.scene, []  # positions of the invisible enclosure walls
-        colliders: list[Collider] = []
-        obstacles: list[PlacedSurface] = []
-        for placed in placed_shapes(scene, layout):
-            shape, motion = placed.shape, placed.motion
-            if not shape.collider:
-                continue
-            if not (shape.visible or shape.proxy):
-                walls.append(len(colliders))
-            mesh = prepare_mesh(placed.stated, f"shape {shape.name!r}")
-            collider = make_collider(shape, mesh, progress)
-            if shape.is_jittered:
-                collider = collider.moved(motion)
-            colliders.append(collider)
-            obstacles.append(PlacedSurface(shape.name, DistanceSurface(mesh), motion))
-        if surroundings is not None and surroundings.mesh is not None:
-            mesh = prepare_mesh(surroundings.mesh, f"asset {surroundings.name!r}", solid=False)
-            colliders.append(make_collider(surroundings, mesh, progress))
-            obstacles.append(PlacedSurface(surroundings.name, DistanceSurface(mesh)))
-        if not colliders:
-            raise InputError(f"{scene.path}: at least one shape must be a collider, on which objects rest (got none)")
-        names, boxes = [item.name for item in obstacles], [item.bounds for item in obstacles]
-        bounds, inner = [], []
-        for number, (region, arrangements) in enumerate(scene.spec.all_regions):
-            beside = walls_beside(scene.spec, number, names, walls)
-            low, high = enclosed_bounds(region, boxes, beside)
-            high[2] += PILE_HEIGHT if "pile" in arrangements else 0.0
-            bounds.append((low, high))
-            inner.append(enclosure_box({names[wall]: boxes[wall] for wall in beside}))
-        finder = ContactFinder(all_pieces((part.body for part in self._objects), colliders))
-        outer_low, outer_high = np.array(bounds).swapaxes(0, 1)
-        inner_low, inner_high = np.array(inner).swapaxes(0, 1)
-        return _Ground(tuple(colliders), tuple(obstacles), finder, (outer_low, outer_high), (inner_low, inner_high))
-
-    def _check_given_poses(self, ground: _Ground) -> None:
+    def _check_given_poses(self, ground: Ground) -> None:
         """Refuse start poses of the scene file that overlap one another or a collider.
 
         The simulation would push such objects apart.
@@ -464,7 +396,7 @@ class Drop:
         for entry, spec in enumerate(self.scene.spec.objects):
             for number, pose in enumerate(spec.poses):
                 keys[self._placed(self.scene.pools[entry][0], pose_matrix(pose))] = f"objects[{entry}].poses[{number}]"
-        for pair in all_clearances(list(keys), ground.obstacles, reach=_MAX_MEASURED_GAP):
+        for pair in all_clearances(list(keys), ground.obstacles, reach=MAX_MEASURED_GAP):
             if -pair.distance > _MAX_START_OVERLAP:
                 other = keys.get(pair.second, f"collider {pair.second.name!r}")
                 raise InputError(
@@ -537,36 +469,6 @@ class Drop:
         worst = int(np.argmax(taken))
         return f", {taken[worst]:.0%} of which are inside {obstacles[worst].name!r}" if taken[worst] >= 0.1 else ""
 
-    def _arrangement_defect(
-        self,
-        resting: Sequence[PlacedSurface],
-        clearances: Sequence[Clearance],
-        obstacles: Sequence[PlacedSurface],
-        start: Float64Array,
-        end: Float64Array,
-        drawn: Sequence[_DrawnObject],
-    ) -> _Defect | None:
-        """Return how a resting layout violates the requested arrangement, or None."""
-        arrangement_of = {item: one.arrangement for item, one in zip(resting, drawn, strict=True)}
-        for pair in clearances:
-            if pair.second.name.startswith(ENCLOSURE) and pair.distance < max_gap(0.0):
-                return f"{pair.first.name} {LEANING}", {pair.first}
-        for pair in clearances:
-            if (
-                arrangement_of[pair.first] == "scatter"
-                and pair.second not in obstacles
-                and pair.distance < _MIN_SCATTER_DISTANCE
-            ):
-                return f"{pair.first.name} and {pair.second.name} touch", {pair.first, pair.second}
-        # The tilt is the angle between the vertical and the object's start vertical after its rotation.
-        tilts = np.degrees(np.arccos(np.clip(np.einsum("nj,nj->n", end[:, 2, :3], start[:, 2, :3]), -1, 1)))
-        fallen = [
-            item
-            for item, tilt, one in zip(resting, tilts, drawn, strict=True)
-            if one.arrangement in PUT_DOWN and one.given is None and tilt > _FALLEN_TILT
-        ]
-        return (f"{fallen[0].name} fell over", set(fallen)) if fallen else None
-
     def _placed(self, asset: int, pose: Float64Array) -> PlacedSurface:
         return PlacedSurface(self.scene.assets[asset].name, self._objects[asset].surface, pose)
 
@@ -575,33 +477,3 @@ class Drop:
             Instance(one.id, one.asset, self.scene.class_index(one.asset), pose)
             for one, pose in zip(drawn, poses, strict=True)
         )
-
-
-def _support_gaps(resting: Sequence[PlacedSurface], clearances: Sequence[Clearance]) -> dict[PlacedSurface, float]:
-    """Compute the distance of each object from its nearest neighbour [m]."""
-    return {
-        item: max(0.0, min(pair.distance for pair in clearances if item in (pair.first, pair.second)))
-        for item in resting
-    }
-
-
-def _rest_defect(
-    clearances: Sequence[Clearance], gaps: Mapping[PlacedSurface, float], obstacles: Sequence[PlacedSurface]
-) -> _Defect | None:
-    """Return the defect of a resting state (penetration or unsupported object), or None."""
-    for pair in sorted(clearances, key=lambda pair: pair.distance):
-        if pair.second in obstacles:
-            deepest = max(_MAX_DEPTH_IN_COLLIDER, _MAX_DEPTH_SHARE * pair.first.size)
-        else:
-            deepest = max(_MAX_DEPTH_IN_OBJECT, _MAX_DEPTH_SHARE * max(pair.first.size, pair.second.size))
-        if -pair.distance > deepest:
-            reason = f"{pair.first.name} and {pair.second.name} overlap by {-pair.distance * 1e3:.1f} mm"
-            return reason, {pair.first, pair.second}
-    for item, gap in gaps.items():
-        if gap > max_gap(item.size):
-            return f"{item.name} rests {gap * 1e3:.1f} mm or more from what is nearest", {item}
-    return None
-
-
-def _deepest(pairs: Iterable[Clearance]) -> float:
-    return max([0.0, *(-pair.distance for pair in pairs)])

@@ -16,6 +16,9 @@ from mitsplat.scene.spec.object_spec import Arrangement
 from mitsplat.scene.spec.shape_spec import Region
 from mitsplat.scene.walls import PILE_HEIGHT
 
+PUT_DOWN: frozenset[Arrangement] = frozenset({"stack", "upright", "tower", "packed"})
+"""Arrangements of other than random poses."""
+
 _MAX_POSITIONS = 200  # positions tried per object before all objects are drawn again
 _MAX_POSITIONS_IN_LAYER = 20  # positions tried per layer of a pile
 _MAX_DRAWS = 20

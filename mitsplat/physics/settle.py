@@ -29,7 +29,10 @@ from mitsplat.storage.content_hash import ContentHash
 
 PACKAGE = Path(__file__).parents[1]
 
-_PHYSICS_MODULES = ("bodies", "contacts", "drop", "friction", "handling", "placement", "rest", "restitution", "worlds")
+_PHYSICS_MODULES = (
+    *("bodies", "certificate", "contacts", "drop", "friction", "ground", "handling", "placement", "rest"),
+    *("restitution", "worlds"),
+)
 MODULES = (
     "geometry.decomposition",
     "geometry.mesh",
@@ -135,7 +138,8 @@ def try_alone(scene: Scene, *, tries: int = 3) -> Iterator[tuple[str, Arrangemen
     scene = replace(scene, spec=scene.spec.model_copy(update={"settle": settle}))
     tried = set()
     with warp_settings():
-        from mitsplat.physics.drop import PUT_DOWN, drop_of  # Newton reads these settings when it compiles
+        from mitsplat.physics.drop import drop_of  # Newton reads these settings when it compiles
+        from mitsplat.physics.placement import PUT_DOWN
 
         drop = drop_of(scene, lambda text: None)
         for entry, pool in zip(scene.spec.objects, scene.pools, strict=True):

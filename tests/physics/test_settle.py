@@ -331,14 +331,14 @@ def test_a_layout_that_never_rests_is_an_error(scene_data, write_scene):
 @pytest.mark.parametrize(("size", "depth", "refused"), [(0.05, 3.5e-4, True), (0.2, 3.5e-4, False), (0.2, 7e-4, True)])
 def test_the_allowed_depth_grows_with_the_size_of_an_object(size, depth, refused):
     """The allowed depth is 0.3 mm, or 0.3 % of the object's size: 0.6 mm for 200 mm."""
-    from mitsplat.geometry.mesh_distance import Clearance, DistanceSurface, PlacedSurface
-    from mitsplat.physics.drop import _rest_defect
+    from mitsplat.geometry.mesh_distance import DistanceSurface, PlacedSurface
+    from mitsplat.physics.certificate import RestingObject, RestingState
 
-    item, table = (
-        PlacedSurface(name, DistanceSurface(trimesh.creation.box((size,) * 3))) for name in ("part", "table")
-    )
-    fault = _rest_defect([Clearance(item, table, -depth)], {item: 0.0}, [table])
-    assert (fault is not None) == refused
+    item = PlacedSurface("part", DistanceSurface(trimesh.creation.box((size,) * 3)), pose_at((0, 0, size / 2 - depth)))
+    table = PlacedSurface("table", DistanceSurface(trimesh.creation.box((1.0, 1.0, 0.1))), pose_at((0, 0, -0.05)))
+    state = RestingState([RestingObject(item, "drop", None)], [table])
+    assert state.collider_penetration == pytest.approx(depth, abs=1e-6)
+    assert (state.find_defect() is not None) == refused
 
 
 def test_a_scene_without_colliders_is_refused(scene_data, write_scene):

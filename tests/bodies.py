@@ -10,6 +10,9 @@ from scipy.spatial.transform import Rotation
 from mitsplat.geometry.mesh import mass_properties
 
 STEPPERS = ("warp", "mujoco")
+GRAVITY = 9.81
+EVERYWHERE = np.full(3, -1e3), np.full(3, 1e3)
+"""Bounds that no body reaches [m]."""
 
 
 def pose_at(position: ArrayLike, rotation: Rotation | None = None) -> NDArray[np.float64]:
@@ -56,3 +59,25 @@ def world_of(stepper, bodies, colliders, poses, *, timestep=0.002, capacity=1.0)
         world = WarpWorld(bodies, colliders, timestep=timestep, capacity=capacity)
     world.reset(np.stack(poses))
     return world
+
+
+def run_until(world, time):
+    """Advance a world to a simulated time [s]."""
+    while world.time < time - 1e-9:
+        world.advance()
+
+
+def centres(world):
+    """Return the centres of mass [m], shape (N, 3)."""
+    return np.array([(pose @ [*body.mass.centre, 1])[:3] for body, pose in zip(world.bodies, world.poses, strict=True)])
+
+
+def energy(world):
+    """Return the kinetic and potential energy of the bodies [J]."""
+    total = 0.0
+    for body, pose, centre, (speed, spin) in zip(
+        world.bodies, world.poses, centres(world), world.velocities, strict=True
+    ):
+        inertia = pose[:3, :3] @ body.mass.inertia @ pose[:3, :3].T
+        total += body.mass.mass * (GRAVITY * centre[2] + speed @ speed / 2) + spin @ inertia @ spin / 2
+    return total

@@ -14,11 +14,9 @@ from mitsplat.physics.settle import replay_layout, settle_layout, try_alone
 from mitsplat.scene.loading.scene_loading import load_scene
 from mitsplat.scene.planning.contents import draw_arrangements
 from mitsplat.scene.spec.shape_spec import Region
-from tests.bodies import STEPPERS, body_of, pose_at, table, world_of
+from tests.bodies import EVERYWHERE, GRAVITY, STEPPERS, body_of, pose_at, table, world_of
 
-GRAVITY = 9.81
 WAYS = ["tossed", "tipped", "pushed", "shaken"]
-EVERYWHERE = np.full(3, -1e3), np.full(3, 1e3)
 EVERY = np.ones(1, dtype=bool)
 X = np.array([1.0, 0.0, 0.0])
 pytestmark = pytest.mark.usefixtures("physics")

@@ -17,7 +17,6 @@ from mitsplat.errors import InputError
 from mitsplat.geometry.mesh_distance import PlacedSurface, all_clearances
 from mitsplat.physics.bodies import Part, make_part
 from mitsplat.physics.certificate import MAX_MEASURED_GAP, RestingObject, RestingState
-from mitsplat.physics.ground import Ground, make_ground
 from mitsplat.physics.handling import draw_handling
 from mitsplat.physics.placement import PUT_DOWN, Item, draw_poses
 from mitsplat.physics.rest import (
@@ -30,6 +29,7 @@ from mitsplat.physics.rest import (
     observe_nothing,
     run_to_rest,
 )
+from mitsplat.physics.static_scene import Ground, make_ground
 from mitsplat.physics.worlds import MujocoWorld, WarpWorld, World
 from mitsplat.progress import Note
 from mitsplat.scene.layout import NO_PHYSICS, Instance, Layout, LeftOut, RestCertificate, UnsettledLayoutError

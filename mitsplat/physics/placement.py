@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import compress, pairwise
 
 import numpy as np
 from scipy.spatial import ConvexHull
@@ -61,7 +61,8 @@ def draw_poses(
 ) -> Float64Array | None:
     """Draw start poses (N, 4, 4) of all items, or None if there is no room.
 
-    Drawn poses touch neither one another nor an obstacle.
+    Drawn poses touch neither one another nor an obstacle. Their bounding boxes do not overlap, unless there is no other
+    room for objects in random poses: boxes of long rods fill a region that the rods do not fill.
 
     Args:
         items: Objects to place.
@@ -73,10 +74,11 @@ def draw_poses(
             None.
         turned_over: Probability that such an object stands on another side, see :func:`standing_turns`.
     """
-    for _ in range(_MAX_DRAWS):
-        poses = _Draw(items, obstacles, rng, yaw, turned_over).all_poses(regions)
-        if poses is not None:
-            return poses
+    for boxes in (True, False):
+        for _ in range(_MAX_DRAWS):
+            poses = _Draw(items, obstacles, rng, yaw, turned_over, boxes_overlap=not boxes).all_poses(regions)
+            if poses is not None:
+                return poses
     return None
 
 
@@ -122,13 +124,16 @@ class _Draw:
         rng: np.random.Generator,
         yaw: tuple[float, float] | None,
         turned_over: float,
+        *,
+        boxes_overlap: bool,
     ) -> None:
         self._items, self._obstacles, self._rng, self._yaw = items, obstacles, rng, yaw
-        self._turned_over = turned_over
+        self._turned_over, self._boxes_overlap = turned_over, boxes_overlap
         self._low = self._high = self._column_base = np.zeros(3)
         self._ceiling = np.inf
         self._poses = np.tile(np.eye(4), (len(items), 1, 1))
         self._occupied: list[Float64Array] = []
+        self._placed: list[int] = []
 
     def all_poses(self, regions: Sequence[tuple[Region, Arrangement]]) -> Float64Array | None:
         free = []
@@ -222,7 +227,7 @@ class _Draw:
         high: Float64Array,
         *,
         places: int = _MAX_POSITIONS,
-        occupies: Callable[[Float64Array], Float64Array] = lambda box: box,
+        occupies: Callable[[Float64Array], Float64Array] | None = None,
     ) -> bool:
         """Place an item with a random rotation at a free position between two corners."""
         pose = np.eye(4)
@@ -233,8 +238,10 @@ class _Draw:
         for _ in range(places):
             pose[:3, 3] = self._rng.uniform(low - bounds[0], high - bounds[1])
             box = bounds + pose[:3, 3]
-            if self._is_free(i, pose, occupies(box)):
-                self._record(i, pose, occupies(box))
+            if occupies is not None:
+                box = occupies(box)
+            if self._is_free(i, pose, box, boxes_overlap=self._boxes_overlap and occupies is None):
+                self._record(i, pose, box)
                 return True
         return False
 
@@ -358,18 +365,29 @@ class _Draw:
                 return False
             pose[2, 3] -= distance - _START_GAP / 2
 
-    def _is_free(self, i: int, pose: Float64Array, box: Float64Array, *, above: bool = False) -> bool:
-        """Return True if a pose collides with nothing; with ``above``, the space above must be free too."""
+    def _is_free(
+        self, i: int, pose: Float64Array, box: Float64Array, *, above: bool = False, boxes_overlap: bool = False
+    ) -> bool:
+        """Return True if a pose collides with nothing; with ``above``, the space above must be free too.
+
+        With ``boxes_overlap``, objects whose bounding boxes overlap do not collide unless their meshes do.
+        """
         if above:
             box = np.stack([box[0], [*box[1][:2], self._ceiling]])
-        if self._occupied and _boxes_meet(box, np.stack(self._occupied)).any():
-            return False
+        near: list[PlacedSurface] = []
+        if self._occupied and (meet := _boxes_meet(box, np.stack(self._occupied))).any():
+            if not boxes_overlap:
+                return False
+            near = [PlacedSurface("", self._items[j].surface, self._poses[j]) for j in compress(self._placed, meet)]
         placed = PlacedSurface("", self._items[i].surface, pose)
-        return all(clearance(placed, item, reach=_SPACING).distance > 0 for item in self._obstacles)
+        return all(clearance(placed, item, reach=_SPACING).distance > 0 for item in self._obstacles) and all(
+            clearance(placed, item, reach=_SPACING).distance >= _SPACING for item in near
+        )
 
     def _record(self, i: int, pose: Float64Array, box: Float64Array) -> None:
         self._poses[i] = pose
         self._occupied.append(box)
+        self._placed.append(i)
 
 
 def _bounds(outline: Float64Array, pose: Float64Array) -> Float64Array:

@@ -30,8 +30,8 @@ from mitsplat.storage.content_hash import ContentHash
 PACKAGE = Path(__file__).parents[1]
 
 _PHYSICS_MODULES = (
-    *("bodies", "certificate", "contacts", "drop", "friction", "ground", "handling", "placement", "rest"),
-    *("restitution", "worlds"),
+    *("bodies", "certificate", "contacts", "drop", "friction", "handling", "placement", "rest", "restitution"),
+    *("static_scene", "worlds"),
 )
 MODULES = (
     "geometry.decomposition",

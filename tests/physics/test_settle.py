@@ -8,6 +8,7 @@ import hashlib
 import json
 import shutil
 from dataclasses import replace
+from itertools import combinations
 from weakref import ref
 
 import numpy as np
@@ -23,6 +24,7 @@ from mitsplat.scene.layout import Layout
 from mitsplat.scene.loading.scene_loading import load_scene
 from mitsplat.scene.planning.layout_surroundings import draw_surroundings
 from mitsplat.scene.planning.shape_poses import placed_shapes
+from mitsplat.scene.spec.shape_spec import Region
 from tests.bodies import STEPPERS, lowest, pose_at
 
 pytestmark = pytest.mark.usefixtures("physics")
@@ -69,6 +71,24 @@ def test_drawn_poses_are_uniform_and_do_not_overlap(scene_data, write_scene):
         assert kstest(rotations[:, 2, column], "uniform", args=(-1, 2)).pvalue > 1e-3
     angles = Rotation.from_matrix(rotations).magnitude()
     assert kstest(angles, lambda t: (t - np.sin(t)) / np.pi).pvalue > 1e-3
+
+
+def test_long_rods_start_together_although_their_bounding_boxes_fill_the_region():
+    """Ten rods of 150 x 3 x 3 mm start in a region of 160 mm without contact, but their bounding boxes overlap."""
+    from mitsplat.geometry.mesh_distance import DistanceSurface, PlacedSurface, all_clearances
+    from mitsplat.physics.placement import Item, draw_poses
+
+    rod = trimesh.creation.box((0.003, 0.003, 0.15))
+    item = Item(0, DistanceSurface(rod), np.array(rod.vertices))
+    region = Region(min=(-0.08, -0.08, 0.0), max=(0.08, 0.08, 0.16))
+    poses = draw_poses([item] * 10, (), [(region, "drop")], np.random.default_rng(1))
+    placed = [PlacedSurface("", item.surface, pose) for pose in poses]
+    assert min(pair.distance for pair in all_clearances(placed, (), reach=0.005)) >= 1e-3 - 1e-6
+    overlaps = [
+        ((one.bounds[0] < other.bounds[1]) & (other.bounds[0] < one.bounds[1])).all()
+        for one, other in combinations(placed, 2)
+    ]
+    assert sum(overlaps) > 5
 
 
 def test_a_layout_satisfies_its_certificate(scene_data, write_scene):

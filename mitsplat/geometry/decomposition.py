@@ -27,8 +27,8 @@ from mitsplat.storage.content_hash import ContentHash
 _logger = logging.getLogger(__name__)
 
 MAX_PIECES = 32
-# Acceptable gap between pieces and mesh [m], or as a share of the object's size if that is larger.
-_MIN_GAP_LIMIT, _GAP_SHARE = 1e-3, 0.005
+# Acceptable gap between pieces and mesh [m]; a larger share for objects below 10 mm, a smaller one above 200 mm.
+_GAP_LIMIT, _GAP_SHARE_OF_SMALL, _GAP_SHARE_OF_LARGE = 1e-3, 0.1, 0.005
 _THRESHOLD = 0.02
 # A solid that fills this share of its hull is replaced by the hull. The difference is below the resolution of physics.
 _CONVEX = 0.9995
@@ -55,9 +55,10 @@ _MARGIN, _SAMPLES, _BATCH = 0.75, 8000, 32
 def max_gap(size: float) -> float:
     """Return the acceptable gap [m] for an object with a longest extent [m].
 
-    The gap is that between object and support, and that between convex pieces and mesh.
+    The gap is that between object and support, and that between convex pieces and mesh: 1 mm, but 10 % of the size
+    below 10 mm, and 0.5 % above 200 mm.
     """
-    return max(_MIN_GAP_LIMIT, _GAP_SHARE * size)
+    return max(min(_GAP_LIMIT, _GAP_SHARE_OF_SMALL * size), _GAP_SHARE_OF_LARGE * size)
 
 
 def convex_pieces(

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from mitsplat.geometry.decomposition import max_gap
 from mitsplat.geometry.mesh_distance import Clearance, PlacedSurface, all_clearances
 from mitsplat.physics.placement import PUT_DOWN
-from mitsplat.physics.rest import LEANING
+from mitsplat.physics.rest import LEANING, WALL_DISTANCE
 from mitsplat.scene.spec.object_spec import Arrangement
 from mitsplat.scene.walls import ENCLOSURE
 
@@ -87,7 +87,7 @@ class RestingState:
 
     def _find_violation(self) -> Defect | None:
         for pair in self._clearances:
-            if pair.second.name.startswith(ENCLOSURE) and pair.distance < max_gap(0.0):
+            if pair.second.name.startswith(ENCLOSURE) and pair.distance < WALL_DISTANCE:
                 return self._defect(f"{pair.first.name} {LEANING}", pair.first)
         scattered = {one.surface for one in self._objects if one.arrangement == "scatter"}
         for pair in self._clearances:

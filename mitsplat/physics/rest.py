@@ -23,6 +23,8 @@ LEANING, LATE = "rests against the enclosure", "keeps moving"
 # the velocities of resting bodies.
 _REST_MOTION, _REST_TIME = 5e-4, 1.0
 _QUIET_MOTION, _QUIET_TIME = 1e-4, 0.25
+WALL_DISTANCE = 1e-3
+"""Distance from a wall below which a body leans against it [m]."""
 FREE_TIME = 1.5
 """Time without rolling friction for bodies that fall in random poses [s], longer than rebounds last."""
 _SPEED_WINDOW = 0.05  # averaging time of the reported speeds [s]
@@ -30,7 +32,6 @@ _DRAG_TIME = 0.2  # time constant of the drag on bodies that still move after FR
 # Bodies are late if they roll or rock while the others rest: they move by more than a limit [m] within a time [s]. At
 # least one body may be late, and at most this share of all.
 _LATE_MOTION, _LATE_TIME, _MAX_LATE = 1e-3, 1.0, 0.5
-_WALL_DISTANCE = 1e-3  # distance from a wall below which a body leans against it [m]
 _MAX_REDRAWS = 8  # of bodies, in one drop
 
 
@@ -222,11 +223,11 @@ class _Failures:
         if outside.any():
             return f"{int(outside.sum())} left the enclosure", outside
         calm = time - self._last_motion >= _QUIET_TIME
-        reach = self._reach[:, None] + _WALL_DISTANCE
+        reach = self._reach[:, None] + WALL_DISTANCE
         leaning = calm & ((centres - reach < self._low) | (centres + reach > self._high)).any(axis=1)
         for i in np.flatnonzero(leaning):
             points = self._world.bodies[i].outline @ poses[i, :3, :3].T + poses[i, :3, 3]
-            beyond = (points < self._low[i] + _WALL_DISTANCE) | (points > self._high[i] - _WALL_DISTANCE)
+            beyond = (points < self._low[i] + WALL_DISTANCE) | (points > self._high[i] - WALL_DISTANCE)
             leaning[i] = beyond.any()
         if leaning.any():
             return LEANING, leaning

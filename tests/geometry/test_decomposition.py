@@ -157,8 +157,8 @@ def test_pieces_of_a_scan_are_few_and_within_the_allowed_standoff():
     pieces = convex_pieces(can)
     assert len(pieces) <= decomposition.MAX_PIECES
     assert all(piece.is_convex for piece in pieces)
-    assert standoff(DistanceSurface(can), pieces) < max_gap(0)
-    assert standoff(DistanceSurface(can), [can.convex_hull]) > 3 * max_gap(0)
+    assert standoff(DistanceSurface(can), pieces) < max_gap(0.1)
+    assert standoff(DistanceSurface(can), [can.convex_hull]) > 3 * max_gap(0.1)
 
 
 def test_the_number_of_pieces_is_bounded_for_rough_scans():
@@ -195,6 +195,14 @@ def test_a_scan_is_simplified_to_5000_faces_within_its_tolerance():
     assert np.abs(DistanceSurface(kept).signed_distances(rough)).max() < 0.003 * ball.scale * 1.01
 
 
+def test_pieces_of_a_finely_meshed_tube_of_five_millimetres_leave_its_bore_open():
+    tube = trimesh.creation.annulus(r_min=0.0008, r_max=0.0025, height=0.002, sections=800)
+    assert len(tube.faces) > 3000
+    pieces = convex_pieces(tube)
+    assert standoff(DistanceSurface(tube), pieces) < max_gap(0.005) == pytest.approx(5e-4)
+    assert not any(piece.contains([[0, 0, 0]])[0] for piece in pieces)
+
+
 def test_a_small_dent_of_a_large_face_gets_its_own_pieces():
     plate, drill = trimesh.creation.box((0.16, 0.12, 0.012)), trimesh.creation.cylinder(0.004, 0.008, sections=32)
     drill.apply_translation((0.031, 0.017, 0.006))
@@ -202,4 +210,4 @@ def test_a_small_dent_of_a_large_face_gets_its_own_pieces():
     assert len(dented.faces) > 3000
     pieces = convex_pieces(dented)
     assert len(pieces) > 1
-    assert standoff(DistanceSurface(dented), pieces) < max_gap(0)
+    assert standoff(DistanceSurface(dented), pieces) < max_gap(0.1)

@@ -64,7 +64,8 @@ def write_preview(scene: Scene, layout: Layout, path: Path) -> tuple[int, list[s
         for number in moment.dropped_again:
             marked[number] = moment.time + _MARK_TIME
             again.append(f"{names[number]} (object {number}) after {moment.time:.1f} s")
-        shown = {number: names[number] for number, end in marked.items() if moment.time < end}
+        ends = {} if moment.layout is layout else marked  # nothing is marked at rest
+        shown = {number: names[number] for number, end in ends.items() if moment.time < end}
         picture = render_frame(scene, frame, layout=moment.layout, quality="fast")
         pictures.append(_mark(picture, shown))
     step = round(_INTERVAL * 1000)

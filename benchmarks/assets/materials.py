@@ -35,7 +35,8 @@ from PIL import Image
 from scipy.spatial import KDTree
 
 # isort: on
-from benchmarks.light.shadows import ROOT, block, coverage, lights_of, pose, psnr, save_sheet, worn
+from benchmarks.light.shadow_scenes import ROOT, block, coverage, lights_of, pose, worn
+from benchmarks.light.shadows import psnr, save_sheet
 from benchmarks.record import figure, recording
 from mitsplat.bake.mesh_parts import MeshPart, bake_lights, mitsuba_scene, part_shape, read_parts
 from mitsplat.bake.mesh_surface import MeshSurface

@@ -30,7 +30,7 @@ from pathlib import Path
 from typing import Any
 
 # isort: off
-from benchmarks.light.shadows import Thing, nearest_object, placed, shipped
+from benchmarks.light.shadow_scenes import Thing, nearest_object, placed, shipped
 
 import numpy as np
 import trimesh

@@ -15,7 +15,7 @@ from trimesh.transformations import rotation_matrix, translation_matrix
 
 from benchmarks.detector import clutter
 from benchmarks.detector.clutter import Material, Thing, matt, metal, plate, tube, vivid
-from benchmarks.light.shadows import block
+from benchmarks.light.shadow_scenes import block
 from mitsplat.geometry.camera import look_at_pose
 from scenes.build.parts import turned
 

@@ -34,7 +34,7 @@ from scipy.ndimage import gaussian_filter
 
 # isort: on
 from benchmarks.assets.photographing import Sensors
-from benchmarks.light.shadows import block, nearest_object, placed, shipped, worn
+from benchmarks.light.shadow_scenes import block, nearest_object, placed, shipped, worn
 from benchmarks.record import ROOT, figure, recording
 from mitsplat.bake.mesh_parts import MeshPart, bake_lights, mitsuba_scene, read_parts
 from mitsplat.capture.lighting.panorama import unit_vector

@@ -24,20 +24,8 @@ from typing import Any
 from mitsplat.arrays import Float64Array
 
 # isort: off
-from benchmarks.light.shadows import (
-    LIGHTS,
-    ROOT,
-    SETUPS,
-    Setup,
-    SplatScene,
-    brightness,
-    difference,
-    lights_of,
-    placed,
-    psnr,
-    save_sheet,
-    take_truth,
-)
+from benchmarks.light.shadow_scenes import LIGHTS, ROOT, SETUPS, Setup, lights_of, placed
+from benchmarks.light.shadows import SplatScene, brightness, difference, psnr, save_sheet, take_truth
 
 import mitsuba as mi
 import numpy as np

@@ -33,18 +33,8 @@ import numpy.typing as npt
 import trimesh
 
 # isort: on
-from benchmarks.light.shadows import (
-    LIGHTS,
-    ROOT,
-    SKY,
-    Photographer,
-    block,
-    coverage,
-    difference,
-    pose,
-    psnr,
-    save_sheet,
-)
+from benchmarks.light.shadow_scenes import LIGHTS, ROOT, SKY, block, coverage, pose
+from benchmarks.light.shadows import Photographer, difference, psnr, save_sheet
 from benchmarks.record import figure, recording
 from mitsplat.bake.mesh_parts import MeshPart, bake_lights, part_shape
 from mitsplat.gaussians.spherical_harmonics import SH_C0

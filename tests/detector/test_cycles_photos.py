@@ -16,7 +16,7 @@ from PIL import Image
 from benchmarks import record
 from benchmarks.detector import clutter, cycles_photos, experiment
 from benchmarks.detector.interiors import BENCHES, Interior
-from benchmarks.light.shadows import nearest_object, placed, shipped
+from benchmarks.light.shadow_scenes import nearest_object, placed, shipped
 from mitsplat.geometry.camera import Camera
 from mitsplat.runtime.variant import ensure_variant
 from scenes.build.parts import PARTS, build_part

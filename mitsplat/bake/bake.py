@@ -26,7 +26,7 @@ from mitsplat.bake.radiance import BOUNCES, bake_radiance, hemisphere, ray_offse
 from mitsplat.bake.surface_materials import SurfaceFinish
 from mitsplat.bake.verification import BakedView, PictureFunction, compare_views, compare_with_textures
 from mitsplat.errors import InputError
-from mitsplat.fit.refine_splats import Picture, RefineSettings, refine_splats
+from mitsplat.fit.refine_splats import Picture, refine_splats
 from mitsplat.gaussians.spherical_harmonics import SH_C0
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.gaussians.surfels import Surfels
@@ -362,7 +362,8 @@ def _fit_splats(
     return refine_splats(
         splats,
         pictures,
-        RefineSettings(iterations=settings.fit_steps, seed=settings.seed),
+        iterations=settings.fit_steps,
+        seed=settings.seed,
         observe=lambda step, _: stages("fitting to the pictures", step / settings.fit_steps),
     )
 

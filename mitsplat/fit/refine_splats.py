@@ -38,34 +38,15 @@ class Picture:
     alpha: Float32Array
 
 
-@dataclass(frozen=True)
-class RefineSettings:
-    """Steps and learning rates; rates fall exponentially to ``final_rate`` times their start.
-
-    Attributes:
-        iterations: Optimiser steps, each with one picture; all pictures are used in turn.
-        rate_means: Rate of the means per step, as a share of the mean scale of the splats.
-        rate_quats: Rate of the quaternions' components.
-        rate_scales: Rate of the logarithms of the scales.
-        rate_opacities: Rate of the logits of the opacities.
-        rate_sh: Rate of the constant SH coefficient.
-        rest_rate: Share of ``rate_sh`` for higher bands, which few pictures determine.
-        final_rate: Factor on all rates at the end.
-        seed: Seed of the picture order and of the backgrounds.
-    """
-
-    iterations: int = 300
-    rate_means: float = 0.02
-    rate_quats: float = 0.004
-    rate_scales: float = 0.01
-    rate_opacities: float = 0.05
-    rate_sh: float = 0.01
-    rest_rate: float = 0.2
-    final_rate: float = 0.1
-    seed: int = 0
-
-
 QUALITY = Quality(transmittance_min=1e-3)
+_RATES = {"means": 0.02, "quats": 0.004, "scales": 0.01, "opacities": 0.05, "sh": 0.01}
+"""Initial learning rates per step: of the means, as a share of the mean scale of the splats; of the quaternions'
+components, the logarithms of the scales, the logits of the opacities, and the constant SH coefficients.
+"""
+_HIGHER_BANDS = 0.2
+"""Rate of the higher SH bands, which few pictures determine, relative to that of the constant ones."""
+_FINAL_RATE = 0.1
+"""Factor on all rates at the end, to which they fall exponentially."""
 _REPORT_STEPS = 10
 """Steps between reports; reading a loss waits for the device."""
 
@@ -73,8 +54,9 @@ _REPORT_STEPS = 10
 def refine_splats(
     splats: Splats,
     pictures: Sequence[Picture],
-    settings: RefineSettings = RefineSettings(),
     *,
+    iterations: int,
+    seed: int = 0,
     observe: Callable[[int, float], None] | None = None,
 ) -> Splats:
     """Refine splats with Adam on the mean squared error of display-encoded colours.
@@ -85,7 +67,8 @@ def refine_splats(
     Args:
         splats: Initial splats.
         pictures: Target pictures.
-        settings: Steps and learning rates.
+        iterations: Optimiser steps, each with one picture; all pictures are used in turn.
+        seed: Seed of the picture order and of the backgrounds.
         observe: Called after every tenth step and the last step, with the step number and its PSNR [dB].
 
     Returns:
@@ -103,18 +86,18 @@ def refine_splats(
         ([wrapped(mi.Float, p.rgb[..., c].astype(np.float32)) for c in range(3)], wrapped(mi.Float, p.alpha))
         for p in pictures
     ]
-    rng = np.random.default_rng(settings.seed)
+    rng = np.random.default_rng(seed)
     order: list[int] = []
-    for step in range(settings.iterations):
+    for step in range(iterations):
         order = order or list(rng.permutation(len(pictures)))
         picture = order.pop()
         seen = model.render(eyes[picture], QUALITY)
         colour, alpha, loss = _gradients(seen.rgb, seen.alpha, *targets[picture], on_device(rng.random()))
         model.set_gradients(eyes[picture], QUALITY, [seen.gradient(colour, alpha)])
-        decay = settings.final_rate ** (step / max(1, settings.iterations - 1))
-        rates = {name: getattr(settings, f"rate_{name}") * decay for name in model.values}
-        model.update(rates | {"sh": model.sh_rates(rates["sh"], rates["sh"] * settings.rest_rate)})
-        if observe is not None and (step % _REPORT_STEPS == 0 or step == settings.iterations - 1):
+        decay = _FINAL_RATE ** (step / max(1, iterations - 1))
+        rates = {name: _RATES[name] * decay for name in model.values}
+        model.update(rates | {"sh": model.sh_rates(rates["sh"], rates["sh"] * _HIGHER_BANDS)})
+        if observe is not None and (step % _REPORT_STEPS == 0 or step == iterations - 1):
             observe(step, psnr_of(float(loss.numpy()[0]) / 3))
     return model.splats()
 

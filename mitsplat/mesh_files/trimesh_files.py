@@ -202,8 +202,9 @@ def _warnings(
         if is_coloured or any(np.any(one.face_attributes.get("stl", 0)) for one in scene.geometry.values()):
             yield "the colours of its faces are not read, because STL files store them in several ways"
     elif kind == ".ply":
-        yield from _ply_warnings(_ply_header(path), scene)
-        named = _texture_names(_ply_header(path))
+        header = _ply_header(path)
+        yield from _ply_warnings(header, scene)
+        named = _texture_names(header)
         if textures and named and all(part.material.texture is None for part in parts):
             yield f"its texture {named[0]} has no coordinates, and is left out"
     elif kind == ".off":

@@ -48,9 +48,9 @@ def make_figure(alt: str, caption: str, source: str) -> str:
     return f'<figure><img alt="{alt}" src="{source}"><figcaption>{caption}</figcaption></figure>'
 
 
-def inline_image(pixels: npt.NDArray[Any], *, quality: int = 82) -> str:
+def inline_image(pixels: npt.NDArray[Any]) -> str:
     """Encode a picture in blue, green, red order (H, W, 3) as a data URL."""
-    _, data = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, quality])
+    _, data = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, 82])
     return f"data:image/jpeg;base64,{base64.b64encode(bytes(data)).decode('ascii')}"
 
 

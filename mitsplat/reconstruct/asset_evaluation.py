@@ -172,8 +172,9 @@ class Verdict:
         """Share of the photos with a camera pose."""
         return self.photos / max(1, self.photos + self.rejected)
 
-    def misses(self, thresholds: Thresholds = Thresholds()) -> tuple[str, ...]:
+    def misses(self) -> tuple[str, ...]:
         """Return a sentence with advice for each threshold that is missed."""
+        thresholds = Thresholds()
         least = {
             "registered": f"only {self.photos} of {self.photos + self.rejected} photos have a camera pose",
             "psnr": f"held-out photos have a PSNR of only {self.psnr or 0:.1f} dB",

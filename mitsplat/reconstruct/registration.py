@@ -66,8 +66,8 @@ class Offset:
     spread: float
 
 
-def surface_points(splats: Splats, cameras: Sequence[Camera], *, count: int = 4000, seed: int = 0) -> Float64Array:
-    """Return at most ``count`` points (M, 3) on the splat surface that cameras see.
+def surface_points(splats: Splats, cameras: Sequence[Camera]) -> Float64Array:
+    """Return at most ``_SAMPLES`` points (M, 3) on the splat surface that cameras see.
 
     At the surface the transmittance falls to one half.
 
@@ -84,8 +84,8 @@ def surface_points(splats: Splats, cameras: Sequence[Camera], *, count: int = 40
     found: Float64Array = np.concatenate([np.zeros((0, 3)), *points])
     if not len(found):
         raise InputError("the splats show no opaque surface to the cameras")
-    if len(found) > count:
-        found = found[np.random.default_rng(seed).choice(len(found), count, replace=False)]
+    if len(found) > _SAMPLES:
+        found = found[np.random.default_rng(0).choice(len(found), _SAMPLES, replace=False)]
     return found
 
 

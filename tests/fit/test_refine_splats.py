@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mitsplat.fit.refine_splats import QUALITY, Picture, RefineSettings, refine_splats
+from mitsplat.fit.refine_splats import QUALITY, Picture, refine_splats
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.camera import Camera
 from mitsplat.images.colour import encode_srgb
@@ -43,7 +43,7 @@ def test_refinement_recovers_disturbed_splats_on_unseen_views() -> None:
     )
     shown = [picture(truth, camera) for camera in cameras(8)]
     steps: list[float] = []
-    fitted = refine_splats(start, shown, RefineSettings(iterations=160), observe=lambda step, psnr: steps.append(psnr))
+    fitted = refine_splats(start, shown, iterations=160, observe=lambda step, psnr: steps.append(psnr))
     unseen = Camera.look_at((1.5, 1.6, 0.5), (0, 0, 0), width=48, height=40, fov_x=45)
     assert len(steps) == 17 and steps[-1] > steps[0]
     assert error(fitted, truth, unseen) < 0.15 * error(start, truth, unseen)
@@ -51,4 +51,4 @@ def test_refinement_recovers_disturbed_splats_on_unseen_views() -> None:
 
 def test_refinement_without_pictures_is_refused() -> None:
     with pytest.raises(ValueError, match="pictures"):
-        refine_splats(make_splats(2), [])
+        refine_splats(make_splats(2), [], iterations=1)

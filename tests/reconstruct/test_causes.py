@@ -8,7 +8,6 @@ import pytest
 
 from mitsplat.capture.capture import Capture, Photo
 from mitsplat.geometry.camera import Camera
-from mitsplat.reconstruct.asset_evaluation import Thresholds
 from mitsplat.reconstruct.causes import blurred_photos, find_causes, missing_views, views_from
 from tests.reconstruct.test_reconstruct import GOOD
 
@@ -73,7 +72,7 @@ def test_blurred_photos_are_named_and_smooth_objects_are_not():
 
 def test_a_missed_threshold_names_measured_causes_before_advice():
     found = replace(GOOD, psnr=20.0, causes={"psnr": "2 of 9 photos are blurred (a.jpg, b.jpg)", "mesh_iou": "unused"})
-    (sentence,) = found.misses(Thresholds())
+    (sentence,) = found.misses()
     assert "is required): 2 of 9 photos are blurred (a.jpg, b.jpg); use even light" in sentence
 
 

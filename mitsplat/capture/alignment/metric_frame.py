@@ -23,6 +23,8 @@ from mitsplat.geometry.triangulation import nearest_point_to_lines
 DEFAULT_BOARD = Board()
 """Default board of `mitsplat board`."""
 
+_PLANES = 30_000
+"""Number of random planes among which the table is searched."""
 _MIN_TILT_COSINE = np.cos(np.radians(30))
 """Cosine of the largest angle between the table normal and the vertical that the cameras suggest."""
 
@@ -181,17 +183,12 @@ def spot(model: SparseModel, name: str) -> Float64Array:
     return np.asarray(camera.world_from_camera[:3, :3] @ ray + camera.centre)
 
 
-def find_table(model: SparseModel, *, trials: int = 30000, seed: int = 0) -> tuple[Float64Array, Float64Array] | None:
+def find_table(model: SparseModel) -> tuple[Float64Array, Float64Array] | None:
     """Find the plane on which objects stand, by RANSAC (Fischler and Bolles 1981) over the points.
 
     The plane with the most points is chosen, at least 2 % of them. At least 95 % of the cameras must be above it, and
     less than a tenth of the points below it. If the cameras suggest a vertical, the normal must be within 30 degrees of
     it.
-
-    Args:
-        model: Result of structure from motion.
-        trials: Number of random planes.
-        seed: Seed of the random numbers.
 
     Returns:
         Normal towards the cameras and a point of the plane, or None.
@@ -203,9 +200,9 @@ def find_table(model: SparseModel, *, trials: int = 30000, seed: int = 0) -> tup
     distance = float(np.median(np.linalg.norm(centres - nearest_point_to_lines(centres, forward), axis=1)))
     tolerance = 0.004 * distance
     upward = vertical_from_cameras(model)
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     sample = points[rng.permutation(len(points))[:3000]]
-    a, b, c = (sample[indices] for indices in rng.integers(0, len(sample), (3, trials)))
+    a, b, c = (sample[indices] for indices in rng.integers(0, len(sample), (3, _PLANES)))
     normals = np.cross(b - a, c - a)
     lengths = np.linalg.norm(normals, axis=1)
     a, normals = (values[lengths > 1e-4 * distance**2] for values in (a, normals))

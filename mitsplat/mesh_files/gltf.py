@@ -245,7 +245,7 @@ class _GltfReader:
         """Convert a material for faces with coordinates ``uv`` (F, 3, 2) by their set."""
         warnings: list[str] = []
         values, extensions = stored.get("pbrMetallicRoughness", {}), stored.get("extensions", {})
-        metallic, roughness = float(values.get("metallicFactor", 1.0)), float(values.get("roughnessFactor", 1.0))
+        metallic, roughness = (_share(values, f"{name}Factor") for name in ("metallic", "roughness"))
         factor, base = values.get("baseColorFactor", (1, 1, 1, 1)), values.get("baseColorTexture")
         specular, left_out = DIELECTRIC_SPECULAR, set(extensions) - _READ_EXTENSIONS - _WITHOUT_EFFECT
         if "KHR_materials_ior" in extensions:
@@ -283,9 +283,7 @@ class _GltfReader:
             metallic, roughness = means_of(gloss)
         normal = self._read_texture(stored.get("normalTexture"), uv, warnings)
         if normal is not None and (scale := stored["normalTexture"].get("scale", 1.0)) != 1.0:
-            slopes = 127.5 + scale * (normal.pixels[..., :2] - 127.5)
-            pixels = np.concatenate([slopes.clip(0, 255).astype(np.uint8), normal.pixels[..., 2:]], axis=2)
-            normal = Texture(pixels, normal.uv, normal.wrap)
+            normal = Texture(_steeper(normal.pixels, scale), normal.uv, normal.wrap)
         return Material(
             np.clip(np.asarray(factor[:3], dtype=np.float64), 0.0, 1.0),
             texture,
@@ -388,3 +386,28 @@ def _transformed(uv: Float64Array, transform: JsonObject) -> Float64Array:
     angle = float(transform.get("rotation", 0.0))
     turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
     return np.asarray((uv * transform.get("scale", (1, 1))) @ turn.T + transform.get("offset", (0, 0)))
+
+
+def _share(values: JsonObject, name: str) -> float:
+    """Return a number from 0 to 1 of a material, 1 by default.
+
+    Raises:
+        InputError: If it is no such number.
+    """
+    value = values.get(name, 1.0)
+    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value <= 1:
+        raise InputError(f"{name} of a material must be from 0 to 1 (got {value})")
+    return float(value)
+
+
+def _steeper(pixels: npt.NDArray[np.uint8], scale: object) -> npt.NDArray[np.uint8]:
+    """Return a normal map (H, W, 3) whose slopes along x and y are multiplied by ``scale``, as unit vectors.
+
+    Raises:
+        InputError: If the scale is not a finite number.
+    """
+    if isinstance(scale, bool) or not isinstance(scale, int | float) or not np.isfinite(scale):
+        raise InputError(f"scale of a normal map must be a finite number (got {scale})")
+    normals = (pixels / 127.5 - 1.0) * (scale, scale, 1.0)
+    normals /= np.maximum(np.linalg.norm(normals, axis=2, keepdims=True), 1e-6)
+    return np.asarray(np.rint(127.5 + 127.5 * normals).astype(np.uint8))

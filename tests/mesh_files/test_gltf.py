@@ -534,3 +534,39 @@ def test_proxy_meshes_of_assets_and_scenes_have_the_same_geometry(tmp_path: Path
     np.testing.assert_allclose(mesh.bounds, [(-SIZE, 0, 0), (0, SIZE, 2 * SIZE)], atol=1e-7)
     assert mesh.is_watertight
     assert mesh.volume == pytest.approx(2 * SIZE**3)
+
+
+def _normal_mapped(scale: object, tmp_path: Path, **factors: object) -> Path:
+    """Save a sheet with the normal (0.6, 0, 0.8) everywhere, and factors of its material."""
+    glb = Glb()
+    attributes = {"POSITION": glb.accessor(CORNERS), "TEXCOORD_0": glb.accessor(CORNER_UV)}
+    texture = glb.texture(Image.new("RGB", (2, 2), (204, 128, 230)))
+    material = {"normalTexture": {"index": texture, "scale": scale}, "pbrMetallicRoughness": factors}
+    glb.mesh(attributes, glb.accessor(QUAD), material)
+    return glb.save(tmp_path / "a.glb")
+
+
+@pytest.mark.parametrize("scale", [0, 0.5, 5, -1])
+def test_scale_of_a_normal_map_multiplies_its_slopes(scale: float, tmp_path: Path) -> None:
+    """glTF 2.0, 3.9.3: normalize((2 texel - 1) * (scale, scale, 1))."""
+    (part,) = read(_normal_mapped(scale, tmp_path))
+    normal = part.normals_at(np.zeros(1, int), np.full((1, 3), 1 / 3))[0]
+    expected = np.array([0.6 * scale, 0.0, 0.8]) / np.hypot(0.6 * scale, 0.8)
+    along, up = normal @ [1, 0, 0], abs(normal @ part.mesh.face_normals[0])
+    np.testing.assert_allclose((along, up), (expected[0], expected[2]), atol=0.02)
+
+
+@pytest.mark.parametrize(
+    ("scale", "factors", "message"),
+    [
+        ("1", {}, r"scale of a normal map must be a finite number \(got 1\)"),
+        (1, {"metallicFactor": 3}, r"metallicFactor of a material must be from 0 to 1 \(got 3\)"),
+        (1, {"roughnessFactor": -1}, r"roughnessFactor of a material must be from 0 to 1 \(got -1\)"),
+        (1, {"metallicFactor": float("nan")}, r"metallicFactor of a material must be from 0 to 1 \(got nan\)"),
+    ],
+)
+def test_material_factors_out_of_range_are_refused(
+    scale: object, factors: dict[str, object], message: str, tmp_path: Path
+) -> None:
+    with pytest.raises(InputError, match=message):
+        read(_normal_mapped(scale, tmp_path, **factors))

@@ -65,14 +65,18 @@ class CaptureSettings:
     """Settings of a capture.
 
     Attributes:
-        kind: ``object`` is segmented by masks; ``environment`` is not. max_size: Longest edge of the photos [px];
-        larger photos are reduced. frames: Maximum number of frames taken from a video. board: ChArUco board to detect.
-        tag: Edge length of printed AprilTags [m]; None if unknown. scale_from: Two points and their distance [m], as in
-        :func:`mitsplat.capture.alignment.metric_frame.spot`. poses: COLMAP model or ``transforms.json`` with given
-        cameras. metric: True if ``poses`` are in metres with z up; they are then not transformed. masks: Folder of
-        masks. mask_model: ONNX file of a segmentation network. undistorted: Resample the photos to pinhole cameras.
-        picks: Pixels on the object, PHOTO:X,Y in pixels of the capture's photos. Without picks, the object is the
-        object
+        kind: ``object`` is segmented by masks; ``environment`` is not.
+        max_size: Longest edge of the photos [px]; larger photos are reduced.
+        frames: Maximum number of frames taken from a video.
+        board: ChArUco board to detect.
+        tag: Edge length of printed AprilTags [m]; None if unknown.
+        scale_from: Two points and their distance [m], as in :func:`mitsplat.capture.alignment.metric_frame.spot`.
+        poses: COLMAP model or ``transforms.json`` with given cameras.
+        metric: True if ``poses`` are in metres with z up; they are then not transformed.
+        masks: Folder of masks.
+        mask_model: ONNX file of a segmentation network.
+        undistorted: Resample the photos to pinhole cameras.
+        picks: Pixels on the object, PHOTO:X,Y in pixels of the capture's photos. Without picks, the object is the one
             at which the photos are directed.
         picks_not: Pixels on other objects.
         box: Minimum and maximum x, y and z of a box that contains the object, in the frame of the capture.

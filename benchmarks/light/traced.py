@@ -70,7 +70,7 @@ def filtered(by_neighbours: bool) -> Iterator[None]:
 @contextmanager
 def reflected() -> Iterator[None]:
     """Return reflected light of many rays, without the mean over cells on meshes."""
-    rays = patch.multiple(bounce, BOUNCE_RAYS=REFLECTED, MESH_RAYS=REFLECTED)
+    rays = patch.multiple(bounce, BOUNCE_RAYS=REFLECTED, CELL_RAYS=REFLECTED, MESH_RAYS=REFLECTED)
     with rays, patch.object(LightFilter, "average", lambda _, values: values):
         yield
 

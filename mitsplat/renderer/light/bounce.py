@@ -23,10 +23,13 @@ from mitsplat.renderer.light.reflectors import Reflectors
 from mitsplat.renderer.light.shadow_rays import ROBERTS, ShadowTracer, ray_origin, sequence_point
 from mitsplat.renderer.rays.device_arrays import gathered
 
-BOUNCE_RAYS = 7
-"""Rays per pixel of objects, and of captured surroundings near objects, before neighbours are averaged."""
+BOUNCE_RAYS = 3
+"""Rays per pixel of objects, before neighbours are averaged."""
 
-CELL = 4
+CELL_RAYS = 4
+"""Rays per cell of 2 x 2 pixels on captured surroundings near objects, before neighbours are averaged."""
+
+COVER_CELL = 4
 """Edge [px] of the cells in which :func:`object_cover` is constant."""
 
 MIN_COVER, MAX_SHARE = 0.03, 0.85
@@ -35,8 +38,7 @@ traced at captured points.
 """
 
 MESH_RAYS = 2
-"""Rays per pixel on visible meshes such as a table, at one pixel of four; averages over even surfaces reduce the noise.
-"""
+"""Rays per cell on visible meshes such as a table; averages over even surfaces reduce the noise."""
 
 SPREAD = 64
 """Mean distance between a point and its neighbours in the wide average over meshes, over the offset of ray origins."""
@@ -59,21 +61,21 @@ class Bounce:
 def object_cover(visible: VisibleSurfaces) -> mi.Float | None:
     """Estimate the share of the cosine-weighted hemisphere that objects cover at every pixel of the image.
 
-    The estimate is that of one captured point in each cell of CELL x CELL pixels; where there is none, it is 1. The
-    result is None without objects.
+    The estimate is that of one captured point in each cell of COVER_CELL x COVER_CELL pixels; where there is none, it
+    is 1. The result is None without objects.
     """
     boxes, view = visible.proxies.boxes, visible.view
     if boxes is None:
         return None
-    width, height = -(-view.width // CELL), -(-view.height // CELL)
+    width, height = -(-view.width // COVER_CELL), -(-view.height // COVER_CELL)
     cell = dr.arange(mi.UInt32, width * height)
-    x = dr.minimum(cell % width * CELL + CELL // 2, view.width - 1)
-    y = dr.minimum(cell // width * CELL + CELL // 2, view.height - 1)
+    x = dr.minimum(cell % width * COVER_CELL + COVER_CELL // 2, view.width - 1)
+    y = dr.minimum(cell // width * COVER_CELL + COVER_CELL // 2, view.height - 1)
     point = visible.at(y * view.width + x)
     cover = dr.select(_captured(point), boxes.form_factor(point.position, point.normal), 1)
     dr.eval(cover)
     pixel = dr.arange(mi.UInt32, view.width * view.height)
-    return dr.gather(mi.Float, cover, pixel // view.width // CELL * width + pixel % view.width // CELL)
+    return dr.gather(mi.Float, cover, pixel // view.width // COVER_CELL * width + pixel % view.width // COVER_CELL)
 
 
 def _captured(point: LitSurface) -> mi.Bool:
@@ -86,11 +88,11 @@ def trace_bounce(tracer: ShadowTracer, reflectors: Reflectors, estimate: Estimat
 
     ``cover`` is that of :func:`object_cover`.
 
-    Points of objects use a few rays each, so that their neighbours must be averaged, at captured points twice. On
-    visible meshes, one pixel in each cell of 2 x 2 is traced, and the result is already a mean over many cells. This
-    mean is necessary, because few rays hit small bright regions such as a wall near a lamp. Light of near surfaces
-    changes over short distances, so that less of this mean counts there (Ward et al. 1988, "A Ray Tracing Solution for
-    Diffuse Interreflection").
+    Points of objects use a few rays each, so that their neighbours must be averaged. On captured surroundings and
+    visible meshes, one pixel in each cell of 2 x 2 is traced, and the mean over 9 x 9 cells is taken first. Its window
+    is one period of the ray directions, so that it has no steps. On meshes, the mean is wider still, because few rays
+    hit small bright regions such as a wall near a lamp. Light of near surfaces changes over short distances, so that
+    less of this mean counts there (Ward et al. 1988, "A Ray Tracing Solution for Diffuse Interreflection").
     """
     surface, view, pixel = tracer.surface, tracer.view, tracer.pixel
     cells = replace(view, width=-(-view.width // 2), height=-(-view.height // 2))
@@ -111,22 +113,24 @@ def trace_bounce(tracer: ShadowTracer, reflectors: Reflectors, estimate: Estimat
         captured = _captured(surface) & (shaded | (dr.gather(mi.Float, cover, pixel) > MIN_COVER))
     diffuse = surface.relit & thing & surface.diffuse
     few = captured & selected
-    for mesh, which, rays in ((False, diffuse | few, BOUNCE_RAYS), (True, on_mesh, MESH_RAYS)):
+    for which, rays, in_cells in ((diffuse, BOUNCE_RAYS, False), (few, CELL_RAYS, True), (on_mesh, MESH_RAYS, True)):
         places = dr.compress(which)
         if not dr.width(places):
             continue
         own, number = gathered(surface, places), dr.gather(mi.UInt32, pixel, places)
-        start = tracer.sequence_start(number)
+        cell = dr.gather(mi.UInt32, row * cells.width + column, places)
+        start = tracer.start_at(cell % cells.width, cell // cells.width) if in_cells else tracer.sequence_start(number)
         origin, normal = mi.Point3f(ray_origin(own)), mi.Vector3f(own.normal)
-        dr.eval(own, start, origin, normal)
+        dr.eval(own, start, origin, normal, cell)
         found, without, nearness = reflectors.irradiance(origin, normal, start, rays, _two_points)
-        if mesh:
-            cell = dr.gather(mi.UInt32, row * cells.width + column, places)
-            *means, near = LightFilter(own, cells, cell).average([*found, dr.sum(found) * nearness])
-            wide = mi.Color3f(*LightFilter(own, cells, cell, stride=RADIUS).average(means))
-            found = mi.Color3f(*means)
-            share = dr.clip(SPREAD * own.offset * near / dr.maximum(dr.sum(found), 1e-20), 0, 1)
-            found = dr.lerp(wide, found, share)
+        if in_cells:
+            values = [*found, *without, dr.sum(found) * nearness]
+            *means, near = LightFilter(own, cells, cell).average(values)
+            found, without = mi.Color3f(*means[:3]), mi.Color3f(*means[3:])
+            if which is on_mesh:
+                wide = mi.Color3f(*LightFilter(own, cells, cell, stride=RADIUS).average(means[:3]))
+                share = dr.clip(SPREAD * own.offset * near / dr.maximum(dr.sum(found), 1e-20), 0, 1)
+                found = dr.lerp(wide, found, share)
         dr.scatter(relit, found, places)
         dr.scatter(static, without, places)
         dr.scatter(known, mi.Float(1), places)
@@ -137,10 +141,7 @@ def trace_bounce(tracer: ShadowTracer, reflectors: Reflectors, estimate: Estimat
         own = gathered(surface, places)
         columns = [dr.gather(mi.Float, c, places) for c in (*relit, *static, known)]
         dr.eval(own, columns)
-        light_filter = LightFilter(own, view, dr.gather(mi.UInt32, pixel, places))
-        for _ in range(2):  # a single box would show rare bright rays as squares
-            columns = light_filter.average(columns)
-        *columns, share = columns
+        *columns, share = LightFilter(own, view, dr.gather(mi.UInt32, pixel, places)).average(columns)
         both = dr.zeros(mi.Color3f, count), dr.zeros(mi.Color3f, count)
         for total, colours in zip(both, (columns[:3], columns[3:]), strict=True):
             dr.scatter(total, dr.select(share > 1e-6, mi.Color3f(*colours) / share, 0), places)

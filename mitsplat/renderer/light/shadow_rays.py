@@ -122,13 +122,16 @@ class ShadowTracer:
 
     def sequence_start(self, pixel: mi.UInt32) -> mi.UInt32:
         """Return the number of the first point of pixels in the sequence."""
-        start = dr.opaque(mi.UInt32, self.seed * 2654435761 % (1 << 32))
         x, y = pixel % self.view.width, pixel // self.view.width
         if self.lattice is not None:
             # Traced neighbours are two pixels apart there.
             shift = dr.select(dr.gather(mi.Bool, self.lattice, pixel), mi.UInt32(1), 0)
             x, y = x >> shift, y >> shift
-        return start + _bayer(x, y)
+        return self.start_at(x, y)
+
+    def start_at(self, x: mi.UInt32, y: mi.UInt32) -> mi.UInt32:
+        """Return the number of the first point of the elements of a grid: neighbours take distant points."""
+        return dr.opaque(mi.UInt32, self.seed * 2654435761 % (1 << 32)) + _bayer(x, y)
 
 
 @dataclass(frozen=True, eq=False)

@@ -61,7 +61,7 @@ PLANE_FACTOR = 2
 quarter larger than with rays at each pixel. With this factor the error is the same.
 """
 
-FIRST_REFLECTIONS = 2, 8
+FIRST_REFLECTIONS = 2, 6
 """Reflection rays per pixel of a dielectric and of a metal before the error estimate."""
 
 MIN_COVER = 0.2

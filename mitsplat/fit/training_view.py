@@ -115,7 +115,7 @@ class TrainingView:
 
     @cached_property
     def hidden(self) -> mi.Bool | None:
-        """Flat mask on the device of the pixels where another thing may hide the object; None if there are none."""
+        """Flat mask on the device of the pixels where another object may hide the object; None if there are none."""
         return None if self._hidden is None else wrapped(mi.Bool, self._hidden.ravel())
 
     @property

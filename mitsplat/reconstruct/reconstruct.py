@@ -58,8 +58,8 @@ class ImportedMesh:
     Attributes:
         mesh: Mesh in its own frame.
         capture_from_mesh: Transform to the capture's frame, shape (4, 4); None to register the mesh to the splats.
-        metres_per_unit: Scale of the mesh [m]; after registration it also gives the scale of a capture of unknown
-            units.
+        metres_per_unit: Scale of the mesh [m]; the registration to a capture in metres keeps it, and it gives the scale
+            of a capture of unknown units.
     """
 
     mesh: trimesh.Trimesh
@@ -194,7 +194,7 @@ def reconstruct_asset(
             refinement = refine_mesh(mesh, views, settings.refine, floor=floor, progress=progress)
             mesh = refinement.mesh
     else:
-        mesh, alignment = _place_mesh(imported, splats, cameras)
+        mesh, alignment = _place_mesh(imported, splats, cameras, metric=capture.units == "metre")
         mesh = simplify_surface(mesh, settings.surface.faces)
     if progress is not None:
         progress(0, 1, "evaluating held-out photos")
@@ -260,13 +260,18 @@ def _alignment_rotation(mesh: trimesh.Trimesh) -> Float64Array:
 
 
 def _place_mesh(
-    imported: ImportedMesh, splats: Splats, cameras: Sequence[Camera]
+    imported: ImportedMesh, splats: Splats, cameras: Sequence[Camera], *, metric: bool
 ) -> tuple[trimesh.Trimesh, Alignment | None]:
-    """Return the mesh in the capture's frame and its registration, or None if the transform was given."""
+    """Return the mesh in the capture's frame and its registration, or None if the transform was given.
+
+    In a ``metric`` capture, a mesh of stated units keeps its size: the surface of splats on metal is often too small.
+    """
     alignment = None
     matrix = imported.capture_from_mesh
     if matrix is None:
-        alignment = register_mesh(imported.mesh, surface_points(splats, cameras))
+        alignment = register_mesh(
+            imported.mesh, surface_points(splats, cameras), imported.metres_per_unit if metric else None
+        )
         matrix = alignment.splats_from_mesh
     mesh = imported.mesh.copy()
     mesh.apply_transform(matrix)

@@ -1,8 +1,8 @@
 """Registration of a mesh from another source to splats, and their distance.
 
 Mesh reconstruction tools first transform the cameras, so that the object is centred and of unit size. Their mesh is in
-that frame, and the inverse of this transform takes it back. A CAD mesh has its own frame and scale, and is registered
-to the surface of the splats.
+that frame, and the inverse of this transform takes it back. A CAD mesh has its own frame, and is registered to the
+surface of the splats.
 """
 
 from __future__ import annotations
@@ -34,6 +34,8 @@ _KERNEL_START, _KERNEL_END = 0.1, 0.01
 """Initial and final width of the robust kernel, as a share of the mesh's diagonal."""
 _MAX_DISTANCE = 0.05
 """Upper limit of a point's distance in the misfit, as a share of the diagonal."""
+_MAX_SIZE_RATIO = 1.5
+"""Ratio of the sizes of mesh and points from which a known scale is wrong; the points show a part of the surface."""
 _OFFSET_SHARE = 0.9
 """Share of the points, the nearest ones, that determine an offset."""
 
@@ -112,15 +114,17 @@ def invert_transform(path: Path) -> Float64Array:
     return np.asarray(np.linalg.inv(matrix), dtype=np.float64)
 
 
-def register_mesh(mesh: trimesh.Trimesh, points: Float64Array) -> Alignment:
-    """Register a mesh of any frame and scale to points (N, 3) on parts of the object's surface.
+def register_mesh(mesh: trimesh.Trimesh, points: Float64Array, scale: float | None = None) -> Alignment:
+    """Register a mesh of any frame to points (N, 3) on parts of the object's surface.
+
+    ``scale`` is the known length of the mesh's unit in the frame of the points; by default it is estimated.
 
     Iterative closest points with scale, by Gauss-Newton steps on point-to-plane distances (Chen and Medioni 1992). The
     24 proper matches of the principal axes are starting poses. All starts use a few points; the best starts are refined
     with all points.
 
     Raises:
-        InputError: If there are fewer than 100 points.
+        InputError: If there are fewer than 100 points, or the size of the mesh contradicts that of the points.
     """
     if len(points) < 100:
         raise InputError(f"a registration needs at least 100 points of the splats' surface (got {len(points)})")
@@ -131,18 +135,22 @@ def register_mesh(mesh: trimesh.Trimesh, points: Float64Array) -> Alignment:
     missed = _MAX_DISTANCE * mesh.scale
     widths = mesh.scale * np.geomspace(_KERNEL_START, _KERNEL_END, _COARSE_STEPS)
     starts: list[tuple[float, int, Float64Array]] = []
-    for start in _initial_poses(points, samples):
-        found = _icp_steps(surface, few, start, widths)
+    if scale is not None:
+        ratio = scale * _size(samples) / _size(points)
+        if not 1 / _MAX_SIZE_RATIO < ratio < _MAX_SIZE_RATIO:
+            raise InputError(f"the mesh is {ratio:.3g} times as large as the photographed object: check its units")
+    for start in _initial_poses(points, samples, scale):
+        found = _icp_steps(surface, few, start, widths, scale is not None)
         starts.append((_misfit(surface, samples[:_COARSE_POINTS], few, found, missed), len(starts), found))
     finals: list[tuple[float, int, Float64Array]] = []
     for _, _, start in sorted(starts)[:_REFINED_POSES]:
-        found = _icp_steps(surface, points, start, np.repeat(widths[-1], _FINE_STEPS))
+        found = _icp_steps(surface, points, start, np.repeat(widths[-1], _FINE_STEPS), scale is not None)
         finals.append((_misfit(surface, samples, points, found, missed), len(finals), found))
     _, _, mesh_from_splats = min(finals)
     distance = surface.nearest(_transform_points(points, mesh_from_splats))[2]
     splats_from_mesh = np.asarray(np.linalg.inv(mesh_from_splats), dtype=np.float64)
-    scale = float(np.cbrt(np.linalg.det(splats_from_mesh[:3, :3])))
-    return Alignment(splats_from_mesh, scale, float(np.median(distance) / mesh.scale))
+    found_scale = float(np.cbrt(np.linalg.det(splats_from_mesh[:3, :3])))
+    return Alignment(splats_from_mesh, found_scale, float(np.median(distance) / mesh.scale))
 
 
 def measure_offset(mesh: trimesh.Trimesh, points: Float64Array) -> Offset:
@@ -160,31 +168,42 @@ def _transform_points(points: Float64Array, matrix: Float64Array) -> Float64Arra
     return moved
 
 
-def _initial_poses(points: Float64Array, samples: Float64Array) -> list[Float64Array]:
-    """Return the transforms that match centres, sizes and principal axes of two point sets, in all 24 proper ways."""
+def _size(points: Float64Array) -> float:
+    """Return the root mean square distance of points (N, 3) from their mean."""
+    return float(np.sqrt(((points - points.mean(axis=0)) ** 2).sum(axis=1).mean()))
+
+
+def _initial_poses(points: Float64Array, samples: Float64Array, scale: float | None) -> list[Float64Array]:
+    """Return the transforms that match centres, sizes and principal axes of two point sets, in all 24 proper ways.
+
+    ``scale`` replaces the ratio of the sizes if it is known, see :func:`register_mesh`.
+    """
     frames = []
     for cloud in (points, samples):
         middle = cloud.mean(axis=0)
         axes = np.linalg.svd(cloud - middle, full_matrices=False)[2].T
         axes[:, 2] *= np.sign(np.linalg.det(axes))
-        frames.append((middle, axes, float(np.sqrt(((cloud - middle) ** 2).sum(axis=1).mean()))))
+        frames.append((middle, axes, _size(cloud)))
     (from_middle, from_axes, from_size), (to_middle, to_axes, to_size) = frames
+    ratio = to_size / from_size if scale is None else 1 / scale
     starts = []
     for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3)):
         turn = np.eye(3)[list(order)] * signs
         if np.linalg.det(turn) < 0:
             continue
         start = np.eye(4)
-        start[:3, :3] = to_size / from_size * to_axes @ turn @ from_axes.T
+        start[:3, :3] = ratio * to_axes @ turn @ from_axes.T
         start[:3, 3] = to_middle - start[:3, :3] @ from_middle
         starts.append(start)
     return starts
 
 
 def _icp_steps(
-    surface: DistanceSurface, points: Float64Array, matrix: Float64Array, widths: Float64Array
+    surface: DistanceSurface, points: Float64Array, matrix: Float64Array, widths: Float64Array, rigid: bool
 ) -> Float64Array:
     """Run Gauss-Newton on ``n . (p + w x (p - c) + s (p - c) + t - q)`` for rotation w, scale s and translation t.
+
+    With ``rigid``, s is 0.
 
     Points have weights by the kernel of Geman and McClure, whose width decreases with the steps (graduated
     non-convexity, Blake and Zisserman 1987). A wide kernel at the start is necessary for nearly round parts: only the
@@ -199,6 +218,8 @@ def _icp_steps(
         size = float(np.linalg.norm(arm, axis=1).mean())
         arm, gap = arm / size, gap / size
         rows = np.concatenate([np.cross(arm, normal), np.einsum("nd,nd->n", arm, normal)[:, None], normal], axis=1)
+        if rigid:
+            rows[:, 3] = 0
         wanted = np.einsum("nd,nd->n", gap, normal)
         # The pseudo-inverse makes no step in directions in which the surface slides along itself, such as around the
         # axis of a turned part.

@@ -131,6 +131,22 @@ def test_a_drawing_is_registered_with_its_scale(known_object: KnownObject, seed:
     assert measure_offset(drawing, points).shift < 0.002
 
 
+def test_a_drawing_of_known_units_keeps_its_size(known_object: KnownObject) -> None:
+    """The surface of splats is 4 % too small, as on polished metal; wrong units are refused."""
+    points = np.asarray(trimesh.sample.sample_surface(known_object.mesh, 1000, seed=0)[0])
+    points = points.mean(axis=0) + 0.96 * (points - points.mean(axis=0))
+    drawing = known_object.mesh.copy()
+    drawing.apply_transform(similarity(1000.0, 1))
+    assert register_mesh(drawing, points).scale == pytest.approx(0.96e-3, rel=5e-3)
+    found = register_mesh(drawing, points, 1e-3)
+    assert found.scale == pytest.approx(1e-3, rel=1e-6)
+    drawing.apply_transform(found.splats_from_mesh)
+    distance = np.linalg.norm(drawing.vertices - known_object.mesh.vertices, axis=1).max()
+    assert distance < 0.03 * known_object.mesh.scale
+    with pytest.raises(InputError, match="times as large as the photographed object: check its units"):
+        register_mesh(drawing, points, 0.0254)
+
+
 @pytest.mark.parametrize("seed", [1, 4, 6])
 def test_a_nearly_round_drawing_is_rotated_by_its_edges(known_object: KnownObject, seed: int) -> None:
     """Nine of ten points are on a ball and do not depend on its rotation.

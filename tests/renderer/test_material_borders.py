@@ -54,9 +54,9 @@ def _step_splats() -> Splats:
     )
 
 
-def _rendered() -> Layers:
-    """Return the layers of the step in even light, seen from above and from the side of the steel."""
-    shape = make_splats_shape(_step_splats(), proxy=_step_mesh(), instance=1)
+def _rendered(splats: Splats | None = None) -> Layers:
+    """Return the layers of the step, or of other splats on it, seen in even light from above and the side of steel."""
+    shape = make_splats_shape(splats or _step_splats(), proxy=_step_mesh(), instance=1)
     light = {"type": "constant", "radiance": {"type": "rgb", "value": 1.0}}
     scene = mi.load_dict({"type": "scene", "object": shape, "light": light})
     camera = Camera.look_at((-1.2, 0, 2.6), (0, 0, 0), width=96, height=64, fov_x=24)
@@ -88,6 +88,19 @@ def test_a_border_of_steel_and_rubber_is_not_brighter_than_steel(monkeypatch: py
     assert highlight[bright].max() < 0.5 * (steel + rubber)
     monkeypatch.setattr(material_borders, "DIFFERENT", 2.0)
     assert _rendered().highlight.mean(axis=2)[bright].max() > 0.5 * (steel + rubber)
+
+
+def test_the_luminance_of_a_border_is_the_linear_mean_of_its_materials() -> None:
+    """White and black splats show the share of steel in each pixel."""
+    splats = _step_splats()
+    white = np.where(splats.means[:, :1] < 0, 1.0, 0.0).repeat(3, axis=1)
+    shares = replace(splats, sh=(((white - 0.5) / SH_C0)[:, None]).astype(np.float32), materials=None)
+    layers, counted = _rendered(), _rendered(shares)
+    share = encode_srgb(counted.captured.mean(axis=2))
+    border = (share > 0.1) & (share < 0.9) & (layers.alpha > 0.999)
+    expected = share * STEEL[0] + (1 - share) * RUBBER[0]
+    assert np.count_nonzero(border) > 20
+    assert layers.captured.mean(axis=2)[border] == pytest.approx(expected[border], rel=0.05)
 
 
 def test_objects_of_one_material_have_no_borders() -> None:

@@ -107,6 +107,8 @@ class LayerRenderer:
         light, highlight = mi.Color3f(1), mi.Color3f(0)
         if self.shadow == "traced" and scene.emitters():
             mesh = shown.diffuse & shown.front
+            metallic, roughness, luminance = self._border_materials(contents, view, hit, splat, z_max)
+            shown = shown.with_luminance(luminance)
             seen = VisiblePixels(
                 rays.d,
                 shown.cover,
@@ -114,7 +116,8 @@ class LayerRenderer:
                 dr.select(mesh, 0, splat.instance),
                 contents.traits.seen(self._shape_votes(contents, view, z_max), splat.instance),
                 mesh,
-                *self._border_materials(contents, view, hit, splat, z_max),
+                metallic,
+                roughness,
                 self._shading_normals(contents, view, splat, z_max),
             )
             # Visible meshes receive light like static proxies, also where splats touch them.
@@ -288,10 +291,10 @@ class LayerRenderer:
 
     def _border_materials(
         self, contents: SceneContents, view: CameraView, hit: Hit, splat: Image, z_max: mi.Float | None
-    ) -> tuple[mi.Float, mi.Float]:
-        """Return metalness and roughness of pixels at borders of materials, :data:`FROM_PROXY` elsewhere."""
+    ) -> tuple[mi.Float, mi.Float, mi.Float]:
+        """Return metalness, roughness and luminance at borders of materials, :data:`FROM_PROXY` elsewhere."""
         if contents.mixed is None:
-            return mi.Float(FROM_PROXY), mi.Float(FROM_PROXY)
+            return mi.Float(FROM_PROXY), mi.Float(FROM_PROXY), mi.Float(FROM_PROXY)
         return contents.mixed.materials(view, self.quality, hit, splat.instance, z_max)
 
     def _shading_normals(

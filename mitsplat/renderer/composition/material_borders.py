@@ -6,7 +6,8 @@ rendered again, with material parameters in place of colours.
 
 A pixel that shows several materials with metalness m, roughness r and luminance l of the base colour, in shares w,
 reflects diffuse light in proportion to sum w (1 - m) l, and tinted light in proportion to sum w m l. Its metalness is
-therefore sum w m l / sum w l. The roughness is weighted likewise.
+therefore sum w m l / sum w l. The roughness is weighted likewise. The luminance of the pixel is sum w l: splats blend
+display-encoded colours, which would draw a dark line between bright steel and dark rubber.
 """
 
 from __future__ import annotations
@@ -80,8 +81,8 @@ class MixedObjects:
 
     def materials(
         self, view: CameraView, quality: Quality, hit: Hit, instance: mi.UInt32, z_max: mi.Float | None
-    ) -> tuple[mi.Float, mi.Float]:
-        """Return metalness and roughness of the pixels at borders, :data:`FROM_PROXY` elsewhere.
+    ) -> tuple[mi.Float, mi.Float, mi.Float]:
+        """Return metalness, roughness and luminance of the pixels at borders, :data:`FROM_PROXY` elsewhere.
 
         Args:
             view: The camera.
@@ -91,21 +92,22 @@ class MixedObjects:
             z_max: Depth along z [m] of the nearest visible surface; splats behind it are not visible.
         """
         pixels = view.width * view.height
-        parameters = [dr.full(mi.Float, FROM_PROXY, pixels) for _ in range(2)]
+        parameters = [dr.full(mi.Float, FROM_PROXY, pixels) for _ in range(3)]
         subset = self._borders(view, hit, instance)
         if subset.count == 0:
-            return parameters[0], parameters[1]
+            return parameters[0], parameters[1], parameters[2]
         found = ParameterPass.of(self.clouds, self.placements, view, quality, subset, z_max)
         image, pixel, inside = found.image, found.pixel, found.inside
         metal, luminance, rough = image.rgb
         mixed = dr.gather(mi.Bool, self.mixed, dr.gather(mi.UInt32, instance, pixel, inside), inside)
         shown = inside & mixed & (image.alpha > 0.5) & (luminance > 0)
-        for values, sums in zip(parameters, (metal, rough), strict=True):
-            value = dr.clip(sums / luminance, 0, 1)
+        shares = metal / luminance, rough / luminance, luminance / image.alpha
+        for values, share in zip(parameters, shares, strict=True):
+            value = dr.clip(share, 0, 1)
             dr.eval(value)
             dr.scatter(values, value, pixel, shown, mode=dr.ReduceMode.Permute)
         dr.eval(parameters)
-        return parameters[0], parameters[1]
+        return parameters[0], parameters[1], parameters[2]
 
     def _borders(self, view: CameraView, hit: Hit, instance: mi.UInt32) -> TileSubset:
         """Return the tiles near borders between materials of one visible instance."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -73,6 +73,15 @@ class PrimaryVisibility:
             key = dr.select(front, shape + NO_SPLAT, key)
         cover = dr.select(diffuse, 1, splat.alpha)
         return cls(colour, alpha, splat.alpha, cover, solid, diffuse, front, emission, key)
+
+    def with_luminance(self, luminance: mi.Float) -> PrimaryVisibility:
+        """Return this visibility with another luminance of the splats, where ``luminance`` is positive.
+
+        Pixels that also show a mesh are not changed.
+        """
+        own = mi.luminance(self.colour)
+        changed = (luminance > 0) & (own > 0) & ~self.solid
+        return replace(self, colour=dr.select(changed, luminance * self.splat_alpha / own, 1) * self.colour)
 
     def shares(self, splat: Image, own: list[mi.Float], on_mesh: mi.Bool) -> tuple[mi.Color3f, mi.Float]:
         """Return the shares of ``colour`` (Color3f) and of ``cover`` (Float) that one surface has.

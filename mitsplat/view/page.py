@@ -36,6 +36,11 @@ _HALF_MAX = 200.0
 """Maximum standard deviation sent to browsers; viser stores covariances as half floats, whose maximum is 65504."""
 _START_FOV = 0.9
 """Vertical field of view of a page without a camera view [rad]."""
+_PANE_HEIGHT = 360
+"""Height of the pane of a small browser window [px]."""
+_BLUR, _DRAWN = 0.3, 0.25
+"""viser adds ``_BLUR`` [px²] to the variances of a projected Gaussian, and draws it if the product of its opacity and
+the determinant of its covariance is at least ``_DRAWN`` [px⁴] (``GaussianSplatsHelpers.ts``)."""
 
 
 @dataclass(frozen=True)
@@ -80,6 +85,7 @@ class Page:
         self._gaussians = gaussians
         self._shown: dict[str, ShownPart] = {}
         self._handles: dict[str, Any] = {}
+        self._start: Camera | None = None
         self._clicked: Callable[[int], object] = lambda index: None
         self.gui = self._server.gui
         self.gui.configure_theme(control_width="medium", show_logo=False, show_share_button=False, dark_mode=True)
@@ -187,6 +193,7 @@ class Page:
 
     def look_through(self, camera: Camera) -> None:
         """Move the view of all present and future browsers to a camera."""
+        self._start = self._start or camera
         pose, fov = camera.world_from_camera, 2 * float(np.arctan(0.5 * camera.height / camera.fy))
         ahead = pose[:3, 3] + self._distance(pose) * pose[:3, 2]
         start = self._server.initial_camera
@@ -219,6 +226,14 @@ class Page:
         middle = bounds_of(self._shown.values()).mean(axis=0)
         return max(float((middle - pose[:3, 3]) @ pose[:3, 2]), 0.05)
 
+    def _pixel_size(self, part: ShownPart) -> float:
+        """Return the size of a pixel at the middle of a part [m] in the first view; without one, all of it is seen."""
+        low, high = bounds_of([part])
+        if self._start is None:
+            return float(np.linalg.norm(high - low)) / _PANE_HEIGHT
+        distance = float(np.linalg.norm((low + high) / 2 - self._start.world_from_camera[:3, 3]))
+        return distance * self._start.height / (self._start.fy * _PANE_HEIGHT)
+
     def _add_group(self, group: str) -> None:
         if group in self._boxes:
             return
@@ -234,7 +249,9 @@ class Page:
         scene, drawable = self._server.scene, part.drawable
         place = {"position": part.pose[:3, 3], "wxyz": _wxyz(part.pose)}
         if isinstance(drawable, ShownSplats):
-            return scene.add_gaussian_splats(part.name, **splat_arrays(drawable.thinned()), **place)
+            return scene.add_gaussian_splats(
+                part.name, **splat_arrays(drawable.thinned(), self._pixel_size(part)), **place
+            )
         if isinstance(drawable, ShownMesh):
             opacity = None if drawable.opacity == 1.0 else drawable.opacity
             vertices, faces = np.asarray(drawable.mesh.vertices, dtype=np.float32), np.asarray(drawable.mesh.faces)
@@ -279,15 +296,20 @@ class Page:
         return handle
 
 
-def splat_arrays(splats: Splats) -> dict[str, Any]:
+def splat_arrays(splats: Splats, pixel: float = 0.0) -> dict[str, Any]:
     """Return viser's arrays of Gaussians: centres, covariances, colours, opacities and a scale.
+
+    viser does not draw Gaussians that are smaller than about half a pixel, so that objects of many small Gaussians
+    would be missing. These are enlarged for a view in which a pixel has the size ``pixel`` [m].
 
     Covariances are sent as half floats, which would round those of Gaussians of a millimetre to zero. So all values are
     enlarged, and ``scale`` reduces them again.
     """
-    factor = _HALF_MAX / max(float(splats.scales.max(initial=0.0)), 1e-6)
+    variances = np.clip(np.sqrt(_DRAWN / np.maximum(splats.opacities, _DRAWN)) - _BLUR, 0.0, None)
+    scales = np.maximum(splats.scales, (1.05 * pixel * np.sqrt(variances))[:, None]).astype(np.float64)
+    factor = _HALF_MAX / max(float(scales.max(initial=0.0)), 1e-6)
     axes = Rotation.from_quat(splats.quats).as_matrix() if len(splats) else np.zeros((0, 3, 3))
-    axes = axes * (factor * splats.scales.astype(np.float64))[:, None, :]
+    axes = axes * (factor * scales)[:, None, :]
     return {
         "centers": (factor * splats.means).astype(np.float32),
         "covariances": (axes @ axes.transpose(0, 2, 1)).astype(np.float32),

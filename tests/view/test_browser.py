@@ -159,6 +159,27 @@ def test_all_of_several_large_clouds_are_shown(browser):
         page.close()
 
 
+def test_an_object_of_gaussians_smaller_than_a_pixel_is_shown(browser):
+    """viser leaves out Gaussians smaller than about half a pixel."""
+    rng, count = np.random.default_rng(0), 20_000
+    points = rng.normal(size=(count, 3)).astype(np.float32)
+    splats = Splats(
+        0.05 * points / np.linalg.norm(points, axis=1, keepdims=True),
+        np.tile(np.float32([0, 0, 0, 1]), (count, 1)),
+        np.full((count, 3), 2e-4, dtype=np.float32),
+        np.full(count, 0.8, dtype=np.float32),
+        np.tile(3.4 * np.float32([1, 0, 0]) - 1.7, (count, 1, 1)),
+    )
+    page = Page("small Gaussians", Address(port=0), gaussians=count)
+    try:
+        page.look_through(Camera.look_at((0, -1.1, 0), (0, 0, 0), width=290, height=560, fov_x=25))
+        page.show([ShownPart("/splats/red", ShownSplats(splats), np.eye(4))])
+        browser.get(page.url)
+        until(lambda: redness(screen(browser)[:, 490:770]) > 0.005)
+    finally:
+        page.close()
+
+
 def faults(browser: Any) -> list[str]:
     """Return the browser's errors since the last call."""
     return [entry["message"] for entry in browser.get_log("browser") if entry["level"] == "SEVERE"]

@@ -49,12 +49,20 @@ CALLS = {
     "LateDeviceError": "assert issubclass(ms.LateDeviceError, ms.InputError)",
     "MissingResourceError": "ms.MissingResourceError('x')",
     "PartialResultError": "ms.PartialResultError('x')",
-    "asset_from_photos": "refused(lambda: ms.asset_from_photos(Path('no_photos'), Path('asset'), job('part')))",
+    "asset_from_photos": "refused(lambda: ms.asset_from_photos('no_photos', 'asset', ms.AssetJob(name='part')))",
     "camera_from_mujoco": "refused(lambda: ms.camera_from_mujoco(None, None, 'camera'))",
     "capture_photos": "refused(lambda: ms.capture_photos(Path('no_photos'), Path('capture')))",
     "fit_capture": "refused(lambda: ms.fit_capture(empty_capture(), 'fit'))",
     "import_splats": "refused(lambda: ms.import_splats('no.ply', name='part'))",
     "Asset": "ms.Asset.load('assets/nut')",
+    "AssetJob": "ms.AssetJob(name='part')",
+    "BakeSettings": "ms.BakeSettings(gaussians=30)",
+    "Capture": "assert len(empty_capture().photos) == 0",
+    "CaptureSettings": "ms.CaptureSettings()",
+    "FitSettings": "ms.FitSettings()",
+    "ImportSettings": "ms.ImportSettings()",
+    "audit_dataset": "refused(lambda: ms.audit_dataset(Path('no_dataset')))",
+    "write_report": "refused(lambda: ms.write_report(Path('no_dataset')))",
     "Camera": "camera.project(np.zeros((1, 3)))",
     "Frame": "ms.Frame",
     "InputError": "ms.InputError('x')",
@@ -99,21 +107,13 @@ assert mitsuba.variant() is None
 modules = [f"mitsplat.{m.name}" for m in pkgutil.iter_modules(ms.__path__) if m.name not in ("sfm_child", "plugins")]
 
 def bake(file, **options):
-    from mitsplat.bake.bake import BakeSettings
-    few = BakeSettings(gaussians=30, fit_steps=0, verify_views=0)
+    few = ms.BakeSettings(gaussians=30, fit_steps=0, verify_views=0)
     return ms.bake_asset(file, name="part", kind="environment", settings=few, **options)
 
 from pathlib import Path
 
-def job(name):
-    from mitsplat.reconstruct import AssetJob
-
-    return AssetJob(name=name)
-
 def empty_capture():
-    from mitsplat.capture import Capture
-
-    return Capture(photos=(), points=np.zeros((0, 3)), colours=np.zeros((0, 3)))
+    return ms.Capture(photos=(), points=np.zeros((0, 3)), colours=np.zeros((0, 3)))
 
 def refused(call):
     from mitsplat.errors import MissingResourceError

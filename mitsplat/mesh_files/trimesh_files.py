@@ -10,7 +10,7 @@ from __future__ import annotations
 import importlib.util
 import io
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -28,7 +28,7 @@ from mitsplat.errors import InputError, MissingResourceError
 from mitsplat.geometry.mesh import check_faces
 from mitsplat.images.colour import decode_srgb
 from mitsplat.mesh_files.collada_files import check_collada, collada_warnings, lost_node, plain_name, read_collada_asset
-from mitsplat.mesh_files.face_polygons import has_concave, plain_obj
+from mitsplat.mesh_files.face_polygons import has_concave, plain_obj, split_polygons
 from mitsplat.mesh_files.file_references import find_reference
 from mitsplat.mesh_files.mesh_file import (
     DIELECTRIC_SPECULAR,
@@ -102,10 +102,10 @@ def read_with_trimesh(path: Path, *, textures: bool = True) -> MeshFile:
         if kind == ".ply" and "unexpected length" in str(error):
             raise InputError(_LENGTH) from error
         raise
-    if any(has_concave(np.asarray(positions), polygons) for positions, polygons in _polygons(path, scene, document)):
-        raise InputError(
-            "it has concave polygons, which are read from OBJ files only: export it with triangles instead of polygons"
-        )
+    for positions, polygons in _polygons(path, scene, document):
+        concave = has_concave(np.asarray(positions), polygons)
+        if concave and not (kind in (".ply", ".off") and _split_faces(scene, np.asarray(positions), polygons)):
+            raise InputError("it has concave polygons, which are not read from such files: export it with triangles")
     parts = scene_parts(scene, path)
     if document is None:
         warnings = tuple(_warnings(path, scene, content, parts, textures))
@@ -470,6 +470,20 @@ def _polygons(path: Path, scene: trimesh.Scene, document: Any) -> Iterator[tuple
                     yield one.vertex, [one.vertex_index[a:b] for a, b in zip(starts, ends, strict=True)]
                 elif np.ndim(one.vertex_index) == 2:
                     yield one.vertex, one.vertex_index
+
+
+def _split_faces(scene: trimesh.Scene, positions: Float64Array, polygons: Sequence[Any]) -> bool:
+    """Replace the triangles of the only mesh of a scene by those of its polygons, concave ones included.
+
+    Returns:
+        False if the mesh has other vertices than the file, or a texture or colours of its faces.
+    """
+    (mesh,) = scene.geometry.values()
+    if not np.array_equal(mesh.vertices, positions) or mesh.visual.kind not in (None, "vertex"):
+        return False
+    corners = split_polygons(positions, polygons)
+    mesh.faces = np.concatenate([np.asarray(one)[rows] for one, rows in zip(polygons, corners, strict=True)])
+    return True
 
 
 def check_textures(mesh: Path) -> None:

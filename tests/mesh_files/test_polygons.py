@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 from PIL import Image
 
 from mitsplat.errors import InputError
+from mitsplat.images.colour import encode_srgb
 from mitsplat.mesh_files.mesh_reading import read_mesh_file
 
 TRIANGLE = ((0, 0, 0), (1, 0, 0), (1, 1, 0))
@@ -124,16 +126,45 @@ def write_dae(path: Path, outline: object) -> None:
     )
 
 
-@pytest.mark.parametrize("kind", ["ply", "off", "dae"])
-def test_concave_polygons_of_other_formats_are_refused(tmp_path: Path, kind: str) -> None:
-    if kind == "dae":
-        pytest.importorskip("collada")
-    write = {"ply": write_ply, "off": write_off, "dae": write_dae}[kind]
-    write(tmp_path / f"a.{kind}", ((0, 0, 0), (5, 0, 0), (6, 3, 0), (3, 5, 0), (0, 3, 0)))
-    assert len(read_mesh_file(tmp_path / f"a.{kind}").parts[0].faces) == 3
-    write(tmp_path / f"b.{kind}", COMB)
-    with pytest.raises(InputError, match=rf"b\.{kind}: it has concave polygons, .* export it with triangles"):
-        read_mesh_file(tmp_path / f"b.{kind}")
+PENTAGON = ((0, 0, 0), (5, 0, 0), (6, 3, 0), (3, 5, 0), (0, 3, 0))
+
+
+@pytest.mark.parametrize("write", [write_ply, write_off])
+def test_concave_polygons_of_ply_and_off_keep_their_outline(
+    tmp_path: Path, write: Callable[[Path, object], None]
+) -> None:
+    path = tmp_path / f"a.{write.__name__.removeprefix('write_')}"
+    write(path, PENTAGON)
+    assert len(triangles(path)) == 3
+    write(path, COMB)
+    found = triangles(path)
+    areas = 0.5 * np.cross(found[:, 1] - found[:, 0], found[:, 2] - found[:, 0])[:, 2]
+    assert len(areas) == 6 and areas.min() > 0 and areas.sum() == pytest.approx(9)
+
+
+def test_concave_polygons_of_ply_keep_the_colours_of_vertices(tmp_path: Path) -> None:
+    write_ply(tmp_path / "a.ply", COMB)
+    text = (tmp_path / "a.ply").read_text()
+    text = text.replace(
+        "element face", "".join(f"property uchar {name}\n" for name in ("red", "green", "blue")) + "element face"
+    )
+    for number, row in enumerate(rows_of(COMB, "").splitlines()):
+        text = text.replace(f"{row}\n", f"{row} {20 * number} 0 0\n", 1)
+    (tmp_path / "a.ply").write_text(text)
+    (part,) = read_mesh_file(tmp_path / "a.ply").parts
+    assert part.colours is not None
+    corners = part.vertices[part.faces].reshape(-1, 3)
+    index = [int(np.flatnonzero((np.array(COMB) == corner).all(axis=1))[0]) for corner in corners]
+    assert 255 * encode_srgb(part.colours[..., 0].ravel()) == pytest.approx(20.0 * np.array(index), abs=0.5)
+
+
+def test_concave_polygons_of_collada_are_refused(tmp_path: Path) -> None:
+    pytest.importorskip("collada")
+    write_dae(tmp_path / "a.dae", PENTAGON)
+    assert len(triangles(tmp_path / "a.dae")) == 3
+    write_dae(tmp_path / "b.dae", COMB)
+    with pytest.raises(InputError, match=r"b\.dae: it has concave polygons, .* export it with triangles"):
+        read_mesh_file(tmp_path / "b.dae")
 
 
 def test_two_material_files_and_a_missing_one_are_named(tmp_path: Path) -> None:

@@ -54,12 +54,12 @@ def _step_splats() -> Splats:
     )
 
 
-def _rendered(splats: Splats | None = None) -> Layers:
+def _rendered(splats: Splats | None = None, target: tuple[float, float, float] = (0, 0, 0)) -> Layers:
     """Return the layers of the step, or of other splats on it, seen in even light from above and the side of steel."""
     shape = make_splats_shape(splats or _step_splats(), proxy=_step_mesh(), instance=1)
     light = {"type": "constant", "radiance": {"type": "rgb", "value": 1.0}}
     scene = mi.load_dict({"type": "scene", "object": shape, "light": light})
-    camera = Camera.look_at((-1.2, 0, 2.6), (0, 0, 0), width=96, height=64, fov_x=24)
+    camera = Camera.look_at((-1.2, 0, 2.6), target, width=96, height=64, fov_x=24)
     return render_layers(make_integrator(white=float(np.pi), hide_emitters=True), scene, camera)
 
 
@@ -101,6 +101,10 @@ def test_the_luminance_of_a_border_is_the_linear_mean_of_its_materials() -> None
     expected = share * STEEL[0] + (1 - share) * RUBBER[0]
     assert np.count_nonzero(border) > 20
     assert layers.captured.mean(axis=2)[border] == pytest.approx(expected[border], rel=0.05)
+
+
+def test_an_object_of_several_materials_may_be_outside_of_the_image() -> None:
+    assert _rendered(target=(9, 0, 2.6)).alpha.max() == 0
 
 
 def test_objects_of_one_material_have_no_borders() -> None:

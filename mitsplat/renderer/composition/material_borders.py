@@ -113,6 +113,8 @@ class MixedObjects:
         """Return the tiles near borders between materials of one visible instance."""
         tiles = dr.zeros(mi.Bool, view.tiles_x * view.tiles_y)
         pixel = dr.compress((hit.instance == instance) & dr.gather(mi.Bool, self.mixed, instance))
+        if dr.width(pixel) == 0:
+            return TileSubset.of(tiles, view)
         x, y = mi.Int32(pixel % view.width), mi.Int32(pixel // view.width)
         number, metallic = dr.gather(mi.UInt32, hit.instance, pixel), dr.gather(mi.Float, hit.metallic, pixel)
         border = mi.Bool(False)

@@ -22,10 +22,8 @@ def experiment_table(results: Mapping[str, Mapping[str, Any]], plan: str = "arms
     """Return the precision of all recorded arms of a plan, or of some arms in their order, with 95 % intervals.
 
     Intervals are percentiles of a bootstrap over scenes of photographs, with equal draws in every arm, and over seeds,
-    with
-    separate draws for each arm. An arm of one seed has only the variation of scenes. The plan names the arm that each
-    arm is
-    compared with.
+    with separate draws for each arm. An arm of one seed has only the variation of scenes. The plan names the arm that
+    each arm is compared with.
     """
     seeds, draws = _by_arm(results, plan, *arms), precision_draws(results, plan)
     entries = read_arms(Path(f"{plan}.yaml"))["arms"]

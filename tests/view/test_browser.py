@@ -127,20 +127,24 @@ def test_the_page_of_a_scene_works_in_chromium(browser, scene_file):
         use_page(browser, scene_file)
 
 
+def sphere_splats(count: int, scale: float, opacity: float, hue: tuple[int, int, int], *, seed: int = 0) -> Splats:
+    """Return Gaussians of one size [m] and colour on a sphere with a radius of 5 cm."""
+    points = np.random.default_rng(seed).normal(size=(count, 3)).astype(np.float32)
+    return Splats(
+        0.05 * points / np.linalg.norm(points, axis=1, keepdims=True),
+        np.tile(np.float32([0, 0, 0, 1]), (count, 1)),
+        np.full((count, 3), scale, dtype=np.float32),
+        np.full(count, opacity, dtype=np.float32),
+        np.tile(3.4 * np.float32(hue) - 1.7, (count, 1, 1)),
+    )
+
+
 def test_all_of_several_large_clouds_are_shown(browser):
     """The browser sorts and draws the Gaussians of all clouds together, so that their number is limited together."""
-    rng, count = np.random.default_rng(0), 10_000
     hues = {"red": (1, 0, 0), "green": (0, 1, 0), "blue": (0, 0, 1), "yellow": (1, 1, 0)}
     parts = []
     for number, (name, hue) in enumerate(hues.items()):
-        points = rng.normal(size=(count, 3)).astype(np.float32)
-        splats = Splats(
-            0.05 * points / np.linalg.norm(points, axis=1, keepdims=True),
-            np.tile(np.float32([0, 0, 0, 1]), (count, 1)),
-            np.full((count, 3), 1.6e-3, dtype=np.float32),
-            np.full(count, 0.99, dtype=np.float32),
-            np.tile(3.4 * np.float32(hue) - 1.7, (count, 1, 1)),
-        )
+        splats = sphere_splats(10_000, 1.6e-3, 0.99, hue, seed=number)
         parts.append(ShownPart(f"/splats/{name}", ShownSplats(splats), pose_at((0.11 * (number - 1.5), 0, 0))))
     page = Page("large clouds", Address(port=0), gaussians=4_000)
     try:
@@ -161,16 +165,8 @@ def test_all_of_several_large_clouds_are_shown(browser):
 
 def test_an_object_of_gaussians_smaller_than_a_pixel_is_shown(browser):
     """viser leaves out Gaussians smaller than about half a pixel."""
-    rng, count = np.random.default_rng(0), 20_000
-    points = rng.normal(size=(count, 3)).astype(np.float32)
-    splats = Splats(
-        0.05 * points / np.linalg.norm(points, axis=1, keepdims=True),
-        np.tile(np.float32([0, 0, 0, 1]), (count, 1)),
-        np.full((count, 3), 2e-4, dtype=np.float32),
-        np.full(count, 0.8, dtype=np.float32),
-        np.tile(3.4 * np.float32([1, 0, 0]) - 1.7, (count, 1, 1)),
-    )
-    page = Page("small Gaussians", Address(port=0), gaussians=count)
+    splats = sphere_splats(20_000, 2e-4, 0.8, (1, 0, 0))
+    page = Page("small Gaussians", Address(port=0), gaussians=20_000)
     try:
         page.look_through(Camera.look_at((0, -1.1, 0), (0, 0, 0), width=290, height=560, fov_x=25))
         page.show([ShownPart("/splats/red", ShownSplats(splats), np.eye(4))])

@@ -111,13 +111,17 @@ def use_device(device: str | Device) -> Device:
 def use_shared_device(kind: Kind, threads: int | None = None) -> None:
     """Select a device like :func:`use_device`, in one of several processes that share its cores.
 
-    On a GPU, Dr.Jit's threads only build scenes. Few threads do this in a tenth of the time of sixteen threads.
+    On a GPU, Dr.Jit's threads only build scenes. Few threads do this in a tenth of the time of sixteen threads. OpenCV
+    uses one thread: by default, it would keep one busy for each core in every process.
 
     Args:
         kind: Kind of the device.
         threads: Number of threads on a CPU, at least MIN_THREADS; None for one per core.
     """
+    import cv2
+
     use_device(kind)
+    cv2.setNumThreads(1)
     ensure_threads(MIN_THREADS if kind == "cuda" else threads)
 
 

@@ -98,12 +98,13 @@ class Variant:
 
 @dataclass(frozen=True)
 class Threads:
-    """Job that returns the number of Dr.Jit's threads."""
+    """Job that returns the numbers of Dr.Jit's and OpenCV's threads."""
 
     def __call__(self, index, note, /):
+        import cv2
         import drjit as dr
 
-        return dr.thread_count()
+        return dr.thread_count(), cv2.getNumThreads()
 
 
 @dataclass(frozen=True)

@@ -298,7 +298,7 @@ def test_workers_select_the_device_first(monkeypatch):
 def test_workers_share_the_cores(monkeypatch, workers, threads):
     monkeypatch.setattr(engine, "usable_cores", lambda: 6)
     with closing(run_frames(Threads(), {0: range(2)}, workers=workers, note=print, device=CPU)) as results:
-        assert list(results) == [threads, threads]
+        assert list(results) == [(threads, 1), (threads, 1)]
 
 
 def test_a_missing_gpu_is_reported_in_one_sentence():

@@ -304,7 +304,7 @@ def main() -> None:
     parser.add_argument("--samples", type=int, default=64)
     parser.add_argument("--gaussians", type=int, default=30_000)
     parser.add_argument("--iterations", type=int, default=3000)
-    parser.add_argument("--edge", type=int, default=800)
+    parser.add_argument("--max-size", type=int, default=800)
     parser.add_argument("--ground", choices=list(GROUNDS), default="cloth", help="ground below the solid")
     parser.add_argument("--beside", action="store_true", help="another object in the cameras' focus, and one click")
     parser.add_argument("--known-poses", action="store_true", help="give the true cameras, in unknown units")
@@ -346,7 +346,7 @@ def measure(args: argparse.Namespace) -> int:
         args.out / "asset",
         AssetJob(name="clutter", settings=ReconstructSettings(size=float(mesh.extents.max()))),
         capture=CaptureSettings(poses=poses, picks=picks),
-        fit=FitSettings(gaussians=args.gaussians, iterations=args.iterations, size=args.edge),
+        fit=FitSettings(gaussians=args.gaussians, iterations=args.iterations, max_size=args.max_size),
         progress=tell,
     )
     for sentence in done.verdict.misses():

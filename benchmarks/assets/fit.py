@@ -44,7 +44,7 @@ def main() -> None:
     parser.add_argument("--synthetic", metavar="ASSET", help="asset of scenes/assets, instead of a capture")
     parser.add_argument("--iterations", type=int, default=7000)
     parser.add_argument("--gaussians", type=int, default=30_000)
-    parser.add_argument("--edge", type=int, default=800)
+    parser.add_argument("--max-size", type=int, default=800)
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--replay", choices=("on", "off"), default="on", help="record and replay kernels")
     parser.add_argument("--classic", action="store_true", help="classic densification of 3DGS instead of MCMC")
@@ -55,9 +55,9 @@ def main() -> None:
     device = use_device(args.device)
     recorded.REPLAY = args.replay == "on"
     with recording("assets.fit", parser, args, gpu=device.kind == "cuda"), tempfile.TemporaryDirectory() as folder:
-        settings = FitSettings(gaussians=args.gaussians, iterations=args.iterations, size=args.edge)
+        settings = FitSettings(gaussians=args.gaussians, iterations=args.iterations, max_size=args.max_size)
         if args.synthetic:
-            capture = photograph_asset(ROOT / "scenes/assets" / args.synthetic, Path(folder), args.edge)
+            capture = photograph_asset(ROOT / "scenes/assets" / args.synthetic, Path(folder), args.max_size)
         else:
             capture = Capture.load(args.capture)
             settings = replace(
@@ -69,7 +69,7 @@ def main() -> None:
 
 
 def compare(args: argparse.Namespace, capture: Capture, settings: FitSettings) -> None:
-    print(f"{len(capture.photos)} photos, {args.gaussians} Gaussians, {args.iterations} iterations, {args.edge} px")
+    print(f"{len(capture.photos)} photos, {args.gaussians} Gaussians, {args.iterations} iterations, {args.max_size} px")
     print("fit                  s      PSNR    SSIM   Gaussians")
     watch = Watch(settings.iterations)
     with tempfile.TemporaryDirectory() as folder:

@@ -213,7 +213,7 @@ def main() -> None:
     parser.add_argument("--samples", type=int, default=64)
     parser.add_argument("--gaussians", type=int, default=30_000)
     parser.add_argument("--iterations", type=int, default=3000)
-    parser.add_argument("--edge", type=int, default=800)
+    parser.add_argument("--max-size", type=int, default=800)
     parser.add_argument("--variant", default="llvm_ad_rgb", help="Mitsuba variant, such as cuda_ad_rgb")
     args = parser.parse_args()
     mi.set_variant(args.variant)
@@ -234,7 +234,7 @@ def measure(args: argparse.Namespace) -> int:
         photograph(scene, views, photos, samples=args.samples)
         marker.write_text(made)
     truth = by_name(views)
-    fit = FitSettings(gaussians=args.gaussians, iterations=args.iterations, size=args.edge)
+    fit = FitSettings(gaussians=args.gaussians, iterations=args.iterations, max_size=args.max_size)
 
     def tell(done: int, total: int, text: str) -> None:
         if done == total:

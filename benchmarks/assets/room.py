@@ -253,7 +253,7 @@ def measure(args: argparse.Namespace) -> int:
         marker.write_text(made)
     stage("photographs")
     capture = CaptureSettings(kind="environment", board=BOARD)
-    fit = FitSettings(gaussians=args.gaussians, iterations=args.iterations, size=args.width, masks="off")
+    fit = FitSettings(gaussians=args.gaussians, iterations=args.iterations, max_size=args.width, masks="off")
     taken = capture_photos(photos, asset / "capture", capture)
     stage("cameras")
     fit_capture(taken.capture, asset / "fit", fit, overwrite=True)

@@ -46,7 +46,7 @@ from mitsplat.runtime.variant import ensure_variant
 WIDTH, SAMPLES = 320, 12
 AROUND, CLOSE, FINE = 8, 26.0, 24
 """Number of views of the comparison, their field of view [degrees], and samples per pixel."""
-FIT = FitSettings(gaussians=4000, iterations=500, size=WIDTH)
+FIT = FitSettings(gaussians=4000, iterations=500, max_size=WIDTH)
 SURFACE = SurfaceSettings(voxels=96, faces=4000)
 GOOD = {"psnr": 24.0, "splat_iou": 0.95, "mesh_iou": 0.94, "chamfer": 1.0, "scale": 1.0}
 """True errors of a good asset: thresholds of the verdict, 1 % of the diagonal, and 1 % of the scale."""

@@ -182,7 +182,7 @@ def chart(
     tolerance: Annotated[
         float, typer.Option(help="Mark the fastest preset whose error (RMSE of encoded colours) is at most this value.")
     ] = 0.004,
-    at: Annotated[
+    order_tolerance: Annotated[
         list[float] | None,
         typer.Option(
             metavar="VALUE", help="Additional blending-order tolerance at which `balanced` is measured; repeatable."
@@ -215,7 +215,7 @@ def chart(
     with progress_bar() as progress:
         rows = measure_steps(
             scene,
-            tolerances=at or (),
+            tolerances=order_tolerance or (),
             frames=frames,
             overrides=scene_overrides(size=size),
             allow_outside=allow_outside,

@@ -108,7 +108,7 @@ def fit(
         float | None,
         typer.Option(help="Stop early at this PSNR [dB] on validation photos, which are then excluded from training."),
     ] = None,
-    edge: Annotated[
+    max_size: Annotated[
         int, typer.Option(help="Longest edge of the training images [px]; objects are cropped first.")
     ] = 800,
     sh_degree: ShDegree = 3,
@@ -150,7 +150,7 @@ def fit(
         iterations=iterations,
         budget=None if budget is None else _parse_duration(budget),
         target_psnr=target_psnr,
-        size=edge,
+        max_size=max_size,
         sh_degree=sh_degree,
         seed=seed,
     )

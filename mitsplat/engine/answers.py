@@ -92,7 +92,7 @@ class Started:
 Answer = Status | Finished[Result] | Failure | Lost
 
 
-class Pool(Protocol[Result]):
+class WorkerPool(Protocol[Result]):
     """Pool of numbered workers, each of which makes one frame at a time."""
 
     def start(self) -> int:

@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Generator, Mapping, Sequence
 from typing import Generic
 
-from mitsplat.engine.answers import Failure, Lost, LostWorkersError, Pool, Result, Status
+from mitsplat.engine.answers import Failure, Lost, LostWorkersError, Result, Status, WorkerPool
 from mitsplat.engine.frame_queue import FrameQueue
 from mitsplat.engine.worker_growth import WorkerGrowth
 from mitsplat.errors import MissingResourceError
@@ -18,7 +18,7 @@ MAX_LOSSES = 3
 
 
 def run_pool(
-    pool: Pool[Result], layouts: Mapping[int, Sequence[int]], max_workers: int, note: Note, *, grow: bool = False
+    pool: WorkerPool[Result], layouts: Mapping[int, Sequence[int]], max_workers: int, note: Note, *, grow: bool = False
 ) -> Generator[Result]:
     """Distribute all frames over the pool's workers and yield the results in order of completion.
 
@@ -44,7 +44,13 @@ class _Scheduler(Generic[Result]):
     """State of a run, see :func:`run_pool`."""
 
     def __init__(
-        self, pool: Pool[Result], layouts: Mapping[int, Sequence[int]], max_workers: int, note: Note, *, grow: bool
+        self,
+        pool: WorkerPool[Result],
+        layouts: Mapping[int, Sequence[int]],
+        max_workers: int,
+        note: Note,
+        *,
+        grow: bool,
     ) -> None:
         self._pool, self._note, self._grow = pool, note, grow
         self._queue = FrameQueue(layouts)

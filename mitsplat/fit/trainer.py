@@ -51,8 +51,8 @@ class FitSettings:
             machine.
         target_psnr: Mean PSNR [dB] at which the fit ends early. It is measured on one in eight of the training photos,
             which are then not fitted. Held-out photos never affect a decision.
-        size: Longest edge of the pictures [px]; photos are reduced, never enlarged.
-        crop: True to fit only the area around the object in each photo, with ``size`` for this area; only if masks
+        max_size: Longest edge of the pictures [px]; photos are reduced, never enlarged.
+        crop: True to fit only the area around the object in each photo, with ``max_size`` for this area; only if masks
             supervise alpha. Held-out photos are compared as a whole.
         sh_degree: Degree of the spherical harmonics, 0 to 3; it increases by one every fifth of the fit.
         masks: ``alpha``: only masked pixels are fitted, and masks supervise alpha; ``off``: masks are not read.
@@ -81,7 +81,7 @@ class FitSettings:
     iterations: int = 3000
     budget: float | None = None
     target_psnr: float | None = None
-    size: int = 800
+    max_size: int = 800
     crop: bool = True
     sh_degree: int = 3
     masks: Literal["alpha", "off"] = "alpha"
@@ -101,10 +101,9 @@ class FitSettings:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        for name, least in (("gaussians", 2), ("iterations", 1), ("size", 64), ("refine_every", 1), ("seed", 0)):
+        for name, least in (("gaussians", 2), ("iterations", 1), ("max_size", 64), ("refine_every", 1), ("seed", 0)):
             if getattr(self, name) < least:
-                label = "the longest edge of pictures" if name == "size" else name
-                raise InputError(f"{label} must be at least {least} (got {getattr(self, name)})")
+                raise InputError(f"{name} must be at least {least} (got {getattr(self, name)})")
         if not 0 <= self.sh_degree <= 3:
             raise InputError(f"sh_degree must be 0, 1, 2 or 3 (got {self.sh_degree})")
         if self.target_psnr is not None and not np.isfinite(self.target_psnr):
@@ -203,7 +202,7 @@ def fit_capture(
     if done is not None:
         return done
     state = folder.checkpoint(overwrite=overwrite)
-    maps, warnings = ({}, ()) if depths is None else align_maps(training, capture.points, depths, settings.size)
+    maps, warnings = ({}, ()) if depths is None else align_maps(training, capture.points, depths, settings.max_size)
     fit = _Fit(capture, training, validation, settings, maps, densification)
     if state is not None:
         fit.restore(state)
@@ -493,7 +492,7 @@ def _training_view(
     if window is not None:
         camera = camera.cropped(*window)
         inverse_depth = None if inverse_depth is None else crop_map(inverse_depth, photo.camera, window)
-    scale = min(1.0, settings.size / max(camera.width, camera.height))
+    scale = min(1.0, settings.max_size / max(camera.width, camera.height))
     return TrainingView(photo, scale, masked=settings.masks != "off", inverse_depth=inverse_depth, window=window)
 
 

@@ -29,7 +29,7 @@ from mitsplat.physics.rest import (
     observe_nothing,
     run_to_rest,
 )
-from mitsplat.physics.static_scene import Ground, make_ground
+from mitsplat.physics.static_scene import StaticScene, make_static_scene
 from mitsplat.physics.worlds import MujocoWorld, WarpWorld, World
 from mitsplat.progress import Note
 from mitsplat.scene.layout import NO_PHYSICS, Instance, Layout, LeftOut, RestCertificate, UnsettledLayoutError
@@ -120,11 +120,12 @@ class Drop:
         self._objects = [self._part(asset, progress) for asset in scene.assets]
         self._surroundings = (scene.environments if scene.spec.environment_collides else ()) or (None,)
         bodies = [part.body for part in self._objects]
-        self._grounds = {
-            number: make_ground(scene, bodies, around, progress) for number, around in enumerate(self._surroundings)
+        self._static_scenes = {
+            number: make_static_scene(scene, bodies, around, progress)
+            for number, around in enumerate(self._surroundings)
         }
-        for ground in self._grounds.values():
-            self._check_given_poses(ground)
+        for static in self._static_scenes.values():
+            self._check_given_poses(static)
 
     def settle(self, index: int) -> Layout:
         """Draw poses until a layout passes all checks.
@@ -193,9 +194,9 @@ class Drop:
 
     def _try(self, index: int, drawn: Sequence[_DrawnObject], refused: Sequence[str]) -> Layout | _Rejection:
         """Drop the given objects from the next draw of start poses."""
-        number = self._ground_of(index)
+        number = self._static_key(index)
         assets, given = tuple(one.asset for one in drawn), [one.given for one in drawn]
-        regions, obstacles = [one.region for one in drawn], self._grounds[number].obstacles
+        regions, obstacles = [one.region for one in drawn], self._static_scenes[number].obstacles
         arrangements = self._arrangements(drawn)
         rng = random_stream(self.scene.spec.seed, "object poses", index, len(refused))
         try:
@@ -274,7 +275,7 @@ class Drop:
         attempt = certificate.attempts - 1
         rng = random_stream(self.scene.spec.seed, "object poses", layout.index, attempt)
         capacity = 2.0 ** certificate.refused.count(CONTACT_OVERFLOW)
-        number, regions = self._ground_of(layout.index), [one.region for one in drawn]
+        number, regions = self._static_key(layout.index), [one.region for one in drawn]
         world = self._world(assets, capacity, number)
         start = self.draw_poses(assets, rng, given, number, regions, self._arrangements(drawn))
         restarted = np.zeros(len(drawn), dtype=bool)
@@ -289,18 +290,18 @@ class Drop:
         self._run(world, start, layout.index, attempt, drawn, rng, observe)
         yield from moments
 
-    def _ground_of(self, layout: int) -> int:
-        """Return the key of a layout's ground; environments without collision share one ground.
+    def _static_key(self, layout: int) -> int:
+        """Return the key of a layout's static scene; environments without collision share one.
 
-        If colliders are drawn per layout, each layout has a ground of its own, and the last one is cached.
+        If colliders are drawn per layout, each layout has its own static scene, and the last one is cached.
         """
         number = draw_environment(self.scene.spec, layout) if len(self._surroundings) > 1 else 0
         if not any(shape.collider and shape.is_drawn for shape in self.scene.spec.shapes):
             return number
         key = len(self._surroundings) + layout
-        if key not in self._grounds:
+        if key not in self._static_scenes:
             bodies, around = [part.body for part in self._objects], self._surroundings[number]
-            self._grounds = {key: make_ground(self.scene, bodies, around, lambda text: None, layout)}
+            self._static_scenes = {key: make_static_scene(self.scene, bodies, around, lambda text: None, layout)}
         return key
 
     def _run(
@@ -316,8 +317,8 @@ class Drop:
         """Simulate a draw of a layout from its start poses (N, 4, 4); ``rng`` draws those of objects that fail."""
         settle = self.scene.spec.settle
         fastest = _POUR_SPEED if any(one.arrangement == "pile" for one in drawn) else np.inf
-        number, arrangements = self._ground_of(index), self._arrangements(drawn)
-        ground = self._grounds[number]
+        number, arrangements = self._static_key(index), self._arrangements(drawn)
+        static = self._static_scenes[number]
         free = np.array([one.given is None for one in drawn])
         own = np.array([one.region for one in drawn])
 
@@ -349,8 +350,8 @@ class Drop:
         return run_to_rest(
             world,
             max_time=settle.max_time,
-            bounds=limits(ground.bounds),
-            walls=limits(ground.walls),
+            bounds=limits(static.bounds),
+            walls=limits(static.walls),
             free_time=FREE_TIME if falls else 0.0,
             fastest=fastest,
             handling=handling,
@@ -359,24 +360,24 @@ class Drop:
         )
 
     def _world(self, assets: tuple[int, ...], capacity: float, number: int = 0) -> World:
-        """Return the simulation of these assets on a ground; the last one is cached."""
+        """Return the simulation of these assets in a static scene; the last one is cached."""
         key = assets, capacity, number
         if key not in self._worlds:
-            ground = self._grounds[number]
+            static = self._static_scenes[number]
             bodies = [self._objects[asset].body for asset in assets]
             self._worlds.clear()
             self._world_count += 1
             if self._world_count % _COLLECTION_INTERVAL == 0:
                 gc.collect()
             self._worlds[key] = (
-                MujocoWorld(bodies, ground.colliders, timestep=TIMESTEP)
+                MujocoWorld(bodies, static.colliders, timestep=TIMESTEP)
                 if self.scene.spec.settle.stepper == "mujoco"
                 else WarpWorld(
                     bodies,
-                    ground.colliders,
+                    static.colliders,
                     timestep=TIMESTEP,
                     capacity=capacity,
-                    contact_finder=ground.contact_finder,
+                    contact_finder=static.contact_finder,
                 )
             )
         return self._worlds[key]
@@ -387,7 +388,7 @@ class Drop:
             self._parts[id(asset.mesh)] = make_part(asset, progress)
         return self._parts[id(asset.mesh)]
 
-    def _check_given_poses(self, ground: Ground) -> None:
+    def _check_given_poses(self, static: StaticScene) -> None:
         """Refuse start poses of the scene file that overlap one another or a collider.
 
         The simulation would push such objects apart.
@@ -396,7 +397,7 @@ class Drop:
         for entry, spec in enumerate(self.scene.spec.objects):
             for number, pose in enumerate(spec.poses):
                 keys[self._placed(self.scene.pools[entry][0], pose_matrix(pose))] = f"objects[{entry}].poses[{number}]"
-        for pair in all_clearances(list(keys), ground.obstacles, reach=MAX_MEASURED_GAP):
+        for pair in all_clearances(list(keys), static.obstacles, reach=MAX_MEASURED_GAP):
             if -pair.distance > _MAX_START_OVERLAP:
                 other = keys.get(pair.second, f"collider {pair.second.name!r}")
                 raise InputError(
@@ -409,11 +410,11 @@ class Drop:
         assets: Sequence[int],
         rng: np.random.Generator,
         given: Sequence[Float64Array | None] = (),
-        ground: int = 0,
+        number: int = 0,
         regions: Sequence[int] | None = None,
         arrangements: Sequence[Arrangement] | None = None,
     ) -> Float64Array:
-        """Draw start poses (N, 4, 4) above a ground, see :func:`mitsplat.physics.placement.draw_poses`.
+        """Draw start poses (N, 4, 4) in static scene ``number``, see :func:`mitsplat.physics.placement.draw_poses`.
 
         ``arrangements`` are those of all regions; the first of the scene file if None.
 
@@ -422,7 +423,7 @@ class Drop:
         """
         items = self._items(assets, given, regions)
         region, arrangements = self.scene.spec.region, arrangements or self._arrangements(())
-        poses = self._place(items, ground, rng, arrangements)
+        poses = self._place(items, number, rng, arrangements)
         if poses is not None:
             return poses
         if self.scene.spec.regions:
@@ -435,18 +436,19 @@ class Drop:
         raise InputError(
             f"{self.scene.path}: region must be large enough to hold all objects of a layout without overlap "
             f"(got {len(assets)} objects in {size[0]:.3g} x {size[1]:.3g} x {size[2]:.3g} m"
-            f"{self._describe_obstruction(self._grounds[ground].obstacles)}, settle.arrangement {arrangements[0]})"
+            f"{self._describe_obstruction(self._static_scenes[number].obstacles)}, "
+            f"settle.arrangement {arrangements[0]})"
         )
 
     def _place(
-        self, items: Sequence[Item], ground: int, rng: np.random.Generator, arrangements: Sequence[Arrangement]
+        self, items: Sequence[Item], number: int, rng: np.random.Generator, arrangements: Sequence[Arrangement]
     ) -> Float64Array | None:
         settle = self.scene.spec.settle
         regions = [
             (region, arrangement)
             for (region, _), arrangement in zip(self.scene.spec.all_regions, arrangements, strict=True)
         ]
-        return draw_poses(items, self._grounds[ground].obstacles, regions, rng, settle.yaw, settle.turned_over)
+        return draw_poses(items, self._static_scenes[number].obstacles, regions, rng, settle.yaw, settle.turned_over)
 
     def _items(
         self, assets: Sequence[int], given: Sequence[Float64Array | None], regions: Sequence[int] | None

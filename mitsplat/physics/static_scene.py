@@ -22,7 +22,7 @@ from mitsplat.scene.walls import PILE_HEIGHT, enclosed_bounds, enclosure_box, wa
 
 
 @dataclass(frozen=True, eq=False)
-class Ground:
+class StaticScene:
     """Static scene; colliders and obstacles are parallel.
 
     Attributes:
@@ -38,9 +38,9 @@ class Ground:
     walls: tuple[Float64Array, Float64Array]
 
 
-def make_ground(
+def make_static_scene(
     scene: Scene, bodies: Sequence[Body], surroundings: Asset | None, progress: Note, layout: int | None = None
-) -> Ground:
+) -> StaticScene:
     """Build the static scene from colliding shapes and, optionally, surroundings.
 
     Args:
@@ -84,7 +84,7 @@ def make_ground(
         inner.append(enclosure_box({names[wall]: boxes[wall] for wall in beside}))
     outer_low, outer_high = np.array(bounds).swapaxes(0, 1)
     inner_low, inner_high = np.array(inner).swapaxes(0, 1)
-    return Ground(
+    return StaticScene(
         tuple(colliders),
         tuple(obstacles),
         ContactFinder(all_pieces(bodies, colliders)),

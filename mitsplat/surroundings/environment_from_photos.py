@@ -34,7 +34,7 @@ from mitsplat.surroundings.coverage import (
 )
 from mitsplat.surroundings.depth_views import SurfacePoints, depth_views, surface_points
 from mitsplat.surroundings.floaters import remove_floaters
-from mitsplat.surroundings.ready_scene import Region, scene_text
+from mitsplat.surroundings.ready_scene import Rectangle, scene_text
 from mitsplat.surroundings.removal import RemovedObject, remove_objects
 from mitsplat.surroundings.supports import Support, find_supports, flatten_mesh
 
@@ -218,7 +218,7 @@ def _mesh(
     return flatten_mesh(mesh, supports, _FLATTEN_RANGE * scale)
 
 
-def _region(coverage: Coverage, support: Support, factor: float) -> Region | None:
+def _region(coverage: Coverage, support: Support, factor: float) -> Rectangle | None:
     """Return the largest free rectangle of the support in its frame [m or units]."""
     cells = free_rectangle(coverage.free)
     if cells is None:
@@ -232,7 +232,7 @@ def _rows(
     supports: Sequence[Support],
     coverage: Coverage,
     holes: Sequence[Hole],
-    region: Region | None,
+    region: Rectangle | None,
     factor: float,
     unit: str,
 ) -> dict[str, str]:
@@ -293,7 +293,7 @@ def _mean_psnr(views: Sequence[HeldOutView], fitted: Splats | None) -> float:
 
 
 def _findings(
-    coverage: Coverage, holes: Sequence[Hole], region: Region | None, factor: float, unit: str, *, metric: bool
+    coverage: Coverage, holes: Sequence[Hole], region: Rectangle | None, factor: float, unit: str, *, metric: bool
 ) -> list[str]:
     found = []
     if coverage.hidden.mean() > _MAX_HIDDEN_SHARE:

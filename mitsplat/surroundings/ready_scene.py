@@ -25,14 +25,14 @@ _BOX_THICKNESS = 0.04
 
 _FOLDER = "{folder}"
 
-Region = tuple[float, float, float, float]
+Rectangle = tuple[float, float, float, float]
 """Rectangle: least and largest x, least and largest y [m]."""
 
 
 def scene_text(
     name: str,
     supports: Sequence[Support],
-    free: Region,
+    free: Rectangle,
     cameras: Sequence[Camera],
 ) -> str:
     """Return the text of a scene file, with ``{folder}`` in place of the name of the asset's folder.

@@ -45,7 +45,7 @@ class _Message(BaseModel):
     model_config = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)
 
 
-class _Camera(_Message):
+class _CameraPose(_Message):
     type: Literal["ViewerCameraMessage"]
     wxyz: _Rotation
     position: _Vector
@@ -108,7 +108,9 @@ class _HandleDrag(_Message):
 
 
 _EXPECTED: TypeAdapter[Any] = TypeAdapter(
-    Annotated[_Camera | _Control | _NodeClick | _SceneClick | _HandleMove | _HandleDrag, Field(discriminator="type")]
+    Annotated[
+        _CameraPose | _Control | _NodeClick | _SceneClick | _HandleMove | _HandleDrag, Field(discriminator="type")
+    ]
 )
 
 
@@ -124,7 +126,7 @@ def is_expected(message: str | bytes) -> bool:
 
 
 @dataclass
-class Pool:
+class MessageThreads:
     """Threads that handle messages.
 
     Attributes:
@@ -145,7 +147,7 @@ class Pool:
 class Connection(ServerConnection):  # type: ignore[misc]  # of the extra `view`, which mypy does not read
     """Connection of a browser that receives only expected messages."""
 
-    def __init__(self, *args: Any, pool: Pool, **options: Any) -> None:
+    def __init__(self, *args: Any, pool: MessageThreads, **options: Any) -> None:
         super().__init__(*args, **options)
         self._pool = pool
 

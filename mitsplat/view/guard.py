@@ -20,7 +20,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from mitsplat.errors import InputError, MissingResourceError
-from mitsplat.view.client_messages import MAX_MESSAGE_BYTES, Connection, Pool
+from mitsplat.view.client_messages import MAX_MESSAGE_BYTES, Connection, MessageThreads
 
 if TYPE_CHECKING:
     from websockets.asyncio.server import ServerConnection
@@ -105,7 +105,7 @@ class Guard:
 
 
 @contextmanager
-def guarded(guard: Guard) -> Iterator[Pool]:
+def guarded(guard: Guard) -> Iterator[MessageThreads]:
     """Make servers of ``websockets`` that start in this context apply the guard.
 
     Yields:
@@ -118,7 +118,7 @@ def guarded(guard: Guard) -> Iterator[Pool]:
     from websockets.datastructures import Headers
     from websockets.http11 import Request
 
-    start, started, pool = server.serve, [], Pool()
+    start, started, pool = server.serve, [], MessageThreads()
 
     def serve(
         *args: Any, process_request: Callable[[ServerConnection, Request], Response | None], **options: Any

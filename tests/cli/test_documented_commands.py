@@ -58,7 +58,7 @@ SMALLER = {
     "chart": ["-n", "1", "--size", "32x18"],
     "bake": ["--gaussians", "60"],
     "capture": ["--frames", "17"],
-    "fit": ["--gaussians", "200", "--iterations", "20", "--edge", "64"],
+    "fit": ["--gaussians", "200", "--iterations", "20", "--max-size", "64"],
     "mesh": ["--faces", "300", "--voxels", "48"],
     "import": ["--faces", "300", "--voxels", "48"],
     "split": ["--folds", "2"],

@@ -32,12 +32,12 @@ from tests.conftest import box_asset
 def test_fit_passes_every_option_on(fit_capture: Calls, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     status = run(
         "fit", "photos", "-o", tmp_path, "--gaussians", 70, "--iterations", 80,
-        "--budget", "1.5min", "--target-psnr", 27, "--edge", 90, "--sh-degree", 2, "--seed", 4, "--overwrite",
+        "--budget", "1.5min", "--target-psnr", 27, "--max-size", 90, "--sh-degree", 2, "--seed", 4, "--overwrite",
     )  # fmt: skip
     assert status == 0
     assert fit_capture.args[:2] == (Path("photos"), tmp_path) and fit_capture.kwargs["overwrite"]
     assert fit_capture.args[2] == FitSettings(
-        gaussians=70, iterations=80, budget=90.0, target_psnr=27, size=90, sh_degree=2, seed=4,
+        gaussians=70, iterations=80, budget=90.0, target_psnr=27, max_size=90, sh_degree=2, seed=4,
     )  # fmt: skip
     assert "(12 Gaussians; 1 held-out photos: 28.00 dB, SSIM 0.900)" in capsys.readouterr().out
     fit_capture.kwargs["progress"](FitProgress(40, 0.5, 24.5, 23.0, 60))

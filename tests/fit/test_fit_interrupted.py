@@ -26,7 +26,7 @@ from mitsplat.reconstruct.reconstruct import AssetJob
 from tests.fit.test_fit import SMALL, photograph
 from tests.reconstruct.test_reconstruct import GOOD
 
-TINY = replace(SMALL, gaussians=40, iterations=6, refine_every=2, sh_degree=0, size=64)
+TINY = replace(SMALL, gaussians=40, iterations=6, refine_every=2, sh_degree=0, max_size=64)
 NEW = replace(TINY, seed=1, target_psnr=60.0)
 
 CHILD = """

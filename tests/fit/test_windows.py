@@ -62,11 +62,11 @@ def test_a_window_has_the_pixels_of_the_photo(photos: list[Photo]) -> None:
 
 def test_a_window_is_scaled_to_the_size_of_the_fit(photos: list[Photo]) -> None:
     depth = np.arange(20_000, dtype=np.float32).reshape(100, 200)
-    view = _training_view(photos[1], FitSettings(size=80), depth, (50, 20, 100, 60))
+    view = _training_view(photos[1], FitSettings(max_size=80), depth, (50, 20, 100, 60))
     assert (view.camera.width, view.camera.height, view.half.camera.width) == (80, 48, 40)
     assert view.camera.fx == pytest.approx(0.8 * photos[1].camera.fx)
     assert view.inverse_depth is not None and view.inverse_depth.shape == (48, 80)
     small = depth[::2, ::2]  # half the resolution of the photo
     np.testing.assert_array_equal(crop_map(small, photos[1].camera, (50, 20, 100, 60))[::2, ::2], small[10:40, 25:75])
-    whole = _training_view(photos[1], FitSettings(size=80))
+    whole = _training_view(photos[1], FitSettings(max_size=80))
     assert (whole.camera.width, whole.camera.height) == (80, 40)

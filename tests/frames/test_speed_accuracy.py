@@ -111,7 +111,20 @@ def test_chart_command_writes_table_csv_and_picture(
     out = tmp_path / "chart.png"
     result = CliRunner().invoke(
         app,
-        ["chart", str(splat_file), "--size", "48x32", "-n", "1", "--tolerance", "0", "--at", "0", "-o", str(out)],
+        [
+            "chart",
+            str(splat_file),
+            "--size",
+            "48x32",
+            "-n",
+            "1",
+            "--tolerance",
+            "0",
+            "--order-tolerance",
+            "0",
+            "-o",
+            str(out),
+        ],
     )
     assert result.exit_code == 0, result.output
     assert "exact *" in result.output

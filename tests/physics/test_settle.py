@@ -63,7 +63,10 @@ def test_drawn_poses_are_uniform_and_do_not_overlap(scene_data, write_scene):
         bounds = np.stack([item.bounds for item in placed])
         assert (bounds >= np.array(scene_data["region"]["min"]) - 1e-9).all()
         assert (bounds <= np.array(scene_data["region"]["max"]) + 1e-9).all()
-        assert min(pair.distance for pair in all_clearances(placed, drop._grounds[0].obstacles, reach=0.005)) > 0.0009
+        assert (
+            min(pair.distance for pair in all_clearances(placed, drop._static_scenes[0].obstacles, reach=0.005))
+            > 0.0009
+        )
     rotations = np.concatenate(rotations)
     # Haar measure: every column is uniform on the sphere, so its z is uniform (Archimedes); the angle t has
     # density (1 - cos t) / pi.

@@ -20,7 +20,7 @@ from mitsplat.geometry.camera import Camera
 from mitsplat.images.colour import encode_srgb
 from mitsplat.reconstruct.asset_evaluation import Verdict
 from mitsplat.reconstruct.materials.capture_light import CaptureLight, require_light_frame
-from mitsplat.reconstruct.materials.estimation import MaterialEstimate, Region, estimate_materials
+from mitsplat.reconstruct.materials.estimation import MaterialEstimate, MaterialRegion, estimate_materials
 from mitsplat.reconstruct.pipeline import asset_pipeline as pipeline
 from mitsplat.reconstruct.reconstruct import AssetJob, Reconstruction, ReconstructSettings
 from mitsplat.scene.spec.light_spec import AreaLight, EnvironmentLight, LightDraw
@@ -121,7 +121,7 @@ def test_wrong_lights_explain_the_photos_worse_than_captured_colours(photographe
 
 def estimate(confidence: float, explained: float = 0.5) -> MaterialEstimate:
     """Return an estimate of one region with these figures."""
-    region = Region((0.5, 0.4, 0.2), 1.0, 0.3, confidence, 1.0)
+    region = MaterialRegion((0.5, 0.4, 0.2), 1.0, 0.3, confidence, 1.0)
     place = np.zeros(1, dtype=np.int64)
     return MaterialEstimate((region,), np.zeros((1, 3)), np.array([region.colour]), place, explained)
 

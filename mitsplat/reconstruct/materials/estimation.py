@@ -60,7 +60,7 @@ _NOISE = 0.1, 0.01
 
 
 @dataclass(frozen=True)
-class Region:
+class MaterialRegion:
     """Surface of one material.
 
     Attributes:
@@ -97,7 +97,7 @@ class MaterialEstimate:
             the light instead of a common radiance. It is small or negative if the light is wrong.
     """
 
-    regions: tuple[Region, ...]
+    regions: tuple[MaterialRegion, ...]
     points: Float64Array
     colours: Float64Array
     region: Int64Array
@@ -133,7 +133,7 @@ class MaterialEstimate:
         return replace(splats, sh=((colours[:, None] - 0.5) / SH_C0).astype(np.float32), materials=materials)
 
 
-class _Fit(NamedTuple):
+class _RegionFit(NamedTuple):
     """Base colours (P, 3), robust mean errors (P,), and the weights (P,) of the base colours in the data."""
 
     colours: Float64Array
@@ -252,7 +252,7 @@ def _mix(traced: Reflectance, metallic: float, place: float) -> tuple[Float64Arr
 
 def _fit_colours(
     seen: Observations, material: tuple[Float64Array, Float64Array], colour: Float64Array | None = None
-) -> _Fit:
+) -> _RegionFit:
     """Fit the base colour of every point by iteratively reweighted least squares with Cauchy's loss.
 
     If ``colour`` (3,) is given, it is the base colour of all points.
@@ -273,7 +273,7 @@ def _fit_colours(
         square = np.where(clipped & (excess > 0), 0, excess**2 * precision)
         weight = precision * ~(clipped & (excess > 0)) / (1 + square)
     errors = np.add.reduceat(np.log1p(square).mean(axis=1), starts) / counts
-    return _Fit(colours, errors, sums)
+    return _RegionFit(colours, errors, sums)
 
 
 def _members(cluster: Int64Array, number: int, clear: BoolArray) -> Int64Array:
@@ -310,7 +310,7 @@ def _merge(cluster: Int64Array, errors: Float64Array, clear: BoolArray) -> Int64
     return found
 
 
-def _region(rows: Int64Array, errors: Float64Array, seen: Observations, traced: Reflectance) -> Region:
+def _region(rows: Int64Array, errors: Float64Array, seen: Observations, traced: Reflectance) -> MaterialRegion:
     """Return the material of the points ``rows``."""
     table = errors[rows].mean(axis=0)
     start = np.unravel_index(table.argmin(), table.shape)
@@ -336,7 +336,7 @@ def _region(rows: Int64Array, errors: Float64Array, seen: Observations, traced: 
     fit = _fit_colours(observed, _mix(own, metallic, place))
     metal = _METALLIC >= 0.5
     other = table[~metal if metallic >= 0.5 else metal].min()
-    return Region(
+    return MaterialRegion(
         colour=tuple(np.median(fit.colours, axis=0).tolist()),
         metallic=float(metallic),
         roughness=float(np.interp(place, np.arange(len(_ROUGHNESS)), _ROUGHNESS)),

@@ -24,7 +24,7 @@ _LOBE_LATTICE, _LIGHT_LATTICE, _OPEN_LATTICE = (55, 34), (377, 233), (89, 55)
 
 
 @dataclass(frozen=True, eq=False)
-class PointLight:
+class IncidentLight:
     """Samples of the emitters at N points, M for each.
 
     Attributes:
@@ -102,7 +102,7 @@ class LitMesh:
         covered = dr.select(hit.is_valid() & (hit.prim_index < self._object_faces), mi.Float(1), 0)
         return 1 - np.array(dr.block_sum(covered, samples), dtype=np.float64) / samples
 
-    def light(self, points: Float64Array, normals: Float64Array) -> PointLight:
+    def light(self, points: Float64Array, normals: Float64Array) -> IncidentLight:
         """Return the light that arrives at points (N, 3) with unit normals (N, 3)."""
         samples, place, normal = _LIGHT_LATTICE[0], _point(points), _vector(normals)
         lane = dr.arange(mi.UInt32, len(points) * samples)
@@ -118,12 +118,12 @@ class LitMesh:
         total = direct + dr.pi * self._reflected(upward)
         irradiance = mi.Color3f(*[dr.block_sum(channel, samples) / samples for channel in total])
         arriving = direct / dr.maximum(dr.dot(si.n, beam.direction), 1e-6)
-        light = PointLight(place, normal, beam.direction, arriving, beam.density, irradiance)
+        light = IncidentLight(place, normal, beam.direction, arriving, beam.density, irradiance)
         dr.eval(light.direction, light.arriving, light.density, light.irradiance)
         return light
 
     def reflectance(
-        self, light: PointLight, row: Int64Array, to_camera: Float64Array, roughness: Sequence[float], seed: int
+        self, light: IncidentLight, row: Int64Array, to_camera: Float64Array, roughness: Sequence[float], seed: int
     ) -> Reflectance:
         """Return the light that points reflect towards cameras.
 

@@ -101,7 +101,7 @@ class Motion(StrictModel):
     exposure: PositiveRange = Field(description="Range of exposure times [s], drawn for every view.")
 
 
-class Viewpoint(StrictModel):
+class CameraKeys(StrictModel):
     """Keys that all kinds of cameras have."""
 
     intrinsics: Intrinsics = Field(Intrinsics(fov_x=60), description="Lens and sensor geometry.")
@@ -126,7 +126,7 @@ class PoseKey(StrictModel):
         return self
 
 
-class CameraPath(Viewpoint):
+class CameraPath(CameraKeys):
     """Views evenly spaced in time on a smooth path through key poses, the same in every layout."""
 
     kind: Literal["path"] = Field("path", description="Path through key poses.")
@@ -151,7 +151,7 @@ def _rigid(matrix: tuple[Row, Row, Row, Row]) -> tuple[Row, Row, Row, Row]:
     return rows
 
 
-class CameraFixed(Viewpoint):
+class CameraFixed(CameraKeys):
     """Camera that stands still, such as one on a robot cell: the same view in every image, except for jitter."""
 
     kind: Literal["fixed"] = Field("fixed", description="Camera that stands still.")
@@ -206,7 +206,7 @@ class CameraFixed(Viewpoint):
         return np.array(self.world_from_camera, dtype=np.float64)
 
 
-class CameraOrbit(Viewpoint):
+class CameraOrbit(CameraKeys):
     """Views evenly spaced on a horizontal circle, the same in every layout."""
 
     kind: Literal["orbit"] = Field("orbit", description="Horizontal circle around a target.")
@@ -245,7 +245,7 @@ class Truncation(StrictModel):
     share: Unit = Field(description="Target share of truncated objects among the labelled objects in view.")
 
 
-class CameraHemisphere(Viewpoint):
+class CameraHemisphere(CameraKeys):
     """Random views, uniform by area on spheres around a target."""
 
     kind: Literal["hemisphere"] = Field("hemisphere", description="Random views around a target.")

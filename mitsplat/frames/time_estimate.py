@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 TIMED_FRAMES = 3
-"""Number of frames of a run after which the first estimate of its time is corrected."""
+"""Number of images after which a run first states its time; the first image of a process also compiles kernels."""
 CORRECTED = 0.5
 """Later estimates are reported if they are lower than this share of the last one: with several processes, the first
-image of each compiles kernels."""
+images of each compile kernels."""
 
 
 class RunTime:
@@ -30,8 +30,8 @@ class RunTime:
         """Add the seconds of the stages of an image.
 
         Returns:
-            The estimate after the first image, after ``TIMED_FRAMES`` images, and after any later one that shows that
-            the run takes much less time; otherwise an empty string.
+            The estimate after ``TIMED_FRAMES`` images, and after any later image that shows that the run takes much
+            less time; otherwise an empty string.
         """
         settle = seconds.get("settle", 0.0)
         image = sum(seconds.values()) - settle
@@ -40,11 +40,10 @@ class RunTime:
         self._timed += 1
         total = self._layouts * self._settle + self._images * self._image
         much_less = self._timed > TIMED_FRAMES and total < CORRECTED * self._reported
-        if self._images == 1 or not (self._timed in (1, TIMED_FRAMES) or much_less):
+        if self._timed != TIMED_FRAMES and not much_less:
             return ""
         self._reported = total
-        text = describe_time(self._layouts, self._settle if self._settles_first else None, self._images, self._image)
-        return f"{text} (the first image of a process also compiles kernels)" if self._timed == 1 else text
+        return describe_time(self._layouts, self._settle if self._settles_first else None, self._images, self._image)
 
 
 def describe_time(layouts: int, settle: float | None, images: int, image: float) -> str:

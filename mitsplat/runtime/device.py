@@ -118,7 +118,7 @@ def use_shared_device(kind: Kind, threads: int | None = None) -> None:
         kind: Kind of the device.
         threads: Number of threads on a CPU, at least MIN_THREADS; None for one per core.
     """
-    import cv2
+    import cv2  # takes a tenth of a second, which only processes of a pool need
 
     use_device(kind)
     cv2.setNumThreads(1)

@@ -6,7 +6,6 @@ Each command imports its dependencies inside its function, so that all other com
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import suppress
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -125,12 +124,17 @@ def _trial_run(path: Path, *, allow_outside: bool) -> Iterator[Finding]:
     """Yield the result of a trial run of a scene, unless the scene is refused."""
     from mitsplat.checks.time_check import measure_run
     from mitsplat.dataset.preflight import run_faults
+    from mitsplat.findings import Finding
     from mitsplat.scene.loading.scene_loading import load_scene
 
     scene = load_scene(path, allow_outside=allow_outside)
     if not any(run_faults(scene)):
-        with suppress(InputError):  # reported by the checks before
+        try:
             yield from measure_run(scene)
+        except InputError as error:
+            yield Finding(
+                "trial run", False, str(error).removeprefix(f"{path}: "), "correct this first, or the problems above"
+            )
 
 
 def audit(dataset: DatasetFolder) -> None:

@@ -278,12 +278,16 @@ def scene_warnings(scene: Scene) -> Iterator[Finding]:
     cameras = [plan.camera for plan in plans]
     inside = [name for camera in cameras if (name := enclosing_shape(scene, camera.centre))]
     low, high = _reachable_box(scene)
-    blind = sum(not sees(camera, low, high) for camera in cameras)
+    blind = [camera for camera in cameras if not sees(camera, low, high)]
+    remedy = "move camera, its keys or its ranges: such images have no labels"
+    if blind and distance_to_box(blind[0].centre, low, high) > FAR:
+        remedy += "; is a position in millimetres?"
     yield Finding(
         "views",
         not inside and not blind,
-        f"of {len(cameras)} views {len(inside)} are from inside of a shape, {blind} see no place where objects can be",
-        "move camera, its keys or its ranges: such images have no labels",
+        f"of {len(cameras)} views {len(inside)} are from inside of a shape, {len(blind)} see no place where objects "
+        "can be",
+        remedy,
     )
     if spec.output.views > 1 and spec.background is None and _is_repeated(scene, plans[0]):
         text = "output.views: the images of a layout show the same view in the same light, and differ in noise alone"

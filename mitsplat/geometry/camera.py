@@ -381,7 +381,7 @@ def look_at_pose(eye: npt.ArrayLike, target: npt.ArrayLike, up: npt.ArrayLike = 
         raise ValueError(f"a camera must look at a point other than its own position (got {start.tolist()} twice)")
     forward = forward / distance
     right = _cross(forward, upper)
-    if np.linalg.norm(right) < 1e-6 * max(1.0, float(np.linalg.norm(upper))):
+    if np.linalg.norm(right) <= 1e-6 * float(np.linalg.norm(upper)):
         right = _cross(forward, np.eye(3)[1 if abs(forward[1]) < 0.9 else 2])
     right /= np.linalg.norm(right)
     pose = np.eye(4)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import time
+from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -11,12 +12,15 @@ from typing import Any
 
 import pytest
 
-from mitsplat.checks import time_check
+from mitsplat.checks import path_checks, time_check
 from mitsplat.dataset.write import write_dataset
+from mitsplat.errors import InputError
+from mitsplat.findings import Finding
 from mitsplat.frames import time_estimate
 from mitsplat.geometry.camera import Camera
 from mitsplat.scene.scene import Scene
-from tests.conftest import BOTH, small_scene
+from tests.cli.typed import run
+from tests.conftest import BOTH, WriteScene, small_scene
 from tests.drawn import large_boxes, render_boxes, scatter_boxes
 
 
@@ -105,3 +109,18 @@ def test_an_estimate_from_first_images_of_several_processes_is_corrected_later()
     texts = [run.add({"trace": seconds}) for seconds in (50.0, 52.0, 51.0, 48.0, 2.0, 1.9, 2.0)]
     assert [bool(text) for text in texts] == [False, False, True, False, True, False, False]
     assert texts[4].startswith("about 3 min in one process: 100 images of 2 s")
+
+
+def test_the_reason_why_trial_images_failed_is_reported(
+    scene_data: dict[str, Any], write_scene: WriteScene, monkeypatch: pytest.MonkeyPatch, capsys: Any
+) -> None:
+    path = write_scene(scene_data)
+
+    def fail(scene: Scene) -> Iterator[Finding]:
+        raise InputError(f"{path}: camera: the eye of frame 0 must not be in a solid")
+        yield
+
+    monkeypatch.setattr(path_checks, "check_path", lambda path, allow_outside: iter(()))
+    monkeypatch.setattr(time_check, "measure_run", fail)
+    assert run("check", path) == 1
+    assert "look  trial run: camera: the eye of frame 0 must not be in a solid" in capsys.readouterr().out

@@ -73,6 +73,7 @@ def test_jitter_moves_and_turns_a_fixed_camera_in_every_image(
         ([0, 0, 1], [0, 0, 1], [0, 1, 0]),
         ([0, 1, 0], [0, 1, 0], [0, 0, 1]),
         ([1, 0, 0], [0, 0, -1], [1, 0, 0]),
+        ([1e-8, 0, 0], [0, 0, -1], [1, 0, 0]),
     ],
 )
 def test_views_along_the_upper_direction_follow_the_stated_rule(
@@ -253,3 +254,20 @@ def test_a_fisheye_without_coefficients_is_not_a_pinhole(scene_data: dict[str, A
     assert "bop must have a camera without lens distortion (got fisheye [0.0, 0.0, 0.0, 0.0])" in refusal(
         write_scene(scene_data)
     )
+
+
+@pytest.mark.parametrize(
+    ("matrix", "rule"),
+    [
+        (POSE.ravel(), "(got 16 numbers): write each row as a list"),
+        (POSE[:3].ravel(), "(got 12 numbers): write each row as a list"),
+        (POSE[:3], "(got 3 rows): add the row [0, 0, 0, 1]"),
+        (POSE[:3, :3], "(got 3 rows of 3): append the centre of the camera"),
+    ],
+)
+def test_other_forms_of_a_matrix_are_refused_with_the_way_to_write_it(
+    matrix: np.ndarray, rule: str, scene_data: dict[str, Any], write_scene: WriteScene
+) -> None:
+    camera = {"kind": "fixed", "world_from_camera": matrix.tolist()}
+    message = refusal(write_scene(scene_data | {"camera": camera}))
+    assert "camera.world_from_camera: must be four rows of four numbers" in message and rule in message

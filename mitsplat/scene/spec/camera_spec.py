@@ -144,6 +144,23 @@ def _rows(matrix: object) -> object:
     return tuple(map(_rows, matrix)) if isinstance(matrix, list | tuple) else matrix
 
 
+def _four_rows(matrix: object) -> object:
+    """Convert lists and arrays to tuples, and refuse other forms of a matrix with the way to write it."""
+    rows = _rows(matrix)
+    if isinstance(rows, tuple):
+        sizes = {len(row) if isinstance(row, tuple) else 0 for row in rows}
+        if sizes == {0} and len(rows) in (12, 16):
+            raise ValueError(f"must be four rows of four numbers (got {len(rows)} numbers): write each row as a list")
+        if len(rows) == 3 and sizes == {4}:
+            raise ValueError("must be four rows of four numbers (got 3 rows): add the row [0, 0, 0, 1]")
+        if len(rows) == 3 and sizes == {3}:
+            raise ValueError(
+                "must be four rows of four numbers (got 3 rows of 3): append the centre of the camera to the rows of "
+                "the rotation, and add the row [0, 0, 0, 1]"
+            )
+    return rows
+
+
 def _rigid(matrix: tuple[Row, Row, Row, Row]) -> tuple[Row, Row, Row, Row]:
     """Refuse a matrix that is no rigid transform, and correct rounded entries of its rotation."""
     rows: tuple[Row, Row, Row, Row]
@@ -158,7 +175,7 @@ class CameraFixed(CameraKeys):
     world_from_camera: Annotated[
         tuple[Row, Row, Row, Row] | None,
         AfterValidator(lambda matrix: matrix if matrix is None else _rigid(matrix)),
-        BeforeValidator(_rows, json_schema_input_type=tuple[Row, Row, Row, Row] | None),
+        BeforeValidator(_four_rows, json_schema_input_type=tuple[Row, Row, Row, Row] | None),
     ] = Field(
         None,
         description="Pose of the camera as the rows of a rigid 4x4 matrix [m]. Its columns are the camera's x axis "

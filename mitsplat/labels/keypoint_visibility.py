@@ -83,5 +83,5 @@ def _keypoint_rays(points: Float64Array, camera: Camera) -> tuple[Float64Array, 
     distance = np.linalg.norm(way, axis=1)[:, None, None]
     beside = np.array([right * 0, right, -right, down, -down])
     ways = way[:, None] + _RAY_OFFSET * distance * beside
-    starts = camera.centre + ways * (camera.near / (ways @ forward))[..., None]
+    starts = camera.centre + ways * (camera.near / np.maximum(ways @ forward, camera.near))[..., None]
     return starts, camera.centre + ways * (1 - RAY_TOLERANCE)

@@ -16,6 +16,7 @@ from mitsplat.frames.frame import Renderer
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.gaussians.surfels import place_surfels
 from mitsplat.geometry.camera import Camera
+from mitsplat.labels.keypoint_visibility import _keypoint_rays
 from mitsplat.labels.labels import HIDDEN, UNLABELLED, VISIBLE
 from mitsplat.scene.layout import Layout
 from mitsplat.scene.loading.scene_loading import load_scene
@@ -184,3 +185,9 @@ def test_a_thin_plate_hides_its_far_side_but_not_the_centre_of_its_hole(scene: A
     assert [rim[i] for i in np.flatnonzero(upper)] == [VISIBLE] * upper.sum()
     assert [rim[i] for i in np.flatnonzero(~upper & outer)] == [HIDDEN] * (~upper & outer).sum()
     assert centre == VISIBLE
+
+
+def test_rays_to_keypoints_beside_the_camera_are_finite() -> None:
+    camera = Camera.look_at((0, 0, 1), (0, 0, 0), width=96, height=72, fov_x=60)
+    rays = _keypoint_rays(np.array([(0.2, 0.1, 1.0), (0.2, 0.1, 1.5)]), camera)
+    assert np.isfinite(rays).all()

@@ -127,7 +127,8 @@ def read_poses(
     matched = {name: by_name[photo] for name, photo in names.items() if photo in by_name and name in model.cameras}
     if len(matched) < 2:
         first = next(iter(paths))
-        raise InputError(f"{source}: must name at least two of the photos (got {len(matched)}; it names {first})")
+        named = f"it names {first}, and a photo is {next(iter(everything), 'missing')}"
+        raise InputError(f"{source}: must name at least two of the photos (got {len(matched)}; {named})")
     _check_coordinates(source, model)
     upright = _upright_photos(source, model, matched, sized)
     matched |= {name: turn_upright(photo) for name, photo in matched.items() if photo.name in upright}

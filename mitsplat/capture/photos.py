@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import struct
+import unicodedata
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -39,6 +40,9 @@ both directions and stay above it.
 _MAX_CLIPPED = 0.9
 """Fraction of black or white pixels above which a photo is unusable; a white backdrop covers less."""
 
+
+_MIN_BRIGHTEST = 20
+"""Minimum grey value of the brightest pixel of a photo [of 255]. 12-bit values in a file of 16 bits are at most 15."""
 
 _PLAIN = 3
 """Largest difference of a plain background from black or white [of 255]; JPEG changes it that much."""
@@ -81,6 +85,7 @@ class _MeasuredPhoto:
     sharpness: float
     is_cutout: bool
     clipped: tuple[float, float]
+    brightest: int
 
 
 def find_photos(folder: Path, *, but: Path | None = None) -> list[Path]:
@@ -225,7 +230,7 @@ def _prepare(
     if (mask := read_mask(masks, prepared)) is not None:
         regions.append(shown & mask)
     clipped = [(float(np.mean(grey[r] <= 4)), float(np.mean(grey[r] >= 251))) for r in regions if r.any()]
-    return _MeasuredPhoto(prepared, sharp, is_cutout, min(clipped, key=max))
+    return _MeasuredPhoto(prepared, sharp, is_cutout, min(clipped, key=max), int(grey[shown].max()))
 
 
 def alpha_channel(image: Image.Image) -> Image.Image | None:
@@ -256,9 +261,14 @@ def plain_background(rgb: ByteImage, *, without_noise: bool = False) -> BoolArra
 
 
 def mask_files(folder: Path) -> dict[str, Path]:
-    """Return the files of a folder of masks by their lower-case path relative to it."""
+    """Return the files of a folder of masks by their path relative to it, see :func:`_mask_key`."""
     below = sorted(path for path in folder.rglob("*") if path.is_file())
-    return {path.relative_to(folder).as_posix().lower(): path for path in below}
+    return {_mask_key(path.relative_to(folder).as_posix()): path for path in below}
+
+
+def _mask_key(name: str) -> str:
+    """Return the key of :func:`mask_files` for a path: in lower case, with composed letters."""
+    return unicodedata.normalize("NFC", name).lower()
 
 
 def read_mask(files: Mapping[str, Path], photo: Prepared) -> BoolArray | None:
@@ -273,7 +283,7 @@ def read_mask(files: Mapping[str, Path], photo: Prepared) -> BoolArray | None:
     """
     name = Path(photo.name)
     candidates = [f"{photo.name}.png", name.with_suffix(".png").as_posix(), photo.name]
-    path = next((files[file.lower()] for file in candidates if file.lower() in files), None)
+    path = next((files[key] for file in candidates if (key := _mask_key(file)) in files), None)
     if path is None:
         return None
     try:
@@ -328,6 +338,11 @@ def _photo_fault(photo: _MeasuredPhoto, median_sharpness: float) -> str | None:
     black, white = photo.clipped
     if black > _MAX_CLIPPED:
         return f"it is too dark ({black:.0%} of it is black)"
+    if photo.brightest < _MIN_BRIGHTEST:
+        return (
+            f"it is too dark (its brightest pixel has {photo.brightest} of 255): multiply 12-bit values in files of 16 "
+            "bits by 16"
+        )
     if white > _MAX_CLIPPED:
         return f"it is too bright ({white:.0%} of it is white)"
     if photo.sharpness < _MIN_SHARPNESS * median_sharpness:

@@ -80,7 +80,7 @@ def run(job: dict[str, Any], folder: Path) -> None:
     """
     if job["task"] == "read":
         limit_memory(job["memory"])  # damaged files can declare arbitrarily large counts
-        store(folder, [pycolmap.Reconstruction(job["model"])])
+        store(folder, [read_model(Path(job["model"]))])
         return
     images, database = folder / job["images"], folder / "database.db"
     extract(job, images, database, folder)
@@ -94,6 +94,31 @@ def run(job: dict[str, Any], folder: Path) -> None:
     else:
         models = reconstruct(images, database, folder, job["enough"])
         store(folder, models, agreement(models[0], database) if models else {})
+
+
+def read_model(source: Path) -> pycolmap.Reconstruction:
+    """Read a COLMAP model, as text only if it is not there in binary form.
+
+    COLMAP ends the names of text files at their first space, so that they are read here.
+
+    Raises:
+        ValueError: If images of one name have different poses.
+    """
+    model = pycolmap.Reconstruction(str(source))
+    if not all((source / f"{part}.bin").exists() for part in ("cameras", "images", "points3D")):
+        lines = iter((source / "images.txt").read_text(encoding="utf-8").splitlines())
+        for line in lines:
+            if line.strip() and not line.lstrip().startswith("#"):
+                values = line.split(maxsplit=9)
+                model.image(int(values[0])).name = values[9].rstrip()
+                next(lines, None)  # points of the image
+    poses: dict[str, np.ndarray[Any, np.dtype[np.float64]]] = {}
+    for index in model.reg_image_ids():
+        image = model.image(index)
+        pose = image.cam_from_world().matrix()
+        if not np.allclose(poses.setdefault(image.name, pose), pose):
+            raise ValueError(f"two images with different poses have the name {image.name}")
+    return model
 
 
 def write_status(folder: Path, doing: str) -> None:
@@ -298,9 +323,14 @@ def model_arrays(model: pycolmap.Reconstruction) -> dict[str, Any]:
     """Return the model as arrays: photos sorted by name, parameters padded with NaN."""
     ids = sorted(model.points3D)
     row = {point: index for index, point in enumerate(ids)}
-    images = sorted((model.image(index) for index in model.reg_image_ids()), key=lambda image: image.name)
+    by_name = {model.image(index).name: model.image(index) for index in model.reg_image_ids()}
+    images = [by_name[name] for name in sorted(by_name)]
     cameras = [model.camera(image.camera_id) for image in images]
-    seen = [sorted({row[point.point3D_id] for point in image.points2D if point.has_point3D()}) for image in images]
+    # Models from which other programs removed points still refer to them.
+    seen = [
+        sorted({row[point.point3D_id] for point in image.points2D if point.has_point3D() and point.point3D_id in row})
+        for image in images
+    ]
     params = np.full((len(images), 32), np.nan)
     for values, camera in zip(params, cameras, strict=True):
         values[: len(camera.params)] = camera.params

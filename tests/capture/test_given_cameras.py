@@ -20,7 +20,7 @@ from mitsplat.capture import known_poses as poses
 from mitsplat.capture import structure_from_motion as sfm
 from mitsplat.capture.capture import Capture
 from mitsplat.capture.known_poses import read_poses
-from mitsplat.capture.photos import Prepared, prepare_photos, with_orientation
+from mitsplat.capture.photos import Prepared, mask_files, prepare_photos, read_mask, with_orientation
 from mitsplat.capture.pipeline.capture_pipeline import CaptureResult, CaptureSettings, capture_photos
 from mitsplat.errors import InputError
 from mitsplat.geometry.camera import Camera
@@ -393,3 +393,52 @@ def test_an_undecided_half_turn_is_refused_with_a_remedy(
         read_poses(tmp_path, prepared, tmp_path / "work", base=tmp_path / "photos")
     assert "camera of a.png holds before or after the rotation in the EXIF data" in str(raised.value)
     assert "(orientation 3): rotate the pixels or remove the entry" in str(raised.value)
+
+
+def write_text_model(folder: Path, images: dict[int, tuple[str, float]], points: str = "", seen: str = "") -> Path:
+    """Write a COLMAP model as text: the name and the x coordinate of each image by its id."""
+    folder.mkdir()
+    (folder / "cameras.txt").write_text("1 PINHOLE 64 48 60 60 32 24\n")
+    lines = [f"{number} 1 0 0 0 {x} 0 1 1 {name}\n{seen}\n" for number, (name, x) in images.items()]
+    (folder / "images.txt").write_text("# images\n" + "".join(lines))
+    (folder / "points3D.txt").write_text(points)
+    return folder
+
+
+def test_names_with_spaces_in_a_text_model_are_read_completely(tmp_path: Path) -> None:
+    model = write_text_model(tmp_path / "model", {1: ("front left 1.jpg", 0.0), 2: ("front left ü 2.jpg", 0.5)})
+    assert list(sfm.read_model(model, tmp_path / "work").cameras) == ["front left 1.jpg", "front left ü 2.jpg"]
+
+
+def test_one_name_with_two_poses_is_refused(tmp_path: Path) -> None:
+    images = {1: ("a.jpg", 0.0), 2: ("b.jpg", 0.5), 3: ("a.jpg", 0.0)}
+    twice = write_text_model(tmp_path / "twice", images)
+    assert list(sfm.read_model(twice, tmp_path / "work").cameras) == ["a.jpg", "b.jpg"]
+    differing = write_text_model(tmp_path / "differing", images | {3: ("a.jpg", 0.1)})
+    with pytest.raises(InputError, match=r"two images with different poses have the name a\.jpg"):
+        sfm.read_model(differing, tmp_path / "work")
+
+
+def test_references_to_removed_points_are_left_out(tmp_path: Path) -> None:
+    images = {1: ("a.jpg", 0.0), 2: ("b.jpg", 0.5)}
+    points = "7 0 0 1 10 20 30 0.1 1 0 2 0\n"
+    model = write_text_model(tmp_path / "model", images, points, seen="32 24 7 40 20 8")
+    read = sfm.read_model(model, tmp_path / "work")
+    assert read.points.tolist() == [[0, 0, 1]] and read.seen["a.jpg"].tolist() == [0]
+
+
+def test_a_mask_with_separate_accents_in_its_name_belongs_to_its_photo(tmp_path: Path) -> None:
+    (tmp_path / "masks").mkdir()
+    Image.new("L", (8, 6), 255).save(tmp_path / "masks" / "u\u0308.png")
+    photo = Prepared("\u00fc.jpg", tmp_path / "copy.jpg", (8, 6), 1, ())
+    assert read_mask(mask_files(tmp_path / "masks"), photo) is not None
+
+
+def test_photos_of_12_bits_in_files_of_16_bits_are_rejected(tmp_path: Path) -> None:
+    (tmp_path / "photos").mkdir()
+    noise = np.random.default_rng(0).integers(1300, 4096, (48, 64)).astype(np.uint16)
+    Image.fromarray(noise).save(tmp_path / "photos/dark.png")
+    Image.fromarray(noise * 16).save(tmp_path / "photos/right.png")
+    good, rejected = prepare_photos(tmp_path / "photos", tmp_path / "out", max_size=100)
+    assert [photo.name for photo in good] == ["right.png"]
+    assert "its brightest pixel has 15 of 255" in rejected["dark.png"]

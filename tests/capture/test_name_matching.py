@@ -35,6 +35,7 @@ PLAIN = [f"{number}.jpg" for number in range(3)]
         ("nerf", ["train/r_0", "train/r_1"], ["masks/r_0.png", "train/r_0.png", "train/r_1.png", "test/r_0.png"],
          {"train/r_0": "train/r_0.png", "train/r_1": "train/r_1.png"}),
         ("photos", ["a.png"], ["a.jpg"], {"a.png": "a.jpg"}),
+        ("photos", ["\u00fc.png"], ["u\u0308.png"], {"\u00fc.png": "u\u0308.png"}),
         ("photos", ["a.png", "a.jpg"], ["a.jpg", "a.png"], {"a.png": "a.png", "a.jpg": "a.jpg"}),
         ("photos", ["frame.0001"], ["frame.0001.png", "frame.0002.png"], {"frame.0001": "frame.0001.png"}),
         ("photos", ["0.jpg"], ["0.jpg", "thumbnails/0.jpg"], {"0.jpg": "0.jpg"}),

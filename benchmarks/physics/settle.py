@@ -8,6 +8,7 @@ rest     ten objects for each seed: time to rest, and motion in the next five se
 worlds   layouts per minute of several layouts in one simulation, on ``--device cpu`` or ``cuda:0``, and of MuJoCo in C
          in as many processes as there are cores
 layouts  time of each of the first layouts of the detector's five scenes, with the scans in ``--hope``
+restitution  rebound heights of boxes that fall flat, over e^2 h of the closed form, with both steppers
 share    time of settling added to the images of the shipped workcell at 1280x720 with ten views of each layout
 
 Parts are nuts, bolts, washers, brackets and plates of 10 to 150 mm, in a box of 0.5 x 0.4 m unless stated otherwise.
@@ -37,6 +38,8 @@ from benchmarks.record import figure, recording
 from mitsplat.asset import Asset
 from mitsplat.errors import InputError
 from mitsplat.geometry.decomposition import convex_pieces
+from mitsplat.geometry.mesh import mass_properties
+from mitsplat.physics.friction import GRAVITY, ContactMaterial
 from mitsplat.physics.settle import settle_layout, settle_layouts, warp_settings
 from mitsplat.runtime.cores import usable_cores
 from mitsplat.scene.layout import Layout
@@ -254,6 +257,42 @@ def measure_rest(count: int) -> None:
         )
 
 
+def measure_restitution(count: int) -> None:
+    """Drop ``count`` boxes with each restitution; their heights, 0.1 to 0.4 m, and densities are random."""
+    from mitsplat.physics.worlds import Body, Collider, MujocoWorld, WarpWorld
+
+    side, place = 0.02, np.eye(4)
+    place[2, 3] = -0.05
+    mesh, rng = box((side, side, side)), np.random.default_rng(0)
+    for restitution in (0.3, 0.5, 0.7, 0.9):
+        heights, densities = rng.uniform(0.1, 0.4, count), rng.uniform(800, 7850, count)
+        material, poses = ContactMaterial(0.5, restitution), np.tile(np.eye(4), (count, 1, 1))
+        poses[:, 0, 3], poses[:, 2, 3] = 0.1 * np.arange(count), side / 2 + heights
+        bodies = [Body((mesh,), mass_properties(mesh, (mesh,), density=one), material) for one in densities]
+        table = Collider(material, box=((20.0, 20.0, 0.1), place))
+        for stepper, kind in (("warp", partial(WarpWorld, capacity=2.0)), ("mujoco", MujocoWorld)):
+            world = kind(bodies, [table], timestep=0.002)
+            world.reset(poses)
+            samples = [heights]
+            while world.time < 0.6:
+                world.advance()
+                samples.append(world.poses[:, 2, 3] - side / 2)
+            above = np.array(samples)
+            bounce = (np.diff(above, axis=0) > 0).argmax(axis=0)
+            top = np.where(np.arange(len(above))[:, None] > bounce, above, -1.0).argmax(axis=0)
+            # The parabola through the highest sample after the impact and the next one.
+            high, later = np.take_along_axis(above, np.array([top, top + 1]), axis=0)
+            speed = (later - high) / world.interval + GRAVITY * world.interval / 2
+            ratio = (high + speed**2 / (2 * GRAVITY)) / (restitution**2 * heights)
+            for value, what in ((ratio.mean(), "mean"), ((ratio.min(), ratio.max()), "range")):
+                figure(value, "", stepper, f"restitution {restitution}", what)
+            print(
+                f"{stepper}, e = {restitution}: rebound over e^2 h {ratio.mean():.3f}, "
+                f"{ratio.min():.3f} to {ratio.max():.3f}",
+                flush=True,
+            )
+
+
 def measure_worlds(count: int, device: str) -> None:
     """Time layouts of ten objects in simulations of 1, 8, 64 and 256 worlds, ``count`` at most, on any Warp device.
 
@@ -336,6 +375,7 @@ MEASURES: dict[str, tuple[Callable[[int], None], int]] = {
     "thin": (measure_thin, 50),
     "bin": (measure_bin, 3),
     "rest": (measure_rest, 20),
+    "restitution": (measure_restitution, 20),
     "share": (measure_share, 6),
 }
 

@@ -21,6 +21,8 @@ from mitsplat.images.colour import encode_srgb
 from mitsplat.reconstruct.asset_evaluation import Verdict
 from mitsplat.reconstruct.materials.capture_light import CaptureLight, require_light_frame
 from mitsplat.reconstruct.materials.estimation import MaterialEstimate, MaterialRegion, estimate_materials
+from mitsplat.reconstruct.materials.lit_surfaces import lit_surfaces
+from mitsplat.reconstruct.materials.observations import View
 from mitsplat.reconstruct.pipeline import asset_pipeline as pipeline
 from mitsplat.reconstruct.reconstruct import AssetJob, Reconstruction, ReconstructSettings
 from mitsplat.scene.spec.light_spec import AreaLight, EnvironmentLight, LightDraw
@@ -117,6 +119,29 @@ def test_wrong_lights_explain_the_photos_worse_than_captured_colours(photographe
     other = CaptureLight((AreaLight(position=(-0.5, 0.3, 0.2), target=(0, 0, 0), size=(0.3, 0.3), radiance=20.0),))
     reason = estimate_materials(photographed, mesh, other).shortcoming()
     assert reason is not None and "reduce the error of captured colours" in reason
+
+
+def test_the_table_outside_of_the_photos_reflects_light_on_the_object(photographed: Capture) -> None:
+    """A small matt wall at the edge of the photos receives what a lambertian table reflects under the lights.
+
+    The photographs show the table up to 0.08 m from the centre, and most of this light comes from further away.
+    """
+    mesh = trimesh.util.concatenate(list(balls().values()))
+    surfaces = lit_surfaces(mesh, [View.of(photo, 640) for photo in photographed.photos], LIGHT, floor=0.0, seed=0)
+    walls = np.array([(0.1, 0.0, 0.03), (0.0, 0.1, 0.03), (-0.1, 0.0, 0.03), (0.0, -0.1, 0.03)])
+    normals = walls * (10, 10, 0)
+    received = np.array(surfaces.light(walls, normals).irradiance)[1]
+    line = (np.arange(120) + 0.5) / 120 - 0.5
+    x, y = np.meshgrid(line, line)
+    table = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
+    lit = surfaces.light(table, np.tile([0.0, 0.0, 1.0], (len(table), 1)))
+    radiance = 0.2 / np.pi * np.array(lit.arriving.y * lit.direction.z).reshape(len(table), -1).mean(axis=1)
+    for wall, normal, found in zip(walls, normals, received, strict=True):
+        to_table = table - wall
+        distance = np.linalg.norm(to_table, axis=1)
+        cosine = np.maximum(to_table @ normal, 0) / distance
+        expected = np.sum(radiance * cosine * (wall[2] / distance) / distance**2) / len(table)
+        assert found == pytest.approx(expected, rel=0.05)
 
 
 def estimate(confidence: float, explained: float = 0.5) -> MaterialEstimate:

@@ -9,7 +9,6 @@ move to the region that explains their photographs best.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 import trimesh
@@ -17,7 +16,7 @@ from scipy.cluster.vq import kmeans2
 from scipy.optimize import minimize
 from scipy.spatial import KDTree
 
-from mitsplat.arrays import BoolArray, Float32Array, Float64Array, Int64Array
+from mitsplat.arrays import BoolArray, Float64Array, Int64Array
 from mitsplat.capture.capture import Capture
 from mitsplat.errors import InputError
 from mitsplat.gaussians.spherical_harmonics import SH_C0
@@ -25,15 +24,9 @@ from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.gaussians.splat_materials import SplatMaterials
 from mitsplat.images.colour import encode_srgb
 from mitsplat.reconstruct.materials.capture_light import CaptureLight, require_light_frame
-from mitsplat.reconstruct.materials.observations import (
-    CLIPPED,
-    Observations,
-    View,
-    clear_points,
-    lit_surfaces,
-    observe,
-    sample_surface,
-)
+from mitsplat.reconstruct.materials.colour_fit import fit_colours, mix_materials
+from mitsplat.reconstruct.materials.lit_surfaces import lit_surfaces
+from mitsplat.reconstruct.materials.observations import Observations, View, clear_points, observe, sample_surface
 from mitsplat.reconstruct.materials.surface_light import LitMesh, Reflectance
 from mitsplat.runtime.variant import ensure_variant
 
@@ -52,11 +45,7 @@ _MIN_SHARE = 0.03
 """Share of the points below which a cluster is merged with another."""
 _NEIGHBOURS = 12
 """Number of points over which colours and errors are averaged."""
-_ROUNDS = 4
-"""Rounds of a robust fit."""
 _MIN_VIEWS = 4
-_NOISE = 0.1, 0.01
-"""Standard error of radiance: relative, and absolute."""
 
 
 @dataclass(frozen=True)
@@ -133,14 +122,6 @@ class MaterialEstimate:
         return replace(splats, sh=((colours[:, None] - 0.5) / SH_C0).astype(np.float32), materials=materials)
 
 
-class _RegionFit(NamedTuple):
-    """Base colours (P, 3), robust mean errors (P,), and the weights (P,) of the base colours in the data."""
-
-    colours: Float64Array
-    errors: Float64Array
-    weights: Float64Array
-
-
 def estimate_materials(
     capture: Capture, mesh: trimesh.Trimesh, light: CaptureLight, *, size: int = 640, seed: int = 0
 ) -> MaterialEstimate:
@@ -159,7 +140,7 @@ def estimate_materials(
     ensure_variant()
     require_light_frame(capture)
     views = [View.of(photo, size) for photo in capture.photos if photo.mask is not None]
-    surfaces = lit_surfaces(mesh, views, light, floor=0.0 if capture.table else float(mesh.bounds[0, 2]))
+    surfaces = lit_surfaces(mesh, views, light, floor=0.0 if capture.table else float(mesh.bounds[0, 2]), seed=seed)
     rng = np.random.default_rng(seed)
     points, normals = sample_surface(mesh, _POINTS, seed)
     seen = observe(surfaces, points, normals, views, "object")
@@ -174,14 +155,14 @@ def estimate_materials(
     fitted = np.sort(rng.permutation(len(points))[:_FIT_POINTS])
     observed, _ = seen.select(fitted)
     traced = _trace(surfaces, points[fitted], normals[fitted], observed, _ROUGHNESS, seed)
-    fits = [[_fit_colours(observed, _mix(traced, m, k)) for k in range(len(_ROUGHNESS))] for m in _METALLIC]
+    fits = [[fit_colours(observed, mix_materials(traced, m, k)) for k in range(len(_ROUGHNESS))] for m in _METALLIC]
     errors = np.stack([np.stack([fit.errors for fit in row], axis=1) for row in fits], axis=1)
 
     def reflected(metallic: float, roughness: float) -> tuple[Float64Array, Float64Array]:
-        return _mix(_trace(surfaces, points, normals, seen, np.array([roughness]), seed), metallic, 0)
+        return mix_materials(_trace(surfaces, points, normals, seen, np.array([roughness]), seed), metallic, 0)
 
     best = np.unravel_index(errors.mean(axis=0).argmin(), errors.shape[1:])
-    fit = _fit_colours(seen, reflected(float(_METALLIC[best[0]]), float(_ROUGHNESS[best[1]])))
+    fit = fit_colours(seen, reflected(float(_METALLIC[best[0]]), float(_ROUGHNESS[best[1]])))
     near = KDTree(points).query(points, k=min(_NEIGHBOURS, len(points)))[1]
     cluster = _clusters(fit.colours, near)
     merged = _merge(cluster[fitted], errors, clear[fitted])
@@ -191,11 +172,11 @@ def estimate_materials(
         for number in range(int(merged.max()) + 1)
     ]
     materials = [reflected(found.metallic, found.roughness) for found in regions]
-    fitted_colours = [_fit_colours(seen, material) for material in materials]
+    fitted_colours = [fit_colours(seen, material) for material in materials]
     # Points change to the cluster whose colour explains the photos of their neighbourhood best.
     names = np.unique(cluster)
     means = [np.median(fitted_colours[merged[name]].colours[cluster == name], axis=0) for name in names]
-    loss = [_fit_colours(seen, materials[merged[name]], one).errors for name, one in zip(names, means, strict=True)]
+    loss = [fit_colours(seen, materials[merged[name]], one).errors for name, one in zip(names, means, strict=True)]
     smooth = np.stack(loss, axis=1)[near].mean(axis=1)
     region = merged[names[smooth.argmin(axis=1)]]
     colours = np.empty_like(points)
@@ -219,10 +200,10 @@ def _clusters(colours: Float64Array, near: Int64Array) -> Int64Array:
 def _captured_loss(seen: Observations, near: Int64Array) -> float:
     """Return the mean error of radiances that are equal in all directions, one for each cluster of points."""
     constant = np.ones_like(seen.radiance), np.zeros_like(seen.radiance)
-    radiance = _fit_colours(seen, constant).colours
+    radiance = fit_colours(seen, constant).colours
     cluster = _clusters(radiance, near)
     means = [np.median(radiance[cluster == name], axis=0) for name in np.unique(cluster)]
-    loss = np.stack([_fit_colours(seen, constant, one).errors for one in means], axis=1)
+    loss = np.stack([fit_colours(seen, constant, one).errors for one in means], axis=1)
     return float(loss[near].mean(axis=1).min(axis=1).mean())
 
 
@@ -236,44 +217,6 @@ def _trace(
 ) -> Reflectance:
     light = surfaces.light(points, normals)
     return surfaces.reflectance(light, seen.point, seen.to_camera, roughness.tolist(), seed)
-
-
-def _mix(traced: Reflectance, metallic: float, place: float) -> tuple[Float64Array, Float64Array]:
-    """Return tint and white part (R, 3) of a material; ``place`` is that of its roughness in the grid."""
-    low = min(int(place), traced.tint.shape[1] - 1)
-    high, share = min(low + 1, traced.tint.shape[1] - 1), place - low
-
-    def at(values: Float32Array) -> Float64Array:
-        return np.asarray((1 - share) * values[:, low].astype(np.float64) + share * values[:, high])
-
-    tint = (1 - metallic) * at(traced.diffuse) + metallic * at(traced.tint)
-    return tint, metallic * at(traced.metal) + (1 - metallic) * at(traced.dielectric)
-
-
-def _fit_colours(
-    seen: Observations, material: tuple[Float64Array, Float64Array], colour: Float64Array | None = None
-) -> _RegionFit:
-    """Fit the base colour of every point by iteratively reweighted least squares with Cauchy's loss.
-
-    If ``colour`` (3,) is given, it is the base colour of all points.
-    """
-    tint, white = material
-    starts = np.flatnonzero(np.diff(seen.point, prepend=-1))
-    counts = np.diff(starts, append=len(seen.point))
-    clipped = seen.radiance >= CLIPPED
-    precision = 1 / (_NOISE[0] * seen.radiance + _NOISE[1]) ** 2
-    weight = precision * ~clipped
-    for _ in range(_ROUNDS if colour is None else 1):
-        sums = np.add.reduceat(weight * tint**2, starts)
-        colours = np.clip(np.add.reduceat(weight * tint * (seen.radiance - white), starts) / (sums + 1e-9), 0, 1)
-        if colour is not None:
-            colours = np.broadcast_to(colour, colours.shape)
-        excess = np.repeat(colours, counts, axis=0) * tint + white - seen.radiance
-        # A clipped pixel limits the radiance from below only.
-        square = np.where(clipped & (excess > 0), 0, excess**2 * precision)
-        weight = precision * ~(clipped & (excess > 0)) / (1 + square)
-    errors = np.add.reduceat(np.log1p(square).mean(axis=1), starts) / counts
-    return _RegionFit(colours, errors, sums)
 
 
 def _members(cluster: Int64Array, number: int, clear: BoolArray) -> Int64Array:
@@ -318,7 +261,7 @@ def _region(rows: Int64Array, errors: Float64Array, seen: Observations, traced: 
     own = Reflectance(*[getattr(traced, name)[mask] for name in ("diffuse", "tint", "metal", "dielectric")])
 
     def error(values: Float64Array) -> float:
-        return float(_fit_colours(observed, _mix(own, values[0], values[1])).errors.mean())
+        return float(fit_colours(observed, mix_materials(own, values[0], values[1])).errors.mean())
 
     limits = [(0.0, 1.0), (0.0, len(_ROUGHNESS) - 1.0)]
     initial = np.array([_METALLIC[start[0]], start[1]], dtype=np.float64)
@@ -333,7 +276,7 @@ def _region(rows: Int64Array, errors: Float64Array, seen: Observations, traced: 
         options={"initial_simplex": simplex, "xatol": 0.02, "fatol": 1e-5, "maxfev": 40},
     )
     metallic, place = found.x
-    fit = _fit_colours(observed, _mix(own, metallic, place))
+    fit = fit_colours(observed, mix_materials(own, metallic, place))
     metal = _METALLIC >= 0.5
     other = table[~metal if metallic >= 0.5 else metal].min()
     return MaterialRegion(

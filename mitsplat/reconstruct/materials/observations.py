@@ -16,7 +16,6 @@ from mitsplat.capture.capture import Photo, known_where
 from mitsplat.geometry.camera import Camera
 from mitsplat.geometry.mesh_normals import corner_normals
 from mitsplat.images.colour import decode_srgb
-from mitsplat.reconstruct.materials.capture_light import CaptureLight
 from mitsplat.reconstruct.materials.surface_light import LitMesh
 
 _MIN_COSINE = 0.2
@@ -25,10 +24,6 @@ CLIPPED = 0.97
 """Linear radiance from which a pixel may be clipped."""
 _MIN_OPENNESS, _MIN_FLATNESS = 0.9, 0.97
 """Limits of clear points: share of the hemisphere without the object, and mean cosine of the normals in two pixels."""
-_GRID, _REACH = 41, 10.0
-"""Vertices along the edge of the support, and half of this edge in diagonals of the object."""
-_SLOPE_WEIGHT = 0.3
-"""Weight, in observations, of a radiance that is equal in all directions."""
 
 
 class View(NamedTuple):
@@ -62,6 +57,11 @@ class Observations(NamedTuple):
     radiance: Float64Array
     to_camera: Float64Array
 
+    def in_order(self) -> Observations:
+        """Return the observations sorted by point."""
+        order = np.argsort(self.point, kind="stable")
+        return Observations(self.point[order], self.radiance[order], self.to_camera[order])
+
     def select(self, points: Int64Array) -> tuple[Observations, BoolArray]:
         """Return the observations of sorted ``points``, renumbered, and the mask (R,) of these observations."""
         rows = np.isin(self.point, points)
@@ -75,49 +75,6 @@ def sample_surface(mesh: trimesh.Trimesh, count: int, seed: int) -> tuple[Float6
     barycentric = np.nan_to_num(trimesh.triangles.points_to_barycentric(mesh.triangles[faces], points), nan=1 / 3)
     normals = np.einsum("nk,nkd->nd", barycentric, corner_normals(mesh)[faces])
     return points, normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-
-
-def lit_surfaces(mesh: trimesh.Trimesh, views: Sequence[View], light: CaptureLight, floor: float) -> LitMesh:
-    """Return the object and its support, a plane at height ``floor``, with their radiance in the photos."""
-    fine = trimesh.Trimesh(mesh.vertices, mesh.faces).subdivide_to_size(float(mesh.scale) / 25, max_iter=20)
-    # The grid is finer below the object, where its shadow ends.
-    centre, line = mesh.bounds.mean(axis=0), np.linspace(-1, 1, _GRID)
-    line = (0.1 * line + 0.9 * line**3) * _REACH * float(mesh.scale)
-    x, y = np.meshgrid(line + centre[0], line + centre[1])
-    plane = np.stack([x.ravel(), y.ravel(), np.full(x.size, floor)], axis=1)
-    corner = np.arange(_GRID * (_GRID - 1)).reshape(-1, _GRID)[:, :-1].ravel()
-    faces = np.concatenate(
-        [
-            np.stack([corner, corner + 1, corner + _GRID + 1], axis=1),
-            np.stack([corner, corner + _GRID + 1, corner + _GRID], axis=1),
-        ]
-    )
-    whole = trimesh.Trimesh(
-        np.concatenate([fine.vertices, plane]), np.concatenate([fine.faces, faces + len(fine.vertices)]), process=False
-    )
-    surfaces = LitMesh(whole, len(fine.faces), light.scene(), centre.tolist())
-    upward = np.tile([0.0, 0.0, 1.0], (len(plane), 1))
-    normals = np.asarray(fine.vertex_normals)
-    radiance = [
-        _linear_radiance(points, observe(surfaces, points, towards, views, shown))
-        for points, towards, shown in ((fine.vertices, normals, "object"), (plane, upward, "surroundings"))
-    ]
-    surfaces.set_radiance(np.concatenate(radiance))
-    return surfaces
-
-
-def _linear_radiance(points: Float64Array, seen: Observations) -> Float64Array:
-    """Fit the radiance of points (N, 3) towards a unit vector d, as coefficients (N, 4, 3) of 1 and d.
-
-    Points without observations get the coefficients of the nearest observed point.
-    """
-    known, starts = np.unique(seen.point, return_index=True)
-    if not len(known):
-        return np.zeros((len(points), 4, 3))
-    basis = np.insert(seen.to_camera, 0, 1.0, axis=1)[:, :, None]
-    left = np.add.reduceat(basis * basis.swapaxes(1, 2), starts) + np.diag([0, *[_SLOPE_WEIGHT] * 3])
-    found = np.linalg.solve(left, np.add.reduceat(basis * seen.radiance[:, None], starts))
-    return np.asarray(found[KDTree(points[known]).query(points)[1]])
 
 
 def observe(
@@ -145,8 +102,7 @@ def observe(
     if not found:
         return Observations(np.zeros(0, dtype=np.int64), np.zeros((0, 3)), np.zeros((0, 3)))
     point, radiance, to_camera = (np.concatenate(parts) for parts in zip(*found, strict=True))
-    order = np.argsort(point, kind="stable")
-    return Observations(point[order], radiance[order].astype(np.float64), to_camera[order])
+    return Observations(point, radiance.astype(np.float64), to_camera).in_order()
 
 
 def clear_points(

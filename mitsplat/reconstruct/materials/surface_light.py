@@ -16,7 +16,13 @@ import trimesh
 
 from mitsplat.arrays import BoolArray, Float32Array, Float64Array, Int64Array
 from mitsplat.renderer.emitters.emitter_sampling import Emitters, receiver
-from mitsplat.renderer.materials.principled import SpecularLobe, diffuse_albedo, lattice_point, power_weight
+from mitsplat.renderer.materials.principled import (
+    SpecularLobe,
+    diffuse_albedo,
+    diffuse_reflectance,
+    lattice_point,
+    power_weight,
+)
 from mitsplat.renderer.rays.device_arrays import plain_mesh, ray_scene, wrapped
 
 _LOBE_LATTICE, _LIGHT_LATTICE, _OPEN_LATTICE = (55, 34), (377, 233), (89, 55)
@@ -32,7 +38,7 @@ class IncidentLight:
         direction: Unit vectors towards the emitters, N M.
         arriving: Radiance over the density of the sample, 0 if it is occluded, N M.
         density: Sampling density [1/sr], N M.
-        irradiance: Irradiance by emitters and surfaces, N.
+        irradiance: Irradiance by surfaces, N.
     """
 
     points: mi.Point3f
@@ -115,8 +121,8 @@ class LitMesh:
         lost = self._scene.ray_test(ray) | ~dr.isfinite(dr.sum(beam.irradiance))
         direct = dr.select(lost, 0, beam.irradiance)
         upward = self._ray(si, si.to_world(mi.warp.square_to_cosine_hemisphere(point)))
-        total = direct + dr.pi * self._reflected(upward)
-        irradiance = mi.Color3f(*[dr.block_sum(channel, samples) / samples for channel in total])
+        reflected = dr.pi * self._reflected(upward)
+        irradiance = mi.Color3f(*[dr.block_sum(channel, samples) / samples for channel in reflected])
         arriving = direct / dr.maximum(dr.dot(si.n, beam.direction), 1e-6)
         light = IncidentLight(place, normal, beam.direction, arriving, beam.density, irradiance)
         dr.eval(light.direction, light.arriving, light.density, light.irradiance)
@@ -159,9 +165,12 @@ class LitMesh:
 
         def add_light(i: mi.UInt32, *sums: mi.Color3f) -> tuple[mi.UInt32, *tuple[mi.Color3f, ...]]:
             at = place * lights + i
-            value, density, cos_half = metal.evaluate(dr.gather(mi.Vector3f, light.direction, at))
+            direction, arriving = dr.gather(mi.Vector3f, light.direction, at), dr.gather(mi.Color3f, light.arriving, at)
+            value, density, cos_half = metal.evaluate(direction)
             value *= power_weight(share * dr.gather(mi.Float, light.density, at), density)
-            return i + 1, *added(sums, dr.gather(mi.Color3f, light.arriving, at) * value, cos_half)
+            cosine = dr.maximum(dr.dot(normal, direction), 0)
+            matt = diffuse_reflectance(cosine, metal.view.z, cos_half, rough) * cosine / dr.pi
+            return i + 1, *added(sums[:3], arriving * value, cos_half), sums[3] + arriving * matt
 
         def add_ray(i: mi.UInt32, *sums: mi.Color3f) -> tuple[mi.UInt32, *tuple[mi.Color3f, ...]]:
             point = lattice_point(i, _LOBE_LATTICE) + shift
@@ -170,19 +179,20 @@ class LitMesh:
             radiance = self._reflected(ray)
             emitted, density = self._emitters.emission(self._lights, si, ray, weight > 0)
             radiance += emitted * power_weight(metal.evaluate(direction)[1], share * density)
-            return i + 1, *added(sums, radiance * weight, cos_half)
+            return i + 1, *added(sums[:3], radiance * weight, cos_half), sums[3]
 
-        total = np.zeros((3, 3, rays * count))
+        total = np.zeros((4, 3, rays * count))
         for add, rounds in ((add_light, lights), (add_ray, lobe_samples)):
-            state = dr.zeros(mi.UInt32, rays * count), *[dr.zeros(mi.Color3f, rays * count) for _ in range(3)]
+            state = dr.zeros(mi.UInt32, rays * count), *[dr.zeros(mi.Color3f, rays * count) for _ in range(4)]
             _, *sums = dr.while_loop(state, lambda i, *_, rounds=rounds: i < rounds, add, label="reflectance")
             means = [part / mi.Float(rounds) for part in sums]
             dr.eval(means)
             total += np.array([np.array(part) for part in means])
-        parts = total.reshape(3, 3, rays, count).transpose(0, 2, 3, 1).astype(np.float32)
-        albedo = np.array(diffuse_albedo(metal.view.z, rough)).reshape(rays, count, 1)
-        irradiance = np.array(light.irradiance).T[row]
-        return Reflectance((albedo * irradiance[:, None] / np.pi).astype(np.float32), *parts)
+        # Surfaces around a point reflect from many directions, so that the mean of the diffuse lobe is enough.
+        irradiance = dr.gather(mi.Color3f, light.irradiance, place)
+        total[3] += np.array(diffuse_albedo(metal.view.z, rough) * irradiance / dr.pi)
+        *specular, diffuse = total.reshape(4, 3, rays, count).transpose(0, 2, 3, 1).astype(np.float32)
+        return Reflectance(diffuse, *specular)
 
     def _ray(self, si: mi.SurfaceInteraction3f, direction: mi.Vector3f) -> mi.Ray3f:
         return mi.Ray3f(si.p + mi.Vector3f(si.n) * self._offset, direction)

@@ -133,6 +133,21 @@ def power_weight(own: mi.Float, other: mi.Float) -> mi.Float:
     return dr.select(own > 0, dr.rcp(1 + dr.square(other / own)), 0)
 
 
+def diffuse_reflectance(cos_light: mi.Float, cos_camera: mi.Float, cos_half: mi.Float, roughness: mi.Float) -> mi.Float:
+    """Return pi times the diffuse lobe of ``principled`` for a base colour of 1 (Burley 2012, section 5.3).
+
+    Args:
+        cos_light: Cosine between the normal and the direction to the light.
+        cos_camera: Cosine n.v between the normal and the direction to the camera.
+        cos_half: Cosine v.h between the half vector and the direction to the camera.
+        roughness: Roughness of the surface.
+    """
+    to_light, to_camera = (dr.power(dr.clip(1 - cosine, 0, 1), 5) for cosine in (cos_light, cos_camera))
+    retro = 2 * roughness * dr.square(cos_half)
+    base = (1 - to_light / 2) * (1 - to_camera / 2)
+    return base + retro * (to_light + to_camera + to_light * to_camera * (retro - 1))
+
+
 def diffuse_albedo(cosine: mi.Float, roughness: mi.Float) -> mi.Float:
     """Return the albedo of the diffuse lobe of ``principled`` for a base colour of 1, given the cosine n.v.
 

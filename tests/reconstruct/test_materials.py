@@ -20,9 +20,10 @@ from mitsplat.geometry.camera import Camera
 from mitsplat.images.colour import encode_srgb
 from mitsplat.reconstruct.asset_evaluation import Verdict
 from mitsplat.reconstruct.materials.capture_light import CaptureLight, require_light_frame
+from mitsplat.reconstruct.materials.colour_fit import fit_colours
 from mitsplat.reconstruct.materials.estimation import MaterialEstimate, MaterialRegion, estimate_materials
 from mitsplat.reconstruct.materials.lit_surfaces import lit_surfaces
-from mitsplat.reconstruct.materials.observations import View
+from mitsplat.reconstruct.materials.observations import Observations, View
 from mitsplat.reconstruct.pipeline import asset_pipeline as pipeline
 from mitsplat.reconstruct.reconstruct import AssetJob, Reconstruction, ReconstructSettings
 from mitsplat.scene.spec.light_spec import AreaLight, EnvironmentLight, LightDraw
@@ -142,6 +143,14 @@ def test_the_table_outside_of_the_photos_reflects_light_on_the_object(photograph
         cosine = np.maximum(to_table @ normal, 0) / distance
         expected = np.sum(radiance * cosine * (wall[2] / distance) / distance**2) / len(table)
         assert found == pytest.approx(expected, rel=0.05)
+
+
+def test_errors_of_the_same_factor_do_not_make_colours_darker() -> None:
+    """The logarithms of the observations of a point are uniform around that of its radiance."""
+    radiance = np.tile(0.5 * np.exp(np.linspace(-0.25, 0.25, 20))[:, None], (1, 3))
+    seen = Observations(np.zeros(20, dtype=np.int64), radiance, np.tile([0.0, 0.0, 1.0], (20, 1)))
+    fit = fit_colours(seen, (np.ones((20, 3)), np.zeros((20, 3))))
+    np.testing.assert_allclose(fit.colours, 0.5, rtol=0.01)
 
 
 def estimate(confidence: float, explained: float = 0.5) -> MaterialEstimate:

@@ -47,16 +47,21 @@ def fit_colours(
     starts = np.flatnonzero(np.diff(seen.point, prepend=-1))
     counts = np.diff(starts, append=len(seen.point))
     clipped = seen.radiance >= CLIPPED
-    precision = 1 / (_NOISE[0] * seen.radiance + _NOISE[1]) ** 2
-    weight = precision * ~clipped
+    scale = _NOISE[0] * seen.radiance + _NOISE[1]
+    weight = ~clipped / scale**2
     for _ in range(_ROUNDS if colour is None else 1):
         sums = np.add.reduceat(weight * tint**2, starts)
         colours = np.clip(np.add.reduceat(weight * tint * (seen.radiance - white), starts) / (sums + 1e-9), 0, 1)
         if colour is not None:
             colours = np.broadcast_to(colour, colours.shape)
-        excess = np.repeat(colours, counts, axis=0) * tint + white - seen.radiance
+        predicted = np.repeat(colours, counts, axis=0) * tint + white
+        excess = predicted - seen.radiance
+        # The product of both scales makes the error depend on the ratio of both radiances only. With the scale of the
+        # observation, dark ones would have more weight, and colours would be too dark.
+        predicted_scale = _NOISE[0] * predicted + _NOISE[1]
         # A clipped pixel limits the radiance from below only.
-        square = np.where(clipped & (excess > 0), 0, excess**2 * precision)
-        weight = precision * ~(clipped & (excess > 0)) / (1 + square)
+        free = clipped & (excess > 0)
+        square = np.where(free, 0, excess**2 / (scale * predicted_scale))
+        weight = ~free * (scale + predicted_scale) / (2 * scale * predicted_scale**2 * (1 + square))
     errors = np.add.reduceat(np.log1p(square).mean(axis=1), starts) / counts
     return ColourFit(colours, errors, sums)

@@ -104,7 +104,8 @@ def progress_bar(unit: str = "images/s") -> Iterator[Progress]:
             speed = task.finished_speed or task.speed
             return Text("" if speed is None else f"{speed:.2f} {unit}")
 
-    columns = (BarColumn(), MofNCompleteColumn(), RateColumn(), TimeRemainingColumn(), TextColumn("{task.description}"))
+    text = TextColumn("{task.description}", markup=False)  # may hold names with brackets
+    columns = (BarColumn(), MofNCompleteColumn(), RateColumn(), TimeRemainingColumn(), text)
     with Progress(*columns, console=Console(stderr=True), speed_estimate_period=300) as bar:
         task = bar.add_task("", total=None)
 
@@ -113,7 +114,7 @@ def progress_bar(unit: str = "images/s") -> Iterator[Progress]:
             if bar.tasks[0].total != total or done < bar.tasks[0].completed:
                 bar.reset(task, total=total, completed=done)
             if doing.startswith(TIME_NOTE):
-                bar.console.print(doing, highlight=False, soft_wrap=True)
+                bar.console.print(doing, markup=False, highlight=False, soft_wrap=True)
             else:
                 bar.update(task, completed=done, description=doing)
 

@@ -62,7 +62,7 @@ def view(
     if gaussians < 1:
         raise InputError(f"--gaussians must be at least 1 (got {gaussians})")
     if find_spec("viser") is None:
-        raise MissingResourceError("the viewer requires viser: pip install 'mitsplat[view]'")
+        raise MissingResourceError("the viewer needs viser: pip install 'mitsplat[view]'")
     from mitsplat.view import Address, serve
 
     def print_url(url: str) -> None:
@@ -207,6 +207,7 @@ def chart(
     """
     from rich.console import Console
     from rich.table import Table
+    from rich.text import Text
 
     from mitsplat.frames.accuracy.accuracy_chart import draw_chart, write_csv
     from mitsplat.frames.accuracy.speed_accuracy import cheapest, check_tolerance, measure_steps
@@ -228,7 +229,9 @@ def chart(
         )
     best = cheapest(rows, tolerance)
     names = "RMSE", "PSNR [dB]", "largest", "estimate", "objects [dB]", "SSIM", "mask IoU", "peak [GiB]"
-    table = Table("step", "s/image", *names)
+    table = Table()
+    for title in ("step", "s/image", *names):
+        table.add_column(Text(title))  # plain text, where markup would remove [dB]
     for row in rows:
         name = f"{row.name} *" if row == best else row.name
         errors = f"{row.rmse:.5f}", f"{row.psnr:.1f}", f"{row.largest:.3f}", f"{row.estimate:.4f}", f"{row.objects:.1f}"

@@ -10,6 +10,7 @@ from typing import Any
 
 from PIL import Image, ImageDraw
 from rich.table import Table
+from rich.text import Text
 
 from mitsplat.frames.frame import Frame, render_frame
 from mitsplat.labels.overlay import draw_labels
@@ -26,10 +27,9 @@ _MARK_TIME = 0.5  # for which an object that was dropped again is marked [s]
 def certificate_table(layouts: Iterable[Layout]) -> Table:
     """Build a table of rest certificates with one row per layout."""
     table = Table()
-    for title in ("layout", "objects", "rest [s]", "speed [mm/s]", "spin [rad/s]", "motion in 1 s [mm]"):
-        table.add_column(title, justify="right")
-    for title in ("in colliders [mm]", "in objects [mm]", "gap [mm]", "draws"):
-        table.add_column(title, justify="right")
+    motion = "layout", "objects", "rest [s]", "speed [mm/s]", "spin [rad/s]", "motion in 1 s [mm]"
+    for title in (*motion, "in colliders [mm]", "in objects [mm]", "gap [mm]", "draws"):
+        table.add_column(Text(title), justify="right")  # plain text, where markup would remove [mm]
     table.add_column("refused")
     for layout in layouts:
         rest = layout.certificate
@@ -39,7 +39,7 @@ def certificate_table(layouts: Iterable[Layout]) -> Table:
             *(f"{rest.max_speed * 1e3:.3f}", f"{rest.max_spin:.4f}"),
             *(f"{length * 1e3:.3f}" for length in lengths),
             str(rest.attempts),
-            ", ".join(f"{count} x {reason}" for reason, count in Counter(rest.refused).items()),
+            Text(", ".join(f"{count} x {reason}" for reason, count in Counter(rest.refused).items())),
         )
     return table
 

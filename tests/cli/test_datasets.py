@@ -78,6 +78,7 @@ def test_settle_prints_certificates_and_writes_the_animation(
     out = capsys.readouterr().out
     layouts = [Layout.from_json(json.loads(path.read_bytes())) for path in sorted((tmp_path / "cache").rglob("*.json"))]
     assert [layout.index for layout in layouts] == [0, 1]
+    assert "rest [s]" in out and "[rad/s]" in out and out.count("[mm]") == 4
     rows = [row.split("│")[1:-1] for row in out.splitlines() if row.startswith("│")]
     for layout, row in zip(layouts, rows, strict=True):
         assert int(row[0]) == layout.index

@@ -111,23 +111,10 @@ def test_chart_command_writes_table_csv_and_picture(
     out = tmp_path / "chart.png"
     result = CliRunner().invoke(
         app,
-        [
-            "chart",
-            str(splat_file),
-            "--size",
-            "48x32",
-            "-n",
-            "1",
-            "--tolerance",
-            "0",
-            "--order-tolerance",
-            "0",
-            "-o",
-            str(out),
-        ],
+        f"chart {splat_file} --size 48x32 -n 1 --tolerance 0 --order-tolerance 0 -o {out}".split(),
     )
     assert result.exit_code == 0, result.output
-    assert "exact *" in result.output
+    assert "exact *" in result.output and "[dB]" in result.output and "[GiB]" in result.output
     with out.with_suffix(".csv").open() as stream:
         lines = list(csv.DictReader(stream))
     assert {"fast", "balanced", "exact"} < {line["name"] for line in lines}

@@ -19,7 +19,7 @@ import trimesh
 
 from mitsplat.arrays import BoolArray, Float64Array
 from mitsplat.asset import Asset
-from mitsplat.bake.mesh_parts import UNIFORM_LIGHT, MeshModel, bake_lights, mitsuba_scene, read_model
+from mitsplat.bake.mesh_parts import UNIFORM_LIGHT, MeshModel, MeshPart, bake_lights, mitsuba_scene, read_model
 from mitsplat.bake.mesh_surface import MeshSurface
 from mitsplat.bake.proxy_mesh import make_proxy
 from mitsplat.bake.radiance import BOUNCES, bake_radiance, hemisphere, ray_offset, rotate_directions
@@ -170,14 +170,7 @@ def bake_asset(
     """
     ensure_variant()
     settings = settings or BakeSettings()
-    if kind not in ("object", "environment"):
-        raise InputError(f"kind must be object or environment (got {kind!r})")
-    if up not in (None, "y", "z"):
-        raise InputError(f"up must be y or z (got {up!r})")
-    if not (density > 0 and np.isfinite(density)):
-        raise InputError(f"density must be a number > 0 in kg/m^3 (got {density:g})")
-    if not (friction >= 0 and np.isfinite(friction)):
-        raise InputError(f"friction must be a number of at least 0 (got {friction:g})")
+    _check_arguments(kind, up, density, friction)
     stages = _Stages(progress)
     emitters = {} if lights is None else bake_lights(lights)
     model = read_model(mesh, metres_per_unit=metres_per_unit, up=up, finish=finish)
@@ -194,16 +187,7 @@ def bake_asset(
         raise InputError(f"{source}: a mesh must be {_MIN_SIZE:g} to {_MAX_SIZE:g} m across (got {size:.3g} m)")
     stages("placing Gaussians")
     rng = np.random.default_rng(settings.seed)
-    relative = settings.density or {}
-    face_density = np.concatenate(
-        [relative.get(part.name, 1.0) * part.detail_density(_DETAIL_GAIN, rng) for part in parts]
-    )
-    clay = mitsuba_scene(parts, UNIFORM_LIGHT, clay=True)
-    # The visible fraction of a few trial surfels determines how many surfels are placed.
-    trial = surface.place_surfels(face_density, min(_TRIAL_GAUSSIANS, settings.gaussians), rng)
-    share = float(_visible_surfels(clay, trial, rng).mean()) if len(trial) else 1.0
-    surfels = surface.place_surfels(face_density, round(settings.gaussians / max(share, 0.2)), rng)
-    surfels = surfels.subset(_visible_surfels(clay, surfels, rng))
+    surfels = _place_visible_surfels(surface, parts, settings, rng)
     if not len(surfels):
         raise InputError(
             f"{name}: no point of the mesh is visible from outside; check whether its faces are inside out"
@@ -237,13 +221,7 @@ def bake_asset(
         capture_light="uniform" if lights is None else "scene",
         white=None if lights is None else float(np.pi),
     )
-    warnings = [*model.warnings, *(warning for part in parts for warning in part.warnings)]
-    backs = surface.share_of_backs(np.random.default_rng(settings.seed)) if kind == "object" else 0.0
-    if backs > _MAX_BACKS and not any("inside out" in warning for warning in warnings):
-        warnings.append(
-            f"{backs:.0%} of the visible points are backs of faces, which stay empty: the surface is open; close it, "
-            "give it a thickness, or state doubleSided in a glTF file"
-        )
+    warnings = _mesh_warnings(model, surface if kind == "object" else None, settings.seed)
     units = _describe_units(model)
     if not settings.verify_views:
         stages.end()
@@ -262,6 +240,46 @@ def bake_asset(
         ]
     stages.end()
     return BakeResult(asset, psnr, psnr_object, views, surface.mesh, brightness, tuple(warnings), units)
+
+
+def _check_arguments(kind: str, up: str | None, density: float, friction: float) -> None:
+    """Raise InputError if an argument of a bake breaks a rule."""
+    if kind not in ("object", "environment"):
+        raise InputError(f"kind must be object or environment (got {kind!r})")
+    if up not in (None, "y", "z"):
+        raise InputError(f"up must be y or z (got {up!r})")
+    if not (density > 0 and np.isfinite(density)):
+        raise InputError(f"density must be a number > 0 in kg/m^3 (got {density:g})")
+    if not (friction >= 0 and np.isfinite(friction)):
+        raise InputError(f"friction must be a number of at least 0 (got {friction:g})")
+
+
+def _place_visible_surfels(
+    surface: MeshSurface, parts: Sequence[MeshPart], settings: BakeSettings, rng: np.random.Generator
+) -> Surfels:
+    """Place surfels on the visible surface, about as many as the settings state."""
+    relative = settings.density or {}
+    face_density = np.concatenate(
+        [relative.get(part.name, 1.0) * part.detail_density(_DETAIL_GAIN, rng) for part in parts]
+    )
+    clay = mitsuba_scene(parts, UNIFORM_LIGHT, clay=True)
+    # The visible fraction of a few trial surfels determines how many surfels are placed.
+    trial = surface.place_surfels(face_density, min(_TRIAL_GAUSSIANS, settings.gaussians), rng)
+    share = float(_visible_surfels(clay, trial, rng).mean()) if len(trial) else 1.0
+    surfels = surface.place_surfels(face_density, round(settings.gaussians / max(share, 0.2)), rng)
+    return surfels.subset(_visible_surfels(clay, surfels, rng))
+
+
+def _mesh_warnings(model: MeshModel, solid: MeshSurface | None, seed: int) -> list[str]:
+    """Return the warnings of a mesh file; ``solid`` is the surface of an object, whose backs should be invisible."""
+    warnings = [*model.warnings, *(warning for part in model.parts for warning in part.warnings)]
+    backs = 0.0 if solid is None else solid.share_of_backs(np.random.default_rng(seed))
+    if backs > _MAX_BACKS and not any("inside out" in warning for warning in warnings):
+        warnings.append(
+            f"{backs:.0%} of the visible points are backs of faces, which stay empty: the surface is open; close it, "
+            "give it a thickness, or state doubleSided in a glTF file"
+        )
+    return warnings
 
 
 class _Stages:

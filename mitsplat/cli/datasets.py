@@ -30,7 +30,11 @@ from mitsplat.cli.options import (
 from mitsplat.errors import InputError, PartialResultError
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+    from contextlib import AbstractContextManager
+
     from mitsplat.dataset.write import DatasetSummary
+    from mitsplat.progress import Progress
     from mitsplat.runtime.device import Device
     from mitsplat.scene.scene import Scene
 
@@ -164,25 +168,12 @@ def render(
         if engine == "ray":
             cluster = Cluster(address, None if resources is None else Cluster.parse_resources(resources))
             cluster.on_device(device)  # raises if the device contradicts the cluster's resources
-        loaded = load_scene(scene, overrides=overrides, allow_outside=allow_outside)
         if tolerance is not None:
             if quality is not None:
                 raise InputError("--quality and --tolerance both select the preset: give only one")
-            from mitsplat.dataset.preflight import refuse, run_faults
-            from mitsplat.frames.accuracy.speed_accuracy import choose_preset
-
-            refuse(loaded, run_faults(loaded))
-            with progress_bars() as progress:
-                best = choose_preset(
-                    scene,
-                    tolerance,
-                    overrides=overrides,
-                    allow_outside=allow_outside,
-                    progress=progress,
-                    device=chosen,
-                )
-            typer.echo(f"preset: {best.name} (RMSE {best.rmse:.2g}, {best.seconds:.2f} s an image)")
-            loaded = load_scene(scene, overrides=overrides | {"quality": best.name}, allow_outside=allow_outside)
+            best = _fastest_preset(scene, tolerance, overrides, allow_outside, chosen, progress_bars)
+            overrides = overrides | {"quality": best}
+        loaded = load_scene(scene, overrides=overrides, allow_outside=allow_outside)
         if only is not None:
             _render_again(loaded, only, out, device if chosen is None else chosen)
             return
@@ -200,6 +191,29 @@ def render(
                 any_device=any_device,
             )
         _print_summary(summary, whole=part is None)
+
+
+def _fastest_preset(
+    scene: Path,
+    tolerance: float,
+    overrides: dict[str, Any],
+    allow_outside: bool,
+    device: Device | None,
+    progress_bars: Callable[[], AbstractContextManager[Progress]],
+) -> str:
+    """Measure the presets on a scene and return the fastest one within a tolerance."""
+    from mitsplat.dataset.preflight import refuse, run_faults
+    from mitsplat.frames.accuracy.speed_accuracy import choose_preset
+    from mitsplat.scene.loading.scene_loading import load_scene
+
+    loaded = load_scene(scene, overrides=overrides, allow_outside=allow_outside)
+    refuse(loaded, run_faults(loaded))
+    with progress_bars() as progress:
+        best = choose_preset(
+            scene, tolerance, overrides=overrides, allow_outside=allow_outside, progress=progress, device=device
+        )
+    typer.echo(f"preset: {best.name} (RMSE {best.rmse:.2g}, {best.seconds:.2f} s an image)")
+    return best.name
 
 
 def _refuse(options: set[str], source: str) -> None:

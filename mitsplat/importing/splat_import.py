@@ -227,13 +227,7 @@ def import_splats(
         InputError: If the file cannot be read, no Gaussian remains, or a value breaks a rule.
     """
     path = path_of(path, "path")
-    if density is not None and mass is not None:
-        raise InputError("density and mass must not both be given")
-    for key, value in (("density", density), ("mass", mass)):
-        if value is not None and not 0 < value < np.inf:
-            raise InputError(f"{key} must be finite and > 0 (got {value:g})")
-    if not 0 <= friction < np.inf:
-        raise InputError(f"friction must be a number of at least 0 (got {friction:g})")
+    _check_physics(density, mass, friction)
     stages = iter(range(_STAGES))
 
     def report(stage_name: str) -> None:
@@ -241,26 +235,10 @@ def import_splats(
             progress(next(stages), _STAGES, stage_name)
 
     report("reading the file")
-    reason = ""
-    if is_usd(path) or is_gltf(path):  # such files state unit and axis, and their splats are in metres with z up
-        if is_usd(path) and settings.up:
-            raise InputError(
-                f"{path}: states its up axis: correct upAxis of the stage, without --up (got {settings.up})"
-            )
-        reason = f"{settings.up}, as given" if settings.up else "as the file states"
-        loaded = (stage or read_stage_asset(path)).splats if is_usd(path) else read_gltf_splats(path)
-        units = settings.units if settings.units or settings.size else 1.0
-        settings = replace(settings, up=FROM_GLTF_AXES[settings.up or "y"], units=units)
-    else:
-        loaded = Splats.load(path)
-    if not len(loaded):
-        raise InputError(f"{path}: must hold at least one Gaussian (got 0)")
+    loaded, settings, reason = _read_splats(path, settings, stage)
     cleaner = _Cleaner(path, loaded)
     if settings.crop is not None:
-        low, high = np.reshape(settings.crop, (2, 3))
-        outside = np.asarray(((loaded.means < low) | (loaded.means > high)).any(axis=1))
-        span = ", ".join(f"{axis} {a:.3g} to {b:.3g}" for axis, a, b in zip("xyz", *loaded.bounds, strict=True))
-        cleaner.remove("outside of the box", outside, f"crop keeps nothing: the file has {span}")
+        cleaner.crop(settings.crop)
     report("removing floaters")
     cleaner.remove_floaters(kind)
     report("finding up")
@@ -336,12 +314,54 @@ def import_splats(
     )
 
 
+def _check_physics(density: float | None, mass: float | None, friction: float) -> None:
+    """Raise InputError if a physical value of an asset breaks a rule."""
+    if density is not None and mass is not None:
+        raise InputError("density and mass must not both be given")
+    for key, value in (("density", density), ("mass", mass)):
+        if value is not None and not 0 < value < np.inf:
+            raise InputError(f"{key} must be finite and > 0 (got {value:g})")
+    if not 0 <= friction < np.inf:
+        raise InputError(f"friction must be a number of at least 0 (got {friction:g})")
+
+
+def _read_splats(path: Path, settings: ImportSettings, stage: StageAsset | None) -> tuple[Splats, ImportSettings, str]:
+    """Read the splats of a file.
+
+    Returns:
+        The splats, the settings with the unit and the axis that the file states, and where its axis comes from, empty
+        if it must be found. Splats of USD and glTF files are in metres with z up.
+    """
+    reason = ""
+    if is_usd(path) or is_gltf(path):
+        if is_usd(path) and settings.up:
+            raise InputError(
+                f"{path}: states its up axis: correct upAxis of the stage, without --up (got {settings.up})"
+            )
+        reason = f"{settings.up}, as given" if settings.up else "as the file states"
+        loaded = (stage or read_stage_asset(path)).splats if is_usd(path) else read_gltf_splats(path)
+        units = settings.units if settings.units or settings.size else 1.0
+        settings = replace(settings, up=FROM_GLTF_AXES[settings.up or "y"], units=units)
+    else:
+        loaded = Splats.load(path)
+    if not len(loaded):
+        raise InputError(f"{path}: must hold at least one Gaussian (got 0)")
+    return loaded, settings, reason
+
+
 class _Cleaner:
     """Remaining Gaussians of a file, and the reasons for the removal of the others."""
 
     def __init__(self, path: Path, splats: Splats) -> None:
         self._path, self._all, self._remaining = path, splats, np.ones(len(splats), dtype=bool)
         self.removed: dict[str, int] = {}
+
+    def crop(self, box: Sequence[float]) -> None:
+        """Remove what lies outside of a box: lower corner, upper corner."""
+        low, high = np.reshape(box, (2, 3))
+        outside = np.asarray(((self._all.means < low) | (self._all.means > high)).any(axis=1))
+        span = ", ".join(f"{axis} {a:.3g} to {b:.3g}" for axis, a, b in zip("xyz", *self._all.bounds, strict=True))
+        self.remove("outside of the box", outside, f"crop keeps nothing: the file has {span}")
 
     @property
     def splats(self) -> Splats:

@@ -8,12 +8,13 @@ from __future__ import annotations
 import html
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import trimesh
 
 from mitsplat.arrays import BoolArray, Float64Array
+from mitsplat.asset import Asset
 from mitsplat.capture.capture import Capture, Photo
 from mitsplat.fit.image_metrics import psnr
 from mitsplat.gaussians.splat_cloud import Splats
@@ -32,7 +33,7 @@ from mitsplat.surroundings.coverage import (
     find_holes,
     free_rectangle,
 )
-from mitsplat.surroundings.depth_views import SurfacePoints, depth_views, surface_points
+from mitsplat.surroundings.depth_views import DepthView, SurfacePoints, depth_views, surface_points
 from mitsplat.surroundings.floaters import remove_floaters
 from mitsplat.surroundings.ready_scene import Rectangle, scene_text
 from mitsplat.surroundings.removal import RemovedObject, remove_objects
@@ -110,7 +111,6 @@ def reconstruct_environment(
         imported = ImportedMesh(mesh, np.eye(4))
     made = reconstruct_asset(capture, splats, replace(job, imported=imported, remove=()), psnr=psnr, progress=progress)
     made, larger = _without_rotation(made, motion)
-    factor = float(larger[0, 0])
     error = "" if capture.scale_error is None else f" ± {capture.scale_error:.2%}"
     rows = {
         "Frame": f"{'in metres' if made.asset.units == 'metre' else 'in unknown units'}{error}"
@@ -120,36 +120,11 @@ def reconstruct_environment(
     }
     findings, sections, record = list[str](), list[str](), dict[str, Any]()
     if found:
-        coverage = find_coverage(found[0], views, points, scale)
-        named = [(photo.name, photo.camera) for photo in capture.training]
-        holes = find_holes(found[0], coverage, splats, named)
-        supports = [support.transformed(larger) for support in found]
-        filled = coverage.cells_with(
-            np.concatenate([np.zeros((0, 2)), *(t.filled for t in removed_objects if t.support == 0)])
-        )
-        region = _region(coverage, found[0], factor)
-        unit = "m" if made.asset.units == "metre" else "units"
-        rows |= _rows(supports, coverage, holes, region, factor, unit)
-        findings += _findings(coverage, holes, region, factor, unit, metric=made.asset.units == "metre")
-        if removed_objects:
-            rows["Removed objects"] = "; ".join(_removal_text(one, factor, unit) for one in removed_objects)
-            record["removed_things"] = [
-                {
-                    "pick": t.pick,
-                    "gaussians": t.gaussians,
-                    "filled": factor**2 * t.area,
-                    "behind": factor**2 * t.behind,
-                    "copied": t.copied,
-                }
-                for t in removed_objects
-            ]
-        sections.append(_support_map(coverage, filled))
-        record["supports"] = [
-            {"pose": s.pose.tolist(), "size": list(s.size), "tilt": s.tilt, "roughness": s.roughness} for s in supports
-        ]
-        if region is not None and made.asset.units == "metre":
-            seen = [photo.camera for photo in capture.transformed(larger).photos]
-            record["scene"] = scene_text(job.name, supports, region, seen)
+        surfaces = _describe_surfaces(capture, splats, found, views, points, scale, removed_objects, made.asset, larger)
+        rows |= surfaces.rows
+        findings += surfaces.findings
+        sections.append(surfaces.map)
+        record |= surfaces.record
     else:
         findings.append(
             "no level surface was found for objects to stand on (one is required): photograph the table from above as "
@@ -165,6 +140,71 @@ def reconstruct_environment(
         psnr = _mean_psnr(made.held_out, fitted if removed_objects else None)
     verdict = replace(made.verdict, psnr=psnr, rows=rows, findings=tuple(findings))
     return replace(made, verdict=verdict, sections=tuple(sections), record=record)
+
+
+class _Surfaces(NamedTuple):
+    """Results on the level surfaces of an environment: rows, findings, map and record of its report."""
+
+    rows: dict[str, str]
+    findings: list[str]
+    map: str
+    record: dict[str, Any]
+
+
+def _describe_surfaces(
+    capture: Capture,
+    splats: Splats,
+    found: Sequence[Support],
+    views: Sequence[DepthView],
+    points: SurfacePoints,
+    scale: float,
+    removed: Sequence[RemovedObject],
+    asset: Asset,
+    larger: Float64Array,
+) -> _Surfaces:
+    """Measure how the photos cover the first surface, and describe all.
+
+    Args:
+        capture: Photos with cameras, in the frame of the first surface.
+        splats: Splats in the same frame, without removed objects.
+        found: Level surfaces in the same frame, at least one.
+        views: Depth maps of the training cameras.
+        points: Points of these maps.
+        scale: Typical depth of the photos.
+        removed: Objects that were removed from surfaces.
+        asset: The environment.
+        larger: Transform (4, 4) from that frame to the asset's, without a rotation.
+    """
+    factor, metric = float(larger[0, 0]), asset.units == "metre"
+    coverage = find_coverage(found[0], views, points, scale)
+    named = [(photo.name, photo.camera) for photo in capture.training]
+    holes = find_holes(found[0], coverage, splats, named)
+    supports = [support.transformed(larger) for support in found]
+    filled = coverage.cells_with(np.concatenate([np.zeros((0, 2)), *(t.filled for t in removed if t.support == 0)]))
+    region = _region(coverage, found[0], factor)
+    unit = "m" if metric else "units"
+    rows = _rows(supports, coverage, holes, region, factor, unit)
+    record: dict[str, Any] = {}
+    if removed:
+        rows["Removed objects"] = "; ".join(_removal_text(one, factor, unit) for one in removed)
+        record["removed_things"] = [
+            {
+                "pick": t.pick,
+                "gaussians": t.gaussians,
+                "filled": factor**2 * t.area,
+                "behind": factor**2 * t.behind,
+                "copied": t.copied,
+            }
+            for t in removed
+        ]
+    record["supports"] = [
+        {"pose": s.pose.tolist(), "size": list(s.size), "tilt": s.tilt, "roughness": s.roughness} for s in supports
+    ]
+    if region is not None and metric:
+        seen = [photo.camera for photo in capture.transformed(larger).photos]
+        record["scene"] = scene_text(asset.name, supports, region, seen)
+    findings = _findings(coverage, holes, region, factor, unit, metric=metric)
+    return _Surfaces(rows, findings, _support_map(coverage, filled), record)
 
 
 def _find_supports(points: SurfacePoints, scale: float, *, vertical_known: bool) -> list[Support]:

@@ -47,9 +47,10 @@ class MeshSurface:
     def trace(self, rays: mi.Ray3f) -> tuple[Int64Array, Float64Array, Float64Array]:
         """Return faces (N,), barycentric coordinates (N, 3) and distances (N,) [m] of first hits; face -1 is a miss."""
         hit = self._scene.ray_intersect_preliminary(rays)
-        dr.eval(hit.t, hit.prim_index, hit.prim_uv)
+        uv = dr.select(dr.isfinite(hit.t), hit.prim_uv, 0.0)  # misses leave it uninitialised
+        dr.eval(hit.t, hit.prim_index, uv)
         distance, index = np.asarray(hit.t, dtype=np.float64), np.asarray(hit.prim_index).astype(np.int64)
-        u, v = np.asarray(hit.prim_uv, dtype=np.float64)
+        u, v = np.asarray(uv, dtype=np.float64)
         is_hit = np.isfinite(distance)
         return np.where(is_hit, index, -1), np.where(is_hit, (1 - u - v, u, v), 0.0).T, distance
 

@@ -286,7 +286,7 @@ def _check_rest(scene: Scene) -> Iterator[Finding]:
     except InputError as error:
         yield Finding("rest", False, str(error), "change what objects rest on, or their region")
     if rested:
-        yield Finding("rest", True, f"{len(rested)} objects come to rest, each tried alone")
+        yield Finding("rest", True, f"{len(rested)} of the objects, each tried alone, come to rest")
 
 
 def _check_surfaces(scene: Scene) -> Iterator[Finding]:

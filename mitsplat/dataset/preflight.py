@@ -285,8 +285,8 @@ def scene_warnings(scene: Scene) -> Iterator[Finding]:
     yield Finding(
         "views",
         not inside and not blind,
-        f"of {len(cameras)} views {len(inside)} are from inside of a shape, {len(blind)} see no place where objects "
-        "can be",
+        f"of {len(cameras)} views, {len(inside)} lie inside a shape and {len(blind)} show no place where objects can "
+        "be",
         remedy,
     )
     if spec.output.views > 1 and spec.background is None and _is_repeated(scene, plans[0]):
@@ -308,7 +308,7 @@ def scene_warnings(scene: Scene) -> Iterator[Finding]:
         lights = {light for plan in plans for light in plan.lights if isinstance(light, LocalLight)}
         names = [name for light in lights if (name := enclosing_shape(scene, np.array(light.position)))]
         if names:
-            text = f"{len(names)} of {len(lights)} drawn lights are inside of a shape, such as {names[0]!r}"
+            text = f"{len(names)} of {len(lights)} drawn lights lie inside a shape, such as {names[0]!r}"
             yield _fault("lights", text, "narrow lights[].draw: they light nothing")
     yield from _bin_warnings(scene)
 

@@ -154,7 +154,7 @@ def test_lights_that_may_be_inside_of_a_shape_get_a_warning(lit: Any) -> None:
     table = {"name": "table", "box": {"size": [1, 1, 0.1], "position": [0, 0, -0.05]}}
     lamp = {"kind": "point", "draw": {"position": [[-0.4, -0.4, 4.6], [0.4, 0.4, 7]]}}
     found = [finding.text for finding in scene_warnings(lit(lamp, shapes=[table, block])) if finding.name == "lights"]
-    assert len(found) == 1 and "drawn lights are inside of a shape, such as 'block'" in found[0]
+    assert len(found) == 1 and "drawn lights lie inside a shape, such as 'block'" in found[0]
 
 
 @pytest.mark.parametrize(

@@ -33,6 +33,8 @@ _ROW_OFFSET, _ROW_SPACING = 0.45, 0.75
 _CREASE_NEIGHBOURS = 16
 _EDGE_SIGMAS = 1.5
 """Standard deviations of a disc between its centre and the nearest crease."""
+_SPREAD = 0.72
+"""Standard deviation along the surface, in units of the local spacing."""
 _MIN_SPREAD = 0.27
 """Minimum standard deviation along the surface near a crease, in units of the local spacing."""
 _THICKNESS = 0.035
@@ -101,9 +103,7 @@ class Surfels:
         )
 
 
-def place_surfels(
-    mesh: trimesh.Trimesh, density: npt.ArrayLike, count: int, rng: np.random.Generator, *, spread: float = 0.72
-) -> Surfels:
+def place_surfels(mesh: trimesh.Trimesh, density: npt.ArrayLike, count: int, rng: np.random.Generator) -> Surfels:
     """Place about ``count`` surfels on ``mesh``.
 
     Args:
@@ -111,7 +111,6 @@ def place_surfels(
         density: Relative density of points on every face, shape (F,), > 0.
         count: Target number of surfels.
         rng: Random generator.
-        spread: Standard deviation along the surface, in units of the local spacing.
     """
     area = mesh.area_faces
     density = np.broadcast_to(np.asarray(density, dtype=np.float64), area.shape)
@@ -126,12 +125,12 @@ def place_surfels(
         spacing = spacing * np.sqrt(len(kept) / count)
     radius = pool.radius[kept, None]
     frames, room = _frames(pool.normals[kept], pool.points[kept], pool.radius[kept], creases)
-    widest = np.clip(room / _EDGE_SIGMAS, _MIN_SPREAD * radius, _SHARES[0] * spread * radius)
+    widest = np.clip(room / _EDGE_SIGMAS, _MIN_SPREAD * radius, _SHARES[0] * _SPREAD * radius)
     bent = pool.uneven[kept]
     widest[bent] = np.minimum(
-        widest[bent], _overhang_limit(pool, pool.points[kept][bent], frames[bent], radius[bent] * spread)
+        widest[bent], _overhang_limit(pool, pool.points[kept][bent], frames[bent], radius[bent] * _SPREAD)
     )
-    scales = np.concatenate([np.minimum(widest, spread * radius), _THICKNESS * radius], axis=1)
+    scales = np.concatenate([np.minimum(widest, _SPREAD * radius), _THICKNESS * radius], axis=1)
     probe = rng.choice(len(pool.points), size=min(len(pool.points), _PROBES * len(kept)), replace=False)
     probe = probe[pool.crease_distance[probe] > 0.15 * pool.radius[probe]]
     scales = _close_gaps(pool.points[kept], frames, scales, widest, pool.points[probe], pool.normals[probe])

@@ -49,6 +49,8 @@ MODULES = (
 From other modules they import only types and values, and the values are hashed separately.
 """
 _SIMULATION = ("mujoco", "mujoco-warp", "newton", "warp-lang")
+_TRIES_ALONE = 3
+"""Drops of an object alone before it counts as one that does not come to rest."""
 LIBRARIES = ("coacd", "fast-simplification", "numpy", "scipy", "trimesh", *_SIMULATION)
 
 
@@ -123,7 +125,7 @@ def settle_layouts(
     return run_frames(_SettleOne(scene, cached), layouts, workers=workers, note=progress or (lambda text: None))
 
 
-def try_alone(scene: Scene, *, tries: int = 3) -> Iterator[tuple[str, Arrangement, list[str]]]:
+def try_alone(scene: Scene) -> Iterator[tuple[str, Arrangement, list[str]]]:
     """Drop each object alone in each arrangement of its regions, but only in the first one of random poses.
 
     Yields:
@@ -151,7 +153,7 @@ def try_alone(scene: Scene, *, tries: int = 3) -> Iterator[tuple[str, Arrangemen
                     one = scene.assets[asset].name, region, arrangement
                     if one not in tried:
                         tried.add(one)
-                        yield one[0], arrangement, drop.try_alone(asset, region, arrangement, tries)
+                        yield one[0], arrangement, drop.try_alone(asset, region, arrangement, _TRIES_ALONE)
 
 
 @dataclass(frozen=True, eq=False)

@@ -426,7 +426,8 @@ class TestAttacks:
             os.mkfifo(place.inside / "pipe")
 
         command = ("sh", "-c", script.replace("{python}", sys.executable).replace("< pipe", "<> pipe"))
-        attack = Attack("a", "b", build, [command], seconds=5, mebibytes=60, keep=("kept",))
+        seconds = 0.5 if fault == "did not end within" else 5
+        attack = Attack("a", "b", build, [command], seconds=seconds, mebibytes=60, keep=("kept",))
         faults = judge(attack, place).faults
         assert (fault is None and faults == ()) or any(fault in found for found in faults), faults
 

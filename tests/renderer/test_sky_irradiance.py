@@ -31,7 +31,9 @@ def by_quadrature(emitter: object, normals: np.ndarray) -> np.ndarray:
     si.wi = mi.Vector3f(-directions.T.astype(np.float32))
     radiance = np.array(emitter.eval(si)).T  # type: ignore[attr-defined]
     weight = np.sin(theta) * (np.pi / rows) * (2 * np.pi / columns)
-    return np.maximum(normals @ directions.T, 0) @ (radiance * weight[:, None])
+    weighted = (radiance * weight[:, None]).astype(np.float32)
+    cosines = normals.astype(np.float32) @ directions.T.astype(np.float32)
+    return np.maximum(cosines, 0, out=cosines) @ weighted
 
 
 def test_the_irradiance_table_agrees_with_a_quadrature() -> None:

@@ -90,8 +90,8 @@ def seen_points(splats: Splats, capture: Capture) -> SurfacePoints:
     return surface_points(depth_views(splats, [photo.camera for photo in capture.training]))
 
 
-def removed(splats: Splats, capture: Capture, *what: str, points: SurfacePoints | None = None) -> Splats:
-    points = seen_points(splats, capture) if points is None else points
+def removed(splats: Splats, capture: Capture, *what: str) -> Splats:
+    points = seen_points(splats, capture)
     return remove_objects(splats, what, capture, find_supports(points, UP, DEPTH, within=5), points, DEPTH)[0]
 
 
@@ -171,17 +171,21 @@ def test_sides_of_objects_are_not_taken_for_walls(points: SurfacePoints) -> None
 
 
 def test_picks_without_an_object_on_a_surface_are_refused(captured: Capture, points: SurfacePoints) -> None:
-    splats = Splats.concatenate([place(), cube()])
+    splats, supports = Splats.concatenate([place(), cube()]), find_supports(points, UP, DEPTH, within=5)
+
+    def remove(spot: str) -> None:
+        remove_objects(splats, (spot,), captured, supports, points, DEPTH)
+
     on_table, on_floor = (pick(5, spot) for spot in ((0.1, -0.1, HEIGHT), (0.0, -1.2, HEIGHT - 0.8)))
     for spot in (on_table, on_floor, "photo05.png:3,1", "photo05.png:-50,900"):  # and pixels without splats
         with pytest.raises(
             InputError, match=r"photo05\.png:.*: an object to remove must stand on one of the detected level surfaces"
         ):
-            removed(splats, captured, spot, points=points)
-    with pytest.raises(InputError, match=r"none\.png:3,4: a pick must be PHOTO:X,Y with a registered photo"):
-        removed(splats, captured, "none.png:3,4", points=points)
+            remove(spot)
+    with pytest.raises(InputError, match=r"none\.png:3,4: a pick must be PHOTO:X,Y of a photo with a camera"):
+        remove("none.png:3,4")
     with pytest.raises(InputError, match=r"a pixel must be given as X,Y \(got 3\)"):
-        removed(splats, captured, "photo05.png:3", points=points)
+        remove("photo05.png:3")
     with pytest.raises(InputError, match="removed only from an environment"):
         AssetJob(name="mug", remove=("photo05.png:3,4",))
     mesh = ImportedMesh(trimesh.creation.box((1, 1, 1)))

@@ -418,8 +418,8 @@ def _bitmap(part: MeshPart, texture: Texture, *, raw: bool) -> dict[str, Any]:
     uv = _uv_of(part)
     if len(wraps) > 1 or uv is None or not np.array_equal(texture.uv, uv):
         raise InputError(
-            f"part {part.name!r}: for the light of a scene, its textures must have the same coordinates and continue "
-            "alike along both axes: bake it without lights"
+            f"part {part.name!r}: to bake the light of a scene, all its textures must have the same coordinates and "
+            "the same wrap mode along both axes: bake it without lights"
         )
     bitmap = {"type": "bitmap", "bitmap": mi.Bitmap(texture.pixels), "raw": raw}
     return {**bitmap, "wrap_mode": wraps.pop()} if wraps else bitmap

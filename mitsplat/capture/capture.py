@@ -298,7 +298,9 @@ class Capture:
         name, _, pixel = pick.rpartition(":")
         photos = {photo.name: photo for photo in self.photos}
         if name not in photos:
-            raise InputError(f"{pick}: a pick must be PHOTO:X,Y with a registered photo, such as {min(photos)}:400,300")
+            raise InputError(
+                f"{pick}: a pick must be PHOTO:X,Y of a photo with a camera, such as {min(photos)}:400,300"
+            )
         try:
             x, y = map(float, pixel.split(","))
         except ValueError:
@@ -348,7 +350,7 @@ class Capture:
                 photos.append(replace(photo, file=file, mask=mask))
             files = {path for photo in photos for path in (photo.file, photo.mask) if path is not None}
             if len(files) < sum(1 + (photo.mask is not None) for photo in photos):
-                raise InputError(f"{folder}: photos need names that differ in more than folder marks and suffix")
+                raise InputError(f"{folder}: photos must have different names without folder separators and suffix")
             seen = [photo.seen for photo in photos]
             arrays: dict[str, Any] = {
                 "points": self.points,

@@ -183,8 +183,8 @@ def _upright_photos(
     decisions = set(upright.values())
     if undecided and len(decisions) != 1:
         raise InputError(
-            f"{source}: does not tell whether its camera of {undecided[0].name} holds before or after the rotation in "
-            f"the EXIF data of the photo (orientation {undecided[0].pending}): rotate the pixels or remove the entry"
+            f"{source}: does not state whether its camera of {undecided[0].name} refers to the photo before or after "
+            f"the rotation in its EXIF data (orientation {undecided[0].pending}): rotate the pixels or remove the entry"
         )
     return {name for name, decision in upright.items() if decision} | {
         photo.name for photo in undecided if True in decisions

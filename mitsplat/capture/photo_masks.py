@@ -141,8 +141,8 @@ def check_borders(capture: Capture, source: Path) -> Capture:
     around = sum(bool(border.mean() > _MAX_BORDER) for border in borders)
     if around > len(capture.photos) / 2:
         raise InputError(
-            f"{source}: masks must be white, or photos opaque, on the object (got {around} of {len(capture.photos)} "
-            "that are so along the whole border of the photo): invert them"
+            f"{source}: masks must be white, or photos opaque, only on the object (got {around} of "
+            f"{len(capture.photos)} with a white or opaque border): invert them"
         )
     return capture
 

@@ -257,7 +257,9 @@ def _run(
                     break
                 except subprocess.TimeoutExpired:
                     if time.monotonic() > until:
-                        raise InputError(f"COLMAP did not end within {seconds:.0f} s") from None
+                        raise InputError(
+                            f"COLMAP did not end within {seconds:.0f} s: give fewer or smaller photos"
+                        ) from None
                     if progress is not None:
                         progress(*_progress_of(job, folder))
         finally:

@@ -144,7 +144,7 @@ def fit(
         raise InputError("--depths and --depth-model both define the depth maps: give only one")
     mapped = depths is not None or depth_model is not None
     if depth_kind != "inverse" and not mapped:
-        raise InputError(f"--depth-kind {depth_kind} requires depth maps: add --depths or --depth-model")
+        raise InputError(f"--depth-kind {depth_kind} needs depth maps: add --depths or --depth-model")
     settings = FitSettings(
         gaussians=gaussians,
         iterations=iterations,

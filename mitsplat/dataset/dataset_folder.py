@@ -291,9 +291,9 @@ def _check_is_dataset(out: Path) -> None:
     except (FileNotFoundError, NotADirectoryError):
         is_dataset = not out.is_dir() or all(is_unfinished(entry.name) for entry in out.iterdir())
     except (OSError, ValueError) as error:
-        raise InputError(f"{out / CONTENT} cannot be read ({error})") from error
+        raise InputError(f"{out / CONTENT}: cannot be read ({error})") from error
     if not is_dataset:
-        raise InputError(f"{out} must be empty or a dataset of mitsplat (it holds other files)")
+        raise InputError(f"{out}: must be empty or a dataset of mitsplat (it holds other files)")
     check_format_version(present, FORMAT_VERSIONS[CONTENT], out / CONTENT)
 
 
@@ -304,16 +304,18 @@ def _check_resumable(
     if not (out / CONTENT).exists():
         return
     if not resume:
-        raise InputError(f"{out} already holds a dataset; resume it or overwrite it")
+        raise InputError(f"{out}: already holds a dataset: resume it, overwrite it or choose another folder")
     present = {**DEFAULT_CONTENT, **read_json(out / CONTENT)}
     not_compared = {"libraries": None, "device": None}
     if difference := first_difference(present | not_compared, content | not_compared):
         key, before, now = difference
-        raise InputError(f"{out} cannot be resumed: {key} was {before} and is {now}; overwrite it or choose another")
+        raise InputError(
+            f"{out}: cannot be resumed: {key} was {before} and is {now}: overwrite it or choose another folder"
+        )
     if present["device"] != content["device"] and not any_device:
         raise InputError(
-            f"{out} cannot be resumed on the device {content['device']}: it was started on {present['device']}, whose "
-            f"pictures differ a little; give --device {present['device']}, or --any-device for frames of both"
+            f"{out}: cannot be resumed on the device {content['device']}: it was started on {present['device']}, whose "
+            f"pictures differ a little: give --device {present['device']}, or --any-device for frames of both"
         )
     stored = read_shard(out)
     if stored != shard:
@@ -321,7 +323,9 @@ def _check_resumable(
             f"shard {part['shard']}/{part['of']} of {part['frames']} images" if part else "a whole dataset"
             for part in (stored, shard)
         )
-        raise InputError(f"{out} cannot be resumed: it was {before} and is {now}; overwrite it or choose another")
+        raise InputError(
+            f"{out}: cannot be resumed: it was {before} and is {now}: overwrite it or choose another folder"
+        )
 
 
 def read_shard(out: Path) -> dict[str, int] | None:

@@ -150,7 +150,7 @@ class Manifest:
 
 def _line_error(path: Path, number: int, error: ValueError) -> InputError:
     line_error = InputError(
-        f"{path}, line {number}: must be the record of a frame ({error}); remove the line to render its frame again"
+        f"{path}:{number}: must be the record of a frame ({error}); remove the line to render its frame again"
     )
     line_error.__cause__ = error
     return line_error

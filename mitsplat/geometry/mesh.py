@@ -87,7 +87,10 @@ def prepare_mesh(mesh: trimesh.Trimesh, name: str, *, solid: bool = True) -> tri
         _logger.warning("%s: the mesh is inside out; physics flips its faces", name)
         welded.invert()
     if solid and abs(volume) < 1e-6 * size**3:
-        raise InputError(f"{name}: the mesh must enclose a volume (got {abs(volume):.3g} m^3 at {size:g} m across)")
+        raise InputError(
+            f"{name}: the mesh must enclose a volume (got {abs(volume):.3g} m^3 at {size:g} m across): "
+            "is it open or flat?"
+        )
     if solid and not welded.is_watertight:
         _logger.warning("%s: the mesh is not closed; mass and inertia are those of its convex pieces", name)
     if len(welded.faces) > _MAX_FACES:

@@ -126,5 +126,5 @@ def _convex_hull(splats: Splats, floor: float | None) -> trimesh.Trimesh:
         points[:, 2] = np.maximum(points[:, 2], floor)
     spans = np.linalg.svd(points - points.mean(axis=0), compute_uv=False) if len(points) > 3 else np.zeros(3)
     if not spans[2] > _MIN_THICKNESS * spans[0]:
-        raise InputError(f"the splats span no volume ({len(points)} opaque Gaussians)")
+        raise InputError(f"the opaque Gaussians must span a volume (got {len(points)} on a point, line or plane)")
     return trimesh.convex.convex_hull(points)

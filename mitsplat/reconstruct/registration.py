@@ -85,7 +85,7 @@ def surface_points(splats: Splats, cameras: Sequence[Camera]) -> Float64Array:
         points.append(local @ camera.world_from_camera[:3, :3].T + camera.centre)
     found: Float64Array = np.concatenate([np.zeros((0, 3)), *points])
     if not len(found):
-        raise InputError("the splats show no opaque surface to the cameras")
+        raise InputError("the splats show no opaque surface to the cameras: do the splats belong to this capture?")
     if len(found) > _SAMPLES:
         found = found[np.random.default_rng(0).choice(len(found), _SAMPLES, replace=False)]
     return found
@@ -127,7 +127,10 @@ def register_mesh(mesh: trimesh.Trimesh, points: Float64Array, scale: float | No
         InputError: If there are fewer than 100 points, or the size of the mesh contradicts that of the points.
     """
     if len(points) < 100:
-        raise InputError(f"a registration needs at least 100 points of the splats' surface (got {len(points)})")
+        raise InputError(
+            f"a registration needs at least 100 points of the splats' surface (got {len(points)}): does the object "
+            "fill enough of the photos?"
+        )
     surface = DistanceSurface(mesh)
     rng = np.random.default_rng(0)
     few = points[rng.choice(len(points), min(_COARSE_POINTS, len(points)), replace=False)]

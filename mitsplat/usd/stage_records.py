@@ -471,9 +471,14 @@ def _mesh_triangles(mesh: UsdGeom.Mesh, time: Usd.TimeCode) -> tuple[Float64Arra
     if not len(counts):
         return None
     if counts.min() < 3 or counts.sum() != len(corners):
-        raise InputError(f"{path}: faceVertexCounts must be at least 3 and match faceVertexIndices ({len(corners)})")
+        raise InputError(
+            f"{path}: faceVertexCounts must be at least 3 and have the sum {len(corners)}, the number of "
+            f"faceVertexIndices (got a least count of {counts.min()} and the sum {counts.sum()})"
+        )
     if corners.min() < 0 or corners.max() >= len(points):
-        raise InputError(f"{path}: faceVertexIndices must be 0 to {len(points) - 1} (got {corners.max()})")
+        raise InputError(
+            f"{path}: faceVertexIndices must be 0 to {len(points) - 1} (got {corners.min()} to {corners.max()})"
+        )
     faces = np.concatenate(list(_fans(counts.astype(np.int64), corners.astype(np.int64))))
     if mesh.GetOrientationAttr().Get() == "leftHanded":
         faces = faces[:, ::-1]

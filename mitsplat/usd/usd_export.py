@@ -106,7 +106,7 @@ def _write_stage(path: Path, write: Callable[[_StageWriter], None]) -> None:
             if packed:
                 result = Path(folder) / "package.usdz"
                 if not UsdUtils.CreateNewUsdzPackage(str(layer), str(result)):
-                    raise InputError(f"{path}: the package cannot be written")
+                    raise InputError(f"{path}: OpenUSD cannot write the package: export .usdc, which needs no package")
             elif writer.textures.is_dir():
                 shutil.copytree(writer.textures, path.with_name(writer.textures.name), dirs_exist_ok=True)
         except Tf.ErrorException as error:

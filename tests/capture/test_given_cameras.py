@@ -391,7 +391,7 @@ def test_an_undecided_half_turn_is_refused_with_a_remedy(
     monkeypatch.setattr(poses, "read_model", lambda *_: model_of(other, points=points))
     with pytest.raises(InputError) as raised:
         read_poses(tmp_path, prepared, tmp_path / "work", base=tmp_path / "photos")
-    assert "camera of a.png holds before or after the rotation in the EXIF data" in str(raised.value)
+    assert "camera of a.png refers to the photo before or after the rotation in its EXIF data" in str(raised.value)
     assert "(orientation 3): rotate the pixels or remove the entry" in str(raised.value)
 
 

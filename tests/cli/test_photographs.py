@@ -65,7 +65,7 @@ def test_fit_takes_depth_maps_of_a_folder_or_of_a_network(
         assert "warning: depth maps that are not used: a.jpg" in capsys.readouterr().out
     for options, text in (
         (("--depths", "maps", "--depth-model", "a.onnx"), "both define the depth maps: give only one"),
-        (("--depth-kind", "metric"), "--depth-kind metric requires depth maps: add --depths or --depth-model"),
+        (("--depth-kind", "metric"), "--depth-kind metric needs depth maps: add --depths or --depth-model"),
     ):
         assert run("fit", "photos", "-o", tmp_path, *options) == 2
         assert text in capsys.readouterr().err

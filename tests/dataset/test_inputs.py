@@ -136,8 +136,8 @@ def test_resuming_after_an_edit_of_an_input_is_refused_by_its_key(copy, file, ed
     with pytest.raises(InputError) as caught:
         write(load_scene(copy / "scene.yaml"), copy / "out", render=never_render)
     key = key if key == "assets" else f"inputs.{key}"
-    assert str(caught.value).startswith(f"{copy / 'out'} cannot be resumed: {key}")
-    assert str(caught.value).endswith("; overwrite it or choose another")
+    assert str(caught.value).startswith(f"{copy / 'out'}: cannot be resumed: {key}")
+    assert str(caught.value).endswith(": overwrite it or choose another folder")
 
 
 def test_files_and_remarks_that_are_not_read_may_change(copy):

@@ -38,9 +38,7 @@ def damaged(path, place):
 def test_a_damaged_line_in_the_middle_is_named_and_kept(tmp_path, number):
     path = damaged(tmp_path / "manifest.jsonl", sum(map(len, LINES[: number - 1])) + 12)
     before = path.read_bytes()
-    with pytest.raises(
-        InputError, match=rf"manifest\.jsonl, line {number}: must be the record of a frame \(its checksum"
-    ):
+    with pytest.raises(InputError, match=rf"manifest\.jsonl:{number}: must be the record of a frame \(its checksum"):
         Manifest(path)
     assert path.read_bytes() == before
 

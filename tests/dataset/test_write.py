@@ -360,7 +360,7 @@ class TestRefusals:
         (out / "dataset.json").write_text("[]")
         self.refuse(scene, out, "must be empty or a dataset of mitsplat", overwrite=overwrite)
         (out / "dataset.json").write_text("{")
-        self.refuse(scene, out, r"dataset\.json cannot be read", overwrite=overwrite)
+        self.refuse(scene, out, r"dataset\.json: cannot be read", overwrite=overwrite)
         (out / "dataset.json").unlink()
         assert contents(out, without=()) == before
 
@@ -394,7 +394,7 @@ class TestRefusals:
         manifest = tmp_path / "out/manifest.jsonl"
         lines = manifest.read_text().splitlines()
         manifest.write_text("\n".join([lines[0], "{", lines[2], ""]))
-        self.refuse(scene, tmp_path / "out", r"manifest\.jsonl, line 2: must be the record of a frame")
+        self.refuse(scene, tmp_path / "out", r"manifest\.jsonl:2: must be the record of a frame")
 
     @pytest.mark.parametrize("frames", [0, 13])
     def test_a_number_of_frames_out_of_range_is_refused(self, scene, tmp_path, frames):
@@ -433,7 +433,7 @@ class TestDevice:
         with pytest.raises(InputError) as refused:
             write(scene, out, render=never_render)
         assert str(refused.value) == (
-            f"{out} cannot be resumed on the device cpu: it was started on cuda, whose pictures differ a little; give "
+            f"{out}: cannot be resumed on the device cpu: it was started on cuda, whose pictures differ a little: give "
             "--device cuda, or --any-device for frames of both"
         )
         assert write(scene, out, any_device=True).rendered == 10

@@ -249,7 +249,7 @@ def test_each_layout_draws_an_arrangement_of_a_list(scene_data, write_scene):
     ("settle", "sentence"),
     [
         ({"arrangement": "tosed"}, "settle.arrangement: must be 'drop', 'tossed'"),
-        ({"arrangement": []}, "settle.arrangement: must have at least 1 item"),
+        ({"arrangement": []}, "settle.arrangement: must have 1 or more items"),
         ({"speed": [0.1, 0.3]}, "settle.speed: needs settle.arrangement tossed, tipped, pushed or shaken (got drop)"),
         ({"arrangement": ["drop", "pushed"], "spin": [0, 90]},
          "settle.spin: needs settle.arrangement tossed (got drop, pushed)"),

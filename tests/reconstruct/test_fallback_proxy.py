@@ -91,5 +91,5 @@ def test_splats_without_volume_are_refused(known_object: KnownObject) -> None:
     views = [MaskedView(view.camera, np.zeros_like(view.mask)) for view in views_of(known_object)]
     flat = known_object.splats.means * (1, 1, 0)
     splats: Splats = replace(known_object.splats, means=flat)
-    with pytest.raises(InputError, match=r"the splats span no volume \(3\d+ opaque Gaussians\)"):
+    with pytest.raises(InputError, match=r"must span a volume \(got 3\d+ on a point"):
         find_proxy_surface(splats, views, SETTINGS)

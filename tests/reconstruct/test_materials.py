@@ -210,7 +210,7 @@ def test_lights_of_a_file_are_fixed_and_their_images_lie_beside_it(tmp_path: Pat
     (tmp_path / "broken.exr").write_bytes(b"no image")
     for lines, message in (
         ("lights: [{kind: environment, image: broken.exr}]", "lamps.yaml: .*broken.exr: not a readable image"),
-        ("lights: []", "at least 1 item"),
+        ("lights: []", "must have 1 or more items"),
         ("lights: [{kind: environment, image: sky.exr}]", "lamps.yaml: .*sky.exr"),
         ("lights: [{kind: environment, image: ../sky.exr}]", "lamps.yaml: must be a file inside"),
         ("lights: [{kind: environment, draw: {radiance: [1, 2]}}]", "lights of photographs must be fixed"),

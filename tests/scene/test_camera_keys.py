@@ -100,7 +100,7 @@ def test_rounded_rotations_are_corrected(scene_data: dict[str, Any], write_scene
     ("camera", "sentence"),
     [
         ({}, "camera: must have either world_from_camera, or eye and target"),
-        ({"eye": [0, 0, 1]}, "camera: must have either world_from_camera, or eye and target"),
+        ({"eye": [0, 0, 1]}, "camera: must have either world_from_camera, or eye and target (got no target)"),
         (FIXED | {"world_from_camera": POSE.tolist()}, "camera.eye: must not be given together with world_from_camera"),
         (FIXED | {"target": FIXED["eye"]}, "camera.target: must differ from eye"),
         (FIXED | {"up": [0, 0, 0]}, "camera.up: must not be zero"),

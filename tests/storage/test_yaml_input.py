@@ -112,7 +112,7 @@ def test_a_valid_file_fills_the_model(drawing: Path) -> None:
         ),
         (
             "title: a\nshapes:\n- kind: polygon\n  corners: [[0, 0]]\n",
-            ":4: shapes[0].corners: must have at least 3 items (got [[0, 0]])",
+            ":4: shapes[0].corners: must have 3 or more items (got [[0, 0]])",
         ),
         ("title: a\ninner:\n  low: 3\n  high: 2\n", ":4: inner.high: must be >= low (got 2)"),
         ("title: a\ntitle: b\n", ':2: keys must be unique (found duplicate key "title")'),

@@ -153,21 +153,21 @@ def spot(model: SparseModel, name: str) -> Float64Array:
 
     Args:
         model: Result of structure from motion.
-        name: "photo" for the camera centre of a photo; "photo:x,y" for the surface point at a pixel of a photo.
+        name: "PHOTO" for the camera centre of a photo; "PHOTO:X,Y" for the surface point at a pixel of a photo.
 
     Raises:
         InputError: If there is no such photo, or it observes no point near the pixel.
     """
     photo, colon, pixel = name.rpartition(":") if ":" in name else (name, "", "")
     if photo not in model.cameras:
-        raise InputError(f"{photo}: no such registered photo")
+        raise InputError(f"{name}: must name a photo with a camera, such as {min(model.cameras)} (got {photo})")
     camera = model.cameras[photo]
     if not colon:
         return camera.centre
     try:
         x, y = map(float, pixel.split(","))
     except ValueError:
-        raise InputError(f"{name}: a pixel must be given as x,y (got {pixel})") from None
+        raise InputError(f"{name}: a pixel must be given as X,Y (got {pixel})") from None
     seen = model.points[model.seen[photo]]
     pixels, depths = camera.project(seen)
     gaps = np.linalg.norm(pixels - (x, y), axis=1)

@@ -75,10 +75,10 @@ class Intrinsics(StrictModel):
     @model_validator(mode="after")
     def _check(self) -> Intrinsics:
         if (self.fov_x is None) == (self.fx is None):
-            raise FieldError((), "must have either fov_x or fx")
+            raise FieldError((), f"must have either fov_x or fx (got {'neither' if self.fx is None else 'both'})")
         for key in ("fy", "cx", "cy", "size"):
             if self.fx is None and getattr(self, key) is not None:
-                raise FieldError(key, "needs fx")
+                raise FieldError(key, "needs fx (got fov_x)")
         if self.aperture > 0 and self.focus <= NEAR:
             raise FieldError("focus", f"must be beyond the near clipping depth, {NEAR} m (got {self.focus})")
         if self.lens == "fisheye" and (self.fx is None or len(self.distortion) != 4):
@@ -208,7 +208,7 @@ class CameraFixed(CameraKeys):
             return self
         for key in ("eye", "target"):
             if getattr(self, key) is None:
-                raise FieldError((), "must have either world_from_camera, or eye and target")
+                raise FieldError((), f"must have either world_from_camera, or eye and target (got no {key})")
         if not any(self.up):
             raise FieldError("up", "must not be zero (got [0, 0, 0])")
         if self.eye == self.target:

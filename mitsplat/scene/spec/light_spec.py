@@ -100,7 +100,7 @@ class LightKey(StrictModel):
     @model_validator(mode="after")
     def _check(self) -> LightKey:
         if self.position is None and self.temperature is None:
-            raise FieldError((), "must have a position or a temperature")
+            raise FieldError((), "must have a position or a temperature (got neither)")
         return self
 
 

@@ -157,7 +157,9 @@ class ObjectSpec(StrictModel):
     @model_validator(mode="after")
     def _check(self) -> ObjectSpec:
         if (self.asset is None) == (self.pool is None):
-            raise FieldError((), "must have either an asset or a pool")
+            raise FieldError(
+                (), f"must have either an asset or a pool (got {'neither' if self.pool is None else 'both'})"
+            )
         if self.pool == ():
             raise FieldError("pool", "must name at least one asset (got [])")
         if self.balance and self.pool is None:

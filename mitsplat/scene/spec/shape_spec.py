@@ -90,8 +90,10 @@ class Shape(StrictModel):
 
     @model_validator(mode="after")
     def _check(self) -> Shape:
-        if sum(form is not None for form in (self.box, self.bin, self.mesh)) != 1:
-            raise FieldError("name", f"shape {self.name!r} must have either a box, a bin or a mesh")
+        forms = [form for form in ("box", "bin", "mesh") if getattr(self, form) is not None]
+        if len(forms) != 1:
+            got = " and ".join(forms) or "none"
+            raise FieldError("name", f"shape {self.name!r} must have either a box, a bin or a mesh (got {got})")
         if not (self.visible or self.collider or self.proxy):
             raise FieldError("visible", f"shape {self.name!r} must be visible, a collider or a proxy")
         if self.materials and not self.visible:

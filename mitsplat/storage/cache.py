@@ -75,6 +75,8 @@ def prepare_caches() -> None:
     Child processes inherit the temporary folder, which is removed when this process ends. Kernels that can be read from
     the unusable folder are copied there.
     """
+    if os.environ.get(_WARP) == "":
+        del os.environ[_WARP]  # Warp would use the working folder
     own, kernels = cache_folder(), warp_folder()
     reasons = {folder: reason for folder in (own, kernels) if (reason := unusable_reason(folder))}
     if kernels in reasons:

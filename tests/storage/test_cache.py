@@ -40,7 +40,8 @@ for name in "ab":
 @pytest.fixture
 def fresh(monkeypatch):
     """Reset the caches that this process has prepared and reported."""
-    prepare_caches.cache_clear()
+    with quiet_warp():  # Warp keeps the folder of the session
+        prepare_caches.cache_clear()
     monkeypatch.setattr(cache, "_reported", set())
     monkeypatch.setenv("WARP_CACHE_PATH", "")
     yield monkeypatch
@@ -102,6 +103,7 @@ def test_a_usable_cache_is_not_replaced(fresh, tmp_path, monkeypatch, caplog):
     prepare_caches()
     write_cache_file(cache_folder() / "layouts" / "a", lambda file: file.write(b"a"))
     assert warp_folder() == tmp_path / "warp"
+    assert "WARP_CACHE_PATH" not in os.environ  # Warp would take an empty value for the working folder
     assert [path.name for path in tmp_path.rglob("*") if path.is_file()] == ["a"]
     assert caplog.records == []
 

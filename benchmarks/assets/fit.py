@@ -151,7 +151,7 @@ def fit_with_gsplat(capture: Capture, settings: FitSettings) -> tuple[float, flo
     from gsplat.strategy import MCMCStrategy
 
     torch.manual_seed(settings.seed)
-    scale = min(1.0, settings.size / max(capture.photos[0].camera.width, capture.photos[0].camera.height))
+    scale = min(1.0, settings.max_size / max(capture.photos[0].camera.width, capture.photos[0].camera.height))
     sights = [TrainingView(photo, scale, masked=False) for photo in capture.training]
     held_out = [TrainingView(photo, scale, masked=False) for photo in capture.held_out]
     centres = np.array([sight.camera.centre for sight in sights])

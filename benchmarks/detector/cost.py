@@ -55,7 +55,7 @@ def rendered(scene: ms.Scene, views: range) -> Iterator[float]:
 
 def traced(scene: ms.Scene, views: range, options: argparse.Namespace) -> Iterator[float]:
     """Return the seconds of each path-traced image, without labels."""
-    for frame in frames(scene, textured(options.hope, options.work), views, samples=64):
+    for frame in frames(scene, textured(options.hope), views, samples=64):
         yield frame.seconds["path"]
 
 

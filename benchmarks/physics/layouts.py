@@ -47,9 +47,11 @@ def write_body(wanted: Wanted, work: Path) -> None:
         mesh, up = wanted.scan, UP.get(wanted.scan.stem, "y")
     else:
         mesh, up = wanted.mesh()
-    bag = wanted.kind == "bags" and isinstance(mesh, trimesh.Trimesh)
-    pieces = hulls_of(mesh) if bag else [parts_hull(mesh, up)]
-    shape = trimesh.Trimesh(mesh.vertices, mesh.faces) if bag else pieces[0]
+    if wanted.kind == "bags" and isinstance(mesh, trimesh.Trimesh):
+        pieces, shape = hulls_of(mesh), trimesh.Trimesh(mesh.vertices, mesh.faces)
+    else:
+        pieces = [parts_hull(mesh, up)]
+        shape = pieces[0]
     name = wanted.name if wanted.kind == "groceries" else "package"
     Asset(wanted.name, name, POINT, mesh=shape, pieces=tuple(pieces), density=DENSITY).save(wanted.out(work))
 

@@ -231,7 +231,7 @@ def measure_rest(count: int) -> None:
             assets, _ = draw_objects(drop.scene, 0)
             world = drop._world(assets, 1.0)
             world.reset(drop.draw_poses(assets, np.random.default_rng(seed)))
-            outcome = run_to_rest(world, max_time=6.0, bounds=drop._grounds[0].bounds, free_time=FREE_TIME)
+            outcome = run_to_rest(world, max_time=6.0, bounds=drop._static_scenes[0].bounds, free_time=FREE_TIME)
             if outcome.rejection:
                 print(f"  seed {seed}: {outcome.rejection}")
                 continue
@@ -308,9 +308,9 @@ def measure_worlds(count: int, device: str) -> None:
     bodies = [drop._objects[asset].body for asset in assets]
     time_worlds(
         bodies,
-        drop._grounds[0].colliders,
+        drop._static_scenes[0].colliders,
         starts,
-        drop._grounds[0].bounds,
+        drop._static_scenes[0].bounds,
         timestep=TIMESTEP,
         device=device,
     )

@@ -72,10 +72,11 @@ def print_costs(name: str, integrator: Any, scene: Any, camera: ms.Camera, repea
     """Print the time of the march with all instances, with the first walk alone, and with a single instance."""
     from mitsplat.renderer.rays.sensors import view_of
     from mitsplat.renderer.splatting import march
+    from mitsplat.renderer.splatting.instance_votes import resolve_instances
     from mitsplat.renderer.splatting.tiles import bin_gaussians
 
     contents = integrator.renderer._contents.read(scene, splat_shadows=False)
-    view, settle = view_of(make_sensor(camera)), march.resolve_instances
+    view = view_of(make_sensor(camera))
     unsure: list[float] = []
 
     def count(instance: Any, doubt: Any, *rest: Any) -> Any:
@@ -85,16 +86,20 @@ def print_costs(name: str, integrator: Any, scene: Any, camera: ms.Camera, repea
     for preset in ("fast", "balanced"):
         quality = PRESETS[preset]
         lists = bin_gaussians(contents.clouds, contents.placements, view, quality)
-        cases = {"all": (lists, settle), "first walk": (lists, count), "one": (replace(lists, instance=1), settle)}
+        cases = {
+            "all": (lists, resolve_instances),
+            "first walk": (lists, count),
+            "one": (replace(lists, instance=1), resolve_instances),
+        }
         times: dict[str, list[float]] = {case: [] for case in cases}
         for _ in range(repeats + 1):
             for case, (own, second) in cases.items():
-                march.resolve_instances = second
+                march.resolve_instances = second  # type: ignore[attr-defined]
                 start = time.process_time()
                 dr.eval(march.march(own, view, quality))
                 dr.sync_thread()
                 times[case].append(time.process_time() - start)
-        march.resolve_instances = settle
+        march.resolve_instances = resolve_instances  # type: ignore[attr-defined]
         least = {case: min(seconds[1:]) for case, seconds in times.items()}
         share = unsure[-1] if unsure else 0.0
         told = ", ".join(f"{case} {least[case] / least['one']:.2f}" for case in ("first walk", "all"))

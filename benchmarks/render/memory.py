@@ -62,9 +62,10 @@ def backward(count: int) -> None:
     names = ("means", "quats", "scales", "opacities", "sh")
     inputs = [mi.Float(np.asarray(getattr(splats, name)).ravel()) for name in names]
     dr.enable_grad(inputs)
+    means, quats, scales, opacities, sh = inputs
 
     def run() -> None:
-        cloud = pack_cloud(*inputs, splats.sh.shape[1])
+        cloud = pack_cloud(means, quats, scales, opacities, sh, splats.sh.shape[1])
         rgb, alpha = render_differentiable(cloud, view_of(make_sensor(CAMERA)), Quality())
         dr.backward(dr.sum(sum(rgb, alpha)))
         dr.eval(*(dr.grad(value) for value in inputs))

@@ -228,7 +228,7 @@ def main() -> None:
 def measure(options: argparse.Namespace) -> None:
     """Measure both runs."""
     Frames.instances = options.instances
-    dataset.FrameJob = Frames  # type: ignore[misc, assignment]
+    dataset.FrameJob = Frames  # type: ignore[attr-defined, misc, assignment]
     os.fsync = syncs = Syncs(options.sync_every)  # type: ignore[assignment]
     with tempfile.TemporaryDirectory(dir=options.folder) as folder:
         path, out = Path(folder) / "scene.yaml", Path(folder) / "out"

@@ -112,7 +112,7 @@ def measure(args: argparse.Namespace) -> int:
         Image.fromarray(np.rint(255 * picture.clip(0, 1)).astype(np.uint8)).save(folder / photo.name)
     level = {name: psnr_of(float((np.concatenate(parts) ** 2).mean())) for name, parts in errors.items()}
     others = {
-        "filled in, m2": float(sum(thing["filled"] for thing in record["removed_things"])),
+        "filled in, m2": float(sum(thing["filled"] for thing in record["removed_objects"])),
         "PSNR where things were, dB": level["after"],
         "PSNR where things were, not removed, dB": level["before"],
         "PSNR of the things in photos with them, dB": level["with"],
@@ -121,7 +121,7 @@ def measure(args: argparse.Namespace) -> int:
     for name, value in others.items():
         figure(value, "", name)
         print(f"{name:45} {value:8.3f}")
-    return tell_wanted({"things removed": len(record["removed_things"])}, WANTED, set(WANTED))
+    return tell_wanted({"things removed": len(record["removed_objects"])}, WANTED, set(WANTED))
 
 
 if __name__ == "__main__":

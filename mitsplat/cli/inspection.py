@@ -210,7 +210,7 @@ def chart(
     from rich.text import Text
 
     from mitsplat.frames.accuracy.accuracy_chart import draw_chart, write_csv
-    from mitsplat.frames.accuracy.speed_accuracy import cheapest, check_tolerance, measure_steps
+    from mitsplat.frames.accuracy.speed_accuracy import check_tolerance, fastest_preset, measure_steps
     from mitsplat.runtime.device import find_device
 
     check_output_file(out, ".png")
@@ -227,7 +227,7 @@ def chart(
             progress=progress,
             device=chosen,
         )
-    best = cheapest(rows, tolerance)
+    best = fastest_preset(rows, tolerance)
     names = "RMSE", "PSNR [dB]", "largest", "estimate", "objects [dB]", "SSIM", "mask IoU", "peak [GiB]"
     table = Table()
     for title in ("step", "s/image", *names):

@@ -187,7 +187,7 @@ def _describe_surfaces(
     record: dict[str, Any] = {}
     if removed:
         rows["Removed objects"] = "; ".join(_removal_text(one, factor, unit) for one in removed)
-        record["removed_things"] = [
+        record["removed_objects"] = [
             {
                 "pick": t.pick,
                 "gaussians": t.gaussians,

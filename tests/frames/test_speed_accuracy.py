@@ -19,7 +19,7 @@ from mitsplat.cli import app
 from mitsplat.errors import InputError
 from mitsplat.frames.accuracy import speed_accuracy
 from mitsplat.frames.accuracy.accuracy_chart import curve_of, draw_chart
-from mitsplat.frames.accuracy.speed_accuracy import Row, Step, cheapest, measure_steps, tolerance_steps
+from mitsplat.frames.accuracy.speed_accuracy import Row, Step, fastest_preset, measure_steps, tolerance_steps
 from mitsplat.gaussians.spherical_harmonics import SH_C0
 from mitsplat.gaussians.surfels import place_surfels
 from mitsplat.images.colour import encode_srgb
@@ -85,13 +85,13 @@ def test_objects_are_compared_with_their_path_traced_meshes(tmp_path: Path, monk
 
 
 @pytest.mark.parametrize(("tolerance", "name"), [(0.02, "fast"), (0.002, "balanced"), (0.0, "exact")])
-def test_the_cheapest_preset_within_a_tolerance_is_chosen(tolerance: float, name: str) -> None:
-    assert cheapest(ROWS, tolerance).name == name
+def test_the_fastest_preset_within_a_tolerance_is_chosen(tolerance: float, name: str) -> None:
+    assert fastest_preset(ROWS, tolerance).name == name
 
 
 def test_negative_tolerance_is_refused() -> None:
     with pytest.raises(InputError, match="tolerance must be at least 0"):
-        cheapest(ROWS, -1.0)
+        fastest_preset(ROWS, -1.0)
 
 
 def test_coarser_presets_have_larger_measured_errors(splat_file: Path) -> None:

@@ -207,7 +207,7 @@ def test_an_environment_records_removed_objects(
     assert [float(edge) for edge in size.split(" x ")] == pytest.approx([CUBE, CUBE, CUBE], abs=0.015)
     assert what in done.verdict.rows["Removed objects"] and "are synthesised" in done.verdict.rows["Removed objects"]
     assert "was hidden by removed objects" in (tmp_path / "cell" / "report.html").read_text()
-    (record,) = json.loads((tmp_path / "cell" / "verdict.json").read_text())["removed_things"]
+    (record,) = json.loads((tmp_path / "cell" / "verdict.json").read_text())["removed_objects"]
     assert record["pick"] == what and CUBE**2 < record["filled"] < 3 * CUBE**2 and record["copied"] == 1
     assert done.verdict.psnr is not None and done.verdict.psnr > 35  # without pixels of the removed object
     asset = Asset.load(tmp_path / "cell")

@@ -16,7 +16,7 @@ from mitsplat.frames.accuracy.speed_accuracy import (
     MESH_PREFIX,
     TOLERANCE_PREFIX,
     Row,
-    cheapest,
+    fastest_preset,
 )
 from mitsplat.quality import PRESETS
 from mitsplat.storage.files import storage_errors, write_file, write_text
@@ -58,7 +58,7 @@ def _draw_errors(axes: Any, rows: Sequence[Row], tolerance: float) -> None:
     front = sorted(p for p in points if not any(q != p and q[0] <= p[0] and q[1] <= p[1] for q in points))
     axes.step(*zip(*front, strict=True), where="post", color="0.7", zorder=1)
     axes.plot(*zip(*curve_of(rows, least), strict=True), color="C0", linewidth=1, zorder=1)
-    chosen = cheapest(rows, tolerance)
+    chosen = fastest_preset(rows, tolerance)
     for row, error in zip(rows, errors, strict=True):
         axes.scatter(row.seconds, error, s=50, color="C3" if row == chosen else "C0", zorder=2)
         label = f"{row.name} (no error)" if row.rmse == 0 else row.name

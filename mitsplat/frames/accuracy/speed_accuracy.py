@@ -198,7 +198,7 @@ def _steps_of(path: Path, overrides: Mapping[str, Any] | None, allow_outside: bo
     return STEPS + LIGHT_STEPS + (MATERIAL_STEPS if has_materials else ())
 
 
-def cheapest(rows: Sequence[Row], tolerance: float) -> Row:
+def fastest_preset(rows: Sequence[Row], tolerance: float) -> Row:
     """Return the fastest preset whose RMSE is within the tolerance; ``rows`` must contain all presets.
 
     Raises:
@@ -228,7 +228,7 @@ def choose_preset(
     progress: Progress | None = None,
     device: Device | None = None,
 ) -> Row:
-    """Return the cheapest preset for a scene, measured on two of its frames; see :func:`measure_steps`.
+    """Return the fastest preset for a scene, measured on two of its frames; see :func:`measure_steps`.
 
     Raises:
         InputError: If the tolerance is negative, or the scene file is invalid.
@@ -238,7 +238,7 @@ def choose_preset(
     rows = measure_steps(
         path, steps, frames=2, overrides=overrides, allow_outside=allow_outside, progress=progress, device=device
     )
-    return cheapest(rows, tolerance)
+    return fastest_preset(rows, tolerance)
 
 
 def _is_splats(path: Path) -> bool:

@@ -90,8 +90,13 @@ def seen_points(splats: Splats, capture: Capture) -> SurfacePoints:
     return surface_points(depth_views(splats, [photo.camera for photo in capture.training]))
 
 
-def removed(splats: Splats, capture: Capture, *what: str) -> Splats:
-    points = seen_points(splats, capture)
+@pytest.fixture(scope="module")
+def shaded_points(captured: Capture) -> SurfacePoints:
+    """Return points on the surfaces of table, floor, box and cube with colour gradients."""
+    return seen_points(Splats.concatenate([*table_and_box(), cube()]), captured)
+
+
+def removed(splats: Splats, capture: Capture, points: SurfacePoints, *what: str) -> Splats:
     return remove_objects(splats, what, capture, find_supports(points, UP, DEPTH, within=5), points, DEPTH)[0]
 
 
@@ -101,10 +106,10 @@ def above(splats: Splats, low: tuple[float, float], high: tuple[float, float]) -
     return np.asarray(inside & (splats.means[:, 2] > HEIGHT + 0.012))
 
 
-def test_a_picked_object_is_removed_and_another_kept(captured: Capture) -> None:
+def test_a_picked_object_is_removed_and_another_kept(captured: Capture, shaded_points: SurfacePoints) -> None:
     bare, box = table_and_box()
     whole = Splats.concatenate([bare, box, cube()])
-    left = removed(whole, captured, pick(12, (BESIDE[0], BESIDE[1], HEIGHT + CUBE)))
+    left = removed(whole, captured, shaded_points, pick(12, (BESIDE[0], BESIDE[1], HEIGHT + CUBE)))
     around = np.array(BESIDE)
     assert not above(left, tuple(around - 0.1), tuple(around + 0.1)).any()
     corner = (TABLE[0] / 2 - BOX[0] - 0.02, TABLE[1] / 2 - BOX[1] - 0.02)
@@ -118,13 +123,12 @@ def test_a_picked_object_is_removed_and_another_kept(captured: Capture) -> None:
         assert np.abs(shown.alpha - true.alpha).max() < 0.05
 
 
-def test_all_picked_objects_are_removed(captured: Capture) -> None:
+def test_all_picked_objects_are_removed(captured: Capture, shaded_points: SurfacePoints) -> None:
     """The colour gradient of the table continues below the removed objects."""
     bare, box = table_and_box()
     on_box = (TABLE[0] / 2 - 0.7 * BOX[0], TABLE[1] / 2 - BOX[1], HEIGHT + BOX[2] / 2)
-    left = removed(
-        Splats.concatenate([bare, box, cube()]), captured, pick(12, (*BESIDE, HEIGHT + CUBE)), pick(8, on_box)
-    )
+    whole = Splats.concatenate([bare, box, cube()])
+    left = removed(whole, captured, shaded_points, pick(12, (*BESIDE, HEIGHT + CUBE)), pick(8, on_box))
     assert not (left.means[:, 2] > HEIGHT + 0.03).any()
     for camera in cameras()[::6]:
         (shown,), (true,) = (show_asset(splats, None, [camera]) for splats in (left, bare))

@@ -219,7 +219,7 @@ class TestJson:
             with (out / "manifest.jsonl").open("rb") as file:
                 kept = file.read()
             (out / "manifest.jsonl").write_bytes(_checked(line) + kept)
-            with pytest.raises(InputError, match=r"line 1: must be the record of a frame"):
+            with pytest.raises(InputError, match=r"manifest\.jsonl:1: must be the record of a frame"):
                 write_folds(out, 2)
             assert any("line 1 is not the record" in text for _, text in audit_dataset(out).violations)
             (out / "manifest.jsonl").write_bytes(kept)
@@ -292,7 +292,7 @@ class TestTypes:
         lines[1] = _changed(lines[1], (key,), new)
         (out / "manifest.jsonl").write_bytes(b"".join(map(encode_line, lines)))
         for command in (lambda: write_folds(out, 2), lambda: READERS["merge"](out), lambda: write(scene, out)):
-            with pytest.raises(InputError, match=r"line 2: must be the record of a frame") as caught:
+            with pytest.raises(InputError, match=r"manifest\.jsonl:2: must be the record of a frame") as caught:
                 command()
             assert "\n" not in str(caught.value)
         assert any("line 2 is not the record" in text for _, text in audit_dataset(out).violations)

@@ -163,7 +163,7 @@ class TestRefusals:
         data = bytearray(manifest.read_bytes())
         data[100] ^= 1
         manifest.write_bytes(data)
-        self.refuse(shards, tmp_path / "out", r"manifest\.jsonl, line 1: must be the record of a frame \(its checksum")
+        self.refuse(shards, tmp_path / "out", r"manifest\.jsonl:1: must be the record of a frame \(its checksum")
 
     def test_a_shard_of_another_scene_is_refused(self, scene, shards, tmp_path):
         other = load_scene(scene.path, overrides={"seed": 8})

@@ -5,7 +5,9 @@ from __future__ import annotations
 import errno
 import os
 import re
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Literal
 
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 """Error numbers of the operating system that mean that there is no space for a file."""
@@ -51,6 +53,11 @@ def describe(value: object) -> str:
     """Return the type of a value and the value, if it is short."""
     text = repr(value)
     return type(value).__name__ if len(text) > 60 or "\n" in text else f"{type(value).__name__} {text}"
+
+
+def list_in_words(words: Sequence[str], last: Literal["and", "or"]) -> str:
+    """Return one or more words as a list: "a", "a or b", "a, b or c"."""
+    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} {last} {words[-1]}"
 
 
 def path_of(value: object, place: str) -> Path:

@@ -29,6 +29,7 @@ from mitsplat.geometry.camera import Camera
 from mitsplat.geometry.lens import Lens
 from mitsplat.images.colour import decode_srgb, encode_srgb
 from mitsplat.storage.content_hash import ContentHash
+from mitsplat.storage.file_kinds import no_folder_with
 from mitsplat.storage.files import IMAGE_ERRORS, copy_file, resolve_inside, write_file, write_text
 from mitsplat.storage.format_version import FORMAT_VERSIONS
 from mitsplat.storage.yaml_input import load_yaml
@@ -387,6 +388,8 @@ class Capture:
             InputError: If a file is missing, has a newer format version or is invalid.
         """
         folder = Path(folder)
+        if not (folder / CAPTURE_FILE).exists():
+            raise no_folder_with(folder, CAPTURE_FILE, "the folder of a capture")
         spec = load_yaml(folder / CAPTURE_FILE, CaptureSpec, newest=FORMAT_VERSIONS[CAPTURE_FILE])
         try:
             with (folder / _POINTS).open("rb") as stored, np.load(stored, allow_pickle=False) as arrays:

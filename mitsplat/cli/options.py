@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from mitsplat.errors import InputError
+from mitsplat.errors import InputError, list_in_words
 from mitsplat.quality import PresetName
 
 SceneFile = Annotated[Path, typer.Argument(metavar="SCENE", help="Scene file (.yaml).")]
@@ -62,7 +62,7 @@ JsonLog = Annotated[
 def check_ending(out: Path | None, *endings: str) -> None:
     """Raise InputError if the output file has none of the given endings."""
     if out is not None and out.suffix.lower() not in endings:
-        raise InputError(f"--out must end in {' or '.join(endings)} (got {out})")
+        raise InputError(f"--out must end in {list_in_words(endings, 'or')} (got {out})")
 
 
 def check_output_file(out: Path, *endings: str) -> None:

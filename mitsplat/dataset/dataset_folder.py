@@ -183,7 +183,9 @@ def open_folder(
 def _lock_error(out: Path, error: OSError) -> str:
     if error.errno in (errno.ELOOP, errno.EMLINK, errno.EINVAL):
         return f"{error.filename}: {error.strerror}"
-    return f"cannot write into {out}: {error.strerror}"
+    if isinstance(error, FileExistsError | NotADirectoryError):
+        return f"{out}: must be a folder, and not below a file (got a file)"
+    return f"{out}: cannot be written ({error.strerror})"
 
 
 @contextmanager

@@ -25,6 +25,7 @@ from mitsplat.images.masks import decode_rle
 from mitsplat.scene.spec.camera_spec import CameraSpec
 from mitsplat.scene.spec.scene_spec import LabelRules, Output
 from mitsplat.storage.field_types import Name
+from mitsplat.storage.file_kinds import no_folder_with
 from mitsplat.storage.files import JsonObject, Record, open_regular, read_json, splits_of
 from mitsplat.storage.format_version import FORMAT_VERSIONS, check_format_version
 
@@ -240,24 +241,24 @@ def read_content(root: Path) -> JsonObject:
     """
     try:
         content: JsonObject = read_json(root / "dataset.json")
-    except OSError as error:
-        reason = f"dataset.json: {error.strerror}" if root.is_dir() else "no such folder"
-        raise InputError(f"{root} must be a dataset of mitsplat ({reason})") from error
-    except ValueError as error:
-        raise InputError(f"{root} must be a dataset of mitsplat (dataset.json: {error})") from error
+    except (FileNotFoundError, NotADirectoryError):
+        raise no_folder_with(root, "dataset.json", "a dataset of mitsplat") from None
+    except (OSError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise InputError(f"{root}: must be a dataset of mitsplat (dataset.json: {reason})") from error
     check_format_version(content, FORMAT_VERSIONS["dataset.json"], root / "dataset.json")
     try:
         checked = _Content.model_validate_json(json.dumps(content))
     except ValidationError as error:
         reason = f"dataset.json: {_first_message(error)}"
-        raise InputError(f"{root} must be a dataset of this version of mitsplat ({reason})") from error
+        raise InputError(f"{root}: must be a dataset of this version of mitsplat ({reason})") from error
     if len(content["keypoints"]) != len(content["classes"]):
         raise InputError(
             f"{root / 'dataset.json'}: keypoints must have one list per class "
             f"(got {len(content['keypoints'])} lists for {len(content['classes'])} classes)"
         )
     if not (root / "manifest.jsonl").is_file():
-        raise InputError(f"{root} must be a dataset of mitsplat (it has no manifest.jsonl)")
+        raise InputError(f"{root}: must be a dataset of mitsplat (it has no manifest.jsonl)")
     content["scene"] |= checked.scene.model_dump(mode="json", include={"camera", "labels", "output"})
     return content
 

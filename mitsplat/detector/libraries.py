@@ -18,7 +18,7 @@ from pathlib import Path
 from pickle import UnpicklingError
 from typing import Any
 
-from mitsplat.errors import InputError, MissingResourceError
+from mitsplat.errors import InputError, MissingResourceError, list_in_words
 
 WEIGHTS_ERRORS = (
     *(OSError, EOFError, UnpicklingError, RuntimeError),
@@ -58,7 +58,7 @@ def load_libraries() -> None:
     """
     missing = [name for name in ("torch", "torchvision", "ultralytics") if find_spec(name) is None]
     if missing:
-        raise MissingResourceError(f"detectors need {' and '.join(missing)}: pip install 'mitsplat[train]'")
+        raise MissingResourceError(f"detectors need {list_in_words(missing, 'and')}: pip install 'mitsplat[train]'")
     import torch
 
     # Without this function, Ultralytics silently uses a loader that executes code.

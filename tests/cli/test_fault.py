@@ -39,8 +39,11 @@ from tests.conftest import box_asset
         ),
         ("render nut", "nut: must be a scene file (.yaml) (got the folder of an asset: enter it in a scene"),
         ("preview scene.xml", "scene.xml: must be a scene file (.yaml) (got a Mitsuba scene: `mitsplat render`"),
-        ("audit folder", "folder must be a dataset of mitsplat (dataset.json: No such file or directory)"),
-        ("audit gone", "gone must be a dataset of mitsplat (no such folder)"),
+        ("audit folder", "folder: must be a dataset of mitsplat (got a folder without dataset.json)"),
+        ("audit gone", "gone: no such folder"),
+        ("audit nut", "nut: must be a dataset of mitsplat (got the folder of an asset: enter it in a scene"),
+        ("fit gone -o fitted", "gone: no such folder"),
+        ("fit nut -o fitted", "nut: must be the folder of a capture (got the folder of an asset: enter it in a scene"),
         ("render gone.yaml --address auto", "--address does not apply to this machine: add --engine ray"),
     ],
 )

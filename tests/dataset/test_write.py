@@ -377,8 +377,8 @@ class TestRefusals:
 
     def test_a_file_in_place_of_the_folder_is_refused(self, scene, tmp_path):
         (tmp_path / "out").write_text("")
-        self.refuse(scene, tmp_path / "out", "cannot write into .*out: File exists")
-        self.refuse(scene, tmp_path / "out/deeper", "cannot write into .*deeper: Not a directory")
+        self.refuse(scene, tmp_path / "out", r"out: must be a folder, and not below a file \(got a file\)")
+        self.refuse(scene, tmp_path / "out/deeper", "deeper: must be a folder, and not below a file")
 
     def test_a_read_only_folder_is_refused(self, scene, tmp_path, monkeypatch):
         """The refusal is simulated, because the tests may run as root, who may write anywhere."""

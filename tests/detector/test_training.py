@@ -69,7 +69,10 @@ def test_settings_out_of_range_are_refused(wrong: str) -> None:
 
 def test_missing_libraries_are_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(libraries, "find_spec", lambda name: None)
-    with pytest.raises(MissingResourceError, match=r"detectors need torch and .*: pip install 'mitsplat\[train\]'"):
+    with pytest.raises(
+        MissingResourceError,
+        match=r"detectors need torch, torchvision and ultralytics: pip install 'mitsplat\[train\]'",
+    ):
         train_detector([tmp_path], tmp_path / "run")
 
 

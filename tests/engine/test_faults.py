@@ -195,7 +195,7 @@ def test_a_read_only_disk_ends_with_status_2(scene, tmp_path):
     folder, begin = mounted(tmp_path, "ro")
     done = run_script(begin + " ".join(command(tmp_path, scene.path, "-o", folder / "out")))
     assert done.returncode == 2
-    assert done.stderr.splitlines()[-1] == f"mitsplat: cannot write into {folder / 'out'}: Read-only file system"
+    assert done.stderr.splitlines()[-1] == f"mitsplat: {folder / 'out'}: cannot be written (Read-only file system)"
 
 
 @dataclass(frozen=True)

@@ -26,9 +26,10 @@ from scipy.spatial.transform import Rotation
 from mitsplat.arrays import BoolArray, Float32Array, Float64Array
 from mitsplat.errors import InputError, path_of
 from mitsplat.gaussians.material_files import read_materials
-from mitsplat.gaussians.spherical_harmonics import sh_rotation
+from mitsplat.gaussians.spherical_harmonics import SH_C0, sh_rotation
 from mitsplat.gaussians.splat_files import SplatArrays, read_splats, write_splats
-from mitsplat.gaussians.splat_materials import SplatMaterials
+from mitsplat.gaussians.splat_materials import MAX_SPECULAR, SplatMaterials
+from mitsplat.images.colour import decode_srgb, encode_srgb
 from mitsplat.quality import KernelName
 
 
@@ -174,13 +175,18 @@ class Splats:
         )
 
     def with_material(self, *, metallic: float = 0.0, roughness: float = 0.5, specular: float = 0.5) -> Splats:
-        """Return the splats with one material; their colours without view dependence become base colours.
+        """Return the splats with one material, whose base colours follow from their colours without view dependence.
+
+        Captured colours contain the uniform light that dielectrics mirror, about their reflectance at normal incidence.
 
         Raises:
             InputError: If a parameter is outside of [0, 1].
         """
         materials = SplatMaterials.uniform(len(self), metallic=metallic, roughness=roughness, specular=specular)
-        return replace(self, sh=self.sh[:, :1], materials=materials)
+        sh, mirrored = self.sh[:, :1], (1 - metallic) * MAX_SPECULAR * specular
+        if mirrored > 0:
+            sh = ((encode_srgb(decode_srgb(0.5 + SH_C0 * sh) - mirrored) - 0.5) / SH_C0).astype(np.float32)
+        return replace(self, sh=sh, materials=materials)
 
     @staticmethod
     def concatenate(parts: Sequence[Splats]) -> Splats:

@@ -2,11 +2,15 @@
 
 import numpy as np
 import pytest
+import trimesh
 from scipy.spatial.transform import Rotation
 
 from mitsplat.errors import InputError
+from mitsplat.gaussians.spherical_harmonics import SH_C0
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.gaussians.splat_materials import SplatMaterials
+from mitsplat.gaussians.surfels import place_surfels
+from mitsplat.geometry.camera import Camera
 
 
 def _splats(materials: SplatMaterials | None) -> Splats:
@@ -33,6 +37,32 @@ def test_transformed_splats_have_rotated_normals() -> None:
     assert moved is not None
     np.testing.assert_allclose(moved.normals, [[0, 1, 0], [-1, 0, 0], [0, 0, 1]], atol=1e-6)
     np.testing.assert_array_equal(moved.specular, _three().specular)
+
+
+@pytest.mark.parametrize(("metallic", "roughness", "encoded"), [(0.0, 0.5, 0.5), (0.0, 0.5, 0.9), (1.0, 0.2, 0.5)])
+def test_objects_keep_their_captured_colours_under_uniform_light_if_they_get_a_material(
+    metallic: float, roughness: float, encoded: float
+) -> None:
+    """The picture of a ball with a material is that of the captured ball.
+
+    Rough metal is darker, because ``principled`` has no multiple scattering.
+    """
+    import mitsuba as mi
+
+    from mitsplat.renderer.layers import make_integrator, make_splats_shape, render_layers
+
+    mesh = trimesh.creation.icosphere(3, 0.02)
+    surfels = place_surfels(mesh, 1.0, 1500, np.random.default_rng(0))
+    captured = surfels.splats(np.full((len(surfels), 1, 3), (encoded - 0.5) / SH_C0))
+    camera = Camera.look_at((0, -0.2, 0.05), (0, 0, 0), width=64, height=64, fov_x=14)
+    pictures = []
+    for splats in (captured, captured.with_material(metallic=metallic, roughness=roughness)):
+        shapes = {"ball": make_splats_shape(splats, None, mesh, instance=1), "light": {"type": "constant"}}
+        layers = render_layers(
+            make_integrator(white=np.pi, hide_emitters=True), mi.load_dict({"type": "scene", **shapes}), camera
+        )
+        pictures.append(layers.rgb[24:40, 24:40].mean())
+    assert pictures[1] == pytest.approx(pictures[0], rel=0.02)
 
 
 @pytest.mark.parametrize(

@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 from mitsplat.arrays import BoolArray, Float64Array
 from mitsplat.asset import Asset
 from mitsplat.gaussians.spherical_harmonics import SH_C0
+from mitsplat.gaussians.splat_materials import SplatMaterials
 from mitsplat.gaussians.surfels import Surfels, place_surfels
 
 _KINDS = ("box", "cylinder", "sphere", "capsule", "cone")
@@ -41,11 +42,12 @@ def _make(number: int, rng: np.random.Generator) -> Asset:
     second = _pattern(surfels.points / mesh.extents.max(), rng)
     is_metal = rng.random() < 0.3
     friction, roughness = float(rng.uniform(0.3, 0.7)), float(rng.uniform(0.1, 0.8))
+    materials = SplatMaterials.uniform(len(surfels), metallic=float(is_metal), roughness=roughness, specular=0.5)
     splats = surfels.splats((np.array(colours)[second.astype(int)][:, None] - 0.5) / SH_C0)
     return Asset(
         name=f"{kind}_{number}",
         class_name=kind,
-        splats=splats.with_material(metallic=float(is_metal), roughness=roughness, specular=0.5),
+        splats=replace(splats, materials=materials),
         mesh=mesh,
         pieces=(mesh,),
         friction=friction,

@@ -99,7 +99,7 @@ def test_an_interrupted_second_capture_leaves_no_readable_capture(
     monkeypatch.setattr(take, "prepare_photos", interrupt)
     with pytest.raises(KeyboardInterrupt):
         capture_photos(given, out, CaptureSettings(board=rendered.BOARD, max_size=240))
-    with pytest.raises(InputError, match=r"capture\.json: "):
+    with pytest.raises(InputError, match=r"without capture\.json"):
         Capture.load(out)
 
 

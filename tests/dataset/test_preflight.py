@@ -131,7 +131,7 @@ TOLD = "views", "lights", "bin"
 @pytest.mark.parametrize(
     ("change", "found"),
     [
-        ({"camera": path_of(ABOVE, ABOVE, INSIDE, INSIDE)}, "of 12 views [2-6] are from inside"),
+        ({"camera": path_of(ABOVE, ABOVE, INSIDE, INSIDE)}, "of 12 views, [2-6] lie inside a shape"),
         ({"lights": [{"kind": "point", "position": [0, 0, -0.05]}]}, r"lights\[0\] is inside of shape 'table'"),
         (
             {"shapes": [{"name": "table", "box": TABLE, "visible": True}, NARROW]},

@@ -19,7 +19,7 @@ from mitsplat.geometry.mesh_normals import CREASE_ANGLE
 from mitsplat.renderer.layers import Layers, make_integrator, make_splats_shape, render_layers
 from mitsplat.renderer.light.light_points import OFFSETS
 from mitsplat.renderer.light.light_tiles import BLOCK
-from mitsplat.renderer.light.shadow_rays import RECURRENCE
+from mitsplat.renderer.light.shadow_rays import RECURRENCE, SURROUNDINGS_RECURRENCE, _bayer
 from mitsplat.renderer.occluders.proxies import Proxies, smooth_normals
 
 WHITE_SKY = {"type": "constant", "radiance": {"type": "rgb", "value": 1.0}}
@@ -534,3 +534,36 @@ def test_sample_points_of_rays_do_not_repeat(stride: int, apart: float) -> None:
     offset = n[:, None] * step
     distance = np.linalg.norm(offset - np.round(offset), axis=1)
     assert np.min(n * distance**2) > apart
+
+
+@pytest.mark.parametrize(
+    ("shape", "limit"), [((3, 3), 0.68), ((1, BLOCK), 0.63), ((BLOCK, 1), 0.68)], ids=["block", "row", "column"]
+)
+def test_neighbouring_pixels_see_the_same_part_of_an_emitter(shape: tuple[int, int], limit: float) -> None:
+    """Neighbours estimate the visible part of an emitter with at most two thirds of the error of independent rays.
+
+    The emitter gets a share of the rays, and a straight edge hides a part of it. Independent rays have the variance
+    n p (1 - p) of the number of n rays that arrive, with the visible part p.
+    """
+    make_integrator()
+    trials, rng = 4000, np.random.default_rng(0)
+    rays, share = rng.choice([4, 10, 20], trials), rng.choice([0.12, 0.22, 0.35, 0.6, 1.0], trials)
+    down, across = (index.ravel() for index in np.indices(shape))
+    rows, columns = (rng.integers(BLOCK, size=(trials, 1)) + step for step in (down, across))
+    rank = np.array(_bayer(mi.UInt32(columns.ravel()), mi.UInt32(rows.ravel())), dtype=np.uint64).reshape(trials, -1, 1)
+    number = (
+        rank + rng.integers(2**32, size=(trials, 1, 1)).astype(np.uint64) + np.arange(20, dtype=np.uint64) * BLOCK**2
+    )
+    x, y = (
+        (number * np.uint64(step) % np.uint64(2**32)).reshape(trials, -1) / 2**32 for step in SURROUNDINGS_RECURRENCE
+    )
+    shot = np.tile(np.arange(20) < rays[:, None], (1, len(down)))
+    start = (rng.random(trials) * (1 - share))[:, None]
+    shot &= (x >= start) & (x < start + share[:, None])
+    angle, edge = rng.random((trials, 1)) * np.pi, rng.uniform(-0.4, 0.4, (trials, 1))
+    grid = (np.indices((32, 32)).reshape(2, -1) + 0.5) / 32 - 0.5
+    visible = (np.cos(angle) * grid[0] + np.sin(angle) * grid[1] > edge).mean(axis=1)
+    arrives = shot & (np.cos(angle) * ((x - start) / share[:, None] - 0.5) + np.sin(angle) * (y - 0.5) > edge)
+    error = arrives.sum(axis=1) - visible * shot.sum(axis=1)
+    variance = rays * len(down) * share * visible * (1 - visible)
+    assert np.sqrt(np.mean(error**2 / (variance + 0.05))) < limit

@@ -29,6 +29,15 @@ Every 64th point of this recurrence is a point of Roberts' recurrence, in whose 
 same. There are 4096 recurrences of this kind; in this one consecutive points are farthest apart.
 """
 
+SURROUNDINGS_RECURRENCE = (3070557862, 373785654)
+"""Recurrence of this kind for the shadow rays of surroundings and visible meshes.
+
+A straight edge hides a part of an emitter that gets a tenth to all of the rays. The error of the visible part, over 3 x
+3 pixels and over rows and columns of 8 pixels, is 0.6 of that of independent rays, nearly the smallest of the 4096.
+With the other recurrence, rows differ by more than noise, so that penumbras have combs. On objects, which also mirror
+the emitters, the other recurrence is better.
+"""
+
 WORD_BITS = 32
 """Number of rays whose occlusion is stored as bits of one integer."""
 
@@ -167,9 +176,8 @@ class _RayBatch:
     def sample(self, i: mi.UInt32) -> tuple[Beam, mi.UInt32, mi.Bool]:
         """Sample ray ``i`` of every point: its beam, its number in the sequence, and True if it carries light."""
         surface, number = self.surface, self.start + i * self.step
-        beam = self.tracer.emitters.sample(
-            receiver(surface.position, surface.normal), sequence_point(number), surface.valid
-        )
+        point = dr.select(surface.instance > 0, sequence_point(number), sequence_point(number, SURROUNDINGS_RECURRENCE))
+        beam = self.tracer.emitters.sample(receiver(surface.position, surface.normal), point, surface.valid)
         return beam, number, surface.valid & (dr.sum(beam.irradiance) > 0)
 
     def occluded(self, occluder_scene: OccluderScene, beam: Beam, number: mi.UInt32, active: mi.Bool) -> mi.Bool:

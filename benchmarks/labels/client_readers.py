@@ -67,7 +67,8 @@ def by_supervision(root: Path, form: str) -> Found:
         else:
             read = supervision.DetectionDataset.from_coco(images, annotations(root, form, split), force_masks=True)
         for path, _, found in read:
-            for box, mask, number in zip(found.xyxy, found.mask, found.class_id, strict=True):
+            masks = [] if found.mask is None else found.mask  # None if the image has no objects
+            for box, mask, number in zip(found.xyxy, masks, found.class_id, strict=True):
                 yield Path(path).name, read.classes[number], box.tolist(), mask
 
 

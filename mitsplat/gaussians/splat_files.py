@@ -282,6 +282,8 @@ def parse_ply_header(data: bytes) -> tuple[str, dict[str, tuple[int, np.dtype[An
         InputError: If the header contains an invalid line.
     """
     end = re.search(rb"\nend_header[ \t]*\r?\n", data[:MAX_PLY_HEADER])
+    if data.startswith(b"\x1f\x8b"):
+        raise InputError("a PLY file must not be compressed by gzip: decompress it")
     if not re.match(rb"ply[ \t]*\r?\n", data) or end is None:
         raise InputError(f"a PLY file must have a header from 'ply' to 'end_header' within {MAX_PLY_HEADER} bytes")
     lines = data[: end.start()].decode("ascii", "replace").splitlines()
@@ -410,6 +412,8 @@ def decode_spz(data: bytes) -> tuple[SplatArrays, KernelName | None]:
     """
     if data[:4] == b"NGSP":  # not in gzip since version 4
         version = int.from_bytes(data[4:8], "little")
+        if version < 4:
+            raise InputError(f"an SPZ file of version {version} must be compressed by gzip")
         raise InputError(f"SPZ files of version {version} are not supported: convert them to version 3, or to .ply")
     raw = _decompress_gzip(data)
     magic, version, count, degree, bits, _, _ = _SPZ_HEADER.unpack(raw[: _SPZ_HEADER.size].ljust(_SPZ_HEADER.size))

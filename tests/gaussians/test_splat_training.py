@@ -173,6 +173,16 @@ def test_spz_files_of_a_later_version_are_refused_with_a_remedy(tmp_path: Path) 
         Splats.load(tmp_path / "a.spz")
 
 
+def test_compression_by_gzip_is_named(tmp_path: Path) -> None:
+    (tmp_path / "a.spz").write_bytes(b"NGSP" + struct.pack("<2I4B", 2, 1, 0, 12, 1, 0) + bytes(40))
+    with pytest.raises(InputError, match=r"a\.spz: an SPZ file of version 2 must be compressed by gzip"):
+        Splats.load(tmp_path / "a.spz")
+    random_splats(5).save(tmp_path / "b.ply")
+    (tmp_path / "b.ply").write_bytes(gzip.compress((tmp_path / "b.ply").read_bytes()))
+    with pytest.raises(InputError, match=r"b\.ply: a PLY file must not be compressed by gzip: decompress it"):
+        Splats.load(tmp_path / "b.ply")
+
+
 def test_unknown_columns_are_named(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     splats, zeros = random_splats(5), np.zeros(5)
     with caplog.at_level(logging.WARNING):

@@ -5,9 +5,11 @@ from __future__ import annotations
 import errno
 import os
 import re
+import types
 from collections.abc import Sequence
+from numbers import Integral, Real
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 """Error numbers of the operating system that mean that there is no space for a file."""
@@ -69,6 +71,89 @@ def path_of(value: object, place: str) -> Path:
     if not isinstance(value, str | os.PathLike):
         raise InputError(f"{place} must be a path (got {describe(value)})")
     return Path(value)
+
+
+def check_number(value: object, place: str) -> None:
+    """Check that an argument of the Python API is a number; truth values are not.
+
+    Raises:
+        InputError: If it is none.
+    """
+    if not isinstance(value, Real) or isinstance(value, bool):
+        raise InputError(f"{place} must be a number (got {describe(value)})")
+
+
+def check_whole_number(value: object, place: str) -> None:
+    """Check that an argument of the Python API is a whole number; truth values are not.
+
+    Raises:
+        InputError: If it is none.
+    """
+    if not isinstance(value, Integral) or isinstance(value, bool):
+        raise InputError(f"{place} must be a whole number (got {describe(value)})")
+
+
+def check_text(value: object, place: str) -> None:
+    """Check that an argument of the Python API is text that is not empty.
+
+    Raises:
+        InputError: If it is not.
+    """
+    if not isinstance(value, str) or not value:
+        raise InputError(f"{place} must be text that is not empty (got {describe(value)})")
+
+
+def check_list(value: object, kind: type, place: str) -> None:
+    """Check that an argument of the Python API is a list or a tuple of values of a type.
+
+    Raises:
+        InputError: If it is none.
+    """
+    if not isinstance(value, list | tuple):
+        raise InputError(f"{place} must be a list of {kind.__name__} objects (got {describe(value)})")
+    for number, one in enumerate(value):
+        if not isinstance(one, kind):
+            raise InputError(f"{place}[{number}] must be a {kind.__name__} (got {describe(one)})")
+
+
+_WORDS = {int: "a whole number", float: "a number", bool: "true or false", str: "text", Path: "a path"}
+
+
+def check_fields(settings: object) -> None:
+    """Check the types of the fields of a frozen dataclass of settings, and convert text to paths.
+
+    Raises:
+        InputError: If a field has another type than its annotation states.
+    """
+    for name, hint in get_type_hints(type(settings)).items():
+        kinds = get_args(hint) if get_origin(hint) in (Union, types.UnionType) else (hint,)
+        value = getattr(settings, name)
+        if Path in kinds and isinstance(value, str):
+            object.__setattr__(settings, name, Path(value))
+        elif not any(_has_kind(value, kind) for kind in kinds):
+            words = [word for kind in kinds for word in _describe_kind(kind)]
+            raise InputError(f"{name} must be {list_in_words(words, 'or')} (got {describe(value)})")
+
+
+def _has_kind(value: object, kind: Any) -> bool:
+    """Return True if a value has the type of an annotation; the items of lists and mappings are not checked."""
+    if get_origin(kind) is Literal:
+        return value in get_args(kind)
+    if kind in (int, float):
+        return isinstance(value, Integral if kind is int else Real) and not isinstance(value, bool)
+    if get_origin(kind) is tuple:
+        items = get_args(kind)
+        return isinstance(value, list | tuple) and (Ellipsis in items or len(value) == len(items))
+    return isinstance(value, get_origin(kind) or kind)
+
+
+def _describe_kind(kind: Any) -> list[str]:
+    """Return the words for the alternatives of an annotation."""
+    if get_origin(kind) is Literal:
+        return list(map(str, get_args(kind)))
+    if get_origin(kind) is tuple:
+        return ["a list" if Ellipsis in get_args(kind) else f"a list of {len(get_args(kind))}"]
+    return ["None" if kind is type(None) else _WORDS.get(kind, f"a {getattr(kind, '__name__', kind)}")]
 
 
 def is_out_of_memory(error: BaseException) -> bool:

@@ -33,7 +33,7 @@ from mitsplat.audit.layout_check import LayoutCheck
 from mitsplat.audit.scene_check import SceneCheck
 from mitsplat.audit.yolo_check import POLYGON_AREA, POLYGON_IOU, DataYamlCheck
 from mitsplat.dataset.schema import Records, read_content
-from mitsplat.errors import InputError
+from mitsplat.errors import InputError, path_of
 from mitsplat.images.picture_files import read_picture
 from mitsplat.storage.content_hash import file_hash
 from mitsplat.storage.files import SPLITS, JsonObject, Record, splits_of
@@ -75,7 +75,7 @@ def audit_dataset(root: str | Path, visit: Callable[[Record], object] = lambda r
     Raises:
         InputError: If the folder is no dataset of mitsplat.
     """
-    root = Path(root)
+    root = path_of(root, "root")
     content = read_content(root)
     _refuse_special(root)
     records = Records(root, content)

@@ -25,7 +25,7 @@ from mitsplat.bake.proxy_mesh import make_proxy
 from mitsplat.bake.radiance import BOUNCES, bake_radiance, hemisphere, ray_offset, rotate_directions
 from mitsplat.bake.surface_materials import SurfaceFinish
 from mitsplat.bake.verification import BakedView, PictureFunction, compare_views, compare_with_textures
-from mitsplat.errors import InputError
+from mitsplat.errors import InputError, check_fields, check_list, check_number, check_text, check_type
 from mitsplat.fit.refine_splats import Picture, refine_splats
 from mitsplat.gaussians.spherical_harmonics import SH_C0
 from mitsplat.gaussians.splat_cloud import Splats
@@ -37,7 +37,7 @@ from mitsplat.mesh_files.mesh_file import MeshFile
 from mitsplat.progress import Progress
 from mitsplat.renderer.path_tracing import render_mesh, trace_radiance
 from mitsplat.runtime.variant import ensure_variant, one_at_a_time
-from mitsplat.scene.spec.light_spec import LightSpec
+from mitsplat.scene.spec.light_spec import DrawnLight, LightSpec
 
 _MIN_RADIANCE = 0.01
 """Radiance of a white surface under the uniform light below which a surfel counts as invisible."""
@@ -115,6 +115,7 @@ class BakeSettings:
     seed: int = 0
 
     def __post_init__(self) -> None:
+        check_fields(self)
         for name in ("gaussians", "proxy_faces"):
             if getattr(self, name) < 1:
                 raise InputError(f"{name} must be at least 1 (got {getattr(self, name)})")
@@ -169,7 +170,20 @@ def bake_asset(
             or if another value breaks a rule.
     """
     ensure_variant()
-    settings = settings or BakeSettings()
+    settings = BakeSettings() if settings is None else settings
+    check_type(settings, BakeSettings, "settings", "for example mitsplat.BakeSettings(gaussians=10000)")
+    check_text(name, "name")
+    for key, value in (("density", density), ("friction", friction), ("metres_per_unit", metres_per_unit)):
+        if key != "metres_per_unit" or value is not None:
+            check_number(value, key)
+    for key, listed, kind_of_items in (
+        ("cameras", cameras, Camera),
+        ("fit_cameras", fit_cameras, Camera),
+        ("pieces", pieces, trimesh.Trimesh),
+    ):
+        check_list(listed, kind_of_items, key)
+    if lights is not None:
+        check_list(lights, DrawnLight, "lights")
     _check_arguments(kind, up, density, friction)
     stages = _Stages(progress)
     emitters = {} if lights is None else bake_lights(lights)

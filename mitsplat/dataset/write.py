@@ -34,7 +34,7 @@ from mitsplat.dataset.preflight import refuse, run_faults
 from mitsplat.engine.pool import check_workers, run_frames
 from mitsplat.engine.ray import Cluster, load_ray, run_on_ray
 from mitsplat.engine.resources import TYPICAL_MEMORY
-from mitsplat.errors import InputError, path_of
+from mitsplat.errors import InputError, check_whole_number, path_of
 from mitsplat.formats.registry import FORMATS, Catalogue
 from mitsplat.frames.budget import worker_memory
 from mitsplat.frames.frame import render_frame
@@ -136,6 +136,7 @@ def write_dataset(
     Scene.check(scene)
     out = path_of(out, "out")
     count = scene.num_frames if frames is None else frames
+    check_whole_number(count, "frames")
     if not 1 <= count <= scene.num_frames:
         raise InputError(
             f"frames must be between 1 and {scene.num_frames}, which is layouts x views of {scene.path} (got {count})"

@@ -19,7 +19,7 @@ from mitsplat.engine.mps import MAX_CLIENTS, SharedGpu
 from mitsplat.engine.resources import TYPICAL_MEMORY, WorkerMemory, unused_memory
 from mitsplat.engine.scheduler import memory_error, run_pool
 from mitsplat.engine.worker_processes import MakeFrame, WorkerProcesses
-from mitsplat.errors import InputError, is_out_of_memory, sentence_of
+from mitsplat.errors import InputError, check_whole_number, is_out_of_memory, sentence_of
 from mitsplat.progress import Note
 from mitsplat.runtime.cores import usable_cores
 from mitsplat.runtime.device import Device, current_device, use_device
@@ -43,7 +43,10 @@ def check_workers(workers: int | None) -> None:
     Raises:
         InputError: If it is less than 1.
     """
-    if workers is not None and workers < 1:
+    if workers is None:
+        return
+    check_whole_number(workers, "workers")
+    if workers < 1:
         raise InputError(f"workers must be at least 1 (got {workers})")
 
 

@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsplat.capture.capture import HELD_OUT_EVERY, Capture, Photo, Window
-from mitsplat.errors import InputError
+from mitsplat.errors import InputError, check_fields, check_type, path_of
 from mitsplat.fit.depth_priors import DepthMap, DepthMaps, align_maps, crop_map
 from mitsplat.fit.fit_folder import FitFolder, FitResult
 from mitsplat.fit.image_metrics import psnr_of
@@ -101,6 +101,7 @@ class FitSettings:
     seed: int = 0
 
     def __post_init__(self) -> None:
+        check_fields(self)
         for name, least in (("gaussians", 2), ("iterations", 1), ("max_size", 64), ("refine_every", 1), ("seed", 0)):
             if getattr(self, name) < least:
                 raise InputError(f"{name} must be at least {least} (got {getattr(self, name)})")
@@ -185,6 +186,9 @@ def fit_capture(
         InputError: If there are too few photos, a photo or a depth map cannot be read, or the folder contains another
             fit.
     """
+    check_type(capture, Capture, "capture", "read a folder with mitsplat.Capture.load")
+    check_type(settings, FitSettings, "settings", "for example mitsplat.FitSettings(iterations=1000)")
+    out = path_of(out, "out")
     training, held_out = _usable_photos(capture.training, settings), _usable_photos(capture.held_out, settings)
     if not (training and held_out):
         raise InputError(

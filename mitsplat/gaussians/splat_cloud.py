@@ -24,7 +24,7 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from mitsplat.arrays import BoolArray, Float32Array, Float64Array
-from mitsplat.errors import InputError, path_of
+from mitsplat.errors import InputError, describe, path_of
 from mitsplat.gaussians.material_files import read_materials
 from mitsplat.gaussians.spherical_harmonics import SH_C0, sh_rotation
 from mitsplat.gaussians.splat_files import SplatArrays, read_splats, write_splats
@@ -62,8 +62,13 @@ class Splats:
     kernel: KernelName | None = None
 
     def __post_init__(self) -> None:
-        with np.errstate(over="ignore"):  # values beyond float32 become inf, which is refused below
-            arrays = {name: np.array(getattr(self, name), dtype=np.float32, order="C") for name in SplatArrays._fields}
+        arrays: dict[str, Float32Array] = {}
+        for name in SplatArrays._fields:
+            try:
+                with np.errstate(over="ignore"):  # values beyond float32 become inf, which is refused below
+                    arrays[name] = np.array(getattr(self, name), dtype=np.float32, order="C")
+            except (TypeError, ValueError):
+                raise InputError(f"{name} must be an array of numbers (got {describe(getattr(self, name))})") from None
         count = len(arrays["means"]) if arrays["means"].ndim else 0
         for name, row in (("means", (3,)), ("quats", (4,)), ("scales", (3,)), ("opacities", ())):
             if arrays[name].shape != (count, *row):

@@ -18,7 +18,7 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
 from mitsplat.arrays import Float64Array, Int64Array
-from mitsplat.errors import describe
+from mitsplat.errors import InputError, check_number, describe
 from mitsplat.geometry.lens import (
     Lens,
     distortion_coefficients,
@@ -80,7 +80,9 @@ class Camera:
             if not isinstance(getattr(self, name), int | float | np.integer | np.floating):
                 raise ValueError(f"{name} must be a number (got {describe(getattr(self, name))})")
         sides = self.width, self.height
-        if not all(isinstance(side, int | np.integer) and 1 <= side <= MAX_IMAGE_SIDE for side in sides):
+        if not all(
+            isinstance(side, int | np.integer) and side is not True and 1 <= side <= MAX_IMAGE_SIDE for side in sides
+        ):
             raise ValueError(
                 f"camera size must be whole numbers of 1 to {MAX_IMAGE_SIDE} px (got {sides[0]}x{sides[1]})"
             )
@@ -136,6 +138,7 @@ class Camera:
         Raises:
             ValueError: If ``eye`` equals ``target`` or ``fov_x`` is not between 0 and 180.
         """
+        check_number(fov_x, "fov_x")
         if not 0.0 < fov_x < 180.0:
             raise ValueError(f"fov_x must be between 0 and 180 degrees (got {fov_x})")
         if fov_x < np.pi:
@@ -252,6 +255,8 @@ class Camera:
     def transformed(self, matrix: npt.ArrayLike) -> Camera:
         """Return the camera after a similarity transform (4, 4). The near distance is scaled."""
         matrix = np.asarray(matrix, dtype=np.float64)
+        if matrix.shape != (4, 4):
+            raise ValueError(f"matrix must have shape (4, 4) (got {matrix.shape})")
         scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
         pose = matrix @ self.world_from_camera
         pose[:3, :3] /= scale
@@ -370,7 +375,9 @@ def look_at_pose(eye: npt.ArrayLike, target: npt.ArrayLike, up: npt.ArrayLike = 
     Raises:
         ValueError: If a point is not finite, or if both points are equal.
     """
-    start, end, upper = points_of(eye, "eye")[0], points_of(target, "target")[0], points_of(up, "up")[0]
+    start, end, upper = (_point(value, name) for value, name in ((eye, "eye"), (target, "target"), (up, "up")))
+    if not (np.isfinite(upper).all() and upper.any()):
+        raise ValueError(f"up must be finite and not zero (got {upper.tolist()})")
     forward = end - start
     distance = np.linalg.norm(forward)
     if not np.isfinite(distance):
@@ -388,6 +395,15 @@ def look_at_pose(eye: npt.ArrayLike, target: npt.ArrayLike, up: npt.ArrayLike = 
     pose[:3, :3] = np.stack([right, _cross(forward, right), forward], axis=1)
     pose[:3, 3] = start
     return pose
+
+
+def _point(value: npt.ArrayLike, place: str) -> Float64Array:
+    """Return an argument of the Python API as one point (3,)."""
+    points = points_of(value, place)
+    if len(points) != 1:
+        raise InputError(f"{place} must be one point (got {len(points)} points)")
+    point: Float64Array = points[0]
+    return point
 
 
 def _cross(a: Float64Array, b: Float64Array) -> Float64Array:

@@ -18,7 +18,7 @@ import trimesh
 
 from mitsplat.arrays import BoolArray, Float64Array
 from mitsplat.asset import Asset
-from mitsplat.errors import InputError, path_of
+from mitsplat.errors import InputError, check_fields, check_number, check_text, check_type, path_of
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.gaussians.splat_files import Axis, default_up_axis
 from mitsplat.geometry.camera import Camera, spiral
@@ -89,6 +89,7 @@ class ImportSettings:
     material: Mapping[str, float] | None = None
 
     def __post_init__(self) -> None:
+        check_fields(self)
         for name in ("units", "size"):
             value = getattr(self, name)
             if value is not None and not 0 < value < np.inf:
@@ -227,6 +228,11 @@ def import_splats(
         InputError: If the file cannot be read, no Gaussian remains, or a value breaks a rule.
     """
     path = path_of(path, "path")
+    check_type(settings, ImportSettings, "settings", "for example mitsplat.ImportSettings(units=0.001)")
+    check_text(name, "name")
+    for key, given in (("density", density), ("mass", mass), ("friction", friction)):
+        if key == "friction" or given is not None:
+            check_number(given, key)
     _check_physics(density, mass, friction)
     stages = iter(range(_STAGES))
 

@@ -12,7 +12,7 @@ import trimesh
 from mitsplat.arrays import Float64Array
 from mitsplat.asset import Asset
 from mitsplat.capture.capture import Capture
-from mitsplat.errors import InputError
+from mitsplat.errors import InputError, check_fields, check_text
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.camera import Camera
 from mitsplat.geometry.decomposition import convex_pieces
@@ -101,6 +101,8 @@ class AssetJob:
     light: CaptureLight | None = None
 
     def __post_init__(self) -> None:
+        check_text(self.name, "name")
+        check_fields(self)
         if self.settings.refine is not None and (self.kind != "object" or self.imported is not None):
             raise InputError("only the mesh of an object that is reconstructed from masks can be refined")
         if self.remove and self.kind != "environment":

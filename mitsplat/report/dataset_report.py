@@ -18,6 +18,7 @@ import numpy as np
 from mitsplat.audit.audit import POLYGON_AREA, POLYGON_IOU, Audit, audit_dataset
 from mitsplat.dataset.manifest import read_lines
 from mitsplat.dataset.schema import Records, read_content
+from mitsplat.errors import path_of
 from mitsplat.formats.coco import image_file
 from mitsplat.images.masks import Silhouette
 from mitsplat.images.picture_files import read_picture_inside
@@ -88,8 +89,8 @@ def write_report(root: str | Path, out: str | Path | None = None) -> DatasetRepo
         InputError: If the folder is no dataset of mitsplat.
         OSError: If the page cannot be written.
     """
-    root = Path(root)
-    out = root / "report.html" if out is None else Path(out)
+    root = path_of(root, "root")
+    out = root / "report.html" if out is None else path_of(out, "out")
     content = read_content(root)
     records = Records(root, content)
     output = content["scene"]["output"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from numbers import Integral
 
 import numpy.typing as npt
 
@@ -31,7 +32,7 @@ def asset_index(name: str | int, names: Sequence[tuple[str, str]], place: str) -
                 f"{place}: must name one asset (it names {len(found)} of scene.assets: use one of the indices "
                 f"{', '.join(map(str, found))})"
             )
-    elif 0 <= name < len(names):
+    elif isinstance(name, Integral) and 0 <= name < len(names):
         return int(name)
     known = ", ".join(sorted({asset for asset, _ in names})) or "none"
     raise InputError(f"{place}: must be an asset of the scene ({known}) or its index in scene.assets")

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from numbers import Integral
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from mitsplat.arrays import Float64Array
-from mitsplat.errors import InputError
+from mitsplat.errors import InputError, describe
 from mitsplat.scene.given_poses import asset_index, rigid_pose
 from mitsplat.scene.scene import Scene
 
@@ -154,6 +155,8 @@ class Layout:
                 f"poses must map names of assets to lists of matrices, as in {{'bolt': [pose]}} (got a "
                 f"{type(poses).__name__})"
             )
+        if not isinstance(index, Integral) or index < 0:
+            raise InputError(f"index must be a whole number of at least 0 (got {describe(index)})")
         lists: dict[int, Sequence[npt.ArrayLike | None]] = {}
         for name, given in poses.items():
             asset = asset_index(name, scene.asset_names, f"poses[{name!r}]")

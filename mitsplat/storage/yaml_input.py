@@ -7,7 +7,7 @@ import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import count
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
@@ -19,7 +19,7 @@ from ruamel.yaml.constructor import DuplicateKeyError
 from ruamel.yaml.error import MarkedYAMLError, YAMLError
 from ruamel.yaml.scanner import RoundTripScanner
 
-from mitsplat.errors import InputError
+from mitsplat.errors import InputError, describe
 from mitsplat.storage.format_version import FORMAT_VERSION, check_format_version
 
 Validated = TypeVar("Validated", bound=BaseModel)
@@ -110,7 +110,7 @@ def load_yaml(
     """
     path = Path(path)
     tree = _parse(path)
-    overridden = {tuple(key.split(".")): value for key, value in (overrides or {}).items()}
+    overridden = _overridden(overrides or {})
     data = _plain(tree, (), tree, path, count())
     for keys, value in overridden.items():
         _set(data, keys, _to_file_values(value))
@@ -123,6 +123,22 @@ def load_yaml(
         findings = [_finding(details, model, data, tree, overridden) for details in error.errors()]
     first = min(findings, key=lambda finding: (_is_consequence(finding, findings), finding.line or 0))
     raise InputError(_sentence(path, first.line, first.path, first.rule))
+
+
+def _overridden(overrides: Mapping[str, object]) -> dict[tuple[str, ...], object]:
+    """Return the overrides of :func:`load_yaml` by their keys.
+
+    Raises:
+        InputError: If they are no mapping of dotted keys to values that a file can contain.
+    """
+    if not isinstance(overrides, Mapping) or not all(isinstance(key, str) for key in overrides):
+        raise InputError(f"overrides must map dotted keys to values, as in {{'output.width': 640}} (got {overrides!r})")
+    for key, value in overrides.items():
+        try:
+            json.dumps(_to_file_values(value))
+        except (TypeError, ValueError):
+            raise InputError(f"overrides[{key!r}]: must be a value of a YAML file (got {describe(value)})") from None
+    return {tuple(key.split(".")): value for key, value in overrides.items()}
 
 
 def model_error_sentence(error: ValidationError, model: type[BaseModel], values: Mapping[str, object]) -> str:
@@ -151,6 +167,8 @@ def _to_file_values(value: Any) -> Any:
         return {str(key): _to_file_values(inner) for key, inner in value.items()}
     if isinstance(value, list | tuple):
         return [_to_file_values(inner) for inner in value]
+    if isinstance(value, PurePath):
+        return str(value)
     return value.tolist() if isinstance(value, np.generic | np.ndarray) else value
 
 
@@ -178,7 +196,10 @@ def _parse(path: Path) -> CommentedMap:
         raise InputError(_sentence(path, line, (), f"keys must be unique ({problem})")) from None
     except MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
-        raise InputError(_sentence(path, mark.line + 1 if mark else None, (), f"not YAML: {error.problem}")) from None
+        remedy = "; use spaces in place of tabs" if "'\\t'" in str(error.problem) else ""
+        raise InputError(
+            _sentence(path, mark.line + 1 if mark else None, (), f"not YAML: {error.problem}{remedy}")
+        ) from None
     except (YAMLError, ValueError) as error:  # ValueError: an impossible date or number
         raise InputError(f"{path}: not YAML: {str(error).splitlines()[0]}") from None
     except RecursionError:
@@ -200,9 +221,8 @@ def _plain(node: Any, keys: KeyPath, tree: CommentedMap, path: Path, values: Ite
     if isinstance(node, Mapping):
         for key in node:
             if not isinstance(key, str):
-                raise InputError(
-                    _sentence(path, _line(tree, keys), keys, f"keys must be text (got {_format_value(key)})")
-                )
+                line = _line(tree, (*keys, key))
+                raise InputError(_sentence(path, line, keys, f"keys must be text (got {_format_value(key)})"))
         return {str(key): _plain(value, (*keys, key), tree, path, values) for key, value in node.items()}
     if isinstance(node, list):
         return [_plain(value, (*keys, position), tree, path, values) for position, value in enumerate(node)]

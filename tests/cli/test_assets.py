@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from functools import partial
+from dataclasses import make_dataclass
 from pathlib import Path
 
 import numpy as np
@@ -16,14 +16,19 @@ from tests.conftest import box_asset
 from tests.mesh_files.test_step import assembly
 
 
+def quick_settings(verify_views: int) -> type:
+    """Return settings of a bake without a fit, by default."""
+    fields = [("fit_steps", int, 0), ("verify_views", int, verify_views)]
+    return make_dataclass("QuickSettings", fields, bases=(BakeSettings,), frozen=True)
+
+
 def test_bake_applies_every_option(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Every option changes the written asset. test_documented_commands.py runs complete bakes in processes of their
     own.
     """
-    few = partial(BakeSettings, fit_steps=0, verify_views=1)
-    monkeypatch.setattr("mitsplat.bake.bake.BakeSettings", few)
+    monkeypatch.setattr("mitsplat.bake.bake.BakeSettings", quick_settings(1))
     box_asset("gear", (20.0, 30.0, 10.0)).mesh.export(tmp_path / "gear.glb")
     options = (
         "--class", "wheel", "--gaussians", 60, "--units", 0.001, "--up", "y",
@@ -47,7 +52,7 @@ def test_bake_applies_every_option(
 def test_bake_splits_a_step_file_into_its_parts(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("mitsplat.bake.bake.BakeSettings", partial(BakeSettings, fit_steps=0, verify_views=0))
+    monkeypatch.setattr("mitsplat.bake.bake.BakeSettings", quick_settings(0))
     step = assembly(tmp_path / "frame.step")
     assert run("bake", step, "-o", tmp_path / "parts", "--split", "--tolerance", 0.5, "--gaussians", 60) == 0
     output = capsys.readouterr().out

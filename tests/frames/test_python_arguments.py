@@ -92,6 +92,39 @@ CALLS: list[tuple[Callable[[ms.Scene, Path], object], str]] = [
     (lambda scene, out: ms.render_splats(SPLATS, POSE), "camera must be a Camera (got ndarray)"),
     (lambda scene, out: ms.use_device(None), "device must be cpu, cuda, cuda:N, cuda:all or auto (got None)"),
     (lambda scene, out: CAMERA.project([[0, 0]]), "points must have shape (N, 3) (got (1, 2))"),
+    (lambda scene, out: ms.Layout.from_poses(scene, {None: [POSE]}), "poses[None]: must be an asset of the scene"),
+    (lambda scene, out: ms.Layout.from_poses(scene, {"nut": [POSE] * 3}, index=-1), "index must be a whole number"),
+    (lambda scene, out: ms.write_dataset(scene, out, frames=[0]), "frames must be a whole number (got list [0])"),
+    (lambda scene, out: ms.write_dataset(scene, out, workers="2"), "workers must be a whole number (got str '2')"),
+    (lambda scene, out: ms.load_scene(scene.path, overrides=["seed"]), "overrides must map dotted keys to values"),
+    (lambda scene, out: ms.load_scene(scene.path, overrides={5: 3}), "overrides must map dotted keys to values"),
+    (
+        lambda scene, out: ms.load_scene(scene.path, overrides={"seed": {1}}),
+        "overrides['seed']: must be a value of a YAML file (got set {1})",
+    ),
+    (lambda scene, out: ms.bake_asset("a.stl", name=5), "name must be text that is not empty (got int 5)"),
+    (lambda scene, out: ms.bake_asset("a.stl", name="a", settings={}), "settings must be a BakeSettings (got dict {})"),
+    (lambda scene, out: ms.bake_asset("a.stl", name="a", density="x"), "density must be a number (got str 'x')"),
+    (lambda scene, out: ms.bake_asset("a.stl", name="a", cameras=[1]), "cameras[0] must be a Camera (got int 1)"),
+    (lambda scene, out: ms.bake_asset("a.stl", name="a", lights="area"), "lights must be a list of DrawnLight objects"),
+    (lambda scene, out: ms.BakeSettings(gaussians=1.5), "gaussians must be a whole number (got float 1.5)"),
+    (lambda scene, out: ms.ImportSettings(up=5), "up must be x, -x, y, -y, z, -z or None (got int 5)"),
+    (lambda scene, out: ms.ImportSettings(crop=(0, 1)), "crop must be a list of 6 or None (got tuple (0, 1))"),
+    (lambda scene, out: ms.CaptureSettings(kind="thing"), "kind must be object or environment (got str 'thing')"),
+    (lambda scene, out: ms.CaptureSettings(poses=5), "poses must be a path or None (got int 5)"),
+    (lambda scene, out: ms.FitSettings(iterations="9"), "iterations must be a whole number (got str '9')"),
+    (lambda scene, out: ms.AssetJob(name=5), "name must be text that is not empty (got int 5)"),
+    (lambda scene, out: ms.AssetJob(name="a", kind="x"), "kind must be object or environment (got str 'x')"),
+    (lambda scene, out: ms.asset_from_photos(out, out, "a"), "job must be a AssetJob (got str 'a')"),
+    (lambda scene, out: ms.capture_photos(out, out, {}), "settings must be a CaptureSettings (got dict {})"),
+    (lambda scene, out: ms.import_splats("a.ply", name="a", settings={}), "settings must be a ImportSettings"),
+    (lambda scene, out: ms.import_splats("a.ply", name="a", mass="x"), "mass must be a number (got str 'x')"),
+    (lambda scene, out: ms.fit_capture(None, out), "capture must be a Capture (got NoneType None)"),
+    (lambda scene, out: ms.audit_dataset(None), "root must be a path (got NoneType None)"),
+    (lambda scene, out: ms.write_report(None), "root must be a path (got NoneType None)"),
+    (lambda scene, out: ms.Splats("a", [[0, 0, 0, 1]], [[1, 1, 1]], [1], [[[0, 0, 0]]]), "means must be an array of"),
+    (lambda scene, out: ms.Camera.look_at((0, 0, 1), (0, 0, 0), width=8, height=6, fov_x="50"), "fov_x must be a"),
+    (lambda scene, out: ms.Camera.look_at(np.eye(3), (0, 0, 0), width=8, height=6, fov_x=50), "eye must be one point"),
     (lambda scene, out: CAMERA.project("nut"), "points must be numbers of shape (N, 3) (got str 'nut')"),
 ]
 
@@ -116,3 +149,16 @@ def test_a_stream_of_a_scene_file_is_refused() -> None:
 def test_absent_objects_count_as_given_poses(scene: ms.Scene) -> None:
     layout = ms.Layout.from_poses(scene, {"nut": [POSE, None, POSE]})
     assert [one.id for one in layout.instances] == [1, 3]
+
+
+def test_paths_may_be_text_and_numbers_may_be_scalars_of_numpy(scene: ms.Scene, tmp_path: Path) -> None:
+    settings = ms.CaptureSettings(poses="model", max_size=np.int64(640))  # type: ignore[arg-type]
+    assert settings.poses == Path("model")
+    assert ms.FitSettings(iterations=np.int32(5), target_psnr=np.float32(20)).iterations == 5  # type: ignore[arg-type]
+    assert ms.load_scene(scene.path, overrides={"name": Path("x"), "seed": np.int64(3)}).spec.seed == 3
+
+
+def test_the_upper_direction_of_a_camera_must_not_be_zero() -> None:
+    for up in ((0, 0, 0), (0, 0, np.nan)):
+        with pytest.raises(ValueError, match="up must be finite and not zero"):
+            ms.Camera.look_at((0, 0, 1), (0, 0, 0), up=up, width=8, height=6, fov_x=50)

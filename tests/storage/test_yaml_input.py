@@ -117,12 +117,16 @@ def test_a_valid_file_fills_the_model(drawing: Path) -> None:
         ("title: a\ninner:\n  low: 3\n  high: 2\n", ":4: inner.high: must be >= low (got 2)"),
         ("title: a\ntitle: b\n", ':2: keys must be unique (found duplicate key "title")'),
         ("title: [a\n", ":2: not YAML: expected ',' or ']', but got '<stream end>'"),
-        ("title: a\n\tcopies: 1\n", ":2: not YAML: found character '\\t' that cannot start any token"),
+        (
+            "title: a\n\tcopies: 1\n",
+            ":2: not YAML: found character '\\t' that cannot start any token; use spaces in place of tabs",
+        ),
         ("title: *a\n", ":1: not YAML: found undefined alias 'a'"),
         ("title: 2020-13-45\n", ": not YAML: month must be in 1..12"),
         ("", ": must be a mapping of keys to values (got nothing)"),
         ("- a\n", ': must be a mapping of keys to values (got ["a"])'),
         ("1: a\n", ":1: keys must be text (got 1)"),
+        ("a: 1\n5: b\n", ":2: keys must be text (got 5)"),
     ],
 )
 def test_an_invalid_file_is_refused_with_line_and_key(drawing: Path, text: str, sentence: str) -> None:

@@ -35,7 +35,7 @@ from mitsplat.capture.pipeline.overview import capture_sheet
 from mitsplat.capture.pipeline.picking import chosen_object
 from mitsplat.capture.structure_from_motion import MIN_AGREEMENT, MIN_POINTS, SURE_AGREEMENT, SparseModel, find_cameras
 from mitsplat.capture.video import ChosenFrames, choose_frames
-from mitsplat.errors import InputError, path_of
+from mitsplat.errors import InputError, check_fields, check_type, path_of
 from mitsplat.geometry.camera import Camera
 from mitsplat.progress import Progress
 from mitsplat.storage.content_hash import file_hash
@@ -103,6 +103,7 @@ class CaptureSettings:
         return bool(self.picks or self.picks_not or self.box)
 
     def __post_init__(self) -> None:
+        check_fields(self)
         rules = (
             (self.max_size < 64, f"the size of photos must be at least 64 px (got {self.max_size})"),
             (self.tag is not None and not self.tag > 0, f"the edge of tags must be > 0 m (got {self.tag})"),
@@ -217,6 +218,7 @@ def capture_photos(
         MissingResourceError: If COLMAP or the mask network fails to run.
     """
     photos, out = path_of(photos, "photos"), path_of(out, "out")
+    check_type(settings, CaptureSettings, "settings", "for example mitsplat.CaptureSettings(max_size=1200)")
     _check_outputs(out, photos, settings)
     if settings.masks is not None and not settings.masks.is_dir():
         raise InputError(f"{settings.masks}: no such folder of masks")

@@ -17,7 +17,7 @@ from typing import Any, Literal
 from mitsplat.asset import ASSET_FILE, read_spec
 from mitsplat.capture.capture import Capture
 from mitsplat.capture.pipeline.capture_pipeline import CaptureSettings, capture_photos
-from mitsplat.errors import InputError, path_of
+from mitsplat.errors import InputError, check_type, path_of
 from mitsplat.fit.fit_folder import FIT_FILE, read_record
 from mitsplat.fit.trainer import FitProgress, FitSettings, fit_capture
 from mitsplat.gaussians.splat_cloud import Splats
@@ -83,6 +83,7 @@ def asset_from_photos(
         MissingResourceError: If a required program or model is missing.
     """
     photos, out = path_of(photos, "photos"), path_of(out, "out")
+    check_type(job, AssetJob, "job", "for example mitsplat.AssetJob(name='cup')")
     fit = fit or default_fit(job.kind)
     taken = capture_photos(photos, out / "capture", capture or CaptureSettings(kind=job.kind), progress=progress)
     if job.light is not None:

@@ -22,6 +22,7 @@ PUT_DOWN: frozenset[Arrangement] = frozenset({"stack", "upright", "tower", "pack
 _MAX_POSITIONS = 200  # positions tried per object before all objects are drawn again
 _MAX_POSITIONS_IN_LAYER = 20  # positions tried per layer of a pile
 _MAX_DRAWS = 20
+_MAX_DRAWS_AMONG_BOXES = 3  # draws in which bounding boxes may overlap; each takes many times as long
 _GROWTH = 1.1  # of the box of tipped objects, after a number of positions without room
 _SPACING = 1e-3  # minimum distance of bounding boxes at the start [m]
 _PACK_GAP = (2e-3, 5e-3)  # distance of packed objects [m]
@@ -74,9 +75,9 @@ def draw_poses(
             None.
         turned_over: Probability that such an object stands on another side, see :func:`standing_turns`.
     """
-    for boxes in (True, False):
-        for _ in range(_MAX_DRAWS):
-            poses = _Draw(items, obstacles, rng, yaw, turned_over, boxes_overlap=not boxes).all_poses(regions)
+    for boxes_overlap, draws in ((False, _MAX_DRAWS), (True, _MAX_DRAWS_AMONG_BOXES)):
+        for _ in range(draws):
+            poses = _Draw(items, obstacles, rng, yaw, turned_over, boxes_overlap=boxes_overlap).all_poses(regions)
             if poses is not None:
                 return poses
     return None

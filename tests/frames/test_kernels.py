@@ -27,8 +27,7 @@ def nothing_of_earlier_tests() -> None:
     """Free emitters and materials of earlier tests.
 
     Kernels cover all kinds of emitters and materials that exist; if some were freed during a test, other kernels would
-    be
-    compiled.
+    be compiled.
     """
     gc.collect()
 
@@ -89,8 +88,7 @@ def test_drawn_lights_compile_no_new_kernels() -> None:
     layout = strewn(0, [0, 1, 2, 3, 3])
     with Renderer(scene) as renderer, dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         # The second view of a layout builds data shared by its other views. On a GPU, a single emitter has kernels of
-        # its own
-        # after several emitters were rendered.
+        # its own after several emitters were rendered.
         for number in (1, 2, 1):
             for _ in range(2):
                 compiled(renderer, numbers.index(number), layout)

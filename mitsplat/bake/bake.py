@@ -173,15 +173,13 @@ def bake_asset(
     settings = BakeSettings() if settings is None else settings
     check_type(settings, BakeSettings, "settings", "for example mitsplat.BakeSettings(gaussians=10000)")
     check_text(name, "name")
-    for key, value in (("density", density), ("friction", friction), ("metres_per_unit", metres_per_unit)):
-        if key != "metres_per_unit" or value is not None:
-            check_number(value, key)
-    for key, listed, kind_of_items in (
-        ("cameras", cameras, Camera),
-        ("fit_cameras", fit_cameras, Camera),
-        ("pieces", pieces, trimesh.Trimesh),
-    ):
-        check_list(listed, kind_of_items, key)
+    check_number(density, "density")
+    check_number(friction, "friction")
+    if metres_per_unit is not None:
+        check_number(metres_per_unit, "metres_per_unit")
+    check_list(cameras, Camera, "cameras")
+    check_list(fit_cameras, Camera, "fit_cameras")
+    check_list(pieces, trimesh.Trimesh, "pieces")
     if lights is not None:
         check_list(lights, DrawnLight, "lights")
     _check_arguments(kind, up, density, friction)

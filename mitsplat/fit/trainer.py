@@ -111,9 +111,6 @@ class FitSettings:
             raise InputError(f"target_psnr must be finite (got {self.target_psnr})")
         if self.budget is not None and not self.budget > 0:
             raise InputError(f"budget must be > 0 s (got {self.budget})")
-        for name, kinds in (("masks", ("alpha", "off")), ("background", ("random", "black"))):
-            if getattr(self, name) not in kinds:
-                raise InputError(f"{name} must be {' or '.join(kinds)} (got {getattr(self, name)})")
         if not 0 <= self.depth_weight < np.inf:
             raise InputError(f"depth_weight must be a number of at least 0 (got {self.depth_weight})")
         for name in ("ssim_share", "coarse"):

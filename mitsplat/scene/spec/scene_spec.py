@@ -10,6 +10,7 @@ from typing import Literal, get_args
 import numpy as np
 from pydantic import Field, model_validator
 
+from mitsplat.errors import list_in_words
 from mitsplat.geometry.camera import MAX_IMAGE_SIDE
 from mitsplat.quality import PresetName
 from mitsplat.scene.spec.camera_spec import CameraSpec
@@ -271,7 +272,7 @@ class SceneSpec(StrictModel):
             ("spin", self.settle.spin != USUAL_SPIN, ("tossed",)),
         ):
             if is_set and used.isdisjoint(allowed):
-                usable = " or ".join(filter(None, (", ".join(allowed[:-1]), allowed[-1])))
+                usable = list_in_words(allowed, "or")
                 text = f"needs settle.arrangement {usable} (got {', '.join(self.settle.arrangement)})"
                 raise FieldError(("settle", key), text)
         names = self.region_names

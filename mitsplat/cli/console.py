@@ -85,7 +85,7 @@ def command_log(
 
 @contextmanager
 def progress_bar(unit: str = "images/s") -> Iterator[Progress]:
-    """Show a bar on stderr with the speed and the remaining time."""
+    """Show a bar on stderr with the speed and the remaining time, from the first report on."""
     # Imported here because half of the commands and `--help` show no bar.
     from rich.console import Console
     from rich.progress import (
@@ -106,19 +106,24 @@ def progress_bar(unit: str = "images/s") -> Iterator[Progress]:
 
     text = TextColumn("{task.description}", markup=False)  # may hold names with brackets
     columns = (BarColumn(), MofNCompleteColumn(), RateColumn(), TimeRemainingColumn(), text)
-    with Progress(*columns, console=Console(stderr=True), speed_estimate_period=300) as bar:
-        task = bar.add_task("", total=None)
+    bar = Progress(*columns, console=Console(stderr=True), speed_estimate_period=300)
+    task = bar.add_task("", total=None)
 
-        def update(done: int, total: int, doing: str) -> None:
-            # Frames of an earlier run and steps of an earlier stage must not count for the present speed.
-            if bar.tasks[0].total != total or done < bar.tasks[0].completed:
-                bar.reset(task, total=total, completed=done)
-            if doing.startswith(TIME_NOTE):
-                bar.console.print(doing, markup=False, highlight=False, soft_wrap=True)
-            else:
-                bar.update(task, completed=done, description=doing)
+    def update(done: int, total: int, doing: str) -> None:
+        # Frames of an earlier run and steps of an earlier stage must not count for the present speed.
+        if bar.tasks[0].total != total or done < bar.tasks[0].completed:
+            bar.reset(task, total=total, completed=done)
+        bar.start()  # does nothing for a bar that is shown
+        if doing.startswith(TIME_NOTE):
+            bar.console.print(doing, markup=False, highlight=False, soft_wrap=True)
+        else:
+            bar.update(task, completed=done, description=doing)
 
+    try:
         yield update
+    finally:
+        if bar.live.is_started:  # a command that fails early shows no empty bar
+            bar.stop()
 
 
 @contextmanager

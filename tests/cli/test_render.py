@@ -140,6 +140,17 @@ def test_the_progress_bar_shows_images_and_rate(
     assert "images/s" in bar
 
 
+def test_an_error_before_the_first_image_shows_no_progress_bar(
+    scene_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fail(*args: Any, **kwargs: Any) -> DatasetSummary:
+        raise InputError("out: is not a dataset")
+
+    monkeypatch.setattr(dataset, "write_dataset", fail)
+    assert run("render", scene_path) == 2
+    assert capsys.readouterr().err == "mitsplat: out: is not a dataset\n"
+
+
 def test_render_writes_the_image_of_a_mitsuba_scene(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -19,7 +19,7 @@ import sys
 from collections.abc import Mapping
 from typing import Any
 
-from benchmarks.figures import read_results
+from benchmarks.figures import present_command, read_results
 from benchmarks.record import ROOT, refusal
 
 IDLE = (
@@ -35,22 +35,15 @@ ELSEWHERE = re.compile(r"\b[A-Z]{3,}\b|\.splat\b|cuda|\.\./shared|--blender|--ga
 
 
 def command_of(result: Mapping[str, Any]) -> list[str]:
-    """Return the command that records a result; the command line's own chart does not, its benchmark does."""
-    words = shlex.split(result["command"])
-    if words[:2] == ["mitsplat", "chart"]:
-        words = [
-            "python",
-            "-m",
-            "benchmarks.render.chart",
-            *("--frames" if word == "-n" else word for word in words[2:]),
-        ]
-    return [sys.executable, *words[1:]] if words[0] == "python" else words
+    """Return the command that records a result."""
+    program, *words = shlex.split(present_command(result))
+    return [sys.executable if program == "python" else program, *words]
 
 
 def recordable(result: Mapping[str, Any]) -> bool:
     """Return True if a checkout on this machine is enough."""
     command = result["command"]
-    own = command.startswith(("python -m benchmarks.", "mitsplat chart"))
+    own = command.startswith("python -m benchmarks.")
     return own and not ELSEWHERE.search(command) and not result["machine"]["gpu"]
 
 

@@ -41,6 +41,12 @@ VIEWS, BYTES = 8, 2.5e5
 LATE = 50
 """Number of commits behind the newest revision from which a caption states the age."""
 
+RENAMED_OPTIONS = {
+    "mitsplat fit": {"--edge": "--max-size"},
+    "python -m benchmarks.render.chart": {"--at": "--order-tolerance"},
+}
+"""Options that were renamed after a command was recorded, by the beginning of the command: old and present name."""
+
 Results = Mapping[str, Mapping[str, Any]]
 
 
@@ -107,12 +113,21 @@ def formatted(value: Any, spec: str) -> str:
         raise FigureError(f"{value} cannot be written as {spec}: {error}") from error
 
 
+def present_command(result: Mapping[str, Any]) -> str:
+    """Return the command of a result, with the present names of its options."""
+    command = str(result["command"])
+    for beginning, names in RENAMED_OPTIONS.items():
+        if command.startswith(f"{beginning} "):
+            command = " ".join(names.get(word, word) for word in command.split(" "))
+    return command
+
+
 def caption(result: Mapping[str, Any], newest: int = 0) -> str:
     """Return the source of figures: command, machine, load, revision, and commits behind the newest revision."""
     load, day = load_of(result), revision_of(result)
     late = newest - (result.get("commits") or newest)
     day += f", {late} commits before the newest figure" if late >= LATE else ""
-    text = f"`{result['command']}` on {machine_of(result)}" + (f", {load}" if load else "")
+    text = f"`{present_command(result)}` on {machine_of(result)}" + (f", {load}" if load else "")
     if result["recorded"] == "transcribed":
         text += f"; taken over from the notes of revision {day}, not recorded anew since"
     else:
@@ -155,7 +170,7 @@ def runs(results: Iterable[Mapping[str, Any]], newest: int) -> str:
         how += f". {result['note']}" if result.get("note") else ""
         load, day = load_of(result).removeprefix("load "), f"{result['revision']}, {result['date']}"
         late = "–" if result.get("commits") is None else newest - result["commits"]
-        lines.append(f"| `{result['command']}` | {machine_of(result)} | {load} | {day} | {late} | {how} |")
+        lines.append(f"| `{present_command(result)}` | {machine_of(result)} | {load} | {day} | {late} | {how} |")
     return "\n".join(lines)
 
 

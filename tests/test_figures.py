@@ -7,6 +7,7 @@ import copy
 import json
 import math
 import re
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -14,12 +15,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+import typer.main
 
 from benchmarks import again, figures, record
 from benchmarks.detector.table import experiment_table, gain_cells
 from benchmarks.figures import FigureError, caption, differences, filled, formatted, read_results, unsaid
 from benchmarks.record import configuration_of, figure, read_recorded, recording, refusal, revision
 from mitsplat.checks import doctor
+from mitsplat.cli import app
 
 ROOT = Path(__file__).parents[1]
 RESULTS = read_results()
@@ -267,8 +270,22 @@ def test_commands_that_need_only_a_checkout_are_run_again() -> None:
         "engine.plan",
     }
     assert set(again.IDLE) <= RESULTS.keys()
-    words = again.command_of({"command": "mitsplat chart scenes/workcell.yaml -n 2"})
-    assert words[1:] == ["-m", "benchmarks.render.chart", "scenes/workcell.yaml", "--frames", "2"]
+    words = again.command_of({"command": "python -m benchmarks.render.chart FILE --at 0.03"})
+    assert words == [sys.executable, "-m", "benchmarks.render.chart", "FILE", "--order-tolerance", "0.03"]
+
+
+def test_shown_commands_have_only_options_that_exist_today() -> None:
+    """Options of benchmarks are looked up in the source of their folder: ``add_argument("--size")``."""
+    known = typer.main.get_command(app).commands
+    for result in read_recorded().values():
+        program, *words = shlex.split(figures.present_command(result))
+        options = {word.partition("=")[0] for word in words if word.startswith("--")}
+        if program == "mitsplat":
+            found = {option for param in known[words[0]].params for option in param.opts}
+        else:
+            source = "".join(path.read_text() for path in Path(*words[1].split(".")[:2]).rglob("*.py"))
+            found = {option for option in options if f'"{option}"' in source}
+        assert options <= found, result["command"]
 
 
 def test_captions_mark_old_dirty_and_transcribed_results() -> None:

@@ -180,6 +180,11 @@ def by_bop_toolkit(root: Path, form: str) -> Found:
 
 def by_torchvision(root: Path, form: str) -> Found:
     """Read COCO files with torchvision's ``CocoDetection``."""
+    import torch
+
+    # The operators of its wheel do not load with a CPU build of PyTorch. The import needs their names, datasets none.
+    for name in ("nms", "qnms"):
+        torch.library.define(f"torchvision::{name}", "(Tensor dets, Tensor scores, float iou_threshold) -> Tensor")
     from torchvision.datasets import CocoDetection
 
     for split in splits(root):

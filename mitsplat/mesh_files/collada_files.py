@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
@@ -70,7 +70,8 @@ def check_collada(path: Path, document: Any) -> None:
         document: The ``collada.Collada`` of the file.
 
     Raises:
-        InputError: If it has controllers, a mesh in a frame that trimesh gets wrong, or a texture that is missing.
+        InputError: If it has controllers, a mesh in a frame that trimesh gets wrong, or a texture that is missing, has
+            other than the first coordinates, or is not repeated.
     """
     root = document.xmlnode.getroot()
     if any(_NOT_FINITE.search(array.text or "") for array in root.iterfind(f".//{_NAMESPACE}float_array")):
@@ -84,6 +85,43 @@ def check_collada(path: Path, document: Any) -> None:
     for material in document.materials:
         if (texture := _texture_of(material)) is not None:
             check_texture(path, plain_name(texture), path.parent)
+    for material, primitive in _bindings(document.scene.nodes):
+        if material is not None and _texture_of(material.target) is not None:
+            _check_coordinates(material, primitive)
+
+
+def _bindings(nodes: Iterable[Any]) -> Iterator[tuple[Any, Any]]:
+    """Yield each primitive of nodes of pycollada after its material node, which is None if its symbol is not bound."""
+    for node in nodes:
+        if (geometry := getattr(node, "geometry", None)) is not None:
+            bound = {one.symbol: one for one in node.materials}
+            yield from ((bound.get(primitive.material), primitive) for primitive in geometry.primitives)
+        yield from _bindings(getattr(node, "children", None) or ())
+
+
+def _check_coordinates(material: Any, primitive: Any) -> None:
+    """Refuse a texture that trimesh puts elsewhere than its material node.
+
+    Raises:
+        InputError: If its coordinates are not the first of several, or end at its border.
+    """
+    diffuse, inputs = material.target.effect.diffuse, primitive.sources.get("TEXCOORD", [])
+    sets = [str(one[3] or 0) for one in inputs]
+    bound = [str(number or 0) for name, _, number in material.inputs if name == diffuse.texcoord]
+    if len(sets) > 1 and bound and bound[0] != sets[0]:
+        raise InputError(
+            f"a texture has its coordinates in set {bound[0]}, but only the first set of COLLADA files is read: export "
+            "it as .glb"
+        )
+    sampler = diffuse.sampler.xmlnode
+    wraps = [sampler.findtext(f".//{_NAMESPACE}wrap_{axis}", "WRAP").strip() for axis in "st"]
+    uv = np.concatenate([np.asarray(one[4].data)[:, :2] for one in inputs[:1]] or [np.zeros((1, 2))])
+    for wrap, values in zip(wraps, uv.T, strict=True):
+        if wrap != "WRAP" and (values.min() < 0 or values.max() > 1):
+            raise InputError(
+                f"a texture is continued by {wrap} outside of its image, which is not read from COLLADA files: export "
+                "it as .glb"
+            )
 
 
 def lost_node(document: Any) -> str | None:
@@ -97,6 +135,9 @@ def collada_warnings(document: Any) -> Iterator[str]:
         yield "the colours of its vertices are left out"
     if any(_opacity(material.effect) < OPAQUE for material in document.materials):
         yield "some of its materials are transparent, but are baked as opaque"
+    unbound = {primitive.material for material, primitive in _bindings(document.scene.nodes) if material is None}
+    for symbol in sorted(str(one) for one in unbound - {None}):
+        yield f"its material symbol {symbol} has no material (instance_material): grey is used"
 
 
 def _texture_of(material: Any) -> str | None:

@@ -56,6 +56,10 @@ def read_mesh_file(path: Path, *, textures: bool = True) -> MeshFile:
     refuse_other_kinds(path, "a mesh (.glb, .step, .obj, .stl, .ply)", *SUFFIXES)
     if not path.is_file():
         raise InputError(f"{path}: no such mesh file")
+    if path.suffix.lower() not in SUFFIXES:
+        raise InputError(
+            f"{path}: must be a mesh ({', '.join(SUFFIXES)}) (got {path.suffix or 'no suffix'}): export it as .glb"
+        )
     try:
         with path.open("rb") as file:
             refuse_placeholder(path, file.read(1024))

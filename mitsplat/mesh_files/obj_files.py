@@ -21,6 +21,7 @@ _KEPT = (b"map_", b"mtllib")
 _NAMES = (b"usemtl", b"newmtl", b"g", b"o")
 """Keys whose values may contain the character that begins a comment."""
 _COLOURED = re.compile(rb"^v(?: \S+){3}((?: \S+){3})$", re.M)
+_ODD_VERTEX = re.compile(rb"^v(?: \S+){5}$|^v(?: \S+){7,}$", re.M)
 _LEFT_OUT = {
     rb"^(?:curv|curv2|surf) ": "its free-form curves and surfaces are left out",
     rb"^[lp] ": "its points and lines are left out",
@@ -49,6 +50,8 @@ def _plain_line(line: bytes) -> bytes:
         return b" ".join(line.strip().split(maxsplit=1))
     if len(words) == 2 and words[0].lower() in (b"ka", b"kd", b"ks"):
         words += words[1:] * 2  # a single value stands for all three
+    if len(words) == 2 and words[0] == b"vt":
+        words.append(b"0")
     return b" ".join(words)
 
 
@@ -60,8 +63,11 @@ def obj_warnings(content: bytes, parts: tuple[FilePart, ...]) -> Iterator[str]:
         parts: What is read.
 
     Raises:
-        InputError: If colours of vertices are not within 0 to 1.
+        InputError: If colours of vertices are not within 0 to 1, or have an opacity.
     """
+    if (odd := _ODD_VERTEX.search(content)) is not None:
+        count = len(odd[0].split()) - 1
+        raise InputError(f"vertices must have 3 numbers, or 6 with red, green and blue (got {count}): leave out others")
     for pattern, sentence in _LEFT_OUT.items():
         if re.search(pattern, content, re.M):
             yield sentence

@@ -247,6 +247,8 @@ class _Package:
                 elif kind in ("compositematerials", "multiproperties"):
                     self._groups[model, number] = _Group(np.full((len(element), 3), UNKNOWN_COLOUR))
                     self._left_out.add(f"{kind} of colours")
+                elif kind == "item" and element.get("printable") in ("0", "false"):
+                    self._left_out.add("items that are not printed")
                 elif kind == "item":
                     yield self._reference(model, element), _matrix(element.get("transform"))
 

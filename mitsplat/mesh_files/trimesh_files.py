@@ -157,6 +157,19 @@ def _plain_stl(path: Path) -> bytes | None:
     return content[:end] if number and end < len(content) and b"facet" not in content[:1024] else None
 
 
+def _check_text_stl(content: bytes, count: int) -> None:
+    """Refuse a text STL file of which ``count`` faces are read, if it has others.
+
+    Raises:
+        InputError: If its last solid is incomplete, which trimesh leaves out.
+    """
+    if b"facet" not in content[:1024].lower():
+        return
+    stated = len(re.findall(rb"^\s*facet\s", content, re.M | re.I))
+    if stated != count:
+        raise InputError(f"only {count} of its {stated} faces can be read (is the file complete?)")
+
+
 def _ply_header(path: Path) -> str:
     with path.open("rb") as file:
         return file.read(_MAX_HEADER_BYTES).partition(b"end_header")[0].decode("utf-8", errors="replace")
@@ -197,8 +210,9 @@ def _warnings(
             yield f"it names no material file (mtllib) of its material {names[0]}, which is left out"
         yield from obj_warnings(content, parts)
     elif kind == ".stl":
-        with path.open("rb") as file:
-            is_coloured = b"COLOR=" in file.read(_STL_HEADER_BYTES)
+        stored = path.read_bytes()
+        is_coloured = b"COLOR=" in stored[:_STL_HEADER_BYTES]
+        _check_text_stl(stored, sum(len(one.faces) for one in scene.geometry.values()))
         if is_coloured or any(np.any(one.face_attributes.get("stl", 0)) for one in scene.geometry.values()):
             yield "the colours of its faces are not read, because STL files store them in several ways"
     elif kind == ".ply":
@@ -224,11 +238,21 @@ def _ply_warnings(header: str, scene: trimesh.Scene) -> Iterator[str]:
                 continue
             coloured.append(name)
             values = np.asarray(element["data"]["red"])
-            most = max(float(np.max(element["data"][one])) for one in ("red", "green", "blue"))
+            channels = [element["data"][one] for one in ("red", "green", "blue")]
+            least, most = min(map(np.min, channels)), max(map(np.max, channels))
             if values.dtype.kind == "f" and most > MAX_FRACTION:
                 raise InputError(
                     f"colours that are no integers must be within 0 to 1 (got {most:g}): divide them by 255"
                 )
+            if values.dtype.kind in "iu" and not 0 <= least <= most <= 255:
+                raise InputError(
+                    f"colours that are integers must be within 0 to 255 (got {least:g} to {most:g}): use uchar"
+                )
+    elements = re.split(r"^element ", header, flags=re.M)
+    own = "".join(text for text in elements if text.startswith(("vertex", "face")))
+    unread = re.findall(r"^property \w+ (\S*(?:red|green|blue))\s*$", own, re.M | re.I)
+    if unread and not coloured:
+        yield f"its properties {', '.join(dict.fromkeys(unread))} are left out, because colours have the name red"
     if {"vertex", "face"} <= set(coloured):
         yield "the colours of its faces are left out, because its vertices have colours"
     left_out = sorted(set(re.findall(r"^element (\S+) [1-9]", header, re.M)) - {"vertex", "face"})

@@ -1,9 +1,10 @@
 """Renders the scenes of ``benchmarks.detector.cycles_photos`` with Blender Cycles, in an environment with ``bpy``.
 
-    python -P blender_photos.py INPUTS PHOTOS PROCESSES THREADS K
+    python -P blender_photos.py INPUTS PHOTOS PROCESSES THREADS K [DEVICE]
 
 Process K of PROCESSES renders its share of the photographs that are missing: ``PHOTOS/scene_NNNN_VVVV.jpg``, and the
-number of the part at every pixel centre in ``PHOTOS/.scene_NNNN_VVVV.npz``.
+number of the part at every pixel centre in ``PHOTOS/.scene_NNNN_VVVV.npz``. DEVICE is CPU, the default, or a kind of
+GPU that Cycles knows, such as CUDA.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ import numpy as np
 from mathutils import Matrix
 
 
-def main(inputs: Path, photos: Path, processes: int, threads: int, process: int) -> None:
+def main(inputs: Path, photos: Path, processes: int, threads: int, process: int, device: str) -> None:
     """Render the share of a process."""
     views = [
         (path, view)
@@ -37,9 +38,24 @@ def main(inputs: Path, photos: Path, processes: int, threads: int, process: int)
         spec = json.loads(path.read_text())
         if built != path:
             build_scene(spec, inputs)
+            use_device(device)
             built = path
         photograph(spec["views"][view], spec["samples"], target, threads)
         print(f"{target.stem}: {time.time() - begun:.1f} s, {time.process_time() - used:.1f} CPU s", file=sys.stderr)
+
+
+def use_device(device: str) -> None:
+    """Render on all GPUs of a kind, or on the CPU."""
+    bpy.context.scene.cycles.device = "CPU" if device == "CPU" else "GPU"
+    if device == "CPU":
+        return
+    preferences = bpy.context.preferences.addons["cycles"].preferences
+    preferences.compute_device_type = device
+    preferences.refresh_devices()
+    for one in preferences.devices:
+        one.use = one.type == device
+    if not any(one.use for one in preferences.devices):
+        raise SystemExit(f"Cycles finds no {device} device")
 
 
 def build_scene(spec: Mapping[str, Any], inputs: Path) -> None:
@@ -232,7 +248,7 @@ def photograph(view: Mapping[str, Any], samples: int, target: Path, threads: int
     render.image_settings.file_format, render.image_settings.color_depth = "OPEN_EXR", "32"
     set_camera(view, scene)
     cycles = scene.cycles
-    cycles.device, cycles.seed = "CPU", view["seed"] % 2**20
+    cycles.seed = view["seed"] % 2**20
     cycles.max_bounces, cycles.diffuse_bounces, cycles.glossy_bounces = 5, 3, 4
     cycles.caustics_reflective = cycles.caustics_refractive = False
     cycles.sample_clamp_indirect, cycles.use_light_tree = 10.0, False
@@ -338,4 +354,5 @@ def blurred(image: np.ndarray, sigma: float) -> np.ndarray:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), Path(sys.argv[2]), *(int(word) for word in sys.argv[3:6]))
+    folders, numbers = (Path(word) for word in sys.argv[1:3]), (int(word) for word in sys.argv[3:6])
+    main(*folders, *numbers, sys.argv[6] if len(sys.argv) > 6 else "CPU")

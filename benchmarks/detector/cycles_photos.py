@@ -2,7 +2,7 @@
 
     python -m venv /tmp/blender && /tmp/blender/bin/pip install bpy==4.5.15     # needs Python 3.11
     python -m benchmarks.detector.cycles_photos WORK --blender /tmp/blender/bin/python [--scenes 12] [--views 8]
-        [--width 960] [--samples 64] [--processes 1]
+        [--width 960] [--samples 64] [--processes 1] [--blender-device CUDA]
 
 Parts of the shipped scenes are dropped on a bench, poured into a bin or laid out by hand, among tools, cables, cloth
 and packaging, in rooms with windows, fluorescent tubes and desk lamps. Only the shapes, the prints and the physics are
@@ -92,9 +92,12 @@ def main() -> None:
     parser.add_argument("--width", type=int, default=960)
     parser.add_argument("--samples", type=int, default=64)
     parser.add_argument("--processes", type=int, default=1, help="Blender processes, which share the cores")
+    parser.add_argument("--blender-device", default="CPU", help="CPU, or the kind of GPU of Cycles: CUDA, OPTIX")
     options = parser.parse_args()
     ensure_variant()
-    with recording("detector.cycles_photos", parser, options, ignore=("work", "blender", "processes")):
+    with recording(
+        "detector.cycles_photos", parser, options, ignore=("work", "blender", "blender_device", "processes")
+    ):
         photograph_benches(options)
 
 
@@ -111,7 +114,8 @@ def photograph_benches(options: argparse.Namespace) -> None:
         threads = max(1, len(os.sched_getaffinity(0)) // options.processes)
         # -P: modules of this folder must not hide those of Blender.
         command = [options.blender, "-P", str(SCRIPT), str(inputs), str(photos), str(options.processes), str(threads)]
-        jobs = [subprocess.Popen([*command, str(k)], stdout=subprocess.DEVNULL) for k in range(options.processes)]
+        words = [[*command, str(k), options.blender_device] for k in range(options.processes)]
+        jobs = [subprocess.Popen(one, stdout=subprocess.DEVNULL) for one in words]
         if failed := [k for k, job in enumerate(jobs) if job.wait()]:
             raise SystemExit(f"Blender failed in processes {failed} of {options.processes}")
     shots = [shot for path in sorted(inputs.glob("scene_*.json")) for shot in label_scene(path, photos)]

@@ -354,5 +354,5 @@ def blurred(image: np.ndarray, sigma: float) -> np.ndarray:
 
 
 if __name__ == "__main__":
-    folders, numbers = (Path(word) for word in sys.argv[1:3]), (int(word) for word in sys.argv[3:6])
-    main(*folders, *numbers, sys.argv[6] if len(sys.argv) > 6 else "CPU")
+    count, cores, mine = (int(word) for word in sys.argv[3:6])
+    main(Path(sys.argv[1]), Path(sys.argv[2]), count, cores, mine, sys.argv[6] if len(sys.argv) > 6 else "CPU")

@@ -222,16 +222,16 @@ def measure_bin(count: int) -> None:
 def measure_rest(count: int) -> None:
     """Drop ten objects once for each of some seeds, without a second draw; then simulate five more seconds."""
     from mitsplat.physics.drop import drop_of
-    from mitsplat.physics.rest import FREE_TIME, _surface_motion, run_to_rest
+    from mitsplat.physics.rest import FREE_TIME, run_to_rest, surface_motion
 
     for stepper in STEPPERS:
         drop = drop_of(make_scene(parts(), 2, stepper), lambda text: None)
         times, moved, total = [], 0, 0
         for seed in range(count):
             assets, _ = draw_objects(drop.scene, 0)
-            world = drop._world(assets, 1.0)
+            world = drop.world_of(assets, 1.0)
             world.reset(drop.draw_poses(assets, np.random.default_rng(seed)))
-            outcome = run_to_rest(world, max_time=6.0, bounds=drop._static_scenes[0].bounds, free_time=FREE_TIME)
+            outcome = run_to_rest(world, max_time=6.0, bounds=drop.static_scenes[0].bounds, free_time=FREE_TIME)
             if outcome.rejection:
                 print(f"  seed {seed}: {outcome.rejection}")
                 continue
@@ -240,7 +240,7 @@ def measure_rest(count: int) -> None:
             while world.time < end:
                 world.advance()
             total += len(world.bodies)
-            moved += int((_surface_motion(world.bodies, outcome.poses, world.poses) > 5e-3).sum())
+            moved += int((surface_motion(world.bodies, outcome.poses, world.poses) > 5e-3).sum())
         for value, unit, what in (
             (count, "", "drops"),
             (len(times), "", "at rest"),
@@ -304,12 +304,12 @@ def measure_worlds(count: int, device: str) -> None:
     drop = drop_of(scene, lambda text: None)
     assets, _ = draw_objects(drop.scene, 0)
     starts = [drop.draw_poses(assets, np.random.default_rng(world)) for world in range(count)]
-    bodies = [drop._objects[asset].body for asset in assets]
+    bodies = [drop.objects[asset].body for asset in assets]
     time_worlds(
         bodies,
-        drop._static_scenes[0].colliders,
+        drop.static_scenes[0].colliders,
         starts,
-        drop._static_scenes[0].bounds,
+        drop.static_scenes[0].bounds,
         timestep=TIMESTEP,
         device=device,
     )

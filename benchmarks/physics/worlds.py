@@ -64,14 +64,14 @@ class Batch:
         timestep: float,
         device: str,
     ) -> None:
-        one = physics._build_scene(bodies, colliders, physics._IMPEDANCE_WARP, True)
+        one = physics.build_scene(bodies, colliders, physics.IMPEDANCE_WARP, True)
         contacts = 2 * physics.max_contacts(len(bodies), one.shape_count)  # no second draw
-        builder = newton.ModelBuilder(gravity=physics._GRAVITY)
+        builder = newton.ModelBuilder(gravity=physics.GRAVITY_VECTOR)
         SolverMuJoCo.register_custom_attributes(builder)
         builder.replicate(one, len(starts))
         model = builder.finalize(device=device)
         self._solver = PairContactSolver(
-            model, nconmax=contacts, njmax=6 * contacts, use_mujoco_contacts=False, **physics._SOLVER_OPTIONS
+            model, nconmax=contacts, njmax=6 * contacts, use_mujoco_contacts=False, **physics.SOLVER_OPTIONS
         )
         self._solver.mjw_model.opt.warn_overflow = 0
         self._pipeline = newton.CollisionPipeline(
@@ -80,20 +80,20 @@ class Batch:
         self._contacts, self._control = self._pipeline.contacts(), model.control()
         self._states, self._timestep = (model.state(), model.state()), timestep
         overflow = {SolverMuJoCo.ObservableKind.OVERFLOW}
-        self._observables = [self._solver.observables(overflow) for _ in range(physics._STEPS)]
-        self.interval = physics._STEPS * timestep
+        self._observables = [self._solver.observables(overflow) for _ in range(physics.STEPS)]
+        self.interval = physics.STEPS * timestep
         self._record()
         with wp.ScopedCapture(device=device) as capture:
             self._record()
         self._graph = capture.graph
         self._shape = len(starts), len(builder.body_mass) // len(starts), 7
-        coordinates = np.concatenate([physics._coordinates(bodies, poses) for poses in starts])
+        coordinates = np.concatenate([physics.body_coordinates(bodies, poses) for poses in starts])
         state = self._states[0]
         self._solver.reset(state)
-        physics._assign(state.joint_q, coordinates.ravel())
-        physics._assign(state.body_q, coordinates)
-        physics._assign(state.joint_qd, np.zeros(6 * len(coordinates)))
-        physics._assign(state.body_qd, np.zeros((len(coordinates), 6)))
+        physics.assign_array(state.joint_q, coordinates.ravel())
+        physics.assign_array(state.body_q, coordinates)
+        physics.assign_array(state.joint_qd, np.zeros(6 * len(coordinates)))
+        physics.assign_array(state.body_qd, np.zeros((len(coordinates), 6)))
 
     def _record(self) -> None:
         here, there = self._states
@@ -126,7 +126,7 @@ def has_rested(
         """A recorded simulation, frame by frame."""
 
         def __init__(self) -> None:
-            super().__init__(bodies, timestep=interval / physics._STEPS)
+            super().__init__(bodies, timestep=interval / physics.STEPS)
             self._frames = iter(frames[:, : len(bodies)])
             self._frame = next(self._frames)
 

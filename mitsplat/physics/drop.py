@@ -110,6 +110,11 @@ class Drop:
     Args:
         scene: Objects, start regions and colliders.
         progress: Callback that receives a short description of a slow operation.
+
+    Attributes:
+        scene: The scene.
+        objects: Physical part of each asset of the scene.
+        static_scenes: Colliders and obstacles by the number of the environment, or those of the last layout only.
     """
 
     def __init__(self, scene: Scene, progress: Note) -> None:
@@ -117,14 +122,14 @@ class Drop:
         self._parts: dict[int, Part] = {}
         self._worlds: dict[tuple[tuple[int, ...], float, int], World] = {}
         self._world_count = 0
-        self._objects = [self._part(asset, progress) for asset in scene.assets]
+        self.objects = [self._part(asset, progress) for asset in scene.assets]
         self._surroundings = (scene.environments if scene.spec.environment_collides else ()) or (None,)
-        bodies = [part.body for part in self._objects]
-        self._static_scenes = {
+        bodies = [part.body for part in self.objects]
+        self.static_scenes = {
             number: make_static_scene(scene, bodies, around, progress)
             for number, around in enumerate(self._surroundings)
         }
-        for static in self._static_scenes.values():
+        for static in self.static_scenes.values():
             self._check_given_poses(static)
 
     def settle(self, index: int) -> Layout:
@@ -196,7 +201,7 @@ class Drop:
         """Drop the given objects from the next draw of start poses."""
         number = self._static_key(index)
         assets, given = tuple(one.asset for one in drawn), [one.given for one in drawn]
-        regions, obstacles = [one.region for one in drawn], self._static_scenes[number].obstacles
+        regions, obstacles = [one.region for one in drawn], self.static_scenes[number].obstacles
         arrangements = self._arrangements(drawn)
         rng = random_stream(self.scene.spec.seed, "object poses", index, len(refused))
         try:
@@ -207,7 +212,7 @@ class Drop:
             alone = [self._place([item], number, rng, arrangements) is None for item in items]
             reason = "no room for it" if any(alone) else CROWDED
             return _Rejection(reason, np.flatnonzero(alone).tolist(), str(error))
-        world = self._world(assets, 2.0 ** refused.count(CONTACT_OVERFLOW), number)
+        world = self.world_of(assets, 2.0 ** refused.count(CONTACT_OVERFLOW), number)
         outcome = self._run(world, start, index, len(refused), drawn, rng)
         if outcome.rejection:
             reason = outcome.rejection
@@ -239,7 +244,7 @@ class Drop:
             collider_penetration=state.collider_penetration,
             pair_penetration=state.pair_penetration,
             support_gap=max(state.support_gaps),
-            standoff=max(self._objects[asset].standoff for asset in assets),
+            standoff=max(self.objects[asset].standoff for asset in assets),
             attempts=len(refused) + 1,
             refused=tuple(refused),
         )
@@ -276,7 +281,7 @@ class Drop:
         rng = random_stream(self.scene.spec.seed, "object poses", layout.index, attempt)
         capacity = 2.0 ** certificate.refused.count(CONTACT_OVERFLOW)
         number, regions = self._static_key(layout.index), [one.region for one in drawn]
-        world = self._world(assets, capacity, number)
+        world = self.world_of(assets, capacity, number)
         start = self.draw_poses(assets, rng, given, number, regions, self._arrangements(drawn))
         restarted = np.zeros(len(drawn), dtype=bool)
         moments = [(0.0, start, restarted.copy())]
@@ -299,9 +304,9 @@ class Drop:
         if not any(shape.collider and shape.is_drawn for shape in self.scene.spec.shapes):
             return number
         key = len(self._surroundings) + layout
-        if key not in self._static_scenes:
-            bodies, around = [part.body for part in self._objects], self._surroundings[number]
-            self._static_scenes = {key: make_static_scene(self.scene, bodies, around, lambda text: None, layout)}
+        if key not in self.static_scenes:
+            bodies, around = [part.body for part in self.objects], self._surroundings[number]
+            self.static_scenes = {key: make_static_scene(self.scene, bodies, around, lambda text: None, layout)}
         return key
 
     def _run(
@@ -318,7 +323,7 @@ class Drop:
         settle = self.scene.spec.settle
         fastest = _POUR_SPEED if any(one.arrangement == "pile" for one in drawn) else np.inf
         number, arrangements = self._static_key(index), self._arrangements(drawn)
-        static = self._static_scenes[number]
+        static = self.static_scenes[number]
         free = np.array([one.given is None for one in drawn])
         own = np.array([one.region for one in drawn])
 
@@ -359,12 +364,12 @@ class Drop:
             observe=observe,
         )
 
-    def _world(self, assets: tuple[int, ...], capacity: float, number: int = 0) -> World:
+    def world_of(self, assets: tuple[int, ...], capacity: float, number: int = 0) -> World:
         """Return the simulation of these assets in a static scene; the last one is cached."""
         key = assets, capacity, number
         if key not in self._worlds:
-            static = self._static_scenes[number]
-            bodies = [self._objects[asset].body for asset in assets]
+            static = self.static_scenes[number]
+            bodies = [self.objects[asset].body for asset in assets]
             self._worlds.clear()
             self._world_count += 1
             if self._world_count % _COLLECTION_INTERVAL == 0:
@@ -436,7 +441,7 @@ class Drop:
         raise InputError(
             f"{self.scene.path}: region must be large enough to hold all objects of a layout without overlap "
             f"(got {len(assets)} objects in {size[0]:.3g} x {size[1]:.3g} x {size[2]:.3g} m"
-            f"{self._describe_obstruction(self._static_scenes[number].obstacles)}, "
+            f"{self._describe_obstruction(self.static_scenes[number].obstacles)}, "
             f"settle.arrangement {arrangements[0]})"
         )
 
@@ -448,7 +453,7 @@ class Drop:
             (region, arrangement)
             for (region, _), arrangement in zip(self.scene.spec.all_regions, arrangements, strict=True)
         ]
-        return draw_poses(items, self._static_scenes[number].obstacles, regions, rng, settle.yaw, settle.turned_over)
+        return draw_poses(items, self.static_scenes[number].obstacles, regions, rng, settle.yaw, settle.turned_over)
 
     def _items(
         self, assets: Sequence[int], given: Sequence[Float64Array | None], regions: Sequence[int] | None
@@ -456,8 +461,8 @@ class Drop:
         return [
             Item(
                 asset,
-                self._objects[asset].surface,
-                self._objects[asset].body.outline,
+                self.objects[asset].surface,
+                self.objects[asset].body.outline,
                 given[i] if given else None,
                 regions[i] if regions else 0,
             )
@@ -472,7 +477,7 @@ class Drop:
         return f", {taken[worst]:.0%} of which are inside {obstacles[worst].name!r}" if taken[worst] >= 0.1 else ""
 
     def _placed(self, asset: int, pose: Float64Array) -> PlacedSurface:
-        return PlacedSurface(self.scene.assets[asset].name, self._objects[asset].surface, pose)
+        return PlacedSurface(self.scene.assets[asset].name, self.objects[asset].surface, pose)
 
     def _instances(self, drawn: Sequence[_DrawnObject], poses: Float64Array) -> tuple[Instance, ...]:
         return tuple(

@@ -144,7 +144,7 @@ def _run_to_rest(
         handling.apply(world)
         poses = _advance(world, fastest, drag=world.time - begin >= FREE_TIME and not quiet)
         past.append(poses)
-        motion = np.maximum(motion, _surface_motion(world.bodies, rest, poses))
+        motion = np.maximum(motion, surface_motion(world.bodies, rest, poses))
         moving = motion > (_QUIET_MOTION if world.time - since < _QUIET_TIME else _REST_MOTION)
         if moving.any() or world.time < handling.end:
             since, rest = world.time, poses
@@ -241,7 +241,7 @@ class _Failures:
         elif self._before is None:
             self._before = time, poses
         elif time - self._before[0] >= _LATE_TIME:
-            moved = _surface_motion(self._world.bodies, self._before[1], poses) > _LATE_MOTION
+            moved = surface_motion(self._world.bodies, self._before[1], poses) > _LATE_MOTION
             if moved.sum() <= max(1, int(_MAX_LATE * len(moved))) < len(moved):
                 late = moved & ~calm
             self._before = time, poses
@@ -265,7 +265,7 @@ def _mean_speeds(
     return float(way.max()) / seconds, float(turn.max()) / seconds
 
 
-def _surface_motion(bodies: Sequence[Body], before: Float64Array, after: Float64Array) -> Float64Array:
+def surface_motion(bodies: Sequence[Body], before: Float64Array, after: Float64Array) -> Float64Array:
     """Compute the largest displacement of a point of each body between two sets of poses [m], shape (N,)."""
     largest = np.zeros(len(bodies))
     for i, (body, change) in enumerate(zip(bodies, after - before, strict=True)):

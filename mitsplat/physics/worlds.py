@@ -34,7 +34,7 @@ from mitsplat.physics.restitution import MIN_IMPACT_SPEED, SIMULTANEOUS, rebound
 
 _logger = logging.getLogger(__name__)
 
-_GRAVITY = (0.0, 0.0, -GRAVITY)
+GRAVITY_VECTOR = (0.0, 0.0, -GRAVITY)
 # Contact of damping 2/t and stiffness 1/(t z)^2, as in MuJoCo, for all contacts that are no impacts (see
 # :mod:`mitsplat.physics.restitution`). At a damping ratio z of 1, a body would rebound from a drop of 0.3 m by 5 mm,
 # because contact cannot pull. From 1.5 on it does not leave the table. At 2 it penetrates deeper without benefit.
@@ -45,15 +45,15 @@ WITH_ROLL, _WITHOUT_ROLL = 6, 4
 # Impedance of contacts at the surface and 1 mm deep: at MuJoCo's default of 0.9, a nut under a plate of a hundred times
 # its mass sinks by 1 mm. MuJoCo's own contacts flicker when stiffer: from 0.98 on, a pile of 29 packages creeps at 1 to
 # 10 mm/s, and another one at 2 to 4 mm/s at 0.97. At 0.96 such piles rest sooner, and friction is still exact to 0.3 %.
-_IMPEDANCE_WARP, IMPEDANCE_MUJOCO = (0.996, 0.9999), (0.96, 0.999)
+IMPEDANCE_WARP, IMPEDANCE_MUJOCO = (0.996, 0.9999), (0.96, 0.999)
 # Moment of inertia below which Newton corrects it [kg m^2], below that of any part of 0.5 mm. By default, Newton adds
 # 1e-6 kg m^2 to moments below 1e-10, which a steel cube of 2 mm has.
 _MIN_INERTIA = 1e-20
 # Solver tolerance of MuJoCo in double precision. At its default of 1e-8, errors of one step cost iterations in the next
 # step: 18 instead of 9 per step in a pile of 29 packages.
 _TOLERANCE = 1e-12
-_STEPS = 4  # per captured graph; even, so that the two states return to their roles
-_SOLVER_OPTIONS: dict[str, Any] = {
+STEPS = 4  # per captured graph; even, so that the two states return to their roles
+SOLVER_OPTIONS: dict[str, Any] = {
     "integrator": "implicitfast",
     "solver": "newton",
     "cone": "elliptic",
@@ -138,7 +138,7 @@ class World(ABC):
 
     def __init__(self, bodies: Sequence[Body], *, timestep: float) -> None:
         self.bodies = tuple(bodies)
-        self.interval = _STEPS * timestep
+        self.interval = STEPS * timestep
         self.time = 0.0
         self._has_rolling_friction = True
 
@@ -151,7 +151,7 @@ class World(ABC):
         """
         self.time = 0.0
         self.set_rolling_friction(True)
-        self._reset(_coordinates(self.bodies, poses))
+        self._reset(body_coordinates(self.bodies, poses))
         self.set_velocities(np.zeros((len(self.bodies), 2, 3)) if velocities is None else velocities)
         self.set_forces(np.zeros((len(self.bodies), 2, 3)))
 
@@ -235,10 +235,10 @@ class WarpWorld(World):
     ) -> None:
         super().__init__(bodies, timestep=timestep)
         self._timestep = timestep
-        model = _build_model(bodies, colliders, _IMPEDANCE_WARP, True)
+        model = _build_model(bodies, colliders, IMPEDANCE_WARP, True)
         contacts = max(8, int(capacity * max_contacts(len(bodies), model.shape_count)))
         self._solver = PairContactSolver(
-            model, nconmax=contacts, njmax=6 * contacts, use_mujoco_contacts=False, **_SOLVER_OPTIONS
+            model, nconmax=contacts, njmax=6 * contacts, use_mujoco_contacts=False, **SOLVER_OPTIONS
         )
         self._friction = _array(self._solver.mjw_model.geom_friction)
         # Overflow is read from flags, because the kernels would print it at every step.
@@ -250,7 +250,7 @@ class WarpWorld(World):
         self._contacts = self._pipeline.contacts()
         self._states = model.state(), model.state()
         self._control = model.control()
-        self._observables = [self._solver.observables({SolverMuJoCo.ObservableKind.OVERFLOW}) for _ in range(_STEPS)]
+        self._observables = [self._solver.observables({SolverMuJoCo.ObservableKind.OVERFLOW}) for _ in range(STEPS)]
         self._record(self._observables[:1])  # loads the kernels; a graph capture must not load them
         with wp.ScopedCapture(device="cpu") as capture:
             self._record(self._observables)
@@ -271,16 +271,16 @@ class WarpWorld(World):
     def _reset(self, coordinates: Float64Array) -> None:
         state = self._states[0]
         self._solver.reset(state)
-        _assign(state.joint_q, coordinates.ravel())
-        _assign(state.body_q, coordinates)
+        assign_array(state.joint_q, coordinates.ravel())
+        assign_array(state.body_q, coordinates)
 
     def _set_velocities(self, velocities: Float64Array) -> None:
         state = self._states[0]
-        _assign(state.joint_qd, velocities.ravel())
-        _assign(state.body_qd, velocities.reshape(-1, 6))
+        assign_array(state.joint_qd, velocities.ravel())
+        assign_array(state.body_qd, velocities.reshape(-1, 6))
 
     def _set_forces(self, forces: Float64Array) -> None:
-        _assign(self._control.joint_f, forces.ravel())
+        assign_array(self._control.joint_f, forces.ravel())
 
     def _advance(self) -> None:
         wp.capture_launch(self._graph)
@@ -288,7 +288,7 @@ class WarpWorld(World):
             raise ContactOverflow
 
     def _set_rolling_friction(self, enabled: bool) -> None:
-        _assign(self._solver.mjw_model.geom_friction, self._friction * (1.0, 1.0, 1.0 if enabled else 0.0))
+        assign_array(self._solver.mjw_model.geom_friction, self._friction * (1.0, 1.0, 1.0 if enabled else 0.0))
 
     def _coordinates(self) -> Float64Array:
         return _array(self._states[0].body_q)
@@ -304,7 +304,7 @@ class MujocoWorld(World):
         solver = PairContactSolver(
             _build_model(bodies, colliders, IMPEDANCE_MUJOCO, False),
             use_mujoco_cpu=True,
-            **_SOLVER_OPTIONS,
+            **SOLVER_OPTIONS,
         )
         self._model, self._data = solver.mj_model, solver.mj_data
         self._model.opt.timestep, self._model.opt.tolerance = timestep, _TOLERANCE
@@ -336,7 +336,7 @@ class MujocoWorld(World):
         self._data.xfrc_applied[1:] = forces.reshape(-1, 6)
 
     def _advance(self) -> None:
-        for _ in range(_STEPS):
+        for _ in range(STEPS):
             self._step()
         full = (mujoco.mjtWarning.mjWARN_CONTACTFULL, mujoco.mjtWarning.mjWARN_CNSTRFULL)
         if any(self._data.warning[kind].number for kind in full):
@@ -407,7 +407,8 @@ def _array(values: Any) -> Float64Array:
     return np.array(values.numpy(), dtype=np.float64)
 
 
-def _assign(array: Any, values: Float64Array) -> None:
+def assign_array(array: Any, values: Float64Array) -> None:
+    """Copy values to a Warp array in single precision."""
     array.assign(values.astype(np.float32))
 
 
@@ -424,7 +425,7 @@ def _initial_coordinates(bodies: Sequence[Body]) -> Float64Array:
     return coordinates
 
 
-def _coordinates(bodies: Sequence[Body], poses: Float64Array) -> Float64Array:
+def body_coordinates(bodies: Sequence[Body], poses: Float64Array) -> Float64Array:
     """Return position and xyzw quaternion of bodies at poses (N, 4, 4), and of those without shape, shape (M, 7)."""
     coordinates = _initial_coordinates(bodies)
     turns = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
@@ -440,10 +441,10 @@ def max_contacts(bodies: int, shapes: int) -> int:
 def _build_model(
     bodies: Sequence[Body], colliders: Sequence[Collider], impedance: tuple[float, float], newton_contacts: bool
 ) -> newton.Model:
-    return _build_scene(bodies, colliders, impedance, newton_contacts).finalize(device="cpu")
+    return build_scene(bodies, colliders, impedance, newton_contacts).finalize(device="cpu")
 
 
-def _build_scene(
+def build_scene(
     bodies: Sequence[Body], colliders: Sequence[Collider], impedance: tuple[float, float], newton_contacts: bool
 ) -> newton.ModelBuilder:
     """Build a scene for Newton's contacts, or else for those of MuJoCo.
@@ -452,7 +453,7 @@ def _build_scene(
     meshes itself.
     """
     contact = {"mujoco:condim": WITH_ROLL, "mujoco:geom_solimp": (*impedance, 1e-3, 0.5, 2.0)}
-    builder = newton.ModelBuilder(gravity=_GRAVITY)
+    builder = newton.ModelBuilder(gravity=GRAVITY_VECTOR)
     builder.validate_inertia_detailed = True  # in Python: the alternative compiles a kernel for 4 s
     builder.inertia_absolute_tolerance = builder.inertia_correction = _MIN_INERTIA
     SolverMuJoCo.register_custom_attributes(builder)

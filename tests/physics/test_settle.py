@@ -64,8 +64,7 @@ def test_drawn_poses_are_uniform_and_do_not_overlap(scene_data, write_scene):
         assert (bounds >= np.array(scene_data["region"]["min"]) - 1e-9).all()
         assert (bounds <= np.array(scene_data["region"]["max"]) + 1e-9).all()
         assert (
-            min(pair.distance for pair in all_clearances(placed, drop._static_scenes[0].obstacles, reach=0.005))
-            > 0.0009
+            min(pair.distance for pair in all_clearances(placed, drop.static_scenes[0].obstacles, reach=0.005)) > 0.0009
         )
     rotations = np.concatenate(rotations)
     # Haar measure: every column is uniform on the sphere, so its z is uniform (Archimedes); the angle t has
@@ -284,7 +283,7 @@ def test_simulations_are_freed(scene_data, write_scene, monkeypatch):
         with warp_settings():
             made = drop.Drop(load_scene(write_scene(scene_data)), lambda text: None)
             for number in range(4):
-                made._world((0, 1)[: 1 + number % 2], 1.0)
+                made.world_of((0, 1)[: 1 + number % 2], 1.0)
         gone = [model() is None for model in models]
     finally:
         gc.enable()

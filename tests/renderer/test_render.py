@@ -181,7 +181,7 @@ def test_an_ended_ray_has_the_colour_of_its_gaussians_only(tolerance: float) -> 
 
 def test_powers_of_two_agree_with_numpy() -> None:
     ensure_variant()
-    from mitsplat.renderer.splatting.walk import exp2
+    from mitsplat.renderer.splatting.response import exp2
 
     x = np.linspace(-126, 126, 200_001, dtype=np.float32)
     found, whole = (exp2(mi.Float(values)).numpy().astype(np.float64) for values in (x, np.arange(-126.0, 127.0)))

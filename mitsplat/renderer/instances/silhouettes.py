@@ -27,9 +27,10 @@ from mitsplat.renderer.projection.records import GaussianRecord
 from mitsplat.renderer.rays.camera_rays import TILE_HEIGHT, TILE_WIDTH, CameraView
 from mitsplat.renderer.rays.device_arrays import plain_mesh, ray_scene, wrapped
 from mitsplat.renderer.splatting.pairs import CrowdedError
+from mitsplat.renderer.splatting.response import exp2, min_log_opacity, respond_along
 from mitsplat.renderer.splatting.tile_depths import DEPTH_BITS
 from mitsplat.renderer.splatting.tiles import TileLists, bin_gaussians
-from mitsplat.renderer.splatting.walk import exp2, max_of, min_log_opacity, respond_along
+from mitsplat.renderer.splatting.walk import max_of
 
 MARGINS = (1.0, 0.5, 0.25, 0.125, 0.0)
 """Candidate margins of the canvas around the image, in image sizes. BOP uses one image on each side. Where lens
@@ -245,7 +246,7 @@ def _covered(lists: TileLists, view: CameraView, quality: Quality, runs: _Runs) 
 
     def body(i: mi.UInt32, through: list[mi.Float]) -> tuple[mi.UInt32, list[mi.Float]]:
         record = GaussianRecord.fetch(lists.records, dr.gather(mi.UInt32, lists.entries, i))
-        responses = respond_along(record, lists, us, vs, shared_column, cap=None)
+        responses = respond_along(record, lists.plane_records, us, vs, shared_column, cap=None)
         return i + 1, [
             dr.select((log_alpha > cut) & (z > near), t * (1 - exp2(log_alpha)), t)
             for t, (log_alpha, z) in zip(through, responses, strict=True)

@@ -15,12 +15,13 @@ import drjit as dr
 import mitsuba as mi
 
 from mitsplat.quality import KERNELS, Order, Quality
-from mitsplat.renderer.projection.records import RECORD, GaussianRecord, PlaneRecord
+from mitsplat.renderer.projection.records import RECORD, GaussianRecord
 from mitsplat.renderer.rays.camera_rays import CameraView
+from mitsplat.renderer.splatting.response import exp2, min_log_opacity, respond_along
 from mitsplat.renderer.splatting.tiles import TileLists
 
 SORT_SLOTS = 8
-"""Number of Gaussians that the order per ray collects in one walk over a part of a list."""
+"""Number of Gaussians that the order per ray collects in one pass over a part of a list."""
 
 WINDOW_SLOTS = 8
 """Number of Gaussians of a list that a ray holds back for sorting."""
@@ -87,7 +88,7 @@ class Rays:
 
     def respond(self, record: GaussianRecord) -> list[tuple[mi.Float, mi.Float]]:
         """Return (log2 of the opacity along the ray, depth of the peak) of one Gaussian per lane, for each ray."""
-        return respond_along(record, self.lists, self.us, self.vs, self.column, self.cap)
+        return respond_along(record, self.lists.plane_records, self.us, self.vs, self.column, self.cap)
 
 
 def walk(
@@ -114,35 +115,6 @@ def walk(
 def max_of(values: Sequence[mi.Float]) -> mi.Float:
     """Return the maximum over the values of a lane's rays, none of which is NaN."""
     return reduce(lambda a, b: dr.select(a > b, a, b), values)
-
-
-def min_log_opacity(quality: Quality) -> mi.Float:
-    """Return log2 of the smallest opacity that counts, limited to the domain of :func:`exp2`."""
-    return dr.maximum(dr.log2(dr.opaque(mi.Float, quality.alpha_min)), -126)
-
-
-def exp2(x: mi.Float) -> mi.Float:
-    """Compute 2^x for x in [-126, 126] with relative error below 2e-7; the result is undefined outside.
-
-    On a CPU, the nearest integer is added to the exponent, and a polynomial that is 1 at 0 covers the remainder. This
-    takes half of the instructions of Dr.Jit's own function, which has no limits. A GPU has one instruction for it.
-    """
-    if dr.backend_v(x) == dr.JitBackend.CUDA:
-        return dr.exp2(x)
-    rounded = x + _ROUNDS
-    rest = x - (rounded - _ROUNDS)
-    power = mi.Float(_EXP2[-1])
-    for coefficient in reversed(_EXP2[:-1]):
-        power = dr.fma(power, rest, coefficient)
-    exponent = dr.reinterpret_array(mi.UInt32, rounded) << 23
-    return dr.reinterpret_array(mi.Float, dr.reinterpret_array(mi.UInt32, power) + exponent)
-
-
-_ROUNDS = 1.5 * 2.0**23
-"""Float whose addition rounds a number to an integer, stored in the low bits of the sum."""
-
-_EXP2 = 1.0, 0.69314700, 0.24022242, 0.055507336, 0.0096715130, 0.0013264727
-"""Polynomial coefficients of 2^x on [-1/2, 1/2] with the smallest relative error."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,48 +144,6 @@ Blend = Callable[[Pixel, "mi.Float", GaussianRecord | FieldsOnAccess, "mi.Float"
 the Gaussian on the ray, its record (for colour and instance), and depth of its peak. An opacity of 0 leaves the state
 unchanged.
 """
-
-
-def respond_along(
-    record: GaussianRecord,
-    lists: TileLists,
-    us: list[mi.Float],
-    vs: list[mi.Float],
-    shared_column: bool,
-    cap: mi.Float | None,
-) -> list[tuple[mi.Float, mi.Float]]:
-    """Return (log2 of the opacity along the ray, peak depth) of a Gaussian on several rays, see `gaussian`."""
-    u0, v0, a, b2, c, opacity, *_, depth, e, f, g, h, i, _ = record
-    result: list[mi.Float] = []
-    previous: tuple[mi.Float, ...] | None = None
-    slant = 0.5 * depth * f
-    for u, v in zip(us, vs, strict=True):
-        if previous is None or not shared_column:
-            du = u - u0
-            ahead = depth * dr.fma(0.5 * du, e, 1)
-            previous = a * du * du, b2 * du, dr.fma(du, dr.fma(du, g, e), 1), dr.fma(du, h, f), ahead
-        top, top_v, bottom, bottom_v, ahead = previous
-        dv = v - v0
-        numerator = dr.fma(dv, dr.fma(dv, c, top_v), top)
-        inverse = dr.rcp(dr.fma(dv, dr.fma(dv, i, bottom_v), bottom))
-        result += [dr.fma(-numerator, inverse, opacity), dr.fma(dv, slant, ahead) * inverse]
-
-    def at_the_camera(result: list[mi.Float], row: mi.Float) -> tuple[list[mi.Float], mi.Float]:
-        plane_record = PlaneRecord.fetch(lists.plane_records, mi.UInt32(row))
-        found: list[mi.Float] = []
-        for u, v in zip(us, vs, strict=True):
-            q, depth = plane_record.respond(u, v)
-            found += [opacity - q, depth]
-        return found, row
-
-    if lists.plane_records is not None:
-        result, _ = dr.if_stmt(
-            (result, u0), a < 0, at_the_camera, lambda result, row: (result, row), label="gaussian at the camera"
-        )
-    # Rounding can raise the response of a needle-shaped Gaussian above its peak by any factor.
-    most = opacity if cap is None else dr.minimum(opacity, cap)
-    log_alphas = [dr.select(log_alpha > most, most, log_alpha) for log_alpha in result[0::2]]
-    return list(zip(log_alphas, result[1::2], strict=True))
 
 
 def _walk_in_tile_order(
@@ -294,98 +224,125 @@ def _walk_in_window(rays: Rays, fresh: Callable[[], Pixel], blend: Blend) -> lis
 def _walk_in_ray_order(rays: Rays, fresh: Callable[[], Pixel], blend: Blend) -> list[Pixel]:
     """Blend in the exact order of the peaks along each ray.
 
-    Each walk collects the next :data:`SORT_SLOTS` peaks behind the last one blended. It ends where no later entry can
-    have a peak in front of those. The next walk begins at the first entry that found no slot. Each walk therefore
+    Each pass collects the next :data:`SORT_SLOTS` peaks behind the last one blended. It ends where no later entry can
+    have a peak in front of those. The next pass begins at the first entry that found no slot. Each pass therefore
     covers a short part of the list, and any number of Gaussians in any order is blended correctly. Equal depths keep
     the list's order.
     """
-    lists, start, stop, far = rays.lists, rays.start, rays.stop, rays.far
-    near, cut, end = rays.near, rays.cut, rays.end
-    none = 0xFFFFFFFF
 
-    def insert(slots: _Slots, left: mi.UInt32, z: mi.Float, alpha: mi.Float, i: mi.UInt32) -> tuple[_Slots, mi.UInt32]:
-        """Return the depth-sorted slots with one more peak, and the first entry that found no slot."""
-        result: _Slots = []
-        behind = mi.Bool(False)
-        for slot_z, slot_alpha, slot_i in slots:
-            # Peaks behind the new one move back by one slot; equal depths keep their order.
-            behind |= z < slot_z
-            result.append((dr.minimum(z, slot_z), dr.select(behind, alpha, slot_alpha), dr.select(behind, i, slot_i)))
-            z, alpha, i = dr.maximum(z, slot_z), dr.select(behind, slot_alpha, alpha), dr.select(behind, slot_i, i)
-        return result, dr.select(z < dr.inf, dr.minimum(left, i), left)
-
-    def collect(
-        begin: mi.UInt32, limit: mi.UInt32, seen: mi.UInt32, last: list[tuple[mi.Float, mi.UInt32]]
-    ) -> tuple[mi.UInt32, list[_Slots], list[mi.UInt32]]:
-        def unfilled(i: mi.UInt32, slots: list[_Slots], left: list[mi.UInt32]) -> mi.Bool:
-            nearest = dr.gather(mi.Float, lists.nearest, i, i < limit)
-            wanted = mi.Bool(False)
-            for own in slots:
-                wanted |= nearest <= own[-1][0]
-            return (i < limit) & wanted
-
-        def body(
-            i: mi.UInt32, slots: list[_Slots], left: list[mi.UInt32]
-        ) -> tuple[mi.UInt32, list[_Slots], list[mi.UInt32]]:
-            record = GaussianRecord.fetch(lists.records, dr.gather(mi.UInt32, lists.entries, i))
-            new_slots, new_left = [], []
-            responses = rays.respond(record)
-            for (log_alpha, z), own, first_left, z_far, (last_z, last_i) in zip(
-                responses, slots, left, far, last, strict=True
-            ):
-                # An entry not visited before always counts, because rounding may put its peak in front of its bound.
-                new = (z > last_z) | ((z == last_z) & (i > last_i)) | (i >= seen)
-                hit = (log_alpha > cut) & (z > near) & (z < z_far) & new
-                own, first_left = dr.if_stmt(
-                    (own, first_left, z, exp2(log_alpha), mi.UInt32(i)),
-                    hit,
-                    insert,
-                    lambda own, first_left, *_: (own, first_left),
-                    label="insert",
-                )
-                new_slots.append(own)
-                new_left.append(first_left)
-            return i + 1, new_slots, new_left
-
-        def empty() -> _Slots:
-            return [(mi.Float(dr.inf), mi.Float(0), mi.UInt32(0)) for _ in range(SORT_SLOTS)]
-
-        state = mi.UInt32(begin), [empty() for _ in far], [mi.UInt32(none) for _ in far]
-        i, slots, left = dr.while_loop(state, unfilled, body, label="collect")
-        return i, slots, left
-
-    def body(
-        pixels: list[Pixel], last: list[tuple[mi.Float, mi.UInt32]], begin: mi.UInt32, seen: mi.UInt32, active: mi.Bool
-    ) -> tuple[list[Pixel], list[tuple[mi.Float, mi.UInt32]], mi.UInt32, mi.UInt32, mi.Bool]:
-        reached, slots, left = collect(begin, dr.select(active, stop, begin), seen, last)
+    def one_pass(
+        pixels: list[Pixel], last: list[_Peak], begin: mi.UInt32, seen: mi.UInt32, active: mi.Bool
+    ) -> tuple[list[Pixel], list[_Peak], mi.UInt32, mi.UInt32, mi.Bool]:
+        limit = dr.select(active, rays.stop, begin)
+        reached, slots, left = _collect_peaks(rays, begin, limit, seen, last)
         blended, new_last, unfinished, next_begin = [], [], mi.Bool(False), mi.UInt32(reached)
         for pixel, own, first_left, (last_z, last_i) in zip(pixels, slots, left, last, strict=True):
-            for z, alpha, i in own:
-                found = active & (z < dr.inf) & (pixel[TRANSMITTANCE] > end)
-                number = dr.gather(mi.UInt32, lists.entries, i, found)
-                record = FieldsOnAccess(lists.records, number, found)
-                z = dr.select(found, z, 0.0)  # an empty slot lies at infinity, and 0 * inf is NaN
-                pixel = blend(pixel, dr.select(found, alpha, 0.0), record, z)
+            pixel = _blend_slots(rays, pixel, own, active, blend)
             # A ray that has ended gets infinity as its last depth, behind which no peak lies.
-            open_ray = pixel[TRANSMITTANCE] > end
+            open_ray = pixel[TRANSMITTANCE] > rays.end
             z, _, i = own[-1]
             last_i = dr.select(z < last_z, last_i, i)
             blended.append(pixel)
             new_last.append((dr.select(open_ray, dr.maximum(z, last_z), dr.inf), last_i))
             next_begin = dr.select(open_ray, dr.minimum(next_begin, first_left), next_begin)
-            unfinished |= open_ray & ((first_left != none) | (reached < stop))
+            unfinished |= open_ray & ((first_left != _NO_ENTRY) | (reached < rays.stop))
         return blended, new_last, next_begin, dr.maximum(seen, reached), active & unfinished
 
     state = (
-        [fresh() for _ in far],
-        [(mi.Float(-dr.inf), mi.UInt32(0)) for _ in far],
-        mi.UInt32(start),
-        mi.UInt32(start),
-        start < stop,
+        [fresh() for _ in rays.far],
+        [(mi.Float(-dr.inf), mi.UInt32(0)) for _ in rays.far],
+        mi.UInt32(rays.start),
+        mi.UInt32(rays.start),
+        rays.start < rays.stop,
     )
-    pixels, *_ = dr.while_loop(state, lambda *state: state[-1], body, label="march by ray")
+    pixels, *_ = dr.while_loop(state, lambda *state: state[-1], one_pass, label="march by ray")
     return pixels
 
+
+def _collect_peaks(
+    rays: Rays, begin: mi.UInt32, limit: mi.UInt32, seen: mi.UInt32, last: list[_Peak]
+) -> tuple[mi.UInt32, list[_Slots], list[mi.UInt32]]:
+    """Collect the next peaks of each ray from the entries ``begin`` to ``limit`` (exclusive).
+
+    Args:
+        rays: The rays.
+        begin: First entry of each lane.
+        limit: End of each lane's entries.
+        seen: First entry that no earlier pass has visited.
+        last: Last peak blended on each ray.
+
+    Returns:
+        The entry at which the lane stopped; and for each ray, its filled slots and the first entry that found no slot
+        (:data:`_NO_ENTRY` if all did).
+    """
+    lists = rays.lists
+
+    def unfilled(i: mi.UInt32, slots: list[_Slots], left: list[mi.UInt32]) -> mi.Bool:
+        nearest = dr.gather(mi.Float, lists.nearest, i, i < limit)
+        wanted = mi.Bool(False)
+        for own in slots:
+            wanted |= nearest <= own[-1][0]
+        return (i < limit) & wanted
+
+    def one_entry(
+        i: mi.UInt32, slots: list[_Slots], left: list[mi.UInt32]
+    ) -> tuple[mi.UInt32, list[_Slots], list[mi.UInt32]]:
+        record = GaussianRecord.fetch(lists.records, dr.gather(mi.UInt32, lists.entries, i))
+        new_slots, new_left = [], []
+        responses = rays.respond(record)
+        for (log_alpha, z), own, first_left, z_far, (last_z, last_i) in zip(
+            responses, slots, left, rays.far, last, strict=True
+        ):
+            # An entry not visited before always counts, because rounding may put its peak in front of its bound.
+            new = (z > last_z) | ((z == last_z) & (i > last_i)) | (i >= seen)
+            hit = (log_alpha > rays.cut) & (z > rays.near) & (z < z_far) & new
+            own, first_left = dr.if_stmt(
+                (own, first_left, z, exp2(log_alpha), mi.UInt32(i)),
+                hit,
+                _insert_peak,
+                lambda own, first_left, *_: (own, first_left),
+                label="insert",
+            )
+            new_slots.append(own)
+            new_left.append(first_left)
+        return i + 1, new_slots, new_left
+
+    empty = [[(mi.Float(dr.inf), mi.Float(0), mi.UInt32(0)) for _ in range(SORT_SLOTS)] for _ in rays.far]
+    state = mi.UInt32(begin), empty, [mi.UInt32(_NO_ENTRY) for _ in rays.far]
+    i, slots, left = dr.while_loop(state, unfilled, one_entry, label="collect")
+    return i, slots, left
+
+
+def _insert_peak(
+    slots: _Slots, left: mi.UInt32, z: mi.Float, alpha: mi.Float, i: mi.UInt32
+) -> tuple[_Slots, mi.UInt32]:
+    """Insert the peak of entry ``i`` into depth-sorted slots; ``left`` is the first entry that found no slot."""
+    result: _Slots = []
+    behind = mi.Bool(False)
+    for slot_z, slot_alpha, slot_i in slots:
+        # Peaks behind the new one move back by one slot; equal depths keep their order.
+        behind |= z < slot_z
+        result.append((dr.minimum(z, slot_z), dr.select(behind, alpha, slot_alpha), dr.select(behind, i, slot_i)))
+        z, alpha, i = dr.maximum(z, slot_z), dr.select(behind, slot_alpha, alpha), dr.select(behind, slot_i, i)
+    return result, dr.select(z < dr.inf, dr.minimum(left, i), left)
+
+
+def _blend_slots(rays: Rays, pixel: Pixel, slots: _Slots, active: mi.Bool, blend: Blend) -> Pixel:
+    """Blend the collected peaks of an ``active`` ray until it ends."""
+    for z, alpha, i in slots:
+        found = active & (z < dr.inf) & (pixel[TRANSMITTANCE] > rays.end)
+        number = dr.gather(mi.UInt32, rays.lists.entries, i, found)
+        record = FieldsOnAccess(rays.lists.records, number, found)
+        z = dr.select(found, z, 0.0)  # an empty slot lies at infinity, and 0 * inf is NaN
+        pixel = blend(pixel, dr.select(found, alpha, 0.0), record, z)
+    return pixel
+
+
+_NO_ENTRY = 0xFFFFFFFF
+"""Number that stands for no entry of a list."""
+
+_Peak = tuple["mi.Float", "mi.UInt32"]
+"""Depth and entry of a peak."""
 
 _Slots = list[tuple["mi.Float", "mi.Float", "mi.UInt32"]]
 """Depth-sorted peaks: depth, opacity and entry."""

@@ -103,65 +103,20 @@ def tile_gradient(
 ) -> mi.Float:
     """Return the gradient from the tiles of lists; ``lists.pairs`` is an upper bound of their pairs."""
     lanes = Lanes(lists, view)
-    us, vs = slopes
     column = dr.arange(mi.UInt32, dr.width(lanes.start)) % TILE_WIDTH
     shares = dr.zeros(mi.Float, RECORD * TILE_WIDTH * lists.pairs)
     cut = dr.log2(dr.opaque(mi.Float, quality.alpha_min))
     end, near = dr.opaque(mi.Float, quality.transmittance_min), view.near_plane
+    d_colour, behind = _pixel_gradients(lanes, seen, gradient)
 
-    def load(values: mi.Float) -> list[mi.Float]:
-        return [dr.gather(mi.Float, values, p, m) for p, m in zip(lanes.pixel, lanes.inside, strict=True)]
-
-    d_colour = list(zip(*(load(g) for g in gradient[:3]), strict=True))
-    whole = list(zip(*(load(c) for c in seen[:3]), strict=True))
-    # Light behind, weighted with the gradient, minus the gradient of alpha through the final transmittance.
-    behind = [
-        sum(c * d for c, d in zip(cs, ds, strict=True)) - (1 - a) * d_alpha
-        for cs, ds, a, d_alpha in zip(whole, d_colour, load(seen[3]), load(gradient[3]), strict=True)
-    ]
-
-    def body(
+    def one_entry(
         i: mi.UInt32, light: list[mi.Float], rest: list[mi.Float]
     ) -> tuple[mi.UInt32, list[mi.Float], list[mi.Float]]:
         record = GaussianRecord.fetch(lists.records, dr.gather(mi.UInt32, lists.entries, i))
-        u0, v0, a, b2, c, log_opacity, red, green, blue, depth, e, f, g, h, k, _ = record
         sums = [mi.Float(0) for _ in range(RECORD)]
         new_light, new_rest = [], []
-        for u, v, t, r, ds in zip(us, vs, light, rest, d_colour, strict=True):
-            du, dv = u - u0, v - v0
-            inverse = dr.rcp(1 + du * (e + g * du + h * dv) + dv * (f + k * dv))
-            q = (du * (a * du + b2 * dv) + dv * dv * c) * inverse
-            z = depth * (1 + 0.5 * (e * du + f * dv)) * inverse
-            hit = (log_opacity - q > cut) & (z > near) & (t > end)
-            # A response that overflows beyond the cut-off, or that rounding raises above the peak, has no gradient.
-            inverse, q = dr.select(hit & (q > 0), inverse, 0), dr.select(hit & (q > 0), q, 0)
-            alpha = dr.select(hit, dr.exp2(log_opacity - q), 0)
-            weight = t * alpha
-            d_own = red * ds[0] + green * ds[1] + blue * ds[2]
-            r = r - weight * d_own
-            d_alpha = t * d_own - r / dr.maximum(1 - alpha, 1e-5)
-            d_log = d_alpha * alpha * LN_2
-            d_top, d_bottom = -d_log * inverse, d_log * q * inverse
-            d_du = d_top * (2 * a * du + b2 * dv) + d_bottom * (e + 2 * g * du + h * dv)
-            d_dv = d_top * (2 * c * dv + b2 * du) + d_bottom * (f + 2 * k * dv + h * du)
-            parts = GaussianRecord(
-                u0=-d_du,
-                v0=-d_dv,
-                a=d_top * du * du,
-                b2=d_top * du * dv,
-                c=d_top * dv * dv,
-                log_opacity=d_log,
-                red=weight * ds[0],
-                green=weight * ds[1],
-                blue=weight * ds[2],
-                depth=0,
-                e=d_bottom * du,
-                f=d_bottom * dv,
-                g=d_bottom * du * du,
-                h=d_bottom * du * dv,
-                i=d_bottom * dv * dv,
-                instance=0,
-            )
+        for u, v, t, r, d_pixel in zip(*slopes, light, rest, d_colour, strict=True):
+            parts, weight, r = _ray_gradient(record, u, v, t, r, d_pixel, cut=cut, near=near, end=end)
             sums = [total + part for total, part in zip(sums, parts, strict=True)]
             new_light.append(t - weight)
             new_rest.append(r)
@@ -171,10 +126,96 @@ def tile_gradient(
     def alive(i: mi.UInt32, light: list[mi.Float], rest: list[mi.Float]) -> mi.Bool:
         return (i < lanes.stop) & (max_of(light) > end)
 
-    state = lanes.start, [mi.Float(1) for _ in us], behind
-    dr.while_loop(state, alive, body, label="march backward")
+    state = lanes.start, [mi.Float(1) for _ in behind], behind
+    dr.while_loop(state, alive, one_entry, label="march backward")
     dr.eval(shares)
     return _sum_shares(shares, lists)
+
+
+def _pixel_gradients(
+    lanes: Lanes, seen: list[mi.Float], gradient: list[mi.Float]
+) -> tuple[list[tuple[mi.Float, ...]], list[mi.Float]]:
+    """Return the gradient of the colour of each of a lane's pixels, and the start value of the light behind.
+
+    The light behind is weighted with the gradient. The gradient of alpha, through the final transmittance, is
+    subtracted from it.
+    """
+
+    def load(values: mi.Float) -> list[mi.Float]:
+        return [dr.gather(mi.Float, values, p, m) for p, m in zip(lanes.pixel, lanes.inside, strict=True)]
+
+    d_colour = list(zip(*(load(g) for g in gradient[:3]), strict=True))
+    whole = list(zip(*(load(c) for c in seen[:3]), strict=True))
+    behind = [
+        sum(c * d for c, d in zip(cs, ds, strict=True)) - (1 - a) * d_alpha
+        for cs, ds, a, d_alpha in zip(whole, d_colour, load(seen[3]), load(gradient[3]), strict=True)
+    ]
+    return d_colour, behind
+
+
+def _ray_gradient(
+    record: GaussianRecord,
+    u: mi.Float,
+    v: mi.Float,
+    light: mi.Float,
+    rest: mi.Float,
+    d_colour: tuple[mi.Float, ...],
+    *,
+    cut: mi.Float,
+    near: mi.Float,
+    end: mi.Float,
+) -> tuple[GaussianRecord, mi.Float, mi.Float]:
+    """Differentiate the blending of one Gaussian on a ray, by the chain rule of the module docstring.
+
+    Args:
+        record: Gaussian.
+        u: Slope of the ray.
+        v: Slope of the ray.
+        light: Transmittance T_i in front of the Gaussian.
+        rest: Light behind the last Gaussian, weighted with the gradient, minus the gradient of alpha.
+        d_colour: Gradients of the pixel's red, green and blue.
+        cut: log2 of the smallest opacity that counts.
+        near: Smallest visible depth [m].
+        end: Transmittance at which a ray ends.
+
+    Returns:
+        Gradient of the record, its weight T_i a_i in the pixel, and ``rest`` behind this Gaussian.
+    """
+    u0, v0, a, b2, c, log_opacity, red, green, blue, depth, e, f, g, h, k, _ = record
+    d_red, d_green, d_blue = d_colour
+    du, dv = u - u0, v - v0
+    inverse = dr.rcp(1 + du * (e + g * du + h * dv) + dv * (f + k * dv))
+    q = (du * (a * du + b2 * dv) + dv * dv * c) * inverse
+    z = depth * (1 + 0.5 * (e * du + f * dv)) * inverse
+    hit = (log_opacity - q > cut) & (z > near) & (light > end)
+    # A response that overflows beyond the cut-off, or that rounding raises above the peak, has no gradient.
+    inverse, q = dr.select(hit & (q > 0), inverse, 0), dr.select(hit & (q > 0), q, 0)
+    alpha = dr.select(hit, dr.exp2(log_opacity - q), 0)
+    weight = light * alpha
+    d_own = red * d_red + green * d_green + blue * d_blue
+    rest = rest - weight * d_own
+    d_alpha = light * d_own - rest / dr.maximum(1 - alpha, 1e-5)
+    d_log = d_alpha * alpha * LN_2
+    d_top, d_bottom = -d_log * inverse, d_log * q * inverse
+    gradient = GaussianRecord(
+        u0=-(d_top * (2 * a * du + b2 * dv) + d_bottom * (e + 2 * g * du + h * dv)),
+        v0=-(d_top * (2 * c * dv + b2 * du) + d_bottom * (f + 2 * k * dv + h * du)),
+        a=d_top * du * du,
+        b2=d_top * du * dv,
+        c=d_top * dv * dv,
+        log_opacity=d_log,
+        red=weight * d_red,
+        green=weight * d_green,
+        blue=weight * d_blue,
+        depth=0,
+        e=d_bottom * du,
+        f=d_bottom * dv,
+        g=d_bottom * du * du,
+        h=d_bottom * du * dv,
+        i=d_bottom * dv * dv,
+        instance=0,
+    )
+    return gradient, weight, rest
 
 
 def _sum_shares(shares: mi.Float, lists: TileLists) -> mi.Float:

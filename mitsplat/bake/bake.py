@@ -188,15 +188,8 @@ def bake_asset(
     model = read_model(mesh, metres_per_unit=metres_per_unit, up=up, finish=finish)
     parts = model.parts
     surface = MeshSurface(parts)
-    source, size = str(mesh) if isinstance(mesh, str | Path) else name, float(surface.mesh.extents.max())
-    if kind == "object" and not any_size:
-        _check_size(source, size, model.units)
-    if kind == "object" and not pieces and _is_flat(surface.mesh):
-        raise InputError(
-            f"{source}: an object must have a volume (got a flat mesh): give it a thickness, or bake an environment"
-        )
-    if not _MIN_SIZE <= size <= _MAX_SIZE:
-        raise InputError(f"{source}: a mesh must be {_MIN_SIZE:g} to {_MAX_SIZE:g} m across (got {size:.3g} m)")
+    source = str(mesh) if isinstance(mesh, str | Path) else name
+    _check_mesh(source, surface.mesh, model.units, kind, any_size=any_size, has_pieces=bool(pieces))
     stages("placing Gaussians")
     rng = np.random.default_rng(settings.seed)
     surfels = _place_visible_surfels(surface, parts, settings, rng)
@@ -297,8 +290,8 @@ def _mesh_warnings(model: MeshModel, solid: MeshSurface | None, seed: int) -> li
 class _Stages:
     """Progress of a bake in percent."""
 
-    def __init__(self, tell: Progress | None) -> None:
-        self._progress = tell
+    def __init__(self, progress: Progress | None) -> None:
+        self._progress = progress
 
     def __call__(self, stage: str, share: float = 0.0) -> None:
         if self._progress is not None:
@@ -323,6 +316,21 @@ def _describe_units(model: MeshModel) -> str:
         return text
     part = "" if len(model.stated) == 2 else f"{model.stated[0]} "
     return f"{text} ({part}stated by the file)"
+
+
+def _check_mesh(
+    source: str, mesh: trimesh.Trimesh, units: float, kind: str, *, any_size: bool, has_pieces: bool
+) -> None:
+    """Raise InputError if a mesh in metres is too small or too large, or if an object encloses no volume."""
+    size = float(mesh.extents.max())
+    if kind == "object" and not any_size:
+        _check_size(source, size, units)
+    if kind == "object" and not has_pieces and _is_flat(mesh):
+        raise InputError(
+            f"{source}: an object must have a volume (got a flat mesh): give it a thickness, or bake an environment"
+        )
+    if not _MIN_SIZE <= size <= _MAX_SIZE:
+        raise InputError(f"{source}: a mesh must be {_MIN_SIZE:g} to {_MAX_SIZE:g} m across (got {size:.3g} m)")
 
 
 def _check_size(source: str, size: float, metres_per_unit: float) -> None:

@@ -135,15 +135,7 @@ def write_dataset(
     """
     Scene.check(scene)
     out = path_of(out, "out")
-    count = scene.num_frames if frames is None else frames
-    check_whole_number(count, "frames")
-    if not 1 <= count <= scene.num_frames:
-        raise InputError(
-            f"frames must be between 1 and {scene.num_frames}, which is layouts x views of {scene.path} (got {count})"
-        )
-    formats = scene.spec.output.formats
-    if unknown := set(formats) - set(FORMATS):
-        raise InputError(f"output.formats must be among {', '.join(FORMATS)} (got {min(unknown)})")
+    count = _frame_count(scene, frames)
     check_workers(workers)
     catalogue = Catalogue.of(scene)
     indices = range(count) if shard is None else shard.frames(count, scene.spec.output.views)
@@ -199,6 +191,23 @@ def write_dataset(
         counts = FrameCounts()
         finish_folder(out, manifest, content, catalogue, counts.add)
         return counts.summary(out, rendered=sum(map(len, layouts.values())))
+
+
+def _frame_count(scene: Scene, frames: int | None) -> int:
+    """Return the number of frames of a dataset, all frames of the scene if ``frames`` is None.
+
+    Raises:
+        InputError: If the scene does not have so many frames, or its formats are unknown.
+    """
+    count = scene.num_frames if frames is None else frames
+    check_whole_number(count, "frames")
+    if not 1 <= count <= scene.num_frames:
+        raise InputError(
+            f"frames must be between 1 and {scene.num_frames}, which is layouts x views of {scene.path} (got {count})"
+        )
+    if unknown := set(scene.spec.output.formats) - set(FORMATS):
+        raise InputError(f"output.formats must be among {', '.join(FORMATS)} (got {min(unknown)})")
+    return count
 
 
 def _results(

@@ -231,18 +231,8 @@ class Renderer:
             InputError: As in :func:`render_frame`; also if the renderer is closed, or if the Mitsuba variant has
                 changed since its creation.
         """
-        if self.integrator is None:
-            raise InputError("the renderer is closed; call render() inside its `with` block")
-        if mi.variant() != self._variant:
-            raise InputError(
-                f"Mitsuba's variant must stay {self._variant}, in which the renderer was created (got {mi.variant()})"
-            )
-        for place, shown in (("layout", layout), ("next_layout", next_layout)):
-            if shown is not None:
-                check_type(shown, Layout, place, "create it by mitsplat.Layout.from_poses(scene, poses)")
-        for place, seen in (("camera", camera), ("next_camera", next_camera)):
-            if seen is not None:
-                check_type(seen, Camera, place, "create it by mitsplat.Camera or mitsplat.Camera.look_at")
+        self._check_variant()
+        _check_types(layout, camera, next_layout, next_camera)
         seconds: dict[str, float] = {}
         if layout is None:
             with _timed(seconds, "settle"):
@@ -289,6 +279,15 @@ class Renderer:
             appearances=draw_appearances(self.scene, layout),
             next_layout=next_layout,
         )
+
+    def _check_variant(self) -> None:
+        """Raise InputError if the renderer is closed or the Mitsuba variant has changed."""
+        if self.integrator is None:
+            raise InputError("the renderer is closed; call render() inside its `with` block")
+        if mi.variant() != self._variant:
+            raise InputError(
+                f"Mitsuba's variant must stay {self._variant}, in which the renderer was created (got {mi.variant()})"
+            )
 
     def _warn_of_empty_view(self, layout: Layout, plan: FramePlan) -> None:
         """Warn once if a given camera sees no object, with the likely cause."""
@@ -357,3 +356,15 @@ class Renderer:
         return label_instances(
             *(truth, layout.instances, scene.class_names, rules), camera=camera, keypoints=keypoints, blocked=blocked
         )
+
+
+def _check_types(
+    layout: Layout | None, camera: Camera | None, next_layout: Layout | None, next_camera: Camera | None
+) -> None:
+    """Raise InputError if a given layout or camera has another type."""
+    for place, shown in (("layout", layout), ("next_layout", next_layout)):
+        if shown is not None:
+            check_type(shown, Layout, place, "create it by mitsplat.Layout.from_poses(scene, poses)")
+    for place, seen in (("camera", camera), ("next_camera", next_camera)):
+        if seen is not None:
+            check_type(seen, Camera, place, "create it by mitsplat.Camera or mitsplat.Camera.look_at")

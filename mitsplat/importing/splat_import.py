@@ -283,17 +283,9 @@ def import_splats(
         capture_light=capture_light or ("uniform" if kind == "object" else "scene"),
         units="unknown",
     )
-    metres_from_file = turn
-    if kind == "object":
-        low, high = splats.bounds if mesh is None else mesh.bounds
-        base = trimesh.transformations.translation_matrix(-np.array([*(low[:2] + high[:2]) / 2, low[2]]))
-        asset, metres_from_file = asset.transformed(base), base @ turn
-    factor = settings.units if settings.size is None else asset.factor_to(settings.size)
-    if factor is not None:
-        larger = np.diag([factor, factor, factor, 1.0])
-        asset, metres_from_file = replace(asset.transformed(larger), units="metre"), larger @ metres_from_file
-        if support is not None:
-            support = replace(support, size=(factor * support.size[0], factor * support.size[1]))
+    asset, asset_from_file, factor = _in_metres(asset, turn, settings)
+    if support is not None and factor is not None:
+        support = replace(support, size=(factor * support.size[0], factor * support.size[1]))
     views: list[AssetView] = []
     mesh_iou = offset = None
     if asset.mesh is not None:
@@ -310,7 +302,7 @@ def import_splats(
         upright=upright,
         found=len(loaded),
         removed=cleaner.removed,
-        removed_splats=cleaner.removed_splats().transformed(metres_from_file),
+        removed_splats=cleaner.removed_splats().transformed(asset_from_file),
         support=support,
         views=views,
         mesh_iou=mesh_iou,
@@ -353,6 +345,26 @@ def _read_splats(path: Path, settings: ImportSettings, stage: StageAsset | None)
     if not len(loaded):
         raise InputError(f"{path}: must hold at least one Gaussian (got 0)")
     return loaded, settings, reason
+
+
+def _in_metres(
+    asset: Asset, asset_from_file: Float64Array, settings: ImportSettings
+) -> tuple[Asset, Float64Array, float | None]:
+    """Move the base of an object to the origin, and scale an asset if the settings state its unit or size.
+
+    Returns:
+        The asset, the transform from the file's coordinates to its coordinates, and the factor; None if the size is
+        unknown.
+    """
+    if asset.kind == "object":
+        low, high = asset.splats.bounds if asset.mesh is None else asset.mesh.bounds
+        base = trimesh.transformations.translation_matrix(-np.array([*(low[:2] + high[:2]) / 2, low[2]]))
+        asset, asset_from_file = asset.transformed(base), base @ asset_from_file
+    factor = settings.units if settings.size is None else asset.factor_to(settings.size)
+    if factor is not None:
+        larger = np.diag([factor, factor, factor, 1.0])
+        asset, asset_from_file = replace(asset.transformed(larger), units="metre"), larger @ asset_from_file
+    return asset, asset_from_file, factor
 
 
 class _Cleaner:

@@ -19,9 +19,9 @@ Positions are in pixels with the image's corner at (0, 0), so pixel centres are 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -280,43 +280,60 @@ def label_instances(
             dropped["small"] += 1
             continue
         visible = Silhouette.cropped(mask, x0, y0)
-        amodal, box, area = _amodal(silhouette, visible, rules.min_fragment, (width, height))
-        agreement, boundary = _agreement(visible, second, instance.id, found_second.get(instance.id))
-        marks = tuple(
-            name
-            for name, value, least in (
-                ("occluded", visible.area / amodal.area, rules.min_visible),
-                ("disagreeing", agreement, rules.min_agreement),
-            )
-            if value < least
-        )
-        if marks and rules.below_threshold == "drop":
-            dropped[marks[0]] += 1
+        name = class_names[instance.class_index]
+        label = _label_instance(instance, name, visible, truth, rules, found_second.get(instance.id))
+        if label.marks and rules.below_threshold == "drop":
+            dropped[label.marks[0]] += 1
             continue
         points = (keypoints or {}).get(instance.asset)
-        labels.append(
-            InstanceLabel(
-                id=instance.id,
-                asset=instance.asset,
-                class_index=instance.class_index,
-                class_name=class_names[instance.class_index],
-                box=visible.box,
-                mask=visible.mask,
-                amodal=amodal,
-                silhouette_box=box,
-                silhouette_area=area,
-                depth_area=_with_depth(amodal, truth),
-                agreement=agreement,
-                boundary_f1=boundary,
-                truncation=1 - amodal.area / (area + (0.0 if silhouette is None else silhouette.beyond)),
-                world_from_object=instance.world_from_object,
-                keypoints=np.zeros((0, 3))
-                if points is None or camera is None
-                else _project_keypoints(points, instance, camera, truth, (blocked or {}).get(instance.id)),
-                marks=marks,
-            )
-        )
+        if points is not None and camera is not None:
+            hidden = (blocked or {}).get(instance.id)
+            label = replace(label, keypoints=_project_keypoints(points, instance, camera, truth, hidden))
+        labels.append(label)
     return Labels(width, height, tuple(labels), dropped)
+
+
+def _label_instance(
+    instance: Instance,
+    class_name: str,
+    visible: Silhouette,
+    truth: Truth,
+    rules: LabelRules,
+    second_bounds: Box | None,
+) -> InstanceLabel:
+    """Label an instance of a class by the ``visible`` part of its silhouette, without keypoints.
+
+    ``second_bounds`` are its bounds in the second id map, None if it is not there.
+    """
+    height, width = truth.instance.shape
+    silhouette = truth.silhouettes.get(instance.id)
+    amodal, box, area = _amodal(silhouette, visible, rules.min_fragment, (width, height))
+    agreement, boundary = _agreement(visible, truth.second, instance.id, second_bounds)
+    marks = tuple(
+        name
+        for name, value, least in (
+            ("occluded", visible.area / amodal.area, rules.min_visible),
+            ("disagreeing", agreement, rules.min_agreement),
+        )
+        if value < least
+    )
+    return InstanceLabel(
+        id=instance.id,
+        asset=instance.asset,
+        class_index=cast(int, instance.class_index),
+        class_name=class_name,
+        box=visible.box,
+        mask=visible.mask,
+        amodal=amodal,
+        silhouette_box=box,
+        silhouette_area=area,
+        depth_area=_with_depth(amodal, truth),
+        agreement=agreement,
+        boundary_f1=boundary,
+        truncation=1 - amodal.area / (area + (0.0 if silhouette is None else silhouette.beyond)),
+        world_from_object=instance.world_from_object,
+        marks=marks,
+    )
 
 
 def _amodal(

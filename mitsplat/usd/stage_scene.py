@@ -30,7 +30,7 @@ from mitsplat.images.picture_files import read_picture
 from mitsplat.scene.loading.scene_loading import load_scene
 from mitsplat.scene.scene import Scene
 from mitsplat.storage.content_hash import ContentHash
-from mitsplat.storage.files import storage_errors, write_text
+from mitsplat.storage.files import JsonObject, storage_errors, write_text
 from mitsplat.usd.stage_assets import body_frames, make_asset, merge_fields, placed_mesh, rigid_frame
 from mitsplat.usd.stage_images import fit_aperture
 from mitsplat.usd.stage_records import Record, read_records
@@ -96,50 +96,16 @@ def read_stage_scene(
     if not any(fields[0]["label"] for fields in groups.values()):
         raise InputError(f"{path}: must have particle fields with a semantic class, UsdSemantics.LabelsAPI (got none)")
     with storage_errors(folder):
-        keys, entries = dict[str, int](), list[dict[str, Any]]()
-        poses: list[dict[str | int, list[Float64Array | None]]] = [{} for _ in records["times"]]
-        owners = {record["path"]: record for record in (*records["fields"], *records["bodies"])}
-        for group, fields in groups.items():
-            asset = _object(path, records, group, fields, frames, notes)
-            label = fields[0]["label"]
-            content = ContentHash(repr((asset.class_name, label)))
-            content.add_array(asset.splats.means)
-            key = content.hexdigest()
-            if key not in keys:
-                keys[key] = len(keys)
-                name = f"{re.sub(r'[^A-Za-z0-9_]', '_', asset.name)}_{keys[key]}"
-                asset.save(folder / "assets" / name)
-                entries.append({"asset": f"assets/{name}", "label": label is not None, "count": 0})
-            entries[keys[key]]["count"] += 1
-            frames_of_object = _motion(path, owners[group], records["times"], notes)
-            for known, pose, shown in zip(
-                poses, frames_of_object, _shown(group, fields, len(poses), notes), strict=True
-            ):
-                known.setdefault(keys[key], []).append(pose if shown else None)
+        entries, poses = _write_objects(path, folder, records, groups, frames, notes)
         data: dict[str, Any] = {"name": path.stem, "objects": entries, "shapes": _shapes(records, folder)}
         if hidden := [one["path"] for one in records["meshes"] if one["visible"] and one["body"] is not None]:
             notes.append(f"not rendered: meshes of rigid bodies; only their splats are: {', '.join(hidden)}")
         if surroundings:
             _environment(path, records, surroundings, notes).save(folder / "assets" / "environment")
             data["environment"] = "assets/environment"
-        data["lights"] = []
-        for record in records["lights"]:
-            for light in _lights(path, record, folder, notes):
-                if light["kind"] == "environment" and any(one["kind"] == "environment" for one in data["lights"]):
-                    notes.append(f"not imported: the light {record['path']}, because a scene has one light of the sky")
-                else:
-                    data["lights"].append(light)
-        cameras = list[tuple[Camera, ...]]()
-        for record in records["cameras"]:
-            camera = _camera(path, record, size or record["resolution"], notes)
-            frames_of_camera = _motion(path, record, records["times"], notes)
-            cameras.append(
-                tuple(replace(camera, world_from_camera=frame @ OPENCV_FROM_OPENGL) for frame in frames_of_camera)
-            )
+        data["lights"] = _scene_lights(path, records, folder, notes)
+        cameras = _camera_tracks(path, records, size, notes)
         first = cameras[0][0]
-        cameras = [track for track in cameras if (track[0].width, track[0].height) == (first.width, first.height)]
-        if len(cameras) < len(records["cameras"]):
-            notes.append("not imported: cameras whose images have another size than those of the first one")
         notes.extend(_unread_motion(records))
         reach = 10.0
         data |= {
@@ -155,6 +121,68 @@ def read_stage_scene(
     return StageScene(
         load_scene(folder / "scene.yaml", overrides=overrides), tuple(poses), tuple(cameras), tuple(notes)
     )
+
+
+def _write_objects(
+    path: Path,
+    folder: Path,
+    records: Record,
+    groups: Mapping[str, Sequence[Record]],
+    frames: dict[str | None, Float64Array],
+    notes: list[str],
+) -> tuple[list[JsonObject], list[dict[str | int, list[Float64Array | None]]]]:
+    """Write the objects of a stage as assets.
+
+    Returns:
+        Entries of the scene file; and for each time code, the poses of the objects by asset, None where not shown.
+    """
+    keys, entries = dict[str, int](), list[JsonObject]()
+    poses: list[dict[str | int, list[Float64Array | None]]] = [{} for _ in records["times"]]
+    owners = {record["path"]: record for record in (*records["fields"], *records["bodies"])}
+    for group, fields in groups.items():
+        asset = _object(path, records, group, fields, frames, notes)
+        label = fields[0]["label"]
+        content = ContentHash(repr((asset.class_name, label)))
+        content.add_array(asset.splats.means)
+        key = content.hexdigest()
+        if key not in keys:
+            keys[key] = len(keys)
+            name = f"{re.sub(r'[^A-Za-z0-9_]', '_', asset.name)}_{keys[key]}"
+            asset.save(folder / "assets" / name)
+            entries.append({"asset": f"assets/{name}", "label": label is not None, "count": 0})
+        entries[keys[key]]["count"] += 1
+        frames_of_object = _motion(path, owners[group], records["times"], notes)
+        for known, pose, shown in zip(poses, frames_of_object, _shown(group, fields, len(poses), notes), strict=True):
+            known.setdefault(keys[key], []).append(pose if shown else None)
+    return entries, poses
+
+
+def _scene_lights(path: Path, records: Record, folder: Path, notes: list[str]) -> list[JsonObject]:
+    """Return the entries of all lights of a stage, with one light of the sky at most."""
+    lights: list[JsonObject] = []
+    for record in records["lights"]:
+        for light in _lights(path, record, folder, notes):
+            if light["kind"] == "environment" and any(one["kind"] == "environment" for one in lights):
+                notes.append(f"not imported: the light {record['path']}, because a scene has one light of the sky")
+            else:
+                lights.append(light)
+    return lights
+
+
+def _camera_tracks(
+    path: Path, records: Record, size: tuple[int, int] | None, notes: list[str]
+) -> list[tuple[Camera, ...]]:
+    """Return each camera at each time code; cameras with another image size than the first one are omitted."""
+    cameras = list[tuple[Camera, ...]]()
+    for record in records["cameras"]:
+        camera = _camera(path, record, size or record["resolution"], notes)
+        frames = _motion(path, record, records["times"], notes)
+        cameras.append(tuple(replace(camera, world_from_camera=frame @ OPENCV_FROM_OPENGL) for frame in frames))
+    first = cameras[0][0]
+    same = [track for track in cameras if (track[0].width, track[0].height) == (first.width, first.height)]
+    if len(same) < len(cameras):
+        notes.append("not imported: cameras whose images have another size than those of the first one")
+    return same
 
 
 def _object(
@@ -243,7 +271,7 @@ def _environment(path: Path, records: Record, fields: Sequence[Record], notes: l
     return replace(asset, name="environment", kind="environment", mass=None)
 
 
-def _shapes(records: Record, folder: Path) -> list[dict[str, Any]]:
+def _shapes(records: Record, folder: Path) -> list[JsonObject]:
     """Write the visible meshes that belong to no body; return their entries in the scene file."""
     found = []
     for number, record in enumerate(one for one in records["meshes"] if one["visible"] and one["body"] is None):
@@ -288,7 +316,7 @@ def _camera(path: Path, record: Record, size: Sequence[int] | None, notes: list[
     )
 
 
-def _lights(path: Path, record: Record, folder: Path, notes: list[str]) -> list[dict[str, Any]]:
+def _lights(path: Path, record: Record, folder: Path, notes: list[str]) -> list[JsonObject]:
     """Return the entry of a light in the scene file; none, with a note, for lights that it does not have.
 
     The image of a light is written into the folder.

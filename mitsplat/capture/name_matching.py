@@ -37,8 +37,8 @@ def match_names(
     Raises:
         InputError: If several names match one photo equally well, or several photos one name.
     """
-    names = {name: composed(path) for name, path in names.items()}
-    places = {photo: composed(PurePosixPath((folder.resolve() / photo).as_posix())) for photo in photos}
+    names = {name: PurePosixPath(composed(str(path))) for name, path in names.items()}
+    places = {photo: PurePosixPath(composed((folder.resolve() / photo).as_posix())) for photo in photos}
     matched: dict[str, str] = {}
     taken: set[str] = set()
     # Folders that belong together, because more than the file names of some photos agree.
@@ -60,9 +60,9 @@ def match_names(
     return matched
 
 
-def composed(path: PurePosixPath) -> PurePosixPath:
-    """Return a path with composed letters. macOS stores some names with separate accents."""
-    return PurePosixPath(unicodedata.normalize("NFC", str(path)))
+def composed(name: str) -> str:
+    """Return a name with composed letters. macOS stores some names with separate accents."""
+    return unicodedata.normalize("NFC", name)
 
 
 def _candidates(names: Mapping[str, PurePosixPath], places: Mapping[str, PurePosixPath]) -> Iterable[_Pair]:
@@ -84,7 +84,7 @@ def _candidates(names: Mapping[str, PurePosixPath], places: Mapping[str, PurePos
                 if one != other:
                     break
                 common += 1
-            yield _Pair((common, likeness, path in (place, composed(PurePosixPath(photo)))), name, photo)
+            yield _Pair((common, likeness, path in (place, PurePosixPath(composed(photo)))), name, photo)
 
 
 def _agree(

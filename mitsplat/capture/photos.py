@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shutil
 import struct
-import unicodedata
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -18,6 +17,7 @@ from PIL import ExifTags, Image, ImageOps
 
 from mitsplat.arrays import BoolArray, ByteImage
 from mitsplat.capture.capture import Photo, stored_name
+from mitsplat.capture.name_matching import composed
 from mitsplat.capture.video.sharpness import sharpness
 from mitsplat.errors import InputError
 from mitsplat.images.colour import eight_bit
@@ -261,14 +261,9 @@ def plain_background(rgb: ByteImage, *, without_noise: bool = False) -> BoolArra
 
 
 def mask_files(folder: Path) -> dict[str, Path]:
-    """Return the files of a folder of masks by their path relative to it, see :func:`_mask_key`."""
+    """Return the files of a folder of masks by their path relative to it, with composed letters in lower case."""
     below = sorted(path for path in folder.rglob("*") if path.is_file())
-    return {_mask_key(path.relative_to(folder).as_posix()): path for path in below}
-
-
-def _mask_key(name: str) -> str:
-    """Return the key of :func:`mask_files` for a path: in lower case, with composed letters."""
-    return unicodedata.normalize("NFC", name).lower()
+    return {composed(path.relative_to(folder).as_posix()).lower(): path for path in below}
 
 
 def read_mask(files: Mapping[str, Path], photo: Prepared) -> BoolArray | None:
@@ -283,7 +278,7 @@ def read_mask(files: Mapping[str, Path], photo: Prepared) -> BoolArray | None:
     """
     name = Path(photo.name)
     candidates = [f"{photo.name}.png", name.with_suffix(".png").as_posix(), photo.name]
-    path = next((files[key] for file in candidates if (key := _mask_key(file)) in files), None)
+    path = next((files[key] for file in candidates if (key := composed(file).lower()) in files), None)
     if path is None:
         return None
     try:

@@ -6,6 +6,8 @@ variant. Annotations are never evaluated, and mypy reads such names as ``Any``.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import numpy.typing as npt
 
@@ -16,3 +18,9 @@ Int32Array = npt.NDArray[np.int32]
 Int64Array = npt.NDArray[np.int64]
 ByteImage = npt.NDArray[np.uint8]
 """Display-encoded RGB image, shape (H, W, 3), unless stated otherwise."""
+AnyArray = npt.NDArray[Any]
+"""Array of any element type."""
+FloatingArray = npt.NDArray[np.floating[Any]]
+"""Array of floats of any size."""
+IntegerArray = npt.NDArray[np.integer[Any]]
+"""Array of integers of any size."""

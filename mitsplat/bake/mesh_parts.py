@@ -23,7 +23,7 @@ from mitsplat.mesh_files.mesh_file import DIELECTRIC_SPECULAR, OPAQUE, Axis, Fil
 from mitsplat.mesh_files.mesh_reading import read_mesh_file
 from mitsplat.mesh_files.trimesh_files import scene_parts
 from mitsplat.renderer.rays.device_arrays import ray_scene
-from mitsplat.renderer.scene_emitters import emitter_dict
+from mitsplat.renderer.scene_emitters import MitsubaDict, emitter_dict
 from mitsplat.runtime.variant import ensure_variant
 from mitsplat.scene.spec.light_spec import LightSpec
 
@@ -36,7 +36,7 @@ _MAX_STEP = 1e-3
 _MAX_DISTANCE = 1000.0
 """Distance from the origin, relative to the size of the mesh, beyond which 32-bit numbers are too coarse to render."""
 _WHITE = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 1.0}}
-UNIFORM_LIGHT: dict[str, Any] = {"light": {"type": "constant", "radiance": {"type": "rgb", "value": 1.0}}}
+UNIFORM_LIGHT: MitsubaDict = {"light": {"type": "constant", "radiance": {"type": "rgb", "value": 1.0}}}
 """Emitter of radiance 1 from all directions."""
 _LINEAR = decode_srgb(np.arange(256) / 255.0)
 """Linear values of 8-bit display-encoded values."""
@@ -359,7 +359,7 @@ def _inverted_bodies(parts: Sequence[MeshPart]) -> Iterator[str]:
             )
 
 
-def mitsuba_scene(parts: Sequence[MeshPart], lights: dict[str, Any], *, clay: bool = False) -> mi.Scene:
+def mitsuba_scene(parts: Sequence[MeshPart], lights: MitsubaDict, *, clay: bool = False) -> mi.Scene:
     """Create a Mitsuba scene of ``parts`` under emitters ``lights``.
 
     Metals and plastics are ``principled`` BSDFs. With ``clay``, all parts have a white diffuse BSDF instead.
@@ -376,17 +376,17 @@ def part_shape(part: MeshPart) -> mi.Mesh:
     return _mitsuba_mesh(part, _bsdf(part))
 
 
-def _clay(part: MeshPart) -> dict[str, Any]:
+def _clay(part: MeshPart) -> MitsubaDict:
     return {"type": "twosided", "bsdf": _WHITE} if part.double_sided else _WHITE
 
 
-def _bsdf(part: MeshPart) -> dict[str, Any]:
+def _bsdf(part: MeshPart) -> MitsubaDict:
     if part.texture is not None:
         pixels = (255.0 * encode_srgb(_LINEAR[part.texture.pixels] * part.factor)).round().astype(np.uint8)
         colour = _bitmap(part, replace(part.texture, pixels=pixels), raw=False)
     else:
         colour = {"type": "mesh_attribute", "name": "vertex_color"}
-    bsdf: dict[str, Any] = {"type": "diffuse", "reflectance": colour}
+    bsdf: MitsubaDict = {"type": "diffuse", "reflectance": colour}
     if part.shiny:
         bsdf = {
             "type": "principled",
@@ -406,7 +406,7 @@ def _channel(part: MeshPart, number: int, uniform: float) -> Any:
     return _bitmap(part, replace(texture, pixels=np.ascontiguousarray(texture.pixels[..., number, None])), raw=True)
 
 
-def _bitmap(part: MeshPart, texture: Texture, *, raw: bool) -> dict[str, Any]:
+def _bitmap(part: MeshPart, texture: Texture, *, raw: bool) -> MitsubaDict:
     """Return Mitsuba's description of a texture.
 
     Raises:
@@ -431,7 +431,7 @@ def _uv_of(part: MeshPart) -> Float64Array | None:
     return next((texture.uv for texture in textures if texture is not None), None)
 
 
-def _mitsuba_mesh(part: MeshPart, bsdf: dict[str, Any]) -> mi.Mesh:
+def _mitsuba_mesh(part: MeshPart, bsdf: MitsubaDict) -> mi.Mesh:
     properties = mi.Properties()
     properties["bsdf"] = mi.load_dict(bsdf)
     count, uv = len(part.mesh.faces), _uv_of(part)
@@ -450,7 +450,7 @@ def _mitsuba_mesh(part: MeshPart, bsdf: dict[str, Any]) -> mi.Mesh:
     return mesh
 
 
-def bake_lights(lights: Sequence[LightSpec]) -> dict[str, Any]:
+def bake_lights(lights: Sequence[LightSpec]) -> MitsubaDict:
     """Return the Mitsuba emitters of a scene's lights, by name.
 
     Raises:

@@ -16,18 +16,17 @@ from collections.abc import Collection, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from mitsplat.arrays import Float64Array, Int32Array
+from mitsplat.arrays import AnyArray, Float64Array, Int32Array
 from mitsplat.capture.photos import Prepared
 from mitsplat.errors import InputError, MissingResourceError
 from mitsplat.geometry.camera import Camera
 from mitsplat.progress import Progress
 from mitsplat.runtime.child_process import python_command, python_environment
-from mitsplat.storage.files import write_text
+from mitsplat.storage.files import JsonObject, write_text
 
 MIN_POINTS = 30
 """Minimum number of points that a photo must observe.
@@ -206,7 +205,7 @@ def opencv_camera(
         raise InputError(f"a camera of lens model {model} cannot be used: {error}") from error
 
 
-def _job(photos: Sequence[Prepared], folder: Path) -> dict[str, Any]:
+def _job(photos: Sequence[Prepared], folder: Path) -> JsonObject:
     """Return the job for the photos: finer features for few photos, sequential matching for many.
 
     The job has the photo folder relative to its own folder, so that results stay valid when both are moved together.
@@ -226,9 +225,7 @@ def _job(photos: Sequence[Prepared], folder: Path) -> dict[str, Any]:
     }
 
 
-def _run(
-    job: Mapping[str, Any], folder: Path, progress: Progress | None, *, seconds: float = math.inf
-) -> dict[str, npt.NDArray[Any]]:
+def _run(job: JsonObject, folder: Path, progress: Progress | None, *, seconds: float = math.inf) -> dict[str, AnyArray]:
     """Run the job in a child process within a time limit.
 
     The database of an earlier run with the same job is reused.
@@ -286,7 +283,7 @@ def _read_status(folder: Path) -> str:
         return ""
 
 
-def _progress_of(job: Mapping[str, Any], folder: Path) -> tuple[int, int, str]:
+def _progress_of(job: JsonObject, folder: Path) -> tuple[int, int, str]:
     """Return the steps done, their total and the present activity."""
     stage, _, count = _read_status(folder).rpartition(" ")
     if not count.isdecimal():
@@ -309,7 +306,7 @@ def _count_rows(database: Path, table: str) -> int:
         return 0
 
 
-def _read_arrays(arrays: Mapping[str, npt.NDArray[Any]], photos: Sequence[Prepared]) -> SparseModel:
+def _read_arrays(arrays: Mapping[str, AnyArray], photos: Sequence[Prepared]) -> SparseModel:
     """Return the result of the child process.
 
     Raises:

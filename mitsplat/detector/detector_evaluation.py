@@ -17,7 +17,6 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -50,7 +49,7 @@ from mitsplat.images.masks import encode_mask
 from mitsplat.pages.html import REPORT_FILE
 from mitsplat.progress import Progress
 from mitsplat.storage.content_hash import file_hash
-from mitsplat.storage.files import storage_errors, write_text
+from mitsplat.storage.files import JsonObject, storage_errors, write_text
 
 MIN_SCORE, NMS_IOU = 0.001, 0.7
 """Least score of stored detections, and IoU threshold of the non-maximum suppression within a class."""
@@ -69,7 +68,7 @@ class Evaluation:
     """
 
     path: Path
-    results: dict[str, Any]
+    results: JsonObject
 
     @property
     def page(self) -> Path:
@@ -189,9 +188,9 @@ def detect(
     return found
 
 
-def coco_truth(found: LabelledSet, *, masks: bool) -> dict[str, Any]:
+def coco_truth(found: LabelledSet, *, masks: bool) -> JsonObject:
     """Return the labels as a COCO dataset; ids of images, annotations and categories count from 1."""
-    annotations: list[dict[str, Any]] = []
+    annotations: list[JsonObject] = []
     for number, sample in enumerate(found.samples, start=1):
         for instance in sample.instances:
             x0, y0, x1, y1 = instance.box
@@ -217,7 +216,7 @@ def coco_truth(found: LabelledSet, *, masks: bool) -> dict[str, Any]:
 
 
 def write_evaluation(
-    found: LabelledSet, detections: Sequence[Detection], out: str | Path, *, masks: bool, about: dict[str, Any]
+    found: LabelledSet, detections: Sequence[Detection], out: str | Path, *, masks: bool, about: JsonObject
 ) -> Evaluation:
     """Compare stored detections with the labels, and write the evaluation folder; Ultralytics is not needed.
 
@@ -255,7 +254,7 @@ def write_evaluation(
     return Evaluation(out, results)
 
 
-def _score_record(score: AveragePrecision) -> dict[str, Any]:
+def _score_record(score: AveragePrecision) -> JsonObject:
     return {
         "map50_95": round(score.map50_95, 5) if score.classes else None,
         "map50": round(score.map50, 5) if score.classes else None,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import html
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import cv2
 import numpy as np
@@ -17,6 +16,7 @@ from mitsplat.images.masks import Silhouette, decode_rle
 from mitsplat.labels.overlay import class_colour
 from mitsplat.pages.html import inline_image, make_page, mask_path
 from mitsplat.pages.svg_charts import bars, curves
+from mitsplat.storage.files import JsonObject
 
 NUM_WORST_IMAGES = 8
 """Number of images in the report; those with the lowest share of correct detections."""
@@ -26,11 +26,11 @@ _PLURALS = {"box": "boxes", "mask": "masks"}
 
 def make_report(
     found: LabelledSet,
-    truth: Mapping[str, Any],
+    truth: JsonObject,
     detections: Sequence[Detection],
     scores: Mapping[str, AveragePrecision],
     confusion: Confusion,
-    results: Mapping[str, Any],
+    results: JsonObject,
 ) -> str:
     """Return the report as one self-contained HTML page."""
     title = f"{found.root.resolve().name}, {found.split}: evaluation of a detector"
@@ -51,7 +51,7 @@ def _section(key: str, heading: str, body: str) -> str:
 
 
 def _summary(
-    found: LabelledSet, scores: Mapping[str, AveragePrecision], confusion: Confusion, results: Mapping[str, Any]
+    found: LabelledSet, scores: Mapping[str, AveragePrecision], confusion: Confusion, results: JsonObject
 ) -> str:
     right, missed, confused, extra = (sum(values) for values in zip(*confusion.errors.values(), strict=True))
     rows = {f"mAP50-95 of {_PLURALS[kind]}": f"{score.map50_95:.3f}" for kind, score in scores.items()}
@@ -76,7 +76,7 @@ def _summary(
     return _section("summary", "Summary", f"<table>{lines}</table><p>{note}</p>")
 
 
-def _classes(scores: Mapping[str, AveragePrecision], results: Mapping[str, Any]) -> str:
+def _classes(scores: Mapping[str, AveragePrecision], results: JsonObject) -> str:
     heads = [f"{name} of {_PLURALS[kind]}" for kind in scores for name in ("AP50-95", "AP50")]
     rows = []
     for name, count in results["data"]["instances"].items():
@@ -131,10 +131,10 @@ def _confusion(confusion: Confusion, class_names: Sequence[str]) -> str:
     return _section("confusion", "Confusion", f'<p>{text}</p><div class="matrix">{table}</div>')
 
 
-def _worst(found: LabelledSet, truth: Mapping[str, Any], detections: Sequence[Detection], confusion: Confusion) -> str:
+def _worst(found: LabelledSet, truth: JsonObject, detections: Sequence[Detection], confusion: Confusion) -> str:
     order = worst_images(confusion)[:NUM_WORST_IMAGES]
-    labelled: dict[int, list[dict[str, Any]]] = {image: [] for image in order}
-    predicted: dict[int, list[dict[str, Any]]] = {image: [] for image in order}
+    labelled: dict[int, list[JsonObject]] = {image: [] for image in order}
+    predicted: dict[int, list[JsonObject]] = {image: [] for image in order}
     for annotation in truth["annotations"]:
         if annotation["image_id"] in labelled:
             labelled[annotation["image_id"]].append(annotation)
@@ -166,7 +166,7 @@ def worst_images(confusion: Confusion) -> list[int]:
     return sorted(shares, key=lambda image: shares[image])
 
 
-def _picture(sample: Sample, shown: Sequence[Mapping[str, Any]], class_names: Sequence[str], what: str) -> str:
+def _picture(sample: Sample, shown: Sequence[JsonObject], class_names: Sequence[str], what: str) -> str:
     image = read_picture(sample.path)
     scale = min(1.0, _THUMBNAIL / sample.width)
     size = max(1, round(sample.width * scale)), max(1, round(sample.height * scale))

@@ -7,12 +7,13 @@ kind of error, and average precision is computed again. The gains of the kinds d
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from mitsplat.detector.scores import IOU, AveragePrecision, Detection, DetectionMatches, overlaps
+from mitsplat.storage.files import JsonObject
 
 MIN_NEAR_IOU = 0.1
 """Least IoU of a badly placed box with a label of its class."""
@@ -26,9 +27,7 @@ ERROR_KINDS = {
 """Kinds of errors and their descriptions."""
 
 
-def error_gains(
-    truth: Mapping[str, Any], detections: Sequence[Detection], before: AveragePrecision
-) -> dict[str, float]:
+def error_gains(truth: JsonObject, detections: Sequence[Detection], before: AveragePrecision) -> dict[str, float]:
     """Return the gain in box mAP50-95 if one kind of error (:data:`ERROR_KINDS`) is corrected.
 
     Args:
@@ -57,7 +56,7 @@ def error_gains(
     }
 
 
-def _by_image(entries: Sequence[Mapping[str, Any]]) -> dict[int, list[Any]]:
+def _by_image(entries: Sequence[JsonObject]) -> dict[int, list[Any]]:
     found = defaultdict(list)
     for entry in entries:
         found[entry["image_id"]].append(entry)
@@ -65,7 +64,7 @@ def _by_image(entries: Sequence[Mapping[str, Any]]) -> dict[int, list[Any]]:
 
 
 def _correct_errors(
-    seen: Sequence[Detection], labels: Sequence[Mapping[str, Any]], hit: set[int]
+    seen: Sequence[Detection], labels: Sequence[JsonObject], hit: set[int]
 ) -> dict[str, list[Detection]]:
     """Return the detections of an image with each kind of error corrected, and add the detected labels to ``hit``.
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import contextlib
 import io
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -22,6 +22,7 @@ from pycocotools.cocoeval import COCOeval
 
 from mitsplat.arrays import Float64Array, Int64Array
 from mitsplat.errors import InputError
+from mitsplat.storage.files import JsonObject
 
 IouType = Literal["bbox", "segm"]
 Detection = dict[str, Any]
@@ -61,7 +62,7 @@ class DetectionMatches:
         InputError: If a detection has an image or a class that is not in ``truth``.
     """
 
-    def __init__(self, truth: Mapping[str, Any], detections: Sequence[Detection], iou_type: IouType = "bbox") -> None:
+    def __init__(self, truth: JsonObject, detections: Sequence[Detection], iou_type: IouType = "bbox") -> None:
         self.images = [image["id"] for image in truth["images"]]
         self._names = {category["id"]: str(category["name"]) for category in truth["categories"]}
         known = set(self.images)
@@ -113,7 +114,7 @@ class DetectionMatches:
 
 
 def average_precision(
-    truth: Mapping[str, Any],
+    truth: JsonObject,
     detections: Sequence[Detection],
     images: Sequence[int] | None = None,
     iou_type: IouType = "bbox",
@@ -142,7 +143,7 @@ class Confusion:
     errors: dict[int, tuple[int, int, int, int]]
 
 
-def confuse(truth: Mapping[str, Any], detections: Sequence[Detection]) -> Confusion:
+def confuse(truth: JsonObject, detections: Sequence[Detection]) -> Confusion:
     """Compare the classes of overlapping detections and labels; detections with higher scores are matched first."""
     index = {category["id"]: i for i, category in enumerate(truth["categories"])}
     nothing = len(index)
@@ -199,12 +200,12 @@ def overlaps(
     return np.asarray(coco_mask.iou(*boxes, [int(crowd) for crowd in crowds or [False] * len(labelled)]))
 
 
-def _coco(content: Mapping[str, Any]) -> COCO:
+def _coco(content: JsonObject) -> COCO:
     coco = COCO()
     coco.dataset = dict(content)
     coco.createIndex()
     return coco
 
 
-def _no_detections(truth: Mapping[str, Any]) -> COCO:
+def _no_detections(truth: JsonObject) -> COCO:
     return _coco({"images": truth["images"], "categories": truth["categories"], "annotations": []})

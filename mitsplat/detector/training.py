@@ -40,7 +40,7 @@ from mitsplat.errors import InputError
 from mitsplat.progress import Progress
 from mitsplat.runtime.cores import usable_cores
 from mitsplat.storage.content_hash import file_hash
-from mitsplat.storage.files import open_in_place, read_json, remove_folder, storage_errors, write_text
+from mitsplat.storage.files import JsonObject, open_in_place, read_json, remove_folder, storage_errors, write_text
 
 RUN_FILE = "run.json"
 WEIGHTS = "weights.pt"
@@ -102,7 +102,7 @@ class TrainSettings:
         if self.weights is not None:
             object.__setattr__(self, "weights", Path(self.weights))
 
-    def weight_settings(self) -> dict[str, Any]:
+    def weight_settings(self) -> JsonObject:
         """Return the settings that affect the weights, without ``device`` and ``workers``."""
         settings = asdict(self) | {"weights": None if self.weights is None else file_hash(self.weights)}
         return {name: value for name, value in settings.items() if name not in ("device", "workers")}
@@ -119,7 +119,7 @@ class Run:
     """
 
     path: Path
-    record: dict[str, Any]
+    record: JsonObject
     was_finished: bool = False
 
     @property
@@ -287,7 +287,7 @@ def _train(
     masks: bool,
     device: str,
     progress: Progress | None,
-) -> dict[str, Any]:
+) -> JsonObject:
     from mitsplat.detector import fixed_steps  # optional dependency: this module subclasses Ultralytics
 
     rendered = sum(len(found.samples) for found in sets)
@@ -351,7 +351,7 @@ def _read_run(path: Path) -> Run | None:
     return Run(path, record)
 
 
-def _existing_run(out: Path, record: dict[str, Any]) -> Run | None:
+def _existing_run(out: Path, record: JsonObject) -> Run | None:
     """Return the run in a folder, which must have the same settings and images, or None."""
     kept = _read_run(out)
     if kept is None:

@@ -16,12 +16,12 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
-import numpy.typing as npt
 
+from mitsplat.arrays import AnyArray
 from mitsplat.errors import InputError
 from mitsplat.fit.training_view import HeldOut
 from mitsplat.gaussians.splat_cloud import Splats
-from mitsplat.storage.files import write_file, write_text
+from mitsplat.storage.files import JsonObject, write_file, write_text
 from mitsplat.storage.format_version import FORMAT_VERSION, FORMAT_VERSIONS, check_format_version
 
 FIT_FILE = "fit.json"
@@ -115,7 +115,7 @@ class FitFolder:
                 (self.path / name).unlink(missing_ok=True)
         return result
 
-    def checkpoint(self, *, overwrite: bool) -> dict[str, npt.NDArray[Any]] | None:
+    def checkpoint(self, *, overwrite: bool) -> dict[str, AnyArray] | None:
         """Return the checkpoint of an unfinished fit of these inputs, or None.
 
         Args:
@@ -154,7 +154,7 @@ class FitFolder:
         splats = Splats.load(self.path / "splats.ply")
         return FitResult(splats, iterations, seconds, held_out, self.inputs, warnings, validation)
 
-    def _read_checkpoint(self, path: Path) -> dict[str, npt.NDArray[Any]]:
+    def _read_checkpoint(self, path: Path) -> dict[str, AnyArray]:
         try:
             with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
                 state = dict(stored)
@@ -201,7 +201,7 @@ class FitFolder:
 
         write_file(self.path / _CHECKPOINT, write)
 
-    def save(self, result: FitResult, known: Mapping[str, Any]) -> None:
+    def save(self, result: FitResult, known: JsonObject) -> None:
         """Write the finished fit; the record contains the result and the entries of ``known``."""
         result.splats.save(self.path / "splats.ply")
         names = ("inputs", "iterations", "seconds", "psnr", "ssim", "validation_psnr", "warnings")

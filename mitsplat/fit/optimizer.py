@@ -11,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
 
-from mitsplat.arrays import BoolArray
+from mitsplat.arrays import AnyArray, BoolArray
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.quality import Quality
 from mitsplat.renderer.differentiation.backward import (
@@ -52,7 +52,7 @@ class Adam:
         steps: Number of updates.
     """
 
-    def __init__(self, values: Mapping[str, npt.NDArray[Any]]) -> None:
+    def __init__(self, values: Mapping[str, AnyArray]) -> None:
         self.values: _Arrays = {k: wrapped(mi.Float, np.asarray(v, dtype=np.float32)) for k, v in values.items()}
         self.first: _Arrays = {k: dr.zeros(mi.Float, dr.width(v)) for k, v in self.values.items()}
         self.second: _Arrays = {k: dr.zeros(mi.Float, dr.width(v)) for k, v in self.values.items()}
@@ -100,7 +100,7 @@ class Adam:
                 moments[name] = dr.gather(mi.Float, moments[name], source) * dr.gather(mi.Float, kept, row)
         self._evaluate()
 
-    def state(self) -> dict[str, npt.NDArray[Any]]:
+    def state(self) -> dict[str, AnyArray]:
         """Return the complete state as arrays for :meth:`restore`."""
         groups = {"value": self.values, "first": self.first, "second": self.second}
         arrays = {
@@ -110,7 +110,7 @@ class Adam:
         }
         return arrays | {"steps": np.array(self.steps)}
 
-    def restore(self, state: Mapping[str, npt.NDArray[Any]]) -> None:
+    def restore(self, state: Mapping[str, AnyArray]) -> None:
         """Restore a state from :meth:`state`."""
         for group, members in (("value", self.values), ("first", self.first), ("second", self.second)):
             for name in members:

@@ -9,7 +9,7 @@ strategies by the protocol :class:`Densification`.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Protocol
+from typing import Protocol
 
 import drjit as dr
 import mitsuba as mi
@@ -18,7 +18,7 @@ import numpy.typing as npt
 from scipy.spatial import KDTree
 from scipy.special import comb
 
-from mitsplat.arrays import Float64Array
+from mitsplat.arrays import AnyArray, Float64Array
 from mitsplat.fit.optimizer import GaussianModel
 from mitsplat.gaussians.spherical_harmonics import SH_C0
 from mitsplat.gaussians.splat_cloud import Splats
@@ -59,10 +59,10 @@ class Densification(Protocol):
             rng: Random number generator of the step.
         """
 
-    def state(self) -> dict[str, npt.NDArray[Any]]:
+    def state(self) -> dict[str, AnyArray]:
         """Return the state as arrays for :meth:`restore`."""
 
-    def restore(self, state: Mapping[str, npt.NDArray[Any]]) -> None:
+    def restore(self, state: Mapping[str, AnyArray]) -> None:
         """Restore a state from :meth:`state`."""
 
 
@@ -89,11 +89,11 @@ class Mcmc:
             grow(model, self._target_count(model.count, fraction), rng)
         jitter(model, rate, (self._seed, step))
 
-    def state(self) -> dict[str, npt.NDArray[Any]]:
+    def state(self) -> dict[str, AnyArray]:
         """Return no state."""
         return {}
 
-    def restore(self, state: Mapping[str, npt.NDArray[Any]]) -> None:
+    def restore(self, state: Mapping[str, AnyArray]) -> None:
         """Do nothing, because there is no state."""
 
     def _target_count(self, count: int, fraction: float) -> int:

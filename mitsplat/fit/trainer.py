@@ -16,8 +16,8 @@ from typing import Any, Literal, NamedTuple
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-import numpy.typing as npt
 
+from mitsplat.arrays import AnyArray
 from mitsplat.capture.capture import HELD_OUT_EVERY, Capture, Photo, Window
 from mitsplat.errors import InputError, check_fields, check_type, path_of
 from mitsplat.fit.depth_priors import DepthMap, DepthMaps, align_maps, crop_map
@@ -369,7 +369,7 @@ class _Fit:
         quality = replace(QUALITY, sh_degree=self.settings.sh_degree)
         return tuple(view.compare(view.render(self.model, quality)[0], folder) for view in photos)
 
-    def state(self) -> dict[str, Any]:
+    def state(self) -> dict[str, AnyArray | float]:
         """Return everything that determines the rest of the fit after a report, as arrays for :meth:`restore`."""
         own = {
             "steps": self.steps,
@@ -379,7 +379,7 @@ class _Fit:
         }
         return own | {f"{name}.{k}": v for name, part in self._stateful_parts.items() for k, v in part.state().items()}
 
-    def restore(self, state: Mapping[str, npt.NDArray[Any]]) -> None:
+    def restore(self, state: Mapping[str, AnyArray]) -> None:
         """Restore a state from :meth:`state`."""
         self.steps, self.seconds = int(state["steps"]), float(state["seconds"])
         self.last_validation, self.validation_psnr = float(state["last_validation"]), float(state["validation_psnr"])

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
-from mitsplat.arrays import ByteImage, Float32Array
+from mitsplat.arrays import AnyArray, ByteImage, Float32Array
 from mitsplat.images.colour import decode_srgb
 from mitsplat.renderer.textures import read_image
 from mitsplat.scene.planning.layout_surroundings import BackgroundDraw
@@ -36,7 +34,7 @@ def crop_background(image: ByteImage, background: BackgroundDraw, width: int, he
     low, high = np.floor(middle - reach).astype(int), np.ceil(middle + reach).astype(int)
     low, high = np.maximum(low, 0), np.minimum(high, size)
     values = decode_srgb(np.arange(256) / 255).astype(np.float32)
-    part: npt.NDArray[Any] = values[image[low[1] : high[1], low[0] : high[0]]]
+    part: AnyArray = values[image[low[1] : high[1], low[0] : high[0]]]
     if step > 1:
         small = np.maximum(np.rint((high - low) / step).astype(int), 1)
         part = cv2.resize(part, tuple(map(int, small)), interpolation=cv2.INTER_AREA)

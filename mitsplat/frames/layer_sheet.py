@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
-from mitsplat.arrays import ByteImage
+from mitsplat.arrays import ByteImage, FloatingArray
 from mitsplat.frames.frame import Frame
 from mitsplat.labels.overlay import class_colour, draw_labels
 
@@ -58,5 +58,5 @@ def _id_colours(ids: npt.NDArray[np.uint16]) -> ByteImage:
     return np.asarray(colours[position].reshape(*ids.shape, 3))
 
 
-def _grey(values: npt.NDArray[np.floating[Any]]) -> ByteImage:
+def _grey(values: FloatingArray) -> ByteImage:
     return np.asarray(np.rint(255 * np.clip(values, 0, 1)), dtype=np.uint8)

@@ -9,7 +9,6 @@ from collections.abc import Mapping
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -28,7 +27,7 @@ from mitsplat.physics.settle import settle_layout
 from mitsplat.progress import Note
 from mitsplat.renderer.layers import describe_sensor
 from mitsplat.renderer.rays.sensors import view_of
-from mitsplat.renderer.scene_emitters import emitter_dict
+from mitsplat.renderer.scene_emitters import MitsubaDict, emitter_dict
 from mitsplat.renderer.textures import finished_mesh, material, texture_image
 from mitsplat.runtime.device import Device
 from mitsplat.runtime.variant import ensure_variant
@@ -81,7 +80,7 @@ def export_xml(scene: Scene, index: int, path: str | Path) -> None:
         write_file(path, lambda part: mi.parser.write_file(state, str(part)))
 
 
-def _export_assets(scene: Scene, layout: Layout, folder: Path) -> dict[str, Any]:
+def _export_assets(scene: Scene, layout: Layout, folder: Path) -> MitsubaDict:
     """Write the splats and meshes of environment and objects; return the Mitsuba dictionaries of their shapes."""
     environment, shapes = scene.environment_of(layout.index), {}
     if environment is not None:
@@ -115,7 +114,7 @@ def _write_asset(asset: Asset, folder: Path, name: str) -> dict[str, str]:
     return files
 
 
-def _export_visible_shapes(scene: Scene, plan: FramePlan, folder: Path) -> dict[str, Any]:
+def _export_visible_shapes(scene: Scene, plan: FramePlan, folder: Path) -> MitsubaDict:
     """Write the meshes and patterns of visible shapes; return their Mitsuba dictionaries."""
     surroundings, shapes = draw_surroundings(scene.spec, plan.index), {}
     for placed in placed_shapes(scene, plan.layout):
@@ -129,9 +128,7 @@ def _export_visible_shapes(scene: Scene, plan: FramePlan, folder: Path) -> dict[
     return shapes
 
 
-def _write_shape(
-    shape: mi.Shape, drawn: MaterialDraw, image: ByteImage | None, folder: Path, name: str
-) -> dict[str, Any]:
+def _write_shape(shape: mi.Shape, drawn: MaterialDraw, image: ByteImage | None, folder: Path, name: str) -> MitsubaDict:
     """Write a mesh and the pattern of its material; return its Mitsuba dictionary."""
     write_file(folder / f"{name}.ply", lambda part: shape.write_ply(str(part)))
     texture = None

@@ -24,7 +24,7 @@ from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.gaussians.splat_files import SplatArrays
 from mitsplat.geometry.camera import Camera
 from mitsplat.renderer.layers import device_array, make_splats_shape
-from mitsplat.renderer.scene_emitters import emitter_dict, movable
+from mitsplat.renderer.scene_emitters import MitsubaDict, emitter_dict, movable
 from mitsplat.renderer.textures import bitmap_texture, finished_mesh, material, texture_image
 from mitsplat.scene.layout import Layout
 from mitsplat.scene.planning.conveyor import Belt
@@ -63,7 +63,7 @@ class SceneBuilder:
 
     def describe(
         self, layout: Layout, lights: tuple[LightSpec, ...], *, replaced_lights: bool = False, belt: Belt | None = None
-    ) -> dict[str, Any]:
+    ) -> MitsubaDict:
         """Return Mitsuba's scene dictionary of a layout.
 
         Args:
@@ -80,7 +80,7 @@ class SceneBuilder:
             **self.emitters(lights, movable=replaced_lights or self._has_moving_lights),
         }
 
-    def emitters(self, lights: tuple[LightSpec, ...], *, movable: bool) -> dict[str, Any]:
+    def emitters(self, lights: tuple[LightSpec, ...], *, movable: bool) -> MitsubaDict:
         """Return the emitters of lights by name; movable ones can move without recompilation of kernels."""
         return {f"light_{number}": self._emitter(light, movable) for number, light in enumerate(lights)}
 
@@ -126,7 +126,7 @@ class SceneBuilder:
         key = finish, travel, motion.tobytes()
         return self._reuse(name, key, lambda: finished_mesh(mesh, shape, finish, image, bsdf, travel, motion))
 
-    def _emitter(self, light: LightSpec, is_movable: bool) -> mi.Emitter | mi.Shape | dict[str, Any]:
+    def _emitter(self, light: LightSpec, is_movable: bool) -> mi.Emitter | mi.Shape | MitsubaDict:
         """Return the emitter of a light, or its Mitsuba dictionary."""
         if not isinstance(light, EnvironmentLight) or light.image is None:
             return movable(emitter_dict(light)) if is_movable else emitter_dict(light)
@@ -164,7 +164,7 @@ def make_asset_shape(
     )
 
 
-def asset_properties(asset: Asset, instance: int, appearance: ObjectAppearance | None = None) -> dict[str, Any]:
+def asset_properties(asset: Asset, instance: int, appearance: ObjectAppearance | None = None) -> MitsubaDict:
     """Return the properties of the shape plugin ``splats`` for an asset; instance 0 is the environment."""
     gloss = {"roughness": float(asset.roughness), "specular": float(asset.specular) if instance else 0.0}
     drawn = appearance.properties() if appearance else {}

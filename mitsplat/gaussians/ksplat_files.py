@@ -8,12 +8,11 @@ on, positions are unsigned 16-bit numbers relative to the centre of a bucket.
 from __future__ import annotations
 
 import struct
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
-from mitsplat.arrays import Float64Array
+from mitsplat.arrays import AnyArray, Float64Array
 from mitsplat.errors import InputError
 
 _HEADER, _SECTION_HEADER = 4096, 1024
@@ -123,7 +122,7 @@ def _read_section(
     )
 
 
-def _by_channel(sh: npt.NDArray[Any]) -> Float64Array:
+def _by_channel(sh: AnyArray) -> Float64Array:
     """Return coefficients (N, K, 3) of rows (N, 3 K): those of degree 1 of red, green and blue, then of degree 2."""
     bands = [band.reshape(len(sh), 3, band.shape[1] // 3) for band in (sh[:, :9], sh[:, 9:])]
     return np.asarray(np.concatenate(bands, axis=2).transpose(0, 2, 1))

@@ -23,7 +23,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from mitsplat.arrays import BoolArray, Float32Array, Float64Array
+from mitsplat.arrays import AnyArray, BoolArray, Float32Array, Float64Array
 from mitsplat.errors import InputError, describe, path_of
 from mitsplat.gaussians.material_files import read_materials
 from mitsplat.gaussians.spherical_harmonics import SH_C0, sh_rotation
@@ -234,7 +234,7 @@ def split_similarity(matrix: npt.ArrayLike) -> tuple[Float64Array, float, Float6
     return u @ vt, scale, matrix[:3, 3]
 
 
-def _require(valid: BoolArray, name: str, rule: str, values: npt.NDArray[Any]) -> None:
+def _require(valid: BoolArray, name: str, rule: str, values: AnyArray) -> None:
     """Raise an InputError that names the first row of ``values`` (N, ...) for which ``valid`` (N, ...) is false."""
     if not valid.all():
         place = np.unravel_index(int(np.argmin(valid)), valid.shape)

@@ -7,9 +7,8 @@ For conventions see :mod:`mitsplat.gaussians.splat_cloud`: x right, y down, z fo
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import cv2
 import numpy as np
@@ -17,7 +16,7 @@ import numpy.typing as npt
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
-from mitsplat.arrays import Float64Array, Int64Array
+from mitsplat.arrays import AnyArray, Float64Array, Int64Array
 from mitsplat.errors import InputError, check_number, describe
 from mitsplat.geometry.lens import (
     Lens,
@@ -29,6 +28,7 @@ from mitsplat.geometry.lens import (
     undistort,
 )
 from mitsplat.geometry.rigid import OPENCV_FROM_OPENGL, points_of, rigid_matrix
+from mitsplat.storage.files import JsonObject
 
 MAX_IMAGE_SIDE = 16384
 """Maximum side length of an image [px]."""
@@ -190,7 +190,7 @@ class Camera:
         )
 
     @classmethod
-    def from_json(cls, stored: Mapping[str, Any]) -> Camera:
+    def from_json(cls, stored: JsonObject) -> Camera:
         """Return the camera from the values of :meth:`to_json`.
 
         Raises:
@@ -201,7 +201,7 @@ class Camera:
         known = {key: stored[key] for key in same}
         return cls(fx=fx, fy=fy, cx=cx, cy=cy, distortion=tuple(stored["distortion"]), **known)
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> JsonObject:
         """Return the camera as JSON values, as in datasets. Floats survive the round trip exactly."""
         return {
             "width": self.width,
@@ -301,7 +301,7 @@ class Camera:
         x, y = pixels[inside].astype(np.int64).T
         return inside, x, y
 
-    def sample(self, image: npt.NDArray[Any], points: npt.ArrayLike, missing: float) -> Float64Array:
+    def sample(self, image: AnyArray, points: npt.ArrayLike, missing: float) -> Float64Array:
         """Return the pixel values (N,) of an image at world points (N, 3); ``missing`` for points outside the image."""
         values = np.full(len(np.atleast_2d(points)), missing)
         inside, x, y = self.visible_pixels(points)

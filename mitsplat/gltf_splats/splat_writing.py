@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import struct
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -16,7 +15,7 @@ from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.gaussians.splat_files import SplatArrays, encode_spz
 from mitsplat.geometry.rigid import Z_UP_FROM_Y_UP
 from mitsplat.gltf_splats.splat_reading import COMPRESSION, ENCODED, EXTENSION, GLTF_FROM_SPZ
-from mitsplat.storage.files import storage_errors, write_file
+from mitsplat.storage.files import JsonObject, storage_errors, write_file
 from mitsplat.version import __version__
 
 _FLOAT, _ARRAY_BUFFER, _POINTS = 5126, 34962, 0
@@ -59,10 +58,10 @@ def write_gltf_splats(splats: Splats, path: Path, *, name: str, spz: bool = Fals
     unit = _spz_unit(splats) if spz else 1.0
     turned = splats.transformed(np.diag([1 / unit, 1 / unit, 1 / unit, 1.0]) @ Z_UP_FROM_Y_UP.T)
     names, properties, extensions = _attributes(turned), {"kernel": "ellipse", "colorSpace": ENCODED}, [EXTENSION]
-    accessors: list[dict[str, Any]] = []
-    views: list[dict[str, Any]] = []
+    accessors: list[JsonObject] = []
+    views: list[JsonObject] = []
     chunks: list[bytes] = []
-    stored: dict[str, Any] = dict(properties)
+    stored: JsonObject = dict(properties)
     if spz:
         arrays = turned.transformed(GLTF_FROM_SPZ.T)
         packed = encode_spz(SplatArrays(arrays.means, arrays.quats, arrays.scales, arrays.opacities, arrays.sh), None)

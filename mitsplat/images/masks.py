@@ -6,14 +6,13 @@ import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 from pycocotools import mask as coco_mask
 
-from mitsplat.arrays import BoolArray
+from mitsplat.arrays import BoolArray, IntegerArray
 
 Box = tuple[int, int, int, int]
 """Bounds (x0, y0, x1, y1) [px], half-open."""
@@ -143,7 +142,7 @@ def _is_connected(pixels: npt.NDArray[np.uint8]) -> bool:
     return hierarchy is not None and int(np.count_nonzero(hierarchy[0, :, 3] < 0)) == 1
 
 
-def bounds_of_ids(ids: npt.NDArray[np.integer[Any]]) -> dict[int, Box]:
+def bounds_of_ids(ids: IntegerArray) -> dict[int, Box]:
     """Return the bounds of every non-zero id in an id map (H, W), by ascending id.
 
     Only the ends of runs along rows are processed, which takes a fifth of the time of ``scipy.ndimage``.

@@ -4,20 +4,19 @@ from __future__ import annotations
 
 import io
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 from PIL import Image
 
+from mitsplat.arrays import AnyArray
 from mitsplat.storage.files import IMAGE_ERRORS, is_inside, read_regular
 
 MAX_FILE_BYTES = 1 << 29
 """Maximum size of an image file [bytes]."""
 
 
-def read_picture(path: Path, flags: int = cv2.IMREAD_COLOR) -> npt.NDArray[Any] | None:
+def read_picture(path: Path, flags: int = cv2.IMREAD_COLOR) -> AnyArray | None:
     """Return the pixels of an image file as ``cv2.imread`` does.
 
     Returns:
@@ -32,6 +31,6 @@ def read_picture(path: Path, flags: int = cv2.IMREAD_COLOR) -> npt.NDArray[Any] 
         return None
 
 
-def read_picture_inside(folder: Path, name: str, flags: int = cv2.IMREAD_COLOR) -> npt.NDArray[Any] | None:
+def read_picture_inside(folder: Path, name: str, flags: int = cv2.IMREAD_COLOR) -> AnyArray | None:
     """Return the pixels of an image file as :func:`read_picture`; None also if a link leads out of the folder."""
     return read_picture(folder / name, flags) if is_inside(folder, name) else None

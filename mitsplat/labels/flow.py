@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-from mitsplat.arrays import BoolArray, Float32Array, Float64Array
+from mitsplat.arrays import BoolArray, Float32Array, Float64Array, FloatingArray, IntegerArray
 from mitsplat.geometry.camera import Camera
 from mitsplat.scene.layout import Layout
 from mitsplat.scene.planning.conveyor import Belt
@@ -18,10 +16,10 @@ UNKNOWN_FLOW = 1e10
 
 
 def optical_flow(
-    depth: npt.NDArray[np.floating[Any]],
+    depth: FloatingArray,
     camera: Camera,
     next_camera: Camera,
-    ids: npt.NDArray[np.integer[Any]] | None = None,
+    ids: IntegerArray | None = None,
     motions: Mapping[int, Float64Array | None] | None = None,
     belt: Belt | None = None,
 ) -> Float32Array:
@@ -61,7 +59,7 @@ def optical_flow(
 
 
 def exposure_flow(
-    depth: npt.NDArray[np.floating[Any]],
+    depth: FloatingArray,
     camera: Camera,
     exposure: float,
     belt: Belt,

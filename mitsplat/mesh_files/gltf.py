@@ -9,13 +9,12 @@ from collections.abc import Iterator
 from dataclasses import replace
 from functools import cache, cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from mitsplat.arrays import Float64Array, Int64Array
+from mitsplat.arrays import AnyArray, Float64Array, Int64Array
 from mitsplat.errors import InputError
 from mitsplat.mesh_files.cut_outs import cut_out, opaque_texture
 from mitsplat.mesh_files.gltf_data import GltfData, normalised
@@ -154,7 +153,7 @@ class _GltfReader:
         total = np.maximum(weights.sum(axis=1, keepdims=True), 1e-12)
         return np.asarray(np.einsum("vj,vjab,vb->va", weights / total, poses[joints.astype(int)], at)[:, :3])
 
-    def _attribute(self, primitive: JsonObject, name: str) -> npt.NDArray[Any]:
+    def _attribute(self, primitive: JsonObject, name: str) -> AnyArray:
         return self._data.accessor(primitive["attributes"][name])
 
     def _read_primitive(self, mesh: int, number: int, weights: tuple[float, ...]) -> FilePart:
@@ -219,9 +218,9 @@ class _GltfReader:
             return cut_out(part, alpha, 255.0 * cutoff / factor[3], opacity)
         return part if factor[3] >= cutoff else replace(part, faces=part.faces[:0])
 
-    def _read_arrays(self, primitive: JsonObject) -> tuple[dict[str, npt.NDArray[Any]], Int64Array]:
+    def _read_arrays(self, primitive: JsonObject) -> tuple[dict[str, AnyArray], Int64Array]:
         """Return the positions, colours and texture coordinates of a primitive, and its indices."""
-        decoded: dict[str, npt.NDArray[Any]] = {}
+        decoded: dict[str, AnyArray] = {}
         indices = None
         if (compressed := primitive.get("extensions", {}).get("KHR_draco_mesh_compression")) is not None:
             decoded, indices = self._data.draco(compressed)

@@ -12,9 +12,9 @@ from typing import Any
 from urllib.parse import unquote_to_bytes
 
 import numpy as np
-import numpy.typing as npt
 from PIL import Image
 
+from mitsplat.arrays import AnyArray
 from mitsplat.errors import InputError, MissingResourceError
 from mitsplat.mesh_files.file_references import find_reference
 from mitsplat.mesh_files.mesh_file import item
@@ -111,7 +111,7 @@ class GltfData:
     def _has_data(self, index: Any) -> bool:
         return "uri" in self.entry("buffers", index) or (index == 0 and bool(self._binary))
 
-    def accessor(self, index: Any) -> npt.NDArray[Any]:
+    def accessor(self, index: Any) -> AnyArray:
         """Return the elements of an accessor, shape (count, components); normalised integers become floats."""
         stored = self.entry("accessors", index)
         kind, count = np.dtype(_TYPES[stored["componentType"]]), stored["count"]
@@ -127,7 +127,7 @@ class GltfData:
             values[rows] = self._elements(sparse["values"], kind, sparse["count"], width)
         return normalised(values) if stored.get("normalized") else values
 
-    def _elements(self, place: JsonObject, kind: np.dtype[Any], count: int, width: int) -> npt.NDArray[Any]:
+    def _elements(self, place: JsonObject, kind: np.dtype[Any], count: int, width: int) -> AnyArray:
         """Return ``count`` elements of a buffer view."""
         data, size = self.view(place["bufferView"]), width * kind.itemsize
         stride = self.entry("bufferViews", place["bufferView"]).get("byteStride") or size
@@ -136,7 +136,7 @@ class GltfData:
             raise ValueError("an accessor extends beyond its data")
         return np.ndarray((count, width), kind, data, start, (stride, kind.itemsize))
 
-    def draco(self, compressed: JsonObject) -> tuple[dict[str, npt.NDArray[Any]], npt.NDArray[Any]]:
+    def draco(self, compressed: JsonObject) -> tuple[dict[str, AnyArray], AnyArray]:
         """Return the attributes and faces of a primitive that is compressed by Draco.
 
         Raises:
@@ -198,7 +198,7 @@ class GltfData:
         return image
 
 
-def normalised(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
+def normalised(values: AnyArray) -> AnyArray:
     """Return integers as floats of at most 1 (glTF 2.0, 3.11); floats are not changed."""
     if values.dtype.kind == "f":
         return values

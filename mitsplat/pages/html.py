@@ -6,13 +6,12 @@ import base64
 import html
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
-from mitsplat.arrays import ByteImage
+from mitsplat.arrays import AnyArray, ByteImage
 from mitsplat.images.masks import Silhouette
 from mitsplat.storage.files import write_text
 
@@ -48,7 +47,7 @@ def make_figure(alt: str, caption: str, source: str) -> str:
     return f'<figure><img alt="{alt}" src="{source}"><figcaption>{caption}</figcaption></figure>'
 
 
-def inline_image(pixels: npt.NDArray[Any]) -> str:
+def inline_image(pixels: AnyArray) -> str:
     """Encode a picture in blue, green, red order (H, W, 3) as a data URL."""
     _, data = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, 82])
     return f"data:image/jpeg;base64,{base64.b64encode(bytes(data)).decode('ascii')}"

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
 import trimesh
 
-from mitsplat.arrays import Float64Array
+from mitsplat.arrays import Float64Array, IntegerArray
 from mitsplat.renderer.rays.device_arrays import plain_mesh
 from mitsplat.runtime.variant import ensure_variant
 
@@ -60,7 +58,7 @@ def edges_through_faces(mesh: trimesh.Trimesh, vertices: Float64Array) -> npt.ND
     return np.asarray(met[~(corners[:, :, None] == edges[met][:, None, :]).any(axis=(1, 2))])
 
 
-def _normals(vertices: Float64Array, faces: npt.NDArray[np.integer[Any]]) -> Float64Array:
+def _normals(vertices: Float64Array, faces: IntegerArray) -> Float64Array:
     """Return the normals of faces; their length is twice the area."""
     a, b, c = np.moveaxis(np.asarray(vertices)[faces], 1, 0)
     return np.cross(b - a, c - a)

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 import trimesh
 
-from mitsplat.arrays import BoolArray, Float32Array, Float64Array
+from mitsplat.arrays import AnyArray, BoolArray, Float32Array, Float64Array
 from mitsplat.errors import check_type
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.gaussians.splat_training import trained_kernel
@@ -23,6 +23,7 @@ from mitsplat.images.masks import Silhouette
 from mitsplat.quality import Quality, resolve_quality
 from mitsplat.renderer.lazy_value import LazyValue
 from mitsplat.renderer.rays.device_arrays import wrapped
+from mitsplat.renderer.scene_emitters import MitsubaDict
 from mitsplat.runtime.dropped_rays import check_dropped_rays
 from mitsplat.runtime.variant import ensure_variant, one_at_a_time
 
@@ -122,7 +123,7 @@ def _sensor_of(camera: Camera, _variant: str) -> mi.Sensor:
 
 def describe_sensor(
     camera: Camera,
-) -> dict[str, Any]:
+) -> MitsubaDict:
     """Return Mitsuba's dictionary of a camera."""
     pose = camera.world_from_camera @ np.diag([-1.0, -1.0, 1.0, 1.0])
     return {
@@ -204,7 +205,7 @@ def render_layers(integrator: mi.Integrator, scene: mi.Scene, camera: Camera, *,
     return Layers.on_device(layers, (camera.height, camera.width))
 
 
-def device_array(values: npt.NDArray[Any]) -> mi.Float | mi.Color3f:
+def device_array(values: AnyArray) -> mi.Float | mi.Color3f:
     """Upload values as flat row-major floats: (H, W) as Float, (H, W, 3) as Color3f."""
     ensure_variant()
     flat = wrapped(mi.Float, values.astype(np.float32, copy=False))

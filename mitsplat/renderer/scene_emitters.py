@@ -14,8 +14,11 @@ from mitsplat.images.colour import temperature_colour
 from mitsplat.runtime.variant import ensure_variant
 from mitsplat.scene.spec.light_spec import LightSpec
 
+MitsubaDict = dict[str, Any]
+"""Description of a Mitsuba object, as ``mi.load_dict`` reads it."""
 
-def emitter_dict(light: LightSpec, folder: Path | None = None) -> dict[str, Any]:
+
+def emitter_dict(light: LightSpec, folder: Path | None = None) -> MitsubaDict:
     """Return Mitsuba's description of one light; environment images are relative to ``folder``."""
     ensure_variant()
     colour = np.asarray(light.colour)
@@ -49,7 +52,7 @@ def emitter_dict(light: LightSpec, folder: Path | None = None) -> dict[str, Any]
     }
 
 
-def movable(description: dict[str, Any]) -> dict[str, Any] | mi.Shape:
+def movable(description: MitsubaDict) -> MitsubaDict | mi.Shape:
     """Return an emitter whose pose may change in every frame without a new compilation of kernels.
 
     A rectangle is loaded here and its pose made opaque. Its frame is then computed on the device, and may differ in the
@@ -66,7 +69,7 @@ def movable(description: dict[str, Any]) -> dict[str, Any] | mi.Shape:
     return shape
 
 
-def _rgb(value: Float64Array) -> dict[str, Any]:
+def _rgb(value: Float64Array) -> MitsubaDict:
     return {"type": "rgb", "value": value.tolist()}
 
 

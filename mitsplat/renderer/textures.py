@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -13,6 +12,7 @@ import trimesh
 from mitsplat.arrays import ByteImage, Float64Array
 from mitsplat.images.colour import decode_srgb
 from mitsplat.renderer.rays.device_arrays import plain_mesh, wrapped
+from mitsplat.renderer.scene_emitters import MitsubaDict
 from mitsplat.scene.planning.layout_surroundings import MaterialDraw
 from mitsplat.scene.spec.shape_spec import Shape
 from mitsplat.scene.walls import pose_matrix
@@ -53,7 +53,7 @@ def read_image(path: Path) -> ByteImage:
     return np.array(bitmap)
 
 
-def material(finish: MaterialDraw, texture: dict[str, Any] | None) -> dict[str, Any]:
+def material(finish: MaterialDraw, texture: MitsubaDict | None) -> MitsubaDict:
     """Return Mitsuba's material of a finish.
 
     Args:
@@ -64,7 +64,7 @@ def material(finish: MaterialDraw, texture: dict[str, Any] | None) -> dict[str, 
     return {"type": "diffuse", "reflectance": colour}
 
 
-def bitmap_texture(image: ByteImage) -> dict[str, Any]:
+def bitmap_texture(image: ByteImage) -> MitsubaDict:
     """Return Mitsuba's texture of an sRGB-encoded image (H, W, 3)."""
     return {"type": "bitmap", "bitmap": mi.Bitmap(image), "wrap_mode": "repeat"}
 

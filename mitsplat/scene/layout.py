@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from numbers import Integral
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -14,6 +13,7 @@ from mitsplat.arrays import Float64Array
 from mitsplat.errors import InputError, describe
 from mitsplat.scene.given_poses import asset_index, rigid_pose
 from mitsplat.scene.scene import Scene
+from mitsplat.storage.files import JsonObject
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +66,7 @@ class RestCertificate:
     attempts: int
     refused: tuple[str, ...] = ()
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> JsonObject:
         """Return the certificate as JSON values."""
         return {**vars(self), "refused": list(self.refused)}
 
@@ -184,7 +184,7 @@ class Layout:
         )
         return cls(index, instances, NO_PHYSICS)
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> JsonObject:
         """Return the layout as JSON values. Floats survive the round trip exactly."""
         return {
             "index": self.index,
@@ -197,7 +197,7 @@ class Layout:
         }
 
     @classmethod
-    def from_json(cls, stored: Mapping[str, Any]) -> Layout:
+    def from_json(cls, stored: JsonObject) -> Layout:
         """Return the layout from the values of :meth:`to_json`."""
         return cls(
             index=stored["index"],

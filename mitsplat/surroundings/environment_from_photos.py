@@ -25,6 +25,7 @@ from mitsplat.progress import Progress
 from mitsplat.reconstruct.asset_evaluation import HeldOutView, show_asset
 from mitsplat.reconstruct.reconstruct import AssetJob, ImportedMesh, Reconstruction, reconstruct_asset
 from mitsplat.reconstruct.surface import reconstruct_surface
+from mitsplat.storage.files import JsonObject
 from mitsplat.surroundings.coverage import (
     MIN_PHOTOS,
     Coverage,
@@ -148,7 +149,7 @@ class _Surfaces(NamedTuple):
     rows: dict[str, str]
     findings: list[str]
     map: str
-    record: dict[str, Any]
+    record: JsonObject
 
 
 def _describe_surfaces(
@@ -184,7 +185,7 @@ def _describe_surfaces(
     region = _region(coverage, found[0], factor)
     unit = "m" if metric else "units"
     rows = _rows(supports, coverage, holes, region, factor, unit)
-    record: dict[str, Any] = {}
+    record: JsonObject = {}
     if removed:
         rows["Removed objects"] = "; ".join(_removal_text(one, factor, unit) for one in removed)
         record["removed_objects"] = [

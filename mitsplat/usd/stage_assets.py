@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import trimesh
@@ -21,6 +21,7 @@ from mitsplat.gaussians.splat_cloud import Splats, split_similarity
 from mitsplat.gaussians.splat_materials import SplatMaterials
 from mitsplat.geometry.decomposition import convex_pieces
 from mitsplat.geometry.mesh import mass_properties, prepare_mesh
+from mitsplat.storage.files import JsonObject
 from mitsplat.usd.stage_records import Record, read_records
 
 _ENCODED = ("", "srgb_rec709_scene", "srgb_rec709_display", "srgb_texture", "sRGB", "auto", "raw")
@@ -166,8 +167,8 @@ def make_asset(path: Path, records: Record, body: str | None, splats: Splats, no
         mesh = trimesh.util.concatenate([placed_mesh(one, frame_from_world) for one in proxies])
     else:
         mesh = trimesh.boolean.union(list(pieces), engine="manifold") if len(pieces) > 1 else pieces[0]
-    values: Mapping[str, Any] = next((one["metadata"] for one in records["fields"] if one["body"] == body), {})
-    contact: dict[str, Any] = {}
+    values: JsonObject = next((one["metadata"] for one in records["fields"] if one["body"] == body), {})
+    contact: JsonObject = {}
     for name, default in (("friction", _DEFAULT_FRICTION), ("restitution", 0.0)):
         stated = sorted({round(one[name], 6) for one in colliders if one[name] is not None})
         if len(stated) > 1:

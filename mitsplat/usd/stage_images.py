@@ -9,6 +9,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
+from mitsplat.storage.files import JsonObject
+
 if TYPE_CHECKING:
     from pxr import Usd
 
@@ -17,7 +19,7 @@ EXPAND = "expandAperture"
 _WINDOW = (0.0, 0.0, 1.0, 1.0)
 
 
-def image_settings(stage: Usd.Stage, camera: Usd.Prim, time: Usd.TimeCode) -> dict[str, Any]:
+def image_settings(stage: Usd.Stage, camera: Usd.Prim, time: Usd.TimeCode) -> JsonObject:
     """Return the image of a camera by its first render product, or else by the render settings of the stage.
 
     Returns:

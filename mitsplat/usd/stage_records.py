@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO, cast
 import numpy as np
 import numpy.typing as npt
 
-from mitsplat.arrays import Float32Array, Float64Array
+from mitsplat.arrays import AnyArray, Float32Array, Float64Array
 from mitsplat.errors import InputError
 from mitsplat.geometry.rigid import Z_UP_FROM_Y_UP
 from mitsplat.runtime.child_process import run_bounded
@@ -88,14 +88,14 @@ def read_records(path: Path, images: int | None = 1) -> Record:
 
 def write_records(output: BinaryIO, _: bytes, path: str, images: str) -> None:
     """Read a stage and write its records, as the child's part of :func:`read_records`."""
-    arrays: dict[str, npt.NDArray[Any]] = {}
+    arrays: dict[str, AnyArray] = {}
     reader = _StageReader(open_confined(Path(path)), int(images) or None)
     text = json.dumps(_without_arrays(reader.read(), arrays))
     arrays["records"] = np.frombuffer(text.encode(), dtype=np.uint8)
     np.savez(output, allow_pickle=False, **arrays)
 
 
-def _without_arrays(value: Any, arrays: dict[str, npt.NDArray[Any]]) -> Any:
+def _without_arrays(value: Any, arrays: dict[str, AnyArray]) -> Any:
     """Return a record whose arrays are replaced by their names in ``arrays``."""
     if isinstance(value, np.ndarray):
         arrays[f"a{len(arrays)}"] = value
@@ -105,7 +105,7 @@ def _without_arrays(value: Any, arrays: dict[str, npt.NDArray[Any]]) -> Any:
     return [_without_arrays(one, arrays) for one in value] if isinstance(value, list) else value
 
 
-def _with_arrays(value: Any, arrays: dict[str, npt.NDArray[Any]]) -> Any:
+def _with_arrays(value: Any, arrays: dict[str, AnyArray]) -> Any:
     if isinstance(value, dict):
         if value.keys() == {"array"}:
             return arrays[value["array"]]

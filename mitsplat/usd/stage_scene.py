@@ -97,7 +97,7 @@ def read_stage_scene(
         raise InputError(f"{path}: must have particle fields with a semantic class, UsdSemantics.LabelsAPI (got none)")
     with storage_errors(folder):
         entries, poses = _write_objects(path, folder, records, groups, frames, notes)
-        data: dict[str, Any] = {"name": path.stem, "objects": entries, "shapes": _shapes(records, folder)}
+        data: JsonObject = {"name": path.stem, "objects": entries, "shapes": _shapes(records, folder)}
         if hidden := [one["path"] for one in records["meshes"] if one["visible"] and one["body"] is not None]:
             notes.append(f"not rendered: meshes of rigid bodies; only their splats are: {', '.join(hidden)}")
         if surroundings:
@@ -331,7 +331,7 @@ def _lights(path: Path, record: Record, folder: Path, notes: list[str]) -> list[
     peak = float(colour.max())
     if strength * peak <= 0:
         return []
-    entry: dict[str, Any] = {"colour": (colour / peak).tolist()}
+    entry: JsonObject = {"colour": (colour / peak).tolist()}
     strength *= peak
     is_normalised = bool(inputs.get("normalize"))
     place = {"position": position.tolist(), "target": (position + normal).tolist()}

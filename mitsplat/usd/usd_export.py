@@ -33,7 +33,7 @@ from mitsplat.physics.settle import warp_settings
 from mitsplat.physics.worlds import CONTACT_DAMPING, CONTACT_STIFFNESS, IMPEDANCE_MUJOCO, WITH_ROLL, Body, Collider
 from mitsplat.scene.scene import Scene
 from mitsplat.scene.spec.light_spec import EnvironmentLight, LightSpec
-from mitsplat.storage.files import library_errors, storage_errors, write_file
+from mitsplat.storage.files import JsonObject, library_errors, storage_errors, write_file
 from mitsplat.usd.frame_content import FrameContent, frame_content
 from mitsplat.usd.stage_records import METADATA
 from mitsplat.usd.usd_layers import is_usd, require_usd
@@ -379,7 +379,7 @@ class _StageWriter:
         self._place(made.GetPrim(), pose)
 
 
-def _metadata(asset: Asset) -> dict[str, Any]:
+def _metadata(asset: Asset) -> JsonObject:
     """Return the values of an asset that no schema of USD has."""
     from pxr import Gf  # optional
 

@@ -7,13 +7,12 @@ import shutil
 import subprocess
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from mitsplat.errors import InputError
 from mitsplat.progress import Progress
 from mitsplat.runtime.child_process import python_command, python_environment
 from mitsplat.storage.content_hash import file_hash
-from mitsplat.storage.files import write_text
+from mitsplat.storage.files import JsonObject, write_text
 
 _RECORD = "video.json"
 _METHOD = 1
@@ -97,7 +96,7 @@ def choose_frames(
     return _chosen_frames(video, folder, found)
 
 
-def _load_finished(video: Path, folder: Path, inputs: dict[str, Any]) -> ChosenFrames | None:
+def _load_finished(video: Path, folder: Path, inputs: JsonObject) -> ChosenFrames | None:
     """Return the frames of an earlier run if they are complete and have the same inputs, else None."""
     try:
         record = json.loads((folder / _RECORD).read_text())
@@ -109,11 +108,11 @@ def _load_finished(video: Path, folder: Path, inputs: dict[str, Any]) -> ChosenF
     return chosen if {path.name for path in folder.glob("*.jpg")} == set(chosen.names) else None
 
 
-def _chosen_frames(video: Path, folder: Path, found: dict[str, Any]) -> ChosenFrames:
+def _chosen_frames(video: Path, folder: Path, found: JsonObject) -> ChosenFrames:
     return ChosenFrames(video, folder, **found | {"names": tuple(found["names"]), "cuts": tuple(found["cuts"])})
 
 
-def _run_worker(video: Path, folder: Path, most: int, least: int, progress: Progress | None) -> dict[str, Any]:
+def _run_worker(video: Path, folder: Path, most: int, least: int, progress: Progress | None) -> JsonObject:
     """Run the child process that writes the frames, and return its result."""
     command = python_command("-m", "mitsplat.capture.video.video_worker", video, folder, str(most), str(least))
     # Excludes playlists, which FFmpeg would follow to other files.

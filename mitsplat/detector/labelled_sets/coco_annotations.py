@@ -12,12 +12,13 @@ from mitsplat.arrays import Float64Array
 from mitsplat.detector.labelled_sets.labelled_set import LabelledObject, ascii_rle, clip_points
 from mitsplat.errors import InputError
 from mitsplat.images.masks import decode_rle
+from mitsplat.storage.files import JsonObject
 
 _BOX_TOLERANCE = 2.0
 """Largest difference of a box from the bounds of its segmentation at which both are the same [px]."""
 
 
-def read_annotation(annotation: dict[str, Any], class_index: int, size: tuple[int, int], path: Path) -> LabelledObject:
+def read_annotation(annotation: JsonObject, class_index: int, size: tuple[int, int], path: Path) -> LabelledObject:
     """Return the labelled object of an annotation in an image of this width and height [px].
 
     Raises:
@@ -48,7 +49,7 @@ def read_annotation(annotation: dict[str, Any], class_index: int, size: tuple[in
     return LabelledObject(class_index, (x0, y0, x1, y1), None, None if rle is None else ascii_rle(rle), bool(crowd))
 
 
-def _read_segmentation(given: Any, size: tuple[int, int], place: str) -> dict[str, Any]:
+def _read_segmentation(given: Any, size: tuple[int, int], place: str) -> JsonObject:
     """Return polygons, or compressed or plain run lengths, as COCO's compressed run-length code.
 
     Raises:
@@ -78,7 +79,7 @@ def _read_segmentation(given: Any, size: tuple[int, int], place: str) -> dict[st
     return dict(rle)
 
 
-def _check_box_of_mask(box: Float64Array, corners: Float64Array, rle: dict[str, Any], place: str) -> None:
+def _check_box_of_mask(box: Float64Array, corners: Float64Array, rle: JsonObject, place: str) -> None:
     """Check that a box as x, y, width, height, whose clipped corners are given, encloses its mask.
 
     Raises:
@@ -101,7 +102,7 @@ def _check_box_of_mask(box: Float64Array, corners: Float64Array, rle: dict[str, 
         raise InputError(f"{place}: bbox must enclose its segmentation, which {span} (got {got})")
 
 
-def _check_box_alone(annotation: dict[str, Any], box: Float64Array, place: str) -> None:
+def _check_box_alone(annotation: JsonObject, box: Float64Array, place: str) -> None:
     """Check the rotation and the area that an annotation without segmentation states for its box.
 
     Raises:

@@ -21,7 +21,7 @@ from mitsplat.detector.labelled_sets.labelled_set import (
 from mitsplat.detector.labelled_sets.pictures import check_image, images_below
 from mitsplat.errors import InputError
 from mitsplat.progress import Progress
-from mitsplat.storage.files import is_inside, read_json
+from mitsplat.storage.files import JsonObject, is_inside, read_json
 
 _MAX_COCO_BYTES = 1 << 32
 """Largest COCO file that is read [bytes]; the file of COCO's 118,287 training images has 0.45e9 bytes."""
@@ -47,7 +47,7 @@ def read_coco(root: Path, split: Split, progress: Progress | None) -> LabelledSe
     return replace(parts[0], samples=samples)
 
 
-def _coco_part(root: Path, split: Split, path: Path, content: dict[str, Any], progress: Progress | None) -> LabelledSet:
+def _coco_part(root: Path, split: Split, path: Path, content: JsonObject, progress: Progress | None) -> LabelledSet:
     """Return the labelled images of one COCO file."""
     try:
         used = {annotation["category_id"] for annotation in content["annotations"]}
@@ -58,7 +58,7 @@ def _coco_part(root: Path, split: Split, path: Path, content: dict[str, Any], pr
         categories.sort(key=lambda category: category["id"])
         names = tuple(str(category["name"]) for category in categories)
         index = {category["id"]: i for i, category in enumerate(categories)}
-        by_image: dict[Any, list[dict[str, Any]]] = {image["id"]: [] for image in content["images"]}
+        by_image: dict[Any, list[JsonObject]] = {image["id"]: [] for image in content["images"]}
         for annotation in content["annotations"]:
             for key, known in (("image_id", by_image), ("category_id", index)):
                 if annotation[key] not in known:
@@ -78,7 +78,7 @@ def _coco_part(root: Path, split: Split, path: Path, content: dict[str, Any], pr
         raise InputError(f"{path}: bbox must be in pixels (got at most 1 in every annotation: are they fractions?)")
     find = _image_finder(root, path)
 
-    def read(image: dict[str, Any]) -> Sample:
+    def read(image: JsonObject) -> Sample:
         file = find(str(image.get("file_name")))
         width, height, shown = check_image(file)
         if (image.get("width", width), image.get("height", height)) != (width, height):
@@ -98,7 +98,7 @@ def _coco_part(root: Path, split: Split, path: Path, content: dict[str, Any], pr
     return LabelledSet(root, "coco", split, names, read_samples(read, images, root, progress))
 
 
-def _coco_files(root: Path, split: Split) -> dict[Path, dict[str, Any]]:
+def _coco_files(root: Path, split: Split) -> dict[Path, JsonObject]:
     """Return the COCO files of a split and their contents: one file, or all files for the split ``all``."""
     folders = (root, *(root / name for name in ("annotations", *_SPLIT_FOLDERS)))
     paths = [path for folder in folders for path in sorted(folder.glob("*.json"))]

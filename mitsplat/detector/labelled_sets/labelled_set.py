@@ -17,6 +17,7 @@ from mitsplat.images.masks import decode_rle, encode_mask
 from mitsplat.labels.polygons import fill_polygon, outline
 from mitsplat.progress import Progress
 from mitsplat.storage.content_hash import ContentHash
+from mitsplat.storage.files import JsonObject
 
 Split = Literal["train", "val", "test", "all"]
 
@@ -39,7 +40,7 @@ class LabelledObject:
     class_index: int
     box: tuple[float, float, float, float]
     polygon: Float64Array | None = None
-    rle: dict[str, Any] | None = None
+    rle: JsonObject | None = None
     crowd: bool = False
 
     @property
@@ -47,7 +48,7 @@ class LabelledObject:
         """True if the label has an outline or a mask, not only a box."""
         return self.polygon is not None or self.rle is not None
 
-    def encode_mask(self, width: int, height: int) -> dict[str, Any]:
+    def encode_mask(self, width: int, height: int) -> JsonObject:
         """Return the mask in an image of this size [px] as COCO's compressed run-length code.
 
         For a label without a mask, the mask is the filled box.
@@ -109,7 +110,7 @@ class LabelledSet:
     class_names: tuple[str, ...]
     samples: tuple[Sample, ...]
 
-    def to_record(self) -> dict[str, Any]:
+    def to_record(self) -> JsonObject:
         """Return the record of the set; its digest covers images, labels and classes."""
         sha = ContentHash()
         sha.add_json([self.class_names, [(sample.name, sample.digest) for sample in self.samples]])
@@ -164,7 +165,7 @@ def check_masks(found: LabelledSet) -> None:
             )
 
 
-def ascii_rle(rle: dict[str, Any]) -> dict[str, Any]:
+def ascii_rle(rle: JsonObject) -> JsonObject:
     """Return a run-length code of pycocotools with its counts as text."""
     return {"size": [int(side) for side in rle["size"]], "counts": rle["counts"].decode("ascii")}
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from ruamel.yaml import YAML
@@ -22,7 +22,7 @@ from mitsplat.detector.labelled_sets.labelled_set import (
 from mitsplat.detector.labelled_sets.pictures import check_image, images_below
 from mitsplat.errors import InputError
 from mitsplat.progress import Progress
-from mitsplat.storage.files import SPLITS
+from mitsplat.storage.files import SPLITS, JsonObject
 
 CLASSES_FILE = "classes.txt"
 """Class names in YOLO exports of Label Studio, one a line; all their images belong to every split."""
@@ -62,7 +62,7 @@ def read_mitsplat(root: Path, split: Split, progress: Progress | None) -> Labell
     return _read_images(root, "mitsplat", split, classes, {name: [f"images/{name}"] for name in SPLITS}, progress)
 
 
-def _read_yaml(path: Path) -> dict[str, Any]:
+def _read_yaml(path: Path) -> JsonObject:
     try:
         content = YAML(typ="safe", pure=True).load(path)
     except (OSError, ValueError, RecursionError, YAMLError) as error:
@@ -72,7 +72,7 @@ def _read_yaml(path: Path) -> dict[str, Any]:
     return content
 
 
-def _class_names(content: dict[str, Any], path: Path) -> tuple[str, ...]:
+def _class_names(content: JsonObject, path: Path) -> tuple[str, ...]:
     names = content.get("names")
     if isinstance(names, dict) and names.keys() == set(range(len(names))):
         names = [names[i] for i in range(len(names))]

@@ -14,6 +14,7 @@ from mitsplat.frames.scene_builder import SceneBuilder
 from mitsplat.renderer.materials.proxy_materials import MaterialColumns, part_materials
 from mitsplat.renderer.occluders.proxies import Occluder, world_corners
 from mitsplat.renderer.rays.device_arrays import wrapped
+from mitsplat.renderer.scene_emitters import MitsubaDict
 from mitsplat.scene.layout import Layout
 from mitsplat.scene.scene import Scene
 
@@ -30,7 +31,7 @@ def without_materials(scene: Scene) -> Scene:
 class MeshSceneBuilder(SceneBuilder):
     """Builder of scenes whose objects are visible meshes: their proxies with the BSDF ``principled``."""
 
-    def describe(self, layout: Layout, *arguments: Any, **keywords: Any) -> dict[str, Any]:
+    def describe(self, layout: Layout, *arguments: Any, **keywords: Any) -> MitsubaDict:
         """Return Mitsuba's scene dictionary, see :meth:`SceneBuilder.describe`."""
         shapes = super().describe(layout, *arguments, **keywords)
         splats = {name: shape for name, shape in shapes.items() if getattr(shape, "instance", 0)}

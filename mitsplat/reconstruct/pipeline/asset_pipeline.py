@@ -12,7 +12,7 @@ import json
 import math
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from mitsplat.asset import ASSET_FILE, read_spec
 from mitsplat.capture.capture import Capture
@@ -29,7 +29,7 @@ from mitsplat.reconstruct.materials.capture_light import CaptureLight, require_l
 from mitsplat.reconstruct.materials.estimation import estimate_materials
 from mitsplat.reconstruct.reconstruct import AssetJob, Reconstruction, reconstruct_asset
 from mitsplat.storage.content_hash import ContentHash, file_hash
-from mitsplat.storage.files import write_text
+from mitsplat.storage.files import JsonObject, write_text
 from mitsplat.surroundings.environment_from_photos import reconstruct_environment
 from mitsplat.surroundings.ready_scene import recorded_scene, write_scene
 from mitsplat.version import __version__
@@ -232,7 +232,7 @@ _REMOVED_FIELDS = ("outside", "unseen", "needles", "floaters")
 
 
 def _save_verdict(out: Path, result: Reconstruction, inputs: str) -> None:
-    record: dict[str, Any] = {"inputs": inputs, **asdict(result.verdict), **result.record}
+    record: JsonObject = {"inputs": inputs, **asdict(result.verdict), **result.record}
     record[ASSET_FILE] = file_hash(out / ASSET_FILE)
     record["asset_from_capture"] = result.asset_from_capture.tolist()
     if result.isolation is not None:

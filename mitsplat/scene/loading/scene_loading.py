@@ -23,6 +23,7 @@ from mitsplat.scene.spec.scene_spec import SCHEMA_VERSION, SceneSpec
 from mitsplat.scene.spec.shape_spec import Region
 from mitsplat.scene.walls import backdrop_shapes, enclosure_walls
 from mitsplat.storage.file_kinds import refuse_other_kinds
+from mitsplat.storage.files import JsonObject
 from mitsplat.storage.yaml_input import key_place, load_yaml
 
 _PYTHON_SCENE_NAME = "<python>.yaml"
@@ -167,7 +168,7 @@ def _check_hold_out(spec: SceneSpec, path: Path) -> None:
         )
 
 
-def scene_json_schema() -> dict[str, Any]:
+def scene_json_schema() -> JsonObject:
     """Return the JSON schema of scene files, for editors."""
     named = {"$schema": "https://json-schema.org/draft/2020-12/schema", "$id": f"urn:mitsplat:scene:{SCHEMA_VERSION}"}
     return {**named, **SceneSpec.model_json_schema()}

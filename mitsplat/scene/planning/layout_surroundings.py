@@ -8,7 +8,6 @@ from __future__ import annotations
 import colorsys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 
@@ -19,6 +18,7 @@ from mitsplat.scene.spec.shape_spec import Shape
 from mitsplat.scene.splits import draw_environment
 from mitsplat.scene.streams import random_stream
 from mitsplat.scene.walls import material_name
+from mitsplat.storage.files import JsonObject
 
 Colour = tuple[float, float, float]
 
@@ -48,7 +48,7 @@ class MaterialDraw:
     image: str | None = None
     seed: int = 0
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> JsonObject:
         """Return the material as JSON values, without the values that its kind does not have."""
         return {name: value for name, value in vars(self).items() if value not in (None, ())}
 
@@ -71,7 +71,7 @@ class BackgroundDraw:
     rotate: float
     gain: float
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> JsonObject:
         """Return the background as JSON values."""
         return dict(vars(self))
 
@@ -98,9 +98,9 @@ class LayoutSurroundings:
         """Return the drawn material of a shape, or its fixed colour."""
         return self.materials.get(material_name(shape.name)) or MaterialDraw("colour", (shape.colour,))
 
-    def to_json(self, spec: SceneSpec) -> dict[str, Any]:
+    def to_json(self, spec: SceneSpec) -> JsonObject:
         """Return the values that the scene file leaves open as JSON values; empty if there are none."""
-        values: dict[str, Any] = {}
+        values: JsonObject = {}
         if isinstance(spec.environment, tuple):
             values["environment"] = {"number": self.environment, "name": spec.environment[self.environment]}
         if self.materials:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 
@@ -16,6 +15,7 @@ from mitsplat.images.colour import hue_matrix, saturation_matrix
 from mitsplat.scene.layout import Instance, Layout
 from mitsplat.scene.scene import Scene
 from mitsplat.scene.streams import random_stream
+from mitsplat.storage.files import JsonObject
 
 WEAR_SEEDS = 1 << 23
 """Number of dirt patterns. Their indices are exact in single precision."""
@@ -49,14 +49,14 @@ class ObjectAppearance:
     wear: float
     wear_seed: int
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> JsonObject:
         """Return the appearance as JSON values for the manifest."""
         return {**vars(self), "gain": list(self.gain)}
 
-    def properties(self) -> dict[str, Any]:
+    def properties(self) -> dict[str, float | str]:
         """Return properties for the shape plugin ``splats``. Unchanged colours and absent dirt have no property."""
         matrix = np.diag(np.multiply(self.gain, self.value)) @ saturation_matrix(self.saturation) @ hue_matrix(self.hue)
-        found: dict[str, Any] = {"roughness": self.roughness, "specular": self.specular}
+        found: dict[str, float | str] = {"roughness": self.roughness, "specular": self.specular}
         if (self.hue, self.saturation, self.value, *self.gain) != (0.0, 1.0, 1.0, 1.0, 1.0, 1.0):
             found["colours"] = " ".join(repr(float(number)) for number in matrix.ravel())
         if self.wear:

@@ -29,6 +29,7 @@ from mitsplat.scene.spec.camera_spec import (
 )
 from mitsplat.scene.spec.scene_spec import Output, SceneSpec
 from mitsplat.scene.streams import random_stream
+from mitsplat.storage.files import JsonObject
 
 if TYPE_CHECKING:
     from mitsplat.scene.layout import Layout
@@ -102,7 +103,7 @@ def check_eye(scene: Scene, index: int, layout: Layout, camera: Camera) -> None:
         raise InputError(f"{scene.path}: the camera of frame {index} must not be in a solid (it is in {solid})")
 
 
-def _camera_of_frame(spec: SceneSpec, index: int, pose: Float64Array) -> tuple[Camera, dict[str, Any]]:
+def _camera_of_frame(spec: SceneSpec, index: int, pose: Float64Array) -> tuple[Camera, JsonObject]:
     """Return the camera of a frame at a pose, and the values drawn for it."""
     drawn, motion = dict[str, Any](), spec.camera.motion
     if motion is not None:

@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 import trimesh
@@ -21,6 +21,7 @@ from mitsplat.arrays import BoolArray, Float64Array, Int64Array
 from mitsplat.geometry.camera import Camera
 from mitsplat.geometry.mesh_points import points_inside
 from mitsplat.scene.planning.shape_poses import placed_shapes
+from mitsplat.storage.files import JsonObject
 
 if TYPE_CHECKING:
     from mitsplat.scene.layout import Instance, Layout
@@ -83,7 +84,7 @@ class PredictedView:
     hidden: int
     cut: int
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> JsonObject:
         """Return the counts as JSON values for the dataset."""
         return {"in_view": self.in_view, "hidden": self.hidden, "cut": self.cut}
 

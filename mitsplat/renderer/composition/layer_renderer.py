@@ -106,9 +106,9 @@ class LayerRenderer:
         radiance = self._radiance(contents, scene, view, rays, meshes, shown, white, paths, seed)
         light, highlight = mi.Color3f(1), mi.Color3f(0)
         if self.shadow == "traced" and scene.emitters():
-            mesh = shown.diffuse & shown.front
             metallic, roughness, luminance = self._border_materials(contents, view, hit, splat, z_max)
             shown = shown.with_luminance(luminance)
+            mesh = shown.diffuse & shown.front
             seen = VisiblePixels(
                 rays.d,
                 shown.cover,
@@ -123,18 +123,8 @@ class LayerRenderer:
             # Visible meshes receive light like static proxies, also where splats touch them.
             ground = meshes.before(static) if meshes else static
             dr.eval(seen, ground)
-            light, highlight = light_factor(
-                scene,
-                contents.proxies,
-                VisibleSurfaces(contents.traits, view, contents.proxies, rays.o, seen, hit, ground),
-                accuracy=accuracy,
-                seed=seed,
-                reference=self.reference,
-                white=white,
-                sky_reach=self.sky_reach or np.inf,
-                grid=contents.grid,
-                bounce=self.bounce,
-            )
+            visible = VisibleSurfaces(contents.traits, view, contents.proxies, rays.o, seen, hit, ground)
+            light, highlight = self._light(contents, scene, visible, accuracy, seed, white)
         if not self.highlight:
             highlight = mi.Color3f(0)
         rgb, captured = shown.lit(light, highlight, radiance)
@@ -155,6 +145,29 @@ class LayerRenderer:
         if self.quality.samples == "edges":
             layers |= self._smooth_edges(contents, scene, view, layers, shown.key, radiance, white)
         return layers
+
+    def _light(
+        self,
+        contents: SceneContents,
+        scene: mi.Scene,
+        visible: VisibleSurfaces,
+        accuracy: Accuracy,
+        seed: int,
+        white: mi.Color3f,
+    ) -> tuple[mi.Color3f, mi.Color3f]:
+        """Trace the light factor and the highlight (Color3f) of visible surfaces."""
+        return light_factor(
+            scene,
+            contents.proxies,
+            visible,
+            accuracy=accuracy,
+            seed=seed,
+            reference=self.reference,
+            white=white,
+            sky_reach=self.sky_reach or np.inf,
+            grid=contents.grid,
+            bounce=self.bounce,
+        )
 
     def _smooth_edges(
         self,

@@ -81,20 +81,87 @@ def pair_records(
     count = dr.width(least)
     if count > 1 << NUMBER_BITS or view.tiles_x * view.tiles_y > TILES_MAX:
         raise CrowdedError
+    # Rows first: one lane finds the spans of one record, then one lane fills one span.
+    spans = _spans_of_rows(records, count, box, view, quality, subset)
+    if spans is None:
+        return None
+    pair_of, pairs = prefix_ranges(spans.length, view.tiles_x)
+    if pairs == 0:
+        return None
+    record = GaussianRecord.fetch(records, spans.owner)
+    ellipsoid = dr.gather(mi.Float, least, spans.owner)
+    key, number = dr.empty(mi.UInt64, pairs), dr.empty(mi.UInt32, pairs) if numbered else None
+
+    def in_view(tile: mi.UInt32, active: mi.Bool = True) -> mi.UInt32:
+        return tile if subset is None else dr.gather(mi.UInt32, subset.number, tile, active)
+
+    if groups is None:
+        first_in_view = in_view(spans.first_tile, spans.length > 0)
+        depth_of = depths_by_tile(record, plane_records, ellipsoid, first_in_view, view, quality)
+    else:
+        group = dr.gather(mi.UInt32, groups, spans.owner)
+
+    def one_tile(k: mi.UInt32) -> tuple[mi.UInt32]:
+        tile, pair = spans.first_tile + k, pair_of + k
+        level = level_of(depth_of(in_view(tile)), view) if groups is None else group
+        own = Pairs.key_of(tile, level, pair if numbered else spans.owner)
+        dr.scatter(key, own, pair, mode=dr.ReduceMode.Permute)
+        if numbered:
+            dr.scatter(number, spans.owner, pair, mode=dr.ReduceMode.Permute)
+        return (k + 1,)
+
+    rows = dr.width(spans.owner)
+    dr.while_loop((dr.zeros(mi.UInt32, rows),), lambda k: k < spans.length, one_tile, label="pairs")
+    if not numbered:
+        dr.eval(key)
+        return Pairs(key)
+    first = dr.empty(mi.UInt32, count + 1)
+    end, inside = dr.opaque(mi.UInt32, pairs), spans.first_row < dr.opaque(mi.UInt32, rows)
+    first_pair = dr.gather(mi.UInt32, pair_of, spans.first_row, inside)
+    dr.scatter(first, dr.select(inside, first_pair, end), dr.arange(mi.UInt32, count))
+    dr.scatter(first, end, dr.opaque(mi.UInt32, count))
+    dr.eval(key, number, first)
+    return Pairs(key, number, first)
+
+
+@dataclass(frozen=True, eq=False)
+class _Spans:
+    """Consecutive tiles of one row that the ellipse of a record intersects, record after record.
+
+    Attributes:
+        owner: Record number of each span.
+        first_tile: First tile of each span, as a place in the subset.
+        length: Number of tiles of each span, 0 for none.
+        first_row: First span of each record.
+    """
+
+    owner: mi.UInt32
+    first_tile: mi.UInt32
+    length: mi.UInt32
+    first_row: mi.UInt32
+
+
+def _spans_of_rows(
+    records: mi.Float,
+    count: int,
+    box: mi.UInt32,
+    view: CameraView,
+    quality: Quality,
+    subset: TileSubset | TileBox | None,
+) -> _Spans | None:
+    """Find the spans of ``count`` records in every row of their tile boxes; return None if there are no rows."""
     order = dr.arange(mi.UInt32, count)
     x0, x1, y0, y1 = dr.gather(mi.Array4u, box, order)
-    row_of, rows = prefix_ranges(dr.select(y1 > y0, y1 - y0, 0), view.tiles_y)
+    first_row, rows = prefix_ranges(dr.select(y1 > y0, y1 - y0, 0), view.tiles_y)
     if rows == 0:
         return None
-    # Rows first: one lane finds the spans of one record, then one lane fills one span.
     cut = dr.log2(dr.opaque(mi.Float, quality.alpha_min))
-    owner, first_tile = dr.empty(mi.UInt32, rows), dr.empty(mi.UInt32, rows)
-    length = dr.empty(mi.UInt32, rows)
-    span_of = _spans(GaussianRecord.fetch(records, order), cut, x0, x1, view)
+    owner, first_tile, length = (dr.empty(mi.UInt32, rows) for _ in range(3))
+    span_of = _span_function(GaussianRecord.fetch(records, order), cut, x0, x1, view)
 
     def one_row(y: mi.UInt32) -> tuple[mi.UInt32]:
         lo, hi = span_of(y)
-        row = row_of + (y - y0)
+        row = first_row + (y - y0)
         begin, size = y * view.tiles_x + lo, dr.select(hi > lo, hi - lo, 0)
         if subset is not None:
             begin, size = subset.among(begin, size)
@@ -105,40 +172,7 @@ def pair_records(
 
     dr.while_loop((mi.UInt32(y0),), lambda y: y < y1, one_row, label="spans of tiles")
     dr.eval(owner, first_tile, length)
-    pair_of, pairs = prefix_ranges(length, view.tiles_x)
-    if pairs == 0:
-        return None
-    record = GaussianRecord.fetch(records, owner)
-    ellipsoid = dr.gather(mi.Float, least, owner)
-    key, number = dr.empty(mi.UInt64, pairs), dr.empty(mi.UInt32, pairs) if numbered else None
-
-    def in_view(tile: mi.UInt32, active: mi.Bool = True) -> mi.UInt32:
-        return tile if subset is None else dr.gather(mi.UInt32, subset.number, tile, active)
-
-    if groups is None:
-        depth_of = depths_by_tile(record, plane_records, ellipsoid, in_view(first_tile, length > 0), view, quality)
-    else:
-        group = dr.gather(mi.UInt32, groups, owner)
-
-    def one_tile(k: mi.UInt32) -> tuple[mi.UInt32]:
-        tile, pair = first_tile + k, pair_of + k
-        level = level_of(depth_of(in_view(tile)), view) if groups is None else group
-        own = Pairs.key_of(tile, level, pair if numbered else owner)
-        dr.scatter(key, own, pair, mode=dr.ReduceMode.Permute)
-        if numbered:
-            dr.scatter(number, owner, pair, mode=dr.ReduceMode.Permute)
-        return (k + 1,)
-
-    dr.while_loop((dr.zeros(mi.UInt32, rows),), lambda k: k < length, one_tile, label="pairs")
-    if not numbered:
-        dr.eval(key)
-        return Pairs(key)
-    first = dr.empty(mi.UInt32, count + 1)
-    end, inside = dr.opaque(mi.UInt32, pairs), row_of < dr.opaque(mi.UInt32, rows)
-    dr.scatter(first, dr.select(inside, dr.gather(mi.UInt32, pair_of, row_of, inside), end), order)
-    dr.scatter(first, end, dr.opaque(mi.UInt32, count))
-    dr.eval(key, number, first)
-    return Pairs(key, number, first)
+    return _Spans(owner, first_tile, length, first_row)
 
 
 def prefix_ranges(sizes: mi.UInt32, most: int) -> tuple[mi.UInt32, int]:
@@ -158,7 +192,7 @@ def prefix_ranges(sizes: mi.UInt32, most: int) -> tuple[mi.UInt32, int]:
     return begin, totals[0]
 
 
-def _spans(
+def _span_function(
     record: GaussianRecord, cut: mi.Float, x0: mi.UInt32, x1: mi.UInt32, view: CameraView
 ) -> Callable[[mi.UInt32], tuple[mi.UInt32, mi.UInt32]]:
     """Return a function from a row of tiles to the half-open range that a record's ellipse intersects.

@@ -104,8 +104,8 @@ def read_poses(
         The model, and the photos. Photos whose cameras hold for the upright image have upright copies.
 
     Raises:
-        InputError: If the file is damaged or contains none of the photos, if names are ambiguous, or if the file does
-            not tell whether its cameras hold for a photo before or after its EXIF rotation.
+        InputError: If the file is damaged or contains none of the photos, if names are ambiguous, or if it is unknown
+            whether a camera holds for a photo before or after its EXIF rotation.
         MissingResourceError: If COLMAP aborts its process.
     """
     by_name = {photo.name: photo for photo in photos}

@@ -241,8 +241,12 @@ def _decode_ksplat(data: bytes) -> SplatArrays:
 def _check_encoding(means: Float32Array, scales: Float32Array, opacities: Float32Array, colours: Float32Array) -> None:
     """Refuse sizes, opacities and colours in place of the logarithms, logits and coefficients of a PLY file.
 
-    No trained splats have only logits from 0 to 1 with Gaussians above one unit, or all over this range, or only
-    Gaussians above one unit of which most are as large as the cloud.
+    Trained splats have logits outside of 0 to 1, and most of their Gaussians are smaller than the cloud. A file is
+    refused in three cases:
+
+    * All logits lie in 0 to 1, and they cover this range or all Gaussians are larger than one unit.
+    * All Gaussians are larger than one unit, and most of them are as large as the cloud.
+    * The coefficients are as large as colours from 0 to 255.
     """
     if len(scales) < _MIN_JUDGED:
         return

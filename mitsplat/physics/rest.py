@@ -90,9 +90,10 @@ def run_to_rest(
     first seconds of bodies that tumble, because discs would stop on their rim.
 
     Bodies that still move after 1.5 s are slowed by a drag with a time constant of 0.2 s, which ends together with
-    rolling friction. A body fails if it leaves the bounds, leans against a wall, or moves on when half of the bodies,
-    or all but one, have moved by less than 1 mm for a second. With ``redraw``, failed bodies start again from new
-    poses, up to eight times, while the others stay where they are. Otherwise, the drop is rejected.
+    rolling friction. A body fails if it leaves the bounds or leans against a wall. It also fails if it still moves
+    after half of the bodies, or all but one, have moved by less than 1 mm for a second. With ``redraw``, failed bodies
+    start again from new poses, up to eight times, while the others stay where they are. Otherwise, the drop is
+    rejected.
 
     Args:
         world: Simulation; changed in place.

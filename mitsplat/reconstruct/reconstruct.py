@@ -87,8 +87,8 @@ class AssetJob:
         light: Light of the photographs, from which the materials of an object are estimated; None if it is unknown.
 
     Raises:
-        InputError: If refinement is requested for a mesh that is not reconstructed from masks, ``remove`` is used
-            with an object or an imported mesh, or ``light`` with an environment, a material or a size.
+        InputError: In one of these cases: refinement of a mesh that is not reconstructed from masks; ``remove`` with
+            an object or an imported mesh; ``light`` with an environment, a material or a size.
     """
 
     name: str

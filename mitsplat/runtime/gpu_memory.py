@@ -30,7 +30,7 @@ class GpuMemory:
 
 
 def gpu_memory() -> dict[str, GpuMemory]:
-    """Memory of every GPU of this machine, by its id and in the order of PCI buses; {} if unknown."""
+    """Return the memory of every GPU of this machine by its id, in the order of PCI buses; {} if unknown."""
     try:
         library = ctypes.CDLL("libnvidia-ml.so.1")
     except OSError:

@@ -200,9 +200,10 @@ def search_shadows(
     Points next to objects, where ``cover`` of :func:`object_cover` is large, are traced in any case.
 
     Returns:
-        True (Bool) for pixels that need traced light, the number of others that show a surface, the light factor
-        (Color3f) of these, and the codes of :func:`mitsplat.renderer.light.light_planes.plane_codes`, None if no plane
-        is visible.
+        * True (Bool) for pixels that need traced light.
+        * Number of the other pixels that show a surface.
+        * Light factor (Color3f) of these.
+        * Codes of :func:`mitsplat.renderer.light.light_planes.plane_codes`; None if no plane is visible.
     """
     visible, error = lighting.visible, lighting.accuracy.error
     pixel = dr.arange(mi.UInt32, lighting.pixels)

@@ -7,7 +7,7 @@ tolerance are walked in the order of each ray.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import partial, reduce
 from operator import or_
@@ -211,11 +211,15 @@ def _march(
 
     def pixels(dx: float, dy: float, labelled: bool) -> tuple[list[Pixel], list[mi.Float]]:
         """Return the states of the rays at an offset in the pixels, and their error estimates."""
-        state: dict[str, Any] = {"several": labelled and several, "late": late}
+        tallies = labelled and several
         where = slopes or lanes.slopes(dr.opaque(mi.Float, dx), dr.opaque(mi.Float, dy))
         rays = Rays.through(lists, view, quality, where, far, lanes.start, lanes.stop)
         found = walk(
-            rays, order, partial(new_state, **state), partial(blend, **state), within_tolerance if stops_early else None
+            rays,
+            order,
+            partial(new_state, tallies, late),
+            partial(blend, several=tallies, late=late),
+            within_tolerance if stops_early else None,
         )
         return without_late_state(found, late), [pixel[ERROR] for pixel in found] if estimated else []
 
@@ -230,20 +234,36 @@ def _march(
     # On a CPU, reading one bit is cheap and mostly saves the launch; on a GPU, it would cause a synchronisation.
     if several and (dr.backend_v(uncertain) == dr.JitBackend.CUDA or dr.any(uncertain)):
         image.instance = resolve_instances(image.instance, uncertain, lists, view, quality, order, z_max)
-    n, colours = view.samples, []
-    for y, x in np.ndindex(n, n) if n > 1 else ():
-        if (2 * x + 1, 2 * y + 1) == (n, n):  # an odd number of samples includes the centre
-            colours.append([*image.rgb, image.alpha])
-        else:
-            found, also = pixels((x + 0.5) / n, (y + 0.5) / n, labelled=False)
-            colours.append([*_picture(found, lanes, quality)])
-            errors = [dr.maximum(a, b) for a, b in zip(errors, also, strict=True)]
-        dr.eval(colours[-1], errors)
-    if n > 1:
-        *image.rgb, image.alpha = (sum(channel[1:], channel[0]) / (n * n) for channel in zip(*colours, strict=True))
+    if view.samples > 1:
+        errors = _average_samples(image, errors, partial(pixels, labelled=False), lanes, view, quality)
         if estimated:
             image.error = lanes.image(mi.Float, errors)
     return image, _tiles_of(_exceeds_tolerance(errors, lanes.inside, tolerance), lanes) if estimated else None
+
+
+def _average_samples(
+    image: Image,
+    errors: list[mi.Float],
+    pixels: Callable[[float, float], tuple[list[Pixel], list[mi.Float]]],
+    lanes: Lanes,
+    view: CameraView,
+    quality: Quality,
+) -> list[mi.Float]:
+    """Replace colour and opacity of an image of the pixel centres by their means over all samples of each pixel.
+
+    ``pixels`` renders the samples at an offset in the pixels. The result is the largest error estimate of each ray.
+    """
+    n, colours = view.samples, []
+    for y, x in np.ndindex(n, n):
+        if (2 * x + 1, 2 * y + 1) == (n, n):  # an odd number of samples includes the centre
+            colours.append([*image.rgb, image.alpha])
+        else:
+            found, also = pixels((x + 0.5) / n, (y + 0.5) / n)
+            colours.append([*_picture(found, lanes, quality)])
+            errors = [dr.maximum(a, b) for a, b in zip(errors, also, strict=True)]
+        dr.eval(colours[-1], errors)
+    *image.rgb, image.alpha = (sum(channel[1:], channel[0]) / (n * n) for channel in zip(*colours, strict=True))
+    return errors
 
 
 def _exceeds_tolerance(errors: list[mi.Float], inside: list[mi.Bool], tolerance: mi.Float) -> mi.Bool:
@@ -276,12 +296,12 @@ def march_tiles(
     if quality.order == "ray":
         dr.eval(lists.nearest)
     late = out_of_order(quality)
-    state: dict[str, Any] = {"several": lists.instance is None, "late": late}
+    several = lists.instance is None
     where = lanes.slopes(dr.opaque(mi.Float, 0.5), dr.opaque(mi.Float, 0.5))
     rays = Rays.through(lists, view, quality, where, far, lanes.start, lanes.stop)
     nothing = [mi.Float(0.0) for _ in range(SHARE - 1)]
-    fresh = iter([[*new_state(**state), dr.gather(mi.Float, own, *place), *nothing] for place in places])
-    found = walk(rays, quality.order, partial(next, fresh), partial(blend_share, **state))
+    fresh = iter([[*new_state(several, late), dr.gather(mi.Float, own, *place), *nothing] for place in places])
+    found = walk(rays, quality.order, partial(next, fresh), partial(blend_share, several=several, late=late))
     pixels = without_late_state([pixel[:-SHARE] for pixel in found], late)
     image, _ = _collect(pixels, lanes, lists.instance, quality)
     share = _images([pixel[1 - SHARE : -4] for pixel in found], pixels, lanes, quality)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -19,6 +19,9 @@ from mitsplat.runtime.onnx_networks import load_library
 from mitsplat.storage.content_hash import ContentHash, file_hash
 from mitsplat.storage.files import write_file
 from mitsplat.version import __version__
+
+if TYPE_CHECKING:
+    import onnxruntime
 
 FloatImage = Float32Array
 
@@ -72,7 +75,7 @@ def model_maps(
     return DepthMaps(files, kind)
 
 
-def open_session(model: Path) -> Any:
+def open_session(model: Path) -> onnxruntime.InferenceSession:
     """Open an onnxruntime session of a network on the CPU.
 
     Raises:
@@ -97,7 +100,7 @@ class DepthNetwork:
         InputError: If the input of the network is not one picture of floats, shape (1, 3, H, W).
     """
 
-    def __init__(self, session: Any, path: Path) -> None:
+    def __init__(self, session: onnxruntime.InferenceSession, path: Path) -> None:
         self._session, self._path = session, path
         inputs = session.get_inputs()
         shape, kind = list(inputs[0].shape), inputs[0].type

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -23,6 +23,7 @@ from mitsplat.renderer.differentiation.backward import (
     render_records,
 )
 from mitsplat.renderer.projection.clouds import Cloud
+from mitsplat.renderer.rays.camera_rays import Kind
 from mitsplat.renderer.rays.device_arrays import number, on_device, wrapped
 from mitsplat.runtime.recorded_kernels import recorded
 
@@ -263,7 +264,7 @@ def _activated(values: _Arrays, unit: mi.Float) -> tuple[mi.Float, mi.Float, mi.
 
 @recorded
 def _project(
-    values: _Arrays, unit: mi.Float, kind: tuple[Any, ...], numbers: _Arrays, quality: Quality, bands: int
+    values: _Arrays, unit: mi.Float, kind: Kind, numbers: _Arrays, quality: Quality, bands: int
 ) -> tuple[mi.Float, mi.Float, mi.UInt32]:
     """Return the view records of Gaussians, their least depths and their tile boxes."""
     records, least, box, _ = project_cloud(pack_cloud(*_activated(values, unit), bands), kind, numbers, quality)
@@ -274,7 +275,7 @@ def _project(
 def _gradients(
     values: _Arrays,
     unit: mi.Float,
-    kind: tuple[Any, ...],
+    kind: Kind,
     numbers: _Arrays,
     quality: Quality,
     bands: int,

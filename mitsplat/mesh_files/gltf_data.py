@@ -54,7 +54,7 @@ class GltfData:
         self.buffer = cache(self._read_buffer)
         self.image = cache(self._read_image)
 
-    def _asset_version(self) -> Any:
+    def _asset_version(self) -> object:
         return self.document["asset"]["version"]
 
     def _read_chunks(self, content: bytes) -> bytes:
@@ -68,7 +68,7 @@ class GltfData:
                 self._binary = content[28 + size : 28 + size + length]
         return content[20 : 20 + size]
 
-    def entry(self, kind: str, index: Any) -> JsonObject:
+    def entry(self, kind: str, index: object) -> JsonObject:
         """Return an object of a list of the document.
 
         Raises:
@@ -92,7 +92,7 @@ class GltfData:
             return base64.b64decode(data) if head.endswith(";base64") else unquote_to_bytes(data)
         return find_reference(self.path, unquote_to_bytes(uri).decode(), kind).read_bytes()
 
-    def view(self, index: Any) -> memoryview:
+    def view(self, index: object) -> memoryview:
         """Return the bytes of a buffer view.
 
         Raises:
@@ -108,10 +108,10 @@ class GltfData:
             raise ValueError(f"buffer view {index} extends beyond its buffer")
         return memoryview(data)[start : start + length]
 
-    def _has_data(self, index: Any) -> bool:
+    def _has_data(self, index: object) -> bool:
         return "uri" in self.entry("buffers", index) or (index == 0 and bool(self._binary))
 
-    def accessor(self, index: Any) -> AnyArray:
+    def accessor(self, index: object) -> AnyArray:
         """Return the elements of an accessor, shape (count, components); normalised integers become floats."""
         stored = self.entry("accessors", index)
         kind, count = np.dtype(_TYPES[stored["componentType"]]), stored["count"]
@@ -156,7 +156,7 @@ class GltfData:
         decoded = {attribute["unique_id"]: np.asarray(attribute["data"]) for attribute in mesh.attributes}
         return {name: decoded[number] for name, number in compressed["attributes"].items()}, np.asarray(mesh.faces)
 
-    def texture_image(self, index: Any) -> Image.Image:
+    def texture_image(self, index: object) -> Image.Image:
         """Return the image of a texture.
 
         Raises:

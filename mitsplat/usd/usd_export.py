@@ -14,7 +14,7 @@ import shutil
 import tempfile
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import trimesh
@@ -39,7 +39,7 @@ from mitsplat.usd.stage_records import METADATA
 from mitsplat.usd.usd_layers import is_usd, require_usd
 
 if TYPE_CHECKING:
-    from pxr import Usd
+    from pxr import Sdf, Usd, UsdGeom, UsdShade
 
 _SENSOR_WIDTH = 0.036
 """Width of the sensor of exported cameras [m]; USD states focal lengths and offsets relative to it."""
@@ -246,7 +246,7 @@ class _StageWriter:
         if tuple(scale) != (1.0, 1.0, 1.0):
             xform.AddScaleOp(double).Set(Gf.Vec3d(*scale))
 
-    def _mesh(self, path: Any, mesh: trimesh.Trimesh) -> Any:
+    def _mesh(self, path: Sdf.Path, mesh: trimesh.Trimesh) -> UsdGeom.Mesh:
         """Write a triangle mesh and return its prim's schema."""
         from pxr import UsdGeom, Vt  # optional
 
@@ -261,7 +261,9 @@ class _StageWriter:
         prim.CreateExtentAttr(Vt.Vec3fArray.FromNumpy(np.stack([points.min(axis=0), points.max(axis=0)])))
         return prim
 
-    def _pieces(self, path: Any, pieces: Iterable[trimesh.Trimesh], material: ContactMaterial, size: float) -> None:
+    def _pieces(
+        self, path: Sdf.Path, pieces: Iterable[trimesh.Trimesh], material: ContactMaterial, size: float
+    ) -> None:
         """Write convex pieces as colliders with a contact material."""
         from pxr import UsdGeom, UsdPhysics  # optional
 
@@ -275,7 +277,7 @@ class _StageWriter:
             UsdPhysics.MeshCollisionAPI.Apply(mesh.GetPrim()).CreateApproximationAttr("convexHull")
             self._collide(mesh.GetPrim(), contact)
 
-    def _contact(self, path: Any, material: ContactMaterial, size: float) -> Any:
+    def _contact(self, path: Sdf.Path, material: ContactMaterial, size: float) -> UsdShade.Material:
         """Write a contact material; Newton reads the attributes of its namespace."""
         from pxr import Sdf, UsdPhysics, UsdShade  # optional
 
@@ -295,7 +297,7 @@ class _StageWriter:
         return UsdShade.Material(prim)
 
     @staticmethod
-    def _collide(prim: Usd.Prim, material: Any) -> None:
+    def _collide(prim: Usd.Prim, material: UsdShade.Material) -> None:
         """Make a prim a collider with a contact material; Newton gives its MuJoCo solver the attributes ``mjc``."""
         from pxr import Sdf, UsdPhysics, UsdShade, Vt  # optional
 
@@ -392,7 +394,7 @@ def _metadata(asset: Asset) -> JsonObject:
     return {name: value for name, value in values.items() if value is not None}
 
 
-def _write_field(stage: Usd.Stage, path: Any, splats: Splats) -> None:
+def _write_field(stage: Usd.Stage, path: Sdf.Path, splats: Splats) -> None:
     """Write splats as a particle field, in single precision; materials are attributes of our own."""
     from pxr import Gf, Sdf, Usd, UsdVol, Vt  # optional
 

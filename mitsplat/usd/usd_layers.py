@@ -11,12 +11,12 @@ import re
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from mitsplat.errors import InputError, MissingResourceError
 
 if TYPE_CHECKING:
-    from pxr import Usd
+    from pxr import Sdf, Usd
 
 USD_SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
 _MAX_LAYERS = 1000
@@ -106,7 +106,7 @@ def _shown(path: Path, identifier: str) -> str:
     return str(path) if identifier == str(path.absolute()) else f"{path}: {identifier}"
 
 
-def _find_clips(layer: Any, found: list[str], path: Any) -> None:
+def _find_clips(layer: Sdf.Layer, found: list[str], path: Sdf.Path) -> None:
     """Append the path of a prim that takes values from clips."""
     spec = layer.GetObjectAtPath(path)
     if spec is not None and spec.HasInfo("clips"):

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -59,7 +58,7 @@ class Board:
             raise InputError(f"a board's square must be {LEAST_SQUARE} to 10 m (got {self.square:g})")
 
     @property
-    def aruco(self) -> Any:
+    def aruco(self) -> cv2.aruco.CharucoBoard:
         """Board object of OpenCV."""
         markers = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_250)
         return cv2.aruco.CharucoBoard((self.columns, self.rows), self.square, _MARKER * self.square, markers)

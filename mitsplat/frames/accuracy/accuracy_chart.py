@@ -8,7 +8,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from mitsplat.frames.accuracy.speed_accuracy import (
     BUDGET_PREFIX,
@@ -20,6 +20,9 @@ from mitsplat.frames.accuracy.speed_accuracy import (
 )
 from mitsplat.quality import PRESETS
 from mitsplat.storage.files import storage_errors, write_file, write_text
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 
 def write_csv(rows: Sequence[Row], file: Path) -> None:
@@ -47,7 +50,7 @@ def draw_chart(rows: Sequence[Row], file: Path, *, title: str, tolerance: float)
         write_file(file, lambda part: figure.savefig(part, dpi=110, format=file.suffix[1:]))
 
 
-def _draw_errors(axes: Any, rows: Sequence[Row], tolerance: float) -> None:
+def _draw_errors(axes: Axes, rows: Sequence[Row], tolerance: float) -> None:
     """Plot the time against the RMSE, both logarithmic.
 
     Steps connect the Pareto-optimal configurations; a curve connects those of ``balanced`` over its tolerance.
@@ -71,7 +74,7 @@ def _draw_errors(axes: Any, rows: Sequence[Row], tolerance: float) -> None:
     axes.margins(x=0.2, y=0.1)
 
 
-def _draw_objects(axes: Any, rows: Sequence[Row]) -> None:
+def _draw_objects(axes: Axes, rows: Sequence[Row]) -> None:
     """Plot the time against the PSNR of objects, without models of light that are cheaper than reflections.
 
     Lines connect ray budgets of splats and of path-traced meshes.

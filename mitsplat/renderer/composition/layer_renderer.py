@@ -5,7 +5,6 @@ from __future__ import annotations
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import reduce
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -32,7 +31,7 @@ from mitsplat.renderer.splatting.march import Image, largest_and_mean, trace
 from mitsplat.renderer.splatting.pairs import CrowdedError
 from mitsplat.renderer.splatting.static_tile_cache import StaticTileCache
 
-_CacheKey = tuple[tuple[Any, ...], Quality, list["mi.Shape"]]
+_CacheKey = tuple[tuple[object, ...], Quality, list["mi.Shape"]]
 """Camera, quality and visible shapes."""
 
 

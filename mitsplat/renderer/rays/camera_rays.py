@@ -88,7 +88,7 @@ class CameraView:
         return self._opaque["near"]
 
     @property
-    def key(self) -> tuple[Any, ...]:
+    def key(self) -> tuple[object, ...]:
         """Values that identify a view."""
         lens = self.fx, self.fy, self.cx, self.cy, self.distortion, self.lens, self.shift
         return self.width, self.height, *lens, self.near, self.samples, self.world_from_camera.tobytes()

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 import trimesh
@@ -32,7 +32,9 @@ there.
 """
 
 
-def load_scene(path: str | Path, *, overrides: Mapping[str, Any] | None = None, allow_outside: bool = False) -> Scene:
+def load_scene(
+    path: str | Path, *, overrides: Mapping[str, object] | None = None, allow_outside: bool = False
+) -> Scene:
     """Read a scene file and all assets, meshes and images that it names, and validate them.
 
     Args:

@@ -35,7 +35,7 @@ from mitsplat.engine.pool import check_workers, run_frames
 from mitsplat.engine.ray import Cluster, load_ray, run_on_ray
 from mitsplat.engine.resources import TYPICAL_MEMORY
 from mitsplat.errors import InputError, check_whole_number, path_of
-from mitsplat.formats.registry import FORMATS, Catalogue
+from mitsplat.formats.registry import Catalogue
 from mitsplat.frames.budget import worker_memory
 from mitsplat.frames.frame import render_frame
 from mitsplat.frames.time_estimate import RunTime
@@ -124,7 +124,7 @@ def write_dataset(
         any_device: Continue a dataset that was started on the other kind of device.
 
     Raises:
-        InputError: If ``frames`` or a format is not available, a preflight check fails (see
+        InputError: If there are not so many ``frames``, a preflight check fails (see
             :mod:`mitsplat.dataset.preflight`), the folder cannot be written, is in use, holds other files, or holds a
             dataset of another scene; nothing is rendered then. Later, if another process changes the folder, or if more
             layouts lack objects than ``settle.incomplete`` allows.
@@ -135,7 +135,12 @@ def write_dataset(
     """
     Scene.check(scene)
     out = path_of(out, "out")
-    count = _frame_count(scene, frames)
+    count = scene.num_frames if frames is None else frames
+    check_whole_number(count, "frames")
+    if not 1 <= count <= scene.num_frames:
+        raise InputError(
+            f"frames must be between 1 and {scene.num_frames}, which is layouts x views of {scene.path} (got {count})"
+        )
     check_workers(workers)
     catalogue = Catalogue.of(scene)
     indices = range(count) if shard is None else shard.frames(count, scene.spec.output.views)
@@ -191,23 +196,6 @@ def write_dataset(
         counts = FrameCounts()
         finish_folder(out, manifest, content, catalogue, counts.add)
         return counts.summary(out, rendered=sum(map(len, layouts.values())))
-
-
-def _frame_count(scene: Scene, frames: int | None) -> int:
-    """Return the number of frames of a dataset, all frames of the scene if ``frames`` is None.
-
-    Raises:
-        InputError: If the scene does not have so many frames, or its formats are unknown.
-    """
-    count = scene.num_frames if frames is None else frames
-    check_whole_number(count, "frames")
-    if not 1 <= count <= scene.num_frames:
-        raise InputError(
-            f"frames must be between 1 and {scene.num_frames}, which is layouts x views of {scene.path} (got {count})"
-        )
-    if unknown := set(scene.spec.output.formats) - set(FORMATS):
-        raise InputError(f"output.formats must be among {', '.join(FORMATS)} (got {min(unknown)})")
-    return count
 
 
 def _results(

@@ -12,7 +12,7 @@ from mitsplat.bake.verification import BakedView
 from mitsplat.geometry.decomposition import max_gap
 from mitsplat.geometry.mesh import mass_properties
 from mitsplat.geometry.mesh_distance import DistanceSurface, standoff
-from mitsplat.pages.html import figure_of, make_figure, make_section, rgb_image, verdict_of, write_report
+from mitsplat.pages.html import figure_of, make_figure, make_section, rgb_image, verdict_of, write_report_page
 
 _VIEW = 420
 _WHITE_DIFFERENCE = 0.3
@@ -25,7 +25,7 @@ def write_bake_report(folder: Path, result: BakeResult) -> Path:
     Raises:
         OSError: If the page cannot be written.
     """
-    return write_report(folder, result.asset.name, "bake", [_figures(result), _views(result)])
+    return write_report_page(folder, result.asset.name, "bake", [_figures(result), _views(result)])
 
 
 def _figures(result: BakeResult) -> str:

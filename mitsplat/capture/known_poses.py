@@ -15,7 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from mitsplat.capture.name_matching import match_names
 from mitsplat.capture.photos import Prepared, shapes_differ, turn_upright, with_orientation
-from mitsplat.capture.structure_from_motion import SparseModel, find_points, read_model
+from mitsplat.capture.structure_from_motion import SparseModel, find_points, read_colmap_model
 from mitsplat.errors import InputError
 from mitsplat.geometry.camera import Camera
 from mitsplat.geometry.rigid import OPENCV_FROM_OPENGL
@@ -111,7 +111,7 @@ def read_poses(
     by_name = {photo.name: photo for photo in photos}
     everything = [*by_name, *unusable]
     if source.is_dir():
-        model = read_model(source, folder / "given")
+        model = read_colmap_model(source, folder / "given")
         paths = {name: PurePosixPath(name.replace("\\", "/")) for name in model.cameras}
         names = match_names(source, paths, base, everything)
         sized = set(model.cameras)

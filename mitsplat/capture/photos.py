@@ -23,7 +23,7 @@ from mitsplat.errors import InputError
 from mitsplat.images.colour import eight_bit
 from mitsplat.progress import Progress
 from mitsplat.runtime.cores import usable_cores
-from mitsplat.storage.file_kinds import check_name
+from mitsplat.storage.file_kinds import check_path_encoding
 from mitsplat.storage.files import IMAGE_ERRORS, files_below, write_file
 
 SUFFIXES = (".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp")
@@ -106,7 +106,7 @@ def find_photos(folder: Path, *, but: Path | None = None) -> list[Path]:
         name = path.relative_to(folder).as_posix()
         if path.suffix.lower() not in SUFFIXES + _UNSUPPORTED or not path.is_file() or "/." in f"/{name}":
             continue
-        check_name(path)
+        check_path_encoding(path)
         other = found.setdefault(stored_name(name, path.suffix.lower()), path)
         if other != path:
             raise InputError(f"{path}: its copy would have the same name as that of {other}: rename one of them")

@@ -152,7 +152,7 @@ def find_points(
     return SparseModel(cameras, model.points, model.colours, seen, reprojection_error=model.reprojection_error)
 
 
-def read_model(source: Path, folder: Path) -> SparseModel:
+def read_colmap_model(source: Path, folder: Path) -> SparseModel:
     """Read a COLMAP model: ``cameras``, ``images`` and ``points3D`` as ``.bin`` or ``.txt``.
 
     Args:

@@ -24,7 +24,7 @@ from typer.core import TyperGroup
 from mitsplat.cli import assets, datasets, detectors, fault, inspection, lights, machine, photographs
 from mitsplat.errors import LateDeviceError, exit_status, sentence_of
 from mitsplat.runtime.child_process import leave_current_folder, python_command, python_environment
-from mitsplat.storage.file_kinds import check_name
+from mitsplat.storage.file_kinds import check_path_encoding
 from mitsplat.version import __version__
 
 COMMAND_GROUPS: Mapping[str, Sequence[Callable[..., None]]] = {
@@ -113,7 +113,7 @@ def main(args: Sequence[str] | None = None) -> None:
         leave_current_folder()
     try:
         for name in (*(sys.argv[1:] if args is None else args), os.fspath(Path.cwd())):
-            check_name(name)
+            check_path_encoding(name)
         app(args)
     except Exception as error:  # noqa: BLE001 - last handler before the traceback would be printed
         if args is None and isinstance(error, LateDeviceError):

@@ -22,7 +22,7 @@ import numpy as np
 
 from mitsplat.detector.detector_report import make_report
 from mitsplat.detector.labelled_sets.labelled_set import LabelledSet, Sample, Split, check_masks, reorder_classes
-from mitsplat.detector.labelled_sets.pictures import read_picture
+from mitsplat.detector.labelled_sets.pictures import read_upright
 from mitsplat.detector.labelled_sets.set_reading import read_set
 from mitsplat.detector.libraries import (
     check_device,
@@ -157,7 +157,7 @@ def detect(
         model, found = YOLO(name, task="segment" if masks else "detect"), []
     for number, sample in enumerate(samples, start=1):
         (result,) = model.predict(
-            read_picture(sample.path),
+            read_upright(sample.path),
             conf=MIN_SCORE,
             iou=NMS_IOU,
             max_det=MAX_DETECTIONS,

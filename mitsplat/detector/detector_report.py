@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from mitsplat.detector.labelled_sets.labelled_set import LabelledSet, Sample
-from mitsplat.detector.labelled_sets.pictures import read_picture
+from mitsplat.detector.labelled_sets.pictures import read_upright
 from mitsplat.detector.losses import ERROR_KINDS
 from mitsplat.detector.scores import CONFIDENCE, IOU, MAX_DETECTIONS, AveragePrecision, Confusion, Detection
 from mitsplat.images.masks import Silhouette, decode_rle
@@ -167,7 +167,7 @@ def worst_images(confusion: Confusion) -> list[int]:
 
 
 def _picture(sample: Sample, shown: Sequence[JsonObject], class_names: Sequence[str], what: str) -> str:
-    image = read_picture(sample.path)
+    image = read_upright(sample.path)
     scale = min(1.0, _THUMBNAIL / sample.width)
     size = max(1, round(sample.width * scale)), max(1, round(sample.height * scale))
     unit, marks, names = sample.width / _THUMBNAIL, [], []

@@ -9,7 +9,6 @@ import atexit
 import importlib.metadata
 import os
 import re
-import shutil
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -19,6 +18,7 @@ from pickle import UnpicklingError
 from typing import Any
 
 from mitsplat.errors import InputError, MissingResourceError, list_in_words
+from mitsplat.storage.cache import remove_in_process
 
 WEIGHTS_ERRORS = (
     *(OSError, EOFError, UnpicklingError, RuntimeError),
@@ -74,7 +74,7 @@ def load_libraries() -> None:
     if "YOLO_CONFIG_DIR" not in os.environ:
         folder = tempfile.mkdtemp(prefix="mitsplat-ultralytics-")
         os.environ["YOLO_CONFIG_DIR"] = folder
-        atexit.register(_remove, folder, os.getpid())
+        atexit.register(remove_in_process, folder, os.getpid())
     from ultralytics.nn import tasks
     from ultralytics.utils.events import events
 
@@ -96,11 +96,6 @@ def check_torchvision() -> None:
             "torchvision cannot be imported, because it was built for another PyTorch: install both from one source "
             f"({str(error).splitlines()[0]})"
         ) from error
-
-
-def _remove(folder: str, process: int) -> None:
-    if os.getpid() == process:  # not in forked workers
-        shutil.rmtree(folder, ignore_errors=True)
 
 
 def versions() -> dict[str, str]:

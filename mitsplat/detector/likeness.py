@@ -22,7 +22,7 @@ from scipy.ndimage import gaussian_filter1d
 
 from mitsplat.arrays import BoolArray, ByteImage, Float64Array
 from mitsplat.detector.labelled_sets.labelled_set import LabelledObject, Sample, Split, reorder_classes
-from mitsplat.detector.labelled_sets.pictures import read_picture
+from mitsplat.detector.labelled_sets.pictures import read_upright
 from mitsplat.detector.labelled_sets.set_reading import read_set
 from mitsplat.detector.libraries import STRIDE
 from mitsplat.errors import InputError
@@ -249,7 +249,7 @@ def _sample_evenly(samples: list[Sample], max_images: int) -> list[Sample]:
 
 def _measure(sample: Sample, number: int, size: int, values: _Values, hues: _HueSums) -> None:
     """Add the measurements of an image, scaled to a longer side of ``size`` pixels, to ``values`` and ``hues``."""
-    stored = read_picture(sample.path)
+    stored = read_upright(sample.path)
     scale = size / max(sample.width, sample.height)
     width, height = (max(round(scale * side), 1) for side in (sample.width, sample.height))
     way = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR

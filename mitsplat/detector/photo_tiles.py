@@ -13,7 +13,7 @@ import numpy as np
 
 from mitsplat.arrays import BoolArray
 from mitsplat.detector.labelled_sets.labelled_set import LabelledObject, LabelledSet
-from mitsplat.detector.labelled_sets.pictures import MIN_SIDE, read_picture
+from mitsplat.detector.labelled_sets.pictures import MIN_SIDE, read_upright
 from mitsplat.errors import InputError
 from mitsplat.images.masks import Silhouette, decode_rle
 from mitsplat.labels.polygons import outline
@@ -43,7 +43,7 @@ def cut_photographs(photographs: LabelledSet, real_size: int, size: int, folder:
     folder.mkdir(parents=True, exist_ok=True)
     samples = []
     for number, sample in enumerate(photographs.samples):
-        picture = read_picture(sample.path)
+        picture = read_upright(sample.path)
         width, height = (max(round(side * size / real_size), 1) for side in (sample.width, sample.height))
         if min(width, height) < MIN_SIDE:
             raise InputError(

@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from mitsplat.errors import InputError
 from mitsplat.formats import maps
-from mitsplat.storage.field_types import check_name
+from mitsplat.storage.field_types import check_label_name
 from mitsplat.storage.files import SPLITS, GrowingFile, JsonObject, Record, link_file, splits_of, write_file
 from mitsplat.storage.json_stream import ListsFile
 
@@ -58,7 +58,7 @@ class Catalogue:
         """
         for name in scene.class_names:
             try:
-                check_name(name)
+                check_label_name(name)
             except ValueError as error:
                 raise InputError(f"{scene.path}: class: {error}") from error
         points: dict[str, tuple[str, tuple[str, ...]]] = {}

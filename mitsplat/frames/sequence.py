@@ -18,7 +18,7 @@ from mitsplat.quality import Quality
 from mitsplat.scene.layout import Layout
 from mitsplat.scene.planning.conveyor import layout_at_view
 from mitsplat.scene.planning.frame_plan import layout_index_of, to_index
-from mitsplat.scene.planning.viewpoints import view_of
+from mitsplat.scene.planning.viewpoints import viewpoint_of
 from mitsplat.scene.scene import Scene
 from mitsplat.scene.spec.light_spec import LightEntry
 
@@ -115,7 +115,7 @@ def _next_view(scene: Scene, shot: Shot, following: Shot) -> tuple[Layout | None
     if next_layout is not None:
         view = next_index - layout_index_of(scene, next_index) * scene.spec.output.views
         next_layout = layout_at_view(scene.spec, next_layout, view)
-    return next_layout, view_of(scene, next_index, next_layout).camera if next_camera is None else next_camera
+    return next_layout, viewpoint_of(scene, next_index, next_layout).camera if next_camera is None else next_camera
 
 
 def _one_per_frame(given: Item | Iterable[Item] | None) -> Iterator[Item | None]:

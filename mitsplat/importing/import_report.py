@@ -15,7 +15,7 @@ from mitsplat.gaussians.spherical_harmonics import SH_C0
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.mesh import mass_properties
 from mitsplat.importing.splat_import import Imported
-from mitsplat.pages.html import figure_of, make_figure, make_section, rgb_image, verdict_of, write_report
+from mitsplat.pages.html import figure_of, make_figure, make_section, rgb_image, verdict_of, write_report_page
 from mitsplat.reconstruct.asset_evaluation import show_asset
 from mitsplat.storage.files import is_inside, write_text
 
@@ -30,7 +30,7 @@ def write_import_report(folder: Path, imported: Imported) -> Path:
     Raises:
         OSError: If the page cannot be written.
     """
-    return write_report(
+    return write_report_page(
         folder, imported.asset.name, "import", [_verdict(imported), _views(imported), _removed(imported)]
     )
 

@@ -25,7 +25,7 @@ def make_page(title: str, body: str, *, script: str = "") -> str:
     return page.replace("{{script}}", f"<script>{script}</script>\n" if script else "")
 
 
-def write_report(folder: Path, name: str, kind: str, sections: Iterable[str]) -> Path:
+def write_report_page(folder: Path, name: str, kind: str, sections: Iterable[str]) -> Path:
     """Write the page ``report.html`` of an asset into its folder, and return its path.
 
     Raises:
@@ -62,10 +62,10 @@ def shrunk_image(picture: ByteImage, width: int) -> str:
 
 def rgb_image(values: npt.NDArray[np.floating], width: int) -> str:
     """Encode colours from 0 to 1, (H, W, 3), as a data URL of a picture at most ``width`` px wide."""
-    return shrunk_image(eight_bit(values), width)
+    return shrunk_image(colour_bytes(values), width)
 
 
-def eight_bit(values: npt.NDArray[np.floating]) -> ByteImage:
+def colour_bytes(values: npt.NDArray[np.floating]) -> ByteImage:
     """Convert colours from 0 to 1 to bytes."""
     return np.asarray(255 * np.clip(values, 0, 1) + 0.5).astype(np.uint8)
 

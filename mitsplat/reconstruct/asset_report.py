@@ -12,13 +12,13 @@ import numpy as np
 from mitsplat.arrays import ByteImage, Float32Array, Float64Array
 from mitsplat.capture.capture import Capture, Photo
 from mitsplat.pages.html import (
-    eight_bit,
+    colour_bytes,
     figure_of,
     make_figure,
     make_section,
     shrunk_image,
     verdict_of,
-    write_report,
+    write_report_page,
 )
 from mitsplat.reconstruct.asset_evaluation import HeldOutView, take_evenly
 from mitsplat.reconstruct.causes import views_from
@@ -44,7 +44,7 @@ def write_asset_report(folder: Path, capture: Capture, result: Reconstruction) -
         OSError: If the page cannot be written.
     """
     sections = (_verdict(result), *result.sections, _held_out(result.held_out), _cameras(capture), _photos(capture))
-    return write_report(folder, result.asset.name, "asset", sections)
+    return write_report_page(folder, result.asset.name, "asset", sections)
 
 
 def _verdict(result: Reconstruction) -> str:
@@ -85,10 +85,10 @@ def _held_out(views: Sequence[HeldOutView]) -> str:
         mask = np.ones(view.alpha.shape, dtype=np.float32) if view.mask is None else view.mask
         difference = np.abs(view.render - view.photo * mask[..., None]) / _MAX_DIFFERENCE
         pictures = {
-            "photo": _outlined(eight_bit(view.photo), view.mask),
-            "render": eight_bit(view.picture),
-            "difference": eight_bit(difference),
-            "mesh over photo": eight_bit(view.shaded(view.photo, 0.85)),
+            "photo": _outlined(colour_bytes(view.photo), view.mask),
+            "render": colour_bytes(view.picture),
+            "difference": colour_bytes(difference),
+            "mesh over photo": colour_bytes(view.shaded(view.photo, 0.85)),
         }
         images = "".join(
             make_figure(f"{kind} {html.escape(view.name, quote=True)}", kind, shrunk_image(picture, _VIEW))
@@ -181,7 +181,7 @@ def _photos(capture: Capture) -> str:
     for photo in shown:
         _, rgb, mask, _ = photo.fitted(_THUMBNAIL)
         note = "" if photo.mask is not None else ", no mask"
-        picture = shrunk_image(_outlined(eight_bit(rgb), mask), _THUMBNAIL)
+        picture = shrunk_image(_outlined(colour_bytes(rgb), mask), _THUMBNAIL)
         figures.append(make_figure(html.escape(photo.name, quote=True), f"{html.escape(photo.name)}{note}", picture))
     rejected = "".join(
         f"<li><b>{html.escape(name)}</b>: {html.escape(reason)}</li>"

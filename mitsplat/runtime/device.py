@@ -138,7 +138,7 @@ def find_device(device: str | Device) -> Device:
     """
     if isinstance(device, Device):
         return device
-    text = check_name(device)
+    text = check_device_name(device)
     if text == "cpu":
         return CPU
     gpus = visible_gpus()
@@ -170,7 +170,7 @@ def _late_device_error(text: str, gpu: Gpu) -> LateDeviceError:
     )
 
 
-def check_name(device: str) -> str:
+def check_device_name(device: str) -> str:
     """Validate and return the name of a device, which need not exist on this machine.
 
     Raises:

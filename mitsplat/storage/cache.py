@@ -81,7 +81,7 @@ def prepare_caches() -> None:
     reasons = {folder: reason for folder in (own, kernels) if (reason := unusable_reason(folder))}
     if kernels in reasons:
         temporary = tempfile.mkdtemp(prefix="mitsplat-kernels-")
-        atexit.register(_remove, temporary, os.getpid())
+        atexit.register(remove_in_process, temporary, os.getpid())
         with suppress(OSError):  # there are none, or some cannot be read
             shutil.copytree(kernels, temporary, dirs_exist_ok=True)
         os.environ[_WARP] = temporary
@@ -114,6 +114,7 @@ def _warn(reasons: dict[Path, str]) -> None:
         _logger.warning("a cache folder cannot be written, so every run computes kernels or layouts again: %s", where)
 
 
-def _remove(folder: str, process: int) -> None:
-    if os.getpid() == process:  # not in forked processes
+def remove_in_process(folder: str, process: int) -> None:
+    """Remove a folder if this is the process with that id, and not a fork of it."""
+    if os.getpid() == process:
         shutil.rmtree(folder, ignore_errors=True)

@@ -44,7 +44,7 @@ def check_order(bounds: tuple[float, float]) -> tuple[float, float]:
     return bounds
 
 
-def check_name(name: str) -> str:
+def check_label_name(name: str) -> str:
     """Refuse a name with control characters (invalid in XML) or line breaks (invalid in line-based label files)."""
     for character in name:
         if unicodedata.category(character) in ("Cc", "Cs", "Zl", "Zp") or ord(character) & 0xFFFE == 0xFFFE:
@@ -54,7 +54,7 @@ def check_name(name: str) -> str:
     return name
 
 
-Name = Annotated[str, Field(min_length=1), AfterValidator(check_name)]
+Name = Annotated[str, Field(min_length=1), AfterValidator(check_label_name)]
 """Name of a class, an asset or a keypoint in label files."""
 
 

@@ -123,7 +123,7 @@ def _similar_folder(folder: Path, file: str) -> Path | None:
     return same[0] if len(same) == 1 else near[close[0]] if close else None
 
 
-def check_name(path: str | Path) -> None:
+def check_path_encoding(path: str | Path) -> None:
     """Refuse a path that is not valid UTF-8. Native libraries reject such paths or abort the process.
 
     Raises:

@@ -102,7 +102,7 @@ def recorded_scene(out: Path) -> str | None:
     return scene.replace(_FOLDER, out.resolve().name) if isinstance(scene, str) else None
 
 
-def write_scene(out: Path, earlier: str | None) -> tuple[Path | None, str | None]:
+def write_recorded_scene(out: Path, earlier: str | None) -> tuple[Path | None, str | None]:
     """Write the recorded scene of an asset, next to its folder; return the file, and a warning if it was edited.
 
     Args:

@@ -22,7 +22,8 @@ from mitsplat.gaussians.splat_materials import SplatMaterials
 from mitsplat.geometry.decomposition import convex_pieces
 from mitsplat.geometry.mesh import mass_properties, prepare_mesh
 from mitsplat.storage.files import JsonObject
-from mitsplat.usd.stage_records import Record, read_records
+from mitsplat.usd.stage_physics import Record
+from mitsplat.usd.stage_records import read_records
 
 _ENCODED = ("", "srgb_rec709_scene", "srgb_rec709_display", "srgb_texture", "sRGB", "auto", "raw")
 """Colour spaces whose coefficients are taken as they are. Files that state none are 3DGS files as a rule."""
@@ -76,7 +77,7 @@ def read_stage_asset(path: Path) -> StageAsset:
         notes.append("not imported: the motion of prims, which are read at the first time code")
     frame = body_frames(path, records["bodies"]).get(bodies.pop(), np.eye(4))
     splats, found_notes = merge_fields(path, fields, _inverse(frame))
-    asset = make_asset(path, records, fields[0]["body"], splats, notes)
+    asset = make_stage_asset(path, records, fields[0]["body"], splats, notes)
     notes += found_notes
     for note in notes:
         _logger.warning("%s: %s", path, note)
@@ -146,7 +147,7 @@ def _splats(field: Record, notes: list[str]) -> Splats:
     )
 
 
-def make_asset(path: Path, records: Record, body: str | None, splats: Splats, notes: list[str]) -> Asset | None:
+def make_stage_asset(path: Path, records: Record, body: str | None, splats: Splats, notes: list[str]) -> Asset | None:
     """Return the asset of a rigid body, or of everything that belongs to none; None if it has no geometry.
 
     Args:

@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from pxr import Usd
 
 Record = dict[str, Any]
+"""Values of a prim, by key."""
 
 
 def body_dynamics(prim: Usd.Prim, time: Usd.TimeCode, units: float, kilograms: float) -> Record:

@@ -24,13 +24,11 @@ from mitsplat.geometry.rigid import Z_UP_FROM_Y_UP
 from mitsplat.runtime.child_process import run_bounded
 from mitsplat.usd.stage_images import image_settings, unread_settings
 from mitsplat.usd.stage_motion import is_moving, sampled_attributes, time_codes, visibility
-from mitsplat.usd.stage_physics import body_dynamics, contact_of, mass_of_colliders
+from mitsplat.usd.stage_physics import Record, body_dynamics, contact_of, mass_of_colliders
 from mitsplat.usd.usd_layers import open_confined, require_usd
 
 if TYPE_CHECKING:
     from pxr import Usd, UsdGeom
-
-Record = dict[str, Any]
 
 METADATA = "mitsplat"
 """Key of ``customData``, and namespace of attributes, for values that no schema of USD has."""

@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from mitsplat.arrays import Float32Array, Float64Array
 from mitsplat.asset import Asset, opaque_core
-from mitsplat.capture.lighting.panorama import HDR_SUFFIXES, read_radiance, rotated, write_exr
+from mitsplat.capture.lighting.panorama import HDR_SUFFIXES, read_radiance, rotated, write_radiance
 from mitsplat.errors import InputError
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.camera import Camera
@@ -31,9 +31,10 @@ from mitsplat.scene.loading.scene_loading import load_scene
 from mitsplat.scene.scene import Scene
 from mitsplat.storage.content_hash import ContentHash
 from mitsplat.storage.files import JsonObject, storage_errors, write_text
-from mitsplat.usd.stage_assets import body_frames, make_asset, merge_fields, placed_mesh, rigid_frame
+from mitsplat.usd.stage_assets import body_frames, make_stage_asset, merge_fields, placed_mesh, rigid_frame
 from mitsplat.usd.stage_images import fit_aperture
-from mitsplat.usd.stage_records import Record, read_records
+from mitsplat.usd.stage_physics import Record
+from mitsplat.usd.stage_records import read_records
 
 _WIDTH = 1280
 """Image width of a stage without render settings [px]."""
@@ -198,7 +199,7 @@ def _object(
     frame = rigid_frame(path, fields[0])[0] if body is None else frames[body]
     splats, found = merge_fields(path, fields, np.asarray(np.linalg.inv(frame), dtype=np.float64))
     notes.extend(found)
-    asset = None if body is None else make_asset(path, records, body, splats, notes)
+    asset = None if body is None else make_stage_asset(path, records, body, splats, notes)
     if asset is None:
         name = group.rpartition("/")[2]
         asset = Asset(name, fields[0]["label"] or name, splats, mesh=_hull(path, group, splats))
@@ -266,7 +267,7 @@ def _environment(path: Path, records: Record, fields: Sequence[Record], notes: l
     splats, found = merge_fields(path, fields, np.eye(4))
     notes.extend(found)
     known = {**records, "fields": list(fields), "colliders": []}
-    asset = make_asset(path, known, None, splats, notes)
+    asset = make_stage_asset(path, known, None, splats, notes)
     asset = asset or Asset("environment", "environment", splats, kind="environment", capture_light="scene")
     return replace(asset, name="environment", kind="environment", mass=None)
 
@@ -341,7 +342,7 @@ def _lights(path: Path, record: Record, folder: Path, notes: list[str]) -> list[
             return [{"kind": "environment", "radiance": strength, **entry}]
         radiance, turn = image
         file = f"sky{len(list(folder.glob('sky*.exr')))}.exr"
-        write_exr(folder / file, radiance * np.asarray(entry["colour"], dtype=np.float32))
+        write_radiance(folder / file, radiance * np.asarray(entry["colour"], dtype=np.float32))
         return [{"kind": "environment", "radiance": strength, "image": file, "rotate_z": turn}]
     if kind in ("RectLight", "DiskLight"):
         sides = np.array([inputs.get("width", 1.0), inputs.get("height", 1.0)])

@@ -25,7 +25,7 @@ from mitsplat.labels.overlay import class_colour
 from mitsplat.scene.layout import Layout
 from mitsplat.scene.planning.conveyor import layout_at_view
 from mitsplat.scene.planning.shape_poses import placed_shapes
-from mitsplat.scene.planning.viewpoints import view_of
+from mitsplat.scene.planning.viewpoints import viewpoint_of
 from mitsplat.scene.scene import Scene
 from mitsplat.scene.spec.light_spec import AreaLight, EnvironmentLight, LightSpec, RoomLight, SpotLight
 from mitsplat.scene.spec.shape_spec import Region
@@ -287,7 +287,7 @@ def camera_parts(scene: Scene, index: int, layout: Layout | None) -> Iterator[Sh
     size = float(np.linalg.norm(np.subtract(scene.spec.region.max, scene.spec.region.min)))
     for frame in sorted({*own[:MAX_CAMERAS], *spread.tolist()}):
         there = None if layout is None or frame not in own else layout_at_view(scene.spec, layout, frame % views)
-        camera = view_of(scene, frame, there).camera
+        camera = viewpoint_of(scene, frame, there).camera
         group, colour = ("cameras", _CAMERA) if frame in own else ("other cameras", _OTHER)
         yield ShownPart(f"/{group}/{frame}", Frustum(camera, 0.15 * size, colour, frame), camera.world_from_camera)
 

@@ -163,7 +163,7 @@ def test_fisheye_cameras_are_read_from_colmap_and_transforms_json(tmp_path: Path
     (given / "cameras.txt").write_text(f"1 OPENCV_FISHEYE 320 240 {' '.join(map(str, values))}\n")
     (given / "images.txt").write_text("1 1 0 0 0 0 0 0 1 a.png\n\n2 1 0 0 0 1 0 0 1 b.png\n\n")
     (given / "points3D.txt").write_text("")
-    colmap = sfm.read_model(given, tmp_path / "work").cameras["a.png"]
+    colmap = sfm.read_colmap_model(given, tmp_path / "work").cameras["a.png"]
     names = ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "k3", "k4")
     frame = {"file_path": "a.png", "transform_matrix": np.diag([1.0, -1.0, -1.0, 1.0]).tolist()}
     lens = dict(zip(names, values, strict=True)) | {"w": 320, "h": 240, "camera_model": "OPENCV_FISHEYE"}
@@ -369,7 +369,7 @@ def test_the_model_decides_whether_its_cameras_hold_for_upright_photos(
     with Image.open(prepared[0].file) as copy:
         stored = np.asarray(copy)
     wanted = upright if of == "upright" else stored
-    monkeypatch.setattr(poses, "read_model", lambda *_: model_of(wanted))
+    monkeypatch.setattr(poses, "read_colmap_model", lambda *_: model_of(wanted))
     found, photos = read_poses(tmp_path, prepared, tmp_path / "work", base=tmp_path / "photos")
     assert len(found.cameras) == 3
     for photo in photos:
@@ -388,7 +388,7 @@ def test_an_undecided_half_turn_is_refused_with_a_remedy(
     """The points have other colours than the photos, or there are no points."""
     upright, prepared = turned_photos(tmp_path, 3, (80, 60))
     other = np.random.default_rng(9).integers(0, 256, upright.shape, dtype=np.uint8)
-    monkeypatch.setattr(poses, "read_model", lambda *_: model_of(other, points=points))
+    monkeypatch.setattr(poses, "read_colmap_model", lambda *_: model_of(other, points=points))
     with pytest.raises(InputError) as raised:
         read_poses(tmp_path, prepared, tmp_path / "work", base=tmp_path / "photos")
     assert "camera of a.png refers to the photo before or after the rotation in its EXIF data" in str(raised.value)
@@ -407,23 +407,23 @@ def write_text_model(folder: Path, images: dict[int, tuple[str, float]], points:
 
 def test_names_with_spaces_in_a_text_model_are_read_completely(tmp_path: Path) -> None:
     model = write_text_model(tmp_path / "model", {1: ("front left 1.jpg", 0.0), 2: ("front left ü 2.jpg", 0.5)})
-    assert list(sfm.read_model(model, tmp_path / "work").cameras) == ["front left 1.jpg", "front left ü 2.jpg"]
+    assert list(sfm.read_colmap_model(model, tmp_path / "work").cameras) == ["front left 1.jpg", "front left ü 2.jpg"]
 
 
 def test_one_name_with_two_poses_is_refused(tmp_path: Path) -> None:
     images = {1: ("a.jpg", 0.0), 2: ("b.jpg", 0.5), 3: ("a.jpg", 0.0)}
     twice = write_text_model(tmp_path / "twice", images)
-    assert list(sfm.read_model(twice, tmp_path / "work").cameras) == ["a.jpg", "b.jpg"]
+    assert list(sfm.read_colmap_model(twice, tmp_path / "work").cameras) == ["a.jpg", "b.jpg"]
     differing = write_text_model(tmp_path / "differing", images | {3: ("a.jpg", 0.1)})
     with pytest.raises(InputError, match=r"two images with different poses have the name a\.jpg"):
-        sfm.read_model(differing, tmp_path / "work")
+        sfm.read_colmap_model(differing, tmp_path / "work")
 
 
 def test_references_to_removed_points_are_left_out(tmp_path: Path) -> None:
     images = {1: ("a.jpg", 0.0), 2: ("b.jpg", 0.5)}
     points = "7 0 0 1 10 20 30 0.1 1 0 2 0\n"
     model = write_text_model(tmp_path / "model", images, points, seen="32 24 7 40 20 8")
-    read = sfm.read_model(model, tmp_path / "work")
+    read = sfm.read_colmap_model(model, tmp_path / "work")
     assert read.points.tolist() == [[0, 0, 1]] and read.seen["a.jpg"].tolist() == [0]
 
 

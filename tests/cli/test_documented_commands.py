@@ -27,7 +27,7 @@ import typer.main
 from ruamel.yaml import YAML
 
 import mitsplat as ms
-from mitsplat.capture.lighting.panorama import write_exr
+from mitsplat.capture.lighting.panorama import write_radiance
 from mitsplat.checks.path_checks import check_scene
 from mitsplat.cli import app
 from mitsplat.gaussians.surfels import place_surfels
@@ -169,7 +169,7 @@ def lay_inputs(folder: Path) -> None:
     for name in ("ball", "photos/ball"):
         (folder / name).mkdir(parents=True)
         room.photographs(folder / name, mirrored, [0.01, 0.05, 0.25, 1.2], ".jpg")
-    write_exr(folder / "hall.exr", room.true_panorama(128, 8))
+    write_radiance(folder / "hall.exr", room.true_panorama(128, 8))
 
 
 PHOTOGRAPHS = ("capture", "asset", "fit", "mesh")

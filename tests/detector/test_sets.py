@@ -15,7 +15,7 @@ from pycocotools import mask as coco_mask
 
 from mitsplat.detector.labelled_sets.coco_annotations import _run_lengths
 from mitsplat.detector.labelled_sets.labelled_set import LabelledSet, check_masks, reorder_classes
-from mitsplat.detector.labelled_sets.pictures import read_picture
+from mitsplat.detector.labelled_sets.pictures import read_upright
 from mitsplat.detector.labelled_sets.set_reading import read_set
 from mitsplat.detector.training import read_sets, write_data
 from mitsplat.errors import InputError
@@ -381,12 +381,12 @@ def test_image_files_are_read_with_any_name(tmp_path: Path) -> None:
     turned = Image.Exif()
     turned[274] = 6
     Image.fromarray(paint(0)[0]).save(path, exif=turned)
-    assert read_picture(path).shape == (WIDTH, HEIGHT, 3)
+    assert read_upright(path).shape == (WIDTH, HEIGHT, 3)
     with pytest.raises(InputError, match=r"none\.png: cannot be read \(No such file"):
-        read_picture(tmp_path / "none.png")
+        read_upright(tmp_path / "none.png")
     (tmp_path / "empty.png").write_bytes(b"")
     with pytest.raises(InputError, match=r"empty\.png: cannot be read as an image"):
-        read_picture(tmp_path / "empty.png")
+        read_upright(tmp_path / "empty.png")
 
 
 def test_the_digest_changes_with_images_and_labels(tmp_path: Path) -> None:

@@ -16,12 +16,12 @@ os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
 import numpy as np
 import mitsplat
 import drjit as dr
-from mitsplat.capture.lighting.panorama import read_radiance, write_exr
+from mitsplat.capture.lighting.panorama import read_radiance, write_radiance
 from mitsplat.runtime.variant import ensure_variant
 ensure_variant()
 dr.set_thread_count(1)
 path, radiance = Path(sys.argv[1]), np.arange(24, dtype=np.float32).reshape(2, 4, 3)
-write_exr(path, radiance)
+write_radiance(path, radiance)
 assert np.array_equal(read_radiance(path), radiance)
 """
 

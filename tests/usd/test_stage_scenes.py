@@ -13,7 +13,7 @@ import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from mitsplat.capture.lighting.panorama import write_exr
+from mitsplat.capture.lighting.panorama import write_radiance
 from mitsplat.errors import InputError
 from mitsplat.geometry.rigid import Z_UP_FROM_Y_UP
 from mitsplat.physics.settle import settle_layout
@@ -375,7 +375,7 @@ def test_an_image_of_the_sky_has_the_orientation_that_usdlux_defines(
     image = np.zeros((32, 64, 3), dtype=np.float32)
     image[:16, :32] = 1.0  # directions with y > 0 (the pole) and x > 0 (left of the middle, +z)
     if suffix == ".exr":
-        write_exr(tmp_path / "sky.exr", image)
+        write_radiance(tmp_path / "sky.exr", image)
     else:
         Image.fromarray((255 * image).astype(np.uint8)).save(tmp_path / "sky.png")
     stage = Usd.Stage.Open(str(path))

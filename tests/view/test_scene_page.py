@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from mitsplat.arrays import ByteImage
 from mitsplat.geometry.camera import look_at_pose
-from mitsplat.scene.planning.viewpoints import view_of
+from mitsplat.scene.planning.viewpoints import viewpoint_of
 from mitsplat.view.page import Address, Page
 from mitsplat.view.previews import SceneRenders, ViewRequest
 from mitsplat.view.scene_page import ScenePage
@@ -112,7 +112,7 @@ def test_a_frame_is_shown_until_the_camera_moves(shown):
     shown.scene_page._frame.value = 1
     second = shown.picture()
     assert np.abs(second.astype(int) - first).mean() > 2
-    own = view_of(shown.scene_page._scene, 1, shown.scene_page._layout).camera.world_from_camera
+    own = viewpoint_of(shown.scene_page._scene, 1, shown.scene_page._layout).camera.world_from_camera
     shown.scene_page._moved(look(own))
     assert shown.scene_page._pose is None  # the page moved the camera there
     shown.scene_page._moved(look(look_at_pose((0, 0.3, 0.3), (0, 0, 0))))

@@ -16,7 +16,7 @@ from mitsplat.arrays import ByteImage, Float32Array, Float64Array
 from mitsplat.capture.lighting.brackets import CLIPPED, exposures_of, merge_exposures, read_photograph
 from mitsplat.capture.lighting.lamps import Lamp, take_lamps
 from mitsplat.capture.lighting.mirror_ball import BallPanorama, Circle, find_ball, unwrap_ball
-from mitsplat.capture.lighting.panorama import HDR_SUFFIXES, level_irradiance, read_radiance, resized, write_exr
+from mitsplat.capture.lighting.panorama import HDR_SUFFIXES, level_irradiance, read_radiance, resized, write_radiance
 from mitsplat.errors import InputError
 from mitsplat.images.colour import LUMINANCE, encode_srgb
 from mitsplat.storage.files import write_file, write_text
@@ -228,11 +228,11 @@ def write_light(estimate: LightEstimate, out: Path, photograph: ByteImage | None
     picture_file, panorama, rest = _output_files(out)
     image = panorama.name
     files = [out, picture_file, panorama]
-    write_exr(panorama, estimate.panorama)
+    write_radiance(panorama, estimate.panorama)
     if estimate.lamps and estimate.settings.rest == "image":
         image = rest.name
         files.append(rest)
-        write_exr(rest, estimate.rest)
+        write_radiance(rest, estimate.rest)
     shown = _draw_lamps(estimate)
     if photograph is not None:
         width = photograph.shape[1] * len(shown) // len(photograph)

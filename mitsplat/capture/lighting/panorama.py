@@ -128,7 +128,7 @@ def read_radiance(path: Path) -> Float32Array:
     return np.asarray(np.maximum(radiance, 0.0))
 
 
-def write_exr(path: Path, radiance: Float32Array) -> None:
+def write_radiance(path: Path, radiance: Float32Array) -> None:
     """Write linear RGB, shape (H, W, 3), as 32-bit OpenEXR."""
     ensure_variant()
     bitmap = mi.Bitmap(np.ascontiguousarray(radiance, dtype=np.float32))

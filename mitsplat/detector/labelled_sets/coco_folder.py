@@ -18,7 +18,7 @@ from mitsplat.detector.labelled_sets.labelled_set import (
     relative_name,
     reorder_classes,
 )
-from mitsplat.detector.labelled_sets.pictures import check_image, images_below
+from mitsplat.detector.labelled_sets.pictures import check_complete, images_below
 from mitsplat.errors import InputError
 from mitsplat.progress import Progress
 from mitsplat.storage.files import JsonObject, is_inside, read_json
@@ -80,7 +80,7 @@ def _coco_part(root: Path, split: Split, path: Path, content: JsonObject, progre
 
     def read(image: JsonObject) -> Sample:
         file = find(str(image.get("file_name")))
-        width, height, shown = check_image(file)
+        width, height, shown = check_complete(file)
         if (image.get("width", width), image.get("height", height)) != (width, height):
             raise InputError(
                 f"{file}: must have the size in {path.name}, {image.get('width')} x {image.get('height')} px, "

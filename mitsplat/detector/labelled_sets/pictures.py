@@ -13,7 +13,7 @@ from mitsplat.arrays import ByteImage
 from mitsplat.errors import InputError
 from mitsplat.images.picture_files import MAX_FILE_BYTES
 from mitsplat.storage.content_hash import ContentHash
-from mitsplat.storage.file_kinds import check_name
+from mitsplat.storage.file_kinds import check_path_encoding
 from mitsplat.storage.files import IMAGE_ERRORS, files_below, read_regular
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
@@ -35,11 +35,11 @@ def images_below(folder: Path) -> list[Path]:
     """
     images = [path for path in files_below(folder) if path.suffix.lower() in SUFFIXES]
     for path in images:
-        check_name(path)
+        check_path_encoding(path)
     return images
 
 
-def read_picture(path: Path) -> ByteImage:
+def read_upright(path: Path) -> ByteImage:
     """Read an image with its EXIF orientation applied: shape (H, W, 3), BGR.
 
     Raises:
@@ -66,7 +66,7 @@ def _decode(data: bytes, path: Path) -> ByteImage:
     return np.asarray(picture, dtype=np.uint8)
 
 
-def check_image(path: Path) -> tuple[int, int, ContentHash]:
+def check_complete(path: Path) -> tuple[int, int, ContentHash]:
     """Check that an image is complete; return its width and height after EXIF orientation [px] and its content hash.
 
     Raises:

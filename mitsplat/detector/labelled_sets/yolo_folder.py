@@ -19,7 +19,7 @@ from mitsplat.detector.labelled_sets.labelled_set import (
     read_samples,
     relative_name,
 )
-from mitsplat.detector.labelled_sets.pictures import check_image, images_below
+from mitsplat.detector.labelled_sets.pictures import check_complete, images_below
 from mitsplat.errors import InputError
 from mitsplat.progress import Progress
 from mitsplat.storage.files import SPLITS, JsonObject
@@ -105,7 +105,7 @@ def _read_images(
         raise InputError(f"{root}: its images have no labels, such as {_label_file(images[0])}")
 
     def read(image: Path) -> Sample:
-        width, height, content = check_image(image)
+        width, height, content = check_complete(image)
         label = _label_file(image)
         if label.is_file():
             text = label.read_text(encoding="utf-8-sig", errors="replace")

@@ -31,7 +31,7 @@ from mitsplat.reconstruct.reconstruct import AssetJob, Reconstruction, reconstru
 from mitsplat.storage.content_hash import ContentHash, file_hash
 from mitsplat.storage.files import JsonObject, write_text
 from mitsplat.surroundings.environment_from_photos import reconstruct_environment
-from mitsplat.surroundings.ready_scene import recorded_scene, write_scene
+from mitsplat.surroundings.ready_scene import recorded_scene, write_recorded_scene
 from mitsplat.version import __version__
 
 
@@ -158,7 +158,7 @@ def make_asset(
         _save_verdict(out, result, inputs)
         warnings = () if edited is None else (f"{ASSET_FILE} had been edited: the edited file is now {edited.name}",)
         done = AssetResult(out, result.verdict, kept=False, warnings=warnings)
-    scene, warning = write_scene(out, earlier_scene)
+    scene, warning = write_recorded_scene(out, earlier_scene)
     return replace(done, scene=scene, warnings=done.warnings if warning is None else (*done.warnings, warning))
 
 

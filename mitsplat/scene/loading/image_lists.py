@@ -12,7 +12,7 @@ from pathlib import Path
 
 from mitsplat.errors import InputError
 from mitsplat.images.untrusted_images import IMAGE_SUFFIXES
-from mitsplat.storage.file_kinds import check_name
+from mitsplat.storage.file_kinds import check_path_encoding
 
 WILDCARDS = frozenset("*?[")
 
@@ -93,7 +93,7 @@ def names_below(folder: Path, pattern: str, paths: Iterable[Path]) -> tuple[str,
     absolute = Path(pattern).is_absolute()
     paths = list(paths)
     for path in paths:
-        check_name(path)
+        check_path_encoding(path)
     return tuple(path.as_posix() if absolute else path.relative_to(folder).as_posix() for path in paths)
 
 

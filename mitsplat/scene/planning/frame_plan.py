@@ -16,7 +16,7 @@ from mitsplat.geometry.camera import Camera
 from mitsplat.scene.layout import Layout
 from mitsplat.scene.planning.conveyor import Belt, belt_of
 from mitsplat.scene.planning.frame_lights import lights_at
-from mitsplat.scene.planning.viewpoints import Viewpoint, check_eye, view_of
+from mitsplat.scene.planning.viewpoints import Viewpoint, check_eye, viewpoint_of
 from mitsplat.scene.scene import Scene
 from mitsplat.scene.spec.image_spec import Randomise
 from mitsplat.scene.spec.light_spec import EnvironmentLight, LightEntry, LightSpec
@@ -131,13 +131,13 @@ def plan_frame(
     view = index - number * spec.output.views
     time = view / max(1, spec.output.views - 1)
     ranges = spec.randomise
-    viewpoint = view_of(scene, index, layout) if camera is None else Viewpoint(camera)
+    viewpoint = viewpoint_of(scene, index, layout) if camera is None else Viewpoint(camera)
     if camera is not None and layout is not None:
         check_eye(scene, index, layout, camera)
     if next_camera is None and camera is not None:
         next_camera = None if next_layout is None else camera
     elif next_camera is None and view + 1 < spec.output.views:
-        next_camera = view_of(scene, index + 1, layout if next_layout is None else next_layout).camera
+        next_camera = viewpoint_of(scene, index + 1, layout if next_layout is None else next_layout).camera
     return FramePlan(
         index=index,
         layout=number,

@@ -65,7 +65,7 @@ class Viewpoint:
 
 
 @lru_cache(maxsize=4)
-def view_of(scene: Scene, index: int, layout: Layout | None = None) -> Viewpoint:
+def viewpoint_of(scene: Scene, index: int, layout: Layout | None = None) -> Viewpoint:
     """Return the viewpoint of frame ``index``. The layout is needed only if the viewpoint depends on the objects.
 
     Raises:

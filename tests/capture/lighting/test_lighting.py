@@ -84,7 +84,7 @@ class TestPanoramas:
     def test_directions_agree_with_those_of_the_renderer(self, tmp_path: Path, turn: float) -> None:
         sky = np.zeros((32, 64, 3), np.float32)
         sky[7, 50] = 1.0
-        panorama.write_exr(tmp_path / "sky.exr", sky)
+        panorama.write_radiance(tmp_path / "sky.exr", sky)
         emitter = mi.load_dict(emitter_dict(EnvironmentLight(image="sky.exr", rotate_z=turn), tmp_path))
         sight = directions(128, 256).reshape(-1, 3)
         seen = dr.zeros(mi.SurfaceInteraction3f, len(sight))
@@ -486,10 +486,10 @@ class TestInput:
         Image.fromarray(grey[:, :100]).save("small.png")
         Path("broken.jpg").write_bytes(b"no image")
         sky = np.ones((8, 16, 3), np.float32)
-        panorama.write_exr(Path("square.exr"), sky[:, :8])
-        panorama.write_exr(Path("dark.exr"), 0 * sky)
+        panorama.write_radiance(Path("square.exr"), sky[:, :8])
+        panorama.write_radiance(Path("dark.exr"), 0 * sky)
         sky[3, 5] = np.nan
-        panorama.write_exr(Path("nan.exr"), sky)
+        panorama.write_radiance(Path("nan.exr"), sky)
         return tmp_path
 
     @pytest.mark.parametrize(

@@ -12,3 +12,7 @@ Note = Callable[[str], None]
 
 TIME_NOTE = "time: "
 """Beginning of the note that estimates the time of a run. It stays visible."""
+
+
+def discard_note(text: str) -> None:
+    """Ignore the description of a slow operation."""

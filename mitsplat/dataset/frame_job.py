@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 from mitsplat.dataset.dataset_files import LOCK
 from mitsplat.errors import InputError, PartialResultError
 from mitsplat.formats.registry import Catalogue, write_frame
-from mitsplat.progress import Note
+from mitsplat.progress import Note, discard_note
 from mitsplat.scene.layout import Layout, UnsettledLayoutError
 from mitsplat.scene.planning.frame_plan import layout_index_of
 from mitsplat.scene.scene import Scene
@@ -103,7 +103,7 @@ class FrameJob:
             with suppress(BlockingIOError), open_in_place(path.parent / LOCK, "ab") as lock:
                 fcntl.lockf(lock, fcntl.LOCK_EX | fcntl.LOCK_NB, 1, index)
                 if not path.exists():
-                    write_text(path, self.settle_to_json(index, lambda text: None))
+                    write_text(path, self.settle_to_json(index, discard_note))
 
     def _layout_path(self, index: int) -> Path:
         return self.out / f"layouts/{index:04d}.json"
@@ -182,7 +182,7 @@ class RemoteFrameJob:
 
     def settle(self, layout: int) -> str:
         """Settle a layout and return it as JSON."""
-        return self.job.settle_to_json(layout, lambda text: None)
+        return self.job.settle_to_json(layout, discard_note)
 
     def make(self, index: int, layout: str) -> RemoteFrame:
         """Make frame ``index`` of a layout."""

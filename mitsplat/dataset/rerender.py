@@ -25,6 +25,7 @@ from mitsplat.errors import InputError, path_of
 from mitsplat.formats.registry import Catalogue
 from mitsplat.frames.frame import render_frame
 from mitsplat.physics.settle import settle_layout
+from mitsplat.progress import discard_note
 from mitsplat.runtime.device import Device, current_device, use_device
 from mitsplat.scene.planning.frame_plan import layout_index_of, to_index
 from mitsplat.scene.scene import Scene
@@ -90,7 +91,7 @@ def rerender_frame(
     layout_file = f"layouts/{layout:04d}.json"
     job = FrameJob(scene, catalogue, out, render, settle)
     with storage_errors(out):
-        text = job.settle_to_json(layout, lambda text: None)
+        text = job.settle_to_json(layout, discard_note)
         _remove_frame(out)
         write_text(out / layout_file, text)
         record, _ = job.write(index, job.load_layout(text))

@@ -20,7 +20,7 @@ from mitsplat.engine.resources import TYPICAL_MEMORY, WorkerMemory, unused_memor
 from mitsplat.engine.scheduler import memory_error, run_pool
 from mitsplat.engine.worker_processes import MakeFrame, WorkerProcesses
 from mitsplat.errors import InputError, check_whole_number, is_out_of_memory, sentence_of
-from mitsplat.progress import Note
+from mitsplat.progress import Note, discard_note
 from mitsplat.runtime.cores import usable_cores
 from mitsplat.runtime.device import Device, current_device, use_device
 
@@ -137,7 +137,7 @@ def run_in_process(make: MakeFrame[Result], device: Device | None = None) -> Gen
         InputError, MissingResourceError, FrameError, LostWorkersError: As :func:`run_frames`.
     """
     with closing(WorkerProcesses(make, device)) as pool:
-        yield from run_pool(pool, {0: [0]}, 1, lambda text: None)
+        yield from run_pool(pool, {0: [0]}, 1, discard_note)
 
 
 def affordable_workers(memory: WorkerMemory, device: Device | None = None) -> int:

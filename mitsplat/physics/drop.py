@@ -31,7 +31,7 @@ from mitsplat.physics.rest import (
 )
 from mitsplat.physics.static_scene import StaticScene, make_static_scene
 from mitsplat.physics.worlds import MujocoWorld, WarpWorld, World
-from mitsplat.progress import Note
+from mitsplat.progress import Note, discard_note
 from mitsplat.scene.layout import NO_PHYSICS, Instance, Layout, LeftOut, RestCertificate, UnsettledLayoutError
 from mitsplat.scene.planning.contents import draw_arrangements, draw_objects, draw_regions
 from mitsplat.scene.scene import Scene
@@ -306,7 +306,7 @@ class Drop:
         key = len(self._surroundings) + layout
         if key not in self.static_scenes:
             bodies, around = [part.body for part in self.objects], self._surroundings[number]
-            self.static_scenes = {key: make_static_scene(self.scene, bodies, around, lambda text: None, layout)}
+            self.static_scenes = {key: make_static_scene(self.scene, bodies, around, discard_note, layout)}
         return key
 
     def _run(

@@ -17,7 +17,7 @@ import trimesh
 
 from mitsplat.engine.pool import run_frames
 from mitsplat.errors import InputError
-from mitsplat.progress import Note
+from mitsplat.progress import Note, discard_note
 from mitsplat.runtime.variant import one_at_a_time
 from mitsplat.runtime.warp_start import quiet_warp
 from mitsplat.scene.layout import Layout, UnsettledLayoutError
@@ -82,7 +82,7 @@ def settle_layout(scene: Scene, index: int, *, progress: Note | None = None, cac
     with warp_settings(progress if scene.spec.settle.stepper == "warp" else None):
         from mitsplat.physics.drop import drop_of  # Newton reads these settings when it compiles
 
-        layout = drop_of(scene, progress or (lambda text: None)).settle(index)
+        layout = drop_of(scene, progress or discard_note).settle(index)
     if cached:
         write_cache_file(path, lambda file: file.write(json.dumps(layout.to_json()).encode()))
     return layout
@@ -122,7 +122,7 @@ def settle_layouts(
     wait for the slowest (``python -m benchmarks.physics.settle worlds``).
     """
     layouts = {index: [index] for index in indices}
-    return run_frames(_SettleOne(scene, cached), layouts, workers=workers, note=progress or (lambda text: None))
+    return run_frames(_SettleOne(scene, cached), layouts, workers=workers, note=progress or discard_note)
 
 
 def try_alone(scene: Scene) -> Iterator[tuple[str, Arrangement, list[str]]]:
@@ -143,7 +143,7 @@ def try_alone(scene: Scene) -> Iterator[tuple[str, Arrangement, list[str]]]:
         from mitsplat.physics.drop import drop_of  # Newton reads these settings when it compiles
         from mitsplat.physics.placement import PUT_DOWN
 
-        drop = drop_of(scene, lambda text: None)
+        drop = drop_of(scene, discard_note)
         for entry, pool in zip(scene.spec.objects, scene.pools, strict=True):
             for region in () if entry.poses else scene.spec.regions_of(entry):
                 possible = scene.spec.all_regions[region][1]
@@ -183,7 +183,7 @@ def replay_layout(scene: Scene, layout: Layout, *, interval: float = 0.04) -> It
     with warp_settings():
         from mitsplat.physics.drop import drop_of  # Newton reads these settings when it compiles
 
-        for time, poses, again in drop_of(scene, lambda text: None).replay(layout, interval):
+        for time, poses, again in drop_of(scene, discard_note).replay(layout, interval):
             moving = (
                 replace(instance, world_from_object=pose)
                 for instance, pose in zip(layout.instances, poses, strict=True)

@@ -16,7 +16,7 @@ from mitsplat.images.colour import decode_srgb
 from mitsplat.physics.bodies import make_body, make_collider
 from mitsplat.physics.settle import settle_layout, warp_settings
 from mitsplat.physics.worlds import Body, Collider
-from mitsplat.progress import Note
+from mitsplat.progress import discard_note
 from mitsplat.renderer.textures import texture_image
 from mitsplat.runtime.variant import ensure_variant
 from mitsplat.scene.planning.conveyor import layout_at_view
@@ -93,26 +93,24 @@ class FrameContent:
     notes: tuple[str, ...] = ()
 
 
-def frame_content(scene: Scene, index: int, progress: Note = lambda text: None) -> FrameContent:
+def frame_content(scene: Scene, index: int) -> FrameContent:
     """Return the content of frame ``index`` of a scene: objects at rest, colliders, camera and lights.
 
     Raises:
         InputError: If there is no such frame, or its layout does not settle.
     """
     number = layout_index_of(scene, index)
-    layout = layout_at_view(
-        scene.spec, settle_layout(scene, number, progress=progress), index % scene.spec.output.views
-    )
+    layout = layout_at_view(scene.spec, settle_layout(scene, number), index % scene.spec.output.views)
     plan = plan_frame(scene, index, layout)
     environment = scene.environment_of(number)
     with warp_settings():
         used = sorted({instance.asset for instance in layout.instances})
-        assets = {asset: (scene.assets[asset], make_body(scene.assets[asset], progress)) for asset in used}
-        shapes = tuple(_static_shapes(scene, plan, progress))
+        assets = {asset: (scene.assets[asset], make_body(scene.assets[asset], discard_note)) for asset in used}
+        shapes = tuple(_static_shapes(scene, plan))
         ground = None
         if environment is not None and environment.mesh is not None and scene.spec.environment_collides:
             mesh = prepare_mesh(environment.mesh, f"asset {environment.name!r}", solid=False)
-            ground = make_collider(environment, mesh, progress)
+            ground = make_collider(environment, mesh, discard_note)
     return FrameContent(
         name=scene.spec.name,
         assets=assets,
@@ -129,7 +127,7 @@ def frame_content(scene: Scene, index: int, progress: Note = lambda text: None) 
     )
 
 
-def _static_shapes(scene: Scene, plan: FramePlan, progress: Note) -> list[StaticShape]:
+def _static_shapes(scene: Scene, plan: FramePlan) -> list[StaticShape]:
     """Return the shapes of the scene file without the walls of enclosures, at which no object rests."""
     surroundings, found = draw_surroundings(scene.spec, plan.index), []
     for placed in placed_shapes(scene, plan.layout):
@@ -138,7 +136,7 @@ def _static_shapes(scene: Scene, plan: FramePlan, progress: Note) -> list[Static
             continue
         collider = None
         if shape.collider:
-            collider = make_collider(shape, prepare_mesh(placed.stated, f"shape {shape.name!r}"), progress)
+            collider = make_collider(shape, prepare_mesh(placed.stated, f"shape {shape.name!r}"), discard_note)
             if shape.is_jittered:
                 collider = collider.moved(placed.motion)
         colour = _mean_colour(scene, shape, surroundings) if shape.visible else None

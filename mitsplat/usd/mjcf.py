@@ -30,6 +30,7 @@ from mitsplat.physics.drop import TIMESTEP
 from mitsplat.physics.friction import GRAVITY, MIN_FRICTION, ContactMaterial
 from mitsplat.physics.settle import warp_settings
 from mitsplat.physics.worlds import CONTACT_TIME, DAMPING_RATIO, IMPEDANCE_MUJOCO, WITH_ROLL, Body
+from mitsplat.progress import discard_note
 from mitsplat.scene.scene import Scene
 from mitsplat.storage.files import storage_errors, write_file
 from mitsplat.usd.frame_content import FrameContent, PlacedObject, frame_content
@@ -53,7 +54,7 @@ def export_asset_mjcf(asset: Asset, path: Path) -> tuple[str, ...]:
         got = "an environment" if asset.kind != "object" else "unknown units"
         raise InputError(f"asset {asset.name!r} must be an object of known size for MJCF (got {got})")
     with warp_settings():
-        body = make_body(asset, lambda text: None)
+        body = make_body(asset, discard_note)
     place = PlacedObject(1, 0, np.eye(4), labelled=True)
     return _write_model(FrameContent(asset.name, {0: (asset, body)}, (place,)), path)
 

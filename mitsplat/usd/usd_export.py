@@ -31,6 +31,7 @@ from mitsplat.physics.bodies import make_body
 from mitsplat.physics.friction import GRAVITY, MIN_FRICTION, ContactMaterial
 from mitsplat.physics.settle import warp_settings
 from mitsplat.physics.worlds import CONTACT_DAMPING, CONTACT_STIFFNESS, IMPEDANCE_MUJOCO, WITH_ROLL, Body, Collider
+from mitsplat.progress import discard_note
 from mitsplat.scene.scene import Scene
 from mitsplat.scene.spec.light_spec import EnvironmentLight, LightSpec
 from mitsplat.storage.files import JsonObject, library_errors, storage_errors, write_file
@@ -62,7 +63,7 @@ def export_asset_usd(asset: Asset, path: Path) -> tuple[str, ...]:
     body = None
     if asset.kind == "object":
         with warp_settings():
-            body = make_body(asset, lambda text: None)
+            body = make_body(asset, discard_note)
 
     def write(writer: _StageWriter) -> None:
         prim = writer.stage.DefinePrim(f"/{writer.name(asset.name)}", "Xform")

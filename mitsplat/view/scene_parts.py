@@ -47,6 +47,8 @@ _GREY, _WALL, _REGION, _LIGHT, _CAMERA, _OTHER = (
     (220, 70, 60),
     (120, 120, 120),
 )
+_CONE_LENGTH = 0.15
+"""Length of the lines that show the cone of a spot light [m]."""
 _RING = np.linspace(0, 2 * np.pi, 25)
 _EDGES = np.array([[0, 1], [2, 3], [4, 5], [6, 7], [0, 2], [1, 3], [4, 6], [5, 7], [0, 4], [1, 5], [2, 6], [3, 7]])
 """Edges of a box, whose corner ``i`` is low or high along x, y, z by the bits of ``i``."""
@@ -340,9 +342,9 @@ def _rectangle(width: float, height: float) -> trimesh.Trimesh:
     return trimesh.Trimesh(corners, [(0, 1, 2), (0, 2, 3)], process=False)
 
 
-def _cone(half_angle: float, length: float = 0.15) -> Float64Array:
+def _cone(half_angle: float) -> Float64Array:
     """Return the lines of a cone that opens along +z from the origin, shape (N, 2, 3) [m]."""
-    along, across = length * np.cos(np.radians(half_angle)), length * np.sin(np.radians(half_angle))
+    along, across = _CONE_LENGTH * np.cos(np.radians(half_angle)), _CONE_LENGTH * np.sin(np.radians(half_angle))
     rim = np.stack([across * np.cos(_RING), across * np.sin(_RING), np.full_like(_RING, along)], axis=1)
     rays = np.stack([np.zeros((4, 3)), rim[:-1:6]], axis=1)
     return np.concatenate([np.stack([rim[:-1], rim[1:]], axis=1), rays])

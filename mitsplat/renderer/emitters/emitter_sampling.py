@@ -266,15 +266,13 @@ def sky_irradiance(emitter: mi.EmitterPtr) -> SkyIrradiance:
     return SkyIrradiance(sample.d, radiance)
 
 
-def reference_irradiance(
-    scene: mi.Scene, point: Sequence[float], normal: Sequence[float] = (0.0, 0.0, 1.0)
-) -> mi.Color3f:
-    """Compute the unoccluded irradiance (Color3f) of the scene's emitters on a surface element.
+def reference_irradiance(scene: mi.Scene, point: Sequence[float]) -> mi.Color3f:
+    """Compute the unoccluded irradiance (Color3f) of the scene's emitters on a surface element that faces up.
 
     Where almost no light reaches that element, the result is the mean over all orientations (a quarter of the fluence).
     """
     i = dr.arange(mi.UInt32, SPHERE_LATTICE[0])
-    si = receiver(mi.Point3f(*[dr.opaque(mi.Float, float(v)) for v in point]), mi.Vector3f(*normal))
+    si = receiver(mi.Point3f(*[dr.opaque(mi.Float, float(v)) for v in point]), mi.Vector3f(0, 0, 1))
     sample, radiance = scene.sample_emitter_direction(si, lattice_point(i, SPHERE_LATTICE), False)
     irradiance = mi.Color3f(*[dr.mean(c) for c in radiance * dr.maximum(dr.dot(mi.Vector3f(si.n), sample.d), 0)])
     mean = mi.Color3f(*[0.25 * dr.mean(c) for c in radiance])

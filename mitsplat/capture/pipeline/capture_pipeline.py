@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -258,21 +258,7 @@ def _capture(photos: Path, out: Path, settings: CaptureSettings, progress: Progr
     by_file = {photo.file.name: photo for photo in prepared}
     model, frame, faults = _find_model(photos, by_file, given, settings, work, progress)
     rejected |= {by_file[file].name: fault for file, fault in faults.items()}
-    capture = Capture(
-        photos=tuple(
-            Photo(by_file[file].name, by_file[file].file, camera, None, model.seen[file])
-            for file, camera in model.cameras.items()
-        ),
-        points=model.points,
-        colours=model.colours,
-        units=frame.units,
-        up=frame.up,
-        rejected=rejected,
-        scale_error=frame.scale_error,
-    ).transformed(frame.matrix)
-    # The near distance depends on the units, and poses do not define one.
-    near = tuple(replace(photo, camera=replace(photo.camera, near=0.01)) for photo in capture.photos)
-    capture = replace(capture, photos=near, table=frame.table)
+    capture = _in_frame(model, frame, by_file, rejected)
     lenses = {photo.name: photo.camera for photo in capture.photos}
     if settings.undistorted:
         capture = replace(capture, photos=tuple(undistort(photo) for photo in capture.photos))
@@ -291,16 +277,44 @@ def _capture(photos: Path, out: Path, settings: CaptureSettings, progress: Progr
         if path.name not in used:
             path.unlink()
     write_file(out / "capture.png", lambda part: capture_sheet(capture).save(part, "PNG"))
-    kept = {photo.name for photo in capture.photos}
-    doubtful = {
-        by_file[file].name: share
-        for file, share in model.agreement.items()
-        if share < SURE_AGREEMENT and file not in frame.confirmed and by_file[file].name in kept
-    }
+    doubtful = _doubtful_photos(model, frame, by_file, {photo.name for photo in capture.photos})
     result = CaptureResult(capture, len(files), frame.source, model.reprojection_error, doubtful)
     record = {key: getattr(result, key) for key in _RESULT_FIELDS}
     write_text(out / _INPUTS, json.dumps({"inputs": inputs, **record}, indent=1))
     return result
+
+
+def _in_frame(
+    model: SparseModel, frame: MetricFrame, by_file: Mapping[str, Prepared], rejected: dict[str, str]
+) -> Capture:
+    """Return the capture of a reconstruction, without masks, in its metric frame."""
+    photos = tuple(
+        Photo(by_file[file].name, by_file[file].file, camera, None, model.seen[file])
+        for file, camera in model.cameras.items()
+    )
+    capture = Capture(
+        photos=photos,
+        points=model.points,
+        colours=model.colours,
+        units=frame.units,
+        up=frame.up,
+        rejected=rejected,
+        scale_error=frame.scale_error,
+    ).transformed(frame.matrix)
+    # The near distance depends on the units, and poses do not define one.
+    near = tuple(replace(photo, camera=replace(photo.camera, near=0.01)) for photo in capture.photos)
+    return replace(capture, photos=near, table=frame.table)
+
+
+def _doubtful_photos(
+    model: SparseModel, frame: MetricFrame, by_file: Mapping[str, Prepared], kept: Set[str]
+) -> dict[str, float]:
+    """Return the agreement of the ``kept`` photos whose camera neither the matches nor a target confirm."""
+    return {
+        by_file[file].name: share
+        for file, share in model.agreement.items()
+        if share < SURE_AGREEMENT and file not in frame.confirmed and by_file[file].name in kept
+    }
 
 
 def _check_outputs(out: Path, photos: Path, settings: CaptureSettings) -> None:

@@ -46,6 +46,32 @@ DIFFUSE_SPREAD = 0.5
 
 
 @dataclass(frozen=True, eq=False)
+class _Point:
+    """Points of objects and visible meshes that rays hit.
+
+    Attributes:
+        origin: Positions, lifted off the surface [m].
+        normal: Unit normals towards the origin of the ray.
+        instance: Instance ids.
+        surface: Materials.
+        albedo: Diffuse reflectance (Color3f).
+        lobe: Specular lobes along the rays; None if the points are diffuse.
+    """
+
+    origin: mi.Point3f
+    normal: mi.Normal3f
+    instance: mi.UInt32
+    surface: SurfaceMaterial
+    albedo: mi.Color3f
+    lobe: SpecularLobe | None
+
+    @property
+    def metal(self) -> mi.Bool:
+        """True for metals, which mirror the further ray."""
+        return self.surface.metallic > 0.5
+
+
+@dataclass(frozen=True, eq=False)
 class Reflectors:
     """Surfaces that reflect light.
 
@@ -227,9 +253,21 @@ class Reflectors:
         spread: mi.Float,
     ) -> mi.Color3f:
         """Return the colour (Color3f) of objects and visible meshes: reflected light of one emitter and one ray."""
-        dynamic, last = self.proxies.dynamic, bounces == 1
+        dynamic = self.proxies.dynamic
         if dynamic is None:
             return mi.Color3f(0)
+        materials, last = dynamic.materials, bounces == 1
+        glossy = materials is not None and materials.glossy and not last
+        point = self._point_at(dynamic, ray, hit, spread if glossy else None)
+        lit = self._direct_light(point, key, emitter_sample)
+        if last or materials is None:
+            return lit
+        return self._with_onward_light(lit, point, key, bounces - 1)
+
+    def _point_at(
+        self, dynamic: TraceScene, ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, spread: mi.Float | None
+    ) -> _Point:
+        """Return the surface points at hits; with a ``spread``, with the specular lobes that reflect along the rays."""
         visible = dynamic.is_visible(hit)
         normal = dynamic.normal_at(hit.prim_index, ~visible)
         surface = dynamic.surface_at(hit.prim_index, hit.prim_uv, ~visible)
@@ -239,49 +277,55 @@ class Reflectors:
             normal = dr.select(visible, si.n, normal)
             diffuse = (si.bsdf().flags() & int(mi.BSDFFlags.DiffuseReflection)) != 0
             colour = dr.select(visible, si.bsdf().eval_diffuse_reflectance(si, diffuse & visible), colour)
-        glossy = dynamic.materials is not None and dynamic.materials.glossy and not last
-        albedo = colour * (1 - surface.metallic) if glossy else colour
         normal = _towards(normal, ray)
         origin = _lifted(ray(hit.t), normal)
-        beam = self.emitters.sample(receiver(origin, normal), emitter_sample, mi.Bool(True))
-        lit, shadow = albedo * beam.irradiance / self.white, _shadow_ray(origin, beam.direction, beam.reach)
-        if glossy:
-            metal = surface.metallic > 0.5
-            roughness = widened(surface.roughness, spread)
-            lobe = SpecularLobe.of(mi.Vector3f(normal), -ray.d, roughness, surface.metallic, surface.specular)
-            lit += self._mirrored_emitter(lobe, surface, beam, dr.dot(normal, beam.direction), metal)
-        free = dr.max(lit) > 0
-        self._end_kernel(lit, shadow, key, free, instance)
-        free &= ~self._occluded(shadow, instance, key, free, self.proxies.occluder_scenes)
-        lit = dr.select(free, lit, 0)
-        if last or dynamic.materials is None:
-            return lit
+        if spread is None:
+            return _Point(origin, normal, instance, surface, colour, None)
+        roughness = widened(surface.roughness, spread)
+        lobe = SpecularLobe.of(mi.Vector3f(normal), -ray.d, roughness, surface.metallic, surface.specular)
+        return _Point(origin, normal, instance, surface, colour * (1 - surface.metallic), lobe)
+
+    def _direct_light(self, point: _Point, key: mi.UInt32, emitter_sample: mi.Point2f) -> mi.Color3f:
+        """Return the light (Color3f) of one sampled emitter that points reflect."""
+        beam = self.emitters.sample(receiver(point.origin, point.normal), emitter_sample, mi.Bool(True))
+        lit = point.albedo * beam.irradiance / self.white
+        if point.lobe is not None:
+            cosine = dr.dot(point.normal, beam.direction)
+            lit += self._mirrored_emitter(point.lobe, point.surface, beam, cosine, point.metal)
+        shadow, free = _shadow_ray(point.origin, beam.direction, beam.reach), dr.max(lit) > 0
+        self._end_kernel(lit, shadow, key, free, point.instance)
+        free &= ~self._occluded(shadow, point.instance, key, free, self.proxies.occluder_scenes)
+        return dr.select(free, lit, 0)
+
+    def _with_onward_light(self, lit: mi.Color3f, point: _Point, key: mi.UInt32, bounces: int) -> mi.Color3f:
+        """Add the light (Color3f) of one further ray per point: mirrored on metals, diffuse on other materials."""
         numbers = [_sequence_number(key, dimension) for dimension in range(4)]
-        point, other = mi.Point2f(*numbers[:2]), mi.Point2f(*numbers[2:])
-        direction = mi.Frame3f(normal).to_world(mi.warp.square_to_cosine_hemisphere(point))
-        throughput, density = mi.Color3f(albedo), mi.Float(0)
-        spread = dr.opaque(mi.Float, DIFFUSE_SPREAD, dr.width(key))
-        if glossy:
-            mirrored, weight, cos_half = lobe.sample(point)
-            direction, fresnel = dr.select(metal, mirrored, direction), lobe.fresnel(cos_half)
-            throughput = dr.select(metal, (surface.colour * fresnel.tint + fresnel.white) * weight, throughput)
-            density = dr.select(metal, lobe.evaluate(direction)[1], 0)
-            spread = dr.select(metal, lobe.alpha, spread)
-        onward = mi.Ray3f(origin, direction)
+        sample, other = mi.Point2f(*numbers[:2]), mi.Point2f(*numbers[2:])
+        direction = mi.Frame3f(point.normal).to_world(mi.warp.square_to_cosine_hemisphere(sample))
+        throughput, density = mi.Color3f(point.albedo), mi.Float(0)
+        spread, lobe, surface = dr.opaque(mi.Float, DIFFUSE_SPREAD, dr.width(key)), point.lobe, point.surface
+        if lobe is not None:
+            mirrored, weight, cos_half = lobe.sample(sample)
+            direction, fresnel = dr.select(point.metal, mirrored, direction), lobe.fresnel(cos_half)
+            throughput = dr.select(point.metal, (surface.colour * fresnel.tint + fresnel.white) * weight, throughput)
+            density = dr.select(point.metal, lobe.evaluate(direction)[1], 0)
+            spread = dr.select(point.metal, lobe.alpha, spread)
+        onward, normal = mi.Ray3f(point.origin, direction), point.normal
         throughput = dr.select(dr.dot(normal, direction) > 0, throughput, 0)
         dr.eval(lit, onward, throughput, normal, density, other, spread)
         lane = dr.compress(dr.max(throughput) > 0)
-        if dr.width(lane):
-            some = (dr.gather(type(v), v, lane) for v in (onward, key, other, normal, density, spread))
-            onward, key, other, normal, density, spread = some
-            key = key * 0x9E3779B1 + 0x85EBCA77  # other random numbers
-            dr.eval(onward, key, other, normal, density, spread)
-            colour, _, onward.maxt = self._trace(onward, key, other, spread, bounces - 1)
-            if glossy:
-                colour += self._mirrored_emission(onward, normal, density)
-            total = dr.gather(mi.Color3f, lit, lane) + dr.gather(mi.Color3f, throughput, lane) * colour
-            dr.eval(total)
-            dr.scatter(lit, total, lane)
+        if not dr.width(lane):
+            return lit
+        some = (dr.gather(type(v), v, lane) for v in (onward, key, other, normal, density, spread))
+        onward, key, other, normal, density, spread = some
+        key = key * 0x9E3779B1 + 0x85EBCA77  # other random numbers
+        dr.eval(onward, key, other, normal, density, spread)
+        colour, _, onward.maxt = self._trace(onward, key, other, spread, bounces)
+        if lobe is not None:
+            colour += self._mirrored_emission(onward, normal, density)
+        total = dr.gather(mi.Color3f, lit, lane) + dr.gather(mi.Color3f, throughput, lane) * colour
+        dr.eval(total)
+        dr.scatter(lit, total, lane)
         return lit
 
     def _mirrored_emission(self, ray: mi.Ray3f, normal: mi.Normal3f, density: mi.Float) -> mi.Color3f:

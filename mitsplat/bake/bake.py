@@ -368,12 +368,7 @@ def _visible_surfels(clay: mi.Scene, surfels: Surfels, rng: np.random.Generator)
     directions = rotate_directions(surfels.frames, hemisphere(8), rng)
     origins = surfels.points[:, None] + ray_offset(clay) * directions
     radiance, _ = trace_radiance(
-        clay,
-        origins.reshape(-1, 3),
-        -directions.reshape(-1, 3),
-        samples=4,
-        bounces=2,
-        seed=int(rng.integers(1 << 30)),
+        clay, origins.reshape(-1, 3), -directions.reshape(-1, 3), samples=4, bounces=2, seed=int(rng.integers(1 << 30))
     )
     return np.asarray(radiance.reshape(len(surfels), -1).mean(axis=1) > _MIN_RADIANCE)
 

@@ -51,12 +51,7 @@ class BakedView:
 
 
 def compare_views(
-    picture: PictureFunction,
-    splats: Splats,
-    cameras: Sequence[Camera],
-    samples: int,
-    seed: int,
-    progress: Progress,
+    picture: PictureFunction, splats: Splats, cameras: Sequence[Camera], samples: int, seed: int, progress: Progress
 ) -> tuple[tuple[BakedView, ...], float, float]:
     """Compare the mesh and the splats in several views.
 

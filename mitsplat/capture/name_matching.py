@@ -88,10 +88,7 @@ def _candidates(names: Mapping[str, PurePosixPath], places: Mapping[str, PurePos
 
 
 def _agree(
-    one: PurePosixPath,
-    other: PurePosixPath,
-    folders: Mapping[PurePosixPath, PurePosixPath],
-    known: set[PurePosixPath],
+    one: PurePosixPath, other: PurePosixPath, folders: Mapping[PurePosixPath, PurePosixPath], known: set[PurePosixPath]
 ) -> bool:
     """Return True unless a folder of the model or of the photos belongs to another one."""
     return folders[one] == other if one in folders else other not in known

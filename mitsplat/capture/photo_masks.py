@@ -19,14 +19,7 @@ from scipy.spatial import cKDTree
 
 from mitsplat.arrays import BoolArray, Float64Array
 from mitsplat.capture.capture import Capture, Photo, mask_name
-from mitsplat.capture.photos import (
-    Prepared,
-    alpha_channel,
-    mask_files,
-    plain_background,
-    read_mask,
-    with_orientation,
-)
+from mitsplat.capture.photos import Prepared, alpha_channel, mask_files, plain_background, read_mask, with_orientation
 from mitsplat.errors import InputError
 from mitsplat.geometry.camera import Camera
 from mitsplat.progress import Progress

@@ -238,11 +238,7 @@ def append_run(out: Path, workers: int | None, device: str, gpus: Sequence[str] 
 
 
 def finish_folder(
-    out: Path,
-    manifest: Manifest,
-    content: JsonObject,
-    catalogue: Catalogue,
-    visit: Callable[[Record], object],
+    out: Path, manifest: Manifest, content: JsonObject, catalogue: Catalogue, visit: Callable[[Record], object]
 ) -> None:
     """Sort the manifest, and write the contact sheet and the collection files in one pass over all records.
 

@@ -114,10 +114,7 @@ class DetectionMatches:
 
 
 def average_precision(
-    truth: JsonObject,
-    detections: Sequence[Detection],
-    images: Sequence[int] | None = None,
-    iou_type: IouType = "bbox",
+    truth: JsonObject, detections: Sequence[Detection], images: Sequence[int] | None = None, iou_type: IouType = "bbox"
 ) -> AveragePrecision:
     """Compute the average precision of stored detections; use :class:`DetectionMatches` for many samples of images.
 

@@ -123,12 +123,7 @@ def _control(command: str) -> bool:
     """Return True if the service is running and executes the command."""
     with suppress(OSError, subprocess.TimeoutExpired):
         done = subprocess.run(
-            [CONTROL],
-            input=f"{command}\n",
-            capture_output=True,
-            text=True,
-            check=False,
-            timeout=_TIMEOUT,
+            [CONTROL], input=f"{command}\n", capture_output=True, text=True, check=False, timeout=_TIMEOUT
         )
         return done.returncode == 0
     return False

@@ -35,12 +35,7 @@ _TYPES = {"tensor(float)": np.float32, "tensor(float16)": np.float16}
 
 
 def model_maps(
-    photos: Sequence[Photo],
-    model: Path,
-    folder: Path,
-    kind: DepthKind = "inverse",
-    *,
-    progress: Progress | None = None,
+    photos: Sequence[Photo], model: Path, folder: Path, kind: DepthKind = "inverse", *, progress: Progress | None = None
 ) -> DepthMaps:
     """Compute depth maps of photos with a network, and cache them in a folder.
 

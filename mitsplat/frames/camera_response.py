@@ -159,14 +159,7 @@ def develop(
     height, width = linear.shape[:2]
     composite, uploaded = composite or Composite(exposure="fixed"), device_array(linear)
     return start_development(
-        uploaded,
-        (height, width),
-        draws,
-        composite,
-        seed=seed,
-        exposure_flow=exposure_flow,
-        white=white,
-        light=light,
+        uploaded, (height, width), draws, composite, seed=seed, exposure_flow=exposure_flow, white=white, light=light
     ).image()
 
 

@@ -100,11 +100,7 @@ def prepare_mesh(mesh: trimesh.Trimesh, name: str, *, solid: bool = True) -> tri
 
 
 def mass_properties(
-    mesh: trimesh.Trimesh,
-    pieces: Sequence[trimesh.Trimesh],
-    *,
-    density: float,
-    mass: float | None = None,
+    mesh: trimesh.Trimesh, pieces: Sequence[trimesh.Trimesh], *, density: float, mass: float | None = None
 ) -> MassProperties:
     """Integrate a uniform density over a mesh, or over its convex pieces if the mesh is not watertight.
 

@@ -59,11 +59,7 @@ def optical_flow(
 
 
 def exposure_flow(
-    depth: FloatingArray,
-    camera: Camera,
-    exposure: float,
-    belt: Belt,
-    carried: BoolArray,
+    depth: FloatingArray, camera: Camera, exposure: float, belt: Belt, carried: BoolArray
 ) -> tuple[Float32Array, Float32Array]:
     """Compute the motion of every pixel to the right and down [px] during the exposure, each (H, W).
 

@@ -21,15 +21,7 @@ from PIL import Image, ImageColor
 from mitsplat.arrays import Float64Array, Int64Array
 from mitsplat.errors import InputError
 from mitsplat.images.colour import decode_srgb
-from mitsplat.mesh_files.mesh_file import (
-    PAINTED_MATERIAL,
-    UNKNOWN_COLOUR,
-    FilePart,
-    MeshFile,
-    Texture,
-    Wrap,
-    pixels_of,
-)
+from mitsplat.mesh_files.mesh_file import PAINTED_MATERIAL, UNKNOWN_COLOUR, FilePart, MeshFile, Texture, Wrap, pixels_of
 from mitsplat.storage.files import IMAGE_ERRORS
 
 _MODEL = "3D/3dmodel.model"

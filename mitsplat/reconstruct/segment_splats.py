@@ -112,12 +112,7 @@ class Isolation:
     lost: float
 
 
-def isolate_object(
-    splats: Splats,
-    views: Sequence[MaskedView],
-    *,
-    progress: Progress | None = None,
-) -> Isolation:
+def isolate_object(splats: Splats, views: Sequence[MaskedView], *, progress: Progress | None = None) -> Isolation:
     """Return the Gaussians of the masked object.
 
     Args:

@@ -121,9 +121,7 @@ def _sensor_of(camera: Camera, _variant: str) -> mi.Sensor:
     return make_sensor(camera)
 
 
-def describe_sensor(
-    camera: Camera,
-) -> MitsubaDict:
+def describe_sensor(camera: Camera) -> MitsubaDict:
     """Return Mitsuba's dictionary of a camera."""
     pose = camera.world_from_camera @ np.diag([-1.0, -1.0, 1.0, 1.0])
     return {

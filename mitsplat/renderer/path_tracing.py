@@ -20,13 +20,7 @@ RAYS_PER_LAUNCH = 1 << 21
 
 
 def trace_radiance(
-    scene: mi.Scene,
-    origins: Float64Array,
-    directions: Float64Array,
-    *,
-    samples: int,
-    bounces: int,
-    seed: int,
+    scene: mi.Scene, origins: Float64Array, directions: Float64Array, *, samples: int, bounces: int, seed: int
 ) -> tuple[Float64Array, BoolArray]:
     """Compute the mean radiance (R, 3) that arrives at points from given directions, and a hit mask (R,).
 
@@ -105,9 +99,7 @@ def render_mesh(
 
 
 def antialiased_picture(
-    camera: Camera,
-    samples: int,
-    trace: Callable[[mi.Ray3f, int, int], tuple[Float64Array, Float64Array]],
+    camera: Camera, samples: int, trace: Callable[[mi.Ray3f, int, int], tuple[Float64Array, Float64Array]]
 ) -> tuple[Float64Array, Float64Array]:
     """Return mean radiance (H, W, 3), black for background, and coverage (H, W) of a pinhole ``camera``.
 

@@ -33,11 +33,7 @@ PILE_HEIGHT = 1.0
 
 
 def enclosure_walls(
-    enclosure: Enclosure,
-    spec: SceneSpec,
-    assets: Sequence[Asset],
-    supports: Sequence[trimesh.Trimesh],
-    number: int = 0,
+    enclosure: Enclosure, spec: SceneSpec, assets: Sequence[Asset], supports: Sequence[trimesh.Trimesh], number: int = 0
 ) -> list[Shape]:
     """Return the enclosure of a region as five invisible boxes: four walls and a lid.
 

@@ -26,14 +26,7 @@ from mitsplat.reconstruct.asset_evaluation import HeldOutView, show_asset
 from mitsplat.reconstruct.reconstruct import AssetJob, ImportedMesh, Reconstruction, reconstruct_asset
 from mitsplat.reconstruct.surface import reconstruct_surface
 from mitsplat.storage.files import JsonObject
-from mitsplat.surroundings.coverage import (
-    MIN_PHOTOS,
-    Coverage,
-    Hole,
-    find_coverage,
-    find_holes,
-    free_rectangle,
-)
+from mitsplat.surroundings.coverage import MIN_PHOTOS, Coverage, Hole, find_coverage, find_holes, free_rectangle
 from mitsplat.surroundings.depth_views import DepthView, SurfacePoints, depth_views, surface_points
 from mitsplat.surroundings.floaters import remove_floaters
 from mitsplat.surroundings.ready_scene import Rectangle, scene_text

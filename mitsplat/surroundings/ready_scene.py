@@ -29,12 +29,7 @@ Rectangle = tuple[float, float, float, float]
 """Rectangle: least and largest x, least and largest y [m]."""
 
 
-def scene_text(
-    name: str,
-    supports: Sequence[Support],
-    free: Rectangle,
-    cameras: Sequence[Camera],
-) -> str:
+def scene_text(name: str, supports: Sequence[Support], free: Rectangle, cameras: Sequence[Camera]) -> str:
     """Return the text of a scene file, with ``{folder}`` in place of the name of the asset's folder.
 
     Args:

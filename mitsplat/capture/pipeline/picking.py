@@ -18,10 +18,7 @@ _WIDE = np.radians(5.0)
 
 
 def chosen_object(
-    capture: Capture,
-    picks: Sequence[str] = (),
-    picks_not: Sequence[str] = (),
-    box: tuple[float, ...] | None = None,
+    capture: Capture, picks: Sequence[str] = (), picks_not: Sequence[str] = (), box: tuple[float, ...] | None = None
 ) -> ChosenObject:
     """Return the points of the object that the hints select.
 

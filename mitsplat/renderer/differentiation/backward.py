@@ -104,13 +104,7 @@ def project_cloud(
     return projector.all_records(dr.zeros(mi.UInt32, cloud.count), dr.arange(mi.UInt32, cloud.count))[:4]
 
 
-def gather_gradients(
-    cloud: Cloud,
-    kind: Kind,
-    numbers: ViewNumbers,
-    quality: Quality,
-    found: mi.Float,
-) -> None:
+def gather_gradients(cloud: Cloud, kind: Kind, numbers: ViewNumbers, quality: Quality, found: mi.Float) -> None:
     """Add the gradients of view records to those of a cloud's parameters.
 
     Gradients of invisible Gaussians are zero, where the chain rule would give 0 times infinity.

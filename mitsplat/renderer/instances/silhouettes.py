@@ -169,14 +169,7 @@ def canvas_margin(view: CameraView | Camera) -> float:
 
 @lru_cache(maxsize=8)
 def _margin(
-    width: int,
-    height: int,
-    fx: float,
-    fy: float,
-    cx: float,
-    cy: float,
-    distortion: tuple[float, ...],
-    lens: Lens,
+    width: int, height: int, fx: float, fy: float, cx: float, cy: float, distortion: tuple[float, ...], lens: Lens
 ) -> float:
     if not distortion:
         return MARGINS[0]

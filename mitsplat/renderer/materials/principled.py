@@ -66,12 +66,7 @@ class SpecularLobe:
 
     @classmethod
     def of(
-        cls,
-        normal: mi.Vector3f,
-        to_camera: mi.Vector3f,
-        roughness: mi.Float,
-        metallic: mi.Float,
-        specular: mi.Float,
+        cls, normal: mi.Vector3f, to_camera: mi.Vector3f, roughness: mi.Float, metallic: mi.Float, specular: mi.Float
     ) -> SpecularLobe:
         """Return the lobes of points with unit ``normal`` and unit vector ``to_camera``."""
         frame = mi.Frame3f(mi.Normal3f(normal))

@@ -159,14 +159,7 @@ class Response:
 
     def cutoff(self, k2: mi.Float) -> Conic6:
         """Return coefficients of du^2, du dv, dv^2, du, dv and 1 of the conic that is <= 0 where q <= k^2."""
-        return (
-            self.a - k2 * self.g,
-            self.b2 - k2 * self.h,
-            self.c - k2 * self.i,
-            -k2 * self.e,
-            -k2 * self.f,
-            -k2,
-        )
+        return (self.a - k2 * self.g, self.b2 - k2 * self.h, self.c - k2 * self.i, -k2 * self.e, -k2 * self.f, -k2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,13 +185,7 @@ class PlacedGaussian:
 
 def project_gaussian(gaussian: PlacedGaussian) -> Response:
     """Compute the response coefficients of Gaussians."""
-    mean, sigma, right, down, forward = (
-        gaussian.mean,
-        gaussian.sigma,
-        gaussian.right,
-        gaussian.down,
-        gaussian.forward,
-    )
+    mean, sigma, right, down, forward = (gaussian.mean, gaussian.sigma, gaussian.right, gaussian.down, gaussian.forward)
     depth = dr.dot(forward, mean)
     inv_depth = dr.rcp(depth)
     u0, v0 = dr.dot(right, mean) * inv_depth, dr.dot(down, mean) * inv_depth

@@ -11,15 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitsplat.geometry.camera import Camera
-from mitsplat.geometry.lens import (
-    FISHEYE_MAX,
-    NEWTON_STEPS,
-    Lens,
-    fisheye_radius,
-    fisheye_rate,
-    opencv_distort,
-    padded,
-)
+from mitsplat.geometry.lens import FISHEYE_MAX, NEWTON_STEPS, Lens, fisheye_radius, fisheye_rate, opencv_distort, padded
 
 TILE_WIDTH, TILE_HEIGHT = 8, 4
 """Size of a tile [px]. Smaller tiles create more pairs to sort. Larger tiles leave more lanes idle, deviate more from

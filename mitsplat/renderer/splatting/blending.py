@@ -130,12 +130,7 @@ def _corrected(
 
 
 def _late_change(
-    pixel: Pixel,
-    alpha: mi.Float,
-    weight: mi.Float,
-    z: mi.Float,
-    values: list[mi.Float | float],
-    sums: list[mi.Float],
+    pixel: Pixel, alpha: mi.Float, weight: mi.Float, z: mi.Float, values: list[mi.Float | float], sums: list[mi.Float]
 ) -> tuple[list[mi.Float], list[mi.Float]]:
     """Return the corrections of blended ``values`` for a late Gaussian, and their decaying ``sums`` after it."""
     met, total = weight > 0, pixel[SUMS][0]

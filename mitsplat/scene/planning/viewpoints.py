@@ -19,14 +19,7 @@ from mitsplat.arrays import Float64Array
 from mitsplat.errors import InputError
 from mitsplat.geometry.camera import Camera, direction, interpolate_poses, look_at_pose
 from mitsplat.scene.planning.visibility_prediction import PredictedView, VisibilityPredictor, containing_solid
-from mitsplat.scene.spec.camera_spec import (
-    TRIES,
-    Acceptance,
-    CameraFixed,
-    CameraHemisphere,
-    CameraOrbit,
-    Intrinsics,
-)
+from mitsplat.scene.spec.camera_spec import TRIES, Acceptance, CameraFixed, CameraHemisphere, CameraOrbit, Intrinsics
 from mitsplat.scene.spec.scene_spec import Output, SceneSpec
 from mitsplat.scene.streams import random_stream
 from mitsplat.storage.files import JsonObject

@@ -224,7 +224,13 @@ def fit_line(values: Float64Array, wanted: Float64Array, *, shift: bool) -> tupl
 
 
 def crop_map(inverse: DepthMap, camera: Camera, window: Window) -> DepthMap:
-    """Crop the map of a whole photo to a window of the photo, rounded to whole map pixels."""
+    """Crop the map of a whole photo to a window of the photo, rounded to whole map pixels.
+
+    Args:
+        inverse: Inverse depths of the photo, at any resolution.
+        camera: Camera of the photo.
+        window: Left, top, width and height [px of the photo].
+    """
     rows, columns = inverse.shape
     left, top, width, height = window
     x = np.floor((left + np.arange(width) + 0.5) * columns / camera.width).astype(np.int64)

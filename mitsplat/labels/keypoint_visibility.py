@@ -57,9 +57,16 @@ def find_blocked_keypoints(
     camera: Camera,
     find_hits: Callable[[Float64Array, Float64Array], BoolArray],
 ) -> dict[int, BoolArray]:
-    """Return True for the keypoints of labelled instances that a mesh hides, by instance id, shape (K,) each.
+    """Find the keypoints of labelled instances that a mesh hides.
 
-    ``find_hits`` returns True for the segments between points (N, 3) [m] that a mesh intersects.
+    Args:
+        assets: Assets of the scene.
+        instances: Placed instances.
+        camera: The camera.
+        find_hits: Function that returns True for the segments between points (N, 3) [m] that a mesh intersects.
+
+    Returns:
+        True for the hidden keypoints by instance id, shape (K,) each.
     """
     shown = [one for one in instances if assets[one.asset].keypoints and one.class_index is not None]
     if not shown:

@@ -22,7 +22,13 @@ def class_colour(class_index: int) -> tuple[int, int, int]:
 
 
 def draw_labels(image: ByteImage, labels: Labels, *, opacity: float = 0.45) -> ByteImage:
-    """Draw masks, outlines, boxes and class names of the instances over an RGB image (H, W, 3)."""
+    """Return an image with the masks, outlines, boxes and class names of its instances.
+
+    Args:
+        image: RGB image, (H, W, 3).
+        labels: Labels of the image.
+        opacity: Opacity of the masks.
+    """
     drawn = image.copy()
     unit = max(1.0, image.shape[1] / 640)
     for label in labels.instances:

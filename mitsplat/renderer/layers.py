@@ -152,7 +152,14 @@ def make_splats_shape(
     proxy: trimesh.Trimesh | None = None,
     **properties: Any,
 ) -> mi.Shape:
-    """Create the shape plugin ``splats`` from data in memory; ``properties`` are those of the plugin."""
+    """Create the shape plugin ``splats`` from data in memory.
+
+    Args:
+        splats: The Gaussians.
+        world_from_splats: Rigid transform with a uniform scale, shape (4, 4); the identity by default.
+        proxy: Mesh in the frame of the splats, which casts and receives shadows.
+        properties: Further properties of the plugin.
+    """
     ensure_variant()
     from mitsplat.plugins.splats import SplatsShape  # derives from a class of the variant
 
@@ -197,7 +204,14 @@ def _single_shape_scene(splats: Splats, variant: str) -> tuple[mi.Integrator, mi
 
 
 def render_layers(integrator: mi.Integrator, scene: mi.Scene, camera: Camera, *, seed: int = 0) -> Layers:
-    """Run the integrator; each layer is copied to the host on first access, see :class:`Layers`."""
+    """Run the integrator; each layer is copied to the host on first access, see :class:`Layers`.
+
+    Args:
+        integrator: From :func:`make_integrator`.
+        scene: Mitsuba scene with shapes of the plugin ``splats``.
+        camera: Camera; the sensors of the scene are not used.
+        seed: Seed of the rays of light.
+    """
     layers = integrator.renderer.render_layers(scene, _sensor_of(camera, str(mi.variant())), seed=seed)
     check_dropped_rays()
     return Layers.on_device(layers, (camera.height, camera.width))
@@ -238,14 +252,31 @@ def _host_ids(ids: mi.UInt32, shape: tuple[int, int]) -> npt.NDArray[np.uint16]:
 def render_silhouettes(
     integrator: mi.Integrator, scene: mi.Scene, camera: Camera, *, source: str = "splats"
 ) -> dict[int, Silhouette]:
-    """Return the unoccluded silhouette of every instance, by its ``splats`` or its ``proxies``."""
+    """Return the unoccluded silhouette of every instance by its id; an instance without pixels is omitted.
+
+    Args:
+        integrator: From :func:`make_integrator`.
+        scene: Mitsuba scene with shapes of the plugin ``splats``.
+        camera: Camera; the sensors of the scene are not used.
+        source: ``splats`` or ``proxies``.
+    """
     silhouettes = dict(integrator.renderer.silhouettes(scene, _sensor_of(camera, str(mi.variant())), source=source))
     check_dropped_rays()
     return silhouettes
 
 
 def find_hits(integrator: mi.Integrator, scene: mi.Scene, starts: Float64Array, ends: Float64Array) -> BoolArray:
-    """Return True for the segments between points (N, 3) [m] that a proxy or a visible mesh intersects."""
+    """Find the segments that a proxy or a visible mesh intersects.
+
+    Args:
+        integrator: From :func:`make_integrator`.
+        scene: Mitsuba scene with the meshes.
+        starts: Start points [m], shape (N, 3).
+        ends: End points [m], shape (N, 3).
+
+    Returns:
+        True for the intersected segments, shape (N,).
+    """
     blocked: BoolArray = integrator.renderer.blocked(scene, starts, ends)
     check_dropped_rays()
     return blocked

@@ -22,10 +22,18 @@ RAYS_PER_LAUNCH = 1 << 21
 def trace_radiance(
     scene: mi.Scene, origins: Float64Array, directions: Float64Array, *, samples: int, bounces: int, seed: int
 ) -> tuple[Float64Array, BoolArray]:
-    """Compute the mean radiance (R, 3) that arrives at points from given directions, and a hit mask (R,).
+    """Compute the mean radiance that arrives at points from given directions, by Mitsuba's path tracer.
 
-    Every ray is traced ``samples`` times by Mitsuba's path tracer. ``origins`` (R, 3) [m] are the points, and
-    ``directions`` (R, 3) point from them to the surfaces.
+    Args:
+        scene: Mitsuba scene.
+        origins: The points [m], shape (R, 3).
+        directions: Unit vectors from the points to the surfaces, shape (R, 3).
+        samples: Number of paths per direction.
+        bounces: Maximum number of surfaces along a path.
+        seed: Seed of the paths.
+
+    Returns:
+        Radiance, shape (R, 3), and True for the directions that meet a surface, shape (R,).
     """
     radiance, hit = np.empty((len(origins), 3)), np.empty(len(origins), dtype=bool)
     step = max(1, RAYS_PER_LAUNCH // samples)

@@ -245,7 +245,15 @@ class DepthRendering(RenderOp):
 def render_records(
     records: mi.Float, least: mi.Float, box: mi.UInt32, view: CameraView, quality: Quality, *, depth: bool = False
 ) -> RenderOp:
-    """Render the result of :func:`project_cloud`; with ``depth``, as a :class:`DepthRendering`.
+    """Render the result of :func:`project_cloud`.
+
+    Args:
+        records: Evaluated view records.
+        least: Evaluated least depths [m].
+        box: Evaluated boxes of tiles.
+        view: Camera; one sample per pixel.
+        quality: Cut-offs; with infinite tolerance.
+        depth: True for a :class:`DepthRendering`.
 
     Raises:
         ValueError: As for :func:`render_differentiable`.

@@ -101,7 +101,10 @@ def tile_gradient(
     gradient: list[mi.Float],
     slopes: tuple[list[mi.Float], list[mi.Float]],
 ) -> mi.Float:
-    """Return the gradient from the tiles of lists; ``lists.pairs`` is an upper bound of their pairs."""
+    """Return the gradient of the flat view records from some tiles; arguments as in :func:`march_backward`.
+
+    ``lists.pairs`` is an upper bound of the pairs in these tiles, and ``slopes`` are those of their lanes.
+    """
     lanes = Lanes(lists, view)
     column = dr.arange(mi.UInt32, dr.width(lanes.start)) % TILE_WIDTH
     shares = dr.zeros(mi.Float, RECORD * TILE_WIDTH * lists.pairs)

@@ -44,7 +44,15 @@ class Cloud:
 def upload_cloud(
     means: np.ndarray, quats: np.ndarray, scales: np.ndarray, opacities: np.ndarray, sh: np.ndarray
 ) -> Cloud:
-    """Copy N Gaussians to the device (shapes as in :class:`mitsplat.gaussians.splat_cloud.Splats`)."""
+    """Copy N Gaussians to the device, with scales of at least :data:`SCALE_RATIO_MIN` of the largest one.
+
+    Args:
+        means: Centres [m], shape (N, 3).
+        quats: Unit quaternions xyzw, shape (N, 4).
+        scales: Standard deviations along the axes [m], shape (N, 3).
+        opacities: Peak opacities, shape (N,).
+        sh: Coefficients of the spherical harmonics of the colour, shape (N, K, 3).
+    """
     count, bands = len(means), sh.shape[1]
     stride = -(-3 * bands // 4) * 4
     padded = np.zeros((count, stride), np.float32)
@@ -154,7 +162,11 @@ def merge_clouds(clouds: Sequence[Cloud]) -> CloudSet:
 def placement_table(
     clouds: CloudSet, placements: Sequence[Placement], view: CameraView
 ) -> tuple[mi.Float, mi.UInt32, mi.UInt32]:
-    """Return placement rows on the device, and for every placed Gaussian its row and its number in the clouds."""
+    """Return the placements of a view on the device.
+
+    Returns:
+        One :class:`PlacementRow` per placement; and for every placed Gaussian, its row and its number in the clouds.
+    """
     rows = np.zeros((max(1, len(placements)), PlacementRow.WIDTH), np.float32)
     if placements:
         matrix = np.array([p.world_from_cloud for p in placements], dtype=np.float64)

@@ -165,7 +165,16 @@ class Projector:
         return _Bounds(response, opacity, at_plane, visible, box, centre[2] - reach[2])
 
     def cull(self, owner: mi.UInt32, local: mi.UInt32, subset: TileSubset | None = None) -> tuple[mi.Bool, mi.Bool]:
-        """Return two flags per Gaussian: it is in view (and in ``subset`` tiles), and it reaches the camera's plane."""
+        """Test Gaussians by the exact box of their cut-off ellipsoid on the screen.
+
+        Args:
+            owner: Placement row of each Gaussian.
+            local: Number of each Gaussian in the clouds.
+            subset: Tiles that count; None for all tiles of the view.
+
+        Returns:
+            True for Gaussians in view, and True for Gaussians that reach the camera's plane.
+        """
         bounds = self._bounds(self._load(owner, local))
         x0, x1, y0, y1 = self.view.tile_box(*bounds.slope_box)
         visible, at_plane = dr.detach(bounds.visible & (x1 > x0) & (y1 > y0)), dr.detach(bounds.at_plane)
@@ -177,7 +186,17 @@ class Projector:
     def records(
         self, owner: mi.UInt32, local: mi.UInt32, at_plane: mi.Bool
     ) -> tuple[mi.Float, mi.Float | None, mi.Float, mi.UInt32]:
-        """Return view records, records of Gaussians at the camera's plane, least depths, and tile boxes."""
+        """Project Gaussians to view records.
+
+        Args:
+            owner: Placement row of each Gaussian.
+            local: Number of each Gaussian in the clouds.
+            at_plane: True for Gaussians that reach the camera's plane, from :meth:`cull`.
+
+        Returns:
+            View records, records of Gaussians at the camera's plane (None without any), least depths [m], and boxes of
+            tiles (x0, x1, y0, y1).
+        """
         g = self._load(owner, local)
         bounds = self._bounds(g)
         record = self._record(g, bounds, local)

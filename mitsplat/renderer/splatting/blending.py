@@ -70,7 +70,16 @@ def new_state(several: bool, late: OutOfOrder) -> Pixel:
 def blend(
     pixel: Pixel, alpha: mi.Float, record: GaussianRecord | FieldsOnAccess, z: mi.Float, several: bool, late: OutOfOrder
 ) -> Pixel:
-    """Return the state of a ray after one more Gaussian."""
+    """Return the state of a ray after one more Gaussian.
+
+    Args:
+        pixel: State of the ray.
+        alpha: Opacity of the Gaussian on the ray; 0 leaves the state unchanged.
+        record: Gaussian, for colour and instance.
+        z: Depth of its peak [m].
+        several: True if the state has a tally of instances.
+        late: How the state treats Gaussians that come late in the order.
+    """
     weight = pixel[TRANSMITTANCE] * alpha
     transmittance = pixel[TRANSMITTANCE] - weight
     colour = record.colour

@@ -70,10 +70,18 @@ def pair_records(
     numbered: bool,
     groups: mi.UInt32 | None = None,
 ) -> Pairs | None:
-    """Pair every record with the tiles it intersects; return None if there are no pairs.
+    """Pair every record with the tiles that it intersects; return None if there are no pairs.
 
-    Tiles are given by their places in ``subset``. ``groups`` are numbers of the records below 2^DEPTH_BITS, which
-    replace the depth level in sort keys.
+    Args:
+        records: View records, flat.
+        plane_records: Records of the Gaussians that reach the camera's plane; None if there are none.
+        least: Depth [m] in front of which the peak of a record cannot lie.
+        box: Half-open boxes of tiles (x0, x1, y0, y1) of the records, flat.
+        view: The camera.
+        quality: Cut-off of the opacity.
+        subset: Tiles that have lists, which are then given by their places in the subset; None for all tiles.
+        numbered: True if sort keys hold the number of the pair instead of the record.
+        groups: Numbers of the records below 2^DEPTH_BITS, which replace the depth level in sort keys.
 
     Raises:
         CrowdedError: If there are more than :data:`PAIRS_MAX` pairs, or more tiles or records than sort keys can hold.

@@ -144,10 +144,19 @@ def bin_records(
     groups: mi.UInt32 | None = None,
     for_gradients: bool = False,
 ) -> TileLists:
-    """Build tile lists from view records, least depths and tile boxes.
+    """Build tile lists from view records.
 
-    ``only`` is the instance id of all records, or None if there are several. ``groups`` are as in
-    :func:`mitsplat.renderer.splatting.pairs.pair_records`.
+    Args:
+        records: View records, flat.
+        plane_records: Records of the Gaussians that reach the camera's plane; None if there are none.
+        least: Depth [m] in front of which the peak of a record cannot lie.
+        box: Half-open boxes of tiles (x0, x1, y0, y1) of the records, flat.
+        view: The camera.
+        quality: Order and cut-off.
+        only: Instance id of all records; None if there are several.
+        subset: Tiles that have lists; None for all tiles of the view.
+        groups: As in :func:`mitsplat.renderer.splatting.pairs.pair_records`.
+        for_gradients: True if entries are also indexed by record.
 
     Raises:
         CrowdedError: If there are too many pairs.
@@ -216,6 +225,12 @@ def _empty(view: CameraView, subset: TileSubset | TileBox | None, records: mi.Fl
 
 def merge_lists(first: TileLists, second: TileLists, tiles: mi.UInt32, view: CameraView) -> TileLists:
     """Merge two lists in some tiles of a view, as if their Gaussians had been binned together.
+
+    Args:
+        first: Lists of all tiles of the view.
+        second: Further lists of all tiles of the view.
+        tiles: Numbers of the tiles that get lists.
+        view: The camera.
 
     Raises:
         CrowdedError: If there are too many pairs.

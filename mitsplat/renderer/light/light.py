@@ -36,7 +36,7 @@ from mitsplat.renderer.light.light_planes import MIN_ROWS, CoarseLight, Planes, 
 from mitsplat.renderer.light.light_points import LightPoints, filtered_roughness
 from mitsplat.renderer.light.light_tiles import block_order
 from mitsplat.renderer.light.lit_surface import LitSurface, VisibleSurfaces
-from mitsplat.renderer.light.reflections import Reflections, ReflectionTracer
+from mitsplat.renderer.light.reflections import Reflections, ReflectionTracer, averaged_reflections
 from mitsplat.renderer.light.reflectors import Reflectors
 from mitsplat.renderer.light.shadow_rays import ShadowTracer
 from mitsplat.renderer.light.unoccluded_light import UnoccludedLight
@@ -446,8 +446,7 @@ class TracedPixels:
         rays = dr.maximum(sums.rays, 1)
         tinted = estimate.tinted * weight + sums.tinted * (per_point / rays)
         colourless = estimate.colourless * weight + sums.colourless * (per_point / rays)
-        means, _ = self.mirror_filter.mirror([*tinted, *colourless], self.mirrored)
-        tinted, colourless = mi.Color3f(*means[:3]), mi.Color3f(*means[3:])
+        tinted, colourless = averaged_reflections(self.mirror_filter, tinted, colourless, sums.variance, self.mirrored)
         own, pixels = self.mirror_filter.here, self.mirror_filter.index
         before = dr.gather(mi.Color3f, light, pixels)
         # Captured colours contain the mirror image of the uniform light.

@@ -16,6 +16,9 @@ RADIUS = 4
 LOBE_SHARE = 0.5
 """Largest angle between the mirrored directions of two neighbours whose reflections are averaged, over GGX's alpha."""
 
+WIDE_LOBE_SHARE = 2.0
+"""The same for neighbours whose difference is explained by noise."""
+
 SAME_GLOSS = 0.1
 """Largest difference of roughness plus twice the metalness between neighbours whose reflections are averaged."""
 
@@ -57,7 +60,7 @@ class _Traits:
     POSITION, NORMAL = slice(0, 3), slice(3, 6)
     TRAIT, KNOWN, RAYS = range(6, 9)
     SHARE, VARIANCE = range(9, 11)
-    MIRRORED, GLOSS = slice(9, 12), 12
+    MIRRORED, GLOSS = slice(11, 14), 14
 
 
 @dataclass(frozen=True, eq=False)
@@ -204,25 +207,36 @@ class LightFilter:
         return LightMeans(mi.Color3f(*values[:3]), mi.Color3f(*values[3:6]), mean_bounced)
 
     def mirror(
-        self, values: list[mi.Float], mirrored: mi.Vector3f, radius: int = RADIUS
+        self,
+        values: list[mi.Float],
+        mirrored: mi.Vector3f,
+        radius: int = RADIUS,
+        *,
+        guide: tuple[mi.Float, mi.Float] | None = None,
     ) -> tuple[list[mi.Float], mi.Float]:
         """Average reflected light per ray over neighbours that mirror similar directions.
 
         All pixels have equal weights, because bright pixels have more rays: weights by rays would add light beside
         highlights. Numbers of rays in proportion to the variance make all pixels equally accurate.
 
-        ``mirrored`` is the mean of the directions that a pixel mirrors. It is short where they differ, and such pixels
-        are not averaged.
+        Args:
+            values: Reflected light per ray.
+            mirrored: Mean of the directions that a pixel mirrors. It is short where they differ, and such pixels are
+                averaged only with a ``guide``.
+            radius: Radius of the filter [px].
+            guide: Brightness and its variance. Neighbours whose brightness differs by no more than noise may mirror
+                directions that are farther apart.
 
         Returns:
             The averages, and the effective number of pixels.
         """
         here = self.here
         gloss = here.roughness + 2 * here.metallic
-        closeness = dr.cos(dr.maximum(LOBE_SHARE * dr.square(here.roughness), 1e-3))
+        share = LOBE_SHARE if guide is None else WIDE_LOBE_SHARE
+        closeness = dr.cos(dr.clip(share * dr.square(here.roughness), 1e-3, 1))
         dr.eval(closeness, gloss)
         even = dr.full(mi.Float, 1, dr.width(self.index))
-        return self._average(values, even, radius, lobe=(mirrored, closeness, gloss))
+        return self._average(values, even, radius, guide, (mirrored, closeness, gloss))
 
     def reflections_for(
         self,
@@ -266,9 +280,9 @@ class LightFilter:
         dr.eval(share, variance)
         return share, variance, shared
 
-    def average(self, values: list[mi.Float]) -> list[mi.Float]:
+    def average(self, values: list[mi.Float], radius: int = RADIUS) -> list[mi.Float]:
         """Average values at the pixels of ``index`` that all have the same number of rays."""
-        return self._average(values, dr.full(mi.Float, 1, dr.width(self.index)), RADIUS)[0]
+        return self._average(values, dr.full(mi.Float, 1, dr.width(self.index)), radius)[0]
 
     def _average(
         self,
@@ -281,12 +295,12 @@ class LightFilter:
         """Return averages, and the effective number of equally weighted pixels with the same number of rays.
 
         If ``share`` (light share and variance) is given, only neighbours whose share differs by no more than noise
-        count. If ``lobe`` (mirrored direction, smallest cosine, gloss) is given, only neighbours of the same gloss that
-        mirror similar directions count.
+        count. If ``lobe`` (mirrored direction, smallest cosine between two of them, gloss) is given, only
+        neighbours of the same gloss that mirror similar directions count.
         """
         here = self.here
         known = dr.select(here.known, mi.Float(1), 0)
-        guide = (share or (0, 0)) if lobe is None else (*lobe[0], lobe[2])
+        guide = [*(share or (0, 0)), *([] if lobe is None else [*lobe[0], lobe[2]])]
         traits = packed([*here.position, *here.normal, here.trait, known, rays, *guide])  # see _Traits
         alike = mi.Float(1)
         for direction in ((1, 0), (0, 1)):
@@ -334,7 +348,10 @@ class LightFilter:
                 difference, variance = other[_Traits.SHARE] - share[0], share[1] + other[_Traits.VARIANCE]
                 near &= dr.square(difference) <= NOISE_LIMIT * variance
             if lobe is not None:
-                near &= dr.dot(mi.Vector3f(*other[_Traits.MIRRORED]), lobe[0]) > lobe[1]
+                towards = mi.Vector3f(*other[_Traits.MIRRORED])
+                # Both are the cosine of unit vectors. The second one accepts equal mean directions of any length.
+                cosine = dr.dot(towards, lobe[0]) if share is None else 1 - dr.squared_norm(towards - lobe[0]) / 2
+                near &= cosine > lobe[1]
                 near &= dr.abs(other[_Traits.GLOSS] - lobe[2]) < SAME_GLOSS
             same &= (near & (known == here.known)) | (known & ~here.known)
             # With half weights at the ends, the filter spans exactly one period of the dither.

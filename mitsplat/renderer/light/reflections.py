@@ -14,7 +14,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mitsplat.renderer.emitters.emitter_sampling import receiver
-from mitsplat.renderer.light.light_filter import packed
+from mitsplat.renderer.light.light_filter import LightFilter, packed
 from mitsplat.renderer.light.reflectors import LANES, Reflectors
 from mitsplat.renderer.light.shadow_rays import ROBERTS, ShadowTracer, ray_origin, sequence_point
 from mitsplat.renderer.materials.principled import power_weight, typical_brightness
@@ -29,6 +29,10 @@ over random steps found these. The distance between points of eight rays, of eig
 of 8 x 8 pixels, and of eight rays of eight such pixels is at least 0.43 of the largest possible distance. Among such
 steps, these have little noise and bias on a metal ball under uniform light.
 """
+
+
+FEW_PIXELS = 30.0
+"""Effective number of averaged pixels below which the average is widened as far as noise explains differences."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,6 +55,13 @@ class Reflections:
     def empty(cls, count: int) -> Reflections:
         """Return sums without rays at ``count`` points."""
         return cls(*[dr.zeros(kind, count) for kind in (mi.Color3f, mi.Color3f, mi.Float, mi.Float)])
+
+    @property
+    def variance(self) -> mi.Float:
+        """Variance of the mean brightness of the rays."""
+        rays = dr.maximum(self.rays, 1)
+        mean = typical_brightness(self.tinted, self.colourless) / rays
+        return dr.maximum(self.squares / rays - dr.square(mean), 0) / dr.maximum(rays - 1, 1)
 
     def add(self, places: mi.UInt32, more: Reflections) -> None:
         """Add the sums ``more`` of distinct ``places`` in place."""
@@ -139,3 +150,37 @@ class ReflectionTracer:
         tinted, colourless = light * tint, light * white
         dr.eval(tinted, colourless)
         return tinted, colourless
+
+
+def averaged_reflections(
+    light_filter: LightFilter, tinted: mi.Color3f, colourless: mi.Color3f, variance: mi.Float, mirrored: mi.Vector3f
+) -> tuple[mi.Color3f, mi.Color3f]:
+    """Average reflected light over neighbours.
+
+    On a cylinder, only pixels along its axis mirror similar directions, and those of an edge differ from all others.
+    Their noise would show as streaks and dashes. These pixels are averaged once more with neighbours that mirror other
+    directions, if noise explains the difference (Rousselle et al. 2013, "Robust Denoising using Feature and Color
+    Information", section 3).
+
+    Args:
+        light_filter: Filter over the pixels.
+        tinted: Light per ray that the base colour multiplies (Color3f).
+        colourless: Other light per ray (Color3f).
+        variance: Variance of its brightness.
+        mirrored: Mean of the directions that a pixel mirrors.
+    """
+    dr.eval(tinted, colourless, variance)
+    (variance,) = light_filter.average([variance], 1)  # a few rays often have no variance by chance
+    means, shared = light_filter.mirror([*tinted, *colourless], mirrored)
+    few = dr.compress(shared < FEW_PIXELS)
+    if dr.width(few):
+        own, some = gathered(light_filter.here, few), [dr.gather(mi.Float, mean, few) for mean in means]
+        brightness = typical_brightness(mi.Color3f(*some[:3]), mi.Color3f(*some[3:]))
+        guide = brightness, dr.gather(mi.Float, variance / shared, few)
+        towards, pixels = dr.gather(mi.Vector3f, mirrored, few), dr.gather(mi.UInt32, light_filter.index, few)
+        dr.eval(own, some, guide, towards, pixels)
+        wide, _ = LightFilter(own, light_filter.view, pixels).mirror(some, towards, guide=guide)
+        dr.eval(means, wide)
+        for mean, value in zip(means, wide, strict=True):
+            dr.scatter(mean, value, few)
+    return mi.Color3f(*means[:3]), mi.Color3f(*means[3:])

@@ -9,7 +9,7 @@ import json
 import statistics
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -18,6 +18,7 @@ from mitsplat.cli.options import JsonLog, Seed, check_ending
 
 if TYPE_CHECKING:
     from mitsplat.detector.likeness import Trait
+    from mitsplat.storage.files import JsonObject
 
 TorchDevice = Annotated[
     str,
@@ -218,7 +219,7 @@ def _print_trait(name: str, trait: Trait) -> None:
         )
 
 
-def _format_scores(score: dict[str, Any]) -> str:
+def _format_scores(score: JsonObject) -> str:
     if score["map50"] is None:
         return "no labels except crowds"
     return f"mAP50-95 {score['map50_95']:.3f}, mAP50 {score['map50']:.3f}"

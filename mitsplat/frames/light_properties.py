@@ -12,6 +12,7 @@ import numpy as np
 from mitsplat.asset import Asset
 from mitsplat.frames.scene_builder import SceneBuilder
 from mitsplat.renderer.emitters.emitter_sampling import reference_irradiance
+from mitsplat.renderer.scene_emitters import MitsubaDict
 from mitsplat.scene.planning.frame_lights import expand_rooms, lights_at
 from mitsplat.scene.scene import Scene
 from mitsplat.scene.spec.light_spec import EnvironmentLight
@@ -23,7 +24,7 @@ CALIBRATION_DRAWS = 16
 Irradiance = tuple[float, float, float]
 
 
-def light_properties(scene: Scene, layout: int = 0) -> dict[str, Any]:
+def light_properties(scene: Scene, layout: int = 0) -> MitsubaDict:
     """Return the lighting properties of the integrator for the environment of a layout."""
     composite = scene.spec.composite
     reference = reference_point(scene)

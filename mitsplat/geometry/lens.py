@@ -19,6 +19,9 @@ from mitsplat.arrays import Float64Array
 Lens = Literal["opencv", "fisheye"]
 """OpenCV camera models: rational with tangential and thin-prism distortion, or fisheye."""
 
+Real = Any
+"""Number, or array of NumPy or Dr.Jit; formulas of lenses are written once for all of them."""
+
 FISHEYE_MAX = float(np.radians(85.0))
 """Maximum angle between a fisheye ray and the optical axis [rad]. Rays are stored as slopes, which diverge at 90
 degrees.
@@ -84,7 +87,7 @@ def is_pinhole(distortion: Sequence[float], lens: Lens) -> bool:
     return lens == "opencv" and not any(distortion)
 
 
-def opencv_distort(u: Any, v: Any, k: Sequence[Any]) -> tuple[Any, Any, tuple[Any, Any, Any, Any]]:
+def opencv_distort(u: Real, v: Real, k: Sequence[Real]) -> tuple[Real, Real, tuple[Real, Real, Real, Real]]:
     """Apply OpenCV's distortion to slopes; return them with the Jacobian (du'/du, du'/dv, dv'/du, dv'/dv).
 
     Source: OpenCV documentation, "Camera Calibration and 3D Reconstruction", rational and thin-prism model.
@@ -111,13 +114,13 @@ def opencv_distort(u: Any, v: Any, k: Sequence[Any]) -> tuple[Any, Any, tuple[An
     return pu + r2 * (s1 + s2 * r2), pv + r2 * (s3 + s4 * r2), jacobian
 
 
-def fisheye_radius(angle: Any, k: Sequence[Any]) -> Any:
+def fisheye_radius(angle: Real, k: Sequence[Real]) -> Real:
     """Return the distance from the principal point [focal lengths] of rays at an angle to the axis [rad]."""
     square = angle * angle
     return angle * (1 + square * (k[0] + square * (k[1] + square * (k[2] + square * k[3]))))
 
 
-def fisheye_rate(angle: Any, k: Sequence[Any]) -> Any:
+def fisheye_rate(angle: Real, k: Sequence[Real]) -> Real:
     """Return the derivative of :func:`fisheye_radius`."""
     square = angle * angle
     return 1 + square * (3 * k[0] + square * (5 * k[1] + square * (7 * k[2] + square * 9 * k[3])))
@@ -166,7 +169,7 @@ def largest_slope(distortion: tuple[float, ...], lens: Lens) -> float:
     return turning_slope(distortion)
 
 
-def radial_distance(slope: Any, distortion: tuple[float, ...], lens: Lens) -> Any:
+def radial_distance(slope: Real, distortion: tuple[float, ...], lens: Lens) -> Real:
     """Return the distance from the principal point of a ray, without tangential and thin-prism distortion."""
     if lens == "fisheye":
         return fisheye_radius(np.arctan(slope), distortion)

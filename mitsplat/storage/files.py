@@ -9,7 +9,7 @@ import re
 import shutil
 import stat
 import struct
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any
@@ -29,7 +29,7 @@ SPLITS = ("train", "val", "test")
 """Splits of a dataset. The scene may disable the last one."""
 
 
-def splits_of(output: Mapping[str, Any]) -> tuple[str, ...]:
+def splits_of(output: JsonObject) -> tuple[str, ...]:
     """Return the splits of a dataset from the ``output`` section of its scene."""
     return SPLITS if output.get("test") else SPLITS[:2]
 

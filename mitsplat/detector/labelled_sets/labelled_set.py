@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal, TypeVar
 
 import numpy as np
 from pycocotools import mask as coco_mask
@@ -23,6 +23,9 @@ Split = Literal["train", "val", "test", "all"]
 
 _OUTSIDE_TOLERANCE = 0.01
 """Largest distance of a position from the image, as a share of its sides; such positions are clipped."""
+
+
+Item = TypeVar("Item")
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,7 +191,7 @@ def clip_points(points: Float64Array, size: tuple[int, int], place: str) -> Floa
 
 
 def read_samples(
-    read: Callable[[Any], Sample], images: Sequence[Any], root: Path, progress: Progress | None
+    read: Callable[[Item], Sample], images: Sequence[Item], root: Path, progress: Progress | None
 ) -> tuple[Sample, ...]:
     """Return the samples that ``read`` makes of the images.
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -360,7 +359,7 @@ class Reflectors:
             self._end_kernel(free)
         return active & ~free
 
-    def _end_kernel(self, *values: Any) -> None:
+    def _end_kernel(self, *values: object) -> None:
         """Evaluate values before the next scene is traced, if a kernel may trace only one scene."""
         if self.proxies.separate_kernels:
             dr.eval(values)

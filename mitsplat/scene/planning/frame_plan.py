@@ -7,9 +7,9 @@ any worker can plan any frame in any order.
 from __future__ import annotations
 
 import operator
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, SupportsIndex
+from typing import SupportsIndex
 
 from mitsplat.errors import InputError, describe
 from mitsplat.geometry.camera import Camera
@@ -24,6 +24,7 @@ from mitsplat.scene.spec.named_files import light_images
 from mitsplat.scene.spec.scene_spec import SceneSpec
 from mitsplat.scene.splits import Split, split_of
 from mitsplat.scene.streams import random_stream
+from mitsplat.storage.files import JsonObject
 
 _FRAME_DRAWS = (
     *("exposure", "vignetting", "chromatic_aberration", "motion_blur", "motion_angle", "iso"),
@@ -59,7 +60,7 @@ class FramePlan:
     lights: tuple[LightSpec, ...]
     draws: dict[str, float]
     seed: int
-    viewpoint: Mapping[str, Any] = field(default_factory=dict)
+    viewpoint: JsonObject = field(default_factory=dict)
     belt: Belt | None = None
 
 

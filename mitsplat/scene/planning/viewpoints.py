@@ -7,10 +7,9 @@ viewpoint instead.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -54,7 +53,7 @@ class Viewpoint:
     """
 
     camera: Camera
-    drawn: Mapping[str, Any] = field(default_factory=dict)
+    drawn: JsonObject = field(default_factory=dict)
 
 
 @lru_cache(maxsize=4)
@@ -98,7 +97,7 @@ def check_eye(scene: Scene, index: int, layout: Layout, camera: Camera) -> None:
 
 def _camera_of_frame(spec: SceneSpec, index: int, pose: Float64Array) -> tuple[Camera, JsonObject]:
     """Return the camera of a frame at a pose, and the values drawn for it."""
-    drawn, motion = dict[str, Any](), spec.camera.motion
+    drawn, motion = JsonObject(), spec.camera.motion
     if motion is not None:
         exposure = random_stream(spec.seed, "camera motion", index).uniform(*motion.exposure)
         drawn["motion"] = {"exposure": float(exposure)}

@@ -23,8 +23,8 @@ def check_image(frame: DecodedFrame, path: Path) -> Iterator[str]:
         yield "cannot be read as an image"
     elif image.shape[:2] != (height, width):
         yield f"is {image.shape[1]}x{image.shape[0]} px, its labels are for {width}x{height}"
-    elif image.min() == image.max():
-        yield "has one colour only"
+    elif np.ptp(frame.ids) > 0 and (image == image[:1, :1]).all():  # masks without an outline allow a plain backdrop
+        yield "has one colour only, but its masks have outlines"
 
 
 def _check_copy(frame: DecodedFrame, path: Path) -> Iterator[str]:

@@ -191,7 +191,8 @@ def exit_status(error: BaseException) -> int | None:
 def sentence_of(error: BaseException) -> str:
     """Return the user message of an error."""
     if isinstance(error, OSError) and error.strerror:
-        return f"{error.filename}: {error.strerror}" if error.filename else error.strerror
+        place = (error.filename2 if error.errno in FULL else None) or error.filename  # a copy names its source first
+        return f"{place}: {error.strerror}" if place else error.strerror
     if is_out_of_memory(error):
         detail = str(error).partition("\n")[0]
         detail = f" ({detail})" if detail else ""

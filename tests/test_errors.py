@@ -1,10 +1,14 @@
 """Error messages and exit statuses of the command line for errors that are not bugs of mitsplat."""
 
+import errno
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
 
-from mitsplat.errors import InputError, exit_status, sentence_of
+from mitsplat.errors import InputError, MissingResourceError, exit_status, sentence_of
+from mitsplat.storage.files import storage_errors
 
 
 @pytest.mark.parametrize(
@@ -32,3 +36,13 @@ def test_out_of_memory_errors_of_opencv_have_status_3() -> None:
 def test_other_errors_are_not_taken_for_out_of_memory() -> None:
     assert exit_status(RuntimeError("out of ideas")) is None
     assert exit_status(InputError("insufficient memory for jokes")) == 2
+
+
+def test_a_full_disk_is_named_by_the_file_that_is_written(tmp_path: Path) -> None:
+    """``shutil.copyfile`` names its source first."""
+    error = OSError(errno.ENOSPC, "No space left on device", "source.jpg", None, "copy.jpg")
+    assert sentence_of(error) == "copy.jpg: No space left on device"
+    message = r"^copy\.jpg: No space left on device: free disk space"
+    with pytest.raises(MissingResourceError, match=message), storage_errors(tmp_path):
+        raise error
+    assert sentence_of(OSError(errno.ENOENT, "No such file", "source.jpg", None, "copy.jpg")).startswith("source.jpg")

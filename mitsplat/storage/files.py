@@ -307,6 +307,7 @@ def storage_errors(folder: Path) -> Iterator[None]:
     except OSError as error:
         place = error.filename or folder
         if error.errno in FULL:
+            place = error.filename2 or place  # a copy names its source first
             raise MissingResourceError(
                 f"{place}: {error.strerror}: free disk space and run again; finished files are kept"
             ) from error

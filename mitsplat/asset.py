@@ -29,7 +29,7 @@ from ruamel.yaml import YAML
 from scipy.spatial import QhullError
 
 from mitsplat.arrays import Float32Array, Float64Array
-from mitsplat.errors import InputError, path_of
+from mitsplat.errors import InputError, checks_arguments, path_of
 from mitsplat.gaussians.material_files import write_materials
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.mesh import check_faces
@@ -125,6 +125,7 @@ class AssetSpec(BaseModel):
         return self
 
 
+@checks_arguments
 @dataclass(frozen=True, eq=False, repr=False)
 class Asset:
     """One object or one environment in metres, z up.

@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 import errno
+import functools
+import inspect
 import os
 import re
 import types
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from numbers import Integral, Real
 from pathlib import Path
-from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+
+import numpy as np
+import numpy.typing as npt
 
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 """Error numbers of the operating system that mean that there is no space for a file."""
 
+_Class = TypeVar("_Class")
 _OUT_OF_MEMORY = re.compile("out[ _]of[ _]memory|can.t allocate memory|insufficient memory", re.IGNORECASE)
 
 
@@ -153,7 +159,94 @@ def _describe_kind(kind: Any) -> list[str]:
         return list(map(str, get_args(kind)))
     if get_origin(kind) is tuple:
         return ["a list" if Ellipsis in get_args(kind) else f"a list of {len(get_args(kind))}"]
+    if get_origin(kind) is os.PathLike or kind is os.PathLike:
+        return ["a path"]
+    if get_origin(kind) is np.ndarray:
+        return ["an array"]
+    if get_origin(kind) is Sequence:
+        return ["a list"]
+    kind = get_origin(kind) or kind
     return ["None" if kind is type(None) else _WORDS.get(kind, f"a {getattr(kind, '__name__', kind)}")]
+
+
+def checks_arguments(kind: type[_Class]) -> type[_Class]:
+    """Class decorator: check the arguments of all public methods by their annotations.
+
+    Numbers, text, paths, lists, mappings, arrays and objects are checked. An argument that becomes an array must
+    consist of numbers. ``from_json`` also names missing keys.
+    """
+    for name, member in list(vars(kind).items()):
+        function = getattr(member, "__func__", member)
+        if not name.startswith("_") and isinstance(function, types.FunctionType):
+            checked = _checked(function, f"{kind.__name__}.{name}")
+            setattr(kind, name, type(member)(checked) if isinstance(member, classmethod | staticmethod) else checked)
+    return kind
+
+
+def _checked(function: Callable[..., Any], place: str) -> Callable[..., Any]:
+    signature = inspect.signature(function)
+    hints = functools.cache(lambda: get_type_hints(function))  # classes of later modules are known at the first call
+
+    @functools.wraps(function)
+    def call(*args: Any, **kwargs: Any) -> Any:
+        try:
+            given = signature.bind(*args, **kwargs).arguments
+        except TypeError:
+            given = {}  # Python's own message names the argument
+        for name, value in given.items():
+            if name in hints():
+                _check_argument(value, hints()[name], name)
+        if not place.endswith(".from_json"):
+            return function(*args, **kwargs)
+        try:
+            return function(*args, **kwargs)
+        except KeyError as error:
+            raise InputError(f"{place} needs the values of to_json: the key {error} is missing") from error
+        except (TypeError, IndexError, AttributeError) as error:
+            raise InputError(f"{place} needs the values of to_json ({error})") from error
+
+    return call
+
+
+def _check_argument(value: Any, hint: Any, place: str) -> None:
+    """Check an argument by its annotation, if it is of a type that needs no conversion.
+
+    Raises:
+        InputError: If it has another type.
+    """
+    if hint == npt.ArrayLike:
+        try:
+            is_numeric = np.asarray(value).dtype.kind in "biuf"
+        except ValueError:
+            is_numeric = False
+        if not is_numeric:
+            raise InputError(f"{place} must be an array of numbers (got {describe(value)})")
+        return
+    kinds = get_args(hint) if get_origin(hint) in (Union, types.UnionType) else (hint,)
+    if not all(_is_checked(kind) for kind in kinds):
+        return
+    if not any(_has_kind(value, kind) and not _is_wrong_text(value, kind) for kind in kinds):
+        words = list(dict.fromkeys(word for kind in kinds for word in _describe_kind(kind)))
+        if "a path" in words:
+            words = [word for word in words if word != "text"]
+        raise InputError(f"{place} must be {list_in_words(words, 'or')} (got {describe(value)})")
+    for kind in kinds:
+        item = get_args(kind)
+        if get_origin(kind) is Sequence and isinstance(value, list | tuple) and isinstance(item[0], type):
+            check_list(value, item[0], place)
+
+
+def _is_checked(kind: Any) -> bool:
+    """Return True for an annotation whose values are checked; values of protocols are converted by the method."""
+    base = get_origin(kind) or kind
+    if base in (object, Mapping):  # methods describe the mappings that they need
+        return False
+    return base is Literal or (isinstance(base, type) and not getattr(base, "_is_protocol", False))
+
+
+def _is_wrong_text(value: Any, kind: Any) -> bool:
+    """Return True for text in place of a list, which Python takes for a list of letters."""
+    return isinstance(value, str | bytes) and get_origin(kind) is Sequence
 
 
 def is_out_of_memory(error: BaseException) -> bool:

@@ -24,7 +24,7 @@ from PIL import Image
 from pydantic import BaseModel, ConfigDict, Field
 
 from mitsplat.arrays import BoolArray, Float32Array, Float64Array, Int32Array
-from mitsplat.errors import InputError
+from mitsplat.errors import InputError, checks_arguments
 from mitsplat.geometry.camera import Camera
 from mitsplat.geometry.lens import Lens
 from mitsplat.images.colour import decode_srgb, encode_srgb
@@ -215,6 +215,7 @@ def _open_image(path: Path) -> Iterator[Image.Image]:
         raise InputError(f"{path}: not a readable image ({error})") from error
 
 
+@checks_arguments
 @dataclass(frozen=True, eq=False)
 class Capture:
     """Photographs of one object or place, with the result of structure from motion.

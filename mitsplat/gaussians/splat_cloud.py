@@ -24,7 +24,7 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from mitsplat.arrays import AnyArray, BoolArray, Float32Array, Float64Array
-from mitsplat.errors import InputError, describe, path_of
+from mitsplat.errors import InputError, checks_arguments, describe, path_of
 from mitsplat.gaussians.material_files import read_materials
 from mitsplat.gaussians.spherical_harmonics import SH_C0, sh_rotation
 from mitsplat.gaussians.splat_files import SplatArrays, read_splats, write_splats
@@ -33,6 +33,7 @@ from mitsplat.images.colour import decode_srgb, encode_srgb
 from mitsplat.quality import KernelName
 
 
+@checks_arguments
 @dataclass(frozen=True, eq=False, repr=False)
 class Splats:
     """Set of N anisotropic 3D Gaussians with view-dependent colour (Kerbl et al. 2023, 3DGS).
@@ -152,7 +153,7 @@ class Splats:
 
     def select(self, index: slice | npt.ArrayLike) -> Splats:
         """Return the Gaussians selected by a Boolean mask (N,), an integer array or a slice, in its order."""
-        rows = index if isinstance(index, slice) else np.atleast_1d(np.asarray(index))
+        rows = index if isinstance(index, slice) else _rows_of(index, len(self))
         arrays = {name: getattr(self, name)[rows] for name in SplatArrays._fields}
         materials = None if self.materials is None else self.materials.select(rows)
         return Splats(**arrays, materials=materials, kernel=self.kernel)
@@ -232,6 +233,25 @@ def split_similarity(matrix: npt.ArrayLike) -> tuple[Float64Array, float, Float6
         raise ValueError(f"a transform must scale uniformly and not shear (R R^T differs from 1 by {error:.3g})")
     u, _, vt = np.linalg.svd(rotation)  # nearest rotation: inputs are often float32
     return u @ vt, scale, matrix[:3, 3]
+
+
+def _rows_of(index: npt.ArrayLike, count: int) -> AnyArray:
+    """Return a mask or whole numbers that select among ``count`` rows.
+
+    Raises:
+        InputError: If it is another array, or has another length, or selects a missing row.
+    """
+    rows = np.atleast_1d(np.asarray(index))
+    if not rows.size:
+        return np.zeros(0, dtype=np.int64)
+    if rows.dtype.kind not in "biu":
+        raise InputError(f"index must be a mask, whole numbers or a slice (got {describe(index)})")
+    if rows.dtype.kind == "b":
+        if rows.shape != (count,):
+            raise InputError(f"a mask must have shape ({count},) (got {rows.shape})")
+    elif not -count <= rows.min() <= rows.max() < count:
+        raise InputError(f"index must be in 0 to {count - 1} (got {rows.min()} to {rows.max()})")
+    return rows
 
 
 def _require(valid: BoolArray, name: str, rule: str, values: AnyArray) -> None:

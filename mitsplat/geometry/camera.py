@@ -17,7 +17,7 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
 from mitsplat.arrays import AnyArray, Float64Array, Int64Array
-from mitsplat.errors import InputError, check_number, describe
+from mitsplat.errors import InputError, check_number, checks_arguments, describe
 from mitsplat.geometry.lens import (
     Lens,
     distortion_coefficients,
@@ -37,6 +37,7 @@ NEAR = 0.01
 """Near clipping depth of cameras in scene files [m]."""
 
 
+@checks_arguments
 @dataclass(frozen=True, eq=False)
 class Camera:
     """OpenCV camera: intrinsics [px], lens distortion and pose.
@@ -196,7 +197,14 @@ class Camera:
         Raises:
             ValueError: If the values are invalid.
         """
-        ((fx, _, cx), (_, fy, cy), _) = stored["intrinsics"]
+        if np.shape(stored["intrinsics"]) != (3, 3):
+            raise InputError(f"intrinsics must have shape (3, 3) (got {describe(stored['intrinsics'])})")
+        ((fx, skew, cx), (lower, fy, cy), last) = stored["intrinsics"]
+        if (skew, lower, *last) != (0, 0, 0, 0, 1):
+            raise InputError(
+                f"intrinsics must have the form [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] (got {stored['intrinsics']}): "
+                "pixels with a skew are not supported"
+            )
         same = ("width", "height", "world_from_camera", "near", "lens", "aperture_radius", "focus_distance")
         known = {key: stored[key] for key in same}
         return cls(fx=fx, fy=fy, cx=cx, cy=cy, distortion=tuple(stored["distortion"]), **known)
@@ -249,6 +257,8 @@ class Camera:
 
     def fitted(self, size: float) -> Camera:
         """Return the same camera with a longest edge of at most ``size`` px."""
+        if not size > 0:
+            raise InputError(f"size must be > 0 (got {size})")
         scale = min(1.0, size / max(self.width, self.height))
         return self.resized(max(1, round(self.width * scale)), max(1, round(self.height * scale)))
 
@@ -258,6 +268,8 @@ class Camera:
         if matrix.shape != (4, 4):
             raise ValueError(f"matrix must have shape (4, 4) (got {matrix.shape})")
         scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
+        if not (scale > 0 and np.isfinite(matrix).all()):
+            raise InputError(f"matrix must be finite and must neither mirror nor flatten (got a scale of {scale:g})")
         pose = matrix @ self.world_from_camera
         pose[:3, :3] /= scale
         return replace(self, world_from_camera=pose, near=self.near * scale)
@@ -303,10 +315,16 @@ class Camera:
 
     def sample(self, image: AnyArray, points: npt.ArrayLike, missing: float) -> Float64Array:
         """Return the pixel values (N,) of an image at world points (N, 3); ``missing`` for points outside the image."""
+        self._check_image(image)
         values = np.full(len(np.atleast_2d(points)), missing)
         inside, x, y = self.visible_pixels(points)
         values[inside] = image[y, x]
         return values
+
+    def _check_image(self, image: AnyArray) -> None:
+        if image.shape[:2] != (self.height, self.width):
+            size = "x".join(map(str, image.shape[1::-1]))
+            raise InputError(f"image must have the size of the camera, {self.width}x{self.height} px (got {size})")
 
     def undistorted(self, image: npt.NDArray[np.uint8]) -> tuple[npt.NDArray[np.uint8], Camera]:
         """Return an image of this camera resampled for a pinhole camera, and that pinhole camera.
@@ -316,6 +334,9 @@ class Camera:
         Args:
             image: Shape (H, W, C).
         """
+        self._check_image(image)
+        if image.dtype != np.uint8 or image.ndim not in (2, 3):
+            raise InputError(f"image must have 8 bits and the shape (H, W, C) (got {image.dtype}, {image.shape})")
         side = np.linspace(0, 1, 65)
         left, right, top, bottom = (
             self.ray_slopes(np.stack([x * self.width, y * self.height], axis=1))
@@ -339,7 +360,10 @@ class Camera:
 
         Positions outside the image for which the lens has no ray are NaN.
         """
-        pixels = np.asarray(pixels, dtype=np.float64).reshape(-1, 2)
+        pixels = np.asarray(pixels, dtype=np.float64)
+        if pixels.shape[-1:] != (2,):
+            raise InputError(f"pixels must have shape (N, 2) (got {pixels.shape})")
+        pixels = pixels.reshape(-1, 2)
         slopes = (pixels - (self.cx, self.cy)) / (self.fx, self.fy)
         if not self.distortion or not len(slopes):
             return slopes

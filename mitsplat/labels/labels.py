@@ -27,6 +27,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsplat.arrays import BoolArray, Float64Array
+from mitsplat.errors import checks_arguments
 from mitsplat.images.masks import (
     BOUNDARY_TOLERANCE,
     Box,
@@ -153,6 +154,7 @@ class InstanceLabel:
         return float(np.count_nonzero(filled & self.mask) / np.count_nonzero(filled | self.mask))
 
 
+@checks_arguments
 @dataclass(frozen=True, eq=False)
 class Labels:
     """Labels of one frame.

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsplat.arrays import Float64Array
-from mitsplat.errors import InputError, describe
+from mitsplat.errors import InputError, checks_arguments, describe
 from mitsplat.scene.given_poses import asset_index, rigid_pose
 from mitsplat.scene.scene import Scene
 from mitsplat.storage.files import JsonObject
@@ -103,6 +103,7 @@ class LeftOut:
     reason: str
 
 
+@checks_arguments
 @dataclass(frozen=True, eq=False, repr=False)
 class Layout:
     """Poses of the objects of one layout, and the objects that were left out.

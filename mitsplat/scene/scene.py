@@ -12,13 +12,14 @@ from typing import Any
 import trimesh
 
 from mitsplat.asset import Asset
-from mitsplat.errors import check_type
+from mitsplat.errors import InputError, check_type, checks_arguments
 from mitsplat.gaussians.splat_training import trained_kernel
 from mitsplat.scene.spec.object_spec import ObjectSpec
 from mitsplat.scene.spec.scene_spec import SceneSpec
 from mitsplat.scene.splits import draw_environment
 
 
+@checks_arguments
 @dataclass(frozen=True, eq=False, repr=False)
 class Scene:
     """Scene specification with all files that it names.
@@ -88,7 +89,10 @@ class Scene:
 
     def entry_of(self, asset: int) -> ObjectSpec:
         """Return the entry of ``spec.objects`` to which an asset belongs."""
-        return next(entry for entry, pool in zip(self.spec.objects, self.pools, strict=True) if asset in pool)
+        for entry, pool in zip(self.spec.objects, self.pools, strict=True):
+            if asset in pool:
+                return entry
+        raise InputError(f"asset must be an index from 0 to {len(self.assets) - 1} (got {asset})")
 
     def class_index(self, asset: int) -> int | None:
         """Return the class index of an asset; None if its objects have no labels."""

@@ -125,7 +125,7 @@ CALLS: list[tuple[Callable[[ms.Scene, Path], object], str]] = [
     (lambda scene, out: ms.Splats("a", [[0, 0, 0, 1]], [[1, 1, 1]], [1], [[[0, 0, 0]]]), "means must be an array of"),
     (lambda scene, out: ms.Camera.look_at((0, 0, 1), (0, 0, 0), width=8, height=6, fov_x="50"), "fov_x must be a"),
     (lambda scene, out: ms.Camera.look_at(np.eye(3), (0, 0, 0), width=8, height=6, fov_x=50), "eye must be one point"),
-    (lambda scene, out: CAMERA.project("nut"), "points must be numbers of shape (N, 3) (got str 'nut')"),
+    (lambda scene, out: CAMERA.project("nut"), "points must be an array of numbers (got str 'nut')"),
 ]
 
 

@@ -12,11 +12,12 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import sys
 import threading
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -167,6 +168,17 @@ def extract(job: dict[str, Any], images: Path, database: Path, folder: Path) -> 
         )
 
 
+def numbers_in(name: str) -> list[str | int]:
+    """Return a key that sorts names by the numbers in them: frame2 before frame10, unlike COLMAP."""
+    return [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", name)]
+
+
+def sequential_pairs(names: Sequence[str]) -> list[tuple[str, str]]:
+    """Return the pairs of COLMAP's sequential matching of photos in an order: each with those 1, 2, 4, ... later."""
+    steps = [2**power for power in range(SEQUENTIAL_OVERLAP)]
+    return [(name, names[at + step]) for at, name in enumerate(names) for step in steps if at + step < len(names)]
+
+
 def match(job: dict[str, Any], database: Path, folder: Path) -> None:
     """Compute verified matches of the pairs that have none yet."""
     write_status(folder, "matching")
@@ -175,7 +187,18 @@ def match(job: dict[str, Any], database: Path, folder: Path) -> None:
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = SEED
     verification.ransac.max_num_trials = MAX_TRIALS
-    if job["matching"] == "sequential":
+    names = [name for group in job["groups"] for name in group]
+    in_order = sorted(names, key=numbers_in)
+    if (
+        job["matching"] == "sequential"
+        and in_order != sorted(names)
+        and not any(set(" \t") & set(name) for name in names)
+    ):
+        listed = pycolmap.ImportedPairingOptions()
+        listed.match_list_path = folder / "pairs.txt"  # whose names are separated by blanks
+        listed.match_list_path.write_text("".join(f"{one} {other}\n" for one, other in sequential_pairs(in_order)))
+        pycolmap.match_image_pairs(database, matching, listed, verification, device=pycolmap.Device.cpu)
+    elif job["matching"] == "sequential":
         pairing = pycolmap.SequentialPairingOptions()
         pairing.overlap = SEQUENTIAL_OVERLAP
         pycolmap.match_sequential(database, matching, pairing, verification, device=pycolmap.Device.cpu)

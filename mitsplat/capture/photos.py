@@ -20,14 +20,15 @@ from mitsplat.capture.capture import Photo, stored_name
 from mitsplat.capture.name_matching import composed
 from mitsplat.capture.video.sharpness import sharpness
 from mitsplat.errors import InputError
-from mitsplat.images.colour import eight_bit
+from mitsplat.images.colour import eight_bit, in_srgb
 from mitsplat.progress import Progress
 from mitsplat.runtime.cores import usable_cores
 from mitsplat.storage.file_kinds import check_path_encoding
 from mitsplat.storage.files import IMAGE_ERRORS, files_below, write_file
 
 SUFFIXES = (".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp")
-_UNSUPPORTED = (".arw", ".avif", ".cr2", ".cr3", ".dng", ".heic", ".heif", ".nef")
+_RAW = (".3fr", ".arw", ".cr2", ".cr3", ".dng", ".iiq", ".nef", ".orf", ".pef", ".raf", ".rw2", ".srw", ".x3f")
+_UNSUPPORTED = (*_RAW, ".avif", ".heic", ".heif", ".jp2", ".jxl")
 _LOSSY = ("JPEG", "MPO", "WEBP")
 
 _MIN_SHARPNESS = 0.12
@@ -125,8 +126,8 @@ def prepare_photos(
 ) -> tuple[list[Prepared], dict[str, str]]:
     """Make upright copies of the usable photographs below ``folder``.
 
-    EXIF orientation is applied because COLMAP ignores it. Photos larger than ``max_size`` are reduced. A photo that
-    needs neither is copied byte by byte.
+    EXIF orientation is applied because COLMAP ignores it, and colours become those of sRGB. Photos larger than
+    ``max_size`` are reduced. A photo that needs none of this is copied byte by byte.
 
     Args:
         folder: Folder of photographs, at any depth.
@@ -187,11 +188,12 @@ def _prepare(
             stated = exif.get(ExifTags.Base.Orientation, 1)
             stated = int(stated) if stated in range(1, 9) else 1
             orientation, pending = (stated, 1) if upright else (1, stated)
-            turned = ImageOps.exif_transpose(image) if upright else image
+            turned = in_srgb(ImageOps.exif_transpose(image) if upright else image)
+            is_srgb = turned.info.get("icc_profile") == image.info.get("icc_profile")
             lossy, kept = image.format in _LOSSY, image.format in ("JPEG", "PNG") and image.mode in ("RGB", "L")
     except IMAGE_ERRORS as error:
         return f"it cannot be read ({error})"
-    kept &= max(turned.size) <= max_size and orientation == pending == 1
+    kept &= is_srgb and max(turned.size) <= max_size and orientation == pending == 1
     suffix = path.suffix if kept else ".jpg" if lossy else ".png"
     file = out / stored_name(name, suffix)
     rgb = eight_bit(turned)

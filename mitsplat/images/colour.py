@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+import io
 import warnings
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from PIL import Image
+from PIL import Image, ImageCms
 
 from mitsplat.arrays import Float64Array
 
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)
 """Rec. 709 luminance weights of linear sRGB."""
+
+
+_EQUAL_COLOURS = 2
+"""Maximum difference of 8-bit colours between sRGB and a profile that counts as sRGB."""
 
 
 def encode_srgb(linear: npt.ArrayLike) -> Float64Array:
@@ -130,3 +135,30 @@ def eight_bit(image: Image.Image) -> Image.Image:
     if "transparency" in image.info:  # Pillow asks for this intermediate mode
         image = image.convert("RGBA")
     return image.convert("RGB")
+
+
+def in_srgb(image: Image.Image) -> Image.Image:
+    """Return an image with the colours of its ICC profile as sRGB; the same image if it has none or that of sRGB.
+
+    Cameras store photographs in wider colour spaces, such as Display P3 or Adobe RGB. Damaged profiles are ignored.
+    """
+    profile = image.info.get("icc_profile")
+    if not profile or image.mode not in ("RGB", "RGBA"):
+        return image
+    levels = np.mgrid[0:256:51, 0:256:51, 0:256:51].reshape(3, 1, -1).T.astype(np.uint8)
+    try:
+        transform = ImageCms.buildTransform(
+            ImageCms.ImageCmsProfile(io.BytesIO(profile)),
+            ImageCms.createProfile("sRGB"),
+            *(image.mode, image.mode),
+            renderingIntent=ImageCms.Intent.RELATIVE_COLORIMETRIC,
+        )
+        probe = ImageCms.applyTransform(Image.fromarray(levels).convert(image.mode), transform)
+        is_srgb = np.abs(np.asarray(probe.convert("RGB")).astype(int) - levels).max() <= _EQUAL_COLOURS
+        converted = None if is_srgb else ImageCms.applyTransform(image, transform)
+    except (ImageCms.PyCMSError, OSError):
+        return image
+    if converted is None:
+        return image
+    converted.info = {**image.info, **converted.info}  # with EXIF
+    return converted

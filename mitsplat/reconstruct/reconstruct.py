@@ -21,7 +21,8 @@ from mitsplat.reconstruct.asset_evaluation import HeldOutView, Verdict, compute_
 from mitsplat.reconstruct.causes import find_causes
 from mitsplat.reconstruct.fallback_proxy import find_proxy_surface
 from mitsplat.reconstruct.materials.capture_light import CaptureLight
-from mitsplat.reconstruct.registration import Alignment, register_mesh, surface_points
+from mitsplat.reconstruct.pose_refinement import RefinedPose, refine_pose
+from mitsplat.reconstruct.registration import Alignment, measure_offset, register_mesh, surface_points
 from mitsplat.reconstruct.segment_splats import Isolation, MaskedView, isolate_object
 from mitsplat.reconstruct.silhouette_refinement import MeshRefineSettings, RefinedMesh, refine_mesh
 from mitsplat.reconstruct.surface import SurfaceSettings, reconstruct_surface, simplify_surface
@@ -130,11 +131,12 @@ class Reconstruction:
         verdict: Quality figures.
         held_out: Held-out views of the evaluation.
         isolation: Result of the isolation, or None for an environment.
-        alignment: Registration of an imported mesh, or None.
+        alignment: Registration of an imported mesh after the refinement of its pose, or None.
         refinement: Result of the mesh refinement in the capture's frame, or None if it was not requested.
         asset_from_capture: Similarity transform from the capture's frame to the asset's frame, shape (4, 4).
         sections: Further sections of the report, HTML.
         record: Further entries of the verdict file, JSON.
+        pose: Refinement of the pose of a registered mesh, or None without a registration or masks.
     """
 
     asset: Asset
@@ -146,6 +148,7 @@ class Reconstruction:
     asset_from_capture: Float64Array
     sections: tuple[str, ...] = ()
     record: Mapping[str, Any] = field(default_factory=dict)
+    pose: RefinedPose | None = None
 
 
 def reconstruct_asset(
@@ -184,7 +187,7 @@ def reconstruct_asset(
         isolation = isolate_object(splats, views, progress=progress)
         splats = isolation.splats
     cameras = [photo.camera.fitted(settings.view_size) for photo in capture.training]
-    alignment = refinement = proxy = None
+    alignment = pose = refinement = proxy = None
     if imported is None:
         floor = 0.0 if job.kind == "object" and capture.table and _may_stand_on_table(splats) else None
         if job.kind == "object":
@@ -196,7 +199,8 @@ def reconstruct_asset(
             refinement = refine_mesh(mesh, views, settings.refine, floor=floor, progress=progress)
             mesh = refinement.mesh
     else:
-        mesh, alignment = _place_mesh(imported, splats, cameras, metric=capture.units == "metre")
+        metric = capture.units == "metre"
+        mesh, alignment, pose = _place_mesh(imported, splats, cameras, views, metric=metric, progress=progress)
         mesh = simplify_surface(mesh, settings.surface.faces)
     if progress is not None:
         progress(0, 1, "evaluating held-out photos")
@@ -206,6 +210,8 @@ def reconstruct_asset(
     )
     if proxy is not None:
         verdict = replace(verdict, surface=proxy.source, surface_faults=proxy.faults)
+    if pose is not None:
+        verdict = replace(verdict, rows={"Pose of the mesh": str(pose)})
     asset = Asset(
         name=job.name,
         class_name=job.class_name or job.name,
@@ -230,7 +236,7 @@ def reconstruct_asset(
             progress(0, 1, "splitting the mesh into convex pieces")
         asset = replace(asset, pieces=convex_pieces(mesh if asset.mesh is None else asset.mesh))
     verdict = replace(verdict, units=asset.units)
-    return Reconstruction(asset, verdict, held_out, isolation, alignment, refinement, asset_from_capture)
+    return Reconstruction(asset, verdict, held_out, isolation, alignment, refinement, asset_from_capture, pose=pose)
 
 
 _MAX_SHARE_BELOW = 0.02
@@ -262,19 +268,33 @@ def _alignment_rotation(mesh: trimesh.Trimesh) -> Float64Array:
 
 
 def _place_mesh(
-    imported: ImportedMesh, splats: Splats, cameras: Sequence[Camera], *, metric: bool
-) -> tuple[trimesh.Trimesh, Alignment | None]:
-    """Return the mesh in the capture's frame and its registration, or None if the transform was given.
+    imported: ImportedMesh,
+    splats: Splats,
+    cameras: Sequence[Camera],
+    views: Sequence[MaskedView],
+    *,
+    metric: bool,
+    progress: Progress | None,
+) -> tuple[trimesh.Trimesh, Alignment | None, RefinedPose | None]:
+    """Return the mesh in the capture's frame, its registration, and the refinement of its pose by the masks.
 
-    In a ``metric`` capture, a mesh of stated units keeps its size: the surface of splats on metal is often too small.
+    The registration is None if the transform was given, and the refinement is None without a registration or masks. In
+    a ``metric`` capture, a mesh of stated units keeps its size: the surface of splats on metal is often too small.
     """
-    alignment = None
-    matrix = imported.capture_from_mesh
-    if matrix is None:
-        alignment = register_mesh(
-            imported.mesh, surface_points(splats, cameras), imported.metres_per_unit if metric else None
-        )
-        matrix = alignment.splats_from_mesh
     mesh = imported.mesh.copy()
-    mesh.apply_transform(matrix)
-    return mesh, alignment
+    if imported.capture_from_mesh is not None:
+        mesh.apply_transform(imported.capture_from_mesh)
+        return mesh, None, None
+    scale = imported.metres_per_unit if metric else None
+    points = surface_points(splats, cameras)
+    alignment = register_mesh(imported.mesh, points, scale)
+    mesh.apply_transform(alignment.splats_from_mesh)
+    if not views:
+        return mesh, alignment, None
+    pose = refine_pose(mesh, views, rigid=scale is not None, progress=progress)
+    if pose.kept:
+        mesh.apply_transform(pose.motion)
+        matrix = pose.motion @ alignment.splats_from_mesh
+        size = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
+        alignment = Alignment(matrix, size, measure_offset(mesh, points).spread)
+    return mesh, alignment, pose

@@ -178,11 +178,15 @@ def refine_mesh(
                 refined, after = found, errors
         if progress is not None:
             progress(step + 1, settings.steps, "refining the mesh")
-    gain = before - after
-    kept = bool(np.isfinite(gain).all() and gain.mean() > gain.std() / np.sqrt(max(len(validation) - 1, 1)))
+    kept = is_gain(before - after)
     if kept:
         mesh = trimesh.Trimesh(refined * radius + middle, mesh.faces, process=False)
     return RefinedMesh(mesh, kept, float(before.mean()), float(after.mean()), len(validation))
+
+
+def is_gain(gains: Float64Array, least: float = 1.0) -> bool:
+    """Return True if the mean of gains (N,) is positive by more than ``least`` standard errors."""
+    return bool(np.isfinite(gains).all() and gains.mean() > least * gains.std() / np.sqrt(max(len(gains) - 1, 1)))
 
 
 class Outline:

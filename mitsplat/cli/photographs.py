@@ -283,7 +283,8 @@ def mesh(
         typer.Option(
             "--import",
             metavar="MESH",
-            help="Use this mesh instead of a reconstructed one; it is registered to the splats.",
+            help="Use this mesh instead of a reconstructed one; it is registered to the splats, and its pose is "
+            "refined with the masks.",
         ),
     ] = None,
     normalisation: Annotated[
@@ -302,6 +303,8 @@ def mesh(
         ),
     ] = False,
     remove: Remove = None,
+    metallic: Metallic = None,
+    roughness: Roughness = None,
     lights: Lights = None,
     device: DeviceName = "cpu",
 ) -> None:
@@ -334,6 +337,7 @@ def mesh(
         settings=ReconstructSettings(surface=surface, size=size, refine=MeshRefineSettings() if refine else None),
         imported=imported,
         remove=tuple(remove or ()),
+        material=uniform_material(metallic, roughness),
         light=None if lights is None else CaptureLight.load(lights),
     )
     select_device(device)

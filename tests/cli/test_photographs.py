@@ -133,7 +133,7 @@ def test_mesh_passes_every_option_on(
     status = run(
         "mesh", "capture", "fit", "-o", tmp_path / "nut", "--name", "m6", "--class", "nut", "--kind", kind,
         "--faces", 500, "--voxels", 64, "--size", 0.1, "--import", tmp_path / "cad.stl",
-        "--normalisation", tmp_path / "matrix.txt", "--units", 0.001,
+        "--normalisation", tmp_path / "matrix.txt", "--units", 0.001, "--metallic", 1, "--roughness", 0.3,
     )  # fmt: skip
     assert status == 0
     capture, fit_folder, out, job = calls.args
@@ -141,6 +141,7 @@ def test_mesh_passes_every_option_on(
     assert (job.name, job.class_name, job.kind, job.settings.size) == ("m6", "nut", kind, 0.1)
     assert job.settings.surface == SurfaceSettings(voxels=64, faces=500)
     assert job.imported.metres_per_unit == 0.001
+    assert job.material == {"metallic": 1.0, "roughness": 0.3}
     np.testing.assert_allclose(job.imported.capture_from_mesh @ [1, 0, 0, 1], [0, 0, 0, 1], atol=1e-12)
     assert "held-out PSNR 27.00 dB; IoU with held-out masks splats 0.970, mesh 0.960" in capsys.readouterr().out
 

@@ -57,7 +57,7 @@ from mitsplat.scene.spec.light_spec import LightSpec
 from scenes.build import materials as m
 from scenes.build.parts import PARTS, build_part
 
-WIDTH, HEIGHT, PHOTOS, HELD_OUT = 192, 144, 20, 1
+WIDTH, PHOTOS, HELD_OUT = 192, 20, 1
 TILTS = {"hex_bolt": 90, "brass_fitting": 90, "proximity_sensor": 90}
 """Rotations of parts that do not stand, about x [degrees]."""
 NEW_LIGHTS = ("softbox", "lamp")
@@ -88,15 +88,16 @@ def balanced(name: str, folder: Path) -> tuple[LightSpec, ...]:
     )
 
 
-def ring(mesh: trimesh.Trimesh, count: int, turn: float = 0.0) -> list[Camera]:
-    """Return cameras in three heights around a mesh."""
+def ring(mesh: trimesh.Trimesh, count: int, turn: float = 0.0, width: int = WIDTH) -> list[Camera]:
+    """Return cameras in three heights around a mesh, with 4:3 images."""
     centre, radius = mesh.bounds.mean(axis=0), 0.5 * float(np.linalg.norm(mesh.extents))
     azimuth = np.radians(np.arange(count) * 360 / count + turn)
     elevation = np.radians(np.resize((15, 40, 65), count))
     flat = np.cos(elevation)
     towards = np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)], axis=1)
     return [
-        Camera.look_at(centre + 5.2 * radius * one, centre, width=WIDTH, height=HEIGHT, fov_x=26) for one in towards
+        Camera.look_at(centre + 5.2 * radius * one, centre, width=width, height=3 * width // 4, fov_x=26)
+        for one in towards
     ]
 
 
@@ -219,9 +220,18 @@ def measure(name: str, out: Path, samples: int) -> dict[str, float]:
     captured, seen = captured_splats(scene, surfels, capture)
     figures = compare(surface, surfels, seen, found)
     looks = captured, found.apply(captured), with_true_materials(captured, surface, surfels)
+    figures |= score_new_lights(parts, mesh, looks, folder, samples)
+    return figures
+
+
+def score_new_lights(
+    parts: Sequence[MeshPart], mesh: trimesh.Trimesh, looks: tuple[Splats, Splats, Splats], folder: Path, samples: int
+) -> dict[str, float]:
+    """Return the PSNR [dB] under other lights of captured, estimated and true materials; write a sheet of pictures."""
+    figures = {}
     others, pictures = ring(mesh, HELD_OUT, turn=29.0), []
     for light in NEW_LIGHTS:
-        new = balanced(light, out)
+        new = balanced(light, folder.parent)
         truth, masks = path_traced(parts, new, others, 8 * samples, folder / f"{light}.npz")
         scores = []
         for camera, photo, mask in zip(others, truth, masks, strict=True):
@@ -230,7 +240,7 @@ def measure(name: str, out: Path, samples: int) -> dict[str, float]:
             pictures += [photo, *shown[:2]]
         for kind, score in zip(("captured", "estimated", "true"), np.mean(scores, axis=0).tolist(), strict=True):
             figures[f"{light} {kind}"] = score
-    save_sheet(out / f"{name}.png", pictures)
+    save_sheet(folder.with_suffix(".png"), pictures)
     return figures
 
 

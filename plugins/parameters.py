@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NoReturn
 
 import mitsuba as mi
 import numpy as np
@@ -68,7 +68,7 @@ class Parameters:
             self.refuse(name, f"be from {least} to {most}", value)
         return int(value)
 
-    def refuse(self, name: str, rule: str, value: object) -> None:
+    def refuse(self, name: str, rule: str, value: object) -> NoReturn:
         """Raise an error that a parameter violates a rule."""
         raise InputError(f"{self._plugin}: {name!r} must {rule} (got {value!r})")
 

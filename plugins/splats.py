@@ -121,7 +121,7 @@ class SplatsShape(mi.Mesh):
         materials_file, is_uniform = given.string("materials", ""), "metallic" in props
         units = given.number("units", 0.0)
         if "units" in props and not 0 < units < np.inf:
-            raise InputError(f"shape 'splats': 'units' must be finite and > 0 (got {units})")
+            given.refuse("units", "be finite and > 0", units)
         asset = None
         if folder:
             if filename or materials_file or proxy_file or units:
@@ -139,11 +139,11 @@ class SplatsShape(mi.Mesh):
         self.capture_light = given.choice("capture_light", light, "uniform" if light == "scene" else "scene")
         self.roughness = given.number("roughness", float(asset.roughness) if asset else 0.4)
         if not 0 < self.roughness <= 1:
-            raise InputError(f"shape 'splats': 'roughness' must be in (0, 1] (got {self.roughness})")
+            given.refuse("roughness", "be in (0, 1]", self.roughness)
         default = float(asset.specular) if asset and self.instance else 0.04 if is_uniform else 0.0
         self.specular = given.number("specular", default)
         if not 0 <= self.specular <= 1:
-            raise InputError(f"shape 'splats': 'specular' must be in [0, 1] (got {self.specular})")
+            given.refuse("specular", "be in [0, 1]", self.specular)
         if splats is None:
             if not filename:
                 raise InputError("shape 'splats': 'asset' or 'filename' is missing")
@@ -151,11 +151,7 @@ class SplatsShape(mi.Mesh):
             if not units:
                 _refuse_other_units(path)
             if is_uniform:
-                metallic = given.number("metallic", 0.0)
-                if not 0 <= metallic <= 1:
-                    given.refuse("metallic", "be in [0, 1]", metallic)
-                specular = specular_of(self.specular)
-                splats = _load_uniform_splats(path, modified, metallic, self.roughness, specular)
+                splats = self._load_uniform(given, path, modified)
             else:
                 splats = _load_splats(path, modified, *(_stamp(materials_file) if materials_file else (None, 0)))
         if proxy is None and proxy_file:
@@ -164,8 +160,14 @@ class SplatsShape(mi.Mesh):
         self.proxy = proxy
         self.gloss = self._read_gloss(props, is_uniform)
         self.world_from_splats = _matrix(props) @ np.diag([units, units, units, 1.0]) if units else _matrix(props)
-
         self.appearance = self._read_appearance(given)
+
+    def _load_uniform(self, given: Parameters, path: Path, modified: int) -> Splats:
+        """Load splats of one material: the parameter ``metallic``, with the shape's roughness and specular."""
+        metallic = given.number("metallic", 0.0)
+        if not 0 <= metallic <= 1:
+            given.refuse("metallic", "be in [0, 1]", metallic)
+        return _load_uniform_splats(path, modified, metallic, self.roughness, specular_of(self.specular))
 
     def _read_gloss(self, props: mi.Properties, is_uniform: bool) -> GlossChange:
         """Return the roughness and specular that replace those of all materials of the splats."""
